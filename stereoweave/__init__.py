@@ -1,0 +1,58 @@
+"""Stereoweave: a rectified stereo pair in; depth, and any view between the two cameras, out."""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from stereoweave.errors import FormatError, MatcherError, StereoweaveError
+    from stereoweave.matcher import Matcher, estimate
+    from stereoweave.render import render
+    from stereoweave.stereo import Estimate, Sample, StereoCamera, StereoPair, View
+    from stereoweave.synthesis import synthesize
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "Estimate": "stereo",
+    "FormatError": "errors",
+    "Matcher": "matcher",
+    "MatcherError": "errors",
+    "Sample": "stereo",
+    "StereoCamera": "stereo",
+    "StereoPair": "stereo",
+    "StereoweaveError": "errors",
+    "View": "stereo",
+    "estimate": "matcher",
+    "render": "render",
+    "synthesize": "synthesis",
+}
+
+__all__ = [
+    "Estimate",
+    "FormatError",
+    "Matcher",
+    "MatcherError",
+    "Sample",
+    "StereoCamera",
+    "StereoPair",
+    "StereoweaveError",
+    "View",
+    "__version__",
+    "estimate",
+    "render",
+    "synthesize",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """The public name, imported when it is first asked for (PEP 562), so that the package itself loads at once."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    # Kept, because importing the module stereoweave.render has just bound that name to the module.
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

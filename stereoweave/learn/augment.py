@@ -1,0 +1,103 @@
+"""One kept pair seen in many ways: cut, scaled, mirrored, recoloured, partly erased."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from stereoweave.stereo import Sample
+
+
+def augment(sample: Sample, height: int, width: int, rng: np.random.Generator) -> Sample:
+    """A cut of the sample of the size asked for; disparity stays exact under each change."""
+    sample = rescaled_cut(sample, height, width, rng)
+    if rng.random() < 0.5:
+        sample = mirrored(sample)
+    if rng.random() < 0.3:
+        sample = upside_down(sample)
+    left, right = recoloured(sample.left, sample.right, rng)
+    if rng.random() < 0.4:
+        right = erased(right, rng)
+    return replace(sample, left=left, right=right)
+
+
+def rescaled_cut(sample: Sample, height: int, width: int, rng: np.random.Generator) -> Sample:
+    """A random part of the sample, scaled so that it fills height x width; its disparity scales with it."""
+    rows, columns = sample.disparity_px.shape
+    smallest = max(height / rows, width / columns)
+    scale = max(smallest, float(np.exp(rng.uniform(np.log(0.75), np.log(1.4)))))
+    # Height and width may stretch a little apart: cameras and hands do so too.
+    stretch = float(np.exp(rng.uniform(-0.1, 0.1)))
+    scale_y = max(scale * stretch, height / rows)
+    part_height, part_width = min(round(height / scale_y), rows), min(round(width / scale), columns)
+    top = int(rng.integers(rows - part_height + 1))
+    start = int(rng.integers(columns - part_width + 1))
+    part = np.s_[top : top + part_height, start : start + part_width]
+    scale_x = width / part_width
+
+    def picture(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+        shrinks = scale_x < 1 or height < part_height
+        return cv2.resize(
+            image[part], (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+        )
+
+    def nearest(values: np.ndarray) -> np.ndarray:
+        # Never a mean across an edge.
+        return cv2.resize(values[part], (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+
+    return Sample(
+        left=picture(sample.left),
+        right=picture(sample.right),
+        disparity_px=nearest(sample.disparity_px) * np.float32(scale_x),
+        right_disparity_px=nearest(sample.right_disparity_px) * np.float32(scale_x),
+        occluded=nearest(sample.occluded.astype(np.uint8)) > 0,
+        right_occluded=nearest(sample.right_occluded.astype(np.uint8)) > 0,
+    )
+
+
+def mirrored(sample: Sample) -> Sample:
+    """The sample as a mirror shows it: the views change places."""
+    return Sample(
+        left=sample.right[:, ::-1],
+        right=sample.left[:, ::-1],
+        disparity_px=sample.right_disparity_px[:, ::-1],
+        right_disparity_px=sample.disparity_px[:, ::-1],
+        occluded=sample.right_occluded[:, ::-1],
+        right_occluded=sample.occluded[:, ::-1],
+    )
+
+
+def upside_down(sample: Sample) -> Sample:
+    """The sample with its first row last."""
+    return Sample(**{name: value[::-1] for name, value in vars(sample).items()})
+
+
+def recoloured(
+    left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], rng: np.random.Generator
+) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
+    """Both views with one change of colour, and each with a small one of its own."""
+    order = rng.permutation(3) if rng.random() < 0.3 else np.arange(3)
+    gain, gamma = rng.uniform(0.7, 1.3, 3) * rng.uniform(0.7, 1.3), rng.uniform(0.7, 1.4)
+    tables = []
+    for _ in range(2):
+        own_gain, own_gamma = gain * rng.uniform(0.95, 1.05, 3), gamma * rng.uniform(0.96, 1.04)
+        tables.append(_colour_table(own_gain, own_gamma))
+    return cv2.LUT(left[..., order], tables[0]), cv2.LUT(right[..., order], tables[1])
+
+
+def _colour_table(gain: Float[np.ndarray, "3"], gamma: float) -> UInt8[np.ndarray, "256 1 3"]:
+    curve = (np.arange(256) / 255) ** gamma
+    return np.clip(255 * curve[:, None, None] * gain, 0, 255).astype(np.uint8)
+
+
+def erased(image: UInt8[np.ndarray, "h w 3"], rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
+    """The image with one or two patches in their mean colour: a match that must be guessed from around it."""
+    image = image.copy()
+    rows, columns = image.shape[:2]
+    for _ in range(rng.integers(1, 3)):
+        height, width = rng.integers(16, 64, 2)
+        top, start = rng.integers(rows - height + 1), rng.integers(columns - width + 1)
+        patch = image[top : top + height, start : start + width]
+        patch[:] = patch.mean((0, 1))
+    return image

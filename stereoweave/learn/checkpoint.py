@@ -1,0 +1,76 @@
+"""Checkpoints: everything that a killed run needs to go on as if nothing had happened."""
+
+import os
+import subprocess
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from stereoweave.errors import FormatError
+from stereoweave.learn.recipe import Recipe, recipe_from
+
+Weights = dict[str, torch.Tensor]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checkpoint:
+    """The state of a run after `step` steps.
+
+    Attributes:
+        weights: of the network as it is trained.
+        averaged: their running average, which is what scores and ships.
+        optimiser: the optimiser's state; empty in a checkpoint that only starts other runs.
+        random_state: PyTorch's; every other draw depends on (seed, step) alone.
+        scores: of the last validation.
+        commit: of the code that trained.
+        hours: of training so far, over all restarts and the run it started from.
+    """
+
+    recipe: Recipe
+    step: int
+    weights: Weights
+    averaged: Weights
+    optimiser: dict[str, Any]
+    random_state: torch.Tensor
+    scores: dict[str, float]
+    commit: str
+    hours: float
+
+
+def save(checkpoint: Checkpoint, path: Path) -> None:
+    """Write a checkpoint whole or not at all."""
+    temporary = path.with_name(path.name + ".part")
+    values = {**vars(checkpoint), "recipe": asdict(checkpoint.recipe)}
+    with temporary.open("wb") as stream:
+        torch.save(values, stream)
+        stream.flush()
+        os.fsync(stream.fileno())
+    temporary.replace(path)
+
+
+def load(path: Path) -> Checkpoint:
+    """The checkpoint of a file, on the CPU; FormatError if it is none."""
+    try:
+        values = torch.load(path, map_location="cpu", weights_only=True)
+        return Checkpoint(**{**values, "recipe": recipe_from(values["recipe"], str(path))})
+    except FileNotFoundError as error:
+        raise FormatError(f"{path}: no such checkpoint; `stereoweave train` writes last.pt into its run") from error
+    except (KeyError, TypeError, RuntimeError, OSError, EOFError, ValueError) as error:
+        if isinstance(error, FormatError):
+            raise
+        raise FormatError(f"{path}: expected a checkpoint of `stereoweave train`, found: {error}") from error
+
+
+def code_commit() -> str:
+    """The commit of the code that runs, '+' behind it where files were changed since; 'unknown' outside git."""
+    here = Path(__file__).parent
+    try:
+        described = subprocess.run(
+            ["git", "describe", "--always", "--dirty=+", "--exclude=*"],
+            cwd=here, capture_output=True, text=True, check=True,
+        )  # fmt: skip
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return described.stdout.strip()

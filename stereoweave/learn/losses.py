@@ -1,0 +1,73 @@
+"""What training minimises: maps over [B, 1, H, W] in, one number out; truth that is NaN does not count."""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from stereoweave.learn.models.weave import Stages
+
+
+def weave_losses(
+    stages: Stages, truth_px: Float[Tensor, "b 1 h w"], occluded: Bool[Tensor, "b 1 h w"]
+) -> dict[str, Tensor]:
+    """The terms of WeaveNet's loss by name, already weighted; their sum is what is minimised.
+
+    Args:
+        stages: What the network predicted for both views, the second half of the batch mirrored.
+        truth_px: Disparity of the same views; NaN where unknown.
+        occluded: Pixels without a match, which the raw correlation cannot be asked to find.
+    """
+    columns = torch.arange(truth_px.shape[3], device=truth_px.device)
+    unmatched = occluded | (truth_px > columns)
+    quarter_truth = truth_px[:, :, 1::4, 1::4] / 4
+    matched_truth = quarter_truth.masked_fill(unmatched[:, :, 1::4, 1::4], torch.nan)
+    return {
+        "correlation": 0.5 * level_cross_entropy(stages.correlation, matched_truth),
+        "scores": level_cross_entropy(stages.scores, quarter_truth),
+        "coarse": 0.5 * regression(stages.coarse_px, halved(truth_px)),
+        "disparity": regression(stages.disparity_px, truth_px),
+        "confidence": 0.3 * confidence_loss(stages.confidence_logit, stages.disparity_px, truth_px),
+    }
+
+
+def level_cross_entropy(
+    scores: Float[Tensor, "b d h w"], truth: Float[Tensor, "b 1 h w"]
+) -> Float[Tensor, ""]:
+    """Cross-entropy against a truth in levels that is shared between its two neighbouring levels."""
+    levels = scores.shape[1]
+    known = (truth >= 0) & (truth <= levels - 1)
+    truth = truth.where(known, 0)
+    below = truth.floor().clamp(max=levels - 2)
+    log_likelihood = scores.float().log_softmax(1)
+    low, high = (log_likelihood.gather(1, below.long() + i) for i in (0, 1))
+    return -mean_over(low + (truth - below) * (high - low), known)
+
+
+def regression(estimate_px: Float[Tensor, "b 1 h w"], truth_px: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
+    """Mean absolute error, rounded below half a pixel."""
+    known = truth_px.isfinite()
+    # Unknown truth is replaced before it meets the estimate: NaN times a mask is NaN, in the gradient too.
+    loss = F.huber_loss(estimate_px, truth_px.where(known, 0), reduction="none", delta=0.5) / 0.5
+    return mean_over(loss, known)
+
+
+def confidence_loss(
+    logit: Float[Tensor, "b 1 h w"], disparity_px: Float[Tensor, "b 1 h w"], truth_px: Float[Tensor, "b 1 h w"]
+) -> Float[Tensor, ""]:
+    """Cross-entropy of the claim that the disparity is within 1 px."""
+    within = (disparity_px.detach() - truth_px).abs() <= 1
+    loss = F.binary_cross_entropy_with_logits(logit, within.float(), reduction="none")
+    return mean_over(loss, truth_px.isfinite())
+
+
+def halved(truth_px: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h2 w2"]:
+    """Mean of each 2x2 block, in pixels of the full resolution; NaN where an edge runs through the block."""
+    blocks = F.pixel_unshuffle(truth_px, 2)
+    low, high = blocks.aminmax(dim=1, keepdim=True)
+    return blocks.mean(1, keepdim=True).where(high - low < 1, torch.nan)
+
+
+def mean_over(values: Float[Tensor, "..."], known: Bool[Tensor, "..."]) -> Float[Tensor, ""]:
+    """Mean of the values that are known; 0, with a gradient of 0, where none is."""
+    return values.where(known, 0).sum() / known.sum().clamp(min=1)

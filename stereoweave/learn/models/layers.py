@@ -1,0 +1,158 @@
+"""What the networks share: convolution blocks, correlation, soft-argmax, guided upsampling."""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+
+class ConvBlock(nn.Sequential):
+    """Convolution, batch norm, ReLU; stride 2 halves the size exactly, and symmetrically under mirroring."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int = 3, dilation: int = 1) -> None:
+        super().__init__(
+            nn.Conv2d(
+                inputs, outputs, kernel, padding=dilation * (kernel // 2), dilation=dilation, bias=False
+            ),
+            nn.BatchNorm2d(outputs),
+            nn.ReLU(inplace=True),
+        )
+
+
+class Halve(nn.Sequential):
+    """ConvBlock at half the resolution.
+
+    The kernel is even, so that the centre of an output pixel is the centre of the pixels it stands for: a
+    network that mirrors its feature maps needs maps whose grid is its own mirror image.
+    """
+
+    def __init__(self, inputs: int, outputs: int, kernel: int = 2) -> None:
+        super().__init__(
+            nn.Conv2d(inputs, outputs, kernel, stride=2, padding=kernel // 2 - 1, bias=False),
+            nn.BatchNorm2d(outputs),
+            nn.ReLU(inplace=True),
+        )
+
+
+class Residual(nn.Module):
+    """Two 3x3 convolutions added to their input."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = ConvBlock(channels, channels)
+        self.second = nn.Sequential(
+            nn.Conv2d(channels, channels, 3, padding=1, bias=False), nn.BatchNorm2d(channels)
+        )
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        return F.relu(x + self.second(self.first(x)))
+
+
+class DilatedDense(nn.Module):
+    """The paper's densely connected blocks: each narrows all maps so far, looks wider, and adds its own.
+
+    Deviation: convolution, norm, ReLU in this order (the paper: norm, ReLU, convolution), so that every norm
+    folds into its convolution when the network is exported.
+    """
+
+    def __init__(self, inputs: int, narrow: int, growth: int, dilations: tuple[int, ...]) -> None:
+        super().__init__()
+        self.blocks = nn.ModuleList(
+            nn.Sequential(
+                ConvBlock(inputs + i * growth, narrow, kernel=1),
+                ConvBlock(narrow, growth, dilation=dilation),
+            )
+            for i, dilation in enumerate(dilations)
+        )
+        self.outputs = inputs + growth * len(dilations)
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c2 h w"]:
+        for block in self.blocks:
+            x = torch.cat([x, block(x)], 1)
+        return x
+
+
+def mirrored(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+    """The map as a mirror shows it, left and right exchanged."""
+    return x.flip(3)
+
+
+def correlation_volume(
+    first: Float[Tensor, "b c h w"], second: Float[Tensor, "b c h w"], levels: int
+) -> Float[Tensor, "b d h w"]:
+    """How well column x of `first` agrees with column x - d of `second`, for d = 0 .. levels - 1; 0 outside.
+
+    One matrix product a row compares all columns with all columns; reading its result with rows one element
+    shorter turns the diagonals that are wanted into columns. Plain reference: `correlation_volume_plain` in
+    tests/test_layers.py.
+    """
+    width = first.shape[3]
+    products = first.permute(0, 2, 3, 1) @ mirrored(second).permute(0, 2, 1, 3)
+    padded = F.pad(products, (0, levels))
+    skewed = padded.flatten(2)[..., width - 1 : -1].unflatten(2, (width, width + levels - 1))
+    return skewed[..., :levels].permute(0, 3, 1, 2)
+
+
+def local_soft_argmax(logits: Float[Tensor, "b d h w"], radius: int = 2) -> Float[Tensor, "b 1 h w"]:
+    """Expected level under a softmax over the best level and `radius` neighbours on each side.
+
+    The window keeps a second, far-off candidate from pulling the mean off the surface.
+    """
+    best = logits.detach().argmax(1, keepdim=True)
+    steps = torch.arange(-radius, radius + 1, device=logits.device).view(1, -1, 1, 1)
+    # A level beyond the volume's ends: far less likely than any inside it.
+    padded = F.pad(logits, (0, 0, 0, 0, radius, radius), value=-1e4)
+    return best + expected_step(padded.gather(1, best + steps + radius))
+
+
+def expected_step(logits: Float[Tensor, "b k h w"]) -> Float[Tensor, "b 1 h w"]:
+    """Expectation of -radius .. radius under a softmax over channels, k = 2 * radius + 1.
+
+    Written out, because ONNX Runtime's softmax over channels is ten times slower than these steps.
+    """
+    radius = logits.shape[1] // 2
+    steps = torch.arange(-radius, radius + 1, device=logits.device).view(1, -1, 1, 1)
+    weights = (logits - logits.amax(1, keepdim=True)).exp()
+    return (weights * steps).sum(1, keepdim=True) / weights.sum(1, keepdim=True)
+
+
+def nearby_matches(
+    first: Float[Tensor, "b c h w"],
+    second: Float[Tensor, "b c h w"],
+    disparity: Int[Tensor, "b 1 h w"],
+    radius: int,
+) -> Float[Tensor, "b k h w"]:
+    """Correlation of column x of `first` with column x - disparity - k of `second`, k = -radius .. radius.
+
+    Columns outside the map count as its border.
+    """
+    batch, channels, height, width = first.shape
+    steps = torch.arange(-radius, radius + 1, device=first.device)
+    columns = torch.arange(width, device=first.device).view(1, 1, width, 1)
+    rows = torch.arange(batch * height, device=first.device).view(batch, height, 1, 1)
+    matched = (columns - disparity.view(batch, height, width, 1) - steps).clamp(0, width - 1) + rows * width
+    # One row of `pixels` is one pixel's features, so that looking one up is one contiguous copy.
+    pixels = second.permute(0, 2, 3, 1).reshape(-1, channels)
+    found = pixels.index_select(0, matched.view(-1)).view(batch, height, width, 2 * radius + 1, channels)
+    return (found * first.permute(0, 2, 3, 1).unsqueeze(3)).sum(4).permute(0, 3, 1, 2)
+
+
+def upsample_convex(
+    x: Float[Tensor, "b 1 h w"], weights: Float[Tensor, "b 36 h w"]
+) -> Float[Tensor, "b 1 h2 w2"]:
+    """Twice the size: each new pixel a convex mixture of the 3x3 old ones around it (RAFT, Teed & Deng 2020).
+
+    `weights` are logits, [B, 9 * 4, H, W]: nine neighbours for each of the four new pixels. A mixture can put
+    an edge anywhere between two old pixels without inventing values between its two sides.
+
+    Deviation: shares of sigmoids, where RAFT takes a softmax, which costs ONNX Runtime more than all convolutions.
+    """
+    batch, _, height, width = x.shape
+    around = F.pad(x, (1, 1, 1, 1), mode="replicate")
+    neighbours = torch.stack(
+        [around[:, :, dy : dy + height, dx : dx + width] for dy in range(3) for dx in range(3)], 1
+    )
+    shares = weights.contiguous().view(batch, 9, 4, height, width).sigmoid()
+    # 1e-4: where all nine are refused, no division by zero, and still a mixture of nothing but neighbours.
+    mixed = ((shares + 1e-4) * neighbours).sum(1) / (shares + 1e-4).sum(1)
+    return F.pixel_shuffle(mixed, 2)
