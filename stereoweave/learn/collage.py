@@ -51,7 +51,7 @@ class Surface:
         for height, middle_x, middle_y, inverse_x, inverse_y in self.hills:
             columns.append(height * np.exp(-(((x - middle_x) * inverse_x) ** 2)))
             rows.append(np.exp(-(((y - middle_y) * inverse_y) ** 2)))
-        return surface(np.stack(columns), np.stack(rows), self.limit_px)
+        return surface(np.stack(columns).astype(np.float32), np.stack(rows).astype(np.float32), self.limit_px)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,7 +212,7 @@ def _draw_surface(rng: np.random.Generator, place: Place, level_px: float, limit
 
 def _draw_paint(rng: np.random.Generator, textures: Bank, place: Place) -> Paint:
     family = textures.periodic if rng.random() < 0.12 else textures.natural
-    texels_per_px = rng.uniform(0.4, 1.0)
+    texels_per_px = rng.uniform(0.45, 1.0)
     texels_per_light_px = 64 / (2 * place.radius_px + 40) * rng.uniform(0.3, 1.5)
     return Paint(
         texture=family[rng.integers(len(family))],
@@ -304,5 +304,7 @@ def _vignette(height: int, width: int, strength: float) -> Float[np.ndarray, "h 
 
 
 def _through_jpeg(image: UInt8[np.ndarray, "h w 3"], quality: int) -> UInt8[np.ndarray, "h w 3"]:
-    _, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return np.ascontiguousarray(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1])
+    _, data = cv2.imencode(
+        ".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality]
+    )
+    return cv2.imdecode(data, cv2.IMREAD_COLOR_RGB)  # type: ignore[return-value]  # None only for bad data

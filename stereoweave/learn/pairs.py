@@ -31,7 +31,7 @@ class KeptPairs:
         """Make the missing pairs in parallel, yielding the index of each as it is done."""
         self.folder.mkdir(parents=True, exist_ok=True)
         # Started afresh, because a forked child inherits PyTorch's threads in an unknown state.
-        with multiprocessing.get_context("spawn").Pool(len(os.sched_getaffinity(0))) as workers:
+        with multiprocessing.get_context("spawn").Pool(os.cpu_count()) as workers:
             yield from workers.imap_unordered(partial(_make, self), self.missing(), chunksize=8)
 
     def __getitem__(self, index: int) -> Sample:

@@ -34,7 +34,7 @@ class Place:
     width: int
     height: int
 
-    def ring(self, angles: Float[np.ndarray, "_"], radii: Float[np.ndarray, "_"]) -> Points:
+    def ring(self, angles: Float[np.ndarray, " n"], radii: Float[np.ndarray, " n"]) -> Points:
         """Points at these angles and multiples of the half extent."""
         reach = self.radius_px * radii
         return np.stack([self.x + reach * np.cos(angles), self.y + reach * np.sin(angles)], axis=1)

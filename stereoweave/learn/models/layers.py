@@ -2,7 +2,7 @@
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
 
@@ -93,16 +93,22 @@ def correlation_volume(
     return skewed[..., :levels].permute(0, 3, 1, 2)
 
 
-def local_soft_argmax(logits: Float[Tensor, "b d h w"], radius: int = 2) -> Float[Tensor, "b 1 h w"]:
-    """Expected level under a softmax over the best level and `radius` neighbours on each side.
+def local_soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
+    """Expected level under a softmax over the surroundings of the best level.
 
-    The window keeps a second, far-off candidate from pulling the mean off the surface.
+    The window keeps a second, far-off candidate from pulling the mean off the surface. First it reaches 2 levels
+    to each side of the best one; then it moves to the mean found there, fading out over 3 levels, so that the
+    result hardly jumps where rounding decides which of two levels is the best.
     """
     best = logits.detach().argmax(1, keepdim=True)
-    steps = torch.arange(-radius, radius + 1, device=logits.device).view(1, -1, 1, 1)
+    reach = 3
+    steps = torch.arange(-reach, reach + 1, device=logits.device).view(1, -1, 1, 1)
     # A level beyond the volume's ends: far less likely than any inside it.
-    padded = F.pad(logits, (0, 0, 0, 0, radius, radius), value=-1e4)
-    return best + expected_step(padded.gather(1, best + steps + radius))
+    padded = F.pad(logits, (0, 0, 0, 0, reach, reach), value=-1e4)
+    around = padded.gather(1, best + steps + reach)
+    centre = expected_step(around[:, 1:-1]).detach()
+    weights = (around - around.amax(1, keepdim=True)).exp() * (1 - (steps - centre).abs() / reach).clamp(min=0)
+    return best + (weights * steps).sum(1, keepdim=True) / weights.sum(1, keepdim=True)
 
 
 def expected_step(logits: Float[Tensor, "b k h w"]) -> Float[Tensor, "b 1 h w"]:
@@ -119,22 +125,26 @@ def expected_step(logits: Float[Tensor, "b k h w"]) -> Float[Tensor, "b 1 h w"]:
 def nearby_matches(
     first: Float[Tensor, "b c h w"],
     second: Float[Tensor, "b c h w"],
-    disparity: Int[Tensor, "b 1 h w"],
+    disparity: Float[Tensor, "b 1 h w"],
     radius: int,
 ) -> Float[Tensor, "b k h w"]:
     """Correlation of column x of `first` with column x - disparity - k of `second`, k = -radius .. radius.
 
-    Columns outside the map count as its border.
+    Between two columns it is interpolated; columns outside the map count as its border.
     """
     batch, channels, height, width = first.shape
-    steps = torch.arange(-radius, radius + 1, device=first.device)
+    whole = disparity.detach().floor()
+    steps = torch.arange(-radius, radius + 2, device=first.device)
     columns = torch.arange(width, device=first.device).view(1, 1, width, 1)
     rows = torch.arange(batch * height, device=first.device).view(batch, height, 1, 1)
-    matched = (columns - disparity.view(batch, height, width, 1) - steps).clamp(0, width - 1) + rows * width
+    matched = columns - whole.long().view(batch, height, width, 1) - steps
     # One row of `pixels` is one pixel's features, so that looking one up is one contiguous copy.
     pixels = second.permute(0, 2, 3, 1).reshape(-1, channels)
-    found = pixels.index_select(0, matched.view(-1)).view(batch, height, width, 2 * radius + 1, channels)
-    return (found * first.permute(0, 2, 3, 1).unsqueeze(3)).sum(4).permute(0, 3, 1, 2)
+    found = pixels.index_select(0, (matched.clamp(0, width - 1) + rows * width).view(-1))
+    found = found.view(batch, height, width, 2 * radius + 2, channels)
+    matches = (found * first.permute(0, 2, 3, 1).unsqueeze(3)).sum(4).permute(0, 3, 1, 2)
+    between = disparity.detach() - whole
+    return matches[:, :-1] + between * (matches[:, 1:] - matches[:, :-1])
 
 
 def upsample_convex(

@@ -106,7 +106,7 @@ class Refinement(nn.Module):
         super().__init__()
         self.radius = radius
         nearby = 2 * radius + 1
-        self.join = ConvBlock(nearby + 1 + 16 + 8, 16, kernel=1)
+        self.join = ConvBlock(nearby + 16 + 8, 16, kernel=1)
         self.body = Residual(16)
         self.scores = nn.Conv2d(16, nearby, 1)
         self.weights = nn.Conv2d(16, 36, 1)
@@ -116,11 +116,10 @@ class Refinement(nn.Module):
         self, disparity: Tensor, first: Tensor, second: Tensor, context: Tensor, decoded: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Disparity in pixels of this resolution, the weights of the last upsampling, and the confidence."""
-        nearest = disparity.detach().round()
-        matches = nearby_matches(first, second, nearest.long(), self.radius)
-        x = self.body(self.join(torch.cat([matches, disparity - nearest, context, decoded], 1)))
+        matches = nearby_matches(first, second, disparity, self.radius)
+        x = self.body(self.join(torch.cat([matches, context, decoded], 1)))
         correction = expected_step((matches + self.scores(x)).float())
-        return nearest + correction, self.weights(x), self.confidence(x)
+        return disparity + correction, self.weights(x), self.confidence(x)
 
 
 class WeaveNet(nn.Module):

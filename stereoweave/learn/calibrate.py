@@ -1,0 +1,89 @@
+"""The network's confidence made a probability, on pairs that it was not trained on."""
+
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from stereoweave.learn.collage import sample
+from stereoweave.learn.models.weave import WeaveNet
+from stereoweave.metrics import calibration_error
+from stereoweave.stereo import Sample, StereoPair
+
+# Apart from the seeds of recipes and from that of validation.
+_FIT_SEED, _PROOF_SEED = 2_000_003, 3_000_017
+_PAIRS = 40
+_SIZE = (320, 512)
+
+
+def calibrate(network: WeaveNet) -> dict[str, Any]:
+    """Scale and shift the network's confidence so that it comes true as often as it says; returns how often it does.
+
+    The scale and the shift (Platt 1999) are folded into the last layer. What is returned comes from other pairs
+    than they were fitted on: `calibration_error`, and per bin of confidence what was `claimed`, what `happened`,
+    and the `share` of pixels.
+    """
+    scale, shift = _fitted(*_claims(network, _FIT_SEED))
+    last = network.refinement.confidence
+    assert last.bias is not None
+    with torch.no_grad():
+        last.weight *= scale
+        last.bias.copy_(last.bias * scale + shift)
+    logits, within = _claims(network, _PROOF_SEED)
+    return reliability(logits.sigmoid().numpy(), within.numpy())
+
+
+def reliability(probability: np.ndarray, happened: np.ndarray, bins: int = 10) -> dict[str, Any]:
+    """What was claimed and what happened, per bin of equal width, and the expected calibration error."""
+    where = np.minimum((probability * bins).astype(int), bins - 1)
+    rows = [
+        {
+            "claimed": round(float(probability[where == i].mean()), 4),
+            "happened": round(float(happened[where == i].mean()), 4),
+            "share": round(float((where == i).mean()), 4),
+        }
+        for i in range(bins)
+        if (where == i).any()
+    ]
+    return {"calibration_error": round(calibration_error(probability, happened), 4), "bins": rows}
+
+
+def unseen_pair() -> StereoPair:
+    """A pair of the project's own that no training sees."""
+    made = sample(_PROOF_SEED, 1, 0, *_SIZE)
+    return StereoPair(left=made.left, right=made.right)
+
+
+def _claims(network: WeaveNet, seed: int) -> tuple[Tensor, Tensor]:
+    """Confidence logits, and whether the disparity was within 1 px, over every 7th pixel of fresh pairs."""
+    logits, within = [], []
+    for index in range(_PAIRS):
+        made = sample(seed, 0, index, *_SIZE)
+        with torch.no_grad():
+            disparity_px, _, logit = network(_tensor(made, "left"), _tensor(made, "right"))
+        error_px = (disparity_px[0, 0] - torch.from_numpy(made.disparity_px)).abs()
+        logits.append(logit.flatten()[::7])
+        within.append(error_px.flatten()[::7] <= 1)
+    return torch.cat(logits), torch.cat(within)
+
+
+def _tensor(made: Sample, side: str) -> Tensor:
+    return torch.from_numpy(getattr(made, side)).permute(2, 0, 1)[None].float() / 255
+
+
+def _fitted(logits: Tensor, within: Tensor) -> tuple[float, float]:
+    """Scale and shift under which the logits are the likeliest explanation of what happened."""
+    parameters = torch.tensor([1.0, 0.0], requires_grad=True)
+    optimiser = torch.optim.LBFGS([parameters], max_iter=50)
+
+    def loss() -> Tensor:
+        optimiser.zero_grad()
+        value = F.binary_cross_entropy_with_logits(logits * parameters[0] + parameters[1], within.float())
+        value.backward()
+        return value
+
+    optimiser.step(loss)
+    scale, shift = parameters.tolist()
+    return scale, shift
