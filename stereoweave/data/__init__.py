@@ -1,0 +1,1 @@
+"""Real datasets as pairs with their ground truth."""

@@ -1,0 +1,65 @@
+"""Real scenes on disk, as pairs with the disparity that was measured for them."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.io import calibrated, read_disparity_png, read_pair, read_pfm
+from stereoweave.stereo import StereoPair
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """A pair to score a matcher on.
+
+    Attributes:
+        name: The folder's.
+        pair: With its camera where the folder has a calib.txt.
+        truth_px: float32 [H, W], the disparity of the left view; NaN where it is unknown.
+    """
+
+    name: str
+    pair: StereoPair
+    truth_px: Float32[np.ndarray, "h w"]
+
+
+def read_scenes(folder: str | Path) -> Iterator[Scene]:
+    """The scenes of `folder` by name, each read when its turn comes.
+
+    A scene is a folder of left.png, right.png, disparity.png (16 bit, pixels * 256, 0 = unknown) or
+    disparity.pfm (NaN or infinity = unknown), and, where the camera is known, Middlebury's calib.txt.
+
+    Raises:
+        StereoweaveError: No scene in the folder.
+        FormatError: A file is missing, damaged, or of another size than its neighbours.
+    """
+    scenes = sorted(left.parent for left in Path(folder).glob("*/left.png"))
+    if not scenes:
+        raise StereoweaveError(f"{folder}: expected <scene>/left.png below it, found none")
+    return map(_read_scene, scenes)
+
+
+def _read_scene(folder: Path) -> Scene:
+    pair = read_pair(folder / "left.png", folder / "right.png")
+    calibration = folder / "calib.txt"
+    if calibration.exists():
+        pair = calibrated(pair, calibration)
+    truth_px = _read_truth(folder)
+    if truth_px.shape != pair.left.shape[:2]:
+        raise FormatError(
+            f"{folder}: expected ground truth of shape {pair.left.shape[:2]}, like its pictures, "
+            f"found {truth_px.shape}"
+        )
+    return Scene(name=folder.name, pair=pair, truth_px=truth_px)
+
+
+def _read_truth(folder: Path) -> Float32[np.ndarray, "h w"]:
+    pfm = folder / "disparity.pfm"
+    if not pfm.exists():
+        return read_disparity_png(folder / "disparity.png")
+    values_px = read_pfm(pfm)
+    return np.where(np.isfinite(values_px), values_px, np.float32(np.nan))

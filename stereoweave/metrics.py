@@ -1,0 +1,108 @@
+"""How far an estimate is from the truth: the one implementation, in double precision.
+
+In ground truth NaN and infinity mean unknown, and unknown pixels do not count. A pixel whose estimate is NaN
+is a bad one. A mean over no pixel is NaN.
+"""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from stereoweave.errors import StereoweaveError
+
+
+def epe_px(estimate_px: Float[np.ndarray, "h w"], truth_px: Float[np.ndarray, "h w"]) -> float:
+    """End-point error: the mean absolute error of disparity in pixels."""
+    error_px, _ = _known_errors(estimate_px, truth_px)
+    return _mean(error_px)
+
+
+def bad_percent(
+    estimate_px: Float[np.ndarray, "h w"], truth_px: Float[np.ndarray, "h w"], threshold_px: float
+) -> float:
+    """Percent of known pixels whose disparity is off by more than threshold_px (Middlebury's bad-n)."""
+    error_px, _ = _known_errors(estimate_px, truth_px)
+    return 100 * _mean(~(error_px <= threshold_px))
+
+
+def d1_percent(estimate_px: Float[np.ndarray, "h w"], truth_px: Float[np.ndarray, "h w"]) -> float:
+    """Percent of known pixels whose disparity is off by over 3 px and over 5 % (KITTI 2015's D1)."""
+    error_px, known_px = _known_errors(estimate_px, truth_px)
+    return 100 * _mean(~((error_px <= 3) | (error_px <= 0.05 * np.abs(known_px))))
+
+
+def depth_error_m(estimate_m: Float[np.ndarray, "h w"], truth_m: Float[np.ndarray, "h w"]) -> float:
+    """Mean absolute error of depth in metres; infinite where a known depth is estimated as infinite."""
+    error_m, _ = _known_errors(estimate_m, truth_m)
+    return _mean(error_m)
+
+
+def mae(image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]) -> float:
+    """Mean absolute difference of two pictures, in grey levels of 0..255."""
+    return _mean(np.abs(_difference(image, truth)))
+
+
+def psnr_db(image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]) -> float:
+    """Peak signal-to-noise ratio of two pictures in dB; squared errors under 1e-10 count as that, 148 dB."""
+    return float(10 * np.log10(255**2 / max(_mean(_difference(image, truth) ** 2), 1e-10)))
+
+
+def ssim(image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]) -> float:
+    """Mean structural similarity of two pictures' luminance, rounded to 8 bits; 1 where they are equal.
+
+    Source: Wang et al. 2004: 11x11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03; borders are mirrored.
+    """
+    _check_shapes(image, truth)
+    a, b = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float64) for picture in (image, truth))
+    mean_a, mean_b = _window_mean(a), _window_mean(b)
+    variance_a, variance_b = _window_mean(a * a) - mean_a**2, _window_mean(b * b) - mean_b**2
+    covariance = _window_mean(a * b) - mean_a * mean_b
+    c1, c2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
+    luminance = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1)
+    return _mean(luminance * (2 * covariance + c2) / (variance_a + variance_b + c2))
+
+
+def _known_errors(
+    estimate: Float[np.ndarray, "h w"], truth: Float[np.ndarray, "h w"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """The absolute errors at the pixels whose truth is known, and the truth there."""
+    _check_shapes(estimate, truth)
+    known = np.isfinite(truth)
+    known_truth = truth[known].astype(np.float64)
+    return np.abs(estimate[known] - known_truth), known_truth
+
+
+def _difference(
+    image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]
+) -> Float[np.ndarray, "h w 3"]:
+    _check_shapes(image, truth)
+    return image.astype(np.float64) - truth
+
+
+def _window_mean(image: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    return cv2.GaussianBlur(image, (11, 11), 1.5)
+
+
+def _mean(values: Float[np.ndarray, "..."] | Bool[np.ndarray, "..."]) -> float:
+    return float(values.mean()) if values.size else float("nan")
+
+
+def _check_shapes(estimate: np.ndarray, truth: np.ndarray) -> None:
+    # NumPy would stretch one to the other where it can, and the score would mean nothing.
+    if estimate.shape != truth.shape:
+        raise StereoweaveError(
+            f"expected an estimate of the truth's shape {truth.shape}, found {estimate.shape}"
+        )
+
+
+def calibration_error(
+    probability: Float[np.ndarray, "..."], happened: Bool[np.ndarray, "..."], bins: int = 15
+) -> float:
+    """Expected calibration error: the mean gap, over bins of equal width, between what was claimed and what happened.
+
+    Source: Guo et al. 2017; each bin weighs as many as fall into it.
+    """
+    where = np.minimum((probability * bins).astype(int), bins - 1).ravel()
+    claimed = np.bincount(where, probability.ravel(), bins)
+    came = np.bincount(where, happened.ravel(), bins)
+    return float(np.abs(claimed - came).sum() / probability.size)
