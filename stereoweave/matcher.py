@@ -1,0 +1,240 @@
+"""A pair becomes an Estimate: the shipped network, or any matcher file, under ONNX Runtime.
+
+A matcher file (docs/architecture.md) takes `left` and `right`, float32 [B, 3, H, W] in 0..1, and gives
+`disparity_px`, and, where the network can, `right_disparity_px` and `confidence_logit`.
+"""
+
+import functools
+import math
+import os
+from collections.abc import Iterator
+from importlib.resources import files
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from stereoweave.errors import MatcherError, StereoweaveError
+from stereoweave.io import SMALLEST_SIDE_PX
+from stereoweave.stereo import Estimate, StereoPair
+
+# A network compares every column of a row with every other: this many pairs of columns take about 0.4 GB.
+_PIXEL_PAIRS_AT_ONCE = 1920 * 1920 * 320
+# What a strip sees beyond its own rows; from twice this distance the network's answer hardly changes.
+_STRIP_OVERLAP_PX = 64
+# A nearer surface this much in front of a pixel's match hides it; less is the two views' disagreement.
+_OCCLUSION_STEP_PX = 1.0
+
+
+class Maps(NamedTuple):
+    """What a graph gives for a pair, each float32 [H, W]; None where it has no such output."""
+
+    disparity_px: np.ndarray
+    right_disparity_px: np.ndarray | None
+    confidence_logit: np.ndarray | None
+
+
+class Matcher:
+    """A matcher file, loaded once and kept between calls.
+
+    Args:
+        model: A shipped name (see `shipped_models`) or the path of an .onnx file.
+        threads: How many threads a call may use; all cores that the process may use if left out.
+
+    Raises:
+        MatcherError: If there is no such model, or the file is not a matcher.
+    """
+
+    def __init__(self, model: str | Path = "small", *, threads: int | None = None) -> None:
+        import onnxruntime
+
+        if threads is not None and threads < 1:
+            raise StereoweaveError(f"threads: expected 1 or more, got {threads}")
+        path = _model_file(model)
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads or _usable_cores()
+        options.log_severity_level = 4  # what is wrong with a file is said once, by the error below
+        try:
+            self._session = onnxruntime.InferenceSession(
+                str(path), options, providers=["CPUExecutionProvider"]
+            )
+        except Exception as error:  # ONNX Runtime's errors have no common base class
+            reason = str(error).splitlines()[0]
+            raise MatcherError(f"{path}: expected an ONNX matcher, found a file ONNX Runtime refuses: {reason}") from error
+        self._outputs = [output.name for output in self._session.get_outputs()]
+        self._check_interface(path)
+        properties = self._session.get_modelmeta().custom_metadata_map
+        self.name = properties["stereoweave.name"]
+        self.multiple_of = int(properties["stereoweave.multiple_of"])
+        self.max_disparity_px = float(properties["stereoweave.max_disparity_px"])
+
+    def estimate(self, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]) -> Estimate:
+        """Disparity of both views, confidence and occlusion of a rectified pair, uint8 RGB of one size.
+
+        Raises:
+            ValueError: If the images are not that, or under 32 px in a direction.
+        """
+        pair = StereoPair(left=left, right=right)
+        height, width = left.shape[:2]
+        if min(height, width) < SMALLEST_SIDE_PX:
+            raise StereoweaveError(
+                f"images: expected at least {SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX} px, got {width}x{height}"
+            )
+        maps = self._maps(pair)
+        right_px = maps.right_disparity_px
+        if right_px is None:
+            right_px = np.ascontiguousarray(self._maps(pair.mirrored()).disparity_px[:, ::-1])
+        seen_px, inside = _right_disparity_at_match(maps.disparity_px, right_px)
+        return Estimate(
+            disparity_px=maps.disparity_px,
+            right_disparity_px=right_px,
+            confidence=_confidence(maps.confidence_logit, seen_px - maps.disparity_px),
+            occluded=~inside | (seen_px - maps.disparity_px > _OCCLUSION_STEP_PX),
+        )
+
+    def _maps(self, pair: StereoPair) -> Maps:
+        """The graph's outputs for a pair of any size: in strips of rows where it is large, blended where they overlap."""
+        height, width = pair.left.shape[:2]
+        strips = list(_strips(height, self._strip_rows(width)))
+        if len(strips) == 1:
+            return self._run(pair.left, pair.right)
+        totals: dict[str, np.ndarray] = {}
+        weights = np.zeros((height, 1), np.float32)
+        for rows in strips:
+            weight = _strip_weights(rows, height)
+            weights[rows] += weight
+            for name, values in self._run(pair.left[rows], pair.right[rows])._asdict().items():
+                if values is not None:
+                    totals.setdefault(name, np.zeros((height, width), np.float32))[rows] += weight * values
+        return Maps(**{name: totals[name] / weights if name in totals else None for name in Maps._fields})
+
+    def _strip_rows(self, width: int) -> int:
+        rows = _PIXEL_PAIRS_AT_ONCE // (width * width)
+        return max(rows // self.multiple_of * self.multiple_of, 4 * _STRIP_OVERLAP_PX)
+
+    def _run(self, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]) -> Maps:
+        height, width = left.shape[:2]
+        inputs = {"left": self._tensor(left), "right": self._tensor(right)}
+        outputs = dict(zip(self._outputs, self._session.run(None, inputs), strict=True))
+        cut = {name: np.ascontiguousarray(value[0, 0, :height, :width]) for name, value in outputs.items()}
+        return Maps(*(cut.get(name) for name in Maps._fields))
+
+    def _tensor(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "1 3 h2 w2"]:
+        """The image as the network takes it, its border repeated up to the size that the network can divide."""
+        below, beside = (-side % self.multiple_of for side in image.shape[:2])
+        padded = cv2.copyMakeBorder(image, 0, below, 0, beside, cv2.BORDER_REPLICATE)
+        return cv2.dnn.blobFromImage(padded, 1 / 255)
+
+    def _check_interface(self, path: Path) -> None:
+        inputs = [input_.name for input_ in self._session.get_inputs()]
+        if inputs != ["left", "right"] or "disparity_px" not in self._outputs:
+            raise MatcherError(
+                f"{path}: expected a matcher, inputs left and right and an output disparity_px, "
+                f"found inputs {', '.join(inputs)} and outputs {', '.join(self._outputs)}"
+            )
+        properties = self._session.get_modelmeta().custom_metadata_map
+        for key in ("name", "multiple_of", "max_disparity_px"):
+            if f"stereoweave.{key}" not in properties:
+                raise MatcherError(
+                    f"{path}: expected a matcher's metadata, found no stereoweave.{key}; `stereoweave export` writes it"
+                )
+
+
+def estimate(
+    left: UInt8[np.ndarray, "h w 3"],
+    right: UInt8[np.ndarray, "h w 3"],
+    *,
+    model: str | Path = "small",
+    threads: int | None = None,
+) -> Estimate:
+    """Disparity of both views, confidence and occlusion of a rectified pair.
+
+    Args:
+        left: The left photograph, uint8 RGB [H, W, 3], at least 32x32.
+        right: The right one, of the same size.
+        model: A shipped name or the path of an .onnx matcher; loaded at the first call, and kept.
+        threads: How many threads may be used; all cores if left out.
+
+    Raises:
+        ValueError: MatcherError for a model that is none, StereoweaveError for images that are none.
+    """
+    return _kept_matcher(str(model), threads).estimate(left, right)
+
+
+def shipped_models() -> list[str]:
+    """The names of the networks inside the package."""
+    return sorted(Path(file.name).stem for file in _weights_folder().iterdir() if file.name.endswith(".onnx"))
+
+
+@functools.lru_cache(maxsize=4)
+def _kept_matcher(model: str, threads: int | None) -> Matcher:
+    return Matcher(model, threads=threads)
+
+
+def _weights_folder() -> Path:
+    return Path(str(files("stereoweave") / "weights"))
+
+
+def _model_file(model: str | Path) -> Path:
+    if str(model).endswith(".onnx"):
+        path = Path(model)
+        if not path.is_file():
+            raise MatcherError(f"{path}: expected an ONNX matcher, found no such file")
+        return path
+    if str(model) not in shipped_models():
+        raise MatcherError(
+            f"unknown model {str(model)!r}; expected {' or '.join(shipped_models())}, or the path of an .onnx file"
+        )
+    return _weights_folder() / f"{model}.onnx"
+
+
+def _usable_cores() -> int:
+    # Not ONNX Runtime's own choice: on a virtual machine it counts two cores as one with two threads.
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _strips(height: int, rows: int) -> Iterator[slice]:
+    """Row ranges of at most `rows` that cover `height` and overlap their neighbours; sizes differ by at most a row."""
+    if height <= rows:
+        yield slice(0, height)
+        return
+    count = math.ceil((height - 2 * _STRIP_OVERLAP_PX) / (rows - 2 * _STRIP_OVERLAP_PX))
+    ends = np.linspace(_STRIP_OVERLAP_PX, height - _STRIP_OVERLAP_PX, count + 1).round().astype(int).tolist()
+    for top, bottom in zip(ends, ends[1:], strict=False):
+        yield slice(top - _STRIP_OVERLAP_PX, bottom + _STRIP_OVERLAP_PX)
+
+
+def _strip_weights(rows: slice, height: int) -> Float[np.ndarray, "h 1"]:
+    """How much a strip counts at each of its rows: less towards an end that another strip sees better."""
+    places = np.arange(rows.start, rows.stop, dtype=np.float32)[:, None] + 0.5
+    from_top = places - rows.start if rows.start > 0 else np.full_like(places, np.inf)
+    from_bottom = rows.stop - places if rows.stop < height else np.full_like(places, np.inf)
+    # Nothing from the outermost quarter of the overlap, where the strip's own border shows.
+    inset = np.minimum(from_top, from_bottom) - _STRIP_OVERLAP_PX / 2
+    return np.clip(inset / _STRIP_OVERLAP_PX, 1e-6, 1).astype(np.float32)
+
+
+def _right_disparity_at_match(
+    disparity_px: Float[np.ndarray, "h w"], right_disparity_px: Float[np.ndarray, "h w"]
+) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """The right view's disparity where each left pixel has its match, and whether that lies inside the image."""
+    height, width = disparity_px.shape
+    columns = np.arange(width, dtype=np.float32) - disparity_px
+    rows = np.broadcast_to(np.arange(height, dtype=np.float32)[:, None], columns.shape)
+    seen_px = cv2.remap(
+        right_disparity_px, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
+    )
+    return seen_px, (columns > -0.5) & (columns < width - 0.5)
+
+
+def _confidence(
+    logit: Float[np.ndarray, "h w"] | None, disagreement_px: Float[np.ndarray, "h w"]
+) -> Float[np.ndarray, "h w"]:
+    """The network's own probability; without one, what the two views' disagreement suggests."""
+    if logit is None:
+        return np.exp(-np.abs(disagreement_px))
+    return 1 / (1 + np.exp(-logit))
