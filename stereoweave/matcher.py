@@ -32,8 +32,8 @@ class Maps(NamedTuple):
     """What a graph gives for a pair, each float32 [H, W]; None where it has no such output."""
 
     disparity_px: np.ndarray
-    right_disparity_px: np.ndarray | None
-    confidence_logit: np.ndarray | None
+    right_disparity_px: np.ndarray | None = None
+    confidence_logit: np.ndarray | None = None
 
 
 class Matcher:
@@ -48,7 +48,7 @@ class Matcher:
     """
 
     def __init__(self, model: str | Path = "small", *, threads: int | None = None) -> None:
-        import onnxruntime
+        import onnxruntime  # type: ignore[import-untyped]
 
         if threads is not None and threads < 1:
             raise StereoweaveError(f"threads: expected 1 or more, got {threads}")
@@ -62,7 +62,9 @@ class Matcher:
             )
         except Exception as error:  # ONNX Runtime's errors have no common base class
             reason = str(error).splitlines()[0]
-            raise MatcherError(f"{path}: expected an ONNX matcher, found a file ONNX Runtime refuses: {reason}") from error
+            raise MatcherError(
+                f"{path}: expected an ONNX matcher, found a file ONNX Runtime refuses: {reason}"
+            ) from error
         self._outputs = [output.name for output in self._session.get_outputs()]
         self._check_interface(path)
         properties = self._session.get_modelmeta().custom_metadata_map
@@ -95,7 +97,7 @@ class Matcher:
         )
 
     def _maps(self, pair: StereoPair) -> Maps:
-        """The graph's outputs for a pair of any size: in strips of rows where it is large, blended where they overlap."""
+        """The graph's outputs for a pair: in strips of rows where it is large, blended where they overlap."""
         height, width = pair.left.shape[:2]
         strips = list(_strips(height, self._strip_rows(width)))
         if len(strips) == 1:
@@ -108,7 +110,7 @@ class Matcher:
             for name, values in self._run(pair.left[rows], pair.right[rows])._asdict().items():
                 if values is not None:
                     totals.setdefault(name, np.zeros((height, width), np.float32))[rows] += weight * values
-        return Maps(**{name: totals[name] / weights if name in totals else None for name in Maps._fields})
+        return Maps(**{name: total / weights for name, total in totals.items()})
 
     def _strip_rows(self, width: int) -> int:
         rows = _PIXEL_PAIRS_AT_ONCE // (width * width)
@@ -119,10 +121,10 @@ class Matcher:
         inputs = {"left": self._tensor(left), "right": self._tensor(right)}
         outputs = dict(zip(self._outputs, self._session.run(None, inputs), strict=True))
         cut = {name: np.ascontiguousarray(value[0, 0, :height, :width]) for name, value in outputs.items()}
-        return Maps(*(cut.get(name) for name in Maps._fields))
+        return Maps(**{name: value for name, value in cut.items() if name in Maps._fields})
 
     def _tensor(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "1 3 h2 w2"]:
-        """The image as the network takes it, its border repeated up to the size that the network can divide."""
+        """The image as the network takes it, its border repeated up to a size that it can divide."""
         below, beside = (-side % self.multiple_of for side in image.shape[:2])
         padded = cv2.copyMakeBorder(image, 0, below, 0, beside, cv2.BORDER_REPLICATE)
         return cv2.dnn.blobFromImage(padded, 1 / 255)
@@ -138,7 +140,8 @@ class Matcher:
         for key in ("name", "multiple_of", "max_disparity_px"):
             if f"stereoweave.{key}" not in properties:
                 raise MatcherError(
-                    f"{path}: expected a matcher's metadata, found no stereoweave.{key}; `stereoweave export` writes it"
+                    f"{path}: expected a matcher's metadata, found no stereoweave.{key}; "
+                    "`stereoweave export` writes it"
                 )
 
 
@@ -185,7 +188,8 @@ def _model_file(model: str | Path) -> Path:
         return path
     if str(model) not in shipped_models():
         raise MatcherError(
-            f"unknown model {str(model)!r}; expected {' or '.join(shipped_models())}, or the path of an .onnx file"
+            f"unknown model {str(model)!r}; expected {' or '.join(shipped_models())}, "
+            "or the path of an .onnx file"
         )
     return _weights_folder() / f"{model}.onnx"
 
@@ -198,7 +202,7 @@ def _usable_cores() -> int:
 
 
 def _strips(height: int, rows: int) -> Iterator[slice]:
-    """Row ranges of at most `rows` that cover `height` and overlap their neighbours; sizes differ by at most a row."""
+    """Row ranges of at most `rows` that cover `height` and overlap their neighbours, equal but for a row."""
     if height <= rows:
         yield slice(0, height)
         return
@@ -221,13 +225,11 @@ def _strip_weights(rows: slice, height: int) -> Float[np.ndarray, "h 1"]:
 def _right_disparity_at_match(
     disparity_px: Float[np.ndarray, "h w"], right_disparity_px: Float[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """The right view's disparity where each left pixel has its match, and whether that lies inside the image."""
+    """The right view's disparity where each left pixel has its match, and whether that is in the image."""
     height, width = disparity_px.shape
     columns = np.arange(width, dtype=np.float32) - disparity_px
     rows = np.broadcast_to(np.arange(height, dtype=np.float32)[:, None], columns.shape)
-    seen_px = cv2.remap(
-        right_disparity_px, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
-    )
+    seen_px = cv2.remap(right_disparity_px, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
     return seen_px, (columns > -0.5) & (columns < width - 0.5)
 
 

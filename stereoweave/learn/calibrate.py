@@ -1,5 +1,6 @@
 """The network's confidence made a probability, on pairs that it was not trained on."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from stereoweave.io import replacing
 from stereoweave.learn.collage import sample
 from stereoweave.learn.models.weave import WeaveNet
 from stereoweave.metrics import calibration_error
@@ -14,16 +16,16 @@ from stereoweave.stereo import Sample, StereoPair
 
 # Apart from the seeds of recipes and from that of validation.
 _FIT_SEED, _PROOF_SEED = 2_000_003, 3_000_017
-_PAIRS = 40
+_PAIRS = 24
 _SIZE = (320, 512)
 
 
 def calibrate(network: WeaveNet) -> dict[str, Any]:
-    """Scale and shift the network's confidence so that it comes true as often as it says; returns how often it does.
+    """How often the network's confidence comes true, after scaling and shifting it to come true as it says.
 
-    The scale and the shift (Platt 1999) are folded into the last layer. What is returned comes from other pairs
-    than they were fitted on: `calibration_error`, and per bin of confidence what was `claimed`, what `happened`,
-    and the `share` of pixels.
+    The scale and the shift (Platt 1999) are folded into the last layer. What is returned comes from other
+    pairs than they were fitted on: `calibration_error`, and per bin of confidence what was `claimed`, what
+    `happened`, and the `share` of pixels.
     """
     scale, shift = _fitted(*_claims(network, _FIT_SEED))
     last = network.refinement.confidence
@@ -57,15 +59,15 @@ def unseen_pair() -> StereoPair:
 
 
 def _claims(network: WeaveNet, seed: int) -> tuple[Tensor, Tensor]:
-    """Confidence logits, and whether the disparity was within 1 px, over every 7th pixel of fresh pairs."""
+    """Confidence logits, and whether the disparity was within 1 px, over every 29th pixel of fresh pairs."""
     logits, within = [], []
     for index in range(_PAIRS):
         made = sample(seed, 0, index, *_SIZE)
         with torch.no_grad():
             disparity_px, _, logit = network(_tensor(made, "left"), _tensor(made, "right"))
         error_px = (disparity_px[0, 0] - torch.from_numpy(made.disparity_px)).abs()
-        logits.append(logit.flatten()[::7])
-        within.append(error_px.flatten()[::7] <= 1)
+        logits.append(logit.flatten()[::29])
+        within.append(error_px.flatten()[::29] <= 1)
     return torch.cat(logits), torch.cat(within)
 
 
@@ -81,9 +83,28 @@ def _fitted(logits: Tensor, within: Tensor) -> tuple[float, float]:
     def loss() -> Tensor:
         optimiser.zero_grad()
         value = F.binary_cross_entropy_with_logits(logits * parameters[0] + parameters[1], within.float())
-        value.backward()
+        value.backward()  # type: ignore[no-untyped-call]
         return value
 
-    optimiser.step(loss)
+    optimiser.step(loss)  # type: ignore[no-untyped-call]
     scale, shift = parameters.tolist()
     return scale, shift
+
+
+def draw_reliability(reliability: dict[str, Any], picture: Path) -> None:
+    """Write a plot of what was claimed against what happened, with the share of pixels below it."""
+    from matplotlib.figure import Figure
+
+    bins = reliability["bins"]
+    claimed, happened, share = ([row[key] for row in bins] for key in ("claimed", "happened", "share"))
+    figure = Figure(figsize=(4.5, 5.5), layout="constrained")
+    above, below = figure.subplots(2, 1, height_ratios=(3, 1), sharex=True)
+    above.plot([0, 1], [0, 1], color="0.7", linestyle="--", label="as claimed")
+    above.plot(claimed, happened, marker="o", label="as it happened")
+    above.set(ylabel="share within 1 px", xlim=(0, 1), ylim=(0, 1), aspect="equal")
+    above.set_title(f"expected calibration error {reliability['calibration_error']:.3f}")
+    above.legend(loc="upper left", frameon=False)
+    below.bar(claimed, share, width=0.07, color="0.6")
+    below.set(xlabel="confidence", ylabel="share of pixels")
+    with replacing(picture) as temporary:
+        figure.savefig(temporary, dpi=120)

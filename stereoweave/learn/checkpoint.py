@@ -2,7 +2,7 @@
 
 import os
 import subprocess
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -54,17 +54,22 @@ def load(path: Path) -> Checkpoint:
     """The checkpoint of a file, on the CPU; FormatError if it is none."""
     try:
         values = torch.load(path, map_location="cpu", weights_only=True)
-        return Checkpoint(**{**values, "recipe": recipe_from(values["recipe"], str(path))})
     except FileNotFoundError as error:
-        raise FormatError(f"{path}: no such checkpoint; `stereoweave train` writes last.pt into its run") from error
-    except (KeyError, TypeError, RuntimeError, OSError, EOFError, ValueError) as error:
-        if isinstance(error, FormatError):
-            raise
-        raise FormatError(f"{path}: expected a checkpoint of `stereoweave train`, found: {error}") from error
+        raise FormatError(
+            f"{path}: no such checkpoint; `stereoweave train` writes last.pt into its run"
+        ) from error
+    except Exception as error:  # other bytes lead PyTorch's reader to any error whatever
+        found = str(error).partition("\n")[0]
+        raise FormatError(f"{path}: expected a checkpoint of `stereoweave train`, found: {found}") from error
+    if not isinstance(values, dict) or values.keys() != {field.name for field in fields(Checkpoint)}:
+        raise FormatError(
+            f"{path}: expected a checkpoint of `stereoweave train`, found something else that PyTorch saved"
+        )
+    return Checkpoint(**{**values, "recipe": recipe_from(values["recipe"], str(path))})
 
 
 def code_commit() -> str:
-    """The commit of the code that runs, '+' behind it where files were changed since; 'unknown' outside git."""
+    """The commit of the code that runs, '+' behind it where files were changed; 'unknown' outside git."""
     here = Path(__file__).parent
     try:
         described = subprocess.run(

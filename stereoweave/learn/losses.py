@@ -44,7 +44,9 @@ def level_cross_entropy(
     return -mean_over(low + (truth - below) * (high - low), known)
 
 
-def regression(estimate_px: Float[Tensor, "b 1 h w"], truth_px: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
+def regression(
+    estimate_px: Float[Tensor, "b 1 h w"], truth_px: Float[Tensor, "b 1 h w"]
+) -> Float[Tensor, ""]:
     """Mean absolute error, rounded below half a pixel."""
     known = truth_px.isfinite()
     # Unknown truth is replaced before it meets the estimate: NaN times a mask is NaN, in the gradient too.
@@ -53,7 +55,9 @@ def regression(estimate_px: Float[Tensor, "b 1 h w"], truth_px: Float[Tensor, "b
 
 
 def confidence_loss(
-    logit: Float[Tensor, "b 1 h w"], disparity_px: Float[Tensor, "b 1 h w"], truth_px: Float[Tensor, "b 1 h w"]
+    logit: Float[Tensor, "b 1 h w"],
+    disparity_px: Float[Tensor, "b 1 h w"],
+    truth_px: Float[Tensor, "b 1 h w"],
 ) -> Float[Tensor, ""]:
     """Cross-entropy of the claim that the disparity is within 1 px."""
     within = (disparity_px.detach() - truth_px).abs() <= 1

@@ -6,13 +6,14 @@ from collections.abc import Iterable
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from stereoweave.learn.collage import sample as make_sample
 from stereoweave.stereo import Sample
 
-# Disparity is kept as 16-bit fixed point, KITTI's 1/256 px: half the bytes of float32, and as exact as needed.
+# Disparity is kept as 16-bit fixed point, KITTI's 1/256 px: half the bytes of float32, and exact enough.
 _DISPARITY_SCALE = 256
 
 
@@ -34,6 +35,15 @@ class KeptPairs:
         with multiprocessing.get_context("spawn").Pool(os.cpu_count()) as workers:
             yield from workers.imap_unordered(partial(_make, self), self.missing(), chunksize=8)
 
+    def keep(self, index: int, sample: Sample) -> None:
+        """Write a pair whole or not at all."""
+        file = self._file(index)
+        temporary = file.with_suffix(".part")
+        arrays: dict[str, Any] = {name: _packed(value) for name, value in vars(sample).items()}
+        with temporary.open("wb") as stream:
+            np.savez(stream, **arrays)
+        temporary.replace(file)
+
     def __getitem__(self, index: int) -> Sample:
         with np.load(self._file(index)) as arrays:
             return Sample(**{field.name: _unpacked(arrays[field.name]) for field in fields(Sample)})
@@ -43,12 +53,7 @@ class KeptPairs:
 
 
 def _make(pairs: KeptPairs, index: int) -> int:
-    sample = make_sample(pairs.seed, 0, index, *pairs.size)
-    file = pairs._file(index)
-    temporary = file.with_suffix(".part")
-    with temporary.open("wb") as stream:
-        np.savez(stream, **{name: _packed(value) for name, value in vars(sample).items()})
-    temporary.replace(file)
+    pairs.keep(index, make_sample(pairs.seed, 0, index, *pairs.size))
     return index
 
 

@@ -1,11 +1,13 @@
 """A recipe: everything that a training run depends on, in one TOML file."""
 
 import tomllib
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from stereoweave.errors import FormatError
+
+_KINDS: dict[object, str] = {int: "a whole number", float: "a number", str: "a text in quotes"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,12 +67,13 @@ def recipe_from(values: dict[str, Any], source: str) -> Recipe:
         raise FormatError(f"{source}: unknown key {unknown[0]!r}; a recipe has {', '.join(known)}")
     for name, value in values.items():
         if not _fits(value, known[name]):
-            raise FormatError(f"{source}: {name} = {value!r}, expected {known[name]}")
-    try:
-        return Recipe(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
-    except TypeError as error:
-        missing = str(error).rpartition("argument")[2].lstrip("s: ")
-        raise FormatError(f"{source}: missing {missing}") from error
+            kind = _KINDS.get(known[name], "two whole numbers")
+            raise FormatError(f"{source}: {name} = {value!r}, expected {kind}")
+    needed = [field.name for field in fields(Recipe) if field.default is MISSING]
+    if missing := [name for name in needed if name not in values]:
+        raise FormatError(f"{source}: missing key {missing[0]!r}; a recipe needs {', '.join(needed)}")
+    settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    return Recipe(**settings)
 
 
 def _fits(value: object, expected: Any) -> bool:

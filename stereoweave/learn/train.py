@@ -1,21 +1,23 @@
-"""Training: one loop from a recipe to a network, that may be killed at any moment and goes on where it was."""
+"""Training: one loop from a recipe to a network; killed at any moment, it goes on where it was."""
 
 import ctypes
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 from lightning_fabric import Fabric
-from lightning_fabric.loggers import TensorBoardLogger
+from lightning_fabric.loggers.tensorboard import TensorBoardLogger
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader, Dataset
 
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.learn import checkpoint
 from stereoweave.learn.augment import augment
 from stereoweave.learn.checkpoint import Checkpoint
@@ -54,7 +56,7 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
 
 
 def collated(samples: list[Sample]) -> dict[str, torch.Tensor]:
-    """Samples as tensors: images [B, 3, H, W] in 0..1, maps [2B, 1, H, W], the right views' mirrored behind the left's."""
+    """Images [B, 3, H, W] in 0..1; maps [2B, 1, H, W], of the left views, then of the right ones mirrored."""
 
     def images(side: str) -> torch.Tensor:
         stacked = np.stack([getattr(sample, side) for sample in samples])
@@ -74,12 +76,15 @@ def collated(samples: list[Sample]) -> dict[str, torch.Tensor]:
 
 
 def train(recipe_path: Path, out: Path, console: Console | None = None) -> Path:
-    """Train the network of a recipe in folder `out`, or go on training there; returns the last checkpoint's path.
+    """Train the network of a recipe in folder `out`, or go on there; returns the last checkpoint's path.
 
     Raises:
-        StereoweaveError: where `out` holds the run of another recipe, or the loss is no longer finite.
+        StereoweaveError: for a recipe that is none, where `out` holds the run of another one, or where the
+            loss is no longer finite.
     """
     recipe = read_recipe(recipe_path)
+    if recipe.model not in MODELS:
+        raise FormatError(f"{recipe_path}: model = {recipe.model!r}, expected {' or '.join(MODELS)}")
     last = out / "last.pt"
     start = _starting_point(recipe, last)
     console = console or Console()
@@ -113,19 +118,17 @@ class Run:
         network = MODELS[recipe.model]()
         network.load_state_dict(start.weights)
         # What bfloat16 convolutions on the CPU are fast in: three times the other layout.
-        network = network.to(memory_format=torch.channels_last)
+        network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         optimiser = torch.optim.AdamW(
             network.parameters(), recipe.learning_rate, weight_decay=recipe.weight_decay, fused=True
         )
-        self.averaged = AveragedModel(
-            network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / _AVERAGED_STEPS), use_buffers=True
-        )
+        self.averaged = AveragedModel(network, multi_avg_fn=_move_average, use_buffers=True)
         self.averaged.module.load_state_dict(start.averaged)
-        self.averaged.n_averaged += 1
-        if start.optimiser:
-            optimiser.load_state_dict(start.optimiser)
+        self.averaged.n_averaged.fill_(start.step)
         self.network, self.optimiser = self.fabric.setup(network, optimiser)
-        self.network.mark_forward_method("stages")
+        if start.optimiser:
+            # Only now, because its state goes to where the weights are.
+            self.optimiser.load_state_dict(start.optimiser)
         self.averaged.to(self.fabric.device)
         torch.set_rng_state(start.random_state)
         self.began = time.monotonic()
@@ -136,13 +139,15 @@ class Run:
         for group in self.optimiser.param_groups:
             group["lr"] = self.recipe.learning_rate_at(step)
         self.network.train()
-        stages = self.network.stages(batch["left"], batch["right"])
+        with self.fabric.autocast():
+            stages = self.network.module.stages(batch["left"], batch["right"])
         losses = weave_losses(stages, batch["disparity_px"], batch["occluded"])
         loss = torch.stack(list(losses.values())).sum()
         value = float(loss.detach())
         if not np.isfinite(value):
             raise StereoweaveError(
-                f"step {step}: the loss is {value}; its pairs are {batches.chosen(step)} of seed {self.recipe.seed}"
+                f"step {step}: the loss is {value}; its pairs are {batches.chosen(step)} "
+                f"of seed {self.recipe.seed}"
             )
         self.optimiser.zero_grad()
         self.fabric.backward(loss)
@@ -176,7 +181,8 @@ def _starting_point(recipe: Recipe, last: Path) -> Checkpoint:
         found = checkpoint.load(last)
         if found.recipe != recipe:
             raise StereoweaveError(
-                f"{last}: is of another recipe ({found.recipe.name}); train into a folder of its own, or remove it"
+                f"{last}: is of another recipe ({found.recipe.name}); "
+                "train into a folder of its own, or remove it"
             )
         return replace(found, commit=checkpoint.code_commit())
     torch.manual_seed(recipe.seed)
@@ -212,14 +218,21 @@ def _numbered_batches(batches: Batches, first: int) -> Iterator[tuple[int, dict[
     """(step, its batch) from step `first` to the last, cut and recoloured in a process beside."""
     steps = range(first, batches.recipe.steps)
     loader = DataLoader(
-        batches, sampler=steps, batch_size=None, num_workers=1, prefetch_factor=4, multiprocessing_context="spawn"
+        batches,
+        sampler=steps,
+        batch_size=None,
+        num_workers=1,
+        prefetch_factor=4,
+        multiprocessing_context="spawn",
+        # Its own, because a loader draws a number when it starts, and a restart would draw once more.
+        generator=torch.Generator(),
     )
     return zip(steps, loader, strict=True)
 
 
 def _keep_freed_memory() -> None:
-    """Have glibc keep large blocks that are freed: fetching them anew from the kernel took two thirds of a step."""
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # glibc alone has it
+    """Have glibc keep large blocks that are freed: getting them anew from the kernel took 2/3 of a step."""
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:
         m_trim_threshold, m_top_pad, m_mmap_max = -1, -2, -4
         mallopt(m_mmap_max, 0)
@@ -227,7 +240,20 @@ def _keep_freed_memory() -> None:
         mallopt(m_top_pad, 2**28)
 
 
-def _precision() -> str:
+@torch.no_grad()
+def _move_average(
+    averaged: Sequence[torch.Tensor], current: Sequence[torch.Tensor], steps: torch.Tensor | int
+) -> None:
+    """Move the average towards the current weights: fast at first, so that random ones are soon forgotten."""
+    share = max(1 / _AVERAGED_STEPS, 9 / (9 + float(steps)))
+    for average, value in zip(averaged, current, strict=True):
+        if average.is_floating_point():
+            average.lerp_(value.to(average), share)
+        else:
+            average.copy_(value)
+
+
+def _precision() -> Literal["bf16-mixed", "32-true"]:
     """bfloat16 where the device computes in it, float32 elsewhere."""
     if torch.cuda.is_available():
         return "bf16-mixed" if torch.cuda.is_bf16_supported() else "32-true"

@@ -2,14 +2,14 @@
 
 import numpy as np
 import torch
+from torch import nn
 
 from stereoweave import metrics
-from stereoweave.learn.models.weave import WeaveNet
 from stereoweave.learn.pairs import KeptPairs
 
 
 @torch.no_grad()
-def validate(network: WeaveNet, pairs: KeptPairs, device: torch.device) -> dict[str, float]:
+def validate(network: nn.Module, pairs: KeptPairs, device: torch.device) -> dict[str, float]:
     """Mean scores over the left views of kept pairs, occluded pixels included."""
     network.eval()
     rows, confidences, truths = [], [], []

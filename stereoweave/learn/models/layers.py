@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 
 class ConvBlock(nn.Sequential):
-    """Convolution, batch norm, ReLU; stride 2 halves the size exactly, and symmetrically under mirroring."""
+    """Convolution, batch norm, ReLU, at the resolution of the input."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 3, dilation: int = 1) -> None:
         super().__init__(
@@ -89,16 +89,16 @@ def correlation_volume(
     width = first.shape[3]
     products = first.permute(0, 2, 3, 1) @ mirrored(second).permute(0, 2, 1, 3)
     padded = F.pad(products, (0, levels))
-    skewed = padded.flatten(2)[..., width - 1 : -1].unflatten(2, (width, width + levels - 1))
+    skewed = torch.unflatten(padded.flatten(2)[..., width - 1 : -1], 2, (width, width + levels - 1))
     return skewed[..., :levels].permute(0, 3, 1, 2)
 
 
 def local_soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
     """Expected level under a softmax over the surroundings of the best level.
 
-    The window keeps a second, far-off candidate from pulling the mean off the surface. First it reaches 2 levels
-    to each side of the best one; then it moves to the mean found there, fading out over 3 levels, so that the
-    result hardly jumps where rounding decides which of two levels is the best.
+    The window keeps a second, far-off candidate from pulling the mean off the surface. First it reaches 2
+    levels to each side of the best one; then it moves to the mean found there, fading out over 3 levels, so
+    that the result hardly jumps where rounding decides which of two levels is the best.
     """
     best = logits.detach().argmax(1, keepdim=True)
     reach = 3
@@ -107,7 +107,8 @@ def local_soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h 
     padded = F.pad(logits, (0, 0, 0, 0, reach, reach), value=-1e4)
     around = padded.gather(1, best + steps + reach)
     centre = expected_step(around[:, 1:-1]).detach()
-    weights = (around - around.amax(1, keepdim=True)).exp() * (1 - (steps - centre).abs() / reach).clamp(min=0)
+    fade = (1 - (steps - centre).abs() / reach).clamp(min=0)
+    weights = (around - around.amax(1, keepdim=True)).exp() * fade
     return best + (weights * steps).sum(1, keepdim=True) / weights.sum(1, keepdim=True)
 
 
@@ -155,7 +156,7 @@ def upsample_convex(
     `weights` are logits, [B, 9 * 4, H, W]: nine neighbours for each of the four new pixels. A mixture can put
     an edge anywhere between two old pixels without inventing values between its two sides.
 
-    Deviation: shares of sigmoids, where RAFT takes a softmax, which costs ONNX Runtime more than all convolutions.
+    Deviation: shares of sigmoids; RAFT's softmax costs ONNX Runtime more than all convolutions.
     """
     batch, _, height, width = x.shape
     around = F.pad(x, (1, 1, 1, 1), mode="replicate")
