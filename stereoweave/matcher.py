@@ -52,7 +52,7 @@ class Matcher:
 
         if threads is not None and threads < 1:
             raise StereoweaveError(f"threads: expected 1 or more, got {threads}")
-        path = _model_file(model)
+        self._path = path = _model_file(model)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads or _usable_cores()
         options.log_severity_level = 4  # what is wrong with a file is said once, by the error below
@@ -120,6 +120,9 @@ class Matcher:
         height, width = left.shape[:2]
         inputs = {"left": self._tensor(left), "right": self._tensor(right)}
         outputs = dict(zip(self._outputs, self._session.run(None, inputs), strict=True))
+        for name, value in outputs.items():
+            if not np.isfinite(value).all():
+                raise MatcherError(f"{self._path}: expected finite values of {name}, found NaN or infinite ones")
         cut = {name: np.ascontiguousarray(value[0, 0, :height, :width]) for name, value in outputs.items()}
         return Maps(**{name: value for name, value in cut.items() if name in Maps._fields})
 

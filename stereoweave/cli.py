@@ -1,0 +1,272 @@
+"""The commands: stereoweave depth | view | bench | train | export."""
+
+import json
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from stereoweave import __version__
+from stereoweave.errors import StereoweaveError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from stereoweave.benchmark import Row
+    from stereoweave.matcher import Matcher
+    from stereoweave.report import Summary
+    from stereoweave.stereo import Estimate, StereoPair
+
+FILES = ("disparity.pfm", "disparity.png", "depth.png", "preview.png", "confidence.png", "report.html")
+
+Pictures = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="PICTURE",
+        help="LEFT RIGHT, rectified and of one size; or one picture with both side by side.",
+    ),
+]
+Model = Annotated[str, typer.Option(help="The name of a shipped network, or an .onnx file.")]
+Threads = Annotated[int | None, typer.Option(min=1, help="Processor threads; as many as cores unless given.")]
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+bench = typer.Typer(help="Score matchers side by side.")
+app.add_typer(bench, name="bench")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """0 where the command line went well; 2 after a mistake of the caller's, told in one line on stderr."""
+    try:
+        return app(arguments, prog_name="stereoweave", standalone_mode=False) or 0
+    except typer.TyperException as error:
+        message = error.format_message().rstrip(".") + "; see stereoweave --help"
+    except (ValueError, OSError) as error:
+        message = str(error)
+    typer.echo("stereoweave: " + " ".join(message.splitlines()), err=True)
+    return 2
+
+
+def _show_version(wanted: bool) -> bool:
+    if wanted:
+        typer.echo(f"stereoweave {__version__}")
+        raise typer.Exit
+    return wanted
+
+
+@app.callback()
+def _stereoweave(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit."),
+    ] = False,
+) -> None:
+    """Depth, and any view between the two cameras, from a rectified stereo pair."""
+
+
+@app.command()
+def depth(  # noqa: PLR0913 - each is a word of the command line
+    pictures: Pictures,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The folder to write the results into.")],
+    calib: Annotated[Path | None, typer.Option(help="Middlebury's calib.txt, for depth in metres.")] = None,
+    model: Model = "small",
+    threads: Threads = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+) -> None:
+    """Depth of a stereo pair: maps, pictures of them, and a report to open in a browser."""
+    from stereoweave.report import summarize, write_report
+
+    pair = _read(pictures, calib)
+    matcher = _matcher(model, threads)
+    with _results_in(out) as folder:
+        start_s = time.perf_counter()
+        estimate = matcher.estimate(pair.left, pair.right)
+        estimate_ms = 1000 * (time.perf_counter() - start_s)
+        names = tuple(picture.name for picture in pictures)
+        summary = summarize(pair, estimate, pictures=names, model=model, estimate_ms=estimate_ms)
+        notes = _write_maps(folder, pair, estimate, summary)
+        write_report(folder / "report.html", pair, estimate, summary)
+    (_tell_json if as_json else _tell)(summary, notes, out)
+
+
+@app.command()
+def view(  # noqa: PLR0913 - each is a word of the command line
+    pictures: Pictures,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The picture to write.")],
+    position: Annotated[
+        float, typer.Option(help="The viewpoint: 0 is the left camera, 1 the right; -0.5 to 1.5.")
+    ] = 0.5,
+    model: Model = "small",
+    threads: Threads = None,
+) -> None:
+    """A new view of a stereo pair, from between its two cameras or a little beyond them."""
+    from stereoweave.io import write_image
+    from stereoweave.render import render
+
+    pair = _read(pictures)
+    estimate = _matcher(model, threads).estimate(pair.left, pair.right)
+    new = render(pair.left, pair.right, estimate, position=position)
+    write_image(out, new.image)
+    typer.echo(f"{out}: view at {position:g}, {100 * (~new.drawn).mean():.1f} % of it seen by neither camera")
+
+
+@bench.command()
+def pairs(
+    folder: Annotated[
+        Path, typer.Argument(help="Holds a folder a scene: left.png, right.png, disparity.png.")
+    ],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="A CSV file for the rows.")] = None,
+    model: Annotated[list[str] | None, typer.Option(help="As for depth; may be given again.")] = None,
+    threads: Threads = None,
+) -> None:
+    """Accuracy and time of networks and of OpenCV's SGBM on pairs with known disparity."""
+    from stereoweave.benchmark import score_pairs, write_csv
+    from stereoweave.data.readers import read_scenes
+    from stereoweave.io import make_folder
+
+    scenes = read_scenes(folder)
+    matchers = {name: _disparity_by(_matcher(name, threads)) for name in model or ["small"]}
+    if out:
+        make_folder(out.parent)
+    rows = score_pairs(matchers, scenes)
+    if out:
+        write_csv(out, rows)
+    _tell_rows([row for row in rows if row.scene == "mean"])
+
+
+@app.command()
+def train(
+    recipe: Annotated[Path, typer.Argument(help="A TOML file, such as recipes/weave_small.toml.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The folder of the run.")],
+) -> None:
+    """Train the network of a recipe; a run that was stopped continues where it was."""
+    with _needing_the_train_extra():
+        from stereoweave.learn.train import train as train_recipe
+    train_recipe(recipe, out)
+
+
+@app.command()
+def export(
+    run: Annotated[Path, typer.Argument(help="The folder of a run, or a checkpoint in it.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The .onnx file to write.")],
+) -> None:
+    """Turn a trained network into a file that --model takes, and prove that both agree."""
+    with _needing_the_train_extra():
+        from stereoweave.learn.export import export as export_run
+    export_run(run, out)
+
+
+def _read(pictures: list[Path], calib: Path | None = None) -> "StereoPair":
+    from stereoweave.io import calibrated, read_pair, read_side_by_side
+
+    match pictures:
+        case [left, right]:
+            pair = read_pair(left, right)
+        case [both]:
+            pair = read_side_by_side(both)
+        case _:
+            names = " ".join(map(str, pictures))
+            raise StereoweaveError(
+                f"expected LEFT RIGHT or SIDE_BY_SIDE, one or two pictures, found {len(pictures)}: {names}"
+            )
+    return calibrated(pair, calib) if calib else pair
+
+
+def _matcher(model: str, threads: int | None) -> "Matcher":
+    from stereoweave.matcher import Matcher
+
+    return Matcher(model, threads=threads)
+
+
+def _disparity_by(matcher: "Matcher") -> "Callable[[StereoPair], np.ndarray]":
+    return lambda pair: matcher.estimate(pair.left, pair.right).disparity_px
+
+
+@contextmanager
+def _results_in(out: Path) -> Iterator[Path]:
+    """A temporary folder, whose files move into `out` in the end; after an error nothing of either is left.
+
+    Files of an earlier result that this one does not have are removed, so that all in `out` belong together.
+    """
+    from stereoweave.io import make_folder
+
+    standing = make_folder(next(path for path in (out, *out.parents) if path.exists()))
+    with tempfile.TemporaryDirectory(prefix=".stereoweave-", dir=standing) as name:
+        yield Path(name)
+        out.mkdir(parents=True, exist_ok=True)
+        for file in FILES:
+            fresh = Path(name, file)
+            fresh.replace(out / file) if fresh.exists() else (out / file).unlink(missing_ok=True)
+
+
+def _write_maps(folder: Path, pair: "StereoPair", estimate: "Estimate", summary: "Summary") -> list[str]:
+    """Writes every map and picture; the lines that say which of them could not be, and why."""
+    from stereoweave.colour import colour_disparity, colour_range_px, grey_confidence
+    from stereoweave.io import RangeError, write_depth_png, write_disparity_png, write_image, write_pfm
+
+    notes = []
+    write_pfm(folder / "disparity.pfm", estimate.disparity_px)
+    try:
+        write_disparity_png(folder / "disparity.png", estimate.disparity_px)
+    except RangeError:
+        notes.append(
+            "no disparity.png: it holds 0 to 255.99 px, found "
+            f"{summary.disparity_min_px:.2f} to {summary.disparity_max_px:.2f} px; disparity.pfm has them"
+        )
+    if pair.camera:
+        write_depth_png(folder / "depth.png", pair.camera.depth_m(estimate.disparity_px))
+    preview = colour_disparity(estimate.disparity_px, colour_range_px(estimate.disparity_px))
+    write_image(folder / "preview.png", preview)
+    write_image(folder / "confidence.png", grey_confidence(estimate.confidence))
+    return notes
+
+
+def _tell_json(summary: "Summary", notes: list[str], out: Path) -> None:
+    files = {file: str(out / file) for file in FILES if (out / file).exists()}
+    typer.echo(json.dumps(asdict(summary) | {"notes": notes, "files": files}, indent=2, allow_nan=False))
+
+
+def _tell(summary: "Summary", notes: list[str], out: Path) -> None:
+    size = f"{summary.width_px}x{summary.height_px} px"
+    typer.echo(
+        f"{' + '.join(summary.pictures)}: {size}, matched by {summary.model} in {summary.estimate_ms:.0f} ms"
+    )
+    typer.echo(f"disparity {summary.disparity_min_px:.1f} to {summary.disparity_max_px:.1f} px")
+    for note in notes:
+        typer.echo(note)
+    typer.echo(f"report: {out / 'report.html'}")
+
+
+def _tell_rows(rows: "list[Row]") -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(
+        "matcher", "EPE px", "bad-1 %", "bad-2 %", "D1 %", "ms", "x SGBM", title="Mean over the scenes"
+    )
+    for row in rows:
+        numbers = (
+            row.epe_px,
+            row.bad1_percent,
+            row.bad2_percent,
+            row.d1_percent,
+            row.time_ms,
+            row.time_relative,
+        )
+        table.add_row(row.matcher, *(f"{number:.2f}" for number in numbers))
+    Console().print(table)
+
+
+@contextmanager
+def _needing_the_train_extra() -> Iterator[None]:
+    try:
+        yield
+    except ModuleNotFoundError as missing:
+        raise StereoweaveError(
+            f"this command needs PyTorch and its company, found no module {missing.name}; "
+            "pip install 'stereoweave[train]'"
+        ) from missing

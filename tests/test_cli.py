@@ -1,0 +1,272 @@
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper
+from PIL import Image
+
+import stereoweave
+from stereoweave.cli import main
+from stereoweave.io import read_image, read_pfm
+
+CALIBRATION = "cam0=[100 0 48; 0 100 32; 0 0 1]\ndoffs=0\nbaseline=80\nwidth=96\nheight=64\n"
+
+
+def run(line: str) -> int:
+    return main(line.split())
+
+
+def save_matcher(path: Path, disparity_px: float) -> None:
+    """A matcher file that finds one disparity wherever it looks."""
+    image = ["batch", 3, "height", "width"]
+    constants = {"zero": 0.0, "disparity": disparity_px}
+    graph = helper.make_graph(
+        [
+            helper.make_node("ReduceMean", ["left"], ["grey"], axes=[1], keepdims=1),
+            helper.make_node("Mul", ["grey", "zero"], ["zeros"]),
+            helper.make_node("Add", ["zeros", "disparity"], ["disparity_px"]),
+        ],
+        "constant",
+        [helper.make_tensor_value_info(side, TensorProto.FLOAT, image) for side in ("left", "right")],
+        [helper.make_tensor_value_info("disparity_px", TensorProto.FLOAT, ["batch", 1, "height", "width"])],
+        [helper.make_tensor(name, TensorProto.FLOAT, [], [value]) for name, value in constants.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    facts = {"name": "constant", "multiple_of": "1", "max_disparity_px": "192", "recipe": "", "commit": ""}
+    helper.set_model_props(model, {f"stereoweave.{key}": value for key, value in facts.items()})
+    onnx.save(model, path)
+
+
+def save_identity(path: Path) -> None:
+    """An ONNX file that is in order, and not a matcher."""
+    x, y = (helper.make_tensor_value_info(name, TensorProto.FLOAT, [1]) for name in "xy")
+    graph = helper.make_graph([helper.make_node("Identity", ["x"], ["y"])], "identity", [x], [y])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), path)
+
+
+def truncate(source: Path, target: Path) -> None:
+    target.write_bytes(source.read_bytes()[: source.stat().st_size // 2])
+
+
+@pytest.fixture
+def pictures(rng, tmp_path, monkeypatch) -> Path:
+    """The folder that the command runs in: a pair of 96x64 and its calibration."""
+    monkeypatch.chdir(tmp_path)
+    photograph = Image.fromarray(rng.integers(0, 256, (8, 13, 3), dtype=np.uint8)).resize((104, 64))
+    left, right = photograph.crop((0, 0, 96, 64)), photograph.crop((8, 0, 104, 64))
+    left.save("left.png")
+    right.save("right.png")
+    Image.fromarray(np.hstack([left, right])).save("both.png")
+    Path("calib.txt").write_text(CALIBRATION)
+    return tmp_path
+
+
+@pytest.fixture
+def mistakes(pictures) -> Path:
+    """The same folder with all that can be wrong beside it."""
+    left = Image.open("left.png")
+    left.save("left.jpg")
+    left.crop((0, 0, 80, 64)).save("narrow.png")
+    left.crop((0, 0, 31, 64)).save("tiny.png")
+    left.crop((0, 0, 95, 64)).save("odd.png")
+    truncate(Path("left.png"), Path("half.png"))
+    truncate(Path("left.jpg"), Path("half.jpg"))
+    truncate(Path("calib.txt"), Path("half.txt"))
+    Path("words.png").write_text("these are words")
+    Path("words.onnx").write_text("these are words")
+    Path("folder").mkdir()
+    Path("wrong.txt").write_text(CALIBRATION.replace("width=96", "width=960"))
+    save_identity(Path("identity.onnx"))
+    save_matcher(Path("nan.onnx"), float("nan"))
+    return pictures
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fragments"),
+    [
+        ("depth none.png right.png -o out", ["none.png", "no such file"]),
+        ("view left.png none.png -o out.png", ["none.png", "no such file"]),
+        ("depth folder right.png -o out", ["folder", "expected a picture"]),
+        ("depth words.png right.png -o out", ["words.png", "expected a picture"]),
+        ("depth half.png right.png -o out", ["half.png", "expected a picture", "truncated"]),
+        ("depth left.png half.jpg -o out", ["half.jpg", "expected a picture", "truncated"]),
+        ("depth left.png narrow.png -o out", ["left.png of 96x64", "narrow.png of 80x64", "one size"]),
+        ("depth tiny.png tiny.png -o out", ["tiny.png", "at least 32x32", "found 31x64"]),
+        ("depth odd.png -o out", ["odd.png", "side by side", "found 95x64"]),
+        ("depth left.png right.png both.png -o out", ["LEFT RIGHT or SIDE_BY_SIDE", "found 3", "both.png"]),
+        ("view left.png right.png both.png left.png -o out.png", ["LEFT RIGHT or SIDE_BY_SIDE", "found 4"]),
+        ("depth left.png right.png --calib half.txt -o out", ["half.txt", "expected a Middlebury calib.txt"]),
+        ("depth left.png right.png --calib none.txt -o out", ["none.txt", "no such file"]),
+        ("depth left.png right.png --calib wrong.txt -o out", ["wrong.txt", "96x64", "960x64"]),
+        ("depth left.png right.png -o calib.txt/out", ["calib.txt", "expected a folder", "found a file"]),
+        ("depth left.png right.png -o calib.txt", ["calib.txt", "expected a folder", "found a file"]),
+        ("view left.png right.png -o calib.txt/out.png", ["calib.txt", "expected a folder", "found a file"]),
+        ("view left.png right.png -o out.words", ["out.words", "expected the ending of a picture"]),
+        ("view left.png right.png -o folder", ["folder", "expected"]),
+        ("view left.png right.png --position 7 -o out.png", ["position", "-0.5", "1.5", "7"]),
+        ("view left.png right.png --position nan -o out.png", ["position", "-0.5", "1.5", "nan"]),
+        ("depth left.png right.png --model large -o out", ["large", "small"]),
+        ("depth left.png right.png --model none.onnx -o out", ["none.onnx", "no such file"]),
+        (
+            "depth left.png right.png --model identity.onnx -o out",
+            ["identity.onnx", "expected", "left", "found"],
+        ),
+        ("depth left.png right.png --model words.onnx -o out", ["words.onnx", "expected"]),
+        ("view left.png right.png --model nan.onnx -o out.png", ["nan.onnx", "disparity_px", "expected finite", "NaN"]),
+        ("depth left.png right.png --model nan.onnx -o out", ["nan.onnx", "disparity_px", "expected finite", "NaN"]),
+        ("depth left.png right.png --threads 0 -o out", ["--threads"]),
+        ("depth left.png right.png", ["--out"]),
+        ("bench pairs folder -o out.csv", ["folder", "left.png"]),
+        ("train none.toml -o out", ["none.toml"]),
+        ("export folder -o out.onnx", ["folder"]),
+        ("dept left.png right.png -o out", ["dept", "depth"]),
+    ],
+)
+def test_a_mistake_is_told_in_one_line_and_leaves_nothing_behind(mistakes, capfd, arguments, fragments):
+    before = sorted(mistakes.rglob("*"))
+    assert run(arguments) == 2
+    printed, told = capfd.readouterr()
+    assert printed == ""
+    (line,) = told.splitlines()
+    assert line.startswith("stereoweave: ")
+    assert [fragment for fragment in fragments if fragment not in line] == []
+    assert sorted(mistakes.rglob("*")) == before
+
+
+def test_the_installed_command_tells_a_mistake_in_one_line(mistakes):
+    command = [Path(sys.executable).with_name("stereoweave"), "depth", "half.png", "right.png", "-o", "out"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert len(done.stderr.splitlines()) == 1
+    assert "half.png" in done.stderr
+
+
+@pytest.mark.parametrize("kind", ["grey", "grey of 16 bits", "RGBA"])
+def test_pictures_of_other_kinds_work(pictures, kind):
+    left = Image.open("left.png")
+    if kind == "grey of 16 bits":
+        left = Image.fromarray(np.asarray(left.convert("L")).astype(np.uint16) * 257)
+    else:
+        left = left.convert({"grey": "L", "RGBA": "RGBA"}[kind])
+    left.save("other.png")
+    assert run("view other.png other.png -o view.png") == 0
+    assert read_image("view.png").shape == (64, 96, 3)
+
+
+def test_depth_writes_what_the_matcher_finds(pictures):
+    assert run("depth left.png right.png --calib calib.txt -o new/out") == 0
+    names = ["confidence.png", "depth.png", "disparity.pfm", "disparity.png", "preview.png", "report.html"]
+    assert sorted(file.name for file in Path("new/out").iterdir()) == names
+    estimate = stereoweave.estimate(read_image("left.png"), read_image("right.png"))
+    disparity_px = read_pfm("new/out/disparity.pfm")
+    np.testing.assert_array_equal(disparity_px, estimate.disparity_px)
+    np.testing.assert_allclose(
+        np.asarray(Image.open("new/out/disparity.png")) / 256, disparity_px, atol=1 / 256
+    )
+    confidence = np.asarray(Image.open("new/out/confidence.png"))
+    np.testing.assert_allclose(confidence / 255, estimate.confidence, atol=0.5 / 255 + 1e-6)
+    assert read_image("new/out/preview.png").shape == (64, 96, 3)
+
+
+def test_depth_png_is_in_millimetres(pictures):
+    save_matcher(Path("four.onnx"), 4.0)
+    assert run("depth left.png right.png --model four.onnx --calib calib.txt -o out") == 0
+    # 100 px * 0.08 m / 4 px = 2 m
+    assert set(np.asarray(Image.open("out/depth.png")).ravel()) == {2000}
+
+
+def test_a_side_by_side_picture_gives_the_same_as_the_two(pictures):
+    assert run("depth left.png right.png -o two") == 0
+    assert run("depth both.png -o one") == 0
+    np.testing.assert_array_equal(read_pfm("one/disparity.pfm"), read_pfm("two/disparity.pfm"))
+
+
+def test_json_alone_is_on_stdout_and_names_the_files(pictures, capfd):
+    save_matcher(Path("four.onnx"), 4.0)
+    assert run("depth left.png right.png --model four.onnx --calib calib.txt -o out --json") == 0
+    printed, told = capfd.readouterr()
+    summary = json.loads(printed)
+    assert told == ""
+    assert summary["pictures"] == ["left.png", "right.png"]
+    assert (summary["model"], summary["width_px"], summary["height_px"]) == ("four.onnx", 96, 64)
+    assert (summary["disparity_min_px"], summary["disparity_max_px"], summary["depth_median_m"]) == (4, 4, 2)
+    assert summary["camera"]["baseline_m"] == 0.08
+    assert all(Path(file).is_file() for file in summary["files"].values())
+    assert len(summary["files"]) == 6
+
+
+@pytest.mark.parametrize("disparity_px", [-3.0, 300.0])
+def test_a_disparity_that_a_png_cannot_hold_gets_none_and_a_line(pictures, capfd, disparity_px):
+    save_matcher(Path("far.onnx"), disparity_px)
+    assert run("depth left.png right.png --model far.onnx -o out") == 0
+    printed, _ = capfd.readouterr()
+    assert "no disparity.png: it holds 0 to 255.99 px" in printed
+    assert not Path("out/disparity.png").exists()
+    np.testing.assert_array_equal(read_pfm("out/disparity.pfm"), np.float32(disparity_px))
+
+
+def test_a_new_result_takes_the_place_of_the_old_one_whole(pictures):
+    assert run("depth left.png right.png --calib calib.txt -o out") == 0
+    Path("out/mine.txt").write_text("kept")
+    assert run("depth left.png right.png -o out") == 0
+    assert not Path("out/depth.png").exists()
+    assert Path("out/mine.txt").read_text() == "kept"
+
+
+def test_view_writes_what_synthesize_draws(pictures):
+    assert run("view left.png right.png --position 0.25 -o view.png") == 0
+    left, right = read_image("left.png"), read_image("right.png")
+    view = stereoweave.synthesize(left, right, position=0.25)
+    np.testing.assert_array_equal(read_image("view.png"), view.image)
+
+
+def test_bench_scores_the_network_beside_sgbm(pictures, capfd):
+    scene = Path("scenes/wall")
+    scene.mkdir(parents=True)
+    for name in ("left.png", "right.png"):
+        Path(name).rename(scene / name)
+    Image.fromarray(np.full((64, 96), 8 * 256, np.uint16)).save(scene / "disparity.png")
+    save_matcher(Path("ten.onnx"), 10.0)
+    assert run("bench pairs scenes --model ten.onnx -o rows.csv") == 0
+    with Path("rows.csv").open() as file:
+        rows = {(row["matcher"], row["scene"]): row for row in csv.DictReader(file)}
+    assert set(rows) == {(name, scene) for name in ("sgbm", "ten.onnx") for scene in ("wall", "mean")}
+    # 10 px found, 8 px true
+    assert float(rows["ten.onnx", "wall"]["epe_px"]) == 2
+    assert "ten.onnx" in capfd.readouterr().out
+
+
+def test_training_without_pytorch_names_the_extra(tmp_path):
+    program = (
+        "import sys; sys.modules['torch'] = None; from stereoweave.cli import main; "
+        "sys.exit(main(['train', 'recipe.toml', '-o', 'run']))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "PyTorch" in done.stderr
+    assert "pip install 'stereoweave[train]'" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_help_loads_nothing_heavy():
+    program = (
+        "import sys; from stereoweave.cli import main; main(['--help']); "
+        "sys.exit(str({'numpy', 'cv2', 'numba', 'onnxruntime', 'torch', 'PIL', 'rich'} & sys.modules.keys()))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert "depth" in done.stdout
+    assert done.stderr.strip() == "set()"
+
+
+def test_version_is_the_package_version(capfd):
+    assert run("--version") == 0
+    assert capfd.readouterr().out == f"stereoweave {stereoweave.__version__}\n"
