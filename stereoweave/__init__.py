@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from stereoweave.errors import FormatError, MatcherError, StereoweaveError
     from stereoweave.matcher import Matcher, estimate
-    from stereoweave.render import render
+    from stereoweave.rendering import render
     from stereoweave.stereo import Estimate, Sample, StereoCamera, StereoPair, View
     from stereoweave.synthesis import synthesize
 
@@ -23,7 +23,7 @@ _HOMES = {
     "StereoweaveError": "errors",
     "View": "stereo",
     "estimate": "matcher",
-    "render": "render",
+    "render": "rendering",
     "synthesize": "synthesis",
 }
 
@@ -48,10 +48,7 @@ def __getattr__(name: str) -> Any:
     """The public name, imported when it is first asked for (PEP 562), so that the package itself loads at once."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-    # Kept, because importing the module stereoweave.render has just bound that name to the module.
-    globals()[name] = value
-    return value
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:

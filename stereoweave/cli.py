@@ -105,7 +105,7 @@ def view(  # noqa: PLR0913 - each is a word of the command line
 ) -> None:
     """A new view of a stereo pair, from between its two cameras or a little beyond them."""
     from stereoweave.io import write_image
-    from stereoweave.render import render
+    from stereoweave.rendering import render
 
     pair = _read(pictures)
     estimate = _matcher(model, threads).estimate(pair.left, pair.right)

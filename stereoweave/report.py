@@ -21,7 +21,7 @@ from stereoweave.colour import (
     legend_colours,
 )
 from stereoweave.io import replacing
-from stereoweave.render import render
+from stereoweave.rendering import render
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
 POSITIONS = tuple(step / 8 for step in range(-2, 11))

@@ -1,0 +1,34 @@
+"""A pair becomes a new view in one call."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from stereoweave.matcher import estimate
+from stereoweave.rendering import check_position, render
+from stereoweave.stereo import View
+
+
+def synthesize(
+    left: UInt8[np.ndarray, "h w 3"],
+    right: UInt8[np.ndarray, "h w 3"],
+    position: float,
+    model: str | Path = "small",
+) -> View:
+    """The view from a position on the line through two cameras: `estimate`, then `render`.
+
+    Args:
+        left: The left photograph, uint8 RGB [H, W, 3], rectified.
+        right: The right one, of the same size.
+        position: 0 is the left camera, 1 the right one; -0.5 to 1.5.
+        model: As for `estimate`.
+
+    Returns:
+        The view, of the photographs' size; `drawn` is False where the colour was invented.
+
+    Raises:
+        ValueError: As `estimate` and `render`; a position out of its range before anything is matched.
+    """
+    check_position(position)
+    return render(left, right, estimate(left, right, model=model), position)

@@ -1,0 +1,288 @@
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plain_rendering import plain_rendering, plain_splat
+
+import stereoweave
+from stereoweave.rendering import render
+from stereoweave.rendering_kernels import NOTHING, splat
+from stereoweave.stereo import Estimate
+
+BACKGROUND = np.array([40, 120, 200], np.uint8)
+OBJECT = np.array([250, 30, 10], np.uint8)
+
+
+def make_estimate(disparity_px, right_disparity_px, confidence=None):
+    if confidence is None:
+        confidence = np.ones(disparity_px.shape, np.float32)
+    return Estimate(
+        disparity_px=disparity_px.astype(np.float32),
+        right_disparity_px=right_disparity_px.astype(np.float32),
+        confidence=confidence.astype(np.float32),
+        occluded=np.zeros(disparity_px.shape, bool),
+    )
+
+
+def wall_with_object(object_columns, height=5, width=40):
+    """Photographs of a plain wall at disparity 2, and an object at 10 in these columns of the left one."""
+    photos, maps = [], []
+    for shift in (0, -10):
+        photo = np.tile(BACKGROUND, (height, width, 1))
+        disparity_px = np.full((height, width), 2.0)
+        columns = slice(object_columns.start + shift, object_columns.stop + shift)
+        photo[:, columns] = OBJECT
+        disparity_px[:, columns] = 10
+        photos.append(photo)
+        maps.append(disparity_px)
+    return *photos, make_estimate(*maps)
+
+
+def random_scene(rng, *, lowest_px=0.0, height=14, width=40):
+    """Photographs of noise, and maps that agree in places only: slants, edges, sticks, and plain errors."""
+    columns = np.arange(width)
+    maps = []
+    for sign in (1, -1):
+        disparity_px = lowest_px + rng.uniform(0, 3) + rng.uniform(-0.2, 0.2, (height, 1)) * columns
+        for size, nearer_px in ((12, 6.0), (5, 9.0), (1, 12.0), (1, 3.5)):
+            x = rng.integers(0, width - size, height)[:, None] - sign * 2
+            disparity_px = np.where(
+                (columns >= x) & (columns < x + size), lowest_px + nearer_px, disparity_px
+            )
+        disparity_px += rng.normal(0, 0.3, (height, width))
+        disparity_px[rng.random((height, width)) < 0.02] += 15
+        maps.append(disparity_px)
+    left, right = rng.integers(0, 256, (2, height, width, 3), dtype=np.uint8)
+    return left, right, make_estimate(*maps, confidence=rng.random((height, width)))
+
+
+def test_halfway_between_the_cameras_a_wall_has_moved_by_half_its_disparity(rng):
+    wide = rng.integers(0, 256, (8, 46, 3), dtype=np.uint8)
+    left, right = wide[:, :40], wide[:, 6:]  # what is at x in the left image is at x - 6 in the right one
+    view = render(left, right, make_estimate(*np.full((2, 8, 40), 6.0)), 0.5)
+    np.testing.assert_array_equal(view.image, wide[:, 3:43])
+    assert view.drawn.all()
+
+
+@pytest.mark.parametrize("position", [0.25, 0.75, 1.25, -0.25])
+def test_a_slanted_ramp_of_grey_is_where_its_disparity_says(position):
+    # d = 4 + x / 8: what is at x in the left image is at u = x - position (4 + x / 8); its grey level is 3 x.
+    columns = np.arange(64.0)
+    to_left_column = lambda u, at: (u + 4 * at) / (1 - at / 8)  # noqa: E731
+    photos = [np.clip(np.rint(3 * to_left_column(columns, at)), 0, 255).astype(np.uint8) for at in (0, 1)]
+    left, right = (np.repeat(np.tile(photo, (6, 1))[..., None], 3, 2) for photo in photos)
+    maps = [np.tile(4 + to_left_column(columns, at) / 8, (6, 1)) for at in (0, 1)]
+    view = render(left, right, make_estimate(*maps), position)
+    expected = 3 * to_left_column(columns, position)
+    inside = view.drawn[0] & (expected < 190) & (expected > 0)
+    assert inside.sum() > 40
+    assert np.abs(view.image[3, inside, 1] - expected[inside]).max() <= 1
+
+
+@pytest.mark.parametrize("position", [0, 1])
+def test_at_the_cameras_the_view_is_the_photograph_itself(rng, position):
+    left, right, estimate = random_scene(rng)
+    view = render(left, right, estimate, position)
+    np.testing.assert_array_equal(view.image, (left, right)[position])
+    assert view.drawn.all()
+
+
+@pytest.mark.parametrize(("camera", "position"), [(0, 1e-3), (0, -1e-3), (1, 1 - 1e-3), (1, 1 + 1e-3)])
+def test_beside_a_camera_the_view_is_nearly_its_photograph(rng, camera, position):
+    left, right, estimate = random_scene(rng)
+    view = render(left, right, estimate, position)
+    apart = np.abs(view.image.astype(int) - (left, right)[camera])
+    # 15 px of disparity move by 0.015 px; and the other photograph weighs a thousandth.
+    assert np.median(apart) <= 1
+    assert view.drawn.mean() > 0.99
+
+
+def test_an_object_lands_where_its_disparity_says_and_hides_the_wall():
+    left, right, estimate = wall_with_object(slice(20, 26))
+    view = render(left, right, estimate, 0.5)
+    # Columns 20..25 move left by 0.5 * 10.
+    np.testing.assert_array_equal(view.image[:, 15:21], np.broadcast_to(OBJECT, (5, 6, 3)))
+    np.testing.assert_array_equal(view.image[:, :15], np.broadcast_to(BACKGROUND, (5, 15, 3)))
+    np.testing.assert_array_equal(view.image[:, 21:], np.broadcast_to(BACKGROUND, (5, 19, 3)))
+
+
+def test_beyond_the_left_camera_the_right_one_shows_what_the_left_one_missed():
+    left, right, estimate = wall_with_object(slice(20, 26))
+    view = render(left, right, estimate, -0.5)
+    # The object is at 25..30. The left camera sees the wall up to 19, which is 20 here; the right one sees it
+    # from 16 on, which is 19 here, up to the object: no hole.
+    np.testing.assert_array_equal(view.image[:, 25:31], np.broadcast_to(OBJECT, (5, 6, 3)))
+    np.testing.assert_array_equal(view.image[:, 31:], np.broadcast_to(BACKGROUND, (5, 9, 3)))
+    assert view.drawn[:, 1:].all()
+    # The left photograph's first column is at 1, the right one's at 3.
+    assert not view.drawn[:, 0].any()
+
+
+def test_a_hole_is_exactly_where_both_cameras_sight_is_blocked():
+    # The object is at 25..40. The left camera sees the wall up to 19, which is 20 here; the right one up to
+    # 9, and from 26 on, which is 29 here and behind the object.
+    left, right, estimate = wall_with_object(slice(20, 36))
+    shade = np.arange(40, dtype=np.uint8)[None, :, None]
+    left = np.where(left == BACKGROUND, left + shade, left)
+    right = np.where(right == BACKGROUND, right + shade + 2, right)
+    view = render(left, right, estimate, -0.5)
+    hole = np.zeros(40, bool)
+    hole[0] = True  # left of the left photograph
+    hole[20:25] = True  # 20 as well: the left camera saw it at the object's rim, where colours mix
+    np.testing.assert_array_equal(~view.drawn, np.tile(hole, (5, 1)))
+    np.testing.assert_array_equal(view.image[:, 25:40], np.broadcast_to(OBJECT, (5, 15, 3)))
+    # 19 of the new view was 18 in the left photograph, and 18 was 17: the mean of their shades.
+    np.testing.assert_array_equal(view.image[:, 20:25], np.broadcast_to(BACKGROUND + 18, (5, 5, 3)))
+
+
+def test_a_seam_of_mixed_colours_around_an_object_stays_with_the_object():
+    left, right, estimate = wall_with_object(slice(20, 26))
+    mixed = (OBJECT // 2 + BACKGROUND // 2).astype(np.uint8)
+    left[:, [19, 26]] = mixed
+    right[:, [9, 16]] = mixed
+    view = render(left, right, estimate, 0.5)
+    wall = np.r_[0:14, 22:40]
+    apart = np.abs(view.image[:, wall].astype(int) - BACKGROUND)
+    # Each photograph's seam falls on wall that the other one shows clean, and weighs a tenth: 9 % of 105.
+    assert apart.max() <= 10
+
+
+@pytest.mark.parametrize(("confidence", "level"), [(0.05, 156), (0.95, 167)])
+def test_confidence_decides_between_maps_that_contradict_each_other(confidence, level):
+    # The left map has an object, at 24..29 of the new view, that the right one looks through; the photographs
+    # differ by as much everywhere. The left camera alone sees it, half of the weight; both see the wall.
+    left, right = np.full((9, 60, 3), 200, np.uint8), np.full((9, 60, 3), 100, np.uint8)
+    disparity_px = np.full((9, 60), 2.0)
+    disparity_px[:, 30:36] = 12
+    certainty = np.where(disparity_px > 2, confidence, 0.9)
+    view = render(left, right, make_estimate(disparity_px, np.full((9, 60), 2.0), certainty), 0.5)
+    of_object, of_wall = 0.5 * (0.3 + confidence), 0.3 + 0.9
+    assert level == round(150 + 50 * of_object / (of_object + of_wall))
+    assert (view.image[:, 24:28] == level).all()
+
+
+def test_a_row_that_nothing_lands_on_shows_the_nearest_photograph_as_invented():
+    left, right = np.full((2, 6, 32, 3), 50, np.uint8)
+    view = render(left + 10, right, make_estimate(*np.full((2, 6, 32), 500.0)), 0.4)
+    assert (view.image == 60).all()
+    assert not view.drawn.any()
+
+
+def test_neither_the_photographs_nor_the_estimate_are_changed_and_they_may_be_read_only(rng):
+    left, right, estimate = random_scene(rng)
+    before = left.copy(), estimate.disparity_px.copy()
+    expected = render(left, right, estimate, 0.3)
+    for array in (left, right, estimate.disparity_px, estimate.confidence):
+        array.flags.writeable = False
+    flipped = left[:, ::-1].copy()[:, ::-1]  # the same, not contiguous
+    np.testing.assert_array_equal(render(flipped, right, estimate, 0.3).image, expected.image)
+    np.testing.assert_array_equal(left, before[0])
+    np.testing.assert_array_equal(estimate.disparity_px, before[1])
+
+
+@pytest.mark.parametrize("position", [-0.51, 1.51, float("nan"), float("inf")])
+def test_a_position_out_of_range_is_refused(rng, position):
+    with pytest.raises(ValueError, match=rf"^position: expected -0\.5 to 1\.5 .*, got {position}$"):
+        render(*random_scene(rng), position)
+
+
+@pytest.mark.usefixtures("without_shape_checks")
+def test_sizes_that_differ_are_refused_in_one_line(rng):
+    left, right, estimate = random_scene(rng)
+    with pytest.raises(ValueError, match=r"^left and right images must be of one size.*$"):
+        render(left[:, 1:], right, estimate, 0.5)
+    with pytest.raises(ValueError, match=r"^estimate: expected the photographs' size 39x14, got 40x14; .*$"):
+        render(left[:, 1:], right[:, 1:], estimate, 0.5)
+
+
+@pytest.mark.parametrize("shift", [-1.5, -0.5, 0.0, 0.25, 1.0, 1.5])
+@pytest.mark.parametrize("lowest_px", [0.0, -8.0])
+def test_the_fast_splat_equals_the_plain_one(rng, shift, lowest_px):
+    disparity_px = random_scene(rng, lowest_px=lowest_px)[2].disparity_px
+    landed_px = np.empty_like(disparity_px)
+    splat(disparity_px, shift, landed_px)
+    expected = plain_splat(disparity_px.astype(float), shift)
+    np.testing.assert_array_equal(landed_px == NOTHING, np.isnan(expected))
+    np.testing.assert_allclose(landed_px[landed_px > NOTHING], expected[~np.isnan(expected)], atol=1e-4)
+
+
+@pytest.mark.parametrize("position", [-0.5, -0.2, 0.25, 0.5, 0.9, 1.5])
+@pytest.mark.parametrize("lowest_px", [0.0, -8.0])
+def test_the_fast_renderer_equals_the_plain_one(rng, position, lowest_px):
+    for _ in range(3):
+        left, right, estimate = random_scene(rng, lowest_px=lowest_px)
+        view = render(left, right, estimate, position)
+        image, drawn = plain_rendering(left, right, estimate, position)
+        np.testing.assert_array_equal(view.drawn, drawn)
+        # Disparities are kept as float32: a colour at a steep edge of noise may round to the next level.
+        assert np.abs(view.image.astype(int) - image).max() <= 1
+
+
+def in_new_process(code, home, **variables):
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+    environment |= {"HOME": str(home), "XDG_CACHE_HOME": str(home / "cache"), **variables}
+    return subprocess.run(
+        [sys.executable, "-B", "-c", code],
+        env=environment,
+        cwd=home,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+
+
+SPLAT = """
+import sys
+sys.path.insert(0, {folder!r})
+import numpy as np
+from stereoweave import rendering_kernels as kernels
+assert kernels.__file__.startswith({folder!r})
+kernels.splat(np.zeros((2, 3), np.float32), 0.5, np.zeros((2, 3), np.float32))
+print(sum(kernels.splat.stats.cache_hits.values()))
+"""
+
+
+@pytest.fixture
+def installation(tmp_path):
+    """A copy of the package, where an installation might be."""
+    folder = tmp_path / "site-packages"
+    package = Path(stereoweave.__file__).parent
+    shutil.copytree(package, folder / "stereoweave", ignore=shutil.ignore_patterns("weights", "__pycache__"))
+    return folder
+
+
+def test_compiled_kernels_are_kept_in_the_users_folder_and_loaded_from_there(installation, tmp_path):
+    code = SPLAT.format(folder=str(installation))
+    before = sorted(installation.rglob("*"))
+    assert in_new_process(code, tmp_path) == "0\n"
+    assert in_new_process(code, tmp_path) == "1\n"
+    assert sorted(installation.rglob("*")) == before
+    assert list((tmp_path / "cache" / "stereoweave" / "kernels").rglob("rendering_kernels.splat*.nbi"))
+
+
+def test_numbas_own_variable_moves_the_kernels(installation, tmp_path):
+    in_new_process(
+        SPLAT.format(folder=str(installation)), tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "elsewhere")
+    )
+    assert list((tmp_path / "elsewhere").rglob("rendering_kernels.splat*.nbi"))
+    assert not (tmp_path / "cache").exists()
+
+
+def test_without_any_writable_folder_the_kernels_still_work(installation, tmp_path):
+    # Folders cannot be made below files, whoever tries: this holds for the superuser too.
+    (tmp_path / "cache").write_text("")
+    (installation / "stereoweave" / "__pycache__").write_text("")
+    code = SPLAT.format(folder=str(installation))
+    assert in_new_process(code, tmp_path, XDG_CACHE_HOME=str(tmp_path / "cache")) == "0\n"
+
+
+def test_importing_the_package_or_the_renderer_does_not_import_numba():
+    code = "import sys, stereoweave, stereoweave.rendering; print('numba' in sys.modules)"
+    assert (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+        == "False\n"
+    )
