@@ -45,7 +45,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """The public name, imported when it is first asked for (PEP 562), so that the package itself loads at once."""
+    """The public name, imported when it is first asked for (PEP 562): the package itself loads at once."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)

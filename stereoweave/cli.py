@@ -144,6 +144,9 @@ def train(
     out: Annotated[Path, typer.Option("--out", "-o", help="The folder of the run.")],
 ) -> None:
     """Train the network of a recipe; a run that was stopped continues where it was."""
+    from stereoweave.learn.recipe import read_recipe
+
+    read_recipe(recipe)  # what is wrong with it is said before PyTorch takes seconds to load
     with _needing_the_train_extra():
         from stereoweave.learn.train import train as train_recipe
     train_recipe(recipe, out)
@@ -153,11 +156,27 @@ def train(
 def export(
     run: Annotated[Path, typer.Argument(help="The folder of a run, or a checkpoint in it.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The .onnx file to write.")],
+    scenes: Annotated[
+        Path | None, typer.Option(help="Pairs on which both must agree too; a folder as for bench pairs.")
+    ] = None,
+    reliability: Annotated[
+        Path | None, typer.Option(help="A picture to write: how often the confidence comes true.")
+    ] = None,
 ) -> None:
     """Turn a trained network into a file that --model takes, and prove that both agree."""
+    from stereoweave.data.readers import read_scenes
+
+    pairs = [scene.pair for scene in read_scenes(scenes)] if scenes else []
     with _needing_the_train_extra():
+        from stereoweave.learn.calibrate import draw_reliability
         from stereoweave.learn.export import export as export_run
-    export_run(run, out)
+    card = export_run(run, out, pairs)
+    if reliability:
+        draw_reliability(card["confidence"], reliability)
+    typer.echo(
+        f"{out}: ONNX Runtime and PyTorch differ by at most {card['onnx_differs_px']:.4f} px "
+        f"over {1 + len(pairs)} pairs"
+    )
 
 
 def _read(pictures: list[Path], calib: Path | None = None) -> "StereoPair":

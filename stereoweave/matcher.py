@@ -122,7 +122,9 @@ class Matcher:
         outputs = dict(zip(self._outputs, self._session.run(None, inputs), strict=True))
         for name, value in outputs.items():
             if not np.isfinite(value).all():
-                raise MatcherError(f"{self._path}: expected finite values of {name}, found NaN or infinite ones")
+                raise MatcherError(
+                    f"{self._path}: expected finite values of {name}, found NaN or infinite ones"
+                )
         cut = {name: np.ascontiguousarray(value[0, 0, :height, :width]) for name, value in outputs.items()}
         return Maps(**{name: value for name, value in cut.items() if name in Maps._fields})
 

@@ -98,9 +98,9 @@ def _check_shapes(estimate: np.ndarray, truth: np.ndarray) -> None:
 def calibration_error(
     probability: Float[np.ndarray, "..."], happened: Bool[np.ndarray, "..."], bins: int = 15
 ) -> float:
-    """Expected calibration error: the mean gap, over bins of equal width, between what was claimed and what happened.
+    """Expected calibration error: the mean gap between what was claimed and what happened, over equal bins.
 
-    Source: Guo et al. 2017; each bin weighs as many as fall into it.
+    Source: Guo et al. 2017; a bin weighs as many as fall into it.
     """
     where = np.minimum((probability * bins).astype(int), bins - 1).ravel()
     claimed = np.bincount(where, probability.ravel(), bins)

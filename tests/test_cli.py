@@ -117,8 +117,14 @@ def mistakes(pictures) -> Path:
             ["identity.onnx", "expected", "left", "found"],
         ),
         ("depth left.png right.png --model words.onnx -o out", ["words.onnx", "expected"]),
-        ("view left.png right.png --model nan.onnx -o out.png", ["nan.onnx", "disparity_px", "expected finite", "NaN"]),
-        ("depth left.png right.png --model nan.onnx -o out", ["nan.onnx", "disparity_px", "expected finite", "NaN"]),
+        (
+            "view left.png right.png --model nan.onnx -o out.png",
+            ["nan.onnx", "disparity_px", "expected finite", "NaN"],
+        ),
+        (
+            "depth left.png right.png --model nan.onnx -o out",
+            ["nan.onnx", "disparity_px", "expected finite", "NaN"],
+        ),
         ("depth left.png right.png --threads 0 -o out", ["--threads"]),
         ("depth left.png right.png", ["--out"]),
         ("bench pairs folder -o out.csv", ["folder", "left.png"]),

@@ -15,7 +15,7 @@ PROPERTIES = {"name": "by_hand", "multiple_of": 16, "max_disparity_px": 255}
 
 
 def matcher_file(path: Path, nodes, outputs, properties=PROPERTIES, inputs=("left", "right")) -> Path:
-    """A matcher file with a graph written by hand; the constants `red`, `hundred` and `one` are there to use."""
+    """A matcher file whose graph is written by hand; the constants `red` and `scale` are there to use."""
     graph = helper.make_graph(
         nodes,
         "by_hand",
@@ -57,7 +57,7 @@ def test_the_shipped_network_takes_any_size_from_32_px_up(rng, height, width):
     for values in (found.disparity_px, found.right_disparity_px, found.confidence):
         assert values.shape == (height, width) and values.dtype == np.float32 and np.isfinite(values).all()
     assert found.occluded.shape == (height, width) and found.occluded.dtype == bool
-    assert 0 <= found.confidence.min() and found.confidence.max() <= 1
+    assert found.confidence.min() >= 0 and found.confidence.max() <= 1
 
 
 def test_a_graph_of_one_output_runs_the_mirrored_pair_for_the_other_view(tmp_path, rng):

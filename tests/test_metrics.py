@@ -119,3 +119,10 @@ def test_picture_scores_are_those_of_the_referee(testdata, scene):
     np.testing.assert_array_equal(left, referee["read"](folder / "left.png"))
     assert metrics.psnr_db(left, right) == pytest.approx(referee["psnr"](left, right), abs=1e-6)
     assert metrics.ssim(left, right) == pytest.approx(referee["ssim"](left, right), abs=1e-6)
+
+
+def test_calibration_error_is_the_mean_gap_between_claim_and_outcome():
+    probability = np.array([0.95, 0.95, 0.95, 0.95, 0.05, 0.05])
+    happened = np.array([True, True, True, False, False, False])
+    # Four claims of 0.95 came true 3 times in 4, two claims of 0.05 never: (4 * 0.20 + 2 * 0.05) / 6.
+    assert metrics.calibration_error(probability, happened) == pytest.approx(0.15)

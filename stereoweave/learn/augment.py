@@ -10,7 +10,7 @@ from stereoweave.stereo import Sample
 
 
 def augment(sample: Sample, height: int, width: int, rng: np.random.Generator) -> Sample:
-    """A cut of the sample of the size asked for; disparity stays exact under each change."""
+    """A cut of the sample of the size asked for; disparity is scaled and moved along with it."""
     sample = rescaled_cut(sample, height, width, rng)
     if rng.random() < 0.5:
         sample = mirrored(sample)
@@ -96,7 +96,7 @@ def erased(image: UInt8[np.ndarray, "h w 3"], rng: np.random.Generator) -> UInt8
     image = image.copy()
     rows, columns = image.shape[:2]
     for _ in range(rng.integers(1, 3)):
-        height, width = rng.integers(16, 64, 2)
+        height, width = np.minimum(rng.integers(16, 64, 2), (rows, columns))
         top, start = rng.integers(rows - height + 1), rng.integers(columns - width + 1)
         patch = image[top : top + height, start : start + width]
         patch[:] = patch.mean((0, 1))

@@ -1,0 +1,127 @@
+"""What the tests of training share: a pair whose truth is known by construction, a network trained on it."""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from stereoweave.learn.checkpoint import Checkpoint
+from stereoweave.learn.losses import weave_losses
+from stereoweave.learn.models import MODELS
+from stereoweave.learn.models.weave import WeaveNet
+from stereoweave.learn.pairs import KeptPairs
+from stereoweave.learn.recipe import Recipe
+from stereoweave.learn.train import collated
+from stereoweave.stereo import Sample
+
+# Pictures this small cost more to share among threads than to compute.
+torch.set_num_threads(1)
+
+PAIR_SIZE = (64, 96)
+RECIPE = Recipe(
+    name="tiny",
+    model="weave",
+    steps=6,
+    batch=2,
+    learning_rate=1e-3,
+    warm_up_steps=2,
+    cool_down_steps=2,
+    pairs=4,
+    pair_size=PAIR_SIZE,
+    crop_size=(64, 64),
+    validation_pairs=2,
+    validate_every=2,
+)
+
+
+def texture(rng, height, width):
+    blocks = rng.integers(30, 226, (height // 4 + 1, width // 4 + 1, 3)).repeat(4, 0).repeat(4, 1)
+    return (blocks[:height, :width] + rng.integers(-30, 30, (height, width, 3))).astype(np.uint8)
+
+
+def box_before_a_wall(rng, size=PAIR_SIZE, wall_px=4, box_px=12):
+    """A sample of two flat surfaces: the box covers the middle half of the left view's rows and columns."""
+    height, width = size
+    wall, box = texture(rng, height, width + wall_px), texture(rng, height // 2, width // 2)
+    rows, start = slice(height // 4, height // 4 + height // 2), width // 4
+    in_left, in_right = np.zeros((2, height, width), bool)
+    in_left[rows, start : start + width // 2] = True
+    in_right[rows, start - box_px : start - box_px + width // 2] = True
+    left, right = wall[:, :width].copy(), wall[:, wall_px:].copy()
+    left[in_left], right[in_right] = box.reshape(-1, 3), box.reshape(-1, 3)
+    # The wall's column x in the left view is at x - wall_px in the right one.
+    occluded, right_occluded = np.ones((2, height, width), bool)
+    occluded[:, wall_px:] = in_right[:, :-wall_px]
+    right_occluded[:, :-wall_px] = in_left[:, wall_px:]
+    return Sample(
+        left=left,
+        right=right,
+        disparity_px=np.where(in_left, box_px, wall_px).astype(np.float32),
+        right_disparity_px=np.where(in_right, box_px, wall_px).astype(np.float32),
+        occluded=occluded & ~in_left,
+        right_occluded=right_occluded & ~in_right,
+    )
+
+
+def keep_pairs(folder, seed, count, size=PAIR_SIZE):
+    """Pairs of this file in place of the collages that training would make."""
+    pairs = KeptPairs(folder, seed, count, size)
+    pairs.folder.mkdir(parents=True, exist_ok=True)
+    for index in range(count):
+        pairs.keep(index, box_before_a_wall(np.random.default_rng((seed, index)), size))
+    return pairs
+
+
+def untrained(name="weave"):
+    torch.manual_seed(0)
+    return MODELS[name]().eval()
+
+
+def checkpoint_of(network, recipe=RECIPE):
+    weights = network.state_dict()
+    return Checkpoint(
+        recipe=recipe,
+        step=recipe.steps,
+        weights=weights,
+        averaged=weights,
+        optimiser={},
+        random_state=torch.get_rng_state(),
+        scores={"epe_px": 1.5},
+        commit="0123abc",
+        hours=0.25,
+    )
+
+
+@dataclass(frozen=True)
+class Overfitted:
+    network: WeaveNet
+    sample: Sample
+    error_before_px: float
+    error_after_px: float
+
+
+@functools.cache
+def overfitted(name="weave", steps=45) -> Overfitted:
+    """A network that has seen one pair again and again, and its mean error on that pair before and after."""
+    network, sample = untrained(name), box_before_a_wall(np.random.default_rng(0))
+    batch = collated([sample])
+    before_px = mean_error_px(network, batch)
+    optimiser = torch.optim.AdamW(network.parameters(), 2e-3)
+    network.train()
+    for _ in range(steps):
+        stages = network.stages(batch["left"], batch["right"])
+        loss = torch.stack(
+            list(weave_losses(stages, batch["disparity_px"], batch["occluded"]).values())
+        ).sum()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    network.eval()
+    return Overfitted(network, sample, before_px, mean_error_px(network, batch))
+
+
+@torch.no_grad()
+def mean_error_px(network, batch) -> float:
+    found_px = network.stages(batch["left"], batch["right"]).disparity_px
+    return float((found_px - batch["disparity_px"]).abs().mean())

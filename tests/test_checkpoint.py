@@ -1,0 +1,101 @@
+import re
+from dataclasses import replace
+
+import pytest
+import torch
+from learn_examples import RECIPE, checkpoint_of
+from torch import nn
+
+from stereoweave.errors import FormatError
+from stereoweave.learn import checkpoint
+
+
+@pytest.fixture
+def trained():
+    """A checkpoint with all that a run leaves, of a network that is a single layer."""
+    torch.manual_seed(0)
+    layer = nn.Conv2d(3, 4, 3).to(memory_format=torch.channels_last)
+    optimiser = torch.optim.AdamW(layer.parameters(), 1e-3, fused=True)
+    layer(torch.rand(1, 3, 5, 5)).sum().backward()
+    optimiser.step()
+    return replace(checkpoint_of(layer), optimiser=optimiser.state_dict())
+
+
+def assert_same(one, other):
+    assert type(one) is type(other)
+    if isinstance(one, torch.Tensor):
+        assert torch.equal(one, other)
+        assert one.stride() == other.stride()
+    elif isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for key, value in one.items():
+            assert_same(value, other[key])
+    else:
+        assert one == other
+
+
+def test_a_checkpoint_comes_back_as_it_was(tmp_path, trained):
+    path = tmp_path / "last.pt"
+    checkpoint.save(trained, path)
+    found = checkpoint.load(path)
+    assert found.recipe == RECIPE
+    assert_same(vars(trained), vars(found))
+
+
+def test_saving_that_fails_leaves_the_earlier_checkpoint(tmp_path, trained):
+    path = tmp_path / "last.pt"
+    checkpoint.save(trained, path)
+    before = path.read_bytes()
+    with pytest.raises(AttributeError, match="lambda|pickle"):
+        checkpoint.save(replace(trained, optimiser={"large": torch.zeros(10_000), "no": lambda: 0}), path)
+    assert path.read_bytes() == before
+
+
+def test_a_saved_checkpoint_leaves_no_other_file(tmp_path, trained):
+    checkpoint.save(trained, tmp_path / "last.pt")
+    checkpoint.save(trained, tmp_path / "last.pt")
+    assert [file.name for file in tmp_path.iterdir()] == ["last.pt"]
+
+
+def truncated(path, trained):
+    checkpoint.save(trained, path)
+    path.write_bytes(path.read_bytes()[:-1000])
+
+
+def of_another_recipe_version(path, trained):
+    values = {**vars(trained), "recipe": {"name": "x", "colour": "red"}}
+    torch.save(values, path)
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda path, _: path.write_bytes(bytes(range(256)) * 8),
+        lambda path, _: path.write_bytes(b""),
+        lambda path, _: path.write_text("hello, I am a text file\nof two lines\n"),
+        lambda path, _: path.write_text("question\n"),
+        lambda path, _: path.mkdir(),
+        lambda path, _: torch.save([1, 2, 3], path),
+        lambda path, _: torch.save({"weights": torch.zeros(3)}, path),
+        lambda path, trained: torch.save(nn.Linear(2, 2), path),
+        truncated,
+        of_another_recipe_version,
+    ],
+    ids=["bytes", "empty", "text", "word", "folder", "list", "weights", "module", "truncated", "recipe"],
+)
+def test_a_file_that_is_no_checkpoint_is_named_in_one_line(tmp_path, trained, write):
+    path = tmp_path / "no.pt"
+    write(path, trained)
+    with pytest.raises(FormatError) as caught:
+        checkpoint.load(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_checkpoint_that_is_not_there_is_named_with_what_makes_one(tmp_path):
+    with pytest.raises(FormatError, match=r"nowhere\.pt: no such checkpoint; `stereoweave train`"):
+        checkpoint.load(tmp_path / "nowhere.pt")
+
+
+def test_the_commit_of_the_code_is_a_short_hash_or_unknown():
+    assert re.fullmatch(r"[0-9a-f]{7,40}\+?|unknown", checkpoint.code_commit())

@@ -1,0 +1,177 @@
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from stereoweave.learn.models.layers import (
+    DilatedDense,
+    Halve,
+    Residual,
+    correlation_volume,
+    expected_step,
+    local_soft_argmax,
+    mirrored,
+    nearby_matches,
+    upsample_convex,
+)
+
+
+@pytest.fixture(autouse=True)
+def same_draws():
+    torch.manual_seed(0)
+
+
+def correlation_volume_plain(first, second, levels):
+    batch, _, height, width = first.shape
+    volume = torch.zeros(batch, levels, height, width)
+    for level in range(levels):
+        for x in range(level, width):
+            volume[:, level, :, x] = (first[:, :, :, x] * second[:, :, :, x - level]).sum(1)
+    return volume
+
+
+def nearby_matches_plain(first, second, disparity, radius):
+    batch, _, height, width = first.shape
+    matches = torch.zeros(batch, 2 * radius + 1, height, width)
+    for b in range(batch):
+        for y in range(height):
+            for x in range(width):
+                for k in range(-radius, radius + 1):
+                    column = x - float(disparity[b, 0, y, x]) - k
+                    before, share = math.floor(column), column - math.floor(column)
+                    products = [
+                        float(first[b, :, y, x] @ second[b, :, y, min(max(c, 0), width - 1)])
+                        for c in (before, before + 1)
+                    ]
+                    matches[b, k + radius, y, x] = (1 - share) * products[0] + share * products[1]
+    return matches
+
+
+def scores(levels, **likelihood):
+    """One pixel's scores: the logarithm of a likelihood at the levels named, hardly anything elsewhere."""
+    logits = torch.full((1, levels, 1, 1), -30.0)
+    for level, value in likelihood.items():
+        logits[0, int(level[1:])] = math.log(value)
+    return logits
+
+
+@pytest.mark.parametrize("levels", [1, 4, 9, 13])
+def test_the_fast_correlation_equals_the_plain_one(levels):
+    first, second = torch.randn(2, 2, 5, 3, 9)
+    expected = correlation_volume_plain(first, second, levels)
+    torch.testing.assert_close(correlation_volume(first, second, levels), expected)
+
+
+def test_the_correlation_is_greatest_at_the_shift_between_the_maps():
+    first = nn.functional.normalize(torch.randn(1, 16, 4, 20), dim=1)
+    second = first.roll(-3, 3)  # column x of the first is at x - 3 in the second
+    assert (correlation_volume(first, second, 8).argmax(1)[..., 3:] == 3).all()
+
+
+@pytest.mark.parametrize("radius", [1, 2])
+def test_nearby_matches_equal_the_plain_loop_between_columns_and_beyond_the_borders(radius):
+    first, second = torch.randn(2, 2, 4, 2, 7)
+    disparity = torch.tensor([0.0, 1.25, 2.5, -1.75, 5.999, 100.3, -40.5]).expand(2, 1, 2, 7)
+    expected = nearby_matches_plain(first, second, disparity, radius)
+    found = nearby_matches(first, second, disparity, radius)
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
+
+
+def test_nearby_matches_at_whole_disparities_are_those_of_the_correlation_volume():
+    first, second = torch.randn(2, 1, 4, 2, 12)
+    volume = correlation_volume(first, second, 7)
+    found = nearby_matches(first, second, torch.full((1, 1, 2, 12), 4.0), radius=2)
+    torch.testing.assert_close(found[..., 6:], volume[:, 2:7, :, 6:])
+
+
+def test_the_expected_step_is_the_mean_of_the_steps():
+    logits = torch.tensor([1.0, 1.0, 1.0, 1.0, 4.0]).log().view(1, 5, 1, 1)
+    assert expected_step(logits).item() == pytest.approx((-2 - 1 + 0 + 1 + 2 * 4) / 8)
+
+
+def test_two_equal_neighbours_give_the_level_between_them():
+    assert local_soft_argmax(scores(12, l5=1, l6=1)).item() == pytest.approx(5.5)
+
+
+@pytest.mark.parametrize(("one", "other", "expected"), [(0, 1, 0.5), (10, 11, 10.5)])
+def test_the_ends_of_the_volume_do_not_pull(one, other, expected):
+    assert local_soft_argmax(scores(12, **{f"l{one}": 1, f"l{other}": 1})).item() == pytest.approx(expected)
+
+
+def test_a_lone_peak_at_an_end_is_found_there():
+    assert local_soft_argmax(scores(12, l0=1)).item() == pytest.approx(0)
+    assert local_soft_argmax(scores(12, l11=1)).item() == pytest.approx(11)
+
+
+def test_the_window_moves_to_the_mean_and_fades_out_over_three_levels():
+    # Mean of 5 (weight 4) and 6 (weight 2): 5 + 1/3. Faded: 4 * (1 - 1/9) = 32/9 and 2 * (1 - 2/9) = 14/9.
+    assert local_soft_argmax(scores(12, l5=4, l6=2)).item() == pytest.approx(5 + 14 / 46)
+
+
+def test_a_far_second_peak_does_not_pull():
+    assert local_soft_argmax(scores(24, l4=1, l20=0.99)).item() == pytest.approx(4, abs=1e-6)
+
+
+def test_the_level_hardly_jumps_where_rounding_decides_which_one_is_best():
+    one, other = (local_soft_argmax(scores(12, l4=0.5, l5=a, l6=b)) for a, b in ((1, 0.999), (0.999, 1)))
+    assert abs(one - other).item() < 0.01
+
+
+def test_upsampling_keeps_a_constant():
+    flat = torch.full((2, 1, 3, 5), 7.25)
+    torch.testing.assert_close(
+        upsample_convex(flat, torch.randn(2, 36, 3, 5) * 5), torch.full((2, 1, 6, 10), 7.25)
+    )
+
+
+def test_upsampled_values_lie_within_those_of_the_nine_neighbours():
+    x, weights = torch.randn(1, 1, 4, 6) * 10, torch.randn(1, 36, 4, 6) * 20
+    around = nn.functional.pad(x, (1, 1, 1, 1), mode="replicate")
+    highest = nn.functional.max_pool2d(around, 3, stride=1).repeat_interleave(2, 2).repeat_interleave(2, 3)
+    lowest = -nn.functional.max_pool2d(-around, 3, stride=1).repeat_interleave(2, 2).repeat_interleave(2, 3)
+    fine = upsample_convex(x, weights)
+    assert (fine <= highest + 1e-5).all()
+    assert (fine >= lowest - 1e-5).all()
+
+
+def test_the_weights_say_which_neighbour_a_new_pixel_takes():
+    x = torch.arange(12.0).view(1, 1, 3, 4)
+    weights = torch.full((1, 9, 2, 2, 3, 4), -30.0)
+    weights[:, 1, 0, 0] = 30  # upper left new pixel: the old one above
+    weights[:, 4, 0, 1] = 30  # upper right: the old one itself
+    weights[:, 6, 1, 0] = 30  # lower left: the old one below on the left
+    weights[:, 5, 1, 1] = 30  # lower right: the old one on the right
+    fine = upsample_convex(x, weights.view(1, 36, 3, 4))[0, 0]
+    # Old pixel (1, 1) is 5: above it 1, below on the left 8, on the right 6. Shares of 1e-4 count little.
+    torch.testing.assert_close(fine[2:4, 2:4], torch.tensor([[1.0, 5.0], [8.0, 6.0]]), atol=0.01, rtol=0)
+
+
+def test_where_every_neighbour_is_refused_their_mean_is_taken():
+    x = torch.arange(9.0).view(1, 1, 3, 3)
+    fine = upsample_convex(x, torch.full((1, 36, 3, 3), -1000.0))
+    assert fine[0, 0, 2, 2].item() == pytest.approx(4)
+
+
+@pytest.mark.parametrize("kernel", [2, 4])
+def test_halving_keeps_the_grid_its_own_mirror_image(kernel):
+    halve = Halve(3, 4, kernel=kernel).eval()
+    with torch.no_grad():
+        halve[0].weight += mirrored(halve[0].weight.clone())
+    image = torch.rand(1, 3, 8, 12)
+    assert halve(image).shape == (1, 4, 4, 6)
+    torch.testing.assert_close(halve(mirrored(image)), mirrored(halve(image)))
+
+
+def test_dense_blocks_hand_on_their_input_in_front_of_what_they_add():
+    dense = DilatedDense(5, narrow=3, growth=2, dilations=(1, 2, 4)).eval()
+    x = torch.randn(1, 5, 6, 6)
+    assert dense(x).shape == (1, dense.outputs, 6, 6) == (1, 11, 6, 6)
+    torch.testing.assert_close(dense(x)[:, :5], x)
+
+
+def test_a_residual_of_nothing_is_its_input():
+    residual = Residual(3).eval()
+    nn.init.zeros_(residual.second[0].weight)
+    x = torch.rand(1, 3, 5, 5)
+    torch.testing.assert_close(residual(x), x)

@@ -1,0 +1,98 @@
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+from learn_examples import RECIPE
+
+from stereoweave.errors import FormatError
+from stereoweave.learn.recipe import Recipe, read_recipe, recipe_from
+
+RECIPES = sorted((Path(__file__).parent.parent / "recipes").glob("*.toml"))
+NEEDED = {
+    "name": "x",
+    "model": "weave",
+    "steps": 10,
+    "batch": 4,
+    "learning_rate": 1.0,
+    "warm_up_steps": 4,
+    "cool_down_steps": 2,
+    "pairs": 8,
+}
+
+
+@pytest.mark.parametrize("file", RECIPES, ids=lambda file: file.name)
+def test_every_shipped_recipe_parses(file):
+    assert read_recipe(file).steps > 0
+
+
+def test_there_are_shipped_recipes():
+    assert RECIPES
+
+
+def test_a_recipe_is_read_with_its_defaults(tmp_path):
+    file = tmp_path / "x.toml"
+    file.write_text(
+        'name = "x"\nmodel = "weave"\nsteps = 10\nbatch = 4\nlearning_rate = 1\nwarm_up_steps = 4\n'
+        "cool_down_steps = 2\npairs = 8\ncrop_size = [64, 96]\n"
+    )
+    assert read_recipe(file) == Recipe(**NEEDED, crop_size=(64, 96))
+
+
+def test_a_recipe_survives_being_a_dictionary():
+    assert recipe_from(asdict(RECIPE), "here") == RECIPE
+
+
+def test_the_learning_rate_rises_stays_and_falls():
+    recipe = Recipe(**NEEDED)
+    rates = [recipe.learning_rate_at(step) for step in range(10)]
+    assert rates == [0.25, 0.5, 0.75, 1, 1, 1, 1, 1, 1, 0.5]
+
+
+def test_the_learning_rate_without_slopes_is_constant():
+    recipe = Recipe(**NEEDED | {"warm_up_steps": 0, "cool_down_steps": 0})
+    assert {recipe.learning_rate_at(step) for step in range(10)} == {1.0}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"stepz": 3}, "unknown key 'stepz'; a recipe has name, model, seed, "),
+        ({"steps": "many"}, "steps = 'many', expected a whole number"),
+        ({"steps": 1.5}, "steps = 1.5, expected a whole number"),
+        ({"steps": True}, "steps = True, expected a whole number"),
+        ({"learning_rate": "high"}, "learning_rate = 'high', expected a number"),
+        ({"learning_rate": False}, "learning_rate = False, expected a number"),
+        ({"name": 3}, "name = 3, expected a text in quotes"),
+        ({"crop_size": 256}, "crop_size = 256, expected two whole numbers"),
+        ({"crop_size": [256]}, r"crop_size = [256], expected two whole numbers"),
+        ({"crop_size": [256, 1.5]}, r"crop_size = [256, 1.5], expected two whole numbers"),
+    ],
+)
+def test_a_wrong_key_or_value_is_named_in_one_line(changes, message):
+    with pytest.raises(FormatError) as caught:
+        recipe_from(NEEDED | changes, "my.toml")
+    assert str(caught.value).startswith(f"my.toml: {message}")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("missing", NEEDED)
+def test_a_missing_key_is_named_in_one_line(missing):
+    values = {name: value for name, value in NEEDED.items() if name != missing}
+    with pytest.raises(FormatError) as caught:
+        recipe_from(values, "my.toml")
+    assert str(caught.value) == f"my.toml: missing key '{missing}'; a recipe needs {', '.join(NEEDED)}"
+
+
+@pytest.mark.parametrize("content", [b"steps = ", b"\xff\xfe\x00", b"[table"])
+def test_a_file_that_is_no_toml_is_named_in_one_line(tmp_path, content):
+    file = tmp_path / "bad.toml"
+    file.write_bytes(content)
+    with pytest.raises(FormatError) as caught:
+        read_recipe(file)
+    assert str(caught.value).startswith(f"{file}: expected a recipe in TOML, found: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(FormatError, match=r"nowhere\.toml: expected a recipe in TOML, found: .*No such file"):
+        read_recipe(tmp_path / "nowhere.toml")

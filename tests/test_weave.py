@@ -1,0 +1,104 @@
+"""The house tests of every network in MODELS, and what WeaveNet's design promises."""
+
+import pytest
+import torch
+from learn_examples import overfitted, untrained
+from torch import nn
+
+from stereoweave.learn.export import multiply_adds
+from stereoweave.learn.models import MODELS
+from stereoweave.learn.models.layers import mirrored
+
+PARAMETERS = {"weave": 451_262}
+
+
+def random_pair(batch, height, width):
+    torch.manual_seed(1)
+    return torch.rand(batch, 3, height, width), torch.rand(batch, 3, height, width)
+
+
+@pytest.fixture(params=MODELS)
+def name(request):
+    return request.param
+
+
+@pytest.mark.parametrize("size", [(16, 16), (32, 32), (16, 112), (48, 80), (112, 32)])
+def test_any_size_that_the_network_divides_gives_maps_of_that_size(name, size):
+    with torch.no_grad():
+        maps = untrained(name)(*random_pair(1, *size))
+    assert len(maps) == 3
+    for values in maps:
+        assert values.shape == (1, 1, *size)
+        assert values.dtype == torch.float32
+        assert values.isfinite().all()
+
+
+def test_each_parameter_gets_a_gradient(name):
+    network = untrained(name).train()
+    maps = network(*random_pair(2, 32, 64))
+    torch.stack([(values * torch.rand_like(values)).sum() for values in maps]).sum().backward()
+    for parameter_name, parameter in network.named_parameters():
+        assert parameter.grad is not None, parameter_name
+        assert parameter.grad.isfinite().all(), parameter_name
+        assert parameter.grad.any(), parameter_name
+
+
+def test_a_pair_is_not_told_from_the_others_in_its_batch(name):
+    network = untrained(name)
+    left, right = random_pair(3, 32, 48)
+    with torch.no_grad():
+        among_some = network(left[:2], right[:2])
+        among_others = network(left[::2], right[::2])
+    for one, other in zip(among_some, among_others, strict=True):
+        torch.testing.assert_close(one[0], other[0], atol=1e-5, rtol=0)
+        assert (one[1] - other[1]).abs().max() > 0.01
+
+
+def test_the_network_has_its_published_number_of_parameters(name):
+    count = sum(parameter.numel() for parameter in MODELS[name]().parameters())
+    assert count == PARAMETERS[name] <= 1_000_000
+    assert f"{count:,} parameters" in MODELS[name].__doc__
+
+
+def test_the_whole_graph_costs_at_most_6_giga_multiply_adds(name):
+    count = multiply_adds(untrained(name))
+    assert count <= 6e9
+    assert f"{count / 1e9:.2f} G multiply-adds" in MODELS[name].__doc__
+
+
+def test_the_network_overfits_one_pair(name):
+    trained = overfitted(name)
+    assert trained.error_after_px < 1
+    assert trained.error_after_px < trained.error_before_px / 5
+
+
+def test_a_mirrored_pair_gives_mirrored_answers():
+    """Exactly so if the features are those of a mirror-symmetric encoder; training has to teach the rest."""
+    # In double precision rounding decides nothing between two levels that match as well.
+    network = untrained().double()
+    with torch.no_grad():
+        for layer in network.encoder.modules():
+            if isinstance(layer, nn.Conv2d):
+                layer.weight += mirrored(layer.weight.clone())
+        left, right = (image.double() for image in random_pair(1, 48, 80))
+        left_px, right_px, _ = network(left, right)
+        mirrored_left_px, mirrored_right_px, _ = network(mirrored(right), mirrored(left))
+    torch.testing.assert_close(right_px, mirrored(mirrored_left_px), atol=1e-3, rtol=0)
+    torch.testing.assert_close(left_px, mirrored(mirrored_right_px), atol=1e-3, rtol=0)
+    assert (left_px - right_px).abs().max() > 0.1
+
+
+def test_the_stages_hold_both_views_the_right_one_mirrored():
+    network = untrained()
+    pair = random_pair(2, 32, 64)
+    with torch.no_grad():
+        stages = network.stages(*pair)
+        left_px, right_px, logit = network(*pair)
+    torch.testing.assert_close(stages.disparity_px, torch.cat([left_px, mirrored(right_px)]))
+    torch.testing.assert_close(stages.confidence_logit[:2], logit)
+    assert stages.correlation.shape == stages.scores.shape == (4, network.levels, 8, 16)
+    assert stages.coarse_px.shape == (4, 1, 16, 32)
+
+
+def test_forty_eight_levels_reach_192_px():
+    assert untrained().max_disparity_px == 192
