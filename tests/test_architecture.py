@@ -1,0 +1,80 @@
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+CONTRACTS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+
+# A contract, a file, and the line in it that the contract forbids.
+BREACHES = [
+    ("The floors of the house", "errors.py", "import stereoweave.stereo"),
+    ("The floors of the house", "rendering.py", "import stereoweave.metrics"),
+    ("The floors of the house", "new_file.py", "import stereoweave.stereo"),
+    ("The floors inside learn", "learn/recipe.py", "import stereoweave.learn.train"),
+    ("The floors inside learn", "learn/new_file.py", "import torch"),
+    ("One network never imports another", "learn/models/rival.py", "import stereoweave.learn.models.weave"),
+    ("PyTorch is imported under learn alone", "io.py", "def tensor():\n    import torch"),
+    ("PyTorch is imported under learn alone", "io.py", "from lightning_fabric import Fabric"),
+    ("Nothing but the commands imports learn", "report.py", "import stereoweave.learn.recipe"),
+]
+
+
+def printed_by(program: str) -> str:
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
+    command = [Path(sys.executable).with_name("lint-imports"), "--no-cache"]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
+def modules_without_pytorch() -> list[str]:
+    files = (path.relative_to(REPOSITORY) for path in (REPOSITORY / "stereoweave").rglob("*.py"))
+    names = (".".join(path.with_suffix("").parts).removesuffix(".__init__") for path in files)
+    return sorted(name for name in names if not name.startswith("stereoweave.learn"))
+
+
+def test_importing_the_package_imports_nothing_but_itself_and_the_standard_library():
+    program = (
+        "import sys; before = set(sys.modules); import stereoweave; "
+        "after = {name.partition('.')[0] for name in sys.modules.keys() - before}; "
+        "print(after - sys.stdlib_module_names)"
+    )
+    assert printed_by(program) == "{'stereoweave'}"
+
+
+def test_every_module_outside_learn_can_be_imported_without_pytorch_and_gradio():
+    modules = modules_without_pytorch()
+    assert "stereoweave.matcher" in modules
+    program = (
+        f"import sys, {', '.join(modules)}; "
+        "print({'torch', 'lightning_fabric', 'gradio', 'onnx', 'skimage'} & sys.modules.keys())"
+    )
+    assert printed_by(program) == "set()"
+
+
+def test_the_imports_of_the_package_keep_every_contract():
+    done = lint_imports(REPOSITORY)
+    assert done.returncode == 0, done.stdout
+    assert f"{len(CONTRACTS)} kept, 0 broken" in done.stdout
+
+
+@pytest.mark.parametrize(("contract", "file", "line"), BREACHES)
+def test_a_breach_of_a_contract_is_caught(tmp_path, contract, file, line):
+    shutil.copytree(REPOSITORY / "stereoweave", tmp_path / "stereoweave")
+    shutil.copy(REPOSITORY / "pyproject.toml", tmp_path)
+    with (tmp_path / "stereoweave" / file).open("a") as stream:
+        stream.write(f"\n{line}\n")
+    done = lint_imports(tmp_path)
+    assert done.returncode == 1
+    assert re.findall(r"^(.+?) BROKEN", done.stdout, re.MULTILINE) == [contract]
+
+
+def test_each_contract_has_a_breach_that_is_tried():
+    assert {contract["name"] for contract in CONTRACTS} == {contract for contract, _, _ in BREACHES}

@@ -1,0 +1,160 @@
+"""What the README says, done as a user would do it: in environments of their own, outside the repository."""
+
+import csv
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stereoweave.io import read_image
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+DEMO, INSTALL, COMMANDS = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
+(PROGRAM,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+LARGEST_ENVIRONMENT_BYTES = 700e6
+
+
+def run(command: list[str | Path], folder: Path, **environment: str) -> str:
+    """What the command printed; an error of its own is shown whole."""
+    done = subprocess.run(
+        command, cwd=folder, env=os.environ | environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def copied_repository(folder: Path) -> Path:
+    """What a fresh checkout has for users, in a folder of that name."""
+    folder.mkdir()
+    for name in ("LICENSE", "Makefile", "README.md", "constraints.txt", "pyproject.toml"):
+        shutil.copy(REPOSITORY / name, folder)
+    for name in ("examples", "stereoweave"):
+        shutil.copytree(REPOSITORY / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+    return folder
+
+
+def packages_in(environment: Path) -> set[str]:
+    return {path.name for path in environment.glob("lib/python*/site-packages/*") if path.is_dir()}
+
+
+def write_pair(folder: Path) -> None:
+    """The files that the README's commands name: a pair of 96x64, 8 px apart, and a folder of one scene."""
+    coarse = np.random.default_rng(0).integers(0, 256, (8, 13, 3), dtype=np.uint8)
+    photograph = Image.fromarray(coarse).resize((104, 64))
+    left, right = photograph.crop((0, 0, 96, 64)), photograph.crop((8, 0, 104, 64))
+    (folder / "scenes" / "wall").mkdir(parents=True)
+    for place in (folder, folder / "scenes" / "wall"):
+        left.save(place / "left.png")
+        right.save(place / "right.png")
+    Image.fromarray(np.full((64, 96), 8 * 256, np.uint16)).save(folder / "scenes" / "wall" / "disparity.png")
+    Image.fromarray(np.hstack([left, right])).save(folder / "side_by_side.png")
+    (folder / "calib.txt").write_text(
+        "cam0=[100 0 48; 0 100 32; 0 0 1]\ndoffs=0\nbaseline=80\nwidth=96\nheight=64\n"
+    )
+
+
+@pytest.fixture(scope="module")
+def caches(tmp_path_factory) -> str:
+    """Where the compiled kernels of these environments go, so that the user's cache keeps none of them."""
+    return str(tmp_path_factory.mktemp("caches"))
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory, caches) -> tuple[Path, str]:
+    """A checkout in which `make demo` was run once, and what that printed."""
+    checkout = copied_repository(tmp_path_factory.mktemp("demo") / "checkout")
+    assert DEMO == "make demo\n"
+    return checkout, run(["make", "demo", f"PYTHON={sys.executable}"], checkout, NUMBA_CACHE_DIR=caches)
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory) -> Path:
+    """An empty environment outside the repository, in which the README's wheel was built and installed."""
+    folder = tmp_path_factory.mktemp("wheel")
+    environment = folder / "environment"
+    run([sys.executable, "-m", "venv", environment], folder)
+    checkout = copied_repository(folder / "checkout")
+    run(["bash", "-ec", INSTALL], checkout, PATH=f"{environment / 'bin'}:{os.environ['PATH']}")
+    shutil.rmtree(checkout)
+    return environment
+
+
+@pytest.fixture
+def pictures(tmp_path) -> Path:
+    write_pair(tmp_path)
+    return tmp_path
+
+
+def test_make_demo_on_a_fresh_checkout_says_where_the_report_is(demo):
+    checkout, printed = demo
+    report = checkout / "demo-out" / "report.html"
+    assert f"{report}\n" in printed
+    assert report.is_file()
+    assert read_image(checkout / "demo-out" / "view.png").shape == (480, 640, 3)
+    assert (checkout / "demo-out" / "depth.png").is_file()
+
+
+def test_the_environment_of_the_demo_is_small_and_has_no_pytorch(demo):
+    environment = demo[0] / ".venv-core"
+    files = (path for path in environment.rglob("*") if path.is_file() and not path.is_symlink())
+    assert sum(path.stat().st_size for path in files) < LARGEST_ENVIRONMENT_BYTES
+    assert {"numpy", "onnxruntime"} <= packages_in(environment)
+    assert "torch" not in packages_in(environment)
+
+
+def test_make_demo_takes_the_users_own_pair_and_installs_once(demo, pictures, caches):
+    checkout, _ = demo
+    pair = [f"LEFT={pictures / 'left.png'}", f"RIGHT={pictures / 'right.png'}"]
+    assert "make demo LEFT=left.png RIGHT=right.png" in README
+    printed = run(["make", "demo", *pair], checkout, NUMBA_CACHE_DIR=caches)
+    assert "pip install" not in printed
+    assert read_image(checkout / "demo-out" / "view.png").shape == (64, 96, 3)
+    assert not (checkout / "demo-out" / "depth.png").exists()
+
+
+def test_the_commands_run_from_the_wheel_in_an_empty_environment(installed, pictures, caches):
+    assert "torch" not in packages_in(installed)
+    path = f"{installed / 'bin'}:{os.environ['PATH']}"
+    run(["bash", "-ec", COMMANDS], pictures, PATH=path, NUMBA_CACHE_DIR=caches)
+    described = re.findall(r"^\| `([\w.]+)` \|", README, re.MULTILINE)
+    assert sorted(path.name for path in (pictures / "metric").iterdir()) == sorted(described)
+    assert read_image(pictures / "view.png").shape == (64, 96, 3)
+    assert (pictures / "rows.csv").is_file()
+
+
+def test_the_program_runs_from_the_wheel_in_an_empty_environment(installed, pictures, caches):
+    run([installed / "bin" / "python", "-c", PROGRAM], pictures, NUMBA_CACHE_DIR=caches)
+    assert read_image(pictures / "view.png").shape == (64, 96, 3)
+
+
+def test_each_command_that_is_mentioned_exists(pictures):
+    command = Path(sys.executable).with_name("stereoweave")
+    mentioned = set(re.findall(r"`stereoweave (\w+)`", README))
+    assert mentioned == {"train", "export"}
+    for name in mentioned:
+        assert "Usage: stereoweave" in run([command, name, "--help"], pictures)
+
+
+def test_each_file_that_is_linked_exists():
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if "://" not in link]
+    assert [link for link in links if not (REPOSITORY / link).exists()] == []
+
+
+def test_the_table_of_results_says_what_the_csv_says():
+    measured = REPOSITORY / "results" / "pairs.csv"
+    rows = csv.DictReader(measured.read_text().splitlines()) if measured.exists() else []
+    decimals = {"epe_px": 2, "bad1_percent": 1, "bad2_percent": 1, "d1_percent": 1, "time_relative": 2}
+    expected = [
+        [row["matcher"], *(f"{float(row[column]):.{places}f}" for column, places in decimals.items())]
+        for row in rows
+        if row["scene"] == "mean"
+    ]
+    table = README.split("<!-- results -->")[1].split("\n\n")[1].splitlines()[2:]
+    assert [[cell.strip() for cell in line.strip("|").split("|")] for line in table] == expected
