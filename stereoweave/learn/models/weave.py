@@ -177,5 +177,6 @@ class WeaveNet(nn.Module):
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Left disparity, right disparity and the left view's confidence logit, each [B, 1, H, W]."""
         stages = self.stages(left, right)
-        left_px, mirrored_right_px = stages.disparity_px.chunk(2)
+        # At infinity noise goes both ways; a rectified pair of parallel cameras has nothing behind that.
+        left_px, mirrored_right_px = stages.disparity_px.clamp(min=0).chunk(2)
         return left_px, mirrored(mirrored_right_px), stages.confidence_logit.chunk(2)[0]
