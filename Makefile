@@ -13,6 +13,9 @@ DEV = .venv
 
 EXAMPLE = examples/left.png examples/right.png
 ifeq ($(LEFT),)
+ifneq ($(RIGHT),)
+$(error RIGHT needs LEFT beside it: make demo LEFT=left.png RIGHT=right.png)
+endif
 PAIR = $(EXAMPLE)
 CALIBRATION = --calib examples/calib.txt
 else

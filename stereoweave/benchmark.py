@@ -13,13 +13,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from stereoweave.data.readers import Scene
+from stereoweave.errors import StereoweaveError
 from stereoweave.io import replacing
 from stereoweave.metrics import bad_percent, d1_percent, epe_px
 from stereoweave.stereo import StereoPair
 
 Match = Callable[[StereoPair], Float[np.ndarray, "h w"]]
 
-SGBM = "sgbm"
+SGBM, MEAN = "sgbm", "mean"
 SGBM_DISPARITIES = 192
 TURNS = 5
 
@@ -46,7 +47,14 @@ class Row:
 
 
 def score_pairs(matchers: Mapping[str, Match], scenes: Iterable[Scene]) -> list[Row]:
-    """A row per scene and matcher, then a mean row per matcher; OpenCV's SGBM joins them as "sgbm"."""
+    """A row per scene and matcher, then a mean row per matcher; OpenCV's SGBM joins them as "sgbm".
+
+    Raises:
+        StereoweaveError: A matcher is called "sgbm" or "mean", or is a file of that name.
+    """
+    for name in matchers:
+        if Path(name).stem in (SGBM, MEAN):
+            raise StereoweaveError(f"{name}: expected a name that the table does not use itself; rename it")
     everyone = {SGBM: opencv_sgbm(), **matchers}
     rows = [row for scene in scenes for row in _score_scene(everyone, scene)]
     return rows + _mean_rows(rows, everyone)
@@ -148,7 +156,7 @@ def _mean_rows(rows: list[Row], names: Iterable[str]) -> list[Row]:
     }
     for mean in means.values():
         mean["time_relative"] = mean["time_ms"] / means[SGBM]["time_ms"]
-    return [Row(matcher=name, scene="mean", **mean) for name, mean in means.items()]
+    return [Row(matcher=name, scene=MEAN, **mean) for name, mean in means.items()]
 
 
 def _last_known(

@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return app(arguments, prog_name="stereoweave", standalone_mode=False) or 0
     except typer.TyperException as error:
         message = error.format_message().rstrip(".") + "; see stereoweave --help"
-    except (ValueError, OSError) as error:
+    except (StereoweaveError, OSError) as error:
         message = str(error)
     typer.echo("stereoweave: " + " ".join(message.splitlines()), err=True)
     return 2
@@ -89,7 +89,7 @@ def depth(  # noqa: PLR0913 - each is a word of the command line
         names = tuple(picture.name for picture in pictures)
         summary = summarize(pair, estimate, pictures=names, model=model, estimate_ms=estimate_ms)
         notes = _write_maps(folder, pair, estimate, summary)
-        write_report(folder / "report.html", pair, estimate, summary)
+        write_report(folder / "report.html", pair, estimate, summary, threads)
     (_tell_json if as_json else _tell)(summary, notes, out)
 
 
@@ -104,12 +104,15 @@ def view(  # noqa: PLR0913 - each is a word of the command line
     threads: Threads = None,
 ) -> None:
     """A new view of a stereo pair, from between its two cameras or a little beyond them."""
-    from stereoweave.io import write_image
-    from stereoweave.rendering import render
+    from stereoweave.io import picture_kind, write_image
+    from stereoweave.rendering import check_position, render
 
+    check_position(position)
+    picture_kind(out)
+    _place_for(out)
     pair = _read(pictures)
     estimate = _matcher(model, threads).estimate(pair.left, pair.right)
-    new = render(pair.left, pair.right, estimate, position=position)
+    new = render(pair.left, pair.right, estimate, position, threads)
     write_image(out, new.image)
     typer.echo(f"{out}: view at {position:g}, {100 * (~new.drawn).mean():.1f} % of it seen by neither camera")
 
@@ -119,23 +122,25 @@ def pairs(
     folder: Annotated[
         Path, typer.Argument(help="Holds a folder a scene: left.png, right.png, disparity.png.")
     ],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="A CSV file for the rows.")] = None,
-    model: Annotated[list[str] | None, typer.Option(help="As for depth; may be given again.")] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("pairs.csv"),
+    model: Annotated[
+        list[str] | None,
+        typer.Option(help="As for depth; may be given again. All shipped networks unless given."),
+    ] = None,
     threads: Threads = None,
 ) -> None:
     """Accuracy and time of networks and of OpenCV's SGBM on pairs with known disparity."""
-    from stereoweave.benchmark import score_pairs, write_csv
+    from stereoweave.benchmark import MEAN, score_pairs, write_csv
     from stereoweave.data.readers import read_scenes
-    from stereoweave.io import make_folder
+    from stereoweave.matcher import shipped_models
 
+    _place_for(out)
     scenes = read_scenes(folder)
-    matchers = {name: _disparity_by(_matcher(name, threads)) for name in model or ["small"]}
-    if out:
-        make_folder(out.parent)
+    matchers = {name: _disparity_by(_matcher(name, threads)) for name in model or shipped_models()}
     rows = score_pairs(matchers, scenes)
-    if out:
-        write_csv(out, rows)
-    _tell_rows([row for row in rows if row.scene == "mean"])
+    write_csv(out, rows)
+    _tell_rows([row for row in rows if row.scene == MEAN])
+    typer.echo(f"rows: {out}")
 
 
 @app.command()
@@ -211,15 +216,23 @@ def _results_in(out: Path) -> Iterator[Path]:
 
     Files of an earlier result that this one does not have are removed, so that all in `out` belong together.
     """
-    from stereoweave.io import make_folder
-
-    standing = make_folder(next(path for path in (out, *out.parents) if path.exists()))
+    standing = _place_for(*(out / file for file in FILES))
     with tempfile.TemporaryDirectory(prefix=".stereoweave-", dir=standing) as name:
         yield Path(name)
         out.mkdir(parents=True, exist_ok=True)
         for file in FILES:
             fresh = Path(name, file)
             fresh.replace(out / file) if fresh.exists() else (out / file).unlink(missing_ok=True)
+
+
+def _place_for(*files: Path) -> Path:
+    """The nearest folder above files of one folder that is there, tried; an error if a file is a folder."""
+    from stereoweave.io import make_folder
+
+    for file in files:
+        if file.is_dir():
+            raise StereoweaveError(f"{file}: expected a file that can be written, found a folder")
+    return make_folder(next(path for path in files[0].parents if path.exists()))
 
 
 def _write_maps(folder: Path, pair: "StereoPair", estimate: "Estimate", summary: "Summary") -> list[str]:

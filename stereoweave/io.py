@@ -17,6 +17,15 @@ from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.stereo import StereoCamera, StereoPair
 
 SMALLEST_SIDE_PX = 32
+_KINDS = {
+    ".png": "PNG",
+    ".jpg": "JPEG",
+    ".jpeg": "JPEG",
+    ".tif": "TIFF",
+    ".tiff": "TIFF",
+    ".webp": "WEBP",
+    ".bmp": "BMP",
+}
 _PFM_HEADER = re.compile(rb"Pf\s+(\d+)\s+(\d+)\s+(\S+)\s")
 
 
@@ -65,12 +74,17 @@ def read_side_by_side(path: str | Path) -> StereoPair:
 
 def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"]) -> None:
     """Writes an RGB or grey picture in the format that the name's ending asks for, such as .png or .jpg."""
-    kind = Image.registered_extensions().get(Path(path).suffix.lower(), "")
-    if kind not in Image.SAVE:
+    _save(path, image, picture_kind(path))
+
+
+def picture_kind(path: str | Path) -> str:
+    """Pillow's name of the format that the ending of `path` asks for; StereoweaveError for an unknown one."""
+    ending = Path(path).suffix
+    if ending.lower() not in _KINDS:
         raise StereoweaveError(
-            f"{path}: expected the ending of a picture, such as .png, found {Path(path).suffix!r}"
+            f"{path}: expected the ending of a picture, {', '.join(_KINDS)}, found {ending!r}"
         )
-    _save(path, image, kind)
+    return _KINDS[ending.lower()]
 
 
 def read_pfm(path: str | Path) -> Float32[np.ndarray, "h w"]:
@@ -231,10 +245,11 @@ def _rgb(picture: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
         # A copy: Pillow lends its pixels read-only, for which Numba compiles anew and PyTorch warns.
         return np.array(picture.convert("RGB"))
     values = np.asarray(picture)
-    if picture.mode == "F" or values.max() > 65535:
-        raise ValueError(f"more than 16 bits a channel, mode {picture.mode}")
-    # The upper byte, as Pillow reduces colour pictures of 16 bits.
-    return np.repeat((values >> 8).astype(np.uint8)[..., None], 3, axis=2)
+    if picture.mode == "F" or values.min() < 0 or values.max() > 65535:
+        raise ValueError(f"more than 16 bits a channel or values below 0, mode {picture.mode}")
+    # The upper byte, as Pillow reduces colour pictures of 16 bits; a file of 32 bits may hold 8 of them.
+    bits = 8 if picture.mode != "I" or values.max() > 255 else 0
+    return np.repeat((values >> bits).astype(np.uint8)[..., None], 3, axis=2)
 
 
 def _save(

@@ -6,8 +6,8 @@ A matcher file (docs/architecture.md) takes `left` and `right`, float32 [B, 3, H
 
 import functools
 import math
-import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
@@ -19,7 +19,9 @@ from jaxtyping import Bool, Float, UInt8
 from stereoweave.errors import MatcherError, StereoweaveError
 from stereoweave.io import SMALLEST_SIDE_PX
 from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.threads import thread_count
 
+_FLOAT32 = "tensor(float)"
 # A network compares every column of a row with every other: this many pairs of columns take about 0.4 GB.
 _PIXEL_PAIRS_AT_ONCE = 1920 * 1920 * 320
 # What a strip sees beyond its own rows; from twice this distance the network's answer hardly changes.
@@ -50,27 +52,17 @@ class Matcher:
     def __init__(self, model: str | Path = "small", *, threads: int | None = None) -> None:
         import onnxruntime  # type: ignore[import-untyped]
 
-        if threads is not None and threads < 1:
-            raise StereoweaveError(f"threads: expected 1 or more, got {threads}")
-        self._path = path = _model_file(model)
+        self._path = _model_file(model)
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads or _usable_cores()
+        # Not ONNX Runtime's own choice: on a virtual machine it counts two cores as one with two threads.
+        options.intra_op_num_threads = thread_count(threads)
         options.log_severity_level = 4  # what is wrong with a file is said once, by the error below
-        try:
+        with _naming(self._path):
             self._session = onnxruntime.InferenceSession(
-                str(path), options, providers=["CPUExecutionProvider"]
+                str(self._path), options, providers=["CPUExecutionProvider"]
             )
-        except Exception as error:  # ONNX Runtime's errors have no common base class
-            reason = str(error).splitlines()[0]
-            raise MatcherError(
-                f"{path}: expected an ONNX matcher, found a file ONNX Runtime refuses: {reason}"
-            ) from error
-        self._outputs = [output.name for output in self._session.get_outputs()]
-        self._check_interface(path)
-        properties = self._session.get_modelmeta().custom_metadata_map
-        self.name = properties["stereoweave.name"]
-        self.multiple_of = int(properties["stereoweave.multiple_of"])
-        self.max_disparity_px = float(properties["stereoweave.max_disparity_px"])
+        self._outputs = self._checked_outputs()
+        self.name, self.multiple_of, self.max_disparity_px = self._checked_properties()
 
     def estimate(self, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]) -> Estimate:
         """Disparity of both views, confidence and occlusion of a rectified pair, uint8 RGB of one size.
@@ -119,14 +111,21 @@ class Matcher:
     def _run(self, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]) -> Maps:
         height, width = left.shape[:2]
         inputs = {"left": self._tensor(left), "right": self._tensor(right)}
-        outputs = dict(zip(self._outputs, self._session.run(None, inputs), strict=True))
+        with _naming(self._path):
+            outputs = dict(zip(self._outputs, self._session.run(self._outputs, inputs), strict=True))
+        expected = [1, 1, *inputs["left"].shape[2:]]
         for name, value in outputs.items():
+            if list(value.shape) != expected:
+                raise MatcherError(
+                    f"{self._path}: expected {name} of shape {expected}, found {list(value.shape)}"
+                )
             if not np.isfinite(value).all():
                 raise MatcherError(
                     f"{self._path}: expected finite values of {name}, found NaN or infinite ones"
                 )
-        cut = {name: np.ascontiguousarray(value[0, 0, :height, :width]) for name, value in outputs.items()}
-        return Maps(**{name: value for name, value in cut.items() if name in Maps._fields})
+        return Maps(
+            **{name: np.ascontiguousarray(value[0, 0, :height, :width]) for name, value in outputs.items()}
+        )
 
     def _tensor(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "1 3 h2 w2"]:
         """The image as the network takes it, its border repeated up to a size that it can divide."""
@@ -134,20 +133,35 @@ class Matcher:
         padded = cv2.copyMakeBorder(image, 0, below, 0, beside, cv2.BORDER_REPLICATE)
         return cv2.dnn.blobFromImage(padded, 1 / 255)
 
-    def _check_interface(self, path: Path) -> None:
-        inputs = [input_.name for input_ in self._session.get_inputs()]
-        if inputs != ["left", "right"] or "disparity_px" not in self._outputs:
+    def _checked_outputs(self) -> list[str]:
+        """The outputs that `Maps` has a place for."""
+        inputs = {value.name: value.type for value in self._session.get_inputs()}
+        outputs = {value.name: value.type for value in self._session.get_outputs()}
+        used = [name for name in Maps._fields if name in outputs]
+        all_float32 = all(outputs[name] == _FLOAT32 for name in used)
+        if inputs != {"left": _FLOAT32, "right": _FLOAT32} or "disparity_px" not in used or not all_float32:
             raise MatcherError(
-                f"{path}: expected a matcher, inputs left and right and an output disparity_px, "
-                f"found inputs {', '.join(inputs)} and outputs {', '.join(self._outputs)}"
+                f"{self._path}: expected a matcher, inputs left and right and an output disparity_px, "
+                f"all {_FLOAT32}, found inputs {_listed(inputs)} and outputs {_listed(outputs)}"
             )
-        properties = self._session.get_modelmeta().custom_metadata_map
-        for key in ("name", "multiple_of", "max_disparity_px"):
-            if f"stereoweave.{key}" not in properties:
-                raise MatcherError(
-                    f"{path}: expected a matcher's metadata, found no stereoweave.{key}; "
-                    "`stereoweave export` writes it"
-                )
+        return used
+
+    def _checked_properties(self) -> tuple[str, int, float]:
+        """Name, multiple_of and max_disparity_px from the file's metadata."""
+        metadata = self._session.get_modelmeta().custom_metadata_map
+        keys = [f"stereoweave.{key}" for key in ("name", "multiple_of", "max_disparity_px")]
+        try:
+            name, multiple_of, max_disparity_px = (metadata[key] for key in keys)
+            if int(multiple_of) < 1:
+                raise ValueError(multiple_of)
+            return name, int(multiple_of), float(max_disparity_px)
+        except KeyError as missing:
+            found = f"no {missing.args[0]}"
+        except ValueError:
+            found = f"multiple_of {multiple_of!r}, max_disparity_px {max_disparity_px!r}"
+        raise MatcherError(
+            f"{self._path}: expected a matcher's metadata, found {found}; `stereoweave export` writes it"
+        )
 
 
 def estimate(
@@ -168,7 +182,8 @@ def estimate(
     Raises:
         ValueError: MatcherError for a model that is none, StereoweaveError for images that are none.
     """
-    return _kept_matcher(str(model), threads).estimate(left, right)
+    path = _model_file(model).absolute()
+    return _kept_matcher(path, path.stat().st_mtime_ns, threads).estimate(left, right)
 
 
 def shipped_models() -> list[str]:
@@ -177,8 +192,25 @@ def shipped_models() -> list[str]:
 
 
 @functools.lru_cache(maxsize=4)
-def _kept_matcher(model: str, threads: int | None) -> Matcher:
-    return Matcher(model, threads=threads)
+def _kept_matcher(path: Path, modified_ns: int, threads: int | None) -> Matcher:
+    # modified_ns is part of the key alone: a file that was written anew is loaded anew.
+    return Matcher(path, threads=threads)
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Turns ONNX Runtime's errors into one line that names the matcher file."""
+    try:
+        yield
+    except Exception as error:  # they have no common base class
+        reason = str(error).splitlines()[0]
+        raise MatcherError(
+            f"{path}: expected an ONNX matcher, found a file ONNX Runtime refuses: {reason}"
+        ) from error
+
+
+def _listed(types: dict[str, str]) -> str:
+    return ", ".join(f"{name} {kind}" for name, kind in types.items())
 
 
 def _weights_folder() -> Path:
@@ -197,13 +229,6 @@ def _model_file(model: str | Path) -> Path:
             "or the path of an .onnx file"
         )
     return _weights_folder() / f"{model}.onnx"
-
-
-def _usable_cores() -> int:
-    # Not ONNX Runtime's own choice: on a virtual machine it counts two cores as one with two threads.
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _strips(height: int, rows: int) -> Iterator[slice]:
@@ -244,4 +269,5 @@ def _confidence(
     """The network's own probability; without one, what the two views' disagreement suggests."""
     if logit is None:
         return np.exp(-np.abs(disagreement_px))
-    return 1 / (1 + np.exp(-logit))
+    # The logistic function, in a form that cannot overflow.
+    return 0.5 * (1 + np.tanh(logit / 2))

@@ -1,6 +1,5 @@
 """New views from an estimate: what a camera elsewhere on the line through the two would have seen."""
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
@@ -11,6 +10,7 @@ from jaxtyping import Float, UInt8
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import Estimate, StereoPair, View
+from stereoweave.threads import thread_count
 
 if TYPE_CHECKING:
     from stereoweave.rendering_kernels import Canvas, Side
@@ -31,6 +31,7 @@ def render(
     right: UInt8[np.ndarray, "h w 3"],
     estimate: Estimate,
     position: float,
+    threads: int | None = None,
 ) -> View:
     """The view from a position on the line through the two cameras, made of both photographs.
 
@@ -45,20 +46,21 @@ def render(
         right: The right one, of the same size.
         estimate: Of these two photographs (`stereoweave.estimate`).
         position: 0 is the left camera, 1 the right one; -0.5 to 1.5.
+        threads: How many threads may be used, of which four at most are; all cores if left out.
 
     Returns:
         The view, of the photographs' size; `drawn` is False where the colour was invented. At 0 and 1 it is
         the photograph itself.
 
     Raises:
-        ValueError: If the sizes differ, or the position is out of its range.
+        ValueError: If the sizes differ, or a number is out of its range.
     """
     _check_size(StereoPair(left=left, right=right), estimate)
     check_position(position)
     if position in (0, 1):
         photo = right if position else left
         return View(image=photo.copy(), drawn=np.ones(photo.shape[:2], bool))
-    return _rendered(left, right, estimate, float(position))
+    return _rendered(left, right, estimate, float(position), min(_MOST_THREADS, thread_count(threads)))
 
 
 def check_position(position: float) -> None:
@@ -78,7 +80,7 @@ def _check_size(pair: StereoPair, estimate: Estimate) -> None:
         )
 
 
-def _rendered(left: np.ndarray, right: np.ndarray, estimate: Estimate, position: float) -> View:
+def _rendered(left: np.ndarray, right: np.ndarray, estimate: Estimate, position: float, threads: int) -> View:
     from stereoweave import rendering_kernels as kernels  # Numba takes half a second to import
 
     distances = abs(position), abs(1 - position)
@@ -99,9 +101,9 @@ def _rendered(left: np.ndarray, right: np.ndarray, estimate: Estimate, position:
     def paint(rows: slice) -> None:
         kernels.paint(*(side.rows(rows) for side in sides), canvas.rows(rows))
 
-    _in_bands(place, left.shape[0])
+    _in_bands(place, left.shape[0], threads)
     _align(canvas)
-    _in_bands(paint, left.shape[0])
+    _in_bands(paint, left.shape[0], threads)
     kernels.fill(canvas)
     return View(image=np.clip(np.rint(canvas.image), 0, 255).astype(np.uint8), drawn=canvas.drawn)
 
@@ -154,12 +156,11 @@ def _align(canvas: "Canvas") -> None:
     canvas.front_px[:] += canvas.products[..., 2] * np.clip(step_px, -_LARGEST_STEP_PX, _LARGEST_STEP_PX)
 
 
-def _in_bands(work: Callable[[slice], None], height: int) -> None:
-    """Do the work on bands of rows, in as many threads as there are cores, up to four.
+def _in_bands(work: Callable[[slice], None], height: int, count: int) -> None:
+    """Do the work on that many bands of rows, each in a thread.
 
     Rows are independent: in rectified photographs everything moves along them.
     """
-    count = min(_MOST_THREADS, os.cpu_count() or 1)
     ends = [height * band // count for band in range(count + 1)]
     with ThreadPoolExecutor(count) as pool:
         list(pool.map(work, map(slice, ends[:-1], ends[1:])))

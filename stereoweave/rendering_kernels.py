@@ -100,11 +100,11 @@ def kernel(function: Callable[..., None]) -> Callable[..., None]:
     settings: typing.Any = config
     chosen_by_user = settings.CACHE_DIR
     # Numba reads this setting while it decorates; it is put back for the sake of other packages' functions.
-    settings.CACHE_DIR = chosen_by_user or str(cache_folder())
     try:
+        settings.CACHE_DIR = chosen_by_user or str(cache_folder())
         return njit(cache=True, nogil=True)(function)
     except RuntimeError:
-        # No folder at all can be written: better to compile in every process than not to work.
+        # No home, or no folder that can be written: better to compile in every process than not to work.
         return njit(nogil=True)(function)
     finally:
         settings.CACHE_DIR = chosen_by_user

@@ -79,22 +79,27 @@ def summarize(
     )
 
 
-def write_report(path: Path, pair: StereoPair, estimate: Estimate, summary: Summary) -> None:
+def write_report(
+    path: Path, pair: StereoPair, estimate: Estimate, summary: Summary, threads: int | None = None
+) -> None:
     """Write the page: a single HTML file that asks the network for nothing.
 
     It shows the left image, depth (disparity without a camera), confidence, the numbers of `summary`, and the
-    views from POSITIONS under a slider. Pictures are at most 1000 px on their longer side.
+    views from POSITIONS under a slider. Pictures are at most 1000 px on their longer side;
+    `threads` is as for `render`.
     """
     template = importlib.resources.files("stereoweave").joinpath("report.html").read_text(encoding="utf-8")
-    page = string.Template(template).substitute(_fields(pair, estimate, summary))
+    page = string.Template(template).substitute(_fields(pair, estimate, summary, threads))
     with replacing(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
 
 
-def _fields(pair: StereoPair, estimate: Estimate, summary: Summary) -> dict[str, object]:
+def _fields(pair: StereoPair, estimate: Estimate, summary: Summary, threads: int | None) -> dict[str, object]:
     """Everything that the template asks for, by name."""
     small, small_estimate = _shrunk(pair, estimate)
-    views = [render(small.left, small.right, small_estimate, position=position) for position in POSITIONS]
+    views = [
+        render(small.left, small.right, small_estimate, position, threads=threads) for position in POSITIONS
+    ]
     range_px = colour_range_px(estimate.disparity_px)
     shown_size = (small.left.shape[1], small.left.shape[0])
     data = {

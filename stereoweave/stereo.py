@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from stereoweave.errors import StereoweaveError
+
 
 @dataclass(frozen=True, kw_only=True)
 class StereoCamera:
@@ -25,11 +27,11 @@ class StereoCamera:
 
     def __post_init__(self) -> None:
         if not (self.focal_px > 0 and self.baseline_m > 0):
-            raise ValueError(
+            raise StereoweaveError(
                 f"focal_px and baseline_m must be positive, got {self.focal_px} and {self.baseline_m}"
             )
         if not np.isfinite([self.focal_px, self.baseline_m, self.cx_px, self.cy_px, self.doffs_px]).all():
-            raise ValueError(f"a camera's numbers must be finite, got {self}")
+            raise StereoweaveError(f"a camera's numbers must be finite, got {self}")
 
     def depth_m(self, disparity_px: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
         """Depth along the optical axis in metres; infinite where disparity_px + doffs_px <= 0."""
@@ -54,11 +56,11 @@ class StereoPair:
     def __post_init__(self) -> None:
         for side, image in (("left", self.left), ("right", self.right)):
             if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-                raise ValueError(
+                raise StereoweaveError(
                     f"{side} image: expected uint8 RGB [H, W, 3], got {image.dtype} {list(image.shape)}"
                 )
         if self.left.shape != self.right.shape:
-            raise ValueError(
+            raise StereoweaveError(
                 "left and right images must be of one size, "
                 f"got {_size(self.left)} and {_size(self.right)}; crop or rescale one of them"
             )
@@ -91,10 +93,12 @@ class Estimate:
         for name in ("disparity_px", "right_disparity_px", "confidence", "occluded"):
             value = getattr(self, name)
             if value.shape != shape:
-                raise ValueError(f"{name}: expected the shape of disparity_px {shape}, got {value.shape}")
+                raise StereoweaveError(
+                    f"{name}: expected the shape of disparity_px {shape}, got {value.shape}"
+                )
             if not np.isfinite(value).all():
                 count = int((~np.isfinite(value)).sum())
-                raise ValueError(
+                raise StereoweaveError(
                     f"{name}: expected finite values, got {count} NaN or infinite ones; fill them first"
                 )
 

@@ -15,6 +15,7 @@ def synthesize(
     right: UInt8[np.ndarray, "h w 3"],
     position: float,
     model: str | Path = "small",
+    threads: int | None = None,
 ) -> View:
     """The view from a position on the line through two cameras: `estimate`, then `render`.
 
@@ -23,6 +24,7 @@ def synthesize(
         right: The right one, of the same size.
         position: 0 is the left camera, 1 the right one; -0.5 to 1.5.
         model: As for `estimate`.
+        threads: How many threads may be used; all cores if left out.
 
     Returns:
         The view, of the photographs' size; `drawn` is False where the colour was invented.
@@ -31,4 +33,5 @@ def synthesize(
         ValueError: As `estimate` and `render`; a position out of its range before anything is matched.
     """
     check_position(position)
-    return render(left, right, estimate(left, right, model=model), position)
+    found = estimate(left, right, model=model, threads=threads)
+    return render(left, right, found, position, threads)

@@ -6,6 +6,7 @@ import pytest
 
 from stereoweave.benchmark import TURNS, fill_rows, opencv_sgbm, score_pairs, write_csv
 from stereoweave.data.readers import Scene, read_scenes
+from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import StereoPair
 
 
@@ -47,6 +48,12 @@ def test_times_are_relative_to_sgbm_in_the_same_row(rng):
         assert row.time_relative == pytest.approx(row.time_ms / times_ms["sgbm", row.scene])
     for name in ("constant", "sgbm"):
         assert times_ms[name, "mean"] == pytest.approx((times_ms[name, "a"] + times_ms[name, "b"]) / 2)
+
+
+@pytest.mark.parametrize("name", ["sgbm", "files/mean.onnx"])
+def test_a_matcher_of_a_name_that_the_table_uses_itself_is_refused(rng, name):
+    with pytest.raises(StereoweaveError, match=f"{name}: expected"):
+        score_pairs({name: constant(1.0)}, [scene_of(rng)])
 
 
 def test_matchers_take_turns_after_one_call_to_warm_up(rng):

@@ -13,7 +13,11 @@ from PIL import Image
 import stereoweave
 from stereoweave.cli import main
 from stereoweave.io import read_image, read_pfm
+from stereoweave.matcher import shipped_models
 
+REPOSITORY = Path(__file__).resolve().parent.parent
+EXAMPLES = REPOSITORY / "examples"
+RECIPE = REPOSITORY / "recipes" / "weave_small.toml"
 CALIBRATION = "cam0=[100 0 48; 0 100 32; 0 0 1]\ndoffs=0\nbaseline=80\nwidth=96\nheight=64\n"
 
 
@@ -21,23 +25,34 @@ def run(line: str) -> int:
     return main(line.split())
 
 
-def save_matcher(path: Path, disparity_px: float) -> None:
-    """A matcher file that finds one disparity wherever it looks."""
-    image = ["batch", 3, "height", "width"]
+def save_matcher(
+    path: Path,
+    disparity_px: float,
+    *,
+    size=("height", "width"),
+    inputs=TensorProto.FLOAT,
+    shrunk=1,
+    keepdims=1,
+    multiple_of="1",
+) -> None:
+    """A matcher file that finds one disparity wherever it looks; the options make it one that is none."""
+    image = ["batch", 3, *size]
     constants = {"zero": 0.0, "disparity": disparity_px}
     graph = helper.make_graph(
         [
-            helper.make_node("ReduceMean", ["left"], ["grey"], axes=[1], keepdims=1),
+            helper.make_node("Cast", ["left"], ["wide"], to=TensorProto.FLOAT),
+            helper.make_node("MaxPool", ["wide"], ["pooled"], kernel_shape=[1, 1], strides=[shrunk, shrunk]),
+            helper.make_node("ReduceMean", ["pooled"], ["grey"], axes=[1], keepdims=keepdims),
             helper.make_node("Mul", ["grey", "zero"], ["zeros"]),
             helper.make_node("Add", ["zeros", "disparity"], ["disparity_px"]),
         ],
         "constant",
-        [helper.make_tensor_value_info(side, TensorProto.FLOAT, image) for side in ("left", "right")],
-        [helper.make_tensor_value_info("disparity_px", TensorProto.FLOAT, ["batch", 1, "height", "width"])],
+        [helper.make_tensor_value_info(side, inputs, image) for side in ("left", "right")],
+        [helper.make_tensor_value_info("disparity_px", TensorProto.FLOAT, None)],
         [helper.make_tensor(name, TensorProto.FLOAT, [], [value]) for name, value in constants.items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
-    facts = {"name": "constant", "multiple_of": "1", "max_disparity_px": "192", "recipe": "", "commit": ""}
+    facts = {"name": "constant", "multiple_of": multiple_of, "max_disparity_px": "192"}
     helper.set_model_props(model, {f"stereoweave.{key}": value for key, value in facts.items()})
     onnx.save(model, path)
 
@@ -83,6 +98,19 @@ def mistakes(pictures) -> Path:
     Path("wrong.txt").write_text(CALIBRATION.replace("width=96", "width=960"))
     save_identity(Path("identity.onnx"))
     save_matcher(Path("nan.onnx"), float("nan"))
+    save_matcher(Path("fixed.onnx"), 4.0, size=(32, 32))
+    save_matcher(Path("float16.onnx"), 4.0, inputs=TensorProto.FLOAT16)
+    save_matcher(Path("rank3.onnx"), 4.0, keepdims=0)
+    save_matcher(Path("quarter.onnx"), 4.0, shrunk=4)
+    save_matcher(Path("zero.onnx"), 4.0, multiple_of="0")
+    save_matcher(Path("abc.onnx"), 4.0, multiple_of="abc")
+    save_matcher(Path("sgbm.onnx"), 4.0)
+    Path("taken/depth.png").mkdir(parents=True)
+    Path("taken.png").mkdir()
+    Path("scenes/wall").mkdir(parents=True)
+    for name in ("left.png", "right.png"):
+        Path("scenes/wall", name).write_bytes(Path(name).read_bytes())
+    Image.fromarray(np.full((64, 96), 8 * 256, np.uint16)).save("scenes/wall/disparity.png")
     return pictures
 
 
@@ -125,6 +153,18 @@ def mistakes(pictures) -> Path:
             "depth left.png right.png --model nan.onnx -o out",
             ["nan.onnx", "disparity_px", "expected finite", "NaN"],
         ),
+        ("depth left.png right.png --model fixed.onnx -o out", ["fixed.onnx", "expected", "ONNX Runtime"]),
+        ("depth left.png right.png --model float16.onnx -o out", ["float16.onnx", "left tensor(float16)"]),
+        (
+            "depth left.png right.png --model rank3.onnx -o out",
+            ["rank3.onnx", "[1, 1, 64, 96]", "[1, 64, 96]"],
+        ),
+        ("view both.png --model quarter.onnx -o out.png", ["quarter.onnx", "disparity_px", "[1, 1, 16, 24]"]),
+        ("depth left.png right.png --model zero.onnx -o out", ["zero.onnx", "multiple_of '0'"]),
+        ("depth left.png right.png --model abc.onnx -o out", ["abc.onnx", "multiple_of 'abc'"]),
+        ("depth left.png right.png -o taken", ["taken/depth.png", "expected a file", "found a folder"]),
+        ("view left.png right.png -o taken.png", ["taken.png", "expected a file", "found a folder"]),
+        ("bench pairs scenes --model sgbm.onnx -o rows.csv", ["sgbm.onnx", "rename"]),
         ("depth left.png right.png --threads 0 -o out", ["--threads"]),
         ("depth left.png right.png", ["--out"]),
         ("bench pairs folder -o out.csv", ["folder", "left.png"]),
@@ -142,6 +182,20 @@ def test_a_mistake_is_told_in_one_line_and_leaves_nothing_behind(mistakes, capfd
     assert line.startswith("stereoweave: ")
     assert [fragment for fragment in fragments if fragment not in line] == []
     assert sorted(mistakes.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    "options", ["--position 7 -o out.png", "-o out.words", "-o taken.png", "-o calib.txt/a.png"]
+)
+def test_view_finds_mistakes_of_its_own_before_it_matches(mistakes, capfd, options):
+    assert run(f"view left.png right.png --model nan.onnx {options}") == 2
+    assert "nan.onnx" not in capfd.readouterr().err
+
+
+def test_an_error_of_our_own_is_not_taken_for_the_callers(pictures, monkeypatch):
+    monkeypatch.setattr(stereoweave.matcher.Matcher, "estimate", lambda *_: int("our own"))
+    with pytest.raises(ValueError, match="our own"):
+        run("depth left.png right.png -o out")
 
 
 def test_the_installed_command_tells_a_mistake_in_one_line(mistakes):
@@ -248,10 +302,34 @@ def test_bench_scores_the_network_beside_sgbm(pictures, capfd):
     assert "ten.onnx" in capfd.readouterr().out
 
 
+def test_bench_takes_every_shipped_network_and_says_where_the_rows_are(mistakes, capfd):
+    assert run("bench pairs scenes") == 0
+    with Path("pairs.csv").open() as file:
+        assert {row["matcher"] for row in csv.DictReader(file)} == {"sgbm", *shipped_models()}
+    assert capfd.readouterr().out.endswith("rows: pairs.csv\n")
+
+
+def test_depth_of_a_large_picture_takes_less_than_a_gigabyte_and_a_half(tmp_path):
+    for side in ("left.png", "right.png"):
+        Image.open(EXAMPLES / side).resize((1920, 1080)).save(tmp_path / side)
+    # In a process of its own, whose only child is the command: Linux counts a parent's memory as its child's.
+    program = (
+        "import resource, subprocess, sys; subprocess.run(sys.argv[1:], check=True); "
+        "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
+    )
+    command = [Path(sys.executable).with_name("stereoweave"), "depth", "left.png", "right.png", "-o", "out"]
+    done = subprocess.run(
+        [sys.executable, "-c", program, *command], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    unit_bytes = 1 if sys.platform == "darwin" else 1024
+    peak_bytes = unit_bytes * int(done.stdout.splitlines()[-1])
+    assert 0.1e9 < peak_bytes < 1.5e9
+
+
 def test_training_without_pytorch_names_the_extra(tmp_path):
     program = (
         "import sys; sys.modules['torch'] = None; from stereoweave.cli import main; "
-        "sys.exit(main(['train', 'recipe.toml', '-o', 'run']))"
+        f"sys.exit(main(['train', {str(RECIPE)!r}, '-o', 'run']))"
     )
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=False, cwd=tmp_path

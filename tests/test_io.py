@@ -56,9 +56,10 @@ def test_a_picture_comes_back_as_it_was_written(tmp_path, picture, ending):
     assert image.flags.writeable
 
 
-def test_a_jpeg_comes_back_nearly(tmp_path, picture):
-    io.write_image(tmp_path / "picture.jpg", picture)
-    assert np.abs(io.read_image(tmp_path / "picture.jpg").astype(int) - picture).max() < 12
+@pytest.mark.parametrize("ending", ["jpg", "jpeg", "webp"])
+def test_a_picture_of_few_bytes_comes_back_nearly(tmp_path, picture, ending):
+    io.write_image(tmp_path / f"picture.{ending}", picture)
+    assert np.abs(io.read_image(tmp_path / f"picture.{ending}").astype(int) - picture).max() < 12
 
 
 def test_a_path_may_be_a_string(tmp_path, picture):
@@ -88,6 +89,23 @@ def test_sixteen_bit_grey_keeps_the_upper_byte(tmp_path, ending):
     expected = np.full((40, 48, 3), 0x12, np.uint8)
     expected[0, 0], expected[0, 1] = 0, 255
     np.testing.assert_array_equal(io.read_image(tmp_path / f"grey.{ending}"), expected)
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(1, 0), (257, 8)])
+def test_grey_of_32_bits_is_taken_for_the_8_or_16_that_it_holds(tmp_path, scale, shift):
+    values = np.tile(np.arange(256, dtype=np.int32) * scale, (40, 1))
+    Image.fromarray(values).save(tmp_path / "grey.tiff")
+    np.testing.assert_array_equal(io.read_image(tmp_path / "grey.tiff")[..., 1], values >> shift)
+
+
+def test_dark_grey_of_16_bits_stays_dark(tmp_path):
+    cv2.imwrite(str(tmp_path / "grey.png"), np.full((40, 48), 200, np.uint16))
+    assert io.read_image(tmp_path / "grey.png").max() == 0
+
+
+def test_grey_below_0_is_refused(tmp_path):
+    Image.fromarray(np.full((40, 48), -1, np.int32)).save(tmp_path / "grey.tiff")
+    assert "below 0" in raises(io.read_image, tmp_path / "grey.tiff")
 
 
 @pytest.mark.parametrize("channels", [3, 4])
@@ -176,7 +194,7 @@ def test_a_picture_of_32_pixels_is_read(tmp_path):
     assert io.read_image(tmp_path / "small.png").shape == (32, 32, 3)
 
 
-@pytest.mark.parametrize("name", ["picture", "picture.foo", "picture.psd"])
+@pytest.mark.parametrize("name", ["picture", "picture.foo", "picture.psd", "picture.pdf"])
 def test_an_unknown_ending_is_refused(tmp_path, picture, name):
     message = raises(io.write_image, tmp_path / name, picture, kind=StereoweaveError)
     assert f"found {Path(name).suffix!r}" in message

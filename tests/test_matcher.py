@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ PROPERTIES = {"name": "by_hand", "multiple_of": 16, "max_disparity_px": 255}
 
 
 def matcher_file(path: Path, nodes, outputs, properties=PROPERTIES, inputs=("left", "right")) -> Path:
-    """A matcher file whose graph is written by hand; the constants `red` and `scale` are there to use."""
+    """A matcher file whose graph is written by hand; the constants below are there to use."""
     graph = helper.make_graph(
         nodes,
         "by_hand",
@@ -23,6 +24,7 @@ def matcher_file(path: Path, nodes, outputs, properties=PROPERTIES, inputs=("lef
         [helper.make_tensor_value_info(name, TensorProto.FLOAT, MAP) for name in outputs],
         [
             helper.make_tensor("red", TensorProto.INT64, [1], [0]),
+            helper.make_tensor("last", TensorProto.INT64, [1], [-1]),
             helper.make_tensor("scale", TensorProto.FLOAT, [1], [255.0]),
         ],
     )
@@ -69,15 +71,18 @@ def test_a_graph_of_one_output_runs_the_mirrored_pair_for_the_other_view(tmp_pat
 
 
 def test_padding_repeats_the_border(tmp_path):
-    lowest = helper.make_node("ReduceMin", ["all"], ["lowest"], keepdims=1)
-    everywhere = helper.make_node("Max", ["all", "lowest"], ["spread"])
-    difference = helper.make_node("Sub", ["all", "spread"], ["nothing"])
-    answer = helper.make_node("Add", ["nothing", "lowest"], ["disparity_px"])
-    nodes = [*red_of("left", "all"), lowest, everywhere, difference, answer]
-    found = Matcher(matcher_file(tmp_path / "min.onnx", nodes, ["disparity_px"])).estimate(
-        painted(np.full((33, 45), 90)), painted(np.full((33, 45), 90))
-    )
-    np.testing.assert_allclose(found.disparity_px, 90, atol=1e-4)  # zeros in the padding would be the lowest
+    nodes = [
+        *red_of("left", "all"),
+        helper.make_node("Gather", ["all", "last"], ["last_column"], axis=3),
+        helper.make_node("Gather", ["last_column", "last"], ["corner"], axis=2),
+        helper.make_node("Sub", ["all", "all"], ["nothing"]),
+        helper.make_node("Add", ["nothing", "corner"], ["disparity_px"]),
+    ]
+    y, x = np.mgrid[:33, :45]
+    ramp = painted(2 * x + 3 * y)
+    found = Matcher(matcher_file(tmp_path / "corner.onnx", nodes, ["disparity_px"])).estimate(ramp, ramp)
+    # The padded picture of 48x48 ends as this one does; reflected, it would end darker.
+    np.testing.assert_allclose(found.disparity_px, 2 * 44 + 3 * 32, atol=1e-4)
 
 
 def test_a_nearer_surface_and_the_left_border_occlude(both_views):
@@ -100,12 +105,26 @@ def test_confidence_is_the_probability_of_the_logit(tmp_path):
     np.testing.assert_allclose(found.confidence, 1 / (1 + np.exp(-2.0)), rtol=1e-5)
 
 
-def test_strips_put_together_are_the_whole(both_views, rng, monkeypatch):
+def test_the_confidence_of_a_logit_beyond_what_float32_can_raise_is_0_or_1():
+    logit = np.array([[-200, -89, 0, 89, 200]], np.float32)
+    found = matcher._confidence(logit, np.zeros((1, 5), np.float32))
+    np.testing.assert_allclose(found, [[0, 0, 0.5, 1, 1]], atol=1e-30)
+    assert found.dtype == np.float32
+
+
+def test_strips_put_together_are_the_whole(tmp_path, rng, monkeypatch):
+    # Each answer is the mean of the 65 rows around it: nearer than 32 rows to its end a strip is wrong.
+    mean = helper.make_node(
+        "AveragePool", ["all"], ["disparity_px"], kernel_shape=[65, 1], pads=[32, 0, 32, 0]
+    )
+    nodes = [*red_of("left", "all"), mean]
+    unpadded = PROPERTIES | {"multiple_of": 1}  # no strip is padded
+    means = Matcher(matcher_file(tmp_path / "means.onnx", nodes, ["disparity_px"], unpadded))
     left, right = (painted(rng.integers(0, 255, (700, 64))) for _ in range(2))
-    whole = both_views.estimate(left, right)
+    whole = means.estimate(left, right)
     monkeypatch.setattr(matcher, "_PIXEL_PAIRS_AT_ONCE", 64 * 64 * 256)
-    assert len(list(matcher._strips(700, both_views._strip_rows(64)))) > 3
-    in_strips = both_views.estimate(left, right)
+    assert len(list(matcher._strips(700, means._strip_rows(64)))) > 3
+    in_strips = means.estimate(left, right)
     np.testing.assert_allclose(in_strips.disparity_px, whole.disparity_px, atol=1e-3)
 
 
@@ -131,6 +150,21 @@ def test_a_model_is_loaded_once_and_kept(rng):
     assert matcher._kept_matcher.cache_info().misses == 1
 
 
+def test_a_file_that_was_written_anew_is_loaded_anew_whatever_its_path_is_relative_to(
+    tmp_path, rng, monkeypatch
+):
+    left, right = (painted(rng.integers(0, 255, (32, 48))) for _ in range(2))
+    found = []
+    for turn, (folder, image) in enumerate([("a", "left"), ("a", "right"), ("b", "left")]):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        monkeypatch.chdir(tmp_path / folder)
+        file = matcher_file(Path("matcher.onnx"), red_of(image, "disparity_px"), ["disparity_px"])
+        os.utime(file, ns=(turn, turn))
+        found.append(sw.estimate(left, right, model="matcher.onnx").disparity_px)
+    for disparity_px, image in zip(found, (left, right, left), strict=True):
+        np.testing.assert_allclose(disparity_px, image[:, :, 0], atol=1e-4)
+
+
 def test_the_answer_does_not_depend_on_earlier_calls_of_other_sizes(rng):
     left, right = rng.integers(0, 256, (2, 64, 80, 3), np.uint8)
     first = sw.estimate(left, right)
@@ -147,6 +181,23 @@ def test_a_graph_that_is_no_matcher_is_refused(tmp_path):
     nodes = red_of("picture", "label")
     file = matcher_file(tmp_path / "other.onnx", nodes, ["label"], inputs=("picture",))
     with pytest.raises(sw.MatcherError, match=r"other\.onnx: expected a matcher.*found inputs picture"):
+        Matcher(file)
+
+
+def test_the_order_of_the_inputs_is_free(tmp_path, rng):
+    nodes = red_of("left", "disparity_px")
+    file = matcher_file(tmp_path / "swapped.onnx", nodes, ["disparity_px"], inputs=("right", "left"))
+    left, right = (painted(rng.integers(0, 255, (32, 48))) for _ in range(2))
+    np.testing.assert_allclose(Matcher(file).estimate(left, right).disparity_px, left[:, :, 0], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("multiple_of", "0"), ("multiple_of", "1.5"), ("max_disparity_px", "far")]
+)
+def test_metadata_that_is_no_number_is_refused(tmp_path, key, value):
+    nodes = red_of("left", "disparity_px")
+    file = matcher_file(tmp_path / "odd.onnx", nodes, ["disparity_px"], PROPERTIES | {key: value})
+    with pytest.raises(sw.MatcherError, match=rf"odd\.onnx: expected .* found .*{key} '{value}'"):
         Matcher(file)
 
 

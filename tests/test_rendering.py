@@ -280,6 +280,17 @@ def test_without_any_writable_folder_the_kernels_still_work(installation, tmp_pa
     assert in_new_process(code, tmp_path, XDG_CACHE_HOME=str(tmp_path / "cache")) == "0\n"
 
 
+def test_without_a_home_folder_the_kernels_still_work(installation, tmp_path):
+    code = SPLAT.format(folder=str(installation))
+    assert in_new_process(code, tmp_path, XDG_CACHE_HOME="~nobody-of-this-name/cache") == "0\n"
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_the_view_does_not_depend_on_the_number_of_threads(rng, threads):
+    scene = random_scene(rng)
+    np.testing.assert_array_equal(render(*scene, 0.5, threads=threads).image, render(*scene, 0.5).image)
+
+
 def test_importing_the_package_or_the_renderer_does_not_import_numba():
     code = "import sys, stereoweave, stereoweave.rendering; print('numba' in sys.modules)"
     assert (

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
 CAMERA = {"focal_px": 1000.0, "baseline_m": 0.1, "cx_px": 320.0, "cy_px": 240.0}
@@ -45,20 +46,20 @@ def test_the_disparity_of_infinite_depth_is_minus_doffs():
     ],
 )
 def test_a_camera_refuses_nonsense(name, value):
-    with pytest.raises(ValueError, match=f"{value}"):
+    with pytest.raises(StereoweaveError, match=f"{value}"):
         StereoCamera(**CAMERA | {name: value})
 
 
 @pytest.mark.usefixtures("without_shape_checks")
 def test_a_pair_refuses_pictures_of_two_sizes():
-    with pytest.raises(ValueError, match=r"one size, got 40x32 and 41x32; crop"):
+    with pytest.raises(StereoweaveError, match=r"one size, got 40x32 and 41x32; crop"):
         StereoPair(left=np.zeros((32, 40, 3), np.uint8), right=np.zeros((32, 41, 3), np.uint8))
 
 
 @pytest.mark.usefixtures("without_shape_checks")
 @pytest.mark.parametrize("image", [np.zeros((32, 40, 3), np.float32), np.zeros((32, 40), np.uint8)])
 def test_a_pair_refuses_what_is_not_rgb_of_8_bits(image):
-    with pytest.raises(ValueError, match="right image: expected uint8 RGB"):
+    with pytest.raises(StereoweaveError, match="right image: expected uint8 RGB"):
         StereoPair(left=np.zeros((32, 40, 3), np.uint8), right=image)
 
 
@@ -83,11 +84,11 @@ def make_estimate(**changes):
 def test_an_estimate_refuses_disparities_that_are_not_finite():
     disparity_px = np.zeros((4, 5), np.float32)
     disparity_px[1, :2] = np.nan, np.inf
-    with pytest.raises(ValueError, match="right_disparity_px: expected finite values, got 2 NaN"):
+    with pytest.raises(StereoweaveError, match="right_disparity_px: expected finite values, got 2 NaN"):
         make_estimate(right_disparity_px=disparity_px)
 
 
 @pytest.mark.usefixtures("without_shape_checks")
 def test_an_estimate_refuses_maps_of_two_sizes():
-    with pytest.raises(ValueError, match="occluded: expected the shape of disparity_px"):
+    with pytest.raises(StereoweaveError, match="occluded: expected the shape of disparity_px"):
         make_estimate(occluded=np.zeros((4, 6), bool))

@@ -1,0 +1,19 @@
+"""How many threads a call may use."""
+
+import os
+
+from stereoweave.errors import StereoweaveError
+
+
+def thread_count(threads: int | None) -> int:
+    """The number asked for, or `usable_cores` where none is; StereoweaveError for one below 1."""
+    if threads is not None and threads < 1:
+        raise StereoweaveError(f"threads: expected 1 or more, got {threads}")
+    return threads or usable_cores()
+
+
+def usable_cores() -> int:
+    """The cores that this process may run on, which can be fewer than the machine has."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
