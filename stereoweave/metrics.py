@@ -10,6 +10,9 @@ from jaxtyping import Bool, Float, UInt8
 
 from stereoweave.errors import StereoweaveError
 
+# As many as Guo et al. 2017 take.
+_BINS = 15
+
 
 def epe_px(estimate_px: Float[np.ndarray, "h w"], truth_px: Float[np.ndarray, "h w"]) -> float:
     """End-point error: the mean absolute error of disparity in pixels."""
@@ -62,6 +65,26 @@ def ssim(image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]) -
     return _mean(luminance * (2 * covariance + c2) / (variance_a + variance_b + c2))
 
 
+def calibration_error(probability: Float[np.ndarray, "..."], happened: Bool[np.ndarray, "..."]) -> float:
+    """Expected calibration error: the mean gap between what was claimed and what happened, over equal bins.
+
+    Source: Guo et al. 2017; a bin weighs as many as fall into it.
+    """
+    claimed, came_true, share = calibration_bins(probability, happened)
+    return float((np.abs(claimed - came_true) * share).sum())
+
+
+def calibration_bins(
+    probability: Float[np.ndarray, "..."], happened: Bool[np.ndarray, "..."]
+) -> Float[np.ndarray, "3 n"]:
+    """Mean claim, how much of it came true, and share of all, in each of 15 equal bins that is not empty."""
+    where = np.minimum((probability * _BINS).astype(int), _BINS - 1).ravel()
+    counts = np.bincount(where, minlength=_BINS)
+    used = counts > 0
+    claimed, came_true = (np.bincount(where, x.ravel(), _BINS)[used] for x in (probability, happened))
+    return np.stack([claimed / counts[used], came_true / counts[used], counts[used] / where.size])
+
+
 def _known_errors(
     estimate: Float[np.ndarray, "h w"], truth: Float[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
@@ -93,16 +116,3 @@ def _check_shapes(estimate: np.ndarray, truth: np.ndarray) -> None:
         raise StereoweaveError(
             f"expected an estimate of the truth's shape {truth.shape}, found {estimate.shape}"
         )
-
-
-def calibration_error(
-    probability: Float[np.ndarray, "..."], happened: Bool[np.ndarray, "..."], bins: int = 15
-) -> float:
-    """Expected calibration error: the mean gap between what was claimed and what happened, over equal bins.
-
-    Source: Guo et al. 2017; a bin weighs as many as fall into it.
-    """
-    where = np.minimum((probability * bins).astype(int), bins - 1).ravel()
-    claimed = np.bincount(where, probability.ravel(), bins)
-    came = np.bincount(where, happened.ravel(), bins)
-    return float(np.abs(claimed - came).sum() / probability.size)

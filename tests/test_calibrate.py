@@ -30,8 +30,11 @@ def test_reliability_compares_what_was_claimed_with_what_happened():
     found = calibrate.reliability(probability, happened)
     assert found["bins"] == [
         {"claimed": 0.12, "happened": 0.5, "share": 0.3333},
-        {"claimed": 0.95, "happened": 0.75, "share": 0.6667},
+        {"claimed": 0.9, "happened": 0.0, "share": 0.1667},
+        {"claimed": 0.9667, "happened": 1.0, "share": 0.5},
     ]
+    # The error is that of the same bins: (2 * 0.38 + 1 * 0.9 + 3 * 0.0333) / 6.
+    assert found["calibration_error"] == 0.2933
 
 
 def test_reliability_of_honest_claims_has_no_error():

@@ -1,5 +1,6 @@
 import re
-from dataclasses import replace
+import subprocess
+from dataclasses import asdict, replace
 
 import pytest
 import torch
@@ -57,6 +58,14 @@ def test_a_saved_checkpoint_leaves_no_other_file(tmp_path, trained):
     assert [file.name for file in tmp_path.iterdir()] == ["last.pt"]
 
 
+def test_a_checkpoint_from_before_there_was_an_origin_has_none(tmp_path, trained):
+    path = tmp_path / "old.pt"
+    values = {**vars(trained), "recipe": asdict(RECIPE)}
+    del values["origin"]
+    torch.save(values, path)
+    assert checkpoint.load(path).origin == ()
+
+
 def truncated(path, trained):
     checkpoint.save(trained, path)
     path.write_bytes(path.read_bytes()[:-1000])
@@ -99,3 +108,14 @@ def test_a_checkpoint_that_is_not_there_is_named_with_what_makes_one(tmp_path):
 
 def test_the_commit_of_the_code_is_a_short_hash_or_unknown():
     assert re.fullmatch(r"[0-9a-f]{7,40}\+?|unknown", checkpoint.code_commit())
+
+
+def test_the_commit_of_code_installed_in_somebody_elses_repository_is_unknown(tmp_path, monkeypatch):
+    (tmp_path / "venv/stereoweave/learn").mkdir(parents=True)
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=x", "-c", "user.email=x"]
+    for command in (["init", "-q"], ["commit", "-q", "--allow-empty", "-m", "x"]):
+        subprocess.run([*git, *command], check=True)
+    monkeypatch.setattr(checkpoint, "__file__", str(tmp_path / "venv/stereoweave/learn/checkpoint.py"))
+    assert checkpoint.code_commit() == "unknown"
+    monkeypatch.setattr(checkpoint, "__file__", str(tmp_path / "stereoweave/learn/checkpoint.py"))
+    assert re.fullmatch(r"[0-9a-f]{7,40}", checkpoint.code_commit())

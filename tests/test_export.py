@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 import onnx
 import pytest
@@ -46,6 +47,12 @@ def test_the_matcher_file_answers_as_pytorch_does_and_nothing_is_written_otherwi
     card = export.export(run, out, [pair])
     assert 0 <= card["onnx_differs_px"] < 0.01
     assert sorted(file.name for file in out.parent.iterdir()) == ["tiny.json", "tiny.onnx"]
+
+    assert card["compared_pairs"] == 2
+    assert 0 <= card["onnx_differs_confidence"] < 0.01
+    assert card["origin"] == ()
+    assert b"site-packages" not in out.read_bytes()
+    assert str(Path(export.__file__).parent).encode() not in out.read_bytes()
 
     graph = onnx.load(out)
     facts = {entry.key: entry.value for entry in graph.metadata_props}

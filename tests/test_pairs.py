@@ -1,6 +1,7 @@
 import numpy as np
 from learn_examples import PAIR_SIZE, box_before_a_wall, keep_pairs
 
+from stereoweave.learn import pairs as pairs_module
 from stereoweave.learn.collage import sample
 from stereoweave.learn.pairs import KeptPairs
 
@@ -36,6 +37,14 @@ def test_pairs_of_another_seed_or_size_are_kept_apart(tmp_path):
     assert KeptPairs(tmp_path, 3, 4, PAIR_SIZE).missing() == [2, 3]
     assert KeptPairs(tmp_path, 4, 2, PAIR_SIZE).missing() == [0, 1]
     assert KeptPairs(tmp_path, 3, 2, (96, 64)).missing() == [0, 1]
+
+
+def test_pairs_of_another_version_of_the_generator_are_kept_apart(tmp_path, monkeypatch):
+    keep_pairs(tmp_path, 3, 2)
+    for name in ("collage", "paint", "shapes", "textures"):
+        (tmp_path / f"{name}.py").write_text("changed")
+    monkeypatch.setattr(pairs_module, "__file__", str(tmp_path / "pairs.py"))
+    assert KeptPairs(tmp_path, 3, 2, PAIR_SIZE).missing() == [0, 1]
 
 
 def test_what_is_missing_or_half_written_is_made_as_the_generator_makes_it(tmp_path):

@@ -66,6 +66,17 @@ def test_the_learning_rate_without_slopes_is_constant():
         ({"crop_size": 256}, "crop_size = 256, expected two whole numbers"),
         ({"crop_size": [256]}, r"crop_size = [256], expected two whole numbers"),
         ({"crop_size": [256, 1.5]}, r"crop_size = [256, 1.5], expected two whole numbers"),
+        (
+            {"crop_size": [0, 64]},
+            "crop_size = [0, 64], expected more than 0 and at most pair_size = [320, 512]",
+        ),
+        ({"crop_size": [64, 528]}, "crop_size = [64, 528], expected more than 0 and at most pair_size = ["),
+        ({"batch": 0}, "batch = 0, expected more than 0"),
+        ({"steps": -1}, "steps = -1, expected more than 0"),
+        ({"pairs": 0}, "pairs = 0, expected more than 0"),
+        ({"validation_pairs": 0}, "validation_pairs = 0, expected more than 0"),
+        ({"validate_every": 0}, "validate_every = 0, expected more than 0"),
+        ({"learning_rate": float("nan")}, "learning_rate = nan, expected more than 0"),
     ],
 )
 def test_a_wrong_key_or_value_is_named_in_one_line(changes, message):

@@ -114,6 +114,7 @@ def test_a_run_starts_from_the_averaged_weights_of_another(folder, finished):
     first = checkpoint.load(finished)
     assert start.step == 0
     assert start.hours == first.hours
+    assert start.origin == ({"recipe": asdict(RECIPE), "step": RECIPE.steps, "commit": first.commit},)
     assert_same(start.weights, first.averaged)
 
 
@@ -136,6 +137,20 @@ def test_a_recipe_for_an_unknown_network_is_refused(tmp_path):
         train(file, tmp_path / "run", QUIET)
 
 
+@pytest.mark.parametrize("sizes", [{"crop_size": (64, 56)}, {"pair_size": (64, 100)}])
+def test_a_recipe_with_sizes_that_the_network_cannot_divide_is_refused(tmp_path, sizes):
+    file = write(replace(RECIPE, **sizes), tmp_path / "odd.toml")
+    with pytest.raises(FormatError, match=r"odd\.toml: pair_size = .*, expected multiples of 16 for weave"):
+        train(file, tmp_path / "run", QUIET)
+
+
+def test_a_run_into_a_file_fails_before_any_pair_is_made(recipe_file, tmp_path):
+    (tmp_path / "file").write_text("kept")
+    with pytest.raises(StereoweaveError, match="file: expected a folder that can be written"):
+        train(recipe_file, tmp_path / "file", QUIET)
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["kept"]
+
+
 @pytest.mark.parametrize("file", RECIPES, ids=lambda file: file.name)
 def test_every_shipped_recipe_takes_a_step(file, folder, tmp_path):
     small = {name: getattr(RECIPE, name) for name in ("pairs", "pair_size", "crop_size", "batch")}
@@ -150,7 +165,9 @@ def test_every_shipped_recipe_takes_a_step(file, folder, tmp_path):
         assert not torch.equal(value, before[name]), name
 
 
-def test_a_step_computes_in_bfloat16_where_the_device_does(folder, tmp_path):
+@pytest.mark.parametrize(("precision", "dtype"), [("bf16-mixed", torch.bfloat16), ("32-true", torch.float32)])
+def test_a_step_computes_in_bfloat16_where_the_device_does(folder, tmp_path, monkeypatch, precision, dtype):
+    monkeypatch.setattr(training, "_precision", lambda: precision)
     run = Run(RECIPE, training._starting_point(RECIPE, tmp_path / "last.pt"), TensorBoardLogger(tmp_path))
     seen = []
     run.network.module.to_match.register_forward_hook(
@@ -158,8 +175,7 @@ def test_a_step_computes_in_bfloat16_where_the_device_does(folder, tmp_path):
     )
     batches = Batches(RECIPE, KeptPairs(folder / "pairs", RECIPE.seed, RECIPE.pairs, PAIR_SIZE))
     run.step(0, batches[0], batches)
-    expected = torch.bfloat16 if training._precision() == "bf16-mixed" else torch.float32
-    assert set(seen) == {expected}
+    assert set(seen) == {dtype}
 
 
 def test_every_pair_comes_once_before_any_comes_again():

@@ -94,10 +94,23 @@ def test_the_stages_hold_both_views_the_right_one_mirrored():
     with torch.no_grad():
         stages = network.stages(*pair)
         left_px, right_px, logit = network(*pair)
-    torch.testing.assert_close(stages.disparity_px, torch.cat([left_px, mirrored(right_px)]))
+    torch.testing.assert_close(stages.disparity_px.clamp(min=0), torch.cat([left_px, mirrored(right_px)]))
     torch.testing.assert_close(stages.confidence_logit[:2], logit)
     assert stages.correlation.shape == stages.scores.shape == (4, network.levels, 8, 16)
     assert stages.coarse_px.shape == (4, 1, 16, 32)
+
+
+def test_a_disparity_below_zero_comes_out_as_zero():
+    network = untrained()
+    # Half resolution's coarse estimate stays near 0 px, and the refinement takes 2 px off.
+    torch.nn.init.zeros_(network.refinement.scores.weight)
+    with torch.no_grad():
+        network.aggregation.scores.bias[0] = 1e4
+        network.refinement.scores.bias[0] = 1e4
+        pair = random_pair(1, 32, 64)
+        assert network.stages(*pair).disparity_px.max() < 0
+        for values in network(*pair)[:2]:
+            assert (values == 0).all()
 
 
 def test_forty_eight_levels_reach_192_px():

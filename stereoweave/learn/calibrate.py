@@ -11,7 +11,7 @@ from torch import Tensor
 from stereoweave.io import replacing
 from stereoweave.learn.collage import sample
 from stereoweave.learn.models.weave import WeaveNet
-from stereoweave.metrics import calibration_error
+from stereoweave.metrics import calibration_bins, calibration_error
 from stereoweave.stereo import Sample, StereoPair
 
 # Apart from the seeds of recipes and from that of validation.
@@ -37,18 +37,10 @@ def calibrate(network: WeaveNet) -> dict[str, Any]:
     return reliability(logits.sigmoid().numpy(), within.numpy())
 
 
-def reliability(probability: np.ndarray, happened: np.ndarray, bins: int = 10) -> dict[str, Any]:
+def reliability(probability: np.ndarray, happened: np.ndarray) -> dict[str, Any]:
     """What was claimed and what happened, per bin of equal width, and the expected calibration error."""
-    where = np.minimum((probability * bins).astype(int), bins - 1)
-    rows = [
-        {
-            "claimed": round(float(probability[where == i].mean()), 4),
-            "happened": round(float(happened[where == i].mean()), 4),
-            "share": round(float((where == i).mean()), 4),
-        }
-        for i in range(bins)
-        if (where == i).any()
-    ]
+    bins = calibration_bins(probability, happened).round(4).T.tolist()
+    rows = [dict(zip(("claimed", "happened", "share"), row, strict=True)) for row in bins]
     return {"calibration_error": round(calibration_error(probability, happened), 4), "bins": rows}
 
 
@@ -104,7 +96,7 @@ def draw_reliability(reliability: dict[str, Any], picture: Path) -> None:
     above.set(ylabel="share within 1 px", xlim=(0, 1), ylim=(0, 1), aspect="equal")
     above.set_title(f"expected calibration error {reliability['calibration_error']:.3f}")
     above.legend(loc="upper left", frameon=False)
-    below.bar(claimed, share, width=0.07, color="0.6")
+    below.bar(claimed, share, width=0.05, color="0.6")
     below.set(xlabel="confidence", ylabel="share of pixels")
     with replacing(picture) as temporary:
         figure.savefig(temporary, dpi=120)

@@ -26,6 +26,7 @@ class Checkpoint:
         scores: of the last validation.
         commit: of the code that trained.
         hours: of training so far, over all restarts and the run it started from.
+        origin: recipe, step and commit of the checkpoints it came from, the first one first.
     """
 
     recipe: Recipe
@@ -37,6 +38,11 @@ class Checkpoint:
     scores: dict[str, float]
     commit: str
     hours: float
+    origin: tuple[dict[str, Any], ...] = ()
+
+    def as_origin(self) -> tuple[dict[str, Any], ...]:
+        """The origin of a run that starts from this one."""
+        return *self.origin, {"recipe": asdict(self.recipe), "step": self.step, "commit": self.commit}
 
 
 def save(checkpoint: Checkpoint, path: Path) -> None:
@@ -61,7 +67,8 @@ def load(path: Path) -> Checkpoint:
     except Exception as error:  # other bytes lead PyTorch's reader to any error whatever
         found = str(error).partition("\n")[0]
         raise FormatError(f"{path}: expected a checkpoint of `stereoweave train`, found: {found}") from error
-    if not isinstance(values, dict) or values.keys() != {field.name for field in fields(Checkpoint)}:
+    # Checkpoints written before there was an origin have none.
+    if not isinstance(values, dict) or {*values, "origin"} != {field.name for field in fields(Checkpoint)}:
         raise FormatError(
             f"{path}: expected a checkpoint of `stereoweave train`, found something else that PyTorch saved"
         )
@@ -70,11 +77,11 @@ def load(path: Path) -> Checkpoint:
 
 def code_commit() -> str:
     """The commit of the code that runs, '+' behind it where files were changed; 'unknown' outside git."""
-    here = Path(__file__).parent
     try:
+        # Of the package's own repository alone: an installed package may lie in somebody else's.
         described = subprocess.run(
-            ["git", "describe", "--always", "--dirty=+", "--exclude=*"],
-            cwd=here, capture_output=True, text=True, check=True,
+            ["git", "--git-dir=.git", "describe", "--always", "--dirty=+", "--exclude=*"],
+            cwd=Path(__file__).parents[2], capture_output=True, text=True, check=True,
         )  # fmt: skip
     except (OSError, subprocess.CalledProcessError):
         return "unknown"

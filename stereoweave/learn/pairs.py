@@ -1,5 +1,6 @@
 """Collage pairs made once and kept on disk: a step then pays for cutting and recolouring alone."""
 
+import hashlib
 import multiprocessing
 import os
 from collections.abc import Iterable
@@ -18,10 +19,10 @@ _DISPARITY_SCALE = 256
 
 
 class KeptPairs:
-    """The first `count` collage pairs of (seed, epoch 0), made in `folder` where they are not there yet."""
+    """The first `count` collage pairs of (seed, epoch 0), kept in a folder of their own in `folder`."""
 
     def __init__(self, folder: Path, seed: int, count: int, size: tuple[int, int]) -> None:
-        self.folder = folder / f"seed{seed}-{size[0]}x{size[1]}"
+        self.folder = folder / f"seed{seed}-{size[0]}x{size[1]}-{generator_version()}"
         self.seed, self.count, self.size = seed, count, size
 
     def missing(self) -> list[int]:
@@ -50,6 +51,12 @@ class KeptPairs:
 
     def _file(self, index: int) -> Path:
         return self.folder / f"{index:06d}.npz"
+
+
+def generator_version() -> str:
+    """8 hexadecimal digits that change with the code that makes pairs."""
+    sources = (Path(__file__).with_name(f"{name}.py") for name in ("collage", "paint", "shapes", "textures"))
+    return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:8]
 
 
 def _make(pairs: KeptPairs, index: int) -> int:

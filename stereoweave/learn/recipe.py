@@ -1,5 +1,6 @@
 """A recipe: everything that a training run depends on, in one TOML file."""
 
+import math
 import tomllib
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 from stereoweave.errors import FormatError
 
 _KINDS: dict[object, str] = {int: "a whole number", float: "a number", str: "a text in quotes"}
+_POSITIVE = ("steps", "batch", "learning_rate", "pairs", "validation_pairs", "validate_every")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +54,7 @@ class Recipe:
 
 
 def read_recipe(path: Path) -> Recipe:
-    """The recipe of a TOML file; FormatError for an unknown, a missing or a mistyped key."""
+    """The recipe of a TOML file; FormatError for a key that is unknown, missing, mistyped or out of range."""
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
@@ -61,7 +63,7 @@ def read_recipe(path: Path) -> Recipe:
 
 
 def recipe_from(values: dict[str, Any], source: str) -> Recipe:
-    """The recipe with these values; `source` names them in an error."""
+    """The recipe with these values; FormatError, which names their `source`, if they make none."""
     known = {field.name: field.type for field in fields(Recipe)}
     if unknown := sorted(values.keys() - known.keys()):
         raise FormatError(f"{source}: unknown key {unknown[0]!r}; a recipe has {', '.join(known)}")
@@ -73,7 +75,16 @@ def recipe_from(values: dict[str, Any], source: str) -> Recipe:
     if missing := [name for name in needed if name not in values]:
         raise FormatError(f"{source}: missing key {missing[0]!r}; a recipe needs {', '.join(needed)}")
     settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-    return Recipe(**settings)
+    recipe = Recipe(**settings)
+    for name in _POSITIVE:
+        if not 0 < getattr(recipe, name) < math.inf:
+            raise FormatError(f"{source}: {name} = {getattr(recipe, name)}, expected more than 0")
+    if not all(0 < crop <= side for crop, side in zip(recipe.crop_size, recipe.pair_size, strict=True)):
+        raise FormatError(
+            f"{source}: crop_size = {list(recipe.crop_size)}, expected more than 0 and "
+            f"at most pair_size = {list(recipe.pair_size)}"
+        )
+    return recipe
 
 
 def _fits(value: object, expected: Any) -> bool:

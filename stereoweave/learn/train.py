@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader, Dataset
 
 from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.io import make_folder
 from stereoweave.learn import checkpoint
 from stereoweave.learn.augment import augment
 from stereoweave.learn.checkpoint import Checkpoint
@@ -85,7 +86,13 @@ def train(recipe_path: Path, out: Path, console: Console | None = None) -> Path:
     recipe = read_recipe(recipe_path)
     if recipe.model not in MODELS:
         raise FormatError(f"{recipe_path}: model = {recipe.model!r}, expected {' or '.join(MODELS)}")
-    last = out / "last.pt"
+    multiple = MODELS[recipe.model].multiple_of
+    if any(side % multiple for side in recipe.pair_size + recipe.crop_size):
+        raise FormatError(
+            f"{recipe_path}: pair_size = {list(recipe.pair_size)}, crop_size = {list(recipe.crop_size)}, "
+            f"expected multiples of {multiple} for {recipe.model}"
+        )
+    last = make_folder(out) / "last.pt"
     start = _starting_point(recipe, last)
     console = console or Console()
     pairs = _kept(KeptPairs(out.parent / "pairs", recipe.seed, recipe.pairs, recipe.pair_size), console)
@@ -186,11 +193,11 @@ def _starting_point(recipe: Recipe, last: Path) -> Checkpoint:
             )
         return replace(found, commit=checkpoint.code_commit())
     torch.manual_seed(recipe.seed)
-    hours = 0.0
-    weights = MODELS[recipe.model]().state_dict()
+    weights, hours = MODELS[recipe.model]().state_dict(), 0.0
+    origin: tuple[dict[str, Any], ...] = ()
     if recipe.start_from:
         earlier = checkpoint.load(Path(recipe.start_from))
-        weights, hours = earlier.averaged, earlier.hours
+        weights, hours, origin = earlier.averaged, earlier.hours, earlier.as_origin()
     return Checkpoint(
         recipe=recipe,
         step=0,
@@ -201,6 +208,7 @@ def _starting_point(recipe: Recipe, last: Path) -> Checkpoint:
         scores={},
         commit=checkpoint.code_commit(),
         hours=hours,
+        origin=origin,
     )
 
 
@@ -255,9 +263,12 @@ def _move_average(
 
 def _precision() -> Literal["bf16-mixed", "32-true"]:
     """bfloat16 where the device computes in it, float32 elsewhere."""
-    if torch.cuda.is_available():
-        return "bf16-mixed" if torch.cuda.is_bf16_supported() else "32-true"
-    return "bf16-mixed" if torch.ops.mkldnn._is_mkldnn_bf16_supported() else "32-true"
+    if torch.accelerator.is_available():
+        computes = torch.cuda.is_bf16_supported()
+    else:
+        one_dnn = torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
+        computes = one_dnn and torch.cpu.get_capabilities().get("avx512_bf16", False)
+    return "bf16-mixed" if computes else "32-true"
 
 
 def _progress(console: Console) -> Progress:
