@@ -110,6 +110,7 @@ class Matcher:
 
     def _run(self, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]) -> Maps:
         height, width = left.shape[:2]
+        (above, _), (before, _) = self._borders_px(left)
         inputs = {"left": self._tensor(left), "right": self._tensor(right)}
         with _naming(self._path):
             outputs = dict(zip(self._outputs, self._session.run(self._outputs, inputs), strict=True))
@@ -124,13 +125,24 @@ class Matcher:
                     f"{self._path}: expected finite values of {name}, found NaN or infinite ones"
                 )
         return Maps(
-            **{name: np.ascontiguousarray(value[0, 0, :height, :width]) for name, value in outputs.items()}
+            **{
+                name: np.ascontiguousarray(value[0, 0, above : above + height, before : before + width])
+                for name, value in outputs.items()
+            }
         )
 
+    def _borders_px(self, image: UInt8[np.ndarray, "h w 3"]) -> list[tuple[int, int]]:
+        """What is added before and behind the rows and the columns, up to a size that the network can divide.
+
+        Half on each side: what lies beyond a view's left border hurts that view alone, and so both alike.
+        """
+        missing = [-side % self.multiple_of for side in image.shape[:2]]
+        return [(px // 2, px - px // 2) for px in missing]
+
     def _tensor(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "1 3 h2 w2"]:
-        """The image as the network takes it, its border repeated up to a size that it can divide."""
-        below, beside = (-side % self.multiple_of for side in image.shape[:2])
-        padded = cv2.copyMakeBorder(image, 0, below, 0, beside, cv2.BORDER_REPLICATE)
+        """The image as the network takes it, its border repeated around it."""
+        (above, below), (before, behind) = self._borders_px(image)
+        padded = cv2.copyMakeBorder(image, above, below, before, behind, cv2.BORDER_REPLICATE)
         return cv2.dnn.blobFromImage(padded, 1 / 255)
 
     def _checked_outputs(self) -> list[str]:
