@@ -93,7 +93,7 @@ def draw_reliability(reliability: dict[str, Any], picture: Path) -> None:
     above, below = figure.subplots(2, 1, height_ratios=(3, 1), sharex=True)
     above.plot([0, 1], [0, 1], color="0.7", linestyle="--", label="as claimed")
     above.plot(claimed, happened, marker="o", label="as it happened")
-    above.set(ylabel="share within 1 px", xlim=(0, 1), ylim=(0, 1), aspect="equal")
+    above.set(ylabel="share within 1 px", xlim=(0, 1), ylim=(0, 1))
     above.set_title(f"expected calibration error {reliability['calibration_error']:.3f}")
     above.legend(loc="upper left", frameon=False)
     below.bar(claimed, share, width=0.05, color="0.6")
