@@ -44,6 +44,12 @@ def finished(folder, recipe_file):
     return train(recipe_file, folder / "finished", QUIET)
 
 
+@pytest.fixture
+def logger(tmp_path):
+    with training.closing_curves(TensorBoardLogger(tmp_path, name="", version="")) as logger:
+        yield logger
+
+
 def write(recipe, file):
     lines = (f"{name} = {list(v) if isinstance(v, tuple) else repr(v)}" for name, v in asdict(recipe).items())
     file.write_text("\n".join(lines) + "\n")
@@ -152,12 +158,12 @@ def test_a_run_into_a_file_fails_before_any_pair_is_made(recipe_file, tmp_path):
 
 
 @pytest.mark.parametrize("file", RECIPES, ids=lambda file: file.name)
-def test_every_shipped_recipe_takes_a_step(file, folder, tmp_path):
+def test_every_shipped_recipe_takes_a_step(file, folder, tmp_path, logger):
     small = {name: getattr(RECIPE, name) for name in ("pairs", "pair_size", "crop_size", "batch")}
     recipe = replace(read_recipe(file), seed=RECIPE.seed, start_from="", **small)
     batches = Batches(recipe, KeptPairs(folder / "pairs", recipe.seed, recipe.pairs, recipe.pair_size))
     start = training._starting_point(recipe, tmp_path / "last.pt")
-    run = Run(recipe, start, TensorBoardLogger(tmp_path, name="", version=""))
+    run = Run(recipe, start, logger)
     before = {name: value.clone() for name, value in run.network.module.named_parameters()}
     assert 0 < run.step(0, batches[0], batches) < 100
     for name, value in run.network.module.named_parameters():
@@ -166,9 +172,11 @@ def test_every_shipped_recipe_takes_a_step(file, folder, tmp_path):
 
 
 @pytest.mark.parametrize(("precision", "dtype"), [("bf16-mixed", torch.bfloat16), ("32-true", torch.float32)])
-def test_a_step_computes_in_bfloat16_where_the_device_does(folder, tmp_path, monkeypatch, precision, dtype):
+def test_a_step_computes_in_bfloat16_where_the_device_does(
+    folder, tmp_path, monkeypatch, logger, precision, dtype
+):
     monkeypatch.setattr(training, "_precision", lambda: precision)
-    run = Run(RECIPE, training._starting_point(RECIPE, tmp_path / "last.pt"), TensorBoardLogger(tmp_path))
+    run = Run(RECIPE, training._starting_point(RECIPE, tmp_path / "last.pt"), logger)
     seen = []
     run.network.module.to_match.register_forward_hook(
         lambda _layer, _inputs, output: seen.append(output.dtype)

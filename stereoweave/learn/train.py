@@ -4,6 +4,7 @@ import ctypes
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -99,9 +100,10 @@ def train(recipe_path: Path, out: Path, console: Console | None = None) -> Path:
     held_out = _kept(
         KeptPairs(out.parent / "pairs", _VALIDATION_SEED, recipe.validation_pairs, recipe.pair_size), console
     )
-    run = Run(recipe, start, TensorBoardLogger(out, name="", version=""))
+    logger = TensorBoardLogger(out, name="", version="")
+    run = Run(recipe, start, logger)
     batches = Batches(recipe, pairs)
-    with _progress(console) as progress:
+    with closing_curves(logger), _progress(console) as progress:
         task = progress.add_task(recipe.name, total=recipe.steps, completed=start.step, loss="", rate="")
         began = time.perf_counter()
         for step, batch in _numbered_batches(batches, start.step):
@@ -113,6 +115,15 @@ def train(recipe_path: Path, out: Path, console: Console | None = None) -> Path:
             rate, began = recipe.batch / (time.perf_counter() - began), time.perf_counter()
             progress.update(task, completed=step + 1, loss=f"loss {loss:.3f}", rate=f"{rate:.1f} pairs/s")
     return last
+
+
+@contextmanager
+def closing_curves(logger: TensorBoardLogger) -> Iterator[TensorBoardLogger]:
+    """The logger, whose last values are in its file when the block is left, after an error too."""
+    try:
+        yield logger
+    finally:
+        logger.finalize("left")
 
 
 class Run:
