@@ -250,7 +250,7 @@ def _numbered_batches(batches: Batches, first: int) -> Iterator[tuple[int, dict[
 
 
 def _keep_freed_memory() -> None:
-    """Have glibc keep large blocks that are freed: getting them anew from the kernel took 2/3 of a step."""
+    """Have glibc keep large blocks that are freed: getting them anew from the kernel slows every step."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:
         m_trim_threshold, m_top_pad, m_mmap_max = -1, -2, -4
