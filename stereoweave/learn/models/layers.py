@@ -167,3 +167,103 @@ def upsample_convex(
     # 1e-4: where all nine are refused, no division by zero, and still a mixture of nothing but neighbours.
     mixed = ((shares + 1e-4) * neighbours).sum(1) / (shares + 1e-4).sum(1)
     return F.pixel_shuffle(mixed, 2)
+
+
+def pad_to_multiple(image: Float[Tensor, "b c h w"], multiple: int) -> Float[Tensor, "b c h2 w2"]:
+    """The image with its last row and column repeated until both sides are multiples of `multiple`.
+
+    Everything is added below and on the right, so that a pixel keeps its place: a result is cut back to
+    [..., :height, :width]. An image that already fits comes back itself, and an exported graph whose sides
+    are declared as multiples holds no padding.
+    """
+    below, behind = (-side % multiple for side in image.shape[2:])
+    if below == behind == 0:
+        return image
+    return F.pad(image, (0, behind, 0, below), mode="replicate")
+
+
+class NormReluConv(nn.Sequential):
+    """Batch norm, ReLU, convolution, in the order of DenseMapNet and the paper; the resolution stays."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int = 5, dilation: int = 1) -> None:
+        super().__init__(
+            keras_norm(inputs), nn.ReLU(inplace=True), same_conv(inputs, outputs, kernel, dilation)
+        )
+
+
+class PooledMatching(nn.Module):
+    """DenseMapNet's correspondence network, which the paper takes over: both views in one map, pooled by 8.
+
+    Layers are registered in the order in which Keras numbers them in DenseMapNet's published weights.
+
+    Args:
+        channels: Channels of one view.
+    """
+
+    def __init__(self, channels: int = 3) -> None:
+        super().__init__()
+        self.left_features = same_conv(channels, 16)
+        self.left_channel = same_conv(channels, 1, dilation=2)
+        self.stereo_features = same_conv(2 * channels, 32)
+        self.norm = keras_norm(32)
+        self.correspondence = nn.ModuleList(same_conv(32, 32, dilation=dilation) for dilation in (1, 2, 3, 4))
+        self.dense = nn.ModuleList(
+            nn.Sequential(NormReluConv(176 + 16 * i, 64, kernel=1), NormReluConv(64, 16, dilation=i + 1))
+            for i in range(4)
+        )
+        self.bottleneck = NormReluConv(240, 32, kernel=1)
+        self.dropout = nn.Dropout(0.2)
+
+    def forward(
+        self, left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"]
+    ) -> tuple[Float[Tensor, "b 32 h8 w8"], Float[Tensor, "b 16 h w"], Float[Tensor, "b 1 h w"]]:
+        """Matches at 1/8 resolution; the left view's features at full resolution, and one channel of it."""
+        features = self.left_features(left)
+        stereo = self.stereo_features(torch.cat([left, right], 1))
+        stereo = F.relu(self.norm(F.max_pool2d(stereo, 8)))
+        # The widest dilation first: the published weights want the channels in this order.
+        found = [self.dropout(conv(stereo)) for conv in reversed(self.correspondence)]
+        matches = torch.cat([F.max_pool2d(features, 8), *found, stereo], 1)
+        for block in self.dense:
+            matches = torch.cat([matches, self.dropout(block(matches))], 1)
+        return self.bottleneck(matches), features, self.left_channel(left)
+
+
+class CodeHead(nn.Module):
+    """The last layers of DenseMapNet and the paper: a code in 0..1 from decoded maps and the left channel."""
+
+    def __init__(self, inputs: int) -> None:
+        super().__init__()
+        self.conv = NormReluConv(inputs + 1, 16)
+        self.norm = keras_norm(inputs + 1 + 16)
+        self.to_code = nn.ConvTranspose2d(inputs + 1 + 16, 1, 9, padding=4)
+
+    def forward(
+        self, decoded: Float[Tensor, "b c h w"], left_channel: Float[Tensor, "b 1 h w"]
+    ) -> Float[Tensor, "b 1 h w"]:
+        joined = torch.cat([decoded, left_channel], 1)
+        joined = torch.cat([joined, self.conv(joined)], 1)
+        return self.to_code(F.relu(self.norm(joined))).sigmoid()
+
+
+def same_conv(inputs: int, outputs: int, kernel: int = 5, dilation: int = 1) -> nn.Conv2d:
+    """A convolution with bias that keeps the resolution."""
+    return nn.Conv2d(inputs, outputs, kernel, padding=dilation * (kernel // 2), dilation=dilation)
+
+
+def keras_norm(channels: int) -> nn.BatchNorm2d:
+    """Batch norm with Keras's defaults, under which DenseMapNet and the paper's network were published."""
+    return nn.BatchNorm2d(channels, eps=1e-3, momentum=0.01)
+
+
+def initialise_as_keras(network: nn.Module) -> None:
+    """Give every convolution Glorot's uniform weights and no bias, Keras's defaults.
+
+    PyTorch's own would start a transposed convolution to one channel with weights more than twice as large:
+    the sigmoid behind it would see logits with a standard deviation of 2 in place of 0.8 (measured).
+    """
+    for layer in network.modules():
+        if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
+            nn.init.xavier_uniform_(layer.weight)
+            assert layer.bias is not None
+            nn.init.zeros_(layer.bias)

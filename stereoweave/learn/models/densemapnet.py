@@ -1,0 +1,155 @@
+"""DenseMapNet: R. Atienza, "Fast Disparity Estimation Using Dense Networks", ICRA 2018.
+
+The parent of the paper's network: the same matching over both views laid together and pooled by 8, its result
+enlarged by 8 at once. What the two share is in layers.py. The layers are those of the published weights
+(github.com/roatienza/densemapnet, MIT licence), which `load_keras` reads.
+
+Deviation: sides that are no multiples of 8 are padded below and on the right with the border's pixels before
+the network, and the result is cut back; the published code pads its maps with zeros inside.
+"""
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from stereoweave.errors import FormatError
+from stereoweave.learn.models.layers import CodeHead, PooledMatching, initialise_as_keras, pad_to_multiple
+
+# What a layer is called in a Keras file, and what each of our tensors is called there.
+_KERAS_NAMES: dict[type[nn.Module], tuple[str, dict[str, str]]] = {
+    nn.Conv2d: ("conv2d", {"weight": "kernel", "bias": "bias"}),
+    nn.ConvTranspose2d: ("conv2d_transpose", {"weight": "kernel", "bias": "bias"}),
+    nn.BatchNorm2d: (
+        "batch_normalization",
+        {
+            "weight": "gamma",
+            "bias": "beta",
+            "running_mean": "moving_mean",
+            "running_var": "moving_variance",
+        },
+    ),
+}
+
+
+class DenseMapNet(nn.Module):
+    """The network that the paper builds on: a code of disparity in 0..1 for each pixel of the left view.
+
+    290,290 parameters; 8.41 G multiply-adds at 640x480.
+
+    Args:
+        channels: 3 for RGB; 1 for a network that matches grey pictures (286,240 parameters), as the one
+            published for KITTI 2015 does. It is given RGB like any other and weighs the colours by Rec. 601,
+            as OpenCV and Pillow do; how its author did is not known.
+    """
+
+    multiple_of = 8
+    predicts: ClassVar[Literal["code", "disparity_px"]] = "code"
+    output_weights: ClassVar[tuple[float, ...]] = (1.0,)
+
+    def __init__(self, channels: Literal[1, 3] = 3) -> None:
+        super().__init__()
+        self.channels = channels
+        self.matching = PooledMatching(channels)
+        self.head = CodeHead(32)
+        initialise_as_keras(self)
+
+    def outputs(
+        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
+    ) -> tuple[Float[Tensor, "b 1 h w"]]:
+        """All that training supervises: the code alone."""
+        height, width = left.shape[2:]
+        left, right = (pad_to_multiple(view, self.multiple_of) for view in (left, right))
+        if self.channels == 1:
+            left, right = _grey(left), _grey(right)
+        matches, _, left_channel = self.matching(left, right)
+        code = self.head(F.interpolate(matches, scale_factor=8.0), left_channel)
+        return (code[..., :height, :width],)
+
+    def forward(
+        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
+    ) -> Float[Tensor, "b 1 h w"]:
+        """The left view's code [B, 1, H, W] in 0..1, near is high; published networks: disparity / d_max.
+
+        Args:
+            left: The left view [B, 3, H, W], RGB in 0..1, of any size.
+            right: The right view, likewise.
+        """
+        return self.outputs(left, right)[-1]
+
+
+def load_keras(path: str | Path) -> DenseMapNet:
+    """The published network of a Keras HDF5 weight file, in eval mode; grey if the file is.
+
+    Its code is disparity / d_max, but the file does not hold d_max, the largest one in training.
+
+    Raises:
+        FormatError: If the file is missing, is no HDF5, or holds other layers or shapes than DenseMapNet's.
+    """
+    found = _read_hdf5(path)
+    first = found.get("conv2d_1/conv2d_1/kernel:0")
+    network = DenseMapNet(channels=1 if first is not None and first.shape[2:] == (1, 16) else 3)
+    with torch.no_grad():
+        for name, values in _keras_views(network):
+            if name not in found:
+                raise FormatError(f"{path}: expected DenseMapNet's weights, found no {name}")
+            theirs = found.pop(name)
+            if theirs.shape != values.shape:
+                raise FormatError(
+                    f"{path}: expected {name} of shape {tuple(values.shape)}, found {theirs.shape}"
+                )
+            values.copy_(torch.from_numpy(theirs))
+    if found:
+        raise FormatError(f"{path}: expected DenseMapNet's weights alone, found {min(found)} beside them")
+    return network.eval()
+
+
+def _read_hdf5(path: str | Path) -> dict[str, np.ndarray]:
+    """Every array of the file by its full name."""
+    import h5py  # type: ignore[import-untyped]
+
+    arrays = {}
+
+    def keep(name: str, item: object) -> None:
+        if isinstance(item, h5py.Dataset):
+            arrays[name] = item[()]
+
+    try:
+        with h5py.File(path) as file:
+            file.visititems(keep)
+    except FileNotFoundError as error:
+        raise FormatError(f"{path}: expected Keras weights as HDF5, found no such file") from error
+    except (OSError, KeyError, RuntimeError, ValueError) as error:
+        # HDF5's own words are long and of several lines; they stay with the cause.
+        raise FormatError(f"{path}: expected Keras weights as HDF5, found something else") from error
+    return arrays
+
+
+def _keras_views(network: nn.Module) -> Iterator[tuple[str, Tensor]]:
+    """Every tensor of the network under its name in a Keras file, its axes in Keras's order.
+
+    Keras numbers the layers of a kind as they are constructed; so does `modules()`.
+    """
+    count = Counter[str]()
+    for layer in network.modules():
+        if type(layer) in _KERAS_NAMES:
+            kind, parts = _KERAS_NAMES[type(layer)]
+            count[kind] += 1
+            for ours, theirs in parts.items():
+                values: Tensor = getattr(layer, ours)
+                name = f"{kind}_{count[kind]}"
+                yield (
+                    f"{name}/{name}/{theirs}:0",
+                    values.permute(2, 3, 1, 0) if values.ndim == 4 else values,
+                )
+
+
+def _grey(view: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
+    red, green, blue = view.chunk(3, 1)
+    return 0.299 * red + 0.587 * green + 0.114 * blue

@@ -1,0 +1,82 @@
+"""FastDepthNet: the network of "Fast Depth Estimation for View Synthesis", section III-A.
+
+The matching of DenseMapNet (Atienza, "Fast Disparity Estimation Using Dense Networks", ICRA 2018) with a
+decoder in steps of two, which sees the left view again at each step. What the two share is in layers.py.
+
+The paper gives the structure. Filter counts, dropout of single values and the constants of batch norm are
+those of the published implementations, and add up to their 314,722 parameters. Where both are silent:
+
+- Upsampling repeats pixels, as Keras does when not told otherwise.
+- Initial weights are Glorot's and biases 0, Keras's defaults.
+- Sides that are no multiples of 8 are padded below and on the right with the border's pixels, and the result
+  is cut back. Both views are padded alike, which leaves every disparity as it was; and nothing is moved, so
+  that the cut is all there is to undo.
+"""
+
+from typing import ClassVar, Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from stereoweave.learn.models.layers import (
+    CodeHead,
+    NormReluConv,
+    PooledMatching,
+    initialise_as_keras,
+    pad_to_multiple,
+)
+
+
+class FastDepthNet(nn.Module):
+    """The paper's network: a code of depth or disparity in 0..1 for each pixel of the left view.
+
+    314,722 parameters; 7.39 G multiply-adds at 640x480.
+
+    Args:
+        skips: Whether the steps of the decoder see the left view's pooled features; without, the paper's
+            claim for them can be tested (301,858 parameters).
+    """
+
+    multiple_of = 8
+    predicts: ClassVar[Literal["code", "disparity_px"]] = "code"
+    output_weights: ClassVar[tuple[float, ...]] = (1.0,)
+
+    def __init__(self, skips: bool = True) -> None:
+        super().__init__()
+        self.skips = skips
+        joined = 16 if skips else 0
+        self.matching = PooledMatching()
+        self.decode_quarter = NormReluConv(32 + joined, 16)
+        self.decode_half = NormReluConv(16 + joined, 16)
+        self.head = CodeHead(16)
+        initialise_as_keras(self)
+
+    def outputs(
+        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
+    ) -> tuple[Float[Tensor, "b 1 h w"]]:
+        """All that training supervises: the code alone."""
+        height, width = left.shape[2:]
+        left, right = (pad_to_multiple(view, self.multiple_of) for view in (left, right))
+        matches, features, left_channel = self.matching(left, right)
+        quarter = self.decode_quarter(self._enlarged(matches, features, 4))
+        half = self.decode_half(self._enlarged(quarter, features, 2))
+        code = self.head(F.interpolate(half, scale_factor=2.0), left_channel)
+        return (code[..., :height, :width],)
+
+    def forward(
+        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
+    ) -> Float[Tensor, "b 1 h w"]:
+        """The left view's code [B, 1, H, W] in 0..1, near is high; `DepthCurve` decodes it.
+
+        Args:
+            left: The left view [B, 3, H, W], RGB in 0..1, of any size.
+            right: The right view, likewise.
+        """
+        return self.outputs(left, right)[-1]
+
+    def _enlarged(self, x: Tensor, features: Tensor, pool: int) -> Tensor:
+        """Twice the size, which is 1/`pool` of the full one, and the left view's features at that size."""
+        enlarged = F.interpolate(x, scale_factor=2.0)
+        return torch.cat([enlarged, F.max_pool2d(features, pool)], 1) if self.skips else enlarged

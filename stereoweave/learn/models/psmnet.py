@@ -1,0 +1,262 @@
+"""PSMNet with the stacked hourglass.
+
+J.-R. Chang and Y.-S. Chen, Pyramid Stereo Matching Network, CVPR 2018, arXiv:1803.08669.
+
+Deviations, and choices where the paper is silent:
+
+- The batch norms of the features see both views at once: one batch is quicker than two, and weights that
+  serve both want statistics of both. So a single pair can train where pooling leaves one pixel of a map.
+- A pooling window is cut to the map where the map is smaller, so that small crops train.
+- The pyramid's branches have 1x1 kernels, as the paper's text says; with its table's 3x3 ones the count would
+  be 131,072 above the published one.
+- The cost volume is 0 where the candidate is outside the right image; the left features stay there.
+- Colours are scaled to -1..1, and not by a data set's mean and deviation: a batch norm follows.
+- Enlargements regard pixels as areas (align_corners off), whatever the size of the map.
+"""
+
+from typing import ClassVar, Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.learn.models.layers import ConvBlock, pad_to_multiple
+
+
+def norm_convolution(inputs: int, outputs: int, kernel: int, stride: int, dilation: int) -> nn.Sequential:
+    """Convolution and batch norm; 1 / `stride` of the input's resolution."""
+    padding = dilation * (kernel // 2)
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, kernel, stride, padding, dilation, bias=False), nn.BatchNorm2d(outputs)
+    )
+
+
+def norm_convolution_3d(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
+    """3x3x3 convolution and batch norm; 1 / `stride` of the input's resolution, candidates included."""
+    return nn.Sequential(
+        nn.Conv3d(inputs, outputs, 3, stride, padding=1, bias=False), nn.BatchNorm3d(outputs)
+    )
+
+
+def norm_expansion_3d(inputs: int, outputs: int) -> nn.Sequential:
+    """3x3x3 transposed convolution and batch norm; twice the input's resolution, candidates included."""
+    return nn.Sequential(
+        nn.ConvTranspose3d(inputs, outputs, 3, stride=2, padding=1, output_padding=1, bias=False),
+        nn.BatchNorm3d(outputs),
+    )
+
+
+class BasicBlock(nn.Module):
+    """Two 3x3 convolutions added to their input, which a 1x1 convolution fits to them where it has to."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int = 1, dilation: int = 1) -> None:
+        super().__init__()
+        self.body = nn.Sequential(
+            norm_convolution(inputs, outputs, 3, stride, dilation),
+            nn.ReLU(inplace=True),
+            norm_convolution(outputs, outputs, 3, 1, dilation),
+        )
+        fits = inputs == outputs and stride == 1
+        self.shortcut = nn.Identity() if fits else norm_convolution(inputs, outputs, 1, stride, 1)
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c2 h2 w2"]:
+        return self.body(x) + self.shortcut(x)
+
+
+def basic_blocks(inputs: int, outputs: int, count: int, stride: int = 1, dilation: int = 1) -> nn.Sequential:
+    """`count` basic blocks in a row; the first of them changes channels and resolution."""
+    rest = (BasicBlock(outputs, outputs, dilation=dilation) for _ in range(count - 1))
+    return nn.Sequential(BasicBlock(inputs, outputs, stride, dilation), *rest)
+
+
+class PyramidPooling(nn.Module):
+    """The means of windows of four sizes, narrowed to 32 channels each and enlarged again: [B, 128, H, W]."""
+
+    windows = (64, 32, 16, 8)
+
+    def __init__(self, inputs: int) -> None:
+        super().__init__()
+        self.branches = nn.ModuleList(ConvBlock(inputs, 32, kernel=1) for _ in self.windows)
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 128 h w"]:
+        height, width = x.shape[2:]
+        pooled = (F.avg_pool2d(x, (min(window, height), min(window, width))) for window in self.windows)
+        narrowed = (branch(mean) for branch, mean in zip(self.branches, pooled, strict=True))
+        return torch.cat([F.interpolate(map_, (height, width), mode="bilinear") for map_ in narrowed], 1)
+
+
+class Features(nn.Module):
+    """Features of a view and its wider surroundings, at a quarter of its resolution [B, 32, H/4, W/4]."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv0 = nn.Sequential(
+            norm_convolution(3, 32, 3, stride=2, dilation=1),
+            nn.ReLU(inplace=True),
+            ConvBlock(32, 32),
+            ConvBlock(32, 32),
+        )
+        self.conv1 = basic_blocks(32, 32, 3)
+        self.conv2 = basic_blocks(32, 64, 16, stride=2)
+        self.conv3 = basic_blocks(64, 128, 3, dilation=2)
+        self.conv4 = basic_blocks(128, 128, 3, dilation=4)
+        self.pyramid = PyramidPooling(128)
+        self.fusion = nn.Sequential(ConvBlock(64 + 128 + 128, 128), nn.Conv2d(128, 32, 1, bias=False))
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 32 h4 w4"]:
+        conv2 = self.conv2(self.conv1(self.conv0(image * 2 - 1)))
+        conv4 = self.conv4(self.conv3(conv2))
+        return self.fusion(torch.cat([conv2, conv4, self.pyramid(conv4)], 1))
+
+
+def cost_volume(
+    left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"], levels: int
+) -> Float[Tensor, "b c2 d h w"]:
+    """Features of column x of `left`, then of column x - d of `right`, for d = 0 .. levels - 1; 0 outside.
+
+    Windows as wide as the image slide over the right view, to the left of which lies nothing but zeros: the
+    last window is d = 0. Plain reference: `cost_volume_plain` in tests/test_psmnet.py.
+    """
+    windows = F.pad(right, (levels - 1, 0)).unfold(3, right.shape[3], 1)
+    shifted = windows.flip(3).transpose(2, 3)
+    return torch.cat([left.unsqueeze(2).expand_as(shifted), shifted], 1)
+
+
+def soft_argmin(cost: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
+    """Expected disparity under a softmax over matching costs (Kendall et al. 2017).
+
+    Args:
+        cost: matching cost a candidate [B, D, H, W]; low is good. Candidate i means a disparity of i pixels
+            at this resolution.
+
+    Returns:
+        Disparity [B, 1, H, W] in pixels: column x of the left image is at x - disparity in the right.
+    """
+    candidates_px = torch.arange(cost.shape[1], dtype=cost.dtype, device=cost.device).view(1, -1, 1, 1)
+    return ((-cost).softmax(1) * candidates_px).sum(1, keepdim=True)
+
+
+class Hourglass(nn.Module):
+    """Costs regarded at a half and a quarter of their resolution, and brought back."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.down = nn.Sequential(
+            norm_convolution_3d(32, 64, stride=2), nn.ReLU(inplace=True), norm_convolution_3d(64, 64)
+        )
+        self.bottom = nn.Sequential(
+            norm_convolution_3d(64, 64, stride=2),
+            nn.ReLU(inplace=True),
+            norm_convolution_3d(64, 64),
+            nn.ReLU(inplace=True),
+        )
+        self.up = norm_expansion_3d(64, 64)
+        self.out = norm_expansion_3d(64, 32)
+
+    def forward(
+        self,
+        x: Float[Tensor, "b 32 d h w"],
+        way_down: Float[Tensor, "b 64 d2 h2 w2"] | None,
+        way_up: Float[Tensor, "b 64 d2 h2 w2"] | None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """What to add to the volume [B, 32, D, H, W], and the maps of the ways down and up at half of that.
+
+        `way_down` is the first hourglass's, `way_up` the last one's; both None in the first hourglass.
+        """
+        down = self.down(x)
+        here = F.relu(down if way_up is None else down + way_up)
+        up = F.relu(self.up(self.bottom(here)) + (here if way_down is None else way_down))
+        return self.out(up), here, up
+
+
+class PSMNet(nn.Module):
+    """Disparity of the left view, 0 to `max_disparity_px` - 1: the mean of a distribution over whole pixels.
+
+    5,224,768 parameters. 432.88 G multiply-adds at 640x480 and 192 candidates: the convolutions; batch norm,
+    pooling, the enlargement of the costs and their softmax are not counted.
+
+    Args:
+        max_disparity_px: number of candidates, a multiple of 16.
+    """
+
+    multiple_of = 16
+    predicts: ClassVar[Literal["code", "disparity_px"]] = "disparity_px"
+    output_weights: ClassVar[tuple[float, ...]] = (0.5, 0.7, 1.0)
+
+    def __init__(self, max_disparity_px: int = 192) -> None:
+        super().__init__()
+        if max_disparity_px < 16 or max_disparity_px % 16:
+            raise StereoweaveError(
+                f"PSMNet: max_disparity_px must be a multiple of 16, from 16 on, got {max_disparity_px}"
+            )
+        self.max_disparity_px = max_disparity_px
+        self.features = Features()
+        self.narrow = nn.Sequential(
+            norm_convolution_3d(64, 32),
+            nn.ReLU(inplace=True),
+            norm_convolution_3d(32, 32),
+            nn.ReLU(inplace=True),
+        )
+        self.residual = nn.Sequential(
+            norm_convolution_3d(32, 32), nn.ReLU(inplace=True), norm_convolution_3d(32, 32)
+        )
+        self.hourglasses = nn.ModuleList(Hourglass() for _ in self.output_weights)
+        self.heads = nn.ModuleList(_head() for _ in self.output_weights)
+        self.apply(_initialise)
+
+    def costs(
+        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
+    ) -> list[Float[Tensor, "b 1 d4 h4 w4"]]:
+        """Matching costs after each hourglass, for 1/4 of the candidates at 1/4 of the padded size."""
+        views = pad_to_multiple(torch.cat([left, right]), self.multiple_of)
+        left_features, right_features = self.features(views).chunk(2)
+        narrowed = self.narrow(cost_volume(left_features, right_features, self.max_disparity_px // 4))
+        volume = narrowed + self.residual(narrowed)
+        costs: list[Tensor] = []
+        maps, first_down, up = volume, None, None
+        for hourglass, head in zip(self.hourglasses, self.heads, strict=True):
+            correction, down, up = hourglass(maps, first_down, up)
+            first_down = down if first_down is None else first_down
+            maps = volume + correction
+            costs.append(head(maps) + costs[-1] if costs else head(maps))
+        return costs
+
+    def outputs(
+        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
+    ) -> tuple[Float[Tensor, "b 1 h w"], ...]:
+        """Disparities in pixels after each hourglass; the last one is the answer."""
+        return tuple(_disparity_px(cost, left) for cost in self.costs(left, right))
+
+    def forward(
+        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
+    ) -> Float[Tensor, "b 1 h w"]:
+        """Disparity of the left view in pixels; the images are RGB in 0..1."""
+        return _disparity_px(self.costs(left, right)[-1], left)
+
+
+def _head() -> nn.Sequential:
+    return nn.Sequential(
+        norm_convolution_3d(32, 32), nn.ReLU(inplace=True), nn.Conv3d(32, 1, 3, padding=1, bias=False)
+    )
+
+
+def _disparity_px(
+    cost: Float[Tensor, "b 1 d4 h4 w4"], image: Float[Tensor, "b 3 h w"]
+) -> Float[Tensor, "b 1 h w"]:
+    """Disparity at the size of `image` of costs at a quarter of its padded size.
+
+    In float32 whatever the costs are in: between 128 and 256, bfloat16 holds whole numbers and no fractions.
+    """
+    full = F.interpolate(cost.float(), scale_factor=4.0, mode="trilinear").squeeze(1)
+    return soft_argmin(full)[..., : image.shape[2], : image.shape[3]]
+
+
+def _initialise(layer: nn.Module) -> None:
+    """Normal weights of variance 2 / (kernel volume * outputs), as published."""
+    if isinstance(layer, nn.Conv2d | nn.Conv3d):
+        nn.init.kaiming_normal_(layer.weight, mode="fan_out", nonlinearity="relu")
+    elif isinstance(layer, nn.ConvTranspose3d):
+        # PyTorch keeps these weights the other way round, so that its fan in is the layer's fan out.
+        nn.init.kaiming_normal_(layer.weight, mode="fan_in", nonlinearity="relu")
