@@ -1,4 +1,12 @@
-"""What training minimises: maps over [B, 1, H, W] in, one number out; truth that is NaN does not count."""
+"""What training minimises: maps over [B, 1, H, W] in, one number out; truth that is NaN does not count.
+
+`weave_losses` and its terms are WeaveNet's. `CODE_LOSSES` and `projection_loss` are those of "Fast Depth
+Estimation for View Synthesis", for networks that predict the code of a `DepthCurve`; its perceptual loss
+needs weights and is in perceptual.py.
+"""
+
+from collections.abc import Callable
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -6,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from stereoweave.learn.models.weave import Stages
+from stereoweave.learn.warp import reconstruct_left
 
 
 def weave_losses(
@@ -72,6 +81,63 @@ def halved(truth_px: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h2 w2"]:
     return blocks.mean(1, keepdim=True).where(high - low < 1, torch.nan)
 
 
+def l2_loss(code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
+    """Mean squared error of the code: the paper's choice, the first term of its equation (5)."""
+    return _mean_over_known(F.mse_loss, code, truth)
+
+
+def l1_loss(code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
+    """Mean absolute error of the code."""
+    return _mean_over_known(F.l1_loss, code, truth)
+
+
+def smooth_l1_loss(
+    code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"], beta: float = 1 / 192
+) -> Float[Tensor, ""]:
+    """Mean absolute error of the code less beta / 2, and its square / (2 beta) where it is below beta.
+
+    PSMNet and others turn at 1 px. That is 1 / max_disparity_px of a code whose exponent is 1, and 1 / 192
+    is it for PSMNet's range.
+    """
+    return _mean_over_known(partial(F.smooth_l1_loss, beta=beta), code, truth)
+
+
+def cross_entropy_loss(code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
+    """Mean binary cross-entropy of the code, both in 0..1; least, but not 0, where the code is the truth.
+
+    PyTorch bounds it by 100 and its gradient by 1e12, so both are finite where a code is exactly 0 or 1;
+    behind a sigmoid, whose slope is 0 there, such a code learns nothing.
+    """
+    return _mean_over_known(F.binary_cross_entropy, code, truth)
+
+
+CODE_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "l2": l2_loss,
+    "l1": l1_loss,
+    "smooth_l1": smooth_l1_loss,
+    "cross_entropy": cross_entropy_loss,
+}
+
+
+def projection_loss(
+    left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"], disparity_px: Float[Tensor, "b 1 h w"]
+) -> Float[Tensor, ""]:
+    """Mean squared difference of the left image and its reconstruction: equation (5), second term.
+
+    The mean is over the existing pixels of the whole batch, and 0 where none exists. The paper is silent on
+    the images' range and channels. Here they are in 0..1, like the code beside them, so that equal weights
+    weigh like with like; and channels are averaged, so that grey and colour weigh alike.
+    """
+    reconstructed, exists = reconstruct_left(right, disparity_px)
+    return mean_over(((reconstructed - left) ** 2).mean(1, keepdim=True), exists)
+
+
 def mean_over(values: Float[Tensor, "..."], known: Bool[Tensor, "..."]) -> Float[Tensor, ""]:
     """Mean of the values that are known; 0, with a gradient of 0, where none is."""
     return values.where(known, 0).sum() / known.sum().clamp(min=1)
+
+
+def _mean_over_known(loss: Callable[..., Tensor], code: Tensor, truth: Tensor) -> Tensor:
+    known = truth.isfinite()
+    # Replaced before it meets the code: NaN times a mask is NaN, in the gradient too.
+    return mean_over(loss(code, truth.where(known, 0), reduction="none"), known)

@@ -1,0 +1,94 @@
+"""The perceptual loss: maps are compared as a network that was trained on photographs sees them."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from stereoweave.errors import FormatError
+
+WEIGHTS = "vgg16-397923af.pth, torchvision's VGG-16 trained on ImageNet"
+
+
+class PerceptualLoss(nn.Module):
+    """The feature reconstruction loss of Johnson et al. (2016) between codes, on VGG-16's relu2_2.
+
+    relu2_2 is what they use wherever an image is to be reconstructed; deeper layers keep less of where edges
+    are. The weights are frozen; a file needs those of the first four convolutions alone.
+
+    Args:
+        weights: File of VGG-16's weights under torchvision's names; never downloaded by itself.
+    """
+
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(self, weights: Path) -> None:
+        super().__init__()
+        # Without storage, so that no random first weights are drawn: a seed gives the same training
+        # whichever loss is chosen.
+        with torch.device("meta"):
+            self.features = nn.Sequential(
+                *_convolution(3, 64), *_convolution(64, 64), nn.MaxPool2d(2),
+                *_convolution(64, 128), *_convolution(128, 128),
+            )  # fmt: skip
+        self.load_state_dict(_read(weights, self.state_dict()), assign=True)
+        self.requires_grad_(False)
+        # ImageNet's, with which VGG-16 was trained; not in the state, which is the file's.
+        mean, deviation = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+        self.register_buffer("mean", mean.view(3, 1, 1), persistent=False)
+        self.register_buffer("deviation", deviation.view(3, 1, 1), persistent=False)
+
+    def forward(self, code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
+        """Mean squared difference of the features; 0 where no pixel is known.
+
+        A feature sees 14x14 pixels, so unknown ones cannot be left out of the mean afterwards. They are taken
+        from the prediction on both sides, where they differ in nothing and have no gradient; and the mean is
+        divided by the share of known pixels, so that sparse truth weighs as much as it does in other losses.
+
+        Args:
+            code: Predicted code in 0..1.
+            truth: True code in 0..1; NaN where unknown.
+        """
+        known = truth.isfinite()
+        shown, expected = (values.where(known, code.detach()) for values in (code, truth))
+        difference = F.mse_loss(self._seen(shown), self._seen(expected))
+        return difference * known.numel() / known.sum().clamp(min=1)
+
+    def _seen(self, code: Tensor) -> Tensor:
+        # Three channels come of the one by the three means.
+        return self.features((code - self.mean) / self.deviation)
+
+
+def _convolution(inputs: int, outputs: int) -> tuple[nn.Module, nn.Module]:
+    return nn.Conv2d(inputs, outputs, 3, padding=1), nn.ReLU()
+
+
+def _read(path: Path, expected: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors of a file that `expected` names, in float32; FormatError if one is missing or misshapen."""
+    found = _load(path)
+    for name, tensor in expected.items():
+        shape = list(getattr(found.get(name), "shape", [])) or "nothing"
+        if shape != list(tensor.shape):
+            raise FormatError(
+                f"{path}: {name}: expected {list(tensor.shape)}, found {shape}; is it {WEIGHTS}?"
+            )
+    return {name: found[name].float() for name in expected}
+
+
+def _load(path: Path) -> dict[str, Any]:
+    try:
+        found = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError as error:
+        raise FormatError(
+            f"{path}: no such file; expected {WEIGHTS}, which is never downloaded by itself"
+        ) from error
+    except Exception as error:  # other bytes lead PyTorch's reader to any error whatever
+        reason = str(error).partition("\n")[0]
+        raise FormatError(f"{path}: expected {WEIGHTS}, found: {reason}") from error
+    if not isinstance(found, dict):
+        raise FormatError(f"{path}: expected {WEIGHTS}, found a {type(found).__name__}")
+    return found
