@@ -10,7 +10,7 @@ from pathlib import Path
 from uuid import uuid4
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8, UInt16
+from jaxtyping import Float, Float32, Shaped, UInt8, UInt16
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from stereoweave.errors import FormatError, StereoweaveError
@@ -39,7 +39,7 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
     Raises:
         FormatError: No such file, no picture, a truncated one, or one under 32 pixels wide or high.
     """
-    with _reading(path, "a picture (PNG, JPEG, TIFF or the like)"), Image.open(path) as picture:
+    with reading(path, "a picture (PNG, JPEG, TIFF or the like)"), Image.open(path) as picture:
         image = _rgb(ImageOps.exif_transpose(picture))
     if min(image.shape[:2]) < SMALLEST_SIDE_PX:
         raise FormatError(
@@ -95,7 +95,7 @@ def read_pfm(path: str | Path) -> Float32[np.ndarray, "h w"]:
     Raises:
         FormatError: No such file, another format, three channels ('PF'), or a length unlike the header's.
     """
-    with _reading(path, "a PFM file"):
+    with reading(path, "a PFM file"):
         content = Path(path).read_bytes()
         header = _PFM_HEADER.match(content)
         if header is None:
@@ -122,10 +122,27 @@ def write_pfm(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
         temporary.write_bytes(header + values[::-1].astype("<f4").tobytes())
 
 
+def read_pixels(path: str | Path, *modes: str) -> Shaped[np.ndarray, "h w *channels"]:
+    """The numbers of a picture as they are stored, for one that holds a measurement or a mask.
+
+    Args:
+        path: The picture.
+        modes: Pillow's names of the kinds that will do, such as "L", 8-bit grey, or "RGB".
+
+    Raises:
+        FormatError: No such file, a damaged one, or a picture of another kind.
+    """
+    expected = f"a picture of mode {' or '.join(modes)}"
+    with reading(path, expected), Image.open(path) as picture:
+        if picture.mode not in modes:
+            raise FormatError(f"{path}: expected {expected}, found {picture.format} of mode {picture.mode}")
+        return np.array(picture)
+
+
 def read_disparity_png(path: str | Path) -> Float32[np.ndarray, "h w"]:
     """Disparity in pixels from a 16-bit PNG of pixels * 256 (KITTI's); its 0, unknown, becomes NaN."""
     expected = "a 16-bit grey PNG of disparity * 256"
-    with _reading(path, expected), Image.open(path) as picture:
+    with reading(path, expected), Image.open(path) as picture:
         if not picture.mode.startswith("I"):
             raise FormatError(f"{path}: expected {expected}, found {picture.format} of mode {picture.mode}")
         steps = np.asarray(picture)
@@ -192,6 +209,19 @@ def make_folder(path: str | Path) -> Path:
 
 
 @contextmanager
+def reading(path: str | Path, expected: str) -> Iterator[None]:
+    """Turns what goes wrong while `path` is read into a FormatError: in one line, expected and found."""
+    try:
+        # Pillow warns about odd tags before it gives up on a file; the error below says it in one line.
+        with warnings.catch_warnings(action="ignore"):
+            yield
+    except FormatError:
+        raise
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise FormatError(f"{path}: expected {expected}, found {_reason(error)}") from error
+
+
+@contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
     """A name beside `path` to write to: it takes the place of `path` at the end, or is removed on an error.
 
@@ -211,18 +241,6 @@ def replacing(path: str | Path) -> Iterator[Path]:
         ) from error
     finally:
         temporary.unlink(missing_ok=True)
-
-
-@contextmanager
-def _reading(path: str | Path, expected: str) -> Iterator[None]:
-    try:
-        # Pillow warns about odd tags before it gives up on a file; the error below says it in one line.
-        with warnings.catch_warnings(action="ignore"):
-            yield
-    except FormatError:
-        raise
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise FormatError(f"{path}: expected {expected}, found {_reason(error)}") from error
 
 
 def _reason(error: Exception) -> str:
@@ -261,7 +279,7 @@ def _save(
 
 
 def _read_calibration(path: str | Path) -> tuple[StereoCamera, str]:
-    with _reading(path, "a Middlebury calib.txt"):
+    with reading(path, "a Middlebury calib.txt"):
         lines = Path(path).read_text(errors="replace").splitlines()
         entries = dict(line.split("=", 1) for line in lines if "=" in line)
         missing = {"cam0", "doffs", "baseline", "width", "height"} - entries.keys()

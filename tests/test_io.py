@@ -338,6 +338,32 @@ def test_a_depth_png_holds_millimetres_and_unknown_as_0(tmp_path):
     np.testing.assert_array_equal(stored(tmp_path / "depth.png"), [[1000, 2346, 65535], [0, 0, 0]])
 
 
+# Numbers in pictures
+
+
+@pytest.mark.parametrize(
+    ("mode", "values"),
+    [
+        ("L", np.arange(12, dtype=np.uint8).reshape(3, 4)),
+        ("1", np.eye(4, dtype=np.bool_)),
+        ("I;16", np.array([[0, 1, 65535]], np.uint16)),
+        ("RGB", np.array([[[1, 2, 3], [255, 0, 128]]], np.uint8)),
+    ],
+)
+def test_numbers_come_back_as_they_are_stored(tmp_path, mode, values):
+    path = tmp_path / "numbers.png"
+    Image.fromarray(values).save(path)
+    read = io.read_pixels(path, "other", mode)
+    assert read.dtype == values.dtype
+    np.testing.assert_array_equal(read, values)
+
+
+def test_numbers_in_a_picture_of_another_kind_are_refused(tmp_path, picture):
+    io.write_image(tmp_path / "colour.png", picture)
+    assert "mode L or 1, found PNG of mode RGB" in raises(io.read_pixels, tmp_path / "colour.png", "L", "1")
+    raises(io.read_pixels, tmp_path / "nowhere.png", "L")
+
+
 # Calibration
 
 

@@ -1,15 +1,52 @@
-"""Real scenes on disk, as pairs with the disparity that was measured for them."""
+"""Datasets by name, as frames to train on; and scenes in the project's own layout, to score a matcher on."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32
 
+from stereoweave.data import eth3d, kitti, middlebury, paper_layout, scene_flow, sintel
+from stereoweave.data.frames import Frame, existing
+from stereoweave.data.splits import split_frames
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io import calibrated, read_disparity_png, read_pair, read_pfm
 from stereoweave.stereo import StereoPair
+
+__all__ = ["DATASETS", "Frame", "Scene", "open_dataset", "read_scenes", "split_frames"]
+
+DATASETS: dict[str, Callable[[Path], list[Frame]]] = {
+    "sintel": sintel.sintel,
+    "flyingthings3d": scene_flow.flyingthings3d,
+    "driving": scene_flow.driving,
+    "monkaa": scene_flow.monkaa,
+    "kitti2012": kitti.kitti2012,
+    "kitti2015": kitti.kitti2015,
+    "middlebury2001": middlebury.middlebury2001,
+    "middlebury2003": middlebury.middlebury2003,
+    "middlebury2005": middlebury.middlebury2005,
+    "middlebury2006": middlebury.middlebury2006,
+    "middlebury2014": middlebury.middlebury2014,
+    "middlebury2021": middlebury.middlebury2021,
+    "eth3d": eth3d.eth3d,
+    "paper": paper_layout.paper,
+}
+
+
+def open_dataset(name: str, root: str | Path) -> list[Frame]:
+    """The frames of a dataset by name, listed from the folder that its authors' archives were unpacked to.
+
+    Raises:
+        StereoweaveError: An unknown dataset, a root that lacks a folder, or no frame in it.
+        FormatError: A file is missing, where the listing shows it; a frame's `read` finds the others.
+    """
+    if name not in DATASETS:
+        raise StereoweaveError(f"dataset: expected one of {', '.join(DATASETS)}, found {name!r}")
+    frames = DATASETS[name](existing(Path(root)))
+    if not frames:
+        raise StereoweaveError(f"{root}: expected the frames of {name}, unpacked as they come, found none")
+    return sorted(frames, key=lambda frame: frame.name)
 
 
 @dataclass(frozen=True, kw_only=True)

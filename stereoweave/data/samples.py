@@ -1,0 +1,81 @@
+"""Samples from what the files of a dataset hold: sizes compared, what is unknown or hidden marked."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Shaped
+
+from stereoweave.errors import FormatError
+from stereoweave.stereo import Sample, StereoPair
+
+# As in the project's own collages: rounding, and surfaces that all but touch.
+_TOLERANCE_PX = 0.5
+
+
+def of_its_size(
+    values: Shaped[np.ndarray, "h w *channels"], path: Path, pair: StereoPair
+) -> Shaped[np.ndarray, "h w *channels"]:
+    """The values themselves; FormatError, naming `path`, where they are not of the size of the pair."""
+    (height_px, width_px), expected = values.shape[:2], pair.left.shape[:2]
+    if (height_px, width_px) != expected:
+        raise FormatError(
+            f"{path}: expected {expected[1]}x{expected[0]} pixels, like the pictures it belongs to, "
+            f"found {width_px}x{height_px}"
+        )
+    return values
+
+
+def make_sample(
+    pair: StereoPair,
+    disparity_px: Float[np.ndarray, "h w"],
+    right_disparity_px: Float[np.ndarray, "h w"] | None = None,
+    occluded: Bool[np.ndarray, "h w"] | None = None,
+) -> Sample:
+    """The sample of a pair and its ground truth.
+
+    Args:
+        pair: With its camera where that is known.
+        disparity_px: Of the left view; NaN and infinity are unknown.
+        right_disparity_px: Of the right view; None where the dataset has none: all of it becomes unknown.
+        occluded: The dataset's own mask of the left view; None to find it from the two disparities.
+    """
+    left_px = _unknown_is_nan(disparity_px)
+    right_px = (
+        np.full_like(left_px, np.nan) if right_disparity_px is None else _unknown_is_nan(right_disparity_px)
+    )
+    return Sample(
+        left=pair.left,
+        right=pair.right,
+        disparity_px=left_px,
+        right_disparity_px=right_px,
+        occluded=hidden(left_px, right_px) if occluded is None else occluded,
+        right_occluded=np.ascontiguousarray(hidden(right_px[:, ::-1], left_px[:, ::-1])[:, ::-1]),
+        camera=pair.camera,
+    )
+
+
+def hidden(
+    disparity_px: Float[np.ndarray, "h w"], other_px: Float[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels that this view alone sees: whose match is beside the other picture, or behind what it sees.
+
+    False where a disparity that decides it is unknown. The other view lies to the right of this one; for a
+    right view, both maps are handed in mirrored.
+    """
+    width_px = disparity_px.shape[1]
+    match = np.arange(width_px) - disparity_px
+    outside = (match < 0) | (match > width_px - 1)
+    before = np.where(np.isfinite(match) & ~outside, match, 0).astype(np.intp)
+    after = np.where(match > before, before + 1, before)
+    # On a slope one of the two columns beside the match is never nearer than the surface itself, so that it
+    # does not hide itself. Comparisons with NaN are False.
+    seen_px = np.minimum(_at(other_px, before), _at(other_px, after))
+    return outside | (seen_px > disparity_px + _TOLERANCE_PX)
+
+
+def _at(values: Float[np.ndarray, "h w"], columns: np.ndarray) -> Float[np.ndarray, "h w"]:
+    return np.take_along_axis(values, np.minimum(columns, values.shape[1] - 1), axis=1)
+
+
+def _unknown_is_nan(disparity_px: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    return np.where(np.isfinite(disparity_px), disparity_px, np.nan).astype(np.float32)

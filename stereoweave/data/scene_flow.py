@@ -1,0 +1,86 @@
+"""Scene Flow (Mayer et al. 2016): FlyingThings3D, Driving and Monkaa, as their archives unpack.
+
+A root holds frames_cleanpass, frames_finalpass or both, and disparity; below each are the same folders, the
+last of which are left and right.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from jaxtyping import Float32
+
+from stereoweave.data.frames import Frame, existing, matched
+from stereoweave.data.samples import make_sample, of_its_size
+from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.io import read_pair, read_pfm
+from stereoweave.stereo import Sample, StereoCamera, StereoPair
+
+_PASSES = {"clean": "frames_cleanpass", "final": "frames_finalpass"}
+
+# Published for the pictures of 960x540: lenses of 35 mm and, in a half of Driving, 15 mm.
+_FOCAL_35MM_PX, _FOCAL_15MM_PX = 1050.0, 450.0
+
+
+def flyingthings3d(root: Path) -> list[Frame]:
+    """The full FlyingThings3D, both parts: clean/TRAIN/A/0000/0006."""
+    return _frames(root, {"TRAIN": _FOCAL_35MM_PX, "TEST": _FOCAL_35MM_PX})
+
+
+def driving(root: Path) -> list[Frame]:
+    """Driving: both lenses, directions and speeds: clean/15mm_focallength/scene_backwards/fast/0001."""
+    return _frames(root, {"15mm_focallength": _FOCAL_15MM_PX, "35mm_focallength": _FOCAL_35MM_PX})
+
+
+def monkaa(root: Path) -> list[Frame]:
+    """Monkaa: clean/a_rain_of_stones_x2/0000."""
+    return _frames(root, {".": _FOCAL_35MM_PX})
+
+
+def _frames(root: Path, focal_px: dict[str, float]) -> list[Frame]:
+    # The passes are separate downloads of tens of gigabytes: either will do.
+    passes = {kind: root / folder for kind, folder in _PASSES.items() if (root / folder).is_dir()}
+    if not passes:
+        raise StereoweaveError(
+            f"{root}: expected a folder {' or '.join(_PASSES.values())} there, found neither"
+        )
+    return [
+        Frame(name=PurePosixPath(kind, part, name).as_posix(), read=partial(_read, files, part_focal_px))
+        for kind, pictures in passes.items()
+        for part, part_focal_px in focal_px.items()
+        for name, files in _files(pictures / part, root / "disparity" / part)
+    ]
+
+
+def _files(pictures: Path, truth: Path) -> Iterator[tuple[str, list[Path]]]:
+    tops = existing(pictures), existing(truth)
+    sides = "left", "right"
+    runs = {view.parent.relative_to(top) for top in tops for side in sides for view in top.rglob(side)}
+    for run in sorted(runs):
+        views = [top / run / side for top in tops for side in sides]
+        for name, files in matched(*views).items():
+            yield (run / name).as_posix(), files
+
+
+def _read(files: list[Path], focal_px: float) -> Sample:
+    left, right, disparity, right_disparity = files
+    # The baseline is 1 unit of Blender, which we take for 1 m. The principal point is the published one.
+    camera = StereoCamera(focal_px=focal_px, baseline_m=1.0, cx_px=479.5, cy_px=269.5)
+    pair = replace(read_pair(left, right), camera=camera)
+    return make_sample(pair, _read_disparity(disparity, pair), _read_disparity(right_disparity, pair))
+
+
+def _read_disparity(path: Path, pair: StereoPair) -> Float32[np.ndarray, "h w"]:
+    """Disparity without its sign: positive for both views here, negative for the left in the later subset.
+
+    Parallel cameras leave no doubt about which is meant, unless one map has both signs: FormatError.
+    """
+    values_px = of_its_size(read_pfm(path), path, pair)
+    if (values_px < 0).any() and (values_px > 0).any():
+        raise FormatError(
+            f"{path}: expected disparities of one sign, found {np.nanmin(values_px):.3f} to "
+            f"{np.nanmax(values_px):.3f}; is it a disparity change?"
+        )
+    return np.abs(values_px)

@@ -1,0 +1,67 @@
+"""MPI Sintel stereo, training set (Butler et al. 2012; Wulff and Black 2015), as its archive unpacks it."""
+
+import struct
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from stereoweave.data.frames import Frame, matched
+from stereoweave.data.samples import make_sample, of_its_size
+from stereoweave.errors import FormatError
+from stereoweave.io import read_pair, read_pixels, reading
+from stereoweave.stereo import Sample, StereoCamera
+
+# "Rendered from two cameras with a baseline of 10 cm apart": the dataset's README.
+_BASELINE_M = 0.1
+_CAM = struct.Struct("<f 9d 12d")
+_CAM_TAG = 202021.25
+
+
+def sintel(root: Path) -> list[Frame]:
+    """The 1,064 frames of `root`/training, each in the passes "clean" and "final": clean/alley_1/frame_0001.
+
+    The camera is known where training/camdata_left, of the archive of Sintel's depth, is unpacked there too.
+    """
+    training = root / "training"
+    truth = [training / folder for folder in ("disparities", "occlusions", "outofframe")]
+    cameras = training / "camdata_left"
+    return [
+        Frame(name=f"{kind}/{name}", read=partial(_read, files, cameras / f"{name}.cam"))
+        for kind in ("clean", "final")
+        for name, files in matched(training / f"{kind}_left", training / f"{kind}_right", *truth).items()
+    ]
+
+
+def _read(files: list[Path], camera: Path) -> Sample:
+    left, right, disparity, occlusions, outofframe = files
+    pair = read_pair(left, right)
+    if camera.parents[1].is_dir():
+        pair = replace(pair, camera=_read_camera(camera))
+    packed = of_its_size(read_pixels(disparity, "RGB"), disparity, pair)
+    # Both masks mark what the right camera does not see: behind something nearer, or beside its picture.
+    occluded = [of_its_size(read_pixels(mask, "L", "1"), mask, pair) > 0 for mask in (occlusions, outofframe)]
+    return make_sample(pair, _unpacked_px(packed), occluded=occluded[0] | occluded[1])
+
+
+def _unpacked_px(packed: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
+    """Disparity from its packing in RGB: R * 4 + G / 2^6 + B / 2^14.
+
+    The README calls them "negative disparities", for a match lies further left; the numbers are positive.
+    """
+    return (packed @ np.array([4, 2**-6, 2**-14])).astype(np.float32)
+
+
+def _read_camera(path: Path) -> StereoCamera:
+    """The camera of a .cam file: a tag, then 3x3 intrinsics and 3x4 extrinsics, row by row, little-endian."""
+    with reading(path, "a camera of MPI Sintel"):
+        content = path.read_bytes()
+        if len(content) != _CAM.size or struct.unpack_from("<f", content)[0] != _CAM_TAG:
+            raise FormatError(
+                f"{path}: expected a camera of MPI Sintel, {_CAM.size} bytes that begin with {_CAM_TAG}, "
+                f"found {len(content)} bytes, {content[:4]!r}"
+            )
+        _, focal_px, _, cx_px, _, _, cy_px, *_ = _CAM.unpack(content)
+        return StereoCamera(focal_px=focal_px, baseline_m=_BASELINE_M, cx_px=cx_px, cy_px=cy_px)

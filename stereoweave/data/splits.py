@@ -1,0 +1,63 @@
+"""Which frames of a dataset are trained on and which are held out, by the rules in split_rules/."""
+
+import tomllib
+from fnmatch import fnmatchcase
+from importlib.resources import files
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+
+from stereoweave.data.frames import Frame
+from stereoweave.errors import StereoweaveError
+
+SPLITS = ("random", "disjoint")
+
+
+def split_frames(frames: list[Frame], dataset: str, split: str) -> tuple[list[Frame], list[Frame]]:
+    """The frames to train on and those held out, each by name; their order does not matter.
+
+    Args:
+        frames: Of one dataset.
+        dataset: Its name in `DATASETS`.
+        split: "random", the paper's, or "disjoint", which holds out whole sequences or stretches of them.
+
+    Raises:
+        StereoweaveError: An unknown dataset or split, or one of the two parts is empty.
+    """
+    ordered = sorted(frames, key=lambda frame: frame.name)
+    held_out = _held_out(_rule(dataset, split), ordered)
+    training = [frame for frame in ordered if frame.name not in held_out]
+    if not (training and held_out):
+        raise StereoweaveError(
+            f"split {split!r} of {dataset}: expected frames to train on and frames to hold out, "
+            f"found {len(training)} and {len(held_out)}; is the dataset all there?"
+        )
+    return training, [frame for frame in ordered if frame.name in held_out]
+
+
+def _rule(dataset: str, split: str) -> dict[str, Any]:
+    if split not in SPLITS:
+        raise StereoweaveError(f"split: expected one of {', '.join(SPLITS)}, found {split!r}")
+    rules = tomllib.loads((files(__package__) / "split_rules" / f"{split}.toml").read_text(encoding="utf-8"))
+    if dataset not in rules:
+        raise StereoweaveError(f"split of a dataset: expected one of {', '.join(rules)}, found {dataset!r}")
+    return rules[dataset]
+
+
+def _held_out(rule: dict[str, Any], frames: list[Frame]) -> set[str]:
+    names = [frame.name for frame in frames]
+    match rule:
+        case {"random_share": share, "seed": seed}:
+            order = np.random.default_rng(seed).permutation(len(names))
+            return {names[i] for i in order[: _count(share, len(names))]}
+        case {"last_share": share}:
+            sequences = (list(group) for _, group in groupby(frames, key=lambda frame: frame.sequence))
+            return {frame.name for run in sequences for frame in run[-_count(share, len(run)) :]}
+        case {"names": patterns}:
+            return {name for name in names if any(fnmatchcase(name, pattern) for pattern in patterns)}
+    raise AssertionError(rule)
+
+
+def _count(share: float, frames: int) -> int:
+    return max(1, round(share * frames))
