@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from stereoweave.learn.batches import collated
 from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.losses import weave_losses
 from stereoweave.learn.models import MODELS
 from stereoweave.learn.models.weave import WeaveNet
 from stereoweave.learn.pairs import KeptPairs
 from stereoweave.learn.recipe import Recipe
-from stereoweave.learn.train import collated
 from stereoweave.stereo import Sample
 
 # Pictures this small cost more to share among threads than to compute.

@@ -7,7 +7,7 @@ from learn_examples import RECIPE
 from stereoweave.errors import FormatError
 from stereoweave.learn.recipe import Recipe, read_recipe, recipe_from
 
-RECIPES = sorted((Path(__file__).parent.parent / "recipes").glob("*.toml"))
+RECIPES = sorted((Path(__file__).parent.parent / "recipes").rglob("*.toml"))
 NEEDED = {
     "name": "x",
     "model": "weave",
@@ -16,7 +16,6 @@ NEEDED = {
     "learning_rate": 1.0,
     "warm_up_steps": 4,
     "cool_down_steps": 2,
-    "pairs": 8,
 }
 
 
@@ -33,7 +32,7 @@ def test_a_recipe_is_read_with_its_defaults(tmp_path):
     file = tmp_path / "x.toml"
     file.write_text(
         'name = "x"\nmodel = "weave"\nsteps = 10\nbatch = 4\nlearning_rate = 1\nwarm_up_steps = 4\n'
-        "cool_down_steps = 2\npairs = 8\ncrop_size = [64, 96]\n"
+        "cool_down_steps = 2\ncrop_size = [64, 96]\n"
     )
     assert read_recipe(file) == Recipe(**NEEDED, crop_size=(64, 96))
 
@@ -76,6 +75,16 @@ def test_the_learning_rate_without_slopes_is_constant():
         ({"pairs": 0}, "pairs = 0, expected more than 0"),
         ({"validation_pairs": 0}, "validation_pairs = 0, expected more than 0"),
         ({"validate_every": 0}, "validate_every = 0, expected more than 0"),
+        ({"averaged_steps": 0}, "averaged_steps = 0, expected more than 0"),
+        ({"max_depth_m": 0.0}, "max_depth_m = 0.0, expected more than 0"),
+        ({"augment": 1}, "augment = 1, expected true or false"),
+        ({"exponent": 0.5}, "exponent = 0.5, expected at least 1"),
+        ({"exponent": float("inf")}, "exponent = inf, expected at least 1"),
+        ({"alpha_z": -1.0}, "alpha_z = -1.0, expected at least 0"),
+        ({"alpha_p": -0.1}, "alpha_p = -0.1, expected at least 0"),
+        ({"target": "height"}, "target = 'height', expected disparity or depth"),
+        ({"dataset": "sintel"}, "dataset = 'sintel' with root = '', expected a root for a dataset on disk"),
+        ({"root": "sintel"}, "dataset = 'collage' with root = 'sintel', expected a root for a dataset on"),
         ({"learning_rate": float("nan")}, "learning_rate = nan, expected more than 0"),
     ],
 )

@@ -1,3 +1,4 @@
+import json
 import os
 import signal
 import subprocess
@@ -16,11 +17,13 @@ from rich.console import Console
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.learn import checkpoint
 from stereoweave.learn import train as training
+from stereoweave.learn.batches import Batches, collated
 from stereoweave.learn.pairs import KeptPairs
 from stereoweave.learn.recipe import read_recipe
-from stereoweave.learn.train import Batches, Run, collated, train
+from stereoweave.learn.sources import VALIDATION_SEED
+from stereoweave.learn.train import Run, train
 
-RECIPES = sorted((Path(__file__).parent.parent / "recipes").glob("*.toml"))
+RECIPES = sorted((Path(__file__).parent.parent / "recipes").rglob("*.toml"))
 QUIET = Console(quiet=True)
 
 
@@ -29,7 +32,7 @@ def folder(tmp_path_factory):
     """Where runs go, with the pairs that they train on and are scored on."""
     folder = tmp_path_factory.mktemp("runs")
     keep_pairs(folder / "pairs", RECIPE.seed, RECIPE.pairs)
-    keep_pairs(folder / "pairs", training._VALIDATION_SEED, RECIPE.validation_pairs)
+    keep_pairs(folder / "pairs", VALIDATION_SEED, RECIPE.validation_pairs)
     return folder
 
 
@@ -51,7 +54,7 @@ def logger(tmp_path):
 
 
 def write(recipe, file):
-    lines = (f"{name} = {list(v) if isinstance(v, tuple) else repr(v)}" for name, v in asdict(recipe).items())
+    lines = (f"{name} = {json.dumps(value)}" for name, value in asdict(recipe).items())
     file.write_text("\n".join(lines) + "\n")
     return file
 
@@ -139,14 +142,14 @@ def test_a_loss_that_is_not_finite_stops_and_names_the_pairs(folder, tmp_path):
 
 def test_a_recipe_for_an_unknown_network_is_refused(tmp_path):
     file = write(replace(RECIPE, model="spider"), tmp_path / "spider.toml")
-    with pytest.raises(FormatError, match=r"spider\.toml: model = 'spider', expected weave"):
+    with pytest.raises(FormatError, match=r"tiny: model = 'spider', expected weave"):
         train(file, tmp_path / "run", QUIET)
 
 
 @pytest.mark.parametrize("sizes", [{"crop_size": (64, 56)}, {"pair_size": (64, 100)}])
 def test_a_recipe_with_sizes_that_the_network_cannot_divide_is_refused(tmp_path, sizes):
     file = write(replace(RECIPE, **sizes), tmp_path / "odd.toml")
-    with pytest.raises(FormatError, match=r"odd\.toml: pair_size = .*, expected multiples of 16 for weave"):
+    with pytest.raises(FormatError, match=r"tiny: pair_size = .*, expected multiples of 16 for weave"):
         train(file, tmp_path / "run", QUIET)
 
 

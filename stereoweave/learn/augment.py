@@ -6,13 +6,28 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from stereoweave.stereo import Sample
+from stereoweave.errors import StereoweaveError
+from stereoweave.stereo import Sample, StereoCamera
+
+
+def cut(sample: Sample, height: int, width: int, rng: np.random.Generator) -> Sample:
+    """A random part of the sample of the size asked for, as it is; StereoweaveError where it is smaller."""
+    rows, columns = sample.disparity_px.shape
+    if rows < height or columns < width:
+        raise StereoweaveError(
+            f"crop_size = {[height, width]}: expected at most the pictures' {[rows, columns]}; cut less"
+        )
+    top, start = int(rng.integers(rows - height + 1)), int(rng.integers(columns - width + 1))
+    part = np.s_[top : top + height, start : start + width]
+    maps = {name: value[part] for name, value in vars(sample).items() if name != "camera"}
+    return Sample(**maps, camera=moved(sample.camera, start, top))
 
 
 def augment(sample: Sample, height: int, width: int, rng: np.random.Generator) -> Sample:
     """A cut of the sample of the size asked for; disparity is scaled and moved along with it."""
     sample = rescaled_cut(sample, height, width, rng)
-    if rng.random() < 0.5:
+    # Without the right view's disparity a mirrored pair has nothing to learn from.
+    if rng.random() < 0.5 and np.isfinite(sample.right_disparity_px).any():
         sample = mirrored(sample)
     if rng.random() < 0.3:
         sample = upside_down(sample)
@@ -53,11 +68,30 @@ def rescaled_cut(sample: Sample, height: int, width: int, rng: np.random.Generat
         right_disparity_px=nearest(sample.right_disparity_px) * np.float32(scale_x),
         occluded=nearest(sample.occluded.astype(np.uint8)) > 0,
         right_occluded=nearest(sample.right_occluded.astype(np.uint8)) > 0,
+        camera=moved(sample.camera, start, top, scale_x, height / part_height),
+    )
+
+
+def moved(
+    camera: StereoCamera | None, start_px: int, top_px: int, scale_x: float = 1.0, scale_y: float = 1.0
+) -> StereoCamera | None:
+    """The camera of a part that starts at that column and row, scaled.
+
+    Its focal length is the one along rows, which depth depends on.
+    """
+    return camera and replace(
+        camera,
+        focal_px=camera.focal_px * scale_x,
+        cx_px=(camera.cx_px - start_px) * scale_x,
+        cy_px=(camera.cy_px - top_px) * scale_y,
+        doffs_px=camera.doffs_px * scale_x,
     )
 
 
 def mirrored(sample: Sample) -> Sample:
     """The sample as a mirror shows it: the views change places."""
+    camera = sample.camera
+    last = sample.left.shape[1] - 1
     return Sample(
         left=sample.right[:, ::-1],
         right=sample.left[:, ::-1],
@@ -65,12 +99,15 @@ def mirrored(sample: Sample) -> Sample:
         right_disparity_px=sample.disparity_px[:, ::-1],
         occluded=sample.right_occluded[:, ::-1],
         right_occluded=sample.occluded[:, ::-1],
+        camera=camera and replace(camera, cx_px=last - camera.cx_px - camera.doffs_px),
     )
 
 
 def upside_down(sample: Sample) -> Sample:
     """The sample with its first row last."""
-    return Sample(**{name: value[::-1] for name, value in vars(sample).items()})
+    maps = {name: value[::-1] for name, value in vars(sample).items() if name != "camera"}
+    camera, last = sample.camera, sample.left.shape[0] - 1
+    return Sample(**maps, camera=camera and replace(camera, cy_px=last - camera.cy_px))
 
 
 def recoloured(

@@ -16,11 +16,14 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.io import make_folder, replacing
 from stereoweave.learn import calibrate, checkpoint
 from stereoweave.learn.checkpoint import Checkpoint
-from stereoweave.learn.models import MODELS
+from stereoweave.learn.models import CodeNetwork, network_of
 from stereoweave.learn.models.weave import WeaveNet
+from stereoweave.learn.objective import CodeObjective
+from stereoweave.learn.recipe import Recipe
 from stereoweave.matcher import Matcher
 from stereoweave.stereo import StereoPair
 
+# WeaveNet gives all of them; the paper's network and its rivals the first.
 OUTPUTS = ["disparity_px", "right_disparity_px", "confidence_logit"]
 # The two runtimes may differ by rounding; more than this is another network.
 LARGEST_DIFFERENCE_PX = 0.01
@@ -40,10 +43,8 @@ def export(trained: Path, out: Path, pairs: Iterable[StereoPair] = ()) -> dict[s
             then.
     """
     kept = checkpoint.load(trained / "last.pt" if trained.is_dir() else trained)
-    network = MODELS[kept.recipe.model]()
-    network.load_state_dict(kept.averaged)
-    network.eval()
-    reliability = calibrate.calibrate(network)
+    network = matcher_network(kept)
+    reliability = {"confidence": calibrate.calibrate(network)} if isinstance(network, WeaveNet) else {}
     make_folder(out.parent)
     with replacing(out) as temporary:
         onnx.save(graph_of(network, kept), temporary)
@@ -61,13 +62,41 @@ def export(trained: Path, out: Path, pairs: Iterable[StereoPair] = ()) -> dict[s
         "onnx_differs_confidence": of_confidence,
         "compared_pairs": len(found),
     }
-    card = _card(kept, network) | agreement | {"confidence": reliability}
+    card = _card(kept, network) | agreement | reliability
     with replacing(out.with_suffix(".json")) as card_file:
         card_file.write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
     return card
 
 
-def graph_of(network: WeaveNet, kept: Checkpoint) -> onnx.ModelProto:
+class DisparityNetwork(nn.Module):
+    """A network of the paper's kind as a matcher: disparity of the left view in pixels, [B, 1, H, W]."""
+
+    def __init__(self, network: Any, recipe: Recipe) -> None:
+        super().__init__()
+        self.network, self.objective = network, CodeObjective(recipe, network)
+        self.multiple_of = network.multiple_of
+        self.max_disparity_px = int(recipe.max_disparity_px)
+
+    def forward(self, left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor]:
+        return (self.objective.disparity_px(self.network(left, right), {}),)
+
+
+def matcher_network(kept: Checkpoint) -> Any:
+    """The averaged network of a checkpoint, ready to match; StereoweaveError where it estimates depth."""
+    network = network_of(kept.recipe)
+    network.load_state_dict(kept.averaged)
+    network.eval()
+    if not isinstance(network, CodeNetwork):
+        return network
+    if kept.recipe.target != "disparity":
+        raise StereoweaveError(
+            f"{kept.recipe.name}: a matcher file gives disparity, expected target = 'disparity', found "
+            f"{kept.recipe.target!r}; the network needs each pair's camera"
+        )
+    return DisparityNetwork(network, kept.recipe)
+
+
+def graph_of(network: Any, kept: Checkpoint) -> onnx.ModelProto:
     """The network as an ONNX graph for any height and width that it can divide, with a matcher's metadata."""
     # Two tensors: given the same one twice, the exporter would take both inputs to be one.
     left, right = torch.rand(2, 1, 3, 4 * network.multiple_of, 8 * network.multiple_of)
@@ -81,7 +110,7 @@ def graph_of(network: WeaveNet, kept: Checkpoint) -> onnx.ModelProto:
             dynamo=True,
             opset_version=20,
             input_names=["left", "right"],
-            output_names=OUTPUTS,
+            output_names=OUTPUTS[: len(network(left, right))],
             dynamic_shapes=({2: height, 3: width}, {2: height, 3: width}),
             verbose=False,
         )
@@ -106,7 +135,7 @@ def graph_of(network: WeaveNet, kept: Checkpoint) -> onnx.ModelProto:
     return graph
 
 
-def differences(network: WeaveNet, matcher: Matcher, pair: StereoPair) -> tuple[float, float]:
+def differences(network: Any, matcher: Matcher, pair: StereoPair) -> tuple[float, float]:
     """The largest differences of PyTorch and ONNX Runtime: of both disparities in px, and of confidence."""
     multiple = network.multiple_of
     height, width = (side // multiple * multiple for side in pair.left.shape[:2])
@@ -115,9 +144,11 @@ def differences(network: WeaveNet, matcher: Matcher, pair: StereoPair) -> tuple[
     with torch.no_grad():
         expected = [x[0, 0] for x in network(*tensors)]
     # In one piece, because the strips of a large pair answer a little differently.
-    found = [torch.from_numpy(x) for x in matcher._run(left, right)]
-    left_px, right_px = (float((found[i] - expected[i]).abs().max()) for i in (0, 1))
-    return max(left_px, right_px), float((found[2].sigmoid() - expected[2].sigmoid()).abs().max())
+    found = [torch.from_numpy(x) for x in matcher._run(left, right) if x is not None]
+    largest_px = max(float((found[i] - x).abs().max()) for i, x in enumerate(expected[:2]))
+    if len(expected) < len(OUTPUTS):
+        return largest_px, 0.0
+    return largest_px, float((found[2].sigmoid() - expected[2].sigmoid()).abs().max())
 
 
 def multiply_adds(network: nn.Module, height: int = 480, width: int = 640) -> int:
@@ -125,9 +156,12 @@ def multiply_adds(network: nn.Module, height: int = 480, width: int = 640) -> in
     image = torch.rand(1, 3, height, width)
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         network(image, image)
+    counted = counter.get_total_flops() // 2
+    if not isinstance(network, WeaveNet):
+        return counted
     # The counter sees convolutions and matrix products; the refinement compares 16 features of both views
     # at 6 columns a pixel by a plain product.
-    return counter.get_total_flops() // 2 + 2 * (height // 2) * (width // 2) * 16 * 6
+    return counted + 2 * (height // 2) * (width // 2) * 16 * 6
 
 
 def _card(kept: Checkpoint, network: nn.Module) -> dict[str, Any]:

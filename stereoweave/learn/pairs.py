@@ -16,6 +16,8 @@ from stereoweave.stereo import Sample
 
 # Disparity is kept as 16-bit fixed point, KITTI's 1/256 px: half the bytes of float32, and exact enough.
 _DISPARITY_SCALE = 256
+# A collage has no camera.
+_MAPS = [field.name for field in fields(Sample) if field.name != "camera"]
 
 
 class KeptPairs:
@@ -40,14 +42,18 @@ class KeptPairs:
         """Write a pair whole or not at all."""
         file = self._file(index)
         temporary = file.with_suffix(".part")
-        arrays: dict[str, Any] = {name: _packed(value) for name, value in vars(sample).items()}
+        arrays: dict[str, Any] = {name: _packed(getattr(sample, name)) for name in _MAPS}
         with temporary.open("wb") as stream:
             np.savez(stream, **arrays)
         temporary.replace(file)
 
     def __getitem__(self, index: int) -> Sample:
         with np.load(self._file(index)) as arrays:
-            return Sample(**{field.name: _unpacked(arrays[field.name]) for field in fields(Sample)})
+            maps: dict[str, Any] = {name: _unpacked(arrays[name]) for name in _MAPS}
+        return Sample(**maps)
+
+    def name(self, index: int) -> str:
+        return str(self._file(index))
 
     def _file(self, index: int) -> Path:
         return self.folder / f"{index:06d}.npz"

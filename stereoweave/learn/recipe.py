@@ -8,8 +8,26 @@ from typing import Any
 
 from stereoweave.errors import FormatError
 
-_KINDS: dict[object, str] = {int: "a whole number", float: "a number", str: "a text in quotes"}
-_POSITIVE = ("steps", "batch", "learning_rate", "pairs", "validation_pairs", "validate_every")
+_KINDS: dict[object, str] = {
+    int: "a whole number",
+    float: "a number",
+    str: "a text in quotes",
+    bool: "true or false",
+}
+_POSITIVE = (
+    "steps",
+    "batch",
+    "learning_rate",
+    "pairs",
+    "validation_pairs",
+    "validate_every",
+    "averaged_steps",
+    "max_disparity_px",
+    "max_depth_m",
+)
+_AT_LEAST = {"exponent": 1, "alpha_z": 0, "alpha_p": 0}
+COLLAGE = "collage"
+TARGETS = ("disparity", "depth")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,13 +39,27 @@ class Recipe:
         seed: of the first weights, the pairs and every draw.
         start_from: checkpoint whose averaged weights are the first ones; empty for random ones.
         steps: optimiser steps in all.
-        batch: pairs a step; both views of each are predicted.
+        batch: pairs a step.
         learning_rate: between warm-up and cool-down, along which it rises and falls linearly.
-        weight_decay: AdamW's.
+        weight_decay: AdamW's; with 0 it is Adam.
+        averaged_steps: length of the running average of the weights, which is what scores and ships; longer
+            lags behind, shorter keeps the noise of single batches, and 1 is the weights themselves.
+        dataset: "collage", or a name in DATASETS.
+        root: folder of the dataset as its authors unpack it; empty for collage.
+        split: how the frames of a dataset are parted, a name in SPLITS (data/splits.py).
         pairs: collage pairs made once and kept; later steps cut them differently.
-        pair_size, crop_size: height and width of a kept pair and of what a step sees of it.
-        validation_pairs: collage pairs of another seed, never trained on.
+        pair_size: height and width of a kept collage pair.
+        crop_size: height and width of what a step sees of a pair.
+        augment: whether cuts are also scaled, mirrored and recoloured.
+        validation_pairs: pairs to score on, never trained on: of another seed, or from the held-out frames.
         validate_every: steps between two validations, each followed by a checkpoint.
+        loss: a name in LOSSES: "weave" for WeaveNet, and the others, between codes, for the other networks.
+        target: what a code stands for, "disparity" or "depth".
+        max_disparity_px, max_depth_m: the target's greatest value.
+        exponent: the paper's p.
+        fit_exponent: p is fitted to the histogram of the training truth instead.
+        alpha_z, alpha_p: weights of the loss between codes and of the projection loss.
+        vgg16_weights: file of the VGG-16 behind the perceptual loss.
     """
 
     name: str
@@ -40,11 +72,25 @@ class Recipe:
     warm_up_steps: int
     cool_down_steps: int
     weight_decay: float = 1e-4
-    pairs: int
+    averaged_steps: int = 500
+    dataset: str = COLLAGE
+    root: str = ""
+    split: str = "random"
+    pairs: int = 4000
     pair_size: tuple[int, int] = (320, 512)
     crop_size: tuple[int, int] = (256, 384)
+    augment: bool = True
     validation_pairs: int = 64
     validate_every: int = 500
+    loss: str = "weave"
+    target: str = "disparity"
+    max_disparity_px: float = 192.0
+    max_depth_m: float = 15.0
+    exponent: float = 1.0
+    fit_exponent: bool = False
+    alpha_z: float = 1.0
+    alpha_p: float = 0.0
+    vgg16_weights: str = ""
 
     def learning_rate_at(self, step: int) -> float:
         """The learning rate of a step, counted from 0."""
@@ -76,20 +122,39 @@ def recipe_from(values: dict[str, Any], source: str) -> Recipe:
         raise FormatError(f"{source}: missing key {missing[0]!r}; a recipe needs {', '.join(needed)}")
     settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
     recipe = Recipe(**settings)
+    _check_numbers(recipe, source)
+    _check_sizes(recipe, source)
+    if recipe.target not in TARGETS:
+        raise FormatError(f"{source}: target = {recipe.target!r}, expected {' or '.join(TARGETS)}")
+    if (recipe.dataset == COLLAGE) == bool(recipe.root):
+        raise FormatError(
+            f"{source}: dataset = {recipe.dataset!r} with root = {recipe.root!r}, expected a root for a "
+            "dataset on disk and none for collage"
+        )
+    return recipe
+
+
+def _check_numbers(recipe: Recipe, source: str) -> None:
     for name in _POSITIVE:
         if not 0 < getattr(recipe, name) < math.inf:
             raise FormatError(f"{source}: {name} = {getattr(recipe, name)}, expected more than 0")
-    if not all(0 < crop <= side for crop, side in zip(recipe.crop_size, recipe.pair_size, strict=True)):
+    for name, least in _AT_LEAST.items():
+        if not least <= getattr(recipe, name) < math.inf:
+            raise FormatError(f"{source}: {name} = {getattr(recipe, name)}, expected at least {least}")
+
+
+def _check_sizes(recipe: Recipe, source: str) -> None:
+    limits = recipe.pair_size if recipe.dataset == COLLAGE else (math.inf, math.inf)
+    if not all(0 < crop <= side for crop, side in zip(recipe.crop_size, limits, strict=True)):
         raise FormatError(
             f"{source}: crop_size = {list(recipe.crop_size)}, expected more than 0 and "
             f"at most pair_size = {list(recipe.pair_size)}"
         )
-    return recipe
 
 
 def _fits(value: object, expected: Any) -> bool:
     if expected is float:
         return isinstance(value, float | int) and not isinstance(value, bool)
-    if expected in (int, str):
+    if expected in (int, str, bool):
         return type(value) is expected
     return isinstance(value, list | tuple) and len(value) == 2 and all(type(v) is int for v in value)

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,66 +16,20 @@ from lightning_fabric import Fabric
 from lightning_fabric.loggers.tensorboard import TensorBoardLogger
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from torch import nn
 from torch.optim.swa_utils import AveragedModel
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io import make_folder
 from stereoweave.learn import checkpoint
-from stereoweave.learn.augment import augment
+from stereoweave.learn.batches import Batches
 from stereoweave.learn.checkpoint import Checkpoint
-from stereoweave.learn.losses import weave_losses
-from stereoweave.learn.models import MODELS
+from stereoweave.learn.models import network_of
+from stereoweave.learn.objective import fitted, objective_of
 from stereoweave.learn.pairs import KeptPairs
-from stereoweave.learn.recipe import Recipe, read_recipe
-from stereoweave.learn.validate import validate
-from stereoweave.stereo import Sample
-
-# Averaged over about this many steps; longer lags behind, shorter keeps the noise of single batches.
-_AVERAGED_STEPS = 500
-# Validation pairs come from this seed; a recipe's own is small.
-_VALIDATION_SEED = 1_000_003
-
-
-class Batches(Dataset[dict[str, torch.Tensor]]):
-    """The batch of every step, each drawn from (seed, step) alone, whoever asks and in whatever order."""
-
-    def __init__(self, recipe: Recipe, pairs: KeptPairs) -> None:
-        self.recipe, self.pairs = recipe, pairs
-
-    def __getitem__(self, step: int) -> dict[str, torch.Tensor]:
-        rng = np.random.default_rng((self.recipe.seed, step))
-        chosen = self.chosen(step)
-        return collated([augment(self.pairs[i], *self.recipe.crop_size, rng) for i in chosen])
-
-    def chosen(self, step: int) -> list[int]:
-        """Indices of the pairs of a step: every pair once before any comes again."""
-        count = self.pairs.count
-        places = range(step * self.recipe.batch, (step + 1) * self.recipe.batch)
-        return [int(self._order(place // count)[place % count]) for place in places]
-
-    def _order(self, epoch: int) -> np.ndarray:
-        return np.random.default_rng((self.recipe.seed, epoch, 1)).permutation(self.pairs.count)
-
-
-def collated(samples: list[Sample]) -> dict[str, torch.Tensor]:
-    """Images [B, 3, H, W] in 0..1; maps [2B, 1, H, W], of the left views, then of the right ones mirrored."""
-
-    def images(side: str) -> torch.Tensor:
-        stacked = np.stack([getattr(sample, side) for sample in samples])
-        return torch.from_numpy(stacked).permute(0, 3, 1, 2).float() / 255
-
-    def maps(name: str) -> torch.Tensor:
-        lefts = [getattr(sample, name) for sample in samples]
-        rights = [getattr(sample, f"right_{name}")[:, ::-1] for sample in samples]
-        return torch.from_numpy(np.stack(lefts + rights))[:, None]
-
-    return {
-        "left": images("left"),
-        "right": images("right"),
-        "disparity_px": maps("disparity_px"),
-        "occluded": maps("occluded"),
-    }
+from stereoweave.learn.recipe import COLLAGE, Recipe, read_recipe
+from stereoweave.learn.sources import Source, sources
 
 
 def train(recipe_path: Path, out: Path, console: Console | None = None) -> Path:
@@ -84,36 +39,29 @@ def train(recipe_path: Path, out: Path, console: Console | None = None) -> Path:
         StereoweaveError: for a recipe that is none, where `out` holds the run of another one, or where the
             loss is no longer finite.
     """
-    recipe = read_recipe(recipe_path)
-    if recipe.model not in MODELS:
-        raise FormatError(f"{recipe_path}: model = {recipe.model!r}, expected {' or '.join(MODELS)}")
-    multiple = MODELS[recipe.model].multiple_of
-    if any(side % multiple for side in recipe.pair_size + recipe.crop_size):
-        raise FormatError(
-            f"{recipe_path}: pair_size = {list(recipe.pair_size)}, crop_size = {list(recipe.crop_size)}, "
-            f"expected multiples of {multiple} for {recipe.model}"
-        )
+    return train_recipe(read_recipe(recipe_path), out, console or Console())
+
+
+def train_recipe(recipe: Recipe, out: Path, console: Console) -> Path:
+    """As `train`, of a recipe at hand."""
+    _check(recipe)
     last = make_folder(out) / "last.pt"
-    start = _starting_point(recipe, last)
-    console = console or Console()
-    pairs = _kept(KeptPairs(out.parent / "pairs", recipe.seed, recipe.pairs, recipe.pair_size), console)
-    held_out = _kept(
-        KeptPairs(out.parent / "pairs", _VALIDATION_SEED, recipe.validation_pairs, recipe.pair_size), console
-    )
+    pairs, held_out = (_kept(pairs, console) for pairs in sources(recipe, out.parent / "pairs"))
+    recipe = fitted(recipe, pairs)
     logger = TensorBoardLogger(out, name="", version="")
-    run = Run(recipe, start, logger)
+    run = Run(recipe, _starting_point(recipe, last), logger)
     batches = Batches(recipe, pairs)
     with closing_curves(logger), _progress(console) as progress:
-        task = progress.add_task(recipe.name, total=recipe.steps, completed=start.step, loss="", rate="")
+        task = progress.add_task(recipe.name, total=recipe.steps, completed=run.start.step, loss="", rate="")
         began = time.perf_counter()
-        for step, batch in _numbered_batches(batches, start.step):
+        for step, batch in _numbered_batches(batches, run.start.step):
             loss = run.step(step, batch, batches)
             if (step + 1) % recipe.validate_every == 0 or step + 1 == recipe.steps:
-                scores = validate(run.averaged.module, held_out, run.fabric.device)
+                scores = run.objective.scores(run.averaged.module, held_out, run.fabric.device)
                 run.keep(step + 1, scores, last)
-                console.print(f"step {step + 1}: " + "  ".join(f"{k} {v:.3f}" for k, v in scores.items()))
+                console.print(f"step {step + 1}: " + "  ".join(f"{k} {v:.4g}" for k, v in scores.items()))
             rate, began = recipe.batch / (time.perf_counter() - began), time.perf_counter()
-            progress.update(task, completed=step + 1, loss=f"loss {loss:.3f}", rate=f"{rate:.1f} pairs/s")
+            progress.update(task, completed=step + 1, loss=f"loss {loss:.4g}", rate=f"{rate:.1f} pairs/s")
     return last
 
 
@@ -133,14 +81,18 @@ class Run:
         self.recipe, self.start = recipe, start
         _keep_freed_memory()
         self.fabric = Fabric(accelerator="auto", devices=1, precision=_precision(), loggers=logger)
-        network = MODELS[recipe.model]()
+        network = network_of(recipe)
         network.load_state_dict(start.weights)
-        # What bfloat16 convolutions on the CPU are fast in: three times the other layout.
-        network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.objective = objective_of(recipe, network)
+        for layer in network.modules():
+            if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
+                # What bfloat16 convolutions on the CPU are fast in: three times the other layout.
+                layer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         optimiser = torch.optim.AdamW(
             network.parameters(), recipe.learning_rate, weight_decay=recipe.weight_decay, fused=True
         )
-        self.averaged = AveragedModel(network, multi_avg_fn=_move_average, use_buffers=True)
+        average = partial(_move_average, recipe.averaged_steps)
+        self.averaged = AveragedModel(network, multi_avg_fn=average, use_buffers=True)
         self.averaged.module.load_state_dict(start.averaged)
         self.averaged.n_averaged.fill_(start.step)
         self.network, self.optimiser = self.fabric.setup(network, optimiser)
@@ -158,24 +110,30 @@ class Run:
             group["lr"] = self.recipe.learning_rate_at(step)
         self.network.train()
         with self.fabric.autocast():
-            stages = self.network.module.stages(batch["left"], batch["right"])
-        losses = weave_losses(stages, batch["disparity_px"], batch["occluded"])
+            predicted = self.objective.predict(self.network.module, batch)
+        losses = self.objective.losses(predicted, batch)
         loss = torch.stack(list(losses.values())).sum()
         value = float(loss.detach())
         if not np.isfinite(value):
-            raise StereoweaveError(
-                f"step {step}: the loss is {value}; its pairs are {batches.chosen(step)} "
-                f"of seed {self.recipe.seed}"
-            )
+            raise self._not_finite(step, f"the loss is {value}", batches)
         self.optimiser.zero_grad()
         self.fabric.backward(loss)
-        self.fabric.clip_gradients(self.network, self.optimiser, max_norm=5.0)
+        norm = self.fabric.clip_gradients(
+            self.network, self.optimiser, max_norm=5.0, error_if_nonfinite=False
+        )
+        if norm is None or not norm.isfinite():
+            raise self._not_finite(step, f"the norm of the gradient is {norm}", batches)
         self.optimiser.step()
         self.averaged.update_parameters(self.network.module)
         if step % 20 == 0:
             terms = {f"loss/{name}": float(term.detach()) for name, term in losses.items()}
             self.fabric.log_dict({"loss": value, **terms}, step)
         return value
+
+    def _not_finite(self, step: int, what: str, batches: Batches) -> StereoweaveError:
+        return StereoweaveError(
+            f"step {step}: {what}; its pairs are {batches.chosen(step)} of seed {self.recipe.seed}"
+        )
 
     def keep(self, step: int, scores: dict[str, float], path: Path) -> None:
         """Write the run as it is after `step` steps, and its scores to the curves."""
@@ -204,7 +162,7 @@ def _starting_point(recipe: Recipe, last: Path) -> Checkpoint:
             )
         return replace(found, commit=checkpoint.code_commit())
     torch.manual_seed(recipe.seed)
-    weights, hours = MODELS[recipe.model]().state_dict(), 0.0
+    weights, hours = network_of(recipe).state_dict(), 0.0
     origin: tuple[dict[str, Any], ...] = ()
     if recipe.start_from:
         earlier = checkpoint.load(Path(recipe.start_from))
@@ -223,9 +181,21 @@ def _starting_point(recipe: Recipe, last: Path) -> Checkpoint:
     )
 
 
-def _kept(pairs: KeptPairs, console: Console) -> KeptPairs:
-    """The pairs, made before if they were not there."""
-    if missing := len(pairs.missing()):
+def _check(recipe: Recipe) -> None:
+    """FormatError where the recipe names an unknown network, or sizes that it cannot divide."""
+    with torch.device("meta"):
+        multiple = network_of(recipe).multiple_of
+    sizes = recipe.crop_size + (recipe.pair_size if recipe.dataset == COLLAGE else ())
+    if any(side % multiple for side in sizes):
+        raise FormatError(
+            f"{recipe.name}: pair_size = {list(recipe.pair_size)}, crop_size = {list(recipe.crop_size)}, "
+            f"expected multiples of {multiple} for {recipe.model}"
+        )
+
+
+def _kept(pairs: Source, console: Console) -> Source:
+    """The pairs; collages are made before if they were not there."""
+    if isinstance(pairs, KeptPairs) and (missing := len(pairs.missing())):
         with _progress(console) as progress:
             task = progress.add_task("making pairs", total=missing, loss="", rate="")
             for _ in pairs.make():
@@ -261,10 +231,13 @@ def _keep_freed_memory() -> None:
 
 @torch.no_grad()
 def _move_average(
-    averaged: Sequence[torch.Tensor], current: Sequence[torch.Tensor], steps: torch.Tensor | int
+    averaged_steps: int,
+    averaged: Sequence[torch.Tensor],
+    current: Sequence[torch.Tensor],
+    steps: torch.Tensor | int,
 ) -> None:
     """Move the average towards the current weights: fast at first, so that random ones are soon forgotten."""
-    share = max(1 / _AVERAGED_STEPS, 9 / (9 + float(steps)))
+    share = max(1 / averaged_steps, 9 / (9 + float(steps)))
     for average, value in zip(averaged, current, strict=True):
         if average.is_floating_point():
             average.lerp_(value.to(average), share)

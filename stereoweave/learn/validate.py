@@ -5,12 +5,12 @@ import torch
 from torch import nn
 
 from stereoweave import metrics
-from stereoweave.learn.pairs import KeptPairs
+from stereoweave.learn.sources import Source
 
 
 @torch.no_grad()
-def validate(network: nn.Module, pairs: KeptPairs, device: torch.device) -> dict[str, float]:
-    """Mean scores over the left views of kept pairs, occluded pixels included."""
+def validate(network: nn.Module, pairs: Source, device: torch.device) -> dict[str, float]:
+    """Mean scores over the left views of the pairs, occluded pixels included."""
     network.eval()
     rows, confidences, truths = [], [], []
     for index in range(pairs.count):

@@ -1,5 +1,57 @@
 """The networks, by the name that a recipe gives."""
 
-from stereoweave.learn.models.weave import WeaveNet
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Literal, Protocol, runtime_checkable
 
-MODELS: dict[str, type[WeaveNet]] = {"weave": WeaveNet}
+from torch import Tensor
+
+from stereoweave.errors import FormatError
+from stereoweave.learn.models.densemapnet import DenseMapNet
+from stereoweave.learn.models.dispnet import DispNet
+from stereoweave.learn.models.fast_depth import FastDepthNet
+from stereoweave.learn.models.psmnet import PSMNet
+from stereoweave.learn.models.weave import WeaveNet
+from stereoweave.learn.recipe import Recipe
+
+MODELS: dict[str, Callable[..., Any]] = {
+    "weave": WeaveNet,
+    "fast_depth": FastDepthNet,
+    "fast_depth_without_skips": partial(FastDepthNet, skips=False),
+    "densemapnet": DenseMapNet,
+    "dispnet": DispNet,
+    "psmnet": PSMNet,
+}
+
+
+@runtime_checkable
+class CodeNetwork(Protocol):
+    """The paper's network and its rivals, from images [B, 3, H, W] in 0..1 of any size to maps [B, 1, H, W].
+
+    Attributes:
+        predicts: the code of a `DepthCurve`, or disparity in pixels.
+        output_weights: what each of `outputs` counts in the loss.
+    """
+
+    predicts: Literal["code", "disparity_px"]
+    output_weights: tuple[float, ...]
+
+    def outputs(self, left: Tensor, right: Tensor) -> tuple[Tensor, ...]:
+        """Every output that training supervises; the last one is the answer."""
+        ...
+
+    def __call__(self, left: Tensor, right: Tensor) -> Tensor:
+        """The answer."""
+        ...
+
+    def eval(self) -> Any: ...
+
+
+def network_of(recipe: Recipe) -> Any:
+    """The network of a recipe with random weights; FormatError for an unknown name."""
+    if recipe.model not in MODELS:
+        raise FormatError(f"{recipe.name}: model = {recipe.model!r}, expected {' or '.join(MODELS)}")
+    if recipe.model == "psmnet":
+        # The only one that has its range of disparities built in and lets one choose it.
+        return PSMNet(int(recipe.max_disparity_px))
+    return MODELS[recipe.model]()

@@ -1,0 +1,82 @@
+"""The batch of every step: which pairs, how they are cut, and how they are laid together."""
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.learn.augment import augment, cut
+from stereoweave.learn.recipe import Recipe
+from stereoweave.learn.sources import Source
+from stereoweave.stereo import Sample
+
+
+class Batches(Dataset[dict[str, torch.Tensor]]):
+    """The batch of every step, each drawn from (seed, step) alone, whoever asks and in whatever order."""
+
+    def __init__(self, recipe: Recipe, pairs: Source) -> None:
+        self.recipe, self.pairs = recipe, pairs
+
+    def __getitem__(self, step: int) -> dict[str, torch.Tensor]:
+        rng = np.random.default_rng((self.recipe.seed, step))
+        part = augment if self.recipe.augment else cut
+        samples = (known(self.pairs, index) for index in self.chosen(step))
+        return collated([part(sample, *self.recipe.crop_size, rng) for sample in samples])
+
+    def chosen(self, step: int) -> list[int]:
+        """Indices of the pairs of a step: every pair once before any comes again."""
+        count = self.pairs.count
+        places = range(step * self.recipe.batch, (step + 1) * self.recipe.batch)
+        return [int(self._order(place // count)[place % count]) for place in places]
+
+    def _order(self, epoch: int) -> np.ndarray:
+        return np.random.default_rng((self.recipe.seed, epoch, 1)).permutation(self.pairs.count)
+
+
+def known(pairs: Source, index: int) -> Sample:
+    """The sample of that index; StereoweaveError where nothing in it is known."""
+    sample = pairs[index]
+    if not np.isfinite(sample.disparity_px).any():
+        raise StereoweaveError(
+            f"{pairs.name(index)}: expected at least one pixel of known disparity, found none; "
+            "remove it from the dataset"
+        )
+    return sample
+
+
+def collated(samples: list[Sample]) -> dict[str, torch.Tensor]:
+    """Images [B, 3, H, W] in 0..1; maps [2B, 1, H, W], of the left views, then of the right ones mirrored.
+
+    Where every sample has a camera, also `focal_baseline_px_m` and `doffs_px`, [B, 1, 1, 1].
+
+    Raises:
+        StereoweaveError: The samples are not of one size.
+    """
+    sizes = sorted({sample.left.shape[:2] for sample in samples})
+    if len(sizes) > 1:
+        raise StereoweaveError(
+            f"a batch: expected pairs of one size, found {' and '.join(f'{w}x{h}' for h, w in sizes)}; "
+            "cut them to one crop_size"
+        )
+
+    def images(side: str) -> torch.Tensor:
+        stacked = np.stack([getattr(sample, side) for sample in samples])
+        return torch.from_numpy(stacked).permute(0, 3, 1, 2).float() / 255
+
+    def maps(name: str) -> torch.Tensor:
+        lefts = [getattr(sample, name) for sample in samples]
+        rights = [getattr(sample, f"right_{name}")[:, ::-1] for sample in samples]
+        return torch.from_numpy(np.stack(lefts + rights))[:, None]
+
+    batch = {
+        "left": images("left"),
+        "right": images("right"),
+        "disparity_px": maps("disparity_px"),
+        "occluded": maps("occluded"),
+    }
+    cameras = [sample.camera for sample in samples if sample.camera is not None]
+    if len(cameras) == len(samples):
+        products = [camera.focal_px * camera.baseline_m for camera in cameras]
+        batch["focal_baseline_px_m"] = torch.tensor(products).view(-1, 1, 1, 1)
+        batch["doffs_px"] = torch.tensor([camera.doffs_px for camera in cameras]).view(-1, 1, 1, 1)
+    return batch
