@@ -1,5 +1,6 @@
 """Training: one loop from a recipe to a network; killed at any moment, it goes on where it was."""
 
+import csv
 import ctypes
 import sys
 import time
@@ -21,7 +22,7 @@ from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader
 
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io import make_folder
+from stereoweave.io import make_folder, replacing
 from stereoweave.learn import checkpoint
 from stereoweave.learn.batches import Batches
 from stereoweave.learn.checkpoint import Checkpoint
@@ -30,6 +31,9 @@ from stereoweave.learn.objective import fitted, objective_of
 from stereoweave.learn.pairs import KeptPairs
 from stereoweave.learn.recipe import COLLAGE, Recipe, read_recipe
 from stereoweave.learn.sources import Source, sources
+
+# Beside a run's checkpoint: its scores after each validation.
+CURVE = "validation.csv"
 
 
 def train(recipe_path: Path, out: Path, console: Console | None = None) -> Path:
@@ -46,7 +50,7 @@ def train_recipe(recipe: Recipe, out: Path, console: Console) -> Path:
     """As `train`, of a recipe at hand."""
     _check(recipe)
     last = make_folder(out) / "last.pt"
-    pairs, held_out = (_kept(pairs, console) for pairs in sources(recipe, out.parent / "pairs"))
+    pairs, held_out = (kept(pairs, console) for pairs in sources(recipe, out.parent / "pairs"))
     recipe = fitted(recipe, pairs)
     logger = TensorBoardLogger(out, name="", version="")
     run = Run(recipe, _starting_point(recipe, last), logger)
@@ -59,10 +63,28 @@ def train_recipe(recipe: Recipe, out: Path, console: Console) -> Path:
             if (step + 1) % recipe.validate_every == 0 or step + 1 == recipe.steps:
                 scores = run.objective.scores(run.averaged.module, held_out, run.fabric.device)
                 run.keep(step + 1, scores, last)
+                record(last.with_name(CURVE), step + 1, scores)
                 console.print(f"step {step + 1}: " + "  ".join(f"{k} {v:.4g}" for k, v in scores.items()))
             rate, began = recipe.batch / (time.perf_counter() - began), time.perf_counter()
             progress.update(task, completed=step + 1, loss=f"loss {loss:.4g}", rate=f"{rate:.1f} pairs/s")
     return last
+
+
+def record(path: Path, step: int, scores: dict[str, float]) -> None:
+    """Add the scores after `step` steps to a CSV file; rows of that step and later ones are replaced."""
+    rows = [row for row in read_record(path) if row["step"] < step] + [{"step": step, **scores}]
+    with replacing(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[-1]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def read_record(path: Path) -> list[dict[str, float]]:
+    """The scores of a run by step, the first ones first; none where there is no file yet."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
 
 
 @contextmanager
@@ -193,7 +215,7 @@ def _check(recipe: Recipe) -> None:
         )
 
 
-def _kept(pairs: Source, console: Console) -> Source:
+def kept(pairs: Source, console: Console) -> Source:
     """The pairs; collages are made before if they were not there."""
     if isinstance(pairs, KeptPairs) and (missing := len(pairs.missing())):
         with _progress(console) as progress:

@@ -1,0 +1,98 @@
+"""The trainings of the paper's experiment: for each claim recipes that differ in one thing alone."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+from stereoweave.learn.recipe import Recipe
+
+NETWORKS, ADJUSTMENT, PROJECTION, LOSS, DECODER, TRANSFER = (
+    "networks",
+    "depth adjustment",
+    "projection loss",
+    "loss",
+    "decoder",
+    "transfer",
+)
+PAPER = "the paper's recipe"
+# What the rivals are trained with: the losses of their own papers, without this paper's two contributions.
+OWN: dict[str, dict[str, Any]] = {
+    "densemapnet": {"exponent": 1.0, "alpha_p": 0.0},
+    "dispnet": {"exponent": 1.0, "alpha_p": 0.0, "loss": "l1", "learning_rate": 1e-4},
+    "psmnet": {"exponent": 1.0, "alpha_p": 0.0, "loss": "smooth_l1"},
+}
+# PSMNet costs 59 times as many multiply-adds as the paper's network.
+PSMNET_SHARE = 4
+# The other set that a trained network is tuned on: few collages of another seed, enlarged and recoloured.
+OTHER_SEED = 100
+OTHER_SET: dict[str, Any] = {"seed": OTHER_SEED, "pairs": 500, "augment": True}
+OTHER_RANGE = 1.5  # enlarging the pictures by up to 1.4 enlarges their disparity
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """One training: the claim it is for, what is special about it there, and its recipe."""
+
+    claim: str
+    setting: str
+    recipe: Recipe
+
+
+def trials(base: Recipe, seeds: int, fitted_exponent: float) -> list[Trial]:
+    """All trainings of the experiment, the most wanted first.
+
+    One that serves several claims comes once for each, under the same recipe name.
+
+    Args:
+        base: The paper's recipe, for the data at hand.
+        seeds: How many of each; DispNet, PSMNet, and the losses that the paper merely names, come once.
+        fitted_exponent: p fitted to the histogram of the base's training truth.
+    """
+    return [
+        *_each(seeds, base, PROJECTION, {PAPER: {}, "without": {"alpha_p": 0.0}}),
+        *_each(seeds, base, NETWORKS, {"fast_depth": {}, "densemapnet": _rival("densemapnet")}),
+        *_each(1, base, NETWORKS, {"psmnet": _rival("psmnet") | {"steps": base.steps // PSMNET_SHARE}}),
+        *_each(1, base, NETWORKS, {"dispnet": _rival("dispnet")}),
+        *_each(seeds, base, ADJUSTMENT, {f"p = {p:g}": {"exponent": p} for p in (1.0, 1.5, 2.0, 1.25)}),
+        *_each(seeds, base, ADJUSTMENT, {"p fitted": {"exponent": fitted_exponent}}),
+        *_each(seeds, base, DECODER, {PAPER: {}, "upsampled at once, no skips": {"model": "densemapnet"}}),
+        *_each(1, base, DECODER, {"step-wise, no skips": {"model": "fast_depth_without_skips"}}),
+        *_each(1, base, LOSS, {"l2": {}, **{loss: {"loss": loss} for loss in _other_losses(base)}}),
+        *_transfer(base),
+    ]
+
+
+def _each(seeds: int, base: Recipe, claim: str, settings: dict[str, dict[str, Any]]) -> Iterator[Trial]:
+    for setting, changes in settings.items():
+        for seed in range(base.seed, base.seed + seeds):
+            yield Trial(claim=claim, setting=setting, recipe=_named(replace(base, seed=seed, **changes)))
+
+
+def _transfer(base: Recipe) -> Iterator[Trial]:
+    other = replace(base, max_disparity_px=OTHER_RANGE * base.max_disparity_px, **OTHER_SET)
+    yield Trial(claim=TRANSFER, setting="from scratch", recipe=_named(other))
+    start = f"{_named(base).name}/last.pt"  # below the folder of the runs
+    yield Trial(claim=TRANSFER, setting=PAPER, recipe=_named(replace(other, start_from=start)))
+
+
+def _rival(model: str) -> dict[str, Any]:
+    return {"model": model, **OWN[model]}
+
+
+def _other_losses(base: Recipe) -> tuple[str, ...]:
+    """Those the paper compared l2 with; the perceptual one needs a file that cannot be shipped."""
+    return ("l1", "smooth_l1", "cross_entropy", *(("perceptual",) if base.vgg16_weights else ()))
+
+
+def _named(recipe: Recipe) -> Recipe:
+    """The recipe, named after everything in which trials differ."""
+    parts = [
+        recipe.model,
+        recipe.loss,
+        f"p{recipe.exponent:.4g}",
+        f"projection{recipe.alpha_p:g}",
+        f"steps{recipe.steps}",
+        f"seed{recipe.seed}",
+        *(["tuned"] if recipe.start_from else []),
+    ]
+    return replace(recipe, name="-".join(parts))
