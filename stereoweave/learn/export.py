@@ -98,30 +98,9 @@ def matcher_network(kept: Checkpoint) -> Any:
 
 def graph_of(network: Any, kept: Checkpoint) -> onnx.ModelProto:
     """The network as an ONNX graph for any height and width that it can divide, with a matcher's metadata."""
-    # Two tensors: given the same one twice, the exporter would take both inputs to be one.
-    left, right = torch.rand(2, 1, 3, 4 * network.multiple_of, 8 * network.multiple_of)
     height, width = (network.multiple_of * torch.export.Dim(name, min=2, max=1024) for name in ("h", "w"))
-    with warnings.catch_warnings():
-        # The exporter warns of what it is not asked for: torchvision's operators, names of repeated axes.
-        warnings.simplefilter("ignore")
-        program = torch.onnx.export(
-            network,
-            (left, right),
-            dynamo=True,
-            opset_version=20,
-            input_names=["left", "right"],
-            output_names=OUTPUTS[: len(network(left, right))],
-            dynamic_shapes=({2: height, 3: width}, {2: height, 3: width}),
-            verbose=False,
-        )
-    assert program is not None
-    program.optimize()
-    graph = program.model_proto
-    # The exporter notes where each part comes from, with this machine's paths.
-    for part in (graph.graph, *graph.graph.node, *graph.graph.value_info):
-        del part.metadata_props[:]
-    for part in (*graph.graph.input, *graph.graph.output):
-        del part.metadata_props[:]
+    sides = {2: height, 3: width}
+    graph = _exported(network, 4 * network.multiple_of, 8 * network.multiple_of, (sides, sides))
     properties = {
         "name": kept.recipe.name,
         "multiple_of": network.multiple_of,
@@ -132,6 +111,38 @@ def graph_of(network: Any, kept: Checkpoint) -> onnx.ModelProto:
     onnx.helper.set_model_props(
         graph, {f"stereoweave.{key}": str(value) for key, value in properties.items()}
     )
+    return graph
+
+
+def fixed_graph_of(network: Any, height: int, width: int) -> onnx.ModelProto:
+    """The network as an ONNX graph for pairs of that size alone."""
+    return _exported(network, height, width, None)
+
+
+def _exported(network: Any, height: int, width: int, dynamic_shapes: Any) -> onnx.ModelProto:
+    # Two tensors: given the same one twice, the exporter would take both inputs to be one.
+    left, right = torch.rand(2, 1, 3, height, width)
+    with warnings.catch_warnings(), torch.no_grad():
+        # The exporter warns of what it is not asked for: torchvision's operators, names of repeated axes.
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            network,
+            (left, right),
+            dynamo=True,
+            opset_version=20,
+            input_names=["left", "right"],
+            output_names=OUTPUTS[:1] if isinstance(network, DisparityNetwork) else OUTPUTS,
+            dynamic_shapes=dynamic_shapes,
+            verbose=False,
+        )
+    assert program is not None
+    program.optimize()
+    graph = program.model_proto
+    # The exporter notes where each part comes from, with this machine's paths.
+    for part in (graph.graph, *graph.graph.node, *graph.graph.value_info):
+        del part.metadata_props[:]
+    for part in (*graph.graph.input, *graph.graph.output):
+        del part.metadata_props[:]
     return graph
 
 

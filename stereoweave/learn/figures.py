@@ -18,7 +18,7 @@ from stereoweave.io import replacing
 from stereoweave.projection import project_right
 from stereoweave.stereo import DepthCurve, Sample
 
-Estimated = tuple[Sample, Mapping[str, Float[np.ndarray, "h w"]]]
+Estimated = tuple[Sample, Mapping[str, Float[np.ndarray, "_ _"]]]
 """A sample, and the disparities in px of its left view under the names that head their columns."""
 
 # Okabe and Ito's colours, which colour-blind readers tell apart.
@@ -112,7 +112,7 @@ def _mean_curve(seeds: Sequence[Sequence[tuple[int, float]]]) -> tuple[list[int]
     return steps, [float(np.mean([loss[step] for loss in losses])) for step in steps]
 
 
-def _draw_grid(path: str | Path, rows: Sequence[Mapping[str, UInt8[np.ndarray, "h w 3"]]]) -> None:
+def _draw_grid(path: str | Path, rows: Sequence[Mapping[str, UInt8[np.ndarray, "_ _ 3"]]]) -> None:
     """Write pictures in rows; the names of the first row head the columns."""
     heights_in = [
         max(_PICTURE_WIDTH_IN * picture.shape[0] / picture.shape[1] for picture in row.values())

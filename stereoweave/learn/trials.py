@@ -23,10 +23,10 @@ OWN: dict[str, dict[str, Any]] = {
 }
 # PSMNet costs 59 times as many multiply-adds as the paper's network.
 PSMNET_SHARE = 4
-# The other set that a trained network is tuned on: few collages of another seed, enlarged and recoloured.
+# The other set that a trained network is tuned on: few collages, larger, with larger disparities.
 OTHER_SEED = 100
-OTHER_SET: dict[str, Any] = {"seed": OTHER_SEED, "pairs": 500, "augment": True}
-OTHER_RANGE = 1.5  # enlarging the pictures by up to 1.4 enlarges their disparity
+OTHER_PAIRS = 500
+OTHER_SIZE = 1.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +69,14 @@ def _each(seeds: int, base: Recipe, claim: str, settings: dict[str, dict[str, An
 
 
 def _transfer(base: Recipe) -> Iterator[Trial]:
-    other = replace(base, max_disparity_px=OTHER_RANGE * base.max_disparity_px, **OTHER_SET)
+    height, width = (int(OTHER_SIZE * side) for side in base.pair_size)
+    other = replace(
+        base,
+        seed=OTHER_SEED,
+        pairs=OTHER_PAIRS,
+        pair_size=(height, width),
+        max_disparity_px=OTHER_SIZE * base.max_disparity_px,
+    )
     yield Trial(claim=TRANSFER, setting="from scratch", recipe=_named(other))
     start = f"{_named(base).name}/last.pt"  # below the folder of the runs
     yield Trial(claim=TRANSFER, setting=PAPER, recipe=_named(replace(other, start_from=start)))
