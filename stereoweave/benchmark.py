@@ -4,9 +4,10 @@ import csv
 import os
 import platform
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -105,14 +106,19 @@ def fill_rows(disparity_px: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "
     return filled_px[np.maximum.accumulate(np.where(occupied, np.arange(len(known)), 0))]
 
 
-def write_csv(path: str | Path, rows: Iterable[Row]) -> None:
-    """Writes the rows with a header, each beside the processor and the OpenCV that it was measured with."""
+def write_csv(path: str | Path, rows: Sequence[Any]) -> None:
+    """Writes the rows with a header, each beside the processor and the OpenCV that it was measured with.
+
+    Args:
+        path: Where to; the folder is made.
+        rows: One or more instances of one dataclass, whose fields are the columns.
+    """
     machine = {"cpu": _cpu_name(), "cores": os.cpu_count(), "opencv": cv2.__version__}
     with replacing(path) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [field.name for field in fields(Row)] + list(machine))
+        writer = csv.DictWriter(file, [field.name for field in fields(rows[0])] + list(machine))
         writer.writeheader()
         for row in rows:
-            values = {k: f"{v:.4f}" if isinstance(v, float) else v for k, v in asdict(row).items()}
+            values = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in asdict(row).items()}
             writer.writerow(values | machine)
 
 

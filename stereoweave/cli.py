@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -33,6 +33,14 @@ Pictures = Annotated[
 ]
 Model = Annotated[str, typer.Option(help="The name of a shipped network, or an .onnx file.")]
 Threads = Annotated[int | None, typer.Option(min=1, help="Processor threads; as many as cores unless given.")]
+
+RecipeFile = Annotated[
+    Path, typer.Argument(metavar="RECIPE", help="A TOML file, such as recipes/paper/experiment.toml.")
+]
+RunsFolder = Annotated[Path, typer.Option("--out", "-o", help="The folder of the trainings.")]
+ReportFolder = Annotated[Path, typer.Option(help="The folder for rows, tables and figures.")]
+Seeds = Annotated[int, typer.Option(min=1, help="How often each training is repeated.")]
+Jobs = Annotated[int, typer.Option(min=1, help="Trainings at a time.")]
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 bench = typer.Typer(help="Score matchers side by side.")
@@ -143,6 +151,90 @@ def pairs(
     typer.echo(f"rows: {out}")
 
 
+@bench.command()
+def networks(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of stereoweave train.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("networks.csv"),
+) -> None:
+    """Errors of trained networks on the pairs held out from them, and of the right views made with them."""
+    from stereoweave.benchmark import write_csv
+
+    _place_for(out)
+    with _needing_the_train_extra():
+        from stereoweave.learn.evaluation import evaluate
+    rows = evaluate(runs)
+    write_csv(out, rows)
+    _tell_table("Means over the held-out pairs", rows)
+    typer.echo(f"rows: {out}")
+
+
+@bench.command()
+def speed(
+    recipe: RecipeFile,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("speed.csv"),
+) -> None:
+    """Time of the paper's network and its rivals for a pair of 640x480, in PyTorch and in ONNX Runtime."""
+    from stereoweave.benchmark import write_csv
+    from stereoweave.learn.recipe import read_recipe
+
+    _place_for(out)
+    read = read_recipe(recipe)
+    with _needing_the_train_extra():
+        from stereoweave.learn.speed import run_times
+    rows = run_times(read)
+    write_csv(out, rows)
+    _tell_table("A pair of 640x480", rows)
+    typer.echo(f"rows: {out}")
+
+
+@bench.command()
+def paper(
+    recipe: RecipeFile,
+    out: RunsFolder,
+    report: ReportFolder,
+    seeds: Seeds = 3,
+    jobs: Jobs = 1,
+) -> None:
+    """The paper's experiment: train its network, its rivals and every variant, and compare with its tables.
+
+    Stopped and started again it goes on where it was.
+    """
+    from stereoweave.learn.trials import CLAIMS
+
+    _experiment(recipe, out, report, seeds, jobs, CLAIMS)
+
+
+@bench.command()
+def exponent(
+    recipe: RecipeFile,
+    out: RunsFolder,
+    report: ReportFolder,
+    seeds: Seeds = 3,
+    jobs: Jobs = 1,
+) -> None:
+    """The paper's Fig. 2: the curves of the depth adjustment, and the validation loss with and without it."""
+    from stereoweave.learn.trials import ADJUSTMENT
+
+    _experiment(recipe, out, report, seeds, jobs, (ADJUSTMENT,))
+
+
+def _experiment(  # noqa: PLR0913 - the words of two command lines
+    recipe: Path, out: Path, report: Path, seeds: int, jobs: int, claims: Sequence[str]
+) -> None:
+    from rich.console import Console
+
+    from stereoweave.learn.recipe import read_recipe
+
+    base, console = read_recipe(recipe), Console()
+    with _needing_the_train_extra():
+        from stereoweave.learn.paper import plan, run_trials
+        from stereoweave.learn.paper_report import write_report
+    planned = plan(base, out, seeds, console, claims)
+    run_trials(planned, out, jobs, console)
+    write_report(base, planned, out, report)
+    typer.echo(f"tables: {report / 'paper.md'}")
+
+
 @app.command()
 def train(
     recipe: Annotated[Path, typer.Argument(help="A TOML file, such as recipes/weave_small.toml.")],
@@ -176,7 +268,7 @@ def export(
         from stereoweave.learn.calibrate import draw_reliability
         from stereoweave.learn.export import export as export_run
     card = export_run(run, out, pairs)
-    if reliability:
+    if reliability and "confidence" in card:
         draw_reliability(card["confidence"], reliability)
     typer.echo(
         f"{out}: ONNX Runtime and PyTorch differ by at most {card['onnx_differs_px']:.4f} px "
@@ -290,6 +382,18 @@ def _tell_rows(rows: "list[Row]") -> None:
             row.time_relative,
         )
         table.add_row(row.matcher, *(f"{number:.2f}" for number in numbers))
+    Console().print(table)
+
+
+def _tell_table(title: str, rows: Sequence[Any]) -> None:
+    """Print dataclass rows as a table, under their fields' names."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(*asdict(rows[0]), title=title)
+    for row in rows:
+        cells = asdict(row).values()
+        table.add_row(*(f"{cell:.2f}" if isinstance(cell, float) else str(cell) for cell in cells))
     Console().print(table)
 
 

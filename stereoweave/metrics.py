@@ -40,9 +40,14 @@ def depth_error_m(estimate_m: Float[np.ndarray, "h w"], truth_m: Float[np.ndarra
     return _mean(error_m)
 
 
-def mae(image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]) -> float:
-    """Mean absolute difference of two pictures, in grey levels of 0..255."""
-    return _mean(np.abs(_difference(image, truth)))
+def mae(
+    image: UInt8[np.ndarray, "h w 3"],
+    truth: UInt8[np.ndarray, "h w 3"],
+    where: Bool[np.ndarray, "h w"] | None = None,
+) -> float:
+    """Mean absolute difference of two pictures, in grey levels of 0..255; of the pixels `where`, if given."""
+    error = np.abs(_difference(image, truth))
+    return _mean(error if where is None else error[where])
 
 
 def psnr_db(image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]) -> float:

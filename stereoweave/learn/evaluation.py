@@ -30,10 +30,10 @@ def evaluate(runs: Sequence[Path]) -> list[ViewRow]:
     nothing can reach.
 
     Args:
-        runs: Folders of `stereoweave train`, all of one dataset, split and seed.
+        runs: Folders of `stereoweave train`, all with the same held-out pairs.
 
     Raises:
-        StereoweaveError: The runs do not share their pairs, or one is of a network without a single view.
+        StereoweaveError: The runs do not share their held-out pairs.
     """
     kept = {run.name: checkpoint.load(run / "last.pt") for run in runs}
     training, held_out = sources(_common(kept), runs[0].parent / "pairs")
@@ -70,7 +70,7 @@ def median_method(training: Source) -> Method:
 
 def _common(kept: dict[str, Checkpoint]) -> Recipe:
     """The recipe of the first run, whose held-out pairs the others have to share."""
-    pairs = {name: _pairs_of(one.recipe) for name, one in kept.items()}
+    pairs = {name: held_out_of(one.recipe) for name, one in kept.items()}
     first, *others = pairs
     for name in others:
         if pairs[name] != pairs[first]:
@@ -80,5 +80,6 @@ def _common(kept: dict[str, Checkpoint]) -> Recipe:
     return kept[first].recipe
 
 
-def _pairs_of(recipe: Recipe) -> tuple[object, ...]:
-    return recipe.dataset, recipe.root, recipe.split, recipe.pair_size, recipe.seed, recipe.validation_pairs
+def held_out_of(recipe: Recipe) -> tuple[object, ...]:
+    """What the recipe's held-out pairs depend on: runs that agree in it are scored on the same ones."""
+    return recipe.dataset, recipe.root, recipe.split, recipe.pair_size, recipe.validation_pairs

@@ -19,7 +19,7 @@ from stereoweave.projection import project_right
 from stereoweave.stereo import DepthCurve, Sample
 
 Estimated = tuple[Sample, Mapping[str, Float[np.ndarray, "_ _"]]]
-"""A sample, and the disparities in px of its left view under the names that head their columns."""
+"""A sample, and disparities (px) of its left view [H, W] by their columns' names; rows may differ in size."""
 
 # Okabe and Ito's colours, which colour-blind readers tell apart.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")

@@ -180,12 +180,17 @@ def fitted(recipe: Recipe, pairs: Source) -> Recipe:
     """The recipe, with its exponent fitted to the truth of the training pairs where it asks for that."""
     if not recipe.fit_exponent:
         return recipe
+    return replace(recipe, exponent=fit_exponent(truth_histogram(recipe, pairs)))
+
+
+def truth_histogram(recipe: Recipe, pairs: Source) -> Float[np.ndarray, " n"]:
+    """Counts of the normalised truth, before the exponent, in equal bins over 0..1; of spread pairs."""
     straight = curve_of(replace(recipe, exponent=1.0))
     counts = np.zeros(_FITTED_BINS)
     for index in range(0, pairs.count, max(1, pairs.count // _FITTED_PAIRS)):
         code = _array(straight.encode(truth_of(recipe, collated([known(pairs, index)]))))
         counts += np.histogram(code[np.isfinite(code)], _FITTED_BINS, (0, 1))[0]
-    return replace(recipe, exponent=fit_exponent(counts))
+    return counts
 
 
 def truth_of(recipe: Recipe, batch: Batch) -> Map:

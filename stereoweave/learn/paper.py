@@ -2,7 +2,7 @@
 
 import multiprocessing
 import os
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from pathlib import Path
@@ -14,33 +14,43 @@ from stereoweave.learn.objective import fitted
 from stereoweave.learn.recipe import Recipe
 from stereoweave.learn.sources import sources
 from stereoweave.learn.train import kept, train_recipe
-from stereoweave.learn.trials import Trial, trials
+from stereoweave.learn.trials import CLAIMS, Trial, trials
 
 
-def run_trials(base: Recipe, runs: Path, seeds: int, jobs: int, console: Console) -> list[Trial]:
-    """The trials, each trained in a folder of its own in `runs`; what was trained before stays as it is.
+def plan(
+    base: Recipe, runs: Path, seeds: int, console: Console, claims: Collection[str] = CLAIMS
+) -> list[Trial]:
+    """The trials for these claims, their training pairs made, and the exponent fitted to those of the base.
 
     Args:
         base: The paper's recipe for the data at hand.
-        runs: The folder; killed and started again, the experiment goes on where it was.
+        runs: The folder of the runs, and of kept pairs below it.
         seeds: How often each training is repeated.
-        jobs: Trainings at a time, which share the processor's cores.
         console: Where progress is told.
+        claims: Names in CLAIMS.
     """
     training, _ = (kept(pairs, console) for pairs in sources(base, runs / "pairs"))
     exponent = fitted(replace(base, fit_exponent=True), training).exponent
-    planned = [_below(trial, runs) for trial in trials(base, seeds, exponent)]
-    recipes = {trial.recipe.name: trial.recipe for trial in planned}.values()
-    # Made before, so that no two trainings make the same ones.
-    for pairs in (pairs for recipe in recipes for pairs in sources(recipe, runs / "pairs")):
-        kept(pairs, console)
-    # What starts from another training comes when that one is there.
-    for group in (
-        [recipe for recipe in recipes if not recipe.start_from],
-        [recipe for recipe in recipes if recipe.start_from],
-    ):
-        _train_all(group, runs, jobs, console)
+    planned = [_below(trial, runs) for trial in trials(base, seeds, exponent) if trial.claim in claims]
+    for trial in planned:
+        for pairs in sources(trial.recipe, runs / "pairs"):
+            kept(pairs, console)
     return planned
+
+
+def run_trials(planned: Iterable[Trial], runs: Path, jobs: int, console: Console) -> None:
+    """Train each trial in a folder of its own in `runs`; one that was killed goes on where it was.
+
+    Args:
+        planned: Trials whose pairs are made: no two trainings make the same ones.
+        runs: The folder.
+        jobs: Trainings at a time, which share the processor's cores.
+        console: Where progress is told.
+    """
+    recipes = {trial.recipe.name: trial.recipe for trial in planned}.values()
+    # What starts from another training comes when that one is there.
+    _train_all([recipe for recipe in recipes if not recipe.start_from], runs, jobs, console)
+    _train_all([recipe for recipe in recipes if recipe.start_from], runs, jobs, console)
 
 
 def _below(trial: Trial, runs: Path) -> Trial:

@@ -6,23 +6,27 @@ from typing import Any
 
 from stereoweave.learn.recipe import Recipe
 
-NETWORKS, ADJUSTMENT, PROJECTION, LOSS, DECODER, TRANSFER = (
+CLAIMS = NETWORKS, NETWORKS_SHORT, ADJUSTMENT, PROJECTION, LOSS, DECODER, TRANSFER, ITERATIONS = (
     "networks",
+    "networks, a quarter of the steps",
     "depth adjustment",
     "projection loss",
     "loss",
     "decoder",
     "transfer",
+    "iterations",
 )
 PAPER = "the paper's recipe"
+SCRATCH, TUNED = "from scratch", "from the synthetic checkpoint"
 # What the rivals are trained with: the losses of their own papers, without this paper's two contributions.
 OWN: dict[str, dict[str, Any]] = {
     "densemapnet": {"exponent": 1.0, "alpha_p": 0.0},
     "dispnet": {"exponent": 1.0, "alpha_p": 0.0, "loss": "l1", "learning_rate": 1e-4},
     "psmnet": {"exponent": 1.0, "alpha_p": 0.0, "loss": "smooth_l1"},
 }
-# PSMNet costs 59 times as many multiply-adds as the paper's network.
-PSMNET_SHARE = 4
+# PSMNet costs 59 times as many multiply-adds as the paper's network: it is compared after fewer steps.
+SHORT = 4
+FIGURE_3_STEPS = (10, 50, 250)
 # The other set that a trained network is tuned on: few collages, larger, with larger disparities.
 OTHER_SEED = 100
 OTHER_PAIRS = 500
@@ -48,17 +52,19 @@ def trials(base: Recipe, seeds: int, fitted_exponent: float) -> list[Trial]:
         seeds: How many of each; DispNet, PSMNet, and the losses that the paper merely names, come once.
         fitted_exponent: p fitted to the histogram of the base's training truth.
     """
+    every = {"psmnet": _rival("psmnet"), "fast_depth": {}, **{rival: _rival(rival) for rival in OWN}}
     return [
         *_each(seeds, base, PROJECTION, {PAPER: {}, "without": {"alpha_p": 0.0}}),
         *_each(seeds, base, NETWORKS, {"fast_depth": {}, "densemapnet": _rival("densemapnet")}),
-        *_each(1, base, NETWORKS, {"psmnet": _rival("psmnet") | {"steps": base.steps // PSMNET_SHARE}}),
         *_each(1, base, NETWORKS, {"dispnet": _rival("dispnet")}),
+        *_each(1, replace(base, steps=base.steps // SHORT), NETWORKS_SHORT, every),
         *_each(seeds, base, ADJUSTMENT, {f"p = {p:g}": {"exponent": p} for p in (1.0, 1.5, 2.0, 1.25)}),
         *_each(seeds, base, ADJUSTMENT, {"p fitted": {"exponent": fitted_exponent}}),
         *_each(seeds, base, DECODER, {PAPER: {}, "upsampled at once, no skips": {"model": "densemapnet"}}),
         *_each(1, base, DECODER, {"step-wise, no skips": {"model": "fast_depth_without_skips"}}),
         *_each(1, base, LOSS, {"l2": {}, **{loss: {"loss": loss} for loss in _other_losses(base)}}),
         *_transfer(base),
+        *_each(1, base, ITERATIONS, {f"{steps} steps": {"steps": steps} for steps in FIGURE_3_STEPS}),
     ]
 
 
@@ -77,9 +83,9 @@ def _transfer(base: Recipe) -> Iterator[Trial]:
         pair_size=(height, width),
         max_disparity_px=OTHER_SIZE * base.max_disparity_px,
     )
-    yield Trial(claim=TRANSFER, setting="from scratch", recipe=_named(other))
+    yield Trial(claim=TRANSFER, setting=SCRATCH, recipe=_named(other))
     start = f"{_named(base).name}/last.pt"  # below the folder of the runs
-    yield Trial(claim=TRANSFER, setting=PAPER, recipe=_named(replace(other, start_from=start)))
+    yield Trial(claim=TRANSFER, setting=TUNED, recipe=_named(replace(other, start_from=start)))
 
 
 def _rival(model: str) -> dict[str, Any]:

@@ -1,0 +1,218 @@
+"""The report of the paper's experiment: rows as CSV, tables as Markdown, and the paper's figures."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from stereoweave.benchmark import write_csv
+from stereoweave.io import make_folder, replacing
+from stereoweave.learn import checkpoint
+from stereoweave.learn.checkpoint import Checkpoint
+from stereoweave.learn.claims import PaperRow, claims_table, settings_table
+from stereoweave.learn.evaluation import evaluate, held_out_of, method_of
+from stereoweave.learn.figures import draw_exponent_curves, draw_iterations, draw_validation, draw_views
+from stereoweave.learn.objective import truth_histogram
+from stereoweave.learn.recipe import Recipe
+from stereoweave.learn.sources import sources
+from stereoweave.learn.train import CURVE, read_record
+from stereoweave.learn.trials import (
+    ADJUSTMENT,
+    ITERATIONS,
+    NETWORKS,
+    PROJECTION,
+    SCRATCH,
+    TRANSFER,
+    TUNED,
+    Trial,
+)
+from stereoweave.view_benchmark import Method, ViewRow
+
+# Held-out pairs that the figures show.
+SHOWN = (3, 11, 24)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """What the tables and figures are made of.
+
+    Attributes:
+        trained: The trials that are trained to their end.
+        missing: The names of the other trials' recipes.
+        kept: The checkpoints of the trained ones by their recipe's name.
+        curves: Their scores by step.
+        rows: A row for each of them.
+        common: The methods that every table has, on the base's held-out pairs.
+    """
+
+    base: Recipe
+    trained: list[Trial]
+    missing: list[str]
+    kept: dict[str, Checkpoint]
+    curves: dict[str, list[dict[str, float]]]
+    rows: list[PaperRow]
+    common: list[ViewRow]
+
+
+def write_report(base: Recipe, planned: Sequence[Trial], runs: Path, out: Path) -> None:
+    """Write paper.csv, paper.md and the figures into a folder, from the trials that are trained.
+
+    Args:
+        base: The recipe that the trials start from.
+        planned: All trials; paper.md names those that are not trained to their end.
+        runs: The folder of their runs.
+        out: The folder to write into.
+    """
+    make_folder(out)
+    report = _gathered(base, planned, runs)
+    write_csv(out / "paper.csv", report.rows)
+    with replacing(out / "paper.md") as temporary:
+        temporary.write_text(_markdown(report), encoding="utf-8")
+    _draw(report, runs, out)
+
+
+def _gathered(base: Recipe, planned: Sequence[Trial], runs: Path) -> Report:
+    files = {trial.recipe.name: runs / trial.recipe.name / "last.pt" for trial in planned}
+    kept = {name: checkpoint.load(file) for name, file in files.items() if file.exists()}
+    trained = [trial for trial in planned if _finished(trial, kept)]
+    scores, common = _scores([base, *(trial.recipe for trial in trained)], runs)
+    names = {trial.recipe.name for trial in trained}
+    return Report(
+        base=base,
+        trained=trained,
+        missing=sorted(files.keys() - names),
+        kept={name: kept[name] for name in names},
+        curves={name: read_record(runs / name / CURVE) for name in names},
+        rows=[_row(trial, kept[trial.recipe.name], scores[trial.recipe.name]) for trial in trained],
+        common=common,
+    )
+
+
+def _finished(trial: Trial, kept: Mapping[str, Checkpoint]) -> bool:
+    found = kept.get(trial.recipe.name)
+    return found is not None and found.step == trial.recipe.steps
+
+
+def _scores(recipes: Sequence[Recipe], runs: Path) -> tuple[dict[str, ViewRow], list[ViewRow]]:
+    """The scores of each run but the first recipe's; and of what every table has, on that one's pairs."""
+    base, *others = recipes
+    scores: dict[str, ViewRow] = {}
+    common: list[ViewRow] = []
+    for pairs in dict.fromkeys(held_out_of(recipe) for recipe in others):
+        names = list(dict.fromkeys(recipe.name for recipe in others if held_out_of(recipe) == pairs))
+        found = evaluate([runs / name for name in names])
+        scores |= {row.method: row for row in found if row.method in names}
+        if pairs == held_out_of(base):
+            common = [row for row in found if row.method not in names]
+    return scores, common
+
+
+def _row(trial: Trial, kept: Checkpoint, score: ViewRow) -> PaperRow:
+    recipe = kept.recipe
+    return PaperRow(
+        claim=trial.claim,
+        setting=trial.setting,
+        seed=recipe.seed,
+        model=recipe.model,
+        loss=recipe.loss,
+        exponent=recipe.exponent,
+        alpha_p=recipe.alpha_p,
+        steps=recipe.steps,
+        batch=recipe.batch,
+        crop=f"{recipe.crop_size[1]}x{recipe.crop_size[0]}",
+        prediction=kept.scores["prediction"],
+        squared_error=kept.scores["squared_error"],
+        epe_px=score.epe_px,
+        mae_sourced=score.mae_sourced,
+        sourced_percent=score.sourced_percent,
+        mae_filled=score.mae_filled,
+        psnr_db=score.psnr_db,
+        ssim=score.ssim,
+        minutes=60 * kept.hours,
+        commit=kept.commit,
+    )
+
+
+def _markdown(report: Report) -> str:
+    """The tables, and what was not run."""
+    base = report.base
+    parts = [
+        "# The paper's experiment: what was measured",
+        f"Written by `stereoweave bench paper`. {base.pairs} collage pairs of "
+        f"{base.crop_size[1]}x{base.crop_size[0]} a seed, batch {base.batch}, {base.steps} steps unless a "
+        f"table says otherwise, Adam at {base.learning_rate:g}; scores over {base.validation_pairs} held-out "
+        "pairs. Right view: made from the left image by forward projection; MAE, 0 to 255, over all pixels "
+        "after one row fill, then over the pixels that received a source, and their share.",
+        "## The claims",
+        claims_table(report.rows),
+    ]
+    for claim in dict.fromkeys(row.claim for row in report.rows):
+        parts += [f"## {claim.capitalize()}", settings_table(report.rows, claim)]
+    parts += ["## What needs no training", _common_table(report.common)]
+    if reached := _transfer(report):
+        parts += ["## Transfer: steps to one validation loss", reached]
+    if report.missing:
+        parts += ["## Not run", "\n".join(f"- {name}" for name in report.missing)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _common_table(rows: Sequence[ViewRow]) -> str:
+    lines = ["| method | EPE px | MAE | MAE of sourced | sourced % | PSNR dB | SSIM |", "|---" * 7 + "|"]
+    for row in rows:
+        lines.append(
+            f"| {row.method} | {row.epe_px:.2f} | {row.mae_filled:.2f} | {row.mae_sourced:.2f} "
+            f"| {row.sourced_percent:.1f} | {row.psnr_db:.2f} | {row.ssim:.3f} |"
+        )
+    return "\n".join(lines)
+
+
+def _transfer(report: Report) -> str:
+    """When the tuned network first reached what the one from scratch reached at its best."""
+    curves = {
+        trial.setting: report.curves[trial.recipe.name] for trial in report.trained if trial.claim == TRANSFER
+    }
+    if len(curves) < 2:
+        return ""
+    best = min(curves[SCRATCH], key=lambda point: point["loss"])
+    reached = [point["step"] for point in curves[TUNED] if point["loss"] <= best["loss"]]
+    tuned = f"{reached[0]:.0f} steps" if reached else f"more than {curves[TUNED][-1]['step']:.0f} steps"
+    return (
+        f"The validation loss of {best['loss']:.5f}, the best {SCRATCH} (after {best['step']:.0f} steps), is "
+        f"reached {TUNED} after {tuned}, where scores are taken every {report.base.validate_every} steps."
+    )
+
+
+def _draw(report: Report, runs: Path, out: Path) -> None:
+    """Fig. 2, left and right, and the same of the projection loss; Fig. 3; Fig. 5; as far as trained."""
+    training, held_out = sources(report.base, runs / "pairs")
+    claims = {row.claim for row in report.rows}
+    if ADJUSTMENT in claims:
+        exponents = {row.exponent for row in report.rows if row.claim == ADJUSTMENT}
+        histogram = truth_histogram(report.base, training)
+        draw_exponent_curves(out / "exponent_curves.png", sorted(exponents), histogram)
+    for claim, name in ((ADJUSTMENT, "exponent"), (PROJECTION, "projection")):
+        if claim in claims:
+            draw_validation(out / f"{name}_validation.png", dict(sorted(_by_setting(report, claim).items())))
+    samples = [held_out[index] for index in SHOWN if index < held_out.count]
+    for claim, draw, name in ((ITERATIONS, draw_iterations, "iterations"), (NETWORKS, draw_views, "views")):
+        if claim in claims:
+            methods = _first_of_each(report, claim)
+            estimates = [{setting: match(sample) for setting, match in methods.items()} for sample in samples]
+            draw(out / f"{name}.jpg", list(zip(samples, estimates, strict=True)))
+
+
+def _first_of_each(report: Report, claim: str) -> dict[str, Method]:
+    """For each setting its first seed's network."""
+    names = {t.setting: t.recipe.name for t in reversed(report.trained) if t.claim == claim}
+    return {setting: method_of(report.kept[name]) for setting, name in reversed(names.items())}
+
+
+def _by_setting(report: Report, claim: str) -> dict[str, list[list[tuple[int, float]]]]:
+    """For each setting the (step, squared error) of each seed."""
+    found: dict[str, list[list[tuple[int, float]]]] = {}
+    for trial in report.trained:
+        if trial.claim == claim:
+            curve = [
+                (int(point["step"]), point["squared_error"]) for point in report.curves[trial.recipe.name]
+            ]
+            found.setdefault(trial.setting, []).append(curve)
+    return found
