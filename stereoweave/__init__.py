@@ -7,12 +7,13 @@ if TYPE_CHECKING:
     from stereoweave.errors import FormatError, MatcherError, StereoweaveError
     from stereoweave.matcher import Matcher, estimate
     from stereoweave.rendering import render
-    from stereoweave.stereo import Estimate, Sample, StereoCamera, StereoPair, View
+    from stereoweave.stereo import DepthCurve, Estimate, Sample, StereoCamera, StereoPair, View
     from stereoweave.synthesis import synthesize
 
 __version__ = "0.1.0"
 
 _HOMES = {
+    "DepthCurve": "stereo",
     "Estimate": "stereo",
     "FormatError": "errors",
     "Matcher": "matcher",
@@ -28,6 +29,7 @@ _HOMES = {
 }
 
 __all__ = [
+    "DepthCurve",
     "Estimate",
     "FormatError",
     "Matcher",
