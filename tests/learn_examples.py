@@ -1,19 +1,21 @@
 """What the tests of training share: a pair whose truth is known by construction, a network trained on it."""
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import pytest
 import torch
 
+from stereoweave.errors import StereoweaveError
 from stereoweave.learn.batches import collated
 from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.losses import weave_losses
-from stereoweave.learn.models import MODELS
+from stereoweave.learn.models import network_of
 from stereoweave.learn.models.weave import WeaveNet
 from stereoweave.learn.pairs import KeptPairs
 from stereoweave.learn.recipe import Recipe
-from stereoweave.stereo import Sample
+from stereoweave.stereo import Sample, StereoCamera
 
 # Pictures this small cost more to share among threads than to compute.
 torch.set_num_threads(1)
@@ -33,6 +35,17 @@ RECIPE = Recipe(
     validation_pairs=2,
     validate_every=2,
 )
+# f B = 24 px m: the box of `box_before_a_wall` is at 2 m, its wall at 6 m.
+CAMERA = StereoCamera(focal_px=120.0, baseline_m=0.2, cx_px=47.5, cy_px=31.5)
+
+
+def recipe_of(model, **changes):
+    """RECIPE with another model: its loss changes with it, and PSMNet has a few candidates alone.
+
+    48 of them, because with 32 a volume is 2 levels deep, for which oneDNN's bfloat16 gradient is garbage.
+    """
+    loss = "weave" if model == "weave" else "l2"
+    return replace(RECIPE, **{"model": model, "loss": loss, "max_disparity_px": 48.0, **changes})
 
 
 def texture(rng, height, width):
@@ -75,7 +88,7 @@ def keep_pairs(folder, seed, count, size=PAIR_SIZE):
 
 def untrained(name="weave"):
     torch.manual_seed(0)
-    return MODELS[name]().eval()
+    return network_of(recipe_of(name)).eval()
 
 
 def checkpoint_of(network, recipe=RECIPE):
@@ -91,6 +104,31 @@ def checkpoint_of(network, recipe=RECIPE):
         commit="0123abc",
         hours=0.25,
     )
+
+
+def complaint(call, *arguments) -> str:
+    """The one line of the error in which the call must end."""
+    with pytest.raises(StereoweaveError) as caught:
+        call(*arguments)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@dataclass(frozen=True)
+class Listed:
+    """Samples in memory as a source."""
+
+    samples: list[Sample]
+
+    @property
+    def count(self) -> int:
+        return len(self.samples)
+
+    def __getitem__(self, index: int) -> Sample:
+        return self.samples[index]
+
+    def name(self, index: int) -> str:
+        return f"sample {index}"
 
 
 @dataclass(frozen=True)

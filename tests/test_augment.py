@@ -1,11 +1,24 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from learn_examples import complaint
 
-from stereoweave.learn.augment import augment, erased, mirrored, recoloured, rescaled_cut, upside_down
-from stereoweave.stereo import Sample
+from stereoweave.learn.augment import (
+    augment,
+    cut,
+    erased,
+    mirrored,
+    moved,
+    recoloured,
+    rescaled_cut,
+    upside_down,
+)
+from stereoweave.stereo import Sample, StereoCamera
 
 HEIGHT, WIDTH = 96, 144
 NEAR_PX, SLOPE = 5.0, 0.05
+CAMERA = StereoCamera(focal_px=90.0, baseline_m=0.1, cx_px=70.0, cy_px=40.0, doffs_px=6.0)
 
 
 def picture(x, y):
@@ -61,9 +74,9 @@ def test_the_example_itself_is_exact(sample):
 
 @pytest.mark.parametrize("seed", range(8))
 def test_a_scaled_cut_stays_exact(sample, seed):
-    cut = rescaled_cut(sample, 64, 80, np.random.default_rng(seed))
-    assert cut.left.shape == cut.right.shape == (64, 80, 3)
-    assert_views_agree(cut, 4)
+    part = rescaled_cut(sample, 64, 80, np.random.default_rng(seed))
+    assert part.left.shape == part.right.shape == (64, 80, 3)
+    assert_views_agree(part, 4)
 
 
 def test_cuts_are_scaled_up_and_down(sample):
@@ -138,3 +151,86 @@ def test_erasing_puts_flat_patches_into_a_copy(rng):
     changed = (found != image).any(2)
     assert 15 * 15 <= changed.sum() <= 2 * 63 * 63
     assert np.unique(found[changed], axis=0).shape[0] <= 3
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_cut_keeps_every_value_and_moves_the_camera_s_centre(sample, seed):
+    part = cut(replace(sample, camera=CAMERA), 30, 50, np.random.default_rng(seed))
+    # The camera tells where the part lies.
+    start, top = round(70 - part.camera.cx_px), round(40 - part.camera.cy_px)
+    assert 0 <= start <= WIDTH - 50 and 0 <= top <= HEIGHT - 30
+    for name, values in vars(sample).items():
+        if name != "camera":
+            np.testing.assert_array_equal(
+                getattr(part, name), values[top : top + 30, start : start + 50], err_msg=name
+            )
+    assert part.camera == replace(CAMERA, cx_px=70.0 - start, cy_px=40.0 - top)
+
+
+def test_cuts_lie_in_different_places_and_the_whole_is_one_of_them(sample):
+    whole = replace(sample, camera=CAMERA)
+    centres = {cut(whole, 30, 50, np.random.default_rng(seed)).camera.cx_px for seed in range(20)}
+    assert len(centres) > 10
+    assert_same(cut(whole, HEIGHT, WIDTH, np.random.default_rng(0)), whole)
+
+
+@pytest.mark.parametrize("size", [(HEIGHT + 1, 50), (30, WIDTH + 1)])
+def test_a_cut_larger_than_the_sample_is_refused(sample, size):
+    assert complaint(cut, sample, *size, np.random.default_rng(0)) == (
+        f"crop_size = {list(size)}: expected at most the pictures' [96, 144]; cut less"
+    )
+
+
+def test_a_scaled_camera_sees_with_a_longer_focal_length():
+    assert moved(CAMERA, 10, 20, 2.0, 0.5) == StereoCamera(
+        focal_px=180.0, baseline_m=0.1, cx_px=120.0, cy_px=10.0, doffs_px=12.0
+    )
+    assert moved(None, 10, 20) is None
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_depth_stays_when_a_sample_is_scaled(sample, seed):
+    # 9 px m over 5 + x / 20 + 6 px: the nearest and the farthest of the wall bound what a part can see.
+    part = rescaled_cut(replace(sample, camera=CAMERA), 64, 80, np.random.default_rng(seed))
+    scale = part.camera.focal_px / 90
+    assert part.camera.doffs_px == pytest.approx(6 * scale)
+    columns = (part.disparity_px / scale - NEAR_PX) / SLOPE
+    expected_m = 9 / (NEAR_PX + SLOPE * columns + 6)
+    np.testing.assert_allclose(part.camera.depth_m(part.disparity_px), expected_m, rtol=1e-5)
+    # Where the columns lie that the part shows, the camera says too: 70 px right of the wall's beginning.
+    first = 70 - part.camera.cx_px / scale
+    np.testing.assert_allclose(columns[0], first + np.arange(80) / scale, atol=1.01)
+
+
+def places_m(sample):
+    """Where the left view's pixels lie, in metres from the left camera: right, down and ahead [H, W, 3]."""
+    camera = sample.camera
+    y, x = np.mgrid[: sample.left.shape[0], : sample.left.shape[1]]
+    depth_m = camera.depth_m(sample.disparity_px)
+    right, down = (x - camera.cx_px) / camera.focal_px, (y - camera.cy_px) / camera.focal_px
+    return np.stack([right * depth_m, down * depth_m, depth_m], -1)
+
+
+def test_a_sample_upside_down_shows_every_place_upside_down(sample):
+    sample = replace(sample, camera=CAMERA)
+    turned = places_m(upside_down(sample))[::-1]
+    np.testing.assert_allclose(turned, places_m(sample) * [1, -1, 1], rtol=1e-5, atol=1e-6)
+
+
+def test_a_mirrored_sample_shows_every_place_from_the_other_camera(sample):
+    sample = replace(sample, camera=CAMERA)
+    mirror = mirrored(sample)
+    # The right camera of the sample, 10 cm further right, whose centre is doffs further right.
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    depth_m = 9 / (sample.right_disparity_px + 6)
+    right_m, down_m = (x - 76.0) / 90 * depth_m, (y - 40.0) / 90 * depth_m
+    expected = np.stack([-right_m, down_m, depth_m], -1)[:, ::-1]
+    np.testing.assert_allclose(places_m(mirror), expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(mirrored(mirror).camera.cx_px, 70)
+
+
+def test_a_pair_without_the_right_view_s_disparity_is_never_mirrored(sample):
+    sample = replace(sample, right_disparity_px=np.full_like(sample.right_disparity_px, np.nan))
+    for seed in range(12):
+        augmented = augment(sample, 64, 80, np.random.default_rng(seed))
+        assert np.isfinite(augmented.disparity_px).all()

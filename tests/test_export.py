@@ -1,10 +1,21 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import onnx
 import pytest
-from learn_examples import PAIR_SIZE, RECIPE, checkpoint_of, overfitted
+import torch
+from learn_examples import (
+    PAIR_SIZE,
+    RECIPE,
+    checkpoint_of,
+    complaint,
+    overfitted,
+    recipe_of,
+    untrained,
+)
 from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn import calibrate, checkpoint, export
@@ -86,6 +97,63 @@ def test_the_matcher_file_answers_as_pytorch_does_and_nothing_is_written_otherwi
     assert list(elsewhere.parent.iterdir()) == []
 
 
+@pytest.fixture
+def paper_run(tmp_path):
+    """The folder of a run of the paper's network, whose weights spread its codes over 0..1."""
+    network = untrained("fast_depth")
+    torch.nn.init.normal_(network.head.to_code.weight, std=0.05)
+    recipe = recipe_of("fast_depth", exponent=1.5, alpha_p=1.0)
+    (tmp_path / "paper").mkdir()
+    checkpoint.save(checkpoint_of(network, recipe), tmp_path / "paper" / "last.pt")
+    return tmp_path / "paper"
+
+
+def test_the_papers_network_becomes_a_matcher_that_finds_the_right_view_by_the_mirrored_pair(
+    paper_run, pair, tmp_path
+):
+    out = tmp_path / "paper.onnx"
+    card = export.export(paper_run, out, [pair])
+    assert 0 <= card["onnx_differs_px"] < 0.01
+    assert card["onnx_differs_confidence"] == 0
+    assert card["parameters"] == 314_722
+    assert "confidence" not in card
+    assert [value.name for value in onnx.load(out).graph.output] == ["disparity_px"]
+
+    matcher = Matcher(out, threads=1)
+    found = matcher.estimate(pair.left, pair.right)
+    network = export.matcher_network(checkpoint.load(paper_run / "last.pt"))
+    for values, view in (
+        (found.disparity_px, pair),
+        (found.right_disparity_px[:, ::-1], pair.mirrored()),
+    ):
+        tensors = [torch.from_numpy(image).permute(2, 0, 1)[None] / 255 for image in (view.left, view.right)]
+        with torch.no_grad():
+            code = network.network(*tensors)[0, 0].numpy()
+        # Equation (4), of a range of 48 px.
+        np.testing.assert_allclose(values, 48 * code ** (1 / 1.5), atol=0.01)
+    assert np.ptp(found.disparity_px) > 1
+
+
+def test_a_network_that_predicts_pixels_gives_a_matcher_its_pixels():
+    network, recipe = untrained("psmnet"), recipe_of("psmnet", exponent=2.0)
+    left, right = torch.rand(2, 1, 3, 32, 48)
+    matcher = export.DisparityNetwork(network, recipe)
+    with torch.no_grad():
+        (found_px,) = matcher(left, right)
+        torch.testing.assert_close(found_px, network(left, right))
+    assert (matcher.multiple_of, matcher.max_disparity_px) == (16, 48)
+
+
+def test_a_network_of_depth_is_no_matcher(tmp_path):
+    recipe = recipe_of("fast_depth", target="depth")
+    checkpoint.save(checkpoint_of(untrained("fast_depth"), recipe), tmp_path / "last.pt")
+    assert complaint(export.export, tmp_path, tmp_path / "out" / "depth.onnx") == (
+        "tiny: a matcher file gives disparity, expected target = 'disparity', found 'depth'; "
+        "the network needs each pair's camera"
+    )
+    assert not (tmp_path / "out").exists()
+
+
 class OneLayer(nn.Module):
     def __init__(self):
         super().__init__()
@@ -95,10 +163,17 @@ class OneLayer(nn.Module):
         return self.layer(left) @ right[:, :1].mT
 
 
-def test_multiply_adds_are_those_of_layers_products_and_the_refinement():
+def test_multiply_adds_are_those_of_layers_and_products():
     height, width = 8, 12
     layer = height * width * 8 * 3 * 9
     product = 8 * height * width * height
+    assert export.multiply_adds(OneLayer(), height, width) == layer + product
+
+
+def test_multiply_adds_count_the_refinement_of_weavenet():
+    network, image = untrained(), torch.rand(1, 3, 16, 32)
+    with FlopCounterMode(display=False) as counter, torch.no_grad():
+        network(image, image)
     # Both views at half the resolution compare 16 features with those of 6 columns.
-    refinement = 2 * (height // 2) * (width // 2) * 16 * 6
-    assert export.multiply_adds(OneLayer(), height, width) == layer + product + refinement
+    refinement = 2 * 8 * 16 * 16 * 6
+    assert export.multiply_adds(network, 16, 32) == counter.get_total_flops() // 2 + refinement

@@ -41,6 +41,33 @@ def test_a_recipe_survives_being_a_dictionary():
     assert recipe_from(asdict(RECIPE), "here") == RECIPE
 
 
+def test_a_recipe_for_a_dataset_on_disk_is_bound_by_no_pair_size():
+    recipe = recipe_from(
+        NEEDED | {"dataset": "sintel", "root": "datasets/sintel", "crop_size": [384, 1024]}, "here"
+    )
+    assert recipe.crop_size == (384, 1024)
+
+
+def test_table_1_has_a_recipe_for_each_of_its_cells():
+    recipes = {file.stem: read_recipe(file) for file in RECIPES if file.parent.name == "paper"}
+    cells = {
+        f"{dataset}_{model}": (dataset.replace("propeller", "paper"), model)
+        for dataset in ("sintel", "driving", "monkaa", "propeller")
+        for model in ("dispnet", "densemapnet", "psmnet", "fast_depth")
+    }
+    assert cells.keys() <= recipes.keys()
+    for name, cell in cells.items():
+        recipe = recipes[name]
+        assert recipe.name == name
+        assert (recipe.dataset, recipe.model) == cell
+        assert recipe.target == ("depth" if recipe.dataset == "paper" else "disparity")
+        # The paper's: Adam and batches of 4 pairs.
+        assert (recipe.batch, recipe.weight_decay, recipe.averaged_steps) == (4, 0.0, 1)
+        # Its own two contributions, and the transfer, are for its own network alone.
+        own = (1.5, 1.0, "checkpoints/fast_depth.pt") if recipe.model == "fast_depth" else (1.0, 0.0, "")
+        assert (recipe.exponent, recipe.alpha_p, recipe.start_from) == own
+
+
 def test_the_learning_rate_rises_stays_and_falls():
     recipe = Recipe(**NEEDED)
     rates = [recipe.learning_rate_at(step) for step in range(10)]
@@ -76,7 +103,13 @@ def test_the_learning_rate_without_slopes_is_constant():
         ({"validation_pairs": 0}, "validation_pairs = 0, expected more than 0"),
         ({"validate_every": 0}, "validate_every = 0, expected more than 0"),
         ({"averaged_steps": 0}, "averaged_steps = 0, expected more than 0"),
+        ({"max_disparity_px": 0.0}, "max_disparity_px = 0.0, expected more than 0"),
+        ({"max_disparity_px": float("inf")}, "max_disparity_px = inf, expected more than 0"),
         ({"max_depth_m": 0.0}, "max_depth_m = 0.0, expected more than 0"),
+        ({"fit_exponent": "yes"}, "fit_exponent = 'yes', expected true or false"),
+        ({"loss": 2}, "loss = 2, expected a text in quotes"),
+        ({"exponent": float("nan")}, "exponent = nan, expected at least 1"),
+        ({"alpha_z": float("inf")}, "alpha_z = inf, expected at least 0"),
         ({"augment": 1}, "augment = 1, expected true or false"),
         ({"exponent": 0.5}, "exponent = 0.5, expected at least 1"),
         ({"exponent": float("inf")}, "exponent = inf, expected at least 1"),

@@ -10,14 +10,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from learn_examples import PAIR_SIZE, RECIPE, box_before_a_wall, checkpoint_of, keep_pairs, untrained
+from learn_examples import (
+    CAMERA,
+    PAIR_SIZE,
+    RECIPE,
+    Listed,
+    box_before_a_wall,
+    checkpoint_of,
+    complaint,
+    keep_pairs,
+    recipe_of,
+    untrained,
+)
 from lightning_fabric.loggers.tensorboard import TensorBoardLogger
 from rich.console import Console
 
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.learn import checkpoint
 from stereoweave.learn import train as training
-from stereoweave.learn.batches import Batches, collated
+from stereoweave.learn.batches import Batches
+from stereoweave.learn.models import MODELS
 from stereoweave.learn.pairs import KeptPairs
 from stereoweave.learn.recipe import read_recipe
 from stereoweave.learn.sources import VALIDATION_SEED
@@ -25,6 +37,28 @@ from stereoweave.learn.train import Run, train
 
 RECIPES = sorted((Path(__file__).parent.parent / "recipes").rglob("*.toml"))
 QUIET = Console(quiet=True)
+CAMERA_PAIRS = Listed(
+    [replace(box_before_a_wall(np.random.default_rng(seed)), camera=CAMERA) for seed in range(4)]
+)
+
+
+def in_memory(recipe):
+    """The recipe for `CAMERA_PAIRS`, so small that PSMNet is quick; Table I has five such."""
+    return replace(
+        recipe,
+        name=recipe.model,
+        seed=0,
+        start_from="",
+        dataset=RECIPE.dataset,
+        root="",
+        pair_size=PAIR_SIZE,
+        crop_size=(64, 64),
+        batch=2,
+        max_disparity_px=48.0,
+    )
+
+
+FIRST_STEPS = {in_memory(read_recipe(file)): file.stem for file in RECIPES}
 
 
 @pytest.fixture(scope="module")
@@ -140,6 +174,22 @@ def test_a_loss_that_is_not_finite_stops_and_names_the_pairs(folder, tmp_path):
     assert not (folder / "broken" / "last.pt").exists()
 
 
+def test_a_gradient_that_is_not_finite_stops_before_it_reaches_the_weights(tmp_path, logger):
+    recipe = recipe_of("fast_depth")
+    run = Run(recipe, training._starting_point(recipe, tmp_path / "last.pt"), logger)
+    network = run.network.module
+    before = [value.clone() for value in network.parameters()]
+    # A product with infinity makes the gradient infinite and leaves the loss as it was.
+    network.head.to_code.bias.register_hook(lambda gradient: gradient * torch.inf)
+    batches = Batches(recipe, CAMERA_PAIRS)
+    assert complaint(run.step, 7, batches[7], batches) == (
+        f"step 7: the norm of the gradient is inf; its pairs are {batches.chosen(7)} of seed 0"
+    )
+    for value, earlier in zip(network.parameters(), before, strict=True):
+        assert torch.equal(value, earlier)
+    assert not run.optimiser.state_dict()["state"]
+
+
 def test_a_recipe_for_an_unknown_network_is_refused(tmp_path):
     file = write(replace(RECIPE, model="spider"), tmp_path / "spider.toml")
     with pytest.raises(FormatError, match=r"tiny: model = 'spider', expected weave"):
@@ -160,18 +210,74 @@ def test_a_run_into_a_file_fails_before_any_pair_is_made(recipe_file, tmp_path):
     assert [file.read_text() for file in tmp_path.iterdir()] == ["kept"]
 
 
-@pytest.mark.parametrize("file", RECIPES, ids=lambda file: file.name)
-def test_every_shipped_recipe_takes_a_step(file, folder, tmp_path, logger):
-    small = {name: getattr(RECIPE, name) for name in ("pairs", "pair_size", "crop_size", "batch")}
-    recipe = replace(read_recipe(file), seed=RECIPE.seed, start_from="", **small)
-    batches = Batches(recipe, KeptPairs(folder / "pairs", recipe.seed, recipe.pairs, recipe.pair_size))
-    start = training._starting_point(recipe, tmp_path / "last.pt")
-    run = Run(recipe, start, logger)
+def step_of(recipe, folder, logger):
+    """The first step of a recipe on pairs in memory: the run after it, and every parameter before."""
+    run = Run(recipe, training._starting_point(recipe, folder / "last.pt"), logger)
     before = {name: value.clone() for name, value in run.network.module.named_parameters()}
+    batches = Batches(recipe, CAMERA_PAIRS)
     assert 0 < run.step(0, batches[0], batches) < 100
+    return run, before
+
+
+def assert_all_moved(run, before):
     for name, value in run.network.module.named_parameters():
         assert value.isfinite().all()
         assert not torch.equal(value, before[name]), name
+
+
+@pytest.mark.parametrize("recipe", FIRST_STEPS, ids=FIRST_STEPS.values())
+def test_every_shipped_recipe_takes_a_step(recipe, tmp_path, logger):
+    assert_all_moved(*step_of(recipe, tmp_path, logger))
+
+
+@pytest.mark.parametrize("model", [name for name in MODELS if name != "weave"])
+def test_any_of_the_papers_networks_trains_by_changing_one_word(model, tmp_path, logger):
+    """All of equation (5) on depth with an exponent, in the one batch that all of them see."""
+    recipe = recipe_of("fast_depth", target="depth", exponent=1.5, alpha_p=1.0, averaged_steps=1)
+    run, before = step_of(replace(recipe, model=model), tmp_path, logger)
+    assert_all_moved(run, before)
+    # An average over one step is that step's weights.
+    assert_same(dict(run.averaged.module.state_dict()), dict(run.network.module.state_dict()))
+
+
+def test_a_code_network_that_is_resumed_ends_as_one_that_was_not(folder):
+    """Dropout included, whose draws go on where they were."""
+    recipe = recipe_of("fast_depth", name="paper", steps=4, alpha_p=1.0)
+    whole = checkpoint.load(training.train_recipe(recipe, folder / "paper", QUIET))
+    last = folder / "paper_resumed" / "last.pt"
+
+    class Killed(Exception):
+        pass
+
+    def kill(self, *arguments):
+        keep(self, *arguments)
+        raise Killed
+
+    with pytest.MonkeyPatch.context() as patch:
+        keep = Run.keep
+        patch.setattr(Run, "keep", kill)
+        with pytest.raises(Killed):
+            training.train_recipe(recipe, last.parent, QUIET)
+    assert checkpoint.load(last).step == 2
+    torch.manual_seed(99)
+    resumed = checkpoint.load(training.train_recipe(recipe, last.parent, QUIET))
+    assert resumed.step == whole.step == 4
+    for name in ("weights", "averaged", "optimiser", "random_state", "scores"):
+        assert_same(getattr(resumed, name), getattr(whole, name))
+
+
+def test_the_scores_of_a_run_are_recorded_step_by_step(folder, finished):
+    rows = training.read_record(finished.with_name(training.CURVE))
+    assert [row["step"] for row in rows] == list(range(2, RECIPE.steps + 1, 2))
+    assert rows[-1] == {"step": RECIPE.steps, **checkpoint.load(finished).scores}
+
+
+def test_a_record_that_is_written_again_replaces_what_came_later(tmp_path):
+    for step, score in ((10, 3.0), (20, 2.0), (30, 1.0), (20, 2.5)):
+        training.record(tmp_path / "curve.csv", step, {"loss": score})
+    rows = training.read_record(tmp_path / "curve.csv")
+    assert rows == [{"step": 10, "loss": 3.0}, {"step": 20, "loss": 2.5}]
+    assert training.read_record(tmp_path / "nowhere.csv") == []
 
 
 @pytest.mark.parametrize(("precision", "dtype"), [("bf16-mixed", torch.bfloat16), ("32-true", torch.float32)])
@@ -187,32 +293,3 @@ def test_a_step_computes_in_bfloat16_where_the_device_does(
     batches = Batches(RECIPE, KeptPairs(folder / "pairs", RECIPE.seed, RECIPE.pairs, PAIR_SIZE))
     run.step(0, batches[0], batches)
     assert set(seen) == {dtype}
-
-
-def test_every_pair_comes_once_before_any_comes_again():
-    recipe = replace(RECIPE, pairs=7, batch=3)
-    batches = Batches(recipe, KeptPairs(Path("unused"), 0, recipe.pairs, PAIR_SIZE))
-    chosen = [index for step in range(7) for index in batches.chosen(step)]
-    epochs = [chosen[:7], chosen[7:14], chosen[14:]]
-    assert all(sorted(epoch) == list(range(7)) for epoch in epochs)
-    assert epochs[0] != epochs[1]
-
-
-def test_a_batch_depends_on_the_seed_and_the_step_alone(folder):
-    pairs = KeptPairs(folder / "pairs", RECIPE.seed, RECIPE.pairs, PAIR_SIZE)
-    one, other = Batches(RECIPE, pairs), Batches(RECIPE, pairs)
-    other[0]
-    assert_same(one[1], other[1])
-    assert not torch.equal(one[1]["left"], one[2]["left"])
-
-
-def test_a_batch_holds_the_left_views_maps_and_behind_them_the_right_ones_mirrored():
-    samples = [box_before_a_wall(np.random.default_rng(seed)) for seed in (0, 1)]
-    batch = collated(samples)
-    height, width = PAIR_SIZE
-    assert batch["left"].shape == batch["right"].shape == (2, 3, height, width)
-    assert batch["left"][1, 2, 5, 7].item() == pytest.approx(samples[1].left[5, 7, 2] / 255)
-    assert batch["disparity_px"].shape == batch["occluded"].shape == (4, 1, height, width)
-    np.testing.assert_array_equal(batch["disparity_px"][1, 0], samples[1].disparity_px)
-    np.testing.assert_array_equal(batch["disparity_px"][3, 0], samples[1].right_disparity_px[:, ::-1])
-    np.testing.assert_array_equal(batch["occluded"][2, 0], samples[0].right_occluded[:, ::-1])

@@ -117,7 +117,7 @@ def comparisons() -> Iterator[Comparison]:
             less = [less_percent(*both) for both in numbers]
             yield Comparison(
                 text=f"the paper's network against {rival}: {name}",
-                paper=" ".join(f"{value:.0f}" for value in less) + " % (Table I)",
+                paper=" ".join(f"{value:z.0f}" for value in less) + " % (Table I)",
                 paper_percent=float(np.mean(less)),
                 claim=NETWORKS_SHORT if rival == "psmnet" else NETWORKS,
                 reference=rival,
@@ -161,10 +161,10 @@ def claims_table(rows: Sequence[PaperRow]) -> str:
             lines.append(f"| {comparison.text} | {comparison.paper} | not run | | |")
             continue
         mean, half = float(np.mean(values)), half_width(values)
-        interval = f"{mean - half:.0f} to {mean + half:.0f}" if len(values) > 1 else "one seed"
+        interval = f"{mean - half:z.0f} to {mean + half:z.0f}" if len(values) > 1 else "one seed"
         lines.append(
-            f"| {comparison.text} | {comparison.paper} | {mean:.0f} ({interval}) "
-            f"| {mean - comparison.paper_percent:+.0f} | {_verdict(mean, half)} |"
+            f"| {comparison.text} | {comparison.paper} | {mean:z.0f} ({interval}) "
+            f"| {mean - comparison.paper_percent:+z.0f} | {_verdict(mean, half)} |"
         )
     return "\n".join(lines)
 

@@ -33,8 +33,9 @@ def evaluate(runs: Sequence[Path]) -> list[ViewRow]:
         runs: Folders of `stereoweave train`, all with the same held-out pairs.
 
     Raises:
-        StereoweaveError: The runs do not share their held-out pairs.
+        StereoweaveError: The runs do not share their held-out pairs, or two rows would bear one name.
     """
+    _check_names([run.name for run in runs])
     kept = {run.name: checkpoint.load(run / "last.pt") for run in runs}
     training, held_out = sources(_common(kept), runs[0].parent / "pairs")
     methods = {MEDIAN: median_method(training), **{name: method_of(one) for name, one in kept.items()}}
@@ -66,6 +67,14 @@ def median_method(training: Source) -> Method:
     values_px = [known(training, i).disparity_px[::_MEDIAN_STRIDE, ::_MEDIAN_STRIDE].ravel() for i in some]
     median_px = np.nanmedian(np.concatenate(values_px))
     return lambda sample: np.full_like(sample.disparity_px, median_px)
+
+
+def _check_names(names: Sequence[str]) -> None:
+    rows = [MEDIAN, *names]
+    if twice := [name for name in names if rows.count(name) > 1]:
+        raise StereoweaveError(
+            f"{twice[0]}: expected run folders of different names, none of them {MEDIAN!r}; rename it"
+        )
 
 
 def _common(kept: dict[str, Checkpoint]) -> Recipe:

@@ -138,10 +138,14 @@ class CodeObjective:
         return terms
 
     def _depth_m(self, disparity_px: Map, batch: Batch) -> Map:
-        """Depth of an estimated disparity, at most max_depth_m."""
-        focal_baseline = batch["focal_baseline_px_m"]
+        """Depth of an estimated disparity; beyond max_depth_m it goes on along the tangent, linearly.
+
+        So it is finite where disparity is 0 or less, and a network that starts there still has a gradient.
+        """
+        focal_baseline, shifted_px = batch["focal_baseline_px_m"], disparity_px + batch["doffs_px"]
         least_px = focal_baseline / self.recipe.max_depth_m
-        return focal_baseline / (disparity_px + batch["doffs_px"]).clamp(min=least_px)
+        beyond = (1 - shifted_px / least_px).clamp(min=0)
+        return focal_baseline / shifted_px.clamp(min=least_px) + beyond * self.recipe.max_depth_m
 
     def _scores_of(self, network: CodeNetwork, sample: Sample, device: torch.device) -> dict[str, float]:
         batch = {name: values.to(device) for name, values in collated([sample]).items()}
@@ -155,7 +159,8 @@ class CodeObjective:
         scores["squared_error"] = float(error.nanmean())
         scores["epe_px"] = metrics.epe_px(_array(self.disparity_px(output, batch)), sample.disparity_px)
         if self.recipe.target == "depth":
-            scores["depth_error_m"] = metrics.depth_error_m(_array(quantity), _array(truth))
+            estimate_m = _array(quantity.clamp(max=self.recipe.max_depth_m))
+            scores["depth_error_m"] = metrics.depth_error_m(estimate_m, _array(truth))
         return scores
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
+from stereoweave.errors import StereoweaveError
 from stereoweave.learn.objective import fitted
 from stereoweave.learn.recipe import Recipe
 from stereoweave.learn.sources import sources
@@ -28,7 +29,14 @@ def plan(
         seeds: How often each training is repeated.
         console: Where progress is told.
         claims: Names in CLAIMS.
+
+    Raises:
+        StereoweaveError: The base is not of the paper's network.
     """
+    if base.model != "fast_depth":
+        raise StereoweaveError(
+            f"{base.name}: model = {base.model!r}, expected 'fast_depth', which the others are compared with"
+        )
     training, _ = (kept(pairs, console) for pairs in sources(base, runs / "pairs"))
     exponent = fitted(replace(base, fit_exponent=True), training).exponent
     planned = [_below(trial, runs) for trial in trials(base, seeds, exponent) if trial.claim in claims]

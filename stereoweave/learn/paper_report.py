@@ -27,7 +27,7 @@ from stereoweave.learn.trials import (
 )
 from stereoweave.view_benchmark import Method, ViewRow
 
-# Held-out pairs that the figures show.
+# Held-out pairs that the figures show, counted round where there are fewer.
 SHOWN = (3, 11, 24)
 
 
@@ -192,7 +192,7 @@ def _draw(report: Report, runs: Path, out: Path) -> None:
     for claim, name in ((ADJUSTMENT, "exponent"), (PROJECTION, "projection")):
         if claim in claims:
             draw_validation(out / f"{name}_validation.png", dict(sorted(_by_setting(report, claim).items())))
-    samples = [held_out[index] for index in SHOWN if index < held_out.count]
+    samples = [held_out[index] for index in dict.fromkeys(shown % held_out.count for shown in SHOWN)]
     for claim, draw, name in ((ITERATIONS, draw_iterations, "iterations"), (NETWORKS, draw_views, "views")):
         if claim in claims:
             methods = _first_of_each(report, claim)

@@ -45,13 +45,13 @@ def run_times(recipe: Recipe, networks: Sequence[str] = NETWORKS, turns: int = T
     """A row per network, timed in turns, so that a machine that slows down slows all alike.
 
     Args:
-        recipe: Of any of them, for disparity; all are built as it would build them, for 192 px.
+        recipe: All are built as it would build them, but for disparity up to 192 px; the loss costs nothing.
         networks: Names in MODELS, DenseMapNet's among them.
         turns: How often each is timed; PSMNet, which takes a minute for all of them, a third as often.
     """
     torch.set_num_threads(thread_count(None))
     pair = torch.rand(2, 1, 3, HEIGHT_PX, WIDTH_PX)
-    recipe = replace(recipe, max_disparity_px=DISPARITIES)
+    recipe = replace(recipe, target="disparity", max_disparity_px=DISPARITIES, loss="l2")
     built = {
         name: DisparityNetwork(network_of(replace(recipe, model=name)).eval(), recipe) for name in networks
     }
@@ -97,7 +97,7 @@ def _times_ms(calls: Mapping[str, tuple[Callable[[], object], ...]], turns: int)
     taken: dict[str, list[list[float]]] = {name: [[] for _ in both] for name, both in calls.items()}
     for turn in range(-1, turns):  # the first one warms up
         for name, both in calls.items():
-            if name == "psmnet" and turn % 3:
+            if name == "psmnet" and max(turn, 0) % 3:
                 continue
             for times, call in zip(taken[name], both, strict=True):
                 start_s = time.perf_counter()

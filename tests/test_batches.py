@@ -1,0 +1,105 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from learn_examples import CAMERA, PAIR_SIZE, RECIPE, Listed, box_before_a_wall, complaint
+
+from stereoweave.learn.batches import Batches, collated, known
+from stereoweave.learn.pairs import KeptPairs
+
+
+def samples(count, **changes):
+    return [replace(box_before_a_wall(np.random.default_rng(seed)), **changes) for seed in range(count)]
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    return Listed(samples(4))
+
+
+def test_every_pair_comes_once_before_any_comes_again():
+    recipe = replace(RECIPE, pairs=7, batch=3)
+    batches = Batches(recipe, KeptPairs(Path("unused"), 0, recipe.pairs, PAIR_SIZE))
+    chosen = [index for step in range(7) for index in batches.chosen(step)]
+    epochs = [chosen[:7], chosen[7:14], chosen[14:]]
+    assert all(sorted(epoch) == list(range(7)) for epoch in epochs)
+    assert epochs[0] != epochs[1]
+
+
+def test_a_batch_depends_on_the_seed_and_the_step_alone(pairs):
+    one, other = Batches(RECIPE, pairs), Batches(RECIPE, pairs)
+    other[0]
+    again, first = other[1], one[1]
+    assert first.keys() == again.keys()
+    assert all(torch.equal(first[name].nan_to_num(-1), again[name].nan_to_num(-1)) for name in first)
+    assert not torch.equal(first["left"], one[2]["left"])
+
+
+def test_a_batch_without_augmentation_holds_cuts_of_the_pairs_as_they_are(pairs):
+    batches = Batches(replace(RECIPE, augment=False, crop_size=PAIR_SIZE), pairs)
+    batch = batches[0]
+    for place, index in enumerate(batches.chosen(0)):
+        np.testing.assert_array_equal(batch["disparity_px"][place, 0], pairs[index].disparity_px)
+        found = (255 * batch["right"][place]).round().byte().permute(1, 2, 0)
+        np.testing.assert_array_equal(found, pairs[index].right)
+
+
+def test_a_batch_holds_the_left_views_maps_and_behind_them_the_right_ones_mirrored():
+    first, second = samples(2)
+    batch = collated([first, second])
+    height, width = PAIR_SIZE
+    assert batch.keys() == {"left", "right", "disparity_px", "occluded"}
+    assert batch["left"].shape == batch["right"].shape == (2, 3, height, width)
+    assert batch["left"][1, 2, 5, 7].item() == pytest.approx(second.left[5, 7, 2] / 255)
+    assert batch["disparity_px"].shape == batch["occluded"].shape == (4, 1, height, width)
+    np.testing.assert_array_equal(batch["disparity_px"][1, 0], second.disparity_px)
+    np.testing.assert_array_equal(batch["disparity_px"][3, 0], second.right_disparity_px[:, ::-1])
+    np.testing.assert_array_equal(batch["occluded"][2, 0], first.right_occluded[:, ::-1])
+
+
+def test_each_sample_keeps_its_own_camera():
+    first, second = samples(2, camera=CAMERA)
+    second = replace(second, camera=replace(CAMERA, focal_px=60.0, doffs_px=3.0))
+    batch = collated([first, second])
+    # 120 px and 60 px times 0.2 m.
+    torch.testing.assert_close(batch["focal_baseline_px_m"], torch.tensor([24.0, 12.0]).view(2, 1, 1, 1))
+    torch.testing.assert_close(batch["doffs_px"], torch.tensor([0.0, 3.0]).view(2, 1, 1, 1))
+
+
+def test_a_batch_in_which_one_sample_has_no_camera_has_none():
+    first, second = samples(2, camera=CAMERA)
+    assert "focal_baseline_px_m" not in collated([first, replace(second, camera=None)])
+
+
+def test_a_batch_of_mixed_sizes_is_refused():
+    mixed = [box_before_a_wall(np.random.default_rng(0), size) for size in ((64, 96), (32, 48), (64, 96))]
+    assert complaint(collated, mixed) == (
+        "a batch: expected pairs of one size, found 48x32 and 96x64; cut them to one crop_size"
+    )
+
+
+def test_a_pair_without_a_single_known_pixel_is_named():
+    unknown_px = np.full(PAIR_SIZE, np.nan, np.float32)
+    pairs = Listed([*samples(2), *samples(1, disparity_px=unknown_px)])
+    assert known(pairs, 1) is pairs[1]
+    assert complaint(known, pairs, 2) == (
+        "sample 2: expected at least one pixel of known disparity, found none; remove it from the dataset"
+    )
+    batches = Batches(replace(RECIPE, batch=3), pairs)
+    assert "sample 2: " in complaint(batches.__getitem__, 0)
+
+
+def test_one_known_pixel_is_enough():
+    disparity_px = np.full(PAIR_SIZE, np.nan, np.float32)
+    disparity_px[10, 20] = 0
+    (sample,) = samples(1, disparity_px=disparity_px)
+    assert known(Listed([sample]), 0) is sample
+
+
+def test_a_crop_larger_than_the_pictures_is_refused(pairs):
+    batches = Batches(replace(RECIPE, augment=False, crop_size=(64, 112)), pairs)
+    assert complaint(batches.__getitem__, 0) == (
+        "crop_size = [64, 112]: expected at most the pictures' [64, 96]; cut less"
+    )
