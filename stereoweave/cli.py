@@ -386,11 +386,11 @@ def _tell_rows(rows: "list[Row]") -> None:
 
 
 def _tell_table(title: str, rows: Sequence[Any]) -> None:
-    """Print dataclass rows as a table, under their fields' names."""
+    """Print dataclass rows as a table, under their fields' names; nothing is cut to fit a terminal."""
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
 
-    table = Table(*asdict(rows[0]), title=title)
+    table = Table(*(Column(name, overflow="fold") for name in asdict(rows[0])), title=title)
     for row in rows:
         cells = asdict(row).values()
         table.add_row(*(f"{cell:.2f}" if isinstance(cell, float) else str(cell) for cell in cells))

@@ -16,7 +16,7 @@ from stereoweave.io import read_image
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-DEMO, INSTALL, COMMANDS = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
+DEMO, INSTALL, COMMANDS, RESEARCH = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
 (PROGRAM,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 LARGEST_ENVIRONMENT_BYTES = 700e6
 
@@ -132,6 +132,24 @@ def test_the_commands_run_from_the_wheel_in_an_empty_environment(installed, pict
 def test_the_program_runs_from_the_wheel_in_an_empty_environment(installed, pictures, caches):
     run([installed / "bin" / "python", "-c", PROGRAM], pictures, NUMBA_CACHE_DIR=caches)
     assert read_image(pictures / "view.png").shape == (64, 96, 3)
+
+
+def test_two_trainings_are_resumed_and_scored_by_the_commands_for_researchers(tmp_path):
+    for name in ("quick", "quick_plain"):
+        recipe = (REPOSITORY / "recipes" / "paper" / f"{name}.toml").read_text()
+        # The same in fewer steps, of fewer pairs.
+        short = recipe.replace("steps = 400", "steps = 4").replace("every = 100", "every = 2")
+        (tmp_path / "recipes" / "paper").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "recipes" / "paper" / f"{name}.toml").write_text(short.replace("pairs = 64", "pairs = 8"))
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    run(["bash", "-ec", RESEARCH], tmp_path, PATH=path)
+    rows = {row["method"]: row for row in csv.DictReader((tmp_path / "runs" / "quick.csv").open())}
+    assert list(rows) == ["ground truth", "no warping", "sgbm", "median", "quick", "quick_plain"]
+    assert rows["quick"]["epe_px"] != rows["quick_plain"]["epe_px"]
+    finished = (tmp_path / "runs" / "quick" / "last.pt").stat().st_mtime_ns
+    # Started again with the same words, a training that is at its end has nothing left to do.
+    run(["bash", "-ec", RESEARCH.splitlines()[0]], tmp_path, PATH=path)
+    assert (tmp_path / "runs" / "quick" / "last.pt").stat().st_mtime_ns == finished
 
 
 def test_each_command_that_is_mentioned_exists(pictures):

@@ -17,6 +17,7 @@ from stereoweave.io import make_folder, replacing
 from stereoweave.learn import calibrate, checkpoint
 from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.models import CodeNetwork, network_of
+from stereoweave.learn.models.psmnet import PSMNet
 from stereoweave.learn.models.weave import WeaveNet
 from stereoweave.learn.objective import CodeObjective
 from stereoweave.learn.recipe import Recipe
@@ -82,7 +83,11 @@ class DisparityNetwork(nn.Module):
 
 
 def matcher_network(kept: Checkpoint) -> Any:
-    """The averaged network of a checkpoint, ready to match; StereoweaveError where it estimates depth."""
+    """The averaged network of a checkpoint, ready to match.
+
+    Raises:
+        StereoweaveError: It estimates depth, or is a PSMNet.
+    """
     network = network_of(kept.recipe)
     network.load_state_dict(kept.averaged)
     network.eval()
@@ -92,6 +97,11 @@ def matcher_network(kept: Checkpoint) -> Any:
         raise StereoweaveError(
             f"{kept.recipe.name}: a matcher file gives disparity, expected target = 'disparity', found "
             f"{kept.recipe.target!r}; the network needs each pair's camera"
+        )
+    if isinstance(network, PSMNet):
+        raise StereoweaveError(
+            f"{kept.recipe.name}: a matcher file serves pairs of any size, expected another network, "
+            "found psmnet, whose pooling windows depend on the size; score it by stereoweave bench networks"
         )
     return DisparityNetwork(network, kept.recipe)
 

@@ -62,8 +62,9 @@ def train_recipe(recipe: Recipe, out: Path, console: Console) -> Path:
             loss = run.step(step, batch, batches)
             if (step + 1) % recipe.validate_every == 0 or step + 1 == recipe.steps:
                 scores = run.objective.scores(run.averaged.module, held_out, run.fabric.device)
-                run.keep(step + 1, scores, last)
+                # First, because what is killed between the two then writes the same row again.
                 record(last.with_name(CURVE), step + 1, scores)
+                run.keep(step + 1, scores, last)
                 console.print(f"step {step + 1}: " + "  ".join(f"{k} {v:.4g}" for k, v in scores.items()))
             rate, began = recipe.batch / (time.perf_counter() - began), time.perf_counter()
             progress.update(task, completed=step + 1, loss=f"loss {loss:.4g}", rate=f"{rate:.1f} pairs/s")

@@ -56,15 +56,15 @@ def trials(base: Recipe, seeds: int, fitted_exponent: float) -> list[Trial]:
     return [
         *_each(seeds, base, PROJECTION, {PAPER: {}, "without": {"alpha_p": 0.0}}),
         *_each(seeds, base, NETWORKS, {"fast_depth": {}, "densemapnet": _rival("densemapnet")}),
-        *_each(1, base, NETWORKS, {"dispnet": _rival("dispnet")}),
-        *_each(1, replace(base, steps=base.steps // SHORT), NETWORKS_SHORT, every),
         *_each(seeds, base, ADJUSTMENT, {f"p = {p:g}": {"exponent": p} for p in (1.0, 1.5, 2.0, 1.25)}),
         *_each(seeds, base, ADJUSTMENT, {"p fitted": {"exponent": fitted_exponent}}),
+        *_each(1, replace(base, steps=base.steps // SHORT), NETWORKS_SHORT, every),
         *_each(seeds, base, DECODER, {PAPER: {}, "upsampled at once, no skips": {"model": "densemapnet"}}),
         *_each(1, base, DECODER, {"step-wise, no skips": {"model": "fast_depth_without_skips"}}),
         *_each(1, base, LOSS, {"l2": {}, **{loss: {"loss": loss} for loss in _other_losses(base)}}),
         *_transfer(base),
         *_each(1, base, ITERATIONS, {f"{steps} steps": {"steps": steps} for steps in FIGURE_3_STEPS}),
+        *_each(1, base, NETWORKS, {"dispnet": _rival("dispnet")}),
     ]
 
 
