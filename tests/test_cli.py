@@ -354,3 +354,131 @@ def test_help_loads_nothing_heavy():
 def test_version_is_the_package_version(capfd):
     assert run("--version") == 0
     assert capfd.readouterr().out == f"stereoweave {stereoweave.__version__}\n"
+
+
+@pytest.fixture
+def network_run(tmp_path, monkeypatch):
+    """The folder that the command runs in: a network as it begins, `run`, and two pairs held out from it."""
+    from learn_examples import checkpoint_of, keep_pairs, recipe_of, untrained
+
+    from stereoweave.learn.checkpoint import save
+    from stereoweave.learn.sources import VALIDATION_SEED
+
+    monkeypatch.chdir(tmp_path)
+    recipe = recipe_of("fast_depth")
+    Path("run").mkdir()
+    save(checkpoint_of(untrained("fast_depth"), recipe), Path("run/last.pt"))
+    for seed, count in ((recipe.seed, recipe.pairs), (VALIDATION_SEED, recipe.validation_pairs)):
+        keep_pairs(Path("pairs"), seed, count)
+    return tmp_path
+
+
+def read_rows(file):
+    with Path(file).open() as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_bench_networks_scores_a_run_beside_what_needs_no_training(network_run, capfd):
+    assert run("bench networks run -o new/rows.csv") == 0
+    rows = {row["method"]: row for row in read_rows("new/rows.csv")}
+    assert list(rows) == ["ground truth", "no warping", "sgbm", "median", "run"]
+    # A quarter of the held-out pixels is at 12 px, the others are at 4.
+    assert (float(rows["no warping"]["epe_px"]), float(rows["median"]["epe_px"])) == (6, 2)
+    assert "cpu" in rows["run"]
+    printed = capfd.readouterr().out
+    assert "Means over the held-out pairs" in printed
+    assert all(name.split()[0] in printed for name in rows)
+    # Folded where a terminal is narrow, not cut: a run is known by the end of its name.
+    assert "…" not in printed
+    assert printed.endswith("rows: new/rows.csv\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fragments"),
+    [
+        ("bench networks folder -o rows.csv", ["folder/last.pt", "no such checkpoint"]),
+        ("bench networks nowhere -o rows.csv", ["nowhere/last.pt", "no such checkpoint"]),
+        ("bench networks here here -o rows.csv", ["here", "different names"]),
+        ("bench networks folder -o taken.png", ["taken.png", "expected a file", "found a folder"]),
+        ("bench networks", ["RUN..."]),
+        ("bench speed none.toml -o rows.csv", ["none.toml", "expected a recipe"]),
+        ("bench speed words.toml -o rows.csv", ["words.toml", "expected a recipe"]),
+        ("bench paper none.toml -o runs --report report", ["none.toml", "expected a recipe"]),
+        ("bench paper low.toml -o runs --report report", ["low.toml", "exponent = 0.5", "at least 1"]),
+        (f"bench paper {RECIPE} -o runs --report report", ["weave_small", "expected 'fast_depth'"]),
+        (f"bench paper {RECIPE} -o runs", ["--report"]),
+        (f"bench paper {RECIPE} -o runs --report report --seeds 0", ["--seeds"]),
+        ("bench exponent words.toml -o runs --report report", ["words.toml", "expected a recipe"]),
+        (f"bench exponent {RECIPE} -o runs --report report --jobs 0", ["--jobs"]),
+    ],
+)
+def test_a_mistake_with_a_benchmark_of_networks_is_told_in_one_line(mistakes, capfd, arguments, fragments):
+    Path("words.toml").write_text("these are words")
+    text = (REPOSITORY / "recipes/paper/experiment.toml").read_text()
+    Path("low.toml").write_text(text.replace("exponent = 1.5", "exponent = 0.5"))
+    before = sorted(mistakes.rglob("*"))
+    assert run(arguments) == 2
+    printed, told = capfd.readouterr()
+    assert printed == ""
+    (line,) = told.splitlines()
+    assert line.startswith("stereoweave: ")
+    assert [fragment for fragment in fragments if fragment not in line] == []
+    assert sorted(mistakes.rglob("*")) == before
+
+
+def test_bench_speed_writes_a_row_a_network(tmp_path, monkeypatch, capfd):
+    from stereoweave.learn import speed
+
+    monkeypatch.chdir(tmp_path)
+    given = []
+    row = speed.SpeedRow(
+        network="densemapnet",
+        parameters=290290,
+        multiply_adds=8_410_000_000,
+        eager_ms=400.0,
+        eager_relative=1.0,
+        onnx_ms=80.0,
+        onnx_relative=1.0,
+    )
+    monkeypatch.setattr(speed, "run_times", lambda recipe: given.append(recipe.name) or [row])
+    assert run(f"bench speed {REPOSITORY}/recipes/paper/experiment.toml") == 0
+    assert given == ["experiment"]
+    (written,) = read_rows("speed.csv")
+    assert (written["network"], written["parameters"], written["eager_ms"]) == (
+        "densemapnet",
+        "290290",
+        "400",
+    )
+    assert capfd.readouterr().out.endswith("rows: speed.csv\n")
+
+
+@pytest.mark.parametrize(
+    ("command", "claims"), [("paper", None), ("exponent", ("depth adjustment",))], ids=["paper", "exponent"]
+)
+def test_the_experiment_is_planned_trained_and_reported(tmp_path, monkeypatch, capfd, command, claims):
+    from stereoweave.learn import paper, paper_report
+    from stereoweave.learn.trials import CLAIMS
+
+    monkeypatch.chdir(tmp_path)
+    done = []
+
+    def plan(base, runs, seeds, console, chosen):
+        done.append(("plan", base.name, runs, seeds, chosen))
+        return ["trials"]
+
+    monkeypatch.setattr(paper, "plan", plan)
+    monkeypatch.setattr(paper, "run_trials", lambda *given: done.append(("train", *given[:3])))
+    monkeypatch.setattr(
+        paper_report,
+        "write_report",
+        lambda base, *given: done.append(("report", base.name, *given)),
+    )
+    recipe = REPOSITORY / "recipes/paper/experiment.toml"
+    assert run(f"bench {command} {recipe} -o runs --report results --seeds 2 --jobs 4") == 0
+    runs, report = Path("runs"), Path("results")
+    assert done == [
+        ("plan", "experiment", runs, 2, claims or CLAIMS),
+        ("train", ["trials"], runs, 4),
+        ("report", "experiment", ["trials"], runs, report),
+    ]
+    assert capfd.readouterr().out == "tables: results/paper.md\n"

@@ -20,7 +20,7 @@ class PaperRow:
         prediction: Loss between codes, as the network was trained with it.
         squared_error: The same between codes without exponent, which can be compared between exponents.
         epe_px, mae_sourced, sourced_percent, mae_filled, psnr_db, ssim: See `ViewRow`.
-        minutes: Wall time of the training, beside others on the same machine.
+        minutes: Wall time of the training and of the one it started from, beside others on the same machine.
     """
 
     claim: str

@@ -72,7 +72,9 @@ def _train_all(recipes: Iterable[Recipe], runs: Path, jobs: int, console: Consol
             workers.submit(_train, recipe, runs / recipe.name, jobs): recipe.name for recipe in recipes
         }
         for done in as_completed(started):
-            done.result()
+            if error := done.exception():
+                workers.shutdown(cancel_futures=True)
+                raise error
             console.print(started[done])
 
 

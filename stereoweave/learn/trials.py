@@ -102,7 +102,7 @@ def _named(recipe: Recipe) -> Recipe:
     parts = [
         recipe.model,
         recipe.loss,
-        f"p{recipe.exponent:.4g}",
+        f"p{recipe.exponent:g}",
         f"projection{recipe.alpha_p:g}",
         f"steps{recipe.steps}",
         f"seed{recipe.seed}",
