@@ -230,6 +230,13 @@ def test_a_loss_that_is_unknown_or_another_network_s_is_refused():
         assert message == f"tiny: loss = {recipe.loss!r}, expected {expected}"
 
 
+def test_a_perceptual_loss_without_the_name_of_its_file_is_refused():
+    recipe = replace(DISPARITY, loss="perceptual")
+    message = complaint(objective_of, recipe, Constant("code", 0.5))
+    assert message.startswith("tiny: loss = 'perceptual', expected vgg16_weights, the path of torchvision's")
+    assert message.endswith("found none; it is never downloaded by itself")
+
+
 def test_a_perceptual_loss_without_its_file_is_refused(tmp_path):
     file = str(tmp_path / "vgg16.pth")
     recipe = replace(DISPARITY, loss="perceptual", vgg16_weights=file)

@@ -167,6 +167,11 @@ class CodeObjective:
 def _comparison(recipe: Recipe) -> Callable[[Map, Map], Tensor]:
     """The loss between codes, and the truth's."""
     if recipe.loss == PERCEPTUAL:
+        if not recipe.vgg16_weights:
+            raise FormatError(
+                f"{recipe.name}: loss = {PERCEPTUAL!r}, expected vgg16_weights, the path of torchvision's "
+                "vgg16-397923af.pth, found none; it is never downloaded by itself"
+            )
         return PerceptualLoss(Path(recipe.vgg16_weights))
     if recipe.loss == SMOOTH_L1:
         # Its corner is at 1 px, as published.

@@ -52,8 +52,11 @@ def train_recipe(recipe: Recipe, out: Path, console: Console) -> Path:
     last = make_folder(out) / "last.pt"
     pairs, held_out = (kept(pairs, console) for pairs in sources(recipe, out.parent / "pairs"))
     recipe = fitted(recipe, pairs)
+    start = _starting_point(recipe, last)
+    if start.step == recipe.steps:
+        return last
     logger = TensorBoardLogger(out, name="", version="")
-    run = Run(recipe, _starting_point(recipe, last), logger)
+    run = Run(recipe, start, logger)
     batches = Batches(recipe, pairs)
     with closing_curves(logger), _progress(console) as progress:
         task = progress.add_task(recipe.name, total=recipe.steps, completed=run.start.step, loss="", rate="")
@@ -205,9 +208,11 @@ def _starting_point(recipe: Recipe, last: Path) -> Checkpoint:
 
 
 def _check(recipe: Recipe) -> None:
-    """FormatError where the recipe names an unknown network, or sizes that it cannot divide."""
+    """FormatError where the recipe names an unknown network or loss, or sizes it cannot take."""
     with torch.device("meta"):
-        multiple = network_of(recipe).multiple_of
+        network = network_of(recipe)
+        objective_of(recipe, network)
+    multiple = network.multiple_of
     sizes = recipe.crop_size + (recipe.pair_size if recipe.dataset == COLLAGE else ())
     if any(side % multiple for side in sizes):
         raise FormatError(
