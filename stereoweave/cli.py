@@ -153,19 +153,27 @@ def pairs(
 
 @bench.command()
 def networks(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of stereoweave train.")],
+    runs: Annotated[
+        list[Path],
+        typer.Argument(metavar="RUN...", help="Folders of stereoweave train, or checkpoints."),
+    ],
     out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("networks.csv"),
+    pairs: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Where kept pairs are, or are made; beside the first run unless given.",
+        ),
+    ] = None,
 ) -> None:
     """Errors of trained networks on the pairs held out from them, and of the right views made with them."""
-    from stereoweave.benchmark import write_csv
+    from rich.console import Console
 
     _place_for(out)
     with _needing_the_train_extra():
         from stereoweave.learn.evaluation import evaluate
-    rows = evaluate(runs)
-    write_csv(out, rows)
-    _tell_table("Means over the held-out pairs", rows)
-    typer.echo(f"rows: {out}")
+    rows = evaluate(runs, pairs or runs[0].parent / "pairs", Console())
+    _write_and_tell(out, "Means over the held-out pairs", rows)
 
 
 @bench.command()
@@ -174,17 +182,13 @@ def speed(
     out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("speed.csv"),
 ) -> None:
     """Time of the paper's network and its rivals for a pair of 640x480, in PyTorch and in ONNX Runtime."""
-    from stereoweave.benchmark import write_csv
     from stereoweave.learn.recipe import read_recipe
 
     _place_for(out)
     read = read_recipe(recipe)
     with _needing_the_train_extra():
         from stereoweave.learn.speed import run_times
-    rows = run_times(read)
-    write_csv(out, rows)
-    _tell_table("A pair of 640x480", rows)
-    typer.echo(f"rows: {out}")
+    _write_and_tell(out, "A pair of 640x480", run_times(read))
 
 
 @bench.command()
@@ -385,6 +389,15 @@ def _tell_rows(rows: "list[Row]") -> None:
     Console().print(table)
 
 
+def _write_and_tell(out: Path, title: str, rows: Sequence[Any]) -> None:
+    """Write dataclass rows as CSV, print them as a table, and name the file."""
+    from stereoweave.benchmark import write_csv
+
+    write_csv(out, rows)
+    _tell_table(title, rows)
+    typer.echo(f"rows: {out}")
+
+
 def _tell_table(title: str, rows: Sequence[Any]) -> None:
     """Print dataclass rows as a table, under their fields' names; nothing is cut to fit a terminal."""
     from rich.console import Console
@@ -404,5 +417,5 @@ def _needing_the_train_extra() -> Iterator[None]:
     except ModuleNotFoundError as missing:
         raise StereoweaveError(
             f"this command needs PyTorch and its company, found no module {missing.name}; "
-            "pip install 'stereoweave[train]'"
+            "install the extra 'train': pip install 'stereoweave[train]', from the wheel or the copy you have"
         ) from missing

@@ -48,8 +48,8 @@ class ViewRow:
 
     Attributes:
         epe_px: End-point error over the pixels of known truth.
-        epe_cm: Mean absolute error of depth there, through each sample's camera; NaN if one has no camera,
-            infinite if a disparity is at infinity or behind it.
+        epe_cm: Mean absolute error of depth there, through each sample's camera; NaN if one has no camera.
+            Estimates are clamped as `score_views` says.
     """
 
     method: str
@@ -62,11 +62,19 @@ class ViewRow:
     ssim: float
 
 
-def score_views(methods: Mapping[str, Method], samples: Iterable[Sample]) -> list[ViewRow]:
+def score_views(
+    methods: Mapping[str, Method], samples: Iterable[Sample], max_depth_m: float | None = None
+) -> list[ViewRow]:
     """A row per method, the means over all samples, after those of three that every table has.
 
     "ground truth" is the true disparity, which has no source to give where it is unknown; "no warping" a
     disparity of 0, whose right view is the left image; "sgbm" OpenCV's matcher, its holes filled along rows.
+
+    Args:
+        methods: What gives the disparity of each further row, by its name.
+        samples: Pairs of known disparity.
+        max_depth_m: What an estimated depth is clamped to before it is compared, since one pixel at infinity
+            would make the mean infinite. None: the greatest true depth of each sample.
 
     Raises:
         StereoweaveError: A method bears one of these three names, or there is no sample.
@@ -76,7 +84,8 @@ def score_views(methods: Mapping[str, Method], samples: Iterable[Sample]) -> lis
         raise StereoweaveError(f"{min(taken)}: expected a name that the table does not use itself; rename it")
     everyone |= methods
     scores = [
-        {name: _scores(method(sample), sample) for name, method in everyone.items()} for sample in samples
+        {name: _scores(method(sample), sample, max_depth_m) for name, method in everyone.items()}
+        for sample in samples
     ]
     if not scores:
         raise StereoweaveError("samples: expected at least one, found none; is the split empty?")
@@ -95,20 +104,23 @@ def view_errors(right: UInt8[np.ndarray, "h w 3"], projected: View) -> ViewError
     )
 
 
-def _scores(disparity_px: Float[np.ndarray, "h w"], sample: Sample) -> dict[str, float]:
+def _scores(
+    disparity_px: Float[np.ndarray, "h w"], sample: Sample, max_depth_m: float | None
+) -> dict[str, float]:
     errors = view_errors(sample.right, project_right(sample.left, disparity_px))
     return {
         "epe_px": epe_px(disparity_px, sample.disparity_px),
-        "epe_cm": _epe_cm(disparity_px, sample),
+        "epe_cm": _epe_cm(disparity_px, sample, max_depth_m),
         **asdict(errors),
     }
 
 
-def _epe_cm(disparity_px: Float[np.ndarray, "h w"], sample: Sample) -> float:
+def _epe_cm(disparity_px: Float[np.ndarray, "h w"], sample: Sample, max_depth_m: float | None) -> float:
     if sample.camera is None:
         return float("nan")
-    depth_m = sample.camera.depth_m
-    return 100 * depth_error_m(depth_m(disparity_px), depth_m(sample.disparity_px))
+    truth_m = sample.camera.depth_m(sample.disparity_px)
+    farthest_m = truth_m[np.isfinite(truth_m)].max(initial=0) if max_depth_m is None else max_depth_m
+    return 100 * depth_error_m(np.minimum(sample.camera.depth_m(disparity_px), farthest_m), truth_m)
 
 
 def _means(scores: list[dict[str, float]]) -> dict[str, float]:

@@ -7,7 +7,7 @@ from learn_examples import PAIR_SIZE, box_before_a_wall, overfitted
 
 from stereoweave.io import read_image
 from stereoweave.learn import calibrate
-from stereoweave.learn.train import collated
+from stereoweave.learn.batches import collated
 
 
 @pytest.fixture

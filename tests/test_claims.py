@@ -11,9 +11,10 @@ from stereoweave.learn.claims import (
     comparisons,
     half_width,
     less_percent,
+    run_time_table,
     settings_table,
 )
-from stereoweave.learn.trials import ADJUSTMENT, NETWORKS, NETWORKS_SHORT, PAPER, PROJECTION
+from stereoweave.learn.trials import ADJUSTMENT, DECODER, NETWORKS, NETWORKS_SHORT, PAPER, PROJECTION
 
 COMPARISONS = {comparison.text: comparison for comparison in comparisons()}
 PROJECTED = "projection loss: end-point error"
@@ -82,7 +83,8 @@ def test_half_of_the_interval_is_students():
     ("less", "measured", "difference", "verdict"),
     [
         ((20, 21, 22), "21 (19 to 23)", "+1", "holds"),
-        ((-20, -21, -22), "-21 (-23 to -19)", "-41", "does not hold"),
+        ((-20, -21, -22), "-21 (-23 to -19)", "-41", "the opposite"),
+        ((10, 11, 12), "11 (9 to 13)", "-9", "better, but less than claimed"),
         ((-9, 1, 11), "1 (-24 to 26)", "-19", "undecided"),
         ((15,), "15 (one seed)", "-5", "one seed: no verdict"),
     ],
@@ -94,18 +96,46 @@ def test_a_claim_holds_where_its_whole_interval_does(less, measured, difference,
 
 def test_what_has_no_rows_is_not_run():
     lines = claims_table([]).splitlines()[2:]
-    assert len(lines) == len(COMPARISONS) == 10
+    assert len(lines) == len(COMPARISONS) == 15
     assert all(line.endswith("| not run | | |") for line in lines)
     run = [line for line in claims_table(projected(20)).splitlines()[2:] if "not run" not in line]
-    assert [line.split(" | ")[0] for line in run] == [f"| {PROJECTED}"]
+    texts = [line.split(" | ")[0] for line in run]
+    assert texts == [
+        f"| {PROJECTED}",
+        "| projection loss: loss between codes",
+        "| projection loss: MAE of the right view",
+    ]
 
 
 def test_the_depth_adjustment_is_claimed_of_loss_and_error():
     claimed = {one.measure: one.paper_percent for one in COMPARISONS.values() if one.claim == ADJUSTMENT}
-    assert claimed == {"prediction": 15, "squared_error": 15, "epe_px": 20}
+    assert claimed == {"prediction": 15, "squared_error": 15, "epe_px": 20, "mae_filled": None}
     rows = [row(ADJUSTMENT, "p = 1", epe_px=5.0), row(ADJUSTMENT, "p = 1.5", epe_px=4.0)]
     cells = line_of(claims_table(rows), "depth adjustment, p = 1.5 against 1: end-point error")
     assert cells == ["up to 20 %", "20 (one seed)", "+0", "one seed: no verdict"]
+
+
+def test_losses_in_codes_of_two_exponents_decide_nothing():
+    rows = [
+        row(ADJUSTMENT, setting, seed, prediction=loss)
+        for setting, loss in (("p = 1", 2.0), ("p = 1.5", 1.0))
+        for seed in range(3)
+    ]
+    text = (
+        "depth adjustment, p = 1.5 against 1: validation loss, each in its own code, smaller by construction"
+    )
+    assert line_of(claims_table(rows), text) == ["about 15 %", "50 (50 to 50)", "+35", "not a fair test"]
+
+
+@pytest.mark.parametrize(
+    ("less", "verdict"),
+    [((20, 21, 22), "better"), ((-9, 1, 11), "undecided"), ((-20, -21, -22), "the opposite")],
+)
+def test_what_the_paper_has_no_number_of_has_no_difference(less, verdict):
+    reference = [row(DECODER, "upsampled at once, no skips", seed, epe_px=2.0) for seed in range(3)]
+    changed = [row(DECODER, PAPER, seed, epe_px=2 * (1 - value / 100)) for seed, value in enumerate(less)]
+    cells = line_of(claims_table(reference + changed), "step-wise decoder with skips: end-point error")
+    assert (cells[0], cells[2], cells[3]) == ("-", "", verdict)
 
 
 def test_table_i_is_the_papers():
@@ -148,3 +178,25 @@ def test_the_settings_of_a_claim_are_ranked_by_the_mae_of_the_filled_view():
     assert first == (f"| {PAPER} | 2 | 2.00 ± 1.41 | 1.00000 | 7.00 | 5.00 | 1.0 | 1.00 | 1.000 | 1.0 |")
     assert second == "| without | 1 | 1.00 | 1.00000 | 9.00 | 1.00 | 1.0 | 1.00 | 1.000 | 1.0 |"
     assert header.count("|") == first.count("|")
+
+
+def test_a_single_score_is_ranked_after_the_means():
+    rows = [
+        row(PROJECTION, "without", 0, mae_filled=1.0),
+        row(PROJECTION, PAPER, 0, mae_filled=9.0),
+        row(PROJECTION, PAPER, 1, mae_filled=9.0),
+    ]
+    lines = settings_table(rows, PROJECTION).splitlines()[2:]
+    assert [line.split(" | ")[:2] for line in lines] == [[f"| {PAPER}", "2"], ["| without", "1"]]
+
+
+def test_run_times_stand_beside_the_papers():
+    numbers = {"parameters": "300", "multiply_adds": "8410000000", "eager_ms": "400", "onnx_ms": "80"}
+    rows = [
+        {"network": "psmnet", **numbers, "eager_relative": "21", "onnx_relative": "12.5"},
+        {"network": "another", **numbers, "eager_relative": "2", "onnx_relative": "3"},
+    ]
+    table = run_time_table(rows)
+    assert line_of(table, "psmnet") == ["300", "8.4", "400", "21.00", "80", "12.50", "10", "+2.50"]
+    assert line_of(table, "another")[-2:] == ["-", ""]
+    assert table.splitlines()[0].count("|") == table.splitlines()[2].count("|")

@@ -337,7 +337,7 @@ def test_training_without_pytorch_names_the_extra(tmp_path):
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "PyTorch" in done.stderr
-    assert "pip install 'stereoweave[train]'" in done.stderr
+    assert "pip install 'stereoweave[train]', from the wheel or the copy you have" in done.stderr
     assert list(tmp_path.iterdir()) == []
 
 
@@ -393,11 +393,20 @@ def test_bench_networks_scores_a_run_beside_what_needs_no_training(network_run, 
     assert printed.endswith("rows: new/rows.csv\n")
 
 
+def test_bench_networks_takes_a_checkpoint_and_pairs_from_where_it_is_told(network_run):
+    assert run("bench networks run -o beside.csv") == 0
+    Path("pairs").rename("kept")
+    Path("run/last.pt").rename("run/run.pt")
+    assert run("bench networks run/run.pt --pairs kept -o told.csv") == 0
+    assert read_rows("told.csv") == read_rows("beside.csv")
+    assert list(network_run.rglob("pairs")) == []
+
+
 @pytest.mark.parametrize(
     ("arguments", "fragments"),
     [
         ("bench networks folder -o rows.csv", ["folder/last.pt", "no such checkpoint"]),
-        ("bench networks nowhere -o rows.csv", ["nowhere/last.pt", "no such checkpoint"]),
+        ("bench networks nowhere -o rows.csv", ["nowhere: no such checkpoint"]),
         ("bench networks here here -o rows.csv", ["here", "different names"]),
         ("bench networks folder -o taken.png", ["taken.png", "expected a file", "found a folder"]),
         ("bench networks", ["RUN..."]),

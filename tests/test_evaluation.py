@@ -13,6 +13,7 @@ from learn_examples import (
     keep_pairs,
     recipe_of,
 )
+from rich.console import Console
 
 from stereoweave.learn import checkpoint
 from stereoweave.learn.batches import collated
@@ -24,6 +25,7 @@ from stereoweave.metrics import epe_px
 from stereoweave.projection import project_right
 from stereoweave.view_benchmark import view_errors
 
+QUIET = Console(quiet=True)
 PAPER = recipe_of("fast_depth", max_disparity_px=32.0, exponent=2.0)
 
 
@@ -69,11 +71,17 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def rows(folder):
-    return {row.method: row for row in evaluate([folder / name for name in KEPT])}
+    return {row.method: row for row in evaluate([folder / name for name in KEPT], folder / "pairs", QUIET)}
 
 
 def test_the_runs_follow_what_every_table_has(rows):
     assert list(rows) == ["ground truth", "no warping", "sgbm", "median", *KEPT]
+
+
+def test_a_checkpoint_is_scored_as_the_folder_of_its_run_is(folder, rows):
+    (folder / "kept.pt").write_bytes((folder / "random" / "last.pt").read_bytes())
+    *_, row = evaluate([folder / "kept.pt"], folder / "pairs", QUIET)
+    assert row == replace(rows["random"], method="kept", epe_cm=row.epe_cm)
 
 
 def test_a_disparity_that_is_the_same_everywhere_has_the_error_that_it_must(rows):
@@ -134,12 +142,12 @@ def test_the_median_is_of_what_is_known(rng):
 def test_runs_with_other_held_out_pairs_are_scored_apart(folder):
     (folder / "more").mkdir()
     checkpoint.save(kept_of(replace(PAPER, validation_pairs=3)), folder / "more" / "last.pt")
-    message = complaint(evaluate, [folder / "random", folder / "more"])
+    message = complaint(evaluate, [folder / "random", folder / "more"], folder / "pairs", QUIET)
     assert message.startswith("more: expected the pairs of random, (")
     assert message.endswith("; score it apart")
 
 
 @pytest.mark.parametrize("other", ["elsewhere/random", "median"])
 def test_two_rows_of_one_name_are_refused(folder, other):
-    message = complaint(evaluate, [folder / "random", folder / other])
+    message = complaint(evaluate, [folder / "random", folder / other], folder / "pairs", QUIET)
     assert message.startswith(f"{other.split('/')[-1]}: expected run folders of different names")

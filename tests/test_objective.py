@@ -195,9 +195,15 @@ def test_a_depth_of_just_the_greatest_passes_and_one_beyond_is_refused():
     assert message.startswith("depth: expected more than 0 and at most 6.0 m, NaN where unknown, found 6.06")
 
 
-def test_a_disparity_beyond_the_greatest_is_refused():
-    message = complaint(losses_of, DISPARITY, Constant("code", 0.5), batch_of([[2.0, 4.5, 0.0]]))
-    assert message.startswith("disparity: expected 0 to 4.0 px, NaN where unknown, found 4.5")
+def test_a_disparity_beyond_the_greatest_counts_as_unknown():
+    some, known = batch_of([[2.0, 4.5, 0.0]]), batch_of([[2.0, torch.nan, 0.0]])
+    losses = losses_of(DISPARITY, Constant("code", 0.5), some)
+    assert losses["prediction"] == losses_of(DISPARITY, Constant("code", 0.5), known)["prediction"]
+
+
+def test_a_disparity_below_0_is_refused():
+    message = complaint(losses_of, DISPARITY, Constant("code", 0.5), batch_of([[2.0, -0.5, 0.0]]))
+    assert message.startswith("disparity: expected 0 to 4.0 px, NaN where unknown, found -0.5")
 
 
 def test_depth_without_a_camera_is_refused():

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from learn_examples import RECIPE, box_before_a_wall, complaint, keep_pairs, recipe_of
+import torch
+from learn_examples import box_before_a_wall, complaint, keep_pairs, recipe_of
 from rich.console import Console
 
 from stereoweave.io import read_image
@@ -19,6 +20,7 @@ from stereoweave.learn.sources import VALIDATION_SEED
 from stereoweave.learn.train import CURVE, Run, read_record
 from stereoweave.learn.trials import (
     ADJUSTMENT,
+    FITTED,
     ITERATIONS,
     NETWORKS,
     PAPER,
@@ -122,7 +124,7 @@ def fitted_name():
     """Three quarters of the training truth are at 12 px, and a quarter at 14 px, of 16 px."""
     counts = np.zeros(256)
     counts[256 * 12 // 16], counts[256 * 14 // 16] = 3, 1
-    return f"fast_depth-l2-p{fit_exponent(counts):.4g}-projection1-steps4-seed0"
+    return f"fast_depth-l2-p{fit_exponent(counts):g}-projection1-steps4-seed0"
 
 
 def rows_of(experiment):
@@ -136,15 +138,22 @@ def test_a_plan_has_the_trials_of_its_claims_and_makes_no_pair_twice(experiment)
 
 
 def test_the_exponent_is_fitted_to_the_training_truth(experiment):
-    (trial,) = (trial for trial in experiment.planned if trial.setting == "p fitted")
+    (trial,) = (trial for trial in experiment.planned if trial.setting.endswith(FITTED))
     assert trial.recipe.name == fitted_name()
     assert not trial.recipe.fit_exponent
 
 
-def test_a_plan_starts_from_the_papers_network(tmp_path):
-    assert complaint(plan, RECIPE, tmp_path, 1, QUIET) == (
-        "tiny: model = 'weave', expected 'fast_depth', which the others are compared with"
-    )
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"model": "weave"}, "model = 'weave', expected 'fast_depth', which the experiment starts from"),
+        ({"dataset": "driving"}, "dataset = 'driving', expected 'collage', which the experiment starts from"),
+        ({"target": "depth"}, "target = 'depth', expected 'disparity', which the experiment starts from"),
+        ({"steps": 3}, "steps = 3, expected at least 4: some trainings have a quarter of them"),
+    ],
+)
+def test_a_plan_starts_from_the_papers_network_on_collages(tmp_path, changes, words):
+    assert complaint(plan, replace(BASE, **changes), tmp_path, 1, QUIET) == f"base: {words}"
     assert list(tmp_path.iterdir()) == []
 
 
@@ -181,7 +190,8 @@ def test_the_tables_name_what_was_not_run(experiment):
     names.add("fast_depth-l2-p1.25-projection1-steps4-seed0")
     assert not_run == [word for name in sorted(names) for word in ("-", name)]
     assert "against dispnet: end-point error | " in text
-    assert text.count("| not run | | |") == 4
+    # Against DispNet and PSMNet two each, and the decoder.
+    assert text.count("| not run | | |") == 6
     assert [line for line in text.splitlines() if line.startswith("| no warping | 6.00 | ")]
     assert "## Transfer" not in text
     for claim in CLAIMS:
@@ -258,20 +268,82 @@ def test_a_tuned_trial_starts_from_a_run_below_the_folder_of_the_runs():
     assert paper._below(tuned, Path("runs")).recipe.start_from == f"runs/{FIRST}/last.pt"
 
 
+def report_of(trained, curves):
+    return Report(
+        base=BASE,
+        planned=trained,
+        trained=trained,
+        missing=[],
+        kept={},
+        curves=curves,
+        rows=[],
+        common=[],
+    )
+
+
 def transfer_of(scratch, tuned):
     """What the report says of two trainings with these (step, loss)."""
     trained = [trial for trial in trials(BASE, 1, 1.37) if trial.claim == TRANSFER]
     curves = [[{"step": step, "loss": loss} for step, loss in curve] for curve in (scratch, tuned)]
     named = {trial.recipe.name: curve for trial, curve in zip(trained, curves, strict=True)}
-    report = Report(base=BASE, trained=trained, missing=[], kept={}, curves=named, rows=[], common=[])
+    report = report_of(trained, named)
     return paper_report._transfer(report), paper_report._transfer(replace(report, trained=trained[:1]))
 
 
 def test_transfer_counts_the_steps_to_the_best_loss_from_scratch():
     scratch = [(2.0, 0.5), (4.0, 0.25), (6.0, 0.375)]
     found, alone = transfer_of(scratch, [(2.0, 0.25), (4.0, 0.125), (6.0, 0.125)])
-    assert "0.25000, the best from scratch (after 4 steps)" in found
-    assert "reached from the synthetic checkpoint after 2 steps" in found
+    assert found == (
+        "The reference is the best validation loss from scratch: 0.25000, after 4 steps. "
+        "From the synthetic checkpoint it is reached after 2 steps. One seed; scores are 2 steps apart."
+    )
     assert alone == ""
     never, _ = transfer_of(scratch, [(2.0, 0.5), (4.0, 0.5), (6.0, 0.5)])
-    assert "reached from the synthetic checkpoint after more than 6 steps" in never
+    assert "it is never reached: the run ended at 6 steps. " in never
+
+
+def test_a_fitted_exponent_that_was_planned_anyway_is_named_and_drawn_once():
+    planned = [trial for trial in trials(BASE, 2, 1.5) if trial.claim == ADJUSTMENT]
+    assert paper_report._fitted(planned) == (
+        "Fitted to the histogram of the training truth, p is 1.5, which is p = 1.5: "
+        "both rows are the same trainings."
+    )
+    assert paper_report._fitted(trials(BASE, 1, 1.3742)) == (
+        "Fitted to the histogram of the training truth, p is 1.374."
+    )
+    curves = {trial.recipe.name: [{"step": 2.0, "squared_error": 0.5}] for trial in planned}
+    drawn = paper_report._by_setting(report_of(planned, curves), ADJUSTMENT)
+    assert drawn == dict.fromkeys(("p = 1", "p = 1.25", "p = 1.5", "p = 2"), [[(2, 0.5)]] * 2)
+
+
+def test_run_times_beside_the_report_join_it(experiment, tmp_path):
+    header = "network,parameters,multiply_adds,eager_ms,eager_relative,onnx_ms,onnx_relative\n"
+    speed = tmp_path / "speed.csv"
+    speed.write_text(header + "fast_depth,300,9000000000,420,1.1,90,1.25\n")
+    write_report(BASE, experiment.of(EARLY), experiment.runs, tmp_path)
+    text = (tmp_path / "paper.md").read_text()
+    assert "| fast_depth | 300 | 9.0 | 420 | 1.10 | 90 | 1.25 | 1.05 | +0.20 |" in text
+    assert "## Run time" not in (experiment.out / "paper.md").read_text()
+    speed.write_text("network\nfast_depth\n")
+    words = complaint(write_report, BASE, experiment.of(EARLY), experiment.runs, tmp_path)
+    assert words == (
+        f"{speed}: expected the rows of `stereoweave bench speed`, found 'onnx_relative'; "
+        "write it anew or remove it"
+    )
+
+
+def test_a_report_of_nothing_is_refused(tmp_path):
+    out = tmp_path / "report"
+    planned = trials(BASE, 1, 1.37)
+    names = {trial.recipe.name for trial in planned}
+    assert complaint(write_report, BASE, planned, tmp_path / "runs", out) == (
+        f"{tmp_path}/runs: expected a trial trained to its end, found none of {len(names)}; "
+        "`stereoweave bench paper` goes on with them"
+    )
+    assert not out.exists()
+
+
+def test_the_head_says_what_is_not_the_papers(experiment):
+    text = (experiment.out / "paper.md").read_text().split("## The claims")[0]
+    for words in ("averaged over about 1 steps", "clipped at norm 5", torch.__version__, "± is the standard"):
+        assert words in text

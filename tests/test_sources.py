@@ -67,11 +67,16 @@ def test_a_frame_is_read_when_it_is_asked_for(recipe, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("count", "chosen"), [(1, [36]), (2, [36, 38]), (3, [36, 37, 38]), (4, [36, 37, 38, 39])]
+    ("count", "chosen"), [(1, [36]), (2, [36, 39]), (3, [36, 38, 39]), (4, [36, 37, 38, 39])]
 )
 def test_validation_pairs_are_spread_over_the_held_out_frames(recipe, tmp_path, count, chosen):
     _, held_out = sources(replace(recipe, validation_pairs=count), tmp_path)
     assert names(held_out) == [FRAMES[number] for number in chosen]
+
+
+def test_all_held_out_frames_are_given_where_all_are_asked_for(recipe, tmp_path):
+    _, held_out = sources(replace(recipe, validation_pairs=1), tmp_path, whole=True)
+    assert names(held_out) == FRAMES[36:]
 
 
 def test_an_unknown_dataset_is_answered_with_the_known_ones(recipe, tmp_path):

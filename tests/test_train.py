@@ -1,5 +1,6 @@
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from dataset_examples import write_map, write_picture
 from learn_examples import (
     CAMERA,
     PAIR_SIZE,
@@ -167,11 +169,43 @@ def test_a_loss_that_is_not_finite_stops_and_names_the_pairs(folder, tmp_path):
     checkpoint.save(checkpoint_of(broken), tmp_path / "broken.pt")
     recipe = replace(RECIPE, name="broken", start_from=str(tmp_path / "broken.pt"))
     file = write(recipe, tmp_path / "broken.toml")
-    chosen = Batches(recipe, KeptPairs(folder / "pairs", recipe.seed, recipe.pairs, PAIR_SIZE)).chosen(0)
+    pairs = KeptPairs(folder / "pairs", recipe.seed, recipe.pairs, PAIR_SIZE)
+    names = ", ".join(pairs.name(index) for index in Batches(recipe, pairs).chosen(0))
     with pytest.raises(StereoweaveError) as caught:
         train(file, folder / "broken", QUIET)
-    assert str(caught.value) == f"step 0: the loss is nan; its pairs are {chosen} of seed {recipe.seed}"
+    assert str(caught.value) == f"step 0: the loss is nan; its pairs are {names}"
     assert not (folder / "broken" / "last.pt").exists()
+
+
+def test_a_pair_that_cannot_be_trained_on_is_named_in_one_line(tmp_path):
+    """Although it is read in a process beside, where PyTorch would put a traceback before the words."""
+    for frame in ("a", "b"):
+        for side in ("left", "right"):
+            write_picture(tmp_path / "set" / side / f"{frame}.png", 7)
+        # No depth is known.
+        write_map(tmp_path / "set" / "depth" / f"{frame}.png", [0], 0, np.uint16)
+    (tmp_path / "set" / "calib.txt").write_text(
+        "cam0=[300 0 19.5; 0 300 15.5; 0 0 1]\ndoffs=0\nbaseline=100\nwidth=40\nheight=32\n"
+    )
+    changes = {"dataset": "paper", "root": str(tmp_path / "set"), "crop_size": (32, 32), "batch": 1}
+    file = write(recipe_of("fast_depth", **changes), tmp_path / "unknown.toml")
+    message = complaint(train, file, tmp_path / "run", QUIET)
+    assert re.fullmatch(r"[ab]: expected at least one pixel of known disparity, found none; .*", message)
+
+
+def test_a_truth_out_of_range_is_named_with_the_pairs_of_its_step(tmp_path, logger):
+    recipe = recipe_of("fast_depth", target="depth", max_depth_m=1.0)
+    run = Run(recipe, training._starting_point(recipe, tmp_path / "last.pt"), logger)
+    batches = Batches(recipe, CAMERA_PAIRS)
+    message = complaint(run.step, 0, batches[0], batches)
+    assert message.startswith(f"step 0: one of {', '.join(batches.names(0))}: depth: expected more than 0")
+
+
+def test_weights_of_another_network_are_refused_as_a_start(finished, tmp_path):
+    recipe = recipe_of("fast_depth", start_from=str(finished))
+    assert complaint(training._starting_point, recipe, tmp_path / "last.pt") == (
+        f"tiny: start_from = {str(finished)!r}, expected a checkpoint of fast_depth, found one of weave"
+    )
 
 
 def test_a_gradient_that_is_not_finite_stops_before_it_reaches_the_weights(tmp_path, logger):
@@ -183,7 +217,7 @@ def test_a_gradient_that_is_not_finite_stops_before_it_reaches_the_weights(tmp_p
     network.head.to_code.bias.register_hook(lambda gradient: gradient * torch.inf)
     batches = Batches(recipe, CAMERA_PAIRS)
     assert complaint(run.step, 7, batches[7], batches) == (
-        f"step 7: the norm of the gradient is inf; its pairs are {batches.chosen(7)} of seed 0"
+        f"step 7: the norm of the gradient is inf; its pairs are {', '.join(batches.names(7))}"
     )
     for value, earlier in zip(network.parameters(), before, strict=True):
         assert torch.equal(value, earlier)

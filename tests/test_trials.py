@@ -42,7 +42,7 @@ DIFFERENCES = {
     (ADJUSTMENT, "p = 1.25"): {"exponent": 1.25},
     (ADJUSTMENT, "p = 1.5"): {},
     (ADJUSTMENT, "p = 2"): {"exponent": 2.0},
-    (ADJUSTMENT, "p fitted"): {"exponent": 1.37},
+    (ADJUSTMENT, "p = 1.37 (fitted)"): {"exponent": 1.37},
     (DECODER, PAPER): {},
     (DECODER, "step-wise, no skips"): {"model": "fast_depth_without_skips"},
     (DECODER, "upsampled at once, no skips"): {"model": "densemapnet"},
@@ -97,6 +97,10 @@ def test_a_name_stands_for_one_recipe_and_a_recipe_has_one_name(fitted):
 def test_the_papers_recipe_is_trained_once_for_five_claims():
     claims = [trial.claim for trial in trials(BASE, 1, 1.37) if trial.recipe.name == FIRST]
     assert claims == [PROJECTION, NETWORKS, ADJUSTMENT, DECODER, LOSS]
+
+
+def test_a_base_that_fits_its_exponent_does_not_make_the_others_fit():
+    assert trials(replace(BASE, fit_exponent=True), 1, 1.37) == trials(BASE, 1, 1.37)
 
 
 def test_the_perceptual_loss_waits_for_its_file():

@@ -109,11 +109,41 @@ def test_rows_are_means_over_the_samples_in_order_of_the_methods(rng):
 def test_depth_errors_are_in_centimetres_through_each_sample_s_own_camera(rng):
     near = StereoCamera(focal_px=100, baseline_m=0.2, cx_px=50, cy_px=16)
     far = replace(near, baseline_m=0.4)
-    rows = by_method(score_views({"five": constant(5)}, [shifted(rng, 10, near), shifted(rng, 8, far)]))
+    samples = [shifted(rng, 10, near), shifted(rng, 8, far)]
+    rows = by_method(score_views({"five": constant(5)}, samples, max_depth_m=15))
     # 20 / 5 in place of 20 / 10 is 2 m off; 40 / 5 in place of 40 / 8 is 3 m off.
     assert rows["five"].epe_cm == pytest.approx(250)
     assert rows["ground truth"].epe_cm == 0
-    assert rows["no warping"].epe_cm == np.inf
+
+
+@pytest.mark.parametrize(("max_depth_m", "farthest_m"), [(None, 6), (10.0, 10), (6.5, 6.5)])
+def test_depth_at_infinity_or_behind_it_counts_as_the_farthest_that_can_be(rng, max_depth_m, farthest_m):
+    # Of 24 px m, the box of 12 px is 2 m away and the wall of 4 px is 6 m away.
+    camera = StereoCamera(focal_px=100, baseline_m=0.24, cx_px=48, cy_px=32)
+    sample = replace(box_before_a_wall(rng), camera=camera)
+    methods = {"behind": constant(-1), "box": constant(12)}
+    rows = by_method(score_views(methods, [sample], max_depth_m))
+    # The box fills a quarter of the left view.
+    expected_cm = 25 * (farthest_m - 2) + 75 * (farthest_m - 6)
+    assert rows["no warping"].epe_cm == rows["behind"].epe_cm == pytest.approx(expected_cm)
+    assert rows["box"].epe_cm == pytest.approx(75 * 4)
+
+
+def test_the_farthest_depth_is_each_sample_s_own_and_what_is_unknown_has_none(rng):
+    camera = StereoCamera(focal_px=100, baseline_m=0.2, cx_px=50, cy_px=16)
+    half = np.full((32, 100), 10, np.float32)
+    half[:8], half[8:16] = np.nan, 0
+    partly = replace(shifted(rng, 10, camera), disparity_px=half)
+    rows = by_method(score_views({"near": constant(20)}, [partly, shifted(rng, 4, camera)]))
+    # At 2 m and at 5 m the walls are the farthest there is; 1 m is 1 m and 4 m before them.
+    assert rows["no warping"].epe_cm == 0
+    assert rows["near"].epe_cm == pytest.approx(250)
+
+
+def test_without_any_known_truth_there_is_no_error_in_centimetres(rng):
+    camera = StereoCamera(focal_px=100, baseline_m=0.2, cx_px=50, cy_px=16)
+    unknown = replace(shifted(rng, 7, camera), disparity_px=np.full((32, 100), np.nan, np.float32))
+    assert np.isnan(by_method(score_views({}, [unknown]))["no warping"].epe_cm)
 
 
 def test_without_a_camera_there_is_no_error_in_centimetres(rng):
@@ -148,4 +178,4 @@ def test_the_csv_has_a_column_for_each_number_beside_the_machine(tmp_path, rng):
         *("method", "epe_px", "epe_cm", "mae_sourced", "sourced_percent", "mae_filled", "psnr_db", "ssim"),
         *("cpu", "cores", "opencv"),
     ]
-    assert (first["method"], first["epe_cm"], first["sourced_percent"]) == ("ground truth", "nan", "93.0000")
+    assert (first["method"], first["epe_cm"], first["sourced_percent"]) == ("ground truth", "nan", "93")

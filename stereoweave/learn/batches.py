@@ -29,6 +29,10 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
         places = range(step * self.recipe.batch, (step + 1) * self.recipe.batch)
         return [int(self._order(place // count)[place % count]) for place in places]
 
+    def names(self, step: int) -> list[str]:
+        """What errors call the pairs of a step."""
+        return [self.pairs.name(index) for index in self.chosen(step)]
+
     def _order(self, epoch: int) -> np.ndarray:
         return np.random.default_rng((self.recipe.seed, epoch, 1)).permutation(self.pairs.count)
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
+from rich.console import Console
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn import checkpoint
@@ -14,7 +15,7 @@ from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.models import CodeNetwork, network_of
 from stereoweave.learn.objective import CodeObjective
 from stereoweave.learn.recipe import Recipe
-from stereoweave.learn.sources import Source, sources
+from stereoweave.learn.sources import Source, kept, sources
 from stereoweave.stereo import Sample
 from stereoweave.view_benchmark import Method, ViewRow, score_views
 
@@ -23,29 +24,35 @@ MEDIAN = "median"
 _MEDIAN_PAIRS, _MEDIAN_STRIDE = 400, 8
 
 
-def evaluate(runs: Sequence[Path]) -> list[ViewRow]:
-    """A row per run on the pairs held out from it, after ground truth, no warping, SGBM and the median.
+def evaluate(runs: Sequence[Path], folder: Path, console: Console) -> list[ViewRow]:
+    """A row per run on all pairs held out from it, after ground truth, no warping, SGBM and the median.
 
     "median" predicts the median disparity of the training pairs everywhere: what a network that looks at
     nothing can reach.
 
     Args:
-        runs: Folders of `stereoweave train`, all with the same held-out pairs.
+        runs: Folders of `stereoweave train`, or checkpoints, all with the same held-out pairs.
+        folder: Where collage pairs are kept; missing ones are made.
+        console: Where that is told.
 
     Raises:
         StereoweaveError: The runs do not share their held-out pairs, or two rows would bear one name.
     """
-    _check_names([run.name for run in runs])
-    kept = {run.name: checkpoint.load(run / "last.pt") for run in runs}
-    training, held_out = sources(_common(kept), runs[0].parent / "pairs")
-    methods = {MEDIAN: median_method(training), **{name: method_of(one) for name, one in kept.items()}}
-    return score_views(methods, (known(held_out, index) for index in range(held_out.count)))
+    names = [run.name if run.is_dir() else run.stem for run in runs]
+    _check_names(names)
+    files = [run / "last.pt" if run.is_dir() else run for run in runs]
+    networks = {name: checkpoint.load(file) for name, file in zip(names, files, strict=True)}
+    recipe = _common(networks)
+    training, held_out = (kept(pairs, console) for pairs in sources(recipe, folder, whole=True))
+    methods = {MEDIAN: median_method(training), **{name: method_of(one) for name, one in networks.items()}}
+    samples = (known(held_out, index) for index in range(held_out.count))
+    return score_views(methods, samples, recipe.max_depth_m if recipe.target == "depth" else None)
 
 
-def method_of(kept: Checkpoint) -> Method:
+def method_of(trained: Checkpoint) -> Method:
     """The averaged network of a checkpoint as a function from a sample to its left view's disparity in px."""
-    network = network_of(kept.recipe)
-    network.load_state_dict(kept.averaged)
+    network = network_of(trained.recipe)
+    network.load_state_dict(trained.averaged)
     network.eval()
 
     def match(sample: Sample) -> Float[np.ndarray, "h w"]:
@@ -57,7 +64,7 @@ def method_of(kept: Checkpoint) -> Method:
             return output[0][0, 0].numpy()
 
     if isinstance(network, CodeNetwork):
-        objective = CodeObjective(kept.recipe, network)
+        objective = CodeObjective(trained.recipe, network)
     return match
 
 
@@ -77,16 +84,16 @@ def _check_names(names: Sequence[str]) -> None:
         )
 
 
-def _common(kept: dict[str, Checkpoint]) -> Recipe:
+def _common(networks: dict[str, Checkpoint]) -> Recipe:
     """The recipe of the first run, whose held-out pairs the others have to share."""
-    pairs = {name: held_out_of(one.recipe) for name, one in kept.items()}
+    pairs = {name: held_out_of(one.recipe) for name, one in networks.items()}
     first, *others = pairs
     for name in others:
         if pairs[name] != pairs[first]:
             raise StereoweaveError(
                 f"{name}: expected the pairs of {first}, {pairs[first]}, found {pairs[name]}; score it apart"
             )
-    return kept[first].recipe
+    return networks[first].recipe
 
 
 def held_out_of(recipe: Recipe) -> tuple[object, ...]:

@@ -53,18 +53,19 @@ def draw_exponent_curves(
 
 
 def draw_validation(path: str | Path, curves: Mapping[str, Sequence[Sequence[tuple[int, float]]]]) -> None:
-    """Write Fig. 2, right: validation loss against steps; thin lines are seeds, bold ones their mean.
+    """Write Fig. 2, right: error on held-out pairs against steps; thin lines are seeds, bold ones their mean.
 
     Args:
         path: The picture's file.
-        curves: For each setting a list of (step, loss) per seed. The mean is over the steps that all have.
+        curves: For each setting a list of (step, squared error of the straight code) per seed. The mean is
+            over the steps that all have.
     """
     figure, axes = _plot()
     for (setting, seeds), colour in zip(curves.items(), _colours(len(curves)), strict=True):
         for seed in seeds:
             axes.plot(*zip(*seed, strict=True), color=colour, linewidth=0.8, alpha=0.4)
         axes.plot(*_mean_curve(seeds), color=colour, linewidth=2.5, label=setting)
-    axes.set(yscale="log", xlabel="training step", ylabel="validation loss")
+    axes.set(yscale="log", xlabel="training step", ylabel="validation: squared error of the straight code")
     # Matplotlib labels whole decades, of which a loss may cross none.
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
     axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))

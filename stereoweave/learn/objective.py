@@ -1,6 +1,7 @@
 """What a recipe minimises and how its network is scored: WeaveNet's own way, or the paper's."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -126,7 +127,10 @@ class CodeObjective:
         between exponents.
         """
         network.eval()
-        rows = [self._scores_of(network, known(pairs, index), device) for index in range(pairs.count)]
+        rows = []
+        for index in range(pairs.count):
+            with naming(pairs.name(index)):
+                rows.append(self._scores_of(network, known(pairs, index), device))
         return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
     def _terms(self, output: Map, code_truth: Map, batch: Batch) -> dict[str, Tensor]:
@@ -174,7 +178,7 @@ def _comparison(recipe: Recipe) -> Callable[[Map, Map], Tensor]:
             )
         return PerceptualLoss(Path(recipe.vgg16_weights))
     if recipe.loss == SMOOTH_L1:
-        # Its corner is at 1 px, as published.
+        # Of straight codes of disparity the corner is at 1 px, as published.
         return partial(smooth_l1_loss, beta=1 / recipe.max_disparity_px)
     return CODE_LOSSES[recipe.loss]
 
@@ -198,16 +202,21 @@ def truth_histogram(recipe: Recipe, pairs: Source) -> Float[np.ndarray, " n"]:
     straight = curve_of(replace(recipe, exponent=1.0))
     counts = np.zeros(_FITTED_BINS)
     for index in range(0, pairs.count, max(1, pairs.count // _FITTED_PAIRS)):
-        code = _array(straight.encode(truth_of(recipe, collated([known(pairs, index)]))))
+        with naming(pairs.name(index)):
+            code = _array(straight.encode(truth_of(recipe, collated([known(pairs, index)]))))
         counts += np.histogram(code[np.isfinite(code)], _FITTED_BINS, (0, 1))[0]
     return counts
 
 
 def truth_of(recipe: Recipe, batch: Batch) -> Map:
-    """The left views' truth as what the code stands for, disparity in px or depth in m; NaN where unknown."""
+    """The left views' truth as what the code stands for, disparity in px or depth in m; NaN where unknown.
+
+    Disparity above max_disparity_px counts as unknown, as PSMNet's authors have it; depth beyond max_depth_m
+    does not.
+    """
     disparity_px = batch["disparity_px"][: len(batch["left"])]
     if recipe.target == "disparity":
-        return disparity_px
+        return disparity_px.where(disparity_px <= recipe.max_disparity_px, torch.nan)
     if "focal_baseline_px_m" not in batch:
         raise StereoweaveError(
             f"{recipe.name}: target = 'depth', expected pairs with a camera, found dataset = "
@@ -216,6 +225,16 @@ def truth_of(recipe: Recipe, batch: Batch) -> Map:
     depth_m = batch["focal_baseline_px_m"] / (disparity_px + batch["doffs_px"])
     # A depth of just max_depth_m, kept as disparity, comes back a rounding error farther.
     return depth_m.where(depth_m > 1.0001 * recipe.max_depth_m, depth_m.clamp(max=recipe.max_depth_m))
+
+
+@contextmanager
+def naming(what: str) -> Iterator[None]:
+    """Says in an error which pair or pairs it is about, where it does not yet."""
+    try:
+        yield
+    except StereoweaveError as error:
+        words = str(error)
+        raise StereoweaveError(words if words.startswith(what) else f"{what}: {words}") from error
 
 
 def _array(values: Map) -> Float[np.ndarray, "h w"]:

@@ -12,10 +12,10 @@ from rich.console import Console
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn.objective import fitted
-from stereoweave.learn.recipe import Recipe
-from stereoweave.learn.sources import sources
-from stereoweave.learn.train import kept, train_recipe
-from stereoweave.learn.trials import CLAIMS, Trial, trials
+from stereoweave.learn.recipe import COLLAGE, Recipe
+from stereoweave.learn.sources import kept, sources
+from stereoweave.learn.train import train_recipe
+from stereoweave.learn.trials import CLAIMS, SHORT, Trial, trials
 
 
 def plan(
@@ -31,12 +31,9 @@ def plan(
         claims: Names in CLAIMS.
 
     Raises:
-        StereoweaveError: The base is not of the paper's network.
+        StereoweaveError: The base is not of the paper's network, collages and disparity, or too short.
     """
-    if base.model != "fast_depth":
-        raise StereoweaveError(
-            f"{base.name}: model = {base.model!r}, expected 'fast_depth', which the others are compared with"
-        )
+    _check(base)
     training, _ = (kept(pairs, console) for pairs in sources(base, runs / "pairs"))
     exponent = fitted(replace(base, fit_exponent=True), training).exponent
     planned = [_below(trial, runs) for trial in trials(base, seeds, exponent) if trial.claim in claims]
@@ -59,6 +56,19 @@ def run_trials(planned: Iterable[Trial], runs: Path, jobs: int, console: Console
     # What starts from another training comes when that one is there.
     _train_all([recipe for recipe in recipes if not recipe.start_from], runs, jobs, console)
     _train_all([recipe for recipe in recipes if recipe.start_from], runs, jobs, console)
+
+
+def _check(base: Recipe) -> None:
+    for key, expected in {"model": "fast_depth", "dataset": COLLAGE, "target": "disparity"}.items():
+        if (found := getattr(base, key)) != expected:
+            raise StereoweaveError(
+                f"{base.name}: {key} = {found!r}, expected {expected!r}, which the experiment starts from"
+            )
+    if base.steps < SHORT:
+        raise StereoweaveError(
+            f"{base.name}: steps = {base.steps}, expected at least {SHORT}: "
+            "some trainings have a quarter of them"
+        )
 
 
 def _below(trial: Trial, runs: Path) -> Trial:

@@ -1,14 +1,19 @@
 """The report of the paper's experiment: rows as CSV, tables as Markdown, and the paper's figures."""
 
+import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+from rich.console import Console
+
 from stereoweave.benchmark import write_csv
+from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io import make_folder, replacing
 from stereoweave.learn import checkpoint
 from stereoweave.learn.checkpoint import Checkpoint
-from stereoweave.learn.claims import PaperRow, claims_table, settings_table
+from stereoweave.learn.claims import PaperRow, claims_table, run_time_table, settings_table
 from stereoweave.learn.evaluation import evaluate, held_out_of, method_of
 from stereoweave.learn.figures import draw_exponent_curves, draw_iterations, draw_validation, draw_views
 from stereoweave.learn.objective import truth_histogram
@@ -17,6 +22,7 @@ from stereoweave.learn.sources import sources
 from stereoweave.learn.train import CURVE, read_record
 from stereoweave.learn.trials import (
     ADJUSTMENT,
+    FITTED,
     ITERATIONS,
     NETWORKS,
     PROJECTION,
@@ -29,6 +35,8 @@ from stereoweave.view_benchmark import Method, ViewRow
 
 # Held-out pairs that the figures show, counted round where there are fewer.
 SHOWN = (3, 11, 24)
+# In the report's folder, where `stereoweave bench speed` wrote it there.
+SPEED = "speed.csv"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,8 +44,9 @@ class Report:
     """What the tables and figures are made of.
 
     Attributes:
-        trained: The trials that are trained to their end.
-        missing: The names of the other trials' recipes.
+        planned: All trials.
+        trained: Those that are trained to their end.
+        missing: The names of the others' recipes.
         kept: The checkpoints of the trained ones by their recipe's name.
         curves: Their scores by step.
         rows: A row for each of them.
@@ -45,6 +54,7 @@ class Report:
     """
 
     base: Recipe
+    planned: list[Trial]
     trained: list[Trial]
     missing: list[str]
     kept: dict[str, Checkpoint]
@@ -60,13 +70,17 @@ def write_report(base: Recipe, planned: Sequence[Trial], runs: Path, out: Path) 
         base: The recipe that the trials start from.
         planned: All trials; paper.md names those that are not trained to their end.
         runs: The folder of their runs.
-        out: The folder to write into.
+        out: The folder to write into; run times that lie in it, as speed.csv, join paper.md.
+
+    Raises:
+        StereoweaveError: No trial is trained to its end.
     """
-    make_folder(out)
+    run_time = _run_time(out / SPEED)
     report = _gathered(base, planned, runs)
+    make_folder(out)
     write_csv(out / "paper.csv", report.rows)
     with replacing(out / "paper.md") as temporary:
-        temporary.write_text(_markdown(report), encoding="utf-8")
+        temporary.write_text(_markdown(report, run_time), encoding="utf-8")
     _draw(report, runs, out)
 
 
@@ -74,10 +88,16 @@ def _gathered(base: Recipe, planned: Sequence[Trial], runs: Path) -> Report:
     files = {trial.recipe.name: runs / trial.recipe.name / "last.pt" for trial in planned}
     kept = {name: checkpoint.load(file) for name, file in files.items() if file.exists()}
     trained = [trial for trial in planned if _finished(trial, kept)]
+    if not trained:
+        raise StereoweaveError(
+            f"{runs}: expected a trial trained to its end, found none of {len(files)}; "
+            "`stereoweave bench paper` goes on with them"
+        )
     scores, common = _scores([base, *(trial.recipe for trial in trained)], runs)
     names = {trial.recipe.name for trial in trained}
     return Report(
         base=base,
+        planned=list(planned),
         trained=trained,
         missing=sorted(files.keys() - names),
         kept={name: kept[name] for name in names},
@@ -99,7 +119,8 @@ def _scores(recipes: Sequence[Recipe], runs: Path) -> tuple[dict[str, ViewRow], 
     common: list[ViewRow] = []
     for pairs in dict.fromkeys(held_out_of(recipe) for recipe in others):
         names = list(dict.fromkeys(recipe.name for recipe in others if held_out_of(recipe) == pairs))
-        found = evaluate([runs / name for name in names])
+        # Quiet, because the plan has made the pairs.
+        found = evaluate([runs / name for name in names], runs / "pairs", Console(quiet=True))
         scores |= {row.method: row for row in found if row.method in names}
         if pairs == held_out_of(base):
             common = [row for row in found if row.method not in names]
@@ -132,27 +153,69 @@ def _row(trial: Trial, kept: Checkpoint, score: ViewRow) -> PaperRow:
     )
 
 
-def _markdown(report: Report) -> str:
+def _markdown(report: Report, run_time: str) -> str:
     """The tables, and what was not run."""
-    base = report.base
     parts = [
         "# The paper's experiment: what was measured",
-        f"Written by `stereoweave bench paper`. {base.pairs} collage pairs of "
-        f"{base.crop_size[1]}x{base.crop_size[0]} a seed, batch {base.batch}, {base.steps} steps unless a "
-        f"table says otherwise, Adam at {base.learning_rate:g}; scores over {base.validation_pairs} held-out "
-        "pairs. Right view: made from the left image by forward projection; MAE, 0 to 255, over all pixels "
-        "after one row fill, then over the pixels that received a source, and their share.",
+        *_head(report.base),
         "## The claims",
         claims_table(report.rows),
     ]
     for claim in dict.fromkeys(row.claim for row in report.rows):
         parts += [f"## {claim.capitalize()}", settings_table(report.rows, claim)]
+        if claim == ADJUSTMENT and (fitted := _fitted(report.planned)):
+            parts.append(fitted)
     parts += ["## What needs no training", _common_table(report.common)]
     if reached := _transfer(report):
         parts += ["## Transfer: steps to one validation loss", reached]
+    if run_time:
+        parts += ["## Run time", run_time]
     if report.missing:
         parts += ["## Not run", "\n".join(f"- {name}" for name in report.missing)]
     return "\n\n".join(parts) + "\n"
+
+
+def _head(base: Recipe) -> list[str]:
+    """What all trainings share, what of it is not the paper's, and how the tables are read."""
+    return [
+        f"Written by `stereoweave bench paper`. {base.pairs} collage pairs of "
+        f"{base.crop_size[1]}x{base.crop_size[0]} a seed, batch {base.batch}, {base.steps} steps unless a "
+        f"table says otherwise, Adam at {base.learning_rate:g}; scores over {base.validation_pairs} held-out "
+        "pairs. Right view: made from the left image by forward projection; MAE, 0 to 255, over all pixels "
+        "after one row fill, then over the pixels that received a source, and their share.",
+        f"Not the paper's: what is scored are weights averaged over about {base.averaged_steps} steps; "
+        "gradients are clipped at norm 5; precision is bf16-mixed where the processor has it, else float32; "
+        f"PyTorch is {torch.__version__}. The rivals train with the losses of their own papers (DispNet with "
+        "its learning rate too), without this paper's depth adjustment and projection loss.",
+        f"± is the standard deviation over the seeds. A row of one seed is of seed {base.seed} alone (in the "
+        "transfer, of another set); it comes after the means over several and is not ranked against them.",
+    ]
+
+
+def _fitted(planned: Sequence[Trial]) -> str:
+    """The fitted exponent, and which planned one it is, if it is one."""
+    settings = {trial.setting: trial.recipe for trial in reversed(planned) if trial.claim == ADJUSTMENT}
+    for setting, recipe in settings.items():
+        if setting.endswith(FITTED):
+            same = [name for name in settings if name != setting and settings[name].name == recipe.name]
+            also = f", which is {same[0]}: both rows are the same trainings" if same else ""
+            return f"Fitted to the histogram of the training truth, p is {recipe.exponent:.4g}{also}."
+    return ""
+
+
+def _run_time(path: Path) -> str:
+    """The table of run times; empty where there is no such file."""
+    if not path.exists():
+        return ""
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            table = run_time_table(csv.DictReader(file))
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(
+            f"{path}: expected the rows of `stereoweave bench speed`, found {error}; "
+            "write it anew or remove it"
+        ) from error
+    return f"A pair of 640x480, all cores of a processor; the paper's are of GPUs.\n\n{table}"
 
 
 def _common_table(rows: Sequence[ViewRow]) -> str:
@@ -174,10 +237,15 @@ def _transfer(report: Report) -> str:
         return ""
     best = min(curves[SCRATCH], key=lambda point: point["loss"])
     reached = [point["step"] for point in curves[TUNED] if point["loss"] <= best["loss"]]
-    tuned = f"{reached[0]:.0f} steps" if reached else f"more than {curves[TUNED][-1]['step']:.0f} steps"
+    tuned = (
+        f"is reached after {reached[0]:.0f} steps"
+        if reached
+        else f"is never reached: the run ended at {curves[TUNED][-1]['step']:.0f} steps"
+    )
     return (
-        f"The validation loss of {best['loss']:.5f}, the best {SCRATCH} (after {best['step']:.0f} steps), is "
-        f"reached {TUNED} after {tuned}, where scores are taken every {report.base.validate_every} steps."
+        f"The reference is the best validation loss {SCRATCH}: {best['loss']:.5f}, after {best['step']:.0f} "
+        f"steps. {TUNED.capitalize()} it {tuned}. One seed; scores are {report.base.validate_every} steps "
+        "apart."
     )
 
 
@@ -207,12 +275,11 @@ def _first_of_each(report: Report, claim: str) -> dict[str, Method]:
 
 
 def _by_setting(report: Report, claim: str) -> dict[str, list[list[tuple[int, float]]]]:
-    """For each setting the (step, squared error) of each seed."""
+    """For each setting the (step, squared error) of each seed; of settings with one training the first."""
+    # Listed backwards, so that the first one of a name is kept.
+    once = {trial.recipe.name: trial for trial in reversed(report.trained) if trial.claim == claim}
     found: dict[str, list[list[tuple[int, float]]]] = {}
-    for trial in report.trained:
-        if trial.claim == claim:
-            curve = [
-                (int(point["step"]), point["squared_error"]) for point in report.curves[trial.recipe.name]
-            ]
-            found.setdefault(trial.setting, []).append(curve)
+    for name, trial in reversed(once.items()):
+        curve = [(int(point["step"]), point["squared_error"]) for point in report.curves[name]]
+        found.setdefault(trial.setting, []).append(curve)
     return found

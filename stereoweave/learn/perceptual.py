@@ -53,6 +53,7 @@ class PerceptualLoss(nn.Module):
             code: Predicted code in 0..1.
             truth: True code in 0..1; NaN where unknown.
         """
+        self.to(code.device)
         known = truth.isfinite()
         shown, expected = (values.where(known, code.detach()) for values in (code, truth))
         difference = F.mse_loss(self._seen(shown), self._seen(expected))

@@ -55,7 +55,8 @@ class Recipe:
         validate_every: steps between two validations, each followed by a checkpoint.
         loss: a name in LOSSES: "weave" for WeaveNet, and the others, between codes, for the other networks.
         target: what a code stands for, "disparity" or "depth".
-        max_disparity_px, max_depth_m: the target's greatest value.
+        max_disparity_px: code 1 as a disparity; truth above it counts as unknown.
+        max_depth_m: code 0 as a depth; truth beyond it is an error.
         exponent: the paper's p.
         fit_exponent: p is fitted to the histogram of the training truth instead.
         alpha_z, alpha_p: weights of the loss between codes and of the projection loss.

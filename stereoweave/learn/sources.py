@@ -4,6 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
 from stereoweave.data.readers import DATASETS, Frame, open_dataset, split_frames
 from stereoweave.errors import FormatError
 from stereoweave.learn.pairs import KeptPairs
@@ -45,15 +49,15 @@ class Frames:
         return self.frames[index].name
 
 
-def sources(recipe: Recipe, kept: Path) -> tuple[Source, Source]:
-    """What a recipe trains on, and what it is scored on; collages are kept in folders below `kept`.
+def sources(recipe: Recipe, folder: Path, whole: bool = False) -> tuple[Source, Source]:
+    """What a recipe trains on, and what it is scored on; collages are kept in folders below `folder`.
 
-    Of the held-out frames of a dataset `validation_pairs` are taken, evenly spread.
+    Of the held-out frames of a dataset `validation_pairs` are taken, evenly spread, or all if `whole`.
     """
     if recipe.dataset == COLLAGE:
         return (
-            KeptPairs(kept, recipe.seed, recipe.pairs, recipe.pair_size),
-            KeptPairs(kept, VALIDATION_SEED, recipe.validation_pairs, recipe.pair_size),
+            KeptPairs(folder, recipe.seed, recipe.pairs, recipe.pair_size),
+            KeptPairs(folder, VALIDATION_SEED, recipe.validation_pairs, recipe.pair_size),
         )
     if recipe.dataset not in DATASETS:
         raise FormatError(
@@ -61,5 +65,22 @@ def sources(recipe: Recipe, kept: Path) -> tuple[Source, Source]:
         )
     frames = open_dataset(recipe.dataset, recipe.root)
     training, held_out = split_frames(frames, recipe.dataset, recipe.split)
-    stride = max(1, len(held_out) // recipe.validation_pairs)
-    return Frames(training), Frames(held_out[::stride][: recipe.validation_pairs])
+    count = len(held_out) if whole else min(recipe.validation_pairs, len(held_out))
+    spread = np.linspace(0, len(held_out) - 1, count).round().astype(int)
+    return Frames(training), Frames([held_out[i] for i in spread])
+
+
+def kept(pairs: Source, console: Console) -> Source:
+    """The pairs; collages are made before if they were not there."""
+    if isinstance(pairs, KeptPairs) and (missing := len(pairs.missing())):
+        with progress(console) as bar:
+            task = bar.add_task("making pairs", total=missing, loss="", rate="")
+            for _ in pairs.make():
+                bar.advance(task)
+    return pairs
+
+
+def progress(console: Console) -> Progress:
+    """A bar for long work; its tasks have the fields loss and rate."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, TextColumn("{task.fields[loss]} {task.fields[rate]}"), console=console)

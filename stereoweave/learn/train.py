@@ -16,10 +16,9 @@ import torch
 from lightning_fabric import Fabric
 from lightning_fabric.loggers.tensorboard import TensorBoardLogger
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import nn
 from torch.optim.swa_utils import AveragedModel
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Dataset
 
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io import make_folder, replacing
@@ -27,10 +26,9 @@ from stereoweave.learn import checkpoint
 from stereoweave.learn.batches import Batches
 from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.models import network_of
-from stereoweave.learn.objective import fitted, objective_of
-from stereoweave.learn.pairs import KeptPairs
+from stereoweave.learn.objective import fitted, naming, objective_of
 from stereoweave.learn.recipe import COLLAGE, Recipe, read_recipe
-from stereoweave.learn.sources import Source, sources
+from stereoweave.learn.sources import kept, progress, sources
 
 # Beside a run's checkpoint: its scores after each validation.
 CURVE = "validation.csv"
@@ -58,8 +56,8 @@ def train_recipe(recipe: Recipe, out: Path, console: Console) -> Path:
     logger = TensorBoardLogger(out, name="", version="")
     run = Run(recipe, start, logger)
     batches = Batches(recipe, pairs)
-    with closing_curves(logger), _progress(console) as progress:
-        task = progress.add_task(recipe.name, total=recipe.steps, completed=run.start.step, loss="", rate="")
+    with closing_curves(logger), progress(console) as bar:
+        task = bar.add_task(recipe.name, total=recipe.steps, completed=run.start.step, loss="", rate="")
         began = time.perf_counter()
         for step, batch in _numbered_batches(batches, run.start.step):
             loss = run.step(step, batch, batches)
@@ -70,7 +68,7 @@ def train_recipe(recipe: Recipe, out: Path, console: Console) -> Path:
                 run.keep(step + 1, scores, last)
                 console.print(f"step {step + 1}: " + "  ".join(f"{k} {v:.4g}" for k, v in scores.items()))
             rate, began = recipe.batch / (time.perf_counter() - began), time.perf_counter()
-            progress.update(task, completed=step + 1, loss=f"loss {loss:.4g}", rate=f"{rate:.1f} pairs/s")
+            bar.update(task, completed=step + 1, loss=f"loss {loss:.4g}", rate=f"{rate:.1f} pairs/s")
     return last
 
 
@@ -137,7 +135,8 @@ class Run:
         self.network.train()
         with self.fabric.autocast():
             predicted = self.objective.predict(self.network.module, batch)
-        losses = self.objective.losses(predicted, batch)
+        with naming(f"step {step}: one of {', '.join(batches.names(step))}"):
+            losses = self.objective.losses(predicted, batch)
         loss = torch.stack(list(losses.values())).sum()
         value = float(loss.detach())
         if not np.isfinite(value):
@@ -157,9 +156,7 @@ class Run:
         return value
 
     def _not_finite(self, step: int, what: str, batches: Batches) -> StereoweaveError:
-        return StereoweaveError(
-            f"step {step}: {what}; its pairs are {batches.chosen(step)} of seed {self.recipe.seed}"
-        )
+        return StereoweaveError(f"step {step}: {what}; its pairs are {', '.join(batches.names(step))}")
 
     def keep(self, step: int, scores: dict[str, float], path: Path) -> None:
         """Write the run as it is after `step` steps, and its scores to the curves."""
@@ -192,6 +189,11 @@ def _starting_point(recipe: Recipe, last: Path) -> Checkpoint:
     origin: tuple[dict[str, Any], ...] = ()
     if recipe.start_from:
         earlier = checkpoint.load(Path(recipe.start_from))
+        if earlier.recipe.model != recipe.model:
+            raise FormatError(
+                f"{recipe.name}: start_from = {recipe.start_from!r}, expected a checkpoint of "
+                f"{recipe.model}, found one of {earlier.recipe.model}"
+            )
         weights, hours, origin = earlier.averaged, earlier.hours, earlier.as_origin()
     return Checkpoint(
         recipe=recipe,
@@ -221,21 +223,27 @@ def _check(recipe: Recipe) -> None:
         )
 
 
-def kept(pairs: Source, console: Console) -> Source:
-    """The pairs; collages are made before if they were not there."""
-    if isinstance(pairs, KeptPairs) and (missing := len(pairs.missing())):
-        with _progress(console) as progress:
-            task = progress.add_task("making pairs", total=missing, loss="", rate="")
-            for _ in pairs.make():
-                progress.advance(task)
-    return pairs
+class _Told(Dataset[Any]):
+    """The batches, or the error where one cannot be made.
+
+    Raised in the loader's process it would come with PyTorch's traceback for its words.
+    """
+
+    def __init__(self, batches: Batches) -> None:
+        self.batches = batches
+
+    def __getitem__(self, step: int) -> dict[str, torch.Tensor] | StereoweaveError:
+        try:
+            return self.batches[step]
+        except StereoweaveError as error:
+            return error
 
 
 def _numbered_batches(batches: Batches, first: int) -> Iterator[tuple[int, dict[str, torch.Tensor]]]:
     """(step, its batch) from step `first` to the last, cut and recoloured in a process beside."""
     steps = range(first, batches.recipe.steps)
     loader = DataLoader(
-        batches,
+        _Told(batches),
         sampler=steps,
         batch_size=None,
         num_workers=1,
@@ -244,7 +252,10 @@ def _numbered_batches(batches: Batches, first: int) -> Iterator[tuple[int, dict[
         # Its own, because a loader draws a number when it starts, and a restart would draw once more.
         generator=torch.Generator(),
     )
-    return zip(steps, loader, strict=True)
+    for step, batch in zip(steps, loader, strict=True):
+        if isinstance(batch, StereoweaveError):
+            raise batch
+        yield step, batch
 
 
 def _keep_freed_memory() -> None:
@@ -281,8 +292,3 @@ def _precision() -> Literal["bf16-mixed", "32-true"]:
         one_dnn = torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
         computes = one_dnn and torch.cpu.get_capabilities().get("avx512_bf16", False)
     return "bf16-mixed" if computes else "32-true"
-
-
-def _progress(console: Console) -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, TextColumn("{task.fields[loss]} {task.fields[rate]}"), console=console)

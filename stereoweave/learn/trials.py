@@ -17,6 +17,7 @@ CLAIMS = NETWORKS, NETWORKS_SHORT, ADJUSTMENT, PROJECTION, LOSS, DECODER, TRANSF
     "iterations",
 )
 PAPER = "the paper's recipe"
+FITTED = "(fitted)"
 SCRATCH, TUNED = "from scratch", "from the synthetic checkpoint"
 # What the rivals are trained with: the losses of their own papers, without this paper's two contributions.
 OWN: dict[str, dict[str, Any]] = {
@@ -52,12 +53,16 @@ def trials(base: Recipe, seeds: int, fitted_exponent: float) -> list[Trial]:
         seeds: How many of each; DispNet, PSMNet, and the losses that the paper merely names, come once.
         fitted_exponent: p fitted to the histogram of the base's training truth.
     """
+    # Else every p would be the fitted one.
+    base = replace(base, fit_exponent=False)
     every = {"psmnet": _rival("psmnet"), "fast_depth": {}, **{rival: _rival(rival) for rival in OWN}}
     return [
         *_each(seeds, base, PROJECTION, {PAPER: {}, "without": {"alpha_p": 0.0}}),
         *_each(seeds, base, NETWORKS, {"fast_depth": {}, "densemapnet": _rival("densemapnet")}),
         *_each(seeds, base, ADJUSTMENT, {f"p = {p:g}": {"exponent": p} for p in (1.0, 1.5, 2.0, 1.25)}),
-        *_each(seeds, base, ADJUSTMENT, {"p fitted": {"exponent": fitted_exponent}}),
+        *_each(
+            seeds, base, ADJUSTMENT, {f"p = {fitted_exponent:.3g} {FITTED}": {"exponent": fitted_exponent}}
+        ),
         *_each(1, replace(base, steps=base.steps // SHORT), NETWORKS_SHORT, every),
         *_each(seeds, base, DECODER, {PAPER: {}, "upsampled at once, no skips": {"model": "densemapnet"}}),
         *_each(1, base, DECODER, {"step-wise, no skips": {"model": "fast_depth_without_skips"}}),

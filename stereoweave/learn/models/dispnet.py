@@ -32,6 +32,8 @@ Deviations, and choices where the paper is silent:
   and the answer weighs as much as all others together, without a schedule that this network alone would need.
 - A prediction reaches the next iconv by bilinear enlargement; the table names no layer for it.
 - A leaky ReLU, slope 0.1, follows every convolution but the predictions.
+- Colours are scaled to -1..1.
+- Images are padded to multiples of 64, the stride of conv6, and the answer is cut to their size.
 """
 
 from typing import ClassVar, Literal
