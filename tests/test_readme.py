@@ -143,7 +143,8 @@ def test_two_trainings_are_resumed_and_scored_by_the_commands_for_researchers(tm
         (tmp_path / "recipes" / "paper" / f"{name}.toml").write_text(short.replace("pairs = 64", "pairs = 8"))
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     run(["bash", "-ec", RESEARCH], tmp_path, PATH=path)
-    rows = {row["method"]: row for row in csv.DictReader((tmp_path / "runs" / "quick.csv").open())}
+    written = (tmp_path / "runs" / "quick.csv").read_text()
+    rows = {row["method"]: row for row in csv.DictReader(written.splitlines())}
     assert list(rows) == ["ground truth", "no warping", "sgbm", "median", "quick", "quick_plain"]
     assert rows["quick"]["epe_px"] != rows["quick_plain"]["epe_px"]
     finished = (tmp_path / "runs" / "quick" / "last.pt").stat().st_mtime_ns
