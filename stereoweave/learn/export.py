@@ -1,8 +1,10 @@
 """A checkpoint becomes a matcher file: calibrated, exported, and proved to answer as PyTorch does."""
 
 import json
+import logging
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -132,9 +134,7 @@ def fixed_graph_of(network: Any, height: int, width: int) -> onnx.ModelProto:
 def _exported(network: Any, height: int, width: int, dynamic_shapes: Any) -> onnx.ModelProto:
     # Two tensors: given the same one twice, the exporter would take both inputs to be one.
     left, right = torch.rand(2, 1, 3, height, width)
-    with warnings.catch_warnings(), torch.no_grad():
-        # The exporter warns of what it is not asked for: torchvision's operators, names of repeated axes.
-        warnings.simplefilter("ignore")
+    with _quietly(), torch.no_grad():
         program = torch.onnx.export(
             network,
             (left, right),
@@ -154,6 +154,19 @@ def _exported(network: Any, height: int, width: int, dynamic_shapes: Any) -> onn
     for part in (*graph.graph.input, *graph.graph.output):
         del part.metadata_props[:]
     return graph
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """Without what the exporter tells unasked: of torchvision's operators, of names of repeated axes."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            yield
+    finally:
+        logger.setLevel(level)
 
 
 def differences(network: Any, matcher: Matcher, pair: StereoPair) -> tuple[float, float]:
