@@ -50,7 +50,7 @@ def trials(base: Recipe, seeds: int, fitted_exponent: float) -> list[Trial]:
 
     Args:
         base: The paper's recipe, for the data at hand.
-        seeds: How many of each; DispNet, PSMNet, and the losses that the paper merely names, come once.
+        seeds: How many of each; DispNet and PSMNet, the transfer and the iterations come once.
         fitted_exponent: p fitted to the histogram of the base's training truth.
     """
     # Else every p would be the fitted one.
@@ -65,8 +65,8 @@ def trials(base: Recipe, seeds: int, fitted_exponent: float) -> list[Trial]:
         ),
         *_each(1, replace(base, steps=base.steps // SHORT), NETWORKS_SHORT, every),
         *_each(seeds, base, DECODER, {PAPER: {}, "upsampled at once, no skips": {"model": "densemapnet"}}),
-        *_each(1, base, DECODER, {"step-wise, no skips": {"model": "fast_depth_without_skips"}}),
-        *_each(1, base, LOSS, {"l2": {}, **{loss: {"loss": loss} for loss in _other_losses(base)}}),
+        *_each(seeds, base, DECODER, {"step-wise, no skips": {"model": "fast_depth_without_skips"}}),
+        *_each(seeds, base, LOSS, {"l2": {}, **{loss: {"loss": loss} for loss in _other_losses(base)}}),
         *_transfer(base),
         *_each(1, base, ITERATIONS, {f"{steps} steps": {"steps": steps} for steps in FIGURE_3_STEPS}),
         *_each(1, base, NETWORKS, {"dispnet": _rival("dispnet")}),
