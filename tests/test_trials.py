@@ -57,11 +57,9 @@ DIFFERENCES = {
     (ITERATIONS, "250 steps"): {"steps": 250},
 }
 SEVERAL = {
-    *((claim, setting) for claim, setting in DIFFERENCES if claim in (PROJECTION, ADJUSTMENT)),
+    *((claim, setting) for claim, setting in DIFFERENCES if claim in (PROJECTION, ADJUSTMENT, DECODER, LOSS)),
     (NETWORKS, "fast_depth"),
     (NETWORKS, "densemapnet"),
-    (DECODER, PAPER),
-    (DECODER, "upsampled at once, no skips"),
 }
 
 

@@ -73,7 +73,9 @@ def _check(base: Recipe) -> None:
 
 def _below(trial: Trial, runs: Path) -> Trial:
     start = trial.recipe.start_from
-    return replace(trial, recipe=replace(trial.recipe, start_from=str(runs / start) if start else ""))
+    # In full, so that the folder may be spelled otherwise when the experiment is started again.
+    start_from = str((runs / start).resolve()) if start else ""
+    return replace(trial, recipe=replace(trial.recipe, start_from=start_from))
 
 
 def _train_all(recipes: Iterable[Recipe], runs: Path, jobs: int, console: Console) -> None:
