@@ -236,6 +236,15 @@ def test_a_loss_that_is_unknown_or_another_network_s_is_refused():
         assert message == f"tiny: loss = {recipe.loss!r}, expected {expected}"
 
 
+def test_cross_entropy_is_refused_for_pixels_which_may_leave_their_range():
+    recipe = replace(DISPARITY, loss="cross_entropy")
+    assert complaint(objective_of, recipe, Constant("disparity_px", 2.0)) == (
+        "tiny: loss = 'cross_entropy', expected a network that predicts codes, found model = "
+        f"{recipe.model!r}, whose pixels may leave their range; take another loss"
+    )
+    assert objective_of(recipe, Constant("code", 0.5)).recipe == recipe
+
+
 def test_a_perceptual_loss_without_the_name_of_its_file_is_refused():
     recipe = replace(DISPARITY, loss="perceptual")
     message = complaint(objective_of, recipe, Constant("code", 0.5))

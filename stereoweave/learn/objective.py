@@ -28,7 +28,7 @@ from stereoweave.stereo import DepthCurve, Sample, fit_exponent
 Batch = dict[str, Tensor]
 Map = Float[Tensor, "b 1 h w"]
 
-WEAVE, SMOOTH_L1, PERCEPTUAL = "weave", "smooth_l1", "perceptual"
+WEAVE, SMOOTH_L1, CROSS_ENTROPY, PERCEPTUAL = "weave", "smooth_l1", "cross_entropy", "perceptual"
 LOSSES = (WEAVE, *CODE_LOSSES, PERCEPTUAL)
 # The histogram of the truth that an exponent is fitted to: of so many training pairs, in so many bins.
 _FITTED_PAIRS, _FITTED_BINS = 200, 256
@@ -60,7 +60,14 @@ def objective_of(recipe: Recipe, network: nn.Module) -> Objective:
         raise FormatError(
             f"{recipe.name}: loss = {recipe.loss!r}, expected {fitting} for model = {recipe.model!r}"
         )
-    return CodeObjective(recipe, network) if isinstance(network, CodeNetwork) else WeaveObjective()
+    if not isinstance(network, CodeNetwork):
+        return WeaveObjective()
+    if recipe.loss == CROSS_ENTROPY and network.predicts != "code":
+        raise FormatError(
+            f"{recipe.name}: loss = {recipe.loss!r}, expected a network that predicts codes, found "
+            f"model = {recipe.model!r}, whose pixels may leave their range; take another loss"
+        )
+    return CodeObjective(recipe, network)
 
 
 class WeaveObjective:
