@@ -1,4 +1,4 @@
-"""The commands: stereoweave depth | view | bench | train | export."""
+"""The commands: stereoweave depth | view | bench | synth | train | export."""
 
 import json
 import tempfile
@@ -13,6 +13,7 @@ import typer
 
 from stereoweave import __version__
 from stereoweave.errors import StereoweaveError
+from stereoweave.synth_commands import synth
 
 if TYPE_CHECKING:
     import numpy as np
@@ -45,6 +46,7 @@ Jobs = Annotated[int, typer.Option(min=1, help="Trainings at a time.")]
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 bench = typer.Typer(help="Score matchers side by side.")
 app.add_typer(bench, name="bench")
+app.add_typer(synth, name="synth")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -26,6 +26,8 @@ _KINDS = {
     ".webp": "WEBP",
     ".bmp": "BMP",
 }
+# The names that `replacing` gives while it writes.
+_TEMPORARY = re.compile(r"\..*-[0-9a-f]{8}(\.\w+)?")
 _PFM_HEADER = re.compile(rb"Pf\s+(\d+)\s+(\d+)\s+(\S+)\s")
 
 
@@ -241,6 +243,17 @@ def replacing(path: str | Path) -> Iterator[Path]:
         ) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def is_leftover(path: Path) -> bool:
+    """Whether a file is what `replacing` left where the program was killed."""
+    return _TEMPORARY.fullmatch(path.name) is not None
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Removes what `replacing` left in a folder and below it, where nobody is writing now."""
+    for path in filter(is_leftover, folder.rglob(".*")):
+        path.unlink(missing_ok=True)
 
 
 def _reason(error: Exception) -> str:

@@ -6,6 +6,8 @@ summary says so; with STEREOWEAVE_REQUIRE_ALL=1 the run fails instead.
 
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -25,6 +27,12 @@ class Capability(NamedTuple):
     missing: str
 
 
+def renders() -> bool:
+    """Whether OpenGL works without a window; tried in a process of its own, which a broken driver may end."""
+    program = "import moderngl; moderngl.create_context(standalone=True, backend='egl')"
+    return subprocess.run([sys.executable, "-c", program], capture_output=True, check=False).returncode == 0
+
+
 CAPABILITIES = {
     "testdata": Capability(
         (TESTDATA / "stereo").is_dir(), "on the real pictures", f"STEREOWEAVE_TESTDATA={TESTDATA} not found"
@@ -32,6 +40,7 @@ CAPABILITIES = {
     "needs_chromium": Capability(
         shutil.which("chromium") is not None, "in a browser", "no chromium on the PATH"
     ),
+    "needs_egl": Capability(renders(), "of the renderer", "no EGL: apt install libegl1 libgl1-mesa-dri"),
 }
 
 LEFT_OUT = pytest.StashKey[dict[str, int]]()

@@ -17,6 +17,8 @@ BREACHES = [
     ("The floors of the house", "new_file.py", "import stereoweave.stereo"),
     ("The floors inside learn", "learn/recipe.py", "import stereoweave.learn.train"),
     ("The floors inside learn", "learn/new_file.py", "import torch"),
+    ("The floors inside synth", "synth/world.py", "import stereoweave.synth.stage"),
+    ("The floors inside synth", "synth/new_file.py", "import numpy"),
     ("One network never imports another", "learn/models/rival.py", "import stereoweave.learn.models.weave"),
     ("PyTorch is imported under learn alone", "io.py", "def tensor():\n    import torch"),
     ("PyTorch is imported under learn alone", "io.py", "from lightning_fabric import Fabric"),

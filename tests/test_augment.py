@@ -229,6 +229,15 @@ def test_a_mirrored_sample_shows_every_place_from_the_other_camera(sample):
     np.testing.assert_allclose(mirrored(mirror).camera.cx_px, 70)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_sky_stays_at_no_disparity(sample, seed):
+    sky = np.zeros_like(sample.disparity_px)
+    sample = replace(sample, disparity_px=sky, right_disparity_px=sky, camera=replace(CAMERA, doffs_px=0.0))
+    augmented = augment(sample, 64, 80, np.random.default_rng(seed))
+    np.testing.assert_array_equal(augmented.disparity_px, np.zeros((64, 80)))
+    assert np.isinf(augmented.camera.depth_m(augmented.disparity_px)).all()
+
+
 def test_a_pair_without_the_right_view_s_disparity_is_never_mirrored(sample):
     sample = replace(sample, right_disparity_px=np.full_like(sample.right_disparity_px, np.nan))
     for seed in range(12):

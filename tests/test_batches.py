@@ -1,4 +1,5 @@
-from dataclasses import replace
+from collections import Counter
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from learn_examples import CAMERA, PAIR_SIZE, RECIPE, Listed, box_before_a_wall,
 
 from stereoweave.learn.batches import Batches, collated, known
 from stereoweave.learn.pairs import KeptPairs
+from stereoweave.learn.sources import Mix
 
 
 def samples(count, **changes):
@@ -19,6 +21,23 @@ def pairs():
     return Listed(samples(4))
 
 
+@dataclass(frozen=True)
+class Backwards(Listed):
+    """Pairs that are read best from the last to the first."""
+
+    def order(self, rng):
+        return np.arange(self.count)[::-1]
+
+
+def mix_of(*counts, weights):
+    return Mix(tuple(Listed(samples(1) * count) for count in counts), weights)
+
+
+def chosen_of(mix, steps, **changes):
+    batches = Batches(replace(RECIPE, **changes), mix)
+    return [index for step in range(steps) for index in batches.chosen(step)]
+
+
 def test_every_pair_comes_once_before_any_comes_again():
     recipe = replace(RECIPE, pairs=7, batch=3)
     batches = Batches(recipe, KeptPairs(Path("unused"), 0, recipe.pairs, PAIR_SIZE))
@@ -26,6 +45,58 @@ def test_every_pair_comes_once_before_any_comes_again():
     epochs = [chosen[:7], chosen[7:14], chosen[14:]]
     assert all(sorted(epoch) == list(range(7)) for epoch in epochs)
     assert epochs[0] != epochs[1]
+
+
+def test_the_pairs_of_a_step_come_in_the_order_of_their_seed_and_epoch():
+    """As they did before sets were mixed: runs of old are resumed and compared with."""
+    batches = Batches(replace(RECIPE, batch=3, seed=5), Listed(samples(1) * 7))
+    orders = [np.random.default_rng((5, epoch, 1)).permutation(7) for epoch in range(3)]
+    assert [index for step in range(7) for index in batches.chosen(step)] == np.concatenate(orders).tolist()
+
+
+def test_of_each_set_of_a_mix_every_pair_comes_once_before_any_comes_again():
+    chosen = chosen_of(mix_of(5, 3, weights=(3.0, 1.0)), 40, batch=4)
+    for own in (range(5), range(5, 8)):
+        drawn = [index for index in chosen if index in own]
+        epochs = [drawn[i : i + len(own)] for i in range(0, len(drawn) - len(own) + 1, len(own))]
+        assert len(epochs) > 5
+        assert all(sorted(epoch) == list(own) for epoch in epochs)
+        assert len({tuple(epoch) for epoch in epochs}) > 1
+
+
+def test_the_sets_of_a_mix_are_drawn_by_weight():
+    counts = Counter(index // 10 for index in chosen_of(mix_of(10, 10, 10, weights=(5, 4, 1)), 100, batch=40))
+    # Of 4,000 draws; the deviations are 32, 31 and 19.
+    assert [counts[which] for which in range(3)] == pytest.approx([2000, 1600, 400], abs=130)
+
+
+def test_a_step_of_a_mix_depends_on_the_seed_and_the_step_alone():
+    mix = mix_of(5, 3, weights=(1.0, 1.0))
+    whole = chosen_of(mix, 20, batch=4)
+    assert Batches(replace(RECIPE, batch=4), mix).chosen(13) == whole[52:56]
+    assert chosen_of(mix, 20, batch=4, seed=1) != whole
+
+
+def test_a_set_is_read_in_its_own_order():
+    mix = Mix((Listed(samples(1) * 5), Backwards(samples(1) * 4)), (1.0, 1.0))
+    drawn = [index for index in chosen_of(mix, 20) if index >= 5]
+    assert drawn == [8 - i % 4 for i in range(len(drawn))]
+
+
+def test_a_batch_of_a_mix_has_the_pairs_of_its_sets_and_names_them(pairs):
+    cameras = Listed(samples(3, camera=CAMERA))
+    mix = Mix((pairs, cameras), (1.0, 1.0))
+    batches = Batches(replace(RECIPE, augment=False, crop_size=PAIR_SIZE, batch=8), mix)
+    chosen, batch = batches.chosen(0), batches[0]
+    assert min(chosen) < 4 <= max(chosen)
+    own = [(pairs, index) if index < 4 else (cameras, index - 4) for index in chosen]
+    for place, (source, index) in enumerate(own):
+        np.testing.assert_array_equal(batch["disparity_px"][place, 0], source[index].disparity_px)
+        found = (255 * batch["left"][place]).round().byte().permute(1, 2, 0)
+        np.testing.assert_array_equal(found, source[index].left)
+    assert batches.names(0) == [source.name(index) for source, index in own]
+    # Not all of them have a camera.
+    assert "focal_baseline_px_m" not in batch
 
 
 def test_a_batch_depends_on_the_seed_and_the_step_alone(pairs):

@@ -11,6 +11,7 @@ from stereoweave.learn.claims import (
     comparisons,
     half_width,
     less_percent,
+    propeller_table,
     run_time_table,
     settings_table,
 )
@@ -20,18 +21,19 @@ COMPARISONS = {comparison.text: comparison for comparison in comparisons()}
 PROJECTED = "projection loss: end-point error"
 
 
-def row(claim, setting, seed=0, **scores):
+def row(claim, setting, seed=0, model="fast_depth", steps=600, **scores):
     found = dict.fromkeys(("prediction", "squared_error", "epe_px", "mae_sourced", "sourced_percent"), 1.0)
+    found |= {"epe_cm": math.nan}
     found |= dict.fromkeys(("mae_filled", "psnr_db", "ssim", "minutes"), 1.0) | scores
     return PaperRow(
         claim=claim,
         setting=setting,
         seed=seed,
-        model="fast_depth",
+        model=model,
         loss="l2",
         exponent=1.5,
         alpha_p=1.0,
-        steps=600,
+        steps=steps,
         batch=4,
         crop="192x128",
         commit="0123abc",
@@ -178,6 +180,50 @@ def test_the_settings_of_a_claim_are_ranked_by_the_mae_of_the_filled_view():
     assert first == (f"| {PAPER} | 2 | 2.00 ± 1.41 | 1.00000 | 7.00 | 5.00 | 1.0 | 1.00 | 1.000 | 1.0 |")
     assert second == "| without | 1 | 1.00 | 1.00000 | 9.00 | 1.00 | 1.0 | 1.00 | 1.000 | 1.0 |"
     assert header.count("|") == first.count("|")
+
+
+def test_depth_is_claimed_of_the_error_in_cm_and_of_propeller_alone():
+    found = {comparison.text: comparison for comparison in comparisons(depth=True)}
+    assert found.keys() == COMPARISONS.keys()
+    assert {one.measure for one in found.values()} == {"prediction", "squared_error", "epe_cm", "mae_filled"}
+    # 1 - 2.32 / 8.67, and 1 - 37.31 / 41.22.
+    parent = found["the paper's network against densemapnet: end-point error"]
+    assert (parent.paper, parent.measure) == ("73 % (Table I, Propeller)", "epe_cm")
+    assert parent.paper_percent == pytest.approx(73.24, abs=0.01)
+    slow = found["the paper's network against psmnet: MAE of the right view"]
+    assert slow.paper == "9 % (Table I, Propeller)"
+    assert slow.paper_percent == pytest.approx(9.49, abs=0.01)
+    rows = [
+        row(PROJECTION, setting, epe_px=1.0, epe_cm=error)
+        for setting, error in (("without", 50.0), (PAPER, 40.0))
+    ]
+    assert line_of(claims_table(rows, depth=True), PROJECTED)[1] == "20 (one seed)"
+
+
+def test_networks_stand_beside_the_papers_propeller():
+    rows = [
+        row(NETWORKS, "fast_depth", 0, epe_cm=40.0, mae_filled=30.0),
+        row(NETWORKS, "fast_depth", 1, epe_cm=50.0, mae_filled=32.0),
+        row(NETWORKS_SHORT, "psmnet", model="psmnet", steps=150, epe_cm=1.38, mae_filled=41.22),
+        row(NETWORKS_SHORT, "fast_depth", steps=150, epe_cm=60.0, mae_filled=40.0),
+        row(PROJECTION, PAPER, epe_cm=0.0, mae_filled=0.0),
+    ]
+    lines = propeller_table(rows).splitlines()
+    assert lines[2:] == [
+        "| psmnet | 150 | 2.38 | 1.38 | -1.00 | 41.22 | 41.22 | +0.00 |",
+        "| fast_depth | 150 | 2.32 | 60.00 | +57.68 | 37.31 | 40.00 | +2.69 |",
+        "| fast_depth | 600 | 2.32 | 45.00 | +42.68 | 37.31 | 31.00 | -6.31 |",
+    ]
+    assert {line.count("|") for line in lines} == {9}
+
+
+def test_the_settings_of_depth_have_their_errors_in_cm_first():
+    rows = [row(PROJECTION, PAPER, seed, epe_cm=error) for seed, error in enumerate((30.0, 50.0))]
+    header, _, line = settings_table(rows, PROJECTION, depth=True).splitlines()
+    assert header.startswith("| setting | seeds | EPE cm | EPE px | ")
+    # Of 30 and 50 the deviation is 10 sqrt(2).
+    assert line.startswith(f"| {PAPER} | 2 | 40.0 ± 14.1 | 1.00 | ")
+    assert header.count("|") == line.count("|")
 
 
 def test_a_single_score_is_ranked_after_the_means():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from learn_examples import (
+    CAMERA,
     PAIR_SIZE,
     RECIPE,
     Listed,
@@ -23,7 +24,7 @@ from stereoweave.learn.pairs import KeptPairs
 from stereoweave.learn.sources import VALIDATION_SEED
 from stereoweave.metrics import epe_px
 from stereoweave.projection import project_right
-from stereoweave.view_benchmark import view_errors
+from stereoweave.view_benchmark import score_views, view_errors
 
 QUIET = Console(quiet=True)
 PAPER = recipe_of("fast_depth", max_disparity_px=32.0, exponent=2.0)
@@ -130,6 +131,20 @@ def test_the_averaged_weights_are_scored(rng):
     other = replace(kept, weights=kept_of(PAPER).weights)
     found_px = method_of(other)(box_before_a_wall(rng))
     np.testing.assert_allclose(found_px, 32 * np.sqrt(0.5), rtol=1e-6)
+
+
+def test_a_depth_becomes_the_disparity_of_each_pair_s_own_camera():
+    # The code 0.5 is 4 m: 24 / 4 px, and 12 / 4 - 1 px.
+    recipe = recipe_of("fast_depth", target="depth", max_depth_m=8.0)
+    sample = replace(box_before_a_wall(np.random.default_rng(0)), camera=CAMERA)
+    other = replace(sample, camera=replace(CAMERA, focal_px=60.0, doffs_px=1.0))
+    match = method_of(kept_of(recipe, answer_half))
+    for pair, expected_px in ((sample, 6.0), (other, 2.0)):
+        np.testing.assert_allclose(match(pair), np.full(PAIR_SIZE, expected_px), rtol=1e-6)
+    # The wall, 4 px, and the box, 12 px, are 6 m and 2 m away; for the other camera 12 / 5 and 12 / 13 m.
+    errors_m = 2.0, 0.75 * (4 - 12 / 5) + 0.25 * (4 - 12 / 13)
+    *_, row = score_views({"half": match}, [sample, other], recipe.max_depth_m)
+    assert row.epe_cm == pytest.approx(100 * np.mean(errors_m), rel=1e-5)
 
 
 def test_the_median_is_of_what_is_known(rng):

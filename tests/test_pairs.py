@@ -41,9 +41,10 @@ def test_pairs_of_another_seed_or_size_are_kept_apart(tmp_path):
 
 def test_pairs_of_another_version_of_the_generator_are_kept_apart(tmp_path, monkeypatch):
     keep_pairs(tmp_path, 3, 2)
-    for name in ("collage", "paint", "shapes", "textures"):
-        (tmp_path / f"{name}.py").write_text("changed")
-    monkeypatch.setattr(pairs_module, "__file__", str(tmp_path / "pairs.py"))
+    for source in pairs_module._SOURCES:
+        (tmp_path / source).parent.mkdir(exist_ok=True)
+        (tmp_path / source).write_text("changed")
+    monkeypatch.setattr(pairs_module, "__file__", str(tmp_path / "learn" / "pairs.py"))
     assert KeptPairs(tmp_path, 3, 2, PAIR_SIZE).missing() == [0, 1]
 
 

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from learn_examples import box_before_a_wall, complaint, keep_pairs, recipe_of
+from learn_examples import CAMERA, Listed, box_before_a_wall, complaint, keep_pairs, recipe_of
 from rich.console import Console
 
+from stereoweave.data.paper_layout import write_frame
 from stereoweave.io import read_image
 from stereoweave.learn import checkpoint, paper, paper_report, train
 from stereoweave.learn import trials as the_trials
@@ -56,6 +57,7 @@ STRAIGHT = "fast_depth-l2-p1-projection1-steps4-seed0"
 DENSEMAPNET = "densemapnet-l2-p1-projection0-steps4-seed0"
 EARLY, LATER = (f"fast_depth-l2-p1.5-projection1-steps{steps}-seed0" for steps in (1, 2))
 SECOND_POWER = "fast_depth-l2-p2-projection1-steps4-seed0"
+ON_DISK = FIRST, WITHOUT, DENSEMAPNET, "psmnet-smooth_l1-p1-projection0-steps1-seed0"
 TRAINED = FIRST, WITHOUT, DENSEMAPNET, STRAIGHT, EARLY, LATER
 ROWS = [
     (PROJECTION, PAPER, FIRST),
@@ -147,12 +149,11 @@ def test_the_exponent_is_fitted_to_the_training_truth(experiment):
     ("changes", "words"),
     [
         ({"model": "weave"}, "model = 'weave', expected 'fast_depth', which the experiment starts from"),
-        ({"dataset": "driving"}, "dataset = 'driving', expected 'collage', which the experiment starts from"),
         ({"target": "depth"}, "target = 'depth', expected 'disparity', which the experiment starts from"),
         ({"steps": 3}, "steps = 3, expected at least 4: some trainings have a quarter of them"),
     ],
 )
-def test_a_plan_starts_from_the_papers_network_on_collages(tmp_path, changes, words):
+def test_a_plan_starts_from_the_papers_network_and_of_collages_from_disparity(tmp_path, changes, words):
     assert complaint(plan, replace(BASE, **changes), tmp_path, 1, QUIET) == f"base: {words}"
     assert list(tmp_path.iterdir()) == []
 
@@ -194,6 +195,7 @@ def test_the_tables_name_what_was_not_run(experiment):
     assert text.count("| not run | | |") == 6
     assert [line for line in text.splitlines() if line.startswith("| no warping | 6.00 | ")]
     assert "## Transfer" not in text
+    assert "Propeller" not in text and "EPE cm" not in text
     for claim in CLAIMS:
         assert f"## {claim.capitalize()}\n" in text
 
@@ -273,6 +275,8 @@ def test_a_tuned_trial_starts_from_a_run_below_the_folder_of_the_runs():
 def report_of(trained, curves):
     return Report(
         base=BASE,
+        training=Listed([]),
+        held_out=Listed([]),
         planned=trained,
         trained=trained,
         missing=[],
@@ -316,6 +320,70 @@ def test_a_fitted_exponent_that_was_planned_anyway_is_named_and_drawn_once():
     curves = {trial.recipe.name: [{"step": 2.0, "squared_error": 0.5}] for trial in planned}
     drawn = paper_report._by_setting(report_of(planned, curves), ADJUSTMENT)
     assert drawn == dict.fromkeys(("p = 1", "p = 1.25", "p = 1.5", "p = 2"), [[(2, 0.5)]] * 2)
+
+
+@pytest.fixture(scope="module")
+def on_disk(tmp_path_factory):
+    """The experiment on depth, of ten pairs in the paper's layout: the wall is 6 m away, the box 2 m."""
+    folder = tmp_path_factory.mktemp("propeller")
+    root, runs, out = folder / "set", folder / "runs", folder / "report"
+    for index in range(10):
+        sample = box_before_a_wall(np.random.default_rng(index), (64, 80))
+        write_frame(root, f"propeller/{index:04d}", replace(sample, camera=CAMERA))
+    base = replace(
+        BASE,
+        dataset="paper",
+        root=str(root),
+        split="disjoint",
+        target="depth",
+        max_depth_m=8.0,
+        max_disparity_px=48.0,
+        validation_pairs=64,
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        train_in_place(patch)
+        patch.setattr(the_trials, "FIGURE_3_STEPS", (1, 2))
+        planned = plan(base, runs, 1, QUIET)
+        experiment = Experiment(planned, runs, out)
+        run_trials(experiment.of(*ON_DISK), runs, JOBS, QUIET)
+    write_report(base, planned, runs, out)
+    return experiment
+
+
+def test_depth_of_pairs_on_disk_is_scored_in_cm(on_disk):
+    rows = {(row["claim"], row["setting"]): row for row in rows_of(on_disk)}
+    names = {trial.recipe.name for trial in on_disk.planned}
+    assert {row["model"] for row in rows.values()} == {"fast_depth", "densemapnet", "psmnet"}
+    assert set(ON_DISK) <= names
+    for trial in on_disk.of(*ON_DISK):
+        kept = checkpoint.load(on_disk.last(trial.recipe.name))
+        row = rows[trial.claim, trial.setting]
+        assert float(row["epe_cm"]) == pytest.approx(100 * kept.scores["depth_error_m"], rel=1e-3)
+        assert float(row["epe_px"]) == pytest.approx(kept.scores["epe_px"], rel=1e-3)
+        assert (row["crop"], row["seed"]) == ("64x64", "0")
+
+
+def test_the_tables_of_depth_stand_beside_the_papers_propeller(on_disk):
+    text = (on_disk.out / "paper.md").read_text()
+    assert "9 pairs of " in text.split("## The claims")[0]
+    assert "cuts of 64x64; split disjoint, target depth up to 8 m" in text
+    assert "scores over 1 held-out pairs" in text
+    assert "Beyond 8 m ground truth is unknown" in text
+    assert "transfer" not in text.lower()
+    table = text.split("## Table I, Propeller\n\n")[1].split("\n\n")[0].splitlines()[2:]
+    assert [line.split(" | ")[:3] for line in table] == [
+        ["| densemapnet", "4", "8.67"],
+        ["| psmnet", "1", "2.38"],
+        ["| fast_depth", "4", "2.32"],
+    ]
+    # Without a disparity everything is at 8 m: three quarters of the pixels are wrong by 2 m, the box by 6 m.
+    assert [line for line in text.splitlines() if line.startswith("| no warping | 300.0 | 6.00 | ")]
+    assert [line for line in text.splitlines() if line.startswith("| ground truth | 0.0 | 0.00 | ")]
+    names = {file.name for file in on_disk.out.iterdir()}
+    assert names == {"paper.csv", "paper.md", "exponent_curves.png", "projection_validation.png"} | {
+        "views.jpg",
+        "exponent_validation.png",
+    }
 
 
 def test_run_times_beside_the_report_join_it(experiment, tmp_path):

@@ -1,4 +1,5 @@
-from dataclasses import asdict
+import json
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -39,6 +40,26 @@ def test_a_recipe_is_read_with_its_defaults(tmp_path):
 
 def test_a_recipe_survives_being_a_dictionary():
     assert recipe_from(asdict(RECIPE), "here") == RECIPE
+
+
+def test_a_mix_is_a_table_of_sets_and_weights_and_survives_being_a_dictionary(tmp_path):
+    file = tmp_path / "x.toml"
+    lines = [f"{name} = {value!r}" for name, value in NEEDED.items()]
+    file.write_text("\n".join([*lines, "[mix]", "collage = 0.5", '"runs/synth/rooms" = 2']))
+    recipe = read_recipe(file)
+    assert recipe == Recipe(**NEEDED, mix=(("collage", 0.5), ("runs/synth/rooms", 2)))
+    assert hash(recipe) != hash(Recipe(**NEEDED))
+    assert recipe_from(asdict(recipe), "here") == recipe
+    # As a checkpoint's card keeps it.
+    assert recipe_from(json.loads(json.dumps(asdict(recipe))), "here") == recipe
+
+
+def test_the_trainings_with_and_without_rendered_pairs_differ_in_them_alone():
+    alone, mixed = (
+        read_recipe(file) for file in RECIPES if file.stem in ("weave_small_collage", "weave_small_mix")
+    )
+    assert alone == replace(mixed, mix=())
+    assert dict(mixed.mix).keys() == {"collage", "runs/synth/rooms", "runs/synth/scenes"}
 
 
 def test_a_recipe_for_a_dataset_on_disk_is_bound_by_no_pair_size():
@@ -118,6 +139,18 @@ def test_the_learning_rate_without_slopes_is_constant():
         ({"target": "height"}, "target = 'height', expected disparity or depth"),
         ({"dataset": "sintel"}, "dataset = 'sintel' with root = '', expected a root for a dataset on disk"),
         ({"root": "sintel"}, "dataset = 'collage' with root = 'sintel', expected a root for a dataset on"),
+        ({"mix": "collage"}, "mix = 'collage', expected a table of sets and their weights, such as collage"),
+        (
+            {"mix": {"collage": "half"}},
+            "mix = {'collage': 'half'}, expected a table of sets and their weights",
+        ),
+        ({"mix": [["collage", 1, 2]]}, "mix = [['collage', 1, 2]], expected a table of sets and their weig"),
+        ({"mix": {"collage": 1.0, "rooms": 0}}, "mix: weight 0 of 'rooms', expected more than 0"),
+        ({"mix": {"collage": float("nan")}}, "mix: weight nan of 'collage', expected more than 0"),
+        (
+            {"mix": {"collage": 1.0}, "dataset": "sintel", "root": "sintel"},
+            "mix with dataset = 'sintel', expected 'collage', which a mix is scored on",
+        ),
         ({"learning_rate": float("nan")}, "learning_rate = nan, expected more than 0"),
     ],
 )

@@ -1,12 +1,17 @@
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from dataset_examples import shades, write_map, write_picture
-from learn_examples import PAIR_SIZE, RECIPE, complaint
+from learn_examples import CAMERA, PAIR_SIZE, RECIPE, box_before_a_wall, complaint, keep_pairs
+from rich.console import Console
 
+from stereoweave.data.packing import packed
+from stereoweave.data.shards import write_shard
+from stereoweave.learn import pairs as the_pairs
 from stereoweave.learn.pairs import KeptPairs
-from stereoweave.learn.sources import VALIDATION_SEED, Source, sources
+from stereoweave.learn.sources import VALIDATION_SEED, Mix, Source, kept, sources
 
 CALIBRATION = "cam0=[300 0 19.5; 0 300 15.5; 0 0 1]\ndoffs=0\nbaseline=100\nwidth=40\nheight=32\n"
 FRAMES = [f"mill/{number:04d}" for number in range(40)]
@@ -27,6 +32,25 @@ def root(tmp_path_factory):
 @pytest.fixture
 def recipe(root):
     return replace(RECIPE, dataset="paper", root=str(root), split="disjoint", validation_pairs=100)
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory):
+    """Rendered sets: six pairs of rooms, and in one folder two of a ship and four of a crane."""
+    root = tmp_path_factory.mktemp("rendered")
+    for folder, count in (("rooms", 6), ("scenes/ship", 2), ("scenes/crane", 4)):
+        (root / folder).mkdir(parents=True)
+        samples = (box_before_a_wall(np.random.default_rng((count, i))) for i in range(count))
+        pairs = [packed(replace(sample, camera=CAMERA), {}) for sample in samples]
+        write_shard(root / folder, Path(folder).name, 0, pairs)
+    return root
+
+
+def mixed(root, **weights):
+    return replace(
+        RECIPE,
+        mix=tuple((name if name == "collage" else str(root / name), w) for name, w in weights.items()),
+    )
 
 
 def names(source):
@@ -87,4 +111,55 @@ def test_an_unknown_dataset_is_answered_with_the_known_ones(recipe, tmp_path):
 def test_a_root_that_lacks_a_folder_is_named(recipe, tmp_path):
     assert str(tmp_path / "nowhere") in complaint(
         sources, replace(recipe, root=str(tmp_path / "nowhere")), tmp_path
+    )
+
+
+def test_a_mix_has_the_pairs_of_its_sets_one_behind_another(rendered, tmp_path):
+    keep_pairs(tmp_path, RECIPE.seed, RECIPE.pairs)
+    training, held_out = sources(mixed(rendered, rooms=3.0, collage=1.0), tmp_path)
+    assert isinstance(training, Mix) and isinstance(training, Source)
+    assert (training.count, held_out.count) == (6 + 4, 2)
+    assert held_out.folder == KeptPairs(tmp_path, VALIDATION_SEED, 2, PAIR_SIZE).folder
+    rooms, collages = training.sets
+    assert names(training) == [*names(rooms), *names(collages)]
+    assert names(rooms)[5] == "rooms-000005"
+    np.testing.assert_array_equal(training[4].left, rooms[4].left)
+    np.testing.assert_array_equal(training[6].left, collages[0].left)
+    assert (training[5].camera, training[6].camera) == (CAMERA, None)
+    assert training.weights == (3.0, 1.0)
+
+
+def test_the_sets_in_one_folder_share_its_weight_by_their_pairs(rendered, tmp_path):
+    training, _ = sources(mixed(rendered, collage=0.5, rooms=0.2, scenes=0.3), tmp_path)
+    assert [one.count for one in training.sets] == [RECIPE.pairs, 6, 4, 2]
+    assert training.sets[2].name(0) == "crane-000000"
+    assert training.weights == pytest.approx((0.5, 0.2, 0.2, 0.1))
+
+
+def test_the_collages_of_a_mix_are_made_like_others(rendered, tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(the_pairs.KeptPairs, "make", lambda pairs: iter(made.append(pairs.folder) or []))
+    training, _ = sources(mixed(rendered, rooms=1.0, collage=1.0), tmp_path)
+    assert kept(training, Console(quiet=True)) is training
+    assert made == [KeptPairs(tmp_path, RECIPE.seed, RECIPE.pairs, PAIR_SIZE).folder]
+
+
+def test_a_mix_without_collages_makes_none_to_train_on(rendered, tmp_path):
+    training, _ = sources(mixed(rendered, rooms=1.0), tmp_path)
+    kept(training, Console(quiet=True))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_set_of_a_mix_that_is_not_there_is_named(rendered, tmp_path):
+    assert complaint(sources, mixed(rendered, caves=1.0), tmp_path) == (
+        f"tiny: mix: {rendered}/caves: expected pairs of `stereoweave synth make`, or folders of such, found "
+        "none; make them first"
+    )
+
+
+def test_a_set_that_is_smaller_than_the_crop_is_named(rendered, tmp_path):
+    recipe = replace(mixed(rendered, scenes=1.0), pair_size=(80, 96), crop_size=(80, 96))
+    assert complaint(sources, recipe, tmp_path) == (
+        f"tiny: crop_size = [80, 96], expected at most [64, 96], the size of the pairs in {rendered}/scenes/"
+        "crane; cut less"
     )

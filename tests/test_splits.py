@@ -40,6 +40,7 @@ EXAMPLES = {
     "middlebury2021": frames("artroom1", "traproom1", "traproom2"),
     "eth3d": frames("delivery_area_1l", "facade_1s", "forest_1s", "forest_2s"),
     "paper": frames(*run("mill", 20), *run("propeller", 40)),
+    "shards": frames(*(f"ship/ship-{i:06d}" for i in range(30)), *(f"ship-{i:06d}" for i in range(10))),
 }
 
 CASES = list(product(DATASETS, SPLITS))

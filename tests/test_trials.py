@@ -101,6 +101,15 @@ def test_a_base_that_fits_its_exponent_does_not_make_the_others_fit():
     assert trials(replace(BASE, fit_exponent=True), 1, 1.37) == trials(BASE, 1, 1.37)
 
 
+def test_pairs_on_disk_have_all_trials_but_the_transfer():
+    on_disk = trials(replace(BASE, dataset="paper", root="propeller", target="depth"), 2, 1.37)
+    collages = trials(BASE, 2, 1.37)
+    assert [trial.recipe.name for trial in on_disk] == [
+        trial.recipe.name for trial in collages if trial.claim != TRANSFER
+    ]
+    assert {trial.recipe.target for trial in on_disk} == {"depth"}
+
+
 def test_the_perceptual_loss_waits_for_its_file():
     with_file = trials(replace(BASE, vgg16_weights="vgg16.npz"), 1, 1.37)
     losses = [trial.recipe.loss for trial in with_file if trial.claim == LOSS]

@@ -6,34 +6,93 @@ are read:
 - 16-bit grey PNG of millimetres; 0 is unknown, and so is what is beyond 15 m;
 - 8-bit RGB PNG of (R + 256 G + 65536 B) / (2^24 - 1) of 15 m, lowest byte first, as the simulator CARLA packs
   it; 0 is unknown, and so is the greatest number, where 15 m cannot be told from what is beyond it.
+
+The second is written. Each written frame has its checksums in sums/NAME.sha256, for sha256sum --check in the
+root; they come last, so that a frame that has them is whole.
 """
 
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Shaped, UInt8
 
+from stereoweave.data.checksums import check_sums, checksums
 from stereoweave.data.frames import Frame, matched
 from stereoweave.data.samples import make_sample, of_its_size
-from stereoweave.errors import FormatError
-from stereoweave.io import calibrated, read_pair, read_pixels
-from stereoweave.stereo import Sample
+from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.io import calibrated, read_pair, read_pixels, reading, replacing, write_image
+from stereoweave.stereo import Sample, StereoCamera
 
 RANGE_M = 15.0
 _PACKED_MAX = 2**24 - 1
+_ENDINGS = {"left": "png", "right": "png", "calib": "txt", "depth": "png"}
 
 
 def paper(root: Path) -> list[Frame]:
     """The frames of left, right and depth, which hold files of equal names, in subfolders or not: scene/0001.
 
-    One camera made them all: calib.txt, in Middlebury's format, beside the three folders.
+    Beside the three folders lies the camera in Middlebury's format: calib.txt, which made them all, or
+    calib/scene/0001.txt for each.
     """
     camera = root / "calib.txt"
-    if not camera.exists():
+    if not (camera.exists() or (root / "calib").is_dir()):
         raise FormatError(f"{camera}: expected the camera in Middlebury's format, found no such file")
     folders = [root / name for name in ("left", "right", "depth")]
-    return [Frame(name=name, read=partial(_read, files, camera)) for name, files in matched(*folders).items()]
+
+    def camera_of(name: str) -> Path:
+        return camera if camera.exists() else _files(root, name)["calib"]
+
+    frames = matched(*folders).items()
+    return [Frame(name=name, read=partial(_read, files, camera_of(name))) for name, files in frames]
+
+
+def write_frame(root: Path, name: str, sample: Sample) -> None:
+    """Writes a frame with its camera; its checksums come last, and say that it is whole.
+
+    Depth of 15 m or more becomes unknown: the paper's camera reaches no further.
+
+    Raises:
+        StereoweaveError: The sample has no camera, or the folder cannot be written, or is full.
+    """
+    if sample.camera is None:
+        raise StereoweaveError(f"{root}: expected a sample with its camera, to write its depth, found none")
+    files = _files(root, name)
+    write_image(files["left"], sample.left)
+    write_image(files["right"], sample.right)
+    _write_text(files["calib"], _calibration(sample.camera, sample.left.shape[:2]))
+    write_image(files["depth"], _packed(sample.camera.depth_m(sample.disparity_px)))
+    contents = {path.relative_to(root).as_posix(): path.read_bytes() for path in files.values()}
+    _write_text(_sums(root, name), checksums(contents).decode())
+
+
+def whole_frames(root: Path) -> list[str]:
+    """The names of the frames that `write_frame` wrote to the end."""
+    sums = root / "sums"
+    return sorted(path.relative_to(sums).with_suffix("").as_posix() for path in sums.rglob("[!.]*.sha256"))
+
+
+def remove_unfinished(root: Path) -> None:
+    """Removes all but the frames that `write_frame` wrote to the end, where nobody is writing now."""
+    whole = set(whole_frames(root))
+    for folder in (root / name for name in _ENDINGS):
+        for path in folder.rglob("*.*"):
+            if path.relative_to(folder).with_suffix("").as_posix() not in whole:
+                path.unlink()
+
+
+def check_frame(root: Path, name: str) -> None:
+    """FormatError, naming the file, where a file of a written frame is damaged or missing."""
+    sums = _sums(root, name)
+    with reading(sums, "the checksums of a frame"):
+        expected = sums.read_bytes()
+    contents = {
+        path.relative_to(root).as_posix(): path.read_bytes()
+        for path in _files(root, name).values()
+        if path.exists()
+    }
+    remedy = f"delete {sums} and start the same stereoweave synth make again"
+    check_sums(contents, expected, root, remedy)
 
 
 def _read(files: list[Path], camera: Path) -> Sample:
@@ -50,3 +109,33 @@ def _depth_m(stored: Shaped[np.ndarray, "h w *channels"]) -> Float[np.ndarray, "
         return np.where((stored > 0) & (stored <= 1000 * RANGE_M), stored / 1000, np.nan)
     packed = stored @ np.array([1, 256, 65536])
     return np.where((packed > 0) & (packed < _PACKED_MAX), packed / _PACKED_MAX * RANGE_M, np.nan)
+
+
+def _packed(depth_m: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """The inverse of `_depth_m`; a known depth is 1 at least, so that it does not become an unknown one."""
+    known = (depth_m > 0) & (depth_m < RANGE_M)
+    number = np.rint(np.where(known, depth_m, 0) / RANGE_M * _PACKED_MAX).clip(1, _PACKED_MAX - 1)
+    number = np.where(known, number, 0).astype(np.uint32)
+    return np.stack([number & 255, number >> 8 & 255, number >> 16], axis=-1).astype(np.uint8)
+
+
+def _calibration(camera: StereoCamera, shape: tuple[int, ...]) -> str:
+    focal_px, cx_px, cy_px, doffs_px = camera.focal_px, camera.cx_px, camera.cy_px, camera.doffs_px
+    return (
+        f"cam0=[{focal_px} 0 {cx_px}; 0 {focal_px} {cy_px}; 0 0 1]\n"
+        f"cam1=[{focal_px} 0 {cx_px + doffs_px}; 0 {focal_px} {cy_px}; 0 0 1]\n"
+        f"doffs={doffs_px}\nbaseline={1000 * camera.baseline_m}\nwidth={shape[1]}\nheight={shape[0]}\n"
+    )
+
+
+def _files(root: Path, name: str) -> dict[str, Path]:
+    return {folder: root / folder / f"{name}.{ending}" for folder, ending in _ENDINGS.items()}
+
+
+def _sums(root: Path, name: str) -> Path:
+    return root / "sums" / f"{name}.sha256"
+
+
+def _write_text(path: Path, text: str) -> None:
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")

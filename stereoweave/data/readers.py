@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from stereoweave.data import eth3d, kitti, middlebury, paper_layout, scene_flow, sintel
+from stereoweave.data import eth3d, kitti, middlebury, paper_layout, scene_flow, shards, sintel
 from stereoweave.data.frames import Frame, existing
 from stereoweave.data.splits import split_frames
 from stereoweave.errors import FormatError, StereoweaveError
@@ -31,6 +31,7 @@ DATASETS: dict[str, Callable[[Path], list[Frame]]] = {
     "middlebury2021": middlebury.middlebury2021,
     "eth3d": eth3d.eth3d,
     "paper": paper_layout.paper,
+    "shards": shards.shards,
 }
 
 

@@ -7,7 +7,7 @@ from torch.utils.data import Dataset
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn.augment import augment, cut
 from stereoweave.learn.recipe import Recipe
-from stereoweave.learn.sources import Source
+from stereoweave.learn.sources import Mix, Ordered, Source
 from stereoweave.stereo import Sample
 
 
@@ -16,6 +16,7 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
 
     def __init__(self, recipe: Recipe, pairs: Source) -> None:
         self.recipe, self.pairs = recipe, pairs
+        self.mix = pairs if isinstance(pairs, Mix) else Mix((pairs,), (1.0,))
 
     def __getitem__(self, step: int) -> dict[str, torch.Tensor]:
         rng = np.random.default_rng((self.recipe.seed, step))
@@ -24,17 +25,24 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
         return collated([part(sample, *self.recipe.crop_size, rng) for sample in samples])
 
     def chosen(self, step: int) -> list[int]:
-        """Indices of the pairs of a step: every pair once before any comes again."""
-        count = self.pairs.count
-        places = range(step * self.recipe.batch, (step + 1) * self.recipe.batch)
-        return [int(self._order(place // count)[place % count]) for place in places]
+        """Indices of the pairs of a step: of each set every pair once before any comes again."""
+        end = (step + 1) * self.recipe.batch
+        # With those of all steps before, so that each step stands alone: 5 ms for 60,000 steps of 4.
+        drawn = self.mix.drawn(end, np.random.default_rng((self.recipe.seed, 0, 0, 1)))
+        turns = ((drawn[place], drawn[:place]) for place in range(end - self.recipe.batch, end))
+        return [self._index(int(which), int((before == which).sum())) for which, before in turns]
 
     def names(self, step: int) -> list[str]:
         """What errors call the pairs of a step."""
         return [self.pairs.name(index) for index in self.chosen(step)]
 
-    def _order(self, epoch: int) -> np.ndarray:
-        return np.random.default_rng((self.recipe.seed, epoch, 1)).permutation(self.pairs.count)
+    def _index(self, which: int, turn: int) -> int:
+        """The index of the pair that a set gives when it is drawn for that time, counted from 0."""
+        one = self.mix.sets[which]
+        epoch, place = divmod(turn, one.count)
+        rng = np.random.default_rng((self.recipe.seed, epoch, 1 + which))
+        order = one.order(rng) if isinstance(one, Ordered) else rng.permutation(one.count)
+        return self.mix.first(which) + int(order[place])
 
 
 def known(pairs: Source, index: int) -> Sample:

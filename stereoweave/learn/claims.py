@@ -19,7 +19,7 @@ class PaperRow:
         steps: Of the training; pairs it saw are steps * batch.
         prediction: Loss between codes, as the network was trained with it.
         squared_error: The same between codes without exponent, which can be compared between exponents.
-        epe_px, mae_sourced, sourced_percent, mae_filled, psnr_db, ssim: See `ViewRow`.
+        epe_px, epe_cm, mae_sourced, sourced_percent, mae_filled, psnr_db, ssim: See `ViewRow`.
         minutes: Wall time of the training and of the one it started from, beside others on the same machine.
     """
 
@@ -36,6 +36,7 @@ class PaperRow:
     prediction: float
     squared_error: float
     epe_px: float
+    epe_cm: float
     mae_sourced: float
     sourced_percent: float
     mae_filled: float
@@ -74,15 +75,18 @@ TABLE_I = {
     "psmnet": ((3.85, 8.12, 3.88, 2.38), (7.94, 10.32, 7.36, 41.22)),
     "fast_depth": ((3.95, 6.42, 4.08, 2.32), (7.99, 8.24, 7.93, 37.31)),
 }
+# The only column whose target is depth.
+_PROPELLER = 3
 _COLUMNS = {
-    "epe_px": ".2f",
-    "squared_error": ".5f",
-    "mae_filled": ".2f",
-    "mae_sourced": ".2f",
-    "sourced_percent": ".1f",
-    "psnr_db": ".2f",
-    "ssim": ".3f",
-    "minutes": ".1f",
+    "epe_cm": ("EPE cm", ".1f"),
+    "epe_px": ("EPE px", ".2f"),
+    "squared_error": ("squared error", ".5f"),
+    "mae_filled": ("MAE", ".2f"),
+    "mae_sourced": ("MAE of sourced", ".2f"),
+    "sourced_percent": ("sourced %", ".1f"),
+    "psnr_db": ("PSNR dB", ".2f"),
+    "ssim": ("SSIM", ".3f"),
+    "minutes": ("minutes", ".1f"),
 }
 # What a setting is claimed to lower: the measure, what we call it, the paper's words, percent.
 _Measured = tuple[str, str, str, float | None]
@@ -115,9 +119,9 @@ _VARIANTS = (
 RUN_TIMES = {"fast_depth": 1.05, "densemapnet": 1.0, "dispnet": 2.0, "psmnet": 10.0}
 
 
-def comparisons() -> Iterator[Comparison]:
-    """The claims that one number can decide."""
-    for text, claim, reference, changed, measures in (*_VARIANTS, *_rivals()):
+def comparisons(depth: bool = False) -> Iterator[Comparison]:
+    """The claims that one number can decide; with `depth` as target end-point errors are in cm."""
+    for text, claim, reference, changed, measures in (*_VARIANTS, *_rivals(depth)):
         for measure, name, paper, percent in measures:
             yield Comparison(
                 text=f"{text}: {name}",
@@ -126,25 +130,28 @@ def comparisons() -> Iterator[Comparison]:
                 claim=claim,
                 reference=reference,
                 changed=changed,
-                measure=measure,
+                measure="epe_cm" if depth and measure == "epe_px" else measure,
             )
 
 
-def _rivals() -> Iterator[tuple[str, str, str, str, tuple[_Measured, ...]]]:
-    """What Table I comes to for each rival, as rows of _VARIANTS."""
+def _rivals(depth: bool) -> Iterator[tuple[str, str, str, str, tuple[_Measured, ...]]]:
+    """What Table I comes to for each rival, as rows of _VARIANTS; with `depth` its column of depth alone."""
     for rival in ("densemapnet", "dispnet", "psmnet"):
         claim = NETWORKS_SHORT if rival == "psmnet" else NETWORKS
         measures = (
-            _in_table_i(rival, 0, "epe_px", "end-point error"),
-            _in_table_i(rival, 1, "mae_filled", "MAE of the right view"),
+            _in_table_i(rival, 0, "epe_px", "end-point error", depth),
+            _in_table_i(rival, 1, "mae_filled", "MAE of the right view", depth),
         )
         yield f"the paper's network against {rival}", claim, rival, "fast_depth", measures
 
 
-def _in_table_i(rival: str, column: int, measure: str, name: str) -> _Measured:
+def _in_table_i(rival: str, column: int, measure: str, name: str, depth: bool) -> _Measured:
     numbers = zip(TABLE_I[rival][column], TABLE_I["fast_depth"][column], strict=True)
     less = [less_percent(*both) for both in numbers]
-    return measure, name, " ".join(f"{value:z.0f}" for value in less) + " % (Table I)", float(np.mean(less))
+    where = "Table I"
+    if depth:
+        less, where = [less[_PROPELLER]], "Table I, Propeller"
+    return measure, name, f"{' '.join(f'{value:z.0f}' for value in less)} % ({where})", float(np.mean(less))
 
 
 def less_percent(reference: float, changed: float) -> float:
@@ -170,13 +177,16 @@ def half_width(values: Sequence[float]) -> float:
     return float(stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values)))
 
 
-def claims_table(rows: Sequence[PaperRow]) -> str:
-    """Markdown: what the paper says, what was measured, the difference, and whether that holds here."""
+def claims_table(rows: Sequence[PaperRow], depth: bool = False) -> str:
+    """Markdown: what the paper says, what was measured, the difference, and whether that holds here.
+
+    With `depth` as target end-point errors are in cm, and of Table I only Propeller's are compared.
+    """
     lines = [
         "| claim: percent less | paper | here (95 % interval) | difference (points) | verdict |",
         "|---|---|---|---|---|",
     ]
-    for comparison in comparisons():
+    for comparison in comparisons(depth):
         values = by_seed(rows, comparison)
         if not values:
             lines.append(f"| {comparison.text} | {comparison.paper} | not run | | |")
@@ -190,20 +200,38 @@ def claims_table(rows: Sequence[PaperRow]) -> str:
     return "\n".join(lines)
 
 
-def settings_table(rows: Sequence[PaperRow], claim: str) -> str:
+def propeller_table(rows: Sequence[PaperRow]) -> str:
+    """Markdown: the networks, on pairs of our own, beside Table I's column of depth, Propeller."""
+    columns = "network", "steps", "EPE cm: paper", "here", "difference", "MAE of the right view: paper"
+    lines = [f"| {' | '.join((*columns, 'here', 'difference'))} |", "|---" * 8 + "|"]
+    found = [row for row in rows if row.claim in (NETWORKS, NETWORKS_SHORT)]
+    for network, steps in sorted({(row.model, row.steps) for row in found}, key=_as_table_i):
+        chosen = [row for row in found if (row.model, row.steps) == (network, steps)]
+        cells = [network, str(steps)]
+        for column, measure in zip(TABLE_I[network], ("epe_cm", "mae_filled"), strict=True):
+            paper, here = column[_PROPELLER], _mean(chosen, measure)
+            cells += [f"{paper:.2f}", f"{here:.2f}", _difference(here, paper, 2)]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def settings_table(rows: Sequence[PaperRow], claim: str, depth: bool = False) -> str:
     """Markdown: the settings of one claim with the means over their seeds; the lowest filled MAE first.
 
-    Settings of one seed come after those of several: a single score is no rival of a mean.
+    Settings of one seed come after those of several: a single score is no rival of a mean. With `depth` as
+    target there are end-point errors in cm too.
     """
-    columns = "setting", "seeds", "EPE px", "squared error", "MAE", "MAE of sourced", "sourced %", "PSNR dB"
-    lines = [f"| {' | '.join((*columns, 'SSIM', 'minutes'))} |", "|---" * 10 + "|"]
+    columns = {name: column for name, column in _COLUMNS.items() if depth or name != "epe_cm"}
+    headings = ["setting", "seeds", *(heading for heading, _ in columns.values())]
+    lines = [f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
+    first = next(iter(columns))
     settings = dict.fromkeys(row.setting for row in rows if row.claim == claim)
     chosen = {name: [row for row in rows if _of(row, claim, name)] for name in settings}
     ranked = sorted(chosen.items(), key=lambda item: (len(item[1]) == 1, _mean(item[1], "mae_filled")))
     for name, found in ranked:
-        spread = f" ± {np.std([row.epe_px for row in found], ddof=1):.2f}" if len(found) > 1 else ""
-        numbers = [f"{_mean(found, measure):{digits}}" for measure, digits in _COLUMNS.items()]
-        numbers[0] += spread
+        numbers = [f"{_mean(found, measure):{digits}}" for measure, (_, digits) in columns.items()]
+        if len(found) > 1:
+            numbers[0] += f" ± {np.std([getattr(row, first) for row in found], ddof=1):{columns[first][1]}}"
         lines.append(f"| {name} | {len(found)} | {' | '.join(numbers)} |")
     return "\n".join(lines)
 
@@ -254,6 +282,11 @@ def _verdict(comparison: Comparison, mean: float, half: float) -> str:
     if comparison.paper_percent is None:
         return "better"
     return "better, but less than claimed" if high < comparison.paper_percent else "holds"
+
+
+def _as_table_i(trained: tuple[str, int]) -> tuple[int, int]:
+    """The order of Table I's rows, and of the steps."""
+    return list(TABLE_I).index(trained[0]), trained[1]
 
 
 def _of(row: PaperRow, claim: str, setting: str) -> bool:

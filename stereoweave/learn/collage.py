@@ -12,8 +12,8 @@ from jaxtyping import Float, UInt8
 
 from stereoweave.learn.paint import Paint, Sheet, colour, cover, expose, occlusion, seen_from_right, surface
 from stereoweave.learn.shapes import Patch, Place, below, draw_shape, everywhere, rods
-from stereoweave.learn.textures import SIDE, Bank, bank, natural_colour
 from stereoweave.stereo import Sample
+from stereoweave.synth.patterns import SIDE, Bank, bank, natural_colour
 
 PLANE_SLOPE = 0.3  # px of disparity a px: steeper surfaces are rare and nearly edge-on to one camera
 BEND_SLOPE = 0.25  # bends add to the plane; together below 0.6, so that no surface turns its back

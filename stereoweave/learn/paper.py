@@ -31,7 +31,8 @@ def plan(
         claims: Names in CLAIMS.
 
     Raises:
-        StereoweaveError: The base is not of the paper's network, collages and disparity, or too short.
+        StereoweaveError: The base is not of the paper's network, is too short, or has depth as its target
+            where pairs have no camera.
     """
     _check(base)
     training, _ = (kept(pairs, console) for pairs in sources(base, runs / "pairs"))
@@ -59,7 +60,9 @@ def run_trials(planned: Iterable[Trial], runs: Path, jobs: int, console: Console
 
 
 def _check(base: Recipe) -> None:
-    for key, expected in {"model": "fast_depth", "dataset": COLLAGE, "target": "disparity"}.items():
+    # A collage has no camera.
+    target = {"target": "disparity"} if base.dataset == COLLAGE else {}
+    for key, expected in {"model": "fast_depth", **target}.items():
         if (found := getattr(base, key)) != expected:
             raise StereoweaveError(
                 f"{base.name}: {key} = {found!r}, expected {expected!r}, which the experiment starts from"

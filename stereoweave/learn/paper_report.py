@@ -13,18 +13,25 @@ from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io import make_folder, replacing
 from stereoweave.learn import checkpoint
 from stereoweave.learn.checkpoint import Checkpoint
-from stereoweave.learn.claims import PaperRow, claims_table, run_time_table, settings_table
+from stereoweave.learn.claims import (
+    PaperRow,
+    claims_table,
+    propeller_table,
+    run_time_table,
+    settings_table,
+)
 from stereoweave.learn.evaluation import evaluate, held_out_of, method_of
 from stereoweave.learn.figures import draw_exponent_curves, draw_iterations, draw_validation, draw_views
 from stereoweave.learn.objective import truth_histogram
-from stereoweave.learn.recipe import Recipe
-from stereoweave.learn.sources import sources
+from stereoweave.learn.recipe import COLLAGE, Recipe
+from stereoweave.learn.sources import Source, sources
 from stereoweave.learn.train import CURVE, read_record
 from stereoweave.learn.trials import (
     ADJUSTMENT,
     FITTED,
     ITERATIONS,
     NETWORKS,
+    NETWORKS_SHORT,
     PROJECTION,
     SCRATCH,
     TRANSFER,
@@ -44,6 +51,7 @@ class Report:
     """What the tables and figures are made of.
 
     Attributes:
+        training, held_out: The pairs of the base.
         planned: All trials.
         trained: Those that are trained to their end.
         missing: The names of the others' recipes.
@@ -54,6 +62,8 @@ class Report:
     """
 
     base: Recipe
+    training: Source
+    held_out: Source
     planned: list[Trial]
     trained: list[Trial]
     missing: list[str]
@@ -61,6 +71,11 @@ class Report:
     curves: dict[str, list[dict[str, float]]]
     rows: list[PaperRow]
     common: list[ViewRow]
+
+    @property
+    def depth(self) -> bool:
+        """Whether depth is what was learned, which is scored in cm."""
+        return self.base.target == "depth"
 
 
 def write_report(base: Recipe, planned: Sequence[Trial], runs: Path, out: Path) -> None:
@@ -81,7 +96,7 @@ def write_report(base: Recipe, planned: Sequence[Trial], runs: Path, out: Path) 
     write_csv(out / "paper.csv", report.rows)
     with replacing(out / "paper.md") as temporary:
         temporary.write_text(_markdown(report, run_time), encoding="utf-8")
-    _draw(report, runs, out)
+    _draw(report, out)
 
 
 def _gathered(base: Recipe, planned: Sequence[Trial], runs: Path) -> Report:
@@ -95,8 +110,11 @@ def _gathered(base: Recipe, planned: Sequence[Trial], runs: Path) -> Report:
         )
     scores, common = _scores([base, *(trial.recipe for trial in trained)], runs)
     names = {trial.recipe.name for trial in trained}
+    training, held_out = sources(base, runs / "pairs", whole=True)
     return Report(
         base=base,
+        training=training,
+        held_out=held_out,
         planned=list(planned),
         trained=trained,
         missing=sorted(files.keys() - names),
@@ -143,6 +161,7 @@ def _row(trial: Trial, kept: Checkpoint, score: ViewRow) -> PaperRow:
         prediction=kept.scores["prediction"],
         squared_error=kept.scores["squared_error"],
         epe_px=score.epe_px,
+        epe_cm=score.epe_cm,
         mae_sourced=score.mae_sourced,
         sourced_percent=score.sourced_percent,
         mae_filled=score.mae_filled,
@@ -157,15 +176,17 @@ def _markdown(report: Report, run_time: str) -> str:
     """The tables, and what was not run."""
     parts = [
         "# The paper's experiment: what was measured",
-        *_head(report.base),
+        *_head(report),
         "## The claims",
-        claims_table(report.rows),
+        claims_table(report.rows, report.depth),
     ]
+    if report.depth and any(row.claim in (NETWORKS, NETWORKS_SHORT) for row in report.rows):
+        parts += ["## Table I, Propeller", propeller_table(report.rows)]
     for claim in dict.fromkeys(row.claim for row in report.rows):
-        parts += [f"## {claim.capitalize()}", settings_table(report.rows, claim)]
+        parts += [f"## {claim.capitalize()}", settings_table(report.rows, claim, report.depth)]
         if claim == ADJUSTMENT and (fitted := _fitted(report.planned)):
             parts.append(fitted)
-    parts += ["## What needs no training", _common_table(report.common)]
+    parts += ["## What needs no training", _common_table(report.common, report.depth)]
     if reached := _transfer(report):
         parts += ["## Transfer: steps to one validation loss", reached]
     if run_time:
@@ -175,21 +196,39 @@ def _markdown(report: Report, run_time: str) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _head(base: Recipe) -> list[str]:
+def _head(report: Report) -> list[str]:
     """What all trainings share, what of it is not the paper's, and how the tables are read."""
+    base = report.base
+    another_set = " (in the transfer, of another set)" if base.dataset == COLLAGE else ""
+    unknown = (
+        f" Beyond {base.max_depth_m:g} m ground truth is unknown and gives no source." if report.depth else ""
+    )
     return [
-        f"Written by `stereoweave bench paper`. {base.pairs} collage pairs of "
-        f"{base.crop_size[1]}x{base.crop_size[0]} a seed, batch {base.batch}, {base.steps} steps unless a "
-        f"table says otherwise, Adam at {base.learning_rate:g}; scores over {base.validation_pairs} held-out "
-        "pairs. Right view: made from the left image by forward projection; MAE, 0 to 255, over all pixels "
-        "after one row fill, then over the pixels that received a source, and their share.",
+        f"Written by `stereoweave bench paper`. {_pairs(report)}, batch {base.batch}, {base.steps} steps "
+        f"unless a table says otherwise, Adam at {base.learning_rate:g}; scores over "
+        f"{report.held_out.count} held-out pairs. Right view: made from the left image by forward "
+        "projection; MAE, 0 to 255, over all pixels after one row fill, then over the pixels that received a "
+        f"source, and their share.{unknown}",
         f"Not the paper's: what is scored are weights averaged over about {base.averaged_steps} steps; "
         "gradients are clipped at norm 5; precision is bf16-mixed where the processor has it, else float32; "
         f"PyTorch is {torch.__version__}. The rivals train with the losses of their own papers (DispNet with "
         "its learning rate too), without this paper's depth adjustment and projection loss.",
-        f"± is the standard deviation over the seeds. A row of one seed is of seed {base.seed} alone (in the "
-        "transfer, of another set); it comes after the means over several and is not ranked against them.",
+        f"± is the standard deviation over the seeds. A row of one seed is of seed {base.seed} alone"
+        f"{another_set}; it comes after the means over several and is not ranked against them.",
     ]
+
+
+def _pairs(report: Report) -> str:
+    """What was trained on."""
+    base = report.base
+    size = f"{base.crop_size[1]}x{base.crop_size[0]}"
+    if base.dataset == COLLAGE:
+        return f"{base.pairs} collage pairs of {size} a seed"
+    target = f"depth up to {base.max_depth_m:g} m" if report.depth else "disparity"
+    return (
+        f"{report.training.count} pairs of {base.root}, the same for every seed, in cuts of {size}; split "
+        f"{base.split}, target {target}"
+    )
 
 
 def _fitted(planned: Sequence[Trial]) -> str:
@@ -218,11 +257,13 @@ def _run_time(path: Path) -> str:
     return f"A pair of 640x480, all cores of a processor; the paper's are of GPUs.\n\n{table}"
 
 
-def _common_table(rows: Sequence[ViewRow]) -> str:
-    lines = ["| method | EPE px | MAE | MAE of sourced | sourced % | PSNR dB | SSIM |", "|---" * 7 + "|"]
+def _common_table(rows: Sequence[ViewRow], depth: bool) -> str:
+    columns = ["method", *(["EPE cm"] if depth else []), "EPE px", "MAE", "MAE of sourced", "sourced %"]
+    lines = [f"| {' | '.join((*columns, 'PSNR dB', 'SSIM'))} |", "|---" * (len(columns) + 2) + "|"]
     for row in rows:
+        in_cm = f" {row.epe_cm:.1f} |" if depth else ""
         lines.append(
-            f"| {row.method} | {row.epe_px:.2f} | {row.mae_filled:.2f} | {row.mae_sourced:.2f} "
+            f"| {row.method} |{in_cm} {row.epe_px:.2f} | {row.mae_filled:.2f} | {row.mae_sourced:.2f} "
             f"| {row.sourced_percent:.1f} | {row.psnr_db:.2f} | {row.ssim:.3f} |"
         )
     return "\n".join(lines)
@@ -249,13 +290,13 @@ def _transfer(report: Report) -> str:
     )
 
 
-def _draw(report: Report, runs: Path, out: Path) -> None:
+def _draw(report: Report, out: Path) -> None:
     """Fig. 2, left and right, and the same of the projection loss; Fig. 3; Fig. 5; as far as trained."""
-    training, held_out = sources(report.base, runs / "pairs")
+    held_out = report.held_out
     claims = {row.claim for row in report.rows}
     if ADJUSTMENT in claims:
         exponents = {row.exponent for row in report.rows if row.claim == ADJUSTMENT}
-        histogram = truth_histogram(report.base, training)
+        histogram = truth_histogram(report.base, report.training)
         draw_exponent_curves(out / "exponent_curves.png", sorted(exponents), histogram)
     for claim, name in ((ADJUSTMENT, "exponent"), (PROJECTION, "projection")):
         if claim in claims:

@@ -8,12 +8,6 @@ from typing import Any
 
 from stereoweave.errors import FormatError
 
-_KINDS: dict[object, str] = {
-    int: "a whole number",
-    float: "a number",
-    str: "a text in quotes",
-    bool: "true or false",
-}
 _POSITIVE = (
     "steps",
     "batch",
@@ -27,7 +21,15 @@ _POSITIVE = (
 )
 _AT_LEAST = {"exponent": 1, "alpha_z": 0, "alpha_p": 0}
 COLLAGE = "collage"
+Weights = tuple[tuple[str, float], ...]
 TARGETS = ("disparity", "depth")
+_KINDS: dict[object, str] = {
+    int: "a whole number",
+    float: "a number",
+    str: "a text in quotes",
+    bool: "true or false",
+    Weights: "a table of sets and their weights, such as collage = 0.5",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +48,8 @@ class Recipe:
             lags behind, shorter keeps the noise of single batches, and 1 is the weights themselves.
         dataset: "collage", or a name in DATASETS.
         root: folder of the dataset as its authors unpack it; empty for collage.
+        mix: what to train on instead of the dataset alone: sets, which are "collage" or folders of rendered
+            pairs (data/shards.py), and their weights, of which the ratios count. Scores stay the dataset's.
         split: how the frames of a dataset are parted, a name in SPLITS (data/splits.py).
         pairs: collage pairs made once and kept; later steps cut them differently.
         pair_size: height and width of a kept collage pair.
@@ -76,6 +80,7 @@ class Recipe:
     averaged_steps: int = 500
     dataset: str = COLLAGE
     root: str = ""
+    mix: Weights = ()
     split: str = "random"
     pairs: int = 4000
     pair_size: tuple[int, int] = (320, 512)
@@ -122,9 +127,11 @@ def recipe_from(values: dict[str, Any], source: str) -> Recipe:
     if missing := [name for name in needed if name not in values]:
         raise FormatError(f"{source}: missing key {missing[0]!r}; a recipe needs {', '.join(needed)}")
     settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-    recipe = Recipe(**settings)
+    # A table in TOML, pairs of set and weight in a checkpoint.
+    recipe = Recipe(**{**settings, "mix": tuple(dict(settings.get("mix", ())).items())})
     _check_numbers(recipe, source)
     _check_sizes(recipe, source)
+    _check_mix(recipe, source)
     if recipe.target not in TARGETS:
         raise FormatError(f"{source}: target = {recipe.target!r}, expected {' or '.join(TARGETS)}")
     if (recipe.dataset == COLLAGE) == bool(recipe.root):
@@ -153,9 +160,27 @@ def _check_sizes(recipe: Recipe, source: str) -> None:
         )
 
 
+def _check_mix(recipe: Recipe, source: str) -> None:
+    for name, weight in recipe.mix:
+        if not 0 < weight < math.inf:
+            raise FormatError(f"{source}: mix: weight {weight} of {name!r}, expected more than 0")
+    if recipe.mix and recipe.dataset != COLLAGE:
+        raise FormatError(
+            f"{source}: mix with dataset = {recipe.dataset!r}, expected {COLLAGE!r}, which a mix is scored on"
+        )
+
+
 def _fits(value: object, expected: Any) -> bool:
     if expected is float:
         return isinstance(value, float | int) and not isinstance(value, bool)
     if expected in (int, str, bool):
         return type(value) is expected
+    if expected is Weights:
+        pairs = list(value.items()) if isinstance(value, dict) else value
+        return isinstance(pairs, list | tuple) and all(_is_weighted(pair) for pair in pairs)
     return isinstance(value, list | tuple) and len(value) == 2 and all(type(v) is int for v in value)
+
+
+def _is_weighted(pair: object) -> bool:
+    """Whether it is the name of a set and its weight."""
+    return isinstance(pair, list | tuple) and len(pair) == 2 and _fits(pair[0], str) and _fits(pair[1], float)

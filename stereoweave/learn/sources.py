@@ -1,17 +1,19 @@
-"""Where a recipe's pairs come from: collages that are kept, or the frames of a dataset on disk."""
+"""Where a recipe's pairs come from: collages, rendered sets mixed in, or a dataset's frames on disk."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Int
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from stereoweave.data.readers import DATASETS, Frame, open_dataset, split_frames
+from stereoweave.data.shards import Shards, list_shards
 from stereoweave.errors import FormatError
 from stereoweave.learn.pairs import KeptPairs
 from stereoweave.learn.recipe import COLLAGE, Recipe
+from stereoweave.progress import progress
 from stereoweave.stereo import Sample
 
 # Validation pairs come from this seed; a recipe's own is small.
@@ -30,6 +32,51 @@ class Source(Protocol):
     def name(self, index: int) -> str:
         """What an error calls the sample."""
         ...
+
+
+@runtime_checkable
+class Ordered(Protocol):
+    """A source that is read faster in some orders than in others."""
+
+    def order(self, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
+        """All of its indices, in an order to read them in."""
+        ...
+
+
+@dataclass(frozen=True)
+class Mix:
+    """Sets one behind another as one source, and the weights by which training draws from them."""
+
+    sets: tuple[Source, ...]
+    weights: tuple[float, ...]
+
+    @property
+    def count(self) -> int:
+        return sum(one.count for one in self.sets)
+
+    def __getitem__(self, index: int) -> Sample:
+        source, own = self._own(index)
+        return source[own]
+
+    def name(self, index: int) -> str:
+        source, own = self._own(index)
+        return source.name(own)
+
+    def first(self, which: int) -> int:
+        """The index of the first pair of a set."""
+        return sum(one.count for one in self.sets[:which])
+
+    def drawn(self, places: int, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
+        """The set of each place, by weight; fewer places from the same numbers are the first of more."""
+        bounds = np.cumsum(self.weights) / np.sum(self.weights)
+        return np.searchsorted(bounds[:-1], rng.random(places), side="right")
+
+    def _own(self, index: int) -> tuple[Source, int]:
+        for one in self.sets:
+            if index < one.count:
+                return one, index
+            index -= one.count
+        raise IndexError(index)
 
 
 @dataclass(frozen=True)
@@ -55,8 +102,9 @@ def sources(recipe: Recipe, folder: Path, whole: bool = False) -> tuple[Source, 
     Of the held-out frames of a dataset `validation_pairs` are taken, evenly spread, or all if `whole`.
     """
     if recipe.dataset == COLLAGE:
+        collages = KeptPairs(folder, recipe.seed, recipe.pairs, recipe.pair_size)
         return (
-            KeptPairs(folder, recipe.seed, recipe.pairs, recipe.pair_size),
+            _mixed(recipe, collages) if recipe.mix else collages,
             KeptPairs(folder, VALIDATION_SEED, recipe.validation_pairs, recipe.pair_size),
         )
     if recipe.dataset not in DATASETS:
@@ -70,17 +118,44 @@ def sources(recipe: Recipe, folder: Path, whole: bool = False) -> tuple[Source, 
     return Frames(training), Frames([held_out[i] for i in spread])
 
 
+def _mixed(recipe: Recipe, collages: Source) -> Mix:
+    sets: list[Source] = []
+    weights: list[float] = []
+    for name, weight in recipe.mix:
+        found = [collages] if name == COLLAGE else _rendered(recipe, Path(name))
+        count = sum(one.count for one in found)
+        sets += found
+        weights += [weight * one.count / count for one in found]
+    return Mix(tuple(sets), tuple(weights))
+
+
+def _rendered(recipe: Recipe, folder: Path) -> list[Source]:
+    """The set in a folder, or those in the folders in it; FormatError for none, or one too small to cut."""
+    folders = [path for path in (folder, *sorted(folder.glob("*/"))) if list_shards(path)]
+    if not folders:
+        raise FormatError(
+            f"{recipe.name}: mix: {folder}: expected pairs of `stereoweave synth make`, or folders of such, "
+            "found none; make them first"
+        )
+    sets: list[Source] = [Shards(path) for path in folders]
+    for path, one in zip(folders, sets, strict=True):
+        rows, columns = one[0].disparity_px.shape
+        if recipe.crop_size[0] > rows or recipe.crop_size[1] > columns:
+            raise FormatError(
+                f"{recipe.name}: crop_size = {list(recipe.crop_size)}, expected at most {[rows, columns]}, "
+                f"the size of the pairs in {path}; cut less"
+            )
+    return sets
+
+
 def kept(pairs: Source, console: Console) -> Source:
     """The pairs; collages are made before if they were not there."""
+    if isinstance(pairs, Mix):
+        for one in pairs.sets:
+            kept(one, console)
     if isinstance(pairs, KeptPairs) and (missing := len(pairs.missing())):
         with progress(console) as bar:
             task = bar.add_task("making pairs", total=missing, loss="", rate="")
             for _ in pairs.make():
                 bar.advance(task)
     return pairs
-
-
-def progress(console: Console) -> Progress:
-    """A bar for long work; its tasks have the fields loss and rate."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, TextColumn("{task.fields[loss]} {task.fields[rate]}"), console=console)

@@ -28,7 +28,8 @@ from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.models import network_of
 from stereoweave.learn.objective import fitted, naming, objective_of
 from stereoweave.learn.recipe import COLLAGE, Recipe, read_recipe
-from stereoweave.learn.sources import kept, progress, sources
+from stereoweave.learn.sources import kept, sources
+from stereoweave.progress import progress
 
 # Beside a run's checkpoint: its scores after each validation.
 CURVE = "validation.csv"

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-from stereoweave.learn.recipe import Recipe
+from stereoweave.learn.recipe import COLLAGE, Recipe
 
 CLAIMS = NETWORKS, NETWORKS_SHORT, ADJUSTMENT, PROJECTION, LOSS, DECODER, TRANSFER, ITERATIONS = (
     "networks",
@@ -46,7 +46,8 @@ class Trial:
 def trials(base: Recipe, seeds: int, fitted_exponent: float) -> list[Trial]:
     """All trainings of the experiment, the most wanted first.
 
-    One that serves several claims comes once for each, under the same recipe name.
+    One that serves several claims comes once for each, under the same recipe name. The transfer, to other
+    collages, is for collages alone: of a dataset on disk the recipe knows no other set.
 
     Args:
         base: The paper's recipe, for the data at hand.
@@ -67,7 +68,7 @@ def trials(base: Recipe, seeds: int, fitted_exponent: float) -> list[Trial]:
         *_each(seeds, base, DECODER, {PAPER: {}, "upsampled at once, no skips": {"model": "densemapnet"}}),
         *_each(seeds, base, DECODER, {"step-wise, no skips": {"model": "fast_depth_without_skips"}}),
         *_each(seeds, base, LOSS, {"l2": {}, **{loss: {"loss": loss} for loss in _other_losses(base)}}),
-        *_transfer(base),
+        *(_transfer(base) if base.dataset == COLLAGE else ()),
         *_each(1, base, ITERATIONS, {f"{steps} steps": {"steps": steps} for steps in FIGURE_3_STEPS}),
         *_each(1, base, NETWORKS, {"dispnet": _rival("dispnet")}),
     ]

@@ -4,8 +4,8 @@ import sys
 import numpy as np
 import pytest
 
-from stereoweave.learn import textures
-from stereoweave.learn.textures import NATURAL, PERIODIC, PHOTOGRAPHS, SIDE, bank, power_noise, procedural
+from stereoweave.synth import patterns
+from stereoweave.synth.patterns import NATURAL, PERIODIC, PHOTOGRAPHS, SIDE, bank, power_noise, procedural
 
 
 def test_the_bank_holds_textures_of_one_size_and_is_built_once():
@@ -17,7 +17,7 @@ def test_the_bank_holds_textures_of_one_size_and_is_built_once():
 
 def test_about_half_of_the_textures_are_crops_of_photographs():
     total = len(bank().natural) + len(bank().periodic)
-    assert 0.4 < textures.PHOTOGRAPH_CROPS / total < 0.6
+    assert 0.4 < patterns.PHOTOGRAPH_CROPS / total < 0.6
 
 
 def test_every_texture_shows_something():
@@ -26,7 +26,7 @@ def test_every_texture_shows_something():
 
 def test_a_texture_depends_on_its_number_alone():
     alone = procedural(NATURAL, 40)
-    np.testing.assert_array_equal(alone, bank().natural[textures.PHOTOGRAPH_CROPS + 40])
+    np.testing.assert_array_equal(alone, bank().natural[patterns.PHOTOGRAPH_CROPS + 40])
 
 
 @pytest.mark.parametrize("kinds", [NATURAL, PERIODIC])
@@ -56,6 +56,6 @@ def test_light_maps_never_darken_to_black_nor_blind():
         assert 0.2 < light.min() <= light.max() < 1.7
 
 
-def test_importing_the_textures_does_not_import_scikit_image():
-    code = "import sys, stereoweave.learn.textures; assert 'skimage' not in sys.modules"
+def test_importing_the_patterns_does_not_import_scikit_image():
+    code = "import sys, stereoweave.synth.patterns; assert 'skimage' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

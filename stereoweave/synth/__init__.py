@@ -1,0 +1,1 @@
+"""Synthetic stereo with exact ground truth: scenes, textures, and the renderer."""

@@ -1,0 +1,81 @@
+"""How a rig's camera sees: matrices, rays, and which triangles are in view."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from stereoweave.synth.rigs import Rig
+
+# What is nearer is not seen. The depth buffer's 24 bits are spread from here to infinity.
+NEAR_M = 0.1
+
+
+def projection(rig: Rig) -> Float[np.ndarray, "4 4"]:
+    """From camera coordinates (right, down, forward, 1) to OpenGL's clip space.
+
+    Rows of the frame buffer count downwards as those of the image do, so that nothing is turned over on
+    reading. Pixel centres are integers for the rig and halves for OpenGL.
+    """
+    width_px, height_px = rig.size_px
+    camera = rig.camera
+    return np.array(
+        [
+            [2 * camera.focal_px / width_px, 0, (2 * camera.cx_px + 1) / width_px - 1, 0],
+            [0, 2 * camera.focal_px / height_px, (2 * camera.cy_px + 1) / height_px - 1, 0],
+            [0, 0, 1, -2 * NEAR_M],
+            [0, 0, 1, 0],
+        ]
+    )
+
+
+def in_view(
+    corners_m: Float[np.ndarray, "3 3 n"], rig: Rig, positions: Sequence[float]
+) -> Int[np.ndarray, " k"]:
+    """The triangles that any of the positions may see, the nearest to the rig first.
+
+    What is hidden behind pixels already drawn is not shaded. corners_m is `Mesh.corners_m.T`: axis, corner,
+    triangle, contiguous.
+    """
+    away_m = corners_m.reshape(3, -1) - rig.position_m.astype(np.float32)[:, None]
+    right, down, forward = (rig.axes.astype(np.float32) @ away_m).reshape(corners_m.shape)
+    (left_edge, right_edge), (upper_edge, lower_edge) = _edges(rig).astype(np.float32)
+    shift_m = np.float32(rig.camera.baseline_m) * np.array([min(positions), max(positions)], np.float32)
+    outside = (
+        (forward < NEAR_M).all(0)
+        | (right < left_edge * forward + shift_m[0]).all(0)
+        | (right > right_edge * forward + shift_m[1]).all(0)
+        | (down < upper_edge * forward).all(0)
+        | (down > lower_edge * forward).all(0)
+    )
+    seen = np.flatnonzero(~outside)
+    nearest_m = np.maximum(forward.min(0)[seen], 0)
+    # Positive floats sort as their bits do, and 16 bits sort fast.
+    return seen[np.argsort((nearest_m.view(np.uint32) >> 16).astype(np.uint16), kind="stable")]
+
+
+def _edges(rig: Rig) -> Float[np.ndarray, "2 2"]:
+    """The picture's borders at depth 1: left and right, upper and lower."""
+    camera, (width_px, height_px) = rig.camera, rig.size_px
+    borders_px = np.array([[-0.5, width_px - 0.5], [-0.5, height_px - 0.5]])
+    return (borders_px - [[camera.cx_px], [camera.cy_px]]) / camera.focal_px
+
+
+def to_direction(rig: Rig, samples: int) -> Float[np.ndarray, "3 3"]:
+    """From OpenGL's (column, row, 1) among samples x samples a pixel to a direction in the world, of depth 1."""
+    camera = rig.camera
+    to_camera = np.array(
+        [
+            [1 / samples, 0, -0.5 - camera.cx_px],
+            [0, 1 / samples, -0.5 - camera.cy_px],
+            [0, 0, camera.focal_px],
+        ]
+    )
+    return rig.axes.T @ to_camera / camera.focal_px
+
+
+def rays(rig: Rig, samples: int = 1) -> Float[np.ndarray, "h w 3"]:
+    """Directions in the world, of depth 1, through the pixels' centres or samples x samples places about them."""
+    width, height = (side * samples for side in rig.size_px)
+    column, row = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return np.stack([column, row, np.ones_like(row)], -1) @ to_direction(rig, samples).T

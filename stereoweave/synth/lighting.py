@@ -1,0 +1,149 @@
+"""What light needs to know of a world beforehand: how the sun sees it, and where it is crowded.
+
+Triangles come as `Mesh.corners_m.T`, contiguous: axis, corner, triangle.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+Corners = Float[np.ndarray, "3 3 n"]
+
+# Around a target of 8 m these are cells of 17 cm.
+CELLS = 64
+_EMPTY_CELLS = 8
+_MOST_SAMPLES = 4096
+# What the wide mean of the crowd holds beside a single plane.
+_WIDE_CELLS = 9
+
+
+@dataclass(frozen=True, kw_only=True)
+class SunView:
+    """The world as the sun sees it: a square around the target, and a wide one with the same middle.
+
+    Attributes:
+        to_unit: [3, 4], from (x, y, z, 1) to 0..1 across and down the inner square, and away from the sun.
+        inner_m: the inner square's side.
+        wide: how many times as wide the other one is.
+        inside: the triangles that cast shadows into the inner square.
+        beyond: those that cast shadows into the wide square and do not lie in the inner one altogether.
+    """
+
+    to_unit: Float[np.ndarray, "3 4"]
+    inner_m: float
+    wide: float
+    inside: Int[np.ndarray, " k"]
+    beyond: Int[np.ndarray, " l"]
+
+
+def sun_view(
+    corners_m: Corners, target_m: Corners, sun: tuple[float, float, float], reach_m: float
+) -> SunView:
+    """The sun's view; a target's shadow fills the same square as the target, wherever it falls."""
+    axes = _across(np.array(sun))
+    low, high = _extent(_turned(target_m, axes))
+    middle = (low + high) / 2
+    half_m = 1.04 * float((high - low)[:2].max()) / 2
+    across, down, away = _turned(corners_m, axes)
+    near = np.stack([across - middle[0], down - middle[1]])
+    lowest, highest = near.min(1), near.max(1)
+    inside = ((highest > -half_m) & (lowest < half_m)).all(0)
+    within = ((lowest > -half_m) & (highest < half_m)).all(0)
+    wide_m = max(reach_m, half_m)
+    beyond = ((highest > -wide_m) & (lowest < wide_m)).all(0) & ~within
+    spare_m = 0.01 + 0.01 * float(away.max() - away.min())
+    start = np.array([middle[0] - half_m, middle[1] - half_m, away.min() - spare_m])
+    span = np.array([2 * half_m, 2 * half_m, away.max() - away.min() + 2 * spare_m])
+    return SunView(
+        to_unit=np.column_stack([axes / span[:, None], -start / span]),
+        inner_m=2 * half_m,
+        wide=wide_m / half_m,
+        inside=np.flatnonzero(inside),
+        beyond=np.flatnonzero(beyond),
+    )
+
+
+def _across(sun: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Two directions across the sun's rays and the one along them."""
+    across = np.cross([0, 1, 0] if abs(sun[2]) > 0.9 else [0, 0, 1], sun)
+    across = across / np.linalg.norm(across)
+    return np.stack([across, np.cross(sun, across), -sun])
+
+
+def _turned(corners_m: Corners, axes: Float[np.ndarray, "3 3"]) -> Corners:
+    return (axes.astype(np.float32) @ corners_m.reshape(3, -1)).reshape(corners_m.shape)
+
+
+def _extent(corners_m: Corners) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    return corners_m.min((1, 2)), corners_m.max((1, 2))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Crowd:
+    """How much surface there is around places near the target.
+
+    Attributes:
+        share: uint8 [CELLS, CELLS, CELLS], z y x: the share of the sky that it hides from there, 255 for all.
+        low_m: the cube's lower corner.
+        cell_m: the side of a cell.
+    """
+
+    share: UInt8[np.ndarray, "z y x"]
+    low_m: Float[np.ndarray, "3"]
+    cell_m: float
+
+
+def crowd(corners_m: Corners, target_m: Corners) -> Crowd:
+    """The surface around the target, counted on a grid from points spread evenly over the triangles."""
+    low, high = _extent(target_m)
+    cell_m = 1.1 * float((high - low).max()) / (CELLS - 2 * _EMPTY_CELLS)
+    low_m = (low + high) / 2 - np.float32(cell_m * CELLS / 2)
+    points, areas = _spread(_touching(corners_m, low_m, cell_m * CELLS), cell_m)
+    place = ((points - low_m[:, None]) / np.float32(cell_m)).astype(np.int32)
+    x, y, z = place
+    inside = ((place >= 0) & (place < CELLS)).all(0)
+    index = ((z * CELLS + y) * CELLS + x)[inside]
+    counted = np.bincount(index, areas[inside] / cell_m**2, CELLS**3).astype(np.float32)
+    surface = np.minimum(counted, 1).reshape(CELLS, CELLS, CELLS)
+    return Crowd(share=_hidden(surface), low_m=low_m, cell_m=cell_m)
+
+
+def _hidden(surface: Float[np.ndarray, "z y x"]) -> UInt8[np.ndarray, "z y x"]:
+    """The share of the sky hidden by surface in the cell itself and, less, in a cube about it.
+
+    A plane, which hides nothing from a place on it, is taken off the latter.
+    """
+    around = surface
+    for axis in range(3):
+        layers = np.moveaxis(around, axis, 0)
+        blurred = cv2.blur(layers.reshape(CELLS, -1), (1, _WIDE_CELLS), borderType=cv2.BORDER_CONSTANT)
+        around = np.moveaxis(blurred.reshape(layers.shape), 0, axis)
+    hidden = 0.35 * surface + 2.5 * np.maximum(around - 1.2 / _WIDE_CELLS, 0)
+    # What is outside the grid looks like its border.
+    inner = np.zeros_like(hidden)
+    inner[1:-1, 1:-1, 1:-1] = hidden[1:-1, 1:-1, 1:-1]
+    return (255 * np.minimum(inner, 0.85)).astype(np.uint8)
+
+
+def _touching(corners_m: Corners, low_m: Float[np.ndarray, "3"], side_m: float) -> Corners:
+    low = low_m[:, None]
+    near = ((corners_m.max(1) > low) & (corners_m.min(1) < low + np.float32(side_m))).all(0)
+    return corners_m[..., near]
+
+
+def _spread(corners_m: Corners, cell_m: float) -> tuple[Float[np.ndarray, "3 p"], Float[np.ndarray, " p"]]:
+    """Points on the triangles, about two a cell, and the area that each stands for."""
+    first = corners_m[:, 0]
+    edge, other = corners_m[:, 1] - first, corners_m[:, 2] - first
+    normal = edge[[1, 2, 0]] * other[[2, 0, 1]] - edge[[2, 0, 1]] * other[[1, 2, 0]]
+    areas = np.sqrt((normal**2).sum(0)) / 2
+    counts = np.clip(np.ceil(areas * np.float32(2 / cell_m**2)), 1, _MOST_SAMPLES).astype(np.int32)
+    which = np.repeat(np.arange(len(areas)), counts)
+    # The powers of the plastic number fill a square evenly (Roberts, 2018); folded over, a triangle.
+    number = np.arange(len(which))
+    s, t = ((number * step % 1).astype(np.float32) for step in (0.7548776662, 0.5698402910))
+    folded = s + t > 1
+    s, t = np.where(folded, 1 - s, s), np.where(folded, 1 - t, t)
+    return first[:, which] + s * edge[:, which] + t * other[:, which], (areas / counts)[which]

@@ -1,0 +1,233 @@
+"""Sets of rendered pairs on disk, made by several processes; one that was stopped goes on where it was."""
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import cache, partial
+from importlib.metadata import version
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+from rich.console import Console
+
+from stereoweave.data.packing import packed
+from stereoweave.data.paper_layout import remove_unfinished, whole_frames, write_frame
+from stereoweave.data.shards import list_shards, write_shard
+from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.io import SMALLEST_SIDE_PX, is_leftover, make_folder, reading, remove_leftovers, replacing
+from stereoweave.synth.samples import Camera, Order, Rendered, rendered
+from stereoweave.synth.workers import in_workers, step_done
+
+SET_FILE = "set.json"
+FORMAT = 1
+# 50 MB of 640x480: enough to read at the disk's full speed, and half a minute's work to lose.
+PAIRS_A_SHARD = 50
+_NOT_OF_THE_PAIRS = {"making.py", "workers.py", "checking.py", "contact_sheet.py", "costs.py"}
+_PACKAGES = ("moderngl", "numpy", "opencv-python-headless", "scikit-image", "trimesh")
+
+
+@runtime_checkable
+class Studio(Protocol):
+    """What makes pairs, in whichever process it is sent to."""
+
+    def renderer(self) -> str:
+        """What decides the bytes of a pair besides the order and the generator's version."""
+        ...
+
+    def __call__(self, order: Order, index: int) -> Rendered: ...
+
+
+@dataclass(frozen=True)
+class RenderingStudio:
+    """Makes pairs with the best renderer that this machine has; `plain` leaves every effect out."""
+
+    plain: bool = False
+
+    def renderer(self) -> str:
+        return f"{type(camera(self.plain)).__name__}{', plain' if self.plain else ''}"
+
+    def __call__(self, order: Order, index: int) -> Rendered:
+        return rendered(camera(self.plain), order, index)
+
+
+class Layout(NamedTuple):
+    """A way to lay pairs out in a folder.
+
+    Attributes:
+        there: the numbers of the pairs that are whole.
+        write: writes pairs of these numbers as they come.
+        tidy: removes what was not written to the end.
+    """
+
+    there: Callable[[Path], set[int]]
+    write: Callable[[Path, str, Sequence[int], Iterator[Rendered]], None]
+    tidy: Callable[[Path], None]
+
+
+def make(  # noqa: PLR0913 - each is a word of the command line
+    order: Order,
+    pairs: int,
+    out: Path,
+    *,
+    layout: str = "shards",
+    jobs: int = 1,
+    studio: Studio = RenderingStudio(),
+    console: Console | None = None,
+) -> int:
+    """How many pairs were made to have the first `pairs` of an order in a folder; the others were there.
+
+    Args:
+        order: Scene, seed, size and so on.
+        pairs: How many there shall be.
+        out: The folder, new or with the same set.
+        layout: A name in LAYOUTS.
+        jobs: Processes at a time; the bytes do not depend on it.
+        studio: What makes the pairs.
+        console: Where the progress is shown.
+
+    Raises:
+        StereoweaveError: Nonsense was asked for, `out` has another set in it or cannot be written, the disk
+            is full, or a worker was killed. All that is there then is whole, and the same call goes on.
+    """
+    _check(order, pairs, layout)
+    make_folder(out)
+    _claim(out, _facts(order, layout, studio), pairs)
+    runs = _runs(sorted(set(range(pairs)) - LAYOUTS[layout].there(out)))
+    missing = sum(map(len, runs))
+    work = partial(_make_run, order, out, layout, studio)
+    try:
+        for _ in in_workers(work, runs, jobs, console or Console(), f"making {order.scene}", missing):
+            pass
+    except StereoweaveError as error:
+        raise StereoweaveError(f"{error}; what is there is whole, and the same command goes on") from error
+    finally:
+        LAYOUTS[layout].tidy(out)
+    return missing
+
+
+def read_set(folder: Path) -> dict[str, Any]:
+    """What is written about a set: its order, its layout, what made it, and how many pairs were asked for.
+
+    Raises:
+        FormatError: There is no set in the folder, or one in another version's format.
+    """
+    path = folder / SET_FILE
+    with reading(path, "the description of a set that stereoweave synth make made"):
+        facts = json.loads(path.read_text(encoding="utf-8"))
+    if not (isinstance(facts, dict) and facts.get("format") == FORMAT and facts.get("layout") in LAYOUTS):
+        raise FormatError(
+            f"{path}: expected a set of format {FORMAT}, found one that another version of stereoweave made; "
+            "read it with that one, or make it anew"
+        )
+    return facts
+
+
+def generator_version() -> str:
+    """8 hexadecimal digits that change with the code that makes pairs, and with the packages it uses."""
+    folder = Path(__file__).parent
+    sources = sorted(path for path in folder.rglob("*.*") if path.suffix != ".pyc" and path.is_file())
+    contents = [path.read_bytes() for path in sources if path.name not in _NOT_OF_THE_PAIRS]
+    versions = [f"{package}=={version(package)}".encode() for package in _PACKAGES]
+    return hashlib.sha256(b"".join(contents + versions)).hexdigest()[:8]
+
+
+def _check(order: Order, pairs: int, layout: str) -> None:
+    if layout not in LAYOUTS:
+        raise StereoweaveError(f"layout: expected one of {', '.join(LAYOUTS)}, found {layout!r}")
+    least = {"pairs": (pairs, 1), "seed": (order.seed, 0), "frames": (order.frames, 1)}
+    least |= {"size": (min(order.size_px), SMALLEST_SIDE_PX)}
+    for name, (value, smallest) in least.items():
+        if value < smallest:
+            raise StereoweaveError(f"{name}: expected at least {smallest}, found {value}")
+    names = {f"{position:.2f}" for position in order.views if math.isfinite(position)}
+    if len(names) < len(order.views):
+        raise StereoweaveError(
+            f"view: expected positions that differ in their first two decimals, found {order.views}"
+        )
+    if layout == "paper" and order.views:
+        raise StereoweaveError(f"view: expected none in the paper's layout, found {order.views}; take shards")
+
+
+def _facts(order: Order, layout: str, studio: Studio) -> dict[str, Any]:
+    facts = {"format": FORMAT, "layout": layout, **asdict(order)}
+    facts |= {"generator": generator_version(), "renderer": studio.renderer()}
+    return json.loads(json.dumps(facts))  # where tuples have become lists
+
+
+def _claim(out: Path, facts: dict[str, Any], pairs: int) -> None:
+    """Writes down whose folder this is, or refuses one that is another's."""
+    if (out / SET_FILE).exists():
+        _compare(out, facts, read_set(out))
+    elif others := sorted(path.name for path in out.iterdir() if not is_leftover(path)):
+        raise StereoweaveError(
+            f"{out}: expected a new folder, or one with a {SET_FILE}, found {others[0]} in it"
+        )
+    LAYOUTS[facts["layout"]].tidy(out)
+    with replacing(out / SET_FILE) as temporary:
+        temporary.write_text(json.dumps(facts | {"pairs": pairs}, indent=1) + "\n", encoding="utf-8")
+
+
+def _compare(out: Path, expected: dict[str, Any], found: dict[str, Any]) -> None:
+    for name, value in expected.items():
+        if found.get(name) != value:
+            raise StereoweaveError(
+                f"{out / SET_FILE}: expected {name} = {json.dumps(value)}, as this run would make, "
+                f"found {json.dumps(found.get(name))}; ask for the same, or take another folder"
+            )
+
+
+def _runs(numbers: Sequence[int]) -> list[list[int]]:
+    """Sorted numbers in runs without a gap, none of which reaches past a multiple of PAIRS_A_SHARD."""
+    places = enumerate(numbers)
+    groups = groupby(places, key=lambda item: (item[1] - item[0], item[1] // PAIRS_A_SHARD))
+    return [[number for _, number in group] for _, group in groups]
+
+
+def _make_run(order: Order, out: Path, layout: str, studio: Studio, run: Sequence[int]) -> None:
+    def pairs() -> Iterator[Rendered]:
+        for number in run:
+            yield studio(order, number)
+            step_done()
+
+    LAYOUTS[layout].write(out, order.scene, run, pairs())
+
+
+def _write_shard(out: Path, scene: str, run: Sequence[int], pairs: Iterator[Rendered]) -> None:
+    packs = [packed(pair.sample, {place: shot.image for place, shot in pair.views}) for pair in pairs]
+    write_shard(out, scene, run[0], packs)
+
+
+def _write_frames(out: Path, scene: str, run: Sequence[int], pairs: Iterator[Rendered]) -> None:
+    for number, pair in zip(run, pairs, strict=True):
+        write_frame(out, f"{scene}/{number:06d}", pair.sample)
+
+
+def _in_shards(out: Path) -> set[int]:
+    return {number for shard in list_shards(out) for number in range(shard.first, shard.last + 1)}
+
+
+def _in_frames(out: Path) -> set[int]:
+    return {int(name.rpartition("/")[2]) for name in whole_frames(out)}
+
+
+def _tidy_frames(out: Path) -> None:
+    remove_leftovers(out)
+    remove_unfinished(out)
+
+
+@cache
+def camera(plain: bool = False) -> Camera:
+    """The best renderer that this machine has, one a process; `plain` leaves every effect out."""
+    from stereoweave.synth.cameras import camera_for
+    from stereoweave.synth.effects import PLAIN, Effects
+
+    return camera_for(PLAIN if plain else Effects())
+
+
+LAYOUTS = {
+    "shards": Layout(_in_shards, _write_shard, remove_leftovers),
+    "paper": Layout(_in_frames, _write_frames, _tidy_frames),
+}

@@ -1,0 +1,371 @@
+"""The pieces that scenes are built from: tubes, boxes, solids of revolution, lofts, sheets, spheres.
+
+All at once for arrays of pieces, because a lattice mast has a thousand struts. Metres; z is up. Points and
+sizes are [N, 3], or one [3] for all. Textures are laid on in metres along the surface.
+"""
+
+import functools
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int
+
+from stereoweave.synth.world import Mesh, joined
+
+Point = Float[np.ndarray, "3"]
+Points = Float[np.ndarray, "_ 3"]
+Numbers = np.ndarray | Sequence[Any] | float  # an array, or lists that make one
+
+
+def tubes(  # noqa: PLR0913, bars differ in so much
+    starts_m: Numbers,
+    ends_m: Numbers,
+    radii_m: Numbers,
+    material: int,
+    sides: int = 6,
+    capped: bool = True,
+) -> Mesh:
+    """Straight round bars [N] from start to end; `capped` closes both ends by cones of no height.
+
+    radii_m: one for all, [N], or [N, 2] for the start's and the end's.
+    """
+    starts, ends = np.broadcast_arrays(np.atleast_2d(starts_m), np.atleast_2d(ends_m))
+    count = len(starts)
+    radii = np.asarray(radii_m, np.float64)
+    radii = np.broadcast_to(radii[:, None] if radii.ndim == 1 else radii, (count, 2))
+    along = ends - starts
+    length = np.linalg.norm(along, axis=1)
+    along = along / length[:, None]
+    across, other = _frames(along)
+    plan = _bar(sides, capped)
+    outwards = plan.circle @ np.stack([across, other], 1)
+    middles = np.stack([starts, ends], 1)
+    rings = middles[:, :, None] + radii[..., None, None] * outwards[:, None]
+    around = np.arctan2(plan.circle[:, 1], plan.circle[:, 0]) % (2 * np.pi) * radii.max(1)[:, None]
+    around[:, -1] = 2 * np.pi * radii.max(1)
+    # Every piece shows another part of its texture.
+    offset = np.broadcast_to((np.arange(count) * 0.618)[:, None] % 7, around.shape)
+    sides_uv = [np.stack([around, offset + up], -1) for up in (0, length[:, None])]
+    ends_uv = radii[..., None, None] * plan.circle
+    points = np.concatenate([rings.reshape(count, 2 * len(plan.circle), 3), middles], 1)
+    normals = np.concatenate([outwards, -along[:, None], along[:, None]], 1)
+    uv = np.concatenate(
+        [*sides_uv, ends_uv.reshape(count, 2 * len(plan.circle), 2), np.zeros((count, 2, 2))], 1
+    )
+    corners = points.astype(np.float32)[:, plan.points]
+    mesh = _mesh(
+        corners, normals.astype(np.float32)[:, plan.normals], uv.astype(np.float32)[:, plan.uv], material
+    )
+    return mesh if radii.all() else _solid(mesh)
+
+
+def boxes(
+    centres_m: Numbers, sizes_m: Numbers, material: int, turns: Float[np.ndarray, "_ 3 3"] | None = None
+) -> Mesh:
+    """Blocks [N] with flat faces; `turns` rotates each about its centre."""
+    centres, sizes = np.broadcast_arrays(np.atleast_2d(centres_m), np.atleast_2d(sizes_m))
+    cube, face_normals = _cube()
+    corners = cube[None] * (sizes / 2)[:, None, None]
+    normals = np.broadcast_to(face_normals, corners.shape)
+    uv = _box_uv(corners, normals) + (np.arange(len(corners)) * 0.618 % 7)[:, None, None, None]
+    if turns is not None:
+        across = turns.swapaxes(1, 2)[:, None]
+        corners, normals = corners @ across, normals @ across
+    return _mesh(corners + centres[:, None, None], normals, uv, material)
+
+
+def lathe(profile_m: Numbers, material: int, sections: int = 32, crease_deg: float = 35) -> Mesh:
+    """A solid of revolution about z; profile_m [K, 2]: radius and height, from bottom to top outside.
+
+    Edges of the profile sharper than `crease_deg` stay sharp.
+    """
+    profile = np.asarray(profile_m, np.float64)
+    angle = np.arange(sections + 1) * 2 * np.pi / sections
+    circle = np.stack([np.cos(angle), np.sin(angle)], -1)
+    step = np.diff(profile, axis=0)
+    slope = step / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
+    flat = np.stack([slope[:, 1], -slope[:, 0]], -1)  # outwards, for a profile that rises outside
+    below, above = flat.copy(), flat.copy()
+    smooth = (flat[:-1] * flat[1:]).sum(1) > np.cos(np.radians(crease_deg))
+    mean = flat[:-1] + flat[1:]
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
+    below[1:][smooth], above[:-1][smooth] = mean[smooth], mean[smooth]
+    arc = np.concatenate([[0], np.cumsum(np.linalg.norm(step, axis=1))])
+    spans = np.stack([profile[:-1], profile[1:]], 1)
+    girth = spans[:, :, 0].max(1)[:, None, None] * angle
+    height = np.stack([arc[:-1], arc[1:]], 1)[..., None]
+    uv = np.stack(np.broadcast_arrays(girth, height), -1)
+    return _grids(_around(circle, spans), _around(circle, np.stack([below, above], 1)), uv, material)
+
+
+def loft(rings_m: Float[np.ndarray, "k m 3"], material: int, capped: bool = True) -> Mesh:
+    """A smooth closed surface through rings of points, such as a hull, a blade or a bent pipe.
+
+    Rings go counter-clockwise, seen from the last ring towards the first; their last point is not the first
+    one again. `capped` closes both ends by fans around the middle of the first and the last ring.
+    """
+    rings = np.asarray(rings_m, np.float64)
+    rings = np.concatenate([rings, rings[:, :1]], axis=1)
+    skin = sheet(rings, material, closed=True)
+    if not capped:
+        return skin
+    return _with_caps(skin, rings[[0, -1]][None], material)
+
+
+def sweep(path_m: Numbers, radius_m: Numbers, material: int, sides: int = 8) -> Mesh:
+    """A round pipe or cable along a path [K, 3]; radius_m: one, or one a point."""
+    path = np.asarray(path_m, np.float64)
+    along = np.gradient(path, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    across, other = _carried_frames(along)
+    angle = np.arange(sides) * 2 * np.pi / sides
+    outwards = np.cos(angle)[None, :, None] * across[:, None] + np.sin(angle)[None, :, None] * other[:, None]
+    radii = np.broadcast_to(np.asarray(radius_m, np.float64), len(path))
+    return loft(path[:, None] + radii[:, None, None] * outwards, material)
+
+
+def sheet(points_m: Float[np.ndarray, "r c 3"], material: int, closed: bool = False) -> Mesh:
+    """A smooth surface through a grid of points, seen from where columns x rows points to.
+
+    With x along columns and y along rows the front is up. `closed`: the last column is the first one again.
+    """
+    points = np.asarray(points_m, np.float64)
+    if closed:
+        wrapped = np.concatenate([points[:, -2:-1], points, points[:, 1:2]], axis=1)
+        along_columns = (wrapped[:, 2:] - wrapped[:, :-2]) / 2
+    else:
+        along_columns = np.gradient(points, axis=1)
+    normals = np.cross(along_columns, np.gradient(points, axis=0))
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    u = _lengths(points, 1).mean(0)[None] * np.ones((len(points), 1))
+    v = _lengths(points, 0).mean(1)[:, None] * np.ones((1, points.shape[1]))
+    return _grids(points[None], normals[None], np.stack([u, v], -1)[None], material)
+
+
+def spheres(centres_m: Numbers, radii_m: Numbers, material: int, subdivisions: int = 2) -> Mesh:
+    """Balls [N]; radii_m: one for all, [N], or [N, 3] for ellipsoids along the axes."""
+    centres = np.atleast_2d(np.asarray(centres_m, np.float64))
+    radii = np.asarray(radii_m, np.float64)
+    radii = np.broadcast_to(radii[:, None] if radii.ndim == 1 else radii, (len(centres), 3))
+    ball = _ball(subdivisions)
+    corners = ball[None] * radii[:, None, None]
+    normals = ball[None] / radii[:, None, None]
+    normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+    uv = _box_uv(
+        corners, np.broadcast_to(ball.mean(1, keepdims=True), ball.shape)[None].repeat(len(radii), 0)
+    )
+    return _mesh(corners + centres[:, None, None], normals, uv, material)
+
+
+def facets(triangles_m: Numbers, material: int) -> Mesh:
+    """Flat triangles [N, 3, 3] as given, counter-clockwise seen from outside."""
+    triangles = np.asarray(triangles_m, np.float64)
+    across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+    normals = np.repeat(across[:, None], 3, axis=1)
+    return _mesh(triangles, normals, _box_uv(triangles, normals), material)
+
+
+def prism(outline_m: Numbers, depth_m: float, material: int) -> Mesh:
+    """A convex outline [K, 2], counter-clockwise from above, pulled up from z = 0 by depth_m."""
+    floor = np.pad(np.asarray(outline_m, np.float64), ((0, 0), (0, 1)))
+    roof = floor + [0, 0, depth_m]
+    after, above = np.roll(floor, -1, axis=0), np.roll(roof, -1, axis=0)
+    walls = [np.stack([floor, after, above], 1), np.stack([floor, above, roof], 1)]
+    fan = [
+        np.stack([np.broadcast_to(ring[0], (len(ring) - 2, 3)), ring[1:-1], ring[2:]], 1)
+        for ring in (roof, floor[::-1])
+    ]
+    return facets(np.concatenate(walls + fan), material)
+
+
+def copies(mesh: Mesh, poses: Float[np.ndarray, "n 4 4"]) -> Mesh:
+    """The mesh once for each pose, without scaling that differs by axis."""
+    turns = poses[:, :3, :3].swapaxes(1, 2)
+    scales = np.cbrt(np.abs(np.linalg.det(turns)))[:, None, None]
+    corners = mesh.corners_m.reshape(-1, 3) @ turns.astype(np.float32)
+    corners += poses[:, None, :3, 3].astype(np.float32)
+    normals = mesh.normals.reshape(-1, 3) @ (turns / scales).astype(np.float32)
+    uv = mesh.uv_m + (np.arange(len(poses), dtype=np.float32) * 0.618 % 7)[:, None, None, None]
+    count = len(poses)
+    return Mesh(
+        corners_m=corners.reshape(-1, 3, 3),
+        normals=normals.reshape(-1, 3, 3),
+        uv_m=uv.reshape(-1, 3, 2),
+        material=np.tile(mesh.material, count),
+        target=np.tile(mesh.target, count),
+    )
+
+
+def turn(axis: tuple[float, float, float], angle_deg: float) -> Float[np.ndarray, "4 4"]:
+    """The pose that rotates about an axis through the origin, counter-clockwise seen from its tip."""
+    pose = np.eye(4)
+    pose[:3, :3] = cv2.Rodrigues(np.radians(angle_deg) * np.array(axis) / np.linalg.norm(axis))[0]
+    return pose
+
+
+def shift(x: float = 0, y: float = 0, z: float = 0) -> Float[np.ndarray, "4 4"]:
+    """The pose that moves by metres."""
+    pose = np.eye(4)
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def polyline_tubes(points_m: Numbers, radius_m: float, material: int, sides: int = 6) -> Mesh:
+    """Tubes from each point to the next: railings, frames, cables with corners."""
+    points = np.asarray(points_m)
+    return tubes(points[:-1], points[1:], radius_m, material, sides)
+
+
+def _grids(
+    points: Float[np.ndarray, "n r c 3"],
+    normals: Float[np.ndarray, "n r c 3"],
+    uv: Float[np.ndarray, "n r c 2"],
+    material: int,
+) -> Mesh:
+    """Two triangles for each cell of each grid."""
+
+    def cells(values: np.ndarray) -> np.ndarray:
+        a, b, c, d = values[:, :-1, :-1], values[:, :-1, 1:], values[:, 1:, 1:], values[:, 1:, :-1]
+        return np.stack([np.stack([a, b, c], -2), np.stack([a, c, d], -2)], -3)
+
+    corners, corner_normals, corner_uv = (
+        cells(values.astype(np.float32)) for values in (points, normals, uv)
+    )
+    return _solid(_mesh(corners, corner_normals, corner_uv, material))
+
+
+def _solid(mesh: Mesh) -> Mesh:
+    """The mesh without triangles of no area: at a pole a grid's cell has no second triangle."""
+    a, b, c = mesh.corners_m.swapaxes(0, 1)
+    kept = (np.abs(np.cross(b - a, c - a)) > 1e-12).any(1)
+    if kept.all():
+        return mesh
+    return Mesh(
+        corners_m=mesh.corners_m[kept],
+        normals=mesh.normals[kept],
+        uv_m=mesh.uv_m[kept],
+        material=mesh.material[kept],
+        target=mesh.target[kept],
+    )
+
+
+def _with_caps(walls: Mesh, ends: Float[np.ndarray, "n 2 m 3"], material: int) -> Mesh:
+    """The walls, and fans over first and last rings whose last point is the first again."""
+    fans = [walls]
+    for k in (0, 1):
+        ring = ends[:, k] if k else ends[:, k, ::-1]
+        middle = ring[:, :-1].mean(1)[:, None]
+        corners = np.stack([np.broadcast_to(middle, ring[:, 1:].shape), ring[:, :-1], ring[:, 1:]], -2)
+        normal = np.cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :])
+        solid = np.linalg.norm(normal, axis=-1) > 1e-12
+        summed = normal.sum(1, keepdims=True)
+        summed = summed / np.maximum(np.linalg.norm(summed, axis=-1, keepdims=True), 1e-12)
+        normals = np.broadcast_to(summed[:, :, None], corners.shape)
+        uv = _box_uv(corners, normals)
+        fans.append(_mesh(corners[solid], normals[solid], uv[solid], material))
+    return joined(fans)
+
+
+def _mesh(corners: np.ndarray, normals: np.ndarray, uv: np.ndarray, material: int) -> Mesh:
+    count = corners.size // 9
+    return Mesh(
+        corners_m=corners.reshape(-1, 3, 3).astype(np.float32, copy=False),
+        normals=normals.reshape(-1, 3, 3).astype(np.float32, copy=False),
+        uv_m=uv.reshape(-1, 3, 2).astype(np.float32, copy=False),
+        material=np.full(count, material, np.int32),
+        target=np.zeros(count, bool),
+    )
+
+
+def _frames(along: Points) -> tuple[Points, Points]:
+    """Two unit vectors across each direction; across, other and along are right-handed."""
+    helper = np.where(np.abs(along[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    across = np.cross(helper, along)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    return across, np.cross(along, across)
+
+
+def _carried_frames(along: Points) -> tuple[Points, Points]:
+    """As `_frames`, each nearly the one before it, so that a pipe does not twist."""
+    across = _frames(along[:1])[0][0]
+    carried = []
+    # In plain numbers, because arrays of three are slow.
+    u, v, w = across.tolist()
+    for x, y, z in along.tolist():
+        off = u * x + v * y + w * z
+        u, v, w = u - off * x, v - off * y, w - off * z
+        size = math.sqrt(u * u + v * v + w * w)
+        u, v, w = u / size, v / size, w / size
+        carried.append((u, v, w))
+    stacked = np.array(carried)
+    return stacked, np.cross(along, stacked)
+
+
+def _around(circle: Float[np.ndarray, "s 2"], radius_and_height: np.ndarray) -> np.ndarray:
+    """Rings [..., S, 3] from radii and heights [..., 2]."""
+    radius, height = radius_and_height[..., None, :1], radius_and_height[..., None, 1:]
+    level = radius * circle
+    return np.concatenate([level, np.broadcast_to(height, (*level.shape[:-1], 1))], -1)
+
+
+def _lengths(points: Float[np.ndarray, "r c 3"], axis: int) -> Float[np.ndarray, "r c"]:
+    """How far each point is from the first along the grid."""
+    step = np.linalg.norm(np.diff(points, axis=axis), axis=-1)
+    start = np.zeros_like(np.take(step, [0], axis=axis))
+    return np.concatenate([start, np.cumsum(step, axis=axis)], axis=axis)
+
+
+def _box_uv(corners: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Texture places from the two axes across the one that each face looks along the most."""
+    axis = np.abs(normals[..., :1, :]).argmax(-1)[..., None]
+    x, y, z = corners[..., 0], corners[..., 1], corners[..., 2]
+    axis = axis[..., 0] * np.ones(x.shape, int)
+    u = np.where(axis == 0, y, x)
+    v = np.where(axis == 2, y, z)
+    return np.stack([u, v], -1)
+
+
+class _Bar(NamedTuple):
+    """How a bar's triangles are joined: places in its tables of points, normals and texture, each [T, 3].
+
+    Points: the start's ring [S + 1], the end's, both middles. Normals: a ring [S + 1], back, ahead. Texture:
+    both rings for the sides, then as the points for the ends.
+    """
+
+    circle: Float[np.ndarray, "s 2"]
+    points: Int[np.ndarray, "t 3"]
+    normals: Int[np.ndarray, "t 3"]
+    uv: Int[np.ndarray, "t 3"]
+
+
+@functools.cache
+def _bar(sides: int, capped: bool) -> _Bar:
+    angle = np.arange(sides + 1) * 2 * np.pi / sides
+    k, ring = np.arange(sides), sides + 1
+    walls = np.concatenate([np.stack([k, k + 1, k + 1 + ring], 1), np.stack([k, k + 1 + ring, k + ring], 1)])
+    back = np.stack([np.full(sides, 2 * ring), k + 1, k], 1)
+    ahead = np.stack([np.full(sides, 2 * ring + 1), k + ring, k + 1 + ring], 1)
+    if not capped:
+        back, ahead = back[:0], ahead[:0]
+    return _Bar(
+        circle=np.stack([np.cos(angle), np.sin(angle)], -1),
+        points=np.concatenate([walls, back, ahead]),
+        normals=np.concatenate([walls % ring, np.full_like(back, ring), np.full_like(ahead, ring + 1)]),
+        uv=np.concatenate([walls, back + 2 * ring, ahead + 2 * ring]),
+    )
+
+
+@functools.cache
+def _cube() -> tuple[Float[np.ndarray, "12 3 3"], Float[np.ndarray, "12 3 3"]]:
+    cube = trimesh.creation.box((2, 2, 2))
+    return cube.triangles, np.repeat(cube.face_normals[:, None], 3, axis=1)
+
+
+@functools.cache
+def _ball(subdivisions: int) -> Float[np.ndarray, "n 3 3"]:
+    return trimesh.creation.icosphere(subdivisions).triangles

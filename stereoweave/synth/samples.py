@@ -1,0 +1,126 @@
+"""Pair number `index` of a scene: a stage, a rig, its pictures, and the exact truth."""
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from stereoweave.data.samples import make_sample
+from stereoweave.errors import StereoweaveError
+from stereoweave.stereo import Sample, StereoCamera, StereoPair
+from stereoweave.synth.rigs import (
+    Rig,
+    Viewpoint,
+    between,
+    draw_focal_px,
+    draw_nearest_px,
+    draw_viewpoint,
+    rig_at,
+)
+from stereoweave.synth.scenes import SCENES
+from stereoweave.synth.stage import Stage
+from stereoweave.synth.world import Shot, World
+
+# What is nearer than this share of the picture decides the baseline: a single blade of grass does not.
+_NEAREST_SHARE = 0.01
+
+
+@runtime_checkable
+class Camera(Protocol):
+    """Takes pictures of worlds: `renderer.Renderer`, or `raycast.Raycaster`, which is slower and plainer."""
+
+    def depth_m(self, world: World, rig: Rig, position: float) -> Float[np.ndarray, "h w"]: ...
+
+    def shots(self, world: World, rig: Rig, positions: Sequence[float]) -> list[Shot]: ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Order:
+    """What is to be rendered.
+
+    Attributes:
+        scene: a name in SCENES.
+        seed: of everything random, together with the scene's name and the index.
+        size_px: width and height.
+        frames: pairs in a row that show one world, from a camera that moves smoothly; 1 for stills.
+        views: positions of further views between (or beyond) the two cameras, such as 0.5.
+        rig: focal length in px and baseline in m of all pairs; None to draw them anew for each world.
+    """
+
+    scene: str
+    seed: int = 0
+    size_px: tuple[int, int] = (640, 480)
+    frames: int = 1
+    views: tuple[float, ...] = ()
+    rig: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.scene not in SCENES:
+            raise StereoweaveError(f"scene: expected one of {', '.join(SCENES)}, found {self.scene!r}")
+        if self.rig is not None:
+            _camera(*self.rig, self.size_px)  # which refuses nonsense
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rendered:
+    """A pair with its truth.
+
+    Attributes:
+        sample: the pair, its disparities (0 for the sky), occlusion masks and camera.
+        depth_m: float32 [H, W] of the left view; infinite for the sky.
+        views: position and picture of each further view.
+    """
+
+    sample: Sample
+    depth_m: Float[np.ndarray, "h w"]
+    views: tuple[tuple[float, Shot], ...]
+
+
+def rendered(camera: Camera, order: Order, index: int) -> Rendered:
+    """Pair number `index` of an order, the same in every process."""
+    sequence, frame = divmod(index, order.frames)
+    stage, rig = staged(camera, order, sequence, frame)
+    left, right, *others = camera.shots(stage.world, rig, (0.0, 1.0, *order.views))
+    left_px, right_px = (rig.camera.disparity_px(shot.depth_m).astype(np.float32) for shot in (left, right))
+    pair = StereoPair(left=left.image, right=right.image, camera=rig.camera)
+    return Rendered(
+        sample=make_sample(pair, left_px, right_px),
+        depth_m=left.depth_m,
+        views=tuple(zip(order.views, others, strict=True)),
+    )
+
+
+def staged(camera: Camera, order: Order, sequence: int, frame: int = 0) -> tuple[Stage, Rig]:
+    """The stage and rig of a frame of a sequence; (seed, scene, sequence) decide all but the frame."""
+    rng = np.random.default_rng((order.seed, zlib.crc32(order.scene.encode()), sequence))
+    stage = SCENES[order.scene](rng)
+    focal_px, nearest_px = draw_focal_px(rng, order.size_px[0]), draw_nearest_px(rng, order.size_px[0])
+    start = draw_viewpoint(rng, stage.orbit)
+    # A film pans over a part of the orbit.
+    end = between(start, draw_viewpoint(rng, stage.orbit), rng.uniform(0.15, 0.4))
+    ends = (start,) if order.frames == 1 else (start, end)
+    if order.rig is not None:
+        focal_px, baseline_m = order.rig
+    else:
+        nearest_m = min(_nearest_m(camera, stage, place, focal_px, order.size_px) for place in ends)
+        baseline_m = nearest_px * nearest_m / focal_px
+    share = frame / max(order.frames - 1, 1)
+    camera_model = _camera(focal_px, baseline_m, order.size_px)
+    return stage, rig_at(stage.orbit, between(start, end, share), camera_model, order.size_px)
+
+
+def _nearest_m(
+    camera: Camera, stage: Stage, place: Viewpoint, focal_px: float, size_px: tuple[int, int]
+) -> float:
+    rig = rig_at(stage.orbit, place, _camera(focal_px, 1e-6, size_px), size_px)
+    return float(np.quantile(camera.depth_m(stage.world, rig, 0.0), _NEAREST_SHARE))
+
+
+def _camera(focal_px: float, baseline_m: float, size_px: tuple[int, int]) -> StereoCamera:
+    width_px, height_px = size_px
+    return StereoCamera(
+        focal_px=focal_px, baseline_m=baseline_m, cx_px=(width_px - 1) / 2, cy_px=(height_px - 1) / 2
+    )

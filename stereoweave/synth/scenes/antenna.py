@@ -1,0 +1,291 @@
+"""Antennas: a radio mast with panels and drums, aerials on a roof, or a great dish on its mount."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from stereoweave.synth.aerials import dipoles, drum, panel, whip, yagi
+from stereoweave.synth.lattice import (
+    Bracing,
+    aviation,
+    bars,
+    cables,
+    chains,
+    galvanised,
+    hanging,
+    ladder,
+    levels,
+    painted,
+    railing,
+    rings,
+    truss,
+)
+from stereoweave.synth.parts import boxes, shift, tubes, turn
+from stereoweave.synth.rigs import Orbit
+from stereoweave.synth.scenes.radio_dish import radio_dish
+from stereoweave.synth.scenes.roof_aerials import roof_aerials
+from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.surroundings import bushes, daylight, hills, houses, places, rocks, terrain, trees
+from stereoweave.synth.world import Material, Mesh, World, joined
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """A mast's measures.
+
+    Attributes:
+        corners: 3 or 4 legs.
+        widths_m: of its sides, at the foot and at the top.
+        guyed: whether it is slim and held by wires, or stands on its own.
+    """
+
+    height_m: float
+    corners: int
+    widths_m: tuple[float, float]
+    guyed: bool
+    banded: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finish:
+    """Materials of the mast and its antennas."""
+
+    steel: int
+    bands: tuple[int, ...]
+    cover: int
+    radome: int
+    cable: int
+
+
+def antenna(rng: np.random.Generator) -> Stage:
+    """A mast of 6.5 m, a roof's aerials of 3 m, or a dish of 4 m."""
+    kind = str(rng.choice(["mast", "roof", "dish"], p=[0.5, 0.25, 0.25]))
+    return {"mast": _mast_site, "roof": roof_aerials, "dish": radio_dish}[kind](rng)
+
+
+def _mast_site(rng: np.random.Generator) -> Stage:
+    palette, plan = Palette(), _plan(rng)
+    finish = _finish(rng, palette, plan)
+    mast = joined(
+        [
+            _mast(rng, plan, finish),
+            _sectors(rng, plan, finish),
+            _links(rng, plan, finish),
+            _top(rng, plan, finish),
+        ]
+    )
+    site = _site(rng, palette, finish)
+    sky, fog, exposure = daylight(rng)
+    world = World(
+        mesh=joined([mast.as_target(), site, _land(rng, palette)]),
+        materials=tuple(palette.materials),
+        sky=sky,
+        fog=fog,
+        exposure=exposure,
+    )
+    orbit = Orbit(
+        centre_m=(0.0, 0.0, 0.57 * plan.height_m),
+        distance_m=(8.2, 11.4),
+        elevation_deg=(-18, 20),
+        aim_m=0.5,
+        floor_m=0.6,
+    )
+    return Stage(world=world, orbit=orbit)
+
+
+def _plan(rng: np.random.Generator) -> Plan:
+    guyed = bool(rng.random() < 0.45)
+    top = rng.uniform(0.2, 0.28)
+    return Plan(
+        height_m=rng.uniform(5.8, 6.5),
+        corners=3 if guyed else int(rng.choice([3, 4])),
+        widths_m=(top, top) if guyed else (rng.uniform(0.9, 1.2), top + 0.04),
+        guyed=guyed,
+        banded=bool(rng.random() < 0.5),
+    )
+
+
+def _finish(rng: np.random.Generator, palette: Palette, plan: Plan) -> Finish:
+    steel = palette.add(galvanised(rng))
+    bands = tuple(palette.add(material) for material in aviation(rng)) if plan.banded else (steel,)
+    grey = rng.uniform(0.6, 0.85)
+    return Finish(
+        steel=steel,
+        bands=bands,
+        cover=palette.add(Material(texture="plain", tint=(grey, grey, grey * 0.97), roughness=0.5)),
+        radome=palette.add(Material(texture="plain", tint=(0.78, 0.78, 0.75), roughness=0.6)),
+        cable=palette.add(Material(texture="plain", tint=(0.05, 0.05, 0.055), roughness=0.6)),
+    )
+
+
+def _width(plan: Plan, z_m: float) -> float:
+    return float(np.interp(z_m, (0, plan.height_m), plan.widths_m))
+
+
+def _mast(rng: np.random.Generator, plan: Plan, finish: Finish) -> Mesh:
+    """The lattice with ladder, cables, landings, and guy wires where it is slim."""
+    joints = rings(*levels((0.0, plan.height_m), plan.widths_m, 1.0), corners=plan.corners)
+    thick = 1.0 if plan.guyed else 1.35
+    bracing: Bracing = "zigzag" if plan.guyed or rng.random() < 0.5 else "cross"
+    lattice = truss(joints, bracing).banded(
+        0.017 * thick, 0.009 * thick, finish.bands, (np.inf, plan.height_m / 7)
+    )
+    # Inside, near the middle of the first face.
+    foot, head = (joints[k, :2].mean(0) * [0.8, 0.8, 1] for k in (0, -1))
+    sideways = joints[0, 1] - joints[0, 0]
+    trunk = foot * [0.4, 0.4, 1] + np.linspace(-0.05, 0.05, 6)[:, None] * sideways / np.linalg.norm(sideways)
+    rises = np.stack([trunk, trunk - foot * [0.4, 0.4, 1] + head * [0.4, 0.4, 0.9]], 1)
+    parts = [
+        lattice,
+        ladder(tuple(foot), tuple(head), tuple(sideways), 0.11, finish.steel),
+        bars(rises, 0.008, finish.cable, sides=4),
+        boxes(joints[0] + [0, 0, 0.02], (0.26, 0.26, 0.16), finish.radome),
+        *[
+            _landing(plan, z, finish)
+            for z in (() if plan.guyed else (0.42 * plan.height_m, 0.66 * plan.height_m))
+        ],
+    ]
+    if plan.guyed:
+        parts.append(_guys(plan, finish))
+    return joined(parts)
+
+
+def _landing(plan: Plan, z_m: float, finish: Finish) -> Mesh:
+    half = 0.5 * _width(plan, z_m) + 0.14
+    rim = half * np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0], [1, 1, 0]])
+    return joined(
+        [
+            boxes((0, 0, z_m), (2 * half, 2 * half, 0.012), finish.steel),
+            railing(rim + [0, 0, z_m], 0.2, 0.2, 0.006, finish.steel),
+        ]
+    )
+
+
+def _guys(plan: Plan, finish: Finish) -> Mesh:
+    """Wires from three heights to three anchors, with strainers near the ground."""
+    angle = np.radians([60, 180, 300])
+    around = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    radius = plan.widths_m[0] / np.sqrt(3)
+    feet = 2.5 * around + [0, 0, 0.12]
+    tops = [radius * around + [0, 0, share * plan.height_m] for share in (0.4, 0.68, 0.94)]
+    wires = [cables(top, feet, 0.006, finish.steel, sag_m=0.03, count=8) for top in tops]
+    strainers = [
+        tubes(feet + 0.04 * (top - feet), feet + 0.09 * (top - feet), 0.014, finish.steel) for top in tops
+    ]
+    return joined([*wires, *strainers, boxes(feet - [0, 0, 0.09], (0.24, 0.24, 0.2), finish.radome)])
+
+
+def _sectors(rng: np.random.Generator, plan: Plan, finish: Finish) -> Mesh:
+    """One or two crowns of panels on frames around the mast."""
+    heights = [0.93] if rng.random() < 0.5 else [0.93, 0.78]
+    turned = rng.uniform(0, 120)
+    crowns = []
+    for share in heights:
+        size, high = rng.uniform(0.5, 0.75), rng.uniform(0.5, 0.75)
+        crowns.append(_crown(plan, share * plan.height_m, size, high, finish).placed(turn((0, 0, 1), turned)))
+    return joined(crowns)
+
+
+def _crown(plan: Plan, z_m: float, side_m: float, panel_m: float, finish: Finish) -> Mesh:
+    """Three frames, each with two panels, held off the mast."""
+    out = 0.42 * side_m + 0.5 * _width(plan, z_m)
+    half = side_m / 2
+    rails = np.array([[(out, -half, z), (out, half, z)] for z in (-0.2, 0.2)])
+    poles = np.array([[(out, y, -0.42), (out, y, 0.42)] for y in (-half, half)])
+    arms = np.array([[(0.02, 0, z), (out, y, z)] for z in (-0.2, 0.2) for y in (-0.6 * half, 0.6 * half)])
+    antennas = [panel(panel_m, finish.cover, finish.steel).moved(out + 0.1, y) for y in (-half, half)]
+    frame = joined([bars(np.concatenate([rails, poles, arms]), 0.014, finish.steel), *antennas])
+    return joined([frame.placed(turn((0, 0, 1), angle)) for angle in (0, 120, 240)]).moved(z=z_m)
+
+
+def _links(rng: np.random.Generator, plan: Plan, finish: Finish) -> Mesh:
+    """Drums, and now and then a yagi or loops, at the mast's side."""
+    parts = []
+    for share in rng.uniform(0.35, 0.68, int(rng.integers(2, 5))):
+        radius = rng.uniform(0.14, 0.32)
+        parts.append(_beside(rng, plan, share, drum(radius, finish.radome, finish.steel), finish))
+    for share in rng.uniform(0.3, 0.7, int(rng.integers(1, 3))):
+        aerial = yagi(rng.uniform(0.6, 0.9), 9, finish.steel, finish.cable)
+        parts.append(_beside(rng, plan, share, aerial.moved(0.15), finish))
+    parts.append(_beside(rng, plan, rng.uniform(0.45, 0.62), dipoles(3, finish.steel).moved(0.1), finish))
+    return joined(parts)
+
+
+def _beside(rng: np.random.Generator, plan: Plan, share: float, mesh: Mesh, finish: Finish) -> Mesh:
+    """Something on an arm at a share of the mast's height, anywhere around."""
+    z = share * plan.height_m
+    out = 0.55 * _width(plan, z) + 0.16
+    arm = bars(
+        np.array([[(0, 0, 0), (out, 0, 0)], [(out - 0.02, 0, -0.18), (out - 0.02, 0, 0.18)]]),
+        0.02,
+        finish.steel,
+    )
+    placed = joined([mesh.moved(out), arm])
+    return placed.placed(shift(z=z) @ turn((0, 0, 1), rng.uniform(0, 360)))
+
+
+def _top(rng: np.random.Generator, plan: Plan, finish: Finish) -> Mesh:
+    """Whips, lightning rod, lamp."""
+    z = plan.height_m
+    around = 0.5 * plan.widths_m[1] * np.array([(1, 1), (-1, 1), (0, -1.2)])
+    rods = [whip(rng.uniform(0.4, 1.0), finish.cover, finish.steel).moved(x, y, z) for x, y in around]
+    plate = boxes((0, 0, z), (plan.widths_m[1] * 1.3, plan.widths_m[1] * 1.3, 0.015), finish.steel)
+    return joined([*rods, plate, tubes((0, 0, z), (0, 0, z + 0.2), 0.05, finish.bands[0], 12)])
+
+
+def _site(rng: np.random.Generator, palette: Palette, finish: Finish) -> Mesh:
+    """The cabin, the bridge that carries the cables to it, the fence around all."""
+    wall = palette.add(
+        painted(rng, ((0.45, 0.5, 0.44), (0.7, 0.68, 0.62))[int(rng.integers(2))], roughness=0.8)
+    )
+    gravel = palette.add(Material(texture="gravel", variant=int(rng.integers(8)), span_m=1.5, relief=0.6))
+    away = 1.15
+    posts = np.array([[(x, 0.0, 0), (x, 0.0, 0.72)] for x in (0.35, 0.75)])
+    wires = hanging(
+        [(0.05, y, 0.75) for y in (-0.03, 0, 0.03)], [(away, y, 0.72) for y in (-0.03, 0, 0.03)], 0.02, 6
+    )
+    rim = 2.0 * np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0], [1, 1, 0]]) + [0.4, 0.2, 0]
+    cabin = [
+        boxes((away + 0.45, 0, 0.42), (0.9, 0.8, 0.76), wall),
+        boxes((away + 0.45, 0, 0.83), (1.02, 0.92, 0.06), finish.radome),
+        boxes((away + 0.45, 0, 0.02), (1.1, 1.0, 0.1), finish.radome),
+        boxes((away + 0.3, 0.41, 0.36), (0.28, 0.03, 0.58), finish.steel),
+        boxes((away + 0.72, 0.45, 0.5), (0.22, 0.12, 0.22), finish.radome),
+        boxes((away + 0.72, 0.51, 0.5), (0.16, 0.01, 0.16), finish.cable),
+    ]
+    mesh = joined(
+        [
+            *cabin,
+            ladder((0.1, 0, 0.7), (away, 0, 0.7), (0, 1, 0), 0.14, finish.steel),
+            bars(posts, 0.016, finish.steel),
+            bars(chains(wires), 0.009, finish.cable, sides=4),
+            railing(rim, 0.62, 0.5, 0.011, finish.steel, rails=7),
+            boxes((0.4, 0.2, 0), (3.96, 3.96, 0.03), gravel),
+        ]
+    )
+    return mesh.placed(turn((0, 0, 1), float(rng.choice([0, 90, 180, 270])) + rng.uniform(-20, 20)))
+
+
+def _land(rng: np.random.Generator, palette: Palette) -> Mesh:
+    """A hilltop or the edge of a village."""
+    small: Float[np.ndarray, "4 4"] = np.diag([0.4, 0.4, 0.4, 1.0])
+    village = places(rng, int(rng.integers(0, 9)), 16 / 0.4, 50 / 0.4)
+    parts = [
+        terrain(
+            rng,
+            palette,
+            str(rng.choice(["grass", "grass", "grass", "soil"])),
+            extent_m=110,
+            bumps_m=0.6,
+            flat_radius_m=11,
+        ),
+        trees(rng, palette, places(rng, int(rng.integers(12, 30)), 11, 60), height_m=(1.8, 4.0)),
+        bushes(rng, palette, places(rng, 14, 4 / 0.4, 30 / 0.4)).placed(small),
+        hills(rng, palette, distance_m=rng.uniform(80, 120)),
+    ]
+    if len(village):
+        parts.append(houses(rng, palette, village).placed(small))
+    else:
+        parts.append(rocks(rng, palette, places(rng, 14, 3.5, 20)))
+    return joined(parts)

@@ -1,0 +1,181 @@
+"""A refinery: columns, tanks, vessels and stacks on both sides of a rack full of pipes."""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+from stereoweave.synth.lattice import aviation, galvanised, painted, railing
+from stereoweave.synth.parts import boxes, lathe, shift, turn
+from stereoweave.synth.pipework import pipes, rack
+from stereoweave.synth.plants import Coats, Unit, ball_tank, chimney, column, drum_tank, flare, vessels
+from stereoweave.synth.rigs import Orbit
+from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.surroundings import barrels, daylight, hills, houses, pallets, places, terrain, trees
+from stereoweave.synth.world import Material, Mesh, World, joined
+
+UNITS: dict[str, Callable[[np.random.Generator, Coats], Unit]] = {
+    "column": column,
+    "ball tank": ball_tank,
+    "drum tank": drum_tank,
+    "vessels": vessels,
+    "chimney": chimney,
+    "flare": flare,
+}
+# How many there are of each: a person names a refinery by them.
+_COUNTS = {
+    "column": (3, 3),
+    "ball tank": (1, 2),
+    "drum tank": (2, 3),
+    "vessels": (2, 2),
+    "chimney": (1, 1),
+    "flare": (1, 1),
+}
+_PLOTS_X_M = (-2.7, -0.9, 0.9, 2.7)
+_PLOTS_Y_M = (-2.75, -1.4, 1.4, 2.75)
+_HALF_RACK_M = 3.3
+_YARD_M = 13.5  # half a side
+# Surroundings come in their real size.
+_SMALL = np.diag([0.3, 0.3, 0.3, 1.0])
+
+
+def refinery(rng: np.random.Generator) -> Stage:
+    """A refinery of 10 to 12 units, seen from all around."""
+    palette = Palette()
+    coats = _coats(rng, palette)
+    rusty = Material(texture="rust", variant=int(rng.integers(64)), span_m=0.8)
+    paints = [painted(rng, colour) for colour in ((0.5, 0.4, 0.1), (0.2, 0.3, 0.24))]
+    lines = (*coats.shells[:4], *(palette.add(material) for material in (rusty, *paints)))
+    plant = [*_units(rng, coats, lines), _rack(rng, coats, lines), *_yard(rng, palette, coats)]
+    corners = _YARD_M * np.array([(x, y, 0.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))])
+    around = [
+        _ground(rng, palette),
+        railing(corners, 0.28, 1.2, 0.012, coats.rail, rails=3),
+        _tank_farm(rng, coats),
+        trees(rng, palette, places(rng, 16, 17.0, 60.0), (1.0, 2.6)),
+        houses(rng, palette, places(rng, 6, 20.0, 50.0) / 0.3).placed(_SMALL),
+        hills(rng, palette, distance_m=rng.uniform(70, 120)),
+    ]
+    sky, fog, exposure = daylight(rng)
+    mesh = joined([*(part.as_target() for part in plant), *around])
+    world = World(mesh=mesh, materials=tuple(palette.materials), sky=sky, fog=fog, exposure=exposure)
+    orbit = Orbit(
+        centre_m=(0.0, 0.0, 1.5), distance_m=(7.5, 11.0), elevation_deg=(-4.0, 24.0), aim_m=0.7, floor_m=0.6
+    )
+    return Stage(world=world, orbit=orbit)
+
+
+def _coats(rng: np.random.Generator, palette: Palette) -> Coats:
+    red, white = aviation(rng)
+    bare = Material(
+        texture="steel",
+        variant=int(rng.integers(64)),
+        tint=(1.3, 1.3, 1.32),
+        span_m=0.7,
+        roughness=0.4,
+        metal=0.6,
+    )
+    shells = (
+        galvanised(rng),
+        bare,
+        painted(rng, (0.75, 0.75, 0.72)),
+        painted(rng, (0.5, 0.53, 0.52)),
+        painted(rng, (0.55, 0.5, 0.4)),
+    )
+    structure = painted(rng, [(0.25, 0.27, 0.28), (0.3, 0.16, 0.1), (0.2, 0.28, 0.33)][rng.integers(3)])
+    rails = painted(rng, (0.62, 0.45, 0.06) if rng.random() < 0.6 else (0.6, 0.6, 0.58))
+    return Coats(
+        shells=tuple(palette.add(shell) for shell in shells),
+        steel=palette.add(structure),
+        rail=palette.add(rails),
+        red=palette.add(red),
+        white=palette.add(white),
+        concrete=palette.add(
+            Material(texture="concrete", variant=int(rng.integers(64)), tint=(0.8, 0.79, 0.76), span_m=1.2)
+        ),
+        sign=palette.add(Material(texture="sign", variant=int(rng.integers(64)), span_m=0.5)),
+        flame=palette.add(Material(texture="plain", tint=(1.0, 0.5, 0.12), glow=6.0)),
+    )
+
+
+def _units(rng: np.random.Generator, coats: Coats, lines: tuple[int, ...]) -> list[Mesh]:
+    """The units on their plots, and a pipe or two from each to the rack."""
+    plots = iter(np.array([(x, y) for x in _PLOTS_X_M for y in _PLOTS_Y_M])[rng.permutation(16)])
+    meshes: list[Mesh] = []
+    routes: dict[int, list[Float[np.ndarray, "_ 3"]]] = {}
+    for name, counts in _COUNTS.items():
+        count = int(rng.integers(counts[0], counts[1] + 1))
+        # Two are often of one make, and building is what takes time.
+        kinds = [UNITS[name](rng, coats) for _ in range((count + 1) // 2)]
+        for k in range(count):
+            x, y = next(plots)
+            pose = shift(x, y) @ turn((0, 0, 1), 90.0 * int(rng.integers(4)))
+            unit = kinds[k % len(kinds)]
+            meshes.append(unit.mesh.placed(pose))
+            for nozzle in unit.nozzles_m @ pose[:3, :3].T + pose[:3, 3]:
+                routes.setdefault(int(rng.choice(lines[:4])), []).append(_route(rng, nozzle, (x, y)))
+    radii_m = {coat: rng.choice([0.02, 0.028, 0.036], len(paths)).tolist() for coat, paths in routes.items()}
+    return [*meshes, *(pipes(paths, radii_m[coat], coat) for coat, paths in routes.items())]
+
+
+def _route(
+    rng: np.random.Generator, start_m: Float[np.ndarray, "3"], plot_m: tuple[float, float]
+) -> Float[np.ndarray, "_ 3"]:
+    """From a nozzle out to a lane between the plots, along it at some height, and into the rack."""
+    x, y, z = start_m
+    lane_x, side = plot_m[0] + rng.choice([-1, 1]) * rng.uniform(0.7, 0.88), np.sign(plot_m[1])
+    high_m, into_m = float(rng.choice([0.17, 0.51, 0.63])), float(rng.choice([0.8, 1.16]))
+    near_y, rack_y = side * 0.62, side * rng.uniform(0.1, 0.45)
+    return np.array(
+        [(x, y, z), (lane_x, y, z), (lane_x, y, high_m), (lane_x, near_y, high_m), (lane_x, near_y, into_m)]
+        + [(lane_x, rack_y, into_m)]
+    )
+
+
+def _rack(rng: np.random.Generator, coats: Coats, lines: tuple[int, ...]) -> Mesh:
+    levels_m = (0.72, 1.08) if rng.random() < 0.6 else (0.72, 1.08, 1.42)
+    return rack(rng, _HALF_RACK_M, levels_m, lines, coats)
+
+
+def _yard(rng: np.random.Generator, palette: Palette, coats: Coats) -> list[Mesh]:
+    """What stands between: a slab under the plant, a control house, boards with signs, drums, pallets."""
+    slab = boxes([[0, 0, 0.0]], [[8.4, 8.0, 0.03]], coats.concrete)
+    spots = np.column_stack(
+        [rng.uniform(-3.6, 3.6, 6), rng.choice([-1, 1], 6) * rng.uniform(3.5, 3.9, 6), np.zeros(6)]
+    )
+    boards = [boxes([spot + [0, 0, 0.28]], [[0.34, 0.015, 0.22]], coats.sign) for spot in spots[:3]]
+    legs = boxes(spots[:3] + [0, 0, 0.12], [[0.03, 0.012, 0.26]], coats.rail)
+    drums = barrels(rng, palette, _cluster(rng, 8) / 0.3).placed(_SMALL)
+    stacks = pallets(rng, palette, _cluster(rng, 4) / 0.3).placed(_SMALL)
+    return [slab, *boards, legs, drums, stacks]
+
+
+def _ground(rng: np.random.Generator, palette: Palette) -> Mesh:
+    """A paved yard in open land."""
+    family = str(rng.choice(["concrete", "asphalt", "gravel"]))
+    paving = Material(
+        texture=family, variant=int(rng.integers(64)), tint=(0.9, 0.88, 0.85), span_m=1.6, roughness=0.95
+    )
+    yard = boxes([[0, 0, -0.2]], [[2.02 * _YARD_M, 2.02 * _YARD_M, 0.4]], palette.add(paving))
+    land = str(rng.choice(["grass", "grass", "soil"]))
+    return joined(
+        [yard, terrain(rng, palette, land, extent_m=110.0, level_m=-0.1, bumps_m=0.8, flat_radius_m=20.0)]
+    )
+
+
+def _tank_farm(rng: np.random.Generator, coats: Coats) -> Mesh:
+    """Large tanks on one side in the distance."""
+    spots = places(rng, 24, 18.0, 42.0)
+    spots = spots[np.argsort(-spots @ [np.cos(way := rng.uniform(0, 6)), np.sin(way), 0])[:7]]
+    profile = np.array(
+        [[0, 0], [2.2, 0], [2.2, 0.7], [2.24, 0.72], [2.2, 0.74], [2.2, 1.5], [0.05, 1.8], [0, 1.8]]
+    )
+    tanks = [lathe(profile * rng.uniform([0.7, 0.9], [1.1, 1.5]), coats.shell(rng), 40) for _ in range(2)]
+    return joined(tanks[k % 2].moved(x, y, -0.1) for k, (x, y, _) in enumerate(spots))
+
+
+def _cluster(rng: np.random.Generator, count: int) -> Float[np.ndarray, "n 3"]:
+    """Spots close to each other at the edge of the plant."""
+    middle = np.array([rng.choice([-1, 1]) * 3.85, rng.uniform(-3.4, 3.4), 0.015])
+    grid = np.stack(np.meshgrid(np.arange(3) - 1, np.arange(3) - 1), -1).reshape(-1, 2)[:count]
+    return middle + np.pad(0.26 * grid + rng.normal(0, 0.02, grid.shape), ((0, 0), (0, 1)))

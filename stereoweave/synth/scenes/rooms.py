@@ -1,0 +1,158 @@
+"""Rooms and grounds full of things of all shapes and surfaces, for training."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from stereoweave.synth.clutter import Space, clutter
+from stereoweave.synth.interiors import lamps_at, pendants, shell
+from stereoweave.synth.parts import boxes, turn
+from stereoweave.synth.rigs import Orbit
+from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.surfaces import chosen
+from stereoweave.synth.surroundings import bushes, daylight, hills, houses, places, rocks, terrain, trees
+from stereoweave.synth.world import Colour, Lamp, Mesh, Sky, World, joined
+
+# The cameras of one world see nearly the same, so that things can be placed where all of them see them.
+_SWING_DEG = 12.0
+
+
+def rooms(rng: np.random.Generator) -> Stage:
+    """A room or a ground with 15 to 40 things, seen from a part of a circle around its middle."""
+    return _room(rng) if rng.random() < 0.5 else _ground(rng)
+
+
+def _room(rng: np.random.Generator) -> Stage:
+    palette = Palette()
+    size_m = rng.uniform([5.0, 5.0, 2.5], [10.0, 10.0, 4.2])
+    open_roof, open_side = rng.random() < 0.2, int(rng.integers(4)) if rng.random() < 0.25 else None
+    orbit = _orbit_inside(rng, size_m)
+    space = Space(
+        orbit=orbit,
+        low_m=np.array([-0.5, -0.5, 0]) * size_m,
+        high_m=np.array([0.5, 0.5, 1]) * size_m,
+        far_m=orbit.distance_m[1] + 0.45 * float(size_m[:2].max()),
+    )
+    things = clutter(rng, palette, space)
+    spots_m = _lamp_spots(rng, space)
+    lamps = lamps_at(rng, spots_m)
+    parts = [shell(rng, palette, size_m, open_roof=open_roof, open_side=open_side)]
+    sky, _, exposure = daylight(rng)
+    if not open_roof:
+        parts.append(pendants(rng, palette, spots_m, float(size_m[2])))
+    if not open_roof and open_side is None:
+        sky, exposure = _indoors(rng, sky, lamps)
+    else:
+        parts.append(terrain(rng, palette, "grass", extent_m=80.0, level_m=-0.2, flat_radius_m=9.0))
+        parts.append(trees(rng, palette, places(rng, 14, 12.0, 40.0)))
+    mesh = joined([*parts, *(thing.as_target() for thing in things)])
+    world = World(mesh=mesh, materials=tuple(palette.materials), sky=sky, lamps=lamps, exposure=exposure)
+    return Stage(world=world, orbit=orbit)
+
+
+def _ground(rng: np.random.Generator) -> Stage:
+    palette = Palette()
+    azimuth_deg, lowest_deg, distance_m = rng.uniform((0, -3, 2.0), (360, 15, 4.5)).tolist()
+    orbit = Orbit(
+        centre_m=(0.0, 0.0, rng.uniform(0.8, 1.5)),
+        distance_m=(distance_m, 1.1 * distance_m),
+        azimuth_deg=(azimuth_deg, azimuth_deg + _SWING_DEG),
+        elevation_deg=(lowest_deg, lowest_deg + 4),
+        aim_m=0.25,
+        floor_m=0.45,
+    )
+    reach_m = rng.uniform(3.5, 8.0)
+    space = Space(
+        orbit=orbit,
+        low_m=np.array([-9.0, -9.0, 0.0]),
+        high_m=np.array([9.0, 9.0, 4.5]),
+        far_m=distance_m + reach_m,
+    )
+    things = clutter(rng, palette, space)
+    family = str(rng.choice(["grass", "soil", "gravel", "asphalt", "concrete"]))
+    parts = [
+        terrain(rng, palette, family, extent_m=90.0, bumps_m=1.5, flat_radius_m=9.5),
+        _walls(rng, palette, azimuth_deg + _SWING_DEG / 2, reach_m),
+        trees(rng, palette, places(rng, int(rng.integers(5, 20)), 12.0, 45.0)),
+        bushes(rng, palette, places(rng, int(rng.integers(4, 20)), 10.0, 30.0)),
+        *_far_off(rng, palette),
+    ]
+    mesh = joined([*parts, *(thing.as_target() for thing in things)])
+    sky, fog, exposure = daylight(rng)
+    exposure *= float(np.exp(rng.normal(-0.12, 0.25)))
+    materials = tuple(palette.materials)
+    return Stage(
+        world=World(mesh=mesh, materials=materials, sky=sky, fog=fog, exposure=exposure), orbit=orbit
+    )
+
+
+def _far_off(rng: np.random.Generator, palette: Palette) -> Sequence[Mesh]:
+    """Some of hills, houses and rocks."""
+    far = []
+    if rng.random() < 0.6:
+        far.append(hills(rng, palette, distance_m=rng.uniform(70, 130)))
+    if rng.random() < 0.6:
+        far.append(houses(rng, palette, places(rng, int(rng.integers(2, 6)), 18.0, 50.0)))
+    if rng.random() < 0.6:
+        far.append(rocks(rng, palette, places(rng, int(rng.integers(4, 16)), 10.0, 25.0)))
+    return far
+
+
+def _walls(rng: np.random.Generator, palette: Palette, cameras_deg: float, away_m: float) -> Mesh:
+    """One to four walls that stand free beyond the middle, opposite to the cameras."""
+    walls = []
+    for _ in range(int(rng.integers(1, 5))):
+        material = palette.add(
+            chosen(rng, ("brick", "stone", "plaster", "concrete", "wood", "photograph"), 7.0)
+        )
+        size_m = rng.uniform([2.0, 0.15, 1.0], [7.0, 0.4, 3.2])
+        wall = boxes([[0, 0, size_m[2] / 2 - 0.3]], size_m[None], material)
+        coping = boxes([[0, 0, size_m[2] - 0.27]], (size_m * [1.02, 1.3, 0])[None] + [[0, 0, 0.08]], material)
+        around = turn((0, 0, 1), cameras_deg + 180 + rng.uniform(-55, 55))
+        facing = joined([wall, coping]).placed(turn((0, 0, 1), 90 + rng.normal(0, 25)))
+        walls.append(facing.moved(x=away_m * rng.uniform(0.9, 1.5)).placed(around))
+    return joined(walls)
+
+
+def _orbit_inside(rng: np.random.Generator, size_m: Float[np.ndarray, "3"]) -> Orbit:
+    """A part of a circle around the room's middle as wide as the walls allow, at heights people look from."""
+    azimuth_deg = rng.uniform(0, 360)
+    angle = np.radians(np.linspace(azimuth_deg, azimuth_deg + _SWING_DEG, 9))
+    to_wall_m = np.minimum(size_m[0] / 2 / abs(np.cos(angle)), size_m[1] / 2 / abs(np.sin(angle))).min()
+    farthest_m, height_m = min(float(to_wall_m) - 0.6, 5.0), rng.uniform(0.9, 1.4)
+    highest_deg = float(np.degrees(np.arctan((size_m[2] - 0.4 - height_m) / farthest_m)))
+    lowest_deg = rng.uniform(-8.0, min(14.0, highest_deg - 4))
+    return Orbit(
+        centre_m=(0.0, 0.0, height_m),
+        distance_m=(0.9 * farthest_m, farthest_m),
+        azimuth_deg=(azimuth_deg, azimuth_deg + _SWING_DEG),
+        elevation_deg=(lowest_deg, lowest_deg + 4),
+        aim_m=0.25,
+        floor_m=0.4,
+    )
+
+
+def _lamp_spots(rng: np.random.Generator, space: Space) -> Float[np.ndarray, "n 3"]:
+    """Spots of one to four lamps in the upper part of a room, away from the cameras."""
+    low_m = space.low_m * 0.8 + [0, 0, 0.68 * space.high_m[2]]
+    high_m = space.high_m * [0.8, 0.8, 0.85]
+    spots_m = rng.uniform(low_m, high_m, (40, 3))
+    clear_m = np.linalg.norm(spots_m[:, None] - space.eyes_m(), axis=2).min(1)
+    return spots_m[np.argsort(clear_m < 1.0, kind="stable")[: rng.integers(1, 5)]]
+
+
+def _indoors(rng: np.random.Generator, sky: Sky, lamps: Sequence[Lamp]) -> tuple[Sky, float]:
+    """A sky whose light comes from walls rather than from the sun, and the exposure for a room."""
+    ambient = rng.uniform(0.15, 0.6)
+    warm = np.array([1.0, 0.95, 0.87])
+
+    def shaded(share: float) -> Colour:
+        red, green, blue = (ambient * share * warm * rng.uniform(0.95, 1.05, 3)).tolist()
+        return red, green, blue
+
+    room_light = Sky(
+        sun=sky.sun, sun_light=(0.0, 0.0, 0.0), zenith=shaded(1.0), horizon=shaded(0.8), ground=shaded(0.5)
+    )
+    lamp_light = sum(lamp.light[1] / (1.0 + np.sum(np.square(lamp.position_m))) for lamp in lamps)
+    return room_light, float(0.9 * np.exp(rng.normal(0, 0.35)) / (ambient + lamp_light))

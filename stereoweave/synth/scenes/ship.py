@@ -1,0 +1,232 @@
+"""A small ship, on the water or at a quay: a tug, a trawler, a coaster or a patrol boat. Its bow is at +x."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from stereoweave.synth import deck_gear as gear
+from stereoweave.synth.deckhouses import (
+    Paints,
+    door,
+    funnel,
+    lifebuoys,
+    mast,
+    stays,
+    tyres,
+    windows,
+)
+from stereoweave.synth.harbours import harbour, open_water
+from stereoweave.synth.hulls import Hull
+from stereoweave.synth.lattice import galvanised, ladder, painted, railing
+from stereoweave.synth.parts import Point, lathe, sheet, tubes, turn
+from stereoweave.synth.rigs import Orbit
+from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.surroundings import daylight, varied
+from stereoweave.synth.vessels import TRADES, Plan
+from stereoweave.synth.world import Colour, Material, Mesh, World, joined
+
+
+def ship(rng: np.random.Generator) -> Stage:
+    """A ship of 7 to 8.5 m, all of it in the picture or most."""
+    palette = Palette()
+    plan = TRADES[str(rng.choice(list(TRADES)))](rng)
+    heel = turn((1, 0, 0), rng.normal(0, 0.8)) @ turn((0, 1, 0), rng.normal(0, 0.6))
+    vessel = _built(rng, palette, plan).placed(heel)
+    moored = rng.random() < 0.5
+    around = harbour(rng, palette, plan.hull) if moored else open_water(rng, palette)
+    sky, fog, exposure = daylight(rng)
+    world = World(
+        mesh=joined([vessel.as_target(), around]),
+        materials=tuple(palette.materials),
+        sky=sky,
+        fog=fog,
+        exposure=exposure,
+    )
+    orbit = Orbit(
+        centre_m=(0.0, 0.0, 0.8),
+        distance_m=(6.6, 9.6),
+        azimuth_deg=(22.0, 158.0) if moored else (0.0, 360.0),
+        elevation_deg=(2.0, 24.0),
+        aim_m=0.6,
+        floor_m=0.8,
+    )
+    return Stage(world=world, orbit=orbit)
+
+
+# Hull, stripe, bottom, house, second colour, as fleets paint them.
+_LIVERIES: tuple[tuple[Colour, Colour, Colour, Colour, Colour], ...] = (
+    ((0.05, 0.06, 0.07), (0.9, 0.9, 0.87), (0.42, 0.1, 0.07), (0.9, 0.88, 0.82), (0.6, 0.3, 0.08)),
+    ((0.06, 0.13, 0.28), (0.9, 0.9, 0.87), (0.4, 0.11, 0.08), (0.95, 0.95, 0.93), (0.62, 0.12, 0.08)),
+    ((0.4, 0.07, 0.05), (0.9, 0.9, 0.87), (0.08, 0.09, 0.1), (0.95, 0.94, 0.9), (0.08, 0.1, 0.12)),
+    ((0.09, 0.15, 0.12), (0.85, 0.8, 0.65), (0.4, 0.11, 0.08), (0.9, 0.87, 0.78), (0.6, 0.5, 0.28)),
+    ((0.42, 0.45, 0.47), (0.1, 0.1, 0.11), (0.35, 0.1, 0.08), (0.5, 0.53, 0.55), (0.3, 0.33, 0.35)),
+    ((0.95, 0.95, 0.93), (0.1, 0.2, 0.4), (0.1, 0.22, 0.36), (0.97, 0.96, 0.93), (0.1, 0.25, 0.45)),
+    ((0.3, 0.4, 0.46), (0.9, 0.9, 0.87), (0.4, 0.11, 0.08), (0.92, 0.9, 0.85), (0.7, 0.45, 0.15)),
+)
+
+
+def _built(rng: np.random.Generator, palette: Palette, plan: Plan) -> Mesh:
+    """The whole ship, afloat."""
+    side, stripe, bottom, walls, trim = _LIVERIES[rng.integers(len(_LIVERIES))]
+    coats = [
+        palette.add(replace(painted(rng, colour), span_m=rng.uniform(3, 5)))
+        for colour in (bottom, stripe, side)
+    ]
+    paints = _paints(rng, palette, walls, trim)
+    sign = palette.add(Material(texture="sign", variant=1, span_m=1.0, roughness=0.6))
+    cloth = palette.add(Material(texture="cloth", variant=0, tint=varied(rng, trim), span_m=0.5))
+    boxes = tuple(
+        palette.add(painted(rng, colour))
+        for colour in ((0.35, 0.12, 0.08), (0.12, 0.2, 0.35), (0.5, 0.48, 0.42))
+    )
+    hull = plan.hull
+    pieces = [
+        hull.skin(*coats),
+        hull.deck(paints.roof, paints.house, paints.trim),
+        _houses(rng, plan, paints),
+        _forward(plan, paints),
+        _name(hull, sign),
+        plan.fitted(rng, plan, paints, boxes),
+        gear.flag(rng, plan.on_deck(-hull.length_m / 2 + 0.12), 1.0, paints, cloth),
+    ]
+    if plan.fenders:
+        pieces.append(_fenders(hull, paints))
+    if hull.bulwark_m < 0.2:
+        pieces.append(_rails(hull, paints))
+    return joined(pieces)
+
+
+def _paints(rng: np.random.Generator, palette: Palette, walls: Colour, trim: Colour) -> Paints:
+    decks: tuple[Colour, ...] = ((0.14, 0.21, 0.17), (0.3, 0.14, 0.1), (0.33, 0.34, 0.35))
+    return Paints(
+        house=palette.add(painted(rng, walls)),
+        roof=palette.add(painted(rng, decks[int(rng.integers(3))], 0.8)),
+        trim=palette.add(painted(rng, trim)),
+        white=palette.add(painted(rng, (0.95, 0.95, 0.92))),
+        dark=palette.add(Material(texture="plain", tint=(0.05, 0.05, 0.055), roughness=0.7)),
+        glass=palette.add(Material(texture="plain", tint=(0.05, 0.07, 0.08), roughness=0.06)),
+        steel=palette.add(galvanised(rng)),
+        orange=palette.add(Material(texture="plain", tint=(0.75, 0.2, 0.05), roughness=0.6)),
+        rope=palette.add(
+            Material(
+                texture="cloth",
+                variant=int(rng.integers(3)),
+                tint=varied(
+                    rng, [(0.6, 0.9, 0.75), (0.65, 0.75, 1.0), (1.6, 1.4, 1.1)][int(rng.integers(3))]
+                ),
+                span_m=0.3,
+                relief=0.8,
+            )
+        ),
+    )
+
+
+def _houses(rng: np.random.Generator, plan: Plan, paints: Paints) -> Mesh:
+    """House and bridge with all that is on and about them."""
+    house, bridge = plan.house, plan.bridge
+    starboard, front, port, back = house.walls_m()
+    pieces = [house.mesh(paints.house, paints.roof), bridge.mesh(paints.house, paints.roof, 0.09)]
+    pieces += [
+        windows(wall, max(int(house.x_m[1] - house.x_m[0]) * 2, 3), (0.58, 0.8), paints, 0.55)
+        for wall in (starboard, port)
+    ]
+    pieces += [windows(front, 3, (0.55, 0.8), paints, 0.5), door(back, rng.uniform(0.3, 0.7), paints)]
+    for wall, count in zip(bridge.walls_m(), (3, 5, 3, 3), strict=True):
+        pieces.append(windows(wall, count, (0.44, 0.82), paints, 0.3))
+    top = house.z_m[1] + 0.05
+    pieces += [
+        funnel(np.array([x, y, top - 0.05]), (0.5, 0.34 if y else 0.5, 1.0), paints) for x, y in plan.funnels
+    ]
+    foot = np.array([plan.mast_m[0], 0, bridge.z_m[1] + 0.04])
+    pieces += [
+        mast(rng, foot, plan.mast_m[1], paints),
+        _rigging(plan, foot, paints),
+        _roof_rails(plan, paints),
+    ]
+    half = house.width_m / 2
+    at = np.array(
+        [
+            [house.x_m[0] + 0.35, side * (half + 0.03), house.z_m[0] + 0.62 * (top - house.z_m[0])]
+            for side in (1, -1)
+        ]
+    )
+    pieces.append(lifebuoys(at, np.array([[0, 1.0, 0], [0, -1.0, 0]]), paints))
+    return joined(pieces)
+
+
+def _rigging(plan: Plan, foot: Point, paints: Paints) -> Mesh:
+    """Wires from the mast to bow and stern, and a searchlight on the bridge's front."""
+    top = foot + [-0.05 * plan.mast_m[1], 0, 0.92 * plan.mast_m[1]]
+    bow, aft = plan.hull.length_m / 2, -plan.hull.length_m / 2
+    ends = np.array(
+        [plan.on_deck(bow + 0.2) + [0, 0, plan.hull.bulwark_m], plan.on_deck(aft + 0.1) + [0, 0, 0.9]]
+    )
+    lamp = lathe([(0.05, 0), (0.09, 0.05), (0.09, 0.12), (0, 0.12)], paints.white, 14).placed(
+        turn((0, 1, 0), 85)
+    )
+    light = np.array([plan.bridge.x_m[1] - 0.15, 0.3, plan.bridge.z_m[1] + 0.17])
+    post = tubes(light - [0, 0, 0.15], light, 0.02, paints.white)
+    return joined([stays(np.stack([top, top]), ends, paints), lamp.moved(*light), post])
+
+
+def _roof_rails(plan: Plan, paints: Paints) -> Mesh:
+    """A railing round the after part of the house's roof, and a ladder up to the bridge's."""
+    _, top = plan.house.corners_m(-0.05)
+    top = top + [0, 0, 0.05]
+    ahead = (plan.bridge.x_m[0] - plan.house.x_m[0]) / (plan.house.x_m[1] - plan.house.x_m[0])
+    ahead = float(np.clip(ahead, 0.12, 1)) + 0.1
+    path = np.stack([top[0] + ahead * (top[1] - top[0]), top[0], top[3], top[3] + ahead * (top[2] - top[3])])
+    back = plan.bridge.x_m[0]
+    foot, head = (back - 0.14, -0.3, plan.bridge.z_m[0]), (back - 0.1, -0.3, plan.bridge.z_m[1] + 0.2)
+    return joined(
+        [railing(path, 0.38, 0.4, 0.012, paints.white, 3), ladder(foot, head, (0, 1, 0), 0.26, paints.white)]
+    )
+
+
+def _forward(plan: Plan, paints: Paints) -> Mesh:
+    """A windlass, bitts, anchors and a rope on the forecastle, vents and bitts elsewhere."""
+    hull = plan.hull
+    bow = hull.length_m / 2
+    ends = np.array([[0.14], [0.76]])
+    inboard = hull.side_m(ends, hull.edge_m(ends) - hull.bulwark_m, np.array([1, -1])) * [1, 0.76, 1]
+    anchors = []
+    for side in (1.0, -1.0):
+        at = hull.side_m(0.93, hull.edge_m(0.93) - 0.32, side)
+        anchors.append(gear.anchor(at, side, paints))
+    windlass = gear.winch(np.zeros(3), 0.6, paints, paints.rope).placed(np.diag([0.6, 0.6, 0.6, 1]))
+    return joined(
+        [
+            windlass.moved(*plan.on_deck(bow - 0.75)),
+            gear.bitts(inboard.reshape(-1, 3), paints),
+            gear.vents(np.stack([plan.on_deck(bow - 1.15, side * 0.22) for side in (1, -1)]), paints),
+            *anchors,
+        ]
+    )
+
+
+def _name(hull: Hull, sign: int) -> Mesh:
+    """The name on both bows and on the stern."""
+    plates = []
+    for side in (1, -1):
+        plates.append(hull.patch((48, 54), (3, 5), side, sign))
+    z = hull.edge_m(0.0) - np.array([0.4, 0.12])
+    at = hull.side_m(np.zeros(2), z, 0.0) - [0.03, 0, 0]
+    plates.append(sheet(np.stack([at + [0, y, 0] for y in (0.45, -0.45)], 1), sign))
+    return joined(plates)
+
+
+def _fenders(hull: Hull, paints: Paints) -> Mesh:
+    """Tyres along both sides."""
+    share = np.linspace(0.06, 0.76, 9)
+    hung = []
+    for side in (1, -1):
+        at, ahead = (hull.side_m(s, hull.edge_m(s) - 0.2, side) for s in (share, share + 0.01))
+        hung.append(tyres(at + [0, side * 0.05, 0], (ahead - at) * [1, 1, 0], paints))
+    return joined(hung)
+
+
+def _rails(hull: Hull, paints: Paints) -> Mesh:
+    """Railings along both sides and the stern."""
+    share = np.linspace(0.985, 0.0, 14)
+    port, starboard = (hull.side_m(share, hull.edge_m(share), side) * [1, 0.97, 1] for side in (1, -1))
+    return railing(np.concatenate([port, starboard[::-1]]), 0.36, 0.6, 0.011, paints.white, 3)

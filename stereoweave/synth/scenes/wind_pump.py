@@ -1,0 +1,163 @@
+"""A wind pump: a wheel of many sheet-iron blades with a tail on a lattice tower, a tank, dry country."""
+
+import numpy as np
+
+from stereoweave.synth.lattice import bars, chains, galvanised, ladder, levels, painted, railing, rings, truss
+from stereoweave.synth.parts import boxes, copies, lathe, sheet, spheres, tubes, turn
+from stereoweave.synth.rigs import Orbit
+from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.surroundings import bushes, daylight, fence, hills, places, rocks, terrain, trees
+from stereoweave.synth.world import Material, Mesh, World, joined
+
+
+def wind_pump(rng: np.random.Generator) -> Stage:
+    """A pump about 5 m high, its wheel towards +x."""
+    palette = Palette()
+    steel = palette.add(galvanised(rng))
+    blades = palette.add(galvanised(rng) if rng.random() < 0.6 else painted(rng, (0.7, 0.68, 0.62)))
+    tail = palette.add(painted(rng, (0.5, 0.08, 0.05)))
+    rust = palette.add(Material(texture="rust", variant=int(rng.integers(8)), span_m=1.0))
+    hub, radius = rng.uniform(3.9, 4.4), rng.uniform(0.95, 1.3)
+    target = joined(
+        [
+            _wheel(rng, radius, (blades, tail, steel)).moved(0.3, 0, hub),
+            _tail(rng, radius, (tail, steel)).moved(0, 0, hub),
+            _tower(hub - 0.12, steel, rust),
+            _tank(rng, palette, steel, rust),
+        ]
+    )
+    sky, fog, exposure = daylight(rng)
+    world = World(
+        mesh=joined([target.as_target(), _country(rng, palette)]),
+        materials=tuple(palette.materials),
+        sky=sky,
+        fog=fog,
+        exposure=exposure,
+    )
+    front = float(rng.choice([0, 180]))
+    orbit = Orbit(
+        centre_m=(0.0, 0.0, 0.5 * (hub + radius)),
+        distance_m=(6.0, 8.5),
+        azimuth_deg=(front - 60, front + 60),
+        elevation_deg=(-16, 16),
+        aim_m=0.5,
+        floor_m=0.5,
+    )
+    return Stage(world=world, orbit=orbit)
+
+
+def _wheel(rng: np.random.Generator, radius_m: float, skins: tuple[int, int, int]) -> Mesh:
+    """Curved blades set at an angle, two rings, spokes, a hub; the wheel's axis is x."""
+    blades, marked, steel = skins
+    count = int(rng.choice([12, 15, 18]))
+    share = np.linspace(0, 1, 5)[:, None]
+    width = (0.42 + 0.5 * share) * 2 * np.pi * radius_m / count * 0.95
+    across = np.linspace(-0.5, 0.5, 5)[None]
+    z = radius_m * (0.4 + 0.6 * share) + 0 * across
+    bowl = 0.3 * width * (0.25 - across**2)
+    tilt = np.radians(28)
+    y = across * width * np.cos(tilt) - bowl * np.sin(tilt)
+    x = across * width * np.sin(tilt) + bowl * np.cos(tilt)
+    blade = np.stack([x, y, z], -1)
+    both = [sheet(blade, blades), sheet(blade[:, ::-1] - [0.006, 0, 0], blades)]
+    turns = np.stack([turn((1, 0, 0), 360 * (k + rng.uniform(0, 0.02)) / count) for k in range(count)])
+    angle = np.linspace(0, 2 * np.pi, 4 * count + 1)
+    circle = np.column_stack([0 * angle, np.cos(angle), np.sin(angle)])
+    hoops = np.stack([circle * 0.46 * radius_m - [0.02, 0, 0], circle * 0.86 * radius_m - [0.05, 0, 0]])
+    spokes = circle[: 4 * 6 * (count // 6) : 4 * (count // 6)]
+    starts = np.concatenate([spokes * 0.06, spokes * 0.06 - [0.16, 0, 0]])
+    ends = np.tile(spokes * 0.86 * radius_m - [0.05, 0, 0], (2, 1))
+    hub = lathe([(0, -0.2), (0.08, -0.2), (0.08, 0.02), (0.04, 0.08), (0, 0.09)], marked, 20)
+    return joined(
+        [
+            copies(joined(both), turns),
+            bars(chains(hoops), 0.011, steel),
+            bars(np.stack([starts, ends], 1), 0.01, steel),
+            hub.placed(turn((0, 1, 0), 90)),
+        ]
+    )
+
+
+def _tail(rng: np.random.Generator, radius_m: float, skins: tuple[int, int]) -> Mesh:
+    """Gear case, boom, and the vane that turns the wheel into the wind, with the maker's name."""
+    vane, steel = skins
+    end = -1.25 * radius_m
+    half = rng.uniform(0.26, 0.34)
+    boom = np.array(
+        [
+            [(0.15, 0, 0.0), (end, 0, 0.0)],
+            [(0, 0, 0.16), (0.75 * end, 0, 0.0)],
+            [(0, 0, -0.16), (0.75 * end, 0, 0.0)],
+        ]
+    )
+    outline = np.array(
+        [[(0.55 * end, -0.5 * half), (1.3 * end, -half)], [(0.55 * end, 0.5 * half), (1.3 * end, half)]]
+    )
+    board = np.insert(outline, 1, 0.012, axis=2)
+    return joined(
+        [
+            boxes((0.05, 0, 0), (0.26, 0.2, 0.26), vane),
+            bars(boom, 0.014, steel),
+            sheet(board, vane),
+            sheet(board[:, ::-1] * [1, -1, 1], vane),
+        ]
+    )
+
+
+def _tower(top_m: float, steel: int, rust: int) -> Mesh:
+    """Four legs, crossed braces, platform with railing, ladder, pump rod, footings."""
+    joints = rings(*levels((0.0, top_m), (1.3, 0.14), 0.9))
+    deck = 0.86 * top_m
+    rim = 0.28 * np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0], [1, 1, 0]])
+    return joined(
+        [
+            truss(joints, "cross").mesh(0.02, 0.0085, steel),
+            boxes((0, 0, deck), (0.58, 0.58, 0.02), rust),
+            railing(rim + [0, 0, deck], 0.2, 0.3, 0.006, steel),
+            ladder((0, 0.64, 0.05), (0, 0.15, deck), (1, 0, 0), 0.11, steel),
+            tubes((0, 0, 0.05), (0, 0, top_m), 0.011, rust),
+            tubes((0, 0, 0.0), (0, 0, 0.5), 0.045, rust, 12),
+            boxes(joints[0], (0.16, 0.16, 0.12), rust),
+        ]
+    )
+
+
+def _tank(rng: np.random.Generator, palette: Palette, steel: int, rust: int) -> Mesh:
+    """A tank of corrugated iron full of water, the pipe into it, a trough."""
+    water = palette.add(Material(texture="water", tint=(0.3, 0.38, 0.36), roughness=0.1, relief=0.1))
+    radius, height = rng.uniform(0.55, 0.8), rng.uniform(0.5, 0.75)
+    z = np.linspace(0, height, 25)
+    wall = np.column_stack([radius + 0.012 * np.sin(np.arange(25) * np.pi / 2), z])
+    inside = np.array([[radius - 0.02, height], [radius - 0.02, height - 0.12]])
+    tank = lathe(np.concatenate([[[radius, -0.1]], wall, inside]), steel, 40)
+    surface = lathe([(radius - 0.01, height - 0.08), (0, height - 0.08)], water, 32)
+    x, y = -0.4, float(rng.choice([-1, 1])) * (radius + 0.95)
+    pipe = np.array([[0, 0, height + 0.14], [x, y * 0.8, height + 0.14], [x, y * 0.8, height - 0.02]])
+    return joined(
+        [
+            joined([tank, surface]).moved(x, y),
+            bars(chains(pipe[None]), 0.02, rust, sides=8),
+            spheres(pipe[1], 0.024, rust, 1),
+            tubes((0, 0, 0.4), (0, 0, height + 0.14), 0.02, rust, 8),
+            boxes((x + 1.1, y, 0.1), (0.9, 0.3, 0.2), rust),
+            boxes((x + 1.1, y, 0.195), (0.82, 0.24, 0.02), water),
+        ]
+    )
+
+
+def _country(rng: np.random.Generator, palette: Palette) -> Mesh:
+    """Dry ground with scrub, stones, a few trees, a fence, hills."""
+    small = np.diag([0.5, 0.5, 0.5, 1.0])
+    corners = np.array([(-40, 14, 0), (-6, 11, 0), (18, 12, 0), (50, 18, 0)]) * [1, rng.choice([-1, 1]), 1]
+    return joined(
+        [
+            terrain(
+                rng, palette, str(rng.choice(["soil", "grass"])), extent_m=110, bumps_m=0.8, flat_radius_m=9
+            ),
+            bushes(rng, palette, places(rng, 26, 3.5 / 0.5, 40 / 0.5)).placed(small),
+            rocks(rng, palette, places(rng, 14, 2.5 / 0.5, 25 / 0.5)).placed(small),
+            trees(rng, palette, places(rng, 12, 12, 60), height_m=(1.5, 3.5)),
+            fence(rng, palette, corners / 0.5).placed(small),
+            hills(rng, palette, distance_m=rng.uniform(85, 130)),
+        ]
+    )

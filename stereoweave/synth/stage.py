@@ -1,0 +1,26 @@
+"""What a scene gives: a world, and where to see it from."""
+
+from dataclasses import dataclass, field
+
+from stereoweave.synth.rigs import Orbit
+from stereoweave.synth.world import Material, World
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """A world and the places that a rig may stand at in it."""
+
+    world: World
+    orbit: Orbit
+
+
+@dataclass
+class Palette:
+    """The materials of a scene while it is being built."""
+
+    materials: list[Material] = field(default_factory=list)
+
+    def add(self, material: Material) -> int:
+        """Takes a material in; returns its index, for the meshes made of it."""
+        self.materials.append(material)
+        return len(self.materials) - 1

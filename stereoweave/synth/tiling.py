@@ -1,0 +1,191 @@
+"""What textures are made of: noise, cells and drawing that go on across the borders.
+
+Everything is SIDE texels wide and high and goes on at its other side. Colours are sRGB levels 0..255, and
+so are heights, 128 being the middle.
+"""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+SIDE = 512
+
+Map = Float[np.ndarray, "side side"]
+Colours = Float[np.ndarray, "side side 3"]
+Surface = Float[np.ndarray, "side side 4"]  # colour and height
+Canvas = UInt8[np.ndarray, "side side 4"]
+Colour = tuple[float, float, float]
+
+
+class Cells(NamedTuple):
+    """The Voronoi cells of scattered sites.
+
+    Attributes:
+        label: int [SIDE, SIDE], which cell a texel belongs to.
+        rim: float32, distance to the border of the next cell in texels, about.
+        number: how many cells there are.
+    """
+
+    label: Int[np.ndarray, "side side"]
+    rim: Map
+    number: int
+
+    def each(self, values: np.ndarray) -> np.ndarray:
+        """For each texel the value [N] or [N, C] of its cell."""
+        return values.astype(np.float32)[self.label]
+
+
+def noise(
+    rng: np.random.Generator,
+    exponent: float = 1.2,
+    cycles: float = 2.0,
+    stretch: tuple[float, float] = (1.0, 1.0),
+) -> Map:
+    """Noise whose amplitude falls as frequency**-exponent (1 in photographs); mean 0, deviation 1.
+
+    Args:
+        rng: Where the noise comes from.
+        exponent: How smooth the noise is.
+        cycles: Up to so many waves a side all are equally strong, so that no blot marks every tile.
+        stretch: How much longer than wide structures are, along y and along x.
+    """
+    along_y, along_x = stretch[0] * np.fft.fftfreq(SIDE), stretch[1] * np.fft.rfftfreq(SIDE)
+    squared = np.add.outer((along_y**2).astype(np.float32), (along_x**2).astype(np.float32))
+    strength = np.maximum(squared, (cycles / SIDE) ** 2) ** (-exponent / 2)
+    # So many waves add up to a normal distribution whatever theirs is; a flat one is drawn fastest.
+    waves = rng.random((SIDE, SIDE // 2 + 1, 2), np.float32).view(np.complex64)[..., 0] - (0.5 + 0.5j)
+    spectrum = waves.astype(np.complex64) * strength
+    spectrum[0, 0] = 0
+    values = np.fft.irfft2(spectrum, (SIDE, SIDE))
+    return values / values.std()
+
+
+def grid() -> tuple[Map, Map]:
+    """The texels' y and x."""
+    y, x = np.mgrid[:SIDE, :SIDE].astype(np.float32)
+    return y, x
+
+
+def cells(
+    rng: np.random.Generator, rows: int, columns: int, jitter: float = 0.45, rough: float = 0.0
+) -> Cells:
+    """Cells around sites on a jittered grid of rows x columns; borders wander by about `rough` texels."""
+    home = np.indices((rows, columns)).reshape(2, -1).T + 0.5
+    sites = home + jitter * rng.uniform(-1, 1, home.shape)
+    y, x = (sites * [SIDE / rows, SIDE / columns]).astype(int).T % SIDE
+    away = np.ones((SIDE, SIDE), np.uint8)
+    away[y, x] = 0
+    wide = cv2.copyMakeBorder(away, SIDE // 2, SIDE // 2, SIDE // 2, SIDE // 2, cv2.BORDER_WRAP)
+    _, nearest = cv2.distanceTransformWithLabels(wide, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    number = np.zeros(nearest.max() + 1, np.float32)
+    number[nearest[wide == 0]] = np.pad(_numbered(away), SIDE // 2, mode="wrap")[wide == 0]
+    label = number[nearest[SIDE // 2 : -SIDE // 2, SIDE // 2 : -SIDE // 2]]
+    if rough:
+        wander = [rough * noise(rng, 1.8, 5) for _ in range(2)]
+        label = bent(label, wander[0], wander[1], cv2.INTER_NEAREST)
+    return Cells(label.astype(np.int32), _rim(label), int(label.max()) + 1)
+
+
+def _numbered(away: UInt8[np.ndarray, "side side"]) -> Map:
+    return (np.cumsum(away == 0) - 1).reshape(away.shape).astype(np.float32)
+
+
+def _rim(label: Map) -> Map:
+    edge = (label != np.roll(label, 1, 0)) | (label != np.roll(label, 1, 1))
+    wide = cv2.copyMakeBorder((~edge).astype(np.uint8), 64, 64, 64, 64, cv2.BORDER_WRAP)
+    distance = cv2.distanceTransform(wide, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[64:-64, 64:-64]
+    # Whole texels make jagged joints.
+    return blurred(distance, 0.7)
+
+
+def bent(image: np.ndarray, down: Map, right: Map, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
+    """The image, looked up so many texels further down and right."""
+    y, x = grid()
+    return cv2.remap(image, x + right, y + down, interpolation, borderMode=cv2.BORDER_WRAP)
+
+
+def blurred(image: np.ndarray, sigma: float) -> np.ndarray:
+    """The image under a Gaussian of `sigma` texels."""
+    margin = int(4 * sigma) + 1
+    padded = cv2.copyMakeBorder(image, margin, margin, margin, margin, cv2.BORDER_WRAP)
+    return cv2.GaussianBlur(padded, (0, 0), sigma)[margin:-margin, margin:-margin]
+
+
+def run_down(source: Map, length: float) -> Map:
+    """What flows down from a source, fading over `length` texels, as rust and dirt do in the rain."""
+    tail = np.exp(-np.arange(SIDE, dtype=np.float32) / length)
+    spectrum = np.fft.rfft(source, axis=0) * np.fft.rfft(tail / tail.sum())[:, None]
+    return np.fft.irfft(spectrum, SIDE, axis=0).astype(np.float32)
+
+
+def painted(
+    canvas: Canvas,
+    polygons: Float[np.ndarray, "n k 2"],
+    levels: Float[np.ndarray, "n 4"],
+) -> None:
+    """Paints polygons, x y in texels, one over the other, into colour and height."""
+    low, high = polygons.min(1), polygons.max(1)
+    shifts = SIDE * (np.indices((3, 3)).reshape(2, 9).T - 1)
+    seen = ((high[:, None] + shifts > -1) & (low[:, None] + shifts < SIDE)).all(-1)
+    # OpenCV draws smooth edges less well along the border of a picture.
+    margin = 4
+    wide = cv2.copyMakeBorder(canvas, margin, margin, margin, margin, cv2.BORDER_WRAP)
+    corners = np.round((polygons + margin) * 16).astype(np.int32)
+    shades = np.clip(levels, 0, 255).tolist()
+    for number, shift in np.argwhere(seen).tolist():
+        cv2.fillPoly(wide, [corners[number] + 16 * shifts[shift]], shades[number], cv2.LINE_AA, 4)
+    canvas[:] = wide[margin:-margin, margin:-margin]
+
+
+def blades(
+    at: Float[np.ndarray, "n 2"],
+    turns: Float[np.ndarray, "n 2"],
+    length: Float[np.ndarray, " n"],
+    wide: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, "n 8 2"]:
+    """Outlines of blades of grass or straw, which begin at a point and become narrow.
+
+    turns: their direction at the beginning and at the tip, in radians.
+    """
+    share = np.linspace(0, 1, 4)
+    way = turns[:, :1] + share * (turns[:, 1:] - turns[:, :1])
+    steps = np.stack([np.cos(way), np.sin(way)], -1) * (length / 4)[:, None, None]
+    spine = at[:, None] + np.cumsum(steps, 1)
+    across = np.stack([-np.sin(way), np.cos(way)], -1) * (wide[:, None] * (1.05 - share**2))[..., None]
+    return np.concatenate([spine - across, (spine + across)[:, ::-1]], 1)
+
+
+def from_line(position: np.ndarray, first: float, period: float) -> Map:
+    """Distance to the nearest of the lines at first, first + period, ..."""
+    return np.abs((position - first + period / 2) % period - period / 2).astype(np.float32)
+
+
+def step(low: float, high: float, values: Map) -> Map:
+    """0 below low, 1 above high, smooth in between; low > high turns it round."""
+    share = np.clip((values - low) / (high - low), 0, 1)
+    return share * share * (3 - 2 * share)
+
+
+def mixed(first: np.ndarray | Colour, second: np.ndarray | Colour, share: Map) -> Colours:
+    """(1 - share) of the first and share of the second, each a picture or one colour."""
+    first, second = np.asarray(first, np.float32), np.asarray(second, np.float32)
+    return first + share[..., None] * (second - first)
+
+
+def ramp(values: Map, *colours: Colour) -> Colours:
+    """0..1 to colours, which are evenly spaced from the first to the last."""
+    at, stops = np.linspace(0, len(colours) - 1, 1024), range(len(colours))
+    table = np.stack([np.interp(at, stops, channel) for channel in np.transpose(colours)], -1)
+    return table.astype(np.float32)[np.clip(values * 1023, 0, 1023).astype(np.int32)]
+
+
+def neutral(levels: Map, red: float, blue: float) -> Colours:
+    """Grey levels, their red and blue multiplied."""
+    return np.dstack([levels * red, levels, levels * blue]).astype(np.float32)
+
+
+def surface(colours: Colours, height: Map) -> Surface:
+    """Colour and height, which is given as -1..1 about the middle, and clipped to it."""
+    return np.dstack([colours, 128 + 127 * np.clip(height, -1, 1)]).astype(np.float32)

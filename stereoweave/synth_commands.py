@@ -1,0 +1,110 @@
+"""The commands stereoweave synth make | check | sheet."""
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stereoweave.errors import StereoweaveError
+
+synth = typer.Typer(help="Rendered stereo with exact ground truth: make it, check it, look at it.")
+
+Jobs = Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores unless given.")]
+
+
+@synth.command()
+def make(  # noqa: PLR0913 - each is a word of the command line
+    scene: Annotated[str, typer.Argument(help="Such as propeller; a wrong name is answered with all.")],
+    pairs: Annotated[int, typer.Option(min=1, help="How many there shall be in the folder.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The folder of the set.")],
+    seed: Annotated[int, typer.Option(min=0, help="Another one gives other pairs.")] = 0,
+    size: Annotated[str, typer.Option(help="Width and height in pixels.")] = "640x480",
+    plain: Annotated[
+        bool, typer.Option("--plain", help="Without shadows, gloss and the like: faster.")
+    ] = False,
+    layout: Annotated[str, typer.Option(help="shards, or paper: folders left, right and depth.")] = "shards",
+    frames: Annotated[int, typer.Option(min=1, help="Pairs in a row as a film, from a moving camera.")] = 1,
+    view: Annotated[
+        list[float] | None, typer.Option(help="A further picture from between, such as 0.5; again for more.")
+    ] = None,
+    rig: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="FOCAL_PX BASELINE_M", help="Of all pairs; drawn for each unless given."),
+    ] = None,
+    jobs: Jobs = None,
+) -> None:
+    """Make a set of rendered pairs, or go on with one that was stopped or shall have more."""
+    with _needing_the_synth_extra():
+        from stereoweave.synth.making import RenderingStudio
+        from stereoweave.synth.making import make as make_set
+        from stereoweave.synth.samples import Order
+    order = Order(
+        scene=scene, seed=seed, size_px=_size_px(size), frames=frames, views=tuple(view or ()), rig=rig
+    )
+    made = make_set(order, pairs, out, layout=layout, jobs=_jobs(jobs), studio=RenderingStudio(plain))
+    typer.echo(f"{out}: {made} pairs made, {pairs - made} were there")
+
+
+@synth.command()
+def check(folder: Annotated[Path, typer.Argument(help="What synth make made.")], jobs: Jobs = None) -> None:
+    """Check a set: checksums, disparity against the pictures, statistics; exit status 1 if one is wrong."""
+    with _needing_the_synth_extra():
+        from stereoweave.synth.checking import check as check_set
+        from stereoweave.synth.checking import lines
+
+    found = check_set(folder, _jobs(jobs))
+    typer.echo("\n".join(lines(found)))
+    if found.problems:
+        raise typer.Exit(1)
+
+
+@synth.command()
+def sheet(
+    out: Annotated[Path, typer.Option("--out", "-o", help="The picture to write.")],
+    seed: Annotated[int, typer.Option(min=0, help="As for make.")] = 0,
+    quiz: Annotated[
+        bool, typer.Option("--quiz", help="16 left pictures without a label; what they show is printed.")
+    ] = False,
+) -> None:
+    """A picture of all scenes, a row each: left, right, depth, and what one camera alone sees."""
+    from stereoweave.io import picture_kind, write_image
+
+    picture_kind(out)
+    with _needing_the_synth_extra():
+        from stereoweave.synth import contact_sheet
+        from stereoweave.synth.making import camera
+        from stereoweave.synth.scenes import SCENES
+    if quiz:
+        picture, answers = contact_sheet.quiz(camera(), [name for name in SCENES if name != "rooms"], seed)
+        typer.echo("by row: " + ", ".join(answers))
+    else:
+        picture = contact_sheet.sheet(camera(), list(SCENES), seed)
+    write_image(out, picture)
+    typer.echo(f"{out}: {picture.shape[1]}x{picture.shape[0]} pixels")
+
+
+def _size_px(size: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d+)x(\d+)", size)
+    if found is None:
+        raise StereoweaveError(f"--size: expected width x height in pixels, such as 640x480, found {size!r}")
+    return int(found[1]), int(found[2])
+
+
+def _jobs(jobs: int | None) -> int:
+    from stereoweave.threads import usable_cores
+
+    return jobs or usable_cores()
+
+
+@contextmanager
+def _needing_the_synth_extra() -> Iterator[None]:
+    try:
+        yield
+    except ModuleNotFoundError as missing:
+        raise StereoweaveError(
+            f"this command needs what renders, found no module {missing.name}; "
+            "install the extra 'synth': pip install 'stereoweave[synth]', from the wheel or the copy you have"
+        ) from missing

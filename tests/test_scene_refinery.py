@@ -1,0 +1,67 @@
+import functools
+
+import numpy as np
+import pytest
+
+from stereoweave.synth.pipework import pipes
+from stereoweave.synth.plants import Coats
+from stereoweave.synth.scenes.refinery import UNITS, refinery
+from stereoweave.synth.textures import FAMILIES
+
+COATS = Coats(shells=(0, 1, 2), steel=3, rail=4, red=5, white=6, concrete=7, sign=8, flame=9)
+
+
+@functools.cache
+def staged(seed):
+    return refinery(np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_refinery_has_triangles_materials_and_unit_normals(seed):
+    world = staged(seed).world
+    mesh = world.mesh
+    assert len(mesh.material) >= 20_000
+    assert 6 <= len(world.materials) <= 64
+    assert set(np.unique(mesh.material)) <= set(range(len(world.materials)))
+    assert {material.texture for material in world.materials} <= set(FAMILIES)
+    assert np.isfinite(mesh.corners_m).all()
+    assert np.isfinite(mesh.uv_m).all()
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=-1), 1, atol=1e-3)
+
+
+def test_the_seed_alone_decides_the_refinery():
+    again = refinery(np.random.default_rng(1)).world.mesh
+    first, other = staged(1).world.mesh, staged(2).world.mesh
+    np.testing.assert_array_equal(first.corners_m, again.corners_m)
+    np.testing.assert_array_equal(first.material, again.material)
+    assert first.corners_m.shape != other.corners_m.shape
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_target_is_the_plant_that_all_cameras_stand_outside_of(seed):
+    stage = staged(seed)
+    mesh = stage.world.mesh
+    target_m = mesh.corners_m[mesh.target].reshape(-1, 3)
+    assert np.linalg.norm(target_m[:, :2], axis=1).max() < stage.orbit.distance_m[0] * np.cos(np.radians(24))
+    assert 3.5 < target_m[:, 2].max() < 7
+    assert 0.3 < mesh.target.mean() < 0.95
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_every_unit_keeps_to_its_plot_and_its_pipes_begin_there(name):
+    for seed in range(4):
+        unit = UNITS[name](np.random.default_rng(seed), COATS)
+        reach_m = np.linalg.norm(unit.mesh.corners_m[..., :2], axis=-1).max()
+        assert reach_m < 1.05
+        assert unit.mesh.corners_m[..., 2].min() > -0.05
+        assert np.linalg.norm(unit.nozzles_m[:, :2], axis=1).max() < reach_m
+        assert set(np.unique(unit.mesh.material)) <= set(range(10))
+
+
+def test_pipes_follow_their_paths():
+    path_m = np.array([[0.0, 0, 0], [0, 0, 1], [2, 0, 1]])
+    mesh = pipes([path_m], [0.05], 3)
+    # The flanges stand out by 1.6 radii, the elbow by 2 % of one.
+    np.testing.assert_allclose(mesh.corners_m.min((0, 1)), [-0.08, -0.08, 0], atol=0.002)
+    np.testing.assert_allclose(mesh.corners_m.max((0, 1)), [2, 0.08, 1.08], atol=0.002)
+    assert set(mesh.material) == {3}
