@@ -1,5 +1,6 @@
-"""The commands stereoweave synth make | check | sheet."""
+"""The commands stereoweave synth make | check | sheet | costs."""
 
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -84,6 +85,20 @@ def sheet(
         picture = contact_sheet.sheet(camera(), list(SCENES), seed)
     write_image(out, picture)
     typer.echo(f"{out}: {picture.shape[1]}x{picture.shape[0]} pixels")
+
+
+@synth.command()
+def costs(
+    scene: Annotated[str, typer.Argument(help="What is rendered.")] = "propeller",
+    pairs: Annotated[int, typer.Option(min=1, help="How many, of which the mean is told.")] = 3,
+) -> None:
+    """Measure what each effect of the renderer costs: milliseconds of one core for a pair of 640x480."""
+    # As in `make`: Mesa reads it when the renderer starts.
+    os.environ["LP_NUM_THREADS"] = "1"
+    with _needing_the_synth_extra():
+        from stereoweave.synth.costs import costs as measured
+    for cost in measured(scene, pairs):
+        typer.echo(f"{cost.ms_a_pair:6.0f} ms  {cost.effect}")
 
 
 def _size_px(size: str) -> tuple[int, int]:

@@ -16,7 +16,7 @@ from stereoweave.io import read_image
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-DEMO, INSTALL, COMMANDS, RESEARCH = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
+DEMO, INSTALL, COMMANDS, SYNTHETIC, RESEARCH = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
 (PROGRAM,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 LARGEST_ENVIRONMENT_BYTES = 700e6
 
@@ -132,6 +132,16 @@ def test_the_commands_run_from_the_wheel_in_an_empty_environment(installed, pict
 def test_the_program_runs_from_the_wheel_in_an_empty_environment(installed, pictures, caches):
     run([installed / "bin" / "python", "-c", PROGRAM], pictures, NUMBA_CACHE_DIR=caches)
     assert read_image(pictures / "view.png").shape == (64, 96, 3)
+
+
+@pytest.mark.needs_egl
+def test_synthetic_sets_are_made_and_checked_by_the_commands_for_them(tmp_path):
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    printed = run(["bash", "-ec", SYNTHETIC], tmp_path, PATH=path)
+    assert "4 pairs\n" in printed
+    made = {file.relative_to(tmp_path / "sets").as_posix() for file in (tmp_path / "sets").rglob("*.*")}
+    assert {"ship/ship-000000-000003.tar", "views/propeller-000000-000001.tar"} < made
+    assert len([name for name in made if name.startswith("film/depth/")]) == 3
 
 
 def test_two_trainings_are_resumed_and_scored_by_the_commands_for_researchers(tmp_path):

@@ -8,6 +8,7 @@ from shard_examples import contents
 from stereoweave.cli import main
 from stereoweave.data.shards import Shards
 from stereoweave.synth.contact_sheet import quiz, sheet
+from stereoweave.synth.costs import Cost
 from stereoweave.synth.making import camera
 
 
@@ -70,6 +71,16 @@ def test_a_quiz_shows_every_scene_and_tells_them_by_place():
     assert not picture[240:, 640:].any()
 
 
+def test_the_costs_of_the_effects_are_told_in_milliseconds(monkeypatch, capsys):
+    def measured(scene, pairs):
+        return [Cost(effect="gloss", ms_a_pair=10.4), Cost(effect=f"{scene} {pairs}", ms_a_pair=-0.6)]
+
+    monkeypatch.setenv("LP_NUM_THREADS", "1")
+    monkeypatch.setattr("stereoweave.synth.costs.costs", measured)
+    assert run("synth costs pylon --pairs 2") == 0
+    assert capsys.readouterr().out == "    10 ms  gloss\n    -1 ms  pylon 2\n"
+
+
 # Mistakes: one line, and 2
 
 
@@ -86,6 +97,7 @@ def test_a_quiz_shows_every_scene_and_tells_them_by_place():
         ("synth make pylon --pairs 1 --rig 0 0.2 -o set", "focal_px and baseline_m must be positive"),
         ("synth make pylon --pairs 1 --layout zip -o set", "layout: expected one of shards, paper"),
         ("synth make pylon --pairs 1 -o file/set", "file/set: expected a folder that can be written"),
+        ("synth costs cathedral", "scene: expected one of "),
         ("synth check set", "set/set.json: expected the description of a set"),
         ("synth sheet -o sheet.doc", "sheet.doc: expected the ending of a picture"),
     ],

@@ -51,11 +51,11 @@ def test_a_given_rig_takes_every_pair_from_where_any_rig_stands(index):
     np.testing.assert_array_equal(fixed.axes, drawn.axes)
 
 
-def test_a_drawn_rig_has_its_nearest_disparity_between_14_and_130_px_of_640():
+def test_a_drawn_rig_has_its_nearest_disparity_between_18_and_160_px_of_640():
     nearest_px = [
         staged(Wall(), ORDER, index)[1].camera.disparity_px(np.array([[4.0]])) for index in range(4)
     ]
-    assert all(7 <= px <= 65 for px in np.ravel(nearest_px))
+    assert all(9 <= px <= 80 for px in np.ravel(nearest_px))
 
 
 @pytest.mark.parametrize("rig", [(0.0, 0.5), (260.0, -0.5), (float("inf"), 0.5)])

@@ -5,6 +5,9 @@
     occluded.png, right_occluded.png                1 bit
     camera.json                                     the camera in pixels and metres, and steps_per_px
 
+Of 640x480, 17 rendered pairs of all scenes take 0.4 to 1.2 MB, 0.87 on average; packing takes 25 to 60 ms of
+a core, unpacking 22.
+
 A disparity of 0, such as the sky's, is known here; so KITTI's PNG, whose 0 is unknown, would not do.
 """
 

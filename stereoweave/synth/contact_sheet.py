@@ -54,7 +54,7 @@ def _masked(image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]) ->
     return np.where(mask[..., None], np.array(OCCLUDED_RGB, np.uint8), grey[..., None])
 
 
-def _shrunk(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+def _shrunk(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "240 320 3"]:
     return cv2.resize(image, _TILE_PX, interpolation=cv2.INTER_AREA)
 
 

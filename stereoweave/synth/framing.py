@@ -49,9 +49,10 @@ def in_view(
         | (down > lower_edge * forward).all(0)
     )
     seen = np.flatnonzero(~outside)
-    nearest_m = np.maximum(forward.min(0)[seen], 0)
-    # Positive floats sort as their bits do, and 16 bits sort fast.
-    return seen[np.argsort((nearest_m.view(np.uint32) >> 16).astype(np.uint16), kind="stable")]
+    # By the farthest corner, so that large pieces of ground come after what stands on them. Positive floats
+    # sort as their bits do, and 16 bits sort fast.
+    farthest_m = forward.max(0)[seen]
+    return seen[np.argsort((farthest_m.view(np.uint32) >> 16).astype(np.uint16), kind="stable")]
 
 
 def _edges(rig: Rig) -> Float[np.ndarray, "2 2"]:
@@ -62,7 +63,7 @@ def _edges(rig: Rig) -> Float[np.ndarray, "2 2"]:
 
 
 def to_direction(rig: Rig, samples: int) -> Float[np.ndarray, "3 3"]:
-    """From OpenGL's (column, row, 1) among samples x samples a pixel to a direction in the world, of depth 1."""
+    """From OpenGL's (column, row, 1), samples x samples a pixel, to a direction in the world of depth 1."""
     camera = rig.camera
     to_camera = np.array(
         [
@@ -75,7 +76,7 @@ def to_direction(rig: Rig, samples: int) -> Float[np.ndarray, "3 3"]:
 
 
 def rays(rig: Rig, samples: int = 1) -> Float[np.ndarray, "h w 3"]:
-    """Directions in the world, of depth 1, through the pixels' centres or samples x samples places about them."""
+    """Directions in the world of depth 1 through the pixels' centres, or samples x samples a pixel."""
     width, height = (side * samples for side in rig.size_px)
     column, row = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return np.stack([column, row, np.ones_like(row)], -1) @ to_direction(rig, samples).T

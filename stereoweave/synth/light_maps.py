@@ -1,5 +1,7 @@
 """What light needs to know of a world, as textures: the sun's shadow map and the crowd's grid."""
 
+from typing import Any
+
 import moderngl
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +19,7 @@ _SHADOW_MAP, _CROWD = 2, 3  # texture units
 
 
 class LightMaps:
-    """The textures and the uniforms of the program "surface" that go with them; made anew for each world."""
+    """The textures, made anew for each world, and the uniforms that surfaces read them with."""
 
     def __init__(self, gl: moderngl.Context, programs: Programs) -> None:
         self._gl = gl
@@ -31,14 +33,14 @@ class LightMaps:
         self._crowd.filter = moderngl.LINEAR, moderngl.LINEAR
         self._crowd.repeat_x = self._crowd.repeat_y = self._crowd.repeat_z = False
         self._crowd.use(_CROWD)
-        programs.set("surface", shadow_map=_SHADOW_MAP, crowd=_CROWD)
+        programs.bind(shadow_map=_SHADOW_MAP, crowd=_CROWD)
 
-    def cast(self, geometry: Geometry, sky: Sky) -> None:
+    def cast(self, geometry: Geometry, sky: Sky) -> dict[str, Any]:
         """The sun's shadows."""
         self._frame.use()
         self._frame.clear()
         if not any(sky.sun_light):
-            return
+            return {}
         view = sun_view(geometry.corners_m, geometry.target_m, sky.sun, _REACH_M)
         # Away from the sun, so that a surface does not fall into its own shadow.
         self._gl.polygon_offset = 2.0, 4.0
@@ -51,21 +53,25 @@ class LightMaps:
             geometry.draw(self._programs["sun"], triangles)
         self._gl.polygon_offset = 0.0, 0.0
         width_px, height_px = self._map.size
-        self._programs.set(
-            "surface",
-            to_unit=view.to_unit.T,
-            inner_m=view.inner_m,
-            wide=view.wide,
-            squares=(_INNER_PX / width_px, _WIDE_PX / width_px, _INNER_PX / height_px, _WIDE_PX / height_px),
-            texels=(1 / _INNER_PX, view.wide / _WIDE_PX),
-        )
+        return {
+            "to_unit": view.to_unit.T,
+            "inner_m": view.inner_m,
+            "wide": view.wide,
+            "squares": (
+                _INNER_PX / width_px,
+                _WIDE_PX / width_px,
+                _INNER_PX / height_px,
+                _WIDE_PX / height_px,
+            ),
+            "texels": (1 / _INNER_PX, view.wide / _WIDE_PX),
+        }
 
-    def occlude(self, geometry: Geometry) -> None:
+    def occlude(self, geometry: Geometry) -> dict[str, Any]:
         """Where the sky is hidden."""
         counted = crowd(geometry.corners_m, geometry.target_m)
         self._crowd.write(counted.share)
         side_m = counted.cell_m * CELLS
-        self._programs.set("surface", crowd_frame=(*counted.low_m, 1 / side_m))
+        return {"crowd_frame": (*counted.low_m, 1 / side_m)}
 
 
 def _widened(view: SunView) -> Float[np.ndarray, "3 4"]:

@@ -9,13 +9,15 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-Corners = Float[np.ndarray, "3 3 n"]
+Corners = Float[np.ndarray, "3 3 _"]
 
-# Around a target of 8 m these are cells of 17 cm.
+# Cells of the crowd's grid along an axis; around a target of 8 m they measure 17 cm.
 CELLS = 64
-_EMPTY_CELLS = 8
-_MOST_SAMPLES = 4096
-# What the wide mean of the crowd holds beside a single plane.
+# Between the target and the grid's border.
+_SPARE_CELLS = 8
+# A triangle larger than this many cells' sides is cut into pieces.
+_LARGE_CELLS = 64
+# The side of the cube around a place that hides the sky from it: 1.5 m around a target of 8 m.
 _WIDE_CELLS = 9
 
 
@@ -98,9 +100,9 @@ class Crowd:
 def crowd(corners_m: Corners, target_m: Corners) -> Crowd:
     """The surface around the target, counted on a grid from points spread evenly over the triangles."""
     low, high = _extent(target_m)
-    cell_m = 1.1 * float((high - low).max()) / (CELLS - 2 * _EMPTY_CELLS)
+    cell_m = 1.1 * float((high - low).max()) / (CELLS - 2 * _SPARE_CELLS)
     low_m = (low + high) / 2 - np.float32(cell_m * CELLS / 2)
-    points, areas = _spread(_touching(corners_m, low_m, cell_m * CELLS), cell_m)
+    points, areas = _spread(_pieces(corners_m, low_m, cell_m), cell_m)
     place = ((points - low_m[:, None]) / np.float32(cell_m)).astype(np.int32)
     x, y, z = place
     inside = ((place >= 0) & (place < CELLS)).all(0)
@@ -120,11 +122,22 @@ def _hidden(surface: Float[np.ndarray, "z y x"]) -> UInt8[np.ndarray, "z y x"]:
         layers = np.moveaxis(around, axis, 0)
         blurred = cv2.blur(layers.reshape(CELLS, -1), (1, _WIDE_CELLS), borderType=cv2.BORDER_CONSTANT)
         around = np.moveaxis(blurred.reshape(layers.shape), 0, axis)
-    hidden = 0.35 * surface + 2.5 * np.maximum(around - 1.2 / _WIDE_CELLS, 0)
+    hidden = 0.35 * surface + 5 * np.maximum(around - 1.2 / _WIDE_CELLS, 0)
     # What is outside the grid looks like its border.
     inner = np.zeros_like(hidden)
     inner[1:-1, 1:-1, 1:-1] = hidden[1:-1, 1:-1, 1:-1]
     return (255 * np.minimum(inner, 0.85)).astype(np.uint8)
+
+
+def _pieces(corners_m: Corners, low_m: Float[np.ndarray, "3"], cell_m: float) -> Corners:
+    """The triangles that touch the grid; large ones in pieces, so that few points are spread beside it."""
+    done = []
+    rest = _touching(corners_m, low_m, cell_m * CELLS)
+    while rest.size:
+        large = _areas(rest) > _LARGE_CELLS * cell_m**2
+        done.append(rest[..., ~large])
+        rest = _touching(_quartered(rest[..., large]), low_m, cell_m * CELLS)
+    return np.concatenate(done, axis=-1)
 
 
 def _touching(corners_m: Corners, low_m: Float[np.ndarray, "3"], side_m: float) -> Corners:
@@ -133,13 +146,26 @@ def _touching(corners_m: Corners, low_m: Float[np.ndarray, "3"], side_m: float) 
     return corners_m[..., near]
 
 
+def _quartered(corners_m: Corners) -> Corners:
+    """Each triangle as four, cut through the middles of its edges."""
+    a, b, c = corners_m.transpose(1, 0, 2)
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    parts = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+    return np.concatenate([np.stack(part, 1) for part in parts], axis=-1)
+
+
+def _areas(corners_m: Corners) -> Float[np.ndarray, " p"]:
+    edge, other = corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0]
+    normal = edge[[1, 2, 0]] * other[[2, 0, 1]] - edge[[2, 0, 1]] * other[[1, 2, 0]]
+    return np.sqrt((normal**2).sum(0)) / 2
+
+
 def _spread(corners_m: Corners, cell_m: float) -> tuple[Float[np.ndarray, "3 p"], Float[np.ndarray, " p"]]:
     """Points on the triangles, about two a cell, and the area that each stands for."""
     first = corners_m[:, 0]
     edge, other = corners_m[:, 1] - first, corners_m[:, 2] - first
-    normal = edge[[1, 2, 0]] * other[[2, 0, 1]] - edge[[2, 0, 1]] * other[[1, 2, 0]]
-    areas = np.sqrt((normal**2).sum(0)) / 2
-    counts = np.clip(np.ceil(areas * np.float32(2 / cell_m**2)), 1, _MOST_SAMPLES).astype(np.int32)
+    areas = _areas(corners_m)
+    counts = np.maximum(np.ceil(areas * np.float32(2 / cell_m**2)), 1).astype(np.int32)
     which = np.repeat(np.arange(len(areas)), counts)
     # The powers of the plastic number fill a square evenly (Roberts, 2018); folded over, a triangle.
     number = np.arange(len(which))

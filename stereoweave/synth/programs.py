@@ -16,40 +16,58 @@ MOST_LAMPS = 4
 _PARTS = {
     "depth": ("depth.vert", "depth.frag"),
     "sun": ("sun.vert", "sun.frag"),
-    "surface": ("surface.vert", "light.glsl", "surface.frag"),
     "sky": ("whole.vert", "light.glsl", "sky.frag"),
     "resolve": ("whole.vert", "resolve.frag"),
 }
+_SURFACE = ("surface.vert", "light.glsl", "surface.frag")
 
 
 class Programs:
-    """Every program by its name, compiled with the effects that are switched on."""
+    """Every program by its name, compiled with the effects that are switched on.
+
+    The program for surfaces is there once for each number of lamps (`surface`), because llvmpipe takes a
+    quarter longer for a loop over lamps whose number it learns from a uniform, even if that is 0.
+    """
 
     def __init__(self, gl: moderngl.Context, effects: Effects) -> None:
-        defined = _definitions(effects)
-        self._programs = {
-            name: gl.program(
+        def program(vertices: str, *fragments: str, lamps: int = 0) -> moderngl.Program:
+            defined = _definitions(effects, lamps)
+            return gl.program(
                 vertex_shader=defined + _text(vertices),
                 fragment_shader=defined + "".join(map(_text, fragments)),
             )
-            for name, (vertices, *fragments) in _PARTS.items()
-        }
+
+        self._programs = {name: program(*parts) for name, parts in _PARTS.items()}
+        for lamps in range(MOST_LAMPS + 1):
+            self._programs[surface(lamps)] = program(*_SURFACE, lamps=lamps)
 
     def __getitem__(self, name: str) -> moderngl.Program:
         return self._programs[name]
 
+    def bind(self, **units: int) -> None:
+        """Tells every program in which texture units its samplers find their textures."""
+        for program in self._programs.values():
+            for key, unit in units.items():
+                if key in program:
+                    program[key] = unit
+
     def set(self, name: str, **values: Any) -> None:
         """Sets a program's uniforms, matrices by columns; those that no effect uses are passed over."""
+        program = self._programs[name]
         for key, value in values.items():
-            uniform = self._programs[name].get(key, None)
+            uniform = program.get(key, None)
             if isinstance(uniform, moderngl.Uniform):
-                kind = np.int32 if np.asarray(value).dtype.kind == "i" else np.float32
-                uniform.write(np.ascontiguousarray(value, kind).tobytes())
+                uniform.write(np.ascontiguousarray(value, np.float32).tobytes())
 
 
-def _definitions(effects: Effects) -> str:
+def surface(lamps: int) -> str:
+    """The name of the program for surfaces in the light of so many lamps."""
+    return f"surface, {lamps} lamps"
+
+
+def _definitions(effects: Effects, lamps: int) -> str:
     switches = ("shadows", "ambient_occlusion", "gloss", "fog", "relief")
-    numbers = {"MATERIALS": MOST_MATERIALS, "LAMPS": MOST_LAMPS, "SAMPLES": effects.samples, "CELLS": CELLS}
+    numbers = {"MATERIALS": MOST_MATERIALS, "LAMPS": lamps, "SAMPLES": effects.samples, "CELLS": CELLS}
     lines = [f"#define {name.upper()}" for name in switches if getattr(effects, name)]
     lines += [f"#define {name} {number}" for name, number in numbers.items()]
     return "\n".join(["#version 330 core", *lines, ""])

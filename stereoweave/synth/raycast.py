@@ -113,7 +113,7 @@ class Raycaster:
 
 @dataclass(frozen=True, kw_only=True)
 class _Hits:
-    """What rays met: triangle (-1 for none), distance in lengths of the ray (inf), and the corners' shares."""
+    """What rays met: triangle (-1 for none), distance in lengths of the ray (inf), the corners' shares."""
 
     triangle: Int[np.ndarray, " p"]
     distance: Float[np.ndarray, " p"]
@@ -127,21 +127,17 @@ class _Hits:
 
 def _met(mesh: Mesh, eye_m: np.ndarray, directions: Vectors, triangle: Int[np.ndarray, " p"]) -> _Hits:
     """Where rays meet the triangles' planes, in double precision; embree says only which triangle."""
-    first, second, third = mesh.corners_m[triangle].astype(np.float64).transpose(1, 0, 2)
-    edge, other = second - first, third - first
-    across = np.cross(directions, other)
+    met = triangle >= 0
+    first, second, third = mesh.corners_m[triangle[met]].astype(np.float64).transpose(1, 0, 2)
+    edge, other, from_first = second - first, third - first, eye_m - first
+    across, lifted = np.cross(directions[met], other), np.cross(from_first, edge)
     size = (edge * across).sum(1)
-    from_first = eye_m - first
-    lifted = np.cross(from_first, edge)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        s = (from_first * across).sum(1) / size
-        t = (directions * lifted).sum(1) / size
-        distance = (other * lifted).sum(1) / size
-    return _Hits(
-        triangle=triangle,
-        distance=np.where(triangle < 0, np.inf, distance),
-        shares=np.stack([1 - s - t, s, t], -1),
-    )
+    s = (from_first * across).sum(1) / size
+    t = (directions[met] * lifted).sum(1) / size
+    distance, shares = np.full(len(triangle), np.inf), np.zeros((len(triangle), 3))
+    distance[met] = (other * lifted).sum(1) / size
+    shares[met] = np.stack([1 - s - t, s, t], -1)
+    return _Hits(triangle=triangle, distance=distance, shares=shares)
 
 
 def _smooth_normals(mesh: Mesh, hits: _Hits, directions: Vectors) -> Vectors:
@@ -155,7 +151,7 @@ def _smooth_normals(mesh: Mesh, hits: _Hits, directions: Vectors) -> Vectors:
 
 
 def _colours(world: World, hits: _Hits, ray_m: Float[np.ndarray, " p"]) -> Vectors:
-    """The share of each colour's light that surfaces throw back; ray_m: how wide the rays are where they end."""
+    """The share of each colour's light that surfaces throw back; ray_m: how wide the rays end."""
     material = world.mesh.material[hits.triangle]
     uv_m = np.einsum("pc,pcx->px", hits.shares, world.mesh.uv_m[hits.triangle])
     colours = np.empty((len(material), 3))
@@ -179,7 +175,7 @@ def _colours(world: World, hits: _Hits, ray_m: Float[np.ndarray, " p"]) -> Vecto
 @functools.lru_cache(maxsize=24)
 def _pyramid(layer: int) -> list[Float[np.ndarray, "side side 3"]]:
     """A texture's light in ever fewer texels, each of them the mean of four of the level before."""
-    levels = [linear(bank().pixels[layer, ..., :3]).astype(np.float32)]
+    levels = [linear(bank().pixels[layer, ..., :3].astype(np.float32))]
     while len(levels[-1]) > 1:
         half = len(levels[-1]) // 2
         levels.append(levels[-1].reshape(half, 2, half, 2, 3).mean((1, 3)))

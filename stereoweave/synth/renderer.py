@@ -12,7 +12,7 @@ from stereoweave.synth.effects import PLAIN as PLAIN
 from stereoweave.synth.effects import Effects as Effects
 from stereoweave.synth.framing import in_view, projection, to_direction
 from stereoweave.synth.light_maps import LightMaps
-from stereoweave.synth.programs import MOST_LAMPS, Programs
+from stereoweave.synth.programs import Programs, surface
 from stereoweave.synth.rigs import Rig
 from stereoweave.synth.textures import bank
 from stereoweave.synth.uploads import Frames, Geometry, MaterialBlock, texture_array
@@ -26,8 +26,8 @@ class Renderer:
 
     A world and a rig give the same bytes, whatever was rendered before. Depth is rasterised apart from the
     picture, through the pixels' centres. The picture takes 2x2 samples a pixel, their mean position its
-    centre, and shades each of them: under llvmpipe that takes little more than half the time of multisampling,
-    which shades what is hidden too, and it smooths highlights and the edges of shadows as well.
+    centre, and shades each of them: under llvmpipe that takes little more than half the time of
+    multisampling, which shades what is hidden too, and it smooths highlights and shadows' edges as well.
     """
 
     def __init__(self, effects: Effects = Effects()) -> None:  # noqa: B008, frozen
@@ -39,9 +39,8 @@ class Renderer:
         self._bank = bank()
         self._textures = texture_array(self._gl, self._bank.pixels)
         self._textures.use(_TEXTURES)
-        for name, unit in (("surface", _TEXTURES), ("sky", _TEXTURES), ("resolve", _SAMPLES)):
-            self._programs.set(name, textures=unit, samples=unit)
-        self._materials = MaterialBlock(self._gl, self._programs["surface"])
+        self._programs.bind(textures=_TEXTURES, samples=_SAMPLES)
+        self._materials = MaterialBlock(self._gl)
         self._light_maps = LightMaps(self._gl, self._programs)
         self._geometry: Geometry | None = None
         self._frames: Frames | None = None
@@ -89,8 +88,9 @@ class Renderer:
         frames = self._framed(rig)
         frames.samples.use()
         frames.samples.clear()
-        self._aim("surface", rig, position)
-        geometry.draw(self._programs["surface"], triangles)
+        name = surface(len(geometry.world.lamps))
+        self._aim(name, rig, position)
+        geometry.draw(self._programs[name], triangles)
         # The sky lies at the far end of the depth buffer, which is what it was cleared to.
         self._gl.depth_func = "<="
         self._programs.set("sky", to_direction=to_direction(rig, self.effects.samples).T)
@@ -128,21 +128,20 @@ class Renderer:
             return
         self._materials.write(world, self._bank)
         sky, fog = world.sky, world.fog
-        shared = {name: getattr(sky, name) for name in ("sun", "sun_light", "zenith", "horizon", "ground")}
+        shared: dict[str, Any] = {
+            name: getattr(sky, name) for name in ("sun", "sun_light", "zenith", "horizon", "ground")
+        }
         shared["exposure"] = world.exposure
         shared["fog"] = (*fog.colour, fog.density_per_m) if fog else (0.0,) * 4
-        lamp_m, lamp_light = np.zeros((2, MOST_LAMPS, 3))
-        for k, lamp in enumerate(world.lamps):
-            lamp_m[k], lamp_light[k] = lamp.position_m, lamp.light
-        self._programs.set(
-            "surface", **shared, lamp_count=len(world.lamps), lamp_m=lamp_m, lamp_light=lamp_light
-        )
-        layer = float(self._bank.layer("sky", sky.cloud_variant))
+        layer = self._bank.layer("sky", sky.cloud_variant)
         self._programs.set("sky", **shared, cloud_layer=layer, clouds=sky.clouds)
+        shared["lamp_m"] = [lamp.position_m for lamp in world.lamps]
+        shared["lamp_light"] = [lamp.light for lamp in world.lamps]
         if self.effects.shadows:
-            self._light_maps.cast(geometry, sky)
+            shared |= self._light_maps.cast(geometry, sky)
         if self.effects.ambient_occlusion:
-            self._light_maps.occlude(geometry)
+            shared |= self._light_maps.occlude(geometry)
+        self._programs.set(surface(len(world.lamps)), **shared)
         self._lit = world
 
 

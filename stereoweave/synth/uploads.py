@@ -1,5 +1,6 @@
 """What lies in the graphics card's memory: a world's triangles and materials, the textures, frame buffers."""
 
+import cv2
 import moderngl
 import numpy as np
 from jaxtyping import Int, UInt8
@@ -71,12 +72,10 @@ def _check(world: World) -> None:
 class MaterialBlock:
     """The shader's uniform block `Materials`."""
 
-    def __init__(self, gl: moderngl.Context, program: moderngl.Program) -> None:
+    def __init__(self, gl: moderngl.Context) -> None:
+        # The only block of its program, and so at binding 0.
         self._buffer = gl.buffer(reserve=4 * _FLOATS * MOST_MATERIALS)
         self._buffer.bind_to_uniform_block(0)
-        block = program["Materials"]
-        assert isinstance(block, moderngl.UniformBlock)
-        block.binding = 0
 
     def write(self, world: World, textures: Bank) -> None:
         """Takes over the materials of a world."""
@@ -103,10 +102,11 @@ def texture_array(
     """
     layers, height, width, channels = pixels.shape
     array = gl.texture_array((width, height, layers), channels)
-    root = np.round(255 * np.sqrt(linear(np.arange(256)))).astype(np.uint8)
+    levels = np.arange(256)
+    root = np.round(255 * np.sqrt(linear(levels.astype(np.float32))))
+    table = np.stack([root, root, root, levels], -1).astype(np.uint8)[None]
     for k, layer in enumerate(pixels):
-        coded = np.dstack([root[layer[..., :3]], layer[..., 3]])
-        array.write(coded, viewport=(0, 0, k, width, height, 1))
+        array.write(cv2.LUT(layer, table), viewport=(0, 0, k, width, height, 1))
     array.build_mipmaps()
     array.filter = moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR
     return array

@@ -16,9 +16,10 @@ layout(std140) uniform Materials {
 
 uniform vec3 eye_m;
 uniform sampler2DArray textures;
-uniform int lamp_count;
+#if LAMPS > 0
 uniform vec3 lamp_m[LAMPS];
 uniform vec3 lamp_light[LAMPS];
+#endif
 uniform vec4 fog;  // colour, and density per metre
 
 in vec3 place_m;
@@ -132,16 +133,19 @@ void main() {
     roughness = max(made.roughness, 0.1);
     roughness = sqrt(sqrt(roughness * roughness * roughness * roughness + min(turn, 0.2)));
     diffuse = own * (1 - made.metal);
-    mirror = mix(vec3(0.04), own, made.metal);
+    // Soil, leaves and chalk swallow in their pores much of what they would mirror.
+    mirror = mix(vec3(mix(0.05, 0.01, roughness)), own, made.metal);
 #endif
     vec3 light = open * diffuse * sky_around(normal);
     light += sunny * sun_light * thrown_back(sun, normal, viewer, diffuse, mirror, roughness);
-    for (int k = 0; k < lamp_count; ++k) {
+#if LAMPS > 0
+    for (int k = 0; k < LAMPS; ++k) {
         vec3 towards_m = lamp_m[k] - place_m;
         float nearness = inversesqrt(dot(towards_m, towards_m));
         light += open * lamp_light[k] * nearness * nearness
                * thrown_back(towards_m * nearness, normal, viewer, diffuse, mirror, roughness);
     }
+#endif
 #ifdef GLOSS
     vec3 reflected = reflect(-viewer, normal);
     float grazing = 1 - max(dot(normal, viewer), 0);
