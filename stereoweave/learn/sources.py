@@ -1,6 +1,6 @@
 """Where a recipe's pairs come from: collages, rendered sets mixed in, or a dataset's frames on disk."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -11,6 +11,7 @@ from rich.console import Console
 from stereoweave.data.readers import DATASETS, Frame, open_dataset, split_frames
 from stereoweave.data.shards import Shards, list_shards
 from stereoweave.errors import FormatError
+from stereoweave.learn.collage import photograph
 from stereoweave.learn.pairs import KeptPairs
 from stereoweave.learn.recipe import COLLAGE, Recipe
 from stereoweave.progress import progress
@@ -80,6 +81,31 @@ class Mix:
 
 
 @dataclass(frozen=True)
+class Photographed:
+    """A rendered set, whose views are ideal, as two real cameras would give it; each pair always alike."""
+
+    shards: Shards
+
+    @property
+    def count(self) -> int:
+        return self.shards.count
+
+    def __getitem__(self, index: int) -> Sample:
+        sample = self.shards[index]
+        # As collages are: without noise, blur and other tones in one of the views, matching is too easy.
+        left, right = photograph(
+            np.random.default_rng(index), sample.left.astype(np.float32), sample.right.astype(np.float32)
+        )
+        return replace(sample, left=left, right=right)
+
+    def name(self, index: int) -> str:
+        return self.shards.name(index)
+
+    def order(self, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
+        return self.shards.order(rng)
+
+
+@dataclass(frozen=True)
 class Frames:
     """Frames of a dataset on disk, read when they are asked for."""
 
@@ -137,7 +163,7 @@ def _rendered(recipe: Recipe, folder: Path) -> list[Source]:
             f"{recipe.name}: mix: {folder}: expected pairs of `stereoweave synth make`, or folders of such, "
             "found none; make them first"
         )
-    sets: list[Source] = [Shards(path) for path in folders]
+    sets: list[Source] = [Photographed(Shards(path)) for path in folders]
     for path, one in zip(folders, sets, strict=True):
         rows, columns = one[0].disparity_px.shape
         if recipe.crop_size[0] > rows or recipe.crop_size[1] > columns:
