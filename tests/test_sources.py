@@ -8,7 +8,7 @@ from learn_examples import CAMERA, PAIR_SIZE, RECIPE, box_before_a_wall, complai
 from rich.console import Console
 
 from stereoweave.data.packing import packed
-from stereoweave.data.shards import write_shard
+from stereoweave.data.shards import Shards, write_shard
 from stereoweave.learn import pairs as the_pairs
 from stereoweave.learn.pairs import KeptPairs
 from stereoweave.learn.sources import VALIDATION_SEED, Mix, Source, kept, sources
@@ -134,6 +134,17 @@ def test_the_sets_in_one_folder_share_its_weight_by_their_pairs(rendered, tmp_pa
     assert [one.count for one in training.sets] == [RECIPE.pairs, 6, 4, 2]
     assert training.sets[2].name(0) == "crane-000000"
     assert training.weights == pytest.approx((0.5, 0.2, 0.2, 0.1))
+
+
+def test_rendered_pairs_of_a_mix_are_photographed_each_always_alike(rendered, tmp_path):
+    training, _ = sources(mixed(rendered, rooms=1.0), tmp_path)
+    ideal = Shards(rendered / "rooms")
+    np.testing.assert_array_equal(training[2].disparity_px, ideal[2].disparity_px)
+    for index in range(ideal.count):
+        np.testing.assert_array_equal(training[index].right, training[index].right)
+    changed = [not np.array_equal(training[i].left, ideal[i].left) for i in range(ideal.count)]
+    # A quarter of all pairs have no photometric difference.
+    assert sum(changed) >= 3
 
 
 def test_the_collages_of_a_mix_are_made_like_others(rendered, tmp_path, monkeypatch):
