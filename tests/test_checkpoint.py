@@ -119,3 +119,24 @@ def test_the_commit_of_code_installed_in_somebody_elses_repository_is_unknown(tm
     assert checkpoint.code_commit() == "unknown"
     monkeypatch.setattr(checkpoint, "__file__", str(tmp_path / "stereoweave/learn/checkpoint.py"))
     assert re.fullmatch(r"[0-9a-f]{7,40}", checkpoint.code_commit())
+
+
+def gone_on(start, value):
+    """A run from `start` of a network of one weight."""
+    return replace(start, averaged={"weight": torch.tensor([value])}, origin=start.as_origin(), hours=3.0)
+
+
+def test_the_mean_of_two_runs_lies_half_way_and_names_both_and_their_start_once(trained):
+    start = replace(trained, hours=2.0)
+    first, second = gone_on(start, 1.0), replace(gone_on(start, 4.0), commit="another")
+    found = checkpoint.mean(first, second, start)
+    assert found.averaged["weight"].item() == 2.5
+    assert found.hours == 4.0
+    commits = [run["commit"] for run in found.origin]
+    assert commits == [start.commit, first.commit, "another"]
+
+
+def test_runs_that_did_not_start_alike_have_no_mean(trained):
+    first = gone_on(trained, 1.0)
+    with pytest.raises(FormatError, match="found one that did not"):
+        checkpoint.mean(first, trained, trained)

@@ -2,7 +2,7 @@
 
 import os
 import subprocess
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,43 @@ class Checkpoint:
     def as_origin(self) -> tuple[dict[str, Any], ...]:
         """The origin of a run that starts from this one."""
         return *self.origin, {"recipe": asdict(self.recipe), "step": self.step, "commit": self.commit}
+
+
+def mean(first: Checkpoint, second: Checkpoint, start: Checkpoint) -> Checkpoint:
+    """What lies half-way between two runs that went on from `start`, to start a further run from.
+
+    The mean of two networks that were trained on from one is often better than either (Wortsman et al.,
+    "Model soups", ICML 2022); running variances are means too.
+
+    Raises:
+        FormatError: One of the two did not go on from `start`.
+    """
+    for run in (first, second):
+        if _points(run.origin) != _points(start.as_origin()):
+            raise FormatError(
+                f"{run.recipe.name}: expected a run that started from {start.recipe.name} after {start.step} "
+                "steps, found one that did not"
+            )
+    weights = {name: _half_way(value, second.averaged[name]) for name, value in first.averaged.items()}
+    return replace(
+        first,
+        weights=weights,
+        averaged=weights,
+        optimiser={},
+        scores={},
+        hours=first.hours + second.hours - start.hours,
+        origin=first.as_origin() + second.as_origin()[len(start.as_origin()) :],
+    )
+
+
+def _points(origin: tuple[dict[str, Any], ...]) -> list[tuple[str, int]]:
+    # Not the recipes, which have had more keys since.
+    return [(past["commit"], past["step"]) for past in origin]
+
+
+def _half_way(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+    # A batch norm counts its batches in whole numbers.
+    return (first + second) / 2 if first.is_floating_point() else first
 
 
 def save(checkpoint: Checkpoint, path: Path) -> None:
