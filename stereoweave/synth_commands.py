@@ -13,12 +13,18 @@ from stereoweave.errors import StereoweaveError
 
 synth = typer.Typer(help="Rendered stereo with exact ground truth: make it, check it, look at it.")
 
+# Named here, because the help imports nothing heavy.
+SCENE_NAMES = (
+    "antenna", "bridge", "crane", "propeller", "pylon", "refinery", "rooms", "ship", "wind_turbine",
+)  # fmt: skip
+
+Scene = Annotated[str, typer.Argument(help=f"One of {', '.join(SCENE_NAMES)}.")]
 Jobs = Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores unless given.")]
 
 
 @synth.command()
 def make(  # noqa: PLR0913 - each is a word of the command line
-    scene: Annotated[str, typer.Argument(help="Such as propeller; a wrong name is answered with all.")],
+    scene: Scene,
     pairs: Annotated[int, typer.Option(min=1, help="How many there shall be in the folder.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The folder of the set.")],
     seed: Annotated[int, typer.Option(min=0, help="Another one gives other pairs.")] = 0,
@@ -29,13 +35,20 @@ def make(  # noqa: PLR0913 - each is a word of the command line
     layout: Annotated[str, typer.Option(help="shards, or paper: folders left, right and depth.")] = "shards",
     frames: Annotated[int, typer.Option(min=1, help="Pairs in a row as a film, from a moving camera.")] = 1,
     view: Annotated[
-        list[float] | None, typer.Option(help="A further picture from between, such as 0.5; again for more.")
+        list[float] | None,
+        typer.Option(help="A further picture, 0.5 from half way, -0.5 to 1.5; again for more."),
     ] = None,
     rig: Annotated[
         tuple[float, float] | None,
         typer.Option(metavar="FOCAL_PX BASELINE_M", help="Of all pairs; drawn for each unless given."),
     ] = None,
-    jobs: Jobs = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Processes, as many as cores unless given; each makes a shard of 50 pairs at a time.",
+        ),
+    ] = None,
 ) -> None:
     """Make a set of rendered pairs, or go on with one that was stopped or shall have more."""
     with _needing_the_synth_extra():
@@ -46,7 +59,7 @@ def make(  # noqa: PLR0913 - each is a word of the command line
         scene=scene, seed=seed, size_px=_size_px(size), frames=frames, views=tuple(view or ()), rig=rig
     )
     made = make_set(order, pairs, out, layout=layout, jobs=_jobs(jobs), studio=RenderingStudio(plain))
-    typer.echo(f"{out}: {made} pairs made, {pairs - made} were there")
+    typer.echo(f"{out}: {made} pair{'s' * (made != 1)} made, {pairs - made} there before")
 
 
 @synth.command()
@@ -89,7 +102,7 @@ def sheet(
 
 @synth.command()
 def costs(
-    scene: Annotated[str, typer.Argument(help="What is rendered.")] = "propeller",
+    scene: Scene = "propeller",
     pairs: Annotated[int, typer.Option(min=1, help="How many, of which the mean is told.")] = 3,
 ) -> None:
     """Measure what each effect of the renderer costs: milliseconds of one core for a pair of 640x480."""
@@ -102,7 +115,7 @@ def costs(
 
 
 def _size_px(size: str) -> tuple[int, int]:
-    found = re.fullmatch(r"(\d+)x(\d+)", size)
+    found = re.fullmatch("([0-9]{1,9})x([0-9]{1,9})", size)
     if found is None:
         raise StereoweaveError(f"--size: expected width x height in pixels, such as 640x480, found {size!r}")
     return int(found[1]), int(found[2])

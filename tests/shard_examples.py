@@ -54,7 +54,7 @@ class PaintedStudio:
         sample = box_before_a_wall(np.random.default_rng((order.seed, index)), order.size_px)
         shot = Shot(image=sample.right, depth_m=sample.disparity_px, target=sample.occluded)
         views = tuple((position, shot) for position in order.views)
-        return Rendered(sample=sample, depth_m=CAMERA.depth_m(sample.disparity_px), views=views)
+        return Rendered(sample=sample, views=views)
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -125,6 +125,14 @@ def test_a_match_behind_something_nearer_is_hidden():
     assert hidden(disparity_px, other_px).tolist() == [[True, False, True, True, False, False, False, False]]
 
 
+@pytest.mark.parametrize(("match", "behind"), [(2.25, True), (2.75, False)])
+def test_at_a_jump_the_column_nearer_to_the_match_decides(match, behind):
+    # The ground that is in column 4 here; there a block of 8 px ends after column 2.
+    ground_px = 4 - match
+    disparity_px, other_px = row(*5 * [ground_px]), row(8, 8, 8, ground_px, ground_px)
+    assert hidden(disparity_px, other_px)[0, 4] == behind
+
+
 def test_a_slope_does_not_hide_itself():
     # d = 2 x / 3 here, so that column x is column x / 3 there, and the disparity there is twice the column.
     columns = np.arange(16, dtype=np.float32)[None]

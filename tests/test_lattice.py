@@ -126,8 +126,8 @@ def test_uncapped_bars_have_two_triangles_a_side():
 
 def test_a_ladder_has_a_rung_every_three_quarters_of_its_width():
     mesh = ladder((0, 0, 0), (0, 0, 3), (0, 1, 0), 0.4, 0)
-    # 3 m at 0.3 m: ten rungs and two rails, each of four sides with two triangles and four in each cap.
-    assert len(mesh.material) == (10 + 2) * 16
+    # 3 m at 0.3 m: ten rungs and two rails of four sides with two triangles each; rails have caps of four.
+    assert len(mesh.material) == 10 * 8 + 2 * 16
     # The rails' middles are 0.4 m apart and 0.03 m thick to each side, at four points on the axes.
     np.testing.assert_allclose(extent_m(mesh)[1:], [0.46, 3.0], atol=1e-6)
 
@@ -143,7 +143,7 @@ def test_a_cage_stays_outside_of_its_ladder():
 def test_a_railing_has_posts_at_its_corners_and_between():
     path = np.array([[0.0, 0, 1], [2.0, 0, 1]])
     mesh = railing(path, 0.5, 1.0, 0.01, 0, rails=2)
-    assert len(mesh.material) == (3 + 2) * 16
+    assert len(mesh.material) == (3 + 2) * 8
     assert mesh.corners_m[..., 2].min() == pytest.approx(1.0)
     assert mesh.corners_m[..., 2].max() == pytest.approx(1.5, abs=0.011)
 

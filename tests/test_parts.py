@@ -5,6 +5,7 @@ from stereoweave.synth.parts import (
     boxes,
     copies,
     facets,
+    frames,
     lathe,
     loft,
     polyline_tubes,
@@ -157,3 +158,13 @@ def test_a_quarter_turn_about_z_takes_x_to_y():
 
 def test_a_shift_moves_by_its_metres():
     np.testing.assert_allclose(shift(1, 2, 3) @ (10, 20, 30, 1), (11, 22, 33, 1))
+
+
+def test_frames_are_right_handed_and_their_first_vector_is_level():
+    along = np.array([[1.0, 0, 0], [0.0, 0, 1], [0, 0, -1], [0.6, 0, 0.8], [0.04, 0.0, 0.9992]])
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    across, other = frames(along)
+    turns = np.stack([across, other, along], -1)
+    np.testing.assert_allclose(turns @ turns.swapaxes(1, 2), np.tile(np.eye(3), (5, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(turns), 1.0)
+    np.testing.assert_allclose(across[:, 2], 0, atol=1e-12)

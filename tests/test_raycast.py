@@ -85,6 +85,7 @@ def test_what_stands_before_the_sun_takes_its_light():
     np.testing.assert_array_equal(lit[outside], shadowed[outside])
 
 
+@pytest.mark.needs_egl
 def test_both_are_cameras():
     assert isinstance(Raycaster(), Camera)
     made = camera_for(PLAIN)

@@ -6,7 +6,6 @@ import pytest
 from stereoweave.synth.pipework import pipes
 from stereoweave.synth.plants import Coats
 from stereoweave.synth.scenes.refinery import UNITS, refinery
-from stereoweave.synth.textures import FAMILIES
 
 COATS = Coats(shells=(0, 1, 2), steel=3, rail=4, red=5, white=6, concrete=7, sign=8, flame=9)
 
@@ -14,27 +13,6 @@ COATS = Coats(shells=(0, 1, 2), steel=3, rail=4, red=5, white=6, concrete=7, sig
 @functools.cache
 def staged(seed):
     return refinery(np.random.default_rng(seed))
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_a_refinery_has_triangles_materials_and_unit_normals(seed):
-    world = staged(seed).world
-    mesh = world.mesh
-    assert len(mesh.material) >= 20_000
-    assert 6 <= len(world.materials) <= 64
-    assert set(np.unique(mesh.material)) <= set(range(len(world.materials)))
-    assert {material.texture for material in world.materials} <= set(FAMILIES)
-    assert np.isfinite(mesh.corners_m).all()
-    assert np.isfinite(mesh.uv_m).all()
-    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=-1), 1, atol=1e-3)
-
-
-def test_the_seed_alone_decides_the_refinery():
-    again = refinery(np.random.default_rng(1)).world.mesh
-    first, other = staged(1).world.mesh, staged(2).world.mesh
-    np.testing.assert_array_equal(first.corners_m, again.corners_m)
-    np.testing.assert_array_equal(first.material, again.material)
-    assert first.corners_m.shape != other.corners_m.shape
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -61,7 +39,7 @@ def test_every_unit_keeps_to_its_plot_and_its_pipes_begin_there(name):
 def test_pipes_follow_their_paths():
     path_m = np.array([[0.0, 0, 0], [0, 0, 1], [2, 0, 1]])
     mesh = pipes([path_m], [0.05], 3)
-    # The flanges stand out by 1.6 radii, the elbow by 2 % of one.
+    # The flanges stand out by 1.6 radii, the elbow by 0.15 of one.
     np.testing.assert_allclose(mesh.corners_m.min((0, 1)), [-0.08, -0.08, 0], atol=0.002)
     np.testing.assert_allclose(mesh.corners_m.max((0, 1)), [2, 0.08, 1.08], atol=0.002)
     assert set(mesh.material) == {3}

@@ -162,6 +162,22 @@ def test_a_shard_that_is_missing_between_others_is_noticed(folder):
     assert "found ship-000008-000009.tar" in message
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        (
+            "ship-000003-000005.tar",
+            "expected no pair of ship-000000-000003.tar, found some in both; delete it",
+        ),
+        ("towns-000004-000007.tar", "expected a shard of ship, found another set's; move or delete it"),
+    ],
+)
+def test_a_shard_too_many_is_named_with_what_to_do(folder, name, words):
+    (folder / name).touch()
+    assert error_of(Shards, folder, "ship").startswith(f"{folder / name}: {words}")
+    assert error_of(list_shards, folder).startswith(f"{folder / name}: {words}")
+
+
 def test_a_folder_without_shards_is_refused(tmp_path):
     (tmp_path / ".ship-000000-000003-12345678.tar").touch()
     assert str(tmp_path) in error_of(Shards, tmp_path)

@@ -1,15 +1,22 @@
+import re
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
+import moderngl
 import pytest
+from dataset_examples import error_of
 from shard_examples import contents
 
 from stereoweave.cli import main
 from stereoweave.data.shards import Shards
 from stereoweave.synth.contact_sheet import quiz, sheet
-from stereoweave.synth.costs import Cost
+from stereoweave.synth.costs import costs
 from stereoweave.synth.making import camera
+from stereoweave.synth.scenes import SCENES
+from stereoweave.synth.uploads import Frames
+from stereoweave.synth_commands import SCENE_NAMES
 
 
 def run(line: str) -> int:
@@ -33,7 +40,7 @@ def test_a_set_is_made_once(words, capsys):
     out = Path(words.split()[-1])
     before = contents(out)
     assert run(words) == 0
-    assert f"{out}: 0 pairs made, 2 were there" in capsys.readouterr().out
+    assert f"{out}: 0 pairs made, 2 there before" in capsys.readouterr().out
     assert contents(out) == before
     assert Shards(out)[1].left.shape == (120, 160, 3)
     assert list(Shards(out).views(1)) == [0.5]
@@ -43,19 +50,24 @@ def test_a_set_is_made_once(words, capsys):
 def test_a_set_is_found_in_order_and_a_damaged_one_ends_with_1(words, capsys):
     out = Path(words.split()[-1])
     assert run(f"synth check {out} --jobs 1") == 0
-    assert "disparity, px" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "disparity, px" in told
+    assert told.endswith("\nin order\n")
     shard = out / "pylon-000000-000001.tar"
     content = shard.read_bytes()
     shard.write_bytes(content[:2000] + b"?" + content[2001:])
     assert run(f"synth check {out} --jobs 1") == 1
     shard.write_bytes(content)
-    assert f"{shard}: expected pylon-000000." in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert f"{shard}: expected pylon-000000." in told
+    assert told.endswith("makes its pairs again\n1 problem\n")
 
 
 @pytest.mark.needs_egl
-def test_a_sheet_has_a_row_of_five_pictures_for_each_scene():
+def test_a_sheet_has_a_row_of_five_pictures_for_each_scene(capsys):
     picture = sheet(camera(plain=True), ["pylon", "rooms"], seed=0)
     assert picture.shape == (20 + 2 * (20 + 240), 5 * 320, 3)
+    assert "2/2" in capsys.readouterr().out
     tiles = picture[40:280].reshape(240, 5, 320, 3)
     assert all(tiles[:, column].std() > 5 for column in range(5))
     # What only one camera sees is orange, and nothing else in the last two columns has a colour.
@@ -71,14 +83,17 @@ def test_a_quiz_shows_every_scene_and_tells_them_by_place():
     assert not picture[240:, 640:].any()
 
 
+@pytest.mark.needs_egl
 def test_the_costs_of_the_effects_are_told_in_milliseconds(monkeypatch, capsys):
-    def measured(scene, pairs):
-        return [Cost(effect="gloss", ms_a_pair=10.4), Cost(effect=f"{scene} {pairs}", ms_a_pair=-0.6)]
-
     monkeypatch.setenv("LP_NUM_THREADS", "1")
-    monkeypatch.setattr("stereoweave.synth.costs.costs", measured)
-    assert run("synth costs pylon --pairs 2") == 0
-    assert capsys.readouterr().out == "    10 ms  gloss\n    -1 ms  pylon 2\n"
+    monkeypatch.setattr("stereoweave.synth.costs.costs", partial(costs, size_px=(64, 48)))
+    assert run("synth costs pylon --pairs 1") == 0
+    told = [re.fullmatch(r" *(-?\d+) ms  (.+)", line) for line in capsys.readouterr().out.splitlines()]
+    effects = [found[2] for found in told]
+    assert effects[0] == "everything"
+    assert effects[1:3] == ["shadows", "ambient occlusion"]
+    assert effects[-1] == "none (plain)"
+    assert int(told[0][1]) > int(told[-1][1]) > 0
 
 
 # Mistakes: one line, and 2
@@ -93,7 +108,14 @@ def test_the_costs_of_the_effects_are_told_in_milliseconds(monkeypatch, capsys):
         ("synth make pylon --pairs 1 --seed -1 -o set", "greater than or equal to 0"),
         ("synth make pylon --pairs 1 --frames 0 -o set", "greater than or equal to 1"),
         ("synth make pylon --pairs 1 --size 640 -o set", "--size: expected width x height"),
-        ("synth make pylon --pairs 1 --size 640x10 -o set", "size: expected at least 32, found 10"),
+        (
+            "synth make pylon --pairs 1 --size 640x10 -o set",
+            "--size: expected 32 to 4096 px a side, found 640x10",
+        ),
+        ("synth make pylon --pairs 1 --size 99999x32 -o set", "--size: expected 32 to 4096 px a side"),
+        ("synth make pylon --pairs 1 --size ６４x４８ -o set", "--size: expected width x height"),
+        ("synth make pylon --pairs 1 --view 1.6 -o set", "view: expected positions of -0.5 "),
+        ("synth make pylon --pairs 1 --view 0.5 --view 0.5 -o set", "view: expected positions that differ"),
         ("synth make pylon --pairs 1 --rig 0 0.2 -o set", "focal_px and baseline_m must be positive"),
         ("synth make pylon --pairs 1 --layout zip -o set", "layout: expected one of shards, paper"),
         ("synth make pylon --pairs 1 -o file/set", "file/set: expected a folder that can be written"),
@@ -111,6 +133,28 @@ def test_a_mistake_is_answered_in_one_line(tmp_path, monkeypatch, capsys, line, 
     assert told.err.count("\n") == 1
     assert told.out == ""
     assert list(contents(tmp_path)) == ["file"]
+
+
+def test_the_help_names_every_scene(capsys):
+    assert list(SCENE_NAMES) == list(SCENES)
+    assert run("synth make --help") == 0
+    told = capsys.readouterr().out
+    assert all(name in told for name in SCENES)
+
+
+def test_costs_of_an_unknown_scene_are_refused_before_a_renderer_starts(monkeypatch, capsys):
+    monkeypatch.setenv("LP_NUM_THREADS", "1")
+    monkeypatch.setattr("stereoweave.synth.costs.Renderer", None)
+    assert run("synth costs cathedral") == 2
+    assert "scene: expected one of" in capsys.readouterr().err
+
+
+@pytest.mark.needs_egl
+def test_what_opengl_has_no_room_for_is_told_in_a_line():
+    gl = moderngl.create_context(standalone=True, backend="egl")
+    message = error_of(Frames, gl, (100_000, 32), 2)
+    assert message.startswith("pictures of 100000x32 px: expected OpenGL to have room for them, found ")
+    gl.release()
 
 
 def test_without_the_extra_the_answer_names_it(tmp_path):

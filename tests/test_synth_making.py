@@ -1,4 +1,5 @@
 import io
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -15,7 +16,10 @@ from stereoweave.data.readers import open_dataset
 from stereoweave.data.shards import Shards
 from stereoweave.errors import FormatError
 from stereoweave.synth import making
-from stereoweave.synth.making import generator_version, make, read_set
+from stereoweave.synth.checking import check
+from stereoweave.synth.effects import PLAIN
+from stereoweave.synth.making import RenderingStudio, generator_version, make, read_set
+from stereoweave.synth.renderer import Renderer
 from stereoweave.synth.samples import Order
 
 ORDER = Order(scene="pylon", seed=3, size_px=(48, 32), views=(0.5,))
@@ -28,7 +32,8 @@ from shard_examples import PaintedStudio
 from stereoweave.synth import making
 from stereoweave.synth.samples import Order
 if __name__ == "__main__":
-    making.PAIRS_A_SHARD, making.generator_version = 4, lambda: "01234567"
+    making.LAYOUTS["shards"] = making.LAYOUTS["shards"]._replace(pairs_a_run=4)
+    making.generator_version = lambda: "01234567"
     {first}
     order = Order(scene="pylon", seed=3, size_px=(48, 32), views=(0.5,))
     making.make(order, 10, Path({out!r}), studio={studio})
@@ -37,7 +42,7 @@ if __name__ == "__main__":
 
 def prepare(patch):
     """Small shards, and a version that stays what it is while somebody works on a scene."""
-    patch.setattr(making, "PAIRS_A_SHARD", 4)
+    patch.setitem(making.LAYOUTS, "shards", making.LAYOUTS["shards"]._replace(pairs_a_run=4))
     patch.setattr(making, "generator_version", lambda: "01234567")
 
 
@@ -148,7 +153,32 @@ def test_more_pairs_later_leave_the_first_ones_as_they_are(finished, tmp_path):
 def test_fewer_pairs_are_there_already(finished, tmp_path):
     copied(finished, tmp_path)
     assert made(tmp_path, 3) == 0
-    assert Shards(tmp_path).count == 10
+    assert contents(tmp_path) == contents(finished)
+    assert read_set(tmp_path)["pairs"] == 10
+
+
+def test_a_damaged_shard_is_made_again_once_it_is_deleted(finished, tmp_path):
+    copied(finished, tmp_path)
+    shard = tmp_path / "pylon-000004-000007.tar"
+    shard.write_bytes(b"damaged")
+    assert error_of(Shards(tmp_path).files, 5).endswith(
+        "delete it, and the same stereoweave synth make makes its pairs again"
+    )
+    assert made(tmp_path) == 0
+    shard.unlink()
+    assert made(tmp_path) == 4
+    assert contents(tmp_path) == contents(finished)
+
+
+@pytest.mark.parametrize("name", ["pylon-000003-000005.tar", "crane-000000-000003.tar"])
+def test_a_shard_too_many_is_named_alike_by_making_and_checking(finished, tmp_path, name):
+    copied(finished, tmp_path)
+    (tmp_path / name).touch()
+    messages = [error_of(made, tmp_path), error_of(check, tmp_path)]
+    assert messages[0] == messages[1]
+    assert messages[0].startswith(f"{tmp_path / name}: expected ")
+    (tmp_path / name).unlink()
+    assert made(tmp_path) == 0
 
 
 def test_further_views_are_kept(finished):
@@ -158,6 +188,15 @@ def test_further_views_are_kept(finished):
 
 
 # The paper's folders
+
+
+def test_each_of_the_jobs_has_work_in_a_small_set_of_frames(tmp_path):
+    order = replace(ORDER, views=())
+    made(tmp_path / "one", 6, order, layout="paper")
+    runs = making._runs(range(6), making.LAYOUTS["paper"].pairs_a_run)
+    assert runs == [[0, 1, 2, 3], [4, 5]]
+    made(tmp_path / "two", 6, order, layout="paper", jobs=2)
+    assert contents(tmp_path / "one") == contents(tmp_path / "two")
 
 
 def test_the_paper_s_folders_go_on_after_a_kill_to_the_same_bytes(tmp_path):
@@ -197,6 +236,14 @@ def test_every_frame_may_have_a_camera_of_its_own(frame):
     other = replace(sample.camera, focal_px=61.7, doffs_px=0.1)
     write_frame(root, "pylon/000001", replace(sample, camera=other))
     assert [frame.read().camera for frame in open_dataset("paper", root)] == [sample.camera, other]
+
+
+def test_a_frame_is_on_the_disk_before_its_checksums_appear(tmp_path, monkeypatch):
+    sums, at_each = tmp_path / "sums" / "pylon" / "000000.sha256", []
+    monkeypatch.setattr("os.fsync", lambda file: at_each.append(sums.exists()))
+    write_frame(tmp_path, "pylon/000000", STUDIO(ORDER, 0).sample)
+    assert at_each == [False] * 4
+    assert sums.exists()
 
 
 @pytest.mark.parametrize("folder", ["left", "right", "depth", "calib"])
@@ -250,6 +297,18 @@ def test_a_description_of_another_format_is_refused(tmp_path, text):
     assert str(tmp_path / "set.json") in error_of(made, tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("pairs", "3"), ("pairs", True), ("pairs", None), ("layout", []), ("layout", "zip"), ("scene", 7)],
+)
+def test_a_damaged_description_is_refused_in_a_line(finished, tmp_path, name, value):
+    facts = json.loads((finished / "set.json").read_text()) | {name: value}
+    (tmp_path / "set.json").write_text(json.dumps(facts))
+    message = error_of(read_set, tmp_path)
+    assert message.startswith(f"{tmp_path / 'set.json'}: expected layout (shards or paper), scene and number")
+    assert f"found {name} = {json.dumps(value)}; " in message
+
+
 def test_a_folder_with_something_else_in_it_is_refused_and_kept(tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
     (tmp_path / ".set-0123abcd.json").touch()
@@ -270,9 +329,15 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
         (-3, {}, "pairs: expected at least 1, found -3"),
         (1, {"order": replace(ORDER, seed=-1)}, "seed: expected at least 0, found -1"),
         (1, {"order": replace(ORDER, frames=0)}, "frames: expected at least 1, found 0"),
-        (1, {"order": replace(ORDER, size_px=(640, 0))}, "size: expected at least 32, found 0"),
+        (
+            1,
+            {"order": replace(ORDER, size_px=(640, 0))},
+            "--size: expected 32 to 4096 px a side, found 640x0",
+        ),
+        (1, {"order": replace(ORDER, size_px=(4097, 32))}, "--size: expected 32 to 4096 px a side"),
         (1, {"order": replace(ORDER, views=(0.5, 0.501))}, "view: expected positions that differ"),
-        (1, {"order": replace(ORDER, views=(float("nan"),))}, "view: expected positions that differ"),
+        (1, {"order": replace(ORDER, views=(float("nan"),))}, "view: expected positions of -0.5 "),
+        (1, {"order": replace(ORDER, views=(0.5, 1.6))}, "view: expected positions of -0.5 "),
         (1, {"layout": "paper"}, "view: expected none"),
         (1, {"layout": "zip"}, "layout: expected one of shards, paper, found 'zip'"),
     ],
@@ -292,15 +357,31 @@ def test_a_set_without_a_description_is_none(tmp_path):
 # The version of what makes pairs
 
 
-def test_the_version_changes_with_scenes_and_shaders_and_not_with_what_comes_after(tmp_path, monkeypatch):
+def test_the_version_changes_with_what_makes_pairs_and_not_with_what_comes_after(tmp_path, monkeypatch):
     monkeypatch.undo()
-    (tmp_path / "scenes").mkdir()
-    for name in ("making.py", "scenes/ship.py", "shade.frag"):
-        (tmp_path / name).write_text("as it was")
-    monkeypatch.setattr(making, "__file__", str(tmp_path / "making.py"))
+    changed = ("synth/scenes/ship.py", "synth/shade.frag", "data/packing.py", "data/samples.py", "stereo.py")
+    files = [tmp_path / name for name in ("synth/making.py", "data/paper_layout.py", *changed)]
+    for file in files:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text("as it was")
+    monkeypatch.setattr(making, "__file__", str(files[0]))
     versions = [generator_version()]
-    for name in ("making.py", "scenes/ship.py", "shade.frag"):
-        (tmp_path / name).write_text("changed")
+    for file in files:
+        file.write_text("changed")
         versions.append(generator_version())
     assert versions[0] == versions[1]
-    assert len({versions[0], versions[2], versions[3]}) == 3
+    assert len(set(versions)) == len(files)
+    monkeypatch.setattr(making, "version", lambda package: "1" if package == "pillow" else "0")
+    pillow = generator_version()
+    monkeypatch.setattr(making, "version", lambda package: "0")
+    assert generator_version() != pillow
+
+
+@pytest.mark.needs_egl
+def test_a_set_names_the_opengl_that_draws(monkeypatch):
+    monkeypatch.setenv("LP_NUM_THREADS", "1")
+    renderer = Renderer(PLAIN)
+    name = renderer.name
+    renderer.close()
+    assert "OpenGL" in name
+    assert RenderingStudio(plain=True).renderer() == f"{name}, plain"

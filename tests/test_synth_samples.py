@@ -34,6 +34,8 @@ def small_scene(monkeypatch):
 class Wall:
     """A camera that sees a wall 4 m away, wherever it stands."""
 
+    name = "wall"
+
     def depth_m(self, world, rig, position):
         return np.full(rig.size_px[::-1], 4.0, np.float32)
 
@@ -56,6 +58,26 @@ def test_a_drawn_rig_has_its_nearest_disparity_between_18_and_160_px_of_640():
         staged(Wall(), ORDER, index)[1].camera.disparity_px(np.array([[4.0]])) for index in range(4)
     ]
     assert all(9 <= px <= 80 for px in np.ravel(nearest_px))
+
+
+class Wire(Wall):
+    """A wall 4 m away, and a wire at a share of that before an eye that stands beside the middle."""
+
+    def __init__(self, share):
+        self.share = share
+
+    def depth_m(self, world, rig, position):
+        depth_m = super().depth_m(world, rig, position)
+        if rig.camera.baseline_m > 1e-3 and position == 1.0:
+            depth_m[:, :2] *= self.share  # 0.6 % of the picture
+        return depth_m
+
+
+@pytest.mark.parametrize(("share", "shrunk"), [(1.0, 1.0), (0.9, 1.0), (0.5, 0.5 * 1.25), (0.1, 0.1 * 1.25)])
+def test_a_wire_close_to_one_eye_shrinks_the_baseline_to_a_quarter_above_the_drawn_disparity(share, shrunk):
+    (_, wired), (_, clear) = (staged(camera, ORDER, 0) for camera in (Wire(share), Wall()))
+    assert wired.camera.baseline_m == pytest.approx(shrunk * clear.camera.baseline_m)
+    assert wired.camera.focal_px == clear.camera.focal_px
 
 
 @pytest.mark.parametrize("rig", [(0.0, 0.5), (260.0, -0.5), (float("inf"), 0.5)])

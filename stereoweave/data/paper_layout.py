@@ -11,6 +11,7 @@ The second is written. Each written frame has its checksums in sums/NAME.sha256,
 root; they come last, so that a frame that has them is whole.
 """
 
+import os
 from functools import partial
 from pathlib import Path
 
@@ -62,7 +63,7 @@ def write_frame(root: Path, name: str, sample: Sample) -> None:
     write_image(files["right"], sample.right)
     _write_text(files["calib"], _calibration(sample.camera, sample.left.shape[:2]))
     write_image(files["depth"], _packed(sample.camera.depth_m(sample.disparity_px)))
-    contents = {path.relative_to(root).as_posix(): path.read_bytes() for path in files.values()}
+    contents = {path.relative_to(root).as_posix(): _on_disk(path) for path in files.values()}
     _write_text(_sums(root, name), checksums(contents).decode())
 
 
@@ -91,7 +92,7 @@ def check_frame(root: Path, name: str) -> None:
         for path in _files(root, name).values()
         if path.exists()
     }
-    remedy = f"delete {sums} and start the same stereoweave synth make again"
+    remedy = f"delete {sums}, and the same stereoweave synth make makes it again"
     check_sums(contents, expected, root, remedy)
 
 
@@ -134,6 +135,13 @@ def _files(root: Path, name: str) -> dict[str, Path]:
 
 def _sums(root: Path, name: str) -> Path:
     return root / "sums" / f"{name}.sha256"
+
+
+def _on_disk(path: Path) -> bytes:
+    """What a file holds, once that is on the disk: later than its checksums, it could be lost before them."""
+    with path.open("rb") as stream:
+        os.fsync(stream.fileno())
+        return stream.read()
 
 
 def _write_text(path: Path, text: str) -> None:

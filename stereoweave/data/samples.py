@@ -65,16 +65,16 @@ def hidden(
     width_px = disparity_px.shape[1]
     match = np.arange(width_px) - disparity_px
     outside = (match < 0) | (match > width_px - 1)
-    before = np.where(np.isfinite(match) & ~outside, match, 0).astype(np.intp)
-    after = np.where(match > before, before + 1, before)
-    # On a slope one of the two columns beside the match is never nearer than the surface itself, so that it
-    # does not hide itself. Comparisons with NaN are False.
-    seen_px = np.minimum(_at(other_px, before), _at(other_px, after))
-    return outside | (seen_px > disparity_px + _TOLERANCE_PX)
-
-
-def _at(values: Float[np.ndarray, "h w"], columns: np.ndarray) -> Float[np.ndarray, "h w"]:
-    return np.take_along_axis(values, np.minimum(columns, values.shape[1] - 1), axis=1)
+    match = np.where(np.isfinite(match) & ~outside, match, 0)
+    before = match.astype(np.intp)
+    share = (match - before).astype(np.float32)
+    after = before + (share > 0)
+    before_px, after_px = (np.take_along_axis(other_px, columns, axis=1) for columns in (before, after))
+    # At a jump the nearer one of the two columns beside the match decides; on a slope that one may be nearer
+    # than the surface itself, but what lies between the two is not. Comparisons with NaN are False.
+    column_px = np.where(share < 0.5, before_px, after_px)
+    between_px = (1 - share) * before_px + share * after_px
+    return outside | (np.minimum(column_px, between_px) > disparity_px + _TOLERANCE_PX)
 
 
 def _unknown_is_nan(disparity_px: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

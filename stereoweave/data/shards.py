@@ -13,6 +13,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from functools import partial
 from io import BufferedReader, BytesIO
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,6 +28,7 @@ from stereoweave.io import reading, replacing
 from stereoweave.stereo import Sample
 
 _SUMS = "sha256"
+_DELETE = "delete it, and the same stereoweave synth make makes its pairs again"
 _NAME = re.compile(r"(.+)-(\d{6,})-(\d{6,})\.tar")
 # Shards whose pairs are mixed in `Shards.order`: 400 pairs, as `stereoweave synth make` writes them.
 _WINDOW = 8
@@ -62,23 +64,42 @@ def write_shard(folder: Path, set_name: str, first: int, pairs: Sequence[Mapping
         os.fsync(stream.fileno())
 
 
-def list_shards(folder: Path) -> list[Shard]:
-    """The shards in a folder, by their first pair."""
+def list_shards(folder: Path, set_name: str | None = None) -> list[Shard]:
+    """The shards of one set in a folder, by their first pair.
+
+    Args:
+        folder: Of a set.
+        set_name: The set's; that of the first shard if None.
+
+    Raises:
+        FormatError: A shard is another set's, or has a pair that is in the one before it too.
+    """
     names = ((path, _NAME.fullmatch(path.name)) for path in folder.glob("[!.]*.tar"))
     shards = [Shard(path, found[1], int(found[2]), int(found[3])) for path, found in names if found]
-    return sorted(shards, key=lambda shard: shard.first)
+    shards.sort(key=lambda shard: (shard.first, shard.last, shard.path.name))
+    for shard in shards:
+        if shard.set_name != (expected := set_name or shards[0].set_name):
+            raise FormatError(
+                f"{shard.path}: expected a shard of {expected}, found another set's; move or delete it"
+            )
+    for before, shard in pairwise(shards):
+        if shard.first <= before.last:
+            raise FormatError(
+                f"{shard.path}: expected no pair of {before.path.name}, found some in both; {_DELETE}"
+            )
+    return shards
 
 
 class Shards:
     """The pairs of a set by index; it may travel to other processes, and opens files only while it reads."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, set_name: str | None = None) -> None:
         """Lists the shards of a folder.
 
         Raises:
-            FormatError: There is none, or one is missing before another one.
+            FormatError: There is none, one is missing before another one, or as in `list_shards`.
         """
-        self.shards = list_shards(folder)
+        self.shards = list_shards(folder, set_name)
         if not self.shards:
             raise FormatError(f"{folder}: expected shards like ship-000000-000049.tar, found none")
         self._starts = [0]
@@ -110,7 +131,7 @@ class Shards:
             places = self._places(path).get(name, {})
             files = {f"{name}.{end}": _read_at(stream, *place) for end, place in places.items()}
         sums = files.pop(f"{name}.{_SUMS}", f"  {name}.{_SUMS}".encode())
-        check_sums(files, sums, path, "delete the shard and start the same stereoweave synth make again")
+        check_sums(files, sums, path, _DELETE)
         return {end.removeprefix(f"{name}."): content for end, content in files.items()}
 
     def order(self, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
@@ -162,7 +183,9 @@ def _contents(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
                 name, _, end = member.name.partition(".")
                 contents[name][end] = member.offset_data, member.size
     except tarfile.TarError as error:
-        raise FormatError(f"{path}: expected a shard, a tar file, found a damaged one ({error})") from error
+        raise FormatError(
+            f"{path}: expected a shard, a tar file, found a damaged one ({error}); {_DELETE}"
+        ) from error
     return dict(contents)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from stereoweave.synth.lattice import galvanised, painted, railing
-from stereoweave.synth.parts import Numbers, boxes, copies, prism, sheet, shift, sweep, turn
+from stereoweave.synth.parts import Numbers, boxes, copies, frames, prism, sheet, shift, sweep, turn
 from stereoweave.synth.stage import Palette
 from stereoweave.synth.world import Colour, Material, Mesh, joined
 
@@ -86,10 +86,7 @@ def beams(starts_m: Numbers, ends_m: Numbers, size_m: tuple[float, float], mater
     along = ends - starts
     length = np.linalg.norm(along, axis=1, keepdims=True)
     along = along / length
-    helper = np.where(np.abs(along[:, 2:]) < 0.99, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
-    across = np.cross(helper, along)
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    turns = np.stack([along, across, np.cross(along, across)], -1)
+    turns = np.stack([along, *frames(along)], -1)
     sizes = np.concatenate([length, np.broadcast_to(size_m, (len(along), 2))], 1)
     return boxes((starts + ends) / 2, sizes, material, turns)
 

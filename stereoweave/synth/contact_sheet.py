@@ -1,13 +1,15 @@
 """All scenes at one look: a picture with a row for each."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 from PIL import Image, ImageDraw, ImageFont
+from rich.console import Console
 
 from stereoweave.colour import OCCLUDED_RGB, colour_disparity, colour_range_px
+from stereoweave.progress import progress
 from stereoweave.stereo import Sample
 from stereoweave.synth.samples import Camera, Order, rendered
 
@@ -19,8 +21,7 @@ _LABEL_PX = 20
 def sheet(camera: Camera, scenes: Sequence[str], seed: int, index: int = 0) -> UInt8[np.ndarray, "h w 3"]:
     """Pair `index` of each scene in a row: left, right, depth in colour (red is near), and both masks."""
     rows = [np.hstack([_label(text) for text in COLUMNS])]
-    for scene in scenes:
-        sample = rendered(camera, Order(scene=scene, seed=seed), index).sample
+    for scene, sample in _samples(camera, [(scene, index) for scene in scenes], seed):
         tiles = [_shrunk(picture) for picture in _pictures(sample)]
         rows += [_label(f"{scene} {index}", len(tiles) * _TILE_PX[0]), np.hstack(tiles)]
     return np.vstack(rows)
@@ -34,12 +35,19 @@ def quiz(
         [scenes[place % len(scenes)] for place in range(pictures)]
     )
     names = order.tolist()
-    tiles = [
-        _shrunk(rendered(camera, Order(scene=name, seed=seed), place).sample.left)
-        for place, name in enumerate(names)
-    ]
+    numbered = [(name, place) for place, name in enumerate(names)]
+    tiles = [_shrunk(sample.left) for _, sample in _samples(camera, numbered, seed)]
     tiles += [np.zeros_like(tiles[0])] * (-pictures % 4)
     return np.vstack([np.hstack(tiles[start : start + 4]) for start in range(0, len(tiles), 4)]), names
+
+
+def _samples(camera: Camera, pairs: Sequence[tuple[str, int]], seed: int) -> Iterator[tuple[str, Sample]]:
+    """Scene and sample of each pair; a bar shows how far it is."""
+    with progress(Console()) as bar:
+        shown = bar.add_task("rendering pairs", total=len(pairs), loss="", rate="")
+        for scene, index in pairs:
+            yield scene, rendered(camera, Order(scene=scene, seed=seed), index).sample
+            bar.advance(shown)
 
 
 def _pictures(sample: Sample) -> list[UInt8[np.ndarray, "h w 3"]]:

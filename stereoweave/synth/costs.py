@@ -29,8 +29,8 @@ class Cost:
 
 def costs(scene: str = "propeller", pairs: int = 3, size_px: tuple[int, int] = (640, 480)) -> list[Cost]:
     """All effects together, what each adds to them, and no effect: both views and depths, scene apart."""
-    renderer = Renderer(PLAIN)
     order = Order(scene=scene, size_px=size_px)
+    renderer = Renderer(PLAIN)
     stages = [staged(renderer, order, index) for index in range(pairs)]
     renderer.close()
     views = [(stage.world, rig) for stage, rig in stages]

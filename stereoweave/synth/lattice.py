@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.synth.parts import Numbers, Points, copies, lathe, tubes
+from stereoweave.synth.parts import Numbers, Points, copies, frames, lathe, tubes
 from stereoweave.synth.world import Colour, Material, Mesh, joined
 
 Segments = Float[np.ndarray, "_ 2 3"]
@@ -166,7 +166,7 @@ def ladder(
     return joined(
         [
             bars(rails, 0.075 * width_m, material, sides=4),
-            bars(_segments(middles - half, middles + half), 0.05 * width_m, material, sides=4),
+            bars(_segments(middles - half, middles + half), 0.05 * width_m, material, sides=4, capped=False),
         ]
     )
 
@@ -187,7 +187,8 @@ def cage(
     count = max(int(np.linalg.norm(head - foot) / (1.6 * width_m)), 1) + 1
     hoops = np.linspace(foot, head, count)[:, None] + bow
     strips = hoops[:, 1:-1].swapaxes(0, 1)
-    return bars(np.concatenate([chains(hoops), chains(strips)]), 0.045 * width_m, material, sides=4)
+    members = np.concatenate([chains(hoops), chains(strips)])
+    return bars(members, 0.045 * width_m, material, sides=4, capped=False)
 
 
 def railing(  # noqa: PLR0913, railings differ in so much
@@ -207,8 +208,8 @@ def railing(  # noqa: PLR0913, railings differ in so much
     heights = (np.arange(rails) + 1)[:, None, None] / rails * up
     return joined(
         [
-            bars(_segments(feet, feet + up), radius_m, material, sides=4),
-            bars(chains(path_m[None] + heights), 0.8 * radius_m, material, sides=4),
+            bars(_segments(feet, feet + up), radius_m, material, sides=4, capped=False),
+            bars(chains(path_m[None] + heights), 0.8 * radius_m, material, sides=4, capped=False),
         ]
     )
 
@@ -217,11 +218,8 @@ def towards(at_m: Numbers, directions: Numbers) -> Float[np.ndarray, "n 4 4"]:
     """Poses [N] at points, whose z looks along a direction and whose x stays level."""
     at, along = np.broadcast_arrays(np.atleast_2d(at_m), np.atleast_2d(directions))
     z = along / np.linalg.norm(along, axis=1, keepdims=True)
-    helper = np.where(np.abs(z[:, 2:]) < 0.999, [[0.0, 0.0, 1.0]], [[0.0, -1.0, 0.0]])
-    x = np.cross(helper, z)
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
     poses = np.tile(np.eye(4), (len(z), 1, 1))
-    poses[:, :3, :3] = np.stack([x, np.cross(z, x), z], -1)
+    poses[:, :3, :3] = np.stack([*frames(z), z], -1)
     poses[:, :3, 3] = at
     return poses
 

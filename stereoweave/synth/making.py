@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache, partial
@@ -18,6 +17,7 @@ from stereoweave.data.paper_layout import remove_unfinished, whole_frames, write
 from stereoweave.data.shards import list_shards, write_shard
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io import SMALLEST_SIDE_PX, is_leftover, make_folder, reading, remove_leftovers, replacing
+from stereoweave.rendering import FIRST_POSITION, LAST_POSITION
 from stereoweave.synth.samples import Camera, Order, Rendered, rendered
 from stereoweave.synth.workers import in_workers, step_done
 
@@ -25,8 +25,14 @@ SET_FILE = "set.json"
 FORMAT = 1
 # 50 MB of 640x480: enough to read at the disk's full speed, and half a minute's work to lose.
 PAIRS_A_SHARD = 50
+# Frames have files of their own, so that a worker's run may be short, and no worker be without one.
+_FRAMES_A_RUN = 4
+# Colour and depth of the samples of such a picture take half a gigabyte.
+_LARGEST_SIDE_PX = 4096
 _NOT_OF_THE_PAIRS = {"making.py", "workers.py", "checking.py", "contact_sheet.py", "costs.py"}
-_PACKAGES = ("moderngl", "numpy", "opencv-python-headless", "scikit-image", "trimesh")
+_OF_THE_PAIRS_TOO = ("stereo.py", "data/samples.py", "data/packing.py", "data/paper_layout.py")
+# What casts the rays, or draws the triangles, is in the renderer's name.
+_PACKAGES = ("moderngl", "numpy", "opencv-python-headless", "pillow", "scikit-image", "trimesh")
 
 
 @runtime_checkable
@@ -47,7 +53,9 @@ class RenderingStudio:
     plain: bool = False
 
     def renderer(self) -> str:
-        return f"{type(camera(self.plain)).__name__}{', plain' if self.plain else ''}"
+        # In a process that ends at once: a renderer takes more memory than all else here.
+        (name,) = in_workers(_camera_name, [self.plain], 1, Console(quiet=True), "starting the renderer", 1)
+        return f"{name}{', plain' if self.plain else ''}"
 
     def __call__(self, order: Order, index: int) -> Rendered:
         return rendered(camera(self.plain), order, index)
@@ -57,14 +65,16 @@ class Layout(NamedTuple):
     """A way to lay pairs out in a folder.
 
     Attributes:
-        there: the numbers of the pairs that are whole.
+        there: the numbers of a scene's pairs that are whole.
         write: writes pairs of these numbers as they come.
         tidy: removes what was not written to the end.
+        pairs_a_run: how many pairs one worker makes at a time; no run reaches past a multiple of it.
     """
 
-    there: Callable[[Path], set[int]]
+    there: Callable[[Path, str], set[int]]
     write: Callable[[Path, str, Sequence[int], Iterator[Rendered]], None]
     tidy: Callable[[Path], None]
+    pairs_a_run: int
 
 
 def make(  # noqa: PLR0913 - each is a word of the command line
@@ -95,7 +105,8 @@ def make(  # noqa: PLR0913 - each is a word of the command line
     _check(order, pairs, layout)
     make_folder(out)
     _claim(out, _facts(order, layout, studio), pairs)
-    runs = _runs(sorted(set(range(pairs)) - LAYOUTS[layout].there(out)))
+    lacking = sorted(set(range(pairs)) - LAYOUTS[layout].there(out, order.scene))
+    runs = _runs(lacking, LAYOUTS[layout].pairs_a_run)
     missing = sum(map(len, runs))
     work = partial(_make_run, order, out, layout, studio)
     try:
@@ -112,16 +123,17 @@ def read_set(folder: Path) -> dict[str, Any]:
     """What is written about a set: its order, its layout, what made it, and how many pairs were asked for.
 
     Raises:
-        FormatError: There is no set in the folder, or one in another version's format.
+        FormatError: There is no set in the folder, one in another version's format, or a damaged description.
     """
     path = folder / SET_FILE
     with reading(path, "the description of a set that stereoweave synth make made"):
         facts = json.loads(path.read_text(encoding="utf-8"))
-    if not (isinstance(facts, dict) and facts.get("format") == FORMAT and facts.get("layout") in LAYOUTS):
+    if not (isinstance(facts, dict) and facts.get("format") == FORMAT):
         raise FormatError(
             f"{path}: expected a set of format {FORMAT}, found one that another version of stereoweave made; "
             "read it with that one, or make it anew"
         )
+    _check_facts(path, facts)
     return facts
 
 
@@ -129,20 +141,45 @@ def generator_version() -> str:
     """8 hexadecimal digits that change with the code that makes pairs, and with the packages it uses."""
     folder = Path(__file__).parent
     sources = sorted(path for path in folder.rglob("*.*") if path.suffix != ".pyc" and path.is_file())
-    contents = [path.read_bytes() for path in sources if path.name not in _NOT_OF_THE_PAIRS]
+    sources = [path for path in sources if path.name not in _NOT_OF_THE_PAIRS]
+    sources += [folder.parent / name for name in _OF_THE_PAIRS_TOO]
+    contents = [path.read_bytes() for path in sources]
     versions = [f"{package}=={version(package)}".encode() for package in _PACKAGES]
     return hashlib.sha256(b"".join(contents + versions)).hexdigest()[:8]
+
+
+def _check_facts(path: Path, facts: dict[str, Any]) -> None:
+    kinds = {"layout": str, "scene": str, "pairs": int}
+    wrong = [name for name, kind in kinds.items() if type(facts.get(name)) is not kind]
+    if not wrong and facts["layout"] not in LAYOUTS:
+        wrong = ["layout"]
+    if wrong:
+        raise FormatError(
+            f"{path}: expected layout ({' or '.join(LAYOUTS)}), scene and number of pairs as written, "
+            f"found {wrong[0]} = {json.dumps(facts.get(wrong[0]))}; put back the file, or make the set anew"
+        )
 
 
 def _check(order: Order, pairs: int, layout: str) -> None:
     if layout not in LAYOUTS:
         raise StereoweaveError(f"layout: expected one of {', '.join(LAYOUTS)}, found {layout!r}")
     least = {"pairs": (pairs, 1), "seed": (order.seed, 0), "frames": (order.frames, 1)}
-    least |= {"size": (min(order.size_px), SMALLEST_SIDE_PX)}
     for name, (value, smallest) in least.items():
         if value < smallest:
             raise StereoweaveError(f"{name}: expected at least {smallest}, found {value}")
-    names = {f"{position:.2f}" for position in order.views if math.isfinite(position)}
+    width_px, height_px = order.size_px
+    if min(order.size_px) < SMALLEST_SIDE_PX or max(order.size_px) > _LARGEST_SIDE_PX:
+        raise StereoweaveError(
+            f"--size: expected {SMALLEST_SIDE_PX} to {_LARGEST_SIDE_PX} px a side, "
+            f"found {width_px}x{height_px}"
+        )
+    for position in order.views:
+        if not FIRST_POSITION <= position <= LAST_POSITION:
+            raise StereoweaveError(
+                f"view: expected positions of {FIRST_POSITION} (0 is the left camera, 1 the right one) "
+                f"to {LAST_POSITION}, found {position}"
+            )
+    names = {f"{position:.2f}" for position in order.views}
     if len(names) < len(order.views):
         raise StereoweaveError(
             f"view: expected positions that differ in their first two decimals, found {order.views}"
@@ -160,7 +197,9 @@ def _facts(order: Order, layout: str, studio: Studio) -> dict[str, Any]:
 def _claim(out: Path, facts: dict[str, Any], pairs: int) -> None:
     """Writes down whose folder this is, or refuses one that is another's."""
     if (out / SET_FILE).exists():
-        _compare(out, facts, read_set(out))
+        found = read_set(out)
+        _compare(out, facts, found)
+        pairs = max(pairs, found["pairs"])
     elif others := sorted(path.name for path in out.iterdir() if not is_leftover(path)):
         raise StereoweaveError(
             f"{out}: expected a new folder, or one with a {SET_FILE}, found {others[0]} in it"
@@ -179,10 +218,10 @@ def _compare(out: Path, expected: dict[str, Any], found: dict[str, Any]) -> None
             )
 
 
-def _runs(numbers: Sequence[int]) -> list[list[int]]:
-    """Sorted numbers in runs without a gap, none of which reaches past a multiple of PAIRS_A_SHARD."""
+def _runs(numbers: Sequence[int], most: int) -> list[list[int]]:
+    """Sorted numbers in runs without a gap, none of which reaches past a multiple of `most`."""
     places = enumerate(numbers)
-    groups = groupby(places, key=lambda item: (item[1] - item[0], item[1] // PAIRS_A_SHARD))
+    groups = groupby(places, key=lambda item: (item[1] - item[0], item[1] // most))
     return [[number for _, number in group] for _, group in groups]
 
 
@@ -205,12 +244,13 @@ def _write_frames(out: Path, scene: str, run: Sequence[int], pairs: Iterator[Ren
         write_frame(out, f"{scene}/{number:06d}", pair.sample)
 
 
-def _in_shards(out: Path) -> set[int]:
-    return {number for shard in list_shards(out) for number in range(shard.first, shard.last + 1)}
+def _in_shards(out: Path, scene: str) -> set[int]:
+    return {number for shard in list_shards(out, scene) for number in range(shard.first, shard.last + 1)}
 
 
-def _in_frames(out: Path) -> set[int]:
-    return {int(name.rpartition("/")[2]) for name in whole_frames(out)}
+def _in_frames(out: Path, scene: str) -> set[int]:
+    names = (name.rpartition("/") for name in whole_frames(out))
+    return {int(number) for folder, _, number in names if folder == scene}
 
 
 def _tidy_frames(out: Path) -> None:
@@ -227,7 +267,11 @@ def camera(plain: bool = False) -> Camera:
     return camera_for(PLAIN if plain else Effects())
 
 
+def _camera_name(plain: bool) -> str:
+    return camera(plain).name
+
+
 LAYOUTS = {
-    "shards": Layout(_in_shards, _write_shard, remove_leftovers),
-    "paper": Layout(_in_frames, _write_frames, _tidy_frames),
+    "shards": Layout(_in_shards, _write_shard, remove_leftovers, PAIRS_A_SHARD),
+    "paper": Layout(_in_frames, _write_frames, _tidy_frames, _FRAMES_A_RUN),
 }

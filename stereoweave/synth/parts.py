@@ -40,7 +40,7 @@ def tubes(  # noqa: PLR0913, bars differ in so much
     along = ends - starts
     length = np.linalg.norm(along, axis=1)
     along = along / length[:, None]
-    across, other = _frames(along)
+    across, other = frames(along)
     plan = _bar(sides, capped)
     outwards = plan.circle @ np.stack([across, other], 1)
     middles = np.stack([starts, ends], 1)
@@ -215,6 +215,17 @@ def shift(x: float = 0, y: float = 0, z: float = 0) -> Float[np.ndarray, "4 4"]:
     return pose
 
 
+def frames(along: Points) -> tuple[Points, Points]:
+    """Two unit vectors across each unit direction [N], the first one level; with it they are right-handed.
+
+    What is within 2.5 degrees of upright has its first along -y.
+    """
+    helper = np.where(np.abs(along[:, 2:]) < 0.999, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    across = np.cross(helper, along)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    return across, np.cross(along, across)
+
+
 def polyline_tubes(points_m: Numbers, radius_m: float, material: int, sides: int = 6) -> Mesh:
     """Tubes from each point to the next: railings, frames, cables with corners."""
     points = np.asarray(points_m)
@@ -282,17 +293,9 @@ def _mesh(corners: np.ndarray, normals: np.ndarray, uv: np.ndarray, material: in
     )
 
 
-def _frames(along: Points) -> tuple[Points, Points]:
-    """Two unit vectors across each direction; across, other and along are right-handed."""
-    helper = np.where(np.abs(along[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
-    across = np.cross(helper, along)
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    return across, np.cross(along, across)
-
-
 def _carried_frames(along: Points) -> tuple[Points, Points]:
-    """As `_frames`, each nearly the one before it, so that a pipe does not twist."""
-    across = _frames(along[:1])[0][0]
+    """As `frames`, each nearly the one before it, so that a pipe does not twist."""
+    across = frames(along[:1])[0][0]
     carried = []
     # In plain numbers, because arrays of three are slow.
     u, v, w = across.tolist()

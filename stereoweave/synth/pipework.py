@@ -22,12 +22,13 @@ def pipes(paths_m: Sequence[Path], radii_m: Sequence[float], material: int) -> M
     )
     radii, length = np.repeat(radii_m, counts), np.linalg.norm(ends - starts, axis=1)
     elbows = np.concatenate([path[1:-1] for path in paths_m])
-    bent = spheres(elbows, 1.02 * np.repeat(radii_m, np.array(counts) - 1), material, subdivisions=1)
+    # So much wider than the pipes, the twenty faces of a ball close the gap between their ends.
+    bent = spheres(elbows, 1.15 * np.repeat(radii_m, np.array(counts) - 1), material, subdivisions=0)
     long = length > 0.5
     along = (ends - starts)[long] / length[long, None]
     middle, half = (0.6 * starts + 0.4 * ends)[long], 0.4 * radii[long, None] * along
     flanges = tubes(middle - half, middle + half, 1.6 * radii[long], material, 8)
-    return joined([tubes(starts, ends, radii, material, 8, capped=False), flanges, bent])
+    return joined([tubes(starts, ends, radii, material, 6, capped=False), flanges, bent])
 
 
 def valves(at_m: Path, axes: Path, radius_m: float, body: int, wheel: int) -> Mesh:

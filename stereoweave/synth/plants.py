@@ -47,8 +47,8 @@ def column(rng: np.random.Generator, coats: Coats) -> Unit:
     bend = np.linspace(0, np.pi / 2, 6)
     dome = np.column_stack([upper_m * np.cos(bend), high_m + 0.5 * upper_m * np.sin(bend)])
     below = [[0, 0], [1.15 * radius_m, 0], [radius_m, 0.35], [radius_m, neck_m], [upper_m, neck_m + 0.15]]
-    parts = [lathe(np.concatenate([below, dome]), coats.shell(rng), 28)]
-    hoop = lathe([[radius_m, -0.02], [radius_m + 0.01, 0], [radius_m, 0.02]], coats.steel, 24)
+    parts = [lathe(np.concatenate([below, dome]), coats.shell(rng), 20)]
+    hoop = lathe([[radius_m, -0.02], [radius_m + 0.01, 0], [radius_m, 0.02]], coats.steel, 16)
     parts.append(copies(hoop, _risen(np.arange(0.45, neck_m, 0.45))))
     floors_m = np.linspace(0.0, high_m - 0.05, int(rng.integers(4, 7)))[1:]
     for inner_m, low in ((radius_m, floors_m < neck_m), (upper_m, floors_m >= neck_m)):
@@ -62,8 +62,8 @@ def column(rng: np.random.Generator, coats: Coats) -> Unit:
     )
     line = line @ turn((0, 0, 1), rng.uniform(0, 360))[:3, :3].T
     parts += [
-        tubes(line[:-1], line[1:], 0.035, coats.shells[0], 10),
-        spheres(line[1:3], 0.036, coats.shells[0], 2),
+        tubes(line[:-1], line[1:], 0.035, coats.shells[0], 10, capped=False),
+        spheres(line[1:3], 0.036, coats.shells[0], 1),
     ]
     return Unit(mesh=joined(parts), nozzles_m=np.array([line[-1], [0, 0, 0.7]]))
 
@@ -78,7 +78,7 @@ def ball_tank(rng: np.random.Generator, coats: Coats) -> Unit:
     after = np.roll(ring, -1, axis=0)
     parts = [
         spheres([[0, 0, middle_m]], radius_m, coats.shell(rng), subdivisions=3),
-        tubes(ring, tops, 0.03, coats.shells[0], 8),
+        tubes(ring, tops, 0.03, coats.shells[0], 8, capped=False),
         tubes(
             np.concatenate([ring + [0, 0, 0.05], after + [0, 0, 0.05]]),
             np.concatenate([after, ring]) + [0, 0, middle_m - 0.25],
@@ -87,7 +87,7 @@ def ball_tank(rng: np.random.Generator, coats: Coats) -> Unit:
             4,
             capped=False,
         ),
-        tubes(ring, ring + [0, 0, 0.06], 0.06, coats.concrete, 8),
+        tubes(ring, ring + [0, 0, 0.06], 0.06, coats.concrete, 6),
         lathe(
             [[radius_m, middle_m - 0.02], [radius_m + 0.015, middle_m], [radius_m, middle_m + 0.02]],
             coats.steel,
@@ -95,7 +95,7 @@ def ball_tank(rng: np.random.Generator, coats: Coats) -> Unit:
         ),
         _deck(0.02, 0.2, coats).moved(z=middle_m + radius_m),
     ]
-    share = np.linspace(0, 1, 40)
+    share = np.linspace(0, 1, 30)
     polar = np.pi / 2 * (1.05 - 0.85 * share)
     reach_m = (radius_m + 0.09) * np.sin(polar) + 0.02
     path = np.stack(
@@ -107,7 +107,7 @@ def ball_tank(rng: np.random.Generator, coats: Coats) -> Unit:
         -1,
     )
     foot = path[0] * [1.0, 1.0, 0] + [0.1, -0.5, 0]
-    parts += [_stair(np.concatenate([np.linspace(foot, path[0], 10)[:-1], path]), coats)]
+    parts += [_stair(np.concatenate([np.linspace(foot, path[0], 8)[:-1], path]), coats)]
     return Unit(mesh=joined(parts), nozzles_m=np.array([[0, 0, 0.22]]))
 
 
@@ -125,10 +125,10 @@ def drum_tank(rng: np.random.Generator, coats: Coats) -> Unit:
             [0, high_m + 0.12],
         ],
         coats.shell(rng),
-        48,
+        36,
     )
     seams = [
-        lathe([[radius_m, z - 0.01], [radius_m + 0.008, z], [radius_m, z + 0.01]], coats.steel, 48)
+        lathe([[radius_m, z - 0.01], [radius_m + 0.008, z], [radius_m, z + 0.01]], coats.steel, 36)
         for z in seams_m
     ]
     angle = np.linspace(0, 2 * np.pi, 21)
@@ -143,7 +143,7 @@ def drum_tank(rng: np.random.Generator, coats: Coats) -> Unit:
     board = sheet(
         np.stack([(radius_m + 0.006) * np.cos(label), (radius_m + 0.006) * np.sin(label), z], -1), coats.sign
     )
-    base = lathe([[0, 0], [radius_m + 0.1, 0], [radius_m + 0.1, 0.05], [0, 0.05]], coats.concrete, 40)
+    base = lathe([[0, 0], [radius_m + 0.1, 0], [radius_m + 0.1, 0.05], [0, 0.05]], coats.concrete, 32)
     parts = [shell, *seams, _railing(rim, coats), _stair(path, coats), board, base]
     return Unit(mesh=joined(parts), nozzles_m=np.array([[0, 0, 0.12]]))
 
@@ -156,7 +156,7 @@ def vessels(rng: np.random.Generator, coats: Coats) -> Unit:
     profile = np.concatenate(
         [cap - [0, long_m], [[radius_m, -long_m], [radius_m, long_m]], cap[::-1] * [1, -1] + [0, long_m]]
     )
-    lying = lathe(profile, coats.shell(rng), 28).placed(turn((0, 1, 0), 90))
+    lying = lathe(profile, coats.shell(rng), 20).placed(turn((0, 1, 0), 90))
     places = [(y, z) for y in (-0.26, 0.26) for z in (radius_m + 0.12, 3.2 * radius_m + 0.16)]
     used = places[: int(rng.integers(2, 5))]
     poses = np.stack([shift(0, y, z) for y, z in used])
@@ -268,19 +268,19 @@ def _deck(inner_m: float, wide_m: float, coats: Coats) -> Mesh:
     """A round platform with its railing, and brackets under it."""
     outer_m = inner_m + wide_m
     plate = lathe(
-        [[inner_m, -0.02], [outer_m, -0.02], [outer_m, 0.0], [inner_m, 0.0]], coats.steel, 20, crease_deg=10
+        [[inner_m, -0.02], [outer_m, -0.02], [outer_m, 0.0], [inner_m, 0.0]], coats.steel, 16, crease_deg=10
     )
     angle = np.linspace(0, 2 * np.pi, 11)
     rim = np.stack([outer_m * np.cos(angle), outer_m * np.sin(angle), 0 * angle], -1)
     brackets = np.stack([0.95 * rim[:-1:2], rim[:-1:2] * inner_m / outer_m - [0, 0, 0.15]], 1)
-    return joined([plate, bars(brackets, 0.008, coats.steel, 4, capped=False), _railing(rim, coats)])
+    return joined([plate, bars(brackets, 0.008, coats.steel, 3, capped=False), _railing(rim, coats)])
 
 
 def _railing(path_m: Float[np.ndarray, "n 3"], coats: Coats) -> Mesh:
     """Posts at the points of a path, and two rails."""
     rails = [np.stack([path_m[:-1], path_m[1:]], 1) + [0, 0, z] for z in (0.055, 0.11)]
     posts = np.stack([path_m, path_m + [0, 0, 0.11]], 1)
-    return bars(np.concatenate([*rails, posts]), 0.006, coats.rail, 4, capped=False)
+    return bars(np.concatenate([*rails, posts]), 0.0065, coats.rail, 3, capped=False)
 
 
 def _climb(at_m: float, high_m: float, coats: Coats) -> Mesh:
@@ -289,7 +289,7 @@ def _climb(at_m: float, high_m: float, coats: Coats) -> Mesh:
     bow = np.stack([at_m + 0.12 * np.cos(angle), 0.07 * np.sin(angle), 0 * angle], -1)
     hoops = bow + np.arange(0.24, high_m, 0.2)[:, None, None] * [0, 0, 1]
     strips = np.stack([hoops[0, 1:-1], hoops[-1, 1:-1]], 1)
-    caged = bars(np.concatenate([chains(hoops), strips]), 0.005, coats.rail, 4, capped=False)
+    caged = bars(np.concatenate([chains(hoops), strips]), 0.0055, coats.rail, 3, capped=False)
     return joined([ladder((at_m, 0.0, 0.0), (at_m, 0.0, high_m), (0, 1, 0), 0.11, coats.rail), caged])
 
 

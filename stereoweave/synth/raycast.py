@@ -6,6 +6,7 @@ It stands in where OpenGL is missing, and it is the renderer's independent refer
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -36,26 +37,35 @@ class Raycaster:
         self._scene: EmbreeScene | None = None
         self._world: World | None = None
 
+    @property
+    def name(self) -> str:
+        """What casts the rays, and its version."""
+        return f"embree {version('embreex')}"
+
     def depth_m(self, world: World, rig: Rig, position: float) -> Float[np.ndarray, "h w"]:
         """float32 [H, W] in metres along the optical axis; infinite where nothing is."""
-        return self._truth(world, rig, position)[0]
+        return self.seen(world, rig.eye_m(position), rays(rig))[0].astype(np.float32)
+
+    def seen(
+        self, world: World, eye_m: Float[np.ndarray, "3"], directions: Float[np.ndarray, "h w 3"]
+    ) -> tuple[Float[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
+        """What rays from one point meet: how far away, in lengths of their directions, and which triangle.
+
+        Infinity and -1 where nothing is.
+        """
+        hits = self._cast(world, eye_m, directions.reshape(-1, 3))
+        shape = directions.shape[:2]
+        return hits.distance.reshape(shape), hits.triangle.reshape(shape)
 
     def shots(self, world: World, rig: Rig, positions: Sequence[float]) -> list[Shot]:
         """A picture with its truth for each position."""
         return [self._shot(world, rig, position) for position in positions]
 
     def _shot(self, world: World, rig: Rig, position: float) -> Shot:
-        depth_m, triangle = self._truth(world, rig, position)
+        depth_m, triangle = self.seen(world, rig.eye_m(position), rays(rig))
         target = (triangle >= 0) & world.mesh.target[triangle]
-        return Shot(image=self._image(world, rig, position), depth_m=depth_m, target=target)
-
-    def _truth(
-        self, world: World, rig: Rig, position: float
-    ) -> tuple[Float[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
-        """Depth, and which triangle is seen; -1 for none."""
-        hits = self._cast(world, rig.eye_m(position), rays(rig).reshape(-1, 3))
-        shape = rig.size_px[::-1]
-        return hits.distance.astype(np.float32).reshape(shape), hits.triangle.reshape(shape)
+        image = self._image(world, rig, position)
+        return Shot(image=image, depth_m=depth_m.astype(np.float32), target=target)
 
     def _image(self, world: World, rig: Rig, position: float) -> UInt8[np.ndarray, "h w 3"]:
         samples = self.effects.samples

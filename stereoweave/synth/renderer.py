@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.synth.effects import PLAIN as PLAIN
-from stereoweave.synth.effects import Effects as Effects
+from stereoweave.synth.effects import Effects
 from stereoweave.synth.framing import in_view, projection, to_direction
 from stereoweave.synth.light_maps import LightMaps
 from stereoweave.synth.programs import Programs, surface
@@ -45,6 +44,11 @@ class Renderer:
         self._geometry: Geometry | None = None
         self._frames: Frames | None = None
         self._lit: World | None = None
+
+    @property
+    def name(self) -> str:
+        """Which OpenGL draws, and of what version."""
+        return f"{self._gl.info['GL_RENDERER']}, OpenGL {self._gl.info['GL_VERSION']}"
 
     def depth_m(self, world: World, rig: Rig, position: float) -> Float[np.ndarray, "h w"]:
         """float32 [H, W] in metres along the optical axis; infinite where nothing is."""

@@ -1,7 +1,7 @@
 """Pair number `index` of a scene: a stage, a rig, its pictures, and the exact truth."""
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -13,7 +13,6 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import Sample, StereoCamera, StereoPair
 from stereoweave.synth.rigs import (
     Rig,
-    Viewpoint,
     between,
     draw_focal_px,
     draw_nearest_px,
@@ -26,11 +25,18 @@ from stereoweave.synth.world import Shot, World
 
 # What is nearer than this share of the picture decides the baseline: a single blade of grass does not.
 _NEAREST_SHARE = 0.01
+# Of what stands right before one of the two eyes even a wire counts, if it is so much nearer than drawn.
+_WIRE_SHARE, _EXCESS = 0.002, 1.25
+# Looking for what is nearest takes a small picture only.
+_LOOK_WIDTH_PX = 160
 
 
 @runtime_checkable
 class Camera(Protocol):
     """Takes pictures of worlds: `renderer.Renderer`, or `raycast.Raycaster`, which is slower and plainer."""
+
+    @property
+    def name(self) -> str: ...
 
     def depth_m(self, world: World, rig: Rig, position: float) -> Float[np.ndarray, "h w"]: ...
 
@@ -70,12 +76,10 @@ class Rendered:
 
     Attributes:
         sample: the pair, its disparities (0 for the sky), occlusion masks and camera.
-        depth_m: float32 [H, W] of the left view; infinite for the sky.
         views: position and picture of each further view.
     """
 
     sample: Sample
-    depth_m: Float[np.ndarray, "h w"]
     views: tuple[tuple[float, Shot], ...]
 
 
@@ -88,7 +92,6 @@ def rendered(camera: Camera, order: Order, index: int) -> Rendered:
     pair = StereoPair(left=left.image, right=right.image, camera=rig.camera)
     return Rendered(
         sample=make_sample(pair, left_px, right_px),
-        depth_m=left.depth_m,
         views=tuple(zip(order.views, others, strict=True)),
     )
 
@@ -105,18 +108,40 @@ def staged(camera: Camera, order: Order, sequence: int, frame: int = 0) -> tuple
     if order.rig is not None:
         focal_px, baseline_m = order.rig
     else:
-        nearest_m = min(_nearest_m(camera, stage, place, focal_px, order.size_px) for place in ends)
-        baseline_m = nearest_px * nearest_m / focal_px
+
+        def rigs(baseline_m: float) -> list[Rig]:
+            scale = _LOOK_WIDTH_PX / order.size_px[0]
+            size_px = (_LOOK_WIDTH_PX, max(round(scale * order.size_px[1]), 1))
+            small = _camera(scale * focal_px, baseline_m, size_px)
+            return [rig_at(stage.orbit, place, small, size_px) for place in ends]
+
+        baseline_m = _baseline_m(camera, stage.world, rigs, nearest_px / focal_px)
     share = frame / max(order.frames - 1, 1)
     camera_model = _camera(focal_px, baseline_m, order.size_px)
     return stage, rig_at(stage.orbit, between(start, end, share), camera_model, order.size_px)
 
 
-def _nearest_m(
-    camera: Camera, stage: Stage, place: Viewpoint, focal_px: float, size_px: tuple[int, int]
+def _baseline_m(
+    camera: Camera, world: World, rigs: Callable[[float], Sequence[Rig]], metres_px: float
 ) -> float:
-    rig = rig_at(stage.orbit, place, _camera(focal_px, 1e-6, size_px), size_px)
-    return float(np.quantile(camera.depth_m(stage.world, rig, 0.0), _NEAREST_SHARE))
+    """The baseline that gives what is nearest, seen from half way between the two eyes, its disparity.
+
+    Where the eyes then stand something may be nearer: if its disparity exceeds the wanted one by more than a
+    quarter, the baseline is so much shorter.
+
+    Args:
+        camera: which looks at the world.
+        world: what there is.
+        rigs: for a baseline in metres.
+        metres_px: the wanted disparity through the focal length: of baseline, for each metre of depth.
+    """
+
+    def nearest_m(baseline_m: float, positions: Sequence[float], share: float) -> float:
+        views = [(rig, position) for rig in rigs(baseline_m) for position in positions]
+        return min(float(np.quantile(camera.depth_m(world, *view), share)) for view in views)
+
+    baseline_m = metres_px * nearest_m(1e-6, (0.0,), _NEAREST_SHARE)
+    return min(baseline_m, _EXCESS * metres_px * nearest_m(baseline_m, (0.0, 1.0), _WIRE_SHARE))
 
 
 def _camera(focal_px: float, baseline_m: float, size_px: tuple[int, int]) -> StereoCamera:

@@ -1,5 +1,8 @@
 """What lies in the graphics card's memory: a world's triangles and materials, the textures, frame buffers."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import cv2
 import moderngl
 import numpy as np
@@ -32,12 +35,13 @@ class Geometry:
         self.corners_m = np.ascontiguousarray(mesh.corners_m.T, np.float32)
         self.target_m = self.corners_m[..., mesh.target] if mesh.target.any() else self.corners_m
         tag = np.repeat(mesh.material + MOST_MATERIALS * mesh.target, 3)
-        self._attributes = {
-            "corner_m": (self._buffer(mesh.corners_m, np.float32), "3f"),
-            "normal": (self._buffer(mesh.normals, np.float32), "3f"),
-            "uv_m": (self._buffer(mesh.uv_m, np.float32), "2f"),
-            "tag": (self._buffer(tag, np.int32), "1i"),
-        }
+        with _finding_room(f"a world of {len(mesh.material)} triangles"):
+            self._attributes = {
+                "corner_m": (self._buffer(mesh.corners_m, np.float32), "3f"),
+                "normal": (self._buffer(mesh.normals, np.float32), "3f"),
+                "uv_m": (self._buffer(mesh.uv_m, np.float32), "2f"),
+                "tag": (self._buffer(tag, np.int32), "1i"),
+            }
 
     def draw(self, program: moderngl.Program, triangles: Int[np.ndarray, " k"]) -> None:
         """Draws some of the triangles, in their order."""
@@ -57,6 +61,16 @@ class Geometry:
 
     def _buffer(self, values: np.ndarray, kind: type) -> moderngl.Buffer:
         return self._gl.buffer(np.ascontiguousarray(values, kind))
+
+
+@contextmanager
+def _finding_room(what: str) -> Iterator[None]:
+    try:
+        yield
+    except moderngl.Error as error:
+        raise StereoweaveError(
+            f"{what}: expected OpenGL to have room for them, found {error}; ask for smaller ones"
+        ) from error
 
 
 def _check(world: World) -> None:
@@ -118,17 +132,18 @@ class Frames:
     def __init__(self, gl: moderngl.Context, size_px: tuple[int, int], samples: int) -> None:
         self.size_px = size_px
         fine = size_px[0] * samples, size_px[1] * samples
-        self.sampled = gl.texture(fine, 4)
-        self._renderbuffers = [
-            gl.renderbuffer(size_px, 2, dtype="f4"),
-            gl.depth_renderbuffer(size_px),
-            gl.depth_renderbuffer(fine),
-            gl.renderbuffer(size_px, 4),
-        ]
-        places, near, fine_near, shown = self._renderbuffers
-        self.depth = gl.framebuffer([places], near)
-        self.samples = gl.framebuffer([self.sampled], fine_near)
-        self.pixels = gl.framebuffer([shown])
+        with _finding_room(f"pictures of {size_px[0]}x{size_px[1]} px"):
+            self.sampled = gl.texture(fine, 4)
+            self._renderbuffers = [
+                gl.renderbuffer(size_px, 2, dtype="f4"),
+                gl.depth_renderbuffer(size_px),
+                gl.depth_renderbuffer(fine),
+                gl.renderbuffer(size_px, 4),
+            ]
+            places, near, fine_near, shown = self._renderbuffers
+            self.depth = gl.framebuffer([places], near)
+            self.samples = gl.framebuffer([self.sampled], fine_near)
+            self.pixels = gl.framebuffer([shown])
 
     def release(self) -> None:
         """Gives the memory back."""

@@ -52,7 +52,7 @@ def refinery(rng: np.random.Generator) -> Stage:
         _ground(rng, palette),
         railing(corners, 0.28, 1.2, 0.012, coats.rail, rails=3),
         _tank_farm(rng, coats),
-        trees(rng, palette, places(rng, 16, 17.0, 60.0), (1.0, 2.6)),
+        trees(rng, palette, places(rng, 7, 17.0, 60.0), (1.0, 2.6)),
         houses(rng, palette, places(rng, 6, 20.0, 50.0) / 0.3).placed(_SMALL),
         hills(rng, palette, distance_m=rng.uniform(70, 120)),
     ]
@@ -145,7 +145,7 @@ def _yard(rng: np.random.Generator, palette: Palette, coats: Coats) -> list[Mesh
     )
     boards = [boxes([spot + [0, 0, 0.28]], [[0.34, 0.015, 0.22]], coats.sign) for spot in spots[:3]]
     legs = boxes(spots[:3] + [0, 0, 0.12], [[0.03, 0.012, 0.26]], coats.rail)
-    drums = barrels(rng, palette, _cluster(rng, 8) / 0.3).placed(_SMALL)
+    drums = barrels(rng, palette, _cluster(rng, 6) / 0.3).placed(_SMALL)
     stacks = pallets(rng, palette, _cluster(rng, 4) / 0.3).placed(_SMALL)
     return [slab, *boards, legs, drums, stacks]
 
@@ -170,7 +170,7 @@ def _tank_farm(rng: np.random.Generator, coats: Coats) -> Mesh:
     profile = np.array(
         [[0, 0], [2.2, 0], [2.2, 0.7], [2.24, 0.72], [2.2, 0.74], [2.2, 1.5], [0.05, 1.8], [0, 1.8]]
     )
-    tanks = [lathe(profile * rng.uniform([0.7, 0.9], [1.1, 1.5]), coats.shell(rng), 40) for _ in range(2)]
+    tanks = [lathe(profile * rng.uniform([0.7, 0.9], [1.1, 1.5]), coats.shell(rng), 24) for _ in range(2)]
     return joined(tanks[k % 2].moved(x, y, -0.1) for k, (x, y, _) in enumerate(spots))
 
 
