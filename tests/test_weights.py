@@ -83,7 +83,7 @@ def test_new_views_come_near_to_real_photographs(testdata, name, least_db):
 
 @pytest.mark.testdata
 def test_on_real_pairs_the_shipped_file_answers_as_its_checkpoint_in_pytorch(testdata):
-    kept = checkpoint.load(ROOT / "checkpoints/small_again.pt")
+    kept = checkpoint.load(ROOT / "checkpoints/small_mean.pt")
     network = MODELS[kept.recipe.model]()
     network.load_state_dict(kept.averaged)
     matcher = Matcher(NETWORK)

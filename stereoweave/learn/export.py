@@ -207,7 +207,7 @@ def _card(kept: Checkpoint, network: nn.Module) -> dict[str, Any]:
         "steps": kept.step,
         "origin": kept.origin,
         "hours": round(kept.hours, 2),
-        "data": "collage pairs of the project's own making (docs/training-data.md)",
+        "data": "collages and rendered pairs of the project's own making (docs/training-data.md)",
         "parameters": sum(parameter.numel() for parameter in network.parameters()),
         "multiply_adds_640x480": multiply_adds(network),
         "validation": kept.scores,
