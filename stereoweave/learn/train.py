@@ -24,7 +24,7 @@ from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io import make_folder, replacing
 from stereoweave.learn import checkpoint
 from stereoweave.learn.batches import Batches
-from stereoweave.learn.checkpoint import Checkpoint
+from stereoweave.learn.checkpoint import Checkpoint, Weights
 from stereoweave.learn.models import network_of
 from stereoweave.learn.objective import fitted, naming, objective_of
 from stereoweave.learn.recipe import COLLAGE, Recipe, read_recipe
@@ -190,12 +190,7 @@ def _starting_point(recipe: Recipe, last: Path) -> Checkpoint:
     origin: tuple[dict[str, Any], ...] = ()
     if recipe.start_from:
         earlier = checkpoint.load(Path(recipe.start_from))
-        if earlier.recipe.model != recipe.model:
-            raise FormatError(
-                f"{recipe.name}: start_from = {recipe.start_from!r}, expected a checkpoint of "
-                f"{recipe.model}, found one of {earlier.recipe.model}"
-            )
-        weights, hours, origin = earlier.averaged, earlier.hours, earlier.as_origin()
+        weights, hours, origin = _grown(weights, earlier, recipe), earlier.hours, earlier.as_origin()
     return Checkpoint(
         recipe=recipe,
         step=0,
@@ -208,6 +203,21 @@ def _starting_point(recipe: Recipe, last: Path) -> Checkpoint:
         hours=hours,
         origin=origin,
     )
+
+
+def _grown(fresh: Weights, earlier: Checkpoint, recipe: Recipe) -> Weights:
+    """An earlier network's averaged weights where this one has such of the same shape, and fresh ones beside."""
+    taken = {
+        name: value
+        for name, value in earlier.averaged.items()
+        if name in fresh and value.shape == fresh[name].shape
+    }
+    if not taken:
+        raise FormatError(
+            f"{recipe.name}: start_from = {recipe.start_from!r}, expected a checkpoint that shares weights with "
+            f"{recipe.model}, found one of {earlier.recipe.model}"
+        )
+    return fresh | taken
 
 
 def _check(recipe: Recipe) -> None:

@@ -11,11 +11,12 @@ from stereoweave.learn.models.densemapnet import DenseMapNet
 from stereoweave.learn.models.dispnet import DispNet
 from stereoweave.learn.models.fast_depth import FastDepthNet
 from stereoweave.learn.models.psmnet import PSMNet
-from stereoweave.learn.models.weave import WeaveNet
+from stereoweave.learn.models.weave import BASE, SMALL, WeaveNet
 from stereoweave.learn.recipe import Recipe
 
 MODELS: dict[str, Callable[..., Any]] = {
-    "weave": WeaveNet,
+    "weave_small": partial(WeaveNet, SMALL),
+    "weave_base": partial(WeaveNet, BASE),
     "fast_depth": FastDepthNet,
     "fast_depth_without_skips": partial(FastDepthNet, skips=False),
     "densemapnet": DenseMapNet,

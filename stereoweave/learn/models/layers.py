@@ -35,11 +35,11 @@ class Halve(nn.Sequential):
 
 
 class Residual(nn.Module):
-    """Two 3x3 convolutions added to their input."""
+    """Two 3x3 convolutions, the first one dilated, added to their input."""
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, dilation: int = 1) -> None:
         super().__init__()
-        self.first = ConvBlock(channels, channels)
+        self.first = ConvBlock(channels, channels, dilation=dilation)
         self.second = nn.Sequential(
             nn.Conv2d(channels, channels, 3, padding=1, bias=False), nn.BatchNorm2d(channels)
         )
@@ -149,22 +149,28 @@ def nearby_matches(
 
 
 def upsample_convex(
-    x: Float[Tensor, "b 1 h w"], weights: Float[Tensor, "b 36 h w"]
+    x: Float[Tensor, "b 1 h w"], weights: Float[Tensor, "b k h w"]
 ) -> Float[Tensor, "b 1 h2 w2"]:
-    """Twice the size: each new pixel a convex mixture of the 3x3 old ones around it (RAFT, Teed & Deng 2020).
+    """Twice the size: each new pixel a convex mixture of old ones around it (RAFT, Teed & Deng 2020).
 
-    `weights` are logits, [B, 9 * 4, H, W]: nine neighbours for each of the four new pixels. A mixture can put
-    an edge anywhere between two old pixels without inventing values between its two sides.
+    `weights` are logits, one for each of the old pixels and each of the four new ones: [B, 9 * 4, H, W] mixes
+    the 3x3 old pixels around, [B, 4 * 4, H, W] the 2x2 between whose centres the new one lies. A mixture
+    can put an edge anywhere between two old pixels without inventing values between its two sides.
 
     Deviation: shares of sigmoids; RAFT's softmax costs ONNX Runtime more than all convolutions.
     """
-    batch, _, height, width = x.shape
+    batch, channels, height, width = weights.shape
     around = F.pad(x, (1, 1, 1, 1), mode="replicate")
-    neighbours = torch.stack(
-        [around[:, :, dy : dy + height, dx : dx + width] for dy in range(3) for dx in range(3)], 1
-    )
-    shares = weights.contiguous().view(batch, 9, 4, height, width).sigmoid()
-    # 1e-4: where all nine are refused, no division by zero, and still a mixture of nothing but neighbours.
+    shifted = [around[:, :, dy : dy + height, dx : dx + width] for dy in range(3) for dx in range(3)]
+    if channels == 9 * 4:
+        neighbours = torch.stack(shifted, 1)
+    else:
+        # Of old pixel (a, b) among the four, for new pixel (i, j) among the four.
+        corners = [(0, 0), (0, 1), (1, 0), (1, 1)]
+        neighbours = torch.cat([shifted[3 * (i + a) + j + b] for a, b in corners for i, j in corners], 1)
+        neighbours = neighbours.view(batch, 4, 4, height, width)
+    shares = weights.contiguous().view(batch, channels // 4, 4, height, width).sigmoid()
+    # 1e-4: where all are refused, no division by zero, and still a mixture of nothing but neighbours.
     mixed = ((shares + 1e-4) * neighbours).sum(1) / (shares + 1e-4).sum(1)
     return F.pixel_shuffle(mixed, 2)
 

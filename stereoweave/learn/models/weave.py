@@ -6,7 +6,7 @@ dilated, densely connected blocks, the decoder in steps of two, and the skip con
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -26,6 +26,64 @@ from stereoweave.learn.models.layers import (
     upsample_convex,
 )
 
+Block = TypeVar("Block", Residual, nn.Conv2d)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Size:
+    """How large the parts of a WeaveNet are; one value a resolution where there are four: 1/2, 1/4, 1/8, 1/16.
+
+    Attributes:
+        channels: of the encoder's maps.
+        convolutions: 3x3 ones of the encoder at each resolution, after the one that halves; an even number
+            makes residual blocks.
+        dilations: of the dense blocks at 1/8.
+        growth: channels that each of them adds.
+        bottleneck: channels that the dense blocks end in.
+        context: channels at 1/16 of the aggregation's view of the wider surroundings.
+        join_kernel: of the last convolution of the features that are correlated.
+        propagation: channels of the blocks at 1/4 that spread sure disparities over unsure ones; 0 for none.
+        refinement: 3x3 convolutions at 1/2.
+        neighbours: old pixels that an upsampled one is mixed of, 9 or 4.
+    """
+
+    channels: tuple[int, int, int, int]
+    convolutions: tuple[int, int, int, int]
+    dilations: tuple[int, ...]
+    growth: int
+    bottleneck: int
+    context: int
+    join_kernel: int
+    propagation: int
+    refinement: int
+    neighbours: int
+
+
+SMALL = Size(
+    channels=(16, 32, 48, 64),
+    convolutions=(0, 1, 1, 1),
+    dilations=(1, 2, 4),
+    growth=16,
+    bottleneck=32,
+    context=48,
+    join_kernel=1,
+    propagation=0,
+    refinement=1,
+    neighbours=4,
+)
+BASE = Size(
+    channels=(16, 32, 64, 96),
+    convolutions=(1, 4, 4, 4),
+    dilations=(1, 2, 4, 8, 1),
+    growth=32,
+    bottleneck=48,
+    context=96,
+    join_kernel=3,
+    propagation=48,
+    refinement=6,
+    neighbours=9,
+)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Stages:
@@ -34,83 +92,149 @@ class Stages:
     Attributes:
         correlation: raw matching scores a level of 4 px at 1/4 resolution [2B, D, H/4, W/4].
         scores: the same after aggregation.
-        coarse_px: disparity read from `scores`, at half resolution, in pixels of the full one.
+        quarter_px: disparity read from `scores`, at 1/4 resolution, in pixels of the full one.
+        coarse_px: disparity before the refinement, at half resolution, in pixels of the full one.
         disparity_px: the final one [2B, 1, H, W].
         confidence_logit: log odds of being within 1 px [2B, 1, H, W].
     """
 
     correlation: Float[Tensor, "b d h4 w4"]
     scores: Float[Tensor, "b d h4 w4"]
+    quarter_px: Float[Tensor, "b 1 h4 w4"]
     coarse_px: Float[Tensor, "b 1 h2 w2"]
     disparity_px: Float[Tensor, "b 1 h w"]
     confidence_logit: Float[Tensor, "b 1 h w"]
 
 
 class Features(NamedTuple):
-    """Feature maps of an image at 1/2, 1/4 and 1/8 of its resolution."""
+    """Feature maps of an image at 1/2, 1/4, 1/8 and 1/16 of its resolution."""
 
     half: Tensor
     quarter: Tensor
     eighth: Tensor
+    sixteenth: Tensor
 
-    def mirrored(self) -> "Features":
-        return Features(*(mirrored(map_) for map_ in self))
+
+def as_left_view(views: Tensor, batch: int) -> Tensor:
+    """Maps of the left views, then of the right ones mirrored, from those of the left and the right ones."""
+    return torch.cat([views[:batch], mirrored(views[batch:])])
+
+
+def as_other_view(views: Tensor, batch: int) -> Tensor:
+    """What belongs to `as_left_view` as its right view: maps of the right views, of the left ones mirrored."""
+    return torch.cat([views[batch:], mirrored(views[:batch])])
+
+
+def convolutions(channels: int, count: int) -> list[nn.Module]:
+    """3x3 convolutions one behind the other: residual blocks of two, and one alone where the count is odd."""
+    alone: list[nn.Module] = [ConvBlock(channels, channels)] * (count % 2)
+    residual = [Residual(channels) for _ in range(count // 2)]
+    return alone + residual[:1] + [silent(block) for block in residual[1:]]
+
+
+def silent(block: Block) -> Block:
+    """The block, adding nothing until it is trained: so that a trained network can grow by it."""
+    last = block.second[1] if isinstance(block, Residual) else block
+    for parameter in last.parameters():
+        nn.init.zeros_(parameter)
+    return block
 
 
 class Encoder(nn.Module):
     """Features of one view: down to 1/16, and up again so that the finer maps know the wider surroundings."""
 
-    def __init__(self) -> None:
+    def __init__(self, size: Size) -> None:
         super().__init__()
-        self.down_to_half = nn.Sequential(Halve(3, 16, kernel=4), ConvBlock(16, 16))
-        self.down_to_quarter = nn.Sequential(Halve(16, 32), Residual(32))
-        self.down_to_eighth = nn.Sequential(Halve(32, 64), Residual(64))
-        self.down_to_sixteenth = nn.Sequential(Halve(64, 96), Residual(96))
-        self.up_to_eighth = ConvBlock(96, 64, kernel=1)
-        self.up_to_quarter = ConvBlock(64, 32, kernel=1)
-        self.join = ConvBlock(32, 32)
+        half, quarter, eighth, sixteenth = size.channels
+        counts = size.convolutions
+        self.down_to_half = nn.Sequential(Halve(3, half, kernel=4), *convolutions(half, counts[0]))
+        self.down_to_quarter = nn.Sequential(Halve(half, quarter), *convolutions(quarter, counts[1]))
+        self.down_to_eighth = nn.Sequential(Halve(quarter, eighth), *convolutions(eighth, counts[2]))
+        self.down_to_sixteenth = nn.Sequential(Halve(eighth, sixteenth), *convolutions(sixteenth, counts[3]))
+        self.up_to_eighth = ConvBlock(sixteenth, eighth, kernel=1)
+        self.up_to_quarter = ConvBlock(eighth, quarter, kernel=1)
+        self.join = ConvBlock(quarter, quarter, kernel=size.join_kernel)
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Features:
         half = self.down_to_half(image * 2 - 1)
         quarter = self.down_to_quarter(half)
         eighth = self.down_to_eighth(quarter)
-        eighth = eighth + F.interpolate(self.up_to_eighth(self.down_to_sixteenth(eighth)), scale_factor=2.0)
+        sixteenth = self.down_to_sixteenth(eighth)
+        eighth = eighth + F.interpolate(self.up_to_eighth(sixteenth), scale_factor=2.0)
         quarter = quarter + F.interpolate(self.up_to_quarter(eighth), scale_factor=2.0)
-        return Features(half, self.join(quarter), eighth)
+        return Features(half, self.join(quarter), eighth, sixteenth)
+
+
+class Context(nn.Module):
+    """What the wider surroundings say, at 1/16: a plain surface is known by where it ends."""
+
+    def __init__(self, inputs: int, sixteenth: int, channels: int, outputs: int) -> None:
+        super().__init__()
+        self.down = Halve(inputs, channels)
+        self.join = ConvBlock(channels + sixteenth, channels, kernel=1)
+        self.body = nn.Sequential(*(Residual(channels, dilation) for dilation in (2, 4)))
+        self.up = silent(nn.Conv2d(channels, outputs, 1))
+
+    def forward(self, dense: Tensor, sixteenth: Tensor) -> Tensor:
+        wide = self.body(self.join(torch.cat([self.down(dense), sixteenth], 1)))
+        return F.interpolate(self.up(wide), scale_factor=2.0)
 
 
 class Aggregation(nn.Module):
     """Matching scores made sure of by their surroundings: dilated dense blocks at 1/8, decoded to 1/4."""
 
-    def __init__(self, levels: int) -> None:
+    def __init__(self, levels: int, size: Size) -> None:
         super().__init__()
-        self.down = Halve(levels + 32, 64)
-        self.dense = DilatedDense(64 + 64, narrow=32, growth=32, dilations=(1, 2, 4, 8, 1))
-        self.bottleneck = ConvBlock(self.dense.outputs, 48, kernel=1)
-        self.join = ConvBlock(48 + levels + 32, 32, kernel=1)
+        _, quarter, eighth, sixteenth = size.channels
+        self.down = Halve(levels + quarter, eighth)
+        self.dense = DilatedDense(2 * eighth, narrow=32, growth=size.growth, dilations=size.dilations)
+        self.bottleneck = ConvBlock(self.dense.outputs, size.bottleneck, kernel=1)
+        self.context = Context(self.dense.outputs, sixteenth, size.context, size.bottleneck)
+        self.join = ConvBlock(size.bottleneck + levels + quarter, 32, kernel=1)
         self.decode = ConvBlock(32, 32)
         self.scores = nn.Conv2d(32, levels, 1)
 
     def forward(self, correlation: Tensor, features: Features) -> tuple[Tensor, Tensor]:
         """Scores [B, D, H/4, W/4] and the decoder's features [B, 32, H/4, W/4]."""
         matches = torch.cat([correlation, features.quarter], 1)
-        wide = self.bottleneck(self.dense(torch.cat([self.down(matches), features.eighth], 1)))
+        dense = self.dense(torch.cat([self.down(matches), features.eighth], 1))
+        wide = self.bottleneck(dense) + self.context(dense, features.sixteenth)
         decoded = self.decode(self.join(torch.cat([F.interpolate(wide, scale_factor=2.0), matches], 1)))
         return correlation + self.scores(decoded), decoded
+
+
+class Propagation(nn.Module):
+    """Disparity at 1/4 made smooth where the surface is, from how it departs from its surroundings."""
+
+    def __init__(self, quarter: int, channels: int) -> None:
+        super().__init__()
+        self.join = ConvBlock(32 + quarter + 2, channels, kernel=1)
+        self.body = nn.Sequential(*(Residual(channels, dilation) for dilation in (1, 4)))
+        self.correction = silent(nn.Conv2d(channels, 1, 1))
+        self.decoded = silent(nn.Conv2d(channels, 32, 1))
+
+    def forward(
+        self, disparity: Tensor, quarter: Tensor, decoded: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Disparity in levels [B, 1, H/4, W/4] and the decoder's features."""
+        # Taken in float32: beside a disparity of 100 px bfloat16 cannot tell a slope from a plane.
+        departure = disparity - F.avg_pool2d(disparity, 9, 1, 4, count_include_pad=False)
+        x = self.body(self.join(torch.cat([decoded, quarter, departure, disparity / 16], 1)))
+        return disparity + self.correction(x).float(), decoded + self.decoded(x)
 
 
 class Refinement(nn.Module):
     """A correction of at most `radius` pixels at half resolution, read from matches around the estimate."""
 
-    def __init__(self, radius: int = 2) -> None:
+    def __init__(self, size: Size, radius: int = 2) -> None:
         super().__init__()
         self.radius = radius
         nearby = 2 * radius + 1
-        self.join = ConvBlock(nearby + 16 + 8, 16, kernel=1)
-        self.body = Residual(16)
+        self.join = ConvBlock(nearby + size.channels[0] + 8, 16, kernel=1)
+        self.body = nn.Sequential(*convolutions(16, size.refinement))
         self.scores = nn.Conv2d(16, nearby, 1)
-        self.weights = nn.Conv2d(16, 36, 1)
-        self.confidence = nn.Conv2d(16, 1, 1)
+        self.weights = nn.Conv2d(16, 4 * size.neighbours, 1)
+        self.confidence = nn.Conv2d(16, 4, 1)
 
     def forward(
         self, disparity: Tensor, first: Tensor, second: Tensor, context: Tensor, decoded: Tensor
@@ -119,28 +243,30 @@ class Refinement(nn.Module):
         matches = nearby_matches(first, second, disparity, self.radius)
         x = self.body(self.join(torch.cat([matches, context, decoded], 1)))
         correction = expected_step((matches + self.scores(x)).float())
-        return disparity + correction, self.weights(x), self.confidence(x)
+        return disparity + correction, self.weights(x), F.pixel_shuffle(self.confidence(x), 2)
 
 
 class WeaveNet(nn.Module):
     """Disparity of both views of a rectified pair, and the left one's confidence.
 
-    Sides must be multiples of 16. Disparities from 0 to `levels` * 4 - 1 px are found. 451,262 parameters;
-    5.86 G multiply-adds for both views at 640x480.
+    Sides must be multiples of 16. Disparities from 0 to `levels` * 4 - 1 px are found. SMALL has PARAMS_S
+    parameters and MACS_S G multiply-adds for both views at 640x480, BASE PARAMS_B and MACS_B.
     """
 
     multiple_of = 16
 
-    def __init__(self, levels: int = 48) -> None:
+    def __init__(self, size: Size = SMALL, levels: int = 48) -> None:
         super().__init__()
         self.levels = levels
-        self.encoder = Encoder()
-        self.to_match = nn.Conv2d(32, 32, 1)
-        self.aggregation = Aggregation(levels)
-        self.weights = nn.Conv2d(32, 36, 1)
-        self.to_match_half = nn.Conv2d(16, 16, 1)
+        half, quarter = size.channels[:2]
+        self.encoder = Encoder(size)
+        self.to_match = nn.Conv2d(quarter, 32, 1)
+        self.aggregation = Aggregation(levels, size)
+        self.propagation = Propagation(quarter, size.propagation) if size.propagation else None
+        self.weights = nn.Conv2d(32, 4 * size.neighbours, 1)
+        self.to_match_half = nn.Conv2d(half, 16, 1)
         self.to_half = nn.Conv2d(32, 32, 1)
-        self.refinement = Refinement()
+        self.refinement = Refinement(size)
 
     @property
     def max_disparity_px(self) -> int:
@@ -150,29 +276,36 @@ class WeaveNet(nn.Module):
         """Every step of the prediction for both views."""
         batch = len(left)
         maps = self.encoder(torch.cat([left, right]))
-        left_maps, right_maps = Features(*(m[:batch] for m in maps)), Features(*(m[batch:] for m in maps))
         # In a mirror the right view is a left one, so that one aggregation serves both.
-        first = Features(*map(torch.cat, zip(left_maps, right_maps.mirrored(), strict=True)))
-        second = Features(*map(torch.cat, zip(right_maps, left_maps.mirrored(), strict=True)))
+        first = Features(*(as_left_view(map_, batch) for map_ in maps))
+        match, match_half = self.to_match(maps.quarter), self.to_match_half(maps.half)
         correlation = correlation_volume(
-            self.to_match(first.quarter), self.to_match(second.quarter), self.levels
+            as_left_view(match, batch), as_other_view(match, batch), self.levels
         )
         scores, decoded = self.aggregation(correlation, first)
-        coarse = upsample_convex(local_soft_argmax(scores.float()) * 2, self.weights(decoded).float())
+        quarter = local_soft_argmax(scores.float())
+        spread, decoded = self._propagated(quarter, first.quarter, decoded)
+        coarse = upsample_convex(spread * 2, self.weights(decoded).float())
         fine, weights, confidence = self.refinement(
             coarse,
-            self.to_match_half(first.half),
-            self.to_match_half(second.half),
+            as_left_view(match_half, batch),
+            as_other_view(match_half, batch),
             first.half,
             F.pixel_shuffle(self.to_half(decoded), 2),
         )
         return Stages(
             correlation=correlation,
             scores=scores,
+            quarter_px=quarter * 4,
             coarse_px=coarse * 2,
             disparity_px=upsample_convex(fine * 2, weights.float()),
-            confidence_logit=F.interpolate(confidence.float(), scale_factor=2.0, mode="bilinear"),
+            confidence_logit=confidence.float(),
         )
+
+    def _propagated(self, quarter: Tensor, features: Tensor, decoded: Tensor) -> tuple[Tensor, Tensor]:
+        if self.propagation is None:
+            return quarter, decoded
+        return self.propagation(quarter, features, decoded)
 
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Left disparity, right disparity and the left view's confidence logit, each [B, 1, H, W]."""
