@@ -18,7 +18,11 @@ from stereoweave.learn.warp import reconstruct_left
 
 
 def weave_losses(
-    stages: Stages, truth_px: Float[Tensor, "b 1 h w"], occluded: Bool[Tensor, "b 1 h w"]
+    stages: Stages,
+    truth_px: Float[Tensor, "b 1 h w"],
+    occluded: Bool[Tensor, "b 1 h w"],
+    distribution: float = 1.0,
+    curved: Callable[[Tensor], Tensor] = lambda px: px,
 ) -> dict[str, Tensor]:
     """The terms of WeaveNet's loss by name, already weighted; their sum is what is minimised.
 
@@ -26,16 +30,21 @@ def weave_losses(
         stages: What the network predicted for both views, the second half of the batch mirrored.
         truth_px: Disparity of the same views; NaN where unknown.
         occluded: Pixels without a match, which the raw correlation cannot be asked to find.
+        distribution: Weight of the cross-entropies.
+        curved: What is compared of disparities in px, estimated and true.
     """
     columns = torch.arange(truth_px.shape[3], device=truth_px.device)
     unmatched = occluded | (truth_px > columns)
-    quarter_truth = truth_px[:, :, 1::4, 1::4] / 4
-    matched_truth = quarter_truth.masked_fill(unmatched[:, :, 1::4, 1::4], torch.nan)
+    # A level is as many pixels as the maps of scores are smaller.
+    step = truth_px.shape[3] // stages.scores.shape[3]
+    centres = (..., slice(step // 2 - 1, None, step), slice(step // 2 - 1, None, step))
+    level_truth = truth_px[centres] / step
+    matched_truth = level_truth.masked_fill(unmatched[centres], torch.nan)
     return {
-        "correlation": 0.5 * level_cross_entropy(stages.correlation, matched_truth),
-        "scores": level_cross_entropy(stages.scores, quarter_truth),
-        "coarse": 0.5 * regression(stages.coarse_px, halved(truth_px)),
-        "disparity": regression(stages.disparity_px, truth_px),
+        "correlation": 0.5 * distribution * level_cross_entropy(stages.correlation, matched_truth),
+        "scores": distribution * level_cross_entropy(stages.scores, level_truth),
+        "coarse": 0.5 * regression(curved(stages.coarse_px), curved(halved(truth_px))),
+        "disparity": regression(curved(stages.disparity_px), curved(truth_px)),
         "confidence": 0.3 * confidence_loss(stages.confidence_logit, stages.disparity_px, truth_px),
     }
 

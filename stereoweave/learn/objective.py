@@ -61,7 +61,7 @@ def objective_of(recipe: Recipe, network: nn.Module) -> Objective:
             f"{recipe.name}: loss = {recipe.loss!r}, expected {fitting} for model = {recipe.model!r}"
         )
     if not isinstance(network, CodeNetwork):
-        return WeaveObjective()
+        return WeaveObjective(recipe)
     if recipe.loss == CROSS_ENTROPY and network.predicts != "code":
         raise FormatError(
             f"{recipe.name}: loss = {recipe.loss!r}, expected a network that predicts codes, found "
@@ -71,16 +71,35 @@ def objective_of(recipe: Recipe, network: nn.Module) -> Objective:
 
 
 class WeaveObjective:
-    """Disparity of both views, with every stage of WeaveNet supervised."""
+    """Disparity of both views, with every stage of WeaveNet supervised.
+
+    With an exponent above 1 the regression compares codes of a `DepthCurve`, times max_disparity_px, which is
+    pixels where the exponent is 1.
+    """
+
+    def __init__(self, recipe: Recipe) -> None:
+        self.recipe = recipe
 
     def predict(self, network: WeaveNet, batch: Batch) -> Stages:
         return network.stages(batch["left"], batch["right"])
 
     def losses(self, predicted: Stages, batch: Batch) -> dict[str, Tensor]:
-        return weave_losses(predicted, batch["disparity_px"], batch["occluded"])
+        truth_px, occluded = batch["disparity_px"], batch["occluded"]
+        terms = weave_losses(predicted, truth_px, occluded, self.recipe.distribution, self._curved)
+        if self.recipe.alpha_p:
+            left_px = predicted.disparity_px.chunk(2)[0]
+            error = projection_loss(batch["left"], batch["right"], left_px)
+            terms["projection"] = self.recipe.alpha_p * error
+        return terms
 
     def scores(self, network: WeaveNet, pairs: Source, device: torch.device) -> dict[str, float]:
         return validate(network, pairs, device)
+
+    def _curved(self, disparity_px: Tensor) -> Tensor:
+        if self.recipe.exponent == 1:
+            return disparity_px  # as it is, to the last bit
+        curve = DepthCurve(exponent=self.recipe.exponent, max_disparity_px=self.recipe.max_disparity_px)
+        return self.recipe.max_disparity_px * curve.encode_estimate(disparity_px)
 
 
 class CodeObjective:

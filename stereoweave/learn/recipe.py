@@ -19,7 +19,7 @@ _POSITIVE = (
     "max_disparity_px",
     "max_depth_m",
 )
-_AT_LEAST = {"exponent": 1, "alpha_z": 0, "alpha_p": 0}
+_AT_LEAST = {"exponent": 1, "alpha_z": 0, "alpha_p": 0, "distribution": 0}
 COLLAGE = "collage"
 Weights = tuple[tuple[str, float], ...]
 TARGETS = ("disparity", "depth")
@@ -65,6 +65,7 @@ class Recipe:
         exponent: the paper's p.
         fit_exponent: p is fitted to the histogram of the training truth instead.
         alpha_z, alpha_p: weights of the loss between codes and of the projection loss.
+        distribution: weight of WeaveNet's cross-entropies between levels; with 0 it learns by regression alone.
         vgg16_weights: file of the VGG-16 behind the perceptual loss.
     """
 
@@ -97,6 +98,7 @@ class Recipe:
     fit_exponent: bool = False
     alpha_z: float = 1.0
     alpha_p: float = 0.0
+    distribution: float = 1.0
     vgg16_weights: str = ""
 
     def learning_rate_at(self, step: int) -> float:

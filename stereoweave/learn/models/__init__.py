@@ -11,6 +11,7 @@ from stereoweave.learn.models.densemapnet import DenseMapNet
 from stereoweave.learn.models.dispnet import DispNet
 from stereoweave.learn.models.fast_depth import FastDepthNet
 from stereoweave.learn.models.psmnet import PSMNet
+from stereoweave.learn.models.variants import VARIANTS
 from stereoweave.learn.models.weave import BASE, SMALL, WeaveNet
 from stereoweave.learn.recipe import Recipe
 
@@ -50,9 +51,10 @@ class CodeNetwork(Protocol):
 
 def network_of(recipe: Recipe) -> Any:
     """The network of a recipe with random weights; FormatError for an unknown name."""
-    if recipe.model not in MODELS:
+    models = MODELS | VARIANTS
+    if recipe.model not in models:
         raise FormatError(f"{recipe.name}: model = {recipe.model!r}, expected {' or '.join(MODELS)}")
     if recipe.model == "psmnet":
         # The only one that has its range of disparities built in and lets one choose it.
         return PSMNet(int(recipe.max_disparity_px))
-    return MODELS[recipe.model]()
+    return models[recipe.model]()

@@ -24,6 +24,7 @@ from stereoweave.learn.models.layers import (
     mirrored,
     nearby_matches,
     upsample_convex,
+    warped_matches,
 )
 
 Block = TypeVar("Block", Residual, nn.Conv2d)
@@ -43,6 +44,8 @@ class Size:
         context: channels at 1/16 of the aggregation's view of the wider surroundings.
         join_kernel: of the last convolution of the features that are correlated.
         propagation: channels of the blocks at 1/4 that spread sure disparities over unsure ones; 0 for none.
+        compared: channels that are compared at 1/2.
+        warps: whether they are compared with the other view warped once, and not looked up step by step.
         refinement: 3x3 convolutions at 1/2.
         neighbours: old pixels that an upsampled one is mixed of, 9 or 4.
     """
@@ -55,6 +58,8 @@ class Size:
     context: int
     join_kernel: int
     propagation: int
+    compared: int
+    warps: bool
     refinement: int
     neighbours: int
 
@@ -68,6 +73,8 @@ SMALL = Size(
     context=48,
     join_kernel=1,
     propagation=0,
+    compared=8,
+    warps=True,
     refinement=1,
     neighbours=4,
 )
@@ -80,6 +87,8 @@ BASE = Size(
     context=96,
     join_kernel=3,
     propagation=48,
+    compared=16,
+    warps=False,
     refinement=6,
     neighbours=9,
 )
@@ -98,8 +107,8 @@ class Stages:
         confidence_logit: log odds of being within 1 px [2B, 1, H, W].
     """
 
-    correlation: Float[Tensor, "b d h4 w4"]
-    scores: Float[Tensor, "b d h4 w4"]
+    correlation: Float[Tensor, "b d h_d w_d"]
+    scores: Float[Tensor, "b d h_d w_d"]
     quarter_px: Float[Tensor, "b 1 h4 w4"]
     coarse_px: Float[Tensor, "b 1 h2 w2"]
     disparity_px: Float[Tensor, "b 1 h w"]
@@ -229,6 +238,7 @@ class Refinement(nn.Module):
     def __init__(self, size: Size, radius: int = 2) -> None:
         super().__init__()
         self.radius = radius
+        self.matches = warped_matches if size.warps else nearby_matches
         nearby = 2 * radius + 1
         self.join = ConvBlock(nearby + size.channels[0] + 8, 16, kernel=1)
         self.body = nn.Sequential(*convolutions(16, size.refinement))
@@ -240,7 +250,7 @@ class Refinement(nn.Module):
         self, disparity: Tensor, first: Tensor, second: Tensor, context: Tensor, decoded: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Disparity in pixels of this resolution, the weights of the last upsampling, and the confidence."""
-        matches = nearby_matches(first, second, disparity, self.radius)
+        matches = self.matches(first, second, disparity, self.radius)
         x = self.body(self.join(torch.cat([matches, context, decoded], 1)))
         correction = expected_step((matches + self.scores(x)).float())
         return disparity + correction, self.weights(x), F.pixel_shuffle(self.confidence(x), 2)
@@ -254,6 +264,7 @@ class WeaveNet(nn.Module):
     """
 
     multiple_of = 16
+    upsample = staticmethod(upsample_convex)
 
     def __init__(self, size: Size = SMALL, levels: int = 48) -> None:
         super().__init__()
@@ -264,7 +275,7 @@ class WeaveNet(nn.Module):
         self.aggregation = Aggregation(levels, size)
         self.propagation = Propagation(quarter, size.propagation) if size.propagation else None
         self.weights = nn.Conv2d(32, 4 * size.neighbours, 1)
-        self.to_match_half = nn.Conv2d(half, 16, 1)
+        self.to_match_half = nn.Conv2d(half, size.compared, 1)
         self.to_half = nn.Conv2d(32, 32, 1)
         self.refinement = Refinement(size)
 
@@ -278,14 +289,11 @@ class WeaveNet(nn.Module):
         maps = self.encoder(torch.cat([left, right]))
         # In a mirror the right view is a left one, so that one aggregation serves both.
         first = Features(*(as_left_view(map_, batch) for map_ in maps))
-        match, match_half = self.to_match(maps.quarter), self.to_match_half(maps.half)
-        correlation = correlation_volume(
-            as_left_view(match, batch), as_other_view(match, batch), self.levels
-        )
-        scores, decoded = self.aggregation(correlation, first)
-        quarter = local_soft_argmax(scores.float())
+        correlation, scores, decoded = self.matched(maps, first)
+        quarter = self.read(scores.float(), decoded)
         spread, decoded = self._propagated(quarter, first.quarter, decoded)
-        coarse = upsample_convex(spread * 2, self.weights(decoded).float())
+        coarse = self.upsample(spread * 2, self.weights(decoded).float())
+        match_half = self.to_match_half(maps.half)
         fine, weights, confidence = self.refinement(
             coarse,
             as_left_view(match_half, batch),
@@ -298,9 +306,27 @@ class WeaveNet(nn.Module):
             scores=scores,
             quarter_px=quarter * 4,
             coarse_px=coarse * 2,
-            disparity_px=upsample_convex(fine * 2, weights.float()),
+            disparity_px=self.upsample(fine * 2, weights.float()),
             confidence_logit=confidence.float(),
         )
+
+    def matched(self, maps: Features, first: Features) -> tuple[Tensor, Tensor, Tensor]:
+        """Matching scores before and after aggregation, and the decoder's features.
+
+        Args:
+            maps: Features of the left views, then of the right ones.
+            first: The same as left views.
+        """
+        match = self.to_match(maps.quarter)
+        batch = len(match) // 2
+        correlation = correlation_volume(
+            as_left_view(match, batch), as_other_view(match, batch), self.levels
+        )
+        return correlation, *self.aggregation(correlation, first)
+
+    def read(self, scores: Tensor, decoded: Tensor) -> Tensor:
+        """Disparity in pixels of 1/4 resolution; scores that are coarser need the decoder's features too."""
+        return local_soft_argmax(scores)
 
     def _propagated(self, quarter: Tensor, features: Tensor, decoded: Tensor) -> tuple[Tensor, Tensor]:
         if self.propagation is None:

@@ -1,0 +1,144 @@
+"""WeaveNets that differ from SMALL in one thing each, to be trained beside it: the ablations' networks."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from stereoweave.learn.models.layers import (
+    ConvBlock,
+    correlation_volume,
+    local_soft_argmax,
+    upsample_convex,
+)
+from stereoweave.learn.models.weave import (
+    SMALL,
+    Aggregation,
+    Features,
+    WeaveNet,
+    as_left_view,
+    as_other_view,
+)
+
+
+def upsample_bilinear(x: Float[Tensor, "b 1 h w"], _weights: Tensor) -> Float[Tensor, "b 1 h2 w2"]:
+    """Twice the size, whatever the weights."""
+    return F.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
+
+
+def soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
+    """Expected level under a softmax over all levels, between two surfaces at an edge (Kendall et al. 2017)."""
+    levels = torch.arange(logits.shape[1], device=logits.device).view(1, -1, 1, 1)
+    return (logits.softmax(1) * levels).sum(1, keepdim=True)
+
+
+class Bilinear(WeaveNet):
+    """Upsampled without looking at the image."""
+
+    upsample = staticmethod(upsample_bilinear)
+
+    def __init__(self) -> None:
+        super().__init__()
+        # Nothing computes the weights that nothing reads.
+        self.weights = nn.Identity()
+        self.refinement.weights = nn.Identity()
+
+
+class AllLevels(WeaveNet):
+    """Disparity as the expectation over all levels, not over those around the best."""
+
+    def read(self, scores: Tensor, decoded: Tensor) -> Tensor:
+        return soft_argmax(scores)
+
+
+class Grouped(WeaveNet):
+    """Features correlated in `groups` of channels, each with scores of its own (GwcNet, Guo et al. 2019)."""
+
+    def __init__(self, groups: int = 4) -> None:
+        super().__init__()
+        self.groups = groups
+        half, quarter, eighth, sixteenth = SMALL.channels
+        wider = (half, quarter + (groups - 1) * self.levels, eighth, sixteenth)
+        self.aggregation = Aggregation(self.levels, replace(SMALL, channels=wider))
+
+    def matched(self, maps: Features, first: Features) -> tuple[Tensor, Tensor, Tensor]:
+        match = self.to_match(maps.quarter)
+        batch = len(match) // 2
+        volumes = [
+            correlation_volume(as_left_view(group, batch), as_other_view(group, batch), self.levels)
+            for group in match.chunk(self.groups, 1)
+        ]
+        correlation = torch.stack(volumes).sum(0)
+        # The sum of all says what the last one is.
+        beside = first._replace(quarter=torch.cat([first.quarter, *volumes[:-1]], 1))
+        return correlation, *self.aggregation(correlation, beside)
+
+
+class EighthAggregation(Aggregation):
+    """Scores that enter and leave at 1/8; the decoder still ends at 1/4."""
+
+    def __init__(self, levels: int) -> None:
+        super().__init__(levels, SMALL)
+        _, quarter, eighth, _ = SMALL.channels
+        self.down = ConvBlock(levels, eighth)
+        self.join = ConvBlock(SMALL.bottleneck + quarter, 32, kernel=1)
+        self.scores = nn.Conv2d(32, levels, 2, stride=2)
+
+    def forward(self, correlation: Tensor, features: Features) -> tuple[Tensor, Tensor]:
+        dense = self.dense(torch.cat([self.down(correlation), features.eighth], 1))
+        wide = self.bottleneck(dense) + self.context(dense, features.sixteenth)
+        joined = self.join(torch.cat([F.interpolate(wide, scale_factor=2.0), features.quarter], 1))
+        decoded = self.decode(joined)
+        return correlation + self.scores(decoded), decoded
+
+
+class Eighth(WeaveNet):
+    """Correlated at 1/8, in half as many levels of 8 px."""
+
+    def __init__(self) -> None:
+        super().__init__(SMALL, levels=24)
+        self.to_match = nn.Conv2d(SMALL.channels[2], 32, 1)
+        self.aggregation = EighthAggregation(self.levels)
+        self.weights_of_eighth = nn.Conv2d(32, 4 * SMALL.neighbours, 2, stride=2)
+
+    @property
+    def max_disparity_px(self) -> int:
+        return 8 * self.levels
+
+    def matched(self, maps: Features, first: Features) -> tuple[Tensor, Tensor, Tensor]:
+        return super().matched(maps._replace(quarter=maps.eighth), first)
+
+    def read(self, scores: Tensor, decoded: Tensor) -> Tensor:
+        weights = self.weights_of_eighth(decoded).float()
+        return upsample_convex(2 * local_soft_argmax(scores), weights)
+
+
+class NoContext(nn.Module):
+    """Nothing, in the place of Context."""
+
+    def forward(self, dense: Tensor, sixteenth: Tensor) -> Tensor:
+        return dense.new_zeros(())
+
+
+class WithoutContext(WeaveNet):
+    """Without the aggregation's view of the wider surroundings at 1/16."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.aggregation.context = NoContext()
+
+
+VARIANTS: dict[str, Callable[[], WeaveNet]] = {
+    "weave_small_eighth": Eighth,
+    "weave_small_grouped": Grouped,
+    "weave_small_all_levels": AllLevels,
+    "weave_small_undilated": partial(WeaveNet, replace(SMALL, dilations=(1, 1, 1))),
+    "weave_small_without_dense": partial(WeaveNet, replace(SMALL, dilations=())),
+    "weave_small_without_context": WithoutContext,
+    "weave_small_bilinear": Bilinear,
+    "weave_small_nine_neighbours": partial(WeaveNet, replace(SMALL, neighbours=9)),
+}
