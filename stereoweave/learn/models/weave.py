@@ -45,6 +45,7 @@ class Size:
         join_kernel: of the last convolution of the features that are correlated.
         propagation: channels of the blocks at 1/4 that spread sure disparities over unsure ones; 0 for none.
         compared: channels that are compared at 1/2.
+        handed: channels that the decoder hands to 1/2; in all, 4 should divide what is joined there.
         warps: whether they are compared with the other view warped once, and not looked up step by step.
         refinement: 3x3 convolutions at 1/2.
         neighbours: old pixels that an upsampled one is mixed of, 9 or 4.
@@ -59,6 +60,7 @@ class Size:
     join_kernel: int
     propagation: int
     compared: int
+    handed: int
     warps: bool
     refinement: int
     neighbours: int
@@ -74,6 +76,7 @@ SMALL = Size(
     join_kernel=1,
     propagation=0,
     compared=8,
+    handed=7,
     warps=True,
     refinement=1,
     neighbours=4,
@@ -88,6 +91,7 @@ BASE = Size(
     join_kernel=3,
     propagation=48,
     compared=16,
+    handed=8,
     warps=False,
     refinement=6,
     neighbours=9,
@@ -240,7 +244,7 @@ class Refinement(nn.Module):
         self.radius = radius
         self.matches = warped_matches if size.warps else nearby_matches
         nearby = 2 * radius + 1
-        self.join = ConvBlock(nearby + size.channels[0] + 8, 16, kernel=1)
+        self.join = ConvBlock(nearby + size.channels[0] + size.handed, 16, kernel=1)
         self.body = nn.Sequential(*convolutions(16, size.refinement))
         self.scores = nn.Conv2d(16, nearby, 1)
         self.weights = nn.Conv2d(16, 4 * size.neighbours, 1)
@@ -276,7 +280,7 @@ class WeaveNet(nn.Module):
         self.propagation = Propagation(quarter, size.propagation) if size.propagation else None
         self.weights = nn.Conv2d(32, 4 * size.neighbours, 1)
         self.to_match_half = nn.Conv2d(half, size.compared, 1)
-        self.to_half = nn.Conv2d(32, 32, 1)
+        self.to_half = nn.Conv2d(32, 4 * size.handed, 1)
         self.refinement = Refinement(size)
 
     @property
