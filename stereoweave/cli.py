@@ -1,9 +1,10 @@
 """The commands: stereoweave depth | view | bench | synth | train | export."""
 
 import json
+import math
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -16,14 +17,33 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.synth_commands import synth
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from stereoweave.benchmark import Row
     from stereoweave.matcher import Matcher
     from stereoweave.report import Summary
     from stereoweave.stereo import Estimate, StereoPair
 
 FILES = ("disparity.pfm", "disparity.png", "depth.png", "preview.png", "confidence.png", "report.html")
+
+# What stereoweave bench pairs shows of its rows, by heading and column.
+PAIRS_TABLES = {
+    "Errors, mean over the scenes": {
+        "EPE px": "epe_px",
+        "bad-1 %": "bad1_percent",
+        "bad-2 %": "bad2_percent",
+        "D1 %": "d1_percent",
+        "edge EPE": "edge_epe_px",
+        "edge bad-1": "edge_bad1_percent",
+        "flying %": "flying_percent",
+    },
+    "Cost and confidence, mean over the scenes": {
+        "ms": "time_ms",
+        "x SGBM": "time_relative",
+        "memory MB": "memory_mb",
+        "AUSE px": "ause_px",
+        "AUSE %": "ause_bad1_percent",
+        "calibration": "calibration_error",
+    },
+}
 
 Pictures = Annotated[
     list[Path],
@@ -88,6 +108,7 @@ def depth(  # noqa: PLR0913 - each is a word of the command line
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Depth of a stereo pair: maps, pictures of them, and a report to open in a browser."""
+    from stereoweave.hints import hints
     from stereoweave.report import summarize, write_report
 
     pair = _read(pictures, calib)
@@ -98,7 +119,7 @@ def depth(  # noqa: PLR0913 - each is a word of the command line
         estimate_ms = 1000 * (time.perf_counter() - start_s)
         names = tuple(picture.name for picture in pictures)
         summary = summarize(pair, estimate, pictures=names, model=model, estimate_ms=estimate_ms)
-        notes = _write_maps(folder, pair, estimate, summary)
+        notes = _write_maps(folder, pair, estimate, summary) + hints(pair, estimate, matcher)
         write_report(folder / "report.html", pair, estimate, summary, threads)
     (_tell_json if as_json else _tell)(summary, notes, out)
 
@@ -114,6 +135,7 @@ def view(  # noqa: PLR0913 - each is a word of the command line
     threads: Threads = None,
 ) -> None:
     """A new view of a stereo pair, from between its two cameras or a little beyond them."""
+    from stereoweave.hints import hints
     from stereoweave.io import picture_kind, write_image
     from stereoweave.rendering import check_position, render
 
@@ -121,35 +143,71 @@ def view(  # noqa: PLR0913 - each is a word of the command line
     picture_kind(out)
     _place_for(out)
     pair = _read(pictures)
-    estimate = _matcher(model, threads).estimate(pair.left, pair.right)
+    matcher = _matcher(model, threads)
+    estimate = matcher.estimate(pair.left, pair.right)
     new = render(pair.left, pair.right, estimate, position, threads)
     write_image(out, new.image)
     typer.echo(f"{out}: view at {position:g}, {100 * (~new.drawn).mean():.1f} % of it seen by neither camera")
+    for hint in hints(pair, estimate, matcher):
+        typer.echo(hint)
 
 
 @bench.command()
-def pairs(
+def pairs(  # noqa: PLR0913 - each is a word of the command line
     folder: Annotated[
-        Path, typer.Argument(help="Holds a folder a scene: left.png, right.png, disparity.png.")
+        Path,
+        typer.Argument(
+            help="Holds a folder a scene, of left.png, right.png, disparity.png; or what synth make made."
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("pairs.csv"),
     model: Annotated[
         list[str] | None,
         typer.Option(help="As for depth; may be given again. All shipped networks unless given."),
     ] = None,
+    dataset: Annotated[
+        str | None, typer.Option(help="The folder holds this dataset, as its authors' archives unpack.")
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="A picture to write: errors against time. Extra 'train'.")
+    ] = None,
+    sparsification: Annotated[
+        Path | None, typer.Option(help="A picture to write: errors by confidence. Extra 'train'.")
+    ] = None,
     threads: Threads = None,
 ) -> None:
-    """Accuracy and time of networks and of OpenCV's SGBM on pairs with known disparity."""
-    from stereoweave.benchmark import MEAN, score_pairs, write_csv
+    """Errors, edges, confidence, time and memory of networks and OpenCV's matchers on known disparity."""
+    from functools import partial
+
+    import cv2
+
+    from stereoweave.benchmark import MEAN, network, score_pairs, with_memory, write_csv
     from stereoweave.data.readers import read_scenes
+    from stereoweave.io import picture_kind
     from stereoweave.matcher import shipped_models
+    from stereoweave.opencv_matchers import SGBM
+    from stereoweave.threads import thread_count
 
     _place_for(out)
-    scenes = read_scenes(folder)
-    matchers = {name: _disparity_by(_matcher(name, threads)) for name in model or shipped_models()}
-    rows = score_pairs(matchers, scenes)
+    for picture in filter(None, (plot, sparsification)):
+        picture_kind(picture)
+        _place_for(picture)
+        with _needing_the_train_extra("a plot needs matplotlib"):
+            from stereoweave import benchmark_plots
+    scenes = read_scenes(folder, dataset)
+    cv2.setNumThreads(thread_count(threads))
+    makers = {name: partial(network, name, threads) for name in model or shipped_models()}
+    scores = score_pairs(makers, scenes)
+    rows = with_memory(scores.rows, makers, scores.largest)
     write_csv(out, rows)
-    _tell_rows([row for row in rows if row.scene == MEAN])
+    means = [row for row in rows if row.scene == MEAN]
+    if plot:
+        benchmark_plots.draw_error_over_time(plot, means)
+    if sparsification:
+        benchmark_plots.draw_sparsification(
+            sparsification, {name: scores.curves[name] for name in (*makers, SGBM)}
+        )
+    _tell_rows(means)
     typer.echo(f"rows: {out}")
 
 
@@ -208,6 +266,32 @@ def paper(
     from stereoweave.learn.trials import CLAIMS
 
     _experiment(recipe, out, report, seeds, jobs, CLAIMS)
+
+
+@bench.command()
+def ablations(
+    recipe: RecipeFile,
+    out: RunsFolder,
+    report: Annotated[Path, typer.Option(help="The CSV file to write, a row a training; it is added to.")],
+    rendered: Annotated[
+        Path, typer.Option(metavar="FOLDER", help="Held-out pairs of stereoweave synth make.")
+    ] = Path("runs/synth_val/rooms"),
+    seeds: Seeds = 2,
+) -> None:
+    """WeaveNet's choices made otherwise, one at a time: train each, score it on collages and rendered pairs.
+
+    Stopped and started again it goes on where it was.
+    """
+    from rich.console import Console
+
+    from stereoweave.learn.recipe import read_recipe
+
+    base = read_recipe(recipe)
+    _place_for(report)
+    with _needing_the_train_extra():
+        from stereoweave.learn.ablations import plan, run_ablations
+    run_ablations(plan(base, seeds), out, rendered, report, Console())
+    typer.echo(f"rows: {report}")
 
 
 @bench.command()
@@ -304,10 +388,6 @@ def _matcher(model: str, threads: int | None) -> "Matcher":
     return Matcher(model, threads=threads)
 
 
-def _disparity_by(matcher: "Matcher") -> "Callable[[StereoPair], np.ndarray]":
-    return lambda pair: matcher.estimate(pair.left, pair.right).disparity_px
-
-
 @contextmanager
 def _results_in(out: Path) -> Iterator[Path]:
     """A temporary folder, whose files move into `out` in the end; after an error nothing of either is left.
@@ -372,23 +452,17 @@ def _tell(summary: "Summary", notes: list[str], out: Path) -> None:
 
 
 def _tell_rows(rows: "list[Row]") -> None:
+    """Print the means in two tables, since one would be wider than a terminal."""
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
 
-    table = Table(
-        "matcher", "EPE px", "bad-1 %", "bad-2 %", "D1 %", "ms", "x SGBM", title="Mean over the scenes"
-    )
-    for row in rows:
-        numbers = (
-            row.epe_px,
-            row.bad1_percent,
-            row.bad2_percent,
-            row.d1_percent,
-            row.time_ms,
-            row.time_relative,
-        )
-        table.add_row(row.matcher, *(f"{number:.2f}" for number in numbers))
-    Console().print(table)
+    for title, columns in PAIRS_TABLES.items():
+        headings = (Column(name, justify="right", no_wrap=True) for name in columns)
+        table = Table(Column("matcher", overflow="fold"), *headings, title=title)
+        for row in rows:
+            numbers = [getattr(row, field) for field in columns.values()]
+            table.add_row(row.matcher, *("–" if math.isnan(x) else f"{x:.2f}" for x in numbers))
+        Console().print(table)
 
 
 def _write_and_tell(out: Path, title: str, rows: Sequence[Any]) -> None:
@@ -413,11 +487,11 @@ def _tell_table(title: str, rows: Sequence[Any]) -> None:
 
 
 @contextmanager
-def _needing_the_train_extra() -> Iterator[None]:
+def _needing_the_train_extra(what: str = "this command needs PyTorch and its company") -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as missing:
         raise StereoweaveError(
-            f"this command needs PyTorch and its company, found no module {missing.name}; "
+            f"{what}, found no module {missing.name}; "
             "install the extra 'train': pip install 'stereoweave[train]', from the wheel or the copy you have"
         ) from missing

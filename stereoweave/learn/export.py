@@ -193,9 +193,10 @@ def multiply_adds(network: nn.Module, height: int = 480, width: int = 640) -> in
     counted = counter.get_total_flops() // 2
     if not isinstance(network, WeaveNet):
         return counted
-    # The counter sees convolutions and matrix products; the refinement compares 16 features of both views
-    # at 6 columns a pixel by a plain product.
-    return counted + 2 * (height // 2) * (width // 2) * 16 * 6
+    # The counter sees convolutions and matrix products; the refinement compares features of both views by
+    # plain products, at one column more than it gives matches for where it interpolates between products.
+    nearby = 2 * network.refinement.radius + 1 + (not network.size.warps)
+    return counted + 2 * (height // 2) * (width // 2) * network.size.compared * nearby
 
 
 def _card(kept: Checkpoint, network: nn.Module) -> dict[str, Any]:

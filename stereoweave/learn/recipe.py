@@ -65,7 +65,7 @@ class Recipe:
         exponent: the paper's p.
         fit_exponent: p is fitted to the histogram of the training truth instead.
         alpha_z, alpha_p: weights of the loss between codes and of the projection loss.
-        distribution: weight of WeaveNet's cross-entropies between levels; with 0 it learns by regression alone.
+        distribution: weight of WeaveNet's cross-entropies between levels; 0 leaves regression alone.
         vgg16_weights: file of the VGG-16 behind the perceptual loss.
     """
 

