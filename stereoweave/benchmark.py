@@ -1,28 +1,45 @@
-"""Matchers side by side on real pairs, in one run: accuracy, time, and time relative to OpenCV's SGBM."""
+"""Matchers side by side on pairs of known disparity: accuracy, edges, confidence, time and memory."""
 
 import csv
 import os
 import platform
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float
 
 from stereoweave.data.readers import Scene
+from stereoweave.edges import edge_bad_percent, edge_epe_px, flying_percent
 from stereoweave.errors import StereoweaveError
 from stereoweave.io import replacing
-from stereoweave.metrics import bad_percent, d1_percent, epe_px
-from stereoweave.stereo import StereoPair
+from stereoweave.matcher import Matcher
+from stereoweave.memory import peak_memory_mb
+from stereoweave.metrics import (
+    Sparsification,
+    bad_percent,
+    calibration_error,
+    d1_percent,
+    epe_px,
+    sparsification,
+)
+from stereoweave.opencv_matchers import OPENCV_MATCHERS, SGBM, fill_rows, left_right_confidence
+from stereoweave.stereo import Estimate, StereoPair
 
-Match = Callable[[StereoPair], Float[np.ndarray, "h w"]]
+Match = Callable[[StereoPair], Estimate | Float[np.ndarray, "h w"]]
+"""What is timed: a pair to an Estimate; or to the left disparity in px [H, W] alone, where <= 0 is a hole.
 
-SGBM, MEAN = "sgbm", "mean"
-SGBM_DISPARITIES = 192
+The holes of such a map are then filled along rows, and its confidence is the left-right check, for which the
+mirrored pair is matched too. Neither is timed: others do it in other ways, at other costs.
+"""
+
+Maker = Callable[[], Match]
+
+MEAN = "mean"
 TURNS = 5
 
 
@@ -30,11 +47,18 @@ TURNS = 5
 class Row:
     """How one matcher did on one scene, or on the mean of all (scene "mean").
 
-    Errors are over every pixel whose truth is known, occluded ones included.
+    Errors are over every pixel whose truth is known, occluded ones included. A mean is over the scenes that
+    have the number: a scene without a depth edge has no error near one.
 
     Attributes:
+        edge_epe_px, edge_bad1_percent, flying_percent: Near depth edges (edges.py).
+        ause_px, ause_bad1_percent: How far the confidence is from an order of pixels by their error, or from
+            bad ones before good ones: the area between its sparsification curve and the oracle's.
+        calibration_error: Of a confidence that is a probability, and NaN for the left-right check. Each scene
+            counts by itself: claims too high in one do not make up for claims too low in another.
         time_ms: Median of the warm calls; in the mean row, the mean of these over the scenes.
         time_relative: time_ms as a multiple of SGBM's in the same row.
+        memory_mb: In the mean row alone, where it was measured: of the largest pair (memory.py).
     """
 
     matcher: str
@@ -43,67 +67,86 @@ class Row:
     bad1_percent: float
     bad2_percent: float
     d1_percent: float
+    edge_epe_px: float
+    edge_bad1_percent: float
+    flying_percent: float
+    ause_px: float
+    ause_bad1_percent: float
+    calibration_error: float
     time_ms: float
     time_relative: float
+    memory_mb: float = float("nan")
 
 
-def score_pairs(matchers: Mapping[str, Match], scenes: Iterable[Scene]) -> list[Row]:
-    """A row per scene and matcher, then a mean row per matcher; OpenCV's SGBM joins them as "sgbm".
+class Curves(NamedTuple):
+    """How a matcher's mean error in px, and its percent of bad pixels (over 1 px), fall by its confidence."""
+
+    epe_px: Sparsification
+    bad1_percent: Sparsification
+
+
+class Scores(NamedTuple):
+    """What `score_pairs` gives.
+
+    Attributes:
+        rows: One per scene and matcher, then a mean row per matcher.
+        curves: By matcher, the mean over the scenes.
+        largest: The pair with the most pixels, for `with_memory`.
+    """
+
+    rows: list[Row]
+    curves: dict[str, Curves]
+    largest: StereoPair
+
+
+class _Answer(NamedTuple):
+    disparity_px: Float[np.ndarray, "h w"]
+    confidence: Float[np.ndarray, "h w"]
+    is_probability: bool
+
+
+def network(model: str | Path, threads: int | None = None) -> Match:
+    """A shipped network by name, or a matcher file by path; errors as for `Matcher`."""
+    matcher = Matcher(model, threads=threads)
+    return lambda pair: matcher.estimate(pair.left, pair.right)
+
+
+def score_pairs(makers: Mapping[str, Maker], scenes: Iterable[Scene]) -> Scores:
+    """The errors, times and sparsification curves of matchers on scenes; those of OpenCV join them.
+
+    Args:
+        makers: What makes each matcher, by its name.
+        scenes: At least one.
 
     Raises:
-        StereoweaveError: A matcher is called "sgbm" or "mean", or is a file of that name.
+        StereoweaveError: A matcher bears a name that the table uses itself, or is a file of that name.
     """
-    for name in matchers:
-        if Path(name).stem in (SGBM, MEAN):
-            raise StereoweaveError(f"{name}: expected a name that the table does not use itself; rename it")
-    everyone = {SGBM: opencv_sgbm(), **matchers}
-    rows = [row for scene in scenes for row in _score_scene(everyone, scene)]
-    return rows + _mean_rows(rows, everyone)
+    matchers = {name: make() for name, make in _everyone(makers).items()}
+    scored: list[tuple[Row, Curves]] = []
+    largest: StereoPair | None = None
+    for scene in scenes:
+        scored += _score_scene(matchers, scene)
+        largest = max(largest or scene.pair, scene.pair, key=lambda pair: pair.left.size)
+    if largest is None:
+        raise StereoweaveError("scenes: expected at least one, found none")
+    rows = [row for row, _ in scored]
+    curves = {name: _mean_curves([of for row, of in scored if row.matcher == name]) for name in matchers}
+    return Scores(rows + _mean_rows(rows, matchers), curves, largest)
 
 
-def opencv_sgbm() -> Match:
-    """OpenCV's semi-global matcher over 192 disparities; values <= 0 are its holes, for `fill_rows`.
+def with_memory(rows: Iterable[Row], makers: Mapping[str, Maker], pair: StereoPair) -> list[Row]:
+    """The rows, those of means with the memory that each matcher takes for a pair in a process of its own.
 
-    Source of the settings: OpenCV's sample stereo_match.cpp at a block size of 5 (P1 = 8*3*5*5,
-    P2 = 32*3*5*5), with the speckle range of 2 that StereoSGBM's documentation recommends; the sample has 32.
+    Args:
+        rows: As `score_pairs` gives them.
+        makers: As `score_pairs` took them; each has to be one that can be pickled.
+        pair: What is matched; the largest one of all says what is enough.
     """
-    matcher = cv2.StereoSGBM.create(
-        minDisparity=0,
-        numDisparities=SGBM_DISPARITIES,
-        blockSize=5,
-        P1=600,
-        P2=2400,
-        disp12MaxDiff=1,
-        preFilterCap=63,
-        uniquenessRatio=10,
-        speckleWindowSize=100,
-        speckleRange=2,
-        mode=cv2.STEREO_SGBM_MODE_SGBM,
-    )
-
-    def match(pair: StereoPair) -> Float32[np.ndarray, "h w"]:
-        # SGBM gives no answer in the first 192 columns: a border gives them that room.
-        left, right = (
-            cv2.copyMakeBorder(image, 0, 0, SGBM_DISPARITIES, 0, cv2.BORDER_REPLICATE)
-            for image in (pair.left, pair.right)
-        )
-        return matcher.compute(left, right)[:, SGBM_DISPARITIES:].astype(np.float32) / 16
-
-    return match
-
-
-def fill_rows(disparity_px: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """The map with each hole (<= 0) filled from the farther of its known neighbours along the row.
-
-    A row without any takes the one above; above the first row that has some, holes stay.
-    """
-    known = disparity_px > 0
-    occupied = known.max(axis=1)
-    farther_px = np.minimum(
-        _last_known(disparity_px, known), _last_known(disparity_px[:, ::-1], known[:, ::-1])[:, ::-1]
-    )
-    filled_px = np.where(known | ~occupied[:, None], disparity_px, farther_px)
-    return filled_px[np.maximum.accumulate(np.where(occupied, np.arange(len(known)), 0))]
+    everyone = _everyone(makers)
+    return [
+        replace(row, memory_mb=peak_memory_mb(everyone[row.matcher], pair)) if row.scene == MEAN else row
+        for row in rows
+    ]
 
 
 def write_csv(path: str | Path, rows: Sequence[Any]) -> None:
@@ -122,27 +165,68 @@ def write_csv(path: str | Path, rows: Sequence[Any]) -> None:
             writer.writerow(values | machine)
 
 
-def _score_scene(matchers: Mapping[str, Match], scene: Scene) -> list[Row]:
+def _everyone(makers: Mapping[str, Maker]) -> dict[str, Maker]:
+    for name in makers:
+        if Path(name).stem in (*OPENCV_MATCHERS, MEAN):
+            raise StereoweaveError(f"{name}: expected a name that the table does not use itself; rename it")
+    return {**OPENCV_MATCHERS, **makers}
+
+
+def _score_scene(matchers: Mapping[str, Match], scene: Scene) -> list[tuple[Row, Curves]]:
     # These first calls warm the matchers up for the timing.
-    disparities_px = {name: match(scene.pair) for name, match in matchers.items()}
-    # Untimed: others fill SGBM's holes in other ways, at other costs.
-    disparities_px[SGBM] = fill_rows(disparities_px[SGBM])
+    answers = {name: _answer(match, scene.pair) for name, match in matchers.items()}
     # In turns, so that a machine that slows down slows all alike.
     turns_ms = [{name: _time_ms(match, scene.pair) for name, match in matchers.items()} for _ in range(TURNS)]
     times_ms = {name: float(np.median([turn_ms[name] for turn_ms in turns_ms])) for name in matchers}
-    return [
-        Row(
+    scored = []
+    for name, answer in answers.items():
+        curves = _curves(answer, scene.truth_px)
+        row = Row(
             matcher=name,
             scene=scene.name,
-            epe_px=epe_px(disparity_px, scene.truth_px),
-            bad1_percent=bad_percent(disparity_px, scene.truth_px, 1),
-            bad2_percent=bad_percent(disparity_px, scene.truth_px, 2),
-            d1_percent=d1_percent(disparity_px, scene.truth_px),
+            **_errors(answer, scene.truth_px),
+            ause_px=curves.epe_px.ause,
+            ause_bad1_percent=curves.bad1_percent.ause,
             time_ms=times_ms[name],
             time_relative=times_ms[name] / times_ms[SGBM],
         )
-        for name, disparity_px in disparities_px.items()
-    ]
+        scored.append((row, curves))
+    return scored
+
+
+def _answer(match: Match, pair: StereoPair) -> _Answer:
+    found = match(pair)
+    if isinstance(found, Estimate):
+        return _Answer(found.disparity_px, found.confidence, is_probability=True)
+    mirrored_px = match(pair.mirrored())
+    assert not isinstance(mirrored_px, Estimate)
+    return _Answer(fill_rows(found), left_right_confidence(found, mirrored_px[:, ::-1]), is_probability=False)
+
+
+def _errors(answer: _Answer, truth_px: Float[np.ndarray, "h w"]) -> dict[str, float]:
+    """The columns of a row that compare with the truth pixel by pixel."""
+    found_px = answer.disparity_px
+    known = np.isfinite(truth_px)
+    hits = np.abs(found_px - truth_px)[known] <= 1
+    return {
+        "epe_px": epe_px(found_px, truth_px),
+        "bad1_percent": bad_percent(found_px, truth_px, 1),
+        "bad2_percent": bad_percent(found_px, truth_px, 2),
+        "d1_percent": d1_percent(found_px, truth_px),
+        "edge_epe_px": edge_epe_px(found_px, truth_px),
+        "edge_bad1_percent": edge_bad_percent(found_px, truth_px, 1),
+        "flying_percent": flying_percent(found_px, truth_px),
+        "calibration_error": calibration_error(answer.confidence[known], hits)
+        if answer.is_probability
+        else float("nan"),
+    }
+
+
+def _curves(answer: _Answer, truth_px: Float[np.ndarray, "h w"]) -> Curves:
+    known = np.isfinite(truth_px)
+    error_px = np.abs(answer.disparity_px[known] - truth_px[known].astype(np.float64))
+    confidence = answer.confidence[known]
+    return Curves(sparsification(error_px, confidence), sparsification(100.0 * (error_px > 1), confidence))
 
 
 def _time_ms(match: Match, pair: StereoPair) -> float:
@@ -155,7 +239,7 @@ def _mean_rows(rows: list[Row], names: Iterable[str]) -> list[Row]:
     columns = [field.name for field in fields(Row) if field.type is float]
     means = {
         name: {
-            column: float(np.mean([getattr(row, column) for row in rows if row.matcher == name]))
+            column: float(_mean_known([getattr(row, column) for row in rows if row.matcher == name]))
             for column in columns
         }
         for name in names
@@ -165,13 +249,18 @@ def _mean_rows(rows: list[Row], names: Iterable[str]) -> list[Row]:
     return [Row(matcher=name, scene=MEAN, **mean) for name, mean in means.items()]
 
 
-def _last_known(
-    values: Float32[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]
-) -> Float32[np.ndarray, "h w"]:
-    """At each pixel the nearest known value at or before it in the row; infinity where there is none."""
-    columns = np.maximum.accumulate(np.where(known, np.arange(values.shape[1]), -1), axis=1)
-    last = np.take_along_axis(values, np.maximum(columns, 0), axis=1)
-    return np.where(columns >= 0, last, np.float32(np.inf))
+def _mean_curves(curves: Sequence[Curves]) -> Curves:
+    means = (
+        Sparsification(*(_mean_known(lines) for lines in zip(*of_scenes, strict=True)))
+        for of_scenes in zip(*curves, strict=True)
+    )
+    return Curves(*means)
+
+
+def _mean_known(values: Sequence[Any]) -> Any:
+    """The mean of numbers, or of arrays of one shape, over those without NaN; NaN where there is none."""
+    known = [value for value in values if not np.isnan(value).any()]
+    return np.mean(known, axis=0) if known else values[0]
 
 
 def _cpu_name() -> str:

@@ -38,10 +38,10 @@ PAIRS_TABLES = {
     "Cost and confidence, mean over the scenes": {
         "ms": "time_ms",
         "x SGBM": "time_relative",
-        "memory MB": "memory_mb",
+        "RAM MB": "memory_mb",
         "AUSE px": "ause_px",
         "AUSE %": "ause_bad1_percent",
-        "calibration": "calibration_error",
+        "calibr. error": "calibration_error",
     },
 }
 
@@ -457,11 +457,11 @@ def _tell_rows(rows: "list[Row]") -> None:
     from rich.table import Column, Table
 
     for title, columns in PAIRS_TABLES.items():
-        headings = (Column(name, justify="right", no_wrap=True) for name in columns)
-        table = Table(Column("matcher", overflow="fold"), *headings, title=title)
+        numbers = (Column(name, justify="right") for name in columns)
+        table = Table(Column("matcher", no_wrap=True), *numbers, title=title)
         for row in rows:
-            numbers = [getattr(row, field) for field in columns.values()]
-            table.add_row(row.matcher, *("–" if math.isnan(x) else f"{x:.2f}" for x in numbers))
+            cells = [getattr(row, field) for field in columns.values()]
+            table.add_row(Path(row.matcher).name, *("–" if math.isnan(x) else f"{x:.2f}" for x in cells))
         Console().print(table)
 
 

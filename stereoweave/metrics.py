@@ -4,6 +4,8 @@ In ground truth NaN and infinity mean unknown, and unknown pixels do not count. 
 is a bad one. A mean over no pixel is NaN.
 """
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -12,6 +14,28 @@ from stereoweave.errors import StereoweaveError
 
 # As many as Guo et al. 2017 take.
 _BINS = 15
+DROPPED_PERCENT = np.arange(96)
+"""How many of the pixels `sparsification` drops."""
+
+
+class Sparsification(NamedTuple):
+    """Mean error of what is kept after 0, 1, ... 95 % of the pixels were dropped, [96], in the error's unit.
+
+    Attributes:
+        kept: The least confident were dropped.
+        oracle: Those of the largest error were, which no confidence can better.
+    """
+
+    kept: Float[np.ndarray, " n"]
+    oracle: Float[np.ndarray, " n"]
+
+    @property
+    def ause(self) -> float:
+        """Area under the sparsification error, the gap between the two, over the share dropped; 0 is best.
+
+        Source: Ilg et al. 2018, who divide errors by the mean of all pixels; these keep their unit.
+        """
+        return float(np.trapezoid(self.kept - self.oracle, DROPPED_PERCENT / 100))
 
 
 def epe_px(estimate_px: Float[np.ndarray, "h w"], truth_px: Float[np.ndarray, "h w"]) -> float:
@@ -75,6 +99,8 @@ def calibration_error(probability: Float[np.ndarray, "..."], happened: Bool[np.n
 
     Source: Guo et al. 2017; a bin weighs as many as fall into it.
     """
+    if not probability.size:
+        return float("nan")
     claimed, came_true, share = calibration_bins(probability, happened)
     return float((np.abs(claimed - came_true) * share).sum())
 
@@ -88,6 +114,31 @@ def calibration_bins(
     used = counts > 0
     claimed, came_true = (np.bincount(where, x.ravel(), _BINS)[used] for x in (probability, happened))
     return np.stack([claimed / counts[used], came_true / counts[used], counts[used] / where.size])
+
+
+def sparsification(error: Float[np.ndarray, " n"], confidence: Float[np.ndarray, " n"]) -> Sparsification:
+    """How the mean error falls as the least confident pixels are dropped, beside the best that could be.
+
+    Source: Ilg et al. 2018. Pixels of equal confidence are dropped in any order: the mean over all is given.
+
+    Args:
+        error: Of each pixel [N], such as absolute errors in px, or 100 for a bad pixel and 0 for a good one.
+        confidence: Any measure that orders the pixels [N], infinite ones too; not NaN.
+    """
+    _check_shapes(error, confidence)
+    return Sparsification(kept=_kept_means(error, confidence), oracle=_kept_means(error, -error))
+
+
+def _kept_means(
+    error: Float[np.ndarray, " n"], confidence: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " m"]:
+    """The curve itself."""
+    if not error.size:
+        return np.full(len(DROPPED_PERCENT), np.nan)
+    _, group, counts = np.unique(-confidence, return_inverse=True, return_counts=True)
+    expected = np.repeat(np.bincount(group, error) / counts, counts)
+    kept = error.size - error.size * DROPPED_PERCENT // 100
+    return expected.cumsum()[kept - 1] / kept
 
 
 def _known_errors(

@@ -12,9 +12,9 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from stereoweave.benchmark import SGBM, fill_rows, opencv_sgbm
 from stereoweave.errors import StereoweaveError
 from stereoweave.metrics import depth_error_m, epe_px, mae, psnr_db, ssim
+from stereoweave.opencv_matchers import OPENCV_MATCHERS, SGBM, fill_rows
 from stereoweave.projection import fill_from_rows, project_right
 from stereoweave.stereo import Sample, StereoPair, View
 
@@ -136,5 +136,5 @@ def _zero_px(sample: Sample) -> Float[np.ndarray, "h w"]:
 
 
 def _sgbm() -> Method:
-    match = opencv_sgbm()
+    match = OPENCV_MATCHERS[SGBM]()
     return lambda sample: fill_rows(match(StereoPair(left=sample.left, right=sample.right)))

@@ -23,7 +23,7 @@ torch.set_num_threads(1)
 PAIR_SIZE = (64, 96)
 RECIPE = Recipe(
     name="tiny",
-    model="weave",
+    model="weave_small",
     steps=20,
     batch=2,
     learning_rate=1e-3,
@@ -44,7 +44,7 @@ def recipe_of(model, **changes):
 
     48 of them, because with 32 a volume is 2 levels deep, for which oneDNN's bfloat16 gradient is garbage.
     """
-    loss = "weave" if model == "weave" else "l2"
+    loss = "weave" if model.startswith("weave") else "l2"
     return replace(RECIPE, **{"model": model, "loss": loss, "max_disparity_px": 48.0, **changes})
 
 
@@ -86,7 +86,7 @@ def keep_pairs(folder, seed, count, size=PAIR_SIZE):
     return pairs
 
 
-def untrained(name="weave"):
+def untrained(name="weave_small"):
     torch.manual_seed(0)
     return network_of(recipe_of(name)).eval()
 
@@ -140,7 +140,7 @@ class Overfitted:
 
 
 @functools.cache
-def overfitted(name="weave", steps=45) -> Overfitted:
+def overfitted(name="weave_small", steps=45) -> Overfitted:
     """A network that has seen one pair again and again, and its mean error on that pair before and after."""
     network, sample = untrained(name), box_before_a_wall(np.random.default_rng(0))
     batch = collated([sample])

@@ -1,13 +1,15 @@
 import csv
-import runpy
+import math
+from functools import partial
 
 import numpy as np
 import pytest
 
-from stereoweave.benchmark import TURNS, fill_rows, opencv_sgbm, score_pairs, write_csv
-from stereoweave.data.readers import Scene, read_scenes
-from stereoweave.errors import StereoweaveError
-from stereoweave.stereo import StereoPair
+from stereoweave.benchmark import MEAN, TURNS, network, score_pairs, with_memory, write_csv
+from stereoweave.data.readers import Scene
+from stereoweave.errors import MatcherError, StereoweaveError
+from stereoweave.opencv_matchers import OPENCV_MATCHERS
+from stereoweave.stereo import Estimate, StereoPair
 
 
 def scene_of(rng, name="noise", disparity_px=7):
@@ -20,16 +22,44 @@ def scene_of(rng, name="noise", disparity_px=7):
 
 
 def constant(disparity_px):
-    return lambda pair: np.full(pair.left.shape[:2], disparity_px, np.float32)
+    """What makes a matcher that finds one disparity everywhere."""
+    return lambda: lambda pair: np.full(pair.left.shape[:2], disparity_px, np.float32)
+
+
+def certain(disparity_px, confidence):
+    """What makes one that gives it as an Estimate."""
+
+    def match(pair):
+        found_px = np.full(pair.left.shape[:2], disparity_px, np.float32)
+        claimed = np.full(pair.left.shape[:2], confidence, np.float32)
+        return Estimate(
+            disparity_px=found_px,
+            right_disparity_px=found_px,
+            confidence=claimed,
+            occluded=np.zeros(found_px.shape, bool),
+        )
+
+    return lambda: match
+
+
+def by_matcher(rows, scene=MEAN):
+    return {row.matcher: row for row in rows if row.scene == scene}
+
+
+def with_step(scene, behind_px):
+    """The scene with another true disparity in its left half."""
+    truth_px = scene.truth_px.copy()
+    truth_px[:, :50] = behind_px
+    return Scene(name=scene.name, pair=scene.pair, truth_px=truth_px)
 
 
 def test_rows_hold_the_errors_of_each_matcher_on_each_scene_and_their_means(rng):
     scenes = [scene_of(rng, "near", disparity_px=20), scene_of(rng, "far", disparity_px=7)]
-    rows = score_pairs({"seven": constant(7.0), "eight": constant(8.5)}, scenes)
+    rows = score_pairs({"seven": constant(7.0), "eight": constant(8.5)}, scenes).rows
     found = {
         (row.matcher, row.scene): (row.epe_px, row.bad1_percent, row.bad2_percent, row.d1_percent)
         for row in rows
-        if row.matcher != "sgbm"
+        if row.matcher in ("seven", "eight")
     }
     assert found == {
         ("seven", "near"): (13.0, 100.0, 100.0, 100.0),
@@ -42,7 +72,7 @@ def test_rows_hold_the_errors_of_each_matcher_on_each_scene_and_their_means(rng)
 
 
 def test_times_are_relative_to_sgbm_in_the_same_row(rng):
-    rows = score_pairs({"constant": constant(1.0)}, [scene_of(rng, "a"), scene_of(rng, "b")])
+    rows = score_pairs({"constant": constant(1.0)}, [scene_of(rng, "a"), scene_of(rng, "b")]).rows
     times_ms = {(row.matcher, row.scene): row.time_ms for row in rows}
     for row in rows:
         assert row.time_relative == pytest.approx(row.time_ms / times_ms["sgbm", row.scene])
@@ -50,70 +80,118 @@ def test_times_are_relative_to_sgbm_in_the_same_row(rng):
         assert times_ms[name, "mean"] == pytest.approx((times_ms[name, "a"] + times_ms[name, "b"]) / 2)
 
 
-@pytest.mark.parametrize("name", ["sgbm", "files/mean.onnx"])
+@pytest.mark.parametrize("name", ["sgbm", "files/mean.onnx", "bm.onnx"])
 def test_a_matcher_of_a_name_that_the_table_uses_itself_is_refused(rng, name):
     with pytest.raises(StereoweaveError, match=f"{name}: expected"):
         score_pairs({name: constant(1.0)}, [scene_of(rng)])
 
 
-def test_matchers_take_turns_after_one_call_to_warm_up(rng):
+def test_matchers_take_turns_after_the_calls_that_warm_them_up(rng):
     calls = []
 
-    def noted(name):
+    def noted(name, make):
         def match(pair):
             calls.append(name)
-            return constant(1.0)(pair)
+            return make()(pair)
+
+        return lambda: match
+
+    makers = {"map": noted("map", constant(1.0)), "estimate": noted("estimate", certain(1.0, 0.5))}
+    score_pairs(makers, [scene_of(rng)])
+    # A map's left-right check takes the mirrored pair.
+    assert calls == ["map", "map", "estimate"] + ["map", "estimate"] * TURNS
+
+
+def test_near_an_edge_a_row_tells_errors_and_flying_pixels(rng):
+    scenes = [with_step(scene_of(rng, "step"), 27), scene_of(rng, "flat")]
+    rows = score_pairs({"between": constant(17.0), "before": constant(27.0)}, scenes).rows
+    for of in (by_matcher(rows, "step"), by_matcher(rows)):  # a flat scene has no part in the mean
+        assert (of["between"].edge_epe_px, of["before"].edge_epe_px) == (10, 10)
+        assert (of["between"].edge_bad1_percent, of["before"].edge_bad1_percent) == (100, 50)
+        assert (of["between"].flying_percent, of["before"].flying_percent) == (100, 0)
+    assert math.isnan(by_matcher(rows, "flat")["between"].flying_percent)
+
+
+def test_a_probability_is_compared_with_what_came_true_and_a_left_right_check_is_none(rng):
+    scene = with_step(scene_of(rng), 27)
+    rows = score_pairs({"sure": certain(7.0, 0.9), "map": constant(7.0)}, [scene]).rows
+    # Half of the pixels are right.
+    assert by_matcher(rows)["sure"].calibration_error == pytest.approx(0.4)
+    assert math.isnan(by_matcher(rows)["map"].calibration_error)
+
+
+def test_the_area_between_the_curves_is_that_of_the_mean_curves(rng):
+    scenes = [with_step(scene_of(rng, "a"), 27), with_step(scene_of(rng, "b"), 12)]
+    scores = score_pairs({"flat": certain(7.0, 0.5)}, scenes)
+    curves, row = scores.curves["flat"], by_matcher(scores.rows)["flat"]
+    np.testing.assert_allclose(curves.epe_px.kept, (10 + 2.5) / 2)
+    np.testing.assert_allclose(curves.bad1_percent.kept, 50)
+    assert row.ause_px == pytest.approx(curves.epe_px.ause)
+    assert row.ause_bad1_percent == pytest.approx(curves.bad1_percent.ause)
+    # With p dropped, the oracle keeps 100 (1/2 - p) / (1 - p) % bad ones; its integral is 50 (1 - ln 2).
+    assert row.ause_bad1_percent == pytest.approx(95 / 2 - 50 * (1 - math.log(2)), abs=0.02)
+
+
+def test_the_holes_of_a_map_are_its_least_confident_pixels_and_filled(rng):
+    def half():
+        def match(pair):
+            found_px = np.full(pair.left.shape[:2], 7, np.float32)
+            found_px[:, 30:70] = -1
+            return found_px
 
         return match
 
-    score_pairs({"a": noted("a"), "b": noted("b")}, [scene_of(rng)])
-    assert calls == ["a", "b"] * (1 + TURNS)
+    scene = scene_of(rng)
+    truth_px = scene.truth_px.copy()
+    truth_px[:, 30:70] = 12
+    scores = score_pairs({"half": half}, [Scene(name="a", pair=scene.pair, truth_px=truth_px)])
+    assert by_matcher(scores.rows)["half"].epe_px == pytest.approx(2)
+    assert scores.curves["half"].epe_px.kept[-1] == 0
 
 
-def test_sgbm_finds_the_disparity_of_random_dots_up_to_the_left_border(rng):
-    disparity_px = opencv_sgbm()(scene_of(rng).pair)
-    assert disparity_px.shape == (48, 100)
-    np.testing.assert_array_equal(disparity_px[:, 10:90], 7)
+def test_a_scene_without_known_disparity_has_no_part_in_the_means(rng):
+    scene = scene_of(rng)
+    unknown = Scene(name="unknown", pair=scene.pair, truth_px=np.full_like(scene.truth_px, np.nan))
+    scores = score_pairs({"eight": certain(8.0, 0.5)}, [unknown, scene])
+    assert math.isnan(by_matcher(scores.rows, "unknown")["eight"].calibration_error)
+    assert by_matcher(scores.rows)["eight"].epe_px == 1
+    np.testing.assert_array_equal(scores.curves["eight"].epe_px.kept, 1)
 
 
-def test_a_hole_takes_the_farther_of_its_neighbours_along_the_row():
-    holes = [[-1, -1, -1, -1], [-1, 5, -1, 3], [2, -1, 0, 9], [-1, -1, -1, -1]]
-    filled = [[-1, -1, -1, -1], [5, 5, 3, 3], [2, 2, 2, 9], [2, 2, 2, 9]]
-    np.testing.assert_array_equal(fill_rows(np.array(holes, np.float32)), filled)
+def test_no_scene_is_an_error():
+    with pytest.raises(StereoweaveError, match="expected at least one, found none"):
+        score_pairs({}, [])
+
+
+def test_a_model_that_is_none_is_an_error_before_any_scene_is_read():
+    with pytest.raises(MatcherError, match=r"none.onnx"):
+        score_pairs({"none": partial(network, "none.onnx")}, iter(lambda: pytest.fail("was read"), None))
+
+
+def test_memory_stands_in_the_rows_of_means_and_is_that_of_the_largest_pair(rng):
+    small, large = scene_of(rng), scene_of(rng)
+    wide = np.tile(large.pair.left, (1, 2, 1))
+    large = Scene(
+        name="large", pair=StereoPair(left=wide, right=wide), truth_px=np.ones((48, 200), np.float32)
+    )
+    scores = score_pairs({}, [small, large, small])
+    assert scores.largest is large.pair
+    rows = with_memory([row for row in scores.rows if row.matcher == "sgbm"], {}, scores.largest)
+    assert [math.isnan(row.memory_mb) for row in rows] == [True, True, True, False]
+    assert 0 < rows[-1].memory_mb < 100
 
 
 def test_a_csv_holds_every_row_under_a_header_and_the_machine(tmp_path, rng):
-    rows = score_pairs({"seven": constant(7.0)}, [scene_of(rng)])
+    rows = score_pairs({"seven": constant(7.0)}, [scene_of(rng)]).rows
     write_csv(tmp_path / "pairs.csv", rows)
     with (tmp_path / "pairs.csv").open(newline="") as file:
         read = list(csv.DictReader(file))
+    everyone = [*OPENCV_MATCHERS, "seven"]
     assert [(row["matcher"], row["scene"]) for row in read] == [
-        ("sgbm", "noise"),
-        ("seven", "noise"),
-        ("sgbm", "mean"),
-        ("seven", "mean"),
+        (name, scene) for scene in ("noise", "mean") for name in everyone
     ]
-    assert read[1]["epe_px"] == "0"
+    assert read[len(OPENCV_MATCHERS)]["epe_px"] == "0"
     assert float(read[0]["time_ms"]) == pytest.approx(rows[0].time_ms, abs=1e-4)
     assert int(read[0]["cores"]) >= 1
     assert read[0]["cpu"]
     assert list(tmp_path.iterdir()) == [tmp_path / "pairs.csv"]
-
-
-@pytest.mark.testdata
-def test_sgbm_is_set_and_filled_as_the_referee_does(testdata):
-    referee = runpy.run_path(str(testdata / "referee" / "score_pairs.py"))
-    theirs, ours = referee["sgbm"](0), opencv_sgbm()
-    for scene in read_scenes(testdata / "stereo" / "pairs"):
-        expected = theirs(scene.pair.left, scene.pair.right)
-        np.testing.assert_array_equal(ours(scene.pair), expected)
-        np.testing.assert_array_equal(fill_rows(expected), referee["fill_rows"](expected))
-
-
-@pytest.mark.testdata
-def test_holes_are_filled_as_the_referee_does_whatever_the_map(testdata, rng):
-    fill_rows_plain = runpy.run_path(str(testdata / "referee" / "score_pairs.py"))["fill_rows"]
-    for share in (0.0, 0.5, 0.95, 1.0):
-        holes = rng.uniform(0.1, 50, (40, 12)).astype(np.float32)
-        holes[rng.random(holes.shape) < share] = -1
-        np.testing.assert_array_equal(fill_rows(holes), fill_rows_plain(holes))

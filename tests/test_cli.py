@@ -14,6 +14,7 @@ import stereoweave
 from stereoweave.cli import main
 from stereoweave.io import read_image, read_pfm
 from stereoweave.matcher import shipped_models
+from stereoweave.opencv_matchers import OPENCV_MATCHERS
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 EXAMPLES = REPOSITORY / "examples"
@@ -259,6 +260,19 @@ def test_json_alone_is_on_stdout_and_names_the_files(pictures, capfd):
     assert summary["camera"]["baseline_m"] == 0.08
     assert all(Path(file).is_file() for file in summary["files"].values())
     assert len(summary["files"]) == 6
+    assert summary["notes"] == []
+
+
+@pytest.mark.parametrize("command", ["depth", "depth --json", "view"])
+def test_what_is_amiss_with_a_pair_is_part_of_what_is_printed(pictures, capfd, command):
+    Image.new("RGB", (96, 64)).save("black.png")
+    assert (
+        run(f"{command} black.png black.png --threads 1 -o {'out.png' if command == 'view' else 'out'}") == 0
+    )
+    printed, told = capfd.readouterr()
+    assert told == ""
+    notes = json.loads(printed)["notes"] if "--json" in command else printed.splitlines()
+    assert [note for note in notes if note.startswith("sure of only 0 % of the picture")] != []
 
 
 @pytest.mark.parametrize("disparity_px", [-3.0, 300.0])
@@ -296,7 +310,7 @@ def test_bench_scores_the_network_beside_sgbm(pictures, capfd):
     assert run("bench pairs scenes --model ten.onnx -o rows.csv") == 0
     with Path("rows.csv").open() as file:
         rows = {(row["matcher"], row["scene"]): row for row in csv.DictReader(file)}
-    assert set(rows) == {(name, scene) for name in ("sgbm", "ten.onnx") for scene in ("wall", "mean")}
+    assert set(rows) == {(name, scene) for name in (*OPENCV_MATCHERS, "ten.onnx") for scene in ("wall", "mean")}
     # 10 px found, 8 px true
     assert float(rows["ten.onnx", "wall"]["epe_px"]) == 2
     assert "ten.onnx" in capfd.readouterr().out
@@ -305,7 +319,7 @@ def test_bench_scores_the_network_beside_sgbm(pictures, capfd):
 def test_bench_takes_every_shipped_network_and_says_where_the_rows_are(mistakes, capfd):
     assert run("bench pairs scenes") == 0
     with Path("pairs.csv").open() as file:
-        assert {row["matcher"] for row in csv.DictReader(file)} == {"sgbm", *shipped_models()}
+        assert {row["matcher"] for row in csv.DictReader(file)} == {*OPENCV_MATCHERS, *shipped_models()}
     assert capfd.readouterr().out.endswith("rows: pairs.csv\n")
 
 
@@ -414,7 +428,7 @@ def test_bench_networks_takes_a_checkpoint_and_pairs_from_where_it_is_told(netwo
         ("bench speed words.toml -o rows.csv", ["words.toml", "expected a recipe"]),
         ("bench paper none.toml -o runs --report report", ["none.toml", "expected a recipe"]),
         ("bench paper low.toml -o runs --report report", ["low.toml", "exponent = 0.5", "at least 1"]),
-        (f"bench paper {RECIPE} -o runs --report report", ["weave_small", "expected 'fast_depth'"]),
+        (f"bench paper {RECIPE} -o runs --report report", ["small", "expected 'fast_depth'"]),
         (f"bench paper {RECIPE} -o runs", ["--report"]),
         (f"bench paper {RECIPE} -o runs --report report --seeds 0", ["--seeds"]),
         ("bench exponent words.toml -o runs --report report", ["words.toml", "expected a recipe"]),

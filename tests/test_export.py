@@ -171,7 +171,7 @@ def test_multiply_adds_are_those_of_layers_and_products():
 
 
 def test_multiply_adds_count_the_refinement_of_weavenet():
-    network, image = untrained(), torch.rand(1, 3, 16, 32)
+    network, image = untrained("weave_base"), torch.rand(1, 3, 16, 32)
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         network(image, image)
     # Both views at half the resolution compare 16 features with those of 6 columns.

@@ -126,3 +126,35 @@ def test_calibration_error_is_the_mean_gap_between_claim_and_outcome():
     happened = np.array([True, True, True, False, False, False])
     # Four claims of 0.95 came true 3 times in 4, two claims of 0.05 never: (4 * 0.20 + 2 * 0.05) / 6.
     assert metrics.calibration_error(probability, happened) == pytest.approx(0.15)
+
+
+def test_the_calibration_error_of_no_claim_is_nan():
+    assert math.isnan(metrics.calibration_error(np.ones(0), np.ones(0, bool)))
+
+
+def test_sparsification_gives_the_mean_error_of_what_is_kept():
+    error_px = np.array([1.0, 4.0, 2.0, 3.0])
+    best = metrics.sparsification(error_px, np.array([0.9, 0.1, 0.6, 0.5]))
+    worst = metrics.sparsification(error_px, np.array([-9.0, 3.0, 1.0, 2.0]))
+    # Of four pixels the first is dropped at 25 %, the second at 50 % and the third at 75 %.
+    times = [25, 25, 25, 21]
+    np.testing.assert_allclose(best.kept, np.repeat([2.5, 2, 1.5, 1], times))
+    np.testing.assert_allclose(worst.kept, np.repeat([2.5, 3, 3.5, 4], times))
+    np.testing.assert_allclose(best.oracle, best.kept)
+    np.testing.assert_allclose(worst.oracle, best.kept)
+    assert best.ause == 0
+    # The gap is 0, 1, 2 and 3 px; the trapezoids halve the first and the last.
+    assert worst.ause == pytest.approx((25 * 1 + 25 * 2 + 21 * 3 - 1.5) / 100)
+
+
+def test_pixels_of_equal_confidence_are_dropped_in_any_order():
+    error_px = np.array([5.0, 0.0, 1.0, 0.0])
+    curve = metrics.sparsification(error_px, np.array([-np.inf, 1.0, -np.inf, 2.0])).kept
+    np.testing.assert_allclose(curve, np.repeat([1.5, 1, 0, 0], [25, 25, 25, 21]))
+    np.testing.assert_allclose(metrics.sparsification(error_px, np.zeros(4)).kept, 1.5)
+
+
+def test_the_curve_of_no_pixel_is_nan():
+    nothing = metrics.sparsification(np.ones(0), np.ones(0))
+    assert np.isnan(nothing.kept).all()
+    assert math.isnan(nothing.ause)

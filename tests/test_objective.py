@@ -230,7 +230,7 @@ def test_a_loss_that_is_unknown_or_another_network_s_is_refused():
     for recipe, network, expected in (
         (replace(DISPARITY, loss="l3"), paper, ", ".join(LOSSES)),
         (replace(DISPARITY, loss="weave"), paper, f"{known} for model = 'fast_depth'"),
-        (replace(RECIPE, loss="l2"), weave, "weave for model = 'weave'"),
+        (replace(RECIPE, loss="l2"), weave, "weave for model = 'weave_small'"),
     ):
         message = complaint(objective_of, recipe, network)
         assert message == f"tiny: loss = {recipe.loss!r}, expected {expected}"

@@ -11,7 +11,7 @@ from stereoweave.learn.recipe import Recipe, read_recipe, recipe_from
 RECIPES = sorted((Path(__file__).parent.parent / "recipes").rglob("*.toml"))
 NEEDED = {
     "name": "x",
-    "model": "weave",
+    "model": "weave_small",
     "steps": 10,
     "batch": 4,
     "learning_rate": 1.0,
@@ -32,7 +32,7 @@ def test_there_are_shipped_recipes():
 def test_a_recipe_is_read_with_its_defaults(tmp_path):
     file = tmp_path / "x.toml"
     file.write_text(
-        'name = "x"\nmodel = "weave"\nsteps = 10\nbatch = 4\nlearning_rate = 1\nwarm_up_steps = 4\n'
+        'name = "x"\nmodel = "weave_small"\nsteps = 10\nbatch = 4\nlearning_rate = 1\nwarm_up_steps = 4\n'
         "cool_down_steps = 2\ncrop_size = [64, 96]\n"
     )
     assert read_recipe(file) == Recipe(**NEEDED, crop_size=(64, 96))
@@ -52,14 +52,6 @@ def test_a_mix_is_a_table_of_sets_and_weights_and_survives_being_a_dictionary(tm
     assert recipe_from(asdict(recipe), "here") == recipe
     # As a checkpoint's card keeps it.
     assert recipe_from(json.loads(json.dumps(asdict(recipe))), "here") == recipe
-
-
-def test_the_trainings_with_and_without_rendered_pairs_differ_in_them_alone():
-    alone, mixed = (
-        read_recipe(file) for file in RECIPES if file.stem in ("weave_small_collage", "weave_small_mix")
-    )
-    assert alone == replace(mixed, mix=())
-    assert dict(mixed.mix).keys() == {"collage", "runs/synth/rooms", "runs/synth/scenes"}
 
 
 def test_a_recipe_for_a_dataset_on_disk_is_bound_by_no_pair_size():

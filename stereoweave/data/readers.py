@@ -65,20 +65,39 @@ class Scene:
     truth_px: Float32[np.ndarray, "h w"]
 
 
-def read_scenes(folder: str | Path) -> Iterator[Scene]:
+def read_scenes(folder: str | Path, dataset: str | None = None) -> Iterator[Scene]:
     """The scenes of `folder` by name, each read when its turn comes.
 
     A scene is a folder of left.png, right.png, disparity.png (16 bit, pixels * 256, 0 = unknown) or
-    disparity.pfm (NaN or infinity = unknown), and, where the camera is known, Middlebury's calib.txt.
+    disparity.pfm (NaN or infinity = unknown), and, where the camera is known, Middlebury's calib.txt. Where
+    there is none, the pairs of all rendered sets (`stereoweave synth make`) in the folder are the scenes.
+
+    Args:
+        folder: Of the scenes.
+        dataset: The name of a dataset in `DATASETS` whose frames are the scenes instead.
 
     Raises:
-        StereoweaveError: No scene in the folder.
+        StereoweaveError: No scene in the folder, or as for `open_dataset`.
         FormatError: A file is missing, damaged, or of another size than its neighbours.
     """
+    if dataset:
+        return map(_frame_scene, open_dataset(dataset, folder))
     scenes = sorted(left.parent for left in Path(folder).glob("*/left.png"))
-    if not scenes:
-        raise StereoweaveError(f"{folder}: expected <scene>/left.png below it, found none")
-    return map(_read_scene, scenes)
+    if scenes:
+        return map(_read_scene, scenes)
+    frames = shards.shards(Path(folder))
+    if not frames:
+        raise StereoweaveError(
+            f"{folder}: expected <scene>/left.png below it, found none, and no rendered set; "
+            "a dataset has to be named"
+        )
+    return map(_frame_scene, frames)
+
+
+def _frame_scene(frame: Frame) -> Scene:
+    sample = frame.read()
+    pair = StereoPair(left=sample.left, right=sample.right, camera=sample.camera)
+    return Scene(name=frame.name, pair=pair, truth_px=sample.disparity_px)
 
 
 def _read_scene(folder: Path) -> Scene:

@@ -4,7 +4,7 @@ import csv
 import hashlib
 import os
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from stereoweave.learn.sources import Photographed, Source, kept, sources
 from stereoweave.learn.train import train_recipe
 from stereoweave.learn.trials import Trial
 from stereoweave.learn.validate import validate
+from stereoweave.view_benchmark import Method
 
 BASE = "base"
 MIX = ((COLLAGE, 0.55), ("runs/synth/rooms", 0.33), ("runs/synth/scenes", 0.12))
@@ -53,6 +54,8 @@ VARIATIONS: dict[str, dict[str, dict[str, Any]]] = {
     "projection loss": {"projection": {"alpha_p": 100.0}},
     "mix of data": {"mix": {"mix": MIX}},
 }
+
+_CPU = torch.device("cpu")
 
 
 def plan(base: Recipe, seeds: int) -> list[Trial]:
@@ -98,7 +101,7 @@ def run_ablations(
         trained = checkpoint.load(train_recipe(trial.recipe, runs / trial.recipe.name, console))
         _, collages = sources(trial.recipe, runs / "pairs")
         held_out = {"collage": collages, "rendered": rendered_pairs}
-        rows[i] = {key: _text(value) for key, value in _row(trial, trained, held_out)}
+        rows[i] = {key: _text(value) for key, value in _row(trial, trained, held_out).items()}
         _write(report, [rows[j] for j in sorted(rows)])
         console.print(f"{trial.recipe.name}: {len(rows)} of {len(planned)}")
 
@@ -108,43 +111,47 @@ def fingerprint(recipe: Recipe) -> str:
     return hashlib.sha256(repr(replace(recipe, name="")).encode()).hexdigest()[:8]
 
 
-def _row(trial: Trial, trained: Checkpoint, held_out: dict[str, Source]) -> Iterator[tuple[str, Any]]:
-    recipe, network = trained.recipe, network_of(trained.recipe)
-    changes = VARIATIONS[trial.claim][trial.setting]
-    yield "choice", trial.claim
-    yield "variation", trial.setting
-    yield "seed", recipe.seed
-    yield "changes", ", ".join(f"{key} = {value}" for key, value in changes.items())
-    yield "fingerprint", fingerprint(trial.recipe)
-    yield "commit", trained.commit
-    yield "machine", f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}, {os.cpu_count()} cores"
-    yield "steps", trained.step
-    yield "pairs_seen", trained.step * recipe.batch
-    yield "hours", trained.hours
-    yield "parameters", sum(parameter.numel() for parameter in network.parameters())
-    yield "multiply_adds", multiply_adds(network.eval())
-    for name, pairs in held_out.items():
-        for score, value in _scores(trained, pairs).items():
-            yield f"{name}_{score}", value
-
-
-def _scores(trained: Checkpoint, pairs: Source) -> dict[str, float]:
-    """Those of every validation, and the means of those near depth edges."""
-    network, match = network_of(trained.recipe), method_of(trained)
+def _row(trial: Trial, trained: Checkpoint, held_out: dict[str, Source]) -> dict[str, object]:
+    network = network_of(trained.recipe)
     network.load_state_dict(trained.averaged)
-    near = []
+    network.eval()
+    changes = VARIATIONS[trial.claim][trial.setting]
+    scores = {
+        f"{pairs}_{name}": value
+        for pairs, source in held_out.items()
+        for name, value in (validate(network, source, _CPU) | _near_edges(method_of(trained), source)).items()
+    }
+    return {
+        "choice": trial.claim,
+        "variation": trial.setting,
+        "seed": trained.recipe.seed,
+        "changes": ", ".join(f"{key} = {value}" for key, value in changes.items()),
+        "fingerprint": fingerprint(trial.recipe),
+        "commit": trained.commit,
+        "machine": f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}, {os.cpu_count()} cores",
+        "steps": trained.step,
+        "pairs_seen": trained.step * trained.recipe.batch,
+        "hours": trained.hours,
+        "parameters": sum(parameter.numel() for parameter in network.parameters()),
+        "multiply_adds": multiply_adds(network),
+        **scores,
+    }
+
+
+def _near_edges(match: Method, pairs: Source) -> dict[str, float]:
+    """Means over the pairs, of which one without a depth edge does not count."""
+    rows = []
     for index in range(pairs.count):
         sample = pairs[index]
         found_px, truth_px = match(sample), sample.disparity_px
-        near.append(
+        rows.append(
             {
                 "edge_epe_px": edge_epe_px(found_px, truth_px),
                 "edge_bad1_percent": edge_bad_percent(found_px, truth_px, 1),
                 "flying_percent": flying_percent(found_px, truth_px),
             }
         )
-    edges = {name: float(np.nanmean([scores[name] for scores in near])) for name in near[0]}
-    return validate(network, pairs, torch.device("cpu")) | edges
+    return {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}
 
 
 def _text(value: object) -> str:

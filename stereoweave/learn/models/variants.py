@@ -25,13 +25,13 @@ from stereoweave.learn.models.weave import (
 )
 
 
-def upsample_bilinear(x: Float[Tensor, "b 1 h w"], _weights: Tensor) -> Float[Tensor, "b 1 h2 w2"]:
+def upsample_bilinear(x: Float[Tensor, "b 1 h w"], weights: Tensor) -> Float[Tensor, "b 1 h2 w2"]:
     """Twice the size, whatever the weights."""
     return F.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
 
 
 def soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
-    """Expected level under a softmax over all levels; at an edge between its two sides (Kendall et al. 2017)."""
+    """Expected level under a softmax over all levels (Kendall et al. 2017); at an edge between its sides."""
     levels = torch.arange(logits.shape[1], device=logits.device).view(1, -1, 1, 1)
     return (logits.softmax(1) * levels).sum(1, keepdim=True)
 
@@ -44,8 +44,8 @@ class Bilinear(WeaveNet):
     def __init__(self) -> None:
         super().__init__()
         # Nothing computes the weights that nothing reads.
-        self.weights = nn.Identity()
-        self.refinement.weights = nn.Identity()
+        self.register_module("weights", nn.Identity())
+        self.refinement.register_module("weights", nn.Identity())
 
 
 class AllLevels(WeaveNet):
@@ -84,7 +84,7 @@ class EighthAggregation(Aggregation):
     def __init__(self, levels: int) -> None:
         super().__init__(levels, SMALL)
         _, quarter, eighth, _ = SMALL.channels
-        self.down = ConvBlock(levels, eighth)
+        self.register_module("down", ConvBlock(levels, eighth))
         self.join = ConvBlock(SMALL.bottleneck + quarter, 32, kernel=1)
         self.scores = nn.Conv2d(32, levels, 2, stride=2)
 
@@ -129,7 +129,7 @@ class WithoutContext(WeaveNet):
 
     def __init__(self) -> None:
         super().__init__()
-        self.aggregation.context = NoContext()
+        self.aggregation.register_module("context", NoContext())
 
 
 VARIANTS: dict[str, Callable[[], WeaveNet]] = {

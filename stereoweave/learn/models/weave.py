@@ -105,7 +105,6 @@ class Stages:
     Attributes:
         correlation: raw matching scores a level of 4 px at 1/4 resolution [2B, D, H/4, W/4].
         scores: the same after aggregation.
-        quarter_px: disparity read from `scores`, at 1/4 resolution, in pixels of the full one.
         coarse_px: disparity before the refinement, at half resolution, in pixels of the full one.
         disparity_px: the final one [2B, 1, H, W].
         confidence_logit: log odds of being within 1 px [2B, 1, H, W].
@@ -113,7 +112,6 @@ class Stages:
 
     correlation: Float[Tensor, "b d h_d w_d"]
     scores: Float[Tensor, "b d h_d w_d"]
-    quarter_px: Float[Tensor, "b 1 h4 w4"]
     coarse_px: Float[Tensor, "b 1 h2 w2"]
     disparity_px: Float[Tensor, "b 1 h w"]
     confidence_logit: Float[Tensor, "b 1 h w"]
@@ -308,7 +306,6 @@ class WeaveNet(nn.Module):
         return Stages(
             correlation=correlation,
             scores=scores,
-            quarter_px=quarter * 4,
             coarse_px=coarse * 2,
             disparity_px=self.upsample(fine * 2, weights.float()),
             confidence_logit=confidence.float(),

@@ -1,0 +1,109 @@
+"""OpenCV's matchers, set as its sample sets them, and their maps filled and checked as their users do."""
+
+from collections.abc import Callable
+from functools import partial
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from stereoweave.stereo import StereoPair
+
+MapMatch = Callable[[StereoPair], Float32[np.ndarray, "h w"]]
+"""A pair to the disparity in px of its left view [H, W]; values <= 0 are holes."""
+
+SGBM = "sgbm"
+DISPARITIES = 192
+
+
+def _sgbm(mode: int) -> MapMatch:
+    """The semi-global matcher over 192 disparities.
+
+    Source of the settings: OpenCV's sample stereo_match.cpp at a block size of 5 (P1 = 8*3*5*5,
+    P2 = 32*3*5*5), with the speckle range of 2 that StereoSGBM's documentation recommends; the sample has 32.
+    """
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=0,
+        numDisparities=DISPARITIES,
+        blockSize=5,
+        P1=600,
+        P2=2400,
+        disp12MaxDiff=1,
+        preFilterCap=63,
+        uniquenessRatio=10,
+        speckleWindowSize=100,
+        speckleRange=2,
+        mode=mode,
+    )
+    return lambda pair: _with_room(matcher, pair.left, pair.right)
+
+
+def _bm() -> MapMatch:
+    """The block matcher over 192 disparities, set as in the same sample, with the same speckle range."""
+    matcher = cv2.StereoBM.create(numDisparities=DISPARITIES, blockSize=9)
+    matcher.setPreFilterCap(31)
+    matcher.setTextureThreshold(10)
+    matcher.setUniquenessRatio(15)
+    matcher.setDisp12MaxDiff(1)
+    matcher.setSpeckleWindowSize(100)
+    matcher.setSpeckleRange(2)
+    return lambda pair: _with_room(
+        matcher, *(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (pair.left, pair.right))
+    )
+
+
+OPENCV_MATCHERS: dict[str, Callable[[], MapMatch]] = {
+    SGBM: partial(_sgbm, cv2.STEREO_SGBM_MODE_SGBM),
+    "sgbm_8_paths": partial(_sgbm, cv2.STEREO_SGBM_MODE_HH),
+    "sgbm_3_way": partial(_sgbm, cv2.STEREO_SGBM_MODE_SGBM_3WAY),
+    "bm": _bm,
+}
+"""What makes each of them."""
+
+
+def fill_rows(disparity_px: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """The map with each hole (<= 0) filled from the farther of its known neighbours along the row.
+
+    A row without any takes the one above; above the first row that has some, holes stay.
+    """
+    known = disparity_px > 0
+    occupied = known.max(axis=1)
+    farther_px = np.minimum(
+        _last_known(disparity_px, known), _last_known(disparity_px[:, ::-1], known[:, ::-1])[:, ::-1]
+    )
+    filled_px = np.where(known | ~occupied[:, None], disparity_px, farther_px)
+    return filled_px[np.maximum.accumulate(np.where(occupied, np.arange(len(known)), 0))]
+
+
+def left_right_confidence(
+    disparity_px: Float32[np.ndarray, "h w"], right_disparity_px: Float32[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w"]:
+    """How little the two views' disparities disagree at a pixel and its match: 0 px at best, else negative.
+
+    It orders pixels, and is no probability. Minus infinity where either is a hole (<= 0), or the match lies
+    outside of the right view.
+    """
+    width = disparity_px.shape[1]
+    matches = np.rint(np.arange(width) - disparity_px).astype(int)
+    seen_px = np.take_along_axis(right_disparity_px, matches.clip(0, width - 1), axis=1)
+    known = (disparity_px > 0) & (seen_px > 0) & (matches >= 0)
+    return np.where(known, -np.abs(disparity_px - seen_px), np.float32(-np.inf))
+
+
+def _with_room(
+    matcher: cv2.StereoMatcher, left: UInt8[np.ndarray, "h w *c"], right: UInt8[np.ndarray, "h w *c"]
+) -> Float32[np.ndarray, "h w"]:
+    # OpenCV gives no answer in the first 192 columns: a border gives them that room.
+    left, right = (
+        cv2.copyMakeBorder(image, 0, 0, DISPARITIES, 0, cv2.BORDER_REPLICATE) for image in (left, right)
+    )
+    return matcher.compute(left, right)[:, DISPARITIES:].astype(np.float32) / 16
+
+
+def _last_known(
+    values: Float32[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w"]:
+    """At each pixel the nearest known value at or before it in the row; infinity where there is none."""
+    columns = np.maximum.accumulate(np.where(known, np.arange(values.shape[1]), -1), axis=1)
+    last = np.take_along_axis(values, np.maximum(columns, 0), axis=1)
+    return np.where(columns >= 0, last, np.float32(np.inf))
