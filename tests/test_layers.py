@@ -14,6 +14,8 @@ from stereoweave.learn.models.layers import (
     mirrored,
     nearby_matches,
     upsample_convex,
+    upsample_to_a_side,
+    warped_matches,
 )
 
 
@@ -48,6 +50,23 @@ def nearby_matches_plain(first, second, disparity, radius):
     return matches
 
 
+def warped_matches_plain(first, second, disparity, radius):
+    batch, _, height, width = first.shape
+    warped, matches = torch.zeros(second.shape), torch.zeros(batch, 2 * radius + 1, height, width)
+    for b in range(batch):
+        for y in range(height):
+            for x in range(width):
+                column = min(max(x - float(disparity[b, 0, y, x]), 0), width - 1)
+                before, share = math.floor(column), column - math.floor(column)
+                after = min(before + 1, width - 1)
+                warped[b, :, y, x] = (1 - share) * second[b, :, y, before] + share * second[b, :, y, after]
+            for x in range(width):
+                for k in range(-radius, radius + 1):
+                    if 0 <= x - k < width:
+                        matches[b, k + radius, y, x] = first[b, :, y, x] @ warped[b, :, y, x - k]
+    return matches
+
+
 def scores(levels, **likelihood):
     """One pixel's scores: the logarithm of a likelihood at the levels named, hardly anything elsewhere."""
     logits = torch.full((1, levels, 1, 1), -30.0)
@@ -56,9 +75,10 @@ def scores(levels, **likelihood):
     return logits
 
 
+@pytest.mark.parametrize("width", [4, 9, 12])
 @pytest.mark.parametrize("levels", [1, 4, 9, 13])
-def test_the_fast_correlation_equals_the_plain_one(levels):
-    first, second = torch.randn(2, 2, 5, 3, 9)
+def test_the_fast_correlation_equals_the_plain_one(levels, width):
+    first, second = torch.randn(2, 2, 5, 3, width)
     expected = correlation_volume_plain(first, second, levels)
     torch.testing.assert_close(correlation_volume(first, second, levels), expected)
 
@@ -83,6 +103,22 @@ def test_nearby_matches_at_whole_disparities_are_those_of_the_correlation_volume
     volume = correlation_volume(first, second, 7)
     found = nearby_matches(first, second, torch.full((1, 1, 2, 12), 4.0), radius=2)
     torch.testing.assert_close(found[..., 6:], volume[:, 2:7, :, 6:])
+
+
+@pytest.mark.parametrize("radius", [1, 2])
+def test_warped_matches_equal_the_plain_loop_between_columns_and_beyond_the_borders(radius):
+    first, second = torch.randn(2, 2, 4, 2, 7)
+    disparity = torch.tensor([0.0, 1.25, 2.5, -1.75, 5.999, 100.3, -40.5]).expand(2, 1, 2, 7)
+    expected = warped_matches_plain(first, second, disparity, radius)
+    torch.testing.assert_close(warped_matches(first, second, disparity, radius), expected)
+
+
+@pytest.mark.parametrize("matches", [nearby_matches, warped_matches])
+def test_columns_are_found_as_well_in_bfloat16_which_cannot_count_them(matches):
+    first, second = torch.randn(2, 1, 4, 1, 600).bfloat16()
+    disparity = torch.full((1, 1, 1, 600), 3.0, dtype=torch.bfloat16)
+    expected = matches(first.float(), second.float(), disparity.float(), 1)
+    torch.testing.assert_close(matches(first, second, disparity, 1).float(), expected, atol=0.1, rtol=0.02)
 
 
 def test_the_expected_step_is_the_mean_of_the_steps():
@@ -175,3 +211,26 @@ def test_a_residual_of_nothing_is_its_input():
     nn.init.zeros_(residual.second[0].weight)
     x = torch.rand(1, 3, 5, 5)
     torch.testing.assert_close(residual(x), x)
+
+
+def upsampled_corner(upsample, neighbours, logits):
+    """The first of the four new pixels of the middle one of 3x3 old ones, each with its weight."""
+    x = torch.tensor(neighbours).view(1, 1, 3, 3)
+    weights = torch.tensor(logits).view(1, 9, 1, 1, 1).expand(1, 9, 4, 3, 3).reshape(1, 36, 3, 3)
+    return upsample(x, weights)[0, 0, 2, 2].item()
+
+
+def test_a_mixture_of_two_surfaces_becomes_the_one_that_has_more_of_it():
+    surfaces = [10.0, 10.0, 50.0, 11.0, 10.0, 50.0, 10.0, 10.0, 50.0]
+    six_of_nine = upsampled_corner(upsample_to_a_side, surfaces, [0.0] * 9)
+    assert six_of_nine == pytest.approx(61 / 6, abs=1e-3)
+    three_that_count = upsampled_corner(upsample_to_a_side, surfaces, [-3.0, -3.0, 3.0] * 3)
+    assert three_that_count == pytest.approx(50, abs=1e-3)
+    assert upsampled_corner(upsample_convex, surfaces, [0.0] * 9) == pytest.approx(211 / 9, abs=1e-3)
+
+
+def test_a_slanted_surface_is_mixed_as_ever():
+    slant = [float(i) / 2 for i in range(9)]
+    logits = torch.linspace(-1, 1, 9).tolist()
+    mixed = upsampled_corner(upsample_convex, slant, logits)
+    assert upsampled_corner(upsample_to_a_side, [s / 2 for s in slant], logits) == pytest.approx(mixed / 2)

@@ -1,9 +1,15 @@
 """What the networks share: convolution blocks, correlation, soft-argmax, guided upsampling."""
 
+from itertools import pairwise
+
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
+
+# Of the columns of a correlation. Where images' sides are multiples of 16 and it is at 1/4, four divide every
+# width: an exported graph pads nothing, and has as many matrix products whatever the width is.
+_BLOCKS = 4
 
 
 class ConvBlock(nn.Sequential):
@@ -82,15 +88,30 @@ def correlation_volume(
 ) -> Float[Tensor, "b d h w"]:
     """How well column x of `first` agrees with column x - d of `second`, for d = 0 .. levels - 1; 0 outside.
 
-    One matrix product a row compares all columns with all columns; reading its result with rows one element
-    shorter turns the diagonals that are wanted into columns. Plain reference: `correlation_volume_plain` in
+    A matrix product a row compares the columns of a quarter of the width with all that they can meet: at
+    640x480 half of the work of comparing all with all. Plain reference: `correlation_volume_plain` in
     tests/test_layers.py.
     """
     width = first.shape[3]
-    products = first.permute(0, 2, 3, 1) @ mirrored(second).permute(0, 2, 1, 3)
-    padded = F.pad(products, (0, levels))
-    skewed = torch.unflatten(padded.flatten(2)[..., width - 1 : -1], 2, (width, width + levels - 1))
-    return skewed[..., :levels].permute(0, 3, 1, 2)
+    if behind := -width % _BLOCKS:
+        return correlation_volume(F.pad(first, (0, behind)), F.pad(second, (0, behind)), levels)[..., :width]
+    block = width // _BLOCKS
+    columns = first.permute(0, 2, 3, 1)
+    # Column x - d is column x - d + levels - 1 of these.
+    others = F.pad(second, (levels - 1, 0)).permute(0, 2, 1, 3)
+    starts = [i * block for i in range(_BLOCKS)]
+    products = [columns[:, :, x : x + block] @ others[..., x : x + block + levels - 1] for x in starts]
+    volume = torch.cat([_diagonals(product, levels) for product in products], 2)
+    return volume.permute(0, 3, 1, 2).flip(1)
+
+
+def _diagonals(products: Float[Tensor, "b h n m"], levels: int) -> Float[Tensor, "b h n d"]:
+    """products[..., i, i + e] at [..., i, e], for e = 0 .. levels - 1 = m - n.
+
+    Read with rows one element longer, the diagonals are columns.
+    """
+    rows = products.shape[2]
+    return F.pad(products.flatten(2), (0, rows)).unflatten(2, (rows, rows + levels))[..., :levels]
 
 
 def local_soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
@@ -131,21 +152,20 @@ def nearby_matches(
 ) -> Float[Tensor, "b k h w"]:
     """Correlation of column x of `first` with column x - disparity - k of `second`, k = -radius .. radius.
 
-    Between two columns it is interpolated; columns outside the map count as its border.
+    Between two columns it is interpolated; columns outside the map count as its border. One column at a
+    time: what is looked up for it stays in the processor's cache until it is summed.
     """
     batch, channels, height, width = first.shape
     whole = disparity.detach().floor()
-    steps = torch.arange(-radius, radius + 2, device=first.device)
-    columns = torch.arange(width, device=first.device).view(1, 1, width, 1)
-    rows = torch.arange(batch * height, device=first.device).view(batch, height, 1, 1)
-    matched = columns - whole.long().view(batch, height, width, 1) - steps
-    # One row of `pixels` is one pixel's features, so that looking one up is one contiguous copy.
-    pixels = second.permute(0, 2, 3, 1).reshape(-1, channels)
-    found = pixels.index_select(0, (matched.clamp(0, width - 1) + rows * width).view(-1))
-    found = found.view(batch, height, width, 2 * radius + 2, channels)
-    matches = (found * first.permute(0, 2, 3, 1).unsqueeze(3)).sum(4).permute(0, 3, 1, 2)
+    # float32: bfloat16 cannot count a map's columns.
+    columns = torch.arange(width, dtype=torch.float32, device=first.device) - whole
+    left, pixels = _pixels(first), _pixels(second)
+    products = []
+    for step in range(-radius, radius + 2):
+        found = pixels.index_select(0, _places((columns - step).clamp(0, width - 1)))
+        products.append((left * found).sum(1).view(batch, 1, height, width))
     between = disparity.detach() - whole
-    return matches[:, :-1] + between * (matches[:, 1:] - matches[:, :-1])
+    return torch.cat([near + between * (far - near) for near, far in pairwise(products)], 1)
 
 
 def warped_matches(
@@ -154,26 +174,36 @@ def warped_matches(
     disparity: Float[Tensor, "b 1 h w"],
     radius: int,
 ) -> Float[Tensor, "b k h w"]:
-    """Correlation of column x of `first` with column x - k of `second` warped by `disparity`, k = -radius .. radius.
+    """Correlation of column x of `first` with column x - k of the warped `second`, k = -radius .. radius.
 
-    Where the surface is smooth this is `nearby_matches` at a third of its cost: two columns are looked up
-    for each pixel, whatever the radius. Columns outside the map count as its border; beyond the warped map
-    there is nothing, 0.
+    `disparity` warps it. Where the surface is smooth this is `nearby_matches`, and costs less: two columns
+    are looked up for each pixel, whatever the radius. Columns outside the map count as its border; beyond
+    the warped map there is nothing, 0.
     """
     batch, channels, height, width = first.shape
-    columns = torch.arange(width, device=first.device).view(1, 1, 1, width) - disparity.detach()
-    below = columns.clamp(0, width - 1).floor().clamp(max=width - 2)
-    between = (columns.clamp(0, width - 1) - below).view(batch, height, width, 1)
-    rows = torch.arange(batch * height, dtype=torch.int32, device=first.device) * width
-    places = (below.to(torch.int32) + rows.view(batch, 1, height, 1)).view(-1)
-    # One row of `pixels` is one pixel's features, so that looking one up is one contiguous copy.
-    pixels = second.permute(0, 2, 3, 1).reshape(-1, channels)
-    low, high = (pixels.index_select(0, places + i).view(batch, height, width, channels) for i in (0, 1))
-    warped = F.pad(low + between * (high - low), (0, 0, radius, radius))
+    columns = torch.arange(width, dtype=torch.float32, device=first.device) - disparity.detach()
+    columns = columns.clamp(0, width - 1)
+    below = columns.floor().clamp(0, width - 2)
+    places = _places(below)
+    pixels = _pixels(second)
+    low, high = pixels.index_select(0, places), pixels.index_select(0, places + 1)
+    warped = low + (columns - below).view(-1, 1) * (high - low)
+    warped = F.pad(warped.view(batch, height, width, channels), (0, 0, radius, radius))
     left = first.permute(0, 2, 3, 1)
     steps = range(2 * radius, -1, -1)
-    matches = [(left * warped[:, :, step : step + width]).sum(3, keepdim=True) for step in steps]
-    return torch.cat(matches, 3).permute(0, 3, 1, 2)
+    return torch.cat([(left * warped[:, :, x : x + width]).sum(3).unsqueeze(1) for x in steps], 1)
+
+
+def _pixels(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "n c"]:
+    """A pixel's features a row, so that looking one up is one contiguous copy."""
+    return x.permute(0, 2, 3, 1).reshape(-1, x.shape[1])
+
+
+def _places(columns: Float[Tensor, "b 1 h w"]) -> Int64[Tensor, " n"]:
+    """The rows of `_pixels` that hold these whole columns, each of its own line and image."""
+    batch, _, height, width = columns.shape
+    lines = torch.arange(batch * height, device=columns.device).view(batch, 1, height, 1)
+    return (columns.long() + lines * width).view(-1)
 
 
 def upsample_convex(
@@ -187,6 +217,33 @@ def upsample_convex(
 
     Deviation: shares of sigmoids; RAFT's softmax costs ONNX Runtime more than all convolutions.
     """
+    neighbours, shares = _mixture(x, weights)
+    return F.pixel_shuffle((shares * neighbours).sum(1) / shares.sum(1), 2)
+
+
+def upsample_to_a_side(
+    x: Float[Tensor, "b 1 h w"], weights: Float[Tensor, "b k h w"], step: float = 2.0
+) -> Float[Tensor, "b 1 h2 w2"]:
+    """As `upsample_convex`, but a mixture of two sides becomes the side that has more of it.
+
+    The sides are the neighbours above and below the mixture; they are two surfaces where their means are
+    more than `step` apart. The mean of two surfaces is on neither, and would fly between them. Not for training:
+    a side that is wrong gets no gradient towards the other.
+    """
+    neighbours, shares = _mixture(x, weights)
+    share, total = shares.sum(1), (shares * neighbours).sum(1)
+    mixed = total / share
+    above = shares * (neighbours > mixed.unsqueeze(1))
+    share_above, total_above = above.sum(1), (above * neighbours).sum(1)
+    # 1e-6: where all neighbours are equal none is above, and rounding may leave none below.
+    mean_above = total_above / (share_above + 1e-6)
+    mean_below = (total - total_above) / (share - share_above + 1e-6)
+    side = torch.where(2 * share_above > share, mean_above, mean_below)
+    return F.pixel_shuffle(torch.where(mean_above - mean_below > step, side, mixed), 2)
+
+
+def _mixture(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Old pixels around each new one and their shares, [B, 9, 4, H, W] (neighbours [B, 9, 1, H, W]) or 4 of 9."""
     batch, channels, height, width = weights.shape
     around = F.pad(x, (1, 1, 1, 1), mode="replicate")
     shifted = [around[:, :, dy : dy + height, dx : dx + width] for dy in range(3) for dx in range(3)]
@@ -197,10 +254,8 @@ def upsample_convex(
         corners = [(0, 0), (0, 1), (1, 0), (1, 1)]
         neighbours = torch.cat([shifted[3 * (i + a) + j + b] for a, b in corners for i, j in corners], 1)
         neighbours = neighbours.view(batch, 4, 4, height, width)
-    shares = weights.contiguous().view(batch, channels // 4, 4, height, width).sigmoid()
     # 1e-4: where all are refused, no division by zero, and still a mixture of nothing but neighbours.
-    mixed = ((shares + 1e-4) * neighbours).sum(1) / (shares + 1e-4).sum(1)
-    return F.pixel_shuffle(mixed, 2)
+    return neighbours, weights.contiguous().view(batch, channels // 4, 4, height, width).sigmoid() + 1e-4
 
 
 def pad_to_multiple(image: Float[Tensor, "b c h w"], multiple: int) -> Float[Tensor, "b c h2 w2"]:

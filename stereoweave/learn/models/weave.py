@@ -24,6 +24,7 @@ from stereoweave.learn.models.layers import (
     mirrored,
     nearby_matches,
     upsample_convex,
+    upsample_to_a_side,
     warped_matches,
 )
 
@@ -266,7 +267,6 @@ class WeaveNet(nn.Module):
     """
 
     multiple_of = 16
-    upsample = staticmethod(upsample_convex)
 
     def __init__(self, size: Size = SMALL, levels: int = 48) -> None:
         super().__init__()
@@ -324,6 +324,10 @@ class WeaveNet(nn.Module):
             as_left_view(match, batch), as_other_view(match, batch), self.levels
         )
         return correlation, *self.aggregation(correlation, first)
+
+    def upsample(self, x: Tensor, weights: Tensor) -> Tensor:
+        """Twice the size, guided by weights; in use sharper than in training, which needs the gradient."""
+        return upsample_convex(x, weights) if self.training else upsample_to_a_side(x, weights)
 
     def read(self, scores: Tensor, decoded: Tensor) -> Tensor:
         """Disparity in pixels of 1/4 resolution; scores that are coarser need the decoder's features too."""
