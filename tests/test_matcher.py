@@ -98,18 +98,49 @@ def test_a_nearer_surface_and_the_left_border_occlude(both_views):
     np.testing.assert_array_equal(found.occluded, expected)
 
 
-def test_confidence_is_the_probability_of_the_logit(tmp_path):
+def test_confidence_is_the_probability_of_the_logit(tmp_path, rng):
     nodes = red_of("left", "disparity_px") + red_of("right", "confidence_logit")
     file = matcher_file(tmp_path / "sure.onnx", nodes, ["disparity_px", "confidence_logit"])
-    found = Matcher(file).estimate(painted(np.full((32, 32), 3)), painted(np.full((32, 32), 2)))
-    np.testing.assert_allclose(found.confidence, 1 / (1 + np.exp(-2.0)), rtol=1e-5)
+    left, right = painted(np.full((32, 32), 3)), painted(np.full((32, 32), 3))
+    left[:, :, 1] = rng.integers(0, 256, (32, 32))  # a plain picture has no confidence
+    found = Matcher(file).estimate(left, right)
+    np.testing.assert_allclose(found.confidence, 1 / (1 + np.exp(-3.0)), rtol=1e-5)
 
 
 def test_the_confidence_of_a_logit_beyond_what_float32_can_raise_is_0_or_1():
     logit = np.array([[-200, -89, 0, 89, 200]], np.float32)
-    found = matcher._confidence(logit, np.zeros((1, 5), np.float32))
+    nowhere = np.zeros((1, 5), bool)
+    found = matcher._confidence(logit, np.zeros((1, 5), np.float32), ~nowhere, nowhere)
     np.testing.assert_allclose(found, [[0, 0, 0.5, 1, 1]], atol=1e-30)
     assert found.dtype == np.float32
+
+
+def test_confidence_halves_where_the_right_view_sees_farther_than_the_match_and_is_0_where_all_is_plain():
+    # Even odds everywhere; at the first two matches and at the last, which lies outside of the right picture,
+    # the right view's disparity is lower by more than 1 px.
+    disagreement_px = np.array([[-3, -1.5, -1, 0, 5, 0, -3]], np.float32)
+    inside = np.array([[True, True, True, True, True, True, False]])
+    plain = np.array([[False, False, False, False, False, True, False]])
+    found = matcher._confidence(np.zeros((1, 7), np.float32), disagreement_px, inside, plain)
+    np.testing.assert_array_equal(found, [[0.25, 0.25, 0.5, 0.5, 0.5, 0, 0.5]])
+
+
+def test_without_a_logit_confidence_is_what_the_disagreement_suggests():
+    disagreement_px = np.log(np.array([[0.5, 1, 2, 1]], np.float32))
+    plain = np.array([[False, False, False, True]])
+    found = matcher._confidence(None, disagreement_px, np.ones((1, 4), bool), plain)
+    np.testing.assert_allclose(found, [[0.5, 1, 0.5, 0]], rtol=1e-6)
+
+
+def test_plain_is_what_has_nothing_to_match_by_within_32_px():
+    # Columns 0 to 99 are grey but for the rounding of 2 levels; a board of another grey begins at column 100.
+    image = painted(np.full((40, 140), 90))
+    image[::2, ::3] += 2
+    image[:, 100:] = 93
+    expected = np.zeros((40, 140), bool)
+    expected[:, :68] = True
+    expected[:, 132:] = True  # 32 px right of column 99 the board is all there is
+    np.testing.assert_array_equal(matcher._plain(image), expected)
 
 
 def test_strips_put_together_are_the_whole(tmp_path, rng, monkeypatch):
@@ -192,9 +223,11 @@ def test_the_order_of_the_inputs_is_free(tmp_path, rng):
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("multiple_of", "0"), ("multiple_of", "1.5"), ("max_disparity_px", "far")]
+    ("key", "value"),
+    [("multiple_of", "0"), ("multiple_of", "1.5")]
+    + [("max_disparity_px", value) for value in ("far", "nan", "inf", "-192", "0")],
 )
-def test_metadata_that_is_no_number_is_refused(tmp_path, key, value):
+def test_metadata_that_is_no_possible_number_is_refused(tmp_path, key, value):
     nodes = red_of("left", "disparity_px")
     file = matcher_file(tmp_path / "odd.onnx", nodes, ["disparity_px"], PROPERTIES | {key: value})
     with pytest.raises(sw.MatcherError, match=rf"odd\.onnx: expected .* found .*{key} '{value}'"):
