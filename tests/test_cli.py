@@ -310,7 +310,9 @@ def test_bench_scores_the_network_beside_sgbm(pictures, capfd):
     assert run("bench pairs scenes --model ten.onnx -o rows.csv") == 0
     with Path("rows.csv").open() as file:
         rows = {(row["matcher"], row["scene"]): row for row in csv.DictReader(file)}
-    assert set(rows) == {(name, scene) for name in (*OPENCV_MATCHERS, "ten.onnx") for scene in ("wall", "mean")}
+    assert set(rows) == {
+        (name, scene) for name in (*OPENCV_MATCHERS, "ten.onnx") for scene in ("wall", "mean")
+    }
     # 10 px found, 8 px true
     assert float(rows["ten.onnx", "wall"]["epe_px"]) == 2
     assert "ten.onnx" in capfd.readouterr().out

@@ -148,7 +148,10 @@ def test_the_exponent_is_fitted_to_the_training_truth(experiment):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"model": "weave_small"}, "model = 'weave_small', expected 'fast_depth', which the experiment starts from"),
+        (
+            {"model": "weave_small"},
+            "model = 'weave_small', expected 'fast_depth', which the experiment starts from",
+        ),
         ({"target": "depth"}, "target = 'depth', expected 'disparity', which the experiment starts from"),
         ({"steps": 3}, "steps = 3, expected at least 4: some trainings have a quarter of them"),
     ],

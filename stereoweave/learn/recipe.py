@@ -39,8 +39,8 @@ class Recipe:
     Attributes:
         model: a name in MODELS.
         seed: of the first weights, the pairs and every draw.
-        start_from: checkpoint whose averaged weights are the first ones, where the network has such of the same
-            name and shape; the others, and all if empty, are random.
+        start_from: checkpoint whose averaged weights are the first ones where the network has such, of the
+            same name and shape; the others, and all if empty, are random.
         steps: optimiser steps in all.
         batch: pairs a step.
         learning_rate: between warm-up and cool-down, along which it rises and falls linearly.

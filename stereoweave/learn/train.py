@@ -206,7 +206,7 @@ def _starting_point(recipe: Recipe, last: Path) -> Checkpoint:
 
 
 def _grown(fresh: Weights, earlier: Checkpoint, recipe: Recipe) -> Weights:
-    """An earlier network's averaged weights where this one has such of the same shape, and fresh ones beside."""
+    """An earlier network's averaged weights where this one has such of the same shape, else fresh ones."""
     taken = {
         name: value
         for name, value in earlier.averaged.items()
@@ -214,8 +214,8 @@ def _grown(fresh: Weights, earlier: Checkpoint, recipe: Recipe) -> Weights:
     }
     if not taken:
         raise FormatError(
-            f"{recipe.name}: start_from = {recipe.start_from!r}, expected a checkpoint that shares weights with "
-            f"{recipe.model}, found one of {earlier.recipe.model}"
+            f"{recipe.name}: start_from = {recipe.start_from!r}, expected a checkpoint that shares weights "
+            f"with {recipe.model}, found one of {earlier.recipe.model}"
         )
     return fresh | taken
 

@@ -227,8 +227,8 @@ def upsample_to_a_side(
     """As `upsample_convex`, but a mixture of two sides becomes the side that has more of it.
 
     The sides are the neighbours above and below the mixture; they are two surfaces where their means are
-    more than `step` apart. The mean of two surfaces is on neither, and would fly between them. Not for training:
-    a side that is wrong gets no gradient towards the other.
+    more than `step` apart. The mean of two surfaces is on neither, and would fly between them. Not for
+    training: a side that is wrong gets no gradient towards the other.
     """
     neighbours, shares = _mixture(x, weights)
     share, total = shares.sum(1), (shares * neighbours).sum(1)
@@ -243,7 +243,7 @@ def upsample_to_a_side(
 
 
 def _mixture(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Old pixels around each new one and their shares, [B, 9, 4, H, W] (neighbours [B, 9, 1, H, W]) or 4 of 9."""
+    """Old pixels around each new one, [B, 9, 1, H, W], and their shares, [B, 9, 4, H, W]."""
     batch, channels, height, width = weights.shape
     around = F.pad(x, (1, 1, 1, 1), mode="replicate")
     shifted = [around[:, :, dy : dy + height, dx : dx + width] for dy in range(3) for dx in range(3)]

@@ -33,7 +33,7 @@ Block = TypeVar("Block", Residual, nn.Conv2d)
 
 @dataclass(frozen=True, kw_only=True)
 class Size:
-    """How large the parts of a WeaveNet are; one value a resolution where there are four: 1/2, 1/4, 1/8, 1/16.
+    """How large the parts of a WeaveNet are; of four values each is for one of 1/2, 1/4, 1/8, 1/16.
 
     Attributes:
         channels: of the encoder's maps.
@@ -133,7 +133,7 @@ def as_left_view(views: Tensor, batch: int) -> Tensor:
 
 
 def as_other_view(views: Tensor, batch: int) -> Tensor:
-    """What belongs to `as_left_view` as its right view: maps of the right views, of the left ones mirrored."""
+    """What is matched with `as_left_view`: maps of the right views, then of the left ones mirrored."""
     return torch.cat([views[batch:], mirrored(views[:batch])])
 
 
@@ -225,9 +225,7 @@ class Propagation(nn.Module):
         self.correction = silent(nn.Conv2d(channels, 1, 1))
         self.decoded = silent(nn.Conv2d(channels, 32, 1))
 
-    def forward(
-        self, disparity: Tensor, quarter: Tensor, decoded: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def forward(self, disparity: Tensor, quarter: Tensor, decoded: Tensor) -> tuple[Tensor, Tensor]:
         """Disparity in levels [B, 1, H/4, W/4] and the decoder's features."""
         # Taken in float32: beside a disparity of 100 px bfloat16 cannot tell a slope from a plane.
         departure = disparity - F.avg_pool2d(disparity, 9, 1, 4, count_include_pad=False)
@@ -262,8 +260,9 @@ class Refinement(nn.Module):
 class WeaveNet(nn.Module):
     """Disparity of both views of a rectified pair, and the left one's confidence.
 
-    Sides must be multiples of 16. Disparities from 0 to `levels` * 4 - 1 px are found. SMALL has 278,029 parameters
-    and 2.96 G multiply-adds for both views at 640x480, BASE 1,274,290 parameters and 13.41 G multiply-adds.
+    Sides must be multiples of 16. Disparities from 0 to `levels` * 4 - 1 px are found. For both
+    views at 640x480 SMALL takes 2.96 G multiply-adds with its 278,029 parameters, BASE takes
+    13.41 G multiply-adds with its 1,274,290 parameters.
     """
 
     multiple_of = 16
@@ -320,9 +319,7 @@ class WeaveNet(nn.Module):
         """
         match = self.to_match(maps.quarter)
         batch = len(match) // 2
-        correlation = correlation_volume(
-            as_left_view(match, batch), as_other_view(match, batch), self.levels
-        )
+        correlation = correlation_volume(as_left_view(match, batch), as_other_view(match, batch), self.levels)
         return correlation, *self.aggregation(correlation, first)
 
     def upsample(self, x: Tensor, weights: Tensor) -> Tensor:
