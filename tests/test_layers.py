@@ -220,13 +220,20 @@ def upsampled_corner(upsample, neighbours, logits):
     return upsample(x, weights)[0, 0, 2, 2].item()
 
 
-def test_a_mixture_of_two_surfaces_becomes_the_one_that_has_more_of_it():
-    surfaces = [10.0, 10.0, 50.0, 11.0, 10.0, 50.0, 10.0, 10.0, 50.0]
-    six_of_nine = upsampled_corner(upsample_to_a_side, surfaces, [0.0] * 9)
-    assert six_of_nine == pytest.approx(61 / 6, abs=1e-3)
-    three_that_count = upsampled_corner(upsample_to_a_side, surfaces, [-3.0, -3.0, 3.0] * 3)
-    assert three_that_count == pytest.approx(50, abs=1e-3)
-    assert upsampled_corner(upsample_convex, surfaces, [0.0] * 9) == pytest.approx(211 / 9, abs=1e-3)
+TWO_SURFACES = [10.0, 10.0, 50.0, 11.0, 10.0, 50.0, 10.0, 10.0, 10.0]
+
+
+@pytest.mark.parametrize(
+    ("logits", "expected"),
+    [([0.0] * 9, 71 / 7), ([-9.0, -9.0, 0.0, -9.0, -9.0, 0.0, -9.0, -9.0, -9.0], 50)],
+)
+def test_a_mixture_of_two_surfaces_becomes_the_one_that_has_three_quarters_of_it(logits, expected):
+    found = upsampled_corner(upsample_to_a_side, TWO_SURFACES, logits)
+    assert found == pytest.approx(expected, abs=0.1)
+
+
+def test_the_plain_mixture_of_two_surfaces_is_on_neither():
+    assert upsampled_corner(upsample_convex, TWO_SURFACES, [0.0] * 9) == pytest.approx(171 / 9, abs=1e-3)
 
 
 def test_a_slanted_surface_is_mixed_as_ever():

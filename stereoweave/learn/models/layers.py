@@ -111,7 +111,8 @@ def _diagonals(products: Float[Tensor, "b h n m"], levels: int) -> Float[Tensor,
     Read with rows one element longer, the diagonals are columns.
     """
     rows = products.shape[2]
-    return F.pad(products.flatten(2), (0, rows)).unflatten(2, (rows, rows + levels))[..., :levels]
+    longer = torch.unflatten(F.pad(products.flatten(2), (0, rows)), 2, (rows, rows + levels))
+    return longer[..., :levels]
 
 
 def local_soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
@@ -122,12 +123,13 @@ def local_soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h 
     that the result hardly jumps where rounding decides which of two levels is the best.
     """
     best = logits.detach().argmax(1, keepdim=True)
-    reach = 3
-    steps = torch.arange(-reach, reach + 1, device=logits.device).view(1, -1, 1, 1)
+    near, reach = 2, 3
+    farthest = near + reach
+    steps = torch.arange(-farthest, farthest + 1, device=logits.device).view(1, -1, 1, 1)
     # A level beyond the volume's ends: far less likely than any inside it.
-    padded = F.pad(logits, (0, 0, 0, 0, reach, reach), value=-1e4)
-    around = padded.gather(1, best + steps + reach)
-    centre = expected_step(around[:, 1:-1]).detach()
+    padded = F.pad(logits, (0, 0, 0, 0, farthest, farthest), value=-1e4)
+    around = padded.gather(1, best + steps + farthest)
+    centre = expected_step(around[:, reach:-reach]).detach()
     fade = (1 - (steps - centre).abs() / reach).clamp(min=0)
     weights = (around - around.amax(1, keepdim=True)).exp() * fade
     return best + (weights * steps).sum(1, keepdim=True) / weights.sum(1, keepdim=True)
@@ -227,19 +229,22 @@ def upsample_to_a_side(
     """As `upsample_convex`, but a mixture of two sides becomes the side that has more of it.
 
     The sides are the neighbours above and below the mixture; they are two surfaces where their means are
-    more than `step` apart. The mean of two surfaces is on neither, and would fly between them. Not for
-    training: a side that is wrong gets no gradient towards the other.
+    more than `step` apart. The mean of two surfaces is on neither, and would fly between them. Every choice
+    fades into the other, so that rounding decides nothing: three quarters of the mixture are all of it. Not
+    for training: a side that is wrong gets hardly any gradient towards the other.
     """
     neighbours, shares = _mixture(x, weights)
     share, total = shares.sum(1), (shares * neighbours).sum(1)
     mixed = total / share
-    above = shares * (neighbours > mixed.unsqueeze(1))
+    above = shares * (neighbours - mixed.unsqueeze(1) + 0.5).clamp(0, 1)
     share_above, total_above = above.sum(1), (above * neighbours).sum(1)
-    # 1e-6: where all neighbours are equal none is above, and rounding may leave none below.
+    # 1e-6: where all neighbours are far above or far below there is nothing on the other side.
     mean_above = total_above / (share_above + 1e-6)
     mean_below = (total - total_above) / (share - share_above + 1e-6)
-    side = torch.where(2 * share_above > share, mean_above, mean_below)
-    return F.pixel_shuffle(torch.where(mean_above - mean_below > step, side, mixed), 2)
+    belongs_above = (2 * share_above / share - 0.5).clamp(0, 1)
+    side = mean_below + belongs_above * (mean_above - mean_below)
+    apart = (mean_above - mean_below - step + 0.5).clamp(0, 1)
+    return F.pixel_shuffle(mixed + apart * (side - mixed), 2)
 
 
 def _mixture(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
