@@ -148,6 +148,6 @@ def test_an_unknown_name_is_answered_with_the_known_ones():
     with pytest.raises(FormatError) as caught:
         network_of(recipe_of("spider"))
     assert str(caught.value) == (
-        "tiny: model = 'spider', expected weave_small or weave_base or fast_depth or fast_depth_without_skips or densemapnet "
-        "or dispnet or psmnet"
+        "tiny: model = 'spider', expected weave_small or weave_base or fast_depth or "
+        "fast_depth_without_skips or densemapnet or dispnet or psmnet"
     )

@@ -7,48 +7,74 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+import torch.nn.functional as F
 
 import stereoweave as sw
 from stereoweave import metrics
 from stereoweave.data.readers import read_scenes
+from stereoweave.edges import flying_percent
 from stereoweave.io import read_image
 from stereoweave.learn import checkpoint
 from stereoweave.learn.collage import sample
 from stereoweave.learn.export import differences
-from stereoweave.learn.models import MODELS
-from stereoweave.matcher import Matcher
+from stereoweave.learn.models import network_of
+from stereoweave.learn.models.layers import local_soft_argmax
+from stereoweave.matcher import Matcher, shipped_models
 
 ROOT = Path(__file__).parent.parent
-NETWORK = ROOT / "stereoweave/weights/small.onnx"
-CARD = json.loads(NETWORK.with_suffix(".json").read_text())
+WEIGHTS = ROOT / "stereoweave/weights"
+CARDS = {name: json.loads((WEIGHTS / f"{name}.json").read_text()) for name in ("small", "base")}
 # Of no recipe, no validation and no calibration.
 UNSEEN_SEED = 5_000_011
 
 
-def test_the_shipped_network_is_small_enough_to_ship():
-    assert NETWORK.stat().st_size <= 4_000_000
-    assert CARD["parameters"] <= 1_000_000
-    assert CARD["multiply_adds_640x480"] <= 6_000_000_000
+@pytest.mark.parametrize(("name", "most_multiply_adds"), [("small", 3e9), ("base", 16e9)])
+def test_the_shipped_networks_are_small_enough_to_ship(name, most_multiply_adds):
+    assert (WEIGHTS / f"{name}.onnx").stat().st_size <= 6_000_000
+    assert CARDS[name]["multiply_adds_640x480"] <= most_multiply_adds
 
 
-def test_the_card_names_its_origin_and_its_proofs():
-    assert CARD["licence"] == "Apache-2.0"
-    assert re.fullmatch(r"[0-9a-f]{7,40}", CARD["commit"])
-    assert CARD["hours"] > 0
-    assert CARD["onnx_differs_px"] < 0.01
-    assert CARD["confidence"]["calibration_error"] < 0.1
+def test_they_are_all_that_ships():
+    assert shipped_models() == sorted(CARDS)
 
 
-def test_on_pairs_of_no_training_the_network_is_right_and_knows_where():
+@pytest.mark.parametrize("card", CARDS.values(), ids=CARDS)
+def test_the_card_names_its_origin_and_its_proofs(card):
+    assert card["licence"] == "Apache-2.0"
+    assert re.fullmatch(r"[0-9a-f]{7,40}", card["commit"])
+    assert card["hours"] > 0
+    assert card["onnx_differs_px"] < 0.01
+    assert card["confidence"]["calibration_error"] < 0.1
+
+
+@pytest.mark.parametrize("name", CARDS)
+def test_on_pairs_of_no_training_the_network_is_right_and_knows_where(name):
     errors_px, confidence = [], []
     for index in range(8):
         pair = sample(UNSEEN_SEED, 0, index, 320, 512)
-        found = sw.estimate(pair.left, pair.right)
+        found = sw.estimate(pair.left, pair.right, model=name)
         errors_px.append(np.abs(found.disparity_px - pair.disparity_px))
         confidence.append(found.confidence)
     within = np.stack(errors_px) <= 1
     assert within.mean() > 0.7
     assert metrics.calibration_error(np.stack(confidence), within) < 0.1
+
+
+def test_half_as_many_pixels_fly_as_with_bilinear_upsampling_from_a_quarter():
+    network, flying_percents = trained("small"), []
+    for index in range(8):
+        pair = sample(UNSEEN_SEED, 1, index, 320, 512)
+        images = (torch.from_numpy(x).permute(2, 0, 1)[None].float() / 255 for x in (pair.left, pair.right))
+        with torch.no_grad():
+            stages = network.stages(*images)
+        quarter_px = 4 * local_soft_argmax(stages.scores[:1])
+        bilinear_px = F.interpolate(quarter_px, scale_factor=4.0, mode="bilinear")
+        flying_percents.append(
+            [flying_percent(x[0, 0].numpy(), pair.disparity_px) for x in (stages.disparity_px, bilinear_px)]
+        )
+    found_percent, bilinear_percent = np.mean(flying_percents, axis=0)
+    assert found_percent <= bilinear_percent / 2
 
 
 @pytest.mark.testdata
@@ -82,12 +108,17 @@ def test_new_views_come_near_to_real_photographs(testdata, name, least_db):
 
 
 @pytest.mark.testdata
-def test_on_real_pairs_the_shipped_file_answers_as_its_checkpoint_in_pytorch(testdata):
-    kept = checkpoint.load(ROOT / "checkpoints/small_mean.pt")
-    network = MODELS[kept.recipe.model]()
-    network.load_state_dict(kept.averaged)
-    matcher = Matcher(NETWORK)
+@pytest.mark.parametrize("name", CARDS)
+def test_on_real_pairs_the_shipped_file_answers_as_its_checkpoint_in_pytorch(testdata, name):
+    network, matcher = trained(name), Matcher(name)
     for scene in read_scenes(testdata / "stereo/pairs"):
         # Only of disparity: the confidence that ships was calibrated after training.
-        difference_px, _ = differences(network.eval(), matcher, scene.pair)
+        difference_px, _ = differences(network, matcher, scene.pair)
         assert difference_px < 0.01, scene.name
+
+
+def trained(name):
+    kept = checkpoint.load(ROOT / "checkpoints" / f"{name}.pt")
+    network = network_of(kept.recipe)
+    network.load_state_dict(kept.averaged)
+    return network.eval()
