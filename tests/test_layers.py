@@ -140,9 +140,9 @@ def test_a_lone_peak_at_an_end_is_found_there():
     assert local_soft_argmax(scores(12, l11=1)).item() == pytest.approx(11)
 
 
-def test_the_window_moves_to_the_mean_and_fades_out_over_three_levels():
-    # Mean of 5 (weight 4) and 6 (weight 2): 5 + 1/3. Faded: 4 * (1 - 1/9) = 32/9 and 2 * (1 - 2/9) = 14/9.
-    assert local_soft_argmax(scores(12, l5=4, l6=2)).item() == pytest.approx(5 + 14 / 46)
+def test_the_window_moves_to_the_mean_and_fades_out_over_two_levels():
+    # Mean of 5 (weight 4) and 6 (weight 2): 5 + 1/3. Faded: 4 * (1 - 1/6) = 10/3 and 2 * (1 - 1/3) = 4/3.
+    assert local_soft_argmax(scores(12, l5=4, l6=2)).item() == pytest.approx(5 + 4 / 14)
 
 
 def test_a_far_second_peak_does_not_pull():
@@ -227,7 +227,7 @@ TWO_SURFACES = [10.0, 10.0, 50.0, 11.0, 10.0, 50.0, 10.0, 10.0, 10.0]
     ("logits", "expected"),
     [([0.0] * 9, 71 / 7), ([-9.0, -9.0, 0.0, -9.0, -9.0, 0.0, -9.0, -9.0, -9.0], 50)],
 )
-def test_a_mixture_of_two_surfaces_becomes_the_one_that_has_three_quarters_of_it(logits, expected):
+def test_a_mixture_of_two_surfaces_becomes_the_one_that_has_two_thirds_of_it(logits, expected):
     found = upsampled_corner(upsample_to_a_side, TWO_SURFACES, logits)
     assert found == pytest.approx(expected, abs=0.1)
 

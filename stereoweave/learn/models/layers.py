@@ -119,11 +119,11 @@ def local_soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h 
     """Expected level under a softmax over the surroundings of the best level.
 
     The window keeps a second, far-off candidate from pulling the mean off the surface. First it reaches 2
-    levels to each side of the best one; then it moves to the mean found there, fading out over 3 levels, so
+    levels to each side of the best one; then it moves to the mean found there, fading out over 2 levels, so
     that the result hardly jumps where rounding decides which of two levels is the best.
     """
     best = logits.detach().argmax(1, keepdim=True)
-    near, reach = 2, 3
+    near, reach = 2, 2
     farthest = near + reach
     steps = torch.arange(-farthest, farthest + 1, device=logits.device).view(1, -1, 1, 1)
     # A level beyond the volume's ends: far less likely than any inside it.
@@ -230,7 +230,7 @@ def upsample_to_a_side(
 
     The sides are the neighbours above and below the mixture; they are two surfaces where their means are
     more than `step` apart. The mean of two surfaces is on neither, and would fly between them. Every choice
-    fades into the other, so that rounding decides nothing: three quarters of the mixture are all of it. Not
+    fades into the other, so that rounding decides nothing: two thirds of the mixture are all of it. Not
     for training: a side that is wrong gets hardly any gradient towards the other.
     """
     neighbours, shares = _mixture(x, weights)
@@ -241,7 +241,7 @@ def upsample_to_a_side(
     # 1e-6: where all neighbours are far above or far below there is nothing on the other side.
     mean_above = total_above / (share_above + 1e-6)
     mean_below = (total - total_above) / (share - share_above + 1e-6)
-    belongs_above = (2 * share_above / share - 0.5).clamp(0, 1)
+    belongs_above = (3 * share_above / share - 1).clamp(0, 1)
     side = mean_below + belongs_above * (mean_above - mean_below)
     apart = (mean_above - mean_below - step + 0.5).clamp(0, 1)
     return F.pixel_shuffle(mixed + apart * (side - mixed), 2)
