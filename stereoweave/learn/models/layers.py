@@ -164,7 +164,7 @@ def nearby_matches(
     left, pixels = _pixels(first), _pixels(second)
     products = []
     for step in range(-radius, radius + 2):
-        found = pixels.index_select(0, _places((columns - step).clamp(0, width - 1)))
+        found = pixels.index_select(0, _places(columns - step))
         products.append((left * found).sum(1).view(batch, 1, height, width))
     between = disparity.detach() - whole
     return torch.cat([near + between * (far - near) for near, far in pairwise(products)], 1)
@@ -202,10 +202,11 @@ def _pixels(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "n c"]:
 
 
 def _places(columns: Float[Tensor, "b 1 h w"]) -> Int64[Tensor, " n"]:
-    """The rows of `_pixels` that hold these whole columns, each of its own line and image."""
+    """The rows of `_pixels` that hold these whole columns or the border's, each in its own line and image."""
     batch, _, height, width = columns.shape
     lines = torch.arange(batch * height, device=columns.device).view(batch, 1, height, 1)
-    return (columns.long() + lines * width).view(-1)
+    # Clamped as whole numbers: a disparity that is NaN is to give a loss that is, not to fail here.
+    return (columns.long().clamp(0, width - 1) + lines * width).view(-1)
 
 
 def upsample_convex(
