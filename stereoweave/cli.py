@@ -252,6 +252,27 @@ def speed(
 
 
 @bench.command()
+def costs(
+    runs: Annotated[list[Path], typer.Argument(help="Folders of runs, or checkpoints in them.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="A CSV file to write, too.")] = None,
+) -> None:
+    """What every stage of trained WeaveNets costs: multiply-adds, bytes moved, time; a Markdown table.
+
+    The last columns compare it with the peak, a large matrix product measured in the same run.
+    """
+    from stereoweave.benchmark import write_csv
+
+    if out:
+        _place_for(out)
+    with _needing_the_train_extra():
+        from stereoweave.learn.costs import markdown, stage_costs
+    rows = stage_costs(runs)
+    if out:
+        write_csv(out, rows)
+    typer.echo(markdown(rows))
+
+
+@bench.command()
 def paper(
     recipe: RecipeFile,
     out: RunsFolder,

@@ -227,7 +227,7 @@ TWO_SURFACES = [10.0, 10.0, 50.0, 11.0, 10.0, 50.0, 10.0, 10.0, 10.0]
     ("logits", "expected"),
     [([0.0] * 9, 71 / 7), ([-9.0, -9.0, 0.0, -9.0, -9.0, 0.0, -9.0, -9.0, -9.0], 50)],
 )
-def test_a_mixture_of_two_surfaces_becomes_the_one_that_has_two_thirds_of_it(logits, expected):
+def test_a_mixture_of_two_surfaces_becomes_the_one_that_has_three_quarters_of_it(logits, expected):
     found = upsampled_corner(upsample_to_a_side, TWO_SURFACES, logits)
     assert found == pytest.approx(expected, abs=0.1)
 

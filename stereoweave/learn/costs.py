@@ -130,7 +130,7 @@ def markdown(rows: Sequence[StageCost]) -> str:
 
 
 def traced(network: WeaveNet) -> onnx.ModelProto:
-    """The graph that `export.fixed_graph_of` gives, with the exporter's notes on where each node comes from."""
+    """The graph that `export.fixed_graph_of` gives, with the exporter's notes of where each node is from."""
     left, right = torch.rand(2, 1, 3, HEIGHT_PX, WIDTH_PX)
     with _quietly(), torch.no_grad():
         program = torch.onnx.export(
@@ -160,8 +160,8 @@ def stages_of(graph: onnx.ModelProto) -> dict[str, str]:
             part = inside or last
             stage = _STAGES_BETWEEN.get((inside, last), _STAGES.get(part, part))
         else:
-            stage = _STAGES.get(modules[0], modules[0])
-        last = modules[0] if len(modules) > 1 or inside in _STAGES else last
+            last = modules[0]
+            stage = _STAGES.get(last, last)
         stages |= dict.fromkeys((node.name, *node.output), stage)
     return stages
 

@@ -119,20 +119,22 @@ def local_soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h 
     """Expected level under a softmax over the surroundings of the best level.
 
     The window keeps a second, far-off candidate from pulling the mean off the surface. First it reaches 2
-    levels to each side of the best one; then it moves to the mean found there, fading out over 2 levels, so
-    that the result hardly jumps where rounding decides which of two levels is the best.
+    levels to each side of the best one; then it moves to the mean found there, fading out over 3 levels, again
+    and again, so that it comes to rest in one place even where rounding decides which of two levels is the best.
     """
     best = logits.detach().argmax(1, keepdim=True)
-    near, reach = 2, 2
+    near, reach = 2, 3
     farthest = near + reach
     steps = torch.arange(-farthest, farthest + 1, device=logits.device).view(1, -1, 1, 1)
     # A level beyond the volume's ends: far less likely than any inside it.
     padded = F.pad(logits, (0, 0, 0, 0, farthest, farthest), value=-1e4)
     around = padded.gather(1, best + steps + farthest)
-    centre = expected_step(around[:, reach:-reach]).detach()
-    fade = (1 - (steps - centre).abs() / reach).clamp(min=0)
-    weights = (around - around.amax(1, keepdim=True)).exp() * fade
-    return best + (weights * steps).sum(1, keepdim=True) / weights.sum(1, keepdim=True)
+    likelihood = (around - around.amax(1, keepdim=True)).exp()
+    centre = expected_step(around[:, reach:-reach])
+    for _ in range(3):
+        weights = likelihood * (1 - (steps - centre.detach()).abs() / reach).clamp(min=0)
+        centre = (weights * steps).sum(1, keepdim=True) / weights.sum(1, keepdim=True)
+    return best + centre
 
 
 def expected_step(logits: Float[Tensor, "b k h w"]) -> Float[Tensor, "b 1 h w"]:
@@ -231,7 +233,7 @@ def upsample_to_a_side(
 
     The sides are the neighbours above and below the mixture; they are two surfaces where their means are
     more than `step` apart. The mean of two surfaces is on neither, and would fly between them. Every choice
-    fades into the other, so that rounding decides nothing: two thirds of the mixture are all of it. Not
+    fades into the other, so that rounding decides nothing: three quarters of the mixture are all of it. Not
     for training: a side that is wrong gets hardly any gradient towards the other.
     """
     neighbours, shares = _mixture(x, weights)
@@ -242,7 +244,7 @@ def upsample_to_a_side(
     # 1e-6: where all neighbours are far above or far below there is nothing on the other side.
     mean_above = total_above / (share_above + 1e-6)
     mean_below = (total - total_above) / (share - share_above + 1e-6)
-    belongs_above = (3 * share_above / share - 1).clamp(0, 1)
+    belongs_above = (2 * share_above / share - 0.5).clamp(0, 1)
     side = mean_below + belongs_above * (mean_above - mean_below)
     apart = (mean_above - mean_below - step + 0.5).clamp(0, 1)
     return F.pixel_shuffle(mixed + apart * (side - mixed), 2)
