@@ -140,9 +140,11 @@ def test_a_lone_peak_at_an_end_is_found_there():
     assert local_soft_argmax(scores(12, l11=1)).item() == pytest.approx(11)
 
 
-def test_the_window_moves_to_the_mean_and_fades_out_over_two_levels():
-    # Mean of 5 (weight 4) and 6 (weight 2): 5 + 1/3. Faded: 4 * (1 - 1/6) = 10/3 and 2 * (1 - 1/3) = 4/3.
-    assert local_soft_argmax(scores(12, l5=4, l6=2)).item() == pytest.approx(5 + 4 / 14)
+def test_the_window_fades_out_over_three_levels_and_rests_on_its_own_mean():
+    # 5 weighs 4 and 6 weighs 2; around 5 + c that fades to 4 (1 - c/3) and 2 (2/3 + c/3), of mean 5 + c
+    # where c (16 - 2c) = 4 + 2c.
+    c = (7 - 41**0.5) / 2
+    assert local_soft_argmax(scores(12, l5=4, l6=2)).item() == pytest.approx(5 + c, abs=1e-3)
 
 
 def test_a_far_second_peak_does_not_pull():

@@ -119,8 +119,8 @@ def local_soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h 
     """Expected level under a softmax over the surroundings of the best level.
 
     The window keeps a second, far-off candidate from pulling the mean off the surface. First it reaches 2
-    levels to each side of the best one; then it moves to the mean found there, fading out over 3 levels, again
-    and again, so that it comes to rest in one place even where rounding decides which of two levels is the best.
+    levels to each side of the best one; then it moves to the mean found there, fading out over 3 levels,
+    again and again, so that it rests in one place even where rounding decides which of two levels is best.
     """
     best = logits.detach().argmax(1, keepdim=True)
     near, reach = 2, 3
@@ -262,8 +262,10 @@ def _mixture(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         corners = [(0, 0), (0, 1), (1, 0), (1, 1)]
         neighbours = torch.cat([shifted[3 * (i + a) + j + b] for a, b in corners for i, j in corners], 1)
         neighbours = neighbours.view(batch, 4, 4, height, width)
+    logits = weights.contiguous().view(batch, channels // 4, 4, height, width)
+    # Written out: ONNX Runtime's sigmoid is off by 1e-7, which is much where all neighbours are nearly refused.
     # 1e-4: where all are refused, no division by zero, and still a mixture of nothing but neighbours.
-    return neighbours, weights.contiguous().view(batch, channels // 4, 4, height, width).sigmoid() + 1e-4
+    return neighbours, (1 + (-logits).exp()).reciprocal() + 1e-4
 
 
 def pad_to_multiple(image: Float[Tensor, "b c h w"], multiple: int) -> Float[Tensor, "b c h2 w2"]:
