@@ -1,17 +1,20 @@
 """Plots of `stereoweave bench pairs`: errors against time, and what a confidence is worth."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullLocator
 from matplotlib.transforms import Bbox
 
 from stereoweave.benchmark import Curves, Row
-from stereoweave.io import replacing
+from stereoweave.io import write_image
 from stereoweave.metrics import DROPPED_PERCENT, Sparsification
 from stereoweave.opencv_matchers import OPENCV_MATCHERS
 
@@ -34,13 +37,14 @@ def draw_error_over_time(path: str | Path, rows: Sequence[Row]) -> None:
 
     Args:
         path: The picture's file; its ending says what is written.
-        rows: One of each matcher: the means.
+        rows: One of each matcher: the means. Those of unknown error have no place in it.
     """
+    rows = [row for row in rows if not math.isnan(row.epe_px)]
     figure, panels = _panels()
     for column, axes in panels.items():
         for row in rows:
             axes.plot(row.time_ms, getattr(row, column), **_marker(row))
-        highest = max(getattr(row, column) for row in rows)
+        highest = max((getattr(row, column) for row in rows), default=1)
         axes.set(xscale="log", xlabel="time a pair, ms", ylabel=_TITLES[column], ylim=(0, 1.15 * highest))
         axes.margins(x=0.15)
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -119,5 +123,7 @@ def _written(axes: Axes, name: str, point: tuple[float, float], place: _Place) -
 
 
 def _save(figure: Figure, path: str | Path) -> None:
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=130)
+    canvas = FigureCanvasAgg(figure)
+    figure.set_dpi(130)
+    canvas.draw()
+    write_image(path, np.asarray(canvas.buffer_rgba())[..., :3].copy())

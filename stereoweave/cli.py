@@ -293,7 +293,13 @@ def paper(
 def ablations(
     recipe: RecipeFile,
     out: RunsFolder,
-    report: Annotated[Path, typer.Option(help="The CSV file to write, a row a training; it is added to.")],
+    report: Annotated[
+        Path,
+        typer.Option(
+            help="The CSV file to write, a row a training. Rows of other recipes are dropped, those of the same "
+            "ones are taken as they are: remove the file after a change of code."
+        ),
+    ],
     rendered: Annotated[
         Path, typer.Option(metavar="FOLDER", help="Held-out pairs of stereoweave synth make.")
     ] = Path("runs/synth_val/rooms"),

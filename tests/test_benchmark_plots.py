@@ -1,13 +1,15 @@
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgba
-from matplotlib.figure import Figure
 
+from stereoweave import benchmark_plots
 from stereoweave.benchmark import Curves, Row
 from stereoweave.benchmark_plots import draw_error_over_time, draw_sparsification
+from stereoweave.io import read_image
 from stereoweave.metrics import sparsification
 
 
@@ -15,13 +17,13 @@ from stereoweave.metrics import sparsification
 def drawn(monkeypatch):
     """The figures that were written, in their order."""
     figures = []
-    save = Figure.savefig
+    save = benchmark_plots._save
 
-    def noted(figure, *arguments, **options):
+    def noted(figure, path):
         figures.append(figure)
-        save(figure, *arguments, **options)
+        save(figure, path)
 
-    monkeypatch.setattr(Figure, "savefig", noted)
+    monkeypatch.setattr(benchmark_plots, "_save", noted)
     return figures
 
 
@@ -69,3 +71,10 @@ def test_each_confidence_has_its_curve_and_its_oracle_in_one_colour(tmp_path, dr
         assert kept.get_color() == oracle.get_color() != other_kept.get_color()
     legend = [text.get_text() for text in drawn[0].axes[1].get_legend().get_texts()]
     assert legend == ["small", "sgbm, by its left-right check", "by its error: the oracle"]
+
+
+def test_a_matcher_of_unknown_error_is_left_out_and_any_kind_of_picture_is_written(tmp_path):
+    unknown = replace(ROWS[0], epe_px=float("nan"), bad1_percent=float("nan"))
+    for name, rows in (("all.bmp", [unknown]), ("one.png", [unknown, *ROWS[1:]])):
+        draw_error_over_time(tmp_path / name, rows)
+        assert read_image(tmp_path / name).std() > 5

@@ -37,7 +37,7 @@ class Recipe:
     """What to train, on what, for how long.
 
     Attributes:
-        model: a name in MODELS.
+        model: a name in MODELS or, for ablations, in VARIANTS.
         seed: of the first weights, the pairs and every draw.
         start_from: checkpoint whose averaged weights are the first ones where the network has such, of the
             same name and shape; the others, and all if empty, are random.

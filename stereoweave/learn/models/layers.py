@@ -263,7 +263,7 @@ def _mixture(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         neighbours = torch.cat([shifted[3 * (i + a) + j + b] for a, b in corners for i, j in corners], 1)
         neighbours = neighbours.view(batch, 4, 4, height, width)
     logits = weights.contiguous().view(batch, channels // 4, 4, height, width)
-    # Written out: ONNX Runtime's sigmoid is off by 1e-7, which is much where all neighbours are nearly refused.
+    # Written out: ONNX Runtime's sigmoid is off by 1e-7, which is much where all neighbours are refused.
     # 1e-4: where all are refused, no division by zero, and still a mixture of nothing but neighbours.
     return neighbours, (1 + (-logits).exp()).reciprocal() + 1e-4
 
