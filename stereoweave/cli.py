@@ -296,8 +296,8 @@ def ablations(
     report: Annotated[
         Path,
         typer.Option(
-            help="The CSV file to write, a row a training. Rows of other recipes are dropped, those of the same "
-            "ones are taken as they are: remove the file after a change of code."
+            help="The CSV file to write, a row a training. Rows of other recipes are dropped, those of the "
+            "same are taken as they are: remove the file after a change of code."
         ),
     ],
     rendered: Annotated[

@@ -1,10 +1,13 @@
+import csv
 import json
+from pathlib import Path
 
 import pytest
 import torch
 from learn_examples import RECIPE, checkpoint_of, complaint, recipe_of, untrained
 from onnx import TensorProto, helper
 
+from stereoweave.cli import main
 from stereoweave.learn import checkpoint, costs
 from stereoweave.learn.export import multiply_adds
 
@@ -139,7 +142,8 @@ def test_the_product_is_the_peak_and_the_stages_come_in_order_with_their_total(r
     _, (product, *stages, total) = rows
     assert (product.network, product.stage) == ("", costs.PRODUCT)
     assert product.multiply_adds == 64**3
-    assert product.one_thread_peak_percent == product.two_threads_peak_percent == 100
+    assert product.one_thread_peak_percent == pytest.approx(100)
+    assert product.two_threads_peak_percent == pytest.approx(100)
     assert {row.network for row in (*stages, total)} == {RECIPE.name}
     assert total.stage == costs.TOTAL
     assert [row.stage for row in stages] == [
@@ -186,3 +190,14 @@ def test_another_network_is_one_line_that_says_where_it_is_timed(tmp_path):
     recipe = recipe_of("fast_depth", target="disparity")
     checkpoint.save(checkpoint_of(untrained("fast_depth"), recipe), tmp_path / "last.pt")
     assert "expected a WeaveNet" in complaint(costs.stage_costs, [tmp_path / "last.pt"])
+
+
+def test_the_command_prints_the_table_and_writes_the_rows(rows, monkeypatch, tmp_path, capsys):
+    _, found = rows
+    asked = []
+    monkeypatch.setattr(costs, "stage_costs", lambda runs: asked.append(runs) or found)
+    assert main(["bench", "costs", "a", "b.pt", "-o", str(tmp_path / "costs.csv")]) == 0
+    assert asked == [[Path("a"), Path("b.pt")]]
+    assert capsys.readouterr().out == costs.markdown(found) + "\n"
+    with (tmp_path / "costs.csv").open(newline="") as file:
+        assert [row["stage"] for row in csv.DictReader(file)] == [row.stage for row in found]

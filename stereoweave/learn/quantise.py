@@ -1,4 +1,4 @@
-"""A matcher file with convolutions in 8 bits: a third of the size, and faster where the CPU multiplies those."""
+"""A matcher file with 8-bit convolutions: a third of the size, and faster where a CPU multiplies 8 bits."""
 
 import io
 import json

@@ -239,7 +239,7 @@ def upsample_to_a_side(
     neighbours, shares = _mixture(x, weights)
     share, total = shares.sum(1), (shares * neighbours).sum(1)
     mixed = total / share
-    above = shares * (neighbours - mixed.unsqueeze(1) + 0.5).clamp(0, 1)
+    above = shares * (neighbours - (mixed - 0.5).unsqueeze(1)).clamp(0, 1)
     share_above, total_above = above.sum(1), (above * neighbours).sum(1)
     # 1e-6: where all neighbours are far above or far below there is nothing on the other side.
     mean_above = total_above / (share_above + 1e-6)
