@@ -125,5 +125,5 @@ def _written(axes: Axes, name: str, point: tuple[float, float], place: _Place) -
 def _save(figure: Figure, path: str | Path) -> None:
     canvas = FigureCanvasAgg(figure)
     figure.set_dpi(130)
-    canvas.draw()
-    write_image(path, np.asarray(canvas.buffer_rgba())[..., :3].copy())
+    canvas.draw()  # type: ignore[no-untyped-call]
+    write_image(path, np.asarray(canvas.buffer_rgba())[..., :3].copy())  # type: ignore[no-untyped-call]

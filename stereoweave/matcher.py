@@ -61,6 +61,8 @@ class Matcher:
         options = onnxruntime.SessionOptions()
         # Not ONNX Runtime's own choice: on a virtual machine it counts two cores as one with two threads.
         options.intra_op_num_threads = thread_count(threads)
+        # Else its threads go on waiting busily after a run, and slow down what runs next on these cores.
+        options.add_session_config_entry("session.force_spinning_stop", "1")
         options.log_severity_level = 4  # what is wrong with a file is said once, by the error below
         with _naming(self._path):
             self._session = onnxruntime.InferenceSession(
