@@ -29,9 +29,11 @@ _PIXEL_PAIRS_AT_ONCE = 1920 * 1920 * 320
 _STRIP_OVERLAP_PX = 64
 # A nearer surface this much in front of a pixel's match hides it; less is the two views' disagreement.
 _OCCLUSION_STEP_PX = 1.0
-# Within such a square a picture that varies by no more than this says nothing about disparity: rounding alone
-# does so much. Of painted pairs it takes 1 pixel in 1,000, and of these 1 in 8 is right by luck.
+# Within such a square a picture whose means over 9x9 px vary by no more than this says nothing about
+# disparity: noise of 3 grey levels alone does so much. Of painted pairs it takes 1 pixel in 5,000, and of
+# these 1 in 3 is right.
 _PLAIN_WINDOW_PX = 65
+_PLAIN_MEAN_PX = 9
 _PLAIN_GREY_LEVELS = 2
 
 
@@ -315,7 +317,8 @@ def _confidence(
 
 
 def _plain(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
-    """Where nothing within _PLAIN_WINDOW_PX differs in brightness by more than _PLAIN_GREY_LEVELS."""
+    """Where no mean over _PLAIN_MEAN_PX within _PLAIN_WINDOW_PX differs by more than _PLAIN_GREY_LEVELS."""
     window = np.ones((_PLAIN_WINDOW_PX, _PLAIN_WINDOW_PX), np.uint8)
-    contrast = cv2.morphologyEx(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), cv2.MORPH_GRADIENT, window)
+    means = cv2.blur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (_PLAIN_MEAN_PX, _PLAIN_MEAN_PX))
+    contrast = cv2.morphologyEx(means, cv2.MORPH_GRADIENT, window)
     return contrast <= _PLAIN_GREY_LEVELS

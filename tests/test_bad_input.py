@@ -65,7 +65,7 @@ def test_pictures_of_two_scenes_are_not_trusted():
 def test_what_is_nearer_than_the_range_is_not_trusted(shift_px):
     wide = sample(UNSEEN_SEED, 3, 0, 256, 900).left
     found = estimate(wide[:, :640], wide[:, shift_px : shift_px + 640])
-    assert found.confidence.mean() < 0.2
+    assert found.confidence.mean() < 0.25
 
 
 def test_what_lies_behind_the_range_is_not_trusted():

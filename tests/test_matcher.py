@@ -138,8 +138,9 @@ def test_plain_is_what_has_nothing_to_match_by_within_32_px():
     image[::2, ::3] += 2
     image[:, 100:] = 93
     expected = np.zeros((40, 140), bool)
-    expected[:, :68] = True
-    expected[:, 132:] = True  # 32 px right of column 99 the board is all there is
+    # The last mean of 90 is at column 95, the first of 93 at 103: 8 of its 9 columns are the board's.
+    expected[:, : 103 - 32] = True
+    expected[:, 95 + 32 + 1 :] = True
     np.testing.assert_array_equal(matcher._plain(image), expected)
 
 
@@ -204,7 +205,7 @@ def test_the_answer_does_not_depend_on_earlier_calls_of_other_sizes(rng):
 
 
 def test_an_unknown_name_lists_the_shipped_ones():
-    with pytest.raises(sw.MatcherError, match=r"unknown model 'tiny'; expected small"):
+    with pytest.raises(sw.MatcherError, match=r"unknown model 'tiny'; expected base or small"):
         Matcher("tiny")
 
 
