@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 import onnx
 import onnxruntime  # type: ignore[import-untyped]
-import torch
 from onnx import TensorProto, helper
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn import checkpoint
-from stereoweave.learn.export import OUTPUTS, _quietly, matcher_network
+from stereoweave.learn.export import matcher_network, noted_graph
 from stereoweave.learn.models.weave import WeaveNet
 
 HEIGHT_PX, WIDTH_PX = 480, 640
@@ -131,20 +130,7 @@ def markdown(rows: Sequence[StageCost]) -> str:
 
 def traced(network: WeaveNet) -> onnx.ModelProto:
     """The graph that `export.fixed_graph_of` gives, with the exporter's notes of where each node is from."""
-    left, right = torch.rand(2, 1, 3, HEIGHT_PX, WIDTH_PX)
-    with _quietly(), torch.no_grad():
-        program = torch.onnx.export(
-            network,
-            (left, right),
-            dynamo=True,
-            opset_version=20,
-            input_names=["left", "right"],
-            output_names=OUTPUTS,
-            verbose=False,
-        )
-    assert program is not None
-    program.optimize()
-    return program.model_proto
+    return noted_graph(network, HEIGHT_PX, WIDTH_PX, None)
 
 
 def stages_of(graph: onnx.ModelProto) -> dict[str, str]:

@@ -131,7 +131,8 @@ def fixed_graph_of(network: Any, height: int, width: int) -> onnx.ModelProto:
     return _exported(network, height, width, None)
 
 
-def _exported(network: Any, height: int, width: int, dynamic_shapes: Any) -> onnx.ModelProto:
+def noted_graph(network: Any, height: int, width: int, dynamic_shapes: Any) -> onnx.ModelProto:
+    """The network as an ONNX graph, with the exporter's notes of where each node is from."""
     # Two tensors: given the same one twice, the exporter would take both inputs to be one.
     left, right = torch.rand(2, 1, 3, height, width)
     with _quietly(), torch.no_grad():
@@ -147,7 +148,11 @@ def _exported(network: Any, height: int, width: int, dynamic_shapes: Any) -> onn
         )
     assert program is not None
     program.optimize()
-    graph = program.model_proto
+    return program.model_proto
+
+
+def _exported(network: Any, height: int, width: int, dynamic_shapes: Any) -> onnx.ModelProto:
+    graph = noted_graph(network, height, width, dynamic_shapes)
     # The exporter notes where each part comes from, with this machine's paths.
     for part in (graph.graph, *graph.graph.node, *graph.graph.value_info):
         del part.metadata_props[:]
