@@ -1,8 +1,9 @@
 """New views from an estimate: what a camera elsewhere on the line through the two would have seen."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
@@ -16,14 +17,10 @@ if TYPE_CHECKING:
     from stereoweave.rendering_kernels import Canvas, Side
 
 FIRST_POSITION, LAST_POSITION = -1.0, 2.0
-# A nearer neighbour's colour is out of place once the new view parts the two by more than this.
-_PARTED_PX = 1.0
-# The photographs are aligned over windows of this many pixels, and a disparity is moved by one pixel at most.
-_WINDOW_PX = 5
-_LARGEST_STEP_PX = 1.0
-# Where the squared slope of the grey values is less than this, on average, there is nothing to align.
-_FLAT_LEVELS2 = 30.0
 _MOST_THREADS = 4
+_LEAST_NEARNESS = 1e-3
+# What is hidden is found in bands of about this many rows, however many threads there are.
+_BAND_ROWS = 60
 
 
 class Renderer:
@@ -49,16 +46,61 @@ class Renderer:
         self.pair, self.estimate = pair, estimate
         self.strength, self.convergence_px = strength, convergence_px
         self._threads = min(_MOST_THREADS, thread_count(threads))
+        maps_px = estimate.disparity_px, estimate.right_disparity_px
+        with ThreadPoolExecutor(self._threads) as pool:
+            self._sides = tuple(pool.map(_side, (pair.left, pair.right), maps_px))
+        self._hidden: dict[bool, Hidden] = {}
+        self._confidence = np.require(estimate.confidence, np.float32, ["C", "W"])
 
     def view(self, position: float) -> View:
         """The view from a position: 0 is the left camera, 1 the right one; see `render`."""
         position = 0.5 + self.strength * (position - 0.5)
         check_position(position)
-        left, right = self.pair.left, self.pair.right
-        if position in (0, 1):
-            photo = right if position else left
+        if position in (0, 1) and not self.convergence_px:
+            photo = self.pair.right if position else self.pair.left
             return View(image=photo.copy(), drawn=np.ones(photo.shape[:2], bool))
-        return _rendered(left, right, self.estimate, float(position), self._threads)
+        return self._rendered(float(position))
+
+    def _rendered(self, position: float) -> View:
+        from stereoweave.drawing_kernels import draw  # Numba takes half a second to import
+        from stereoweave.filling_kernels import fill, lay
+
+        shares = abs(1 - position), abs(position)
+        left, right = (
+            side._replace(
+                shift=end - position,
+                offset_px=(position - 0.5) * self.convergence_px,
+                # Not 0, because the other camera alone sees some things.
+                nearness=max(share / sum(shares), _LEAST_NEARNESS),
+            )
+            for side, end, share in zip(self._sides, (0, 1), shares, strict=True)
+        )
+        canvas = _canvas(self.pair.left if position < 0.5 else self.pair.right)
+        _in_bands(
+            partial(draw, left, right, self._confidence, canvas),
+            len(canvas.image),
+            self._threads,
+            self._threads,
+        )
+        if not 0 <= position <= 1:
+            # In between, what neither camera saw is a few pixels wide; `fill` is quicker, and does as well.
+            hidden = self._behind(right=position > 1)
+            lay(*hidden, (right if position > 1 else left).shift, left.offset_px, canvas)
+        fill(canvas)
+        return View(image=canvas.image, drawn=canvas.drawn)
+
+    def _behind(self, right: bool) -> "Hidden":
+        """What is hidden from both cameras, and seen from beyond the right one or the left one."""
+        if right not in self._hidden:
+            self._hidden[right] = _uncovered(self._sides, right, self._threads)
+        return self._hidden[right]
+
+
+class Hidden(NamedTuple):
+    """Background that neither camera sees, in the columns of a photograph; see `hidden_kernels.uncover`."""
+
+    disparity_px: np.ndarray
+    colours: np.ndarray
 
 
 def render(
@@ -110,53 +152,36 @@ def _check_size(pair: StereoPair, estimate: Estimate) -> None:
         )
 
 
-def _rendered(left: np.ndarray, right: np.ndarray, estimate: Estimate, position: float, threads: int) -> View:
-    from stereoweave import rendering_kernels as kernels  # Numba takes half a second to import
-
-    distances = abs(position), abs(1 - position)
-    sides = (
-        _side(left, estimate.disparity_px, -position, distances[1] / sum(distances)),
-        _side(right, estimate.right_disparity_px, 1 - position, distances[0] / sum(distances)),
-    )
-    confidence = np.require(estimate.confidence, np.float32, ["C", "W"])
-    canvas = _canvas(left if position < 0.5 else right)
-
-    def place(rows: slice) -> None:
-        seen, part = [side.rows(rows) for side in sides], canvas.rows(rows)
-        for side in seen:
-            kernels.splat(side.disparity_px, side.shift, side.landed_px)
-        kernels.choose(*seen, confidence[rows], part)
-        kernels.compare(*seen, part)
-
-    def paint(rows: slice) -> None:
-        kernels.paint(*(side.rows(rows) for side in sides), canvas.rows(rows))
-
-    _in_bands(place, left.shape[0], threads)
-    _align(canvas)
-    _in_bands(paint, left.shape[0], threads)
-    kernels.fill(canvas)
-    return View(image=np.clip(np.rint(canvas.image), 0, 255).astype(np.uint8), drawn=canvas.drawn)
-
-
-def _side(
-    photo: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarray, "h w"], shift: float, nearness: float
-) -> "Side":
-    """One photograph as the kernels take it, nothing landed yet."""
-    from stereoweave.rendering_kernels import IMPURE, Side
+def _side(photo: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarray, "h w"]) -> "Side":
+    """One photograph as the kernels take it, for no view yet."""
+    from stereoweave.rendering_kernels import Side
 
     # Numba would compile every kernel once more for arrays that are read-only or have gaps.
     photo = np.require(photo, np.uint8, ["C", "W"])
     disparity_px = np.require(disparity_px, np.float32, ["C", "W"])
-    parted_px = abs(shift) * (cv2.dilate(disparity_px, np.ones((3, 3), np.uint8)) - disparity_px)
     return Side(
         photo=photo,
         grey=cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY),
         disparity_px=disparity_px,
-        purity=np.clip(1 + _PARTED_PX - parted_px, IMPURE, 1).astype(np.float32),
-        landed_px=np.empty_like(disparity_px),
-        shift=shift,
-        nearness=nearness,
+        nearer_px=cv2.dilate(disparity_px, np.ones((3, 3), np.uint8)) - disparity_px,
+        shift=0.0,
+        offset_px=0.0,
+        nearness=0.0,
     )
+
+
+def _uncovered(sides: "Sequence[Side]", right: bool, threads: int) -> Hidden:
+    """What is behind the foreground of the right photograph, or of the left one, for views from beyond it."""
+    from stereoweave.hidden_kernels import uncover
+
+    own, other = sides[right], sides[not right]
+    hidden = Hidden(np.empty_like(own.disparity_px), np.empty_like(own.photo))
+    # From beyond the left camera one looks behind the foreground where the background is on its left.
+    outwards = 1 if right else -1
+    known = own.photo, own.disparity_px, own.nearer_px, other.disparity_px, outwards
+    height = len(own.photo)
+    _in_bands(partial(uncover, *known, *hidden), height, -(-height // _BAND_ROWS), threads)
+    return hidden
 
 
 def _canvas(photo: UInt8[np.ndarray, "h w 3"]) -> "Canvas":
@@ -165,32 +190,15 @@ def _canvas(photo: UInt8[np.ndarray, "h w 3"]) -> "Canvas":
 
     size = photo.shape[:2]
     return Canvas(
-        front_px=np.empty(size, np.float32),
-        back_px=np.empty(size, np.float32),
-        share=np.empty(size, np.float32),
-        products=np.empty(photo.shape, np.float32),
-        image=photo.astype(np.float32),
+        surface_px=np.empty(size, np.float32),
+        image=photo.copy(),
         pure=np.empty(size, bool),
-        drawn=np.empty(size, bool),
+        drawn=np.ones(size, bool),
     )
 
 
-def _align(canvas: "Canvas") -> None:
-    """Move the new view's disparities so that the photographs match there (Lucas and Kanade, one step).
-
-    A matcher's noise would show as blur otherwise: each photograph would be sampled beside the right place.
-    """
-    window = (_WINDOW_PX, _WINDOW_PX)
-    sums = cv2.boxFilter(canvas.products, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    step_px = -sums[..., 0] / (sums[..., 1] + _FLAT_LEVELS2 * np.maximum(sums[..., 2], 1))
-    canvas.front_px[:] += canvas.products[..., 2] * np.clip(step_px, -_LARGEST_STEP_PX, _LARGEST_STEP_PX)
-
-
-def _in_bands(work: Callable[[slice], None], height: int, count: int) -> None:
-    """Do the work on that many bands of rows, each in a thread.
-
-    Rows are independent: in rectified photographs everything moves along them.
-    """
+def _in_bands(work: Callable[[int, int], None], height: int, count: int, threads: int) -> None:
+    """Do the work on that many bands of rows, from one row to before another, in threads."""
     ends = [height * band // count for band in range(count + 1)]
-    with ThreadPoolExecutor(count) as pool:
-        list(pool.map(work, map(slice, ends[:-1], ends[1:])))
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(work, ends[:-1], ends[1:]))

@@ -12,35 +12,48 @@ class PlainSide(NamedTuple):
     disparity_px: np.ndarray
     shift: float
     nearness: float
+    offset_px: float
 
     def column(self, d):
         """Where in the photograph each pixel of the new view is, if its disparity is d."""
-        return np.arange(d.shape[1]) - self.shift * d
+        return np.arange(d.shape[1]) - self.offset_px - self.shift * d
 
 
-def plain_rendering(left, right, estimate, position):
-    """Image and drawn of `stereoweave.render`, for positions other than the cameras'."""
+def plain_rendering(left, right, estimate, position, convergence_px=0.0):
+    """Image and drawn of `stereoweave.render`, and where the colours are pure, for positions other than 0 and 1.
+
+    Beyond the cameras, pixels that are not pure are left to others: this fills them as in between.
+    """
     near, far = abs(1 - position), abs(position)
+    offset_px = (position - 0.5) * convergence_px
     sides = (
-        PlainSide(left.astype(float), estimate.disparity_px.astype(float), -position, near / (near + far)),
         PlainSide(
-            right.astype(float), estimate.right_disparity_px.astype(float), 1 - position, far / (near + far)
+            left.astype(float), estimate.disparity_px.astype(float), -position, near / (near + far), offset_px
+        ),
+        PlainSide(
+            right.astype(float),
+            estimate.right_disparity_px.astype(float),
+            1 - position,
+            far / (near + far),
+            offset_px,
         ),
     )
     front, back, share = plain_surfaces(sides, estimate.confidence)
+    supports = [support(side, np.nan_to_num(front), purity(side)) for side in sides]
     front = aligned(sides, front, back)
-    image, seen, pure = plain_colours(sides, front, back, share)
+    image, seen, pure = plain_colours(sides, front, back, share, supports)
     nearest = left if position < 0.5 else right
     image = np.where(np.isnan(seen)[..., None], nearest, image)
-    return plain_fill(image, seen, pure)
+    image = np.floor(np.clip(image, 0, 255) + 0.5)
+    return *plain_fill(image, seen, pure), pure
 
 
-def plain_splat(disparity_px, shift):
+def plain_splat(disparity_px, shift, offset_px=0.0):
     """The nearest disparity on each pixel of the new view, NaN where there is none."""
     landed = np.full(disparity_px.shape, np.nan)
     columns = np.arange(disparity_px.shape[1])
     for line, row in zip(landed, disparity_px, strict=True):
-        u = columns + shift * row
+        u = columns + shift * row + offset_px
         joined = np.abs(np.diff(row)) <= SAME_SURFACE_PX
         for x in range(len(row)):
             on_left = (columns >= u[x] - 0.5) & (columns <= u[x])
@@ -69,7 +82,8 @@ def linear(values, column):
 
 
 def cubic(values, column):
-    """Catmull and Rom's spline through the four neighbours, in its textbook form."""
+    """Catmull and Rom's spline through the four neighbours, in its textbook form; the border's beyond it."""
+    column = np.clip(column, 0, values.shape[1] - 1)
     whole = np.floor(column).astype(int)
     t = (column - whole)[..., None]
     a, b, c, d = (tap(values, whole + k) for k in (-1, 0, 1, 2))
@@ -138,7 +152,7 @@ def share_of_left(sides, confidence, a, b):
 
 def plain_surfaces(sides, confidence):
     """Front and back disparity of the new view's pixels, NaN where there is none, and the front's share."""
-    a, b = (plain_splat(side.disparity_px, side.shift) for side in sides)
+    a, b = (plain_splat(side.disparity_px, side.shift, side.offset_px) for side in sides)
     both = np.isfinite(a) & np.isfinite(b)
     same = both & (np.abs(a - b) <= SAME_SURFACE_PX)
     front = np.where(same, (a + b) / 2, np.fmax(a, b))
@@ -166,6 +180,7 @@ def aligned(sides, front, back):
     seen = np.min([support(side, d, purity(side)) for side in sides], axis=0) >= 0.5
     seen &= np.isfinite(front) & np.isnan(back)
     left, right = (side.column(d) for side in sides)
+    left, right = (np.clip(x, 0, d.shape[1] - 1) for x in (left, right))
     difference = linear(greys[0], left) - linear(greys[1], right)
     slope = sum(
         sign * side.shift * (linear(g, x + 1) - linear(g, x - 1)) / 2
@@ -188,12 +203,14 @@ def windows(values):
     return np.lib.stride_tricks.sliding_window_view(padded, (5, 5)).sum((2, 3))
 
 
-def plain_colours(sides, front, back, share):
+def plain_colours(sides, front, back, share, front_supports):
     """Colours, the disparity that has most of each pixel (NaN: none), and where the colours are pure."""
     colours, known, seen_by = [], [], []
-    for d, part in ((front, share), (back, 1 - share)):
+    back_supports = [support(side, np.nan_to_num(back), purity(side)) for side in sides]
+    layers = (front, share, front_supports), (back, 1 - share, back_supports)
+    for d, part, found in layers:
         exists, d = np.isfinite(d), np.nan_to_num(d)
-        supports = [exists * support(side, d, purity(side)) for side in sides]
+        supports = [exists * of_side for of_side in found]
         weights = [side.nearness * s for side, s in zip(sides, supports, strict=True)]
         total = np.maximum(sum(weights), 1e-300)
         colours.append(
@@ -214,26 +231,20 @@ def plain_colours(sides, front, back, share):
 
 
 def plain_fill(image, seen, pure):
-    """Image and drawn, with what is not pure filled from the farther end of its run."""
+    """Image and drawn; what is not pure shows what is beside the farther end of its run, mirrored there."""
     height, width = pure.shape
     filled, drawn = image.copy(), np.isfinite(seen)
     for y in range(height):
         known = np.flatnonzero(pure[y])
         for x in np.flatnonzero(~pure[y]):
-            ends = [(e, -1) for e in known[known < x][-1:]] + [(e, 1) for e in known[known > x][:1]]
+            ends = [*known[known < x][-1:], *known[known > x][:1]]
             if not ends:
                 continue
-            source, inwards = min(ends, key=lambda end: seen[y, end[0]])
+            source = min(ends, key=lambda end: seen[y, end])
             if drawn[y, x] and seen[y, x] < seen[y, source] - SAME_SURFACE_PX:
                 continue
-            rows = [row for row in (y - 1, y, y, y + 1) if 0 <= row < height]
-            columns = [source, min(max(source + inwards, 0), width - 1)]
-            beside = [
-                image[row, column]
-                for row in rows
-                for column in columns
-                if pure[row, column] and abs(seen[row, column] - seen[y, source]) <= SAME_SURFACE_PX
-            ]
-            filled[y, x] = np.mean(beside, axis=0)
+            mirrored = min(max(2 * source - x, 0), width - 1)
+            same = pure[y, mirrored] and abs(seen[y, mirrored] - seen[y, source]) <= SAME_SURFACE_PX
+            filled[y, x] = image[y, mirrored if same else source]
             drawn[y, x] = False
-    return np.clip(np.rint(filled), 0, 255).astype(np.uint8), drawn
+    return filled, drawn

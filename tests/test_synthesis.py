@@ -18,7 +18,7 @@ def pair(rng):
 
 def test_synthesizing_is_estimating_and_then_rendering(pair):
     view = synthesize(*pair, position=0.3)
-    expected = render(*pair, estimate(*pair, model="small"), 0.3)
+    expected = render(*pair, estimate(*pair, model="base"), 0.3)
     np.testing.assert_array_equal(view.image, expected.image)
     np.testing.assert_array_equal(view.drawn, expected.drawn)
 
@@ -30,7 +30,7 @@ def test_the_model_is_the_callers_choice(pair):
 
 def test_a_position_out_of_range_is_refused_before_a_model_is_loaded(pair):
     with pytest.raises(ValueError, match="^position: expected"):
-        synthesize(*pair, 2.0, model="no_such_model")
+        synthesize(*pair, 2.5, model="no_such_model")
 
 
 @pytest.mark.testdata
@@ -43,5 +43,5 @@ def test_a_real_photograph_from_between_is_met_better_than_by_fading(testdata):
 
 def test_render_is_still_the_function_after_synthesize_was_used(pair):
     view = sw.synthesize(*pair, position=0.5)
-    again = sw.render(*pair, sw.estimate(*pair), position=0.5)
+    again = sw.render(*pair, sw.estimate(*pair, model="base"), position=0.5)
     np.testing.assert_array_equal(again.image, view.image)

@@ -1,0 +1,110 @@
+import numpy as np
+import pytest
+
+from stereoweave.hidden_kernels import uncover
+from stereoweave.rendering import Renderer
+from stereoweave.rendering_kernels import NOTHING
+from stereoweave.stereo import Estimate, StereoPair
+
+WALL_PX, OBJECT_PX = 2, 10
+OBJECT = np.array([250, 30, 10], np.uint8)
+
+
+def wall_with_object(wall):
+    """A pair of a wall at disparity 2 of the texture `wall` [H, 60, 3], and an object at 10 before it."""
+    left, right = wall.copy(), np.roll(wall, -WALL_PX, axis=1)
+    maps = np.full((2, *wall.shape[:2]), WALL_PX, np.float32)
+    left[:, 20:46], right[:, 10:36] = OBJECT, OBJECT
+    maps[0, :, 20:46], maps[1, :, 10:36] = OBJECT_PX, OBJECT_PX
+    return left, right, maps
+
+
+def uncovered(photo, disparity_px, other_px, side):
+    nearer_px = np.where(disparity_px == WALL_PX, 0, 0).astype(np.float32)
+    edge = np.abs(np.diff(disparity_px, axis=1)) > 1
+    beside = np.pad(edge, ((0, 0), (0, 1))) | np.pad(edge, ((0, 0), (1, 0)))
+    nearer_px[beside & (disparity_px == WALL_PX)] = OBJECT_PX - WALL_PX
+    hidden_px, colours = np.empty_like(disparity_px), np.zeros_like(photo)
+    uncover(photo, disparity_px, nearer_px, other_px, side, hidden_px, colours, 0, len(photo))
+    return hidden_px, colours
+
+
+def stripes(period, height=8):
+    """Vertical stripes, a column each of a shade of its own."""
+    shades = np.tile(40 * np.arange(period, dtype=np.uint8), 60)[:60]
+    return np.repeat(np.tile(shades, (height, 1))[..., None], 3, axis=2)
+
+
+def test_the_wall_goes_on_behind_the_object_as_far_as_a_camera_one_baseline_away_looks():
+    left, _, maps = wall_with_object(stripes(4))
+    hidden_px, _ = uncovered(left, *maps, -1)
+    # From the object's rim, 19, to 8 px behind its border, and one more. The right camera sees 38 and more.
+    expected = np.full((8, 60), NOTHING)
+    expected[:, 19:29] = WALL_PX
+    np.testing.assert_array_equal(hidden_px, expected)
+
+
+def test_what_the_other_camera_sees_is_not_hidden():
+    left, _, maps = wall_with_object(stripes(4))
+    maps[1, :, 22 - WALL_PX] = WALL_PX  # the right camera looks through a slit
+    hidden_px, _ = uncovered(left, *maps, -1)
+    assert (hidden_px[:, 22] == NOTHING).all()
+    assert (hidden_px[:, [21, 23]] == WALL_PX).all()
+
+
+@pytest.mark.parametrize("period", [3, 4, 5])
+def test_stripes_go_on_in_step(period):
+    wall = stripes(period)
+    left, _, maps = wall_with_object(wall)
+    hidden_px, colours = uncovered(left, *maps, -1)
+    hidden = hidden_px > NOTHING
+    # The first row has none above it to follow.
+    np.testing.assert_array_equal(colours[1:][hidden[1:]], wall[1:][hidden[1:]])
+
+
+def test_rows_of_one_colour_go_on(rng):
+    wall = np.tile(rng.integers(0, 200, (8, 1, 3), dtype=np.uint8), (1, 60, 1))
+    left, _, maps = wall_with_object(wall)
+    hidden_px, colours = uncovered(left, *maps, -1)
+    np.testing.assert_array_equal(colours[hidden_px > NOTHING], wall[hidden_px > NOTHING])
+
+
+def test_colours_are_the_walls_and_never_the_objects(rng):
+    wall = rng.integers(0, 200, (12, 60, 3), dtype=np.uint8)
+    left, right, maps = wall_with_object(wall)
+    for photo, own, other, side in ((left, 0, 1, -1), (right, 1, 0, 1)):
+        hidden_px, colours = uncovered(photo, maps[own], maps[other], side)
+        seen = {tuple(colour) for colour in photo[maps[own] == WALL_PX]}
+        assert (hidden_px > NOTHING).sum() == 120
+        assert {tuple(colour) for colour in colours[hidden_px > NOTHING]} <= seen
+
+
+def test_the_right_photograph_mirrored_gives_what_the_left_one_gives(rng):
+    wall = rng.integers(0, 200, (9, 60, 3), dtype=np.uint8)
+    left, _, maps = wall_with_object(wall)
+    expected = uncovered(left, *maps, -1)[0]
+    found = uncovered(*(np.ascontiguousarray(x[:, ::-1]) for x in (left, *maps)), 1)[0]
+    np.testing.assert_array_equal(found[:, ::-1], expected)
+
+
+def test_what_is_invented_stays_the_same_from_view_to_view(rng):
+    wall = rng.integers(0, 200, (9, 60, 3), dtype=np.uint8)
+    left, right, maps = wall_with_object(wall)
+    estimate = Estimate(
+        disparity_px=maps[0],
+        right_disparity_px=maps[1],
+        confidence=np.ones_like(maps[0]),
+        occluded=np.zeros(maps[0].shape, bool),
+    )
+    renderer = Renderer(StereoPair(left=left, right=right), estimate)
+    near, far = renderer.view(-0.5), renderer.view(-1.0)
+    # The wall is at x + 1 and at x + 2, the object's border at 25 and at 30.
+    assert not near.drawn[:, 21:25].any()
+    assert not far.drawn[:, 22:30].any()
+    np.testing.assert_array_equal(near.image[:, 21:25], far.image[:, 22:26])
+
+
+def test_a_plain_picture_hides_nothing():
+    flat = np.full((4, 60), WALL_PX, np.float32)
+    hidden_px, _ = uncovered(stripes(4, 4), flat, flat, -1)
+    assert (hidden_px == NOTHING).all()
