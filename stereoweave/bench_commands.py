@@ -1,17 +1,21 @@
-"""The commands stereoweave bench pairs | networks | speed | costs | paper | exponent | ablations."""
+"""The commands stereoweave bench pairs | views | networks | speed | costs | paper | exponent | ablations."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from stereoweave.command_line import Threads, needing_the_train_extra, place_for
-
-if TYPE_CHECKING:
-    from stereoweave.benchmark import Row
+from stereoweave.command_line import (
+    Model,
+    Threads,
+    load_matcher,
+    needing_the_synth_extra,
+    needing_the_train_extra,
+    place_for,
+)
 
 # What stereoweave bench pairs shows of its rows, by heading and column.
 PAIRS_TABLES = {
@@ -31,6 +35,26 @@ PAIRS_TABLES = {
         "AUSE px": "ause_px",
         "AUSE %": "ause_bad1_percent",
         "calibr. error": "calibration_error",
+    },
+}
+
+# The same of stereoweave bench views.
+VIEWS_TABLES = {
+    "New views, PSNR in dB, mean over the scenes": {
+        "all": "psnr_db",
+        "smooth": "smooth_psnr_db",
+        "edges": "edge_psnr_db",
+        "one sees": "one_psnr_db",
+        "neither": "neither_psnr_db",
+        "ms": "time_ms",
+    },
+    "New views, mean absolute error in levels of 0..255, and SSIM": {
+        "all": "mae",
+        "smooth": "smooth_mae",
+        "edges": "edge_mae",
+        "one sees": "one_mae",
+        "neither": "neither_mae",
+        "SSIM": "ssim",
     },
 }
 
@@ -100,8 +124,58 @@ def pairs(  # noqa: PLR0913 - each is a word of the command line
         benchmark_plots.draw_sparsification(
             sparsification, {name: scores.curves[name] for name in (*makers, SGBM)}
         )
-    _tell_rows(means)
+    _tell_means(PAIRS_TABLES, "matcher", means)
     typer.echo(f"rows: {out}")
+
+
+@bench.command()
+def views(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            help="Holds a folder a scene, of left.png, right.png and view_<position>.png; or what "
+            "synth make --view made."
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("views.csv"),
+    model: Annotated[
+        list[str] | None,
+        typer.Option(help="As for depth; may be given again. All shipped networks unless given."),
+    ] = None,
+    threads: Threads = None,
+) -> None:
+    """Errors of new views against pictures taken there: all pixels, smooth ones, depth edges, hidden ones."""
+    import cv2
+
+    from stereoweave.benchmark import MEAN, write_csv
+    from stereoweave.data.view_sets import read_view_scenes
+    from stereoweave.matcher import shipped_models
+    from stereoweave.threads import thread_count
+    from stereoweave.view_scores import score_scenes
+
+    place_for(out)
+    scenes = read_view_scenes(folder)
+    cv2.setNumThreads(thread_count(threads))
+    matches = {name: load_matcher(name, threads).estimate for name in model or shipped_models()}
+    rows = score_scenes(matches, scenes, threads)
+    write_csv(out, rows)
+    _tell_means(VIEWS_TABLES, "method", [row for row in rows if row.scene == MEAN])
+    typer.echo(f"rows: {out}")
+
+
+@bench.command()
+def flicker(
+    scenes: Annotated[list[str], typer.Argument(metavar="SCENE...", help="As for synth make.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("flicker.csv"),
+    model: Model = "small",
+    frames: Annotated[int, typer.Option(min=3, help="Of each film.")] = 12,
+    threads: Threads = None,
+) -> None:
+    """What steadying is worth: flicker and errors of depth with it and without, on rendered noisy films."""
+    place_for(out)
+    with needing_the_synth_extra():
+        from stereoweave.flicker_bench import flicker_rows
+    _write_and_tell(out, "Rendered films", list(flicker_rows(scenes, model, frames=frames, threads=threads)))
 
 
 @bench.command()
@@ -245,17 +319,25 @@ def _experiment(  # noqa: PLR0913 - the words of two command lines
     typer.echo(f"tables: {report / 'paper.md'}")
 
 
-def _tell_rows(rows: "list[Row]") -> None:
-    """Print the means in two tables, since one would be wider than a terminal."""
+def _tell_means(tables: Mapping[str, Mapping[str, str]], who: str, rows: Sequence[Any]) -> None:
+    """Print rows in several tables, since one would be wider than a terminal.
+
+    Args:
+        tables: By title, the columns' fields by heading.
+        who: The field that names a row.
+        rows: Dataclasses of one kind.
+    """
     from rich.console import Console
     from rich.table import Column, Table
 
-    for title, columns in PAIRS_TABLES.items():
+    for title, columns in tables.items():
         numbers = (Column(name, justify="right") for name in columns)
-        table = Table(Column("matcher", no_wrap=True), *numbers, title=title)
+        table = Table(Column(who, no_wrap=True), *numbers, title=title)
         for row in rows:
             cells = [getattr(row, field) for field in columns.values()]
-            table.add_row(Path(row.matcher).name, *("–" if math.isnan(x) else f"{x:.2f}" for x in cells))
+            table.add_row(
+                Path(getattr(row, who)).name, *("–" if math.isnan(x) else f"{x:.2f}" for x in cells)
+            )
         Console().print(table)
 
 

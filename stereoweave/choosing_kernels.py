@@ -125,16 +125,21 @@ def _gap_px(side, y, u, d):
 @typing.no_type_check
 def _mismatch_levels(left, right, y, u, d):
     """How the photographs differ over three pixels around u if d is right: the channels' sum; -1 outside."""
-    last = left.photo.shape[1] - 1
+    left_photo, right_photo = left.photo[y], right.photo[y]
+    last = left_photo.shape[0] - 1
     total, count = 0.0, 0
     for column in range(u - 1, u + 2):
-        x_left = _column(left.shift, left.offset_px, column, d)
-        x_right = _column(right.shift, right.offset_px, column, d)
-        if min(x_left, x_right) >= 0 and max(x_left, x_right) <= last:
-            for channel in range(3):
-                there = linear(right.photo[y, :, channel], x_right)
-                total += abs(linear(left.photo[y, :, channel], x_left) - there)
-            count += 1
+        x = _column(left.shift, left.offset_px, column, d)
+        z = _column(right.shift, right.offset_px, column, d)
+        if min(x, z) < 0 or max(x, z) > last:
+            continue
+        i, k = int(x), int(z)
+        j, m = min(i + 1, last), min(k + 1, last)
+        count += 1
+        for channel in range(3):
+            here = (1 - x + i) * left_photo[i, channel] + (x - i) * left_photo[j, channel]
+            there = (1 - z + k) * right_photo[k, channel] + (z - k) * right_photo[m, channel]
+            total += abs(here - there)
     return total / count if count else -1.0
 
 

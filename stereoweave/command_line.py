@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import StereoweaveError, needing_extra
 
 if TYPE_CHECKING:
     from stereoweave.matcher import Matcher
@@ -61,10 +61,12 @@ def place_for(*files: Path) -> Path:
 @contextmanager
 def needing_the_train_extra(what: str = "this command needs PyTorch and its company") -> Iterator[None]:
     """Turns the lack of a library into one line that names the extra."""
-    try:
+    with needing_extra("train", what):
         yield
-    except ModuleNotFoundError as missing:
-        raise StereoweaveError(
-            f"{what}, found no module {missing.name}; "
-            "install the extra 'train': pip install 'stereoweave[train]', from the wheel or the copy you have"
-        ) from missing
+
+
+@contextmanager
+def needing_the_synth_extra() -> Iterator[None]:
+    """As `needing_the_train_extra`."""
+    with needing_extra("synth", "this command needs what renders"):
+        yield

@@ -1,5 +1,8 @@
 """The errors that a caller may want to catch; each is a ValueError, and says what to do."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class StereoweaveError(ValueError):
     """What was handed in cannot be worked with."""
@@ -11,3 +14,15 @@ class FormatError(StereoweaveError):
 
 class MatcherError(StereoweaveError):
     """A matcher that is unknown, or an ONNX file that is none."""
+
+
+@contextmanager
+def needing_extra(extra: str, what: str) -> Iterator[None]:
+    """Turns a missing library into one line that says what needs it, and which extra has it."""
+    try:
+        yield
+    except ModuleNotFoundError as missing:
+        raise StereoweaveError(
+            f"{what}, found no module {missing.name}; install the extra '{extra}': "
+            f"pip install 'stereoweave[{extra}]', from the wheel or the copy you have"
+        ) from missing

@@ -5,6 +5,9 @@ import typing
 
 from stereoweave.rendering_kernels import NOTHING, SAME_SURFACE_PX, compiled, kernel
 
+NARROW_PX = 8
+"""A hole of at most so many pixels needs no texture."""
+
 
 @kernel
 @typing.no_type_check
@@ -47,9 +50,11 @@ def _mix(hidden_px, colours, x, beyond, colour):
 @kernel
 @typing.no_type_check
 def fill(canvas):
-    """Give every run of pixels that are still not pure what is seen beside its farther end, mirrored there.
+    """Give every run of pixels that are still not pure what is seen beside its farther end.
 
-    Where the picture ends there is one end only. As in `lay`, a farther pixel on the rim keeps its colour.
+    That is one mean colour for a narrow run, which errs least. A wide one shows texture, mirrored at that
+    end, and so does one at the picture's border, which has one end only. As in `lay`, a farther pixel on the
+    rim keeps its colour.
     """
     surface_px, pure, drawn = canvas.surface_px, canvas.pure, canvas.drawn
     height, width = pure.shape
@@ -65,21 +70,42 @@ def fill(canvas):
                 end += 1
             from_left = end == width or (start > 0 and surface_px[y, start - 1] <= surface_px[y, end])
             source = start - 1 if from_left else end
+            mirrors = start == 0 or end == width or end - start > NARROW_PX
             if source >= 0:
+                colour = _mean_beside(canvas, y, source, -1 if from_left else 1)
                 for u in range(start, end):
                     if not drawn[y, u] or surface_px[y, u] >= surface_px[y, source] - SAME_SURFACE_PX:
-                        _mirror(canvas, y, u, source)
-                        drawn[y, u] = False
+                        _write(canvas, y, u, source, colour, mirrors)
             start = end
 
 
 @compiled
 @typing.no_type_check
-def _mirror(canvas, y, u, source):
-    """Write what lies as far beyond the source as u lies before it, if of its surface; else the source."""
+def _mean_beside(canvas, y, column, inwards):
+    """The mean colour of the surface at (y, column): two columns of three rows, its own counting twice."""
+    height, width = canvas.pure.shape
+    here_px = canvas.surface_px[y, column]
+    red = green = blue = total = 0.0
+    for row in range(max(y - 1, 0), min(y + 2, height)):
+        for x in (column, min(max(column + inwards, 0), width - 1)):
+            if canvas.pure[row, x] and abs(canvas.surface_px[row, x] - here_px) <= SAME_SURFACE_PX:
+                weight = 2.0 if row == y else 1.0
+                red += weight * canvas.image[row, x, 0]
+                green += weight * canvas.image[row, x, 1]
+                blue += weight * canvas.image[row, x, 2]
+                total += weight
+    return red / total + 0.5, green / total + 0.5, blue / total + 0.5
+
+
+@compiled
+@typing.no_type_check
+def _write(canvas, y, u, source, colour, mirrors):
+    """Write a colour, or what lies as far beyond the source as u lies before it if that is of its surface."""
     width = canvas.pure.shape[1]
     mirrored = min(max(2 * source - u, 0), width - 1)
     apart_px = abs(canvas.surface_px[y, mirrored] - canvas.surface_px[y, source])
-    like = mirrored if canvas.pure[y, mirrored] and apart_px <= SAME_SURFACE_PX else source
-    for channel in range(3):
-        canvas.image[y, u, channel] = canvas.image[y, like, channel]
+    if mirrors and canvas.pure[y, mirrored] and apart_px <= SAME_SURFACE_PX:
+        canvas.image[y, u] = canvas.image[y, mirrored]
+    else:
+        canvas.image[y, u, 0], canvas.image[y, u, 1], canvas.image[y, u, 2] = colour
+    canvas.surface_px[y, u], canvas.drawn[y, u] = canvas.surface_px[y, source], False

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.stereo import Estimate, StereoPair, View
+from stereoweave.exposure import match_exposure, recoloured
+from stereoweave.stereo import Estimate, StereoCamera, StereoPair, View
 from stereoweave.threads import thread_count
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ _MOST_THREADS = 4
 _LEAST_NEARNESS = 1e-3
 # What is hidden is found in bands of about this many rows, however many threads there are.
 _BAND_ROWS = 60
+_FARTHEST_MOVE = 1.0
 
 
 class Renderer:
@@ -48,46 +50,63 @@ class Renderer:
         self._threads = min(_MOST_THREADS, thread_count(threads))
         maps_px = estimate.disparity_px, estimate.right_disparity_px
         with ThreadPoolExecutor(self._threads) as pool:
+            looks = pool.submit(match_exposure, pair.left, pair.right, estimate)
             self._sides = tuple(pool.map(_side, (pair.left, pair.right), maps_px))
+        self._looks = looks.result()
         self._hidden: dict[bool, Hidden] = {}
         self._confidence = np.require(estimate.confidence, np.float32, ["C", "W"])
 
-    def view(self, position: float) -> View:
-        """The view from a position: 0 is the left camera, 1 the right one; see `render`."""
+    def view(self, position: float, *, up: float = 0.0, forward: float = 0.0) -> View:
+        """The view from a position: 0 is the left camera, 1 the right one; see `render`.
+
+        Args:
+            position: -1 to 2 after `strength`.
+            up: How far above the line through the cameras, in baselines; -1 to 1.
+            forward: How far before it, in baselines; -1 to 1.
+        """
         position = 0.5 + self.strength * (position - 0.5)
-        check_position(position)
-        if position in (0, 1) and not self.convergence_px:
+        check_position(position, up=up, forward=forward)
+        moves = bool(self.convergence_px or up or forward)
+        if position in (0, 1) and not moves:
             photo = self.pair.right if position else self.pair.left
             return View(image=photo.copy(), drawn=np.ones(photo.shape[:2], bool))
-        return self._rendered(float(position))
+        canvas = self._drawn(float(position))
+        if up or forward:
+            from stereoweave.moving import moved
 
-    def _rendered(self, position: float) -> View:
+            camera = self.pair.camera or _assumed_camera(self.pair)
+            offset_px = (position - 0.5) * self.convergence_px + position * camera.doffs_px
+            canvas = moved(canvas, camera, offset_px, up, forward)
+        return View(image=canvas.image, drawn=canvas.drawn)
+
+    def _drawn(self, position: float) -> "Canvas":
+        """The view from the line through the cameras, filled."""
         from stereoweave.drawing_kernels import draw  # Numba takes half a second to import
         from stereoweave.filling_kernels import fill, lay
+        from stereoweave.rendering_kernels import empty_canvas
 
         shares = abs(1 - position), abs(position)
+        tables = self._looks.tables(position) if self._looks else (None, None)
+        photos = [_photo(side.photo, table) for side, table in zip(self._sides, tables, strict=True)]
         left, right = (
             side._replace(
+                **photo,
                 shift=end - position,
                 offset_px=(position - 0.5) * self.convergence_px,
                 # Not 0, because the other camera alone sees some things.
                 nearness=max(share / sum(shares), _LEAST_NEARNESS),
             )
-            for side, end, share in zip(self._sides, (0, 1), shares, strict=True)
+            for side, photo, end, share in zip(self._sides, photos, (0, 1), shares, strict=True)
         )
-        canvas = _canvas(self.pair.left if position < 0.5 else self.pair.right)
-        _in_bands(
-            partial(draw, left, right, self._confidence, canvas),
-            len(canvas.image),
-            self._threads,
-            self._threads,
-        )
+        canvas = empty_canvas((left if position < 0.5 else right).photo)
+        work = partial(draw, left, right, self._confidence, canvas)
+        _in_bands(work, len(canvas.image), self._threads, self._threads)
         if not 0 <= position <= 1:
             # In between, what neither camera saw is a few pixels wide; `fill` is quicker, and does as well.
             hidden = self._behind(right=position > 1)
             lay(*hidden, (right if position > 1 else left).shift, left.offset_px, canvas)
         fill(canvas)
-        return View(image=canvas.image, drawn=canvas.drawn)
+        return canvas
 
     def _behind(self, right: bool) -> "Hidden":
         """What is hidden from both cameras, and seen from beyond the right one or the left one."""
@@ -103,20 +122,29 @@ class Hidden(NamedTuple):
     colours: np.ndarray
 
 
-def render(
+def render(  # noqa: PLR0913 - each is a choice of the caller's
     left: UInt8[np.ndarray, "h w 3"],
     right: UInt8[np.ndarray, "h w 3"],
     estimate: Estimate,
     position: float,
     threads: int | None = None,
+    *,
+    strength: float = 1.0,
+    convergence_px: float = 0.0,
+    up: float = 0.0,
+    forward: float = 0.0,
+    camera: StereoCamera | None = None,
 ) -> View:
-    """The view from a position on the line through the two cameras, made of both photographs.
+    """The view from a position on the line through the two cameras, or beside it, made of both photographs.
 
     Both disparity maps are splatted to the new view, where the nearer surface wins. Each pixel takes its
     colour from the place of its surface in both photographs, weighted by how near their cameras are, and by
     whether their own disparity agrees: it does not where the camera's sight is blocked. Where the two maps
-    contradict each other, confidence and the photographs' agreement decide. What neither camera saw is filled
-    from the farther side of the gap.
+    contradict each other, confidence and the photographs' agreement decide. What neither camera saw goes on
+    from the farther side of the gap. Photographs that differ in exposure or colour are brought to one look:
+    that of the left one at 0, that of the right one at 1, and in between on the way.
+
+    For many views of one pair make a `Renderer`.
 
     Args:
         left: The left photograph, uint8 RGB [H, W, 3].
@@ -124,6 +152,12 @@ def render(
         estimate: Of these two photographs (`stereoweave.estimate`).
         position: 0 is the left camera, 1 the right one; -1 to 2.
         threads: How many threads may be used, of which four at most are; all cores if left out.
+        strength: Multiplies the baseline about the middle, as for `Renderer`.
+        convergence_px: The disparity of the plane that stays in place from view to view.
+        up: How far above the line through the cameras, in baselines; -1 to 1.
+        forward: How far before it, in baselines; -1 to 1.
+        camera: For `forward` and `up`, which take its focal length, centre and doffs; without one, the focal
+            length is taken to be the picture's width.
 
     Returns:
         The view, of the photographs' size; `drawn` is False where the colour was invented. At 0 and 1 it is
@@ -132,15 +166,22 @@ def render(
     Raises:
         ValueError: If the sizes differ, or a number is out of its range.
     """
-    return Renderer(StereoPair(left=left, right=right), estimate, threads=threads).view(position)
+    pair = StereoPair(left=left, right=right, camera=camera)
+    renderer = Renderer(pair, estimate, strength=strength, convergence_px=convergence_px, threads=threads)
+    return renderer.view(position, up=up, forward=forward)
 
 
-def check_position(position: float) -> None:
-    """Raise a ValueError unless views can be rendered at that position."""
+def check_position(position: float, *, up: float = 0.0, forward: float = 0.0) -> None:
+    """Raise a ValueError unless views can be rendered from there."""
     if not FIRST_POSITION <= position <= LAST_POSITION:
         raise StereoweaveError(
             f"position: expected {FIRST_POSITION} to {LAST_POSITION} (0 left camera, 1 right), got {position}"
         )
+    for name, value in (("up", up), ("forward", forward)):
+        if not abs(value) <= _FARTHEST_MOVE:
+            raise StereoweaveError(
+                f"{name}: expected -{_FARTHEST_MOVE:g} to {_FARTHEST_MOVE:g} (baselines), got {value}"
+            )
 
 
 def _check_size(pair: StereoPair, estimate: Estimate) -> None:
@@ -170,6 +211,22 @@ def _side(photo: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarray, "h 
     )
 
 
+def _photo(
+    photo: UInt8[np.ndarray, "h w 3"], table: Float[np.ndarray, "256 3"] | None
+) -> dict[str, np.ndarray]:
+    """A side's photograph and its grey levels in another look; nothing without a table."""
+    if table is None:
+        return {}
+    coloured = recoloured(photo, table)
+    return {"photo": coloured, "grey": cv2.cvtColor(coloured, cv2.COLOR_RGB2GRAY)}
+
+
+def _assumed_camera(pair: StereoPair) -> StereoCamera:
+    """A camera of 53 degrees of view, whose principal point is the picture's centre."""
+    height, width = pair.left.shape[:2]
+    return StereoCamera(focal_px=width, baseline_m=1.0, cx_px=(width - 1) / 2, cy_px=(height - 1) / 2)
+
+
 def _uncovered(sides: "Sequence[Side]", right: bool, threads: int) -> Hidden:
     """What is behind the foreground of the right photograph, or of the left one, for views from beyond it."""
     from stereoweave.hidden_kernels import uncover
@@ -182,19 +239,6 @@ def _uncovered(sides: "Sequence[Side]", right: bool, threads: int) -> Hidden:
     height = len(own.photo)
     _in_bands(partial(uncover, *known, *hidden), height, -(-height // _BAND_ROWS), threads)
     return hidden
-
-
-def _canvas(photo: UInt8[np.ndarray, "h w 3"]) -> "Canvas":
-    """An empty canvas; where a whole row finds no colour, this photograph will show."""
-    from stereoweave.rendering_kernels import Canvas
-
-    size = photo.shape[:2]
-    return Canvas(
-        surface_px=np.empty(size, np.float32),
-        image=photo.copy(),
-        pure=np.empty(size, bool),
-        drawn=np.ones(size, bool),
-    )
 
 
 def _in_bands(work: Callable[[int, int], None], height: int, count: int, threads: int) -> None:

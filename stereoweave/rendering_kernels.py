@@ -64,6 +64,17 @@ class Canvas(typing.NamedTuple):
     drawn: np.ndarray
 
 
+def empty_canvas(photo: np.ndarray) -> Canvas:
+    """A canvas that shows a photograph, uint8 RGB [H, W, 3], until it is drawn on; some rows never are."""
+    size = photo.shape[:2]
+    return Canvas(
+        surface_px=np.full(size, NOTHING, np.float32),
+        image=photo.copy(),
+        pure=np.zeros(size, bool),
+        drawn=np.ones(size, bool),
+    )
+
+
 class Row(typing.NamedTuple):
     """What is known about a row of the new view before it is painted; arrays are float32 [W].
 
@@ -111,8 +122,8 @@ def kernel(function: Callable[..., None]) -> Callable[..., None]:
 
 
 # Where a row is worked on as a whole, it is in float32 and without branches, so that the compiler makes
-# vector instructions of it: three times as fast. `inlined` helpers take arrays, not a Side, because Numba would
-# count references to all of its arrays at every pixel.
+# vector instructions of it: three times as fast. `inlined` helpers take arrays, not a Side, because Numba
+# would count references to all of its arrays at every pixel.
 compiled = njit(**_SETTINGS)
 inlined = njit(forceinline=True, **_SETTINGS)
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)

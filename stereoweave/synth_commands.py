@@ -2,13 +2,12 @@
 
 import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from stereoweave.command_line import needing_the_synth_extra
 from stereoweave.errors import StereoweaveError
 
 synth = typer.Typer(help="Rendered stereo with exact ground truth: make it, check it, look at it.")
@@ -36,7 +35,7 @@ def make(  # noqa: PLR0913 - each is a word of the command line
     frames: Annotated[int, typer.Option(min=1, help="Pairs in a row as a film, from a moving camera.")] = 1,
     view: Annotated[
         list[float] | None,
-        typer.Option(help="A further picture, 0.5 from half way, -0.5 to 1.5; again for more."),
+        typer.Option(help="A further picture, 0.5 from half way, -1 to 2; again for more."),
     ] = None,
     rig: Annotated[
         tuple[float, float] | None,
@@ -51,7 +50,7 @@ def make(  # noqa: PLR0913 - each is a word of the command line
     ] = None,
 ) -> None:
     """Make a set of rendered pairs, or go on with one that was stopped or shall have more."""
-    with _needing_the_synth_extra():
+    with needing_the_synth_extra():
         from stereoweave.synth.making import RenderingStudio
         from stereoweave.synth.making import make as make_set
         from stereoweave.synth.samples import Order
@@ -65,7 +64,7 @@ def make(  # noqa: PLR0913 - each is a word of the command line
 @synth.command()
 def check(folder: Annotated[Path, typer.Argument(help="What synth make made.")], jobs: Jobs = None) -> None:
     """Check a set: checksums, disparity against the pictures, statistics; exit status 1 if one is wrong."""
-    with _needing_the_synth_extra():
+    with needing_the_synth_extra():
         from stereoweave.synth.checking import check as check_set
         from stereoweave.synth.checking import lines
 
@@ -87,7 +86,7 @@ def sheet(
     from stereoweave.io import picture_kind, write_image
 
     picture_kind(out)
-    with _needing_the_synth_extra():
+    with needing_the_synth_extra():
         from stereoweave.synth import contact_sheet
         from stereoweave.synth.making import camera
         from stereoweave.synth.scenes import SCENES
@@ -108,7 +107,7 @@ def costs(
     """Measure what each effect of the renderer costs: milliseconds of one core for a pair of 640x480."""
     # As in `make`: Mesa reads it when the renderer starts.
     os.environ["LP_NUM_THREADS"] = "1"
-    with _needing_the_synth_extra():
+    with needing_the_synth_extra():
         from stereoweave.synth.costs import costs as measured
     for cost in measured(scene, pairs):
         typer.echo(f"{cost.ms_a_pair:6.0f} ms  {cost.effect}")
@@ -125,14 +124,3 @@ def _jobs(jobs: int | None) -> int:
     from stereoweave.threads import usable_cores
 
     return jobs or usable_cores()
-
-
-@contextmanager
-def _needing_the_synth_extra() -> Iterator[None]:
-    try:
-        yield
-    except ModuleNotFoundError as missing:
-        raise StereoweaveError(
-            f"this command needs what renders, found no module {missing.name}; "
-            "install the extra 'synth': pip install 'stereoweave[synth]', from the wheel or the copy you have"
-        ) from missing

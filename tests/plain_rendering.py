@@ -20,7 +20,7 @@ class PlainSide(NamedTuple):
 
 
 def plain_rendering(left, right, estimate, position, convergence_px=0.0):
-    """Image and drawn of `stereoweave.render`, and where the colours are pure, for positions other than 0 and 1.
+    """Image and drawn of `stereoweave.render`, and where colours are pure, for positions other than 0 and 1.
 
     Beyond the cameras, pixels that are not pure are left to others: this fills them as in between.
     """
@@ -231,20 +231,39 @@ def plain_colours(sides, front, back, share, front_supports):
 
 
 def plain_fill(image, seen, pure):
-    """Image and drawn; what is not pure shows what is beside the farther end of its run, mirrored there."""
+    """Image and drawn; what is not pure shows what is beside the farther end of its run.
+
+    A narrow run shows a mean; others what is mirrored there, if that is of the same surface.
+    """
     height, width = pure.shape
     filled, drawn = image.copy(), np.isfinite(seen)
     for y in range(height):
         known = np.flatnonzero(pure[y])
         for x in np.flatnonzero(~pure[y]):
-            ends = [*known[known < x][-1:], *known[known > x][:1]]
+            before, after = known[known < x][-1:], known[known > x][:1]
+            ends = [(end, -1) for end in before] + [(end, 1) for end in after]
             if not ends:
                 continue
-            source = min(ends, key=lambda end: seen[y, end])
+            source, inwards = min(ends, key=lambda end: seen[y, end[0]])
             if drawn[y, x] and seen[y, x] < seen[y, source] - SAME_SURFACE_PX:
                 continue
+            narrow = len(ends) == 2 and after[0] - before[0] - 1 <= 8
             mirrored = min(max(2 * source - x, 0), width - 1)
             same = pure[y, mirrored] and abs(seen[y, mirrored] - seen[y, source]) <= SAME_SURFACE_PX
-            filled[y, x] = image[y, mirrored if same else source]
+            beside = mean_beside(image, seen, pure, y, source, inwards)
+            filled[y, x] = image[y, mirrored] if same and not narrow else beside
             drawn[y, x] = False
     return filled, drawn
+
+
+def mean_beside(image, seen, pure, y, source, inwards):
+    height, width = pure.shape
+    rows = [row for row in (y - 1, y, y, y + 1) if 0 <= row < height]
+    columns = [source, min(max(source + inwards, 0), width - 1)]
+    beside = [
+        image[row, column]
+        for row in rows
+        for column in columns
+        if pure[row, column] and abs(seen[row, column] - seen[y, source]) <= SAME_SURFACE_PX
+    ]
+    return np.floor(np.mean(beside, axis=0) + 0.5)

@@ -2,6 +2,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,8 @@ def make_estimate(disparity_px, right_disparity_px, confidence=None):
         disparity_px=disparity_px.astype(np.float32),
         right_disparity_px=right_disparity_px.astype(np.float32),
         confidence=confidence.astype(np.float32),
-        occluded=np.zeros(disparity_px.shape, bool),
+        # Where nothing is seen by both, the photographs are not brought to one look: tests look at levels.
+        occluded=np.ones(disparity_px.shape, bool),
     )
 
 
@@ -323,3 +325,15 @@ def test_importing_the_package_or_the_renderer_does_not_import_numba():
         subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
         == "False\n"
     )
+
+
+def test_photographs_of_different_exposure_make_one_look_on_the_way_from_one_to_the_other(rng):
+    coarse = rng.integers(20, 200, (12, 16, 3)).astype(np.uint8)
+    left = np.repeat(np.repeat(coarse, 8, axis=0), 8, axis=1)
+    brighter = np.rint(left * 1.2).astype(np.uint8)
+    flat_px = np.zeros(left.shape[:2], np.float32)
+    seen = replace(make_estimate(flat_px, flat_px), occluded=np.zeros(flat_px.shape, bool))
+    for position in (0.25, 0.5, 0.75):
+        view = render(left, brighter, seen, position)
+        expected = left * (1 + 0.2 * position)
+        assert np.abs(view.image - expected).mean() < 1

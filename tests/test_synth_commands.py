@@ -114,7 +114,7 @@ def test_the_costs_of_the_effects_are_told_in_milliseconds(monkeypatch, capsys):
         ),
         ("synth make pylon --pairs 1 --size 99999x32 -o set", "--size: expected 32 to 4096 px a side"),
         ("synth make pylon --pairs 1 --size ６４x４８ -o set", "--size: expected width x height"),
-        ("synth make pylon --pairs 1 --view 1.6 -o set", "view: expected positions of -0.5 "),
+        ("synth make pylon --pairs 1 --view 2.1 -o set", "view: expected positions of -1.0 "),
         ("synth make pylon --pairs 1 --view 0.5 --view 0.5 -o set", "view: expected positions that differ"),
         ("synth make pylon --pairs 1 --rig 0 0.2 -o set", "focal_px and baseline_m must be positive"),
         ("synth make pylon --pairs 1 --layout zip -o set", "layout: expected one of shards, paper"),
