@@ -5,11 +5,10 @@ import typing
 
 import numpy as np
 
+from stereoweave.compiling import compiled, inlined
 from stereoweave.rendering_kernels import (
     NOTHING,
     SAME_SURFACE_PX,
-    compiled,
-    inlined,
     lies_on,
     linear,
     support_at,

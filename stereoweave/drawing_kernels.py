@@ -5,8 +5,9 @@ import typing
 import numpy as np
 
 from stereoweave.choosing_kernels import choose_row
+from stereoweave.compiling import compiled, kernel
 from stereoweave.painting_kernels import WINDOW_REACH_PX, align_row, compare_row, paint_row
-from stereoweave.rendering_kernels import Row, compiled, kernel, splat_row
+from stereoweave.rendering_kernels import Row, splat_row
 
 _RING = 2 * WINDOW_REACH_PX + 1
 

@@ -3,7 +3,8 @@
 import math
 import typing
 
-from stereoweave.rendering_kernels import NOTHING, SAME_SURFACE_PX, compiled, kernel
+from stereoweave.compiling import compiled, kernel
+from stereoweave.rendering_kernels import NOTHING, SAME_SURFACE_PX
 
 NARROW_PX = 8
 """A hole of at most so many pixels needs no texture."""

@@ -11,7 +11,8 @@ import typing
 
 import numpy as np
 
-from stereoweave.rendering_kernels import NOTHING, SAME_SURFACE_PX, compiled, inlined, kernel
+from stereoweave.compiling import compiled, inlined, kernel
+from stereoweave.rendering_kernels import NOTHING, SAME_SURFACE_PX
 
 RIM_PX = 1
 """So far from a border the background's pixels may carry the foreground's colour."""

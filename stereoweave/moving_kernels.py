@@ -5,7 +5,8 @@ import typing
 
 import numpy as np
 
-from stereoweave.rendering_kernels import SAME_SURFACE_PX, compiled, kernel
+from stereoweave.compiling import compiled, kernel
+from stereoweave.rendering_kernels import SAME_SURFACE_PX
 
 
 @kernel

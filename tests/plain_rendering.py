@@ -24,7 +24,7 @@ def plain_rendering(left, right, estimate, position, convergence_px=0.0):
 
     Beyond the cameras, pixels that are not pure are left to others: this fills them as in between.
     """
-    near, far = abs(1 - position), abs(position)
+    near, far = abs(1 - position) ** 0.5, abs(position) ** 0.5
     offset_px = (position - 0.5) * convergence_px
     sides = (
         PlainSide(

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from stereoweave.compiling import cache_folder
 from stereoweave.errors import StereoweaveError
-from stereoweave.rendering_kernels import cache_folder
 from stereoweave.synth.procedures import (
     cloth,
     ground,
