@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,6 +18,8 @@ from stereoweave.command_line import (
     place_for,
 )
 
+# What is added to a network's name where `refining` comes after it.
+REFINED = " refined"
 # What stereoweave bench pairs shows of its rows, by heading and column.
 PAIRS_TABLES = {
     "Errors, mean over the scenes": {
@@ -94,8 +97,6 @@ def pairs(  # noqa: PLR0913 - each is a word of the command line
     threads: Threads = None,
 ) -> None:
     """Errors, edges, confidence, time and memory of networks and OpenCV's matchers on known disparity."""
-    from functools import partial
-
     import cv2
 
     from stereoweave.benchmark import MEAN, network, score_pairs, with_memory, write_csv
@@ -113,7 +114,10 @@ def pairs(  # noqa: PLR0913 - each is a word of the command line
             from stereoweave import benchmark_plots
     scenes = read_scenes(folder, dataset)
     cv2.setNumThreads(thread_count(threads))
-    makers = {name: partial(network, name, threads) for name in model or shipped_models()}
+    makers = {}
+    for name in model or shipped_models():
+        makers[name] = partial(network, name, threads)
+        makers[name + REFINED] = partial(network, name, threads, refined=True)
     scores = score_pairs(makers, scenes)
     rows = with_memory(scores.rows, makers, scores.largest)
     write_csv(out, rows)
@@ -156,7 +160,10 @@ def views(
     place_for(out)
     scenes = read_view_scenes(folder)
     cv2.setNumThreads(thread_count(threads))
-    matches = {name: load_matcher(name, threads).estimate for name in model or shipped_models()}
+    matches = {}
+    for name in model or shipped_models():
+        matches[name] = load_matcher(name, threads).estimate
+        matches[name + REFINED] = partial(matches[name], refined=True)
     rows = score_scenes(matches, scenes, threads)
     write_csv(out, rows)
     _tell_means(VIEWS_TABLES, "method", [row for row in rows if row.scene == MEAN])

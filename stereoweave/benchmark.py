@@ -105,10 +105,10 @@ class _Answer(NamedTuple):
     is_probability: bool
 
 
-def network(model: str | Path, threads: int | None = None) -> Match:
-    """A shipped network by name, or a matcher file by path; errors as for `Matcher`."""
+def network(model: str | Path, threads: int | None = None, refined: bool = False) -> Match:
+    """A shipped network by name, or a matcher file by path, refined or not; errors as for `Matcher`."""
     matcher = Matcher(model, threads=threads)
-    return lambda pair: matcher.estimate(pair.left, pair.right)
+    return lambda pair: matcher.estimate(pair.left, pair.right, refined=refined)
 
 
 def score_pairs(makers: Mapping[str, Maker], scenes: Iterable[Scene]) -> Scores:

@@ -59,7 +59,7 @@ class Matcher:
     def __init__(self, model: str | Path = "small", *, threads: int | None = None) -> None:
         import onnxruntime  # type: ignore[import-untyped]
 
-        self._path = _model_file(model)
+        self._path, self._threads = _model_file(model), threads
         options = onnxruntime.SessionOptions()
         # Not ONNX Runtime's own choice: on a virtual machine it counts two cores as one with two threads.
         options.intra_op_num_threads = thread_count(threads)
@@ -73,8 +73,16 @@ class Matcher:
         self._outputs = self._checked_outputs()
         self.name, self.multiple_of, self.max_disparity_px = self._checked_properties()
 
-    def estimate(self, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]) -> Estimate:
+    def estimate(
+        self, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], *, refined: bool = False
+    ) -> Estimate:
         """Disparity of both views, confidence and occlusion of a rectified pair, uint8 RGB of one size.
+
+        Args:
+            left: The left photograph [H, W, 3].
+            right: The right one.
+            refined: Whether the estimate is brought to fit the photographs (`refining.refine`): it sees thin
+                things, has sharper edges, and takes longer.
 
         Raises:
             ValueError: If the images are not that, or under 32 px in a direction.
@@ -91,12 +99,17 @@ class Matcher:
             right_px = np.ascontiguousarray(self._maps(pair.mirrored()).disparity_px[:, ::-1])
         seen_px, inside = _right_disparity_at_match(maps.disparity_px, right_px)
         disagreement_px = seen_px - maps.disparity_px
-        return Estimate(
+        found = Estimate(
             disparity_px=maps.disparity_px,
             right_disparity_px=right_px,
             confidence=_confidence(maps.confidence_logit, disagreement_px, inside, _plain(left)),
             occluded=~inside | (disagreement_px > _OCCLUSION_STEP_PX),
         )
+        if not refined:
+            return found
+        from stereoweave.refining import refine  # Numba takes half a second to import
+
+        return refine(left, right, found, self._threads)
 
     def _maps(self, pair: StereoPair) -> Maps:
         """The graph's outputs for a pair: in strips of rows where it is large, blended where they overlap."""
@@ -193,6 +206,7 @@ def estimate(
     *,
     model: str | Path = "small",
     threads: int | None = None,
+    refined: bool = False,
 ) -> Estimate:
     """Disparity of both views, confidence and occlusion of a rectified pair.
 
@@ -201,12 +215,13 @@ def estimate(
         right: The right one, of the same size.
         model: A shipped name or the path of an .onnx matcher; loaded at the first call, and kept.
         threads: How many threads may be used; all cores if left out.
+        refined: As for `Matcher.estimate`.
 
     Raises:
         ValueError: MatcherError for a model that is none, StereoweaveError for images that are none.
     """
     path = _model_file(model).absolute()
-    return _kept_matcher(path, path.stat().st_mtime_ns, threads).estimate(left, right)
+    return _kept_matcher(path, path.stat().st_mtime_ns, threads).estimate(left, right, refined=refined)
 
 
 def shipped_models() -> list[str]:

@@ -17,7 +17,7 @@ def synthesize(
     model: str | Path = "base",
     threads: int | None = None,
 ) -> View:
-    """The view from a position on the line through two cameras: `estimate`, then `render`.
+    """The view from a position on the line through two cameras: `estimate`, refined, then `render`.
 
     Args:
         left: The left photograph, uint8 RGB [H, W, 3], rectified.
@@ -33,5 +33,5 @@ def synthesize(
         ValueError: As `estimate` and `render`; a position out of its range before anything is matched.
     """
     check_position(position)
-    found = estimate(left, right, model=model, threads=threads)
+    found = estimate(left, right, model=model, threads=threads, refined=True)
     return render(left, right, found, position, threads)

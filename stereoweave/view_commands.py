@@ -83,7 +83,7 @@ def view(  # noqa: PLR0913 - each is a word of the command line
         out = marked(out, name, pair, choices)
     place_for(out)
     matcher = load_matcher(model, threads)
-    estimate = matcher.estimate(pair.left, pair.right)
+    estimate = matcher.estimate(pair.left, pair.right, refined=True)
     if plane_px is None:
         plane_px = middle_px(estimate)
     renderer = Renderer(pair, estimate, strength=strength, convergence_px=plane_px, threads=threads)

@@ -14,6 +14,7 @@ from stereoweave.data.shards import write_shard
 from stereoweave.errors import StereoweaveError
 from stereoweave.matcher import shipped_models
 
+NETWORKS = [name + how for name in shipped_models() for how in ("", " refined")]
 OPENCV = ["sgbm", "sgbm_8_paths", "sgbm_3_way", "bm"]
 COLUMNS = (
     "matcher,scene,epe_px,bad1_percent,bad2_percent,d1_percent,edge_epe_px,edge_bad1_percent,flying_percent,"
@@ -60,7 +61,7 @@ def test_every_matcher_has_every_number_and_both_plots_are_drawn(sets, tmp_path,
     text = (out / "rows.csv").read_text()
     assert text.splitlines()[0] == COLUMNS
     means = {row["matcher"]: row for row in csv.DictReader(text.splitlines()) if row["scene"] == "mean"}
-    assert list(means) == [*OPENCV, *shipped_models()]
+    assert list(means) == [*OPENCV, *NETWORKS]
     for name, row in means.items():
         missing = [column for column, value in row.items() if value == "nan"]
         assert missing == (["calibration_error"] if name in OPENCV else [])

@@ -18,7 +18,7 @@ def pair(rng):
 
 def test_synthesizing_is_estimating_and_then_rendering(pair):
     view = synthesize(*pair, position=0.3)
-    expected = render(*pair, estimate(*pair, model="base"), 0.3)
+    expected = render(*pair, estimate(*pair, model="base", refined=True), 0.3)
     np.testing.assert_array_equal(view.image, expected.image)
     np.testing.assert_array_equal(view.drawn, expected.drawn)
 
@@ -43,5 +43,5 @@ def test_a_real_photograph_from_between_is_met_better_than_by_fading(testdata):
 
 def test_render_is_still_the_function_after_synthesize_was_used(pair):
     view = sw.synthesize(*pair, position=0.5)
-    again = sw.render(*pair, sw.estimate(*pair, model="base"), position=0.5)
+    again = sw.render(*pair, sw.estimate(*pair, model="base", refined=True), position=0.5)
     np.testing.assert_array_equal(again.image, view.image)

@@ -2,6 +2,7 @@ import json
 import math
 import subprocess
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
@@ -154,8 +155,8 @@ def test_the_referee_finds_the_same_for_a_photograph_beside_its_place(testdata, 
     ]
     subprocess.run(program, check=True, capture_output=True)
     referee = json.loads((tmp_path / "found.json").read_text())["cones"]
-    matches = {"small": Matcher("small").estimate}
+    matches = {"base refined": partial(Matcher("base").estimate, refined=True)}
     found = by_method(score_scenes(matches, read_view_scenes(tmp_path)), "cones")
-    for method, name in (("nearest photograph",) * 2, ("cross-fade",) * 2, ("small", "stereoweave")):
+    for method, name in (("nearest photograph",) * 2, ("cross-fade",) * 2, ("base refined", "stereoweave")):
         assert found[method].psnr_db == pytest.approx(referee[name]["psnr"], abs=1e-6)
         assert found[method].ssim == pytest.approx(referee[name]["ssim"], abs=1e-6)

@@ -1,0 +1,94 @@
+"""The refinement once more, in plain NumPy: one candidate, one direction and one row after another."""
+
+import numpy as np
+
+OUTSIDE = 65535
+
+
+def plain_costs(own, other, first_px, count):
+    """What each candidate costs [H, W, D]; both are `Cues`."""
+    height, width = own.grey.shape
+    volume = np.empty((height, width, count), int)
+    here = type(own)(*(cue.astype(int) for cue in own))
+    for i in range(count):
+        columns = np.clip(np.arange(width) - first_px - i, 0, width - 1)
+        there = type(own)(*(cue[..., columns].astype(int) for cue in other))
+        one = np.maximum(here.colour - there.brightest, there.darkest - here.colour)
+        two = np.maximum(there.colour - here.brightest, here.darkest - there.colour)
+        differences = np.clip(np.minimum(one, two), 0, 40).sum(1)
+        bits = np.bitwise_count(here.census ^ there.census)
+        pulls = (np.clip(abs(view.prior - 8 * i) - 8, 0, 64) * view.trust // 64 for view in (here, there))
+        volume[..., i] = 2 * bits + differences // 2 + sum(pulls)
+    return volume
+
+
+def plain_census(grey):
+    """One bit for each of the 24 pixels around: whether it is darker."""
+    around = np.pad(grey, 2, mode="edge")
+    height, width = grey.shape
+    codes = np.zeros(grey.shape, int)
+    for place in range(25):
+        if place != 12:
+            dy, dx = divmod(place, 5)
+            codes = 2 * codes + (around[dy : dy + height, dx : dx + width] < grey)
+    return codes
+
+
+def plain_sums(costs, grey):
+    """The sum over paths from the left, the right, above and below, of the cheapest way to each candidate."""
+    total = np.zeros(costs.shape, int)
+    for axis in (0, 1):
+        for backwards in (False, True):
+            lines = [np.swapaxes(values, 0, axis) for values in (costs, grey.astype(int), total)]
+            if backwards:
+                lines = [line[::-1] for line in lines]
+            _add_path(*lines)
+    return total
+
+
+def _add_path(costs, grey, total):
+    """One path down the first axis, for all columns at once."""
+    path = costs[0].copy()
+    total[0] += path
+    for y in range(1, len(costs)):
+        jump = np.maximum((125 / (1 + abs(grey[y] - grey[y - 1]).astype(np.float32) / 30)).astype(int), 30)
+        least = path.min(1, keepdims=True)
+        beside = np.pad(path, ((0, 0), (1, 1)), constant_values=OUTSIDE)
+        ways = [
+            path,
+            beside[:, :-2] + 20,
+            beside[:, 2:] + 20,
+            np.broadcast_to(least + jump[:, None], path.shape),
+        ]
+        path = costs[y] + np.min(ways, 0) - least
+        total[y] += path
+
+
+def plain_pick(sums, first_px):
+    """The disparities of least cost."""
+    count = sums.shape[2]
+    best = sums.argmin(2)
+    inner = np.clip(best, 1, count - 2)
+    before, here, after = (
+        np.take_along_axis(sums, inner[..., None] + step, 2)[..., 0] for step in (-1, 0, 1)
+    )
+    rise = np.maximum(before, after) - here
+    part = np.where((inner == best) & (rise > 0), 0.5 * (before - after) / np.maximum(rise, 1), 0)
+    return first_px + best + part
+
+
+def plain_settled(disparity_px, found_px, other_px, trust, towards):
+    """One view's disparity with what both views found, continued to the border."""
+    width = disparity_px.shape[1]
+    match = np.rint(np.arange(width) + towards * found_px).astype(int)
+    there_px = np.take_along_axis(other_px, np.clip(match, 0, width - 1), axis=1)
+    agreed = (match >= 0) & (match < width) & (abs(there_px - found_px) <= 1)
+    change = agreed & (abs(disparity_px - found_px) > 1.5) & (trust < 0.85)
+    settled_px = np.where(change, found_px, disparity_px)
+    for y in range(len(settled_px)):
+        row_px, known, sure = (values[y, ::-towards] for values in (settled_px, agreed, trust >= 0.85))
+        runs = np.flatnonzero(np.convolve(known, np.ones(8), "valid") == 8)
+        if len(runs) and runs[0] <= row_px[runs[0]] + 2:
+            near = abs(row_px - row_px[runs[0]]) <= 24
+            row_px[(np.arange(width) < runs[0]) & near & ~sure] = row_px[runs[0]]
+    return settled_px
