@@ -1,4 +1,4 @@
-"""The commands: stereoweave depth | view | bench | synth | train | export."""
+"""The commands: stereoweave depth | view | video | bench | synth | train | export."""
 
 import json
 import tempfile
@@ -24,6 +24,7 @@ from stereoweave.command_line import (
 )
 from stereoweave.errors import StereoweaveError
 from stereoweave.synth_commands import synth
+from stereoweave.video_commands import video
 from stereoweave.view_commands import view
 
 if TYPE_CHECKING:
@@ -93,6 +94,7 @@ def depth(  # noqa: PLR0913 - each is a word of the command line
 
 
 app.command()(view)
+app.command()(video)
 
 
 @app.command()

@@ -1,0 +1,277 @@
+"""A 3-D film made into another, frame by frame: matched, held steady, and shown as depth, view or layout."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from fractions import Fraction
+from itertools import chain, islice
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, UInt16
+from rich.console import Console
+from rich.progress import Progress, TaskID
+
+from stereoweave import __version__
+from stereoweave.colour import colour_disparity, colour_range_px
+from stereoweave.errors import StereoweaveError
+from stereoweave.film import GREY16, H264, Packing, Picture, Recorder, check_film, growing
+from stereoweave.footage import Footage, StereoFrame
+from stereoweave.layouts import LAYOUTS, Choices, check_reach, middle_px
+from stereoweave.matcher import Matcher
+from stereoweave.progress import progress
+from stereoweave.rendering import Renderer
+from stereoweave.steady import Steadier
+from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.threads import thread_count
+
+# A part is lost when a run is interrupted; each begins with a key frame.
+_PART_S = 10
+_SURVEYED_FRAMES = 24
+_SURVEYED_EVERY_PX = 4
+_NAMED_PROBLEMS = 3
+_STEPS_PER_PX = 256
+
+PACKINGS = {
+    "side_by_side": Packing("left_right", 3),
+    "side_by_side_half": Packing("left_right", 3),
+    "crossed": Packing("right_left", None),
+    "top_bottom": Packing("top_bottom", 4),
+    "top_bottom_half": Packing("top_bottom", 4),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Order:
+    """What a film is made into: one of depth, depth16, position and layout.
+
+    Attributes:
+        depth: The left view's disparity in colours, one range for the whole film.
+        depth16: The same as 16-bit grey, px * 256 as in disparity.png; clipped to 1/256 to 255.99 px.
+        position: A view: 0 is the left camera, 1 the right one.
+        layout: A name in `LAYOUTS`.
+        strength: Multiplies the baseline.
+        convergence_px: The disparity that stays in place from view to view. None is that of the film's middle
+            for layouts whose views lie upon one another, and 0 for all else.
+        model: The name of a shipped network, or an .onnx file.
+        threads: How many threads may be used; all cores unless given.
+    """
+
+    depth: bool = False
+    depth16: bool = False
+    position: float | None = None
+    layout: str | None = None
+    strength: float = 1.0
+    convergence_px: float | None = None
+    model: str = "small"
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        wanted = {
+            "--depth": self.depth,
+            "--depth16": self.depth16,
+            "--position": self.position is not None,
+            "--layout": self.layout is not None,
+        }
+        found = [word for word, given in wanted.items() if given]
+        if len(found) != 1:
+            raise StereoweaveError(
+                f"what to make: expected one of {', '.join(wanted)}, found {' and '.join(found) or 'none'}"
+            )
+        if self.layout not in (None, *LAYOUTS):
+            raise StereoweaveError(f"layout: expected one of {', '.join(LAYOUTS)}, found {self.layout!r}")
+        check_reach(self._positions, self.strength)
+
+    @property
+    def _positions(self) -> tuple[float, ...]:
+        if self.layout:
+            return LAYOUTS[self.layout].positions
+        return () if self.position is None else (self.position,)
+
+    @property
+    def needs_survey(self) -> bool:
+        """Whether something has to be known of the whole film first."""
+        converged = self.layout is not None and LAYOUTS[self.layout].converged
+        return self.depth or self.layout == "rgbd" or (converged and self.convergence_px is None)
+
+    def picture(self, pair: StereoPair, estimate: Estimate, survey: "Survey") -> Picture:
+        """What is shown of one frame."""
+        if self.depth:
+            return colour_disparity(estimate.disparity_px, survey.range_px)
+        if self.depth16:
+            return _grey16(estimate.disparity_px)
+        plane_px = survey.middle_px if self.convergence_px is None else self.convergence_px
+        renderer = Renderer(
+            pair, estimate, strength=self.strength, convergence_px=plane_px, threads=self.threads
+        )
+        if self.position is not None:
+            return renderer.view(self.position).image
+        return LAYOUTS[str(self.layout)].compose(renderer, Choices(range_px=survey.range_px))
+
+    def says(self, survey: "Survey") -> dict[str, str]:
+        """What the file says about itself: how to get back from its pictures to disparities."""
+        low_px, high_px = survey.range_px
+        if self.depth16:
+            return {"comment": f"16-bit grey: disparity of the left view in pixels = value / {_STEPS_PER_PX}"}
+        if self.depth:
+            return {
+                "comment": f"disparity of the left view: {low_px:.2f} px is blue, {high_px:.2f} px is red"
+            }
+        if self.layout == "rgbd":
+            return {"comment": f"disparity in grey: {low_px:.2f} px is black, {high_px:.2f} px is white"}
+        return {}
+
+
+class Survey(NamedTuple):
+    """What was found in frames from all over the film: its range of disparities, and its middle."""
+
+    range_px: tuple[float, float] = (0.0, 1.0)
+    middle_px: float = 0.0
+
+
+@dataclass
+class Tally:
+    """What was met on the way: frames, cuts, and frames with a problem, of which the first ones are named."""
+
+    frames: int = 0
+    cuts: int = 0
+    problems: int = 0
+    named: list[str] = field(default_factory=list)
+
+    def note(self, frame: StereoFrame) -> None:
+        """Counts a frame."""
+        self.frames += 1
+        if frame.problem is not None:
+            self.problems += 1
+            if len(self.named) < _NAMED_PROBLEMS:
+                self.named.append(f"{_clock(frame.time)} {frame.problem}")
+
+
+def make_film(footage: Footage, sources: Sequence[Path], out: Path, order: Order, console: Console) -> Tally:
+    """Writes the film that was ordered; one that was begun and interrupted goes on after its last part.
+
+    Args:
+        footage: The film to make it from.
+        sources: What the footage was opened from, to go on only while it is the same.
+        out: The file to write; its ending chooses the container.
+        order: What it is made into.
+        console: Where progress is told.
+
+    Returns:
+        What was met on the way, in all runs together.
+
+    Raises:
+        StereoweaveError: `out` cannot be such a film, or cannot be written, for instance on a full disk.
+    """
+    _check_out(out, order, footage, sources)
+    matcher, threads = Matcher(order.model, threads=order.threads), thread_count(order.threads)
+    recorder = Recorder(
+        encoding=GREY16 if order.depth16 else H264,
+        time_base=footage.time_base,
+        # FFmpeg's fractions have 32 bits.
+        rate=footage.rate.limit_denominator(100_000),
+        packing=PACKINGS.get(order.layout or ""),
+        threads=threads,
+    )
+    with growing(out, _settings(order, sources)) as parts, progress(console) as bar:
+        if parts.files:
+            maker = _Maker.from_state(order, matcher, parts.state())
+        else:
+            maker = _Maker(order, matcher, _survey(footage, matcher, bar) if order.needs_survey else Survey())
+        done, total = maker.tally.frames, footage.frame_count
+        shown = bar.add_task(out.name, total=total, completed=done, loss="", rate="")
+        frames = footage.frames(done)
+        for first in frames:
+            part = islice(chain([first], frames), round(_PART_S * footage.rate) or 1)
+            with parts.next(maker.state) as path:
+                recorder.write_part(path, maker.pictures(part, bar, shown))
+        recorder.join(parts.files, footage.sound, out, order.says(maker.survey))
+    return maker.tally
+
+
+class _Maker:
+    """Makes a picture of each frame, and can go on where it was left."""
+
+    def __init__(self, order: Order, matcher: Matcher, survey: Survey) -> None:
+        self.survey, self.tally = survey, Tally()
+        self._order, self._matcher, self._steadier = order, matcher, Steadier()
+
+    @classmethod
+    def from_state(cls, order: Order, matcher: Matcher, state: dict[str, np.ndarray]) -> "_Maker":
+        """One that goes on as the one whose `state` this was would have."""
+        low_px, high_px, middle_px = state.pop("survey_px").tolist()
+        maker = cls(order, matcher, Survey((low_px, high_px), middle_px))
+        frames, cuts, problems = state.pop("tally").tolist()
+        maker.tally = Tally(frames, cuts, problems, state.pop("named").tolist())
+        maker._steadier = Steadier.from_state(state)
+        return maker
+
+    def state(self) -> dict[str, np.ndarray]:
+        """All that the next frame's picture depends on."""
+        tally = self.tally
+        return {
+            "survey_px": np.array([*self.survey.range_px, self.survey.middle_px]),
+            "tally": np.array([tally.frames, tally.cuts, tally.problems]),
+            "named": np.array(tally.named, dtype=np.str_),
+            **self._steadier.state(),
+        }
+
+    def pictures(
+        self, frames: Iterable[StereoFrame], bar: Progress, shown: TaskID
+    ) -> Iterator[tuple[Fraction, Picture]]:
+        """What is shown of each frame, with its time; the bar follows."""
+        for frame in frames:
+            estimate = self._matcher.estimate(frame.left, frame.right)
+            estimate = self._steadier(frame.left, frame.right, estimate)
+            pair = StereoPair(left=frame.left, right=frame.right)
+            self.tally.note(frame)
+            self.tally.cuts = self._steadier.cuts
+            bar.update(shown, completed=self.tally.frames)
+            yield frame.time, self._order.picture(pair, estimate, self.survey)
+
+
+def _survey(footage: Footage, matcher: Matcher, bar: Progress) -> Survey:
+    """The range and the middle of the disparities in frames from all over the film."""
+    step = -(-footage.frame_count // _SURVEYED_FRAMES)
+    picked = range(step // 2, footage.frame_count, step)
+    shown = bar.add_task("looking at its depth", total=len(picked), loss="", rate="")
+    thinned, middles_px = [], []
+    for frame in islice(footage.frames(), picked.start, None, step):
+        estimate = matcher.estimate(frame.left, frame.right)
+        thinned.append(estimate.disparity_px[::_SURVEYED_EVERY_PX, ::_SURVEYED_EVERY_PX])
+        middles_px.append(middle_px(estimate))
+        bar.advance(shown)
+    return Survey(colour_range_px(np.vstack(thinned)), float(np.median(middles_px)))
+
+
+def _grey16(disparity_px: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
+    # 0 would mean that it is unknown, as in disparity.png.
+    return np.clip(np.rint(_STEPS_PER_PX * disparity_px), 1, 65535).astype(np.uint16)
+
+
+def _check_out(out: Path, order: Order, footage: Footage, sources: Sequence[Path]) -> None:
+    if order.depth16 and out.suffix.lower() != ".mkv":
+        raise StereoweaveError(f"{out}: expected the ending .mkv for depth in 16 bits, found {out.suffix!r}")
+    for source in sources:
+        if source.exists() and out.exists() and out.samefile(source):
+            raise StereoweaveError(f"{out}: expected another file than the film it is made from")
+    check_film(out, footage.sound)
+
+
+def _settings(order: Order, sources: Sequence[Path]) -> dict[str, object]:
+    """All that the film depends on, but for the threads, in words that JSON has."""
+    words = asdict(order) | {"model": _known_by(Path(order.model))}
+    del words["threads"]
+    return words | {"inputs": [_known_by(source) for source in sources], "version": __version__}
+
+
+def _known_by(path: Path) -> list[object]:
+    """A name, and size and time of the file of that name, if there is one."""
+    status = path.stat() if path.exists() else None
+    return [str(path), *((status.st_size, status.st_mtime_ns) if status else ())]
+
+
+def _clock(time_s: Fraction) -> str:
+    """0:01:02.345 for 62.345 s."""
+    minutes, seconds = divmod(float(time_s), 60)
+    return f"{int(minutes) // 60}:{int(minutes) % 60:02}:{seconds:06.3f}"

@@ -1,0 +1,234 @@
+"""A film through the command: its frames, times and sound, and what becomes of one that is interrupted."""
+
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from film_examples import damage, example_pairs, packets, write_side_by_side, write_video
+
+from stereoweave.cli import main
+from stereoweave.colour import colour_disparity
+from stereoweave.footage import Footage, StereoFrame, open_footage
+from stereoweave.layouts import LAYOUTS, Choices
+from stereoweave.matcher import Matcher
+from stereoweave.rendering import Renderer
+from stereoweave.stereo import StereoPair
+
+# A frame a second, so that a part, 10 s, is 10 frames.
+SLOW_MS = 1000
+
+
+def slow_film(path: Path, count: int = 25) -> Path:
+    return write_side_by_side(
+        path, example_pairs(count), times_ms=range(0, count * SLOW_MS, SLOW_MS), codec="libx264"
+    )
+
+
+def run(film: Path, out: Path, *words: str) -> int:
+    return main(["video", str(film), "-o", str(out), "--threads", "2", *words])
+
+
+def frames_of(film: Path) -> list[np.ndarray]:
+    with av.open(str(film)) as container:
+        return [frame.to_ndarray() for frame in container.decode(video=0)]
+
+
+def rgb_of(film: Path) -> list[np.ndarray]:
+    return [frame.left for frame in open_footage([film, film]).frames()]
+
+
+def times_of(film: Path) -> list[Fraction]:
+    with av.open(str(film)) as container:
+        return [frame.pts * frame.time_base for frame in container.decode(video=0)]
+
+
+def estimate_of(frame: StereoFrame):
+    return Matcher("small", threads=2).estimate(frame.left, frame.right)
+
+
+def test_as_many_frames_at_their_uneven_times_and_the_same_sound(tmp_path, capsys):
+    times_ms = [0, 40, 90, 130, 170, 300, 330, 370]
+    film = write_side_by_side(
+        tmp_path / "in.mp4", example_pairs(8), times_ms=times_ms, sound=True, codec="libx264"
+    )
+    assert run(film, tmp_path / "out.mp4", "--position", "0.5") == 0
+    assert capsys.readouterr().out == f"{tmp_path / 'out.mp4'}: 8 frames, 0 cuts\n"
+    assert times_of(tmp_path / "out.mp4") == [Fraction(ms, 1000) for ms in times_ms]
+    assert packets(tmp_path / "out.mp4", "audio") == packets(film, "audio")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.mp4", "out.mp4"]
+
+
+def test_depth_in_16_bits_is_disparity_times_256(tmp_path):
+    film = write_side_by_side(tmp_path / "in.mp4", example_pairs(2), codec="libx264")
+    assert run(film, tmp_path / "out.mkv", "--depth16") == 0
+    first = next(open_footage([film]).frames())
+    with av.open(str(tmp_path / "out.mkv")) as container:
+        assert (
+            container.metadata["COMMENT"] == "16-bit grey: disparity of the left view in pixels = value / 256"
+        )
+        grey = next(container.decode(video=0)).to_ndarray()
+    # The first frame has none before it to be filtered with.
+    np.testing.assert_array_equal(grey, np.rint(256 * estimate_of(first).disparity_px))
+
+
+def test_colours_of_depth_mean_the_same_in_all_of_the_film(tmp_path, capsys):
+    near = example_pairs(1)[0]
+    far = (255 - near[0][::-1],) * 2
+    film = write_side_by_side(tmp_path / "in.mp4", [near, near, far, far], codec="libx264")
+    assert run(film, tmp_path / "out.mp4", "--depth", "--arrangement", "side_by_side") == 0
+    assert capsys.readouterr().out.endswith("4 frames, 1 cut\n")
+    with av.open(str(tmp_path / "out.mp4")) as container:
+        comment = container.metadata["comment"]
+    low_px, high_px = (float(word) for word in comment.replace(" px", "").split() if word[0].isdigit())
+    frames = list(open_footage([film], "side_by_side").frames())
+    shown = rgb_of(tmp_path / "out.mp4")
+    for index in (0, 2):  # the first frame, and the first one after the cut
+        expected = colour_disparity(estimate_of(frames[index]).disparity_px, (low_px, high_px))
+        assert np.abs(shown[index].astype(int) - expected).mean() < 6
+
+
+@pytest.mark.parametrize("name", ["side_by_side", "anaglyph_dubois"])
+def test_a_layout_is_what_it_is_of_a_still_and_viewers_know_it_by_its_name(tmp_path, name):
+    film = write_side_by_side(tmp_path / "in.mp4", example_pairs(2), codec="libx264")
+    assert run(film, tmp_path / "out.mp4", "--layout", name, "--strength", "1.5", "--convergence", "12") == 0
+    first = next(open_footage([film]).frames())
+    pair = StereoPair(left=first.left, right=first.right)
+    renderer = Renderer(pair, estimate_of(first), strength=1.5, convergence_px=12.0)
+    still = LAYOUTS[name].compose(renderer, Choices())
+    made = tmp_path / f"out{LAYOUTS[name].mark}.mp4"
+    assert np.abs(rgb_of(made)[0].astype(int) - still).mean() < 6
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["in.mp4", made.name])
+
+
+def test_what_lies_upon_one_another_keeps_the_films_middle_in_place(tmp_path):
+    film = write_side_by_side(tmp_path / "in.mp4", example_pairs(3), codec="libx264")
+    for name, words in {"auto": (), "none": ("--convergence", "0")}.items():
+        assert run(film, tmp_path / f"{name}.mp4", "--layout", "anaglyph_grey", *words) == 0
+    # The eyes' pictures, red and green, lie apart by the disparity where nothing is kept in place.
+    apart = {name: _red_from_green(rgb_of(tmp_path / f"{name}.mp4")[1]) for name in ("auto", "none")}
+    assert apart["auto"] < apart["none"] / 2
+
+
+def _red_from_green(anaglyph: np.ndarray) -> float:
+    return np.abs(anaglyph[..., 0].astype(int) - anaglyph[..., 1]).mean()
+
+
+class Interrupted(Footage):
+    """Footage whose reader gets the signal of Ctrl-C at frame 17, once a part is finished."""
+
+    def frames(self, start: int = 0) -> Iterator[StereoFrame]:
+        for index, frame in enumerate(super().frames(start), start):
+            if index == 17 and any(Path(self.name).parent.glob("*.parts/*.nut")):
+                signal.raise_signal(signal.SIGINT)
+            yield frame
+
+
+@pytest.mark.parametrize("words", [("--position", "0.4"), ("--layout", "rgbd")])
+def test_a_film_that_was_interrupted_goes_on_to_the_same_frames(tmp_path, monkeypatch, capsys, words):
+    film = slow_film(tmp_path / "in.mp4")
+    assert run(film, tmp_path / "whole.mp4", *words) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr("stereoweave.footage.Footage", Interrupted)
+        assert run(film, tmp_path / "broken.mp4", *words) == 130
+    [folder] = tmp_path.glob("broken*.parts")
+    [line] = [line for line in capsys.readouterr().err.splitlines() if line.startswith("stereoweave")]
+    assert line.endswith(f": stopped; what is finished stays in {folder}, and the same command goes on")
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "000001.nut",
+        "settings.json",
+        "state-000001.npz",
+    ]
+    assert run(film, tmp_path / "broken.mp4", *words) == 0
+    [whole], [broken] = tmp_path.glob("whole*"), tmp_path.glob("broken*")
+    np.testing.assert_array_equal(frames_of(broken), frames_of(whole))
+    assert times_of(broken) == times_of(film)
+
+
+def test_another_order_does_not_go_on_with_what_was_begun(tmp_path, monkeypatch, capsys):
+    film = slow_film(tmp_path / "in.mp4", 20)
+    with monkeypatch.context() as patch:
+        patch.setattr("stereoweave.footage.Footage", Interrupted)
+        assert run(film, tmp_path / "out.mp4", "--position", "0.4") == 130
+    capsys.readouterr()
+    assert run(film, tmp_path / "out.mp4", "--position", "0.6") == 2
+    folder = tmp_path / "out.mp4.parts"
+    assert capsys.readouterr().err == (
+        f"stereoweave: {folder}: expected parts of the same film, found parts made with another position; "
+        "remove that folder, or give the words that it was begun with\n"
+    )
+
+
+def test_where_the_disk_fills_up_one_line_says_what_stays_and_how_to_go_on(tmp_path):
+    film = slow_film(tmp_path / "in.mp4", 45)
+    assert run(film, tmp_path / "whole.mkv", "--depth16") == 0
+    # Each part finds room, and so does the state after it (0.4 MB); all of them joined do not.
+    room_bytes = int(0.8 * (tmp_path / "whole.mkv").stat().st_size)
+    words = ["video", str(film), "-o", str(tmp_path / "out.mkv"), "--depth16"]
+    program = (
+        "import resource, sys; from stereoweave.cli import main; "
+        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({room_bytes}, {room_bytes})); sys.exit(main({words}))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    folder = tmp_path / "out.mkv.parts"
+    assert done.stderr.splitlines()[-1] == (
+        f"stereoweave: {tmp_path / 'out.mkv'}: expected a file that can be written, found file too large; "
+        f"what is finished stays in {folder}, and the same command goes on from there"
+    )
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.mp4", "out.mkv.parts", "whole.mkv"]
+    assert len(list(folder.glob("*.nut"))) == 5
+    assert run(film, tmp_path / "out.mkv", "--depth16") == 0
+    np.testing.assert_array_equal(frames_of(tmp_path / "out.mkv"), frames_of(tmp_path / "whole.mkv"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.mp4", "out.mkv", "whole.mkv"]
+
+
+def test_a_damaged_frame_is_told_with_its_time_and_is_not_the_end(tmp_path, capsys):
+    film = damage(write_side_by_side(tmp_path / "in.mkv", example_pairs(12), codec="mjpeg"), 5)
+    assert run(film, tmp_path / "out.mkv", "--position", "0.5") == 0
+    told = capsys.readouterr().out.splitlines()
+    assert told[0].endswith("12 frames, 0 cuts")
+    assert told[1] == "problems in 1 of 12 frames: 0:00:00.200 damaged: the frame before it stands in"
+    assert times_of(tmp_path / "out.mkv") == times_of(film)
+
+
+@pytest.mark.parametrize(
+    ("out", "words", "told"),
+    [
+        ("out.mp4", [], "expected one of --depth, --depth16, --position, --layout, found none"),
+        ("out.mp4", ["--depth", "--position", "0"], "found --depth and --position"),
+        ("out.mp4", ["--layout", "wiggle"], "layout: expected one of side_by_side, "),
+        ("out.mp4", ["--position", "2.5"], "position: expected -1 to 2"),
+        ("out.mp4", ["--position", "1", "--strength", "4"], "where strength 4 takes 1"),
+        ("out.gif", ["--depth"], "expected the ending of a film, .mp4, .mkv, .mov, found '.gif'"),
+        ("out.mp4", ["--depth16"], "expected the ending .mkv for depth in 16 bits, found '.mp4'"),
+        ("in.mp4", ["--depth"], "expected another file than the film it is made from"),
+        ("out.mp4", ["--depth", "--model", "huge"], "unknown model 'huge'"),
+        ("out.mp4", ["--depth", "--arrangement", "diagonal"], "expected an arrangement, side_by_side"),
+    ],
+)
+def test_what_cannot_be_made_is_one_line_before_any_work(tmp_path, capsys, out, words, told):
+    film = write_side_by_side(tmp_path / "in.mp4", example_pairs(2), codec="libx264")
+    before = film.read_bytes()
+    assert run(film, tmp_path / out, *words) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert told in line
+    assert [path.name for path in tmp_path.iterdir()] == ["in.mp4"]
+    assert film.read_bytes() == before
+
+
+def test_what_is_no_3d_film_is_one_line(tmp_path, capsys):
+    wide = [np.hstack([left, np.flip(left)]) for left, _ in example_pairs(2)]
+    flat = write_video(tmp_path / "flat.mp4", wide, codec="libx264")
+    broken = tmp_path / "broken.mp4"
+    broken.write_bytes(flat.read_bytes()[:400])
+    for film, told in ((flat, "expected 3-D video"), (broken, "expected a video")):
+        assert run(film, tmp_path / "out.mp4", "--depth") == 2
+        [line] = capsys.readouterr().err.splitlines()
+        assert told in line
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["broken.mp4", "flat.mp4"]
