@@ -2,6 +2,7 @@
 # make test    the tests
 # make check   style, types, floors of imports, and the tests
 # make bench   accuracy and time on the real pairs in STEREOWEAVE_TESTDATA
+# make gallery the README's pictures, docs/gallery, from a pair that is rendered for them
 # Each first sets up the virtual environment that it needs, once.
 
 PYTHON ?= python3
@@ -22,7 +23,11 @@ else
 PAIR = "$(LEFT)" $(if $(RIGHT),"$(RIGHT)")
 endif
 
-.PHONY: demo test check bench
+RENDER = $(DEV)/bin/stereoweave synth make refinery --pairs 1 --seed 4000 --layout paper
+RENDERED = $(foreach side,left right,runs/gallery/$(1)/$(side)/refinery/000000.png)
+VIEW = $(DEV)/bin/stereoweave view
+
+.PHONY: demo test check bench gallery
 
 demo: $(CORE)/installed
 	$(CORE)/bin/stereoweave depth $(PAIR) $(CALIBRATION) --out demo-out
@@ -41,6 +46,20 @@ check: $(DEV)/installed
 
 bench: $(CORE)/installed
 	$(CORE)/bin/stereoweave bench pairs $(STEREOWEAVE_TESTDATA)/stereo/pairs --out results/pairs.csv
+
+# The wiggle's frames are smaller, because it is as large as all other pictures together else.
+gallery: $(DEV)/installed
+	$(RENDER) --size 640x480 -o runs/gallery/pair
+	$(RENDER) --size 400x300 -o runs/gallery/smaller
+	$(DEV)/bin/stereoweave depth $(call RENDERED,pair) --model base -o runs/gallery/depth
+	mkdir -p docs/gallery
+	cp runs/gallery/depth/preview.png docs/gallery/depth.png
+	$(VIEW) $(call RENDERED,pair) --layout side_by_side -o docs/gallery/pair.jpg
+	$(VIEW) $(call RENDERED,pair) --position -0.5 -o docs/gallery/beyond_left.jpg
+	$(VIEW) $(call RENDERED,pair) --position 0.5 -o docs/gallery/between.jpg
+	$(VIEW) $(call RENDERED,pair) --position 1.5 -o docs/gallery/beyond_right.jpg
+	$(VIEW) $(call RENDERED,pair) --layout anaglyph_dubois -o docs/gallery/anaglyph.jpg
+	$(VIEW) $(call RENDERED,smaller) --layout wiggle -o docs/gallery/wiggle.webp
 
 $(CORE)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(CORE)

@@ -5,7 +5,7 @@ import typing
 import numpy as np
 
 from stereoweave.compiling import compiled, inlined
-from stereoweave.rendering_kernels import NOTHING, support_at
+from stereoweave.rendering_kernels import NOTHING, SAME_SURFACE_PX, support_at
 
 RIM = 0.15
 """A surface with no more support than this is seen by one photograph alone, and through impure pixels."""
@@ -16,6 +16,12 @@ LARGEST_STEP_PX = np.float32(1)
 """A disparity is moved by this at most."""
 FLAT_LEVELS2 = np.float32(30)
 """Where the squared slope of the grey values is less than this, on average, there is nothing to align."""
+DOUBLES_REACH_PX = 12
+"""What is doubled is thin: on both sides, pixels that are not lie within so many."""
+AGREED_LEVELS = 30
+"""Photographs that differ by no more than this, summed over the channels, show the same."""
+ALIKE_LEVELS, UNLIKE_LEVELS = 20, 60
+"""What differs by less than the first goes with its surroundings, by more than the second it does not."""
 _HALF, _ONE, _LARGEST = np.float32(0.5), np.float32(1), np.float32(255)
 _LEAST = np.float32(1e-9)
 _1, _2, _3 = np.uint32(1), np.uint32(2), np.uint32(3)
@@ -151,6 +157,7 @@ def paint_row(left, right, y, row, canvas):
         of_left[u] = left_share * in_left[u] / max(total, _LEAST)
         pure[u] = in_left[u] + in_right[u] > RIM
         surface_px[u] = front_px[u] if in_left[u] + in_right[u] > 0 else NOTHING
+    _part_doubles(row, left_colours, right_colours, of_left)
     for channel in range(3):
         a, b = left_colours[channel], right_colours[channel]
         for u in range(width):
@@ -160,6 +167,58 @@ def paint_row(left, right, y, row, canvas):
             _paint_two(left, right, y, u, row, left_padded, right_padded, canvas)
         elif in_left[u] + in_right[u] > 0:
             image[u, 0], image[u, 1], image[u, 2] = left_colours[0, u], left_colours[1, u], left_colours[2, u]
+
+
+@compiled
+@typing.no_type_check
+def _part_doubles(row, left_colours, right_colours, of_left):
+    """Take from one photograph alone what would be doubled: a thin thing that both disparity maps have lost.
+
+    Both photographs show it, before its background and apart. So where they differ, and one of them goes with
+    the pixels of that surface on both sides, on which they agree, the other one shows such a thing.
+    """
+    width = of_left.shape[0]
+    agreed = np.empty(width, np.int32)  # the last pixel before each on which both agree
+    last = -2 * DOUBLES_REACH_PX
+    for u in range(width):
+        if _both_alone(row, u) and _apart_levels(left_colours, u, right_colours, u) <= AGREED_LEVELS:
+            last = u
+        agreed[u] = last
+    after = width + 2 * DOUBLES_REACH_PX
+    for k in range(width):
+        u = width - 1 - k
+        before = agreed[u]
+        if before == u:
+            after = u
+        elif _both_alone(row, u) and max(u - before, after - u) <= DOUBLES_REACH_PX:
+            d = row.front_px[u]
+            slant_px = max(abs(row.front_px[before] - d), abs(row.front_px[after] - d))
+            sides_levels = _apart_levels(left_colours, before, left_colours, after)
+            if slant_px > SAME_SURFACE_PX or sides_levels > ALIKE_LEVELS:
+                continue
+            of_one = _apart_levels(left_colours, u, left_colours, before)
+            of_other = _apart_levels(right_colours, u, left_colours, before)
+            if min(of_one, of_other) <= ALIKE_LEVELS and max(of_one, of_other) >= UNLIKE_LEVELS:
+                of_left[u] = 1 if of_one < of_other else 0
+
+
+@inlined
+@typing.no_type_check
+def _both_alone(row, u):
+    """Whether both photographs show a pixel's only surface."""
+    return min(row.in_left[u], row.in_right[u]) >= _HALF and row.back_px[u] == NOTHING
+
+
+@inlined
+@typing.no_type_check
+def _apart_levels(colours, u, others, v):
+    """How two colours of rows [3, W] differ, summed over the channels."""
+    red, green, blue = (
+        colours[0, u] - others[0, v],
+        colours[1, u] - others[1, v],
+        colours[2, u] - others[2, v],
+    )
+    return abs(red) + abs(green) + abs(blue)
 
 
 @compiled

@@ -208,17 +208,16 @@ def plain_colours(sides, front, back, share, front_supports):
     colours, known, seen_by = [], [], []
     back_supports = [support(side, np.nan_to_num(back), purity(side)) for side in sides]
     layers = (front, share, front_supports), (back, 1 - share, back_supports)
-    for d, part, found in layers:
-        exists, d = np.isfinite(d), np.nan_to_num(d)
+    for layer, (surface, part, found) in enumerate(layers):
+        exists, d = np.isfinite(surface), np.nan_to_num(surface)
         supports = [exists * of_side for of_side in found]
         weights = [side.nearness * s for side, s in zip(sides, supports, strict=True)]
-        total = np.maximum(sum(weights), 1e-300)
-        colours.append(
-            sum(
-                (w / total)[..., None] * cubic(side.photo, side.column(d))
-                for w, side in zip(weights, sides, strict=True)
-            )
-        )
+        of_left = weights[0] / np.maximum(sum(weights), 1e-300)
+        seen_in = [cubic(side.photo, side.column(d)) for side in sides]
+        if layer == 0:
+            both = (np.minimum(*supports) >= 0.5) & np.isnan(back)
+            of_left = part_doubles(of_left, *seen_in, d, both)
+        colours.append(of_left[..., None] * seen_in[0] + (1 - of_left)[..., None] * seen_in[1])
         known.append(np.where(sum(supports) > 0, part, 0))
         seen_by.append(sum(supports))
     total = known[0] + known[1]
@@ -228,6 +227,24 @@ def plain_colours(sides, front, back, share, front_supports):
     seen = np.where(of_front, front, back)
     seen[total == 0] = np.nan
     return image, seen, (total > 0) & (np.where(of_front, seen_by[0], seen_by[1]) > 0.15)
+
+
+def part_doubles(of_left, left, right, d, both):
+    """The left photograph's part, 0 or 1 where one of the two shows a thin thing that the maps have lost."""
+    of_left = of_left.copy()
+    agreed = both & (np.abs(left - right).sum(2) <= 30)
+    for y, x in np.argwhere(both & ~agreed):
+        places = np.flatnonzero(agreed[y])
+        before, after = places[places < x][-1:], places[places > x][:1]
+        if not (len(before) and len(after) and max(x - before[0], after[0] - x) <= 12):
+            continue
+        a, b = before[0], after[0]
+        flat = max(abs(d[y, a] - d[y, x]), abs(d[y, b] - d[y, x])) <= SAME_SURFACE_PX
+        if flat and np.abs(left[y, a] - left[y, b]).sum() <= 20:
+            of_one, of_other = (np.abs(colours[y, x] - left[y, a]).sum() for colours in (left, right))
+            if min(of_one, of_other) <= 20 and max(of_one, of_other) >= 60:
+                of_left[y, x] = of_one < of_other
+    return of_left
 
 
 def plain_fill(image, seen, pure):

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from stereoweave.animation import write_animation
 from stereoweave.io import read_image
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-DEMO, INSTALL, COMMANDS, SYNTHETIC, RESEARCH = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
+DEMO, INSTALL, COMMANDS, VIDEO, SYNTHETIC, RESEARCH = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
 (PROGRAM,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 LARGEST_ENVIRONMENT_BYTES = 700e6
 
@@ -126,12 +127,22 @@ def test_the_commands_run_from_the_wheel_in_an_empty_environment(installed, pict
     described = re.findall(r"^\| `([\w.]+)` \|", README, re.MULTILINE)
     assert sorted(path.name for path in (pictures / "metric").iterdir()) == sorted(described)
     assert read_image(pictures / "view.png").shape == (64, 96, 3)
+    assert read_image(pictures / "quilt_qs8x6a1.5.png").shape == (6 * 64, 8 * 96, 3)
+    assert Image.open(pictures / "wiggle.webp").n_frames == 12
     assert (pictures / "rows.csv").is_file()
 
 
 def test_the_program_runs_from_the_wheel_in_an_empty_environment(installed, pictures, caches):
     run([installed / "bin" / "python", "-c", PROGRAM], pictures, NUMBA_CACHE_DIR=caches)
     assert read_image(pictures / "view.png").shape == (64, 96, 3)
+
+
+def test_films_are_made_by_the_commands_for_them(pictures):
+    frame = read_image(pictures / "side_by_side.png")
+    write_animation(pictures / "film_LR.mp4", [frame] * 3, frame_ms=40)
+    run(["bash", "-ec", VIDEO], pictures, PATH=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+    films = sorted(path.name for path in pictures.glob("*.m[pk][4v]"))
+    assert films == ["anaglyph.mp4", "between.mp4", "depth.mkv", "depth.mp4", "film_LR.mp4"]
 
 
 @pytest.mark.needs_egl
@@ -142,6 +153,7 @@ def test_synthetic_sets_are_made_and_checked_by_the_commands_for_them(tmp_path):
     made = {file.relative_to(tmp_path / "sets").as_posix() for file in (tmp_path / "sets").rglob("*.*")}
     assert {"ship/ship-000000-000003.tar", "views/propeller-000000-000001.tar"} < made
     assert len([name for name in made if name.startswith("film/depth/")]) == 3
+    assert "ground truth" in (tmp_path / "views.csv").read_text()
 
 
 def test_two_trainings_are_resumed_and_scored_by_the_commands_for_researchers(tmp_path):

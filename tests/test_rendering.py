@@ -169,6 +169,18 @@ def test_confidence_decides_between_maps_that_contradict_each_other(confidence, 
     assert (view.image[:, 24:28] == level).all()
 
 
+def test_a_thin_thing_that_both_maps_have_lost_is_not_seen_doubled():
+    # A stick before a wall of shades, at 20 in the left photograph and at 12 in the right one; the maps have
+    # the wall alone, at 2, before which the stick would show at 19 and at 13 of the view half-way.
+    wall = np.repeat((100 + np.arange(40) // 4)[None, :, None], 9, axis=0).repeat(3, axis=2).astype(np.uint8)
+    left, right = wall.copy(), np.roll(wall, -2, axis=1)
+    left[:, 20], right[:, 12] = OBJECT, OBJECT
+    flat_px = np.full((9, 40), 2.0)
+    view = render(left, right, make_estimate(flat_px, flat_px), 0.5)
+    expected = np.roll(wall, -1, axis=1)
+    assert np.abs(view.image.astype(int) - expected)[:, 3:-3].max() <= 2
+
+
 def test_a_row_that_nothing_lands_on_shows_the_nearest_photograph_as_invented():
     left, right = np.full((2, 6, 32, 3), 50, np.uint8)
     view = render(left + 10, right, make_estimate(*np.full((2, 6, 32), 500.0)), 0.4)

@@ -79,27 +79,36 @@ def test_two_thirds_as_many_pixels_fly_as_with_bilinear_upsampling_from_a_quarte
 
 
 @pytest.mark.testdata
-@pytest.mark.parametrize(("name", "most"), [("small", (1.8, 24.0, 15.0)), ("base", (1.05, 17.0, 10.0))])
-def test_on_real_pairs_the_network_is_as_good_as_promised(testdata, name, most):
+@pytest.mark.parametrize(
+    ("name", "refined", "most"),
+    [
+        ("small", False, (1.8, 24.0, 15.0)),
+        ("small", True, (1.6, 20.0, 11.5)),
+        ("base", False, (1.05, 17.0, 10.0)),
+        ("base", True, (0.95, 14.6, 8.4)),
+    ],
+)
+def test_on_real_pairs_the_network_is_as_good_as_promised(testdata, name, refined, most):
     rows = []
     for scene in read_scenes(testdata / "stereo/pairs"):
-        found_px = sw.estimate(scene.pair.left, scene.pair.right, model=name).disparity_px
+        pair = scene.pair
+        found_px = sw.estimate(pair.left, pair.right, model=name, refined=refined).disparity_px
         bad = [metrics.bad_percent(found_px, scene.truth_px, threshold_px) for threshold_px in (1, 2)]
         rows.append([metrics.epe_px(found_px, scene.truth_px), *bad])
     assert (np.mean(rows, axis=0) <= most).all()
 
 
 @pytest.mark.testdata
-# The aims for base are 28.2, 26.7 and 33.8 dB: what SGBM's disparity gives through a plain splat.
+# The aims are 29.2, 28.0 and 35.0 dB (lab notebook, 2026-11-21).
 @pytest.mark.parametrize(
     ("name", "scene_name", "least_db"),
     [
-        ("small", "cones", 26.6),
-        ("small", "tsukuba", 26.3),
-        ("small", "venus", 32.5),
-        ("base", "cones", 27.2),
-        ("base", "tsukuba", 27.8),
-        ("base", "venus", 33.0),
+        ("small", "cones", 28.6),
+        ("small", "tsukuba", 28.0),
+        ("small", "venus", 33.9),
+        ("base", "cones", 28.9),
+        ("base", "tsukuba", 28.6),
+        ("base", "venus", 34.2),
     ],
 )
 def test_new_views_come_near_to_real_photographs(testdata, name, scene_name, least_db):
