@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from stereoweave.errors import StereoweaveError, needing_extra
-from stereoweave.io import replacing
+from stereoweave.io import held_by_its_format, replacing
 
 Frames = Iterator[UInt8[np.ndarray, "h w 3"]]
 
@@ -120,7 +120,8 @@ def _write_webp(path: Path, frames: Frames, frame_ms: int) -> None:
 
 def _save(path: Path, kind: str, pictures: Iterator[Image.Image], frame_ms: int, **options: int) -> None:
     first = next(pictures)
-    first.save(path, kind, save_all=True, append_images=pictures, duration=frame_ms, loop=0, **options)
+    with held_by_its_format(path, (first.height, first.width)):
+        first.save(path, kind, save_all=True, append_images=pictures, duration=frame_ms, loop=0, **options)
 
 
 _KINDS: dict[str, Callable[[Path, Frames, int], None]] = {

@@ -42,6 +42,16 @@ PAIRS_TABLES = {
 }
 
 # The same of stereoweave bench views.
+FLICKER_TABLES = {
+    "Disparity and the view half-way, mean over the scenes": {
+        "flicker px": "flicker_px",
+        "of the view": "view_flicker_levels",
+        "EPE px": "epe_px",
+        "moving": "moving_epe_px",
+        "uncovered": "uncovered_epe_px",
+        "ms": "time_ms",
+    },
+}
 VIEWS_TABLES = {
     "New views, PSNR in dB, mean over the scenes": {
         "all": "psnr_db",
@@ -175,14 +185,19 @@ def flicker(
     scenes: Annotated[list[str], typer.Argument(metavar="SCENE...", help="As for synth make.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("flicker.csv"),
     model: Model = "small",
-    frames: Annotated[int, typer.Option(min=3, help="Of each film.")] = 12,
+    frames: Annotated[int, typer.Option(min=2, max=120, help="Of each film.")] = 12,
     threads: Threads = None,
 ) -> None:
     """What steadying is worth: flicker and errors of depth with it and without, on rendered noisy films."""
     place_for(out)
     with needing_the_synth_extra():
-        from stereoweave.flicker_bench import flicker_rows
-    _write_and_tell(out, "Rendered films", list(flicker_rows(scenes, model, frames=frames, threads=threads)))
+        from stereoweave.flicker_bench import flicker_rows, means
+    from stereoweave.benchmark import write_csv
+
+    rows = list(flicker_rows(scenes, model, frames=frames, threads=threads))
+    write_csv(out, rows)
+    _tell_means(FLICKER_TABLES, "film", means(rows))
+    typer.echo(f"rows: {out}")
 
 
 @bench.command()

@@ -57,6 +57,6 @@ def _sources_digest() -> str:
     Numba looks at the file of the kernel alone, and would keep what functions of other files were before.
     """
     digest = hashlib.sha256()
-    for source in sorted(Path(__file__).parent.glob("*_kernels.py")):
+    for source in (Path(__file__), *sorted(Path(__file__).parent.glob("*_kernels.py"))):
         digest.update(source.read_bytes())
     return digest.hexdigest()[:12]

@@ -2,9 +2,9 @@
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -18,6 +18,7 @@ from stereoweave.steady import Steadier
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.synth.samples import Order
 
+MEAN = "mean"
 FRAME_BY_FRAME, STEADY = "frame by frame", "steady"
 # Five seconds of a camera on its way.
 _WAY_FRAMES = 120
@@ -107,6 +108,20 @@ def flicker_rows(  # noqa: PLR0913 - each is a word of the command line
                     time_ms=taken.time_ms,
                     **_errors(film, taken),
                 )
+
+
+def means(rows: Sequence[FlickerRow]) -> list[FlickerRow]:
+    """The mean over the scenes of each film and method, the two in one name."""
+    groups: dict[tuple[str, str], list[FlickerRow]] = {}
+    for row in rows:
+        groups.setdefault((row.film, row.method), []).append(row)
+    return [_mean(", ".join(name), group) for name, group in groups.items()]
+
+
+def _mean(name: str, rows: Sequence[FlickerRow]) -> FlickerRow:
+    numbers = ("flicker_px", "view_flicker_levels", "epe_px", "moving_epe_px", "uncovered_epe_px", "time_ms")
+    values: dict[str, Any] = {n: float(np.mean([getattr(row, n) for row in rows])) for n in numbers}
+    return replace(rows[0], film=name, scene=MEAN, **values)
 
 
 def _films(order: Order, frames: int) -> Iterator[Film]:

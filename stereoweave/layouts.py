@@ -5,6 +5,7 @@ a motion is a row of views. The two eyes are the positions 0 and 1 of the render
 convergence they keep to.
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from PIL import Image
 from stereoweave.animation import animation_ending
 from stereoweave.colour import colour_range_px
 from stereoweave.errors import StereoweaveError
-from stereoweave.io import picture_kind, replacing, write_image
+from stereoweave.io import held_by_its_format, picture_kind, replacing, write_image
 from stereoweave.rendering import FIRST_POSITION, LAST_POSITION, Renderer
 from stereoweave.stereo import Estimate, StereoPair
 
@@ -75,6 +76,10 @@ class Choices:
             raise StereoweaveError(
                 f"quilt: expected columns and rows of 2 to {_MOST_VIEWS} views, "
                 f"got {self.columns}x{self.rows}; the displays' are 5x9, 8x6, 7x7 and 11x6"
+            )
+        if self.range_px is not None and not -math.inf < self.range_px[0] < self.range_px[1] < math.inf:
+            raise StereoweaveError(
+                f"range: expected two disparities in px, the lower one first, got {self.range_px}"
             )
 
 
@@ -290,7 +295,7 @@ def write_picture(path: str | Path, picture: UInt8[np.ndarray, "h w 3"]) -> None
     if ending not in _HELD:
         write_image(path, picture)
         return
-    with replacing(path) as temporary:
+    with replacing(path) as temporary, held_by_its_format(path, picture.shape):
         if ending == ".jps":
             Image.fromarray(picture).save(temporary, "JPEG", extra=_JPS_SEGMENT, **_FINE)
         else:

@@ -7,18 +7,15 @@ of what the network said: thin things that its coarse steps cannot see, and edge
 """
 
 import math
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8, UInt16
 
-from stereoweave.errors import StereoweaveError
 from stereoweave.exposure import match_exposure, recoloured
-from stereoweave.stereo import Estimate, StereoPair
-from stereoweave.threads import thread_count
+from stereoweave.stereo import Estimate, StereoPair, check_fits
+from stereoweave.threads import in_bands, thread_count
 
 if TYPE_CHECKING:
     from stereoweave.refining_kernels import Cues
@@ -57,12 +54,7 @@ def refine(
         threads: How many threads may be used, of which four at most are; all cores if left out.
     """
     pair = StereoPair(left=left, right=right)
-    found, expected = estimate.disparity_px.shape, pair.left.shape[:2]
-    if found != expected:
-        raise StereoweaveError(
-            f"estimate: expected the photographs' size {expected[1]}x{expected[0]}, "
-            f"got {found[1]}x{found[0]}; make it from these photographs"
-        )
+    check_fits(estimate, pair)
     looks = match_exposure(left, right, estimate)
     if looks is not None:
         pair = StereoPair(left=left, right=recoloured(right, looks.tables(0)[1]))
@@ -145,16 +137,25 @@ def _found(
         kernels.match(own, other, first, last, costs)
         kernels.along_rows(costs, steps_along, first, last, sums)
 
-    _in_bands(match, height, threads)
-    _in_bands(lambda first, last: kernels.along_columns(costs, steps_down, first, last, sums), width, threads)
-    _in_bands(lambda first, last: kernels.pick(sums, first_px, first, last, found_px), height, threads)
+    in_bands(match, height, threads, threads)
+    in_bands(
+        lambda first, last: kernels.along_columns(costs, steps_down, first, last, sums),
+        width,
+        threads,
+        threads,
+    )
+    in_bands(
+        lambda first, last: kernels.pick(sums, first_px, first, last, found_px), height, threads, threads
+    )
     return found_px
 
 
 def _candidates(estimate: Estimate) -> tuple[int, int]:
     """The first disparity in px that is looked at, and how many are."""
     both = estimate.disparity_px, estimate.right_disparity_px
-    first_px = math.floor(min(view.min() for view in both)) - _MARGIN_PX
+    least_px = math.floor(min(view.min() for view in both))
+    # Parallel cameras give none below 0: a plain sky would take them.
+    first_px = least_px - _MARGIN_PX if least_px < 0 else max(least_px - _MARGIN_PX, 0)
     last_px = math.ceil(max(view.max() for view in both)) + _MARGIN_PX
     count = last_px - first_px + 1
     return first_px, count + -count % _CANDIDATES_MULTIPLE
@@ -216,10 +217,3 @@ def _large_steps(grey: UInt8[np.ndarray, "h w"], axis: int) -> UInt16[np.ndarray
     before = grey.take([0, *range(grey.shape[axis] - 1)], axis)
     costs = _LARGEST_STEP / (1 + cv2.absdiff(grey, before).astype(np.float32) / _HALVING_LEVELS)
     return np.maximum(costs, _LEAST_LARGE_STEP).astype(np.uint16)
-
-
-def _in_bands(work: Callable[[int, int], None], size: int, count: int) -> None:
-    """Do the work from `first` to `last` of that many bands, each in a thread."""
-    ends = [size * band // count for band in range(count + 1)]
-    with ThreadPoolExecutor(count) as pool:
-        list(pool.map(work, ends[:-1], ends[1:]))

@@ -1,6 +1,7 @@
 """New views from an estimate: what a camera elsewhere on the line through the two would have seen."""
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
@@ -11,8 +12,8 @@ from jaxtyping import Float, UInt8
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.exposure import match_exposure, recoloured
-from stereoweave.stereo import Estimate, StereoCamera, StereoPair, View
-from stereoweave.threads import thread_count
+from stereoweave.stereo import Estimate, StereoCamera, StereoPair, View, check_fits
+from stereoweave.threads import in_bands, thread_count
 
 if TYPE_CHECKING:
     from stereoweave.rendering_kernels import Canvas, Side
@@ -23,6 +24,8 @@ _LEAST_NEARNESS = 1e-3
 # What is hidden is found in bands of about this many rows, however many threads there are.
 _BAND_ROWS = 60
 _FARTHEST_MOVE = 1.0
+# So few pixels may be farther than what is taken to be far away: a matcher's errors.
+_FAR_PERCENT = 1
 
 
 class Renderer:
@@ -32,7 +35,8 @@ class Renderer:
         pair: The two photographs, with their camera where it is known.
         estimate: Of these two photographs.
         strength: Multiplies the baseline about the middle: p is seen from 0.5 + strength * (p - 0.5).
-        convergence_px: The disparity of the plane that stays in place from view to view.
+        convergence_px: The disparity of the plane that stays in place from view to view; at most the
+            picture's width, of either sign.
     """
 
     def __init__(
@@ -44,7 +48,8 @@ class Renderer:
         convergence_px: float = 0.0,
         threads: int | None = None,
     ) -> None:
-        _check_size(pair, estimate)
+        check_fits(estimate, pair)
+        _check_shifts(strength, convergence_px, pair)
         self.pair, self.estimate = pair, estimate
         self.strength, self.convergence_px = strength, convergence_px
         self._threads = min(_MOST_THREADS, thread_count(threads))
@@ -74,7 +79,7 @@ class Renderer:
         if up or forward:
             from stereoweave.moving import moved
 
-            camera = self.pair.camera or _assumed_camera(self.pair)
+            camera = self.pair.camera or _assumed_camera(self.estimate)
             offset_px = (position - 0.5) * self.convergence_px + position * camera.doffs_px
             canvas = moved(canvas, camera, offset_px, up, forward)
         return View(image=canvas.image, drawn=canvas.drawn)
@@ -101,7 +106,7 @@ class Renderer:
         )
         canvas = empty_canvas((left if position < 0.5 else right).photo)
         work = partial(draw, left, right, self._confidence, canvas)
-        _in_bands(work, len(canvas.image), self._threads, self._threads)
+        in_bands(work, len(canvas.image), self._threads, self._threads)
         if not 0 <= position <= 1:
             # In between, what neither camera saw is a few pixels wide; `fill` is quicker, and does as well.
             hidden = self._behind(right=position > 1)
@@ -185,12 +190,13 @@ def check_position(position: float, *, up: float = 0.0, forward: float = 0.0) ->
             )
 
 
-def _check_size(pair: StereoPair, estimate: Estimate) -> None:
-    found, expected = estimate.disparity_px.shape, pair.left.shape[:2]
-    if found != expected:
+def _check_shifts(strength: float, convergence_px: float, pair: StereoPair) -> None:
+    if not 0 <= strength < math.inf:
+        raise StereoweaveError(f"strength: expected 0 or more, got {strength}")
+    width = pair.left.shape[1]
+    if not abs(convergence_px) <= width:
         raise StereoweaveError(
-            f"estimate: expected the photographs' size {expected[1]}x{expected[0]}, "
-            f"got {found[1]}x{found[0]}; make it from these photographs"
+            f"convergence: expected -{width} to {width} px, the picture's width, got {convergence_px}"
         )
 
 
@@ -222,10 +228,19 @@ def _photo(
     return {"photo": coloured, "grey": cv2.cvtColor(coloured, cv2.COLOR_RGB2GRAY)}
 
 
-def _assumed_camera(pair: StereoPair) -> StereoCamera:
-    """A camera of 53 degrees of view, whose principal point is the picture's centre."""
-    height, width = pair.left.shape[:2]
-    return StereoCamera(focal_px=width, baseline_m=1.0, cx_px=(width - 1) / 2, cy_px=(height - 1) / 2)
+def _assumed_camera(estimate: Estimate) -> StereoCamera:
+    """A camera of 53 degrees of view, whose principal point is the picture's centre.
+
+    Where disparities are negative, the cameras converge: what has the least is then taken to be far away.
+    """
+    height, width = estimate.disparity_px.shape
+    return StereoCamera(
+        focal_px=width,
+        baseline_m=1.0,
+        cx_px=(width - 1) / 2,
+        cy_px=(height - 1) / 2,
+        doffs_px=max(0.0, -float(np.percentile(estimate.disparity_px, _FAR_PERCENT))),
+    )
 
 
 def _uncovered(sides: "Sequence[Side]", right: bool, threads: int) -> Hidden:
@@ -238,12 +253,5 @@ def _uncovered(sides: "Sequence[Side]", right: bool, threads: int) -> Hidden:
     outwards = 1 if right else -1
     known = own.photo, own.disparity_px, own.nearer_px, other.disparity_px, outwards
     height = len(own.photo)
-    _in_bands(partial(uncover, *known, *hidden), height, -(-height // _BAND_ROWS), threads)
+    in_bands(partial(uncover, *known, *hidden), height, -(-height // _BAND_ROWS), threads)
     return hidden
-
-
-def _in_bands(work: Callable[[int, int], None], height: int, count: int, threads: int) -> None:
-    """Do the work on that many bands of rows, from one row to before another, in threads."""
-    ends = [height * band // count for band in range(count + 1)]
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(work, ends[:-1], ends[1:]))

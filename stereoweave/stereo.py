@@ -110,6 +110,21 @@ class Estimate:
                 raise StereoweaveError(
                     f"{name}: expected finite values, got {count} NaN or infinite ones; fill them first"
                 )
+        if self.confidence.size and not 0 <= self.confidence.min() <= self.confidence.max() <= 1:
+            raise StereoweaveError(
+                f"confidence: expected probabilities, 0 to 1, got {self.confidence.min():g} to "
+                f"{self.confidence.max():g}"
+            )
+
+
+def check_fits(estimate: Estimate, pair: StereoPair) -> None:
+    """Raise a StereoweaveError unless the estimate is of the size of the pair."""
+    found, expected = estimate.disparity_px.shape, pair.left.shape[:2]
+    if found != expected:
+        raise StereoweaveError(
+            f"estimate: expected the photographs' size {expected[1]}x{expected[0]}, "
+            f"got {found[1]}x{found[0]}; make it from these photographs"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,8 @@
-"""How many threads a call may use."""
+"""How many threads a call may use, and rows shared out among them."""
 
 import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 from stereoweave.errors import StereoweaveError
 
@@ -17,3 +19,10 @@ def usable_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def in_bands(work: Callable[[int, int], None], height: int, count: int, threads: int) -> None:
+    """Do the work on that many bands of rows, from one row to before another, in threads."""
+    ends = [height * band // count for band in range(count + 1)]
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(work, ends[:-1], ends[1:]))

@@ -63,6 +63,9 @@ def view(  # noqa: PLR0913 - each is a word of the command line
     quilt: Annotated[
         str | None, typer.Option(metavar="COLUMNSxROWS", help="The views of a quilt. [default: 8x6]")
     ] = None,
+    calib: Annotated[
+        Path | None, typer.Option(help="Middlebury's calib.txt, for --up and --forward in true proportion.")
+    ] = None,
     model: Model = "base",
     threads: Threads = None,
 ) -> None:
@@ -73,12 +76,14 @@ def view(  # noqa: PLR0913 - each is a word of the command line
 
     name = layout_of(out, layout)
     _refuse_idle(name, {"--position": position, "--up": up or None, "--forward": forward or None}, quilt)
+    if name == "rgbd" and (strength != 1 or convergence is not None):
+        raise StereoweaveError("--strength, --convergence: expected with several views, found with rgbd")
     check_position(_MIDDLE, up=up, forward=forward)
     choices = _choices(quilt)
     positions, converged = _needs(name, _MIDDLE if position is None else position)
     check_reach(positions, strength)
-    plane_px = _plane_px(convergence or ("auto" if converged else "0"))
-    pair = read_pictures(pictures)
+    plane_px = _plane_px(("auto" if converged else "0") if convergence is None else convergence)
+    pair = read_pictures(pictures, calib)
     if name in LAYOUTS:
         out = marked(out, name, pair, choices)
     place_for(out)

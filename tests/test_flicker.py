@@ -5,7 +5,7 @@ import pytest
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.flicker import flicker, seen_again
-from stereoweave.flicker_bench import FRAME_BY_FRAME, STEADY, flicker_rows
+from stereoweave.flicker_bench import FRAME_BY_FRAME, STEADY, FlickerRow, flicker_rows, means
 from stereoweave.flicker_films import (
     LEFT,
     MIDDLE,
@@ -207,3 +207,18 @@ def test_the_rows_say_what_steadying_is_worth():
 def test_a_film_of_one_frame_is_refused():
     with pytest.raises(StereoweaveError, match="frames: expected 2 or more"):
         list(flicker_rows(["rooms"], frames=1))
+
+
+def test_means_are_over_the_scenes_of_a_film_and_a_method():
+    def row(scene, method, value):
+        numbers = dict.fromkeys(("view_flicker_levels", "epe_px", "moving_epe_px", "uncovered_epe_px"), value)
+        return FlickerRow(
+            film="still", scene=scene, model="small", method=method, width_px=8, height_px=6, frames=3,
+            noise_levels=4.0, flicker_px=value, time_ms=float("nan"), **numbers,
+        )  # fmt: skip
+
+    found = means([row("a", STEADY, 1.0), row("a", FRAME_BY_FRAME, 5.0), row("b", STEADY, 2.0)])
+    assert [(mean.film, mean.scene, mean.flicker_px) for mean in found] == [
+        ("still, steady", "mean", 1.5),
+        ("still, frame by frame", "mean", 5.0),
+    ]

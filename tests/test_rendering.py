@@ -349,3 +349,29 @@ def test_photographs_of_different_exposure_make_one_look_on_the_way_from_one_to_
         view = render(left, brighter, seen, position)
         expected = left * (1 + 0.2 * position)
         assert np.abs(view.image - expected).mean() < 1
+
+
+@pytest.mark.parametrize("convergence_px", [float("nan"), float("inf"), -41.0])
+def test_a_convergence_beyond_the_pictures_width_is_refused(rng, convergence_px):
+    left, right, estimate = random_scene(rng)
+    with pytest.raises(ValueError, match=r"^convergence: expected -40 to 40 px, .*, got "):
+        Renderer(StereoPair(left=left, right=right), estimate, convergence_px=convergence_px)
+
+
+@pytest.mark.parametrize("strength", [float("nan"), float("inf"), -1.0])
+def test_a_strength_that_is_none_is_refused(rng, strength):
+    left, right, estimate = random_scene(rng)
+    with pytest.raises(ValueError, match=r"^strength: expected 0 or more, got "):
+        Renderer(StereoPair(left=left, right=right), estimate, strength=strength)
+
+
+def test_a_view_from_above_moves_what_has_negative_disparity_too():
+    # Of the two, the wall at -8 is taken to be far away; the stripe at -3 is 5 px nearer.
+    left = np.zeros((20, 30, 3), np.uint8)
+    left[8:12] = 200
+    disparity_px = np.full((20, 30), -8.0)
+    disparity_px[8:12] = -3
+    renderer = Renderer(StereoPair(left=left, right=left), make_estimate(disparity_px, disparity_px))
+    level, above = (renderer.view(0.0, up=up).image[:, 15, 0] for up in (1e-9, 1.0))
+    np.testing.assert_array_equal(np.flatnonzero(level > 100), np.arange(8, 12))
+    np.testing.assert_array_equal(np.flatnonzero(above > 100), np.arange(13, 17))
