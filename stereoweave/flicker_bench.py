@@ -115,10 +115,10 @@ def means(rows: Sequence[FlickerRow]) -> list[FlickerRow]:
     groups: dict[tuple[str, str], list[FlickerRow]] = {}
     for row in rows:
         groups.setdefault((row.film, row.method), []).append(row)
-    return [_mean(", ".join(name), group) for name, group in groups.items()]
+    return [_mean_row(", ".join(name), group) for name, group in groups.items()]
 
 
-def _mean(name: str, rows: Sequence[FlickerRow]) -> FlickerRow:
+def _mean_row(name: str, rows: Sequence[FlickerRow]) -> FlickerRow:
     numbers = ("flicker_px", "view_flicker_levels", "epe_px", "moving_epe_px", "uncovered_epe_px", "time_ms")
     values: dict[str, Any] = {n: float(np.mean([getattr(row, n) for row in rows])) for n in numbers}
     return replace(rows[0], film=name, scene=MEAN, **values)
