@@ -19,7 +19,9 @@ def lay(hidden_px, colours, shift, offset_px, canvas):
     """
     height, width = hidden_px.shape
     for y in range(height):
-        for x in range(width):
+        for k in range(width):
+            # What lands on one pixel comes nearest first, so that nothing is laid twice.
+            x = k if shift > 0 else width - 1 - k
             d = hidden_px[y, x]
             if d == NOTHING:
                 continue
@@ -27,9 +29,7 @@ def lay(hidden_px, colours, shift, offset_px, canvas):
             for u in range(max(math.ceil(at - 0.5), 0), min(math.ceil(at + 0.5) - 1, width - 1) + 1):
                 own_px = canvas.surface_px[y, u]
                 farther = own_px > NOTHING and own_px < d - SAME_SURFACE_PX
-                # A farther background may lie behind a nearer one, which is laid then.
-                laid = canvas.pure[y, u] and not canvas.drawn[y, u]
-                if farther or (canvas.pure[y, u] and not laid) or (laid and own_px >= d):
+                if farther or canvas.pure[y, u]:
                     continue
                 _mix(hidden_px[y], colours[y], x, u - at, canvas.image[y, u])
                 canvas.surface_px[y, u], canvas.pure[y, u], canvas.drawn[y, u] = d, True, False

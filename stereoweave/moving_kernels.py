@@ -60,8 +60,9 @@ def _copy(image, surface_px, x, part, colour):
     width = image.shape[0]
     a, b, c, d = max(x - 1, 0), x, min(x + 1, width - 1), min(x + 2, width - 1)
     w0, w1, w2, w3 = 0.0, 1.0 - part, part, 0.0
-    nearest, farthest = min(surface_px[a], surface_px[d]), max(surface_px[a], surface_px[d])
-    if max(farthest, surface_px[b]) - min(nearest, surface_px[b]) <= SAME_SURFACE_PX:
+    low_px = min(min(surface_px[a], surface_px[b]), min(surface_px[c], surface_px[d]))
+    high_px = max(max(surface_px[a], surface_px[b]), max(surface_px[c], surface_px[d]))
+    if high_px - low_px <= SAME_SURFACE_PX:
         w0 = ((-0.5 * part + 1.0) * part - 0.5) * part
         w1 = (1.5 * part - 2.5) * part * part + 1.0
         w3 = (0.5 * part - 0.5) * part * part

@@ -1,9 +1,11 @@
 import numpy as np
 import pytest
+from plain_moving import plain_lay
 
+from stereoweave.filling_kernels import lay
 from stereoweave.hidden_kernels import uncover
 from stereoweave.rendering import Renderer
-from stereoweave.rendering_kernels import NOTHING
+from stereoweave.rendering_kernels import NOTHING, Canvas, empty_canvas
 from stereoweave.stereo import Estimate, StereoPair
 
 WALL_PX, OBJECT_PX = 2, 10
@@ -20,7 +22,7 @@ def wall_with_object(wall):
 
 
 def uncovered(photo, disparity_px, other_px, side):
-    nearer_px = np.where(disparity_px == WALL_PX, 0, 0).astype(np.float32)
+    nearer_px = np.zeros_like(disparity_px)
     edge = np.abs(np.diff(disparity_px, axis=1)) > 1
     beside = np.pad(edge, ((0, 0), (0, 1))) | np.pad(edge, ((0, 0), (1, 0)))
     nearer_px[beside & (disparity_px == WALL_PX)] = OBJECT_PX - WALL_PX
@@ -108,3 +110,42 @@ def test_a_plain_picture_hides_nothing():
     flat = np.full((4, 60), WALL_PX, np.float32)
     hidden_px, _ = uncovered(stripes(4, 4), flat, flat, -1)
     assert (hidden_px == NOTHING).all()
+
+
+def random_hidden(rng, height=40, width=50):
+    """Bands of hidden background at several depths, their colours, and a canvas with gaps and rims."""
+    bands = np.repeat(rng.choice([NOTHING, 1.0, 3.0, 9.0, 14.0], (height, width // 5)), 5, axis=1)
+    hidden_px = np.where(bands > NOTHING, bands + rng.normal(0, 0.4, (height, width)), NOTHING)
+    drawn_on = np.repeat(rng.random((height, width // 5)) < 0.6, 5, axis=1)
+    canvas = Canvas(
+        surface_px=np.where(drawn_on, rng.uniform(0, 20, (height, width)), NOTHING).astype(np.float32),
+        image=rng.integers(0, 256, (height, width, 3), dtype=np.uint8),
+        pure=drawn_on & (rng.random((height, width)) < 0.5),
+        drawn=np.ones((height, width), bool),
+    )
+    return hidden_px.astype(np.float32), rng.integers(0, 256, (height, width, 3), dtype=np.uint8), canvas
+
+
+@pytest.mark.parametrize("shift", [1.0, 0.4, -0.4, -1.0])
+@pytest.mark.parametrize("offset_px", [0.0, -2.3])
+def test_the_fast_laying_equals_the_plain_one(rng, shift, offset_px):
+    hidden_px, colours, canvas = random_hidden(rng)
+    expected = plain_lay(hidden_px, colours, shift, offset_px, canvas)
+    lay(hidden_px, colours, shift, offset_px, canvas)
+    np.testing.assert_array_equal(canvas.surface_px, expected.surface_px)
+    np.testing.assert_array_equal(canvas.pure, expected.pure)
+    np.testing.assert_array_equal(canvas.drawn, expected.drawn)
+    np.testing.assert_array_equal(canvas.image, expected.image)
+
+
+@pytest.mark.parametrize(("shift", "near_at", "far_at"), [(1.0, 12, 20), (-1.0, 30, 22)])
+def test_hidden_background_is_laid_only_where_none_is_nearer(shift, near_at, far_at):
+    # At disparity 10 and at 2, both land on column 22 from the left, or on 20 from the right.
+    hidden_px, colours = np.full((1, 40), NOTHING), np.zeros((1, 40, 3), np.uint8)
+    hidden_px[0, near_at], hidden_px[0, far_at] = 10, 2
+    colours[0, near_at], colours[0, far_at] = 200, 100
+    canvas = empty_canvas(np.zeros((1, 40, 3), np.uint8))
+    lay(hidden_px, colours, shift, 0.0, canvas)
+    (column,) = np.flatnonzero(canvas.pure[0])
+    assert (canvas.surface_px[0, column], canvas.drawn[0, column]) == (10, False)
+    assert (canvas.image[0, column] == 200).all()

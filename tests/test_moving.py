@@ -1,7 +1,10 @@
 import numpy as np
 import pytest
+from plain_moving import plain_move
 
+from stereoweave.moving_kernels import move
 from stereoweave.rendering import Renderer
+from stereoweave.rendering_kernels import Canvas, empty_canvas
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
 
@@ -61,12 +64,25 @@ def test_forward_everything_grows_about_the_centre_by_its_depth():
     assert view.drawn.all()
 
 
-def test_backward_is_forward_undone_where_both_can_be_seen(rng):
+def test_backward_is_forward_undone_where_both_can_be_seen():
+    # From 10 baselines to 11, where the disparity is 80 / 11, and to 10 again.
     camera = StereoCamera(focal_px=80.0, baseline_m=0.1, cx_px=45.0, cy_px=30.0)
-    renderer = flat(rng, 8, camera)
-    far = renderer.view(0.5, forward=-1.0)
+    columns, rows = np.meshgrid(np.arange(90), np.arange(60))
+    left = np.stack([2 * columns, 3 * rows, columns + rows], axis=2).astype(np.uint8)
+    near = Renderer(
+        StereoPair(left=left, right=np.roll(left, -8, axis=1), camera=camera),
+        estimate_of(*np.full((2, 60, 90), 8.0)),
+    )
+    far_left, far_right = (near.view(position, forward=-1.0) for position in (0.0, 1.0))
     # 10 / 11 as large: 60 rows fill 54.5 of the picture.
-    assert far.drawn[:, 45].sum() == pytest.approx(60 * 10 / 11, abs=1)
+    assert far_left.drawn[:, 45].sum() == pytest.approx(60 * 10 / 11, abs=1)
+    far = Renderer(
+        StereoPair(left=far_left.image, right=far_right.image, camera=camera),
+        estimate_of(*np.full((2, 60, 90), 80 / 11)),
+    )
+    again = far.view(0.0, forward=1.0)
+    # Each of the two views rounds to whole levels.
+    assert np.abs(again.image.astype(int) - left)[2:-2, 2:-2].max() <= 2
 
 
 def test_an_offset_between_the_principal_points_counts_as_depth(rng):
@@ -76,18 +92,60 @@ def test_an_offset_between_the_principal_points_counts_as_depth(rng):
     np.testing.assert_array_equal(above.image[6:], level.image[:-6])
 
 
-@pytest.mark.parametrize("move", [{"up": 1.1}, {"forward": -1.1}, {"up": float("nan")}])
-def test_a_move_out_of_range_is_refused(rng, move):
-    (name, value), *_ = move.items()
+@pytest.mark.parametrize(("name", "value"), [("up", 1.1), ("forward", -1.1), ("up", float("nan"))])
+def test_a_move_out_of_range_is_refused(rng, name, value):
     with pytest.raises(ValueError, match=rf"^{name}: expected -1 to 1 \(baselines\), got {value}$"):
-        flat(rng, 8).view(0.5, **move)
+        flat(rng, 8).view(0.5, **{name: value})
 
 
-def test_a_camera_moved_up_and_forward_keeps_the_order_of_depth(rng):
-    left = rng.integers(0, 256, (30, 40, 3), dtype=np.uint8)
-    disparity_px = np.repeat(np.linspace(12, 1, 30)[:, None], 40, axis=1)
-    view = Renderer(StereoPair(left=left, right=left), estimate_of(disparity_px, disparity_px)).view(
-        0.0, up=0.3, forward=0.3
+@pytest.mark.parametrize("rows", [slice(None), slice(None, None, -1)])
+def test_a_camera_moved_up_and_forward_keeps_the_order_of_depth(rows):
+    # Upside down, and from below, the near box comes after the other one where it came before.
+    camera = StereoCamera(focal_px=100.0, baseline_m=0.1, cx_px=45.0, cy_px=29.5)
+    photos, maps = np.full((2, 60, 90, 3), 50, np.uint8), np.zeros((2, 60, 90))
+    for side in (0, 1):
+        for level, disparity_px, top in ((200, 20, 10), (120, 10, 20)):
+            columns = slice(37 - side * disparity_px, 53 - side * disparity_px)
+            photos[side, top : top + 10, columns], maps[side, top : top + 10, columns] = level, disparity_px
+    left, right = (np.ascontiguousarray(photo[rows]) for photo in photos)
+    renderer = Renderer(StereoPair(left=left, right=right, camera=camera), estimate_of(*maps[:, rows]))
+    up = 0.6 if rows.step is None else -0.6
+    image = renderer.view(0.0, up=up, forward=1.0).image[rows, :, 0]
+    # The near box grows by 5 / 4 and falls by 0.6 * 25 to rows 20 to 31; the other one by 10 / 9 and
+    # 0.6 * 100 / 9 to rows 26 to 36.
+    assert (image[20:32, 35:55] == 200).all()
+    assert (image[32:37, 36:54] == 120).all()
+    assert (image == 200).sum() == 12 * 20
+
+
+def random_move(rng, rate):
+    """A view of noise with slants and jumps, and for its pixels targets with folds, and disparities."""
+    height, width = 30, 50
+    jumps = rng.choice([0.0, 8.0, -6.0, 12.0], (height, width), p=[0.85, 0.05, 0.05, 0.05])
+    surface_px = np.cumsum(jumps + rng.normal(0, 0.8, (height, width)), axis=1).astype(np.float32)
+    view = Canvas(
+        surface_px=surface_px,
+        image=rng.integers(0, 256, (height, width, 3), dtype=np.uint8),
+        pure=np.ones((height, width), bool),
+        drawn=rng.random((height, width)) < 0.8,
     )
-    assert view.image.shape == left.shape
-    assert view.drawn.any()
+    columns = (np.arange(width) - width / 2) * rate + width / 2
+    targets = columns + 0.3 * surface_px + rng.normal(0, 0.7, (height, width))
+    disparity_px = surface_px + rng.normal(0, 1, (height, width))
+    return view, targets.astype(np.float32), disparity_px.astype(np.float32)
+
+
+@pytest.mark.parametrize("rate", [0.6, 1.0, 2.7])
+@pytest.mark.parametrize("halves", [False, True])
+def test_the_fast_move_equals_the_plain_one(rng, rate, halves):
+    view, targets, disparity_px = random_move(rng, rate)
+    if halves:  # where a pixel's border falls on another's middle
+        targets = np.rint(2 * targets) / 2
+    canvas = empty_canvas(255 - view.image)
+    expected = plain_move(view, targets, disparity_px, canvas)
+    move(view.image, view.surface_px, view.drawn, targets, disparity_px, canvas)
+    np.testing.assert_array_equal(canvas.pure, expected.pure)
+    np.testing.assert_allclose(canvas.surface_px, expected.surface_px, rtol=0, atol=1e-4)
+    np.testing.assert_array_equal(canvas.drawn, expected.drawn)
+    assert np.abs(canvas.image - expected.image).max() <= 1
+    assert 0.3 < canvas.pure.mean() < 1

@@ -40,9 +40,9 @@ def test_a_quilt_of_48_views_matches_once(pair, monkeypatch, capfd):
     sizes = []
     estimate = Matcher.estimate
 
-    def counted(matcher, left, right):
+    def counted(matcher, left, right, **options):
         sizes.append(left.shape[:2])
-        return estimate(matcher, left, right)
+        return estimate(matcher, left, right, **options)
 
     monkeypatch.setattr(Matcher, "estimate", counted)
     assert run("view left.png right.png --layout quilt --threads 1 -o view.png") == 0
@@ -71,7 +71,7 @@ def test_a_layout_is_made_of_one_estimate_at_its_strength_and_plane(
     before = set(Path().iterdir())
     assert run(f"view left.png right.png --model small --threads 1 {arguments}") == 0
     assert written(before) == Path(file)
-    estimate = Matcher("small", threads=1).estimate(pair.left, pair.right)
+    estimate = Matcher("small", threads=1).estimate(pair.left, pair.right, refined=True)
     plane_px = middle_px(estimate) if convergence_px is None else convergence_px
     renderer = Renderer(pair, estimate, strength=strength, convergence_px=plane_px, threads=1)
     choices = Choices(columns=3, rows=2) if "3x2" in arguments else Choices()
@@ -146,7 +146,7 @@ def test_a_wiggle_moves(pair, capfd, ending):
 def test_a_mistake_is_told_in_one_line_before_anything_is_matched(
     pair, monkeypatch, capfd, arguments, fragments
 ):
-    def unmatched(*_):
+    def unmatched(*_, **__):
         raise AssertionError("matched")
 
     monkeypatch.setattr(Matcher, "estimate", unmatched)
