@@ -14,6 +14,7 @@ from io import BytesIO
 from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+from zipfile import BadZipFile
 
 import av
 import cv2
@@ -40,6 +41,8 @@ else:
 CONTAINERS = {".mp4": "mp4", ".mkv": "matroska", ".mov": "mov"}
 # Sound begins before 0 by what its decoder throws away: the muxer would rather make the whole film late.
 _EXACT_TIMES = {"avoid_negative_ts": "disabled"}
+# When streams begin is told in these; a whole number for 90 kHz, 48 kHz, and rates such as 30000/1001.
+_EXACT_STARTS = {"movie_timescale": "720000"}
 # Enough for the first ones of all streams of sound.
 _TRIED_PACKETS = 64
 # swscale's plain conversion takes a level or two from everything.
@@ -122,7 +125,8 @@ class Recorder:
         """
         with ExitStack() as stack:
             temporary = stack.enter_context(replacing(film))
-            container = stack.enter_context(av.open(str(temporary), "w", options=_EXACT_TIMES))
+            options = _EXACT_TIMES | (_EXACT_STARTS if film.suffix.lower() in (".mp4", ".mov") else {})
+            container = stack.enter_context(av.open(str(temporary), "w", options=options))
             container.metadata.update(metadata)
             first = stack.enter_context(av.open(str(parts[0])))
             stream = container.add_stream_from_template(first.streams.video[0], opaque=True)
@@ -207,7 +211,8 @@ class Parts:
 
     def state(self) -> dict[str, np.ndarray]:
         """The state after the last finished part."""
-        with np.load(self._state_file(len(self.files))) as arrays:
+        file = self._state_file(len(self.files))
+        with _undamaged(file), file.open("rb") as opened, np.load(opened) as arrays:
             return dict(arrays)
 
     def _state_file(self, number: int) -> Path:
@@ -228,20 +233,22 @@ def growing(film: Path, settings: Mapping[str, object]) -> Iterator[Parts]:
         settings: What it is made of, and how, in words that JSON has.
 
     Raises:
-        StereoweaveError: There are parts that were made with other settings; or what went wrong, with a word
-            about what stays.
+        StereoweaveError: There are parts that were made with other settings, or are damaged; or what went
+            wrong, with a word about what stays.
     """
     folder = parts_folder(film)
     parts = Parts(folder)
     if parts.files:
         _check_settings(folder, settings)
+        parts.state()
         remove_leftovers(folder)
     else:
         _clear(folder)
     make_folder(folder)
     try:
         if not parts.files:
-            _settings_file(folder).write_text(json.dumps(settings, indent=2))
+            with replacing(_settings_file(folder)) as file:
+                file.write_text(json.dumps(settings, indent=2))
         yield parts
     except BaseException as error:
         if not parts.files:
@@ -267,13 +274,40 @@ def _clear(folder: Path) -> None:
 
 
 def _check_settings(folder: Path, settings: Mapping[str, object]) -> None:
-    found = json.loads(_settings_file(folder).read_text())
+    file = _settings_file(folder)
+    with _undamaged(file):
+        found = dict(json.loads(file.read_text()))
     other = [name for name, value in json.loads(json.dumps(settings)).items() if value != found.get(name)]
     if other:
+        begun = ", ".join(_begun_with(name, found.get(name)) for name in other)
         raise StereoweaveError(
-            f"{folder}: expected parts of the same film, found parts made with another {', '.join(other)}; "
+            f"{folder}: expected parts of the same film, found parts begun {begun}; "
             "remove that folder, or give the words that it was begun with"
         )
+
+
+def _begun_with(name: str, value: object) -> str:
+    match value:
+        case None | False:
+            return f"without {name}"
+        case True:
+            return f"with {name}"
+        case str() | int() | float():
+            return f"with {name} {value}"
+        case _:
+            return f"with another {name}"
+
+
+@contextmanager
+def _undamaged(file: Path) -> Iterator[None]:
+    """Turns what can be wrong with a file of a film's parts into one line."""
+    try:
+        yield
+    except (OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
+        raise StereoweaveError(
+            f"{file}: expected what an interrupted film goes on from, found none that can be read; "
+            f"remove that folder: {file.parent}"
+        ) from error
 
 
 def _frame(picture: Picture) -> VideoFrame:

@@ -135,7 +135,7 @@ def _films(order: Order, frames: int) -> Iterator[Film]:
 def _both(
     film: Film, pairs: list[StereoPair], estimates: list[Estimate], threads: int | None
 ) -> dict[str, _Taken]:
-    steadier, steady, times_ms = Steadier(), [], []
+    steadier, steady, times_ms = Steadier(threads), [], []
     for pair, estimate in zip(pairs, estimates, strict=True):
         start_s = time.perf_counter()
         steady.append(steadier(pair.left, pair.right, estimate))

@@ -1,6 +1,5 @@
 """3-D video from files: pairs of frames with their times, whatever the arrangement of the two eyes."""
 
-from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -10,11 +9,12 @@ import numpy as np
 from jaxtyping import UInt8
 
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.footage_layout import ARRANGEMENTS, Arrangement, guess_arrangement
+from stereoweave.footage_layout import ARRANGEMENTS, guess_arrangement
 from stereoweave.footage_tracks import Shot, Track, open_track
 
 _BEFORE, _AFTER = "damaged: the frame before it stands in", "damaged: the one after it stands in"
 _SPOILT = "made from a damaged frame before it"
+_MOVED = "its time stamp was missing or another frame's: it is shown a little later"
 
 
 class StereoFrame(NamedTuple):
@@ -37,6 +37,7 @@ class Footage:
 
     Attributes:
         name: The files, as the caller gave them.
+        arrangement: How a frame holds both eyes, a name in `ARRANGEMENTS`; None of two files.
         size_px: Width and height of one eye at its full size.
         frame_count: How many frames `frames` gives: one for each in the file, damaged or not.
         rate: Average frames a second.
@@ -44,13 +45,14 @@ class Footage:
         sound: The file whose sound belongs to it, if any.
     """
 
-    def __init__(self, tracks: Sequence[Track], arrangement: Arrangement | None) -> None:
+    def __init__(self, tracks: Sequence[Track], arrangement: str | None) -> None:
         """Footage of two tracks, or of one with both eyes in the given arrangement."""
         self._tracks = tracks
-        self._arrangement = arrangement
+        self._split = ARRANGEMENTS[arrangement] if arrangement else None
         first = tracks[0]
         self.name = ", ".join(track.name for track in tracks)
-        self.size_px = arrangement.eye_size_px(*first.size_px) if arrangement else first.size_px
+        self.arrangement = arrangement
+        self.size_px = self._split.eye_size_px(*first.size_px) if self._split else first.size_px
         self.frame_count = min(len(track.steps) for track in tracks)
         self.rate, self.time_base = first.rate, first.time_base
         self.sound = next((track.sound for track in tracks if track.sound), None)
@@ -65,7 +67,7 @@ class Footage:
         every_track = zip(*(_bridged(track, start) for track in self._tracks), strict=False)
         for index, seen in zip(range(start, self.frame_count), every_track, strict=False):
             pictures = [shot.picture() for shot, _ in seen]
-            left, right = self._arrangement.eyes(*pictures) if self._arrangement else pictures
+            left, right = self._split.eyes(*pictures) if self._split else pictures
             time = (steps[index] - steps[0]) * self.time_base
             yield StereoFrame(left, right, time, self._problem(index, [problem for _, problem in seen]))
 
@@ -76,17 +78,19 @@ class Footage:
             for track, problem in zip(self._tracks, problems, strict=True)
             if problem
         ]
+        found += [_MOVED] if index in self._tracks[0].moved else []
         if index == self.frame_count - 1:
             found += [ending for track in self._tracks if (ending := self._ending(track))]
         return "; ".join(found) or None
 
     def _ending(self, track: Track) -> str | None:
         more = len(track.steps) - self.frame_count
-        return f"{track.name} goes on for {more} frames after the other's end" if more else track.broken_off
+        frames = "1 frame" if more == 1 else f"{more} frames"
+        return f"{track.name} goes on for {frames} after the other's end" if more else track.broken_off
 
 
 def open_footage(
-    paths: Sequence[Path], arrangement: str | None = None, *, rate: Fraction = Fraction(25)
+    paths: Sequence[Path], arrangement: str | None = None, *, rate: Fraction | None = None
 ) -> Footage:
     """The footage in one video of both eyes, in two, left and right, or in series of pictures likewise.
 
@@ -95,11 +99,11 @@ def open_footage(
     Args:
         paths: One or two: videos, folders of pictures, or glob patterns of pictures.
         arrangement: How one frame holds both eyes, a name in `ARRANGEMENTS`; guessed unless given.
-        rate: Frames a second, for pictures.
+        rate: Frames a second, for pictures, 25 unless given.
 
     Raises:
         FormatError: A file that cannot be read or halved, is not 3-D, or does not go with the other one.
-        StereoweaveError: An unknown arrangement, not one or two paths, or PyAV is missing.
+        StereoweaveError: An unknown arrangement, not one or two paths, a video's rate, or PyAV is missing.
     """
     if arrangement not in (None, *ARRANGEMENTS):
         raise StereoweaveError(f"expected an arrangement, {', '.join(ARRANGEMENTS)}, found {arrangement!r}")
@@ -115,7 +119,7 @@ def open_footage(
     [track] = tracks
     name = arrangement or guess_arrangement(track.name, track.samples(), track.declared)
     try:
-        return Footage(tracks, ARRANGEMENTS[name])
+        return Footage(tracks, name)
     except FormatError as error:
         raise FormatError(f"{track.name}: {error}") from error
 
@@ -142,8 +146,8 @@ def _bridged(track: Track, start: int) -> Iterator[tuple[Shot, str | None]]:
     """What is shown as each frame of a track from number `start` on, and its problem."""
     upcoming, last, spoilt = 0, None, False
     for shot in track.shots(start):
-        index = bisect_left(track.steps, shot.step)
-        if index < upcoming or index == len(track.steps) or track.steps[index] != shot.step:
+        index = shot.number
+        if not upcoming <= index < len(track.steps):
             continue
         missing = range(upcoming, index)
         yield from ((last or shot, _BEFORE if last else _AFTER) for number in missing if number >= start)

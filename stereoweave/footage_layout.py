@@ -53,6 +53,7 @@ ARRANGEMENTS = {
     "top_bottom": Arrangement(beside=False),
     "top_bottom_half": Arrangement(beside=False, half=True),
     "crossed": Arrangement(right_first=True),
+    "top_bottom_right_first": Arrangement(beside=False, right_first=True),
 }
 
 _WORDS_IN_NAMES = {

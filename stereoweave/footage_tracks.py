@@ -2,11 +2,12 @@
 
 import re
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from bisect import bisect_left
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from fractions import Fraction
 from functools import partial
-from itertools import islice
+from itertools import count, islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -38,7 +39,8 @@ _STEREO_3D = {
     7: "columns",
 }
 
-_INDEX_AT_THE_END = ".mp4", ".m4v", ".mov"
+# What an MP4 or MOV file begins with, after four bytes of length.
+_MP4_BOXES = b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot"
 
 # How much earlier than it claims a file may end before it counts as cut off.
 _CUT_OFF_S = Fraction(1, 5)
@@ -48,12 +50,12 @@ class Shot(NamedTuple):
     """A frame that could be decoded.
 
     Attributes:
-        step: When it is shown, in steps of the track's time base.
+        number: Which frame of the track it is.
         picture: Makes its picture, uint8 RGB [H, W, 3]; where it is not called, nothing is converted.
         fresh: Whether it is made without any frame before it.
     """
 
-    step: int
+    number: int
     picture: Callable[[], UInt8[np.ndarray, "h w 3"]]
     fresh: bool
 
@@ -64,6 +66,7 @@ class VideoTrack:
     Attributes:
         name: As the caller gave it.
         steps: When each frame is shown, rising, in steps of `time_base`: one for each frame in the file.
+        moved: Frames whose time stamp was missing or another's, and which got one after it.
         time_base: Seconds.
         rate: Average frames a second.
         size_px: Width and height of a whole frame, turned as a player would.
@@ -97,11 +100,11 @@ class VideoTrack:
         depends on all before it.
         """
         with _reading(self._path) as (container, stream):
-            for number, frame in enumerate(_decoded(container, stream)):
-                step = number if self._numbered else frame.pts
-                whole = not frame.is_corrupt and (frame.width, frame.height) == self._frame_size_px
-                if whole and step is not None:
-                    yield Shot(step, partial(_rgb, frame), frame.key_frame)
+            frames = _decoded(container, stream)
+            placed = _by_rank(frames, stream) if self._stamps is None else _by_stamp(frames, self._stamps)
+            for index, frame in placed:
+                if not frame.is_corrupt and (frame.width, frame.height) == self._frame_size_px:
+                    yield Shot(index, partial(_rgb, frame), frame.key_frame)
 
     def samples(self) -> list[UInt8[np.ndarray, "h w 3"]]:
         """Some pictures from all over the film, at least one."""
@@ -121,11 +124,15 @@ class VideoTrack:
 
         stamps, end_s, reason = _stamps(container, stream)
         rate = stream.guessed_rate or Fraction(25)
-        steps = sorted({stamp for stamp in stamps if stamp is not None})
-        # AVI with frames out of order, and bare streams, have no times to go by: there the order decides.
-        self._numbered = len(steps) < len(stamps)
-        self.steps: Sequence[int] = range(len(stamps)) if self._numbered else array("q", steps)
-        self.time_base = 1 / rate if self._numbered else Fraction(stream.time_base or 1)
+        self.moved: Collection[int] = ()
+        self.steps: Sequence[int] = range(len(stamps))
+        self.time_base = 1 / rate
+        self._stamps: Sequence[int] | None = None
+        # Bare streams, and some AVI, have no times to go by: there the order decides.
+        if 2 * len(set(stamps) - {None}) > len(stamps):
+            self.time_base = Fraction(stream.time_base or 1)
+            self._stamps = array("q", sorted(_filled(stamps)))
+            self.steps, self.moved = _separated(self._stamps, round(1 / rate / self.time_base))
         self.rate = _rate(self.steps, self.time_base, rate)
         claimed_s = Fraction(container.duration or 0, av.time_base)
         if reason is None and claimed_s > end_s + _CUT_OFF_S:
@@ -141,6 +148,7 @@ class PictureTrack:
     """
 
     declared: str | None = None
+    moved: Collection[int] = ()
     sound: Path | None = None
     broken_off: str | None = None
 
@@ -180,25 +188,36 @@ class PictureTrack:
 Track = VideoTrack | PictureTrack
 
 
-def open_track(path: Path, rate: Fraction) -> Track:
+def open_track(path: Path, rate: Fraction | None) -> Track:
     """The frames of a video file, of a folder of pictures, or of the pictures that a glob pattern finds.
 
     Args:
         path: The file, the folder, or the pattern, such as frames/left_*.png; 2 comes before 10.
-        rate: Frames a second, for pictures.
+        rate: Frames a second, for pictures, 25 unless given.
 
     Raises:
         FormatError: No such file, folder or picture, or nothing in it can be read.
+        StereoweaveError: A rate for a video.
     """
-    if path.is_dir():
-        files = [file for file in path.iterdir() if _is_picture(file)]
-    elif not path.exists() and re.search(r"[*?\[]", path.name):
-        files = [file for file in path.parent.glob(path.name) if _is_picture(file)]
-    else:
+    files = picture_files(path)
+    if files is None:
+        if rate is not None:
+            raise StereoweaveError(f"{path}: expected pictures for a rate, found a video, which has its own")
         return VideoTrack(path)
     if not files:
         raise FormatError(f"{path}: expected a video or pictures, found no picture there")
-    return PictureTrack(str(path), sorted(files, key=_in_counting_order), rate)
+    return PictureTrack(str(path), files, rate or Fraction(25))
+
+
+def picture_files(path: Path) -> list[Path] | None:
+    """The pictures in a folder, or that a glob pattern finds, in counting order; None for any other path."""
+    if path.is_dir():
+        found = path.iterdir()
+    elif not path.exists() and re.search(r"[*?\[]", path.name):
+        found = path.parent.glob(path.name)
+    else:
+        return None
+    return sorted(filter(_is_picture, found), key=_in_counting_order)
 
 
 @contextmanager
@@ -208,16 +227,14 @@ def _reading(path: Path) -> Iterator[tuple["av.container.InputContainer", "av.Vi
     try:
         container = av.open(str(path), metadata_errors="replace")
     except av.error.FFmpegError as error:
-        reason = f"{path}: expected a video, found one that cannot be opened ({_words(error)})"
-        if path.suffix.lower() in _INDEX_AT_THE_END and not isinstance(error, OSError):
-            reason += "; a file of this kind that was cut off has lost its index: record or fetch it again"
-        raise FormatError(reason) from error
+        raise FormatError(f"{path}: expected a video, found {_unopened(path, error)}") from error
     with container:
         stream = container.streams.best("video")
         if not isinstance(stream, av.VideoStream) or stream.codec_context is None:
             raise FormatError(f"{path}: expected a video, found no picture track that can be decoded")
         # With more threads FFmpeg mends damaged H.264 badly or not at all, and not always alike.
         stream.codec_context.thread_count = 1
+        stream.codec_context.copy_opaque = True  # the packet's rank, to the frame
         if stream.codec_context.name == "mjpeg":
             # Unasked, it hands out pictures whose lower part is grey and calls them sound.
             stream.codec_context.options = {"err_detect": "explode"}
@@ -228,8 +245,11 @@ def _decoded(container: "av.container.InputContainer", stream: "av.VideoStream")
     """What the decoder makes of every packet up to where the file ends or breaks off, in order of display."""
     import av
 
+    ranks = count()
     with suppress(av.error.FFmpegError):
         for packet in container.demux(stream):
+            if _is_frame(packet):
+                packet.opaque = next(ranks)
             with suppress(av.error.FFmpegError):
                 yield from stream.decode(packet)
     # Where the file could be read to its end the decoder is empty already, and says so.
@@ -247,7 +267,7 @@ def _stamps(
     end_s = Fraction(0)
     try:
         for packet in container.demux():
-            if packet.stream is stream and packet.size and not packet.is_discard:
+            if packet.stream is stream and _is_frame(packet):
                 stamps.append(packet.pts)
             if packet.pts is not None and packet.time_base:
                 end_s = max(end_s, (packet.pts + (packet.duration or 0)) * packet.time_base)
@@ -256,8 +276,81 @@ def _stamps(
     return stamps, end_s, None
 
 
+def _is_frame(packet: "av.Packet[Any]") -> bool:
+    return bool(packet.size) and not packet.is_discard
+
+
+def _filled(stamps: Sequence[int | None]) -> list[int]:
+    """Time stamps, with that of the frame before it in the file for one that is missing."""
+    known = next(stamp for stamp in stamps if stamp is not None)
+    return [known := known if stamp is None else stamp for stamp in stamps]
+
+
+def _separated(stamps: Sequence[int], usual: int) -> tuple["array[int]", list[int]]:
+    """Rising times from sorted stamps, and the numbers of those moved: one frame on, or halfway to the next.
+
+    Args:
+        stamps: In steps of a time base.
+        usual: From frame to frame, in the same steps.
+    """
+    steps, moved = array("q", stamps[:1]), []
+    later = [b for a, b in pairwise(stamps) if b > a]
+    after = 0
+    for index in range(1, len(stamps)):
+        if stamps[index] > stamps[index - 1]:
+            after += 1
+            steps.append(max(stamps[index], steps[-1] + 1))
+            continue
+        room = (later[after] - steps[-1]) // 2 if after < len(later) else usual
+        steps.append(steps[-1] + max(min(usual, room), 1))
+        moved.append(index)
+    return steps, moved
+
+
+def _by_stamp(
+    frames: Iterator["av.VideoFrame"], stamps: Sequence[int]
+) -> Iterator[tuple[int, "av.VideoFrame"]]:
+    """Frames with their numbers, as their time stamps tell; those of one stamp in the order they come."""
+    last = -1
+    for frame in frames:
+        stamp = stamps[max(last, 0)] if frame.pts is None else frame.pts
+        index = max(bisect_left(stamps, stamp), last + 1)
+        if index < len(stamps) and stamps[index] == stamp:
+            yield index, frame
+            last = index
+
+
+def _by_rank(
+    frames: Iterator["av.VideoFrame"], stream: "av.VideoStream"
+) -> Iterator[tuple[int, "av.VideoFrame"]]:
+    """Frames with their numbers, as the ranks of their packets in the file tell.
+
+    No frame is shown before its rank, but for those that are coded out of turn: among these, what was lost is
+    noticed at the next key frame.
+    """
+    index = -1
+    for frame in frames:
+        ranked: Any = frame
+        in_turn = frame.key_frame or not stream.codec_context.has_b_frames
+        index = max(index + 1, ranked.opaque) if in_turn and ranked.opaque is not None else index + 1
+        yield index, frame
+
+
 def _intact(frames: Iterator["av.VideoFrame"]) -> Iterator["av.VideoFrame"]:
     return (frame for frame in frames if not frame.is_corrupt)
+
+
+def _unopened(path: Path, error: "av.error.FFmpegError") -> str:
+    """What was found instead of a video."""
+    beginning = b""
+    with suppress(OSError), path.open("rb") as file:
+        beginning = file.read(8)
+        if not beginning:
+            return "an empty file"
+    found = f"one that cannot be opened ({_words(error)})"
+    if beginning[4:] in _MP4_BOXES:
+        found += "; a file of this kind that was cut off has lost its index: record or fetch it again"
+    return found
 
 
 def _words(error: "av.error.FFmpegError") -> str:

@@ -3,8 +3,8 @@
 Each view is filtered by itself. What was found before is brought along the motion of the picture, and what a
 surface's neighbourhood then says in common is taken for a true change of its distance. What is left is noise:
 a pixel becomes the mean over the frames that saw its point. It starts anew where the picture before does not
-explain it, and where the disparity contradicts what was found: at once beside anything that moves, by vote
-where all is at rest. So nothing trails behind what moves.
+explain it, and where the disparity contradicts what was found: at once beside anything that moves in either
+view, by vote where all is at rest. So nothing trails behind what moves.
 """
 
 import typing
@@ -13,11 +13,12 @@ from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from stereoweave.compiling import kernel
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import Estimate
+from stereoweave.threads import thread_count
 
 MOST_FRAMES = 12.0
 """A mean stands for no more frames than this, so that what changes slowly is not held back for long."""
@@ -37,8 +38,19 @@ _UNUSUAL, _LEAST_LEVELS, _NOISIEST_LEVELS = 1.5, 0.5, 6.0
 _REST, _REST_LEVELS = 1.1, 0.25
 # At rest is what has nothing that moves within half of this.
 _CALM_PX = 9
-# Rendered films explain more than 0.6 of a picture from one 11 frames before; pairs of scenes less than 0.3.
-_CUT_SHARE = 0.4
+# What a plane has none of; normal noise of one level makes it 6 levels, half of it below 0.674 times that.
+_ROUGHNESS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+_MEDIAN_ROUGHNESS = 6 * 0.674
+# Contrast is a standard deviation above this multiple of the noise's, and a level.
+_CONTRAST, _CONTRAST_LEVELS = 2.0, 1.0
+# What differs by more than this share of its contrast is something else, however faint both are.
+_DIFFERENT_SHARE = 0.6
+# Rendered films explain more than 0.4 of their contrast from the frame before; pairs of scenes less than 0.1.
+_CUT_SHARE = 0.2
+# Contrast in less than this share of a picture is a thing in it, which may come and go without a cut.
+_LEAST_CONTRAST_SHARE = 0.05
+# Where so much of the picture is at rest, most of it is not contradicted by chance.
+_LEAST_ASKED_SHARE = 0.25
 
 
 class Track(typing.NamedTuple):
@@ -62,22 +74,45 @@ class Motion(typing.NamedTuple):
         to_before_px: float32 [H2, W2, 2], from a pixel to its point in the picture before, full-size pixels.
         explained: bool, whether the picture before looks the same there.
         calm: bool, whether nothing moves around.
+        explained_share: Of what has contrast; 1 where next to nothing has.
     """
 
     to_before_px: np.ndarray
     explained: np.ndarray
     calm: np.ndarray
+    explained_share: float
+
+
+class Expectation(typing.NamedTuple):
+    """What a view is to show, from what was found before; the last two arrays are of half its size.
+
+    Attributes:
+        carried: What is known about the point that each pixel shows now.
+        calm: bool, whether nothing moves around, nor around the place it matches in the other view.
+        drift_px: float32, how the surface changes in disparity.
+    """
+
+    carried: Track
+    calm: np.ndarray
+    drift_px: np.ndarray
 
 
 class Steadier:
     """Takes the estimates of a film, frame by frame, and gives each filtered with those before it.
 
+    Args:
+        threads: How many may be used, of which two views need two; all cores if left out.
+
     Attributes:
         cuts: How many cuts there were so far.
+
+    Raises:
+        StereoweaveError: `threads` is below 1.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, threads: int | None = None) -> None:
         self.cuts = 0
+        self._threads = min(thread_count(threads), 2)
         self._greys: list[np.ndarray] = []
         self._tracks: list[Track] = []
 
@@ -104,7 +139,10 @@ class Steadier:
         claims = (estimate.confidence, np.ones_like(estimate.confidence))
         disparities_px = (estimate.disparity_px, estimate.right_disparity_px)
         news = [Track(*maps, np.ones_like(maps[0])) for maps in zip(disparities_px, claims, strict=True)]
-        self._tracks = self._continued(before, news) or news
+        continued = self._continued(before, news) if before else None
+        if before and continued is None:
+            self.cuts += 1
+        self._tracks = continued or news
         filtered, filtered_right = self._tracks
         return Estimate(
             disparity_px=filtered.disparity_px,
@@ -122,9 +160,9 @@ class Steadier:
         return kept
 
     @classmethod
-    def from_state(cls, state: Mapping[str, np.ndarray]) -> "Steadier":
+    def from_state(cls, state: Mapping[str, np.ndarray], threads: int | None = None) -> "Steadier":
         """One that goes on where the one that gave this `state` was."""
-        steadier = cls()
+        steadier = cls(threads)
         steadier.cuts = int(state["cuts"])
         for side in ("left", "right") if "left_grey" in state else ():
             steadier._greys.append(state[f"{side}_grey"])
@@ -132,18 +170,18 @@ class Steadier:
         return steadier
 
     def _continued(self, before: list[np.ndarray], news: list[Track]) -> list[Track] | None:
-        """The tracks filtered with those before; None at the start and after a cut."""
-        if not before:
-            return None
+        """The tracks filtered with those before; None after a cut."""
         if news[0].frames.shape != self._tracks[0].frames.shape:
-            self.cuts += 1
             return None
-        with ThreadPoolExecutor(2) as pool:
+        with ThreadPoolExecutor(self._threads) as pool:
             motions = list(pool.map(_motion, before, self._greys))
-            if np.mean([motion.explained.mean() for motion in motions]) < _CUT_SHARE:
-                self.cuts += 1
+            if np.mean([motion.explained_share for motion in motions]) < _CUT_SHARE:
                 return None
-            return list(pool.map(_filtered, self._tracks, news, motions))
+            # A match lies to the left in the right view, and to the right in the left one.
+            expected = list(pool.map(_expected, self._tracks, news, motions, motions[::-1], (-1, 1)))
+            if _mostly_contradicted(news, expected):
+                return None
+            return list(pool.map(_filtered, news, expected))
 
 
 def _grey(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2"]:
@@ -167,7 +205,30 @@ def _motion(before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "h2 w2"]
     flow[rests] = 0
     around = np.ones((_CALM_PX, _CALM_PX), np.uint8)
     calm = cv2.erode((rests & explained).astype(np.uint8), around).astype(bool)
-    return Motion(2 * flow, explained, calm)
+    return Motion(2 * flow, explained, calm, _explained_share(grey, least_levels, explained))
+
+
+def _explained_share(
+    grey: UInt8[np.ndarray, "h2 w2"],
+    least_levels: Float[np.ndarray, "h2 w2"],
+    explained: Bool[np.ndarray, "h2 w2"],
+) -> float:
+    """The share explained of what has contrast; 1 where next to nothing has."""
+    window = (_WINDOW_PX, _WINDOW_PX)
+    squares = cv2.sqrBoxFilter(grey, cv2.CV_32F, window)
+    variance = squares - cv2.boxFilter(grey, cv2.CV_32F, window) ** 2
+    contrast_levels = np.sqrt(np.maximum(variance, 0))
+    has_contrast = contrast_levels > _CONTRAST * _noise_levels(grey) + _CONTRAST_LEVELS
+    if has_contrast.mean() < _LEAST_CONTRAST_SHARE:
+        return 1.0
+    alike = explained & (least_levels < _DIFFERENT_SHARE * contrast_levels)
+    return float(alike[has_contrast].mean())
+
+
+def _noise_levels(grey: UInt8[np.ndarray, "h2 w2"]) -> float:
+    """The noise's standard deviation, from the median size of what a smooth picture has none of."""
+    roughness = cv2.filter2D(grey, cv2.CV_32F, _ROUGHNESS)
+    return float(np.median(np.abs(roughness[::4, ::4]))) / _MEDIAN_ROUGHNESS
 
 
 def _as_bright(
@@ -197,14 +258,45 @@ def _difference_levels(
     return cv2.boxFilter(cv2.absdiff(a, b), cv2.CV_32F, (_WINDOW_PX, _WINDOW_PX))
 
 
-def _filtered(track: Track, new: Track, motion: Motion) -> Track:
-    """The track as it is after a further frame, which may be one that starts it anew."""
+def _expected(track: Track, new: Track, motion: Motion, other: Motion, towards: int) -> Expectation:
+    """What the new frame is to show; a match lies towards (-1 left, 1 right) its place in the other view."""
     carried = Track(*(np.empty_like(values) for values in track))
     carry(new.disparity_px, track, motion, carried)
     drift_px = np.empty(motion.calm.shape, np.float32)
     measure_drift(new.disparity_px, carried, drift_px)
-    mean = Track(*(np.empty_like(values) for values in track))
-    blend(new, carried, motion.calm, drift_px, mean)
+    calm = motion.calm & _matched(other.calm, carried.disparity_px[::2, ::2], towards)
+    return Expectation(carried, calm, drift_px)
+
+
+def _matched(
+    other_calm: Bool[np.ndarray, "h2 w2"], disparity_px: Float[np.ndarray, "h2 w2"], towards: int
+) -> Bool[np.ndarray, "h2 w2"]:
+    """Whether the other view is calm where each pixel has its match; at its edge for one outside it."""
+    height, width = other_calm.shape
+    rows, columns = np.indices((height, width), np.float32)
+    there = columns + np.float32(towards / 2) * disparity_px
+    calm = other_calm.astype(np.uint8)
+    return cv2.remap(calm, there, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE) > 0
+
+
+def _mostly_contradicted(news: list[Track], expected: list[Expectation]) -> bool:
+    """Whether most of what is known and at rest has another disparity now, by every fourth pixel."""
+    asked, contradicted = [], []
+    for new, (carried, calm, drift_px) in zip(news, expected, strict=True):
+        new_px, old_px, frames = (
+            values[::4, ::4] for values in (new.disparity_px, carried.disparity_px, carried.frames)
+        )
+        apart_px = np.abs(new_px - old_px - drift_px[::2, ::2])
+        asked.append(calm[::2, ::2] & (frames > 0))
+        contradicted.append(asked[-1] & (apart_px > SAME_PX + SAME_SHARE * np.abs(new_px)))
+    asked_share = np.mean(asked)
+    return bool(asked_share >= _LEAST_ASKED_SHARE and np.mean(contradicted) > 0.5 * asked_share)
+
+
+def _filtered(new: Track, expected: Expectation) -> Track:
+    """The track as it is after a further frame."""
+    mean = Track(*(np.empty_like(values) for values in new))
+    blend(new, expected.carried, expected.calm, expected.drift_px, mean)
     return mean
 
 

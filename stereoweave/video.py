@@ -1,9 +1,11 @@
 """A 3-D film made into another, frame by frame: matched, held steady, and shown as depth, view or layout."""
 
+import hashlib
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from fractions import Fraction
 from itertools import chain, islice
+from math import isfinite
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +19,9 @@ from stereoweave.colour import colour_disparity, colour_range_px
 from stereoweave.errors import StereoweaveError
 from stereoweave.film import GREY16, H264, Packing, Picture, Recorder, check_film, growing
 from stereoweave.footage import Footage, StereoFrame
+from stereoweave.footage_layout import ARRANGEMENTS
+from stereoweave.footage_tracks import picture_files
+from stereoweave.hints import hints
 from stereoweave.layouts import LAYOUTS, Choices, check_reach, middle_px
 from stereoweave.matcher import Matcher
 from stereoweave.progress import progress
@@ -27,7 +32,9 @@ from stereoweave.threads import thread_count
 
 # A part is lost when a run is interrupted; each begins with a key frame.
 _PART_S = 10
-_SURVEYED_FRAMES = 24
+_SURVEYED_FRAMES, _HINTED_FRAMES = 24, 3
+# Where no survey reads the whole film, its first minute is looked at.
+_BEGINNING_S = 60
 _SURVEYED_EVERY_PX = 4
 _NAMED_PROBLEMS = 3
 _STEPS_PER_PX = 256
@@ -80,7 +87,21 @@ class Order:
             )
         if self.layout not in (None, *LAYOUTS):
             raise StereoweaveError(f"layout: expected one of {', '.join(LAYOUTS)}, found {self.layout!r}")
+        self._check_numbers(found[0] if self.layout is None else f"--layout {self.layout}")
         check_reach(self._positions, self.strength)
+
+    def _check_numbers(self, wanted: str) -> None:
+        """Refuses numbers that are none, or that what is wanted would not heed."""
+        numbers = {"--strength": (self.strength, 1.0), "--convergence": (self.convergence_px, None)}
+        for word, (value, unset) in numbers.items():
+            if value == unset or value is None:
+                continue
+            if not isfinite(value):
+                raise StereoweaveError(
+                    f"{word}: expected a number that is not infinite or nan, found {value}"
+                )
+            if not self._positions:
+                raise StereoweaveError(f"{word}: expected a view or a layout of views for it, found {wanted}")
 
     @property
     def _positions(self) -> tuple[float, ...]:
@@ -155,7 +176,7 @@ def make_film(footage: Footage, sources: Sequence[Path], out: Path, order: Order
         sources: What the footage was opened from, to go on only while it is the same.
         out: The file to write; its ending chooses the container.
         order: What it is made into.
-        console: Where progress is told.
+        console: Where progress is told, and before it what seems amiss with the film.
 
     Returns:
         What was met on the way, in all runs together.
@@ -173,11 +194,14 @@ def make_film(footage: Footage, sources: Sequence[Path], out: Path, order: Order
         packing=PACKINGS.get(order.layout or ""),
         threads=threads,
     )
-    with growing(out, _settings(order, sources)) as parts, progress(console) as bar:
+    with growing(out, _settings(order, footage, sources)) as parts, progress(console) as bar:
         if parts.files:
             maker = _Maker.from_state(order, matcher, parts.state())
         else:
-            maker = _Maker(order, matcher, _survey(footage, matcher, bar) if order.needs_survey else Survey())
+            survey, lines = _look(footage, matcher, bar, whole=order.needs_survey)
+            maker = _Maker(order, matcher, survey)
+            for line in lines:
+                console.print(line, markup=False, highlight=False, soft_wrap=True)
         done, total = maker.tally.frames, footage.frame_count
         shown = bar.add_task(out.name, total=total, completed=done, loss="", rate="")
         frames = footage.frames(done)
@@ -194,7 +218,7 @@ class _Maker:
 
     def __init__(self, order: Order, matcher: Matcher, survey: Survey) -> None:
         self.survey, self.tally = survey, Tally()
-        self._order, self._matcher, self._steadier = order, matcher, Steadier()
+        self._order, self._matcher, self._steadier = order, matcher, Steadier(order.threads)
 
     @classmethod
     def from_state(cls, order: Order, matcher: Matcher, state: dict[str, np.ndarray]) -> "_Maker":
@@ -203,7 +227,7 @@ class _Maker:
         maker = cls(order, matcher, Survey((low_px, high_px), middle_px))
         frames, cuts, problems = state.pop("tally").tolist()
         maker.tally = Tally(frames, cuts, problems, state.pop("named").tolist())
-        maker._steadier = Steadier.from_state(state)
+        maker._steadier = Steadier.from_state(state, order.threads)
         return maker
 
     def state(self) -> dict[str, np.ndarray]:
@@ -230,18 +254,53 @@ class _Maker:
             yield frame.time, self._order.picture(pair, estimate, self.survey)
 
 
-def _survey(footage: Footage, matcher: Matcher, bar: Progress) -> Survey:
-    """The range and the middle of the disparities in frames from all over the film."""
-    step = -(-footage.frame_count // _SURVEYED_FRAMES)
-    picked = range(step // 2, footage.frame_count, step)
+def _look(footage: Footage, matcher: Matcher, bar: Progress, *, whole: bool) -> tuple[Survey, list[str]]:
+    """Range and middle of the disparities all over the film, if it is the whole; and what seems amiss."""
+    beginning = min(footage.frame_count, round(_BEGINNING_S * footage.rate) or 1)
+    picked = _spread(footage.frame_count, _SURVEYED_FRAMES) if whole else _spread(beginning, _HINTED_FRAMES)
+    hinted = set(picked[len(picked) // 6 :: -(-len(picked) // _HINTED_FRAMES)])
     shown = bar.add_task("looking at its depth", total=len(picked), loss="", rate="")
-    thinned, middles_px = [], []
-    for frame in islice(footage.frames(), picked.start, None, step):
+    thinned, middles_px, amiss = [], [], []
+    frames = islice(footage.frames(), picked.start, picked.stop, picked.step)
+    for index, frame in zip(picked, frames, strict=True):
         estimate = matcher.estimate(frame.left, frame.right)
         thinned.append(estimate.disparity_px[::_SURVEYED_EVERY_PX, ::_SURVEYED_EVERY_PX])
         middles_px.append(middle_px(estimate))
+        if index in hinted:
+            lines = hints(StereoPair(left=frame.left, right=frame.right), estimate, matcher)
+            amiss.append([f"{_clock(frame.time)} {line}" for line in lines])
         bar.advance(shown)
-    return Survey(colour_range_px(np.vstack(thinned)), float(np.median(middles_px)))
+    told = _told(amiss, footage.arrangement)
+    if not whole:
+        return Survey(), told
+    return Survey(colour_range_px(np.vstack(thinned)), float(np.median(middles_px))), told
+
+
+def _spread(count: int, wanted: int) -> range:
+    """So many frames of the first `count`, evenly spread, or all if there are fewer."""
+    step = -(-count // wanted)
+    return range(step // 2, count, step)
+
+
+def _told(amiss: Sequence[Sequence[str]], arrangement: str | None) -> list[str]:
+    """The lines of the last frame with any, where most have some: a film may begin with a black picture."""
+    some = [lines for lines in amiss if lines]
+    if 2 * len(some) <= len(amiss):
+        return []
+    other = _other_way_round(arrangement)
+    return [
+        line.replace("swapped?", f"swapped? Then give --arrangement {other}.", 1) if other else line
+        for line in some[-1]
+    ]
+
+
+def _other_way_round(arrangement: str | None) -> str | None:
+    """The arrangement that differs only in which eye comes first, if it has a name."""
+    if arrangement is None:
+        return None
+    split = ARRANGEMENTS[arrangement]
+    other = split._replace(right_first=not split.right_first)
+    return next((name for name, known in ARRANGEMENTS.items() if known == other), None)
 
 
 def _grey16(disparity_px: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
@@ -258,17 +317,32 @@ def _check_out(out: Path, order: Order, footage: Footage, sources: Sequence[Path
     check_film(out, footage.sound)
 
 
-def _settings(order: Order, sources: Sequence[Path]) -> dict[str, object]:
-    """All that the film depends on, but for the threads, in words that JSON has."""
-    words = asdict(order) | {"model": _known_by(Path(order.model))}
-    del words["threads"]
-    return words | {"inputs": [_known_by(source) for source in sources], "version": __version__}
+def _settings(order: Order, footage: Footage, sources: Sequence[Path]) -> dict[str, object]:
+    """All that the film depends on but for the threads, as users call it, in words that JSON has."""
+    model = Path(order.model)
+    return {
+        "--depth": order.depth,
+        "--depth16": order.depth16,
+        "--position": order.position,
+        "--layout": order.layout,
+        "--strength": order.strength,
+        "--convergence": order.convergence_px,
+        "--arrangement": footage.arrangement,
+        "--rate": str(footage.rate),
+        "--model": _known_by(model) if model.exists() else order.model,
+        "FILM": [_known_by(source) for source in sources],
+        "stereoweave": __version__,
+    }
 
 
 def _known_by(path: Path) -> list[object]:
-    """A name, and size and time of the file of that name, if there is one."""
-    status = path.stat() if path.exists() else None
-    return [str(path), *((status.st_size, status.st_mtime_ns) if status else ())]
+    """A name, and a digest of the names, sizes and times of the files that it stands for."""
+    files = picture_files(path)
+    digest = hashlib.sha256()
+    for file in [path] if files is None else files:
+        status = file.stat()
+        digest.update(f"{file.name} {status.st_size} {status.st_mtime_ns}\n".encode())
+    return [str(path), digest.hexdigest()]
 
 
 def _clock(time_s: Fraction) -> str:

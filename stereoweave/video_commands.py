@@ -1,14 +1,18 @@
 """The command stereoweave video."""
 
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stereoweave.command_line import Model, Threads, place_for
+from stereoweave.errors import StereoweaveError
 
 if TYPE_CHECKING:
     from stereoweave.video import Tally
+
+_HIGHEST_RATE = 1000
 
 
 def video(  # noqa: PLR0913 - each is a word of the command line
@@ -57,8 +61,15 @@ def video(  # noqa: PLR0913 - each is a word of the command line
     arrangement: Annotated[
         str | None,
         typer.Option(
-            help="How a frame holds both views: side_by_side, side_by_side_half, top_bottom, top_bottom_half "
-            "or crossed; guessed unless given."
+            help="How a frame holds both views, such as side_by_side, top_bottom_half or crossed; guessed "
+            "unless given. Any other word lists them all."
+        ),
+    ] = None,
+    rate: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FPS",
+            help="Frames a second of a series of pictures, such as 24 or 30000/1001. [default: 25]",
         ),
     ] = None,
     model: Model = "small",
@@ -74,21 +85,21 @@ def video(  # noqa: PLR0913 - each is a word of the command line
         from stereoweave.film import parts_folder
         from stereoweave.video import Order, make_film
 
-    order = Order(
-        depth=depth,
-        depth16=depth16,
-        position=position,
-        layout=layout,
-        strength=strength,
-        convergence_px=convergence,
-        model=model,
-        threads=threads,
-    )
-    footage = open_footage(films, arrangement)
-    if layout:
-        out = _marked(out, layout, footage.size_px)
-    place_for(out)
     try:
+        order = Order(
+            depth=depth,
+            depth16=depth16,
+            position=position,
+            layout=layout,
+            strength=strength,
+            convergence_px=convergence,
+            model=model,
+            threads=threads,
+        )
+        footage = open_footage(films, arrangement, rate=None if rate is None else _fraction(rate))
+        if layout:
+            out = _marked(out, layout, footage.size_px)
+        place_for(out)
         tally = make_film(footage, films, out, order, Console(stderr=True))
     except KeyboardInterrupt:
         folder = parts_folder(out)
@@ -100,6 +111,21 @@ def video(  # noqa: PLR0913 - each is a word of the command line
         typer.echo(f"stereoweave: {out}: stopped; {kept}", err=True)
         raise typer.Exit(130) from None
     _tell(out, tally)
+
+
+def _fraction(rate: str) -> Fraction:
+    """Frames a second from a word such as 24, 23.976 or 30000/1001."""
+    try:
+        # FFmpeg's fractions have 32 bits.
+        fraction = Fraction(rate).limit_denominator(100_000)
+    except (ValueError, ZeroDivisionError):
+        fraction = Fraction(0)
+    if not 0 < fraction <= _HIGHEST_RATE:
+        raise StereoweaveError(
+            "--rate: expected frames a second, such as 24 or 30000/1001, "
+            f"at most {_HIGHEST_RATE}, found {rate!r}"
+        )
+    return fraction
 
 
 def _marked(out: Path, layout: str, size_px: tuple[int, int]) -> Path:
@@ -115,7 +141,8 @@ def _marked(out: Path, layout: str, size_px: tuple[int, int]) -> Path:
 
 def _tell(out: Path, tally: "Tally") -> None:
     cuts = "1 cut" if tally.cuts == 1 else f"{tally.cuts} cuts"
-    typer.echo(f"{out}: {tally.frames} frames, {cuts}")
+    frames = "1 frame" if tally.frames == 1 else f"{tally.frames} frames"
+    typer.echo(f"{out}: {frames}, {cuts}")
     if tally.problems:
         more = "; ..." if tally.problems > len(tally.named) else ""
-        typer.echo(f"problems in {tally.problems} of {tally.frames} frames: {'; '.join(tally.named)}{more}")
+        typer.echo(f"problems in {tally.problems} of {frames}: {'; '.join(tally.named)}{more}")

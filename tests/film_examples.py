@@ -48,6 +48,8 @@ def packed(left: np.ndarray, right: np.ndarray, arrangement: str = "side_by_side
             return np.hstack([right, left])
         case "top_bottom":
             return np.vstack([left, right])
+        case "top_bottom_right_first":
+            return np.vstack([right, left])
         case "side_by_side_half":
             return np.hstack([shrunk(eye, width_px // 2, height_px) for eye in (left, right)])
         case "top_bottom_half":

@@ -311,7 +311,9 @@ def test_bench_scores_the_network_beside_sgbm(pictures, capfd):
     with Path("rows.csv").open() as file:
         rows = {(row["matcher"], row["scene"]): row for row in csv.DictReader(file)}
     assert set(rows) == {
-        (name, scene) for name in (*OPENCV_MATCHERS, "ten.onnx") for scene in ("wall", "mean")
+        (name, scene)
+        for name in (*OPENCV_MATCHERS, "ten.onnx", "ten.onnx refined")
+        for scene in ("wall", "mean")
     }
     # 10 px found, 8 px true
     assert float(rows["ten.onnx", "wall"]["epe_px"]) == 2
@@ -321,7 +323,8 @@ def test_bench_scores_the_network_beside_sgbm(pictures, capfd):
 def test_bench_takes_every_shipped_network_and_says_where_the_rows_are(mistakes, capfd):
     assert run("bench pairs scenes") == 0
     with Path("pairs.csv").open() as file:
-        assert {row["matcher"] for row in csv.DictReader(file)} == {*OPENCV_MATCHERS, *shipped_models()}
+        networks = [name + how for name in shipped_models() for how in ("", " refined")]
+        assert {row["matcher"] for row in csv.DictReader(file)} == {*OPENCV_MATCHERS, *networks}
     assert capfd.readouterr().out.endswith("rows: pairs.csv\n")
 
 

@@ -1,6 +1,7 @@
 """Films in parts and whole: times, sound, colours and marks come out as they went in."""
 
 import json
+import resource
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -196,6 +197,15 @@ def test_pictures_and_sound_stay_in_step_where_the_pictures_begin_late(tmp_path)
     assert sound_of(film) == sound_of(original)
 
 
+@pytest.mark.parametrize("ending", [".mp4", ".mov"])
+def test_a_late_start_is_kept_exactly(tmp_path, ending):
+    ninety_kilohertz = Fraction(1, 90_000)
+    late = [(36_001 + index * 3600) * ninety_kilohertz for index in range(3)]
+    writing = recorder(time_base=ninety_kilohertz, rate=Fraction(25))
+    film = make(tmp_path / f"film{ending}", list(zip(late, pictures(3), strict=True)), writing)
+    assert shown_at(film) == late
+
+
 def test_sound_that_a_container_cannot_hold_is_refused_with_one_that_can(tmp_path):
     original = two_languages(tmp_path / "in.mkv")
     with pytest.raises(
@@ -277,12 +287,67 @@ def test_parts_of_another_film_are_not_continued(tmp_path):
         raise KeyboardInterrupt
     with (
         pytest.raises(
-            StereoweaveError, match=r"found parts made with another position; remove that folder, or give"
+            StereoweaveError, match=r"found parts begun with position 0\.5; remove that folder, or give"
         ),
         growing(film, {"position": 0.25, "model": "small"}),
     ):
         pass
     assert json.loads((tmp_path / "film.mp4.parts" / "settings.json").read_text())["position"] == 0.5
+
+
+@pytest.mark.parametrize("name", ["settings.json", "state-000001.npz"])
+@pytest.mark.parametrize("content", [b"", b"[1, 2", b"PK\x03\x04 no archive"])
+def test_a_damaged_parts_folder_is_to_be_removed(tmp_path, name, content):
+    folder = begin(tmp_path / "film.mp4")
+    (folder / name).write_bytes(content)
+    assert_to_be_removed(tmp_path / "film.mp4", name)
+
+
+def test_parts_without_their_settings_are_to_be_removed(tmp_path):
+    folder = begin(tmp_path / "film.mp4")
+    (folder / "settings.json").unlink()
+    assert_to_be_removed(tmp_path / "film.mp4", "settings.json")
+
+
+def test_a_disk_that_is_full_from_the_start_is_one_line_with_the_file(tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    told = r"settings\.json: expected a file that can be written, found file too large$"
+    with pytest.raises(StereoweaveError, match=told):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1, hard))
+        try:
+            with growing(tmp_path / "film.mp4", {"position": 0.5}):
+                pass
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [(True, "with --x"), (False, "without --x"), (None, "without --x"), (0.5, "with --x 0.5")],
+)
+def test_what_a_film_was_begun_with_is_told_as_users_write_it(tmp_path, value, told):
+    film = tmp_path / "film.mp4"
+    begin(film, {"--x": value})
+    with pytest.raises(StereoweaveError, match=f"found parts begun {told}; "), growing(film, {"--x": "else"}):
+        pass
+
+
+def begin(film: Path, settings: dict[str, object] | None = None) -> Path:
+    """The folder of a film that was interrupted after one part."""
+    with pytest.raises(KeyboardInterrupt), growing(film, settings or {}) as parts:
+        add(parts, b"first", 1)
+        raise KeyboardInterrupt
+    return parts_folder(film)
+
+
+def assert_to_be_removed(film: Path, name: str) -> None:
+    with pytest.raises(StereoweaveError) as caught, growing(film, {}):
+        pass
+    folder = parts_folder(film)
+    assert str(caught.value).startswith(f"{folder / name}: expected")
+    assert str(caught.value).endswith(f"remove that folder: {folder}")
+    assert (folder / "000001.nut").exists()
 
 
 def add(parts: Parts, content: bytes, frames: int) -> None:

@@ -1,7 +1,10 @@
 import sys
+from array import array
 from fractions import Fraction
 from itertools import pairwise
+from types import SimpleNamespace
 
+import av
 import numpy as np
 import pytest
 from film_examples import (
@@ -19,6 +22,7 @@ from film_examples import (
 from stereoweave.errors import StereoweaveError
 from stereoweave.footage import ARRANGEMENTS, open_footage
 from stereoweave.footage_layout import guess_arrangement, resemblance
+from stereoweave.footage_tracks import _by_rank, _filled, _separated
 from stereoweave.io import write_image
 
 BEFORE = "damaged: the frame before it stands in"
@@ -235,6 +239,13 @@ def test_an_mp4_that_was_cut_off_cannot_be_opened_and_says_why(tmp_path):
     assert "lost its index" in refusal(path)
 
 
+def test_only_what_begins_as_an_mp4_has_lost_its_index(tmp_path):
+    (tmp_path / "text.mp4").write_text("no video\n" * 100)
+    (tmp_path / "empty.mp4").touch()
+    assert "index" not in refusal(tmp_path / "text.mp4")
+    assert refusal(tmp_path / "empty.mp4").endswith("empty.mp4: expected a video, found an empty file")
+
+
 def test_what_is_no_video_is_named_in_one_line(tmp_path):
     (tmp_path / "text.mkv").write_text("no video\n" * 100)
     (tmp_path / "empty").mkdir()
@@ -252,6 +263,69 @@ def test_frames_without_times_of_their_own_follow_each_other_at_the_films_rate(t
         frames = list(footage.frames())
         assert_eyes(frames, pairs, tolerance=3.0)
         assert [frame.time for frame in frames] == [Fraction(index, 25) for index in range(9)]
+
+
+MOVED = "its time stamp was missing or another frame's: it is shown a little later"
+
+
+def restamped(path, stamps_ms):
+    """A film with these time stamps, in a container that holds equal ones too."""
+    source = write_side_by_side(path.with_name("source.mkv"), example_pairs(len(stamps_ms)), codec="mjpeg")
+    with av.open(str(source)) as old, av.open(str(path), "w") as new:
+        stream = new.add_stream_from_template(old.streams.video[0], opaque=True)
+        for packet, stamp_ms in zip(
+            (packet for packet in old.demux(video=0) if packet.size), stamps_ms, strict=True
+        ):
+            packet.stream, packet.time_base = stream, Fraction(1, 1000)
+            packet.pts = packet.dts = stamp_ms
+            new.mux(packet)
+    return path
+
+
+def test_a_repeated_time_stamp_moves_its_frame_alone(tmp_path):
+    footage = open_footage([restamped(tmp_path / "film.mkv", [0, 70, 70, 90, 240])])
+    times_ms = [1000 * frame.time for frame in footage.frames()]
+    assert times_ms == [0, 70, 80, 90, 240]  # halfway to 90
+    assert problems(footage) == {2: MOVED}
+    assert_eyes(footage.frames(), example_pairs(5), tolerance=6.0)
+    assert_same(footage.frames(2), list(footage.frames())[2:])
+
+
+def test_a_repeat_goes_one_frame_on_where_there_is_room():
+    assert _separated([0, 40, 40, 200, 200], usual=40) == (array("q", [0, 40, 80, 200, 240]), [2, 4])
+
+
+def test_steps_rise_where_there_is_no_room_between_repeated_stamps():
+    steps, moved = _separated([0, 5, 5, 5, 6, 9], usual=4)
+    assert list(steps) == [0, 5, 6, 7, 8, 9]
+    assert moved == [2, 3]
+
+
+def test_a_missing_time_stamp_is_taken_for_that_of_the_frame_before():
+    assert _filled([None, 40, None, 120]) == [40, 40, 40, 120]
+
+
+@pytest.mark.parametrize(("key_every", "spoilt"), [("1", []), ("5", [4])])
+def test_a_frame_lost_where_there_are_no_times_is_the_one_that_is_bridged(tmp_path, key_every, spoilt):
+    options = {"bf": "0", "g": key_every}
+    path = write_side_by_side(tmp_path / "a.h264", example_pairs(9), codec="libx264", options=options)
+    whole = list(open_footage([path]).frames())
+    with av.open(str(path)) as container:
+        bodies = [bytes(packet) for packet in container.demux(video=0)]
+    # The parameter sets and the first byte of the slice stay, so that it still counts as a frame.
+    sliced = bodies[3].rindex(b"\0\0\1") + 4
+    spoiled = bodies[3][:sliced] + b"\xff" * (len(bodies[3]) - sliced)
+    path.write_bytes(path.read_bytes().replace(bodies[3], spoiled))
+    footage = open_footage([path])
+    assert problems(footage) == {3: BEFORE} | dict.fromkeys(spoilt, SPOILT)
+    assert_same(list(footage.frames())[5:], whole[5:])
+
+
+def test_a_frame_lost_among_those_coded_out_of_turn_is_noticed_at_the_next_key_frame():
+    # In the file I0 P1 B2 B3 P4 I5 P6, of which B3 is lost.
+    shown = [SimpleNamespace(opaque=rank, key_frame=rank in (0, 5)) for rank in (0, 2, 1, 4, 5, 6)]
+    decoder = SimpleNamespace(codec_context=SimpleNamespace(has_b_frames=True))
+    assert [number for number, _ in _by_rank(iter(shown), decoder)] == [0, 1, 2, 3, 5, 6]
 
 
 def test_a_folder_of_pictures_is_a_film_in_counting_order(tmp_path):

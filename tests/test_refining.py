@@ -103,16 +103,26 @@ def test_what_a_nearer_surface_hides_is_occluded(scene):
 
 
 def test_disparities_behind_the_plane_of_convergence_are_found_alike(rng):
-    right_px = np.full((48, 120), 3)
-    right_px[:, 50:55] = 9
+    right_px = np.full((48, 120), 13)
+    right_px[:, 50:55] = 19
     left, right, _ = photographs(rng, right_px, right_px.shape)
-    flat_px = np.full(right_px.shape, 3.0)
-    flat_px[10:20, 20:40] = 9  # so that the range holds both
+    flat_px = np.full(right_px.shape, 13.0)
+    flat_px[10:20, 20:40] = 19  # so that the range holds both
     there = refine(left, right, estimate_of(flat_px, flat_px))
     moved = refine(left, np.roll(right, 20, 1), estimate_of(flat_px - 20, np.roll(flat_px, 20, 1) - 20))
-    inner = (slice(None), slice(30, 90))
+    inner = (slice(None), slice(40, 90))
     np.testing.assert_allclose(moved.disparity_px[inner], there.disparity_px[inner] - 20, atol=1e-4)
-    assert (there.disparity_px[:, 59:64] > 8).mean() > 0.9
+    assert (there.disparity_px[:, 69:74] > 18).mean() > 0.9
+
+
+def test_parallel_cameras_are_given_nothing_below_zero(rng):
+    # The network's least is 0, and a plain sky would take whatever is offered.
+    photo = np.full((48, 120, 3), 200, np.uint8)
+    photo[20:30, 40:80] = rng.integers(0, 256, (10, 40, 3), dtype=np.uint8)
+    flat_px = np.zeros((48, 120))
+    found = refine(photo, photo, estimate_of(flat_px, flat_px))
+    assert found.disparity_px.min() >= 0
+    assert found.right_disparity_px.min() >= 0
 
 
 def random_pair(rng):

@@ -1,5 +1,7 @@
 """Each film is a list of (left, right, estimate); pictures are random textures, and noise has a seed."""
 
+import threading
+
 import cv2
 import numpy as np
 import pytest
@@ -194,6 +196,63 @@ def test_a_frame_of_another_size_is_a_cut(rng):
     assert steadier.cuts == 1
 
 
+def plain_with_patch(rng, row, column, disparity_px):
+    left, right = (np.full((HEIGHT, WIDTH, 3), 128, np.uint8) for _ in range(2))
+    patch = texture(rng, 20, 20)
+    left[row : row + 20, column : column + 20] = patch
+    right[row : row + 20, column - disparity_px : column - disparity_px + 20] = patch
+    return left, right, plain(disparity_px)
+
+
+def test_a_cut_between_plain_scenes_shows_in_their_disparity(rng):
+    before, after = plain_with_patch(rng, 20, 40, 10), plain_with_patch(rng, 70, 120, 30)
+    found, steadier = steadied([before] * 3 + [after] * 2)
+    assert (disparities(found)[3:] == 30).all()
+    assert steadier.cuts == 1
+
+
+def test_a_thing_that_comes_and_goes_over_plain_ground_is_no_cut(rng):
+    film = [plain_with_patch(rng, row, column, 10) for row, column in [(20, 40), (70, 120), (20, 100)]]
+    assert steadied(film)[1].cuts == 0
+
+
+@pytest.mark.parametrize("contrast", [0.25, 0.1])
+def test_a_cut_between_faint_scenes_is_one(rng, contrast):
+    def faint(disparity_px):
+        images = [cv2.convertScaleAbs(texture(rng), alpha=contrast, beta=100) for _ in range(2)]
+        return *images, plain(disparity_px)
+
+    before, after = faint(10), faint(10.5)
+    found, steadier = steadied([before, before, after, after])
+    assert (found[2].disparity_px == 10.5).all()
+    assert steadier.cuts == 1
+
+
+@pytest.mark.parametrize("jump_px", [3, 6, -6])
+def test_what_moves_in_the_right_view_alone_is_not_outvoted(rng, jump_px):
+    left, wide = texture(rng), texture(rng, HEIGHT, WIDTH + 20)
+    near_px = np.array([20, 20, 20, 20 + jump_px])
+    rights = [wide[:, 10 + shift_px : 10 + shift_px + WIDTH].copy() for shift_px in near_px - 20]
+    film = [(left, right, plain(px)) for right, px in zip(rights, near_px, strict=True)]
+    found, steadier = steadied(film)
+    assert np.abs(found[-1].disparity_px - near_px[-1]).mean() < 0.1
+    assert steadier.cuts == 0
+
+
+def test_a_small_thing_that_moves_in_the_right_view_alone_is_not_outvoted(rng):
+    ground, thing = texture(rng), texture(rng, 12, 12)
+    film, square = [], np.s_[60:72, 100:112]
+    for near_px in range(12, 33, 3):
+        left, right = ground.copy(), ground.copy()
+        column = 100 - near_px
+        left[square] = right[60:72, column : column + 12] = thing
+        disparity_px = np.zeros((HEIGHT, WIDTH))
+        disparity_px[square] = near_px
+        film.append((left, right, estimate(disparity_px)))
+    found = disparities(steadied(film)[0])
+    np.testing.assert_allclose(found[:, *square].mean(axis=(1, 2)), range(12, 33, 3), atol=0.2)
+
+
 @pytest.mark.parametrize(("gain", "offset_levels"), [(0.6, 0), (0.8, 50), (1.0, -20)])
 def test_a_fade_is_no_cut_and_keeps_what_was_found(rng, gain, offset_levels):
     left, right = (cv2.convertScaleAbs(texture(rng), alpha=0.6, beta=40) for _ in range(2))
@@ -214,6 +273,31 @@ def test_a_state_goes_on_bit_for_bit(rng, tmp_path):
         one, other = steadier(*frame), again(*frame)
         for name in ("disparity_px", "right_disparity_px", "confidence", "occluded"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+@pytest.mark.parametrize(
+    "start", [Steadier, lambda threads: Steadier.from_state(Steadier().state(), threads)]
+)
+@pytest.mark.parametrize("threads", [1, 2])
+def test_no_more_threads_work_than_asked_for(rng, start, threads):
+    workers = set()
+    steadier = start(threads)
+    threading.setprofile(lambda *_: workers.add(threading.get_ident()))
+    try:
+        for frame in at_rest(rng, [plain(10)] * 2):
+            steadier(*frame)
+    finally:
+        threading.setprofile(None)
+    assert len(workers) <= threads
+
+
+def test_the_number_of_threads_changes_nothing(rng):
+    film, _, _ = square_film(rng, 3, 3, 1)
+    one, two = Steadier(1), Steadier(2)
+    for frame in film:
+        found, expected = one(*frame), two(*frame)
+        np.testing.assert_array_equal(found.disparity_px, expected.disparity_px)
+        np.testing.assert_array_equal(found.right_disparity_px, expected.right_disparity_px)
 
 
 def test_the_state_before_the_first_frame_and_the_cuts_are_kept(rng):
@@ -257,7 +341,7 @@ def random_motion(rng, shape):
     half = ((shape[0] + 1) // 2, (shape[1] + 1) // 2)
     # No halves: NumPy and the kernel need not round them alike.
     to_before_px = rng.integers(-5, 6, (*half, 2)) + rng.uniform(-0.4, 0.4, (*half, 2))
-    return Motion(to_before_px.astype(np.float32), rng.random(half) < 0.8, rng.random(half) < 0.5)
+    return Motion(to_before_px.astype(np.float32), rng.random(half) < 0.8, rng.random(half) < 0.5, 1.0)
 
 
 def empty_track(shape):

@@ -1,5 +1,6 @@
 """A film through the command: its frames, times and sound, and what becomes of one that is interrupted."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from film_examples import damage, example_pairs, packets, write_side_by_side, wr
 from stereoweave.cli import main
 from stereoweave.colour import colour_disparity
 from stereoweave.footage import Footage, StereoFrame, open_footage
+from stereoweave.io import write_image
 from stereoweave.layouts import LAYOUTS, Choices
 from stereoweave.matcher import Matcher
 from stereoweave.rendering import Renderer
@@ -159,7 +161,7 @@ def test_another_order_does_not_go_on_with_what_was_begun(tmp_path, monkeypatch,
     assert run(film, tmp_path / "out.mp4", "--position", "0.6") == 2
     folder = tmp_path / "out.mp4.parts"
     assert capsys.readouterr().err == (
-        f"stereoweave: {folder}: expected parts of the same film, found parts made with another position; "
+        f"stereoweave: {folder}: expected parts of the same film, found parts begun with --position 0.4; "
         "remove that folder, or give the words that it was begun with\n"
     )
 
@@ -210,6 +212,17 @@ def test_a_damaged_frame_is_told_with_its_time_and_is_not_the_end(tmp_path, caps
         ("in.mp4", ["--depth"], "expected another file than the film it is made from"),
         ("out.mp4", ["--depth", "--model", "huge"], "unknown model 'huge'"),
         ("out.mp4", ["--depth", "--arrangement", "diagonal"], "expected an arrangement, side_by_side"),
+        ("out.mp4", ["--position", "0", "--convergence", "nan"], "--convergence: expected a number that is"),
+        ("out.mp4", ["--layout", "quilt", "--convergence", "-inf"], "not infinite or nan, found -inf"),
+        ("out.mp4", ["--position", "0.5", "--strength", "inf"], "--strength: expected a number that is not"),
+        ("out.mp4", ["--depth", "--convergence", "3"], "--convergence: expected a view or a layout of views"),
+        ("out.mkv", ["--depth16", "--strength", "2"], "for it, found --depth16"),
+        ("out.mp4", ["--layout", "rgbd", "--convergence", "0"], "for it, found --layout rgbd"),
+        ("out.mp4", ["--depth", "--rate", "24"], "expected pictures for a rate, found a video"),
+        ("out.mp4", ["--depth", "--rate", "1/0"], "--rate: expected frames a second"),
+        ("out.mp4", ["--depth", "--rate", "-5"], "--rate: expected frames a second"),
+        ("out.mp4", ["--depth", "--rate", "1e300"], "at most 1000, found '1e300'"),
+        ("out.mp4", ["--depth", "--rate", ""], "--rate: expected frames a second"),
     ],
 )
 def test_what_cannot_be_made_is_one_line_before_any_work(tmp_path, capsys, out, words, told):
@@ -232,3 +245,83 @@ def test_what_is_no_3d_film_is_one_line(tmp_path, capsys):
         [line] = capsys.readouterr().err.splitlines()
         assert told in line
     assert sorted(path.name for path in tmp_path.iterdir()) == ["broken.mp4", "flat.mp4"]
+
+
+def test_swapped_sides_are_told_with_the_arrangement_that_mends_them(tmp_path, capsys):
+    pairs = example_pairs(4, width=320, height=192)
+    crossed = write_side_by_side(tmp_path / "in.mp4", pairs, arrangement="crossed", codec="libx264")
+    assert run(crossed, tmp_path / "a.mp4", "--depth", "--arrangement", "side_by_side") == 0
+    told = capsys.readouterr().err
+    assert told.count("swapped? Then give --arrangement crossed.") == 1
+    assert run(crossed, tmp_path / "b.mp4", "--depth", "--arrangement", "crossed") == 0
+    assert "swapped" not in capsys.readouterr().err
+
+
+def test_a_film_of_more_than_a_minute_is_looked_at_in_its_first(tmp_path, capsys):
+    # At 12 frames a minute, so that two of the three that are looked at, number 2, 6 and 10, are swapped.
+    pairs = example_pairs(16, width=320, height=192)
+    pairs = [pair if index < 5 else pair[::-1] for index, pair in enumerate(pairs)]
+    times_ms = range(0, 16 * 5000, 5000)
+    film = write_side_by_side(tmp_path / "in.mp4", pairs, times_ms=times_ms, codec="libx264")
+    assert run(film, tmp_path / "out.mp4", "--position", "0", "--arrangement", "side_by_side") == 0
+    assert capsys.readouterr().err.count("0:00:50.000 ") == 1
+
+
+def test_swapped_films_are_told_without_an_arrangement(tmp_path, capsys):
+    pairs = example_pairs(2, width=320, height=192)
+    left, right = (write_video(tmp_path / f"{eye}.mp4", [pair[eye] for pair in pairs]) for eye in (0, 1))
+    words = ["video", str(right), str(left), "-o", str(tmp_path / "out.mp4"), "--position", "0"]
+    assert main(words) == 0
+    told = capsys.readouterr().err
+    assert "swapped?" in told
+    assert "--arrangement" not in told
+
+
+def write_pictures(folder: Path, count: int) -> Path:
+    for index, (left, right) in enumerate(example_pairs(count)):
+        write_image(folder / f"{index:03}.png", np.hstack([left, right]))
+    return folder
+
+
+def test_a_series_of_pictures_has_the_rate_that_is_given(tmp_path, capsys):
+    folder = write_pictures(tmp_path / "frames", 3)
+    assert run(folder, tmp_path / "out.mp4", "--position", "0.5", "--rate", "30000/1001") == 0
+    assert times_of(tmp_path / "out.mp4") == [index * Fraction(1001, 30_000) for index in range(3)]
+
+
+@pytest.mark.parametrize("pattern", ["", "*.png"])
+def test_a_series_of_which_one_picture_changed_is_not_gone_on_with(tmp_path, monkeypatch, capsys, pattern):
+    folder = write_pictures(tmp_path / "frames", 20)
+    out = (folder / pattern).with_name("out.mp4")
+    words = ["--position", "0.5", "--rate", "1"]
+    with monkeypatch.context() as patch:
+        patch.setattr("stereoweave.footage.Footage", Interrupted)
+        assert run(folder / pattern, out, *words) == 130
+    status = (folder / "013.png").stat()
+    os.utime(folder / "013.png", ns=(status.st_atime_ns, status.st_mtime_ns + 1_000_000))
+    capsys.readouterr()
+    assert run(folder / pattern, out, *words) == 2
+    assert "found parts begun with another FILM;" in capsys.readouterr().err
+
+
+def test_a_film_taken_apart_otherwise_is_not_gone_on_with(tmp_path, monkeypatch, capsys):
+    film = slow_film(tmp_path / "in.mp4", 20)
+    with monkeypatch.context() as patch:
+        patch.setattr("stereoweave.footage.Footage", Interrupted)
+        assert run(film, tmp_path / "out.mp4", "--position", "0.5") == 130
+    capsys.readouterr()
+    assert run(film, tmp_path / "out.mp4", "--position", "0.5", "--arrangement", "crossed") == 2
+    assert "found parts begun with --arrangement side_by_side;" in capsys.readouterr().err
+
+
+def test_a_film_stopped_while_it_is_opened_says_what_it_says_later(tmp_path, monkeypatch, capsys):
+    film = write_side_by_side(tmp_path / "in.mp4", example_pairs(2), codec="libx264")
+    monkeypatch.setattr("stereoweave.footage.Footage", lambda *_: signal.raise_signal(signal.SIGINT))
+    assert run(film, tmp_path / "out.mp4", "--depth") == 130
+    assert capsys.readouterr().err == f"stereoweave: {tmp_path / 'out.mp4'}: stopped; nothing stays\n"
+
+
+def test_one_frame_is_one_frame(tmp_path, capsys):
+    film = write_side_by_side(tmp_path / "in.mp4", example_pairs(1), codec="libx264")
+    assert run(film, tmp_path / "out.mp4", "--position", "0.5") == 0
+    assert capsys.readouterr().out == f"{tmp_path / 'out.mp4'}: 1 frame, 0 cuts\n"
