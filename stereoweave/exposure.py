@@ -214,9 +214,15 @@ def _fitted(left: UInt8[np.ndarray, " n"], right: UInt8[np.ndarray, " n"]) -> Fl
     left, right = (np.sort(side, kind="stable").astype(int) for side in (left, right))
     weights = np.bincount(left + right, minlength=511) / len(left)
     sums = np.bincount(left + right, right - left, minlength=511) / len(left)
-    at_knots = np.linalg.solve(_HATS.T @ (weights[:, None] * _HATS) + _PRICES, _HATS.T @ sums)
+    # Sums and OpenCV's solver, because the threads of NumPy's library go on waiting busily after a matrix
+    # product, on a core that the renderer needs.
+    weighted = weights[:, None] * _HATS
+    beside = np.diag((weighted[:, 1:] * _HATS[:, :-1]).sum(0), 1)
+    normal = np.diag((weighted * _HATS).sum(0)) + beside + beside.T + _PRICES
+    right_side = (sums[:, None] * _HATS).sum(0)[:, None]
+    _, at_knots = cv2.solve(normal, right_side, flags=cv2.DECOMP_CHOLESKY)
     largest = 2 * np.minimum(_MEANS, 255 - _MEANS)
-    return np.clip(_HATS @ at_knots, -largest, largest)
+    return np.clip(np.interp(_MEANS, _KNOTS, at_knots[:, 0]), -largest, largest)
 
 
 def _mean_size(difference: Float[np.ndarray, " 511"], channel: _Channel) -> float:
