@@ -32,6 +32,14 @@ def slow_film(path: Path, count: int = 25) -> Path:
     )
 
 
+@pytest.fixture(autouse=True)
+def heeded_interrupts():
+    """Where a shell starts the tests in the background, Python leaves Ctrl-C ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def run(film: Path, out: Path, *words: str) -> int:
     return main(["video", str(film), "-o", str(out), "--threads", "2", *words])
 
