@@ -20,6 +20,9 @@ Pictures = Annotated[
         help="LEFT RIGHT, rectified and of one size; or one picture with both side by side.",
     ),
 ]
+Strength = Annotated[
+    float, typer.Option(min=0, help="Multiplies the distance of the cameras, about their middle.")
+]
 Model = Annotated[str, typer.Option(help="The name of a shipped network, or an .onnx file.")]
 Threads = Annotated[int | None, typer.Option(min=1, help="Processor threads; as many as cores unless given.")]
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoweave.command_line import Model, Threads, place_for
+from stereoweave.command_line import Model, Strength, Threads, place_for
 from stereoweave.errors import StereoweaveError
 
 if TYPE_CHECKING:
@@ -15,63 +15,68 @@ if TYPE_CHECKING:
 _HIGHEST_RATE = 1000
 
 
+Films = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="FILM",
+        help="A 3-D film with both views in each frame; or LEFT RIGHT. Videos, folders of pictures, or "
+        "patterns such as 'left/*.png'.",
+    ),
+]
+Out = Annotated[
+    Path,
+    typer.Option("--out", "-o", help="The film to write: .mp4, .mov or .mkv. Begun once, it is continued."),
+]
+Depth = Annotated[
+    bool,
+    typer.Option("--depth", help="Make the left view's disparity in colours, of one range throughout."),
+]
+Depth16 = Annotated[
+    bool, typer.Option("--depth16", help="Make it 16-bit grey, disparity in px * 256, lossless in .mkv.")
+]
+Position = Annotated[
+    float | None,
+    typer.Option(help="Make the view from here: 0 is the left camera, 1 the right; -1 to 2."),
+]
+Layout = Annotated[
+    str | None,
+    typer.Option(help="Make a layout as `stereoweave view` knows them, such as anaglyph_dubois or quilt."),
+]
+Convergence = Annotated[
+    float | None,
+    typer.Option(
+        metavar="PX",
+        help="The disparity that stays in place from view to view. [default: that of the film's middle "
+        "for anaglyphs, quilts and contact sheets, 0 for all others]",
+    ),
+]
+Arrangement = Annotated[
+    str | None,
+    typer.Option(
+        help="How a frame holds both views, such as side_by_side, top_bottom_half or crossed; guessed "
+        "unless given. Any other word lists them all."
+    ),
+]
+Rate = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FPS",
+        help="Frames a second of a series of pictures, such as 24 or 30000/1001. [default: 25]",
+    ),
+]
+
+
 def video(  # noqa: PLR0913 - each is a word of the command line
-    films: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="FILM",
-            help="A 3-D film with both views in each frame; or LEFT RIGHT. Videos, folders of pictures, or "
-            "patterns such as 'left/*.png'.",
-        ),
-    ],
-    out: Annotated[
-        Path,
-        typer.Option(
-            "--out", "-o", help="The film to write: .mp4, .mov or .mkv. Begun once, it is continued."
-        ),
-    ],
-    depth: Annotated[
-        bool,
-        typer.Option("--depth", help="Make the left view's disparity in colours, of one range throughout."),
-    ] = False,
-    depth16: Annotated[
-        bool, typer.Option("--depth16", help="Make it 16-bit grey, disparity in px * 256, lossless in .mkv.")
-    ] = False,
-    position: Annotated[
-        float | None,
-        typer.Option(help="Make the view from here: 0 is the left camera, 1 the right; -1 to 2."),
-    ] = None,
-    layout: Annotated[
-        str | None,
-        typer.Option(
-            help="Make a layout as `stereoweave view` knows them, such as anaglyph_dubois or quilt."
-        ),
-    ] = None,
-    strength: Annotated[
-        float, typer.Option(min=0, help="Multiplies the distance of the cameras, about their middle.")
-    ] = 1.0,
-    convergence: Annotated[
-        float | None,
-        typer.Option(
-            metavar="PX",
-            help="The disparity that stays in place from view to view. [default: that of the film's middle "
-            "for anaglyphs, quilts and contact sheets, 0 for all others]",
-        ),
-    ] = None,
-    arrangement: Annotated[
-        str | None,
-        typer.Option(
-            help="How a frame holds both views, such as side_by_side, top_bottom_half or crossed; guessed "
-            "unless given. Any other word lists them all."
-        ),
-    ] = None,
-    rate: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FPS",
-            help="Frames a second of a series of pictures, such as 24 or 30000/1001. [default: 25]",
-        ),
-    ] = None,
+    films: Films,
+    out: Out,
+    depth: Depth = False,
+    depth16: Depth16 = False,
+    position: Position = None,
+    layout: Layout = None,
+    strength: Strength = 1.0,
+    convergence: Convergence = None,
+    arrangement: Arrangement = None,
+    rate: Rate = None,
     model: Model = "small",
     threads: Threads = None,
 ) -> None:

@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoweave.command_line import Model, Pictures, Threads, load_matcher, place_for, read_pictures
+from stereoweave.command_line import (
+    Model,
+    Pictures,
+    Strength,
+    Threads,
+    load_matcher,
+    place_for,
+    read_pictures,
+)
 from stereoweave.errors import StereoweaveError
 
 if TYPE_CHECKING:
@@ -18,54 +26,60 @@ if TYPE_CHECKING:
 _MIDDLE = 0.5
 
 
+Out = Annotated[
+    Path,
+    typer.Option(
+        "--out",
+        "-o",
+        help="The file to write. A layout that viewers know by a mark in the name gets it: "
+        "view.png becomes view_qs8x6a0.75.png for a quilt. .mpo and .jps are 3-D pictures.",
+    ),
+]
+Position = Annotated[
+    float | None,
+    typer.Option(
+        help="The viewpoint of a single view: 0 is the left camera, 1 the right; -1 to 2. [default: 0.5]"
+    ),
+]
+Up = Annotated[float, typer.Option(help="Raises the viewpoint of a single view, in baselines; -1 to 1.")]
+Forward = Annotated[
+    float, typer.Option(help="Moves the viewpoint of a single view forward, in baselines; -1 to 1.")
+]
+Layout = Annotated[
+    str | None,
+    typer.Option(
+        help="Several views in one: side_by_side, side_by_side_half, crossed, top_bottom, "
+        "top_bottom_half, anaglyph_grey, anaglyph_colour, anaglyph_half_colour, anaglyph_dubois, rgbd, "
+        "quilt, contact_sheet; or moving, as .mp4 (extra 'video'), .gif or .webp: sweep, wiggle."
+    ),
+]
+Convergence = Annotated[
+    str | None,
+    typer.Option(
+        metavar="PX|auto",
+        help="The disparity that stays in place from view to view; auto is that of the scene's middle. "
+        "[default: 0 for a single view and where each eye has a picture of its own, auto else]",
+    ),
+]
+Quilt = Annotated[
+    str | None, typer.Option(metavar="COLUMNSxROWS", help="The views of a quilt. [default: 8x6]")
+]
+Calib = Annotated[
+    Path | None, typer.Option(help="Middlebury's calib.txt, for --up and --forward in true proportion.")
+]
+
+
 def view(  # noqa: PLR0913 - each is a word of the command line
     pictures: Pictures,
-    out: Annotated[
-        Path,
-        typer.Option(
-            "--out",
-            "-o",
-            help="The file to write. A layout that viewers know by a mark in the name gets it: "
-            "view.png becomes view_qs8x6a0.75.png for a quilt. .mpo and .jps are 3-D pictures.",
-        ),
-    ],
-    position: Annotated[
-        float | None,
-        typer.Option(
-            help="The viewpoint of a single view: 0 is the left camera, 1 the right; -1 to 2. [default: 0.5]"
-        ),
-    ] = None,
-    up: Annotated[
-        float, typer.Option(help="Raises the viewpoint of a single view, in baselines; -1 to 1.")
-    ] = 0.0,
-    forward: Annotated[
-        float, typer.Option(help="Moves the viewpoint of a single view forward, in baselines; -1 to 1.")
-    ] = 0.0,
-    layout: Annotated[
-        str | None,
-        typer.Option(
-            help="Several views in one: side_by_side, side_by_side_half, crossed, top_bottom, "
-            "top_bottom_half, anaglyph_grey, anaglyph_colour, anaglyph_half_colour, anaglyph_dubois, rgbd, "
-            "quilt, contact_sheet; or moving, as .mp4 (extra 'video'), .gif or .webp: sweep, wiggle."
-        ),
-    ] = None,
-    strength: Annotated[
-        float, typer.Option(min=0, help="Multiplies the distance of the cameras, about their middle.")
-    ] = 1.0,
-    convergence: Annotated[
-        str | None,
-        typer.Option(
-            metavar="PX|auto",
-            help="The disparity that stays in place from view to view; auto is that of the scene's middle. "
-            "[default: 0 for a single view and where each eye has a picture of its own, auto else]",
-        ),
-    ] = None,
-    quilt: Annotated[
-        str | None, typer.Option(metavar="COLUMNSxROWS", help="The views of a quilt. [default: 8x6]")
-    ] = None,
-    calib: Annotated[
-        Path | None, typer.Option(help="Middlebury's calib.txt, for --up and --forward in true proportion.")
-    ] = None,
+    out: Out,
+    position: Position = None,
+    up: Up = 0.0,
+    forward: Forward = 0.0,
+    layout: Layout = None,
+    strength: Strength = 1.0,
+    convergence: Convergence = None,
+    quilt: Quilt = None,
+    calib: Calib = None,
     model: Model = "base",
     threads: Threads = None,
 ) -> None:
