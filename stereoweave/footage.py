@@ -94,7 +94,7 @@ def open_footage(
 ) -> Footage:
     """The footage in one video of both eyes, in two, left and right, or in series of pictures likewise.
 
-    Reads through the files once, without decoding, to know every frame's time.
+    Reads through the files to know every frame's time, and decodes some frames where it has to guess.
 
     Args:
         paths: One or two: videos, folders of pictures, or glob patterns of pictures.
