@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoweave.errors import StereoweaveError, needing_extra
+from stereoweave.errors import needing_extra
 
 if TYPE_CHECKING:
     from stereoweave.matcher import Matcher
@@ -29,19 +29,9 @@ Threads = Annotated[int | None, typer.Option(min=1, help="Processor threads; as 
 
 def read_pictures(pictures: list[Path], calib: Path | None = None) -> "StereoPair":
     """The pair of the pictures that a command was given, with its camera where there is a calibration."""
-    from stereoweave.io import calibrated, read_pair, read_side_by_side
+    from stereoweave.preparing import Request, prepare
 
-    match pictures:
-        case [left, right]:
-            pair = read_pair(left, right)
-        case [both]:
-            pair = read_side_by_side(both)
-        case _:
-            names = " ".join(map(str, pictures))
-            raise StereoweaveError(
-                f"expected LEFT RIGHT or SIDE_BY_SIDE, one or two pictures, found {len(pictures)}: {names}"
-            )
-    return calibrated(pair, calib) if calib else pair
+    return prepare(pictures, Request(calibration=calib)).pair
 
 
 def load_matcher(model: str, threads: int | None) -> "Matcher":
@@ -52,13 +42,10 @@ def load_matcher(model: str, threads: int | None) -> "Matcher":
 
 
 def place_for(*files: Path) -> Path:
-    """The nearest folder above files of one folder that is there, tried; an error if a file is a folder."""
-    from stereoweave.io import make_folder
+    """As `io.place_for`, which is imported where it is needed alone."""
+    from stereoweave import io
 
-    for file in files:
-        if file.is_dir():
-            raise StereoweaveError(f"{file}: expected a file that can be written, found a folder")
-    return make_folder(next(path for path in files[0].parents if path.exists()))
+    return io.place_for(*files)
 
 
 @contextmanager

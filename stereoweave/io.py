@@ -210,6 +210,14 @@ def make_folder(path: str | Path) -> Path:
         ) from error
 
 
+def place_for(*files: Path) -> Path:
+    """The nearest folder above files of one folder that is there, tried; an error if a file is a folder."""
+    for file in files:
+        if file.is_dir():
+            raise StereoweaveError(f"{file}: expected a file that can be written, found a folder")
+    return make_folder(next(path for path in files[0].parents if path.exists()))
+
+
 @contextmanager
 def reading(path: str | Path, expected: str) -> Iterator[None]:
     """Turns what goes wrong while `path` is read into a FormatError: in one line, expected and found."""

@@ -56,11 +56,17 @@ class StereoCamera:
 
 @dataclass(frozen=True, kw_only=True)
 class StereoPair:
-    """Two rectified photographs of one moment, uint8 RGB of one size, and their camera where it is known."""
+    """Two rectified photographs of one moment, uint8 RGB of one size, and their camera where it is known.
+
+    left_seen and right_seen, bool [H, W], are False where a picture shows nothing, as at the borders that
+    rectification leaves; None where it is full.
+    """
 
     left: UInt8[np.ndarray, "h w 3"]
     right: UInt8[np.ndarray, "h w 3"]
     camera: StereoCamera | None = None
+    left_seen: Bool[np.ndarray, "h w"] | None = None
+    right_seen: Bool[np.ndarray, "h w"] | None = None
 
     def __post_init__(self) -> None:
         for side, image in (("left", self.left), ("right", self.right)):
@@ -73,11 +79,19 @@ class StereoPair:
                 "left and right images must be of one size, "
                 f"got {_size(self.left)} and {_size(self.right)}; crop or rescale one of them"
             )
+        for side, seen in (("left", self.left_seen), ("right", self.right_seen)):
+            if seen is not None and seen.shape != self.left.shape[:2]:
+                raise StereoweaveError(
+                    f"{side}_seen: expected the shape of the images {self.left.shape[:2]}, got {seen.shape}"
+                )
 
     def mirrored(self) -> "StereoPair":
-        """The pair as a mirror shows it: what was the right view is now the left one."""
+        """The pair as a mirror shows it, without its camera: what was the right view is now the left one."""
         return StereoPair(
-            left=np.ascontiguousarray(self.right[:, ::-1]), right=np.ascontiguousarray(self.left[:, ::-1])
+            left=np.ascontiguousarray(self.right[:, ::-1]),
+            right=np.ascontiguousarray(self.left[:, ::-1]),
+            left_seen=None if self.right_seen is None else np.ascontiguousarray(self.right_seen[:, ::-1]),
+            right_seen=None if self.left_seen is None else np.ascontiguousarray(self.left_seen[:, ::-1]),
         )
 
 
