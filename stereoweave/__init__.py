@@ -5,9 +5,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from stereoweave.errors import FormatError, MatcherError, StereoweaveError
-    from stereoweave.matcher import Matcher, estimate
+    from stereoweave.matcher import Matcher
+    from stereoweave.matching import estimate
     from stereoweave.rendering import render
     from stereoweave.stereo import DepthCurve, Estimate, Sample, StereoCamera, StereoPair, View
+    from stereoweave.stereo_matcher import StereoMatcher
     from stereoweave.synthesis import synthesize
 
 __version__ = "0.1.0"
@@ -20,10 +22,11 @@ _HOMES = {
     "MatcherError": "errors",
     "Sample": "stereo",
     "StereoCamera": "stereo",
+    "StereoMatcher": "stereo_matcher",
     "StereoPair": "stereo",
     "StereoweaveError": "errors",
     "View": "stereo",
-    "estimate": "matcher",
+    "estimate": "matching",
     "render": "rendering",
     "synthesize": "synthesis",
 }
@@ -36,6 +39,7 @@ __all__ = [
     "MatcherError",
     "Sample",
     "StereoCamera",
+    "StereoMatcher",
     "StereoPair",
     "StereoweaveError",
     "View",

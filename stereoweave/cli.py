@@ -1,4 +1,4 @@
-"""The commands: stereoweave depth | view | video | bench | synth | train | export."""
+"""The commands: stereoweave depth | measure | view | video | live | app | check | rectify | train and so on."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,8 +9,11 @@ import typer
 from stereoweave import __version__
 from stereoweave.bench_commands import bench
 from stereoweave.command_line import needing_the_train_extra
-from stereoweave.depth_commands import depth
+from stereoweave.depth_commands import depth, measure
 from stereoweave.errors import StereoweaveError
+from stereoweave.live_commands import live
+from stereoweave.page_commands import app as page
+from stereoweave.rig_commands import calibrate, check, rectify
 from stereoweave.synth_commands import synth
 from stereoweave.video_commands import video
 from stereoweave.view_commands import view
@@ -49,9 +52,9 @@ def _stereoweave(
     """Depth, and any view between the two cameras, from a rectified stereo pair."""
 
 
-app.command()(depth)
-app.command()(view)
-app.command()(video)
+for command in (depth, measure, view, video, live, check, rectify, calibrate):
+    app.command()(command)
+app.command("app")(page)
 
 
 @app.command()

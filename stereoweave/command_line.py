@@ -1,5 +1,6 @@
 """What the commands share: words of the command line, and what they do before they work."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -7,31 +8,104 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoweave.errors import needing_extra
+from stereoweave.errors import StereoweaveError, needing_extra
 
 if TYPE_CHECKING:
     from stereoweave.matcher import Matcher
-    from stereoweave.stereo import StereoPair
+    from stereoweave.preparing import Request
 
 Pictures = Annotated[
     list[Path],
-    typer.Argument(
-        metavar="PICTURE",
-        help="LEFT RIGHT, rectified and of one size; or one picture with both side by side.",
+    typer.Argument(metavar="PICTURE", help="LEFT RIGHT, of one size; or one picture with both views."),
+]
+Format = Annotated[
+    str | None,
+    typer.Option(
+        "--format",
+        help="How one picture holds both views: side_by_side, side_by_side_half, crossed, crossed_half, "
+        "top_bottom, top_bottom_half, top_bottom_right_first, top_bottom_right_first_half, mpo, jps; found "
+        "out unless given.",
     ),
+]
+Calib = Annotated[
+    Path | None,
+    typer.Option(
+        help="The cameras' calibration, for metres and --rectify: of OpenCV, Kalibr, KITTI, Middlebury."
+    ),
+]
+FocalPx = Annotated[
+    float | None, typer.Option(help="Without a calibration, for metres: the focal length in pixels.")
+]
+BaselineM = Annotated[float | None, typer.Option(help="And the distance between the two cameras in metres.")]
+Rectify = Annotated[
+    bool,
+    typer.Option(
+        "--rectify", help="Bring the rows of both to match: by the calibration, or without one by features."
+    ),
+]
+Range = Annotated[
+    str | None,
+    typer.Option(
+        "--range",
+        metavar="LOW,HIGH",
+        help="The least and the greatest disparity in pixels; found out unless given.",
+    ),
+]
+Refined = Annotated[
+    bool,
+    typer.Option("--refined", help="Match once more at full resolution: thin things and sharper edges."),
 ]
 Strength = Annotated[
     float, typer.Option(min=0, help="Multiplies the distance of the cameras, about their middle.")
 ]
 Model = Annotated[str, typer.Option(help="The name of a shipped network, or an .onnx file.")]
 Threads = Annotated[int | None, typer.Option(min=1, help="Processor threads; as many as cores unless given.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
-def read_pictures(pictures: list[Path], calib: Path | None = None) -> "StereoPair":
-    """The pair of the pictures that a command was given, with its camera where there is a calibration."""
-    from stereoweave.preparing import Request, prepare
+def request_of(
+    arrangement: str | None = None,
+    calib: Path | None = None,
+    focal_px: float | None = None,
+    baseline_m: float | None = None,
+    rectify: bool = False,
+) -> "Request":
+    """What a command was told of a pair beside its pictures."""
+    from stereoweave.preparing import Request
 
-    return prepare(pictures, Request(calibration=calib)).pair
+    return Request(
+        arrangement=arrangement,
+        calibration=calib,
+        focal_px=focal_px,
+        baseline_m=baseline_m,
+        rectify=rectify,
+    )
+
+
+def range_of(text: str | None) -> tuple[float, float] | None:
+    """The least and the greatest disparity of --range, None where it is not given."""
+    if text is None:
+        return None
+    low_px, high_px = _two_numbers("--range", text, "the least and the greatest disparity, such as -20,150")
+    if low_px >= high_px:
+        raise StereoweaveError(f"--range: expected the least disparity first, found {text!r}")
+    return low_px, high_px
+
+
+def pixel_of(option: str, text: str) -> tuple[int, int]:
+    """Column and row that the words of an option name."""
+    column, row = _two_numbers(option, text, "column and row of a pixel, such as 320,240")
+    return round(column), round(row)
+
+
+def _two_numbers(option: str, text: str, expected: str) -> tuple[float, float]:
+    try:
+        first, second = (float(word) for word in text.split(","))
+    except ValueError:
+        first = second = math.nan
+    if not (math.isfinite(first) and math.isfinite(second)):
+        raise StereoweaveError(f"{option}: expected {expected}, found {text!r}")
+    return first, second
 
 
 def load_matcher(model: str, threads: int | None) -> "Matcher":

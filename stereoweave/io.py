@@ -1,11 +1,10 @@
-"""Pictures, disparity, depth and calibrations: from files, and into files that are whole or not there."""
+"""Pictures, disparity and depth: from files, and into files that are whole or not there."""
 
 import re
 import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from uuid import uuid4
 
@@ -14,7 +13,7 @@ from jaxtyping import Float, Float32, Shaped, UInt8, UInt16
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.stereo import StereoCamera, StereoPair
+from stereoweave.stereo import StereoPair
 
 SMALLEST_SIDE_PX = 32
 _KINDS = {
@@ -42,17 +41,33 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
         FormatError: No such file, no picture, a truncated one, or one under 32 pixels wide or high.
     """
     with reading(path, "a picture (PNG, JPEG, TIFF or the like)"), Image.open(path) as picture:
-        image = _rgb(ImageOps.exif_transpose(picture))
+        image = rgb(ImageOps.exif_transpose(picture))
+    check_large_enough(path, image)
+    return image
+
+
+def check_large_enough(path: str | Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
+    """Raise a FormatError where a view is under 32 pixels wide or high."""
     if min(image.shape[:2]) < SMALLEST_SIDE_PX:
         raise FormatError(
             f"{path}: expected at least {SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX} pixels, found {_size(image)}"
         )
-    return image
 
 
 def read_pair(left: str | Path, right: str | Path) -> StereoPair:
     """The pair of two pictures of one size; FormatError as in `read_image`, or where the sizes differ."""
-    left_image, right_image = read_image(left), read_image(right)
+    return pair_of(left, read_image(left), right, read_image(right))
+
+
+def pair_of(
+    left: str | Path,
+    left_image: UInt8[np.ndarray, "h w 3"],
+    right: str | Path,
+    right_image: UInt8[np.ndarray, "h2 w2 3"],
+) -> StereoPair:
+    """The pair of two pictures and their names; FormatError where one is too small, or the sizes differ."""
+    for path, image in ((left, left_image), (right, right_image)):
+        check_large_enough(path, image)
     if left_image.shape != right_image.shape:
         raise FormatError(
             f"expected left and right pictures of one size, found {left} of {_size(left_image)} "
@@ -61,17 +76,17 @@ def read_pair(left: str | Path, right: str | Path) -> StereoPair:
     return StereoPair(left=left_image, right=right_image)
 
 
-def read_side_by_side(path: str | Path) -> StereoPair:
-    """The pair in one picture, left view first; FormatError for an odd width or halves under 32 px wide."""
-    image = read_image(path)
-    half_px, odd = divmod(image.shape[1], 2)
-    if odd or half_px < SMALLEST_SIDE_PX:
-        raise FormatError(
-            f"{path}: expected two views side by side, in an even width of at least {2 * SMALLEST_SIDE_PX} "
-            f"pixels, found {_size(image)}; a pair in two files needs both, left first"
-        )
-    left, right = (np.ascontiguousarray(half) for half in np.split(image, 2, axis=1))
-    return StereoPair(left=left, right=right)
+def rgb(picture: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
+    """The pixels of an opened picture in RGB: grey is repeated, alpha dropped, 16 bits become 8."""
+    if not picture.mode.startswith(("I", "F")):
+        # A copy: Pillow lends its pixels read-only, for which Numba compiles anew and PyTorch warns.
+        return np.array(picture.convert("RGB"))
+    values = np.asarray(picture)
+    if picture.mode == "F" or values.min() < 0 or values.max() > 65535:
+        raise ValueError(f"more than 16 bits a channel or values below 0, mode {picture.mode}")
+    # The upper byte, as Pillow reduces colour pictures of 16 bits; a file of 32 bits may hold 8 of them.
+    bits = 8 if picture.mode != "I" or values.max() > 255 else 0
+    return np.repeat((values >> bits).astype(np.uint8)[..., None], 3, axis=2)
 
 
 def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"]) -> None:
@@ -122,6 +137,18 @@ def write_pfm(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
     with replacing(path) as temporary:
         header = f"Pf\n{width_px} {height_px}\n-1.0\n".encode()
         temporary.write_bytes(header + values[::-1].astype("<f4").tobytes())
+
+
+def write_float_tiff(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
+    """Writes a TIFF file of one channel, float32 and uncompressed; NaN and infinity stay what they are."""
+    with replacing(path) as temporary, held_by_its_format(path, values.shape):
+        Image.fromarray(values.astype(np.float32)).save(temporary, "TIFF")
+
+
+def write_npy(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
+    """Writes float32 as NumPy's own file; NaN and infinity stay what they are."""
+    with replacing(path) as temporary:
+        np.save(temporary, values.astype(np.float32), allow_pickle=False)
 
 
 def read_pixels(path: str | Path, *modes: str) -> Shaped[np.ndarray, "h w *channels"]:
@@ -175,28 +202,6 @@ def write_depth_png(path: str | Path, depth_m: Float[np.ndarray, "h w"]) -> None
     _save(path, np.where((depth_mm > 0) & (depth_mm <= 65535), depth_mm, 0).astype(np.uint16), "PNG")
 
 
-def read_calibration(path: str | Path) -> StereoCamera:
-    """The camera of a Middlebury calib.txt, whose baseline is in millimetres.
-
-    Source: the format of the Middlebury stereo datasets of 2014, cam0=[f 0 cx; 0 f cy; 0 0 1] and so on.
-
-    Raises:
-        FormatError: No such file, an entry is missing, or its value is nonsense.
-    """
-    return _read_calibration(path)[0]
-
-
-def calibrated(pair: StereoPair, path: str | Path) -> StereoPair:
-    """The pair with the camera of a Middlebury calib.txt, which must be made for pictures of this size."""
-    camera, size = _read_calibration(path)
-    if size != _size(pair.left):
-        raise FormatError(
-            f"{path}: expected a calibration for pictures of {_size(pair.left)}, found one for {size}; "
-            "focal length, centre and doffs grow with the picture"
-        )
-    return replace(pair, camera=camera)
-
-
 def make_folder(path: str | Path) -> Path:
     """The folder `path`, made where it is missing and tried, so that a long run does not fail at its end."""
     folder = Path(path)
@@ -227,7 +232,8 @@ def reading(path: str | Path, expected: str) -> Iterator[None]:
             yield
     except FormatError:
         raise
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+    # A RuntimeError is what Pillow's AVIF gives up with.
+    except (OSError, ValueError, SyntaxError, RuntimeError, Image.DecompressionBombError) as error:
         raise FormatError(f"{path}: expected {expected}, found {_reason(error)}") from error
 
 
@@ -291,46 +297,12 @@ def _reason(error: Exception) -> str:
     return f"one that cannot be read ({error})"
 
 
-def _rgb(picture: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
-    if not picture.mode.startswith(("I", "F")):
-        # A copy: Pillow lends its pixels read-only, for which Numba compiles anew and PyTorch warns.
-        return np.array(picture.convert("RGB"))
-    values = np.asarray(picture)
-    if picture.mode == "F" or values.min() < 0 or values.max() > 65535:
-        raise ValueError(f"more than 16 bits a channel or values below 0, mode {picture.mode}")
-    # The upper byte, as Pillow reduces colour pictures of 16 bits; a file of 32 bits may hold 8 of them.
-    bits = 8 if picture.mode != "I" or values.max() > 255 else 0
-    return np.repeat((values >> bits).astype(np.uint8)[..., None], 3, axis=2)
-
-
 def _save(
     path: str | Path, values: UInt8[np.ndarray, "h w *channels"] | UInt16[np.ndarray, "h w"], kind: str
 ) -> None:
     with replacing(path) as temporary, held_by_its_format(path, values.shape):
         # Level 3 takes a third of the time of Pillow's 6, for 5 % more bytes (a photograph of 741x500).
         Image.fromarray(values).save(temporary, kind, quality=95, compress_level=3)
-
-
-def _read_calibration(path: str | Path) -> tuple[StereoCamera, str]:
-    with reading(path, "a Middlebury calib.txt"):
-        lines = Path(path).read_text(errors="replace").splitlines()
-        entries = dict(line.split("=", 1) for line in lines if "=" in line)
-        missing = {"cam0", "doffs", "baseline", "width", "height"} - entries.keys()
-        if missing:
-            raise FormatError(
-                f"{path}: expected a Middlebury calib.txt, found no entry {', '.join(sorted(missing))}"
-            )
-        (focal_px, _, cx_px), (_, _, cy_px), _ = (
-            [float(number) for number in row.split()] for row in entries["cam0"].strip(" []").split(";")
-        )
-        camera = StereoCamera(
-            focal_px=focal_px,
-            baseline_m=float(entries["baseline"]) / 1000,
-            cx_px=cx_px,
-            cy_px=cy_px,
-            doffs_px=float(entries["doffs"]),
-        )
-        return camera, f"{int(entries['width'])}x{int(entries['height'])}"
 
 
 def _size(image: UInt8[np.ndarray, "h w 3"]) -> str:

@@ -4,7 +4,6 @@ A matcher file (docs/architecture.md) takes `left` and `right`, float32 [B, 3, H
 `disparity_px`, and, where the network can, `right_disparity_px` and `confidence_logit`.
 """
 
-import functools
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,8 +22,8 @@ from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.threads import thread_count
 
 _FLOAT32 = "tensor(float)"
-# A network compares every column of a row with every other: this many pairs of columns take about 0.4 GB.
-_PIXEL_PAIRS_AT_ONCE = 1920 * 1920 * 320
+PIXEL_PAIRS_AT_ONCE = 1920 * 1920 * 1088
+"""A network compares every column of a row with every other: this many pairs of columns take about 1.4 GB."""
 # What a strip sees beyond its own rows; about 1 % of the pixels then differ by over 1 px from the whole.
 _STRIP_OVERLAP_PX = 64
 # A nearer surface this much in front of a pixel's match hides it; less is the two views' disagreement.
@@ -59,7 +58,7 @@ class Matcher:
     def __init__(self, model: str | Path = "small", *, threads: int | None = None) -> None:
         import onnxruntime  # type: ignore[import-untyped]
 
-        self._path, self._threads = _model_file(model), threads
+        self._path, self.threads = model_file(model), threads
         options = onnxruntime.SessionOptions()
         # Not ONNX Runtime's own choice: on a virtual machine it counts two cores as one with two threads.
         options.intra_op_num_threads = thread_count(threads)
@@ -109,7 +108,7 @@ class Matcher:
             return found
         from stereoweave.refining import refine  # Numba takes half a second to import
 
-        return refine(left, right, found, self._threads)
+        return refine(left, right, found, self.threads)
 
     def _maps(self, pair: StereoPair) -> Maps:
         """The graph's outputs for a pair: in strips of rows where it is large, blended where they overlap."""
@@ -128,7 +127,7 @@ class Matcher:
         return Maps(**{name: total / weights for name, total in totals.items()})
 
     def _strip_rows(self, width: int) -> int:
-        rows = _PIXEL_PAIRS_AT_ONCE // (width * width)
+        rows = PIXEL_PAIRS_AT_ONCE // (width * width)
         return max(rows // self.multiple_of * self.multiple_of, 4 * _STRIP_OVERLAP_PX)
 
     def _run(self, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]) -> Maps:
@@ -200,39 +199,9 @@ class Matcher:
         )
 
 
-def estimate(
-    left: UInt8[np.ndarray, "h w 3"],
-    right: UInt8[np.ndarray, "h w 3"],
-    *,
-    model: str | Path = "small",
-    threads: int | None = None,
-    refined: bool = False,
-) -> Estimate:
-    """Disparity of both views, confidence and occlusion of a rectified pair.
-
-    Args:
-        left: The left photograph, uint8 RGB [H, W, 3], at least 32x32.
-        right: The right one, of the same size.
-        model: A shipped name or the path of an .onnx matcher; loaded at the first call, and kept.
-        threads: How many threads may be used; all cores if left out.
-        refined: As for `Matcher.estimate`.
-
-    Raises:
-        ValueError: MatcherError for a model that is none, StereoweaveError for images that are none.
-    """
-    path = _model_file(model).absolute()
-    return _kept_matcher(path, path.stat().st_mtime_ns, threads).estimate(left, right, refined=refined)
-
-
 def shipped_models() -> list[str]:
     """The names of the networks inside the package."""
     return sorted(Path(file.name).stem for file in _weights_folder().iterdir() if file.name.endswith(".onnx"))
-
-
-@functools.lru_cache(maxsize=4)
-def _kept_matcher(path: Path, modified_ns: int, threads: int | None) -> Matcher:
-    # modified_ns is part of the key alone: a file that was written anew is loaded anew.
-    return Matcher(path, threads=threads)
 
 
 @contextmanager
@@ -255,7 +224,8 @@ def _weights_folder() -> Path:
     return Path(str(files("stereoweave") / "weights"))
 
 
-def _model_file(model: str | Path) -> Path:
+def model_file(model: str | Path) -> Path:
+    """The file of a shipped name, or the .onnx file itself; MatcherError where there is none."""
     if str(model).endswith(".onnx"):
         path = Path(model)
         if not path.is_file():
@@ -288,6 +258,14 @@ def _strip_weights(rows: slice, height: int) -> Float[np.ndarray, "h 1"]:
     # Nothing from the outermost quarter of the overlap, where the strip's own border shows.
     inset = np.minimum(from_top, from_bottom) - _STRIP_OVERLAP_PX / 2
     return np.clip(inset / _STRIP_OVERLAP_PX, 1e-6, 1).astype(np.float32)
+
+
+def find_occluded(
+    disparity_px: Float[np.ndarray, "h w"], right_disparity_px: Float[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Left pixels whose match is outside of the right picture, or hidden there by a nearer surface."""
+    seen_px, inside = _right_disparity_at_match(disparity_px, right_disparity_px)
+    return ~inside | (seen_px - disparity_px > _OCCLUSION_STEP_PX)
 
 
 def _right_disparity_at_match(

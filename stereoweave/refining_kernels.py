@@ -81,7 +81,7 @@ def census(grey, codes):
 
 @inlined
 @typing.no_type_check
-def _bits(code):
+def bits(code):
     """How many of 32 bits are set."""
     pairs = np.uint32(code - ((code >> _ONE) & _PAIRS))
     fours = np.uint32((pairs & _FOURS) + ((pairs >> _TWO) & _FOURS))
@@ -133,7 +133,7 @@ def _along(channels, y, start, end):
 def _add_census(code, codes, costs):
     """Add how many bits of the census differ, twice."""
     for i in range(costs.shape[0]):
-        costs[i] = np.uint8(costs[i] + 2 * _bits(code ^ codes[i]))
+        costs[i] = np.uint8(costs[i] + 2 * bits(code ^ codes[i]))
 
 
 @inlined

@@ -5,7 +5,7 @@ import html
 import importlib.resources
 import json
 import string
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import cv2
@@ -58,9 +58,13 @@ class Summary:
 def summarize(
     pair: StereoPair, estimate: Estimate, *, pictures: tuple[str, ...], model: str, estimate_ms: float
 ) -> Summary:
-    """The numbers of an estimate that `model` made of `pictures` (their file names) in `estimate_ms`."""
+    """The numbers of an estimate that `model` made of `pictures` (their file names) in `estimate_ms`.
+
+    What the left picture does not show counts in none of them but the size.
+    """
     height_px, width_px = estimate.disparity_px.shape
-    low_px, median_px, high_px = np.percentile(estimate.disparity_px, [0, 50, 100])
+    seen = slice(None) if pair.left_seen is None else pair.left_seen
+    low_px, median_px, high_px = np.percentile(estimate.disparity_px[seen], [0, 50, 100])
     return Summary(
         pictures=pictures,
         model=model,
@@ -73,8 +77,8 @@ def summarize(
         depth_min_m=_depth_m(pair.camera, high_px),
         depth_median_m=_depth_m(pair.camera, median_px),
         depth_max_m=_depth_m(pair.camera, low_px),
-        occluded_percent=_rounded(100 * estimate.occluded.mean()),
-        confident_percent=_rounded(100 * (estimate.confidence >= 0.5).mean()),
+        occluded_percent=_rounded(100 * estimate.occluded[seen].mean()),
+        confident_percent=_rounded(100 * (estimate.confidence[seen] >= 0.5).mean()),
         camera=pair.camera,
     )
 
@@ -100,7 +104,8 @@ def _fields(pair: StereoPair, estimate: Estimate, summary: Summary, threads: int
     views = [
         render(small.left, small.right, small_estimate, position, threads=threads) for position in POSITIONS
     ]
-    range_px = colour_range_px(estimate.disparity_px)
+    seen = slice(None) if pair.left_seen is None else pair.left_seen
+    range_px = colour_range_px(np.atleast_2d(estimate.disparity_px[seen]))
     shown_size = (small.left.shape[1], small.left.shape[0])
     data = {
         "width_px": summary.width_px,
@@ -144,7 +149,7 @@ def _shrunk(pair: StereoPair, estimate: Estimate) -> tuple[StereoPair, Estimate]
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     scale_x = np.float32(size[0] / width)
     left, right = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (pair.left, pair.right))
-    return replace(pair, left=left, right=right), Estimate(
+    return StereoPair(left=left, right=right), Estimate(
         disparity_px=_picked(estimate.disparity_px, size) * scale_x,
         right_disparity_px=_picked(estimate.right_disparity_px, size) * scale_x,
         confidence=_picked(estimate.confidence, size),

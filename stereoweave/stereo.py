@@ -42,6 +42,14 @@ class StereoCamera:
         if not np.isfinite([self.focal_px, self.baseline_m, self.cx_px, self.cy_px, self.doffs_px]).all():
             raise StereoweaveError(f"a camera's numbers must be finite, got {self}")
 
+    @classmethod
+    def centred(
+        cls, image: UInt8[np.ndarray, "h w 3"], *, focal_px: float, baseline_m: float
+    ) -> "StereoCamera":
+        """The camera of an image [H, W, 3] of which no more is known: its axis meets the image's middle."""
+        height, width = image.shape[:2]
+        return cls(focal_px=focal_px, baseline_m=baseline_m, cx_px=(width - 1) / 2, cy_px=(height - 1) / 2)
+
     def depth_m(self, disparity_px: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
         """Depth along the optical axis in metres; infinite where disparity_px + doffs_px <= 0."""
         shifted_px = np.maximum(disparity_px + self.doffs_px, 0)

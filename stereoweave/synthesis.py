@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from stereoweave.matcher import estimate
+from stereoweave.matching import estimate
 from stereoweave.rendering import check_position, render
 from stereoweave.stereo import View
 

@@ -24,6 +24,7 @@ from stereoweave.footage_tracks import picture_files
 from stereoweave.hints import hints
 from stereoweave.layouts import LAYOUTS, Choices, check_reach, middle_px
 from stereoweave.matcher import Matcher
+from stereoweave.matching import match
 from stereoweave.progress import progress
 from stereoweave.rendering import Renderer
 from stereoweave.steady import Steadier
@@ -36,6 +37,8 @@ _SURVEYED_FRAMES, _HINTED_FRAMES = 24, 3
 # Where no survey reads the whole film, its first minute is looked at.
 _BEGINNING_S = 60
 _SURVEYED_EVERY_PX = 4
+# Single wrong pixels do not widen the range of a film, and what moves may come nearer between those frames.
+_OUTER_PERCENT, _MARGIN_PX = 0.5, 8.0
 _NAMED_PROBLEMS = 3
 _STEPS_PER_PX = 256
 
@@ -144,10 +147,17 @@ class Order:
 
 
 class Survey(NamedTuple):
-    """What was found in frames from all over the film: its range of disparities, and its middle."""
+    """What was found in frames from all over the film.
+
+    Attributes:
+        range_px: The disparities that colours are spread over.
+        middle_px: That of the middle of the scene.
+        within_px: The range that is matched; None where the network's own has all of it.
+    """
 
     range_px: tuple[float, float] = (0.0, 1.0)
     middle_px: float = 0.0
+    within_px: tuple[float, float] | None = None
 
 
 @dataclass
@@ -223,8 +233,9 @@ class _Maker:
     @classmethod
     def from_state(cls, order: Order, matcher: Matcher, state: dict[str, np.ndarray]) -> "_Maker":
         """One that goes on as the one whose `state` this was would have."""
-        low_px, high_px, middle_px = state.pop("survey_px").tolist()
-        maker = cls(order, matcher, Survey((low_px, high_px), middle_px))
+        low_px, high_px, middle_px, *within_px = state.pop("survey_px").tolist()
+        survey = Survey((low_px, high_px), middle_px, (within_px[0], within_px[1]) if within_px else None)
+        maker = cls(order, matcher, survey)
         frames, cuts, problems = state.pop("tally").tolist()
         maker.tally = Tally(frames, cuts, problems, state.pop("named").tolist())
         maker._steadier = Steadier.from_state(state, order.threads)
@@ -234,7 +245,9 @@ class _Maker:
         """All that the next frame's picture depends on."""
         tally = self.tally
         return {
-            "survey_px": np.array([*self.survey.range_px, self.survey.middle_px]),
+            "survey_px": np.array(
+                [*self.survey.range_px, self.survey.middle_px, *(self.survey.within_px or ())]
+            ),
             "tally": np.array([tally.frames, tally.cuts, tally.problems]),
             "named": np.array(tally.named, dtype=np.str_),
             **self._steadier.state(),
@@ -245,13 +258,18 @@ class _Maker:
     ) -> Iterator[tuple[Fraction, Picture]]:
         """What is shown of each frame, with its time; the bar follows."""
         for frame in frames:
-            estimate = self._matcher.estimate(frame.left, frame.right)
-            estimate = self._steadier(frame.left, frame.right, estimate)
             pair = StereoPair(left=frame.left, right=frame.right)
+            estimate = self._estimate(pair)
+            estimate = self._steadier(frame.left, frame.right, estimate)
             self.tally.note(frame)
             self.tally.cuts = self._steadier.cuts
             bar.update(shown, completed=self.tally.frames)
             yield frame.time, self._order.picture(pair, estimate, self.survey)
+
+    def _estimate(self, pair: StereoPair) -> Estimate:
+        if self.survey.within_px is None:
+            return self._matcher.estimate(pair.left, pair.right)
+        return match(self._matcher, pair, range_px=self.survey.within_px)
 
 
 def _look(footage: Footage, matcher: Matcher, bar: Progress, *, whole: bool) -> tuple[Survey, list[str]]:
@@ -263,17 +281,27 @@ def _look(footage: Footage, matcher: Matcher, bar: Progress, *, whole: bool) -> 
     thinned, middles_px, amiss = [], [], []
     frames = islice(footage.frames(), picked.start, picked.stop, picked.step)
     for index, frame in zip(picked, frames, strict=True):
-        estimate = matcher.estimate(frame.left, frame.right)
+        pair = StereoPair(left=frame.left, right=frame.right)
+        estimate = match(matcher, pair)
         thinned.append(estimate.disparity_px[::_SURVEYED_EVERY_PX, ::_SURVEYED_EVERY_PX])
         middles_px.append(middle_px(estimate))
         if index in hinted:
-            lines = hints(StereoPair(left=frame.left, right=frame.right), estimate, matcher)
-            amiss.append([f"{_clock(frame.time)} {line}" for line in lines])
+            amiss.append([f"{_clock(frame.time)} {line}" for line in hints(pair, estimate)])
         bar.advance(shown)
     told = _told(amiss, footage.arrangement)
+    all_px = np.vstack(thinned)
+    within_px = _within_px(all_px, matcher)
     if not whole:
-        return Survey(), told
-    return Survey(colour_range_px(np.vstack(thinned)), float(np.median(middles_px))), told
+        return Survey(within_px=within_px), told
+    return Survey(colour_range_px(all_px), float(np.median(middles_px)), within_px), told
+
+
+def _within_px(disparity_px: Float[np.ndarray, "h w"], matcher: Matcher) -> tuple[float, float] | None:
+    """The range of a film that goes beyond the network's own, by disparities from all over it."""
+    low_px, high_px = np.percentile(disparity_px, [_OUTER_PERCENT, 100 - _OUTER_PERCENT]).tolist()
+    if low_px >= 0 and high_px <= matcher.max_disparity_px:
+        return None
+    return low_px - _MARGIN_PX, high_px + _MARGIN_PX
 
 
 def _spread(count: int, wanted: int) -> range:
@@ -289,7 +317,7 @@ def _told(amiss: Sequence[Sequence[str]], arrangement: str | None) -> list[str]:
         return []
     other = _other_way_round(arrangement)
     return [
-        line.replace("swapped?", f"swapped? Then give --arrangement {other}.", 1) if other else line
+        line.replace("give them the other way round", f"give --arrangement {other}") if other else line
         for line in some[-1]
     ]
 

@@ -8,13 +8,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stereoweave.command_line import (
+    Format,
     Model,
     Pictures,
+    Range,
+    Rectify,
     Strength,
     Threads,
     load_matcher,
     place_for,
-    read_pictures,
+    range_of,
+    request_of,
 )
 from stereoweave.errors import StereoweaveError
 
@@ -65,7 +69,8 @@ Quilt = Annotated[
     str | None, typer.Option(metavar="COLUMNSxROWS", help="The views of a quilt. [default: 8x6]")
 ]
 Calib = Annotated[
-    Path | None, typer.Option(help="Middlebury's calib.txt, for --up and --forward in true proportion.")
+    Path | None,
+    typer.Option(help="The cameras' calibration, for --rectify, and --up and --forward in true proportion."),
 ]
 
 
@@ -79,13 +84,19 @@ def view(  # noqa: PLR0913 - each is a word of the command line
     strength: Strength = 1.0,
     convergence: Convergence = None,
     quilt: Quilt = None,
+    arrangement: Format = None,
     calib: Calib = None,
+    rectify: Rectify = False,
+    range_px: Range = None,
     model: Model = "base",
     threads: Threads = None,
 ) -> None:
     """A new view of a stereo pair, or many, as 3-D viewers and displays take them."""
     from stereoweave.hints import hints
     from stereoweave.layouts import LAYOUTS, check_reach, layout_of, marked, middle_px
+    from stereoweave.matching import match
+    from stereoweave.preparing import prepare
+    from stereoweave.rectify import cropped
     from stereoweave.rendering import Renderer, check_position
 
     name = layout_of(out, layout)
@@ -97,12 +108,13 @@ def view(  # noqa: PLR0913 - each is a word of the command line
     positions, converged = _needs(name, _MIDDLE if position is None else position)
     check_reach(positions, strength)
     plane_px = _plane_px(("auto" if converged else "0") if convergence is None else convergence)
-    pair = read_pictures(pictures, calib)
+    within_px = range_of(range_px)
+    prepared = prepare(pictures, request_of(arrangement, calib, rectify=rectify))
+    pair = cropped(prepared.pair)
     if name in LAYOUTS:
         out = marked(out, name, pair, choices)
     place_for(out)
-    matcher = load_matcher(model, threads)
-    estimate = matcher.estimate(pair.left, pair.right, refined=True)
+    estimate = match(load_matcher(model, threads), pair, range_px=within_px, refined=True)
     if plane_px is None:
         plane_px = middle_px(estimate)
     renderer = Renderer(pair, estimate, strength=strength, convergence_px=plane_px, threads=threads)
@@ -111,8 +123,8 @@ def view(  # noqa: PLR0913 - each is a word of the command line
     else:
         told = _write_layout(out, name, renderer, choices)
     typer.echo(f"{out}: {told}")
-    for hint in hints(pair, estimate, matcher):
-        typer.echo(hint)
+    for note in (*prepared.notes, *hints(pair, estimate)):
+        typer.echo(note)
 
 
 def _refuse_idle(name: str | None, of_one_view: dict[str, float | None], quilt: str | None) -> None:

@@ -54,6 +54,8 @@ def packed(left: np.ndarray, right: np.ndarray, arrangement: str = "side_by_side
             return np.hstack([shrunk(eye, width_px // 2, height_px) for eye in (left, right)])
         case "top_bottom_half":
             return np.vstack([shrunk(eye, width_px, height_px // 2) for eye in (left, right)])
+        case "crossed_half" | "top_bottom_right_first_half":
+            return packed(right, left, "side_by_side_half" if "crossed" in arrangement else "top_bottom_half")
     raise ValueError(arrangement)
 
 

@@ -126,10 +126,13 @@ def mistakes(pictures) -> Path:
         ("depth left.png half.jpg -o out", ["half.jpg", "expected a picture", "truncated"]),
         ("depth left.png narrow.png -o out", ["left.png of 96x64", "narrow.png of 80x64", "one size"]),
         ("depth tiny.png tiny.png -o out", ["tiny.png", "at least 32x32", "found 31x64"]),
-        ("depth odd.png -o out", ["odd.png", "side by side", "found 95x64"]),
+        ("depth odd.png -o out", ["odd.png", "expected a stereo picture", "--format"]),
         ("depth left.png right.png both.png -o out", ["LEFT RIGHT or SIDE_BY_SIDE", "found 3", "both.png"]),
         ("view left.png right.png both.png left.png -o out.png", ["LEFT RIGHT or SIDE_BY_SIDE", "found 4"]),
-        ("depth left.png right.png --calib half.txt -o out", ["half.txt", "expected a Middlebury calib.txt"]),
+        (
+            "depth left.png right.png --calib half.txt -o out",
+            ["half.txt", "expected a calibration of two cameras", "no entry"],
+        ),
         ("depth left.png right.png --calib none.txt -o out", ["none.txt", "no such file"]),
         ("depth left.png right.png --calib wrong.txt -o out", ["wrong.txt", "96x64", "960x64"]),
         ("depth left.png right.png -o calib.txt/out", ["calib.txt", "expected a folder", "found a file"]),
@@ -222,7 +225,15 @@ def test_pictures_of_other_kinds_work(pictures, kind):
 
 def test_depth_writes_what_the_matcher_finds(pictures):
     assert run("depth left.png right.png --calib calib.txt -o new/out") == 0
-    names = ["confidence.png", "depth.png", "disparity.pfm", "disparity.png", "preview.png", "report.html"]
+    names = [
+        "confidence.png",
+        "depth.png",
+        "disparity.pfm",
+        "disparity.png",
+        "occluded.png",
+        "preview.png",
+        "report.html",
+    ]
     assert sorted(file.name for file in Path("new/out").iterdir()) == names
     estimate = stereoweave.estimate(read_image("left.png"), read_image("right.png"))
     disparity_px = read_pfm("new/out/disparity.pfm")
@@ -259,7 +270,7 @@ def test_json_alone_is_on_stdout_and_names_the_files(pictures, capfd):
     assert (summary["disparity_min_px"], summary["disparity_max_px"], summary["depth_median_m"]) == (4, 4, 2)
     assert summary["camera"]["baseline_m"] == 0.08
     assert all(Path(file).is_file() for file in summary["files"].values())
-    assert len(summary["files"]) == 6
+    assert len(summary["files"]) == 7
     assert summary["notes"] == []
 
 

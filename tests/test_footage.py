@@ -87,7 +87,7 @@ def test_an_arrangement_that_nobody_names_is_seen(tmp_path, arrangement):
     ("name", "width", "height", "arrangement"),
     [
         ("film_RL.mkv", 1280, 480, "crossed"),
-        ("film_RL.mkv", 640, 480, "crossed"),
+        ("film_RL.mkv", 640, 480, "crossed_half"),
         ("my-film.sbs.mkv", 1280, 480, "side_by_side"),
         ("my-film.sbs.mkv", 640, 480, "side_by_side_half"),
         ("film [half-SBS].mkv", 1280, 480, "side_by_side_half"),

@@ -8,7 +8,7 @@ from PIL import Image
 
 from stereoweave import io
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.stereo import StereoCamera, StereoPair
+from stereoweave.stereo import StereoPair
 
 CALIBRATION = """\
 cam0=[994.978 0 311.193; 0 994.978 254.877; 0 0 1]
@@ -219,20 +219,6 @@ def test_pictures_of_two_sizes_are_both_named_with_their_sizes(tmp_path, picture
     assert f"{left} of 48x40 and {right} of 47x40" in raises(io.read_pair, left, right)
 
 
-def test_a_side_by_side_picture_is_cut_in_the_middle(tmp_path, picture):
-    io.write_image(tmp_path / "both.png", np.hstack([picture, picture[::-1]]))
-    pair = io.read_side_by_side(tmp_path / "both.png")
-    np.testing.assert_array_equal(pair.left, picture)
-    np.testing.assert_array_equal(pair.right, picture[::-1])
-
-
-@pytest.mark.parametrize("width_px", [62, 97])
-def test_a_side_by_side_picture_needs_two_halves_of_32_pixels(tmp_path, width_px):
-    io.write_image(tmp_path / "both.png", np.zeros((40, width_px, 3), np.uint8))
-    message = raises(io.read_side_by_side, tmp_path / "both.png")
-    assert f"at least 64 pixels, found {width_px}x40" in message
-
-
 # PFM
 
 
@@ -362,51 +348,6 @@ def test_numbers_in_a_picture_of_another_kind_are_refused(tmp_path, picture):
     io.write_image(tmp_path / "colour.png", picture)
     assert "mode L or 1, found PNG of mode RGB" in raises(io.read_pixels, tmp_path / "colour.png", "L", "1")
     raises(io.read_pixels, tmp_path / "nowhere.png", "L")
-
-
-# Calibration
-
-
-def test_a_calibration_is_read_with_its_baseline_in_metres(tmp_path):
-    (tmp_path / "calib.txt").write_text(CALIBRATION)
-    assert io.read_calibration(tmp_path / "calib.txt") == StereoCamera(
-        focal_px=994.978, baseline_m=0.193001, cx_px=311.193, cy_px=254.877, doffs_px=31.086
-    )
-
-
-def test_a_pair_gets_the_camera_of_a_calibration_for_its_size(tmp_path):
-    (tmp_path / "calib.txt").write_text(CALIBRATION)
-    camera = io.calibrated(pair_of(741, 497), tmp_path / "calib.txt").camera
-    assert camera == io.read_calibration(tmp_path / "calib.txt")
-
-
-def test_a_calibration_for_another_size_is_refused(tmp_path):
-    path = tmp_path / "calib.txt"
-    path.write_text(CALIBRATION)
-    with pytest.raises(FormatError, match="for pictures of 370x248, found one for 741x497") as caught:
-        io.calibrated(pair_of(370, 248), path)
-    assert str(path) in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "found"),
-    [
-        ("cam0", "camera", "no entry cam0"),
-        ("baseline=193.001\nwidth=741\n", "", "no entry baseline, width"),
-        ("31.086", "thirty", "thirty"),
-        ("baseline=193.001", "baseline=0", "must be positive"),
-        ("=[994.978 0", "=[-994.978 0", "must be positive"),
-        ("; 0 994.978 254.877; 0 0 1]", "]", "expected 3"),
-    ],
-)
-def test_a_calibration_without_sense_is_refused(tmp_path, old, new, found):
-    (tmp_path / "calib.txt").write_text(CALIBRATION.replace(old, new))
-    assert found in raises(io.read_calibration, tmp_path / "calib.txt")
-
-
-def test_a_picture_is_no_calibration(tmp_path, picture):
-    io.write_image(tmp_path / "left.png", picture)
-    assert "no entry baseline, cam0, doffs" in raises(io.read_calibration, tmp_path / "left.png")
 
 
 # Writing whole files

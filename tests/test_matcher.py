@@ -1,49 +1,11 @@
-import os
-from pathlib import Path
-
 import numpy as np
-import onnx
 import pytest
-from onnx import TensorProto, helper
+from matcher_examples import PROPERTIES, matcher_file, painted, red_of
+from onnx import helper
 
 import stereoweave as sw
 from stereoweave import matcher
 from stereoweave.matcher import Matcher
-
-IMAGE = ["b", 3, "h", "w"]
-MAP = ["b", 1, "h", "w"]
-PROPERTIES = {"name": "by_hand", "multiple_of": 16, "max_disparity_px": 255}
-
-
-def matcher_file(path: Path, nodes, outputs, properties=PROPERTIES, inputs=("left", "right")) -> Path:
-    """A matcher file whose graph is written by hand; the constants below are there to use."""
-    graph = helper.make_graph(
-        nodes,
-        "by_hand",
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, IMAGE) for name in inputs],
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, MAP) for name in outputs],
-        [
-            helper.make_tensor("red", TensorProto.INT64, [1], [0]),
-            helper.make_tensor("last", TensorProto.INT64, [1], [-1]),
-            helper.make_tensor("scale", TensorProto.FLOAT, [1], [255.0]),
-        ],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=10)
-    helper.set_model_props(model, {f"stereoweave.{key}": str(value) for key, value in properties.items()})
-    onnx.save(model, path)
-    return path
-
-
-def red_of(image: str, output: str):
-    """Nodes that give the red channel of an image in 0..255: a disparity that the test paints."""
-    return [
-        helper.make_node("Gather", [image, "red"], [f"{output}_red"], axis=1),
-        helper.make_node("Mul", [f"{output}_red", "scale"], [output]),
-    ]
-
-
-def painted(disparity_px) -> np.ndarray:
-    return np.repeat(np.asarray(disparity_px, np.uint8)[:, :, None], 3, axis=2)
 
 
 @pytest.fixture
@@ -154,7 +116,7 @@ def test_strips_put_together_are_the_whole(tmp_path, rng, monkeypatch):
     means = Matcher(matcher_file(tmp_path / "means.onnx", nodes, ["disparity_px"], unpadded))
     left, right = (painted(rng.integers(0, 255, (700, 64))) for _ in range(2))
     whole = means.estimate(left, right)
-    monkeypatch.setattr(matcher, "_PIXEL_PAIRS_AT_ONCE", 64 * 64 * 256)
+    monkeypatch.setattr(matcher, "PIXEL_PAIRS_AT_ONCE", 64 * 64 * 256)
     assert len(list(matcher._strips(700, means._strip_rows(64)))) > 3
     in_strips = means.estimate(left, right)
     np.testing.assert_allclose(in_strips.disparity_px, whole.disparity_px, atol=1e-3)
@@ -172,36 +134,6 @@ def test_strips_cover_every_row_and_leave_no_row_without_weight(height, rows):
 
 def test_the_number_of_threads_is_honoured():
     assert Matcher("small", threads=1)._session.get_session_options().intra_op_num_threads == 1
-
-
-def test_a_model_is_loaded_once_and_kept(rng):
-    matcher._kept_matcher.cache_clear()
-    left, right = rng.integers(0, 256, (2, 32, 32, 3), np.uint8)
-    for _ in range(3):
-        sw.estimate(left, right)
-    assert matcher._kept_matcher.cache_info().misses == 1
-
-
-def test_a_file_that_was_written_anew_is_loaded_anew_whatever_its_path_is_relative_to(
-    tmp_path, rng, monkeypatch
-):
-    left, right = (painted(rng.integers(0, 255, (32, 48))) for _ in range(2))
-    found = []
-    for turn, (folder, image) in enumerate([("a", "left"), ("a", "right"), ("b", "left")]):
-        (tmp_path / folder).mkdir(exist_ok=True)
-        monkeypatch.chdir(tmp_path / folder)
-        file = matcher_file(Path("matcher.onnx"), red_of(image, "disparity_px"), ["disparity_px"])
-        os.utime(file, ns=(turn, turn))
-        found.append(sw.estimate(left, right, model="matcher.onnx").disparity_px)
-    for disparity_px, image in zip(found, (left, right, left), strict=True):
-        np.testing.assert_allclose(disparity_px, image[:, :, 0], atol=1e-4)
-
-
-def test_the_answer_does_not_depend_on_earlier_calls_of_other_sizes(rng):
-    left, right = rng.integers(0, 256, (2, 64, 80, 3), np.uint8)
-    first = sw.estimate(left, right)
-    sw.estimate(left[:40, :70], right[:40, :70])
-    np.testing.assert_array_equal(sw.estimate(left, right).disparity_px, first.disparity_px)
 
 
 def test_an_unknown_name_lists_the_shipped_ones():

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from stereoweave import io
+from stereoweave.calibration import read_rig
 from stereoweave.data.readers import read_scenes
 from stereoweave.errors import FormatError, StereoweaveError
 
@@ -39,7 +40,7 @@ def test_a_calibration_beside_the_pictures_gives_the_camera(scene):
     io.write_pfm(scene / "disparity.pfm", np.ones((32, 40)))
     (scene / "calib.txt").write_text(CALIBRATION)
     (read,) = read_scenes(scene.parent)
-    assert read.pair.camera == io.read_calibration(scene / "calib.txt")
+    assert read.pair.camera == read_rig(scene / "calib.txt").camera()
 
 
 def test_scenes_come_by_name_and_other_folders_are_passed_over(scene):

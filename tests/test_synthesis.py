@@ -4,7 +4,7 @@ import pytest
 import stereoweave as sw
 from stereoweave.errors import MatcherError
 from stereoweave.io import read_image
-from stereoweave.matcher import estimate
+from stereoweave.matching import estimate
 from stereoweave.metrics import psnr_db
 from stereoweave.rendering import render
 from stereoweave.synthesis import synthesize

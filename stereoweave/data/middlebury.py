@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
+from stereoweave.calibration import calibrated
 from stereoweave.data.frames import Frame, scenes
 from stereoweave.data.samples import make_sample, of_its_size
 from stereoweave.errors import FormatError
-from stereoweave.io import calibrated, read_pair, read_pfm, read_pixels, reading
+from stereoweave.io import read_pair, read_pfm, read_pixels, reading
 from stereoweave.stereo import Sample, StereoCamera, StereoPair
 
 

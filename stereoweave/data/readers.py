@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
+from stereoweave.calibration import calibrated
 from stereoweave.data import eth3d, kitti, middlebury, paper_layout, scene_flow, shards, sintel
 from stereoweave.data.frames import Frame, existing
 from stereoweave.data.splits import split_frames
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io import calibrated, read_disparity_png, read_pair, read_pfm
+from stereoweave.io import read_disparity_png, read_pair, read_pfm
 from stereoweave.stereo import StereoPair
 
 __all__ = ["DATASETS", "Frame", "Scene", "open_dataset", "read_scenes", "split_frames"]

@@ -1,0 +1,27 @@
+"""Depth in metres of a rectified pair: prints what is in the middle, and writes depth.png and disparity.png.
+
+Run: python examples/depth_of_a_pair.py
+"""
+
+from pathlib import Path
+
+from PIL import Image
+
+import stereoweave as sw
+from stereoweave.calibration import read_rig
+from stereoweave.colour import colour_disparity, colour_range_px
+from stereoweave.io import write_depth_png, write_image
+
+HERE = Path(__file__).parent
+
+estimate = sw.estimate(Image.open(HERE / "left.png"), Image.open(HERE / "right.png"))
+camera = read_rig(HERE / "calib.txt").camera()
+depth_m = camera.depth_m(estimate.disparity_px)
+
+height, width = depth_m.shape
+print(f"in the middle: {depth_m[height // 2, width // 2]:.2f} m")
+print(f"sure of {100 * (estimate.confidence > 0.5).mean():.0f} % of the pixels")
+
+write_depth_png("depth.png", depth_m)  # 16 bits, millimetres
+disparity_px = estimate.disparity_px
+write_image("disparity.png", colour_disparity(disparity_px, colour_range_px(disparity_px)))

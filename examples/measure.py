@@ -1,0 +1,28 @@
+"""The distance between what two pixels show, in metres, with its uncertainty.
+
+Run: python examples/measure.py
+or, with column and row of two pixels: python examples/measure.py 80 400 560 400
+"""
+
+import sys
+from pathlib import Path
+
+import stereoweave as sw
+from stereoweave.calibration import calibrated
+from stereoweave.io import read_pair
+from stereoweave.measuring import CameraError, distance
+
+HERE = Path(__file__).parent
+
+column, row, other_column, other_row = map(int, sys.argv[1:] or (80, 440, 560, 440))
+pair = calibrated(read_pair(HERE / "left.png", HERE / "right.png"), HERE / "calib.txt")
+assert pair.camera is not None
+found = distance(
+    sw.estimate(pair.left, pair.right),
+    pair.camera,
+    (column, row),
+    (other_column, other_row),
+    # A baseline that was measured to half a percent.
+    camera_error=CameraError(baseline=0.005),
+)
+print(f"from ({column}, {row}) to ({other_column}, {other_row}): {found}")

@@ -1,0 +1,23 @@
+"""Coloured points and a surface in metres: writes points.ply and surface.glb; needs the extra 'mesh'.
+
+Run: python examples/point_cloud.py
+"""
+
+from pathlib import Path
+
+import stereoweave as sw
+from stereoweave.calibration import calibrated
+from stereoweave.clouds import point_cloud, surface, write_glb, write_ply
+from stereoweave.io import read_pair
+
+HERE = Path(__file__).parent
+
+pair = calibrated(read_pair(HERE / "left.png", HERE / "right.png"), HERE / "calib.txt")
+estimate = sw.estimate(pair.left, pair.right)
+
+# Pixels of doubtful depth, and those that would fly between two surfaces, give no point.
+cloud = point_cloud(pair, estimate, least_confidence=0.7)
+near_m, far_m = cloud.points_m[:, 2].min(), cloud.points_m[:, 2].max()
+print(f"{len(cloud.points_m)} points, {near_m:.2f} to {far_m:.2f} m away")
+write_ply("points.ply", cloud)
+write_glb("surface.glb", surface(pair, estimate))

@@ -1,0 +1,205 @@
+"""A pair of any size, with disparities in any range, becomes an Estimate: what `stereoweave.estimate` does.
+
+A network compares disparities of 0 to so many px, in a picture of so many pixels. What lies elsewhere is
+brought there: the right picture is moved along the rows, or both are made smaller. A disparity found in
+smaller pictures is brought to the full size by `enlarging`.
+"""
+
+import functools
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from stereoweave.arrays import as_rgb
+from stereoweave.enlarging import enlarge
+from stereoweave.errors import StereoweaveError
+from stereoweave.io import SMALLEST_SIDE_PX
+from stereoweave.matcher import PIXEL_PAIRS_AT_ONCE, Matcher, find_occluded, model_file
+from stereoweave.ranging import find_range, goes_beyond
+from stereoweave.stereo import Estimate, StereoPair
+
+_CONFIDENT = 0.5
+# A range is looked for unless all of the picture but so much is certain.
+_DOUBTFUL_PERCENT = 1.0
+# A network is less exact near the ends of its range.
+_MARGIN_PX = 4
+
+
+def estimate(  # noqa: PLR0913 - each has a name, and all but the pictures can be left out
+    left: object,
+    right: object,
+    *,
+    model: str | Path = "small",
+    threads: int | None = None,
+    refined: bool = False,
+    range_px: tuple[float, float] | None = None,
+) -> Estimate:
+    """Disparity of both views, confidence and occlusion of a rectified pair.
+
+    Args:
+        left: The left photograph, at least 32x32: uint8 RGB [H, W, 3], or what else `arrays.as_rgb` takes,
+            such as a PIL image or a PyTorch tensor.
+        right: The right one, of the same size.
+        model: A shipped name or the path of an .onnx matcher; loaded at the first call, and kept.
+        threads: How many threads may be used; all cores if left out.
+        refined: As for `match`.
+        range_px: As for `match`.
+
+    Raises:
+        ValueError: MatcherError for a model that is none, StereoweaveError for images that are none.
+    """
+    pair = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
+    path = model_file(model).absolute()
+    matcher = _kept_matcher(path, path.stat().st_mtime_ns, threads)
+    return match(matcher, pair, range_px=range_px, refined=refined)
+
+
+def match(
+    matcher: Matcher,
+    pair: StereoPair,
+    *,
+    range_px: tuple[float, float] | None = None,
+    refined: bool = False,
+) -> Estimate:
+    """What a matcher finds in a pair of any size; the same as `matcher.estimate` where that sees all of it.
+
+    Args:
+        matcher: The network.
+        pair: The photographs, rectified. Where the left one shows nothing the confidence is 0, and what has
+            its match where the right one shows nothing is occluded.
+        range_px: The least and the greatest disparity of the left view in px. If left out, it is looked for
+            where the network, within its own range, is not certain of nearly all.
+        refined: Whether the estimate is brought to fit the photographs (`refining.refine`) at the size that
+            the network sees.
+
+    Raises:
+        StereoweaveError: For a range that is none, or pictures under 32 px in a direction.
+    """
+    seen = _reduced(pair, _scale_seen_at_once(pair))
+    scale = pair.left.shape[1] / seen.left.shape[1]
+    if range_px is not None:
+        low_px, high_px = _checked(range_px)
+        small, found = _matched_within(matcher, pair, seen, (low_px / scale, high_px / scale))
+    else:
+        small, found = seen, matcher.estimate(seen.left, seen.right)
+        beyond_px = _range_beyond(seen, found, matcher.max_disparity_px)
+        if beyond_px is not None:
+            small, found = _matched_within(matcher, pair, seen, beyond_px)
+    if refined:
+        from stereoweave.refining import refine  # Numba takes half a second to import
+
+        found = refine(small.left, small.right, found, matcher.threads)
+    if small.left.shape != pair.left.shape:
+        found = enlarge(pair.left, pair.right, found, matcher.threads)
+    return _as_seen(found, pair)
+
+
+@functools.lru_cache(maxsize=4)
+def _kept_matcher(path: Path, modified_ns: int, threads: int | None) -> Matcher:
+    # modified_ns is part of the key alone: a file that was written anew is loaded anew.
+    return Matcher(path, threads=threads)
+
+
+def _checked(range_px: tuple[float, float]) -> tuple[float, float]:
+    low_px, high_px = range_px
+    if not (math.isfinite(low_px) and math.isfinite(high_px) and low_px < high_px):
+        raise StereoweaveError(
+            f"range_px: expected the least and the greatest disparity in px, got {low_px:g} and {high_px:g}; "
+            "leave it out to have it found"
+        )
+    return low_px, high_px
+
+
+def _scale_seen_at_once(pair: StereoPair) -> float:
+    """How many times smaller a picture has to be for the network to see it as a whole; at least 1."""
+    height, width = pair.left.shape[:2]
+    return max((width * width * height / PIXEL_PAIRS_AT_ONCE) ** (1 / 3), 1.0)
+
+
+def _reduced(pair: StereoPair, scale: float) -> StereoPair:
+    """The photographs so many times smaller, or the pair itself where that is as large."""
+    height, width = pair.left.shape[:2]
+    size = max(round(width / scale), SMALLEST_SIDE_PX), max(round(height / scale), SMALLEST_SIDE_PX)
+    if size[0] >= width or size[1] >= height:
+        return pair
+    left, right = (cv2.resize(photo, size, interpolation=cv2.INTER_AREA) for photo in (pair.left, pair.right))
+    return StereoPair(left=left, right=right)
+
+
+def _range_beyond(pair: StereoPair, found: Estimate, max_disparity_px: float) -> tuple[float, float] | None:
+    """The range of a pair where it goes beyond the network's, within which the estimate was found."""
+    at_end = (found.disparity_px > max_disparity_px - _MARGIN_PX) | (found.disparity_px <= 0)
+    doubtful = ((found.confidence < _CONFIDENT) & ~found.occluded) | at_end
+    # Only what is of some size: a network is unsure of every edge.
+    small = cv2.resize(doubtful.astype(np.float32), None, fx=1 / 8, fy=1 / 8, interpolation=cv2.INTER_AREA)
+    doubtful = cv2.resize(small, doubtful.shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5
+    if 100 * doubtful.mean() < _DOUBTFUL_PERCENT:
+        return None
+    if not goes_beyond(pair.left, pair.right, doubtful, (0, max_disparity_px)):
+        return None
+    return find_range(pair.left, pair.right)
+
+
+def _matched_within(
+    matcher: Matcher, pair: StereoPair, seen: StereoPair, range_px: tuple[float, float]
+) -> tuple[StereoPair, Estimate]:
+    """A smaller pair, if need be, in which the range fits into the network's, and the estimate of it.
+
+    `seen` is what the network can see at once of the pair, and the range is in its pixels.
+    """
+    low_px, high_px = range_px
+    most_px = matcher.max_disparity_px
+    if low_px >= 0 and high_px <= most_px:
+        return seen, matcher.estimate(seen.left, seen.right)
+    scale = max((high_px - low_px) / (most_px - 2 * _MARGIN_PX), 1.0)
+    small = seen
+    if scale > 1:
+        small = _reduced(pair, scale * pair.left.shape[1] / seen.left.shape[1])
+    ratio = small.left.shape[1] / seen.left.shape[1]
+    return small, _moved(matcher, small, math.floor(low_px * ratio) - _MARGIN_PX)
+
+
+def _moved(matcher: Matcher, pair: StereoPair, least_px: int) -> Estimate:
+    """The estimate of a pair whose least disparity is least_px, matched with the right picture moved."""
+    width = pair.left.shape[1]
+    more = abs(least_px)
+    left_at, right_at = (more, 0) if least_px < 0 else (0, more)
+    found = matcher.estimate(
+        _widened(pair.left, left_at, more - left_at), _widened(pair.right, right_at, more - right_at)
+    )
+    left, right = (np.s_[:, at : at + width] for at in (left_at, right_at))
+    disparity_px = np.ascontiguousarray(found.disparity_px[left]) + np.float32(least_px)
+    right_disparity_px = np.ascontiguousarray(found.right_disparity_px[right]) + np.float32(least_px)
+    return Estimate(
+        disparity_px=disparity_px,
+        right_disparity_px=right_disparity_px,
+        confidence=np.ascontiguousarray(found.confidence[left]),
+        occluded=find_occluded(disparity_px, right_disparity_px),
+    )
+
+
+def _widened(photo: np.ndarray, before: int, behind: int) -> np.ndarray:
+    return cv2.copyMakeBorder(photo, 0, 0, before, behind, cv2.BORDER_REPLICATE)
+
+
+def _as_seen(found: Estimate, pair: StereoPair) -> Estimate:
+    """The estimate with what the pair's masks say."""
+    confidence, occluded = found.confidence, found.occluded
+    if pair.left_seen is not None:
+        confidence = np.where(pair.left_seen, confidence, np.float32(0))
+    if pair.right_seen is not None:
+        occluded = occluded | ~_at_match(pair.right_seen, found.disparity_px)
+    return replace(found, confidence=confidence, occluded=occluded)
+
+
+def _at_match(
+    seen: Bool[np.ndarray, "h w"], disparity_px: Float[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Whether the right picture shows something where each left pixel has its match."""
+    height, width = seen.shape
+    columns = np.clip(np.rint(np.arange(width) - disparity_px), 0, width - 1).astype(np.int32)
+    return np.take_along_axis(seen, columns, axis=1)

@@ -1,0 +1,102 @@
+"""The commands about how the cameras stand: stereoweave check | rectify | calibrate."""
+
+import json
+import re
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stereoweave.command_line import AsJson, Calib, Format, Pictures, place_for
+from stereoweave.errors import StereoweaveError
+
+
+def check(pictures: Pictures, arrangement: Format = None, as_json: AsJson = False) -> None:
+    """What is amiss with a pair and what to do: rows, sides, range of disparities, exposure.
+
+    Exit code 1 where something is.
+    """
+    from stereoweave.alignment import check_pair
+    from stereoweave.pictures import open_pictures
+
+    opened = open_pictures(pictures, arrangement)
+    found = check_pair(opened.pair.left, opened.pair.right)
+    if as_json:
+        typer.echo(json.dumps(asdict(found) | {"notes": [*opened.notes, *found.lines()]}, indent=2))
+    else:
+        typer.echo("\n".join([*opened.notes, *found.lines()]))
+    if found.defects:
+        raise typer.Exit(1)
+
+
+def rectify(
+    pictures: Pictures,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="The folder to write left.png, right.png and calib.yml into.")
+    ],
+    arrangement: Format = None,
+    calib: Calib = None,
+) -> None:
+    """Bring the rows of a pair to match: by a calibration, or without one by what both pictures show.
+
+    The pictures are cut to what both show. With a calibration calib.yml is the new one, of the results.
+    """
+    from stereoweave.calibration import Rig, size_of, words, write_rig
+    from stereoweave.io import write_image
+    from stereoweave.preparing import Request, prepare
+    from stereoweave.rectify import cropped
+
+    prepared = prepare(pictures, Request(arrangement=arrangement, calibration=calib, rectify=True))
+    pair = cropped(prepared.pair)
+    place_for(out / "left.png", out / "right.png", out / "calib.yml")
+    write_image(out / "left.png", pair.left)
+    write_image(out / "right.png", pair.right)
+    if pair.camera:
+        write_rig(out / "calib.yml", Rig.of_rectified(pair.camera, size_of(pair)))
+    else:
+        (out / "calib.yml").unlink(missing_ok=True)
+    typer.echo("\n".join([f"{out}: left.png and right.png, {words(size_of(pair))} px", *prepared.notes]))
+
+
+def calibrate(  # noqa: PLR0913 - each is a word of the command line
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            help="Pictures of a board, at least 5 pairs: in folders left and right, or left_01, right_01."
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The calibration to write, in OpenCV's YAML.")],
+    board: Annotated[
+        str,
+        typer.Option(
+            metavar="COLUMNSxROWS",
+            help="Inner corners of the chessboard, such as 9x6; of a ChArUco board its squares.",
+        ),
+    ],
+    square_mm: Annotated[float, typer.Option(help="The side of a square; measure it on the print.")],
+    charuco: Annotated[
+        str | None, typer.Option(metavar="DICT", help="The markers of a ChArUco board: DICT_5X5_100.")
+    ] = None,
+    marker_mm: Annotated[float | None, typer.Option(help="The side of a ChArUco board's marker.")] = None,
+    fisheye: Annotated[bool, typer.Option("--fisheye", help="The lenses are fisheyes.")] = False,
+) -> None:
+    """How two cameras see and stand, from pictures of a board; how well it is known, in plain words."""
+    from stereoweave.boards import Board
+    from stereoweave.boards import calibrate as calibrate_by
+    from stereoweave.calibration import write_rig
+
+    match = re.fullmatch(r"(\d+)x(\d+)", board)
+    if match is None:
+        raise StereoweaveError(f"--board: expected columns and rows, such as 9x6, found {board!r}")
+    expected = Board(
+        columns=int(match[1]),
+        rows=int(match[2]),
+        square_m=square_mm / 1000,
+        marker_m=None if marker_mm is None else marker_mm / 1000,
+        dictionary=charuco,
+    )
+    place_for(out)
+    found = calibrate_by(folder, expected, fisheye=fisheye)
+    write_rig(out, found.rig)
+    typer.echo("\n".join([f"{out}: the calibration of {found.rig.name}", *found.lines()]))

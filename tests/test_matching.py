@@ -1,0 +1,192 @@
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from matcher_examples import matcher_file, painted, red_of
+from PIL import Image
+
+import stereoweave as sw
+from stereoweave import matching
+from stereoweave.errors import StereoweaveError
+from stereoweave.io import read_pair
+from stereoweave.matcher import Matcher
+from stereoweave.matching import match
+
+FIELDS = ("disparity_px", "right_disparity_px", "confidence", "occluded")
+
+
+@pytest.fixture(scope="module")
+def matcher():
+    return Matcher("small")
+
+
+@pytest.fixture(scope="module")
+def examples():
+    return read_pair("examples/left.png", "examples/right.png")
+
+
+def same(one, other):
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def moved(pair, by_px):
+    """The pair with by_px columns less and disparities by_px lower."""
+    return sw.StereoPair(
+        left=np.ascontiguousarray(pair.left[:, by_px:]), right=np.ascontiguousarray(pair.right[:, :-by_px])
+    )
+
+
+def sure(estimate, confidence=0.9):
+    return (estimate.confidence > confidence) & ~estimate.occluded
+
+
+@pytest.mark.parametrize("refined", [False, True])
+def test_a_pair_that_the_network_sees_all_of_is_what_the_matcher_estimates(matcher, examples, refined):
+    found = sw.estimate(examples.left, examples.right, refined=refined)
+    same(found, matcher.estimate(examples.left, examples.right, refined=refined))
+
+
+def test_a_pair_of_pillow_is_what_its_pixels_are(examples):
+    pictures = (Image.fromarray(photo) for photo in (examples.left, examples.right))
+    same(sw.estimate(*pictures), sw.estimate(examples.left, examples.right))
+
+
+@pytest.mark.parametrize("by_px", [60, 100])
+def test_a_pair_with_columns_cut_off_has_so_much_less_disparity_negative_ones_too(matcher, examples, by_px):
+    whole = matcher.estimate(examples.left, examples.right)
+    found = match(matcher, moved(examples, by_px))
+    clear = sure(whole)[:, by_px:] & sure(found)
+    assert clear.mean() > 0.3
+    off_px = found.disparity_px - (whole.disparity_px[:, by_px:] - by_px)
+    assert found.disparity_px[clear].min() < -5
+    assert np.mean(np.abs(off_px[clear]) > 1) < 0.03
+    assert abs(np.median(off_px[clear])) < 0.1
+
+
+def test_what_is_given_as_the_range_counts_and_not_what_is_found(matcher, examples):
+    pair = moved(examples, 100)
+    same(match(matcher, pair, range_px=(0, 150)), matcher.estimate(pair.left, pair.right))
+    found = match(matcher, examples, range_px=(-20, 120))
+    whole = matcher.estimate(examples.left, examples.right)
+    clear = sure(whole) & sure(found)
+    assert np.mean(np.abs(found.disparity_px - whole.disparity_px)[clear] > 1) < 0.03
+
+
+def test_a_picture_twice_as_large_has_twice_the_disparity_even_if_it_is_matched_smaller(matcher, examples):
+    twice = sw.StereoPair(
+        left=cv2.resize(examples.left, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC),
+        right=cv2.resize(examples.right, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC),
+    )
+    whole = matcher.estimate(examples.left, examples.right)
+    found = match(matcher, twice, range_px=(0, 440))
+    expected_px = 2 * cv2.resize(whole.disparity_px, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
+    clear = cv2.resize(sure(whole).astype(np.uint8), None, fx=2, fy=2) > 0
+    off_px = (found.disparity_px - expected_px)[clear & sure(found)]
+    assert np.mean(np.abs(off_px) > 2) < 0.03
+    assert abs(np.median(off_px)) < 0.2
+
+
+def flat(rng, disparity_px, size=(160, 480)):
+    """A pair of soft noise that is everywhere at one disparity."""
+    height, width = size
+    wide = cv2.GaussianBlur(rng.integers(0, 256, (height, width + disparity_px, 3), np.uint8), (0, 0), 3)
+    wide = cv2.normalize(wide, None, 0, 255, cv2.NORM_MINMAX)
+    return sw.StereoPair(
+        left=np.ascontiguousarray(wide[:, :width]), right=np.ascontiguousarray(wide[:, disparity_px:])
+    )
+
+
+@pytest.mark.parametrize("range_px", [(0, 300), (0, 500), (-200, 200), (None)])
+def test_a_disparity_of_37_px_is_37_px_however_much_the_pair_is_reduced(matcher, rng, range_px):
+    found = match(matcher, flat(rng, 37), range_px=range_px)
+    inner = np.s_[10:-10, 60:-60]
+    assert abs(np.median(found.disparity_px[inner]) - 37) < 0.3
+    assert abs(np.median(found.right_disparity_px[inner]) - 37) < 0.3
+    assert np.mean(np.abs(found.disparity_px[inner] - 37) > 1) < 0.02
+
+
+def test_a_part_that_is_nearer_than_the_networks_range_is_found(matcher, rng):
+    pair = flat(rng, 37, size=(320, 720))
+    board = flat(rng, 0, size=(160, 200)).left
+    pair.left[80:240, 450:650] = pair.right[80:240, 450 - 260 : 650 - 260] = board
+    found_px = match(matcher, pair).disparity_px
+    assert abs(np.median(found_px[90:230, 460:640]) - 260) < 1
+    assert abs(np.median(found_px[:60, 200:600]) - 37) < 1
+
+
+def test_a_pair_larger_than_what_is_seen_at_once_is_matched_smaller(matcher, rng, monkeypatch):
+    pair = flat(rng, 37)
+    monkeypatch.setattr(matching, "PIXEL_PAIRS_AT_ONCE", 200 * 200 * 80)
+    height, width = matching._reduced(pair, matching._scale_seen_at_once(pair)).left.shape[:2]
+    assert 190 * 190 * 76 < width * width * height < 210 * 210 * 84
+    found_px = match(matcher, pair).disparity_px
+    assert abs(np.median(found_px[10:-10, 60:-60]) - 37) < 0.3
+
+
+def test_what_the_pictures_do_not_show_has_no_confidence_and_matches_in_it_are_occluded(matcher, rng):
+    pair = flat(rng, 37)
+    left_seen, right_seen = np.ones((2, *pair.left.shape[:2]), bool)
+    left_seen[:, :100] = False
+    right_seen[:, 300:320] = False
+    found = match(matcher, replace(pair, left_seen=left_seen, right_seen=right_seen))
+    assert (found.confidence[:, :100] == 0).all()
+    assert np.median(found.confidence[:, 120:]) > 0.9
+    assert found.occluded[20:-20, 338:356].mean() > 0.98
+    assert found.occluded[20:-20, 120:330].mean() < 0.02
+
+
+def test_matches_beyond_the_right_picture_are_occluded_whatever_the_range(matcher, rng):
+    pair = flat(rng, 37)
+    found = match(matcher, sw.StereoPair(left=pair.right, right=pair.left))
+    assert abs(np.median(found.disparity_px[:, 60:-60]) + 37) < 0.3
+    assert found.occluded[20:-20, -35:].mean() > 0.9
+    assert found.occluded[20:-20, 40:-40].mean() < 0.02
+
+
+@pytest.mark.parametrize("range_px", [(10, 10), (50, 0), (0, float("nan")), (float("-inf"), 10)])
+def test_a_range_that_is_none_is_refused_in_one_line(matcher, examples, range_px):
+    with pytest.raises(StereoweaveError, match="range_px: expected the least and the greatest") as caught:
+        match(matcher, examples, range_px=range_px)
+    assert "\n" not in str(caught.value)
+
+
+def test_plain_pictures_and_pictures_that_are_no_pair_are_matched_all_the_same(matcher, rng):
+    plain = np.full((64, 96, 3), 90, np.uint8)
+    assert (match(matcher, sw.StereoPair(left=plain, right=plain)).confidence == 0).all()
+    noise = rng.integers(0, 256, (2, 64, 96, 3), np.uint8)
+    pair = sw.StereoPair(left=noise[0], right=noise[1])
+    same(match(matcher, pair), matcher.estimate(*noise))
+
+
+def test_a_model_is_loaded_once_and_kept(rng):
+    matching._kept_matcher.cache_clear()
+    left, right = rng.integers(0, 256, (2, 32, 32, 3), np.uint8)
+    for _ in range(3):
+        sw.estimate(left, right)
+    assert matching._kept_matcher.cache_info().misses == 1
+
+
+def test_a_file_that_was_written_anew_is_loaded_anew_whatever_its_path_is_relative_to(
+    tmp_path, rng, monkeypatch
+):
+    left, right = (painted(rng.integers(0, 255, (32, 48))) for _ in range(2))
+    found = []
+    for turn, (folder, image) in enumerate([("a", "left"), ("a", "right"), ("b", "left")]):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        monkeypatch.chdir(tmp_path / folder)
+        file = matcher_file(Path("matcher.onnx"), red_of(image, "disparity_px"), ["disparity_px"])
+        os.utime(file, ns=(turn, turn))
+        found.append(sw.estimate(left, right, model="matcher.onnx").disparity_px)
+    for disparity_px, image in zip(found, (left, right, left), strict=True):
+        np.testing.assert_allclose(disparity_px, image[:, :, 0], atol=1e-4)
+
+
+def test_the_answer_does_not_depend_on_earlier_calls_of_other_sizes(rng):
+    left, right = rng.integers(0, 256, (2, 64, 80, 3), np.uint8)
+    first = sw.estimate(left, right)
+    sw.estimate(left[:40, :70], right[:40, :70])
+    np.testing.assert_array_equal(sw.estimate(left, right).disparity_px, first.disparity_px)

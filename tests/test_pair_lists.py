@@ -1,0 +1,195 @@
+from pathlib import Path
+
+import pytest
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.pair_lists import Job, Pairs, find_pairs, pairs_by_globs, pairs_in, pairs_in_list
+
+
+def put(folder: Path, *names: str) -> Path:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    return folder
+
+
+def listed(folder: Path, jobs: list[Job]) -> dict[str, tuple[str, ...]]:
+    return {job.name: tuple(path.relative_to(folder).as_posix() for path in job.pictures) for job in jobs}
+
+
+@pytest.mark.parametrize(
+    ("name", "left", "right"),
+    [
+        ("0001", "left/0001.png", "right/0001.png"),
+        ("sea", "sea_L.jpg", "sea_R.jpg"),
+        ("sea", "sea_left.JPG", "sea_right.JPG"),
+        ("0001", "left_0001.png", "right_0001.png"),
+        ("01", "left01.jpg", "right01.jpg"),
+        ("DSC_0001", "DSC_0001L.jpg", "DSC_0001R.jpg"),
+        ("castle", "castle/left.png", "castle/right.png"),
+        ("castle", "castle/im0.png", "castle/im1.png"),
+        ("castle_0001", "castle/Left/0001.png", "castle/Right/0001.png"),
+        ("Img8bit_a_1_Img8bit", "leftImg8bit/a_1_leftImg8bit.png", "rightImg8bit/a_1_rightImg8bit.png"),
+        ("img_7", "imgLeft/img_7.tif", "imgRight/img_7.tif"),
+        ("to", "left_to_right/left.png", "left_to_right/right.png"),
+    ],
+)
+def test_a_folders_pairs_are_found_by_the_marks_of_their_sides(tmp_path, name, left, right):
+    folder = put(tmp_path, left, right)
+    if name.startswith("img"):
+        name = "img_img_7"
+    assert listed(folder, pairs_in(folder).jobs) == {name: (left, right)}
+
+
+def test_a_pair_right_in_the_folder_has_the_folders_name(tmp_path):
+    folder = put(tmp_path / "castle", "left.png", "right.png")
+    assert listed(folder, pairs_in(folder).jobs) == {"castle": ("left.png", "right.png")}
+
+
+def test_words_that_only_begin_like_a_mark_are_none(tmp_path):
+    folder = put(tmp_path, "leftover.png", "lake.png", "Room.png", "im0001.png", "ball.png")
+    expected = {Path(name).stem: (name,) for name in ("leftover.png", "lake.png", "Room.png", "im0001.png")}
+    assert listed(folder, pairs_in(folder).jobs) == expected | {"ball": ("ball.png",)}
+
+
+def test_half_a_pair_is_a_pair_whose_other_picture_is_missing(tmp_path):
+    folder = put(tmp_path, "left/1.png", "right/1.png", "left/2.png", "right/3.png")
+    assert listed(folder, pairs_in(folder).jobs) == {
+        name: (f"left/{name}.png", f"right/{name}.png") for name in ("1", "2", "3")
+    }
+
+
+def test_marks_mean_nothing_where_not_one_pair_is_whole(tmp_path):
+    folder = put(tmp_path, "turn_left.jpg", "sea.jpg")
+    assert listed(folder, pairs_in(folder).jobs) == {"sea": ("sea.jpg",), "turn_left": ("turn_left.jpg",)}
+
+
+def test_files_of_both_views_are_pairs_and_the_camera_s_copy_beside_them_is_left_out(tmp_path):
+    folder = put(tmp_path, "DSCF1.MPO", "DSCF1.JPG", "tree.jps", "notes.txt")
+    pairs = pairs_in(folder)
+    assert listed(folder, pairs.jobs) == {"DSCF1": ("DSCF1.MPO",), "tree": ("tree.jps",)}
+    assert pairs.notes == (f"{folder}: 1 picture left out, whose names do not say left or right: DSCF1.JPG",)
+
+
+def test_a_scene_folder_brings_its_calibration_and_not_its_ground_truth(tmp_path):
+    names = ["left.png", "right.png", "disparity.png"]
+    folder = put(tmp_path, *(f"{scene}/{name}" for scene in ("a", "b") for name in names), "b/calib.txt")
+    pairs = pairs_in(folder)
+    assert [(job.name, job.calibration) for job in pairs.jobs] == [
+        ("a", None),
+        ("b", folder / "b" / "calib.txt"),
+    ]
+    assert "2 pictures left out" in pairs.notes[0]
+
+
+def test_hidden_files_and_results_of_a_batch_are_no_pictures(tmp_path):
+    folder = put(tmp_path, "a_l.png", "a_r.png", "._a_l.png", ".trash/b_l.png")
+    put(folder, "out/batch.json", "out/a/preview.png", "out/a/left.png", "out/a/right.png")
+    assert listed(folder, pairs_in(folder).jobs) == {"a": ("a_l.png", "a_r.png")}
+
+
+def test_two_pairs_of_one_name_are_refused_before_the_start_even_if_capitals_alone_differ(tmp_path):
+    folder = put(tmp_path, "a_L.png", "a_R.png", "A_L.jpg", "A_R.jpg")
+    with pytest.raises(
+        StereoweaveError, match="pairs of different names, found a for .*A_L.jpg and for .*a_L.png"
+    ):
+        pairs_in(folder)
+
+
+def test_a_folder_without_pictures_is_told_in_one_line(tmp_path):
+    with pytest.raises(StereoweaveError, match="expected pictures in it, .* found none"):
+        pairs_in(put(tmp_path, "film.mp4"))
+    with pytest.raises(StereoweaveError, match="expected a folder of pictures, found no such folder"):
+        pairs_in(tmp_path / "none")
+
+
+def test_globs_are_paired_in_the_order_of_their_names(tmp_path):
+    folder = put(tmp_path, "l/2.png", "l/1.png", "r/c.png", "r/b.png", "l/3.txt")
+    jobs = pairs_by_globs(f"{folder}/l/*.png", f"{folder}/r/*.png")
+    assert listed(folder, jobs) == {"1": ("l/1.png", "r/b.png"), "2": ("l/2.png", "r/c.png")}
+
+
+def test_names_from_globs_tell_folders_apart(tmp_path):
+    folder = put(tmp_path, "a/left.png", "a/right.png", "b/c/left.png", "b/c/right.png")
+    jobs = pairs_by_globs(f"{folder}/**/left.png", f"{folder}/**/right.png")
+    assert listed(folder, jobs) == {
+        "a": ("a/left.png", "a/right.png"),
+        "b_c": ("b/c/left.png", "b/c/right.png"),
+    }
+
+
+def test_a_file_whose_name_has_brackets_is_no_pattern(tmp_path):
+    folder = put(tmp_path, "sea [1].png", "sea [2].png")
+    jobs = pairs_by_globs(f"{folder}/sea [1].png", f"{folder}/sea [2].png")
+    assert listed(folder, jobs) == {"sea [1]": ("sea [1].png", "sea [2].png")}
+
+
+def test_unequal_counts_are_refused_with_both(tmp_path):
+    folder = put(tmp_path, "l/1.png", "l/2.png", "r/1.png")
+    with pytest.raises(StereoweaveError, match=r"found 2 for --left .* and 1 for --right"):
+        pairs_by_globs(f"{folder}/l/*", f"{folder}/r/*")
+    with pytest.raises(StereoweaveError, match=r"--right .*expected pictures, found none"):
+        pairs_by_globs(f"{folder}/l/*", f"{folder}/x/*")
+
+
+@pytest.mark.parametrize(
+    ("line", "name", "pictures"),
+    [
+        ("l/1.png r/1.png", "1", ("l/1.png", "r/1.png")),
+        ("l/1.png   r/1.png", "1", ("l/1.png", "r/1.png")),
+        ("l/1.png\tr/1.png\tquay wall", "quay wall", ("l/1.png", "r/1.png")),
+        ("l/1.png, r/1.png, quay", "quay", ("l/1.png", "r/1.png")),
+        ('"my l.png" "my r.png"', "my", ("my l.png", "my r.png")),
+        ('"a, b.png","c, d.png"', "a, b", ("a, b.png", "c, d.png")),
+        ("l'arbre.png r'arbre.png", "l'arbre", ("l'arbre.png", "r'arbre.png")),
+        ("both.jps", "both", ("both.jps",)),
+        ("both.jps,,tree", "tree", ("both.jps",)),
+        ("a.png b.png ../x:y?", "_x_y_", ("a.png", "b.png")),
+        ("a.png b.png CON", "CON_", ("a.png", "b.png")),
+        ("a.png b.png nul.png", "nul.png_", ("a.png", "b.png")),
+        ("a.png b.png summary.csv", "summary.csv_", ("a.png", "b.png")),
+    ],
+)
+def test_a_line_of_a_list_is_a_pair(tmp_path, line, name, pictures):
+    (tmp_path / "list.txt").write_text(f"# left right\n\n{line}\n", encoding="utf-8-sig")
+    assert listed(tmp_path, pairs_in_list(tmp_path / "list.txt")) == {name: pictures}
+
+
+def test_paths_of_a_list_are_relative_to_its_folder_and_those_elsewhere_keep_their_names_apart(tmp_path):
+    (tmp_path / "lists").mkdir()
+    path = tmp_path / "lists" / "list.txt"
+    path.write_text(f"../a/l.png ../a/r.png\n{tmp_path}/b/l.png {tmp_path}/b/r.png\n")
+    first, second = pairs_in_list(path)
+    assert first.pictures == (path.parent / "../a/l.png", path.parent / "../a/r.png")
+    stem = "_".join(tmp_path.parts[1:])
+    assert [first.name, second.name] == [f"{stem}_a", f"{stem}_b"]
+
+
+def test_a_bad_line_is_told_by_its_number(tmp_path):
+    path = tmp_path / "list.txt"
+    path.write_text("a.png b.png\na b c d\n")
+    with pytest.raises(StereoweaveError, match=r"list.txt, line 2: .*found 4 columns: a b c d"):
+        pairs_in_list(path)
+    path.write_text("# nothing\n")
+    with pytest.raises(StereoweaveError, match="expected a pair in each line, found none"):
+        pairs_in_list(path)
+    with pytest.raises(StereoweaveError, match="expected a list of pairs, found no such file"):
+        pairs_in_list(tmp_path / "none.txt")
+
+
+def test_the_words_of_the_command_line_name_one_source(tmp_path):
+    folder = put(tmp_path, "a_l.png", "a_r.png")
+    left, right = (str(folder / f"a_{side}.png") for side in "lr")
+    (folder / "list.txt").write_text("a_l.png a_r.png a\n")
+    job = Job("a", (Path(left), Path(right)))
+    assert find_pairs([folder], None, None, None) == Pairs([job])
+    assert find_pairs([], left, right, None) == Pairs([job])
+    assert find_pairs([], None, None, folder / "list.txt") == Pairs([job])
+    assert find_pairs([Path(left), Path(right)], None, None, None) is None
+    for words, found in {
+        ((), None, None, None): "none",
+        ((folder,), left, right, None): "pictures with --left and --right",
+        ((), left, None, None): "one of the two patterns",
+    }.items():
+        with pytest.raises(StereoweaveError, match=f"or --list, found {found}"):
+            find_pairs(*words)
