@@ -24,7 +24,7 @@ DEFECTS: tuple[Defect, ...] = get_args(Defect)
 _TOLERATED_PX = 0.75
 _TOLERATED_DEGREES = 0.3
 _TOLERATED_STOPS = 0.58
-_TOLERATED_BEHIND_PX = 2.5
+_TOLERATED_BEHIND_PX = 1.5
 _PIXELS_OF_TOLERANCE = 1_500_000
 
 # Matches are right that miss the field of vertical errors by no more than this.
@@ -33,9 +33,9 @@ _FIRST_RIGHT_PX = 2.5
 _TRIALS, _POLISHING = 400, 6
 _LEAST_MATCHES, _LEAST_RIGHT_SHARE = 20, 0.2
 # A disparity counts that so many of a match's neighbours share.
-_NEIGHBOURS, _LEAST_AGREEING = 8, 3
+_NEIGHBOURS, _LEAST_AGREEING = 8, 4
 _AGREE_PX, _AGREE_SHARE = 2.0, 0.05
-_OUTER_PERCENT = 0.5
+_OUTER_PERCENT = 1.0
 
 # Light is compared in such windows, by levels that neither photograph cuts off.
 _LIGHT_WINDOW_PX = 7
@@ -61,7 +61,7 @@ class Alignment:
         vertical_error_px, vertical_error_95_px: Median and 95 % of how far apart their rows are.
         vertical_shift_px: How much lower the right photograph lies, in its middle.
         rotation_degrees: How far the right photograph is turned clockwise.
-        range_px: The least and the greatest disparity, without the outermost 0.5 %.
+        range_px: The least and the greatest disparity, without the outermost 1 %.
         exposure_ratio: How many times as much light the right photograph got; NaN where it cannot be told.
         defects: Names of what is amiss, of `DEFECTS`; empty for a sound pair.
     """
@@ -132,7 +132,7 @@ class Alignment:
                 )
             case "negative_disparity":
                 return (
-                    f"disparities go down to {self.range_px[0]:.0f} px, as of converged cameras or 3-D films: "
+                    f"disparities go down to {self.range_px[0]:.0f} px, as in 3-D films: "
                     "they are matched as they are, but metres from focal length and baseline need doffs"
                 )
 

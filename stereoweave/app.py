@@ -12,6 +12,7 @@ from collections.abc import Awaitable, Callable, MutableMapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import gradio as gr
 import uvicorn
@@ -83,9 +84,9 @@ class Page:
             self._clicks = gr.State([])
             gr.HTML(_HEAD, padding=False)
             with gr.Row():
-                with gr.Column(scale=1, min_width=320):
+                with gr.Column(scale=1, min_width=280):
                     self._ask()
-                with gr.Column(scale=3, min_width=320):
+                with gr.Column(scale=3, min_width=280):
                     self._empty = gr.HTML(_EMPTY, padding=False)
                     with gr.Column(visible=False) as self._results:
                         self._show()
@@ -122,36 +123,39 @@ class Page:
 
     def _show(self) -> None:
         """The part that shows results."""
-        with gr.Tab("View and depth"):
-            self._view = _picture("New view", "view")
-            self._position = gr.Slider(
-                -0.5,
-                1.5,
-                value=0.5,
-                step=0.05,
-                label="Viewpoint",
-                info="0 is the left camera, 1 the right one",
-                buttons=[],
-                elem_id="position",
-            )
-            self._where = gr.HTML(elem_id="where")
-            with gr.Row():
-                with gr.Column(min_width=280):
-                    self._depth = _picture("Depth", "depth")
-                    self._ramp = gr.HTML()
-                with gr.Column(min_width=280):
-                    self._confidence = _picture("Confidence", "confidence")
-                    gr.HTML(_confidence_legend())
-        with gr.Tab("Measure"):
-            self._measured = gr.HTML(elem_id="measured")
-            self._photograph = _picture("Left photograph", "photograph")
-        with gr.Tab("Point cloud"):
-            self._cloud = gr.Model3D(
-                label="Drag to turn, scroll to come nearer", clear_color=(0.94, 0.95, 0.96, 1.0), height=560
-            )
-        with gr.Tab("Files"):
-            self._all = gr.DownloadButton("Download all (zip)", variant="primary", elem_id="all")
-            self._files = gr.File(label="Or one at a time", interactive=False, elem_id="files")
+        with gr.Tabs() as self._tabs:
+            with gr.Tab("View and depth", id="first"):
+                self._view = _picture("New view", "view")
+                self._position = gr.Slider(
+                    -0.5,
+                    1.5,
+                    value=0.5,
+                    step=0.05,
+                    label="Viewpoint",
+                    info="0 is the left camera, 1 the right one",
+                    buttons=[],
+                    elem_id="position",
+                )
+                self._where = gr.HTML(elem_id="where")
+                with gr.Row():
+                    with gr.Column(min_width=280):
+                        self._depth = _picture("Depth", "depth")
+                        self._ramp = gr.HTML()
+                    with gr.Column(min_width=280):
+                        self._confidence = _picture("Confidence", "confidence")
+                        gr.HTML(_confidence_legend())
+            with gr.Tab("Measure"):
+                self._measured = gr.HTML(elem_id="measured")
+                self._photograph = _picture("Left photograph", "photograph")
+            with gr.Tab("Point cloud") as self._cloud_tab:
+                self._cloud = gr.Model3D(
+                    label="Drag to turn, scroll to come nearer",
+                    clear_color=(0.94, 0.95, 0.96, 1.0),
+                    height=560,
+                )
+            with gr.Tab("Files"):
+                self._all = gr.DownloadButton("Download all (zip)", variant="primary", elem_id="all")
+                self._files = gr.File(label="Or one at a time", interactive=False, elem_id="files")
 
     def _connect(self) -> None:
         """What happens on which event."""
@@ -159,7 +163,8 @@ class Page:
         asked += [self._focal_px, self._baseline_mm]
         seen = [self._empty, self._results, self._kept, self._view, self._where, self._depth, self._ramp]
         seen += [self._confidence, self._photograph, self._clicks, self._measured]
-        taken = [self._status, self._cloud, self._files, self._all]
+        seen += [self._tabs, self._cloud]
+        taken = [self._status, self._files, self._all]
         sampled = self._sample.click(self._sampled, None, asked, api_visibility="private")
         for begin in (self._find.click, sampled.then):
             found = begin(
@@ -187,11 +192,17 @@ class Page:
             concurrency_limit=None,
             api_visibility="private",
         )
+        # When its tab is opened, and under a new name each time: Gradio's viewer stays empty where its value
+        # comes before it is shown, or comes twice.
+        self._cloud_tab.select(
+            self._turned, self._kept, self._cloud, concurrency_id="matching", api_visibility="private"
+        )
         self._photograph.select(
             self._clicked,
             [self._kept, self._clicks],
             [self._photograph, self._measured, self._clicks],
             show_progress="hidden",
+            trigger_mode="multiple",
             concurrency_limit=None,
             api_visibility="private",
         )
@@ -231,13 +242,12 @@ class Page:
         return re.sub(rf"{re.escape(str(self._folder))}/\w+/", "", " ".join(line.splitlines()))
 
     def _written(self, kept: Kept | None, progress: Any = gr.Progress()) -> dict[Any, Any]:  # noqa: B008
-        """The files and the point cloud, which take as long again as all that was shown."""
+        """The files, which take as long again as all that was shown."""
         if kept is None:
             return {self._files: None}
         _tell(progress, 0.8, "writing the files")
         try:
             files, notes = write_all(kept)
-            cloud = write_cloud(kept.folder / "shown.glb", kept.result)
             packed = zipped(kept.folder / "stereoweave.zip", files)
         except (StereoweaveError, OSError) as error:
             return {self._status: _told([self._on_the_page(str(error))], problem=True)}
@@ -245,7 +255,6 @@ class Page:
             self._status: self._summary(kept, notes),
             self._files: [str(file) for file in files],
             self._all: str(packed),
-            self._cloud: str(cloud) if cloud else None,
         }
 
     def _summary(self, kept: Kept, notes: Sequence[str] = ()) -> str:
@@ -279,6 +288,7 @@ class Page:
             self._confidence: colour_confidence(estimate.confidence, estimate.occluded),
             self._photograph: pair.left,
             self._clicks: [],
+            self._tabs: gr.update(selected="first"),
             self._measured: _paragraphs([_TO_MEASURE]),
             self._cloud: None,
             self._files: None,
@@ -292,6 +302,11 @@ class Page:
         view = kept.renderer.view(position)
         unseen = f"{100 * (~view.drawn).mean():.1f} % of it seen by neither camera"
         return view.image, f"{position:g}, {_place(position)}; {unseen}"
+
+    def _turned(self, kept: Kept | None) -> str | None:
+        """The file of the point cloud."""
+        cloud = kept and write_cloud(kept.folder / f"{uuid4().hex}.glb", kept.result)
+        return str(cloud) if cloud else None
 
     def _clicked(
         self, kept: Kept | None, clicks: list[tuple[int, int]], event: gr.SelectData

@@ -144,19 +144,6 @@ class Rig:
             doffs_px=round(float(right[0, 2] - left[0, 2]), 9),
         )
 
-    @classmethod
-    def of_rectified(cls, camera: StereoCamera, size_px: Size) -> "Rig":
-        """The rig of rectified pictures of a size: the inverse of `camera`."""
-        matrix = np.array([[camera.focal_px, 0, camera.cx_px], [0, camera.focal_px, camera.cy_px], [0, 0, 1]])
-        aside = np.array([[0, 0, camera.doffs_px], [0, 0, 0], [0, 0, 0]])
-        return cls(
-            left=Optics(matrix=matrix, distortion=np.zeros(5)),
-            right=Optics(matrix=matrix + aside, distortion=np.zeros(5)),
-            rotation=np.eye(3),
-            translation_m=np.array([-camera.baseline_m, 0, 0]),
-            size_px=size_px,
-        )
-
     def check_size(self, pair: StereoPair) -> None:
         """Raise a FormatError where it is for pictures of another size than those of the pair."""
         size_px = size_of(pair)

@@ -7,6 +7,7 @@ handed from strip to strip, so that the strips' height changes nothing.
 """
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import cv2
@@ -34,7 +35,7 @@ _HALVING_LEVELS = 30
 _FOLLOWED_PX = 2.0
 _MEAN_PX = 9
 _LEAST_SHARE, _LEAST_SHARE_AROUND = 0.3, 0.02
-_SETTLED_ROWS = 512
+_SETTLED_ROWS = 256
 # What is left of the prior's confidence, and the most that it can be. On painted pairs what follows the prior
 # is right as often as that claimed, what the views see not alike 85 % as often, and what is changed every
 # other time.
@@ -75,22 +76,32 @@ class _View:
     ) -> None:
         self.grey, self.other = grey, other
         self._scale = scale = np.float32(grey.shape[1] / smaller_px.shape[1])
-        self.prior_px = _resized(smaller_px, grey.shape) * scale
+        self._columns_px = _resized(smaller_px, (len(smaller_px), grey.shape[1])) * scale
         window = np.ones((_SURFACES_PX, _SURFACES_PX), np.uint8)
         self._surfaces_px = cv2.erode(smaller_px, window) * scale, cv2.dilate(smaller_px, window) * scale
+        self.parallel = smaller_px.min() >= 0
         self._rows, self._columns = (
             _places(size, smaller) for size, smaller in zip(grey.shape, smaller_px.shape, strict=True)
         )
+
+    def prior_px(self, rows: slice) -> Float32[np.ndarray, "h w"]:
+        """The disparity of the smaller copy at each pixel of some rows."""
+        height, smaller = len(self.grey), len(self._columns_px)
+        places = np.clip((np.arange(height)[rows] + 0.5) * smaller / height - 0.5, 0, smaller - 1)
+        above = np.minimum(places.astype(int), smaller - 2)
+        share = (places - above).astype(np.float32)[:, None]
+        return (1 - share) * self._columns_px[above] + share * self._columns_px[above + 1]
 
     def surfaces_px(self, rows: slice) -> list[Float32[np.ndarray, "h w"]]:
         """The farthest and the nearest surface around each pixel of some rows."""
         return [surface[self._rows[rows]][:, self._columns] for surface in self._surfaces_px]
 
-    def cues(self, rows: slice) -> tuple[_Cues, _Cues]:
+    def cues(self, rows: slice, threads: int) -> tuple[_Cues, _Cues]:
         """Those of both pictures as `enlarging_kernels.match` takes them."""
         from stereoweave import enlarging_kernels as kernels  # Numba takes half a second to import
 
-        own, other = _cues(self.grey, rows), _cues(self.other, rows)
+        with ThreadPoolExecutor(threads) as pool:
+            own, other = pool.map(lambda grey: _cues(grey, rows), (self.grey, self.other))
         more = ((0, 0), (kernels.BAND, kernels.BAND))
         return own, _Cues(*(np.pad(cue[:, ::-1], more, mode="edge") for cue in other))
 
@@ -100,7 +111,7 @@ class _View:
 
         farthest_px, nearest_px = self.surfaces_px(rows)
         at_edge = self.at_edge(farthest_px, nearest_px)
-        prior_px = self.prior_px[rows]
+        prior_px = self.prior_px(rows)
         bands_px = [np.where(at_edge, surface, prior_px) for surface in (farthest_px, nearest_px)]
         return np.rint(np.stack(bands_px, 2)).astype(np.int16) - np.int16(kernels.MIDDLE)
 
@@ -169,15 +180,16 @@ def _level(
     view = _View(left, right, smaller.disparity_px)
     right_view = _View(_mirrored(right), _mirrored(left), _mirrored(smaller.right_disparity_px))
     found_px, right_found_px = _found(view, threads), _found(right_view, threads)
-    disparity_px, doubt = _settled(view, found_px, _mirrored(right_found_px))
-    right_disparity_px = _mirrored(_settled(right_view, right_found_px, _mirrored(found_px))[0])
-    confidence = _resized(smaller.confidence, left.shape)
+    disparity_px, doubt = _settled(view, found_px, _mirrored(right_found_px), threads)
+    right_disparity_px = _mirrored(_settled(right_view, right_found_px, _mirrored(found_px), threads)[0])
+    del view, right_view, found_px, right_found_px  # as large as the result: 1 GB of 50 megapixels
+    confidence = _confidence(smaller.confidence, doubt)
     occluded = np.empty(left.shape, bool)
     kernels.hide(disparity_px, right_disparity_px, occluded)
     return Estimate(
         disparity_px=disparity_px,
         right_disparity_px=right_disparity_px,
-        confidence=np.minimum(confidence * _LEFT_OF_CONFIDENCE[doubt], _MOST_CONFIDENCE[doubt]),
+        confidence=confidence,
         occluded=occluded,
     )
 
@@ -225,7 +237,7 @@ class _Strip:
         self._first = view.first_candidates(rows)
         self._along, self._down = view.steps_along(rows), view.steps_down(rows)
         self._costs, self._sums = (volume[: len(self._first)] for volume in (costs, sums))
-        own, other = (tuple(cues) for cues in view.cues(rows))
+        own, other = (tuple(cues) for cues in view.cues(rows, threads))
         pull = _pull()
         self._in_bands(lambda *band: kernels.match(own, other, self._first, pull, band, self._costs), 0)
 
@@ -251,17 +263,24 @@ class _Strip:
 
 
 def _settled(
-    view: _View, found_px: Float32[np.ndarray, "h w"], other_px: Float32[np.ndarray, "h w"]
+    view: _View,
+    found_px: Float32[np.ndarray, "h w"],
+    other_px: Float32[np.ndarray, "h w"],
+    threads: int,
 ) -> tuple[Float32[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]]:
     """A left view's disparity, from what both views found and the prior, and how doubtful it is (_Doubt)."""
     settled_px, doubt = np.empty(found_px.shape, np.float32), np.empty(found_px.shape, np.uint8)
     halo = _MEAN_PX // 2
-    for rows in _strips(len(found_px), _SETTLED_ROWS):
+
+    def settle(rows: slice) -> None:
         around = slice(max(rows.start - halo, 0), rows.stop + halo)
         strip = _settled_strip(view, around, found_px[around], other_px[around])
         inner = slice(rows.start - around.start, rows.stop - around.start)
         settled_px[rows], doubt[rows] = (values[inner] for values in strip)
-    if view.prior_px.min() >= 0:
+
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(settle, _strips(len(found_px), _SETTLED_ROWS)))
+    if view.parallel:
         # Parallel cameras give none below 0: a plain sky would take them.
         np.maximum(settled_px, 0, out=settled_px)
     return settled_px, doubt
@@ -276,7 +295,7 @@ def _settled_strip(
     from stereoweave import enlarging_kernels as kernels
 
     farthest_px, nearest_px = view.surfaces_px(rows)
-    at_edge, prior_px = view.at_edge(farthest_px, nearest_px), view.prior_px[rows]
+    at_edge, prior_px = view.at_edge(farthest_px, nearest_px), view.prior_px(rows)
     agreed = np.empty(found_px.shape, bool)
     kernels.agree(found_px, other_px, agreed)
     off_px = found_px - prior_px
@@ -292,6 +311,17 @@ def _settled_strip(
     kernels.fill(agreed, at_edge, farthest_px, nearest_px, settled_px)
     doubt = np.where(follows, _FOLLOWS, np.where(agreed | at_edge, _CHANGED, _UNSEEN))
     return settled_px, doubt.astype(np.uint8)
+
+
+def _confidence(
+    smaller: Float[np.ndarray, "h2 w2"], doubt: UInt8[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w"]:
+    """What is left of the smaller copy's confidence."""
+    confidence = _resized(smaller, doubt.shape)
+    for rows in _strips(len(doubt), _SETTLED_ROWS):
+        kept = confidence[rows] * _LEFT_OF_CONFIDENCE[doubt[rows]]
+        np.minimum(kept, _MOST_CONFIDENCE[doubt[rows]], out=confidence[rows])
+    return confidence
 
 
 def _no_paths(width: int) -> _Paths:

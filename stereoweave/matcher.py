@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -23,7 +23,9 @@ from stereoweave.threads import thread_count
 
 _FLOAT32 = "tensor(float)"
 PIXEL_PAIRS_AT_ONCE = 1920 * 1920 * 1088
-"""A network compares every column of a row with every other: this many pairs of columns take about 1.4 GB."""
+"""A network compares every column of a row with every other: this many pairs of columns take about 1 GB."""
+# After more of them the memory is given back: what enlarges their disparities needs as much.
+_KEPT_PIXEL_PAIRS = 1280 * 1280 * 960
 # What a strip sees beyond its own rows; about 1 % of the pixels then differ by over 1 px from the whole.
 _STRIP_OVERLAP_PX = 64
 # A nearer surface this much in front of a pixel's match hides it; less is the two views' disagreement.
@@ -110,6 +112,10 @@ class Matcher:
 
         return refine(left, right, found, self.threads)
 
+    def sees_whole(self, width: int, height: int) -> bool:
+        """Whether a picture of that size is matched at once, and not in strips of rows."""
+        return height <= self._strip_rows(width)
+
     def _maps(self, pair: StereoPair) -> Maps:
         """The graph's outputs for a pair: in strips of rows where it is large, blended where they overlap."""
         height, width = pair.left.shape[:2]
@@ -135,7 +141,8 @@ class Matcher:
         (above, _), (before, _) = self._borders_px(left)
         inputs = {"left": self._tensor(left), "right": self._tensor(right)}
         with _naming(self._path):
-            outputs = dict(zip(self._outputs, self._session.run(self._outputs, inputs), strict=True))
+            values = self._session.run(self._outputs, inputs, _run_options(height * width * width))
+            outputs = dict(zip(self._outputs, values, strict=True))
         expected = [1, 1, *inputs["left"].shape[2:]]
         for name, value in outputs.items():
             if list(value.shape) != expected:
@@ -214,6 +221,16 @@ def _naming(path: Path) -> Iterator[None]:
         raise MatcherError(
             f"{path}: expected an ONNX matcher, found a file ONNX Runtime refuses: {reason}"
         ) from error
+
+
+def _run_options(pixel_pairs: int) -> Any:
+    """How a picture is run: ONNX Runtime keeps what it took for the next one, unless that is very much."""
+    import onnxruntime
+
+    options = onnxruntime.RunOptions()
+    if pixel_pairs > _KEPT_PIXEL_PAIRS:
+        options.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
+    return options
 
 
 def _listed(types: dict[str, str]) -> str:

@@ -27,6 +27,8 @@ _CONFIDENT = 0.5
 _DOUBTFUL_PERCENT = 1.0
 # A network is less exact near the ends of its range.
 _MARGIN_PX = 4
+# Of the pixel pairs that are matched at once: rows are counted in multiples.
+_FILLED = 0.95
 
 
 def estimate(  # noqa: PLR0913 - each has a name, and all but the pictures can be left out
@@ -79,7 +81,7 @@ def match(
     Raises:
         StereoweaveError: For a range that is none, or pictures under 32 px in a direction.
     """
-    seen = _reduced(pair, _scale_seen_at_once(pair))
+    seen = _seen_whole(matcher, pair)
     scale = pair.left.shape[1] / seen.left.shape[1]
     if range_px is not None:
         low_px, high_px = _checked(range_px)
@@ -114,10 +116,12 @@ def _checked(range_px: tuple[float, float]) -> tuple[float, float]:
     return low_px, high_px
 
 
-def _scale_seen_at_once(pair: StereoPair) -> float:
-    """How many times smaller a picture has to be for the network to see it as a whole; at least 1."""
+def _seen_whole(matcher: Matcher, pair: StereoPair) -> StereoPair:
+    """The pair, smaller where the network would else see it in strips, whose seams would show."""
     height, width = pair.left.shape[:2]
-    return max((width * width * height / PIXEL_PAIRS_AT_ONCE) ** (1 / 3), 1.0)
+    if matcher.sees_whole(width, height):
+        return pair
+    return _reduced(pair, (width * width * height / (_FILLED * PIXEL_PAIRS_AT_ONCE)) ** (1 / 3))
 
 
 def _reduced(pair: StereoPair, scale: float) -> StereoPair:

@@ -42,7 +42,7 @@ def rectify(
 
     The pictures are cut to what both show. With a calibration calib.yml is the new one, of the results.
     """
-    from stereoweave.calibration import Rig, size_of, words, write_rig
+    from stereoweave.calibration import rig_of, size_of, words, write_rig
     from stereoweave.io import write_image
     from stereoweave.preparing import Request, prepare
     from stereoweave.rectify import cropped
@@ -53,7 +53,7 @@ def rectify(
     write_image(out / "left.png", pair.left)
     write_image(out / "right.png", pair.right)
     if pair.camera:
-        write_rig(out / "calib.yml", Rig.of_rectified(pair.camera, size_of(pair)))
+        write_rig(out / "calib.yml", rig_of(pair))
     else:
         (out / "calib.yml").unlink(missing_ok=True)
     typer.echo("\n".join([f"{out}: left.png and right.png, {words(size_of(pair))} px", *prepared.notes]))

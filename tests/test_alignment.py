@@ -11,7 +11,7 @@ from stereoweave.learn.collage import sample
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 SEED = 77
 # Painted pairs whose two exposures are alike.
-ALIKE = 2, 6, 9
+ALIKE = 2, 6
 
 
 def turned(photo, degrees):
@@ -100,7 +100,7 @@ def test_convergence_is_named_as_rows_that_do_not_match(pairs):
 
 def test_pictures_of_two_scenes_and_plain_ones_have_too_few_matches(pairs):
     plain = np.full((100, 200, 3), 90, np.uint8)
-    for left, right in ((pairs[2][0], pairs[3][1]), (plain, plain)):
+    for left, right in ((pairs[1][0], pairs[2][1]), (plain, plain)):
         found = check_pair(left, right)
         assert found.defects == ("too_few_matches",)
         assert found.lines() == found.warnings()
@@ -116,5 +116,5 @@ def test_each_defect_has_its_words(pairs):
 def test_real_pairs_have_no_defect(testdata):
     folders = sorted(left.parent for left in (testdata / "stereo").glob("pairs/*/left.png"))
     assert len(folders) == 12
-    for folder in folders[::3]:
+    for folder in folders[::4]:
         assert check_pair(read_image(folder / "left.png"), read_image(folder / "right.png")).defects == ()

@@ -10,6 +10,7 @@ from rig_examples import Cameras, Plane, fisheye, pinhole, rig_of, turned
 from stereoweave import boards
 from stereoweave.boards import Board
 from stereoweave.calibration import read_rig, write_rig
+from stereoweave.cli import main
 from stereoweave.errors import StereoweaveError
 from stereoweave.io import write_image
 
@@ -98,6 +99,17 @@ def test_what_was_found_is_told_in_plain_words(charucos):
     assert "turned by 2.6" in told[1]
     assert "reprojection error 0." in told[2]
     assert told[-1].startswith("fair: 0.") and "over 10 pairs; corners cover only" in told[-1]
+
+
+def test_the_command_writes_the_calibration_and_says_how_good_it_is(charucos, tmp_path, capsys):
+    out = tmp_path / "new" / "rig.yml"
+    board = ["--board", "7x5", "--square-mm", "40", "--charuco", "DICT_4X4_50", "--marker-mm", "30"]
+    assert main(["calibrate", str(charucos), *board, "-o", str(out)]) == 0
+    assert read_rig(out).baseline_m == pytest.approx(0.1, rel=0.005)
+    told = capsys.readouterr().out
+    assert told.startswith(f"{out}: ") and "reprojection error 0." in told
+    assert main(["calibrate", str(charucos), *board, "--board", "seven", "-o", str(out)]) == 2
+    assert "such as 9x6" in capsys.readouterr().err
 
 
 def test_a_bad_pair_is_named_and_the_rest_go_on(copied):

@@ -9,6 +9,7 @@ from matcher_examples import matcher_file, painted, red_of
 from PIL import Image
 
 import stereoweave as sw
+from stereoweave import matcher as matcher_module
 from stereoweave import matching
 from stereoweave.errors import StereoweaveError
 from stereoweave.io import read_pair
@@ -119,12 +120,27 @@ def test_a_part_that_is_nearer_than_the_networks_range_is_found(matcher, rng):
 
 
 def test_a_pair_larger_than_what_is_seen_at_once_is_matched_smaller(matcher, rng, monkeypatch):
-    pair = flat(rng, 37)
-    monkeypatch.setattr(matching, "PIXEL_PAIRS_AT_ONCE", 200 * 200 * 80)
-    height, width = matching._reduced(pair, matching._scale_seen_at_once(pair)).left.shape[:2]
-    assert 190 * 190 * 76 < width * width * height < 210 * 210 * 84
+    pair = flat(rng, 37, size=(320, 480))
+    for module in (matching, matcher_module):
+        monkeypatch.setattr(module, "PIXEL_PAIRS_AT_ONCE", 400 * 400 * 266)
+    small = matching._seen_whole(matcher, pair)
+    assert matcher.sees_whole(small.left.shape[1], small.left.shape[0])
+    assert 385 < small.left.shape[1] < 400
     found_px = match(matcher, pair).disparity_px
     assert abs(np.median(found_px[10:-10, 60:-60]) - 37) < 0.3
+
+
+@pytest.mark.parametrize("size", [(1500, 2000), (4000, 6000), (5774, 8660), (1000, 5000), (9000, 2000)])
+def test_what_is_matched_smaller_is_seen_whole_so_that_no_seam_can_show(matcher, size):
+    photo = np.broadcast_to(np.zeros((1, 1, 3), np.uint8), (*size, 3))
+    seen = matching._seen_whole(matcher, sw.StereoPair(left=photo, right=photo)).left
+    assert matcher.sees_whole(seen.shape[1], seen.shape[0])
+    assert seen.shape[1] ** 2 * seen.shape[0] > 0.85 * matching.PIXEL_PAIRS_AT_ONCE
+    assert abs(seen.shape[1] / seen.shape[0] - size[1] / size[0]) < 0.01 * size[1] / size[0]
+
+
+def test_a_film_frame_of_1920x1080_is_seen_whole(matcher):
+    assert matcher.sees_whole(1920, 1080)
 
 
 def test_what_the_pictures_do_not_show_has_no_confidence_and_matches_in_it_are_occluded(matcher, rng):
