@@ -19,7 +19,7 @@ def flat(level: int) -> np.ndarray:
 
 
 def estimate(left, right):
-    found = sw.estimate(np.ascontiguousarray(left), np.ascontiguousarray(right), threads=1)
+    found = sw.Matcher(threads=1).estimate(np.ascontiguousarray(left), np.ascontiguousarray(right))
     for values in (found.disparity_px, found.right_disparity_px, found.confidence):
         assert np.isfinite(values).all()
     return found
