@@ -1,4 +1,4 @@
-"""Stereoweave: a rectified stereo pair in; depth, and any view between the two cameras, out."""
+"""Stereoweave: a stereo pair in; depth, and any view between the two cameras, out."""
 
 import importlib
 from typing import TYPE_CHECKING, Any

@@ -5,8 +5,9 @@ from typing import Literal, get_args
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, UInt8
 
+from stereoweave.signs import depth_order, surely_negative
 from stereoweave.sparse import Matches, sparse_matches
 
 Defect = Literal[
@@ -24,7 +25,6 @@ DEFECTS: tuple[Defect, ...] = get_args(Defect)
 _TOLERATED_PX = 0.75
 _TOLERATED_DEGREES = 0.3
 _TOLERATED_STOPS = 0.58
-_TOLERATED_BEHIND_PX = 1.5
 _PIXELS_OF_TOLERANCE = 1_500_000
 
 # Matches are right that miss the field of vertical errors by no more than this.
@@ -42,12 +42,6 @@ _LIGHT_WINDOW_PX = 7
 _BLACK_LEVEL, _WHITE_LEVEL = 8, 250
 _GAMMA = 2.2
 
-# Occlusion is looked at in pictures so wide, by semi-global matching with OpenCV's usual penalties.
-_OCCLUSION_WIDTH_PX = 320
-_BLOCK_PX, _MARGIN_PX = 5, 3
-_LEAST_JUMP_PX, _LEAST_COLOUR_STEP, _BESIDE_PX = 2.0, 10.0, 3
-# So many votes for one order of depth weigh as much as none at all.
-_VOTES_OF_DOUBT = 20
 # How clearly occlusion must speak against what the signs of the disparities say by themselves.
 _CLEAR_VOTE = 0.15
 
@@ -150,10 +144,13 @@ def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3
     matches = Matches(matches.left_px[right_ones], matches.right_px[right_ones])
     # The sides of a turned picture move left and right as well.
     disparity_px = matches.disparity_px - slope * (matches.right_px[:, 1] - centre_px[1])
-    disparity_px = disparity_px[_shared_by_neighbours(matches, disparity_px, scale)]
+    shared = _shared_by_neighbours(matches, disparity_px, scale)
+    disparity_px = disparity_px[shared]
     if len(disparity_px) < _LEAST_MATCHES:
         return _unrelated(count)
-    least_px, greatest_px = np.percentile(disparity_px, [_OUTER_PERCENT, 100 - _OUTER_PERCENT])
+    small = _reduced(left, scale), _levelled(_reduced(right, scale), shift_px / scale, slope)
+    negative_px = scale * surely_negative(*small, matches.left_px[shared] / scale, disparity_px / scale)
+    least_px, greatest_px = _range(disparity_px, negative_px)
     ratio = _light_ratio(left, right, matches)
     # A turn about another point than the middle of the right picture looks like a shift as well.
     tolerated_px = scale * _TOLERATED_PX + abs(slope) * float(np.median(np.abs(disparity_px)))
@@ -163,8 +160,8 @@ def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3
         "not_rectified": uneven_px > 2 * scale * _TOLERATED_PX,
         "exposure": abs(np.log2(ratio)) > _TOLERATED_STOPS,
     }
-    if least_px < -_TOLERATED_BEHIND_PX * scale:
-        order = _depth_order(left, _levelled(right, shift_px, slope), (float(least_px), float(greatest_px)))
+    if len(negative_px):
+        order = depth_order(*small, (least_px / scale, greatest_px / scale))
         usual = _CLEAR_VOTE * (2 * float((disparity_px < 0).mean()) - 1)
         swapped = greatest_px < -least_px and order < usual
         amiss["swapped" if swapped else "negative_disparity"] = True
@@ -175,10 +172,22 @@ def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3
         vertical_error_95_px=float(np.percentile(rows_px, 95)),
         vertical_shift_px=shift_px,
         rotation_degrees=float(np.degrees(slope)),
-        range_px=(float(least_px), float(greatest_px)),
+        range_px=(least_px, greatest_px),
         exposure_ratio=ratio,
         defects=tuple(defect for defect in DEFECTS if amiss.get(defect)),
     )
+
+
+def _range(
+    disparity_px: Float[np.ndarray, " n"], negative_px: Float[np.ndarray, " m"]
+) -> tuple[float, float]:
+    """The least and the greatest disparity, without the outermost 1 %; negative ones if some are sure."""
+    at_least_0 = disparity_px[disparity_px >= 0]
+    counted_px = disparity_px if len(negative_px) or not len(at_least_0) else at_least_0
+    least_px, greatest_px = np.percentile(counted_px, [_OUTER_PERCENT, 100 - _OUTER_PERCENT])
+    if len(negative_px):
+        least_px = min(least_px, np.median(negative_px))
+    return float(least_px), float(greatest_px)
 
 
 def _unrelated(matches: int) -> Alignment:
@@ -270,6 +279,13 @@ def _levels(
     return np.percentile(photo[rows, columns].max(3), [15, 50, 85], axis=(1, 2))
 
 
+def _reduced(photo: UInt8[np.ndarray, "h w 3"], scale: float) -> UInt8[np.ndarray, "h2 w2 3"]:
+    if scale == 1:
+        return photo
+    size = round(photo.shape[1] / scale), round(photo.shape[0] / scale)
+    return cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
+
+
 def _levelled(photo: UInt8[np.ndarray, "h w 3"], shift_px: float, slope: float) -> UInt8[np.ndarray, "h w 3"]:
     """The right photograph moved up and turned back."""
     height, width = photo.shape[:2]
@@ -277,64 +293,3 @@ def _levelled(photo: UInt8[np.ndarray, "h w 3"], shift_px: float, slope: float) 
     source = np.array([[1, -slope, slope * y], [slope, 1, shift_px - slope * x]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return cv2.warpAffine(photo, source, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
-
-
-def _depth_order(
-    left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], range_px: tuple[float, float]
-) -> float:
-    """-1..1: above 0 where greater disparities hide smaller ones, below 0 where it is the other way round.
-
-    What the right camera does not see lies, in the left picture, between a smaller disparity and a greater
-    one. It belongs to what is hidden, so its colour is that of the farther side.
-    """
-    factor = min(1.0, _OCCLUSION_WIDTH_PX / left.shape[1])
-    size = (round(left.shape[1] * factor), round(left.shape[0] * factor))
-    small_left, small_right = (cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (left, right))
-    disparity_px, seen = _matched(small_left, small_right, range_px[0] * factor, range_px[1] * factor)
-    colours = cv2.cvtColor(cv2.GaussianBlur(small_left, (0, 0), 0.7), cv2.COLOR_RGB2LAB).astype(np.float32)
-    votes = [vote for row in range(size[1]) for vote in _votes(disparity_px[row], seen[row], colours[row])]
-    return sum(votes) / (len(votes) + _VOTES_OF_DOUBT)
-
-
-def _votes(
-    disparity_px: Float32[np.ndarray, " w"], seen: Bool[np.ndarray, " w"], colours: Float32[np.ndarray, "w 3"]
-) -> list[float]:
-    """For each hidden stretch of a row, -1..1: how much more it is like its left side than its right one."""
-    votes = []
-    changes = np.diff(seen.astype(np.int8))
-    ends = np.flatnonzero(changes == 1) + 1
-    for start in np.flatnonzero(changes == -1) + 1:
-        end = next(iter(ends[ends > start]), len(seen))
-        if start < _BESIDE_PX or end + _BESIDE_PX > len(seen):
-            continue
-        jump_px = disparity_px[end + 1] - disparity_px[start - 2]
-        before, after = colours[start - _BESIDE_PX : start], colours[end : end + _BESIDE_PX]
-        hidden, before, after = (part.mean(0) for part in (colours[start:end], before, after))
-        plain = np.linalg.norm(before - after) < _LEAST_COLOUR_STEP
-        if plain or jump_px < _LEAST_JUMP_PX or abs(end - start - jump_px) > 0.5 * jump_px + 1:
-            continue
-        unlike_before, unlike_after = np.linalg.norm(hidden - before), np.linalg.norm(hidden - after)
-        votes.append(float((unlike_after - unlike_before) / (unlike_after + unlike_before)))
-    return votes
-
-
-def _matched(
-    left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], least_px: float, greatest_px: float
-) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Disparity of the left picture by semi-global matching, and where the right picture's agrees."""
-    first_px = int(np.floor(least_px)) - _MARGIN_PX
-    count = int(np.ceil((greatest_px + _MARGIN_PX - first_px) / 16)) * 16
-    penalty = _BLOCK_PX**2
-    matcher = cv2.StereoSGBM.create(first_px, count, _BLOCK_PX, P1=8 * penalty, P2=32 * penalty)
-    beside = max(first_px + count, -first_px, 0)
-    # Exposures may differ.
-    greys = [cv2.equalizeHist(cv2.cvtColor(x, cv2.COLOR_RGB2GRAY)) for x in (left, right)]
-    greys = [cv2.copyMakeBorder(x, 0, 0, beside, beside, cv2.BORDER_REPLICATE) for x in greys]
-    mirrored = [np.ascontiguousarray(x[:, ::-1]) for x in reversed(greys)]
-    here = slice(beside, beside + left.shape[1])
-    left_px = matcher.compute(*greys)[:, here].astype(np.float32) / 16
-    right_px = matcher.compute(*mirrored)[:, ::-1][:, here].astype(np.float32) / 16
-    columns = np.rint(np.arange(left.shape[1]) - left_px).astype(int)
-    inside = (columns >= 0) & (columns < left.shape[1])
-    back_px = np.take_along_axis(right_px, np.clip(columns, 0, left.shape[1] - 1), axis=1)
-    return left_px, inside & (np.abs(back_px - left_px) <= 1) & (left_px > first_px)

@@ -10,13 +10,16 @@ import tempfile
 import webbrowser
 from collections.abc import Awaitable, Callable, MutableMapping, Sequence
 from functools import partial
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 from uuid import uuid4
 
 import gradio as gr
 import uvicorn
 from fastapi import FastAPI
+from starlette.responses import PlainTextResponse
 
 from stereoweave.colour import OCCLUDED_RGB, colour_confidence, css_colour, legend_colours
 from stereoweave.errors import StereoweaveError
@@ -39,7 +42,8 @@ from stereoweave.preparing import Request
 _MOST_BYTES = 200 * 1024**2
 
 _KEPT_S = 3600
-# Each keeps its last result: 60 MB, and 19 bytes a pixel of the left picture, 0.5 GB of 24 megapixels.
+# Each keeps its last result: 60 MB, and 19 bytes a pixel of the left picture, 0.5 GB of 24 megapixels; and
+# on disk its files, 0.9 GB of so many.
 _MOST_SESSIONS = 4
 _GUESSED = "guessed"
 _MODELS = [("fast", "small"), ("fine", "base")]
@@ -60,10 +64,15 @@ _NAMES = {
     "--focal-px": "the focal length",
     "--baseline-m": "how far apart the cameras are",
     "--calib": "a calibration file",
+    "name its --format": "choose “How one file holds both”",
     "--format": "“How one file holds both”",
 }
 _TO_MEASURE = "Click two points of the photograph: here stands how far each is, and how far apart they are."
 _NO_METRES = "For metres give a calibration file, or the focal length and how far apart the cameras are."
+_WITHOUT_WEBGL = """const canvas = document.createElement("canvas");
+if (!canvas.getContext("webgl2") && !canvas.getContext("webgl")) element.innerHTML =
+  '<p class="told problem">This browser does not draw in three dimensions: switch on its hardware ' +
+  'acceleration (WebGL). Where metres are known, another program shows cloud.glb, under Files.</p>';"""
 _GONE = "This result has been put away, as after an hour. Find depth again."
 
 _Scope = MutableMapping[str, Any]
@@ -87,7 +96,7 @@ class Page:
                 with gr.Column(scale=1, min_width=280):
                     self._ask()
                 with gr.Column(scale=3, min_width=280):
-                    self._empty = gr.HTML(_EMPTY, padding=False)
+                    self._status = gr.HTML(_EMPTY, elem_id="status", padding=False)
                     with gr.Column(visible=False) as self._results:
                         self._show()
             self._connect()
@@ -119,7 +128,6 @@ class Page:
                 self._baseline_mm = _known_number("Baseline, mm", "baseline")
         self._find = gr.Button("Find depth", variant="primary", elem_id="find")
         self._sample = gr.Button("Try the sample", elem_id="sample")
-        self._status = gr.HTML(elem_id="status", padding=False)
 
     def _show(self) -> None:
         """The part that shows results."""
@@ -148,6 +156,7 @@ class Page:
                 self._measured = gr.HTML(elem_id="measured")
                 self._photograph = _picture("Left photograph", "photograph")
             with gr.Tab("Point cloud") as self._cloud_tab:
+                gr.HTML(js_on_load=_WITHOUT_WEBGL, padding=False)
                 self._cloud = gr.Model3D(
                     label="Drag to turn, scroll to come nearer",
                     clear_color=(0.94, 0.95, 0.96, 1.0),
@@ -155,13 +164,13 @@ class Page:
                 )
             with gr.Tab("Files"):
                 self._all = gr.DownloadButton("Download all (zip)", variant="primary", elem_id="all")
-                self._files = gr.File(label="Or one at a time", interactive=False, elem_id="files")
+                self._files = gr.File(label="One at a time", interactive=False, elem_id="files")
 
     def _connect(self) -> None:
         """What happens on which event."""
         asked = [self._left, self._right, self._model, self._rectify, self._arrangement, self._calibration]
         asked += [self._focal_px, self._baseline_mm]
-        seen = [self._empty, self._results, self._kept, self._view, self._where, self._depth, self._ramp]
+        seen = [self._results, self._kept, self._view, self._where, self._depth, self._ramp]
         seen += [self._confidence, self._photograph, self._clicks, self._measured]
         seen += [self._tabs, self._cloud]
         taken = [self._status, self._files, self._all]
@@ -230,7 +239,6 @@ class Page:
         except (StereoweaveError, OSError) as error:
             return {
                 self._status: _told([self._on_the_page(str(error))], problem=True),
-                self._empty: gr.update(visible=True),
                 self._results: gr.update(visible=False),
                 self._kept: None,
             }
@@ -254,7 +262,7 @@ class Page:
         return {
             self._status: self._summary(kept, notes),
             self._files: [str(file) for file in files],
-            self._all: str(packed),
+            self._all: gr.update(value=packed and str(packed), visible=packed is not None),
         }
 
     def _summary(self, kept: Kept, notes: Sequence[str] = ()) -> str:
@@ -278,7 +286,6 @@ class Page:
         view, where = self._seen(kept, position)
         return {
             self._status: self._summary(kept),
-            self._empty: gr.update(visible=False),
             self._results: gr.update(visible=True),
             self._kept: kept,
             self._view: view,
@@ -292,7 +299,7 @@ class Page:
             self._measured: _paragraphs([_TO_MEASURE]),
             self._cloud: None,
             self._files: None,
-            self._all: None,
+            self._all: gr.update(value=None, visible=False),
         }
 
     def _seen(self, kept: Kept | None, position: float) -> tuple[Any, str]:
@@ -330,7 +337,7 @@ def _tell(progress: Any, share: float, what: str) -> None:
 
 
 def _known_number(label: str, name: str) -> gr.Number:
-    return gr.Number(0, label=label, info="0: not known", minimum=0, min_width=120, elem_id=name)
+    return gr.Number(0, label=label, info="0: not known", min_width=120, elem_id=name)
 
 
 def _picture(label: str, name: str) -> gr.Image:
@@ -377,8 +384,11 @@ def _sample_folder() -> Path:
     return Path(str(importlib.resources.files("stereoweave"))) / "sample"
 
 
-def make_server(folder: Path) -> FastAPI:
-    """The page as an ASGI application; uploads and results lie in a folder of its own."""
+def make_server(folder: Path, names: frozenset[str] | None) -> FastAPI:
+    """The page as an ASGI application; uploads and results lie in a folder of its own.
+
+    It answers to `names` alone, to any where there are none.
+    """
     os.environ["GRADIO_TEMP_DIR"] = str(folder)
     server = FastAPI(openapi_url=None)
     css = importlib.resources.files("stereoweave").joinpath("page.css").read_text(encoding="utf-8")
@@ -397,7 +407,7 @@ def make_server(folder: Path) -> FastAPI:
         theme=_theme(),
         css=css,
     )
-    server.add_middleware(KeepingToItself)
+    server.add_middleware(KeepingToItself, names=names)
     return server
 
 
@@ -413,12 +423,22 @@ def _theme() -> gr.themes.Base:
 
 
 class KeepingToItself:
-    """Tells the browser to load nothing from anywhere else, whatever the page should ask for."""
+    """Tells the browser to load nothing from anywhere else, whatever the page should ask for.
 
-    def __init__(self, app: _Server) -> None:
-        self._app = app
+    Where `names` are given, who asks for the page under another name is refused: a name that another site's
+    DNS server gives this computer's address would open the page to that site.
+    """
+
+    def __init__(self, app: _Server, names: frozenset[str] | None) -> None:
+        self._app, self._names = app, names
 
     async def __call__(self, scope: _Scope, receive: _Receive, send: _Send) -> None:
+        if self._names and scope["type"] == "http":
+            host = dict(scope["headers"]).get(b"host", b"").decode("latin-1")
+            if urlsplit(f"//{host}").hostname not in self._names:
+                await PlainTextResponse("only for this computer", 403)(scope, receive, send)
+                return
+
         async def send_with_policy(message: MutableMapping[str, Any]) -> None:
             if message["type"] == "http.response.start":
                 message["headers"] = [*message.get("headers", []), (b"content-security-policy", _POLICY)]
@@ -427,11 +447,18 @@ class KeepingToItself:
         await self._app(scope, receive, send_with_policy)
 
 
+def _own_names(listener: socket.socket) -> frozenset[str] | None:
+    """What this computer calls itself, where it alone is served."""
+    address = listener.getsockname()[0]
+    return frozenset({address, "localhost"}) if ip_address(address).is_loopback else None
+
+
 def serve(listener: socket.socket, url: str, *, open_browser: bool) -> None:
     """Serves the page on a listening socket until it is interrupted; then what was uploaded is removed."""
     with tempfile.TemporaryDirectory(prefix="stereoweave-page-") as folder:
         # An open page keeps a connection open, which would never end of itself.
-        config = uvicorn.Config(make_server(Path(folder)), log_level="critical", timeout_graceful_shutdown=1)
+        server = make_server(Path(folder), _own_names(listener))
+        config = uvicorn.Config(server, log_level="critical", timeout_graceful_shutdown=1)
         if open_browser:
             webbrowser.open(url)
         uvicorn.Server(config).run(sockets=[listener])

@@ -7,6 +7,8 @@ from PIL import Image
 from stereoweave.errors import StereoweaveError
 
 _CHANNELS = (1, 3, 4)
+# As a share of white: it is less than half a level, so that it rounds to 0 or 255.
+_FORGIVEN = 0.4 / 255
 # What Pillow cannot turn into RGB in one step.
 _BETWEEN = {"La": "LA", "RGBa": "RGBA"}
 
@@ -55,7 +57,7 @@ def _of_pil(picture: Image.Image) -> Shaped[np.ndarray, "h w *channels"]:
         # A copy: Pillow lends its pixels read-only, for which Numba compiles anew and PyTorch warns.
         return np.array(direct.convert("RGB"))
     values = np.asarray(picture)
-    if picture.mode == "I" and values.min() >= 0 and values.max() <= 65535:
+    if picture.mode == "I" and values.size and values.min() >= 0 and values.max() <= 65535:
         # Mode I has 32 bits, and what files hold in it 16 or 8, as `io.read_image` takes it.
         return values.astype(np.uint16 if values.max() > 255 else np.uint8)
     return values
@@ -71,14 +73,13 @@ def _eight_bits(values: Shaped[np.ndarray, "..."], name: str) -> UInt8[np.ndarra
         raise StereoweaveError(
             f"{name}: expected uint8, uint16 or a float in 0..1, got {got}; convert 0..255 by astype('uint8')"
         )
-    levels = np.rint(values * 255.0)
-    # Not the opposite comparison, which would let NaN pass.
-    if not ((levels >= 0) & (levels <= 255)).all():
+    # Not the opposite comparison, which would let NaN pass; and before the product, which may overflow.
+    if not ((values >= -_FORGIVEN) & (values <= 1 + _FORGIVEN)).all():
         raise StereoweaveError(
             f"{name}: expected floats in 0..1, got {got} of {values.min():g} to {values.max():g}; "
             "divide 0..255 by 255, and fill NaN"
         )
-    return levels.astype(np.uint8)
+    return np.rint(values * 255.0).astype(np.uint8)
 
 
 def _channels_last(levels: UInt8[np.ndarray, "..."], name: str) -> UInt8[np.ndarray, "h w channels"]:

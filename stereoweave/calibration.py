@@ -186,7 +186,7 @@ def read_rig(path: str | Path, size_px: Size | None = None) -> Rig:
         FormatError: No such file, an entry is missing, or its value is nonsense.
     """
     with reading(path, _EXPECTED):
-        text = Path(path).read_text(errors="replace")
+        text = Path(path).read_text("utf-8-sig", errors="replace")
         if re.search(r"^(cam0|doffs|baseline)\s*=", text, re.MULTILINE):
             rig = _middlebury(text)
         elif re.search(r"^(P\d|P_rect_\d\d|K_\d\d):", text, re.MULTILINE):
@@ -254,7 +254,7 @@ _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix_of)
 
 def _stored(text: str) -> dict[str, Any]:
     """The entries of a file of YAML, or of OpenCV's XML or JSON."""
-    if text.lstrip("\ufeff \n\r\t").startswith(("<", "{")):
+    if text.lstrip().startswith(("<", "{")):
         return _stored_by_opencv(text)
     try:
         # Not YAML: OpenCV writes a colon in it.
@@ -288,7 +288,7 @@ def _completed(entries: dict[str, Any], path: Path) -> dict[str, Any]:
     for this, other in (("intrinsics", "extrinsics"), ("extrinsics", "intrinsics")):
         beside = path.with_name(path.name.replace(this, other))
         if this in path.name and beside.exists():
-            return _stored(beside.read_text(errors="replace")) | entries
+            return _stored(beside.read_text("utf-8-sig", errors="replace")) | entries
     return entries
 
 
@@ -373,7 +373,7 @@ def _known_model(named: object) -> str:
 def _unit(translation: Float[np.ndarray, "3"], stated: object) -> tuple[str, tuple[str, ...]]:
     """The translation's unit of length, and a line that says so where it is a guess."""
     if stated is not None:
-        if stated not in _METRES:
+        if str(stated) not in _METRES:
             raise ValueError(f"translation_unit {stated}, not one of {', '.join(_METRES)}")
         return str(stated), ()
     length = float(np.linalg.norm(translation))
@@ -389,9 +389,12 @@ def _size(entries: Mapping[str, Any]) -> Size | None:
     both = _first(entries, ("imagesize", "resolution", "size"))
     if both is None:
         both = [entries.get("image" + side, entries.get(side)) for side in ("width", "height")]
-    if None in list(both):
-        return None
-    width, height = _numbers(both).ravel()
+        if None in both:
+            return None
+    sides_px = _numbers(both).ravel()
+    if sides_px.size != 2:
+        raise ValueError(f"a picture's size of {both}, not width and height")
+    width, height = sides_px
     return int(width), int(height)
 
 
@@ -486,7 +489,8 @@ def _kitti_size(rows: Mapping[str, Float[np.ndarray, " _"]], key: str) -> Size |
 
 def _middlebury(text: str) -> Rig:
     """Source: the Middlebury datasets of 2014, cam0=[f 0 cx; 0 f cy; 0 0 1], the baseline in millimetres."""
-    entries = dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
+    lines = (line.split("=", 1) for line in text.splitlines() if "=" in line)
+    entries = {key.strip(): value for key, value in lines}
     missing = {"cam0", "doffs", "baseline", "width", "height"} - entries.keys()
     if missing:
         raise ValueError(f"no entry {', '.join(sorted(missing))} of a Middlebury calib.txt")
@@ -514,4 +518,7 @@ def _camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarr
 
 
 def _numbers(values: Any) -> Float[np.ndarray, "..."]:
-    return np.asarray(values, dtype=np.float64)
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except TypeError as error:  # of a dict, for instance
+        raise ValueError(f"{values} in place of numbers") from error

@@ -1,4 +1,4 @@
-"""The commands: stereoweave depth | measure | view | video | live | app | check | rectify | train and so on."""
+"""The commands: stereoweave depth | measure | view | video | live | app | check | rectify | train, more."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -49,7 +49,7 @@ def _stereoweave(
         typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit."),
     ] = False,
 ) -> None:
-    """Depth, and any view between the two cameras, from a rectified stereo pair."""
+    """Depth, and any view between the two cameras, from a stereo pair."""
 
 
 for command in (depth, measure, view, video, live, check, rectify, calibrate):

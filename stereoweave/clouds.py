@@ -18,8 +18,8 @@ from stereoweave.io import replacing
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair, check_fits
 
 NO_CAMERA = (
-    "expected a camera, for metres, found none; give its calibration (--calib), or its focal length and the "
-    "distance between the two (--focal-px and --baseline-m)"
+    "expected a camera, for metres, found none; give its calibration (--calib), or, of pictures that need no "
+    "--rectify, its focal length and the distance between the two (--focal-px and --baseline-m)"
 )
 MOST_POINTS = 4_000_000
 # A surface that both cameras see changes by less than this from a pixel to the next: more is a jump.

@@ -23,6 +23,8 @@ _UNKNOWN = 0xFFFFFFFF
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 # CIPA DCG-001: a focal length "in 35 mm film" is one of the same diagonal angle on 36 mm x 24 mm.
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
+# Shares of a view's diagonal: a fisheye lens has 0.15 and more, a telescope up to 50. Else the tag is wrong.
+_SHORTEST, _LONGEST = 0.1, 100
 # Of 3-D cameras that do not write it down, by the makers' data sheets.
 _BASELINES_M = {"FinePix REAL 3D W1": 0.077, "FinePix REAL 3D W3": 0.075, "Nintendo 3DS": 0.035}
 _TURNS = {
@@ -114,9 +116,20 @@ def _multi_picture_tags(content: bytes) -> dict[int, Any]:
 
 
 def _focal_px(tags: Tags, width_px: int, height_px: int) -> float | None:
+    diagonal_px = math.hypot(width_px, height_px)
+    lengths_px = (
+        _focal_on_film_px(tags, diagonal_px),
+        _focal_on_sensor_px(tags, width_px),
+    )
+    return next((px for px in lengths_px if px and _SHORTEST < px / diagonal_px < _LONGEST), None)
+
+
+def _focal_on_film_px(tags: Tags, diagonal_px: float) -> float | None:
     of_film_mm = _positive(tags.get(_FOCAL_35_MM))
-    if of_film_mm:
-        return of_film_mm / _FILM_DIAGONAL_MM * math.hypot(width_px, height_px)
+    return of_film_mm / _FILM_DIAGONAL_MM * diagonal_px if of_film_mm else None
+
+
+def _focal_on_sensor_px(tags: Tags, width_px: int) -> float | None:
     focal_mm, density = _positive(tags.get(_FOCAL_MM)), _positive(tags.get(_FOCAL_PLANE_X))
     taken_px = _positive(tags.get(_WIDTH_PX))
     unit_mm = _UNIT_MM.get(tags.get(_FOCAL_PLANE_UNIT, 2))

@@ -15,6 +15,7 @@ from itertools import count
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, cast
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -90,7 +91,8 @@ class Capture:
         self.name, self.count = " and ".join(sources), len(sources)
         self._captures = [_opened(source) for source in sources]
         first = self._captures[0]
-        self._is_film = first.get(cv2.CAP_PROP_FRAME_COUNT) > 0
+        # Of a picture, or a stream that was written down, no number of frames is known.
+        self._is_film = first.get(cv2.CAP_PROP_FRAME_COUNT) > 0 or Path(sources[0]).is_file()
         rate = first.get(cv2.CAP_PROP_FPS)
         self._step_s = 1 / (rate if rate > 0 else _USUAL_RATE)
         self._newest: Moment | None = None
@@ -216,8 +218,7 @@ class Screen(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
-        host = self.headers.get("Host", "").rpartition(":")[0]
-        if host not in _OWN_NAMES:
+        if urlsplit(f"//{self.headers.get('Host', '')}").hostname not in _OWN_NAMES:
             self.send_error(403, "only for this machine")
         elif self.path == "/":
             self._begin("text/html; charset=utf-8")

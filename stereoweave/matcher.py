@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, UInt8
 from stereoweave.errors import MatcherError, StereoweaveError
 from stereoweave.io import SMALLEST_SIDE_PX
 from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.subpixel import to_subpixel
 from stereoweave.threads import thread_count
 
 _FLOAT32 = "tensor(float)"
@@ -106,15 +107,20 @@ class Matcher:
             confidence=_confidence(maps.confidence_logit, disagreement_px, inside, _plain(left)),
             occluded=~inside | (disagreement_px > _OCCLUSION_STEP_PX),
         )
-        if not refined:
-            return found
+        found = to_subpixel(left, right, found, self.threads)
+        return self.refined(left, right, found) if refined else found
+
+    def refined(
+        self, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], found: Estimate
+    ) -> Estimate:
+        """An estimate of these photographs, matched once more (`refining.refine`), to a part of a pixel."""
         from stereoweave.refining import refine  # Numba takes half a second to import
 
-        return refine(left, right, found, self.threads)
+        return to_subpixel(left, right, refine(left, right, found, self.threads), self.threads)
 
     def sees_whole(self, width: int, height: int) -> bool:
         """Whether a picture of that size is matched at once, and not in strips of rows."""
-        return height <= self._strip_rows(width)
+        return height <= self._strip_rows(width) and width * width * height <= PIXEL_PAIRS_AT_ONCE
 
     def _maps(self, pair: StereoPair) -> Maps:
         """The graph's outputs for a pair: in strips of rows where it is large, blended where they overlap."""

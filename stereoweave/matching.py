@@ -22,11 +22,14 @@ from stereoweave.matcher import PIXEL_PAIRS_AT_ONCE, Matcher, find_occluded, mod
 from stereoweave.ranging import find_range, goes_beyond
 from stereoweave.stereo import Estimate, StereoPair
 
-_CONFIDENT = 0.5
+# A network that is shown what is beyond its range often believes in the end of it, but not quite.
+_CONFIDENT, _CONFIDENT_AT_END = 0.5, 0.9
 # A range is looked for unless all of the picture but so much is certain.
 _DOUBTFUL_PERCENT = 1.0
 # A network is less exact near the ends of its range.
 _MARGIN_PX = 4
+# Disparities this far outside of a range that was given are no rounding, but wrong.
+_OUTSIDE_PX = 1
 # Of the pixel pairs that are matched at once: rows are counted in multiples.
 _FILLED = 0.95
 
@@ -73,10 +76,10 @@ def match(
         matcher: The network.
         pair: The photographs, rectified. Where the left one shows nothing the confidence is 0, and what has
             its match where the right one shows nothing is occluded.
-        range_px: The least and the greatest disparity of the left view in px. If left out, it is looked for
-            where the network, within its own range, is not certain of nearly all.
-        refined: Whether the estimate is brought to fit the photographs (`refining.refine`) at the size that
-            the network sees.
+        range_px: The least and the greatest disparity of the left view in px: what is found outside of it is
+            brought to its nearer end, with confidence 0. If left out, it is looked for where the network,
+            within its own range, is not certain of nearly all.
+        refined: As for `Matcher.estimate`, at the size that the network sees.
 
     Raises:
         StereoweaveError: For a range that is none, or pictures under 32 px in a direction.
@@ -84,7 +87,7 @@ def match(
     seen = _seen_whole(matcher, pair)
     scale = pair.left.shape[1] / seen.left.shape[1]
     if range_px is not None:
-        low_px, high_px = _checked(range_px)
+        low_px, high_px = _checked(range_px, pair.left.shape[1])
         small, found = _matched_within(matcher, pair, seen, (low_px / scale, high_px / scale))
     else:
         small, found = seen, matcher.estimate(seen.left, seen.right)
@@ -92,11 +95,11 @@ def match(
         if beyond_px is not None:
             small, found = _matched_within(matcher, pair, seen, beyond_px)
     if refined:
-        from stereoweave.refining import refine  # Numba takes half a second to import
-
-        found = refine(small.left, small.right, found, matcher.threads)
+        found = matcher.refined(small.left, small.right, found)
     if small.left.shape != pair.left.shape:
         found = enlarge(pair.left, pair.right, found, matcher.threads)
+    if range_px is not None:
+        found = _clipped(found, *range_px)
     return _as_seen(found, pair)
 
 
@@ -106,14 +109,20 @@ def _kept_matcher(path: Path, modified_ns: int, threads: int | None) -> Matcher:
     return Matcher(path, threads=threads)
 
 
-def _checked(range_px: tuple[float, float]) -> tuple[float, float]:
+def _checked(range_px: tuple[float, float], width_px: int) -> tuple[float, float]:
+    """The part of a range that pictures of this width can have."""
     low_px, high_px = range_px
     if not (math.isfinite(low_px) and math.isfinite(high_px) and low_px < high_px):
         raise StereoweaveError(
             f"range_px: expected the least and the greatest disparity in px, got {low_px:g} and {high_px:g}; "
             "leave it out to have it found"
         )
-    return low_px, high_px
+    if low_px >= width_px or high_px <= -width_px:
+        raise StereoweaveError(
+            f"range_px: expected disparities of {-width_px} to {width_px} px, the width of the pictures, "
+            f"got {low_px:g} and {high_px:g}; leave it out to have it found"
+        )
+    return max(low_px, -width_px), min(high_px, width_px)
 
 
 def _seen_whole(matcher: Matcher, pair: StereoPair) -> StereoPair:
@@ -131,21 +140,29 @@ def _reduced(pair: StereoPair, scale: float) -> StereoPair:
     if size[0] >= width or size[1] >= height:
         return pair
     left, right = (cv2.resize(photo, size, interpolation=cv2.INTER_AREA) for photo in (pair.left, pair.right))
-    return StereoPair(left=left, right=right)
+    left_seen, right_seen = (
+        None if seen is None else cv2.resize(seen.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        for seen in (pair.left_seen, pair.right_seen)
+    )
+    return StereoPair(left=left, right=right, left_seen=left_seen, right_seen=right_seen)
 
 
 def _range_beyond(pair: StereoPair, found: Estimate, max_disparity_px: float) -> tuple[float, float] | None:
     """The range of a pair where it goes beyond the network's, within which the estimate was found."""
-    at_end = (found.disparity_px > max_disparity_px - _MARGIN_PX) | (found.disparity_px <= 0)
-    doubtful = ((found.confidence < _CONFIDENT) & ~found.occluded) | at_end
+    doubtful = _doubtful(found, max_disparity_px)
+    if 100 * doubtful.mean() < _DOUBTFUL_PERCENT or not goes_beyond(pair, doubtful, (0, max_disparity_px)):
+        return None
+    return find_range(pair)
+
+
+def _doubtful(found: Estimate, max_disparity_px: float) -> Bool[np.ndarray, "h w"]:
+    """Where the network is not certain, and what it finds may be beyond its range."""
+    near_end = np.abs(found.disparity_px - max_disparity_px / 2) > max_disparity_px / 2 - _MARGIN_PX
+    doubtful = (found.confidence < _CONFIDENT) & ~found.occluded
+    doubtful |= (near_end & (found.confidence < _CONFIDENT_AT_END)) | (found.disparity_px <= 0)
     # Only what is of some size: a network is unsure of every edge.
     small = cv2.resize(doubtful.astype(np.float32), None, fx=1 / 8, fy=1 / 8, interpolation=cv2.INTER_AREA)
-    doubtful = cv2.resize(small, doubtful.shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5
-    if 100 * doubtful.mean() < _DOUBTFUL_PERCENT:
-        return None
-    if not goes_beyond(pair.left, pair.right, doubtful, (0, max_disparity_px)):
-        return None
-    return find_range(pair.left, pair.right)
+    return cv2.resize(small, doubtful.shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5
 
 
 def _matched_within(
@@ -159,12 +176,13 @@ def _matched_within(
     most_px = matcher.max_disparity_px
     if low_px >= 0 and high_px <= most_px:
         return seen, matcher.estimate(seen.left, seen.right)
-    scale = max((high_px - low_px) / (most_px - 2 * _MARGIN_PX), 1.0)
+    scale = max((high_px - low_px) / (most_px - _MARGIN_PX), 1.0)
     small = seen
     if scale > 1:
         small = _reduced(pair, scale * pair.left.shape[1] / seen.left.shape[1])
     ratio = small.left.shape[1] / seen.left.shape[1]
-    return small, _moved(matcher, small, math.floor(low_px * ratio) - _MARGIN_PX)
+    # Not farther than the least: a network takes a plain sky for what is at the lower end of its range.
+    return small, _moved(matcher, small, math.floor(low_px * ratio))
 
 
 def _moved(matcher: Matcher, pair: StereoPair, least_px: int) -> Estimate:
@@ -188,6 +206,17 @@ def _moved(matcher: Matcher, pair: StereoPair, least_px: int) -> Estimate:
 
 def _widened(photo: np.ndarray, before: int, behind: int) -> np.ndarray:
     return cv2.copyMakeBorder(photo, 0, 0, before, behind, cv2.BORDER_REPLICATE)
+
+
+def _clipped(found: Estimate, low_px: float, high_px: float) -> Estimate:
+    """The estimate within a range; what was found outside is not believed."""
+    outside_px = np.maximum(low_px - found.disparity_px, found.disparity_px - high_px)
+    return replace(
+        found,
+        disparity_px=np.clip(found.disparity_px, low_px, high_px),
+        right_disparity_px=np.clip(found.right_disparity_px, low_px, high_px),
+        confidence=np.where(outside_px > _OUTSIDE_PX, np.float32(0), found.confidence),
+    )
 
 
 def _as_seen(found: Estimate, pair: StereoPair) -> Estimate:

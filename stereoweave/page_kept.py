@@ -15,18 +15,19 @@ from stereoweave.clouds import EmptyError, point_cloud, write_glb
 from stereoweave.colour import colour_disparity, colour_range_px
 from stereoweave.errors import StereoweaveError
 from stereoweave.hints import hints
-from stereoweave.io import RangeError
 from stereoweave.matcher import Matcher
 from stereoweave.matching import match
 from stereoweave.measuring import distance
 from stereoweave.preparing import Request, prepare
 from stereoweave.rendering import Renderer
-from stereoweave.report import Summary, summarize
-from stereoweave.results import FILES, Result, needs_camera
-from stereoweave.stereo import Estimate, StereoCamera, StereoPair
+from stereoweave.report import Summary, shrunk, summarize
+from stereoweave.results import FILES, Result, needs_camera, write_files
+from stereoweave.stereo import Estimate, StereoCamera
 
 _LONGER_SIDE_PX = 1280
 _MOST_POINTS = 300_000
+# What lies there twice, once by itself and once in the zip: that of about 8 megapixels.
+_MOST_ZIPPED_BYTES = 300 * 1024**2
 _NO_METRES = "For metres give a calibration file, or the focal length and how far apart the cameras are."
 
 
@@ -64,6 +65,9 @@ def matched(uploads: Uploads, folder: Path, tell: Callable[[float, str], None]) 
     """
     if not uploads.pictures:
         raise StereoweaveError("expected a left and a right picture, or one file with both; found none")
+    for file in (*uploads.pictures, uploads.request.calibration):
+        if file and not file.exists():
+            raise StereoweaveError(f"{file.name} has been put away, as after an hour; give it again")
     tell(0.1, "reading")
     prepared = prepare(uploads.pictures, uploads.request)
     pair = prepared.pair
@@ -78,27 +82,23 @@ def matched(uploads: Uploads, folder: Path, tell: Callable[[float, str], None]) 
     return Kept(
         result=Result(pair=pair, estimate=estimate, summary=summary),
         notes=prepared.notes,
-        renderer=Renderer(*_reduced(pair, estimate)),
+        renderer=Renderer(*shrunk(pair, estimate, _LONGER_SIDE_PX)),
         folder=folder,
     )
 
 
 def write_all(kept: Kept) -> tuple[list[Path], list[str]]:
     """The result's files in all formats, and lines about those that could not be, and what is amiss."""
-    result, files, notes = kept.result, [], []
-    for name, write in FILES.items():
-        if needs_camera(name) and not result.pair.camera:
-            continue
-        try:
-            write(kept.folder / name, result)
-            files.append(kept.folder / name)
-        except (RangeError, EmptyError) as error:
-            notes.append(f"no {name}: {error}")
-    return files, notes + hints(result.pair, result.estimate)
+    result = kept.result
+    names = [name for name in FILES if result.pair.camera or not needs_camera(name)]
+    notes = write_files(kept.folder, names, result) + hints(result.pair, result.estimate)
+    return [file for file in map(kept.folder.joinpath, names) if file.exists()], notes
 
 
-def zipped(file: Path, files: Sequence[Path]) -> Path:
-    """One file that holds the others, which are compressed already or hardly can be."""
+def zipped(file: Path, files: Sequence[Path]) -> Path | None:
+    """One file that holds the others, which are compressed already or hardly can be; None of large ones."""
+    if sum(path.stat().st_size for path in files) > _MOST_ZIPPED_BYTES:
+        return None
     with zipfile.ZipFile(file, "w") as archive:
         for path in files:
             archive.write(path, path.name)
@@ -172,29 +172,6 @@ def numbers(summary: Summary) -> str:
 
 def _metres(depth_m: float | None) -> str:
     return "infinite" if depth_m is None or not np.isfinite(depth_m) else f"{depth_m:.2f} m"
-
-
-def _reduced(pair: StereoPair, estimate: Estimate) -> tuple[StereoPair, Estimate]:
-    """Both at most _LONGER_SIDE_PX long, disparities in pixels of that size; without the camera."""
-    height, width = pair.left.shape[:2]
-    scale = min(1.0, _LONGER_SIDE_PX / max(height, width))
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    left, right = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (pair.left, pair.right))
-
-    def picked(values: np.ndarray) -> np.ndarray:
-        # Each value is one that the map had: a mean over an edge lies nowhere.
-        kept = cv2.resize(values.astype(np.float32), size, interpolation=cv2.INTER_NEAREST_EXACT)
-        return kept.astype(values.dtype)
-
-    scale_x = np.float32(size[0] / width)
-    return StereoPair(
-        left=left, right=right, left_seen=None if pair.left_seen is None else picked(pair.left_seen)
-    ), Estimate(
-        disparity_px=picked(estimate.disparity_px) * scale_x,
-        right_disparity_px=picked(estimate.right_disparity_px) * scale_x,
-        confidence=picked(estimate.confidence),
-        occluded=picked(estimate.occluded),
-    )
 
 
 def _known(result: Result, point: tuple[int, int]) -> str:

@@ -114,6 +114,9 @@ def decode(picture: Image.Image) -> Photograph:
     # First, since TIFF is turned upright by this, and then says so in its tags.
     picture.load()
     tags = exif.read_tags(picture)
+    if picture.mode.startswith(("I", "F")):
+        # Here, where a value that no photograph has is told with the file's name.
+        return Photograph(Image.fromarray(rgb(picture)), tags, None)
     image, note = _in_srgb(picture)
     return Photograph(image, tags, note)
 

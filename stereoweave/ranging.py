@@ -6,10 +6,12 @@ the whole row of the right one, in either direction.
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+
+from stereoweave.stereo import StereoPair
 
 _WIDTH_PX = 384
-_ROWS, _ROWS_OF_A_PART = 32, 12
+_ROWS = 32
 # What is compared: so many rows by so many columns.
 _WINDOW_ROWS, _WINDOW_COLUMNS = 7, 11
 # At most one place in so many columns is looked for, where grey levels vary by so much.
@@ -24,43 +26,34 @@ _SUPPORT = 4
 _CELL_PX = (32, 32, 3)
 _LEAST_MATCHES = 30
 _ENDS_PERCENT = 0.5
-# What the matches did not meet lies beyond them by so much of their range, and so many px of the small ones.
+# What the matches did not meet is nearer by so much of their range, and so many px of the small ones.
 _MARGIN_SHARE, _MARGIN_PX = 0.06, 2.0
 # Of the matches in a part of the picture, so many and such a share have to lie beyond a range.
 _LEAST_BEYOND, _LEAST_SHARE_BEYOND = 6, 0.1
-_SLACK_PX = 1.5
+_SLACK_PX = 0.6
 
 
-def find_range(
-    left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]
-) -> tuple[float, float] | None:
-    """The least and the greatest disparity of the left view in px, with a margin, negative ones included.
+def find_range(pair: StereoPair) -> tuple[float, float] | None:
+    """The least and the greatest disparity of the left view in px, negative ones included.
+
+    The greatest has a margin, for what the matches did not meet. The least has none: a network takes a plain
+    sky for what is at the lower end of its range (5 px lower doubles the wrong pixels of a rendered ship).
 
     None where too little of one picture is found in the other, as in plain pictures, or in two that are no
-    pair.
-
-    Args:
-        left: The left photograph of a rectified pair, uint8 RGB [H, W, 3].
-        right: The right one, of the same size.
+    pair. What the pictures do not show is not looked at.
     """
-    scale = _scale(left)
-    disparity_px = _disparities(left, right, None)
+    disparity_px = _disparities(pair, None)
     if len(disparity_px) < _LEAST_MATCHES:
         return None
     low_px, high_px = np.percentile(disparity_px, [_ENDS_PERCENT, 100 - _ENDS_PERCENT])
-    margin_px = _MARGIN_SHARE * (high_px - low_px) + _MARGIN_PX * scale
-    return float(low_px - margin_px), float(high_px + margin_px)
+    margin_px = _MARGIN_SHARE * (high_px - low_px) + _MARGIN_PX * _scale(pair.left)
+    return float(low_px), float(high_px + margin_px)
 
 
-def goes_beyond(
-    left: UInt8[np.ndarray, "h w 3"],
-    right: UInt8[np.ndarray, "h w 3"],
-    where: Bool[np.ndarray, "h w"],
-    range_px: tuple[float, float],
-) -> bool:
+def goes_beyond(pair: StereoPair, where: Bool[np.ndarray, "h w"], range_px: tuple[float, float]) -> bool:
     """Whether something in a part of the left picture has a disparity outside of a range."""
-    slack_px = _SLACK_PX * _scale(left)
-    disparity_px = _disparities(left, right, where)
+    slack_px = _SLACK_PX * _scale(pair.left)
+    disparity_px = _disparities(pair, where)
     beyond = (disparity_px < range_px[0] - slack_px) | (disparity_px > range_px[1] + slack_px)
     return bool(beyond.sum() >= max(_LEAST_BEYOND, _LEAST_SHARE_BEYOND * len(beyond)))
 
@@ -71,47 +64,14 @@ def _scale(photo: UInt8[np.ndarray, "h w 3"]) -> float:
     return width / min(width, _WIDTH_PX)
 
 
-def _disparities(
-    left: UInt8[np.ndarray, "h w 3"],
-    right: UInt8[np.ndarray, "h w 3"],
-    where: Bool[np.ndarray, "h w"] | None,
-) -> Float32[np.ndarray, " n"]:
+def _disparities(pair: StereoPair, where: Bool[np.ndarray, "h w"] | None) -> Float[np.ndarray, " n"]:
     """The disparities in px of places that stand out, `where` that is wished if given."""
-    small_left, small_right = _small_grey(left), _small_grey(right)
-    wanted = np.ones(small_left.shape, bool)
+    left, right = _small_grey(pair.left), _small_grey(pair.right)
+    wanted = _inner(pair.left_seen, left)
     if where is not None:
-        size = small_left.shape[::-1]
-        wanted = cv2.resize(where.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-    matches = _supported(row_matches(small_left, small_right, wanted))
-    return (matches[:, 2] * _scale(left)).astype(np.float32)
-
-
-def row_matches(
-    left: Float32[np.ndarray, "h w"], right: Float32[np.ndarray, "h w"], wanted: Bool[np.ndarray, "h w"]
-) -> Int[np.ndarray, "n 3"]:
-    """Column, row and disparity in px of what both grey pictures show on a row, and nothing else is like."""
-    height, width = left.shape
-    rows = np.linspace(_WINDOW_ROWS // 2, height - 1 - _WINDOW_ROWS // 2, min(_ROWS, height // 4))
-    rows = rows.round().astype(int)
-    if not wanted.all():
-        most = np.argsort(wanted[rows].sum(1))[-_ROWS_OF_A_PART:]
-        rows = rows[np.sort(most)]
-    at, columns = _outstanding(left, rows, wanted)
-    own, other = _windows(left, rows), _windows(right, rows)
-    found = np.full(columns.shape, -width)
-    for i in range(len(rows)):
-        places = columns[at == i]
-        likeness = own[i, places] @ other[i].T
-        best = likeness.argmax(1)
-        highest = likeness.max(1)
-        near = np.abs(np.arange(width) - best[:, None]) <= _PEAK_PX
-        second = np.where(near, -1, likeness).max(1)
-        back = (other[i, best] @ own[i].T).argmax(1)
-        alone = 1 - highest <= _MOST_AMBIGUOUS * (1 - second)
-        sure = (highest >= _LEAST_LIKENESS) & alone & (np.abs(back - places) <= 1)
-        found[at == i] = np.where(sure, best, -width)
-    sure = found >= 0
-    return np.stack([columns[sure], rows[at[sure]], (columns - found)[sure]], axis=1)
+        wanted &= _small_mask(where, left)
+    matches = _supported(_row_matches(left, right, wanted, _inner(pair.right_seen, right)))
+    return matches[:, 2] * _scale(pair.left)
 
 
 def _small_grey(photo: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h2 w2"]:
@@ -121,37 +81,100 @@ def _small_grey(photo: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h2 w2
     return cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
+def _small_mask(
+    mask: Bool[np.ndarray, "h w"], small: Float32[np.ndarray, "h2 w2"]
+) -> Bool[np.ndarray, "h2 w2"]:
+    return cv2.resize(mask.astype(np.uint8), small.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+
+
+def _inner(
+    seen: Bool[np.ndarray, "h w"] | None, small: Float32[np.ndarray, "h2 w2"]
+) -> Bool[np.ndarray, "h2 w2"]:
+    """Where a small picture shows something in all of the window: what begins beside it is no texture."""
+    if seen is None:
+        return np.ones(small.shape, bool)
+    window = np.ones((_WINDOW_ROWS + 2, _WINDOW_COLUMNS + 2), np.uint8)
+    return cv2.erode(_small_mask(seen, small).astype(np.uint8), window) > 0
+
+
+def _row_matches(
+    left: Float32[np.ndarray, "h w"],
+    right: Float32[np.ndarray, "h w"],
+    wanted: Bool[np.ndarray, "h w"],
+    seen: Bool[np.ndarray, "h w"],
+) -> Float[np.ndarray, "n 3"]:
+    """Column, row and disparity in px of what both grey pictures show on a row, and nothing else is like.
+
+    Args:
+        left: The left picture, in grey levels.
+        right: The right one.
+        wanted: Where the left one is looked at.
+        seen: Where the right one is.
+    """
+    height = left.shape[0]
+    rows = np.linspace(_WINDOW_ROWS // 2, height - 1 - _WINDOW_ROWS // 2, min(_ROWS, height // 4))
+    rows = rows.round().astype(int)
+    rows = rows[wanted[rows].any(1)]
+    own, other = _windows(left, rows), _windows(right, rows) * seen[rows, None]
+    found = [np.zeros((0, 3))]
+    for row, row_own, row_other, columns in zip(
+        rows, own, other, _outstanding(left, rows, wanted), strict=True
+    ):
+        columns, partners = _partners(row_own, row_other, columns)
+        found.append(np.stack([columns, np.full(len(columns), row), columns - partners], axis=1))
+    return np.concatenate(found)
+
+
+def _partners(
+    own: Float32[np.ndarray, "k w"], other: Float32[np.ndarray, "k w"], columns: Int[np.ndarray, " n"]
+) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """The columns of a row that are found in the other picture's, and where, to a part of a pixel."""
+    # Not a product of matrices: NumPy would use all cores, which may be more than the caller allows.
+    likeness = np.einsum("kn,kw->nw", own[:, columns], other)
+    width = likeness.shape[1]
+    each, best = np.arange(len(columns)), likeness.argmax(1)
+    before, highest, behind = (likeness[each, np.clip(best + step, 0, width - 1)] for step in (-1, 0, 1))
+    near = np.clip(best[:, None] + np.arange(-_PEAK_PX, _PEAK_PX + 1), 0, width - 1)
+    np.put_along_axis(likeness, near, -1, 1)
+    sure = (highest >= _LEAST_LIKENESS) & (1 - highest <= _MOST_AMBIGUOUS * (1 - likeness.max(1)))
+    back = np.einsum("kn,kw->nw", other[:, best[sure]], own).argmax(1)
+    sure[sure] = np.abs(back - columns[sure]) <= 1
+    # The top of the parabola through the highest likeness and those beside it.
+    bend = np.maximum(2 * highest - before - behind, 1e-6)
+    top = best + np.clip((behind - before) / (2 * bend), -0.5, 0.5)
+    return columns[sure], top[sure]
+
+
 def _outstanding(
     grey: Float32[np.ndarray, "h w"], rows: Int[np.ndarray, " r"], wanted: Bool[np.ndarray, "h w"]
-) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """The column of most contrast in every _SPACING_PX of the rows, where wanted: its row's index, and it."""
-    steps = np.abs(cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=1 / 8))[rows]
+) -> list[Int[np.ndarray, " n"]]:
+    """Of each row the column of most contrast in every _SPACING_PX, where wanted."""
+    steps = np.abs(cv2.Sobel(grey, cv2.CV_32F, 1, 0))[rows]
     count = grey.shape[1] // _SPACING_PX
     cells = steps[:, : count * _SPACING_PX].reshape(len(rows), count, _SPACING_PX)
     columns = cells.argmax(2) + _SPACING_PX * np.arange(count)
-    chosen = np.take_along_axis(wanted[rows], columns, 1)
-    return np.nonzero(chosen)[0], columns[chosen]
+    return [places[ok[places]] for places, ok in zip(columns, wanted[rows], strict=True)]
 
 
-def _windows(grey: Float32[np.ndarray, "h w"], rows: Int[np.ndarray, " r"]) -> Float32[np.ndarray, "r w k"]:
-    """The window around each pixel of the rows, its mean taken off, of length 1; 0 where it is plain."""
+def _windows(grey: Float32[np.ndarray, "h w"], rows: Int[np.ndarray, " r"]) -> Float32[np.ndarray, "r k w"]:
+    """The window around each pixel of the rows, freed of brightness, of length 1; 0 where it is plain."""
+    size = (_WINDOW_COLUMNS, _WINDOW_ROWS)
+    uneven = grey - cv2.blur(grey, size)
+    contrast = np.sqrt(cv2.blur(uneven * uneven, size))
+    length = contrast * np.sqrt(np.float32(_WINDOW_ROWS * _WINDOW_COLUMNS))
+    factor = np.where(contrast < _LEAST_CONTRAST_LEVELS, 0, 1 / np.maximum(length, 1e-6)).astype(np.float32)
     beside = _WINDOW_COLUMNS // 2
-    around = cv2.copyMakeBorder(grey, 0, 0, beside, beside, cv2.BORDER_REPLICATE)
-    views = np.lib.stride_tricks.sliding_window_view(around, (_WINDOW_ROWS, _WINDOW_COLUMNS))
-    windows = views[rows - _WINDOW_ROWS // 2].reshape(
-        len(rows), grey.shape[1], _WINDOW_ROWS * _WINDOW_COLUMNS
-    )
-    windows = windows - windows.mean(2, keepdims=True)
-    length = np.sqrt(np.einsum("rwk,rwk->rw", windows, windows))
-    plain = length < _LEAST_CONTRAST_LEVELS * np.sqrt(windows.shape[2])
-    return windows * np.where(plain, 0, 1 / np.maximum(length, 1e-6))[..., None].astype(np.float32)
+    around = cv2.copyMakeBorder(uneven, 0, 0, beside, beside, cv2.BORDER_REPLICATE)
+    views = np.lib.stride_tricks.sliding_window_view(around, size[::-1])[rows - _WINDOW_ROWS // 2]
+    windows = views.transpose(0, 2, 3, 1).reshape(len(rows), _WINDOW_ROWS * _WINDOW_COLUMNS, grey.shape[1])
+    return windows * factor[rows, None]
 
 
-def _supported(matches: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, "m 3"]:
+def _supported(matches: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
     """The matches that enough others beside them have a like disparity."""
     if not len(matches):
         return matches
-    cells = matches // _CELL_PX
+    cells = (matches // _CELL_PX).astype(int)
     cells = cells - cells.min(0) + 1
     counts = np.zeros(cells.max(0) + 2, int)
     np.add.at(counts, tuple(cells.T), 1)

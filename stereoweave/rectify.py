@@ -11,8 +11,9 @@ from stereoweave.calibration import Optics, Rig, size_of
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import StereoCamera, StereoPair
 
-# A picture is looked at in this many cells a side when the largest rectangle is sought.
-_CELLS = 256
+# A picture is looked at in this many cells along its longer side when the largest rectangle is sought, and
+# in no fewer than these along its shorter one: a border spoils whole cells.
+_CELLS, _LEAST_CELLS = 256, 32
 # Where a polynomial of distortion is searched for the radius at which it turns back.
 _RADIUS_STEPS = 2000
 
@@ -196,7 +197,7 @@ def _what_was_done(rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], pair: St
 
 def _largest_rectangle(full: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
     """Rows and columns of a rectangle that is full everywhere: the largest of whole cells, then grown."""
-    cell_px = max(1, -(-max(full.shape) // _CELLS))
+    cell_px = max(1, min(-(-max(full.shape) // _CELLS), min(full.shape) // _LEAST_CELLS))
     top, bottom, start, stop = (cell_px * side for side in _largest_of_cells(_full_cells(full, cell_px)))
     bottom, stop = min(bottom, full.shape[0]), min(stop, full.shape[1])
     for _ in range(cell_px):

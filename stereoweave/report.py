@@ -21,7 +21,7 @@ from stereoweave.colour import (
     legend_colours,
 )
 from stereoweave.io import replacing
-from stereoweave.rendering import render
+from stereoweave.rendering import Renderer
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
 POSITIONS = tuple(step / 8 for step in range(-2, 11))
@@ -100,13 +100,15 @@ def write_report(
 
 def _fields(pair: StereoPair, estimate: Estimate, summary: Summary, threads: int | None) -> dict[str, object]:
     """Everything that the template asks for, by name."""
-    small, small_estimate = _shrunk(pair, estimate)
-    views = [
-        render(small.left, small.right, small_estimate, position, threads=threads) for position in POSITIONS
-    ]
+    small, small_estimate = shrunk(pair, estimate, _LONGER_SIDE_PX)
+    renderer = Renderer(small, small_estimate, threads=threads)
+    views = [renderer.view(position) for position in POSITIONS]
     seen = slice(None) if pair.left_seen is None else pair.left_seen
     range_px = colour_range_px(np.atleast_2d(estimate.disparity_px[seen]))
-    shown_size = (small.left.shape[1], small.left.shape[0])
+    height, width = small.left.shape[:2]
+    depth = colour_disparity(_picked(estimate.disparity_px, (width, height)), range_px)
+    if small.left_seen is not None:
+        depth[~small.left_seen] = 0
     data = {
         "width_px": summary.width_px,
         "height_px": summary.height_px,
@@ -119,8 +121,8 @@ def _fields(pair: StereoPair, estimate: Estimate, summary: Summary, threads: int
     return {
         "title": html.escape(title),
         "subtitle": html.escape(f"{size}, matched by {summary.model} in {summary.estimate_ms:.0f} ms"),
-        "width": small.left.shape[1],
-        "height": small.left.shape[0],
+        "width": width,
+        "height": height,
         "views": "\n".join(map(_view_tag, POSITIONS, (view.image for view in views))),
         "first": POSITIONS[0],
         "last": POSITIONS[-1],
@@ -130,7 +132,7 @@ def _fields(pair: StereoPair, estimate: Estimate, summary: Summary, threads: int
         "numbers": "\n".join(_number_tag(name, value) for name, value in _numbers(summary)),
         "left": _data_uri(small.left),
         "depth_name": "Depth" if pair.camera else "Disparity",
-        "depth": _data_uri(colour_disparity(_picked(estimate.disparity_px, shown_size), range_px)),
+        "depth": _data_uri(depth),
         "confidence": _data_uri(colour_confidence(small_estimate.confidence, small_estimate.occluded)),
         "ramp": ",".join(legend_colours(24)),
         "ticks": "".join(f"<span>{tick}</span>" for tick in _ticks(range_px, pair.camera)),
@@ -140,26 +142,28 @@ def _fields(pair: StereoPair, estimate: Estimate, summary: Summary, threads: int
     }
 
 
-def _shrunk(pair: StereoPair, estimate: Estimate) -> tuple[StereoPair, Estimate]:
-    """Both at most _LONGER_SIDE_PX long, disparities in pixels of that size."""
+def shrunk(pair: StereoPair, estimate: Estimate, longer_side_px: int) -> tuple[StereoPair, Estimate]:
+    """Both for showing, at most `longer_side_px` long, disparities in its pixels; no camera."""
     height, width = estimate.disparity_px.shape
-    scale = _LONGER_SIDE_PX / max(height, width)
-    if scale >= 1:
-        return pair, estimate
+    scale = min(1.0, longer_side_px / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     scale_x = np.float32(size[0] / width)
     left, right = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (pair.left, pair.right))
-    return StereoPair(left=left, right=right), Estimate(
+    left_seen, right_seen = (
+        None if seen is None else _picked(seen, size) for seen in (pair.left_seen, pair.right_seen)
+    )
+    return StereoPair(left=left, right=right, left_seen=left_seen, right_seen=right_seen), Estimate(
         disparity_px=_picked(estimate.disparity_px, size) * scale_x,
         right_disparity_px=_picked(estimate.right_disparity_px, size) * scale_x,
         confidence=_picked(estimate.confidence, size),
-        occluded=_picked(estimate.occluded.astype(np.uint8), size).astype(bool),
+        occluded=_picked(estimate.occluded, size),
     )
 
 
 def _picked(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """The map at another size (width, height), each value one it had: a mean over an edge lies nowhere."""
-    return cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT)
+    numbers = values.view(np.uint8) if values.dtype == bool else values
+    return cv2.resize(numbers, size, interpolation=cv2.INTER_NEAREST_EXACT).view(values.dtype)
 
 
 def _levels(estimate: Estimate) -> dict[str, object]:

@@ -157,7 +157,7 @@ def make_depth(
         names = tuple(picture.name for picture in pictures)
         summary = summarize(pair, estimate, pictures=names, model=order.model, estimate_ms=estimate_ms)
         result = Result(pair=pair, estimate=estimate, summary=summary, threads=order.threads)
-        notes = [*prepared.notes, *left_out, *_write_files(folder, files, result)]
+        notes = [*prepared.notes, *left_out, *write_files(folder, files, result)]
         notes += hints(pair, estimate)
     return summary, notes
 
@@ -190,17 +190,22 @@ def _results_in(out: Path) -> Iterator[Path]:
     """A temporary folder, whose files move into `out` in the end; after an error nothing of either is left.
 
     Files of an earlier result that this one does not have are removed, so that all in `out` belong together.
+    Where no disparity.pfm is there, which every result has and is moved first, they are the user's, and stay.
     """
     standing = place_for(*(out / file for file in FILES))
     with tempfile.TemporaryDirectory(prefix=".stereoweave-", dir=standing) as name:
         yield Path(name)
         out.mkdir(parents=True, exist_ok=True)
+        is_earlier_result = (out / "disparity.pfm").exists()
         for file in FILES:
             fresh = Path(name, file)
-            fresh.replace(out / file) if fresh.exists() else (out / file).unlink(missing_ok=True)
+            if fresh.exists():
+                fresh.replace(out / file)
+            elif is_earlier_result:
+                (out / file).unlink(missing_ok=True)
 
 
-def _write_files(folder: Path, files: Sequence[str], result: Result) -> list[str]:
+def write_files(folder: Path, files: Sequence[str], result: Result) -> list[str]:
     """Writes them; the lines that say which of them could not be or hold less, and why."""
     notes = []
     for file in files:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -47,16 +48,30 @@ def rectify(
     from stereoweave.preparing import Request, prepare
     from stereoweave.rectify import cropped
 
+    _spare(pictures, calib, out)
+    place_for(out / "left.png", out / "right.png", out / "calib.yml")
     prepared = prepare(pictures, Request(arrangement=arrangement, calibration=calib, rectify=True))
     pair = cropped(prepared.pair)
-    place_for(out / "left.png", out / "right.png", out / "calib.yml")
     write_image(out / "left.png", pair.left)
     write_image(out / "right.png", pair.right)
     if pair.camera:
         write_rig(out / "calib.yml", rig_of(pair))
-    else:
-        (out / "calib.yml").unlink(missing_ok=True)
     typer.echo("\n".join([f"{out}: left.png and right.png, {words(size_of(pair))} px", *prepared.notes]))
+
+
+def _spare(pictures: Sequence[Path], calib: Path | None, out: Path) -> None:
+    """An error where results would take the place of what was given, or a calibration not be of theirs."""
+    given = [file for file in (*pictures, calib) if file and file.exists()]
+    for result in (out / "left.png", out / "right.png", out / "calib.yml"):
+        if result.exists() and any(result.samefile(file) for file in given):
+            raise StereoweaveError(
+                f"{result}: expected a place for a result, found a file that was given; choose another --out"
+            )
+    if calib is None and (out / "calib.yml").exists():
+        raise StereoweaveError(
+            f"{out / 'calib.yml'}: expected no calibration beside pictures rectified without one, found one; "
+            "choose another --out"
+        )
 
 
 def calibrate(  # noqa: PLR0913 - each is a word of the command line

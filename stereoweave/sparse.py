@@ -15,7 +15,6 @@ from jaxtyping import Float, Float32, UInt8
 
 # Corners are found and paired in copies of at most so many pixels.
 _PIXELS = 1_500_000
-_PIXELS_FOR_ROWS = 310_000
 _CORNER_QUALITY = 0.005
 _CORNER_DISTANCE_PX = 4
 _TILES = 4
@@ -58,21 +57,13 @@ def sparse_matches(
     One in five or so is wrong: the caller's geometry sorts them out.
     """
     greys = [cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY) for photo in (left, right)]
-    found = _paired(greys, _PIXELS, most, rows_off=_MOST_ROWS_OFF * left.shape[0])
+    found = _paired(greys, most, rows_off=_MOST_ROWS_OFF * left.shape[0])
     return _exact(greys[0], greys[1], found)
 
 
-def row_matches(
-    left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], *, most: int = 1000
-) -> Matches:
-    """As `sparse_matches`, of a rectified pair, faster and only to a pixel or two of a reduced copy."""
-    greys = [cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY) for photo in (left, right)]
-    return _paired(greys, _PIXELS_FOR_ROWS, most, rows_off=_ROWS_OFF_PX * _reduction(left, _PIXELS_FOR_ROWS))
-
-
-def _paired(greys: list[UInt8[np.ndarray, "h w"]], pixels: int, most: int, rows_off: float) -> Matches:
+def _paired(greys: list[UInt8[np.ndarray, "h w"]], most: int, rows_off: float) -> Matches:
     """Corners of both pictures that are each other's best, by at most so many rows apart."""
-    (left, left_windows), (right, right_windows) = (_corners(grey, pixels, most) for grey in greys)
+    (left, left_windows), (right, right_windows) = (_corners(grey, most) for grey in greys)
     if not (len(left) and len(right)):
         return Matches(np.zeros((0, 2)), np.zeros((0, 2)))
     alike = left_windows @ right_windows.T
@@ -88,10 +79,10 @@ def _paired(greys: list[UInt8[np.ndarray, "h w"]], pixels: int, most: int, rows_
 
 
 def _corners(
-    grey: UInt8[np.ndarray, "h w"], pixels: int, most: int
+    grey: UInt8[np.ndarray, "h w"], most: int
 ) -> tuple[Float[np.ndarray, "n 2"], Float32[np.ndarray, "n k"]]:
     """Corners in px of the full picture, and the windows around them."""
-    factor = _reduction(grey, pixels)
+    factor = _reduction(grey)
     height, width = grey.shape
     if factor > 1:
         small = (round(width / factor), round(height / factor))
@@ -139,7 +130,7 @@ def _exact(left: UInt8[np.ndarray, "h w"], right: UInt8[np.ndarray, "h w"], foun
         step = np.linalg.solve(normal, missed)[..., 0]
         exact -= np.clip(step, -1, 1)
     seen, _ = _normalised(_windows(right, exact, _EXACT_RADIUS, 1.0))
-    reach_px = 1 + 2 * _reduction(left, _PIXELS)
+    reach_px = 1 + 2 * _reduction(left)
     fits = (np.abs(step).max(1) < _CONVERGED_PX) & ((seen * window).sum(1) > _LEAST_EXACT_CORRELATION)
     fits &= np.abs(exact - found.right_px).max(1) < reach_px
     return Matches(found.left_px[fits], exact[fits])
@@ -170,6 +161,6 @@ def _normalised(
     return centred / length, length
 
 
-def _reduction(picture: np.ndarray, pixels: int) -> float:
-    """By how much the picture is shrunk to have at most so many pixels; 1 where it has."""
-    return max(1.0, math.sqrt(picture.shape[0] * picture.shape[1] / pixels))
+def _reduction(picture: np.ndarray) -> float:
+    """By how much the picture is shrunk to have at most _PIXELS; 1 where it has."""
+    return max(1.0, math.sqrt(picture.shape[0] * picture.shape[1] / _PIXELS))

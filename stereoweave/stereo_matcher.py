@@ -43,6 +43,8 @@ class StereoMatcher:
     ) -> None:
         self._least_px, self._count, self._refined = minDisparity, numDisparities, refined
         self._min_confidence = min_confidence
+        if not 0 <= min_confidence <= 1:
+            raise StereoweaveError(f"min_confidence: expected a probability, 0 to 1, found {min_confidence}")
         self._check_range()
         self._matcher = Matcher(model, threads=threads)
 

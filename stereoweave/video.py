@@ -34,13 +34,11 @@ from stereoweave.threads import thread_count
 # A part is lost when a run is interrupted; each begins with a key frame.
 _PART_S = 10
 _SURVEYED_FRAMES, _HINTED_FRAMES = 24, 3
-# Where no survey reads the whole film, its first minute is looked at.
-_BEGINNING_S = 60
 _SURVEYED_EVERY_PX = 4
 # Single wrong pixels do not widen the range of a film, and what moves may come nearer between those frames.
 _OUTER_PERCENT, _MARGIN_PX = 0.5, 8.0
 _NAMED_PROBLEMS = 3
-_STEPS_PER_PX = 256
+_STEPS_PER_PX, _MOST_GREY16_PX = 256, 255.99
 
 PACKINGS = {
     "side_by_side": Packing("left_right", 3),
@@ -112,25 +110,38 @@ class Order:
             return LAYOUTS[self.layout].positions
         return () if self.position is None else (self.position,)
 
-    @property
-    def needs_survey(self) -> bool:
-        """Whether something has to be known of the whole film first."""
-        converged = self.layout is not None and LAYOUTS[self.layout].converged
-        return self.depth or self.layout == "rgbd" or (converged and self.convergence_px is None)
-
     def picture(self, pair: StereoPair, estimate: Estimate, survey: "Survey") -> Picture:
         """What is shown of one frame."""
         if self.depth:
             return colour_disparity(estimate.disparity_px, survey.range_px)
         if self.depth16:
             return _grey16(estimate.disparity_px)
-        plane_px = survey.middle_px if self.convergence_px is None else self.convergence_px
         renderer = Renderer(
-            pair, estimate, strength=self.strength, convergence_px=plane_px, threads=self.threads
+            pair,
+            estimate,
+            strength=self.strength,
+            convergence_px=self._plane_px(survey),
+            threads=self.threads,
         )
         if self.position is not None:
             return renderer.view(self.position).image
         return LAYOUTS[str(self.layout)].compose(renderer, Choices(range_px=survey.range_px))
+
+    def _plane_px(self, survey: "Survey") -> float:
+        """The disparity that stays in place from view to view."""
+        if self.convergence_px is not None:
+            return self.convergence_px
+        return survey.middle_px if self.layout and LAYOUTS[self.layout].converged else 0.0
+
+    def loses(self, survey: "Survey") -> list[str]:
+        """A line for what the file cannot hold of the film; none where it holds all."""
+        low_px, high_px = survey.range_px
+        if not self.depth16 or (low_px >= 0 and high_px <= _MOST_GREY16_PX):
+            return []
+        return [
+            f"--depth16 holds 0 to {_MOST_GREY16_PX} px: of this film's disparities, {low_px:.1f} to "
+            f"{high_px:.1f} px, what lies beyond is clipped; --depth shows all of them in colours"
+        ]
 
     def says(self, survey: "Survey") -> dict[str, str]:
         """What the file says about itself: how to get back from its pictures to disparities."""
@@ -152,12 +163,12 @@ class Survey(NamedTuple):
     Attributes:
         range_px: The disparities that colours are spread over.
         middle_px: That of the middle of the scene.
-        within_px: The range that is matched; None where the network's own has all of it.
+        within_px: The range that is matched; None where the network's own has all of it, as far as is known.
     """
 
-    range_px: tuple[float, float] = (0.0, 1.0)
-    middle_px: float = 0.0
-    within_px: tuple[float, float] | None = None
+    range_px: tuple[float, float]
+    middle_px: float
+    within_px: tuple[float, float] | None
 
 
 @dataclass
@@ -208,9 +219,9 @@ def make_film(footage: Footage, sources: Sequence[Path], out: Path, order: Order
         if parts.files:
             maker = _Maker.from_state(order, matcher, parts.state())
         else:
-            survey, lines = _look(footage, matcher, bar, whole=order.needs_survey)
+            survey, lines = _look(footage, matcher, bar)
             maker = _Maker(order, matcher, survey)
-            for line in lines:
+            for line in [*lines, *order.loses(survey)]:
                 console.print(line, markup=False, highlight=False, soft_wrap=True)
         done, total = maker.tally.frames, footage.frame_count
         shown = bar.add_task(out.name, total=total, completed=done, loss="", rate="")
@@ -259,23 +270,20 @@ class _Maker:
         """What is shown of each frame, with its time; the bar follows."""
         for frame in frames:
             pair = StereoPair(left=frame.left, right=frame.right)
-            estimate = self._estimate(pair)
+            estimate = match(self._matcher, pair, range_px=self.survey.within_px)
             estimate = self._steadier(frame.left, frame.right, estimate)
             self.tally.note(frame)
             self.tally.cuts = self._steadier.cuts
             bar.update(shown, completed=self.tally.frames)
             yield frame.time, self._order.picture(pair, estimate, self.survey)
 
-    def _estimate(self, pair: StereoPair) -> Estimate:
-        if self.survey.within_px is None:
-            return self._matcher.estimate(pair.left, pair.right)
-        return match(self._matcher, pair, range_px=self.survey.within_px)
 
+def _look(footage: Footage, matcher: Matcher, bar: Progress) -> tuple[Survey, list[str]]:
+    """Range and middle of the disparities all over the film; and what seems amiss.
 
-def _look(footage: Footage, matcher: Matcher, bar: Progress, *, whole: bool) -> tuple[Survey, list[str]]:
-    """Range and middle of the disparities all over the film, if it is the whole; and what seems amiss."""
-    beginning = min(footage.frame_count, round(_BEGINNING_S * footage.rate) or 1)
-    picked = _spread(footage.frame_count, _SURVEYED_FRAMES) if whole else _spread(beginning, _HINTED_FRAMES)
+    All over: titles, with which a film may begin, say nothing about its range.
+    """
+    picked = _spread(footage.frame_count, _SURVEYED_FRAMES)
     hinted = set(picked[len(picked) // 6 :: -(-len(picked) // _HINTED_FRAMES)])
     shown = bar.add_task("looking at its depth", total=len(picked), loss="", rate="")
     thinned, middles_px, amiss = [], [], []
@@ -288,12 +296,9 @@ def _look(footage: Footage, matcher: Matcher, bar: Progress, *, whole: bool) -> 
         if index in hinted:
             amiss.append([f"{_clock(frame.time)} {line}" for line in hints(pair, estimate)])
         bar.advance(shown)
-    told = _told(amiss, footage.arrangement)
     all_px = np.vstack(thinned)
-    within_px = _within_px(all_px, matcher)
-    if not whole:
-        return Survey(within_px=within_px), told
-    return Survey(colour_range_px(all_px), float(np.median(middles_px)), within_px), told
+    survey = Survey(colour_range_px(all_px), float(np.median(middles_px)), _within_px(all_px, matcher))
+    return survey, _told(amiss, footage.arrangement)
 
 
 def _within_px(disparity_px: Float[np.ndarray, "h w"], matcher: Matcher) -> tuple[float, float] | None:

@@ -1,5 +1,6 @@
 """The page in a browser: the command serves it, Chromium loads it, and nobody else is asked for anything."""
 
+import http.client
 import io
 import os
 import re
@@ -12,6 +13,7 @@ import sys
 import zipfile
 import zlib
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +23,16 @@ from PIL import Image
 
 from stereoweave.cli import main
 from stereoweave.colour import colour_disparity, colour_range_px
+from stereoweave.errors import StereoweaveError
 from stereoweave.io import read_image, read_pfm
+from stereoweave.page_kept import Uploads, matched, zipped
+from stereoweave.preparing import Request
 from stereoweave.results import FILES
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 SIZE = (640, 480)
+UNDRAWN = "does not draw in three dimensions"
+WINDOW = {"width": 1280, "height": 1000}
 SERVER = [
     sys.executable,
     "-c",
@@ -92,7 +99,7 @@ class Visit:
 
     def __init__(self, browser: Any, address: str) -> None:
         self.asked: list[str] = []
-        self._context = browser.new_context(viewport={"width": 1280, "height": 1000})
+        self._context = browser.new_context(viewport=WINDOW)
         self.page = self._context.new_page()
         self.page.set_default_timeout(PATIENCE_MS)
         self.page.on("request", lambda request: self.asked.append(request.url))
@@ -105,11 +112,19 @@ class Visit:
             self.page.locator(f"#{field} input[type=file]").set_input_files(file)
             self.page.locator(f"#{field}").get_by_text(file.name.rsplit(".", 1)[0]).first.wait_for()
 
+    def take_back(self) -> None:
+        """Empties the fields of pictures."""
+        for _ in range(self.page.get_by_label("Clear").count()):
+            self.page.get_by_label("Clear").first.click()
+
     def find(self) -> str:
-        """What the page says after its work, when all files are there."""
-        self.page.click("#find")
+        """What the page says after its work, which is something new, when all files are there."""
         said = self.page.locator("#status .told")
-        said.wait_for()
+        before = said.inner_text() if said.count() else ""
+        self.page.click("#find")
+        self.page.wait_for_function(
+            "before => (document.querySelector('#status .told')?.innerText ?? before) !== before", arg=before
+        )
         if said.get_attribute("role") == "status":
             self.page.get_by_role("tab", name="Files").click()
             self.page.locator("#files a").first.wait_for()
@@ -139,6 +154,20 @@ def visit(browser, address) -> Iterator[Visit]:
     visit = Visit(browser, address)
     yield visit
     visit.close()
+
+
+@pytest.fixture(scope="module")
+def hasty_visit(browser, address) -> Iterator[Visit]:
+    visit = Visit(browser, address)
+    yield visit
+    visit.close()
+
+
+@pytest.fixture
+def hasty(hasty_visit) -> Visit:
+    """A visitor who gives what is no pair, one thing after the other."""
+    hasty_visit.take_back()
+    return hasty_visit
 
 
 @pytest.fixture(scope="module")
@@ -221,6 +250,7 @@ def test_the_point_cloud_is_drawn(answered):
             break
         answered.page.wait_for_timeout(500)
     assert drawn_percent() > 4
+    assert answered.page.get_by_text(UNDRAWN).count() == 0
 
 
 def test_visitors_do_not_see_each_others_results(answered, visit, tmp_path):
@@ -238,20 +268,68 @@ def test_the_sample_needs_one_click_and_has_metres(visit):
     visit.page.locator("#status").get_by_text("depth from").wait_for()
 
 
-def test_what_is_no_picture_is_told_by_its_name_alone(visit, tmp_path):
+def test_a_focal_length_that_can_be_none_is_told(hasty):
+    hasty.give(left=EXAMPLES / "left.png", right=EXAMPLES / "right.png")
+    hasty.page.get_by_text("More about the pictures").click()
+    for name in ("focal", "baseline"):
+        hasty.page.locator(f"#{name} input").fill("-600")
+    assert "must be positive" in hasty.find()
+    for name in ("focal", "baseline"):
+        hasty.page.locator(f"#{name} input").fill("0")
+
+
+def test_the_page_fits_a_telephone(answered):
+    answered.page.set_viewport_size({"width": 390, "height": 800})
+    answered.page.wait_for_timeout(200)
+    width = answered.page.evaluate("document.documentElement.scrollWidth")
+    answered.page.set_viewport_size(WINDOW)
+    assert width == 390
+
+
+def test_a_browser_that_draws_no_points_is_told(browser, address):
+    with_none = browser.browser_type.launch(
+        executable_path=shutil.which("chromium"), args=["--no-sandbox", "--disable-3d-apis"]
+    )
+    page = Visit(with_none, address).page
+    page.click("#sample")
+    page.get_by_role("tab", name="Point cloud").click()
+    page.get_by_text(UNDRAWN).wait_for()
+    with_none.close()
+
+
+def test_an_upload_that_was_put_away_is_asked_for_again(tmp_path):
+    request = Request(calibration=tmp_path / "calib.txt")
+    uploads = Uploads(
+        pictures=(EXAMPLES / "left.png", EXAMPLES / "right.png"), request=request, model="small"
+    )
+    with pytest.raises(StereoweaveError, match=r"^calib.txt has been put away, .*; give it again$"):
+        matched(uploads, tmp_path, lambda share, what: None)
+
+
+def test_large_files_are_not_zipped(tmp_path):
+    small, large = tmp_path / "small.npy", tmp_path / "large.npy"
+    for file, size in ((small, 9), (large, 301 * 1024**2)):
+        with file.open("wb") as opened:
+            opened.truncate(size)
+    assert zipped(tmp_path / "all.zip", [small, large]) is None
+    assert not (tmp_path / "all.zip").exists()
+    assert zipped(tmp_path / "all.zip", [small]) == tmp_path / "all.zip"
+
+
+def test_what_is_no_picture_is_told_by_its_name_alone(hasty, tmp_path):
     (tmp_path / "notes.txt").write_text("no picture")
-    visit.give(left=tmp_path / "notes.txt", right=EXAMPLES / "right.png")
-    said = visit.find()
+    hasty.give(left=tmp_path / "notes.txt", right=EXAMPLES / "right.png")
+    said = hasty.find()
     assert said.startswith("notes.txt: expected ")
     assert "/" not in said
-    assert visit.page.locator("#status .told").get_attribute("role") == "alert"
+    assert hasty.page.locator("#status .told").get_attribute("role") == "alert"
 
 
-def test_nothing_given_is_told(visit):
-    assert visit.find() == "expected a left and a right picture, or one file with both; found none"
+def test_nothing_given_is_told(hasty):
+    assert hasty.find() == "expected a left and a right picture, or one file with both; found none"
 
 
-def test_a_picture_of_800_megapixels_is_refused(visit, tmp_path):
+def test_a_picture_of_800_megapixels_is_refused(hasty, tmp_path):
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
@@ -263,17 +341,17 @@ def test_a_picture_of_800_megapixels_is_refused(visit, tmp_path):
         + chunk(b"IEND", b"")
     )
     (tmp_path / "bomb.png").write_bytes(png)
-    visit.give(left=tmp_path / "bomb.png")
-    said = visit.find()
+    hasty.give(left=tmp_path / "bomb.png")
+    said = hasty.find()
     assert said.startswith("bomb.png: expected ")
     assert len(said.splitlines()) == 1
 
 
-def test_a_file_of_more_than_200_megabytes_is_refused(visit, tmp_path):
+def test_a_file_of_more_than_200_megabytes_is_refused(hasty, tmp_path):
     with (tmp_path / "large.tiff").open("wb") as file:
         file.truncate(201 * 1024**2)
-    visit.page.locator("#left input[type=file]").set_input_files(tmp_path / "large.tiff")
-    visit.page.get_by_text(re.compile("exceed the maximum allowed size of 200")).first.wait_for()
+    hasty.page.locator("#left input[type=file]").set_input_files(tmp_path / "large.tiff")
+    hasty.page.get_by_text(re.compile("exceed the maximum allowed size of 200")).first.wait_for()
 
 
 def test_the_page_asks_nobody_but_its_server(answered, address):
@@ -282,10 +360,30 @@ def test_the_page_asks_nobody_but_its_server(answered, address):
     assert elsewhere == []
 
 
-def test_the_browser_is_told_to_load_nothing_from_elsewhere(visit, address):
-    policy = visit.page.request.get(address).headers["content-security-policy"]
+def asked(address: str, path: str = "/", **headers: str) -> http.client.HTTPResponse:
+    with closing(http.client.HTTPConnection(address.removeprefix("http://"), timeout=20)) as connection:
+        connection.request("GET", path, headers=headers)
+        answer = connection.getresponse()
+        answer.read()
+        return answer
+
+
+def test_the_browser_is_told_to_load_nothing_from_elsewhere(address):
+    policy = asked(address).headers["content-security-policy"]
     sources = set(policy.removeprefix("default-src ").split())
     assert sources == {"'self'", "'unsafe-inline'", "'unsafe-eval'", "data:", "blob:"}
+
+
+def test_a_foreign_name_for_this_computer_does_not_open_the_page(address):
+    port = address.rsplit(":", 1)[1]
+    assert asked(address, Host=f"somewhere.example:{port}").status == 403
+    assert asked(address, "/gradio_api/info", Host=f"127.0.0.1.somewhere.example:{port}").status == 403
+    assert asked(address, Host=f"localhost:{port}").status == 200
+
+
+@pytest.mark.parametrize("path", [__file__, "/etc/passwd", "../../etc/passwd", "%2Fetc%2Fpasswd"])
+def test_a_file_that_nobody_gave_to_the_page_is_not_given_out(address, path):
+    assert asked(address, f"/gradio_api/file={path}").status == 403
 
 
 def test_only_this_computer_is_served(address):

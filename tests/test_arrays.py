@@ -43,7 +43,9 @@ def test_a_float_is_the_share_of_white(dtype):
 
 
 def test_what_rounds_to_a_level_is_no_float_outside_of_the_range():
-    assert as_rgb(np.full((40, 50), 1.0001))[0, 0].tolist() == [255, 255, 255]
+    for dtype in (np.float16, np.float32, np.float64):
+        assert as_rgb(np.full((40, 50), 1.001, dtype))[0, 0].tolist() == [255, 255, 255]
+        assert as_rgb(np.full((40, 50), -0.001, dtype))[0, 0].tolist() == [0, 0, 0]
 
 
 def test_what_comes_out_is_contiguous():
@@ -141,6 +143,9 @@ def test_taking_pictures_does_not_import_pytorch():
         (torch.full((3, 40, 50), 255.0), ["float32 [3, 40, 50]", "of 255 to 255", "divide"]),
         (np.full((40, 50, 3), -0.1), ["float64", "-0.1", "0..1"]),
         (np.full((40, 50), np.nan), ["nan", "fill NaN"]),
+        (np.full((40, 50), 1e308), ["of 1e+308 to 1e+308"]),
+        (torch.full((40, 50), 300.0).half().numpy(), ["float16", "of 300 to 300"]),
+        (Image.new("I", (0, 0)), ["int32 [0, 0]"]),
         (Image.new("F", (50, 40), 3), ["float32 [40, 50]", "of 3 to 3"]),
         (Image.new("I", (50, 40), 70000), ["int32"]),
     ],

@@ -147,6 +147,11 @@ def test_a_middlebury_calibration_is_read_with_its_baseline_in_metres(tmp_path):
     assert camera.doffs_px == pytest.approx(31.086)
 
 
+@pytest.mark.parametrize("text", ["\ufeff" + MIDDLEBURY, MIDDLEBURY.replace("=", " = ")])
+def test_a_middlebury_calibration_that_an_editor_has_touched_is_read_too(tmp_path, text):
+    assert read_rig(stored(tmp_path, text)).camera().doffs_px == pytest.approx(31.086)
+
+
 def test_a_pair_gets_the_camera_of_a_calibration_for_its_size(tmp_path):
     path = stored(tmp_path, MIDDLEBURY)
     assert calibration.calibrated(pair_of(741, 497), path).camera == read_rig(path).camera()
@@ -318,6 +323,19 @@ def test_extrinsics_are_completed_by_the_intrinsics_beside_them(tmp_path):
     whole = read_rig(stored(tmp_path, OPENCV))
     for name in ("intrinsics.yml", "extrinsics.yml"):
         assert_same(read_rig(tmp_path / name), whole)
+
+
+@pytest.mark.parametrize(
+    ("more", "found"),
+    [
+        ("image_size: 640", "a picture's size of 640, not width and height"),
+        ("image_size: [640, 480, 3]", "not width and height"),
+        ("M1: {rows: 3}", "{'rows': 3} in place of numbers"),
+        ("translation_unit: [mm]", "translation_unit ['mm'], not one of m, cm, mm"),
+    ],
+)
+def test_a_size_a_matrix_or_a_unit_without_sense_is_refused(tmp_path, more, found):
+    assert found in refusal(stored(tmp_path, f"{OPENCV}{more}\n"))
 
 
 def test_what_an_opencv_file_lacks_is_named(tmp_path):

@@ -247,10 +247,10 @@ def test_depth_writes_what_the_matcher_finds(pictures):
 
 
 def test_depth_png_is_in_millimetres(pictures):
-    save_matcher(Path("four.onnx"), 4.0)
-    assert run("depth left.png right.png --model four.onnx --calib calib.txt -o out") == 0
-    # 100 px * 0.08 m / 4 px = 2 m
-    assert set(np.asarray(Image.open("out/depth.png")).ravel()) == {2000}
+    save_matcher(Path("eight.onnx"), 8.0)
+    assert run("depth left.png right.png --model eight.onnx --calib calib.txt -o out") == 0
+    # 100 px * 0.08 m / 8 px = 1 m
+    assert np.median(np.asarray(Image.open("out/depth.png"))) == 1000
 
 
 def test_a_side_by_side_picture_gives_the_same_as_the_two(pictures):
@@ -260,14 +260,15 @@ def test_a_side_by_side_picture_gives_the_same_as_the_two(pictures):
 
 
 def test_json_alone_is_on_stdout_and_names_the_files(pictures, capfd):
-    save_matcher(Path("four.onnx"), 4.0)
-    assert run("depth left.png right.png --model four.onnx --calib calib.txt -o out --json") == 0
+    save_matcher(Path("eight.onnx"), 8.0)
+    assert run("depth left.png right.png --model eight.onnx --calib calib.txt -o out --json") == 0
     printed, told = capfd.readouterr()
     summary = json.loads(printed)
     assert told == ""
     assert summary["pictures"] == ["left.png", "right.png"]
-    assert (summary["model"], summary["width_px"], summary["height_px"]) == ("four.onnx", 96, 64)
-    assert (summary["disparity_min_px"], summary["disparity_max_px"], summary["depth_median_m"]) == (4, 4, 2)
+    assert (summary["model"], summary["width_px"], summary["height_px"]) == ("eight.onnx", 96, 64)
+    assert 7 < summary["disparity_min_px"] <= 8 <= summary["disparity_max_px"] < 9
+    assert (summary["disparity_median_px"], summary["depth_median_m"]) == (8, 1)
     assert summary["camera"]["baseline_m"] == 0.08
     assert all(Path(file).is_file() for file in summary["files"].values())
     assert len(summary["files"]) == 7
@@ -293,7 +294,8 @@ def test_a_disparity_that_a_png_cannot_hold_gets_none_and_a_line(pictures, capfd
     printed, _ = capfd.readouterr()
     assert "no disparity.png: it holds 0 to 255.99 px" in printed
     assert not Path("out/disparity.png").exists()
-    np.testing.assert_array_equal(read_pfm("out/disparity.pfm"), np.float32(disparity_px))
+    # No disparity that the photographs bear out, which moves it by at most 1 px.
+    np.testing.assert_allclose(read_pfm("out/disparity.pfm"), disparity_px, atol=1.001)
 
 
 def test_a_new_result_takes_the_place_of_the_old_one_whole(pictures):
@@ -316,19 +318,19 @@ def test_bench_scores_the_network_beside_sgbm(pictures, capfd):
     scene.mkdir(parents=True)
     for name in ("left.png", "right.png"):
         Path(name).rename(scene / name)
-    Image.fromarray(np.full((64, 96), 8 * 256, np.uint16)).save(scene / "disparity.png")
-    save_matcher(Path("ten.onnx"), 10.0)
-    assert run("bench pairs scenes --model ten.onnx -o rows.csv") == 0
+    Image.fromarray(np.full((64, 96), 6 * 256, np.uint16)).save(scene / "disparity.png")
+    save_matcher(Path("eight.onnx"), 8.0)
+    assert run("bench pairs scenes --model eight.onnx -o rows.csv") == 0
     with Path("rows.csv").open() as file:
         rows = {(row["matcher"], row["scene"]): row for row in csv.DictReader(file)}
     assert set(rows) == {
         (name, scene)
-        for name in (*OPENCV_MATCHERS, "ten.onnx", "ten.onnx refined")
+        for name in (*OPENCV_MATCHERS, "eight.onnx", "eight.onnx refined")
         for scene in ("wall", "mean")
     }
-    # 10 px found, 8 px true
-    assert float(rows["ten.onnx", "wall"]["epe_px"]) == 2
-    assert "ten.onnx" in capfd.readouterr().out
+    # 8 px found, as the photographs have it, 6 px said to be true
+    assert float(rows["eight.onnx", "wall"]["epe_px"]) == pytest.approx(2, abs=1e-3)
+    assert "eight.onnx" in capfd.readouterr().out
 
 
 def test_bench_takes_every_shipped_network_and_says_where_the_rows_are(mistakes, capfd):

@@ -76,6 +76,18 @@ def test_an_unknown_or_odd_focal_length_is_none(tmp_path, value):
     assert exif.lens_of({FOCAL_MM: IFDRational(1, 0), PLANE_X: "text", WIDTH_PX: value}, 40, 32) is None
 
 
+def test_a_focal_length_that_no_lens_has_is_none_or_that_of_the_other_tags():
+    # 4000x3000 has a diagonal of 5000 px: 65535 mm on film are 7.6 million px, and 10 mm at 1 px a mm are 10.
+    assert exif.lens_of({FOCAL_35_MM: 65535}, 4000, 3000) is None
+    sensor = {FOCAL_MM: 10, PLANE_UNIT: 4, WIDTH_PX: 4000}
+    assert exif.lens_of(sensor | {PLANE_X: 1}, 4000, 3000) is None
+    both = sensor | {PLANE_X: 400, FOCAL_35_MM: 65535}
+    assert exif.lens_of(both, 4000, 3000).focal_px == pytest.approx(4000)
+    # A round fisheye lens and a telescope.
+    assert exif.lens_of({FOCAL_35_MM: 7}, 4000, 3000).focal_px == pytest.approx(809, abs=1)
+    assert exif.lens_of({FOCAL_35_MM: 2000}, 4000, 3000).focal_px == pytest.approx(231_125, abs=1)
+
+
 def test_the_baseline_of_an_mpo_frame_is_read_in_metres():
     picture = Image.new("RGB", (40, 32))
     picture.info["mp"] = multi_picture(2, (77, 1000))

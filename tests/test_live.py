@@ -144,6 +144,16 @@ def test_more_than_two_sources_are_refused():
         Capture(["0", "1", "2"])
 
 
+def test_a_picture_and_a_stream_in_a_file_are_films_that_end(tmp_path):
+    cv2.imwrite(str(tmp_path / "one.png"), greys(3)[2])
+    jpegs = [cv2.imencode(".jpg", grey)[1].tobytes() for grey in greys(3)]
+    (tmp_path / "camera.mjpeg").write_bytes(b"".join(jpegs))
+    for name, last in (("one.png", 0), ("camera.mjpeg", 2)):
+        with Capture([str(tmp_path / name)]) as capture:
+            assert capture.newest(last - 1) is not None
+            assert capture.newest(last) is None
+
+
 def test_a_stream_that_stops_is_told_and_is_no_end_of_a_film():
     grey = greys(6)[5]
     with Screen(0) as screen:
@@ -188,6 +198,7 @@ def test_the_page_is_for_this_machine_alone():
     with Screen(0) as screen:
         assert asked(screen.url, Host="somewhere.example:80").status == 403
         assert asked(screen.url, Host=f"localhost:{screen.server_port}").status == 200
+        assert asked(screen.url, Host="localhost").status == 200  # as browsers write port 80
         assert asked(screen.url, "/other").status == 404
         assert asked(screen.url).headers["Cross-Origin-Resource-Policy"] == "same-origin"
 

@@ -69,10 +69,9 @@ def test_a_pair_with_columns_cut_off_has_so_much_less_disparity_negative_ones_to
 
 
 def test_what_is_given_as_the_range_counts_and_not_what_is_found(matcher, examples):
-    pair = moved(examples, 100)
-    same(match(matcher, pair, range_px=(0, 150)), matcher.estimate(pair.left, pair.right))
-    found = match(matcher, examples, range_px=(-20, 120))
     whole = matcher.estimate(examples.left, examples.right)
+    same(match(matcher, examples, range_px=(0, 192)), whole)
+    found = match(matcher, examples, range_px=(-20, 120))
     clear = sure(whole) & sure(found)
     assert np.mean(np.abs(found.disparity_px - whole.disparity_px)[clear] > 1) < 0.03
 
@@ -143,6 +142,26 @@ def test_a_film_frame_of_1920x1080_is_seen_whole(matcher):
     assert matcher.sees_whole(1920, 1080)
 
 
+@pytest.mark.parametrize("by_px", [40, 60])
+def test_something_just_below_zero_is_matched_as_such(matcher, rng, by_px):
+    """A wall 3 px behind the plane of the screen of a 3-D film, and a board before it."""
+    pair = flat(rng, 37, size=(240, 480))
+    board = flat(rng, 0, size=(100, 120)).left
+    pair.left[70:170, 300:420] = pair.right[70:170, 300 - by_px : 420 - by_px] = board
+    found_px = match(matcher, moved(pair, 40)).disparity_px
+    assert abs(np.median(found_px[:60, 60:-60]) + 3) < 0.3
+    assert abs(np.median(found_px[80:160, 270:370]) - (by_px - 40)) < 0.5
+
+
+def test_masks_are_made_smaller_with_the_pictures(rng):
+    pair = flat(rng, 37)
+    seen = np.ones(pair.left.shape[:2], bool)
+    seen[:, :120] = False
+    small = matching._reduced(replace(pair, left_seen=seen), 2)
+    assert small.right_seen is None
+    np.testing.assert_array_equal(small.left_seen[:, [59, 60]], np.tile([False, True], (80, 1)))
+
+
 def test_what_the_pictures_do_not_show_has_no_confidence_and_matches_in_it_are_occluded(matcher, rng):
     pair = flat(rng, 37)
     left_seen, right_seen = np.ones((2, *pair.left.shape[:2]), bool)
@@ -161,6 +180,17 @@ def test_matches_beyond_the_right_picture_are_occluded_whatever_the_range(matche
     assert abs(np.median(found.disparity_px[:, 60:-60]) + 37) < 0.3
     assert found.occluded[20:-20, -35:].mean() > 0.9
     assert found.occluded[20:-20, 40:-40].mean() < 0.02
+
+
+def test_a_disparity_outside_of_the_range_that_is_given_is_brought_to_its_end_and_not_believed(matcher, rng):
+    for range_px, end_px in [((50, 90), 50), ((-20, 20), 20)]:
+        found = match(matcher, flat(rng, 37), range_px=range_px)
+        for disparity_px in (found.disparity_px, found.right_disparity_px):
+            assert range_px[0] <= disparity_px.min()
+            assert disparity_px.max() <= range_px[1]
+        inner = np.s_[10:-10, 60:-60]
+        assert np.median(found.disparity_px[inner]) == end_px
+        assert (found.confidence[inner] == 0).mean() > 0.98
 
 
 @pytest.mark.parametrize("range_px", [(10, 10), (50, 0), (0, float("nan")), (float("-inf"), 10)])
@@ -198,7 +228,8 @@ def test_a_file_that_was_written_anew_is_loaded_anew_whatever_its_path_is_relati
         os.utime(file, ns=(turn, turn))
         found.append(sw.estimate(left, right, model="matcher.onnx").disparity_px)
     for disparity_px, image in zip(found, (left, right, left), strict=True):
-        np.testing.assert_allclose(disparity_px, image[:, :, 0], atol=1e-4)
+        # The graph gives red as disparity, of which the last step moves it by at most 1 px.
+        np.testing.assert_allclose(disparity_px, image[:, :, 0], atol=1.001)
 
 
 def test_the_answer_does_not_depend_on_earlier_calls_of_other_sizes(rng):

@@ -3,6 +3,7 @@ import re
 import struct
 import zlib
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from film_examples import packed, shrunk
 from PIL import Image, ImageCms
 from skimage import data
 
+from stereoweave.command_line import Format
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.exif import Lens
 from stereoweave.footage_layout import ARRANGEMENTS
@@ -135,6 +137,16 @@ def test_the_damaged_one_of_two_files_is_named(tmp_path, pair):
     )
 
 
+@pytest.mark.parametrize("alone", [True, False])
+def test_values_that_no_photograph_has_are_refused_with_the_name(tmp_path, pair, alone):
+    left, right = write_two(tmp_path, pair.left, pair.right)
+    left = left.with_suffix(".tif")
+    Image.fromarray(pair.left[..., 0].astype(np.float32)).save(left)
+    message = refusal(left) if alone else refusal(left, right)
+    assert message.startswith(f"{left}: expected a picture")
+    assert "more than 16 bits a channel" in message
+
+
 @pytest.mark.parametrize("count", [0, 3])
 def test_one_or_two_files_are_expected(tmp_path, count):
     message = refusal(*[tmp_path / "a.png"] * count, kind=StereoweaveError)
@@ -146,6 +158,11 @@ def test_an_arrangement_is_for_one_file_and_one_of_the_formats(tmp_path):
     assert "found two" in refusal(*two, arrangement="crossed", kind=StereoweaveError)
     message = refusal(two[0], arrangement="sideways", kind=StereoweaveError)
     assert message == f"--format: expected one of {', '.join(FORMATS)}, found 'sideways'"
+
+
+def test_the_help_of_format_names_all_of_them():
+    words = re.findall(r"[a-z_]+(?=[,;])", get_args(Format)[1].help)
+    assert sorted(words) == sorted(FORMATS)
 
 
 # Orientation

@@ -17,7 +17,9 @@ from stereoweave.io import read_image
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-DEMO, INSTALL, COMMANDS, VIDEO, SYNTHETIC, RESEARCH = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
+DEMO, INSTALL, COMMANDS, OWN_PICTURES, VIDEO, SYNTHETIC, RESEARCH = re.findall(
+    r"```sh\n(.*?)```", README, re.DOTALL
+)
 (PROGRAM,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 LARGEST_ENVIRONMENT_BYTES = 700e6
 
@@ -138,6 +140,24 @@ def test_the_program_runs_from_the_wheel_in_an_empty_environment(installed, pict
     assert read_image(pictures / "view.png").shape == (64, 96, 3)
 
 
+def test_pictures_of_ones_own_go_through_the_commands_for_them(tmp_path):
+    (tmp_path / "photographs").mkdir()
+    for name in ("left.png", "right.png", "calib.txt"):
+        shutil.copy(REPOSITORY / "examples" / name, tmp_path)
+    for eye in ("left", "right"):
+        shutil.copy(tmp_path / f"{eye}.png", tmp_path / "photographs" / f"1_{eye[0].upper()}.png")
+    printed = run(
+        ["bash", "-ec", OWN_PICTURES], tmp_path, PATH=f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    )
+    assert "nothing is amiss" in printed
+    assert "(68 %)" in printed
+    assert {"cloud.ply", "mesh.glb", "depth.png"} < {path.name for path in (tmp_path / "points").iterdir()}
+    assert sorted(path.name for path in (tmp_path / "rows").iterdir()) == ["left.png", "right.png"]
+    for folder in ("many", "many_more"):
+        assert (tmp_path / folder / "1" / "disparity.pfm").is_file()
+        assert (tmp_path / folder / "summary.csv").read_text().count("\n") == 2
+
+
 def test_films_are_made_by_the_commands_for_them(pictures):
     frame = read_image(pictures / "side_by_side.png")
     write_animation(pictures / "film_LR.mp4", [frame] * 3, frame_ms=40)
@@ -179,7 +199,7 @@ def test_two_trainings_are_resumed_and_scored_by_the_commands_for_researchers(tm
 def test_each_command_that_is_mentioned_exists(pictures):
     command = Path(sys.executable).with_name("stereoweave")
     mentioned = set(re.findall(r"`stereoweave (\w+)`", README))
-    assert mentioned == {"train", "export"}
+    assert mentioned == {"train", "export", "app"}
     for name in mentioned:
         assert "Usage: stereoweave" in run([command, name, "--help"], pictures)
 

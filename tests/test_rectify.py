@@ -22,7 +22,6 @@ from stereoweave.calibration import Optics, Rig
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.matcher import Matcher
 from stereoweave.stereo import StereoCamera, StereoPair
-from stereoweave.subpixel import to_subpixel
 
 WALL_M = 5.0
 
@@ -119,7 +118,7 @@ def test_the_rectified_camera_keeps_the_resolution_of_the_middle(wall, rig):
 def test_depth_of_a_wall_at_5_m_by_a_crooked_rig_is_true(wall):
     pair = wall.pair
     camera = pair.camera
-    estimate = to_subpixel(pair.left, pair.right, Matcher("small").estimate(pair.left, pair.right))
+    estimate = Matcher("small").estimate(pair.left, pair.right)
     rows, columns = np.mgrid[:480, :640]
     aside, down = (columns - camera.cx_px) / camera.focal_px, (rows - camera.cy_px) / camera.focal_px
     distance_m = camera.depth_m(estimate.disparity_px) * np.sqrt(1 + aside**2 + down**2)
@@ -208,6 +207,13 @@ def test_the_largest_rectangle_that_both_fill_is_kept(rng):
     np.testing.assert_array_equal(cropped.right, pair.right[20:, 31:630])
     assert cropped.camera == replace(camera, cx_px=310 - 31, cy_px=240 - 20)
     assert cropped.left_seen is None and cropped.right_seen is None
+
+
+def test_a_low_and_wide_pair_loses_no_more_than_its_border():
+    image, seen = np.zeros((150, 20_000, 3), np.uint8), np.zeros((150, 20_000), bool)
+    seen[3:-4, 10:-20] = True
+    cropped = rectify.cropped(StereoPair(left=image, right=image, left_seen=seen))
+    assert cropped.left.shape == (143, 19_970, 3)
 
 
 def test_a_full_pair_is_cropped_to_itself(rng):

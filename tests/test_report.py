@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stereoweave.report import POSITIONS, Summary, summarize, write_report
+from stereoweave.report import POSITIONS, Summary, shrunk, summarize, write_report
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
 CAMERA = StereoCamera(focal_px=400, baseline_m=0.04, cx_px=160, cy_px=60, doffs_px=0)
@@ -97,6 +98,19 @@ def test_a_long_picture_is_shrunk_and_its_disparity_with_it(rng, tmp_path):
     halfway = np.asarray(Image.fromarray(photograph[:, 40:2040]).resize((1000, 80)))
     assert pictures["The left photograph"].shape == (80, 1000, 3)
     assert difference(pictures["View at position 0.5"], halfway) < 5
+
+
+def test_what_the_left_picture_does_not_show_has_no_colour_of_depth(rng, tmp_path):
+    pair, estimate = wall(texture(rng, 120, 320 + SHIFT_PX), SHIFT_PX, CAMERA)
+    seen = np.ones((120, 320), bool)
+    seen[:, :80] = False
+    pair = replace(pair, left_seen=seen)
+    write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"))
+    depth = pictures_in((tmp_path / "report.html").read_text(encoding="utf-8"))["Depth in colour"]
+    assert depth[:, :72].max() < 8
+    assert depth[:, 88:].max(axis=2).min() > 40
+    shown, _ = shrunk(pair, estimate, 160)
+    assert (shown.left_seen == seen[::2, ::2]).all()
 
 
 def test_the_page_is_one_file_that_refers_to_no_other(rng, tmp_path):

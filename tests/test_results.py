@@ -91,6 +91,13 @@ def test_files_of_an_earlier_result_go(folder, matcher):
     assert names_in("out") == {*ALWAYS, "mine.txt"}
 
 
+def test_files_of_the_same_names_that_are_no_earlier_result_stay(folder, matcher):
+    for name in ("mesh.ply", "depth.npy"):
+        Path(name).write_text("of another program")
+    make_depth(PICTURES, Path(), DepthOrder(), matcher)
+    assert {Path(name).read_text() for name in ("mesh.ply", "depth.npy")} == {"of another program"}
+
+
 def test_an_unknown_file_is_told_with_those_that_there_are():
     with pytest.raises(StereoweaveError, match=r"^--write: .*disparity.npy.*mesh.glb.*found 'cloud.obj'$"):
         DepthOrder(files=("depth.npy", "cloud.obj"))
@@ -190,7 +197,7 @@ def test_a_range_and_a_refinement_are_handed_on(folder, matcher):
 
 
 def test_the_command_writes_what_it_is_told(folder, capfd):
-    depth(PICTURES, Path("out"), calib=Path("calib.txt"), write=["cloud.ply", "depth.npy"])
+    depth(Path("out"), PICTURES, calib=Path("calib.txt"), write=["cloud.ply", "depth.npy"])
     assert names_in("out") == {*ALWAYS, "depth.png", "cloud.ply", "depth.npy"}
     assert "report: out/report.html" in capfd.readouterr().out
 

@@ -59,6 +59,22 @@ def test_the_new_calibration_belongs_to_the_new_pictures(tmp_path):
     assert calibrated(pair, out / "calib.yml").camera == calibrated(pair, EXAMPLES / "calib.txt").camera
 
 
+def test_rectification_spares_the_pictures_and_the_calibration_that_are_there(tmp_path, capsys):
+    files = {name: tmp_path / name for name in ("left.png", "right.png", "calib.yml")}
+    for path, source in zip(files.values(), (LEFT, RIGHT, EXAMPLES / "calib.txt"), strict=True):
+        path.write_bytes(Path(source).read_bytes())
+    before = {name: path.read_bytes() for name, path in files.items()}
+    pictures = [str(files["left.png"]), str(files["right.png"])]
+    for words, named in (
+        (pictures, "left.png"),
+        ([LEFT, RIGHT, "--calib", str(files["calib.yml"])], "calib.yml"),
+        ([LEFT, RIGHT], "calib.yml"),
+    ):
+        assert main(["rectify", *words, "-o", str(tmp_path)]) == 2
+        assert f"{files[named]}: expected" in capsys.readouterr().err
+    assert {name: path.read_bytes() for name, path in files.items()} == before
+
+
 def test_depth_and_views_warn_by_themselves_and_rectify_mends(turned, tmp_path, capsys):
     assert main(["depth", LEFT, turned, "-o", str(tmp_path / "as_it_is")]) == 0
     assert "is turned 1.0 degrees" in capsys.readouterr().out

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from stereoweave.io import read_image
-from stereoweave.sparse import row_matches, sparse_matches
+from stereoweave.sparse import sparse_matches
 
 LEFT = Path(__file__).resolve().parent.parent / "examples/left.png"
 
@@ -47,19 +47,12 @@ def test_large_pictures_are_matched_in_their_own_pixels(photo):
     found = sparse_matches(large, moved(large, -82, 3), most=500)
     assert np.median(np.abs(found.disparity_px - 82)) < 0.2
     assert np.median(np.abs(found.lower_px - 3)) < 0.2
-    assert np.median(np.abs(row_matches(large, moved(large, -82, 0), most=500).disparity_px - 82)) < 2
-
-
-def test_rows_that_do_not_match_are_not_looked_at_by_row_matches(photo):
-    found = row_matches(photo, moved(photo, -7, 0))
-    assert np.abs(found.lower_px).max() <= 3
-    assert np.median(found.disparity_px) == 7
 
 
 def test_plain_pictures_have_no_matches():
     plain = np.full((64, 96, 3), 90, np.uint8)
-    for found in (sparse_matches(plain, plain), row_matches(plain, plain)):
-        assert found.left_px.shape == found.right_px.shape == (0, 2)
+    found = sparse_matches(plain, plain)
+    assert found.left_px.shape == found.right_px.shape == (0, 2)
 
 
 def test_the_smallest_pictures_are_matched(rng):

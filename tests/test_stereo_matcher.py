@@ -118,6 +118,11 @@ def test_a_range_that_int16_does_not_hold_is_refused(least, count):
         matcher.setNumDisparities(count)
 
 
+def test_a_confidence_in_percent_is_refused():
+    with pytest.raises(StereoweaveError, match=r"^min_confidence: expected .* 0 to 1, found 50"):
+        StereoMatcher(0, 64, min_confidence=50)
+
+
 def test_the_widest_ranges_that_int16_holds_are_taken():
     assert StereoMatcher(-2046, 4093).getNumDisparities() == 4093
 

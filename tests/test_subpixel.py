@@ -101,3 +101,46 @@ def test_plain_and_occluded_places_and_all_but_the_left_disparity_stay(rng, text
     flat = estimate_of(np.full((HEIGHT, WIDTH), 7.3))
     for estimate in (flat, replace(flat, occluded=np.ones((HEIGHT, WIDTH), bool))):
         np.testing.assert_allclose(to_subpixel(plain, plain, estimate).disparity_px, 7.3, atol=1e-5)
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_bands_of_rows_find_what_the_whole_picture_does(rng, threads):
+    left, right = rng.integers(0, 256, (2, 230, 90, 3), dtype=np.uint8)
+    given = estimate_of(cv2.GaussianBlur(rng.uniform(0, 30, (230, 90)).astype(np.float32), (0, 0), 2))
+    whole = to_subpixel(left, right, given, threads=1)
+    in_bands = to_subpixel(left, right, given, threads=threads)
+    assert np.abs(whole.disparity_px - given.disparity_px).mean() > 0.05
+    np.testing.assert_allclose(in_bands.disparity_px, whole.disparity_px, atol=1e-3)
+
+
+@pytest.mark.parametrize(("height", "width"), [(HEIGHT - 1, WIDTH - 1), (HEIGHT - 1, WIDTH), (HEIGHT, 91)])
+def test_odd_sizes_are_as_good_as_even_ones(texture, height, width):
+    truth_px = ramp_px()
+    left, right = (np.ascontiguousarray(image[:height, :width]) for image in pair_with(truth_px, texture))
+    truth_px = truth_px[:height, :width]
+    found = to_subpixel(left, right, estimate_of(truth_px + 0.3))
+    assert found.disparity_px.shape == (height, width)
+    assert np.median(errors_px(found, truth_px)) < 0.03
+
+
+def test_a_steep_slant_is_no_edge(texture):
+    truth_px = np.repeat(np.linspace(5, 29, HEIGHT, dtype=np.float32)[:, None], WIDTH, axis=1)
+    left, right = pair_with(truth_px, texture)
+    found = to_subpixel(left, right, estimate_of(truth_px + 0.2))
+    assert np.median(np.abs(found.disparity_px - truth_px)[8:-8, 40:-8]) < 0.05
+
+
+def test_no_threads_are_refused(texture):
+    left, right = pair_with(ramp_px(), texture)
+    with pytest.raises(ValueError, match="threads: expected 1 or more, got 0"):
+        to_subpixel(left, right, estimate_of(ramp_px()), threads=0)
+
+
+def test_disparity_falls_below_zero_only_where_some_was_given_so(texture):
+    left, right = pair_with(np.full((HEIGHT, WIDTH), -0.4, np.float32), texture)
+    given_px = np.full((HEIGHT, WIDTH), 0.1, np.float32)
+    parallel = to_subpixel(left, right, estimate_of(given_px))
+    assert parallel.disparity_px.min() == 0
+    given_px[0, 0] = -2
+    converged = to_subpixel(left, right, estimate_of(given_px))
+    assert np.median(errors_px(converged, -0.4)) < 0.05

@@ -11,12 +11,12 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from film_examples import damage, example_pairs, packets, write_side_by_side, write_video
+from film_examples import EXAMPLES, damage, example_pairs, packets, write_side_by_side, write_video
 
 from stereoweave.cli import main
 from stereoweave.colour import colour_disparity
 from stereoweave.footage import Footage, StereoFrame, open_footage
-from stereoweave.io import write_image
+from stereoweave.io import read_image, write_image
 from stereoweave.layouts import LAYOUTS, Choices
 from stereoweave.matcher import Matcher
 from stereoweave.rendering import Renderer
@@ -123,6 +123,43 @@ def test_what_lies_upon_one_another_keeps_the_films_middle_in_place(tmp_path):
     # The eyes' pictures, red and green, lie apart by the disparity where nothing is kept in place.
     apart = {name: _red_from_green(rgb_of(tmp_path / f"{name}.mp4")[1]) for name in ("auto", "none")}
     assert apart["auto"] < apart["none"] / 2
+
+
+def converged_pairs(moved_px: list[int]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The same window of the example pair, its disparities lower by each of these."""
+    left, right = (read_image(EXAMPLES / f"{eye}.png") for eye in ("left", "right"))
+    rows = slice(200, 296)
+    return [(left[rows, 180:436], right[rows, 180 - by_px : 436 - by_px]) for by_px in moved_px]
+
+
+def test_disparities_behind_the_screen_are_found_however_late_in_a_film(tmp_path, capsys):
+    # 11 to 21 px without the move; the last of these frames begins after a minute.
+    pairs = converged_pairs([22] * 6 + [62] * 2)
+    times_ms = range(0, 8 * 12_000, 12_000)
+    film = write_side_by_side(tmp_path / "in.mp4", pairs, times_ms=times_ms, codec="libx264")
+    words = ["--arrangement", "side_by_side"]
+    assert run(film, tmp_path / "depth.mkv", "--depth", *words) == 0
+    with av.open(str(tmp_path / "depth.mkv")) as container:
+        comment = container.metadata["COMMENT"]
+    low_px, high_px = (
+        float(word) for word in comment.replace(" px", "").split() if word.lstrip("-")[0].isdigit()
+    )
+    assert -62 + 10 < low_px < -62 + 16
+    assert -22 + 16 < high_px < -22 + 22
+    # A point at disparity d is at x - d / 2 in the view halfway: the move brings it 31 columns to the right.
+    assert run(film, tmp_path / "view.mp4", "--position", "0.5", *words) == 0
+    still = write_side_by_side(tmp_path / "still.mp4", converged_pairs([0]), codec="libx264")
+    assert run(still, tmp_path / "unmoved.mp4", "--position", "0.5", *words) == 0
+    moved, unmoved = (rgb_of(tmp_path / name)[-1].astype(int) for name in ("view.mp4", "unmoved.mp4"))
+    assert np.abs(moved[:, 71:] - unmoved[:, 40:-31]).mean() < 6
+
+
+def test_depth_in_16_bits_says_what_it_cannot_hold(tmp_path, capsys):
+    film = write_side_by_side(tmp_path / "in.mp4", converged_pairs([40, 40]), codec="libx264")
+    assert run(film, tmp_path / "out.mkv", "--depth16", "--arrangement", "side_by_side") == 0
+    [line] = [line for line in capsys.readouterr().err.splitlines() if "--depth16" in line]
+    assert line.startswith("--depth16 holds 0 to 255.99 px: of this film's disparities, -2")
+    assert line.endswith("what lies beyond is clipped; --depth shows all of them in colours")
 
 
 def _red_from_green(anaglyph: np.ndarray) -> float:
@@ -265,14 +302,14 @@ def test_swapped_sides_are_told_with_the_arrangement_that_mends_them(tmp_path, c
     assert "swapped" not in capsys.readouterr().err
 
 
-def test_a_film_of_more_than_a_minute_is_looked_at_in_its_first(tmp_path, capsys):
-    # At 12 frames a minute, so that two of the three that are looked at, number 2, 6 and 10, are swapped.
+def test_a_film_is_looked_at_beyond_its_first_minute(tmp_path, capsys):
+    # At 12 frames a minute, so that two of the three that are looked at, number 2, 8 and 14, are swapped.
     pairs = example_pairs(16, width=320, height=192)
     pairs = [pair if index < 5 else pair[::-1] for index, pair in enumerate(pairs)]
     times_ms = range(0, 16 * 5000, 5000)
     film = write_side_by_side(tmp_path / "in.mp4", pairs, times_ms=times_ms, codec="libx264")
     assert run(film, tmp_path / "out.mp4", "--position", "0", "--arrangement", "side_by_side") == 0
-    assert capsys.readouterr().err.count("0:00:50.000 ") == 1
+    assert capsys.readouterr().err.count("0:01:10.000 ") == 1
 
 
 def test_swapped_films_are_told_without_an_arrangement(tmp_path, capsys):

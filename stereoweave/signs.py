@@ -1,0 +1,200 @@
+"""The signs of disparities: whether some are negative for certain, and whether near things hide far ones.
+
+Parallel cameras give disparities of 0 and more; converged ones negative ones as well, and so do a left and a
+right photograph that are swapped.
+"""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+# From here on a disparity is negative.
+_NEGATIVE_PX = -1.5
+# Of so many places at most it is looked whether they are sure, and so many have to be.
+_MOST_TRIED, _LEAST_SURE = 150, 4
+# A place is sure whose window is so like the other picture's, and what lies at 0 or more much less so.
+_LEAST_LIKENESS, _MOST_AMBIGUOUS = 0.9, 0.7
+# By so much equal windows differ as grey levels are rounded.
+_ROUNDING = 0.003
+# How far away the likest window is looked for, as a share of the width.
+_REACH = 0.45
+_RADIUS_PX = 7
+
+# What has no corners is matched densely in pictures so wide; farther behind there are corners, or nothing.
+_DENSE_WIDTH_PX, _DENSE_RANGE_PX = 160, (-5.0, 53.0)
+_DENSE_NEGATIVE_PX, _DENSE_RADIUS_PX = -0.5, 4
+_LEAST_TEXTURE_LEVELS = 1.0
+
+# Occlusion is looked at in pictures so wide, by semi-global matching with OpenCV's usual penalties.
+_OCCLUSION_WIDTH_PX = 320
+_BLOCK_PX, _MARGIN_PX = 5, 3
+_LEAST_JUMP_PX, _LEAST_COLOUR_STEP, _BESIDE_PX = 2.0, 10.0, 3
+# So many votes for one order of depth weigh as much as none at all.
+_VOTES_OF_DOUBT = 20
+
+
+def surely_negative(
+    left: UInt8[np.ndarray, "h w 3"],
+    right: UInt8[np.ndarray, "h w 3"],
+    places_px: Float[np.ndarray, "n 2"],
+    disparity_px: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, " m"]:
+    """Negative disparities in px of which nothing makes positive ones; none where there are but a few.
+
+    Where things repeat, as in a truss, matches miss by a period; but then the place at the right distance is
+    about as alike, and sound pairs are far more common than converged ones.
+
+    Args:
+        left: The left photograph, uint8 RGB [H, W, 3].
+        right: The right one, of which the rows match.
+        places_px: Columns and rows in the left photograph.
+        disparity_px: What was found for them. Where these are positive, plainer places are looked at as well.
+    """
+    negative = disparity_px < _NEGATIVE_PX
+    greys = cv2.cvtColor(left, cv2.COLOR_RGB2GRAY), cv2.cvtColor(right, cv2.COLOR_RGB2GRAY)
+    sure_px = _sure(*greys, places_px[negative], disparity_px[negative], _RADIUS_PX)
+    if len(sure_px) >= _LEAST_SURE:
+        return sure_px
+    factor = min(1.0, _DENSE_WIDTH_PX / left.shape[1])
+    left, right = (_shrunk(photo, factor) for photo in (left, right))
+    places_px, disparity_px = _dense_negative(left, right)
+    greys = cv2.cvtColor(left, cv2.COLOR_RGB2GRAY), cv2.cvtColor(right, cv2.COLOR_RGB2GRAY)
+    sure_px = _sure(*greys, places_px, disparity_px, _DENSE_RADIUS_PX)
+    return sure_px / factor if len(sure_px) >= _LEAST_SURE else sure_px[:0]
+
+
+def _dense_negative(
+    left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
+    """Places in the left picture, and their disparities, that semi-global matching takes for negative."""
+    disparity_px, seen = _matched(left, right, *_DENSE_RANGE_PX)
+    slope = cv2.Sobel(cv2.cvtColor(left, cv2.COLOR_RGB2GRAY), cv2.CV_32F, 1, 0, scale=1 / 8)
+    textured = cv2.blur(np.abs(slope), (_BLOCK_PX, _BLOCK_PX)) > _LEAST_TEXTURE_LEVELS
+    rows, columns = np.nonzero(seen & textured & (disparity_px < _DENSE_NEGATIVE_PX))
+    return np.stack([columns, rows], axis=1).astype(float), disparity_px[rows, columns].astype(float)
+
+
+def _sure(
+    left: UInt8[np.ndarray, "h w"],
+    right: UInt8[np.ndarray, "h w"],
+    places_px: Float[np.ndarray, "n 2"],
+    disparity_px: Float[np.ndarray, " n"],
+    radius_px: int,
+) -> Float[np.ndarray, " m"]:
+    """Those of (some of) the negative disparities that are the only likely ones in both pictures."""
+    step = max(1, -(-len(places_px) // _MOST_TRIED))
+    disparity_px = disparity_px[::step]
+    columns, rows = np.rint(places_px[::step]).astype(int).T
+    partners = np.clip(np.rint(columns - disparity_px).astype(int), 0, left.shape[1] - 1)
+    rim = radius_px + 1
+    reach_px = round(_REACH * left.shape[1])
+    left, right = (
+        cv2.copyMakeBorder(grey, rim, rim, rim, rim, cv2.BORDER_REPLICATE) for grey in (left, right)
+    )
+    sure = [
+        _is_alone(left, right, (row, column, partner), -reach_px, radius_px)
+        and _is_alone(right, left, (row, partner, column), reach_px, radius_px)
+        for row, column, partner in np.stack([rows, columns, partners], axis=1).tolist()
+    ]
+    return disparity_px[np.array(sure, bool)]
+
+
+def _is_alone(
+    own: UInt8[np.ndarray, "h w"],
+    other: UInt8[np.ndarray, "h w"],
+    place: tuple[int, int, int],
+    reach_px: int,
+    radius_px: int,
+) -> bool:
+    """Whether a window is like the other picture's at its partner, and like none at a positive disparity.
+
+    Args:
+        own: The picture of the window, with a border of `radius_px` + 1.
+        other: The other picture, alike.
+        place: Row, column and the partner's column, without that border.
+        reach_px: How far positive disparities go: to the left in the right picture, to the right in the left.
+        radius_px: Of the window.
+    """
+    row, column, partner = place
+    last_column = own.shape[1] - 2 * radius_px - 3
+    end = min(max(column + reach_px, 0), last_column)
+    window = _strip(own, row, column, column, radius_px)[1:-1]
+    found = _strip(other, row, partner - 1, partner + 1, radius_px)
+    likeness = cv2.matchTemplate(found, window, cv2.TM_CCOEFF_NORMED).max()
+    if likeness < _LEAST_LIKENESS:
+        return False
+    positive = _strip(other, row, min(column, end), max(column, end), radius_px)
+    second = cv2.matchTemplate(positive, window, cv2.TM_CCOEFF_NORMED).max()
+    return bool(max(1 - likeness, _ROUNDING) <= _MOST_AMBIGUOUS * (1 - second))
+
+
+def _strip(
+    bordered: UInt8[np.ndarray, "h w"], row: int, first: int, last: int, radius_px: int
+) -> UInt8[np.ndarray, "h2 w2"]:
+    """What windows around the columns cover, and a row more above and below."""
+    return bordered[row : row + 2 * radius_px + 3, first + 1 : last + 2 * radius_px + 2]
+
+
+def depth_order(
+    left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], range_px: tuple[float, float]
+) -> float:
+    """-1..1: above 0 where greater disparities hide smaller ones, below 0 where it is the other way round.
+
+    What the right camera does not see lies, in the left picture, between a smaller disparity and a greater
+    one. It belongs to what is hidden, so its colour is that of the farther side.
+    """
+    factor = min(1.0, _OCCLUSION_WIDTH_PX / left.shape[1])
+    small_left, small_right = (_shrunk(photo, factor) for photo in (left, right))
+    disparity_px, seen = _matched(small_left, small_right, range_px[0] * factor, range_px[1] * factor)
+    colours = cv2.cvtColor(cv2.GaussianBlur(small_left, (0, 0), 0.7), cv2.COLOR_RGB2LAB).astype(np.float32)
+    votes = [vote for row in range(len(seen)) for vote in _votes(disparity_px[row], seen[row], colours[row])]
+    return sum(votes) / (len(votes) + _VOTES_OF_DOUBT)
+
+
+def _votes(
+    disparity_px: Float32[np.ndarray, " w"], seen: Bool[np.ndarray, " w"], colours: Float32[np.ndarray, "w 3"]
+) -> list[float]:
+    """For each hidden stretch of a row, -1..1: how much more it is like its left side than its right one."""
+    votes = []
+    changes = np.diff(seen.astype(np.int8))
+    ends = np.flatnonzero(changes == 1) + 1
+    for start in np.flatnonzero(changes == -1) + 1:
+        end = next(iter(ends[ends > start]), len(seen))
+        if start < _BESIDE_PX or end + _BESIDE_PX > len(seen):
+            continue
+        jump_px = disparity_px[end + 1] - disparity_px[start - 2]
+        before, after = colours[start - _BESIDE_PX : start], colours[end : end + _BESIDE_PX]
+        hidden, before, after = (part.mean(0) for part in (colours[start:end], before, after))
+        plain = np.linalg.norm(before - after) < _LEAST_COLOUR_STEP
+        if plain or jump_px < _LEAST_JUMP_PX or abs(end - start - jump_px) > 0.5 * jump_px + 1:
+            continue
+        unlike_before, unlike_after = np.linalg.norm(hidden - before), np.linalg.norm(hidden - after)
+        votes.append(float((unlike_after - unlike_before) / (unlike_after + unlike_before)))
+    return votes
+
+
+def _matched(
+    left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], least_px: float, greatest_px: float
+) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Disparity of the left picture by semi-global matching, and where the right picture's agrees."""
+    first_px = int(np.floor(least_px)) - _MARGIN_PX
+    count = int(np.ceil((greatest_px + _MARGIN_PX - first_px) / 16)) * 16
+    penalty = _BLOCK_PX**2
+    matcher = cv2.StereoSGBM.create(first_px, count, _BLOCK_PX, P1=8 * penalty, P2=32 * penalty)
+    beside = max(first_px + count, -first_px, 0)
+    # Exposures may differ.
+    greys = [cv2.equalizeHist(cv2.cvtColor(x, cv2.COLOR_RGB2GRAY)) for x in (left, right)]
+    greys = [cv2.copyMakeBorder(x, 0, 0, beside, beside, cv2.BORDER_REPLICATE) for x in greys]
+    mirrored = [np.ascontiguousarray(x[:, ::-1]) for x in reversed(greys)]
+    here = slice(beside, beside + left.shape[1])
+    left_px = matcher.compute(*greys)[:, here].astype(np.float32) / 16
+    right_px = matcher.compute(*mirrored)[:, ::-1][:, here].astype(np.float32) / 16
+    columns = np.rint(np.arange(left.shape[1]) - left_px).astype(int)
+    inside = (columns >= 0) & (columns < left.shape[1])
+    back_px = np.take_along_axis(right_px, np.clip(columns, 0, left.shape[1] - 1), axis=1)
+    return left_px, inside & (np.abs(back_px - left_px) <= 1) & (left_px > first_px)
+
+
+def _shrunk(photo: UInt8[np.ndarray, "h w 3"], factor: float) -> UInt8[np.ndarray, "h2 w2 3"]:
+    size = round(photo.shape[1] * factor), round(photo.shape[0] * factor)
+    return cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
