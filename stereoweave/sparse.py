@@ -67,7 +67,8 @@ def _paired(greys: list[UInt8[np.ndarray, "h w"]], most: int, rows_off: float) -
     if not (len(left) and len(right)):
         return Matches(np.zeros((0, 2)), np.zeros((0, 2)))
     alike = left_windows @ right_windows.T
-    alike[np.abs(left[:, 1:] - right[:, 1]) > rows_off] = -1
+    apart_px = np.subtract.outer(left[:, 1].astype(np.float32), right[:, 1].astype(np.float32))
+    alike[np.abs(apart_px, out=apart_px) > rows_off] = -1
     lefts = np.arange(len(left))
     partner, partner_of_right = alike.argmax(1), alike.argmax(0)
     best = alike[lefts, partner]
