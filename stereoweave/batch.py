@@ -35,6 +35,7 @@ from stereoweave.progress import progress
 from stereoweave.results import DepthOrder, make_depth
 from stereoweave.threads import usable_cores
 
+_BLAS_THREADS = "OPENBLAS_NUM_THREADS"
 DONE_FILE = "done.json"
 _NUMBERS = ("disparity_min_px", "disparity_median_px", "disparity_max_px", "confident_percent")
 _COLUMNS = ("name", "pictures", "seconds", *_NUMBERS, "notes", "error")
@@ -177,7 +178,7 @@ def _pool(processes: int, threads: int | None) -> Iterator[ProcessPoolExecutor]:
     others = multiprocessing.active_children()
     # Started afresh, because a forked child inherits OpenCV's and ONNX Runtime's threads in an unknown state.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, context, _begin, (threads,)) as pool:
+    with _few_blas_threads(threads), ProcessPoolExecutor(processes, context, _begin, (threads,)) as pool:
         try:
             yield pool
         except BaseException:
@@ -187,6 +188,22 @@ def _pool(processes: int, threads: int | None) -> Iterator[ProcessPoolExecutor]:
                     child.terminate()
                     child.join()
             raise
+
+
+@contextmanager
+def _few_blas_threads(threads: int | None) -> Iterator[None]:
+    """Processes that are started meanwhile have so many threads in OpenBLAS, NumPy's matrix library.
+
+    It reads the environment once, while it is loaded; its threads go on waiting busily after each product.
+    """
+    before = os.environ.get(_BLAS_THREADS)
+    os.environ[_BLAS_THREADS] = str(threads or usable_cores())
+    try:
+        yield
+    finally:
+        os.environ.pop(_BLAS_THREADS)
+        if before is not None:
+            os.environ[_BLAS_THREADS] = before
 
 
 def _begin(threads: int | None) -> None:
