@@ -8,7 +8,7 @@ from pathlib import Path
 from PIL import Image
 
 import stereoweave as sw
-from stereoweave.calibration import read_rig
+from stereoweave.calibration_files import read_rig
 from stereoweave.colour import colour_disparity, colour_range_px
 from stereoweave.io import write_depth_png, write_image
 

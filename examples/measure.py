@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import stereoweave as sw
-from stereoweave.calibration import calibrated
+from stereoweave.calibration_files import calibrated
 from stereoweave.io import read_pair
 from stereoweave.measuring import CameraError, distance
 

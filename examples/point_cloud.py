@@ -6,7 +6,7 @@ Run: python examples/point_cloud.py
 from pathlib import Path
 
 import stereoweave as sw
-from stereoweave.calibration import calibrated
+from stereoweave.calibration_files import calibrated
 from stereoweave.clouds import point_cloud, surface, write_glb, write_ply
 from stereoweave.io import read_pair
 

@@ -11,8 +11,6 @@ import json
 import multiprocessing
 import os
 import shutil
-import signal
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -31,6 +29,7 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.io import make_folder, reading, remove_leftovers, replacing
 from stereoweave.matcher import Matcher
 from stereoweave.pair_lists import BATCH_FILE, SUMMARY_FILE, Job, Pairs
+from stereoweave.processes import begin_work
 from stereoweave.progress import progress
 from stereoweave.results import DepthOrder, make_depth
 from stereoweave.threads import usable_cores
@@ -156,7 +155,7 @@ def _until_one_is_killed(
 ) -> Generator[Outcome, None, list[Job]]:
     """Outcomes of the jobs that wait; returns those that were being made when a process was killed."""
     pending: dict[Future[str | None], Job] = {}
-    with _pool(processes, threads) as pool:
+    with _pool(processes, threads or usable_cores()) as pool:
         try:
             while waiting or pending:
                 # No more than can be worked on, so that few are suspected.
@@ -173,12 +172,15 @@ def _until_one_is_killed(
 
 
 @contextmanager
-def _pool(processes: int, threads: int | None) -> Iterator[ProcessPoolExecutor]:
+def _pool(processes: int, threads: int) -> Iterator[ProcessPoolExecutor]:
     """Processes to work in, which are ended when something goes wrong here."""
     others = multiprocessing.active_children()
     # Started afresh, because a forked child inherits OpenCV's and ONNX Runtime's threads in an unknown state.
     context = multiprocessing.get_context("spawn")
-    with _few_blas_threads(threads), ProcessPoolExecutor(processes, context, _begin, (threads,)) as pool:
+    with (
+        _few_blas_threads(threads),
+        ProcessPoolExecutor(processes, context, begin_work, (threads,)) as pool,
+    ):
         try:
             yield pool
         except BaseException:
@@ -191,35 +193,19 @@ def _pool(processes: int, threads: int | None) -> Iterator[ProcessPoolExecutor]:
 
 
 @contextmanager
-def _few_blas_threads(threads: int | None) -> Iterator[None]:
+def _few_blas_threads(threads: int) -> Iterator[None]:
     """Processes that are started meanwhile have so many threads in OpenBLAS, NumPy's matrix library.
 
     It reads the environment once, while it is loaded; its threads go on waiting busily after each product.
     """
     before = os.environ.get(_BLAS_THREADS)
-    os.environ[_BLAS_THREADS] = str(threads or usable_cores())
+    os.environ[_BLAS_THREADS] = str(threads)
     try:
         yield
     finally:
         os.environ.pop(_BLAS_THREADS)
         if before is not None:
             os.environ[_BLAS_THREADS] = before
-
-
-def _begin(threads: int | None) -> None:
-    import cv2
-
-    cv2.setNumThreads(threads or usable_cores())
-    # Ctrl-C reaches the whole group, and the parent alone is to answer it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_the_parent, daemon=True).start()
-
-
-def _end_with_the_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
 
 
 def _make(out: Path, order: DepthOrder, job: Job) -> str | None:

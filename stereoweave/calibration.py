@@ -1,19 +1,13 @@
-"""How two cameras see and stand: read from the files that calibration programs write, and written as one."""
+"""How two cameras see and stand; `calibration_files` reads it, and writes it."""
 
 import math
-import re
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 from jaxtyping import Float
 
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io import reading, replacing
 from stereoweave.stereo import StereoCamera, StereoPair
 
 # How many coefficients OpenCV's models have; 0 is a lens without distortion.
@@ -21,11 +15,6 @@ _PINHOLE_COUNTS, _FISHEYE_COUNTS = (0, 4, 5, 8, 12, 14), (0, 4)
 # Files with few decimals are let through: over a picture of 4000 px these are some hundredths of a pixel.
 _ROTATION_OFF, _SAME_PX, _SAME_DIRECTION = 1e-5, 1e-2, 1e-3
 _ROUNDED = 1e-3
-_MM_ABOVE = 2.0
-_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-_FISHEYE_NAMES = {"fisheye", "equidistant", "equi", "kannalabrandt", "kb4"}
-_PINHOLE_NAMES = {"pinhole", "radtan", "plumbbob", "rationalpolynomial", "brownconrady", "none"}
-_EXPECTED = "a calibration of two cameras: OpenCV's YAML or XML, Kalibr's camchain, KITTI's or Middlebury's"
 
 Size = tuple[int, int]
 
@@ -165,345 +154,18 @@ def words(size_px: Size | None) -> str:
     return "unknown size" if size_px is None else f"{size_px[0]}x{size_px[1]}"
 
 
-def read_rig(path: str | Path, size_px: Size | None = None) -> Rig:
-    """The two cameras of a calibration file, known by its content.
-
-    Sources:
-        OpenCV's YAML, XML or JSON (cv2.FileStorage) with the names of its examples, M1 D1 M2 D2 R T, or
-        K1 .., cameraMatrix1 .., and so on, where extrinsics.yml is completed by the intrinsics.yml beside it
-        and the other way round. It does not say its unit of length: without an entry translation_unit (m, cm
-        or mm) a translation longer than 2 is taken for millimetres, else for metres. Nor does it say the
-        lens: without an entry distortion_model it is taken for a pinhole.
-        Kalibr's camchain.yaml, cam0 left and cam1 right. KITTI's calib.txt (P0 to P3) and
-        calib_cam_to_cam.txt, of the colour cameras 2 and 3 where they are there. Middlebury's calib.txt.
-
-    Args:
-        path: The file.
-        size_px: Width and height of the pictures: KITTI's calib_cam_to_cam.txt has a calibration for the
-            raw pictures as well, which is taken where they are of that size.
-
-    Raises:
-        FormatError: No such file, an entry is missing, or its value is nonsense.
-    """
-    with reading(path, _EXPECTED):
-        text = Path(path).read_text("utf-8-sig", errors="replace")
-        if re.search(r"^(cam0|doffs|baseline)\s*=", text, re.MULTILINE):
-            rig = _middlebury(text)
-        elif re.search(r"^(P\d|P_rect_\d\d|K_\d\d):", text, re.MULTILINE):
-            rig = _kitti(text, size_px)
-        elif "cam0" in (entries := _stored(text)):
-            rig = _kalibr(entries)
-        else:
-            rig = _opencv(_completed(entries, Path(path)))
-        return replace(rig, name=str(path))
-
-
-def calibrated(pair: StereoPair, path: str | Path) -> StereoPair:
-    """The pair with the camera of a calibration for rectified pictures of this size."""
-    rig = read_rig(path, size_of(pair))
-    rig.check_size(pair)
-    return replace(pair, camera=rig.camera())
-
-
 def rig_of(pair: StereoPair) -> Rig:
     """The rig of a rectified pair whose camera is known."""
     camera = pair.camera
     if camera is None:
         raise StereoweaveError("expected a pair whose camera is known, found none; give it a calibration")
-    left = _camera_matrix(camera.focal_px, camera.focal_px, camera.cx_px, camera.cy_px)
-    right = _camera_matrix(camera.focal_px, camera.focal_px, camera.cx_px + camera.doffs_px, camera.cy_px)
-    return replace(_side_by_side(left, right, -camera.baseline_m), size_px=size_of(pair))
+    focal_px, cx_px, cy_px = camera.focal_px, camera.cx_px, camera.cy_px
+    left = np.array([[focal_px, 0, cx_px], [0, focal_px, cy_px], [0, 0, 1]], np.float64)
+    right = left + np.array([[0, 0, camera.doffs_px], [0, 0, 0], [0, 0, 0]])
+    return replace(side_by_side(left, right, -camera.baseline_m), size_px=size_of(pair))
 
 
-def write_rig(path: str | Path, rig: Rig) -> None:
-    """Writes OpenCV's YAML, which `read_rig` reads back exactly and cv2.FileStorage reads as well.
-
-    Its entries: image_width, image_height, distortion_model, M1, D1, M2, D2, R, T and translation_unit.
-    """
-    if rig.left.fisheye != rig.right.fisheye:
-        raise StereoweaveError(f"{path}: expected two lenses of one kind, found a pinhole and a fisheye one")
-    storage = cv2.FileStorage(".yml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
-    if rig.size_px is not None:
-        storage.write("image_width", rig.size_px[0])
-        storage.write("image_height", rig.size_px[1])
-    storage.write("distortion_model", "fisheye" if rig.left.fisheye else "pinhole")
-    for side, optics in (("1", rig.left), ("2", rig.right)):
-        storage.write(f"M{side}", optics.matrix)
-        storage.write(f"D{side}", optics.distortion.reshape(1, -1))
-    storage.write("R", rig.rotation)
-    storage.write("T", rig.translation_m.reshape(3, 1))
-    storage.write("translation_unit", "m")
-    with replacing(path) as temporary:
-        temporary.write_text(storage.releaseAndGetString())
-
-
-# OpenCV and Kalibr
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML's plain values, and OpenCV's matrices."""
-
-
-def _matrix_of(loader: yaml.SafeLoader, node: yaml.MappingNode) -> np.ndarray:
-    stored = loader.construct_mapping(node, deep=True)
-    return _numbers(stored["data"]).reshape(int(stored["rows"]), int(stored["cols"]))
-
-
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix_of)
-
-
-def _stored(text: str) -> dict[str, Any]:
-    """The entries of a file of YAML, or of OpenCV's XML or JSON."""
-    if text.lstrip().startswith(("<", "{")):
-        return _stored_by_opencv(text)
-    try:
-        # Not YAML: OpenCV writes a colon in it.
-        entries = yaml.load(re.sub(r"\A\s*%YAML.*", "", text), _Loader)
-    except (yaml.YAMLError, KeyError, TypeError) as error:
-        raise ValueError(str(error).splitlines()[0]) from error
-    if not isinstance(entries, dict):
-        raise ValueError("neither of them")
-    return {str(key): value for key, value in entries.items()}
-
-
-def _stored_by_opencv(text: str) -> dict[str, Any]:
-    try:
-        storage = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
-        root = storage.root()
-        return {key: _value(root.getNode(key)) for key in root.keys()}  # noqa: SIM118 - no dict
-    except (cv2.error, SystemError) as error:  # the latter is what OpenCV's constructor makes of the former
-        raise ValueError("text that OpenCV cannot read") from error
-
-
-def _value(node: cv2.FileNode) -> Any:
-    if node.isMap():
-        return node.mat()
-    if node.isSeq():
-        return [_value(node.at(index)) for index in range(node.size())]
-    return node.string() if node.isString() else node.real()
-
-
-def _completed(entries: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Entries, and those of the file beside it where one of OpenCV's two files was named."""
-    for this, other in (("intrinsics", "extrinsics"), ("extrinsics", "intrinsics")):
-        beside = path.with_name(path.name.replace(this, other))
-        if this in path.name and beside.exists():
-            return _stored(beside.read_text("utf-8-sig", errors="replace")) | entries
-    return entries
-
-
-def _opencv(entries: Mapping[str, Any]) -> Rig:
-    # Some write camera_matrix_left, some cameraMatrixLeft.
-    plain = {_plain_word(key): value for key, value in entries.items()}
-    parts = _opencv_parts(plain)
-    model = _model(plain)
-    left, right = (
-        Optics(
-            matrix=parts[f"matrix {side}"].reshape(3, 3),
-            distortion=parts[f"distortion {side}"].ravel(),
-            fisheye=model == "fisheye",
-        )
-        for side in ("left", "right")
-    )
-    translation = parts["translation"].reshape(3)
-    unit, notes = _unit(translation, plain.get("translationunit"))
-    if model is None and left.distortion.size == 4:
-        notes += (
-            "the calibration does not say its lenses: taken for pinhole ones, k1 k2 p1 p2; an entry "
-            "distortion_model: fisheye says otherwise",
-        )
-    return Rig(
-        left=left,
-        right=right,
-        rotation=parts["rotation"].reshape(3, 3),
-        translation_m=translation * _METRES[unit],
-        size_px=_size(plain),
-        notes=notes,
-    )
-
-
-def _opencv_parts(plain: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """The numbers of either camera and between them, whatever they are called."""
-    found = {
-        f"{what} {side}": _of_side(plain, names, sides)
-        for side, sides in (("left", ("1", "left", "l")), ("right", ("2", "right", "r")))
-        for what, names in (
-            ("matrix", ("m", "k", "cm", "cameramatrix", "mtx")),
-            ("distortion", ("d", "dist", "distcoeffs", "distortion", "distortioncoefficients")),
-        )
-    }
-    found["rotation"] = _first(plain, ("r", "rotation", "rotationmatrix", "rot"))
-    found["translation"] = _first(plain, ("t", "translation", "translationvector", "trans"))
-    missing = [name for name, value in found.items() if value is None]
-    if missing:
-        raise ValueError(f"no entry for {', '.join(missing)} (M1 D1 M2 D2 R T)")
-    return {name: _numbers(value) for name, value in found.items()}
-
-
-def _plain_word(word: object) -> str:
-    return re.sub(r"[^a-z0-9]", "", str(word).lower())
-
-
-def _first(entries: Mapping[str, Any], names: Iterable[str]) -> Any:
-    return next((entries[name] for name in names if name in entries), None)
-
-
-def _of_side(entries: Mapping[str, Any], names: Iterable[str], sides: Iterable[str]) -> Any:
-    pairs = [(name, side) for name in names for side in sides]
-    return _first(entries, [name + side for name, side in pairs] + [side + name for name, side in pairs])
-
-
-def _model(entries: Mapping[str, Any]) -> str | None:
-    """The kind of lens that OpenCV's file names, fisheye or pinhole; None where it names none."""
-    if entries.get("fisheyemodel", entries.get("fisheye", 0)) in (1, True):
-        return "fisheye"
-    named = _first(entries, ("distortionmodel", "cameramodel", "model"))
-    return None if named is None else _known_model(named)
-
-
-def _known_model(named: object) -> str:
-    word = _plain_word(named)
-    if word in _FISHEYE_NAMES:
-        return "fisheye"
-    if word in _PINHOLE_NAMES:
-        return "pinhole"
-    raise ValueError(f"a lens {named}; radtan (pinhole) and equidistant (fisheye) ones are known")
-
-
-def _unit(translation: Float[np.ndarray, "3"], stated: object) -> tuple[str, tuple[str, ...]]:
-    """The translation's unit of length, and a line that says so where it is a guess."""
-    if stated is not None:
-        if str(stated) not in _METRES:
-            raise ValueError(f"translation_unit {stated}, not one of {', '.join(_METRES)}")
-        return str(stated), ()
-    length = float(np.linalg.norm(translation))
-    unit, word = ("mm", "millimetres") if length > _MM_ABOVE else ("m", "metres")
-    note = (
-        f"the calibration does not say its unit of length: its baseline of {length:g} was taken for {word}; "
-        "an entry translation_unit: m, cm or mm says otherwise"
-    )
-    return unit, (note,)
-
-
-def _size(entries: Mapping[str, Any]) -> Size | None:
-    both = _first(entries, ("imagesize", "resolution", "size"))
-    if both is None:
-        both = [entries.get("image" + side, entries.get(side)) for side in ("width", "height")]
-        if None in both:
-            return None
-    sides_px = _numbers(both).ravel()
-    if sides_px.size != 2:
-        raise ValueError(f"a picture's size of {both}, not width and height")
-    width, height = sides_px
-    return int(width), int(height)
-
-
-def _kalibr(entries: Mapping[str, Any]) -> Rig:
-    first, second = entries["cam0"], entries.get("cam1")
-    if not isinstance(first, dict) or not isinstance(second, dict):
-        raise ValueError("not two cameras, cam0 and cam1")
-    transform = second.get("T_cn_cnm1")
-    if transform is None:
-        raise ValueError("no T_cn_cnm1 of cam1, the way from cam0 to it")
-    to_right = _numbers(transform).reshape(4, 4)
-    left, right = _kalibr_optics("cam0", first), _kalibr_optics("cam1", second)
-    return Rig(
-        left=left,
-        right=right,
-        rotation=to_right[:3, :3],
-        translation_m=to_right[:3, 3],
-        size_px=_size({_plain_word(key): value for key, value in first.items()}),
-    )
-
-
-def _kalibr_optics(name: str, entries: Mapping[str, Any]) -> Optics:
-    missing = {"intrinsics", "distortion_coeffs"} - entries.keys()
-    if missing:
-        raise ValueError(f"no {' and no '.join(sorted(missing))} of {name}")
-    camera, intrinsics = entries.get("camera_model", "pinhole"), _numbers(entries["intrinsics"])
-    if camera != "pinhole" or intrinsics.size != 4:
-        raise ValueError(
-            f"the camera model {camera} of {name}; calibrate with pinhole-radtan or pinhole-equi"
-        )
-    fisheye = _known_model(entries.get("distortion_model", "radtan")) == "fisheye"
-    matrix = _camera_matrix(*intrinsics.tolist())
-    return Optics(matrix=matrix, distortion=_numbers(entries["distortion_coeffs"]).ravel(), fisheye=fisheye)
-
-
-# KITTI and Middlebury
-
-
-def _kitti(text: str, size_px: Size | None) -> Rig:
-    """Source: the development kits of KITTI's raw data, stereo, object and odometry benchmarks."""
-    lines = (line.split(":", 1) for line in text.splitlines() if ":" in line)
-    rows = {
-        key.strip(): _numbers(values.split())
-        for key, values in lines
-        if re.match(r"[PKDRTS]_?(rect_)?\d", key.strip())
-    }
-    first, second = (2, 3) if {"P3", "P_rect_03", "K_03"} & rows.keys() else (0, 1)
-    notes = (f"of KITTI's cameras, {first} is taken for the left one and {second} for the right one",)
-    raw_px = _kitti_size(rows, f"S_{first:02}")
-    keys = (f"P_rect_{first:02}", f"P_rect_{second:02}")
-    if keys[0] not in rows:
-        keys = f"P{first}", f"P{second}"
-    if keys[0] not in rows or (size_px is not None and size_px == raw_px):
-        return replace(_kitti_raw(rows, f"{first:02}", f"{second:02}"), size_px=raw_px, notes=notes)
-    left, right = (_kitti_row(rows, key).reshape(3, 4) for key in keys)
-    return replace(
-        _side_by_side(left, right, right[0, 3] / right[0, 0] - left[0, 3] / left[0, 0]),
-        size_px=_kitti_size(rows, f"S_rect_{first:02}"),
-        notes=notes,
-    )
-
-
-def _kitti_raw(rows: Mapping[str, Float[np.ndarray, " _"]], first: str, second: str) -> Rig:
-    """The rig of the pictures before KITTI's own rectification; each camera stands relative to camera 0."""
-    left, right = (
-        Optics(
-            matrix=_kitti_row(rows, f"K_{number}").reshape(3, 3),
-            distortion=_kitti_row(rows, f"D_{number}"),
-        )
-        for number in (first, second)
-    )
-    left_rotation, right_rotation = (
-        _kitti_row(rows, f"R_{number}").reshape(3, 3) for number in (first, second)
-    )
-    rotation = right_rotation @ left_rotation.T
-    translation_m = _kitti_row(rows, f"T_{second}") - rotation @ _kitti_row(rows, f"T_{first}")
-    return Rig(left=left, right=right, rotation=rotation, translation_m=translation_m)
-
-
-def _kitti_row(rows: Mapping[str, Float[np.ndarray, " _"]], key: str) -> Float[np.ndarray, " _"]:
-    if key not in rows:
-        raise ValueError(f"no entry {key}")
-    return rows[key]
-
-
-def _kitti_size(rows: Mapping[str, Float[np.ndarray, " _"]], key: str) -> Size | None:
-    if key not in rows:
-        return None
-    width, height = rows[key].tolist()
-    return int(width), int(height)
-
-
-def _middlebury(text: str) -> Rig:
-    """Source: the Middlebury datasets of 2014, cam0=[f 0 cx; 0 f cy; 0 0 1], the baseline in millimetres."""
-    lines = (line.split("=", 1) for line in text.splitlines() if "=" in line)
-    entries = {key.strip(): value for key, value in lines}
-    missing = {"cam0", "doffs", "baseline", "width", "height"} - entries.keys()
-    if missing:
-        raise ValueError(f"no entry {', '.join(sorted(missing))} of a Middlebury calib.txt")
-    left = _numbers([row.split() for row in entries["cam0"].strip(" []").split(";")]).reshape(3, 3)
-    right = left + np.array([[0, 0, float(entries["doffs"])], [0, 0, 0], [0, 0, 0]])
-    baseline_m = float(entries["baseline"]) / 1000
-    if not baseline_m > 0:
-        raise ValueError(f"a baseline of {entries['baseline']}, which must be positive")
-    size_px = int(entries["width"]), int(entries["height"])
-    return replace(_side_by_side(left, right, -baseline_m), size_px=size_px)
-
-
-def _side_by_side(left: Float[np.ndarray, "3 n"], right: Float[np.ndarray, "3 n"], aside_m: float) -> Rig:
+def side_by_side(left: Float[np.ndarray, "3 n"], right: Float[np.ndarray, "3 n"], aside_m: float) -> Rig:
     """The rig of rectified pictures; what a matrix says beyond its third column is not looked at."""
     return Rig(
         left=Optics(matrix=left[:, :3], distortion=np.zeros(0)),
@@ -511,14 +173,3 @@ def _side_by_side(left: Float[np.ndarray, "3 n"], right: Float[np.ndarray, "3 n"
         rotation=np.eye(3),
         translation_m=np.array([aside_m, 0, 0]),
     )
-
-
-def _camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
-    return _numbers([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-
-
-def _numbers(values: Any) -> Float[np.ndarray, "..."]:
-    try:
-        return np.asarray(values, dtype=np.float64)
-    except TypeError as error:  # of a dict, for instance
-        raise ValueError(f"{values} in place of numbers") from error

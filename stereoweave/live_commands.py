@@ -48,7 +48,7 @@ def live(  # noqa: PLR0913 - each is a word of the command line
     """What cameras see and its depth in colours, as it comes, on a page in the browser; Ctrl-C ends it."""
     # Else the libraries that OpenCV reads with tell the terminal in their words what the error says in ours.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    from stereoweave.calibration import read_rig
+    from stereoweave.calibration_files import read_rig
     from stereoweave.footage_layout import ARRANGEMENTS
     from stereoweave.live import Capture, Screen, Tally, show
 

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from stereoweave.calibration import read_rig, size_of
+from stereoweave.calibration import size_of
+from stereoweave.calibration_files import read_rig
 from stereoweave.errors import StereoweaveError
 from stereoweave.exif import Lens
 from stereoweave.pictures import open_pictures

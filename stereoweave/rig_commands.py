@@ -43,7 +43,8 @@ def rectify(
 
     The pictures are cut to what both show. With a calibration calib.yml is the new one, of the results.
     """
-    from stereoweave.calibration import rig_of, size_of, words, write_rig
+    from stereoweave.calibration import rig_of, size_of, words
+    from stereoweave.calibration_files import write_rig
     from stereoweave.io import write_image
     from stereoweave.preparing import Request, prepare
     from stereoweave.rectify import cropped
@@ -99,7 +100,7 @@ def calibrate(  # noqa: PLR0913 - each is a word of the command line
     """How two cameras see and stand, from pictures of a board; how well it is known, in plain words."""
     from stereoweave.boards import Board
     from stereoweave.boards import calibrate as calibrate_by
-    from stereoweave.calibration import write_rig
+    from stereoweave.calibration_files import write_rig
 
     match = re.fullmatch(r"(\d+)x(\d+)", board)
     if match is None:

@@ -9,7 +9,7 @@ from rig_examples import Cameras, Plane, fisheye, pinhole, rig_of, turned
 
 from stereoweave import boards
 from stereoweave.boards import Board
-from stereoweave.calibration import read_rig, write_rig
+from stereoweave.calibration_files import read_rig, write_rig
 from stereoweave.cli import main
 from stereoweave.errors import StereoweaveError
 from stereoweave.io import write_image

@@ -10,16 +10,6 @@ from stereoweave import io
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.stereo import StereoPair
 
-CALIBRATION = """\
-cam0=[994.978 0 311.193; 0 994.978 254.877; 0 0 1]
-cam1=[994.978 0 342.279; 0 994.978 254.877; 0 0 1]
-doffs=31.086
-baseline=193.001
-width=741
-height=497
-ndisp=70
-"""
-
 
 @pytest.fixture
 def picture():
@@ -166,7 +156,7 @@ def test_a_folder_is_no_picture(tmp_path):
     assert raises(io.read_image, tmp_path).endswith("found a folder")
 
 
-@pytest.mark.parametrize("content", [b"", b"hello", CALIBRATION.encode(), b"\x89PNG\r\n\x1a\n"])
+@pytest.mark.parametrize("content", [b"", b"hello", b"cam0=[994.978 0 311.193]\n", b"\x89PNG\r\n\x1a\n"])
 def test_what_is_no_picture_is_named(tmp_path, content):
     (tmp_path / "picture.png").write_bytes(content)
     assert raises(io.read_image, tmp_path / "picture.png").endswith("found something else")

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stereoweave.calibration import read_rig
+from stereoweave.calibration_files import read_rig
 from stereoweave.colour import colour_disparity
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.live import Capture, Screen, Tally, composed, followed, range_words, show

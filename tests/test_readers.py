@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from stereoweave import io
-from stereoweave.calibration import read_rig
+from stereoweave.calibration_files import read_rig
 from stereoweave.data.readers import read_scenes
 from stereoweave.errors import FormatError, StereoweaveError
 

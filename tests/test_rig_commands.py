@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stereoweave.alignment import check_pair
-from stereoweave.calibration import calibrated
+from stereoweave.calibration_files import calibrated
 from stereoweave.cli import main
 from stereoweave.io import read_image, read_pair, write_image
 

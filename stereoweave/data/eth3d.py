@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stereoweave.calibration import calibrated
+from stereoweave.calibration_files import calibrated
 from stereoweave.data.frames import Frame, existing, scenes
 from stereoweave.data.samples import make_sample, of_its_size
 from stereoweave.io import read_pair, read_pfm, read_pixels

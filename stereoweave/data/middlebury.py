@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from stereoweave.calibration import calibrated
+from stereoweave.calibration_files import calibrated
 from stereoweave.data.frames import Frame, scenes
 from stereoweave.data.samples import make_sample, of_its_size
 from stereoweave.errors import FormatError

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
-from stereoweave.calibration import calibrated
+from stereoweave.calibration_files import calibrated
 from stereoweave.data.checksums import check_sums, checksums
 from stereoweave.data.frames import Frame, matched
 from stereoweave.data.samples import make_sample, of_its_size

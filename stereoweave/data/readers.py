@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from stereoweave.calibration import calibrated
+from stereoweave.calibration_files import calibrated
 from stereoweave.data import eth3d, kitti, middlebury, paper_layout, scene_flow, shards, sintel
 from stereoweave.data.frames import Frame, existing
 from stereoweave.data.splits import split_frames

@@ -2,8 +2,6 @@
 
 import multiprocessing
 import os
-import signal
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -13,6 +11,7 @@ from typing import TypeVar
 from rich.console import Console
 
 from stereoweave.errors import StereoweaveError
+from stereoweave.processes import begin_work
 from stereoweave.progress import progress
 
 Task = TypeVar("Task")
@@ -80,16 +79,4 @@ def _begin(done: "Synchronized[int]") -> None:
     _done = done
     # Mesa reads it when the first context is made; more threads than cores slow all of them down.
     os.environ["LP_NUM_THREADS"] = "1"
-    import cv2
-
-    cv2.setNumThreads(1)
-    # Ctrl-C reaches the whole group, and the parent alone is to answer it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_the_parent, daemon=True).start()
-
-
-def _end_with_the_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
+    begin_work(threads=1)
