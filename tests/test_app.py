@@ -56,6 +56,8 @@ pytestmark = pytest.mark.needs_chromium
 
 def start(folder: Path) -> tuple[subprocess.Popen[str], str]:
     """A server of its own, whose temporary files are in `folder`, and its address."""
+    # Where a shell starts the tests in the background, Ctrl-C is ignored, and processes inherit that.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     server = subprocess.Popen(
         [*SERVER, "--port", "0"],
         stdout=subprocess.PIPE,
@@ -63,6 +65,7 @@ def start(folder: Path) -> tuple[subprocess.Popen[str], str]:
         text=True,
         env={**os.environ, "TMPDIR": str(folder), "PYTHONUNBUFFERED": "1"},
     )
+    signal.signal(signal.SIGINT, before)
     assert server.stdout
     return server, re.search(r"http://\S+", server.stdout.readline())[0]
 
@@ -273,6 +276,7 @@ def test_a_focal_length_that_can_be_none_is_told(hasty):
     hasty.page.get_by_text("More about the pictures").click()
     for name in ("focal", "baseline"):
         hasty.page.locator(f"#{name} input").fill("-600")
+        hasty.page.locator(f"#{name} input").press("Tab")
     assert "must be positive" in hasty.find()
     for name in ("focal", "baseline"):
         hasty.page.locator(f"#{name} input").fill("0")

@@ -131,7 +131,8 @@ def test_the_commands_run_from_the_wheel_in_an_empty_environment(installed, pict
     assert read_image(pictures / "view.png").shape == (64, 96, 3)
     assert read_image(pictures / "quilt_qs8x6a1.5.png").shape == (6 * 64, 8 * 96, 3)
     with Image.open(pictures / "wiggle.webp") as wiggle:
-        assert wiggle.n_frames == 12
+        # Of 12 frames; those that are alike become one.
+        assert 5 < wiggle.n_frames <= 12
     assert (pictures / "rows.csv").is_file()
 
 
