@@ -275,8 +275,11 @@ def test_a_focal_length_that_can_be_none_is_told(hasty):
     hasty.give(left=EXAMPLES / "left.png", right=EXAMPLES / "right.png")
     hasty.page.get_by_text("More about the pictures").click()
     for name in ("focal", "baseline"):
-        hasty.page.locator(f"#{name} input").fill("-600")
-        hasty.page.locator(f"#{name} input").press("Tab")
+        field = hasty.page.locator(f"#{name} input")
+        field.click()
+        field.press("ControlOrMeta+a")
+        field.press_sequentially("-600")
+        field.press("Tab")
     assert "must be positive" in hasty.find()
     for name in ("focal", "baseline"):
         hasty.page.locator(f"#{name} input").fill("0")
