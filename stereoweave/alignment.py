@@ -1,5 +1,6 @@
 """How well two photographs are a rectified stereo pair: what is amiss with them, and what mends it."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -69,21 +70,19 @@ class Alignment:
     exposure_ratio: float
     defects: tuple[Defect, ...]
 
-    @property
-    def swapped(self) -> bool:
-        """Whether the left photograph seems to be the right camera's."""
-        return "swapped" in self.defects
-
     def lines(self) -> list[str]:
         """All that was found, a line each, with what to do about what is amiss."""
         if "too_few_matches" in self.defects:
             return [self._told("too_few_matches")]
         least_px, greatest_px = self.range_px
+        light = f"the right picture got {self.exposure_ratio:.2f} times the left one's light"
+        if math.isnan(self.exposure_ratio):
+            light = "not compared, for where both are alike they are too dark or too bright"
         found = [
             f"rows: {self.matches} matches, {self.vertical_error_px:.2f} px apart in the median, "
             f"95 % under {self.vertical_error_95_px:.2f} px",
             f"disparities: {least_px:.0f} to {greatest_px:.0f} px",
-            f"exposure: the right picture got {self.exposure_ratio:.2f} times the left one's light",
+            f"exposure: {light}",
         ]
         told = [self._told(defect) for defect in self.defects]
         return found + (told or ["nothing is amiss: a rectified pair, left and right in their places"])

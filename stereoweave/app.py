@@ -68,7 +68,6 @@ _NAMES = {
     "--format": "“How one file holds both”",
 }
 _TO_MEASURE = "Click two points of the photograph: here stands how far each is, and how far apart they are."
-_NO_METRES = "For metres give a calibration file, or the focal length and how far apart the cameras are."
 _WITHOUT_WEBGL = """const canvas = document.createElement("canvas");
 if (!canvas.getContext("webgl2") && !canvas.getContext("webgl")) element.innerHTML =
   '<p class="told problem">This browser does not draw in three dimensions: switch on its hardware ' +

@@ -92,7 +92,7 @@ def depth_of_many(
 ) -> int:
     """Makes a batch and tells how it went; the exit code: 1 if a pair failed, 130 if Ctrl-C ended it.
 
-    Reports are made where the order names report.html alone: each takes as long as all else.
+    Reports are made only where the order's files name report.html or all: each takes as long as all else.
     """
     order = replace(order, always=tuple(file for file in order.always if file != "report.html"))
     for note in pairs.notes:

@@ -53,7 +53,10 @@ Range = Annotated[
 ]
 Refined = Annotated[
     bool,
-    typer.Option("--refined", help="Match once more at full resolution: thin things and sharper edges."),
+    typer.Option(
+        "--refined",
+        help="Match once more, at full resolution up to 2 megapixels: thin things, sharper edges.",
+    ),
 ]
 Strength = Annotated[
     float, typer.Option(min=0, help="Multiplies the distance of the cameras, about their middle.")

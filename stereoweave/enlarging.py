@@ -268,7 +268,7 @@ def _settled(
     other_px: Float32[np.ndarray, "h w"],
     threads: int,
 ) -> tuple[Float32[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]]:
-    """A left view's disparity, from what both views found and the prior, and how doubtful it is (_Doubt)."""
+    """A left view's disparity, from both views' and the prior; its doubt: _FOLLOWS, _UNSEEN or _CHANGED."""
     settled_px, doubt = np.empty(found_px.shape, np.float32), np.empty(found_px.shape, np.uint8)
     halo = _MEAN_PX // 2
 

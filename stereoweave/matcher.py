@@ -80,6 +80,8 @@ class Matcher:
     ) -> Estimate:
         """Disparity of both views, confidence and occlusion of a rectified pair, uint8 RGB of one size.
 
+        The left view's disparity is brought to a part of a pixel (`subpixel.to_subpixel`).
+
         Args:
             left: The left photograph [H, W, 3].
             right: The right one.

@@ -128,9 +128,14 @@ def _checked(range_px: tuple[float, float], width_px: int) -> tuple[float, float
 def _seen_whole(matcher: Matcher, pair: StereoPair) -> StereoPair:
     """The pair, smaller where the network would else see it in strips, whose seams would show."""
     height, width = pair.left.shape[:2]
+    return _reduced(pair, _times_smaller(matcher, width, height))
+
+
+def _times_smaller(matcher: Matcher, width: int, height: int) -> float:
+    """By how much the network has to be shown less, to see a picture of this size whole; 1 where it does."""
     if matcher.sees_whole(width, height):
-        return pair
-    return _reduced(pair, (width * width * height / (_FILLED * PIXEL_PAIRS_AT_ONCE)) ** (1 / 3))
+        return 1.0
+    return (width * width * height / (_FILLED * PIXEL_PAIRS_AT_ONCE)) ** (1 / 3)
 
 
 def _reduced(pair: StereoPair, scale: float) -> StereoPair:
@@ -180,9 +185,14 @@ def _matched_within(
     small = seen
     if scale > 1:
         small = _reduced(pair, scale * pair.left.shape[1] / seen.left.shape[1])
-    ratio = small.left.shape[1] / seen.left.shape[1]
     # Not farther than the least: a network takes a plain sky for what is at the lower end of its range.
-    return small, _moved(matcher, small, math.floor(low_px * ratio))
+    least_px = math.floor(low_px * small.left.shape[1] / seen.left.shape[1])
+    height, width = small.left.shape[:2]
+    smaller = _times_smaller(matcher, width + abs(least_px), height)
+    if smaller > 1:
+        small = _reduced(pair, smaller * pair.left.shape[1] / width)
+        least_px = math.floor(low_px * small.left.shape[1] / seen.left.shape[1])
+    return small, _moved(matcher, small, least_px)
 
 
 def _moved(matcher: Matcher, pair: StereoPair, least_px: int) -> Estimate:

@@ -20,7 +20,7 @@ class Request:
 
     Attributes:
         arrangement: How one picture holds both views, a name in `pictures.FORMATS`; guessed where None.
-        calibration: A calibration file of the two cameras (`calibration.read_rig`).
+        calibration: A calibration file of the two cameras (`calibration_files.read_rig`).
         focal_px, baseline_m: Without one, what is known of the cameras; else EXIF may say it.
         rectify: Whether the rows are brought to match: by the calibration, or by features without one.
     """

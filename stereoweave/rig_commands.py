@@ -1,6 +1,7 @@
 """The commands about how the cameras stand: stereoweave check | rectify | calibrate."""
 
 import json
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -24,11 +25,20 @@ def check(pictures: Pictures, arrangement: Format = None, as_json: AsJson = Fals
     opened = open_pictures(pictures, arrangement)
     found = check_pair(opened.pair.left, opened.pair.right)
     if as_json:
-        typer.echo(json.dumps(asdict(found) | {"notes": [*opened.notes, *found.lines()]}, indent=2))
+        facts = {name: _known(value) for name, value in asdict(found).items()}
+        facts["notes"] = [*opened.notes, *found.lines()]
+        typer.echo(json.dumps(facts, indent=2, allow_nan=False))
     else:
         typer.echo("\n".join([*opened.notes, *found.lines()]))
     if found.defects:
         raise typer.Exit(1)
+
+
+def _known(value: object) -> object:
+    """The value, or None, JSON's null, in place of a number that is not known."""
+    if isinstance(value, tuple):
+        return [_known(part) for part in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def rectify(

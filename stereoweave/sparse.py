@@ -25,7 +25,6 @@ _LEAST_CORRELATION = 0.5
 _MOST_AMBIGUOUS = 0.85
 # Pictures that are not rectified show a thing at most this share of their height higher or lower.
 _MOST_ROWS_OFF = 0.25
-_ROWS_OFF_PX = 3.0
 # Windows, in full size, by which a match becomes exact, and how many steps that takes.
 _EXACT_RADIUS, _EXACT_STEPS = 6, 8
 _CONVERGED_PX, _LEAST_EXACT_CORRELATION = 0.05, 0.7

@@ -306,7 +306,8 @@ def _within_px(disparity_px: Float[np.ndarray, "h w"], matcher: Matcher) -> tupl
     low_px, high_px = np.percentile(disparity_px, [_OUTER_PERCENT, 100 - _OUTER_PERCENT]).tolist()
     if low_px >= 0 and high_px <= matcher.max_disparity_px:
         return None
-    return low_px - _MARGIN_PX, high_px + _MARGIN_PX
+    # A plain sky is taken for what is at the lower end of a range: that of parallel cameras stays at 0.
+    return min(low_px, max(low_px - _MARGIN_PX, 0.0)), high_px + _MARGIN_PX
 
 
 def _spread(count: int, wanted: int) -> range:

@@ -237,3 +237,20 @@ def test_the_answer_does_not_depend_on_earlier_calls_of_other_sizes(rng):
     first = sw.estimate(left, right)
     sw.estimate(left[:40, :70], right[:40, :70])
     np.testing.assert_array_equal(sw.estimate(left, right).disparity_px, first.disparity_px)
+
+
+def test_a_pair_that_is_moved_is_still_seen_whole(rng, monkeypatch):
+    for module in (matcher_module, matching):  # 8 px more than 96 columns are too many
+        monkeypatch.setattr(module, "PIXEL_PAIRS_AT_ONCE", 96 * 96 * 64)
+    seen = []
+    estimate = Matcher.estimate
+
+    def noted(matcher, left, right, **options):
+        seen.append(matcher.sees_whole(left.shape[1], left.shape[0]))
+        return estimate(matcher, left, right, **options)
+
+    monkeypatch.setattr(Matcher, "estimate", noted)
+    left, right = rng.integers(0, 256, (2, 64, 96, 3), np.uint8)
+    found = match(Matcher(), sw.StereoPair(left=left, right=right), range_px=(-8, 40))
+    assert found.disparity_px.shape == (64, 96)
+    assert seen == [True]

@@ -44,6 +44,14 @@ def test_the_check_gives_its_numbers_as_json(turned, capsys):
     assert abs(found["rotation_degrees"]) == pytest.approx(1, abs=0.1)
 
 
+def test_what_is_not_known_of_a_plain_pair_is_null_in_json(tmp_path, capsys):
+    write_image(tmp_path / "plain.png", np.full((64, 96, 3), 90, np.uint8))
+    assert main(["check", str(tmp_path / "plain.png"), str(tmp_path / "plain.png"), "--json"]) == 1
+    found = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert found["defects"] == ["too_few_matches"]
+    assert found["exposure_ratio"] is None
+
+
 def test_a_pair_is_rectified_by_what_it_shows_into_files_that_fit(turned, tmp_path, capsys):
     assert main(["rectify", LEFT, turned, "-o", str(tmp_path / "out")]) == 0
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["left.png", "right.png"]
