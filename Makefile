@@ -68,5 +68,5 @@ $(CORE)/installed: pyproject.toml constraints.txt
 
 $(DEV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(DEV)
-	$(DEV)/bin/python -m pip install --constraint constraints.txt --editable '.[synth,train,video,app,dev]'
+	$(DEV)/bin/python -m pip install --constraint constraints.txt --editable '.[synth,train,video,app,cluster,dev]'
 	touch $@
