@@ -1,4 +1,4 @@
-"""Which pictures are pairs: in a folder, by two glob patterns, or by a list; and what each pair is called."""
+"""Which pictures are pairs: among a folder's files, by two glob patterns, or by a list; and their names."""
 
 import csv
 import glob
@@ -6,19 +6,27 @@ import os
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import repeat, takewhile
+from functools import lru_cache
+from itertools import chain, repeat, takewhile
 from pathlib import Path
+from posixpath import splitext
+from typing import NamedTuple
 
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io import reading
+from stereoweave.stores import store_at
 
 BATCH_FILE, SUMMARY_FILE = "batch.json", "summary.csv"
-# These hold both views, whatever lies beside them: cameras that write .mpo put the left view there as .jpg.
-_OF_BOTH_VIEWS = {".mpo", ".jps", ".pns"}
-# Formats that are not read are found as well, so that they are refused by their names.
-_PICTURES = {
-    *(".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".jp2", ".pgm", ".ppm"),
-    *(".heic", ".heif", ".avif"),
+_CALIBRATION = "calib.txt"
+_ENDINGS = {
+    # Formats that are not read are found as well, so that they are refused by their names.
+    "picture": (
+        *(".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".jp2", ".pgm", ".ppm"),
+        *(".heic", ".heif", ".avif"),
+    ),
+    # Whatever lies beside them: cameras that write .mpo put the left view there as .jpg.
+    "both views": (".mpo", ".jps", ".pns"),
+    "film": (".mp4", ".mkv", ".mov", ".avi", ".webm"),
 }
 _SIDES = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R", "im0": "im1"}
 _OTHER_SIDES = _SIDES | {right: left for left, right in _SIDES.items()}
@@ -45,6 +53,28 @@ class Job:
     name: str
     pictures: tuple[Path, ...]
     calibration: Path | None = None
+
+
+class ListedPair(NamedTuple):
+    """A pair, or a film, among listed files.
+
+    Attributes:
+        name: The folder of its results; no other pair or film among the files has it.
+        files: Paths of left and right, of one picture that holds both, or of the film, parted by "/".
+        calibration: The path of the pair's own calibration file, where it has one.
+    """
+
+    name: str
+    files: tuple[str, ...]
+    calibration: str | None = None
+
+
+class Listed(NamedTuple):
+    """What is to be worked on among listed files: pairs and films; and pictures that belong to no pair."""
+
+    pairs: list[ListedPair]
+    films: list[ListedPair]
+    left_out: list[str]
 
 
 @dataclass(frozen=True)
@@ -85,31 +115,65 @@ def find_pairs(
 
 
 def pairs_in(folder: Path) -> Pairs:
-    """The pairs in a folder and below it; the note tells of pictures there that belong to none.
-
-    A pair is two pictures whose paths differ in the marks of the sides alone: left/a.png and right/a.png,
-    a_L.png and a_R.png, left_01.png and right_01.png, im0.png and im1.png. Where one of the two is missing,
-    the pair is there all the same, and cannot be read. Files of both views are pairs by themselves, and so is
-    every picture where not one pair was found by marks. A calib.txt beside left.png or im0.png is the pair's.
-    Hidden files, and folders that a batch was written to, are left out.
+    """The pairs in a folder and below it, as `pairs_among` finds them; the note tells of pictures left out.
 
     Raises:
         StereoweaveError: No such folder, no picture in it, or two pairs of one name.
     """
     if not folder.is_dir():
         raise StereoweaveError(f"{folder}: expected a folder of pictures, found {_found(folder)}")
-    batches = {path.parent for path in folder.rglob(BATCH_FILE)}
-    paths = [path for path in sorted(folder.rglob("*")) if _is_picture(path, folder, batches)]
-    doubles = [path for path in paths if path.suffix.lower() in _OF_BOTH_VIEWS]
-    halves = [path.relative_to(folder) for path in paths if path.suffix.lower() not in _OF_BOTH_VIEWS]
-    pairs = _pairs_by_marks(halves)
-    rest = sorted(set(halves) - {half for pair in pairs for half in pair})
-    if not (pairs or doubles):
-        doubles, rest = [folder / half for half in rest], []
-    pictures = [(path,) for path in doubles] + [(folder / left, folder / right) for left, right in pairs]
-    if not pictures:
+    listed = pairs_among(folder, (file.path for file in store_at(folder).files()))
+    if not listed.pairs:
         raise StereoweaveError(f"{folder}: expected pictures in it, {_endings()}, found none")
-    return Pairs(_jobs(pictures, folder), _left_out(folder, rest))
+    jobs = [
+        Job(
+            pair.name,
+            tuple(folder / path for path in pair.files),
+            folder / pair.calibration if pair.calibration else None,
+        )
+        for pair in listed.pairs
+    ]
+    return Pairs(jobs, left_out_note(folder, listed.left_out))
+
+
+def pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
+    """The pairs and the films among the files of a folder.
+
+    A pair is two pictures whose paths differ in the marks of the sides alone: left/a.png and right/a.png,
+    a_L.png and a_R.png, left_01.png and right_01.png, im0.png and im1.png. Where one of the two is missing,
+    the pair is there all the same, and cannot be read. Files of both views are pairs by themselves, and so is
+    every picture where not one pair was found by marks. A calib.txt beside left.png or im0.png is the pair's.
+    Folders that a batch was written to are left out.
+
+    Args:
+        folder: Its path or URL; a pair right in it has its name.
+        paths: Of the files below it, relative to it and parted by "/", without hidden ones.
+
+    Raises:
+        StereoweaveError: Two pairs are of one name.
+    """
+    files = _by_kind(paths)
+    halves, doubles = _pairs_by_marks(files["picture"]), files["both views"]
+    rest = sorted(set(files["picture"]).difference(chain.from_iterable(halves)))
+    if not (halves or doubles):
+        doubles, rest = rest, []
+    whole, calibrations = Path(os.path.abspath(folder)).name, set(files[_CALIBRATION])  # noqa: PTH100
+    pairs = [ListedPair(_name(path, 1, whole), (path,)) for path in sorted(doubles)]
+    for left, right in halves:
+        beside = f"{left[: left.rfind('/') + 1]}{_CALIBRATION}"
+        calibration = beside if beside in calibrations and _brings_one(left, 2) else None
+        pairs.append(ListedPair(_name(left, 2, whole), (left, right), calibration))
+    films = [ListedPair(_safe(path), (path,)) for path in sorted(files["film"])]
+    _check_names((pair.name, pair.files[0]) for pair in chain(pairs, films))
+    return Listed(pairs, films, rest)
+
+
+def left_out_note(folder: str | Path, pictures: Sequence[str]) -> tuple[str, ...]:
+    """A line that tells of the pictures of a folder that belong to no pair; none where there are none."""
+    if not pictures:
+        return ()
+    count = "1 picture" if len(pictures) == 1 else f"{len(pictures)} pictures"
+    return (f"{folder}: {count} left out, whose names do not say left or right: {pictures[0]}",)
 
 
 def pairs_by_globs(left: str, right: str) -> list[Job]:
@@ -160,62 +224,75 @@ def pairs_in_list(path: Path) -> list[Job]:
     return _jobs(pictures, path.parent, [row[2] if len(row) == 3 else "" for row in rows.values()])
 
 
-def _left_out(folder: Path, rest: Sequence[Path]) -> tuple[str, ...]:
-    if not rest:
-        return ()
-    count = "1 picture" if len(rest) == 1 else f"{len(rest)} pictures"
-    return (f"{folder}: {count} left out, whose names do not say left or right: {rest[0]}",)
-
-
 def _found(path: Path) -> str:
     return "a file" if path.exists() else "no such folder"
 
 
 def _endings() -> str:
-    return ", ".join(sorted(_OF_BOTH_VIEWS | _PICTURES))
+    return ", ".join(sorted((*_ENDINGS["picture"], *_ENDINGS["both views"])))
 
 
-def _is_picture(path: Path, folder: Path, batches: set[Path]) -> bool:
-    hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
-    known = path.suffix.lower() in _OF_BOTH_VIEWS | _PICTURES
-    return known and not hidden and path.is_file() and batches.isdisjoint(path.parents)
-
-
-def _pairs_by_marks(paths: Sequence[Path]) -> list[tuple[Path, Path]]:
-    """Left and right, of every path with a mark; none at all where nowhere both are there."""
-    there = set(paths)
-    pairs = set()
+def _by_kind(paths: Iterable[str]) -> dict[str, list[str]]:
+    """What is of use among listed files, by kind; nothing of what is in the folders of other batches."""
+    kinds: dict[str, list[str]] = {kind: [] for kind in (*_ENDINGS, BATCH_FILE, _CALIBRATION)}
+    kind_of = {ending: kind for kind, endings in _ENDINGS.items() for ending in endings}
+    kind_of |= {name: name for name in (BATCH_FILE, _CALIBRATION)}
     for path in paths:
-        if others := _partners(path):
+        name = path.rpartition("/")[2]
+        if kind := kind_of.get(splitext(name)[1].lower()) or kind_of.get(name):
+            kinds[kind].append(path)
+    batches = {path.rpartition("/")[0] for path in kinds[BATCH_FILE]}
+    if batches:
+        kinds = {
+            kind: [path for path in of if batches.isdisjoint(_above(path))] for kind, of in kinds.items()
+        }
+    return kinds
+
+
+def _above(path: str) -> list[str]:
+    """The folders in which a path is; the last is the whole, ""."""
+    parts = path.split("/")
+    return ["/".join(parts[:count]) for count in reversed(range(len(parts)))]
+
+
+def _pairs_by_marks(paths: Sequence[str]) -> list[tuple[str, str]]:
+    """Left and right, of every path with a mark; none at all where nowhere both are there."""
+    there, pairs, settled = set(paths), set(), set()
+    for path in paths:
+        if path not in settled and (marked := _marked(path)):
+            others, is_left = marked
             partner = next((other for other in others if other in there), others[0])
-            pairs.add((path, partner) if _is_left(path) else (partner, path))
+            pairs.add((path, partner) if is_left else (partner, path))
+            if partner == others[0]:  # which has this one for its own first choice
+                settled.add(partner)
     return sorted(pairs) if any(there.issuperset(pair) for pair in pairs) else []
 
 
-def _partners(path: Path) -> list[Path]:
-    """What the other side's picture may be called: with every mark of the path changed, or the last alone."""
-    parts = _stems(path)
-    marked = [index for index, part in enumerate(parts) if _MARK.search(part)]
-    return [
-        _with(path, [_swapped(part) if index in chosen else part for index, part in enumerate(parts)])
-        for chosen in (marked, marked[-1:])
-        if chosen
-    ]
+def _marked(path: str) -> tuple[list[str], bool] | None:
+    """What the other side's picture may be called, and whether this one is the left; None without a mark.
+
+    The other's name has every mark of the path changed, or the last alone.
+    """
+    stem, ending = splitext(path)
+    parts = stem.split("/")
+    swapped = [_swapped(part) for part in parts]
+    places = [place for place, (part, other) in enumerate(zip(parts, swapped, strict=True)) if part != other]
+    if not places:
+        return None
+    last = places[-1]
+    others = ["/".join(swapped) + ending]
+    if len(places) > 1:
+        others.append("/".join((*parts[:last], *swapped[last:])) + ending)
+    return others, _MARK.findall(parts[last])[-1] in _SIDES
 
 
-def _is_left(path: Path) -> bool:
-    last = next(part for part in reversed(_stems(path)) if _MARK.search(part))
-    return _MARK.findall(last)[-1] in _SIDES
+def _stems(path: str) -> list[str]:
+    """The parts of a path, the last without its ending."""
+    return splitext(path)[0].split("/")
 
 
-def _stems(path: Path) -> list[str]:
-    return [*path.parent.parts, path.stem]
-
-
-def _with(path: Path, stems: Sequence[str]) -> Path:
-    return Path(*stems[:-1], stems[-1] + path.suffix)
-
-
+# Most pictures are in the same folders as the one before them.
+@lru_cache(maxsize=1000)
 def _swapped(part: str) -> str:
     return _MARK.sub(lambda mark: _OTHER_SIDES[mark[0]], part)
 
@@ -235,27 +312,39 @@ def _columns(line: str) -> list[str]:
 
 def _jobs(pictures: Iterable[tuple[Path, ...]], root: Path, names: Iterable[str] = repeat("")) -> list[Job]:
     """A job for each pair, called by the name that is given, else by its path below `root` without marks."""
-    jobs: dict[str, Job] = {}
-    for paths, given in zip(pictures, names, strict=False):
-        job = Job(_safe(given or _name(paths, root)), paths, _calibration(paths))
-        # Not every disk tells small letters from capitals.
-        other = jobs.setdefault(job.name.casefold(), job)
-        if other is not job:
-            raise StereoweaveError(
-                f"expected pairs of different names, found {job.name} for {other.pictures[0]} and for "
-                f"{paths[0]}; name them in the third column of a --list"
-            )
-    return list(jobs.values())
-
-
-def _name(pictures: Sequence[Path], root: Path) -> str:
     # Without following links, as `resolve` would: the names are to be those that the user sees.
-    first, above = (Path(os.path.abspath(path)) for path in (pictures[0], root))  # noqa: PTH100
-    below = first.relative_to(above if first.is_relative_to(above) else first.anchor)
-    parts = _stems(below) if len(pictures) == 1 else list(map(_without_marks, _stems(below)))
-    return "_".join(filter(None, parts)) or above.name
+    above = Path(os.path.abspath(root))  # noqa: PTH100
+    jobs = []
+    for paths, given in zip(pictures, names, strict=False):
+        first = Path(os.path.abspath(paths[0]))  # noqa: PTH100
+        below = first.relative_to(above if first.is_relative_to(above) else first.anchor).as_posix()
+        name = _safe(given) if given else _name(below, len(paths), above.name)
+        beside = paths[0].with_name(_CALIBRATION)
+        jobs.append(Job(name, paths, beside if _brings_one(below, len(paths)) and beside.exists() else None))
+    _check_names((job.name, job.pictures[0]) for job in jobs)
+    return jobs
 
 
+def _check_names(names: Iterable[tuple[str, str | Path]]) -> None:
+    """Refuses two pairs of one name, each told by its first file."""
+    seen: dict[str, str | Path] = {}
+    for name, file in names:
+        # Not every disk tells small letters from capitals.
+        other = seen.setdefault(name.casefold(), file)
+        if other is not file:
+            raise StereoweaveError(
+                f"expected pairs of different names, found {name} for {other} and for {file}; "
+                "rename one, or name them in the third column of a --list"
+            )
+
+
+def _name(path: str, pictures: int, whole: str) -> str:
+    """The name of a pair by the path of its first picture; the whole folder's where no other is left."""
+    parts = _stems(path) if pictures == 1 else list(map(_without_marks, _stems(path)))
+    return _safe("_".join(filter(None, parts)) or whole)
+
+
+@lru_cache(maxsize=1000)
 def _without_marks(part: str) -> str:
     return "_".join(filter(None, (piece.strip(" _.-") for piece in _MARK.split(part))))
 
@@ -266,6 +355,6 @@ def _safe(name: str) -> str:
     return f"{name}_" if _TAKEN.fullmatch(name) else name
 
 
-def _calibration(pictures: Sequence[Path]) -> Path | None:
-    beside = pictures[0].with_name("calib.txt")
-    return beside if len(pictures) == 2 and _MARK.fullmatch(pictures[0].stem) and beside.exists() else None
+def _brings_one(path: str, pictures: int) -> bool:
+    """Whether a calibration file beside a pair's first picture is the pair's own."""
+    return pictures == 2 and _MARK.fullmatch(_stems(path)[-1]) is not None

@@ -6,11 +6,18 @@ summary says so; with STEREOWEAVE_REQUIRE_ALL=1 the run fails instead.
 
 import os
 import shutil
+import signal
+import socket
 import subprocess
 import sys
+import tempfile
+import time
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
+from urllib.request import Request, urlopen
+from uuid import uuid4
 
 import jaxtyping
 import numpy as np
@@ -85,3 +92,104 @@ def testdata() -> Path:
 def without_shape_checks(monkeypatch: pytest.MonkeyPatch) -> None:
     """As users run the package, for tests of the errors that users see where jaxtyping would speak first."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
+@pytest.fixture(scope="session")
+def ray_address(s3: str) -> Iterator[str]:
+    """The address of a Ray of 2 CPUs that was started for the tests, as `--address` takes it.
+
+    Its workers reach the S3 server of the tests as well.
+    """
+    with ray_head(cpus=2) as address:
+        yield address
+
+
+@contextmanager
+def ray_head(cpus: int) -> Iterator[str]:
+    """Ray, started by its own command and on ports of its own, for as long as the block lasts."""
+    port, client_port = free_ports(2)
+    # Directly below /tmp: the names of Unix sockets have at most 107 bytes.
+    with tempfile.TemporaryDirectory(prefix="sw-", dir="/tmp", ignore_cleanup_errors=True) as folder:
+        options = {
+            "node-ip-address": "127.0.0.1",
+            "port": port,
+            "ray-client-server-port": client_port,
+            "dashboard-agent-listen-port": 0,
+            "temp-dir": folder,
+            "num-cpus": cpus,
+            "object-store-memory": 150_000_000,
+            "include-dashboard": "false",
+            "include-log-monitor": "false",
+        }
+        command = [sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--block"]
+        command += ["--disable-usage-stats", *(f"--{name}={value}" for name, value in options.items())]
+        log = Path(folder, "start.log")
+        with log.open("wb") as out:
+            # Whoever has a token in his home folder would have to show it. Workers import what tests define.
+            environment = os.environ | {"RAY_AUTH_MODE": "disabled", "PYTHONPATH": str(Path(__file__).parent)}
+            head = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=environment)
+        try:
+            while head.poll() is None and "Ray runtime started" not in log.read_text():
+                time.sleep(0.05)
+            assert head.poll() is None, log.read_text()
+            yield f"127.0.0.1:{port}"
+        finally:
+            # Ended politely it would wait for half a minute; all its processes end with those of the node.
+            for process in processes_of(head.pid):
+                with suppress(ProcessLookupError):
+                    os.kill(process, signal.SIGKILL)
+            head.wait()
+
+
+def processes_of(process: int) -> list[int]:
+    """The process, and all that it has started and that these have."""
+    parents = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            parents[int(stat.parent.name)] = int(stat.read_text().rpartition(")")[2].split()[1])
+    found = [process]
+    for parent in found:
+        found += [child for child, its_parent in parents.items() if its_parent == parent]
+    return found
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports of this machine that nobody listens at."""
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
+        for taken in sockets:
+            taken.bind(("127.0.0.1", 0))
+        return [taken.getsockname()[1] for taken in sockets]
+
+
+@pytest.fixture(scope="session")
+def s3() -> Iterator[str]:
+    """The endpoint of an S3 server on this machine, to which the environment leads from now on."""
+    from moto.server import ThreadedMotoServer
+
+    server = ThreadedMotoServer("127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    settings = {
+        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
+        "AWS_ACCESS_KEY_ID": "testing",
+        "AWS_SECRET_ACCESS_KEY": "testing",
+        "AWS_DEFAULT_REGION": "us-east-1",
+        # Whatever else this machine's user has for Amazon.
+        "AWS_CONFIG_FILE": os.devnull,
+        "AWS_SHARED_CREDENTIALS_FILE": os.devnull,
+        "AWS_EC2_METADATA_DISABLED": "true",
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in settings.items():
+            patch.setenv(name, value)
+        yield settings["AWS_ENDPOINT_URL"]
+    server.stop()
+
+
+@pytest.fixture
+def bucket(s3: str) -> str:
+    """The URL of a new bucket of the S3 server."""
+    name = f"bucket-{uuid4().hex}"
+    urlopen(Request(f"{s3}/{name}", method="PUT")).close()
+    return f"s3://{name}"

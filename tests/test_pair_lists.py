@@ -3,7 +3,16 @@ from pathlib import Path
 import pytest
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.pair_lists import Job, Pairs, find_pairs, pairs_by_globs, pairs_in, pairs_in_list
+from stereoweave.pair_lists import (
+    Job,
+    ListedPair,
+    Pairs,
+    find_pairs,
+    pairs_among,
+    pairs_by_globs,
+    pairs_in,
+    pairs_in_list,
+)
 
 
 def put(folder: Path, *names: str) -> Path:
@@ -101,6 +110,58 @@ def test_a_folder_without_pictures_is_told_in_one_line(tmp_path):
         pairs_in(put(tmp_path, "film.mp4"))
     with pytest.raises(StereoweaveError, match="expected a folder of pictures, found no such folder"):
         pairs_in(tmp_path / "none")
+
+
+def test_pairs_among_the_files_of_a_store_are_those_of_a_folder_with_the_same_files(tmp_path):
+    names = ["a/left.png", "a/right.png", "a/calib.txt", "b_l.png", "b_r.png", "c/1.jps", "d.png", "left.png"]
+    names += ["out/batch.json", "out/e/left.png", "out/e/right.png", "right.png", "calib.txt", "c/calib.txt"]
+    folder = put(tmp_path / "castle", *names)
+    among = pairs_among("s3://bucket/castle", iter(names))
+    assert among.pairs == [
+        ListedPair("c_1", ("c/1.jps",)),
+        ListedPair("a", ("a/left.png", "a/right.png"), "a/calib.txt"),
+        ListedPair("b", ("b_l.png", "b_r.png")),
+        ListedPair("castle", ("left.png", "right.png"), "calib.txt"),
+    ]
+    assert among.left_out == ["d.png"]
+    jobs = pairs_in(folder).jobs
+    assert listed(folder, jobs) == {pair.name: pair.files for pair in among.pairs}
+    assert [job.calibration for job in jobs] == [
+        folder / pair.calibration if pair.calibration else None for pair in among.pairs
+    ]
+
+
+def test_films_have_their_endings_in_their_names_and_are_no_pictures():
+    files = ["a_l.png", "a_r.png", "a.mp4", "trip/a.MKV", "a.webm", "old/batch.json", "old/made.mov", "a.txt"]
+    among = pairs_among("pairs", files)
+    assert [pair.name for pair in among.pairs] == ["a"]
+    assert among.films == [
+        ListedPair("a.mp4", ("a.mp4",)),
+        ListedPair("a.webm", ("a.webm",)),
+        ListedPair("trip_a.MKV", ("trip/a.MKV",)),
+    ]
+    assert among.left_out == []
+
+
+def test_two_films_of_one_name_are_refused():
+    with pytest.raises(StereoweaveError, match="found a_b.mp4 for a/b.mp4 and for a_b.mp4"):
+        pairs_among("pairs", ["a/b.mp4", "a_b.mp4"])
+
+
+def test_a_file_named_like_a_kind_of_file_is_nothing():
+    assert pairs_among("pairs", ["picture", "film", "both views"]) == ([], [], [])
+
+
+def test_nothing_is_found_in_the_folder_that_a_batch_was_written_to():
+    assert pairs_among("out", ["batch.json", "a/left.png", "a/right.png"]) == ([], [], [])
+
+
+def test_a_side_may_be_told_by_folder_and_name_or_by_the_name_alone():
+    files = ["left/a_l.png", "right/a_r.png", "left_run/b_l.png", "left_run/b_r.png"]
+    assert [pair.files for pair in pairs_among("x", files).pairs] == [
+        ("left/a_l.png", "right/a_r.png"),
+        ("left_run/b_l.png", "left_run/b_r.png"),
+    ]
 
 
 def test_globs_are_paired_in_the_order_of_their_names(tmp_path):
