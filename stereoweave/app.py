@@ -38,6 +38,7 @@ from stereoweave.page_kept import (
 )
 from stereoweave.pictures import FORMATS
 from stereoweave.preparing import Request
+from stereoweave.providers import CPU
 
 _MOST_BYTES = 200 * 1024**2
 
@@ -83,8 +84,8 @@ _Server = Callable[[_Scope, _Receive, _Send], Awaitable[None]]
 class Page:
     """The page's parts, and what each does; `folder` takes the files to download, for an hour."""
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, provider: str = CPU) -> None:
+        self._folder, self._provider = folder, provider
         with gr.Blocks(
             title="Stereoweave", analytics_enabled=False, delete_cache=(_KEPT_S // 4, _KEPT_S)
         ) as self.blocks:
@@ -278,7 +279,7 @@ class Page:
             rectify=given[self._rectify],
         )
         pictures = tuple(Path(file) for file in (given[self._left], given[self._right]) if file)
-        return Uploads(pictures=pictures, request=request, model=given[self._model])
+        return Uploads(pictures=pictures, request=request, model=given[self._model], provider=self._provider)
 
     def _shown(self, kept: Kept, position: float) -> dict[Any, Any]:
         pair, estimate = kept.renderer.pair, kept.renderer.estimate
@@ -383,7 +384,7 @@ def _sample_folder() -> Path:
     return Path(str(importlib.resources.files("stereoweave"))) / "sample"
 
 
-def make_server(folder: Path, names: frozenset[str] | None) -> FastAPI:
+def make_server(folder: Path, names: frozenset[str] | None, provider: str = CPU) -> FastAPI:
     """The page as an ASGI application; uploads and results lie in a folder of its own.
 
     It answers to `names` alone, to any where there are none.
@@ -393,7 +394,7 @@ def make_server(folder: Path, names: frozenset[str] | None) -> FastAPI:
     css = importlib.resources.files("stereoweave").joinpath("page.css").read_text(encoding="utf-8")
     gr.mount_gradio_app(
         server,
-        Page(folder).blocks,
+        Page(folder, provider).blocks,
         path="/",
         footer_links=[],
         run_history=False,
@@ -452,11 +453,11 @@ def _own_names(listener: socket.socket) -> frozenset[str] | None:
     return frozenset({address, "localhost"}) if ip_address(address).is_loopback else None
 
 
-def serve(listener: socket.socket, url: str, *, open_browser: bool) -> None:
+def serve(listener: socket.socket, url: str, *, open_browser: bool, provider: str = CPU) -> None:
     """Serves the page on a listening socket until it is interrupted; then what was uploaded is removed."""
     with tempfile.TemporaryDirectory(prefix="stereoweave-page-") as folder:
         # An open page keeps a connection open, which would never end of itself.
-        server = make_server(Path(folder), _own_names(listener))
+        server = make_server(Path(folder), _own_names(listener), provider)
         config = uvicorn.Config(server, log_level="critical", timeout_graceful_shutdown=1)
         if open_browser:
             webbrowser.open(url)

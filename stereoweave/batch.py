@@ -6,7 +6,6 @@ results are, and how they came out. What was made how, `batch.json` says for the
 
 import csv
 import functools
-import hashlib
 import json
 import multiprocessing
 import os
@@ -24,14 +23,14 @@ from typing import Any
 import typer
 from rich.console import Console
 
-from stereoweave import __version__
+from stereoweave.claiming import check_claim, check_unclaimed, described, description
 from stereoweave.errors import StereoweaveError
 from stereoweave.io import make_folder, reading, remove_leftovers, replacing
 from stereoweave.matcher import Matcher
 from stereoweave.pair_lists import BATCH_FILE, SUMMARY_FILE, Job, Pairs
 from stereoweave.processes import begin_work
 from stereoweave.progress import progress
-from stereoweave.results import DepthOrder, make_depth
+from stereoweave.results import DepthOrder, make_depth, order_facts
 from stereoweave.threads import usable_cores
 
 _BLAS_THREADS = "OPENBLAS_NUM_THREADS"
@@ -75,7 +74,8 @@ def run_batch(
     processes = min(processes or usable_cores(), max(len(jobs), 1))
     if processes > 1 and order.threads is None:
         order = replace(order, threads=1)
-    Matcher(order.model, threads=1)  # said once, here, if there is no such network
+    # Said once, here, if there is no such network or provider.
+    Matcher(order.model, threads=1, provider=order.provider)
     make_folder(out)
     _claim(out, order)
     missing = [job for job in jobs if not _is_finished(out / job.name, job)]
@@ -216,7 +216,8 @@ def _make(out: Path, order: DepthOrder, job: Job) -> str | None:
         if job.calibration and not order.request.calibration:
             order = replace(order, request=replace(order.request, calibration=job.calibration))
         start_s = time.perf_counter()
-        summary, notes = make_depth(job.pictures, folder, order, _matcher(order.model, order.threads))
+        matcher = _matcher(order.model, order.threads, order.provider)
+        summary, notes = make_depth(job.pictures, folder, order, matcher)
         seconds = round(time.perf_counter() - start_s, 3)
         files = sorted(path.name for path in folder.iterdir() if path.name[0] != ".")
         facts = {"sources": sources, "files": files, "seconds": seconds, "notes": notes}
@@ -230,9 +231,9 @@ def _make(out: Path, order: DepthOrder, job: Job) -> str | None:
 
 
 @functools.cache
-def _matcher(model: str, threads: int | None) -> Matcher:
+def _matcher(model: str, threads: int | None, provider: str) -> Matcher:
     """The matcher of this process, kept between pairs."""
-    return Matcher(model, threads=threads)
+    return Matcher(model, threads=threads, provider=provider)
 
 
 def _sources(job: Job) -> list[list[Any]]:
@@ -264,41 +265,17 @@ def _finished(folder: Path) -> dict[str, Any]:
 
 def _claim(out: Path, order: DepthOrder) -> None:
     """Writes down whose folder this is, or refuses one that is another's."""
-    facts, path = _facts(order), out / BATCH_FILE
+    facts, path = order_facts(order), out / BATCH_FILE
     if path.exists():
-        _compare(path, facts)
-    elif others := sorted(entry.name for entry in out.iterdir() if not entry.name.startswith(".")):
-        raise StereoweaveError(
-            f"{out}: expected a new folder, or one with a {BATCH_FILE}, found {others[0]} in it"
-        )
+        expected = "the description of a batch that stereoweave depth made"
+        with reading(path, expected):
+            found = described(path, path.read_text(encoding="utf-8"), expected)
+        check_claim(path, facts, found)
     else:
+        check_unclaimed(out, BATCH_FILE, (entry.name for entry in out.iterdir() if entry.name[0] != "."))
         with replacing(path) as temporary:
-            temporary.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+            temporary.write_text(description(facts), encoding="utf-8")
     _tidy(out)
-
-
-def _compare(path: Path, expected: dict[str, Any]) -> None:
-    with reading(path, "the description of a batch that stereoweave depth made"):
-        found = json.loads(path.read_text(encoding="utf-8"))
-    for name in sorted(expected.keys() | found.keys()):
-        if found.get(name) != expected.get(name):
-            raise StereoweaveError(
-                f"{path}: expected {name} = {json.dumps(expected.get(name))}, as this run would make, "
-                f"found {json.dumps(found.get(name))}; ask for the same, or take another folder"
-            )
-
-
-def _facts(order: DepthOrder) -> dict[str, Any]:
-    """All that decides the results of a pair beside its pictures, files by what is in them."""
-    facts = {"stereoweave": __version__, **asdict(order)}
-    del facts["threads"]
-    facts |= facts.pop("request")
-    for name in ("model", "calibration"):
-        if facts[name] and (name == "calibration" or Path(facts[name]).is_file()):
-            with reading(facts[name], f"a {name}"):
-                content = Path(facts[name]).read_bytes()
-            facts[name] = f"{Path(facts[name]).name} {hashlib.sha256(content).hexdigest()[:12]}"
-    return json.loads(json.dumps(facts, default=str))  # where tuples have become lists
 
 
 def _tidy(out: Path) -> None:

@@ -1,7 +1,7 @@
-"""The commands stereoweave bench pairs | views | networks | speed | costs | paper | exponent | ablations."""
+"""The commands stereoweave bench pairs | views | networks | speed | costs | parity | paper, more."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -10,9 +10,11 @@ from typing import Annotated, Any
 import typer
 
 from stereoweave.command_line import (
+    Cluster,
     Model,
+    Provider,
     Threads,
-    load_matcher,
+    engine_of,
     needing_the_synth_extra,
     needing_the_train_extra,
     place_for,
@@ -104,15 +106,20 @@ def pairs(  # noqa: PLR0913 - each is a word of the command line
     sparsification: Annotated[
         Path | None, typer.Option(help="A picture to write: errors by confidence. Extra 'train'.")
     ] = None,
+    cluster: Cluster = None,
     threads: Threads = None,
+    provider: Provider = "cpu",
 ) -> None:
-    """Errors, edges, confidence, time and memory of networks and OpenCV's matchers on known disparity."""
+    """Errors, edges, confidence, time and memory of networks and OpenCV's matchers on known disparity.
+
+    With --cluster each scene is scored by one worker of --threads cores, 1 unless given, so that the times
+    beside SGBM's stay comparable; the memory is measured here.
+    """
     import cv2
 
-    from stereoweave.benchmark import MEAN, network, score_pairs, with_memory, write_csv
-    from stereoweave.data.readers import read_scenes
+    from stereoweave.benchmark import MEAN, score_pairs, with_memory, write_csv
+    from stereoweave.data.readers import list_scenes
     from stereoweave.io import picture_kind
-    from stereoweave.matcher import shipped_models
     from stereoweave.opencv_matchers import SGBM
     from stereoweave.threads import thread_count
 
@@ -122,15 +129,13 @@ def pairs(  # noqa: PLR0913 - each is a word of the command line
         place_for(picture)
         with needing_the_train_extra("a plot needs matplotlib"):
             from stereoweave import benchmark_plots
-    scenes = read_scenes(folder, dataset)
+    engine = engine_of(cluster, cpus_each=threads or 1)
+    threads = engine.threads_each if engine else threads
     cv2.setNumThreads(thread_count(threads))
-    makers = {}
-    for name in model or shipped_models():
-        makers[name] = partial(network, name, threads)
-        makers[name + REFINED] = partial(network, name, threads, refined=True)
-    scores = score_pairs(makers, scenes)
+    makers = _makers(model, threads, provider)
+    scores = score_pairs(makers, partial(list_scenes, folder.absolute(), dataset), engine)
     rows = with_memory(scores.rows, makers, scores.largest)
-    write_csv(out, rows)
+    write_csv(out, rows, scores.machine)
     means = [row for row in rows if row.scene == MEAN]
     if plot:
         benchmark_plots.draw_error_over_time(plot, means)
@@ -143,7 +148,7 @@ def pairs(  # noqa: PLR0913 - each is a word of the command line
 
 
 @bench.command()
-def views(
+def views(  # noqa: PLR0913 - each is a word of the command line
     folder: Annotated[
         Path,
         typer.Argument(
@@ -156,37 +161,40 @@ def views(
         list[str] | None,
         typer.Option(help="As for depth; may be given again. All shipped networks unless given."),
     ] = None,
+    cluster: Cluster = None,
     threads: Threads = None,
+    provider: Provider = "cpu",
 ) -> None:
-    """Errors of new views against pictures taken there: all pixels, smooth ones, depth edges, hidden ones."""
+    """Errors of new views against pictures taken there: all pixels, smooth ones, depth edges, hidden ones.
+
+    With --cluster each scene is scored by one worker of --threads cores, 1 unless given.
+    """
     import cv2
 
     from stereoweave.benchmark import MEAN, write_csv
-    from stereoweave.data.view_sets import read_view_scenes
-    from stereoweave.matcher import shipped_models
+    from stereoweave.data.view_sets import list_view_scenes
     from stereoweave.threads import thread_count
     from stereoweave.view_scores import score_scenes
 
     place_for(out)
-    scenes = read_view_scenes(folder)
+    engine = engine_of(cluster, cpus_each=threads or 1)
+    threads = engine.threads_each if engine else threads
     cv2.setNumThreads(thread_count(threads))
-    matches = {}
-    for name in model or shipped_models():
-        matches[name] = load_matcher(name, threads).estimate
-        matches[name + REFINED] = partial(matches[name], refined=True)
-    rows = score_scenes(matches, scenes, threads)
-    write_csv(out, rows)
-    _tell_means(VIEWS_TABLES, "method", [row for row in rows if row.scene == MEAN])
+    scenes = partial(list_view_scenes, folder.absolute())
+    scores = score_scenes(_makers(model, threads, provider), scenes, threads, engine)
+    write_csv(out, scores.rows, scores.machine)
+    _tell_means(VIEWS_TABLES, "method", [row for row in scores.rows if row.scene == MEAN])
     typer.echo(f"rows: {out}")
 
 
 @bench.command()
-def flicker(
+def flicker(  # noqa: PLR0913 - each is a word of the command line
     scenes: Annotated[list[str], typer.Argument(metavar="SCENE...", help="As for synth make.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("flicker.csv"),
     model: Model = "small",
     frames: Annotated[int, typer.Option(min=2, max=120, help="Of each film.")] = 12,
     threads: Threads = None,
+    provider: Provider = "cpu",
 ) -> None:
     """What steadying is worth: flicker and errors of depth with it and without, on rendered noisy films."""
     place_for(out)
@@ -194,7 +202,7 @@ def flicker(
         from stereoweave.flicker_bench import flicker_rows, means
     from stereoweave.benchmark import write_csv
 
-    rows = list(flicker_rows(scenes, model, frames=frames, threads=threads))
+    rows = list(flicker_rows(scenes, model, frames=frames, threads=threads, provider=provider))
     write_csv(out, rows)
     _tell_means(FLICKER_TABLES, "film", means(rows))
     typer.echo(f"rows: {out}")
@@ -238,6 +246,26 @@ def speed(
     with needing_the_train_extra():
         from stereoweave.learn.speed import run_times
     _write_and_tell(out, "A pair of 640x480", run_times(read))
+
+
+@bench.command()
+def parity(
+    checkpoints: Annotated[
+        list[Path], typer.Argument(metavar="CHECKPOINT...", help="Of shipped networks, as in checkpoints/.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("parity.csv"),
+) -> None:
+    """How far every variant of shipped networks is from PyTorch, on every provider that is here."""
+    from stereoweave.benchmark import write_csv
+
+    place_for(out)
+    with needing_the_train_extra():
+        from stereoweave.learn.parity import markdown
+        from stereoweave.learn.parity import parity as measured
+    rows = measured(checkpoints)
+    write_csv(out, rows)
+    typer.echo(markdown(rows))
+    typer.echo(f"rows: {out}")
 
 
 @bench.command()
@@ -322,6 +350,20 @@ def exponent(
     from stereoweave.learn.trials import ADJUSTMENT
 
     _experiment(recipe, out, report, seeds, jobs, (ADJUSTMENT,))
+
+
+def _makers(models: Sequence[str] | None, threads: int | None, provider: str) -> dict[str, Callable[[], Any]]:
+    """What makes each network, as it is and refined; all shipped ones unless some are named."""
+    from stereoweave.benchmark import network
+    from stereoweave.matcher import shipped_models
+
+    makers: dict[str, Callable[[], Any]] = {}
+    for name in models or shipped_models():
+        # A worker of a cluster has another current folder.
+        model = str(Path(name).absolute()) if Path(name).is_file() else name
+        makers[name] = partial(network, model, threads, provider=provider)
+        makers[name + REFINED] = partial(network, model, threads, refined=True, provider=provider)
+    return makers
 
 
 def _experiment(  # noqa: PLR0913 - the words of two command lines

@@ -1,5 +1,6 @@
 """The commands: stereoweave depth | measure | view | video | live | app | check | rectify | train, more."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -8,12 +9,14 @@ import typer
 
 from stereoweave import __version__
 from stereoweave.bench_commands import bench
+from stereoweave.cluster_commands import batch
 from stereoweave.command_line import needing_the_train_extra
 from stereoweave.depth_commands import depth, measure
 from stereoweave.errors import StereoweaveError
 from stereoweave.live_commands import live
 from stereoweave.page_commands import app as page
 from stereoweave.rig_commands import calibrate, check, rectify
+from stereoweave.serve_commands import serve
 from stereoweave.synth_commands import synth
 from stereoweave.video_commands import video
 from stereoweave.view_commands import view
@@ -52,7 +55,7 @@ def _stereoweave(
     """Depth, and any view between the two cameras, from a stereo pair."""
 
 
-for command in (depth, measure, view, video, live, check, rectify, calibrate):
+for command in (depth, measure, view, video, live, check, rectify, calibrate, serve, batch):
     app.command()(command)
 app.command("app")(page)
 
@@ -63,45 +66,64 @@ def train(
     out: Annotated[Path, typer.Option("--out", "-o", help="The folder of the run.")],
 ) -> None:
     """Train the network of a recipe; a run that was stopped continues where it was."""
+    from stereoweave.learn.ranks import told_once
     from stereoweave.learn.recipe import read_recipe
 
-    read_recipe(recipe)  # what is wrong with it is said before PyTorch takes seconds to load
+    with told_once():
+        read_recipe(recipe)  # what is wrong with it is said before PyTorch takes seconds to load
     with needing_the_train_extra():
         from stereoweave.learn.train import train as train_recipe
     train_recipe(recipe, out)
 
 
 @app.command()
-def export(
-    run: Annotated[Path, typer.Argument(help="The folder of a run, or a checkpoint in it.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The .onnx file to write.")],
+def export(  # noqa: PLR0913 - each is a word of the command line
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="The folder of a run, a checkpoint in it, or a matcher: a shipped name, an .onnx file."
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="The .onnx file to write, in float32.")
+    ] = None,
+    half: Annotated[
+        Path | None, typer.Option(help="An .onnx file to write that computes in 16 bits.")
+    ] = None,
+    eight_bits: Annotated[
+        Path | None, typer.Option(help="An .onnx file to write whose convolutions compute in 8 bits.")
+    ] = None,
+    size: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WxH", help="What is written takes one pair of this size alone, as TensorRT wants it."
+        ),
+    ] = None,
     scenes: Annotated[
         Path | None, typer.Option(help="Pairs on which both must agree too; a folder as for bench pairs.")
     ] = None,
     reliability: Annotated[
         Path | None, typer.Option(help="A picture to write: how often the confidence comes true.")
     ] = None,
-    eight_bits: Annotated[
-        Path | None, typer.Option(help="A second .onnx file to write, whose convolutions compute in 8 bits.")
-    ] = None,
 ) -> None:
-    """Turn a trained network into a file that --model takes, and prove that both agree."""
+    """Turn a trained network into files that --model takes, and prove that they agree with it.
+
+    A matcher file is made of a trained network, and variants are made of either: in 16 bits, in 8, for one
+    size. Each is compared with what it is made from, and refused if it differs by too much.
+    """
     from stereoweave.data.readers import read_scenes
 
+    size_px = _size_px(size) if size else None
     pairs = [scene.pair for scene in read_scenes(scenes)] if scenes else []
     with needing_the_train_extra():
-        from stereoweave.learn.calibrate import draw_reliability
-        from stereoweave.learn.export import export as export_run
-    card = export_run(run, out, pairs)
-    if reliability and "confidence" in card:
-        draw_reliability(card["confidence"], reliability)
-    typer.echo(
-        f"{out}: ONNX Runtime and PyTorch differ by at most {card['onnx_differs_px']:.4f} px "
-        f"over {1 + len(pairs)} pairs"
-    )
-    if eight_bits:
-        from stereoweave.learn.quantise import quantise
+        from stereoweave.learn.matcher_files import MatcherFiles, write_matcher_files
+    files = MatcherFiles(out=out, half=half, eight_bits=eight_bits, size=size_px)
+    for line in write_matcher_files(source, files, pairs, reliability):
+        typer.echo(line)
 
-        quantised = quantise(out, eight_bits)
-        lost_px = quantised["epe_px"] - quantised["epe_px_of_32_bits"]
-        typer.echo(f"{eight_bits}: 8 bits change the mean error by {lost_px:+.3f} px")
+
+def _size_px(size: str) -> tuple[int, int]:
+    found = re.fullmatch("([0-9]{1,5})x([0-9]{1,5})", size)
+    if found is None:
+        raise StereoweaveError(f"--size: expected width x height in pixels, such as 640x480, found {size!r}")
+    return int(found[1]), int(found[2])

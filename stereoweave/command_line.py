@@ -11,6 +11,7 @@ import typer
 from stereoweave.errors import StereoweaveError, needing_extra
 
 if TYPE_CHECKING:
+    from stereoweave.engine import Engine
     from stereoweave.matcher import Matcher
     from stereoweave.preparing import Request
 
@@ -63,6 +64,22 @@ Strength = Annotated[
 ]
 Model = Annotated[str, typer.Option(help="The name of a shipped network, or an .onnx file.")]
 Threads = Annotated[int | None, typer.Option(min=1, help="Processor threads; as many as cores unless given.")]
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Work on a Ray cluster: host:port or ray://host:port of its head, auto for one that runs here, "
+        "local for this machine's cores. All its nodes have to see the folder under the same name. Extra "
+        "'cluster'.",
+    ),
+]
+Provider = Annotated[
+    str,
+    typer.Option(
+        help="What the network is run on: cpu; cuda or tensorrt (NVIDIA's GPUs), openvino (Intel's "
+        "processors), coreml (macOS), directml (Windows). What one needs, it says where that is missing."
+    ),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
@@ -111,11 +128,18 @@ def _two_numbers(option: str, text: str, expected: str) -> tuple[float, float]:
     return first, second
 
 
-def load_matcher(model: str, threads: int | None) -> "Matcher":
+def load_matcher(model: str, threads: int | None, provider: str = "cpu") -> "Matcher":
     """The matcher that a command was asked for."""
     from stereoweave.matcher import Matcher
 
-    return Matcher(model, threads=threads)
+    return Matcher(model, threads=threads, provider=provider)
+
+
+def engine_of(cluster: str | None, workers: int | None = None, cpus_each: float = 1) -> "Engine | None":
+    """Where a command's work is done; None where it is not to be a cluster."""
+    from stereoweave.engine import Engine
+
+    return Engine(cluster, workers, cpus_each) if cluster else None
 
 
 def place_for(*files: Path) -> Path:

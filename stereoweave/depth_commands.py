@@ -15,6 +15,7 @@ from stereoweave.command_line import (
     Format,
     Model,
     Pictures,
+    Provider,
     Range,
     Rectify,
     Refined,
@@ -76,6 +77,7 @@ def depth(  # noqa: PLR0913 - each is a word of the command line
     refined: Refined = False,
     model: Model = "small",
     threads: Threads = None,
+    provider: Provider = "cpu",
     as_json: AsJson = False,
 ) -> None:
     """Depth of a stereo pair, or of many: maps, pictures of them, and a report to open in a browser."""
@@ -86,6 +88,7 @@ def depth(  # noqa: PLR0913 - each is a word of the command line
         request=request_of(arrangement, calib, focal_px, baseline_m, rectify),
         model=model,
         threads=threads,
+        provider=provider,
         range_px=range_of(range_px),
         refined=refined,
         files=tuple(write or ()),
@@ -95,7 +98,7 @@ def depth(  # noqa: PLR0913 - each is a word of the command line
         from stereoweave.batch import depth_of_many
 
         raise typer.Exit(depth_of_many(pairs, out, order, processes=jobs, as_json=as_json))
-    summary, notes = make_depth(pictures, out, order, load_matcher(model, threads))
+    summary, notes = make_depth(pictures, out, order, load_matcher(model, threads, provider))
     (_tell_json if as_json else _tell)(summary, notes, out)
 
 
@@ -114,6 +117,7 @@ def measure(  # noqa: PLR0913 - each is a word of the command line
     refined: Refined = False,
     model: Model = "base",
     threads: Threads = None,
+    provider: Provider = "cpu",
     as_json: AsJson = False,
 ) -> None:
     """The distance in metres between what two pixels show, and how certain it is.
@@ -129,7 +133,8 @@ def measure(  # noqa: PLR0913 - each is a word of the command line
     within_px = range_of(range_px)
     prepared = prepare(pictures, request_of(arrangement, calib, focal_px, baseline_m, rectify))
     camera = needed_camera(prepared.pair)
-    estimate = match(load_matcher(model, threads), prepared.pair, range_px=within_px, refined=refined)
+    matcher = load_matcher(model, threads, provider)
+    estimate = match(matcher, prepared.pair, range_px=within_px, refined=refined)
     error = CameraError(focal=focal_error_percent / 100, baseline=baseline_error_percent / 100)
     found = distance(estimate, camera, *places, camera_error=error)
     if as_json:

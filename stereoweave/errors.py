@@ -13,7 +13,11 @@ class FormatError(StereoweaveError):
 
 
 class MatcherError(StereoweaveError):
-    """A matcher that is unknown, or an ONNX file that is none."""
+    """A matcher that is unknown, an ONNX file that is none, or a provider that is not there."""
+
+
+class ProviderError(MatcherError):
+    """What a network is run on failed meanwhile, as for want of memory; the same call may work later."""
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.flicker import flicker
 from stereoweave.flicker_films import LEFT, MIDDLE, NOISE_LEVELS, Film, noisy, panning, passing, still
 from stereoweave.matcher import Matcher
+from stereoweave.providers import CPU
 from stereoweave.rendering import Renderer
 from stereoweave.steady import Steadier
 from stereoweave.stereo import Estimate, StereoPair
@@ -71,6 +72,7 @@ def flicker_rows(  # noqa: PLR0913 - each is a word of the command line
     size_px: tuple[int, int] = (640, 480),
     seed: int = 0,
     threads: int | None = None,
+    provider: str = CPU,
 ) -> Iterator[FlickerRow]:
     """Two rows, frame by frame and steady, of each of four films of each scene.
 
@@ -81,6 +83,7 @@ def flicker_rows(  # noqa: PLR0913 - each is a word of the command line
         size_px: Width and height.
         seed: Of the scenes and of the noise.
         threads: How many may be used; all cores if left out.
+        provider: As for `Matcher`.
 
     Raises:
         StereoweaveError: A scene or the model is unknown, or there are too few frames.
@@ -88,7 +91,7 @@ def flicker_rows(  # noqa: PLR0913 - each is a word of the command line
     if frames < 2:
         raise StereoweaveError(f"frames: expected 2 or more, for flicker is between two; got {frames}")
     orders = [Order(scene=scene, seed=seed, size_px=size_px, frames=_WAY_FRAMES) for scene in scenes]
-    matcher = Matcher(model, threads=threads)
+    matcher = Matcher(model, threads=threads, provider=provider)
     for order in orders:
         for film in _films(order, frames):
             pairs = [

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from stereoweave.command_line import Model, Threads, load_matcher
+from stereoweave.command_line import Model, Provider, Threads, load_matcher
 from stereoweave.errors import StereoweaveError
 
 Sources = Annotated[
@@ -42,6 +42,7 @@ def live(  # noqa: PLR0913 - each is a word of the command line
     calib: Calib = None,
     model: Model = "small",
     threads: Threads = None,
+    provider: Provider = "cpu",
     port: Port = 8123,
     browser: Browser = True,
 ) -> None:
@@ -58,7 +59,7 @@ def live(  # noqa: PLR0913 - each is a word of the command line
             f"{arrangement} of {' '.join(sources)}"
         )
     rig = read_rig(calib) if calib else None
-    matcher, tally = load_matcher(model, threads), Tally()
+    matcher, tally = load_matcher(model, threads, provider), Tally()
     with Screen(port) as screen, Capture(sources) as capture:
         typer.echo(f"{capture.name}: shown at {screen.url}; Ctrl-C ends it")
         if browser:

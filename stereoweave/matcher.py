@@ -5,8 +5,7 @@ A matcher file (docs/architecture.md) takes `left` and `right`, float32 [B, 3, H
 """
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
@@ -18,6 +17,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from stereoweave.errors import MatcherError, StereoweaveError
 from stereoweave.io import SMALLEST_SIDE_PX
+from stereoweave.providers import CPU, PROVIDERS, open_session, running
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.subpixel import to_subpixel
 from stereoweave.threads import thread_count
@@ -53,27 +53,28 @@ class Matcher:
     Args:
         model: A shipped name (see `shipped_models`) or the path of an .onnx file.
         threads: How many threads a call may use; all cores that the process may use if left out.
+        provider: What the network is run on, a name in `providers.PROVIDERS`.
+
+    Attributes:
+        fixed_size: Height and width of the only pictures that the network takes; None where any will do.
 
     Raises:
-        MatcherError: If there is no such model, or the file is not a matcher.
+        MatcherError: If there is no such model, the file is not a matcher, or the provider is not there.
     """
 
-    def __init__(self, model: str | Path = "small", *, threads: int | None = None) -> None:
-        import onnxruntime  # type: ignore[import-untyped]
-
-        self._path, self.threads = model_file(model), threads
-        options = onnxruntime.SessionOptions()
-        # Not ONNX Runtime's own choice: on a virtual machine it counts two cores as one with two threads.
-        options.intra_op_num_threads = thread_count(threads)
-        # Else its threads go on waiting busily after a run, and slow down what runs next on these cores.
-        options.add_session_config_entry("session.force_spinning_stop", "1")
-        options.log_severity_level = 4  # what is wrong with a file is said once, by the error below
-        with _naming(self._path):
-            self._session = onnxruntime.InferenceSession(
-                str(self._path), options, providers=["CPUExecutionProvider"]
-            )
+    def __init__(
+        self, model: str | Path = "small", *, threads: int | None = None, provider: str = CPU
+    ) -> None:
+        self._path, self.threads, self.provider = model_file(model), threads, provider
+        self._session = open_session(self._path, provider, thread_count(threads))
         self._outputs = self._checked_outputs()
         self.name, self.multiple_of, self.max_disparity_px = self._checked_properties()
+        # A side that may be any has a name; a file need not say how many sides there are.
+        shape: list[Any] = [*self._session.get_inputs()[0].shape, *["any"] * 4]
+        batch, _, height, width = shape[:4]
+        self._takes_batches = not isinstance(batch, int) and PROVIDERS[provider].batches
+        is_fixed = isinstance(height, int) and isinstance(width, int)
+        self.fixed_size: tuple[int, int] | None = (height, width) if is_fixed else None
 
     def estimate(
         self, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], *, refined: bool = False
@@ -89,18 +90,50 @@ class Matcher:
                 things, has sharper edges, and takes longer.
 
         Raises:
-            ValueError: If the images are not that, or under 32 px in a direction.
+            ValueError: If the images are not that, under 32 px in a direction, or larger than `fixed_size`.
         """
-        pair = StereoPair(left=left, right=right)
-        height, width = left.shape[:2]
-        if min(height, width) < SMALLEST_SIDE_PX:
+        (found,) = self.estimate_many([StereoPair(left=left, right=right)])
+        return self.refined(left, right, found) if refined else found
+
+    def estimate_many(self, pairs: Sequence[StereoPair]) -> list[Estimate]:
+        """As `estimate` of each, of pairs of one size; in one run where the file can and the provider gains.
+
+        Raises:
+            ValueError: As for `estimate`, or if the pairs are not all of one size.
+        """
+        self._check_sizes(pairs)
+        every_maps = self._maps(pairs)
+        if any(maps.right_disparity_px is None for maps in every_maps):
+            mirrored = self._maps([pair.mirrored() for pair in pairs])
+            every_maps = [
+                maps._replace(right_disparity_px=np.ascontiguousarray(other.disparity_px[:, ::-1]))
+                for maps, other in zip(every_maps, mirrored, strict=True)
+            ]
+        return [self._estimate(pair, maps) for pair, maps in zip(pairs, every_maps, strict=True)]
+
+    def _check_sizes(self, pairs: Sequence[StereoPair]) -> None:
+        sizes = sorted({pair.left.shape[:2] for pair in pairs})
+        if len(sizes) > 1:
+            found = ", ".join(f"{width}x{height}" for height, width in sizes)
             raise StereoweaveError(
-                f"images: expected at least {SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX} px, got {width}x{height}"
+                f"pairs: expected all of one size, got {found}; matching.match_many takes pairs of any sizes"
             )
-        maps = self._maps(pair)
-        right_px = maps.right_disparity_px
-        if right_px is None:
-            right_px = np.ascontiguousarray(self._maps(pair.mirrored()).disparity_px[:, ::-1])
+        for height, width in sizes:
+            got = f"got {width}x{height}"
+            if min(height, width) < SMALLEST_SIDE_PX:
+                least = f"{SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX}"
+                raise StereoweaveError(f"images: expected at least {least} px, {got}")
+            if self.fixed_size is not None and not self.sees_whole(width, height):
+                most = f"{self.fixed_size[1]}x{self.fixed_size[0]}"
+                raise StereoweaveError(
+                    f"images: expected at most {most} px, the size that {self._path.name} takes, {got}; "
+                    "matching.match makes them smaller"
+                )
+
+    def _estimate(self, pair: StereoPair, maps: Maps) -> Estimate:
+        """What the maps of both views say of a pair, to a part of a pixel."""
+        left, right_px = pair.left, maps.right_disparity_px
+        assert right_px is not None
         seen_px, inside = _right_disparity_at_match(maps.disparity_px, right_px)
         disagreement_px = seen_px - maps.disparity_px
         found = Estimate(
@@ -109,8 +142,7 @@ class Matcher:
             confidence=_confidence(maps.confidence_logit, disagreement_px, inside, _plain(left)),
             occluded=~inside | (disagreement_px > _OCCLUSION_STEP_PX),
         )
-        found = to_subpixel(left, right, found, self.threads)
-        return self.refined(left, right, found) if refined else found
+        return to_subpixel(left, pair.right, found, self.threads)
 
     def refined(
         self, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], found: Estimate
@@ -121,18 +153,32 @@ class Matcher:
         return to_subpixel(left, right, refine(left, right, found, self.threads), self.threads)
 
     def sees_whole(self, width: int, height: int) -> bool:
-        """Whether a picture of that size is matched at once, and not in strips of rows."""
+        """Whether a picture of that size is matched at once, not in strips of rows, and can be matched."""
+        if self.fixed_size is not None:
+            return height <= self.fixed_size[0] and width <= self.fixed_size[1]
         return height <= self._strip_rows(width) and width * width * height <= PIXEL_PAIRS_AT_ONCE
 
-    def _maps(self, pair: StereoPair) -> Maps:
-        """The graph's outputs for a pair: in strips of rows where it is large, blended where they overlap."""
+    def _maps(self, pairs: Sequence[StereoPair]) -> list[Maps]:
+        """The graph's outputs for pairs of one size, as many at once as may be."""
+        if not pairs:
+            return []
+        height, width = pairs[0].left.shape[:2]
+        if self.fixed_size is None and height > self._strip_rows(width):
+            return [self._in_strips(pair) for pair in pairs]
+        rows, columns = self._run_size(height, width)
+        at_once = max(PIXEL_PAIRS_AT_ONCE // (rows * columns**2), 1) if self._takes_batches else 1
+        return [
+            maps
+            for first in range(0, len(pairs), at_once)
+            for maps in self._run_together([(x.left, x.right) for x in pairs[first : first + at_once]])
+        ]
+
+    def _in_strips(self, pair: StereoPair) -> Maps:
+        """The graph's outputs for a large pair: in strips of rows, blended where they overlap."""
         height, width = pair.left.shape[:2]
-        strips = list(_strips(height, self._strip_rows(width)))
-        if len(strips) == 1:
-            return self._run(pair.left, pair.right)
         totals: dict[str, np.ndarray] = {}
         weights = np.zeros((height, 1), np.float32)
-        for rows in strips:
+        for rows in _strips(height, self._strip_rows(width)):
             weight = _strip_weights(rows, height)
             weights[rows] += weight
             for name, values in self._run(pair.left[rows], pair.right[rows])._asdict().items():
@@ -145,13 +191,30 @@ class Matcher:
         return max(rows // self.multiple_of * self.multiple_of, 4 * _STRIP_OVERLAP_PX)
 
     def _run(self, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]) -> Maps:
-        height, width = left.shape[:2]
-        (above, _), (before, _) = self._borders_px(left)
-        inputs = {"left": self._tensor(left), "right": self._tensor(right)}
-        with _naming(self._path):
-            values = self._session.run(self._outputs, inputs, _run_options(height * width * width))
-            outputs = dict(zip(self._outputs, values, strict=True))
-        expected = [1, 1, *inputs["left"].shape[2:]]
+        (maps,) = self._run_together([(left, right)])
+        return maps
+
+    def _run_together(self, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Maps]:
+        """The graph's outputs for left and right pictures of one size, in one run."""
+        height, width = pairs[0][0].shape[:2]
+        (above, _), (before, _) = self._borders_px(height, width)
+        inputs = {"left": self._tensor([x for x, _ in pairs]), "right": self._tensor([x for _, x in pairs])}
+        pixel_pairs = len(pairs) * height * width * width
+        with running(self.provider, self._path):
+            values = self._session.run(self._outputs, inputs, self._run_options(pixel_pairs))
+        outputs = dict(zip(self._outputs, values, strict=True))
+        self._check_outputs(outputs, [len(pairs), 1, *inputs["left"].shape[2:]])
+        return [
+            Maps(
+                **{
+                    name: np.ascontiguousarray(value[i, 0, above : above + height, before : before + width])
+                    for name, value in outputs.items()
+                }
+            )
+            for i in range(len(pairs))
+        ]
+
+    def _check_outputs(self, outputs: dict[str, np.ndarray], expected: list[int]) -> None:
         for name, value in outputs.items():
             if list(value.shape) != expected:
                 raise MatcherError(
@@ -161,27 +224,39 @@ class Matcher:
                 raise MatcherError(
                     f"{self._path}: expected finite values of {name}, found NaN or infinite ones"
                 )
-        return Maps(
-            **{
-                name: np.ascontiguousarray(value[0, 0, above : above + height, before : before + width])
-                for name, value in outputs.items()
-            }
-        )
 
-    def _borders_px(self, image: UInt8[np.ndarray, "h w 3"]) -> list[tuple[int, int]]:
-        """What is added before and behind the rows and the columns, up to a size that the network can divide.
+    def _run_options(self, pixel_pairs: int) -> Any:
+        """How a picture is run: what it took in memory is kept for the next one, unless that is very much."""
+        import onnxruntime  # type: ignore[import-untyped]
+
+        options = onnxruntime.RunOptions()
+        if self.provider == CPU and pixel_pairs > _KEPT_PIXEL_PAIRS:
+            options.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
+        return options
+
+    def _run_size(self, height: int, width: int) -> tuple[int, int]:
+        """The size, in rows and columns, at which the network is shown a picture."""
+        if self.fixed_size is not None:
+            return self.fixed_size
+        return height + -height % self.multiple_of, width + -width % self.multiple_of
+
+    def _borders_px(self, height: int, width: int) -> list[tuple[int, int]]:
+        """What is added before and behind the rows and the columns, up to a size that the network takes.
 
         Half on each side: what lies beyond a view's left border hurts that view alone, and so both alike.
         """
-        missing = [-side % self.multiple_of for side in image.shape[:2]]
-        return [(px // 2, px - px // 2) for px in missing]
+        rows, columns = self._run_size(height, width)
+        return [(px // 2, px - px // 2) for px in (rows - height, columns - width)]
 
-    def _tensor(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "1 3 h2 w2"]:
-        """The image as the network takes it, its border repeated around it."""
-        (above, below), (before, behind) = self._borders_px(image)
-        padded = cv2.copyMakeBorder(image, above, below, before, behind, cv2.BORDER_REPLICATE)
+    def _tensor(self, images: Sequence[UInt8[np.ndarray, "h w 3"]]) -> Float[np.ndarray, "b 3 h2 w2"]:
+        """The images as the network takes them, their borders repeated around them."""
+        (above, below), (before, behind) = self._borders_px(*images[0].shape[:2])
+        padded = [
+            cv2.copyMakeBorder(image, above, below, before, behind, cv2.BORDER_REPLICATE) for image in images
+        ]
         # Half the time of cv2.dnn.blobFromImage, and the same numbers.
-        return np.stack(cv2.split(padded))[None] * np.float32(1 / 255)
+        planes = np.stack([plane for image in padded for plane in cv2.split(image)])
+        return planes.reshape(len(images), 3, *padded[0].shape[:2]) * np.float32(1 / 255)
 
     def _checked_outputs(self) -> list[str]:
         """The outputs that `Maps` has a place for."""
@@ -217,28 +292,6 @@ class Matcher:
 def shipped_models() -> list[str]:
     """The names of the networks inside the package."""
     return sorted(Path(file.name).stem for file in _weights_folder().iterdir() if file.name.endswith(".onnx"))
-
-
-@contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Turns ONNX Runtime's errors into one line that names the matcher file."""
-    try:
-        yield
-    except Exception as error:  # they have no common base class
-        reason = str(error).splitlines()[0]
-        raise MatcherError(
-            f"{path}: expected an ONNX matcher, found a file ONNX Runtime refuses: {reason}"
-        ) from error
-
-
-def _run_options(pixel_pairs: int) -> Any:
-    """How a picture is run: ONNX Runtime keeps what it took for the next one, unless that is very much."""
-    import onnxruntime
-
-    options = onnxruntime.RunOptions()
-    if pixel_pairs > _KEPT_PIXEL_PAIRS:
-        options.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
-    return options
 
 
 def _listed(types: dict[str, str]) -> str:

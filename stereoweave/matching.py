@@ -7,8 +7,10 @@ smaller pictures is brought to the full size by `enlarging`.
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -19,6 +21,7 @@ from stereoweave.enlarging import enlarge
 from stereoweave.errors import StereoweaveError
 from stereoweave.io import SMALLEST_SIDE_PX
 from stereoweave.matcher import PIXEL_PAIRS_AT_ONCE, Matcher, find_occluded, model_file
+from stereoweave.providers import CPU
 from stereoweave.ranging import find_range, goes_beyond
 from stereoweave.stereo import Estimate, StereoPair
 
@@ -32,6 +35,15 @@ _MARGIN_PX = 4
 _OUTSIDE_PX = 1
 # Of the pixel pairs that are matched at once: rows are counted in multiples.
 _FILLED = 0.95
+# How much a width and a move, both rounded, may be too large together.
+_ROUNDED_PX = 2
+
+
+class _Shown(NamedTuple):
+    """What a network is shown of a pair: it made small, and by how much its right picture is moved, if so."""
+
+    small: StereoPair
+    least_px: int | None = None
 
 
 def estimate(  # noqa: PLR0913 - each has a name, and all but the pictures can be left out
@@ -40,6 +52,7 @@ def estimate(  # noqa: PLR0913 - each has a name, and all but the pictures can b
     *,
     model: str | Path = "small",
     threads: int | None = None,
+    provider: str = CPU,
     refined: bool = False,
     range_px: tuple[float, float] | None = None,
 ) -> Estimate:
@@ -51,15 +64,17 @@ def estimate(  # noqa: PLR0913 - each has a name, and all but the pictures can b
         right: The right one, of the same size.
         model: A shipped name or the path of an .onnx matcher; loaded at the first call, and kept.
         threads: How many threads may be used; all cores if left out.
+        provider: What the network is run on: cpu, cuda, tensorrt, openvino, coreml or directml.
         refined: As for `match`.
         range_px: As for `match`.
 
     Raises:
-        ValueError: MatcherError for a model that is none, StereoweaveError for images that are none.
+        ValueError: MatcherError for a model that is none or a provider that is not there, ProviderError for
+            one that fails, StereoweaveError for images that are none.
     """
     pair = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
     path = model_file(model).absolute()
-    matcher = _kept_matcher(path, path.stat().st_mtime_ns, threads)
+    matcher = _kept_matcher(path, path.stat().st_mtime_ns, threads, provider)
     return match(matcher, pair, range_px=range_px, refined=refined)
 
 
@@ -84,29 +99,38 @@ def match(
     Raises:
         StereoweaveError: For a range that is none, or pictures under 32 px in a direction.
     """
-    seen = _seen_whole(matcher, pair)
-    scale = pair.left.shape[1] / seen.left.shape[1]
-    if range_px is not None:
-        low_px, high_px = _checked(range_px, pair.left.shape[1])
-        small, found = _matched_within(matcher, pair, seen, (low_px / scale, high_px / scale))
-    else:
-        small, found = seen, matcher.estimate(seen.left, seen.right)
-        beyond_px = _range_beyond(seen, found, matcher.max_disparity_px)
-        if beyond_px is not None:
-            small, found = _matched_within(matcher, pair, seen, beyond_px)
-    if refined:
-        found = matcher.refined(small.left, small.right, found)
-    if small.left.shape != pair.left.shape:
-        found = enlarge(pair.left, pair.right, found, matcher.threads)
-    if range_px is not None:
-        found = _clipped(found, *range_px)
-    return _as_seen(found, pair)
+    shown = _shown_first(matcher, pair, range_px)
+    moved = _moved(shown)
+    found = matcher.estimate(moved.left, moved.right)
+    return _finished(matcher, pair, shown, found, range_px=range_px, refined=refined)
+
+
+def match_many(
+    matcher: Matcher,
+    pairs: Sequence[StereoPair],
+    *,
+    range_px: tuple[float, float] | None = None,
+    refined: bool = False,
+) -> list[Estimate]:
+    """As `match` of each, of pairs of any sizes, by `Matcher.estimate_many` where they look alike to it."""
+    every_shown = [_shown_first(matcher, pair, range_px) for pair in pairs]
+    moved = [_moved(shown) for shown in every_shown]
+    of_size: dict[tuple[int, ...], list[int]] = {}
+    for i, pair in enumerate(moved):
+        of_size.setdefault(pair.left.shape, []).append(i)
+    found: dict[int, Estimate] = {}
+    for alike in of_size.values():
+        found |= zip(alike, matcher.estimate_many([moved[i] for i in alike]), strict=True)
+    return [
+        _finished(matcher, pair, shown, found[i], range_px=range_px, refined=refined)
+        for i, (pair, shown) in enumerate(zip(pairs, every_shown, strict=True))
+    ]
 
 
 @functools.lru_cache(maxsize=4)
-def _kept_matcher(path: Path, modified_ns: int, threads: int | None) -> Matcher:
+def _kept_matcher(path: Path, modified_ns: int, threads: int | None, provider: str) -> Matcher:
     # modified_ns is part of the key alone: a file that was written anew is loaded anew.
-    return Matcher(path, threads=threads)
+    return Matcher(path, threads=threads, provider=provider)
 
 
 def _checked(range_px: tuple[float, float], width_px: int) -> tuple[float, float]:
@@ -125,16 +149,59 @@ def _checked(range_px: tuple[float, float], width_px: int) -> tuple[float, float
     return max(low_px, -width_px), min(high_px, width_px)
 
 
+def _shown_first(matcher: Matcher, pair: StereoPair, range_px: tuple[float, float] | None) -> _Shown:
+    """What the network is shown before anything is known of the pair but the range, if that is given."""
+    seen = _seen_whole(matcher, pair)
+    if range_px is None:
+        return _Shown(seen)
+    width = pair.left.shape[1]
+    low_px, high_px = (px * seen.left.shape[1] / width for px in _checked(range_px, width))
+    return _shown_within(matcher, pair, seen, (low_px, high_px))
+
+
+def _finished(  # noqa: PLR0913 - all that is known of a pair by then
+    matcher: Matcher,
+    pair: StereoPair,
+    shown: _Shown,
+    found: Estimate,
+    *,
+    range_px: tuple[float, float] | None,
+    refined: bool,
+) -> Estimate:
+    """The estimate of a pair from that of what the network was shown first, and is shown again if need be."""
+    found = _unmoved(shown, found)
+    if range_px is None:
+        beyond_px = _range_beyond(shown.small, found, matcher.max_disparity_px)
+        if beyond_px is not None:
+            shown = _shown_within(matcher, pair, shown.small, beyond_px)
+            moved = _moved(shown)
+            found = _unmoved(shown, matcher.estimate(moved.left, moved.right))
+    if refined:
+        found = matcher.refined(shown.small.left, shown.small.right, found)
+    if shown.small.left.shape != pair.left.shape:
+        found = enlarge(pair.left, pair.right, found, matcher.threads)
+    if range_px is not None:
+        found = _clipped(found, *range_px)
+    return _as_seen(found, pair)
+
+
 def _seen_whole(matcher: Matcher, pair: StereoPair) -> StereoPair:
     """The pair, smaller where the network would else see it in strips, whose seams would show."""
     height, width = pair.left.shape[:2]
     return _reduced(pair, _times_smaller(matcher, width, height))
 
 
-def _times_smaller(matcher: Matcher, width: int, height: int) -> float:
-    """By how much the network has to be shown less, to see a picture of this size whole; 1 where it does."""
+def _times_smaller(matcher: Matcher, width: int, height: int, moved_px: int = 0) -> float:
+    """By how much the network has to be shown less, to see a picture of this size whole; 1 where it does.
+
+    It does so where the picture is wider by what the other one is moved by.
+    """
+    width += moved_px
     if matcher.sees_whole(width, height):
         return 1.0
+    if matcher.fixed_size is not None:
+        rows, columns = matcher.fixed_size
+        return max(height / rows, width / (columns - (_ROUNDED_PX if moved_px else 0)))
     return (width * width * height / (_FILLED * PIXEL_PAIRS_AT_ONCE)) ** (1 / 3)
 
 
@@ -142,7 +209,7 @@ def _reduced(pair: StereoPair, scale: float) -> StereoPair:
     """The photographs so many times smaller, or the pair itself where that is as large."""
     height, width = pair.left.shape[:2]
     size = max(round(width / scale), SMALLEST_SIDE_PX), max(round(height / scale), SMALLEST_SIDE_PX)
-    if size[0] >= width or size[1] >= height:
+    if size == (width, height) or min(width, height) < SMALLEST_SIDE_PX:
         return pair
     left, right = (cv2.resize(photo, size, interpolation=cv2.INTER_AREA) for photo in (pair.left, pair.right))
     left_seen, right_seen = (
@@ -170,17 +237,17 @@ def _doubtful(found: Estimate, max_disparity_px: float) -> Bool[np.ndarray, "h w
     return cv2.resize(small, doubtful.shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5
 
 
-def _matched_within(
+def _shown_within(
     matcher: Matcher, pair: StereoPair, seen: StereoPair, range_px: tuple[float, float]
-) -> tuple[StereoPair, Estimate]:
-    """A smaller pair, if need be, in which the range fits into the network's, and the estimate of it.
+) -> _Shown:
+    """A smaller pair, if need be, in which the range fits into the network's, and how it is moved to fit.
 
     `seen` is what the network can see at once of the pair, and the range is in its pixels.
     """
     low_px, high_px = range_px
     most_px = matcher.max_disparity_px
     if low_px >= 0 and high_px <= most_px:
-        return seen, matcher.estimate(seen.left, seen.right)
+        return _Shown(seen)
     scale = max((high_px - low_px) / (most_px - _MARGIN_PX), 1.0)
     small = seen
     if scale > 1:
@@ -188,30 +255,43 @@ def _matched_within(
     # Not farther than the least: a network takes a plain sky for what is at the lower end of its range.
     least_px = math.floor(low_px * small.left.shape[1] / seen.left.shape[1])
     height, width = small.left.shape[:2]
-    smaller = _times_smaller(matcher, width + abs(least_px), height)
+    smaller = _times_smaller(matcher, width, height, abs(least_px))
     if smaller > 1:
         small = _reduced(pair, smaller * pair.left.shape[1] / width)
         least_px = math.floor(low_px * small.left.shape[1] / seen.left.shape[1])
-    return small, _moved(matcher, small, least_px)
+    return _Shown(small, least_px)
 
 
-def _moved(matcher: Matcher, pair: StereoPair, least_px: int) -> Estimate:
-    """The estimate of a pair whose least disparity is least_px, matched with the right picture moved."""
-    width = pair.left.shape[1]
-    more = abs(least_px)
-    left_at, right_at = (more, 0) if least_px < 0 else (0, more)
-    found = matcher.estimate(
-        _widened(pair.left, left_at, more - left_at), _widened(pair.right, right_at, more - right_at)
+def _moved(shown: _Shown) -> StereoPair:
+    """The pair as the network gets it: both pictures wider, so that the right one can be moved."""
+    if shown.least_px is None:
+        return shown.small
+    (left_at, right_at), more = _places(shown.least_px), abs(shown.least_px)
+    return StereoPair(
+        left=_widened(shown.small.left, left_at, more - left_at),
+        right=_widened(shown.small.right, right_at, more - right_at),
     )
-    left, right = (np.s_[:, at : at + width] for at in (left_at, right_at))
-    disparity_px = np.ascontiguousarray(found.disparity_px[left]) + np.float32(least_px)
-    right_disparity_px = np.ascontiguousarray(found.right_disparity_px[right]) + np.float32(least_px)
+
+
+def _unmoved(shown: _Shown, found: Estimate) -> Estimate:
+    """The estimate of a pair from that of its pictures as the network got them."""
+    if shown.least_px is None:
+        return found
+    width, least_px = shown.small.left.shape[1], np.float32(shown.least_px)
+    left, right = (np.s_[:, at : at + width] for at in _places(shown.least_px))
+    disparity_px = np.ascontiguousarray(found.disparity_px[left]) + least_px
+    right_disparity_px = np.ascontiguousarray(found.right_disparity_px[right]) + least_px
     return Estimate(
         disparity_px=disparity_px,
         right_disparity_px=right_disparity_px,
         confidence=np.ascontiguousarray(found.confidence[left]),
         occluded=find_occluded(disparity_px, right_disparity_px),
     )
+
+
+def _places(least_px: int) -> tuple[int, int]:
+    """The columns of the wider pictures at which the left and the right one begin."""
+    return (-least_px, 0) if least_px < 0 else (0, least_px)
 
 
 def _widened(photo: np.ndarray, before: int, behind: int) -> np.ndarray:

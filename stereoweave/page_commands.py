@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from stereoweave.command_line import Provider
 from stereoweave.errors import StereoweaveError, needing_extra
 
 Host = Annotated[
@@ -17,8 +18,13 @@ Port = Annotated[int, typer.Option(min=0, max=65535, help="0 takes any that is f
 OpenBrowser = Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")]
 
 
-def app(host: Host = "127.0.0.1", port: Port = 7860, open_browser: OpenBrowser = False) -> None:
+def app(
+    host: Host = "127.0.0.1", port: Port = 7860, open_browser: OpenBrowser = False, provider: Provider = "cpu"
+) -> None:
     """A web page: drop a pair, see depth and views, turn the point cloud, measure, download."""
+    from stereoweave.providers import check_provider
+
+    check_provider(provider)
     with _listening(host, port) as listener:
         with needing_extra("app", "the page needs Gradio"):
             from stereoweave.app import serve
@@ -26,7 +32,7 @@ def app(host: Host = "127.0.0.1", port: Port = 7860, open_browser: OpenBrowser =
         url = f"http://{shown}:{listener.getsockname()[1]}"
         typer.echo(f"Stereoweave: {url} (Ctrl-C ends it)")
         try:
-            serve(listener, url, open_browser=open_browser)
+            serve(listener, url, open_browser=open_browser, provider=provider)
         except KeyboardInterrupt:
             raise typer.Exit(130) from None
 

@@ -19,6 +19,7 @@ from stereoweave.matcher import Matcher
 from stereoweave.matching import match
 from stereoweave.measuring import distance
 from stereoweave.preparing import Request, prepare
+from stereoweave.providers import CPU
 from stereoweave.rendering import Renderer
 from stereoweave.report import Summary, shrunk, summarize
 from stereoweave.results import FILES, Result, needs_camera, write_files
@@ -51,11 +52,12 @@ class Kept:
 
 @dataclass(frozen=True, kw_only=True)
 class Uploads:
-    """What a visitor gave: the files as they were uploaded, and what was said of them."""
+    """What a visitor gave: the files as they were uploaded, what was said of them, and what matches them."""
 
     pictures: tuple[Path, ...]
     request: Request
     model: str
+    provider: str = CPU
 
 
 def matched(uploads: Uploads, folder: Path, tell: Callable[[float, str], None]) -> Kept:
@@ -74,7 +76,7 @@ def matched(uploads: Uploads, folder: Path, tell: Callable[[float, str], None]) 
     height, width = pair.left.shape[:2]
     tell(0.3, f"matching {width}×{height} px")
     start_s = time.perf_counter()
-    estimate = match(_matcher(uploads.model), pair, refined=True)
+    estimate = match(_matcher(uploads.model, uploads.provider), pair, refined=True)
     estimate_ms = 1000 * (time.perf_counter() - start_s)
     names = tuple(picture.name for picture in uploads.pictures)
     summary = summarize(pair, estimate, pictures=names, model=uploads.model, estimate_ms=estimate_ms)
@@ -200,5 +202,5 @@ def _supposed_camera(estimate: Estimate) -> StereoCamera:
 
 
 @functools.cache
-def _matcher(model: str) -> Matcher:
-    return Matcher(model)
+def _matcher(model: str, provider: str) -> Matcher:
+    return Matcher(model, provider=provider)

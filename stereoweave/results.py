@@ -5,17 +5,20 @@ PFM file, which is Middlebury's way, NaN in NPY and TIFF files, and 0 in a PNG. 
 infinite in all files of depth but the PNG, where it is 0 too.
 """
 
+import hashlib
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
+from stereoweave import __version__
 from stereoweave.clouds import (
     MOST_POINTS,
     NO_CAMERA,
@@ -35,6 +38,7 @@ from stereoweave.hints import hints
 from stereoweave.io import (
     RangeError,
     place_for,
+    reading,
     write_depth_png,
     write_disparity_png,
     write_float_tiff,
@@ -45,6 +49,7 @@ from stereoweave.io import (
 from stereoweave.matcher import Matcher
 from stereoweave.matching import match
 from stereoweave.preparing import Request, prepare
+from stereoweave.providers import CPU
 from stereoweave.report import Summary, summarize, write_report
 from stereoweave.stereo import Estimate, StereoPair
 
@@ -121,6 +126,7 @@ class DepthOrder:
         request: What is said of the pictures.
         model: The name of the network, for the summary.
         threads: How many threads may be used; all cores if left out.
+        provider: What the network is run on, a name in `providers.PROVIDERS`.
         range_px: The least and the greatest disparity; found from the pair where None.
         refined: As for `matching.match`.
         files: What is written beside `always`, names in FILES, or "all"; depth.png is with any camera.
@@ -130,6 +136,7 @@ class DepthOrder:
     request: Request = Request()
     model: str = "small"
     threads: int | None = None
+    provider: str = CPU
     range_px: tuple[float, float] | None = None
     refined: bool = False
     files: tuple[str, ...] = ()
@@ -155,11 +162,28 @@ def make_depth(
         estimate = match(matcher, pair, range_px=order.range_px, refined=order.refined)
         estimate_ms = 1000 * (time.perf_counter() - start_s)
         names = tuple(picture.name for picture in pictures)
-        summary = summarize(pair, estimate, pictures=names, model=order.model, estimate_ms=estimate_ms)
+        model = order.model if matcher.provider == CPU else f"{order.model} on {matcher.provider}"
+        summary = summarize(pair, estimate, pictures=names, model=model, estimate_ms=estimate_ms)
         result = Result(pair=pair, estimate=estimate, summary=summary, threads=order.threads)
         notes = [*prepared.notes, *left_out, *write_files(folder, files, result)]
         notes += hints(pair, estimate)
     return summary, notes
+
+
+def order_facts(order: DepthOrder) -> dict[str, Any]:
+    """All that decides the results of a pair beside its pictures, files by what is in them.
+
+    What it is computed with does not: a batch whose GPU fails can be finished on the processor.
+    """
+    facts = {"stereoweave": __version__, **asdict(order)}
+    del facts["threads"], facts["provider"]
+    facts |= facts.pop("request")
+    for name in ("model", "calibration"):
+        if facts[name] and (name == "calibration" or Path(facts[name]).is_file()):
+            with reading(facts[name], f"a {name}"):
+                content = Path(facts[name]).read_bytes()
+            facts[name] = f"{Path(facts[name]).name} {hashlib.sha256(content).hexdigest()[:12]}"
+    return facts
 
 
 def needs_camera(file: str) -> bool:

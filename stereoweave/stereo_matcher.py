@@ -9,6 +9,7 @@ from stereoweave.arrays import as_rgb
 from stereoweave.errors import StereoweaveError
 from stereoweave.matcher import Matcher
 from stereoweave.matching import match
+from stereoweave.providers import CPU
 from stereoweave.stereo import StereoPair
 
 _STEPS_PER_PX = 16
@@ -27,6 +28,7 @@ class StereoMatcher:
         numDisparities: How many are, from minDisparity on; any number, where OpenCV demands a multiple of 16.
         model: A shipped name or the path of an .onnx matcher.
         threads: How many threads a call may use; all cores if left out.
+        provider: As for `stereoweave.estimate`.
         refined: As for `stereoweave.estimate`.
         min_confidence: Pixels whose disparity is less likely than this to be within 1 px are invalid.
     """
@@ -38,6 +40,7 @@ class StereoMatcher:
         *,
         model: str | Path = "small",
         threads: int | None = None,
+        provider: str = CPU,
         refined: bool = False,
         min_confidence: float = 0.5,
     ) -> None:
@@ -46,7 +49,7 @@ class StereoMatcher:
         if not 0 <= min_confidence <= 1:
             raise StereoweaveError(f"min_confidence: expected a probability, 0 to 1, found {min_confidence}")
         self._check_range()
-        self._matcher = Matcher(model, threads=threads)
+        self._matcher = Matcher(model, threads=threads, provider=provider)
 
     def compute(
         self, left: UInt8[np.ndarray, "h w *channels"], right: UInt8[np.ndarray, "h w *channels"]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from stereoweave.command_line import needing_the_synth_extra
+from stereoweave.command_line import Cluster, engine_of, needing_the_synth_extra
 from stereoweave.errors import StereoweaveError
 
 synth = typer.Typer(help="Rendered stereo with exact ground truth: make it, check it, look at it.")
@@ -48,6 +48,7 @@ def make(  # noqa: PLR0913 - each is a word of the command line
             help="Processes, as many as cores unless given; each makes a shard of 50 pairs at a time.",
         ),
     ] = None,
+    cluster: Cluster = None,
 ) -> None:
     """Make a set of rendered pairs, or go on with one that was stopped or shall have more."""
     with needing_the_synth_extra():
@@ -57,7 +58,8 @@ def make(  # noqa: PLR0913 - each is a word of the command line
     order = Order(
         scene=scene, seed=seed, size_px=_size_px(size), frames=frames, views=tuple(view or ()), rig=rig
     )
-    made = make_set(order, pairs, out, layout=layout, jobs=_jobs(jobs), studio=RenderingStudio(plain))
+    studio, engine = RenderingStudio(plain), engine_of(cluster, workers=jobs)
+    made = make_set(order, pairs, out, layout=layout, jobs=_jobs(jobs), engine=engine, studio=studio)
     typer.echo(f"{out}: {made} pair{'s' * (made != 1)} made, {pairs - made} there before")
 
 

@@ -26,6 +26,7 @@ from stereoweave.layouts import LAYOUTS, Choices, check_reach, middle_px
 from stereoweave.matcher import Matcher
 from stereoweave.matching import match
 from stereoweave.progress import progress
+from stereoweave.providers import CPU
 from stereoweave.rendering import Renderer
 from stereoweave.steady import Steadier
 from stereoweave.stereo import Estimate, StereoPair
@@ -63,6 +64,7 @@ class Order:
             for layouts whose views lie upon one another, and 0 for all else.
         model: The name of a shipped network, or an .onnx file.
         threads: How many threads may be used; all cores unless given.
+        provider: What the network is run on, a name in `providers.PROVIDERS`.
     """
 
     depth: bool = False
@@ -73,6 +75,7 @@ class Order:
     convergence_px: float | None = None
     model: str = "small"
     threads: int | None = None
+    provider: str = CPU
 
     def __post_init__(self) -> None:
         wanted = {
@@ -206,14 +209,14 @@ def make_film(footage: Footage, sources: Sequence[Path], out: Path, order: Order
         StereoweaveError: `out` cannot be such a film, or cannot be written, for instance on a full disk.
     """
     _check_out(out, order, footage, sources)
-    matcher, threads = Matcher(order.model, threads=order.threads), thread_count(order.threads)
+    matcher = Matcher(order.model, threads=order.threads, provider=order.provider)
     recorder = Recorder(
         encoding=GREY16 if order.depth16 else H264,
         time_base=footage.time_base,
         # FFmpeg's fractions have 32 bits.
         rate=footage.rate.limit_denominator(100_000),
         packing=PACKINGS.get(order.layout or ""),
-        threads=threads,
+        threads=thread_count(order.threads),
     )
     with growing(out, _settings(order, footage, sources)) as parts, progress(console) as bar:
         if parts.files:
@@ -352,7 +355,7 @@ def _check_out(out: Path, order: Order, footage: Footage, sources: Sequence[Path
 
 
 def _settings(order: Order, footage: Footage, sources: Sequence[Path]) -> dict[str, object]:
-    """All that the film depends on but for the threads, as users call it, in words that JSON has."""
+    """All that the film depends on but for what computes it, as users call it, in words that JSON has."""
     model = Path(order.model)
     return {
         "--depth": order.depth,

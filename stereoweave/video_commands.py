@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoweave.command_line import Model, Strength, Threads, place_for
+from stereoweave.command_line import Model, Provider, Strength, Threads, place_for
 from stereoweave.errors import StereoweaveError
 
 if TYPE_CHECKING:
@@ -79,6 +79,7 @@ def video(  # noqa: PLR0913 - each is a word of the command line
     rate: Rate = None,
     model: Model = "small",
     threads: Threads = None,
+    provider: Provider = "cpu",
 ) -> None:
     """A 3-D film's depth, a new view of it, or another layout, with its sound and its frame times."""
     from rich.console import Console
@@ -100,6 +101,7 @@ def video(  # noqa: PLR0913 - each is a word of the command line
             convergence_px=convergence,
             model=model,
             threads=threads,
+            provider=provider,
         )
         footage = open_footage(films, arrangement, rate=None if rate is None else _fraction(rate))
         if layout:

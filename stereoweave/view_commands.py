@@ -11,6 +11,7 @@ from stereoweave.command_line import (
     Format,
     Model,
     Pictures,
+    Provider,
     Range,
     Rectify,
     Strength,
@@ -90,6 +91,7 @@ def view(  # noqa: PLR0913 - each is a word of the command line
     range_px: Range = None,
     model: Model = "base",
     threads: Threads = None,
+    provider: Provider = "cpu",
 ) -> None:
     """A new view of a stereo pair, or many, as 3-D viewers and displays take them."""
     from stereoweave.hints import hints
@@ -114,7 +116,7 @@ def view(  # noqa: PLR0913 - each is a word of the command line
     if name in LAYOUTS:
         out = marked(out, name, pair, choices)
     place_for(out)
-    estimate = match(load_matcher(model, threads), pair, range_px=within_px, refined=True)
+    estimate = match(load_matcher(model, threads, provider), pair, range_px=within_px, refined=True)
     if plane_px is None:
         plane_px = middle_px(estimate)
     renderer = Renderer(pair, estimate, strength=strength, convergence_px=plane_px, threads=threads)

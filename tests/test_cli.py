@@ -99,7 +99,7 @@ def mistakes(pictures) -> Path:
     Path("wrong.txt").write_text(CALIBRATION.replace("width=96", "width=960"))
     save_identity(Path("identity.onnx"))
     save_matcher(Path("nan.onnx"), float("nan"))
-    save_matcher(Path("fixed.onnx"), 4.0, size=(32, 32))
+    save_matcher(Path("fixed.onnx"), 4.0, size=(32, "w"))
     save_matcher(Path("float16.onnx"), 4.0, inputs=TensorProto.FLOAT16)
     save_matcher(Path("rank3.onnx"), 4.0, keepdims=0)
     save_matcher(Path("quarter.onnx"), 4.0, shrunk=4)

@@ -1,11 +1,16 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from matcher_examples import PROPERTIES, matcher_file, painted, red_of
-from onnx import helper
+from matcher_examples import ANY_SIZE, PROPERTIES, matcher_file, of_fixed_size, painted, red_of
+from onnx import TensorProto, helper
 
 import stereoweave as sw
 from stereoweave import matcher
+from stereoweave.io import read_pair
 from stereoweave.matcher import Matcher
+from stereoweave.providers import PROVIDERS
+from stereoweave.stereo import StereoPair
 
 # What the photographs may move a disparity of the left view by.
 SUBPIXEL_PX = 1.001
@@ -197,3 +202,111 @@ def test_a_file_that_is_no_onnx_is_refused_in_one_line(tmp_path):
 def test_images_under_32_px_are_refused(both_views):
     with pytest.raises(sw.StereoweaveError, match="at least 32x32 px, got 40x31"):
         both_views.estimate(painted(np.zeros((31, 40))), painted(np.zeros((31, 40))))
+
+
+def counting(path, size=ANY_SIZE):
+    """A matcher file whose disparity is the left red channel, and its right disparity how many pairs run."""
+    nodes = [
+        *red_of("left", "disparity_px"),
+        helper.make_node("Sub", ["disparity_px", "disparity_px"], ["nothing"]),
+        helper.make_node("Shape", ["left"], ["count"], end=1),
+        helper.make_node("Cast", ["count"], ["count_px"], to=TensorProto.FLOAT),
+        helper.make_node("Add", ["nothing", "count_px"], ["right_disparity_px"]),
+    ]
+    return matcher_file(path, nodes, ["disparity_px", "right_disparity_px"], size=size)
+
+
+@pytest.fixture
+def like_a_gpu(monkeypatch):
+    """The processor runs several pairs at once, which is what makes a GPU quicker, and itself slower."""
+    monkeypatch.setitem(PROVIDERS, "cpu", replace(PROVIDERS["cpu"], batches=True))
+
+
+@pytest.fixture
+def five_pairs(rng):
+    return [StereoPair(left=x, right=x) for x in rng.integers(0, 256, (5, 48, 64, 3), np.uint8)]
+
+
+@pytest.mark.parametrize(
+    ("size", "counts"), [(ANY_SIZE, [2, 2, 2, 2, 1]), ((1, "h", "w"), [1] * 5), ((1, 64, 80), [1] * 5)]
+)
+def test_pairs_of_one_size_run_together_as_far_as_the_file_and_the_memory_go(
+    tmp_path, five_pairs, like_a_gpu, monkeypatch, size, counts
+):
+    monkeypatch.setattr(matcher, "PIXEL_PAIRS_AT_ONCE", 2 * 48 * 64 * 64 + 1)
+    found = Matcher(counting(tmp_path / "counting.onnx", size)).estimate_many(five_pairs)
+    assert [estimate.right_disparity_px.max() for estimate in found] == counts
+    for pair, estimate in zip(five_pairs, found, strict=True):
+        np.testing.assert_allclose(estimate.disparity_px, pair.left[:, :, 0], atol=SUBPIXEL_PX)
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_pairs_matched_together_are_as_each_is_alone(tmp_path, five_pairs, like_a_gpu, views):
+    # 47x61 is padded; with one output the mirrored pairs run too.
+    outputs = ["disparity_px", "right_disparity_px"][:views]
+    nodes = [
+        node for image, out in zip(("left", "right"), outputs, strict=False) for node in red_of(image, out)
+    ]
+    network = Matcher(matcher_file(tmp_path / "red.onnx", nodes, outputs))
+    pairs = [StereoPair(left=x.left[:47, :61], right=x.right[::-1][:47, :61]) for x in five_pairs]
+    for pair, found in zip(pairs, network.estimate_many(pairs), strict=True):
+        alone = network.estimate(pair.left, pair.right)
+        for name in ("disparity_px", "right_disparity_px", "confidence"):
+            np.testing.assert_allclose(getattr(found, name), getattr(alone, name), atol=1e-3)
+        np.testing.assert_array_equal(found.occluded, alone.occluded)
+
+
+def test_the_processor_takes_one_pair_after_another(tmp_path, five_pairs):
+    found = Matcher(counting(tmp_path / "counting.onnx")).estimate_many(five_pairs)
+    assert [estimate.right_disparity_px.max() for estimate in found] == [1] * 5
+
+
+def test_the_shipped_network_gives_pairs_together_what_it_gives_each(five_pairs, like_a_gpu):
+    network = Matcher()
+    for pair, found in zip(five_pairs[:2], network.estimate_many(five_pairs[:2]), strict=True):
+        alone = network.estimate(pair.left, pair.right)
+        np.testing.assert_allclose(found.right_disparity_px, alone.right_disparity_px, atol=1e-3)
+        np.testing.assert_allclose(found.confidence, alone.confidence, atol=1e-3)
+
+
+def test_no_pairs_give_no_estimates(both_views):
+    assert both_views.estimate_many([]) == []
+
+
+def test_pairs_of_two_sizes_are_refused_together(both_views, five_pairs):
+    smaller = StereoPair(left=five_pairs[0].left[:40], right=five_pairs[0].right[:40])
+    with pytest.raises(sw.StereoweaveError, match="all of one size, got 64x40, 64x48"):
+        both_views.estimate_many([*five_pairs, smaller])
+
+
+def test_large_pairs_run_in_strips_one_after_another(tmp_path, rng, like_a_gpu, monkeypatch):
+    monkeypatch.setattr(matcher, "PIXEL_PAIRS_AT_ONCE", 64 * 64 * 256)
+    pairs = [StereoPair(left=x, right=x) for x in rng.integers(0, 256, (2, 400, 64, 3), np.uint8)]
+    found = Matcher(counting(tmp_path / "counting.onnx")).estimate_many(pairs)
+    for pair, estimate in zip(pairs, found, strict=True):
+        np.testing.assert_allclose(estimate.disparity_px, pair.left[:, :, 0], atol=SUBPIXEL_PX)
+        np.testing.assert_allclose(estimate.right_disparity_px, 1, atol=1e-3)
+
+
+def test_a_file_for_one_size_takes_smaller_pictures_and_refuses_larger_ones_in_one_line(tmp_path, rng):
+    network = Matcher(counting(tmp_path / "one_size.onnx", (1, 64, 80)))
+    assert network.fixed_size == (64, 80)
+    assert network.sees_whole(80, 64) and network.sees_whole(33, 40)
+    assert not network.sees_whole(81, 64) and not network.sees_whole(80, 65)
+    picture = rng.integers(0, 256, (41, 57, 3), np.uint8)
+    found = network.estimate(picture, picture)
+    np.testing.assert_allclose(found.disparity_px, picture[:, :, 0], atol=SUBPIXEL_PX)
+    tall = np.zeros((65, 64, 3), np.uint8)
+    message = r"at most 80x64 px, the size that one_size\.onnx takes, got 64x65; matching\.match makes"
+    with pytest.raises(sw.StereoweaveError, match=message):
+        network.estimate(tall, tall)
+
+
+def test_what_a_picture_is_padded_with_up_to_a_fixed_size_changes_little(tmp_path):
+    pair = read_pair("examples/left.png", "examples/right.png")
+    left, right = (np.ascontiguousarray(x[120:280, 200:424]) for x in (pair.left, pair.right))
+    fixed = Matcher(of_fixed_size("small", tmp_path / "fixed.onnx", 240, 320))
+    alone, found = Matcher().estimate(left, right), fixed.estimate(left, right)
+    sure = (alone.confidence > 0.9) & ~alone.occluded
+    assert sure.mean() > 0.4
+    assert np.mean(np.abs(found.disparity_px - alone.disparity_px)[sure] > 1) < 0.01

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from matcher_examples import matcher_file, painted, red_of
+from matcher_examples import matcher_file, of_fixed_size, painted, red_of
 from PIL import Image
 
 import stereoweave as sw
@@ -14,7 +14,8 @@ from stereoweave import matching
 from stereoweave.errors import StereoweaveError
 from stereoweave.io import read_pair
 from stereoweave.matcher import Matcher
-from stereoweave.matching import match
+from stereoweave.matching import match, match_many
+from stereoweave.providers import PROVIDERS
 
 FIELDS = ("disparity_px", "right_disparity_px", "confidence", "occluded")
 
@@ -254,3 +255,43 @@ def test_a_pair_that_is_moved_is_still_seen_whole(rng, monkeypatch):
     found = match(Matcher(), sw.StereoPair(left=left, right=right), range_px=(-8, 40))
     assert found.disparity_px.shape == (64, 96)
     assert seen == [True]
+
+
+@pytest.mark.parametrize("given", [{}, {"range_px": (-8, 100), "refined": True}])
+def test_pairs_of_any_sizes_and_ranges_matched_together_are_as_each_is_alone(rng, monkeypatch, given):
+    monkeypatch.setitem(PROVIDERS, "cpu", replace(PROVIDERS["cpu"], batches=True))  # as a GPU takes them
+    matcher = Matcher()
+    noise = rng.integers(0, 256, (2, 64, 96, 3), np.uint8)
+    shorter, negative = flat(rng, 12, (64, 96)), flat(rng, 30, (96, 160))
+    seen = np.arange(96) > 20
+    pairs = [
+        flat(rng, 20, (64, 96)),
+        sw.StereoPair(left=negative.right, right=negative.left),
+        replace(shorter, left_seen=np.tile(seen, (64, 1))),
+        sw.StereoPair(left=noise[0], right=noise[1]),
+    ]
+    for pair, found in zip(pairs, match_many(matcher, pairs, **given), strict=True):
+        alone = match(matcher, pair, **given)
+        np.testing.assert_array_equal(found.occluded, alone.occluded)
+        for name in FIELDS[:3]:
+            np.testing.assert_allclose(getattr(found, name), getattr(alone, name), atol=1e-3)
+
+
+@pytest.mark.parametrize("range_px", [None, (0, 80), (-60, 80)])
+def test_a_pair_larger_than_the_only_size_of_a_matcher_file_is_matched_smaller(tmp_path, rng, range_px):
+    fixed = Matcher(of_fixed_size("small", tmp_path / "fixed.onnx", 160, 320))
+    found_px = match(fixed, flat(rng, 37, (200, 480)), range_px=range_px).disparity_px
+    assert found_px.shape == (200, 480)
+    assert abs(np.median(found_px[10:-10, 60:-60]) - 37) < 0.5
+
+
+@pytest.mark.parametrize("size", [(160, 321), (161, 320), (100, 321), (480, 640), (40, 2000), (320, 160)])
+@pytest.mark.parametrize("least_px", [0, -1, -7, -31])
+def test_whatever_is_shown_to_a_file_for_one_size_fits_it(tmp_path, size, least_px):
+    fixed = Matcher(of_fixed_size("small", tmp_path / "fixed.onnx", 160, 320))
+    blank = np.zeros((*size, 3), np.uint8)
+    shown = matching._shown_first(fixed, sw.StereoPair(left=blank, right=blank), (least_px, 60))
+    height, width = matching._moved(shown).left.shape[:2]
+    assert fixed.sees_whole(width, height)
+    # No smaller than it has to be.
+    assert max(height / 160, width / 320) > 0.97 or size[0] < 160
