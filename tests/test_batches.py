@@ -7,8 +7,9 @@ import pytest
 import torch
 from learn_examples import CAMERA, PAIR_SIZE, RECIPE, Listed, box_before_a_wall, complaint
 
-from stereoweave.learn.batches import Batches, collated, known
+from stereoweave.learn.batches import Batches, collated, known, split
 from stereoweave.learn.pairs import KeptPairs
+from stereoweave.learn.ranks import Ranks
 from stereoweave.learn.sources import Mix
 
 
@@ -174,3 +175,66 @@ def test_a_crop_larger_than_the_pictures_is_refused(pairs):
     assert complaint(batches.__getitem__, 0) == (
         "crop_size = [64, 112]: expected at most the pictures' [64, 96]; cut less"
     )
+
+
+@dataclass(frozen=True)
+class Watched(Listed):
+    """Pairs that note which of them are read."""
+
+    read: list[int]
+
+    def __getitem__(self, index):
+        self.read.append(index)
+        return self.samples[index]
+
+
+def shares_of(recipe, count, step):
+    """What each of so many processes reads for a step, and what it makes of it."""
+    watched = [Watched(samples(1) * 12, []) for _ in range(count)]
+    batches = [Batches(recipe, pairs, Ranks(rank, count)) for rank, pairs in enumerate(watched)]
+    return [one[step] for one in batches], [one.read for one in watched]
+
+
+def assert_same_batches(one, other):
+    assert one.keys() == other.keys()
+    assert all(torch.equal(one[name].nan_to_num(-1), other[name].nan_to_num(-1)) for name in one)
+
+
+def test_processes_read_their_own_neighbouring_pairs_of_a_step_and_no_others():
+    recipe = replace(RECIPE, batch=6, micro_batch=1, seed=5)
+    # Of 12 pairs in this order step 1 has the last six: three processes make two micro-batches each.
+    order = np.random.default_rng((5, 0, 1)).permutation(12).tolist()
+    _, read = shares_of(recipe, 3, 1)
+    assert read == [order[6:8], order[8:10], order[10:12]]
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_processes_make_the_very_micro_batches_that_one_process_makes(count):
+    recipe = replace(RECIPE, batch=8, micro_batch=2)
+    ((whole,), _), (shares, _) = shares_of(recipe, 1, 3), shares_of(recipe, count, 3)
+    parts = [part for share in shares for part in split(share, 4 // count)]
+    for one, other in zip(parts, split(whole, 4), strict=True):
+        assert_same_batches(one, other)
+
+
+def test_the_first_micro_batch_is_cut_as_a_batch_that_is_not_parted(pairs):
+    recipe = replace(RECIPE, batch=2)
+    parted = split(Batches(replace(recipe, micro_batch=1), pairs)[4], 2)
+    whole = Batches(recipe, pairs)[4]
+    assert torch.equal(parted[0]["left"][0], whole["left"][0])
+    # Its own generator, not the first one's going on.
+    assert not torch.equal(parted[1]["left"][0], whole["left"][1])
+
+
+def test_zeros_behind_seed_and_step_change_no_draw():
+    """By which recipes without micro-batches are cut as they were before there were any."""
+    key = Batches(replace(RECIPE, seed=3), Listed(samples(2))).key(7, 0)
+    assert np.random.default_rng(key).random() == np.random.default_rng((3, 7)).random()
+
+
+def test_a_batch_is_split_into_what_its_samples_would_be_collated_to(pairs):
+    for one, other in zip(
+        split(collated(pairs.samples), 2), (pairs.samples[:2], pairs.samples[2:]), strict=True
+    ):
+        assert_same_batches(one, collated(other))
+    assert_same_batches(split(collated(pairs.samples), 1)[0], collated(pairs.samples))

@@ -83,6 +83,13 @@ def test_the_matcher_file_answers_as_pytorch_does_and_nothing_is_written_otherwi
     assert written["parameters"] == sum(p.numel() for p in overfitted().network.parameters())
 
     matcher = Matcher(out, threads=1)
+    mirrored = pair.mirrored()
+    for found, alone in zip(matcher.estimate_many([pair, mirrored]), (pair, mirrored), strict=True):
+        expected = matcher.estimate(alone.left, alone.right)
+        np.testing.assert_allclose(found.disparity_px, expected.disparity_px, atol=1e-3)
+        np.testing.assert_allclose(found.confidence, expected.confidence, atol=1e-3)
+    assert [side.dim_param for side in graph.graph.input[0].type.tensor_type.shape.dim][:2] == ["batch", ""]
+
     assert matcher.estimate(pair.left[:45, :77], pair.right[:45, :77]).disparity_px.shape == (45, 77)
     found_px = matcher.estimate(pair.left, pair.right).disparity_px
     assert abs(found_px - overfitted().sample.disparity_px).mean() < 1

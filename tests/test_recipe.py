@@ -174,3 +174,17 @@ def test_a_file_that_is_no_toml_is_named_in_one_line(tmp_path, content):
 def test_a_file_that_is_not_there_is_named(tmp_path):
     with pytest.raises(FormatError, match=r"nowhere\.toml: expected a recipe in TOML, found: .*No such file"):
         read_recipe(tmp_path / "nowhere.toml")
+
+
+def test_a_step_has_one_micro_batch_unless_the_recipe_says_otherwise():
+    assert recipe_from(NEEDED, "here").micro_batches == 1
+    assert recipe_from(NEEDED | {"micro_batch": 4}, "here").micro_batches == 1
+    assert recipe_from(NEEDED | {"micro_batch": 1}, "here").micro_batches == 4
+
+
+@pytest.mark.parametrize(
+    ("micro_batch", "expected"), [(3, "a divisor of batch = 4"), (8, "a divisor"), (-1, "at least 0")]
+)
+def test_micro_batches_that_a_batch_cannot_be_parted_into_are_refused(micro_batch, expected):
+    with pytest.raises(FormatError, match=f"here: micro_batch = {micro_batch}, expected {expected}"):
+        recipe_from(NEEDED | {"micro_batch": micro_batch}, "here")

@@ -212,7 +212,7 @@ def test_weights_of_another_network_are_refused_as_a_start(finished, tmp_path):
 def test_a_gradient_that_is_not_finite_stops_before_it_reaches_the_weights(tmp_path, logger):
     recipe = recipe_of("fast_depth")
     run = Run(recipe, training._starting_point(recipe, tmp_path / "last.pt"), logger)
-    network = run.network.module
+    network = run.network
     before = [value.clone() for value in network.parameters()]
     # A product with infinity makes the gradient infinite and leaves the loss as it was.
     network.head.to_code.bias.register_hook(lambda gradient: gradient * torch.inf)
@@ -248,7 +248,7 @@ def test_a_run_into_a_file_fails_before_any_pair_is_made(recipe_file, tmp_path):
 def step_of(recipe, folder, logger, steps=1):
     """The first steps of a recipe on pairs in memory: the run after them, and every parameter before."""
     run = Run(recipe, training._starting_point(recipe, folder / "last.pt"), logger)
-    before = {name: value.clone() for name, value in run.network.module.named_parameters()}
+    before = {name: value.clone() for name, value in run.network.named_parameters()}
     batches = Batches(recipe, CAMERA_PAIRS)
     for step in range(steps):
         assert 0 < run.step(step, batches[step], batches) < 100
@@ -256,7 +256,7 @@ def step_of(recipe, folder, logger, steps=1):
 
 
 def assert_all_moved(run, before):
-    for name, value in run.network.module.named_parameters():
+    for name, value in run.network.named_parameters():
         assert value.isfinite().all()
         assert not torch.equal(value, before[name]), name
 
@@ -274,7 +274,7 @@ def test_any_of_the_papers_networks_trains_by_changing_one_word(model, tmp_path,
     run, before = step_of(replace(recipe, model=model), tmp_path, logger)
     assert_all_moved(run, before)
     # An average over one step is that step's weights.
-    assert_same(dict(run.averaged.module.state_dict()), dict(run.network.module.state_dict()))
+    assert_same(dict(run.averaged.module.state_dict()), dict(run.network.state_dict()))
 
 
 def test_a_code_network_that_is_resumed_ends_as_one_that_was_not(folder):
@@ -324,9 +324,7 @@ def test_a_step_computes_in_bfloat16_where_the_device_does(
     monkeypatch.setattr(training, "_precision", lambda: precision)
     run = Run(RECIPE, training._starting_point(RECIPE, tmp_path / "last.pt"), logger)
     seen = []
-    run.network.module.to_match.register_forward_hook(
-        lambda _layer, _inputs, output: seen.append(output.dtype)
-    )
+    run.network.to_match.register_forward_hook(lambda _layer, _inputs, output: seen.append(output.dtype))
     batches = Batches(RECIPE, KeptPairs(folder / "pairs", RECIPE.seed, RECIPE.pairs, PAIR_SIZE))
     run.step(0, batches[0], batches)
     assert set(seen) == {dtype}

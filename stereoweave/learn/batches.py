@@ -1,4 +1,4 @@
-"""The batch of every step: which pairs, how they are cut, and how they are laid together."""
+"""The batch of every step: which pairs, how they are cut, and how they are laid together and parted."""
 
 import numpy as np
 import torch
@@ -6,23 +6,41 @@ from torch.utils.data import Dataset
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn.augment import augment, cut
+from stereoweave.learn.ranks import Ranks
 from stereoweave.learn.recipe import Recipe
 from stereoweave.learn.sources import Mix, Ordered, Source
 from stereoweave.stereo import Sample
 
 
 class Batches(Dataset[dict[str, torch.Tensor]]):
-    """The batch of every step, each drawn from (seed, step) alone, whoever asks and in whatever order."""
+    """The batch of every step, or of each the share of one of several processes.
 
-    def __init__(self, recipe: Recipe, pairs: Source) -> None:
+    A micro-batch is drawn from (seed, step, its place in the step) alone, whoever asks and in whatever order.
+    """
+
+    def __init__(self, recipe: Recipe, pairs: Source, ranks: Ranks | None = None) -> None:
         self.recipe, self.pairs = recipe, pairs
         self.mix = pairs if isinstance(pairs, Mix) else Mix((pairs,), (1.0,))
+        self.parts = (ranks or Ranks()).share(recipe.micro_batches)
 
     def __getitem__(self, step: int) -> dict[str, torch.Tensor]:
-        rng = np.random.default_rng((self.recipe.seed, step))
-        part = augment if self.recipe.augment else cut
-        samples = (known(self.pairs, index) for index in self.chosen(step))
-        return collated([part(sample, *self.recipe.crop_size, rng) for sample in samples])
+        chosen = self.chosen(step)
+        size = len(chosen) // self.recipe.micro_batches
+        return collated(
+            [
+                sample
+                for part in self.parts
+                for sample in self._cut(chosen[part * size : (part + 1) * size], self.key(step, part))
+            ]
+        )
+
+    def key(self, step: int, part: int) -> tuple[int, ...]:
+        """What the draws of a micro-batch begin from.
+
+        Zeros at the end change no draw: the first one's are those of (seed, step), as before steps had parts.
+        Even, because of the odd ones are the orders of pairs and sets.
+        """
+        return self.recipe.seed, step, 0, 2 * part
 
     def chosen(self, step: int) -> list[int]:
         """Indices of the pairs of a step: of each set every pair once before any comes again."""
@@ -35,6 +53,11 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
     def names(self, step: int) -> list[str]:
         """What errors call the pairs of a step."""
         return [self.pairs.name(index) for index in self.chosen(step)]
+
+    def _cut(self, indices: list[int], key: tuple[int, ...]) -> list[Sample]:
+        rng = np.random.default_rng(key)
+        part = augment if self.recipe.augment else cut
+        return [part(known(self.pairs, index), *self.recipe.crop_size, rng) for index in indices]
 
     def _index(self, which: int, turn: int) -> int:
         """The index of the pair that a set gives when it is drawn for that time, counted from 0."""
@@ -92,3 +115,14 @@ def collated(samples: list[Sample]) -> dict[str, torch.Tensor]:
         batch["focal_baseline_px_m"] = torch.tensor(products).view(-1, 1, 1, 1)
         batch["doffs_px"] = torch.tensor([camera.doffs_px for camera in cameras]).view(-1, 1, 1, 1)
     return batch
+
+
+def split(batch: dict[str, torch.Tensor], parts: int) -> list[dict[str, torch.Tensor]]:
+    """A collated batch in equal parts, its first pairs first, each as if collated alone."""
+    pairs = len(batch["left"])
+
+    def part(values: torch.Tensor, which: int) -> torch.Tensor:
+        # Maps of the left views are before those of the right ones.
+        return torch.unflatten(values, 0, (len(values) // pairs, parts, -1))[:, which].flatten(0, 1)
+
+    return [{name: part(values, which) for name, values in batch.items()} for which in range(parts)]

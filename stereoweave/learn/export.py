@@ -109,10 +109,16 @@ def matcher_network(kept: Checkpoint) -> Any:
 
 
 def graph_of(network: Any, kept: Checkpoint) -> onnx.ModelProto:
-    """The network as an ONNX graph for any height and width that it can divide, with a matcher's metadata."""
+    """The network as an ONNX graph with a matcher's metadata, for any height and width that it can divide.
+
+    And for any number of pairs: what it costs to leave that free cannot be measured (under 1 %).
+    """
     height, width = (network.multiple_of * torch.export.Dim(name, min=2, max=1024) for name in ("h", "w"))
-    sides = {2: height, 3: width}
+    sides = {0: torch.export.Dim("batch"), 2: height, 3: width}
     graph = _exported(network, 4 * network.multiple_of, 8 * network.multiple_of, (sides, sides))
+    first, *_ = graph.graph.input[0].type.tensor_type.shape.dim
+    # The exporter does not tell where a network's code fixes what was to be free.
+    assert first.dim_param, "the network's code fixes the number of pairs"
     properties = {
         "name": kept.recipe.name,
         "multiple_of": network.multiple_of,
@@ -133,8 +139,9 @@ def fixed_graph_of(network: Any, height: int, width: int) -> onnx.ModelProto:
 
 def noted_graph(network: Any, height: int, width: int, dynamic_shapes: Any) -> onnx.ModelProto:
     """The network as an ONNX graph, with the exporter's notes of where each node is from."""
-    # Two tensors: given the same one twice, the exporter would take both inputs to be one.
-    left, right = torch.rand(2, 1, 3, height, width)
+    # Two tensors: given the same one twice, the exporter would take both inputs to be one. Two pairs where
+    # their number is free: an axis of 1 it would take to be always so.
+    left, right = torch.rand(2, 1 if dynamic_shapes is None else 2, 3, height, width)
     with _quietly(), torch.no_grad():
         program = torch.onnx.export(
             network,

@@ -1,9 +1,7 @@
 """A matcher file with 8-bit convolutions: a third of the size, and faster where a CPU multiplies 8 bits."""
 
 import io
-import json
 import tempfile
-from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import redirect_stdout
 from pathlib import Path
@@ -23,6 +21,7 @@ from onnxruntime.quantization import (  # type: ignore[import-untyped]
 from stereoweave.errors import StereoweaveError
 from stereoweave.io import make_folder, replacing
 from stereoweave.learn.collage import sample
+from stereoweave.learn.graphs import read_graph, with_what_stands_between, write_card
 from stereoweave.matcher import Matcher
 from stereoweave.stereo import Sample
 
@@ -44,28 +43,28 @@ def quantise(source: Path, out: Path) -> dict[str, Any]:
     overflow on CPUs that have AVX2 and no 8-bit dot product (ONNX Runtime, "Quantize ONNX Models").
 
     Args:
-        source: A matcher file of `stereoweave export`.
+        source: A matcher file in float32 for pairs of any size.
         out: The .onnx file to write.
 
     Raises:
-        StereoweaveError: The mean error grows by 0.05 px or more on pairs other than those that the ranges
-            are from; nothing is written then.
+        StereoweaveError: The source is no such file, or the mean error grows by 0.05 px or more on pairs
+            other than those that the ranges are from; nothing is written then.
     """
+    graph = read_graph(source)
     make_folder(out.parent)
     with replacing(out) as temporary:
-        _write(onnx.load(source), temporary)
+        _write(graph, temporary)
         before_px, after_px = (_mean_error_px(Matcher(file)) for file in (source, temporary))
         if not after_px - before_px < LARGEST_LOSS_PX:
             raise StereoweaveError(
                 f"{source}: 8 bits cost {after_px - before_px:.3f} px of mean error, expected under "
                 f"{LARGEST_LOSS_PX}; nothing was written"
             )
-    card_file = source.with_suffix(".json")
-    card = json.loads(card_file.read_text(encoding="utf-8")) if card_file.exists() else {}
-    card |= {"bits": 8, "epe_px_of_32_bits": before_px, "epe_px": after_px, "compared_pairs": _PROOF_PAIRS}
-    with replacing(out.with_suffix(".json")) as temporary:
-        temporary.write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
-    return card
+    return write_card(
+        source,
+        out,
+        {"bits": 8, "epe_px_of_32_bits": before_px, "epe_px": after_px, "compared_pairs": _PROOF_PAIRS},
+    )
 
 
 def quantised_nodes(graph: onnx.ModelProto) -> list[str]:
@@ -74,28 +73,13 @@ def quantised_nodes(graph: onnx.ModelProto) -> list[str]:
     They are the convolutions but the refinement's, and what stands between them alone. Disparities,
     correlations and what they are read from never are: eight bits of a disparity are whole pixels.
     """
-    readers = defaultdict(list)
-    for node in graph.graph.node:
-        for value in node.input:
-            readers[value].append(node)
-    chosen = {
+    convolutions = (
         node.name
         for node in graph.graph.node
         if node.op_type == "Conv" and not node.input[1].startswith(_KEPT)
-    }
-    # Backwards, because a node is between convolutions if all that read it are.
-    for node in reversed(graph.graph.node):
-        following = {reader.name for value in node.output for reader in readers[value]}
-        if node.op_type in ("Concat", "Resize", "Relu", "Add") and following and following <= chosen:
-            chosen.add(node.name)
-    relus = {
-        reader.name
-        for node in graph.graph.node
-        if node.op_type == "Conv" and node.name in chosen
-        for reader in readers[node.output[0]]
-        if reader.op_type == "Relu"
-    }
-    return [node.name for node in graph.graph.node if node.name in chosen | relus]
+    )
+    chosen = with_what_stands_between(graph, convolutions, ("Concat", "Resize", "Relu", "Add"))
+    return [node.name for node in graph.graph.node if node.name in chosen]
 
 
 class _Inputs(CalibrationDataReader):  # type: ignore[misc]

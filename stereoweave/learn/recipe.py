@@ -19,7 +19,7 @@ _POSITIVE = (
     "max_disparity_px",
     "max_depth_m",
 )
-_AT_LEAST = {"exponent": 1, "alpha_z": 0, "alpha_p": 0, "distribution": 0}
+_AT_LEAST = {"micro_batch": 0, "exponent": 1, "alpha_z": 0, "alpha_p": 0, "distribution": 0}
 COLLAGE = "collage"
 Weights = tuple[tuple[str, float], ...]
 TARGETS = ("disparity", "depth")
@@ -43,6 +43,8 @@ class Recipe:
             same name and shape; the others, and all if empty, are random.
         steps: optimiser steps in all.
         batch: pairs a step.
+        micro_batch: pairs that go through the network at once, which batch norms take their statistics from;
+            a step goes along the mean gradient of its micro-batches. 0 is the whole batch.
         learning_rate: between warm-up and cool-down, along which it rises and falls linearly.
         weight_decay: AdamW's; with 0 it is Adam.
         averaged_steps: length of the running average of the weights, which is what scores and ships; longer
@@ -75,6 +77,7 @@ class Recipe:
     start_from: str = ""
     steps: int
     batch: int
+    micro_batch: int = 0
     learning_rate: float
     warm_up_steps: int
     cool_down_steps: int
@@ -100,6 +103,11 @@ class Recipe:
     alpha_p: float = 0.0
     distribution: float = 1.0
     vgg16_weights: str = ""
+
+    @property
+    def micro_batches(self) -> int:
+        """How many of them a step has."""
+        return self.batch // (self.micro_batch or self.batch)
 
     def learning_rate_at(self, step: int) -> float:
         """The learning rate of a step, counted from 0."""
@@ -152,6 +160,10 @@ def _check_numbers(recipe: Recipe, source: str) -> None:
     for name, least in _AT_LEAST.items():
         if not least <= getattr(recipe, name) < math.inf:
             raise FormatError(f"{source}: {name} = {getattr(recipe, name)}, expected at least {least}")
+    if recipe.batch % (recipe.micro_batch or recipe.batch):
+        raise FormatError(
+            f"{source}: micro_batch = {recipe.micro_batch}, expected a divisor of batch = {recipe.batch}"
+        )
 
 
 def _check_sizes(recipe: Recipe, source: str) -> None:

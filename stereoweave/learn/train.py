@@ -2,11 +2,14 @@
 
 import csv
 import ctypes
+import logging
+import platform
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import timedelta
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +18,7 @@ import numpy as np
 import torch
 from lightning_fabric import Fabric
 from lightning_fabric.loggers.tensorboard import TensorBoardLogger
+from lightning_fabric.strategies.ddp import DDPStrategy
 from rich.console import Console
 from torch import nn
 from torch.optim.swa_utils import AveragedModel
@@ -23,12 +27,14 @@ from torch.utils.data import DataLoader, Dataset
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io import make_folder, replacing
 from stereoweave.learn import checkpoint
-from stereoweave.learn.batches import Batches
+from stereoweave.learn.batches import Batches, split
 from stereoweave.learn.checkpoint import Checkpoint, Weights
 from stereoweave.learn.models import network_of
 from stereoweave.learn.objective import fitted, naming, objective_of
+from stereoweave.learn.ranks import ranks, threads_each, told_once
 from stereoweave.learn.recipe import COLLAGE, Recipe, read_recipe
-from stereoweave.learn.sources import kept, sources
+from stereoweave.learn.sources import Source, kept, sources
+from stereoweave.learn.sums import StepSums
 from stereoweave.progress import progress
 
 # Beside a run's checkpoint: its scores after each validation.
@@ -38,39 +44,72 @@ CURVE = "validation.csv"
 def train(recipe_path: Path, out: Path, console: Console | None = None) -> Path:
     """Train the network of a recipe in folder `out`, or go on there; returns the last checkpoint's path.
 
+    Started by torchrun, its processes share each step's micro-batches, and the first of them alone writes.
+
     Raises:
         StereoweaveError: for a recipe that is none, where `out` holds the run of another one, or where the
             loss is no longer finite.
     """
-    return train_recipe(read_recipe(recipe_path), out, console or Console())
+    with told_once():
+        return train_recipe(read_recipe(recipe_path), out, console or Console(quiet=ranks().rank > 0))
 
 
 def train_recipe(recipe: Recipe, out: Path, console: Console) -> Path:
     """As `train`, of a recipe at hand."""
     _check(recipe)
-    last = make_folder(out) / "last.pt"
-    pairs, held_out = (kept(pairs, console) for pairs in sources(recipe, out.parent / "pairs"))
+    last = out / "last.pt"
+    logger = TensorBoardLogger(out, name="", version="")
+    fabric = _fabric(logger)
+    pairs, held_out = _ready(recipe, out, console, fabric)
     recipe = fitted(recipe, pairs)
     start = _starting_point(recipe, last)
+    if start.step != fabric.broadcast(start.step):
+        raise _not_shared(out)
     if start.step == recipe.steps:
         return last
-    logger = TensorBoardLogger(out, name="", version="")
-    run = Run(recipe, start, logger)
-    batches = Batches(recipe, pairs)
+    run = Run(recipe, start, logger, fabric)
+    batches = Batches(recipe, pairs, ranks())
     with closing_curves(logger), progress(console) as bar:
         task = bar.add_task(recipe.name, total=recipe.steps, completed=run.start.step, loss="", rate="")
         began = time.perf_counter()
         for step, batch in _numbered_batches(batches, run.start.step):
             loss = run.step(step, batch, batches)
             if (step + 1) % recipe.validate_every == 0 or step + 1 == recipe.steps:
-                scores = run.objective.scores(run.averaged.module, held_out, run.fabric.device)
-                # First, because what is killed between the two then writes the same row again.
-                record(last.with_name(CURVE), step + 1, scores)
-                run.keep(step + 1, scores, last)
-                console.print(f"step {step + 1}: " + "  ".join(f"{k} {v:.4g}" for k, v in scores.items()))
+                if run.fabric.is_global_zero:
+                    _validate(run, step + 1, held_out, last, console)
+                run.fabric.barrier()
             rate, began = recipe.batch / (time.perf_counter() - began), time.perf_counter()
             bar.update(task, completed=step + 1, loss=f"loss {loss:.4g}", rate=f"{rate:.1f} pairs/s")
     return last
+
+
+def _ready(recipe: Recipe, out: Path, console: Console, fabric: Fabric) -> tuple[Source, Source]:
+    """The pairs to train on and to score on, made by the first process where they were not there."""
+    found = sources(recipe, out.parent / "pairs")
+    if fabric.is_global_zero:
+        make_folder(out)
+        for pairs in found:
+            kept(pairs, console)
+    fabric.barrier()
+    if not out.is_dir():
+        raise _not_shared(out)
+    return found
+
+
+def _not_shared(out: Path) -> StereoweaveError:
+    return StereoweaveError(
+        f"{out}: expected what the first process sees there, found something else on {platform.node()}; "
+        "train into a folder that all machines share"
+    )
+
+
+def _validate(run: "Run", steps: int, held_out: Source, last: Path, console: Console) -> None:
+    """Score the run as it is after so many steps, and keep it and its scores."""
+    scores = run.objective.scores(run.averaged.module, held_out, run.fabric.device)
+    # First, because what is killed between the two then writes the same row again.
+    record(last.with_name(CURVE), steps, scores)
+    run.keep(steps, scores, last)
+    console.print(f"step {steps}: " + "  ".join(f"{k} {v:.4g}" for k, v in scores.items()))
 
 
 def record(path: Path, step: int, scores: dict[str, float]) -> None:
@@ -102,59 +141,70 @@ def closing_curves(logger: TensorBoardLogger) -> Iterator[TensorBoardLogger]:
 class Run:
     """The moving parts of a training: network, average, optimiser, and the machine they are on."""
 
-    def __init__(self, recipe: Recipe, start: Checkpoint, logger: TensorBoardLogger) -> None:
+    def __init__(
+        self, recipe: Recipe, start: Checkpoint, logger: TensorBoardLogger, fabric: Fabric | None = None
+    ) -> None:
         self.recipe, self.start = recipe, start
         _keep_freed_memory()
-        self.fabric = Fabric(accelerator="auto", devices=1, precision=_precision(), loggers=logger)
-        network = network_of(recipe)
-        network.load_state_dict(start.weights)
-        self.objective = objective_of(recipe, network)
-        for layer in network.modules():
+        self.fabric = fabric or _fabric(logger)
+        self.network = network_of(recipe)
+        self.network.load_state_dict(start.weights)
+        self.objective = objective_of(recipe, self.network)
+        for layer in self.network.modules():
             if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
                 # What bfloat16 convolutions on the CPU are fast in: three times the other layout.
                 layer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        optimiser = torch.optim.AdamW(
-            network.parameters(), recipe.learning_rate, weight_decay=recipe.weight_decay, fused=True
-        )
         average = partial(_move_average, recipe.averaged_steps)
-        self.averaged = AveragedModel(network, multi_avg_fn=average, use_buffers=True)
+        self.averaged = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
         self.averaged.module.load_state_dict(start.averaged)
         self.averaged.n_averaged.fill_(start.step)
-        self.network, self.optimiser = self.fabric.setup(network, optimiser)
-        if start.optimiser:
-            # Only now, because its state goes to where the weights are.
-            self.optimiser.load_state_dict(start.optimiser)
         self.averaged.to(self.fabric.device)
+        self.fabric.to_device(self.network)
+        if self.fabric.world_size > 1 and self.fabric.device.type == "cuda":
+            nn.SyncBatchNorm.convert_sync_batchnorm(self.network)  # type: ignore[no-untyped-call]
+        self.optimiser = torch.optim.AdamW(
+            self.network.parameters(), recipe.learning_rate, weight_decay=recipe.weight_decay, fused=True
+        )
+        if start.optimiser:
+            self.optimiser.load_state_dict(start.optimiser)
         torch.set_rng_state(start.random_state)
         self.began = time.monotonic()
 
     def step(self, step: int, batch: dict[str, torch.Tensor], batches: Batches) -> float:
         """One step down the loss; returns the loss."""
-        batch = self.fabric.to_device(batch)
         for group in self.optimiser.param_groups:
             group["lr"] = self.recipe.learning_rate_at(step)
         self.network.train()
-        with self.fabric.autocast():
-            predicted = self.objective.predict(self.network.module, batch)
-        with naming(f"step {step}: one of {', '.join(batches.names(step))}"):
-            losses = self.objective.losses(predicted, batch)
-        loss = torch.stack(list(losses.values())).sum()
-        value = float(loss.detach())
+        terms = self._gradient(step, self.fabric.to_device(batch), batches)
+        value = terms.pop("loss")
         if not np.isfinite(value):
             raise self._not_finite(step, f"the loss is {value}", batches)
-        self.optimiser.zero_grad()
-        self.fabric.backward(loss)
-        norm = self.fabric.clip_gradients(
-            self.network, self.optimiser, max_norm=5.0, error_if_nonfinite=False
-        )
-        if norm is None or not norm.isfinite():
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), max_norm=5.0)
+        if not norm.isfinite():
             raise self._not_finite(step, f"the norm of the gradient is {norm}", batches)
         self.optimiser.step()
-        self.averaged.update_parameters(self.network.module)
+        self.averaged.update_parameters(self.network)
         if step % 20 == 0:
-            terms = {f"loss/{name}": float(term.detach()) for name, term in losses.items()}
-            self.fabric.log_dict({"loss": value, **terms}, step)
+            self.fabric.log_dict({"loss": value, **{f"loss/{k}": term for k, term in terms.items()}}, step)
         return value
+
+    def _gradient(self, step: int, batch: dict[str, torch.Tensor], batches: Batches) -> dict[str, float]:
+        """Give the weights the gradient of a step, of whichever process; returns the loss and its terms."""
+        sums, what = StepSums(self.network), f"step {step}: one of {', '.join(batches.names(step))}"
+        for part, values in zip(batches.parts, split(batch, len(batches.parts)), strict=True):
+            if self.recipe.micro_batches > 1:
+                # Whichever process it is, dropout is the micro-batch's own.
+                torch.manual_seed(int(np.random.SeedSequence(batches.key(step, part)).generate_state(1)[0]))
+            with self.fabric.autocast():
+                predicted = self.objective.predict(self.network, values)
+            with naming(what):
+                terms = self.objective.losses(predicted, values)
+            loss = torch.stack(list(terms.values())).sum()
+            self.optimiser.zero_grad()
+            self.fabric.backward(loss)
+            sums.add([loss, *terms.values()])
+        means = sums.finish(self.fabric, self.recipe.micro_batches)
+        return dict(zip(["loss", *terms], means, strict=True))
 
     def _not_finite(self, step: int, what: str, batches: Batches) -> StereoweaveError:
         return StereoweaveError(f"step {step}: {what}; its pairs are {', '.join(batches.names(step))}")
@@ -165,7 +215,7 @@ class Run:
         state = replace(
             self.start,
             step=step,
-            weights=self.network.module.state_dict(),
+            weights=self.network.state_dict(),
             averaged=self.averaged.module.state_dict(),
             optimiser=self.optimiser.state_dict(),
             random_state=torch.get_rng_state(),
@@ -221,7 +271,7 @@ def _grown(fresh: Weights, earlier: Checkpoint, recipe: Recipe) -> Weights:
 
 
 def _check(recipe: Recipe) -> None:
-    """FormatError where the recipe names an unknown network or loss, or sizes it cannot take."""
+    """FormatError where the recipe names an unknown network or loss, or sizes or processes it cannot take."""
     with torch.device("meta"):
         network = network_of(recipe)
         objective_of(recipe, network)
@@ -231,6 +281,11 @@ def _check(recipe: Recipe) -> None:
         raise FormatError(
             f"{recipe.name}: pair_size = {list(recipe.pair_size)}, crop_size = {list(recipe.crop_size)}, "
             f"expected multiples of {multiple} for {recipe.model}"
+        )
+    if recipe.micro_batches % ranks().count:
+        raise FormatError(
+            f"{recipe.name}: {recipe.micro_batches} micro-batches a step, expected a multiple of the "
+            f"{ranks().count} processes; set micro_batch, or --nproc-per-node"
         )
 
 
@@ -267,6 +322,35 @@ def _numbered_batches(batches: Batches, first: int) -> Iterator[tuple[int, dict[
         if isinstance(batch, StereoweaveError):
             raise batch
         yield step, batch
+
+
+def _fabric(logger: TensorBoardLogger) -> Fabric:
+    """This process's device, among torchrun's processes where it has some."""
+    own = ranks()
+    if own.count == 1:
+        return Fabric(accelerator="auto", devices=1, precision=_precision(), loggers=logger)
+    cuda = torch.cuda.is_available()
+    if cuda and own.count_here > torch.cuda.device_count():
+        raise StereoweaveError(
+            f"torchrun: expected at most a process for each of {torch.cuda.device_count()} GPUs, found "
+            f"{own.count_here}; start fewer with --nproc-per-node"
+        )
+    if (threads := threads_each()) and not cuda:
+        torch.set_num_threads(threads)
+    if own.rank > 0:
+        logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
+    fabric = Fabric(
+        accelerator="cuda" if cuda else "cpu",
+        devices=own.count_here,
+        num_nodes=own.count // own.count_here,
+        # The others wait for the first one however long it makes pairs or scores: should it die, torchrun
+        # ends them.
+        strategy=DDPStrategy(timeout=timedelta(days=1)),
+        precision=_precision(),
+        loggers=logger,
+    )
+    fabric.launch()
+    return fabric
 
 
 def _keep_freed_memory() -> None:

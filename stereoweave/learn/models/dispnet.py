@@ -142,7 +142,7 @@ class DispNet(nn.Module):
         maps_32nd = self.conv5(sixteenth)
         maps = self.conv6(maps_32nd)
         predicted = [self.prediction(maps)]
-        skips = maps_32nd, sixteenth, eighth, left_quarter, half[: len(left)]
+        skips = maps_32nd, sixteenth, eighth, left_quarter, half[: left.shape[0]]
         for expand, skipped in zip(self.expansions, skips, strict=True):
             maps, disparity_px = expand(maps, predicted[-1], skipped)
             predicted.append(disparity_px)

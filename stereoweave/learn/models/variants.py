@@ -67,7 +67,7 @@ class Grouped(WeaveNet):
 
     def matched(self, maps: Features, first: Features) -> tuple[Tensor, Tensor, Tensor]:
         match = self.to_match(maps.quarter)
-        batch = len(match) // 2
+        batch = match.shape[0] // 2
         volumes = [
             correlation_volume(as_left_view(group, batch), as_other_view(group, batch), self.levels)
             for group in match.chunk(self.groups, 1)

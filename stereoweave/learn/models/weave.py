@@ -128,12 +128,12 @@ class Features(NamedTuple):
     sixteenth: Tensor
 
 
-def as_left_view(views: Tensor, batch: int) -> Tensor:
+def as_left_view(views: Tensor, batch: int | torch.SymInt) -> Tensor:
     """Maps of the left views, then of the right ones mirrored, from those of the left and the right ones."""
     return torch.cat([views[:batch], mirrored(views[batch:])])
 
 
-def as_other_view(views: Tensor, batch: int) -> Tensor:
+def as_other_view(views: Tensor, batch: int | torch.SymInt) -> Tensor:
     """What is matched with `as_left_view`: maps of the right views, then of the left ones mirrored."""
     return torch.cat([views[batch:], mirrored(views[:batch])])
 
@@ -287,7 +287,7 @@ class WeaveNet(nn.Module):
 
     def stages(self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]) -> Stages:
         """Every step of the prediction for both views."""
-        batch = len(left)
+        batch = left.shape[0]  # here and below no len() and no chunk(): exported, they would fix the batch
         maps = self.encoder(torch.cat([left, right]))
         # In a mirror the right view is a left one, so that one aggregation serves both.
         first = Features(*(as_left_view(map_, batch) for map_ in maps))
@@ -319,7 +319,7 @@ class WeaveNet(nn.Module):
             first: The same as left views.
         """
         match = self.to_match(maps.quarter)
-        batch = len(match) // 2
+        batch = match.shape[0] // 2
         correlation = correlation_volume(as_left_view(match, batch), as_other_view(match, batch), self.levels)
         return correlation, *self.aggregation(correlation, first)
 
@@ -338,7 +338,7 @@ class WeaveNet(nn.Module):
 
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Left disparity, right disparity and the left view's confidence logit, each [B, 1, H, W]."""
-        stages = self.stages(left, right)
+        stages, batch = self.stages(left, right), left.shape[0]
         # At infinity noise goes both ways; a rectified pair of parallel cameras has nothing behind that.
-        left_px, mirrored_right_px = stages.disparity_px.clamp(min=0).chunk(2)
-        return left_px, mirrored(mirrored_right_px), stages.confidence_logit.chunk(2)[0]
+        disparity_px = stages.disparity_px.clamp(min=0)
+        return disparity_px[:batch], mirrored(disparity_px[batch:]), stages.confidence_logit[:batch]
