@@ -6,8 +6,10 @@ import platform
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -15,6 +17,7 @@ from jaxtyping import Float
 
 from stereoweave.data.readers import Scene
 from stereoweave.edges import edge_bad_percent, edge_epe_px, flying_percent
+from stereoweave.engine import Engine, stream
 from stereoweave.errors import StereoweaveError
 from stereoweave.io import replacing
 from stereoweave.matcher import Matcher
@@ -28,6 +31,7 @@ from stereoweave.metrics import (
     sparsification,
 )
 from stereoweave.opencv_matchers import OPENCV_MATCHERS, SGBM, fill_rows, left_right_confidence
+from stereoweave.providers import CPU
 from stereoweave.stereo import Estimate, StereoPair
 
 Match = Callable[[StereoPair], Estimate | Float[np.ndarray, "h w"]]
@@ -38,6 +42,11 @@ mirrored pair is matched too. Neither is timed: others do it in other ways, at o
 """
 
 Maker = Callable[[], Match]
+
+AnyScene = TypeVar("AnyScene")
+Result = TypeVar("Result")
+Lister = Callable[[], Sequence[Callable[[], AnyScene]]]
+"""Lists what reads each scene: called where a benchmark is started, and by every worker of a cluster."""
 
 MEAN = "mean"
 TURNS = 5
@@ -92,11 +101,29 @@ class Scores(NamedTuple):
         rows: One per scene and matcher, then a mean row per matcher.
         curves: By matcher, the mean over the scenes.
         largest: The pair with the most pixels, for `with_memory`.
+        machine: What the rows were measured with, for `write_csv`.
     """
 
     rows: list[Row]
     curves: dict[str, Curves]
     largest: StereoPair
+    machine: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Scored(Generic[Result]):
+    """What a scene's number gave, and the machine that it was measured on."""
+
+    number: int
+    result: Result
+    machine: dict[str, str]
+
+
+class _Scene(NamedTuple):
+    """What `score_pairs` keeps of a scene."""
+
+    scored: list[tuple[Row, Curves]]
+    pixels: int
 
 
 class _Answer(NamedTuple):
@@ -105,33 +132,62 @@ class _Answer(NamedTuple):
     is_probability: bool
 
 
-def network(model: str | Path, threads: int | None = None, refined: bool = False) -> Match:
+def network(
+    model: str | Path, threads: int | None = None, refined: bool = False, provider: str = CPU
+) -> Match:
     """A shipped network by name, or a matcher file by path, refined or not; errors as for `Matcher`."""
-    matcher = Matcher(model, threads=threads)
+    matcher = Matcher(model, threads=threads, provider=provider)
     return lambda pair: matcher.estimate(pair.left, pair.right, refined=refined)
 
 
-def score_pairs(makers: Mapping[str, Maker], scenes: Iterable[Scene]) -> Scores:
+def score_pairs(makers: Mapping[str, Maker], scenes: Lister[Scene], engine: Engine | None = None) -> Scores:
     """The errors, times and sparsification curves of matchers on scenes; those of OpenCV join them.
 
     Args:
         makers: What makes each matcher, by its name.
-        scenes: At least one.
+        scenes: Lists at least one.
+        engine: Where each scene is scored by one worker, so that times are compared on one machine; in this
+            process unless given. The makers and `scenes` are sent to it.
 
     Raises:
-        StereoweaveError: A matcher bears a name that the table uses itself, or is a file of that name.
+        StereoweaveError: A matcher bears a name that the table uses itself, or is a file of that name; there
+            is no scene; or as in `engine.stream`.
     """
-    matchers = {name: make() for name, make in _everyone(makers).items()}
-    scored: list[tuple[Row, Curves]] = []
-    largest: StereoPair | None = None
-    for scene in scenes:
-        scored += _score_scene(matchers, scene)
-        largest = max(largest or scene.pair, scene.pair, key=lambda pair: pair.left.size)
-    if largest is None:
-        raise StereoweaveError("scenes: expected at least one, found none")
+    everyone = _everyone(makers)
+    found = score_all(everyone, scenes, _score_scene, engine)
+    scored = [row_and_curves for scene in found for row_and_curves in scene.result.scored]
     rows = [row for row, _ in scored]
-    curves = {name: _mean_curves([of for row, of in scored if row.matcher == name]) for name in matchers}
-    return Scores(rows + _mean_rows(rows, matchers), curves, largest)
+    curves = {name: _mean_curves([of for row, of in scored if row.matcher == name]) for name in everyone}
+    largest = max(found, key=lambda scene: scene.result.pixels)
+    return Scores(
+        rows + _mean_rows(rows, everyone), curves, scenes()[largest.number]().pair, machine_of_all(found)
+    )
+
+
+def score_all(
+    makers: Mapping[str, Callable[[], Any]],
+    scenes: Lister[AnyScene],
+    score: Callable[[Mapping[str, Any], AnyScene], Result],
+    engine: Engine | None,
+) -> list[Scored[Result]]:
+    """What `score` gives for all that the makers make and each scene, in the scenes' order.
+
+    The rest is as for `score_pairs`.
+    """
+    make_scorer = partial(_Scorer, makers, scenes, score)
+    scorer = make_scorer()  # here in any case, where it is said what is no matcher and no scene
+    count = len(scorer.readers)
+    if not count:
+        raise StereoweaveError("scenes: expected at least one, found none")
+    if engine is None:
+        return [scorer(number) for number in range(count)]
+    return sorted(stream(partial(make_scorer, count), range(count), engine), key=attrgetter("number"))
+
+
+def machine_of_all(scored: Iterable[Scored[Any]]) -> dict[str, str]:
+    """What the scenes were measured with; what is not the same for all of them is written side by side."""
+    machines = [scene.machine for scene in scored]
+    return {name: " + ".join(sorted({machine[name] for machine in machines})) for name in machines[0]}
 
 
 def with_memory(rows: Iterable[Row], makers: Mapping[str, Maker], pair: StereoPair) -> list[Row]:
@@ -149,20 +205,43 @@ def with_memory(rows: Iterable[Row], makers: Mapping[str, Maker], pair: StereoPa
     ]
 
 
-def write_csv(path: str | Path, rows: Sequence[Any]) -> None:
+def write_csv(path: str | Path, rows: Sequence[Any], machine: dict[str, str] | None = None) -> None:
     """Writes the rows with a header, each beside the processor and the OpenCV that it was measured with.
 
     Args:
         path: Where to; the folder is made.
         rows: One or more instances of one dataclass, whose fields are the columns.
+        machine: These two, and the number of cores; this one's unless given.
     """
-    machine = {"cpu": _cpu_name(), "cores": os.cpu_count(), "opencv": cv2.__version__}
+    machine = machine or _machine()
     with replacing(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.DictWriter(file, [field.name for field in fields(rows[0])] + list(machine))
         writer.writeheader()
         for row in rows:
             values = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in asdict(row).items()}
             writer.writerow(values | machine)
+
+
+class _Scorer:
+    """Scores scenes by their number, with matchers that are made once."""
+
+    def __init__(
+        self,
+        makers: Mapping[str, Callable[[], Any]],
+        scenes: Lister[Any],
+        score: Callable[[Mapping[str, Any], Any], Any],
+        expected: int | None = None,
+    ) -> None:
+        self.matchers = {name: make() for name, make in makers.items()}
+        self.readers, self.score = scenes(), score
+        if expected not in (None, len(self.readers)):
+            raise StereoweaveError(
+                f"{platform.node()}: expected the {expected} scenes that are where the command was started, "
+                f"found {len(self.readers)}; put them on a disk that every node of the cluster sees"
+            )
+
+    def __call__(self, number: int) -> Scored[Any]:
+        return Scored(number, self.score(self.matchers, self.readers[number]()), _machine())
 
 
 def _everyone(makers: Mapping[str, Maker]) -> dict[str, Maker]:
@@ -172,7 +251,7 @@ def _everyone(makers: Mapping[str, Maker]) -> dict[str, Maker]:
     return {**OPENCV_MATCHERS, **makers}
 
 
-def _score_scene(matchers: Mapping[str, Match], scene: Scene) -> list[tuple[Row, Curves]]:
+def _score_scene(matchers: Mapping[str, Match], scene: Scene) -> _Scene:
     # These first calls warm the matchers up for the timing.
     answers = {name: _answer(match, scene.pair) for name, match in matchers.items()}
     # In turns, so that a machine that slows down slows all alike.
@@ -191,7 +270,7 @@ def _score_scene(matchers: Mapping[str, Match], scene: Scene) -> list[tuple[Row,
             time_relative=times_ms[name] / times_ms[SGBM],
         )
         scored.append((row, curves))
-    return scored
+    return _Scene(scored, scene.truth_px.size)
 
 
 def _answer(match: Match, pair: StereoPair) -> _Answer:
@@ -261,6 +340,10 @@ def _mean_known(values: Sequence[Any]) -> Any:
     """The mean of numbers, or of arrays of one shape, over those without NaN; NaN where there is none."""
     known = [value for value in values if not np.isnan(value).any()]
     return np.mean(known, axis=0) if known else values[0]
+
+
+def _machine() -> dict[str, str]:
+    return {"cpu": _cpu_name(), "cores": str(os.cpu_count()), "opencv": cv2.__version__}
 
 
 def _cpu_name() -> str:

@@ -13,24 +13,25 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import partial
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from stereoweave.benchmark import MEAN, TURNS
+from stereoweave.benchmark import MEAN, TURNS, Lister, machine_of_all, score_all
 from stereoweave.data.samples import hidden
 from stereoweave.data.view_sets import TrueView, ViewScene
 from stereoweave.data.view_truth import fill_unknown, view_truth
 from stereoweave.edges import near_edge
-from stereoweave.errors import StereoweaveError
+from stereoweave.engine import Engine
 from stereoweave.metrics import mae, psnr_db, ssim
 from stereoweave.opencv_matchers import OPENCV_MATCHERS, SGBM, fill_rows, left_right_confidence
 from stereoweave.rendering import Renderer
 from stereoweave.stereo import Estimate, Sample, StereoPair
 
-Match = Callable[[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]], Estimate]
-"""A left and a right photograph to the estimate that views are rendered from, such as `Matcher.estimate`."""
+Match = Callable[[StereoPair], Estimate]
+"""A pair to the estimate that views are rendered from, such as what `benchmark.network` gives."""
 
 Viewer = Callable[[float], UInt8[np.ndarray, "h w 3"]]
 """A position to one method's view of one scene."""
@@ -70,25 +71,36 @@ class ViewScore:
     time_ms: float
 
 
+class ViewScores(NamedTuple):
+    """A row per scene, position and method, then a mean row per method; and what they were measured with."""
+
+    rows: list[ViewScore]
+    machine: dict[str, str]
+
+
 def score_scenes(
-    networks: Mapping[str, Match], scenes: Iterable[ViewScene], threads: int | None = None
-) -> list[ViewScore]:
-    """A row per scene, position and method, then a mean row per method.
+    networks: Mapping[str, Callable[[], Match]],
+    scenes: Lister[ViewScene],
+    threads: int | None = None,
+    engine: Engine | None = None,
+) -> ViewScores:
+    """How the views of several methods compare with the pictures taken there.
 
     Four methods are in every table. "nearest photograph" and "cross-fade", the two photographs' weighted
     mean, need no disparity. "sgbm" is OpenCV's matcher, and "ground truth" the true disparity of both views:
     the ceiling, where it is known. These two are filled along rows, and rendered as the networks' are.
 
     Args:
-        networks: Further methods by name.
-        scenes: At least one.
+        networks: What makes each further method, by its name.
+        scenes: Lists at least one.
         threads: For rendering; all cores if left out.
+        engine: As for `benchmark.score_pairs`, which says what is raised, too.
     """
-    rows = [row for scene in scenes for row in _score_scene(networks, scene, threads)]
-    if not rows:
-        raise StereoweaveError("scenes: expected at least one, found none")
+    found = score_all(networks, scenes, partial(_score_scene, threads), engine)
+    rows = [row for scene in found for row in scene.result]
     methods = dict.fromkeys(row.method for row in rows)
-    return rows + [_mean_row(method, [row for row in rows if row.method == method]) for method in methods]
+    means = [_mean_row(method, [row for row in rows if row.method == method]) for method in methods]
+    return ViewScores(rows + means, machine_of_all(found))
 
 
 def moved(image: UInt8[np.ndarray, "h w 3"], offset_px: tuple[float, float]) -> UInt8[np.ndarray, "h w 3"]:
@@ -100,7 +112,7 @@ def moved(image: UInt8[np.ndarray, "h w 3"], offset_px: tuple[float, float]) -> 
     return cv2.warpAffine(image, shift, size, flags=cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
 
 
-def _score_scene(networks: Mapping[str, Match], scene: ViewScene, threads: int | None) -> list[ViewScore]:
+def _score_scene(threads: int | None, networks: Mapping[str, Match], scene: ViewScene) -> list[ViewScore]:
     viewers = _viewers(networks, scene.sample, threads)
     rows = []
     for true in scene.views:
@@ -126,7 +138,7 @@ def _viewers(networks: Mapping[str, Match], sample: Sample, threads: int | None)
     estimates = {SGBM: _sgbm_estimate(pair)}
     if _truth_known(sample):
         estimates[GROUND_TRUTH] = _true_estimate(sample)
-    estimates |= {name: match(pair.left, pair.right) for name, match in networks.items()}
+    estimates |= {name: match(pair) for name, match in networks.items()}
     rendered = {
         name: partial(_rendered, Renderer(pair, estimate, threads=threads))
         for name, estimate in estimates.items()

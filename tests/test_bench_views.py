@@ -86,6 +86,10 @@ def test_a_model_that_is_not_there_is_told_in_one_line(tmp_path, sets, capfd):
     _refused(tmp_path, capfd, "unknown model 'huge'", "--model huge")
 
 
+def test_a_cluster_that_does_not_answer_is_told_in_one_line(tmp_path, sets, capfd):
+    _refused(tmp_path, capfd, "127.0.0.1:1: expected the head of a Ray cluster", "--cluster 127.0.0.1:1")
+
+
 def _refused(tmp_path, capfd, fragment, options=""):
     (tmp_path / "sets").mkdir(exist_ok=True)
     assert main(f"bench views {tmp_path / 'sets'} -o {tmp_path}/views.csv {options}".split()) == 2

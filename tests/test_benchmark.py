@@ -21,6 +21,11 @@ def scene_of(rng, name="noise", disparity_px=7):
     return Scene(name=name, pair=pair, truth_px=np.full((48, 100), disparity_px, np.float32))
 
 
+def scores_of(makers, scenes):
+    """As `score_pairs`, of scenes that are read already."""
+    return score_pairs(makers, lambda: [partial(lambda scene: scene, scene) for scene in scenes])
+
+
 def constant(disparity_px):
     """What makes a matcher that finds one disparity everywhere."""
     return lambda: lambda pair: np.full(pair.left.shape[:2], disparity_px, np.float32)
@@ -55,7 +60,7 @@ def with_step(scene, behind_px):
 
 def test_rows_hold_the_errors_of_each_matcher_on_each_scene_and_their_means(rng):
     scenes = [scene_of(rng, "near", disparity_px=20), scene_of(rng, "far", disparity_px=7)]
-    rows = score_pairs({"seven": constant(7.0), "eight": constant(8.5)}, scenes).rows
+    rows = scores_of({"seven": constant(7.0), "eight": constant(8.5)}, scenes).rows
     found = {
         (row.matcher, row.scene): (row.epe_px, row.bad1_percent, row.bad2_percent, row.d1_percent)
         for row in rows
@@ -72,7 +77,7 @@ def test_rows_hold_the_errors_of_each_matcher_on_each_scene_and_their_means(rng)
 
 
 def test_times_are_relative_to_sgbm_in_the_same_row(rng):
-    rows = score_pairs({"constant": constant(1.0)}, [scene_of(rng, "a"), scene_of(rng, "b")]).rows
+    rows = scores_of({"constant": constant(1.0)}, [scene_of(rng, "a"), scene_of(rng, "b")]).rows
     times_ms = {(row.matcher, row.scene): row.time_ms for row in rows}
     for row in rows:
         assert row.time_relative == pytest.approx(row.time_ms / times_ms["sgbm", row.scene])
@@ -83,7 +88,7 @@ def test_times_are_relative_to_sgbm_in_the_same_row(rng):
 @pytest.mark.parametrize("name", ["sgbm", "files/mean.onnx", "bm.onnx"])
 def test_a_matcher_of_a_name_that_the_table_uses_itself_is_refused(rng, name):
     with pytest.raises(StereoweaveError, match=f"{name}: expected"):
-        score_pairs({name: constant(1.0)}, [scene_of(rng)])
+        scores_of({name: constant(1.0)}, [scene_of(rng)])
 
 
 def test_matchers_take_turns_after_the_calls_that_warm_them_up(rng):
@@ -97,14 +102,14 @@ def test_matchers_take_turns_after_the_calls_that_warm_them_up(rng):
         return lambda: match
 
     makers = {"map": noted("map", constant(1.0)), "estimate": noted("estimate", certain(1.0, 0.5))}
-    score_pairs(makers, [scene_of(rng)])
+    scores_of(makers, [scene_of(rng)])
     # A map's left-right check takes the mirrored pair.
     assert calls == ["map", "map", "estimate"] + ["map", "estimate"] * TURNS
 
 
 def test_near_an_edge_a_row_tells_errors_and_flying_pixels(rng):
     scenes = [with_step(scene_of(rng, "step"), 27), scene_of(rng, "flat")]
-    rows = score_pairs({"between": constant(17.0), "before": constant(27.0)}, scenes).rows
+    rows = scores_of({"between": constant(17.0), "before": constant(27.0)}, scenes).rows
     for of in (by_matcher(rows, "step"), by_matcher(rows)):  # a flat scene has no part in the mean
         assert (of["between"].edge_epe_px, of["before"].edge_epe_px) == (10, 10)
         assert (of["between"].edge_bad1_percent, of["before"].edge_bad1_percent) == (100, 50)
@@ -114,7 +119,7 @@ def test_near_an_edge_a_row_tells_errors_and_flying_pixels(rng):
 
 def test_a_probability_is_compared_with_what_came_true_and_a_left_right_check_is_none(rng):
     scene = with_step(scene_of(rng), 27)
-    rows = score_pairs({"sure": certain(7.0, 0.9), "map": constant(7.0)}, [scene]).rows
+    rows = scores_of({"sure": certain(7.0, 0.9), "map": constant(7.0)}, [scene]).rows
     # Half of the pixels are right.
     assert by_matcher(rows)["sure"].calibration_error == pytest.approx(0.4)
     assert math.isnan(by_matcher(rows)["map"].calibration_error)
@@ -122,7 +127,7 @@ def test_a_probability_is_compared_with_what_came_true_and_a_left_right_check_is
 
 def test_the_area_between_the_curves_is_that_of_the_mean_curves(rng):
     scenes = [with_step(scene_of(rng, "a"), 27), with_step(scene_of(rng, "b"), 12)]
-    scores = score_pairs({"flat": certain(7.0, 0.5)}, scenes)
+    scores = scores_of({"flat": certain(7.0, 0.5)}, scenes)
     curves, row = scores.curves["flat"], by_matcher(scores.rows)["flat"]
     np.testing.assert_allclose(curves.epe_px.kept, (10 + 2.5) / 2)
     np.testing.assert_allclose(curves.bad1_percent.kept, 50)
@@ -144,7 +149,7 @@ def test_the_holes_of_a_map_are_its_least_confident_pixels_and_filled(rng):
     scene = scene_of(rng)
     truth_px = scene.truth_px.copy()
     truth_px[:, 30:70] = 12
-    scores = score_pairs({"half": half}, [Scene(name="a", pair=scene.pair, truth_px=truth_px)])
+    scores = scores_of({"half": half}, [Scene(name="a", pair=scene.pair, truth_px=truth_px)])
     assert by_matcher(scores.rows)["half"].epe_px == pytest.approx(2)
     assert scores.curves["half"].epe_px.kept[-1] == 0
 
@@ -152,7 +157,7 @@ def test_the_holes_of_a_map_are_its_least_confident_pixels_and_filled(rng):
 def test_a_scene_without_known_disparity_has_no_part_in_the_means(rng):
     scene = scene_of(rng)
     unknown = Scene(name="unknown", pair=scene.pair, truth_px=np.full_like(scene.truth_px, np.nan))
-    scores = score_pairs({"eight": certain(8.0, 0.5)}, [unknown, scene])
+    scores = scores_of({"eight": certain(8.0, 0.5)}, [unknown, scene])
     assert math.isnan(by_matcher(scores.rows, "unknown")["eight"].calibration_error)
     assert by_matcher(scores.rows)["eight"].epe_px == 1
     np.testing.assert_array_equal(scores.curves["eight"].epe_px.kept, 1)
@@ -160,12 +165,12 @@ def test_a_scene_without_known_disparity_has_no_part_in_the_means(rng):
 
 def test_no_scene_is_an_error():
     with pytest.raises(StereoweaveError, match="expected at least one, found none"):
-        score_pairs({}, [])
+        scores_of({}, [])
 
 
 def test_a_model_that_is_none_is_an_error_before_any_scene_is_read():
     with pytest.raises(MatcherError, match=r"none.onnx"):
-        score_pairs({"none": partial(network, "none.onnx")}, iter(lambda: pytest.fail("was read"), None))
+        score_pairs({"none": partial(network, "none.onnx")}, lambda: pytest.fail("was listed"))
 
 
 def test_memory_stands_in_the_rows_of_means_and_is_that_of_the_largest_pair(rng):
@@ -174,7 +179,7 @@ def test_memory_stands_in_the_rows_of_means_and_is_that_of_the_largest_pair(rng)
     large = Scene(
         name="large", pair=StereoPair(left=wide, right=wide), truth_px=np.ones((48, 200), np.float32)
     )
-    scores = score_pairs({}, [small, large, small])
+    scores = scores_of({}, [small, large, small])
     assert scores.largest is large.pair
     rows = with_memory([row for row in scores.rows if row.matcher == "sgbm"], {}, scores.largest)
     assert [math.isnan(row.memory_mb) for row in rows] == [True, True, True, False]
@@ -182,7 +187,7 @@ def test_memory_stands_in_the_rows_of_means_and_is_that_of_the_largest_pair(rng)
 
 
 def test_a_csv_holds_every_row_under_a_header_and_the_machine(tmp_path, rng):
-    rows = score_pairs({"seven": constant(7.0)}, [scene_of(rng)]).rows
+    rows = scores_of({"seven": constant(7.0)}, [scene_of(rng)]).rows
     write_csv(tmp_path / "pairs.csv", rows)
     with (tmp_path / "pairs.csv").open(newline="") as file:
         read = list(csv.DictReader(file))

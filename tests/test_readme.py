@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image, ImageSequence
+from pyarrow import parquet
 
 from stereoweave.animation import write_animation
 from stereoweave.io import read_image
@@ -18,7 +19,7 @@ from stereoweave.layouts import MOTIONS
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-DEMO, INSTALL, COMMANDS, OWN_PICTURES, VIDEO, SYNTHETIC, RESEARCH = re.findall(
+DEMO, INSTALL, COMMANDS, OWN_PICTURES, VIDEO, BEYOND, SYNTHETIC, RESEARCH = re.findall(
     r"```sh\n(.*?)```", README, re.DOTALL
 )
 (PROGRAM,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
@@ -167,6 +168,16 @@ def test_films_are_made_by_the_commands_for_them(pictures):
     run(["bash", "-ec", VIDEO], pictures, PATH=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     films = sorted(path.name for path in pictures.glob("*.m[pk][4v]"))
     assert films == ["anaglyph.mp4", "between.mp4", "depth.mkv", "depth.mp4", "film_LR.mp4"]
+
+
+def test_an_archive_is_worked_through_by_the_command_for_it(pictures):
+    (pictures / "scenes").rename(pictures / "photographs")
+    printed = run(
+        ["bash", "-ec", BEYOND], pictures, PATH=f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    )
+    assert "1 pair: 1 made" in printed
+    assert parquet.read_table(pictures / "depths" / "manifest")["pair"].to_pylist() == ["wall"]
+    assert (pictures / "depths" / "wall" / "disparity.pfm").is_file()
 
 
 @pytest.mark.needs_egl

@@ -135,6 +135,17 @@ def test_a_mistake_is_answered_in_one_line(tmp_path, monkeypatch, capsys, line, 
     assert list(contents(tmp_path)) == ["file"]
 
 
+@pytest.mark.needs_egl
+def test_a_cluster_that_does_not_answer_is_told_in_one_line(tmp_path, capsys):
+    line = f"synth make pylon --pairs 1 --size 48x32 --plain -o {tmp_path} --cluster 127.0.0.1:1"
+    assert run(line) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert "127.0.0.1:1: expected the head of a Ray cluster that answers, found " in told.err
+    assert told.err.endswith("; what is there is whole, and the same command goes on\n")
+    assert told.err.count("\n") == 1
+
+
 def test_the_help_names_every_scene(capsys):
     assert list(SCENE_NAMES) == list(SCENES)
     assert run("synth make --help") == 0

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from view_examples import boxes_before_a_wall
 
+from stereoweave.benchmark import network
 from stereoweave.data.samples import make_sample
-from stereoweave.data.view_sets import TrueView, ViewScene, read_view_scenes
+from stereoweave.data.view_sets import TrueView, ViewScene, list_view_scenes
 from stereoweave.errors import StereoweaveError
-from stereoweave.matcher import Matcher
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.view_scores import moved, score_scenes
 
@@ -38,13 +38,24 @@ def wall(rng, shift_px=4, height=32, width=64):
     return make_sample(StereoPair(left=left, right=right), disparity_px, disparity_px), middle
 
 
+def rows_of(networks, scenes):
+    return score_scenes(networks, listed(scenes)).rows
+
+
 def by_method(rows, scene):
     return {row.method: row for row in rows if row.scene == scene}
 
 
+def listed(scenes):
+    """What lists them as if each were read."""
+    return lambda: [partial(lambda scene: scene, scene) for scene in scenes]
+
+
 def constant(disparity_px):
-    def match(left, right):
-        map_px = np.full(left.shape[:2], disparity_px, np.float32)
+    """What makes a matcher that finds one disparity everywhere."""
+
+    def match(pair):
+        map_px = np.full(pair.left.shape[:2], disparity_px, np.float32)
         return Estimate(
             disparity_px=map_px,
             right_disparity_px=map_px,
@@ -52,13 +63,13 @@ def constant(disparity_px):
             occluded=np.zeros(map_px.shape, bool),
         )
 
-    return match
+    return lambda: match
 
 
 def test_a_plane_at_its_true_disparity_is_seen_without_error(rng):
     sample, middle = wall(rng)
     rows = by_method(
-        score_scenes({"right": constant(4), "wrong": constant(8)}, [scene_of(sample, (0.5, middle))]), "shed"
+        rows_of({"right": constant(4), "wrong": constant(8)}, [scene_of(sample, (0.5, middle))]), "shed"
     )
     assert list(rows) == [*OURS, "right", "wrong"]
     for method in ("ground truth", "right"):
@@ -75,7 +86,7 @@ def test_each_kind_of_pixel_has_its_own_error():
     image = np.full((32, 40, 3), 101, np.uint8)
     image[:, edges] = 110
     scene = scene_of(boxes_before_a_wall((20, 28), height=32), (0.5, image))
-    for row in by_method(score_scenes({}, [scene]), "shed").values():
+    for row in by_method(rows_of({}, [scene]), "shed").values():
         assert (row.smooth_mae, row.edge_mae) == (1, 10)
         assert row.smooth_psnr_db == pytest.approx(LEVEL_DB)
         assert row.edge_psnr_db == pytest.approx(TEN_LEVELS_DB)
@@ -91,7 +102,7 @@ def test_what_neither_photograph_sees_counts_by_itself():
     image = np.full((32, 40, 3), 100, np.uint8)
     image[:, 12:14], image[:, 14:17] = 110, 106
     scene = scene_of(boxes_before_a_wall((10, 16), (18, 24), height=32), (0.5, image))
-    row = by_method(score_scenes({}, [scene]), "shed")["ground truth"]
+    row = by_method(rows_of({}, [scene]), "shed")["ground truth"]
     # The slit is at columns 12 and 13 (test_view_truth.py), and the boxes' edges towards it are edges too: of
     # 3 to 22, all that is near an edge, 18 columns are known, and three of these off by 6.
     assert (row.neither_mae, row.edge_mae, row.smooth_mae) == (10, 1, 0)
@@ -101,7 +112,7 @@ def test_what_neither_photograph_sees_counts_by_itself():
 def test_the_two_yardsticks_show_the_photographs_themselves():
     dark, bright = (np.full((32, 40, 3), level, np.uint8) for level in (100, 140))
     sample = make_sample(StereoPair(left=dark, right=bright), np.full((32, 40), np.nan))
-    rows = score_scenes({}, [scene_of(sample, (0.25, dark), (0.75, dark), (1.5, bright))])
+    rows = rows_of({}, [scene_of(sample, (0.25, dark), (0.75, dark), (1.5, bright))])
     errors = {(row.method, row.position): row.mae for row in rows}
     assert [errors["nearest photograph", position] for position in (0.25, 0.75, 1.5)] == [0, 40, 0]
     assert [errors["cross-fade", position] for position in (0.25, 0.75, 1.5)] == [10, 30, 0]
@@ -110,7 +121,7 @@ def test_the_two_yardsticks_show_the_photographs_themselves():
 def test_without_known_disparity_there_is_no_ceiling_and_there_are_no_kinds():
     grey = np.full((32, 40, 3), 100, np.uint8)
     left_alone = make_sample(StereoPair(left=grey, right=grey), np.full((32, 40), 3.0))
-    rows = by_method(score_scenes({}, [scene_of(left_alone, (0.5, grey))]), "shed")
+    rows = by_method(rows_of({}, [scene_of(left_alone, (0.5, grey))]), "shed")
     assert list(rows) == OURS[:3]
     assert rows["sgbm"].mae == 0
     for kind in ("smooth", "edge", "one", "neither"):
@@ -124,7 +135,7 @@ def test_a_mean_counts_every_scene_once_however_many_its_positions():
     known = boxes_before_a_wall((20, 28), height=32)
     shed = scene_of(plain, (0.25, grey + np.uint8(1)), (0.5, grey + np.uint8(2)), (0.75, grey + np.uint8(3)))
     barn = scene_of(known, (0.5, grey + np.uint8(10)), name="barn")
-    rows = score_scenes({}, [shed, barn])
+    rows = rows_of({}, [shed, barn])
     assert [row.scene for row in rows] == 9 * ["shed"] + 4 * ["barn"] + 4 * ["mean"]
     means = by_method(rows, "mean")
     assert means["sgbm"].mae == (2 + 10) / 2
@@ -140,7 +151,7 @@ def test_moving_a_picture_by_a_pixel_takes_each_from_its_neighbour(rng):
 
 def test_no_scene_at_all_is_an_error():
     with pytest.raises(StereoweaveError, match="at least one, found none"):
-        score_scenes({}, [])
+        rows_of({}, [])
 
 
 @pytest.mark.testdata
@@ -155,8 +166,8 @@ def test_the_referee_finds_the_same_for_a_photograph_beside_its_place(testdata, 
     ]
     subprocess.run(program, check=True, capture_output=True)
     referee = json.loads((tmp_path / "found.json").read_text())["cones"]
-    matches = {"base refined": partial(Matcher("base").estimate, refined=True)}
-    found = by_method(score_scenes(matches, read_view_scenes(tmp_path)), "cones")
+    makers = {"base refined": partial(network, "base", refined=True)}
+    found = by_method(score_scenes(makers, partial(list_view_scenes, tmp_path)).rows, "cones")
     for method, name in (("nearest photograph",) * 2, ("cross-fade",) * 2, ("base refined", "stereoweave")):
         assert found[method].psnr_db == pytest.approx(referee[name]["psnr"], abs=1e-6)
         assert found[method].ssim == pytest.approx(referee[name]["ssim"], abs=1e-6)

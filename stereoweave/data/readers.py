@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io import read_disparity_png, read_pair, read_pfm
 from stereoweave.stereo import StereoPair
 
-__all__ = ["DATASETS", "Frame", "Scene", "open_dataset", "read_scenes", "split_frames"]
+__all__ = ["DATASETS", "Frame", "Scene", "list_scenes", "open_dataset", "read_scenes", "split_frames"]
 
 DATASETS: dict[str, Callable[[Path], list[Frame]]] = {
     "sintel": sintel.sintel,
@@ -67,7 +68,12 @@ class Scene:
 
 
 def read_scenes(folder: str | Path, dataset: str | None = None) -> Iterator[Scene]:
-    """The scenes of `folder` by name, each read when its turn comes.
+    """The scenes of `folder` by name, each read when its turn comes; as for `list_scenes`."""
+    return (read() for read in list_scenes(folder, dataset))
+
+
+def list_scenes(folder: str | Path, dataset: str | None = None) -> list[Callable[[], Scene]]:
+    """What reads each scene of `folder`, by the scenes' names.
 
     A scene is a folder of left.png, right.png, disparity.png (16 bit, pixels * 256, 0 = unknown) or
     disparity.pfm (NaN or infinity = unknown), and, where the camera is known, Middlebury's calib.txt. Where
@@ -79,20 +85,20 @@ def read_scenes(folder: str | Path, dataset: str | None = None) -> Iterator[Scen
 
     Raises:
         StereoweaveError: No scene in the folder, or as for `open_dataset`.
-        FormatError: A file is missing, damaged, or of another size than its neighbours.
+        FormatError: While a scene is read: a file is missing, damaged, or of another size than its others.
     """
     if dataset:
-        return map(_frame_scene, open_dataset(dataset, folder))
+        return [partial(_frame_scene, frame) for frame in open_dataset(dataset, folder)]
     scenes = sorted(left.parent for left in Path(folder).glob("*/left.png"))
     if scenes:
-        return map(_read_scene, scenes)
+        return [partial(_read_scene, scene) for scene in scenes]
     frames = shards.shards(Path(folder))
     if not frames:
         raise StereoweaveError(
             f"{folder}: expected <scene>/left.png below it, found none, and no rendered set; "
             "a dataset has to be named"
         )
-    return map(_frame_scene, frames)
+    return [partial(_frame_scene, frame) for frame in frames]
 
 
 def _frame_scene(frame: Frame) -> Scene:

@@ -48,7 +48,12 @@ class ViewScene:
 
 
 def read_view_scenes(folder: str | Path) -> Iterator[ViewScene]:
-    """The scenes of `folder` by name, each read when its turn comes.
+    """The scenes of `folder` by name, each read when its turn comes; as for `list_view_scenes`."""
+    return (read() for read in list_view_scenes(folder))
+
+
+def list_view_scenes(folder: str | Path) -> list[Callable[[], ViewScene]]:
+    """What reads each scene of `folder`, by the scenes' names.
 
     A scene is a folder of left.png, right.png, and view_<position>.png for each further photograph. It may
     have disparity.png (16 bit, pixels * 256, 0 = unknown) or disparity.pfm (NaN or infinity = unknown), the
@@ -58,12 +63,12 @@ def read_view_scenes(folder: str | Path) -> Iterator[ViewScene]:
 
     Raises:
         StereoweaveError: No scene in the folder.
-        FormatError: A file is missing, damaged, or of another size than its neighbours; a position is no
-            number that a view can be rendered at; a scene has no further picture.
+        FormatError: While a scene is read: a file is missing, damaged, or of another size than its
+            neighbours; a position is no number that a view can be rendered at; there is no further picture.
     """
     root = Path(folder)
     if scenes := sorted(left.parent for left in root.glob("*/left.png")):
-        return map(_read_scene, scenes)
+        return [partial(_read_scene, scene) for scene in scenes]
     below = sorted({path.parent for path in root.rglob("[!.]*.tar")})
     sets = [Shards(path) for path in below if list_shards(path)]
     if not sets:
@@ -71,7 +76,7 @@ def read_view_scenes(folder: str | Path) -> Iterator[ViewScene]:
             f"{root}: expected <scene>/left.png below it, or rendered sets, found neither; "
             "stereoweave synth make --view 0.5 renders one"
         )
-    return (_rendered_scene(pairs, index, root) for pairs in sets for index in range(pairs.count))
+    return [partial(_rendered_scene, pairs, index, root) for pairs in sets for index in range(pairs.count)]
 
 
 def _rendered_scene(pairs: Shards, index: int, root: Path) -> ViewScene:

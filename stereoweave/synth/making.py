@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import platform
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache, partial
@@ -12,14 +13,16 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from rich.console import Console
 
+from stereoweave.claiming import check_claim, check_unclaimed, description
 from stereoweave.data.packing import packed
 from stereoweave.data.paper_layout import remove_unfinished, whole_frames, write_frame
 from stereoweave.data.shards import list_shards, write_shard
+from stereoweave.engine import Engine
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io import SMALLEST_SIDE_PX, is_leftover, make_folder, reading, remove_leftovers, replacing
 from stereoweave.rendering import FIRST_POSITION, LAST_POSITION
 from stereoweave.synth.samples import Camera, Order, Rendered, rendered
-from stereoweave.synth.workers import in_workers, step_done
+from stereoweave.synth.workers import in_engine, in_workers, step_done
 
 SET_FILE = "set.json"
 FORMAT = 1
@@ -84,6 +87,7 @@ def make(  # noqa: PLR0913 - each is a word of the command line
     *,
     layout: str = "shards",
     jobs: int = 1,
+    engine: Engine | None = None,
     studio: Studio = RenderingStudio(),
     console: Console | None = None,
 ) -> int:
@@ -95,23 +99,30 @@ def make(  # noqa: PLR0913 - each is a word of the command line
         out: The folder, new or with the same set.
         layout: A name in LAYOUTS.
         jobs: Processes at a time; the bytes do not depend on it.
+        engine: Where the pairs are made instead; all its machines have to see `out`, and the bytes do not
+            depend on it either. What a killed worker was making is made again.
         studio: What makes the pairs.
         console: Where the progress is shown.
 
     Raises:
         StereoweaveError: Nonsense was asked for, `out` has another set in it or cannot be written, the disk
-            is full, or a worker was killed. All that is there then is whole, and the same call goes on.
+            is full, a worker was killed, or a machine does not see `out` or would make other pairs. All that
+            is there then is whole, and the same call goes on.
     """
     _check(order, pairs, layout)
     make_folder(out)
     _claim(out, _facts(order, layout, studio), pairs)
-    lacking = sorted(set(range(pairs)) - LAYOUTS[layout].there(out, order.scene))
-    runs = _runs(lacking, LAYOUTS[layout].pairs_a_run)
+    runs = _runs(_lacking(order, pairs, out, layout), LAYOUTS[layout].pairs_a_run)
     missing = sum(map(len, runs))
-    work = partial(_make_run, order, out, layout, studio)
+    told = console or Console(), f"making {order.scene}", missing
     try:
-        for _ in in_workers(work, runs, jobs, console or Console(), f"making {order.scene}", missing):
-            pass
+        if engine is None:
+            for _ in in_workers(partial(_make_run, order, out, layout, studio), runs, jobs, *told):
+                pass
+        else:
+            # Absolute, because its workers have another current folder.
+            in_engine(partial(_on_a_node, order, out.absolute(), layout, studio), runs, engine, *told)
+            _check_shared(out, _lacking(order, pairs, out, layout))
     except StereoweaveError as error:
         raise StereoweaveError(f"{error}; what is there is whole, and the same command goes on") from error
     finally:
@@ -190,32 +201,46 @@ def _check(order: Order, pairs: int, layout: str) -> None:
 
 def _facts(order: Order, layout: str, studio: Studio) -> dict[str, Any]:
     facts = {"format": FORMAT, "layout": layout, **asdict(order)}
-    facts |= {"generator": generator_version(), "renderer": studio.renderer()}
-    return json.loads(json.dumps(facts))  # where tuples have become lists
+    return facts | {"generator": generator_version(), "renderer": studio.renderer()}
 
 
 def _claim(out: Path, facts: dict[str, Any], pairs: int) -> None:
     """Writes down whose folder this is, or refuses one that is another's."""
     if (out / SET_FILE).exists():
         found = read_set(out)
-        _compare(out, facts, found)
-        pairs = max(pairs, found["pairs"])
-    elif others := sorted(path.name for path in out.iterdir() if not is_leftover(path)):
-        raise StereoweaveError(
-            f"{out}: expected a new folder, or one with a {SET_FILE}, found {others[0]} in it"
-        )
+        pairs = max(pairs, found.pop("pairs"))
+        check_claim(out / SET_FILE, facts, found)
+    else:
+        check_unclaimed(out, SET_FILE, (path.name for path in out.iterdir() if not is_leftover(path)))
     LAYOUTS[facts["layout"]].tidy(out)
     with replacing(out / SET_FILE) as temporary:
-        temporary.write_text(json.dumps(facts | {"pairs": pairs}, indent=1) + "\n", encoding="utf-8")
+        temporary.write_text(description(facts | {"pairs": pairs}), encoding="utf-8")
 
 
-def _compare(out: Path, expected: dict[str, Any], found: dict[str, Any]) -> None:
-    for name, value in expected.items():
-        if found.get(name) != value:
-            raise StereoweaveError(
-                f"{out / SET_FILE}: expected {name} = {json.dumps(value)}, as this run would make, "
-                f"found {json.dumps(found.get(name))}; ask for the same, or take another folder"
-            )
+def _lacking(order: Order, pairs: int, out: Path, layout: str) -> list[int]:
+    return sorted(set(range(pairs)) - LAYOUTS[layout].there(out, order.scene))
+
+
+def _on_a_node(order: Order, out: Path, layout: str, studio: Studio) -> Callable[[Sequence[int]], int]:
+    """What makes runs of the set here; StereoweaveError where it is not seen, or would become another."""
+    try:
+        found = read_set(out)
+        del found["pairs"]
+        check_claim(out / SET_FILE, _facts(order, layout, studio), found)
+    except StereoweaveError as error:
+        raise StereoweaveError(
+            f"{platform.node()}: {error}; all nodes of a cluster need the folder on a disk that they share, "
+            "and the same versions of all"
+        ) from error
+    return partial(_make_run, order, out, layout, studio)
+
+
+def _check_shared(out: Path, lacking: Sequence[int]) -> None:
+    if lacking:
+        raise StereoweaveError(
+            f"{out}: expected all pairs that the cluster made, found {len(lacking)} of them missing; "
+            "do all its nodes share the disk?"
+        )
 
 
 def _runs(numbers: Sequence[int], most: int) -> list[list[int]]:
@@ -225,13 +250,14 @@ def _runs(numbers: Sequence[int], most: int) -> list[list[int]]:
     return [[number for _, number in group] for _, group in groups]
 
 
-def _make_run(order: Order, out: Path, layout: str, studio: Studio, run: Sequence[int]) -> None:
+def _make_run(order: Order, out: Path, layout: str, studio: Studio, run: Sequence[int]) -> int:
     def pairs() -> Iterator[Rendered]:
         for number in run:
             yield studio(order, number)
             step_done()
 
     LAYOUTS[layout].write(out, order.scene, run, pairs())
+    return len(run)
 
 
 def _write_shard(out: Path, scene: str, run: Sequence[int], pairs: Iterator[Rendered]) -> None:

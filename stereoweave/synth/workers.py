@@ -1,15 +1,17 @@
-"""Work shared among processes, one core each, that end with the one that started them."""
+"""Work shared among processes, one core each, that end with the one that started them; or among machines."""
 
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 from multiprocessing.sharedctypes import Synchronized
 from typing import TypeVar
 
 from rich.console import Console
 
+from stereoweave.engine import Engine, connect, stream
 from stereoweave.errors import StereoweaveError
 from stereoweave.processes import begin_work
 from stereoweave.progress import progress
@@ -17,8 +19,8 @@ from stereoweave.progress import progress
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-# Of a worker: how many steps all of them have done.
-_done: "Synchronized[int]"
+# Of a worker of this machine: how many steps all of them have done.
+_done: "Synchronized[int] | None" = None
 
 
 def in_workers(  # noqa: PLR0913 - what, on what, by how many, and how it is told
@@ -68,15 +70,52 @@ def in_workers(  # noqa: PLR0913 - what, on what, by how many, and how it is tol
             raise
 
 
+def in_engine(  # noqa: PLR0913 - as `in_workers`
+    make_work: Callable[[], Callable[[Task], int]],
+    tasks: Sequence[Task],
+    engine: Engine,
+    console: Console,
+    description: str,
+    steps: int,
+) -> None:
+    """Does what `in_workers` does by an engine's workers, whose tasks are done again where one is killed.
+
+    Args:
+        make_work: Makes, once in each worker, what gives the number of steps that a task was.
+        tasks: As for `in_workers`, and so are the last three.
+        engine: Where.
+        console: See there.
+        description: See there.
+        steps: See there.
+
+    Raises:
+        StereoweaveError: As in `engine.stream`.
+    """
+    with connect(engine), progress(console) as bar:
+        shown = bar.add_task(description, total=steps, loss="", rate="")
+        for done in stream(partial(_begun, make_work), tasks, engine):
+            bar.update(shown, advance=done)
+
+
 def step_done() -> None:
     """Called by `work` after each step, for the bar."""
-    with _done.get_lock():
-        _done.value += 1
+    if _done is not None:
+        with _done.get_lock():
+            _done.value += 1
 
 
 def _begin(done: "Synchronized[int]") -> None:
     global _done  # noqa: PLW0603 - a worker has one counter, and functions that are pickled cannot carry it
     _done = done
+    _draw_with_one_thread()
+    begin_work(threads=1)
+
+
+def _begun(make_work: Callable[[], Callable[[Task], int]]) -> Callable[[Task], int]:
+    _draw_with_one_thread()
+    return make_work()
+
+
+def _draw_with_one_thread() -> None:
     # Mesa reads it when the first context is made; more threads than cores slow all of them down.
     os.environ["LP_NUM_THREADS"] = "1"
-    begin_work(threads=1)
