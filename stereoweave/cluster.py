@@ -6,7 +6,7 @@ through, and all others made. Two such runs at once do everything twice, and har
 """
 
 import json
-import shutil
+import platform
 import time
 from collections.abc import Iterator
 from contextlib import closing
@@ -19,10 +19,11 @@ import typer
 from rich.console import Console
 
 from stereoweave.claiming import check_claim, check_unclaimed, described, description
-from stereoweave.cluster_worker import Counts, Worker
+from stereoweave.cluster_worker import BEGUN, Counts, Worker, remove_left_behind
 from stereoweave.engine import Engine, connect, room, stream
+from stereoweave.errors import StereoweaveError
 from stereoweave.io import reading
-from stereoweave.manifest import MANIFEST, Plan, extend_plan
+from stereoweave.manifest import MANIFEST, PLAN, Plan, extend_plan
 from stereoweave.matcher import Matcher
 from stereoweave.pair_lists import BATCH_FILE
 from stereoweave.progress import progress
@@ -31,8 +32,6 @@ from stereoweave.stores import Store, store_at
 
 # Ray Data remembers something of each task; chunks beyond so many share one.
 _MOST_TASKS = 2000
-# A killed worker's temporary folders; what is younger may be another run's.
-_LEFT_BEHIND_S = 600
 
 
 @dataclass(frozen=True)
@@ -134,7 +133,7 @@ def _run(worker: Worker, plan: Plan, engine: Engine, console: Console) -> Counts
     counts, start_s = Counts(), time.perf_counter()
     of_each = -(-len(plan.chunks) // _MOST_TASKS)
     tasks = [plan.chunks[first : first + of_each] for first in range(0, len(plan.chunks), of_each)]
-    with closing(stream(partial(_itself, worker), tasks, engine)) as results, progress(console) as bar:
+    with closing(stream(partial(_ready, worker), tasks, engine)) as results, progress(console) as bar:
         shown = bar.add_task("depth", total=plan.count, loss="", rate="")
         for result in results:
             counts += result
@@ -144,7 +143,17 @@ def _run(worker: Worker, plan: Plan, engine: Engine, console: Console) -> Counts
     return counts
 
 
-def _itself(worker: Worker) -> Worker:
+def _ready(worker: Worker) -> Worker:
+    """The worker, on a machine that sees both places."""
+    try:
+        for store in (worker.source, worker.destination):
+            if store.folder is not None:
+                store.check_source()
+    except StereoweaveError as error:
+        raise StereoweaveError(
+            f"{platform.node()}: {error}; all machines of a cluster need it on a disk that they share, "
+            "or take an object store"
+        ) from error
     return worker
 
 
@@ -175,16 +184,14 @@ def _claim(destination: Store, order: DepthOrder, source: Store) -> None:
 
 def _carried(order: DepthOrder) -> Iterator[tuple[str, str, bytes]]:
     """The order's own files, which workers on other machines cannot read: kind, name and content."""
-    for kind, path in (("model", order.model), ("calibration", order.request.calibration)):
+    model = order.model if order.model.endswith(".onnx") else None  # else a name that they all know
+    for kind, path in (("model", model), ("calibration", order.request.calibration)):
         if path and Path(path).is_file():
             with reading(path, f"a {kind}"):
                 yield kind, Path(path).name, Path(path).read_bytes()
 
 
 def _tidy(destination: Store) -> None:
-    """Removes the temporary folders of killed workers."""
-    if destination.folder is None:
-        return
-    for folder in destination.folder.glob(".stereoweave-*"):
-        if time.time() - folder.stat().st_mtime > _LEFT_BEHIND_S:
-            shutil.rmtree(folder, ignore_errors=True)
+    if destination.folder is not None:
+        for below in ("", MANIFEST, PLAN, BEGUN):
+            remove_left_behind(destination.folder / below)

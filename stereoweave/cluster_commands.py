@@ -29,8 +29,8 @@ Destination = Annotated[
 Address = Annotated[
     str | None,
     typer.Option(
-        help="The Ray cluster to work on: host:port or ray://host:port of its head, or auto for one that "
-        "runs here. This machine alone unless given."
+        help="The Ray cluster to work on: host:port or ray://host:port of its head, auto for one that runs "
+        "here, local for this machine's cores. RAY_ADDRESS, or else local, unless given."
     ),
 ]
 Workers = Annotated[

@@ -8,18 +8,23 @@ import errno
 import functools
 import json
 import multiprocessing
+import platform
+import shutil
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from stereoweave.errors import ProviderError, StereoweaveError
-from stereoweave.io import is_leftover
+from stereoweave.io import SMALLEST_SIDE_PX, is_leftover
 from stereoweave.manifest import Planned, read_chunk, read_rows, write_rows
 from stereoweave.matcher import Matcher
 from stereoweave.processes import begin_work
@@ -33,7 +38,11 @@ FILM = "depth.mkv"
 _NAMED_FAILURES = 5
 # A process may also be killed for others' need of memory.
 _MOST_TRIES = 3
+# Processes that are killed while they start, one after another: more are no accident.
+_MOST_FALSE_STARTS = 10
 _KILLED = "its process was killed every time; is the memory full?"
+# What is younger may be a living worker's.
+_LEFT_BEHIND_S = 600
 _FULL_OR_GONE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.ESTALE}
 
 
@@ -91,8 +100,11 @@ class Worker:
         return Counts(len(missing) - len(failed), there, len(failed), failed[:_NAMED_FAILURES])
 
     def _is_made(self, planned: Planned, row: Row | None) -> bool:
+        return row is not None and not row["error"] and self._holds(planned, row)
+
+    def _holds(self, planned: Planned, row: Row) -> bool:
         """Whether a row is of these very files, and its results are there."""
-        if row is None or row["error"] or tuple(row["versions"]) != planned.versions:
+        if tuple(row["versions"]) != planned.versions:
             return False
         folder = planned.name
         there = {file.path.removeprefix(f"{folder}/") for file in self.destination.files(folder)}
@@ -108,21 +120,27 @@ class Worker:
 
     def _rows_apart(self, missing: Sequence[Planned], mark: str) -> list[Row]:
         """The rows, each made in another process; what it was killed by is noted, and not tried for ever."""
-        notes = json.loads(self.destination.read_bytes(mark))
-        tries, rows = notes.get("tries", {}), notes.get("rows", [])
-        done = {row["pair"]: tuple(row["versions"]) for row in rows}
+        notes = self._notes(mark)
+        tries, rows = notes.get("tries", {}), {row["pair"]: row for row in notes.get("rows", [])}
         with _Apart(self) as apart:
             for planned in missing:
-                if done.get(planned.name) == planned.versions:
+                if planned.name in rows and self._holds(planned, rows[planned.name]):
                     continue
                 row = None
                 while row is None and tries.get(planned.name, 0) < _MOST_TRIES:
                     apart.begin()
                     tries[planned.name] = tries.get(planned.name, 0) + 1
-                    self.destination.write_bytes(mark, json.dumps({"tries": tries, "rows": rows}).encode())
+                    noted = json.dumps({"tries": tries, "rows": list(rows.values())})
+                    self.destination.write_bytes(mark, noted.encode())
                     row = apart.row(planned)
-                rows.append(row or self._empty_row(planned) | {"error": _KILLED})
-        return rows
+                rows[planned.name] = row or self._empty_row(planned) | {"error": _KILLED}
+        return list(rows.values())
+
+    def _notes(self, mark: str) -> dict[str, Any]:
+        try:
+            return json.loads(self.destination.read_bytes(mark))
+        except ValueError:  # another run has just made the chunk, or the file was lost with a machine's power
+            return {}
 
     def row(self, planned: Planned) -> Row:
         """The row of a pair or a film that is made now.
@@ -131,14 +149,20 @@ class Worker:
             StereoweaveError: Not because of the pair: the source, the destination or the provider fails.
         """
         start_s = time.perf_counter()
-        row = self._empty_row(planned)
+        row, order = self._empty_row(planned), self._order()
+        matcher = _matcher(order.model, order.threads, order.provider)
         with tempfile.TemporaryDirectory(prefix="stereoweave-") as name:
             try:
-                row |= self._film(planned, Path(name)) if planned.is_film else self._pair(planned, Path(name))
-            except (ProviderError, _StoreError):
+                if planned.is_film:
+                    row |= self._film(planned, Path(name), order)
+                else:
+                    row |= self._pair(planned, Path(name), order, matcher)
+            except _StoreError:
                 raise
             except Exception as error:  # whatever a library makes of a bad picture, the others go on
                 self._check_disk(error)
+                if any(isinstance(cause, ProviderError) for cause in _causes(error)):
+                    _check_runs(matcher)
                 kind = "" if isinstance(error, StereoweaveError) else f"{type(error).__name__}: "
                 told = f"{kind}{error}".replace(f"{name}/pictures", self.source.place)
                 row["error"] = " ".join(told.split())
@@ -160,12 +184,10 @@ class Worker:
             }
         )
 
-    def _pair(self, planned: Planned, scratch: Path) -> Row:
+    def _pair(self, planned: Planned, scratch: Path, order: DepthOrder, matcher: Matcher) -> Row:
         pictures, calibration = self._fetched(planned, scratch / "pictures")
-        order = self._order()
         if calibration and not order.request.calibration:
             order = replace(order, request=replace(order.request, calibration=calibration))
-        matcher = _matcher(order.model, order.threads, order.provider)
         with self._results(planned, scratch) as out:
             summary, notes = make_depth(pictures, out, order, matcher)
         return {
@@ -179,21 +201,32 @@ class Worker:
             "files": _names(out),
         }
 
-    def _film(self, planned: Planned, scratch: Path) -> Row:
+    def _film(self, planned: Planned, scratch: Path, order: DepthOrder) -> Row:
         from rich.console import Console
 
         from stereoweave.animation import needing_the_video_extra
 
         with needing_the_video_extra("a film"):
+            from stereoweave.film import parts_folder
             from stereoweave.footage import open_footage
             from stereoweave.video import Order, make_film
 
         films, _ = self._fetched(planned, scratch / "pictures")
-        order = self._order()
         ordered = Order(depth16=True, model=order.model, threads=order.threads, provider=order.provider)
         footage = open_footage(films, order.request.arrangement)
         with self._results(planned, scratch) as out:
-            tally = make_film(footage, films, out / FILM, ordered, Console(quiet=True))
+            make = partial(make_film, footage, films, out / FILM, ordered, Console(quiet=True))
+            begun = parts_folder(out / FILM)
+            was_begun = begun.exists()
+            try:
+                tally = make()
+            except StereoweaveError as error:
+                self._check_disk(error)
+                if not was_begun or any(isinstance(cause, ProviderError) for cause in _causes(error)):
+                    raise
+                # A killed worker's parts, of other files or damaged.
+                shutil.rmtree(begun, ignore_errors=True)
+                tally = make()
         width, height = footage.size_px
         return {"width_px": width, "height_px": height, "checks": tally.named, "files": _names(out)}
 
@@ -212,8 +245,7 @@ class Worker:
         """A folder to make the results in, which are then in the destination."""
         if self.destination.folder is not None:
             folder = self.destination.folder / planned.name
-            for leftover in filter(is_leftover, folder.glob(".*")):
-                leftover.unlink(missing_ok=True)
+            remove_left_behind(folder)
             yield folder
             return
         folder = scratch / "results"
@@ -229,8 +261,7 @@ class Worker:
 
     def _check_disk(self, error: Exception) -> None:
         """Raises where a disk is full or gone: so it would be with the pairs to come."""
-        cause = error if isinstance(error, OSError) else error.__cause__
-        if isinstance(cause, OSError) and cause.errno in _FULL_OR_GONE:
+        if any(isinstance(cause, OSError) and cause.errno in _FULL_OR_GONE for cause in _causes(error)):
             raise _StoreError(f"{self.destination.place}: {' '.join(str(error).split())}") from error
 
     def _order(self) -> DepthOrder:
@@ -273,14 +304,23 @@ class _Apart:
 
     def begin(self) -> None:
         """Waits for the process, if there is none."""
+        false_starts = 0
         while self._pool is None:
             threads = self._worker.order.threads or 1
             pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), begin_work, (threads,))
             try:
                 pool.submit(_warm, self._worker).result()
                 self._pool = pool
-            except BrokenProcessPool:
-                pool.shutdown()
+            except BrokenProcessPool as error:
+                false_starts += 1
+                if false_starts == _MOST_FALSE_STARTS:
+                    raise StereoweaveError(
+                        f"{platform.node()}: expected a process that loads the network, found it killed "
+                        f"{false_starts} times in a row; is the memory full?"
+                    ) from error
+            finally:
+                if self._pool is None:
+                    pool.shutdown()
 
     def row(self, planned: Planned) -> Row | None:
         """The row; None where the process was killed."""
@@ -316,6 +356,31 @@ def _carried(name: str, content: bytes) -> Path:
 @functools.cache
 def _scratch() -> "tempfile.TemporaryDirectory[str]":
     return tempfile.TemporaryDirectory(prefix="stereoweave-")
+
+
+def remove_left_behind(folder: Path) -> None:
+    """Removes what killed workers have left half-written in a folder, a while ago."""
+    for path in folder.glob(".*"):
+        with suppress(FileNotFoundError):
+            if time.time() - path.stat().st_mtime < _LEFT_BEHIND_S:
+                continue
+            if path.name.startswith(".stereoweave-"):
+                shutil.rmtree(path, ignore_errors=True)
+            elif is_leftover(path):
+                path.unlink()
+
+
+def _check_runs(matcher: Matcher) -> None:
+    """Raises where a provider fails with the smallest pair as well: then the last one was not too large."""
+    plain = np.zeros((SMALLEST_SIDE_PX, SMALLEST_SIDE_PX, 3), np.uint8)
+    matcher.estimate(plain, plain)
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """An error, what it came of, and so on."""
+    while error is not None:
+        yield error
+        error = error.__cause__
 
 
 def _names(folder: Path) -> list[str]:

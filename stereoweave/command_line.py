@@ -1,6 +1,7 @@
 """What the commands share: words of the command line, and what they do before they work."""
 
 import math
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -81,6 +82,13 @@ Provider = Annotated[
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+Host = Annotated[
+    str,
+    typer.Option(
+        help="The address to serve. 127.0.0.1 is this computer alone; 0.0.0.0 is everyone in its networks."
+    ),
+]
+Port = Annotated[int, typer.Option(min=0, max=65535, help="0 takes any that is free.")]
 
 
 def request_of(
@@ -147,6 +155,23 @@ def place_for(*files: Path) -> Path:
     from stereoweave import io
 
     return io.place_for(*files)
+
+
+def listening(host: str, port: int) -> socket.socket:
+    """A socket that listens there; an error in one line where that cannot be."""
+    try:
+        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        return socket.create_server(address[:2], family=family)
+    except OSError as error:
+        raise StereoweaveError(
+            f"--host {host} --port {port}: expected an address that is free, found {str(error).lower()}; "
+            "--port 0 takes any port that is free"
+        ) from error
+
+
+def url_at(host: str, port: int) -> str:
+    """The URL of what listens there."""
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}"
 
 
 @contextmanager

@@ -29,6 +29,8 @@ _QUESTION = "/ray.rpc.NodeInfoGcsService/GetClusterId"
 # Tasks and results alone pass through it.
 _OBJECT_STORE_BYTES = 200_000_000
 _LOOKED_AT_EVERY_S, _BACK_WITHIN_S = 2, 10
+# Ray counts cores and GPUs in such parts.
+_LEAST_SHARE = 0.0001
 # Workers that end while they start, one after another: more are no accident.
 _MOST_FALSE_STARTS = 20
 # No statistics of use to Ray's makers, no warning of what Ray will change, no lines from its C++ parts.
@@ -61,10 +63,11 @@ class Engine:
     def __post_init__(self) -> None:
         if self.workers is not None and self.workers < 1:
             raise StereoweaveError(f"--workers: expected 1 or more, found {self.workers}")
-        if not 0 < self.cpus_each < math.inf:
-            raise StereoweaveError(f"--cpus-each: expected more than 0, found {self.cpus_each}")
-        if not 0 <= self.gpus_each < math.inf:
-            raise StereoweaveError(f"--gpus-each: expected 0 or more, found {self.gpus_each}")
+        if not _LEAST_SHARE <= self.cpus_each < math.inf:
+            raise StereoweaveError(f"--cpus-each: expected {_LEAST_SHARE} or more, found {self.cpus_each}")
+        gpus = self.gpus_each
+        if gpus and not (_LEAST_SHARE <= gpus < 1 or (1 <= gpus < math.inf and gpus % 1 == 0)):
+            raise StereoweaveError(f"--gpus-each: expected 0, a part of 1 or a whole number, found {gpus}")
 
     @property
     def threads_each(self) -> int:
@@ -88,6 +91,8 @@ def connect(engine: Engine) -> Iterator[None]:
             _check_answers(address)  # before Ray is loaded, and reads whether there is a token to show
         with _without_words():
             import ray
+    # It would tell of killed workers on the standard output, in the midst of ours.
+    ray._private.worker._worker_logs_enabled = False
     if already:
         yield
         return
@@ -134,13 +139,21 @@ def _run(
     make_worker: Callable[[], Callable[[Task], Result]], tasks: dict[int, Task], engine: Engine
 ) -> Iterator[tuple[int, Result]]:
     """Number and result of each task, until all are done or a machine is lost."""
+    from ray.exceptions import RayError
+
     batches = _dataset(make_worker, tasks, engine).iter_batches(batch_size=None, prefetch_batches=0)
-    for batch in batches:
-        for index, content in zip(batch[_INDEX], batch[_CONTENT], strict=True):
-            result, error = pickle.loads(content)
-            if error:
-                raise error
-            yield int(index), result
+    try:
+        for batch in batches:
+            for index, content in zip(batch[_INDEX], batch[_CONTENT], strict=True):
+                result, error = pickle.loads(content)
+                if error:
+                    raise error
+                yield int(index), result
+    except RayError as error:
+        raise StereoweaveError(
+            f"{engine.address or 'Ray'}: expected workers that begin, found {_last_line(error)}; "
+            "see that all machines have the same Stereoweave, Ray and Python"
+        ) from error
 
 
 def _dataset(
@@ -174,6 +187,8 @@ def _context(engine: Engine) -> "DataContext":
     context.enable_auto_log_stats = False
     context.print_on_execution_start = False
     context.max_consecutive_actor_init_deaths = _MOST_FALSE_STARTS
+    # A film, or a task of many pairs, may take longer than the half hour after which Ray Data gives up.
+    context.execution_no_progress_timeout_s = -1
     watch: Any = partial(_Watch, engine)  # called as a class
     context.custom_execution_callback_classes = [watch]
     return context
@@ -279,7 +294,9 @@ def _check_answers(address: str) -> None:
         return
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not (host and port.isdigit() and 0 < int(port) < 65536):
-        raise StereoweaveError(f"--address: expected host:port, ray://host:port or auto, found {address!r}")
+        raise StereoweaveError(
+            f"a cluster's address: expected host:port, ray://host:port, auto or local, found {address!r}"
+        )
     try:
         socket.create_connection((host, int(port)), _ANSWERS_WITHIN_S).close()
         if os.environ.get("RAY_USE_TLS") != "1":
@@ -328,6 +345,11 @@ def _without_words() -> Iterator[None]:
 def _first_line(error: Exception) -> str:
     text = str(error) or type(error).__name__
     return text.splitlines()[0].rstrip(".;")
+
+
+def _last_line(error: Exception) -> str:
+    """Where Ray says what it came of."""
+    return str(error).strip().splitlines()[-1].rstrip(".;")
 
 
 class _Worker:

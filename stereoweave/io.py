@@ -27,6 +27,11 @@ _KINDS = {
 }
 # The names that `replacing` gives while it writes.
 _TEMPORARY = re.compile(r"\..*-[0-9a-f]{8}(\.\w+)?")
+# What libraries say of a damaged file: an OverflowError of an infinite size, Pillow's AVIF a RuntimeError.
+_UNREADABLE = (
+    *(OSError, ValueError, OverflowError, SyntaxError, RuntimeError),
+    Image.DecompressionBombError,
+)
 _PFM_HEADER = re.compile(rb"Pf\s+(\d+)\s+(\d+)\s+(\S+)\s")
 
 
@@ -232,8 +237,7 @@ def reading(path: str | Path, expected: str) -> Iterator[None]:
             yield
     except FormatError:
         raise
-    # A RuntimeError is what Pillow's AVIF gives up with.
-    except (OSError, ValueError, SyntaxError, RuntimeError, Image.DecompressionBombError) as error:
+    except _UNREADABLE as error:
         raise FormatError(f"{path}: expected {expected}, found {_reason(error)}") from error
 
 

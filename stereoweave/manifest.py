@@ -153,7 +153,6 @@ def _all_planned(
 ) -> Iterator[Planned]:
     for listed, is_film in [(pairs, False), (films, True)]:
         for name, files, calibration in listed:
-            name = f"{name}_" if name.casefold() in (MANIFEST, PLAN) else name
             every = (*files, calibration) if calibration else files
             found = tuple(versions.get(path, "") for path in every)  # one of a pair may be missing
             yield Planned(name, files, found, calibration, is_film)
@@ -224,5 +223,10 @@ def _write(destination: Store, path: str, rows: Sequence[dict[str, Any]], schema
     from pyarrow import parquet
 
     content = io.BytesIO()
-    parquet.write_table(pyarrow.Table.from_pylist(rows, schema=schema), content)
+    try:
+        parquet.write_table(pyarrow.Table.from_pylist(rows, schema=schema), content)
+    except UnicodeEncodeError as error:
+        raise StereoweaveError(
+            f"{destination.place}: expected files with names in UTF-8, found {error.object!r}; rename it"
+        ) from error
     destination.write_bytes(path, content.getvalue())

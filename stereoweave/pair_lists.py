@@ -36,8 +36,10 @@ _MARK = re.compile(
     r"|^[lLrR](?=$|[ _.-])|(?<![A-Za-z])[lLrR]$|^im[01]$"
 )
 _NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*\x00-\x1f]')
-# Windows' names of devices, and the files of the batch itself.
-_TAKEN = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?|batch\.json|summary\.csv", re.IGNORECASE)
+# Windows' names of devices, and the files and folders of the batches themselves.
+_TAKEN = re.compile(
+    r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?|batch\.json|summary\.csv|manifest|plan|begun", re.IGNORECASE
+)
 
 
 @dataclass(frozen=True)

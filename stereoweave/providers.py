@@ -63,7 +63,8 @@ def _tensorrt_options(threads: int) -> dict[str, str]:
     return {
         f"trt_{kind}_cache_{key}": value
         for kind in ("engine", "timing")
-        for key, value in (("enable", "1"), ("path", str(folder)))
+        # In Python's words: a 1, which CUDA's options may have, TensorRT's refuse.
+        for key, value in (("enable", "True"), ("path", str(folder)))
     }
 
 

@@ -179,7 +179,7 @@ def order_facts(order: DepthOrder) -> dict[str, Any]:
     del facts["threads"], facts["provider"]
     facts |= facts.pop("request")
     for name in ("model", "calibration"):
-        if facts[name] and (name == "calibration" or Path(facts[name]).is_file()):
+        if facts[name] and (name == "calibration" or facts[name].endswith(".onnx")):
             with reading(facts[name], f"a {name}"):
                 content = Path(facts[name]).read_bytes()
             facts[name] = f"{Path(facts[name]).name} {hashlib.sha256(content).hexdigest()[:12]}"

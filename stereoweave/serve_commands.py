@@ -7,17 +7,10 @@ from typing import Annotated
 
 import typer
 
-from stereoweave.command_line import Model, Provider, Threads
+from stereoweave.command_line import Host, Model, Port, Provider, Threads, listening, url_at
 from stereoweave.errors import StereoweaveError, needing_extra
 from stereoweave.threads import usable_cores
 
-Host = Annotated[
-    str,
-    typer.Option(
-        help="The address to serve. 127.0.0.1 is this computer alone; 0.0.0.0 is everyone in its networks."
-    ),
-]
-Port = Annotated[int, typer.Option(min=0, max=65535, help="0 takes any that is free.")]
 Replicas = Annotated[int, typer.Option(min=1, help="Processes, each with a network of its own.")]
 Address = Annotated[
     str | None,
@@ -77,10 +70,15 @@ def serve(  # noqa: PLR0913 - each is a word of the command line
         batch=batch or (8 if provider in GPU_PROVIDERS else 1),
         limits=limits,
     )
-    with serving(settings, host, port, address) as url:
+    with listening(host, port) as listener:
+        port = listener.getsockname()[1]
+    with serving(settings, host, port, address):
         stopped = threading.Event()
         # Here, because Ray brings handlers of its own.
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stopped.set())
+        url = url_at(host, port)
         typer.echo(f"Stereoweave: {url}, described by {url}/openapi.json; Ctrl-C ends it")
-        stopped.wait()
+        # Again and again: a signal that another thread receives is handled when this one is awake.
+        while not stopped.wait(timeout=1):
+            pass

@@ -9,10 +9,9 @@ import logging
 import math
 import os
 import re
-import socket
 import urllib.request
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -25,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from ray import serve
 from ray.serve.schema import LoggingConfig
 
-from stereoweave.engine import Engine, connect
+from stereoweave.engine import Engine, connect, room
 from stereoweave.errors import StereoweaveError
 from stereoweave.matcher import Matcher
 from stereoweave.service_http import Guard, Limits, make_app
@@ -70,6 +69,11 @@ class Settings(BaseModel):
     batch: Annotated[int, Field(ge=1)] = 1
     limits: Limits = Limits()
 
+    @property
+    def gpus_each(self) -> int:
+        """The GPUs that each replica has to itself."""
+        return 1 if self.provider in GPU_PROVIDERS else 0
+
 
 @serve.ingress()
 class Replica:
@@ -112,11 +116,10 @@ class Replica:
 
 def application(settings: Settings) -> serve.Application:
     """The service for `serve.run`, or for a Serve config file as stereoweave.service:application."""
-    on_gpu = settings.provider in GPU_PROVIDERS
     deployed = serve.deployment(
         name=NAME,
         num_replicas=settings.replicas,
-        ray_actor_options={"num_cpus": settings.threads, "num_gpus": 1 if on_gpu else 0},
+        ray_actor_options={"num_cpus": settings.threads, "num_gpus": settings.gpus_each},
         max_ongoing_requests=settings.limits.waiting + _MOST_AT_DOOR,
         max_queued_requests=_MOST_AT_DOOR,
         graceful_shutdown_timeout_s=settings.limits.timeout_s,
@@ -166,33 +169,33 @@ class _Gathered(Collector):
 
 
 @contextmanager
-def serving(settings: Settings, host: str, port: int, address: str | None = None) -> Iterator[str]:
-    """The service, for as long as the block lasts, and its URL; what it accepted is done before it ends.
+def serving(settings: Settings, host: str, port: int, address: str | None = None) -> Iterator[None]:
+    """The service, for as long as the block lasts; what it accepted is done before it ends.
 
     Args:
         settings: What it is made of.
         host: The address to serve.
-        port: 0 takes any that is free.
+        port: One that is free.
         address: As for `Engine`; a cluster that serves nothing yet.
 
     Raises:
-        StereoweaveError: The port is taken, there are too few cores, or Ray or the network is not as it
-            should be.
+        StereoweaveError: There is no room for all replicas, or Ray or the network is not as it should be.
     """
     address = address or os.environ.get("RAY_ADDRESS")
-    port = _free_port(host, port)
+    engine = Engine(address, cpus_each=settings.threads, gpus_each=settings.gpus_each)
     if address is None:
-        _check_cores(settings)
+        _check_room(settings, usable_cores() // settings.threads)
         Matcher(settings.model, provider=settings.provider)  # its errors come before Ray takes seconds
     logging.getLogger("ray.serve").setLevel(logging.CRITICAL)
-    with connect(Engine(address=address)):
+    with connect(engine):
         _check_free(address)
+        _check_room(settings, _room(engine))
         serve.start(http_options={"host": host, "port": port}, logging_config=_QUIET)
         try:
             _run(settings)
-            yield f"http://{f'[{host}]' if ':' in host else host}:{port}"
+            yield
         finally:
-            serve.delete(NAME)
+            _end()
             if address:
                 serve.shutdown()  # type: ignore[no-untyped-call]
 
@@ -203,7 +206,7 @@ def _check_free(address: str | None) -> None:
     if others:
         raise StereoweaveError(
             f"{address}: expected a cluster that serves nothing yet, found {', '.join(others)}; "
-            "add stereoweave.service:application to its Serve config file"
+            "`serve shutdown` ends that, or add stereoweave.service:application to its Serve config file"
         )
 
 
@@ -212,29 +215,34 @@ def _run(settings: Settings) -> None:
     try:
         serve.run(application(settings), name=NAME, route_prefix="/")
     except RuntimeError as error:
+        told = "\n".join(each.message for each in serve.status().applications[NAME].deployments.values())
+        ours = re.findall(r"^stereoweave\.errors\.\w+: (.+)", told, re.MULTILINE)
         raise StereoweaveError(
-            f"expected a network that loads where the service runs, found {error}; is the model there too?"
+            f"expected a network that loads where the service runs, found {(ours or [error])[-1]}; "
+            "is the model there too?"
         ) from error
 
 
-def _check_cores(settings: Settings) -> None:
-    """An error where not all replicas would find room on this machine, and Ray would wait for it."""
-    needed, found = settings.replicas * settings.threads, usable_cores()
-    if needed > found:
+def _end() -> None:
+    """Ends the replicas, each when what it accepted is done."""
+    while NAME in serve.status().applications:
+        with suppress(TimeoutError):  # it waits for a minute, and a request may take longer
+            serve.delete(NAME)
+
+
+def _check_room(settings: Settings, found: int) -> None:
+    """An error where there is room for fewer replicas: Ray would wait for more, without a word."""
+    if settings.replicas > found:
+        gpu = " and a GPU" if settings.gpus_each else ""
         raise StereoweaveError(
-            f"--replicas {settings.replicas} --threads {settings.threads}: expected at most {found} cores "
-            f"together, found {needed}"
+            f"--replicas {settings.replicas} --threads {settings.threads}: expected at most {found}, for "
+            f"which there is room, found {settings.replicas}; each takes {settings.threads} cores{gpu}"
         )
 
 
-def _free_port(host: str, port: int) -> int:
-    """The port, or one that is free where it is 0; an error in one line where it is taken."""
+def _room(engine: Engine) -> int:
+    """How many replicas the machines have room for."""
     try:
-        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        with socket.create_server(address[:2], family=family) as listener:
-            return listener.getsockname()[1]
-    except OSError as error:
-        raise StereoweaveError(
-            f"--host {host} --port {port}: expected an address that is free, found {str(error).lower()}; "
-            "--port 0 takes any port that is free"
-        ) from error
+        return room(engine)
+    except StereoweaveError:  # there is none: it names options of another command
+        return 0

@@ -122,7 +122,7 @@ class ViewForm(PairForm):
         return super().said(calibration) | {"position": self.position, "strength": self.strength}
 
 
-def stored(form: PairForm, folder: Path, file: str) -> Order:
+def stored(form: PairForm, folder: Path, file: str, most_megapixels: float) -> Order:
     """The order of a form, whose files now lie in the folder, under names of ours."""
     uploads = form.uploads()
     for field, upload in uploads.items():
@@ -136,4 +136,10 @@ def stored(form: PairForm, folder: Path, file: str) -> Order:
         calibration = folder / "calib"
         calibration.write_bytes(content)
     pictures = tuple(folder / field for field in uploads)
-    return Order(folder=folder, pictures=pictures, file=file, **form.said(calibration))
+    return Order(
+        folder=folder,
+        pictures=pictures,
+        file=file,
+        most_megapixels=most_megapixels,
+        **form.said(calibration),
+    )

@@ -31,18 +31,29 @@ from stereoweave.service_requests import (
 _RETRY_AFTER_S = 1
 _LATENCIES_S = [0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 60]
 _PATHS = ("/disparity", "/depth", "/view")
+# As nginx has it: the client went away, and nobody was answered.
+_CLIENT_GONE = 499
 _DESCRIPTION = """Depth, and any view between the two cameras, of a rectified stereo pair: POST a form with
 the files `left` and `right`, or with one `picture` of both views. The header `X-Stereoweave-Report` of a
 response has numbers and notes in JSON; every error is `{"detail": "..."}`."""
+
+
+class Refusal(BaseModel):
+    """What is wrong with a request, in one line."""
+
+    detail: str
+
+
 _REFUSALS: dict[int | str, dict[str, Any]] = {
-    status: {"description": description}
+    status: {"model": Refusal, "description": description}
     for status, description in {
         400: "A picture or a calibration that cannot be read, or a form that is none.",
         408: "The request did not arrive in time.",
         413: "Too many bytes, or pixels.",
         415: "No multipart/form-data.",
         422: "A field that is unknown, missing, or says what cannot be.",
-        503: "As many requests wait as are accepted; the header Retry-After says when to come again.",
+        503: "As many requests wait as are accepted: the header Retry-After says when to come again. Or what "
+        "the network runs on failed.",
         504: "No answer in time.",
     }.items()
 }
@@ -125,7 +136,10 @@ def make_app(answering: Answering, limits: Limits, metrics: Callable[[], bytes])
 
 def _responses(*endings: str) -> dict[int | str, dict[str, Any]]:
     files = {MEDIA_TYPES[ending]: {"schema": {"type": "string", "format": "binary"}} for ending in endings}
-    return {200: {"content": files, "description": "The file."}, **_REFUSALS}
+    report = {
+        "X-Stereoweave-Report": {"description": "Numbers and notes, in JSON.", "schema": {"type": "string"}}
+    }
+    return {200: {"content": files, "description": "The file.", "headers": report}, **_REFUSALS}
 
 
 def _in_one_line(error: RequestValidationError) -> str:
@@ -135,11 +149,11 @@ def _in_one_line(error: RequestValidationError) -> str:
 
 
 async def _answered(form: PairForm, file: str, answering: Answering, limits: Limits) -> Response:
-    # A name is left over where a thread still wrote into it; the operating system clears those away.
+    # Where it is cancelled, a thread may still work in the folder.
     with TemporaryDirectory(prefix="stereoweave-", ignore_cleanup_errors=True) as name:
         try:
-            order = await asyncio.to_thread(stored, form, Path(name), file)
-            megapixels = await asyncio.to_thread(check_pixels, order, limits.megapixels)
+            order = await asyncio.to_thread(stored, form, Path(name), file, limits.megapixels)
+            megapixels = await asyncio.to_thread(check_pixels, order)
             answer = await answering(order, megapixels)
         except StereoweaveError as error:
             raise HTTPException(_status(error), told(error, Path(name))) from error
@@ -190,12 +204,15 @@ class Guard:
         # Not every path that a client may think of.
         path = scope["path"] if scope["path"] in _PATHS else "none"
         refusal = self._refusal(Headers(scope=scope))
-        if refusal is None:
-            await self._accept(scope, exchange)
-            self._seconds.observe(time.perf_counter() - start_s, tags={"path": path})
-        else:
-            await refusal(scope, receive, exchange.send)
-        self._requests.inc(tags={"path": path, "status": str(exchange.status)})
+        try:
+            if refusal is None:
+                await self._accept(scope, exchange)
+                self._seconds.observe(time.perf_counter() - start_s, tags={"path": path})
+            else:
+                await refusal(scope, receive, exchange.send)
+        finally:
+            status = str(exchange.status or _CLIENT_GONE)
+            self._requests.inc(tags={"path": path, "status": status})
 
     def _refusal(self, headers: Headers) -> Response | None:
         """The response to a request of which the head says that it is not accepted."""

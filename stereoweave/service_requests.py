@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from stereoweave.clouds import needed_camera
@@ -44,7 +45,7 @@ class Order:
     """What a request wants.
 
     Attributes:
-        folder: Its own, where its pictures are and its file is written.
+        folder: Its own, where its pictures are.
         pictures: Two, left first, or one that holds both views.
         file: What it gets: a disparity or a depth in `results.FILES`, or a view, such as view.png.
         request: What is said of the pictures.
@@ -53,6 +54,7 @@ class Order:
         position: Where a view is seen from.
         strength: As for `rendering.Renderer`.
         checked: Whether the notes say what is amiss with the pair, which takes half as long again.
+        most_megapixels: Of a view.
     """
 
     folder: Path
@@ -64,6 +66,7 @@ class Order:
     position: float = 0.5
     strength: float = 1.0
     checked: bool = False
+    most_megapixels: float = MOST_MEGAPIXELS
 
     def __post_init__(self) -> None:
         if self.is_view:
@@ -83,24 +86,30 @@ class Answer:
     report: str
 
 
-def check_pixels(order: Order, most_megapixels: float) -> float:
+def check_pixels(order: Order) -> float:
     """The megapixels of the order's pictures, as their heads say, before memory is spent on any.
 
     Raises:
-        TooLargeError: A view of more than `most_megapixels`.
+        TooLargeError: More than the order's views may have.
         FormatError: No picture, or none of a kind that is read.
     """
     views = 3 - len(order.pictures)
     megapixels = 0.0
     for path in order.pictures:
         with opening(path, views=views) as picture:
-            width_px, height_px = picture.size
-        if width_px * height_px > views * most_megapixels * 1e6:
-            raise TooLargeError(
-                f"{path}: expected at most {views * most_megapixels:g} megapixels, "
-                f"found {width_px}x{height_px}; scale it down"
-            )
-        megapixels += width_px * height_px / 1e6
+            size_px = picture.size
+        megapixels += _checked_megapixels(path, size_px, views * order.most_megapixels)
+    return megapixels
+
+
+def _checked_megapixels(path: Path, size_px: tuple[int, ...], most_megapixels: float) -> float:
+    width_px, height_px = size_px
+    megapixels = width_px * height_px / 1e6
+    if megapixels > most_megapixels:
+        raise TooLargeError(
+            f"{path}: expected at most {most_megapixels:g} megapixels, "
+            f"found {width_px}x{height_px}; scale it down"
+        )
     return megapixels
 
 
@@ -125,6 +134,7 @@ def answer_many(matcher: Matcher, orders: Sequence[Order]) -> list[Answer | Exce
 def told(error: Exception, folder: Path) -> str:
     """An error in one line and in the words of a request: no path of this machine, fields for options."""
     text = str(error).replace(f"{folder}/", "")
+    text = re.sub(r"(?<![^\s'\"(])/(?:[^\s/]+/)+", "", text)  # where a network is
     text = re.sub(r"--([a-z][a-z-]+)", lambda option: option[1].replace("-", "_"), text)
     return " ".join(text.split())
 
@@ -139,6 +149,8 @@ def _attempt(work: Callable[..., Any], *given: Any, **options: Any) -> Any:
 
 def _prepared(order: Order) -> Prepared:
     prepared = prepare(order.pictures, order.request)
+    # Again: half views, and the further pictures of an MPO file, are larger than its head says.
+    _checked_megapixels(order.pictures[0], prepared.pair.left.shape[1::-1], order.most_megapixels)
     if needs_camera(order.file):
         needed_camera(prepared.pair)
     return replace(prepared, pair=cropped(prepared.pair)) if order.is_view else prepared
@@ -165,14 +177,16 @@ def _answered(matcher: Matcher, order: Order, prepared: Prepared, found: tuple[E
     names = tuple(picture.name for picture in order.pictures)
     summary = summarize(pair, estimate, pictures=names, model=matcher.name, estimate_ms=estimate_ms)
     result = Result(pair=pair, estimate=estimate, summary=summary, threads=matcher.threads)
-    path = order.folder / order.file
-    if order.is_view:
-        renderer = Renderer(pair, estimate, strength=order.strength, threads=matcher.threads)
-        write_image(path, renderer.view(order.position).image)
-    else:
-        _write_map(path, result)
     notes = [*prepared.notes, *(hints(pair, estimate) if order.checked else ())]
-    return Answer(content=path.read_bytes(), report=_report(summary, notes, order.folder))
+    # Not beside its pictures: where the client went away their folder is removed, and would be made again.
+    with TemporaryDirectory(prefix="stereoweave-") as folder:
+        path = Path(folder, order.file)
+        if order.is_view:
+            renderer = Renderer(pair, estimate, strength=order.strength, threads=matcher.threads)
+            write_image(path, renderer.view(order.position).image)
+        else:
+            _write_map(path, result)
+        return Answer(content=path.read_bytes(), report=_report(summary, notes, order.folder))
 
 
 def _write_map(path: Path, result: Result) -> None:

@@ -183,8 +183,7 @@ class DiskStore:
             entries = _entries(self.folder / within)
             paths = [f"{within}/{entry.name}" if within else entry.name for entry in entries]
             for entry, path in zip(entries, paths, strict=True):
-                if entry.is_file():
-                    status = entry.stat()
+                if status := _status(entry):
                     yield StoredFile(path, status.st_size, str(status.st_mtime_ns))
             folders = zip(entries, paths, strict=True)
             # Not through links, which may lead back here.
@@ -329,6 +328,13 @@ def _entries(folder: Path) -> list[os.DirEntry[str]]:
     with suppress(FileNotFoundError, PermissionError), os.scandir(folder) as entries:
         return sorted((entry for entry in entries if entry.name[0] != "."), key=lambda entry: entry.name)
     return []
+
+
+def _status(entry: os.DirEntry[str]) -> os.stat_result | None:
+    """Size and time of a file; None of anything else, and of one that has just been removed."""
+    with suppress(FileNotFoundError):
+        return entry.stat() if entry.is_file() else None
+    return None
 
 
 def _listed_in_s3(library: "AsyncFileSystem", folder: str) -> Iterator[StoredFile]:

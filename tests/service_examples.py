@@ -216,6 +216,7 @@ def _wrong_calibrations() -> dict[str, Sender]:
         "YAML that runs": b"!!python/object/apply:os.system ['true']",
         "of a negative focal length": CALIB.replace(b"600", b"-600"),
         "of NaN": CALIB.replace(b"600", b"nan"),
+        "of an infinite size": CALIB.replace(b"640", b"inf"),
         "of other pictures": CALIB.replace(b"640", b"1280"),
         "too long": CALIB + b"\n# " + bytes(300_000),
         "deeply nested": b"[" * 5_000,

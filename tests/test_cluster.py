@@ -2,25 +2,30 @@
 
 import json
 import os
+import platform
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import fsspec
+import numpy as np
 import pyarrow.dataset
 import pytest
 from conftest import processes_of
+from film_examples import example_pairs, packets, write_side_by_side
 
 from stereoweave import cluster_worker
 from stereoweave.cli import main
-from stereoweave.cluster import run_cluster
-from stereoweave.cluster_worker import Worker
+from stereoweave.cluster import _carried, _ready, run_cluster
+from stereoweave.cluster_worker import FILM, Worker, remove_left_behind
 from stereoweave.engine import Engine, connect
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import MatcherError, ProviderError, StereoweaveError
+from stereoweave.film import parts_folder
 from stereoweave.io import read_image, read_pfm, write_image
-from stereoweave.manifest import extend_plan, read_rows
+from stereoweave.manifest import extend_plan, read_chunk, read_rows
 from stereoweave.matcher import Matcher
 from stereoweave.results import DepthOrder, make_depth
 from stereoweave.stores import store_at
@@ -177,6 +182,139 @@ def test_a_pair_that_kills_its_process_becomes_a_row_and_costs_no_other(tmp_path
         None,
     ]
     assert not out.exists(f"begun/{first:08d}.json")
+
+
+class Stillborn(Worker):
+    """A worker of which every further process is killed while it starts."""
+
+    def _order(self):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Overtaxed(Worker):
+    """A worker whose provider has no memory for the pair 01."""
+
+    def _pair(self, planned, *more):
+        if planned.name == "01":
+            raise ProviderError("provider cpu: expected to run small.onnx, found that it failed: alloc")
+        return super()._pair(planned, *more)
+
+
+@pytest.fixture
+def places(tmp_path, monkeypatch):
+    """Source and destination of a chunk of three pairs, and its number."""
+    monkeypatch.setattr("stereoweave.manifest._CHUNKS_OF_A_WORKER", 1)
+    source, out = store_at(write_pairs(tmp_path / "pairs", numbered(3))), store_at(tmp_path / "out")
+    [chunk] = extend_plan(source, out, workers=1).chunks
+    return source, out, chunk
+
+
+def test_rows_that_a_killed_worker_noted_count_while_their_results_are_there(places):
+    source, out, chunk = places
+    worker = Worker(source, out, ORDER)
+    planned = read_chunk(out, chunk)
+    rows = [worker._empty_row(one) | {"checks": ["noted"]} for one in planned[:2]]
+    rows[0]["files"] = ["disparity.pfm"]  # which is not there
+    mark = f"begun/{chunk:08d}.json"
+    out.write_bytes(mark, json.dumps({"rows": rows}).encode())
+    assert worker([chunk]).made == 3
+    assert [row["checks"] == ["noted"] for row in read_rows(out, chunk).values()] == [False, True, False]
+    out.write_bytes(mark, b"")  # lost with a machine's power
+    assert worker._notes(mark) == {}
+    out.remove(mark)  # by another run, which has just made the chunk
+    assert worker._notes(mark) == {}
+
+
+def test_processes_that_are_killed_while_they_start_end_the_run(places, monkeypatch):
+    monkeypatch.setattr(cluster_worker, "_MOST_FALSE_STARTS", 2)
+    source, out, chunk = places
+    out.write_bytes(f"begun/{chunk:08d}.json", b"{}")
+    with pytest.raises(
+        StereoweaveError, match="loads the network, found it killed 2 times in a row; is the mem"
+    ):
+        Stillborn(source, out, ORDER)([chunk])
+
+
+def test_a_pair_that_is_too_much_for_the_provider_is_a_row_and_one_that_fails_always_ends_the_run(
+    places, monkeypatch
+):
+    source, out, chunk = places
+    with monkeypatch.context() as patch:
+        patch.setattr(Matcher, "estimate", fails)
+        with pytest.raises(ProviderError, match=r"^provider cpu: .* it failed: lost$"):
+            Overtaxed(source, out, ORDER)([chunk])
+    assert read_rows(out, chunk) == {}
+    out.remove(f"begun/{chunk:08d}.json")
+    counts = Overtaxed(source, out, ORDER)([chunk])
+    assert (counts.made, counts.failed) == (2, 1)
+    assert read_rows(out, chunk)["01"]["error"].endswith("found that it failed: alloc")
+    counts = Worker(source, out, ORDER)([chunk])
+    assert (counts.made, counts.there) == (1, 2)
+
+
+def fails(*_: object) -> None:
+    raise ProviderError("provider cpu: expected to run small.onnx, found that it failed: lost")
+
+
+def test_a_provider_that_a_workers_machine_has_not_ends_the_run_and_is_no_row(places):
+    source, out, chunk = places
+    with pytest.raises(MatcherError, match="provider directml: expected an ONNX Runtime that has it"):
+        Worker(source, out, replace(ORDER, provider="directml"))([chunk])
+    assert read_rows(out, chunk) == {}
+
+
+def test_a_machine_that_does_not_see_a_folder_is_named(places, tmp_path):
+    source, out, _ = places
+    worker = Worker(source, out, ORDER)
+    assert _ready(worker) is worker
+    for places_there in ((store_at(tmp_path / "none"), out), (source, store_at(tmp_path / "none"))):
+        with pytest.raises(
+            StereoweaveError, match="none: expected a folder, found no such folder; all"
+        ) as told:
+            _ready(Worker(*places_there, ORDER))
+        assert str(told.value).startswith(f"{platform.node()}: ")
+
+
+def test_a_film_goes_on_without_the_parts_of_another(tmp_path):
+    (tmp_path / "films").mkdir()
+    write_side_by_side(tmp_path / "films" / "sea.mkv", example_pairs(3))
+    source, out = store_at(tmp_path / "films"), store_at(tmp_path / "out")
+    parts = parts_folder(tmp_path / "out" / "sea.mkv" / FILM)
+    parts.mkdir(parents=True)
+    (parts / "000001.nut").touch()
+    np.savez(parts / "state-000001.npz")
+    (parts / "settings.json").write_text("{}")
+    [chunk] = extend_plan(source, out, workers=1).chunks
+    assert Worker(source, out, ORDER)([chunk]).made == 1
+    [row] = read_rows(out, chunk).values()
+    assert (row["files"], row["error"], row["width_px"]) == ([FILM], None, 160)
+    assert len(packets(tmp_path / "out" / "sea.mkv" / FILM, "video")) == 3
+    assert not parts.exists()
+
+
+def test_what_killed_workers_left_is_removed_after_a_while(tmp_path):
+    for age_s in (0, 3600):
+        for name in (f".stereoweave-{age_s:08d}", f".part-{age_s:08d}.parquet", f".mine-{age_s}"):
+            path = tmp_path / name
+            path.mkdir() if "weave" in name else path.touch()
+            os.utime(path, (time.time() - age_s,) * 2)
+    remove_left_behind(tmp_path)
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {".stereoweave-00000000", ".part-00000000.parquet", ".mine-0", ".mine-3600"}
+
+
+def test_a_file_beside_that_is_called_like_a_network_is_none(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("small").write_bytes(b"something else")
+    assert list(_carried(DepthOrder())) == []
+
+
+def test_a_name_that_is_no_text_is_told(tmp_path):
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+        Path(os.fsdecode(os.fsencode(tmp_path / side) + b"/\xff.png")).touch()
+    with pytest.raises(StereoweaveError, match=r"names in UTF-8, found '.*\\udcff.*'; rename it"):
+        extend_plan(store_at(tmp_path), store_at(tmp_path / "out"), workers=1)
 
 
 def test_another_runs_destination_is_refused_and_so_is_a_source_with_nothing_in_it(engine, tmp_path):

@@ -1,8 +1,12 @@
+import shutil
+from pathlib import Path
+
 import onnx
 import pytest
 
 from stereoweave import cli
 from stereoweave.learn import halve, matcher_files, quantise
+from stereoweave.matcher import model_file
 
 
 def test_variants_are_made_of_a_shipped_network(tmp_path, monkeypatch, capsys):
@@ -56,3 +60,12 @@ def test_8_bits_are_asked_for_in_the_same_way(tmp_path, monkeypatch):
     assert line.endswith("small8.onnx: 8 bits change the mean error by -0.250 px")
     assert [out for _, out in taken] == [tmp_path / "small8.onnx"]
     assert quantise.LARGEST_LOSS_PX > 0
+
+
+@pytest.mark.parametrize("option", ["-o", "--half", "--eight-bits"])
+def test_nothing_takes_the_place_of_the_file_that_it_is_made_from(tmp_path, monkeypatch, capsys, option):
+    monkeypatch.chdir(tmp_path)
+    shutil.copyfile(model_file("small"), "mine.onnx")
+    assert cli.main(["export", "mine.onnx", option, str(tmp_path / "mine.onnx")]) == 2
+    assert "mine.onnx: expected another file than the one to make it from" in capsys.readouterr().err
+    assert Path("mine.onnx").read_bytes() == model_file("small").read_bytes()

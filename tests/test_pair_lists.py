@@ -209,11 +209,24 @@ def test_unequal_counts_are_refused_with_both(tmp_path):
         ("a.png b.png CON", "CON_", ("a.png", "b.png")),
         ("a.png b.png nul.png", "nul.png_", ("a.png", "b.png")),
         ("a.png b.png summary.csv", "summary.csv_", ("a.png", "b.png")),
+        ("a.png b.png Plan", "Plan_", ("a.png", "b.png")),
     ],
 )
 def test_a_line_of_a_list_is_a_pair(tmp_path, line, name, pictures):
     (tmp_path / "list.txt").write_text(f"# left right\n\n{line}\n", encoding="utf-8-sig")
     assert listed(tmp_path, pairs_in_list(tmp_path / "list.txt")) == {name: pictures}
+
+
+def test_a_pair_named_like_a_folder_of_a_batch_is_renamed_and_may_not_take_another_s_name(tmp_path):
+    folder = put(
+        tmp_path, *(f"{name}/{side}.png" for name in ("begun", "manifest") for side in ("left", "right"))
+    )
+    assert [job.name for job in pairs_in(folder).jobs] == ["begun_", "manifest_"]
+    put(tmp_path, "manifest_/left.png", "manifest_/right.png")
+    with pytest.raises(
+        StereoweaveError, match="different names, found manifest_ for manifest.*and for manifest_"
+    ):
+        pairs_in(folder)
 
 
 def test_paths_of_a_list_are_relative_to_its_folder_and_those_elsewhere_keep_their_names_apart(tmp_path):

@@ -51,12 +51,13 @@ def test_float32_and_its_batches_are_pytorchs_to_rounding_and_16_bits_to_a_fifti
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
-    """The small network in PyTorch, and the variants of its file, proved on one pair each."""
+    """The small network in PyTorch, and the variants of its file, proved on one pair each; 8 bits of two."""
     file = model_file("small")
     kept = checkpoint.load(ROOT / "checkpoints/small.pt")
     with pytest.MonkeyPatch.context() as patch:
         for module in (halve, quantise):
             patch.setattr(module, "_PROOF_PAIRS", 1)
+        patch.setattr(quantise, "_RANGES_PAIRS", 2)
         made = parity.variants(file, tmp_path_factory.mktemp("variants"))
     return parity.as_shipped(matcher_network(kept), file), made
 

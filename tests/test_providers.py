@@ -162,9 +162,9 @@ def test_tensorrt_keeps_its_engines_in_the_users_cache_where_there_is_one(tmp_pa
     monkeypatch.setattr(compiling, "cache_folder", lambda: tmp_path / "kernels")
     folder = str(tmp_path / "tensorrt")
     assert PROVIDERS["tensorrt"].options(1) == {
-        "trt_engine_cache_enable": "1",
+        "trt_engine_cache_enable": "True",
         "trt_engine_cache_path": folder,
-        "trt_timing_cache_enable": "1",
+        "trt_timing_cache_enable": "True",
         "trt_timing_cache_path": folder,
     }
     assert Path(folder).is_dir()

@@ -49,6 +49,16 @@ def test_the_first_process_tells_an_error_at_once_and_the_others_wait_to_be_ende
     assert waited == [20, 20]
 
 
+def test_who_only_finds_that_another_process_is_gone_waits_too(started, monkeypatch):
+    waited = []
+    monkeypatch.setattr(time, "sleep", waited.append)
+    for rank, count in ((0, 1), (0, 2), (1, 2)):
+        started(rank, count, count)
+        with pytest.raises(RuntimeError, match="closed by peer"), told_once():
+            raise RuntimeError("connection closed by peer")
+    assert waited == [20, 20]
+
+
 def test_processes_of_a_machine_share_its_cores_unless_the_user_said_how(started, monkeypatch):
     monkeypatch.setattr(the_ranks, "usable_cores", lambda: 12)
     assert threads_each() is None

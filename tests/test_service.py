@@ -3,12 +3,13 @@ import io
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -22,9 +23,11 @@ from service_examples import BOTH, CALIB, EXAMPLES, malformed
 import stereoweave as sw
 from stereoweave.calibration_files import calibrated
 from stereoweave.cli import main
+from stereoweave.errors import ProviderError
 from stereoweave.io import read_disparity_png, read_image, read_pair, read_pfm, write_image
 from stereoweave.matcher import Matcher
-from stereoweave.service_requests import Answer, Order, answer_many
+from stereoweave.preparing import Request
+from stereoweave.service_requests import Answer, Order, TooLargeError, answer_many, check_pixels
 
 WAITING, MEGABYTES = 3, 4
 
@@ -33,16 +36,22 @@ pytestmark = pytest.mark.filterwarnings("ignore:Using extra keyword arguments on
 
 
 @pytest.fixture(scope="module")
-def service() -> Iterator[httpx.Client]:
+def service(tmp_path_factory) -> Iterator[httpx.Client]:
     """The command, in a process of its own, which has to end by itself, and all that it started with it."""
     limits = ["--waiting", WAITING, "--max-megabytes", MEGABYTES, "--max-megapixels", 1]
     words = ["--port", 0, "--batch", 2, *limits]
+    uploads = tmp_path_factory.mktemp("uploads")
     process = subprocess.Popen(
         [sys.executable, "-m", "stereoweave", "serve", *map(str, words)],
         stdout=subprocess.PIPE,
         text=True,
-        # Metrics each second, and not each ten.
-        env={**os.environ, "RAY_metrics_report_interval_ms": "1000"},
+        # Metrics each second, and not each ten. The names of the sockets of Ray may not be long.
+        env={
+            **os.environ,
+            "RAY_metrics_report_interval_ms": "1000",
+            "RAY_TMPDIR": "/tmp",
+            "TMPDIR": str(uploads),
+        },
     )
     try:
         with process.stdout:
@@ -56,6 +65,7 @@ def service() -> Iterator[httpx.Client]:
             process.send_signal(signal.SIGTERM)
             assert process.wait(30) == 0
             assert not [pid for pid in started if Path(f"/proc/{pid}").exists()]
+            assert not list(uploads.glob("stereoweave-*"))
     finally:
         process.kill()
         process.wait()
@@ -163,13 +173,22 @@ def test_its_description_names_every_path_and_field(service):
         said = description["paths"][f"/{what}"]["post"]
         schema = said["requestBody"]["content"]["multipart/form-data"]["schema"]
         assert schema == {"$ref": f"#/components/schemas/{form}"}
-        assert {"200", "400", "413", "422", "503", "504"} <= set(said["responses"])
+        responses = said["responses"]
+        assert set(responses) == {"200", "400", "408", "413", "415", "422", "503", "504"}
+        assert "X-Stereoweave-Report" in responses.pop("200")["headers"]
+        for refusal in responses.values():
+            assert refusal["content"]["application/json"]["schema"] == {
+                "$ref": "#/components/schemas/Refusal"
+            }
     fields = description["components"]["schemas"]["ViewForm"]["properties"]
     assert {"left", "right", "picture", "position", "file", "range", "calib"} <= set(fields)
 
 
 def test_its_metrics_count_requests_by_status(service):
     assert post(service, "/depth").status_code == 422  # no camera
+    with pytest.raises(httpx.ReadTimeout):  # the client goes away
+        service.post("/view", files=BOTH, timeout=httpx.Timeout(60, read=0.05))
+    expected = {("/depth", "422"), ("/view", "499"), ("/disparity", "200"), ("/disparity", "503")}
     deadline_s = time.monotonic() + 30
     while time.monotonic() < deadline_s:
         families = {
@@ -177,10 +196,10 @@ def test_its_metrics_count_requests_by_status(service):
         }
         counted = families.get("ray_stereoweave_requests")
         seen = {(s.labels["path"], s.labels["status"]) for s in counted.samples} if counted else set()
-        if {("/depth", "422"), ("/disparity", "200"), ("/disparity", "503")} <= seen:
+        if expected <= seen:
             break
         time.sleep(0.2)
-    assert {("/depth", "422"), ("/disparity", "200"), ("/disparity", "503")} <= seen
+    assert expected <= seen
     assert families["ray_stereoweave_request_seconds"].type == "histogram"
     batches = {s.labels.get("le"): s.value for s in families["ray_serve_actual_batch_size"].samples}
     assert batches["+Inf"] > batches["1.0"]  # some were of two
@@ -210,6 +229,33 @@ def test_those_that_are_matched_together_get_what_each_gets_alone(estimate, tmp_
     assert "range_px" in str(beyond)
 
 
+def test_nothing_is_left_of_a_request_whose_client_goes_away_while_it_is_matched(tmp_path):
+    folder = tmp_path / "pictures"
+
+    class MatcherAtThatMoment(Matcher):
+        def estimate_many(self, pairs: Sequence[sw.StereoPair]) -> list[sw.Estimate]:
+            shutil.rmtree(folder)
+            return super().estimate_many(pairs)
+
+    answer_many(MatcherAtThatMoment("small"), [order(folder)])
+    assert not folder.exists()
+
+
+def test_a_view_is_measured_again_where_the_head_of_its_file_does_not_say_its_size(photos, tmp_path):
+    write_image(tmp_path / "both.png", np.hstack(photos))
+    halves = Order(
+        folder=tmp_path,
+        pictures=(tmp_path / "both.png",),
+        file="disparity.npy",
+        request=Request(arrangement="side_by_side_half"),
+        most_megapixels=0.5,
+    )
+    assert check_pixels(halves) == 1280 * 480 / 1e6  # as two views of 640x480 px would have
+    (refusal,) = answer_many(Matcher("small"), [halves])
+    assert isinstance(refusal, TooLargeError)
+    assert "expected at most 0.5 megapixels, found 1280x480" in str(refusal)
+
+
 def ask_guarded(answering: Any, content: AsyncIterator[bytes] | bytes | None = None) -> httpx.Response:
     """The response of a guard that allows a fifth of a second."""
     from stereoweave.service_http import Guard, Limits, make_app
@@ -228,6 +274,19 @@ def ask_guarded(answering: Any, content: AsyncIterator[bytes] | bytes | None = N
 
 async def never(order: Order, megapixels: float) -> Answer:
     await asyncio.Event().wait()
+
+
+def test_a_provider_that_fails_is_no_fault_of_the_request():
+    async def fails(order: Order, megapixels: float) -> Answer:
+        raise ProviderError(
+            "provider cuda: expected to run /srv/net.onnx, found that it failed: out of memory"
+        )
+
+    response = ask_guarded(fails)
+    assert response.status_code == 503
+    assert response.json()["detail"] == (
+        "provider cuda: expected to run net.onnx, found that it failed: out of memory"
+    )
 
 
 def test_what_takes_too_long_is_cancelled():
@@ -269,4 +328,21 @@ def test_what_cannot_be_served_is_said_before_ray_starts(words, expected, capsys
     assert main(["serve", "--port", "0", *words]) == 2
     told = capsys.readouterr().err
     assert expected in told
+    assert told.count("\n") == 1
+
+
+def test_a_cluster_without_room_is_said_and_not_waited_for(ray_address, capsys):
+    assert main(["serve", "--port", "0", "--address", ray_address, "--threads", "3"]) == 2
+    told = capsys.readouterr().err
+    assert told == (
+        "stereoweave: --replicas 1 --threads 3: expected at most 0, for which there is room, found 1; "
+        "each takes 3 cores\n"
+    )
+
+
+def test_a_network_that_the_cluster_does_not_have_is_named(ray_address, capsys):
+    words = ["--address", ray_address, "--threads", "1", "--model", "none.onnx"]
+    assert main(["serve", "--port", "0", *words]) == 2
+    told = capsys.readouterr().err
+    assert "found none.onnx: expected an ONNX matcher, found no such file; is the model there too?" in told
     assert told.count("\n") == 1

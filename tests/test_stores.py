@@ -9,6 +9,7 @@ from urllib.request import Request, urlopen
 
 import pytest
 
+from stereoweave import stores
 from stereoweave.errors import StereoweaveError
 from stereoweave.stores import Store, store_at
 
@@ -147,6 +148,15 @@ def test_links_to_files_are_followed_and_links_to_folders_are_not(tmp_path):
     (tmp_path / "a" / "broken.png").symlink_to("none.png")
     (tmp_path / "a" / "again").symlink_to("..")
     assert [file[:2] for file in store_at(tmp_path).files()] == [("a/b.png", 3), ("a/c.png", 3)]
+
+
+def test_a_file_that_is_removed_while_it_is_listed_is_left_out(tmp_path):
+    (tmp_path / "a").write_bytes(b"1")
+    [entry] = stores._entries(tmp_path)
+    assert stores._status(entry).st_size == 1
+    [entry] = stores._entries(tmp_path)
+    (tmp_path / "a").unlink()
+    assert stores._status(entry) is None
 
 
 def test_a_path_needs_none_of_the_libraries_of_stores(tmp_path):

@@ -1,3 +1,4 @@
+import atexit
 import json
 import os
 import re
@@ -25,6 +26,7 @@ from learn_examples import (
     untrained,
 )
 from lightning_fabric.loggers.tensorboard import TensorBoardLogger
+from lightning_fabric.utilities.distributed import _destroy_dist_connection
 from rich.console import Console
 
 from stereoweave.errors import FormatError, StereoweaveError
@@ -175,6 +177,13 @@ def test_a_loss_that_is_not_finite_stops_and_names_the_pairs(folder, tmp_path):
         train(file, folder / "broken", QUIET)
     assert str(caught.value) == f"step 0: the loss is nan; its pairs are {names}"
     assert not (folder / "broken" / "last.pt").exists()
+
+
+def test_a_process_that_fails_does_not_wait_for_the_others_to_leave_their_gpus(tmp_path, monkeypatch):
+    left_out = []
+    monkeypatch.setattr(atexit, "unregister", left_out.append)
+    complaint(train, tmp_path / "none.toml", tmp_path / "run", QUIET)
+    assert left_out == [_destroy_dist_connection]
 
 
 def test_a_pair_that_cannot_be_trained_on_is_named_in_one_line(tmp_path):

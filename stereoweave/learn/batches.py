@@ -68,6 +68,22 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
         return self.mix.first(which) + int(order[place])
 
 
+class Told(Dataset[dict[str, torch.Tensor] | StereoweaveError]):
+    """The batches, or the error where one cannot be made.
+
+    Raised in the loader's process it would come with PyTorch's traceback for its words.
+    """
+
+    def __init__(self, batches: Batches) -> None:
+        self.batches = batches
+
+    def __getitem__(self, step: int) -> dict[str, torch.Tensor] | StereoweaveError:
+        try:
+            return self.batches[step]
+        except StereoweaveError as error:
+            return error
+
+
 def known(pairs: Source, index: int) -> Sample:
     """The sample of that index; StereoweaveError where nothing in it is known."""
     sample = pairs[index]

@@ -64,6 +64,7 @@ def write_matcher_files(
     with tempfile.TemporaryDirectory() as folder:
         if is_matcher(source):
             made = model_file(source)
+            _check_apart(made, files)
         else:
             made = Path(folder, "any_size.onnx")
             yield _exported(Path(source), made, pairs, reliability)
@@ -104,9 +105,13 @@ def _written(made: Path, files: MatcherFiles) -> Iterator[str]:
             yield f"{file}: for pairs of {files.size[0]}x{files.size[1]} alone"
 
 
+def _check_apart(source: Path, files: MatcherFiles) -> None:
+    for file in files.wanted:
+        if file.resolve() == source.resolve():
+            raise StereoweaveError(f"{file}: expected another file than the one to make it from")
+
+
 def _copy(source: Path, out: Path) -> None:
-    if source.resolve() == out.resolve():
-        raise StereoweaveError(f"{out}: expected another file than the one to make it from")
     with replacing(out) as temporary:
         shutil.copyfile(source, temporary)
     write_card(source, out, {})

@@ -10,7 +10,7 @@ from pathlib import Path
 from stereoweave.errors import StereoweaveError
 from stereoweave.threads import usable_cores
 
-# How long a process waits with an error for the first one to tell it, by which torchrun ends them all.
+# How long a process waits with an error for another one to tell it, by which torchrun ends them all.
 _PATIENCE_S = 20.0
 
 
@@ -37,14 +37,17 @@ def ranks() -> Ranks:
 
 @contextmanager
 def told_once() -> Iterator[None]:
-    """An error that all processes have in the block leaves it in the first one alone.
+    """An error leaves the block in one process alone: in the first one, where all of them have it.
 
-    The others wait until torchrun ends them for that. An error that is theirs alone leaves it a little later.
+    The others wait until torchrun ends them for that, and so does the first one where it only finds that
+    another one is gone. An error that is theirs alone leaves it a little later.
     """
     try:
         yield
-    except (StereoweaveError, OSError):
-        if ranks().rank > 0:
+    except Exception as error:
+        own = ranks()
+        to_tell = isinstance(error, StereoweaveError | OSError)
+        if own.rank > 0 or (own.count > 1 and not to_tell):
             time.sleep(_PATIENCE_S)
         raise
 

@@ -14,7 +14,7 @@ class StepSums:
 
     PyTorch's DistributedDataParallel adds gradients in float32, whose sums depend on their order, and so on
     how many processes there are: losses then differ by 1 % after 50 steps of a small network. Here they are
-    added in float64, in which float32 numbers give the same sum in any order.
+    added in float64; what their order changes there is lost again in float32, but for one in millions.
     """
 
     def __init__(self, network: nn.Module) -> None:
@@ -31,7 +31,9 @@ class StepSums:
         # Apple's GPUs have no float64; of them there is never more than one.
         exact = torch.float32 if losses[0].device.type == "mps" else torch.float64
         row = torch.cat([value.detach().flatten().to(exact) for value in values])
-        self.count, self.total = self.count + 1, self.total + row
+        # In place, as below: of a large network they are as large as its optimiser.
+        self.total = self.total.add_(row) if self.count else row
+        self.count += 1
         for value, before in zip(self.statistics, self.before, strict=True):
             value.copy_(before)
 
@@ -41,7 +43,7 @@ class StepSums:
         assert isinstance(total, Tensor)
         into = [*self._gradients(), *self.statistics]
         sizes = [value.numel() for value in into]
-        losses, *means = torch.split(total / micro_batches, [len(total) - sum(sizes), *sizes])
+        losses, *means = torch.split(total.div_(micro_batches), [len(total) - sum(sizes), *sizes])
         for value, mean in zip(into, means, strict=True):
             value.copy_(mean.view_as(value))
         for layer in self.norms:

@@ -1,5 +1,6 @@
 """Training: one loop from a recipe to a network; killed at any moment, it goes on where it was."""
 
+import atexit
 import csv
 import ctypes
 import logging
@@ -19,15 +20,16 @@ import torch
 from lightning_fabric import Fabric
 from lightning_fabric.loggers.tensorboard import TensorBoardLogger
 from lightning_fabric.strategies.ddp import DDPStrategy
+from lightning_fabric.utilities.distributed import _destroy_dist_connection
 from rich.console import Console
 from torch import nn
 from torch.optim.swa_utils import AveragedModel
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io import make_folder, replacing
 from stereoweave.learn import checkpoint
-from stereoweave.learn.batches import Batches, split
+from stereoweave.learn.batches import Batches, Told, split
 from stereoweave.learn.checkpoint import Checkpoint, Weights
 from stereoweave.learn.models import network_of
 from stereoweave.learn.objective import fitted, naming, objective_of
@@ -50,7 +52,7 @@ def train(recipe_path: Path, out: Path, console: Console | None = None) -> Path:
         StereoweaveError: for a recipe that is none, where `out` holds the run of another one, or where the
             loss is no longer finite.
     """
-    with told_once():
+    with told_once(), _no_farewell_after_an_error():
         return train_recipe(read_recipe(recipe_path), out, console or Console(quiet=ranks().rank > 0))
 
 
@@ -289,27 +291,11 @@ def _check(recipe: Recipe) -> None:
         )
 
 
-class _Told(Dataset[Any]):
-    """The batches, or the error where one cannot be made.
-
-    Raised in the loader's process it would come with PyTorch's traceback for its words.
-    """
-
-    def __init__(self, batches: Batches) -> None:
-        self.batches = batches
-
-    def __getitem__(self, step: int) -> dict[str, torch.Tensor] | StereoweaveError:
-        try:
-            return self.batches[step]
-        except StereoweaveError as error:
-            return error
-
-
 def _numbered_batches(batches: Batches, first: int) -> Iterator[tuple[int, dict[str, torch.Tensor]]]:
     """(step, its batch) from step `first` to the last, cut and recoloured in a process beside."""
     steps = range(first, batches.recipe.steps)
     loader = DataLoader(
-        _Told(batches),
+        Told(batches),
         sampler=steps,
         batch_size=None,
         num_workers=1,
@@ -351,6 +337,19 @@ def _fabric(logger: TensorBoardLogger) -> Fabric:
     )
     fabric.launch()
     return fabric
+
+
+@contextmanager
+def _no_farewell_after_an_error() -> Iterator[None]:
+    """An error in the block ends this process, although others wait for it on their GPUs.
+
+    NCCL is left at exit by all processes together: who leaves it alone waits for the others, and they for it.
+    """
+    try:
+        yield
+    except BaseException:
+        atexit.unregister(_destroy_dist_connection)
+        raise
 
 
 def _keep_freed_memory() -> None:

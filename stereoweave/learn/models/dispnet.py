@@ -135,14 +135,16 @@ class DispNet(nn.Module):
         """Disparities pr6 to pr1, at 1/64 to 1/2 of the padded images' size, in pixels of the full one."""
         views = pad_to_multiple(torch.cat([left, right]), self.multiple_of)
         half = self.conv1(views * 2 - 1)
-        left_quarter, right_quarter = self.conv2(half).chunk(2)
+        batch = left.shape[0]  # and no chunk(): exported, it would fix the batch
+        quarter = self.conv2(half)
+        left_quarter, right_quarter = quarter[:batch], quarter[batch:]
         correlation = F.leaky_relu(mean_correlation(left_quarter, right_quarter), SLOPE)
         eighth = self.conv3(torch.cat([correlation, self.redirect(left_quarter)], 1))
         sixteenth = self.conv4(eighth)
         maps_32nd = self.conv5(sixteenth)
         maps = self.conv6(maps_32nd)
         predicted = [self.prediction(maps)]
-        skips = maps_32nd, sixteenth, eighth, left_quarter, half[: left.shape[0]]
+        skips = maps_32nd, sixteenth, eighth, left_quarter, half[:batch]
         for expand, skipped in zip(self.expansions, skips, strict=True):
             maps, disparity_px = expand(maps, predicted[-1], skipped)
             predicted.append(disparity_px)
