@@ -4,6 +4,7 @@ import atexit
 import csv
 import ctypes
 import logging
+import os
 import platform
 import sys
 import time
@@ -23,6 +24,8 @@ from lightning_fabric.strategies.ddp import DDPStrategy
 from lightning_fabric.utilities.distributed import _destroy_dist_connection
 from rich.console import Console
 from torch import nn
+from torch.distributed.distributed_c10d import PrefixStore
+from torch.distributed.rendezvous import rendezvous
 from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader
 
@@ -33,7 +36,7 @@ from stereoweave.learn.batches import Batches, Told, split
 from stereoweave.learn.checkpoint import Checkpoint, Weights
 from stereoweave.learn.models import network_of
 from stereoweave.learn.objective import fitted, naming, objective_of
-from stereoweave.learn.ranks import ranks, threads_each, told_once
+from stereoweave.learn.ranks import Ranks, ranks, threads_each, told_once
 from stereoweave.learn.recipe import COLLAGE, Recipe, read_recipe
 from stereoweave.learn.sources import Source, kept, sources
 from stereoweave.learn.sums import StepSums
@@ -41,6 +44,8 @@ from stereoweave.progress import progress
 
 # Beside a run's checkpoint: its scores after each validation.
 CURVE = "validation.csv"
+# The others wait for the first one however long it makes pairs or scores: should it die, torchrun ends them.
+_PATIENCE = timedelta(days=1)
 
 
 def train(recipe_path: Path, out: Path, console: Console | None = None) -> Path:
@@ -329,14 +334,31 @@ def _fabric(logger: TensorBoardLogger) -> Fabric:
         accelerator="cuda" if cuda else "cpu",
         devices=own.count_here,
         num_nodes=own.count // own.count_here,
-        # The others wait for the first one however long it makes pairs or scores: should it die, torchrun
-        # ends them.
-        strategy=DDPStrategy(timeout=timedelta(days=1)),
+        strategy=DDPStrategy(timeout=_PATIENCE),
         precision=_precision(),
         loggers=logger,
     )
+    if own.count == own.count_here > 1:
+        _meet(own, "nccl" if cuda else "gloo")
     fabric.launch()
     return fabric
+
+
+def _meet(own: Ranks, backend: str) -> None:
+    """Joins the processes that torchrun started together on this machine.
+
+    It keeps one store for all its starts: without a place of their own there, those that are started again
+    find the addresses of their killed predecessors, and wait for them (PyTorch's issue 135712).
+    """
+    store, rank, count = next(rendezvous("env://", own.rank, own.count))
+    place = f"start {os.environ['TORCHELASTIC_RESTART_COUNT']}"
+    torch.distributed.init_process_group(
+        backend,
+        store=PrefixStore(place, store),
+        rank=rank,
+        world_size=count,
+        timeout=_PATIENCE,
+    )
 
 
 @contextmanager
