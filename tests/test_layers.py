@@ -8,11 +8,13 @@ from stereoweave.learn.models.layers import (
     DilatedDense,
     Halve,
     Residual,
+    at_match,
     correlation_volume,
     expected_step,
     local_soft_argmax,
     mirrored,
     nearby_matches,
+    surroundings,
     upsample_convex,
     upsample_to_a_side,
     warped_matches,
@@ -243,3 +245,27 @@ def test_a_slanted_surface_is_mixed_as_ever():
     logits = torch.linspace(-1, 1, 9).tolist()
     mixed = upsampled_corner(upsample_convex, slant, logits)
     assert upsampled_corner(upsample_to_a_side, [s / 2 for s in slant], logits) == pytest.approx(mixed / 2)
+
+
+@pytest.mark.parametrize("logit", [-1000.0, -89.0, 0.0, 1000.0])
+def test_the_gradient_of_the_upsampling_is_finite_however_surely_neighbours_are_refused(logit):
+    # Below -88 exp(-logit) is infinite in float32: trained weights have reached -92.
+    x = torch.arange(9.0).view(1, 1, 3, 3).requires_grad_()
+    weights = torch.full((1, 36, 3, 3), logit).requires_grad_()
+    upsample_convex(x, weights).sum().backward()
+    assert x.grad.isfinite().all()
+    assert weights.grad.isfinite().all()
+
+
+def test_a_map_is_looked_up_at_the_match_between_two_columns_and_at_the_border():
+    other = torch.tensor([10.0, 20.0, 40.0, 80.0]).view(1, 1, 1, 4)
+    disparity = torch.tensor([0.0, 0.25, 5.0, -3.0]).view(1, 1, 1, 4)
+    # Columns 0, 0.75, -3 and 6.
+    assert at_match(other, disparity).flatten().tolist() == pytest.approx([10, 17.5, 10, 80])
+
+
+def test_surroundings_are_the_values_at_the_offsets_and_outside_the_border_s():
+    x = torch.arange(12.0).view(1, 1, 3, 4)
+    below, left_far = surroundings(x, [(1, 0), (0, -5)])[0]
+    assert below.tolist() == [[4, 5, 6, 7], [8, 9, 10, 11], [8, 9, 10, 11]]
+    assert left_far.tolist() == [[0] * 4, [4] * 4, [8] * 4]

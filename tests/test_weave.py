@@ -8,8 +8,10 @@ from learn_examples import overfitted, untrained
 from torch import nn
 
 from stereoweave.learn.export import multiply_adds
+from stereoweave.learn.losses import weave_losses
 from stereoweave.learn.models.layers import mirrored
 from stereoweave.learn.models.weave import BASE, WeaveNet
+from stereoweave.learn.models.weave_stages import OFFSETS, Completion
 
 
 def random_pair(batch, height, width):
@@ -97,3 +99,75 @@ def test_a_disparity_below_zero_comes_out_as_zero():
 
 def test_forty_eight_levels_reach_192_px():
     assert untrained().max_disparity_px == 192
+
+
+GROWN = replace(BASE, wider=64, completion=32, sharpening=8)
+
+
+@pytest.mark.parametrize("part", ["wider", "completion", "sharpening"])
+def test_each_stage_that_a_network_grows_by_adds_nothing_until_it_is_trained(part):
+    torch.manual_seed(0)
+    before = WeaveNet(BASE).eval()
+    grown = WeaveNet(replace(BASE, **{part: getattr(GROWN, part)})).eval()
+    grown.load_state_dict(grown.state_dict() | before.state_dict())
+    pair = random_pair(1, 64, 96)
+    with torch.no_grad():
+        for found, expected in zip(grown(*pair), before(*pair), strict=True):
+            assert torch.equal(found, expected)
+
+
+def test_every_stage_of_a_grown_network_learns():
+    """In bfloat16 too, in which oneDNN's gradients of some convolutions are not finite."""
+    torch.manual_seed(0)
+    network = WeaveNet(GROWN).train()
+    left, right = random_pair(2, 64, 96)
+    truth_px = torch.full((4, 1, 64, 96), 9.0)
+    for _ in range(4):  # what is silent passes a gradient on once it has moved
+        with torch.autocast("cpu", torch.bfloat16):
+            stages = network.stages(left, right)
+        terms = weave_losses(stages, truth_px, torch.zeros_like(truth_px, dtype=torch.bool))
+        network.zero_grad()
+        sum(terms.values()).backward()
+        assert all(parameter.grad.isfinite().all() for parameter in network.parameters())
+        with torch.no_grad():
+            for parameter in network.parameters():
+                parameter -= 1e-2 * parameter.grad
+    grown_by = ("sharpening.", "completion.", "aggregation.context.wider.")
+    for name, parameter in network.named_parameters():
+        assert not name.startswith(grown_by) or parameter.grad.any(), name
+
+
+def test_a_mirrored_pair_is_completed_and_sharpened_alike():
+    """Whatever the features are: the stages are shown each view with the other one in its own columns."""
+    torch.manual_seed(0)
+    network = WeaveNet(GROWN).eval().double()
+    for layer in (network.completion.share, network.sharpening.scores):
+        nn.init.normal_(layer.weight, std=0.5)
+    with torch.no_grad():
+        for part in (network.encoder, network.sharpening.features, network.sharpening.to_match):
+            for layer in part.modules():
+                if isinstance(layer, nn.Conv2d):
+                    layer.weight += mirrored(layer.weight.clone())
+        left, right = (image.double() for image in random_pair(1, 64, 96))
+        left_px, right_px, _ = network(left, right)
+        mirrored_left_px, mirrored_right_px, _ = network(mirrored(right), mirrored(left))
+    torch.testing.assert_close(right_px, mirrored(mirrored_left_px), atol=1e-3, rtol=0)
+    torch.testing.assert_close(left_px, mirrored(mirrored_right_px), atol=1e-3, rtol=0)
+
+
+def test_a_completion_takes_the_surface_that_its_affinities_point_to():
+    """A hole of 3 columns in a wall at 2: each pixel takes the one 8 columns to the left instead."""
+    torch.manual_seed(0)
+    completion = Completion(quarter=4, channels=8).eval()
+    disparity = torch.full((1, 1, 6, 24), 2.0)
+    disparity[..., 12:15] = 7.0
+    with torch.no_grad():
+        completion.affinity.weight.zero_()
+        completion.affinity.bias.fill_(-1e4)
+        completion.affinity.bias[OFFSETS.index((0, -8))] = 0
+        completion.share.bias.fill_(100.0)
+        found, decoded = completion(
+            disparity, torch.full_like(disparity, 2.0), torch.rand(1, 4, 6, 24), torch.rand(1, 32, 6, 24)
+        )
+    assert found[..., 12:15].tolist() == [[[[2.0] * 3] * 6]]
+    assert found[..., 20:23].tolist() == [[[[7.0] * 3] * 6]]

@@ -1,6 +1,8 @@
 """What the networks share: convolution blocks, correlation, soft-argmax, guided upsampling."""
 
+from collections.abc import Sequence
 from itertools import pairwise
+from typing import TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -10,6 +12,8 @@ from torch import Tensor, nn
 # Of the columns of a correlation. Where images' sides are multiples of 16 and it is at 1/4, four divide every
 # width: an exported graph pads nothing, and has as many matrix products whatever the width is.
 _BLOCKS = 4
+# Of a neighbour that is refused: where all are, no division by zero, and still a mixture of neighbours alone.
+_LEAST_SHARE = 1e-4
 
 
 class ConvBlock(nn.Sequential):
@@ -52,6 +56,17 @@ class Residual(nn.Module):
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         return F.relu(x + self.second(self.first(x)))
+
+
+Block = TypeVar("Block", Residual, nn.Conv2d)
+
+
+def silent(block: Block) -> Block:
+    """The block, adding nothing until it is trained: so that a trained network can grow by it."""
+    last = block.second[1] if isinstance(block, Residual) else block
+    for parameter in last.parameters():
+        nn.init.zeros_(parameter)
+    return block
 
 
 class DilatedDense(nn.Module):
@@ -198,6 +213,29 @@ def warped_matches(
     return torch.cat([(left * warped[:, :, x : x + width]).sum(3).unsqueeze(1) for x in steps], 1)
 
 
+def at_match(
+    other: Float[Tensor, "b 1 h w"], disparity: Float[Tensor, "b 1 h w"]
+) -> Float[Tensor, "b 1 h w"]:
+    """The other view's map at column x - disparity, between two columns interpolated; outside, its border."""
+    width = other.shape[3]
+    columns = torch.arange(width, dtype=torch.float32, device=other.device) - disparity.detach()
+    columns = columns.clamp(0, width - 1)
+    below = columns.floor().clamp(0, width - 2)
+    place = below.long().clamp(0, width - 2)
+    low, high = other.gather(3, place), other.gather(3, place + 1)
+    return low + (columns - below) * (high - low)
+
+
+def surroundings(x: Float[Tensor, "b 1 h w"], offsets: Sequence[tuple[int, int]]) -> Float[Tensor, "b k h w"]:
+    """The map's values at offsets of rows and columns from each pixel; outside the map, its border's."""
+    height, width = x.shape[2:]
+    reach = max(abs(side) for offset in offsets for side in offset)
+    around = F.pad(x, (reach, reach, reach, reach), mode="replicate")
+    return torch.cat(
+        [around[:, :, reach + y : reach + y + height, reach + x : reach + x + width] for y, x in offsets], 1
+    )
+
+
 def _pixels(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "n c"]:
     """A pixel's features a row, so that looking one up is one contiguous copy."""
     return x.permute(0, 2, 3, 1).reshape(-1, x.shape[1])
@@ -222,7 +260,8 @@ def upsample_convex(
 
     Deviation: shares of sigmoids; RAFT's softmax costs ONNX Runtime more than all convolutions.
     """
-    neighbours, shares = _mixture(x, weights)
+    neighbours, logits = _neighbours(x, weights)
+    shares = logits.sigmoid() + _LEAST_SHARE
     return F.pixel_shuffle((shares * neighbours).sum(1) / shares.sum(1), 2)
 
 
@@ -236,7 +275,10 @@ def upsample_to_a_side(
     fades into the other, so that rounding decides nothing: three quarters of the mixture are all of it. Not
     for training: a side that is wrong gets hardly any gradient towards the other.
     """
-    neighbours, shares = _mixture(x, weights)
+    neighbours, logits = _neighbours(x, weights)
+    # Written out: ONNX Runtime's sigmoid is off by 1e-7, which is much where all neighbours are refused. Its
+    # gradient is NaN below a logit of -88, so that training takes PyTorch's sigmoid.
+    shares = (1 + (-logits).exp()).reciprocal() + _LEAST_SHARE
     share, total = shares.sum(1), (shares * neighbours).sum(1)
     mixed = total / share
     above = shares * (neighbours - (mixed - 0.5).unsqueeze(1)).clamp(0, 1)
@@ -250,8 +292,8 @@ def upsample_to_a_side(
     return F.pixel_shuffle(mixed + apart * (side - mixed), 2)
 
 
-def _mixture(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Old pixels around each new one, [B, 9, 1, H, W], and their shares, [B, 9, 4, H, W]."""
+def _neighbours(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Old pixels around each new one, [B, 9, 1, H, W], and the logits of their shares, [B, 9, 4, H, W]."""
     batch, channels, height, width = weights.shape
     around = F.pad(x, (1, 1, 1, 1), mode="replicate")
     shifted = [around[:, :, dy : dy + height, dx : dx + width] for dy in range(3) for dx in range(3)]
@@ -262,10 +304,7 @@ def _mixture(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         corners = [(0, 0), (0, 1), (1, 0), (1, 1)]
         neighbours = torch.cat([shifted[3 * (i + a) + j + b] for a, b in corners for i, j in corners], 1)
         neighbours = neighbours.view(batch, 4, 4, height, width)
-    logits = weights.contiguous().view(batch, channels // 4, 4, height, width)
-    # Written out: ONNX Runtime's sigmoid is off by 1e-7, which is much where all neighbours are refused.
-    # 1e-4: where all are refused, no division by zero, and still a mixture of nothing but neighbours.
-    return neighbours, (1 + (-logits).exp()).reciprocal() + 1e-4
+    return neighbours, weights.contiguous().view(batch, channels // 4, 4, height, width)
 
 
 def pad_to_multiple(image: Float[Tensor, "b c h w"], multiple: int) -> Float[Tensor, "b c h2 w2"]:

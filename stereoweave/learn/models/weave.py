@@ -6,7 +6,7 @@ dilated, densely connected blocks, the decoder in steps of two, and the skip con
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -23,12 +23,12 @@ from stereoweave.learn.models.layers import (
     local_soft_argmax,
     mirrored,
     nearby_matches,
+    silent,
     upsample_convex,
     upsample_to_a_side,
     warped_matches,
 )
-
-Block = TypeVar("Block", Residual, nn.Conv2d)
+from stereoweave.learn.models.weave_stages import Completion, Sharpening, WiderContext
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +51,9 @@ class Size:
         warps: whether they are compared with the other view warped once, and not looked up step by step.
         refinement: 3x3 convolutions at 1/2.
         neighbours: old pixels that an upsampled one is mixed of, 9 or 4.
+        wider: channels of the context at 1/32; 0 for none.
+        completion: channels of the stage at 1/4 that completes what one camera alone sees; 0 for none.
+        sharpening: channels that are compared at full resolution; 0 for none.
     """
 
     channels: tuple[int, int, int, int]
@@ -66,6 +69,9 @@ class Size:
     warps: bool
     refinement: int
     neighbours: int
+    wider: int = 0
+    completion: int = 0
+    sharpening: int = 0
 
 
 SMALL = Size(
@@ -145,14 +151,6 @@ def convolutions(channels: int, count: int) -> list[nn.Module]:
     return alone + residual[:1] + [silent(block) for block in residual[1:]]
 
 
-def silent(block: Block) -> Block:
-    """The block, adding nothing until it is trained: so that a trained network can grow by it."""
-    last = block.second[1] if isinstance(block, Residual) else block
-    for parameter in last.parameters():
-        nn.init.zeros_(parameter)
-    return block
-
-
 class Encoder(nn.Module):
     """Features of one view: down to 1/16, and up again so that the finer maps know the wider surroundings."""
 
@@ -181,15 +179,19 @@ class Encoder(nn.Module):
 class Context(nn.Module):
     """What the wider surroundings say, at 1/16: a plain surface is known by where it ends."""
 
-    def __init__(self, inputs: int, sixteenth: int, channels: int, outputs: int) -> None:
+    def __init__(self, inputs: int, sixteenth: int, size: Size) -> None:
         super().__init__()
+        channels, outputs = size.context, size.bottleneck
         self.down = Halve(inputs, channels)
         self.join = ConvBlock(channels + sixteenth, channels, kernel=1)
         self.body = nn.Sequential(*(Residual(channels, dilation) for dilation in (2, 4)))
+        self.wider = WiderContext(channels, size.wider) if size.wider else None
         self.up = silent(nn.Conv2d(channels, outputs, 1))
 
     def forward(self, dense: Tensor, sixteenth: Tensor) -> Tensor:
         wide = self.body(self.join(torch.cat([self.down(dense), sixteenth], 1)))
+        if self.wider is not None:
+            wide = self.wider(wide)
         return F.interpolate(self.up(wide), scale_factor=2.0)
 
 
@@ -202,7 +204,7 @@ class Aggregation(nn.Module):
         self.down = Halve(levels + quarter, eighth)
         self.dense = DilatedDense(2 * eighth, narrow=32, growth=size.growth, dilations=size.dilations)
         self.bottleneck = ConvBlock(self.dense.outputs, size.bottleneck, kernel=1)
-        self.context = Context(self.dense.outputs, sixteenth, size.context, size.bottleneck)
+        self.context = Context(self.dense.outputs, sixteenth, size)
         self.join = ConvBlock(size.bottleneck + levels + quarter, 32, kernel=1)
         self.decode = ConvBlock(32, 32)
         self.scores = nn.Conv2d(32, levels, 1)
@@ -250,12 +252,12 @@ class Refinement(nn.Module):
 
     def forward(
         self, disparity: Tensor, first: Tensor, second: Tensor, context: Tensor, decoded: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Disparity in pixels of this resolution, the weights of the last upsampling, and the confidence."""
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Disparity in pixels of this resolution, weights of the last upsampling, confidence, features."""
         matches = self.matches(first, second, disparity, self.radius)
         x = self.body(self.join(torch.cat([matches, context, decoded], 1)))
         correction = expected_step((matches + self.scores(x)).float())
-        return disparity + correction, self.weights(x), F.pixel_shuffle(self.confidence(x), 2)
+        return disparity + correction, self.weights(x), F.pixel_shuffle(self.confidence(x), 2), x
 
 
 class WeaveNet(nn.Module):
@@ -266,20 +268,21 @@ class WeaveNet(nn.Module):
     13.41 G multiply-adds with its 1,274,290 parameters.
     """
 
-    multiple_of = 16
-
     def __init__(self, size: Size = SMALL, levels: int = 48) -> None:
         super().__init__()
         self.size, self.levels = size, levels
+        self.multiple_of = 32 if size.wider else 16
         half, quarter = size.channels[:2]
         self.encoder = Encoder(size)
         self.to_match = nn.Conv2d(quarter, 32, 1)
         self.aggregation = Aggregation(levels, size)
+        self.completion = Completion(quarter, size.completion) if size.completion else None
         self.propagation = Propagation(quarter, size.propagation) if size.propagation else None
         self.weights = nn.Conv2d(32, 4 * size.neighbours, 1)
         self.to_match_half = nn.Conv2d(half, size.compared, 1)
         self.to_half = nn.Conv2d(32, 4 * size.handed, 1)
         self.refinement = Refinement(size)
+        self.sharpening = Sharpening(8, 16, size.sharpening) if size.sharpening else None
 
     @property
     def max_disparity_px(self) -> int:
@@ -288,27 +291,31 @@ class WeaveNet(nn.Module):
     def stages(self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]) -> Stages:
         """Every step of the prediction for both views."""
         batch = left.shape[0]  # here and below no len() and no chunk(): exported, they would fix the batch
-        maps = self.encoder(torch.cat([left, right]))
+        images = torch.cat([left, right])
+        maps = self.encoder(images)
         # In a mirror the right view is a left one, so that one aggregation serves both.
         first = Features(*(as_left_view(map_, batch) for map_ in maps))
         correlation, scores, decoded = self.matched(maps, first)
         quarter = self.read(scores.float(), decoded)
-        spread, decoded = self._propagated(quarter, first.quarter, decoded)
+        spread, decoded = self._propagated(quarter, first.quarter, decoded, batch)
         coarse = self.upsample(spread * 2, self.weights(decoded).float())
         match_half = self.to_match_half(maps.half)
-        fine, weights, confidence = self.refinement(
+        fine, weights, confidence, context = self.refinement(
             coarse,
             as_left_view(match_half, batch),
             as_other_view(match_half, batch),
             first.half,
             F.pixel_shuffle(self.to_half(decoded), 2),
         )
+        disparity_px, logit = self._sharpened(
+            self.upsample(fine * 2, weights.float()), confidence.float(), images, context, batch
+        )
         return Stages(
             correlation=correlation,
             scores=scores,
             coarse_px=coarse * 2,
-            disparity_px=self.upsample(fine * 2, weights.float()),
-            confidence_logit=confidence.float(),
+            disparity_px=disparity_px,
+            confidence_logit=logit,
         )
 
     def matched(self, maps: Features, first: Features) -> tuple[Tensor, Tensor, Tensor]:
@@ -331,10 +338,26 @@ class WeaveNet(nn.Module):
         """Disparity in pixels of 1/4 resolution; scores that are coarser need the decoder's features too."""
         return local_soft_argmax(scores)
 
-    def _propagated(self, quarter: Tensor, features: Tensor, decoded: Tensor) -> tuple[Tensor, Tensor]:
+    def _propagated(
+        self, quarter: Tensor, features: Tensor, decoded: Tensor, batch: int | torch.SymInt
+    ) -> tuple[Tensor, Tensor]:
+        if self.completion is not None:
+            # Of each view the other one, in that one's own columns.
+            other = mirrored(torch.cat([quarter[batch:], quarter[:batch]]))
+            quarter, decoded = self.completion(quarter, other, features, decoded)
         if self.propagation is None:
             return quarter, decoded
         return self.propagation(quarter, features, decoded)
+
+    def _sharpened(
+        self, disparity_px: Tensor, logit: Tensor, images: Tensor, context: Tensor, batch: int | torch.SymInt
+    ) -> tuple[Tensor, Tensor]:
+        if self.sharpening is None:
+            return disparity_px, logit
+        features, match = self.sharpening.views(images)
+        first, second = as_left_view(match, batch), as_other_view(match, batch)
+        sharp_px, more = self.sharpening(disparity_px, first, second, as_left_view(features, batch), context)
+        return sharp_px, logit + more
 
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Left disparity, right disparity and the left view's confidence logit, each [B, 1, H, W]."""

@@ -1,0 +1,130 @@
+"""Stages that a trained WeaveNet can grow by: each adds nothing until it is trained."""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from stereoweave.learn.models.layers import (
+    ConvBlock,
+    Halve,
+    Residual,
+    at_match,
+    expected_step,
+    silent,
+    surroundings,
+    warped_matches,
+)
+
+# Where the completion looks for the surface behind, in pixels of 1/4 resolution: rows, columns.
+OFFSETS = tuple(
+    (sign * step * down, sign * step * along)
+    for down, along, steps in ((0, 1, (2, 4, 8, 16, 32)), (1, 0, (2, 4, 8, 16)))
+    for step in steps
+    for sign in (-1, 1)
+)
+# A larger disagreement of the two views says no more than this one, in pixels of 1/4 resolution.
+_LARGEST_CHECK = 4.0
+
+
+class WiderContext(nn.Module):
+    """What the surroundings say at 1/32, added to the context at 1/16."""
+
+    def __init__(self, channels: int, wider: int) -> None:
+        super().__init__()
+        self.down = Halve(channels, wider)
+        self.body = nn.Sequential(*(Residual(wider, dilation) for dilation in (1, 2)))
+        self.up = silent(nn.Conv2d(wider, channels, 1))
+
+    def forward(self, wide: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        return wide + F.interpolate(self.up(self.body(self.down(wide))), scale_factor=2.0)
+
+
+class Completion(nn.Module):
+    """Disparity at 1/4 completed from its surroundings where the two views contradict each other.
+
+    A pixel that one camera alone sees has no match. The left-right check tells where that is, and each such
+    pixel takes a mixture of disparities that stand 2 to 32 pixels away in its row and column: the convex
+    combination of learned affinities of spatial propagation networks (Liu et al., NeurIPS 2017) with fixed,
+    far offsets in place of repeated steps.
+    """
+
+    def __init__(self, quarter: int, channels: int) -> None:
+        super().__init__()
+        self.join = ConvBlock(32 + quarter + 4, channels, kernel=1)
+        self.body = ConvBlock(channels, channels, dilation=2)
+        self.affinity = nn.Conv2d(channels, len(OFFSETS), 1)
+        self.share = silent(nn.Conv2d(channels, 1, 1))
+        self.decoded = silent(nn.Conv2d(channels, 32, 1))
+
+    def forward(
+        self,
+        disparity: Float[Tensor, "b 1 h w"],
+        other: Float[Tensor, "b 1 h w"],
+        quarter: Float[Tensor, "b c h w"],
+        decoded: Float[Tensor, "b 32 h w"],
+    ) -> tuple[Tensor, Tensor]:
+        """Disparity in pixels of 1/4 resolution and the decoder's features.
+
+        Args:
+            disparity: In pixels of 1/4 resolution.
+            other: The other view's disparity, in that view's own columns.
+            quarter: The encoder's features.
+            decoded: The decoder's features.
+        """
+        x = self.body(self.join(torch.cat([decoded, quarter, *self._checks(disparity, other)], 1)))
+        around = surroundings(disparity, OFFSETS)
+        affinity = self.affinity(x).float()
+        weights = (affinity - affinity.amax(1, keepdim=True)).exp()
+        mixed = (weights * around).sum(1, keepdim=True) / weights.sum(1, keepdim=True)
+        share = self.share(x).float().tanh()
+        return disparity + share * (mixed - disparity), decoded + self.decoded(x)
+
+    def _checks(self, disparity: Tensor, other: Tensor) -> tuple[Tensor, ...]:
+        """What tells an occluded pixel: the left-right check, the border, and how it departs from around."""
+        columns = torch.arange(disparity.shape[3], dtype=torch.float32, device=disparity.device)
+        # In float32: beside a disparity of 100 px bfloat16 cannot tell a slope from a plane.
+        departure = disparity - F.avg_pool2d(disparity, 9, 1, 4, count_include_pad=False)
+        check = (at_match(other, disparity) - disparity).clamp(-_LARGEST_CHECK, _LARGEST_CHECK)
+        inside = (columns - disparity).clamp(-_LARGEST_CHECK, _LARGEST_CHECK)
+        return departure, disparity / 16, check, inside
+
+
+class Sharpening(nn.Module):
+    """A correction of at most `radius` pixels at full resolution, read from matches around the estimate."""
+
+    def __init__(self, handed: int, inputs: int, channels: int, radius: int = 2) -> None:
+        super().__init__()
+        self.radius = radius
+        nearby = 2 * radius + 1
+        self.features = nn.Sequential(nn.Conv2d(3, channels, 3, padding=1), nn.ReLU(inplace=True))
+        self.to_match = nn.Conv2d(channels, channels, 1)
+        self.hand = nn.Conv2d(inputs, 4 * handed, 1)
+        self.join = nn.Sequential(nn.Conv2d(nearby + channels + handed, 16, 1), nn.ReLU(inplace=True))
+        self.body = nn.Sequential(nn.Conv2d(16, 16, 3, padding=1), nn.ReLU(inplace=True))
+        self.scores = silent(nn.Conv2d(16, nearby, 1))
+        self.gain = nn.Parameter(torch.zeros(()))
+        self.confidence = silent(nn.Conv2d(16, 1, 1))
+
+    def views(self, images: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, Tensor]:
+        """Features of the images, and what is compared of them."""
+        features = self.features(images * 2 - 1)
+        return features, self.to_match(features)
+
+    def forward(
+        self, disparity: Tensor, first: Tensor, second: Tensor, features: Tensor, context: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Disparity in pixels, and what it adds to the confidence's logit.
+
+        Args:
+            disparity: In pixels of full resolution.
+            first: What is compared of this view.
+            second: The same of the other one.
+            features: Of this view.
+            context: The refinement's features at half resolution.
+        """
+        matches = warped_matches(first, second, disparity, self.radius)
+        handed = F.pixel_shuffle(self.hand(context), 2)
+        x = self.body(self.join(torch.cat([matches, features, handed], 1)))
+        scores = (self.scores(x) + self.gain * matches).float()
+        return disparity + expected_step(scores), self.confidence(x).float()
