@@ -143,3 +143,26 @@ def test_pixels_whose_match_lies_outside_the_other_view_do_not_touch_the_correla
     weave_losses(predicted, *flat_truth(6.0))["correlation"].backward()
     touched = predicted.correlation.grad.abs().sum((0, 1, 2)) > 0
     assert touched.tolist() == [False, False, True, True]
+
+
+@pytest.mark.parametrize(
+    ("robust", "expected"), [(1.0, 2.5 * math.log(3.75)), (0.5, 1.25 * math.log(3.75) + 1.375)]
+)
+def test_a_robust_regression_is_the_logarithm_of_what_it_was(robust, expected):
+    # An error of 3 px is 2.75 without the logarithm.
+    assert regression(a_map(7.0), a_map(10.0), robust).item() == pytest.approx(expected, abs=1e-6)
+
+
+def test_truth_beyond_the_last_level_enters_no_loss():
+    predicted = stages()
+    # Four levels of 4 px reach 12 px.
+    truth_px, occluded = flat_truth(12.5)
+    terms = weave_losses(predicted, truth_px, occluded)
+    assert {name: term.item() for name, term in terms.items()} == dict.fromkeys(terms, 0)
+    assert weave_losses(predicted, truth_px - 0.5, occluded)["disparity"].item() == pytest.approx(6.75)
+
+
+def test_truth_below_zero_counts_for_the_confidence_alone():
+    terms = weave_losses(stages(), *flat_truth(-8.0))
+    expected = dict.fromkeys(terms, 0) | {"confidence": 0.3 * math.log(2)}
+    assert {name: term.item() for name, term in terms.items()} == pytest.approx(expected)

@@ -16,35 +16,44 @@ from torch import Tensor
 from stereoweave.learn.models.weave import Stages
 from stereoweave.learn.warp import reconstruct_left
 
+_ROBUST_SCALE = 2.5
+
 
 def weave_losses(
     stages: Stages,
     truth_px: Float[Tensor, "b 1 h w"],
     occluded: Bool[Tensor, "b 1 h w"],
     distribution: float = 1.0,
-    curved: Callable[[Tensor], Tensor] = lambda px: px,
+    compare: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> dict[str, Tensor]:
     """The terms of WeaveNet's loss by name, already weighted; their sum is what is minimised.
+
+    Truth beyond the last level counts as unknown. Truth below 0 px, which the network cannot answer, counts
+    for the confidence alone.
 
     Args:
         stages: What the network predicted for both views, the second half of the batch mirrored.
         truth_px: Disparity of the same views; NaN where unknown.
         occluded: Pixels without a match, which the raw correlation cannot be asked to find.
         distribution: Weight of the cross-entropies.
-        curved: What is compared of disparities in px, estimated and true.
+        compare: Loss between disparities in px, estimated and true; `regression` unless given.
     """
+    compare = compare or regression
     columns = torch.arange(truth_px.shape[3], device=truth_px.device)
     unmatched = occluded | (truth_px > columns)
     # A level is as many pixels as the maps of scores are smaller.
     step = truth_px.shape[3] // stages.scores.shape[3]
     centres = (..., slice(step // 2 - 1, None, step), slice(step // 2 - 1, None, step))
+    reach_px = step * (stages.scores.shape[1] - 1)
+    truth_px = truth_px.where(truth_px <= reach_px, torch.nan)
+    ahead_px = truth_px.where(truth_px >= 0, torch.nan)
     level_truth = truth_px[centres] / step
     matched_truth = level_truth.masked_fill(unmatched[centres], torch.nan)
     return {
         "correlation": 0.5 * distribution * level_cross_entropy(stages.correlation, matched_truth),
         "scores": distribution * level_cross_entropy(stages.scores, level_truth),
-        "coarse": 0.5 * regression(curved(stages.coarse_px), curved(halved(truth_px))),
-        "disparity": regression(curved(stages.disparity_px), curved(truth_px)),
+        "coarse": 0.5 * compare(stages.coarse_px, halved(ahead_px)),
+        "disparity": compare(stages.disparity_px, ahead_px),
         "confidence": 0.3 * confidence_loss(stages.confidence_logit, stages.disparity_px, truth_px),
     }
 
@@ -63,12 +72,17 @@ def level_cross_entropy(
 
 
 def regression(
-    estimate_px: Float[Tensor, "b 1 h w"], truth_px: Float[Tensor, "b 1 h w"]
+    estimate_px: Float[Tensor, "b 1 h w"], truth_px: Float[Tensor, "b 1 h w"], robust: float = 0.0
 ) -> Float[Tensor, ""]:
-    """Mean absolute error, rounded below half a pixel."""
+    """Mean absolute error e, rounded below half a pixel; the share `robust` of it is 2.5 log(1 + e) instead.
+
+    The logarithm pulls hardest on errors that are nearly small enough to count as right.
+    """
     known = truth_px.isfinite()
     # Unknown truth is replaced before it meets the estimate: NaN times a mask is NaN, in the gradient too.
     loss = F.huber_loss(estimate_px, truth_px.where(known, 0), reduction="none", delta=0.5) / 0.5
+    if robust:
+        loss = (1 - robust) * loss + robust * _ROBUST_SCALE * loss.log1p()
     return mean_over(loss, known)
 
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from stereoweave import metrics
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.learn.batches import collated, known
-from stereoweave.learn.losses import CODE_LOSSES, projection_loss, smooth_l1_loss, weave_losses
+from stereoweave.learn.losses import CODE_LOSSES, projection_loss, regression, smooth_l1_loss, weave_losses
 from stereoweave.learn.models import CodeNetwork
 from stereoweave.learn.models.weave import Stages, WeaveNet
 from stereoweave.learn.perceptual import PerceptualLoss
@@ -85,7 +85,7 @@ class WeaveObjective:
 
     def losses(self, predicted: Stages, batch: Batch) -> dict[str, Tensor]:
         truth_px, occluded = batch["disparity_px"], batch["occluded"]
-        terms = weave_losses(predicted, truth_px, occluded, self.recipe.distribution, self._curved)
+        terms = weave_losses(predicted, truth_px, occluded, self.recipe.distribution, self._compare)
         if self.recipe.alpha_p:
             left_px = predicted.disparity_px.chunk(2)[0]
             error = projection_loss(batch["left"], batch["right"], left_px)
@@ -94,6 +94,9 @@ class WeaveObjective:
 
     def scores(self, network: WeaveNet, pairs: Source, device: torch.device) -> dict[str, float]:
         return validate(network, pairs, device)
+
+    def _compare(self, estimate_px: Tensor, truth_px: Tensor) -> Tensor:
+        return regression(self._curved(estimate_px), self._curved(truth_px), self.recipe.robust)
 
     def _curved(self, disparity_px: Tensor) -> Tensor:
         if self.recipe.exponent == 1:
