@@ -243,3 +243,37 @@ def test_a_pair_without_the_right_view_s_disparity_is_never_mirrored(sample):
     for seed in range(12):
         augmented = augment(sample, 64, 80, np.random.default_rng(seed))
         assert np.isfinite(augmented.disparity_px).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("offset", [0.05, 0.14])
+def test_a_right_crop_further_to_the_right_stays_exact(sample, seed, offset):
+    part = rescaled_cut(sample, 64, 96, np.random.default_rng(seed), offset)
+    assert_views_agree(part, 12)
+
+
+def test_a_right_crop_further_to_the_right_adds_its_offset_to_the_disparity():
+    x = np.mgrid[:64, :96][1].astype(np.float32)
+    flat = np.full((64, 96), 5, np.float32)
+    sample = Sample(
+        left=picture(x, x), right=picture(x + 5, x), disparity_px=flat, right_disparity_px=flat,
+        occluded=flat < 0, right_occluded=flat < 0, camera=CAMERA,
+    )  # fmt: skip
+    part = rescaled_cut(sample, 64, 64, np.random.default_rng(0), 0.125)
+    width = 64 / part.camera.focal_px * 90  # of what was cut
+    offset_px = round(0.125 * width)
+    assert 0 < offset_px <= 12
+    np.testing.assert_allclose(part.disparity_px, (5 + offset_px) * 64 / width, rtol=1e-5)
+    # Depth stays: 9 px m over 5 + 6 px.
+    np.testing.assert_allclose(part.camera.depth_m(part.disparity_px), 9 / 11, rtol=1e-5)
+
+
+def test_the_share_of_right_crops_that_are_moved_is_the_one_asked_for(sample):
+    def nearest_px(share, seed):
+        part = augment(replace(sample, camera=CAMERA), 48, 48, np.random.default_rng(seed), share)
+        return part.camera.doffs_px / part.camera.focal_px
+
+    moved_ones = [nearest_px(0.3, seed) < 6 / 90 - 1e-9 for seed in range(300)]
+    # 90 of 300 expected, of which a few are moved by less than half a pixel; the deviation is 8.
+    assert 60 < sum(moved_ones) < 120
+    assert not any(nearest_px(0, seed) < 6 / 90 - 1e-9 for seed in range(30))

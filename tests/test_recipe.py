@@ -144,6 +144,10 @@ def test_the_learning_rate_without_slopes_is_constant():
             "mix with dataset = 'sintel', expected 'collage', which a mix is scored on",
         ),
         ({"learning_rate": float("nan")}, "learning_rate = nan, expected more than 0"),
+        ({"offset_share": 1.5}, "offset_share = 1.5, expected 0 to 1"),
+        ({"robust": -0.1}, "robust = -0.1, expected 0 to 1"),
+        ({"fresh": 1}, "fresh = 1, expected true or false"),
+        ({"held_out": {"rooms": 1}}, "held_out = {'rooms': 1}, expected a table of names and folders"),
     ],
 )
 def test_a_wrong_key_or_value_is_named_in_one_line(changes, message):

@@ -10,8 +10,10 @@ from rich.console import Console
 from stereoweave.data.packing import packed
 from stereoweave.data.shards import Shards, write_shard
 from stereoweave.learn import pairs as the_pairs
+from stereoweave.learn.batches import Batches
+from stereoweave.learn.collage import sample as collage_sample
 from stereoweave.learn.pairs import KeptPairs
-from stereoweave.learn.sources import VALIDATION_SEED, Mix, Source, kept, sources
+from stereoweave.learn.sources import VALIDATION_SEED, Mix, Source, held_out_sets, kept, sources
 
 CALIBRATION = "cam0=[300 0 19.5; 0 300 15.5; 0 0 1]\ndoffs=0\nbaseline=100\nwidth=40\nheight=32\n"
 FRAMES = [f"mill/{number:04d}" for number in range(40)]
@@ -174,3 +176,27 @@ def test_a_set_that_is_smaller_than_the_crop_is_named(rendered, tmp_path):
         f"tiny: crop_size = [80, 96], expected at most [64, 96], the size of the pairs in {rendered}/scenes/"
         "crane; cut less"
     )
+
+
+def test_fresh_collages_are_those_of_the_seed_and_none_is_kept(tmp_path):
+    recipe = replace(RECIPE, fresh=True, pair_size=(32, 48), crop_size=(32, 32))
+    training, held_out = sources(recipe, tmp_path)
+    expected = collage_sample(recipe.seed, 0, 5, 32, 48)
+    np.testing.assert_array_equal(training[5].left, expected.left)
+    np.testing.assert_array_equal(training[5].disparity_px, expected.disparity_px)
+    assert training.name(5) == f"collage 5 of seed {recipe.seed}"
+    assert [Batches(recipe, training).chosen(step) for step in (0, 7)] == [[0, 1], [14, 15]]
+    assert held_out.folder.name.startswith(f"seed{VALIDATION_SEED}-")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_held_out_sets_are_read_from_their_folders(rendered):
+    held_out = held_out_sets(
+        replace(RECIPE, held_out=(("rooms", str(rendered / "rooms")), ("all", str(rendered / "scenes"))))
+    )
+    assert {name: pairs.count for name, pairs in held_out.items()} == {"rooms": 6, "all": 6}
+
+
+def test_a_held_out_set_that_is_not_there_is_named(tmp_path):
+    message = complaint(held_out_sets, replace(RECIPE, held_out=(("rooms", str(tmp_path / "rooms")),)))
+    assert message.startswith(f"tiny: held_out: {tmp_path / 'rooms'}: expected pairs of `stereoweave synth")

@@ -29,6 +29,9 @@ from lightning_fabric.loggers.tensorboard import TensorBoardLogger
 from lightning_fabric.utilities.distributed import _destroy_dist_connection
 from rich.console import Console
 
+from stereoweave.data.packing import packed
+from stereoweave.data.shards import write_shard
+from stereoweave.error_classes import CLASSES
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.learn import checkpoint
 from stereoweave.learn import train as training
@@ -155,6 +158,39 @@ def test_a_folder_with_a_run_of_another_recipe_is_refused(folder, finished, tmp_
     assert finished.read_bytes() == before
 
 
+def test_a_run_goes_on_with_another_end_and_other_data(folder, finished):
+    recipe = replace(
+        RECIPE, steps=RECIPE.steps + 2, cool_down_steps=1, mix=(("collage", 1.0),), crop_size=(32, 64)
+    )
+    start = training._starting_point(recipe, finished)
+    assert (start.step, start.recipe) == (RECIPE.steps, recipe)
+    assert_same(start.optimiser, checkpoint.load(finished).optimiser)
+
+
+def test_a_run_is_kept_every_ten_minutes(folder, recipe_file, tmp_path, logger, monkeypatch):
+    last = tmp_path / "last.pt"
+    run = Run(RECIPE, training._starting_point(RECIPE, last), logger)
+    run.keep_now_and_then(3, last)
+    assert not last.exists()
+    now = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now + 601)
+    run.keep_now_and_then(3, last)
+    assert checkpoint.load(last).step == 3
+    run.keep_now_and_then(4, last)
+    assert checkpoint.load(last).step == 3
+
+
+def test_a_run_is_scored_by_class_on_the_held_out_sets_of_its_recipe(folder, tmp_path):
+    sample = replace(box_before_a_wall(np.random.default_rng(0)), camera=CAMERA)
+    (tmp_path / "boxes").mkdir()
+    write_shard(tmp_path / "boxes", "boxes", 0, [packed(sample, {})])
+    recipe = replace(RECIPE, name="scored", steps=2, held_out=(("boxes", str(tmp_path / "boxes")),))
+    kept = checkpoint.load(train(write(recipe, tmp_path / "scored.toml"), folder / "scored", QUIET))
+    assert kept.scores["boxes_epe_px"] > 0
+    parts = [kept.scores[f"boxes_{name}_bad1_percent"] for name in CLASSES]
+    assert sum(parts) == pytest.approx(kept.scores["boxes_bad1_percent"])
+
+
 def test_a_run_starts_from_the_averaged_weights_of_another(folder, finished):
     recipe = replace(RECIPE, name="second", start_from=str(finished))
     start = training._starting_point(recipe, folder / "second" / "last.pt")
@@ -165,17 +201,19 @@ def test_a_run_starts_from_the_averaged_weights_of_another(folder, finished):
     assert_same(start.weights, first.averaged)
 
 
-def test_a_loss_that_is_not_finite_stops_and_names_the_pairs(folder, tmp_path):
+def test_a_loss_that_is_not_finite_twice_stops_and_names_the_pairs(folder, tmp_path):
     broken = untrained()
     torch.nn.init.constant_(broken.to_match.weight, torch.nan)
     checkpoint.save(checkpoint_of(broken), tmp_path / "broken.pt")
     recipe = replace(RECIPE, name="broken", start_from=str(tmp_path / "broken.pt"))
     file = write(recipe, tmp_path / "broken.toml")
     pairs = KeptPairs(folder / "pairs", recipe.seed, recipe.pairs, PAIR_SIZE)
-    names = ", ".join(pairs.name(index) for index in Batches(recipe, pairs).chosen(0))
+    names = ", ".join(pairs.name(index) for index in Batches(recipe, pairs).chosen(1))
     with pytest.raises(StereoweaveError) as caught:
         train(file, folder / "broken", QUIET)
-    assert str(caught.value) == f"step 0: the loss is nan; its pairs are {names}"
+    assert str(caught.value) == (
+        f"step 1: the loss is nan; its pairs are {names}; step 0 was skipped for the like"
+    )
     assert not (folder / "broken" / "last.pt").exists()
 
 
@@ -218,19 +256,23 @@ def test_weights_of_another_network_are_refused_as_a_start(finished, tmp_path):
     )
 
 
-def test_a_gradient_that_is_not_finite_stops_before_it_reaches_the_weights(tmp_path, logger):
+def test_a_gradient_that_is_not_finite_never_reaches_the_weights_and_twice_stops(tmp_path, logger, caplog):
     recipe = recipe_of("fast_depth")
     run = Run(recipe, training._starting_point(recipe, tmp_path / "last.pt"), logger)
     network = run.network
-    before = [value.clone() for value in network.parameters()]
+    before = {name: value.clone() for name, value in network.state_dict().items()}
     # A product with infinity makes the gradient infinite and leaves the loss as it was.
     network.head.to_code.bias.register_hook(lambda gradient: gradient * torch.inf)
     batches = Batches(recipe, CAMERA_PAIRS)
-    assert complaint(run.step, 7, batches[7], batches) == (
-        f"step 7: the norm of the gradient is inf; its pairs are {', '.join(batches.names(7))}"
-    )
-    for value, earlier in zip(network.parameters(), before, strict=True):
-        assert torch.equal(value, earlier)
+    found = f"step 7: the norm of the gradient is inf; its pairs are {', '.join(batches.names(7))}"
+    run.step(7, batches[7], batches)
+    assert run.skipped == [7]
+    assert caplog.messages == [f"{found}; skipped"]
+    run.step(507, batches[507], batches)  # 500 steps later it is isolated still
+    assert complaint(run.step, 1006, batches[1006], batches).endswith("; step 507 was skipped for the like")
+    # Batch norms' statistics included.
+    assert_same(network.state_dict(), before)
+    assert_same(run.averaged.module.state_dict(), before)
     assert not run.optimiser.state_dict()["state"]
 
 

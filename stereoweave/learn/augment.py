@@ -23,9 +23,25 @@ def cut(sample: Sample, height: int, width: int, rng: np.random.Generator) -> Sa
     return Sample(**maps, camera=moved(sample.camera, start, top))
 
 
-def augment(sample: Sample, height: int, width: int, rng: np.random.Generator) -> Sample:
-    """A cut of the sample of the size asked for; disparity is scaled and moved along with it."""
-    sample = rescaled_cut(sample, height, width, rng)
+# The right crop lies at most this share of its width further to the right than the left one.
+_LARGEST_OFFSET = 0.14
+
+
+def augment(
+    sample: Sample, height: int, width: int, rng: np.random.Generator, offset_share: float = 0.0
+) -> Sample:
+    """A cut of the sample of the size asked for; disparity is scaled and moved along with it.
+
+    Args:
+        sample: What is cut.
+        height: In px.
+        width: In px.
+        rng: What all draws come from.
+        offset_share: Share of the samples whose right view is cut further to the right, by up to 14 % of the
+            width. Their disparity grows by as much, so that plain surfaces are not always far.
+    """
+    offset = rng.uniform(0, _LARGEST_OFFSET) if offset_share and rng.random() < offset_share else 0.0
+    sample = rescaled_cut(sample, height, width, rng, offset)
     # Without the right view's disparity a mirrored pair has nothing to learn from.
     if rng.random() < 0.5 and np.isfinite(sample.right_disparity_px).any():
         sample = mirrored(sample)
@@ -37,8 +53,13 @@ def augment(sample: Sample, height: int, width: int, rng: np.random.Generator) -
     return replace(sample, left=left, right=right)
 
 
-def rescaled_cut(sample: Sample, height: int, width: int, rng: np.random.Generator) -> Sample:
-    """A random part of the sample, scaled so that it fills height x width; its disparity scales with it."""
+def rescaled_cut(
+    sample: Sample, height: int, width: int, rng: np.random.Generator, offset: float = 0.0
+) -> Sample:
+    """A random part of the sample, scaled so that it fills height x width; its disparity scales with it.
+
+    The right view's part begins `offset` of its width, or as much as there is, further to the right.
+    """
     rows, columns = sample.disparity_px.shape
     smallest = max(height / rows, width / columns)
     scale = max(smallest, float(np.exp(rng.uniform(np.log(0.75), np.log(1.4)))))
@@ -47,28 +68,35 @@ def rescaled_cut(sample: Sample, height: int, width: int, rng: np.random.Generat
     scale_y = max(scale * stretch, height / rows)
     part_height, part_width = min(round(height / scale_y), rows), min(round(width / scale), columns)
     top = int(rng.integers(rows - part_height + 1))
-    start = int(rng.integers(columns - part_width + 1))
-    part = np.s_[top : top + part_height, start : start + part_width]
+    offset_px = min(round(offset * part_width), columns - part_width)
+    start = int(rng.integers(columns - part_width - offset_px + 1))
+    rows_of_part = slice(top, top + part_height)
+    here = rows_of_part, slice(start, start + part_width)
+    there = rows_of_part, slice(start + offset_px, start + offset_px + part_width)
     scale_x = width / part_width
+    camera = sample.camera and replace(sample.camera, doffs_px=sample.camera.doffs_px - offset_px)
 
     def picture(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
         shrinks = scale_x < 1 or height < part_height
         return cv2.resize(
-            image[part], (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+            image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
         )
 
     def nearest(values: np.ndarray) -> np.ndarray:
         # Never a mean across an edge.
-        return cv2.resize(values[part], (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+        return cv2.resize(values, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+
+    def disparity_px(values: np.ndarray) -> np.ndarray:
+        return (nearest(values) + np.float32(offset_px)) * np.float32(scale_x)
 
     return Sample(
-        left=picture(sample.left),
-        right=picture(sample.right),
-        disparity_px=nearest(sample.disparity_px) * np.float32(scale_x),
-        right_disparity_px=nearest(sample.right_disparity_px) * np.float32(scale_x),
-        occluded=nearest(sample.occluded.astype(np.uint8)) > 0,
-        right_occluded=nearest(sample.right_occluded.astype(np.uint8)) > 0,
-        camera=moved(sample.camera, start, top, scale_x, height / part_height),
+        left=picture(sample.left[here]),
+        right=picture(sample.right[there]),
+        disparity_px=disparity_px(sample.disparity_px[here]),
+        right_disparity_px=disparity_px(sample.right_disparity_px[there]),
+        occluded=nearest(sample.occluded[here].astype(np.uint8)) > 0,
+        right_occluded=nearest(sample.right_occluded[there].astype(np.uint8)) > 0,
+        camera=moved(camera, start, top, scale_x, height / part_height),
     )
 
 

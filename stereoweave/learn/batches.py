@@ -22,6 +22,7 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
         self.recipe, self.pairs = recipe, pairs
         self.mix = pairs if isinstance(pairs, Mix) else Mix((pairs,), (1.0,))
         self.parts = (ranks or Ranks()).share(recipe.micro_batches)
+        self._draw(0)
 
     def __getitem__(self, step: int) -> dict[str, torch.Tensor]:
         chosen = self.chosen(step)
@@ -44,20 +45,29 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
 
     def chosen(self, step: int) -> list[int]:
         """Indices of the pairs of a step: of each set every pair once before any comes again."""
-        end = (step + 1) * self.recipe.batch
-        # With those of all steps before, so that each step stands alone: 5 ms for 60,000 steps of 4.
-        drawn = self.mix.drawn(end, np.random.default_rng((self.recipe.seed, 0, 0, 1)))
-        turns = ((drawn[place], drawn[:place]) for place in range(end - self.recipe.batch, end))
-        return [self._index(int(which), int((before == which).sum())) for which, before in turns]
+        first, end = step * self.recipe.batch, (step + 1) * self.recipe.batch
+        while len(self._drawn) < end:
+            self._draw(2 * len(self._drawn) + end)
+        return [self._index(int(self._drawn[i]), int(self._turns[i])) for i in range(first, end)]
 
     def names(self, step: int) -> list[str]:
         """What errors call the pairs of a step."""
         return [self.pairs.name(index) for index in self.chosen(step)]
 
+    def _draw(self, places: int) -> None:
+        """Draw the set of each of the first places, and count how often it was drawn before."""
+        self._drawn = self.mix.drawn(places, np.random.default_rng((self.recipe.seed, 0, 0, 1)))
+        self._turns = np.zeros(places, np.int64)
+        for which in range(len(self.mix.sets)):
+            places_of_set = np.flatnonzero(self._drawn == which)
+            self._turns[places_of_set] = np.arange(len(places_of_set))
+
     def _cut(self, indices: list[int], key: tuple[int, ...]) -> list[Sample]:
-        rng = np.random.default_rng(key)
-        part = augment if self.recipe.augment else cut
-        return [part(known(self.pairs, index), *self.recipe.crop_size, rng) for index in indices]
+        rng, size = np.random.default_rng(key), self.recipe.crop_size
+        samples = (known(self.pairs, index) for index in indices)
+        if self.recipe.augment:
+            return [augment(sample, *size, rng, self.recipe.offset_share) for sample in samples]
+        return [cut(sample, *size, rng) for sample in samples]
 
     def _index(self, which: int, turn: int) -> int:
         """The index of the pair that a set gives when it is drawn for that time, counted from 0."""

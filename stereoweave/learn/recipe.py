@@ -20,8 +20,10 @@ _POSITIVE = (
     "max_depth_m",
 )
 _AT_LEAST = {"micro_batch": 0, "exponent": 1, "alpha_z": 0, "alpha_p": 0, "distribution": 0}
+_SHARES = ("offset_share", "robust")
 COLLAGE = "collage"
 Weights = tuple[tuple[str, float], ...]
+Folders = tuple[tuple[str, str], ...]
 TARGETS = ("disparity", "depth")
 _KINDS: dict[object, str] = {
     int: "a whole number",
@@ -29,6 +31,7 @@ _KINDS: dict[object, str] = {
     str: "a text in quotes",
     bool: "true or false",
     Weights: "a table of sets and their weights, such as collage = 0.5",
+    Folders: 'a table of names and folders, such as rooms = "held_out/rooms"',
 }
 
 
@@ -55,10 +58,13 @@ class Recipe:
             pairs (data/shards.py), and their weights, of which the ratios count. Scores stay the dataset's.
         split: how the frames of a dataset are parted, a name in SPLITS (data/splits.py).
         pairs: collage pairs made once and kept; later steps cut them differently.
+        fresh: whether a collage is painted each time one is drawn, and none is kept.
         pair_size: height and width of a kept collage pair.
         crop_size: height and width of what a step sees of a pair.
         augment: whether cuts are also scaled, mirrored and recoloured.
+        offset_share: share of the pairs whose right crop is moved to the right, so that the disparity grows.
         validation_pairs: pairs to score on, never trained on: of another seed, or from the held-out frames.
+        held_out: names of further sets to score on, and their folders of rendered pairs.
         validate_every: steps between two validations, each followed by a checkpoint.
         loss: a name in LOSSES: "weave" for WeaveNet, and the others, between codes, for the other networks.
         target: what a code stands for, "disparity" or "depth".
@@ -68,6 +74,7 @@ class Recipe:
         fit_exponent: p is fitted to the histogram of the training truth instead.
         alpha_z, alpha_p: weights of the loss between codes and of the projection loss.
         distribution: weight of WeaveNet's cross-entropies between levels; 0 leaves regression alone.
+        robust: share of the logarithm in WeaveNet's regression, which counts large errors less.
         vgg16_weights: file of the VGG-16 behind the perceptual loss.
     """
 
@@ -88,10 +95,13 @@ class Recipe:
     mix: Weights = ()
     split: str = "random"
     pairs: int = 4000
+    fresh: bool = False
     pair_size: tuple[int, int] = (320, 512)
     crop_size: tuple[int, int] = (256, 384)
     augment: bool = True
+    offset_share: float = 0.0
     validation_pairs: int = 64
+    held_out: Folders = ()
     validate_every: int = 500
     loss: str = "weave"
     target: str = "disparity"
@@ -102,6 +112,7 @@ class Recipe:
     alpha_z: float = 1.0
     alpha_p: float = 0.0
     distribution: float = 1.0
+    robust: float = 0.0
     vgg16_weights: str = ""
 
     @property
@@ -139,7 +150,8 @@ def recipe_from(values: dict[str, Any], source: str) -> Recipe:
         raise FormatError(f"{source}: missing key {missing[0]!r}; a recipe needs {', '.join(needed)}")
     settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
     # A table in TOML, pairs of set and weight in a checkpoint.
-    recipe = Recipe(**{**settings, "mix": tuple(dict(settings.get("mix", ())).items())})
+    tables = {name: tuple(dict(settings.get(name, ())).items()) for name in ("mix", "held_out")}
+    recipe = Recipe(**{**settings, **tables})
     _check_numbers(recipe, source)
     _check_sizes(recipe, source)
     _check_mix(recipe, source)
@@ -160,6 +172,9 @@ def _check_numbers(recipe: Recipe, source: str) -> None:
     for name, least in _AT_LEAST.items():
         if not least <= getattr(recipe, name) < math.inf:
             raise FormatError(f"{source}: {name} = {getattr(recipe, name)}, expected at least {least}")
+    for name in _SHARES:
+        if not 0 <= getattr(recipe, name) <= 1:
+            raise FormatError(f"{source}: {name} = {getattr(recipe, name)}, expected 0 to 1")
     if recipe.batch % (recipe.micro_batch or recipe.batch):
         raise FormatError(
             f"{source}: micro_batch = {recipe.micro_batch}, expected a divisor of batch = {recipe.batch}"
@@ -190,12 +205,13 @@ def _fits(value: object, expected: Any) -> bool:
         return isinstance(value, float | int) and not isinstance(value, bool)
     if expected in (int, str, bool):
         return type(value) is expected
-    if expected is Weights:
+    if expected in (Weights, Folders):
         pairs = list(value.items()) if isinstance(value, dict) else value
-        return isinstance(pairs, list | tuple) and all(_is_weighted(pair) for pair in pairs)
+        of = float if expected is Weights else str
+        return isinstance(pairs, list | tuple) and all(_is_named(pair, of) for pair in pairs)
     return isinstance(value, list | tuple) and len(value) == 2 and all(type(v) is int for v in value)
 
 
-def _is_weighted(pair: object) -> bool:
-    """Whether it is the name of a set and its weight."""
-    return isinstance(pair, list | tuple) and len(pair) == 2 and _fits(pair[0], str) and _fits(pair[1], float)
+def _is_named(pair: object, kind: type) -> bool:
+    """Whether it is a name and a value of that kind."""
+    return isinstance(pair, list | tuple) and len(pair) == 2 and _fits(pair[0], str) and _fits(pair[1], kind)

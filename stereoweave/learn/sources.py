@@ -11,7 +11,7 @@ from rich.console import Console
 from stereoweave.data.readers import DATASETS, Frame, open_dataset, split_frames
 from stereoweave.data.shards import Shards, list_shards
 from stereoweave.errors import FormatError
-from stereoweave.learn.collage import photograph
+from stereoweave.learn import collage
 from stereoweave.learn.pairs import KeptPairs
 from stereoweave.learn.recipe import COLLAGE, Recipe
 from stereoweave.progress import progress
@@ -39,7 +39,7 @@ class Source(Protocol):
 class Ordered(Protocol):
     """A source that is read faster in some orders than in others."""
 
-    def order(self, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
+    def order(self, rng: np.random.Generator) -> Int[np.ndarray, " n"] | range:
         """All of its indices, in an order to read them in."""
         ...
 
@@ -81,6 +81,25 @@ class Mix:
 
 
 @dataclass(frozen=True)
+class FreshCollages:
+    """Collages painted when they are drawn: as many as anyone asks for, and none is kept."""
+
+    seed: int
+    size: tuple[int, int]
+    count: int = 10**9
+
+    def __getitem__(self, index: int) -> Sample:
+        return collage.sample(self.seed, 0, index, *self.size)
+
+    def name(self, index: int) -> str:
+        return f"collage {index} of seed {self.seed}"
+
+    def order(self, rng: np.random.Generator) -> range:
+        """In turn: each is as random as the next."""
+        return range(self.count)
+
+
+@dataclass(frozen=True)
 class Photographed:
     """A rendered set, whose views are ideal, as two real cameras would give it; each pair always alike."""
 
@@ -93,7 +112,7 @@ class Photographed:
     def __getitem__(self, index: int) -> Sample:
         sample = self.shards[index]
         # As collages are: without noise, blur and other tones in one of the views, matching is too easy.
-        left, right = photograph(
+        left, right = collage.photograph(
             np.random.default_rng(index), sample.left.astype(np.float32), sample.right.astype(np.float32)
         )
         return replace(sample, left=left, right=right)
@@ -128,7 +147,7 @@ def sources(recipe: Recipe, folder: Path, whole: bool = False) -> tuple[Source, 
     Of the held-out frames of a dataset `validation_pairs` are taken, evenly spread, or all if `whole`.
     """
     if recipe.dataset == COLLAGE:
-        collages = KeptPairs(folder, recipe.seed, recipe.pairs, recipe.pair_size)
+        collages = _collages(recipe, folder)
         return (
             _mixed(recipe, collages) if recipe.mix else collages,
             KeptPairs(folder, VALIDATION_SEED, recipe.validation_pairs, recipe.pair_size),
@@ -144,6 +163,12 @@ def sources(recipe: Recipe, folder: Path, whole: bool = False) -> tuple[Source, 
     return Frames(training), Frames([held_out[i] for i in spread])
 
 
+def _collages(recipe: Recipe, folder: Path) -> Source:
+    if recipe.fresh:
+        return FreshCollages(recipe.seed, recipe.pair_size)
+    return KeptPairs(folder, recipe.seed, recipe.pairs, recipe.pair_size)
+
+
 def _mixed(recipe: Recipe, collages: Source) -> Mix:
     sets: list[Source] = []
     weights: list[float] = []
@@ -155,14 +180,29 @@ def _mixed(recipe: Recipe, collages: Source) -> Mix:
     return Mix(tuple(sets), tuple(weights))
 
 
-def _rendered(recipe: Recipe, folder: Path) -> list[Source]:
-    """The set in a folder, or those in the folders in it; FormatError for none, or one too small to cut."""
+def held_out_sets(recipe: Recipe) -> dict[str, Source]:
+    """The further sets that a recipe is scored on, by name; FormatError where one is not there."""
+    sets: dict[str, Source] = {}
+    for name, folder in recipe.held_out:
+        found = tuple(Photographed(Shards(path)) for path in _folders(recipe, "held_out", Path(folder)))
+        sets[name] = Mix(found, (1.0,) * len(found))
+    return sets
+
+
+def _folders(recipe: Recipe, key: str, folder: Path) -> list[Path]:
+    """The folder of a rendered set, or those in it; FormatError for none."""
     folders = [path for path in (folder, *sorted(folder.glob("*/"))) if list_shards(path)]
     if not folders:
         raise FormatError(
-            f"{recipe.name}: mix: {folder}: expected pairs of `stereoweave synth make`, or folders of such, "
-            "found none; make them first"
+            f"{recipe.name}: {key}: {folder}: expected pairs of `stereoweave synth make`, or folders of "
+            "such, found none; make them first"
         )
+    return folders
+
+
+def _rendered(recipe: Recipe, folder: Path) -> list[Source]:
+    """The set in a folder, or those in the folders in it; FormatError for none, or one too small to cut."""
+    folders = _folders(recipe, "mix", folder)
     sets: list[Source] = [Photographed(Shards(path)) for path in folders]
     for path, one in zip(folders, sets, strict=True):
         rows, columns = one[0].disparity_px.shape

@@ -52,5 +52,13 @@ class StepSums:
                 layer.num_batches_tracked -= self.count - 1
         return losses.tolist()
 
+    def undo(self) -> None:
+        """Give the batch norms the statistics that they had before the step."""
+        for value, before in zip(self.statistics, self.before, strict=True):
+            value.copy_(before)
+        for layer in self.norms:
+            if layer.num_batches_tracked is not None:
+                layer.num_batches_tracked -= 1
+
     def _gradients(self) -> list[Tensor]:
         return [value.grad for value in self.parameters if value.grad is not None]

@@ -38,14 +38,23 @@ from stereoweave.learn.models import network_of
 from stereoweave.learn.objective import fitted, naming, objective_of
 from stereoweave.learn.ranks import Ranks, ranks, threads_each, told_once
 from stereoweave.learn.recipe import COLLAGE, Recipe, read_recipe
-from stereoweave.learn.sources import Source, kept, sources
+from stereoweave.learn.sources import Source, held_out_sets, kept, sources
 from stereoweave.learn.sums import StepSums
+from stereoweave.learn.validate import validate_by_class
 from stereoweave.progress import progress
 
 # Beside a run's checkpoint: its scores after each validation.
 CURVE = "validation.csv"
+# A killed run loses no more than this, beside what it lost since its last validation.
+_KEEP_EVERY_S = 600
+# Steps with a loss or gradient that is not finite are skipped; a second one within this many stops the run.
+_STEPS_BETWEEN_SKIPS = 500
+# What a run may go on with where its recipe says otherwise than its last checkpoint's.
+_RESUMABLE = ("steps", "cool_down_steps", "mix", "pair_size", "crop_size", "validate_every", "held_out")
 # The others wait for the first one however long it makes pairs or scores: should it die, torchrun ends them.
 _PATIENCE = timedelta(days=1)
+
+_LOGGER = logging.getLogger(__name__)
 
 
 def train(recipe_path: Path, out: Path, console: Console | None = None) -> Path:
@@ -81,6 +90,7 @@ def train_recipe(recipe: Recipe, out: Path, console: Console) -> Path:
         began = time.perf_counter()
         for step, batch in _numbered_batches(batches, run.start.step):
             loss = run.step(step, batch, batches)
+            run.keep_now_and_then(step + 1, last)
             if (step + 1) % recipe.validate_every == 0 or step + 1 == recipe.steps:
                 if run.fabric.is_global_zero:
                     _validate(run, step + 1, held_out, last, console)
@@ -112,7 +122,11 @@ def _not_shared(out: Path) -> StereoweaveError:
 
 def _validate(run: "Run", steps: int, held_out: Source, last: Path, console: Console) -> None:
     """Score the run as it is after so many steps, and keep it and its scores."""
-    scores = run.objective.scores(run.averaged.module, held_out, run.fabric.device)
+    network, device = run.averaged.module, run.fabric.device
+    scores = run.objective.scores(network, held_out, device)
+    for name, pairs in run.by_class.items():
+        found = validate_by_class(network, pairs, device)
+        scores |= {f"{name}_{key}": value for key, value in found.items()}
     # First, because what is killed between the two then writes the same row again.
     record(last.with_name(CURVE), steps, scores)
     run.keep(steps, scores, last)
@@ -151,7 +165,7 @@ class Run:
     def __init__(
         self, recipe: Recipe, start: Checkpoint, logger: TensorBoardLogger, fabric: Fabric | None = None
     ) -> None:
-        self.recipe, self.start = recipe, start
+        self.recipe, self.start, self.by_class = recipe, start, held_out_sets(recipe)
         _keep_freed_memory()
         self.fabric = fabric or _fabric(logger)
         self.network = network_of(recipe)
@@ -175,29 +189,41 @@ class Run:
         if start.optimiser:
             self.optimiser.load_state_dict(start.optimiser)
         torch.set_rng_state(start.random_state)
-        self.began = time.monotonic()
+        self.began = self.kept = time.monotonic()
+        self.scores = start.scores
+        self.skipped: list[int] = []
 
     def step(self, step: int, batch: dict[str, torch.Tensor], batches: Batches) -> float:
-        """One step down the loss; returns the loss."""
+        """Take one step down the loss and return the loss.
+
+        A step whose loss or gradient is not finite changes nothing, and is counted and logged.
+
+        Raises:
+            StereoweaveError: Two such steps are closer than 500 steps.
+        """
         for group in self.optimiser.param_groups:
             group["lr"] = self.recipe.learning_rate_at(step)
         self.network.train()
-        terms = self._gradient(step, self.fabric.to_device(batch), batches)
+        sums = StepSums(self.network)
+        terms = self._gradient(step, self.fabric.to_device(batch), batches, sums)
         value = terms.pop("loss")
-        if not np.isfinite(value):
-            raise self._not_finite(step, f"the loss is {value}", batches)
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), max_norm=5.0)
-        if not norm.isfinite():
-            raise self._not_finite(step, f"the norm of the gradient is {norm}", batches)
+        if not (np.isfinite(value) and norm.isfinite()):
+            sums.undo()
+            found = f"the loss is {value}" if norm.isfinite() else f"the norm of the gradient is {norm}"
+            self._skip(step, found, batches)
+            return value
         self.optimiser.step()
         self.averaged.update_parameters(self.network)
         if step % 20 == 0:
             self.fabric.log_dict({"loss": value, **{f"loss/{k}": term for k, term in terms.items()}}, step)
         return value
 
-    def _gradient(self, step: int, batch: dict[str, torch.Tensor], batches: Batches) -> dict[str, float]:
+    def _gradient(
+        self, step: int, batch: dict[str, torch.Tensor], batches: Batches, sums: StepSums
+    ) -> dict[str, float]:
         """Give the weights the gradient of a step, of whichever process; returns the loss and its terms."""
-        sums, what = StepSums(self.network), f"step {step}: one of {', '.join(batches.names(step))}"
+        what = f"step {step}: one of {', '.join(batches.names(step))}"
         for part, values in zip(batches.parts, split(batch, len(batches.parts)), strict=True):
             if self.recipe.micro_batches > 1:
                 # Whichever process it is, dropout is the micro-batch's own.
@@ -213,12 +239,26 @@ class Run:
         means = sums.finish(self.fabric, self.recipe.micro_batches)
         return dict(zip(["loss", *terms], means, strict=True))
 
-    def _not_finite(self, step: int, what: str, batches: Batches) -> StereoweaveError:
-        return StereoweaveError(f"step {step}: {what}; its pairs are {', '.join(batches.names(step))}")
+    def _skip(self, step: int, found: str, batches: Batches) -> None:
+        found = f"step {step}: {found}; its pairs are {', '.join(batches.names(step))}"
+        if self.skipped and step - self.skipped[-1] < _STEPS_BETWEEN_SKIPS:
+            raise StereoweaveError(f"{found}; step {self.skipped[-1]} was skipped for the like")
+        self.skipped.append(step)
+        self.fabric.log_dict({"skipped_steps": float(len(self.skipped))}, step)
+        _LOGGER.warning("%s; skipped", found)
+
+    def keep_now_and_then(self, step: int, path: Path) -> None:
+        """Write the run as it is after `step` steps, if that is ten minutes after it was written last."""
+        if self.fabric.is_global_zero and time.monotonic() - self.kept > _KEEP_EVERY_S:
+            self._write(step, self.scores, path)
 
     def keep(self, step: int, scores: dict[str, float], path: Path) -> None:
         """Write the run as it is after `step` steps, and its scores to the curves."""
         self.fabric.log_dict({f"validation/{name}": score for name, score in scores.items()}, step)
+        self._write(step, scores, path)
+
+    def _write(self, step: int, scores: dict[str, float], path: Path) -> None:
+        self.kept, self.scores = time.monotonic(), scores
         state = replace(
             self.start,
             step=step,
@@ -236,12 +276,12 @@ def _starting_point(recipe: Recipe, last: Path) -> Checkpoint:
     """Where the run stands: its own last checkpoint, the averaged weights of another, or random weights."""
     if last.exists():
         found = checkpoint.load(last)
-        if found.recipe != recipe:
+        if replace(found.recipe, **{name: getattr(recipe, name) for name in _RESUMABLE}) != recipe:
             raise StereoweaveError(
                 f"{last}: is of another recipe ({found.recipe.name}); "
                 "train into a folder of its own, or remove it"
             )
-        return replace(found, commit=checkpoint.code_commit())
+        return replace(found, recipe=recipe, commit=checkpoint.code_commit())
     torch.manual_seed(recipe.seed)
     weights, hours = network_of(recipe).state_dict(), 0.0
     origin: tuple[dict[str, Any], ...] = ()
