@@ -171,3 +171,18 @@ def test_the_fast_painter_equals_the_plain_one(index):
         image, disparity_px = plain_view(scene, side)
         np.testing.assert_allclose(view.disparity_px, disparity_px, atol=1e-3)
         np.testing.assert_allclose(view.image, image, atol=0.5)
+
+
+@pytest.mark.parametrize("width", [384, 704, 1440])
+def test_no_disparity_exceeds_the_networks_reach_at_any_width(width):
+    # Fewer rows than columns: only the width matters, and painting takes time.
+    for index in range(60):
+        scene = draw_scene(np.random.default_rng((9, index)), 64, width)
+        greatest_px = max(layer.surface.over(layer.patch).max(initial=0) for layer in scene.layers)
+        assert greatest_px <= 188
+
+
+def test_the_range_of_a_narrow_pair_shrinks_with_its_width():
+    for index in range(60):
+        scene = draw_scene(np.random.default_rng((9, index)), 96, 192)
+        assert max(layer.surface.over(layer.patch).max(initial=0) for layer in scene.layers) <= 94

@@ -18,6 +18,7 @@ from stereoweave.synth.patterns import SIDE, Bank, bank, natural_colour
 PLANE_SLOPE = 0.3  # px of disparity a px: steeper surfaces are rare and nearly edge-on to one camera
 BEND_SLOPE = 0.25  # bends add to the plane; together below 0.6, so that no surface turns its back
 RELIEF = 0.3  # of the scene's greatest disparity: about how much one surface varies at most
+NETWORK_REACH_PX = 188  # no network finds a greater disparity
 CLEAN_SHARE = 0.25  # pairs without any photometric difference
 LEVELS = np.arange(1021, dtype=np.float32) / 4  # grey levels that a tone curve tells apart
 
@@ -149,9 +150,10 @@ def draw_scene(rng: np.random.Generator, height: int, width: int) -> Scene:
 
 
 def _draw_limit(rng: np.random.Generator, width: int) -> float:
-    """The scene's greatest disparity: log-uniform, mostly 10 to 110 px of 384, at times 6 to 190."""
-    low, high = (10, 110) if rng.random() < 0.7 else (6, 190)
-    return float(np.exp(rng.uniform(np.log(low), np.log(high)))) * width / 384
+    """The scene's greatest disparity: log-uniform, mostly 10 to 110 px at 384 columns, at times 6 to 188."""
+    low, high = (10, 110) if rng.random() < 0.7 else (6, NETWORK_REACH_PX)
+    # Wider views show more of a scene, not larger disparities: the network has an end.
+    return float(np.exp(rng.uniform(np.log(low), np.log(high)))) * min(width / 384, 1)
 
 
 def _draw_place(rng: np.random.Generator, smallest: float, width: int, height: int) -> Place:
