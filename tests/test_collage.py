@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from paint_reference import plain_view, rectangle, sampled
 
-from stereoweave.learn.collage import Layer, Scene, Surface, draw_scene, paint_scene, sample
+from stereoweave.learn.collage import paint_scene, sample
+from stereoweave.learn.collage_kinds import draw_scene
+from stereoweave.learn.collage_scene import Layer, Scene, Surface
 from stereoweave.learn.paint import Paint, occlusion
 from stereoweave.learn.shapes import everywhere
 
