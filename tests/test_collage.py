@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 from paint_reference import plain_view, rectangle, sampled
 
-from stereoweave.learn.collage import paint_scene, sample
+from stereoweave.learn.collage import (
+    FAULTS,
+    demosaiced,
+    paint_scene,
+    photograph,
+    sample,
+)
 from stereoweave.learn.collage_kinds import draw_scene
 from stereoweave.learn.collage_scene import Layer, Scene, Surface
 from stereoweave.learn.paint import Paint, occlusion
@@ -175,16 +181,37 @@ def test_the_fast_painter_equals_the_plain_one(index):
         np.testing.assert_allclose(view.image, image, atol=0.5)
 
 
-@pytest.mark.parametrize("width", [384, 704, 1440])
-def test_no_disparity_exceeds_the_networks_reach_at_any_width(width):
-    # Fewer rows than columns: only the width matters, and painting takes time.
-    for index in range(60):
-        scene = draw_scene(np.random.default_rng((9, index)), 64, width)
-        greatest_px = max(layer.surface.over(layer.patch).max(initial=0) for layer in scene.layers)
-        assert greatest_px <= 188
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_camera_with_a_fault_still_gives_grey_levels(fault, rng):
+    views = [rng.uniform(0, 255, (33, 48, 3)).astype(np.float32) for _ in range(2)]
+    for _ in range(5):
+        faulty = fault(rng, *views)
+        assert any((after != before).any() for after, before in zip(faulty, views, strict=True))
+        for view in faulty:
+            assert view.shape == (33, 48, 3) and view.dtype == np.float32
+            assert view.min() >= 0 and view.max() <= 255
 
 
-def test_the_range_of_a_narrow_pair_shrinks_with_its_width():
-    for index in range(60):
-        scene = draw_scene(np.random.default_rng((9, index)), 96, 192)
-        assert max(layer.surface.over(layer.patch).max(initial=0) for layer in scene.layers) <= 94
+def test_in_some_pairs_the_right_view_is_a_row_or_two_lower_or_higher():
+    step = np.zeros((48, 8, 3), np.float32)
+    step[24:] = 200
+    rows = []
+    for index in range(3000):
+        _, right = photograph(np.random.default_rng((8, index)), step, step)
+        levels = right[20:28].mean(axis=(1, 2))
+        # How many of the eight rows are bright, parts of rows included; four where nothing moved.
+        rows.append(((levels - levels.min()) / (levels.max() - levels.min())).sum())
+    moved_px = np.abs(np.array(rows) - 4)
+    # Half of the 3 % of pairs that have faults; the others are at most half a row apart.
+    assert 0.008 < (moved_px > 0.75).mean() < 0.022
+    assert 1.6 < moved_px.max() < 2.3
+
+
+def test_a_bayer_filter_keeps_plain_colours_and_what_its_pixels_saw(rng):
+    plain = np.tile(np.array([200.0, 100.0, 50.0], np.float32), (7, 9, 1))
+    np.testing.assert_array_equal(demosaiced(plain), plain)
+    image = np.round(rng.uniform(0, 255, (16, 20, 3))).astype(np.float32)
+    inner = demosaiced(image)[2:-2, 2:-2], image[2:-2, 2:-2]
+    for row, column, channel in [(0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2)]:
+        found, seen = (view[row::2, column::2, channel] for view in inner)
+        np.testing.assert_array_equal(found, seen)

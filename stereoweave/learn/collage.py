@@ -16,7 +16,11 @@ from stereoweave.learn.paint import Sheet, colour, cover, expose, occlusion, see
 from stereoweave.stereo import Sample
 
 CLEAN_SHARE = 0.25  # pairs without any photometric difference
+FAULTY_SHARE = 0.03  # pairs with faults that good cameras do not have
 LEVELS = np.arange(1021, dtype=np.float32) / 4  # grey levels that a tone curve tells apart
+
+
+View = Float[np.ndarray, "h w 3"]  # 0..255
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +78,8 @@ def photograph(
     rng: np.random.Generator, left: Float[np.ndarray, "h w 3"], right: Float[np.ndarray, "h w 3"]
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
     """The two images as two real cameras give them: a little apart in height, sharpness, tone and noise."""
+    if rng.random() < FAULTY_SHARE:
+        left, right = _with_faults(rng, left, right)
     if rng.random() < CLEAN_SHARE:
         plain, still = np.tile(LEVELS, (3, 1)), np.zeros((3, LEVELS.size), np.float32)
         return expose(left, plain, still, left), expose(right, plain, still, right)
@@ -98,6 +104,49 @@ def photograph(
         shown = expose(view, tone, deviation, noise)
         views.append(shown if quality is None else _through_jpeg(shown, quality))
     return views[0], views[1]
+
+
+def _with_faults(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
+    """The views with one to three of the faults, in the order in which light meets them."""
+    for fault in np.sort(rng.choice(len(FAULTS), rng.integers(1, 4), replace=False)):
+        left, right = FAULTS[fault](rng, left, right)
+    return left, right
+
+
+def _lowered(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
+    """Cameras that are one or two rows apart in height."""
+    return left, _shifted_down(right, rng.choice([-1, 1]) * rng.uniform(0.8, 2))
+
+
+def _blurred(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
+    """One lens out of focus."""
+    deviation_px, which = rng.uniform(0.7, 1.6), rng.integers(2)
+    if which:
+        return left, cv2.GaussianBlur(right, (0, 0), deviation_px)
+    return cv2.GaussianBlur(left, (0, 0), deviation_px), right
+
+
+def _darkened_corners(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
+    """Each lens with corners of its own darkness."""
+    own, other = (_vignette(left.shape[0], left.shape[1], rng.uniform(0.2, 0.7)) for _ in range(2))
+    return left * own, right * other
+
+
+def _interpolated(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
+    """Colours of which each pixel of one or both sensors saw but one."""
+    which = rng.integers(3)
+    return left if which == 1 else demosaiced(left), right if which == 2 else demosaiced(right)
+
+
+FAULTS = (_lowered, _blurred, _darkened_corners, _interpolated)
+
+
+def demosaiced(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """The image (0..255) behind a Bayer filter, the other two colours of each pixel interpolated."""
+    levels = np.round(image * 256).astype(np.uint16)
+    mosaic = levels[..., 1].copy()
+    mosaic[::2, ::2], mosaic[1::2, 1::2] = levels[::2, ::2, 0], levels[1::2, 1::2, 2]
+    return cv2.demosaicing(mosaic, cv2.COLOR_BayerBG2RGB).astype(np.float32) / 256
 
 
 def _draw_tone(rng: np.random.Generator, spread: float) -> Float[np.ndarray, "3 1021"]:
