@@ -9,10 +9,12 @@ from paint_reference import plain_view, rectangle, sampled
 
 from stereoweave.learn.collage import (
     FAULTS,
+    NOTHING_PX,
     demosaiced,
     paint_scene,
     photograph,
     sample,
+    training_sample,
 )
 from stereoweave.learn.collage_kinds import draw_scene
 from stereoweave.learn.collage_scene import Layer, Scene, Surface
@@ -179,6 +181,38 @@ def test_the_fast_painter_equals_the_plain_one(index):
         image, disparity_px = plain_view(scene, side)
         np.testing.assert_allclose(view.disparity_px, disparity_px, atol=1e-3)
         np.testing.assert_allclose(view.image, image, atol=0.5)
+
+
+@pytest.fixture(scope="module")
+def training_pairs():
+    return [training_sample(6, 0, index, 64, 96) for index in range(150)]
+
+
+def test_some_training_pairs_have_negative_disparities_and_the_others_are_ordinary(training_pairs):
+    negative = [pair.disparity_px.min() < 0 for pair in training_pairs]
+    assert 3 <= sum(negative) <= 18
+    for index in np.flatnonzero(~np.array(negative))[:20].tolist():
+        assert digest(training_pairs[index]) == digest(sample(6, 0, index, 64, 96))
+
+
+def test_a_training_pair_of_plain_noise_has_nothing_to_find(training_pairs):
+    noise = [pair for pair in training_pairs if pair.disparity_px.max() < 0]
+    assert noise
+    for pair in noise:
+        assert (pair.disparity_px == NOTHING_PX).all() and (pair.right_disparity_px == NOTHING_PX).all()
+        assert pair.occluded.all() and pair.right_occluded.all()
+        across = [np.corrcoef(np.diff(pair.left[y, :, 0]), np.diff(pair.right[y, :, 0])) for y in range(64)]
+        assert abs(np.mean(across, axis=0)[0, 1]) < 0.1
+
+
+def test_views_cut_apart_have_exact_disparities_on_both_sides_of_0(training_pairs):
+    apart = [pair for pair in training_pairs if pair.disparity_px.min() < 0 < pair.disparity_px.max()]
+    assert apart
+    for pair in apart:
+        assert 0.05 < (pair.disparity_px < 0).mean() < 0.95
+        assert pair.left.shape == (64, 96, 3)
+        there_px = sampled(pair.right_disparity_px[..., None], -pair.disparity_px)[..., 0]
+        assert np.median(np.abs(there_px - pair.disparity_px)[~pair.occluded]) < 1e-3
 
 
 @pytest.mark.parametrize("fault", FAULTS)

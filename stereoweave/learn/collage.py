@@ -8,15 +8,19 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from stereoweave.learn.collage_kinds import draw_scene
 from stereoweave.learn.collage_scene import Scene
 from stereoweave.learn.paint import Sheet, colour, cover, expose, occlusion, seen_from_right
 from stereoweave.stereo import Sample
+from stereoweave.synth.patterns import bank, natural_colour
 
 CLEAN_SHARE = 0.25  # pairs without any photometric difference
 FAULTY_SHARE = 0.03  # pairs with faults that good cameras do not have
+NOISE_SHARE = 0.02  # training pairs that show noise and nothing else
+CUT_APART_SHARE = 0.04  # training pairs whose disparities are partly negative
+NOTHING_PX = -8.0  # a disparity that no network claims, where there is nothing to find
 LEVELS = np.arange(1021, dtype=np.float32) / 4  # grey levels that a tone curve tells apart
 
 
@@ -38,13 +42,43 @@ def sample(seed: int, epoch: int, index: int, height: int = 256, width: int = 38
     are built at the first call, which takes some seconds.
     """
     rng = np.random.default_rng((seed, epoch, index))
+    return _photographed(rng, *_paint(rng, height, width))
+
+
+def training_sample(seed: int, epoch: int, index: int, height: int = 256, width: int = 384) -> Sample:
+    """As `sample`, but in one pair of 17 the disparity is partly or wholly below 0.
+
+    A network that clamps at 0 cannot find it; its confidence learns to say so. There are two kinds: views cut
+    apart, with exact disparities on both sides of 0, and plain noise, where all disparities are NOTHING_PX.
+    """
+    # Not the generator of `sample`, so that all other pairs are those of `sample`.
+    rng = np.random.default_rng((seed, epoch, index, 1))
+    kind = rng.random()
+    if kind < NOISE_SHARE:
+        return _plain_noise(rng, height, width)
+    if kind < NOISE_SHARE + CUT_APART_SHARE:
+        return _photographed(rng, *_cut_apart(rng, *_paint(rng, height, width + width // 4), width))
+    return sample(seed, epoch, index, height, width)
+
+
+def _paint(rng: np.random.Generator, height: int, width: int) -> tuple[Painting, Painting]:
+    """Both views of a random scene that has something to match."""
     while True:
         left, right = paint_scene(draw_scene(rng, height, width))
-        occluded = occlusion(left.disparity_px, right.disparity_px, -1)
-        right_occluded = occlusion(right.disparity_px, left.disparity_px, 1)
-        # A pair that shows nothing to match is drawn anew.
+        occluded, right_occluded = _occlusions(left, right)
         if occluded.mean() < 0.6 and right_occluded.mean() < 0.6 and left.image.std() > 6:
-            break
+            return left, right
+
+
+def _occlusions(left: Painting, right: Painting) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    return (
+        occlusion(left.disparity_px, right.disparity_px, -1),
+        occlusion(right.disparity_px, left.disparity_px, 1),
+    )
+
+
+def _photographed(rng: np.random.Generator, left: Painting, right: Painting) -> Sample:
+    occluded, right_occluded = _occlusions(left, right)
     left_image, right_image = photograph(rng, left.image, right.image)
     return Sample(
         left=left_image,
@@ -53,6 +87,42 @@ def sample(seed: int, epoch: int, index: int, height: int = 256, width: int = 38
         right_disparity_px=right.disparity_px,
         occluded=occluded,
         right_occluded=right_occluded,
+    )
+
+
+def _cut_apart(
+    rng: np.random.Generator, left: Painting, right: Painting, width: int
+) -> tuple[Painting, Painting]:
+    """Views of that width; the left one starts so far to the right that 10 to 70 % are below 0."""
+    spare = left.image.shape[1] - width
+    start = int(np.clip(np.ceil(np.quantile(left.disparity_px, rng.uniform(0.1, 0.7))), 1, spare))
+
+    def cut(view: Painting, first: int) -> Painting:
+        columns = np.s_[:, first : first + width]
+        return Painting(
+            image=view.image[columns], disparity_px=view.disparity_px[columns] - np.float32(start)
+        )
+
+    return cut(left, start), cut(right, 0)
+
+
+def _plain_noise(rng: np.random.Generator, height: int, width: int) -> Sample:
+    """Two views of one colour under smooth light, and each sensor's noise."""
+    lights = bank().lights
+    light = 1 + rng.uniform(0, 0.3) * (lights[rng.integers(len(lights))] - 1)
+    shown = natural_colour(rng) * cv2.resize(light, (width, height), interpolation=cv2.INTER_CUBIC)[..., None]
+    level = np.exp(rng.uniform(np.log(0.5), np.log(12)))
+    views = [shown + level * rng.standard_normal(shown.shape, np.float32) for _ in range(2)]
+    left, right = (np.clip(np.round(view), 0, 255).astype(np.uint8) for view in views)
+    nothing_px = np.full((height, width), NOTHING_PX, np.float32)
+    nowhere = np.ones((height, width), bool)
+    return Sample(
+        left=left,
+        right=right,
+        disparity_px=nothing_px,
+        right_disparity_px=nothing_px,
+        occluded=nowhere,
+        right_occluded=nowhere,
     )
 
 
