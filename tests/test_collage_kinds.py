@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from stereoweave.learn.collage import paint_scene
-from stereoweave.learn.collage_kinds import Canvas, draw_scene, draw_street
+from stereoweave.learn.collage_kinds import Canvas, draw_scene, draw_street, draw_training_scene
 from stereoweave.learn.collage_layers import draw_paint, plain_paint, unfocused_paint
 from stereoweave.learn.collage_scene import Layer, Scene, Surface
 from stereoweave.learn.shapes import Place, everywhere
@@ -14,7 +14,7 @@ HEIGHT, WIDTH = 320, 512
 @pytest.fixture(scope="module")
 def painted():
     """Disparity, its limit, and the image of the left views of 100 scenes as large as in training."""
-    scenes = [draw_scene(np.random.default_rng((7, index)), HEIGHT, WIDTH) for index in range(100)]
+    scenes = [draw_training_scene(np.random.default_rng((7, index)), HEIGHT, WIDTH) for index in range(100)]
     views = [(paint_scene(scene)[0], scene.layers[0].surface.limit_px) for scene in scenes]
     return [(view.disparity_px, limit_px, view.image) for view, limit_px in views]
 
@@ -35,19 +35,22 @@ def wall(paint, height=96, width=128):
     return paint_scene(Scene(layers=(layer,), height=height, width=width))[0].image
 
 
+@pytest.mark.parametrize("draw", [draw_scene, draw_training_scene])
 @pytest.mark.parametrize("width", [384, 704, 1440])
-def test_no_disparity_exceeds_the_networks_reach_at_any_width(width):
+def test_no_disparity_exceeds_the_networks_reach_at_any_width(draw, width):
     # Fewer rows than columns: only the width matters, and painting takes time.
     for index in range(60):
-        scene = draw_scene(np.random.default_rng((9, index)), 64, width)
+        scene = draw(np.random.default_rng((9, index)), 64, width)
         greatest_px = max(layer.surface.over(layer.patch).max(initial=0) for layer in scene.layers)
         assert greatest_px <= 188
 
 
-def test_the_range_of_a_narrow_pair_shrinks_with_its_width():
+@pytest.mark.parametrize("draw", [draw_scene, draw_training_scene])
+def test_the_range_of_a_narrow_pair_shrinks_with_its_width(draw):
+    # 190 px of 384 columns are 95 of 192.
     for index in range(60):
-        scene = draw_scene(np.random.default_rng((9, index)), 96, 192)
-        assert max(layer.surface.over(layer.patch).max(initial=0) for layer in scene.layers) <= 94
+        scene = draw(np.random.default_rng((9, index)), 96, 192)
+        assert max(layer.surface.over(layer.patch).max(initial=0) for layer in scene.layers) <= 95
 
 
 def test_plain_does_not_mean_far(painted):
@@ -76,7 +79,7 @@ def test_a_plain_paint_has_hardly_any_texture_and_an_unfocused_one_no_fine_one(r
 
 
 def test_a_street_rises_from_the_horizon_to_the_nearest_below():
-    canvas = Canvas(width=240, height=128, limit_px=40.0)
+    canvas = Canvas(view_width=192, height=128, limit_px=40.0)
     skies = 0
     for index in range(20):
         layers = draw_street(np.random.default_rng(index), canvas)
@@ -89,7 +92,7 @@ def test_a_street_rises_from_the_horizon_to_the_nearest_below():
 
 
 def test_what_stands_on_a_street_has_the_disparity_of_its_foot():
-    canvas = Canvas(width=240, height=128, limit_px=40.0)
+    canvas = Canvas(view_width=192, height=128, limit_px=40.0)
     for index in range(20):
         sky, ground, *others = draw_street(np.random.default_rng(index), canvas)
         flat = [layer.surface for layer in others if layer.surface.plane[1:3] == (0.0, 0.0)]

@@ -4,13 +4,14 @@ What transfers to photographs is natural textures and a wide spread of dispariti
 geometry, so a scene is a collage; its disparity is exact in both views all the same.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from stereoweave.learn.collage_kinds import draw_scene
+from stereoweave.learn.collage_kinds import draw_scene, draw_training_scene
 from stereoweave.learn.collage_scene import Scene
 from stereoweave.learn.paint import Sheet, colour, cover, expose, occlusion, seen_from_right
 from stereoweave.stereo import Sample
@@ -20,7 +21,7 @@ CLEAN_SHARE = 0.25  # pairs without any photometric difference
 FAULTY_SHARE = 0.03  # pairs with faults that good cameras do not have
 NOISE_SHARE = 0.02  # training pairs that show noise and nothing else
 CUT_APART_SHARE = 0.04  # training pairs whose disparities are partly negative
-NOTHING_PX = -8.0  # a disparity that no network claims, where there is nothing to find
+NOTHING_PX = -1000.0  # the disparity of what cannot be found; below 0 however the views are moved
 LEVELS = np.arange(1021, dtype=np.float32) / 4  # grey levels that a tone curve tells apart
 
 
@@ -42,29 +43,35 @@ def sample(seed: int, epoch: int, index: int, height: int = 256, width: int = 38
     are built at the first call, which takes some seconds.
     """
     rng = np.random.default_rng((seed, epoch, index))
-    return _photographed(rng, *_paint(rng, height, width))
+    return _photographed(rng, *_paint(rng, draw_scene, height, width))
 
 
 def training_sample(seed: int, epoch: int, index: int, height: int = 256, width: int = 384) -> Sample:
-    """As `sample`, but in one pair of 17 the disparity is partly or wholly below 0.
+    """As `sample`, but of more kinds of scenes; one pair of 17 is for the confidence alone.
 
-    A network that clamps at 0 cannot find it; its confidence learns to say so. There are two kinds: views cut
-    apart, with exact disparities on both sides of 0, and plain noise, where all disparities are NOTHING_PX.
+    In such a pair disparities are partly or wholly below 0, where a network that clamps at 0 cannot find
+    them. Either the views are cut apart, with exact disparities on both sides of 0, or they show plain noise
+    and all disparities are NOTHING_PX.
     """
-    # Not the generator of `sample`, so that all other pairs are those of `sample`.
     rng = np.random.default_rng((seed, epoch, index, 1))
     kind = rng.random()
     if kind < NOISE_SHARE:
         return _plain_noise(rng, height, width)
     if kind < NOISE_SHARE + CUT_APART_SHARE:
-        return _photographed(rng, *_cut_apart(rng, *_paint(rng, height, width + width // 4), width))
-    return sample(seed, epoch, index, height, width)
+        views = _paint(rng, draw_training_scene, height, width + width // 4)
+        return _photographed(rng, *_cut_apart(rng, *views, width))
+    return _photographed(rng, *_paint(rng, draw_training_scene, height, width))
 
 
-def _paint(rng: np.random.Generator, height: int, width: int) -> tuple[Painting, Painting]:
+def _paint(
+    rng: np.random.Generator,
+    draw: Callable[[np.random.Generator, int, int], Scene],
+    height: int,
+    width: int,
+) -> tuple[Painting, Painting]:
     """Both views of a random scene that has something to match."""
     while True:
-        left, right = paint_scene(draw_scene(rng, height, width))
+        left, right = paint_scene(draw(rng, height, width))
         occluded, right_occluded = _occlusions(left, right)
         if occluded.mean() < 0.6 and right_occluded.mean() < 0.6 and left.image.std() > 6:
             return left, right
@@ -148,8 +155,10 @@ def photograph(
     rng: np.random.Generator, left: Float[np.ndarray, "h w 3"], right: Float[np.ndarray, "h w 3"]
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
     """The two images as two real cameras give them: a little apart in height, sharpness, tone and noise."""
-    if rng.random() < FAULTY_SHARE:
-        left, right = _with_faults(rng, left, right)
+    # With numbers of their own, so that a pair without faults stays as it was before there were any.
+    fault_rng = rng.spawn(1)[0]
+    if fault_rng.random() < FAULTY_SHARE:
+        left, right = _with_faults(fault_rng, left, right)
     if rng.random() < CLEAN_SHARE:
         plain, still = np.tile(LEVELS, (3, 1)), np.zeros((3, LEVELS.size), np.float32)
         return expose(left, plain, still, left), expose(right, plain, still, right)

@@ -34,11 +34,16 @@ NETWORK_REACH_PX = 188  # no network finds a greater disparity
 
 @dataclass(frozen=True, kw_only=True)
 class Canvas:
-    """What layers are drawn on, in px, and the scene's greatest disparity."""
+    """What layers are drawn on, by the size of the views in px and the scene's greatest disparity."""
 
-    width: int
+    view_width: int
     height: int
     limit_px: float
+
+    @property
+    def width(self) -> int:
+        """Columns: those of the left view, and to their right those that only the right camera sees."""
+        return self.view_width + int(np.ceil(self.limit_px)) + 2
 
     def whole(self) -> Place:
         """The place that all of the canvas takes."""
@@ -58,34 +63,48 @@ class Canvas:
         return far_px + (self.limit_px - far_px) * nearness
 
 
+Kind = Callable[[np.random.Generator, Canvas], list[Layer]]
+
+
 def draw_scene(rng: np.random.Generator, height: int, width: int) -> Scene:
-    """The description of a scene of a random kind."""
-    limit_px = _draw_limit(rng, width)
-    # Left-image columns that only the right camera sees continue the canvas to the right.
-    canvas = Canvas(width=width + int(np.ceil(limit_px)) + 2, height=height, limit_px=limit_px)
-    draw = list(KINDS)[rng.choice(len(KINDS), p=list(KINDS.values()))]
-    # Far to near, so that the nearer of two soft edges is blended last.
-    layers = sorted(draw(rng, canvas), key=lambda layer: layer.surface.plane[0])
-    return Scene(layers=tuple(layers), height=height, width=width)
+    """The description of a mixed scene, as validation has them.
+
+    Its greatest disparity is log-uniform, mostly 10 to 110 px of 384, at times 6 to 188.
+    """
+    low, high = (10, 110) if rng.random() < 0.7 else (6, 190)
+    limit_px = float(np.exp(rng.uniform(np.log(low), np.log(high)))) * width / 384
+    return _draw(rng, draw_mixed, height, width, min(limit_px, NETWORK_REACH_PX))
 
 
-def _draw_limit(rng: np.random.Generator, width: int) -> float:
-    """The scene's greatest disparity: log-uniform, mostly 22 to 175 px at 384 columns, at times 6 to 188."""
+def draw_training_scene(rng: np.random.Generator, height: int, width: int) -> Scene:
+    """The description of a scene of any kind, with a wider baseline than those of validation.
+
+    Its greatest disparity is log-uniform, mostly 22 to 175 px, at times 6 to 188; less below 384 columns.
+    """
     low, high = (22, 175) if rng.random() < 0.7 else (6, NETWORK_REACH_PX)
     # Wider views show more of a scene, not larger disparities: the network has an end.
-    return float(np.exp(rng.uniform(np.log(low), np.log(high)))) * min(width / 384, 1)
+    limit_px = float(np.exp(rng.uniform(np.log(low), np.log(high)))) * min(width / 384, 1)
+    kind = list(KINDS)[rng.choice(len(KINDS), p=list(KINDS.values()))]
+    return _draw(rng, kind, height, width, limit_px)
+
+
+def _draw(rng: np.random.Generator, kind: Kind, height: int, width: int, limit_px: float) -> Scene:
+    canvas = Canvas(view_width=width, height=height, limit_px=limit_px)
+    # Far to near, so that the nearer of two soft edges is blended last.
+    layers = sorted(kind(rng, canvas), key=lambda layer: layer.surface.plane[0])
+    return Scene(layers=tuple(layers), height=height, width=width)
 
 
 def draw_mixed(rng: np.random.Generator, canvas: Canvas) -> list[Layer]:
     """One or two backgrounds, objects, and in half of the scenes bunches of rods."""
-    far_px = rng.uniform(0, 1) if rng.random() < 0.1 else canvas.limit_px * rng.uniform(0.08, 0.65)
+    far_px = rng.uniform(0, 1) if rng.random() < 0.1 else canvas.limit_px * rng.uniform(0.08, 0.5)
     layers = _draw_backgrounds(rng, canvas, far_px)
     bunches = int(rng.integers(1, 5)) if rng.random() < 0.5 else 0
     for k in range(rng.integers(6, 25)):
         thin = k < bunches
         place = canvas.anywhere(rng, 0.07 if thin else 0.012, 0.6)
         # Large things stand behind and rods in front more often than not, so that both leave much to see.
-        nearness = rng.random() ** (0.8 if thin else 1 + 3 * place.radius_px / canvas.width)
+        nearness = rng.random() ** (0.8 if thin else 1 + 3 * place.radius_px / canvas.view_width)
         patch = rods(rng, place) if thin else draw_shape(rng, place)
         layers.append(draw_layer(rng, patch, place, canvas.between(far_px, nearness), canvas.limit_px))
     return layers
@@ -94,23 +113,26 @@ def draw_mixed(rng: np.random.Generator, canvas: Canvas) -> list[Layer]:
 def _draw_backgrounds(rng: np.random.Generator, canvas: Canvas, far_px: float) -> list[Layer]:
     layers = [draw_layer(rng, _all_of(canvas), canvas.whole(), far_px, canvas.limit_px)]
     if rng.random() < 0.5:
-        rise = rng.uniform(0.3, 1.0)
-        layers.append(_draw_floor(rng, canvas, far_px, rise, draw_paint(rng, canvas.whole())))
+        layers.append(_draw_floor(rng, canvas, far_px, 0.3, draw_paint))
     return layers
 
 
 def _draw_floor(
-    rng: np.random.Generator, canvas: Canvas, start_px: float, rise: float, paint: Paint
+    rng: np.random.Generator,
+    canvas: Canvas,
+    start_px: float,
+    least_rise: float,
+    paint: Callable[[np.random.Generator, Place], Paint],
 ) -> Layer:
-    """A plane below a line where it has the disparity start_px; it rises by that share of what is left."""
+    """A plane below a line where it has the disparity start_px; it rises by a share of what is left."""
     horizon, tilt = rng.uniform(0.3, 0.8) * canvas.height, rng.normal(0, 0.1)
     # Its disparity is the same along the whole line.
-    slope = min(rise * (canvas.limit_px - start_px) / (canvas.height - horizon), PLANE_SLOPE)
-    middle_x = canvas.width / 2
+    rise = rng.uniform(least_rise, 1.0) * (canvas.limit_px - start_px) / (canvas.height - horizon)
+    slope, middle_x = min(rise, PLANE_SLOPE), canvas.width / 2
     return Layer(
         patch=below(horizon - tilt * middle_x, tilt, canvas.width, canvas.height),
         surface=Surface(plane=(start_px, -tilt * slope, slope, middle_x, horizon), limit_px=canvas.limit_px),
-        paint=paint,
+        paint=paint(rng, canvas.whole()),
     )
 
 
@@ -131,17 +153,16 @@ def draw_boards(rng: np.random.Generator, canvas: Canvas) -> list[Layer]:
 def _draw_plain_plane(rng: np.random.Generator, canvas: Canvas, far_px: float) -> Layer:
     """A board, in a quarter of the scenes a table, in a quarter a wall."""
     kind = rng.random()
-    paint = plain_paint(rng, canvas.whole())
     if kind < 0.25:
-        start_px = canvas.between(far_px, rng.uniform(0.1, 0.6))
-        return _draw_floor(rng, canvas, start_px, rng.uniform(0.5, 1), paint)
+        return _draw_floor(rng, canvas, canvas.between(far_px, rng.uniform(0.1, 0.6)), 0.5, plain_paint)
     level_px = canvas.between(far_px, rng.uniform(0.25, 0.85))
     place = canvas.whole()
     patch = _all_of(canvas)
     if kind < 0.75:
         place = canvas.anywhere(rng, 0.3, 0.8)
         patch = board(rng, place)
-    return Layer(patch=patch, surface=draw_plane(rng, place, level_px, canvas.limit_px), paint=paint)
+    surface = draw_plane(rng, place, level_px, canvas.limit_px)
+    return Layer(patch=patch, surface=surface, paint=plain_paint(rng, place))
 
 
 def _draw_signs(rng: np.random.Generator, canvas: Canvas, plain: Layer) -> list[Layer]:
@@ -301,8 +322,8 @@ def _all_of(canvas: Canvas) -> Patch:
     return everywhere(canvas.width, canvas.height)
 
 
-# The share of each kind.
-KINDS: dict[Callable[[np.random.Generator, Canvas], list[Layer]], float] = {
+# The share of each kind in training.
+KINDS: dict[Kind, float] = {
     draw_mixed: 0.6,
     draw_boards: 0.2,
     draw_street: 0.1,

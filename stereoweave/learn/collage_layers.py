@@ -2,7 +2,7 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from stereoweave.learn.collage_scene import Layer, Surface
 from stereoweave.learn.paint import Paint
@@ -57,59 +57,41 @@ def draw_surface(rng: np.random.Generator, place: Place, level_px: float, limit_
 
 def draw_paint(rng: np.random.Generator, place: Place) -> Paint:
     """A texture of any kind and colour, lit; a near-plain one in a fifth of the layers."""
-    family = bank().periodic if rng.random() < 0.12 else bank().natural
-    texture = family[rng.integers(len(family))]
-    plain = rng.random() < 0.2
-    to_colour = _toned_down(rng.uniform(0.01, 0.08), natural_colour(rng)) if plain else _draw_recolouring(rng)
-    return _draw_lit(rng, place, texture, to_colour, _draw_light(rng))
+    textures = bank()
+    family = textures.periodic if rng.random() < 0.12 else textures.natural
+    texels_per_px = rng.uniform(0.45, 1.0)
+    texels_per_light_px = 64 / (2 * place.radius_px + 40) * rng.uniform(0.3, 1.5)
+    return Paint(
+        texture=family[rng.integers(len(family))],
+        to_texture=_draw_mapping(rng, texels_per_px, SIDE),
+        to_colour=_draw_recolouring(rng),
+        light=textures.lights[rng.integers(len(textures.lights))],
+        to_light=_draw_mapping(rng, min(texels_per_light_px, 0.6), 64),
+        gloss=_draw_gloss(rng, place),
+    )
 
 
 def plain_paint(
     rng: np.random.Generator, place: Place, colour: Float[np.ndarray, "3"] | None = None
 ) -> Paint:
     """A colour with at most 3 % of a texture's contrast, under nearly even light."""
-    base = natural_colour(rng) if colour is None else colour
+    paint = draw_paint(rng, place)
     contrast = rng.uniform(0, 0.03) if rng.random() < 0.7 else 0.0
-    texture = bank().natural[rng.integers(len(bank().natural))]
-    evenness = rng.uniform(0, 0.35)
-    light = (1 + evenness * (_draw_light(rng) - 1)).astype(np.float32)
-    return _draw_lit(rng, place, texture, _toned_down(contrast, base), light)
+    light = 1 + rng.uniform(0, 0.35) * (paint.light - 1)
+    to_colour = _toned_down(contrast, natural_colour(rng) if colour is None else colour)
+    return paint._replace(to_colour=to_colour, light=light.astype(np.float32))
 
 
 def unfocused_paint(rng: np.random.Generator, place: Place) -> Paint:
     """A texture as a lens shows it that is focused elsewhere: without anything finer than 8 to 32 px."""
-    texture = bank().natural[rng.integers(len(bank().natural))]
-    texels = int(SIDE / rng.uniform(8, 32))
-    small = cv2.resize(texture, (texels, texels), interpolation=cv2.INTER_AREA)
-    smooth = cv2.resize(small, (SIDE // 2, SIDE // 2), interpolation=cv2.INTER_CUBIC)
-    paint = _draw_lit(rng, place, smooth, _draw_recolouring(rng), _draw_light(rng))
-    return paint._replace(to_texture=draw_mapping(rng, 0.5, SIDE // 2))
+    paint = draw_paint(rng, place)
+    texels, side = int(SIDE / rng.uniform(8, 32)), SIDE // 2
+    small = cv2.resize(paint.texture, (texels, texels), interpolation=cv2.INTER_AREA)
+    smooth = cv2.resize(small, (side, side), interpolation=cv2.INTER_CUBIC)
+    return paint._replace(texture=smooth, to_texture=_draw_mapping(rng, 0.5, side))
 
 
-def _draw_lit(
-    rng: np.random.Generator,
-    place: Place,
-    texture: UInt8[np.ndarray, "_ _ 3"],
-    to_colour: Float[np.ndarray, "3 4"],
-    light: Float[np.ndarray, "_ _"],
-) -> Paint:
-    texels_per_light_px = 64 / (2 * place.radius_px + 40) * rng.uniform(0.3, 1.5)
-    return Paint(
-        texture=texture,
-        to_texture=draw_mapping(rng, rng.uniform(0.45, 1.0), SIDE),
-        to_colour=to_colour,
-        light=light,
-        to_light=draw_mapping(rng, min(texels_per_light_px, 0.6), 64),
-        gloss=_draw_gloss(rng, place),
-    )
-
-
-def _draw_light(rng: np.random.Generator) -> Float[np.ndarray, "64 64"]:
-    return bank().lights[rng.integers(len(bank().lights))]
-
-
-def draw_mapping(rng: np.random.Generator, texels_per_px: float, side: int) -> Float[np.ndarray, "2 3"]:
-    """From x, y, 1 to places in a texture of that side, turned and shifted."""
+def _draw_mapping(rng: np.random.Generator, texels_per_px: float, side: int) -> Float[np.ndarray, "2 3"]:
     # Photographs keep their uprights more often than not.
     turn = rng.normal(0, 0.1) if rng.random() < 0.5 else rng.uniform(0, 2 * np.pi)
     cosine, sine = texels_per_px * np.cos(turn), texels_per_px * np.sin(turn)
@@ -117,18 +99,20 @@ def draw_mapping(rng: np.random.Generator, texels_per_px: float, side: int) -> F
     return np.array([[cosine, -sine, shift[0]], [sine, cosine, shift[1]]], np.float32)
 
 
-def _toned_down(contrast: float, colour: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 4"]:
-    return np.column_stack([contrast * np.eye(3), colour - contrast * 110]).astype(np.float32)
-
-
 def _draw_recolouring(rng: np.random.Generator) -> Float[np.ndarray, "3 4"]:
-    """A change of gain, tint and hue."""
+    """Of a texel's colour: a near-plain one in a fifth of the layers, else a change of gain, tint and hue."""
+    if rng.random() < 0.2:
+        return _toned_down(rng.uniform(0.01, 0.08), natural_colour(rng))
     gain = np.exp(rng.normal(0, 0.25) + rng.normal(0, 0.1, 3))
     mix = np.eye(3) * gain
     if rng.random() < 0.1:
         mix = mix[rng.permutation(3)]
     lift = rng.normal(0, 10)
     return np.column_stack([mix, np.full(3, lift)]).astype(np.float32)
+
+
+def _toned_down(contrast: float, colour: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 4"]:
+    return np.column_stack([contrast * np.eye(3), colour - contrast * 110]).astype(np.float32)
 
 
 def _draw_gloss(rng: np.random.Generator, place: Place) -> Float[np.ndarray, "6"]:
