@@ -37,7 +37,7 @@ class Painting:
 
 
 def sample(seed: int, epoch: int, index: int, height: int = 256, width: int = 384) -> Sample:
-    """Training pair number `index` of an epoch, with exact disparity and occlusion for both views.
+    """Mixed collage number `index` of an epoch, with exact disparity and occlusion for both views.
 
     The same arguments give the same pair in every process. Disparities are finite and >= 0. The textures
     are built at the first call, which takes some seconds.
@@ -47,10 +47,10 @@ def sample(seed: int, epoch: int, index: int, height: int = 256, width: int = 38
 
 
 def training_sample(seed: int, epoch: int, index: int, height: int = 256, width: int = 384) -> Sample:
-    """As `sample`, but of more kinds of scenes; one pair of 17 is for the confidence alone.
+    """A collage of any kind, with what `sample` gives; 6 % of the pairs are for the confidence alone.
 
-    In such a pair disparities are partly or wholly below 0, where a network that clamps at 0 cannot find
-    them. Either the views are cut apart, with exact disparities on both sides of 0, or they show plain noise
+    In those, disparities are partly or wholly below 0, where a network that clamps at 0 cannot find them.
+    Either the views are cut apart, with exact disparities on both sides of 0, or they show plain noise
     and all disparities are NOTHING_PX.
     """
     rng = np.random.default_rng((seed, epoch, index, 1))
@@ -100,7 +100,7 @@ def _photographed(rng: np.random.Generator, left: Painting, right: Painting) -> 
 def _cut_apart(
     rng: np.random.Generator, left: Painting, right: Painting, width: int
 ) -> tuple[Painting, Painting]:
-    """Views of that width; the left one starts so far to the right that 10 to 70 % are below 0."""
+    """Views of that width; the left one starts so far to the right that many disparities are below 0."""
     spare = left.image.shape[1] - width
     start = int(np.clip(np.ceil(np.quantile(left.disparity_px, rng.uniform(0.1, 0.7))), 1, spare))
 

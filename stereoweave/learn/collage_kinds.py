@@ -59,7 +59,7 @@ class Canvas:
         return self.place(rng.uniform(0, self.width), rng.uniform(0, self.height), radius_px)
 
     def between(self, far_px: float, nearness: float) -> float:
-        """The disparity that far from far_px to the greatest; nearness is in 0..1."""
+        """The disparity at a nearness of 0 (far_px) to 1 (the scene's greatest)."""
         return far_px + (self.limit_px - far_px) * nearness
 
 
@@ -151,7 +151,7 @@ def draw_boards(rng: np.random.Generator, canvas: Canvas) -> list[Layer]:
 
 
 def _draw_plain_plane(rng: np.random.Generator, canvas: Canvas, far_px: float) -> Layer:
-    """A board, in a quarter of the scenes a table, in a quarter a wall."""
+    """A board in half of the draws, a table in a quarter, a wall in a quarter."""
     kind = rng.random()
     if kind < 0.25:
         return _draw_floor(rng, canvas, canvas.between(far_px, rng.uniform(0.1, 0.6)), 0.5, plain_paint)
