@@ -7,7 +7,17 @@ import numpy as np
 import pytest
 from paint_reference import plain_view, rectangle, sampled
 
-from stereoweave.learn.collage import Layer, Scene, Surface, draw_scene, paint_scene, sample
+from stereoweave.learn.collage import (
+    FAULTS,
+    NOTHING_PX,
+    demosaiced,
+    paint_scene,
+    photograph,
+    sample,
+    training_sample,
+)
+from stereoweave.learn.collage_kinds import draw_scene, draw_training_scene
+from stereoweave.learn.collage_scene import Layer, Scene, Surface
 from stereoweave.learn.paint import Paint, occlusion
 from stereoweave.learn.shapes import everywhere
 
@@ -26,9 +36,9 @@ def flat(disparity_px):
     return Surface(plane=(disparity_px, 0.0, 0.0, 0.0, 0.0), waves=(), hills=(), limit_px=100.0)
 
 
-def matt_scene(index):
+def matt_scene(index, draw=draw_scene):
     """A scene without highlights, which are the one thing that moves on a surface."""
-    scene = draw_scene(np.random.default_rng(index), HEIGHT, WIDTH)
+    scene = draw(np.random.default_rng(index), HEIGHT, WIDTH)
     layers = tuple(
         dataclasses.replace(layer, paint=layer.paint._replace(gloss=np.zeros(6, np.float32)))
         for layer in scene.layers
@@ -90,10 +100,11 @@ def test_degenerate_pairs_do_not_come():
         assert pair.left.std() > 3
 
 
+@pytest.mark.parametrize("draw", [draw_scene, draw_training_scene])
 @pytest.mark.parametrize(("here", "there", "sign"), [(0, 1, -1), (1, 0, 1)])
-def test_the_other_view_shifted_by_the_exact_disparity_is_this_view(here, there, sign):
+def test_the_other_view_shifted_by_the_exact_disparity_is_this_view(here, there, sign, draw):
     for index in range(8):
-        views = paint_scene(matt_scene(index))
+        views = paint_scene(matt_scene(index, draw))
         hidden = occlusion(views[here].disparity_px, views[there].disparity_px, sign)
         shifted = sampled(views[there].image, sign * views[here].disparity_px)
         error = np.abs(shifted - views[here].image).mean(axis=2)[~hidden]
@@ -101,10 +112,11 @@ def test_the_other_view_shifted_by_the_exact_disparity_is_this_view(here, there,
         assert error.mean() < 6
 
 
+@pytest.mark.parametrize("draw", [draw_scene, draw_training_scene])
 @pytest.mark.parametrize(("here", "there", "sign"), [(0, 1, -1), (1, 0, 1)])
-def test_the_disparities_of_both_views_agree_where_both_see_a_surface(here, there, sign):
+def test_the_disparities_of_both_views_agree_where_both_see_a_surface(here, there, sign, draw):
     for index in range(8):
-        views = paint_scene(matt_scene(index))
+        views = paint_scene(matt_scene(index, draw))
         disparity_px, other_px = views[here].disparity_px, views[there].disparity_px
         hidden = occlusion(disparity_px, other_px, sign)
         error_px = np.abs(sampled(other_px[..., None], sign * disparity_px)[..., 0] - disparity_px)
@@ -157,17 +169,89 @@ def test_the_right_view_inverts_a_slope_exactly():
     np.testing.assert_allclose(right.disparity_px[2], (columns + 10) / 0.75 - columns, atol=1e-4)
 
 
-def test_surfaces_never_turn_their_back():
+@pytest.mark.parametrize("draw", [draw_scene, draw_training_scene])
+def test_surfaces_never_turn_their_back(draw):
     for index in range(30):
-        for layer in draw_scene(np.random.default_rng(index), HEIGHT, WIDTH).layers:
+        for layer in draw(np.random.default_rng(index), HEIGHT, WIDTH).layers:
             disparity_px = layer.surface.over(layer.patch)
             assert np.abs(np.diff(disparity_px, axis=1)).max(initial=0) < 0.6
 
 
+@pytest.mark.parametrize("draw", [draw_scene, draw_training_scene])
 @pytest.mark.parametrize("index", range(4))
-def test_the_fast_painter_equals_the_plain_one(index):
-    scene = draw_scene(np.random.default_rng(index), HEIGHT, WIDTH)
+def test_the_fast_painter_equals_the_plain_one(index, draw):
+    scene = draw(np.random.default_rng(index), HEIGHT, WIDTH)
     for side, view in enumerate(paint_scene(scene)):
         image, disparity_px = plain_view(scene, side)
         np.testing.assert_allclose(view.disparity_px, disparity_px, atol=1e-3)
         np.testing.assert_allclose(view.image, image, atol=0.5)
+
+
+@pytest.fixture(scope="module")
+def training_pairs():
+    return [training_sample(6, 0, index, 64, 96) for index in range(150)]
+
+
+def test_the_same_numbers_give_the_same_training_pair_and_not_the_one_of_validation(training_pairs):
+    assert digest(training_sample(6, 0, 9, 64, 96)) == digest(training_pairs[9])
+    assert digest(sample(6, 0, 9, 64, 96)) != digest(training_pairs[9])
+
+
+def test_some_training_pairs_have_negative_disparities(training_pairs):
+    assert 3 <= sum(pair.disparity_px.min() < 0 for pair in training_pairs) <= 18
+
+
+def test_a_training_pair_of_plain_noise_has_nothing_to_find(training_pairs):
+    noise = [pair for pair in training_pairs if pair.disparity_px.max() < 0]
+    assert noise
+    for pair in noise:
+        assert (pair.disparity_px == NOTHING_PX).all() and (pair.right_disparity_px == NOTHING_PX).all()
+        assert pair.occluded.all() and pair.right_occluded.all()
+        across = [np.corrcoef(np.diff(pair.left[y, :, 0]), np.diff(pair.right[y, :, 0])) for y in range(64)]
+        assert abs(np.mean(across, axis=0)[0, 1]) < 0.1
+
+
+def test_views_cut_apart_have_exact_disparities_on_both_sides_of_0(training_pairs):
+    apart = [pair for pair in training_pairs if pair.disparity_px.min() < 0 < pair.disparity_px.max()]
+    assert apart
+    for pair in apart:
+        assert 0.05 < (pair.disparity_px < 0).mean() < 0.95
+        assert pair.left.shape == (64, 96, 3)
+        there_px = sampled(pair.right_disparity_px[..., None], -pair.disparity_px)[..., 0]
+        assert np.median(np.abs(there_px - pair.disparity_px)[~pair.occluded]) < 1e-3
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_camera_with_a_fault_still_gives_grey_levels(fault, rng):
+    views = [rng.uniform(0, 255, (33, 48, 3)).astype(np.float32) for _ in range(2)]
+    for _ in range(5):
+        faulty = fault(rng, *views)
+        assert any((after != before).any() for after, before in zip(faulty, views, strict=True))
+        for view in faulty:
+            assert view.shape == (33, 48, 3) and view.dtype == np.float32
+            assert view.min() >= 0 and view.max() <= 255
+
+
+def test_in_some_pairs_the_right_view_is_a_row_or_two_lower_or_higher():
+    step = np.zeros((48, 8, 3), np.float32)
+    step[24:] = 200
+    rows = []
+    for index in range(3000):
+        _, right = photograph(np.random.default_rng((8, index)), step, step)
+        levels = right[20:28].mean(axis=(1, 2))
+        # How many of the eight rows are bright, parts of rows included; four where nothing moved.
+        rows.append(((levels - levels.min()) / (levels.max() - levels.min())).sum())
+    moved_px = np.abs(np.array(rows) - 4)
+    # Half of the 3 % of pairs that have faults; the others are at most half a row apart.
+    assert 0.008 < (moved_px > 0.75).mean() < 0.022
+    assert 1.6 < moved_px.max() < 2.3
+
+
+def test_a_bayer_filter_keeps_plain_colours_and_what_its_pixels_saw(rng):
+    plain = np.tile(np.array([200.0, 100.0, 50.0], np.float32), (7, 9, 1))
+    np.testing.assert_array_equal(demosaiced(plain), plain)
+    image = np.round(rng.uniform(0, 255, (16, 20, 3))).astype(np.float32)
+    inner = demosaiced(image)[2:-2, 2:-2], image[2:-2, 2:-2]
+    for row, column, channel in [(0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2)]:
+        found, seen = (view[row::2, column::2, channel] for view in inner)
+        np.testing.assert_array_equal(found, seen)

@@ -4,76 +4,28 @@ What transfers to photographs is natural textures and a wide spread of dispariti
 geometry, so a scene is a collage; its disparity is exact in both views all the same.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
-from stereoweave.learn.paint import Paint, Sheet, colour, cover, expose, occlusion, seen_from_right, surface
-from stereoweave.learn.shapes import Patch, Place, below, draw_shape, everywhere, rods
+from stereoweave.learn.collage_kinds import draw_scene, draw_training_scene
+from stereoweave.learn.collage_scene import Scene
+from stereoweave.learn.paint import Sheet, colour, cover, expose, occlusion, seen_from_right
 from stereoweave.stereo import Sample
-from stereoweave.synth.patterns import SIDE, Bank, bank, natural_colour
+from stereoweave.synth.patterns import bank, natural_colour
 
-PLANE_SLOPE = 0.3  # px of disparity a px: steeper surfaces are rare and nearly edge-on to one camera
-BEND_SLOPE = 0.25  # bends add to the plane; together below 0.6, so that no surface turns its back
-RELIEF = 0.3  # of the scene's greatest disparity: about how much one surface varies at most
 CLEAN_SHARE = 0.25  # pairs without any photometric difference
+FAULTY_SHARE = 0.03  # pairs with faults that good cameras do not have
+NOISE_SHARE = 0.02  # training pairs that show noise and nothing else
+CUT_APART_SHARE = 0.04  # training pairs whose disparities are partly negative
+NOTHING_PX = -1000.0  # the disparity of what cannot be found; below 0 however the views are moved
 LEVELS = np.arange(1021, dtype=np.float32) / 4  # grey levels that a tone curve tells apart
 
 
-@dataclass(frozen=True, kw_only=True)
-class Surface:
-    """Disparity over left-image x, y: a sum of products of a function of x and one of y, within 0..limit_px.
-
-    Attributes:
-        plane: disparity at the centre, its slopes along x and y, the centre's x and y.
-        waves: rows of amplitude_px, angular frequencies along x and y, phase.
-        hills: rows of height_px, centre x and y, inverse radii along x and y (0: a ridge, as on a cylinder).
-        limit_px: the greatest disparity of the scene.
-    """
-
-    plane: tuple[float, float, float, float, float]
-    waves: tuple[tuple[float, float, float, float], ...]
-    hills: tuple[tuple[float, float, float, float, float], ...]
-    limit_px: float
-
-    def over(self, patch: Patch) -> Float[np.ndarray, "h w"]:
-        """Disparity float32 at each pixel of the patch."""
-        x = np.arange(patch.field.shape[1], dtype=np.float32) + patch.left
-        y = np.arange(patch.field.shape[0], dtype=np.float32) + patch.top
-        level, slope_x, slope_y, centre_x, centre_y = self.plane
-        columns = [level + slope_x * (x - centre_x), np.ones_like(x)]
-        rows = [np.ones_like(y), slope_y * (y - centre_y)]
-        for amplitude, along_x, along_y, phase in self.waves:
-            columns += [amplitude * np.sin(along_x * x + phase), amplitude * np.cos(along_x * x + phase)]
-            rows += [np.cos(along_y * y), np.sin(along_y * y)]
-        for height, middle_x, middle_y, inverse_x, inverse_y in self.hills:
-            columns.append(height * np.exp(-(((x - middle_x) * inverse_x) ** 2)))
-            rows.append(np.exp(-(((y - middle_y) * inverse_y) ** 2)))
-        return surface(np.stack(columns).astype(np.float32), np.stack(rows).astype(np.float32), self.limit_px)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Layer:
-    """A surface within a silhouette, painted."""
-
-    patch: Patch
-    surface: Surface
-    paint: Paint
-
-    def sheet(self) -> Sheet:
-        """The layer as the left camera sees it."""
-        return Sheet(self.patch.field, self.surface.over(self.patch), self.patch.left, self.patch.top)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scene:
-    """Layers from far to near (by their centres), and the size of the views in px."""
-
-    layers: tuple[Layer, ...]
-    height: int
-    width: int
+View = Float[np.ndarray, "h w 3"]  # 0..255
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,19 +37,55 @@ class Painting:
 
 
 def sample(seed: int, epoch: int, index: int, height: int = 256, width: int = 384) -> Sample:
-    """Training pair number `index` of an epoch, with exact disparity and occlusion for both views.
+    """Mixed collage number `index` of an epoch, with exact disparity and occlusion for both views.
 
     The same arguments give the same pair in every process. Disparities are finite and >= 0. The textures
     are built at the first call, which takes some seconds.
     """
     rng = np.random.default_rng((seed, epoch, index))
+    return _photographed(rng, *_paint(rng, draw_scene, height, width))
+
+
+def training_sample(seed: int, epoch: int, index: int, height: int = 256, width: int = 384) -> Sample:
+    """A collage of any kind, with what `sample` gives; 6 % of the pairs are for the confidence alone.
+
+    In those, disparities are partly or wholly below 0, where a network that clamps at 0 cannot find them.
+    Either the views are cut apart, with exact disparities on both sides of 0, or they show plain noise
+    and all disparities are NOTHING_PX.
+    """
+    rng = np.random.default_rng((seed, epoch, index, 1))
+    kind = rng.random()
+    if kind < NOISE_SHARE:
+        return _plain_noise(rng, height, width)
+    if kind < NOISE_SHARE + CUT_APART_SHARE:
+        views = _paint(rng, draw_training_scene, height, width + width // 4)
+        return _photographed(rng, *_cut_apart(rng, *views, width))
+    return _photographed(rng, *_paint(rng, draw_training_scene, height, width))
+
+
+def _paint(
+    rng: np.random.Generator,
+    draw: Callable[[np.random.Generator, int, int], Scene],
+    height: int,
+    width: int,
+) -> tuple[Painting, Painting]:
+    """Both views of a random scene that has something to match."""
     while True:
-        left, right = paint_scene(draw_scene(rng, height, width))
-        occluded = occlusion(left.disparity_px, right.disparity_px, -1)
-        right_occluded = occlusion(right.disparity_px, left.disparity_px, 1)
-        # A pair that shows nothing to match is drawn anew.
+        left, right = paint_scene(draw(rng, height, width))
+        occluded, right_occluded = _occlusions(left, right)
         if occluded.mean() < 0.6 and right_occluded.mean() < 0.6 and left.image.std() > 6:
-            break
+            return left, right
+
+
+def _occlusions(left: Painting, right: Painting) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    return (
+        occlusion(left.disparity_px, right.disparity_px, -1),
+        occlusion(right.disparity_px, left.disparity_px, 1),
+    )
+
+
+def _photographed(rng: np.random.Generator, left: Painting, right: Painting) -> Sample:
+    occluded, right_occluded = _occlusions(left, right)
     left_image, right_image = photograph(rng, left.image, right.image)
     return Sample(
         left=left_image,
@@ -106,6 +94,42 @@ def sample(seed: int, epoch: int, index: int, height: int = 256, width: int = 38
         right_disparity_px=right.disparity_px,
         occluded=occluded,
         right_occluded=right_occluded,
+    )
+
+
+def _cut_apart(
+    rng: np.random.Generator, left: Painting, right: Painting, width: int
+) -> tuple[Painting, Painting]:
+    """Views of that width; the left one starts so far to the right that many disparities are below 0."""
+    spare = left.image.shape[1] - width
+    start = int(np.clip(np.ceil(np.quantile(left.disparity_px, rng.uniform(0.1, 0.7))), 1, spare))
+
+    def cut(view: Painting, first: int) -> Painting:
+        columns = np.s_[:, first : first + width]
+        return Painting(
+            image=view.image[columns], disparity_px=view.disparity_px[columns] - np.float32(start)
+        )
+
+    return cut(left, start), cut(right, 0)
+
+
+def _plain_noise(rng: np.random.Generator, height: int, width: int) -> Sample:
+    """Two views of one colour under smooth light, and each sensor's noise."""
+    lights = bank().lights
+    light = 1 + rng.uniform(0, 0.3) * (lights[rng.integers(len(lights))] - 1)
+    shown = natural_colour(rng) * cv2.resize(light, (width, height), interpolation=cv2.INTER_CUBIC)[..., None]
+    level = np.exp(rng.uniform(np.log(0.5), np.log(12)))
+    views = [shown + level * rng.standard_normal(shown.shape, np.float32) for _ in range(2)]
+    left, right = (np.clip(np.round(view), 0, 255).astype(np.uint8) for view in views)
+    nothing_px = np.full((height, width), NOTHING_PX, np.float32)
+    nowhere = np.ones((height, width), bool)
+    return Sample(
+        left=left,
+        right=right,
+        disparity_px=nothing_px,
+        right_disparity_px=nothing_px,
+        occluded=nowhere,
+        right_occluded=nowhere,
     )
 
 
@@ -127,138 +151,14 @@ def _paint_view(scene: Scene, sheets: list[Sheet], side: int) -> Painting:
     return Painting(image=image, disparity_px=nearest)
 
 
-def draw_scene(rng: np.random.Generator, height: int, width: int) -> Scene:
-    """A scene's description: one or two backgrounds, objects, and in half of the scenes bunches of rods."""
-    limit_px = _draw_limit(rng, width)
-    # Left-image columns that only the right camera sees continue the canvas to the right.
-    canvas_width = width + int(np.ceil(limit_px)) + 2
-    far_px = rng.uniform(0, 1) if rng.random() < 0.1 else limit_px * rng.uniform(0.08, 0.5)
-    layers = _draw_backgrounds(rng, far_px, limit_px, canvas_width, height)
-    bunches = int(rng.integers(1, 5)) if rng.random() < 0.5 else 0
-    for k in range(rng.integers(6, 25)):
-        thin = k < bunches
-        place = _draw_place(rng, 0.07 if thin else 0.012, canvas_width, height)
-        # Large things stand behind and rods in front more often than not, so that both leave much to see.
-        nearness = rng.random() ** (0.8 if thin else 1 + 3 * place.radius_px / width)
-        patch = rods(rng, place) if thin else draw_shape(rng, place)
-        level_px = far_px + (limit_px - far_px) * nearness
-        layers.append(_draw_layer(rng, patch, place, level_px, limit_px))
-    # Far to near, so that the nearer of two soft edges is blended last.
-    layers.sort(key=lambda layer: layer.surface.plane[0])
-    return Scene(layers=tuple(layers), height=height, width=width)
-
-
-def _draw_limit(rng: np.random.Generator, width: int) -> float:
-    """The scene's greatest disparity: log-uniform, mostly 10 to 110 px of 384, at times 6 to 190."""
-    low, high = (10, 110) if rng.random() < 0.7 else (6, 190)
-    return float(np.exp(rng.uniform(np.log(low), np.log(high)))) * width / 384
-
-
-def _draw_place(rng: np.random.Generator, smallest: float, width: int, height: int) -> Place:
-    radius_px = width * float(np.exp(rng.uniform(np.log(smallest), np.log(0.6))))
-    return Place(rng.uniform(0, width), rng.uniform(0, height), radius_px, width, height)
-
-
-def _draw_backgrounds(
-    rng: np.random.Generator, far_px: float, limit_px: float, width: int, height: int
-) -> list[Layer]:
-    middle = Place(width / 2, height / 2, width / 2, width, height)
-    layers = [_draw_layer(rng, everywhere(width, height), middle, far_px, limit_px)]
-    if rng.random() < 0.5:
-        horizon, tilt = rng.uniform(0.3, 0.8) * height, rng.normal(0, 0.1)
-        # Its disparity starts at the wall's along the whole line where the two meet.
-        rise = min(rng.uniform(0.3, 1.0) * (limit_px - far_px) / (height - horizon), PLANE_SLOPE)
-        plane = (far_px, -tilt * rise, rise, middle.x, horizon)
-        floor = Surface(plane=plane, waves=(), hills=(), limit_px=limit_px)
-        patch, paint = below(horizon - tilt * middle.x, tilt, width, height), _draw_paint(rng, bank(), middle)
-        layers.append(Layer(patch=patch, surface=floor, paint=paint))
-    return layers
-
-
-def _draw_layer(
-    rng: np.random.Generator, patch: Patch, place: Place, level_px: float, limit_px: float
-) -> Layer:
-    return Layer(
-        patch=patch,
-        surface=_draw_surface(rng, place, level_px, limit_px),
-        paint=_draw_paint(rng, bank(), place),
-    )
-
-
-def _draw_surface(rng: np.random.Generator, place: Place, level_px: float, limit_px: float) -> Surface:
-    """A plane, in half of the layers bent."""
-    relief_px = RELIEF * limit_px
-    slope = min(PLANE_SLOPE, relief_px / place.radius_px)
-    flat = rng.random() < 0.2
-    slope_x, slope_y = (0.0, 0.0) if flat else (slope * rng.triangular(-1, 0, 1, 2)).tolist()
-    waves, hills = [], []
-    bend = rng.random()
-    if bend < 0.25:
-        for _ in range(rng.integers(1, 4)):
-            frequency = 2 * np.pi / (place.radius_px * rng.uniform(0.5, 3) + 16)
-            turn = rng.uniform(0, np.pi)
-            amplitude = min(BEND_SLOPE / 3 / frequency, relief_px / 3) * rng.random()
-            along_x, along_y = frequency * np.cos(turn), frequency * np.sin(turn)
-            waves.append((amplitude, along_x, along_y, rng.uniform(0, 2 * np.pi)))
-    elif bend < 0.5:
-        radius_px = place.radius_px * rng.uniform(0.4, 1.2)
-        # The steepest slope of a Gaussian of this radius is 0.86 of its height over the radius.
-        height_px = min(BEND_SLOPE * radius_px / 0.86, relief_px) * rng.uniform(-0.4, 1)
-        keep = [(1, 1), (1, 0), (0, 1)][rng.integers(3)]
-        hills.append((height_px, place.x, place.y, keep[0] / radius_px, keep[1] / radius_px))
-    plane = (level_px, slope_x, slope_y, place.x, place.y)
-    return Surface(plane=plane, waves=tuple(waves), hills=tuple(hills), limit_px=limit_px)
-
-
-def _draw_paint(rng: np.random.Generator, textures: Bank, place: Place) -> Paint:
-    family = textures.periodic if rng.random() < 0.12 else textures.natural
-    texels_per_px = rng.uniform(0.45, 1.0)
-    texels_per_light_px = 64 / (2 * place.radius_px + 40) * rng.uniform(0.3, 1.5)
-    return Paint(
-        texture=family[rng.integers(len(family))],
-        to_texture=_draw_mapping(rng, texels_per_px, SIDE),
-        to_colour=_draw_recolouring(rng),
-        light=textures.lights[rng.integers(len(textures.lights))],
-        to_light=_draw_mapping(rng, min(texels_per_light_px, 0.6), 64),
-        gloss=_draw_gloss(rng, place),
-    )
-
-
-def _draw_mapping(rng: np.random.Generator, texels_per_px: float, side: int) -> Float[np.ndarray, "2 3"]:
-    # Photographs keep their uprights more often than not.
-    turn = rng.normal(0, 0.1) if rng.random() < 0.5 else rng.uniform(0, 2 * np.pi)
-    cosine, sine = texels_per_px * np.cos(turn), texels_per_px * np.sin(turn)
-    shift = rng.uniform(0, 2 * side, 2)
-    return np.array([[cosine, -sine, shift[0]], [sine, cosine, shift[1]]], np.float32)
-
-
-def _draw_recolouring(rng: np.random.Generator) -> Float[np.ndarray, "3 4"]:
-    """Of a texel's colour: a near-plain one in a fifth of the layers, else a change of gain, tint and hue."""
-    if rng.random() < 0.2:
-        contrast = rng.uniform(0.01, 0.08)
-        base = natural_colour(rng) - contrast * 110
-        return np.column_stack([contrast * np.eye(3), base]).astype(np.float32)
-    gain = np.exp(rng.normal(0, 0.25) + rng.normal(0, 0.1, 3))
-    mix = np.eye(3) * gain
-    if rng.random() < 0.1:
-        mix = mix[rng.permutation(3)]
-    lift = rng.normal(0, 10)
-    return np.column_stack([mix, np.full(3, lift)]).astype(np.float32)
-
-
-def _draw_gloss(rng: np.random.Generator, place: Place) -> Float[np.ndarray, "6"]:
-    """A highlight on a fifth of the layers; in the right view it has moved on the surface by up to 8 px."""
-    if rng.random() < 0.8:
-        return np.zeros(6, np.float32)
-    x, y = rng.normal([place.x, place.y], place.radius_px / 2)
-    inverse = 1 / (place.radius_px * rng.uniform(0.1, 0.5, 2) + 3)
-    return np.array([x, y, inverse[0], inverse[1], rng.uniform(30, 160), rng.uniform(-8, 8)], np.float32)
-
-
 def photograph(
     rng: np.random.Generator, left: Float[np.ndarray, "h w 3"], right: Float[np.ndarray, "h w 3"]
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
     """The two images as two real cameras give them: a little apart in height, sharpness, tone and noise."""
+    # With numbers of their own, so that a pair without faults stays as it was before there were any.
+    fault_rng = rng.spawn(1)[0]
+    if fault_rng.random() < FAULTY_SHARE:
+        left, right = _with_faults(fault_rng, left, right)
     if rng.random() < CLEAN_SHARE:
         plain, still = np.tile(LEVELS, (3, 1)), np.zeros((3, LEVELS.size), np.float32)
         return expose(left, plain, still, left), expose(right, plain, still, right)
@@ -283,6 +183,49 @@ def photograph(
         shown = expose(view, tone, deviation, noise)
         views.append(shown if quality is None else _through_jpeg(shown, quality))
     return views[0], views[1]
+
+
+def _with_faults(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
+    """The views with one to three of the faults, in the order in which light meets them."""
+    for fault in np.sort(rng.choice(len(FAULTS), rng.integers(1, 4), replace=False)):
+        left, right = FAULTS[fault](rng, left, right)
+    return left, right
+
+
+def _lowered(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
+    """Cameras that are one or two rows apart in height."""
+    return left, _shifted_down(right, rng.choice([-1, 1]) * rng.uniform(0.8, 2))
+
+
+def _blurred(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
+    """One lens out of focus."""
+    deviation_px, which = rng.uniform(0.7, 1.6), rng.integers(2)
+    if which:
+        return left, cv2.GaussianBlur(right, (0, 0), deviation_px)
+    return cv2.GaussianBlur(left, (0, 0), deviation_px), right
+
+
+def _darkened_corners(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
+    """Each lens with corners of its own darkness."""
+    own, other = (_vignette(left.shape[0], left.shape[1], rng.uniform(0.2, 0.7)) for _ in range(2))
+    return left * own, right * other
+
+
+def _interpolated(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
+    """Colours of which each pixel of one or both sensors saw but one."""
+    which = rng.integers(3)
+    return left if which == 1 else demosaiced(left), right if which == 2 else demosaiced(right)
+
+
+FAULTS = (_lowered, _blurred, _darkened_corners, _interpolated)
+
+
+def demosaiced(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """The image (0..255) behind a Bayer filter, the other two colours of each pixel interpolated."""
+    levels = np.round(image * 256).astype(np.uint16)
+    mosaic = levels[..., 1].copy()
+    mosaic[::2, ::2], mosaic[1::2, 1::2] = levels[::2, ::2, 0], levels[1::2, 1::2, 2]
+    return cv2.demosaicing(mosaic, cv2.COLOR_BayerBG2RGB).astype(np.float32) / 256
 
 
 def _draw_tone(rng: np.random.Generator, spread: float) -> Float[np.ndarray, "3 1021"]:

@@ -81,6 +81,43 @@ def rods(rng: np.random.Generator, place: Place) -> Patch:
     return _from_strokes(tuple(strokes), place)
 
 
+def board(rng: np.random.Generator, place: Place) -> Patch:
+    """A rectangle seen from aside, mostly upright; its half width is the place's half extent."""
+    turn = rng.normal(0, 0.06) if rng.random() < 0.8 else rng.uniform(0, np.pi)
+    half_height = rng.uniform(0.4, 1.1)
+    corners = np.array([[-1, -half_height], [1, -half_height], [1, half_height], [-1, half_height]])
+    # A farther side is a shorter one.
+    corners[:, 1] *= 1 + rng.uniform(-0.15, 0.15) * corners[:, 0]
+    turned = corners @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    return polygon([place.x, place.y] + place.radius_px * turned, place)
+
+
+def pillar(rng: np.random.Generator, place: Place) -> Patch:
+    """A bar across the canvas, mostly upright; its half width is the place's half extent."""
+    turn = np.pi / 2 + rng.normal(0, 0.05) if rng.random() < 0.8 else rng.uniform(0, np.pi)
+    reach = np.hypot(place.width, place.height) + place.radius_px
+    along = reach * np.array([np.cos(turn), np.sin(turn)])
+    across = place.radius_px * np.array([-np.sin(turn), np.cos(turn)])
+    corners = np.stack([along + across, across - along, -along - across, along - across])
+    return polygon([place.x, place.y] + corners, place)
+
+
+def post(place: Place, half_width_px: float, foot_y: float) -> Patch:
+    """An upright stroke from the top of the place down to foot_y."""
+    points = np.array([[place.x, place.y - place.radius_px], [place.x, foot_y]])
+    return _from_strokes(((points, half_width_px),), place)
+
+
+def polygon(corners: Points, place: Place) -> Patch:
+    """The inside of a polygon, cut to the canvas of the place."""
+    return _from_outline(place, corners)
+
+
+def softened(patch: Patch) -> Patch:
+    """The patch with edges 4 px wide, as out of focus; what is plainly inside stays opaque."""
+    return Patch(patch.field * np.float32(0.5 / REACH_PX), patch.left, patch.top)
+
+
 def _from_outline(place: Place, *contours: Points) -> Patch:
     left, top, shape = place.box(np.concatenate(contours), MARGIN_PX)
     return Patch(outline_field(contours, left, top, shape), left, top)
