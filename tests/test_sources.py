@@ -11,7 +11,7 @@ from stereoweave.data.packing import packed
 from stereoweave.data.shards import Shards, write_shard
 from stereoweave.learn import pairs as the_pairs
 from stereoweave.learn.batches import Batches
-from stereoweave.learn.collage import sample as collage_sample
+from stereoweave.learn.collage import training_sample
 from stereoweave.learn.pairs import KeptPairs
 from stereoweave.learn.sources import VALIDATION_SEED, Mix, Source, held_out_sets, kept, sources
 
@@ -181,7 +181,7 @@ def test_a_set_that_is_smaller_than_the_crop_is_named(rendered, tmp_path):
 def test_fresh_collages_are_those_of_the_seed_and_none_is_kept(tmp_path):
     recipe = replace(RECIPE, fresh=True, pair_size=(32, 48), crop_size=(32, 32))
     training, held_out = sources(recipe, tmp_path)
-    expected = collage_sample(recipe.seed, 0, 5, 32, 48)
+    expected = training_sample(recipe.seed, 0, 5, 32, 48)
     np.testing.assert_array_equal(training[5].left, expected.left)
     np.testing.assert_array_equal(training[5].disparity_px, expected.disparity_px)
     assert training.name(5) == f"collage 5 of seed {recipe.seed}"

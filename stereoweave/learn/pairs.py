@@ -18,7 +18,12 @@ from stereoweave.stereo import Sample
 _DISPARITY_SCALE = 256
 # A collage has no camera.
 _MAPS = [field.name for field in fields(Sample) if field.name != "camera"]
-_SOURCES = ("learn/collage.py", "learn/paint.py", "learn/shapes.py", "synth/patterns.py")
+_SOURCES = (
+    *(f"learn/collage{part}.py" for part in ("", "_kinds", "_layers", "_scene")),
+    "learn/paint.py",
+    "learn/shapes.py",
+    "synth/patterns.py",
+)
 
 
 class KeptPairs:

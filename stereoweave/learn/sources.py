@@ -82,14 +82,14 @@ class Mix:
 
 @dataclass(frozen=True)
 class FreshCollages:
-    """Collages painted when they are drawn: as many as anyone asks for, and none is kept."""
+    """Collages of the training's kinds, painted when they are drawn; none is kept."""
 
     seed: int
     size: tuple[int, int]
     count: int = 10**9
 
     def __getitem__(self, index: int) -> Sample:
-        return collage.sample(self.seed, 0, index, *self.size)
+        return collage.training_sample(self.seed, 0, index, *self.size)
 
     def name(self, index: int) -> str:
         return f"collage {index} of seed {self.seed}"
