@@ -9,7 +9,7 @@ from stereoweave.synth.furniture import shelf
 from stereoweave.synth.parts import boxes, lathe, sheet, spheres, tubes
 from stereoweave.synth.solids import Skin
 from stereoweave.synth.stage import Palette
-from stereoweave.synth.surfaces import chosen, muted, surface
+from stereoweave.synth.surfaces import broad, chosen, muted, surface
 from stereoweave.synth.world import Lamp, Material, Mesh, joined
 
 Corner = tuple[float, float, float]
@@ -34,17 +34,17 @@ def shell(
     """
     x, y, height_m = (float(v) for v in size_m)
     distance_m = 0.6 * max(x, y)
-    floor = palette.add(chosen(rng, _FLOORS, distance_m))
+    floor = palette.add(broad(rng, _FLOORS, distance_m))
     parts = [_panel(rng, (-x / 2, -y / 2, 0), (x, 0, 0), (0, y, 0), floor)]
     if not open_roof:
-        ceiling = palette.add(chosen(rng, _CEILINGS, distance_m))
+        ceiling = palette.add(broad(rng, _CEILINGS, distance_m))
         parts.append(_panel(rng, (-x / 2, y / 2, height_m), (x, 0, 0), (0, -y, 0), ceiling))
-    common = palette.add(chosen(rng, _WALLS, distance_m))
+    common = palette.add(broad(rng, _WALLS, distance_m))
     trim = palette.add(chosen(rng, ("wood", "paint", "plain"), distance_m))
     for side in range(4):
         if side == open_side:
             continue
-        wall = common if rng.random() < 0.6 else palette.add(chosen(rng, _WALLS, distance_m))
+        wall = common if rng.random() < 0.6 else palette.add(broad(rng, _WALLS, distance_m))
         length_m, away_m = (y, x / 2) if side % 2 == 0 else (x, y / 2)
         panel = _panel(rng, (-length_m / 2, 0, 0), (0, 0, height_m), (length_m, 0, 0), wall)
         skirting = boxes([[0, 0.01, 0.05]], [[length_m, 0.05, 0.1]], trim)
