@@ -12,6 +12,7 @@ from stereoweave.synth.scenes.pylon import pylon
 from stereoweave.synth.scenes.refinery import refinery
 from stereoweave.synth.scenes.rooms import rooms
 from stereoweave.synth.scenes.ship import ship
+from stereoweave.synth.scenes.street import street
 from stereoweave.synth.scenes.wind_turbine import wind_turbine
 from stereoweave.synth.stage import Stage
 
@@ -24,5 +25,6 @@ SCENES: dict[str, Callable[[np.random.Generator], Stage]] = {
     "refinery": refinery,
     "rooms": rooms,
     "ship": ship,
+    "street": street,
     "wind_turbine": wind_turbine,
 }
