@@ -155,7 +155,7 @@ def street_furniture(rng: np.random.Generator, palette: Palette, plan: StreetPla
 
 
 def _ground(rng: np.random.Generator, family: str, span_m: float) -> Material:
-    grey = rng.uniform(0.3, 0.7) if family == "plain" else rng.uniform(0.8, 1.1)
+    grey = rng.uniform(0.08, 0.4) if family == "plain" else rng.uniform(0.8, 1.1)
     return Material(
         texture=family,
         variant=int(rng.integers(64)),

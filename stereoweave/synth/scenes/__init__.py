@@ -7,6 +7,7 @@ import numpy as np
 from stereoweave.synth.scenes.antenna import antenna
 from stereoweave.synth.scenes.bridge import bridge
 from stereoweave.synth.scenes.crane import crane
+from stereoweave.synth.scenes.figures import figures
 from stereoweave.synth.scenes.propeller import propeller
 from stereoweave.synth.scenes.pylon import pylon
 from stereoweave.synth.scenes.refinery import refinery
@@ -20,6 +21,7 @@ SCENES: dict[str, Callable[[np.random.Generator], Stage]] = {
     "antenna": antenna,
     "bridge": bridge,
     "crane": crane,
+    "figures": figures,
     "propeller": propeller,
     "pylon": pylon,
     "refinery": refinery,

@@ -6,14 +6,14 @@ import numpy as np
 from jaxtyping import Float
 
 from stereoweave.synth.clutter import Space, clutter
-from stereoweave.synth.interiors import lamps_at, pendants, shell
+from stereoweave.synth.interiors import indoor_light, lamp_spots, lamps_at, pendants, shell
 from stereoweave.synth.parts import boxes, turn
 from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
 from stereoweave.synth.surfaces import chosen
 from stereoweave.synth.surroundings import bushes, daylight, hills, houses, places, rocks, terrain, trees
 from stereoweave.synth.table_tops import draw_table_top, table_top
-from stereoweave.synth.world import Colour, Lamp, Mesh, Sky, World, joined
+from stereoweave.synth.world import Mesh, World, joined
 
 # The cameras of one world see nearly the same, so that things can be placed where all of them see them.
 _SWING_DEG = 12.0
@@ -53,14 +53,14 @@ def _table_top(rng: np.random.Generator) -> Stage:
     )
     things = clutter(rng, palette, space)
     towards_cameras = turn((0, 0, 1), azimuth_deg + _SWING_DEG / 2)
-    spots_m = _lamp_spots(rng, space, size_m)
+    spots_m = lamp_spots(rng, size_m, space.eyes_m())
     lamps = lamps_at(rng, spots_m)
     parts = [
         table_top(rng, palette, sizes).placed(towards_cameras),
         shell(rng, palette, size_m, open_roof=False, open_side=None),
         pendants(rng, palette, spots_m, float(size_m[2])),
     ]
-    sky, exposure = _indoors(rng, daylight(rng)[0], lamps)
+    sky, exposure = indoor_light(rng, daylight(rng)[0], lamps)
     mesh = joined([*parts, *(thing.as_target() for thing in things)])
     world = World(mesh=mesh, materials=tuple(palette.materials), sky=sky, lamps=lamps, exposure=exposure)
     return Stage(world=world, orbit=orbit, nearest_px=_NEAREST_PX)
@@ -78,14 +78,14 @@ def _room(rng: np.random.Generator) -> Stage:
         far_m=orbit.distance_m[1] + 0.45 * float(size_m[:2].max()),
     )
     things = clutter(rng, palette, space)
-    spots_m = _lamp_spots(rng, space, size_m)
+    spots_m = lamp_spots(rng, size_m, space.eyes_m())
     lamps = lamps_at(rng, spots_m)
     parts = [shell(rng, palette, size_m, open_roof=open_roof, open_side=open_side)]
     sky, _, exposure = daylight(rng)
     if not open_roof:
         parts.append(pendants(rng, palette, spots_m, float(size_m[2])))
     if not open_roof and open_side is None:
-        sky, exposure = _indoors(rng, sky, lamps)
+        sky, exposure = indoor_light(rng, sky, lamps)
     else:
         parts.append(terrain(rng, palette, "grass", extent_m=80.0, level_m=-0.2, flat_radius_m=9.0))
         parts.append(trees(rng, palette, places(rng, 14, 12.0, 40.0)))
@@ -173,29 +173,3 @@ def _orbit_inside(rng: np.random.Generator, size_m: Float[np.ndarray, "3"]) -> O
         aim_m=0.25,
         floor_m=0.4,
     )
-
-
-def _lamp_spots(
-    rng: np.random.Generator, space: Space, size_m: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "n 3"]:
-    """Spots of one to four lamps in the upper part of a room, away from the cameras."""
-    low_m, high_m = size_m * [-0.4, -0.4, 0.68], size_m * [0.4, 0.4, 0.85]
-    spots_m = rng.uniform(low_m, high_m, (40, 3))
-    clear_m = np.linalg.norm(spots_m[:, None] - space.eyes_m(), axis=2).min(1)
-    return spots_m[np.argsort(clear_m < 1.0, kind="stable")[: rng.integers(1, 5)]]
-
-
-def _indoors(rng: np.random.Generator, sky: Sky, lamps: Sequence[Lamp]) -> tuple[Sky, float]:
-    """A sky whose light comes from walls rather than from the sun, and the exposure for a room."""
-    ambient = rng.uniform(0.15, 0.6)
-    warm = np.array([1.0, 0.95, 0.87])
-
-    def shaded(share: float) -> Colour:
-        red, green, blue = (ambient * share * warm * rng.uniform(0.95, 1.05, 3)).tolist()
-        return red, green, blue
-
-    room_light = Sky(
-        sun=sky.sun, sun_light=(0.0, 0.0, 0.0), zenith=shaded(1.0), horizon=shaded(0.8), ground=shaded(0.5)
-    )
-    lamp_light = sum(lamp.light[1] / (1.0 + np.sum(np.square(lamp.position_m))) for lamp in lamps)
-    return room_light, float(1.1 * np.exp(rng.normal(0, 0.3)) / (ambient + lamp_light))
