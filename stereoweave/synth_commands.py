@@ -14,7 +14,8 @@ synth = typer.Typer(help="Rendered stereo with exact ground truth: make it, chec
 
 # Named here, because the help imports nothing heavy.
 SCENE_NAMES = (
-    "antenna", "bridge", "crane", "propeller", "pylon", "refinery", "rooms", "ship", "wind_turbine",
+    "antenna", "bridge", "crane", "figures", "propeller", "pylon", "refinery", "rooms", "ship", "street",
+    "wind_turbine",
 )  # fmt: skip
 
 Scene = Annotated[str, typer.Argument(help=f"One of {', '.join(SCENE_NAMES)}.")]

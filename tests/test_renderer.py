@@ -167,6 +167,15 @@ def test_the_sky_is_infinitely_far(plain):
     assert np.isinf(depth_m).all() and (depth_m > 0).all()
 
 
+def test_a_world_without_a_sun_looks_like_one_whose_sun_gives_no_light_to_speak_of(renderer, rng):
+    world, rig = cluttered(rng), orbiting()
+    without, faint = (
+        renderer.shots(replace(world, sky=replace(world.sky, sun_light=3 * (light,))), rig, (0.0,))[0].image
+        for light in (0.0, 1e-12)
+    )
+    np.testing.assert_array_equal(without, faint)
+
+
 def test_positions_lie_on_the_baseline(plain):
     columns = [
         np.flatnonzero(

@@ -10,7 +10,8 @@ from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.scenes.rooms import rooms
 from stereoweave.synth.solids import SOLIDS, Skin
 from stereoweave.synth.stage import Palette
-from stereoweave.synth.surfaces import PERIODIC, surface
+from stereoweave.synth.surfaces import PERIODIC, broad, surface
+from stereoweave.synth.table_tops import draw_table_top, table_top
 from stereoweave.synth.textures import FAMILIES
 from stereoweave.synth.thin_things import THIN
 
@@ -69,6 +70,36 @@ def test_a_fifth_of_the_surfaces_is_nearly_plain_and_a_third_shows_photographs(r
     assert 0.30 < families.count("photograph") / 4000 < 0.40
     assert 0.08 < sum(families.count(name) for name in PERIODIC) / 4000 < 0.16
     assert set(families) == set(FAMILIES)
+
+
+def test_two_thirds_of_the_walls_floors_and_tables_are_plain_and_flat(rng):
+    materials = [broad(rng, ("brick", "wood"), 3.0) for _ in range(2000)]
+    plain = [material for material in materials if material.texture == "plain"]
+    assert 0.61 < len(plain) / 2000 < 0.69
+    assert {material.texture for material in materials} == {"plain", "brick", "wood"}
+    assert max(material.relief for material in plain) <= 0.1
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_table_reaches_from_before_the_middle_to_the_wall_behind_it(seed):
+    rng = np.random.default_rng(seed)
+    sizes = draw_table_top(rng)
+    corners_m = table_top(rng, Palette(), sizes).corners_m
+    slab_m = corners_m[np.ptp(corners_m[..., 2], axis=1) == 0]
+    surface_m = slab_m[np.isclose(slab_m[:, 0, 2], sizes.height_m, atol=1e-5)]
+    assert surface_m[..., 0].min() == pytest.approx(-sizes.behind_m)
+    assert surface_m[..., 0].max() == pytest.approx(sizes.before_m)
+    assert np.ptp(surface_m[..., 1]) == pytest.approx(sizes.width_m)
+
+
+def test_boards_and_walls_of_a_table_keep_a_quarter_of_the_distance_away_from_the_cameras():
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        sizes = draw_table_top(rng)
+        corners_m = table_top(rng, Palette(), sizes).corners_m.reshape(-1, 3)
+        upright_m = corners_m[corners_m[:, 2] > sizes.height_m + 0.01]
+        away_m = np.linalg.norm(upright_m[:, :2] - [sizes.distance_m, 0], axis=1)
+        assert away_m.min() > 0.25 * sizes.distance_m
 
 
 def test_a_fifth_of_the_surfaces_shines(rng):

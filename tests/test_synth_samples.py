@@ -60,6 +60,12 @@ def test_a_drawn_rig_has_its_nearest_disparity_between_18_and_160_px_of_640():
     assert all(9 <= px <= 80 for px in np.ravel(nearest_px))
 
 
+def test_a_scene_may_have_a_range_of_its_own_for_the_nearest_disparity(monkeypatch):
+    monkeypatch.setitem(SCENES, "propeller", lambda rng: replace(STAGE, nearest_px=(100.0, 100.0)))
+    _, rig = staged(Wall(), ORDER, 0)
+    np.testing.assert_allclose(rig.camera.disparity_px(np.array([[4.0]])), 50.0)  # of 320 px width
+
+
 class Wire(Wall):
     """A wall 4 m away, and a wire at a share of that before an eye that stands beside the middle."""
 

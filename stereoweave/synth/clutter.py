@@ -33,12 +33,16 @@ class Space:
         orbit: where the cameras are; things keep away from all of it.
         low_m, high_m: [3], the corners of the box that things stay in; its floor is at low_m[2].
         far_m: how far from the cameras things may be.
+        count: of things, from..to.
+        standing: the share of things that stand on the floor.
     """
 
     orbit: Orbit
     low_m: Float[np.ndarray, "3"]
     high_m: Float[np.ndarray, "3"]
     far_m: float
+    count: tuple[int, int] = COUNT
+    standing: float = 0.4
 
     def eyes_m(self) -> Float[np.ndarray, "n 3"]:
         """Places all over the orbit."""
@@ -66,7 +70,7 @@ class _Place:
 
 def clutter(rng: np.random.Generator, palette: Palette, space: Space) -> list[Mesh]:
     """15 to 40 things of 5 cm to 1.5 m; in half of the draws many of them are 1 to 6 px thin."""
-    count = int(rng.integers(COUNT[0], COUNT[1] + 1))
+    count = int(rng.integers(space.count[0], space.count[1] + 1))
     thin_share = rng.uniform(0.25, 0.5) if rng.random() < 0.5 else 0.0
     bars_px = _log_uniform(rng, *_THIN_PX, (count,))
     things, skins = [], []
@@ -98,7 +102,7 @@ def _places(rng: np.random.Generator, space: Space, count: int) -> list[_Place]:
     eyes_m = space.eyes_m()
     shape = (count, _CANDIDATES)
     sizes = np.sort(_log_uniform(rng, *_SIZE_PER_DISTANCE, (count,)))[::-1]
-    standing = rng.random(count) < 0.4
+    standing = rng.random(count) < space.standing
     depths_m = _log_uniform(rng, _NEAREST_M, space.far_m, shape)
     sizes_m = np.clip(sizes[:, None] * depths_m, *_SIZES_M)
     spots = _seen_at(rng, space, eyes_m[rng.integers(len(eyes_m), size=shape)], depths_m)

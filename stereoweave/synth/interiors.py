@@ -1,6 +1,6 @@
 """A room: floor, walls, ceiling, and what is on its walls."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -9,8 +9,8 @@ from stereoweave.synth.furniture import shelf
 from stereoweave.synth.parts import boxes, lathe, sheet, spheres, tubes
 from stereoweave.synth.solids import Skin
 from stereoweave.synth.stage import Palette
-from stereoweave.synth.surfaces import chosen, muted, surface
-from stereoweave.synth.world import Lamp, Material, Mesh, joined
+from stereoweave.synth.surfaces import broad, chosen, muted, surface
+from stereoweave.synth.world import Colour, Lamp, Material, Mesh, Sky, joined
 
 Corner = tuple[float, float, float]
 Hanging = Callable[[np.random.Generator, Palette, float, float, int], Mesh]
@@ -34,17 +34,17 @@ def shell(
     """
     x, y, height_m = (float(v) for v in size_m)
     distance_m = 0.6 * max(x, y)
-    floor = palette.add(chosen(rng, _FLOORS, distance_m))
+    floor = palette.add(broad(rng, _FLOORS, distance_m))
     parts = [_panel(rng, (-x / 2, -y / 2, 0), (x, 0, 0), (0, y, 0), floor)]
     if not open_roof:
-        ceiling = palette.add(chosen(rng, _CEILINGS, distance_m))
+        ceiling = palette.add(broad(rng, _CEILINGS, distance_m))
         parts.append(_panel(rng, (-x / 2, y / 2, height_m), (x, 0, 0), (0, -y, 0), ceiling))
-    common = palette.add(chosen(rng, _WALLS, distance_m))
+    common = palette.add(broad(rng, _WALLS, distance_m))
     trim = palette.add(chosen(rng, ("wood", "paint", "plain"), distance_m))
     for side in range(4):
         if side == open_side:
             continue
-        wall = common if rng.random() < 0.6 else palette.add(chosen(rng, _WALLS, distance_m))
+        wall = common if rng.random() < 0.6 else palette.add(broad(rng, _WALLS, distance_m))
         length_m, away_m = (y, x / 2) if side % 2 == 0 else (x, y / 2)
         panel = _panel(rng, (-length_m / 2, 0, 0), (0, 0, height_m), (length_m, 0, 0), wall)
         skirting = boxes([[0, 0.01, 0.05]], [[length_m, 0.05, 0.1]], trim)
@@ -76,6 +76,32 @@ def lamps_at(rng: np.random.Generator, spots_m: Float[np.ndarray, "n 3"]) -> tup
         Lamp(position_m=(x, y, z), light=(red, green, blue))
         for (x, y, z), (red, green, blue) in zip(spots_m.tolist(), lights, strict=True)
     )
+
+
+def lamp_spots(
+    rng: np.random.Generator, size_m: Float[np.ndarray, "3"], eyes_m: Float[np.ndarray, "k 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Spots of one to four lamps in the upper part of a room, away from the cameras."""
+    low_m, high_m = size_m * [-0.4, -0.4, 0.68], size_m * [0.4, 0.4, 0.85]
+    spots_m = rng.uniform(low_m, high_m, (40, 3))
+    clear_m = np.linalg.norm(spots_m[:, None] - eyes_m, axis=2).min(1)
+    return spots_m[np.argsort(clear_m < 1.0, kind="stable")[: rng.integers(1, 5)]]
+
+
+def indoor_light(rng: np.random.Generator, sky: Sky, lamps: Sequence[Lamp]) -> tuple[Sky, float]:
+    """A sky whose light comes from walls rather than from the sun, and the exposure for a room."""
+    ambient = rng.uniform(0.15, 0.6)
+    warm = np.array([1.0, 0.95, 0.87])
+
+    def shaded(share: float) -> Colour:
+        red, green, blue = (ambient * share * warm * rng.uniform(0.95, 1.05, 3)).tolist()
+        return red, green, blue
+
+    room_light = Sky(
+        sun=sky.sun, sun_light=(0.0, 0.0, 0.0), zenith=shaded(1.0), horizon=shaded(0.8), ground=shaded(0.5)
+    )
+    lamp_light = sum(lamp.light[1] / (1.0 + np.sum(np.square(lamp.position_m))) for lamp in lamps)
+    return room_light, float(1.1 * np.exp(rng.normal(0, 0.3)) / (ambient + lamp_light))
 
 
 def _panel(rng: np.random.Generator, origin: Corner, along: Corner, up: Corner, material: int) -> Mesh:

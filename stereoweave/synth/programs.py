@@ -26,12 +26,13 @@ class Programs:
     """Every program by its name, compiled with the effects that are switched on.
 
     The program for surfaces is there once for each number of lamps (`surface`), because llvmpipe takes a
-    quarter longer for a loop over lamps whose number it learns from a uniform, even if that is 0.
+    quarter longer for a loop over lamps whose number it learns from a uniform, even if that is 0; and once
+    more for each without a sun, whose shadows and gloss nobody sees in a closed room.
     """
 
     def __init__(self, gl: moderngl.Context, effects: Effects) -> None:
-        def program(vertices: str, *fragments: str, lamps: int = 0) -> moderngl.Program:
-            defined = _definitions(effects, lamps)
+        def program(vertices: str, *fragments: str, lamps: int = 0, sun: bool = True) -> moderngl.Program:
+            defined = _definitions(effects, lamps, sun)
             return gl.program(
                 vertex_shader=defined + _text(vertices),
                 fragment_shader=defined + "".join(map(_text, fragments)),
@@ -39,7 +40,8 @@ class Programs:
 
         self._programs = {name: program(*parts) for name, parts in _PARTS.items()}
         for lamps in range(MOST_LAMPS + 1):
-            self._programs[surface(lamps)] = program(*_SURFACE, lamps=lamps)
+            for sun in (False, True):
+                self._programs[surface(lamps, sun)] = program(*_SURFACE, lamps=lamps, sun=sun)
 
     def __getitem__(self, name: str) -> moderngl.Program:
         return self._programs[name]
@@ -60,15 +62,16 @@ class Programs:
                 uniform.write(np.ascontiguousarray(value, np.float32).tobytes())
 
 
-def surface(lamps: int) -> str:
-    """The name of the program for surfaces in the light of so many lamps."""
-    return f"surface, {lamps} lamps"
+def surface(lamps: int, sun: bool) -> str:
+    """The name of the program for surfaces in the light of a number of lamps, with or without a sun."""
+    return f"surface, {lamps} lamps{', sun' * sun}"
 
 
-def _definitions(effects: Effects, lamps: int) -> str:
-    switches = ("shadows", "ambient_occlusion", "gloss", "fog", "relief")
+def _definitions(effects: Effects, lamps: int, sun: bool) -> str:
+    switches = ("shadows",) * sun + ("ambient_occlusion", "gloss", "fog", "relief")
     numbers = {"MATERIALS": MOST_MATERIALS, "LAMPS": lamps, "SAMPLES": effects.samples, "CELLS": CELLS}
     lines = [f"#define {name.upper()}" for name in switches if getattr(effects, name)]
+    lines += ["#define SUN"] * sun
     lines += [f"#define {name} {number}" for name, number in numbers.items()]
     return "\n".join(["#version 330 core", *lines, ""])
 

@@ -92,7 +92,7 @@ class Renderer:
         frames = self._framed(rig)
         frames.samples.use()
         frames.samples.clear()
-        name = surface(len(geometry.world.lamps))
+        name = surface(len(geometry.world.lamps), any(geometry.world.sky.sun_light))
         self._aim(name, rig, position)
         geometry.draw(self._programs[name], triangles)
         # The sky lies at the far end of the depth buffer, which is what it was cleared to.
@@ -145,7 +145,7 @@ class Renderer:
             shared |= self._light_maps.cast(geometry, sky)
         if self.effects.ambient_occlusion:
             shared |= self._light_maps.occlude(geometry)
-        self._programs.set(surface(len(world.lamps)), **shared)
+        self._programs.set(surface(len(world.lamps), any(sky.sun_light)), **shared)
         self._lit = world
 
 

@@ -100,7 +100,8 @@ def staged(camera: Camera, order: Order, sequence: int, frame: int = 0) -> tuple
     """The stage and rig of a frame of a sequence; (seed, scene, sequence) decide all but the frame."""
     rng = np.random.default_rng((order.seed, zlib.crc32(order.scene.encode()), sequence))
     stage = SCENES[order.scene](rng)
-    focal_px, nearest_px = draw_focal_px(rng, order.size_px[0]), draw_nearest_px(rng, order.size_px[0])
+    focal_px = draw_focal_px(rng, order.size_px[0])
+    nearest_px = draw_nearest_px(rng, order.size_px[0], stage.nearest_px)
     start = draw_viewpoint(rng, stage.orbit)
     # A film pans over a part of the orbit.
     end = between(start, draw_viewpoint(rng, stage.orbit), rng.uniform(0.15, 0.4))

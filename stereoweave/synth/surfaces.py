@@ -9,6 +9,8 @@ from stereoweave.synth.world import Colour, Material
 # What transfers to photographs are textures with natural statistics; surfaces without any, and such that
 # repeat, are what real rooms are hard for.
 _PHOTOGRAPHS, _PLAIN, _PERIODIC = 0.35, 0.20, 0.12
+# Of walls, floors and tables, whose middle is farther from any texture than a matcher looks.
+_BROAD_PLAIN = 0.65
 PERIODIC = ("brick", "tiles", "cloth")
 NATURAL = (
     ("rust", "paint", "steel", "concrete", "plaster", "stone", "bark", "wood")
@@ -42,6 +44,21 @@ def chosen(rng: np.random.Generator, families: tuple[str, ...], distance_m: floa
         span_m=fine_span_m(rng, distance_m),
         roughness=rng.uniform(0.5, 1.0),
         relief=rng.uniform(0.1, 0.5),
+    )
+
+
+def broad(rng: np.random.Generator, families: tuple[str, ...], distance_m: float) -> Material:
+    """A surface for a wall, a floor or a table: plain more often than not, else of one of the families."""
+    if rng.random() >= _BROAD_PLAIN:
+        return chosen(rng, families, distance_m)
+    return Material(
+        texture="plain",
+        variant=int(rng.integers(1000)),
+        tint=muted(rng, 0.3),
+        # Up to six times coarser than pixels, so that little of the texture's own unevenness is left.
+        span_m=fine_span_m(rng, distance_m) * rng.uniform(1, 6),
+        roughness=rng.uniform(0.35, 1.0),
+        relief=rng.uniform(0.0, 0.1),
     )
 
 

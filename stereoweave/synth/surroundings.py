@@ -33,6 +33,7 @@ _GROUND_TINTS: dict[str, tuple[Colour, float]] = {  # tint, and how many metres 
     "gravel": ((0.9, 0.88, 0.85), 3.0),
     "asphalt": ((1.0, 1.0, 1.02), 7.0),
     "concrete": ((0.9, 0.89, 0.86), 7.0),
+    "plain": ((0.45, 0.42, 0.36), 9.0),
 }
 
 
@@ -75,7 +76,8 @@ def terrain(  # noqa: PLR0913, grounds differ in so much
 ) -> Mesh:
     """Ground that reaches extent_m to each side, flat around the origin, with bumps of bumps_m beyond.
 
-    family: of the texture, one of "grass", "soil", "gravel", "asphalt", "concrete".
+    family: of the texture, one of "grass", "soil", "gravel", "asphalt", "concrete", or "plain" for
+    sand and snow.
     """
     tint, span_m = _GROUND_TINTS[family]
     material = palette.add(

@@ -7,11 +7,13 @@ import numpy as np
 from stereoweave.synth.scenes.antenna import antenna
 from stereoweave.synth.scenes.bridge import bridge
 from stereoweave.synth.scenes.crane import crane
+from stereoweave.synth.scenes.figures import figures
 from stereoweave.synth.scenes.propeller import propeller
 from stereoweave.synth.scenes.pylon import pylon
 from stereoweave.synth.scenes.refinery import refinery
 from stereoweave.synth.scenes.rooms import rooms
 from stereoweave.synth.scenes.ship import ship
+from stereoweave.synth.scenes.street import street
 from stereoweave.synth.scenes.wind_turbine import wind_turbine
 from stereoweave.synth.stage import Stage
 
@@ -19,10 +21,12 @@ SCENES: dict[str, Callable[[np.random.Generator], Stage]] = {
     "antenna": antenna,
     "bridge": bridge,
     "crane": crane,
+    "figures": figures,
     "propeller": propeller,
     "pylon": pylon,
     "refinery": refinery,
     "rooms": rooms,
     "ship": ship,
+    "street": street,
     "wind_turbine": wind_turbine,
 }

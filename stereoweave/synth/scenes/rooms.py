@@ -6,21 +6,64 @@ import numpy as np
 from jaxtyping import Float
 
 from stereoweave.synth.clutter import Space, clutter
-from stereoweave.synth.interiors import lamps_at, pendants, shell
+from stereoweave.synth.interiors import indoor_light, lamp_spots, lamps_at, pendants, shell
 from stereoweave.synth.parts import boxes, turn
 from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
 from stereoweave.synth.surfaces import chosen
 from stereoweave.synth.surroundings import bushes, daylight, hills, houses, places, rocks, terrain, trees
-from stereoweave.synth.world import Colour, Lamp, Mesh, Sky, World, joined
+from stereoweave.synth.table_tops import draw_table_top, table_top
+from stereoweave.synth.world import Mesh, World, joined
 
 # The cameras of one world see nearly the same, so that things can be placed where all of them see them.
 _SWING_DEG = 12.0
+# Of table tops, rooms and grounds.
+_SHARES = (0.64, 0.24, 0.12)
+# Wider than in other scenes: in real pairs of rooms 6 to 8 % of the left picture is outside the right one.
+_NEAREST_PX = (60.0, 170.0)
 
 
 def rooms(rng: np.random.Generator) -> Stage:
-    """A room or a ground with 15 to 40 things, seen from a part of a circle around its middle."""
-    return _room(rng) if rng.random() < 0.5 else _ground(rng)
+    """A table top, a room or a ground with 9 to 40 things, seen from a part of a circle around its middle."""
+    kinds = (_table_top, _room, _ground)
+    return kinds[rng.choice(len(kinds), p=_SHARES)](rng)
+
+
+def _table_top(rng: np.random.Generator) -> Stage:
+    """A table near the cameras in a closed room, with boards on it and a wall behind it."""
+    palette = Palette()
+    sizes, size_m = draw_table_top(rng), rng.uniform([6.5, 6.5, 2.5], [9.0, 9.0, 3.5])
+    azimuth_deg, lowest_deg = rng.uniform((0, 6), (360, 28)).tolist()
+    orbit = Orbit(
+        centre_m=(0.0, 0.0, sizes.height_m + rng.uniform(0.1, 0.3) * sizes.distance_m),
+        distance_m=(sizes.distance_m, 1.1 * sizes.distance_m),
+        azimuth_deg=(azimuth_deg, azimuth_deg + _SWING_DEG),
+        elevation_deg=(lowest_deg, lowest_deg + 4),
+        aim_m=0.2,
+        floor_m=sizes.height_m + 0.2,
+    )
+    half_m = 0.5 * max(sizes.width_m, 2 * sizes.behind_m)
+    space = Space(
+        orbit=orbit,
+        low_m=np.array([-half_m, -half_m, sizes.height_m]),
+        high_m=np.array([half_m, half_m, sizes.height_m + 1.4]),
+        far_m=sizes.distance_m + 0.8 * sizes.behind_m,
+        count=(9, 30),
+        standing=0.75,
+    )
+    things = clutter(rng, palette, space)
+    towards_cameras = turn((0, 0, 1), azimuth_deg + _SWING_DEG / 2)
+    spots_m = lamp_spots(rng, size_m, space.eyes_m())
+    lamps = lamps_at(rng, spots_m)
+    parts = [
+        table_top(rng, palette, sizes).placed(towards_cameras),
+        shell(rng, palette, size_m, open_roof=False, open_side=None),
+        pendants(rng, palette, spots_m, float(size_m[2])),
+    ]
+    sky, exposure = indoor_light(rng, daylight(rng)[0], lamps)
+    mesh = joined([*parts, *(thing.as_target() for thing in things)])
+    world = World(mesh=mesh, materials=tuple(palette.materials), sky=sky, lamps=lamps, exposure=exposure)
+    return Stage(world=world, orbit=orbit, nearest_px=_NEAREST_PX)
 
 
 def _room(rng: np.random.Generator) -> Stage:
@@ -35,20 +78,20 @@ def _room(rng: np.random.Generator) -> Stage:
         far_m=orbit.distance_m[1] + 0.45 * float(size_m[:2].max()),
     )
     things = clutter(rng, palette, space)
-    spots_m = _lamp_spots(rng, space)
+    spots_m = lamp_spots(rng, size_m, space.eyes_m())
     lamps = lamps_at(rng, spots_m)
     parts = [shell(rng, palette, size_m, open_roof=open_roof, open_side=open_side)]
     sky, _, exposure = daylight(rng)
     if not open_roof:
         parts.append(pendants(rng, palette, spots_m, float(size_m[2])))
     if not open_roof and open_side is None:
-        sky, exposure = _indoors(rng, sky, lamps)
+        sky, exposure = indoor_light(rng, sky, lamps)
     else:
         parts.append(terrain(rng, palette, "grass", extent_m=80.0, level_m=-0.2, flat_radius_m=9.0))
         parts.append(trees(rng, palette, places(rng, 14, 12.0, 40.0)))
     mesh = joined([*parts, *(thing.as_target() for thing in things)])
     world = World(mesh=mesh, materials=tuple(palette.materials), sky=sky, lamps=lamps, exposure=exposure)
-    return Stage(world=world, orbit=orbit)
+    return Stage(world=world, orbit=orbit, nearest_px=_NEAREST_PX)
 
 
 def _ground(rng: np.random.Generator) -> Stage:
@@ -82,9 +125,8 @@ def _ground(rng: np.random.Generator) -> Stage:
     sky, fog, exposure = daylight(rng)
     exposure *= float(np.exp(rng.normal(-0.12, 0.25)))
     materials = tuple(palette.materials)
-    return Stage(
-        world=World(mesh=mesh, materials=materials, sky=sky, fog=fog, exposure=exposure), orbit=orbit
-    )
+    world = World(mesh=mesh, materials=materials, sky=sky, fog=fog, exposure=exposure)
+    return Stage(world=world, orbit=orbit, nearest_px=_NEAREST_PX)
 
 
 def _far_off(rng: np.random.Generator, palette: Palette) -> Sequence[Mesh]:
@@ -131,28 +173,3 @@ def _orbit_inside(rng: np.random.Generator, size_m: Float[np.ndarray, "3"]) -> O
         aim_m=0.25,
         floor_m=0.4,
     )
-
-
-def _lamp_spots(rng: np.random.Generator, space: Space) -> Float[np.ndarray, "n 3"]:
-    """Spots of one to four lamps in the upper part of a room, away from the cameras."""
-    low_m = space.low_m * 0.8 + [0, 0, 0.68 * space.high_m[2]]
-    high_m = space.high_m * [0.8, 0.8, 0.85]
-    spots_m = rng.uniform(low_m, high_m, (40, 3))
-    clear_m = np.linalg.norm(spots_m[:, None] - space.eyes_m(), axis=2).min(1)
-    return spots_m[np.argsort(clear_m < 1.0, kind="stable")[: rng.integers(1, 5)]]
-
-
-def _indoors(rng: np.random.Generator, sky: Sky, lamps: Sequence[Lamp]) -> tuple[Sky, float]:
-    """A sky whose light comes from walls rather than from the sun, and the exposure for a room."""
-    ambient = rng.uniform(0.15, 0.6)
-    warm = np.array([1.0, 0.95, 0.87])
-
-    def shaded(share: float) -> Colour:
-        red, green, blue = (ambient * share * warm * rng.uniform(0.95, 1.05, 3)).tolist()
-        return red, green, blue
-
-    room_light = Sky(
-        sun=sky.sun, sun_light=(0.0, 0.0, 0.0), zenith=shaded(1.0), horizon=shaded(0.8), ground=shaded(0.5)
-    )
-    lamp_light = sum(lamp.light[1] / (1.0 + np.sum(np.square(lamp.position_m))) for lamp in lamps)
-    return room_light, float(0.9 * np.exp(rng.normal(0, 0.35)) / (ambient + lamp_light))

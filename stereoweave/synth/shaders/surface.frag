@@ -137,7 +137,9 @@ void main() {
     mirror = mix(vec3(mix(0.05, 0.01, roughness)), own, made.metal);
 #endif
     vec3 light = open * diffuse * sky_around(normal);
+#ifdef SUN
     light += sunny * sun_light * thrown_back(sun, normal, viewer, diffuse, mirror, roughness);
+#endif
 #if LAMPS > 0
     for (int k = 0; k < LAMPS; ++k) {
         vec3 towards_m = lamp_m[k] - place_m;

@@ -1,0 +1,46 @@
+"""A street seen from a car in one of its lanes."""
+
+import numpy as np
+
+from stereoweave.synth.rigs import Orbit
+from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.streets import (
+    carriageway,
+    draw_street_plan,
+    fronts,
+    street_furniture,
+    traffic,
+    walkers,
+)
+from stereoweave.synth.surroundings import daylight, hills, terrain
+from stereoweave.synth.world import World, joined
+
+# Between the road before the car and the horizon.
+_NEAREST_PX = (25.0, 130.0)
+
+
+def street(rng: np.random.Generator) -> Stage:
+    """A street with house fronts, vehicles, people and posts, along x, from 1.2 to 2 m above its lane."""
+    palette, plan = Palette(), draw_street_plan(rng)
+    target = joined([traffic(rng, palette, plan), walkers(rng, palette, plan)]).as_target()
+    parts = [
+        carriageway(rng, palette, plan),
+        fronts(rng, palette, plan),
+        street_furniture(rng, palette, plan),
+        terrain(rng, palette, "grass", extent_m=180.0, level_m=-0.1, bumps_m=0.0),
+    ]
+    if rng.random() < 0.5:
+        parts.append(hills(rng, palette, distance_m=160.0))
+    sky, fog, exposure = daylight(rng)
+    world = World(
+        mesh=joined([target, *parts]), materials=tuple(palette.materials), sky=sky, fog=fog, exposure=exposure
+    )
+    turned_deg = float(rng.normal(180.0, 3.0))
+    orbit = Orbit(
+        centre_m=(0.0, plan.lane_m, rng.uniform(1.2, 1.6)),
+        distance_m=(9.0, 14.0),
+        azimuth_deg=(turned_deg - 2, turned_deg + 2),
+        elevation_deg=(0.0, 1.6),
+        aim_m=1.2,
+    )
+    return Stage(world=world, orbit=orbit, nearest_px=_NEAREST_PX)
