@@ -1,0 +1,133 @@
+"""Train a network by the clock on a lent GPU; recipes/gpu/README.md has the commands.
+
+Nothing but the standard library is imported before the machine is checked, and nothing at all again in the
+processes that paint.
+"""
+
+import argparse
+import importlib
+import os
+import sys
+import time
+from functools import partial
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+BEGAN_S = time.monotonic()
+# At once, so that a command that is killed has said what it did.
+say = partial(print, flush=True)
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+# Module, the names it is installed under, and the oldest version that was read or tried.
+NEEDS = (
+    ("numpy", ("numpy",), (2, 0)),
+    ("cv2", ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless"), (4, 11)),
+    ("numba", ("numba",), (0, 61)),
+    ("jaxtyping", ("jaxtyping",), (0, 2)),
+    ("PIL", ("pillow",), (9, 0)),
+    ("yaml", ("pyyaml",), (5, 0)),
+    ("rich", ("rich",), (13, 0)),
+    ("skimage", ("scikit-image",), (0, 22)),
+    ("torch", ("torch",), (2, 4)),
+)
+
+
+def main() -> int:
+    """Check the machine, train, and return the exit status."""
+    options = _options()
+    say(f"Python {sys.version.split()[0]}, {os.cpu_count()} processors, code {Path(__file__).parents[2]}")
+    if problems := [problem for problem in map(_problem, NEEDS) if problem]:
+        say("\n".join(problems), file=sys.stderr)
+        return 2
+    from stereoweave.errors import StereoweaveError
+
+    try:
+        _train(options)
+    except StereoweaveError as error:
+        say(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
+    parser.add_argument("recipe", type=Path)
+    parser.add_argument("--out", type=Path, required=True, help="folder of the files to bring back")
+    parser.add_argument("--earlier", type=Path, help="folder with the files of an earlier command")
+    parser.add_argument("--minutes", type=float, default=8.7, help="of this command")
+    parser.add_argument("--total-minutes", type=float, default=26.0, help="of all commands")
+    parser.add_argument("--processes", type=int, help="that paint; default 14, or what the machine has")
+    parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
+    parser.add_argument("--batch", type=int, help="pairs a step, in place of the recipe's")
+    parser.add_argument(
+        "--cool-down-crop", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="while the rate falls"
+    )
+    parser.add_argument("--commit", default="", help="of the code, where the machine has no git")
+    return parser.parse_args()
+
+
+def _problem(need: tuple[str, tuple[str, ...], tuple[int, int]]) -> str:
+    """Import a library; what is wrong with it, in one line, or ''."""
+    module, names, least = need
+    wanted = f"{names[0]} {least[0]}.{least[1]} or later"
+    try:
+        importlib.import_module(module)
+    except Exception as error:  # a broken installation ends in any error whatever
+        return f"{module}: expected {wanted}, found {type(error).__name__}: {error}; bring its wheel along"
+    found = next((have for name in names if (have := _version(name))), "")
+    say(f"{module} {found or 'of unknown version'}")
+    if found and tuple(int(part) for part in found.split(".")[:2]) < least:
+        return f"{module}: expected {wanted}, found {found}; bring its wheel along"
+    return ""
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return ""
+
+
+def _train(options: argparse.Namespace) -> None:
+    from dataclasses import replace
+
+    import torch
+
+    from stereoweave.errors import StereoweaveError
+    from stereoweave.learn.recipe import read_recipe
+    from stereoweave.learn.timed import Command, train_by_clock
+    from stereoweave.threads import usable_cores
+
+    recipe = read_recipe(options.recipe)
+    if options.batch:
+        recipe = replace(recipe, batch=options.batch)
+    if options.device == "cuda":
+        if not torch.cuda.is_available():
+            raise StereoweaveError(
+                "--device cuda: expected a GPU, found none; --device cpu rehearses on the CPU"
+            )
+        torch.backends.cudnn.benchmark = True
+        properties = torch.cuda.get_device_properties(0)
+        say(f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, CUDA {torch.version.cuda}")
+    command = Command(
+        out=options.out,
+        earlier=options.earlier,
+        began_s=BEGAN_S,
+        minutes=options.minutes,
+        total_minutes=options.total_minutes,
+        device=options.device,
+        processes=options.processes or max(1, min(14, usable_cores() - 2)),
+        cool_down_crop=options.cool_down_crop and tuple(options.cool_down_crop),
+        commit=options.commit,
+    )
+    say(f"{command.processes} processes paint; {time.monotonic() - BEGAN_S:.0f} s used so far")
+    try:
+        train_by_clock(recipe, command, say)
+    except torch.cuda.OutOfMemoryError as error:
+        raise StereoweaveError(f"--batch {recipe.batch}: {error}; give a smaller one") from error
+    if options.device == "cuda":
+        say(f"at most {torch.cuda.max_memory_allocated() / 2**30:.1f} GiB of GPU memory used")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
