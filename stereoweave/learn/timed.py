@@ -18,7 +18,7 @@ import torch
 from stereoweave.errors import StereoweaveError
 from stereoweave.io import make_folder
 from stereoweave.learn import checkpoint
-from stereoweave.learn.clock import Clock, cools_at, learning_rate_at
+from stereoweave.learn.clock import RESERVE_S, Clock, cools_at, learning_rate_at
 from stereoweave.learn.painters import Painters, cooling
 from stereoweave.learn.pairs import KeptPairs
 from stereoweave.learn.recipe import Recipe
@@ -131,8 +131,9 @@ class _Training:
 
     def end(self, held_out: Source) -> None:
         """Save the run with its scores, and say what is next."""
-        if isinstance(held_out, KeptPairs) and held_out.missing():
-            self.report("not scored: held-out pairs are missing")
+        too_late = self.clock.left_at(time.monotonic()) < -RESERVE_S
+        if too_late or (isinstance(held_out, KeptPairs) and held_out.missing()):
+            self.report("not scored: the time is over" if too_late else "not scored: no held-out pairs")
             return self._save({})
         scores = self.run.scores(held_out)
         self._save(scores)
