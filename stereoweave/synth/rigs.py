@@ -7,6 +7,9 @@ from jaxtyping import Float
 
 from stereoweave.stereo import StereoCamera
 
+# In a picture 640 px wide, unless a scene has a range of its own.
+NEAREST_PX = (18.0, 160.0)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Rig:
@@ -78,13 +81,15 @@ def draw_focal_px(rng: np.random.Generator, width_px: int) -> float:
     return float(width_px / 2 / np.tan(np.radians(rng.uniform(42, 72)) / 2))
 
 
-def draw_nearest_px(rng: np.random.Generator, width_px: int) -> float:
-    """The disparity of what is nearest: log-uniform, 18 to 160 px of 640.
+def draw_nearest_px(
+    rng: np.random.Generator, width_px: int, range_px: tuple[float, float] = NEAREST_PX
+) -> float:
+    """Draw the disparity of the nearest surface, log-uniform in a range given for a width of 640 px.
 
     The baseline follows from it, because for training the spread of disparities matters more than that of
     baselines.
     """
-    return float(np.exp(rng.uniform(np.log(18), np.log(160))) * width_px / 640)
+    return float(np.exp(rng.uniform(*np.log(range_px))) * width_px / 640)
 
 
 def rig_at(orbit: Orbit, viewpoint: Viewpoint, camera: StereoCamera, size_px: tuple[int, int]) -> Rig:

@@ -2,16 +2,25 @@
 
 from dataclasses import dataclass, field
 
-from stereoweave.synth.rigs import Orbit
+from stereoweave.synth.rigs import NEAREST_PX, Orbit
 from stereoweave.synth.world import Material, World
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stage:
-    """A world and the places that a rig may stand at in it."""
+    """A world and the places that a rig may stand at in it.
+
+    Attributes:
+        world: what is seen.
+        orbit: where from.
+        nearest_px: the disparity of the nearest surface in a picture 640 px wide, from..to.
+        noise_levels: standard deviation of the cameras' noise in a white surface, in grey levels of 0..255.
+    """
 
     world: World
     orbit: Orbit
+    nearest_px: tuple[float, float] = NEAREST_PX
+    noise_levels: float = 0.0
 
 
 @dataclass
