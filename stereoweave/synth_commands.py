@@ -12,7 +12,7 @@ synth = typer.Typer(help="Rendered stereo with exact ground truth: make it, chec
 
 # Named here, because the help imports nothing heavy.
 SCENE_NAMES = (
-    "antenna", "bridge", "crane", "propeller", "pylon", "refinery", "rooms", "ship", "wind_turbine",
+    "antenna", "boards", "bridge", "crane", "propeller", "pylon", "refinery", "rooms", "ship", "wind_turbine",
 )  # fmt: skip
 
 Scene = Annotated[str, typer.Argument(help=f"One of {', '.join(SCENE_NAMES)}.")]
@@ -91,7 +91,9 @@ def sheet(
         from stereoweave.synth.making import camera
         from stereoweave.synth.scenes import SCENES
     if quiz:
-        picture, answers = contact_sheet.quiz(camera(), [name for name in SCENES if name != "rooms"], seed)
+        picture, answers = contact_sheet.quiz(
+            camera(), [name for name in SCENES if name not in ("boards", "rooms")], seed
+        )
         typer.echo("by row: " + ", ".join(answers))
     else:
         picture = contact_sheet.sheet(camera(), list(SCENES), seed)
