@@ -17,6 +17,7 @@ from stereoweave.command_line import (
     engine_of,
     needing_the_synth_extra,
     needing_the_train_extra,
+    parse_size_px,
     place_for,
 )
 
@@ -42,6 +43,17 @@ PAIRS_TABLES = {
         "calibr. error": "calibration_error",
     },
 }
+
+# What stereoweave bench pairs --classes shows: a column for each class.
+CLASS_TABLES = {
+    "Pixels by class, % of the known ones": "share_percent",
+    "bad-1 by class, points: together they make bad-1": "bad1_percent",
+    "bad-2 by class, points": "bad2_percent",
+    "EPE within each class, px": "epe_px",
+}
+
+# As short as eight columns have to be in 80 characters.
+CLASS_HEADINGS = {"thin_or_edge": "edges", "weak_texture": "weak", "textured": "texture"}
 
 # The same of stereoweave bench views.
 FLICKER_TABLES = {
@@ -106,6 +118,14 @@ def pairs(  # noqa: PLR0913 - each is a word of the command line
     sparsification: Annotated[
         Path | None, typer.Option(help="A picture to write: errors by confidence. Extra 'train'.")
     ] = None,
+    classes: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="A second CSV file to write: errors outside the right picture, where occluded, near edges, "
+            "where plain, weakly textured, textured.",
+        ),
+    ] = None,
     cluster: Cluster = None,
     threads: Threads = None,
     provider: Provider = "cpu",
@@ -124,6 +144,8 @@ def pairs(  # noqa: PLR0913 - each is a word of the command line
     from stereoweave.threads import thread_count
 
     place_for(out)
+    if classes:
+        place_for(classes)
     for picture in filter(None, (plot, sparsification)):
         picture_kind(picture)
         place_for(picture)
@@ -144,7 +166,28 @@ def pairs(  # noqa: PLR0913 - each is a word of the command line
             sparsification, {name: scores.curves[name] for name in (*makers, SGBM)}
         )
     _tell_means(PAIRS_TABLES, "matcher", means)
+    if classes:
+        write_csv(classes, scores.class_rows, scores.machine)
+        _print_classes([row for row in scores.class_rows if row.scene == MEAN])
+        typer.echo(f"errors by class: {classes}")
     typer.echo(f"rows: {out}")
+
+
+@bench.command()
+def collages(
+    out: Annotated[Path, typer.Option("--out", "-o", help="The folder of the set, new or empty.")],
+    pairs: Annotated[int, typer.Option(min=1, help="How many.")] = 16,
+    seed: Annotated[
+        int, typer.Option(min=0, help="1000003 gives the pairs that trainings validate on.")
+    ] = 1_000_003,
+    size: Annotated[str, typer.Option(help="Width and height in pixels.")] = "384x256",
+) -> None:
+    """Write held-out collages, the painted pairs that networks train on, as a set that bench pairs reads."""
+    with needing_the_train_extra():
+        from stereoweave.learn.collage_set import write_collages
+    width_px, height_px = parse_size_px(size)
+    write_collages(out, pairs, seed, (height_px, width_px))
+    typer.echo(f"{out}: {pairs} pair{'s' * (pairs != 1)} made")
 
 
 @bench.command()
@@ -399,10 +442,30 @@ def _tell_means(tables: Mapping[str, Mapping[str, str]], who: str, rows: Sequenc
         table = Table(Column(who, no_wrap=True), *numbers, title=title)
         for row in rows:
             cells = [getattr(row, field) for field in columns.values()]
-            table.add_row(
-                Path(getattr(row, who)).name, *("–" if math.isnan(x) else f"{x:.2f}" for x in cells)
-            )
+            table.add_row(Path(getattr(row, who)).name, *map(_cell, cells))
         Console().print(table)
+
+
+def _print_classes(means: Sequence[Any]) -> None:
+    """Print the mean rows of errors by class, a row for each matcher and a column for each class."""
+    from rich.console import Console
+    from rich.table import Column, Table
+
+    matchers = list(dict.fromkeys(row.matcher for row in means))
+    names = list(dict.fromkeys(row.pixel_class for row in means))
+    found = {(row.matcher, row.pixel_class): row for row in means}
+    for title, field in CLASS_TABLES.items():
+        headings = (Column(CLASS_HEADINGS.get(name, name), justify="right") for name in names)
+        table = Table(Column("matcher", no_wrap=True), *headings, title=title)
+        # The share of a class is the same for every matcher.
+        rows = {"any": matchers[0]} if field == "share_percent" else {Path(m).name: m for m in matchers}
+        for label, matcher in rows.items():
+            table.add_row(label, *(_cell(getattr(found[matcher, name], field)) for name in names))
+        Console().print(table)
+
+
+def _cell(number: float) -> str:
+    return "–" if math.isnan(number) else f"{number:.2f}"
 
 
 def _write_and_tell(out: Path, title: str, rows: Sequence[Any]) -> None:

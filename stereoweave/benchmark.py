@@ -4,6 +4,7 @@ import csv
 import os
 import platform
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
@@ -18,6 +19,7 @@ from jaxtyping import Float
 from stereoweave.data.readers import Scene
 from stereoweave.edges import edge_bad_percent, edge_epe_px, flying_percent
 from stereoweave.engine import Engine, stream
+from stereoweave.error_classes import ClassErrors, class_errors, classify
 from stereoweave.errors import StereoweaveError
 from stereoweave.io import replacing
 from stereoweave.matcher import Matcher
@@ -87,6 +89,28 @@ class Row:
     memory_mb: float = float("nan")
 
 
+@dataclass(frozen=True, kw_only=True)
+class ClassRow:
+    """Errors of one matcher on one scene, or on the mean of all, in one class of pixels.
+
+    Attributes:
+        pixel_class: A name in `error_classes.CLASSES`, or `error_classes.ALL`.
+
+    The others are those of `ClassErrors`. A mean is over the scenes that have the number: a scene without a
+    plain pixel has no error within the class.
+    """
+
+    matcher: str
+    scene: str
+    pixel_class: str
+    share_percent: float
+    bad1_percent: float
+    bad2_percent: float
+    bad1_within_percent: float
+    bad2_within_percent: float
+    epe_px: float
+
+
 class Curves(NamedTuple):
     """How a matcher's mean error in px, and its percent of bad pixels (over 1 px), fall by its confidence."""
 
@@ -99,12 +123,14 @@ class Scores(NamedTuple):
 
     Attributes:
         rows: One per scene and matcher, then a mean row per matcher.
+        class_rows: One per scene, matcher and class of pixels, then one per matcher and class for the mean.
         curves: By matcher, the mean over the scenes.
         largest: The pair with the most pixels, for `with_memory`.
         machine: What the rows were measured with, for `write_csv`.
     """
 
     rows: list[Row]
+    class_rows: list[ClassRow]
     curves: dict[str, Curves]
     largest: StereoPair
     machine: dict[str, str]
@@ -123,6 +149,7 @@ class _Scene(NamedTuple):
     """What `score_pairs` keeps of a scene."""
 
     scored: list[tuple[Row, Curves]]
+    class_rows: list[ClassRow]
     pixels: int
 
 
@@ -157,10 +184,14 @@ def score_pairs(makers: Mapping[str, Maker], scenes: Lister[Scene], engine: Engi
     found = score_all(everyone, scenes, _score_scene, engine)
     scored = [row_and_curves for scene in found for row_and_curves in scene.result.scored]
     rows = [row for row, _ in scored]
-    curves = {name: _mean_curves([of for row, of in scored if row.matcher == name]) for name in everyone}
+    class_rows = [row for scene in found for row in scene.result.class_rows]
     largest = max(found, key=lambda scene: scene.result.pixels)
     return Scores(
-        rows + _mean_rows(rows, everyone), curves, scenes()[largest.number]().pair, machine_of_all(found)
+        rows=rows + _mean_rows(rows, everyone),
+        class_rows=class_rows + _mean_class_rows(class_rows),
+        curves={name: _mean_curves([of for row, of in scored if row.matcher == name]) for name in everyone},
+        largest=scenes()[largest.number]().pair,
+        machine=machine_of_all(found),
     )
 
 
@@ -270,7 +301,16 @@ def _score_scene(matchers: Mapping[str, Match], scene: Scene) -> _Scene:
             time_relative=times_ms[name] / times_ms[SGBM],
         )
         scored.append((row, curves))
-    return _Scene(scored, scene.truth_px.size)
+    return _Scene(scored, _class_rows(answers, scene), scene.truth_px.size)
+
+
+def _class_rows(answers: Mapping[str, _Answer], scene: Scene) -> list[ClassRow]:
+    masks = classify(scene.pair.left, scene.truth_px, scene.occluded)
+    return [
+        ClassRow(matcher=name, scene=scene.name, pixel_class=pixel_class, **asdict(errors))
+        for name, answer in answers.items()
+        for pixel_class, errors in class_errors(answer.disparity_px, scene.truth_px, masks).items()
+    ]
 
 
 def _answer(match: Match, pair: StereoPair) -> _Answer:
@@ -326,6 +366,23 @@ def _mean_rows(rows: list[Row], names: Iterable[str]) -> list[Row]:
     for mean in means.values():
         mean["time_relative"] = mean["time_ms"] / means[SGBM]["time_ms"]
     return [Row(matcher=name, scene=MEAN, **mean) for name, mean in means.items()]
+
+
+def _mean_class_rows(rows: Sequence[ClassRow]) -> list[ClassRow]:
+    """The means over the scenes, in the order of the first scene's rows."""
+    by_class: defaultdict[tuple[str, str], list[ClassRow]] = defaultdict(list)
+    for row in rows:
+        by_class[row.matcher, row.pixel_class].append(row)
+    columns = [field.name for field in fields(ClassErrors)]
+    return [
+        ClassRow(
+            matcher=matcher,
+            scene=MEAN,
+            pixel_class=pixel_class,
+            **{column: float(_mean_known([getattr(row, column) for row in alike])) for column in columns},
+        )
+        for (matcher, pixel_class), alike in by_class.items()
+    ]
 
 
 def _mean_curves(curves: Sequence[Curves]) -> Curves:

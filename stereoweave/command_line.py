@@ -1,6 +1,7 @@
 """What the commands share: words of the command line, and what they do before they work."""
 
 import math
+import re
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -148,6 +149,14 @@ def engine_of(cluster: str | None, workers: int | None = None, cpus_each: float 
     from stereoweave.engine import Engine
 
     return Engine(cluster, workers, cpus_each) if cluster else None
+
+
+def parse_size_px(size: str) -> tuple[int, int]:
+    """Width and height of --size."""
+    found = re.fullmatch("([0-9]{1,9})x([0-9]{1,9})", size)
+    if found is None:
+        raise StereoweaveError(f"--size: expected width x height in pixels, such as 640x480, found {size!r}")
+    return int(found[1]), int(found[2])
 
 
 def place_for(*files: Path) -> Path:

@@ -1,21 +1,19 @@
 """The commands stereoweave synth make | check | sheet | costs."""
 
 import os
-import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from stereoweave.command_line import Cluster, engine_of, needing_the_synth_extra
-from stereoweave.errors import StereoweaveError
+from stereoweave.command_line import Cluster, engine_of, needing_the_synth_extra, parse_size_px
 
 synth = typer.Typer(help="Rendered stereo with exact ground truth: make it, check it, look at it.")
 
 # Named here, because the help imports nothing heavy.
 SCENE_NAMES = (
-    "antenna", "bridge", "crane", "figures", "propeller", "pylon", "refinery", "rooms", "ship", "street",
-    "wind_turbine",
+    "antenna", "boards", "bridge", "crane", "figures", "propeller", "pylon", "refinery", "rooms", "ship",
+    "street", "wind_turbine",
 )  # fmt: skip
 
 Scene = Annotated[str, typer.Argument(help=f"One of {', '.join(SCENE_NAMES)}.")]
@@ -57,7 +55,7 @@ def make(  # noqa: PLR0913 - each is a word of the command line
         from stereoweave.synth.making import make as make_set
         from stereoweave.synth.samples import Order
     order = Order(
-        scene=scene, seed=seed, size_px=_size_px(size), frames=frames, views=tuple(view or ()), rig=rig
+        scene=scene, seed=seed, size_px=parse_size_px(size), frames=frames, views=tuple(view or ()), rig=rig
     )
     studio, engine = RenderingStudio(plain), engine_of(cluster, workers=jobs)
     made = make_set(order, pairs, out, layout=layout, jobs=_jobs(jobs), engine=engine, studio=studio)
@@ -94,7 +92,9 @@ def sheet(
         from stereoweave.synth.making import camera
         from stereoweave.synth.scenes import SCENES
     if quiz:
-        picture, answers = contact_sheet.quiz(camera(), [name for name in SCENES if name != "rooms"], seed)
+        picture, answers = contact_sheet.quiz(
+            camera(), [name for name in SCENES if name not in ("boards", "rooms")], seed
+        )
         typer.echo("by row: " + ", ".join(answers))
     else:
         picture = contact_sheet.sheet(camera(), list(SCENES), seed)
@@ -114,13 +114,6 @@ def costs(
         from stereoweave.synth.costs import costs as measured
     for cost in measured(scene, pairs):
         typer.echo(f"{cost.ms_a_pair:6.0f} ms  {cost.effect}")
-
-
-def _size_px(size: str) -> tuple[int, int]:
-    found = re.fullmatch("([0-9]{1,9})x([0-9]{1,9})", size)
-    if found is None:
-        raise StereoweaveError(f"--size: expected width x height in pixels, such as 640x480, found {size!r}")
-    return int(found[1]), int(found[2])
 
 
 def _jobs(jobs: int | None) -> int:

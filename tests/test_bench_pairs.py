@@ -11,7 +11,11 @@ from stereoweave.data.packing import packed
 from stereoweave.data.paper_layout import write_frame
 from stereoweave.data.readers import read_scenes
 from stereoweave.data.shards import write_shard
+from stereoweave.error_classes import CLASSES
 from stereoweave.errors import StereoweaveError
+from stereoweave.io import write_image, write_pfm
+from stereoweave.learn import collage
+from stereoweave.learn.sources import VALIDATION_SEED
 from stereoweave.matcher import shipped_models
 
 NETWORKS = [name + how for name in shipped_models() for how in ("", " refined")]
@@ -95,6 +99,77 @@ def test_a_mistake_is_told_in_one_line_before_anything_is_measured(
     (line,) = told.splitlines()
     assert [fragment for fragment in fragments if fragment not in line] == []
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_errors_by_class_are_a_second_file_and_add_up_to_the_first(sets, tmp_path, capfd, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    out = tmp_path / "out"
+    options = f"-o {out}/rows.csv --classes {out}/classes.csv --model small --threads 1"
+    assert main(f"bench pairs {sets / 'ship'} {options}".split()) == 0
+    text = (out / "classes.csv").read_text()
+    assert text.splitlines()[0] == (
+        "matcher,scene,pixel_class,share_percent,bad1_percent,bad2_percent,bad1_within_percent,"
+        "bad2_within_percent,epe_px,cpu,cores,opencv"
+    )
+    by_class = {}
+    for row in csv.DictReader(text.splitlines()):
+        by_class.setdefault((row["matcher"], row["scene"]), {})[row["pixel_class"]] = row
+    whole = list(csv.DictReader((out / "rows.csv").read_text().splitlines()))
+    assert list(by_class) == [
+        (matcher, scene)
+        for scene in ("ship-000000", "ship-000001", "mean")
+        for matcher in (*OPENCV, "small", "small refined")
+    ]
+    for row in whole:
+        found = by_class[row["matcher"], row["scene"]]
+        assert list(found) == [*CLASSES, "all"]
+        points = sum(float(found[name]["bad1_percent"]) for name in CLASSES)
+        assert points == pytest.approx(float(row["bad1_percent"]), abs=1e-3)
+        assert float(found["all"]["epe_px"]) == pytest.approx(float(row["epe_px"]), rel=1e-5)
+    printed = capfd.readouterr().out
+    assert f"errors by class: {out}/classes.csv\n" in printed
+    assert [name for name in ("outside", "occluded", "edges", "plain", "weak") if name not in printed] == []
+    assert "…" not in printed
+
+
+def test_rendered_pairs_know_their_occlusion_and_folders_do_not(sets, tmp_path):
+    for number, scene in enumerate(read_scenes(sets / "ship")):
+        np.testing.assert_array_equal(scene.occluded, pair(number).occluded)
+    made = pair(0)
+    folder = tmp_path / "scenes" / "box"
+    folder.mkdir(parents=True)
+    for name, image in (("left", made.left), ("right", made.right)):
+        write_image(folder / f"{name}.png", image)
+    write_pfm(folder / "disparity.pfm", made.disparity_px)
+    (scene,) = read_scenes(tmp_path / "scenes")
+    assert scene.occluded is None
+
+
+def test_held_out_collages_are_a_set_and_those_that_trainings_validate_on(tmp_path, capfd):
+    assert main(f"bench collages -o {tmp_path}/collages --pairs 2 --size 64x48".split()) == 0
+    assert capfd.readouterr().out == f"{tmp_path}/collages: 2 pairs made\n"
+    for number, scene in enumerate(read_scenes(tmp_path / "collages")):
+        expected = collage.sample(VALIDATION_SEED, 0, number, 48, 64)
+        assert scene.name == f"collage-{number:06d}"
+        np.testing.assert_array_equal(scene.pair.left, expected.left)
+        np.testing.assert_array_equal(scene.pair.right, expected.right)
+        np.testing.assert_allclose(scene.truth_px, expected.disparity_px, atol=0.001)
+        np.testing.assert_array_equal(scene.occluded, expected.occluded)
+
+
+@pytest.mark.parametrize(
+    ("options", "fragment"),
+    [
+        ("--size 640", "--size: expected width x height in pixels"),
+        ("--size 64x16", "--size: expected at least 32x32 pixels, found 64x16"),
+        ("--size 64x48", "expected a new or empty folder"),
+    ],
+)
+def test_collages_are_not_written_among_other_files_or_tiny(sets, capfd, options, fragment):
+    before = sorted(sets.rglob("*"))
+    assert main(f"bench collages -o {sets} {options}".split()) == 2
+    assert fragment in capfd.readouterr().err
+    assert sorted(sets.rglob("*")) == before
 
 
 def test_a_plot_without_matplotlib_names_the_extra(tmp_path):

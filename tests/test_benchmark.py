@@ -1,5 +1,6 @@
 import csv
 import math
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -74,6 +75,32 @@ def test_rows_hold_the_errors_of_each_matcher_on_each_scene_and_their_means(rng)
         ("eight", "far"): (1.5, 100.0, 0.0, 0.0),
         ("eight", "mean"): (6.5, 100.0, 50.0, 50.0),
     }
+
+
+def test_errors_by_class_are_those_of_each_scene_and_their_means(rng):
+    near, far = scene_of(rng, "near", disparity_px=20), scene_of(rng, "far", disparity_px=7)
+    occluded = np.zeros(far.truth_px.shape, bool)
+    occluded[:, 50:60] = True
+    makers = {"seven": constant(7.0)}
+    rows = scores_of(makers, [near, replace(far, occluded=occluded)]).class_rows
+    found = {
+        (row.scene, row.pixel_class): (row.share_percent, row.bad1_percent, row.epe_px)
+        for row in rows
+        if row.matcher == "seven"
+    }
+    expected = {
+        ("near", "outside"): (20, 20, 13),
+        ("near", "occluded"): (0, 0, math.nan),
+        ("near", "all"): (100, 100, 13),
+        ("far", "outside"): (7, 0, 0),
+        ("far", "occluded"): (10, 0, 0),
+        ("far", "all"): (100, 0, 0),
+        ("mean", "outside"): (13.5, 10, 6.5),
+        ("mean", "occluded"): (5, 0, 0),
+        ("mean", "all"): (100, 50, 6.5),
+    }
+    for key, numbers in expected.items():
+        assert found[key] == pytest.approx(numbers, nan_ok=True), key
 
 
 def test_times_are_relative_to_sgbm_in_the_same_row(rng):

@@ -6,10 +6,10 @@ from learn_examples import complaint
 
 from stereoweave.stereo import StereoCamera
 from stereoweave.synth.rigs import Orbit
-from stereoweave.synth.samples import Order, staged
+from stereoweave.synth.samples import Order, rendered, staged
 from stereoweave.synth.scenes import SCENES
 from stereoweave.synth.stage import Stage
-from stereoweave.synth.world import Mesh, Sky, World
+from stereoweave.synth.world import Mesh, Shot, Sky, World
 
 ORDER = Order(scene="propeller", size_px=(320, 240))
 TRIANGLE = Mesh(
@@ -64,6 +64,26 @@ def test_a_scene_may_have_a_range_of_its_own_for_the_nearest_disparity(monkeypat
     monkeypatch.setitem(SCENES, "propeller", lambda rng: replace(STAGE, nearest_px=(100.0, 100.0)))
     _, rig = staged(Wall(), ORDER, 0)
     np.testing.assert_allclose(rig.camera.disparity_px(np.array([[4.0]])), 50.0)  # of 320 px width
+
+
+class Grey(Wall):
+    """A camera that takes even pictures, white on the left and black on the right."""
+
+    def shots(self, world, rig, positions):
+        levels = [np.full((*rig.size_px[::-1], 3), 255 * (position == 0), np.uint8) for position in positions]
+        known = np.ones(rig.size_px[::-1], bool)
+        return [Shot(image=level, depth_m=4 * known.astype(np.float32), target=known) for level in levels]
+
+
+def test_noise_grows_with_the_root_of_brightness_and_comes_from_the_seed(monkeypatch):
+    assert rendered(Grey(), ORDER, 0).sample.left.min() == 255
+    monkeypatch.setitem(SCENES, "propeller", lambda rng: replace(STAGE, noise_levels=4.0))
+    sample = rendered(Grey(), ORDER, 0).sample
+    # Half of the values are cut off at white and at black: of a normal one, 0.399 of its deviation is left.
+    assert (255 - sample.left).mean() == pytest.approx(0.399 * 4, rel=0.05)
+    assert sample.right.mean() == pytest.approx(0.399 * 4 * 0.2**0.5, rel=0.05)
+    np.testing.assert_array_equal(rendered(Grey(), ORDER, 0).sample.left, sample.left)
+    assert not np.array_equal(rendered(Grey(), ORDER, 1).sample.left, sample.left)
 
 
 class Wire(Wall):

@@ -61,6 +61,8 @@ def in_memory(recipe):
         pair_size=PAIR_SIZE,
         crop_size=(64, 64),
         batch=2,
+        micro_batch=0,
+        held_out=(),
         max_disparity_px=48.0,
     )
 

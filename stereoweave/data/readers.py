@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 
 from stereoweave.calibration_files import calibrated
 from stereoweave.data import eth3d, kitti, middlebury, paper_layout, scene_flow, shards, sintel
@@ -60,11 +60,13 @@ class Scene:
         name: The folder's.
         pair: With its camera where the folder has a calib.txt.
         truth_px: float32 [H, W], the disparity of the left view; NaN where it is unknown.
+        occluded: True occlusion of the left view; None where the truth of the right view is unknown.
     """
 
     name: str
     pair: StereoPair
     truth_px: Float32[np.ndarray, "h w"]
+    occluded: Bool[np.ndarray, "h w"] | None = None
 
 
 def read_scenes(folder: str | Path, dataset: str | None = None) -> Iterator[Scene]:
@@ -104,7 +106,8 @@ def list_scenes(folder: str | Path, dataset: str | None = None) -> list[Callable
 def _frame_scene(frame: Frame) -> Scene:
     sample = frame.read()
     pair = StereoPair(left=sample.left, right=sample.right, camera=sample.camera)
-    return Scene(name=frame.name, pair=pair, truth_px=sample.disparity_px)
+    occluded = sample.occluded if np.isfinite(sample.right_disparity_px).any() else None
+    return Scene(name=frame.name, pair=pair, truth_px=sample.disparity_px, occluded=occluded)
 
 
 def _read_scene(folder: Path) -> Scene:

@@ -23,16 +23,18 @@ _SIZE = (320, 512)
 def calibrate(network: WeaveNet) -> dict[str, Any]:
     """How often the network's confidence comes true, after scaling and shifting it to come true as it says.
 
-    The scale and the shift (Platt 1999) are folded into the last layer. What is returned comes from other
+    The scale and the shift (Platt 1999) are folded into the last layers. What is returned comes from other
     pairs than they were fitted on: `calibration_error`, and per bin of confidence what was `claimed`, what
     `happened`, and the `share` of pixels.
     """
     scale, shift = _fitted(*_claims(network, _FIT_SEED))
-    last = network.refinement.confidence
-    assert last.bias is not None
     with torch.no_grad():
-        last.weight *= scale
-        last.bias.copy_(last.bias * scale + shift)
+        for index, layer in enumerate(network.confidence_layers):
+            assert layer.bias is not None
+            layer.weight *= scale
+            layer.bias *= scale
+            # The outputs add up, so that one of them is shifted.
+            layer.bias += shift if index == 0 else 0
     logits, within = _claims(network, _PROOF_SEED)
     return reliability(logits.sigmoid().numpy(), within.numpy())
 

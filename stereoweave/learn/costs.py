@@ -39,7 +39,9 @@ _STAGES_BETWEEN = {
     ("", ""): "encoder",
     ("", "encoder"): "mirroring",
     ("", "aggregation"): "disparity from scores",
+    ("", "completion"): "completion",
     ("", "propagation"): "upsampling",
+    ("", "sharpening"): "sharpening",
     ("", "refinement"): "upsampling",
     ("refinement", "to_half"): "matching at 1/2",
 }

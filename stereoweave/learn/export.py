@@ -208,7 +208,10 @@ def multiply_adds(network: nn.Module, height: int = 480, width: int = 640) -> in
     # The counter sees convolutions and matrix products; the refinement compares features of both views by
     # plain products, at one column more than it gives matches for where it interpolates between products.
     nearby = 2 * network.refinement.radius + 1 + (not network.size.warps)
-    return counted + 2 * (height // 2) * (width // 2) * network.size.compared * nearby
+    counted += 2 * (height // 2) * (width // 2) * network.size.compared * nearby
+    if network.sharpening is None:
+        return counted
+    return counted + 2 * height * width * network.size.sharpening * (2 * network.sharpening.radius + 1)
 
 
 def _card(kept: Checkpoint, network: nn.Module) -> dict[str, Any]:

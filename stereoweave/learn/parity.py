@@ -171,9 +171,10 @@ def as_shipped(network: WeaveNet, file: Path) -> WeaveNet:
     """The network of a checkpoint, its confidence calibrated as it was for the matcher file."""
     weights = {x.name: x for x in onnx.load(file).graph.initializer}
     with torch.no_grad():
-        for name, parameter in network.refinement.confidence.named_parameters():
-            stored = numpy_helper.to_array(weights[f"refinement.confidence.{name}"])
-            parameter.copy_(torch.from_numpy(stored.copy()))
+        for name, parameter in network.named_parameters():
+            if ".confidence." in name:
+                stored = numpy_helper.to_array(weights[name])
+                parameter.copy_(torch.from_numpy(stored.copy()))
     return network
 
 

@@ -33,7 +33,7 @@ _SIZE = (320, 512)
 # Of the values of a map; what lies beyond is cut, so that few far-off ones do not make the steps coarse.
 _RANGE_PERCENTILE = 99.99
 # These layers keep float32: they read what is finer than a pixel; in 8 bits too, twice as much is lost.
-_KEPT = "refinement."
+_KEPT = ("refinement.", "sharpening.")
 
 
 def quantise(source: Path, out: Path) -> dict[str, Any]:
@@ -70,8 +70,9 @@ def quantise(source: Path, out: Path) -> dict[str, Any]:
 def quantised_nodes(graph: onnx.ModelProto) -> list[str]:
     """The names of the nodes that compute in 8 bits.
 
-    They are the convolutions but the refinement's, and what stands between them alone. Disparities,
-    correlations and what they are read from never are: eight bits of a disparity are whole pixels.
+    They are the convolutions but those of the refinement and the sharpening, and what stands between them
+    alone. Disparities, correlations and what they are read from never are: eight bits of a disparity are
+    whole pixels.
     """
     convolutions = (
         node.name

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from stereoweave.data.samples import make_sample
 from stereoweave.errors import StereoweaveError
@@ -89,7 +89,9 @@ def rendered(camera: Camera, order: Order, index: int) -> Rendered:
     stage, rig = staged(camera, order, sequence, frame)
     left, right, *others = camera.shots(stage.world, rig, (0.0, 1.0, *order.views))
     left_px, right_px = (rig.camera.disparity_px(shot.depth_m).astype(np.float32) for shot in (left, right))
-    pair = StereoPair(left=left.image, right=right.image, camera=rig.camera)
+    rng = np.random.default_rng((*_seed(order, sequence), frame))
+    left_image, right_image = (_with_noise(rng, shot.image, stage.noise_levels) for shot in (left, right))
+    pair = StereoPair(left=left_image, right=right_image, camera=rig.camera)
     return Rendered(
         sample=make_sample(pair, left_px, right_px),
         views=tuple(zip(order.views, others, strict=True)),
@@ -98,7 +100,7 @@ def rendered(camera: Camera, order: Order, index: int) -> Rendered:
 
 def staged(camera: Camera, order: Order, sequence: int, frame: int = 0) -> tuple[Stage, Rig]:
     """The stage and rig of a frame of a sequence; (seed, scene, sequence) decide all but the frame."""
-    rng = np.random.default_rng((order.seed, zlib.crc32(order.scene.encode()), sequence))
+    rng = np.random.default_rng(_seed(order, sequence))
     stage = SCENES[order.scene](rng)
     focal_px = draw_focal_px(rng, order.size_px[0])
     nearest_px = draw_nearest_px(rng, order.size_px[0], stage.nearest_px)
@@ -120,6 +122,20 @@ def staged(camera: Camera, order: Order, sequence: int, frame: int = 0) -> tuple
     share = frame / max(order.frames - 1, 1)
     camera_model = _camera(focal_px, baseline_m, order.size_px)
     return stage, rig_at(stage.orbit, between(start, end, share), camera_model, order.size_px)
+
+
+def _seed(order: Order, sequence: int) -> tuple[int, int, int]:
+    return order.seed, zlib.crc32(order.scene.encode()), sequence
+
+
+def _with_noise(
+    rng: np.random.Generator, image: UInt8[np.ndarray, "h w 3"], levels: float
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The picture with a sensor's noise, which grows with the root of the brightness as photons' does."""
+    if not levels:
+        return image
+    deviation = levels * np.sqrt((0.25 + image / 255) / 1.25)
+    return np.clip(np.rint(image + deviation * rng.standard_normal(image.shape)), 0, 255).astype(np.uint8)
 
 
 def _baseline_m(

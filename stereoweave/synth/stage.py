@@ -14,11 +14,13 @@ class Stage:
         world: what is seen.
         orbit: where from.
         nearest_px: the disparity of the nearest surface in a picture 640 px wide, from..to.
+        noise_levels: standard deviation of the cameras' noise in a white surface, in grey levels of 0..255.
     """
 
     world: World
     orbit: Orbit
     nearest_px: tuple[float, float] = NEAREST_PX
+    noise_levels: float = 0.0
 
 
 @dataclass

@@ -12,12 +12,13 @@ from stereoweave.learn.models.dispnet import DispNet
 from stereoweave.learn.models.fast_depth import FastDepthNet
 from stereoweave.learn.models.psmnet import PSMNet
 from stereoweave.learn.models.variants import VARIANTS
-from stereoweave.learn.models.weave import BASE, SMALL, WeaveNet
+from stereoweave.learn.models.weave import BASE, BASE_GROWN, SMALL, WeaveNet
 from stereoweave.learn.recipe import Recipe
 
 MODELS: dict[str, Callable[..., Any]] = {
     "weave_small": partial(WeaveNet, SMALL),
     "weave_base": partial(WeaveNet, BASE),
+    "weave_base_grown": partial(WeaveNet, BASE_GROWN),
     "fast_depth": FastDepthNet,
     "fast_depth_without_skips": partial(FastDepthNet, skips=False),
     "densemapnet": DenseMapNet,

@@ -142,10 +142,8 @@ VARIANTS: dict[str, Callable[[], WeaveNet]] = {
     "weave_small_without_context": WithoutContext,
     "weave_small_bilinear": Bilinear,
     "weave_small_nine_neighbours": partial(WeaveNet, replace(SMALL, neighbours=9)),
-    "weave_base_before": partial(WeaveNet, BASE),
     "weave_base_wider": partial(WeaveNet, replace(BASE, wider=64)),
     "weave_base_completed": partial(WeaveNet, replace(BASE, completion=32)),
     "weave_base_sharpened": partial(WeaveNet, replace(BASE, sharpening=8)),
-    "weave_base_grown": partial(WeaveNet, replace(BASE, wider=64, completion=32, sharpening=8)),
     "weave_small_looked_up": partial(WeaveNet, replace(SMALL, warps=False, compared=16, handed=8)),
 }

@@ -5,7 +5,7 @@ tied to the pictures it saw. WeaveNet compares features of one encoder instead, 
 dilated, densely connected blocks, the decoder in steps of two, and the skip connections from the image.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -104,6 +104,9 @@ BASE = Size(
     refinement=6,
     neighbours=9,
 )
+
+# BASE with the stages that it can grow by; they add nothing until they are trained.
+BASE_GROWN = replace(BASE, wider=64, completion=32, sharpening=8)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -263,9 +266,10 @@ class Refinement(nn.Module):
 class WeaveNet(nn.Module):
     """Disparity of both views of a rectified pair, and the left one's confidence.
 
-    Sides must be multiples of 16. Disparities from 0 to `levels` * 4 - 1 px are found. For both
-    views at 640x480 SMALL takes 2.96 G multiply-adds with its 278,029 parameters, BASE takes
-    13.41 G multiply-adds with its 1,274,290 parameters.
+    Sides must be multiples of 16, or of 32 with a context at 1/32. Disparities from 0 to `levels` * 4 - 1 px
+    are found. For both views at 640x480 SMALL takes 2.96 G multiply-adds with its 278,029 parameters, BASE
+    takes 13.41 G multiply-adds with its 1,274,290 parameters, BASE_GROWN takes 15.98 G multiply-adds with its
+    1,470,020 parameters.
     """
 
     def __init__(self, size: Size = SMALL, levels: int = 48) -> None:
@@ -287,6 +291,12 @@ class WeaveNet(nn.Module):
     @property
     def max_disparity_px(self) -> int:
         return 4 * self.levels
+
+    @property
+    def confidence_layers(self) -> tuple[nn.Conv2d, ...]:
+        """The layers whose outputs add up to the confidence's logit."""
+        sharpened = () if self.sharpening is None else (self.sharpening.confidence,)
+        return self.refinement.confidence, *sharpened
 
     def stages(self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]) -> Stages:
         """Every step of the prediction for both views."""

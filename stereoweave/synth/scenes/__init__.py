@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from stereoweave.synth.scenes.antenna import antenna
+from stereoweave.synth.scenes.boards import boards
 from stereoweave.synth.scenes.bridge import bridge
 from stereoweave.synth.scenes.crane import crane
 from stereoweave.synth.scenes.figures import figures
@@ -19,6 +20,7 @@ from stereoweave.synth.stage import Stage
 
 SCENES: dict[str, Callable[[np.random.Generator], Stage]] = {
     "antenna": antenna,
+    "boards": boards,
     "bridge": bridge,
     "crane": crane,
     "figures": figures,
