@@ -93,6 +93,12 @@ def export(  # noqa: PLR0913 - each is a word of the command line
     eight_bits: Annotated[
         Path | None, typer.Option(help="An .onnx file to write whose convolutions compute in 8 bits.")
     ] = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option(
+            help="A .pt file to write: a run's averaged weights in 16 bits, for recipes to start from."
+        ),
+    ] = None,
     size: Annotated[
         str | None,
         typer.Option(
@@ -116,7 +122,11 @@ def export(  # noqa: PLR0913 - each is a word of the command line
     size_px = _size_px(size) if size else None
     pairs = [scene.pair for scene in read_scenes(scenes)] if scenes else []
     with needing_the_train_extra():
-        from stereoweave.learn.matcher_files import MatcherFiles, write_matcher_files
+        from stereoweave.learn.matcher_files import MatcherFiles, write_matcher_files, write_weights
+    if weights:
+        typer.echo(write_weights(Path(source), weights))
+    if weights and not (out or half or eight_bits):
+        return
     files = MatcherFiles(out=out, half=half, eight_bits=eight_bits, size=size_px)
     for line in write_matcher_files(source, files, pairs, reliability):
         typer.echo(line)

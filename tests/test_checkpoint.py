@@ -4,7 +4,7 @@ from dataclasses import asdict, replace
 
 import pytest
 import torch
-from learn_examples import RECIPE, checkpoint_of
+from learn_examples import RECIPE, checkpoint_of, untrained
 from torch import nn
 
 from stereoweave.errors import FormatError
@@ -140,3 +140,18 @@ def test_runs_that_did_not_start_alike_have_no_mean(trained):
     first = gone_on(trained, 1.0)
     with pytest.raises(FormatError, match="found one that did not"):
         checkpoint.mean(first, trained, trained)
+
+
+def test_averaged_weights_alone_are_small_and_a_run_can_start_from_them(tmp_path):
+    network = untrained()
+    kept = replace(checkpoint_of(network), optimiser={"state": torch.zeros(10)})
+    checkpoint.save(checkpoint.averaged_alone(kept), tmp_path / "weights.pt")
+    count = sum(value.numel() for value in network.state_dict().values())
+    assert (tmp_path / "weights.pt").stat().st_size < 2 * count + 120_000
+    found = checkpoint.load(tmp_path / "weights.pt")
+    assert found.optimiser == {}
+    start = checkpoint.start_of(replace(RECIPE, start_from=str(tmp_path / "weights.pt")), "0123abc")
+    assert start.origin[-1]["step"] == RECIPE.steps
+    for name, value in network.state_dict().items():
+        # 11 bits of a float16's fraction.
+        torch.testing.assert_close(start.weights[name], value, rtol=1e-3, atol=1e-6)

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from stereoweave.errors import FormatError
+from stereoweave.learn.models import network_of
 from stereoweave.learn.recipe import Recipe, recipe_from
 
 Weights = dict[str, torch.Tensor]
@@ -43,6 +44,56 @@ class Checkpoint:
     def as_origin(self) -> tuple[dict[str, Any], ...]:
         """The origin of a run that starts from this one."""
         return *self.origin, {"recipe": asdict(self.recipe), "step": self.step, "commit": self.commit}
+
+
+def start_of(recipe: Recipe, commit: str) -> Checkpoint:
+    """The start of a run: the averaged weights of `start_from` where the network has such, else random ones.
+
+    Raises:
+        FormatError: `start_from` is no checkpoint, or shares no weights with the network.
+    """
+    torch.manual_seed(recipe.seed)
+    weights: Weights = network_of(recipe).state_dict()
+    hours = 0.0
+    origin: tuple[dict[str, Any], ...] = ()
+    if recipe.start_from:
+        earlier = load(Path(recipe.start_from))
+        weights, hours, origin = _grown(weights, earlier, recipe), earlier.hours, earlier.as_origin()
+    return Checkpoint(
+        recipe=recipe,
+        step=0,
+        weights=weights,
+        averaged=weights,
+        optimiser={},
+        random_state=torch.get_rng_state(),
+        scores={},
+        commit=commit,
+        hours=hours,
+        origin=origin,
+    )
+
+
+def _grown(fresh: Weights, earlier: Checkpoint, recipe: Recipe) -> Weights:
+    """An earlier network's averaged weights where this one has such of the same shape, else fresh ones."""
+    taken = {
+        name: value.to(fresh[name].dtype)  # kept in half precision, perhaps
+        for name, value in earlier.averaged.items()
+        if name in fresh and value.shape == fresh[name].shape
+    }
+    if not taken:
+        raise FormatError(
+            f"{recipe.name}: start_from = {recipe.start_from!r}, expected a checkpoint that shares weights "
+            f"with {recipe.model}, found one of {earlier.recipe.model}"
+        )
+    return fresh | taken
+
+
+def averaged_alone(kept: Checkpoint) -> Checkpoint:
+    """The checkpoint with nothing but its averaged weights, in half precision: to start other runs from."""
+    weights = {
+        name: value.half() if value.is_floating_point() else value for name, value in kept.averaged.items()
+    }
+    return replace(kept, weights=weights, averaged=weights, optimiser={})
 
 
 def mean(first: Checkpoint, second: Checkpoint, start: Checkpoint) -> Checkpoint:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.io import place_for, replacing
+from stereoweave.learn import checkpoint
 from stereoweave.learn.calibrate import draw_reliability
 from stereoweave.learn.export import export
 from stereoweave.learn.fixed_size import check_size, fix_size
@@ -71,6 +72,24 @@ def write_matcher_files(
         if files.size:
             check_size(*files.size, Matcher(made).multiple_of)
         yield from _written(made, files)
+
+
+def write_weights(run: Path, out: Path) -> str:
+    """Write the averaged weights of a run in half precision, for recipes to start from; returns a line on it.
+
+    Args:
+        run: The folder of a run, or a checkpoint.
+        out: The .pt file.
+
+    Raises:
+        StereoweaveError: `run` has no checkpoint, or `out` another ending.
+    """
+    if out.suffix != ".pt":
+        raise StereoweaveError(f"{out}: expected a name that ends in .pt, as start_from takes it")
+    kept = checkpoint.load(run / "last.pt" if run.is_dir() else run)
+    place_for(out)
+    checkpoint.save(checkpoint.averaged_alone(kept), out)
+    return f"{out}: averaged weights after {kept.step} steps, in 16 bits"
 
 
 def is_matcher(source: str) -> bool:

@@ -71,7 +71,7 @@ def standing(recipe: Recipe, out: Path, earlier: Path | None, commit: str) -> St
     folders = [folder for folder in (out, earlier) if folder and (folder / PROGRESS).exists()]
     found = [(_progress(folder / PROGRESS), folder) for folder in folders]
     if not found:
-        return Standing(checkpoint=_first(recipe, commit), optimiser={}, progress=Progress())
+        return Standing(checkpoint=checkpoint.start_of(recipe, commit), optimiser={}, progress=Progress())
     progress, folder = max(found, key=lambda one: one[0].seconds)
     last = checkpoint.load(folder / NETWORK)
     if last.recipe.model != recipe.model:
@@ -84,43 +84,6 @@ def standing(recipe: Recipe, out: Path, earlier: Path | None, commit: str) -> St
         progress = replace(progress, optimiser_steps=0)
     state = replace(last, recipe=recipe, commit=commit)
     return Standing(checkpoint=state, optimiser=optimiser, progress=progress)
-
-
-def _first(recipe: Recipe, commit: str) -> Checkpoint:
-    torch.manual_seed(recipe.seed)
-    weights: Weights = network_of(recipe).state_dict()
-    hours = 0.0
-    origin: tuple[dict[str, Any], ...] = ()
-    if recipe.start_from:
-        earlier = checkpoint.load(Path(recipe.start_from))
-        weights, hours, origin = _grown(weights, earlier, recipe), earlier.hours, earlier.as_origin()
-    return Checkpoint(
-        recipe=recipe,
-        step=0,
-        weights=weights,
-        averaged=weights,
-        optimiser={},
-        random_state=torch.get_rng_state(),
-        scores={},
-        commit=commit,
-        hours=hours,
-        origin=origin,
-    )
-
-
-def _grown(fresh: Weights, earlier: Checkpoint, recipe: Recipe) -> Weights:
-    """The earlier averaged weights where the network has such of the same shape, else fresh ones."""
-    taken = {
-        name: value.to(fresh[name].dtype)
-        for name, value in earlier.averaged.items()
-        if name in fresh and value.shape == fresh[name].shape
-    }
-    if not taken:
-        raise FormatError(
-            f"{recipe.name}: start_from = {recipe.start_from!r}, expected a checkpoint that shares weights "
-            f"with {recipe.model}, found one of {earlier.recipe.model}"
-        )
-    return fresh | taken
 
 
 def _progress(path: Path) -> Progress:

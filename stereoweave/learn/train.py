@@ -14,7 +14,7 @@ from dataclasses import replace
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -33,7 +33,7 @@ from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io import make_folder, replacing
 from stereoweave.learn import checkpoint
 from stereoweave.learn.batches import Batches, Told, split
-from stereoweave.learn.checkpoint import Checkpoint, Weights
+from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.models import network_of
 from stereoweave.learn.objective import fitted, naming, objective_of
 from stereoweave.learn.ranks import Ranks, ranks, threads_each, told_once
@@ -210,7 +210,9 @@ class Run:
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), max_norm=5.0)
         if not (np.isfinite(value) and norm.isfinite()):
             sums.undo()
-            found = f"the loss is {value}" if norm.isfinite() else f"the norm of the gradient is {norm}"
+            found = f"the loss is {value}"
+            if np.isfinite(value):
+                found = f"the norm of the gradient is {norm}"
             self._skip(step, found, batches)
             return value
         self.optimiser.step()
@@ -282,39 +284,7 @@ def _starting_point(recipe: Recipe, last: Path) -> Checkpoint:
                 "train into a folder of its own, or remove it"
             )
         return replace(found, recipe=recipe, commit=checkpoint.code_commit())
-    torch.manual_seed(recipe.seed)
-    weights, hours = network_of(recipe).state_dict(), 0.0
-    origin: tuple[dict[str, Any], ...] = ()
-    if recipe.start_from:
-        earlier = checkpoint.load(Path(recipe.start_from))
-        weights, hours, origin = _grown(weights, earlier, recipe), earlier.hours, earlier.as_origin()
-    return Checkpoint(
-        recipe=recipe,
-        step=0,
-        weights=weights,
-        averaged=weights,
-        optimiser={},
-        random_state=torch.get_rng_state(),
-        scores={},
-        commit=checkpoint.code_commit(),
-        hours=hours,
-        origin=origin,
-    )
-
-
-def _grown(fresh: Weights, earlier: Checkpoint, recipe: Recipe) -> Weights:
-    """An earlier network's averaged weights where this one has such of the same shape, else fresh ones."""
-    taken = {
-        name: value
-        for name, value in earlier.averaged.items()
-        if name in fresh and value.shape == fresh[name].shape
-    }
-    if not taken:
-        raise FormatError(
-            f"{recipe.name}: start_from = {recipe.start_from!r}, expected a checkpoint that shares weights "
-            f"with {recipe.model}, found one of {earlier.recipe.model}"
-        )
-    return fresh | taken
+    return checkpoint.start_of(recipe, checkpoint.code_commit())
 
 
 def _check(recipe: Recipe) -> None:

@@ -15,6 +15,7 @@ from stereoweave.stereo import Sample
 Map = Float[np.ndarray, "h w"]
 
 
+@torch.no_grad()
 def validate(network: nn.Module, pairs: Source, device: torch.device) -> dict[str, float]:
     """Mean scores over the left views of the pairs, occluded pixels included."""
     rows, confidences, truths = [], [], []
@@ -27,6 +28,7 @@ def validate(network: nn.Module, pairs: Source, device: torch.device) -> dict[st
     }
 
 
+@torch.no_grad()
 def validate_by_class(network: nn.Module, pairs: Source, device: torch.device) -> dict[str, float]:
     """Mean scores over the left views of the pairs, and what each class of pixels adds to bad-1.
 
@@ -43,7 +45,6 @@ def validate_by_class(network: nn.Module, pairs: Source, device: torch.device) -
     return _mean(rows)
 
 
-@torch.no_grad()
 def _answers(network: nn.Module, pairs: Source, device: torch.device) -> Iterator[tuple[Sample, Map, Map]]:
     """Each sample, its left disparity in px, and its confidence."""
     network.eval()
