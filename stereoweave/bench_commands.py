@@ -382,6 +382,19 @@ def ablations(
 
 
 @bench.command()
+def training(
+    run: Annotated[Path, typer.Argument(help="The folder of a run of stereoweave train.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file; rows of other runs in it stay.")],
+) -> None:
+    """Learning curve of a run: its held-out scores against the pairs seen, and the power laws they follow."""
+    place_for(out)
+    with needing_the_train_extra():
+        from stereoweave.learn.curves import record_curve
+    for name, law in record_curve(run, out).items():
+        typer.echo(f"{name}: {law.at_10000_pairs:.4g} * (pairs / 10,000)^-{law.exponent:.3f}")
+
+
+@bench.command()
 def exponent(
     recipe: RecipeFile,
     out: RunsFolder,
