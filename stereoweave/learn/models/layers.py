@@ -206,7 +206,7 @@ def warped_matches(
     places = _places(below)
     pixels = _pixels(second)
     low, high = pixels.index_select(0, places), pixels.index_select(0, places + 1)
-    warped = low + (columns - below).view(-1, 1) * (high - low)
+    warped = low + (columns - below).view(-1, 1).to(low.dtype) * (high - low)
     warped = F.pad(warped.view(batch, height, width, channels), (0, 0, radius, radius))
     left = first.permute(0, 2, 3, 1)
     steps = range(2 * radius, -1, -1)

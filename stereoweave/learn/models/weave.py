@@ -365,6 +365,12 @@ class WeaveNet(nn.Module):
         if self.sharpening is None:
             return disparity_px, logit
         features, match = self.sharpening.views(images)
+        if self.training:
+            # Of the left views alone, which costs half; the right ones supervise what is to be sharpened.
+            lefts = (disparity_px[:batch], match[:batch], match[batch:], features[:batch], context[:batch])
+            sharp_px, more = self.sharpening(*lefts)
+            right_px, right_logit = disparity_px[batch:], logit[batch:]
+            return torch.cat([sharp_px, right_px]), torch.cat([logit[:batch] + more, right_logit])
         first, second = as_left_view(match, batch), as_other_view(match, batch)
         sharp_px, more = self.sharpening(disparity_px, first, second, as_left_view(features, batch), context)
         return sharp_px, logit + more
