@@ -20,7 +20,7 @@ from stereoweave.arrays import as_rgb
 from stereoweave.enlarging import enlarge
 from stereoweave.errors import StereoweaveError
 from stereoweave.io import SMALLEST_SIDE_PX
-from stereoweave.matcher import PIXEL_PAIRS_AT_ONCE, Matcher, find_occluded, model_file
+from stereoweave.matcher import PIXEL_PAIRS_AT_ONCE, Matcher, check_steps, find_occluded, model_file
 from stereoweave.providers import CPU
 from stereoweave.ranging import find_range, goes_beyond
 from stereoweave.stereo import Estimate, StereoPair
@@ -54,6 +54,7 @@ def estimate(  # noqa: PLR0913 - each has a name, and all but the pictures can b
     threads: int | None = None,
     provider: str = CPU,
     refined: bool = False,
+    raw: bool = False,
     range_px: tuple[float, float] | None = None,
 ) -> Estimate:
     """Disparity of both views, confidence and occlusion of a rectified pair.
@@ -66,6 +67,7 @@ def estimate(  # noqa: PLR0913 - each has a name, and all but the pictures can b
         threads: How many threads may be used; all cores if left out.
         provider: What the network is run on: cpu, cuda, tensorrt, openvino, coreml or directml.
         refined: As for `match`.
+        raw: As for `match`.
         range_px: As for `match`.
 
     Raises:
@@ -75,7 +77,7 @@ def estimate(  # noqa: PLR0913 - each has a name, and all but the pictures can b
     pair = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
     path = model_file(model).absolute()
     matcher = _kept_matcher(path, path.stat().st_mtime_ns, threads, provider)
-    return match(matcher, pair, range_px=range_px, refined=refined)
+    return match(matcher, pair, range_px=range_px, refined=refined, raw=raw)
 
 
 def match(
@@ -84,6 +86,7 @@ def match(
     *,
     range_px: tuple[float, float] | None = None,
     refined: bool = False,
+    raw: bool = False,
 ) -> Estimate:
     """What a matcher finds in a pair of any size; the same as `matcher.estimate` where that sees all of it.
 
@@ -95,14 +98,17 @@ def match(
             brought to its nearer end, with confidence 0. If left out, it is looked for where the network,
             within its own range, is not certain of nearly all.
         refined: As for `Matcher.estimate`, at the size that the network sees.
+        raw: As for `Matcher.estimate`, at the size that the network sees; a larger pair's disparities are
+            brought to its size by `enlarging` all the same.
 
     Raises:
-        StereoweaveError: For a range that is none, or pictures under 32 px in a direction.
+        StereoweaveError: For a range that is none, pictures under 32 px in a direction, or both refined and
+            raw.
     """
+    check_steps(refined=refined, raw=raw)
     shown = _shown_first(matcher, pair, range_px)
-    moved = _moved(shown)
-    found = matcher.estimate(moved.left, moved.right)
-    return _finished(matcher, pair, shown, found, range_px=range_px, refined=refined)
+    (found,) = matcher.estimate_many([_moved(shown)], raw=True)
+    return _finished(matcher, pair, shown, found, range_px=range_px, refined=refined, raw=raw)
 
 
 def match_many(
@@ -111,8 +117,10 @@ def match_many(
     *,
     range_px: tuple[float, float] | None = None,
     refined: bool = False,
+    raw: bool = False,
 ) -> list[Estimate]:
     """As `match` of each, of pairs of any sizes, by `Matcher.estimate_many` where they look alike to it."""
+    check_steps(refined=refined, raw=raw)
     every_shown = [_shown_first(matcher, pair, range_px) for pair in pairs]
     moved = [_moved(shown) for shown in every_shown]
     of_size: dict[tuple[int, ...], list[int]] = {}
@@ -120,9 +128,9 @@ def match_many(
         of_size.setdefault(pair.left.shape, []).append(i)
     found: dict[int, Estimate] = {}
     for alike in of_size.values():
-        found |= zip(alike, matcher.estimate_many([moved[i] for i in alike]), strict=True)
+        found |= zip(alike, matcher.estimate_many([moved[i] for i in alike], raw=True), strict=True)
     return [
-        _finished(matcher, pair, shown, found[i], range_px=range_px, refined=refined)
+        _finished(matcher, pair, shown, found[i], range_px=range_px, refined=refined, raw=raw)
         for i, (pair, shown) in enumerate(zip(pairs, every_shown, strict=True))
     ]
 
@@ -167,17 +175,18 @@ def _finished(  # noqa: PLR0913 - all that is known of a pair by then
     *,
     range_px: tuple[float, float] | None,
     refined: bool,
+    raw: bool,
 ) -> Estimate:
-    """The estimate of a pair from that of what the network was shown first, and is shown again if need be."""
+    """The estimate of a pair from the network's own of what it was shown first; shown again if need be."""
     found = _unmoved(shown, found)
     if range_px is None:
         beyond_px = _range_beyond(shown.small, found, matcher.max_disparity_px)
         if beyond_px is not None:
             shown = _shown_within(matcher, pair, shown.small, beyond_px)
-            moved = _moved(shown)
-            found = _unmoved(shown, matcher.estimate(moved.left, moved.right))
-    if refined:
-        found = matcher.refined(shown.small.left, shown.small.right, found)
+            (found,) = matcher.estimate_many([_moved(shown)], raw=True)
+            found = _unmoved(shown, found)
+    if not raw:
+        found = matcher.finish(shown.small, _as_seen(found, shown.small), refined=refined)
     if shown.small.left.shape != pair.left.shape:
         found = enlarge(pair.left, pair.right, found, matcher.threads)
     if range_px is not None:
