@@ -3,33 +3,35 @@
 import numpy as np
 
 
-def plain_fill(disparity_px, occluded, seen):
-    """The filled disparity [H, W], and where it was filled."""
-    height, width = disparity_px.shape
+def plain_fill(disparity_px, confidence, occluded, seen):
+    """The filled disparity [H, W], and its confidence."""
     visible = ~occluded & seen
-    row_px = disparity_px.copy()
-    for y in range(height):
-        for x in np.flatnonzero(~visible[y]):
-            ends_px = [_end_px(disparity_px[y], visible[y], x, step) for step in (-1, 1)]
-            row_px[y, x] = np.nanmin([*ends_px, np.inf])
-            if np.isinf(row_px[y, x]):
-                row_px[y, x] = disparity_px[y, x]
-    found_px, filled = disparity_px.copy(), np.zeros(occluded.shape, bool)
+    row_px, beside = disparity_px.copy(), confidence.copy()
+    for y, x in np.argwhere(~visible):
+        ends = [_end(disparity_px[y], confidence[y], visible[y], x, step) for step in (-1, 1)]
+        known = [end for end in ends if end is not None]
+        if known:
+            row_px[y, x], beside[y, x] = min(known, key=lambda end: end[0])
+    found_px, believed = disparity_px.copy(), confidence.copy()
     around = np.pad(row_px, 2, mode="edge")
     for y, x in np.argwhere(occluded):
         smooth_px = np.median(around[y : y + 5, x : x + 5])
         if abs(smooth_px - disparity_px[y, x]) <= 10 or not _is_between(disparity_px, visible, y, x):
-            found_px[y, x], filled[y, x] = smooth_px, True
-    return found_px, filled
+            found_px[y, x] = smooth_px
+            if confidence[y, x] > 0:
+                believed[y, x] = 0.6 * confidence[y, x] + 0.4 * beside[y, x]
+    return found_px, believed
 
 
-def _end_px(row_px, visible, x, step):
-    """The lower median of the visible ones among the 7 pixels at an end of the run around x, or NaN."""
+def _end(row_px, confidence, visible, x, step):
+    """Lower medians of disparity and of confidence of the visible ones among the 7 pixels at a run's end."""
     while 0 <= x < len(row_px) and not visible[x]:
         x += step
     columns = [column for column in range(x, x + 7 * step, step) if 0 <= column < len(row_px)]
-    known_px = sorted(row_px[column] for column in columns if visible[column])
-    return known_px[(len(known_px) - 1) // 2] if known_px else np.nan
+    known = [column for column in columns if visible[column]]
+    if not known:
+        return None
+    return tuple(sorted(values[known])[(len(known) - 1) // 2] for values in (row_px, confidence))
 
 
 def _is_between(disparity_px, visible, y, x):
