@@ -60,6 +60,13 @@ Refined = Annotated[
         help="Match once more, at full resolution up to 2 megapixels: thin things, sharper edges.",
     ),
 ]
+Raw = Annotated[
+    bool,
+    typer.Option(
+        "--raw",
+        help="The network's own disparity: occluded pixels not filled, nothing brought to a part of a pixel.",
+    ),
+]
 Strength = Annotated[
     float, typer.Option(min=0, help="Multiplies the distance of the cameras, about their middle.")
 ]

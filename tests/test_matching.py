@@ -52,6 +52,15 @@ def test_a_pair_that_the_network_sees_all_of_is_what_the_matcher_estimates(match
     same(found, matcher.estimate(examples.left, examples.right, refined=refined))
 
 
+def test_raw_is_the_networks_own_disparity_alone_and_among_others(matcher, examples):
+    alone = matcher.estimate(examples.left, examples.right, raw=True)
+    same(sw.estimate(examples.left, examples.right, raw=True), alone)
+    same(match_many(matcher, [examples], raw=True)[0], alone)
+    filled = matcher.estimate(examples.left, examples.right)
+    assert (np.abs(filled.disparity_px - alone.disparity_px)[alone.occluded] > 1).mean() > 0.1
+    assert np.abs(filled.disparity_px - alone.disparity_px)[~alone.occluded].max() < 1.001
+
+
 def test_a_pair_of_pillow_is_what_its_pixels_are(examples):
     pictures = (Image.fromarray(photo) for photo in (examples.left, examples.right))
     same(sw.estimate(*pictures), sw.estimate(examples.left, examples.right))
