@@ -17,8 +17,8 @@ _MEDIAN_PX = 5
 _FAR_OFF_PX = 10.0
 _SPACING_PX, _AROUND = 4, 11
 # The share of the confidence beside a run in that of a pixel filled from there; its own claim has the rest.
-# Fitted on collages and rendered pairs: the claim alone is 0.02 to 0.12 too low there, and this is off by 0.02
-# to 0.06.
+# Fitted on collages and rendered pairs: the claim alone is 0.02 to 0.12 too low there, this is off by 0.02 to
+# 0.06.
 _SHARE_BESIDE = np.float32(0.4)
 
 
