@@ -40,6 +40,24 @@ _PLAIN_MEAN_PX = 9
 _PLAIN_GREY_LEVELS = 2
 
 
+class Mode(NamedTuple):
+    """A way to match that has a name as networks have.
+
+    Attributes:
+        network: The shipped network.
+        magnification: How many times larger than it is a pair is shown to it at most.
+        refined: Whether every estimate is refined.
+    """
+
+    network: str
+    magnification: float
+    refined: bool
+
+
+MODES = {"best": Mode(network="base", magnification=1.5, refined=True)}
+"""For stills: thin things and edges, in several times the time."""
+
+
 class Maps(NamedTuple):
     """What a graph gives for a pair, each float32 [H, W]; None where it has no such output."""
 
@@ -52,12 +70,14 @@ class Matcher:
     """A matcher file, loaded once and kept between calls.
 
     Args:
-        model: A shipped name (see `shipped_models`) or the path of an .onnx file.
+        model: A shipped name (see `shipped_models`), a name in `MODES`, or the path of an .onnx file.
         threads: How many threads a call may use; all cores that the process may use if left out.
         provider: What the network is run on, a name in `providers.PROVIDERS`.
 
     Attributes:
         fixed_size: Height and width of the only pictures that the network takes; None where any will do.
+        magnification: How many times larger than it is `matching.match` shows a pair to the network at most;
+            `estimate` shows it as it is.
 
     Raises:
         MatcherError: If there is no such model, the file is not a matcher, or the provider is not there.
@@ -67,6 +87,9 @@ class Matcher:
         self, model: str | Path = "small", *, threads: int | None = None, provider: str = CPU
     ) -> None:
         self._path, self.threads, self.provider = model_file(model), threads, provider
+        mode = MODES.get(str(model))
+        self.magnification = mode.magnification if mode else 1.0
+        self._refines = mode is not None and mode.refined
         self._session = open_session(self._path, provider, thread_count(threads))
         self._outputs = self._checked_outputs()
         self.name, self.multiple_of, self.max_disparity_px = self._checked_properties()
@@ -129,7 +152,7 @@ class Matcher:
     def finish(self, pair: StereoPair, found: Estimate, *, refined: bool = False) -> Estimate:
         """The network's own estimate of a pair to a part of a pixel, refined on request, and filled."""
         found = to_subpixel(pair.left, pair.right, found, self.threads)
-        if refined:
+        if refined or self._refines:
             from stereoweave.refining import refine  # Numba takes half a second to import
 
             found = refine(pair.left, pair.right, found, self.threads)
@@ -306,18 +329,19 @@ def _weights_folder() -> Path:
 
 
 def model_file(model: str | Path) -> Path:
-    """The file of a shipped name, or the .onnx file itself; MatcherError where there is none."""
+    """The file of a shipped name or a mode, or the .onnx file itself; MatcherError where there is none."""
     if str(model).endswith(".onnx"):
         path = Path(model)
         if not path.is_file():
             raise MatcherError(f"{path}: expected an ONNX matcher, found no such file")
         return path
-    if str(model) not in shipped_models():
+    name = MODES[str(model)].network if str(model) in MODES else str(model)
+    if name not in shipped_models():
         raise MatcherError(
-            f"unknown model {str(model)!r}; expected {' or '.join(shipped_models())}, "
+            f"unknown model {name!r}; expected {' or '.join(shipped_models())}, {' or '.join(MODES)}, "
             "or the path of an .onnx file"
         )
-    return _weights_folder() / f"{model}.onnx"
+    return _weights_folder() / f"{name}.onnx"
 
 
 def _strips(height: int, rows: int) -> Iterator[slice]:
