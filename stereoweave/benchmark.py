@@ -23,6 +23,7 @@ from stereoweave.error_classes import ClassErrors, class_errors, classify
 from stereoweave.errors import StereoweaveError
 from stereoweave.io import replacing
 from stereoweave.matcher import Matcher
+from stereoweave.matching import match
 from stereoweave.memory import peak_memory_mb
 from stereoweave.metrics import (
     Sparsification,
@@ -162,9 +163,9 @@ class _Answer(NamedTuple):
 def network(
     model: str | Path, threads: int | None = None, refined: bool = False, provider: str = CPU
 ) -> Match:
-    """A shipped network by name, or a matcher file by path, refined or not; errors as for `Matcher`."""
+    """What `stereoweave.estimate` does with a model, refined or not; errors as for `Matcher`."""
     matcher = Matcher(model, threads=threads, provider=provider)
-    return lambda pair: matcher.estimate(pair.left, pair.right, refined=refined)
+    return lambda pair: match(matcher, pair, refined=refined)
 
 
 def score_pairs(makers: Mapping[str, Maker], scenes: Lister[Scene], engine: Engine | None = None) -> Scores:

@@ -13,6 +13,7 @@ from stereoweave.command_line import (
     Model,
     Provider,
     Range,
+    Raw,
     Rectify,
     Refined,
     range_of,
@@ -59,6 +60,7 @@ def batch(  # noqa: PLR0913 - each is a word of the command line
     range_px: Range = None,
     write: Write = None,
     refined: Refined = False,
+    raw: Raw = False,
     model: Model = "small",
     provider: Provider = "cpu",
     as_json: AsJson = False,
@@ -77,6 +79,7 @@ def batch(  # noqa: PLR0913 - each is a word of the command line
         provider=provider,
         range_px=range_of(range_px),
         refined=refined,
+        raw=raw,
         files=tuple(write or ()),
     )
     engine = Engine(address, workers, cpus_each, gpus_each)

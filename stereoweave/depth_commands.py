@@ -17,6 +17,7 @@ from stereoweave.command_line import (
     Pictures,
     Provider,
     Range,
+    Raw,
     Rectify,
     Refined,
     Threads,
@@ -75,6 +76,7 @@ def depth(  # noqa: PLR0913 - each is a word of the command line
     range_px: Range = None,
     write: Write = None,
     refined: Refined = False,
+    raw: Raw = False,
     model: Model = "small",
     threads: Threads = None,
     provider: Provider = "cpu",
@@ -91,6 +93,7 @@ def depth(  # noqa: PLR0913 - each is a word of the command line
         provider=provider,
         range_px=range_of(range_px),
         refined=refined,
+        raw=raw,
         files=tuple(write or ()),
     )
     pictures = pictures or []

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from stereoweave.errors import MatcherError, StereoweaveError
 from stereoweave.io import SMALLEST_SIDE_PX
+from stereoweave.occluded_fill import fill_occluded
 from stereoweave.providers import CPU, PROVIDERS, open_session, running
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.subpixel import to_subpixel
@@ -39,6 +40,24 @@ _PLAIN_MEAN_PX = 9
 _PLAIN_GREY_LEVELS = 2
 
 
+class Mode(NamedTuple):
+    """A way to match that has a name as networks have.
+
+    Attributes:
+        network: The shipped network.
+        magnification: How many times larger than it is a pair is shown to it at most.
+        refined: Whether every estimate is refined.
+    """
+
+    network: str
+    magnification: float
+    refined: bool
+
+
+MODES = {"best": Mode(network="base", magnification=1.5, refined=True)}
+"""For stills: thin things and edges, in several times the time."""
+
+
 class Maps(NamedTuple):
     """What a graph gives for a pair, each float32 [H, W]; None where it has no such output."""
 
@@ -51,12 +70,14 @@ class Matcher:
     """A matcher file, loaded once and kept between calls.
 
     Args:
-        model: A shipped name (see `shipped_models`) or the path of an .onnx file.
+        model: A shipped name (see `shipped_models`), a name in `MODES`, or the path of an .onnx file.
         threads: How many threads a call may use; all cores that the process may use if left out.
         provider: What the network is run on, a name in `providers.PROVIDERS`.
 
     Attributes:
         fixed_size: Height and width of the only pictures that the network takes; None where any will do.
+        magnification: How many times larger than it is `matching.match` shows a pair to the network at most;
+            `estimate` shows it as it is.
 
     Raises:
         MatcherError: If there is no such model, the file is not a matcher, or the provider is not there.
@@ -66,6 +87,9 @@ class Matcher:
         self, model: str | Path = "small", *, threads: int | None = None, provider: str = CPU
     ) -> None:
         self._path, self.threads, self.provider = model_file(model), threads, provider
+        mode = MODES.get(str(model))
+        self.magnification = mode.magnification if mode else 1.0
+        self._refines = mode is not None and mode.refined
         self._session = open_session(self._path, provider, thread_count(threads))
         self._outputs = self._checked_outputs()
         self.name, self.multiple_of, self.max_disparity_px = self._checked_properties()
@@ -77,30 +101,41 @@ class Matcher:
         self.fixed_size: tuple[int, int] | None = (height, width) if is_fixed else None
 
     def estimate(
-        self, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], *, refined: bool = False
+        self,
+        left: UInt8[np.ndarray, "h w 3"],
+        right: UInt8[np.ndarray, "h w 3"],
+        *,
+        refined: bool = False,
+        raw: bool = False,
     ) -> Estimate:
         """Disparity of both views, confidence and occlusion of a rectified pair, uint8 RGB of one size.
 
-        The left view's disparity is brought to a part of a pixel (`subpixel.to_subpixel`).
+        The left view's disparity is brought to a part of a pixel (`subpixel.to_subpixel`), and where it is
+        occluded it continues the background (`occluded_fill.fill_occluded`).
 
         Args:
             left: The left photograph [H, W, 3].
             right: The right one.
             refined: Whether the estimate is brought to fit the photographs (`refining.refine`): it sees thin
                 things, has sharper edges, and takes longer.
+            raw: Return the network's own disparities instead, without any of these steps.
 
         Raises:
-            ValueError: If the images are not that, under 32 px in a direction, or larger than `fixed_size`.
+            ValueError: If the images are not that, under 32 px in a direction, or larger than `fixed_size`;
+                or if the estimate is to be both refined and raw.
         """
-        (found,) = self.estimate_many([StereoPair(left=left, right=right)])
-        return self.refined(left, right, found) if refined else found
+        (found,) = self.estimate_many([StereoPair(left=left, right=right)], refined=refined, raw=raw)
+        return found
 
-    def estimate_many(self, pairs: Sequence[StereoPair]) -> list[Estimate]:
+    def estimate_many(
+        self, pairs: Sequence[StereoPair], *, refined: bool = False, raw: bool = False
+    ) -> list[Estimate]:
         """As `estimate` of each, of pairs of one size; in one run where the file can and the provider gains.
 
         Raises:
             ValueError: As for `estimate`, or if the pairs are not all of one size.
         """
+        check_steps(refined=refined, raw=raw)
         self._check_sizes(pairs)
         every_maps = self._maps(pairs)
         if any(maps.right_disparity_px is None for maps in every_maps):
@@ -109,7 +144,20 @@ class Matcher:
                 maps._replace(right_disparity_px=np.ascontiguousarray(other.disparity_px[:, ::-1]))
                 for maps, other in zip(every_maps, mirrored, strict=True)
             ]
-        return [self._estimate(pair, maps) for pair, maps in zip(pairs, every_maps, strict=True)]
+        found = [_estimate(pair.left, maps) for pair, maps in zip(pairs, every_maps, strict=True)]
+        if raw:
+            return found
+        return [self.finish(pair, own, refined=refined) for pair, own in zip(pairs, found, strict=True)]
+
+    def finish(self, pair: StereoPair, found: Estimate, *, refined: bool = False) -> Estimate:
+        """The network's own estimate of a pair to a part of a pixel, refined on request, and filled."""
+        found = to_subpixel(pair.left, pair.right, found, self.threads)
+        if refined or self._refines:
+            from stereoweave.refining import refine  # Numba takes half a second to import
+
+            found = refine(pair.left, pair.right, found, self.threads)
+            found = to_subpixel(pair.left, pair.right, found, self.threads)
+        return fill_occluded(found, pair.left_seen)
 
     def _check_sizes(self, pairs: Sequence[StereoPair]) -> None:
         sizes = sorted({pair.left.shape[:2] for pair in pairs})
@@ -129,28 +177,6 @@ class Matcher:
                     f"images: expected at most {most} px, the size that {self._path.name} takes, {got}; "
                     "matching.match makes them smaller"
                 )
-
-    def _estimate(self, pair: StereoPair, maps: Maps) -> Estimate:
-        """What the maps of both views say of a pair, to a part of a pixel."""
-        left, right_px = pair.left, maps.right_disparity_px
-        assert right_px is not None
-        seen_px, inside = _right_disparity_at_match(maps.disparity_px, right_px)
-        disagreement_px = seen_px - maps.disparity_px
-        found = Estimate(
-            disparity_px=maps.disparity_px,
-            right_disparity_px=right_px,
-            confidence=_confidence(maps.confidence_logit, disagreement_px, inside, _plain(left)),
-            occluded=~inside | (disagreement_px > _OCCLUSION_STEP_PX),
-        )
-        return to_subpixel(left, pair.right, found, self.threads)
-
-    def refined(
-        self, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], found: Estimate
-    ) -> Estimate:
-        """An estimate of these photographs, matched once more (`refining.refine`), to a part of a pixel."""
-        from stereoweave.refining import refine  # Numba takes half a second to import
-
-        return to_subpixel(left, right, refine(left, right, found, self.threads), self.threads)
 
     def sees_whole(self, width: int, height: int) -> bool:
         """Whether a picture of that size is matched at once, not in strips of rows, and can be matched."""
@@ -303,18 +329,19 @@ def _weights_folder() -> Path:
 
 
 def model_file(model: str | Path) -> Path:
-    """The file of a shipped name, or the .onnx file itself; MatcherError where there is none."""
+    """The file of a shipped name or a mode, or the .onnx file itself; MatcherError where there is none."""
     if str(model).endswith(".onnx"):
         path = Path(model)
         if not path.is_file():
             raise MatcherError(f"{path}: expected an ONNX matcher, found no such file")
         return path
-    if str(model) not in shipped_models():
+    name = MODES[str(model)].network if str(model) in MODES else str(model)
+    if name not in shipped_models():
         raise MatcherError(
-            f"unknown model {str(model)!r}; expected {' or '.join(shipped_models())}, "
+            f"unknown model {name!r}; expected {' or '.join(shipped_models())}, {' or '.join(MODES)}, "
             "or the path of an .onnx file"
         )
-    return _weights_folder() / f"{model}.onnx"
+    return _weights_folder() / f"{name}.onnx"
 
 
 def _strips(height: int, rows: int) -> Iterator[slice]:
@@ -336,6 +363,28 @@ def _strip_weights(rows: slice, height: int) -> Float[np.ndarray, "h 1"]:
     # Nothing from the outermost quarter of the overlap, where the strip's own border shows.
     inset = np.minimum(from_top, from_bottom) - _STRIP_OVERLAP_PX / 2
     return np.clip(inset / _STRIP_OVERLAP_PX, 1e-6, 1).astype(np.float32)
+
+
+def check_steps(*, refined: bool, raw: bool) -> None:
+    """Raise a StereoweaveError where an estimate is to be both refined and raw."""
+    if refined and raw:
+        raise StereoweaveError(
+            "raw: expected without refined: it is the network's own disparity; leave one of them out"
+        )
+
+
+def _estimate(left: UInt8[np.ndarray, "h w 3"], maps: Maps) -> Estimate:
+    """The network's own estimate from the maps of both views."""
+    right_px = maps.right_disparity_px
+    assert right_px is not None
+    seen_px, inside = _right_disparity_at_match(maps.disparity_px, right_px)
+    disagreement_px = seen_px - maps.disparity_px
+    return Estimate(
+        disparity_px=maps.disparity_px,
+        right_disparity_px=right_px,
+        confidence=_confidence(maps.confidence_logit, disagreement_px, inside, _plain(left)),
+        occluded=~inside | (disagreement_px > _OCCLUSION_STEP_PX),
+    )
 
 
 def find_occluded(

@@ -14,13 +14,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 
 from stereoweave.arrays import as_rgb
 from stereoweave.enlarging import enlarge
 from stereoweave.errors import StereoweaveError
 from stereoweave.io import SMALLEST_SIDE_PX
-from stereoweave.matcher import PIXEL_PAIRS_AT_ONCE, Matcher, find_occluded, model_file
+from stereoweave.matcher import MODES, PIXEL_PAIRS_AT_ONCE, Matcher, check_steps, find_occluded, model_file
 from stereoweave.providers import CPU
 from stereoweave.ranging import find_range, goes_beyond
 from stereoweave.stereo import Estimate, StereoPair
@@ -37,6 +37,8 @@ _OUTSIDE_PX = 1
 _FILLED = 0.95
 # How much a width and a move, both rounded, may be too large together.
 _ROUNDED_PX = 2
+# The median window of a larger estimate, of which one pixel is taken for each of the pair's.
+_MEDIAN_PX = 3
 
 
 class _Shown(NamedTuple):
@@ -54,6 +56,7 @@ def estimate(  # noqa: PLR0913 - each has a name, and all but the pictures can b
     threads: int | None = None,
     provider: str = CPU,
     refined: bool = False,
+    raw: bool = False,
     range_px: tuple[float, float] | None = None,
 ) -> Estimate:
     """Disparity of both views, confidence and occlusion of a rectified pair.
@@ -62,10 +65,12 @@ def estimate(  # noqa: PLR0913 - each has a name, and all but the pictures can b
         left: The left photograph, at least 32x32: uint8 RGB [H, W, 3], or what else `arrays.as_rgb` takes,
             such as a PIL image or a PyTorch tensor.
         right: The right one, of the same size.
-        model: A shipped name or the path of an .onnx matcher; loaded at the first call, and kept.
+        model: A shipped name, `best` (the network base at 1.5 times the size, and refined), or the path of
+            an .onnx matcher; loaded at the first call, and kept.
         threads: How many threads may be used; all cores if left out.
         provider: What the network is run on: cpu, cuda, tensorrt, openvino, coreml or directml.
         refined: As for `match`.
+        raw: As for `match`.
         range_px: As for `match`.
 
     Raises:
@@ -74,8 +79,9 @@ def estimate(  # noqa: PLR0913 - each has a name, and all but the pictures can b
     """
     pair = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
     path = model_file(model).absolute()
-    matcher = _kept_matcher(path, path.stat().st_mtime_ns, threads, provider)
-    return match(matcher, pair, range_px=range_px, refined=refined)
+    named = model if str(model) in MODES else path
+    matcher = _kept_matcher(named, path.stat().st_mtime_ns, threads, provider)
+    return match(matcher, pair, range_px=range_px, refined=refined, raw=raw)
 
 
 def match(
@@ -84,6 +90,7 @@ def match(
     *,
     range_px: tuple[float, float] | None = None,
     refined: bool = False,
+    raw: bool = False,
 ) -> Estimate:
     """What a matcher finds in a pair of any size; the same as `matcher.estimate` where that sees all of it.
 
@@ -95,14 +102,17 @@ def match(
             brought to its nearer end, with confidence 0. If left out, it is looked for where the network,
             within its own range, is not certain of nearly all.
         refined: As for `Matcher.estimate`, at the size that the network sees.
+        raw: As for `Matcher.estimate`, at the size that the network sees; a larger pair's disparities are
+            brought to its size by `enlarging` all the same.
 
     Raises:
-        StereoweaveError: For a range that is none, or pictures under 32 px in a direction.
+        StereoweaveError: For a range that is none, pictures under 32 px in a direction, or both refined and
+            raw.
     """
+    check_steps(refined=refined, raw=raw)
     shown = _shown_first(matcher, pair, range_px)
-    moved = _moved(shown)
-    found = matcher.estimate(moved.left, moved.right)
-    return _finished(matcher, pair, shown, found, range_px=range_px, refined=refined)
+    (found,) = matcher.estimate_many([_moved(shown)], raw=True)
+    return _finished(matcher, pair, shown, found, range_px=range_px, refined=refined, raw=raw)
 
 
 def match_many(
@@ -111,8 +121,10 @@ def match_many(
     *,
     range_px: tuple[float, float] | None = None,
     refined: bool = False,
+    raw: bool = False,
 ) -> list[Estimate]:
     """As `match` of each, of pairs of any sizes, by `Matcher.estimate_many` where they look alike to it."""
+    check_steps(refined=refined, raw=raw)
     every_shown = [_shown_first(matcher, pair, range_px) for pair in pairs]
     moved = [_moved(shown) for shown in every_shown]
     of_size: dict[tuple[int, ...], list[int]] = {}
@@ -120,17 +132,17 @@ def match_many(
         of_size.setdefault(pair.left.shape, []).append(i)
     found: dict[int, Estimate] = {}
     for alike in of_size.values():
-        found |= zip(alike, matcher.estimate_many([moved[i] for i in alike]), strict=True)
+        found |= zip(alike, matcher.estimate_many([moved[i] for i in alike], raw=True), strict=True)
     return [
-        _finished(matcher, pair, shown, found[i], range_px=range_px, refined=refined)
+        _finished(matcher, pair, shown, found[i], range_px=range_px, refined=refined, raw=raw)
         for i, (pair, shown) in enumerate(zip(pairs, every_shown, strict=True))
     ]
 
 
 @functools.lru_cache(maxsize=4)
-def _kept_matcher(path: Path, modified_ns: int, threads: int | None, provider: str) -> Matcher:
+def _kept_matcher(model: str | Path, modified_ns: int, threads: int | None, provider: str) -> Matcher:
     # modified_ns is part of the key alone: a file that was written anew is loaded anew.
-    return Matcher(path, threads=threads, provider=provider)
+    return Matcher(model, threads=threads, provider=provider)
 
 
 def _checked(range_px: tuple[float, float], width_px: int) -> tuple[float, float]:
@@ -167,18 +179,22 @@ def _finished(  # noqa: PLR0913 - all that is known of a pair by then
     *,
     range_px: tuple[float, float] | None,
     refined: bool,
+    raw: bool,
 ) -> Estimate:
-    """The estimate of a pair from that of what the network was shown first, and is shown again if need be."""
+    """The estimate of a pair from the network's own of what it was shown first; shown again if need be."""
     found = _unmoved(shown, found)
     if range_px is None:
         beyond_px = _range_beyond(shown.small, found, matcher.max_disparity_px)
         if beyond_px is not None:
             shown = _shown_within(matcher, pair, shown.small, beyond_px)
-            moved = _moved(shown)
-            found = _unmoved(shown, matcher.estimate(moved.left, moved.right))
-    if refined:
-        found = matcher.refined(shown.small.left, shown.small.right, found)
-    if shown.small.left.shape != pair.left.shape:
+            (found,) = matcher.estimate_many([_moved(shown)], raw=True)
+            found = _unmoved(shown, found)
+    small = shown.small
+    if not raw:
+        found = matcher.finish(small, _as_seen(found, small), refined=refined)
+    if small.left.shape[1] > pair.left.shape[1]:
+        found = _shrunk(found, pair)
+    elif small.left.shape != pair.left.shape:
         found = enlarge(pair.left, pair.right, found, matcher.threads)
     if range_px is not None:
         found = _clipped(found, *range_px)
@@ -186,37 +202,64 @@ def _finished(  # noqa: PLR0913 - all that is known of a pair by then
 
 
 def _seen_whole(matcher: Matcher, pair: StereoPair) -> StereoPair:
-    """The pair, smaller where the network would else see it in strips, whose seams would show."""
+    """The pair, smaller where the network would else see it in strips, whose seams would show.
+
+    It is larger, by up to the matcher's magnification, where the network sees even that whole.
+    """
     height, width = pair.left.shape[:2]
-    return _reduced(pair, _times_smaller(matcher, width, height))
+    return _resized(pair, _times_smaller(matcher, width, height, largest=matcher.magnification))
 
 
-def _times_smaller(matcher: Matcher, width: int, height: int, moved_px: int = 0) -> float:
-    """By how much the network has to be shown less, to see a picture of this size whole; 1 where it does.
+def _times_smaller(
+    matcher: Matcher, width: int, height: int, moved_px: int = 0, largest: float = 1.0
+) -> float:
+    """By how much the network has to be shown less, to see a picture of this size whole.
 
-    It does so where the picture is wider by what the other one is moved by.
+    It sees one `largest` times larger, 1 / largest, if it can. The picture is wider by what the other one is
+    moved by.
     """
     width += moved_px
-    if matcher.sees_whole(width, height):
-        return 1.0
+    if matcher.sees_whole(round(width * largest), round(height * largest)):
+        return 1 / largest
     if matcher.fixed_size is not None:
         rows, columns = matcher.fixed_size
         return max(height / rows, width / (columns - (_ROUNDED_PX if moved_px else 0)))
     return (width * width * height / (_FILLED * PIXEL_PAIRS_AT_ONCE)) ** (1 / 3)
 
 
-def _reduced(pair: StereoPair, scale: float) -> StereoPair:
+def _resized(pair: StereoPair, scale: float) -> StereoPair:
     """The photographs so many times smaller, or the pair itself where that is as large."""
     height, width = pair.left.shape[:2]
     size = max(round(width / scale), SMALLEST_SIDE_PX), max(round(height / scale), SMALLEST_SIDE_PX)
     if size == (width, height) or min(width, height) < SMALLEST_SIDE_PX:
         return pair
-    left, right = (cv2.resize(photo, size, interpolation=cv2.INTER_AREA) for photo in (pair.left, pair.right))
+    way = cv2.INTER_AREA if scale > 1 else cv2.INTER_CUBIC
+    left, right = (cv2.resize(photo, size, interpolation=way) for photo in (pair.left, pair.right))
     left_seen, right_seen = (
         None if seen is None else cv2.resize(seen.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
         for seen in (pair.left_seen, pair.right_seen)
     )
     return StereoPair(left=left, right=right, left_seen=left_seen, right_seen=right_seen)
+
+
+def _shrunk(found: Estimate, pair: StereoPair) -> Estimate:
+    """The estimate of a larger copy of a pair, at its size; no pixel is a mix of two surfaces."""
+    size = pair.left.shape[1::-1]
+    scale = np.float32(size[0] / found.disparity_px.shape[1])
+    disparity_px, right_disparity_px = (
+        scale * _nearest(cv2.medianBlur(view, _MEDIAN_PX), size)
+        for view in (found.disparity_px, found.right_disparity_px)
+    )
+    return Estimate(
+        disparity_px=disparity_px,
+        right_disparity_px=right_disparity_px,
+        confidence=_nearest(found.confidence, size),
+        occluded=_nearest(found.occluded.astype(np.uint8), size) > 0,
+    )
+
+
+def _nearest(values: Shaped[np.ndarray, "h w"], size: tuple[int, int]) -> Shaped[np.ndarray, "h2 w2"]:
+    return cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT)
 
 
 def _range_beyond(pair: StereoPair, found: Estimate, max_disparity_px: float) -> tuple[float, float] | None:
@@ -251,13 +294,13 @@ def _shown_within(
     scale = max((high_px - low_px) / (most_px - _MARGIN_PX), 1.0)
     small = seen
     if scale > 1:
-        small = _reduced(pair, scale * pair.left.shape[1] / seen.left.shape[1])
+        small = _resized(pair, scale * pair.left.shape[1] / seen.left.shape[1])
     # Not farther than the least: a network takes a plain sky for what is at the lower end of its range.
     least_px = math.floor(low_px * small.left.shape[1] / seen.left.shape[1])
     height, width = small.left.shape[:2]
     smaller = _times_smaller(matcher, width, height, abs(least_px))
     if smaller > 1:
-        small = _reduced(pair, smaller * pair.left.shape[1] / width)
+        small = _resized(pair, smaller * pair.left.shape[1] / width)
         least_px = math.floor(low_px * small.left.shape[1] / seen.left.shape[1])
     return _Shown(small, least_px)
 

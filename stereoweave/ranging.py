@@ -4,6 +4,8 @@ Both photographs are made small, and on some of their rows what stands out in th
 the whole row of the right one, in either direction.
 """
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
@@ -31,6 +33,19 @@ _MARGIN_SHARE, _MARGIN_PX = 0.06, 2.0
 # Of the matches in a part of the picture, so many and such a share have to lie beyond a range.
 _LEAST_BEYOND, _LEAST_SHARE_BEYOND = 6, 0.1
 _SLACK_PX = 0.6
+
+
+class _Texture(NamedTuple):
+    """The windows of a small grey picture, freed of brightness.
+
+    Attributes:
+        windows: Grey levels less their mean around, in the window that has a pixel of column x in its middle;
+            by its first row and x.
+        scale: What makes the window around a pixel one of length 1; 0 where it is plain, and matches nothing.
+    """
+
+    windows: Float32[np.ndarray, "h2 w r c"]
+    scale: Float32[np.ndarray, "h w"]
 
 
 def find_range(pair: StereoPair) -> tuple[float, float] | None:
@@ -114,60 +129,73 @@ def _row_matches(
     height = left.shape[0]
     rows = np.linspace(_WINDOW_ROWS // 2, height - 1 - _WINDOW_ROWS // 2, min(_ROWS, height // 4))
     rows = rows.round().astype(int)
-    rows = rows[wanted[rows].any(1)]
-    own, other = _windows(left, rows), _windows(right, rows) * seen[rows, None]
-    found = [np.zeros((0, 3))]
-    for row, row_own, row_other, columns in zip(
-        rows, own, other, _outstanding(left, rows, wanted), strict=True
-    ):
-        columns, partners = _partners(row_own, row_other, columns)
-        found.append(np.stack([columns, np.full(len(columns), row), columns - partners], axis=1))
-    return np.concatenate(found)
+    own, other = _texture(left), _texture(right)
+    other.scale[~seen] = 0
+    rows, columns = _outstanding(left, rows, wanted & (own.scale > 0))
+    likeness = _likeness(own, rows, columns, other)
+    best, offsets_px, sure = _peaks(likeness)
+    back = _likeness(other, rows[sure], best[sure], own).argmax(1)
+    sure[sure] = np.abs(back - columns[sure]) <= 1
+    return np.stack([columns, rows, columns - best - offsets_px], axis=1)[sure]
 
 
-def _partners(
-    own: Float32[np.ndarray, "k w"], other: Float32[np.ndarray, "k w"], columns: Int[np.ndarray, " n"]
-) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """The columns of a row that are found in the other picture's, and where, to a part of a pixel."""
-    # Not a product of matrices: NumPy would use all cores, which may be more than the caller allows.
-    likeness = np.einsum("kn,kw->nw", own[:, columns], other)
+def _peaks(
+    likeness: Float32[np.ndarray, "n w"],
+) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """The column that is most like, how far from it the peak is, and whether it is like and nothing else is.
+
+    What is near a peak is overwritten.
+    """
     width = likeness.shape[1]
-    each, best = np.arange(len(columns)), likeness.argmax(1)
+    each, best = np.arange(len(likeness)), likeness.argmax(1)
     before, highest, behind = (likeness[each, np.clip(best + step, 0, width - 1)] for step in (-1, 0, 1))
     near = np.clip(best[:, None] + np.arange(-_PEAK_PX, _PEAK_PX + 1), 0, width - 1)
     np.put_along_axis(likeness, near, -1, 1)
     sure = (highest >= _LEAST_LIKENESS) & (1 - highest <= _MOST_AMBIGUOUS * (1 - likeness.max(1)))
-    back = np.einsum("kn,kw->nw", other[:, best[sure]], own).argmax(1)
-    sure[sure] = np.abs(back - columns[sure]) <= 1
     # The top of the parabola through the highest likeness and those beside it.
     bend = np.maximum(2 * highest - before - behind, 1e-6)
-    top = best + np.clip((behind - before) / (2 * bend), -0.5, 0.5)
-    return columns[sure], top[sure]
+    return best, np.clip((behind - before) / (2 * bend), -0.5, 0.5), sure
 
 
 def _outstanding(
     grey: Float32[np.ndarray, "h w"], rows: Int[np.ndarray, " r"], wanted: Bool[np.ndarray, "h w"]
-) -> list[Int[np.ndarray, " n"]]:
-    """Of each row the column of most contrast in every _SPACING_PX, where wanted."""
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    """Rows and columns of the places of most contrast in every _SPACING_PX of the rows, where wanted."""
     steps = np.abs(cv2.Sobel(grey, cv2.CV_32F, 1, 0))[rows]
     count = grey.shape[1] // _SPACING_PX
     cells = steps[:, : count * _SPACING_PX].reshape(len(rows), count, _SPACING_PX)
     columns = cells.argmax(2) + _SPACING_PX * np.arange(count)
-    return [places[ok[places]] for places, ok in zip(columns, wanted[rows], strict=True)]
+    places = np.repeat(rows, count), columns.ravel()
+    ok = wanted[places]
+    return places[0][ok], places[1][ok]
 
 
-def _windows(grey: Float32[np.ndarray, "h w"], rows: Int[np.ndarray, " r"]) -> Float32[np.ndarray, "r k w"]:
-    """The window around each pixel of the rows, freed of brightness, of length 1; 0 where it is plain."""
+def _texture(grey: Float32[np.ndarray, "h w"]) -> _Texture:
     size = (_WINDOW_COLUMNS, _WINDOW_ROWS)
     uneven = grey - cv2.blur(grey, size)
     contrast = np.sqrt(cv2.blur(uneven * uneven, size))
-    length = contrast * np.sqrt(np.float32(_WINDOW_ROWS * _WINDOW_COLUMNS))
-    factor = np.where(contrast < _LEAST_CONTRAST_LEVELS, 0, 1 / np.maximum(length, 1e-6)).astype(np.float32)
+    length = np.sqrt(np.float32(_WINDOW_ROWS * _WINDOW_COLUMNS)) * contrast
+    scale = np.zeros_like(length)
+    np.divide(1, length, out=scale, where=contrast >= _LEAST_CONTRAST_LEVELS)
     beside = _WINDOW_COLUMNS // 2
     around = cv2.copyMakeBorder(uneven, 0, 0, beside, beside, cv2.BORDER_REPLICATE)
-    views = np.lib.stride_tricks.sliding_window_view(around, size[::-1])[rows - _WINDOW_ROWS // 2]
-    windows = views.transpose(0, 2, 3, 1).reshape(len(rows), _WINDOW_ROWS * _WINDOW_COLUMNS, grey.shape[1])
-    return windows * factor[rows, None]
+    return _Texture(np.lib.stride_tricks.sliding_window_view(around, size[::-1]), scale)
+
+
+def _likeness(
+    own: _Texture, rows: Int[np.ndarray, " n"], columns: Int[np.ndarray, " n"], other: _Texture
+) -> Float32[np.ndarray, "n w"]:
+    """How like the window around each of these places is to each of the other picture's on its row."""
+    width, pixels = other.scale.shape[1], _WINDOW_ROWS * _WINDOW_COLUMNS
+    likeness = np.empty((len(rows), width), np.float32)
+    # A row at a time: its windows, a matrix [77, W], stay in the processor's cache.
+    for row in np.unique(rows):
+        here, first = rows == row, row - _WINDOW_ROWS // 2
+        within = own.windows[first, columns[here]].reshape(-1, pixels)
+        along = other.windows[first].transpose(1, 2, 0).reshape(pixels, width)
+        # Not a product of matrices: NumPy would use all cores, which may be more than the caller allows.
+        likeness[here] = np.einsum("nk,kw->nw", within, along)
+    return likeness * own.scale[rows, columns, None] * other.scale[rows]
 
 
 def _supported(matches: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:

@@ -46,7 +46,7 @@ from stereoweave.io import (
     write_npy,
     write_pfm,
 )
-from stereoweave.matcher import Matcher
+from stereoweave.matcher import Matcher, check_steps
 from stereoweave.matching import match
 from stereoweave.preparing import Request, prepare
 from stereoweave.providers import CPU
@@ -129,6 +129,7 @@ class DepthOrder:
         provider: What the network is run on, a name in `providers.PROVIDERS`.
         range_px: The least and the greatest disparity; found from the pair where None.
         refined: As for `matching.match`.
+        raw: As for `matching.match`.
         files: What is written beside `always`, names in FILES, or "all"; depth.png is with any camera.
         always: What is written of every pair.
     """
@@ -139,10 +140,12 @@ class DepthOrder:
     provider: str = CPU
     range_px: tuple[float, float] | None = None
     refined: bool = False
+    raw: bool = False
     files: tuple[str, ...] = ()
     always: tuple[str, ...] = ALWAYS
 
     def __post_init__(self) -> None:
+        check_steps(refined=self.refined, raw=self.raw)
         for file in self.files:
             if file not in FILES and file != ALL:
                 raise StereoweaveError(
@@ -159,7 +162,7 @@ def make_depth(
     files, left_out = _files_of(order, pair)
     with _results_in(out) as folder:
         start_s = time.perf_counter()
-        estimate = match(matcher, pair, range_px=order.range_px, refined=order.refined)
+        estimate = match(matcher, pair, range_px=order.range_px, refined=order.refined, raw=order.raw)
         estimate_ms = 1000 * (time.perf_counter() - start_s)
         names = tuple(picture.name for picture in pictures)
         model = order.model if matcher.provider == CPU else f"{order.model} on {matcher.provider}"

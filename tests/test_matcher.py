@@ -9,11 +9,9 @@ import stereoweave as sw
 from stereoweave import matcher
 from stereoweave.io import read_pair
 from stereoweave.matcher import Matcher
+from stereoweave.matching import match, match_many
 from stereoweave.providers import PROVIDERS
 from stereoweave.stereo import StereoPair
-
-# What the photographs may move a disparity of the left view by.
-SUBPIXEL_PX = 1.001
 
 
 @pytest.fixture
@@ -35,8 +33,8 @@ def test_the_shipped_network_takes_any_size_from_32_px_up(rng, height, width):
 def test_a_graph_of_one_output_runs_the_mirrored_pair_for_the_other_view(tmp_path, rng):
     file = matcher_file(tmp_path / "one.onnx", red_of("left", "disparity_px"), ["disparity_px"])
     left, right = (painted(rng.integers(0, 255, (40, 50))) for _ in range(2))
-    found = Matcher(file).estimate(left, right)
-    np.testing.assert_allclose(found.disparity_px, left[:, :, 0], atol=SUBPIXEL_PX)
+    found = Matcher(file).estimate(left, right, raw=True)
+    np.testing.assert_allclose(found.disparity_px, left[:, :, 0], atol=1e-4)
     np.testing.assert_allclose(found.right_disparity_px, right[:, :, 0], atol=1e-4)
 
 
@@ -68,12 +66,41 @@ def test_a_nearer_surface_and_the_left_border_occlude(both_views):
     np.testing.assert_array_equal(found.occluded, expected)
 
 
+def test_what_a_board_hides_of_a_wall_takes_the_walls_disparity_and_raw_is_what_the_network_says(both_views):
+    # As above, but of the hidden part of the wall the network says 2 px.
+    left_px, right_px = np.full((32, 40), 4), np.full((32, 40), 4)
+    left_px[:, 20:30] = 10
+    right_px[:, 10:20] = 10
+    left_px[:, 14:20] = 2
+    left, right = painted(left_px), painted(right_px)
+    raw, found = (both_views.estimate(left, right, raw=raw) for raw in (True, False))
+    np.testing.assert_allclose(raw.disparity_px, left_px, atol=1e-4)
+    np.testing.assert_allclose(found.disparity_px[:, 14:20], 4, atol=0.1)
+    np.testing.assert_array_equal(found.occluded, raw.occluded)
+    assert found.occluded[:, 14:20].all()
+
+
+@pytest.mark.parametrize("call", ["estimate", "estimate_many", "sw.estimate", "match", "match_many"])
+def test_an_estimate_cannot_be_both_refined_and_raw(both_views, call):
+    grey = np.full((32, 40, 3), 90, np.uint8)
+    pair, both = StereoPair(left=grey, right=grey), {"refined": True, "raw": True}
+    calls = {
+        "estimate": lambda: both_views.estimate(grey, grey, **both),
+        "estimate_many": lambda: both_views.estimate_many([pair], **both),
+        "sw.estimate": lambda: sw.estimate(grey, grey, **both),
+        "match": lambda: match(both_views, pair, **both),
+        "match_many": lambda: match_many(both_views, [pair], **both),
+    }
+    with pytest.raises(sw.StereoweaveError, match="raw: expected without refined"):
+        calls[call]()
+
+
 def test_confidence_is_the_probability_of_the_logit(tmp_path, rng):
     nodes = red_of("left", "disparity_px") + red_of("right", "confidence_logit")
     file = matcher_file(tmp_path / "sure.onnx", nodes, ["disparity_px", "confidence_logit"])
     left, right = painted(np.full((32, 32), 3)), painted(np.full((32, 32), 3))
     left[:, :, 1] = rng.integers(0, 256, (32, 32))  # a plain picture has no confidence
-    found = Matcher(file).estimate(left, right)
+    found = Matcher(file).estimate(left, right, raw=True)
     np.testing.assert_allclose(found.confidence, 1 / (1 + np.exp(-3.0)), rtol=1e-5)
 
 
@@ -152,7 +179,9 @@ def test_the_number_of_threads_is_honoured():
 
 
 def test_an_unknown_name_lists_the_shipped_ones():
-    with pytest.raises(sw.MatcherError, match=r"unknown model 'tiny'; expected base or small"):
+    with pytest.raises(
+        sw.MatcherError, match=r"unknown model 'tiny'; expected base or small, best, or the path"
+    ):
         Matcher("tiny")
 
 
@@ -167,8 +196,8 @@ def test_the_order_of_the_inputs_is_free(tmp_path, rng):
     nodes = red_of("left", "disparity_px")
     file = matcher_file(tmp_path / "swapped.onnx", nodes, ["disparity_px"], inputs=("right", "left"))
     left, right = (painted(rng.integers(0, 255, (32, 48))) for _ in range(2))
-    found = Matcher(file).estimate(left, right)
-    np.testing.assert_allclose(found.disparity_px, left[:, :, 0], atol=SUBPIXEL_PX)
+    found = Matcher(file).estimate(left, right, raw=True)
+    np.testing.assert_allclose(found.disparity_px, left[:, :, 0], atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -234,10 +263,10 @@ def test_pairs_of_one_size_run_together_as_far_as_the_file_and_the_memory_go(
     tmp_path, five_pairs, like_a_gpu, monkeypatch, size, counts
 ):
     monkeypatch.setattr(matcher, "PIXEL_PAIRS_AT_ONCE", 2 * 48 * 64 * 64 + 1)
-    found = Matcher(counting(tmp_path / "counting.onnx", size)).estimate_many(five_pairs)
+    found = Matcher(counting(tmp_path / "counting.onnx", size)).estimate_many(five_pairs, raw=True)
     assert [estimate.right_disparity_px.max() for estimate in found] == counts
     for pair, estimate in zip(five_pairs, found, strict=True):
-        np.testing.assert_allclose(estimate.disparity_px, pair.left[:, :, 0], atol=SUBPIXEL_PX)
+        np.testing.assert_allclose(estimate.disparity_px, pair.left[:, :, 0], atol=1e-4)
 
 
 @pytest.mark.parametrize("views", [1, 2])
@@ -282,9 +311,9 @@ def test_pairs_of_two_sizes_are_refused_together(both_views, five_pairs):
 def test_large_pairs_run_in_strips_one_after_another(tmp_path, rng, like_a_gpu, monkeypatch):
     monkeypatch.setattr(matcher, "PIXEL_PAIRS_AT_ONCE", 64 * 64 * 256)
     pairs = [StereoPair(left=x, right=x) for x in rng.integers(0, 256, (2, 400, 64, 3), np.uint8)]
-    found = Matcher(counting(tmp_path / "counting.onnx")).estimate_many(pairs)
+    found = Matcher(counting(tmp_path / "counting.onnx")).estimate_many(pairs, raw=True)
     for pair, estimate in zip(pairs, found, strict=True):
-        np.testing.assert_allclose(estimate.disparity_px, pair.left[:, :, 0], atol=SUBPIXEL_PX)
+        np.testing.assert_allclose(estimate.disparity_px, pair.left[:, :, 0], atol=1e-3)
         np.testing.assert_allclose(estimate.right_disparity_px, 1, atol=1e-3)
 
 
@@ -294,8 +323,8 @@ def test_a_file_for_one_size_takes_smaller_pictures_and_refuses_larger_ones_in_o
     assert network.sees_whole(80, 64) and network.sees_whole(33, 40)
     assert not network.sees_whole(81, 64) and not network.sees_whole(80, 65)
     picture = rng.integers(0, 256, (41, 57, 3), np.uint8)
-    found = network.estimate(picture, picture)
-    np.testing.assert_allclose(found.disparity_px, picture[:, :, 0], atol=SUBPIXEL_PX)
+    found = network.estimate(picture, picture, raw=True)
+    np.testing.assert_allclose(found.disparity_px, picture[:, :, 0], atol=1e-4)
     tall = np.zeros((65, 64, 3), np.uint8)
     message = r"at most 80x64 px, the size that one_size\.onnx takes, got 64x65; matching\.match makes"
     with pytest.raises(sw.StereoweaveError, match=message):

@@ -52,6 +52,15 @@ def test_a_pair_that_the_network_sees_all_of_is_what_the_matcher_estimates(match
     same(found, matcher.estimate(examples.left, examples.right, refined=refined))
 
 
+def test_raw_is_the_networks_own_disparity_alone_and_among_others(matcher, examples):
+    alone = matcher.estimate(examples.left, examples.right, raw=True)
+    same(sw.estimate(examples.left, examples.right, raw=True), alone)
+    same(match_many(matcher, [examples], raw=True)[0], alone)
+    filled = matcher.estimate(examples.left, examples.right)
+    assert (np.abs(filled.disparity_px - alone.disparity_px)[alone.occluded] > 1).mean() > 0.1
+    assert np.abs(filled.disparity_px - alone.disparity_px)[~alone.occluded].max() < 1.001
+
+
 def test_a_pair_of_pillow_is_what_its_pixels_are(examples):
     pictures = (Image.fromarray(photo) for photo in (examples.left, examples.right))
     same(sw.estimate(*pictures), sw.estimate(examples.left, examples.right))
@@ -154,11 +163,75 @@ def test_something_just_below_zero_is_matched_as_such(matcher, rng, by_px):
     assert abs(np.median(found_px[80:160, 270:370]) - (by_px - 40)) < 0.5
 
 
+@pytest.fixture(scope="module")
+def best():
+    return Matcher("best")
+
+
+@pytest.fixture(scope="module")
+def part(examples):
+    """160x96 px of the example."""
+    left, right = (np.ascontiguousarray(x[200:296, 240:400]) for x in (examples.left, examples.right))
+    return sw.StereoPair(left=left, right=right)
+
+
+def test_best_is_base_at_one_and_a_half_times_the_size_and_refined(best, part):
+    found = sw.estimate(part.left, part.right, model="best")
+    larger = (cv2.resize(x, (240, 144), interpolation=cv2.INTER_CUBIC) for x in (part.left, part.right))
+    expected = sw.estimate(*larger, model="base", refined=True)
+    expected_px = cv2.resize(expected.disparity_px, (160, 96), interpolation=cv2.INTER_NEAREST_EXACT) / 1.5
+    assert found.disparity_px.shape == found.confidence.shape == found.occluded.shape == (96, 160)
+    # All but what a median over 3x3 px moves.
+    assert np.mean(np.abs(found.disparity_px - expected_px) > 0.2) < 0.05
+    same(match_many(best, [part])[0], found)
+
+
+def test_best_is_refined_whether_it_is_asked_for_or_not(best, part):
+    same(match(best, part, refined=True), match(best, part))
+
+
+def test_the_best_estimate_mixes_no_surfaces():
+    stripes_px = np.repeat([[6.0, 60.0, 6.0, 60.0]], 9, axis=1).repeat(90, axis=0).astype(np.float32)
+    found = sw.Estimate(
+        disparity_px=stripes_px,
+        right_disparity_px=stripes_px,
+        confidence=np.ones_like(stripes_px),
+        occluded=stripes_px > 10,
+    )
+    grey = np.zeros((60, 24, 3), np.uint8)
+    shrunk = matching._shrunk(found, sw.StereoPair(left=grey, right=grey))
+    np.testing.assert_allclose(np.unique(shrunk.disparity_px), [4, 40])
+    np.testing.assert_array_equal(shrunk.occluded, shrunk.disparity_px > 10)
+
+
+@pytest.mark.parametrize("range_px", [None, (0, 150), (-20, 60)])
+def test_a_disparity_of_37_px_is_37_px_for_best(best, rng, range_px):
+    texture = rng.integers(0, 256, (96, 400, 3), np.uint8)
+    texture = cv2.GaussianBlur(texture, (0, 0), 1.5)
+    left, right = (np.ascontiguousarray(texture[:, at : at + 300]) for at in (50, 87))
+    found = match(best, sw.StereoPair(left=left, right=right), range_px=range_px)
+    assert found.disparity_px.shape == (96, 300)
+    assert np.median(np.abs(found.disparity_px - 37)[:, 60:]) < 0.1
+
+
+def test_what_is_seen_whole_only_at_less_than_one_and_a_half_times_the_size_is_shown_so_large(
+    best, rng, monkeypatch
+):
+    for module in (matcher_module, matching):
+        monkeypatch.setattr(module, "PIXEL_PAIRS_AT_ONCE", 100 * 100 * 100)
+    for size, least, most in (((64, 80), 1.2, 1.5), ((40, 40), 1.5, 1.5), ((200, 200), 0.4, 0.5)):
+        left, right = rng.integers(0, 256, (2, *size, 3), np.uint8)
+        shown = matching._seen_whole(best, sw.StereoPair(left=left, right=right))
+        height, width = shown.left.shape[:2]
+        assert best.sees_whole(width, height)
+        assert least <= width / size[1] <= most
+
+
 def test_masks_are_made_smaller_with_the_pictures(rng):
     pair = flat(rng, 37)
     seen = np.ones(pair.left.shape[:2], bool)
     seen[:, :120] = False
-    small = matching._reduced(replace(pair, left_seen=seen), 2)
+    small = matching._resized(replace(pair, left_seen=seen), 2)
     assert small.right_seen is None
     np.testing.assert_array_equal(small.left_seen[:, [59, 60]], np.tile([False, True], (80, 1)))
 
@@ -227,10 +300,9 @@ def test_a_file_that_was_written_anew_is_loaded_anew_whatever_its_path_is_relati
         monkeypatch.chdir(tmp_path / folder)
         file = matcher_file(Path("matcher.onnx"), red_of(image, "disparity_px"), ["disparity_px"])
         os.utime(file, ns=(turn, turn))
-        found.append(sw.estimate(left, right, model="matcher.onnx").disparity_px)
+        found.append(sw.estimate(left, right, model="matcher.onnx", raw=True).disparity_px)
     for disparity_px, image in zip(found, (left, right, left), strict=True):
-        # The graph gives red as disparity, of which the last step moves it by at most 1 px.
-        np.testing.assert_allclose(disparity_px, image[:, :, 0], atol=1.001)
+        np.testing.assert_allclose(disparity_px, image[:, :, 0], atol=1e-4)
 
 
 def test_the_answer_does_not_depend_on_earlier_calls_of_other_sizes(rng):
@@ -244,13 +316,13 @@ def test_a_pair_that_is_moved_is_still_seen_whole(rng, monkeypatch):
     for module in (matcher_module, matching):  # 8 px more than 96 columns are too many
         monkeypatch.setattr(module, "PIXEL_PAIRS_AT_ONCE", 96 * 96 * 64)
     seen = []
-    estimate = Matcher.estimate
+    estimate_many = Matcher.estimate_many
 
-    def noted(matcher, left, right, **options):
-        seen.append(matcher.sees_whole(left.shape[1], left.shape[0]))
-        return estimate(matcher, left, right, **options)
+    def noted(matcher, pairs, **options):
+        seen.extend(matcher.sees_whole(pair.left.shape[1], pair.left.shape[0]) for pair in pairs)
+        return estimate_many(matcher, pairs, **options)
 
-    monkeypatch.setattr(Matcher, "estimate", noted)
+    monkeypatch.setattr(Matcher, "estimate_many", noted)
     left, right = rng.integers(0, 256, (2, 64, 96, 3), np.uint8)
     found = match(Matcher(), sw.StereoPair(left=left, right=right), range_px=(-8, 40))
     assert found.disparity_px.shape == (64, 96)

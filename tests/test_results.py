@@ -182,18 +182,31 @@ def test_the_summary_counts_what_the_left_picture_shows():
     assert (summary.confident_percent, summary.depth_min_m) == (100, 2)
 
 
-def test_a_range_and_a_refinement_are_handed_on(folder, matcher):
+def test_what_is_asked_of_the_estimate_is_handed_on(folder, matcher):
     found_px = {}
     for name, order in {
         "plain": DepthOrder(),
         "moved": DepthOrder(range_px=(-40.0, 100.0)),
         "refined": DepthOrder(refined=True),
+        "raw": DepthOrder(raw=True),
     }.items():
         make_depth(PICTURES, Path(name), order, matcher)
         found_px[name] = read_pfm(f"{name}/disparity.pfm")
     assert (found_px["moved"] != found_px["plain"]).any()
-    refined = matcher.estimate(read_image("left.png"), read_image("right.png"), refined=True)
-    np.testing.assert_array_equal(found_px["refined"], refined.disparity_px)
+    for how in ("refined", "raw"):
+        expected = matcher.estimate(read_image("left.png"), read_image("right.png"), **{how: True})
+        np.testing.assert_array_equal(found_px[how], expected.disparity_px)
+
+
+def test_an_order_cannot_be_both_refined_and_raw():
+    with pytest.raises(StereoweaveError, match="raw: expected without refined"):
+        DepthOrder(refined=True, raw=True)
+
+
+def test_the_command_gives_the_networks_own_disparity_on_request(folder, matcher):
+    depth(Path("out"), PICTURES, raw=True)
+    expected = matcher.estimate(read_image("left.png"), read_image("right.png"), raw=True)
+    np.testing.assert_array_equal(read_pfm("out/disparity.pfm"), expected.disparity_px)
 
 
 def test_the_command_writes_what_it_is_told(folder, capfd):

@@ -1,0 +1,108 @@
+"""An estimate whose occluded pixels take the disparity of the background beside them."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Int
+
+from stereoweave.stereo import Estimate
+
+# The median of so many visible pixels stands for an end of a run: the first is often a mix of two surfaces.
+_END_PX = 7
+_MEDIAN_PX = 5
+# The network's own disparity stays where it is this far from the filled one, and between the disparities of
+# the visible pixels around: there the fill is the worse of two guesses. Around are 11x11 places of a grid
+# that has every fourth pixel of every fourth row.
+_FAR_OFF_PX = 10.0
+_SPACING_PX, _AROUND = 4, 11
+# The share of the confidence beside a run in that of a pixel filled from there; its own claim has the rest.
+# Fitted on collages and rendered pairs: the claim alone is 0.02 to 0.12 too low there, this is off by 0.02 to
+# 0.06.
+_SHARE_BESIDE = np.float32(0.4)
+
+
+def fill_occluded(estimate: Estimate, left_seen: Bool[np.ndarray, "h w"] | None = None) -> Estimate:
+    """The estimate with its occluded pixels filled from the farther visible surface in their row.
+
+    Visible pixels stay as they are, and so does `occluded`. The confidence of a filled pixel is brought
+    nearer to that of the surface it is filled from; where it is 0 it stays.
+
+    Args:
+        estimate: Its disparities go on where it is occluded.
+        left_seen: Where the left picture shows something that they can go on from; everywhere if left out.
+    """
+    occluded = estimate.occluded
+    visible = ~occluded if left_seen is None else ~occluded & left_seen
+    own_px, claimed = estimate.disparity_px[occluded], estimate.confidence[occluded]
+    disparity_px, confidence = estimate.disparity_px.copy(), estimate.confidence.copy()
+    disparity_px[~visible], confidence[~visible] = _background(estimate, visible)
+    filled_px, beside = cv2.medianBlur(disparity_px, _MEDIAN_PX)[occluded], confidence[occluded]
+    kept = np.abs(filled_px - own_px) > _FAR_OFF_PX
+    rows, columns = np.nonzero(occluded)
+    kept[kept] = _within_surroundings(estimate.disparity_px, visible, rows[kept], columns[kept])
+    np.copyto(disparity_px, estimate.disparity_px)
+    np.copyto(confidence, estimate.confidence)
+    disparity_px[occluded] = np.where(kept, own_px, filled_px)
+    believed = claimed + _SHARE_BESIDE * (beside - claimed)
+    confidence[occluded] = np.where(kept | (claimed == 0), claimed, believed)
+    return replace(estimate, disparity_px=disparity_px, confidence=confidence)
+
+
+def _background(
+    estimate: Estimate, visible: Bool[np.ndarray, "h w"]
+) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
+    """Disparity and confidence at the farther end of the run of each pixel that is not visible, row by row.
+
+    They are the pixel's own in a row without a visible one.
+    """
+    hidden = np.pad(~visible, ((0, 0), (1, 1)))
+    changes = np.flatnonzero(hidden.ravel()[1:] != hidden.ravel()[:-1])
+    rows, columns = np.divmod(changes.reshape(-1, 2), hidden.shape[1])
+    steps = np.arange(_END_PX)
+    left, right = (rows[:, :1], columns[:, :1] - 1 - steps), (rows[:, 1:], columns[:, 1:] + steps)
+    left_px, right_px = (_medians(estimate.disparity_px, visible, *end) for end in (left, right))
+    left_confidence, right_confidence = (
+        _medians(estimate.confidence, visible, *end) for end in (left, right)
+    )
+    from_right = np.isnan(left_px) | (right_px < left_px)
+    lengths = np.diff(columns)[:, 0]
+    farther_px = np.repeat(np.where(from_right, right_px, left_px), lengths)
+    confidence = np.repeat(np.where(from_right, right_confidence, left_confidence), lengths)
+    alone = np.isnan(farther_px)
+    return (
+        np.where(alone, estimate.disparity_px[~visible], farther_px),
+        np.where(alone, estimate.confidence[~visible], confidence),
+    )
+
+
+def _medians(
+    values: Float32[np.ndarray, "h w"],
+    visible: Bool[np.ndarray, "h w"],
+    rows: Int[np.ndarray, "n 1"],
+    columns: Int[np.ndarray, "n k"],
+) -> Float32[np.ndarray, " n"]:
+    """The median of the visible pixels among some of a row, the lesser of two; NaN without any."""
+    last = values.shape[1] - 1
+    at = rows, columns.clip(0, last)
+    known = (columns >= 0) & (columns <= last) & visible[at]
+    ordered = np.sort(np.where(known, values[at], np.float32(np.nan)), axis=1)
+    middle = np.maximum(known.sum(axis=1) - 1, 0) // 2
+    return ordered[np.arange(len(middle)), middle]
+
+
+def _within_surroundings(
+    disparity_px: Float32[np.ndarray, "h w"],
+    visible: Bool[np.ndarray, "h w"],
+    rows: Int[np.ndarray, " n"],
+    columns: Int[np.ndarray, " n"],
+) -> Bool[np.ndarray, " n"]:
+    """Whether the disparity at each of these pixels is between those of the visible pixels around it."""
+    some = np.s_[::_SPACING_PX, ::_SPACING_PX]
+    known, some_px = visible[some], disparity_px[some]
+    window = np.ones((_AROUND, _AROUND), np.uint8)
+    at = rows // _SPACING_PX, columns // _SPACING_PX
+    farthest_px = cv2.erode(np.where(known, some_px, np.float32(np.inf)), window)[at]
+    nearest_px = cv2.dilate(np.where(known, some_px, np.float32(-np.inf)), window)[at]
+    own_px = disparity_px[rows, columns]
+    return (own_px >= farthest_px) & (own_px <= nearest_px)
