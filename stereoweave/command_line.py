@@ -74,8 +74,8 @@ Strength = Annotated[
 Model = Annotated[
     str,
     typer.Option(
-        help="The name of a shipped network, or an .onnx file; best for stills: base at 1.5 times the size, "
-        "and refined."
+        help="The name of a shipped network, or an .onnx file; or best, for stills: base, once more at 1.5 "
+        "times the size, and refined."
     ),
 ]
 Threads = Annotated[int | None, typer.Option(min=1, help="Processor threads; as many as cores unless given.")]

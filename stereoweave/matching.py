@@ -23,6 +23,7 @@ from stereoweave.io import SMALLEST_SIDE_PX
 from stereoweave.matcher import MODES, PIXEL_PAIRS_AT_ONCE, Matcher, check_steps, find_occluded, model_file
 from stereoweave.providers import CPU
 from stereoweave.ranging import find_range, goes_beyond
+from stereoweave.refining import right_confidence
 from stereoweave.stereo import Estimate, StereoPair
 
 # A network that is shown what is beyond its range often believes in the end of it, but not quite.
@@ -37,6 +38,12 @@ _OUTSIDE_PX = 1
 _FILLED = 0.95
 # How much a width and a move, both rounded, may be too large together.
 _ROUNDED_PX = 2
+# A closer look at less than this magnification is not worth its time; the range that it has to see is that of
+# all but so much of some pixels.
+_LEAST_MAGNIFICATION = 1.1
+_ENDS_PERCENT, _STEP_PX = 0.5, 4
+# Disparities of the larger picture that differ by more are of two surfaces.
+_OTHER_SURFACE_PX = 3.0
 # The median window of a larger estimate, of which one pixel is taken for each of the pair's.
 _MEDIAN_PX = 3
 
@@ -65,8 +72,8 @@ def estimate(  # noqa: PLR0913 - each has a name, and all but the pictures can b
         left: The left photograph, at least 32x32: uint8 RGB [H, W, 3], or what else `arrays.as_rgb` takes,
             such as a PIL image or a PyTorch tensor.
         right: The right one, of the same size.
-        model: A shipped name, `best` (the network base at 1.5 times the size, and refined), or the path of
-            an .onnx matcher; loaded at the first call, and kept.
+        model: A shipped name, `best` (the network base, once more at 1.5 times the size, and refined), or the
+            path of an .onnx matcher; loaded at the first call, and kept.
         threads: How many threads may be used; all cores if left out.
         provider: What the network is run on: cpu, cuda, tensorrt, openvino, coreml or directml.
         refined: As for `match`.
@@ -190,6 +197,8 @@ def _finished(  # noqa: PLR0913 - all that is known of a pair by then
             (found,) = matcher.estimate_many([_moved(shown)], raw=True)
             found = _unmoved(shown, found)
     small = shown.small
+    if matcher.magnification > 1:
+        small, found = _look_closer(matcher, pair, small, found)
     if not raw:
         found = matcher.finish(small, _as_seen(found, small), refined=refined)
     if small.left.shape[1] > pair.left.shape[1]:
@@ -202,12 +211,9 @@ def _finished(  # noqa: PLR0913 - all that is known of a pair by then
 
 
 def _seen_whole(matcher: Matcher, pair: StereoPair) -> StereoPair:
-    """The pair, smaller where the network would else see it in strips, whose seams would show.
-
-    It is larger, by up to the matcher's magnification, where the network sees even that whole.
-    """
+    """The pair, smaller where the network would else see it in strips, whose seams would show."""
     height, width = pair.left.shape[:2]
-    return _resized(pair, _times_smaller(matcher, width, height, largest=matcher.magnification))
+    return _resized(pair, _times_smaller(matcher, width, height))
 
 
 def _times_smaller(
@@ -240,6 +246,64 @@ def _resized(pair: StereoPair, scale: float) -> StereoPair:
         for seen in (pair.left_seen, pair.right_seen)
     )
     return StereoPair(left=left, right=right, left_seen=left_seen, right_seen=right_seen)
+
+
+def _look_closer(
+    matcher: Matcher, pair: StereoPair, small: StereoPair, found: Estimate
+) -> tuple[StereoPair, Estimate]:
+    """A pair as it is shown for a matcher's magnification, and the network's own estimate of that.
+
+    It is enlarged by less where the range or the memory allow no more. Where the estimate at hand is surer
+    and says something else, that counts: beyond the network's range, and on plain surfaces.
+
+    Args:
+        matcher: Its network looks closer.
+        pair: At its own size.
+        small: As it was shown before.
+        found: What was found then.
+    """
+    height, width = pair.left.shape[:2]
+    seen = _resized(pair, _times_smaller(matcher, width, height, largest=matcher.magnification))
+    range_px = np.percentile(found.disparity_px[::_STEP_PX, ::_STEP_PX], [_ENDS_PERCENT, 100 - _ENDS_PERCENT])
+    low_px, high_px = range_px * seen.left.shape[1] / small.left.shape[1]
+    shown = _shown_within(matcher, pair, seen, (float(low_px), float(high_px)))
+    if shown.small.left.shape[1] < _LEAST_MAGNIFICATION * small.left.shape[1]:
+        return small, found
+    (closer,) = matcher.estimate_many([_moved(shown)], raw=True)
+    return shown.small, _surer(_unmoved(shown, closer), found)
+
+
+def _surer(closer: Estimate, found: Estimate) -> Estimate:
+    """The closer look, but what was found at a smaller size where that is another surface, and surer."""
+    size = closer.disparity_px.shape[::-1]
+    scale = np.float32(size[0] / found.disparity_px.shape[1])
+    found_px, right_found_px, confidence, right_trust = (
+        _nearest(values, size)
+        for values in (
+            scale * found.disparity_px,
+            scale * found.right_disparity_px,
+            found.confidence,
+            right_confidence(found),
+        )
+    )
+    kept = _is_other(closer.disparity_px, found_px) & (confidence > closer.confidence)
+    right_kept = _is_other(closer.right_disparity_px, right_found_px)
+    right_kept &= right_trust > right_confidence(closer)
+    disparity_px = np.where(kept, found_px, closer.disparity_px)
+    right_disparity_px = np.where(right_kept, right_found_px, closer.right_disparity_px)
+    return Estimate(
+        disparity_px=disparity_px,
+        right_disparity_px=right_disparity_px,
+        confidence=np.where(kept, confidence, closer.confidence),
+        occluded=find_occluded(disparity_px, right_disparity_px),
+    )
+
+
+def _is_other(
+    one_px: Float[np.ndarray, "h w"], other_px: Float[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Where two disparities are not of one surface."""
+    return np.abs(one_px - other_px) > _OTHER_SURFACE_PX
 
 
 def _shrunk(found: Estimate, pair: StereoPair) -> Estimate:

@@ -59,7 +59,7 @@ def refine(
     if looks is not None:
         pair = StereoPair(left=left, right=recoloured(right, looks.tables(0)[1]))
     found_px, right_found_px = _matched(pair, estimate, min(_MOST_THREADS, thread_count(threads)))
-    trust, right_trust = np.asarray(estimate.confidence, np.float32, order="C"), _right_trust(estimate)
+    trust, right_trust = np.asarray(estimate.confidence, np.float32, order="C"), right_confidence(estimate)
     disparity_px = _settled(estimate.disparity_px, found_px, right_found_px, trust, -1)
     right_disparity_px = _settled(estimate.right_disparity_px, right_found_px, found_px, right_trust, 1)
     seen_px, inside = _at_match(right_disparity_px, disparity_px, -1)
@@ -94,7 +94,7 @@ def _matched(
     """The disparities of least cost of both views."""
     first_px, count = _candidates(estimate)
     left = _cues(pair.left, estimate.disparity_px - first_px, estimate.confidence)
-    right = _cues(pair.right, estimate.right_disparity_px - first_px, _right_trust(estimate))
+    right = _cues(pair.right, estimate.right_disparity_px - first_px, right_confidence(estimate))
     mirrored = _part(right, np.s_[..., ::-1]), _part(left, np.s_[..., ::-1])
     views = [(own, _backwards(other, first_px, count)) for own, other in ((left, right), mirrored)]
     height, width = left.grey.shape
@@ -193,7 +193,7 @@ def _part(cues: "Cues", index: Any) -> "Cues":
     return type(cues)(*(np.ascontiguousarray(cue[index]) for cue in cues))
 
 
-def _right_trust(estimate: Estimate) -> Float32[np.ndarray, "h w"]:
+def right_confidence(estimate: Estimate) -> Float32[np.ndarray, "h w"]:
     """The confidence of the right view's disparities, for which the left one's speaks at their matches."""
     seen_px, inside = _at_match(estimate.disparity_px, estimate.right_disparity_px, 1)
     confidence, _ = _at_match(np.asarray(estimate.confidence, np.float32), estimate.right_disparity_px, 1)

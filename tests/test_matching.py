@@ -176,6 +176,7 @@ def part(examples):
 
 
 def test_best_is_base_at_one_and_a_half_times_the_size_and_refined(best, part):
+    # All of it is looked at closer, since nothing is surer of another surface at its own size.
     found = sw.estimate(part.left, part.right, model="best")
     larger = (cv2.resize(x, (240, 144), interpolation=cv2.INTER_CUBIC) for x in (part.left, part.right))
     expected = sw.estimate(*larger, model="base", refined=True)
@@ -214,17 +215,47 @@ def test_a_disparity_of_37_px_is_37_px_for_best(best, rng, range_px):
     assert np.median(np.abs(found.disparity_px - 37)[:, 60:]) < 0.1
 
 
-def test_what_is_seen_whole_only_at_less_than_one_and_a_half_times_the_size_is_shown_so_large(
-    best, rng, monkeypatch
-):
+@pytest.mark.parametrize(
+    ("size", "least", "most"), [((64, 80), 1.2, 1.5), ((60, 60), 1.5, 1.5), ((200, 200), 0, 0)]
+)
+def test_best_looks_closer_by_as_much_as_is_seen_whole(best, rng, monkeypatch, size, least, most):
     for module in (matcher_module, matching):
         monkeypatch.setattr(module, "PIXEL_PAIRS_AT_ONCE", 100 * 100 * 100)
-    for size, least, most in (((64, 80), 1.2, 1.5), ((40, 40), 1.5, 1.5), ((200, 200), 0.4, 0.5)):
-        left, right = rng.integers(0, 256, (2, *size, 3), np.uint8)
-        shown = matching._seen_whole(best, sw.StereoPair(left=left, right=right))
-        height, width = shown.left.shape[:2]
-        assert best.sees_whole(width, height)
-        assert least <= width / size[1] <= most
+    seen = []
+    estimate_many = Matcher.estimate_many
+
+    def noted(matcher, pairs, **options):
+        seen.extend(pair.left.shape for pair in pairs)
+        return estimate_many(matcher, pairs, **options)
+
+    monkeypatch.setattr(Matcher, "estimate_many", noted)
+    left, right = rng.integers(0, 256, (2, *size, 3), np.uint8)
+    match(best, sw.StereoPair(left=left, right=right), range_px=(0, 40))
+    assert all(best.sees_whole(width, height) for height, width, _ in seen)
+    closer = [width / size[1] for _, width, _ in seen[1:]]
+    assert [least <= magnification <= most for magnification in closer] == [True] * (most > 0)
+
+
+def test_a_smaller_look_counts_where_it_is_surer_of_another_surface():
+    closer, found = (
+        sw.Estimate(
+            disparity_px=np.full(size, px, np.float32),
+            right_disparity_px=np.full(size, px, np.float32),
+            confidence=np.full(size, confidence, np.float32),
+            occluded=np.zeros(size, bool),
+        )
+        for size, px, confidence in (((36, 48), 9, 0.5), ((24, 32), 6, 0.5))
+    )
+    closer.confidence[:, 40:] = 0.4
+    found.disparity_px[:12], found.right_disparity_px[:12] = 16, 16  # 24 px of the larger picture
+    found.disparity_px[12:], found.right_disparity_px[12:] = 7, 7  # 10.5 px
+    merged = matching._surer(closer, found)
+    expected_px = np.full((36, 48), 9)
+    expected_px[:18, 40:] = 24
+    np.testing.assert_allclose(merged.disparity_px, expected_px)
+    np.testing.assert_allclose(merged.confidence[:, :40], 0.5)
+    np.testing.assert_allclose(merged.confidence[18:, 40:], 0.4)
+    np.testing.assert_allclose(merged.confidence[:18, 40:], 0.5)
 
 
 def test_masks_are_made_smaller_with_the_pictures(rng):

@@ -137,7 +137,7 @@ def test_the_kernels_equal_the_plain_ones(rng):
     left, right, given = random_pair(rng)
     first_px, count = refining._candidates(given)
     own = refining._cues(left, given.disparity_px - first_px, given.confidence)
-    other = refining._cues(right, given.right_disparity_px - first_px, refining._right_trust(given))
+    other = refining._cues(right, given.right_disparity_px - first_px, refining.right_confidence(given))
     for view in (own, other):
         np.testing.assert_array_equal(view.census, plain_census(view.grey))
     costs = np.empty((24, 50, count), np.uint8)
@@ -154,7 +154,7 @@ def test_both_views_settle_as_the_plain_ones(rng):
     refined = refine(left, right, given)
     expected = plain_settled(given.disparity_px, *found_px, given.confidence, -1)
     np.testing.assert_array_equal(refined.disparity_px, expected)
-    expected = plain_settled(given.right_disparity_px, *found_px[::-1], refining._right_trust(given), 1)
+    expected = plain_settled(given.right_disparity_px, *found_px[::-1], refining.right_confidence(given), 1)
     np.testing.assert_array_equal(refined.right_disparity_px, expected)
     assert (refined.disparity_px != given.disparity_px).any()
 
