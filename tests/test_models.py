@@ -16,6 +16,7 @@ from stereoweave.learn.objective import objective_of
 PARAMETERS = {
     "weave_small": 278_029,
     "weave_base": 1_274_290,
+    "weave_base_grown": 1_470_020,
     "fast_depth": 314_722,
     "fast_depth_without_skips": 301_858,
     "densemapnet": 290_290,
@@ -95,7 +96,7 @@ def test_each_parameter_gets_a_gradient(name):
 
 def test_a_pair_is_not_told_from_the_others_in_its_batch(name):
     network = random_network(name).eval()
-    left, right = random_pair(3, 32, 48)
+    left, right = random_pair(3, 32, 64)
     with torch.no_grad():
         among_some = outputs_of(network, (left[:2], right[:2]))
         among_others = outputs_of(network, (left[::2], right[::2]))
@@ -148,6 +149,6 @@ def test_an_unknown_name_is_answered_with_the_known_ones():
     with pytest.raises(FormatError) as caught:
         network_of(recipe_of("spider"))
     assert str(caught.value) == (
-        "tiny: model = 'spider', expected weave_small or weave_base or fast_depth or "
-        "fast_depth_without_skips or densemapnet or dispnet or psmnet"
+        "tiny: model = 'spider', expected weave_small or weave_base or weave_base_grown or fast_depth "
+        "or fast_depth_without_skips or densemapnet or dispnet or psmnet"
     )

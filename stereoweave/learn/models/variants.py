@@ -16,7 +16,6 @@ from stereoweave.learn.models.layers import (
     upsample_convex,
 )
 from stereoweave.learn.models.weave import (
-    BASE,
     SMALL,
     Aggregation,
     Features,
@@ -142,8 +141,5 @@ VARIANTS: dict[str, Callable[[], WeaveNet]] = {
     "weave_small_without_context": WithoutContext,
     "weave_small_bilinear": Bilinear,
     "weave_small_nine_neighbours": partial(WeaveNet, replace(SMALL, neighbours=9)),
-    "weave_base_wider": partial(WeaveNet, replace(BASE, wider=64)),
-    "weave_base_completed": partial(WeaveNet, replace(BASE, completion=32)),
-    "weave_base_sharpened": partial(WeaveNet, replace(BASE, sharpening=8)),
     "weave_small_looked_up": partial(WeaveNet, replace(SMALL, warps=False, compared=16, handed=8)),
 }

@@ -85,7 +85,8 @@ def _standing_boards(rng: np.random.Generator, palette: Palette) -> _Near:
     parts = []
     for k, away in enumerate(away_m):
         width_m = away * rng.uniform(0.7, 1.4)
-        edge_m = rng.uniform(-0.6, 0.4) * away * _HALF_VIEW
+        # Those behind leave a gap beside the first: boards alone would show no outline.
+        edge_m = rng.uniform(*((-0.6, 0.4) if k == 0 else (0.65, 0.85))) * away * _HALF_VIEW
         top_m = eye_m + away * rng.uniform(0.05, 0.5)
         pose = turn((0, 0, 1), rng.normal(0, 15))
         pose[:2, 3] = side * (-1) ** k * (edge_m + width_m / 2), away - distance_m
