@@ -240,7 +240,7 @@ def test_a_pair_that_is_too_much_for_the_provider_is_a_row_and_one_that_fails_al
 ):
     source, out, chunk = places
     with monkeypatch.context() as patch:
-        patch.setattr(Matcher, "estimate", fails)
+        patch.setattr(Matcher, "estimate_many", fails)
         with pytest.raises(ProviderError, match=r"^provider cpu: .* it failed: lost$"):
             Overtaxed(source, out, ORDER)([chunk])
     assert read_rows(out, chunk) == {}
@@ -252,7 +252,7 @@ def test_a_pair_that_is_too_much_for_the_provider_is_a_row_and_one_that_fails_al
     assert (counts.made, counts.there) == (1, 2)
 
 
-def fails(*_: object) -> None:
+def fails(*_: object, **__: object) -> None:
     raise ProviderError("provider cpu: expected to run small.onnx, found that it failed: lost")
 
 

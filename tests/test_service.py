@@ -233,9 +233,9 @@ def test_nothing_is_left_of_a_request_whose_client_goes_away_while_it_is_matched
     folder = tmp_path / "pictures"
 
     class MatcherAtThatMoment(Matcher):
-        def estimate_many(self, pairs: Sequence[sw.StereoPair]) -> list[sw.Estimate]:
+        def estimate_many(self, pairs: Sequence[sw.StereoPair], **how: bool) -> list[sw.Estimate]:
             shutil.rmtree(folder)
-            return super().estimate_many(pairs)
+            return super().estimate_many(pairs, **how)
 
     answer_many(MatcherAtThatMoment("small"), [order(folder)])
     assert not folder.exists()

@@ -38,13 +38,13 @@ def written(before: set[Path]) -> Path:
 
 def test_a_quilt_of_48_views_matches_once(pair, monkeypatch, capfd):
     sizes = []
-    estimate = Matcher.estimate
+    estimate_many = Matcher.estimate_many
 
-    def counted(matcher, left, right, **options):
-        sizes.append(left.shape[:2])
-        return estimate(matcher, left, right, **options)
+    def counted(matcher, pairs, **options):
+        sizes.extend(pair.left.shape[:2] for pair in pairs)
+        return estimate_many(matcher, pairs, **options)
 
-    monkeypatch.setattr(Matcher, "estimate", counted)
+    monkeypatch.setattr(Matcher, "estimate_many", counted)
     assert run("view left.png right.png --layout quilt --threads 1 -o view.png") == 0
     # The hints match twice more, at half the size.
     assert sizes.count((64, 95)) == 1
@@ -149,7 +149,7 @@ def test_a_mistake_is_told_in_one_line_before_anything_is_matched(
     def unmatched(*_, **__):
         raise AssertionError("matched")
 
-    monkeypatch.setattr(Matcher, "estimate", unmatched)
+    monkeypatch.setattr(Matcher, "estimate_many", unmatched)
     Path("taken_RGBD.png").mkdir()
     before = sorted(Path().rglob("*"))
     assert run(f"view left.png right.png {arguments}") == 2
