@@ -45,7 +45,8 @@ check: $(DEV)/installed
 	$(DEV)/bin/pytest
 
 bench: $(CORE)/installed
-	$(CORE)/bin/stereoweave bench pairs $(STEREOWEAVE_TESTDATA)/stereo/pairs --out results/pairs.csv
+	$(CORE)/bin/stereoweave bench pairs $(STEREOWEAVE_TESTDATA)/stereo/pairs \
+		--model base --model small --model best --classes results/classes.csv --out results/pairs.csv
 
 # The wiggle's frames are smaller, because it is as large as all other pictures together else.
 gallery: $(DEV)/installed

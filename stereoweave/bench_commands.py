@@ -411,14 +411,15 @@ def exponent(
 def _makers(models: Sequence[str] | None, threads: int | None, provider: str) -> dict[str, Callable[[], Any]]:
     """What makes each network, as it is and refined; all shipped ones unless some are named."""
     from stereoweave.benchmark import network
-    from stereoweave.matcher import shipped_models
+    from stereoweave.matcher import MODES, shipped_models
 
     makers: dict[str, Callable[[], Any]] = {}
     for name in models or shipped_models():
         # A worker of a cluster has another current folder.
         model = str(Path(name).absolute()) if Path(name).is_file() else name
         makers[name] = partial(network, model, threads, provider=provider)
-        makers[name + REFINED] = partial(network, model, threads, refined=True, provider=provider)
+        if name not in MODES:  # which refine by themselves
+            makers[name + REFINED] = partial(network, model, threads, refined=True, provider=provider)
     return makers
 
 
