@@ -90,6 +90,14 @@ RecipeFile = Annotated[
 ]
 RunsFolder = Annotated[Path, typer.Option("--out", "-o", help="The folder of the trainings.")]
 ReportFolder = Annotated[Path, typer.Option(help="The folder for rows, tables and figures.")]
+Classes = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="A second CSV file to write: errors outside the right picture, where occluded, near edges, "
+        "where plain, weakly textured, textured.",
+    ),
+]
 Seeds = Annotated[int, typer.Option(min=1, help="How often each training is repeated.")]
 Jobs = Annotated[int, typer.Option(min=1, help="Trainings at a time.")]
 
@@ -118,14 +126,7 @@ def pairs(  # noqa: PLR0913 - each is a word of the command line
     sparsification: Annotated[
         Path | None, typer.Option(help="A picture to write: errors by confidence. Extra 'train'.")
     ] = None,
-    classes: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="A second CSV file to write: errors outside the right picture, where occluded, near edges, "
-            "where plain, weakly textured, textured.",
-        ),
-    ] = None,
+    classes: Classes = None,
     cluster: Cluster = None,
     threads: Threads = None,
     provider: Provider = "cpu",
@@ -139,18 +140,12 @@ def pairs(  # noqa: PLR0913 - each is a word of the command line
 
     from stereoweave.benchmark import MEAN, score_pairs, with_memory, write_csv
     from stereoweave.data.readers import list_scenes
-    from stereoweave.io import picture_kind
     from stereoweave.opencv_matchers import SGBM
     from stereoweave.threads import thread_count
 
-    place_for(out)
-    if classes:
-        place_for(classes)
-    for picture in filter(None, (plot, sparsification)):
-        picture_kind(picture)
-        place_for(picture)
-        with needing_the_train_extra("a plot needs matplotlib"):
-            from stereoweave import benchmark_plots
+    for file in filter(None, (out, classes)):
+        place_for(file)
+    _check_plots(plot, sparsification)
     engine = engine_of(cluster, cpus_each=threads or 1)
     threads = engine.threads_each if engine else threads
     cv2.setNumThreads(thread_count(threads))
@@ -159,17 +154,11 @@ def pairs(  # noqa: PLR0913 - each is a word of the command line
     rows = with_memory(scores.rows, makers, scores.largest)
     write_csv(out, rows, scores.machine)
     means = [row for row in rows if row.scene == MEAN]
-    if plot:
-        benchmark_plots.draw_error_over_time(plot, means)
-    if sparsification:
-        benchmark_plots.draw_sparsification(
-            sparsification, {name: scores.curves[name] for name in (*makers, SGBM)}
-        )
+    if plot or sparsification:
+        _draw_plots(plot, sparsification, means, {name: scores.curves[name] for name in (*makers, SGBM)})
     _tell_means(PAIRS_TABLES, "matcher", means)
     if classes:
-        write_csv(classes, scores.class_rows, scores.machine)
-        _print_classes([row for row in scores.class_rows if row.scene == MEAN])
-        typer.echo(f"errors by class: {classes}")
+        _write_classes(classes, scores)
     typer.echo(f"rows: {out}")
 
 
@@ -458,6 +447,37 @@ def _tell_means(tables: Mapping[str, Mapping[str, str]], who: str, rows: Sequenc
             cells = [getattr(row, field) for field in columns.values()]
             table.add_row(Path(getattr(row, who)).name, *map(_cell, cells))
         Console().print(table)
+
+
+def _check_plots(*pictures: Path | None) -> None:
+    """Fail before anything is scored where a picture cannot be drawn or written."""
+    from stereoweave.io import picture_kind
+
+    for picture in filter(None, pictures):
+        picture_kind(picture)
+        place_for(picture)
+        with needing_the_train_extra("a plot needs matplotlib"):
+            from stereoweave import benchmark_plots  # noqa: F401 - imported to see that it can be
+
+
+def _draw_plots(
+    plot: Path | None, sparsification: Path | None, means: Sequence[Any], curves: Mapping[str, Any]
+) -> None:
+    from stereoweave import benchmark_plots
+
+    if plot:
+        benchmark_plots.draw_error_over_time(plot, means)
+    if sparsification:
+        benchmark_plots.draw_sparsification(sparsification, curves)
+
+
+def _write_classes(file: Path, scores: Any) -> None:
+    """Write the errors by class, and print their means."""
+    from stereoweave.benchmark import MEAN, write_csv
+
+    write_csv(file, scores.class_rows, scores.machine)
+    _print_classes([row for row in scores.class_rows if row.scene == MEAN])
+    typer.echo(f"errors by class: {file}")
 
 
 def _print_classes(means: Sequence[Any]) -> None:
