@@ -2,6 +2,8 @@
 # make test    the tests
 # make check   style, types, floors of imports, and the tests
 # make bench   accuracy and time on the real pairs in STEREOWEAVE_TESTDATA
+# make audit   licences of all that is installed, and known vulnerabilities where their service is reached
+# make release the wheel, and the lists of what it needs (SBOM), in dist
 # make gallery the README's pictures, docs/gallery, from a pair that is rendered for them
 # Each first sets up the virtual environment that it needs, once.
 
@@ -11,6 +13,7 @@ STEREOWEAVE_TESTDATA ?= ../shared
 # What users install: no PyTorch.
 CORE = .venv-core
 DEV = .venv
+AUDIT = .venv-audit
 
 EXAMPLE = examples/left.png examples/right.png
 ifeq ($(LEFT),)
@@ -23,11 +26,13 @@ else
 PAIR = "$(LEFT)" $(if $(RIGHT),"$(RIGHT)")
 endif
 
+SBOM = $(AUDIT)/bin/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible
+VERSION = $(shell sed -n 's/^__version__ = "\(.*\)"/\1/p' stereoweave/__init__.py)
 RENDER = $(DEV)/bin/stereoweave synth make refinery --pairs 1 --seed 4000 --layout paper
 RENDERED = $(foreach side,left right,runs/gallery/$(1)/$(side)/refinery/000000.png)
 VIEW = $(DEV)/bin/stereoweave view
 
-.PHONY: demo test check bench gallery
+.PHONY: demo test check bench audit release gallery
 
 demo: $(CORE)/installed
 	$(CORE)/bin/stereoweave depth $(PAIR) $(CALIBRATION) --out demo-out
@@ -47,6 +52,21 @@ check: $(DEV)/installed
 bench: $(CORE)/installed
 	$(CORE)/bin/stereoweave bench pairs $(STEREOWEAVE_TESTDATA)/stereo/pairs \
 		--model base --model small --model best --classes results/classes.csv --out results/pairs.csv
+
+# Without a +cpu at its end, because advisories are of versions that have none.
+audit: $(DEV)/installed $(AUDIT)/installed
+	$(AUDIT)/bin/pip-licenses --python $(DEV)/bin/python --summary
+	@$(DEV)/bin/python -m pip freeze --exclude-editable | sed 's/+.*//' > $(AUDIT)/packages.txt
+	@cd $(AUDIT) && if bin/pip-audit --requirement packages.txt --no-deps --disable-pip \
+		--vulnerability-service osv --progress-spinner off > found.txt 2> log.txt; \
+	then tail -n 1 log.txt; \
+	elif grep '^Found' log.txt; then cat found.txt; exit 1; \
+	else echo "Known vulnerabilities: not looked up, no answer from the service ($$(tail -n 1 log.txt))"; fi
+
+release: $(CORE)/installed $(DEV)/installed $(AUDIT)/installed
+	$(CORE)/bin/python -m pip wheel --no-deps --wheel-dir dist .
+	$(SBOM) --output-file dist/stereoweave-$(VERSION).cdx.json $(CORE)
+	$(SBOM) --output-file dist/stereoweave-$(VERSION)-all-extras.cdx.json $(DEV)
 
 # The wiggle's frames are smaller, because it is as large as all other pictures together else.
 gallery: $(DEV)/installed
@@ -70,4 +90,9 @@ $(CORE)/installed: pyproject.toml constraints.txt
 $(DEV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(DEV)
 	$(DEV)/bin/python -m pip install --constraint constraints.txt --editable '.[synth,train,video,app,cluster,dev]'
+	touch $@
+
+$(AUDIT)/installed: constraints.txt
+	$(PYTHON) -m venv $(AUDIT)
+	$(AUDIT)/bin/python -m pip install --constraint constraints.txt cyclonedx-bom pip-audit pip-licenses
 	touch $@

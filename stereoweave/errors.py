@@ -20,6 +20,10 @@ class ProviderError(MatcherError):
     """What a network is run on failed meanwhile, as for want of memory; the same call may work later."""
 
 
+class OutputInUseError(StereoweaveError):
+    """Another process writes to the same output."""
+
+
 @contextmanager
 def needing_extra(extra: str, what: str) -> Iterator[None]:
     """Turns a missing library into one line that says what needs it, and which extra has it."""

@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from urllib.request import Request, urlopen
 from uuid import uuid4
 
@@ -139,6 +139,16 @@ def ray_head(cpus: int) -> Iterator[str]:
                 with suppress(ProcessLookupError):
                     os.kill(process, signal.SIGKILL)
             head.wait()
+
+
+@contextmanager
+def halted(process: subprocess.Popen[Any]) -> Iterator[None]:
+    """A process stands still during the block, and keeps what it holds."""
+    process.send_signal(signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        process.send_signal(signal.SIGCONT)
 
 
 def processes_of(process: int) -> list[int]:

@@ -11,11 +11,12 @@ import time
 from pathlib import Path
 
 import pytest
+from conftest import halted
 from rich.console import Console
 
 from stereoweave.batch import DONE_FILE, Tally, depth_of_many, run_batch
 from stereoweave.cli import main
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import OutputInUseError, StereoweaveError
 from stereoweave.io import read_image, write_image
 from stereoweave.matcher import Matcher
 from stereoweave.pair_lists import Job, Pairs, pairs_in
@@ -122,7 +123,7 @@ def test_a_bad_pair_is_told_and_the_others_are_as_they_are_alone_and_the_next_ru
     ]
 
 
-def test_a_killed_batch_goes_on_and_so_does_an_interrupted_one_without_a_pair_twice(tmp_path, capsys):
+def test_a_killed_batch_goes_on_and_so_does_an_interrupted_one_but_none_beside_another(tmp_path, capsys):
     folder, out = write_pairs(tmp_path / "pairs", 24, (256, 192)), tmp_path / "out"
     before = {}
     for end, goal in ((signal.SIGKILL, 3), (signal.SIGINT, 8)):
@@ -137,7 +138,10 @@ def test_a_killed_batch_goes_on_and_so_does_an_interrupted_one_without_a_pair_tw
         )
         while len(made_at_ns(out)) < goal and process.poll() is None:
             time.sleep(0.002)
-        os.killpg(process.pid, end)
+        with halted(process):
+            with pytest.raises(OutputInUseError, match=f"{out}: .* found one that is in use"):
+                batch(folder, out)
+            os.killpg(process.pid, end)
         told, errors = process.communicate()
         made = made_at_ns(out)
         assert goal <= len(made) < 24
