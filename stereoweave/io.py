@@ -1,7 +1,9 @@
 """Pictures, disparity and depth: from files, and into files that are whole or not there."""
 
 import re
+import stat
 import tempfile
+import textwrap
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -207,6 +209,23 @@ def write_depth_png(path: str | Path, depth_m: Float[np.ndarray, "h w"]) -> None
     _save(path, np.where((depth_mm > 0) & (depth_mm <= 65535), depth_mm, 0).astype(np.uint16), "PNG")
 
 
+def read_limited(path: str | Path, most_bytes: int) -> bytes:
+    """The content of a regular file of at most `most_bytes` bytes.
+
+    Raises:
+        FormatError: The file is larger, or a pipe or a device, which may be without end.
+        OSError: It cannot be read; `reading` makes a FormatError of it.
+    """
+    mode = Path(path).stat().st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # opening a folder says that it is one
+        raise FormatError(f"{path}: expected a regular file, found a pipe or a device; save it to a file")
+    with Path(path).open("rb") as file:
+        content = file.read(most_bytes + 1)
+    if len(content) > most_bytes:
+        raise FormatError(f"{path}: expected a file of at most {most_bytes} bytes, found more")
+    return content
+
+
 def make_folder(path: str | Path) -> Path:
     """The folder `path`, made where it is missing and tried, so that a long run does not fail at its end."""
     folder = Path(path)
@@ -298,7 +317,8 @@ def _reason(error: Exception) -> str:
             return "something else"
         case OSError(strerror=str(text)):
             return text.lower()
-    return f"one that cannot be read ({error})"
+    # Libraries quote what they found, which may be all of a file, and in many lines.
+    return f"one that cannot be read ({textwrap.shorten(str(error)[:1000], 200, placeholder=' ...')})"
 
 
 def _save(

@@ -101,6 +101,7 @@ def _aliases():
     laughs += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 10)]
     return {
         "recursive list": "M1: &a [*a, *a, *a]\n",
+        "recursive list in a rig": yaml_of(RIG | {"M1": "&a [*a, *a, *a]"}),
         "recursive map": "M1: &a {rows: *a, cols: *a, data: *a}\n",
         "recursive key": "? &a [*a]\n: 1\n",
         "recursive matrix": "M1: &a !!opencv-matrix {rows: 3, cols: 3, data: *a}\n",

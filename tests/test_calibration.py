@@ -329,9 +329,9 @@ def test_extrinsics_are_completed_by_the_intrinsics_beside_them(tmp_path):
 @pytest.mark.parametrize(
     ("more", "found"),
     [
-        ("image_size: 640", "a picture's size of 640, not width and height"),
+        ("image_size: 640", "a picture's size of '640', not width and height"),
         ("image_size: [640, 480, 3]", "not width and height"),
-        ("M1: {rows: 3}", "{'rows': 3} in place of numbers"),
+        ("M1: {rows: 3}", "{'rows': '3'} in place of numbers"),
         ("translation_unit: [mm]", "translation_unit ['mm'], not one of m, cm, mm"),
     ],
 )
