@@ -15,12 +15,10 @@ from jaxtyping import Float
 
 from stereoweave.calibration import Optics, Rig, Size, side_by_side, size_of
 from stereoweave.errors import StereoweaveError
-from stereoweave.io import read_limited, reading, replacing
+from stereoweave.io import read_small, reading, replacing
 from stereoweave.stereo import StereoPair
 from stereoweave.structured_text import BASE64, parse_entries
 
-# Those of real rigs have some kilobytes.
-MOST_CALIBRATION_BYTES = 256 * 1024
 _MM_ABOVE = 2.0
 _TRUE = ("1", "true", "True")
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -68,7 +66,7 @@ def read_rig(path: str | Path, size_px: Size | None = None) -> Rig:
 def calibration_bytes(path: str | Path) -> bytes:
     """The content of a calibration file; FormatError where it is missing, too large or no regular file."""
     with reading(path, _EXPECTED):
-        return read_limited(path, MOST_CALIBRATION_BYTES)
+        return read_small(path)
 
 
 def calibrated(pair: StereoPair, path: str | Path) -> StereoPair:

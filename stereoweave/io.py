@@ -18,6 +18,8 @@ from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.stereo import StereoPair
 
 SMALLEST_SIDE_PX = 32
+# Calibrations of real rigs and training recipes have some kilobytes.
+MOST_SMALL_BYTES = 256 * 1024
 _KINDS = {
     ".png": "PNG",
     ".jpg": "JPEG",
@@ -209,8 +211,8 @@ def write_depth_png(path: str | Path, depth_m: Float[np.ndarray, "h w"]) -> None
     _save(path, np.where((depth_mm > 0) & (depth_mm <= 65535), depth_mm, 0).astype(np.uint16), "PNG")
 
 
-def read_limited(path: str | Path, most_bytes: int) -> bytes:
-    """The content of a regular file of at most `most_bytes` bytes.
+def read_small(path: str | Path) -> bytes:
+    """The content of a regular file of at most 256 KB, such as a calibration.
 
     Raises:
         FormatError: The file is larger, or a pipe or a device, which may be without end.
@@ -220,9 +222,9 @@ def read_limited(path: str | Path, most_bytes: int) -> bytes:
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # opening a folder says that it is one
         raise FormatError(f"{path}: expected a regular file, found a pipe or a device; save it to a file")
     with Path(path).open("rb") as file:
-        content = file.read(most_bytes + 1)
-    if len(content) > most_bytes:
-        raise FormatError(f"{path}: expected a file of at most {most_bytes} bytes, found more")
+        content = file.read(MOST_SMALL_BYTES + 1)
+    if len(content) > MOST_SMALL_BYTES:
+        raise FormatError(f"{path}: expected a file of at most {MOST_SMALL_BYTES} bytes, found more")
     return content
 
 

@@ -7,8 +7,11 @@ from pathlib import Path
 import pytest
 from hostile_calibrations import HARMLESS, HOSTILE, RIG, json_of, xml_of, yaml_of
 
-from stereoweave.calibration_files import MOST_CALIBRATION_BYTES, read_rig
+from stereoweave.calibration_files import read_rig
 from stereoweave.errors import FormatError
+from stereoweave.io import MOST_SMALL_BYTES
+from stereoweave.preparing import Request
+from stereoweave.results import DepthOrder, order_facts
 
 WITHOUT_LIMIT = ["/dev/zero", "/dev/urandom"]
 # Run in a process of its own, which may grow by 100 MB: an error of memory, or its death, fails.
@@ -77,12 +80,20 @@ def test_a_pipe_into_which_nobody_writes_is_refused_in_place_of_a_calibration(tm
     assert "found a pipe or a device" in refusal(tmp_path / "calib.yml")
 
 
+def test_what_a_batch_writes_down_of_its_calibration_passes_the_same_gate(tmp_path):
+    large = tmp_path / "calib"
+    large.write_bytes(HOSTILE["size: json of a megabyte"])
+    for path, found in ((Path("/dev/zero"), "found a pipe or a device"), (large, "bytes, found more")):
+        with pytest.raises(FormatError, match=found):
+            order_facts(DepthOrder(request=Request(calibration=path)))
+
+
 def test_the_file_beside_opencvs_two_passes_the_same_gate(tmp_path):
     (tmp_path / "extrinsics.yml").write_text(yaml_of({name: RIG[name] for name in "RT"}))
     beside = tmp_path / "intrinsics.yml"
     for content, found in (
         (HOSTILE["aliases: recursive list"], "an alias"),
-        (b"#" * (MOST_CALIBRATION_BYTES + 1), f"at most {MOST_CALIBRATION_BYTES} bytes"),
+        (b"#" * (MOST_SMALL_BYTES + 1), f"at most {MOST_SMALL_BYTES} bytes"),
     ):
         beside.write_bytes(content)
         with pytest.raises(FormatError, match=found) as caught:
@@ -97,9 +108,9 @@ def test_the_file_beside_opencvs_two_passes_the_same_gate(tmp_path):
 @pytest.mark.parametrize("text_of", [yaml_of, json_of, xml_of])
 def test_a_calibration_may_be_as_large_as_the_limit_and_no_larger(text_of, tmp_path):
     path, text = tmp_path / "calib", text_of(RIG)
-    path.write_text(text + "\n" * (MOST_CALIBRATION_BYTES - len(text)))
+    path.write_text(text + "\n" * (MOST_SMALL_BYTES - len(text)))
     assert read_rig(path).size_px == (640, 480)
-    path.write_text(text + "\n" * (MOST_CALIBRATION_BYTES - len(text) + 1))
+    path.write_text(text + "\n" * (MOST_SMALL_BYTES - len(text) + 1))
     assert "bytes, found more" in refusal(path)
 
 
