@@ -48,7 +48,8 @@ def read_rig(path: str | Path, size_px: Size | None = None) -> Rig:
             raw pictures as well, which is taken where they are of that size.
 
     Raises:
-        FormatError: No such file, an entry is missing, or its value is nonsense.
+        FormatError: No such file, no regular one, or one of more than 256 KB; an entry is missing, or its
+            value is nonsense; it is nested more than 20 deep, has more than 10,000 values, an alias or a DTD.
     """
     with reading(path, _EXPECTED):
         text = _text(Path(path))

@@ -348,12 +348,18 @@ def _rigs():
         "a place too far": {"T": [1e200, 1e200, 0]},
         "a focal length below zero": {"M1": [-500, *MATRIX[1:]]},
         "skew": {"M1": [500, 1, *MATRIX[2:]]},
+        "a focal length of 1e300": {"M1": [1e300, *MATRIX[1:]]},
+        "a centre of -1e60": {"M2": [*MATRIX[:2], -1e60, *MATRIX[3:]]},
+        "coefficients of 1e20": {"D2": [1e20] * 5},
+        "a baseline of 1e12": {"T": [-1e12, 0, 0]},
         "six coefficients": {"D1": [0] * 6},
         "a size of three": {"image_size": "[640, 480, 3]"},
         "a lens of no kind": {"distortion_model": "x" * 100_000},
     }
     return {what: yaml_of(RIG | change) for what, change in changes.items()} | {
         "kitti without a row": KITTI.splitlines()[0],
+        "middlebury doffs of 1e300": MIDDLEBURY.replace("doffs=31", "doffs=1e300"),
+        "middlebury baseline of 1e150": MIDDLEBURY.replace("193", "1e150"),
         "kitti of 11 numbers": KITTI.replace("0 0 1 0", "0 0 1"),
         "kalibr of one camera": KALIBR.replace("cam1", "cam2"),
         "kalibr of maps": KALIBR.replace("[460, 460, 363, 248]", "{a: 1, b: 2, c: 3, d: 4}"),
