@@ -19,6 +19,7 @@ from pathlib import Path
 import typer
 from rich.console import Console
 
+from stereoweave.calibration_files import calibration_bytes
 from stereoweave.claiming import check_claim, check_unclaimed, described, description
 from stereoweave.cluster_worker import BEGUN, Counts, Worker, remove_left_behind
 from stereoweave.engine import Engine, connect, room, stream
@@ -191,11 +192,12 @@ def _claim(destination: Store, order: DepthOrder, source: Store) -> None:
 
 def _carried(order: DepthOrder) -> Iterator[tuple[str, str, bytes]]:
     """The order's own files, which workers on other machines cannot read: kind, name and content."""
-    model = order.model if order.model.endswith(".onnx") else None  # else a name that they all know
-    for kind, path in (("model", model), ("calibration", order.request.calibration)):
-        if path and Path(path).is_file():
-            with reading(path, f"a {kind}"):
-                yield kind, Path(path).name, Path(path).read_bytes()
+    model, calibration = Path(order.model), order.request.calibration
+    if order.model.endswith(".onnx") and model.is_file():  # else a name that they all know
+        with reading(model, "a model"):
+            yield "model", model.name, model.read_bytes()
+    if calibration and calibration.is_file():
+        yield "calibration", calibration.name, calibration_bytes(calibration)
 
 
 def _tidy(destination: Store) -> None:

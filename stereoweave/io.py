@@ -1,7 +1,9 @@
 """Pictures, disparity and depth: from files, and into files that are whole or not there."""
 
 import re
+import stat
 import tempfile
+import textwrap
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +18,8 @@ from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.stereo import StereoPair
 
 SMALLEST_SIDE_PX = 32
+# Calibrations of real rigs and training recipes have some kilobytes.
+MOST_SMALL_BYTES = 256 * 1024
 _KINDS = {
     ".png": "PNG",
     ".jpg": "JPEG",
@@ -207,6 +211,23 @@ def write_depth_png(path: str | Path, depth_m: Float[np.ndarray, "h w"]) -> None
     _save(path, np.where((depth_mm > 0) & (depth_mm <= 65535), depth_mm, 0).astype(np.uint16), "PNG")
 
 
+def read_small(path: str | Path) -> bytes:
+    """The content of a regular file of at most 256 KB, such as a calibration.
+
+    Raises:
+        FormatError: The file is larger, or a pipe or a device, which may be without end.
+        OSError: It cannot be read; `reading` makes a FormatError of it.
+    """
+    mode = Path(path).stat().st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # opening a folder says that it is one
+        raise FormatError(f"{path}: expected a regular file, found a pipe or a device; save it to a file")
+    with Path(path).open("rb") as file:
+        content = file.read(MOST_SMALL_BYTES + 1)
+    if len(content) > MOST_SMALL_BYTES:
+        raise FormatError(f"{path}: expected a file of at most {MOST_SMALL_BYTES} bytes, found more")
+    return content
+
+
 def make_folder(path: str | Path) -> Path:
     """The folder `path`, made where it is missing and tried, so that a long run does not fail at its end."""
     folder = Path(path)
@@ -298,7 +319,8 @@ def _reason(error: Exception) -> str:
             return "something else"
         case OSError(strerror=str(text)):
             return text.lower()
-    return f"one that cannot be read ({error})"
+    # Libraries quote what they found, which may be all of a file, and in many lines.
+    return f"one that cannot be read ({textwrap.shorten(str(error)[:1000], 200, placeholder=' ...')})"
 
 
 def _save(

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from stereoweave.errors import FormatError
+from stereoweave.io import read_small, reading
 
 _POSITIVE = (
     "steps",
@@ -129,10 +130,8 @@ class Recipe:
 
 def read_recipe(path: Path) -> Recipe:
     """The recipe of a TOML file; FormatError for a key that is unknown, missing, mistyped or out of range."""
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise FormatError(f"{path}: expected a recipe in TOML, found: {error}") from error
+    with reading(path, "a recipe in TOML"):
+        values = tomllib.loads(read_small(path).decode())
     return recipe_from(values, str(path))
 
 
