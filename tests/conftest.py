@@ -47,6 +47,7 @@ CAPABILITIES = {
     "needs_chromium": Capability(
         shutil.which("chromium") is not None, "in a browser", "no chromium on the PATH"
     ),
+    "needs_strace": Capability(shutil.which("strace") is not None, "under strace", "no strace on the PATH"),
     "needs_egl": Capability(renders(), "of the renderer", "no EGL: apt install libegl1 libgl1-mesa-dri"),
 }
 
