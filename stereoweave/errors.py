@@ -30,3 +30,17 @@ def needing_extra(extra: str, what: str) -> Iterator[None]:
             f"{what}, found no module {missing.name}; install the extra '{extra}': "
             f"pip install 'stereoweave[{extra}]', from the wheel or the copy you have"
         ) from missing
+
+
+def reason(error: Exception) -> str:
+    """What was found instead of a file that can be read or written, to end an error's line with."""
+    match error:
+        case FileNotFoundError():
+            return "no such file"
+        case IsADirectoryError():
+            return "a folder"
+        case FileExistsError():
+            return "a file"
+        case OSError(strerror=str(text)):
+            return text.lower()
+    return f"one that cannot be read ({error})"

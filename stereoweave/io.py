@@ -2,7 +2,6 @@
 
 import re
 import tempfile
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,9 +9,10 @@ from uuid import uuid4
 
 import numpy as np
 from jaxtyping import Float, Float32, Shaped, UInt8, UInt16
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageOps
 
-from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.errors import FormatError, StereoweaveError, reason
+from stereoweave.picture_files import A_PICTURE, decoding, rgb
 from stereoweave.stereo import StereoPair
 
 SMALLEST_SIDE_PX = 32
@@ -27,11 +27,8 @@ _KINDS = {
 }
 # The names that `replacing` gives while it writes.
 _TEMPORARY = re.compile(r"\..*-[0-9a-f]{8}(\.\w+)?")
-# What libraries say of a damaged file: an OverflowError of an infinite size, Pillow's AVIF a RuntimeError.
-_UNREADABLE = (
-    *(OSError, ValueError, OverflowError, SyntaxError, RuntimeError),
-    Image.DecompressionBombError,
-)
+# What libraries say of a damaged file; of an infinite size an OverflowError, of deep JSON a RecursionError.
+_UNREADABLE = OSError, ValueError, OverflowError, SyntaxError, RuntimeError
 _PFM_HEADER = re.compile(rb"Pf\s+(\d+)\s+(\d+)\s+(\S+)\s")
 
 
@@ -45,7 +42,7 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
     Raises:
         FormatError: No such file, no picture, a truncated one, or one under 32 pixels wide or high.
     """
-    with reading(path, "a picture (PNG, JPEG, TIFF or the like)"), Image.open(path) as picture:
+    with decoding(path, A_PICTURE), Image.open(path) as picture:
         image = rgb(ImageOps.exif_transpose(picture))
     check_large_enough(path, image)
     return image
@@ -79,19 +76,6 @@ def pair_of(
             f"and {right} of {_size(right_image)}; crop or rescale one of them"
         )
     return StereoPair(left=left_image, right=right_image)
-
-
-def rgb(picture: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
-    """The pixels of an opened picture in RGB: grey is repeated, alpha dropped, 16 bits become 8."""
-    if not picture.mode.startswith(("I", "F")):
-        # A copy: Pillow lends its pixels read-only, for which Numba compiles anew and PyTorch warns.
-        return np.array(picture.convert("RGB"))
-    values = np.asarray(picture)
-    if picture.mode == "F" or values.min() < 0 or values.max() > 65535:
-        raise ValueError(f"more than 16 bits a channel or values below 0, mode {picture.mode}")
-    # The upper byte, as Pillow reduces colour pictures of 16 bits; a file of 32 bits may hold 8 of them.
-    bits = 8 if picture.mode != "I" or values.max() > 255 else 0
-    return np.repeat((values >> bits).astype(np.uint8)[..., None], 3, axis=2)
 
 
 def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"]) -> None:
@@ -167,7 +151,7 @@ def read_pixels(path: str | Path, *modes: str) -> Shaped[np.ndarray, "h w *chann
         FormatError: No such file, a damaged one, or a picture of another kind.
     """
     expected = f"a picture of mode {' or '.join(modes)}"
-    with reading(path, expected), Image.open(path) as picture:
+    with decoding(path, expected), Image.open(path) as picture:
         if picture.mode not in modes:
             raise FormatError(f"{path}: expected {expected}, found {picture.format} of mode {picture.mode}")
         return np.array(picture)
@@ -176,7 +160,7 @@ def read_pixels(path: str | Path, *modes: str) -> Shaped[np.ndarray, "h w *chann
 def read_disparity_png(path: str | Path) -> Float32[np.ndarray, "h w"]:
     """Disparity in pixels from a 16-bit PNG of pixels * 256 (KITTI's); its 0, unknown, becomes NaN."""
     expected = "a 16-bit grey PNG of disparity * 256"
-    with reading(path, expected), Image.open(path) as picture:
+    with decoding(path, expected), Image.open(path) as picture:
         if not picture.mode.startswith("I"):
             raise FormatError(f"{path}: expected {expected}, found {picture.format} of mode {picture.mode}")
         steps = np.asarray(picture)
@@ -216,7 +200,7 @@ def make_folder(path: str | Path) -> Path:
             return folder
     except OSError as error:
         raise StereoweaveError(
-            f"{path}: expected a folder that can be written, found {_reason(error)}"
+            f"{path}: expected a folder that can be written, found {reason(error)}"
         ) from error
 
 
@@ -232,13 +216,11 @@ def place_for(*files: Path) -> Path:
 def reading(path: str | Path, expected: str) -> Iterator[None]:
     """Turns what goes wrong while `path` is read into a FormatError: in one line, expected and found."""
     try:
-        # Pillow warns about odd tags before it gives up on a file; the error below says it in one line.
-        with warnings.catch_warnings(action="ignore"):
-            yield
+        yield
     except FormatError:
         raise
     except _UNREADABLE as error:
-        raise FormatError(f"{path}: expected {expected}, found {_reason(error)}") from error
+        raise FormatError(f"{path}: expected {expected}, found {reason(error)}") from error
 
 
 @contextmanager
@@ -257,7 +239,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
         temporary.replace(target)
     except OSError as error:
         raise StereoweaveError(
-            f"{path}: expected a file that can be written, found {_reason(error)}"
+            f"{path}: expected a file that can be written, found {reason(error)}"
         ) from error
     finally:
         temporary.unlink(missing_ok=True)
@@ -284,21 +266,6 @@ def remove_leftovers(folder: Path) -> None:
     """Removes what `replacing` left in a folder and below it, where nobody is writing now."""
     for path in filter(is_leftover, folder.rglob(".*")):
         path.unlink(missing_ok=True)
-
-
-def _reason(error: Exception) -> str:
-    match error:
-        case FileNotFoundError():
-            return "no such file"
-        case IsADirectoryError():
-            return "a folder"
-        case FileExistsError():
-            return "a file"
-        case UnidentifiedImageError():
-            return "something else"
-        case OSError(strerror=str(text)):
-            return text.lower()
-    return f"one that cannot be read ({error})"
 
 
 def _save(

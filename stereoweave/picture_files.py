@@ -1,6 +1,7 @@
 """One file of a picture as a camera or an editor left it: refused by its name, or decoded, with its tags."""
 
 import io
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -8,18 +9,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image, features
+from PIL import Image, UnidentifiedImageError, features
 
 from stereoweave import exif
-from stereoweave.errors import FormatError
-from stereoweave.io import reading, rgb
+from stereoweave.errors import FormatError, reason
 
 # 50 megapixels a view are supported, and cameras of that class have up to 64. Known from the file's head,
 # before memory is spent.
 MOST_PIXELS = 65_000_000
 # Not all that Pillow opens: PostScript, for one, would run as a program. Of JPEG are MPO and JPS.
 _KINDS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "AVIF", "JPEG2000")
-_A_PICTURE = "a picture (PNG, JPEG, TIFF or the like)"
+A_PICTURE = "a picture (PNG, JPEG, TIFF or the like)"
 _RAW_ENDINGS = {
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".kdc", ".mrw", ".nef", ".nrw", ".orf"),
     *(".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
@@ -30,6 +30,13 @@ _AVIF_BRANDS = {b"avif", b"avis"}
 _MP_ENTRIES, _DISPARITY = 0xB002, "Multi-Frame Image: (Disparity)"
 # How the colours of a mode are stored, where a profile can say what they mean.
 _PROFILED = {"RGB": "RGB", "RGBA": "RGB", "P": "RGB", "L": "L", "LA": "L", "CMYK": "CMYK"}
+
+
+# What Pillow says of a damaged file: an OverflowError of an infinite size, its AVIF a RuntimeError.
+_UNREADABLE = (
+    *(OSError, ValueError, OverflowError, SyntaxError, RuntimeError),
+    Image.DecompressionBombError,
+)
 
 
 class Photograph(NamedTuple):
@@ -45,6 +52,21 @@ class Photograph(NamedTuple):
 
 
 @contextmanager
+def decoding(path: str | Path, expected: str) -> Iterator[None]:
+    """Turns what goes wrong while a picture is decoded into a FormatError of one line."""
+    try:
+        # Pillow warns about odd tags before it gives up on a file; the error below says it in one line.
+        with warnings.catch_warnings(action="ignore"):
+            yield
+    except FormatError:
+        raise
+    except UnidentifiedImageError as error:
+        raise FormatError(f"{path}: expected {expected}, found something else") from error
+    except _UNREADABLE as error:
+        raise FormatError(f"{path}: expected {expected}, found {reason(error)}") from error
+
+
+@contextmanager
 def opening(path: Path, *, views: int) -> Iterator[Image.Image]:
     """An opened picture of one or two views, not yet decoded, whose size and kind can be worked with.
 
@@ -52,7 +74,7 @@ def opening(path: Path, *, views: int) -> Iterator[Image.Image]:
         FormatError: It cannot; or whatever goes wrong while the picture is open.
     """
     most = f"at most {views * MOST_PIXELS // 1_000_000} megapixels"
-    with reading(path, _A_PICTURE):
+    with decoding(path, A_PICTURE):
         _refuse_by_name(path)
         try:
             picture = Image.open(path, formats=_KINDS)
@@ -71,21 +93,21 @@ def _refuse_by_name(path: Path) -> None:
     ending = path.suffix.lower()
     if ending in _RAW_ENDINGS:
         raise FormatError(
-            f"{path}: expected {_A_PICTURE}, found a camera's raw file; develop it to one of these first"
+            f"{path}: expected {A_PICTURE}, found a camera's raw file; develop it to one of these first"
         )
     with path.open("rb") as file:
         head = file.read(64)
     brands = {head[start : start + 4] for start in (8, *range(16, 64, 4))} if head[4:8] == b"ftyp" else set()
     if brands & _AVIF_BRANDS:
         if not features.check("avif"):
-            raise FormatError(f"{path}: expected {_A_PICTURE}, found AVIF, which this Pillow does not read")
+            raise FormatError(f"{path}: expected {A_PICTURE}, found AVIF, which this Pillow does not read")
     elif brands & _HEIF_BRANDS:
         raise FormatError(
-            f"{path}: expected {_A_PICTURE}, found HEIC, such as a spatial photograph, which is not read; "
+            f"{path}: expected {A_PICTURE}, found HEIC, such as a spatial photograph, which is not read; "
             "export it as two JPEG files, or as one with both views side by side"
         )
     elif brands or ending in _VIDEO_ENDINGS:
-        raise FormatError(f"{path}: expected {_A_PICTURE}, found a video; 'stereoweave video' takes those")
+        raise FormatError(f"{path}: expected {A_PICTURE}, found a video; 'stereoweave video' takes those")
 
 
 def _refuse_by_content(path: Path, picture: Any) -> None:
@@ -119,6 +141,19 @@ def decode(picture: Image.Image) -> Photograph:
         return Photograph(Image.fromarray(rgb(picture)), tags, None)
     image, note = _in_srgb(picture)
     return Photograph(image, tags, note)
+
+
+def rgb(picture: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
+    """The pixels of an opened picture in RGB: grey is repeated, alpha dropped, 16 bits become 8."""
+    if not picture.mode.startswith(("I", "F")):
+        # A copy: Pillow lends its pixels read-only, for which Numba compiles anew and PyTorch warns.
+        return np.array(picture.convert("RGB"))
+    values = np.asarray(picture)
+    if picture.mode == "F" or values.min() < 0 or values.max() > 65535:
+        raise ValueError(f"more than 16 bits a channel or values below 0, mode {picture.mode}")
+    # The upper byte, as Pillow reduces colour pictures of 16 bits; a file of 32 bits may hold 8 of them.
+    bits = 8 if picture.mode != "I" or values.max() > 255 else 0
+    return np.repeat((values >> bits).astype(np.uint8)[..., None], 3, axis=2)
 
 
 def _in_srgb(picture: Image.Image) -> tuple[Image.Image, str | None]:
