@@ -43,4 +43,7 @@ def reason(error: Exception) -> str:
             return "a file"
         case OSError(strerror=str(text)):
             return text.lower()
-    return f"one that cannot be read ({error})"
+        case MemoryError():
+            return "one that takes more memory than there is"
+    words = " ".join(str(error).split()) or type(error).__name__
+    return f"one that cannot be read ({words})"
