@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import struct
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from fastapi import UploadFile
 from picture_examples import SRGB, png_of, profile
 from PIL import Image
 
+import stereoweave
 from stereoweave import boards, page_kept
 from stereoweave.cli import main
 from stereoweave.data.readers import list_scenes
@@ -135,6 +137,13 @@ def test_every_way_refuses_a_damaged_picture_with_the_same_words(tmp_path, pictu
         "expected a picture (PNG, JPEG, TIFF or the like), found one that cannot be read (image file is"
     )
     assert {way: message for way, message in messages.items() if expected not in message} == {}
+
+
+def test_no_other_module_opens_pictures():
+    package = Path(stereoweave.__file__).parent
+    opening = re.compile(r"\b(Image\.open|cv2\.imread|imageio\.\w+|ImageOps\.exif_transpose)\(")
+    found = [path.name for path in package.rglob("*.py") if opening.search(path.read_text(encoding="utf-8"))]
+    assert found == ["picture_files.py"]
 
 
 # Kinds
