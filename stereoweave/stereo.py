@@ -13,6 +13,9 @@ from jaxtyping import Bool, Float, Real, UInt8
 
 from stereoweave.errors import StereoweaveError
 
+# What OpenCV's remapping takes: it counts pixels in 16 bits.
+LONGEST_SIDE_PX = 32_766
+
 # The two share the operators that are used here, but no base class; PyTorch is not imported outside learn.
 ArrayOrTensor = TypeVar("ArrayOrTensor", bound=Any)
 
@@ -86,6 +89,11 @@ class StereoPair:
             if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
                 raise StereoweaveError(
                     f"{side} image: expected uint8 RGB [H, W, 3], got {image.dtype} {list(image.shape)}"
+                )
+            if max(image.shape) > LONGEST_SIDE_PX:
+                raise StereoweaveError(
+                    f"{side} image: expected at most {LONGEST_SIDE_PX} pixels a side, got {_size(image)}; "
+                    "scale it down or cut it"
                 )
         if self.left.shape != self.right.shape:
             raise StereoweaveError(

@@ -94,6 +94,22 @@ def test_pairs_are_read_by_index_across_shards(folder):
     ]
 
 
+@pytest.mark.parametrize(
+    ("damage", "found"),
+    [
+        ({"left.webp": b"RIFF"}, "left.webp: expected a picture"),
+        ({"disparity.png": b"%!PS-Adobe-3.0 EPSF-3.0\n"}, "disparity.png: expected a picture"),
+        ({"camera.json": b"[]"}, "found ship-000000 without or with damaged ones"),
+        ({"camera.json": b"{}"}, "steps_per_px"),
+    ],
+)
+def test_a_damaged_file_of_a_pair_is_named_though_its_checksum_is_right(tmp_path, damage, found):
+    write_shard(tmp_path, "ship", 0, [packed(pair(1), {}) | damage])
+    message = error_of(Shards(tmp_path).__getitem__, 0)
+    assert message.startswith(f"{tmp_path / 'ship-000000-000000.tar'}: expected the files of a pair")
+    assert found in message
+
+
 @pytest.mark.parametrize("index", [-1, 10])
 def test_an_index_outside_of_the_set_is_an_index_error(folder, index):
     with pytest.raises(IndexError):

@@ -9,6 +9,12 @@ from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 CAMERA = {"focal_px": 1000.0, "baseline_m": 0.1, "cx_px": 320.0, "cy_px": 240.0}
 
 
+def test_a_pair_longer_than_the_limit_is_refused_in_one_line():
+    image = np.zeros((32_767, 32, 3), np.uint8)
+    with pytest.raises(StereoweaveError, match="at most 32766 pixels a side, got 32x32767"):
+        StereoPair(left=image, right=image)
+
+
 def test_depth_is_focal_length_times_baseline_over_disparity_and_doffs():
     camera = StereoCamera(**CAMERA, doffs_px=5.0)
     depth_m = camera.depth_m(np.array([[45.0, 15.0, -3.0]], np.float32))

@@ -24,6 +24,7 @@ from jaxtyping import Bool, Float, Shaped, UInt8
 from PIL import Image
 
 from stereoweave.errors import StereoweaveError
+from stereoweave.picture_files import unpacked_values
 from stereoweave.stereo import Sample, StereoCamera
 
 _UNKNOWN = 65535
@@ -67,16 +68,16 @@ def unpacked(files: Mapping[str, bytes]) -> Sample:
     facts = json.loads(files["camera.json"])
 
     def disparity_px(name: str) -> Float[np.ndarray, "h w"]:
-        steps = _decoded(files[f"{name}.png"])
+        steps = _decoded(files, f"{name}.png")
         return np.where(steps == _UNKNOWN, np.nan, steps / facts["steps_per_px"]).astype(np.float32)
 
     return Sample(
-        left=_decoded(files["left.webp"]),
-        right=_decoded(files["right.webp"]),
+        left=_decoded(files, "left.webp"),
+        right=_decoded(files, "right.webp"),
         disparity_px=disparity_px("disparity"),
         right_disparity_px=disparity_px("right_disparity"),
-        occluded=_decoded(files["occluded.png"]),
-        right_occluded=_decoded(files["right_occluded.png"]),
+        occluded=_decoded(files, "occluded.png"),
+        right_occluded=_decoded(files, "right_occluded.png"),
         camera=StereoCamera(**facts["camera"]) if facts["camera"] else None,
     )
 
@@ -84,7 +85,7 @@ def unpacked(files: Mapping[str, bytes]) -> Sample:
 def unpacked_views(files: Mapping[str, bytes]) -> dict[float, UInt8[np.ndarray, "h w 3"]]:
     """The further pictures among files that `packed` made, by their position."""
     names = sorted(name for name in files if name.startswith("view_"))
-    return {float(name[len("view_") : -len(".webp")]): _decoded(files[name]) for name in names}
+    return {float(name[len("view_") : -len(".webp")]): _decoded(files, name) for name in names}
 
 
 def _steps_per_px(disparities_px: Iterable[Float[np.ndarray, "h w"]]) -> int:
@@ -112,6 +113,5 @@ def _encoded(image: UInt8[np.ndarray, "h w 3"] | Bool[np.ndarray, "h w"], kind: 
     return stream.getvalue()
 
 
-def _decoded(content: bytes) -> Shaped[np.ndarray, "h w *channels"]:
-    with Image.open(io.BytesIO(content)) as picture:
-        return np.array(picture)
+def _decoded(files: Mapping[str, bytes], name: str) -> Shaped[np.ndarray, "h w *channels"]:
+    return unpacked_values(name, files[name])
