@@ -101,6 +101,33 @@ def test_a_file_that_is_no_checkpoint_is_named_in_one_line(tmp_path, trained, wr
     assert "\n" not in str(caught.value)
 
 
+class Program:
+    """What calls a program when it is unpickled."""
+
+    def __init__(self, words):
+        self.words = words
+
+    def __reduce__(self):
+        return subprocess.check_call, (self.words,)
+
+
+def test_a_checkpoint_that_holds_a_program_is_refused_in_one_line_and_the_program_is_not_run(
+    tmp_path, trained
+):
+    path, made = tmp_path / "no.pt", tmp_path / "made"
+    values = {
+        **vars(trained),
+        "recipe": asdict(RECIPE),
+        "optimiser": {"state": Program(["touch", str(made)])},
+    }
+    torch.save(values, path)
+    with pytest.raises(FormatError) as caught:
+        checkpoint.load(path)
+    assert str(caught.value).startswith(f"{path}: expected a checkpoint")
+    assert "\n" not in str(caught.value)
+    assert not made.exists()
+
+
 def test_a_checkpoint_that_is_not_there_is_named_with_what_makes_one(tmp_path):
     with pytest.raises(FormatError, match=r"nowhere\.pt: no such checkpoint; `stereoweave train`"):
         checkpoint.load(tmp_path / "nowhere.pt")
