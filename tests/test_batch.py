@@ -122,6 +122,18 @@ def test_a_bad_pair_is_told_and_the_others_are_as_they_are_alone_and_the_next_ru
     ]
 
 
+def test_a_pair_that_fails_when_it_is_made_again_is_finished_no_more(tmp_path):
+    folder, out = write_pairs(tmp_path / "pairs", 2), tmp_path / "out"
+    assert batch(folder, out, processes=1)[0].done == 2
+    first, second = pairs_in(folder).jobs
+    second.pictures[1].write_bytes(b"no picture")
+    tally, _ = batch(folder, out, processes=1)
+    assert [name for name, _ in tally.failed] == ["01"]
+    assert list(made_at_ns(out)) == ["00"]
+    batch(folder, out, jobs=[first], processes=1)
+    assert list(table(out)) == ["00"]
+
+
 def test_a_killed_batch_goes_on_and_so_does_an_interrupted_one_without_a_pair_twice(tmp_path, capsys):
     folder, out = write_pairs(tmp_path / "pairs", 24, (256, 192)), tmp_path / "out"
     before = {}
