@@ -298,6 +298,12 @@ def test_a_disparity_outside_of_the_range_that_is_given_is_brought_to_its_end_an
         assert (found.confidence[inner] == 0).mean() > 0.98
 
 
+def test_a_range_beyond_the_pictures_width_is_as_good_as_the_width(matcher, rng):
+    pair = flat(rng, 12, (64, 160))
+    same(match(matcher, pair, range_px=(-9000, 20)), match(matcher, pair, range_px=(-160, 20)))
+    same(match(matcher, pair, range_px=(0, 9000)), match(matcher, pair, range_px=(0, 160)))
+
+
 @pytest.mark.parametrize("range_px", [(10, 10), (50, 0), (0, float("nan")), (float("-inf"), 10)])
 def test_a_range_that_is_none_is_refused_in_one_line(matcher, examples, range_px):
     with pytest.raises(StereoweaveError, match="range_px: expected the least and the greatest") as caught:
