@@ -148,6 +148,14 @@ def test_the_commit_of_code_installed_in_somebody_elses_repository_is_unknown(tm
     assert re.fullmatch(r"[0-9a-f]{7,40}", checkpoint.code_commit())
 
 
+def test_a_run_starts_with_the_weights_of_its_seed_and_nothing_behind_it():
+    start, again, other = (checkpoint.start_of(replace(RECIPE, seed=seed), "0123abc") for seed in (1, 1, 2))
+    assert (start.step, start.hours, start.origin) == (0, 0, ())
+    assert_same(start.weights, again.weights)
+    assert torch.equal(start.random_state, again.random_state)
+    assert any(not torch.equal(value, other.weights[name]) for name, value in start.weights.items())
+
+
 def gone_on(start, value):
     """A run from `start` of a network of one weight."""
     return replace(start, averaged={"weight": torch.tensor([value])}, origin=start.as_origin(), hours=3.0)
