@@ -79,9 +79,11 @@ def places(path: Path) -> dict[Place, list[tuple[str, Operator, int]]]:
     nodes = list(ast_nodes(get_ast(source)))
     found = defaultdict(list)
     for name, operator in operators().items():
-        starts = (start for node in nodes for start, _ in operator.mutation_positions(node))
-        for occurrence, place in enumerate(starts):
-            if not any(first <= place < last for first, last in left_out):
+        starts = ((node, start) for node in nodes for start, _ in operator.mutation_positions(node))
+        for occurrence, (node, place) in enumerate(starts):
+            # The `*` before parameters that have names looks like a product.
+            is_mark = node.parent is not None and node.parent.type == "parameters"
+            if not is_mark and not any(first <= place < last for first, last in left_out):
                 found[place].append((name, operator, occurrence))
     return dict(found)
 

@@ -93,13 +93,13 @@ def test_every_operator_makes_what_its_examples_say(operator):
 def test_annotations_text_and_joined_paths_are_not_changed(tmp_path):
     source = tmp_path / "source.py"
     source.write_text(
-        "def f(x: int | None = 1) -> list[1]:\n"
+        "def f(*, x: int | None = 1) -> list[1]:\n"
         "    y: A[2] = x * 3\n"
         "    if y < 4:\n"
         "        raise ValueError(f'{y + 5}: expected {x - 6}')\n"
         "    return folder / 'name' / f'{7}'\n"
     )
-    assert sorted(places(source)) == [(1, 22), (2, 16), (2, 18), (3, 7), (3, 9), (3, 11)]
+    assert sorted(places(source)) == [(1, 25), (2, 16), (2, 18), (3, 7), (3, 9), (3, 11)]
 
 
 def test_a_lower_count_is_the_beginning_of_a_higher_one_and_another_seed_another_draw(repository):
