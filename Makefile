@@ -1,6 +1,7 @@
 # make demo    depth, a new view and a report, of the example or of LEFT=… RIGHT=… (needs Python 3.11 or newer)
 # make test    the tests
 # make check   style, types, floors of imports, and the tests
+# make mutate which of COUNT=400 changes of the sources, drawn by SEED=1, the tests notice; a stopped run goes on
 # make bench   accuracy and time on the real pairs in STEREOWEAVE_TESTDATA
 # make audit   licences of all that is installed, and known vulnerabilities where their service is reached
 # make release the wheel, and the lists of what it needs (SBOM), in dist
@@ -9,6 +10,8 @@
 
 PYTHON ?= python3
 STEREOWEAVE_TESTDATA ?= ../shared
+COUNT ?= 400
+SEED ?= 1
 
 # What users install: no PyTorch.
 CORE = .venv-core
@@ -32,7 +35,7 @@ RENDER = $(DEV)/bin/stereoweave synth make refinery --pairs 1 --seed 4000 --layo
 RENDERED = $(foreach side,left right,runs/gallery/$(1)/$(side)/refinery/000000.png)
 VIEW = $(DEV)/bin/stereoweave view
 
-.PHONY: demo test check bench audit release gallery
+.PHONY: demo test check mutate bench audit release gallery
 
 demo: $(CORE)/installed
 	$(CORE)/bin/stereoweave depth $(PAIR) $(CALIBRATION) --out demo-out
@@ -48,6 +51,9 @@ check: $(DEV)/installed
 	$(DEV)/bin/mypy
 	$(DEV)/bin/lint-imports
 	$(DEV)/bin/pytest
+
+mutate: $(DEV)/installed
+	$(DEV)/bin/python -m mutate --count $(COUNT) --seed $(SEED)
 
 bench: $(CORE)/installed
 	$(CORE)/bin/stereoweave bench pairs $(STEREOWEAVE_TESTDATA)/stereo/pairs \
@@ -89,7 +95,7 @@ $(CORE)/installed: pyproject.toml constraints.txt
 
 $(DEV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(DEV)
-	$(DEV)/bin/python -m pip install --constraint constraints.txt --editable '.[synth,train,video,app,cluster,dev]'
+	$(DEV)/bin/python -m pip install --constraint constraints.txt --editable '.[synth,train,video,app,cluster,mutate,dev]'
 	touch $@
 
 $(AUDIT)/installed: constraints.txt
