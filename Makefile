@@ -1,12 +1,15 @@
 # make demo    depth, a new view and a report, of the example or of LEFT=… RIGHT=… (needs Python 3.11 or newer)
 # make test    the tests
 # make check   style, types, floors of imports, and the tests
+# make fuzz    damaged files and requests for SECONDS=60, each answered by our own errors or kept in tests/corpus
 # make bench   accuracy and time on the real pairs in STEREOWEAVE_TESTDATA
 # make gallery the README's pictures, docs/gallery, from a pair that is rendered for them
 # Each first sets up the virtual environment that it needs, once.
 
 PYTHON ?= python3
 STEREOWEAVE_TESTDATA ?= ../shared
+# Of make fuzz; without a SEED each run draws one.
+SECONDS ?= 60
 
 # What users install: no PyTorch.
 CORE = .venv-core
@@ -27,7 +30,7 @@ RENDER = $(DEV)/bin/stereoweave synth make refinery --pairs 1 --seed 4000 --layo
 RENDERED = $(foreach side,left right,runs/gallery/$(1)/$(side)/refinery/000000.png)
 VIEW = $(DEV)/bin/stereoweave view
 
-.PHONY: demo test check bench gallery
+.PHONY: demo test check fuzz bench gallery
 
 demo: $(CORE)/installed
 	$(CORE)/bin/stereoweave depth $(PAIR) $(CALIBRATION) --out demo-out
@@ -43,6 +46,9 @@ check: $(DEV)/installed
 	$(DEV)/bin/mypy
 	$(DEV)/bin/lint-imports
 	$(DEV)/bin/pytest
+
+fuzz: $(DEV)/installed
+	$(DEV)/bin/python -m fuzz --seconds $(SECONDS) $(if $(SEED),--seed $(SEED))
 
 bench: $(CORE)/installed
 	$(CORE)/bin/stereoweave bench pairs $(STEREOWEAVE_TESTDATA)/stereo/pairs \
