@@ -49,9 +49,10 @@ def _files_in(content: bytes) -> dict[str, bytes]:
         tarfile.open(fileobj=io.BytesIO(content), encoding="latin-1") as tar,
     ):
         for member in tar:
-            opened = tar.extractfile(member)
+            if member.size < 0:  # the same head would come again without end
+                break
             if member.name.isprintable():  # halves of characters would not be written again
-                files[member.name] = opened.read() if opened else b""
+                files[member.name] = content[member.offset_data :][: member.size]
     return files
 
 
