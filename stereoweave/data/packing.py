@@ -63,28 +63,48 @@ def packed(sample: Sample, views: Mapping[float, UInt8[np.ndarray, "h w 3"]]) ->
 
 
 def unpacked(files: Mapping[str, bytes]) -> Sample:
-    """The sample of files that `packed` made."""
-    facts = json.loads(files["camera.json"])
+    """The sample of files that `packed` made; a ValueError for any others."""
+    steps_per_px, camera = _facts(_file(files, "camera.json"))
+    left = _decoded(files, "left.webp", "RGB")
+
+    def of_its_size(name: str, mode: str) -> Shaped[np.ndarray, "h w *channels"]:
+        values = _decoded(files, name, mode)
+        if values.shape[:2] != left.shape[:2]:
+            raise ValueError(f"{name} of {values.shape[1]}x{values.shape[0]} px")
+        return values
 
     def disparity_px(name: str) -> Float[np.ndarray, "h w"]:
-        steps = _decoded(files[f"{name}.png"])
-        return np.where(steps == _UNKNOWN, np.nan, steps / facts["steps_per_px"]).astype(np.float32)
+        steps = of_its_size(name, "I;16")
+        return np.where(steps == _UNKNOWN, np.nan, steps / steps_per_px).astype(np.float32)
 
     return Sample(
-        left=_decoded(files["left.webp"]),
-        right=_decoded(files["right.webp"]),
-        disparity_px=disparity_px("disparity"),
-        right_disparity_px=disparity_px("right_disparity"),
-        occluded=_decoded(files["occluded.png"]),
-        right_occluded=_decoded(files["right_occluded.png"]),
-        camera=StereoCamera(**facts["camera"]) if facts["camera"] else None,
+        left=left,
+        right=of_its_size("right.webp", "RGB"),
+        disparity_px=disparity_px("disparity.png"),
+        right_disparity_px=disparity_px("right_disparity.png"),
+        occluded=of_its_size("occluded.png", "1"),
+        right_occluded=of_its_size("right_occluded.png", "1"),
+        camera=camera,
     )
 
 
 def unpacked_views(files: Mapping[str, bytes]) -> dict[float, UInt8[np.ndarray, "h w 3"]]:
-    """The further pictures among files that `packed` made, by their position."""
+    """The further pictures among files that `packed` made, by their position; a ValueError for any others."""
     names = sorted(name for name in files if name.startswith("view_"))
-    return {float(name[len("view_") : -len(".webp")]): _decoded(files[name]) for name in names}
+    return {float(name[len("view_") : -len(".webp")]): _decoded(files, name, "RGB") for name in names}
+
+
+def _facts(content: bytes) -> tuple[int, StereoCamera | None]:
+    """The steps per pixel and the camera that camera.json says."""
+    try:
+        match json.loads(content):
+            case {"steps_per_px": int(steps), "camera": None} if 0 < steps <= _MOST_STEPS_PER_PX:
+                return steps, None
+            case {"steps_per_px": int(steps), "camera": dict(camera)} if 0 < steps <= _MOST_STEPS_PER_PX:
+                return steps, StereoCamera(**{name: float(value) for name, value in camera.items()})
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
+        raise ValueError(f"camera.json that cannot be used: {error}") from error
+    raise ValueError("camera.json without steps_per_px or camera")
 
 
 def _steps_per_px(disparities_px: Iterable[Float[np.ndarray, "h w"]]) -> int:
@@ -112,6 +132,19 @@ def _encoded(image: UInt8[np.ndarray, "h w 3"] | Bool[np.ndarray, "h w"], kind: 
     return stream.getvalue()
 
 
-def _decoded(content: bytes) -> Shaped[np.ndarray, "h w *channels"]:
-    with Image.open(io.BytesIO(content)) as picture:
-        return np.array(picture)
+def _file(files: Mapping[str, bytes], name: str) -> bytes:
+    if name not in files:
+        raise ValueError(f"no {name}")
+    return files[name]
+
+
+def _decoded(files: Mapping[str, bytes], name: str, mode: str) -> Shaped[np.ndarray, "h w *channels"]:
+    """A picture among the files, which must be of that mode."""
+    content = _file(files, name)
+    try:
+        with Image.open(io.BytesIO(content), formats=("WEBP", "PNG")) as picture:
+            if picture.mode != mode:
+                raise ValueError(f"mode {picture.mode}")
+            return np.array(picture)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise ValueError(f"{name} that cannot be used: {error}") from error

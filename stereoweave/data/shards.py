@@ -114,7 +114,9 @@ class Shards:
         self._contents: dict[Path, dict[str, dict[str, tuple[int, int]]]] = {}
 
     def __getitem__(self, index: int) -> Sample:
-        return unpacked(self.files(index))
+        files = self.files(index)
+        with reading(self._shard(index).path, f"the pair {self.name(index)}"):
+            return unpacked(files)
 
     def name(self, index: int) -> str:
         """What the names of the pair's files begin with."""
@@ -122,7 +124,9 @@ class Shards:
 
     def views(self, index: int) -> dict[float, UInt8[np.ndarray, "h w 3"]]:
         """The further pictures of a pair, by their position between the cameras."""
-        return unpacked_views(self.files(index))
+        files = self.files(index)
+        with reading(self._shard(index).path, f"the pictures of {self.name(index)}"):
+            return unpacked_views(files)
 
     def files(self, index: int) -> dict[str, bytes]:
         """The files of a pair by the ends of their names, checked; FormatError where one is damaged."""
@@ -130,8 +134,8 @@ class Shards:
         with reading(path, "a shard"), path.open("rb") as stream:
             places = self._places(path).get(name, {})
             files = {f"{name}.{end}": _read_at(stream, *place) for end, place in places.items()}
-        sums = files.pop(f"{name}.{_SUMS}", f"  {name}.{_SUMS}".encode())
-        check_sums(files, sums, path, _DELETE)
+            sums = files.pop(f"{name}.{_SUMS}", f"  {name}.{_SUMS}".encode())
+            check_sums(files, sums, path, _DELETE)
         return {end.removeprefix(f"{name}."): content for end, content in files.items()}
 
     def order(self, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
@@ -180,6 +184,8 @@ def _contents(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
     try:
         with tarfile.open(path, "r:") as tar:
             for member in tar:
+                if member.size < 0:  # the same head would come again without end
+                    raise tarfile.ReadError(f"a size of {member.size} bytes")
                 name, _, end = member.name.partition(".")
                 contents[name][end] = member.offset_data, member.size
     except tarfile.TarError as error:
