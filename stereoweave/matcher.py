@@ -96,10 +96,10 @@ class Matcher:
         try:
             self._outputs = self._checked_outputs()
             self.name, self.multiple_of, self.max_disparity_px = self._checked_properties()
+            # A side that may be any has a name; a file need not say how many sides there are.
+            shape: list[Any] = [*self._session.get_inputs()[0].shape, *["any"] * 4]
         except UnicodeDecodeError as error:
             raise MatcherError(f"{self._path}: expected metadata in UTF-8, found {error}") from error
-        # A side that may be any has a name; a file need not say how many sides there are.
-        shape: list[Any] = [*self._session.get_inputs()[0].shape, *["any"] * 4]
         batch, _, height, width = shape[:4]
         self._takes_batches = not isinstance(batch, int) and PROVIDERS[provider].batches
         is_fixed = isinstance(height, int) and isinstance(width, int)
