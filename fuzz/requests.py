@@ -51,7 +51,7 @@ def _parsed(content: bytes) -> list[Any]:
     """What a server reads of it: the head, parts of the body, its end where it is whole."""
     connection, events = h11.Connection(h11.SERVER), []
     try:
-        connection.receive_data(content)
+        connection.receive_data(content or b"\r\n")  # no bytes would be the end of the connection
         while (event := connection.next_event()) not in (h11.NEED_DATA, h11.PAUSED):
             events.append(event)
     except h11.RemoteProtocolError:

@@ -126,6 +126,7 @@ def test_a_request_that_ends_in_500_is_a_finding():
     with pytest.raises(ServerError):
         send(fails, request_bytes("POST", "/500", data={"x": "1"}))
     assert send(fails, b"no request\r\n\r\n") is None
+    assert send(fails, b"") is None
 
 
 @pytest.mark.parametrize("path", FOUND, ids=lambda path: f"{path.parent.name}/{path.name}")
