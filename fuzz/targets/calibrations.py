@@ -59,6 +59,10 @@ T_03: -0.5 0 0
 S_rect_03: 70 46
 P_rect_03: 70 0 36 -35 0 70 24 0 0 0 1 0
 """
+# Each list is nine of the one before it.
+_LAUGHS = b"\nx0: &x0 [1]\n" + b"\n".join(
+    b"x%d: &x%d [%s]" % (level, level, b", ".join([b"*x%d" % (level - 1)] * 9)) for level in range(1, 10)
+)
 
 
 def _starts() -> dict[str, bytes]:
@@ -109,6 +113,7 @@ TARGET = Target(
     read=_read,
     tokens=(
         *b"*a [ { <a> </a> &amp; <!-- [*a,*a] %YAML:1.0 data:[ type_id= \xff\xfe \0".split(),
+        *(b"[" * 20_000, b'{"a":' * 20_000, b"<a>" * 30_000, b"\nM1: &a [*a, *a]\n", _LAUGHS),
         *(b"&a ", b"&a [*a, *a]", b"<<: *a", b"!!opencv-matrix", b"!!python/object:os.system", b"!!binary "),
         *(b"- ", b"? ", b"<!DOCTYPE a>", b'{"a":', b'"', b"\n", b"  ", b"---\n", b"dt: d\n", b"rows: "),
         *(b"M1: ", b"cam0: ", b"P3: ", b"distortion_model: fisheye\n", b"translation_unit: cm\n"),

@@ -50,6 +50,18 @@ TARGET = Target(
     tokens=(
         *rb'[ ] [[ ]] { } a. inf nan true " """ '.split(),
         *rb"' ''' \u \UFFFFFFFF 1979-05-27T07:32:00Z 0x 0b1 1_0 #".split(),
-        *(b"= [", b"= {a = ", b"\n", b"\r", b"\0", b"seed = ", b"mix = ", b"pair_size = ", b"[mix.a]\n"),
+        *(
+            b"\na = " + b"[" * 20_000,
+            b"\na" + b".a" * 20_000,
+            b"= [",
+            b"= {a = ",
+            b"\n",
+            b"\r",
+            b"\0",
+            b"seed = ",
+            b"mix = ",
+            b"pair_size = ",
+            b"[mix.a]\n",
+        ),
     ),
 )
