@@ -1,7 +1,8 @@
 # make demo    depth, a new view and a report, of the example or of LEFT=… RIGHT=… (needs Python 3.11 or newer)
 # make test    the tests
 # make check   style, types, floors of imports, and the tests
-# make mutate which of COUNT=400 changes of the sources, drawn by SEED=1, the tests notice; a stopped run goes on
+# make mutate which of COUNT=400 changes of the sources, drawn by SEED, the tests notice; a stopped run goes on
+# make fuzz    damaged files and requests for SECONDS=60, each answered by our own errors or kept in tests/corpus
 # make bench   accuracy and time on the real pairs in STEREOWEAVE_TESTDATA
 # make audit   licences of all that is installed, and known vulnerabilities where their service is reached
 # make release the wheel, and the lists of what it needs (SBOM), in dist
@@ -10,8 +11,8 @@
 
 PYTHON ?= python3
 STEREOWEAVE_TESTDATA ?= ../shared
+SECONDS ?= 60
 COUNT ?= 400
-SEED ?= 1
 
 # What users install: no PyTorch.
 CORE = .venv-core
@@ -35,7 +36,7 @@ RENDER = $(DEV)/bin/stereoweave synth make refinery --pairs 1 --seed 4000 --layo
 RENDERED = $(foreach side,left right,runs/gallery/$(1)/$(side)/refinery/000000.png)
 VIEW = $(DEV)/bin/stereoweave view
 
-.PHONY: demo test check mutate bench audit release gallery
+.PHONY: demo test check fuzz mutate bench audit release gallery
 
 demo: $(CORE)/installed
 	$(CORE)/bin/stereoweave depth $(PAIR) $(CALIBRATION) --out demo-out
@@ -53,7 +54,10 @@ check: $(DEV)/installed
 	$(DEV)/bin/pytest
 
 mutate: $(DEV)/installed
-	$(DEV)/bin/python -m mutate --count $(COUNT) --seed $(SEED)
+	$(DEV)/bin/python -m mutate --count $(COUNT) $(if $(SEED),--seed $(SEED))
+
+fuzz: $(DEV)/installed
+	$(DEV)/bin/python -m fuzz --seconds $(SECONDS) $(if $(SEED),--seed $(SEED))
 
 bench: $(CORE)/installed
 	$(CORE)/bin/stereoweave bench pairs $(STEREOWEAVE_TESTDATA)/stereo/pairs \

@@ -32,6 +32,8 @@ _KEPT_PIXEL_PAIRS = 1280 * 1280 * 960
 _STRIP_OVERLAP_PX = 64
 # A nearer surface this much in front of a pixel's match hides it; less is the two views' disagreement.
 _OCCLUSION_STEP_PX = 1.0
+# Pictures are padded up to it.
+_MOST_MULTIPLE_OF = 1024
 # Within such a square a picture whose means over 9x9 px vary by no more than this says nothing about
 # disparity: noise of 3 grey levels alone does so much. Of painted pairs it takes 1 pixel in 5,000, and of
 # these 1 in 3 is right.
@@ -91,10 +93,13 @@ class Matcher:
         self.magnification = mode.magnification if mode else 1.0
         self._refines = mode is not None and mode.refined
         self._session = open_session(self._path, provider, thread_count(threads))
-        self._outputs = self._checked_outputs()
-        self.name, self.multiple_of, self.max_disparity_px = self._checked_properties()
-        # A side that may be any has a name; a file need not say how many sides there are.
-        shape: list[Any] = [*self._session.get_inputs()[0].shape, *["any"] * 4]
+        try:
+            self._outputs = self._checked_outputs()
+            self.name, self.multiple_of, self.max_disparity_px = self._checked_properties()
+            # A side that may be any has a name; a file need not say how many sides there are.
+            shape: list[Any] = [*self._session.get_inputs()[0].shape, *["any"] * 4]
+        except UnicodeDecodeError as error:
+            raise MatcherError(f"{self._path}: expected metadata in UTF-8, found {error}") from error
         batch, _, height, width = shape[:4]
         self._takes_batches = not isinstance(batch, int) and PROVIDERS[provider].batches
         is_fixed = isinstance(height, int) and isinstance(width, int)
@@ -305,7 +310,7 @@ class Matcher:
         keys = [f"stereoweave.{key}" for key in ("name", "multiple_of", "max_disparity_px")]
         try:
             name, multiple_of, max_disparity_px = (metadata[key] for key in keys)
-            if int(multiple_of) < 1 or not 0 < float(max_disparity_px) < math.inf:
+            if not 1 <= int(multiple_of) <= _MOST_MULTIPLE_OF or not 0 < float(max_disparity_px) < math.inf:
                 raise ValueError
             return name, int(multiple_of), float(max_disparity_px)
         except KeyError as missing:

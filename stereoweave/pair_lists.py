@@ -210,7 +210,9 @@ def pairs_in_list(path: Path) -> list[Job]:
     with reading(path, "a list of pairs"):
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     rows = {
-        number: _columns(line) for number, line in enumerate(lines, 1) if line.strip()[:1] not in ("", "#")
+        number: _columns(f"{path}, line {number}", line)
+        for number, line in enumerate(lines, 1)
+        if line.strip()[:1] not in ("", "#")
     }
     for number, row in rows.items():
         if not 1 <= len(row) <= 3 or not row[0]:
@@ -304,9 +306,12 @@ def _matches(pattern: str) -> list[Path]:
     return [path for path in map(Path, found) if path.is_file()]
 
 
-def _columns(line: str) -> list[str]:
+def _columns(where: str, line: str) -> list[str]:
     delimiter = next((character for character in "\t," if character in line), " ")
-    [row] = csv.reader([line.strip()], delimiter=delimiter, skipinitialspace=delimiter == ",")
+    try:
+        [row] = csv.reader([line.strip()], delimiter=delimiter, skipinitialspace=delimiter == ",")
+    except csv.Error as error:
+        raise FormatError(f"{where}: expected left, right and perhaps a name, found {error}") from error
     return [column.strip() for column in row if column or delimiter != " "]
 
 
@@ -319,8 +324,10 @@ def _jobs(pictures: Iterable[tuple[Path, ...]], root: Path, names: Iterable[str]
         first = Path(os.path.abspath(paths[0]))  # noqa: PTH100
         below = first.relative_to(above if first.is_relative_to(above) else first.anchor).as_posix()
         name = _safe(given) if given else _name(below, len(paths), above.name)
-        beside = paths[0].with_name(_CALIBRATION)
-        jobs.append(Job(name, paths, beside if _brings_one(below, len(paths)) and beside.exists() else None))
+        beside = paths[0].parent / _CALIBRATION
+        # Not Path.exists, which fails where a name is too long.
+        is_own = _brings_one(below, len(paths)) and os.path.exists(beside)  # noqa: PTH110
+        jobs.append(Job(name, paths, beside if is_own else None))
     _check_names((job.name, job.pictures[0]) for job in jobs)
     return jobs
 

@@ -208,13 +208,21 @@ def test_the_order_of_the_inputs_is_free(tmp_path, rng):
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("multiple_of", "0"), ("multiple_of", "1.5")]
+    [("multiple_of", value) for value in ("0", "1.5", "1000000")]
     + [("max_disparity_px", value) for value in ("far", "nan", "inf", "-192", "0")],
 )
 def test_metadata_that_is_no_possible_number_is_refused(tmp_path, key, value):
     nodes = red_of("left", "disparity_px")
     file = matcher_file(tmp_path / "odd.onnx", nodes, ["disparity_px"], PROPERTIES | {key: value})
     with pytest.raises(sw.MatcherError, match=rf"odd\.onnx: expected .* found .*{key} '{value}'"):
+        Matcher(file)
+
+
+def test_a_matcher_whose_metadata_is_no_text_is_refused(tmp_path):
+    nodes = red_of("left", "disparity_px")
+    file = matcher_file(tmp_path / "odd.onnx", nodes, ["disparity_px"], PROPERTIES | {"name": "network"})
+    file.write_bytes(file.read_bytes().replace(b"network", b"net\xffork"))
+    with pytest.raises(sw.MatcherError, match=r"odd\.onnx: expected metadata in UTF-8"):
         Matcher(file)
 
 

@@ -239,10 +239,22 @@ def test_paths_of_a_list_are_relative_to_its_folder_and_those_elsewhere_keep_the
     assert [first.name, second.name] == [f"{stem}_a", f"{stem}_b"]
 
 
+def test_what_cannot_be_a_picture_is_noticed_only_when_it_is_read(tmp_path):
+    long = "a" * 300  # no file system has such names
+    (tmp_path / "list.txt").write_text(f"/ right.png\n{long}/left.png {long}/right.png\n")
+    assert [job.pictures for job in pairs_in_list(tmp_path / "list.txt")] == [
+        (Path("/"), tmp_path / "right.png"),
+        (tmp_path / long / "left.png", tmp_path / long / "right.png"),
+    ]
+
+
 def test_a_bad_line_is_told_by_its_number(tmp_path):
     path = tmp_path / "list.txt"
     path.write_text("a.png b.png\na b c d\n")
     with pytest.raises(StereoweaveError, match=r"list.txt, line 2: .*found 4 columns: a b c d"):
+        pairs_in_list(path)
+    path.write_text(f"a.png {'b' * 140_000}\n")
+    with pytest.raises(StereoweaveError, match=r"list.txt, line 1: expected .*field larger than"):
         pairs_in_list(path)
     path.write_text("# nothing\n")
     with pytest.raises(StereoweaveError, match="expected a pair in each line, found none"):

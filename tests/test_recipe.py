@@ -93,12 +93,30 @@ def test_the_learning_rate_without_slopes_is_constant():
 
 
 @pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("a = " + "[" * 3000, "maximum recursion depth"),
+        (f"steps = {'9' * 5000}", "integer string conversion"),
+        (f"steps = 0x{'f' * 5000}", "steps = a value too long to be written, expected a whole number"),
+        ("a" + ".a" * 50_000 + " = 1", "more than 10000 characters"),
+    ],
+)
+def test_a_recipe_made_to_do_harm_is_refused_at_once(tmp_path, text, found):
+    file = tmp_path / "hostile.toml"
+    file.write_text(text)
+    with pytest.raises(FormatError, match=f"hostile.toml: .*{found}"):
+        read_recipe(file)
+
+
+@pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"stepz": 3}, "unknown key 'stepz'; a recipe has name, model, seed, "),
         ({"steps": "many"}, "steps = 'many', expected a whole number"),
         ({"steps": 1.5}, "steps = 1.5, expected a whole number"),
         ({"steps": True}, "steps = True, expected a whole number"),
+        ({"steps": 2**63}, "steps = 9223372036854775808, expected a whole number of at most 64 bits"),
+        ({"learning_rate": 10**400}, f"learning_rate = 1{'0' * 99}..., expected a number"),
         ({"learning_rate": "high"}, "learning_rate = 'high', expected a number"),
         ({"learning_rate": False}, "learning_rate = False, expected a number"),
         ({"name": 3}, "name = 3, expected a text in quotes"),

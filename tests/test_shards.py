@@ -1,5 +1,6 @@
 import gc
 import io
+import itertools
 import json
 import pickle
 import subprocess
@@ -169,6 +170,76 @@ def test_a_shard_that_lost_its_end_is_noticed_and_named(folder):
     assert str(path) in error_of(Shards(folder).files, 7)
     path.write_bytes(b"nothing")
     assert str(path) in error_of(Shards(folder).files, 7)
+
+
+def png(values):
+    stream = io.BytesIO()
+    Image.fromarray(values).save(stream, "PNG")
+    return stream.getvalue()
+
+
+def facts(**changes):
+    camera = {"focal_px": 60.0, "baseline_m": 0.2, "cx_px": 23.5, "cy_px": 15.5, "doffs_px": 0.0}
+    return json.dumps({"steps_per_px": 1024, "camera": camera} | changes).encode()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "found"),
+    [
+        ("right.webp", None, "no right.webp"),
+        ("camera.json", None, "no camera.json"),
+        ("left.webp", b"no picture", "left.webp"),
+        ("left.webp", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 48 32\n", "left.webp"),
+        ("left.webp", png(np.zeros((32, 48), np.uint8)), "left.webp of another kind"),
+        ("disparity.png", png(np.zeros((32, 48), np.uint8)), "disparity.png of another kind"),
+        ("disparity.png", png(np.zeros((32, 47), np.uint16)), "disparity.png of 47x32"),
+        ("occluded.png", png(np.zeros((31, 48), bool)), "occluded.png of 48x31"),
+        ("camera.json", b"[" * 5000, "recursion"),
+        ("camera.json", b"[]", "camera.json"),
+        ("camera.json", facts(steps_per_px=0), "camera.json"),
+        ("camera.json", facts(steps_per_px="1"), "camera.json"),
+        ("camera.json", facts(camera=3), "camera.json"),
+        ("camera.json", facts(camera={"focal_px": 60.0}), "camera.json"),
+        ("camera.json", facts(camera={"focal_mm": 6}), "camera.json"),
+        ("camera.json", facts(camera=json.loads(facts())["camera"] | {"cx_px": "x"}), "camera.json"),
+    ],
+    ids=itertools.count(),
+)
+def test_a_pair_of_which_a_file_is_another_than_ours_is_named_with_it(tmp_path, name, content, found):
+    files = packed(pair(0), {}) | {name: content}
+    write_shard(tmp_path, "ship", 0, [{end: made for end, made in files.items() if made is not None}])
+    message = error_of(Shards(tmp_path).__getitem__, 0)
+    assert message.startswith(f"{tmp_path / 'ship-000000-000000.tar'}: expected ")
+    assert "ship-000000" in message
+    assert found in message
+
+
+def test_a_further_view_of_another_kind_is_named(tmp_path):
+    write_shard(tmp_path, "ship", 0, [packed(pair(0), {}) | {"view_0.50.webp": b"no picture"}])
+    assert "view_0.50.webp" in error_of(Shards(tmp_path).views, 0)
+
+
+def test_a_name_in_a_shard_that_is_no_text_is_refused(tmp_path):
+    write_shard(tmp_path, "ship", 0, [packed(pair(0), {})])
+    path = tmp_path / "ship-000000-000000.tar"
+    head = bytearray(path.read_bytes()[:512])
+    place = head.index(b"camera.json")
+    head[place] = 0xFF
+    head[148:156] = b" " * 8
+    head[148:156] = b"%06o\0 " % sum(head)
+    path.write_bytes(head + path.read_bytes()[512:])
+    assert str(path) in error_of(Shards(tmp_path).files, 0)
+
+
+def test_a_shard_with_a_file_of_a_negative_size_is_refused(tmp_path):
+    write_shard(tmp_path, "ship", 0, [packed(pair(0), {})])
+    path = tmp_path / "ship-000000-000000.tar"
+    head = bytearray(path.read_bytes()[:512])
+    head[124:136] = b"\xff" * 10 + b"\xfe\x00"  # -512, after which the same head comes again
+    head[148:156] = b" " * 8
+    head[148:156] = b"%06o\0 " % sum(head)
+    path.write_bytes(head + path.read_bytes()[512:])
+    assert str(path) in error_of(Shards(tmp_path).files, 0)
 
 
 def test_a_shard_that_is_missing_between_others_is_noticed(folder):

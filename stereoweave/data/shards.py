@@ -132,8 +132,8 @@ class Shards:
         with reading(path, "a shard"), path.open("rb") as stream:
             places = self._places(path).get(name, {})
             files = {f"{name}.{end}": _read_at(stream, *place) for end, place in places.items()}
-        sums = files.pop(f"{name}.{_SUMS}", f"  {name}.{_SUMS}".encode())
-        check_sums(files, sums, path, _DELETE)
+            sums = files.pop(f"{name}.{_SUMS}", f"  {name}.{_SUMS}".encode())
+            check_sums(files, sums, path, _DELETE)
         return {end.removeprefix(f"{name}."): content for end, content in files.items()}
 
     def order(self, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
@@ -192,6 +192,8 @@ def _contents(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
     try:
         with tarfile.open(path, "r:") as tar:
             for member in tar:
+                if member.size < 0:  # the same head would come again without end
+                    raise tarfile.ReadError(f"a size of {member.size} bytes")
                 name, _, end = member.name.partition(".")
                 contents[name][end] = member.offset_data, member.size
     except tarfile.TarError as error:

@@ -9,6 +9,12 @@ from typing import Any
 from stereoweave.errors import FormatError
 from stereoweave.io import read_small, reading
 
+# In characters; our longest recipe has 1,064. Python's time for a key grows with the square of its dots.
+_LONGEST = 10_000
+# In an error.
+_LONGEST_VALUE = 100
+# TOML's whole numbers; Python's may have any number of digits.
+_WHOLE_BITS = 64
 _POSITIVE = (
     "steps",
     "batch",
@@ -27,7 +33,7 @@ Weights = tuple[tuple[str, float], ...]
 Folders = tuple[tuple[str, str], ...]
 TARGETS = ("disparity", "depth")
 _KINDS: dict[object, str] = {
-    int: "a whole number",
+    int: f"a whole number of at most {_WHOLE_BITS} bits",
     float: "a number",
     str: "a text in quotes",
     bool: "true or false",
@@ -131,7 +137,10 @@ class Recipe:
 def read_recipe(path: Path) -> Recipe:
     """The recipe of a TOML file; FormatError for a key that is unknown, missing, mistyped or out of range."""
     with reading(path, "a recipe in TOML"):
-        values = tomllib.loads(read_small(path).decode())
+        text = read_small(path).decode()
+        if len(text) > _LONGEST:
+            raise ValueError(f"more than {_LONGEST} characters")
+        values = tomllib.loads(text)
     return recipe_from(values, str(path))
 
 
@@ -143,7 +152,7 @@ def recipe_from(values: dict[str, Any], source: str) -> Recipe:
     for name, value in values.items():
         if not _fits(value, known[name]):
             kind = _KINDS.get(known[name], "two whole numbers")
-            raise FormatError(f"{source}: {name} = {value!r}, expected {kind}")
+            raise FormatError(f"{source}: {name} = {_written(value)}, expected {kind}")
     needed = [field.name for field in fields(Recipe) if field.default is MISSING]
     if missing := [name for name in needed if name not in values]:
         raise FormatError(f"{source}: missing key {missing[0]!r}; a recipe needs {', '.join(needed)}")
@@ -199,16 +208,27 @@ def _check_mix(recipe: Recipe, source: str) -> None:
         )
 
 
+def _written(value: object) -> str:
+    """The value as Python writes it, or its beginning."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # of a number of more than 4,300 digits, of nested arrays
+        return "a value too long to be written"
+    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}..."
+
+
 def _fits(value: object, expected: Any) -> bool:
+    if type(value) is int:
+        return expected in (int, float) and value.bit_length() < _WHOLE_BITS
     if expected is float:
-        return isinstance(value, float | int) and not isinstance(value, bool)
+        return isinstance(value, float)
     if expected in (int, str, bool):
         return type(value) is expected
     if expected in (Weights, Folders):
         pairs = list(value.items()) if isinstance(value, dict) else value
         of = float if expected is Weights else str
         return isinstance(pairs, list | tuple) and all(_is_named(pair, of) for pair in pairs)
-    return isinstance(value, list | tuple) and len(value) == 2 and all(type(v) is int for v in value)
+    return isinstance(value, list | tuple) and len(value) == 2 and all(_fits(v, int) for v in value)
 
 
 def _is_named(pair: object, kind: type) -> bool:

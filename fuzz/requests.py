@@ -1,0 +1,102 @@
+"""A file that holds an HTTP request, sent to an ASGI application as a server would."""
+
+import asyncio
+from collections.abc import Awaitable, Callable, MutableMapping
+from typing import Any
+from urllib.parse import unquote
+
+import h11
+import httpx
+
+_Message = MutableMapping[str, Any]
+Application = Callable[
+    [_Message, Callable[[], Awaitable[_Message]], Callable[[_Message], Awaitable[None]]], Awaitable[None]
+]
+
+
+class ServerError(Exception):
+    """A response by which a server says that the fault is its own."""
+
+
+def request_bytes(method: str, path: str, **form: Any) -> bytes:
+    """A request as it goes over the wire; `form` is as httpx takes it."""
+    request = httpx.Request(method, f"http://127.0.0.1{path}", **form)
+    body = request.read()
+    headers = [name + b": " + value for name, value in request.headers.raw]
+    head = [f"{method} {path} HTTP/1.1".encode(), *headers]
+    return b"\r\n".join(head) + b"\r\n\r\n" + body
+
+
+def repair_length(content: bytes) -> bytes:
+    """The request with a Content-Length that is its body's."""
+    head, blank, body = content.partition(b"\r\n\r\n")
+    lines = [line for line in head.split(b"\r\n") if not line.lower().startswith(b"content-length")]
+    return b"\r\n".join([*lines, b"Content-Length: %d" % len(body)]) + blank + body
+
+
+def send(application: Application, content: bytes) -> int | None:
+    """The status of the response to a request; None where it is no request, and no server passes it on.
+
+    Raises:
+        ServerError: The status is 500.
+        Exception: Whatever the application raises.
+    """
+    events = _parsed(content)
+    if not events or not isinstance(events[0], h11.Request):
+        return None
+    return asyncio.run(_exchange(application, events[0], events[1:]))
+
+
+def _parsed(content: bytes) -> list[Any]:
+    """What a server reads of it: the head, parts of the body, its end where it is whole."""
+    connection, events = h11.Connection(h11.SERVER), []
+    try:
+        connection.receive_data(content or b"\r\n")  # no bytes would be the end of the connection
+        while (event := connection.next_event()) not in (h11.NEED_DATA, h11.PAUSED):
+            events.append(event)
+    except h11.RemoteProtocolError:
+        return events
+    return events
+
+
+async def _exchange(application: Application, head: h11.Request, body: list[Any]) -> int | None:
+    # Where the end of the body is missing, the client is gone.
+    messages: list[_Message] = [
+        {"type": "http.request", "body": bytes(event.data), "more_body": True}
+        if isinstance(event, h11.Data)
+        else {"type": "http.request", "body": b"", "more_body": False}
+        for event in body
+        if isinstance(event, h11.Data | h11.EndOfMessage)
+    ]
+    status: list[int] = []
+
+    async def receive() -> _Message:
+        return messages.pop(0) if messages else {"type": "http.disconnect"}
+
+    async def respond(message: _Message) -> None:
+        if message["type"] == "http.response.start":
+            status.append(message["status"])
+
+    await application(_scope(head), receive, respond)
+    if status[:1] == [500]:
+        raise ServerError("status 500")
+    return status[0] if status else None
+
+
+def _scope(head: h11.Request) -> _Message:
+    path, _, query = head.target.partition(b"?")
+    return {
+        "type": "http",
+        "asgi": {"version": "3.0", "spec_version": "2.3"},
+        "http_version": head.http_version.decode(),
+        "method": head.method.decode(),
+        "scheme": "http",
+        "path": unquote(path.decode()),
+        "raw_path": path,
+        "query_string": query,
+        "root_path": "",
+        "headers": list(head.headers),
+        "client": ("127.0.0.1", 40_000),
+        "server": ("127.0.0.1", 8000),
+        "state": {},
+    }

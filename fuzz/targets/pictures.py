@@ -1,0 +1,92 @@
+"""Pictures of one view or two, in every kind that is read, with tags, profiles and markers."""
+
+import io
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from PIL import Image, ImageCms, features
+
+from fuzz.repairs import repair_png
+from fuzz.targets import Target, read_every_way, written
+from stereoweave.io import read_image
+from stereoweave.layouts import write_picture
+from stereoweave.pictures import open_pictures
+
+_SIZE_PX = 48, 72
+
+
+def eyes(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """A small pair, uint8 RGB [48, 72, 3]: one texture, seen 4 px apart."""
+    rng = np.random.default_rng(seed)
+    noise = rng.integers(0, 256, (_SIZE_PX[0], _SIZE_PX[1] + 4, 3), np.uint8)
+    texture = cv2.GaussianBlur(noise, (0, 0), 1)
+    return texture[:, 4:].copy(), texture[:, :-4].copy()
+
+
+def encoded(image: np.ndarray, kind: str, **options: Any) -> bytes:
+    """The picture as a file that Pillow writes."""
+    stream = io.BytesIO()
+    Image.fromarray(image).save(stream, kind, **options)
+    return stream.getvalue()
+
+
+def _starts() -> dict[str, bytes]:
+    left, right = eyes()
+    both = np.hstack([left, right])
+    grey = cv2.cvtColor(both, cv2.COLOR_RGB2GRAY)
+    return {
+        **dict(_plain(both, grey)),
+        **dict(_with_tags(both)),
+        "eyes.mpo": written("eyes.mpo", lambda path: write_picture(path, both)),
+        "eyes.jps": written("eyes.jps", lambda path: write_picture(path, both)),
+        "above_TB.png": encoded(np.vstack([left, right]), "PNG"),
+    }
+
+
+def _plain(both: np.ndarray, grey: np.ndarray) -> Iterator[tuple[str, bytes]]:
+    kinds = {"png": "PNG", "jpg": "JPEG", "tif": "TIFF", "webp": "WEBP", "bmp": "BMP", "gif": "GIF"}
+    kinds |= {"ppm": "PPM", "jp2": "JPEG2000"} | ({"avif": "AVIF"} if features.check("avif") else {})
+    for ending, kind in kinds.items():
+        yield f"colour.{ending}", encoded(both, kind)
+    for ending in ("png", "tif", "pgm"):
+        yield f"deep.{ending}", encoded(grey.astype(np.uint16) << 8, kinds.get(ending, "PPM"))
+    yield "lzw.tif", encoded(both, "TIFF", compression="tiff_lzw")
+    yield "jpeg.tif", encoded(both, "TIFF", compression="jpeg")
+    yield "lossless.webp", encoded(both, "WEBP", lossless=True)
+    yield "alpha.png", encoded(np.dstack([both, grey]), "PNG")
+    yield "progressive.jpg", encoded(grey, "JPEG", progressive=True)
+
+
+def _with_tags(both: np.ndarray) -> Iterator[tuple[str, bytes]]:
+    exif = Image.Exif()
+    exif[0x0110], exif[0x0112] = "FinePix REAL 3D W3", 3
+    details = exif.get_ifd(0x8769)
+    details |= {0x920A: 6.3, 0xA405: 35, 0xA002: 144, 0xA20E: 3000.0, 0xA210: 3}
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("LAB")).tobytes()
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    xmp = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><GPano:Pose>0</GPano:Pose></x:xmpmeta>'
+    for ending, kind in {"jpg": "JPEG", "png": "PNG", "webp": "WEBP", "tif": "TIFF"}.items():
+        yield f"tags.{ending}", encoded(both, kind, exif=exif, icc_profile=srgb)
+    yield "profile.jpg", encoded(both, "JPEG", exif=exif, icc_profile=profile, xmp=xmp)
+
+
+def _read(path: Path) -> None:
+    read_every_way(
+        partial(open_pictures, [path]), partial(open_pictures, [path, path]), partial(read_image, path)
+    )
+
+
+TARGET = Target(
+    starts=_starts,
+    read=_read,
+    tokens=(
+        *b"IHDR IDAT IEND tRNS PLTE acTL eXIf iCCP II*\0 MM\0* RIFF VP8L ANIM GIF89a P6 BM ftypavif".split(),
+        *(b"\xff\xd8", b"\xff\xd9", b"\xff\xe1", b"\xff\xe2MPF\0", b"\xff\xe3_JPSJPS_", b"Exif\0\0", b"jP  "),
+        *(b"\x21\xf9\x04", b"\x2c", b"acsp", b"GImage:"),
+    ),
+    repair=repair_png,
+)

@@ -1,0 +1,59 @@
+"""Videos of both eyes, in several containers and codecs."""
+
+from fractions import Fraction
+from functools import partial
+from itertools import islice
+from pathlib import Path
+
+import av
+import numpy as np
+
+from fuzz.targets import Target, written
+from fuzz.targets.pictures import eyes
+from stereoweave.footage import open_footage
+from stereoweave.footage_tracks import open_track
+
+_FRAMES = 5
+_KINDS = {
+    "mpeg4_SBS.mp4": "mpeg4",
+    "h264_SBS.mp4": "libx264",
+    "ffv1_SBS.mkv": "ffv1",
+    "mjpeg_SBS.avi": "mjpeg",
+}
+_PIXELS = {"ffv1": "bgr0", "mjpeg": "yuvj420p"}
+
+
+def _starts() -> dict[str, bytes]:
+    return {name: written(name, partial(_write, codec=codec)) for name, codec in _KINDS.items()}
+
+
+def _write(path: Path, codec: str) -> None:
+    frames = [np.hstack(eyes(seed)) for seed in range(_FRAMES)]
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=25)
+        assert isinstance(stream, av.VideoStream)
+        stream.height, stream.width = frames[0].shape[:2]
+        stream.pix_fmt = _PIXELS.get(codec, "yuv420p")
+        for index, image in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(image, "rgb24")
+            frame.pts, frame.time_base = index, Fraction(1, 25)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def _read(path: Path) -> None:
+    # Not guessed, which would take most of the time; of pictures it is.
+    footage = open_footage([path], "side_by_side")
+    for _ in islice(footage.frames(), 2 * _FRAMES):
+        pass
+    open_track(path, None).samples()
+
+
+TARGET = Target(
+    starts=_starts,
+    read=_read,
+    tokens=(
+        *b"moov mdat trak stts stsz stco ctts elst st3d sv3d avcC RIFF movi idx1 00dc LIST strf".split(),
+        *(b"\0\0\1", b"\x1a\x45\xdf\xa3", b"\xa3", b"\x53\xb8", b"\xe7"),
+    ),
+)

@@ -1,0 +1,138 @@
+"""The fuzzer finds what is planted, its valid files are valid, and what it found once stays mended."""
+
+import csv
+import os
+import shutil
+import subprocess
+import sys
+import warnings
+from contextlib import suppress
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from fuzz.findings import kept
+from fuzz.mutations import MOST_BYTES, mutate
+from fuzz.repairs import repair_png, repair_shard
+from fuzz.requests import ServerError, request_bytes, send
+from fuzz.running import fuzz
+from fuzz.targets import NAMES, load
+from stereoweave.errors import StereoweaveError
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+CORPUS = REPOSITORY / "tests" / "corpus"
+FOUND = [path for name in NAMES for path in kept(CORPUS / name)]
+
+# Of Ray's own code, as it is imported.
+pytestmark = pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`:DeprecationWarning")
+
+# What each word of `broken_target` is found as.
+PLANTED = {
+    "raise": "IndexError in its target",
+    "warn": "UserWarning in its target",
+    "exhaust": "MemoryError in its target",
+    "crash": "SIGSEGV in its target",
+    "hang": "hang in its target",
+}
+
+
+@pytest.fixture
+def planted(tmp_path) -> Path:
+    """A corpus with a file for each word."""
+    folder = tmp_path / "corpus" / "broken_target"
+    folder.mkdir(parents=True)
+    for word in [*PLANTED, "refuse"]:
+        (folder / f"{word}-file.txt").write_text(f"some text, {word}, more text")
+    return folder
+
+
+def test_errors_warnings_crashes_hangs_and_hunger_are_found_and_refusals_are_not(planted):
+    outcome = fuzz("broken_target", seed=1, seconds=1.5, corpus=planted, case_s=0.3)
+    assert set(outcome.findings) == set(PLANTED.values())
+    assert outcome.cases >= 1 + len(PLANTED)
+    contents = {key: finding.content for key, finding in outcome.findings.items()}
+    assert contents["IndexError in its target"] == b"raise"  # made as small as it can be
+    assert b"crash" in contents["SIGSEGV in its target"]
+    assert b"hang" in contents["hang in its target"]
+
+
+def test_the_command_keeps_what_it_found_and_fails(tmp_path):
+    def run(target: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "fuzz", "--seconds", "0.5", "--seed", "3", "--target", target]
+        command += ["--corpus", str(tmp_path / "corpus"), "--out", str(tmp_path / "fuzz.csv")]
+        paths = os.pathsep.join([str(REPOSITORY), str(REPOSITORY / "tests")])
+        environment = os.environ | {"PYTHONPATH": paths}
+        return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+
+    done = run("broken_target")
+    assert done.returncode == 1, done.stderr
+    (path,) = (tmp_path / "corpus" / "broken_target").iterdir()
+    assert path.read_bytes() == b"raise"  # a word that it knows
+    assert f"IndexError in its target: out of range  -> {path}" in done.stdout
+    done = run("maps")
+    assert done.returncode == 0, done.stdout
+    first, second = csv.DictReader((tmp_path / "fuzz.csv").read_text().splitlines())
+    assert (first["target"], first["seed"], first["findings"]) == ("broken_target", "3", "1")
+    assert (second["target"], second["findings"]) == ("maps", "0")
+    assert int(second["cases"]) > 0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_start_file_is_valid(tmp_path, without_shape_checks, name):
+    target = load(name)
+    for file, content in target.starts().items():
+        path = tmp_path / file
+        path.write_bytes(content)
+        target.read(path)
+        assert target.repair(content)
+        path.unlink()
+
+
+def test_a_case_depends_on_its_seed_alone_and_is_never_long():
+    start, others, tokens = b"width = 3\n" * 20, [b"other\n" * 9], [b"token"]
+    cases = [mutate(start, others, tokens, Random(number)) for number in range(2000)]
+    assert cases == [mutate(start, others, tokens, Random(number)) for number in range(2000)]
+    assert len(set(cases)) > 1500
+    assert max(map(len, cases)) <= MOST_BYTES
+    for trace in (b"token" * 1000, b"other", b"1e999", b"\xff\xff\xff\xff"):
+        assert any(trace in case for case in cases), trace
+
+
+def test_a_repaired_png_and_a_repaired_shard_pass_their_checks(tmp_path, without_shape_checks):
+    png = load("pictures").starts()["colour.png"]
+    damaged = png.replace(b"IHDR\0\0\0\x90", b"IHDR\0\0\0\x40")  # 64 columns, no longer 144
+    assert damaged != png
+    assert repair_png(png) == png
+    assert repair_png(damaged)[:16] == damaged[:16]
+    assert repair_png(damaged)[29:33] != damaged[29:33]  # the checksum of the head
+    shards = load("shards")
+    ((name, shard),) = shards.starts().items()
+    other = shard.replace(b'"focal_px": 60.0', b'"focal_px": 70.0')
+    path = tmp_path / name
+    path.write_bytes(other)
+    with pytest.raises(StereoweaveError, match="camera.json as it was written"):
+        shards.read(path)
+    path.write_bytes(repair_shard(other))
+    shards.read(path)
+
+
+def test_a_request_that_ends_in_500_is_a_finding():
+    async def fails(scope, receive, send):
+        assert (await receive())["body"] == b"x=1"
+        await send({"type": "http.response.start", "status": int(scope["path"][1:]), "headers": []})
+
+    assert send(fails, request_bytes("POST", "/404", data={"x": "1"})) == 404
+    with pytest.raises(ServerError):
+        send(fails, request_bytes("POST", "/500", data={"x": "1"}))
+    assert send(fails, b"no request\r\n\r\n") is None
+    assert send(fails, b"") is None
+
+
+@pytest.mark.parametrize("path", FOUND, ids=lambda path: f"{path.parent.name}/{path.name}")
+def test_what_was_found_once_is_answered_by_an_own_error(tmp_path, without_shape_checks, path):
+    """`make fuzz` writes these files; the reader may also have learnt to read them."""
+    copy = tmp_path / path.name.partition("-")[2]
+    shutil.copy(path, copy)
+    with suppress(StereoweaveError), warnings.catch_warnings(action="error"):
+        load(path.parent.name).read(copy)
