@@ -1,19 +1,23 @@
 # make demo    depth, a new view and a report, of the example or of LEFT=… RIGHT=… (needs Python 3.11 or newer)
 # make test    the tests
 # make check   style, types, floors of imports, and the tests
+# make mutate which of COUNT=400 changes of the sources, drawn by SEED, the tests notice; a stopped run goes on
 # make fuzz    damaged files and requests for SECONDS=60, each answered by our own errors or kept in tests/corpus
 # make bench   accuracy and time on the real pairs in STEREOWEAVE_TESTDATA
+# make audit   licences of all that is installed, and known vulnerabilities where their service is reached
+# make release the wheel, and the lists of what it needs (SBOM), in dist
 # make gallery the README's pictures, docs/gallery, from a pair that is rendered for them
 # Each first sets up the virtual environment that it needs, once.
 
 PYTHON ?= python3
 STEREOWEAVE_TESTDATA ?= ../shared
-# Of make fuzz; without a SEED each run draws one.
 SECONDS ?= 60
+COUNT ?= 400
 
 # What users install: no PyTorch.
 CORE = .venv-core
 DEV = .venv
+AUDIT = .venv-audit
 
 EXAMPLE = examples/left.png examples/right.png
 ifeq ($(LEFT),)
@@ -26,11 +30,13 @@ else
 PAIR = "$(LEFT)" $(if $(RIGHT),"$(RIGHT)")
 endif
 
+SBOM = $(AUDIT)/bin/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible
+VERSION = $(shell sed -n 's/^__version__ = "\(.*\)"/\1/p' stereoweave/__init__.py)
 RENDER = $(DEV)/bin/stereoweave synth make refinery --pairs 1 --seed 4000 --layout paper
 RENDERED = $(foreach side,left right,runs/gallery/$(1)/$(side)/refinery/000000.png)
 VIEW = $(DEV)/bin/stereoweave view
 
-.PHONY: demo test check fuzz bench gallery
+.PHONY: demo test check fuzz mutate bench audit release gallery
 
 demo: $(CORE)/installed
 	$(CORE)/bin/stereoweave depth $(PAIR) $(CALIBRATION) --out demo-out
@@ -47,12 +53,30 @@ check: $(DEV)/installed
 	$(DEV)/bin/lint-imports
 	$(DEV)/bin/pytest
 
+mutate: $(DEV)/installed
+	$(DEV)/bin/python -m mutate --count $(COUNT) $(if $(SEED),--seed $(SEED))
+
 fuzz: $(DEV)/installed
 	$(DEV)/bin/python -m fuzz --seconds $(SECONDS) $(if $(SEED),--seed $(SEED))
 
 bench: $(CORE)/installed
 	$(CORE)/bin/stereoweave bench pairs $(STEREOWEAVE_TESTDATA)/stereo/pairs \
 		--model base --model small --model best --classes results/classes.csv --out results/pairs.csv
+
+# Without a +cpu at its end, because advisories are of versions that have none.
+audit: $(DEV)/installed $(AUDIT)/installed
+	$(AUDIT)/bin/pip-licenses --python $(DEV)/bin/python --summary
+	@$(DEV)/bin/python -m pip freeze --exclude-editable | sed 's/+.*//' > $(AUDIT)/packages.txt
+	@cd $(AUDIT) && if bin/pip-audit --requirement packages.txt --no-deps --disable-pip \
+		--vulnerability-service osv --progress-spinner off > found.txt 2> log.txt; \
+	then tail -n 1 log.txt; \
+	elif grep '^Found' log.txt; then cat found.txt; exit 1; \
+	else echo "Known vulnerabilities: not looked up, no answer from the service ($$(tail -n 1 log.txt))"; fi
+
+release: $(CORE)/installed $(DEV)/installed $(AUDIT)/installed
+	$(CORE)/bin/python -m pip wheel --no-deps --wheel-dir dist .
+	$(SBOM) --output-file dist/stereoweave-$(VERSION).cdx.json $(CORE)
+	$(SBOM) --output-file dist/stereoweave-$(VERSION)-all-extras.cdx.json $(DEV)
 
 # The wiggle's frames are smaller, because it is as large as all other pictures together else.
 gallery: $(DEV)/installed
@@ -75,5 +99,10 @@ $(CORE)/installed: pyproject.toml constraints.txt
 
 $(DEV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(DEV)
-	$(DEV)/bin/python -m pip install --constraint constraints.txt --editable '.[synth,train,video,app,cluster,dev]'
+	$(DEV)/bin/python -m pip install --constraint constraints.txt --editable '.[synth,train,video,app,cluster,mutate,dev]'
+	touch $@
+
+$(AUDIT)/installed: constraints.txt
+	$(PYTHON) -m venv $(AUDIT)
+	$(AUDIT)/bin/python -m pip install --constraint constraints.txt cyclonedx-bom pip-audit pip-licenses
 	touch $@

@@ -3,6 +3,8 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from stereoweave.telemetry import disable_telemetry
+
 if TYPE_CHECKING:
     from stereoweave.errors import FormatError, MatcherError, StereoweaveError
     from stereoweave.matcher import Matcher
@@ -48,6 +50,10 @@ __all__ = [
     "render",
     "synthesize",
 ]
+
+
+# Every import of a module of the package, in any process, runs this first.
+disable_telemetry()
 
 
 def __getattr__(name: str) -> Any:

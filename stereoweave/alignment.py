@@ -281,7 +281,7 @@ def _levels(
 def _reduced(photo: UInt8[np.ndarray, "h w 3"], scale: float) -> UInt8[np.ndarray, "h2 w2 3"]:
     if scale == 1:
         return photo
-    size = round(photo.shape[1] / scale), round(photo.shape[0] / scale)
+    size = max(round(photo.shape[1] / scale), 1), max(round(photo.shape[0] / scale), 1)
     return cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
 
 

@@ -27,6 +27,7 @@ from stereoweave.claiming import check_claim, check_unclaimed, described, descri
 from stereoweave.errors import StereoweaveError
 from stereoweave.io import make_folder, reading, remove_leftovers, replacing
 from stereoweave.matcher import Matcher
+from stereoweave.output_lock import lock_output
 from stereoweave.pair_lists import BATCH_FILE, SUMMARY_FILE, Job, Pairs
 from stereoweave.processes import begin_work
 from stereoweave.progress import progress
@@ -69,7 +70,8 @@ def run_batch(
         console: Where progress and failures are shown.
 
     Raises:
-        StereoweaveError: `out` has something else in it or cannot be written, or the matcher is none.
+        StereoweaveError: `out` has something else in it, is in use or cannot be written, or there is no such
+            matcher.
     """
     processes = min(processes or usable_cores(), max(len(jobs), 1))
     if processes > 1 and order.threads is None:
@@ -77,13 +79,14 @@ def run_batch(
     # Said once, here, if there is no such network or provider.
     Matcher(order.model, threads=1, provider=order.provider)
     make_folder(out)
-    _claim(out, order)
-    missing = [job for job in jobs if not _is_finished(out / job.name, job)]
-    try:
-        failed = _run(functools.partial(_make, out, order), missing, processes, order.threads, console)
-    finally:
-        _tidy(out)
-    _write_summary(out, jobs, dict(failed))
+    with lock_output(out):
+        _claim(out, order)
+        missing = [job for job in jobs if not _is_finished(out / job.name, job)]
+        try:
+            failed = _run(functools.partial(_make, out, order), missing, processes, order.threads, console)
+        finally:
+            _tidy(out)
+        _write_summary(out, jobs, dict(failed))
     return Tally(len(missing) - len(failed), len(jobs) - len(missing), tuple(failed))
 
 

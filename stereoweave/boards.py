@@ -14,6 +14,7 @@ from jaxtyping import Float, Int, UInt8
 from stereoweave.calibration import Optics, Rig, Size, words
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io import read_image
+from stereoweave.picture_files import ENDINGS
 
 FEWEST_PAIRS = 5
 _FEWEST_CORNERS = 8
@@ -22,7 +23,6 @@ _OUTLIER = 3.0
 _GOOD_PX, _FAIR_PX = 0.5, 1.0
 _GOOD_COVER_PERCENT, _FAIR_COVER_PERCENT = 60, 40
 _GOOD_PAIRS, _GOOD_TILT_DEGREES = 10, 15
-_ENDINGS = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp"}
 _SIDE = re.compile(r"(?<![a-z])(left|right|cam0|cam1|l|r)(?![a-z])", re.IGNORECASE)
 _LEFT_WORDS = {"left", "cam0", "l"}
 # OpenCV 4 has its flags for fisheye lenses apart.
@@ -255,7 +255,7 @@ def _pairs(folder: Path) -> tuple[dict[str, tuple[Path, Path]], dict[str, str]]:
     for path in sorted(folder.rglob("*")):
         relative = path.relative_to(folder).with_suffix("").as_posix()
         marks = _SIDE.findall(relative)
-        if path.suffix.lower() in _ENDINGS and marks:
+        if path.suffix.lower() in ENDINGS and marks:
             sides.setdefault(_SIDE.sub("*", relative), {})[marks[-1].lower() in _LEFT_WORDS] = path
     pairs = {str(key): (found[True], found[False]) for key, found in sides.items() if len(found) == 2}
     single = {

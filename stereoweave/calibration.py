@@ -1,6 +1,5 @@
 """How two cameras see and stand; `calibration_files` reads it, and writes it."""
 
-import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -8,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.stereo import StereoCamera, StereoPair
+from stereoweave.stereo import CAMERA_NUMBERS_BELOW, StereoCamera, StereoPair
 
 # How many coefficients OpenCV's models have; 0 is a lens without distortion.
 _PINHOLE_COUNTS, _FISHEYE_COUNTS = (0, 4, 5, 8, 12, 14), (0, 4)
@@ -38,11 +37,13 @@ class Optics:
     def __post_init__(self) -> None:
         numbers = (*self.matrix.ravel(), *self.distortion)
         (fx, skew, _), (below, fy, _), last = self.matrix.tolist()
+        small = (np.abs(numbers) < CAMERA_NUMBERS_BELOW).all()
         upright = (skew, below, *last) == (0, 0, 0, 0, 1)
-        if not (upright and fx > 0 and fy > 0 and np.isfinite(numbers).all()):
+        if not (upright and fx > 0 and fy > 0 and small):
             raise StereoweaveError(
-                "expected a camera matrix fx 0 cx, 0 fy cy, 0 0 1 with positive focal lengths, "
-                f"found {self.matrix.tolist()} and distortion {self.distortion.tolist()}"
+                "expected a camera matrix fx 0 cx, 0 fy cy, 0 0 1 with positive focal lengths and numbers "
+                f"below {CAMERA_NUMBERS_BELOW:g}, found {self.matrix.tolist()} "
+                f"and distortion {self.distortion.tolist()}"
             )
         counts = _FISHEYE_COUNTS if self.fisheye else _PINHOLE_COUNTS
         if self.distortion.size not in counts:
@@ -81,10 +82,10 @@ class Rig:
                 f"{self.name}: expected a rotation matrix from the left camera to the right one, "
                 f"found {self.rotation.round(4).tolist()}"
             )
-        if not 0 < np.linalg.norm(self.translation_m) < math.inf:
+        if not 0 < np.linalg.norm(self.translation_m) < CAMERA_NUMBERS_BELOW:
             raise StereoweaveError(
-                f"{self.name}: expected cameras at two places, found the translation "
-                f"{self.translation_m.tolist()}"
+                f"{self.name}: expected cameras at two places within {CAMERA_NUMBERS_BELOW:g} m, "
+                f"found the translation {self.translation_m.tolist()}"
             )
         if self.size_px is not None and min(self.size_px) < 1:
             raise StereoweaveError(

@@ -1,6 +1,9 @@
 """Two cameras from the files that calibration programs write, and into one."""
 
+import base64
+import math
 import re
+import reprlib
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -8,18 +11,22 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 from jaxtyping import Float
 
 from stereoweave.calibration import Optics, Rig, Size, side_by_side, size_of
 from stereoweave.errors import StereoweaveError
-from stereoweave.io import reading, replacing
+from stereoweave.io import read_small, reading, replacing
 from stereoweave.stereo import StereoPair
+from stereoweave.structured_text import BASE64, parse_entries
 
 _MM_ABOVE = 2.0
+_TRUE = ("1", "true", "True")
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _FISHEYE_NAMES = {"fisheye", "equidistant", "equi", "kannalabrandt", "kb4"}
 _PINHOLE_NAMES = {"pinhole", "radtan", "plumbbob", "rationalpolynomial", "brownconrady", "none"}
+# OpenCV's names of types: those of base64, and those whose decimal digits are rounded to them.
+_BASE64_TYPES = {"u": "u1", "c": "i1", "w": "<u2", "s": "<i2", "i": "<i4", "f": "<f4", "d": "<f8"}
+_ROUNDED = {"h": np.float16, "f": np.float32}
 _EXPECTED = "a calibration of two cameras: OpenCV's YAML or XML, Kalibr's camchain, KITTI's or Middlebury's"
 
 
@@ -41,19 +48,26 @@ def read_rig(path: str | Path, size_px: Size | None = None) -> Rig:
             raw pictures as well, which is taken where they are of that size.
 
     Raises:
-        FormatError: No such file, an entry is missing, or its value is nonsense.
+        FormatError: No such file, no regular one, or one of more than 256 KB; an entry is missing, or its
+            value is nonsense; it is nested more than 20 deep, has more than 10,000 values, an alias or a DTD.
     """
     with reading(path, _EXPECTED):
-        text = Path(path).read_text("utf-8-sig", errors="replace")
+        text = _text(Path(path))
         if re.search(r"^(cam0|doffs|baseline)\s*=", text, re.MULTILINE):
             rig = _middlebury(text)
         elif re.search(r"^(P\d|P_rect_\d\d|K_\d\d):", text, re.MULTILINE):
             rig = _kitti(text, size_px)
-        elif "cam0" in (entries := _stored(text)):
+        elif "cam0" in (entries := parse_entries(text)):
             rig = _kalibr(entries)
         else:
             rig = _opencv(_completed(entries, Path(path)))
         return replace(rig, name=str(path))
+
+
+def calibration_bytes(path: str | Path) -> bytes:
+    """The content of a calibration file; FormatError where it is missing, too large or no regular file."""
+    with reading(path, _EXPECTED):
+        return read_small(path)
 
 
 def calibrated(pair: StereoPair, path: str | Path) -> StereoPair:
@@ -85,50 +99,11 @@ def write_rig(path: str | Path, rig: Rig) -> None:
         temporary.write_text(storage.releaseAndGetString())
 
 
+def _text(path: Path) -> str:
+    return calibration_bytes(path).decode("utf-8-sig", errors="replace")
+
+
 # OpenCV and Kalibr
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML's plain values, and OpenCV's matrices."""
-
-
-def _matrix_of(loader: yaml.SafeLoader, node: yaml.MappingNode) -> np.ndarray:
-    stored = loader.construct_mapping(node, deep=True)
-    return _numbers(stored["data"]).reshape(int(stored["rows"]), int(stored["cols"]))
-
-
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix_of)
-
-
-def _stored(text: str) -> dict[str, Any]:
-    """The entries of a file of YAML, or of OpenCV's XML or JSON."""
-    if text.lstrip().startswith(("<", "{")):
-        return _stored_by_opencv(text)
-    try:
-        # Not YAML: OpenCV writes a colon in it.
-        entries = yaml.load(re.sub(r"\A\s*%YAML.*", "", text), _Loader)
-    except (yaml.YAMLError, KeyError, TypeError) as error:
-        raise ValueError(str(error).splitlines()[0]) from error
-    if not isinstance(entries, dict):
-        raise ValueError("neither of them")
-    return {str(key): value for key, value in entries.items()}
-
-
-def _stored_by_opencv(text: str) -> dict[str, Any]:
-    try:
-        storage = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
-        root = storage.root()
-        return {key: _value(root.getNode(key)) for key in root.keys()}  # noqa: SIM118 - no dict
-    except (cv2.error, SystemError) as error:  # the latter is what OpenCV's constructor makes of the former
-        raise ValueError("text that OpenCV cannot read") from error
-
-
-def _value(node: cv2.FileNode) -> Any:
-    if node.isMap():
-        return node.mat()
-    if node.isSeq():
-        return [_value(node.at(index)) for index in range(node.size())]
-    return node.string() if node.isString() else node.real()
 
 
 def _completed(entries: dict[str, Any], path: Path) -> dict[str, Any]:
@@ -136,7 +111,8 @@ def _completed(entries: dict[str, Any], path: Path) -> dict[str, Any]:
     for this, other in (("intrinsics", "extrinsics"), ("extrinsics", "intrinsics")):
         beside = path.with_name(path.name.replace(this, other))
         if this in path.name and beside.exists():
-            return _stored(beside.read_text("utf-8-sig", errors="replace")) | entries
+            with reading(beside, _EXPECTED):
+                return parse_entries(_text(beside)) | entries
     return entries
 
 
@@ -203,7 +179,7 @@ def _of_side(entries: Mapping[str, Any], names: Iterable[str], sides: Iterable[s
 
 def _model(entries: Mapping[str, Any]) -> str | None:
     """The kind of lens that OpenCV's file names, fisheye or pinhole; None where it names none."""
-    if entries.get("fisheyemodel", entries.get("fisheye", 0)) in (1, True):
+    if entries.get("fisheyemodel", entries.get("fisheye", "")) in _TRUE:
         return "fisheye"
     named = _first(entries, ("distortionmodel", "cameramodel", "model"))
     return None if named is None else _known_model(named)
@@ -215,14 +191,16 @@ def _known_model(named: object) -> str:
         return "fisheye"
     if word in _PINHOLE_NAMES:
         return "pinhole"
-    raise ValueError(f"a lens {named}; radtan (pinhole) and equidistant (fisheye) ones are known")
+    raise ValueError(
+        f"a lens {reprlib.repr(named)}; radtan (pinhole) and equidistant (fisheye) ones are known"
+    )
 
 
 def _unit(translation: Float[np.ndarray, "3"], stated: object) -> tuple[str, tuple[str, ...]]:
     """The translation's unit of length, and a line that says so where it is a guess."""
     if stated is not None:
         if str(stated) not in _METRES:
-            raise ValueError(f"translation_unit {stated}, not one of {', '.join(_METRES)}")
+            raise ValueError(f"translation_unit {reprlib.repr(stated)}, not one of {', '.join(_METRES)}")
         return str(stated), ()
     length = float(np.linalg.norm(translation))
     unit, word = ("mm", "millimetres") if length > _MM_ABOVE else ("m", "metres")
@@ -241,7 +219,7 @@ def _size(entries: Mapping[str, Any]) -> Size | None:
             return None
     sides_px = _numbers(both).ravel()
     if sides_px.size != 2:
-        raise ValueError(f"a picture's size of {both}, not width and height")
+        raise ValueError(f"a picture's size of {reprlib.repr(both)}, not width and height")
     width, height = sides_px
     return int(width), int(height)
 
@@ -271,7 +249,8 @@ def _kalibr_optics(name: str, entries: Mapping[str, Any]) -> Optics:
     camera, intrinsics = entries.get("camera_model", "pinhole"), _numbers(entries["intrinsics"])
     if camera != "pinhole" or intrinsics.size != 4:
         raise ValueError(
-            f"the camera model {camera} of {name}; calibrate with pinhole-radtan or pinhole-equi"
+            f"the camera model {reprlib.repr(camera)} of {name}; "
+            "calibrate with pinhole-radtan or pinhole-equi"
         )
     fisheye = _known_model(entries.get("distortion_model", "radtan")) == "fisheye"
     matrix = _camera_matrix(*intrinsics.tolist())
@@ -356,7 +335,36 @@ def _camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarr
 
 
 def _numbers(values: Any) -> Float[np.ndarray, "..."]:
+    """The numbers of a value of `parse_entries`: one, a list of them, a list of rows, or OpenCV's matrix."""
+    if isinstance(values, dict) and "data" in values:
+        return _matrix(values)
+    if isinstance(values, str) and values.startswith(BASE64):
+        return _decoded(values)
     try:
         return np.asarray(values, dtype=np.float64)
-    except TypeError as error:  # of a dict, for instance
-        raise ValueError(f"{values} in place of numbers") from error
+    except (TypeError, ValueError) as error:  # the former of a dict, for instance
+        raise ValueError(f"{reprlib.repr(values)} in place of numbers") from error
+
+
+def _matrix(entries: Mapping[str, Any]) -> Float[np.ndarray, "..."]:
+    """OpenCV's matrix: what cv2.FileStorage makes of it, in float64."""
+    written = re.fullmatch(r"(\d*)([A-Za-z])", str(entries.get("dt", "d")))
+    if written is None:
+        raise ValueError(f"a matrix of the type {reprlib.repr(entries['dt'])}")
+    numbers = _numbers(entries["data"])
+    if written[2] in _ROUNDED:
+        numbers = numbers.astype(_ROUNDED[written[2]]).astype(np.float64)
+    sides = entries.get("sizes", [entries.get("rows", ""), entries.get("cols", "")])
+    shape = [*map(int, _numbers(sides).ravel().tolist()), int(written[1] or 1)]  # the last: its channels
+    if min(shape) < 0 or math.prod(shape) != numbers.size:
+        raise ValueError(f"a matrix of {numbers.size} numbers in the shape {reprlib.repr(shape)}")
+    return numbers.reshape(shape)
+
+
+def _decoded(data: str) -> Float[np.ndarray, " _"]:
+    """The numbers of OpenCV's base64: of a header of 24 bytes, which says their type, and their bytes."""
+    content = base64.b64decode(data.removeprefix(BASE64))
+    written = re.fullmatch(rb"\d*([a-z]) *", content[:24])
+    if written is None or written[1].decode() not in _BASE64_TYPES:
+        raise ValueError(f"base64 of the type {content[:24]!r}")
+    return np.frombuffer(content, _BASE64_TYPES[written[1].decode()], offset=24).astype(np.float64)

@@ -2,14 +2,15 @@
 
 What is to be made and what came of it is in Parquet files by chunks (`manifest`); here are their numbers.
 A run that was stopped in whatever way goes on with the same command: chunks whose rows are written are looked
-through, and all others made. Two such runs at once do everything twice, and harm nothing.
+through, and all others made. On a disk a second run is refused while one goes on; in an object store two at
+once do everything twice, and harm nothing.
 """
 
 import json
 import platform
 import time
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import islice
@@ -18,6 +19,7 @@ from pathlib import Path
 import typer
 from rich.console import Console
 
+from stereoweave.calibration_files import calibration_bytes
 from stereoweave.claiming import check_claim, check_unclaimed, described, description
 from stereoweave.cluster_worker import BEGUN, Counts, Worker, remove_left_behind
 from stereoweave.engine import Engine, connect, room, stream
@@ -25,6 +27,7 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.io import reading
 from stereoweave.manifest import MANIFEST, PLAN, Plan, extend_plan
 from stereoweave.matcher import Matcher
+from stereoweave.output_lock import lock_output
 from stereoweave.pair_lists import BATCH_FILE
 from stereoweave.progress import progress
 from stereoweave.results import DepthOrder, order_facts
@@ -74,8 +77,8 @@ def run_cluster(
         console: Where progress is shown; nowhere unless given.
 
     Raises:
-        StereoweaveError: A place, the cluster, the network or the provider cannot be used, or not any more:
-            what is made stays, and the same call goes on.
+        StereoweaveError: A place, the cluster, the network or the provider cannot be used, or not any more,
+            or another run writes to the destination. What is made stays, and the same call goes on.
     """
     engine = engine or Engine()
     order = _for_many(order or DepthOrder(), engine)
@@ -85,7 +88,7 @@ def run_cluster(
         Matcher(order.model, threads=1)  # said once, here, if there is no such network
     read_from.check_source()
     write_to.check_destination()
-    with connect(engine):
+    with _alone(write_to), connect(engine):
         workers = room(engine)
         _claim(write_to, order, read_from)
         plan = extend_plan(read_from, write_to, min(workers, engine.workers or workers))
@@ -93,7 +96,7 @@ def run_cluster(
             console.print(note, markup=False, highlight=False, soft_wrap=True)
         worker = Worker(read_from, write_to, order, tuple(_carried(order)))
         counts = _run(worker, plan, engine, console)
-    _tidy(write_to)
+        _tidy(write_to)
     return ClusterTally(counts.made, counts.there, counts.failed, counts.named, write_to.at(MANIFEST))
 
 
@@ -169,6 +172,11 @@ def _store(place: str | Path) -> Store:
     return store if store.folder is None else store_at(store.folder.absolute())
 
 
+def _alone(destination: Store) -> AbstractContextManager[None]:
+    """Keeps a second run out of a folder on a disk; an object store has no locks."""
+    return lock_output(destination.folder) if destination.folder else nullcontext()
+
+
 def _claim(destination: Store, order: DepthOrder, source: Store) -> None:
     """Writes down whose folder this is, or refuses one that is another's."""
     facts = {"made by": "stereoweave batch", "source": source.place, **order_facts(order)}
@@ -184,11 +192,12 @@ def _claim(destination: Store, order: DepthOrder, source: Store) -> None:
 
 def _carried(order: DepthOrder) -> Iterator[tuple[str, str, bytes]]:
     """The order's own files, which workers on other machines cannot read: kind, name and content."""
-    model = order.model if order.model.endswith(".onnx") else None  # else a name that they all know
-    for kind, path in (("model", model), ("calibration", order.request.calibration)):
-        if path and Path(path).is_file():
-            with reading(path, f"a {kind}"):
-                yield kind, Path(path).name, Path(path).read_bytes()
+    model, calibration = Path(order.model), order.request.calibration
+    if order.model.endswith(".onnx") and model.is_file():  # else a name that they all know
+        with reading(model, "a model"):
+            yield "model", model.name, model.read_bytes()
+    if calibration and calibration.is_file():
+        yield "calibration", calibration.name, calibration_bytes(calibration)
 
 
 def _tidy(destination: Store) -> None:

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from stereoweave.errors import ProviderError, StereoweaveError
+from stereoweave.errors import OutputInUseError, ProviderError, StereoweaveError
 from stereoweave.io import SMALLEST_SIDE_PX, is_leftover
 from stereoweave.manifest import Planned, read_chunk, read_rows, write_rows
 from stereoweave.matcher import Matcher
@@ -222,7 +222,8 @@ class Worker:
                 tally = make()
             except StereoweaveError as error:
                 self._check_disk(error)
-                if not was_begun or any(isinstance(cause, ProviderError) for cause in _causes(error)):
+                kept = ProviderError | OutputInUseError
+                if not was_begun or any(isinstance(cause, kept) for cause in _causes(error)):
                     raise
                 # A killed worker's parts, of other files or damaged.
                 shutil.rmtree(begun, ignore_errors=True)

@@ -33,12 +33,14 @@ _LOOKED_AT_EVERY_S, _BACK_WITHIN_S = 2, 10
 _LEAST_SHARE = 0.0001
 # Workers that end while they start, one after another: more are no accident.
 _MOST_FALSE_STARTS = 20
-# No statistics of use to Ray's makers, no warning of what Ray will change, no lines from its C++ parts.
+# No warning of what Ray will change, no lines from its C++ parts.
 _SILENCE = {
-    "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "RAY_BACKEND_LOG_LEVEL": "fatal",
 }
+# Where this is 0, as by default on macOS and Windows, a Ray that is started here takes the loopback address
+# for that of its machine, and listens there alone. If `ray.init` is given a loopback address, it replaces it.
+_OPEN_TO_OTHER_MACHINES = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 _INDEX, _CONTENT = "index", "content"
 
 
@@ -75,6 +77,20 @@ class Engine:
         return max(1, int(self.cpus_each))
 
 
+def set_environment(address: str | None) -> str | None:
+    """The address of the cluster to join; None where Ray is started here, to listen on loopback alone.
+
+    Sets the variables that Ray reads when it is imported, except those that the user has set.
+    """
+    for name, value in _SILENCE.items():
+        os.environ.setdefault(name, value)
+    address = address or os.environ.get("RAY_ADDRESS")
+    if address and address != "local":
+        return address
+    os.environ.setdefault(_OPEN_TO_OTHER_MACHINES, "0")
+    return None
+
+
 @contextmanager
 def connect(engine: Engine) -> Iterator[None]:
     """Within the block this process is Ray's driver; nothing is done where it is one already.
@@ -82,9 +98,7 @@ def connect(engine: Engine) -> Iterator[None]:
     Raises:
         StereoweaveError: Ray is missing, or nothing at the address answers as its head.
     """
-    for name, value in _SILENCE.items():
-        os.environ.setdefault(name, value)
-    address = engine.address or os.environ.get("RAY_ADDRESS")
+    address = set_environment(engine.address)
     with needing_extra("cluster", "this needs Ray"):
         already = "ray" in sys.modules and sys.modules["ray"].is_initialized()
         if address and not already:
@@ -96,7 +110,7 @@ def connect(engine: Engine) -> Iterator[None]:
     if already:
         yield
         return
-    _join(address) if address and address != "local" else _start()
+    _join(address) if address else _start()
     try:
         yield
     finally:
@@ -261,11 +275,14 @@ def _start() -> None:
     """Ray on this machine, with all cores that this process may use."""
     import ray
 
-    with _without_words():
+    # Ray starts the process of a dashboard in any case, and that asks the metadata services of three clouds,
+    # though nothing is reported (2.60). If the port of that process is taken, Ray goes on without it.
+    with _without_words(), socket.create_server(("127.0.0.1", 0)) as taken:
         ray.init(
             address="local",
             num_cpus=usable_cores(),
             include_dashboard=False,
+            dashboard_port=taken.getsockname()[1],
             object_store_memory=_OBJECT_STORE_BYTES,
             log_to_driver=False,
             logging_level=logging.ERROR,
@@ -290,7 +307,7 @@ def _check_answers(address: str) -> None:
     """Refuses an address where no Ray answers: Ray itself would try for minutes, and say so in many lines."""
     import grpc  # type: ignore[import-untyped]
 
-    if address in ("auto", "local"):
+    if address == "auto":
         return
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not (host and port.isdigit() and 0 < int(port) < 65536):

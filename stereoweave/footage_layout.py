@@ -228,7 +228,8 @@ def _contrast_beside(kind: str, frame: Frame) -> float:
     beside, above = 0.0, 0.0
     for eye in _halves(kind, frame):
         smaller = min(1.0, _DETAIL_PX / max(eye.shape[:2]))
-        small = cv2.resize(eye, None, fx=smaller, fy=smaller, interpolation=cv2.INTER_AREA)
+        size_px = max(round(eye.shape[1] * smaller), 1), max(round(eye.shape[0] * smaller), 1)
+        small = cv2.resize(eye, size_px, interpolation=cv2.INTER_AREA)
         # So that the grain of the sensor, alike along both, does not count.
         shades = cv2.GaussianBlur(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1)
         beside += float(np.abs(np.diff(shades, axis=1)).mean())

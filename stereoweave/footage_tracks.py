@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from stereoweave.errors import FormatError, StereoweaveError, needing_extra
-from stereoweave.io import picture_kind, read_image
+from stereoweave.io import read_image
+from stereoweave.picture_files import ENDINGS
 
 if TYPE_CHECKING:
     import av
@@ -157,10 +158,7 @@ class PictureTrack:
         self._files = files
         self.steps: Sequence[int] = range(len(files))
         self.rate, self.time_base = rate, 1 / rate
-        self.size_px = 0, 0
-        first = next((picture for index in self.steps if (picture := self._read(index)) is not None), None)
-        if first is None:
-            raise FormatError(f"{name}: expected pictures, found none that can be read, such as {files[0]}")
+        first = self._first()
         self.size_px = first.shape[1], first.shape[0]
 
     def shots(self, start: int) -> Iterator[Shot]:
@@ -173,6 +171,16 @@ class PictureTrack:
         starts = [int(share * len(self._files)) for share in (0.0, *_SAMPLES)]
         return [shot.picture() for start in starts for shot in islice(self.shots(start), 1)]
 
+    def _first(self) -> UInt8[np.ndarray, "h w 3"]:
+        """The first picture that can be read."""
+        problem: FormatError | None = None
+        for file in self._files:
+            try:
+                return read_image(file)
+            except FormatError as error:
+                problem = problem or error
+        raise FormatError(f"{self.name}: expected pictures, found none that can be read: {problem}")
+
     def _shot(self, index: int) -> Shot | None:
         picture = self._read(index)
         return None if picture is None else Shot(index, lambda: picture, fresh=True)
@@ -180,7 +188,7 @@ class PictureTrack:
     def _read(self, index: int) -> UInt8[np.ndarray, "h w 3"] | None:
         with suppress(FormatError):
             picture = read_image(self._files[index])
-            if self.size_px in ((0, 0), (picture.shape[1], picture.shape[0])):
+            if self.size_px == (picture.shape[1], picture.shape[0]):
                 return picture
         return None
 
@@ -394,9 +402,7 @@ def _rate(steps: Sequence[int], time_base: Fraction, average: Fraction) -> Fract
 
 
 def _is_picture(file: Path) -> bool:
-    with suppress(StereoweaveError):
-        return bool(picture_kind(file)) and not file.name.startswith(".")
-    return False
+    return file.suffix.lower() in ENDINGS and not file.name.startswith(".")
 
 
 def _in_counting_order(file: Path) -> list[tuple[int, str]]:

@@ -1,8 +1,10 @@
 """Pictures, disparity and depth: from files, and into files that are whole or not there."""
 
+import math
+import os
 import re
+import stat
 import tempfile
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,12 +12,16 @@ from uuid import uuid4
 
 import numpy as np
 from jaxtyping import Float, Float32, Shaped, UInt8, UInt16
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image
 
-from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.errors import FormatError, StereoweaveError, reason
+from stereoweave.exif import orientation
+from stereoweave.picture_files import check_regular, check_size, opening, read_photograph, stored_values
 from stereoweave.stereo import StereoPair
 
 SMALLEST_SIDE_PX = 32
+# Calibrations of real rigs and training recipes have some kilobytes.
+MOST_SMALL_BYTES = 256 * 1024
 _KINDS = {
     ".png": "PNG",
     ".jpg": "JPEG",
@@ -27,12 +33,11 @@ _KINDS = {
 }
 # The names that `replacing` gives while it writes.
 _TEMPORARY = re.compile(r"\..*-[0-9a-f]{8}(\.\w+)?")
-# What libraries say of a damaged file: an OverflowError of an infinite size, Pillow's AVIF a RuntimeError.
-_UNREADABLE = (
-    *(OSError, ValueError, OverflowError, SyntaxError, RuntimeError),
-    Image.DecompressionBombError,
-)
-_PFM_HEADER = re.compile(rb"Pf\s+(\d+)\s+(\d+)\s+(\S+)\s")
+# What libraries say of a damaged file; of an infinite size an OverflowError, of deep JSON a RecursionError.
+_UNREADABLE = OSError, ValueError, OverflowError, SyntaxError, RuntimeError
+# Of Python's integers one of 4,301 digits cannot even be shown.
+_PFM_HEADER = re.compile(rb"Pf\s+(\d{1,9})\s+(\d{1,9})\s+(\S{1,99})\s")
+_LONGEST_PFM_HEADER = 256
 
 
 class RangeError(StereoweaveError):
@@ -40,13 +45,17 @@ class RangeError(StereoweaveError):
 
 
 def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture in RGB, upright as its EXIF tag says; grey is repeated, alpha dropped, 16 bits become 8.
+    """The picture in RGB and sRGB, upright as its EXIF tag says.
+
+    A colour profile is obeyed, grey is repeated, alpha dropped, 16 bits become 8. Of an MPO file it is the
+    first picture.
 
     Raises:
-        FormatError: No such file, no picture, a truncated one, or one under 32 pixels wide or high.
+        FormatError: No such file, no picture of a kind that is read, a truncated one, an animation, one under
+            32 pixels wide or high, over 65 megapixels, or over 32,766 pixels wide or high.
     """
-    with reading(path, "a picture (PNG, JPEG, TIFF or the like)"), Image.open(path) as picture:
-        image = rgb(ImageOps.exif_transpose(picture))
+    photograph = read_photograph(Path(path))
+    image = photograph.upright(orientation(photograph.tags))
     check_large_enough(path, image)
     return image
 
@@ -81,19 +90,6 @@ def pair_of(
     return StereoPair(left=left_image, right=right_image)
 
 
-def rgb(picture: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
-    """The pixels of an opened picture in RGB: grey is repeated, alpha dropped, 16 bits become 8."""
-    if not picture.mode.startswith(("I", "F")):
-        # A copy: Pillow lends its pixels read-only, for which Numba compiles anew and PyTorch warns.
-        return np.array(picture.convert("RGB"))
-    values = np.asarray(picture)
-    if picture.mode == "F" or values.min() < 0 or values.max() > 65535:
-        raise ValueError(f"more than 16 bits a channel or values below 0, mode {picture.mode}")
-    # The upper byte, as Pillow reduces colour pictures of 16 bits; a file of 32 bits may hold 8 of them.
-    bits = 8 if picture.mode != "I" or values.max() > 255 else 0
-    return np.repeat((values >> bits).astype(np.uint8)[..., None], 3, axis=2)
-
-
 def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"]) -> None:
     """Writes an RGB or grey picture in the format that the name's ending asks for, such as .png or .jpg."""
     _save(path, image, picture_kind(path))
@@ -115,25 +111,39 @@ def read_pfm(path: str | Path) -> Float32[np.ndarray, "h w"]:
     Source: the format as Middlebury uses it: rows from the bottom up, a negative scale for little-endian.
 
     Raises:
-        FormatError: No such file, another format, three channels ('PF'), or a length unlike the header's.
+        FormatError: No such file, another format, three channels ('PF'), no pixel or more than `read_image`
+            takes, a scale that is none, or a length unlike the header's.
     """
-    with reading(path, "a PFM file"):
-        content = Path(path).read_bytes()
-        header = _PFM_HEADER.match(content)
-        if header is None:
+    check_regular(Path(path), "a PFM file")
+    with reading(path, "a PFM file"), Path(path).open("rb") as file:
+        (width_px, height_px), order, start = _pfm_header(path, file.read(_LONGEST_PFM_HEADER))
+        expected, found = 4 * width_px * height_px, file.seek(0, os.SEEK_END) - start
+        if found != expected:
             raise FormatError(
-                f"{path}: expected a PFM file of one channel, 'Pf', width, height and scale, "
-                f"found {content[:12]!r}"
+                f"{path}: expected {expected} bytes for {width_px}x{height_px} values, found {found}; "
+                "is the file truncated?"
             )
-        width_px, height_px, scale = int(header[1]), int(header[2]), float(header[3])
-    expected, found = 4 * width_px * height_px, len(content) - header.end()
-    if found != expected:
-        raise FormatError(
-            f"{path}: expected {expected} bytes for {width_px}x{height_px} values, found {found}; "
-            "is the file truncated?"
-        )
-    values = np.frombuffer(content, "<f4" if scale < 0 else ">f4", offset=header.end())
+        file.seek(start)
+        values = np.frombuffer(file.read(), f"{order}f4")
     return values.reshape(height_px, width_px)[::-1].astype(np.float32, order="C")
+
+
+def _pfm_header(path: str | Path, content: bytes) -> tuple[tuple[int, int], str, int]:
+    """Width and height in pixels, the byte order as NumPy writes it, and where the values begin."""
+    header = _PFM_HEADER.match(content)
+    if header is None:
+        raise FormatError(
+            f"{path}: expected a PFM file of one channel, 'Pf', width, height and scale, "
+            f"found {content[:12]!r}"
+        )
+    size_px, scale = (int(header[1]), int(header[2])), float(header[3])
+    check_size(path, size_px)
+    if 0 in size_px or scale == 0 or not math.isfinite(scale):
+        raise FormatError(
+            f"{path}: expected a PFM file of at least one pixel, and a scale other than 0, "
+            f"found {size_px[0]}x{size_px[1]} and {scale:g}"
+        )
+    return size_px, "<" if scale < 0 else ">", header.end()
 
 
 def write_pfm(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
@@ -167,19 +177,19 @@ def read_pixels(path: str | Path, *modes: str) -> Shaped[np.ndarray, "h w *chann
         FormatError: No such file, a damaged one, or a picture of another kind.
     """
     expected = f"a picture of mode {' or '.join(modes)}"
-    with reading(path, expected), Image.open(path) as picture:
+    with opening(Path(path), expected=expected) as picture:
         if picture.mode not in modes:
             raise FormatError(f"{path}: expected {expected}, found {picture.format} of mode {picture.mode}")
-        return np.array(picture)
+        return stored_values(path, picture)
 
 
 def read_disparity_png(path: str | Path) -> Float32[np.ndarray, "h w"]:
     """Disparity in pixels from a 16-bit PNG of pixels * 256 (KITTI's); its 0, unknown, becomes NaN."""
     expected = "a 16-bit grey PNG of disparity * 256"
-    with reading(path, expected), Image.open(path) as picture:
+    with opening(Path(path), expected=expected) as picture:
         if not picture.mode.startswith("I"):
             raise FormatError(f"{path}: expected {expected}, found {picture.format} of mode {picture.mode}")
-        steps = np.asarray(picture)
+        steps = stored_values(path, picture)
     return np.where(steps > 0, steps / 256, np.nan).astype(np.float32)
 
 
@@ -207,6 +217,23 @@ def write_depth_png(path: str | Path, depth_m: Float[np.ndarray, "h w"]) -> None
     _save(path, np.where((depth_mm > 0) & (depth_mm <= 65535), depth_mm, 0).astype(np.uint16), "PNG")
 
 
+def read_small(path: str | Path) -> bytes:
+    """The content of a regular file of at most 256 KB, such as a calibration.
+
+    Raises:
+        FormatError: The file is larger, or a pipe or a device, which may be without end.
+        OSError: It cannot be read; `reading` makes a FormatError of it.
+    """
+    mode = Path(path).stat().st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # opening a folder says that it is one
+        raise FormatError(f"{path}: expected a regular file, found a pipe or a device; save it to a file")
+    with Path(path).open("rb") as file:
+        content = file.read(MOST_SMALL_BYTES + 1)
+    if len(content) > MOST_SMALL_BYTES:
+        raise FormatError(f"{path}: expected a file of at most {MOST_SMALL_BYTES} bytes, found more")
+    return content
+
+
 def make_folder(path: str | Path) -> Path:
     """The folder `path`, made where it is missing and tried, so that a long run does not fail at its end."""
     folder = Path(path)
@@ -216,7 +243,7 @@ def make_folder(path: str | Path) -> Path:
             return folder
     except OSError as error:
         raise StereoweaveError(
-            f"{path}: expected a folder that can be written, found {_reason(error)}"
+            f"{path}: expected a folder that can be written, found {reason(error)}"
         ) from error
 
 
@@ -232,13 +259,11 @@ def place_for(*files: Path) -> Path:
 def reading(path: str | Path, expected: str) -> Iterator[None]:
     """Turns what goes wrong while `path` is read into a FormatError: in one line, expected and found."""
     try:
-        # Pillow warns about odd tags before it gives up on a file; the error below says it in one line.
-        with warnings.catch_warnings(action="ignore"):
-            yield
+        yield
     except FormatError:
         raise
     except _UNREADABLE as error:
-        raise FormatError(f"{path}: expected {expected}, found {_reason(error)}") from error
+        raise FormatError(f"{path}: expected {expected}, found {reason(error)}") from error
 
 
 @contextmanager
@@ -257,7 +282,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
         temporary.replace(target)
     except OSError as error:
         raise StereoweaveError(
-            f"{path}: expected a file that can be written, found {_reason(error)}"
+            f"{path}: expected a file that can be written, found {reason(error)}"
         ) from error
     finally:
         temporary.unlink(missing_ok=True)
@@ -284,21 +309,6 @@ def remove_leftovers(folder: Path) -> None:
     """Removes what `replacing` left in a folder and below it, where nobody is writing now."""
     for path in filter(is_leftover, folder.rglob(".*")):
         path.unlink(missing_ok=True)
-
-
-def _reason(error: Exception) -> str:
-    match error:
-        case FileNotFoundError():
-            return "no such file"
-        case IsADirectoryError():
-            return "a folder"
-        case FileExistsError():
-            return "a file"
-        case UnidentifiedImageError():
-            return "something else"
-        case OSError(strerror=str(text)):
-            return text.lower()
-    return f"one that cannot be read ({error})"
 
 
 def _save(

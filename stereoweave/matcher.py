@@ -19,7 +19,7 @@ from stereoweave.errors import MatcherError, StereoweaveError
 from stereoweave.io import SMALLEST_SIDE_PX
 from stereoweave.occluded_fill import fill_occluded
 from stereoweave.providers import CPU, PROVIDERS, open_session, running
-from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
 from stereoweave.subpixel import to_subpixel
 from stereoweave.threads import thread_count
 
@@ -187,6 +187,8 @@ class Matcher:
         """Whether a picture of that size is matched at once, not in strips of rows, and can be matched."""
         if self.fixed_size is not None:
             return height <= self.fixed_size[0] and width <= self.fixed_size[1]
+        if max(height, width) > LONGEST_SIDE_PX:
+            return False
         return height <= self._strip_rows(width) and width * width * height <= PIXEL_PAIRS_AT_ONCE
 
     def _maps(self, pairs: Sequence[StereoPair]) -> list[Maps]:

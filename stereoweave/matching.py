@@ -24,7 +24,7 @@ from stereoweave.matcher import MODES, PIXEL_PAIRS_AT_ONCE, Matcher, check_steps
 from stereoweave.providers import CPU
 from stereoweave.ranging import find_range, goes_beyond
 from stereoweave.refining import right_confidence
-from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
 
 # A network that is shown what is beyond its range often believes in the end of it, but not quite.
 _CONFIDENT, _CONFIDENT_AT_END = 0.5, 0.9
@@ -230,7 +230,8 @@ def _times_smaller(
     if matcher.fixed_size is not None:
         rows, columns = matcher.fixed_size
         return max(height / rows, width / (columns - (_ROUNDED_PX if moved_px else 0)))
-    return (width * width * height / (_FILLED * PIXEL_PAIRS_AT_ONCE)) ** (1 / 3)
+    too_many = (width * width * height / (_FILLED * PIXEL_PAIRS_AT_ONCE)) ** (1 / 3)
+    return max(too_many, height / LONGEST_SIDE_PX, width / LONGEST_SIDE_PX)
 
 
 def _resized(pair: StereoPair, scale: float) -> StereoPair:

@@ -14,16 +14,14 @@ from typing import NamedTuple
 
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io import reading
+from stereoweave.picture_files import ENDINGS
 from stereoweave.stores import store_at
 
 BATCH_FILE, SUMMARY_FILE = "batch.json", "summary.csv"
 _CALIBRATION = "calib.txt"
 _ENDINGS = {
     # Formats that are not read are found as well, so that they are refused by their names.
-    "picture": (
-        *(".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".jp2", ".pgm", ".ppm"),
-        *(".heic", ".heif", ".avif"),
-    ),
+    "picture": (*ENDINGS, ".heic", ".heif"),
     # Whatever lies beside them: cameras that write .mpo put the left view there as .jpg.
     "both views": (".mpo", ".jps", ".pns"),
     "film": (".mp4", ".mkv", ".mov", ".avi", ".webm"),

@@ -14,8 +14,8 @@ from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.footage_layout import ARRANGEMENTS, Arrangement, guess_arrangement, resemblance
 from stereoweave.io import check_large_enough, pair_of
 from stereoweave.picture_files import (
-    MOST_PIXELS,
     Photograph,
+    check_size,
     decode,
     opening,
     read_frame,
@@ -105,7 +105,7 @@ def _one(path: Path, arrangement: str | None) -> Opened:
         if arrangement == "mpo":
             raise FormatError(f"{path}: expected an MPO file with two pictures of one size, found one")
         name, why = _declared(path, picture, arrangement)
-        photograph = decode(picture)
+        photograph = decode(path, picture)
     lies = exif.orientation(photograph.tags)
     image = photograph.upright(lies)
     if name is None:
@@ -214,11 +214,7 @@ def _halves(
         view_px = arrangement.eye_size_px(width_px, height_px)
     except FormatError as error:
         raise FormatError(f"{path}: {error}") from error
-    if view_px[0] * view_px[1] > MOST_PIXELS:
-        raise FormatError(
-            f"{path}: expected at most {MOST_PIXELS // 1_000_000} megapixels a view, "
-            f"found {view_px[0]}x{view_px[1]}; scale it down"
-        )
+    check_size(path, view_px)
     left, right = arrangement.eyes(image)
     check_large_enough(path, left)
     return left, right

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from stereoweave import __version__
+from stereoweave.calibration_files import calibration_bytes
 from stereoweave.clouds import (
     MOST_POINTS,
     NO_CAMERA,
@@ -181,12 +182,16 @@ def order_facts(order: DepthOrder) -> dict[str, Any]:
     facts = {"stereoweave": __version__, **asdict(order)}
     del facts["threads"], facts["provider"]
     facts |= facts.pop("request")
-    for name in ("model", "calibration"):
-        if facts[name] and (name == "calibration" or facts[name].endswith(".onnx")):
-            with reading(facts[name], f"a {name}"):
-                content = Path(facts[name]).read_bytes()
-            facts[name] = f"{Path(facts[name]).name} {hashlib.sha256(content).hexdigest()[:12]}"
+    if facts["model"].endswith(".onnx"):
+        with reading(facts["model"], "a model"):
+            facts["model"] = _by_content(facts["model"], Path(facts["model"]).read_bytes())
+    if facts["calibration"]:
+        facts["calibration"] = _by_content(facts["calibration"], calibration_bytes(facts["calibration"]))
     return facts
+
+
+def _by_content(path: str | Path, content: bytes) -> str:
+    return f"{Path(path).name} {hashlib.sha256(content).hexdigest()[:12]}"
 
 
 def needs_camera(file: str) -> bool:

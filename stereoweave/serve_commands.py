@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from stereoweave.command_line import Host, Model, Port, Provider, Threads, listening, url_at
+from stereoweave.engine import set_environment
 from stereoweave.errors import StereoweaveError, needing_extra
 from stereoweave.threads import usable_cores
 
@@ -49,6 +50,7 @@ def serve(  # noqa: PLR0913 - each is a word of the command line
     timeout_s: TimeoutS = 60,
 ) -> None:
     """Depth and views over HTTP, for other programs; Ctrl-C ends it when what it accepted is done."""
+    set_environment(address)  # before the service imports Ray
     with needing_extra("cluster", "the service needs Ray Serve"):
         from stereoweave.service import GPU_PROVIDERS, Settings, serving
         from stereoweave.service_http import Limits

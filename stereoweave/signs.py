@@ -196,5 +196,5 @@ def _matched(
 
 
 def _shrunk(photo: UInt8[np.ndarray, "h w 3"], factor: float) -> UInt8[np.ndarray, "h2 w2 3"]:
-    size = round(photo.shape[1] * factor), round(photo.shape[0] * factor)
+    size = round(photo.shape[1] * factor), max(round(photo.shape[0] * factor), 1)
     return cv2.resize(photo, size, interpolation=cv2.INTER_AREA)

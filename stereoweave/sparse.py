@@ -85,7 +85,7 @@ def _corners(
     factor = _reduction(grey)
     height, width = grey.shape
     if factor > 1:
-        small = (round(width / factor), round(height / factor))
+        small = (max(round(width / factor), 1), max(round(height / factor), 1))
         grey = cv2.resize(grey, small, interpolation=cv2.INTER_AREA)
     corners = _spread_corners(grey, most)
     smooth = cv2.GaussianBlur(grey, (0, 0), _WINDOW_BLUR_PX)

@@ -13,9 +13,14 @@ from jaxtyping import Bool, Float, Real, UInt8
 
 from stereoweave.errors import StereoweaveError
 
+# What OpenCV's remapping takes: it counts pixels in 16 bits.
+LONGEST_SIDE_PX = 32_766
+
 # The two share the operators that are used here, but no base class; PyTorch is not imported outside learn.
 ArrayOrTensor = TypeVar("ArrayOrTensor", bound=Any)
 
+# Pixels, metres and coefficients beyond it are no camera's, and their products would leave float32.
+CAMERA_NUMBERS_BELOW = 1e9
 # A code, not what it encodes: so the slope of `DepthCurve.decode` is bounded for any exponent.
 _STRAIGHT_BELOW = 1e-5
 _LARGEST_FITTED_EXPONENT = 8.0
@@ -39,8 +44,11 @@ class StereoCamera:
             raise StereoweaveError(
                 f"focal_px and baseline_m must be positive, got {self.focal_px} and {self.baseline_m}"
             )
-        if not np.isfinite([self.focal_px, self.baseline_m, self.cx_px, self.cy_px, self.doffs_px]).all():
-            raise StereoweaveError(f"a camera's numbers must be finite, got {self}")
+        numbers = [self.focal_px, self.baseline_m, self.cx_px, self.cy_px, self.doffs_px]
+        if not (np.abs(numbers) < CAMERA_NUMBERS_BELOW).all():
+            raise StereoweaveError(
+                f"a camera's numbers must be finite and below {CAMERA_NUMBERS_BELOW:g}, got {self}"
+            )
 
     @classmethod
     def centred(
@@ -81,6 +89,11 @@ class StereoPair:
             if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
                 raise StereoweaveError(
                     f"{side} image: expected uint8 RGB [H, W, 3], got {image.dtype} {list(image.shape)}"
+                )
+            if max(image.shape) > LONGEST_SIDE_PX:
+                raise StereoweaveError(
+                    f"{side} image: expected at most {LONGEST_SIDE_PX} pixels a side, got {_size(image)}; "
+                    "scale it down or cut it"
                 )
         if self.left.shape != self.right.shape:
             raise StereoweaveError(

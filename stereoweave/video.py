@@ -25,6 +25,7 @@ from stereoweave.hints import hints
 from stereoweave.layouts import LAYOUTS, Choices, check_reach, middle_px
 from stereoweave.matcher import Matcher
 from stereoweave.matching import match
+from stereoweave.output_lock import lock_output
 from stereoweave.progress import progress
 from stereoweave.providers import CPU
 from stereoweave.rendering import Renderer
@@ -206,7 +207,8 @@ def make_film(footage: Footage, sources: Sequence[Path], out: Path, order: Order
         What was met on the way, in all runs together.
 
     Raises:
-        StereoweaveError: `out` cannot be such a film, or cannot be written, for instance on a full disk.
+        StereoweaveError: `out` cannot be such a film, is in use, or cannot be written, for instance on a full
+            disk.
     """
     _check_out(out, order, footage, sources)
     matcher = Matcher(order.model, threads=order.threads, provider=order.provider)
@@ -218,7 +220,11 @@ def make_film(footage: Footage, sources: Sequence[Path], out: Path, order: Order
         packing=PACKINGS.get(order.layout or ""),
         threads=thread_count(order.threads),
     )
-    with growing(out, _settings(order, footage, sources)) as parts, progress(console) as bar:
+    with (
+        lock_output(out),
+        growing(out, _settings(order, footage, sources)) as parts,
+        progress(console) as bar,
+    ):
         if parts.files:
             maker = _Maker.from_state(order, matcher, parts.state())
         else:

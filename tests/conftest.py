@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from urllib.request import Request, urlopen
 from uuid import uuid4
 
@@ -47,6 +47,7 @@ CAPABILITIES = {
     "needs_chromium": Capability(
         shutil.which("chromium") is not None, "in a browser", "no chromium on the PATH"
     ),
+    "needs_strace": Capability(shutil.which("strace") is not None, "under strace", "no strace on the PATH"),
     "needs_egl": Capability(renders(), "of the renderer", "no EGL: apt install libegl1 libgl1-mesa-dri"),
 }
 
@@ -125,8 +126,14 @@ def ray_head(cpus: int) -> Iterator[str]:
         command += ["--disable-usage-stats", *(f"--{name}={value}" for name, value in options.items())]
         log = Path(folder, "start.log")
         with log.open("wb") as out:
-            # Whoever has a token in his home folder would have to show it. Workers import what tests define.
-            environment = os.environ | {"RAY_AUTH_MODE": "disabled", "PYTHONPATH": str(Path(__file__).parent)}
+            environment = os.environ | {
+                # Whoever has a token in his home folder would have to show it.
+                "RAY_AUTH_MODE": "disabled",
+                # A head that reports nothing would report that.
+                "RAY_USAGE_STATS_REPORT_URL": "http://127.0.0.1:9",
+                # Workers import what tests define.
+                "PYTHONPATH": str(Path(__file__).parent),
+            }
             head = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=environment)
         try:
             while head.poll() is None and "Ray runtime started" not in log.read_text():
@@ -139,6 +146,16 @@ def ray_head(cpus: int) -> Iterator[str]:
                 with suppress(ProcessLookupError):
                     os.kill(process, signal.SIGKILL)
             head.wait()
+
+
+@contextmanager
+def halted(process: subprocess.Popen[Any]) -> Iterator[None]:
+    """A process stands still during the block, and keeps what it holds."""
+    process.send_signal(signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        process.send_signal(signal.SIGCONT)
 
 
 def processes_of(process: int) -> list[int]:

@@ -37,10 +37,10 @@ def box_before_a_wall(rng: np.random.Generator, size_px: tuple[int, int] = (48, 
 
 @dataclass(frozen=True)
 class PaintedStudio:
-    """Makes pairs without rendering; at a pair it kills its process, or the one that started it."""
+    """Makes pairs without rendering; at a pair it kills its process, or halts the one that started it."""
 
     dies_at: int | None = None
-    orphaned_at: int | None = None
+    halts_at: int | None = None
 
     def renderer(self) -> str:
         return "paint"
@@ -48,8 +48,8 @@ class PaintedStudio:
     def __call__(self, order: Order, index: int) -> Rendered:
         if index == self.dies_at:
             os.kill(os.getpid(), signal.SIGKILL)
-        if index == self.orphaned_at:
-            os.kill(os.getppid(), signal.SIGKILL)
+        if index == self.halts_at:
+            os.kill(os.getppid(), signal.SIGSTOP)
             time.sleep(600)
         sample = box_before_a_wall(np.random.default_rng((order.seed, index)), order.size_px)
         shot = Shot(image=sample.right, depth_m=sample.disparity_px, target=sample.occluded)

@@ -118,3 +118,10 @@ def test_real_pairs_have_no_defect(testdata):
     assert len(folders) == 12
     for folder in folders[::4]:
         assert check_pair(read_image(folder / "left.png"), read_image(folder / "right.png")).defects == ()
+
+
+@pytest.mark.parametrize("size", [(32, 32_000), (32_000, 32)])
+def test_a_strip_of_a_picture_is_checked_like_any_other(rng, size):
+    left = np.zeros((*size, 3), np.uint8)
+    left[:1000, :1000] = rng.integers(0, 256, left[:1000, :1000].shape, dtype=np.uint8)
+    assert set(check_pair(left, np.roll(left, -4, axis=1)).defects) <= set(DEFECTS)

@@ -10,17 +10,20 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import pytest
+from conftest import halted
 from rich.console import Console
 
 from stereoweave.batch import DONE_FILE, Tally, depth_of_many, run_batch
 from stereoweave.cli import main
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import OutputInUseError, StereoweaveError
 from stereoweave.io import read_image, write_image
 from stereoweave.matcher import Matcher
 from stereoweave.pair_lists import Job, Pairs, pairs_in
 from stereoweave.preparing import Request
 from stereoweave.results import DepthOrder, make_depth
+from stereoweave.threads import usable_cores
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 ORDER = DepthOrder(threads=1, always=("disparity.pfm", "preview.png", "confidence.png"))
@@ -41,6 +44,19 @@ class Deadly(Job):
 
     def __reduce__(self):
         return os.kill, (_own_id(), signal.SIGKILL)
+
+
+class Noting(Job):
+    """A job that notes beside its left picture how many threads the process has that it is sent to."""
+
+    def __reduce__(self):
+        return noted_job, (self.name, self.pictures)
+
+
+def noted_job(name: str, pictures: tuple[Path, ...]) -> Job:
+    threads = cv2.getNumThreads(), os.environ["OPENBLAS_NUM_THREADS"]
+    pictures[0].with_suffix(".txt").write_text("{} {}".format(*threads))
+    return Job(name, pictures)
 
 
 class _own_id:
@@ -86,7 +102,9 @@ def test_a_bad_pair_is_told_and_the_others_are_as_they_are_alone_and_the_next_ru
     bad = folder / "right" / "01.png"
     whole = bad.read_bytes()
     bad.write_bytes(whole[:3000])
+    start_s = time.perf_counter()
     tally, shown = batch(folder, out, processes=2)
+    elapsed_s = time.perf_counter() - start_s
     [(name, reason)] = tally.failed
     assert (tally.done, tally.skipped, name) == (3, 0, "01")
     assert str(bad) in reason
@@ -101,7 +119,7 @@ def test_a_bad_pair_is_told_and_the_others_are_as_they_are_alone_and_the_next_ru
     assert list(rows) == ["00", "01", "02", "03"]
     assert rows["01"]["error"] == reason
     assert rows["02"]["pictures"] == "02.png + 02.png"
-    assert float(rows["02"]["seconds"]) > 0
+    assert 0 < float(rows["02"]["seconds"]) < elapsed_s
 
     before = made_at_ns(out)
     bad.write_bytes(whole)
@@ -122,7 +140,49 @@ def test_a_bad_pair_is_told_and_the_others_are_as_they_are_alone_and_the_next_ru
     ]
 
 
-def test_a_killed_batch_goes_on_and_so_does_an_interrupted_one_without_a_pair_twice(tmp_path, capsys):
+def test_a_pair_that_fails_when_it_is_made_again_is_finished_no_more(tmp_path):
+    folder, out = write_pairs(tmp_path / "pairs", 2), tmp_path / "out"
+    assert batch(folder, out, processes=1)[0].done == 2
+    first, second = pairs_in(folder).jobs
+    second.pictures[1].write_bytes(b"no picture")
+    tally, _ = batch(folder, out, processes=1)
+    assert [name for name, _ in tally.failed] == ["01"]
+    assert list(made_at_ns(out)) == ["00"]
+    batch(folder, out, jobs=[first], processes=1)
+    assert list(table(out)) == ["00"]
+
+
+def test_a_pair_is_there_only_with_its_pictures_and_its_mark_unharmed(tmp_path, capsys):
+    folder, out = write_pairs(tmp_path / "pairs", 3), tmp_path / "out"
+    out.mkdir()
+    (out / ".DS_Store").touch()  # a folder of which only this is in it is a new one
+    jobs = pairs_in(folder).jobs
+    assert batch(folder, out, processes=1)[0].done == 3
+    (out / "00" / DONE_FILE).write_text("{")
+    jobs[1].pictures[0].unlink()
+    tally, _ = batch(folder, out, jobs=jobs, processes=1)
+    assert (tally.done, tally.skipped, [name for name, _ in tally.failed]) == (1, 1, ["01"])
+    assert depth_of_many(Pairs(jobs[:1], ("a note",)), out, ORDER) == 0
+    told = capsys.readouterr()
+    assert told.out.splitlines()[0] == f"{out}: 1 pair: 0 made, 1 were there"
+    assert told.err.splitlines()[0] == "a note"
+
+
+@pytest.mark.parametrize(("processes", "threads"), [(2, 1), (1, usable_cores())])
+def test_several_processes_have_a_thread_each_and_a_single_one_has_all_cores(
+    tmp_path, monkeypatch, processes, threads
+):
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
+    folder = write_pairs(tmp_path / "pairs", 2)
+    jobs = [Noting(job.name, job.pictures) for job in pairs_in(folder).jobs]
+    order = DepthOrder(always=("disparity.pfm",))
+    assert batch(folder, tmp_path / "out", order, jobs=jobs, processes=processes)[0].done == 2
+    notes = [job.pictures[0].with_suffix(".txt").read_text() for job in jobs]
+    assert notes == [f"{threads} {threads}"] * 2
+    assert os.environ["OPENBLAS_NUM_THREADS"] == "7"
+
+
+def test_a_killed_batch_goes_on_and_so_does_an_interrupted_one_but_none_beside_another(tmp_path, capsys):
     folder, out = write_pairs(tmp_path / "pairs", 24, (256, 192)), tmp_path / "out"
     before = {}
     for end, goal in ((signal.SIGKILL, 3), (signal.SIGINT, 8)):
@@ -137,7 +197,10 @@ def test_a_killed_batch_goes_on_and_so_does_an_interrupted_one_without_a_pair_tw
         )
         while len(made_at_ns(out)) < goal and process.poll() is None:
             time.sleep(0.002)
-        os.killpg(process.pid, end)
+        with halted(process):
+            with pytest.raises(OutputInUseError, match=f"{out}: .* found one that is in use"):
+                batch(folder, out)
+            os.killpg(process.pid, end)
         told, errors = process.communicate()
         made = made_at_ns(out)
         assert goal <= len(made) < 24

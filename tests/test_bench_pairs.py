@@ -17,6 +17,7 @@ from stereoweave.io import write_image, write_pfm
 from stereoweave.learn import collage
 from stereoweave.learn.sources import VALIDATION_SEED
 from stereoweave.matcher import shipped_models
+from stereoweave.output_lock import lock_output
 
 NETWORKS = [name + how for name in shipped_models() for how in ("", " refined")]
 OPENCV = ["sgbm", "sgbm_8_paths", "sgbm_3_way", "bm"]
@@ -170,6 +171,13 @@ def test_collages_are_not_written_among_other_files_or_tiny(sets, capfd, options
     assert main(f"bench collages -o {sets} {options}".split()) == 2
     assert fragment in capfd.readouterr().err
     assert sorted(sets.rglob("*")) == before
+
+
+def test_collages_are_not_written_where_another_command_writes_them(tmp_path, capfd):
+    with lock_output(tmp_path):
+        assert main(f"bench collages -o {tmp_path} --pairs 2 --size 64x48".split()) == 2
+    assert "found one that is in use" in capfd.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_plot_without_matplotlib_names_the_extra(tmp_path):

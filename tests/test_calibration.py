@@ -211,6 +211,19 @@ def test_kittis_calibration_of_the_raw_pictures_is_taken_for_their_size(tmp_path
         assert rectified.camera().baseline_m == 0.5
 
 
+def test_the_way_between_two_turned_cameras_of_kitti_is_the_one_worked_out_by_hand(tmp_path):
+    # From camera 0 to 2 by 90 degrees about z, to 3 by 90 degrees about x. From 2 to 3: R = R3 R2^T =
+    # [1 0 0; 0 0 -1; 0 1 0] [0 1 0; -1 0 0; 0 0 1], and T = T3 - R T2 = (-0.5, 0, 0) - (2, -3, -1).
+    turned_both = (
+        KITTI_RAW.replace("R_02: 1 0 0 0 1 0 0 0 1", "R_02: 0 -1 0 1 0 0 0 0 1")
+        .replace("T_02: 0 0 0", "T_02: 1 2 3")
+        .replace("R_03: 0 -1 0 1 0 0 0 0 1", "R_03: 1 0 0 0 0 -1 0 1 0")
+    )
+    rig = read_rig(stored(tmp_path, turned_both), (1392, 512))
+    np.testing.assert_array_equal(rig.rotation, [[0, 1, 0], [0, 0, -1], [-1, 0, 0]])
+    np.testing.assert_array_equal(rig.translation_m, [-2.5, 3, 1])
+
+
 def test_a_kitti_file_without_the_second_camera_is_refused(tmp_path):
     text = "\n".join(line for line in KITTI_RAW.splitlines() if "_03" not in line)
     assert "no entry" in refusal(stored(tmp_path, text))
@@ -329,9 +342,9 @@ def test_extrinsics_are_completed_by_the_intrinsics_beside_them(tmp_path):
 @pytest.mark.parametrize(
     ("more", "found"),
     [
-        ("image_size: 640", "a picture's size of 640, not width and height"),
+        ("image_size: 640", "a picture's size of '640', not width and height"),
         ("image_size: [640, 480, 3]", "not width and height"),
-        ("M1: {rows: 3}", "{'rows': 3} in place of numbers"),
+        ("M1: {rows: 3}", "{'rows': '3'} in place of numbers"),
         ("translation_unit: [mm]", "translation_unit ['mm'], not one of m, cm, mm"),
     ],
 )

@@ -101,6 +101,33 @@ def test_a_file_that_is_no_checkpoint_is_named_in_one_line(tmp_path, trained, wr
     assert "\n" not in str(caught.value)
 
 
+class Program:
+    """What calls a program when it is unpickled."""
+
+    def __init__(self, words):
+        self.words = words
+
+    def __reduce__(self):
+        return subprocess.check_call, (self.words,)
+
+
+def test_a_checkpoint_that_holds_a_program_is_refused_in_one_line_and_the_program_is_not_run(
+    tmp_path, trained
+):
+    path, made = tmp_path / "no.pt", tmp_path / "made"
+    values = {
+        **vars(trained),
+        "recipe": asdict(RECIPE),
+        "optimiser": {"state": Program(["touch", str(made)])},
+    }
+    torch.save(values, path)
+    with pytest.raises(FormatError) as caught:
+        checkpoint.load(path)
+    assert str(caught.value).startswith(f"{path}: expected a checkpoint")
+    assert "\n" not in str(caught.value)
+    assert not made.exists()
+
+
 def test_a_checkpoint_that_is_not_there_is_named_with_what_makes_one(tmp_path):
     with pytest.raises(FormatError, match=r"nowhere\.pt: no such checkpoint; `stereoweave train`"):
         checkpoint.load(tmp_path / "nowhere.pt")
@@ -119,6 +146,14 @@ def test_the_commit_of_code_installed_in_somebody_elses_repository_is_unknown(tm
     assert checkpoint.code_commit() == "unknown"
     monkeypatch.setattr(checkpoint, "__file__", str(tmp_path / "stereoweave/learn/checkpoint.py"))
     assert re.fullmatch(r"[0-9a-f]{7,40}", checkpoint.code_commit())
+
+
+def test_a_run_starts_with_the_weights_of_its_seed_and_nothing_behind_it():
+    start, again, other = (checkpoint.start_of(replace(RECIPE, seed=seed), "0123abc") for seed in (1, 1, 2))
+    assert (start.step, start.hours, start.origin) == (0, 0, ())
+    assert_same(start.weights, again.weights)
+    assert torch.equal(start.random_state, again.random_state)
+    assert any(not torch.equal(value, other.weights[name]) for name, value in start.weights.items())
 
 
 def gone_on(start, value):

@@ -14,7 +14,7 @@ import fsspec
 import numpy as np
 import pyarrow.dataset
 import pytest
-from conftest import processes_of
+from conftest import halted, processes_of
 from film_examples import example_pairs, packets, write_side_by_side
 
 from stereoweave import cluster_worker
@@ -22,11 +22,12 @@ from stereoweave.cli import main
 from stereoweave.cluster import _carried, _ready, run_cluster
 from stereoweave.cluster_worker import FILM, Worker, remove_left_behind
 from stereoweave.engine import Engine, connect
-from stereoweave.errors import MatcherError, ProviderError, StereoweaveError
+from stereoweave.errors import MatcherError, OutputInUseError, ProviderError, StereoweaveError
 from stereoweave.film import parts_folder
 from stereoweave.io import read_image, read_pfm, write_image
 from stereoweave.manifest import extend_plan, read_chunk, read_rows
 from stereoweave.matcher import Matcher
+from stereoweave.output_lock import lock_output
 from stereoweave.results import DepthOrder, make_depth
 from stereoweave.stores import store_at
 
@@ -131,7 +132,10 @@ def test_killed_workers_and_a_killed_driver_lose_nothing_and_double_nothing(ray_
     workers = [process for process in processes_of(os.getpid()) if b"MapWorker" in command_of(process)]
     os.kill(workers[0], signal.SIGKILL)
     wait_for(6)
-    driver.kill()
+    with halted(driver):
+        with pytest.raises(OutputInUseError, match=f"{out}: .* found one that is in use"):
+            run_cluster(source, out, DepthOrder(), engine)
+        driver.kill()
     assert driver.wait() == -signal.SIGKILL
     assert 6 <= parts() < 20
     kept = made_at_ns(out)
@@ -290,6 +294,21 @@ def test_a_film_goes_on_without_the_parts_of_another(tmp_path):
     assert (row["files"], row["error"], row["width_px"]) == ([FILM], None, 160)
     assert len(packets(tmp_path / "out" / "sea.mkv" / FILM, "video")) == 3
     assert not parts.exists()
+
+
+def test_a_film_that_another_process_makes_is_a_row_with_an_error_and_keeps_its_parts(tmp_path):
+    (tmp_path / "films").mkdir()
+    write_side_by_side(tmp_path / "films" / "sea.mkv", example_pairs(3))
+    source, out = store_at(tmp_path / "films"), store_at(tmp_path / "out")
+    film = tmp_path / "out" / "sea.mkv" / FILM
+    parts_folder(film).mkdir(parents=True)
+    (parts_folder(film) / "000001.nut").touch()
+    [chunk] = extend_plan(source, out, workers=1).chunks
+    with lock_output(film):
+        assert Worker(source, out, ORDER)([chunk]).failed == 1
+    [row] = read_rows(out, chunk).values()
+    assert "found one that is in use" in row["error"]
+    assert [path.name for path in parts_folder(film).iterdir()] == ["000001.nut"]
 
 
 def test_what_killed_workers_left_is_removed_after_a_while(tmp_path):

@@ -1,3 +1,5 @@
+import os
+
 import numpy as np
 import pytest
 from dataset_examples import cut, error_naming, names, read_frame, shades, write_map, write_picture
@@ -116,6 +118,15 @@ def test_a_calibration_of_words_is_named(dataset, tmp_path):
     path = tmp_path / "training" / LAYOUTS[dataset][4] / "000001.txt"
     path.write_text(path.read_text().replace("700", "far"))
     error_naming(path, dataset, tmp_path)
+
+
+def test_a_calibration_that_is_too_large_or_a_pipe_is_named(dataset, tmp_path):
+    path = tmp_path / "training" / LAYOUTS[dataset][4] / "000001.txt"
+    path.write_text(path.read_text() + " " * 300_000)
+    assert "found more" in error_naming(path, dataset, tmp_path)
+    path.unlink()
+    os.mkfifo(path)
+    assert "found a pipe" in error_naming(path, dataset, tmp_path)
 
 
 @pytest.mark.parametrize("index", [2, 3])

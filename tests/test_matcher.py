@@ -30,6 +30,12 @@ def test_the_shipped_network_takes_any_size_from_32_px_up(rng, height, width):
     assert found.confidence.min() >= 0 and found.confidence.max() <= 1
 
 
+def test_no_network_is_shown_more_rows_than_opencv_takes():
+    small = Matcher("small", threads=1)
+    assert small.sees_whole(32, 32_766)
+    assert not small.sees_whole(32, 32_767)
+
+
 def test_a_graph_of_one_output_runs_the_mirrored_pair_for_the_other_view(tmp_path, rng):
     file = matcher_file(tmp_path / "one.onnx", red_of("left", "disparity_px"), ["disparity_px"])
     left, right = (painted(rng.integers(0, 255, (40, 50))) for _ in range(2))

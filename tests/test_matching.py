@@ -298,6 +298,19 @@ def test_a_disparity_outside_of_the_range_that_is_given_is_brought_to_its_end_an
         assert (found.confidence[inner] == 0).mean() > 0.98
 
 
+@pytest.mark.parametrize("range_px", [(160, 170), (-170, -160)])
+def test_a_range_that_no_pixel_can_have_is_refused_in_one_line(matcher, rng, range_px):
+    with pytest.raises(StereoweaveError, match="expected disparities of -160 to 160 px, the width") as caught:
+        match(matcher, flat(rng, 12, (64, 160)), range_px=range_px)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_range_beyond_the_pictures_width_is_as_good_as_the_width(matcher, rng):
+    pair = flat(rng, 12, (64, 160))
+    same(match(matcher, pair, range_px=(-9000, 20)), match(matcher, pair, range_px=(-160, 20)))
+    same(match(matcher, pair, range_px=(0, 9000)), match(matcher, pair, range_px=(0, 160)))
+
+
 @pytest.mark.parametrize("range_px", [(10, 10), (50, 0), (0, float("nan")), (float("-inf"), 10)])
 def test_a_range_that_is_none_is_refused_in_one_line(matcher, examples, range_px):
     with pytest.raises(StereoweaveError, match="range_px: expected the least and the greatest") as caught:

@@ -92,6 +92,29 @@ def test_an_offset_between_the_principal_points_counts_as_depth(rng):
     np.testing.assert_array_equal(above.image[6:], level.image[:-6])
 
 
+def test_without_a_camera_the_focal_length_is_the_width_and_the_axis_meets_the_pictures_middle():
+    camera = StereoCamera(focal_px=90.0, baseline_m=1.0, cx_px=44.5, cy_px=29.5)
+    assumed, known = (flat(np.random.default_rng(1), 8, given) for given in (None, camera))
+    view, expected = (renderer.view(0.5, up=0.25, forward=0.5) for renderer in (assumed, known))
+    np.testing.assert_array_equal(view.image, expected.image)
+    np.testing.assert_array_equal(view.drawn, expected.drawn)
+
+
+def test_without_a_camera_the_farthest_of_a_converged_pair_is_taken_to_be_infinitely_far(rng):
+    renderer = flat(rng, -8)
+    level, above = renderer.view(0.5), renderer.view(0.5, up=0.5)
+    np.testing.assert_array_equal(above.image, level.image)
+
+
+def test_convergence_moves_a_view_from_above_and_before_aside_and_no_more(rng):
+    straight = flat(rng, 8)
+    converged = Renderer(straight.pair, straight.estimate, convergence_px=8.0)
+    # To the right by (0.25 - 0.5) * 8 px.
+    view, expected = (renderer.view(0.25, up=0.5, forward=0.5) for renderer in (converged, straight))
+    apart = np.abs(view.image[:, 4:80].astype(int) - expected.image[:, 6:82])
+    assert apart.max() <= 1
+
+
 @pytest.mark.parametrize(("name", "value"), [("up", 1.1), ("forward", -1.1), ("up", float("nan"))])
 def test_a_move_out_of_range_is_refused(rng, name, value):
     with pytest.raises(ValueError, match=rf"^{name}: expected -1 to 1 \(baselines\), got {value}$"):

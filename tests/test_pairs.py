@@ -1,9 +1,12 @@
 import numpy as np
+import pytest
 from learn_examples import PAIR_SIZE, box_before_a_wall, keep_pairs
 
+from stereoweave.errors import OutputInUseError
 from stereoweave.learn import pairs as pairs_module
 from stereoweave.learn.collage import sample
 from stereoweave.learn.pairs import KeptPairs
+from stereoweave.output_lock import lock_output
 
 HALF_A_STEP_PX = 1 / 512
 
@@ -46,6 +49,13 @@ def test_pairs_of_another_version_of_the_generator_are_kept_apart(tmp_path, monk
         (tmp_path / source).write_text("changed")
     monkeypatch.setattr(pairs_module, "__file__", str(tmp_path / "learn" / "pairs.py"))
     assert KeptPairs(tmp_path, 3, 2, PAIR_SIZE).missing() == [0, 1]
+
+
+def test_pairs_are_not_made_where_another_process_makes_them(tmp_path):
+    folder = keep_pairs(tmp_path, 3, 1).folder
+    with lock_output(folder), pytest.raises(OutputInUseError):
+        list(KeptPairs(tmp_path, 3, 3, PAIR_SIZE).make())
+    assert [file.name for file in folder.iterdir()] == ["000000.npz"]
 
 
 def test_what_is_missing_or_half_written_is_made_as_the_generator_makes_it(tmp_path):

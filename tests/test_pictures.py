@@ -1,13 +1,13 @@
 import io
 import re
 import struct
-import zlib
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
 import pytest
 from film_examples import packed, shrunk
+from picture_examples import DISPLAY_P3, SRGB, png_of, profile
 from PIL import Image, ImageCms
 from skimage import data
 
@@ -76,38 +76,6 @@ def write_jps(path, image, flags, layout=2, kind=1):
     segment = b"\xff\xe3\x00\x12_JPSJPS_\x00\x04" + bytes([0, flags, layout, kind]) + b"\0\0"
     Image.fromarray(image).save(path, "JPEG", extra=segment, **FINE)
     return path
-
-
-def profile(name, red, green, blue):
-    """An ICC profile, version 4, of these primaries as XYZ under D50, with the curve of sRGB."""
-
-    def fixed(*values):
-        return b"".join(struct.pack(">i", round(value * 65536)) for value in values)
-
-    def text(value):
-        content = value.encode("utf-16-be")
-        return b"mluc" + struct.pack(">LLL2s2sLL", 0, 1, 12, b"en", b"US", len(content), 28) + content
-
-    def xyz(*values):
-        return b"XYZ " + bytes(4) + fixed(*values)
-
-    curve = b"para" + bytes(4) + struct.pack(">HH", 3, 0)
-    curve += fixed(2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
-    tags = {b"desc": text(name), b"cprt": text("none"), b"wtpt": xyz(0.9642, 1, 0.8249)}
-    tags |= {b"rXYZ": xyz(*red), b"gXYZ": xyz(*green), b"bXYZ": xyz(*blue)}
-    tags |= dict.fromkeys((b"rTRC", b"gTRC", b"bTRC"), curve)
-    table, body = struct.pack(">L", len(tags)), b""
-    start = 128 + 4 + 12 * len(tags)
-    for tag, content in tags.items():
-        table += tag + struct.pack(">LL", start + len(body), len(content))
-        body += content + bytes(-len(content) % 4)
-    header = struct.pack(">L4sL4s4s4s", start + len(body), bytes(4), 0x04000000, b"mntr", b"RGB ", b"XYZ ")
-    header += struct.pack(">6H", 2026, 1, 1, 0, 0, 0) + b"acsp" + bytes(28) + fixed(0.9642, 1, 0.8249)
-    return header.ljust(128, b"\0") + table + body
-
-
-SRGB = (0.4361, 0.2225, 0.0139), (0.3851, 0.7169, 0.0971), (0.1431, 0.0606, 0.7141)
-DISPLAY_P3 = (0.5151, 0.2412, -0.0011), (0.2920, 0.6922, 0.0419), (0.1571, 0.0666, 0.7841)
 
 
 # Two files
@@ -623,15 +591,6 @@ def test_an_animation_is_refused_with_the_number_of_its_pictures(tmp_path, pair,
     path = tmp_path / f"a.{ending}"
     Image.fromarray(pair.left).save(path, save_all=True, append_images=[Image.fromarray(pair.right)])
     assert "an animation of 2" in refusal(path)
-
-
-def png_of(width_px, height_px):
-    """A PNG that says it is of this size, with hardly any content."""
-    content = io.BytesIO()
-    Image.new("L", (1, 1)).save(content, "PNG")
-    head = b"IHDR" + struct.pack(">LL", width_px, height_px) + content.getvalue()[24:29]
-    whole = content.getvalue()
-    return whole[:12] + head + struct.pack(">L", zlib.crc32(head)) + whole[33:]
 
 
 @pytest.mark.parametrize(

@@ -183,18 +183,33 @@ def test_a_missing_key_is_named_in_one_line(missing):
     assert str(caught.value) == f"my.toml: missing key '{missing}'; a recipe needs {', '.join(NEEDED)}"
 
 
-@pytest.mark.parametrize("content", [b"steps = ", b"\xff\xfe\x00", b"[table"])
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"steps = ",
+        b"\xff\xfe\x00",
+        b"[table",
+        b"steps = " + b"9" * 5000,
+        b"steps = " + b"[" * 60_000,
+        b"steps = " + b"{a = " * 20_000,
+    ],
+)
 def test_a_file_that_is_no_toml_is_named_in_one_line(tmp_path, content):
     file = tmp_path / "bad.toml"
     file.write_bytes(content)
     with pytest.raises(FormatError) as caught:
         read_recipe(file)
-    assert str(caught.value).startswith(f"{file}: expected a recipe in TOML, found: ")
+    assert str(caught.value).startswith(f"{file}: expected a recipe in TOML, found one that cannot be read (")
     assert "\n" not in str(caught.value)
 
 
+def test_a_recipe_without_end_is_refused():
+    with pytest.raises(FormatError, match="/dev/zero: expected a regular file, found a pipe or a device"):
+        read_recipe(Path("/dev/zero"))
+
+
 def test_a_file_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(FormatError, match=r"nowhere\.toml: expected a recipe in TOML, found: .*No such file"):
+    with pytest.raises(FormatError, match=r"nowhere\.toml: expected a recipe in TOML, found no such file"):
         read_recipe(tmp_path / "nowhere.toml")
 
 

@@ -95,6 +95,22 @@ def test_pairs_are_read_by_index_across_shards(folder):
     ]
 
 
+@pytest.mark.parametrize(
+    ("damage", "found"),
+    [
+        ({"left.webp": b"RIFF"}, "left.webp: expected a picture"),
+        ({"disparity.png": b"%!PS-Adobe-3.0 EPSF-3.0\n"}, "disparity.png: expected a picture"),
+        ({"camera.json": b"[]"}, "found ship-000000 without or with damaged ones"),
+        ({"camera.json": b"{}"}, "steps_per_px"),
+    ],
+)
+def test_a_damaged_file_of_a_pair_is_named_though_its_checksum_is_right(tmp_path, damage, found):
+    write_shard(tmp_path, "ship", 0, [packed(pair(1), {}) | damage])
+    message = error_of(Shards(tmp_path).__getitem__, 0)
+    assert message.startswith(f"{tmp_path / 'ship-000000-000000.tar'}: expected the files of a pair")
+    assert found in message
+
+
 @pytest.mark.parametrize("index", [-1, 10])
 def test_an_index_outside_of_the_set_is_an_index_error(folder, index):
     with pytest.raises(IndexError):
@@ -174,8 +190,8 @@ def facts(**changes):
         ("camera.json", None, "no camera.json"),
         ("left.webp", b"no picture", "left.webp"),
         ("left.webp", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 48 32\n", "left.webp"),
-        ("left.webp", png(np.zeros((32, 48), np.uint8)), "left.webp that cannot be used: mode L"),
-        ("disparity.png", png(np.zeros((32, 48), np.uint8)), "disparity.png that cannot be used: mode L"),
+        ("left.webp", png(np.zeros((32, 48), np.uint8)), "left.webp of another kind"),
+        ("disparity.png", png(np.zeros((32, 48), np.uint8)), "disparity.png of another kind"),
         ("disparity.png", png(np.zeros((32, 47), np.uint16)), "disparity.png of 47x32"),
         ("occluded.png", png(np.zeros((31, 48), bool)), "occluded.png of 48x31"),
         ("camera.json", b"[" * 5000, "recursion"),

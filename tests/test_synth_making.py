@@ -1,5 +1,6 @@
 import io
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -55,12 +56,14 @@ def made(out, pairs=10, order=ORDER, studio=STUDIO, **options):
     return make(order, pairs, out, studio=studio, console=Console(file=io.StringIO()), **options)
 
 
-def run(folder, out, studio="PaintedStudio()", first=""):
-    """The same in a process of its own; returns when it and all that it started have ended."""
+def start(folder, out, studio="PaintedStudio()", first=""):
+    """The same in a process of its own."""
     program = folder / "program.py"
     program.write_text(PROGRAM.format(out=str(out), studio=studio, first=first))
-    paths = {"PYTHONPATH": str(Path(__file__).parent), "PATH": "/usr/bin:/bin"}
-    return subprocess.run([sys.executable, program], capture_output=True, text=True, check=False, env=paths)
+    tests = Path(__file__).parent
+    paths = {"PYTHONPATH": f"{tests}:{tests.parent}", "PATH": "/usr/bin:/bin"}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen([sys.executable, program], **pipes, text=True, env=paths)
 
 
 @pytest.fixture(scope="module")
@@ -120,11 +123,16 @@ def test_a_killed_worker_is_told_in_a_line_and_the_same_call_goes_on_to_the_same
     assert contents(tmp_path) == contents(finished)
 
 
-def test_workers_end_with_the_process_that_started_them_and_another_one_goes_on(finished, tmp_path):
+def test_no_other_process_goes_on_before_one_is_killed_with_its_workers(finished, tmp_path):
     out = tmp_path / "set"
-    killed = run(tmp_path, out, studio="PaintedStudio(orphaned_at=6)")
-    assert killed.returncode == -9, killed.stderr
-    assert sorted(contents(out)) == ["pylon-000000-000003.tar", "set.json"]
+    first = start(tmp_path, out, studio="PaintedStudio(halts_at=6)")
+    try:
+        os.waitpid(first.pid, os.WUNTRACED)
+        assert "expected an output that nobody writes to, found one that is in use" in error_of(made, out)
+    finally:
+        first.kill()
+        first.communicate()  # which returns when its workers have ended too
+    assert sorted(contents(out)) == [".lock", "pylon-000000-000003.tar", "set.json"]
     (out / ".pylon-000004-000007-0123abcd.tar").write_bytes(b"half a shard")
     assert made(out) == 6
     assert contents(out) == contents(finished)
@@ -133,8 +141,8 @@ def test_workers_end_with_the_process_that_started_them_and_another_one_goes_on(
 def test_a_full_disk_is_told_in_a_line_and_leaves_nothing_half_written(tmp_path):
     out = tmp_path / "set"
     # Room for set.json, and not for a shard: the same OSError on the same way as from a full disk.
-    full = run(tmp_path, out, first="resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))")
-    message = full.stderr.splitlines()[-1]
+    full = start(tmp_path, out, first="resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))")
+    message = full.communicate()[1].splitlines()[-1]
     assert "pylon-000000-000003.tar: expected a file that can be written, found file too large" in message
     assert message.endswith("what is there is whole, and the same command goes on")
     assert sorted(contents(out)) == ["set.json"]

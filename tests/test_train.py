@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from conftest import halted
 from dataset_examples import write_map, write_picture
 from learn_examples import (
     CAMERA,
@@ -32,7 +33,7 @@ from rich.console import Console
 from stereoweave.data.packing import packed
 from stereoweave.data.shards import write_shard
 from stereoweave.error_classes import CLASSES
-from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.errors import FormatError, OutputInUseError, StereoweaveError
 from stereoweave.learn import checkpoint
 from stereoweave.learn import train as training
 from stereoweave.learn.batches import Batches
@@ -116,7 +117,7 @@ def assert_same(one, other):
         assert one == other
 
 
-def test_a_run_that_is_killed_and_started_again_ends_as_one_that_was_not(folder, recipe_file, finished):
+def test_a_run_that_is_killed_and_then_started_again_ends_as_one_that_was_not(folder, recipe_file, finished):
     last = folder / "killed" / "last.pt"
     code = (
         "import sys; from pathlib import Path; from stereoweave.learn.train import train; "
@@ -131,7 +132,10 @@ def test_a_run_that_is_killed_and_started_again_ends_as_one_that_was_not(folder,
         )
         while not last.exists() and process.poll() is None:
             time.sleep(0.005)
-        process.send_signal(signal.SIGKILL)
+        with halted(process):
+            with pytest.raises(OutputInUseError, match="killed: .* found one that is in use"):
+                train(recipe_file, last.parent, QUIET)
+            process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL, (folder / "killed.log").read_text()
     killed = checkpoint.load(last)
     assert 0 < killed.step < RECIPE.steps

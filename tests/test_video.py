@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -11,6 +12,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from conftest import halted
 from film_examples import EXAMPLES, damage, example_pairs, packets, write_side_by_side, write_video
 
 from stereoweave.cli import main
@@ -195,6 +197,27 @@ def test_a_film_that_was_interrupted_goes_on_to_the_same_frames(tmp_path, monkey
     [whole], [broken] = tmp_path.glob("whole*"), tmp_path.glob("broken*")
     np.testing.assert_array_equal(frames_of(broken), frames_of(whole))
     assert times_of(broken) == times_of(film)
+
+
+def test_a_film_that_is_being_made_is_refused_until_its_process_is_killed(tmp_path, capsys):
+    film, out = slow_film(tmp_path / "in.mp4"), tmp_path / "out.mp4"
+    program = "import sys; from stereoweave.cli import main; sys.exit(main())"
+    words = ["video", film, "-o", out, "--depth", "--threads", "1"]
+    first = subprocess.Popen([sys.executable, "-c", program, *words], stderr=subprocess.DEVNULL)
+    while not any(tmp_path.glob("*.parts/*.nut")) and first.poll() is None:
+        time.sleep(0.002)
+    (tmp_path / "link").symlink_to(tmp_path)
+    with halted(first):
+        assert run(film, tmp_path / "link" / "out.mp4", "--depth") == 2
+        first.kill()
+    assert capsys.readouterr().err == (
+        f"stereoweave: {tmp_path / 'link' / 'out.mp4'}: expected an output that nobody writes to, found one "
+        "that is in use; wait for the other command to end, or choose another output\n"
+    )
+    assert first.wait() == -signal.SIGKILL
+    assert run(film, out, "--depth") == 0
+    assert len(frames_of(out)) == 25
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.mp4", "link", "out.mp4"]
 
 
 def test_another_order_does_not_go_on_with_what_was_begun(tmp_path, monkeypatch, capsys):

@@ -114,7 +114,14 @@ def test_a_disparity_of_another_size_is_named(scene):
 
 @pytest.mark.parametrize(
     "text",
-    ["{", "[]", '{"offset_px": [1]}', '{"offset_px": {"0.5": [1]}}', '{"offset_px": {"0.5": ["a", null]}}'],
+    [
+        "{",
+        "[]",
+        '{"offset_px": [1]}',
+        '{"offset_px": {"0.5": [1]}}',
+        '{"offset_px": {"0.5": ["a", null]}}',
+        "[" * 60_000,
+    ],
 )
 def test_offsets_of_another_form_are_named(scene, text):
     (scene / "scene.json").write_text(text)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
+from stereoweave.calibration_files import calibration_bytes
 from stereoweave.data.frames import Frame, existing, matched
 from stereoweave.data.samples import make_sample, of_its_size
 from stereoweave.errors import FormatError
@@ -58,7 +59,9 @@ def _read_disparity(path: Path, pair: StereoPair) -> Float32[np.ndarray, "h w"]:
 def _read_camera(path: Path, keys: tuple[str, str]) -> StereoCamera:
     """The camera of two projections P = K [I | t]: P[0, 3] = focal_px * t, and the baseline is t0 - t1."""
     with reading(path, "a calibration of KITTI"):
-        lines = (line.partition(":") for line in path.read_text(errors="replace").splitlines())
+        lines = (
+            line.partition(":") for line in calibration_bytes(path).decode(errors="replace").splitlines()
+        )
         entries = {key: numbers.split() for key, _, numbers in lines}
         missing = [key for key in keys if len(entries.get(key, [])) != 12]
         if missing:

@@ -11,7 +11,7 @@ from stereoweave.calibration_files import calibrated
 from stereoweave.data.frames import Frame, scenes
 from stereoweave.data.samples import make_sample, of_its_size
 from stereoweave.errors import FormatError
-from stereoweave.io import read_pair, read_pfm, read_pixels, reading
+from stereoweave.io import read_pair, read_pfm, read_pixels, read_small, reading
 from stereoweave.stereo import Sample, StereoCamera, StereoPair
 
 
@@ -143,7 +143,7 @@ def _camera_2006(dmin: Path, pair: StereoPair, shrinking: int) -> StereoCamera:
     No principal point is published: it is set to the middle of the picture.
     """
     with reading(dmin, "a number of pixels"):
-        doffs_px = float(dmin.read_text(errors="replace")) / shrinking
+        doffs_px = float(read_small(dmin).decode(errors="replace")) / shrinking
         height_px, width_px = pair.left.shape[:2]
         return StereoCamera(
             focal_px=3740 / shrinking,

@@ -10,12 +10,12 @@ import re
 import tarfile
 from bisect import bisect_right
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from io import BufferedReader, BytesIO
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Int, UInt8
@@ -26,6 +26,8 @@ from stereoweave.data.packing import unpacked, unpacked_views
 from stereoweave.errors import FormatError
 from stereoweave.io import reading, replacing
 from stereoweave.stereo import Sample
+
+Unpacked = TypeVar("Unpacked")
 
 _SUMS = "sha256"
 _DELETE = "delete it, and the same stereoweave synth make makes its pairs again"
@@ -114,9 +116,7 @@ class Shards:
         self._contents: dict[Path, dict[str, dict[str, tuple[int, int]]]] = {}
 
     def __getitem__(self, index: int) -> Sample:
-        files = self.files(index)
-        with reading(self._shard(index).path, f"the pair {self.name(index)}"):
-            return unpacked(files)
+        return self._unpacked(index, unpacked)
 
     def name(self, index: int) -> str:
         """What the names of the pair's files begin with."""
@@ -124,9 +124,7 @@ class Shards:
 
     def views(self, index: int) -> dict[float, UInt8[np.ndarray, "h w 3"]]:
         """The further pictures of a pair, by their position between the cameras."""
-        files = self.files(index)
-        with reading(self._shard(index).path, f"the pictures of {self.name(index)}"):
-            return unpacked_views(files)
+        return self._unpacked(index, unpacked_views)
 
     def files(self, index: int) -> dict[str, bytes]:
         """The files of a pair by the ends of their names, checked; FormatError where one is damaged."""
@@ -143,6 +141,16 @@ class Shards:
         sizes = np.diff(self._starts)
         window = rng.permutation(len(sizes)) // _WINDOW
         return np.lexsort((rng.random(self.count), window.repeat(sizes)))
+
+    def _unpacked(self, index: int, unpack: Callable[[Mapping[str, bytes]], Unpacked]) -> Unpacked:
+        files = self.files(index)
+        try:
+            return unpack(files)
+        except (ValueError, KeyError, TypeError) as error:  # checksums are no proof of who wrote the files
+            raise FormatError(
+                f"{self._shard(index).path}: expected the files of a pair, found {self.name(index)} without "
+                f"or with damaged ones ({error}); {_DELETE}"
+            ) from error
 
     def _shard(self, index: int) -> Shard:
         if not 0 <= index < self.count:

@@ -11,7 +11,7 @@ from jaxtyping import Float32, UInt8
 from stereoweave.data.frames import Frame, matched
 from stereoweave.data.samples import make_sample, of_its_size
 from stereoweave.errors import FormatError
-from stereoweave.io import read_pair, read_pixels, reading
+from stereoweave.io import read_pair, read_pixels, read_small, reading
 from stereoweave.stereo import Sample, StereoCamera
 
 # "Rendered from two cameras with a baseline of 10 cm apart": the dataset's README.
@@ -57,7 +57,7 @@ def _unpacked_px(packed: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w
 def _read_camera(path: Path) -> StereoCamera:
     """The camera of a .cam file: a tag, then 3x3 intrinsics and 3x4 extrinsics, row by row, little-endian."""
     with reading(path, "a camera of MPI Sintel"):
-        content = path.read_bytes()
+        content = read_small(path)
         if len(content) != _CAM.size or struct.unpack_from("<f", content)[0] != _CAM_TAG:
             raise FormatError(
                 f"{path}: expected a camera of MPI Sintel, {_CAM.size} bytes that begin with {_CAM_TAG}, "

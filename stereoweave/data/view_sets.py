@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 from stereoweave.data.samples import make_sample, of_its_size
 from stereoweave.data.shards import Shards, list_shards
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io import read_disparity_png, read_image, read_pair, read_pfm, reading
+from stereoweave.io import read_disparity_png, read_image, read_pair, read_pfm, read_small, reading
 from stereoweave.rendering import FIRST_POSITION, LAST_POSITION
 from stereoweave.stereo import Sample, StereoPair
 
@@ -144,7 +144,7 @@ def _read_offsets(path: Path) -> dict[float, tuple[float, float]]:
         return {}
     with reading(path, 'JSON whose "offset_px" is {position: [right, down]}'):
         try:
-            offsets_px = json.loads(path.read_text()).get("offset_px", {})
+            offsets_px = json.loads(read_small(path)).get("offset_px", {})
             return {float(position): (float(x), float(y)) for position, (x, y) in offsets_px.items()}
         except (AttributeError, TypeError) as error:
             raise ValueError("another form") from error

@@ -8,6 +8,7 @@ from stereoweave.data.shards import write_shard
 from stereoweave.errors import StereoweaveError
 from stereoweave.io import SMALLEST_SIDE_PX, make_folder
 from stereoweave.learn.collage import sample
+from stereoweave.output_lock import lock_output
 
 SET_NAME = "collage"
 _PAIRS_A_SHARD = 50
@@ -31,11 +32,14 @@ def write_collages(out: Path, pairs: int, seed: int, size_px: tuple[int, int]) -
             f"found {size_px[1]}x{size_px[0]}"
         )
     make_folder(out)
-    if any(out.iterdir()):
-        raise StereoweaveError(f"{out}: expected a new or empty folder, found files in it; name another one")
-    for first in range(0, pairs, _PAIRS_A_SHARD):
-        numbers = range(first, min(first + _PAIRS_A_SHARD, pairs))
-        write_shard(out, SET_NAME, first, list(_packed_collages(seed, numbers, size_px)))
+    with lock_output(out):
+        if any(out.glob("[!.]*")):
+            raise StereoweaveError(
+                f"{out}: expected a new or empty folder, found files in it; name another one"
+            )
+        for first in range(0, pairs, _PAIRS_A_SHARD):
+            numbers = range(first, min(first + _PAIRS_A_SHARD, pairs))
+            write_shard(out, SET_NAME, first, list(_packed_collages(seed, numbers, size_px)))
 
 
 def _packed_collages(seed: int, numbers: range, size_px: tuple[int, int]) -> Iterator[dict[str, bytes]]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from stereoweave.learn.collage import sample as make_sample
+from stereoweave.output_lock import lock_output
 from stereoweave.stereo import Sample
 
 # Disparity is kept as 16-bit fixed point, KITTI's 1/256 px: half the bytes of float32, and exact enough.
@@ -41,7 +42,7 @@ class KeptPairs:
         """Make the missing pairs in parallel, yielding the index of each as it is done."""
         self.folder.mkdir(parents=True, exist_ok=True)
         # Started afresh, because a forked child inherits PyTorch's threads in an unknown state.
-        with multiprocessing.get_context("spawn").Pool(os.cpu_count()) as workers:
+        with lock_output(self.folder), multiprocessing.get_context("spawn").Pool(os.cpu_count()) as workers:
             yield from workers.imap_unordered(partial(_make, self), self.missing(), chunksize=8)
 
     def keep(self, index: int, sample: Sample) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from stereoweave.errors import FormatError
+from stereoweave.io import read_small, reading
 
 # In characters; our longest recipe has 1,064. Python's time for a key grows with the square of its dots.
 _LONGEST = 10_000
@@ -135,14 +136,11 @@ class Recipe:
 
 def read_recipe(path: Path) -> Recipe:
     """The recipe of a TOML file; FormatError for a key that is unknown, missing, mistyped or out of range."""
-    try:
-        with path.open(encoding="utf-8") as stream:
-            text = stream.read(_LONGEST + 1)
+    with reading(path, "a recipe in TOML"):
+        text = read_small(path).decode()
         if len(text) > _LONGEST:
             raise ValueError(f"more than {_LONGEST} characters")
         values = tomllib.loads(text)
-    except (OSError, ValueError, RecursionError) as error:
-        raise FormatError(f"{path}: expected a recipe in TOML, found: {error}") from error
     return recipe_from(values, str(path))
 
 

@@ -41,6 +41,7 @@ from stereoweave.learn.recipe import COLLAGE, Recipe, read_recipe
 from stereoweave.learn.sources import Source, held_out_sets, kept, sources
 from stereoweave.learn.sums import StepSums
 from stereoweave.learn.validate import validate_by_class
+from stereoweave.output_lock import lock_output
 from stereoweave.progress import progress
 
 # Beside a run's checkpoint: its scores after each validation.
@@ -63,8 +64,8 @@ def train(recipe_path: Path, out: Path, console: Console | None = None) -> Path:
     Started by torchrun, its processes share each step's micro-batches, and the first of them alone writes.
 
     Raises:
-        StereoweaveError: for a recipe that is none, where `out` holds the run of another one, or where the
-            loss is no longer finite.
+        StereoweaveError: for a recipe that is none, where `out` is in use or holds the run of another one, or
+            where the loss is no longer finite.
     """
     with told_once(), _no_farewell_after_an_error():
         return train_recipe(read_recipe(recipe_path), out, console or Console(quiet=ranks().rank > 0))
@@ -73,6 +74,13 @@ def train(recipe_path: Path, out: Path, console: Console | None = None) -> Path:
 def train_recipe(recipe: Recipe, out: Path, console: Console) -> Path:
     """As `train`, of a recipe at hand."""
     _check(recipe)
+    if ranks().rank:  # the first process writes, and locks, for all
+        return _train(recipe, out, console)
+    with lock_output(make_folder(out)):
+        return _train(recipe, out, console)
+
+
+def _train(recipe: Recipe, out: Path, console: Console) -> Path:
     last = out / "last.pt"
     logger = TensorBoardLogger(out, name="", version="")
     fabric = _fabric(logger)
@@ -104,7 +112,6 @@ def _ready(recipe: Recipe, out: Path, console: Console, fabric: Fabric) -> tuple
     """The pairs to train on and to score on, made by the first process where they were not there."""
     found = sources(recipe, out.parent / "pairs")
     if fabric.is_global_zero:
-        make_folder(out)
         for pairs in found:
             kept(pairs, console)
     fabric.barrier()

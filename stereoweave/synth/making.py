@@ -19,7 +19,8 @@ from stereoweave.data.paper_layout import remove_unfinished, whole_frames, write
 from stereoweave.data.shards import list_shards, write_shard
 from stereoweave.engine import Engine
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io import SMALLEST_SIDE_PX, is_leftover, make_folder, reading, remove_leftovers, replacing
+from stereoweave.io import SMALLEST_SIDE_PX, make_folder, reading, remove_leftovers, replacing
+from stereoweave.output_lock import lock_output
 from stereoweave.rendering import FIRST_POSITION, LAST_POSITION
 from stereoweave.synth.samples import Camera, Order, Rendered, rendered
 from stereoweave.synth.workers import in_engine, in_workers, step_done
@@ -105,28 +106,31 @@ def make(  # noqa: PLR0913 - each is a word of the command line
         console: Where the progress is shown.
 
     Raises:
-        StereoweaveError: Nonsense was asked for, `out` has another set in it or cannot be written, the disk
-            is full, a worker was killed, or a machine does not see `out` or would make other pairs. All that
-            is there then is whole, and the same call goes on.
+        StereoweaveError: Nonsense was asked for, `out` has another set in it, is in use or cannot be written,
+            the disk is full, a worker was killed, or a machine does not see `out` or would make other pairs.
+            All that is there then is whole, and the same call goes on.
     """
     _check(order, pairs, layout)
     make_folder(out)
-    _claim(out, _facts(order, layout, studio), pairs)
-    runs = _runs(_lacking(order, pairs, out, layout), LAYOUTS[layout].pairs_a_run)
-    missing = sum(map(len, runs))
-    told = console or Console(), f"making {order.scene}", missing
-    try:
-        if engine is None:
-            for _ in in_workers(partial(_make_run, order, out, layout, studio), runs, jobs, *told):
-                pass
-        else:
-            # Absolute, because its workers have another current folder.
-            in_engine(partial(_on_a_node, order, out.absolute(), layout, studio), runs, engine, *told)
-            _check_shared(out, _lacking(order, pairs, out, layout))
-    except StereoweaveError as error:
-        raise StereoweaveError(f"{error}; what is there is whole, and the same command goes on") from error
-    finally:
-        LAYOUTS[layout].tidy(out)
+    with lock_output(out):
+        _claim(out, _facts(order, layout, studio), pairs)
+        runs = _runs(_lacking(order, pairs, out, layout), LAYOUTS[layout].pairs_a_run)
+        missing = sum(map(len, runs))
+        told = console or Console(), f"making {order.scene}", missing
+        try:
+            if engine is None:
+                for _ in in_workers(partial(_make_run, order, out, layout, studio), runs, jobs, *told):
+                    pass
+            else:
+                # Absolute, because its workers have another current folder.
+                in_engine(partial(_on_a_node, order, out.absolute(), layout, studio), runs, engine, *told)
+                _check_shared(out, _lacking(order, pairs, out, layout))
+        except StereoweaveError as error:
+            raise StereoweaveError(
+                f"{error}; what is there is whole, and the same command goes on"
+            ) from error
+        finally:
+            LAYOUTS[layout].tidy(out)
     return missing
 
 
@@ -211,7 +215,7 @@ def _claim(out: Path, facts: dict[str, Any], pairs: int) -> None:
         pairs = max(pairs, found.pop("pairs"))
         check_claim(out / SET_FILE, facts, found)
     else:
-        check_unclaimed(out, SET_FILE, (path.name for path in out.iterdir() if not is_leftover(path)))
+        check_unclaimed(out, SET_FILE, (path.name for path in out.iterdir() if path.name[0] != "."))
     LAYOUTS[facts["layout"]].tidy(out)
     with replacing(out / SET_FILE) as temporary:
         temporary.write_text(description(facts | {"pairs": pairs}), encoding="utf-8")

@@ -1,0 +1,118 @@
+"""The seeded draw of mutants."""
+
+import ast
+import random
+import re
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from difflib import unified_diff
+from pathlib import Path
+
+from cosmic_ray.ast import ast_nodes, get_ast
+from cosmic_ray.mutating import mutate_code
+from cosmic_ray.operators.operator import Operator
+
+from mutate.operators import operators
+from mutate.targets import TARGETS
+
+Place = tuple[int, int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mutant:
+    """A source with one change.
+
+    Attributes:
+        target: The part of the package, a key of TARGETS.
+        path: The source, relative to the repository's root.
+        line: Where it is changed, from 1.
+        operator: The name of the operator that changes it.
+        before: The whole source.
+        after: The whole source, changed.
+    """
+
+    target: str
+    path: str
+    line: int
+    operator: str
+    before: str
+    after: str
+
+    def diff(self) -> str:
+        """What is changed, as a patch."""
+        before, after = (text.splitlines(keepends=True) for text in (self.before, self.after))
+        return "".join(unified_diff(before, after, f"a/{self.path}", f"b/{self.path}", n=2))
+
+
+def draw(root: Path, count: int, seed: int) -> list[Mutant]:
+    """Mutants at places that are drawn evenly from all sources; those of a lower count come first.
+
+    At each place one change is drawn from those that the operators offer there.
+    """
+    available = [
+        (target, path, place, changes)
+        for target, settings in TARGETS.items()
+        for path in settings.source_files(root)
+        for place, changes in sorted(places(root / path).items())
+    ]
+    rng = random.Random(seed)
+    rng.shuffle(available)
+    drawn: list[Mutant] = []
+    for target, path, place, changes in available:
+        if len(drawn) == count:
+            break
+        name, operator, occurrence = rng.choice(changes)
+        before = (root / path).read_text(encoding="utf-8")
+        after = mutate_code(before, operator, occurrence)
+        if after is not None and _differs(before, after):
+            drawn.append(
+                Mutant(target=target, path=path, line=place[0], operator=name, before=before, after=after)
+            )
+    return drawn
+
+
+def places(path: Path) -> dict[Place, list[tuple[str, Operator, int]]]:
+    """Where a source can be changed (line, column), and by which occurrence of which operators."""
+    source = path.read_text(encoding="utf-8")
+    left_out = list(_left_out(ast.parse(source)))
+    nodes = list(ast_nodes(get_ast(source)))
+    found = defaultdict(list)
+    for name, operator in operators().items():
+        starts = ((node, start) for node in nodes for start, _ in operator.mutation_positions(node))
+        for occurrence, (node, place) in enumerate(starts):
+            # The `*` before parameters that have names looks like a product.
+            is_mark = node.parent is not None and node.parent.type == "parameters"
+            if not is_mark and not any(first <= place < last for first, last in left_out):
+                found[place].append((name, operator, occurrence))
+    return dict(found)
+
+
+def _left_out(tree: ast.Module) -> Iterator[tuple[Place, Place]]:
+    """What no test can or should notice, and `/` between paths, which no other operator could replace."""
+    for node in ast.walk(tree):
+        # `strict` of zip is an assertion.
+        is_assertion = isinstance(node, ast.keyword) and node.arg == "strict"
+        is_for_types = isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div) and _is_path(node.left):
+            yield _end(node.left), (node.right.lineno, node.right.col_offset)
+        parts = [getattr(node, "annotation", None), getattr(node, "returns", None)]
+        if isinstance(node, ast.Raise | ast.JoinedStr) or is_assertion or is_for_types:
+            parts.append(node)
+        yield from (((part.lineno, part.col_offset), _end(part)) for part in parts if part is not None)
+
+
+def _end(node: ast.expr) -> Place:
+    return node.end_lineno or node.lineno, node.end_col_offset or 0
+
+
+def _is_path(node: ast.expr) -> bool:
+    return bool(re.search(r"folder|path|Path|parent|\bout\b", ast.unparse(node)))
+
+
+def _differs(before: str, after: str) -> bool:
+    """Whether the changed source is still Python, and another program."""
+    try:
+        return ast.dump(ast.parse(before)) != ast.dump(ast.parse(after))
+    except SyntaxError:
+        return False

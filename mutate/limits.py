@@ -1,0 +1,12 @@
+"""A pytest plugin that bounds the memory of the tests and of each process that they start."""
+
+import resource
+
+# A changed loop may fill a list without end.
+_MOST_BYTES = 8 * 2**30
+
+
+def pytest_configure() -> None:
+    """Set the limit before any test is collected."""
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    resource.setrlimit(resource.RLIMIT_DATA, (_MOST_BYTES, hard))

@@ -1,0 +1,173 @@
+"""A run over mutants that can be stopped and continued."""
+
+import hashlib
+import json
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from queue import Queue
+from typing import Any
+
+from mutate.covering import Covered, lines_run, read_covered
+from mutate.drawing import Mutant
+from mutate.measuring import TIMES_FILE
+from mutate.targets import TARGETS
+from mutate.trees import Tree, repository_files
+
+KILLED, SURVIVED, TIMEOUT = "killed", "survived", "timeout"
+
+_MEASURED_WITHIN_S = 900
+# A loaded machine takes longer than it did when the tests were measured.
+_TIMES_AS_LONG, _START_S = 4, 60
+# Tests that call nearly all kernels of Numba.
+_COMPILING = ("tests/test_moving.py", "tests/test_synthesis.py")
+# Pytest's exit code where no test was found.
+_NO_TESTS = 5
+# Nothing else can change what a test finds.
+_PARTS = ("stereoweave/", "tests/", "examples/", "mutate/", "pyproject.toml")
+
+Telling = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What came of a mutant: killed, survived or timeout; how long it took, and how many tests were asked."""
+
+    mutant: Mutant
+    outcome: str
+    seconds: float
+    tests: int
+
+
+class Session:
+    """A run on this state of sources and tests: what was measured, and the outcomes, are kept in a folder."""
+
+    def __init__(self, root: Path, runs: Path, jobs: int) -> None:
+        self.root = root
+        self.folder = runs / _digest(root)
+        (self.folder / "covered").mkdir(parents=True, exist_ok=True)
+        self._trees = [Tree(root, runs / f"tree-{index}") for index in range(jobs)]
+        self._free: Queue[Tree] = Queue()
+        for tree in self._trees:
+            self._free.put(tree)
+
+    def measure(self, told: Telling) -> Covered:
+        """Which tests cover which lines, as far as that was not measured before."""
+        files = sorted({file for target in TARGETS.values() for file in target.test_files(self.root)})
+        with self._at_once() as pool:
+            if any(not self._kept(file).exists() for file in files):
+                told("compiling")
+                list(pool.map(self._compile, self._trees))
+            return read_covered(pool.map(lambda file: self._measured(file, told), files))
+
+    def try_all(self, mutants: Sequence[Mutant], covered: Covered, seed: int) -> Iterator[Trial]:
+        """The outcomes as they come; those of an earlier run of this session first."""
+        kept = self.folder / f"outcomes-{seed}.jsonl"
+        known = _outcomes(kept)
+        waiting = []
+        for turn, mutant in enumerate(mutants):
+            if turn in known:
+                yield Trial(mutant, **known[turn])
+            else:
+                waiting.append((turn, mutant))
+        with self._at_once() as pool, kept.open("a", encoding="utf-8") as out:
+            trials = {pool.submit(self._try, mutant, covered, turn): turn for turn, mutant in waiting}
+            for future in as_completed(trials):
+                trial = future.result()
+                facts = {"outcome": trial.outcome, "seconds": trial.seconds, "tests": trial.tests}
+                out.write(json.dumps({"turn": trials[future]} | facts) + "\n")
+                out.flush()
+                yield trial
+
+    @contextmanager
+    def _at_once(self) -> Iterator[ThreadPoolExecutor]:
+        """As many threads as there are trees; the tests are ended when something goes wrong here."""
+        pool = ThreadPoolExecutor(len(self._trees))
+        try:
+            yield pool
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for tree in self._trees:
+                tree.stop()
+            pool.shutdown()
+
+    @contextmanager
+    def _a_tree(self) -> Iterator[Tree]:
+        tree = self._free.get()
+        try:
+            yield tree
+        finally:
+            self._free.put(tree)
+
+    def _compile(self, tree: Tree) -> None:
+        """Compile the kernels for a copy, so that the first test to call them is not taken for slow."""
+        words = [file for file in _COMPILING if (tree.folder / file).exists()]
+        if words:
+            tree.pytest(words, self.folder / f"log-{tree.folder.name}.txt", _MEASURED_WITHIN_S)
+
+    def _kept(self, file: str) -> Path:
+        return self.folder / "covered" / f"{Path(file).stem}.json"
+
+    def _measured(self, file: str, told: Telling) -> Path:
+        """The JSON file of what was measured of a test file."""
+        kept = self._kept(file)
+        if not kept.exists():
+            with self._a_tree() as tree, tempfile.TemporaryDirectory(dir=self.folder) as folder:
+                told(f"measuring {file}")
+                measured = _measure(tree, file, Path(folder))
+                # Whole or not at all.
+                partial = Path(folder, "measured.json")
+                partial.write_text(json.dumps(measured), encoding="utf-8")
+                partial.replace(kept)
+        return kept
+
+    def _try(self, mutant: Mutant, covered: Covered, turn: int) -> Trial:
+        start_s = time.perf_counter()
+        tests = covered.choose(mutant, self.root)
+        limit_s = _START_S + _TIMES_AS_LONG * covered.seconds(tests)
+        asked, log = self.folder / f"tests-{turn}.txt", self.folder / f"log-{turn}.txt"
+        asked.write_text("\n".join(tests), encoding="utf-8")
+        with self._a_tree() as tree, tree.changed(mutant.path, mutant.after, turn):
+            code = tree.pytest(["-x", f"@{asked}"], log, limit_s)
+        if code == _NO_TESTS:
+            raise RuntimeError(f"{log}: expected tests that cover {mutant.path}:{mutant.line}, found none")
+        outcome = {None: TIMEOUT, 0: SURVIVED}.get(code, KILLED)
+        return Trial(mutant, outcome, round(time.perf_counter() - start_s, 1), len(tests))
+
+
+def _measure(tree: Tree, file: str, folder: Path) -> dict[str, Any]:
+    """What each test of a file takes, and the lines that it runs."""
+    sources = [tree.folder / path for target in TARGETS.values() for path in target.source_files(tree.folder)]
+    settings, times = folder / "coveragerc", folder / "times.json"
+    settings.write_text(
+        "[run]\nparallel = true\ncontext = ${PYTEST_CURRENT_TEST-}\n"
+        f"data_file = {folder}/.coverage\ninclude =\n" + "".join(f"    {source}\n" for source in sources),
+        encoding="utf-8",
+    )
+    variables = {"COVERAGE_PROCESS_START": str(settings), TIMES_FILE: str(times)}
+    log = folder.parent / f"log-{Path(file).stem}.txt"
+    tree.pytest(["-p", "mutate.measuring", file], log, _MEASURED_WITHIN_S, **variables)
+    if not times.exists():
+        raise RuntimeError(f"{log}: expected tests that end, found that they were stopped")
+    return json.loads(times.read_text(encoding="utf-8")) | {"lines": lines_run(folder, tree.folder)}
+
+
+def _outcomes(path: Path) -> dict[int, dict[str, Any]]:
+    """The outcomes of an earlier run, by the mutants' turns."""
+    if not path.exists():
+        return {}
+    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    return {line.pop("turn"): line for line in lines}
+
+
+def _digest(root: Path) -> str:
+    """What sources and tests are, in 12 digits."""
+    digest = hashlib.sha256()
+    for name in repository_files(root):
+        if name.startswith(_PARTS):
+            digest.update(name.encode() + b"\0" + hashlib.sha256((root / name).read_bytes()).digest())
+    return digest.hexdigest()[:12]

@@ -1,0 +1,133 @@
+"""Plain values from YAML, JSON and XML that may have been written to do harm.
+
+The text is read without aliases, DTDs or types of the writer's choice, and nothing recurses before its depth
+and its count have been checked. Its size is the caller's to limit: the time grows with it.
+"""
+
+import re
+from typing import Any
+from xml.etree import ElementTree
+
+import yaml
+
+_MOST_DEEP, _MOST_VALUES = 20, 10_000
+BASE64 = "$base64$"  # OpenCV's own mark in JSON
+_DECLARATION = re.compile(r"<!(?!--|\[CDATA\[)")
+_XML_ITEM = re.compile(r'"[^"]*"|\S+')
+# What OpenCV and others write in JSON and YAML does not allow there; a string is taken whole, ended or not.
+_JSON_ALONE = re.compile(r'("(?:[^"\\]|\\.)*+"?)|//.*|\t')
+
+
+def parse_entries(text: str) -> dict[str, Any]:
+    """The entries of YAML, of JSON or of XML as cv2.FileStorage writes it.
+
+    Each value is a string, as it stands, or a list or a dict of values. Binary data is a string that begins
+    with BASE64.
+
+    Raises:
+        ValueError or SyntaxError: It is none of them, or more deeply nested or of more values than any
+            calibration; it has an alias or a DTD.
+    """
+    start = text.lstrip()[:1]
+    if start == "<":
+        entries = _parse_xml(text)
+    else:
+        entries = _parse_yaml(_JSON_ALONE.sub(r"\1 ", text) if start == "{" else text)
+    if not isinstance(entries, dict):
+        raise ValueError("no entries with names")
+    return entries
+
+
+class _Gate:
+    """Counts the values that a parser enters, before it goes on."""
+
+    def __init__(self) -> None:
+        self._depth = self._values = 0
+
+    def enter(self) -> None:
+        self._depth += 1
+        self._values += 1
+        if self._depth > _MOST_DEEP:
+            raise ValueError(f"values nested more than {_MOST_DEEP} deep")
+        if self._values > _MOST_VALUES:
+            raise ValueError(f"more than {_MOST_VALUES} values")
+
+    def leave(self) -> None:
+        self._depth -= 1
+
+
+class _Loader(yaml.BaseLoader):
+    """PyYAML's loader of strings, lists and dicts alone, whatever the tags say."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._gate = _Gate()
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise ValueError("an alias (*); write its value in its place")
+        self._gate.enter()
+        node = super().compose_node(parent, index)
+        self._gate.leave()
+        return node
+
+
+def _marked(loader: _Loader, node: yaml.ScalarNode) -> str:
+    return BASE64 + str(loader.construct_scalar(node))
+
+
+_Loader.add_constructor("tag:yaml.org,2002:binary", _marked)
+
+
+def _parse_yaml(text: str) -> Any:
+    try:
+        # Not YAML: OpenCV writes a colon in it.
+        return yaml.load(re.sub(r"\A\s*%YAML.*", "", text), _Loader)
+    except yaml.MarkedYAMLError as error:
+        where = f" in line {error.problem_mark.line + 1}" if error.problem_mark else ""
+        raise ValueError(f"{error.problem}{where}") from error
+    except yaml.YAMLError as error:
+        raise ValueError(str(error)) from error
+
+
+class _Builder(ElementTree.TreeBuilder):
+    """ElementTree's elements, while their depth and count are allowed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._gate = _Gate()
+
+    def start(self, tag: str, attrs: dict[str, str], /) -> ElementTree.Element:
+        self._gate.enter()
+        return super().start(tag, attrs)
+
+    def end(self, tag: str, /) -> ElementTree.Element:
+        self._gate.leave()
+        return super().end(tag)
+
+
+def _parse_xml(text: str) -> Any:
+    # Before the parser sees them: entities can name files, and can grow without end.
+    if _DECLARATION.search(text):
+        raise ValueError("XML with a DTD")
+    root = ElementTree.fromstring(text, parser=ElementTree.XMLParser(target=_Builder()))
+    if root.tag != "opencv_storage":
+        raise ValueError("XML that OpenCV did not write")
+    return _xml_value(root)
+
+
+def _xml_value(element: ElementTree.Element) -> Any:
+    text = element.text or ""
+    if element.get("type_id") == "binary":
+        return BASE64 + text
+    if any(child.tag != "_" for child in element):
+        return {child.tag: _xml_value(child) for child in element}
+    items = _xml_items(text)
+    for child in element:
+        items += [_xml_value(child), *_xml_items(child.tail or "")]
+    return items[0] if len(items) == 1 and not len(element) else items
+
+
+def _xml_items(text: str) -> list[Any]:
+    """The numbers and words of a sequence; words of several parts stand in quotes."""
+    return [item.strip('"') for item in _XML_ITEM.findall(text)]

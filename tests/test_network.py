@@ -1,0 +1,203 @@
+"""No word to the outside: estimates, page, service and batch run while strace writes down whom they call."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from ipaddress import IPv6Address, ip_address
+from pathlib import Path
+
+import grpc
+import httpx
+import psutil
+import pytest
+from visitor import Visitor
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+PAIR = {side: EXAMPLES / f"{side}.png" for side in ("left", "right")}
+# ONNX Runtime looks up where its reports go after some ten seconds.
+ALIVE_S = 20
+STRACE = ["strace", "-D", "-f", "-qq", "--seccomp-bpf", "-e", "trace=connect,sendto,sendmsg,sendmmsg"]
+STEREOWEAVE = [sys.executable, "-m", "stereoweave"]
+ESTIMATING = """
+import time
+import stereoweave as sw
+from stereoweave.io import read_image
+left, right = (read_image(f"{folder}/{side}.png")[:96, 200:328] for side in ("left", "right"))
+sw.estimate(left, right)
+print("ready", flush=True)
+while True:
+    sw.estimate(left, right)
+    time.sleep(0.5)
+""".replace("{folder}", str(EXAMPLES))
+LOOKING_UP = "import socket; socket.getaddrinfo('stereoweave.invalid', 443)"
+CALLING_ITSELF = """
+import socket
+with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()):
+    socket.getaddrinfo("localhost", 443)
+"""
+# As strace writes addresses; in the data of a call it escapes quotation marks.
+ADDRESS = re.compile(r'port=htons\((\d+)\).*?(?:inet_addr\(|inet_pton\(AF_INET6, )"([^"]+)"')
+RESOLVER = re.compile(r'sun_path="[^"]*systemd/resolve')
+DNS_PORT = 53
+
+pytestmark = pytest.mark.needs_strace
+
+
+def is_outside(line: str) -> bool:
+    """Whether a line of strace is a look-up, or a call of another address than loopback's."""
+    called = ADDRESS.findall(line)
+    elsewhere = [address for port, address in called if int(port) == DNS_PORT or not is_loopback(address)]
+    return bool(elsewhere or RESOLVER.search(line))
+
+
+def is_loopback(address: str) -> bool:
+    found = ip_address(address)
+    mapped = found.ipv4_mapped if isinstance(found, IPv6Address) else None
+    return (mapped or found).is_loopback
+
+
+def calls_outside(trace: Path) -> list[str]:
+    lines = trace.read_text().splitlines()
+    assert lines  # strace worked
+    return [line for line in lines if is_outside(line)]
+
+
+class Watched:
+    """A program under strace, as a user starts it who has set nothing."""
+
+    def __init__(self, command: Sequence[str], trace: Path) -> None:
+        self.trace = trace
+        set_by_tests = ("ORT_", "GRADIO_", "HF_", "RAY_")
+        kept = {name: value for name, value in os.environ.items() if not name.startswith(set_by_tests)}
+        self.process = subprocess.Popen(
+            [*STRACE, "-o", str(trace), *command],
+            stdout=subprocess.PIPE,
+            text=True,
+            # The names of Ray's sockets may not be long.
+            env={**kept, "RAY_TMPDIR": "/tmp", "PYTHONUNBUFFERED": "1"},
+        )
+
+    def wait_for(self, pattern: str) -> str:
+        """What matches in the lines that it prints."""
+        assert self.process.stdout
+        found = (re.search(pattern, line) for line in self.process.stdout)
+        return next(match[0] for match in found if match)
+
+    def listeners(self) -> dict[tuple[str, int], str]:
+        """Where the program and all that it started listen, and the name of the process."""
+        tree = psutil.Process(self.process.pid)
+        return {
+            tuple(connection.laddr): process.name()
+            for process in (tree, *tree.children(recursive=True))
+            for connection in process.net_connections("tcp")
+            if connection.status == psutil.CONN_LISTEN
+        }
+
+
+@contextmanager
+def watched(command: Sequence[str], trace: Path) -> Iterator[Watched]:
+    """For as long as the block lasts, to whose end it has to live; then nothing of it is left."""
+    program = Watched(command, trace)
+    try:
+        yield program
+        assert program.process.poll() is None
+    finally:
+        started = psutil.Process(program.process.pid).children(recursive=True)
+        program.process.send_signal(signal.SIGTERM)
+        program.process.communicate(timeout=60)
+        for process in started:
+            with suppress(psutil.NoSuchProcess):
+                process.kill()
+
+
+def write_many_pairs(folder: Path) -> Path:
+    """More pairs than a worker makes meanwhile."""
+    for side, path in PAIR.items():
+        (folder / side).mkdir(parents=True)
+        for index in range(500):
+            (folder / side / f"{index:03d}.png").symlink_to(path)
+    return folder
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Calls to the outside, by program; where the service listened, and what is answered there."""
+
+    outside: dict[str, list[str]]
+    listeners: dict[tuple[str, int], str]
+    answers: dict[int, grpc.StatusCode]
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory) -> Seen:
+    """What four programs did in the same seconds."""
+    folder = tmp_path_factory.mktemp("network")
+    pairs, out = write_many_pairs(folder / "pairs"), folder / "out"
+    commands = {
+        "estimate": [sys.executable, "-c", ESTIMATING],
+        "page": [*STEREOWEAVE, "app", "--port", "0"],
+        "service": [*STEREOWEAVE, "serve", "--port", "0", "--threads", "1"],
+        "batch": [*STEREOWEAVE, "batch", str(pairs), str(out), "--workers", "1"],
+    }
+    with ExitStack() as stack:
+        programs = {
+            name: stack.enter_context(watched(command, folder / name)) for name, command in commands.items()
+        }
+        programs["estimate"].wait_for("ready")
+        page, service = (programs[name].wait_for(r"http://[\d.:]+") for name in ("page", "service"))
+        while not list(out.glob("*/disparity.pfm")):
+            assert programs["batch"].process.poll() is None
+            time.sleep(0.1)
+        with httpx.Client(base_url=page, timeout=60) as client:
+            ask_for(ALIVE_S, Visitor(client), service)
+        listeners = programs["service"].listeners()
+        opened = [port for address, port in listeners if not is_loopback(address)]
+        answers = {port: ask_without_token(port) for port in opened}
+    outside = {name: calls_outside(program.trace) for name, program in programs.items()}
+    return Seen(outside, listeners, answers)
+
+
+def ask_for(seconds: float, visitor: Visitor, service: str) -> None:
+    """Keeps the page and the service at work."""
+    files = {side: path.read_bytes() for side, path in PAIR.items()}
+    end_s = time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        assert "far:" in visitor.press("find", **PAIR)
+        httpx.post(f"{service}/disparity", files=files, timeout=60).raise_for_status()
+        httpx.get(f"{service}/metrics").raise_for_status()
+        time.sleep(0.5)
+
+
+def ask_without_token(port: int) -> grpc.StatusCode:
+    """What a replica of Ray Serve answers to a call of somebody who has no token of this Ray."""
+    with grpc.insecure_channel(f"127.0.0.1:{port}") as channel, pytest.raises(grpc.RpcError) as refused:
+        channel.unary_unary("/ray.serve.ASGIService/HandleRequest")(b"", timeout=10)
+    return refused.value.code()
+
+
+@pytest.mark.parametrize("program", ["estimate", "page", "service", "batch"])
+def test_a_program_looks_nothing_up_and_calls_nobody_but_this_computer(seen, program):
+    assert seen.outside[program] == []
+
+
+def test_a_look_up_is_seen_and_a_call_to_this_computer_is_none(tmp_path):
+    outside = {}
+    for name, program in {"look-up": LOOKING_UP, "itself": CALLING_ITSELF}.items():
+        command = [*STRACE, "-o", str(tmp_path / name), sys.executable, "-c", program]
+        subprocess.run(command, stderr=subprocess.DEVNULL, check=False)
+        outside[name] = calls_outside(tmp_path / name)
+    assert outside["look-up"]
+    assert outside["itself"] == []
+
+
+def test_the_service_listens_on_loopback_but_for_one_port_that_wants_the_token(seen):
+    assert len(seen.listeners) > 10
+    (opened,) = [name for (address, _), name in seen.listeners.items() if not is_loopback(address)]
+    assert opened.startswith("ray::ServeReplica")
+    assert list(seen.answers.values()) == [grpc.StatusCode.UNAUTHENTICATED]
