@@ -60,7 +60,6 @@ def _parsed(content: bytes) -> list[Any]:
 
 
 async def _exchange(application: Application, head: h11.Request, body: list[Any]) -> int | None:
-    # Where the end of the body is missing, the client is gone.
     messages: list[_Message] = [
         {"type": "http.request", "body": bytes(event.data), "more_body": True}
         if isinstance(event, h11.Data)
@@ -68,10 +67,15 @@ async def _exchange(application: Application, head: h11.Request, body: list[Any]
         for event in body
         if isinstance(event, h11.Data | h11.EndOfMessage)
     ]
+    is_whole = any(isinstance(event, h11.EndOfMessage) for event in body)
     status: list[int] = []
 
     async def receive() -> _Message:
-        return messages.pop(0) if messages else {"type": "http.disconnect"}
+        if messages:
+            return messages.pop(0)
+        if is_whole:
+            await asyncio.Event().wait()  # the client waits for the response
+        return {"type": "http.disconnect"}  # it is gone before it has sent all
 
     async def respond(message: _Message) -> None:
         if message["type"] == "http.response.start":
