@@ -5,7 +5,9 @@ import importlib.resources
 import os
 import re
 import shutil
+import signal
 import socket
+import sys
 import tempfile
 import webbrowser
 from collections.abc import Sequence
@@ -427,7 +429,8 @@ def _own_names(listener: socket.socket) -> list[str]:
 
 
 def serve(listener: socket.socket, url: str, *, open_browser: bool, provider: str = CPU) -> None:
-    """Serves the page on a listening socket until it is interrupted; then what was uploaded is removed."""
+    """Serves the page on a listening socket until a signal ends it; then what was uploaded is removed."""
+    _end_in_order()
     with tempfile.TemporaryDirectory(prefix="stereoweave-page-") as folder:
         # An open page keeps a connection open, which would never end of itself.
         server = make_server(Path(folder), _own_names(listener), provider)
@@ -435,3 +438,11 @@ def serve(listener: socket.socket, url: str, *, open_browser: bool, provider: st
         if open_browser:
             webbrowser.open(url)
         uvicorn.Server(config).run(sockets=[listener])
+
+
+def _end_in_order() -> None:
+    """Lets SIGTERM, and the end of the terminal, end the process by an exception, as Ctrl-C does."""
+    for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):
+        # Who set it to be ignored, such as nohup, is obeyed.
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, lambda number, _: sys.exit(128 + number))

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -185,3 +186,13 @@ def test_an_upload_whose_name_has_blanks_and_accents_is_its_visitors(visitor, tm
 def test_what_is_no_request_of_the_form_is_refused(visitor, content):
     answer = visitor.http.post("/gradio_api/queue/join", content=content.encode("latin-1"))
     assert (answer.status_code, answer.text) == REFUSED
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_uploads_are_removed_when_a_signal_ends_the_page(tmp_path, small_pair, number):
+    server, address = start(tmp_path)
+    with Visitor(address) as visitor:
+        [path] = visitor.upload(small_pair[0])
+    assert Path(path).is_relative_to(tmp_path)
+    stop(server, number)
+    assert list(tmp_path.glob("stereoweave-page-*")) == []
