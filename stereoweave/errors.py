@@ -3,6 +3,7 @@
 import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 
 class StereoweaveError(ValueError):
@@ -44,6 +45,8 @@ def reason(error: Exception) -> str:
             return "no such file"
         case IsADirectoryError():
             return "a folder"
+        case FileExistsError(filename=str(name)) if Path(name).is_symlink() and not Path(name).exists():
+            return "a link that leads nowhere"
         case FileExistsError():
             return "a file"
         case OSError(strerror=str(text)):
