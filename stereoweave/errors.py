@@ -51,6 +51,8 @@ def reason(error: Exception) -> str:
             return "a file"
         case OSError(strerror=str(text)):
             return text.lower()
+        case EOFError():
+            return "one that ends too early"
         case MemoryError():
             return "one that takes more memory than there is"
     # Libraries quote what they found, which may be all of a file, and in many lines.
