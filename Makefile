@@ -36,22 +36,26 @@ RENDER = $(DEV)/bin/stereoweave synth make refinery --pairs 1 --seed 4000 --layo
 RENDERED = $(foreach side,left right,runs/gallery/$(1)/$(side)/refinery/000000.png)
 VIEW = $(DEV)/bin/stereoweave view
 
-.PHONY: demo test check fuzz mutate bench audit release gallery
+.PHONY: demo test test-system test-others check fuzz mutate bench audit release gallery
 
 demo: $(CORE)/installed
 	$(CORE)/bin/stereoweave depth $(PAIR) $(CALIBRATION) --out demo-out
 	$(CORE)/bin/stereoweave view $(PAIR) --position 0.5 --out demo-out/view.png
 	@echo "Open the report in a browser: $(CURDIR)/demo-out/report.html"
 
+# System tests mostly wait for other programs, so they run beside the others. Each prints when it is done.
 test: $(DEV)/installed
-	$(DEV)/bin/pytest
+	@$(MAKE) --no-print-directory --jobs 2 --output-sync=target test-system test-others
+
+test-system test-others: $(DEV)/installed
+	$(DEV)/bin/pytest -m '$(if $(filter test-others,$@),not )system'
 
 check: $(DEV)/installed
 	$(DEV)/bin/ruff check
 	$(DEV)/bin/ruff format --check
 	$(DEV)/bin/mypy
 	$(DEV)/bin/lint-imports
-	$(DEV)/bin/pytest
+	@$(MAKE) --no-print-directory test
 
 mutate: $(DEV)/installed
 	$(DEV)/bin/python -m mutate --count $(COUNT) $(if $(SEED),--seed $(SEED))

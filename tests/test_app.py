@@ -43,7 +43,7 @@ FLAGS = [
 # A cold computer compiles the loops over pixels first.
 PATIENCE_MS = 60_000
 
-pytestmark = pytest.mark.needs_chromium
+pytestmark = [pytest.mark.system, pytest.mark.needs_chromium]
 
 
 @pytest.fixture(scope="module")

@@ -31,6 +31,8 @@ from stereoweave.output_lock import lock_output
 from stereoweave.results import DepthOrder, make_depth
 from stereoweave.stores import store_at
 
+pytestmark = pytest.mark.system
+
 EXAMPLES = Path(__file__).parent.parent / "examples"
 ORDER = DepthOrder(always=("disparity.pfm", "confidence.png"))
 

@@ -19,6 +19,8 @@ from stereoweave.learn import checkpoint
 from stereoweave.learn import train as training
 from stereoweave.learn.sources import VALIDATION_SEED
 
+pytestmark = pytest.mark.system
+
 # Two processes make two micro-batches each.
 PARTED = replace(
     RECIPE, steps=50, batch=4, micro_batch=1, crop_size=(32, 32), validation_pairs=1, validate_every=30

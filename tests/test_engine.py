@@ -16,6 +16,8 @@ from stereoweave import engine as engine_module
 from stereoweave.engine import Engine, connect, room, stream
 from stereoweave.errors import FormatError, StereoweaveError
 
+pytestmark = pytest.mark.system
+
 
 @pytest.fixture(scope="module")
 def engine(ray_address):

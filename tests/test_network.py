@@ -46,7 +46,7 @@ ADDRESS = re.compile(r'port=htons\((\d+)\).*?(?:inet_addr\(|inet_pton\(AF_INET6,
 RESOLVER = re.compile(r'sun_path="[^"]*systemd/resolve')
 DNS_PORT = 53
 
-pytestmark = pytest.mark.needs_strace
+pytestmark = [pytest.mark.system, pytest.mark.needs_strace]
 
 
 def is_outside(line: str) -> bool:

@@ -27,6 +27,8 @@ from stereoweave.synth import making
 from stereoweave.synth.making import make
 from stereoweave.synth.samples import Order
 
+pytestmark = pytest.mark.system
+
 ORDER = Order(scene="pylon", seed=3, size_px=(48, 32))
 STUDIO = PaintedStudio()
 MEASURED = {"time_ms", "time_relative", "memory_mb"}
