@@ -17,6 +17,8 @@ from stereoweave.animation import write_animation
 from stereoweave.io import read_image
 from stereoweave.layouts import MOTIONS
 
+pytestmark = pytest.mark.system
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
 DEMO, INSTALL, COMMANDS, OWN_PICTURES, VIDEO, BEYOND, SYNTHETIC, RESEARCH = re.findall(
@@ -24,6 +26,13 @@ DEMO, INSTALL, COMMANDS, OWN_PICTURES, VIDEO, BEYOND, SYNTHETIC, RESEARCH = re.f
 )
 (PROGRAM,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 LARGEST_ENVIRONMENT_BYTES = 700e6
+# The trainings of the README, in fewer steps and of fewer pairs.
+SHORTER = {
+    "steps = 400": "steps = 4",
+    "validate_every = 100": "validate_every = 4",
+    "validation_pairs = 8": "validation_pairs = 2",
+    "\npairs = 64": "\npairs = 4",
+}
 
 
 def run(command: list[str | Path], folder: Path, **environment: str) -> str:
@@ -80,12 +89,11 @@ def demo(tmp_path_factory, caches) -> tuple[Path, str]:
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory) -> Path:
-    """An empty environment outside the repository, in which the README's wheel was built and installed."""
-    folder = tmp_path_factory.mktemp("wheel")
-    environment = folder / "environment"
-    run([sys.executable, "-m", "venv", environment], folder)
-    checkout = copied_repository(folder / "checkout")
+def installed(demo) -> Path:
+    """The demo's environment, in which the README's wheel, built there too, took the checkout's place."""
+    environment = demo[0] / ".venv-core"
+    run([environment / "bin" / "python", "-m", "pip", "uninstall", "--yes", "stereoweave"], demo[0])
+    checkout = copied_repository(demo[0].with_name("copy"))
     run(["bash", "-ec", INSTALL], checkout, PATH=f"{environment / 'bin'}:{os.environ['PATH']}")
     shutil.rmtree(checkout)
     return environment
@@ -124,7 +132,7 @@ def test_make_demo_takes_the_users_own_pair_and_installs_once(demo, pictures, ca
     assert not (checkout / "demo-out" / "depth.png").exists()
 
 
-def test_the_commands_run_from_the_wheel_in_an_empty_environment(installed, pictures, caches):
+def test_the_commands_run_from_the_wheel_in_an_environment_of_users(installed, pictures, caches):
     assert "torch" not in packages_in(installed)
     path = f"{installed / 'bin'}:{os.environ['PATH']}"
     run(["bash", "-ec", COMMANDS], pictures, PATH=path, NUMBA_CACHE_DIR=caches)
@@ -139,7 +147,7 @@ def test_the_commands_run_from_the_wheel_in_an_empty_environment(installed, pict
     assert (pictures / "rows.csv").is_file()
 
 
-def test_the_program_runs_from_the_wheel_in_an_empty_environment(installed, pictures, caches):
+def test_the_program_runs_from_the_wheel_in_an_environment_of_users(installed, pictures, caches):
     run([installed / "bin" / "python", "-c", PROGRAM], pictures, NUMBA_CACHE_DIR=caches)
     assert read_image(pictures / "view.png").shape == (64, 96, 3)
 
@@ -194,10 +202,11 @@ def test_synthetic_sets_are_made_and_checked_by_the_commands_for_them(tmp_path):
 def test_two_trainings_are_resumed_and_scored_by_the_commands_for_researchers(tmp_path):
     for name in ("quick", "quick_plain"):
         recipe = (REPOSITORY / "recipes" / "paper" / f"{name}.toml").read_text()
-        # The same in fewer steps, of fewer pairs.
-        short = recipe.replace("steps = 400", "steps = 4").replace("every = 100", "every = 2")
+        for words, fewer in SHORTER.items():
+            assert words in recipe
+            recipe = recipe.replace(words, fewer)
         (tmp_path / "recipes" / "paper").mkdir(parents=True, exist_ok=True)
-        (tmp_path / "recipes" / "paper" / f"{name}.toml").write_text(short.replace("pairs = 64", "pairs = 8"))
+        (tmp_path / "recipes" / "paper" / f"{name}.toml").write_text(recipe)
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     run(["bash", "-ec", RESEARCH], tmp_path, PATH=path)
     written = (tmp_path / "runs" / "quick.csv").read_text()
