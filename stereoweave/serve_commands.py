@@ -1,8 +1,12 @@
 """The command stereoweave serve."""
 
 import math
+import re
 import signal
+import socket
 import threading
+from ipaddress import ip_address
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -33,6 +37,20 @@ MaxMegapixels = Annotated[
     float, typer.Option(min=0.001, max=65, help="Of a view; larger ones get 413, and are not decoded.")
 ]
 TimeoutS = Annotated[float, typer.Option(min=0.001, help="For a request, in seconds; then it gets 504.")]
+BehindProxy = Annotated[
+    bool,
+    typer.Option(
+        "--behind-proxy",
+        help="Allow a --host that other machines reach: a proxy stands before it (deploy/nginx.conf), and "
+        "checks the header Host.",
+    ),
+]
+TokenFile = Annotated[
+    Path | None,
+    typer.Option(help="A file with a token that every request but /health has to show, as Bearer."),
+]
+# As RFC 6750 has it.
+_TOKEN = r"[A-Za-z0-9\-._~+/]+=*"
 
 
 def serve(  # noqa: PLR0913 - each is a word of the command line
@@ -48,10 +66,14 @@ def serve(  # noqa: PLR0913 - each is a word of the command line
     max_megabytes: MaxMegabytes = 64,
     max_megapixels: MaxMegapixels = 25,
     timeout_s: TimeoutS = 60,
+    behind_proxy: BehindProxy = False,
+    token_file: TokenFile = None,
 ) -> None:
     """Depth and views over HTTP, for other programs; Ctrl-C ends it when what it accepted is done."""
     set_environment(address)  # before the service imports Ray
     with needing_extra("cluster", "the service needs Ray Serve"):
+        from pydantic import SecretStr
+
         from stereoweave.service import GPU_PROVIDERS, Settings, serving
         from stereoweave.service_http import Limits
 
@@ -63,24 +85,64 @@ def serve(  # noqa: PLR0913 - each is a word of the command line
     for option, number in numbers.items():
         if not math.isfinite(number):
             raise StereoweaveError(f"{option}: expected a finite number, found {number}")
-    limits = Limits(megabytes=max_megabytes, megapixels=max_megapixels, timeout_s=timeout_s, waiting=waiting)
-    settings = Settings(
-        model=model,
-        provider=provider,
-        threads=threads or max(1, usable_cores() // replicas),
-        replicas=replicas,
-        batch=batch or (8 if provider in GPU_PROVIDERS else 1),
-        limits=limits,
-    )
+    token = SecretStr(_read_token(token_file)) if token_file else None
     with listening(host, port) as listener:
-        port = listener.getsockname()[1]
-    with serving(settings, host, port, address):
-        stopped = threading.Event()
-        # Here, because Ray brings handlers of its own.
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: stopped.set())
-        url = url_at(host, port)
-        typer.echo(f"Stereoweave: {url}, described by {url}/openapi.json; Ctrl-C ends it")
-        # Again and again: a signal that another thread receives is handled when this one is awake.
-        while not stopped.wait(timeout=1):
-            pass
+        limits = Limits(
+            megabytes=max_megabytes,
+            megapixels=max_megapixels,
+            timeout_s=timeout_s,
+            waiting=waiting,
+            hosts=_hosts(listener, host, behind_proxy),
+            token=token,
+        )
+        settings = Settings(
+            model=model,
+            provider=provider,
+            threads=threads or max(1, usable_cores() // replicas),
+            replicas=replicas,
+            batch=batch or (8 if provider in GPU_PROVIDERS else 1),
+            limits=limits,
+        )
+        url = url_at(host, listener.getsockname()[1])
+        with serving(settings, listener, address):
+            _wait_for_signal(f"Stereoweave: {url}, described by {url}/openapi.json; Ctrl-C ends it")
+
+
+def _hosts(listener: socket.socket, host: str, behind_proxy: bool) -> tuple[str, ...] | None:
+    """The names that requests may give this machine; None where a proxy checks them."""
+    address = listener.getsockname()[0]
+    if ip_address(address).is_loopback:
+        return (f"[{address}]" if ":" in address else address, "localhost")
+    if not behind_proxy:
+        raise StereoweaveError(
+            f"--host {host}: expected an address of this machine alone, such as 127.0.0.1, found one that "
+            "others reach; put a proxy before the service (deploy/nginx.conf) and add --behind-proxy"
+        )
+    return None
+
+
+def _read_token(path: Path) -> str:
+    """The token in a file, without the white space around it."""
+    try:
+        token = path.read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise StereoweaveError(f"--token-file {path}: expected a file with a token, found {error}") from error
+    if not re.fullmatch(_TOKEN, token):
+        found = "other characters" if token else "nothing"
+        raise StereoweaveError(
+            f"--token-file {path}: expected a token of letters, digits and -._~+/=, found {found}; "
+            "make one with: openssl rand -hex 32"
+        )
+    return token
+
+
+def _wait_for_signal(message: str) -> None:
+    """Print the message and return at SIGINT or SIGTERM."""
+    stopped = threading.Event()
+    # Here, because Ray brings handlers of its own.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopped.set())
+    typer.echo(message)
+    # Again and again: a signal that another thread receives is handled when this one is awake.
+    while not stopped.wait(timeout=1):
+        pass

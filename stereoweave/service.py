@@ -9,11 +9,15 @@ import logging
 import math
 import os
 import re
+import socket
+import time
 import urllib.request
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from typing import Annotated
+from functools import partial
+from typing import Annotated, Any
 
 import ray
 from prometheus_client import CollectorRegistry, generate_latest
@@ -22,13 +26,20 @@ from prometheus_client.parser import text_string_to_metric_families
 from prometheus_client.registry import Collector
 from pydantic import BaseModel, ConfigDict, Field
 from ray import serve
+from ray.exceptions import RayActorError
+from ray.serve.handle import DeploymentHandle
 from ray.serve.schema import LoggingConfig
 
+from stereoweave.child_process import ProcessDiedError
 from stereoweave.engine import Engine, connect, room
 from stereoweave.errors import StereoweaveError
 from stereoweave.matcher import Matcher
+from stereoweave.service_costs import Budget, work_of
+from stereoweave.service_folders import own_folder
 from stereoweave.service_http import Guard, Limits, make_app
-from stereoweave.service_requests import Answer, Order, answer_many
+from stereoweave.service_requests import Answer, Order, answering
+from stereoweave.service_server import Patience, http_server
+from stereoweave.service_worker import Task, Worker
 from stereoweave.threads import usable_cores
 
 NAME = "stereoweave"
@@ -77,41 +88,68 @@ class Settings(BaseModel):
 
 @serve.ingress()
 class Replica:
-    """A process of the service."""
+    """A process of the service, which answers orders, and on a cluster HTTP as well."""
 
     def __init__(self, settings: Settings) -> None:
-        self._settings = settings
-        self._matcher = Matcher(settings.model, threads=settings.threads, provider=settings.provider)
+        self._settings, self._opened = settings, ExitStack()
+        self._folder = self._opened.enter_context(own_folder())
+        make = partial(answering, settings.model, settings.provider, settings.threads)
+        self._worker = Worker(make, self._folder)
+        self._opened.callback(self._worker.close)
+        self._budget = Budget(self._worker.warm_up())
+        # One thread for each process of the worker: what waits for it is not sent, and can be cancelled.
+        self._measuring, self._answering = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
         self._free = asyncio.Event()
         self._free.set()
         self._together = serve.batch(
             max_batch_size=settings.batch, batch_wait_timeout_s=_GATHERED_WITHIN_S, batch_size_fn=self._size
         )(self._answered)
 
+    def __del__(self) -> None:  # called by Ray Serve when a replica is to end
+        self._opened.close()
+
     def __serve_build_asgi_app__(self) -> Guard:
         limits = self._settings.limits
-        return Guard(make_app(self._answering, limits, metrics), limits)
+        return Guard(make_app(self._answer, limits, metrics, self._folder), limits)
 
-    async def _answering(self, order: Order, megapixels: float) -> Answer:
+    async def outcome(self, order: Order, left_s: float) -> Answer | Exception:
+        """What an order gets within the seconds that are left for it, or why it gets nothing."""
+        try:
+            return await self._answer(order, left_s)
+        except (StereoweaveError, TimeoutError) as error:
+            return error
+
+    async def _answer(self, order: Order, left_s: float) -> Answer:
         """The answer to an order; what is cancelled while it waits is never begun."""
-        # Else each that comes while another is matched would be a batch of its own.
-        await self._free.wait()
-        answer = await self._together((order, megapixels))
+        deadline_s = time.monotonic() + left_s
+        loop = asyncio.get_running_loop()
+        megapixels = await loop.run_in_executor(self._measuring, self._worker.measure, order, left_s)
+        with self._budget.admit(order, megapixels, deadline_s - time.monotonic()):
+            # Else each that comes while another is matched would be a batch of its own.
+            await self._free.wait()
+            answer = await self._together(Task(order, megapixels, deadline_s))
         if isinstance(answer, Exception):
             raise answer
         return answer
 
-    async def _answered(self, waiting: list[tuple[Order, float]]) -> list[Answer | Exception]:
+    async def _answered(self, tasks: list[Task]) -> list[Answer | Exception]:
         self._free.clear()
+        start_s = time.perf_counter()
         try:
-            return await asyncio.to_thread(answer_many, self._matcher, [order for order, _ in waiting])
+            loop = asyncio.get_running_loop()
+            answers = await loop.run_in_executor(self._answering, self._worker.answer, tasks)
         finally:
             self._free.set()
+        if not any(isinstance(answer, Exception) for answer in answers):
+            self._budget.learn(
+                sum(work_of(task.order, task.megapixels) for task in tasks), time.perf_counter() - start_s
+            )
+        return answers
 
-    def _size(self, waiting: Sequence[tuple[Order, float]]) -> int:
+    def _size(self, tasks: Sequence[Task]) -> int:
         """How much of a batch they fill, counted in pairs."""
         most = self._settings.batch
-        return sum(min(math.ceil(megapixels * most / _MEGAPIXELS_AT_ONCE), most) for _, megapixels in waiting)
+        return sum(min(math.ceil(task.megapixels * most / _MEGAPIXELS_AT_ONCE), most) for task in tasks)
 
 
 def application(settings: Settings) -> serve.Application:
@@ -169,13 +207,13 @@ class _Gathered(Collector):
 
 
 @contextmanager
-def serving(settings: Settings, host: str, port: int, address: str | None = None) -> Iterator[None]:
+def serving(settings: Settings, listener: socket.socket, address: str | None = None) -> Iterator[None]:
     """The service, for as long as the block lasts; what it accepted is done before it ends.
 
     Args:
         settings: What it is made of.
-        host: The address to serve.
-        port: One that is free.
+        listener: Where it is served. On a cluster it is closed, and Ray's own proxies listen there on each
+            machine that has a replica.
         address: As for `Engine`; a cluster that serves nothing yet.
 
     Raises:
@@ -190,14 +228,53 @@ def serving(settings: Settings, host: str, port: int, address: str | None = None
     with connect(engine):
         _check_free(address)
         _check_room(settings, _room(engine))
-        serve.start(http_options={"host": host, "port": port}, logging_config=_QUIET)
-        try:
-            _run(settings)
+        with (_at_proxies if address else _at_server)(settings, listener):
             yield
-        finally:
-            _end()
-            if address:
-                serve.shutdown()  # type: ignore[no-untyped-call]
+
+
+@contextmanager
+def _at_server(settings: Settings, listener: socket.socket) -> Iterator[None]:
+    """The service behind an HTTP server of this process, which hands orders to the replicas."""
+    limits = settings.limits
+    limits = limits.model_copy(update={"waiting": limits.waiting * settings.replicas})
+    serve.start(proxy_location="Disabled", logging_config=_QUIET)
+    with ExitStack() as ending:
+        ending.callback(_end)
+        handle = _run(settings)
+
+        async def answer(order: Order, left_s: float) -> Answer:
+            response = handle.outcome.remote(order, left_s)
+            try:
+                outcome = await response
+            except asyncio.CancelledError:
+                response.cancel()  # type: ignore[no-untyped-call]
+                raise
+            except RayActorError as error:
+                raise ProcessDiedError(
+                    "expected a replica that answers, found that it ended; come again"
+                ) from error
+            if isinstance(outcome, Exception):
+                raise outcome
+            return outcome
+
+        folder = ending.enter_context(own_folder())
+        app = Guard(make_app(answer, limits, metrics, folder), limits)
+        ending.enter_context(http_server(app, listener, Patience(end_s=limits.timeout_s)))
+        yield
+
+
+@contextmanager
+def _at_proxies(settings: Settings, listener: socket.socket) -> Iterator[None]:
+    """The service behind the HTTP proxies of Ray Serve, one on each machine."""
+    host, port = listener.getsockname()[:2]
+    listener.close()
+    serve.start(http_options={"host": host, "port": port}, logging_config=_QUIET)
+    try:
+        _run(settings)
+        yield
+    finally:
+        _end()
+        serve.shutdown()  # type: ignore[no-untyped-call]
 
 
 def _check_free(address: str | None) -> None:
@@ -210,10 +287,10 @@ def _check_free(address: str | None) -> None:
         )
 
 
-def _run(settings: Settings) -> None:
-    """Starts the replicas, and waits until their networks are loaded."""
+def _run(settings: Settings) -> DeploymentHandle[Any]:
+    """Start the replicas, and wait until their networks are loaded."""
     try:
-        serve.run(application(settings), name=NAME, route_prefix="/")
+        return serve.run(application(settings), name=NAME, route_prefix="/")
     except RuntimeError as error:
         told = "\n".join(each.message for each in serve.status().applications[NAME].deployments.values())
         ours = re.findall(r"^stereoweave\.errors\.\w+: (.+)", told, re.MULTILINE)

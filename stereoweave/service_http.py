@@ -1,8 +1,10 @@
 """How the service speaks HTTP: what its requests say, and the guard before them, who refuses some."""
 
 import asyncio
+import secrets
 import time
-from collections.abc import Awaitable, Callable, Mapping, MutableMapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, MutableMapping
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -10,12 +12,15 @@ from typing import Annotated, Any
 from fastapi import FastAPI, Form, HTTPException, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, SecretStr
 from ray.serve.metrics import Counter, Histogram
 from starlette.datastructures import Headers
+from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from stereoweave import __version__
+from stereoweave.child_process import ProcessDiedError
 from stereoweave.errors import FormatError, MatcherError, StereoweaveError
+from stereoweave.service_costs import BusyError
 from stereoweave.service_forms import MapForm, PairForm, ViewForm, stored
 from stereoweave.service_requests import (
     MEDIA_TYPES,
@@ -23,7 +28,6 @@ from stereoweave.service_requests import (
     Answer,
     Order,
     TooLargeError,
-    check_pixels,
     told,
 )
 
@@ -31,6 +35,7 @@ from stereoweave.service_requests import (
 _RETRY_AFTER_S = 1
 _LATENCIES_S = [0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 60]
 _PATHS = ("/disparity", "/depth", "/view")
+_HEALTH = "/health"
 # As nginx has it: the client went away, and nobody was answered.
 _CLIENT_GONE = 499
 _DESCRIPTION = """Depth, and any view between the two cameras, of a rectified stereo pair: POST a form with
@@ -48,12 +53,13 @@ _REFUSALS: dict[int | str, dict[str, Any]] = {
     status: {"model": Refusal, "description": description}
     for status, description in {
         400: "A picture or a calibration that cannot be read, or a form that is none.",
+        401: "The service has a token, and the request has none, or another one.",
         408: "The request did not arrive in time.",
-        413: "Too many bytes, or pixels.",
+        413: "Too many bytes or pixels, or more work than the time limit allows.",
         415: "No multipart/form-data.",
         422: "A field that is unknown, missing, or says what cannot be.",
-        503: "As many requests wait as are accepted: the header Retry-After says when to come again. Or what "
-        "the network runs on failed.",
+        503: "As many requests, or as much work, wait as are accepted: the header Retry-After says when to "
+        "come again. Or what the network runs on failed, or the process that worked on the request crashed.",
         504: "No answer in time.",
     }.items()
 }
@@ -61,7 +67,8 @@ _REFUSALS: dict[int | str, dict[str, Any]] = {
 _Message = MutableMapping[str, Any]
 _Receive = Callable[[], Awaitable[_Message]]
 _Send = Callable[[_Message], Awaitable[None]]
-_Server = Callable[[_Message, _Receive, _Send], Awaitable[None]]
+_Server = Callable[[_Message, _Receive, _Send], Coroutine[Any, Any, None]]
+# Of an order, and the seconds that are left for it.
 Answering = Callable[[Order, float], Awaitable[Answer]]
 
 
@@ -73,6 +80,8 @@ class Limits(BaseModel):
         megapixels: Of a view.
         timeout_s: From the head of a request to that of its response.
         waiting: Requests that are accepted and not answered yet; more are refused.
+        hosts: The names that the header Host may have; any where None.
+        token: What a request has to show (`Authorization: Bearer`), except for /health; nothing where None.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -81,14 +90,16 @@ class Limits(BaseModel):
     megapixels: Annotated[float, Field(gt=0, le=MOST_MEGAPIXELS)] = 25
     timeout_s: PositiveFloat = 60
     waiting: Annotated[int, Field(ge=1)] = 8
+    hosts: tuple[str, ...] | None = None
+    token: SecretStr | None = None
 
 
 _MapForm = Annotated[MapForm, Form(media_type="multipart/form-data")]
 _ViewForm = Annotated[ViewForm, Form(media_type="multipart/form-data")]
 
 
-def make_app(answering: Answering, limits: Limits, metrics: Callable[[], bytes]) -> FastAPI:
-    """The application. `answering` does the work, of an order and its megapixels."""
+def make_app(answering: Answering, limits: Limits, metrics: Callable[[], bytes], folder: Path) -> FastAPI:
+    """The application; `answering` does the work, and uploads lie in the folder until it is done."""
     app = FastAPI(
         title="Stereoweave",
         version=__version__,
@@ -97,27 +108,31 @@ def make_app(answering: Answering, limits: Limits, metrics: Callable[[], bytes])
         docs_url=None,
         redoc_url=None,
     )
+    if limits.hosts is not None:
+        app.add_middleware(TrustedHostMiddleware, allowed_hosts=limits.hosts, www_redirect=False)
 
     @app.exception_handler(RequestValidationError)
     async def _refuse(_: Request, error: RequestValidationError) -> Response:
         return JSONResponse({"detail": _in_one_line(error)}, 422)
 
+    answered = _Answers(answering, limits.megapixels, folder)
+
     @app.post("/disparity", responses=_responses(".png", ".pfm", ".npy", ".tiff"), response_class=Response)
-    async def disparity(form: _MapForm) -> Response:
+    async def disparity(request: Request, form: _MapForm) -> Response:
         """The left view's disparity in pixels."""
-        return await _answered(form, f"disparity.{form.file}", answering, limits)
+        return await answered(request, form, f"disparity.{form.file}")
 
     @app.post("/depth", responses=_responses(".png", ".pfm", ".npy", ".tiff"), response_class=Response)
-    async def depth(form: _MapForm) -> Response:
+    async def depth(request: Request, form: _MapForm) -> Response:
         """Its depth along the optical axis; needs a camera: calib, focal_px and baseline_m, or EXIF."""
-        return await _answered(form, f"depth.{form.file}", answering, limits)
+        return await answered(request, form, f"depth.{form.file}")
 
     @app.post("/view", responses=_responses(".png", ".jpg"), response_class=Response)
-    async def view(form: _ViewForm) -> Response:
+    async def view(request: Request, form: _ViewForm) -> Response:
         """What a camera elsewhere on the line through the two would have seen."""
-        return await _answered(form, f"view.{form.file}", answering, limits)
+        return await answered(request, form, f"view.{form.file}")
 
-    @app.get("/health")
+    @app.get(_HEALTH)
     async def health() -> dict[str, str]:
         """That the network is loaded, and requests are taken."""
         return {"status": "ok", "version": __version__}
@@ -148,33 +163,48 @@ def _in_one_line(error: RequestValidationError) -> str:
     )
 
 
-async def _answered(form: PairForm, file: str, answering: Answering, limits: Limits) -> Response:
-    # Where it is cancelled, a thread may still work in the folder.
-    with TemporaryDirectory(prefix="stereoweave-", ignore_cleanup_errors=True) as name:
-        try:
-            order = await asyncio.to_thread(stored, form, Path(name), file, limits.megapixels)
-            megapixels = await asyncio.to_thread(check_pixels, order)
-            answer = await answering(order, megapixels)
-        except StereoweaveError as error:
-            raise HTTPException(_status(error), told(error, Path(name))) from error
-    return Response(
-        answer.content,
-        media_type=MEDIA_TYPES[Path(file).suffix],
-        headers={
-            "Content-Disposition": f'attachment; filename="{file}"',
-            "X-Stereoweave-Report": answer.report,
-        },
-    )
+@dataclass(frozen=True)
+class _Answers:
+    """Makes the response to a form, whose files lie in a folder of their own until then."""
+
+    answering: Answering
+    most_megapixels: float
+    folder: Path
+
+    async def __call__(self, request: Request, form: PairForm, file: str) -> Response:
+        # Where this is cancelled, a process may still work in the folder.
+        with TemporaryDirectory(dir=self.folder, ignore_cleanup_errors=True) as name:
+            try:
+                order = await asyncio.to_thread(stored, form, Path(name), file, self.most_megapixels)
+                answer = await self.answering(order, request.state.deadline_s - time.monotonic())
+            except (StereoweaveError, TimeoutError) as error:
+                raise _refusal_of(error, Path(name)) from error
+        return _file(answer, file)
 
 
-def _status(error: StereoweaveError) -> int:
+def _file(answer: Answer, name: str) -> Response:
+    headers = {
+        "Content-Disposition": f'attachment; filename="{name}"',
+        "X-Stereoweave-Report": answer.report,
+    }
+    return Response(answer.content, media_type=MEDIA_TYPES[Path(name).suffix], headers=headers)
+
+
+def _refusal_of(error: StereoweaveError | TimeoutError, folder: Path) -> HTTPException:
+    headers = {"Retry-After": str(error.retry_after_s)} if isinstance(error, BusyError) else None
+    return HTTPException(_status(error), told(error, folder), headers)
+
+
+def _status(error: StereoweaveError | TimeoutError) -> int:
     match error:
         case TooLargeError():
             return 413
         case FormatError():
             return 400
-        case MatcherError():
+        case MatcherError() | ProcessDiedError() | BusyError():
             return 503
+        case TimeoutError():
+            return 504
     return 422
 
 
@@ -196,9 +226,16 @@ class Guard:
         )
 
     async def __call__(self, scope: _Message, receive: _Receive, send: _Send) -> None:
-        if scope["type"] != "http" or scope["method"] != "POST":
+        if scope["type"] != "http":
             await self._app(scope, receive, send)
-            return
+        elif scope["method"] == "POST":
+            await self._post(scope, receive, send)
+        elif scope["path"] == _HEALTH or self._knows(Headers(scope=scope)):
+            await self._app(scope, receive, send)
+        else:
+            await _stranger()(scope, receive, send)
+
+    async def _post(self, scope: _Message, receive: _Receive, send: _Send) -> None:
         start_s = time.perf_counter()
         exchange = _Exchange(receive, send, self._limits)
         # Not every path that a client may think of.
@@ -216,6 +253,8 @@ class Guard:
 
     def _refusal(self, headers: Headers) -> Response | None:
         """The response to a request of which the head says that it is not accepted."""
+        if not self._knows(headers):
+            return _stranger()
         if self._accepted >= self._limits.waiting:
             detail = f"expected at most {self._limits.waiting} requests at a time, found as many; come again"
             return _refused(503, detail, {"Retry-After": str(_RETRY_AFTER_S)})
@@ -226,11 +265,20 @@ class Guard:
             return _refused(415, "expected multipart/form-data, a form with the pictures as its files")
         return None
 
+    def _knows(self, headers: Headers) -> bool:
+        """Whether a request shows the token, where there is one."""
+        token = self._limits.token
+        if token is None:
+            return True
+        expected = f"Bearer {token.get_secret_value()}"
+        return secrets.compare_digest(headers.get("authorization", "").encode(), expected.encode())
+
     async def _accept(self, scope: _Message, exchange: "_Exchange") -> None:
         self._accepted += 1
+        scope.setdefault("state", {})["deadline_s"] = time.monotonic() + self._limits.timeout_s
         try:
             async with asyncio.timeout(self._limits.timeout_s):
-                await self._app(scope, exchange.receive, exchange.send)
+                await exchange.while_connected(self._app(scope, exchange.receive, exchange.send))
         except TimeoutError:
             if exchange.status is None:
                 await exchange.late()(scope, exchange.receive, exchange.send)
@@ -243,7 +291,7 @@ class _Exchange:
 
     def __init__(self, receive: _Receive, send: _Send, limits: Limits) -> None:
         self._receive, self._send, self._limits = receive, send, limits
-        self._bytes, self._arrived = 0, False
+        self._bytes, self._arrived = 0, asyncio.Event()
         self.status: int | None = None
 
     async def receive(self) -> _Message:
@@ -251,23 +299,49 @@ class _Exchange:
         self._bytes += len(message.get("body", b""))
         if self._bytes > self._limits.megabytes * 1e6:
             raise HTTPException(413, _too_large(self._limits))
-        self._arrived = not message.get("more_body", False)
+        if not message.get("more_body", False):
+            self._arrived.set()
         return message
 
     async def send(self, message: _Message) -> None:
         self.status = message.get("status", self.status)
         await self._send(message)
 
+    async def while_connected(self, work: Coroutine[Any, Any, None]) -> None:
+        """Do the work, and cancel it where the client goes away."""
+        working, watching = asyncio.create_task(work), asyncio.create_task(self._gone())
+        watching.add_done_callback(lambda _: working.cancel())
+        try:
+            await working
+        except asyncio.CancelledError:
+            if not watching.done():
+                raise
+        finally:
+            watching.cancel()
+
+    async def _gone(self) -> None:
+        """Return when the client has gone away, after all of its request arrived."""
+        await self._arrived.wait()
+        while (await self._receive())["type"] != "http.disconnect":
+            pass
+
     def late(self) -> Response:
         """The response to a request that takes too long: to arrive, or to be answered."""
         seconds = f"within {self._limits.timeout_s:g} s"
-        if self._arrived:
+        if self._arrived.is_set():
             return _refused(504, f"expected to be done {seconds}, and was not; send smaller pictures")
         return _refused(408, f"expected the whole request {seconds}, found a part of it")
 
 
 def _refused(status: int, detail: str, headers: Mapping[str, str] | None = None) -> Response:
     return JSONResponse({"detail": detail}, status, headers)
+
+
+def _stranger() -> Response:
+    detail = (
+        "expected the header Authorization: Bearer and the token of this service, found none or another one"
+    )
+    return _refused(401, detail, {"WWW-Authenticate": "Bearer"})
 
 
 def _too_large(limits: Limits) -> str:

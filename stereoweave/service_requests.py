@@ -5,6 +5,7 @@ import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -86,6 +87,9 @@ class Answer:
     report: str
 
 
+Answering = Callable[[Sequence[Order]], list[Answer | Exception]]
+
+
 def check_pixels(order: Order) -> float:
     """The megapixels of the order's pictures, as their heads say, before memory is spent on any.
 
@@ -111,6 +115,16 @@ def _checked_megapixels(path: Path, size_px: tuple[int, ...], most_megapixels: f
             f"found {width_px}x{height_px}; scale it down"
         )
     return megapixels
+
+
+def measuring() -> Callable[[Order], float]:
+    """For a `ChildProcess`: the function that measures the pictures of an order."""
+    return check_pixels
+
+
+def answering(model: str, provider: str, threads: int) -> Answering:
+    """For a `ChildProcess`: loads a network, and returns the function that answers orders with it."""
+    return partial(answer_many, Matcher(model, threads=threads, provider=provider))
 
 
 def answer_many(matcher: Matcher, orders: Sequence[Order]) -> list[Answer | Exception]:

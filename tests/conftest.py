@@ -48,6 +48,11 @@ CAPABILITIES = {
         shutil.which("chromium") is not None, "in a browser", "no chromium on the PATH"
     ),
     "needs_strace": Capability(shutil.which("strace") is not None, "under strace", "no strace on the PATH"),
+    "needs_nginx": Capability(
+        shutil.which("nginx", path=f"{os.environ['PATH']}:/usr/sbin") is not None,
+        "behind nginx",
+        "no nginx: apt install nginx-light",
+    ),
     "needs_egl": Capability(renders(), "of the renderer", "no EGL: apt install libegl1 libgl1-mesa-dri"),
 }
 

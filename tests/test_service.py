@@ -1,33 +1,32 @@
-import asyncio
-import io
 import json
 import os
 import re
-import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator, Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import httpx
 import numpy as np
 import pytest
+import watching
+from hostile_calibrations import HOSTILE
+from hostile_requests import hostile
 from prometheus_client.parser import text_string_to_metric_families
-from service_examples import BOTH, CALIB, EXAMPLES, malformed
+from service_examples import BOTH, CALIB, EXAMPLES, Sender, malformed
 
 import stereoweave as sw
 from stereoweave.calibration_files import calibrated
 from stereoweave.cli import main
-from stereoweave.errors import ProviderError
+from stereoweave.errors import StereoweaveError
 from stereoweave.io import read_disparity_png, read_image, read_pair, read_pfm, write_image
-from stereoweave.matcher import Matcher
-from stereoweave.preparing import Request
-from stereoweave.service_requests import Answer, Order, TooLargeError, answer_many, check_pixels
 
 WAITING, MEGABYTES = 3, 4
 
@@ -35,33 +34,42 @@ WAITING, MEGABYTES = 3, 4
 pytestmark = pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`:DeprecationWarning")
 
 
+class Running(NamedTuple):
+    client: httpx.Client
+    pid: int
+
+
 @pytest.fixture(scope="module")
-def service(tmp_path_factory) -> Iterator[httpx.Client]:
+def service(running) -> httpx.Client:
+    return running.client
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory) -> Iterator[Running]:
+    limits = ["--waiting", WAITING, "--max-megabytes", MEGABYTES, "--max-megapixels", 1, "--timeout-s", 20]
+    with served(tmp_path_factory.mktemp("uploads"), "--batch", 2, *limits) as running:
+        yield running
+
+
+@contextmanager
+def served(uploads: Path, *words: object) -> Iterator[Running]:
     """The command, in a process of its own, which has to end by itself, and all that it started with it."""
-    limits = ["--waiting", WAITING, "--max-megabytes", MEGABYTES, "--max-megapixels", 1]
-    words = ["--port", 0, "--batch", 2, *limits]
-    uploads = tmp_path_factory.mktemp("uploads")
+    # Metrics each second, and not each ten. The names of the sockets of Ray may not be long.
+    ray = {"RAY_metrics_report_interval_ms": "1000", "RAY_TMPDIR": "/tmp"}
     process = subprocess.Popen(
-        [sys.executable, "-m", "stereoweave", "serve", *map(str, words)],
+        [sys.executable, "-m", "stereoweave", "serve", "--port", "0", *map(str, words)],
         stdout=subprocess.PIPE,
         text=True,
-        # Metrics each second, and not each ten. The names of the sockets of Ray may not be long.
-        env={
-            **os.environ,
-            "RAY_metrics_report_interval_ms": "1000",
-            "RAY_TMPDIR": "/tmp",
-            "TMPDIR": str(uploads),
-        },
+        env={**os.environ, **ray, "TMPDIR": str(uploads)},
     )
     try:
         with process.stdout:
             url = re.search(r"http://[\d.:]+", process.stdout.readline())[0]
             # Each request has a connection of its own, as those of many clients.
-            with httpx.Client(
-                base_url=url, timeout=60, limits=httpx.Limits(max_keepalive_connections=0)
-            ) as client:
-                yield client
-            started = children(process.pid)
+            alone = httpx.Limits(max_keepalive_connections=0)
+            with httpx.Client(base_url=url, timeout=60, limits=alone) as client:
+                yield Running(client, process.pid)
+            started = watching.children(process.pid)
             process.send_signal(signal.SIGTERM)
             assert process.wait(30) == 0
             assert not [pid for pid in started if Path(f"/proc/{pid}").exists()]
@@ -69,13 +77,6 @@ def service(tmp_path_factory) -> Iterator[httpx.Client]:
     finally:
         process.kill()
         process.wait()
-
-
-def children(pid: int) -> list[int]:
-    """The processes that a process has started, and those that these have."""
-    tasks = Path(f"/proc/{pid}/task").glob("*/children")
-    direct = [int(child) for task in tasks for child in task.read_text().split()]
-    return direct + [child for each in direct for child in children(each)]
 
 
 def post(service: httpx.Client, path: str, files: Any = BOTH, **data: Any) -> httpx.Response:
@@ -165,6 +166,56 @@ def test_a_service_that_is_full_refuses_and_does_what_it_accepted(service):
     assert "come again" in refused[0].json()["detail"]
 
 
+def test_hostile_requests_and_calibrations_leave_it_answering_at_once_and_small(running):
+    calibrations = dict(list(HOSTILE.items())[:: max(1, len(HOSTILE) // 60)])
+    requests = {name: partial(post_calibration, content) for name, content in calibrations.items()}
+    requests |= hostile() | malformed(MEGABYTES)
+    assert len(calibrations) >= 60
+    assert len(requests) >= 260
+    watcher = [sys.executable, watching.__file__, str(running.client.base_url), str(running.pid)]
+    with (
+        subprocess.Popen(watcher, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as watch,
+        ThreadPoolExecutor(12) as pool,
+    ):
+        sent = {name: pool.submit(send_until_taken, send, running.client) for name, send in requests.items()}
+        statuses = {name: status.result() for name, status in sent.items()}
+        seen = json.loads(watch.communicate()[0])
+    assert not {name: status for name, status in statuses.items() if status >= 500}
+    assert not {name for name in calibrations if statuses[name] == 200}
+    assert len(seen["health_s"]) > 20
+    assert max(seen["health_s"]) < 1
+    assert max(seen["megabytes"]) < 2000
+    assert post(running.client, "/disparity").status_code == 200
+
+
+def post_calibration(content: bytes, client: httpx.Client) -> tuple[int, str]:
+    response = post(client, "/depth", {**BOTH, "calib": content})
+    return response.status_code, response.text
+
+
+def send_until_taken(send: Sender, client: httpx.Client) -> int:
+    """The status that is answered once others have made room; 503 where they do not within a minute."""
+    deadline_s = time.monotonic() + 60
+    while (status := send(client)[0]) == 503 and time.monotonic() < deadline_s:
+        time.sleep(0.1)
+    return status
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("localhost", 200),
+        ("LOCALHOST:1", 200),
+        ("127.0.0.1:99", 200),
+        ("evil.example", 400),
+        ("127.0.0.1.evil", 400),
+    ],
+)
+def test_only_requests_to_a_name_of_this_machine_are_answered(service, host, status):
+    for path in ("/health", "/openapi.json"):
+        assert service.get(path, headers={"Host": host}).status_code == status
+
+
 def test_its_description_names_every_path_and_field(service):
     description = service.get("/openapi.json").json()
     assert description["openapi"].startswith("3.1")
@@ -174,7 +225,7 @@ def test_its_description_names_every_path_and_field(service):
         schema = said["requestBody"]["content"]["multipart/form-data"]["schema"]
         assert schema == {"$ref": f"#/components/schemas/{form}"}
         responses = said["responses"]
-        assert set(responses) == {"200", "400", "408", "413", "415", "422", "503", "504"}
+        assert set(responses) == {"200", "400", "401", "408", "413", "415", "422", "503", "504"}
         assert "X-Stereoweave-Report" in responses.pop("200")["headers"]
         for refusal in responses.values():
             assert refusal["content"]["application/json"]["schema"] == {
@@ -205,106 +256,6 @@ def test_its_metrics_count_requests_by_status(service):
     assert batches["+Inf"] > batches["1.0"]  # some were of two
 
 
-def order(folder: Path, left: bytes = BOTH["left"], **said: Any) -> Order:
-    """For disparity.npy of a pair, in a folder that is made."""
-    folder.mkdir()
-    (folder / "left").write_bytes(left)
-    (folder / "right").write_bytes(BOTH["right"])
-    return Order(folder=folder, pictures=(folder / "left", folder / "right"), file="disparity.npy", **said)
-
-
-def test_those_that_are_matched_together_get_what_each_gets_alone(estimate, tmp_path):
-    orders = [
-        order(tmp_path / "first"),
-        order(tmp_path / "damaged", left=b"no picture"),
-        order(tmp_path / "second"),
-        order(tmp_path / "with a range", range_px=(8, 16)),
-        order(tmp_path / "with a range that is none", range_px=(5000, 6000)),
-    ]
-    first, damaged, second, within, beyond = answer_many(Matcher("small"), orders)
-    for answer in (first, second):
-        np.testing.assert_allclose(np.load(io.BytesIO(answer.content)), estimate.disparity_px, atol=1e-3)
-    assert np.load(io.BytesIO(within.content)).max() == 16
-    assert "expected a picture" in str(damaged)
-    assert "range_px" in str(beyond)
-
-
-def test_nothing_is_left_of_a_request_whose_client_goes_away_while_it_is_matched(tmp_path):
-    folder = tmp_path / "pictures"
-
-    class MatcherAtThatMoment(Matcher):
-        def estimate_many(self, pairs: Sequence[sw.StereoPair], **how: bool) -> list[sw.Estimate]:
-            shutil.rmtree(folder)
-            return super().estimate_many(pairs, **how)
-
-    answer_many(MatcherAtThatMoment("small"), [order(folder)])
-    assert not folder.exists()
-
-
-def test_a_view_is_measured_again_where_the_head_of_its_file_does_not_say_its_size(photos, tmp_path):
-    write_image(tmp_path / "both.png", np.hstack(photos))
-    halves = Order(
-        folder=tmp_path,
-        pictures=(tmp_path / "both.png",),
-        file="disparity.npy",
-        request=Request(arrangement="side_by_side_half"),
-        most_megapixels=0.5,
-    )
-    assert check_pixels(halves) == 1280 * 480 / 1e6  # as two views of 640x480 px would have
-    (refusal,) = answer_many(Matcher("small"), [halves])
-    assert isinstance(refusal, TooLargeError)
-    assert "expected at most 0.5 megapixels, found 1280x480" in str(refusal)
-
-
-def ask_guarded(answering: Any, content: AsyncIterator[bytes] | bytes | None = None) -> httpx.Response:
-    """The response of a guard that allows a fifth of a second."""
-    from stereoweave.service_http import Guard, Limits, make_app
-
-    limits = Limits(timeout_s=0.2)
-    transport = httpx.ASGITransport(Guard(make_app(answering, limits, bytes), limits))
-    headers = {"Content-Type": "multipart/form-data; boundary=b"} if content else {}
-
-    async def ask() -> httpx.Response:
-        async with httpx.AsyncClient(transport=transport, base_url="http://service") as client:
-            files = None if content else BOTH
-            return await client.post("/disparity", content=content, files=files, headers=headers)
-
-    return asyncio.run(ask())
-
-
-async def never(order: Order, megapixels: float) -> Answer:
-    await asyncio.Event().wait()
-
-
-def test_a_provider_that_fails_is_no_fault_of_the_request():
-    async def fails(order: Order, megapixels: float) -> Answer:
-        raise ProviderError(
-            "provider cuda: expected to run /srv/net.onnx, found that it failed: out of memory"
-        )
-
-    response = ask_guarded(fails)
-    assert response.status_code == 503
-    assert response.json()["detail"] == (
-        "provider cuda: expected to run net.onnx, found that it failed: out of memory"
-    )
-
-
-def test_what_takes_too_long_is_cancelled():
-    response = ask_guarded(never)
-    assert response.status_code == 504
-    assert response.json()["detail"].startswith("expected to be done within 0.2 s")
-
-
-def test_a_request_that_does_not_arrive_is_not_waited_for():
-    async def stalls() -> AsyncIterator[bytes]:
-        yield b"--b\r\n"
-        await asyncio.Event().wait()
-
-    response = ask_guarded(never, stalls())
-    assert response.status_code == 408
-    assert "found a part of it" in response.json()["detail"]
-
-
 def test_a_port_that_is_taken_is_one_line(capsys):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
@@ -322,6 +273,19 @@ def test_a_port_that_is_taken_is_one_line(capsys):
         (["--provider", "abacus"], "abacus"),
         (["--address", "127.0.0.1:1"], "127.0.0.1:1: expected the head of a Ray cluster"),
         (["--replicas", "999"], "--replicas 999 --threads 1: expected at most"),
+        (["--host", "0.0.0.0"], "--host 0.0.0.0: expected an address of this machine alone"),
+        (
+            ["--host", "0.0.0.0", "--address", "127.0.0.1:1"],
+            "put a proxy before the service (deploy/nginx.conf)",
+        ),
+        (["--host", "0.0.0.0", "--behind-proxy", "--replicas", "999"], "--replicas 999 --threads 1"),
+        (["--token-file", "none"], "--token-file none: expected a file with a token, found"),
+        (["--token-file", os.devnull], "expected a token of letters, digits and -._~+/=, found nothing"),
+        (["--token-file", str(EXAMPLES / "left.png")], "left.png: expected a file with a token, found"),
+        (
+            ["--token-file", str(EXAMPLES / "calib.txt")],
+            "found other characters; make one with",
+        ),
     ],
 )
 def test_what_cannot_be_served_is_said_before_ray_starts(words, expected, capsys):
@@ -346,3 +310,26 @@ def test_a_network_that_the_cluster_does_not_have_is_named(ray_address, capsys):
     told = capsys.readouterr().err
     assert "found none.onnx: expected an ONNX matcher, found no such file; is the model there too?" in told
     assert told.count("\n") == 1
+
+
+def test_what_the_command_says_of_hosts_and_the_token_holds_for_the_service(tmp_path, monkeypatch):
+    kept = []
+
+    def serving(settings: Any, listener: socket.socket, address: str | None) -> None:
+        kept.append(settings.limits)
+        raise StereoweaveError("not now")
+
+    monkeypatch.setattr("stereoweave.service.serving", serving)
+    (tmp_path / "token").write_text(" se-cret\n")
+    for words in ([], ["--host", "::1"], ["--host", "0.0.0.0", "--behind-proxy"]):
+        assert main(["serve", "--port", "0", "--token-file", str(tmp_path / "token"), *words]) == 2
+    assert [limits.hosts for limits in kept] == [("127.0.0.1", "localhost"), ("[::1]", "localhost"), None]
+    assert {limits.token.get_secret_value() for limits in kept} == {"se-cret"}
+    assert "se-cret" not in repr(kept)
+
+
+def test_on_a_cluster_the_proxies_of_ray_serve_the_same(ray_address, tmp_path):
+    with served(tmp_path, "--address", ray_address, "--threads", 1) as running:
+        assert post(running.client, "/disparity").status_code == 200
+        assert running.client.get("/health", headers={"Host": "evil.example"}).status_code == 400
+        assert running.client.get("/health").status_code == 200

@@ -1,6 +1,7 @@
 """Requests to the service, in front of a real network."""
 
 import asyncio
+import tempfile
 from functools import cache
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from fuzz.targets.pictures import encoded, eyes
 from stereoweave.errors import StereoweaveError
 from stereoweave.matcher import Matcher
 from stereoweave.service_http import Guard, Limits, make_app
-from stereoweave.service_requests import Answer, Order, answer_many
+from stereoweave.service_requests import Answer, Order, answer_many, check_pixels
 
 # A first view compiles its kernels.
 _LIMITS = Limits(megapixels=0.05, megabytes=0.5, timeout_s=600)
@@ -40,13 +41,14 @@ def _starts() -> dict[str, bytes]:
 def _application() -> Application:
     matcher = Matcher("small", threads=1)
 
-    async def answering(order: Order, megapixels: float) -> Answer:
+    async def answering(order: Order, left_s: float) -> Answer:
+        check_pixels(order)
         (answer,) = await asyncio.to_thread(answer_many, matcher, [order])
         if isinstance(answer, Exception):
             raise answer
         return answer
 
-    return Guard(make_app(answering, _LIMITS, bytes), _LIMITS)
+    return Guard(make_app(answering, _LIMITS, bytes, Path(tempfile.gettempdir())), _LIMITS)
 
 
 def _read(path: Path) -> None:

@@ -1,0 +1,153 @@
+"""A function that runs in a process of its own, which can be killed in the middle of a call and replaced."""
+
+import os
+import pickle
+import queue
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from stereoweave.errors import StereoweaveError
+
+Function = Callable[[Any], Any]
+_Reply = tuple[Any, Exception | None]
+
+
+class ProcessDiedError(StereoweaveError):
+    """The process ended in the middle of a call, by a crash or for want of memory."""
+
+
+class ChildProcess:
+    """Calls a function in a process of its own, one call at a time.
+
+    Args:
+        make: Called once in that process, returns the function. It is pickled, as are arguments and results.
+        folder: A folder for the temporary files of the process, which are removed with it.
+    """
+
+    def __init__(self, make: Callable[[], Function], folder: Path) -> None:
+        self._make, self._folder = pickle.dumps(make), folder
+        self._exchanges = ThreadPoolExecutor(1)
+        self._start()
+
+    def __call__(self, argument: Any, timeout_s: float | None) -> Any:
+        """The result of the function, after at most that time.
+
+        Raises:
+            TimeoutError: It took longer, and the process was replaced; or the process was still starting.
+            ProcessDiedError: The process ended by itself, and was replaced.
+            Exception: Whatever the function, or `make`, raised.
+        """
+        start_s = time.monotonic()
+        wait([self._started], timeout_s)
+        left_s = None if timeout_s is None else start_s + timeout_s - time.monotonic()
+        late = TimeoutError(f"expected to be done within {timeout_s or 0:.3g} s, and was not")
+        if not self._started.done() or (left_s is not None and left_s <= 0):
+            raise late
+        self._open(self._started)
+        reply = self._exchanges.submit(_exchange, self._process, pickle.dumps(argument))
+        wait([reply], left_s)
+        if not reply.done():
+            self._replace()
+            raise late
+        return self._open(reply)
+
+    @property
+    def pid(self) -> int:
+        """The id of the process."""
+        return self._process.pid
+
+    def close(self) -> None:
+        """End the process."""
+        self._end()
+        self._exchanges.shutdown()
+
+    def _start(self) -> None:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        environment = {"TMPDIR": str(self._folder), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        command, pipe = [sys.executable, "-m", __name__], subprocess.PIPE
+        self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, env=os.environ | environment)
+        self._started = self._exchanges.submit(_exchange, self._process, self._make)
+
+    def _open(self, reply: Future[_Reply]) -> Any:
+        """What is in a reply that has arrived: a result, or an error to raise."""
+        try:
+            result, error = reply.result()
+        except (OSError, EOFError, pickle.UnpicklingError):
+            status = self._replace()
+            raise ProcessDiedError(
+                f"expected the process that works on the request to finish, found that it ended ({status}); "
+                "a file in the request made it crash, or memory ran out"
+            ) from None
+        if error is not None:
+            raise error
+        return result
+
+    def _replace(self) -> str:
+        """Start another process; returns how the old one ended."""
+        status = self._end()
+        self._start()
+        return f"exit code {status}" if status >= 0 else signal.Signals(-status).name
+
+    def _end(self) -> int:
+        # A process that has ended by itself keeps its own status.
+        self._process.kill()
+        status = self._process.wait()
+        for pipe in filter(None, (self._process.stdin, self._process.stdout)):
+            with suppress(BrokenPipeError):  # the rest of an argument that it never read
+                pipe.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
+        return status
+
+
+def _exchange(process: Any, message: bytes) -> _Reply:
+    """The reply of a process to a message."""
+    pickle.dump(message, process.stdin)  # pickled once more, which tells the reader where it ends
+    process.stdin.flush()
+    return pickle.load(process.stdout)
+
+
+def _work() -> None:
+    """What the process does: it makes the function, and calls it with each message at its standard input."""
+    replies = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what libraries print is no reply
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent handles it
+    messages: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    threading.Thread(target=_receive, args=(messages,), daemon=True).start()
+    made: list[Function] = []
+    replies.write(_reply(lambda make: made.append(make()), messages.get()))
+    while True:
+        replies.flush()
+        replies.write(_reply(made[0], messages.get()))
+
+
+def _receive(messages: "queue.SimpleQueue[bytes]") -> None:
+    """Receive messages; end the process, even in the middle of a call, when its parent has ended."""
+    try:
+        while True:
+            messages.put(pickle.load(sys.stdin.buffer))
+    finally:
+        os._exit(0)
+
+
+def _reply(function: Function, argument: bytes) -> bytes:
+    """The result of the function, or the error that it raised, pickled."""
+    try:
+        return pickle.dumps((function(pickle.loads(argument)), None))
+    except Exception as error:
+        try:
+            return pickle.dumps((None, error))
+        except Exception:  # an error that holds an open file, or the like
+            return pickle.dumps((None, RuntimeError(repr(error))))
+
+
+if __name__ == "__main__":
+    _work()

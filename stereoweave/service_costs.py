@@ -1,0 +1,69 @@
+"""The time that a request will take, estimated before its pictures are decoded; too much of it is refused."""
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.service_requests import Order, TooLargeError
+
+# What large pictures take longer, for each of their pixels, and what full resolution takes longer. Checks and
+# rectification take a fraction of a second whatever the size.
+_LARGE_FROM_MEGAPIXELS, _LARGE, _REFINED = 2, 2.5, 1.3
+
+
+class BusyError(StereoweaveError):
+    """A request that can be done, but not in time after those that were accepted before it."""
+
+    def __init__(self, message: str, retry_after_s: int = 1) -> None:
+        super().__init__(message)
+        self.retry_after_s = retry_after_s
+
+
+class Budget:
+    """The work that one process has accepted, in estimated seconds.
+
+    A request's estimate is its work times the seconds that a unit of it took at best so far: a request is
+    refused only if it could not be done in time even at that speed.
+    """
+
+    def __init__(self, seconds_each: float) -> None:
+        self._accepted, self._seconds_each = 0.0, seconds_each
+
+    @contextmanager
+    def admit(self, order: Order, megapixels: float, left_s: float) -> Iterator[None]:
+        """Within the block the order counts as accepted.
+
+        Raises:
+            TooLargeError: It takes longer than the `left_s` seconds that are left for it.
+            BusyError: It does after what was accepted before it.
+        """
+        work = work_of(order, megapixels)
+        own_s = work * self._seconds_each
+        if own_s > left_s:
+            raise TooLargeError(
+                f"expected a request that takes at most {left_s:.0f} s, found {megapixels:.1f} megapixels, "
+                f"which take {own_s:.0f} s with its options; send smaller pictures, or fewer options"
+            )
+        late_s = self._accepted * self._seconds_each + own_s - left_s
+        if late_s > 0:
+            raise BusyError(
+                f"expected at most {left_s:.0f} s of work, found {late_s:.0f} s more; come again",
+                retry_after_s=math.ceil(late_s),
+            )
+        self._accepted += work
+        try:
+            yield
+        finally:
+            self._accepted -= work
+
+    def learn(self, work: float, took_s: float) -> None:
+        """Take into account how long an amount of work took."""
+        self._seconds_each = min(self._seconds_each, took_s / work)
+
+
+def work_of(order: Order, megapixels: float) -> float:
+    """The work of an order: as many megapixels of a plain disparity of small pictures take as long."""
+    large = _LARGE if megapixels > _LARGE_FROM_MEGAPIXELS else 1
+    refined = _REFINED if order.refined or order.is_view else 1
+    return megapixels * large * refined

@@ -1,0 +1,103 @@
+"""The HTTP server of `stereoweave serve`: uvicorn, with limits on the time and the bytes of a connection.
+
+Ray Serve's own proxy has none: it keeps a head without an end in memory.
+"""
+
+import asyncio
+import math
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+_MOST_HEAD_BYTES = 16 * 1024
+# So many bytes are parsed at a time: h11 takes 40 us for a chunk, which may be of one byte, and others wait.
+_PARSED_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class Patience:
+    """The seconds that a server waits for its clients.
+
+    Attributes:
+        head_s: For all of the head of the next request.
+        reader_s: For a client to read a response, which is in memory until then.
+        end_s: At its own end, for requests that are worked on.
+    """
+
+    head_s: float = 10
+    reader_s: float = 60
+    end_s: float = 60
+
+
+class _Connection(H11Protocol, asyncio.BufferedProtocol):
+    """A connection that is closed where the head of its next request does not arrive in time."""
+
+    def __init__(self, patience: Patience, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._patience = patience
+        self._buffer = bytearray(_PARSED_BYTES)
+
+    def get_buffer(self, sizehint: int) -> bytearray:
+        return self._buffer
+
+    def buffer_updated(self, nbytes: int) -> None:
+        self.data_received(bytes(self._buffer[:nbytes]))
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self._expect_head()
+
+    def data_received(self, data: bytes) -> None:
+        super().data_received(data)
+        if self._is_busy():
+            self._deadline.cancel()
+
+    def connection_lost(self, error: Exception | None) -> None:
+        self._deadline.cancel()
+        super().connection_lost(error)
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        if not self._is_busy():  # else the next request has arrived before
+            self._expect_head()
+
+    def _is_busy(self) -> bool:
+        return self.cycle is not None and not self.cycle.response_complete
+
+    def _expect_head(self) -> None:
+        unread = self.transport.get_write_buffer_size() > 0
+        within_s = self._patience.reader_s if unread else self._patience.head_s
+        self._deadline = self.loop.call_later(within_s, self.transport.abort)
+
+
+@contextmanager
+def http_server(app: Any, listener: socket.socket, patience: Patience) -> Iterator[None]:
+    """Serve an ASGI application at a socket for as long as the block lasts, in a thread."""
+    config = uvicorn.Config(
+        app,
+        http=partial(_Connection, patience),  # type: ignore[arg-type]
+        h11_max_incomplete_event_size=_MOST_HEAD_BYTES,
+        ws="none",
+        loop="asyncio",  # uvloop fails at its end where a connection was aborted
+        proxy_headers=False,
+        server_header=False,
+        access_log=False,
+        log_config=None,
+        log_level="critical",
+        timeout_graceful_shutdown=math.ceil(patience.end_s),
+    )
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=partial(server.run, sockets=[listener]))
+    thread.start()
+    try:
+        yield
+    finally:
+        server.should_exit = True
+        thread.join()

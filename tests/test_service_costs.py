@@ -1,0 +1,42 @@
+from pathlib import Path
+
+import pytest
+
+from stereoweave.service_costs import Budget, BusyError, work_of
+from stereoweave.service_requests import Order, TooLargeError
+
+
+def order(**said) -> Order:
+    return Order(folder=Path(), pictures=(Path("left"), Path("right")), **{"file": "depth.png", **said})
+
+
+def test_what_takes_longer_than_the_time_that_is_left_is_refused():
+    budget = Budget(seconds_each=2)
+    with budget.admit(order(), megapixels=4, left_s=20):
+        pass
+    with pytest.raises(TooLargeError, match="at most 20 s, found 4.2 megapixels, which take 21 s"):
+        budget.admit(order(), megapixels=4.2, left_s=20).__enter__()
+
+
+def test_what_would_be_late_after_those_before_it_is_to_come_again_when_they_are_done():
+    budget = Budget(seconds_each=2)
+    with budget.admit(order(), megapixels=2, left_s=5), budget.admit(order(), megapixels=0.5, left_s=5):
+        with pytest.raises(BusyError, match="found 2 s more") as busy:
+            budget.admit(order(), megapixels=0.8, left_s=5).__enter__()
+        assert busy.value.retry_after_s == 2  # 4 + 1 + 1.6 - 5, rounded up
+    with budget.admit(order(), megapixels=2, left_s=5):
+        pass
+
+
+def test_the_best_speed_counts():
+    budget = Budget(seconds_each=2)
+    budget.learn(work=10, took_s=10)
+    budget.learn(work=10, took_s=500)
+    with budget.admit(order(), megapixels=2, left_s=2):
+        pass
+
+
+def test_large_pictures_and_full_resolution_are_more_work():
+    assert work_of(order(), 0.6) == 0.6
+    assert work_of(order(), 50) == 125
+    assert work_of(order(refined=True), 1) == work_of(order(file="view.png"), 1) == 1.3
