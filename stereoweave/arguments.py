@@ -1,12 +1,16 @@
-"""Arguments of the Python interface that are of a wrong kind: each is one line of a StereoweaveError."""
+"""Arguments of the Python interface that are of a wrong kind: each is one line of a StereoweaveError.
+
+NumPy is imported inside the functions: `--help` counts threads, and is not to wait for it.
+"""
 
 import reprlib
 from numbers import Integral, Real
-from typing import TypeGuard
-
-import numpy as np
+from typing import TYPE_CHECKING, TypeGuard
 
 from stereoweave.errors import StereoweaveError
+
+if TYPE_CHECKING:
+    import numpy as np
 
 _MOST_SHOWN = 60
 _DTYPES = {"f": "floats", "u": "uint8", "b": "booleans"}
@@ -26,6 +30,8 @@ def check_whole_number(name: str, value: object) -> None:
 
 def check_flag(name: str, value: object) -> None:
     """Refuse anything but True and False."""
+    import numpy as np
+
     if not isinstance(value, bool | np.bool_):
         raise StereoweaveError(f"{name}: expected True or False, got {shown(value)}")
 
@@ -50,12 +56,16 @@ def check_array(name: str, value: object, kind: str, dimensions: int) -> None:
 
 def check_numbers(name: str, value: object) -> None:
     """Refuse what is neither a number nor an array of numbers."""
+    import numpy as np
+
     if not isinstance(value, Real | np.ndarray) or np.asarray(value).dtype.kind not in "fiu":
         raise StereoweaveError(f"{name}: expected an array of numbers, got {shown(value)}")
 
 
-def is_plain_array(value: object) -> TypeGuard[np.ndarray]:
+def is_plain_array(value: object) -> TypeGuard["np.ndarray"]:
     """Whether it is an array that computes as arrays do."""
+    import numpy as np
+
     return isinstance(value, np.ndarray) and not isinstance(value, np.matrix | np.ma.MaskedArray)
 
 
@@ -69,6 +79,8 @@ def _is_held_by_float(value: Real) -> bool:
 
 def shown(value: object) -> str:
     """A value in a few words; of an array its type, dtype and shape."""
+    import numpy as np
+
     if isinstance(value, np.ndarray):
         return f"{type(value).__name__} of {value.dtype} {list(value.shape)}"
     text = " ".join(reprlib.repr(value).split())
