@@ -5,24 +5,26 @@ import importlib.resources
 import os
 import re
 import shutil
+import signal
 import socket
+import sys
 import tempfile
 import webbrowser
-from collections.abc import Awaitable, Callable, MutableMapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 from uuid import uuid4
 
 import gradio as gr
 import uvicorn
 from fastapi import FastAPI
-from starlette.responses import PlainTextResponse
+from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from stereoweave.colour import OCCLUDED_RGB, colour_confidence, css_colour, legend_colours
 from stereoweave.errors import StereoweaveError
+from stereoweave.page_gate import ContentPolicy, OwnFiles
 from stereoweave.page_kept import (
     Kept,
     Uploads,
@@ -48,8 +50,6 @@ _KEPT_S = 3600
 _MOST_SESSIONS = 4
 _GUESSED = "guessed"
 _MODELS = [("fast", "small"), ("fine", "base")]
-# What a browser may load: nothing from elsewhere, whatever the page asks for.
-_POLICY = b"default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:"
 
 _HEAD = """<div class="head"><h1>Stereoweave</h1>
 <p>Two photographs of one scene become depth, and the view from anywhere between the two cameras.
@@ -74,11 +74,6 @@ if (!canvas.getContext("webgl2") && !canvas.getContext("webgl")) element.innerHT
   '<p class="told problem">This browser does not draw in three dimensions: switch on its hardware ' +
   'acceleration (WebGL). Where metres are known, another program shows cloud.glb, under Files.</p>';"""
 _GONE = "This result has been put away, as after an hour. Find depth again."
-
-_Scope = MutableMapping[str, Any]
-_Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
-_Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
-_Server = Callable[[_Scope, _Receive, _Send], Awaitable[None]]
 
 
 class Page:
@@ -384,10 +379,10 @@ def _sample_folder() -> Path:
     return Path(str(importlib.resources.files("stereoweave"))) / "sample"
 
 
-def make_server(folder: Path, names: frozenset[str] | None, provider: str = CPU) -> FastAPI:
+def make_server(folder: Path, names: Sequence[str], provider: str = CPU) -> FastAPI:
     """The page as an ASGI application; uploads and results lie in a folder of its own.
 
-    It answers to `names` alone, to any where there are none.
+    It answers to `names` alone.
     """
     os.environ["GRADIO_TEMP_DIR"] = str(folder)
     server = FastAPI(openapi_url=None)
@@ -407,7 +402,10 @@ def make_server(folder: Path, names: frozenset[str] | None, provider: str = CPU)
         theme=_theme(),
         css=css,
     )
-    server.add_middleware(KeepingToItself, names=names)
+    server.add_middleware(OwnFiles)
+    # A name that another site's DNS server gives this computer's address would open the page to that site.
+    server.add_middleware(TrustedHostMiddleware, allowed_hosts=names, www_redirect=False)
+    server.add_middleware(ContentPolicy)
     return server
 
 
@@ -422,39 +420,17 @@ def _theme() -> gr.themes.Base:
     ).set(body_text_color_subdued="*neutral_600", body_text_color_subdued_dark="*neutral_300")
 
 
-class KeepingToItself:
-    """Tells the browser to load nothing from anywhere else, whatever the page should ask for.
-
-    Where `names` are given, who asks for the page under another name is refused: a name that another site's
-    DNS server gives this computer's address would open the page to that site.
-    """
-
-    def __init__(self, app: _Server, names: frozenset[str] | None) -> None:
-        self._app, self._names = app, names
-
-    async def __call__(self, scope: _Scope, receive: _Receive, send: _Send) -> None:
-        if self._names and scope["type"] == "http":
-            host = dict(scope["headers"]).get(b"host", b"").decode("latin-1")
-            if urlsplit(f"//{host}").hostname not in self._names:
-                await PlainTextResponse("only for this computer", 403)(scope, receive, send)
-                return
-
-        async def send_with_policy(message: MutableMapping[str, Any]) -> None:
-            if message["type"] == "http.response.start":
-                message["headers"] = [*message.get("headers", []), (b"content-security-policy", _POLICY)]
-            await send(message)
-
-        await self._app(scope, receive, send_with_policy)
-
-
-def _own_names(listener: socket.socket) -> frozenset[str] | None:
-    """What this computer calls itself, where it alone is served."""
-    address = listener.getsockname()[0]
-    return frozenset({address, "localhost"}) if ip_address(address).is_loopback else None
+def _own_names(listener: socket.socket) -> list[str]:
+    """What this computer calls itself where it alone is served; any name elsewhere."""
+    address = ip_address(listener.getsockname()[0])
+    if not address.is_loopback:
+        return ["*"]
+    return [f"[{address}]" if address.version == 6 else str(address), "localhost"]
 
 
 def serve(listener: socket.socket, url: str, *, open_browser: bool, provider: str = CPU) -> None:
-    """Serves the page on a listening socket until it is interrupted; then what was uploaded is removed."""
+    """Serves the page on a listening socket until a signal ends it; then what was uploaded is removed."""
+    _end_in_order()
     with tempfile.TemporaryDirectory(prefix="stereoweave-page-") as folder:
         # An open page keeps a connection open, which would never end of itself.
         server = make_server(Path(folder), _own_names(listener), provider)
@@ -462,3 +438,11 @@ def serve(listener: socket.socket, url: str, *, open_browser: bool, provider: st
         if open_browser:
             webbrowser.open(url)
         uvicorn.Server(config).run(sockets=[listener])
+
+
+def _end_in_order() -> None:
+    """Lets SIGTERM, and the end of the terminal, end the process by an exception, as Ctrl-C does."""
+    for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):
+        # Who set it to be ignored, such as nohup, is obeyed.
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, lambda number, _: sys.exit(128 + number))

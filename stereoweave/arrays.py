@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Shaped, UInt8
 from PIL import Image
 
+from stereoweave.arguments import is_plain_array
 from stereoweave.errors import StereoweaveError
 
 _CHANNELS = (1, 3, 4)
@@ -37,7 +38,9 @@ def as_rgb(image: object, name: str = "image") -> UInt8[np.ndarray, "h w 3"]:
         tensor = image.detach().cpu()
         # NumPy has no bfloat16.
         image = (tensor.float() if tensor.is_floating_point() else tensor).numpy()
-    if not isinstance(image, np.ndarray):
+    if isinstance(image, np.matrix):
+        image = np.asarray(image)
+    if not is_plain_array(image):
         raise StereoweaveError(
             f"{name}: expected a NumPy array, a PIL image or a torch tensor, got {type(image).__name__}; "
             "PIL.Image.open reads a file"

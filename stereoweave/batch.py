@@ -4,7 +4,6 @@ A pair is finished when its folder has the file `done.json`, which is written la
 results are, and how they came out. What was made how, `batch.json` says for the whole folder.
 """
 
-import csv
 import functools
 import json
 import multiprocessing
@@ -32,6 +31,7 @@ from stereoweave.pair_lists import BATCH_FILE, SUMMARY_FILE, Job, Pairs
 from stereoweave.processes import begin_work
 from stereoweave.progress import progress
 from stereoweave.results import DepthOrder, make_depth, order_facts
+from stereoweave.texts import write_table
 from stereoweave.threads import usable_cores
 
 _BLAS_THREADS = "OPENBLAS_NUM_THREADS"
@@ -295,13 +295,7 @@ def _write_summary(out: Path, jobs: Sequence[Job], failed: dict[str, str]) -> No
         name: {"name": name, "pictures": " + ".join(path.name for path in pictures[name]), "error": error}
         for name, error in failed.items()
     }
-    with (
-        replacing(out / SUMMARY_FILE) as temporary,
-        temporary.open("w", newline="", encoding="utf-8") as file,
-    ):
-        writer = csv.DictWriter(file, _COLUMNS)
-        writer.writeheader()
-        writer.writerows(rows[name] for name in sorted(rows) if rows[name])
+    write_table(out / SUMMARY_FILE, _COLUMNS, (rows[name] for name in sorted(rows) if rows[name]))
 
 
 def _row(folder: Path) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """Matchers side by side on pairs of known disparity: accuracy, edges, confidence, time and memory."""
 
-import csv
 import os
 import platform
 import time
@@ -21,7 +20,6 @@ from stereoweave.edges import edge_bad_percent, edge_epe_px, flying_percent
 from stereoweave.engine import Engine, stream
 from stereoweave.error_classes import ClassErrors, class_errors, classify
 from stereoweave.errors import StereoweaveError
-from stereoweave.io import replacing
 from stereoweave.matcher import Matcher
 from stereoweave.matching import match
 from stereoweave.memory import peak_memory_mb
@@ -36,6 +34,7 @@ from stereoweave.metrics import (
 from stereoweave.opencv_matchers import OPENCV_MATCHERS, SGBM, fill_rows, left_right_confidence
 from stereoweave.providers import CPU
 from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.texts import write_table
 
 Match = Callable[[StereoPair], Estimate | Float[np.ndarray, "h w"]]
 """What is timed: a pair to an Estimate; or to the left disparity in px [H, W] alone, where <= 0 is a hole.
@@ -246,12 +245,9 @@ def write_csv(path: str | Path, rows: Sequence[Any], machine: dict[str, str] | N
         machine: These two, and the number of cores; this one's unless given.
     """
     machine = machine or _machine()
-    with replacing(path) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [field.name for field in fields(rows[0])] + list(machine))
-        writer.writeheader()
-        for row in rows:
-            values = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in asdict(row).items()}
-            writer.writerow(values | machine)
+    columns = [field.name for field in fields(rows[0])] + list(machine)
+    values = [{k: f"{v:.6g}" if isinstance(v, float) else v for k, v in asdict(row).items()} for row in rows]
+    write_table(path, columns, (row | machine for row in values))
 
 
 class _Scorer:

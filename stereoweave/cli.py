@@ -1,6 +1,8 @@
 """The commands: stereoweave depth | measure | view | video | live | app | check | rectify | train, more."""
 
+import io
 import re
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -28,6 +30,8 @@ app.add_typer(synth, name="synth")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """0 where the command line went well; 2 after a mistake of the caller's, told in one line on stderr."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # as stderr is, for names that are no UTF-8
     try:
         return app(arguments, prog_name="stereoweave", standalone_mode=False) or 0
     except typer.TyperException as error:

@@ -3,6 +3,7 @@
 import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 
 class StereoweaveError(ValueError):
@@ -44,10 +45,14 @@ def reason(error: Exception) -> str:
             return "no such file"
         case IsADirectoryError():
             return "a folder"
+        case FileExistsError(filename=str(name)) if Path(name).is_symlink() and not Path(name).exists():
+            return "a link that leads nowhere"
         case FileExistsError():
             return "a file"
         case OSError(strerror=str(text)):
             return text.lower()
+        case EOFError():
+            return "one that ends too early"
         case MemoryError():
             return "one that takes more memory than there is"
     # Libraries quote what they found, which may be all of a file, and in many lines.

@@ -252,7 +252,8 @@ def place_for(*files: Path) -> Path:
     for file in files:
         if file.is_dir():
             raise StereoweaveError(f"{file}: expected a file that can be written, found a folder")
-    return make_folder(next(path for path in files[0].parents if path.exists()))
+    # A link that leads nowhere is in the way of a folder.
+    return make_folder(next(path for path in files[0].parents if path.exists() or path.is_symlink()))
 
 
 @contextmanager

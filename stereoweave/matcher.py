@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from stereoweave.arguments import check_flag, check_kind
 from stereoweave.errors import MatcherError, StereoweaveError
 from stereoweave.io import SMALLEST_SIDE_PX
 from stereoweave.occluded_fill import fill_occluded
@@ -141,6 +142,9 @@ class Matcher:
             ValueError: As for `estimate`, or if the pairs are not all of one size.
         """
         check_steps(refined=refined, raw=raw)
+        check_kind("pairs", pairs, Sequence)
+        for pair in pairs:
+            check_kind("pairs", pair, StereoPair)
         self._check_sizes(pairs)
         every_maps = self._maps(pairs)
         if any(maps.right_disparity_px is None for maps in every_maps):
@@ -337,6 +341,7 @@ def _weights_folder() -> Path:
 
 def model_file(model: str | Path) -> Path:
     """The file of a shipped name or a mode, or the .onnx file itself; MatcherError where there is none."""
+    check_kind("model", model, str, Path)
     if str(model).endswith(".onnx"):
         path = Path(model)
         if not path.is_file():
@@ -374,6 +379,8 @@ def _strip_weights(rows: slice, height: int) -> Float[np.ndarray, "h 1"]:
 
 def check_steps(*, refined: bool, raw: bool) -> None:
     """Raise a StereoweaveError where an estimate is to be both refined and raw."""
+    check_flag("refined", refined)
+    check_flag("raw", raw)
     if refined and raw:
         raise StereoweaveError(
             "raw: expected without refined: it is the network's own disparity; leave one of them out"

@@ -16,15 +16,17 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
+from stereoweave.arguments import check_number
 from stereoweave.arrays import as_rgb
 from stereoweave.enlarging import enlarge
 from stereoweave.errors import StereoweaveError
 from stereoweave.io import SMALLEST_SIDE_PX
 from stereoweave.matcher import MODES, PIXEL_PAIRS_AT_ONCE, Matcher, check_steps, find_occluded, model_file
-from stereoweave.providers import CPU
+from stereoweave.providers import CPU, check_provider
 from stereoweave.ranging import find_range, goes_beyond
 from stereoweave.refining import right_confidence
 from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
+from stereoweave.threads import thread_count
 
 # A network that is shown what is beyond its range often believes in the end of it, but not quite.
 _CONFIDENT, _CONFIDENT_AT_END = 0.5, 0.9
@@ -84,6 +86,8 @@ def estimate(  # noqa: PLR0913 - each has a name, and all but the pictures can b
         ValueError: MatcherError for a model that is none or a provider that is not there, ProviderError for
             one that fails, StereoweaveError for images that are none.
     """
+    check_provider(provider)
+    thread_count(threads)
     pair = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
     path = model_file(model).absolute()
     named = model if str(model) in MODES else path
@@ -154,7 +158,7 @@ def _kept_matcher(model: str | Path, modified_ns: int, threads: int | None, prov
 
 def _checked(range_px: tuple[float, float], width_px: int) -> tuple[float, float]:
     """The part of a range that pictures of this width can have."""
-    low_px, high_px = range_px
+    low_px, high_px = _two_numbers(range_px)
     if not (math.isfinite(low_px) and math.isfinite(high_px) and low_px < high_px):
         raise StereoweaveError(
             f"range_px: expected the least and the greatest disparity in px, got {low_px:g} and {high_px:g}; "
@@ -166,6 +170,19 @@ def _checked(range_px: tuple[float, float], width_px: int) -> tuple[float, float
             f"got {low_px:g} and {high_px:g}; leave it out to have it found"
         )
     return max(low_px, -width_px), min(high_px, width_px)
+
+
+def _two_numbers(range_px: tuple[float, float]) -> tuple[float, float]:
+    is_row = isinstance(range_px, Sequence) or (isinstance(range_px, np.ndarray) and range_px.ndim == 1)
+    if not is_row or len(range_px) != 2:
+        raise StereoweaveError(
+            "range_px: expected the least and the greatest disparity in px, such as (-20, 150); "
+            "leave it out to have it found"
+        )
+    for value in range_px:
+        check_number("range_px", value)
+    low_px, high_px = range_px
+    return low_px, high_px
 
 
 def _shown_first(matcher: Matcher, pair: StereoPair, range_px: tuple[float, float] | None) -> _Shown:

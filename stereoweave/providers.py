@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from stereoweave.arguments import check_kind
 from stereoweave.errors import MatcherError, ProviderError
 
 CPU = "cpu"
@@ -118,6 +119,7 @@ def check_provider(provider: str) -> None:
     """MatcherError for a name that is none, or a provider that the installed ONNX Runtime does not have."""
     import onnxruntime  # type: ignore[import-untyped]
 
+    check_kind("provider", provider, str)
     if provider not in PROVIDERS:
         raise MatcherError(f"provider: expected one of {', '.join(PROVIDERS)}, found {provider!r}")
     there = [name for name, known in PROVIDERS.items() if known.name in onnxruntime.get_available_providers()]

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from stereoweave.arguments import check_number
 from stereoweave.errors import StereoweaveError
 from stereoweave.exposure import match_exposure, recoloured
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair, View, check_fits
@@ -69,6 +70,7 @@ class Renderer:
             up: How far above the line through the cameras, in baselines; -1 to 1.
             forward: How far before it, in baselines; -1 to 1.
         """
+        check_number("position", position)
         position = 0.5 + self.strength * (position - 0.5)
         check_position(position, up=up, forward=forward)
         moves = bool(self.convergence_px or up or forward)
@@ -179,6 +181,8 @@ def render(  # noqa: PLR0913 - each is a choice of the caller's
 
 def check_position(position: float, *, up: float = 0.0, forward: float = 0.0) -> None:
     """Raise a ValueError unless views can be rendered from there."""
+    for name, value in (("position", position), ("up", up), ("forward", forward)):
+        check_number(name, value)
     if not FIRST_POSITION <= position <= LAST_POSITION:
         raise StereoweaveError(
             f"position: expected {FIRST_POSITION} to {LAST_POSITION} (0 left camera, 1 right), got {position}"
@@ -191,6 +195,8 @@ def check_position(position: float, *, up: float = 0.0, forward: float = 0.0) ->
 
 
 def _check_shifts(strength: float, convergence_px: float, pair: StereoPair) -> None:
+    check_number("strength", strength)
+    check_number("convergence_px", convergence_px)
     if not 0 <= strength < math.inf:
         raise StereoweaveError(f"strength: expected 0 or more, got {strength}")
     width = pair.left.shape[1]

@@ -20,9 +20,9 @@ from stereoweave.colour import (
     css_colour,
     legend_colours,
 )
-from stereoweave.io import replacing
 from stereoweave.rendering import Renderer
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
+from stereoweave.texts import writing_text
 
 POSITIONS = tuple(step / 8 for step in range(-2, 11))
 
@@ -94,8 +94,8 @@ def write_report(
     """
     template = importlib.resources.files("stereoweave").joinpath("report.html").read_text(encoding="utf-8")
     page = string.Template(template).substitute(_fields(pair, estimate, summary, threads))
-    with replacing(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    with writing_text(path) as file:
+        file.write(page)
 
 
 def _fields(pair: StereoPair, estimate: Estimate, summary: Summary, threads: int | None) -> dict[str, object]:

@@ -38,6 +38,7 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.hints import hints
 from stereoweave.io import (
     RangeError,
+    make_folder,
     place_for,
     reading,
     write_depth_png,
@@ -227,7 +228,7 @@ def _results_in(out: Path) -> Iterator[Path]:
     standing = place_for(*(out / file for file in FILES))
     with tempfile.TemporaryDirectory(prefix=".stereoweave-", dir=standing) as name:
         yield Path(name)
-        out.mkdir(parents=True, exist_ok=True)
+        make_folder(out)
         is_earlier_result = (out / "disparity.pfm").exists()
         for file in FILES:
             fresh = Path(name, file)

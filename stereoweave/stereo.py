@@ -11,6 +11,14 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Bool, Float, Real, UInt8
 
+from stereoweave.arguments import (
+    check_array,
+    check_kind,
+    check_number,
+    check_numbers,
+    is_plain_array,
+    shown,
+)
 from stereoweave.errors import StereoweaveError
 
 # What OpenCV's remapping takes: it counts pixels in 16 bits.
@@ -40,12 +48,13 @@ class StereoCamera:
     doffs_px: float = 0.0
 
     def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            check_number(name, value)
         if not (self.focal_px > 0 and self.baseline_m > 0):
             raise StereoweaveError(
                 f"focal_px and baseline_m must be positive, got {self.focal_px} and {self.baseline_m}"
             )
-        numbers = [self.focal_px, self.baseline_m, self.cx_px, self.cy_px, self.doffs_px]
-        if not (np.abs(numbers) < CAMERA_NUMBERS_BELOW).all():
+        if not all(abs(value) < CAMERA_NUMBERS_BELOW for value in vars(self).values()):
             raise StereoweaveError(
                 f"a camera's numbers must be finite and below {CAMERA_NUMBERS_BELOW:g}, got {self}"
             )
@@ -55,17 +64,20 @@ class StereoCamera:
         cls, image: UInt8[np.ndarray, "h w 3"], *, focal_px: float, baseline_m: float
     ) -> "StereoCamera":
         """The camera of an image [H, W, 3] of which no more is known: its axis meets the image's middle."""
+        check_array("image", image, "u", 3)
         height, width = image.shape[:2]
         return cls(focal_px=focal_px, baseline_m=baseline_m, cx_px=(width - 1) / 2, cy_px=(height - 1) / 2)
 
     def depth_m(self, disparity_px: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
         """Depth along the optical axis in metres; infinite where disparity_px + doffs_px <= 0."""
+        check_numbers("disparity_px", disparity_px)
         shifted_px = np.maximum(disparity_px + self.doffs_px, 0)
         with np.errstate(divide="ignore"):
             return self.focal_px * self.baseline_m / shifted_px
 
     def disparity_px(self, depth_m: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
         """Disparity in pixels of a depth in metres: the inverse of `depth_m`."""
+        check_numbers("depth_m", depth_m)
         with np.errstate(divide="ignore"):
             return self.focal_px * self.baseline_m / depth_m - self.doffs_px
 
@@ -86,10 +98,8 @@ class StereoPair:
 
     def __post_init__(self) -> None:
         for side, image in (("left", self.left), ("right", self.right)):
-            if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-                raise StereoweaveError(
-                    f"{side} image: expected uint8 RGB [H, W, 3], got {image.dtype} {list(image.shape)}"
-                )
+            if not is_plain_array(image) or image.dtype != np.uint8 or image.shape[2:] != (3,):
+                raise StereoweaveError(f"{side} image: expected uint8 RGB [H, W, 3], got {shown(image)}")
             if max(image.shape) > LONGEST_SIDE_PX:
                 raise StereoweaveError(
                     f"{side} image: expected at most {LONGEST_SIDE_PX} pixels a side, got {_size(image)}; "
@@ -100,7 +110,11 @@ class StereoPair:
                 "left and right images must be of one size, "
                 f"got {_size(self.left)} and {_size(self.right)}; crop or rescale one of them"
             )
+        if self.camera is not None:
+            check_kind("camera", self.camera, StereoCamera)
         for side, seen in (("left", self.left_seen), ("right", self.right_seen)):
+            if seen is not None:
+                check_array(f"{side}_seen", seen, "b", 2)
             if seen is not None and seen.shape != self.left.shape[:2]:
                 raise StereoweaveError(
                     f"{side}_seen: expected the shape of the images {self.left.shape[:2]}, got {seen.shape}"
@@ -133,9 +147,11 @@ class Estimate:
     occluded: Bool[np.ndarray, "h w"]
 
     def __post_init__(self) -> None:
+        check_array("disparity_px", self.disparity_px, "f", 2)
         shape = self.disparity_px.shape
         for name in ("disparity_px", "right_disparity_px", "confidence", "occluded"):
             value = getattr(self, name)
+            check_array(name, value, "b" if name == "occluded" else "f", 2)
             if value.shape != shape:
                 raise StereoweaveError(
                     f"{name}: expected the shape of disparity_px {shape}, got {value.shape}"
@@ -154,6 +170,8 @@ class Estimate:
 
 def check_fits(estimate: Estimate, pair: StereoPair) -> None:
     """Raise a StereoweaveError unless the estimate is of the size of the pair."""
+    check_kind("estimate", estimate, Estimate)
+    check_kind("pair", pair, StereoPair)
     found, expected = estimate.disparity_px.shape, pair.left.shape[:2]
     if found != expected:
         raise StereoweaveError(
@@ -214,8 +232,12 @@ class DepthCurve:
             )
         for name in ("max_disparity_px", "max_depth_m"):
             value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
+            if value is None:
+                continue
+            check_number(name, value)
+            if not 0 < value < math.inf:
                 raise StereoweaveError(f"{name} must be positive and finite, got {value}")
+        check_number("exponent", self.exponent)
         if not 1 <= self.exponent < math.inf:
             raise StereoweaveError(f"exponent must be finite and at least 1, got {self.exponent}")
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int16, UInt8
 
+from stereoweave.arguments import check_flag, check_number, check_whole_number
 from stereoweave.arrays import as_rgb
 from stereoweave.errors import StereoweaveError
 from stereoweave.matcher import Matcher
@@ -44,6 +45,8 @@ class StereoMatcher:
         refined: bool = False,
         min_confidence: float = 0.5,
     ) -> None:
+        check_number("min_confidence", min_confidence)
+        check_flag("refined", refined)
         self._least_px, self._count, self._refined = minDisparity, numDisparities, refined
         self._min_confidence = min_confidence
         if not 0 <= min_confidence <= 1:
@@ -86,6 +89,8 @@ class StereoMatcher:
         self._check_range()
 
     def _check_range(self) -> None:
+        check_whole_number("minDisparity", self._least_px)
+        check_whole_number("numDisparities", self._count)
         least_px, most_px = self._least_px, self._least_px + self._count
         # One more at the low end, for what is invalid.
         if self._count < 1 or least_px - 1 < -_LARGEST_PX or most_px > _LARGEST_PX:

@@ -4,13 +4,18 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
+from stereoweave.arguments import check_whole_number
 from stereoweave.errors import StereoweaveError
+
+_MOST_THREADS = 1024
 
 
 def thread_count(threads: int | None) -> int:
-    """The number asked for, or `usable_cores` where none is; StereoweaveError for one below 1."""
-    if threads is not None and threads < 1:
-        raise StereoweaveError(f"threads: expected 1 or more, got {threads}")
+    """The number asked for, or `usable_cores` where none is; StereoweaveError for what is no such number."""
+    if threads is not None:
+        check_whole_number("threads", threads)
+        if not 1 <= threads <= _MOST_THREADS:
+            raise StereoweaveError(f"threads: expected 1 or more, got {threads}; {_MOST_THREADS} at most")
     return threads or usable_cores()
 
 

@@ -384,7 +384,7 @@ def _known_by(path: Path) -> list[object]:
     digest = hashlib.sha256()
     for file in [path] if files is None else files:
         status = file.stat()
-        digest.update(f"{file.name} {status.st_size} {status.st_mtime_ns}\n".encode())
+        digest.update(f"{file.name} {status.st_size} {status.st_mtime_ns}\n".encode(errors="surrogateescape"))
     return [str(path), digest.hexdigest()]
 
 

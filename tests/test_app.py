@@ -2,13 +2,10 @@
 
 import http.client
 import io
-import os
 import re
 import shutil
-import signal
 import socket
 import struct
-import subprocess
 import sys
 import zipfile
 import zlib
@@ -19,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from page_examples import start, stop
 from PIL import Image
 
 from stereoweave.cli import main
@@ -33,12 +31,6 @@ EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 SIZE = (640, 480)
 UNDRAWN = "does not draw in three dimensions"
 WINDOW = {"width": 1280, "height": 1000}
-SERVER = [
-    sys.executable,
-    "-c",
-    "import sys; from stereoweave.cli import main; sys.exit(main(sys.argv[1:]))",
-    "app",
-]
 FLAGS = [
     "--no-sandbox",
     "--enable-unsafe-swiftshader",
@@ -52,30 +44,6 @@ FLAGS = [
 PATIENCE_MS = 60_000
 
 pytestmark = pytest.mark.needs_chromium
-
-
-def start(folder: Path) -> tuple[subprocess.Popen[str], str]:
-    """A server of its own, whose temporary files are in `folder`, and its address."""
-    # Where a shell starts the tests in the background, Ctrl-C is ignored, and processes inherit that.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    server = subprocess.Popen(
-        [*SERVER, "--port", "0"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "TMPDIR": str(folder), "PYTHONUNBUFFERED": "1"},
-    )
-    signal.signal(signal.SIGINT, before)
-    assert server.stdout
-    return server, re.search(r"http://\S+", server.stdout.readline())[0]
-
-
-def stop(server: subprocess.Popen[str]) -> str:
-    """What the server said to the end, after an interrupt."""
-    server.send_signal(signal.SIGINT)
-    said = "".join(server.communicate(timeout=30))
-    assert server.returncode == 130
-    return said
 
 
 @pytest.fixture(scope="module")
@@ -98,14 +66,16 @@ def browser() -> Iterator[Any]:
 
 
 class Visit:
-    """One visitor's window; `asked` are the addresses that it asked for."""
+    """One visitor's window; `asked` are the addresses that it asked for, `refused` those it did not get."""
 
     def __init__(self, browser: Any, address: str) -> None:
         self.asked: list[str] = []
+        self.refused: list[str] = []
         self._context = browser.new_context(viewport=WINDOW)
         self.page = self._context.new_page()
         self.page.set_default_timeout(PATIENCE_MS)
         self.page.on("request", lambda request: self.asked.append(request.url))
+        self.page.on("response", lambda answer: answer.ok or self.refused.append(answer.url))
         self.page.goto(address)
         self.page.locator("#find").wait_for()
 
@@ -365,6 +335,7 @@ def test_the_page_asks_nobody_but_its_server(answered, address):
     elsewhere = [url for url in answered.asked if not url.startswith((address, "data:", "blob:"))]
     assert len(answered.asked) > 50
     assert elsewhere == []
+    assert answered.refused == []
 
 
 def asked(address: str, path: str = "/", **headers: str) -> http.client.HTTPResponse:
@@ -383,8 +354,9 @@ def test_the_browser_is_told_to_load_nothing_from_elsewhere(address):
 
 def test_a_foreign_name_for_this_computer_does_not_open_the_page(address):
     port = address.rsplit(":", 1)[1]
-    assert asked(address, Host=f"somewhere.example:{port}").status == 403
-    assert asked(address, "/gradio_api/info", Host=f"127.0.0.1.somewhere.example:{port}").status == 403
+    for name in ("somewhere.example", "127.0.0.1.somewhere.example", "[", "127.0.0.1@somewhere.example", ""):
+        assert asked(address, Host=f"{name}:{port}").status == 400, name
+        assert asked(address, "/gradio_api/info", Host=f"{name}:{port}").status == 400, name
     assert asked(address, Host=f"localhost:{port}").status == 200
 
 

@@ -9,6 +9,7 @@ from torch import nn
 
 from stereoweave.errors import FormatError
 from stereoweave.learn import checkpoint
+from stereoweave.learn.perceptual import PerceptualLoss
 
 
 @pytest.fixture
@@ -190,3 +191,19 @@ def test_averaged_weights_alone_are_small_and_a_run_can_start_from_them(tmp_path
     for name, value in network.state_dict().items():
         # 11 bits of a float16's fraction.
         torch.testing.assert_close(start.weights[name], value, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("content", [b"", b"no checkpoint", b"\x80", b"PK\x03\x04"])
+def test_what_is_no_checkpoint_is_refused_with_a_reason(tmp_path, content):
+    path = tmp_path / "last.pt"
+    path.write_bytes(content)
+    for load, expected in (
+        (checkpoint.load, "a checkpoint of `stereoweave train`"),
+        (PerceptualLoss, "vgg16"),
+    ):
+        with pytest.raises(FormatError) as raised:
+            load(path)
+        told = str(raised.value)
+        assert re.fullmatch(rf"{re.escape(str(path))}: expected {expected}.*, found one that \S.+", told), (
+            told
+        )

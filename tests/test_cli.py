@@ -525,3 +525,27 @@ def test_the_experiment_is_planned_trained_and_reported(tmp_path, monkeypatch, c
         ("report", "experiment", ["trials"], runs, report),
     ]
     assert capfd.readouterr().out == "tables: results/paper.md\n"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "depth {left} {right} -o {link}",
+        "depth {folder} -o {link}",
+        "view {left} {right} -o {link}/view.png",
+        "view {left} {right} --layout wiggle -o {link}/view.webp",
+        "rectify {left} {right} -o {link}",
+        "bench pairs {folder} -o {link}/rows.csv",
+        "video {folder} {folder} --depth -o {link}/depth.mp4",
+        "batch {folder} {link}",
+    ],
+)
+def test_a_link_that_leads_nowhere_is_no_place_for_output(tmp_path, capsys, line):
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path / "nowhere")
+    places = {"left": EXAMPLES / "left.png", "right": EXAMPLES / "right.png", "folder": EXAMPLES}
+    assert run(line.format(**places, link=link)) == 2
+    told = capsys.readouterr().err.splitlines()
+    expected = "expected a folder that can be written, found a link that leads nowhere"
+    assert told[-1] == f"stereoweave: {link}: {expected}"
+    assert not (tmp_path / "nowhere").exists()

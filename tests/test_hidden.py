@@ -106,6 +106,24 @@ def test_what_is_invented_stays_the_same_from_view_to_view(rng):
     np.testing.assert_array_equal(near.image[:, 21:25], far.image[:, 22:26])
 
 
+@pytest.mark.parametrize(("position", "first"), [(-0.5, 21), (1.5, 31)])
+def test_in_a_view_from_beyond_the_hidden_stripes_go_on_in_step(position, first):
+    wall = stripes(4)
+    left, right, maps = wall_with_object(wall)
+    estimate = Estimate(
+        disparity_px=maps[0],
+        right_disparity_px=maps[1],
+        confidence=np.ones_like(maps[0]),
+        occluded=np.zeros(maps[0].shape, bool),
+    )
+    view = Renderer(StereoPair(left=left, right=right), estimate).view(position)
+    # The object is at 25..50, or at 5..30; beside it is what neither camera saw.
+    hidden = np.s_[1:, first : first + 4]
+    assert not view.drawn[hidden].any()
+    expected = np.roll(wall, round(-WALL_PX * position), axis=1)
+    np.testing.assert_array_equal(view.image[hidden], expected[hidden])
+
+
 def test_a_plain_picture_hides_nothing():
     flat = np.full((4, 60), WALL_PX, np.float32)
     hidden_px, _ = uncovered(stripes(4, 4), flat, flat, -1)

@@ -373,6 +373,20 @@ def test_a_pair_that_is_moved_is_still_seen_whole(rng, monkeypatch):
     assert seen == [True]
 
 
+def test_a_pair_is_shown_no_smaller_than_its_range_asks_for(matcher, rng, monkeypatch):
+    seen = []
+    estimate_many = Matcher.estimate_many
+
+    def noted(matcher, pairs, **options):
+        seen.extend(pair.left.shape for pair in pairs)
+        return estimate_many(matcher, pairs, **options)
+
+    monkeypatch.setattr(Matcher, "estimate_many", noted)
+    match(matcher, flat(rng, 37), range_px=(-100, 300))
+    # 400 px in the 188 that are seen well: 480x160 px become 226x75, of which the least is -47.1 px.
+    assert seen == [(75, 226 + 48, 3)]
+
+
 @pytest.mark.parametrize("given", [{}, {"range_px": (-8, 100), "refined": True}])
 def test_pairs_of_any_sizes_and_ranges_matched_together_are_as_each_is_alone(rng, monkeypatch, given):
     monkeypatch.setitem(PROVIDERS, "cpu", replace(PROVIDERS["cpu"], batches=True))  # as a GPU takes them

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from stereoweave.errors import FormatError
+from stereoweave.errors import FormatError, reason
 from stereoweave.learn.models import network_of
 from stereoweave.learn.recipe import Recipe, recipe_from
 
@@ -153,8 +153,9 @@ def load(path: Path) -> Checkpoint:
             f"{path}: no such checkpoint; `stereoweave train` writes last.pt into its run"
         ) from error
     except Exception as error:  # other bytes lead PyTorch's reader to any error whatever
-        found = str(error).partition("\n")[0]
-        raise FormatError(f"{path}: expected a checkpoint of `stereoweave train`, found: {found}") from error
+        raise FormatError(
+            f"{path}: expected a checkpoint of `stereoweave train`, found {reason(error)}"
+        ) from error
     # Checkpoints written before there was an origin have none.
     if not isinstance(values, dict) or {*values, "origin"} != {field.name for field in fields(Checkpoint)}:
         raise FormatError(

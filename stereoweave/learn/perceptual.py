@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from stereoweave.errors import FormatError
+from stereoweave.errors import FormatError, reason
 
 WEIGHTS = "vgg16-397923af.pth, torchvision's VGG-16 trained on ImageNet"
 
@@ -88,8 +88,7 @@ def _load(path: Path) -> dict[str, Any]:
             f"{path}: no such file; expected {WEIGHTS}, which is never downloaded by itself"
         ) from error
     except Exception as error:  # other bytes lead PyTorch's reader to any error whatever
-        reason = str(error).partition("\n")[0]
-        raise FormatError(f"{path}: expected {WEIGHTS}, found: {reason}") from error
+        raise FormatError(f"{path}: expected {WEIGHTS}, found {reason(error)}") from error
     if not isinstance(found, dict):
         raise FormatError(f"{path}: expected {WEIGHTS}, found a {type(found).__name__}")
     return found

@@ -1,0 +1,75 @@
+"""Arguments of the Python interface that are of a wrong kind: each is one line of a StereoweaveError."""
+
+import reprlib
+from numbers import Integral, Real
+from typing import TypeGuard
+
+import numpy as np
+
+from stereoweave.errors import StereoweaveError
+
+_MOST_SHOWN = 60
+_DTYPES = {"f": "floats", "u": "uint8", "b": "booleans"}
+
+
+def check_number(name: str, value: object) -> None:
+    """Refuse anything but a number that a float holds, NaN and infinity among them."""
+    if not isinstance(value, Real) or isinstance(value, bool) or not _is_held_by_float(value):
+        raise StereoweaveError(f"{name}: expected a number, got {shown(value)}")
+
+
+def check_whole_number(name: str, value: object) -> None:
+    """Refuse anything but a whole number that a float holds."""
+    if not isinstance(value, Integral) or isinstance(value, bool) or not _is_held_by_float(value):
+        raise StereoweaveError(f"{name}: expected a whole number, got {shown(value)}")
+
+
+def check_flag(name: str, value: object) -> None:
+    """Refuse anything but True and False."""
+    if not isinstance(value, bool | np.bool_):
+        raise StereoweaveError(f"{name}: expected True or False, got {shown(value)}")
+
+
+def check_kind(name: str, value: object, *kinds: type) -> None:
+    """Refuse anything but an instance of these types."""
+    if not isinstance(value, kinds):
+        expected = " or ".join(kind.__name__ for kind in kinds)
+        raise StereoweaveError(f"{name}: expected {expected}, got {shown(value)}")
+
+
+def check_array(name: str, value: object, kind: str, dimensions: int) -> None:
+    """Refuse anything but an array of a kind of numbers, "f", "u" or "b", and of so many dimensions.
+
+    A matrix and a masked array are none: they compute otherwise, or leave out what is masked.
+    """
+    if not is_plain_array(value) or value.dtype.kind != kind or value.ndim != dimensions:
+        raise StereoweaveError(
+            f"{name}: expected an array of {_DTYPES[kind]} with {dimensions} axes, got {shown(value)}"
+        )
+
+
+def check_numbers(name: str, value: object) -> None:
+    """Refuse what is neither a number nor an array of numbers."""
+    if not isinstance(value, Real | np.ndarray) or np.asarray(value).dtype.kind not in "fiu":
+        raise StereoweaveError(f"{name}: expected an array of numbers, got {shown(value)}")
+
+
+def is_plain_array(value: object) -> TypeGuard[np.ndarray]:
+    """Whether it is an array that computes as arrays do."""
+    return isinstance(value, np.ndarray) and not isinstance(value, np.matrix | np.ma.MaskedArray)
+
+
+def _is_held_by_float(value: Real) -> bool:
+    try:
+        float(value)
+    except OverflowError:
+        return False
+    return True
+
+
+def shown(value: object) -> str:
+    """A value in a few words; of an array its type, dtype and shape."""
+    if isinstance(value, np.ndarray):
+        return f"{type(value).__name__} of {value.dtype} {list(value.shape)}"
+    text = " ".join(reprlib.repr(value).split())
+    return text if len(text) <= _MOST_SHOWN else type(value).__name__

@@ -1,0 +1,177 @@
+"""Which requests reach the page: those on the routes that it needs, for the visitor's own files."""
+
+import json
+import re
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from http.cookies import CookieError, SimpleCookie
+from secrets import token_urlsafe
+from typing import Any
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import PlainTextResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+# What a browser may load: nothing from elsewhere, whatever the page asks for.
+_POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:"
+_REFUSED = "expected a file that you gave to this page or that it made of yours; give it again"
+_COOKIE = "stereoweave-visitor"
+_VISITOR = re.compile(r"[\w-]{43}", re.ASCII)
+_API = "/gradio_api"
+_FILE = f"{_API}/file="
+# Gradio has more: calls without its queue, a proxy, recordings, streams, functions of components.
+_ROUTES = re.compile(
+    r"/|/(config|theme\.css|favicon\.ico|manifest\.json|robots\.txt)|/(static|assets|svelte)(/[\w-][\w.-]*)+"
+    rf"|{_API}/(info|app_id|startup-events|upload|upload_progress|queue/join|queue/data|reset|cancel)/?"
+    rf"|{_API}/heartbeat/\w+|{_FILE}.+",
+    re.DOTALL,
+)
+# Those whose answers name files to the visitor.
+_NAMING = (f"{_API}/upload", f"{_API}/queue/data")
+_MOST_BODY_BYTES = 1_000_000
+# Some 200 bytes each; a visitor who looks at a pair for an hour is shown hundreds.
+_MOST_NAMED = 100_000
+
+
+class ContentPolicy:
+    """Tells browsers to load nothing from anywhere else."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        await self._app(scope, receive, _with_header(send, "content-security-policy", _POLICY))
+
+
+class OwnFiles:
+    """Lets a visitor name only files that the page has named to them: their uploads and results, the sample.
+
+    A path is compared as text with those in earlier answers to the same cookie: for a foreign one nothing is
+    looked up on the disk. Gradio checks paths only in a server that it started itself, and not by visitor.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+        self._named: OrderedDict[tuple[str, str], None] = OrderedDict()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        visitor = _visitor(scope)
+        try:
+            receive = await self._checked(scope, receive, visitor)
+        except PermissionError:
+            await PlainTextResponse(_REFUSED, 403)(scope, receive, send)
+            return
+        if scope["path"] == "/" and not visitor:
+            cookie = f"{_COOKIE}={token_urlsafe(32)}; HttpOnly; SameSite=Lax; Path=/"
+            send = _with_header(send, "set-cookie", cookie)
+        elif scope["path"] in _NAMING and visitor:
+            send = self._remembering(send, visitor)
+        await self._app(scope, receive, send)
+
+    async def _checked(self, scope: Scope, receive: Receive, visitor: str) -> Receive:
+        """What to read the request from, if all that it names is the visitor's; a PermissionError if not."""
+        path, method = scope["path"], scope.get("method")
+        if scope["type"] != "http" or not _ROUTES.fullmatch(path):
+            raise PermissionError
+        if path.startswith(_FILE):
+            self._check([path.removeprefix(_FILE)], visitor)
+        elif method == "POST" and path != f"{_API}/upload":
+            value, text = await _json(Request(scope, receive))
+            self._check(list(_paths(value)), visitor)
+            return _replay(text, receive)
+        return receive
+
+    def _check(self, paths: Sequence[Any], visitor: str) -> None:
+        if not all(isinstance(path, str) and (visitor, path) in self._named for path in paths):
+            raise PermissionError
+
+    def _remembering(self, send: Send, visitor: str) -> Send:
+        """Remembers the files of an answer before it is sent: of uploads a list, of events a line each."""
+        kept = b""
+
+        async def send_and_remember(message: Message) -> None:
+            nonlocal kept
+            if message["type"] == "http.response.body":
+                *whole, kept = (kept + message.get("body", b"")).split(b"\n")
+                if not message.get("more_body"):
+                    whole.append(kept)
+                for line in whole:
+                    self._remember(line.removeprefix(b"data: "), visitor)
+            await send(message)
+
+        return send_and_remember
+
+    def _remember(self, line: bytes, visitor: str) -> None:
+        try:
+            value = json.loads(line)
+        except ValueError:
+            return
+        uploads = value if isinstance(value, list) else []
+        for path in (*uploads, *_paths(value)):
+            self._named[visitor, path] = None
+            self._named.move_to_end((visitor, path))
+        while len(self._named) > _MOST_NAMED:
+            self._named.popitem(last=False)
+
+
+def _visitor(scope: Scope) -> str:
+    """Who asks, by the cookie; empty where there is none."""
+    try:
+        cookie = SimpleCookie(Headers(scope=scope).get("cookie", "")).get(_COOKIE)
+    except CookieError:
+        return ""
+    return cookie.value if cookie and _VISITOR.fullmatch(cookie.value) else ""
+
+
+def _with_header(send: Send, name: str, value: str) -> Send:
+    async def send_with_header(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            MutableHeaders(scope=message).append(name, value)
+        await send(message)
+
+    return send_with_header
+
+
+async def _json(request: Request) -> tuple[Any, bytes]:
+    """The value of a request's body, and its text written anew: what is checked is what Gradio reads.
+
+    Raises:
+        PermissionError: It is no JSON, or too large.
+    """
+    body = b""
+    try:
+        async for part in request.stream():
+            body += part
+            if len(body) > _MOST_BODY_BYTES:
+                raise PermissionError
+        value = json.loads(body or b"null")
+        return value, json.dumps(value).encode()
+    except (ValueError, RecursionError, ClientDisconnect) as error:
+        raise PermissionError from error
+
+
+def _paths(value: Any) -> Iterator[Any]:
+    """Every `path` in a value: Gradio takes any mapping that has one for a file."""
+    waiting = [value]
+    while waiting:
+        match waiting.pop():
+            case dict(part):
+                if "path" in part:
+                    yield part["path"]
+                waiting += part.values()
+            case list(parts):
+                waiting += parts
+
+
+def _replay(body: bytes, receive: Receive) -> Receive:
+    """Gives a body that was read already, then what comes after it."""
+    messages = [{"type": "http.request", "body": body, "more_body": False}]
+
+    async def receive_again() -> Message:
+        return messages.pop() if messages else await receive()
+
+    return receive_again

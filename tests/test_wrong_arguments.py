@@ -1,0 +1,148 @@
+"""Arguments of a wrong kind to every name of the Python interface: taken, or one line of our own error."""
+
+import inspect
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import stereoweave as sw
+from stereoweave.arrays import as_rgb
+from stereoweave.errors import StereoweaveError
+from stereoweave.io import read_image
+from stereoweave.rendering import Renderer
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+LEFT, RIGHT = (
+    np.ascontiguousarray(read_image(EXAMPLES / f"{side}.png")[200:264, 200:296]) for side in ("left", "right")
+)
+FLAT = np.full((64, 96), 3.0, np.float32)
+FOUND = sw.Estimate(
+    disparity_px=FLAT, right_disparity_px=FLAT, confidence=FLAT / 3, occluded=np.zeros((64, 96), bool)
+)
+PAIR = sw.StereoPair(left=LEFT, right=RIGHT)
+CAMERA = sw.StereoCamera(focal_px=100.0, baseline_m=0.1, cx_px=48.0, cy_px=32.0)
+
+
+def wrong_values() -> dict[str, Any]:
+    """Values that are right for no argument, or for few."""
+    return {
+        "none": None,
+        "true": True,
+        "a word": "much",
+        "no word": "",
+        "bytes": b"small",
+        "NaN": math.nan,
+        "infinity": math.inf,
+        "a fraction": 1.5,
+        "a complex number": 1j,
+        "minus one": -1,
+        "2 ** 80": 2**80,
+        "2 ** 2000": 2**2000,
+        "a tuple of one": (5,),
+        "a tuple of three": (1, 2, 3),
+        "a tuple of words": ("a", "b"),
+        "a list": [],
+        "a ragged list": [1, (2, 3)],
+        "a mapping": {},
+        "an object": object(),
+        "a kind": int,
+        "an array": np.zeros((2, 2)),
+        "an array of no dimension": np.array(3.0),
+        "a matrix": np.matrix(LEFT[..., 0]),
+        "a masked picture": np.ma.MaskedArray(LEFT, mask=LEFT > 100),
+        "a picture of objects": LEFT.astype(object),
+        "a picture of booleans": LEFT > 100,
+        "a picture of texts": LEFT.astype(str),
+        "a picture of times": LEFT.astype("datetime64[s]"),
+        "a picture of complex numbers": LEFT.astype(complex),
+        "a record array": np.zeros((64, 96), [("r", "u1"), ("g", "u1")]),
+        "an empty picture": LEFT[:0],
+        "floats": FLAT,
+        "a masked map": np.ma.MaskedArray(FLAT, mask=FLAT > 0),
+        "a matrix of floats": np.matrix(FLAT),
+        "a map of objects": FLAT.astype(object),
+        "another size": FLAT[:-1],
+    }
+
+
+class Call:
+    """A call of the interface whose arguments are right, to be made with one of them wrong."""
+
+    def __init__(self, name: str, call: Callable[..., Any], /, **right: Any) -> None:
+        self.name, self.call, self.right = name, call, right
+
+
+def calls() -> list[Call]:
+    """All calls; each names its arguments by the words that callers may use."""
+    matcher = sw.Matcher("small", threads=1)
+    pair = {"left": LEFT, "right": RIGHT}
+    maps = {name: getattr(FOUND, name) for name in ("disparity_px", "right_disparity_px")}
+    maps |= {"confidence": FOUND.confidence, "occluded": FOUND.occluded}
+    steps = {"refined": False, "raw": False}
+    how = {"model": "small", "threads": 1, "provider": "cpu"}
+    seen = np.ones((64, 96), bool)
+    camera = {"focal_px": 100.0, "baseline_m": 0.1, "cx_px": 48.0, "cy_px": 32.0, "doffs_px": 0.0}
+    place = {"up": 0.1, "forward": 0.1}
+    look = {"strength": 1.0, "convergence_px": 1.0}
+    return [
+        Call("estimate", sw.estimate, **pair, **how, **steps, range_px=(0, 20)),
+        Call("Matcher", sw.Matcher, **how),
+        Call("Matcher.estimate", matcher.estimate, **pair, **steps),
+        Call("Matcher.estimate_many", matcher.estimate_many, pairs=[PAIR], **steps),
+        Call("render", sw.render, **pair, estimate=FOUND, position=0.5, threads=1, **look, **place),
+        Call("render with camera", sw.render, **pair, estimate=FOUND, position=0.5, up=0.1, camera=CAMERA),
+        Call("Renderer", Renderer, pair=PAIR, estimate=FOUND, **look, threads=1),
+        Call("Renderer.view", Renderer(PAIR, FOUND, threads=1).view, position=0.5, **place),
+        Call("synthesize", sw.synthesize, **pair, position=0.5, **how),
+        Call("StereoCamera", sw.StereoCamera, **camera),
+        Call("StereoCamera.centred", sw.StereoCamera.centred, image=LEFT, focal_px=100.0, baseline_m=0.1),
+        Call("StereoCamera.depth_m", CAMERA.depth_m, disparity_px=FLAT),
+        Call("StereoCamera.disparity_px", CAMERA.disparity_px, depth_m=FLAT),
+        Call("StereoPair", sw.StereoPair, **pair, camera=CAMERA, left_seen=seen, right_seen=seen),
+        Call("Estimate", sw.Estimate, **maps),
+        Call("DepthCurve", sw.DepthCurve, exponent=1.5, max_disparity_px=192.0),
+        Call("DepthCurve of depth", sw.DepthCurve, max_depth_m=10.0),
+        Call("StereoMatcher", sw.StereoMatcher, minDisparity=0, numDisparities=64, min_confidence=0.5, **how),
+        Call("StereoMatcher.compute", sw.StereoMatcher(threads=1).compute, **pair),
+        Call("as_rgb", as_rgb, image=LEFT, name="picture"),
+    ]
+
+
+def outcome(call: Call, argument: str, value: Any) -> str | None:
+    """What is wrong with the answer to a wrong argument; None where nothing is."""
+    try:
+        call.call(**call.right | {argument: value})
+    except StereoweaveError as error:
+        lines = str(error).splitlines()
+        return None if len(lines) == 1 and len(lines[0]) < 400 else f"{len(lines)} lines: {lines[0][:60]}"
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return None
+
+
+@pytest.mark.usefixtures("without_shape_checks")
+@pytest.mark.filterwarnings("ignore:the matrix subclass")
+def test_a_wrong_argument_is_one_line_of_our_own_error():
+    wrong = []
+    for call in calls():
+        assert outcome(call, *next(iter(call.right.items()))) is None, call.name
+        for argument in call.right:
+            for name, value in wrong_values().items():
+                if (found := outcome(call, argument, value)) is not None:
+                    wrong.append(f"{call.name}({argument}={name}): {found}")
+    assert not wrong, f"{len(wrong)}\n" + "\n".join(wrong)
+
+
+def test_every_argument_of_the_interface_is_tried():
+    tried = {call.name.split(" ")[0]: set(call.right) for call in calls()}
+    for call in calls():
+        tried[call.name.split(" ")[0]] |= set(call.right)
+    for name in ("estimate", "Matcher", "render", "synthesize", "StereoCamera", "StereoPair", "Estimate"):
+        assert tried[name] == set(inspect.signature(getattr(sw, name)).parameters), name
+    assert set(sw.__all__) - {name.split(".")[0] for name in tried} == {
+        *("FormatError", "MatcherError", "StereoweaveError", "Sample", "View", "__version__")
+    }
