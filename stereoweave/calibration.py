@@ -11,6 +11,8 @@ from stereoweave.stereo import CAMERA_NUMBERS_BELOW, StereoCamera, StereoPair
 
 # How many coefficients OpenCV's models have; 0 is a lens without distortion.
 _PINHOLE_COUNTS, _FISHEYE_COUNTS = (0, 4, 5, 8, 12, 14), (0, 4)
+# Of the smallest pictures, 32 px wide, that is a view of 173 degrees.
+_LEAST_FOCAL_PX = 1
 # Files with few decimals are let through: over a picture of 4000 px these are some hundredths of a pixel.
 _ROTATION_OFF, _SAME_PX, _SAME_DIRECTION = 1e-5, 1e-2, 1e-3
 _ROUNDED = 1e-3
@@ -39,11 +41,11 @@ class Optics:
         (fx, skew, _), (below, fy, _), last = self.matrix.tolist()
         small = (np.abs(numbers) < CAMERA_NUMBERS_BELOW).all()
         upright = (skew, below, *last) == (0, 0, 0, 0, 1)
-        if not (upright and fx > 0 and fy > 0 and small):
+        if not (upright and min(fx, fy) >= _LEAST_FOCAL_PX and small):
             raise StereoweaveError(
-                "expected a camera matrix fx 0 cx, 0 fy cy, 0 0 1 with positive focal lengths and numbers "
-                f"below {CAMERA_NUMBERS_BELOW:g}, found {self.matrix.tolist()} "
-                f"and distortion {self.distortion.tolist()}"
+                "expected a camera matrix fx 0 cx, 0 fy cy, 0 0 1 with focal lengths of at least "
+                f"{_LEAST_FOCAL_PX} px and numbers below {CAMERA_NUMBERS_BELOW:g}, "
+                f"found {self.matrix.tolist()} and distortion {self.distortion.tolist()}"
             )
         counts = _FISHEYE_COUNTS if self.fisheye else _PINHOLE_COUNTS
         if self.distortion.size not in counts:

@@ -47,8 +47,10 @@ def rectify(pair: StereoPair, rig: Rig) -> Rectified:
     if rig.unlike_rectified() is None:
         note = f"{rig.name} is for rectified pictures: they are taken as they are"
         return Rectified(pair=replace(pair, camera=rig.camera()), notes=(*rig.notes, note))
-    turns = _turns(rig)
-    camera = _camera(rig, turns, size_of(pair))
+    # What cannot be computed is refused where it is not finite.
+    with np.errstate(all="ignore"):
+        turns = _turns(rig)
+        camera = _camera(rig, turns, size_of(pair))
     left, left_seen = _turned(pair.left, rig.left, turns[0], camera)
     right, right_seen = _turned(pair.right, rig.right, turns[1], camera)
     rectified = StereoPair(left=left, right=right, camera=camera, left_seen=left_seen, right_seen=right_seen)
@@ -115,6 +117,11 @@ def _camera(rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], size_px: tuple[
     focal_px = float(np.mean([optics.matrix[[0, 1], [0, 1]] for optics in lenses]))
     middle_px = (np.array(size_px) - 1) / 2
     ahead = [turn @ _direction(optics, middle_px) for optics, turn in zip(lenses, turns, strict=True)]
+    if not all(np.isfinite(direction).all() and direction[2] > 0 for direction in ahead):
+        raise StereoweaveError(
+            f"{rig.name}: expected two cameras that look the same way, found them turned by "
+            f"{rig.rotation_degrees:.0f} degrees against each other; is that the rotation of this rig?"
+        )
     aside, down = np.mean([direction[:2] / direction[2] for direction in ahead], axis=0)
     return StereoCamera(
         focal_px=focal_px,
@@ -165,6 +172,7 @@ def _before_the_fold(
     return (z > 0) & (radius < _fold(optics, 10.0) * z)
 
 
+@np.errstate(all="ignore")  # where it cannot be computed it does not grow either
 def _fold(optics: Optics, most: float) -> float:
     """The radius (a fisheye lens: angle) at which the distorted radius no longer grows, at most `most`."""
     radius = np.linspace(0, most, _RADIUS_STEPS)
@@ -176,7 +184,7 @@ def _fold(optics: Optics, most: float) -> float:
         k = np.concatenate([k, np.zeros(8)])
         above = 1 + squares * (k[0] + squares * (k[1] + squares * k[4]))
         distorted = radius * above / (1 + squares * (k[5] + squares * (k[6] + squares * k[7])))
-    falls = np.flatnonzero(np.diff(distorted) <= 0)
+    falls = np.flatnonzero(~(np.diff(distorted) > 0))
     return float(radius[falls[0]]) if falls.size else most
 
 

@@ -172,7 +172,7 @@ def test_a_calibration_for_another_size_is_refused(tmp_path):
         ("baseline=193.001\nwidth=741\n", "", "no entry baseline, width"),
         ("31.086", "thirty", "thirty"),
         ("baseline=193.001", "baseline=0", "must be positive"),
-        ("=[994.978 0", "=[-994.978 0", "positive focal lengths"),
+        ("=[994.978 0", "=[-994.978 0", "focal lengths of at least 1 px"),
         ("; 0 994.978 254.877; 0 0 1]", "]", "size 3"),
     ],
 )

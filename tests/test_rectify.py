@@ -185,6 +185,28 @@ def test_cameras_that_are_not_side_by_side_are_refused(rng, translation_m, said)
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("degrees", [90, 135, 180])
+def test_cameras_that_look_different_ways_are_refused(rng, degrees):
+    rotation = turned(0, degrees, 0)
+    rig = replace(flat_rig(), rotation=rotation, translation_m=-rotation @ [0.1, 0, 0])
+    with pytest.raises(StereoweaveError, match="expected two cameras that look the same way") as caught:
+        rectify.rectify(noise(rng, 64, 48), replace(rig, size_px=None))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_lens_whose_model_divides_by_0_far_outside_of_the_picture_is_rectified(rng):
+    """1 + k4 r^2, of OpenCV's rational model, is 0 at r = 10; the picture ends at r = 0.8."""
+    lens = Optics(matrix=flat_rig().left.matrix, distortion=np.array([0, 0, 0, 0, 0, -0.01, 0, 0]))
+    found = rectify.rectify(noise(rng), replace(flat_rig(), left=lens))
+    assert found.pair.left_seen is not None
+    assert found.pair.left_seen.mean() > 0.95
+
+
+def test_a_focal_length_of_less_than_a_pixel_is_no_cameras():
+    with pytest.raises(StereoweaveError, match="focal lengths of at least 1 px"):
+        Optics(matrix=np.diag([1e-320, 5.0, 1]), distortion=np.zeros(0))
+
+
 def test_pictures_of_another_size_than_the_calibrations_are_refused(rng):
     with pytest.raises(FormatError, match="of 320x240, found one for 640x480"):
         rectify.rectify(noise(rng, 320, 240), flat_rig())
