@@ -228,7 +228,7 @@ def test_each_command_that_is_mentioned_exists(pictures):
 
 
 def test_each_file_that_is_linked_exists():
-    links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if "://" not in link]
+    links = [link.split("#")[0] for link in re.findall(r"\]\(([^)]+)\)", README) if "://" not in link]
     assert [link for link in links if not (REPOSITORY / link).exists()] == []
 
 
