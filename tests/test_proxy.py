@@ -15,7 +15,7 @@ from conftest import free_ports
 
 from stereoweave.service_server import Patience, http_server
 
-pytestmark = pytest.mark.needs_nginx
+pytestmark = [pytest.mark.system, pytest.mark.needs_nginx]
 
 CONFIGURATION = Path(__file__).parent.parent / "deploy" / "nginx.conf"
 NAME = "depth.example.org"

@@ -31,7 +31,10 @@ from stereoweave.io import read_disparity_png, read_image, read_pair, read_pfm, 
 WAITING, MEGABYTES = 3, 4
 
 # What Ray Serve is warned of by Pydantic when it is imported.
-pytestmark = pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`:DeprecationWarning")
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`:DeprecationWarning"),
+]
 
 
 class Running(NamedTuple):
