@@ -39,7 +39,10 @@ def start(folder: Path) -> tuple[subprocess.Popen[str], str]:
 def stop(server: subprocess.Popen[str], number: signal.Signals = signal.SIGINT) -> str:
     """What the server said to the end, after a signal."""
     server.send_signal(number)
-    said = "".join(server.communicate(timeout=30))
+    try:
+        said = "".join(server.communicate(timeout=30))
+    finally:
+        server.kill()
     assert server.returncode == 128 + (signal.SIGTERM if number == signal.SIGHUP else number)
     return said
 
