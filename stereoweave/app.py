@@ -442,7 +442,9 @@ def serve(listener: socket.socket, url: str, *, open_browser: bool, provider: st
 
 def _end_in_order() -> None:
     """Lets SIGTERM, and the end of the terminal, end the process by an exception, as Ctrl-C does."""
-    for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):
-        # Who set it to be ignored, such as nohup, is obeyed.
-        if signal.getsignal(number) is signal.SIG_DFL:
-            signal.signal(number, lambda number, _: sys.exit(128 + number))
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    hang_up = getattr(signal, "SIGHUP", None)  # Windows has none
+    # Whoever has it ignored, such as nohup, is obeyed. An exception in the midst of Uvicorn's loop may hang:
+    # SIGTERM ends the loop first.
+    if hang_up and signal.getsignal(hang_up) is signal.SIG_DFL:
+        signal.signal(hang_up, lambda *_: signal.raise_signal(signal.SIGTERM))

@@ -37,10 +37,13 @@ def start(folder: Path) -> tuple[subprocess.Popen[str], str]:
 
 
 def stop(server: subprocess.Popen[str], number: signal.Signals = signal.SIGINT) -> str:
-    """What the server said to the end, after an interrupt."""
+    """What the server said to the end, after a signal."""
     server.send_signal(number)
-    said = "".join(server.communicate(timeout=30))
-    assert server.returncode == 128 + number
+    try:
+        said = "".join(server.communicate(timeout=30))
+    finally:
+        server.kill()
+    assert server.returncode == 128 + (signal.SIGTERM if number == signal.SIGHUP else number)
     return said
 
 
