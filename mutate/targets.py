@@ -45,24 +45,41 @@ TARGETS = {
     ),
     "matching": Target(
         ("matching.py",),
-        ("test_matching.py", "test_synthesis.py", "test_stereo_matcher.py", "test_ranging.py"),
+        (
+            "test_matching.py",
+            "test_synthesis.py",
+            "test_stereo_matcher.py",
+            "test_ranging.py",
+            "test_wrong_arguments.py",
+        ),
     ),
     "calibration": Target(
         ("calibration.py", "calibration_files.py"),
         (
             "test_calibration*.py",
+            "test_hostile_calibrations.py",
+            "test_structured_text.py",
             "test_readers.py",
             "test_boards.py",
             "test_rectify.py",
             "test_rig_commands.py",
         ),
     ),
-    "batch": Target(("batch.py",), ("test_batch.py", "test_pair_lists.py")),
-    "service": Target(("service*.py",), ("test_service*.py",), elsewhere=True),
+    "batch": Target(
+        ("batch.py",), ("test_batch.py", "test_pair_lists.py", "test_names.py", "test_output_lock.py")
+    ),
+    "service": Target(("service*.py",), ("test_service*.py", "test_proxy.py"), elsewhere=True),
     "checkpoint": Target(("learn/checkpoint.py",), ("test_checkpoint.py", "test_train.py")),
     "rendering": Target(
         ("rendering.py",),
-        ("test_rendering.py", "test_hidden.py", "test_moving.py", "test_synthesis.py", "test_layouts.py"),
+        (
+            "test_rendering.py",
+            "test_hidden.py",
+            "test_moving.py",
+            "test_synthesis.py",
+            "test_layouts.py",
+            "test_wrong_arguments.py",
+        ),
     ),
 }
 
