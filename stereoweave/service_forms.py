@@ -17,11 +17,11 @@ from pydantic import (
 )
 from starlette import datastructures
 
+from stereoweave.io import MOST_SMALL_BYTES
 from stereoweave.pictures import FORMATS
 from stereoweave.preparing import Request
 from stereoweave.service_requests import Order, TooLargeError
 
-_MOST_CALIBRATION_BYTES = 256 * 1024
 _RANGE = r"^-?\d{1,6}(\.\d{1,6})?,-?\d{1,6}(\.\d{1,6})?$"
 
 
@@ -130,9 +130,9 @@ def stored(form: PairForm, folder: Path, file: str, most_megapixels: float) -> O
             shutil.copyfileobj(upload.file, out)
     calibration = None
     if form.calib is not None:
-        content = form.calib.file.read(_MOST_CALIBRATION_BYTES + 1)
-        if len(content) > _MOST_CALIBRATION_BYTES:
-            raise TooLargeError(f"calib: expected at most {_MOST_CALIBRATION_BYTES} bytes, found more")
+        content = form.calib.file.read(MOST_SMALL_BYTES + 1)
+        if len(content) > MOST_SMALL_BYTES:
+            raise TooLargeError(f"calib: expected at most {MOST_SMALL_BYTES} bytes, found more")
         calibration = folder / "calib"
         calibration.write_bytes(content)
     pictures = tuple(folder / field for field in uploads)
