@@ -25,6 +25,8 @@ from stereoweave.preparing import Request
 from stereoweave.results import DepthOrder, make_depth
 from stereoweave.threads import usable_cores
 
+pytestmark = pytest.mark.system
+
 EXAMPLES = Path(__file__).parent.parent / "examples"
 ORDER = DepthOrder(threads=1, always=("disparity.pfm", "preview.png", "confidence.png"))
 PROGRAM = """
@@ -34,7 +36,6 @@ from stereoweave.batch import depth_of_many
 from stereoweave.pair_lists import pairs_in
 from stereoweave.results import DepthOrder
 
-pytestmark = pytest.mark.system
 if __name__ == "__main__":
     order = DepthOrder(threads=1, always=("disparity.pfm", "preview.png", "confidence.png"))
     sys.exit(depth_of_many(pairs_in(Path(sys.argv[1])), Path(sys.argv[2]), order, processes=2))
