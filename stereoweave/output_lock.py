@@ -14,8 +14,8 @@ from filelock import FileLock, Timeout
 from stereoweave.errors import OutputInUseError, StereoweaveError
 from stereoweave.io import make_folder
 
-# Some network file systems have no locks.
-_NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP}
+# Some network file systems have no locks. Systems differ in how they say so; the last two are one on Linux.
+_NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.EINVAL, errno.EOPNOTSUPP, errno.ENOTSUP}
 
 
 @contextmanager
@@ -44,8 +44,9 @@ def lock_output(output: Path) -> Iterator[None]:
         ) from error
     except OSError as error:
         if error.errno not in _NO_LOCKS:
+            remedy = "; remove it" if isinstance(error, IsADirectoryError | PermissionError) else ""
             raise StereoweaveError(
-                f"{file}: expected a file that can be written, found {str(error.strerror).lower()}; remove it"
+                f"{file}: expected a file that can be written, found {str(error.strerror).lower()}{remedy}"
             ) from error
     try:
         yield
