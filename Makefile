@@ -43,9 +43,11 @@ demo: $(CORE)/installed
 	$(CORE)/bin/stereoweave view $(PAIR) --position 0.5 --out demo-out/view.png
 	@echo "Open the report in a browser: $(CURDIR)/demo-out/report.html"
 
-# System tests mostly wait for other programs, so they run beside the others. Each prints when it is done.
+# System tests mostly wait for other programs, so they run beside the others. Each prints when it is done,
+# where make can do that: version 3, which macOS has, cannot.
+SYNC = $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
 test: $(DEV)/installed
-	@$(MAKE) --no-print-directory --jobs 2 --output-sync=target test-system test-others
+	@$(MAKE) --no-print-directory --jobs 2 $(SYNC) test-system test-others
 
 test-system test-others: $(DEV)/installed
 	$(DEV)/bin/pytest -m '$(if $(filter test-others,$@),not )system'

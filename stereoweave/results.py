@@ -50,6 +50,7 @@ from stereoweave.io import (
 )
 from stereoweave.matcher import Matcher, check_steps
 from stereoweave.matching import match
+from stereoweave.output_lock import lock_output
 from stereoweave.preparing import Request, prepare
 from stereoweave.providers import CPU
 from stereoweave.report import Summary, summarize, write_report
@@ -228,14 +229,15 @@ def _results_in(out: Path) -> Iterator[Path]:
     standing = place_for(*(out / file for file in FILES))
     with tempfile.TemporaryDirectory(prefix=".stereoweave-", dir=standing) as name:
         yield Path(name)
-        make_folder(out)
-        is_earlier_result = (out / "disparity.pfm").exists()
-        for file in FILES:
-            fresh = Path(name, file)
-            if fresh.exists():
-                fresh.replace(out / file)
-            elif is_earlier_result:
-                (out / file).unlink(missing_ok=True)
+        # Two commands would leave some files of each.
+        with lock_output(make_folder(out)):
+            is_earlier_result = (out / "disparity.pfm").exists()
+            for file in FILES:
+                fresh = Path(name, file)
+                if fresh.exists():
+                    fresh.replace(out / file)
+                elif is_earlier_result:
+                    (out / file).unlink(missing_ok=True)
 
 
 def write_files(folder: Path, files: Sequence[str], result: Result) -> list[str]:

@@ -55,7 +55,8 @@ def rectify(
     """
     from stereoweave.calibration import rig_of, size_of, words
     from stereoweave.calibration_files import write_rig
-    from stereoweave.io import write_image
+    from stereoweave.io import make_folder, write_image
+    from stereoweave.output_lock import lock_output
     from stereoweave.preparing import Request, prepare
     from stereoweave.rectify import cropped
 
@@ -63,10 +64,11 @@ def rectify(
     place_for(out / "left.png", out / "right.png", out / "calib.yml")
     prepared = prepare(pictures, Request(arrangement=arrangement, calibration=calib, rectify=True))
     pair = cropped(prepared.pair)
-    write_image(out / "left.png", pair.left)
-    write_image(out / "right.png", pair.right)
-    if pair.camera:
-        write_rig(out / "calib.yml", rig_of(pair))
+    with lock_output(make_folder(out)):
+        write_image(out / "left.png", pair.left)
+        write_image(out / "right.png", pair.right)
+        if pair.camera:
+            write_rig(out / "calib.yml", rig_of(pair))
     typer.echo("\n".join([f"{out}: left.png and right.png, {words(size_of(pair))} px", *prepared.notes]))
 
 

@@ -130,6 +130,7 @@ def ray_head(cpus: int) -> Iterator[str]:
         command = [sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--block"]
         command += ["--disable-usage-stats", *(f"--{name}={value}" for name, value in options.items())]
         log = Path(folder, "start.log")
+        paths = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
         with log.open("wb") as out:
             environment = os.environ | {
                 # Whoever has a token in his home folder would have to show it.
@@ -137,7 +138,7 @@ def ray_head(cpus: int) -> Iterator[str]:
                 # A head that reports nothing would report that.
                 "RAY_USAGE_STATS_REPORT_URL": "http://127.0.0.1:9",
                 # Workers import what tests define.
-                "PYTHONPATH": str(Path(__file__).parent),
+                "PYTHONPATH": os.pathsep.join(paths),
             }
             head = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=environment)
         try:

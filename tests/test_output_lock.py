@@ -2,6 +2,7 @@
 
 import errno
 import fcntl
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -95,10 +96,8 @@ def test_a_lock_ends_with_an_error_and_the_folder_of_a_new_file_is_made(tmp_path
 
 def test_where_a_lock_cannot_be_written_one_line_says_so(tmp_path):
     (tmp_path / ".lock").mkdir()
-    with (
-        pytest.raises(StereoweaveError, match=r"\.lock: expected a file that can be written, found "),
-        lock_output(tmp_path),
-    ):
+    expected = r"\.lock: expected a file that can be written, found .*; remove it$"
+    with pytest.raises(StereoweaveError, match=expected), lock_output(tmp_path):
         pass
     (tmp_path / "file").touch()
     with (
@@ -108,12 +107,26 @@ def test_where_a_lock_cannot_be_written_one_line_says_so(tmp_path):
         pass
 
 
-@pytest.mark.parametrize("reason", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP])
-def test_a_disk_without_locks_is_written_to_all_the_same(tmp_path, monkeypatch, reason):
+def refuse_locks(monkeypatch: pytest.MonkeyPatch, reason: int) -> None:
+    """Make the operating system refuse every lock."""
+
     def refuse(*_: object) -> None:
-        raise OSError(reason, "no locks here")
+        raise OSError(reason, os.strerror(reason))
 
     monkeypatch.setattr(fcntl, "flock", refuse)
+
+
+def test_nobody_is_sent_to_remove_a_lock_where_that_would_not_help(tmp_path, monkeypatch):
+    refuse_locks(monkeypatch, errno.EIO)
+    with pytest.raises(StereoweaveError, match="found input/output error$"), lock_output(tmp_path):
+        pass
+
+
+@pytest.mark.parametrize(
+    "reason", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL]
+)
+def test_a_disk_without_locks_is_written_to_all_the_same(tmp_path, monkeypatch, reason):
+    refuse_locks(monkeypatch, reason)
     with lock_output(tmp_path):
         (tmp_path / "result").touch()
     assert [path.name for path in tmp_path.iterdir()] == ["result"]

@@ -1,8 +1,10 @@
-import numpy as np
-import pytest
-from learn_examples import PAIR_SIZE, box_before_a_wall, keep_pairs
+import io
+from contextlib import ExitStack
 
-from stereoweave.errors import OutputInUseError
+import numpy as np
+from learn_examples import PAIR_SIZE, box_before_a_wall, keep_pairs
+from rich.console import Console
+
 from stereoweave.learn import pairs as pairs_module
 from stereoweave.learn.collage import sample
 from stereoweave.learn.pairs import KeptPairs
@@ -51,11 +53,22 @@ def test_pairs_of_another_version_of_the_generator_are_kept_apart(tmp_path, monk
     assert KeptPairs(tmp_path, 3, 2, PAIR_SIZE).missing() == [0, 1]
 
 
-def test_pairs_are_not_made_where_another_process_makes_them(tmp_path):
+def test_pairs_that_another_training_makes_are_waited_for_and_not_made_again(tmp_path):
     folder = keep_pairs(tmp_path, 3, 1).folder
-    with lock_output(folder), pytest.raises(OutputInUseError):
-        list(KeptPairs(tmp_path, 3, 3, PAIR_SIZE).make())
-    assert [file.name for file in folder.iterdir()] == ["000000.npz"]
+    other = ExitStack()
+
+    class Screen(io.StringIO):
+        def write(self, text: str) -> int:
+            keep_pairs(tmp_path, 3, 2)
+            other.close()
+            return super().write(text)
+
+    screen = Screen()
+    with other:
+        other.enter_context(lock_output(folder))
+        made = list(KeptPairs(tmp_path, 3, 3, PAIR_SIZE).make(Console(file=screen, width=1000)))
+    assert made == [2]
+    assert screen.getvalue() == f"{folder}: another training makes these pairs; waiting until it is done\n"
 
 
 def test_what_is_missing_or_half_written_is_made_as_the_generator_makes_it(tmp_path):
@@ -64,7 +77,7 @@ def test_what_is_missing_or_half_written_is_made_as_the_generator_makes_it(tmp_p
     (pairs.folder / "000001.part").write_bytes(kept[: len(kept) // 2])
     pairs = KeptPairs(tmp_path, 3, 3, PAIR_SIZE)
     assert pairs.missing() == [1, 2]
-    assert sorted(pairs.make()) == [1, 2]
+    assert sorted(pairs.make(Console(quiet=True))) == [1, 2]
     assert pairs.missing() == []
     assert sorted(file.name for file in pairs.folder.iterdir()) == ["000000.npz", "000001.npz", "000002.npz"]
     assert (pairs.folder / "000000.npz").read_bytes() == kept

@@ -8,9 +8,10 @@ import trimesh
 from PIL import Image
 
 from stereoweave.depth_commands import depth
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import OutputInUseError, StereoweaveError
 from stereoweave.io import read_disparity_png, read_image, read_pfm, read_pixels, write_image
 from stereoweave.matcher import Matcher
+from stereoweave.output_lock import lock_output
 from stereoweave.preparing import Request
 from stereoweave.report import summarize
 from stereoweave.results import ALWAYS, FILES, DepthOrder, Result, make_depth, needs_camera
@@ -96,6 +97,14 @@ def test_files_of_the_same_names_that_are_no_earlier_result_stay(folder, matcher
         Path(name).write_text("of another program")
     make_depth(PICTURES, Path(), DepthOrder(), matcher)
     assert {Path(name).read_text() for name in ("mesh.ply", "depth.npy")} == {"of another program"}
+
+
+def test_results_do_not_move_into_a_folder_that_another_command_writes_to(folder, matcher):
+    make_depth(PICTURES, Path("out"), DepthOrder(), matcher)
+    before = {file: file.read_bytes() for file in Path("out").iterdir()}
+    with lock_output(Path("out")), pytest.raises(OutputInUseError, match="^out: .* found one that is in use"):
+        make_depth(PICTURES, Path("out"), WITH_CAMERA, matcher)
+    assert {file: file.read_bytes() for file in Path("out").iterdir()} == before
 
 
 def test_an_unknown_file_is_told_with_those_that_there_are():

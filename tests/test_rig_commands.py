@@ -11,6 +11,7 @@ from stereoweave.alignment import check_pair
 from stereoweave.calibration_files import calibrated
 from stereoweave.cli import main
 from stereoweave.io import read_image, read_pair, write_image
+from stereoweave.output_lock import lock_output
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 LEFT, RIGHT = str(EXAMPLES / "left.png"), str(EXAMPLES / "right.png")
@@ -81,6 +82,13 @@ def test_rectification_spares_the_pictures_and_the_calibration_that_are_there(tm
         assert main(["rectify", *words, "-o", str(tmp_path)]) == 2
         assert f"{files[named]}: expected" in capsys.readouterr().err
     assert {name: path.read_bytes() for name, path in files.items()} == before
+
+
+def test_a_pair_is_not_rectified_into_a_folder_that_another_command_writes_to(tmp_path, capsys):
+    with lock_output(tmp_path):
+        assert main(["rectify", LEFT, RIGHT, "-o", str(tmp_path)]) == 2
+    assert "found one that is in use" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_depth_and_views_warn_by_themselves_and_rectify_mends(turned, tmp_path, capsys):

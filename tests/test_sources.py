@@ -151,7 +151,7 @@ def test_rendered_pairs_of_a_mix_are_photographed_each_always_alike(rendered, tm
 
 def test_the_collages_of_a_mix_are_made_like_others(rendered, tmp_path, monkeypatch):
     made = []
-    monkeypatch.setattr(the_pairs.KeptPairs, "make", lambda pairs: iter(made.append(pairs.folder) or []))
+    monkeypatch.setattr(the_pairs.KeptPairs, "make", lambda pairs, _: iter(made.append(pairs.folder) or []))
     training, _ = sources(mixed(rendered, rooms=1.0, collage=1.0), tmp_path)
     assert kept(training, Console(quiet=True)) is training
     assert made == [KeptPairs(tmp_path, RECIPE.seed, RECIPE.pairs, PAIR_SIZE).folder]

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 
 from stereoweave.learn.collage import sample as make_sample
 from stereoweave.output_lock import lock_output
@@ -38,11 +39,17 @@ class KeptPairs:
         """Indices of the pairs that are still to be made."""
         return [i for i in range(self.count) if not self._file(i).exists()]
 
-    def make(self) -> Iterable[int]:
-        """Make the missing pairs in parallel, yielding the index of each as it is done."""
+    def make(self, console: Console) -> Iterable[int]:
+        """Make the missing pairs in parallel, yielding the index of each as it is done.
+
+        Trainings in one folder share their pairs: a second one says that it waits for the first.
+        """
         self.folder.mkdir(parents=True, exist_ok=True)
+        note = f"{self.folder}: another training makes these pairs; waiting until it is done"
+        tell = partial(console.print, note, markup=False, highlight=False, soft_wrap=True)
         # Started afresh, because a forked child inherits PyTorch's threads in an unknown state.
-        with lock_output(self.folder), multiprocessing.get_context("spawn").Pool(os.cpu_count()) as workers:
+        start_afresh = multiprocessing.get_context("spawn")
+        with lock_output(self.folder, before_waiting=tell), start_afresh.Pool(os.cpu_count()) as workers:
             yield from workers.imap_unordered(partial(_make, self), self.missing(), chunksize=8)
 
     def keep(self, index: int, sample: Sample) -> None:

@@ -222,6 +222,8 @@ def kept(pairs: Source, console: Console) -> Source:
     if isinstance(pairs, KeptPairs) and (missing := len(pairs.missing())):
         with progress(console) as bar:
             task = bar.add_task("making pairs", total=missing, loss="", rate="")
-            for _ in pairs.make():
+            for _ in pairs.make(console):
                 bar.advance(task)
+            # Another training may have made some of them.
+            bar.update(task, completed=missing)
     return pairs
