@@ -4,12 +4,11 @@ import json
 import re
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
-from http.cookies import CookieError, SimpleCookie
 from secrets import token_urlsafe
 from typing import Any
 
-from starlette.datastructures import Headers, MutableHeaders
-from starlette.requests import ClientDisconnect, Request
+from starlette.datastructures import MutableHeaders
+from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -120,11 +119,8 @@ class OwnFiles:
 
 def _visitor(scope: Scope) -> str:
     """Who asks, by the cookie; empty where there is none."""
-    try:
-        cookie = SimpleCookie(Headers(scope=scope).get("cookie", "")).get(_COOKIE)
-    except CookieError:
-        return ""
-    return cookie.value if cookie and _VISITOR.fullmatch(cookie.value) else ""
+    cookie = HTTPConnection(scope).cookies.get(_COOKIE, "")
+    return cookie if _VISITOR.fullmatch(cookie) else ""
 
 
 def _with_header(send: Send, name: str, value: str) -> Send:
