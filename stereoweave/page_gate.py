@@ -29,8 +29,9 @@ _ROUTES = re.compile(
 # Those whose answers name files to the visitor.
 _NAMING = (f"{_API}/upload", f"{_API}/queue/data")
 _MOST_BODY_BYTES = 1_000_000
-# Some 200 bytes each; a visitor who looks at a pair for an hour is shown hundreds.
-_MOST_NAMED = 100_000
+# About 200 bytes each; a visitor who looks at a pair for an hour is shown hundreds.
+_MOST_NAMED = 10_000
+_MOST_VISITORS = 1_000
 
 
 class ContentPolicy:
@@ -52,7 +53,7 @@ class OwnFiles:
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
-        self._named: OrderedDict[tuple[str, str], None] = OrderedDict()
+        self._named = _Named()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
@@ -85,7 +86,7 @@ class OwnFiles:
         return receive
 
     def _check(self, paths: Sequence[Any], visitor: str) -> None:
-        if not all(isinstance(path, str) and (visitor, path) in self._named for path in paths):
+        if not all(isinstance(path, str) and self._named.knows(visitor, path) for path in paths):
             raise PermissionError
 
     def _remembering(self, send: Send, visitor: str) -> Send:
@@ -111,10 +112,33 @@ class OwnFiles:
             return
         uploads = value if isinstance(value, list) else []
         for path in (*uploads, *_paths(value)):
-            self._named[visitor, path] = None
-            self._named.move_to_end((visitor, path))
-        while len(self._named) > _MOST_NAMED:
-            self._named.popitem(last=False)
+            self._named.add(visitor, path)
+
+
+class _Named:
+    """The paths named to each visitor: each has a limit, so that no visitor takes those of another."""
+
+    def __init__(self) -> None:
+        self._visitors: OrderedDict[str, OrderedDict[str, None]] = OrderedDict()
+
+    def add(self, visitor: str, path: str) -> None:
+        paths = self._visitors.setdefault(visitor, OrderedDict())
+        paths[path] = None
+        _use(paths, path, _MOST_NAMED)
+        _use(self._visitors, visitor, _MOST_VISITORS)
+
+    def knows(self, visitor: str, path: str) -> bool:
+        if visitor not in self._visitors:
+            return False
+        _use(self._visitors, visitor, _MOST_VISITORS)
+        return path in self._visitors[visitor]
+
+
+def _use(entries: OrderedDict[str, Any], key: str, most: int) -> None:
+    """Puts an entry last, and removes the first where there are more than `most`."""
+    entries.move_to_end(key)
+    if len(entries) > most:
+        entries.popitem(last=False)
 
 
 def _visitor(scope: Scope) -> str:

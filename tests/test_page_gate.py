@@ -244,3 +244,21 @@ def test_a_visitor_keeps_their_files_beside_the_cookies_of_other_servers_on_the_
     for header in (f"{others}; {cookie_of(1)}", f"{cookie_of(1)}; {others}"):
         answer = page.get("/gradio_api/file=/own.png", headers={"cookie": header.encode("utf-8")})
         assert (answer.status_code, answer.text) == (200, "content")
+
+
+def test_no_visitor_takes_the_files_of_another_by_naming_many(page):
+    name_files(page, cookie_of(1), "/own.png")
+    name_files(page, cookie_of(2), *(f"/{number}.png" for number in range(100_001)))
+    assert status_of(page, cookie_of(1), "/own.png") == 200
+    # The last 10,000 stay.
+    assert status_of(page, cookie_of(2), "/90000.png") == 403
+    assert status_of(page, cookie_of(2), "/90001.png") == 200
+
+
+def test_of_more_than_1000_visitors_the_one_longest_unused_is_forgotten(page):
+    for number in range(1000):
+        name_files(page, cookie_of(number), "/own.png")
+    assert status_of(page, cookie_of(0), "/own.png") == 200  # now 1 is the longest unused
+    name_files(page, cookie_of(1000), "/own.png")
+    kept = [status_of(page, cookie_of(number), "/own.png") for number in (0, 1, 2, 1000)]
+    assert kept == [200, 403, 200, 200]
