@@ -1,6 +1,7 @@
 """Two cameras from the files that calibration programs write, and into one."""
 
 import base64
+import contextlib
 import math
 import re
 import reprlib
@@ -20,7 +21,7 @@ from stereoweave.stereo import StereoPair
 from stereoweave.structured_text import BASE64, parse_entries
 
 _MM_ABOVE = 2.0
-_TRUE = ("1", "true", "True")
+_YES, _NO = ("true", "yes", "on", "y"), ("false", "no", "off", "n")
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _FISHEYE_NAMES = {"fisheye", "equidistant", "equi", "kannalabrandt", "kb4"}
 _PINHOLE_NAMES = {"pinhole", "radtan", "plumbbob", "rationalpolynomial", "brownconrady", "none"}
@@ -180,10 +181,20 @@ def _of_side(entries: Mapping[str, Any], names: Iterable[str], sides: Iterable[s
 
 def _model(entries: Mapping[str, Any]) -> str | None:
     """The kind of lens that OpenCV's file names, fisheye or pinhole; None where it names none."""
-    if entries.get("fisheyemodel", entries.get("fisheye", "")) in _TRUE:
+    if _is_true(_first(entries, ("fisheyemodel", "fisheye")) or "no"):
         return "fisheye"
     named = _first(entries, ("distortionmodel", "cameramodel", "model"))
     return None if named is None else _known_model(named)
+
+
+def _is_true(said: object) -> bool:
+    word = str(said).lower()
+    if word in _YES or word in _NO:
+        return word in _YES
+    with contextlib.suppress(ValueError):
+        if math.isfinite(number := float(word)):
+            return number != 0
+    raise ValueError(f"fisheye: {reprlib.repr(said)}, not one of {', '.join(_YES + _NO)} or a number")
 
 
 def _known_model(named: object) -> str:
