@@ -28,6 +28,7 @@ _PINHOLE_NAMES = {"pinhole", "radtan", "plumbbob", "rationalpolynomial", "brownc
 # OpenCV's names of types: those of base64, and those whose decimal digits are rounded to them.
 _BASE64_TYPES = {"u": "u1", "c": "i1", "w": "<u2", "s": "<i2", "i": "<i4", "f": "<f4", "d": "<f8"}
 _ROUNDED = {"h": np.float16, "f": np.float32}
+_HEXADECIMAL = re.compile(r"[-+]?0[xX][0-9a-fA-F]{1,16}")
 _EXPECTED = "a calibration of two cameras: OpenCV's YAML or XML, Kalibr's camchain, KITTI's or Middlebury's"
 
 
@@ -333,7 +334,8 @@ def _middlebury(text: str) -> Rig:
     missing = {"cam0", "doffs", "baseline", "width", "height"} - entries.keys()
     if missing:
         raise ValueError(f"no entry {', '.join(sorted(missing))} of a Middlebury calib.txt")
-    left = _numbers([row.split() for row in entries["cam0"].strip(" []").split(";")]).reshape(3, 3)
+    rows = entries["cam0"].strip(" []").split(";", 3)  # a fourth row is refused, however long it is
+    left = _numbers([row.split() for row in rows]).reshape(3, 3)
     right = left + np.array([[0, 0, float(entries["doffs"])], [0, 0, 0], [0, 0, 0]])
     baseline_m = float(entries["baseline"]) / 1000
     if not baseline_m > 0:
@@ -353,9 +355,16 @@ def _numbers(values: Any) -> Float[np.ndarray, "..."]:
     if isinstance(values, str) and values.startswith(BASE64):
         return _decoded(values)
     try:
-        return np.asarray(values, dtype=np.float64)
+        return np.asarray(_decimal(values), dtype=np.float64)
     except (TypeError, ValueError) as error:  # the former of a dict, for instance
         raise ValueError(f"{reprlib.repr(values)} in place of numbers") from error
+
+
+def _decimal(values: Any) -> Any:
+    """The values, with numbers in place of hexadecimal words."""
+    if isinstance(values, list):
+        return [_decimal(value) for value in values]
+    return int(values, 16) if isinstance(values, str) and _HEXADECIMAL.fullmatch(values) else values
 
 
 def _matrix(entries: Mapping[str, Any]) -> Float[np.ndarray, "..."]:

@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import yaml
 
 _MOST_DEEP, _MOST_VALUES = 20, 10_000
+_NULLS = ("", "~", "null", "Null", "NULL")
 BASE64 = "$base64$"  # OpenCV's own mark in JSON
 _DECLARATION = re.compile(r"<!(?!--|\[CDATA\[)")
 _XML_ITEM = re.compile(r'"[^"]*"|\S+')
@@ -21,8 +22,8 @@ _JSON_ALONE = re.compile(r'("(?:[^"\\]|\\.)*+"?)|//.*|\t')
 def parse_entries(text: str) -> dict[str, Any]:
     """The entries of YAML, of JSON or of XML as cv2.FileStorage writes it.
 
-    Each value is a string, as it stands, or a list or a dict of values. Binary data is a string that begins
-    with BASE64.
+    Each value is a string, as it stands, or a list or a dict of values. An entry of YAML's or JSON's null is
+    left out. Binary data is a string that begins with BASE64.
 
     Raises:
         ValueError or SyntaxError: It is none of them, or more deeply nested or of more values than any
@@ -70,6 +71,19 @@ class _Loader(yaml.BaseLoader):
         node = super().compose_node(parent, index)
         self._gate.leave()
         return node
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        node.value = [(key, value) for key, value in node.value if not _is_null(value)]
+        return super().construct_mapping(node, deep)
+
+
+def _is_null(node: yaml.Node) -> bool:
+    return (
+        isinstance(node, yaml.ScalarNode)
+        and node.style is None  # without quotes
+        and node.tag == yaml.resolver.BaseResolver.DEFAULT_SCALAR_TAG
+        and node.value in _NULLS
+    )
 
 
 def _marked(loader: _Loader, node: yaml.ScalarNode) -> str:

@@ -329,6 +329,20 @@ def test_a_lens_is_a_fisheye_in_each_word_for_yes_that_programs_write(tmp_path, 
     assert read_rig(stored(tmp_path, f"{text}fisheye: {said}\n")).left.fisheye is fisheye
 
 
+@pytest.mark.parametrize("null", ["~", "null", "Null", "NULL", ""])
+def test_an_entry_of_null_counts_as_left_out(tmp_path, null):
+    names = ("distortion_model", "translation_unit", "fisheye", "image_size")
+    more = "".join(f"{name}: {null}\n" for name in names)
+    assert_same(read_rig(stored(tmp_path, OPENCV + more)), read_rig(stored(tmp_path, OPENCV)))
+
+
+def test_hexadecimal_numbers_are_read_too(tmp_path):
+    text = OPENCV + "image_size: [0x280, +0X1e0]\nT: [-0x78, 0, 0x0]\n"
+    rig = read_rig(stored(tmp_path, text))
+    assert rig.size_px == (640, 480)
+    np.testing.assert_allclose(rig.translation_m, [-0.12, 0, 0])
+
+
 def test_other_names_and_plain_lists_are_read_too(tmp_path):
     text = """\
 cameraMatrixLeft: [[550, 0, 320], [0, 551, 240], [0, 0, 1]]
