@@ -51,7 +51,8 @@ def read_rig(path: str | Path, size_px: Size | None = None) -> Rig:
 
     Raises:
         FormatError: No such file, no regular one, or one of more than 256 KB; an entry is missing, or its
-            value is nonsense; it is nested more than 20 deep, has more than 10,000 values, an alias or a DTD.
+            value is nonsense; it is nested more than 20 deep, has more than 10,000 values, an anchor, an
+            alias or a DTD.
     """
     # What overflows or is divided by 0 on the way is refused at the end, where it is not finite.
     with reading(path, _EXPECTED), np.errstate(all="ignore"):

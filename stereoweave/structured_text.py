@@ -1,7 +1,7 @@
 """Plain values from YAML, JSON and XML that may have been written to do harm.
 
-The text is read without aliases, DTDs or types of the writer's choice, and nothing recurses before its depth
-and its count have been checked. Its size is the caller's to limit: the time grows with it.
+The text is read without anchors, aliases, DTDs or types of the writer's choice, and nothing recurses before
+its depth and its count have been checked. Its size is the caller's to limit: the time grows with it.
 """
 
 import re
@@ -27,7 +27,7 @@ def parse_entries(text: str) -> dict[str, Any]:
 
     Raises:
         ValueError or SyntaxError: It is none of them, or more deeply nested or of more values than any
-            calibration; it has an alias or a DTD.
+            calibration; it has an anchor, an alias or a DTD.
     """
     start = text.lstrip()[:1]
     if start == "<":
@@ -47,11 +47,17 @@ class _Gate:
 
     def enter(self) -> None:
         self._depth += 1
-        self._values += 1
         if self._depth > _MOST_DEEP:
             raise ValueError(f"values nested more than {_MOST_DEEP} deep")
+        self.count(1)
+
+    def count(self, values: int) -> None:
+        self._values += values
         if self._values > _MOST_VALUES:
-            raise ValueError(f"more than {_MOST_VALUES} values")
+            raise ValueError(
+                f"more than {_MOST_VALUES} values; leave out entries other than the cameras', such as "
+                "image_points"
+            )
 
     def leave(self) -> None:
         self._depth -= 1
@@ -69,6 +75,8 @@ class _Loader(yaml.BaseLoader):
             raise ValueError("an alias (*); write its value in its place")
         self._gate.enter()
         node = super().compose_node(parent, index)
+        if self.anchors:  # of no use without aliases
+            raise ValueError("an anchor (&); leave it out")
         self._gate.leave()
         return node
 
@@ -105,7 +113,7 @@ def _parse_yaml(text: str) -> Any:
 
 
 class _Builder(ElementTree.TreeBuilder):
-    """ElementTree's elements, while their depth and count are allowed."""
+    """ElementTree's elements, while their depth and the count of values are allowed."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -114,6 +122,10 @@ class _Builder(ElementTree.TreeBuilder):
     def start(self, tag: str, attrs: dict[str, str], /) -> ElementTree.Element:
         self._gate.enter()
         return super().start(tag, attrs)
+
+    def data(self, data: str, /) -> None:
+        self._gate.count(len(_XML_ITEM.findall(data)))
+        super().data(data)
 
     def end(self, tag: str, /) -> ElementTree.Element:
         self._gate.leave()
