@@ -1,6 +1,7 @@
 """Two cameras from the files that calibration programs write, and into one."""
 
 import base64
+import contextlib
 import math
 import re
 import reprlib
@@ -20,13 +21,14 @@ from stereoweave.stereo import StereoPair
 from stereoweave.structured_text import BASE64, parse_entries
 
 _MM_ABOVE = 2.0
-_TRUE = ("1", "true", "True")
+_YES, _NO = ("true", "yes", "on", "y"), ("false", "no", "off", "n")
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _FISHEYE_NAMES = {"fisheye", "equidistant", "equi", "kannalabrandt", "kb4"}
 _PINHOLE_NAMES = {"pinhole", "radtan", "plumbbob", "rationalpolynomial", "brownconrady", "none"}
 # OpenCV's names of types: those of base64, and those whose decimal digits are rounded to them.
 _BASE64_TYPES = {"u": "u1", "c": "i1", "w": "<u2", "s": "<i2", "i": "<i4", "f": "<f4", "d": "<f8"}
 _ROUNDED = {"h": np.float16, "f": np.float32}
+_HEXADECIMAL = re.compile(r"[-+]?0[xX][0-9a-fA-F]{1,16}")
 _EXPECTED = "a calibration of two cameras: OpenCV's YAML or XML, Kalibr's camchain, KITTI's or Middlebury's"
 
 
@@ -49,7 +51,8 @@ def read_rig(path: str | Path, size_px: Size | None = None) -> Rig:
 
     Raises:
         FormatError: No such file, no regular one, or one of more than 256 KB; an entry is missing, or its
-            value is nonsense; it is nested more than 20 deep, has more than 10,000 values, an alias or a DTD.
+            value is nonsense; it is nested more than 20 deep, has more than 10,000 values, an anchor, an
+            alias or a DTD.
     """
     # What overflows or is divided by 0 on the way is refused at the end, where it is not finite.
     with reading(path, _EXPECTED), np.errstate(all="ignore"):
@@ -180,10 +183,20 @@ def _of_side(entries: Mapping[str, Any], names: Iterable[str], sides: Iterable[s
 
 def _model(entries: Mapping[str, Any]) -> str | None:
     """The kind of lens that OpenCV's file names, fisheye or pinhole; None where it names none."""
-    if entries.get("fisheyemodel", entries.get("fisheye", "")) in _TRUE:
+    if _is_true(_first(entries, ("fisheyemodel", "fisheye")) or "no"):
         return "fisheye"
     named = _first(entries, ("distortionmodel", "cameramodel", "model"))
     return None if named is None else _known_model(named)
+
+
+def _is_true(said: object) -> bool:
+    word = str(said).lower()
+    if word in _YES or word in _NO:
+        return word in _YES
+    with contextlib.suppress(ValueError):
+        if math.isfinite(number := float(word)):
+            return number != 0
+    raise ValueError(f"fisheye: {reprlib.repr(said)}, not one of {', '.join(_YES + _NO)} or a number")
 
 
 def _known_model(named: object) -> str:
@@ -322,7 +335,8 @@ def _middlebury(text: str) -> Rig:
     missing = {"cam0", "doffs", "baseline", "width", "height"} - entries.keys()
     if missing:
         raise ValueError(f"no entry {', '.join(sorted(missing))} of a Middlebury calib.txt")
-    left = _numbers([row.split() for row in entries["cam0"].strip(" []").split(";")]).reshape(3, 3)
+    rows = entries["cam0"].strip(" []").split(";", 3)  # a fourth row is refused, however long it is
+    left = _numbers([row.split() for row in rows]).reshape(3, 3)
     right = left + np.array([[0, 0, float(entries["doffs"])], [0, 0, 0], [0, 0, 0]])
     baseline_m = float(entries["baseline"]) / 1000
     if not baseline_m > 0:
@@ -342,9 +356,16 @@ def _numbers(values: Any) -> Float[np.ndarray, "..."]:
     if isinstance(values, str) and values.startswith(BASE64):
         return _decoded(values)
     try:
-        return np.asarray(values, dtype=np.float64)
+        return np.asarray(_decimal(values), dtype=np.float64)
     except (TypeError, ValueError) as error:  # the former of a dict, for instance
         raise ValueError(f"{reprlib.repr(values)} in place of numbers") from error
+
+
+def _decimal(values: Any) -> Any:
+    """The values, with numbers in place of hexadecimal words."""
+    if isinstance(values, list):
+        return [_decimal(value) for value in values]
+    return int(values, 16) if isinstance(values, str) and _HEXADECIMAL.fullmatch(values) else values
 
 
 def _matrix(entries: Mapping[str, Any]) -> Float[np.ndarray, "..."]:

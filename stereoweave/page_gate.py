@@ -4,12 +4,11 @@ import json
 import re
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
-from http.cookies import CookieError, SimpleCookie
 from secrets import token_urlsafe
 from typing import Any
 
-from starlette.datastructures import Headers, MutableHeaders
-from starlette.requests import ClientDisconnect, Request
+from starlette.datastructures import MutableHeaders
+from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -30,8 +29,9 @@ _ROUTES = re.compile(
 # Those whose answers name files to the visitor.
 _NAMING = (f"{_API}/upload", f"{_API}/queue/data")
 _MOST_BODY_BYTES = 1_000_000
-# Some 200 bytes each; a visitor who looks at a pair for an hour is shown hundreds.
-_MOST_NAMED = 100_000
+# About 200 bytes each; a visitor who looks at a pair for an hour is shown hundreds.
+_MOST_NAMED = 10_000
+_MOST_VISITORS = 1_000
 
 
 class ContentPolicy:
@@ -53,7 +53,7 @@ class OwnFiles:
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
-        self._named: OrderedDict[tuple[str, str], None] = OrderedDict()
+        self._named = _Named()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
@@ -86,7 +86,7 @@ class OwnFiles:
         return receive
 
     def _check(self, paths: Sequence[Any], visitor: str) -> None:
-        if not all(isinstance(path, str) and (visitor, path) in self._named for path in paths):
+        if not all(isinstance(path, str) and self._named.knows(visitor, path) for path in paths):
             raise PermissionError
 
     def _remembering(self, send: Send, visitor: str) -> Send:
@@ -112,19 +112,39 @@ class OwnFiles:
             return
         uploads = value if isinstance(value, list) else []
         for path in (*uploads, *_paths(value)):
-            self._named[visitor, path] = None
-            self._named.move_to_end((visitor, path))
-        while len(self._named) > _MOST_NAMED:
-            self._named.popitem(last=False)
+            self._named.add(visitor, path)
+
+
+class _Named:
+    """The paths named to each visitor: each has a limit, so that no visitor takes those of another."""
+
+    def __init__(self) -> None:
+        self._visitors: OrderedDict[str, OrderedDict[str, None]] = OrderedDict()
+
+    def add(self, visitor: str, path: str) -> None:
+        paths = self._visitors.setdefault(visitor, OrderedDict())
+        paths[path] = None
+        _use(paths, path, _MOST_NAMED)
+        _use(self._visitors, visitor, _MOST_VISITORS)
+
+    def knows(self, visitor: str, path: str) -> bool:
+        if visitor not in self._visitors:
+            return False
+        _use(self._visitors, visitor, _MOST_VISITORS)
+        return path in self._visitors[visitor]
+
+
+def _use(entries: OrderedDict[str, Any], key: str, most: int) -> None:
+    """Puts an entry last, and removes the first where there are more than `most`."""
+    entries.move_to_end(key)
+    if len(entries) > most:
+        entries.popitem(last=False)
 
 
 def _visitor(scope: Scope) -> str:
     """Who asks, by the cookie; empty where there is none."""
-    try:
-        cookie = SimpleCookie(Headers(scope=scope).get("cookie", "")).get(_COOKIE)
-    except CookieError:
-        return ""
-    return cookie.value if cookie and _VISITOR.fullmatch(cookie.value) else ""
+    cookie = HTTPConnection(scope).cookies.get(_COOKIE, "")
+    return cookie if _VISITOR.fullmatch(cookie) else ""
 
 
 def _with_header(send: Send, name: str, value: str) -> Send:

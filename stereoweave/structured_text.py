@@ -1,7 +1,7 @@
 """Plain values from YAML, JSON and XML that may have been written to do harm.
 
-The text is read without aliases, DTDs or types of the writer's choice, and nothing recurses before its depth
-and its count have been checked. Its size is the caller's to limit: the time grows with it.
+The text is read without anchors, aliases, DTDs or types of the writer's choice, and nothing recurses before
+its depth and its count have been checked. Its size is the caller's to limit: the time grows with it.
 """
 
 import re
@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import yaml
 
 _MOST_DEEP, _MOST_VALUES = 20, 10_000
+_NULLS = ("", "~", "null", "Null", "NULL")
 BASE64 = "$base64$"  # OpenCV's own mark in JSON
 _DECLARATION = re.compile(r"<!(?!--|\[CDATA\[)")
 _XML_ITEM = re.compile(r'"[^"]*"|\S+')
@@ -21,12 +22,12 @@ _JSON_ALONE = re.compile(r'("(?:[^"\\]|\\.)*+"?)|//.*|\t')
 def parse_entries(text: str) -> dict[str, Any]:
     """The entries of YAML, of JSON or of XML as cv2.FileStorage writes it.
 
-    Each value is a string, as it stands, or a list or a dict of values. Binary data is a string that begins
-    with BASE64.
+    Each value is a string, as it stands, or a list or a dict of values. An entry of YAML's or JSON's null is
+    left out. Binary data is a string that begins with BASE64.
 
     Raises:
         ValueError or SyntaxError: It is none of them, or more deeply nested or of more values than any
-            calibration; it has an alias or a DTD.
+            calibration; it has an anchor, an alias or a DTD.
     """
     start = text.lstrip()[:1]
     if start == "<":
@@ -46,11 +47,17 @@ class _Gate:
 
     def enter(self) -> None:
         self._depth += 1
-        self._values += 1
         if self._depth > _MOST_DEEP:
             raise ValueError(f"values nested more than {_MOST_DEEP} deep")
+        self.count(1)
+
+    def count(self, values: int) -> None:
+        self._values += values
         if self._values > _MOST_VALUES:
-            raise ValueError(f"more than {_MOST_VALUES} values")
+            raise ValueError(
+                f"more than {_MOST_VALUES} values; leave out entries other than the cameras', such as "
+                "image_points"
+            )
 
     def leave(self) -> None:
         self._depth -= 1
@@ -68,8 +75,23 @@ class _Loader(yaml.BaseLoader):
             raise ValueError("an alias (*); write its value in its place")
         self._gate.enter()
         node = super().compose_node(parent, index)
+        if self.anchors:  # of no use without aliases
+            raise ValueError("an anchor (&); leave it out")
         self._gate.leave()
         return node
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        node.value = [(key, value) for key, value in node.value if not _is_null(value)]
+        return super().construct_mapping(node, deep)
+
+
+def _is_null(node: yaml.Node) -> bool:
+    return (
+        isinstance(node, yaml.ScalarNode)
+        and node.style is None  # without quotes
+        and node.tag == yaml.resolver.BaseResolver.DEFAULT_SCALAR_TAG
+        and node.value in _NULLS
+    )
 
 
 def _marked(loader: _Loader, node: yaml.ScalarNode) -> str:
@@ -91,7 +113,7 @@ def _parse_yaml(text: str) -> Any:
 
 
 class _Builder(ElementTree.TreeBuilder):
-    """ElementTree's elements, while their depth and count are allowed."""
+    """ElementTree's elements, while their depth and the count of values are allowed."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -100,6 +122,10 @@ class _Builder(ElementTree.TreeBuilder):
     def start(self, tag: str, attrs: dict[str, str], /) -> ElementTree.Element:
         self._gate.enter()
         return super().start(tag, attrs)
+
+    def data(self, data: str, /) -> None:
+        self._gate.count(len(_XML_ITEM.findall(data)))
+        super().data(data)
 
     def end(self, tag: str, /) -> ElementTree.Element:
         self._gate.leave()

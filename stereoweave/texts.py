@@ -2,6 +2,7 @@
 
 import csv
 import re
+import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +13,9 @@ from stereoweave.io import replacing
 # What spreadsheets take for a formula (OWASP, "CSV Injection"); and the mark itself, so that different names
 # stay different.
 _COMPUTED = ("=", "+", "-", "@", "\t", "\r", "\n", "'")
+# Where a spreadsheet may begin a cell: its language sets what it splits at, and quotes inside a cell do not
+# keep it from that.
+_CELL_STARTS = re.compile(r"(?<=[;\t\r\n])(?![\t\r\n])")
 _NUMBER = re.compile(r"-([0-9.]+(e[-+]?[0-9]+)?|inf)")
 
 
@@ -37,6 +41,11 @@ def write_table(path: str | Path, columns: Sequence[str], rows: Iterable[Mapping
 
 
 def _inert(value: Any) -> Any:
-    if isinstance(value, str) and value.startswith(_COMPUTED) and not _NUMBER.fullmatch(value):
-        return f"'{value}"
-    return value
+    if not isinstance(value, str) or _NUMBER.fullmatch(value):
+        return value
+    return "".join(f"'{cell}" if _is_computed(cell) else cell for cell in _CELL_STARTS.split(value))
+
+
+def _is_computed(cell: str) -> bool:
+    """Whether it begins with a mark of formulas, also of full width (＝) or after blanks."""
+    return cell.startswith(_COMPUTED) or unicodedata.normalize("NFKC", cell).lstrip().startswith(_COMPUTED)

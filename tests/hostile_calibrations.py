@@ -111,6 +111,7 @@ def _aliases():
         "recursive camera": KALIBR.replace("[460, 460, 363, 248]", "&a [*a, *a, *a, *a]"),
         "undefined": "M1: *a\n",
         "in json": '{"M1": &a [*a, *a, *a]}\n',
+        "none, but an anchor": yaml_of(RIG | {"points": "&t [1, 2]"}),
     }
 
 
@@ -163,6 +164,8 @@ def _count():
         "numbers in a json list": json_of(RIG | {"points": f"[{numbers}]"}),
         "numbers in yaml lines": yaml_of(RIG) + "points:\n" + "- 1\n" * _MANY,
         "entries of yaml": yaml_of(RIG) + "".join(f"{i}: 1\n" for i in range(25_000)),
+        "numbers in xml": xml_of(RIG | {"points": "1 " * 12_000}),
+        "numbers in lines of xml": xml_of(RIG | {"points": "1\n" * 12_000}),
         "elements of xml": xml_of(RIG | {"points": "<_/>" * 60_000}),
         "documents": "---\n" * _MANY,
         "anchors": yaml_of(RIG) + "points:\n" + "".join(f"- &{i} 1\n" for i in range(20_000)),
@@ -406,9 +409,9 @@ def _harmless():
         "section of xml": xml_of(RIG | {"translation_unit": "<![CDATA[m]]>"}),
         "200000 letters of comment": yaml + "#" + "a" * 200_000,
         "comment that is no utf-8": yaml.encode() + b"# \xe9\xff\n",
-        "anchor without alias": yaml.replace("T: ", "T: &t "),
         "other values beside it": yaml + odd,
         "5000 numbers beside it": f"{yaml}points: [{', '.join('1' * 5000)}]\n",
+        "9000 numbers of xml beside it": xml_of(RIG | {"points": "1 " * 9000}),
         "lists in lists beside it": f"{yaml}points: {'[' * 10}1{']' * 10}\n",
         "end of the document": yaml + "...\n",
         "header of yaml 1.2": yaml_of(RIG, header="%YAML 1.2\n---\n"),

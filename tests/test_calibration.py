@@ -314,6 +314,35 @@ def test_four_coefficients_are_a_pinholes_unless_the_file_says_fisheye(tmp_path)
         assert read_rig(stored(tmp_path, f"{four}{said}\n")).left.fisheye
 
 
+@pytest.mark.parametrize(
+    ("said", "fisheye"),
+    [
+        *((word, True) for word in ("1", "1.0", "1.", "true", "TRUE", "yes", "on", "y")),
+        *((word, False) for word in ("0", "0.", "false", "False", "no", "OFF", "n")),
+    ],
+)
+def test_a_lens_is_a_fisheye_in_each_word_for_yes_that_programs_write(tmp_path, said, fisheye):
+    text = OPENCV.replace("cols: 5", "cols: 4").replace(", 0., 0., 0. ]\n", ", 0., 0. ]\n")
+    text = text.replace(
+        "550., 0., 320., 0., 551., 240., 0., 0. ]", "550., 0., 320., 0., 551., 240., 0., 0., 1. ]"
+    )
+    assert read_rig(stored(tmp_path, f"{text}fisheye: {said}\n")).left.fisheye is fisheye
+
+
+@pytest.mark.parametrize("null", ["~", "null", "Null", "NULL", ""])
+def test_an_entry_of_null_counts_as_left_out(tmp_path, null):
+    names = ("distortion_model", "translation_unit", "fisheye", "image_size")
+    more = "".join(f"{name}: {null}\n" for name in names)
+    assert_same(read_rig(stored(tmp_path, OPENCV + more)), read_rig(stored(tmp_path, OPENCV)))
+
+
+def test_hexadecimal_numbers_are_read_too(tmp_path):
+    text = OPENCV + "image_size: [0x280, +0X1e0]\nT: [-0x78, 0, 0x0]\n"
+    rig = read_rig(stored(tmp_path, text))
+    assert rig.size_px == (640, 480)
+    np.testing.assert_allclose(rig.translation_m, [-0.12, 0, 0])
+
+
 def test_other_names_and_plain_lists_are_read_too(tmp_path):
     text = """\
 cameraMatrixLeft: [[550, 0, 320], [0, 551, 240], [0, 0, 1]]
@@ -345,6 +374,10 @@ def test_extrinsics_are_completed_by_the_intrinsics_beside_them(tmp_path):
         ("image_size: 640", "a picture's size of '640', not width and height"),
         ("image_size: [640, 480, 3]", "not width and height"),
         ("M1: {rows: 3}", "{'rows': '3'} in place of numbers"),
+        ("fisheye: maybe", "fisheye: 'maybe', not one of true, yes, on, y, false, no, off, n or a number"),
+        ("fisheye: [1]", "fisheye: ['1'], not one of"),
+        ("fisheye: .nan", "fisheye: '.nan', not one of"),
+        ("fisheye: nan", "fisheye: 'nan', not one of"),
         ("translation_unit: [mm]", "translation_unit ['mm'], not one of m, cm, mm"),
     ],
 )

@@ -55,6 +55,14 @@ def test_a_hostile_calibration_is_refused_at_once_in_one_short_line(name, tmp_pa
     assert time.process_time() - start_s < 1
 
 
+@pytest.mark.parametrize("text_of", [yaml_of, json_of, xml_of])
+def test_a_file_of_too_many_values_says_which_to_leave_out(text_of, tmp_path):
+    (tmp_path / "calib").write_text(text_of(RIG | {"image_points": [1] * 12_000}))
+    assert "more than 10000 values; leave out entries other than the cameras', such as image_points" in (
+        refusal(tmp_path / "calib")
+    )
+
+
 @pytest.mark.parametrize("name", HARMLESS)
 def test_a_calibration_that_only_looks_odd_is_read(name, tmp_path):
     (tmp_path / "calib").write_bytes(HARMLESS[name])

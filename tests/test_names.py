@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,6 +73,38 @@ def test_tables_of_scores_have_no_formulas_and_keep_different_names_apart(tmp_pa
     rows = table(tmp_path / "rows.csv")
     assert [row["scene"] for row in rows] == [*(f"'{name}" for name in FORMULAS), SHOWN, SHOWN_TOO, "plain"]
     assert {row["bias_px"] for row in rows} == {"-0.5"}
+
+
+def test_no_cell_is_a_formula_however_a_spreadsheet_splits_a_row(tmp_path):
+    @dataclass
+    class Row:
+        share: float
+        scene: str
+
+    # A spreadsheet with German settings splits at semicolons, and knows no quotes inside a cell.
+    names = [
+        *("a;=cmd|'/C calc'!A0", "a\t=1+1", "a; \t=1+1", "a\n=1+1", 'a,";=1+1', "a;'=1+1", "a;=1;=2"),
+        *(" =1+1", "\u00a0=1+1", "\uff1d1+1", "a;\uff1d1+1", "' =1+1"),
+    ]
+    write_csv(tmp_path / "rows.csv", [Row(0.5, name) for name in names], {})
+    rows = table(tmp_path / "rows.csv")
+    assert len({row["scene"] for row in rows}) == len(names)
+    for delimiter in ",;\t":
+        with (tmp_path / "rows.csv").open(newline="", encoding="utf-8") as file:
+            cells = [cell for row in csv.reader(file, delimiter=delimiter) for cell in row]
+        assert len(cells) > len(names)
+        for cell in cells:
+            assert not unicodedata.normalize("NFKC", cell).lstrip().startswith(tuple("=+-@")), cell
+
+
+@pytest.mark.parametrize("name", ["a;b", "a; b - c", "a\tb", "a=1", "-0.5"])
+def test_a_text_that_is_no_formula_stands_in_a_table_as_it_is(tmp_path, name):
+    @dataclass
+    class Row:
+        scene: str
+
+    write_csv(tmp_path / "rows.csv", [Row(name)], {})
+    assert [row["scene"] for row in table(tmp_path / "rows.csv")] == [name]
 
 
 def test_the_console_shows_them_too(tmp_path):

@@ -11,8 +11,14 @@ from urllib.parse import quote
 
 import pytest
 from page_examples import Visitor, file_data, start, stop
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse
+from starlette.routing import Route
+from starlette.testclient import TestClient
 
 from stereoweave.io import read_image, write_image
+from stereoweave.page_gate import OwnFiles
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 REFUSED = (403, "expected a file that you gave to this page or that it made of yours; give it again")
@@ -196,3 +202,63 @@ def test_uploads_are_removed_when_a_signal_ends_the_page(tmp_path, small_pair, n
     assert Path(path).is_relative_to(tmp_path)
     stop(server, number)
     assert list(tmp_path.glob("stereoweave-page-*")) == []
+
+
+async def name_again(request: Request) -> JSONResponse:
+    return JSONResponse(await request.json())
+
+
+async def show_file(_: Request) -> PlainTextResponse:
+    return PlainTextResponse("content")
+
+
+@pytest.fixture
+def page() -> Iterator[TestClient]:
+    """The gate before a little page: an upload lists the files that are named to its visitor."""
+    routes = [
+        Route("/gradio_api/upload", name_again, methods=["POST"]),
+        Route("/gradio_api/file={path:path}", show_file),
+    ]
+    with TestClient(OwnFiles(Starlette(routes=routes))) as page:
+        yield page
+
+
+def cookie_of(number: int) -> str:
+    return f"stereoweave-visitor={number:043}"
+
+
+def name_files(page: TestClient, cookie: str, *paths: str) -> None:
+    answer = page.post("/gradio_api/upload", json=list(paths), headers={"cookie": cookie})
+    assert answer.json() == list(paths)
+
+
+def status_of(page: TestClient, cookie: str, path: str) -> int:
+    return page.get(f"/gradio_api/file={path}", headers={"cookie": cookie}).status_code
+
+
+@pytest.mark.parametrize(
+    "others", ["theme=dark mode", "novalue", "path/x=1", 'x={"a":1}', "é=1"], ids=lambda text: ascii(text)
+)
+def test_a_visitor_keeps_their_files_beside_the_cookies_of_other_servers_on_the_host(page, others):
+    name_files(page, cookie_of(1), "/own.png")
+    for header in (f"{others}; {cookie_of(1)}", f"{cookie_of(1)}; {others}"):
+        answer = page.get("/gradio_api/file=/own.png", headers={"cookie": header.encode("utf-8")})
+        assert (answer.status_code, answer.text) == (200, "content")
+
+
+def test_no_visitor_takes_the_files_of_another_by_naming_many(page):
+    name_files(page, cookie_of(1), "/own.png")
+    name_files(page, cookie_of(2), *(f"/{number}.png" for number in range(100_001)))
+    assert status_of(page, cookie_of(1), "/own.png") == 200
+    # The last 10,000 stay.
+    assert status_of(page, cookie_of(2), "/90000.png") == 403
+    assert status_of(page, cookie_of(2), "/90001.png") == 200
+
+
+def test_of_more_than_1000_visitors_the_one_longest_unused_is_forgotten(page):
+    for number in range(1000):
+        name_files(page, cookie_of(number), "/own.png")
+    assert status_of(page, cookie_of(0), "/own.png") == 200  # now 1 is the longest unused
+    name_files(page, cookie_of(1000), "/own.png")
+    kept = [status_of(page, cookie_of(number), "/own.png") for number in (0, 1, 2, 1000)]
+    assert kept == [200, 403, 200, 200]

@@ -153,8 +153,14 @@ def test_what_has_no_entries_with_names_is_refused(text):
 
 
 def test_values_are_strings_whatever_their_tags_and_looks_say():
-    text = "a: 1\nb: 2001-01-01\nc: !!int 2\nd: ~\ne: !!python/name:os.system\nf: yes\n<<: {g: 1:59}\n"
+    text = "a: 1\nb: 2001-01-01\nc: !!int 2\nd: '~'\ne: !!python/name:os.system\nf: yes\n<<: {g: 1:59}\n"
     assert parse_entries(text) == {
         **{"a": "1", "b": "2001-01-01", "c": "2", "d": "~", "e": "", "f": "yes"},
         "<<": {"g": "1:59"},
     }
+
+
+def test_entries_of_null_are_left_out_and_nulls_elsewhere_stay_words():
+    text = "a: ~\nb: null\nc:\nd: ''\ne: {f: NULL, g: [~, null]}\n"
+    assert parse_entries(text) == {"d": "", "e": {"g": ["~", "null"]}}
+    assert parse_entries('{"a": null, "b": "null"}') == {"b": "null"}
