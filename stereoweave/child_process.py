@@ -73,7 +73,8 @@ class ChildProcess:
     def _start(self) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
         environment = {"TMPDIR": str(self._folder), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-        command, pipe = [sys.executable, "-m", __name__], subprocess.PIPE
+        # -P: else the current folder comes first, and a file there may have the name of a library.
+        command, pipe = [sys.executable, "-P", "-m", __name__], subprocess.PIPE
         self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, env=os.environ | environment)
         self._started = self._exchanges.submit(_exchange, self._process, self._make)
 

@@ -3,6 +3,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -117,3 +118,15 @@ def test_a_busy_process_ends_with_its_parent(tmp_path):
         pid = int(parent.stdout.readline())
         parent.kill()
     wait_for_end(pid)
+
+
+def test_a_file_of_the_current_folder_is_not_taken_for_a_module(tmp_path, monkeypatch):
+    (tmp_path / "textwrap.py").write_text(
+        f"from pathlib import Path\nPath({str(tmp_path)!r}, 'run').touch()\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    child = child_of(abs, tmp_path / "files")
+    with suppress(ProcessDiedError):  # where that file was run, it lacks what is imported from the real one
+        child(-7, timeout_s=10)
+    child.close()
+    assert not (tmp_path / "run").exists()
