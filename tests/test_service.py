@@ -1,6 +1,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -40,6 +41,7 @@ pytestmark = [
 class Running(NamedTuple):
     client: httpx.Client
     pid: int
+    uploads: Path
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +73,7 @@ def served(uploads: Path, *words: object) -> Iterator[Running]:
             # Each request has a connection of its own, as those of many clients.
             alone = httpx.Limits(max_keepalive_connections=0)
             with httpx.Client(base_url=url, timeout=60, limits=alone) as client:
-                yield Running(client, process.pid)
+                yield Running(client, process.pid, uploads)
             started = watching.children(process.pid)
             process.send_signal(signal.SIGTERM)
             assert process.wait(30) == 0
@@ -217,6 +219,22 @@ def send_until_taken(send: Sender, client: httpx.Client) -> int:
 def test_only_requests_to_a_name_of_this_machine_are_answered(service, host, status):
     for path in ("/health", "/openapi.json"):
         assert service.get(path, headers={"Host": host}).status_code == status
+
+
+def test_temporary_folders_that_were_removed_are_made_again_and_one_that_cannot_be_made_is_said(running):
+    for folder in running.uploads.glob("stereoweave-service-*/"):
+        shutil.rmtree(folder)
+    assert post(running.client, "/disparity").status_code == 200
+    [measuring] = running.uploads.glob("stereoweave-service-*/measuring")
+    measuring.rmdir()
+    measuring.touch()
+    refused = post(running.client, "/disparity")
+    assert refused.status_code == 503
+    assert refused.json()["detail"].startswith(
+        "expected room for the request on the disk and in memory, found "
+    )
+    measuring.unlink()
+    assert post(running.client, "/disparity").status_code == 200
 
 
 def test_its_description_names_every_path_and_field(service):

@@ -2,7 +2,7 @@
 
 import asyncio
 import tempfile
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +19,14 @@ from stereoweave.service_requests import Answer, Order, TooLargeError
 pytestmark = pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`:DeprecationWarning")
 
 
-def guarded(answering: Any, **limits: Any) -> httpx.AsyncClient:
+def guarded(
+    answering: Any, metrics: Callable[[], bytes] = bytes, folder: Path | None = None, **limits: Any
+) -> httpx.AsyncClient:
     """A client of the service without a server, whose work is done by a function."""
     from stereoweave.service_http import Guard, Limits, make_app
 
     allowed = Limits(**limits)
-    app = Guard(make_app(answering, allowed, bytes, Path(tempfile.gettempdir())), allowed)
+    app = Guard(make_app(answering, allowed, metrics, folder or Path(tempfile.gettempdir())), allowed)
     return httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://service")
 
 
@@ -206,3 +208,34 @@ def test_what_the_work_came_to_is_told_by_the_status(error, status, header):
     assert response.status_code == status
     assert response.json() == {"detail": str(error)}
     assert response.headers.get("Retry-After") == header
+
+
+async def at_once(order: Order, left_s: float) -> Answer:
+    return Answer(content=order.pictures[0].read_bytes(), report="{}")
+
+
+def test_a_folder_that_was_removed_meanwhile_is_made_again(tmp_path):
+    folder = tmp_path / "emptied" / "own"
+    response = ask_guarded(at_once, folder=folder, timeout_s=60)
+    assert (response.status_code, response.content) == (200, BOTH["left"])
+    assert folder.stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.parametrize(
+    ("error", "found"),
+    [
+        (OSError(28, "No space left on device", "/srv/files/left"), "No space left on device: 'left'"),
+        (MemoryError("Unable to allocate\n4 GiB"), "Unable to allocate 4 GiB"),
+        (MemoryError(), "too little memory"),
+    ],
+)
+def test_a_machine_without_room_is_no_fault_of_the_request(error, found):
+    async def fails(order: Order, left_s: float) -> Answer:
+        raise error
+
+    response = ask_guarded(fails, timeout_s=60)
+    assert response.status_code == 503
+    detail = response.json()["detail"]
+    assert detail.startswith("expected room for the request on the disk and in memory, found ")
+    assert found in detail
+    assert "\n" not in detail
