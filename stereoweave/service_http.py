@@ -1,9 +1,11 @@
 """How the service speaks HTTP: what its requests say, and the guard before them, who refuses some."""
 
 import asyncio
+import math
 import secrets
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, MutableMapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -34,6 +36,7 @@ from stereoweave.service_requests import (
 # In so long some of those that wait are done.
 _RETRY_AFTER_S = 1
 _LATENCIES_S = [0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 60]
+_METRICS_KEPT_S = 1
 _PATHS = ("/disparity", "/depth", "/view")
 _HEALTH = "/health"
 # As nginx has it: the client went away, and nobody was answered.
@@ -118,6 +121,7 @@ def make_app(answering: Answering, limits: Limits, metrics: Callable[[], bytes],
     async def _refuse(_: Request, error: RequestValidationError) -> Response:
         return JSONResponse({"detail": _in_one_line(error)}, 422)
 
+    counted = _Metrics(metrics)
     answered = _Answers(answering, limits.megapixels, folder)
 
     @app.post("/disparity", responses=_responses(".png", ".pfm", ".npy", ".tiff"), response_class=Response)
@@ -144,12 +148,31 @@ def make_app(answering: Answering, limits: Limits, metrics: Callable[[], bytes],
     async def prometheus() -> Response:
         """What is counted, in Prometheus' text format."""
         try:
-            text = await asyncio.to_thread(metrics)
+            text = await counted()
         except OSError as error:
             raise HTTPException(503, f"expected Ray's exporters of metrics, found {error}") from error
         return Response(text, media_type="text/plain; version=0.0.4")
 
     return app
+
+
+class _Metrics:
+    """The text of a function, at most a second old.
+
+    One thread of its own gathers it: however many ask, the threads that uploads need stay free.
+    """
+
+    def __init__(self, gather: Callable[[], bytes]) -> None:
+        self._gather, self._thread, self._gathering = gather, ThreadPoolExecutor(1), asyncio.Lock()
+        self._text, self._until_s = b"", -math.inf
+
+    async def __call__(self) -> bytes:
+        async with self._gathering:
+            if time.monotonic() >= self._until_s:
+                loop = asyncio.get_running_loop()
+                self._text = await loop.run_in_executor(self._thread, self._gather)
+                self._until_s = time.monotonic() + _METRICS_KEPT_S
+            return self._text
 
 
 def _responses(*endings: str) -> dict[int | str, dict[str, Any]]:

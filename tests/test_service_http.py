@@ -2,6 +2,7 @@
 
 import asyncio
 import tempfile
+import threading
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
@@ -239,3 +240,26 @@ def test_a_machine_without_room_is_no_fault_of_the_request(error, found):
     assert detail.startswith("expected room for the request on the disk and in memory, found ")
     assert found in detail
     assert "\n" not in detail
+
+
+def test_a_flood_of_requests_for_metrics_holds_no_other_up_and_gathers_them_once():
+    gathered, allowed = [], threading.Event()
+
+    def gather() -> bytes:
+        gathered.append(threading.get_ident())
+        allowed.wait(10)
+        return b"counted 1\n"
+
+    async def flood() -> tuple[int, set[tuple[int, bytes]]]:
+        async with guarded(at_once, gather, timeout_s=3) as client:
+            asked = [asyncio.create_task(client.get("/metrics")) for _ in range(50)]
+            while not gathered:
+                await asyncio.sleep(0)
+            posted = await client.post("/disparity", files=BOTH)
+            allowed.set()
+            return posted.status_code, {
+                (each.status_code, each.content) for each in await asyncio.gather(*asked)
+            }
+
+    assert asyncio.run(flood()) == (200, {(200, b"counted 1\n")})
+    assert len(gathered) == 1
