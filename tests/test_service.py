@@ -342,9 +342,16 @@ def test_what_the_command_says_of_hosts_and_the_token_holds_for_the_service(tmp_
 
     monkeypatch.setattr("stereoweave.service.serving", serving)
     (tmp_path / "token").write_text(" se-cret\n")
-    for words in ([], ["--host", "::1"], ["--host", "0.0.0.0", "--behind-proxy"]):
+    hosts = {
+        (): ("127.0.0.1", "localhost"),
+        ("--host", "::1"): ("[::1]", "localhost"),
+        ("--host", "127.1"): ("127.0.0.1", "localhost", "127.1"),
+        ("--host", "0.0.0.0", "--behind-proxy"): None,
+        ("--behind-proxy",): None,
+    }
+    for words in hosts:
         assert main(["serve", "--port", "0", "--token-file", str(tmp_path / "token"), *words]) == 2
-    assert [limits.hosts for limits in kept] == [("127.0.0.1", "localhost"), ("[::1]", "localhost"), None]
+    assert [limits.hosts for limits in kept] == list(hosts.values())
     assert {limits.token.get_secret_value() for limits in kept} == {"se-cret"}
     assert "se-cret" not in repr(kept)
 
