@@ -12,7 +12,6 @@ import tempfile
 import webbrowser
 from collections.abc import Sequence
 from functools import partial
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -379,10 +378,10 @@ def _sample_folder() -> Path:
     return Path(str(importlib.resources.files("stereoweave"))) / "sample"
 
 
-def make_server(folder: Path, names: Sequence[str], provider: str = CPU) -> FastAPI:
+def make_server(folder: Path, names: Sequence[str] | None, provider: str = CPU) -> FastAPI:
     """The page as an ASGI application; uploads and results lie in a folder of its own.
 
-    It answers to `names` alone.
+    It answers to `names` alone, or to any name where that is None.
     """
     os.environ["GRADIO_TEMP_DIR"] = str(folder)
     server = FastAPI(openapi_url=None)
@@ -403,8 +402,8 @@ def make_server(folder: Path, names: Sequence[str], provider: str = CPU) -> Fast
         css=css,
     )
     server.add_middleware(OwnFiles)
-    # A name that another site's DNS server gives this computer's address would open the page to that site.
-    server.add_middleware(TrustedHostMiddleware, allowed_hosts=names, www_redirect=False)
+    if names is not None:
+        server.add_middleware(TrustedHostMiddleware, allowed_hosts=names, www_redirect=False)
     server.add_middleware(ContentPolicy)
     return server
 
@@ -420,23 +419,20 @@ def _theme() -> gr.themes.Base:
     ).set(body_text_color_subdued="*neutral_600", body_text_color_subdued_dark="*neutral_300")
 
 
-def _own_names(listener: socket.socket) -> list[str]:
-    """What this computer calls itself where it alone is served; any name elsewhere."""
-    address = ip_address(listener.getsockname()[0])
-    if not address.is_loopback:
-        return ["*"]
-    return [f"[{address}]" if address.version == 6 else str(address), "localhost"]
+def serve(
+    listener: socket.socket, names: Sequence[str] | None, *, browsed: str | None = None, provider: str = CPU
+) -> None:
+    """Serves the page on a listening socket until a signal ends it; then what was uploaded is removed.
 
-
-def serve(listener: socket.socket, url: str, *, open_browser: bool, provider: str = CPU) -> None:
-    """Serves the page on a listening socket until a signal ends it; then what was uploaded is removed."""
+    The page answers to `names`, as of `make_server`; `browsed` is the URL that a browser opens, if any.
+    """
     _end_in_order()
     with tempfile.TemporaryDirectory(prefix="stereoweave-page-") as folder:
         # An open page keeps a connection open, which would never end of itself.
-        server = make_server(Path(folder), _own_names(listener), provider)
+        server = make_server(Path(folder), names, provider)
         config = uvicorn.Config(server, log_level="critical", timeout_graceful_shutdown=1)
-        if open_browser:
-            webbrowser.open(url)
+        if browsed:
+            webbrowser.open(browsed)
         uvicorn.Server(config).run(sockets=[listener])
 
 

@@ -53,6 +53,7 @@ class ChildProcess:
         if not self._started.done() or (left_s is not None and left_s <= 0):
             raise late
         self._open(self._started)
+        self._make_folder()
         reply = self._exchanges.submit(_exchange, self._process, pickle.dumps(argument))
         wait([reply], left_s)
         if not reply.done():
@@ -71,17 +72,23 @@ class ChildProcess:
         self._exchanges.shutdown()
 
     def _start(self) -> None:
-        self._folder.mkdir(parents=True, exist_ok=True)
+        self._make_folder()
         environment = {"TMPDIR": str(self._folder), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-        command, pipe = [sys.executable, "-m", __name__], subprocess.PIPE
+        # -P: else the current folder comes first, and a file there may have the name of a library.
+        command, pipe = [sys.executable, "-P", "-m", __name__], subprocess.PIPE
         self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, env=os.environ | environment)
         self._started = self._exchanges.submit(_exchange, self._process, self._make)
+
+    def _make_folder(self) -> None:
+        """Make the folder where it is missing: what cleans /tmp removes what has not been used for days."""
+        self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
 
     def _open(self, reply: Future[_Reply]) -> Any:
         """What is in a reply that has arrived: a result, or an error to raise."""
         try:
             result, error = reply.result()
-        except (OSError, EOFError, pickle.UnpicklingError):
+        # ValueError: of the pipes of a process that was ended, and could not be replaced then.
+        except (OSError, EOFError, ValueError, pickle.UnpicklingError):
             status = self._replace()
             raise ProcessDiedError(
                 f"expected the process that works on the request to finish, found that it ended ({status}); "

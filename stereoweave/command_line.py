@@ -5,6 +5,7 @@ import re
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
+from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -193,7 +194,26 @@ def listening(host: str, port: int) -> socket.socket:
 
 def url_at(host: str, port: int) -> str:
     """The URL of what listens there."""
-    return f"http://{f'[{host}]' if ':' in host else host}:{port}"
+    return f"http://{_in_url(host)}:{port}"
+
+
+def own_names(listener: socket.socket, host: str) -> tuple[str, ...] | None:
+    """The names that the header Host may have; None, for any, where other machines reach the listener.
+
+    A name that another site's DNS server gives this machine's address would open the listener to that site.
+
+    Args:
+        listener: What listens.
+        host: Its address as the user gave it, such as a name in /etc/hosts.
+    """
+    address = listener.getsockname()[0]
+    if not ip_address(address).is_loopback:
+        return None
+    return tuple(dict.fromkeys([_in_url(address), "localhost", _in_url(host.lower())]))
+
+
+def _in_url(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from stereoweave.command_line import Host, Port, Provider, listening, url_at
+from stereoweave.command_line import Host, Port, Provider, listening, own_names, url_at
 from stereoweave.errors import needing_extra
 
 OpenBrowser = Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")]
@@ -23,6 +23,7 @@ def app(
         url = url_at(host, listener.getsockname()[1])
         typer.echo(f"Stereoweave: {url} (Ctrl-C ends it)")
         try:
-            serve(listener, url, open_browser=open_browser, provider=provider)
+            names, browsed = own_names(listener, host), url if open_browser else None
+            serve(listener, names, browsed=browsed, provider=provider)
         except KeyboardInterrupt:
             raise typer.Exit(130) from None

@@ -5,13 +5,12 @@ import re
 import signal
 import socket
 import threading
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from stereoweave.command_line import Host, Model, Port, Provider, Threads, listening, url_at
+from stereoweave.command_line import Host, Model, Port, Provider, Threads, listening, own_names, url_at
 from stereoweave.engine import set_environment
 from stereoweave.errors import StereoweaveError, needing_extra
 from stereoweave.threads import usable_cores
@@ -110,15 +109,15 @@ def serve(  # noqa: PLR0913 - each is a word of the command line
 
 def _hosts(listener: socket.socket, host: str, behind_proxy: bool) -> tuple[str, ...] | None:
     """The names that requests may give this machine; None where a proxy checks them."""
-    address = listener.getsockname()[0]
-    if ip_address(address).is_loopback:
-        return (f"[{address}]" if ":" in address else address, "localhost")
-    if not behind_proxy:
+    if behind_proxy:
+        return None
+    names = own_names(listener, host)
+    if names is None:
         raise StereoweaveError(
             f"--host {host}: expected an address of this machine alone, such as 127.0.0.1, found one that "
             "others reach; put a proxy before the service (deploy/nginx.conf) and add --behind-proxy"
         )
-    return None
+    return names
 
 
 def _read_token(path: Path) -> str:

@@ -36,7 +36,7 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.matcher import Matcher
 from stereoweave.service_costs import Budget, work_of
 from stereoweave.service_folders import own_folder
-from stereoweave.service_http import Guard, Limits, make_app
+from stereoweave.service_http import FAILURES, Guard, Limits, make_app
 from stereoweave.service_requests import Answer, Order, answering
 from stereoweave.service_server import Patience, http_server
 from stereoweave.service_worker import Task, Worker
@@ -116,7 +116,7 @@ class Replica:
         """What an order gets within the seconds that are left for it, or why it gets nothing."""
         try:
             return await self._answer(order, left_s)
-        except (StereoweaveError, TimeoutError) as error:
+        except FAILURES as error:
             return error
 
     async def _answer(self, order: Order, left_s: float) -> Answer:

@@ -27,7 +27,9 @@ def own_folder() -> Iterator[Path]:
             yield folder
         finally:
             shutil.rmtree(folder, ignore_errors=True)
-            Path(lock.lock_file).unlink()
+            # What cleans /tmp may have removed it, and Windows keeps it while it is open.
+            with suppress(OSError):
+                Path(lock.lock_file).unlink()
 
 
 def _remove_abandoned() -> None:

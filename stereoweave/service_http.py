@@ -1,9 +1,11 @@
 """How the service speaks HTTP: what its requests say, and the guard before them, who refuses some."""
 
 import asyncio
+import math
 import secrets
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, MutableMapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -34,6 +36,7 @@ from stereoweave.service_requests import (
 # In so long some of those that wait are done.
 _RETRY_AFTER_S = 1
 _LATENCIES_S = [0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 60]
+_METRICS_KEPT_S = 1
 _PATHS = ("/disparity", "/depth", "/view")
 _HEALTH = "/health"
 # As nginx has it: the client went away, and nobody was answered.
@@ -59,7 +62,8 @@ _REFUSALS: dict[int | str, dict[str, Any]] = {
         415: "No multipart/form-data.",
         422: "A field that is unknown, missing, or says what cannot be.",
         503: "As many requests, or as much work, wait as are accepted: the header Retry-After says when to "
-        "come again. Or what the network runs on failed, or the process that worked on the request crashed.",
+        "come again. Or the disk, the memory or what the network runs on failed, or the process that worked "
+        "on the request crashed.",
         504: "No answer in time.",
     }.items()
 }
@@ -68,6 +72,8 @@ _Message = MutableMapping[str, Any]
 _Receive = Callable[[], Awaitable[_Message]]
 _Send = Callable[[_Message], Awaitable[None]]
 _Server = Callable[[_Message, _Receive, _Send], Coroutine[Any, Any, None]]
+# What may become of an order, and is told to who posted it. A TimeoutError is an OSError.
+FAILURES = (StereoweaveError, OSError, MemoryError)
 # Of an order, and the seconds that are left for it.
 Answering = Callable[[Order, float], Awaitable[Answer]]
 
@@ -115,6 +121,7 @@ def make_app(answering: Answering, limits: Limits, metrics: Callable[[], bytes],
     async def _refuse(_: Request, error: RequestValidationError) -> Response:
         return JSONResponse({"detail": _in_one_line(error)}, 422)
 
+    counted = _Metrics(metrics)
     answered = _Answers(answering, limits.megapixels, folder)
 
     @app.post("/disparity", responses=_responses(".png", ".pfm", ".npy", ".tiff"), response_class=Response)
@@ -141,12 +148,31 @@ def make_app(answering: Answering, limits: Limits, metrics: Callable[[], bytes],
     async def prometheus() -> Response:
         """What is counted, in Prometheus' text format."""
         try:
-            text = await asyncio.to_thread(metrics)
+            text = await counted()
         except OSError as error:
             raise HTTPException(503, f"expected Ray's exporters of metrics, found {error}") from error
         return Response(text, media_type="text/plain; version=0.0.4")
 
     return app
+
+
+class _Metrics:
+    """The text of a function, at most a second old.
+
+    One thread of its own gathers it: however many ask, the threads that uploads need stay free.
+    """
+
+    def __init__(self, gather: Callable[[], bytes]) -> None:
+        self._gather, self._thread, self._gathering = gather, ThreadPoolExecutor(1), asyncio.Lock()
+        self._text, self._until_s = b"", -math.inf
+
+    async def __call__(self) -> bytes:
+        async with self._gathering:
+            if time.monotonic() >= self._until_s:
+                loop = asyncio.get_running_loop()
+                self._text = await loop.run_in_executor(self._thread, self._gather)
+                self._until_s = time.monotonic() + _METRICS_KEPT_S
+            return self._text
 
 
 def _responses(*endings: str) -> dict[int | str, dict[str, Any]]:
@@ -172,14 +198,23 @@ class _Answers:
     folder: Path
 
     async def __call__(self, request: Request, form: PairForm, file: str) -> Response:
-        # Where this is cancelled, a process may still work in the folder.
-        with TemporaryDirectory(dir=self.folder, ignore_cleanup_errors=True) as name:
+        with self._made() as name:
             try:
                 order = await asyncio.to_thread(stored, form, Path(name), file, self.most_megapixels)
                 answer = await self.answering(order, request.state.deadline_s - time.monotonic())
-            except (StereoweaveError, TimeoutError) as error:
+            except FAILURES as error:
                 raise _refusal_of(error, Path(name)) from error
         return _file(answer, file)
+
+    def _made(self) -> TemporaryDirectory[str]:
+        """A folder for one request."""
+        try:
+            # What cleans /tmp removes what has not been used for days.
+            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            # Where the request is cancelled, a process may still work in it.
+            return TemporaryDirectory(dir=self.folder, ignore_cleanup_errors=True)
+        except OSError as error:
+            raise _refusal_of(error, self.folder) from error
 
 
 def _file(answer: Answer, name: str) -> Response:
@@ -190,12 +225,16 @@ def _file(answer: Answer, name: str) -> Response:
     return Response(answer.content, media_type=MEDIA_TYPES[Path(name).suffix], headers=headers)
 
 
-def _refusal_of(error: StereoweaveError | TimeoutError, folder: Path) -> HTTPException:
+def _refusal_of(error: Exception, folder: Path) -> HTTPException:
     headers = {"Retry-After": str(error.retry_after_s)} if isinstance(error, BusyError) else None
-    return HTTPException(_status(error), told(error, folder), headers)
+    detail = told(error, folder)
+    if not isinstance(error, StereoweaveError | TimeoutError):
+        found = detail or "too little memory"
+        detail = f"expected room for the request on the disk and in memory, found {found}; come again"
+    return HTTPException(_status(error), detail, headers)
 
 
-def _status(error: StereoweaveError | TimeoutError) -> int:
+def _status(error: Exception) -> int:
     match error:
         case TooLargeError():
             return 413
@@ -205,6 +244,8 @@ def _status(error: StereoweaveError | TimeoutError) -> int:
             return 503
         case TimeoutError():
             return 504
+        case OSError() | MemoryError():
+            return 503
     return 422
 
 

@@ -20,12 +20,12 @@ SERVER = [
 ]
 
 
-def start(folder: Path) -> tuple[subprocess.Popen[str], str]:
+def start(folder: Path, *words: str) -> tuple[subprocess.Popen[str], str]:
     """A server of its own, whose temporary files are in `folder`, and its address."""
     # Where a shell starts the tests in the background, Ctrl-C is ignored, and processes inherit that.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     server = subprocess.Popen(
-        [*SERVER, "--port", "0"],
+        [*SERVER, "--port", "0", *words],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -1,8 +1,10 @@
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -117,3 +119,40 @@ def test_a_busy_process_ends_with_its_parent(tmp_path):
         pid = int(parent.stdout.readline())
         parent.kill()
     wait_for_end(pid)
+
+
+def test_a_file_of_the_current_folder_is_not_taken_for_a_module(tmp_path, monkeypatch):
+    (tmp_path / "textwrap.py").write_text(
+        f"from pathlib import Path\nPath({str(tmp_path)!r}, 'run').touch()\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    child = child_of(abs, tmp_path / "files")
+    with suppress(ProcessDiedError):  # where that file was run, it lacks what is imported from the real one
+        child(-7, timeout_s=10)
+    child.close()
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_temporary_folder_is_made_again_where_it_was_removed(tmp_path):
+    child = child_of(partial(subprocess.run, shell=True, check=True), tmp_path / "own" / "files")
+    child("touch $TMPDIR/first", timeout_s=10)
+    shutil.rmtree(tmp_path / "own")
+    child("touch $TMPDIR/second", timeout_s=10)
+    folder = tmp_path / "own" / "files"
+    assert [file.name for file in folder.iterdir()] == ["second"]
+    assert folder.stat().st_mode & 0o777 == 0o700
+    child.close()
+
+
+def test_a_process_that_could_not_be_started_again_is_started_at_a_later_call(tmp_path):
+    child, folder = (
+        child_of(partial(subprocess.run, shell=True, check=True), tmp_path / "files"),
+        tmp_path / "files",
+    )
+    with pytest.raises(FileExistsError):
+        child("rmdir $TMPDIR; touch $TMPDIR; kill -9 $PPID", timeout_s=10)
+    folder.unlink()
+    with pytest.raises(ProcessDiedError):
+        child("true", timeout_s=10)
+    assert child("true", timeout_s=10).returncode == 0
+    child.close()

@@ -12,6 +12,7 @@ from PIL import Image
 
 import stereoweave
 from stereoweave.cli import main
+from stereoweave.command_line import listening, own_names
 from stereoweave.io import read_image, read_pfm
 from stereoweave.matcher import shipped_models
 from stereoweave.opencv_matchers import OPENCV_MATCHERS
@@ -549,3 +550,17 @@ def test_a_link_that_leads_nowhere_is_no_place_for_output(tmp_path, capsys, line
     expected = "expected a folder that can be written, found a link that leads nowhere"
     assert told[-1] == f"stereoweave: {link}: {expected}"
     assert not (tmp_path / "nowhere").exists()
+
+
+@pytest.mark.parametrize(
+    ("address", "host", "names"),
+    [
+        ("127.0.0.1", "127.0.0.1", ("127.0.0.1", "localhost")),
+        ("127.0.1.1", "Debian", ("127.0.1.1", "localhost", "debian")),
+        ("::1", "0:0::1", ("[::1]", "localhost", "[0:0::1]")),
+        ("0.0.0.0", "0.0.0.0", None),
+    ],
+)
+def test_a_listener_answers_to_its_address_and_to_the_name_that_was_given(address, host, names):
+    with listening(address, 0) as listener:
+        assert own_names(listener, host) == names

@@ -1,6 +1,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -40,6 +41,7 @@ pytestmark = [
 class Running(NamedTuple):
     client: httpx.Client
     pid: int
+    uploads: Path
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +73,7 @@ def served(uploads: Path, *words: object) -> Iterator[Running]:
             # Each request has a connection of its own, as those of many clients.
             alone = httpx.Limits(max_keepalive_connections=0)
             with httpx.Client(base_url=url, timeout=60, limits=alone) as client:
-                yield Running(client, process.pid)
+                yield Running(client, process.pid, uploads)
             started = watching.children(process.pid)
             process.send_signal(signal.SIGTERM)
             assert process.wait(30) == 0
@@ -219,6 +221,22 @@ def test_only_requests_to_a_name_of_this_machine_are_answered(service, host, sta
         assert service.get(path, headers={"Host": host}).status_code == status
 
 
+def test_temporary_folders_that_were_removed_are_made_again_and_one_that_cannot_be_made_is_said(running):
+    for folder in running.uploads.glob("stereoweave-service-*/"):
+        shutil.rmtree(folder)
+    assert post(running.client, "/disparity").status_code == 200
+    [measuring] = running.uploads.glob("stereoweave-service-*/measuring")
+    measuring.rmdir()
+    measuring.touch()
+    refused = post(running.client, "/disparity")
+    assert refused.status_code == 503
+    assert refused.json()["detail"].startswith(
+        "expected room for the request on the disk and in memory, found "
+    )
+    measuring.unlink()
+    assert post(running.client, "/disparity").status_code == 200
+
+
 def test_its_description_names_every_path_and_field(service):
     description = service.get("/openapi.json").json()
     assert description["openapi"].startswith("3.1")
@@ -324,9 +342,16 @@ def test_what_the_command_says_of_hosts_and_the_token_holds_for_the_service(tmp_
 
     monkeypatch.setattr("stereoweave.service.serving", serving)
     (tmp_path / "token").write_text(" se-cret\n")
-    for words in ([], ["--host", "::1"], ["--host", "0.0.0.0", "--behind-proxy"]):
+    hosts = {
+        (): ("127.0.0.1", "localhost"),
+        ("--host", "::1"): ("[::1]", "localhost"),
+        ("--host", "127.1"): ("127.0.0.1", "localhost", "127.1"),
+        ("--host", "0.0.0.0", "--behind-proxy"): None,
+        ("--behind-proxy",): None,
+    }
+    for words in hosts:
         assert main(["serve", "--port", "0", "--token-file", str(tmp_path / "token"), *words]) == 2
-    assert [limits.hosts for limits in kept] == [("127.0.0.1", "localhost"), ("[::1]", "localhost"), None]
+    assert [limits.hosts for limits in kept] == list(hosts.values())
     assert {limits.token.get_secret_value() for limits in kept} == {"se-cret"}
     assert "se-cret" not in repr(kept)
 

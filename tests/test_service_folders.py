@@ -54,3 +54,9 @@ def test_a_folder_that_a_link_of_that_name_leads_to_is_not_emptied(temporary):
     (temporary / "stereoweave-service-0.lock").touch()
     with own_folder():
         assert (other / "file").exists()
+
+
+def test_a_lock_file_that_was_removed_meanwhile_is_not_missed(temporary):
+    with own_folder() as folder:
+        folder.with_name(f"{folder.name}.lock").unlink()
+    assert not list(temporary.iterdir())

@@ -2,7 +2,8 @@
 
 import asyncio
 import tempfile
-from collections.abc import AsyncIterator
+import threading
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,14 @@ from stereoweave.service_requests import Answer, Order, TooLargeError
 pytestmark = pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`:DeprecationWarning")
 
 
-def guarded(answering: Any, **limits: Any) -> httpx.AsyncClient:
+def guarded(
+    answering: Any, metrics: Callable[[], bytes] = bytes, folder: Path | None = None, **limits: Any
+) -> httpx.AsyncClient:
     """A client of the service without a server, whose work is done by a function."""
     from stereoweave.service_http import Guard, Limits, make_app
 
     allowed = Limits(**limits)
-    app = Guard(make_app(answering, allowed, bytes, Path(tempfile.gettempdir())), allowed)
+    app = Guard(make_app(answering, allowed, metrics, folder or Path(tempfile.gettempdir())), allowed)
     return httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://service")
 
 
@@ -206,3 +209,57 @@ def test_what_the_work_came_to_is_told_by_the_status(error, status, header):
     assert response.status_code == status
     assert response.json() == {"detail": str(error)}
     assert response.headers.get("Retry-After") == header
+
+
+async def at_once(order: Order, left_s: float) -> Answer:
+    return Answer(content=order.pictures[0].read_bytes(), report="{}")
+
+
+def test_a_folder_that_was_removed_meanwhile_is_made_again(tmp_path):
+    folder = tmp_path / "emptied" / "own"
+    response = ask_guarded(at_once, folder=folder, timeout_s=60)
+    assert (response.status_code, response.content) == (200, BOTH["left"])
+    assert folder.stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.parametrize(
+    ("error", "found"),
+    [
+        (OSError(28, "No space left on device", "/srv/files/left"), "No space left on device: 'left'"),
+        (MemoryError("Unable to allocate\n4 GiB"), "Unable to allocate 4 GiB"),
+        (MemoryError(), "too little memory"),
+    ],
+)
+def test_a_machine_without_room_is_no_fault_of_the_request(error, found):
+    async def fails(order: Order, left_s: float) -> Answer:
+        raise error
+
+    response = ask_guarded(fails, timeout_s=60)
+    assert response.status_code == 503
+    detail = response.json()["detail"]
+    assert detail.startswith("expected room for the request on the disk and in memory, found ")
+    assert found in detail
+    assert "\n" not in detail
+
+
+def test_a_flood_of_requests_for_metrics_holds_no_other_up_and_gathers_them_once():
+    gathered, allowed = [], threading.Event()
+
+    def gather() -> bytes:
+        gathered.append(threading.get_ident())
+        allowed.wait(10)
+        return b"counted 1\n"
+
+    async def flood() -> tuple[int, set[tuple[int, bytes]]]:
+        async with guarded(at_once, gather, timeout_s=3) as client:
+            asked = [asyncio.create_task(client.get("/metrics")) for _ in range(50)]
+            while not gathered:
+                await asyncio.sleep(0)
+            posted = await client.post("/disparity", files=BOTH)
+            allowed.set()
+            return posted.status_code, {
+                (each.status_code, each.content) for each in await asyncio.gather(*asked)
+            }
+
+    assert asyncio.run(flood()) == (200, {(200, b"counted 1\n")})
+    assert len(gathered) == 1
