@@ -22,8 +22,8 @@ SERVER = [
 
 def start(folder: Path, *words: str) -> tuple[subprocess.Popen[str], str]:
     """A server of its own, whose temporary files are in `folder`, and its address."""
-    # Where a shell starts the tests in the background, Ctrl-C is ignored, and processes inherit that.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    # Where a shell or nohup starts the tests in the background, both are ignored, and processes inherit that.
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGINT, signal.SIGHUP)}
     server = subprocess.Popen(
         [*SERVER, "--port", "0", *words],
         stdout=subprocess.PIPE,
@@ -31,7 +31,8 @@ def start(folder: Path, *words: str) -> tuple[subprocess.Popen[str], str]:
         text=True,
         env={**os.environ, "TMPDIR": str(folder), "PYTHONUNBUFFERED": "1"},
     )
-    signal.signal(signal.SIGINT, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
     assert server.stdout
     return server, re.search(r"http://\S+", server.stdout.readline())[0]
 

@@ -12,6 +12,8 @@ import pytest
 
 from stereoweave.child_process import ChildProcess, ProcessDiedError
 
+pytestmark = pytest.mark.system
+
 
 def child_of(function, folder: Path) -> ChildProcess:
     return ChildProcess(partial(partial, function), folder)

@@ -11,6 +11,8 @@ from cosmic_ray.mutating import mutate_code
 from mutate.drawing import draw, places
 from mutate.operators import OUR_OWN
 
+pytestmark = pytest.mark.system
+
 ROOT = Path(__file__).parent.parent
 SOURCE = """
 def clipped(x, most):

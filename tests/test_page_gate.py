@@ -20,6 +20,8 @@ from starlette.testclient import TestClient
 from stereoweave.io import read_image, write_image
 from stereoweave.page_gate import OwnFiles
 
+pytestmark = pytest.mark.system
+
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 REFUSED = (403, "expected a file that you gave to this page or that it made of yours; give it again")
 

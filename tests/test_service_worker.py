@@ -10,6 +10,8 @@ from stereoweave.errors import FormatError, MatcherError
 from stereoweave.service_requests import Answer, Answering, Order, answering
 from stereoweave.service_worker import Task, Worker
 
+pytestmark = pytest.mark.system
+
 EXAMPLES = Path(__file__).parent.parent / "examples"
 PICTURES = (EXAMPLES / "left.png", EXAMPLES / "right.png")
 

@@ -33,6 +33,8 @@ from stereoweave.learn.recipe import read_recipe
 from stereoweave.learn.timed import Command, train_by_clock
 from stereoweave.learn.timed_run import NETWORK, OPTIMISER, PROGRESS, Progress, TimedRun, standing
 
+pytestmark = pytest.mark.system
+
 GPU = Path(__file__).parent.parent / "recipes" / "gpu"
 CPU = torch.device("cpu")
 # 8 of 1000 px of width: the rate falls over the last fifth of the time.
