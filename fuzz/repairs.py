@@ -46,7 +46,7 @@ def _files_in(content: bytes) -> dict[str, bytes]:
     files: dict[str, bytes] = {}
     with (
         suppress(tarfile.TarError, ValueError, OverflowError),
-        tarfile.open(fileobj=io.BytesIO(content), encoding="latin-1") as tar,
+        tarfile.open(fileobj=io.BytesIO(content), mode="r:", encoding="latin-1") as tar,
     ):
         for member in tar:
             if member.size < 0:  # the same head would come again without end
