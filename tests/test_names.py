@@ -118,7 +118,6 @@ def test_the_console_shows_them_too(tmp_path):
 
 
 def test_a_film_of_pictures_with_such_names_is_read(tmp_path):
-    pytest.importorskip("av")
     for frame in range(2):
         write_pair(tmp_path / "in", f"{GREEN}{frame}")
     for side in ("left", "right"):
