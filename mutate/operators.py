@@ -6,6 +6,7 @@ stay.
 """
 
 import ast
+from abc import abstractmethod
 from collections.abc import Iterator
 from typing import Any
 
@@ -43,11 +44,13 @@ class _LeafOperator(Operator):
         node.value = self.changed(node.value)
         return node
 
+    @abstractmethod
     def applies(self, node: NodeOrLeaf) -> bool:
-        raise NotImplementedError
+        """Whether the leaf is one that this operator changes."""
 
+    @abstractmethod
     def changed(self, value: str) -> str:
-        raise NotImplementedError
+        """The text in place of the leaf's."""
 
 
 class ChangeNumber(_LeafOperator):
