@@ -44,7 +44,7 @@ def check_kind(name: str, value: object, *kinds: type) -> None:
 
 
 def check_array(name: str, value: object, kind: str, dimensions: int) -> None:
-    """Refuse anything but an array of a kind of numbers, "f", "u" or "b", and of so many dimensions.
+    """Refuse anything but an array of a kind of numbers, "f", "u" or "b", of `dimensions` axes.
 
     A matrix and a masked array are none: they compute otherwise, or leave out what is masked.
     """

@@ -123,7 +123,7 @@ class ViewForm(PairForm):
 
 
 def stored(form: PairForm, folder: Path, file: str, most_megapixels: float) -> Order:
-    """The order of a form, whose files now lie in the folder, under names of ours."""
+    """The order of a form, whose files now lie in the folder, under names that the service gives them."""
     uploads = form.uploads()
     for field, upload in uploads.items():
         with (folder / field).open("wb") as out:
