@@ -1,8 +1,10 @@
 """The time that a request will take, estimated before its pictures are decoded; too much of it is refused."""
 
 import math
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
+from statistics import median
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.service_requests import Order, TooLargeError
@@ -10,6 +12,8 @@ from stereoweave.service_requests import Order, TooLargeError
 # What large pictures take longer, for each of their pixels, and what full resolution takes longer. Checks and
 # rectification take a fraction of a second whatever the size.
 _LARGE_FROM_MEGAPIXELS, _LARGE, _REFINED = 2, 2.5, 1.3
+# Speeds that are remembered: an odd request or two do not change their median.
+_LATEST = 9
 
 
 class BusyError(StereoweaveError):
@@ -23,12 +27,15 @@ class BusyError(StereoweaveError):
 class Budget:
     """The work that one process has accepted, in estimated seconds.
 
-    A request's estimate is its work times the seconds that a unit of it took at best so far: a request is
-    refused only if it could not be done in time even at that speed.
+    A request that could not be done in time at the best speed so far is refused for good. One that has to
+    wait for others is refused for now if their work and its own take too long at the usual speed, the median
+    of the last few.
     """
 
     def __init__(self, seconds_each: float) -> None:
-        self._accepted, self._seconds_each = 0.0, seconds_each
+        self._accepted: list[float] = []
+        self._best_s = seconds_each
+        self._latest_s = deque([seconds_each], _LATEST)
 
     @contextmanager
     def admit(self, order: Order, megapixels: float, left_s: float) -> Iterator[None]:
@@ -39,27 +46,28 @@ class Budget:
             BusyError: It does after what was accepted before it.
         """
         work = work_of(order, megapixels)
-        own_s = work * self._seconds_each
-        if own_s > left_s:
+        least_s = work * self._best_s
+        if least_s > left_s:
             raise TooLargeError(
                 f"expected a request that takes at most {left_s:.0f} s, found {megapixels:.1f} megapixels, "
-                f"which take {own_s:.0f} s with its options; send smaller pictures, or fewer options"
+                f"which take {least_s:.0f} s with its options; send smaller pictures, or fewer options"
             )
-        late_s = self._accepted * self._seconds_each + own_s - left_s
-        if late_s > 0:
+        late_s = (sum(self._accepted) + work) * median(self._latest_s) - left_s
+        if self._accepted and late_s > 0:
             raise BusyError(
                 f"expected at most {left_s:.0f} s of work, found {late_s:.0f} s more; come again",
                 retry_after_s=math.ceil(late_s),
             )
-        self._accepted += work
+        self._accepted.append(work)
         try:
             yield
         finally:
-            self._accepted -= work
+            self._accepted.remove(work)
 
     def learn(self, work: float, took_s: float) -> None:
         """Take into account how long an amount of work took."""
-        self._seconds_each = min(self._seconds_each, took_s / work)
+        self._latest_s.append(took_s / work)
+        self._best_s = min(self._best_s, took_s / work)
 
 
 def work_of(order: Order, megapixels: float) -> float:

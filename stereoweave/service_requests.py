@@ -16,7 +16,7 @@ from stereoweave.hints import hints
 from stereoweave.io import RangeError, write_image
 from stereoweave.matcher import Matcher
 from stereoweave.matching import match_many
-from stereoweave.picture_files import MOST_PIXELS, opening
+from stereoweave.picture_files import MOST_PIXELS, opening, view_frames
 from stereoweave.preparing import Prepared, Request, prepare
 from stereoweave.rectify import cropped
 from stereoweave.rendering import Renderer, check_position
@@ -91,18 +91,22 @@ Answering = Callable[[Sequence[Order]], list[Answer | Exception]]
 
 
 def check_pixels(order: Order) -> float:
-    """The megapixels of the order's pictures, as their heads say, before memory is spent on any.
+    """The megapixels that are matched, as the heads of the order's pictures say, before memory is spent.
+
+    Those of half views count doubled if the request says that they are half.
 
     Raises:
         TooLargeError: More than the order's views may have.
         FormatError: No picture, or none of a kind that is read.
     """
     views = 3 - len(order.pictures)
+    is_half = (order.request.arrangement or "").endswith("_half")
     megapixels = 0.0
     for path in order.pictures:
         with opening(path, views=views) as picture:
             size_px = picture.size
-        megapixels += _checked_megapixels(path, size_px, views * order.most_megapixels)
+            doubled = is_half or (views == 2 and bool(view_frames(path, picture)))
+        megapixels += (1 + doubled) * _checked_megapixels(path, size_px, views * order.most_megapixels)
     return megapixels
 
 

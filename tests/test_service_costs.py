@@ -28,11 +28,30 @@ def test_what_would_be_late_after_those_before_it_is_to_come_again_when_they_are
         pass
 
 
-def test_the_best_speed_counts():
+def test_what_the_best_speed_allows_is_accepted_where_nothing_waits():
     budget = Budget(seconds_each=2)
     budget.learn(work=10, took_s=10)
     budget.learn(work=10, took_s=500)
     with budget.admit(order(), megapixels=2, left_s=2):
+        pass
+
+
+def test_what_waits_is_taken_to_be_done_at_the_usual_speed():
+    budget = Budget(seconds_each=1)
+    for took_s in (30, 30, 500):
+        budget.learn(work=10, took_s=took_s)
+    with budget.admit(order(), megapixels=1, left_s=6):
+        with pytest.raises(BusyError, match="found 3 s more"):
+            budget.admit(order(), megapixels=2, left_s=6).__enter__()
+        with budget.admit(order(), megapixels=1, left_s=6):
+            pass
+
+
+def test_speeds_of_long_ago_are_forgotten():
+    budget = Budget(seconds_each=50)
+    for _ in range(9):
+        budget.learn(work=1, took_s=2)
+    with budget.admit(order(), megapixels=1, left_s=4), budget.admit(order(), megapixels=1, left_s=4):
         pass
 
 

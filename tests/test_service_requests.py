@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from service_examples import BOTH, EXAMPLES
 
 import stereoweave as sw
@@ -71,7 +72,14 @@ def test_a_view_is_measured_again_where_the_head_of_its_file_does_not_say_its_si
         request=Request(arrangement="side_by_side_half"),
         most_megapixels=0.5,
     )
-    assert check_pixels(halves) == 1280 * 480 / 1e6  # as two views of 640x480 px would have
+    assert check_pixels(halves) == 2 * 1280 * 480 / 1e6  # two views of 1280x480 px are matched
     (refusal,) = answer_many(Matcher("small"), [halves])
     assert isinstance(refusal, TooLargeError)
     assert "expected at most 0.5 megapixels, found 1280x480" in str(refusal)
+
+
+def test_both_pictures_of_one_file_are_measured(photos, tmp_path):
+    left, right = map(Image.fromarray, photos)
+    left.save(tmp_path / "both", "MPO", save_all=True, append_images=[right])
+    both = Order(folder=tmp_path, pictures=(tmp_path / "both",), file="disparity.npy")
+    assert check_pixels(both) == 2 * 640 * 480 / 1e6
