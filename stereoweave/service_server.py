@@ -19,6 +19,8 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 _MOST_HEAD_BYTES = 16 * 1024
 # So many bytes are parsed at a time: h11 takes 40 us for a chunk, which may be of one byte, and others wait.
 _PARSED_BYTES = 4096
+# Each takes a file descriptor, of which a process usually has 1024.
+_MOST_CONNECTIONS = 500
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class Patience:
 
 
 class _Connection(H11Protocol, asyncio.BufferedProtocol):
-    """A connection that is closed where the head of its next request does not arrive in time."""
+    """A connection that is closed if the head of its next request is late, or if there are too many."""
 
     def __init__(self, patience: Patience, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
@@ -53,6 +55,8 @@ class _Connection(H11Protocol, asyncio.BufferedProtocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self._expect_head()
+        if len(self.connections) > _MOST_CONNECTIONS:
+            transport.abort()
 
     def data_received(self, data: bytes) -> None:
         super().data_received(data)

@@ -5,6 +5,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 
 import pytest
 
@@ -12,13 +13,14 @@ from stereoweave.service_server import Patience, http_server
 
 PATIENCE = Patience(head_s=0.5, reader_s=0.5, end_s=10)
 HEAD = b"GET /5 HTTP/1.1\r\nHost: x\r\n"
-ALLOWED = threading.Event()
+ARRIVED, ALLOWED = threading.Event(), threading.Event()
 
 
 async def app(scope, receive, send) -> None:
     if scope["type"] != "http":
         return
     if scope["path"] == "/later":
+        ARRIVED.set()
         await asyncio.to_thread(ALLOWED.wait, 10)
     body = bytes(int(scope["path"][1:])) if scope["path"][1:].isdecimal() else b"later"
     headers = [(b"content-length", str(len(body)).encode())]
@@ -99,12 +101,13 @@ def test_a_response_that_is_not_read_in_time_is_given_up(connection):
 
 
 def test_what_was_accepted_is_answered_before_the_server_ends():
+    ARRIVED.clear()
     ALLOWED.clear()
     with socket.create_server(("127.0.0.1", 0)) as listener:
         with http_server(app, listener, PATIENCE):
             connection = socket.create_connection(listener.getsockname(), timeout=10)
             connection.sendall(b"GET /later HTTP/1.1\r\nHost: x\r\n\r\n")
-            time.sleep(0.2)
+            assert ARRIVED.wait(10)
             threading.Timer(0.5, ALLOWED.set).start()
         with connection:
             assert read_to_end(connection).endswith(b"later")
@@ -120,3 +123,11 @@ def test_a_body_of_tiny_chunks_does_not_hold_others_up(address, connection):
             assert read_to_end(other).startswith(b"HTTP/1.1 200")
         waited_s.append(time.monotonic() - asked_s)
     assert max(waited_s) < 0.7
+
+
+def test_connections_beyond_the_limit_are_closed_at_once_and_the_others_are_answered(address):
+    with ExitStack() as opened:
+        several = [opened.enter_context(socket.create_connection(address, timeout=10)) for _ in range(501)]
+        assert read_to_end(several.pop()) == b""
+        several[-1].sendall(HEAD + b"Connection: close\r\n\r\n")
+        assert read_to_end(several[-1]).startswith(b"HTTP/1.1 200")
