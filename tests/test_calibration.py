@@ -458,6 +458,7 @@ def test_a_rig_without_sense_is_refused():
     rig = rig_of(pinhole)
     for change in (
         {"rotation": -np.eye(3)},
+        {"rotation": 1.001 * np.eye(3)},
         {"rotation": np.full((3, 3), np.nan)},
         {"translation_m": np.zeros(3)},
         {"translation_m": np.array([np.inf, 0, 0])},

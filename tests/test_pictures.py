@@ -94,6 +94,11 @@ def test_two_files_of_different_sizes_are_refused_with_both_sizes(tmp_path, pair
     assert f"{left} of 240x160 and {right} of 238x160" in message
 
 
+def test_two_files_of_under_32_pixels_are_refused(tmp_path, pair):
+    left, right = write_two(tmp_path, pair.left[:31], pair.right[:31])
+    assert f"{left}: expected at least 32x32 pixels, found 240x31" in refusal(left, right)
+
+
 def test_the_damaged_one_of_two_files_is_named(tmp_path, pair):
     left, right = write_two(tmp_path, pair.left, pair.right)
     right.write_bytes(right.read_bytes()[:3000])
