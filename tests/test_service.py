@@ -78,11 +78,19 @@ def served(uploads: Path, *words: object) -> Iterator[Running]:
             started |= set(watching.children(process.pid))
             process.send_signal(signal.SIGTERM)
             assert process.wait(30) == 0
-            assert not [pid for pid in started if Path(f"/proc/{pid}").exists()]
+            assert not still_running(started, within_s=10)
             assert not list(uploads.glob("stereoweave-*"))
     finally:
         process.kill()
         process.wait()
+
+
+def still_running(pids: set[int], within_s: float) -> list[int]:
+    """The processes that have not ended by then."""
+    deadline_s = time.monotonic() + within_s
+    while (left := [pid for pid in pids if Path(f"/proc/{pid}").exists()]) and time.monotonic() < deadline_s:
+        time.sleep(0.05)
+    return left
 
 
 def post(service: httpx.Client, path: str, files: Any = BOTH, **data: Any) -> httpx.Response:
