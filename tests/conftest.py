@@ -7,21 +7,21 @@ summary says so; with STEREOWEAVE_REQUIRE_ALL=1 the run fails instead.
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from urllib.request import Request, urlopen
 from uuid import uuid4
 
 import jaxtyping
 import numpy as np
 import pytest
+from other_processes import free_ports, processes_of
 
 TESTDATA = Path(
     os.environ.get("STEREOWEAVE_TESTDATA") or Path(__file__).resolve().parent.parent.parent / "shared"
@@ -152,37 +152,6 @@ def ray_head(cpus: int) -> Iterator[str]:
                 with suppress(ProcessLookupError):
                     os.kill(process, signal.SIGKILL)
             head.wait()
-
-
-@contextmanager
-def halted(process: subprocess.Popen[Any]) -> Iterator[None]:
-    """A process stands still during the block, and keeps what it holds."""
-    process.send_signal(signal.SIGSTOP)
-    try:
-        yield
-    finally:
-        process.send_signal(signal.SIGCONT)
-
-
-def processes_of(process: int) -> list[int]:
-    """The process, and all that it has started and that these have."""
-    parents = {}
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with suppress(OSError):
-            parents[int(stat.parent.name)] = int(stat.read_text().rpartition(")")[2].split()[1])
-    found = [process]
-    for parent in found:
-        found += [child for child, its_parent in parents.items() if its_parent == parent]
-    return found
-
-
-def free_ports(count: int) -> list[int]:
-    """Ports of this machine that nobody listens at."""
-    with ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
-        for taken in sockets:
-            taken.bind(("127.0.0.1", 0))
-        return [taken.getsockname()[1] for taken in sockets]
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,8 @@
 """What the tests of training share: a pair whose truth is known by construction, a network trained on it."""
 
 import functools
-from dataclasses import dataclass, replace
+import json
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import pytest
@@ -163,3 +164,22 @@ def overfitted(name="weave_small", steps=45) -> Overfitted:
 def mean_error_px(network, batch) -> float:
     found_px = network.stages(batch["left"], batch["right"]).disparity_px
     return float((found_px - batch["disparity_px"]).abs().mean())
+
+
+def write(recipe, file):
+    """The file, which holds the recipe now."""
+    lines = (f"{name} = {json.dumps(value)}" for name, value in asdict(recipe).items())
+    file.write_text("\n".join(lines) + "\n")
+    return file
+
+
+def assert_same(one, other):
+    """Equal to the last bit, through dictionaries and lists."""
+    if isinstance(one, torch.Tensor):
+        assert torch.equal(one, other)
+    elif isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for key in one:
+            assert_same(one[key], other[key])
+    else:
+        assert one == other

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import cv2
 import pytest
-from conftest import halted
+from other_processes import halted
 from rich.console import Console
 
 from stereoweave.batch import DONE_FILE, Tally, depth_of_many, run_batch

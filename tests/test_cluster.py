@@ -14,8 +14,8 @@ import fsspec
 import numpy as np
 import pyarrow.dataset
 import pytest
-from conftest import halted, processes_of
 from film_examples import example_pairs, packets, write_side_by_side
+from other_processes import halted, processes_of
 
 from stereoweave import cluster_worker
 from stereoweave.cli import main

@@ -10,10 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from learn_examples import RECIPE, complaint, keep_pairs
+from learn_examples import RECIPE, assert_same, complaint, keep_pairs, write
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from test_train import assert_same, write
 
 from stereoweave.learn import checkpoint
 from stereoweave.learn import train as training

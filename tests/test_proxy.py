@@ -11,7 +11,7 @@ from pathlib import Path
 
 import httpx
 import pytest
-from conftest import free_ports
+from other_processes import free_ports
 
 from stereoweave.service_server import Patience, http_server
 

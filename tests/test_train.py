@@ -1,5 +1,4 @@
 import atexit
-import json
 import os
 import re
 import signal
@@ -12,22 +11,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import halted
 from dataset_examples import write_map, write_picture
 from learn_examples import (
     CAMERA,
     PAIR_SIZE,
     RECIPE,
     Listed,
+    assert_same,
     box_before_a_wall,
     checkpoint_of,
     complaint,
     keep_pairs,
     recipe_of,
     untrained,
+    write,
 )
 from lightning_fabric.loggers.tensorboard import TensorBoardLogger
 from lightning_fabric.utilities.distributed import _destroy_dist_connection
+from other_processes import halted
 from rich.console import Console
 
 from stereoweave.data.packing import packed
@@ -97,24 +98,6 @@ def finished(folder, recipe_file):
 def logger(tmp_path):
     with training.closing_curves(TensorBoardLogger(tmp_path, name="", version="")) as logger:
         yield logger
-
-
-def write(recipe, file):
-    lines = (f"{name} = {json.dumps(value)}" for name, value in asdict(recipe).items())
-    file.write_text("\n".join(lines) + "\n")
-    return file
-
-
-def assert_same(one, other):
-    """Equal to the last bit, through dictionaries and lists."""
-    if isinstance(one, torch.Tensor):
-        assert torch.equal(one, other)
-    elif isinstance(one, dict):
-        assert one.keys() == other.keys()
-        for key in one:
-            assert_same(one[key], other[key])
-    else:
-        assert one == other
 
 
 def test_a_run_that_is_killed_and_then_started_again_ends_as_one_that_was_not(folder, recipe_file, finished):

@@ -12,8 +12,8 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from conftest import halted
 from film_examples import EXAMPLES, damage, example_pairs, packets, write_side_by_side, write_video
+from other_processes import halted
 
 from stereoweave.cli import main
 from stereoweave.colour import colour_disparity
