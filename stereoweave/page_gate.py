@@ -79,7 +79,7 @@ class OwnFiles:
             raise PermissionError
         if path.startswith(_FILE):
             self._check([path.removeprefix(_FILE)], visitor)
-        elif method == "POST" and path != f"{_API}/upload":
+        elif method not in ("GET", "HEAD") and path != f"{_API}/upload":
             value, text = await _json(Request(scope, receive))
             self._check(list(_paths(value)), visitor)
             return _replay(text, receive)

@@ -248,6 +248,12 @@ def test_a_visitor_keeps_their_files_beside_the_cookies_of_other_servers_on_the_
         assert (answer.status_code, answer.text) == (200, "content")
 
 
+@pytest.mark.parametrize("method", ["POST", "PUT", "PATCH", "DELETE", "OPTIONS", "BREW"])
+def test_a_body_is_checked_whatever_the_method_is(page, method):
+    answer = page.request(method, "/gradio_api/queue/join", json={"path": "/foreign.png"})
+    assert (answer.status_code, answer.text) == REFUSED
+
+
 def test_no_visitor_takes_the_files_of_another_by_naming_many(page):
     name_files(page, cookie_of(1), "/own.png")
     name_files(page, cookie_of(2), *(f"/{number}.png" for number in range(100_001)))
