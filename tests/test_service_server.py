@@ -98,6 +98,13 @@ def test_a_response_that_is_not_read_in_time_is_given_up(connection):
     assert len(read_to_end(connection)) < 49_000_000
 
 
+def test_a_response_that_is_not_read_is_given_up_though_another_request_waits_behind_it(connection):
+    connection.sendall(b"GET /50000000 HTTP/1.1\r\nHost: x\r\n\r\n" * 2)
+    connection.recv(1)
+    time.sleep(4 * PATIENCE.reader_s)
+    assert len(read_to_end(connection)) < 49_000_000
+
+
 def test_what_was_accepted_is_answered_before_the_server_ends():
     ALLOWED.clear()
     with socket.create_server(("127.0.0.1", 0)) as listener:
