@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
@@ -60,6 +61,16 @@ class _Connection(H11Protocol, asyncio.BufferedProtocol):
         super().data_received(data)
         if self._is_busy() and not self._is_unread():
             self._close_within(None)
+
+    def send_400_response(self, msg: str) -> None:
+        can_respond = self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE)
+        if self._is_busy():
+            self.cycle.disconnected = True  # drops what the application still sends
+            self.cycle.message_event.set()
+        if can_respond:
+            super().send_400_response(msg)
+        else:
+            self.transport.close()
 
     def connection_lost(self, error: Exception | None) -> None:
         self._close_within(None)
