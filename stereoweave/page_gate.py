@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from secrets import token_urlsafe
 from typing import Any
 
-from starlette.datastructures import MutableHeaders
-from starlette.requests import ClientDisconnect, HTTPConnection, Request
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -70,7 +70,7 @@ class OwnFiles:
             send = _with_header(send, "set-cookie", cookie)
         elif scope["path"] in _NAMING and visitor:
             send = self._remembering(send, visitor)
-        await self._app(scope, receive, send)
+        await self._app(_without_cookies(scope), receive, send)
 
     async def _checked(self, scope: Scope, receive: Receive, visitor: str) -> Receive:
         """What to read the request from, if all that it names is the visitor's; a PermissionError if not."""
@@ -79,7 +79,7 @@ class OwnFiles:
             raise PermissionError
         if path.startswith(_FILE):
             self._check([path.removeprefix(_FILE)], visitor)
-        elif method == "POST" and path != f"{_API}/upload":
+        elif method not in ("GET", "HEAD") and path != f"{_API}/upload":
             value, text = await _json(Request(scope, receive))
             self._check(list(_paths(value)), visitor)
             return _replay(text, receive)
@@ -143,8 +143,18 @@ def _use(entries: OrderedDict[str, Any], key: str, most: int) -> None:
 
 def _visitor(scope: Scope) -> str:
     """Who asks, by the cookie; empty where there is none."""
-    cookie = HTTPConnection(scope).cookies.get(_COOKIE, "")
-    return cookie if _VISITOR.fullmatch(cookie) else ""
+    # Some versions of Python take the square of a cookie's length to unquote it.
+    for header in Headers(scope=scope).getlist("cookie"):
+        for cookie in header.split(";"):
+            name, _, value = (part.strip() for part in cookie.partition("="))
+            if name == _COOKIE and _VISITOR.fullmatch(value):
+                return value
+    return ""
+
+
+def _without_cookies(scope: Scope) -> Scope:
+    """The request as Gradio gets it, which would unquote cookies of other servers too."""
+    return {**scope, "headers": [(name, value) for name, value in scope["headers"] if name != b"cookie"]}
 
 
 def _with_header(send: Send, name: str, value: str) -> Send:

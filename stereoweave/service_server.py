@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
@@ -39,12 +40,13 @@ class Patience:
 
 
 class _Connection(H11Protocol, asyncio.BufferedProtocol):
-    """A connection that is closed if the head of its next request is late, or if there are too many."""
+    """A connection that is closed if a head or a reader is late, or if there are too many of them."""
 
     def __init__(self, patience: Patience, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self._patience = patience
         self._buffer = bytearray(_PARSED_BYTES)
+        self._deadline: asyncio.TimerHandle | None = None
 
     def get_buffer(self, sizehint: int) -> bytearray:
         return self._buffer
@@ -54,31 +56,58 @@ class _Connection(H11Protocol, asyncio.BufferedProtocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
+        transport.set_write_buffer_limits(high=0)  # writing is paused while the client leaves a byte unread
         self._expect_head()
         if len(self.connections) > _MOST_CONNECTIONS:
             transport.abort()
 
     def data_received(self, data: bytes) -> None:
         super().data_received(data)
+        if self._is_busy() and not self._is_unread():
+            self._close_within(None)
+
+    def send_400_response(self, msg: str) -> None:
+        can_respond = self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE)
         if self._is_busy():
-            self._deadline.cancel()
+            self.cycle.disconnected = True  # drops what the application still sends
+            self.cycle.message_event.set()
+        if can_respond:
+            super().send_400_response(msg)
+        else:
+            self.transport.close()
 
     def connection_lost(self, error: Exception | None) -> None:
-        self._deadline.cancel()
+        self._close_within(None)
         super().connection_lost(error)
+
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        self._close_within(self._patience.reader_s)
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        self._close_within(None)
+        self._expect_head()
 
     def on_response_complete(self) -> None:
         super().on_response_complete()
-        if not self._is_busy():  # else the next request has arrived before
-            self._expect_head()
+        self._expect_head()
 
     def _is_busy(self) -> bool:
         return self.cycle is not None and not self.cycle.response_complete
 
+    def _is_unread(self) -> bool:
+        return self.transport.get_write_buffer_size() > 0
+
     def _expect_head(self) -> None:
-        unread = self.transport.get_write_buffer_size() > 0
-        within_s = self._patience.reader_s if unread else self._patience.head_s
-        self._deadline = self.loop.call_later(within_s, self.transport.abort)
+        """Starts to wait for the next head, unless it has arrived or the client has yet to read."""
+        if not self._is_busy() and not self._is_unread():
+            self._close_within(self._patience.head_s)
+
+    def _close_within(self, seconds: float | None) -> None:
+        if self._deadline is not None:
+            self._deadline.cancel()
+        self._deadline = None if seconds is None else self.loop.call_later(seconds, self.transport.abort)
 
 
 @contextmanager

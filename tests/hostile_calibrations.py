@@ -4,6 +4,8 @@ import base64
 import gzip
 import struct
 
+from fuzz.targets.calibrations import KALIBR, MIDDLEBURY
+
 MATRIX = [500, 0, 320, 0, 500, 240, 0, 0, 1]
 # What a calibration says, flat: a list is a matrix of three columns, or of one row.
 RIG = {
@@ -18,34 +20,7 @@ RIG = {
     "image_width": 640,
     "image_height": 480,
 }
-KALIBR = """\
-cam0:
-  camera_model: pinhole
-  distortion_coeffs: [-0.01, 0.002, -0.0003, 0.0005]
-  distortion_model: radtan
-  intrinsics: [460, 460, 363, 248]
-  resolution: [640, 480]
-cam1:
-  T_cn_cnm1:
-  - [1, 0, 0, -0.1]
-  - [0, 1, 0, 0]
-  - [0, 0, 1, 0]
-  - [0, 0, 0, 1]
-  camera_model: pinhole
-  distortion_coeffs: [-0.02, 0.003, -0.0004, 0.0006]
-  distortion_model: radtan
-  intrinsics: [460, 460, 373, 254]
-  resolution: [640, 480]
-"""
 KITTI = "P0: 700 0 600 0 0 700 170 0 0 0 1 0\nP1: 700 0 600 -350 0 700 170 0 0 0 1 0\n"
-MIDDLEBURY = """\
-cam0=[995 0 311; 0 995 255; 0 0 1]
-cam1=[995 0 342; 0 995 255; 0 0 1]
-doffs=31
-baseline=193
-width=640
-height=480
-"""
 _MANY = 60_000
 
 
@@ -108,7 +83,7 @@ def _aliases():
         "recursive merge": "&a\n<<: *a\nM1: 1\n",
         "nested": "\n".join(laughs) + "\nM1: *a9\n",
         "nested in a rig": yaml_of(RIG | {"M1": "*a9"}, header="\n".join(laughs) + "\n"),
-        "recursive camera": KALIBR.replace("[460, 460, 363, 248]", "&a [*a, *a, *a, *a]"),
+        "recursive camera": KALIBR.replace("[61.6, 60.3, 36.0, 24.1]", "&a [*a, *a, *a, *a]"),
         "undefined": "M1: *a\n",
         "in json": '{"M1": &a [*a, *a, *a]}\n',
         "none, but an anchor": yaml_of(RIG | {"points": "&t [1, 2]"}),
@@ -141,7 +116,7 @@ def _nesting():
         + "!!opencv-matrix {rows: 1, cols: 1, data: " * 5000
         + "1"
         + "}" * 5000,
-        "kalibr 5000 deep": KALIBR.replace("[640, 480]", "[" * 5000 + "]" * 5000),
+        "kalibr 5000 deep": KALIBR.replace("[72, 48]", "[" * 5000 + "]" * 5000),
     }
 
 
@@ -203,10 +178,10 @@ def _scalars():
         "unit of half a character": json_of(RIG | {"translation_unit": '"\\ud800"'}),
         "unit of an escape": yaml_of(RIG | {"translation_unit": '"\\e[2J"'}),
         "unit of a list": yaml_of(RIG | {"translation_unit": "[[[[m]]]]"}),
-        "middlebury width of 5000 digits": MIDDLEBURY.replace("640", "9" * 5000),
-        "middlebury baseline of nan": MIDDLEBURY.replace("193", "nan"),
-        "middlebury doffs of 100000 letters": MIDDLEBURY.replace("doffs=31", "doffs=" + "a" * 100_000),
-        "middlebury focal of infinity": MIDDLEBURY.replace("995", "inf"),
+        "middlebury width of 5000 digits": MIDDLEBURY.replace("72", "9" * 5000),
+        "middlebury baseline of nan": MIDDLEBURY.replace("193.001", "nan"),
+        "middlebury doffs of 100000 letters": MIDDLEBURY.replace("doffs=2", "doffs=" + "a" * 100_000),
+        "middlebury focal of infinity": MIDDLEBURY.replace("60", "inf"),
         "kitti focal of nan": KITTI.replace("700", "nan"),
         "kitti focal of 0": KITTI.replace("700", "0"),
     }
@@ -361,11 +336,11 @@ def _rigs():
     }
     return {what: yaml_of(RIG | change) for what, change in changes.items()} | {
         "kitti without a row": KITTI.splitlines()[0],
-        "middlebury doffs of 1e300": MIDDLEBURY.replace("doffs=31", "doffs=1e300"),
-        "middlebury baseline of 1e150": MIDDLEBURY.replace("193", "1e150"),
+        "middlebury doffs of 1e300": MIDDLEBURY.replace("doffs=2", "doffs=1e300"),
+        "middlebury baseline of 1e150": MIDDLEBURY.replace("193.001", "1e150"),
         "kitti of 11 numbers": KITTI.replace("0 0 1 0", "0 0 1"),
         "kalibr of one camera": KALIBR.replace("cam1", "cam2"),
-        "kalibr of maps": KALIBR.replace("[460, 460, 363, 248]", "{a: 1, b: 2, c: 3, d: 4}"),
+        "kalibr of maps": KALIBR.replace("[61.6, 60.3, 36.0, 24.1]", "{a: 1, b: 2, c: 3, d: 4}"),
         "middlebury without size": MIDDLEBURY.replace("width", "w"),
     }
 

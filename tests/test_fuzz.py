@@ -1,11 +1,13 @@
 """The fuzzer finds what is planted, its valid files are valid, and what it found once stays mended."""
 
+import asyncio
 import csv
 import lzma
 import os
 import shutil
 import subprocess
 import sys
+import threading
 import warnings
 from contextlib import suppress
 from pathlib import Path
@@ -18,7 +20,7 @@ from fuzz.mutations import MOST_BYTES, mutate
 from fuzz.repairs import repair_png, repair_shard
 from fuzz.requests import ServerError, request_bytes, send
 from fuzz.running import fuzz
-from fuzz.targets import NAMES, load
+from fuzz.targets import NAMES, connections, load, page
 from stereoweave.errors import StereoweaveError
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -130,6 +132,53 @@ def test_a_request_that_ends_in_500_is_a_finding():
         send(fails, request_bytes("POST", "/500", data={"x": "1"}))
     assert send(fails, b"no request\r\n\r\n") is None
     assert send(fails, b"") is None
+
+
+def raise_now() -> None:
+    raise IndexError("planted")
+
+
+def raise_in_callback() -> None:
+    asyncio.get_running_loop().call_soon(raise_now)
+
+
+def hang() -> None:
+    threading.Event().wait()
+
+
+@pytest.mark.parametrize(
+    ("fail", "found"),
+    [(raise_now, IndexError), (raise_in_callback, IndexError), (hang, TimeoutError)],
+)
+def test_a_server_that_fails_after_its_response_is_a_finding(monkeypatch, fail, found):
+    async def answer_and_fail(scope, receive, send):
+        await connections.answer_length(scope, receive, send)
+        if scope.get("path") == "/fail":
+            fail()
+
+    monkeypatch.setattr(connections, "ANSWERED_S", 0.5)
+    assert connections.talk(answer_and_fail, request_bytes("GET", "/") * 2) == [200, 200]
+    with pytest.raises(found):
+        connections.talk(answer_and_fail, request_bytes("GET", "/fail"))
+
+
+def test_a_status_of_500_on_a_connection_is_a_finding():
+    async def answer_500(scope, receive, send):
+        await send({"type": "http.response.start", "status": 500, "headers": []})
+        await send({"type": "http.response.body"})
+
+    with pytest.raises(ServerError, match=r"statuses \[500\]"):
+        connections.talk(answer_500, request_bytes("GET", "/"))
+
+
+def test_a_gate_that_lets_a_foreign_file_pass_is_a_finding():
+    starts = load("page").starts()
+    refused = {name for name, content in starts.items() if page.visit(content) == 403}
+    assert refused == {"foreign.http", "stranger.http", "other.http"}
+    for name in refused:
+        with pytest.raises(page.LeakError):
+            page.visit(starts[name], gate=lambda app: app)
+    assert {page.visit(content) for name, content in starts.items() if name not in refused} == {200}
 
 
 @pytest.mark.parametrize("path", FOUND, ids=lambda path: f"{path.parent.name}/{path.name}")

@@ -71,9 +71,8 @@ def test_a_calibration_that_only_looks_odd_is_read(name, tmp_path):
 
 def test_hostile_calibrations_need_no_memory(tmp_path):
     here = Path(__file__).parent
-    process = subprocess.run(
-        [sys.executable, "-c", GROWING, here, tmp_path / "calib"], capture_output=True, text=True, timeout=60
-    )
+    command = [sys.executable, "-c", GROWING, here, tmp_path / "calib"]
+    process = subprocess.run(command, cwd=here.parent, capture_output=True, text=True, timeout=60)
     assert (process.returncode, process.stderr) == (0, "")
     assert len(process.stdout.splitlines()) > 90
 

@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import socket
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -210,7 +211,8 @@ async def name_again(request: Request) -> JSONResponse:
     return JSONResponse(await request.json())
 
 
-async def show_file(_: Request) -> PlainTextResponse:
+async def show_file(request: Request) -> PlainTextResponse:
+    assert request.cookies == {}  # as Gradio reads them
     return PlainTextResponse("content")
 
 
@@ -246,6 +248,22 @@ def test_a_visitor_keeps_their_files_beside_the_cookies_of_other_servers_on_the_
     for header in (f"{others}; {cookie_of(1)}", f"{cookie_of(1)}; {others}"):
         answer = page.get("/gradio_api/file=/own.png", headers={"cookie": header.encode("utf-8")})
         assert (answer.status_code, answer.text) == (200, "content")
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "PATCH", "DELETE", "OPTIONS", "BREW"])
+def test_a_body_is_checked_whatever_the_method_is(page, method):
+    answer = page.request(method, "/gradio_api/queue/join", json={"path": "/foreign.png"})
+    assert (answer.status_code, answer.text) == REFUSED
+
+
+def test_a_long_cookie_of_another_server_does_not_hold_the_page_up(page):
+    other = (
+        'other="' + r"\a" * 30_000 + '"'
+    )  # some versions of Python take the square of its length to read it
+    name_files(page, cookie_of(1), "/own.png")
+    start_s = time.process_time()
+    assert status_of(page, f"{other}; {cookie_of(1)}", "/own.png") == 200
+    assert time.process_time() - start_s < 1
 
 
 def test_no_visitor_takes_the_files_of_another_by_naming_many(page):

@@ -86,6 +86,14 @@ def test_a_head_in_pieces_and_requests_in_one_piece_are_answered(connection):
     assert read_to_end(connection).count(b"HTTP/1.1 200") == 3
 
 
+def test_what_is_no_http_behind_a_response_closes_the_connection_without_an_error(connection, caplog):
+    connection.sendall(b"POST /5 HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n")
+    assert connection.recv(1 << 16).startswith(b"HTTP/1.1 200")  # before there is a body
+    connection.sendall(b"no chunk\r\n")
+    assert read_to_end(connection) == b""
+    assert caplog.messages == []
+
+
 def test_a_request_that_takes_longer_than_a_head_may_take_is_answered(connection):
     ALLOWED.clear()
     connection.sendall(b"GET /later HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
@@ -95,6 +103,13 @@ def test_a_request_that_takes_longer_than_a_head_may_take_is_answered(connection
 
 def test_a_response_that_is_not_read_in_time_is_given_up(connection):
     connection.sendall(b"GET /50000000 HTTP/1.1\r\nHost: x\r\n\r\n")
+    connection.recv(1)
+    time.sleep(4 * PATIENCE.reader_s)
+    assert len(read_to_end(connection)) < 49_000_000
+
+
+def test_a_response_that_is_not_read_is_given_up_though_another_request_waits_behind_it(connection):
+    connection.sendall(b"GET /50000000 HTTP/1.1\r\nHost: x\r\n\r\n" * 2)
     connection.recv(1)
     time.sleep(4 * PATIENCE.reader_s)
     assert len(read_to_end(connection)) < 49_000_000

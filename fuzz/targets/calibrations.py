@@ -12,7 +12,7 @@ from stereoweave.calibration_files import read_rig, write_rig
 from stereoweave.rectify import rectify
 from stereoweave.stereo import StereoPair
 
-_MIDDLEBURY = """cam0=[60 0 36; 0 60 24; 0 0 1]
+MIDDLEBURY = """cam0=[60 0 36; 0 60 24; 0 0 1]
 cam1=[60 0 38; 0 60 24; 0 0 1]
 doffs=2
 baseline=193.001
@@ -20,7 +20,7 @@ width=72
 height=48
 ndisp=36
 """
-_KALIBR = """cam0:
+KALIBR = """cam0:
   camera_model: pinhole
   distortion_coeffs: [-0.01, 2e-3, -3.0e-04, 0.0005]
   distortion_model: equidistant
@@ -67,8 +67,8 @@ _LAUGHS = b"\nx0: &x0 [1]\n" + b"\n".join(
 
 def _starts() -> dict[str, bytes]:
     texts = {
-        "calib.txt": _MIDDLEBURY,
-        "camchain.yaml": _KALIBR,
+        "calib.txt": MIDDLEBURY,
+        "camchain.yaml": KALIBR,
         "P.txt": _KITTI,
         "cam_to_cam.txt": _KITTI_RAW,
     }
