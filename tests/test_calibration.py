@@ -433,13 +433,20 @@ def test_a_calibration_that_is_not_there_is_named(tmp_path):
 
 def test_only_a_rectified_rig_gives_a_camera(tmp_path):
     flat = read_rig(stored(tmp_path, MIDDLEBURY))
-    tall = Optics(matrix=flat.right.matrix + [[0, 0, 0], [0, 0, 2], [0, 0, 0]], distortion=np.zeros(0))
+    other = [
+        Optics(matrix=flat.right.matrix + np.array(added), distortion=np.zeros(0))
+        for added in (
+            [[2, 0, 0], [0, 0, 0], [0, 0, 0]],
+            [[0, 0, 0], [0, 2, 0], [0, 0, 0]],
+            [[0, 0, 0], [0, 0, 2], [0, 0, 0]],
+        )
+    ]
     for unlike, reason in (
         (replace(flat, left=pinhole()), "lenses that distort"),
         (replace(flat, rotation=turned(0, 1, 0)), "turned by 1.00 degrees"),
         (replace(flat, translation_m=np.array([-0.1, 0.01, 0])), "not straight to the right"),
         (replace(flat, translation_m=np.array([0.1, 0, 0])), "not straight to the right"),
-        (replace(flat, right=tall), "heights of the centre"),
+        *((replace(flat, right=each), "focal lengths or heights of the centre") for each in other),
     ):
         with pytest.raises(StereoweaveError, match=reason):
             unlike.camera()
@@ -466,6 +473,12 @@ def test_a_rig_without_sense_is_refused():
     ):
         with pytest.raises(StereoweaveError, match="expected"):
             replace(rig, **change)
+
+
+@pytest.mark.parametrize("fisheye", [False, True])
+def test_lenses_have_as_many_coefficients_as_the_models_of_opencv(fisheye):
+    for count in (0, 4) if fisheye else (0, 4, 5, 8, 12, 14):
+        Optics(matrix=np.eye(3), distortion=np.zeros(count), fisheye=fisheye)
 
 
 @pytest.mark.parametrize(("count", "fisheye"), [(3, False), (6, False), (5, True)])
