@@ -93,9 +93,10 @@ def test_dark_grey_of_16_bits_stays_dark(tmp_path):
     assert io.read_image(tmp_path / "grey.png").max() == 0
 
 
-def test_grey_below_0_is_refused(tmp_path):
-    Image.fromarray(np.full((40, 48), -1, np.int32)).save(tmp_path / "grey.tiff")
-    assert "below 0" in raises(io.read_image, tmp_path / "grey.tiff")
+@pytest.mark.parametrize("level", [-1, 65536])
+def test_grey_beyond_16_bits_is_refused(tmp_path, level):
+    Image.fromarray(np.full((40, 48), level, np.int32)).save(tmp_path / "grey.tiff")
+    assert "more than 16 bits a channel or values below 0" in raises(io.read_image, tmp_path / "grey.tiff")
 
 
 @pytest.mark.parametrize("channels", [3, 4])

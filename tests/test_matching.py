@@ -287,6 +287,15 @@ def test_matches_beyond_the_right_picture_are_occluded_whatever_the_range(matche
     assert found.occluded[20:-20, 40:-40].mean() < 0.02
 
 
+def test_where_a_match_is_beyond_the_right_picture_its_last_column_is_asked(matcher, rng):
+    pair = flat(rng, 37)
+    right_seen = np.ones(pair.left.shape[:2], bool)
+    right_seen[:, -1] = False
+    found = match(matcher, sw.StereoPair(left=pair.right, right=pair.left, right_seen=right_seen))
+    assert found.occluded[20:-20, -30:].mean() > 0.9
+    assert found.occluded[20:-20, 40:-40].mean() < 0.02
+
+
 def test_a_disparity_outside_of_the_range_that_is_given_is_brought_to_its_end_and_not_believed(matcher, rng):
     for range_px, end_px in [((50, 90), 50), ((-20, 20), 20)]:
         found = match(matcher, flat(rng, 37), range_px=range_px)
