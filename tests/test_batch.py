@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 from other_processes import halted
 from rich.console import Console
@@ -18,7 +19,7 @@ from rich.console import Console
 from stereoweave.batch import DONE_FILE, Tally, depth_of_many, run_batch
 from stereoweave.cli import main
 from stereoweave.errors import OutputInUseError, StereoweaveError
-from stereoweave.io import read_image, write_image
+from stereoweave.io import read_image, read_pixels, write_image
 from stereoweave.matcher import Matcher
 from stereoweave.pair_lists import Job, Pairs, pairs_in
 from stereoweave.preparing import Request
@@ -267,14 +268,22 @@ def test_another_order_or_another_folder_is_refused_before_anything_starts(tmp_p
     assert not (tmp_path / "new").exists()
 
 
-def test_a_scenes_own_calibration_gives_its_depth_in_metres(tmp_path):
+def test_a_scenes_own_calibration_gives_its_depth_in_metres_unless_one_is_named_for_all(tmp_path):
     folder, out = tmp_path / "scenes", tmp_path / "out"
     (folder / "room").mkdir(parents=True)
     for name in ("left.png", "right.png", "calib.txt"):
         (folder / "room" / name).write_bytes((EXAMPLES / name).read_bytes())
     tally, _ = batch(folder, out, processes=1)
     assert tally == Tally(done=1, skipped=0, failed=())
-    assert (out / "room" / "depth.png").exists()
+    own_mm = read_pixels(out / "room" / "depth.png", "I;16")
+
+    calibration = tmp_path / "twice.txt"
+    words = (EXAMPLES / "calib.txt").read_text().replace("baseline=100", "baseline=200")
+    calibration.write_text(words)
+    order = DepthOrder(request=Request(calibration=calibration))
+    batch(folder, tmp_path / "other", order, processes=1)
+    other_mm = read_pixels(tmp_path / "other" / "room" / "depth.png", "I;16")
+    assert np.median(other_mm / own_mm) == pytest.approx(2, rel=1e-3)
 
 
 def test_the_command_takes_a_list_and_makes_no_reports_unless_they_are_asked_for(tmp_path, capsys):
