@@ -227,4 +227,6 @@ def needing_the_train_extra(what: str = "this command needs PyTorch and its comp
 def needing_the_synth_extra() -> Iterator[None]:
     """As `needing_the_train_extra`."""
     with needing_extra("synth", "this command needs what renders"):
+        import skimage  # noqa: F401 - which textures need later, in other processes too
+
         yield

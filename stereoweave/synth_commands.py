@@ -65,9 +65,8 @@ def make(  # noqa: PLR0913 - each is a word of the command line
 @synth.command()
 def check(folder: Annotated[Path, typer.Argument(help="What synth make made.")], jobs: Jobs = None) -> None:
     """Check a set: checksums, disparity against the pictures, statistics; exit status 1 if one is wrong."""
-    with needing_the_synth_extra():
-        from stereoweave.synth.checking import check as check_set
-        from stereoweave.synth.checking import lines
+    from stereoweave.synth.checking import check as check_set
+    from stereoweave.synth.checking import lines
 
     found = check_set(folder, _jobs(jobs))
     typer.echo("\n".join(lines(found)))

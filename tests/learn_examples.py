@@ -87,6 +87,14 @@ def keep_pairs(folder, seed, count, size=PAIR_SIZE):
     return pairs
 
 
+def make_batches_in_place(patch):
+    """Have a training's batches come in its own process: another one takes seconds to load PyTorch."""
+    patch.setattr(
+        "stereoweave.learn.train._numbered_batches",
+        lambda batches, first: ((step, batches[step]) for step in range(first, batches.recipe.steps)),
+    )
+
+
 def untrained(name="weave_small"):
     torch.manual_seed(0)
     return network_of(recipe_of(name)).eval()

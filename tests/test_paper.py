@@ -7,12 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from learn_examples import CAMERA, Listed, box_before_a_wall, complaint, keep_pairs, recipe_of
+from learn_examples import (
+    CAMERA,
+    Listed,
+    box_before_a_wall,
+    complaint,
+    keep_pairs,
+    make_batches_in_place,
+    recipe_of,
+)
 from rich.console import Console
 
 from stereoweave.data.paper_layout import write_frame
 from stereoweave.io import read_image
-from stereoweave.learn import checkpoint, paper, paper_report, train
+from stereoweave.learn import checkpoint, paper, paper_report
 from stereoweave.learn import trials as the_trials
 from stereoweave.learn.pairs import KeptPairs
 from stereoweave.learn.paper import plan, run_trials
@@ -89,11 +97,7 @@ class Experiment:
 def train_in_place(patch):
     """Have trainings and their batches come in this process: each new one takes seconds to load PyTorch."""
     patch.setattr(paper, "ProcessPoolExecutor", lambda jobs, mp_context: ThreadPoolExecutor(1))
-    patch.setattr(
-        train,
-        "_numbered_batches",
-        lambda batches, first: ((step, batches[step]) for step in range(first, batches.recipe.steps)),
-    )
+    make_batches_in_place(patch)
 
 
 @pytest.fixture

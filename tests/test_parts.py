@@ -1,3 +1,6 @@
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -168,3 +171,25 @@ def test_frames_are_right_handed_and_their_first_vector_is_level():
     np.testing.assert_allclose(turns @ turns.swapaxes(1, 2), np.tile(np.eye(3), (5, 1, 1)), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(turns), 1.0)
     np.testing.assert_allclose(across[:, 2], 0, atol=1e-12)
+
+
+def test_a_ball_of_twenty_faces_is_a_regular_icosahedron():
+    ball = spheres([0, 0, 0], 1.0, 0, subdivisions=0)
+    edges = np.linalg.norm(ball.corners_m - np.roll(ball.corners_m, 1, axis=1), axis=-1)
+    np.testing.assert_allclose(edges, np.full((20, 3), 1 / np.sin(2 * np.pi / 5)), rtol=1e-6)
+
+
+def test_each_division_of_a_ball_makes_four_faces_of_one_on_the_sphere():
+    ball = spheres([1, 2, 3], 0.5, 0, subdivisions=2)
+    assert len(ball.corners_m) == 20 * 4**2
+    np.testing.assert_allclose(np.linalg.norm(ball.corners_m - [1, 2, 3], axis=-1), 0.5, rtol=1e-6)
+
+
+def test_nothing_that_starts_slowly_is_imported_to_make_or_check_a_set():
+    slow = ["scipy", "networkx", "trimesh", "numba", "skimage"]
+    program = (
+        "import sys, stereoweave.synth.checking, stereoweave.synth.making; from stereoweave.synth.parts "
+        f"import spheres; spheres([0, 0, 0], 1.0, 0); print([name for name in {slow} if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -170,7 +170,7 @@ def test_what_opengl_has_no_room_for_is_told_in_a_line():
 
 def test_without_the_extra_the_answer_names_it(tmp_path):
     program = (
-        "import sys; sys.modules['trimesh'] = None; from stereoweave.cli import main; "
+        "import sys; sys.modules['skimage'] = None; from stereoweave.cli import main; "
         "sys.exit(main(['synth', 'make', 'pylon', '--pairs', '1', '-o', 'set']))"
     )
     command = [sys.executable, "-c", program]

@@ -22,6 +22,7 @@ from learn_examples import (
     checkpoint_of,
     complaint,
     keep_pairs,
+    make_batches_in_place,
     recipe_of,
     untrained,
     write,
@@ -92,6 +93,11 @@ def recipe_file(folder):
 def finished(folder, recipe_file):
     """The last checkpoint of a run that nothing stopped."""
     return train(recipe_file, folder / "finished", QUIET)
+
+
+@pytest.fixture
+def in_place(monkeypatch):
+    make_batches_in_place(monkeypatch)
 
 
 @pytest.fixture
@@ -171,7 +177,7 @@ def test_a_run_is_kept_every_ten_minutes(folder, recipe_file, tmp_path, logger, 
     assert checkpoint.load(last).step == 3
 
 
-def test_a_run_is_scored_by_class_on_the_held_out_sets_of_its_recipe(folder, tmp_path):
+def test_a_run_is_scored_by_class_on_the_held_out_sets_of_its_recipe(folder, in_place, tmp_path):
     sample = replace(box_before_a_wall(np.random.default_rng(0)), camera=CAMERA)
     (tmp_path / "boxes").mkdir()
     write_shard(tmp_path / "boxes", "boxes", 0, [packed(sample, {})])
@@ -192,7 +198,7 @@ def test_a_run_starts_from_the_averaged_weights_of_another(folder, finished):
     assert_same(start.weights, first.averaged)
 
 
-def test_a_loss_that_is_not_finite_twice_stops_and_names_the_pairs(folder, tmp_path):
+def test_a_loss_that_is_not_finite_twice_stops_and_names_the_pairs(folder, in_place, tmp_path):
     broken = untrained()
     torch.nn.init.constant_(broken.to_match.weight, torch.nan)
     checkpoint.save(checkpoint_of(broken), tmp_path / "broken.pt")
@@ -319,7 +325,7 @@ def test_any_of_the_papers_networks_trains_by_changing_one_word(model, tmp_path,
     assert_same(dict(run.averaged.module.state_dict()), dict(run.network.state_dict()))
 
 
-def test_a_code_network_that_is_resumed_ends_as_one_that_was_not(folder):
+def test_a_code_network_that_is_resumed_ends_as_one_that_was_not(folder, in_place):
     """Dropout included, whose draws go on where they were."""
     recipe = recipe_of("fast_depth", name="paper", steps=4, alpha_p=1.0)
     whole = checkpoint.load(training.train_recipe(recipe, folder / "paper", QUIET))

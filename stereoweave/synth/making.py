@@ -36,7 +36,7 @@ _LARGEST_SIDE_PX = 4096
 _NOT_OF_THE_PAIRS = {"making.py", "workers.py", "checking.py", "contact_sheet.py", "costs.py"}
 _OF_THE_PAIRS_TOO = ("stereo.py", "data/samples.py", "data/packing.py", "data/paper_layout.py")
 # What casts the rays, or draws the triangles, is in the renderer's name.
-_PACKAGES = ("moderngl", "numpy", "opencv-python-headless", "pillow", "scikit-image", "trimesh")
+_PACKAGES = ("moderngl", "numpy", "opencv-python-headless", "pillow", "scikit-image")
 
 
 @runtime_checkable

@@ -7,11 +7,11 @@ sizes are [N, 3], or one [3] for all. Textures are laid on in metres along the s
 import functools
 import math
 from collections.abc import Sequence
+from itertools import product
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-import trimesh
 from jaxtyping import Float, Int
 
 from stereoweave.synth.world import Mesh, joined
@@ -19,6 +19,19 @@ from stereoweave.synth.world import Mesh, joined
 Point = Float[np.ndarray, "3"]
 Points = Float[np.ndarray, "_ 3"]
 Numbers = np.ndarray | Sequence[Any] | float  # an array, or lists that make one
+
+# Two triangles a side, by their corners, counter-clockwise from outside; corner 4 x + 2 y + z is at the ends
+# of the axes where these are 1.
+_CUBE_FACES = (
+    *((1, 3, 0), (4, 1, 0), (0, 3, 2), (2, 4, 0), (1, 7, 3), (5, 1, 4)),
+    *((5, 7, 1), (3, 7, 2), (6, 4, 2), (2, 7, 6), (6, 5, 4), (7, 5, 6)),
+)
+# Its corners are those of three golden rectangles, one after the other.
+_ICOSAHEDRON_FACES = (
+    *((0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2)),
+    *((10, 7, 6), (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5)),
+    *((2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1)),
+)
 
 
 def tubes(  # noqa: PLR0913, bars differ in so much
@@ -365,10 +378,25 @@ def _bar(sides: int, capped: bool) -> _Bar:
 
 @functools.cache
 def _cube() -> tuple[Float[np.ndarray, "12 3 3"], Float[np.ndarray, "12 3 3"]]:
-    cube = trimesh.creation.box((2, 2, 2))
-    return cube.triangles, np.repeat(cube.face_normals[:, None], 3, axis=1)
+    """The triangles of a cube of side 2 about the origin, and their normals."""
+    corners = np.array(list(product((-1.0, 1.0), repeat=3)))
+    triangles = corners[np.array(_CUBE_FACES)]
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]) / 4
+    return triangles, np.repeat(normals[:, None], 3, axis=1)
 
 
 @functools.cache
 def _ball(subdivisions: int) -> Float[np.ndarray, "n 3 3"]:
-    return trimesh.creation.icosphere(subdivisions).triangles
+    """The triangles of a ball of radius 1 about the origin: an icosahedron's, divided into four each time."""
+    golden_ratio = (1 + math.sqrt(5)) / 2
+    rectangle = np.array([(y, x * golden_ratio, 0) for x, y in product((1, -1), (-1, 1))])
+    corners = np.concatenate([np.roll(rectangle, turn, axis=1) for turn in range(3)])
+    corners /= math.hypot(1, golden_ratio)
+    triangles = corners[np.array(_ICOSAHEDRON_FACES)]
+    for _ in range(subdivisions):
+        a, b, c = triangles.swapaxes(0, 1)
+        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+        parts = [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]
+        triangles = np.moveaxis(np.array(parts), 2, 0).reshape(-1, 3, 3)
+        triangles = triangles / np.linalg.norm(triangles, axis=-1, keepdims=True)
+    return triangles
