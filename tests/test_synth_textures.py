@@ -1,4 +1,5 @@
 import hashlib
+import os
 import subprocess
 import sys
 
@@ -7,8 +8,9 @@ import numpy as np
 import pytest
 
 from stereoweave.errors import StereoweaveError
+from stereoweave.synth import textures
 from stereoweave.synth.patterns import PHOTOGRAPHS
-from stereoweave.synth.textures import FAMILIES, bank, texture
+from stereoweave.synth.textures import FAMILIES, Family, bank, texture
 from stereoweave.synth.tiling import SIDE, blurred, cells, from_line, mixed, noise, painted, run_down, step
 
 # As surfaces outdoors have it: linear mean colour, black 0 and white 1.
@@ -156,6 +158,74 @@ def test_only_photographs_of_known_licence_are_used():
 def test_importing_the_textures_does_not_import_scikit_image():
     code = "import sys, stereoweave.synth.textures; assert 'skimage' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.fixture
+def small_bank(tmp_path, monkeypatch):
+    """The cache folder of a bank of one texture, and a list that grows each time it is drawn."""
+    drawn, (plain, *_) = [], FAMILIES["plain"].variants
+
+    def once(rng):
+        drawn.append(1)
+        return plain(rng)
+
+    monkeypatch.setattr(textures, "FAMILIES", {"plain": Family(variants=(once,), albedo=(0.7, 0.8))})
+    monkeypatch.setattr(textures, "cache_folder", lambda: tmp_path / "kernels")
+    return tmp_path / "textures", drawn
+
+
+def fresh_bank():
+    """The bank of a new process."""
+    return bank.__wrapped__().pixels
+
+
+def test_a_kept_bank_is_read_and_not_drawn_again(small_bank):
+    folder, drawn = small_bank
+    first = fresh_bank()
+    assert [file.suffix for file in folder.iterdir()] == [".rgba"]
+    np.testing.assert_array_equal(fresh_bank(), first)
+    assert len(drawn) == 1
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda kept: b"",
+        lambda kept: bytes(4),
+        lambda kept: kept[: len(kept) // 2],
+        lambda kept: kept + b"more",
+        lambda kept: kept[:1000] + bytes([kept[1000] ^ 1]) + kept[1001:],
+    ],
+    ids=["empty", "four zeros", "cut", "grown", "one bit"],
+)
+def test_a_damaged_file_is_made_anew(small_bank, damage):
+    folder, drawn = small_bank
+    first = fresh_bank()
+    (file,) = folder.iterdir()
+    whole = file.read_bytes()
+    file.write_bytes(damage(whole))
+    np.testing.assert_array_equal(fresh_bank(), first)
+    assert len(drawn) == 2
+    assert file.read_bytes() == whole
+
+
+def test_a_bank_of_other_code_is_drawn_anew_and_banks_of_last_month_are_removed(small_bank, monkeypatch):
+    folder, drawn = small_bank
+    month_s = 31 * 24 * 60 * 60
+    for version, age_s in [("oldest", 2 * month_s), ("old", 0), ("new", 0)]:
+        monkeypatch.setattr(textures, "_version", lambda version=version: version)
+        fresh_bank()
+        written_s = (folder / f"{version}.rgba").stat().st_mtime
+        os.utime(folder / f"{version}.rgba", (written_s, written_s - age_s))
+    assert len(drawn) == 3
+    assert sorted(file.name for file in folder.iterdir()) == ["new.rgba", "old.rgba"]
+
+
+def test_where_nothing_can_be_kept_the_bank_is_there_all_the_same(small_bank):
+    folder, drawn = small_bank
+    folder.write_text("a file where the folder should be")
+    np.testing.assert_array_equal(fresh_bank(), fresh_bank())
+    assert len(drawn) == 2
 
 
 @pytest.mark.parametrize("exponent", [0.5, 1.0, 1.5])

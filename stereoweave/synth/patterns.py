@@ -6,13 +6,10 @@ The photographs are those that scikit-image carries in its wheel; docs/training-
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
-
-from stereoweave.synth.kept_textures import kept
 
 SIDE = 384  # texels; at 0.35 to 1 texel a pixel it spans the width of a training picture
 BANK_SEED = 20_240_607
@@ -59,25 +56,16 @@ class Bank:
 
 @functools.cache
 def bank() -> Bank:
-    """The bank, the same in every process; drawn once on a machine, and kept in the user's cache folder."""
-    natural = PHOTOGRAPH_CROPS + NATURAL_PROCEDURAL
-    shape = (natural + PERIODIC_PROCEDURAL, SIDE, SIDE, 3)
-    textures = kept("rgb", [Path(__file__)], shape, _drawn)
-    return Bank(
-        natural=tuple(textures[:natural]),
-        periodic=tuple(textures[natural:]),
-        lights=tuple(light_map(np.random.default_rng((BANK_SEED, 3, k))) for k in range(LIGHT_MAPS)),
-    )
-
-
-def _drawn() -> UInt8[np.ndarray, "textures side side 3"]:
-    """The natural textures, then the periodic ones."""
+    """The bank, the same in every process; built at the first call, which takes some seconds."""
     from skimage import data
 
     photographs = {name: _rgb(getattr(data, name)()) for name in PHOTOGRAPHS}
-    crops = [photograph_crop(photographs, k) for k in range(PHOTOGRAPH_CROPS)]
-    natural = [procedural(NATURAL, k) for k in range(NATURAL_PROCEDURAL)]
-    return np.stack(crops + natural + [procedural(PERIODIC, k) for k in range(PERIODIC_PROCEDURAL)])
+    crops = tuple(photograph_crop(photographs, k) for k in range(PHOTOGRAPH_CROPS))
+    return Bank(
+        natural=crops + tuple(procedural(NATURAL, k) for k in range(NATURAL_PROCEDURAL)),
+        periodic=tuple(procedural(PERIODIC, k) for k in range(PERIODIC_PROCEDURAL)),
+        lights=tuple(light_map(np.random.default_rng((BANK_SEED, 3, k))) for k in range(LIGHT_MAPS)),
+    )
 
 
 def photograph_crop(photographs: dict[str, Photograph], k: int) -> Texture:

@@ -4,6 +4,9 @@ The photographs among them are scikit-image's; docs/training-data.md has their l
 """
 
 import functools
+import hashlib
+import tempfile
+import time
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from stereoweave.compiling import cache_folder
 from stereoweave.errors import StereoweaveError
-from stereoweave.synth.kept_textures import kept
 from stereoweave.synth.procedures import (
     cloth,
     ground,
@@ -29,6 +32,7 @@ from stereoweave.synth.procedures import (
 from stereoweave.synth.tiling import SIDE, Colours, Surface
 
 BANK_SEED = 20_241_121
+_KEPT_DAYS = 30
 
 Procedure = Callable[[np.random.Generator], Surface]
 Pixels = UInt8[np.ndarray, "layers side side 4"]
@@ -102,10 +106,12 @@ class Bank:
 @functools.cache
 def bank() -> Bank:
     """The bank, the same in every process; drawn once on a machine, and kept in the user's cache folder."""
-    here = Path(__file__)
-    sources = (here, here.with_name("tiling.py"), *sorted(here.with_name("procedures").glob("*.py")))
-    count = sum(len(family.variants) for family in FAMILIES.values())
-    return Bank(kept("rgba", sources, (count, SIDE, SIDE, 4), _drawn))
+    file = cache_folder().with_name("textures") / f"{_version()}.rgba"
+    pixels = _read(file)
+    if pixels is None:
+        pixels = _drawn()
+        _keep(file, pixels)
+    return Bank(pixels)
 
 
 def _drawn() -> Pixels:
@@ -136,3 +142,45 @@ def _exposed(colours: Colours, albedo: float) -> Colours:
     for _ in range(6):
         gain *= float(albedo / linear(np.clip(few * gain, 0, 255)).mean()) ** (1 / 2.2)
     return colours * gain
+
+
+def _version() -> str:
+    """Digits that change with the code that draws."""
+    here = Path(__file__)
+    files = (here, here.with_name("tiling.py"), *sorted(here.with_name("procedures").glob("*.py")))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
+
+
+def _read(file: Path) -> Pixels | None:
+    """What was kept, or None where there is nothing, or nothing whole."""
+    try:
+        kept = np.fromfile(file, np.uint8)
+    except OSError:
+        return None
+    count = sum(len(family.variants) for family in FAMILIES.values())
+    texels, checksum = kept[:-4], kept[-4:]
+    if texels.size != count * SIDE * SIDE * 4 or checksum.tobytes() != _checksum(texels):
+        return None
+    return texels.reshape(count, SIDE, SIDE, 4)
+
+
+def _keep(file: Path, pixels: Pixels) -> None:
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=file.parent) as folder:
+            whole = Path(folder) / file.name
+            with whole.open("wb") as stream:
+                stream.write(pixels.data)
+                stream.write(_checksum(pixels))
+            whole.replace(file)
+        # Not at once: versions side by side, in use by turns, would throw out one another's.
+        for other in file.parent.glob(f"*{file.suffix}"):
+            if time.time() - other.stat().st_mtime > _KEPT_DAYS * 86_400:
+                other.unlink()
+    except OSError:
+        # Where nothing can be kept, each process draws the bank for itself, and that is all the harm.
+        return
+
+
+def _checksum(pixels: UInt8[np.ndarray, "..."]) -> bytes:
+    return zlib.crc32(pixels.data).to_bytes(4, "big")
