@@ -18,6 +18,8 @@ import psutil
 import pytest
 from visitor import Visitor
 
+from stereoweave.io import read_image, write_image
+
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 PAIR = {side: EXAMPLES / f"{side}.png" for side in ("left", "right")}
 # ONNX Runtime looks up where its reports go after some ten seconds.
@@ -116,6 +118,15 @@ def watched(command: Sequence[str], trace: Path) -> Iterator[Watched]:
                 process.kill()
 
 
+def write_small_pair(folder: Path) -> dict[str, Path]:
+    """A part of the example, for what is asked again and again."""
+    folder.mkdir()
+    small = {side: folder / path.name for side, path in PAIR.items()}
+    for side, path in small.items():
+        write_image(path, read_image(PAIR[side])[:96, 200:328])
+    return small
+
+
 def write_many_pairs(folder: Path) -> Path:
     """More pairs than a worker makes meanwhile."""
     for side, path in PAIR.items():
@@ -155,7 +166,7 @@ def seen(tmp_path_factory) -> Seen:
             assert programs["batch"].process.poll() is None
             time.sleep(0.1)
         with httpx.Client(base_url=page, timeout=60) as client:
-            ask_for(ALIVE_S, Visitor(client), service)
+            ask_for(ALIVE_S, Visitor(client), service, write_small_pair(folder / "small"))
         listeners = programs["service"].listeners()
         opened = [port for address, port in listeners if not is_loopback(address)]
         answers = {port: ask_without_token(port) for port in opened}
@@ -163,12 +174,12 @@ def seen(tmp_path_factory) -> Seen:
     return Seen(outside, listeners, answers)
 
 
-def ask_for(seconds: float, visitor: Visitor, service: str) -> None:
+def ask_for(seconds: float, visitor: Visitor, service: str, pair: dict[str, Path]) -> None:
     """Keeps the page and the service at work."""
-    files = {side: path.read_bytes() for side, path in PAIR.items()}
+    files = {side: path.read_bytes() for side, path in pair.items()}
     end_s = time.monotonic() + seconds
     while time.monotonic() < end_s:
-        assert "far:" in visitor.press("find", **PAIR)
+        assert "far:" in visitor.press("find", **pair)
         httpx.post(f"{service}/disparity", files=files, timeout=60).raise_for_status()
         httpx.get(f"{service}/metrics").raise_for_status()
         time.sleep(0.5)

@@ -4,29 +4,49 @@ import sys
 import numpy as np
 import pytest
 
-from stereoweave.synth import patterns
-from stereoweave.synth.patterns import NATURAL, PERIODIC, PHOTOGRAPHS, SIDE, bank, power_noise, procedural
+from stereoweave.synth.patterns import (
+    LIGHT_MAPS,
+    NATURAL,
+    NATURAL_TEXTURES,
+    PERIODIC,
+    PERIODIC_TEXTURES,
+    PHOTOGRAPH_CROPS,
+    PHOTOGRAPHS,
+    SIDE,
+    light_map,
+    natural,
+    periodic,
+    photograph_crop,
+    power_noise,
+    procedural,
+)
 
 
-def test_the_bank_holds_textures_of_one_size_and_is_built_once():
-    assert bank() is bank()
-    for texture in bank().natural + bank().periodic:
+@pytest.fixture(scope="module")
+def textures() -> list[np.ndarray]:
+    """All of them, those of nature first."""
+    return [natural(k) for k in range(NATURAL_TEXTURES)] + [periodic(k) for k in range(PERIODIC_TEXTURES)]
+
+
+def test_the_textures_have_one_size_and_are_made_once(textures):
+    assert natural(3) is natural(3)
+    for texture in textures:
         assert texture.shape == (SIDE, SIDE, 3)
         assert texture.dtype == np.uint8
 
 
-def test_about_half_of_the_textures_are_crops_of_photographs():
-    total = len(bank().natural) + len(bank().periodic)
-    assert 0.4 < patterns.PHOTOGRAPH_CROPS / total < 0.6
+def test_about_half_of_the_textures_are_crops_of_photographs(textures):
+    assert 0.4 < PHOTOGRAPH_CROPS / len(textures) < 0.6
 
 
-def test_every_texture_shows_something():
-    assert min(texture.std() for texture in bank().natural + bank().periodic) > 1
+def test_every_texture_shows_something(textures):
+    assert min(texture.std() for texture in textures) > 1
 
 
-def test_a_texture_depends_on_its_number_alone():
-    alone = procedural(NATURAL, 40)
-    np.testing.assert_array_equal(alone, bank().natural[patterns.PHOTOGRAPH_CROPS + 40])
+def test_a_texture_depends_on_its_number_alone(textures):
+    assert len({texture.tobytes() for texture in textures}) == len(textures)
+    np.testing.assert_array_equal(procedural(NATURAL, 40), natural(PHOTOGRAPH_CROPS + 40))
+    np.testing.assert_array_equal(photograph_crop(40), natural(40))
 
 
 @pytest.mark.parametrize("kinds", [NATURAL, PERIODIC])
@@ -51,7 +71,7 @@ def test_noise_has_the_spectrum_that_was_asked_for():
 
 
 def test_light_maps_never_darken_to_black_nor_blind():
-    for light in bank().lights:
+    for light in map(light_map, range(LIGHT_MAPS)):
         assert light.dtype == np.float32
         assert 0.2 < light.min() <= light.max() < 1.7
 

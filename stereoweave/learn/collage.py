@@ -15,7 +15,7 @@ from stereoweave.learn.collage_kinds import draw_scene, draw_training_scene
 from stereoweave.learn.collage_scene import Scene
 from stereoweave.learn.paint import Sheet, colour, cover, expose, occlusion, seen_from_right
 from stereoweave.stereo import Sample
-from stereoweave.synth.patterns import bank, natural_colour
+from stereoweave.synth.patterns import LIGHT_MAPS, light_map, natural_colour
 
 CLEAN_SHARE = 0.25  # pairs without any photometric difference
 FAULTY_SHARE = 0.03  # pairs with faults that good cameras do not have
@@ -115,8 +115,7 @@ def _cut_apart(
 
 def _plain_noise(rng: np.random.Generator, height: int, width: int) -> Sample:
     """Two views of one colour under smooth light, and each sensor's noise."""
-    lights = bank().lights
-    light = 1 + rng.uniform(0, 0.3) * (lights[rng.integers(len(lights))] - 1)
+    light = 1 + rng.uniform(0, 0.3) * (light_map(int(rng.integers(LIGHT_MAPS))) - 1)
     shown = natural_colour(rng) * cv2.resize(light, (width, height), interpolation=cv2.INTER_CUBIC)[..., None]
     level = np.exp(rng.uniform(np.log(0.5), np.log(12)))
     views = [shown + level * rng.standard_normal(shown.shape, np.float32) for _ in range(2)]

@@ -7,7 +7,16 @@ from jaxtyping import Float
 from stereoweave.learn.collage_scene import Layer, Surface
 from stereoweave.learn.paint import Paint
 from stereoweave.learn.shapes import Patch, Place
-from stereoweave.synth.patterns import SIDE, bank, natural_colour
+from stereoweave.synth.patterns import (
+    LIGHT_MAPS,
+    NATURAL_TEXTURES,
+    PERIODIC_TEXTURES,
+    SIDE,
+    light_map,
+    natural,
+    natural_colour,
+    periodic,
+)
 
 PLANE_SLOPE = 0.3  # px of disparity a px: steeper surfaces are rare and nearly edge-on to one camera
 BEND_SLOPE = 0.25  # bends add to the plane; together below 0.6, so that no surface turns its back
@@ -57,15 +66,14 @@ def draw_surface(rng: np.random.Generator, place: Place, level_px: float, limit_
 
 def draw_paint(rng: np.random.Generator, place: Place) -> Paint:
     """A texture of any kind and colour, lit; a near-plain one in a fifth of the layers."""
-    textures = bank()
-    family = textures.periodic if rng.random() < 0.12 else textures.natural
+    texture, count = (periodic, PERIODIC_TEXTURES) if rng.random() < 0.12 else (natural, NATURAL_TEXTURES)
     texels_per_px = rng.uniform(0.45, 1.0)
     texels_per_light_px = 64 / (2 * place.radius_px + 40) * rng.uniform(0.3, 1.5)
     return Paint(
-        texture=family[rng.integers(len(family))],
+        texture=texture(int(rng.integers(count))),
         to_texture=_draw_mapping(rng, texels_per_px, SIDE),
         to_colour=_draw_recolouring(rng),
-        light=textures.lights[rng.integers(len(textures.lights))],
+        light=light_map(int(rng.integers(LIGHT_MAPS))),
         to_light=_draw_mapping(rng, min(texels_per_light_px, 0.6), 64),
         gloss=_draw_gloss(rng, place),
     )

@@ -5,7 +5,6 @@ The photographs are those that scikit-image carries in its wheel; docs/training-
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -14,8 +13,8 @@ from jaxtyping import Float, UInt8
 SIDE = 384  # texels; at 0.35 to 1 texel a pixel it spans the width of a training picture
 BANK_SEED = 20_240_607
 PHOTOGRAPH_CROPS = 110
-NATURAL_PROCEDURAL = 90
-PERIODIC_PROCEDURAL = 30
+NATURAL_TEXTURES = PHOTOGRAPH_CROPS + 90
+PERIODIC_TEXTURES = 30
 LIGHT_MAPS = 32
 
 Texture = UInt8[np.ndarray, "side side 3"]
@@ -45,34 +44,23 @@ PHOTOGRAPHS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class Bank:
-    """Every texture, uint8 [SIDE, SIDE, 3], and every light map, float32 [64, 64] about 1."""
-
-    natural: tuple[Texture, ...]
-    periodic: tuple[Texture, ...]
-    lights: tuple[Float[np.ndarray, "64 64"], ...]
+@functools.cache
+def natural(k: int) -> Texture:
+    """Texture number k of 0..NATURAL_TEXTURES - 1, the same in every process; made when first needed."""
+    return photograph_crop(k) if k < PHOTOGRAPH_CROPS else procedural(NATURAL, k - PHOTOGRAPH_CROPS)
 
 
 @functools.cache
-def bank() -> Bank:
-    """The bank, the same in every process; built at the first call, which takes some seconds."""
-    from skimage import data
-
-    photographs = {name: _rgb(getattr(data, name)()) for name in PHOTOGRAPHS}
-    crops = tuple(photograph_crop(photographs, k) for k in range(PHOTOGRAPH_CROPS))
-    return Bank(
-        natural=crops + tuple(procedural(NATURAL, k) for k in range(NATURAL_PROCEDURAL)),
-        periodic=tuple(procedural(PERIODIC, k) for k in range(PERIODIC_PROCEDURAL)),
-        lights=tuple(light_map(np.random.default_rng((BANK_SEED, 3, k))) for k in range(LIGHT_MAPS)),
-    )
+def periodic(k: int) -> Texture:
+    """Likewise one of a pattern that repeats, of 0..PERIODIC_TEXTURES - 1."""
+    return procedural(PERIODIC, k)
 
 
-def photograph_crop(photographs: dict[str, Photograph], k: int) -> Texture:
+def photograph_crop(k: int) -> Texture:
     """Crop number k: a part of a photograph turned, mirrored, zoomed and recoloured."""
     rng = np.random.default_rng((BANK_SEED, 1, k))
     weights = np.array(list(PHOTOGRAPHS.values()), float)
-    photograph = photographs[str(rng.choice(list(PHOTOGRAPHS), p=weights / weights.sum()))]
+    photograph = _photograph(str(rng.choice(list(PHOTOGRAPHS), p=weights / weights.sum())))
     crop = _turned_crop(rng, photograph)
     # A grey photograph gets a tint of its own, a coloured one is shifted a little.
     grey = np.ptp(crop, axis=2).max() < 3
@@ -105,8 +93,10 @@ def natural_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
     return cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0, 0] * 255
 
 
-def light_map(rng: np.random.Generator) -> Float[np.ndarray, "64 64"]:
-    """Illumination float32 [64, 64] about 1: smooth, and in half of the maps with a soft-edged shadow."""
+@functools.cache
+def light_map(k: int) -> Float[np.ndarray, "64 64"]:
+    """Light map number k, float32 [64, 64] about 1: smooth, and half of them with a soft-edged shadow."""
+    rng = np.random.default_rng((BANK_SEED, 3, k))
     light = 1 + rng.uniform(0.05, 0.2) * power_noise(rng, 2.5, 64)
     if rng.random() < 0.5:
         edge = rng.uniform(1.5, 12)
@@ -116,7 +106,11 @@ def light_map(rng: np.random.Generator) -> Float[np.ndarray, "64 64"]:
     return np.clip(light, 0.25, 1.6).astype(np.float32)
 
 
-def _rgb(image: np.ndarray) -> Photograph:
+@functools.cache
+def _photograph(name: str) -> Photograph:
+    from skimage import data
+
+    image = getattr(data, name)()
     return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB) if image.ndim == 2 else image
 
 
