@@ -11,7 +11,6 @@ from second_casts import from_the_other_eye
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import StereoCamera
-from stereoweave.synth.costs import costs
 from stereoweave.synth.effects import PLAIN, Effects
 from stereoweave.synth.parts import boxes, sheet, spheres, tubes
 from stereoweave.synth.raycast import Raycaster
@@ -362,21 +361,6 @@ def test_more_than_a_world_may_have_is_an_error(plain, others, message):
 def test_a_pixel_takes_one_sample_or_2x2():
     with pytest.raises(StereoweaveError, match="samples: expected 1 or 2, found 3"):
         Effects(samples=3)
-
-
-def test_costs_name_every_effect():
-    rows = costs("pylon", pairs=1, size_px=(64, 48))
-    assert [row.effect for row in rows] == [
-        "everything",
-        "shadows",
-        "ambient occlusion",
-        "gloss",
-        "fog",
-        "relief",
-        "2x2 samples",
-        "none (plain)",
-    ]
-    assert rows[0].ms_a_pair > 0 and rows[-1].ms_a_pair > 0
 
 
 def _beside_edges(disparity_px: np.ndarray) -> np.ndarray:

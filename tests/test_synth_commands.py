@@ -89,10 +89,16 @@ def test_the_costs_of_the_effects_are_told_in_milliseconds(monkeypatch, capsys):
     monkeypatch.setattr("stereoweave.synth.costs.costs", partial(costs, size_px=(64, 48)))
     assert run("synth costs pylon --pairs 1") == 0
     told = [re.fullmatch(r" *(-?\d+) ms  (.+)", line) for line in capsys.readouterr().out.splitlines()]
-    effects = [found[2] for found in told]
-    assert effects[0] == "everything"
-    assert effects[1:3] == ["shadows", "ambient occlusion"]
-    assert effects[-1] == "none (plain)"
+    assert [found[2] for found in told] == [
+        "everything",
+        "shadows",
+        "ambient occlusion",
+        "gloss",
+        "fog",
+        "relief",
+        "2x2 samples",
+        "none (plain)",
+    ]
     assert int(told[0][1]) > int(told[-1][1]) > 0
 
 
