@@ -53,7 +53,7 @@ def test_on_pairs_of_no_training_the_network_is_right_and_knows_where(name):
     errors_px, confidence = [], []
     for index in range(8):
         pair = sample(UNSEEN_SEED, 0, index, 320, 512)
-        found = sw.estimate(pair.left, pair.right, model=name)
+        found = sw.estimate(pair.left, pair.right, model=name, threads=1)
         errors_px.append(np.abs(found.disparity_px - pair.disparity_px))
         confidence.append(found.confidence)
     within = np.stack(errors_px) <= 1
@@ -92,7 +92,8 @@ def test_on_real_pairs_the_network_is_as_good_as_promised(testdata, name, refine
     rows = []
     for scene in read_scenes(testdata / "stereo/pairs"):
         pair = scene.pair
-        found_px = sw.estimate(pair.left, pair.right, model=name, refined=refined).disparity_px
+        found = sw.estimate(pair.left, pair.right, model=name, threads=1, refined=refined)
+        found_px = found.disparity_px
         bad = [metrics.bad_percent(found_px, scene.truth_px, threshold_px) for threshold_px in (1, 2)]
         rows.append([metrics.epe_px(found_px, scene.truth_px), *bad])
     assert (np.mean(rows, axis=0) <= most).all()
@@ -119,7 +120,7 @@ def test_new_views_come_near_to_real_photographs(testdata, name, scene_name, lea
     found_db = []
     for photograph in scene.glob("view_*.png"):
         position = float(photograph.stem.removeprefix("view_"))
-        view = sw.synthesize(left, right, position=position, model=name)
+        view = sw.synthesize(left, right, position=position, model=name, threads=1)
         image = moved(view.image, offsets.get(str(position), [0, 0]))
         found_db.append(metrics.psnr_db(image, read_image(photograph)))
     assert np.mean(found_db) >= least_db
@@ -128,7 +129,7 @@ def test_new_views_come_near_to_real_photographs(testdata, name, scene_name, lea
 @pytest.mark.testdata
 @pytest.mark.parametrize("name", CARDS)
 def test_on_real_pairs_the_shipped_file_answers_as_its_checkpoint_in_pytorch(testdata, name):
-    network, matcher = trained(name), Matcher(name)
+    network, matcher = trained(name), Matcher(name, threads=1)
     for scene in read_scenes(testdata / "stereo/pairs"):
         # Only of disparity: the confidence that ships was calibrated after training.
         difference_px, _ = differences(network, matcher, scene.pair)
