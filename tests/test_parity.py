@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from stereoweave import cli
 from stereoweave.learn import checkpoint, halve, parity, quantise
@@ -14,6 +15,8 @@ from stereoweave.matcher import model_file
 from stereoweave.providers import open_session
 
 ROOT = Path(__file__).parent.parent
+# Beside other tests two threads wait for one another most of the time, and busily.
+torch.set_num_threads(1)
 # One pair stands for the table's twelve, of which some are harder than others, and processors with other
 # vector instructions round otherwise.
 MARGIN = 3
@@ -102,7 +105,7 @@ def test_the_command_writes_and_shows_a_row_for_each_variant(tmp_path, monkeypat
     made = {"float32": shipped, "one size": shipped._replace(sizes=sizes[1:])}
     for name, value in (("SIZES", sizes), ("_TURNS", 1), ("variants", lambda _file, _folder: made)):
         monkeypatch.setattr(parity, name, value)
-    out = tmp_path / "parity.csv"
+    out, threads = tmp_path / "parity.csv", torch.get_num_threads()
     assert cli.main(["bench", "parity", str(ROOT / "checkpoints/small.pt"), "-o", str(out)]) == 0
     rows = rows_of(out)
     assert parity.markdown(rows) in capsys.readouterr().out
@@ -111,6 +114,7 @@ def test_the_command_writes_and_shows_a_row_for_each_variant(tmp_path, monkeypat
         ("small", "float32", 8), ("small", "one size", 4),
     ]  # fmt: skip
     assert here[0].time_relative == 1
+    assert torch.get_num_threads() == threads
     assert 0 < here[0].left_max_px < 0.01
 
 

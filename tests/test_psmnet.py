@@ -9,6 +9,9 @@ import torch.nn.functional as F
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn.models.psmnet import PSMNet, _disparity_px, cost_volume, soft_argmin
 
+# Volumes this small cost more to share among threads than to compute.
+torch.set_num_threads(1)
+
 
 def cost_volume_plain(left, right, levels):
     batch, channels, height, width = left.shape

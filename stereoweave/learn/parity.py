@@ -94,7 +94,6 @@ def parity(checkpoints: Sequence[Path]) -> list[ParityRow]:
     Args:
         checkpoints: Of the shipped networks.
     """
-    torch.set_num_threads(thread_count(None))
     with tempfile.TemporaryDirectory() as folder:
         return [row for path in checkpoints for row in _rows_of(path, Path(folder))]
 
