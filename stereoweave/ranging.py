@@ -173,7 +173,8 @@ def _outstanding(
 def _texture(grey: Float32[np.ndarray, "h w"]) -> _Texture:
     size = (_WINDOW_COLUMNS, _WINDOW_ROWS)
     uneven = grey - cv2.blur(grey, size)
-    contrast = np.sqrt(cv2.blur(uneven * uneven, size))
+    # Its running sums may end a little below 0.
+    contrast = np.sqrt(np.maximum(cv2.blur(uneven * uneven, size), 0))
     length = np.sqrt(np.float32(_WINDOW_ROWS * _WINDOW_COLUMNS)) * contrast
     scale = np.zeros_like(length)
     np.divide(1, length, out=scale, where=contrast >= _LEAST_CONTRAST_LEVELS)

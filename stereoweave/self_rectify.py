@@ -1,5 +1,6 @@
 """A pair whose rows do not match becomes one whose rows do, by what both pictures show: no calibration."""
 
+from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -72,10 +73,11 @@ def _right_ones(found: Matches) -> Matches:
     right_ones = np.zeros(count, bool)
     if count >= _LEAST_MATCHES:
         cv2.setRNGSeed(0)
-        _, mask = cv2.findFundamentalMat(
-            found.left_px, found.right_px, cv2.USAC_MAGSAC, _RIGHT_PX, 0.9999, 5000
-        )
-        right_ones = right_ones if mask is None else mask.ravel() > 0
+        with suppress(cv2.error):  # where no geometry at all explains any of them
+            _, mask = cv2.findFundamentalMat(
+                found.left_px, found.right_px, cv2.USAC_MAGSAC, _RIGHT_PX, 0.9999, 5000
+            )
+            right_ones = right_ones if mask is None else mask.ravel() > 0
     if right_ones.sum() < max(_LEAST_MATCHES, _LEAST_RIGHT_SHARE * count):
         raise StereoweaveError(
             f"--rectify: expected at least {_LEAST_MATCHES} places that both pictures show from two sides, "
