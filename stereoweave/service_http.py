@@ -345,8 +345,8 @@ class _Exchange:
         return message
 
     async def send(self, message: _Message) -> None:
+        await self._send(message)  # waits for the client to read; nothing is sent if it is cancelled then
         self.status = message.get("status", self.status)
-        await self._send(message)
 
     async def while_connected(self, work: Coroutine[Any, Any, None]) -> None:
         """Do the work, and cancel it where the client goes away."""

@@ -40,7 +40,7 @@ class Patience:
 
 
 class _Connection(H11Protocol, asyncio.BufferedProtocol):
-    """A connection that is closed if a head or a reader is late, or if there are too many of them."""
+    """A connection that is closed if a head or a reader is late, or if there are too many connections."""
 
     def __init__(self, patience: Patience, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)

@@ -382,7 +382,7 @@ def test_what_was_accepted_is_answered_before_it_ends(running):
     """The last test: it ends the service."""
     with ThreadPoolExecutor(1) as pool:
         answer = pool.submit(post, running.client, "/view")
-        while not list(running.uploads.glob("stereoweave-service-*/tmp*")):
+        while not answer.done() and not list(running.uploads.glob("stereoweave-service-*/tmp*")):
             time.sleep(0.01)
         os.kill(running.pid, signal.SIGTERM)
         assert answer.result().status_code == 200

@@ -263,3 +263,28 @@ def test_a_flood_of_requests_for_metrics_holds_no_other_up_and_gathers_them_once
 
     assert asyncio.run(flood()) == (200, {(200, b"counted 1\n")})
     assert len(gathered) == 1
+
+
+def test_a_response_that_could_not_be_begun_in_time_becomes_one_that_says_so():
+    from stereoweave.service_http import Guard, Limits, make_app
+
+    async def answers(order: Order, left_s: float) -> Answer:
+        return Answer(content=b"done", report="{}")
+
+    async def ask() -> httpx.Response:
+        limits, unread = Limits(timeout_s=0.2), [asyncio.Event()]
+        guard = Guard(make_app(answers, limits, bytes, Path(tempfile.gettempdir())), limits)
+
+        async def to_a_slow_reader(scope: Any, receive: Any, send: Any) -> None:
+            async def send_when_read(message: Any) -> None:
+                if unread:  # an earlier response, the first time
+                    await unread.pop().wait()
+                await send(message)
+
+            await guard(scope, receive, send_when_read)
+
+        transport = httpx.ASGITransport(to_a_slow_reader)
+        async with httpx.AsyncClient(transport=transport, base_url="http://service") as client:
+            return await client.post("/disparity", files=BOTH)
+
+    assert asyncio.run(ask()).status_code == 504
