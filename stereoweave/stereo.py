@@ -50,7 +50,8 @@ class StereoCamera:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             check_number(name, value)
-        if not (self.focal_px > 0 and self.baseline_m > 0):
+        # What is smaller still is 0 in float32, and no depth.
+        if not (self.focal_px > 1 / CAMERA_NUMBERS_BELOW and self.baseline_m > 1 / CAMERA_NUMBERS_BELOW):
             raise StereoweaveError(
                 f"focal_px and baseline_m must be positive, got {self.focal_px} and {self.baseline_m}"
             )
