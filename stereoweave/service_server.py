@@ -20,8 +20,9 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 _MOST_HEAD_BYTES = 16 * 1024
 # So many bytes are parsed at a time: h11 takes 40 us for a chunk, which may be of one byte, and others wait.
 _PARSED_BYTES = 4096
-# Each takes a file descriptor, of which a process usually has 1024.
-_MOST_CONNECTIONS = 500
+# Each takes a file descriptor, of which a process usually has 1024. As many as wait to be accepted are
+# accepted at once, before any is closed.
+_MOST_CONNECTIONS, _WAITING_CONNECTIONS = 500, 100
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,10 @@ class Patience:
 
 
 class _Connection(H11Protocol, asyncio.BufferedProtocol):
-    """A connection that is closed if a head or a reader is late, or if there are too many connections."""
+    """A connection that is closed if a head or a reader is late.
+
+    Where there are too many connections, the one that has waited longest for a head is closed.
+    """
 
     def __init__(self, patience: Patience, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
@@ -59,7 +63,10 @@ class _Connection(H11Protocol, asyncio.BufferedProtocol):
         transport.set_write_buffer_limits(high=0)  # writing is paused while the client leaves a byte unread
         self._expect_head()
         if len(self.connections) > _MOST_CONNECTIONS:
-            transport.abort()
+            waiting = [each for each in self.connections if isinstance(each, _Connection) and each._is_idle()]
+            longest = min(waiting, key=_Connection._deadline_s)
+            self.connections.remove(longest)
+            longest.transport.abort()
 
     def data_received(self, data: bytes) -> None:
         super().data_received(data)
@@ -99,9 +106,15 @@ class _Connection(H11Protocol, asyncio.BufferedProtocol):
     def _is_unread(self) -> bool:
         return self.transport.get_write_buffer_size() > 0
 
+    def _is_idle(self) -> bool:
+        return not self._is_busy() and not self._is_unread()
+
+    def _deadline_s(self) -> float:
+        return math.inf if self._deadline is None else self._deadline.when()
+
     def _expect_head(self) -> None:
         """Starts to wait for the next head, unless it has arrived or the client has yet to read."""
-        if not self._is_busy() and not self._is_unread():
+        if self._is_idle():
             self._close_within(self._patience.head_s)
 
     def _close_within(self, seconds: float | None) -> None:
@@ -124,6 +137,8 @@ def http_server(app: Any, listener: socket.socket, patience: Patience) -> Iterat
         access_log=False,
         log_config=None,
         log_level="critical",
+        backlog=_WAITING_CONNECTIONS,
+        timeout_keep_alive=math.ceil(patience.head_s),
         timeout_graceful_shutdown=math.ceil(patience.end_s),
     )
     server = uvicorn.Server(config)
