@@ -140,10 +140,10 @@ class Replica:
             answers = await loop.run_in_executor(self._answering, self._worker.answer, tasks)
         finally:
             self._free.set()
-        if not any(isinstance(answer, Exception) for answer in answers):
-            self._budget.learn(
-                sum(work_of(task.order, task.megapixels) for task in tasks), time.perf_counter() - start_s
-            )
+        if all(isinstance(answer, Answer | TimeoutError) for answer in answers):
+            work = sum(work_of(task.order, task.megapixels) for task in tasks)
+            finished = all(isinstance(answer, Answer) for answer in answers)
+            self._budget.learn(work, time.perf_counter() - start_s, finished=finished)
         return answers
 
     def _size(self, tasks: Sequence[Task]) -> int:

@@ -25,7 +25,7 @@ class BusyError(StereoweaveError):
 
 
 class Budget:
-    """The work that one process has accepted, in estimated seconds.
+    """The work that one process has accepted, and the seconds that each unit of `work_of` takes it.
 
     A request that could not be done in time at the best speed so far is refused for good. One that has to
     wait for others is refused for now if their work and its own take too long at the usual speed, the median
@@ -34,8 +34,8 @@ class Budget:
 
     def __init__(self, seconds_each: float) -> None:
         self._accepted: list[float] = []
-        self._best_s = seconds_each
-        self._latest_s = deque([seconds_each], _LATEST)
+        self._best_each_s = seconds_each
+        self._latest_each_s = deque([seconds_each], _LATEST)
 
     @contextmanager
     def admit(self, order: Order, megapixels: float, left_s: float) -> Iterator[None]:
@@ -46,13 +46,13 @@ class Budget:
             BusyError: It does after what was accepted before it.
         """
         work = work_of(order, megapixels)
-        least_s = work * self._best_s
+        least_s = work * self._best_each_s
         if least_s > left_s:
             raise TooLargeError(
                 f"expected a request that takes at most {left_s:.0f} s, found {megapixels:.1f} megapixels, "
                 f"which take {least_s:.0f} s with its options; send smaller pictures, or fewer options"
             )
-        late_s = (sum(self._accepted) + work) * median(self._latest_s) - left_s
+        late_s = (sum(self._accepted) + work) * median(self._latest_each_s) - left_s
         if self._accepted and late_s > 0:
             raise BusyError(
                 f"expected at most {left_s:.0f} s of work, found {late_s:.0f} s more; come again",
@@ -64,10 +64,14 @@ class Budget:
         finally:
             self._accepted.remove(work)
 
-    def learn(self, work: float, took_s: float) -> None:
-        """Take into account how long an amount of work took."""
-        self._latest_s.append(took_s / work)
-        self._best_s = min(self._best_s, took_s / work)
+    def learn(self, work: float, took_s: float, *, finished: bool = True) -> None:
+        """Take into account how long an amount of work took, or after how long it was stopped unfinished."""
+        each_s = took_s / work
+        if finished:
+            self._best_each_s = min(self._best_each_s, each_s)
+        else:  # it would have taken longer than that
+            each_s = max(each_s, median(self._latest_each_s))
+        self._latest_each_s.append(each_s)
 
 
 def work_of(order: Order, megapixels: float) -> float:

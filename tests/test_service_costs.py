@@ -55,6 +55,16 @@ def test_speeds_of_long_ago_are_forgotten():
         pass
 
 
+def test_what_was_stopped_unfinished_makes_the_usual_speed_slower_and_the_best_no_better():
+    budget = Budget(seconds_each=2)
+    budget.learn(work=1, took_s=8, finished=False)
+    budget.learn(work=8, took_s=1, finished=False)  # had little time left: counts as the median, 5
+    with budget.admit(order(), megapixels=1, left_s=2), pytest.raises(BusyError, match="found 1 s more"):
+        budget.admit(order(), megapixels=1, left_s=9).__enter__()  # the median of 2, 5 and 8, twice, less 9
+    with pytest.raises(TooLargeError, match="take 2 s"):
+        budget.admit(order(), megapixels=1, left_s=1.9).__enter__()
+
+
 def test_large_pictures_and_full_resolution_are_more_work():
     assert work_of(order(), 0.6) == 0.6
     assert work_of(order(), 50) == 125
