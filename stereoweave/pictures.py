@@ -85,6 +85,17 @@ def open_pictures(paths: Sequence[Path], arrangement: str | None = None) -> Open
     )
 
 
+def pixel_factor(path: Path, picture: Image.Image, arrangement: str | None) -> int:
+    """How many times as many pixels both views have as the head of the opened picture that holds them says.
+
+    Two for an MPO file, and for half views that `arrangement` or the file's JPS mark names.
+    """
+    if arrangement in (None, "mpo") and view_frames(path, picture):
+        return 2
+    known = ARRANGEMENTS.get(_declared(path, picture, arrangement)[0] or "")
+    return 2 if known is not None and known.half else 1
+
+
 def _two(left: Path, right: Path) -> Opened:
     photographs = [read_photograph(path) for path in (left, right)]
     lies, notes = _upright(*photographs)

@@ -16,7 +16,8 @@ from stereoweave.hints import hints
 from stereoweave.io import RangeError, write_image
 from stereoweave.matcher import Matcher
 from stereoweave.matching import match_many
-from stereoweave.picture_files import MOST_PIXELS, opening, view_frames
+from stereoweave.picture_files import MOST_PIXELS, opening
+from stereoweave.pictures import pixel_factor
 from stereoweave.preparing import Prepared, Request, prepare
 from stereoweave.rectify import cropped
 from stereoweave.rendering import Renderer, check_position
@@ -93,20 +94,17 @@ Answering = Callable[[Sequence[Order]], list[Answer | Exception]]
 def check_pixels(order: Order) -> float:
     """The megapixels that are matched, as the heads of the order's pictures say, before memory is spent.
 
-    Those of half views count doubled if the request says that they are half.
-
     Raises:
         TooLargeError: More than the order's views may have.
         FormatError: No picture, or none of a kind that is read.
     """
-    views = 3 - len(order.pictures)
-    is_half = (order.request.arrangement or "").endswith("_half")
-    megapixels = 0.0
+    views, megapixels = 3 - len(order.pictures), 0.0
     for path in order.pictures:
         with opening(path, views=views) as picture:
-            size_px = picture.size
-            doubled = is_half or (views == 2 and bool(view_frames(path, picture)))
-        megapixels += (1 + doubled) * _checked_megapixels(path, size_px, views * order.most_megapixels)
+            factor = pixel_factor(path, picture, order.request.arrangement) if views == 2 else 1
+            megapixels += factor * _checked_megapixels(
+                path, picture.size, order.most_megapixels * views / factor
+            )
     return megapixels
 
 
@@ -167,7 +165,7 @@ def _attempt(work: Callable[..., Any], *given: Any, **options: Any) -> Any:
 
 def _prepared(order: Order) -> Prepared:
     prepared = prepare(order.pictures, order.request)
-    # Again: half views, and the further pictures of an MPO file, are larger than its head says.
+    # Again: half views that are guessed are larger than the head of their picture says.
     _checked_megapixels(order.pictures[0], prepared.pair.left.shape[1::-1], order.most_megapixels)
     if needs_camera(order.file):
         needed_camera(prepared.pair)
