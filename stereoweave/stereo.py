@@ -53,7 +53,8 @@ class StereoCamera:
         # What is smaller still is 0 in float32, and no depth.
         if not (self.focal_px > 1 / CAMERA_NUMBERS_BELOW and self.baseline_m > 1 / CAMERA_NUMBERS_BELOW):
             raise StereoweaveError(
-                f"focal_px and baseline_m must be positive, got {self.focal_px} and {self.baseline_m}"
+                f"focal_px and baseline_m must be above {1 / CAMERA_NUMBERS_BELOW:g}, "
+                f"got {self.focal_px} and {self.baseline_m}"
             )
         if not all(abs(value) < CAMERA_NUMBERS_BELOW for value in vars(self).values()):
             raise StereoweaveError(
