@@ -100,6 +100,8 @@ def _address(app: ASGIApp) -> tuple[str, int]:
     # The server's own thread is a daemon as this one is, and so does not keep the process.
     threading.Thread(target=_serve, args=(app, listener), daemon=True).start()
     host, port = listener.getsockname()
+    # When this is answered, uvicorn has set the levels of its loggers.
+    _statuses((host, port), _PLAIN, ANSWERED_S)
     return host, port
 
 
