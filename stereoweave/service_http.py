@@ -72,7 +72,7 @@ _Message = MutableMapping[str, Any]
 _Receive = Callable[[], Awaitable[_Message]]
 _Send = Callable[[_Message], Awaitable[None]]
 _Server = Callable[[_Message, _Receive, _Send], Coroutine[Any, Any, None]]
-# What may become of an order, and is told to who posted it. A TimeoutError is an OSError.
+# The errors of an order that its client is told. A TimeoutError is an OSError.
 FAILURES = (StereoweaveError, OSError, MemoryError)
 # Of an order, and the seconds that are left for it.
 Answering = Callable[[Order, float], Awaitable[Answer]]
