@@ -1,5 +1,5 @@
 # make demo    depth, a new view and a report, of the example or of LEFT=… RIGHT=… (needs Python 3.11 or newer)
-# make test    the tests
+# make test    the tests, JOBS=3 files at a time
 # make check   style, types, floors of imports, and the tests
 # make mutate which of COUNT=400 changes of the sources, drawn by SEED, the tests notice; a stopped run goes on
 # make fuzz    damaged files and requests for SECONDS=60, each answered by our own errors or kept in tests/corpus
@@ -13,6 +13,7 @@ PYTHON ?= python3
 STEREOWEAVE_TESTDATA ?= ../shared
 SECONDS ?= 60
 COUNT ?= 400
+JOBS ?= 3
 
 # What users install: no PyTorch.
 CORE = .venv-core
@@ -39,26 +40,16 @@ RENDER = $(DEV)/bin/stereoweave synth make refinery --pairs 1 --seed 4000 --layo
 RENDERED = $(foreach side,left right,runs/gallery/$(1)/$(side)/refinery/000000.png)
 VIEW = $(DEV)/bin/stereoweave view
 
-.PHONY: demo test test-system test-a-p test-q-z check fuzz mutate bench audit release gallery
+.PHONY: demo test check fuzz mutate bench audit release gallery
 
 demo: $(CORE)/installed
 	$(CORE)/bin/stereoweave depth $(PAIR) $(CALIBRATION) --out demo-out
 	$(CORE)/bin/stereoweave view $(PAIR) --position 0.5 --out demo-out/view.png
 	@echo "Open the report in a browser: $(CURDIR)/demo-out/report.html"
 
-# In three parts at a time: the system tests, which mostly wait for other programs, and the others by the letter
-# that their file begins with, in two parts that take about as long. Each prints when it is done, where make can
-# do that: version 3, which macOS has, cannot.
-SYNC = $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
-PARTS = test-system test-a-p test-q-z
+# Three files at a time on two cores, because the system tests mostly wait for other programs.
 test: $(DEV)/installed
-	@$(MAKE) --no-print-directory --jobs 3 $(SYNC) $(PARTS)
-
-test-system: PART = -m system
-test-a-p: PART = -m 'not system' tests/test_[a-p]*.py
-test-q-z: PART = -m 'not system' tests/test_[q-z]*.py
-$(PARTS): $(DEV)/installed
-	$(DEV)/bin/pytest $(PART)
+	$(DEV)/bin/pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder
 
 check: $(DEV)/installed
 	$(DEV)/bin/ruff check

@@ -1,7 +1,7 @@
 """What the tests share, and which of them need something that a bare machine does not have.
 
 A marker of `CAPABILITIES` on a test says what it needs. Where that is missing the test is left out, and the
-summary says so; with STEREOWEAVE_REQUIRE_ALL=1 the run fails instead.
+summary says so; with STEREOWEAVE_REQUIRE_ALL=1 it fails instead.
 """
 
 import os
@@ -22,6 +22,7 @@ import jaxtyping
 import numpy as np
 import pytest
 from other_processes import free_ports, processes_of
+from xdist.workermanage import WorkerController
 
 TESTDATA = Path(
     os.environ.get("STEREOWEAVE_TESTDATA") or Path(__file__).resolve().parent.parent.parent / "shared"
@@ -56,31 +57,41 @@ CAPABILITIES = {
     "needs_egl": Capability(renders(), "of the renderer", "no EGL: apt install libegl1 libgl1-mesa-dri"),
 }
 
+MISSING = [name for name, capability in CAPABILITIES.items() if not capability.present]
 LEFT_OUT = pytest.StashKey[dict[str, int]]()
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    missing = [name for name, capability in CAPABILITIES.items() if not capability.present]
-    left_out = [item for item in items if any(item.get_closest_marker(name) for name in missing)]
+    if os.environ.get("STEREOWEAVE_REQUIRE_ALL") == "1":
+        return
+    left_out = [item for item in items if any(map(item.get_closest_marker, MISSING))]
     config.stash[LEFT_OUT] = {
-        name: sum(item.get_closest_marker(name) is not None for item in left_out) for name in missing
+        name: sum(item.get_closest_marker(name) is not None for item in left_out) for name in MISSING
     }
-    if left_out and os.environ.get("STEREOWEAVE_REQUIRE_ALL") == "1":
-        raise pytest.UsageError("; ".join(_left_out_lines(config)) + "; STEREOWEAVE_REQUIRE_ALL=1 forbids it")
+    if hasattr(config, "workeroutput"):  # of several processes, whose results one process shows
+        config.workeroutput["left_out"] = config.stash[LEFT_OUT]
     items[:] = [item for item in items if item not in left_out]
     config.hook.pytest_deselected(items=left_out)
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: WorkerController) -> None:
+    node.config.stash[LEFT_OUT] = node.workeroutput.get("left_out", {})
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    for name in filter(item.get_closest_marker, MISSING):
+        pytest.fail(f"{CAPABILITIES[name].missing}; STEREOWEAVE_REQUIRE_ALL=1 forbids to leave it out")
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    for line in _left_out_lines(config):
-        terminalreporter.write_line(line, yellow=True)
-
-
-def _left_out_lines(config: pytest.Config) -> Iterator[str]:
     for name, count in config.stash.get(LEFT_OUT, {}).items():
         if count:
-            yield f"left out: {count} tests {CAPABILITIES[name].tests}: {CAPABILITIES[name].missing}"
+            capability = CAPABILITIES[name]
+            terminalreporter.write_line(
+                f"left out: {count} tests {capability.tests}: {capability.missing}", yellow=True
+            )
 
 
 @pytest.fixture

@@ -81,14 +81,3 @@ def test_a_breach_of_a_contract_is_caught(tmp_path, contract, file, line):
 
 def test_each_contract_has_a_breach_that_is_tried():
     assert {contract["name"] for contract in CONTRACTS} == {contract for contract, _, _ in BREACHES}
-
-
-def test_every_test_is_in_one_part_of_make_test():
-    makefile = (REPOSITORY / "Makefile").read_text()
-    parts = dict(re.findall(r"^(test-\S+): PART = (.+)$", makefile, re.MULTILINE))
-    (started,) = re.findall(r"^PARTS = (.+)$", makefile, re.MULTILINE)
-    assert started.split() == list(parts)
-    assert parts.pop("test-system") == "-m system"
-    patterns = [re.fullmatch(r"-m 'not system' (\S+)", part)[1] for part in parts.values()]
-    files = [path for pattern in patterns for path in REPOSITORY.glob(pattern)]
-    assert sorted(files) == sorted((REPOSITORY / "tests").rglob("test_*.py"))
