@@ -92,7 +92,9 @@ def recipe_file(folder):
 @pytest.fixture(scope="module")
 def finished(folder, recipe_file):
     """The last checkpoint of a run that nothing stopped."""
-    return train(recipe_file, folder / "finished", QUIET)
+    with pytest.MonkeyPatch.context() as patch:
+        make_batches_in_place(patch)
+        return train(recipe_file, folder / "finished", QUIET)
 
 
 @pytest.fixture
@@ -311,8 +313,9 @@ def assert_all_moved(run, before):
 
 @pytest.mark.parametrize("recipe", FIRST_STEPS, ids=FIRST_STEPS.values())
 def test_every_shipped_recipe_takes_its_first_steps(recipe, tmp_path, logger):
-    # Three, because the first two only wake what adds nothing until it is trained, one behind the other.
-    assert_all_moved(*step_of(recipe, tmp_path, logger, steps=3))
+    # WeaveNet's first two only wake what adds nothing until it is trained, one behind the other.
+    steps = 3 if recipe.model.startswith("weave") else 1
+    assert_all_moved(*step_of(recipe, tmp_path, logger, steps))
 
 
 @pytest.mark.parametrize("model", [name for name in MODELS if not name.startswith("weave")])

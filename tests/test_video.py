@@ -24,11 +24,11 @@ from stereoweave.matcher import Matcher
 from stereoweave.rendering import Renderer
 from stereoweave.stereo import StereoPair
 
-# A frame a second, so that a part, 10 s, is 10 frames.
-SLOW_MS = 1000
+# So that a part, 10 s, is 5 frames.
+SLOW_MS = 2000
 
 
-def slow_film(path: Path, count: int = 25) -> Path:
+def slow_film(path: Path, count: int = 13) -> Path:
     return write_side_by_side(
         path, example_pairs(count), times_ms=range(0, count * SLOW_MS, SLOW_MS), codec="libx264"
     )
@@ -170,11 +170,11 @@ def _red_from_green(anaglyph: np.ndarray) -> float:
 
 
 class Interrupted(Footage):
-    """Footage whose reader gets the signal of Ctrl-C at frame 17, once a part is finished."""
+    """Footage whose reader gets the signal of Ctrl-C at frame 8, once a part is finished."""
 
     def frames(self, start: int = 0) -> Iterator[StereoFrame]:
         for index, frame in enumerate(super().frames(start), start):
-            if index == 17 and any(Path(self.name).parent.glob("*.parts/*.nut")):
+            if index == 8 and any(Path(self.name).parent.glob("*.parts/*.nut")):
                 signal.raise_signal(signal.SIGINT)
             yield frame
 
@@ -217,12 +217,12 @@ def test_a_film_that_is_being_made_is_refused_until_its_process_is_killed(tmp_pa
     )
     assert first.wait() == -signal.SIGKILL
     assert run(film, out, "--depth") == 0
-    assert len(frames_of(out)) == 25
+    assert len(frames_of(out)) == 13
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.mp4", "link", "out.mp4"]
 
 
 def test_another_order_does_not_go_on_with_what_was_begun(tmp_path, monkeypatch, capsys):
-    film = slow_film(tmp_path / "in.mp4", 20)
+    film = slow_film(tmp_path / "in.mp4", 10)
     with monkeypatch.context() as patch:
         patch.setattr("stereoweave.footage.Footage", Interrupted)
         assert run(film, tmp_path / "out.mp4", "--position", "0.4") == 130
@@ -253,7 +253,7 @@ def test_where_the_disk_fills_up_one_line_says_what_stays_and_how_to_go_on(tmp_p
         f"what is finished stays in {folder}, and the same command goes on from there"
     )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.mp4", "out.mkv.parts", "whole.mkv"]
-    assert len(list(folder.glob("*.nut"))) == 5
+    assert len(list(folder.glob("*.nut"))) == 9
     assert run(film, tmp_path / "out.mkv", "--depth16") == 0
     np.testing.assert_array_equal(frames_of(tmp_path / "out.mkv"), frames_of(tmp_path / "whole.mkv"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.mp4", "out.mkv", "whole.mkv"]
@@ -317,7 +317,7 @@ def test_what_is_no_3d_film_is_one_line(tmp_path, capsys):
 
 
 def test_swapped_sides_are_told_with_the_arrangement_that_mends_them(tmp_path, capsys):
-    pairs = example_pairs(4, width=320, height=192)
+    pairs = example_pairs(2, width=320, height=192)
     crossed = write_side_by_side(tmp_path / "in.mp4", pairs, arrangement="crossed", codec="libx264")
     assert run(crossed, tmp_path / "a.mp4", "--depth", "--arrangement", "side_by_side") == 0
     told = capsys.readouterr().err
@@ -327,10 +327,10 @@ def test_swapped_sides_are_told_with_the_arrangement_that_mends_them(tmp_path, c
 
 
 def test_a_film_is_looked_at_beyond_its_first_minute(tmp_path, capsys):
-    # At 12 frames a minute, so that two of the three that are looked at, number 2, 8 and 14, are swapped.
-    pairs = example_pairs(16, width=320, height=192)
-    pairs = [pair if index < 5 else pair[::-1] for index, pair in enumerate(pairs)]
-    times_ms = range(0, 16 * 5000, 5000)
+    # At 6 frames a minute, so that two of the three that are looked at, number 1, 4 and 7, are swapped.
+    pairs = example_pairs(8, width=320, height=192)
+    pairs = [pair if index < 3 else pair[::-1] for index, pair in enumerate(pairs)]
+    times_ms = range(0, 8 * 10_000, 10_000)
     film = write_side_by_side(tmp_path / "in.mp4", pairs, times_ms=times_ms, codec="libx264")
     assert run(film, tmp_path / "out.mp4", "--position", "0", "--arrangement", "side_by_side") == 0
     assert capsys.readouterr().err.count("0:01:10.000 ") == 1
@@ -360,21 +360,21 @@ def test_a_series_of_pictures_has_the_rate_that_is_given(tmp_path, capsys):
 
 @pytest.mark.parametrize("pattern", ["", "*.png"])
 def test_a_series_of_which_one_picture_changed_is_not_gone_on_with(tmp_path, monkeypatch, capsys, pattern):
-    folder = write_pictures(tmp_path / "frames", 20)
+    folder = write_pictures(tmp_path / "frames", 10)
     out = (folder / pattern).with_name("out.mp4")
-    words = ["--position", "0.5", "--rate", "1"]
+    words = ["--position", "0.5", "--rate", "0.5"]
     with monkeypatch.context() as patch:
         patch.setattr("stereoweave.footage.Footage", Interrupted)
         assert run(folder / pattern, out, *words) == 130
-    status = (folder / "013.png").stat()
-    os.utime(folder / "013.png", ns=(status.st_atime_ns, status.st_mtime_ns + 1_000_000))
+    status = (folder / "006.png").stat()
+    os.utime(folder / "006.png", ns=(status.st_atime_ns, status.st_mtime_ns + 1_000_000))
     capsys.readouterr()
     assert run(folder / pattern, out, *words) == 2
     assert "found parts begun with another FILM;" in capsys.readouterr().err
 
 
 def test_a_film_taken_apart_otherwise_is_not_gone_on_with(tmp_path, monkeypatch, capsys):
-    film = slow_film(tmp_path / "in.mp4", 20)
+    film = slow_film(tmp_path / "in.mp4", 10)
     with monkeypatch.context() as patch:
         patch.setattr("stereoweave.footage.Footage", Interrupted)
         assert run(film, tmp_path / "out.mp4", "--position", "0.5") == 130

@@ -1,5 +1,6 @@
 """What ships: the network inside the package is the trained one, and as good as its card says."""
 
+import functools
 import json
 import re
 import runpy
@@ -21,6 +22,7 @@ from stereoweave.learn.export import differences
 from stereoweave.learn.models import network_of
 from stereoweave.learn.models.layers import local_soft_argmax
 from stereoweave.matcher import Matcher, shipped_models
+from stereoweave.matching import match
 
 ROOT = Path(__file__).parent.parent
 WEIGHTS = ROOT / "stereoweave/weights"
@@ -78,6 +80,15 @@ def test_two_thirds_as_many_pixels_fly_as_with_bilinear_upsampling_from_a_quarte
     assert found_percent <= bilinear_percent * 2 / 3
 
 
+@functools.cache
+def found_raw(testdata, name):
+    """The real scenes, and what the network itself finds in each: all that `refined` does comes after it."""
+    matcher, scenes = Matcher(name, threads=1), list(read_scenes(testdata / "stereo/pairs"))
+    # Whole, as `estimate` matches what a network can see at once.
+    assert all(matcher.sees_whole(*scene.pair.left.shape[1::-1]) for scene in scenes)
+    return [(scene, match(matcher, scene.pair, raw=True)) for scene in scenes]
+
+
 @pytest.mark.testdata
 @pytest.mark.parametrize(
     ("name", "refined", "most"),
@@ -89,11 +100,9 @@ def test_two_thirds_as_many_pixels_fly_as_with_bilinear_upsampling_from_a_quarte
     ],
 )
 def test_on_real_pairs_the_network_is_as_good_as_promised(testdata, name, refined, most):
-    rows = []
-    for scene in read_scenes(testdata / "stereo/pairs"):
-        pair = scene.pair
-        found = sw.estimate(pair.left, pair.right, model=name, threads=1, refined=refined)
-        found_px = found.disparity_px
+    matcher, rows = Matcher(name, threads=1), []
+    for scene, found in found_raw(testdata, name):
+        found_px = matcher.finish(scene.pair, found, refined=refined).disparity_px
         bad = [metrics.bad_percent(found_px, scene.truth_px, threshold_px) for threshold_px in (1, 2)]
         rows.append([metrics.epe_px(found_px, scene.truth_px), *bad])
     assert (np.mean(rows, axis=0) <= most).all()
