@@ -138,9 +138,10 @@ def write_many_pairs(folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class Seen:
-    """Calls to the outside, by program; where the service listened, and what is answered there."""
+    """Calls to the outside, by program; where page and service listened, and what is answered there."""
 
     outside: dict[str, list[str]]
+    page: str
     listeners: dict[tuple[str, int], str]
     answers: dict[int, grpc.StatusCode]
 
@@ -152,7 +153,7 @@ def seen(tmp_path_factory) -> Seen:
     pairs, out = write_many_pairs(folder / "pairs"), folder / "out"
     commands = {
         "estimate": [sys.executable, "-c", ESTIMATING],
-        "page": [*STEREOWEAVE, "app", "--port", "0"],
+        "page": [*STEREOWEAVE, "app", "--host", "127.1", "--port", "0"],
         "service": [*STEREOWEAVE, "serve", "--port", "0", "--threads", "1"],
         "batch": [*STEREOWEAVE, "batch", str(pairs), str(out), "--workers", "1"],
     }
@@ -171,7 +172,7 @@ def seen(tmp_path_factory) -> Seen:
         opened = [port for address, port in listeners if not is_loopback(address)]
         answers = {port: ask_without_token(port) for port in opened}
     outside = {name: calls_outside(program.trace) for name, program in programs.items()}
-    return Seen(outside, listeners, answers)
+    return Seen(outside, page, listeners, answers)
 
 
 def ask_for(seconds: float, visitor: Visitor, service: str, pair: dict[str, Path]) -> None:
@@ -182,7 +183,7 @@ def ask_for(seconds: float, visitor: Visitor, service: str, pair: dict[str, Path
         assert "far:" in visitor.press("find", **pair)
         httpx.post(f"{service}/disparity", files=files, timeout=60).raise_for_status()
         httpx.get(f"{service}/metrics").raise_for_status()
-        time.sleep(0.5)
+        time.sleep(2)
 
 
 def ask_without_token(port: int) -> grpc.StatusCode:
@@ -195,6 +196,10 @@ def ask_without_token(port: int) -> grpc.StatusCode:
 @pytest.mark.parametrize("program", ["estimate", "page", "service", "batch"])
 def test_a_program_looks_nothing_up_and_calls_nobody_but_this_computer(seen, program):
     assert seen.outside[program] == []
+
+
+def test_the_page_answers_to_the_name_that_its_command_prints(seen):
+    assert seen.page.startswith("http://127.1:")  # where it was asked
 
 
 def test_a_look_up_is_seen_and_a_call_to_this_computer_is_none(tmp_path):
