@@ -4,6 +4,7 @@ A marker of `CAPABILITIES` on a test says what it needs. Where that is missing t
 summary says so; with STEREOWEAVE_REQUIRE_ALL=1 it fails instead.
 """
 
+import gc
 import os
 import shutil
 import signal
@@ -57,6 +58,9 @@ CAPABILITIES = {
     "needs_egl": Capability(renders(), "of the renderer", "no EGL: apt install libegl1 libgl1-mesa-dri"),
 }
 
+# The garbage collector would go through all that is imported, again and again: a quarter of the tests' time.
+gc.disable()
+
 MISSING = [name for name, capability in CAPABILITIES.items() if not capability.present]
 LEFT_OUT = pytest.StashKey[dict[str, int]]()
 
@@ -73,6 +77,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.workeroutput["left_out"] = config.stash[LEFT_OUT]
     items[:] = [item for item in items if item not in left_out]
     config.hook.pytest_deselected(items=left_out)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(optionalhook=True)
