@@ -217,7 +217,7 @@ def send_until_taken(send: Sender, client: httpx.Client) -> int:
     """
     deadline_s = time.monotonic() + 300
     while (status := send(client)[0]) == 503 and time.monotonic() < deadline_s:
-        time.sleep(0.1)
+        time.sleep(0.5)
     return status
 
 
