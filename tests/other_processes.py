@@ -8,9 +8,11 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 
 @contextmanager
-def halted(process: subprocess.Popen[Any]) -> Iterator[None]:
+def halted(process: subprocess.Popen[Any] | psutil.Process) -> Iterator[None]:
     """A process stands still during the block, and keeps what it holds."""
     process.send_signal(signal.SIGSTOP)
     try:
