@@ -39,7 +39,7 @@ ORDER = DepthOrder(always=("disparity.pfm", "confidence.png"))
 
 @pytest.fixture(scope="module")
 def engine(ray_address):
-    engine = Engine(ray_address, workers=2)
+    engine = Engine(ray_address, workers=1)
     with connect(engine):
         yield engine
 
@@ -384,7 +384,7 @@ def test_pairs_go_from_a_bucket_to_a_bucket_with_a_calibration_and_a_bad_one_is_
 def test_the_command_tells_how_it_went(engine, tmp_path, capsys):
     source, out = write_pairs(tmp_path / "pairs", numbered(2)), tmp_path / "out"
     (source / "left" / "01.png").write_bytes(b"none")
-    assert main(["batch", str(source), str(out), "--workers", "2"]) == 1
+    assert main(["batch", str(source), str(out), "--workers", "1"]) == 1
     told = capsys.readouterr()
     assert told.out.splitlines()[0] == f"{out}: 2 pairs: 1 made, 1 failed"
     assert told.out.splitlines()[1].startswith(f"failed: 01: {source}/left/01.png: expected a picture")
