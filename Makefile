@@ -1,6 +1,6 @@
 # make demo    depth, a new view and a report, of the example or of LEFT=… RIGHT=… (needs Python 3.11 or newer)
 # make test    the tests, JOBS=3 files at a time
-# make check   style, types, floors of imports, and the tests
+# make check   style, types, imports between rooms, and the tests
 # make mutate which of COUNT=400 changes of the sources, drawn by SEED, the tests notice; a stopped run goes on
 # make fuzz    damaged files and requests for SECONDS=60, each answered by our own errors or kept in tests/corpus
 # make bench   accuracy and time on the real pairs in STEREOWEAVE_TESTDATA

@@ -8,9 +8,9 @@ from pathlib import Path
 from PIL import Image
 
 import stereoweave as sw
-from stereoweave.calibration_files import read_rig
-from stereoweave.colour import colour_disparity, colour_range_px
-from stereoweave.io import write_depth_png, write_image
+from stereoweave.cameras.calibration_files import read_rig
+from stereoweave.io.colormap import colour_disparity, colour_range_px
+from stereoweave.io.files import write_depth_png, write_image
 
 HERE = Path(__file__).parent
 

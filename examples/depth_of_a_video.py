@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 import stereoweave as sw
-from stereoweave.colour import colour_disparity
+from stereoweave.io.colormap import colour_disparity
 
 source = sys.argv[1]
 capture = cv2.VideoCapture(int(source) if source.isdigit() else source)

@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 
 import stereoweave as sw
-from stereoweave.calibration_files import calibrated
-from stereoweave.io import read_pair
-from stereoweave.measuring import CameraError, distance
+from stereoweave.cameras.calibration_files import calibrated
+from stereoweave.io.files import read_pair
+from stereoweave.outputs.measure import CameraError, distance
 
 HERE = Path(__file__).parent
 

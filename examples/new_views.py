@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 import stereoweave as sw
-from stereoweave.animation import write_animation
-from stereoweave.io import read_pair, write_image
-from stereoweave.rendering import Renderer
+from stereoweave.io.animation import write_animation
+from stereoweave.io.files import read_pair, write_image
+from stereoweave.rendering.renderer import Renderer
 
 HERE = Path(__file__).parent
 

@@ -6,9 +6,9 @@ Run: python examples/point_cloud.py
 from pathlib import Path
 
 import stereoweave as sw
-from stereoweave.calibration_files import calibrated
-from stereoweave.clouds import point_cloud, surface, write_glb, write_ply
-from stereoweave.io import read_pair
+from stereoweave.cameras.calibration_files import calibrated
+from stereoweave.io.files import read_pair
+from stereoweave.outputs.point_cloud import point_cloud, surface, write_glb, write_ply
 
 HERE = Path(__file__).parent
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from stereoweave.stereo_matcher import StereoMatcher
+from stereoweave.matching.sgbm_interface import StereoMatcher
 
 HERE = Path(__file__).parent
 

@@ -17,7 +17,7 @@ import typer
 from fuzz.findings import keep
 from fuzz.running import Outcome, fuzz
 from fuzz.targets import NAMES
-from stereoweave.threads import usable_cores
+from stereoweave.system.threads import usable_cores
 
 CORPUS = Path(__file__).parent.parent / "tests" / "corpus"
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from time import monotonic
 
 # Not the thread by which a worker ends with its parent.
-_OWN_FRAME = re.compile(r'/(stereoweave/(?!processes)[\w/]+\.py)", line \d+,? in (\w+)')
+_OWN_FRAME = re.compile(r'/(stereoweave/(?!system/processes)[\w/]+\.py)", line \d+,? in (\w+)')
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from fuzz.findings import Finding, kept, shrunk
 from fuzz.mutations import mutate
 from fuzz.targets import load
 from stereoweave.errors import StereoweaveError
-from stereoweave.processes import begin_work
+from stereoweave.system.processes import begin_work
 
 READY, DONE = "ready", "done"
 CASE, LOG = "case", "log"

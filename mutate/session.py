@@ -24,7 +24,7 @@ _MEASURED_WITHIN_S = 900
 # A loaded machine takes longer than it did when the tests were measured.
 _TIMES_AS_LONG, _START_S = 4, 60
 # Tests that call nearly all kernels of Numba.
-_COMPILING = ("tests/test_moving.py", "tests/test_synthesis.py")
+_COMPILING = ("tests/rendering/test_camera_motion.py", "tests/rendering/test_synthesize.py")
 # Pytest's exit code where no test was found.
 _NO_TESTS = 5
 # Nothing else can change what a test finds.
@@ -110,7 +110,7 @@ class Session:
             tree.pytest(words, self.folder / f"log-{tree.folder.name}.txt", _MEASURED_WITHIN_S)
 
     def _kept(self, file: str) -> Path:
-        return self.folder / "covered" / f"{Path(file).stem}.json"
+        return self.folder / "covered" / f"{_flat(file)}.json"
 
     def _measured(self, file: str, told: Telling) -> Path:
         """The JSON file of what was measured of a test file."""
@@ -149,11 +149,16 @@ def _measure(tree: Tree, file: str, folder: Path) -> dict[str, Any]:
         encoding="utf-8",
     )
     variables = {"COVERAGE_PROCESS_START": str(settings), TIMES_FILE: str(times)}
-    log = folder.parent / f"log-{Path(file).stem}.txt"
+    log = folder.parent / f"log-{_flat(file)}.txt"
     tree.pytest(["-p", "mutate.measuring", file], log, _MEASURED_WITHIN_S, **variables)
     if not times.exists():
         raise RuntimeError(f"{log}: expected tests that end, found that they were stopped")
     return json.loads(times.read_text(encoding="utf-8")) | {"lines": lines_run(folder, tree.folder)}
+
+
+def _flat(file: str) -> str:
+    """A path as the name of a file."""
+    return file.removesuffix(".py").replace("/", "-")
 
 
 def _outcomes(path: Path) -> dict[int, dict[str, Any]]:

@@ -3,16 +3,16 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from stereoweave.telemetry import disable_telemetry
+from stereoweave.system.telemetry import disable_telemetry
 
 if TYPE_CHECKING:
     from stereoweave.errors import FormatError, MatcherError, StereoweaveError
-    from stereoweave.matcher import Matcher
-    from stereoweave.matching import estimate
-    from stereoweave.rendering import render
+    from stereoweave.matching.estimate import estimate
+    from stereoweave.matching.matcher import Matcher
+    from stereoweave.matching.sgbm_interface import StereoMatcher
+    from stereoweave.rendering.renderer import render
+    from stereoweave.rendering.synthesize import synthesize
     from stereoweave.stereo import DepthCurve, Estimate, Sample, StereoCamera, StereoPair, View
-    from stereoweave.stereo_matcher import StereoMatcher
-    from stereoweave.synthesis import synthesize
 
 __version__ = "0.1.0"
 
@@ -20,17 +20,17 @@ _HOMES = {
     "DepthCurve": "stereo",
     "Estimate": "stereo",
     "FormatError": "errors",
-    "Matcher": "matcher",
+    "Matcher": "matching.matcher",
     "MatcherError": "errors",
     "Sample": "stereo",
     "StereoCamera": "stereo",
-    "StereoMatcher": "stereo_matcher",
+    "StereoMatcher": "matching.sgbm_interface",
     "StereoPair": "stereo",
     "StereoweaveError": "errors",
     "View": "stereo",
-    "estimate": "matching",
-    "render": "rendering",
-    "synthesize": "synthesis",
+    "estimate": "matching.estimate",
+    "render": "rendering.renderer",
+    "synthesize": "rendering.synthesize",
 }
 
 __all__ = [

@@ -2,7 +2,7 @@
 
 import sys
 
-from stereoweave.cli import main
+from stereoweave.cli.root import main
 
 if __name__ == "__main__":
     sys.exit(main())

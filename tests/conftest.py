@@ -67,6 +67,8 @@ LEFT_OUT = pytest.StashKey[dict[str, int]]()
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    # Those of no room first, which are the longest: at the end one process would wait for them.
+    items.sort(key=lambda item: len(item.path.parts))
     if os.environ.get("STEREOWEAVE_REQUIRE_ALL") == "1":
         return
     left_out = [item for item in items if any(map(item.get_closest_marker, MISSING))]
@@ -151,7 +153,8 @@ def ray_head(cpus: int) -> Iterator[str]:
         command = [sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--block"]
         command += ["--disable-usage-stats", *(f"--{name}={value}" for name, value in options.items())]
         log = Path(folder, "start.log")
-        paths = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+        root = Path(__file__).parent.parent
+        paths = [str(root), str(root / "tests" / "helpers"), *filter(None, [os.environ.get("PYTHONPATH")])]
         with log.open("wb") as out:
             environment = os.environ | {
                 # Whoever has a token in his home folder would have to show it.

@@ -18,7 +18,7 @@ import torch
 import trimesh
 from PIL import Image
 
-from stereoweave.io import read_image, read_pixels
+from stereoweave.io.files import read_image, read_pixels
 from stereoweave.stereo import Estimate, StereoCamera
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"

@@ -64,7 +64,7 @@ def test_the_command_keeps_what_it_found_and_fails(tmp_path):
     def run(target: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "fuzz", "--seconds", "0.5", "--seed", "3", "--target", target]
         command += ["--corpus", str(tmp_path / "corpus"), "--out", str(tmp_path / "fuzz.csv")]
-        paths = os.pathsep.join([str(REPOSITORY), str(REPOSITORY / "tests")])
+        paths = os.pathsep.join([str(REPOSITORY), str(REPOSITORY / "tests" / "helpers")])
         environment = os.environ | {"PYTHONPATH": paths}
         return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
 

@@ -23,7 +23,7 @@ def next_of(x):
     return x + 5
 """
 TEST = """
-from stereoweave.rendering import clipped, next_of
+from stereoweave.rendering.renderer import clipped, next_of
 
 
 def test_what_is_too_much_is_clipped():
@@ -41,8 +41,9 @@ def repository(tmp_path):
     """A repository of one source, with tests of one part of it that say much and of one that say little."""
     root = tmp_path / "repository"
     shutil.copytree(ROOT / "mutate", root / "mutate", ignore=shutil.ignore_patterns("__pycache__"))
-    for name, text in (("stereoweave/rendering.py", SOURCE), ("tests/test_rendering.py", TEST)):
-        (root / name).parent.mkdir()
+    files = {"stereoweave/rendering/renderer.py": SOURCE, "tests/rendering/test_renderer.py": TEST}
+    for name, text in files.items():
+        (root / name).parent.mkdir(parents=True)
         (root / name).write_text(text)
     (root / "results").mkdir()
     (root / "pyproject.toml").write_text("")
@@ -67,7 +68,7 @@ def test_a_mutant_that_no_test_notices_survives_and_what_was_tried_is_not_tried_
     assert {mutant.line for mutant in draw(repository, 3, seed=1)} == {3, 7}
     ended = mutate(repository)
     assert ended.stderr == ""
-    assert "killed: stereoweave/rendering.py:3 SwapFunction" in ended.stdout
+    assert "killed: stereoweave/rendering/renderer.py:3 SwapFunction" in ended.stdout
     with (repository / "results" / "mutants.csv").open() as table:
         rows = {row["module"]: row for row in csv.DictReader(table)}
     of_all = rows["all"]

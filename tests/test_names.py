@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from stereoweave.benchmark import write_csv
-from stereoweave.cli import main
-from stereoweave.io import read_image, write_image
+from stereoweave.bench.pairs import write_csv
+from stereoweave.cli.root import main
+from stereoweave.io.files import read_image, write_image
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 # Names as a disk of another country's has them, in Latin-1: "grün", "grûn".

@@ -13,9 +13,9 @@ import pytest
 from PIL import Image, ImageSequence
 from pyarrow import parquet
 
-from stereoweave.animation import write_animation
-from stereoweave.io import read_image
-from stereoweave.layouts import MOTIONS
+from stereoweave.io.animation import write_animation
+from stereoweave.io.files import read_image
+from stereoweave.rendering.layouts import MOTIONS
 
 pytestmark = pytest.mark.system
 

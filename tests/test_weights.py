@@ -12,17 +12,17 @@ import torch
 import torch.nn.functional as F
 
 import stereoweave as sw
-from stereoweave import metrics
+from stereoweave.bench import metrics
+from stereoweave.bench.edge_metrics import flying_percent
 from stereoweave.data.readers import read_scenes
-from stereoweave.edges import flying_percent
-from stereoweave.io import read_image
+from stereoweave.io.files import read_image
 from stereoweave.learn import checkpoint
-from stereoweave.learn.collage import sample
-from stereoweave.learn.export import differences
+from stereoweave.learn.data.collage import sample
+from stereoweave.learn.export.from_checkpoint import differences
 from stereoweave.learn.models import network_of
 from stereoweave.learn.models.layers import local_soft_argmax
-from stereoweave.matcher import Matcher, shipped_models
-from stereoweave.matching import match
+from stereoweave.matching.estimate import match
+from stereoweave.matching.matcher import Matcher, shipped_models
 
 ROOT = Path(__file__).parent.parent
 WEIGHTS = ROOT / "stereoweave/weights"

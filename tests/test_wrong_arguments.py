@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import stereoweave as sw
-from stereoweave.arrays import as_rgb
 from stereoweave.errors import StereoweaveError
-from stereoweave.io import read_image
-from stereoweave.rendering import Renderer
+from stereoweave.io.arrays import as_rgb
+from stereoweave.io.files import read_image
+from stereoweave.rendering.renderer import Renderer
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 LEFT, RIGHT = (

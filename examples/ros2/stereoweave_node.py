@@ -16,8 +16,8 @@ from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from stereo_msgs.msg import DisparityImage
 
-from stereoweave.matcher import Matcher
-from stereoweave.matching import match
+from stereoweave.matching.estimate import match
+from stereoweave.matching.matcher import Matcher
 from stereoweave.stereo import StereoPair
 
 

@@ -7,9 +7,9 @@ import numpy as np
 
 from fuzz.targets import Target, written
 from fuzz.targets.pictures import eyes
-from stereoweave.calibration import Optics, Rig
-from stereoweave.calibration_files import read_rig, write_rig
-from stereoweave.rectify import rectify
+from stereoweave.cameras.calibration_files import read_rig, write_rig
+from stereoweave.cameras.rectify import rectify
+from stereoweave.cameras.rig import Optics, Rig
 from stereoweave.stereo import StereoPair
 
 MIDDLEBURY = """cam0=[60 0 36; 0 60 24; 0 0 1]

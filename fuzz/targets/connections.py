@@ -15,7 +15,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from fuzz.requests import ServerError, request_bytes
 from fuzz.targets import Target
 from stereoweave.errors import StereoweaveError
-from stereoweave.service_server import Patience, http_server
+from stereoweave.service.server import Patience, http_server
 
 ANSWERED_S = 3.0
 # The client keeps the connection open for as long as answers come, so that later requests are answered too.

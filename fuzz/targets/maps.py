@@ -8,7 +8,7 @@ import numpy as np
 from fuzz.repairs import repair_png
 from fuzz.targets import Target, read_every_way, written
 from fuzz.targets.pictures import encoded
-from stereoweave.io import read_disparity_png, read_pfm, read_pixels, write_disparity_png, write_pfm
+from stereoweave.io.files import read_disparity_png, read_pfm, read_pixels, write_disparity_png, write_pfm
 
 
 def _starts() -> dict[str, bytes]:

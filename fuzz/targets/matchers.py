@@ -6,7 +6,7 @@ from onnx import TensorProto, helper
 
 from fuzz.targets import Target
 from fuzz.targets.pictures import eyes
-from stereoweave.matcher import Matcher
+from stereoweave.matching.matcher import Matcher
 
 _PROPERTIES = {"name": "by_rule", "multiple_of": "16", "max_disparity_px": "192"}
 

@@ -13,8 +13,8 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from fuzz.requests import repair_length, request_bytes, send
 from fuzz.targets import Target
+from stereoweave.app.access import ContentPolicy, OwnFiles
 from stereoweave.errors import StereoweaveError
-from stereoweave.page_gate import ContentPolicy, OwnFiles
 
 _OWN, _FOREIGN = "/page/a/own.png", "/page/b/foreign.png"
 _VISITOR, _OTHER = ({"Cookie": f"stereoweave-visitor={letter * 43}"} for letter in "ab")

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from fuzz.targets import Target
-from stereoweave.pair_lists import pairs_in_list
+from stereoweave.pictures.pair_finding import pairs_in_list
 
 _STARTS = {
     "spaces.txt": b"left/a.png right/a.png\n# a comment\n\nleft/b.png right/b.png second\n",

@@ -12,9 +12,9 @@ from PIL import Image, ImageCms, features
 
 from fuzz.repairs import repair_png
 from fuzz.targets import Target, read_every_way, written
-from stereoweave.io import read_image
-from stereoweave.layouts import write_picture
-from stereoweave.pictures import open_pictures
+from stereoweave.io.files import read_image
+from stereoweave.pictures.loading import open_pictures
+from stereoweave.rendering.layouts import write_picture
 
 _SIZE_PX = 48, 72
 

@@ -9,9 +9,9 @@ from fuzz.requests import Application, repair_length, request_bytes, send
 from fuzz.targets import Target, calibrations
 from fuzz.targets.pictures import encoded, eyes
 from stereoweave.errors import StereoweaveError
-from stereoweave.matcher import Matcher
-from stereoweave.service_http import Guard, Limits, make_app
-from stereoweave.service_requests import Answer, Order, answer_many, check_pixels
+from stereoweave.matching.matcher import Matcher
+from stereoweave.service.answers import Answer, Order, answer_many, check_pixels
+from stereoweave.service.asgi import Guard, Limits, make_app
 
 # A first view compiles its kernels.
 _LIMITS = Limits(megapixels=0.05, megabytes=0.5, timeout_s=600)

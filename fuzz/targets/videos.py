@@ -10,8 +10,8 @@ import numpy as np
 
 from fuzz.targets import Target, written
 from fuzz.targets.pictures import eyes
-from stereoweave.footage import open_footage
-from stereoweave.footage_tracks import open_track
+from stereoweave.video.reader import open_footage
+from stereoweave.video.tracks import open_track
 
 _FRAMES = 5
 _KINDS = {

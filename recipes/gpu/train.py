@@ -95,8 +95,8 @@ def _train(options: argparse.Namespace) -> None:
 
     from stereoweave.errors import StereoweaveError
     from stereoweave.learn.recipe import read_recipe
-    from stereoweave.learn.timed import Command, train_by_clock
-    from stereoweave.threads import usable_cores
+    from stereoweave.learn.training.timed import Command, train_by_clock
+    from stereoweave.system.threads import usable_cores
 
     recipe = read_recipe(options.recipe)
     if options.batch:

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from stereoweave.calibration_files import calibrated
+from stereoweave.cameras.calibration_files import calibrated
 from stereoweave.data.frames import Frame, existing, scenes
 from stereoweave.data.samples import make_sample, of_its_size
-from stereoweave.io import read_pair, read_pfm, read_pixels
+from stereoweave.io.files import read_pair, read_pfm, read_pixels
 from stereoweave.stereo import Sample
 
 

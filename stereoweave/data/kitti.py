@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from stereoweave.calibration_files import calibration_bytes
+from stereoweave.cameras.calibration_files import calibration_bytes
 from stereoweave.data.frames import Frame, existing, matched
 from stereoweave.data.samples import make_sample, of_its_size
 from stereoweave.errors import FormatError
-from stereoweave.io import read_disparity_png, read_pair, reading
+from stereoweave.io.files import read_disparity_png, read_pair, reading
 from stereoweave.stereo import Sample, StereoCamera, StereoPair
 
 

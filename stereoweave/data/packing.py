@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Shaped, UInt8
 from PIL import Image
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.picture_files import unpacked_values
+from stereoweave.io.decoding import unpacked_values
 from stereoweave.stereo import Sample, StereoCamera
 
 _UNKNOWN = 65535

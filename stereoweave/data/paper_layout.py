@@ -18,12 +18,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
-from stereoweave.calibration_files import calibrated
+from stereoweave.cameras.calibration_files import calibrated
 from stereoweave.data.checksums import check_sums, checksums
 from stereoweave.data.frames import Frame, matched
 from stereoweave.data.samples import make_sample, of_its_size
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io import read_pair, read_pixels, reading, replacing, write_image
+from stereoweave.io.files import read_pair, read_pixels, reading, replacing, write_image
 from stereoweave.stereo import Sample, StereoCamera
 
 RANGE_M = 15.0

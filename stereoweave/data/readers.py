@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from stereoweave.calibration_files import calibrated
+from stereoweave.cameras.calibration_files import calibrated
 from stereoweave.data import eth3d, kitti, middlebury, paper_layout, scene_flow, shards, sintel
 from stereoweave.data.frames import Frame, existing
 from stereoweave.data.splits import split_frames
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io import read_disparity_png, read_pair, read_pfm
+from stereoweave.io.files import read_disparity_png, read_pair, read_pfm
 from stereoweave.stereo import StereoPair
 
 __all__ = ["DATASETS", "Frame", "Scene", "list_scenes", "open_dataset", "read_scenes", "split_frames"]

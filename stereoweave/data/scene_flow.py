@@ -15,7 +15,7 @@ from jaxtyping import Float32
 from stereoweave.data.frames import Frame, existing, matched
 from stereoweave.data.samples import make_sample, of_its_size
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io import read_pair, read_pfm
+from stereoweave.io.files import read_pair, read_pfm
 from stereoweave.stereo import Sample, StereoCamera, StereoPair
 
 _PASSES = {"clean": "frames_cleanpass", "final": "frames_finalpass"}

@@ -24,7 +24,7 @@ from stereoweave.data.checksums import check_sums, checksums
 from stereoweave.data.frames import Frame
 from stereoweave.data.packing import unpacked, unpacked_views
 from stereoweave.errors import FormatError
-from stereoweave.io import reading, replacing
+from stereoweave.io.files import reading, replacing
 from stereoweave.stereo import Sample
 
 Unpacked = TypeVar("Unpacked")

@@ -11,7 +11,7 @@ from jaxtyping import Float32, UInt8
 from stereoweave.data.frames import Frame, matched
 from stereoweave.data.samples import make_sample, of_its_size
 from stereoweave.errors import FormatError
-from stereoweave.io import read_pair, read_pixels, read_small, reading
+from stereoweave.io.files import read_pair, read_pixels, read_small, reading
 from stereoweave.stereo import Sample, StereoCamera
 
 # "Rendered from two cameras with a baseline of 10 cm apart": the dataset's README.

@@ -8,16 +8,16 @@ import torch
 from jaxtyping import Float
 from rich.console import Console
 
+from stereoweave.bench.projected_views import Method, ViewRow, score_views
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn import checkpoint
-from stereoweave.learn.batches import collated, known
 from stereoweave.learn.checkpoint import Checkpoint
+from stereoweave.learn.data.batches import collated, known
+from stereoweave.learn.data.sources import Source, kept, sources
 from stereoweave.learn.models import CodeNetwork, network_of
-from stereoweave.learn.objective import CodeObjective
 from stereoweave.learn.recipe import Recipe
-from stereoweave.learn.sources import Source, kept, sources
+from stereoweave.learn.training.objective import CodeObjective
 from stereoweave.stereo import Sample
-from stereoweave.view_benchmark import Method, ViewRow, score_views
 
 MEDIAN = "median"
 # Pairs, and every so many pixels of them along both sides, that a median is taken over.

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from stereoweave.errors import FormatError
-from stereoweave.io import read_small, reading
+from stereoweave.io.files import read_small, reading
 
 # In characters; our longest recipe has 1,064. Python's time for a key grows with the square of its dots.
 _LONGEST = 10_000

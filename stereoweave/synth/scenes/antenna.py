@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.synth.aerials import dipoles, drum, panel, whip, yagi
-from stereoweave.synth.lattice import (
+from stereoweave.synth.props.aerials import dipoles, drum, panel, whip, yagi
+from stereoweave.synth.props.lattice import (
     Bracing,
     aviation,
     bars,
@@ -21,12 +21,21 @@ from stereoweave.synth.lattice import (
     rings,
     truss,
 )
-from stereoweave.synth.parts import boxes, shift, tubes, turn
+from stereoweave.synth.props.primitives import boxes, shift, tubes, turn
+from stereoweave.synth.props.surroundings import (
+    bushes,
+    daylight,
+    hills,
+    houses,
+    places,
+    rocks,
+    terrain,
+    trees,
+)
 from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.scenes.radio_dish import radio_dish
 from stereoweave.synth.scenes.roof_aerials import roof_aerials
 from stereoweave.synth.stage import Palette, Stage
-from stereoweave.synth.surroundings import bushes, daylight, hills, houses, places, rocks, terrain, trees
 from stereoweave.synth.world import Material, Mesh, World, joined
 
 

@@ -4,14 +4,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from stereoweave.synth.bridges import SCALE, Plan, abutments, lamps, planned, stone_arches
-from stereoweave.synth.cable_bridges import cable_stayed, suspension
-from stereoweave.synth.parts import boxes, sheet, shift, turn
+from stereoweave.synth.props.bridges import SCALE, Plan, abutments, lamps, planned, stone_arches
+from stereoweave.synth.props.cable_bridges import cable_stayed, suspension
+from stereoweave.synth.props.primitives import boxes, sheet, shift, turn
+from stereoweave.synth.props.surroundings import bushes, daylight, hills, houses, places, rocks, sea, trees
+from stereoweave.synth.props.truss_bridges import lift_bridge, truss_girder
+from stereoweave.synth.props.vehicles import fleet
 from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
-from stereoweave.synth.surroundings import bushes, daylight, hills, houses, places, rocks, sea, trees
-from stereoweave.synth.truss_bridges import lift_bridge, truss_girder
-from stereoweave.synth.vehicles import fleet
 from stereoweave.synth.world import Material, Mesh, World, joined
 
 KINDS: dict[str, Callable[[np.random.Generator, Palette, Plan], Mesh]] = {

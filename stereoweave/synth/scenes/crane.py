@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.synth.building_sites import building_site
-from stereoweave.synth.lattice import (
+from stereoweave.synth.props.building_sites import building_site
+from stereoweave.synth.props.lattice import (
     Truss,
     aviation,
     bars,
@@ -20,11 +20,11 @@ from stereoweave.synth.lattice import (
     rings,
     truss,
 )
-from stereoweave.synth.parts import boxes, lathe, sweep, tubes, turn
+from stereoweave.synth.props.primitives import boxes, lathe, sweep, tubes, turn
+from stereoweave.synth.props.surroundings import daylight
 from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.scenes.quay_crane import quay_crane
 from stereoweave.synth.stage import Palette, Stage
-from stereoweave.synth.surroundings import daylight
 from stereoweave.synth.world import Colour, Material, Mesh, World, joined
 
 PAINTS: tuple[Colour, ...] = (

@@ -4,13 +4,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from stereoweave.synth.clutter import Space, clutter
-from stereoweave.synth.figures import animal, draw_clothes, person
-from stereoweave.synth.interiors import indoor_light, lamp_spots, lamps_at, pendants, shell
-from stereoweave.synth.parts import turn
+from stereoweave.synth.props.clutter import Space, clutter
+from stereoweave.synth.props.figures import animal, draw_clothes, person
+from stereoweave.synth.props.interiors import indoor_light, lamp_spots, lamps_at, pendants, shell
+from stereoweave.synth.props.primitives import turn
+from stereoweave.synth.props.surroundings import (
+    bushes,
+    daylight,
+    hills,
+    houses,
+    places,
+    rocks,
+    terrain,
+    trees,
+)
 from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
-from stereoweave.synth.surroundings import bushes, daylight, hills, houses, places, rocks, terrain, trees
 from stereoweave.synth.world import Colour, Mesh, Sky, World, joined
 
 # A figure before the lens, a background far behind it.

@@ -4,15 +4,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stereoweave.synth import surroundings
-from stereoweave.synth.lattice import railing
-from stereoweave.synth.parts import boxes, copies, lathe, prism, shift, tubes, turn
+from stereoweave.synth.props import surroundings
+from stereoweave.synth.props.lattice import railing
+from stereoweave.synth.props.primitives import boxes, copies, lathe, prism, shift, tubes, turn
+from stereoweave.synth.props.propellers import Screw, draw_screw, screw_mesh
+from stereoweave.synth.props.shipyards import blocks, dock, lamps, litter, scaffold, yard
+from stereoweave.synth.props.sterns import stern
+from stereoweave.synth.props.surroundings import daylight, places, varied
 from stereoweave.synth.rigs import Orbit
-from stereoweave.synth.screws import Screw, draw_screw, screw_mesh
-from stereoweave.synth.shipyards import blocks, dock, lamps, litter, scaffold, yard
 from stereoweave.synth.stage import Palette, Stage
-from stereoweave.synth.sterns import stern
-from stereoweave.synth.surroundings import daylight, places, varied
 from stereoweave.synth.world import Colour, Lamp, Material, Mesh, Sky, World, joined
 
 # How a screw may look: texture and variants, colour, roughness, metal.

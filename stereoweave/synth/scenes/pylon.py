@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.synth.lattice import (
+from stereoweave.synth.props.lattice import (
     Segments,
     Truss,
     aviation,
@@ -20,10 +20,10 @@ from stereoweave.synth.lattice import (
     rings,
     truss,
 )
-from stereoweave.synth.parts import Points, boxes, copies, shift, spheres
+from stereoweave.synth.props.primitives import Points, boxes, copies, shift, spheres
+from stereoweave.synth.props.surroundings import bushes, daylight, hills, houses, places, terrain, trees
 from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
-from stereoweave.synth.surroundings import bushes, daylight, hills, houses, places, terrain, trees
 from stereoweave.synth.world import Material, Mesh, World, joined
 
 # Each arm: its height and its reach, as shares of the tower's height, and the conductors on each side.

@@ -5,13 +5,31 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.synth.lattice import aviation, galvanised, painted, railing
-from stereoweave.synth.parts import boxes, lathe, shift, turn
-from stereoweave.synth.pipework import pipes, rack
-from stereoweave.synth.plants import Coats, Unit, ball_tank, chimney, column, drum_tank, flare, vessels
+from stereoweave.synth.props.lattice import aviation, galvanised, painted, railing
+from stereoweave.synth.props.pipework import pipes, rack
+from stereoweave.synth.props.primitives import boxes, lathe, shift, turn
+from stereoweave.synth.props.refinery_units import (
+    Coats,
+    Unit,
+    ball_tank,
+    chimney,
+    column,
+    drum_tank,
+    flare,
+    vessels,
+)
+from stereoweave.synth.props.surroundings import (
+    barrels,
+    daylight,
+    hills,
+    houses,
+    pallets,
+    places,
+    terrain,
+    trees,
+)
 from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
-from stereoweave.synth.surroundings import barrels, daylight, hills, houses, pallets, places, terrain, trees
 from stereoweave.synth.world import Material, Mesh, World, joined
 
 UNITS: dict[str, Callable[[np.random.Generator, Coats], Unit]] = {

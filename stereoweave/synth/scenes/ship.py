@@ -4,25 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from stereoweave.synth import deck_gear as gear
-from stereoweave.synth.deckhouses import (
-    Paints,
-    door,
-    funnel,
-    lifebuoys,
-    mast,
-    stays,
-    tyres,
-    windows,
-)
-from stereoweave.synth.harbours import harbour, open_water
-from stereoweave.synth.hulls import Hull
-from stereoweave.synth.lattice import galvanised, ladder, painted, railing
-from stereoweave.synth.parts import Point, lathe, sheet, tubes, turn
+from stereoweave.synth.props import deck_gear as gear
+from stereoweave.synth.props.deckhouses import Paints, door, funnel, lifebuoys, mast, stays, tyres, windows
+from stereoweave.synth.props.harbours import harbour, open_water
+from stereoweave.synth.props.hulls import Hull
+from stereoweave.synth.props.lattice import galvanised, ladder, painted, railing
+from stereoweave.synth.props.primitives import Point, lathe, sheet, tubes, turn
+from stereoweave.synth.props.surroundings import daylight, varied
+from stereoweave.synth.props.vessels import TRADES, Plan
 from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
-from stereoweave.synth.surroundings import daylight, varied
-from stereoweave.synth.vessels import TRADES, Plan
 from stereoweave.synth.world import Colour, Material, Mesh, World, joined
 
 

@@ -2,9 +2,7 @@
 
 import numpy as np
 
-from stereoweave.synth.rigs import Orbit
-from stereoweave.synth.stage import Palette, Stage
-from stereoweave.synth.streets import (
+from stereoweave.synth.props.streets import (
     carriageway,
     draw_street_plan,
     fronts,
@@ -12,7 +10,9 @@ from stereoweave.synth.streets import (
     traffic,
     walkers,
 )
-from stereoweave.synth.surroundings import daylight, hills, terrain
+from stereoweave.synth.props.surroundings import daylight, hills, terrain
+from stereoweave.synth.rigs import Orbit
+from stereoweave.synth.stage import Palette, Stage
 from stereoweave.synth.world import World, joined
 
 # Between the road before the car and the horizon.

@@ -2,11 +2,21 @@
 
 import numpy as np
 
-from stereoweave.synth.lattice import bars, chains, galvanised, ladder, levels, painted, railing, rings, truss
-from stereoweave.synth.parts import boxes, copies, lathe, sheet, spheres, tubes, turn
+from stereoweave.synth.props.lattice import (
+    bars,
+    chains,
+    galvanised,
+    ladder,
+    levels,
+    painted,
+    railing,
+    rings,
+    truss,
+)
+from stereoweave.synth.props.primitives import boxes, copies, lathe, sheet, spheres, tubes, turn
+from stereoweave.synth.props.surroundings import bushes, daylight, fence, hills, places, rocks, terrain, trees
 from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
-from stereoweave.synth.surroundings import bushes, daylight, fence, hills, places, rocks, terrain, trees
 from stereoweave.synth.world import Material, Mesh, World, joined
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereoweave.synth.lattice import (
+from stereoweave.synth.props.lattice import (
     bars,
     cables,
     galvanised,
@@ -15,12 +15,22 @@ from stereoweave.synth.lattice import (
     rings,
     truss,
 )
-from stereoweave.synth.parts import boxes, copies, lathe, sheet, shift, spheres, tubes, turn
+from stereoweave.synth.props.primitives import boxes, copies, lathe, sheet, shift, spheres, tubes, turn
+from stereoweave.synth.props.surroundings import (
+    bushes,
+    daylight,
+    fence,
+    hills,
+    houses,
+    places,
+    sea,
+    terrain,
+    trees,
+)
+from stereoweave.synth.props.wind_rotors import Finish, Rotor, composite, head
 from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.scenes.wind_pump import wind_pump
 from stereoweave.synth.stage import Palette, Stage
-from stereoweave.synth.surroundings import bushes, daylight, fence, hills, houses, places, sea, terrain, trees
-from stereoweave.synth.wind_rotors import Finish, Rotor, composite, head
 from stereoweave.synth.world import Colour, Material, Mesh, World, joined
 
 KINDS = {"tube": 0.45, "sea": 0.25, "lattice": 0.15, "pump": 0.15}

@@ -1,0 +1,382 @@
+"""What cameras see, and its disparity in colours beside it: on a page of this machine, as it comes.
+
+OpenCV as it is installed here has no windows, and a rig often has no screen. A browser shows a stream of JPEG
+pictures (multipart/x-mixed-replace) by itself, from another machine too, through a tunnel.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import count
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple, cast
+from urllib.parse import urlsplit
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from stereoweave.cameras.rectify import rectify
+from stereoweave.cameras.rig import Rig
+from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.io.colormap import colour_disparity, colour_range_px
+from stereoweave.matching.estimate import match
+from stereoweave.matching.matcher import Matcher
+from stereoweave.pictures.frame_packing import ARRANGEMENTS, guess_arrangement
+from stereoweave.stereo import StereoCamera, StereoPair
+
+Picture = UInt8[np.ndarray, "h w 3"]
+Frame = UInt8[np.ndarray, "rows columns 3"]
+
+_ADDRESS = "127.0.0.1"
+# A name that another site's DNS server gives this address must not open the page to that site.
+_OWN_NAMES = (_ADDRESS, "localhost")
+# Not "picture": FFmpeg, which may look too, takes its first letters for those of a QuickTime file.
+_BOUNDARY = "frame"
+_PAGE = b"""<!doctype html>
+<html lang="en">
+<meta charset="utf-8">
+<title>Stereoweave live</title>
+<style>
+  body { margin: 0; background: #111 }
+  img { display: block; width: 100vw; height: 100vh; object-fit: contain }
+</style>
+<img src="/stream" alt="The left picture, and its disparity in colours beside it">
+</html>
+"""
+_USUAL_RATE = 25.0
+# A network's address may take its time; a camera that gives nothing for so long is gone.
+_SILENT_S = 10.0
+# How far the colours follow the range of a new frame: at once, they would flicker.
+_FOLLOWED = 0.1
+_RANGED_EVERY_PX = 4
+_RATED_FRAMES = 30
+_STRIP_PX, _FONT, _FONT_SCALE = 32, cv2.FONT_HERSHEY_SIMPLEX, 0.6
+_JPEG_QUALITY = 85
+
+
+class Moment(NamedTuple):
+    """What the sources gave at once: RGB pictures, their number from 0 on, and when (time.monotonic)."""
+
+    number: int
+    pictures: tuple[Picture, ...]
+    taken_s: float
+
+
+class Capture:
+    """One source or two, read in step by a thread that keeps the newest moment and drops older ones.
+
+    A film is read at its own rate, as if a camera gave it.
+
+    Args:
+        sources: What OpenCV opens: a camera's number, a video file, a stream's address, or a series of
+            pictures as frame%03d.png; of both views, or two, the left one first.
+
+    Raises:
+        FormatError: If there is none of that name.
+        StereoweaveError: If there are more than two.
+    """
+
+    def __init__(self, sources: Sequence[str]) -> None:
+        if len(sources) > 2:
+            raise StereoweaveError(
+                f"expected one SOURCE with both views, or LEFT RIGHT, found {len(sources)}: "
+                f"{' '.join(sources)}"
+            )
+        self.name, self.count = " and ".join(sources), len(sources)
+        self._captures = [_opened(source) for source in sources]
+        first = self._captures[0]
+        # Of a picture, or a stream that was written down, no number of frames is known.
+        self._is_film = first.get(cv2.CAP_PROP_FRAME_COUNT) > 0 or Path(sources[0]).is_file()
+        rate = first.get(cv2.CAP_PROP_FPS)
+        self._step_s = 1 / (rate if rate > 0 else _USUAL_RATE)
+        self._newest: Moment | None = None
+        self._ended = False
+        self._changed, self._stopped = threading.Condition(), threading.Event()
+        self._thread = threading.Thread(target=self._read_on, daemon=True)
+
+    def __enter__(self) -> "Capture":
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stopped.set()
+        self._thread.join(timeout=1)  # a camera that hangs is left to the end of the process
+
+    def newest(self, after: int) -> Moment | None:
+        """The newest moment of a number above `after`, which is waited for; None at the end of a film.
+
+        Raises:
+            StereoweaveError: A camera or a stream gives nothing more, or a film nothing at all.
+        """
+        with self._changed:
+            came = self._changed.wait_for(lambda: self._ended or self._has(after), _SILENT_S)
+            if self._has(after):
+                return self._newest
+        if came and self._is_film and after >= 0:
+            return None
+        found = "the end of what it gives" if came else f"nothing for {_SILENT_S:g} s"
+        raise StereoweaveError(
+            f"{self.name}: expected frames, found {found} after {after + 1}; is it still connected?"
+        )
+
+    def _has(self, after: int) -> bool:
+        return self._newest is not None and self._newest.number > after
+
+    def _read_on(self) -> None:
+        begin_s = time.monotonic()
+        try:
+            for number in count():
+                pictures = self._read()
+                early_s = begin_s + number * self._step_s - time.monotonic() if self._is_film else 0
+                if pictures is None or self._stopped.wait(max(early_s, 0)):
+                    return
+                with self._changed:
+                    self._newest = Moment(number, pictures, time.monotonic())
+                    self._changed.notify_all()
+        finally:
+            for capture in self._captures:
+                capture.release()
+            with self._changed:
+                self._ended = True
+                self._changed.notify_all()
+
+    def _read(self) -> tuple[Picture, ...] | None:
+        # All are grabbed before any is decoded, so that two cameras are as near in time as can be.
+        if not all([capture.grab() for capture in self._captures]):
+            return None
+        frames = [capture.retrieve() for capture in self._captures]
+        if not all(well for well, _ in frames):
+            return None
+        return tuple(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB) for _, frame in frames)
+
+
+class Screen(ThreadingHTTPServer):
+    """A page on loopback that shows the newest picture to whoever opens it.
+
+    Args:
+        port: Where; any free one for 0.
+
+    Raises:
+        StereoweaveError: If it is taken.
+    """
+
+    def __init__(self, port: int) -> None:
+        try:
+            super().__init__((_ADDRESS, port), _Handler)
+        except OSError as error:
+            raise StereoweaveError(
+                f"--port: expected a port that is free, found {port} ({error.strerror}); 0 takes any that is"
+            ) from error
+        self.url = f"http://{_ADDRESS}:{self.server_port}/"
+        self._jpeg, self._number, self._closed = b"", 0, False
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self.serve_forever, daemon=True)
+
+    def __enter__(self) -> "Screen":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+        self.shutdown()
+        self.server_close()
+
+    def close(self) -> None:
+        """Ends the streams, after the newest picture."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    def show(self, picture: Picture) -> None:
+        """Shows an RGB picture from now on."""
+        _, jpeg = cv2.imencode(
+            ".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+        )
+        with self._changed:
+            self._jpeg, self._number = jpeg.tobytes(), self._number + 1
+            self._changed.notify_all()
+
+    def pictures(self) -> Iterator[bytes]:
+        """The pictures as JPEG, from the one that is shown on; those that come too fast are left out."""
+        shown = 0
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closed or self._number > shown)  # noqa: B023 - at once
+                if self._number == shown:
+                    return
+                jpeg, shown = self._jpeg, self._number
+            yield jpeg
+
+
+class _Handler(BaseHTTPRequestHandler):
+    def do_GET(self) -> None:
+        if urlsplit(f"//{self.headers.get('Host', '')}").hostname not in _OWN_NAMES:
+            self.send_error(403, "only for this machine")
+        elif self.path == "/":
+            self._begin("text/html; charset=utf-8")
+            self.wfile.write(_PAGE)
+        elif self.path == "/stream":
+            with suppress(ConnectionError):  # who looked has gone
+                self._stream()
+        else:
+            self.send_error(404)
+
+    def log_message(self, format: str, *values: object) -> None:
+        """Nothing: each request would be a line on the terminal."""
+
+    def _begin(self, kind: str) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", kind)
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("Cross-Origin-Resource-Policy", "same-origin")
+        self.end_headers()
+
+    def _stream(self) -> None:
+        boundary = f"\r\n--{_BOUNDARY}\r\n".encode()
+        self._begin(f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
+        self.wfile.write(boundary)
+        for jpeg in cast(Screen, self.server).pictures():
+            header = f"Content-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n".encode()
+            # The boundary at once, for a browser shows a picture when it sees the end of it.
+            self.wfile.write(header + jpeg + boundary)
+
+
+@dataclass
+class Tally:
+    """What was shown so far."""
+
+    shown: int = 0
+    last: int = -1
+    waited_s: float = 0.0
+    first_s: float = 0.0
+    last_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RATED_FRAMES))
+
+    def add(self, moment: Moment, now_s: float) -> None:
+        """Counts a moment that is shown now."""
+        self.first_s = self.first_s if self.shown else now_s
+        self.shown, self.last = self.shown + 1, moment.number
+        self.waited_s += now_s - moment.taken_s
+        self.last_s.append(now_s)
+
+    @property
+    def rate(self) -> float:
+        """Frames a second, of those that were shown last; 0 of a single one."""
+        return _rate(len(self.last_s), self.last_s[-1] - self.last_s[0])
+
+    def line(self) -> str:
+        """All of it in a line."""
+        if not self.shown:
+            return "nothing was shown"
+        rate = _rate(self.shown, self.last_s[-1] - self.first_s)
+        return (
+            f"{self.shown} frames shown of {self.last + 1}, {rate:.1f} a second, "
+            f"{1000 * self.waited_s / self.shown:.0f} ms after they came"
+        )
+
+
+def show(  # noqa: PLR0913 - what to look at, where, and how
+    capture: Capture,
+    screen: Screen,
+    matcher: Matcher,
+    tally: Tally,
+    *,
+    arrangement: str | None = None,
+    rig: Rig | None = None,
+) -> None:
+    """Shows what is captured, and its disparity, until its end.
+
+    Args:
+        capture: What to look at.
+        screen: Where it is shown.
+        matcher: What finds the disparity.
+        tally: Where it is counted, also when something ends it before.
+        arrangement: How one source holds both views, a name in `ARRANGEMENTS`; guessed unless given.
+        rig: The cameras, by which the pictures are rectified; without one they have to be rectified already.
+    """
+    range_px: tuple[float, float] | None = None
+    while moment := capture.newest(tally.last):
+        if capture.count == 1 and arrangement is None:
+            arrangement = guess_arrangement(capture.name, moment.pictures)
+        pair = _pair(moment.pictures, arrangement)
+        pair = rectify(pair, rig).pair if rig else pair
+        disparity_px = match(matcher, pair).disparity_px
+        range_px = followed(range_px, disparity_px)
+        tally.add(moment, time.monotonic())
+        words = f"{tally.rate:.1f} frames/s, {1000 * (tally.last_s[-1] - moment.taken_s):.0f} ms"
+        screen.show(composed(pair, disparity_px, range_px, words))
+
+
+def followed(
+    range_px: tuple[float, float] | None, disparity_px: Float[np.ndarray, "h w"]
+) -> tuple[float, float]:
+    """The disparities of the first and the last colour after a frame: a step towards those of it alone."""
+    wanted_px = colour_range_px(disparity_px[::_RANGED_EVERY_PX, ::_RANGED_EVERY_PX])
+    if range_px is None:
+        return wanted_px
+    low_px, high_px = (old + _FOLLOWED * (new - old) for old, new in zip(range_px, wanted_px, strict=True))
+    return low_px, high_px
+
+
+def composed(
+    pair: StereoPair, disparity_px: Float[np.ndarray, "h w"], range_px: tuple[float, float], words: str
+) -> Frame:
+    """The left picture, the disparity beside it, and a strip of words above both."""
+    colours = colour_disparity(disparity_px, range_px)
+    if pair.left_seen is not None:
+        colours[~pair.left_seen] = 0
+    both = np.hstack([pair.left, colours])
+    text = f"{words}; {range_words(pair.camera, range_px)}"
+    (width_px, _), _ = cv2.getTextSize(text, _FONT, _FONT_SCALE, 1)
+    scale = _FONT_SCALE * min(1.0, both.shape[1] / (width_px + _STRIP_PX))
+    picture = cv2.copyMakeBorder(both, _STRIP_PX, 0, 0, 0, cv2.BORDER_CONSTANT)
+    return cv2.putText(picture, text, (8, 22), _FONT, scale, (255, 255, 255), 1, cv2.LINE_AA)
+
+
+def range_words(camera: StereoCamera | None, range_px: tuple[float, float]) -> str:
+    """What the first and the last colour stand for: metres where the camera is known."""
+    if camera is None:
+        return "disparity {:.1f} px (blue) to {:.1f} px (red)".format(*range_px)
+    far_m, near_m = camera.depth_m(np.array([range_px]))[0]
+    return f"depth {far_m:.2f} m (blue) to {near_m:.2f} m (red)"
+
+
+def _pair(pictures: Sequence[Picture], arrangement: str | None) -> StereoPair:
+    if arrangement is None:
+        left, right = pictures
+    else:
+        [both] = pictures
+        ARRANGEMENTS[arrangement].eye_size_px(both.shape[1], both.shape[0])  # refuses what cannot be halved
+        left, right = ARRANGEMENTS[arrangement].eyes(both)
+    return StereoPair(left=left, right=right)
+
+
+def _opened(source: str) -> cv2.VideoCapture:
+    level = cv2.utils.logging.getLogLevel()
+    # What goes wrong is said once, by the error below.
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
+    cv2.utils.logging.setLogLevel(level)
+    if capture.isOpened():
+        return capture
+    if source.isdigit():
+        found = "no camera of that number that is free"
+    elif "://" in source:
+        found = "no stream at that address"
+    else:
+        found = "something else" if Path(source).exists() else "no such file"
+    raise FormatError(
+        f"{source}: expected a camera's number, a video file, the address of a stream, or pictures as "
+        f"frame%03d.png, found {found}"
+    )
+
+
+def _rate(frames: int, seconds: float) -> float:
+    return (frames - 1) / seconds if seconds > 0 else 0.0

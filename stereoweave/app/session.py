@@ -1,0 +1,206 @@
+"""What the web page makes of a pair, without the page: a result that is kept, measured, drawn and written."""
+
+import functools
+import time
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from stereoweave.cameras.diagnosis import hints
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.colormap import colour_disparity, colour_range_px
+from stereoweave.matching.estimate import match
+from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.providers import CPU
+from stereoweave.outputs.measure import distance
+from stereoweave.outputs.point_cloud import EmptyError, point_cloud, write_glb
+from stereoweave.outputs.report import Summary, shrunk, summarize
+from stereoweave.outputs.results import FILES, Result, needs_camera, write_files
+from stereoweave.pictures.prepare import Request, prepare
+from stereoweave.rendering.renderer import Renderer
+from stereoweave.stereo import Estimate, StereoCamera
+
+_LONGER_SIDE_PX = 1280
+_MOST_POINTS = 300_000
+# What lies there twice, once by itself and once in the zip: that of about 8 megapixels.
+_MOST_ZIPPED_BYTES = 300 * 1024**2
+_NO_METRES = "For metres give a calibration file, or the focal length and how far apart the cameras are."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kept:
+    """What a session keeps: its result, lines about it, what views are made of, and where its files are."""
+
+    result: Result
+    notes: tuple[str, ...]
+    renderer: Renderer
+    folder: Path
+
+    def given_px(self, shown_px: tuple[int, int]) -> tuple[int, int]:
+        """The pixel, column and row, of the pictures given that is at a pixel of the pictures shown."""
+        given, shown = self.result.pair.left.shape[1::-1], self.renderer.pair.left.shape[1::-1]
+        column, row = (
+            round((at + 0.5) * n / m - 0.5) for at, n, m in zip(shown_px, given, shown, strict=True)
+        )
+        return column, row
+
+
+@dataclass(frozen=True, kw_only=True)
+class Uploads:
+    """What a visitor gave: the files as they were uploaded, what was said of them, and what matches them."""
+
+    pictures: tuple[Path, ...]
+    request: Request
+    model: str
+    provider: str = CPU
+
+
+def matched(uploads: Uploads, folder: Path, tell: Callable[[float, str], None]) -> Kept:
+    """The result of the pictures that were given, whose files shall lie in `folder`.
+
+    `tell` hears how much is done, 0 to 1, and what is next.
+    """
+    if not uploads.pictures:
+        raise StereoweaveError("expected a left and a right picture, or one file with both; found none")
+    for file in (*uploads.pictures, uploads.request.calibration):
+        if file and not file.exists():
+            raise StereoweaveError(f"{file.name} has been put away, as after an hour; give it again")
+    tell(0.1, "reading")
+    prepared = prepare(uploads.pictures, uploads.request)
+    pair = prepared.pair
+    height, width = pair.left.shape[:2]
+    tell(0.3, f"matching {width}×{height} px")
+    start_s = time.perf_counter()
+    estimate = match(_matcher(uploads.model, uploads.provider), pair, refined=True)
+    estimate_ms = 1000 * (time.perf_counter() - start_s)
+    names = tuple(picture.name for picture in uploads.pictures)
+    summary = summarize(pair, estimate, pictures=names, model=uploads.model, estimate_ms=estimate_ms)
+    tell(0.6, "showing")
+    return Kept(
+        result=Result(pair=pair, estimate=estimate, summary=summary),
+        notes=prepared.notes,
+        renderer=Renderer(*shrunk(pair, estimate, _LONGER_SIDE_PX)),
+        folder=folder,
+    )
+
+
+def write_all(kept: Kept) -> tuple[list[Path], list[str]]:
+    """The result's files in all formats, and lines about those that could not be, and what is amiss."""
+    result = kept.result
+    names = [name for name in FILES if result.pair.camera or not needs_camera(name)]
+    notes = write_files(kept.folder, names, result) + hints(result.pair, result.estimate)
+    return [file for file in map(kept.folder.joinpath, names) if file.exists()], notes
+
+
+def zipped(file: Path, files: Sequence[Path]) -> Path | None:
+    """One file that holds the others, which are compressed already or hardly can be; None of large ones."""
+    if sum(path.stat().st_size for path in files) > _MOST_ZIPPED_BYTES:
+        return None
+    with zipfile.ZipFile(file, "w") as archive:
+        for path in files:
+            archive.write(path, path.name)
+    return file
+
+
+def write_cloud(file: Path, result: Result) -> Path | None:
+    """The file of the cloud to be turned, seen by a likely camera if none is known; None without a point."""
+    pair, estimate = result.pair, result.estimate
+    seen = pair if pair.camera else replace(pair, camera=_supposed_camera(estimate))
+    try:
+        write_glb(file, point_cloud(seen, estimate, most_points=_MOST_POINTS))
+    except EmptyError:
+        return None
+    return file
+
+
+def depth_picture(kept: Kept) -> UInt8[np.ndarray, "h w 3"]:
+    """The disparity in colours, black where the left picture shows nothing."""
+    disparity_px, seen = kept.renderer.estimate.disparity_px, kept.renderer.pair.left_seen
+    if seen is None:
+        return colour_disparity(disparity_px, colour_range_px(disparity_px))
+    return colour_disparity(disparity_px, colour_range_px(disparity_px[seen][None])) * seen[..., None]
+
+
+def ends(result: Result) -> tuple[str, str]:
+    """How far is what has the first and the last colour of the depth, in metres where they are known."""
+    seen = np.s_[:] if result.pair.left_seen is None else result.pair.left_seen
+    ends_px = np.array([colour_range_px(np.atleast_2d(result.estimate.disparity_px[seen]))])
+    if not result.pair.camera:
+        return f"{ends_px[0, 0]:.1f} px", f"{ends_px[0, 1]:.1f} px"
+    far_m, near_m = result.pair.camera.depth_m(ends_px)[0]
+    return _metres(far_m), _metres(near_m)
+
+
+def marked(
+    photograph: UInt8[np.ndarray, "h w 3"], clicks: Sequence[tuple[int, int]]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The photograph with a ring at each click, and a line between two."""
+    picture = photograph.copy()
+    for colour, width in (((0, 0, 0), 5), ((255, 255, 255), 2)):
+        cv2.polylines(picture, [np.array(clicks, np.int32)], False, colour, width, cv2.LINE_AA)
+        for click in clicks:
+            cv2.circle(picture, click, 7, colour, width, cv2.LINE_AA)
+    return picture
+
+
+def measured(kept: Kept, clicks: Sequence[tuple[int, int]]) -> list[str]:
+    """What is known of each point clicked, and the distance between two."""
+    estimate, camera = kept.result.estimate, kept.result.pair.camera
+    points = [kept.given_px(click) for click in clicks]
+    lines = [_known(kept.result, point) for point in points]
+    if camera is None:
+        return [*lines, _NO_METRES]
+    if len(points) == 2:
+        try:
+            lines.append(f"Between the two: {distance(estimate, camera, *points)}")
+        except StereoweaveError as error:
+            lines.append(f"Between the two: {error}")
+    return lines
+
+
+def numbers(summary: Summary) -> str:
+    """The line on a result: how large, how long, how near and how far, how sure."""
+    text = f"{summary.width_px}×{summary.height_px} px, matched in {summary.estimate_ms / 1000:.1f} s: "
+    text += f"disparity {summary.disparity_min_px:.1f} to {summary.disparity_max_px:.1f} px"
+    if summary.depth_min_m is not None:
+        text += f", depth from {summary.depth_min_m:.2f} m, in the middle {_metres(summary.depth_median_m)}"
+    return f"{text}; sure of {summary.confident_percent:.0f} % of the picture"
+
+
+def _metres(depth_m: float | None) -> str:
+    return "infinite" if depth_m is None or not np.isfinite(depth_m) else f"{depth_m:.2f} m"
+
+
+def _known(result: Result, point: tuple[int, int]) -> str:
+    """What is known of one pixel of the left picture that was given."""
+    column, row = point
+    disparity_px = result.estimate.disparity_px[row : row + 1, column : column + 1]
+    text = f"({column}, {row}): disparity {disparity_px[0, 0]:.2f} px"
+    if result.pair.camera:
+        text += f", depth {_metres(float(result.pair.camera.depth_m(disparity_px)[0, 0]))}"
+    return f"{text}; sure to {100 * result.estimate.confidence[row, column]:.0f} %"
+
+
+def _supposed_camera(estimate: Estimate) -> StereoCamera:
+    """A camera of 53 degrees of view, two of them as far apart as eyes, for a cloud of a likely shape.
+
+    Where disparities are negative the cameras converge: what has the least is taken to be far away.
+    """
+    height, width = estimate.disparity_px.shape
+    return StereoCamera(
+        focal_px=width,
+        baseline_m=0.065,
+        cx_px=(width - 1) / 2,
+        cy_px=(height - 1) / 2,
+        doffs_px=max(0.0, -float(np.percentile(estimate.disparity_px, 1))),
+    )
+
+
+@functools.cache
+def _matcher(model: str, provider: str) -> Matcher:
+    return Matcher(model, provider=provider)

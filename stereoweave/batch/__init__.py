@@ -1,0 +1,1 @@
+"""Many pairs: on this machine, or on a cluster with Ray."""

@@ -1,0 +1,307 @@
+"""Depth of many pairs, by several processes; a batch that was stopped goes on where it was.
+
+A pair is finished when its folder has the file `done.json`, which is written last, says of which pictures the
+results are, and how they came out. What was made how, `batch.json` says for the whole folder.
+"""
+
+import functools
+import json
+import multiprocessing
+import os
+import shutil
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.console import Console
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.files import make_folder, reading, remove_leftovers, replacing
+from stereoweave.io.output_lock import lock_output
+from stereoweave.io.run_folder import check_claim, check_unclaimed, described, description
+from stereoweave.io.text import write_table
+from stereoweave.matching.matcher import Matcher
+from stereoweave.outputs.results import DepthOrder, make_depth, order_facts
+from stereoweave.pictures.pair_finding import BATCH_FILE, SUMMARY_FILE, Job, Pairs
+from stereoweave.system.processes import begin_work
+from stereoweave.system.progress import progress
+from stereoweave.system.threads import usable_cores
+
+_BLAS_THREADS = "OPENBLAS_NUM_THREADS"
+DONE_FILE = "done.json"
+_NUMBERS = ("disparity_min_px", "disparity_median_px", "disparity_max_px", "confident_percent")
+_COLUMNS = ("name", "pictures", "seconds", *_NUMBERS, "notes", "error")
+
+Work = Callable[[Job], str | None]
+# A job, and what went wrong with it, None where nothing did.
+Outcome = tuple[Job, str | None]
+
+
+@dataclass(frozen=True)
+class Tally:
+    """How a batch ended: how many pairs were made, how many were there, and name and reason of the others."""
+
+    done: int
+    skipped: int
+    failed: tuple[tuple[str, str], ...]
+
+
+def run_batch(
+    jobs: Sequence[Job], out: Path, order: DepthOrder, *, processes: int | None = None, console: Console
+) -> Tally:
+    """Makes the results of every pair in `out`/name, but for those that are there, and a table of all.
+
+    A pair that cannot be made is told at once, and the others go on; so it is with a pair whose process
+    is killed. summary.csv has a row for each pair in the folder, earlier runs' and failed ones included.
+
+    Args:
+        jobs: The pairs.
+        out: A new folder, or one that a batch with the same order was begun in.
+        order: What is made of each pair.
+        processes: How many at a time, as many as cores unless given; more than one have a thread each, unless
+            the order says otherwise.
+        console: Where progress and failures are shown.
+
+    Raises:
+        StereoweaveError: `out` has something else in it, is in use or cannot be written, or there is no such
+            matcher.
+    """
+    processes = min(processes or usable_cores(), max(len(jobs), 1))
+    if processes > 1 and order.threads is None:
+        order = replace(order, threads=1)
+    # Said once, here, if there is no such network or provider.
+    Matcher(order.model, threads=1, provider=order.provider)
+    make_folder(out)
+    with lock_output(out):
+        _claim(out, order)
+        missing = [job for job in jobs if not _is_finished(out / job.name, job)]
+        try:
+            failed = _run(functools.partial(_make, out, order), missing, processes, order.threads, console)
+        finally:
+            _tidy(out)
+        _write_summary(out, jobs, dict(failed))
+    return Tally(len(missing) - len(failed), len(jobs) - len(missing), tuple(failed))
+
+
+def depth_of_many(
+    pairs: Pairs, out: Path, order: DepthOrder, *, processes: int | None = None, as_json: bool = False
+) -> int:
+    """Makes a batch and tells how it went; the exit code: 1 if a pair failed, 130 if Ctrl-C ended it.
+
+    Reports are made only where the order's files name report.html or all: each takes as long as all else.
+    """
+    order = replace(order, always=tuple(file for file in order.always if file != "report.html"))
+    for note in pairs.notes:
+        typer.echo(note, err=True)
+    try:
+        tally = run_batch(pairs.jobs, out, order, processes=processes, console=Console(stderr=True))
+    except KeyboardInterrupt:
+        kept = "what is finished stays, and the same command goes on"
+        typer.echo(f"stereoweave: {out}: stopped; {kept}", err=True)
+        return 130
+    if as_json:
+        facts = {**asdict(tally), "failed": dict(tally.failed), "summary": str(out / SUMMARY_FILE)}
+        typer.echo(json.dumps(facts, indent=2))
+    else:
+        _tell(tally, out)
+    return 1 if tally.failed else 0
+
+
+def _tell(tally: Tally, out: Path) -> None:
+    count = tally.done + tally.skipped + len(tally.failed)
+    there = f", {tally.skipped} were there" if tally.skipped else ""
+    failed = f", {len(tally.failed)} failed" if tally.failed else ""
+    typer.echo(f"{out}: {count} {'pair' if count == 1 else 'pairs'}: {tally.done} made{there}{failed}")
+    for name, error in tally.failed:
+        typer.echo(f"failed: {name}: {error}")
+    typer.echo(f"table: {out / SUMMARY_FILE}")
+
+
+def _run(
+    work: Work, jobs: Sequence[Job], processes: int, threads: int | None, console: Console
+) -> list[tuple[str, str]]:
+    """Does the work on all jobs; names and reasons of those that failed, which are shown at once as well."""
+    failed: list[tuple[str, str]] = []
+    start_s = time.perf_counter()
+    with closing(_outcomes(work, jobs, processes, threads)) as outcomes, progress(console) as bar:
+        shown = bar.add_task("depth", total=len(jobs), loss="", rate="")
+        for made, (job, error) in enumerate(outcomes, 1):
+            if error:
+                failed.append((job.name, error))
+                line = f"{job.name}: {error}"
+                console.print(line, markup=False, highlight=False, soft_wrap=True)
+            rate = f"{made / (time.perf_counter() - start_s):.1f} pairs/s"
+            bar.update(shown, advance=1, rate=rate, loss=f"{len(failed)} failed" if failed else "")
+    return failed
+
+
+def _outcomes(
+    work: Work, jobs: Sequence[Job], processes: int, threads: int | None
+) -> Generator[Outcome, None, None]:
+    """The outcomes as they come. When a process is killed, its pair is found by making each suspect alone."""
+    waiting = deque(jobs)
+    while waiting:
+        for job in (yield from _until_one_is_killed(work, waiting, processes, threads)):
+            if (yield from _until_one_is_killed(work, deque([job]), 1, threads)):
+                yield job, "its process was killed; is the memory full?"
+
+
+def _until_one_is_killed(
+    work: Work, waiting: deque[Job], processes: int, threads: int | None
+) -> Generator[Outcome, None, list[Job]]:
+    """Outcomes of the jobs that wait; returns those that were being made when a process was killed."""
+    pending: dict[Future[str | None], Job] = {}
+    with _pool(processes, threads or usable_cores()) as pool:
+        try:
+            while waiting or pending:
+                # No more than can be worked on, so that few are suspected.
+                while waiting and len(pending) < processes:
+                    pending[pool.submit(work, waiting[0])] = waiting[0]
+                    waiting.popleft()
+                finished, _ = wait(pending, return_when=FIRST_COMPLETED)
+                for future in sorted(finished, key=lambda future: future.exception() is not None):
+                    error = future.result()
+                    yield pending.pop(future), error
+        except BrokenProcessPool:
+            pass
+    return list(pending.values())
+
+
+@contextmanager
+def _pool(processes: int, threads: int) -> Iterator[ProcessPoolExecutor]:
+    """Processes to work in, which are ended when something goes wrong here."""
+    others = multiprocessing.active_children()
+    # Started afresh, because a forked child inherits OpenCV's and ONNX Runtime's threads in an unknown state.
+    context = multiprocessing.get_context("spawn")
+    with (
+        _few_blas_threads(threads),
+        ProcessPoolExecutor(processes, context, begin_work, (threads,)) as pool,
+    ):
+        try:
+            yield pool
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for child in multiprocessing.active_children():
+                if child not in others:
+                    child.terminate()
+                    child.join()
+            raise
+
+
+@contextmanager
+def _few_blas_threads(threads: int) -> Iterator[None]:
+    """Processes that are started meanwhile have so many threads in OpenBLAS, NumPy's matrix library.
+
+    It reads the environment once, while it is loaded; its threads go on waiting busily after each product.
+    """
+    before = os.environ.get(_BLAS_THREADS)
+    os.environ[_BLAS_THREADS] = str(threads)
+    try:
+        yield
+    finally:
+        os.environ.pop(_BLAS_THREADS)
+        if before is not None:
+            os.environ[_BLAS_THREADS] = before
+
+
+def _make(out: Path, order: DepthOrder, job: Job) -> str | None:
+    """Makes the results of a pair and marks them as finished; what went wrong in one line, or None."""
+    try:
+        folder, sources = out / job.name, _sources(job)
+        (folder / DONE_FILE).unlink(missing_ok=True)
+        if job.calibration and not order.request.calibration:
+            order = replace(order, request=replace(order.request, calibration=job.calibration))
+        start_s = time.perf_counter()
+        matcher = _matcher(order.model, order.threads, order.provider)
+        summary, notes = make_depth(job.pictures, folder, order, matcher)
+        seconds = round(time.perf_counter() - start_s, 3)
+        files = sorted(path.name for path in folder.iterdir() if path.name[0] != ".")
+        facts = {"sources": sources, "files": files, "seconds": seconds, "notes": notes}
+        with replacing(folder / DONE_FILE) as temporary:
+            temporary.write_text(json.dumps(facts | {"summary": asdict(summary)}), encoding="utf-8")
+    except StereoweaveError as error:
+        return " ".join(str(error).split())
+    except Exception as error:  # whatever a library makes of a bad picture, the other pairs go on
+        return " ".join(f"{type(error).__name__}: {error}".split())
+    return None
+
+
+@functools.cache
+def _matcher(model: str, threads: int | None, provider: str) -> Matcher:
+    """The matcher of this process, kept between pairs."""
+    return Matcher(model, threads=threads, provider=provider)
+
+
+def _sources(job: Job) -> list[list[Any]]:
+    """What tells whether a pair's files are still the same: name, bytes and time of change of each."""
+    sources = []
+    for path in (*job.pictures, *([job.calibration] if job.calibration else [])):
+        with reading(path, "a picture"):
+            status = path.stat()
+        sources.append([path.name, status.st_size, status.st_mtime_ns])
+    return sources
+
+
+def _is_finished(folder: Path, job: Job) -> bool:
+    facts = _finished(folder)
+    try:
+        return bool(facts) and facts["sources"] == _sources(job)
+    except StereoweaveError:
+        return False
+
+
+def _finished(folder: Path) -> dict[str, Any]:
+    """What is written about a finished pair; nothing where it is not, or files are missing by now."""
+    try:
+        facts = json.loads((folder / DONE_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return facts if all((folder / file).exists() for file in facts["files"]) else {}
+
+
+def _claim(out: Path, order: DepthOrder) -> None:
+    """Writes down whose folder this is, or refuses one that is another's."""
+    facts, path = order_facts(order), out / BATCH_FILE
+    if path.exists():
+        expected = "the description of a batch that stereoweave depth made"
+        with reading(path, expected):
+            found = described(path, path.read_text(encoding="utf-8"), expected)
+        check_claim(path, facts, found)
+    else:
+        check_unclaimed(out, BATCH_FILE, (entry.name for entry in out.iterdir() if entry.name[0] != "."))
+        with replacing(path) as temporary:
+            temporary.write_text(description(facts), encoding="utf-8")
+    _tidy(out)
+
+
+def _tidy(out: Path) -> None:
+    """Removes what a killed process was about to write, where nobody is writing now."""
+    for folder in out.glob(".stereoweave-*"):
+        shutil.rmtree(folder, ignore_errors=True)
+    remove_leftovers(out)
+
+
+def _write_summary(out: Path, jobs: Sequence[Job], failed: dict[str, str]) -> None:
+    pictures = {job.name: job.pictures for job in jobs}
+    rows = {folder.parent.name: _row(folder.parent) for folder in out.glob(f"*/{DONE_FILE}")}
+    rows |= {
+        name: {"name": name, "pictures": " + ".join(path.name for path in pictures[name]), "error": error}
+        for name, error in failed.items()
+    }
+    write_table(out / SUMMARY_FILE, _COLUMNS, (rows[name] for name in sorted(rows) if rows[name]))
+
+
+def _row(folder: Path) -> dict[str, Any]:
+    """The row of a finished pair; nothing where it is not finished."""
+    if not (facts := _finished(folder)):
+        return {}
+    row = {name: facts["summary"][name] for name in _NUMBERS}
+    row |= {"name": folder.name, "pictures": " + ".join(facts["summary"]["pictures"])}
+    return row | {"seconds": facts["seconds"], "notes": "; ".join(facts["notes"])}

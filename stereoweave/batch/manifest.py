@@ -1,0 +1,232 @@
+"""What a large batch has to make, and what came of it: Parquet files by chunks, so that nobody reads all.
+
+`plan/part-*.parquet` lists what was found, each with the chunk that it belongs to; it is extended, never
+rearranged. `manifest/part-*.parquet` has the rows of a chunk each, written when all of the chunk is made.
+"""
+
+import io
+import re
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.io.stores import Store, store_at
+from stereoweave.pictures.pair_finding import ListedPair, left_out_note, pairs_among
+
+if TYPE_CHECKING:
+    import pyarrow
+
+MANIFEST, PLAN = "manifest", "plan"
+MOST_IN_A_CHUNK = 32
+"""Pairs: what a dead worker has to do again at most."""
+_CHUNKS_OF_A_WORKER = 8
+_CHUNKS_IN_A_FILE = 64
+_PART = re.compile(r"part-(\d{8})\.parquet")
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A pair, or a film, that is to be made.
+
+    Attributes:
+        name: The folder of its results.
+        files: Paths in the source of left and right, of one picture of both views, or of a film.
+        versions: What changes when one of the files, or the calibration, does.
+        calibration: The path of its own calibration.
+        is_film: Whether it is a film.
+    """
+
+    name: str
+    files: tuple[str, ...]
+    versions: tuple[str, ...]
+    calibration: str | None = None
+    is_film: bool = False
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The numbers of all chunks, how many pairs and films are in them, and lines to tell."""
+
+    chunks: tuple[int, ...]
+    count: int
+    notes: tuple[str, ...] = ()
+
+
+def extend_plan(source: Store, destination: Store, workers: int) -> Plan:
+    """The plan in the destination, brought up to what is in the source now.
+
+    What is new in the source gets chunks of its own, and what has changed there its new versions. What is no
+    longer there stays as it is.
+
+    Args:
+        source: Where the pairs and films are.
+        destination: Where the plan is.
+        workers: How many are to share the new chunks.
+
+    Raises:
+        StereoweaveError: Nothing to make was found, or one of both cannot be used.
+    """
+    _read_plan.cache_clear()
+    versions = {file.path: f"{file.size_bytes} {file.version}" for file in source.files()}
+    listed = pairs_among(source.place, versions)
+    found = {planned.name: planned for planned in _all_planned(listed.pairs, listed.films, versions)}
+    parts = _parts(destination, PLAN)
+    counts = {part: _updated(destination, part, found) for part in parts}  # which takes the known ones out
+    if not (found or counts):
+        raise StereoweaveError(f"{source.place}: expected pairs of pictures or films in it, found none")
+    size = max(1, min(MOST_IN_A_CHUNK, len(found) // (_CHUNKS_OF_A_WORKER * workers)))
+    chunks = list(_in_chunks(found.values(), size))
+    for part, first in enumerate(range(0, len(chunks), _CHUNKS_IN_A_FILE), max(parts, default=-1) + 1):
+        counts[part] = _write_plan(destination, part, chunks[first : first + _CHUNKS_IN_A_FILE])
+    numbers = tuple(
+        part * _CHUNKS_IN_A_FILE + chunk for part, of_each in counts.items() for chunk in range(len(of_each))
+    )
+    # Of a plan that was lost, or that two runs extended at the same time.
+    for stray in set(_parts(destination, MANIFEST)).difference(numbers):
+        destination.remove(_part(MANIFEST, stray))
+    return Plan(numbers, sum(map(sum, counts.values())), left_out_note(source.place, listed.left_out))
+
+
+def read_chunk(destination: Store, chunk: int) -> list[Planned]:
+    """What is to be made in a chunk."""
+    part, number = divmod(chunk, _CHUNKS_IN_A_FILE)
+    return _read_plan(destination.place, part)[number]
+
+
+def read_rows(destination: Store, chunk: int) -> dict[str, dict[str, Any]]:
+    """The rows of a chunk by the names of their pairs; none where they are not written yet."""
+    path = _part(MANIFEST, chunk)
+    if not destination.exists(path):
+        return {}
+    return {row["pair"]: row for row in _read(destination, path)}
+
+
+def write_rows(destination: Store, chunk: int, rows: Sequence[dict[str, Any]]) -> None:
+    """Writes the rows of a chunk: all, or nothing."""
+    _write(destination, _part(MANIFEST, chunk), rows, _rows_schema())
+
+
+def _rows_schema() -> "pyarrow.Schema":
+    import pyarrow
+
+    names = pyarrow.list_(pyarrow.string())
+    return pyarrow.schema(
+        {
+            "pair": pyarrow.string(),
+            "pictures": names,
+            "checks": names,
+            "disparity_min_px": pyarrow.float32(),
+            "disparity_median_px": pyarrow.float32(),
+            "disparity_max_px": pyarrow.float32(),
+            "confident_percent": pyarrow.float32(),
+            "width_px": pyarrow.int32(),
+            "height_px": pyarrow.int32(),
+            "seconds": pyarrow.float32(),
+            "error": pyarrow.string(),
+            "files": names,
+            "versions": names,
+        }
+    )
+
+
+def _plan_schema() -> "pyarrow.Schema":
+    import pyarrow
+
+    names = pyarrow.list_(pyarrow.string())
+    return pyarrow.schema(
+        {
+            "chunk": pyarrow.int64(),
+            "name": pyarrow.string(),
+            "files": names,
+            "versions": names,
+            "calibration": pyarrow.string(),
+            "is_film": pyarrow.bool_(),
+        }
+    )
+
+
+def _all_planned(
+    pairs: Iterable[ListedPair], films: Iterable[ListedPair], versions: dict[str, str]
+) -> Iterator[Planned]:
+    for listed, is_film in [(pairs, False), (films, True)]:
+        for name, files, calibration in listed:
+            every = (*files, calibration) if calibration else files
+            found = tuple(versions.get(path, "") for path in every)  # one of a pair may be missing
+            yield Planned(name, files, found, calibration, is_film)
+
+
+def _in_chunks(planned: Collection[Planned], size: int) -> Iterator[list[Planned]]:
+    """Pairs so many together; a film, which takes as long as many pairs, alone."""
+    pairs = (one for one in planned if not one.is_film)
+    while chunk := list(islice(pairs, size)):
+        yield chunk
+    yield from ([one] for one in planned if one.is_film)
+
+
+def _updated(destination: Store, part: int, found: dict[str, Planned]) -> list[int]:
+    """How many are in each chunk of a file of the plan; those that were found have their versions of now."""
+    chunks = _read_plan(destination.place, part)
+    now = [[found.pop(one.name, one) for one in chunk] for chunk in chunks]
+    if now != chunks:
+        _write_plan(destination, part, now)
+    return [len(chunk) for chunk in now]
+
+
+def _write_plan(destination: Store, part: int, chunks: Sequence[Sequence[Planned]]) -> list[int]:
+    """Writes a file of the plan; how many are in each chunk."""
+    rows = [{"chunk": number, **asdict(one)} for number, chunk in enumerate(chunks) for one in chunk]
+    _write(destination, _part(PLAN, part), rows, _plan_schema())
+    return [len(chunk) for chunk in chunks]
+
+
+# A worker's chunks mostly follow one another.
+@lru_cache(maxsize=1)
+def _read_plan(destination: str, part: int) -> list[list[Planned]]:
+    """What is planned in one file, by chunk."""
+    chunks: list[list[Planned]] = []
+    for row in _read(store_at(destination), _part(PLAN, part)):
+        number = row.pop("chunk")
+        chunks += [[] for _ in range(number + 1 - len(chunks))]
+        row |= {name: tuple(row[name]) for name in ("files", "versions")}
+        chunks[number].append(Planned(**row))
+    return chunks
+
+
+def _part(folder: str, number: int) -> str:
+    return f"{folder}/part-{number:08d}.parquet"
+
+
+def _parts(destination: Store, folder: str) -> list[int]:
+    names = (file.path.rpartition("/")[2] for file in destination.files(folder))
+    return sorted(int(match[1]) for name in names if (match := _PART.fullmatch(name)))
+
+
+def _read(destination: Store, path: str) -> list[dict[str, Any]]:
+    import pyarrow
+    from pyarrow import parquet
+
+    content = destination.read_bytes(path)
+    try:
+        return parquet.ParquetFile(io.BytesIO(content)).read(use_threads=False).to_pylist()
+    except (pyarrow.ArrowException, ValueError) as error:
+        raise FormatError(
+            f"{destination.at(path)}: expected a Parquet file of a batch, found one that cannot be read "
+            f"({error}); remove it, and the same command writes it anew"
+        ) from error
+
+
+def _write(destination: Store, path: str, rows: Sequence[dict[str, Any]], schema: "pyarrow.Schema") -> None:
+    import pyarrow
+    from pyarrow import parquet
+
+    content = io.BytesIO()
+    try:
+        parquet.write_table(pyarrow.Table.from_pylist(rows, schema=schema), content)
+    except UnicodeEncodeError as error:
+        raise StereoweaveError(
+            f"{destination.place}: expected files with names in UTF-8, found {error.object!r}; rename it"
+        ) from error
+    destination.write_bytes(path, content.getvalue())

@@ -1,0 +1,388 @@
+"""One worker of a large batch: makes the pairs of a chunk, and writes their rows when all are made.
+
+A chunk is marked as begun meanwhile. One that is found so was left by a worker that was killed, perhaps by
+one of its pairs: they are then made in a process of their own, which may be killed in the worker's stead.
+"""
+
+import errno
+import functools
+import json
+import multiprocessing
+import platform
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stereoweave.batch.manifest import Planned, read_chunk, read_rows, write_rows
+from stereoweave.errors import OutputInUseError, ProviderError, StereoweaveError
+from stereoweave.io.files import SMALLEST_SIDE_PX, is_leftover
+from stereoweave.io.stores import Store
+from stereoweave.matching.matcher import Matcher
+from stereoweave.outputs.results import DepthOrder, make_depth
+from stereoweave.system.processes import begin_work
+
+Row = dict[str, Any]
+
+BEGUN = "begun"
+FILM = "depth.mkv"
+_NAMED_FAILURES = 5
+# A process may also be killed for others' need of memory.
+_MOST_TRIES = 3
+# Processes that are killed while they start, one after another: more are no accident.
+_MOST_FALSE_STARTS = 10
+_KILLED = "its process was killed every time; is the memory full?"
+# What is younger may be a living worker's.
+_LEFT_BEHIND_S = 600
+_FULL_OR_GONE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.ESTALE}
+
+
+@dataclass(frozen=True)
+class Counts:
+    """How many pairs and films were made, how many were there, how many failed; some of the failed."""
+
+    made: int = 0
+    there: int = 0
+    failed: int = 0
+    named: tuple[tuple[str, str], ...] = ()
+
+    def __add__(self, other: "Counts") -> "Counts":
+        named = (*self.named, *other.named)[:_NAMED_FAILURES]
+        return Counts(self.made + other.made, self.there + other.there, self.failed + other.failed, named)
+
+    @property
+    def all(self) -> int:
+        """Of all three kinds."""
+        return self.made + self.there + self.failed
+
+
+@dataclass(frozen=True)
+class Worker:
+    """Makes what is planned.
+
+    Attributes:
+        source: Where the pictures and films are.
+        destination: Where plan, rows and results are.
+        order: What is made of each pair.
+        carried: The order's own files, which the driver alone may have: their contents by `model` and
+            `calibration`.
+    """
+
+    source: Store
+    destination: Store
+    order: DepthOrder
+    carried: tuple[tuple[str, str, bytes], ...] = ()
+
+    def __call__(self, chunks: Sequence[int]) -> Counts:
+        """Makes what is missing in the chunks."""
+        return sum(map(self.make_chunk, chunks), Counts())
+
+    def make_chunk(self, chunk: int) -> Counts:
+        """Makes what is missing in a chunk, failed before or changed since, and writes its rows."""
+        planned, rows = read_chunk(self.destination, chunk), read_rows(self.destination, chunk)
+        missing = [one for one in planned if not self._is_made(one, rows.get(one.name))]
+        mark = f"{BEGUN}/{chunk:08d}.json"
+        rows |= {row["pair"]: row for row in self._rows(missing, mark)}
+        if missing or rows.keys() != {one.name for one in planned}:
+            write_rows(self.destination, chunk, [rows[one.name] for one in planned])
+            self.destination.remove(mark)
+        failed = tuple((one.name, rows[one.name]["error"]) for one in missing if rows[one.name]["error"])
+        there = len(planned) - len(missing)
+        return Counts(len(missing) - len(failed), there, len(failed), failed[:_NAMED_FAILURES])
+
+    def _is_made(self, planned: Planned, row: Row | None) -> bool:
+        return row is not None and not row["error"] and self._holds(planned, row)
+
+    def _holds(self, planned: Planned, row: Row) -> bool:
+        """Whether a row is of these very files, and its results are there."""
+        if tuple(row["versions"]) != planned.versions:
+            return False
+        folder = planned.name
+        there = {file.path.removeprefix(f"{folder}/") for file in self.destination.files(folder)}
+        return there.issuperset(row["files"])
+
+    def _rows(self, missing: Sequence[Planned], mark: str) -> list[Row]:
+        if not missing:
+            return []
+        if self.destination.exists(mark):
+            return self._rows_apart(missing, mark)
+        self.destination.write_bytes(mark, b"{}")
+        return [self.row(planned) for planned in missing]
+
+    def _rows_apart(self, missing: Sequence[Planned], mark: str) -> list[Row]:
+        """The rows, each made in another process; what it was killed by is noted, and not tried for ever."""
+        notes = self._notes(mark)
+        tries, rows = notes.get("tries", {}), {row["pair"]: row for row in notes.get("rows", [])}
+        with _Apart(self) as apart:
+            for planned in missing:
+                if planned.name in rows and self._holds(planned, rows[planned.name]):
+                    continue
+                row = None
+                while row is None and tries.get(planned.name, 0) < _MOST_TRIES:
+                    apart.begin()
+                    tries[planned.name] = tries.get(planned.name, 0) + 1
+                    noted = json.dumps({"tries": tries, "rows": list(rows.values())})
+                    self.destination.write_bytes(mark, noted.encode())
+                    row = apart.row(planned)
+                rows[planned.name] = row or self._empty_row(planned) | {"error": _KILLED}
+        return list(rows.values())
+
+    def _notes(self, mark: str) -> dict[str, Any]:
+        try:
+            return json.loads(self.destination.read_bytes(mark))
+        except ValueError:  # another run has just made the chunk, or the file was lost with a machine's power
+            return {}
+
+    def row(self, planned: Planned) -> Row:
+        """The row of a pair or a film that is made now.
+
+        Raises:
+            StereoweaveError: Not because of the pair: the source, the destination or the provider fails.
+        """
+        start_s = time.perf_counter()
+        row, order = self._empty_row(planned), self._order()
+        matcher = _matcher(order.model, order.threads, order.provider)
+        with tempfile.TemporaryDirectory(prefix="stereoweave-") as name:
+            try:
+                if planned.is_film:
+                    row |= self._film(planned, Path(name), order)
+                else:
+                    row |= self._pair(planned, Path(name), order, matcher)
+            except _StoreError:
+                raise
+            except Exception as error:  # whatever a library makes of a bad picture, the others go on
+                self._check_disk(error)
+                if any(isinstance(cause, ProviderError) for cause in _causes(error)):
+                    _check_runs(matcher)
+                kind = "" if isinstance(error, StereoweaveError) else f"{type(error).__name__}: "
+                told = f"{kind}{error}".replace(f"{name}/pictures", self.source.place)
+                row["error"] = " ".join(told.split())
+        return row | {"seconds": round(time.perf_counter() - start_s, 3)}
+
+    def _empty_row(self, planned: Planned) -> Row:
+        empty = dict.fromkeys(
+            ("disparity_min_px", "disparity_median_px", "disparity_max_px", "confident_percent")
+        )
+        names = [file.rpartition("/")[2] for file in planned.files]
+        row = {"pair": planned.name, "pictures": names, "versions": list(planned.versions)}
+        return (
+            row
+            | empty
+            | {"width_px": None, "height_px": None, "seconds": None, "error": None}
+            | {
+                "checks": [],
+                "files": [],
+            }
+        )
+
+    def _pair(self, planned: Planned, scratch: Path, order: DepthOrder, matcher: Matcher) -> Row:
+        pictures, calibration = self._fetched(planned, scratch / "pictures")
+        if calibration and not order.request.calibration:
+            order = replace(order, request=replace(order.request, calibration=calibration))
+        with self._results(planned, scratch) as out:
+            summary, notes = make_depth(pictures, out, order, matcher)
+        return {
+            "disparity_min_px": summary.disparity_min_px,
+            "disparity_median_px": summary.disparity_median_px,
+            "disparity_max_px": summary.disparity_max_px,
+            "confident_percent": summary.confident_percent,
+            "width_px": summary.width_px,
+            "height_px": summary.height_px,
+            "checks": notes,
+            "files": _names(out),
+        }
+
+    def _film(self, planned: Planned, scratch: Path, order: DepthOrder) -> Row:
+        from rich.console import Console
+
+        from stereoweave.io.animation import needing_the_video_extra
+
+        with needing_the_video_extra("a film"):
+            from stereoweave.video.convert import Order, make_film
+            from stereoweave.video.reader import open_footage
+            from stereoweave.video.writer import parts_folder
+
+        films, _ = self._fetched(planned, scratch / "pictures")
+        ordered = Order(depth16=True, model=order.model, threads=order.threads, provider=order.provider)
+        footage = open_footage(films, order.request.arrangement)
+        with self._results(planned, scratch) as out:
+            make = partial(make_film, footage, films, out / FILM, ordered, Console(quiet=True))
+            begun = parts_folder(out / FILM)
+            was_begun = begun.exists()
+            try:
+                tally = make()
+            except StereoweaveError as error:
+                self._check_disk(error)
+                kept = ProviderError | OutputInUseError
+                if not was_begun or any(isinstance(cause, kept) for cause in _causes(error)):
+                    raise
+                # A killed worker's parts, of other files or damaged.
+                shutil.rmtree(begun, ignore_errors=True)
+                tally = make()
+        width, height = footage.size_px
+        return {"width_px": width, "height_px": height, "checks": tally.named, "files": _names(out)}
+
+    def _fetched(self, planned: Planned, into: Path) -> tuple[tuple[Path, ...], Path | None]:
+        """The files on a disk of this machine, and the calibration."""
+        try:
+            files = tuple(self.source.fetch(file, into) for file in planned.files)
+            return files, self.source.fetch(planned.calibration, into) if planned.calibration else None
+        except StereoweaveError:
+            with _of_the_store():
+                self.source.check_source()
+            raise  # the store is well, and the file is not
+
+    @contextmanager
+    def _results(self, planned: Planned, scratch: Path) -> Iterator[Path]:
+        """A folder to make the results in, which are then in the destination."""
+        if self.destination.folder is not None:
+            folder = self.destination.folder / planned.name
+            remove_left_behind(folder)
+            yield folder
+            return
+        folder = scratch / "results"
+        folder.mkdir()
+        yield folder
+        with _of_the_store():
+            stored = {file.path for file in self.destination.files(planned.name)}
+            fresh = {f"{planned.name}/{name}": folder / name for name in _names(folder)}
+            for path, file in fresh.items():
+                self.destination.put(file, path)
+            for stale in stored - fresh.keys():
+                self.destination.remove(stale)
+
+    def _check_disk(self, error: Exception) -> None:
+        """Raises where a disk is full or gone: so it would be with the pairs to come."""
+        if any(isinstance(cause, OSError) and cause.errno in _FULL_OR_GONE for cause in _causes(error)):
+            raise _StoreError(f"{self.destination.place}: {' '.join(str(error).split())}") from error
+
+    def _order(self) -> DepthOrder:
+        """The order with the files that were carried here."""
+        order = self.order
+        for kind, name, content in self.carried:
+            path = _carried(name, content)
+            if kind == "model":
+                order = replace(order, model=str(path))
+            else:
+                order = replace(order, request=replace(order.request, calibration=path))
+        return order
+
+
+class _StoreError(StereoweaveError):
+    """What a source or a destination fails with as a whole."""
+
+
+@contextmanager
+def _of_the_store() -> Iterator[None]:
+    try:
+        yield
+    except StereoweaveError as error:
+        raise _StoreError(str(error)) from error
+
+
+class _Apart:
+    """A process of its own that makes rows; another one where it was killed."""
+
+    def __init__(self, worker: Worker) -> None:
+        self._worker = worker
+        self._pool: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> "_Apart":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool:
+            self._pool.shutdown()
+
+    def begin(self) -> None:
+        """Waits for the process, if there is none."""
+        false_starts = 0
+        while self._pool is None:
+            threads = self._worker.order.threads or 1
+            pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), begin_work, (threads,))
+            try:
+                pool.submit(_warm, self._worker).result()
+                self._pool = pool
+            except BrokenProcessPool as error:
+                false_starts += 1
+                if false_starts == _MOST_FALSE_STARTS:
+                    raise StereoweaveError(
+                        f"{platform.node()}: expected a process that loads the network, found it killed "
+                        f"{false_starts} times in a row; is the memory full?"
+                    ) from error
+            finally:
+                if self._pool is None:
+                    pool.shutdown()
+
+    def row(self, planned: Planned) -> Row | None:
+        """The row; None where the process was killed."""
+        assert self._pool is not None
+        try:
+            return self._pool.submit(self._worker.row, planned).result()
+        except BrokenProcessPool:
+            self._pool.shutdown()
+            self._pool = None
+            return None
+
+
+def _warm(worker: Worker) -> None:
+    """Loads what a row takes, so that a try counts only while a pair is made."""
+    order = worker._order()
+    _matcher(order.model, order.threads, order.provider)
+
+
+@functools.cache
+def _matcher(model: str, threads: int | None, provider: str) -> Matcher:
+    """The matcher of this process, kept between pairs."""
+    return Matcher(model, threads=threads, provider=provider)
+
+
+@functools.cache
+def _carried(name: str, content: bytes) -> Path:
+    """A file of the driver's, on a disk of this machine for as long as the process lives."""
+    path = Path(_scratch().name, name)
+    path.write_bytes(content)
+    return path
+
+
+@functools.cache
+def _scratch() -> "tempfile.TemporaryDirectory[str]":
+    return tempfile.TemporaryDirectory(prefix="stereoweave-")
+
+
+def remove_left_behind(folder: Path) -> None:
+    """Removes what killed workers have left half-written in a folder, a while ago."""
+    for path in folder.glob(".*"):
+        with suppress(FileNotFoundError):
+            if time.time() - path.stat().st_mtime < _LEFT_BEHIND_S:
+                continue
+            if path.name.startswith(".stereoweave-"):
+                shutil.rmtree(path, ignore_errors=True)
+            elif is_leftover(path):
+                path.unlink()
+
+
+def _check_runs(matcher: Matcher) -> None:
+    """Raises where a provider fails with the smallest pair as well: then the last one was not too large."""
+    plain = np.zeros((SMALLEST_SIDE_PX, SMALLEST_SIDE_PX, 3), np.uint8)
+    matcher.estimate(plain, plain)
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """An error, what it came of, and so on."""
+    while error is not None:
+        yield error
+        error = error.__cause__
+
+
+def _names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir() if path.name[0] != "." and path.is_file())

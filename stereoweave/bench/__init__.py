@@ -1,0 +1,1 @@
+"""Scores: of disparity, of views, of flicker, against ground truth."""

@@ -1,0 +1,201 @@
+"""Rendered films whose motion is known: one that stands still, a thing that passes, a camera that moves."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from stereoweave.bench.flicker_metrics import seen_again
+from stereoweave.stereo import StereoPair
+from stereoweave.synth.rigs import Rig
+from stereoweave.synth.sets.make import camera
+from stereoweave.synth.sets.samples import Order, staged
+
+LEFT, MIDDLE, RIGHT = 0.0, 0.5, 1.0
+NOISE_LEVELS = 4.0
+# A thing that passes is painted from so many pixels a pixel and direction: it moves in quarters of a pixel.
+_FINE = 4
+# How far it is in front of everything else, at least.
+_IN_FRONT_PX = 8
+
+Change = tuple[Float[np.ndarray, "h w 2"], Float[np.ndarray, "h w"]]
+"""What becomes of a frame's points on the way to another one, as a view sees it: their motion to the right
+and down in px, and the change of their disparity in px."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Film:
+    """A film with its truth.
+
+    Attributes:
+        name: What happens in it.
+        pairs: Its frames, without noise.
+        disparities_px: What each frame truly shows [H, W], at the pixels of the views at LEFT and MIDDLE.
+        moving: Where the left view of each frame shows a thing that moves by itself.
+        change: Of one frame's points on the way to another frame, seen from a position.
+    """
+
+    name: str
+    pairs: list[StereoPair]
+    disparities_px: list[dict[float, Float[np.ndarray, "h w"]]]
+    moving: list[Bool[np.ndarray, "h w"]]
+    change: Callable[[int, int, float], Change]
+
+    def seen_again(self, frame: int, other: int, position: float) -> Bool[np.ndarray, "h w"]:
+        """The points of one frame that another one shows too, seen from a position."""
+        before_px, after_px = (self.disparities_px[number][position] for number in (frame, other))
+        return seen_again(before_px, after_px, *self.change(frame, other, position))
+
+
+def noisy(pair: StereoPair, rng: np.random.Generator) -> StereoPair:
+    """The pair with a sensor's noise: normal, of NOISE_LEVELS, of each eye, pixel and channel by itself."""
+
+    def with_noise(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+        return np.rint(image + rng.normal(0, NOISE_LEVELS, image.shape)).clip(0, 255).astype(np.uint8)
+
+    return StereoPair(left=with_noise(pair.left), right=with_noise(pair.right))
+
+
+def panning(order: Order, frames: int) -> Film:
+    """A film of a camera that moves: so many frames from the middle of the order's, where it is fastest."""
+    first = (order.frames - frames) // 2
+    stages = [staged(camera(), order, 0, first + number) for number in range(frames)]
+    rigs = [rig for _, rig in stages]
+    shots = [camera().shots(stage.world, rig, (LEFT, MIDDLE, RIGHT)) for stage, rig in stages]
+    disparities_px = [
+        {
+            position: rig.camera.disparity_px(shot.depth_m).astype(np.float32)
+            for position, shot in zip((LEFT, MIDDLE), seen, strict=False)
+        }
+        for rig, seen in zip(rigs, shots, strict=True)
+    ]
+
+    def change(frame: int, other: int, position: float) -> Change:
+        return reprojected(disparities_px[frame][position], rigs[frame], rigs[other], position)
+
+    return Film(
+        name="panning",
+        pairs=[StereoPair(left=left.image, right=right.image) for left, _, right in shots],
+        disparities_px=disparities_px,
+        moving=[np.zeros(left.depth_m.shape, bool) for left, _, _ in shots],
+        change=change,
+    )
+
+
+def reprojected(disparity_px: Float[np.ndarray, "h w"], rig: Rig, other: Rig, position: float) -> Change:
+    """What becomes of the points of a view at a position when the rig moves to where the other one is.
+
+    Args:
+        disparity_px: Of the points at the view's pixels; 0 for the sky.
+        rig: Which saw them.
+        other: With the same camera, elsewhere.
+        position: Of the view in both rigs.
+    """
+    lens, turn = rig.camera, other.axes @ rig.axes.T
+    shift = other.axes @ (rig.eye_m(position) - other.eye_m(position))
+    rows, columns = np.indices(disparity_px.shape, np.float64)
+    ray = np.stack(
+        [(columns - lens.cx_px) / lens.focal_px, (rows - lens.cy_px) / lens.focal_px, 1 + 0 * rows]
+    )
+    # All by the depth that the point has in the first view, so that the sky's may be infinite.
+    point = np.tensordot(turn, ray, 1) + shift[:, None, None] * disparity_px / (
+        lens.focal_px * lens.baseline_m
+    )
+    moved_x = lens.focal_px * point[0] / point[2] + lens.cx_px - columns
+    moved_y = lens.focal_px * point[1] / point[2] + lens.cy_px - rows
+    change_px = disparity_px / point[2] - disparity_px
+    return np.stack([moved_x, moved_y], -1).astype(np.float32), change_px.astype(np.float32)
+
+
+def still(film: Film) -> Film:
+    """A film of the same length that shows the first frame all the time."""
+    frames = len(film.pairs)
+    nothing = np.zeros((*film.moving[0].shape, 3), np.float32)
+    return Film(
+        name="still",
+        pairs=film.pairs[:1] * frames,
+        disparities_px=film.disparities_px[:1] * frames,
+        moving=film.moving[:1] * frames,
+        change=lambda frame, other, position: (nothing[..., :2], nothing[..., 2]),
+    )
+
+
+def passing(film: Film, name: str, velocity_px: tuple[float, float], nearing_px: float = 0.0) -> Film:
+    """A film of the same length: the first frame, and in front of it an oval picture that moves.
+
+    That picture is the frame itself, upside down and of a quarter of its size.
+
+    Args:
+        film: Whose first frame is taken.
+        name: Of the new film.
+        velocity_px: Of the oval in the left view, to the right and down, a frame; multiples of 0.25.
+        nearing_px: By how much its disparity grows, a frame; a multiple of 0.5.
+    """
+    pair, truth_px = film.pairs[0], film.disparities_px[0]
+    height, width = film.moving[0].shape
+    steps = range(len(film.pairs))
+    nearest_px = max(math.ceil(values.max()) for values in truth_px.values()) + _IN_FRONT_PX
+    ovals_px = [nearest_px + nearing_px * step for step in steps]
+
+    def pasted(
+        image: UInt8[np.ndarray, "h w 3"], step: int, position: float
+    ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+        left = round(width * 0.375) + velocity_px[0] * step - position * ovals_px[step]
+        return _pasted(image, pair.left, left, round(height * 0.375) + velocity_px[1] * step)
+
+    shown = [
+        {
+            place: pasted(pair.right if place == RIGHT else pair.left, step, place)
+            for place in (LEFT, MIDDLE, RIGHT)
+        }
+        for step in steps
+    ]
+
+    def change(frame: int, other: int, position: float) -> Change:
+        of_oval = np.array([*velocity_px, nearing_px]) * (other - frame)
+        of_oval[0] -= position * of_oval[2]
+        both = shown[frame][position][1][..., None] * of_oval.astype(np.float32)
+        return both[..., :2], both[..., 2]
+
+    return Film(
+        name=name,
+        pairs=[StereoPair(left=views[LEFT][0], right=views[RIGHT][0]) for views in shown],
+        disparities_px=[
+            {
+                place: np.where(shown[step][place][1], np.float32(ovals_px[step]), truth_px[place])
+                for place in truth_px
+            }
+            for step in steps
+        ],
+        moving=[views[LEFT][1] for views in shown],
+        change=change,
+    )
+
+
+def _pasted(
+    image: UInt8[np.ndarray, "h w 3"], picture: UInt8[np.ndarray, "h w 3"], left_px: float, top_px: float
+) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+    """The image with the oval of `passing` over it, and the pixels that the oval has half of or more.
+
+    Args:
+        image: What is behind.
+        picture: What is painted, upside down and four times smaller.
+        left_px: Of the oval's frame; a multiple of 0.25, as is the next.
+        top_px: Likewise.
+    """
+    height, width = picture.shape[:2]
+    oval = np.zeros((height, width, 1), np.uint8)
+    cv2.ellipse(oval, (width // 2, height // 2), (width // 2, height // 2), 0, 0, 360, 255, cv2.FILLED)
+    fine = np.dstack([picture[::-1] * (oval > 0), oval])
+    move = np.array([[1, 0, left_px * _FINE], [0, 1, top_px * _FINE]])
+    fine = cv2.warpAffine(
+        fine, move, (_FINE * image.shape[1], _FINE * image.shape[0]), flags=cv2.INTER_NEAREST
+    )
+    layer = cv2.resize(
+        fine.astype(np.float32), (image.shape[1], image.shape[0]), interpolation=cv2.INTER_AREA
+    )
+    share = layer[..., 3:] / 255
+    return np.rint(image * (1 - share) + layer[..., :3]).astype(np.uint8), share[..., 0] >= 0.5

@@ -1,0 +1,408 @@
+"""Matchers side by side on pairs of known disparity: accuracy, edges, confidence, time and memory."""
+
+import os
+import platform
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from stereoweave.bench.edge_metrics import edge_bad_percent, edge_epe_px, flying_percent
+from stereoweave.bench.error_classes import ClassErrors, class_errors, classify
+from stereoweave.bench.memory import peak_memory_mb
+from stereoweave.bench.metrics import (
+    Sparsification,
+    bad_percent,
+    calibration_error,
+    d1_percent,
+    epe_px,
+    sparsification,
+)
+from stereoweave.data.readers import Scene
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.text import write_table
+from stereoweave.matching.estimate import match
+from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.opencv import OPENCV_MATCHERS, SGBM, fill_rows, left_right_confidence
+from stereoweave.matching.providers import CPU
+from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.system.ray_engine import Engine, stream
+
+Match = Callable[[StereoPair], Estimate | Float[np.ndarray, "h w"]]
+"""What is timed: a pair to an Estimate; or to the left disparity in px [H, W] alone, where <= 0 is a hole.
+
+The holes of such a map are then filled along rows, and its confidence is the left-right check, for which the
+mirrored pair is matched too. Neither is timed: others do it in other ways, at other costs.
+"""
+
+Maker = Callable[[], Match]
+
+AnyScene = TypeVar("AnyScene")
+Result = TypeVar("Result")
+Lister = Callable[[], Sequence[Callable[[], AnyScene]]]
+"""Lists what reads each scene: called where a benchmark is started, and by every worker of a cluster."""
+
+MEAN = "mean"
+TURNS = 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """How one matcher did on one scene, or on the mean of all (scene "mean").
+
+    Errors are over every pixel whose truth is known, occluded ones included. A mean is over the scenes that
+    have the number: a scene without a depth edge has no error near one.
+
+    Attributes:
+        edge_epe_px, edge_bad1_percent, flying_percent: Near depth edges (edges.py).
+        ause_px, ause_bad1_percent: How far the confidence is from an order of pixels by their error, or from
+            bad ones before good ones: the area between its sparsification curve and the oracle's.
+        calibration_error: Of a confidence that is a probability, and NaN for the left-right check. Each scene
+            counts by itself: claims too high in one do not make up for claims too low in another.
+        time_ms: Median of the warm calls; in the mean row, the mean of these over the scenes.
+        time_relative: time_ms as a multiple of SGBM's in the same row.
+        memory_mb: In the mean row alone, where it was measured: of the largest pair (memory.py).
+    """
+
+    matcher: str
+    scene: str
+    epe_px: float
+    bad1_percent: float
+    bad2_percent: float
+    d1_percent: float
+    edge_epe_px: float
+    edge_bad1_percent: float
+    flying_percent: float
+    ause_px: float
+    ause_bad1_percent: float
+    calibration_error: float
+    time_ms: float
+    time_relative: float
+    memory_mb: float = float("nan")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClassRow:
+    """Errors of one matcher on one scene, or on the mean of all, in one class of pixels.
+
+    Attributes:
+        pixel_class: A name in `error_classes.CLASSES`, or `error_classes.ALL`.
+
+    The others are those of `ClassErrors`. A mean is over the scenes that have the number: a scene without a
+    plain pixel has no error within the class.
+    """
+
+    matcher: str
+    scene: str
+    pixel_class: str
+    share_percent: float
+    bad1_percent: float
+    bad2_percent: float
+    bad1_within_percent: float
+    bad2_within_percent: float
+    epe_px: float
+
+
+class Curves(NamedTuple):
+    """How a matcher's mean error in px, and its percent of bad pixels (over 1 px), fall by its confidence."""
+
+    epe_px: Sparsification
+    bad1_percent: Sparsification
+
+
+class Scores(NamedTuple):
+    """What `score_pairs` gives.
+
+    Attributes:
+        rows: One per scene and matcher, then a mean row per matcher.
+        class_rows: One per scene, matcher and class of pixels, then one per matcher and class for the mean.
+        curves: By matcher, the mean over the scenes.
+        largest: The pair with the most pixels, for `with_memory`.
+        machine: What the rows were measured with, for `write_csv`.
+    """
+
+    rows: list[Row]
+    class_rows: list[ClassRow]
+    curves: dict[str, Curves]
+    largest: StereoPair
+    machine: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Scored(Generic[Result]):
+    """What a scene's number gave, and the machine that it was measured on."""
+
+    number: int
+    result: Result
+    machine: dict[str, str]
+
+
+class _Scene(NamedTuple):
+    """What `score_pairs` keeps of a scene."""
+
+    scored: list[tuple[Row, Curves]]
+    class_rows: list[ClassRow]
+    pixels: int
+
+
+class _Answer(NamedTuple):
+    disparity_px: Float[np.ndarray, "h w"]
+    confidence: Float[np.ndarray, "h w"]
+    is_probability: bool
+
+
+def network(
+    model: str | Path, threads: int | None = None, refined: bool = False, provider: str = CPU
+) -> Match:
+    """What `stereoweave.estimate` does with a model, refined or not; errors as for `Matcher`."""
+    matcher = Matcher(model, threads=threads, provider=provider)
+    return lambda pair: match(matcher, pair, refined=refined)
+
+
+def score_pairs(makers: Mapping[str, Maker], scenes: Lister[Scene], engine: Engine | None = None) -> Scores:
+    """The errors, times and sparsification curves of matchers on scenes; those of OpenCV join them.
+
+    Args:
+        makers: What makes each matcher, by its name.
+        scenes: Lists at least one.
+        engine: Where each scene is scored by one worker, so that times are compared on one machine; in this
+            process unless given. The makers and `scenes` are sent to it.
+
+    Raises:
+        StereoweaveError: A matcher bears a name that the table uses itself, or is a file of that name; there
+            is no scene; or as in `engine.stream`.
+    """
+    everyone = _everyone(makers)
+    found = score_all(everyone, scenes, _score_scene, engine)
+    scored = [row_and_curves for scene in found for row_and_curves in scene.result.scored]
+    rows = [row for row, _ in scored]
+    class_rows = [row for scene in found for row in scene.result.class_rows]
+    largest = max(found, key=lambda scene: scene.result.pixels)
+    return Scores(
+        rows=rows + _mean_rows(rows, everyone),
+        class_rows=class_rows + _mean_class_rows(class_rows),
+        curves={name: _mean_curves([of for row, of in scored if row.matcher == name]) for name in everyone},
+        largest=scenes()[largest.number]().pair,
+        machine=machine_of_all(found),
+    )
+
+
+def score_all(
+    makers: Mapping[str, Callable[[], Any]],
+    scenes: Lister[AnyScene],
+    score: Callable[[Mapping[str, Any], AnyScene], Result],
+    engine: Engine | None,
+) -> list[Scored[Result]]:
+    """What `score` gives for all that the makers make and each scene, in the scenes' order.
+
+    The rest is as for `score_pairs`.
+    """
+    make_scorer = partial(_Scorer, makers, scenes, score)
+    scorer = make_scorer()  # here in any case, where it is said what is no matcher and no scene
+    count = len(scorer.readers)
+    if not count:
+        raise StereoweaveError("scenes: expected at least one, found none")
+    if engine is None:
+        return [scorer(number) for number in range(count)]
+    return sorted(stream(partial(make_scorer, count), range(count), engine), key=attrgetter("number"))
+
+
+def machine_of_all(scored: Iterable[Scored[Any]]) -> dict[str, str]:
+    """What the scenes were measured with; what is not the same for all of them is written side by side."""
+    machines = [scene.machine for scene in scored]
+    return {name: " + ".join(sorted({machine[name] for machine in machines})) for name in machines[0]}
+
+
+def with_memory(rows: Iterable[Row], makers: Mapping[str, Maker], pair: StereoPair) -> list[Row]:
+    """The rows, those of means with the memory that each matcher takes for a pair in a process of its own.
+
+    Args:
+        rows: As `score_pairs` gives them.
+        makers: As `score_pairs` took them; each has to be one that can be pickled.
+        pair: What is matched; the largest one of all says what is enough.
+    """
+    everyone = _everyone(makers)
+    return [
+        replace(row, memory_mb=peak_memory_mb(everyone[row.matcher], pair)) if row.scene == MEAN else row
+        for row in rows
+    ]
+
+
+def write_csv(path: str | Path, rows: Sequence[Any], machine: dict[str, str] | None = None) -> None:
+    """Writes the rows with a header, each beside the processor and the OpenCV that it was measured with.
+
+    Args:
+        path: Where to; the folder is made.
+        rows: One or more instances of one dataclass, whose fields are the columns.
+        machine: These two, and the number of cores; this one's unless given.
+    """
+    machine = machine or _machine()
+    columns = [field.name for field in fields(rows[0])] + list(machine)
+    values = [{k: f"{v:.6g}" if isinstance(v, float) else v for k, v in asdict(row).items()} for row in rows]
+    write_table(path, columns, (row | machine for row in values))
+
+
+class _Scorer:
+    """Scores scenes by their number, with matchers that are made once."""
+
+    def __init__(
+        self,
+        makers: Mapping[str, Callable[[], Any]],
+        scenes: Lister[Any],
+        score: Callable[[Mapping[str, Any], Any], Any],
+        expected: int | None = None,
+    ) -> None:
+        self.matchers = {name: make() for name, make in makers.items()}
+        self.readers, self.score = scenes(), score
+        if expected not in (None, len(self.readers)):
+            raise StereoweaveError(
+                f"{platform.node()}: expected the {expected} scenes that are where the command was started, "
+                f"found {len(self.readers)}; put them on a disk that every node of the cluster sees"
+            )
+
+    def __call__(self, number: int) -> Scored[Any]:
+        return Scored(number, self.score(self.matchers, self.readers[number]()), _machine())
+
+
+def _everyone(makers: Mapping[str, Maker]) -> dict[str, Maker]:
+    for name in makers:
+        if Path(name).stem in (*OPENCV_MATCHERS, MEAN):
+            raise StereoweaveError(f"{name}: expected a name that the table does not use itself; rename it")
+    return {**OPENCV_MATCHERS, **makers}
+
+
+def _score_scene(matchers: Mapping[str, Match], scene: Scene) -> _Scene:
+    # These first calls warm the matchers up for the timing.
+    answers = {name: _answer(match, scene.pair) for name, match in matchers.items()}
+    # In turns, so that a machine that slows down slows all alike.
+    turns_ms = [{name: _time_ms(match, scene.pair) for name, match in matchers.items()} for _ in range(TURNS)]
+    times_ms = {name: float(np.median([turn_ms[name] for turn_ms in turns_ms])) for name in matchers}
+    scored = []
+    for name, answer in answers.items():
+        curves = _curves(answer, scene.truth_px)
+        row = Row(
+            matcher=name,
+            scene=scene.name,
+            **_errors(answer, scene.truth_px),
+            ause_px=curves.epe_px.ause,
+            ause_bad1_percent=curves.bad1_percent.ause,
+            time_ms=times_ms[name],
+            time_relative=times_ms[name] / times_ms[SGBM],
+        )
+        scored.append((row, curves))
+    return _Scene(scored, _class_rows(answers, scene), scene.truth_px.size)
+
+
+def _class_rows(answers: Mapping[str, _Answer], scene: Scene) -> list[ClassRow]:
+    masks = classify(scene.pair.left, scene.truth_px, scene.occluded)
+    return [
+        ClassRow(matcher=name, scene=scene.name, pixel_class=pixel_class, **asdict(errors))
+        for name, answer in answers.items()
+        for pixel_class, errors in class_errors(answer.disparity_px, scene.truth_px, masks).items()
+    ]
+
+
+def _answer(match: Match, pair: StereoPair) -> _Answer:
+    found = match(pair)
+    if isinstance(found, Estimate):
+        return _Answer(found.disparity_px, found.confidence, is_probability=True)
+    mirrored_px = match(pair.mirrored())
+    assert not isinstance(mirrored_px, Estimate)
+    return _Answer(fill_rows(found), left_right_confidence(found, mirrored_px[:, ::-1]), is_probability=False)
+
+
+def _errors(answer: _Answer, truth_px: Float[np.ndarray, "h w"]) -> dict[str, float]:
+    """The columns of a row that compare with the truth pixel by pixel."""
+    found_px = answer.disparity_px
+    known = np.isfinite(truth_px)
+    hits = np.abs(found_px - truth_px)[known] <= 1
+    return {
+        "epe_px": epe_px(found_px, truth_px),
+        "bad1_percent": bad_percent(found_px, truth_px, 1),
+        "bad2_percent": bad_percent(found_px, truth_px, 2),
+        "d1_percent": d1_percent(found_px, truth_px),
+        "edge_epe_px": edge_epe_px(found_px, truth_px),
+        "edge_bad1_percent": edge_bad_percent(found_px, truth_px, 1),
+        "flying_percent": flying_percent(found_px, truth_px),
+        "calibration_error": calibration_error(answer.confidence[known], hits)
+        if answer.is_probability
+        else float("nan"),
+    }
+
+
+def _curves(answer: _Answer, truth_px: Float[np.ndarray, "h w"]) -> Curves:
+    known = np.isfinite(truth_px)
+    error_px = np.abs(answer.disparity_px[known] - truth_px[known].astype(np.float64))
+    confidence = answer.confidence[known]
+    return Curves(sparsification(error_px, confidence), sparsification(100.0 * (error_px > 1), confidence))
+
+
+def _time_ms(match: Match, pair: StereoPair) -> float:
+    start_s = time.perf_counter()
+    match(pair)
+    return 1000 * (time.perf_counter() - start_s)
+
+
+def _mean_rows(rows: list[Row], names: Iterable[str]) -> list[Row]:
+    columns = [field.name for field in fields(Row) if field.type is float]
+    means = {
+        name: {
+            column: float(_mean_known([getattr(row, column) for row in rows if row.matcher == name]))
+            for column in columns
+        }
+        for name in names
+    }
+    for mean in means.values():
+        mean["time_relative"] = mean["time_ms"] / means[SGBM]["time_ms"]
+    return [Row(matcher=name, scene=MEAN, **mean) for name, mean in means.items()]
+
+
+def _mean_class_rows(rows: Sequence[ClassRow]) -> list[ClassRow]:
+    """The means over the scenes, in the order of the first scene's rows."""
+    by_class: defaultdict[tuple[str, str], list[ClassRow]] = defaultdict(list)
+    for row in rows:
+        by_class[row.matcher, row.pixel_class].append(row)
+    columns = [field.name for field in fields(ClassErrors)]
+    return [
+        ClassRow(
+            matcher=matcher,
+            scene=MEAN,
+            pixel_class=pixel_class,
+            **{column: float(_mean_known([getattr(row, column) for row in alike])) for column in columns},
+        )
+        for (matcher, pixel_class), alike in by_class.items()
+    ]
+
+
+def _mean_curves(curves: Sequence[Curves]) -> Curves:
+    means = (
+        Sparsification(*(_mean_known(lines) for lines in zip(*of_scenes, strict=True)))
+        for of_scenes in zip(*curves, strict=True)
+    )
+    return Curves(*means)
+
+
+def _mean_known(values: Sequence[Any]) -> Any:
+    """The mean of numbers, or of arrays of one shape, over those without NaN; NaN where there is none."""
+    known = [value for value in values if not np.isnan(value).any()]
+    return np.mean(known, axis=0) if known else values[0]
+
+
+def _machine() -> dict[str, str]:
+    return {"cpu": _cpu_name(), "cores": str(os.cpu_count()), "opencv": cv2.__version__}
+
+
+def _cpu_name() -> str:
+    # Linux alone has this file, and there platform.processor() does not know the model.
+    about = Path("/proc/cpuinfo")
+    lines = about.read_text().splitlines() if about.exists() else []
+    models = [line.split(": ", 1)[1] for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor()

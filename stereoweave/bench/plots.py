@@ -1,0 +1,129 @@
+"""Plots of `stereoweave bench pairs`: errors against time, and what a confidence is worth."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Annotation
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullLocator
+from matplotlib.transforms import Bbox
+
+from stereoweave.bench.metrics import DROPPED_PERCENT, Sparsification
+from stereoweave.bench.pairs import Curves, Row
+from stereoweave.io.files import write_image
+from stereoweave.matching.opencv import OPENCV_MATCHERS
+
+# Okabe and Ito's colours, which colour-blind readers tell apart.
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+_TITLES = {"bad1_percent": "bad-1: off by over 1 px, % of pixels", "epe_px": "EPE: mean error, px"}
+_MARKER_PX = 8
+_Place = tuple[tuple[float, float], Literal["left", "center", "right"], Literal["top", "center", "bottom"]]
+# Where a label may stand beside its point, the best place first: offset in points, and how it is aligned.
+_PLACES: tuple[_Place, ...] = (
+    ((0, 6), "center", "bottom"),
+    ((0, -6), "center", "top"),
+    ((7, 0), "left", "center"),
+    ((-7, 0), "right", "center"),
+)
+
+
+def draw_error_over_time(path: str | Path, rows: Sequence[Row]) -> None:
+    """Write bad-1 and EPE against the time a pair takes, side by side; lower and further left is better.
+
+    Args:
+        path: The picture's file; its ending says what is written.
+        rows: One of each matcher: the means. Those of unknown error have no place in it.
+    """
+    rows = [row for row in rows if not math.isnan(row.epe_px)]
+    figure, panels = _panels()
+    for column, axes in panels.items():
+        for row in rows:
+            axes.plot(row.time_ms, getattr(row, column), **_marker(row))
+        highest = max((getattr(row, column) for row in rows), default=1)
+        axes.set(xscale="log", xlabel="time a pair, ms", ylabel=_TITLES[column], ylim=(0, 1.15 * highest))
+        axes.margins(x=0.15)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+        axes.xaxis.set_minor_locator(NullLocator())
+    # Labels make room for each other, and so have to know where the points will be.
+    figure.draw_without_rendering()
+    for column, axes in panels.items():
+        _label(axes, {_shown(row.matcher): (row.time_ms, getattr(row, column)) for row in rows})
+    _save(figure, path)
+
+
+def draw_sparsification(path: str | Path, curves: Mapping[str, Curves]) -> None:
+    """Write how bad-1 and EPE fall as the least confident pixels are dropped; a dashed line is the oracle's.
+
+    Args:
+        path: The picture's file; its ending says what is written.
+        curves: By matcher, as `score_pairs` gives them.
+    """
+    figure, panels = _panels()
+    for column, axes in panels.items():
+        for index, (name, of_matcher) in enumerate(curves.items()):
+            curve: Sparsification = getattr(of_matcher, column)
+            colour = _COLOURS[index % len(_COLOURS)]
+            axes.plot(DROPPED_PERCENT, curve.kept, color=colour, linewidth=2, label=_legend(name))
+            axes.plot(DROPPED_PERCENT, curve.oracle, color=colour, linewidth=1, linestyle="--")
+        axes.set(xlabel="dropped, % of pixels", ylabel=_TITLES[column], xlim=(0, 95), ylim=(0, None))
+    axes.plot([], [], color="0.4", linewidth=1, linestyle="--", label="by its error: the oracle")
+    axes.legend(loc="upper right", frameon=False)
+    _save(figure, path)
+
+
+def _panels() -> tuple[Figure, dict[str, Axes]]:
+    figure = Figure(figsize=(9, 4), layout="constrained")
+    panels = dict(zip(_TITLES, figure.subplots(1, 2), strict=True))
+    for axes in panels.values():
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(color="0.92")
+        axes.set_axisbelow(True)
+    return figure, panels
+
+
+def _marker(row: Row) -> dict[str, Any]:
+    if row.matcher in OPENCV_MATCHERS:
+        return {"marker": "s", "color": "0.45", "linestyle": ""}
+    return {"marker": "o", "color": _COLOURS[0], "linestyle": ""}
+
+
+def _shown(matcher: str) -> str:
+    return Path(matcher).name
+
+
+def _legend(matcher: str) -> str:
+    return f"{matcher}, by its left-right check" if matcher in OPENCV_MATCHERS else _shown(matcher)
+
+
+def _label(axes: Axes, points: Mapping[str, tuple[float, float]]) -> None:
+    """Write each name beside its point, where no point and no other name is, if there is such a place."""
+    corners = [axes.transData.transform(point) for point in points.values()]
+    taken = [Bbox([corner - _MARKER_PX / 2, corner + _MARKER_PX / 2]) for corner in corners]
+    for name, point in points.items():
+        labels = [_written(axes, name, point, place) for place in _PLACES]
+        boxes = [label.get_window_extent() for label in labels]
+        free = (index for index, box in enumerate(boxes) if not any(map(box.overlaps, taken)))
+        chosen = next(free, 0)
+        taken.append(boxes[chosen])
+        for label in labels[:chosen] + labels[chosen + 1 :]:
+            label.remove()
+
+
+def _written(axes: Axes, name: str, point: tuple[float, float], place: _Place) -> Annotation:
+    offset, horizontal, vertical = place
+    return axes.annotate(
+        name, point, offset, textcoords="offset points", ha=horizontal, va=vertical, fontsize=9
+    )
+
+
+def _save(figure: Figure, path: str | Path) -> None:
+    canvas = FigureCanvasAgg(figure)
+    figure.set_dpi(130)
+    canvas.draw()  # type: ignore[no-untyped-call]
+    write_image(path, np.asarray(canvas.buffer_rgba())[..., :3].copy())  # type: ignore[no-untyped-call]

@@ -1,0 +1,140 @@
+"""Methods side by side on one dataset: errors of depth, and of the right view made with it.
+
+The columns of Table I of "Fast Depth Estimation for View Synthesis". The paper does not say how its view
+error treats pixels without a source, which a bad disparity can make many of. So it is given twice: over the
+pixels that have one, with their share, and over all pixels after one row fill for all methods. The second one
+ranks.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from stereoweave.bench.metrics import depth_error_m, epe_px, mae, psnr_db, ssim
+from stereoweave.bench.projection import fill_from_rows, project_right
+from stereoweave.errors import StereoweaveError
+from stereoweave.matching.opencv import OPENCV_MATCHERS, SGBM, fill_rows
+from stereoweave.stereo import Sample, StereoPair, View
+
+Method = Callable[[Sample], Float[np.ndarray, "h w"]]
+"""What gives the disparity in px of a sample's left view [H, W]."""
+
+GROUND_TRUTH, NO_WARPING = "ground truth", "no warping"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewErrors:
+    """How a projected right view differs from the photograph.
+
+    Attributes:
+        mae_sourced: Mean absolute error, 0 to 255, of the pixels that received a source.
+        sourced_percent: Their share.
+        mae_filled: Mean absolute error, 0 to 255, of all pixels after `fill_from_rows`; the one to rank by.
+        psnr_db, ssim: Of the filled view.
+    """
+
+    mae_sourced: float
+    sourced_percent: float
+    mae_filled: float
+    psnr_db: float
+    ssim: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewRow:
+    """How one method did, as means over the samples: the errors of its disparity, and `ViewErrors`.
+
+    Attributes:
+        epe_px: End-point error over the pixels of known truth.
+        epe_cm: Mean absolute error of depth there, through each sample's camera; NaN if one has no camera.
+            Estimates are clamped as `score_views` says.
+    """
+
+    method: str
+    epe_px: float
+    epe_cm: float
+    mae_sourced: float
+    sourced_percent: float
+    mae_filled: float
+    psnr_db: float
+    ssim: float
+
+
+def score_views(
+    methods: Mapping[str, Method], samples: Iterable[Sample], max_depth_m: float | None = None
+) -> list[ViewRow]:
+    """A row per method, the means over all samples, after those of three that every table has.
+
+    "ground truth" is the true disparity, which has no source to give where it is unknown; "no warping" a
+    disparity of 0, whose right view is the left image; "sgbm" OpenCV's matcher, its holes filled along rows.
+
+    Args:
+        methods: What gives the disparity of each further row, by its name.
+        samples: Pairs of known disparity.
+        max_depth_m: What an estimated depth is clamped to before it is compared, since one pixel at infinity
+            would make the mean infinite. None: the greatest true depth of each sample.
+
+    Raises:
+        StereoweaveError: A method bears one of these three names, or there is no sample.
+    """
+    everyone: dict[str, Method] = {GROUND_TRUTH: _true_px, NO_WARPING: _zero_px, SGBM: _sgbm()}
+    if taken := everyone.keys() & methods.keys():
+        raise StereoweaveError(f"{min(taken)}: expected a name that the table does not use itself; rename it")
+    everyone |= methods
+    scores = [
+        {name: _scores(method(sample), sample, max_depth_m) for name, method in everyone.items()}
+        for sample in samples
+    ]
+    if not scores:
+        raise StereoweaveError("samples: expected at least one, found none; is the split empty?")
+    return [ViewRow(method=name, **_means([score[name] for score in scores])) for name in everyone]
+
+
+def view_errors(right: UInt8[np.ndarray, "h w 3"], projected: View) -> ViewErrors:
+    """The errors of a right view made by `project_right`, against the right photograph."""
+    filled = fill_from_rows(projected)
+    return ViewErrors(
+        mae_sourced=mae(projected.image, right, projected.drawn),
+        sourced_percent=100 * float(projected.drawn.mean()),
+        mae_filled=mae(filled, right),
+        psnr_db=psnr_db(filled, right),
+        ssim=ssim(filled, right),
+    )
+
+
+def _scores(
+    disparity_px: Float[np.ndarray, "h w"], sample: Sample, max_depth_m: float | None
+) -> dict[str, float]:
+    errors = view_errors(sample.right, project_right(sample.left, disparity_px))
+    return {
+        "epe_px": epe_px(disparity_px, sample.disparity_px),
+        "epe_cm": _epe_cm(disparity_px, sample, max_depth_m),
+        **asdict(errors),
+    }
+
+
+def _epe_cm(disparity_px: Float[np.ndarray, "h w"], sample: Sample, max_depth_m: float | None) -> float:
+    if sample.camera is None:
+        return float("nan")
+    truth_m = sample.camera.depth_m(sample.disparity_px)
+    farthest_m = truth_m[np.isfinite(truth_m)].max(initial=0) if max_depth_m is None else max_depth_m
+    return 100 * depth_error_m(np.minimum(sample.camera.depth_m(disparity_px), farthest_m), truth_m)
+
+
+def _means(scores: list[dict[str, float]]) -> dict[str, float]:
+    return {column: float(np.mean([score[column] for score in scores])) for column in scores[0]}
+
+
+def _true_px(sample: Sample) -> Float[np.ndarray, "h w"]:
+    return sample.disparity_px
+
+
+def _zero_px(sample: Sample) -> Float[np.ndarray, "h w"]:
+    return np.zeros_like(sample.disparity_px)
+
+
+def _sgbm() -> Method:
+    match = OPENCV_MATCHERS[SGBM]()
+    return lambda sample: fill_rows(match(StereoPair(left=sample.left, right=sample.right)))

@@ -1,0 +1,150 @@
+"""Pairs with pictures from between (or beyond) the two cameras, real or rendered, to score new views on."""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from stereoweave.data.samples import make_sample, of_its_size
+from stereoweave.data.shards import Shards, list_shards
+from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.io.files import read_disparity_png, read_image, read_pair, read_pfm, read_small, reading
+from stereoweave.rendering.renderer import FIRST_POSITION, LAST_POSITION
+from stereoweave.stereo import Sample, StereoPair
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrueView:
+    """A picture that a camera on the line through the two has taken.
+
+    Attributes:
+        position: Where it stood: 0 is the left camera, 1 the right one.
+        image: uint8 RGB [H, W, 3].
+        offset_px: How far its content lies right of and below the nominal place.
+    """
+
+    position: float
+    image: UInt8[np.ndarray, "h w 3"]
+    offset_px: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewScene:
+    """A pair, and pictures to score new views of it against.
+
+    Attributes:
+        name: The folder's, or SUBFOLDER/ship-000057 in a rendered set.
+        sample: The pair; its disparities are NaN where the scene has none.
+        views: At least one, by position, each of the pair's size.
+    """
+
+    name: str
+    sample: Sample
+    views: tuple[TrueView, ...]
+
+
+def read_view_scenes(folder: str | Path) -> Iterator[ViewScene]:
+    """The scenes of `folder` by name, each read when its turn comes; as for `list_view_scenes`."""
+    return (read() for read in list_view_scenes(folder))
+
+
+def list_view_scenes(folder: str | Path) -> list[Callable[[], ViewScene]]:
+    """What reads each scene of `folder`, by the scenes' names.
+
+    A scene is a folder of left.png, right.png, and view_<position>.png for each further photograph. It may
+    have disparity.png (16 bit, pixels * 256, 0 = unknown) or disparity.pfm (NaN or infinity = unknown), the
+    same as right_disparity, and scene.json, whose "offset_px" {position: [right, down]} says how far a
+    photograph lies beside its nominal place. Where there is no such folder, the pairs of all rendered sets
+    (`stereoweave synth make --view`) in `folder` and below it are the scenes.
+
+    Raises:
+        StereoweaveError: No scene in the folder.
+        FormatError: While a scene is read: a file is missing, damaged, or of another size than its
+            neighbours; a position is no number that a view can be rendered at; there is no further picture.
+    """
+    root = Path(folder)
+    if scenes := sorted(left.parent for left in root.glob("*/left.png")):
+        return [partial(_read_scene, scene) for scene in scenes]
+    below = sorted({path.parent for path in root.rglob("[!.]*.tar")})
+    sets = [Shards(path) for path in below if list_shards(path)]
+    if not sets:
+        raise StereoweaveError(
+            f"{root}: expected <scene>/left.png below it, or rendered sets, found neither; "
+            "stereoweave synth make --view 0.5 renders one"
+        )
+    return [partial(_rendered_scene, pairs, index, root) for pairs in sets for index in range(pairs.count)]
+
+
+def _rendered_scene(pairs: Shards, index: int, root: Path) -> ViewScene:
+    folder = pairs.shards[0].path.parent
+    name = (folder.relative_to(root) / pairs.name(index)).as_posix()
+    views = tuple(TrueView(position=at, image=image) for at, image in sorted(pairs.views(index).items()))
+    if not views:
+        raise FormatError(
+            f"{folder}: expected pairs with further views, found {name} without; "
+            "stereoweave synth make --view 0.5 renders them"
+        )
+    return ViewScene(name=name, sample=pairs[index], views=views)
+
+
+def _read_scene(folder: Path) -> ViewScene:
+    pair = read_pair(folder / "left.png", folder / "right.png")
+    truth_px = partial(_read_disparity, folder, pair=pair)
+    offsets_px = _read_offsets(folder / "scene.json")
+    views = [_read_view(path, pair, offsets_px) for path in folder.glob("view_*.png")]
+    if not views:
+        raise FormatError(
+            f"{folder}: expected a photograph from between, such as view_0.5.png, found no view_*.png"
+        )
+    return ViewScene(
+        name=folder.name,
+        sample=make_sample(pair, truth_px("disparity"), truth_px("right_disparity")),
+        views=tuple(sorted(views, key=lambda view: view.position)),
+    )
+
+
+def _read_view(path: Path, pair: StereoPair, offsets_px: dict[float, tuple[float, float]]) -> TrueView:
+    position = _position(path)
+    image = of_its_size(read_image(path), path, pair)
+    return TrueView(position=position, image=image, offset_px=offsets_px.get(position, (0.0, 0.0)))
+
+
+def _position(path: Path) -> float:
+    text = path.stem.removeprefix("view_")
+    try:
+        position = float(text)
+    except ValueError:
+        position = float("nan")
+    if not FIRST_POSITION <= position <= LAST_POSITION:
+        raise FormatError(
+            f"{path}: expected view_<position>.png, a position of {FIRST_POSITION:g} to {LAST_POSITION:g} "
+            f"(0 left camera, 1 right), found {text!r}"
+        )
+    return position
+
+
+def _read_disparity(folder: Path, name: str, *, pair: StereoPair) -> Float[np.ndarray, "h w"]:
+    """The named disparity, of which one file or none is there; all of it NaN, unknown, if none is."""
+    readers: dict[str, Callable[[Path], Float[np.ndarray, "h w"]]] = {
+        ".pfm": read_pfm,
+        ".png": read_disparity_png,
+    }
+    for ending, read in readers.items():
+        if (path := folder / f"{name}{ending}").exists():
+            return of_its_size(read(path), path, pair)
+    return np.full(pair.left.shape[:2], np.nan, np.float32)
+
+
+def _read_offsets(path: Path) -> dict[float, tuple[float, float]]:
+    if not path.exists():
+        return {}
+    with reading(path, 'JSON whose "offset_px" is {position: [right, down]}'):
+        try:
+            offsets_px = json.loads(read_small(path)).get("offset_px", {})
+            return {float(position): (float(x), float(y)) for position, (x, y) in offsets_px.items()}
+        except (AttributeError, TypeError) as error:
+            raise ValueError("another form") from error

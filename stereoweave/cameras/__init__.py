@@ -1,0 +1,1 @@
+"""Calibration, rectification and their checks."""

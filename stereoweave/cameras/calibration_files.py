@@ -1,0 +1,392 @@
+"""Two cameras from the files that calibration programs write, and into one."""
+
+import base64
+import contextlib
+import math
+import re
+import reprlib
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from stereoweave.cameras.rig import Optics, Rig, Size, side_by_side, size_of
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.files import read_small, reading, replacing
+from stereoweave.io.structured_text import BASE64, parse_entries
+from stereoweave.stereo import StereoPair
+
+_MM_ABOVE = 2.0
+_YES, _NO = ("true", "yes", "on", "y"), ("false", "no", "off", "n")
+_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_FISHEYE_NAMES = {"fisheye", "equidistant", "equi", "kannalabrandt", "kb4"}
+_PINHOLE_NAMES = {"pinhole", "radtan", "plumbbob", "rationalpolynomial", "brownconrady", "none"}
+# OpenCV's names of types: those of base64, and those whose decimal digits are rounded to them.
+_BASE64_TYPES = {"u": "u1", "c": "i1", "w": "<u2", "s": "<i2", "i": "<i4", "f": "<f4", "d": "<f8"}
+_ROUNDED = {"h": np.float16, "f": np.float32}
+_HEXADECIMAL = re.compile(r"[-+]?0[xX][0-9a-fA-F]{1,16}")
+_EXPECTED = "a calibration of two cameras: OpenCV's YAML or XML, Kalibr's camchain, KITTI's or Middlebury's"
+
+
+def read_rig(path: str | Path, size_px: Size | None = None) -> Rig:
+    """The two cameras of a calibration file, known by its content.
+
+    Sources:
+        OpenCV's YAML, XML or JSON (cv2.FileStorage) with the names of its examples, M1 D1 M2 D2 R T, or
+        K1 .., cameraMatrix1 .., and so on, where extrinsics.yml is completed by the intrinsics.yml beside it
+        and the other way round. It does not say its unit of length: without an entry translation_unit (m, cm
+        or mm) a translation longer than 2 is taken for millimetres, else for metres. Nor does it say the
+        lens: without an entry distortion_model it is taken for a pinhole.
+        Kalibr's camchain.yaml, cam0 left and cam1 right. KITTI's calib.txt (P0 to P3) and
+        calib_cam_to_cam.txt, of the colour cameras 2 and 3 where they are there. Middlebury's calib.txt.
+
+    Args:
+        path: The file.
+        size_px: Width and height of the pictures: KITTI's calib_cam_to_cam.txt has a calibration for the
+            raw pictures as well, which is taken where they are of that size.
+
+    Raises:
+        FormatError: No such file, no regular one, or one of more than 256 KB; an entry is missing, or its
+            value is nonsense; it is nested more than 20 deep, has more than 10,000 values, an anchor, an
+            alias or a DTD.
+    """
+    # What overflows or is divided by 0 on the way is refused at the end, where it is not finite.
+    with reading(path, _EXPECTED), np.errstate(all="ignore"):
+        text = _text(Path(path))
+        if re.search(r"^(cam0|doffs|baseline)\s*=", text, re.MULTILINE):
+            rig = _middlebury(text)
+        elif re.search(r"^(P\d|P_rect_\d\d|K_\d\d):", text, re.MULTILINE):
+            rig = _kitti(text, size_px)
+        elif "cam0" in (entries := parse_entries(text)):
+            rig = _kalibr(entries)
+        else:
+            rig = _opencv(_completed(entries, Path(path)))
+        return replace(rig, name=str(path))
+
+
+def calibration_bytes(path: str | Path) -> bytes:
+    """The content of a calibration file; FormatError where it is missing, too large or no regular file."""
+    with reading(path, _EXPECTED):
+        return read_small(path)
+
+
+def calibrated(pair: StereoPair, path: str | Path) -> StereoPair:
+    """The pair with the camera of a calibration for rectified pictures of this size."""
+    rig = read_rig(path, size_of(pair))
+    rig.check_size(pair)
+    return replace(pair, camera=rig.camera())
+
+
+def write_rig(path: str | Path, rig: Rig) -> None:
+    """Writes OpenCV's YAML, which `read_rig` reads back exactly and cv2.FileStorage reads as well.
+
+    Its entries: image_width, image_height, distortion_model, M1, D1, M2, D2, R, T and translation_unit.
+    """
+    if rig.left.fisheye != rig.right.fisheye:
+        raise StereoweaveError(f"{path}: expected two lenses of one kind, found a pinhole and a fisheye one")
+    storage = cv2.FileStorage(".yml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
+    if rig.size_px is not None:
+        storage.write("image_width", rig.size_px[0])
+        storage.write("image_height", rig.size_px[1])
+    storage.write("distortion_model", "fisheye" if rig.left.fisheye else "pinhole")
+    for side, optics in (("1", rig.left), ("2", rig.right)):
+        storage.write(f"M{side}", optics.matrix)
+        storage.write(f"D{side}", optics.distortion.reshape(1, -1))
+    storage.write("R", rig.rotation)
+    storage.write("T", rig.translation_m.reshape(3, 1))
+    storage.write("translation_unit", "m")
+    with replacing(path) as temporary:
+        temporary.write_text(storage.releaseAndGetString())
+
+
+def _text(path: Path) -> str:
+    return calibration_bytes(path).decode("utf-8-sig", errors="replace")
+
+
+# OpenCV and Kalibr
+
+
+def _completed(entries: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Entries, and those of the file beside it where one of OpenCV's two files was named."""
+    for this, other in (("intrinsics", "extrinsics"), ("extrinsics", "intrinsics")):
+        beside = path.with_name(path.name.replace(this, other))
+        if this in path.name and beside.exists():
+            with reading(beside, _EXPECTED):
+                return parse_entries(_text(beside)) | entries
+    return entries
+
+
+def _opencv(entries: Mapping[str, Any]) -> Rig:
+    # Some write camera_matrix_left, some cameraMatrixLeft.
+    plain = {_plain_word(key): value for key, value in entries.items()}
+    parts = _opencv_parts(plain)
+    model = _model(plain)
+    left, right = (
+        Optics(
+            matrix=parts[f"matrix {side}"].reshape(3, 3),
+            distortion=parts[f"distortion {side}"].ravel(),
+            fisheye=model == "fisheye",
+        )
+        for side in ("left", "right")
+    )
+    translation = parts["translation"].reshape(3)
+    unit, notes = _unit(translation, plain.get("translationunit"))
+    if model is None and left.distortion.size == 4:
+        notes += (
+            "the calibration does not say its lenses: taken for pinhole ones, k1 k2 p1 p2; an entry "
+            "distortion_model: fisheye says otherwise",
+        )
+    return Rig(
+        left=left,
+        right=right,
+        rotation=parts["rotation"].reshape(3, 3),
+        translation_m=translation * _METRES[unit],
+        size_px=_size(plain),
+        notes=notes,
+    )
+
+
+def _opencv_parts(plain: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """The numbers of either camera and between them, whatever they are called."""
+    found = {
+        f"{what} {side}": _of_side(plain, names, sides)
+        for side, sides in (("left", ("1", "left", "l")), ("right", ("2", "right", "r")))
+        for what, names in (
+            ("matrix", ("m", "k", "cm", "cameramatrix", "mtx")),
+            ("distortion", ("d", "dist", "distcoeffs", "distortion", "distortioncoefficients")),
+        )
+    }
+    found["rotation"] = _first(plain, ("r", "rotation", "rotationmatrix", "rot"))
+    found["translation"] = _first(plain, ("t", "translation", "translationvector", "trans"))
+    missing = [name for name, value in found.items() if value is None]
+    if missing:
+        raise ValueError(f"no entry for {', '.join(missing)} (M1 D1 M2 D2 R T)")
+    return {name: _numbers(value) for name, value in found.items()}
+
+
+def _plain_word(word: object) -> str:
+    return re.sub(r"[^a-z0-9]", "", str(word).lower())
+
+
+def _first(entries: Mapping[str, Any], names: Iterable[str]) -> Any:
+    return next((entries[name] for name in names if name in entries), None)
+
+
+def _of_side(entries: Mapping[str, Any], names: Iterable[str], sides: Iterable[str]) -> Any:
+    pairs = [(name, side) for name in names for side in sides]
+    return _first(entries, [name + side for name, side in pairs] + [side + name for name, side in pairs])
+
+
+def _model(entries: Mapping[str, Any]) -> str | None:
+    """The kind of lens that OpenCV's file names, fisheye or pinhole; None where it names none."""
+    if _is_true(_first(entries, ("fisheyemodel", "fisheye")) or "no"):
+        return "fisheye"
+    named = _first(entries, ("distortionmodel", "cameramodel", "model"))
+    return None if named is None else _known_model(named)
+
+
+def _is_true(said: object) -> bool:
+    word = str(said).lower()
+    if word in _YES or word in _NO:
+        return word in _YES
+    with contextlib.suppress(ValueError):
+        if math.isfinite(number := float(word)):
+            return number != 0
+    raise ValueError(f"fisheye: {reprlib.repr(said)}, not one of {', '.join(_YES + _NO)} or a number")
+
+
+def _known_model(named: object) -> str:
+    word = _plain_word(named)
+    if word in _FISHEYE_NAMES:
+        return "fisheye"
+    if word in _PINHOLE_NAMES:
+        return "pinhole"
+    raise ValueError(
+        f"a lens {reprlib.repr(named)}; radtan (pinhole) and equidistant (fisheye) ones are known"
+    )
+
+
+def _unit(translation: Float[np.ndarray, "3"], stated: object) -> tuple[str, tuple[str, ...]]:
+    """The translation's unit of length, and a line that says so where it is a guess."""
+    if stated is not None:
+        if str(stated) not in _METRES:
+            raise ValueError(f"translation_unit {reprlib.repr(stated)}, not one of {', '.join(_METRES)}")
+        return str(stated), ()
+    length = float(np.linalg.norm(translation))
+    unit, word = ("mm", "millimetres") if length > _MM_ABOVE else ("m", "metres")
+    note = (
+        f"the calibration does not say its unit of length: its baseline of {length:g} was taken for {word}; "
+        "an entry translation_unit: m, cm or mm says otherwise"
+    )
+    return unit, (note,)
+
+
+def _size(entries: Mapping[str, Any]) -> Size | None:
+    both = _first(entries, ("imagesize", "resolution", "size"))
+    if both is None:
+        both = [entries.get("image" + side, entries.get(side)) for side in ("width", "height")]
+        if None in both:
+            return None
+    sides_px = _numbers(both).ravel()
+    if sides_px.size != 2:
+        raise ValueError(f"a picture's size of {reprlib.repr(both)}, not width and height")
+    width, height = sides_px
+    return int(width), int(height)
+
+
+def _kalibr(entries: Mapping[str, Any]) -> Rig:
+    first, second = entries["cam0"], entries.get("cam1")
+    if not isinstance(first, dict) or not isinstance(second, dict):
+        raise ValueError("not two cameras, cam0 and cam1")
+    transform = second.get("T_cn_cnm1")
+    if transform is None:
+        raise ValueError("no T_cn_cnm1 of cam1, the way from cam0 to it")
+    to_right = _numbers(transform).reshape(4, 4)
+    left, right = _kalibr_optics("cam0", first), _kalibr_optics("cam1", second)
+    return Rig(
+        left=left,
+        right=right,
+        rotation=to_right[:3, :3],
+        translation_m=to_right[:3, 3],
+        size_px=_size({_plain_word(key): value for key, value in first.items()}),
+    )
+
+
+def _kalibr_optics(name: str, entries: Mapping[str, Any]) -> Optics:
+    missing = {"intrinsics", "distortion_coeffs"} - entries.keys()
+    if missing:
+        raise ValueError(f"no {' and no '.join(sorted(missing))} of {name}")
+    camera, intrinsics = entries.get("camera_model", "pinhole"), _numbers(entries["intrinsics"])
+    if camera != "pinhole" or intrinsics.size != 4:
+        raise ValueError(
+            f"the camera model {reprlib.repr(camera)} of {name}; "
+            "calibrate with pinhole-radtan or pinhole-equi"
+        )
+    fisheye = _known_model(entries.get("distortion_model", "radtan")) == "fisheye"
+    matrix = _camera_matrix(*intrinsics.tolist())
+    return Optics(matrix=matrix, distortion=_numbers(entries["distortion_coeffs"]).ravel(), fisheye=fisheye)
+
+
+# KITTI and Middlebury
+
+
+def _kitti(text: str, size_px: Size | None) -> Rig:
+    """Source: the development kits of KITTI's raw data, stereo, object and odometry benchmarks."""
+    lines = (line.split(":", 1) for line in text.splitlines() if ":" in line)
+    rows = {
+        key.strip(): _numbers(values.split())
+        for key, values in lines
+        if re.match(r"[PKDRTS]_?(rect_)?\d", key.strip())
+    }
+    first, second = (2, 3) if {"P3", "P_rect_03", "K_03"} & rows.keys() else (0, 1)
+    notes = (f"of KITTI's cameras, {first} is taken for the left one and {second} for the right one",)
+    raw_px = _kitti_size(rows, f"S_{first:02}")
+    keys = (f"P_rect_{first:02}", f"P_rect_{second:02}")
+    if keys[0] not in rows:
+        keys = f"P{first}", f"P{second}"
+    if keys[0] not in rows or (size_px is not None and size_px == raw_px):
+        return replace(_kitti_raw(rows, f"{first:02}", f"{second:02}"), size_px=raw_px, notes=notes)
+    left, right = (_kitti_row(rows, key).reshape(3, 4) for key in keys)
+    return replace(
+        side_by_side(left, right, right[0, 3] / right[0, 0] - left[0, 3] / left[0, 0]),
+        size_px=_kitti_size(rows, f"S_rect_{first:02}"),
+        notes=notes,
+    )
+
+
+def _kitti_raw(rows: Mapping[str, Float[np.ndarray, " _"]], first: str, second: str) -> Rig:
+    """The rig of the pictures before KITTI's own rectification; each camera stands relative to camera 0."""
+    left, right = (
+        Optics(
+            matrix=_kitti_row(rows, f"K_{number}").reshape(3, 3),
+            distortion=_kitti_row(rows, f"D_{number}"),
+        )
+        for number in (first, second)
+    )
+    left_rotation, right_rotation = (
+        _kitti_row(rows, f"R_{number}").reshape(3, 3) for number in (first, second)
+    )
+    rotation = right_rotation @ left_rotation.T
+    translation_m = _kitti_row(rows, f"T_{second}") - rotation @ _kitti_row(rows, f"T_{first}")
+    return Rig(left=left, right=right, rotation=rotation, translation_m=translation_m)
+
+
+def _kitti_row(rows: Mapping[str, Float[np.ndarray, " _"]], key: str) -> Float[np.ndarray, " _"]:
+    if key not in rows:
+        raise ValueError(f"no entry {key}")
+    return rows[key]
+
+
+def _kitti_size(rows: Mapping[str, Float[np.ndarray, " _"]], key: str) -> Size | None:
+    if key not in rows:
+        return None
+    width, height = rows[key].tolist()
+    return int(width), int(height)
+
+
+def _middlebury(text: str) -> Rig:
+    """Source: the Middlebury datasets of 2014, cam0=[f 0 cx; 0 f cy; 0 0 1], the baseline in millimetres."""
+    lines = (line.split("=", 1) for line in text.splitlines() if "=" in line)
+    entries = {key.strip(): value for key, value in lines}
+    missing = {"cam0", "doffs", "baseline", "width", "height"} - entries.keys()
+    if missing:
+        raise ValueError(f"no entry {', '.join(sorted(missing))} of a Middlebury calib.txt")
+    rows = entries["cam0"].strip(" []").split(";", 3)  # a fourth row is refused, however long it is
+    left = _numbers([row.split() for row in rows]).reshape(3, 3)
+    right = left + np.array([[0, 0, float(entries["doffs"])], [0, 0, 0], [0, 0, 0]])
+    baseline_m = float(entries["baseline"]) / 1000
+    if not baseline_m > 0:
+        raise ValueError(f"a baseline of {entries['baseline']}, which must be positive")
+    size_px = int(entries["width"]), int(entries["height"])
+    return replace(side_by_side(left, right, -baseline_m), size_px=size_px)
+
+
+def _camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
+    return _numbers([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+def _numbers(values: Any) -> Float[np.ndarray, "..."]:
+    """The numbers of a value of `parse_entries`: one, a list of them, a list of rows, or OpenCV's matrix."""
+    if isinstance(values, dict) and "data" in values:
+        return _matrix(values)
+    if isinstance(values, str) and values.startswith(BASE64):
+        return _decoded(values)
+    try:
+        return np.asarray(_decimal(values), dtype=np.float64)
+    except (TypeError, ValueError) as error:  # the former of a dict, for instance
+        raise ValueError(f"{reprlib.repr(values)} in place of numbers") from error
+
+
+def _decimal(values: Any) -> Any:
+    """The values, with numbers in place of hexadecimal words."""
+    if isinstance(values, list):
+        return [_decimal(value) for value in values]
+    return int(values, 16) if isinstance(values, str) and _HEXADECIMAL.fullmatch(values) else values
+
+
+def _matrix(entries: Mapping[str, Any]) -> Float[np.ndarray, "..."]:
+    """OpenCV's matrix: what cv2.FileStorage makes of it, in float64."""
+    written = re.fullmatch(r"(\d*)([A-Za-z])", str(entries.get("dt", "d")))
+    if written is None:
+        raise ValueError(f"a matrix of the type {reprlib.repr(entries['dt'])}")
+    numbers = _numbers(entries["data"])
+    if written[2] in _ROUNDED:
+        numbers = numbers.astype(_ROUNDED[written[2]]).astype(np.float64)
+    sides = entries.get("sizes", [entries.get("rows", ""), entries.get("cols", "")])
+    shape = [*map(int, _numbers(sides).ravel().tolist()), int(written[1] or 1)]  # the last: its channels
+    if min(shape) < 0 or math.prod(shape) != numbers.size:
+        raise ValueError(f"a matrix of {numbers.size} numbers in the shape {reprlib.repr(shape)}")
+    return numbers.reshape(shape)
+
+
+def _decoded(data: str) -> Float[np.ndarray, " _"]:
+    """The numbers of OpenCV's base64: of a header of 24 bytes, which says their type, and their bytes."""
+    content = base64.b64decode(data.removeprefix(BASE64))
+    written = re.fullmatch(rb"\d*([a-z]) *", content[:24])
+    if written is None or written[1].decode() not in _BASE64_TYPES:
+        raise ValueError(f"base64 of the type {content[:24]!r}")
+    return np.frombuffer(content, _BASE64_TYPES[written[1].decode()], offset=24).astype(np.float64)

@@ -1,0 +1,245 @@
+"""A pair whose rows do not match becomes one whose rows do, by the calibration of its two cameras."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from stereoweave.cameras.rig import Optics, Rig, size_of
+from stereoweave.errors import StereoweaveError
+from stereoweave.stereo import StereoCamera, StereoPair
+
+# A picture is looked at in this many cells along its longer side when the largest rectangle is sought, and
+# in no fewer than these along its shorter one: a border spoils whole cells.
+_CELLS, _LEAST_CELLS = 256, 32
+# Where a polynomial of distortion is searched for the radius at which it turns back.
+_RADIUS_STEPS = 2000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rectified:
+    """A pair whose rows match.
+
+    Attributes:
+        pair: Its masks are False where a picture shows nothing, its camera is there where it is known.
+        notes: What was done, a line each.
+    """
+
+    pair: StereoPair
+    notes: tuple[str, ...] = ()
+
+
+def rectify(pair: StereoPair, rig: Rig) -> Rectified:
+    """The pair as two pinhole cameras side by side would have taken it, of the same size, with its camera.
+
+    Both cameras are turned to one direction, which lies between theirs and at a right angle to the baseline.
+    The focal length is the mean of theirs, so that the middle keeps its resolution. The centre, the same in
+    both (doffs 0), is where the views are seen most. A pair of a rectified rig gets its camera, no more.
+
+    Raises:
+        FormatError: The rig is for pictures of another size.
+        StereoweaveError: The right camera is on the left, above or below, or in front.
+    """
+    rig.check_size(pair)
+    _check_side_by_side(rig)
+    if rig.unlike_rectified() is None:
+        note = f"{rig.name} is for rectified pictures: they are taken as they are"
+        return Rectified(pair=replace(pair, camera=rig.camera()), notes=(*rig.notes, note))
+    # What cannot be computed is refused where it is not finite.
+    with np.errstate(all="ignore"):
+        turns = _turns(rig)
+        camera = _camera(rig, turns, size_of(pair))
+    left, left_seen = _turned(pair.left, rig.left, turns[0], camera)
+    right, right_seen = _turned(pair.right, rig.right, turns[1], camera)
+    rectified = StereoPair(left=left, right=right, camera=camera, left_seen=left_seen, right_seen=right_seen)
+    return Rectified(pair=rectified, notes=(*rig.notes, _what_was_done(rig, turns, rectified)))
+
+
+def cropped(pair: StereoPair) -> StereoPair:
+    """The largest rectangle of the pair that both pictures fill, its camera's centre moved along.
+
+    Raises:
+        StereoweaveError: No pixel is seen by both.
+    """
+    if pair.left_seen is None and pair.right_seen is None:
+        return pair
+    full = np.ones(pair.left.shape[:2], bool)
+    for seen in (pair.left_seen, pair.right_seen):
+        full &= True if seen is None else seen
+    rows, columns = _largest_rectangle(full)
+    camera = pair.camera
+    if camera is not None:
+        centre = camera.cx_px - columns.start, camera.cy_px - rows.start
+        camera = replace(camera, cx_px=centre[0], cy_px=centre[1])
+    left, right = (np.ascontiguousarray(image[rows, columns]) for image in (pair.left, pair.right))
+    return StereoPair(left=left, right=right, camera=camera)
+
+
+def _check_side_by_side(rig: Rig) -> None:
+    x, y, z = _right_centre(rig)
+    aside = max(
+        (abs(x), "beside"), (abs(y), "below" if y > 0 else "above"), (abs(z), "in front of or behind")
+    )[1]
+    if aside != "beside":
+        raise StereoweaveError(
+            f"{rig.name}: expected two cameras side by side, found the right one {aside} the left one "
+            f"({x:.3f} m aside, {y:.3f} m down, {z:.3f} m ahead); "
+            "turn the pictures of cameras above each other by 90 degrees and calibrate with those"
+        )
+    if x < 0:
+        raise StereoweaveError(
+            f"{rig.name}: expected the right camera on the right, found it {-x:.3f} m to the left "
+            "of the left one: the sides are swapped; give the pictures the other way round, and a "
+            "calibration made so"
+        )
+
+
+def _right_centre(rig: Rig) -> Float[np.ndarray, "3"]:
+    """Where the right camera is for the left one, x to the right, y down, z ahead, in metres."""
+    return -rig.rotation.T @ rig.translation_m
+
+
+def _turns(rig: Rig) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
+    """The rotations of left and right directions to those of the rectified cameras."""
+    aside = _right_centre(rig) / rig.baseline_m
+    ahead = np.array([0, 0, 1]) + rig.rotation[2]  # the left camera's direction and the right one's
+    ahead -= ahead @ aside * aside
+    ahead /= np.linalg.norm(ahead)
+    turn = np.stack([aside, np.cross(ahead, aside), ahead])
+    return turn, turn @ rig.rotation.T
+
+
+def _camera(rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], size_px: tuple[int, int]) -> StereoCamera:
+    """The rectified camera: what the two cameras have in their middles comes, on average, to the middle."""
+    lenses = rig.left, rig.right
+    focal_px = float(np.mean([optics.matrix[[0, 1], [0, 1]] for optics in lenses]))
+    middle_px = (np.array(size_px) - 1) / 2
+    ahead = [turn @ _direction(optics, middle_px) for optics, turn in zip(lenses, turns, strict=True)]
+    if not all(np.isfinite(direction).all() and direction[2] > 0 for direction in ahead):
+        raise StereoweaveError(
+            f"{rig.name}: expected two cameras that look the same way, found them turned by "
+            f"{rig.rotation_degrees:.0f} degrees against each other; is that the rotation of this rig?"
+        )
+    aside, down = np.mean([direction[:2] / direction[2] for direction in ahead], axis=0)
+    return StereoCamera(
+        focal_px=focal_px,
+        baseline_m=rig.baseline_m,
+        cx_px=float(middle_px[0] - focal_px * aside),
+        cy_px=float(middle_px[1] - focal_px * down),
+    )
+
+
+def _direction(optics: Optics, at_px: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
+    """Where a camera sees what it shows at a pixel."""
+    undistort = cv2.fisheye.undistortPoints if optics.fisheye else cv2.undistortPoints
+    (x, y), *_ = undistort(at_px.reshape(1, 1, 2), optics.matrix, _coefficients(optics)).reshape(-1, 2)
+    return np.array([x, y, 1])
+
+
+def _turned(
+    image: UInt8[np.ndarray, "h w 3"], optics: Optics, turn: Float[np.ndarray, "3 3"], camera: StereoCamera
+) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+    """A picture as the rectified camera would show it, and which of its pixels the picture has.
+
+    Beyond the picture its border is repeated: an edge there would be matched.
+    """
+    height, width = image.shape[:2]
+    pinhole = np.array([[camera.focal_px, 0, camera.cx_px], [0, camera.focal_px, camera.cy_px], [0, 0, 1]])
+    places = cv2.fisheye.initUndistortRectifyMap if optics.fisheye else cv2.initUndistortRectifyMap
+    x_px, y_px = places(optics.matrix, _coefficients(optics), turn, pinhole, (width, height), cv2.CV_32FC1)
+    inside = (x_px > -0.5) & (x_px < width - 0.5) & (y_px > -0.5) & (y_px < height - 0.5)
+    inside &= _before_the_fold(optics, turn, pinhole, (height, width))
+    turned = cv2.remap(image, x_px, y_px, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return turned, inside
+
+
+def _before_the_fold(
+    optics: Optics, turn: Float[np.ndarray, "3 3"], pinhole: Float[np.ndarray, "3 3"], shape: tuple[int, int]
+) -> Bool[np.ndarray, "h w"]:
+    """Where the lens is known to see: not behind it, nor where its polynomial turns back.
+
+    Fitted within the picture, a polynomial falls again somewhere beyond it, and would show the picture's
+    border once more, mirrored.
+    """
+    rows, columns = np.indices(shape, np.float32)
+    to_direction = (turn.T @ np.linalg.inv(pinhole)).astype(np.float32)
+    x, y, z = (row[0] * columns + row[1] * rows + row[2] for row in to_direction)
+    radius = np.hypot(x, y)
+    if optics.fisheye:
+        return np.arctan2(radius, z) < _fold(optics, np.pi)
+    return (z > 0) & (radius < _fold(optics, 10.0) * z)
+
+
+@np.errstate(all="ignore")  # where it cannot be computed it does not grow either
+def _fold(optics: Optics, most: float) -> float:
+    """The radius (a fisheye lens: angle) at which the distorted radius no longer grows, at most `most`."""
+    radius = np.linspace(0, most, _RADIUS_STEPS)
+    squares = radius**2
+    k = _coefficients(optics)
+    if optics.fisheye:
+        distorted = radius * (1 + squares * (k[0] + squares * (k[1] + squares * (k[2] + squares * k[3]))))
+    else:
+        k = np.concatenate([k, np.zeros(8)])
+        above = 1 + squares * (k[0] + squares * (k[1] + squares * k[4]))
+        distorted = radius * above / (1 + squares * (k[5] + squares * (k[6] + squares * k[7])))
+    falls = np.flatnonzero(~(np.diff(distorted) > 0))
+    return float(radius[falls[0]]) if falls.size else most
+
+
+def _coefficients(optics: Optics) -> Float[np.ndarray, " n"]:
+    """The distortion as OpenCV wants it, which has no fisheye lens without any."""
+    return optics.distortion if optics.distortion.size else np.zeros(4)
+
+
+def _what_was_done(rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], pair: StereoPair) -> str:
+    left, right = (np.degrees(np.linalg.norm(cv2.Rodrigues(turn)[0])) for turn in turns)
+    assert pair.left_seen is not None and pair.right_seen is not None
+    seen_percent = 100 * (pair.left_seen & pair.right_seen).mean()
+    return (
+        f"rectified by {rig.name}: the left picture turned by {left:.2f} degrees, the right one by "
+        f"{right:.2f}; both fill {seen_percent:.0f} % of the pixels"
+    )
+
+
+def _largest_rectangle(full: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
+    """Rows and columns of a rectangle that is full everywhere: the largest of whole cells, then grown."""
+    cell_px = max(1, min(-(-max(full.shape) // _CELLS), min(full.shape) // _LEAST_CELLS))
+    top, bottom, start, stop = (cell_px * side for side in _largest_of_cells(_full_cells(full, cell_px)))
+    bottom, stop = min(bottom, full.shape[0]), min(stop, full.shape[1])
+    for _ in range(cell_px):
+        top -= top > 0 and bool(full[top - 1, start:stop].all())
+        bottom += bottom < full.shape[0] and bool(full[bottom, start:stop].all())
+        start -= start > 0 and bool(full[top:bottom, start - 1].all())
+        stop += stop < full.shape[1] and bool(full[top:bottom, stop].all())
+    return slice(top, bottom), slice(start, stop)
+
+
+def _full_cells(full: Bool[np.ndarray, "h w"], cell_px: int) -> Bool[np.ndarray, "rows columns"]:
+    """Which cells are full; one that the picture's end cuts counts by what it has."""
+    height, width = full.shape
+    padded = np.pad(full, ((0, -height % cell_px), (0, -width % cell_px)), constant_values=True)
+    cells = padded.reshape(-1, cell_px, padded.shape[1] // cell_px, cell_px)
+    return np.asarray(cells.all(axis=(1, 3)))
+
+
+def _largest_of_cells(full: Bool[np.ndarray, "rows columns"]) -> tuple[int, int, int, int]:
+    """Top, bottom, start and stop of the largest full rectangle: for every row the bars that stand on it."""
+    best, found = 0, (0, 0, 0, 0)
+    heights = np.zeros(full.shape[1], int)
+    for row, cells in enumerate(full):
+        heights = (heights + 1) * cells
+        standing: list[tuple[int, int]] = []  # column and height, each higher than the one before
+        for column, height in enumerate([*heights.tolist(), 0]):
+            start = column
+            while standing and standing[-1][1] >= height:
+                start, bar = standing.pop()
+                if bar * (column - start) > best:
+                    best, found = bar * (column - start), (row + 1 - bar, row + 1, start, column)
+            standing.append((start, height))
+    if not best:
+        raise StereoweaveError(
+            "expected a pair of pictures that overlap, found no pixel that both of them have"
+        )
+    return found

@@ -1,0 +1,186 @@
+"""A pair whose rows do not match becomes one whose rows do, by what both pictures show: no calibration."""
+
+from contextlib import suppress
+from dataclasses import replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from stereoweave.cameras.feature_matches import Matches, sparse_matches
+from stereoweave.cameras.rectify import Rectified
+from stereoweave.errors import StereoweaveError
+from stereoweave.stereo import StereoPair
+
+_LEAST_MATCHES = 40
+_LEAST_RIGHT_SHARE = 0.3
+# Epipolar lines are missed by less than this where a match is right.
+_RIGHT_PX = 1.0
+_STEPS = 40
+# Errors beyond about this count for less and less.
+_SOFT_PX = 0.5
+# In radians, and as the logarithm of the focal length over the width: what is thought likely beforehand. It
+# decides what the matches leave open, for the least of all turns that explain them.
+_LIKELY_TURN, _LIKELY_LOG_FOCAL = 0.05, 0.3
+_MOST_TURN_DEGREES = 20.0
+_MOST_RESIDUAL_PX = 1.0
+_PIXELS_OF_RESIDUAL = 1_500_000
+# So many of the least disparities may be of wrong matches.
+_OUTER_PERCENT = 1.0
+
+
+class _Turns(NamedTuple):
+    """The homographies that bring each picture to the common rows."""
+
+    left: Float[np.ndarray, "3 3"]
+    right: Float[np.ndarray, "3 3"]
+
+
+def rectify_by_features(pair: StereoPair) -> Rectified:
+    """The pair as two cameras side by side would have seen it, as far as the places that both show tell.
+
+    Both pictures are turned as by a turn of their cameras, of a focal length that is found as well, by angles
+    as small as will do. Shapes stay what they are, unlike after an arbitrary homography. The result has no
+    camera: neither the focal length nor the base is known well enough for metres.
+
+    Source: "Quasi-Euclidean epipolar rectification of uncalibrated images" (Fusiello and Irsara 2011).
+
+    Raises:
+        StereoweaveError: Too few places, or none that such a turn brings to equal rows.
+    """
+    height, width = pair.left.shape[:2]
+    matches = _right_ones(sparse_matches(pair.left, pair.right))
+    parameters = _fitted(matches, width, height)
+    turns = _turns(parameters, width, height)
+    missed_px = np.abs(_rows(turns.right, matches.right_px) - _rows(turns.left, matches.left_px))
+    _check(parameters, float(np.median(missed_px)), width, height)
+    turns, moved_px = _side_by_side(turns, matches)
+    left, left_seen = _warped(pair.left, turns.left, pair.left_seen)
+    right, right_seen = _warped(pair.right, turns.right, pair.right_seen)
+    before_px = np.abs(matches.lower_px)
+    note = (
+        f"rectified by {len(missed_px)} matches: their rows are {np.median(missed_px):.2f} px apart in the "
+        f"median, before {np.median(before_px):.2f} px; the right one was moved {moved_px:+.0f} px sideways"
+    )
+    rectified = replace(pair, left=left, right=right, camera=None, left_seen=left_seen, right_seen=right_seen)
+    return Rectified(pair=rectified, notes=(note,))
+
+
+def _right_ones(found: Matches) -> Matches:
+    """The matches that one epipolar geometry explains."""
+    count = len(found.left_px)
+    right_ones = np.zeros(count, bool)
+    if count >= _LEAST_MATCHES:
+        cv2.setRNGSeed(0)
+        with suppress(cv2.error):  # where no geometry at all explains any of them
+            _, mask = cv2.findFundamentalMat(
+                found.left_px, found.right_px, cv2.USAC_MAGSAC, _RIGHT_PX, 0.9999, 5000
+            )
+            right_ones = right_ones if mask is None else mask.ravel() > 0
+    if right_ones.sum() < max(_LEAST_MATCHES, _LEAST_RIGHT_SHARE * count):
+        raise StereoweaveError(
+            f"--rectify: expected at least {_LEAST_MATCHES} places that both pictures show from two sides, "
+            f"found {right_ones.sum()} of {count} matches that agree; take pictures with more texture and "
+            "more overlap, or give a calibration"
+        )
+    return Matches(found.left_px[right_ones], found.right_px[right_ones])
+
+
+def _fitted(matches: Matches, width: int, height: int) -> Float[np.ndarray, " 6"]:
+    """What `_turns` takes: five angles in radians, and the logarithm of the focal length over the width.
+
+    Levenberg-Marquardt on the Sampson errors in px, with numeric slopes; large errors count for less.
+    """
+    likely = np.array([_LIKELY_TURN] * 5 + [_LIKELY_LOG_FOCAL])
+
+    def errors(parameters: Float[np.ndarray, " 6"]) -> Float[np.ndarray, " n"]:
+        missed_px = _sampson_px(_turns(parameters, width, height), matches)
+        softened = np.sign(missed_px) * _SOFT_PX * np.sqrt(np.log1p((missed_px / _SOFT_PX) ** 2))
+        return np.concatenate([softened, parameters / likely])
+
+    parameters, damping = np.zeros(6), 1e-3
+    missed = errors(parameters)
+    for _ in range(_STEPS):
+        slopes = np.stack([(errors(parameters + 1e-6 * unit) - missed) / 1e-6 for unit in np.eye(6)], axis=1)
+        normal = slopes.T @ slopes
+        step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), slopes.T @ missed)
+        tried = errors(parameters + step)
+        if tried @ tried < missed @ missed:
+            parameters, missed, damping = parameters + step, tried, damping / 10
+        else:
+            damping *= 10
+    return parameters
+
+
+def _turns(parameters: Float[np.ndarray, " 6"], width: int, height: int) -> _Turns:
+    """The turns of the left camera by yaw and roll, and of the right one by pitch, yaw and roll.
+
+    A common pitch changes no row against another, so the left camera has none.
+    """
+    left_yaw, left_roll, right_pitch, right_yaw, right_roll, log_focal = parameters
+    focal_px = width * np.exp(log_focal)
+    camera = np.array([[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]])
+    back = np.linalg.inv(camera)
+    left, _ = cv2.Rodrigues(np.array([0.0, left_yaw, left_roll]))
+    right, _ = cv2.Rodrigues(np.array([right_pitch, right_yaw, right_roll]))
+    return _Turns(camera @ left @ back, camera @ right @ back)
+
+
+def _sampson_px(turns: _Turns, matches: Matches) -> Float[np.ndarray, " n"]:
+    """How far each match is from its epipolar lines, to the first order, in px of the given pictures."""
+    across = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    fundamental = turns.right.T @ across @ turns.left
+    ones = np.ones((len(matches.left_px), 1))
+    left, right = np.hstack([matches.left_px, ones]), np.hstack([matches.right_px, ones])
+    lines_right, lines_left = left @ fundamental.T, right @ fundamental
+    squared = (lines_right[:, :2] ** 2).sum(1) + (lines_left[:, :2] ** 2).sum(1)
+    return (right * lines_right).sum(1) / np.sqrt(squared)
+
+
+def _check(parameters: Float[np.ndarray, " 6"], residual_px: float, width: int, height: int) -> None:
+    largest_degrees = float(np.degrees(np.abs(parameters[:5]).max()))
+    most_px = _MOST_RESIDUAL_PX * max(1.0, (width * height / _PIXELS_OF_RESIDUAL) ** 0.5)
+    if residual_px > most_px or largest_degrees > _MOST_TURN_DEGREES:
+        raise StereoweaveError(
+            f"--rectify: expected cameras side by side, turned by under {_MOST_TURN_DEGREES:.0f} degrees, "
+            f"found rows {residual_px:.1f} px apart after a turn of {largest_degrees:.0f} degrees; did the "
+            "camera move forward, or only turn? Take the pictures from two places side by side"
+        )
+
+
+def _side_by_side(turns: _Turns, matches: Matches) -> tuple[_Turns, float]:
+    """The turns with the left picture's middle in place, the right beside it, and by how far that moved.
+
+    That is to the left where disparities would else be negative, so that they start at 0.
+    """
+    left_px, right_px = _moved(turns.left, matches.left_px), _moved(turns.right, matches.right_px)
+    centre_px = np.median(matches.left_px, 0)
+    back_px = centre_px - np.median(left_px, 0)
+    least_px = np.percentile(left_px[:, 0] - right_px[:, 0] + back_px[0], _OUTER_PERCENT)
+    moved_px = float(np.floor(min(least_px, 0.0)))
+    left_shift, right_shift = np.eye(3), np.eye(3)
+    left_shift[:2, 2] = back_px
+    right_shift[:2, 2] = moved_px, back_px[1]
+    return _Turns(left_shift @ turns.left, right_shift @ turns.right), moved_px
+
+
+def _warped(
+    photo: UInt8[np.ndarray, "h w 3"],
+    turn: Float[np.ndarray, "3 3"],
+    seen: Bool[np.ndarray, "h w"] | None,
+) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+    """The picture after the turn, its border going on where it shows nothing, and where it shows it."""
+    size = photo.shape[1::-1]
+    before = np.ones(photo.shape[:2], np.uint8) if seen is None else seen.astype(np.uint8)
+    warped = cv2.warpPerspective(photo, turn, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    shown = cv2.warpPerspective(255 * before, turn, size, flags=cv2.INTER_LINEAR)
+    return warped, shown == 255
+
+
+def _moved(turn: Float[np.ndarray, "3 3"], places_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    return cv2.perspectiveTransform(places_px[None], turn)[0]
+
+
+def _rows(turn: Float[np.ndarray, "3 3"], places_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+    return _moved(turn, places_px)[:, 1]

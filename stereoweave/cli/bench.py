@@ -1,0 +1,523 @@
+"""The commands stereoweave bench pairs | views | networks | speed | costs | parity | paper, more."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from stereoweave.cli.options import (
+    Cluster,
+    Model,
+    Provider,
+    Threads,
+    engine_of,
+    needing_the_synth_extra,
+    needing_the_train_extra,
+    parse_size_px,
+    place_for,
+)
+
+# What is added to a network's name where `refining` comes after it.
+REFINED = " refined"
+# What stereoweave bench pairs shows of its rows, by heading and column.
+PAIRS_TABLES = {
+    "Errors, mean over the scenes": {
+        "EPE px": "epe_px",
+        "bad-1 %": "bad1_percent",
+        "bad-2 %": "bad2_percent",
+        "D1 %": "d1_percent",
+        "edge EPE": "edge_epe_px",
+        "edge bad-1": "edge_bad1_percent",
+        "flying %": "flying_percent",
+    },
+    "Cost and confidence, mean over the scenes": {
+        "ms": "time_ms",
+        "x SGBM": "time_relative",
+        "RAM MB": "memory_mb",
+        "AUSE px": "ause_px",
+        "AUSE %": "ause_bad1_percent",
+        "calibr. error": "calibration_error",
+    },
+}
+
+# What stereoweave bench pairs --classes shows: a column for each class.
+CLASS_TABLES = {
+    "Pixels by class, % of the known ones": "share_percent",
+    "bad-1 by class, points: together they make bad-1": "bad1_percent",
+    "bad-2 by class, points": "bad2_percent",
+    "EPE within each class, px": "epe_px",
+}
+
+# As short as eight columns have to be in 80 characters.
+CLASS_HEADINGS = {"thin_or_edge": "edges", "weak_texture": "weak", "textured": "texture"}
+
+# The same of stereoweave bench views.
+FLICKER_TABLES = {
+    "Disparity and the view half-way, mean over the scenes": {
+        "flicker px": "flicker_px",
+        "of the view": "view_flicker_levels",
+        "EPE px": "epe_px",
+        "moving": "moving_epe_px",
+        "uncovered": "uncovered_epe_px",
+        "ms": "time_ms",
+    },
+}
+VIEWS_TABLES = {
+    "New views, PSNR in dB, mean over the scenes": {
+        "all": "psnr_db",
+        "smooth": "smooth_psnr_db",
+        "edges": "edge_psnr_db",
+        "one sees": "one_psnr_db",
+        "neither": "neither_psnr_db",
+        "ms": "time_ms",
+    },
+    "New views, mean absolute error in levels of 0..255, and SSIM": {
+        "all": "mae",
+        "smooth": "smooth_mae",
+        "edges": "edge_mae",
+        "one sees": "one_mae",
+        "neither": "neither_mae",
+        "SSIM": "ssim",
+    },
+}
+
+RecipeFile = Annotated[
+    Path, typer.Argument(metavar="RECIPE", help="A TOML file, such as recipes/paper/experiment.toml.")
+]
+RunsFolder = Annotated[Path, typer.Option("--out", "-o", help="The folder of the trainings.")]
+ReportFolder = Annotated[Path, typer.Option(help="The folder for rows, tables and figures.")]
+Classes = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="A second CSV file to write: errors outside the right picture, where occluded, near edges, "
+        "where plain, weakly textured, textured.",
+    ),
+]
+Seeds = Annotated[int, typer.Option(min=1, help="How often each training is repeated.")]
+Jobs = Annotated[int, typer.Option(min=1, help="Trainings at a time.")]
+
+bench = typer.Typer(help="Score matchers side by side.")
+
+
+@bench.command()
+def pairs(  # noqa: PLR0913 - each is a word of the command line
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            help="Holds a folder a scene, of left.png, right.png, disparity.png; or what synth make made."
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("pairs.csv"),
+    model: Annotated[
+        list[str] | None,
+        typer.Option(help="As for depth; may be given again. All shipped networks unless given."),
+    ] = None,
+    dataset: Annotated[
+        str | None, typer.Option(help="The folder holds this dataset, as its authors' archives unpack.")
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="A picture to write: errors against time. Extra 'train'.")
+    ] = None,
+    sparsification: Annotated[
+        Path | None, typer.Option(help="A picture to write: errors by confidence. Extra 'train'.")
+    ] = None,
+    classes: Classes = None,
+    cluster: Cluster = None,
+    threads: Threads = None,
+    provider: Provider = "cpu",
+) -> None:
+    """Errors, edges, confidence, time and memory of networks and OpenCV's matchers on known disparity.
+
+    With --cluster each scene is scored by one worker of --threads cores, 1 unless given, so that the times
+    beside SGBM's stay comparable; the memory is measured here.
+    """
+    import cv2
+
+    from stereoweave.bench.pairs import MEAN, score_pairs, with_memory, write_csv
+    from stereoweave.data.readers import list_scenes
+    from stereoweave.matching.opencv import SGBM
+    from stereoweave.system.threads import thread_count
+
+    for file in filter(None, (out, classes)):
+        place_for(file)
+    _check_plots(plot, sparsification)
+    engine = engine_of(cluster, cpus_each=threads or 1)
+    threads = engine.threads_each if engine else threads
+    cv2.setNumThreads(thread_count(threads))
+    makers = _makers(model, threads, provider)
+    scores = score_pairs(makers, partial(list_scenes, folder.absolute(), dataset), engine)
+    rows = with_memory(scores.rows, makers, scores.largest)
+    write_csv(out, rows, scores.machine)
+    means = [row for row in rows if row.scene == MEAN]
+    if plot or sparsification:
+        _draw_plots(plot, sparsification, means, {name: scores.curves[name] for name in (*makers, SGBM)})
+    _tell_means(PAIRS_TABLES, "matcher", means)
+    if classes:
+        _write_classes(classes, scores)
+    typer.echo(f"rows: {out}")
+
+
+@bench.command()
+def collages(
+    out: Annotated[Path, typer.Option("--out", "-o", help="The folder of the set, new or empty.")],
+    pairs: Annotated[int, typer.Option(min=1, help="How many.")] = 16,
+    seed: Annotated[
+        int, typer.Option(min=0, help="1000003 gives the pairs that trainings validate on.")
+    ] = 1_000_003,
+    size: Annotated[str, typer.Option(help="Width and height in pixels.")] = "384x256",
+) -> None:
+    """Write held-out collages, the painted pairs that networks train on, as a set that bench pairs reads."""
+    with needing_the_train_extra():
+        from stereoweave.learn.data.collage_set import write_collages
+    width_px, height_px = parse_size_px(size)
+    write_collages(out, pairs, seed, (height_px, width_px))
+    typer.echo(f"{out}: {pairs} pair{'s' * (pairs != 1)} made")
+
+
+@bench.command()
+def views(  # noqa: PLR0913 - each is a word of the command line
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            help="Holds a folder a scene, of left.png, right.png and view_<position>.png; or what "
+            "synth make --view made."
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("views.csv"),
+    model: Annotated[
+        list[str] | None,
+        typer.Option(help="As for depth; may be given again. All shipped networks unless given."),
+    ] = None,
+    cluster: Cluster = None,
+    threads: Threads = None,
+    provider: Provider = "cpu",
+) -> None:
+    """Errors of new views against pictures taken there: all pixels, smooth ones, depth edges, hidden ones.
+
+    With --cluster each scene is scored by one worker of --threads cores, 1 unless given.
+    """
+    import cv2
+
+    from stereoweave.bench.pairs import MEAN, write_csv
+    from stereoweave.bench.view_scenes import list_view_scenes
+    from stereoweave.bench.views import score_scenes
+    from stereoweave.system.threads import thread_count
+
+    place_for(out)
+    engine = engine_of(cluster, cpus_each=threads or 1)
+    threads = engine.threads_each if engine else threads
+    cv2.setNumThreads(thread_count(threads))
+    scenes = partial(list_view_scenes, folder.absolute())
+    scores = score_scenes(_makers(model, threads, provider), scenes, threads, engine)
+    write_csv(out, scores.rows, scores.machine)
+    _tell_means(VIEWS_TABLES, "method", [row for row in scores.rows if row.scene == MEAN])
+    typer.echo(f"rows: {out}")
+
+
+@bench.command()
+def flicker(  # noqa: PLR0913 - each is a word of the command line
+    scenes: Annotated[list[str], typer.Argument(metavar="SCENE...", help="As for synth make.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("flicker.csv"),
+    model: Model = "small",
+    frames: Annotated[int, typer.Option(min=2, max=120, help="Of each film.")] = 12,
+    threads: Threads = None,
+    provider: Provider = "cpu",
+) -> None:
+    """What steadying is worth: flicker and errors of depth with it and without, on rendered noisy films."""
+    place_for(out)
+    with needing_the_synth_extra():
+        from stereoweave.bench.flicker import flicker_rows, means
+    from stereoweave.bench.pairs import write_csv
+
+    rows = list(flicker_rows(scenes, model, frames=frames, threads=threads, provider=provider))
+    write_csv(out, rows)
+    _tell_means(FLICKER_TABLES, "film", means(rows))
+    typer.echo(f"rows: {out}")
+
+
+@bench.command()
+def networks(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(metavar="RUN...", help="Folders of stereoweave train, or checkpoints."),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("networks.csv"),
+    pairs: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Where kept pairs are, or are made; beside the first run unless given.",
+        ),
+    ] = None,
+) -> None:
+    """Errors of trained networks on the pairs held out from them, and of the right views made with them."""
+    from rich.console import Console
+
+    place_for(out)
+    with needing_the_train_extra():
+        from stereoweave.learn.evaluation import evaluate
+    rows = evaluate(runs, pairs or runs[0].parent / "pairs", Console())
+    _write_and_tell(out, "Means over the held-out pairs", rows)
+
+
+@bench.command()
+def speed(
+    recipe: RecipeFile,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("speed.csv"),
+) -> None:
+    """Time of the paper's network and its rivals for a pair of 640x480, in PyTorch and in ONNX Runtime."""
+    from stereoweave.learn.recipe import read_recipe
+
+    place_for(out)
+    read = read_recipe(recipe)
+    with needing_the_train_extra():
+        from stereoweave.learn.studies.speed import run_times
+    _write_and_tell(out, "A pair of 640x480", run_times(read))
+
+
+@bench.command()
+def parity(
+    checkpoints: Annotated[
+        list[Path], typer.Argument(metavar="CHECKPOINT...", help="Of shipped networks, as in checkpoints/.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("parity.csv"),
+) -> None:
+    """How far every variant of shipped networks is from PyTorch, on every provider that is here."""
+    from stereoweave.bench.pairs import write_csv
+
+    place_for(out)
+    with needing_the_train_extra():
+        from stereoweave.learn.export.parity import markdown
+        from stereoweave.learn.export.parity import parity as measured
+    rows = measured(checkpoints)
+    write_csv(out, rows)
+    typer.echo(markdown(rows))
+    typer.echo(f"rows: {out}")
+
+
+@bench.command()
+def costs(
+    runs: Annotated[list[Path], typer.Argument(help="Folders of runs, or checkpoints in them.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="A CSV file to write, too.")] = None,
+) -> None:
+    """What every stage of trained WeaveNets costs: multiply-adds, bytes moved, time; a Markdown table.
+
+    The last columns compare it with the peak, a large matrix product measured in the same run.
+    """
+    from stereoweave.bench.pairs import write_csv
+
+    if out:
+        place_for(out)
+    with needing_the_train_extra():
+        from stereoweave.learn.studies.stage_costs import markdown, stage_costs
+    rows = stage_costs(runs)
+    if out:
+        write_csv(out, rows)
+    typer.echo(markdown(rows))
+
+
+@bench.command()
+def paper(
+    recipe: RecipeFile,
+    out: RunsFolder,
+    report: ReportFolder,
+    seeds: Seeds = 3,
+    jobs: Jobs = 1,
+) -> None:
+    """The paper's experiment: train its network, its rivals and every variant, and compare with its tables.
+
+    Stopped and started again it goes on where it was.
+    """
+    from stereoweave.learn.paper.trials import CLAIMS
+
+    _experiment(recipe, out, report, seeds, jobs, CLAIMS)
+
+
+@bench.command()
+def ablations(
+    recipe: RecipeFile,
+    out: RunsFolder,
+    report: Annotated[
+        Path,
+        typer.Option(
+            help="The CSV file to write, a row a training. Rows of other recipes are dropped, those of the "
+            "same are taken as they are: remove the file after a change of code."
+        ),
+    ],
+    rendered: Annotated[
+        Path, typer.Option(metavar="FOLDER", help="Held-out pairs of stereoweave synth make.")
+    ] = Path("runs/synth_val/rooms"),
+    seeds: Seeds = 2,
+) -> None:
+    """WeaveNet's choices made otherwise, one at a time: train each, score it on collages and rendered pairs.
+
+    Stopped and started again it goes on where it was.
+    """
+    from rich.console import Console
+
+    from stereoweave.learn.recipe import read_recipe
+
+    base = read_recipe(recipe)
+    place_for(report)
+    with needing_the_train_extra():
+        from stereoweave.learn.studies.ablations import plan, run_ablations
+    run_ablations(plan(base, seeds), out, rendered, report, Console())
+    typer.echo(f"rows: {report}")
+
+
+@bench.command()
+def training(
+    run: Annotated[Path, typer.Argument(help="The folder of a run of stereoweave train.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file; rows of other runs in it stay.")],
+) -> None:
+    """Learning curve of a run: its held-out scores against the pairs seen, and the power laws they follow."""
+    place_for(out)
+    with needing_the_train_extra():
+        from stereoweave.learn.training.curves import record_curve
+    for name, law in record_curve(run, out).items():
+        typer.echo(f"{name}: {law.at_10000_pairs:.4g} * (pairs / 10,000)^-{law.exponent:.3f}")
+
+
+@bench.command()
+def exponent(
+    recipe: RecipeFile,
+    out: RunsFolder,
+    report: ReportFolder,
+    seeds: Seeds = 3,
+    jobs: Jobs = 1,
+) -> None:
+    """The paper's Fig. 2: the curves of the depth adjustment, and the validation loss with and without it."""
+    from stereoweave.learn.paper.trials import ADJUSTMENT
+
+    _experiment(recipe, out, report, seeds, jobs, (ADJUSTMENT,))
+
+
+def _makers(models: Sequence[str] | None, threads: int | None, provider: str) -> dict[str, Callable[[], Any]]:
+    """What makes each network, as it is and refined; all shipped ones unless some are named."""
+    from stereoweave.bench.pairs import network
+    from stereoweave.matching.matcher import MODES, shipped_models
+
+    makers: dict[str, Callable[[], Any]] = {}
+    for name in models or shipped_models():
+        # A worker of a cluster has another current folder.
+        model = str(Path(name).absolute()) if Path(name).is_file() else name
+        makers[name] = partial(network, model, threads, provider=provider)
+        if name not in MODES:  # which refine by themselves
+            makers[name + REFINED] = partial(network, model, threads, refined=True, provider=provider)
+    return makers
+
+
+def _experiment(  # noqa: PLR0913 - the words of two command lines
+    recipe: Path, out: Path, report: Path, seeds: int, jobs: int, claims: Sequence[str]
+) -> None:
+    from rich.console import Console
+
+    from stereoweave.learn.recipe import read_recipe
+
+    base, console = read_recipe(recipe), Console()
+    with needing_the_train_extra():
+        from stereoweave.learn.paper.experiment import plan, run_trials
+        from stereoweave.learn.paper.report import write_report
+    planned = plan(base, out, seeds, console, claims)
+    run_trials(planned, out, jobs, console)
+    write_report(base, planned, out, report)
+    typer.echo(f"tables: {report / 'paper.md'}")
+
+
+def _tell_means(tables: Mapping[str, Mapping[str, str]], who: str, rows: Sequence[Any]) -> None:
+    """Print rows in several tables, since one would be wider than a terminal.
+
+    Args:
+        tables: By title, the columns' fields by heading.
+        who: The field that names a row.
+        rows: Dataclasses of one kind.
+    """
+    from rich.console import Console
+    from rich.table import Column, Table
+
+    for title, columns in tables.items():
+        numbers = (Column(name, justify="right") for name in columns)
+        table = Table(Column(who, no_wrap=True), *numbers, title=title)
+        for row in rows:
+            cells = [getattr(row, field) for field in columns.values()]
+            table.add_row(Path(getattr(row, who)).name, *map(_cell, cells))
+        Console().print(table)
+
+
+def _check_plots(*pictures: Path | None) -> None:
+    """Fail before anything is scored where a picture cannot be drawn or written."""
+    from stereoweave.io.files import picture_kind
+
+    for picture in filter(None, pictures):
+        picture_kind(picture)
+        place_for(picture)
+        with needing_the_train_extra("a plot needs matplotlib"):
+            from stereoweave.bench import plots as benchmark_plots  # noqa: F401 - imported to see that it can be
+
+
+def _draw_plots(
+    plot: Path | None, sparsification: Path | None, means: Sequence[Any], curves: Mapping[str, Any]
+) -> None:
+    from stereoweave.bench import plots as benchmark_plots
+
+    if plot:
+        benchmark_plots.draw_error_over_time(plot, means)
+    if sparsification:
+        benchmark_plots.draw_sparsification(sparsification, curves)
+
+
+def _write_classes(file: Path, scores: Any) -> None:
+    """Write the errors by class, and print their means."""
+    from stereoweave.bench.pairs import MEAN, write_csv
+
+    write_csv(file, scores.class_rows, scores.machine)
+    _print_classes([row for row in scores.class_rows if row.scene == MEAN])
+    typer.echo(f"errors by class: {file}")
+
+
+def _print_classes(means: Sequence[Any]) -> None:
+    """Print the mean rows of errors by class, a row for each matcher and a column for each class."""
+    from rich.console import Console
+    from rich.table import Column, Table
+
+    matchers = list(dict.fromkeys(row.matcher for row in means))
+    names = list(dict.fromkeys(row.pixel_class for row in means))
+    found = {(row.matcher, row.pixel_class): row for row in means}
+    for title, field in CLASS_TABLES.items():
+        headings = (Column(CLASS_HEADINGS.get(name, name), justify="right") for name in names)
+        table = Table(Column("matcher", no_wrap=True), *headings, title=title)
+        # The share of a class is the same for every matcher.
+        rows = {"any": matchers[0]} if field == "share_percent" else {Path(m).name: m for m in matchers}
+        for label, matcher in rows.items():
+            table.add_row(label, *(_cell(getattr(found[matcher, name], field)) for name in names))
+        Console().print(table)
+
+
+def _cell(number: float) -> str:
+    return "–" if math.isnan(number) else f"{number:.2f}"
+
+
+def _write_and_tell(out: Path, title: str, rows: Sequence[Any]) -> None:
+    """Write dataclass rows as CSV, print them as a table, and name the file."""
+    from stereoweave.bench.pairs import write_csv
+
+    write_csv(out, rows)
+    _tell_table(title, rows)
+    typer.echo(f"rows: {out}")
+
+
+def _tell_table(title: str, rows: Sequence[Any]) -> None:
+    """Print dataclass rows as a table, under their fields' names; nothing is cut to fit a terminal."""
+    from rich.console import Console
+    from rich.table import Column, Table
+
+    table = Table(*(Column(name, overflow="fold") for name in asdict(rows[0])), title=title)
+    for row in rows:
+        cells = asdict(row).values()
+        table.add_row(*(f"{cell:.2f}" if isinstance(cell, float) else str(cell) for cell in cells))
+    Console().print(table)

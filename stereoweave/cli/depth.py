@@ -1,0 +1,166 @@
+"""The commands stereoweave depth and measure."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from stereoweave.cli.options import (
+    AsJson,
+    BaselineM,
+    Calib,
+    FocalPx,
+    Format,
+    Model,
+    Pictures,
+    Provider,
+    Range,
+    Raw,
+    Rectify,
+    Refined,
+    Threads,
+    load_matcher,
+    pixel_of,
+    range_of,
+    request_of,
+)
+
+if TYPE_CHECKING:
+    from stereoweave.outputs.report import Summary
+
+Write = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME",
+        help="A further file to write; may be repeated. disparity.npy, disparity.tiff; in metres, which "
+        "need a camera: depth.pfm, depth.npy, depth.tiff, cloud.ply, cloud.glb, mesh.ply, mesh.glb; or all.",
+    ),
+]
+PicturesOrFolder = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        metavar="PICTURE",
+        help="LEFT RIGHT of one size; or one file of both views; or a folder of many pairs, told by names "
+        "such as left/1.png, 1_L.jpg, im0.png, 1.mpo.",
+    ),
+]
+Left = Annotated[
+    str | None, typer.Option(metavar="GLOB", help="Many left pictures, such as 'left/*.png', quoted.")
+]
+Right = Annotated[str | None, typer.Option(metavar="GLOB", help="As many right ones, in the same order.")]
+Listed = Annotated[
+    Path | None,
+    typer.Option("--list", help="A text file with a pair in each line: left, right, and a name if wanted."),
+]
+Jobs = Annotated[
+    int | None,
+    typer.Option(min=1, help="Pairs at a time where there are many; as many as cores unless given."),
+]
+ErrorPercent = Annotated[float, typer.Option(min=0, help="How uncertain it is, in percent of it.")]
+
+
+def depth(  # noqa: PLR0913 - each is a word of the command line
+    out: Annotated[Path, typer.Option("--out", "-o", help="The folder to write the results into.")],
+    pictures: PicturesOrFolder = None,
+    left: Left = None,
+    right: Right = None,
+    listed: Listed = None,
+    jobs: Jobs = None,
+    arrangement: Format = None,
+    calib: Calib = None,
+    focal_px: FocalPx = None,
+    baseline_m: BaselineM = None,
+    rectify: Rectify = False,
+    range_px: Range = None,
+    write: Write = None,
+    refined: Refined = False,
+    raw: Raw = False,
+    model: Model = "small",
+    threads: Threads = None,
+    provider: Provider = "cpu",
+    as_json: AsJson = False,
+) -> None:
+    """Depth of a stereo pair, or of many: maps, pictures of them, and a report to open in a browser."""
+    from stereoweave.outputs.results import DepthOrder, make_depth
+    from stereoweave.pictures.pair_finding import find_pairs
+
+    order = DepthOrder(
+        request=request_of(arrangement, calib, focal_px, baseline_m, rectify),
+        model=model,
+        threads=threads,
+        provider=provider,
+        range_px=range_of(range_px),
+        refined=refined,
+        raw=raw,
+        files=tuple(write or ()),
+    )
+    pictures = pictures or []
+    if pairs := find_pairs(pictures, left, right, listed):
+        from stereoweave.batch.local import depth_of_many
+
+        raise typer.Exit(depth_of_many(pairs, out, order, processes=jobs, as_json=as_json))
+    summary, notes = make_depth(pictures, out, order, load_matcher(model, threads, provider))
+    (_tell_json if as_json else _tell)(summary, notes, out)
+
+
+def measure(  # noqa: PLR0913 - each is a word of the command line
+    pictures: Pictures,
+    first: Annotated[str, typer.Option("--from", metavar="X,Y", help="A pixel of the left picture.")],
+    second: Annotated[str, typer.Option("--to", metavar="X,Y", help="Another one.")],
+    arrangement: Format = None,
+    calib: Calib = None,
+    focal_px: FocalPx = None,
+    baseline_m: BaselineM = None,
+    focal_error_percent: ErrorPercent = 0.0,
+    baseline_error_percent: ErrorPercent = 0.0,
+    rectify: Rectify = False,
+    range_px: Range = None,
+    refined: Refined = False,
+    model: Model = "base",
+    threads: Threads = None,
+    provider: Provider = "cpu",
+    as_json: AsJson = False,
+) -> None:
+    """The distance in metres between what two pixels show, and how certain it is.
+
+    The pixels are those of the left picture as it is matched: of the rectified one with --rectify.
+    """
+    from stereoweave.matching.estimate import match
+    from stereoweave.outputs.measure import CameraError, distance
+    from stereoweave.outputs.point_cloud import needed_camera
+    from stereoweave.pictures.prepare import prepare
+
+    places = pixel_of("--from", first), pixel_of("--to", second)
+    within_px = range_of(range_px)
+    prepared = prepare(pictures, request_of(arrangement, calib, focal_px, baseline_m, rectify))
+    camera = needed_camera(prepared.pair)
+    matcher = load_matcher(model, threads, provider)
+    estimate = match(matcher, prepared.pair, range_px=within_px, refined=refined)
+    error = CameraError(focal=focal_error_percent / 100, baseline=baseline_error_percent / 100)
+    found = distance(estimate, camera, *places, camera_error=error)
+    if as_json:
+        typer.echo(json.dumps(asdict(found) | {"notes": prepared.notes}, indent=2, allow_nan=False))
+        return
+    typer.echo(str(found))
+    for note in prepared.notes:
+        typer.echo(note)
+
+
+def _tell_json(summary: "Summary", notes: list[str], out: Path) -> None:
+    from stereoweave.outputs.results import FILES
+
+    files = {file: str(out / file) for file in FILES if (out / file).exists()}
+    typer.echo(json.dumps(asdict(summary) | {"notes": notes, "files": files}, indent=2, allow_nan=False))
+
+
+def _tell(summary: "Summary", notes: list[str], out: Path) -> None:
+    size = f"{summary.width_px}x{summary.height_px} px"
+    typer.echo(
+        f"{' + '.join(summary.pictures)}: {size}, matched by {summary.model} in {summary.estimate_ms:.0f} ms"
+    )
+    typer.echo(f"disparity {summary.disparity_min_px:.1f} to {summary.disparity_max_px:.1f} px")
+    for note in notes:
+        typer.echo(note)
+    typer.echo(f"report: {out / 'report.html'}")

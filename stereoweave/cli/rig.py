@@ -1,0 +1,130 @@
+"""The commands about how the cameras stand: stereoweave check | rectify | calibrate."""
+
+import json
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stereoweave.cli.options import AsJson, Calib, Format, Pictures, place_for
+from stereoweave.errors import StereoweaveError
+
+
+def check(pictures: Pictures, arrangement: Format = None, as_json: AsJson = False) -> None:
+    """What is amiss with a pair and what to do: rows, sides, range of disparities, exposure.
+
+    Exit code 1 where something is.
+    """
+    from stereoweave.cameras.alignment import check_pair
+    from stereoweave.pictures.loading import open_pictures
+
+    opened = open_pictures(pictures, arrangement)
+    found = check_pair(opened.pair.left, opened.pair.right)
+    if as_json:
+        facts = {name: _known(value) for name, value in asdict(found).items()}
+        facts["notes"] = [*opened.notes, *found.lines()]
+        typer.echo(json.dumps(facts, indent=2, allow_nan=False))
+    else:
+        typer.echo("\n".join([*opened.notes, *found.lines()]))
+    if found.defects:
+        raise typer.Exit(1)
+
+
+def _known(value: object) -> object:
+    """The value, or None, JSON's null, in place of a number that is not known."""
+    if isinstance(value, tuple):
+        return [_known(part) for part in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def rectify(
+    pictures: Pictures,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="The folder to write left.png, right.png and calib.yml into.")
+    ],
+    arrangement: Format = None,
+    calib: Calib = None,
+) -> None:
+    """Bring the rows of a pair to match: by a calibration, or without one by what both pictures show.
+
+    The pictures are cut to what both show. With a calibration calib.yml is the new one, of the results.
+    """
+    from stereoweave.cameras.calibration_files import write_rig
+    from stereoweave.cameras.rectify import cropped
+    from stereoweave.cameras.rig import rig_of, size_of, words
+    from stereoweave.io.files import make_folder, write_image
+    from stereoweave.io.output_lock import lock_output
+    from stereoweave.pictures.prepare import Request, prepare
+
+    _spare(pictures, calib, out)
+    place_for(out / "left.png", out / "right.png", out / "calib.yml")
+    prepared = prepare(pictures, Request(arrangement=arrangement, calibration=calib, rectify=True))
+    pair = cropped(prepared.pair)
+    with lock_output(make_folder(out)):
+        write_image(out / "left.png", pair.left)
+        write_image(out / "right.png", pair.right)
+        if pair.camera:
+            write_rig(out / "calib.yml", rig_of(pair))
+    typer.echo("\n".join([f"{out}: left.png and right.png, {words(size_of(pair))} px", *prepared.notes]))
+
+
+def _spare(pictures: Sequence[Path], calib: Path | None, out: Path) -> None:
+    """An error where results would take the place of what was given, or a calibration not be of theirs."""
+    given = [file for file in (*pictures, calib) if file and file.exists()]
+    for result in (out / "left.png", out / "right.png", out / "calib.yml"):
+        if result.exists() and any(result.samefile(file) for file in given):
+            raise StereoweaveError(
+                f"{result}: expected a place for a result, found a file that was given; choose another --out"
+            )
+    if calib is None and (out / "calib.yml").exists():
+        raise StereoweaveError(
+            f"{out / 'calib.yml'}: expected no calibration beside pictures rectified without one, found one; "
+            "choose another --out"
+        )
+
+
+def calibrate(  # noqa: PLR0913 - each is a word of the command line
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            help="Pictures of a board, at least 5 pairs: in folders left and right, or left_01, right_01."
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The calibration to write, in OpenCV's YAML.")],
+    board: Annotated[
+        str,
+        typer.Option(
+            metavar="COLUMNSxROWS",
+            help="Inner corners of the chessboard, such as 9x6; of a ChArUco board its squares.",
+        ),
+    ],
+    square_mm: Annotated[float, typer.Option(help="The side of a square; measure it on the print.")],
+    charuco: Annotated[
+        str | None, typer.Option(metavar="DICT", help="The markers of a ChArUco board: DICT_5X5_100.")
+    ] = None,
+    marker_mm: Annotated[float | None, typer.Option(help="The side of a ChArUco board's marker.")] = None,
+    fisheye: Annotated[bool, typer.Option("--fisheye", help="The lenses are fisheyes.")] = False,
+) -> None:
+    """How two cameras see and stand, from pictures of a board; how well it is known, in plain words."""
+    from stereoweave.cameras.boards import Board
+    from stereoweave.cameras.boards import calibrate as calibrate_by
+    from stereoweave.cameras.calibration_files import write_rig
+
+    match = re.fullmatch(r"(\d+)x(\d+)", board)
+    if match is None:
+        raise StereoweaveError(f"--board: expected columns and rows, such as 9x6, found {board!r}")
+    expected = Board(
+        columns=int(match[1]),
+        rows=int(match[2]),
+        square_m=square_mm / 1000,
+        marker_m=None if marker_mm is None else marker_mm / 1000,
+        dictionary=charuco,
+    )
+    place_for(out)
+    found = calibrate_by(folder, expected, fisheye=fisheye)
+    write_rig(out, found.rig)
+    typer.echo("\n".join([f"{out}: the calibration of {found.rig.name}", *found.lines()]))

@@ -1,0 +1,143 @@
+"""The commands: stereoweave depth | measure | view | video | live | app | check | rectify | train, more."""
+
+import io
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stereoweave import __version__
+from stereoweave.cli.app import app as page
+from stereoweave.cli.batch import batch
+from stereoweave.cli.bench import bench
+from stereoweave.cli.depth import depth, measure
+from stereoweave.cli.live import live
+from stereoweave.cli.options import needing_the_train_extra
+from stereoweave.cli.rig import calibrate, check, rectify
+from stereoweave.cli.serve import serve
+from stereoweave.cli.synth import synth
+from stereoweave.cli.video import video
+from stereoweave.cli.view import view
+from stereoweave.errors import StereoweaveError
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app.add_typer(bench, name="bench")
+app.add_typer(synth, name="synth")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """0 where the command line went well; 2 after a mistake of the caller's, told in one line on stderr."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # as stderr is, for names that are no UTF-8
+    try:
+        return app(arguments, prog_name="stereoweave", standalone_mode=False) or 0
+    except typer.TyperException as error:
+        message = error.format_message().rstrip(".") + "; see stereoweave --help"
+    except (StereoweaveError, OSError) as error:
+        message = str(error)
+    typer.echo("stereoweave: " + " ".join(message.splitlines()), err=True)
+    return 2
+
+
+def _show_version(wanted: bool) -> bool:
+    if wanted:
+        typer.echo(f"stereoweave {__version__}")
+        raise typer.Exit
+    return wanted
+
+
+@app.callback()
+def _stereoweave(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit."),
+    ] = False,
+) -> None:
+    """Depth, and any view between the two cameras, from a stereo pair."""
+
+
+for command in (depth, measure, view, video, live, check, rectify, calibrate, serve, batch):
+    app.command()(command)
+app.command("app")(page)
+
+
+@app.command()
+def train(
+    recipe: Annotated[Path, typer.Argument(help="A TOML file, such as recipes/weave_small.toml.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The folder of the run.")],
+) -> None:
+    """Train the network of a recipe; a run that was stopped continues where it was."""
+    from stereoweave.learn.distributed import told_once
+    from stereoweave.learn.recipe import read_recipe
+
+    with told_once():
+        read_recipe(recipe)  # what is wrong with it is said before PyTorch takes seconds to load
+    with needing_the_train_extra():
+        from stereoweave.learn.training.loop import train as train_recipe
+    train_recipe(recipe, out)
+
+
+@app.command()
+def export(  # noqa: PLR0913 - each is a word of the command line
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="The folder of a run, a checkpoint in it, or a matcher: a shipped name, an .onnx file."
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="The .onnx file to write, in float32.")
+    ] = None,
+    half: Annotated[
+        Path | None, typer.Option(help="An .onnx file to write that computes in 16 bits.")
+    ] = None,
+    eight_bits: Annotated[
+        Path | None, typer.Option(help="An .onnx file to write whose convolutions compute in 8 bits.")
+    ] = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option(
+            help="A .pt file to write: a run's averaged weights in 16 bits, for recipes to start from."
+        ),
+    ] = None,
+    size: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WxH", help="What is written takes one pair of this size alone, as TensorRT wants it."
+        ),
+    ] = None,
+    scenes: Annotated[
+        Path | None, typer.Option(help="Pairs on which both must agree too; a folder as for bench pairs.")
+    ] = None,
+    reliability: Annotated[
+        Path | None, typer.Option(help="A picture to write: how often the confidence comes true.")
+    ] = None,
+) -> None:
+    """Turn a trained network into files that --model takes, and prove that they agree with it.
+
+    A matcher file is made of a trained network, and variants are made of either: in 16 bits, in 8, for one
+    size. Each is compared with what it is made from, and refused if it differs by too much.
+    """
+    from stereoweave.data.readers import read_scenes
+
+    size_px = _size_px(size) if size else None
+    pairs = [scene.pair for scene in read_scenes(scenes)] if scenes else []
+    with needing_the_train_extra():
+        from stereoweave.learn.export.files import MatcherFiles, write_matcher_files, write_weights
+    if weights:
+        typer.echo(write_weights(Path(source), weights))
+    if weights and not (out or half or eight_bits):
+        return
+    files = MatcherFiles(out=out, half=half, eight_bits=eight_bits, size=size_px)
+    for line in write_matcher_files(source, files, pairs, reliability):
+        typer.echo(line)
+
+
+def _size_px(size: str) -> tuple[int, int]:
+    found = re.fullmatch("([0-9]{1,5})x([0-9]{1,5})", size)
+    if found is None:
+        raise StereoweaveError(f"--size: expected width x height in pixels, such as 640x480, found {size!r}")
+    return int(found[1]), int(found[2])

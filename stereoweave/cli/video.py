@@ -1,0 +1,155 @@
+"""The command stereoweave video."""
+
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from stereoweave.cli.options import Model, Provider, Strength, Threads, place_for
+from stereoweave.errors import StereoweaveError
+
+if TYPE_CHECKING:
+    from stereoweave.video.convert import Tally
+
+_HIGHEST_RATE = 1000
+
+
+Films = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="FILM",
+        help="A 3-D film with both views in each frame; or LEFT RIGHT. Videos, folders of pictures, or "
+        "patterns such as 'left/*.png'.",
+    ),
+]
+Out = Annotated[
+    Path,
+    typer.Option("--out", "-o", help="The film to write: .mp4, .mov or .mkv. Begun once, it is continued."),
+]
+Depth = Annotated[
+    bool,
+    typer.Option("--depth", help="Make the left view's disparity in colours, of one range throughout."),
+]
+Depth16 = Annotated[
+    bool, typer.Option("--depth16", help="Make it 16-bit grey, disparity in px * 256, lossless in .mkv.")
+]
+Position = Annotated[
+    float | None,
+    typer.Option(help="Make the view from here: 0 is the left camera, 1 the right; -1 to 2."),
+]
+Layout = Annotated[
+    str | None,
+    typer.Option(help="Make a layout as `stereoweave view` knows them, such as anaglyph_dubois or quilt."),
+]
+Convergence = Annotated[
+    float | None,
+    typer.Option(
+        metavar="PX",
+        help="The disparity that stays in place from view to view. [default: that of the film's middle "
+        "for anaglyphs, quilts and contact sheets, 0 for all others]",
+    ),
+]
+Arrangement = Annotated[
+    str | None,
+    typer.Option(
+        help="How a frame holds both views, such as side_by_side, top_bottom_half or crossed; guessed "
+        "unless given. Any other word lists them all."
+    ),
+]
+Rate = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FPS",
+        help="Frames a second of a series of pictures, such as 24 or 30000/1001. [default: 25]",
+    ),
+]
+
+
+def video(  # noqa: PLR0913 - each is a word of the command line
+    films: Films,
+    out: Out,
+    depth: Depth = False,
+    depth16: Depth16 = False,
+    position: Position = None,
+    layout: Layout = None,
+    strength: Strength = 1.0,
+    convergence: Convergence = None,
+    arrangement: Arrangement = None,
+    rate: Rate = None,
+    model: Model = "small",
+    threads: Threads = None,
+    provider: Provider = "cpu",
+) -> None:
+    """A 3-D film's depth, a new view of it, or another layout, with its sound and its frame times."""
+    from rich.console import Console
+
+    from stereoweave.io.animation import needing_the_video_extra
+    from stereoweave.video.reader import open_footage
+
+    with needing_the_video_extra("a film"):
+        from stereoweave.video.convert import Order, make_film
+        from stereoweave.video.writer import parts_folder
+
+    try:
+        order = Order(
+            depth=depth,
+            depth16=depth16,
+            position=position,
+            layout=layout,
+            strength=strength,
+            convergence_px=convergence,
+            model=model,
+            threads=threads,
+            provider=provider,
+        )
+        footage = open_footage(films, arrangement, rate=None if rate is None else _fraction(rate))
+        if layout:
+            out = _marked(out, layout, footage.size_px)
+        place_for(out)
+        tally = make_film(footage, films, out, order, Console(stderr=True))
+    except KeyboardInterrupt:
+        folder = parts_folder(out)
+        kept = (
+            f"what is finished stays in {folder}, and the same command goes on"
+            if folder.exists()
+            else "nothing stays"
+        )
+        typer.echo(f"stereoweave: {out}: stopped; {kept}", err=True)
+        raise typer.Exit(130) from None
+    _tell(out, tally)
+
+
+def _fraction(rate: str) -> Fraction:
+    """Frames a second from a word such as 24, 23.976 or 30000/1001."""
+    try:
+        # FFmpeg's fractions have 32 bits.
+        fraction = Fraction(rate).limit_denominator(100_000)
+    except (ValueError, ZeroDivisionError):
+        fraction = Fraction(0)
+    if not 0 < fraction <= _HIGHEST_RATE:
+        raise StereoweaveError(
+            "--rate: expected frames a second, such as 24 or 30000/1001, "
+            f"at most {_HIGHEST_RATE}, found {rate!r}"
+        )
+    return fraction
+
+
+def _marked(out: Path, layout: str, size_px: tuple[int, int]) -> Path:
+    """The name with the mark by which viewers know the layout."""
+    import numpy as np
+
+    from stereoweave.rendering.layouts import Choices, marked
+    from stereoweave.stereo import StereoPair
+
+    blank = np.broadcast_to(np.uint8(0), (*reversed(size_px), 3))
+    return marked(out, layout, StereoPair(left=blank, right=blank), Choices())
+
+
+def _tell(out: Path, tally: "Tally") -> None:
+    cuts = "1 cut" if tally.cuts == 1 else f"{tally.cuts} cuts"
+    frames = "1 frame" if tally.frames == 1 else f"{tally.frames} frames"
+    typer.echo(f"{out}: {frames}, {cuts}")
+    if tally.problems:
+        more = "; ..." if tally.problems > len(tally.named) else ""
+        typer.echo(f"problems in {tally.problems} of {frames}: {'; '.join(tally.named)}{more}")

@@ -1,0 +1,29 @@
+"""Bytes: files, pictures, maps, stores."""
+
+from stereoweave.io.files import (
+    RangeError,
+    read_disparity_png,
+    read_image,
+    read_pair,
+    read_pfm,
+    write_depth_png,
+    write_disparity_png,
+    write_float_tiff,
+    write_image,
+    write_npy,
+    write_pfm,
+)
+
+__all__ = [
+    "RangeError",
+    "read_disparity_png",
+    "read_image",
+    "read_pair",
+    "read_pfm",
+    "write_depth_png",
+    "write_disparity_png",
+    "write_float_tiff",
+    "write_image",
+    "write_npy",
+    "write_pfm",
+]

@@ -1,0 +1,131 @@
+"""Pictures one after another, as a file that moves: MP4, GIF or animated WebP."""
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from stereoweave.errors import StereoweaveError, needing_extra
+from stereoweave.io.files import held_by_its_format, replacing
+
+Frames = Iterator[UInt8[np.ndarray, "h w 3"]]
+
+
+def write_animation(path: str | Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], frame_ms: int) -> None:
+    """Writes frames in the format that the name's ending asks for: .mp4, .gif or .webp.
+
+    A GIF and a WebP begin anew for ever, and all their frames are held in memory. An MP4 takes one frame at a
+    time, and plays once; its sides are even: the last column or row of an odd number is repeated.
+
+    Args:
+        path: The file; it is whole or not there.
+        frames: uint8 RGB [H, W, 3], one or more, of one size.
+        frame_ms: How long each is shown. A GIF counts in steps of 10 ms.
+
+    Raises:
+        StereoweaveError: Another ending, no frame, sizes that differ, no PyAV, or no room on the disk.
+    """
+    write = _KINDS[animation_ending(path)]
+    alike = _of_one_size(frames)
+    with replacing(path) as temporary:
+        write(temporary, alike, frame_ms)
+
+
+def animation_ending(path: str | Path) -> str:
+    """The ending of `path` in small letters.
+
+    Raises:
+        StereoweaveError: It stands for no animation, or for an MP4 where there is no PyAV.
+    """
+    ending = Path(path).suffix.lower()
+    if ending not in _KINDS:
+        raise StereoweaveError(
+            f"{path}: expected the ending of an animation, {', '.join(_KINDS)}, found {Path(path).suffix!r}"
+        )
+    if ending == ".mp4":
+        with needing_the_video_extra("an MP4 file"):
+            import av  # noqa: F401 - said before frames are made, which takes longer
+    return ending
+
+
+@contextmanager
+def needing_the_video_extra(what: str) -> Iterator[None]:
+    """Turns the lack of PyAV into one line that names the extra."""
+    with needing_extra("video", f"{what} needs PyAV"):
+        yield
+
+
+def _of_one_size(frames: Iterable[UInt8[np.ndarray, "h w 3"]]) -> Frames:
+    """The frames, the first of them made at once, so that its errors come before a file is begun."""
+    coming = iter(frames)
+    first = next(coming, None)
+    if first is None:
+        raise StereoweaveError("frames: expected one or more, found none")
+    return chain([first], (_sized_as(first, frame) for frame in coming))
+
+
+def _sized_as(first: UInt8[np.ndarray, "h w 3"], frame: UInt8[np.ndarray, "h2 w2 3"]) -> np.ndarray:
+    if frame.shape != first.shape:
+        raise StereoweaveError(
+            f"frames: expected all of one size, found {first.shape[1]}x{first.shape[0]} "
+            f"and {frame.shape[1]}x{frame.shape[0]}"
+        )
+    return frame
+
+
+def _write_mp4(path: Path, frames: Frames, frame_ms: int) -> None:
+    import av
+    from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
+
+    first = _with_even_sides(next(frames))
+    with av.open(path, "w", options={"movflags": "faststart"}) as film:
+        stream = film.add_stream("libx264", rate=Fraction(1000, frame_ms), options={"crf": "18"})
+        context = stream.codec_context
+        context.height, context.width = first.shape[:2]
+        context.pix_fmt = "yuv420p"  # the one that every player takes
+        # Said in the file, because players guess from the size else, and shift the colours.
+        context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
+        context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
+        for frame in chain([first], map(_with_even_sides, frames)):
+            picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
+            in_yuv = picture.reformat(
+                format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
+            )
+            film.mux(stream.encode(in_yuv))
+        film.mux(stream.encode())
+
+
+def _with_even_sides(frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+    height, width = frame.shape[:2]
+    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), "edge")
+
+
+def _write_gif(path: Path, frames: Frames, frame_ms: int) -> None:
+    """One palette, the first frame's, for all: they show one scene, whose colours would flicker with many."""
+    pictures = (Image.fromarray(frame) for frame in frames)
+    first = next(pictures)
+    # The nearest of Pillow's to the example's colours, and quickest: 39.1 dB, MEDIANCUT 35.2, both dithered.
+    palette = first.quantize(256, method=Image.Quantize.FASTOCTREE)
+    _save(path, "GIF", (picture.quantize(palette=palette) for picture in chain([first], pictures)), frame_ms)
+
+
+def _write_webp(path: Path, frames: Frames, frame_ms: int) -> None:
+    _save(path, "WEBP", (Image.fromarray(frame) for frame in frames), frame_ms, quality=90, method=4)
+
+
+def _save(path: Path, kind: str, pictures: Iterator[Image.Image], frame_ms: int, **options: int) -> None:
+    first = next(pictures)
+    with held_by_its_format(path, (first.height, first.width)):
+        first.save(path, kind, save_all=True, append_images=pictures, duration=frame_ms, loop=0, **options)
+
+
+_KINDS: dict[str, Callable[[Path, Frames, int], None]] = {
+    ".mp4": _write_mp4,
+    ".gif": _write_gif,
+    ".webp": _write_webp,
+}

@@ -1,0 +1,292 @@
+"""The one gate for files of pictures: each is refused by its name, or decoded, with its tags.
+
+Every way in passes here: commands, Python, video, boards, benchmarks, datasets, the page and the service.
+They all read the same kinds, with the same limits, colours, orientation and errors.
+"""
+
+import io
+import logging
+import stat
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Shaped, UInt8
+from PIL import Image, UnidentifiedImageError, features
+
+from stereoweave.errors import FormatError, reason
+from stereoweave.io import exif
+from stereoweave.stereo import LONGEST_SIDE_PX
+
+# 50 megapixels a view are supported, and cameras of that class have up to 64. Known from the file's head,
+# before memory is spent.
+MOST_PIXELS = 65_000_000
+A_PICTURE = "a picture (PNG, JPEG, TIFF or the like)"
+# The usual endings of what is read, to find pictures in a folder by; what a file is, its content decides.
+ENDINGS = frozenset(
+    {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".jp2", ".pgm", ".ppm", ".avif"}
+)
+# Not all that Pillow opens: PostScript, for one, would run as a program. Of JPEG are MPO and JPS.
+_KINDS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "AVIF", "JPEG2000")
+_RAW_ENDINGS = {
+    *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".kdc", ".mrw", ".nef", ".nrw", ".orf"),
+    *(".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
+}
+_VIDEO_ENDINGS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".wmv")
+_HEIF_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"}
+_AVIF_BRANDS = {b"avif", b"avis"}
+_MP_ENTRIES, _DISPARITY = 0xB002, "Multi-Frame Image: (Disparity)"
+_LONGEST_WORDS = 100
+# How the colours of a mode are stored, where a profile can say what they mean.
+_PROFILED = {"RGB": "RGB", "RGBA": "RGB", "P": "RGB", "L": "L", "LA": "L", "CMYK": "CMYK"}
+
+# Pillow also logs what it then raises, and Python writes what nobody handles to stderr.
+logging.getLogger("PIL").addHandler(logging.NullHandler())
+
+
+class Photograph(NamedTuple):
+    """A decoded picture as it lies in its file, in RGB and sRGB; its tags; what was done to its colours."""
+
+    image: Image.Image
+    tags: exif.Tags
+    note: str | None
+
+    def upright(self, lies: int | None) -> UInt8[np.ndarray, "h w 3"]:
+        """Its pixels, turned upright if it lies so."""
+        # A copy: Pillow lends its pixels read-only, for which Numba compiles anew and PyTorch warns.
+        return np.array(exif.turned(self.image, lies))
+
+
+@contextmanager
+def opening(path: Path, *, views: int = 1, expected: str = A_PICTURE) -> Iterator[Image.Image]:
+    """An opened picture of one or two views, not yet decoded, whose size and kind can be worked with.
+
+    Raises:
+        FormatError: It cannot; the other functions that take it raise one where its content is damaged.
+    """
+    check_regular(path, expected)
+    with _decoding(path, expected), path.open("rb") as file:
+        head = file.read(64)
+    _refuse_by_name(path, head)
+    with _decoding(path, expected):
+        picture = _opened(path, path, views)
+    with picture:
+        check_size(path, picture.size, views=views)
+        _refuse_by_content(path, picture)
+        yield picture
+
+
+def read_photograph(path: Path) -> Photograph:
+    """The picture of a file that holds one view."""
+    with opening(path) as picture:
+        return decode(path, picture)
+
+
+def decode(path: Path, picture: Image.Image) -> Photograph:
+    """The picture that was opened, or the frame of it at hand."""
+    with _decoding(path):
+        # First, since TIFF is turned upright by this, and then says so in its tags.
+        picture.load()
+    tags = exif.read_tags(picture)
+    if picture.mode.startswith(("I", "F")):
+        return Photograph(_eight_bits(path, picture), tags, None)
+    image, note = _in_srgb(picture)
+    with _decoding(path):
+        return Photograph(image if image.mode == "RGB" else image.convert("RGB"), tags, note)
+
+
+def stored_values(path: str | Path, picture: Image.Image) -> Shaped[np.ndarray, "h w *channels"]:
+    """The numbers of an opened picture as they are stored, for a measurement or a mask."""
+    with _decoding(path):
+        picture.load()
+        return np.array(picture)
+
+
+def unpacked_values(name: str, content: bytes) -> Shaped[np.ndarray, "h w *channels"]:
+    """The numbers of a picture that lies within another file, `name` in errors."""
+    with _decoding(name):
+        picture = _opened(name, io.BytesIO(content), 1)
+    check_size(name, picture.size)
+    return stored_values(name, picture)
+
+
+def check_regular(path: Path, expected: str) -> None:
+    """Raise a FormatError for all but a file: a pipe would be waited for, a device read without end."""
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError) as error:  # of a name with a zero byte a ValueError
+        raise FormatError(f"{path}: expected {expected}, found {reason(error)}") from error
+    if not stat.S_ISREG(mode):
+        found = "a folder" if stat.S_ISDIR(mode) else "a pipe or a device; copy it into a file first"
+        raise FormatError(f"{path}: expected {expected}, found {found}")
+
+
+def check_size(path: str | Path, size_px: tuple[int, int], *, views: int = 1) -> None:
+    """Raise a FormatError for width and height that are more than can be worked with."""
+    width_px, height_px = size_px
+    if width_px * height_px > views * MOST_PIXELS:
+        raise FormatError(f"{path}: expected {_most(views)}, found {width_px}x{height_px}; scale it down")
+    if max(size_px) > views * LONGEST_SIDE_PX:
+        raise FormatError(
+            f"{path}: expected at most {views * LONGEST_SIDE_PX} pixels a side, "
+            f"found {width_px}x{height_px}; scale it down or cut it"
+        )
+
+
+@contextmanager
+def _decoding(path: str | Path, expected: str = A_PICTURE) -> Iterator[None]:
+    """Turns whatever Pillow raises into a FormatError: in one line, expected and found.
+
+    Only for calls into Pillow. Its decoders raise whatever a damaged file makes them trip over, IndexError,
+    KeyError, TypeError, struct.error, zlib.error and more, and document none of it: a list of these would
+    never be complete. An error of our own code must not be taken for a damaged file, so it stays outside.
+    """
+    try:
+        # Pillow warns about odd tags before it gives up on a file; the error below says it in one line.
+        with warnings.catch_warnings(action="ignore"):
+            yield
+    except FormatError:
+        raise
+    except UnidentifiedImageError as error:
+        raise FormatError(f"{path}: expected {expected}, found something else") from error
+    except Exception as error:
+        raise FormatError(f"{path}: expected {expected}, found {reason(error)}") from error
+
+
+def _opened(path: str | Path, source: Path | io.BytesIO, views: int) -> Image.Image:
+    try:
+        return Image.open(source, formats=_KINDS)
+    except Image.DecompressionBombError as error:
+        raise FormatError(f"{path}: expected {_most(views)}, found more ({error}); scale it down") from error
+
+
+def _most(views: int) -> str:
+    return f"at most {views * MOST_PIXELS // 1_000_000} megapixels"
+
+
+def _refuse_by_name(path: Path, head: bytes) -> None:
+    """Raise a FormatError for a kind that is not read, by the ending of the name or by the first bytes."""
+    ending = path.suffix.lower()
+    if ending in _RAW_ENDINGS:
+        raise FormatError(
+            f"{path}: expected {A_PICTURE}, found a camera's raw file; develop it to one of these first"
+        )
+    brands = {head[start : start + 4] for start in (8, *range(16, 64, 4))} if head[4:8] == b"ftyp" else set()
+    if brands & _AVIF_BRANDS:
+        if not features.check("avif"):
+            raise FormatError(f"{path}: expected {A_PICTURE}, found AVIF, which this Pillow does not read")
+    elif brands & _HEIF_BRANDS:
+        raise FormatError(
+            f"{path}: expected {A_PICTURE}, found HEIC, such as a spatial photograph, which is not read; "
+            "export it as two JPEG files, or as one with both views side by side"
+        )
+    elif brands or ending in _VIDEO_ENDINGS:
+        raise FormatError(f"{path}: expected {A_PICTURE}, found a video; 'stereoweave video' takes those")
+
+
+def _refuse_by_content(path: Path, picture: Any) -> None:
+    """Raise a FormatError for a picture that is no plain photograph, or more than one."""
+    description = picture.info.get("xmp", b"")
+    words = description if isinstance(description, bytes) else str(description).encode(errors="replace")
+    if b"GImage:" in words or b"equirectangular" in words.lower():
+        raise FormatError(
+            f"{path}: expected a photograph, found VR180 or a panorama of 360 degrees, by its XMP, "
+            "which is not read; export two plain views from it"
+        )
+    if picture.format in ("GIF", "PNG", "WEBP", "AVIF"):
+        with _decoding(path):
+            count = picture.n_frames
+        if count > 1:
+            raise FormatError(
+                f"{path}: expected one picture, found an animation of {count}; save its two views"
+            )
+
+
+def _eight_bits(path: Path, picture: Image.Image) -> Image.Image:
+    """A loaded grey picture of 16 bits, or of 32 that hold no more, in RGB."""
+    with _decoding(path):
+        values = np.asarray(picture)
+    if picture.mode == "F" or values.min() < 0 or values.max() > 65535:
+        raise FormatError(
+            f"{path}: expected {A_PICTURE}, found one that cannot be read (more than 16 bits a channel or "
+            f"values below 0, mode {picture.mode})"
+        )
+    # The upper byte, as Pillow reduces colour pictures of 16 bits; a file of 32 bits may hold 8 of them.
+    bits = 8 if picture.mode != "I" or values.max() > 255 else 0
+    return Image.fromarray((values >> bits).astype(np.uint8)).convert("RGB")
+
+
+def _in_srgb(picture: Image.Image) -> tuple[Image.Image, str | None]:
+    """The picture with its colours in sRGB, and in words what was done for that, if anything."""
+    profile, mode = picture.info.get("icc_profile"), _PROFILED.get(picture.mode)
+    if not profile or mode is None:
+        return picture, None
+    from PIL import ImageCms
+
+    try:
+        stored = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        name = _words(ImageCms.getProfileDescription(stored)) or "a profile without a name"
+        if "srgb" in name.lower():
+            return picture, None
+        converted = ImageCms.profileToProfile(
+            picture.convert(mode),
+            stored,
+            ImageCms.createProfile("sRGB"),
+            renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
+            outputMode="RGB",
+            flags=ImageCms.Flags.BLACKPOINTCOMPENSATION,
+        )
+    except Exception as error:  # whatever Pillow raises of a damaged one, as in `_decoding`
+        return picture, f"the colour profile cannot be used, colours are taken as sRGB ({_words(str(error))})"
+    return converted or picture, f"colours converted from {name}"
+
+
+def _words(text: str) -> str:
+    """A text from a file as a part of a line that is shown."""
+    return "".join(filter(str.isprintable, " ".join(text.split())))[:_LONGEST_WORDS]
+
+
+def view_frames(path: Path, picture: Any) -> list[int]:
+    """The numbers of the two frames of an MPO file that are its views; none if the others are previews."""
+    if picture.format != "MPO":
+        return []
+    with _decoding(path):
+        entries = picture.mpinfo[_MP_ENTRIES]
+        views = [index for index, entry in enumerate(entries) if entry["Attribute"]["MPType"] == _DISPARITY]
+    if len(views) >= 2:
+        return views[:2]
+    size_px = picture.size
+    for index in range(1, len(entries)):
+        _seek(path, picture, index)
+        if picture.size == size_px:
+            return [0, index]
+    _seek(path, picture, 0)
+    return []
+
+
+def read_frame(path: Path, picture: Image.Image, index: int) -> Photograph:
+    """One of the pictures of an MPO file."""
+    _seek(path, picture, index)
+    check_size(path, picture.size)
+    photograph = decode(path, picture)
+    # A copy: Pillow decodes the next frame into the same place.
+    return photograph._replace(image=photograph.image.copy())
+
+
+def _seek(path: Path, picture: Image.Image, index: int) -> None:
+    """Goes to a frame of an MPO file, whose tags and profile are then its own, and not of one before it."""
+    if picture.tell() == index:
+        return
+    for key in ("mp", "icc_profile"):
+        picture.info.pop(key, None)
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            picture.seek(index)
+    except Exception as error:  # whatever Pillow raises of a damaged one, as in `_decoding`
+        raise FormatError(
+            f"{path}: expected an MPO file of whole pictures, found number {index + 1} cut off or damaged "
+            f"({_words(str(error))})"
+        ) from error

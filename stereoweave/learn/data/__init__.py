@@ -1,0 +1,1 @@
+"""What a training sees: painted and rendered pairs, batches."""

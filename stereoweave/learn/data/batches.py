@@ -1,0 +1,154 @@
+"""The batch of every step: which pairs, how they are cut, and how they are laid together and parted."""
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.learn.data.augment import augment, cut
+from stereoweave.learn.data.sources import Mix, Ordered, Source
+from stereoweave.learn.distributed import Ranks
+from stereoweave.learn.recipe import Recipe
+from stereoweave.stereo import Sample
+
+
+class Batches(Dataset[dict[str, torch.Tensor]]):
+    """The batch of every step, or of each the share of one of several processes.
+
+    A micro-batch is drawn from (seed, step, its place in the step) alone, whoever asks and in whatever order.
+    """
+
+    def __init__(self, recipe: Recipe, pairs: Source, ranks: Ranks | None = None) -> None:
+        self.recipe, self.pairs = recipe, pairs
+        self.mix = pairs if isinstance(pairs, Mix) else Mix((pairs,), (1.0,))
+        self.parts = (ranks or Ranks()).share(recipe.micro_batches)
+        self._draw(0)
+
+    def __getitem__(self, step: int) -> dict[str, torch.Tensor]:
+        chosen = self.chosen(step)
+        size = len(chosen) // self.recipe.micro_batches
+        return collated(
+            [
+                sample
+                for part in self.parts
+                for sample in self._cut(chosen[part * size : (part + 1) * size], self.key(step, part))
+            ]
+        )
+
+    def key(self, step: int, part: int) -> tuple[int, ...]:
+        """What the draws of a micro-batch begin from.
+
+        Zeros at the end change no draw: the first one's are those of (seed, step), as before steps had parts.
+        Even, because of the odd ones are the orders of pairs and sets.
+        """
+        return self.recipe.seed, step, 0, 2 * part
+
+    def chosen(self, step: int) -> list[int]:
+        """Indices of the pairs of a step: of each set every pair once before any comes again."""
+        first, end = step * self.recipe.batch, (step + 1) * self.recipe.batch
+        while len(self._drawn) < end:
+            self._draw(2 * len(self._drawn) + end)
+        return [self._index(int(self._drawn[i]), int(self._turns[i])) for i in range(first, end)]
+
+    def names(self, step: int) -> list[str]:
+        """What errors call the pairs of a step."""
+        return [self.pairs.name(index) for index in self.chosen(step)]
+
+    def _draw(self, places: int) -> None:
+        """Draw the set of each of the first places, and count how often it was drawn before."""
+        self._drawn = self.mix.drawn(places, np.random.default_rng((self.recipe.seed, 0, 0, 1)))
+        self._turns = np.zeros(places, np.int64)
+        for which in range(len(self.mix.sets)):
+            places_of_set = np.flatnonzero(self._drawn == which)
+            self._turns[places_of_set] = np.arange(len(places_of_set))
+
+    def _cut(self, indices: list[int], key: tuple[int, ...]) -> list[Sample]:
+        rng, size = np.random.default_rng(key), self.recipe.crop_size
+        samples = (known(self.pairs, index) for index in indices)
+        if self.recipe.augment:
+            return [augment(sample, *size, rng, self.recipe.offset_share) for sample in samples]
+        return [cut(sample, *size, rng) for sample in samples]
+
+    def _index(self, which: int, turn: int) -> int:
+        """The index of the pair that a set gives when it is drawn for that time, counted from 0."""
+        one = self.mix.sets[which]
+        epoch, place = divmod(turn, one.count)
+        rng = np.random.default_rng((self.recipe.seed, epoch, 1 + which))
+        order = one.order(rng) if isinstance(one, Ordered) else rng.permutation(one.count)
+        return self.mix.first(which) + int(order[place])
+
+
+class Told(Dataset[dict[str, torch.Tensor] | StereoweaveError]):
+    """The batches, or the error where one cannot be made.
+
+    Raised in the loader's process it would come with PyTorch's traceback for its words.
+    """
+
+    def __init__(self, batches: Batches) -> None:
+        self.batches = batches
+
+    def __getitem__(self, step: int) -> dict[str, torch.Tensor] | StereoweaveError:
+        try:
+            return self.batches[step]
+        except StereoweaveError as error:
+            return error
+
+
+def known(pairs: Source, index: int) -> Sample:
+    """The sample of that index; StereoweaveError where nothing in it is known."""
+    sample = pairs[index]
+    if not np.isfinite(sample.disparity_px).any():
+        raise StereoweaveError(
+            f"{pairs.name(index)}: expected at least one pixel of known disparity, found none; "
+            "remove it from the dataset"
+        )
+    return sample
+
+
+def collated(samples: list[Sample]) -> dict[str, torch.Tensor]:
+    """Images [B, 3, H, W] in 0..1; maps [2B, 1, H, W], of the left views, then of the right ones mirrored.
+
+    Where every sample has a camera, also `focal_baseline_px_m` and `doffs_px`, [B, 1, 1, 1].
+
+    Raises:
+        StereoweaveError: The samples are not of one size.
+    """
+    sizes = sorted({sample.left.shape[:2] for sample in samples})
+    if len(sizes) > 1:
+        raise StereoweaveError(
+            f"a batch: expected pairs of one size, found {' and '.join(f'{w}x{h}' for h, w in sizes)}; "
+            "cut them to one crop_size"
+        )
+
+    def images(side: str) -> torch.Tensor:
+        stacked = np.stack([getattr(sample, side) for sample in samples])
+        return torch.from_numpy(stacked).permute(0, 3, 1, 2).float() / 255
+
+    def maps(name: str) -> torch.Tensor:
+        lefts = [getattr(sample, name) for sample in samples]
+        rights = [getattr(sample, f"right_{name}")[:, ::-1] for sample in samples]
+        return torch.from_numpy(np.stack(lefts + rights))[:, None]
+
+    batch = {
+        "left": images("left"),
+        "right": images("right"),
+        "disparity_px": maps("disparity_px"),
+        "occluded": maps("occluded"),
+    }
+    cameras = [sample.camera for sample in samples if sample.camera is not None]
+    if len(cameras) == len(samples):
+        products = [camera.focal_px * camera.baseline_m for camera in cameras]
+        batch["focal_baseline_px_m"] = torch.tensor(products).view(-1, 1, 1, 1)
+        batch["doffs_px"] = torch.tensor([camera.doffs_px for camera in cameras]).view(-1, 1, 1, 1)
+    return batch
+
+
+def split(batch: dict[str, torch.Tensor], parts: int) -> list[dict[str, torch.Tensor]]:
+    """A collated batch in equal parts, its first pairs first, each as if collated alone."""
+    pairs = len(batch["left"])
+
+    def part(values: torch.Tensor, which: int) -> torch.Tensor:
+        # Maps of the left views are before those of the right ones.
+        return torch.unflatten(values, 0, (len(values) // pairs, parts, -1))[:, which].flatten(0, 1)
+
+    return [{name: part(values, which) for name, values in batch.items()} for which in range(parts)]

@@ -1,0 +1,252 @@
+"""Endless training pairs: layers of paper-thin, slanted and bent surfaces, painted into both views.
+
+What transfers to photographs is natural textures and a wide spread of disparities rather than exact
+geometry, so a scene is a collage; its disparity is exact in both views all the same.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from stereoweave.learn.data.collage_kinds import draw_scene, draw_training_scene
+from stereoweave.learn.data.collage_scene import Scene
+from stereoweave.learn.data.paint_kernels import Sheet, colour, cover, expose, occlusion, seen_from_right
+from stereoweave.learn.data.textures import LIGHT_MAPS, light_map, natural_colour
+from stereoweave.stereo import Sample
+
+CLEAN_SHARE = 0.25  # pairs without any photometric difference
+FAULTY_SHARE = 0.03  # pairs with faults that good cameras do not have
+NOISE_SHARE = 0.02  # training pairs that show noise and nothing else
+CUT_APART_SHARE = 0.04  # training pairs whose disparities are partly negative
+NOTHING_PX = -1000.0  # the disparity of what cannot be found; below 0 however the views are moved
+LEVELS = np.arange(1021, dtype=np.float32) / 4  # grey levels that a tone curve tells apart
+
+
+View = Float[np.ndarray, "h w 3"]  # 0..255
+
+
+@dataclass(frozen=True, kw_only=True)
+class Painting:
+    """One view: image float32 [H, W, 3] in 0..255, and the disparity of what is seen, float32 [H, W]."""
+
+    image: Float[np.ndarray, "h w 3"]
+    disparity_px: Float[np.ndarray, "h w"]
+
+
+def sample(seed: int, epoch: int, index: int, height: int = 256, width: int = 384) -> Sample:
+    """Mixed collage number `index` of an epoch, with exact disparity and occlusion for both views.
+
+    The same arguments give the same pair in every process. Disparities are finite and >= 0. The textures
+    are built at the first call, which takes some seconds.
+    """
+    rng = np.random.default_rng((seed, epoch, index))
+    return _photographed(rng, *_paint(rng, draw_scene, height, width))
+
+
+def training_sample(seed: int, epoch: int, index: int, height: int = 256, width: int = 384) -> Sample:
+    """A collage of any kind, with what `sample` gives; 6 % of the pairs are for the confidence alone.
+
+    In those, disparities are partly or wholly below 0, where a network that clamps at 0 cannot find them.
+    Either the views are cut apart, with exact disparities on both sides of 0, or they show plain noise
+    and all disparities are NOTHING_PX.
+    """
+    rng = np.random.default_rng((seed, epoch, index, 1))
+    kind = rng.random()
+    if kind < NOISE_SHARE:
+        return _plain_noise(rng, height, width)
+    if kind < NOISE_SHARE + CUT_APART_SHARE:
+        views = _paint(rng, draw_training_scene, height, width + width // 4)
+        return _photographed(rng, *_cut_apart(rng, *views, width))
+    return _photographed(rng, *_paint(rng, draw_training_scene, height, width))
+
+
+def _paint(
+    rng: np.random.Generator,
+    draw: Callable[[np.random.Generator, int, int], Scene],
+    height: int,
+    width: int,
+) -> tuple[Painting, Painting]:
+    """Both views of a random scene that has something to match."""
+    while True:
+        left, right = paint_scene(draw(rng, height, width))
+        occluded, right_occluded = _occlusions(left, right)
+        if occluded.mean() < 0.6 and right_occluded.mean() < 0.6 and left.image.std() > 6:
+            return left, right
+
+
+def _occlusions(left: Painting, right: Painting) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    return (
+        occlusion(left.disparity_px, right.disparity_px, -1),
+        occlusion(right.disparity_px, left.disparity_px, 1),
+    )
+
+
+def _photographed(rng: np.random.Generator, left: Painting, right: Painting) -> Sample:
+    occluded, right_occluded = _occlusions(left, right)
+    left_image, right_image = photograph(rng, left.image, right.image)
+    return Sample(
+        left=left_image,
+        right=right_image,
+        disparity_px=left.disparity_px,
+        right_disparity_px=right.disparity_px,
+        occluded=occluded,
+        right_occluded=right_occluded,
+    )
+
+
+def _cut_apart(
+    rng: np.random.Generator, left: Painting, right: Painting, width: int
+) -> tuple[Painting, Painting]:
+    """Views of that width; the left one starts so far to the right that many disparities are below 0."""
+    spare = left.image.shape[1] - width
+    start = int(np.clip(np.ceil(np.quantile(left.disparity_px, rng.uniform(0.1, 0.7))), 1, spare))
+
+    def cut(view: Painting, first: int) -> Painting:
+        columns = np.s_[:, first : first + width]
+        return Painting(
+            image=view.image[columns], disparity_px=view.disparity_px[columns] - np.float32(start)
+        )
+
+    return cut(left, start), cut(right, 0)
+
+
+def _plain_noise(rng: np.random.Generator, height: int, width: int) -> Sample:
+    """Two views of one colour under smooth light, and each sensor's noise."""
+    light = 1 + rng.uniform(0, 0.3) * (light_map(int(rng.integers(LIGHT_MAPS))) - 1)
+    shown = natural_colour(rng) * cv2.resize(light, (width, height), interpolation=cv2.INTER_CUBIC)[..., None]
+    level = np.exp(rng.uniform(np.log(0.5), np.log(12)))
+    views = [shown + level * rng.standard_normal(shown.shape, np.float32) for _ in range(2)]
+    left, right = (np.clip(np.round(view), 0, 255).astype(np.uint8) for view in views)
+    nothing_px = np.full((height, width), NOTHING_PX, np.float32)
+    nowhere = np.ones((height, width), bool)
+    return Sample(
+        left=left,
+        right=right,
+        disparity_px=nothing_px,
+        right_disparity_px=nothing_px,
+        occluded=nowhere,
+        right_occluded=nowhere,
+    )
+
+
+def paint_scene(scene: Scene) -> tuple[Painting, Painting]:
+    """Both views of a scene, left and right, as ideal cameras see it."""
+    left_sheets = [layer.sheet() for layer in scene.layers]
+    right_sheets = [seen_from_right(sheet, scene.width) for sheet in left_sheets]
+    return _paint_view(scene, left_sheets, 0), _paint_view(scene, right_sheets, 1)
+
+
+def _paint_view(scene: Scene, sheets: list[Sheet], side: int) -> Painting:
+    nearest = np.full((scene.height, scene.width), -1, np.float32)
+    nearest_opaque = nearest.copy()
+    image = np.full((scene.height, scene.width, 3), 0, np.float32)
+    for sheet in sheets:
+        cover(sheet, nearest, nearest_opaque)
+    for layer, sheet in zip(scene.layers, sheets, strict=True):
+        colour(image, sheet, layer.paint, nearest_opaque, side)
+    return Painting(image=image, disparity_px=nearest)
+
+
+def photograph(
+    rng: np.random.Generator, left: Float[np.ndarray, "h w 3"], right: Float[np.ndarray, "h w 3"]
+) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
+    """The two images as two real cameras give them: a little apart in height, sharpness, tone and noise."""
+    # With numbers of their own, so that a pair without faults stays as it was before there were any.
+    fault_rng = rng.spawn(1)[0]
+    if fault_rng.random() < FAULTY_SHARE:
+        left, right = _with_faults(fault_rng, left, right)
+    if rng.random() < CLEAN_SHARE:
+        plain, still = np.tile(LEVELS, (3, 1)), np.zeros((3, LEVELS.size), np.float32)
+        return expose(left, plain, still, left), expose(right, plain, still, right)
+    if rng.random() < 0.33:
+        right = _shifted_down(right, rng.uniform(-0.5, 0.5))
+    # One pair in six has plainly different exposures, the others as two cameras of one make have.
+    spread = 0.2 if rng.random() < 0.17 else 0.04
+    noise_level = float(np.exp(rng.uniform(np.log(0.2), np.log(5)))) if rng.random() < 0.75 else 0.0
+    blur_share = 0.5 if rng.random() < 0.4 else 0.0
+    quality = int(rng.integers(50, 96)) if rng.random() < 0.25 else None
+    vignette = rng.uniform(0.1, 0.4) if rng.random() < 0.06 else 0.0
+    views = []
+    for view in (left, right):
+        if rng.random() < blur_share:
+            view = cv2.GaussianBlur(view, (0, 0), rng.uniform(0.3, 0.9))
+        if vignette:
+            view = view * _vignette(view.shape[0], view.shape[1], vignette)
+        tone = _draw_tone(rng, spread)
+        # Photons are counted: their noise grows with the root of the brightness, over the sensor's own.
+        deviation = noise_level * np.sqrt(0.25 + np.clip(tone, 0, 255) / 255)
+        noise = rng.standard_normal(view.shape, np.float32) if noise_level else view
+        shown = expose(view, tone, deviation, noise)
+        views.append(shown if quality is None else _through_jpeg(shown, quality))
+    return views[0], views[1]
+
+
+def _with_faults(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
+    """The views with one to three of the faults, in the order in which light meets them."""
+    for fault in np.sort(rng.choice(len(FAULTS), rng.integers(1, 4), replace=False)):
+        left, right = FAULTS[fault](rng, left, right)
+    return left, right
+
+
+def _lowered(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
+    """Cameras that are one or two rows apart in height."""
+    return left, _shifted_down(right, rng.choice([-1, 1]) * rng.uniform(0.8, 2))
+
+
+def _blurred(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
+    """One lens out of focus."""
+    deviation_px, which = rng.uniform(0.7, 1.6), rng.integers(2)
+    if which:
+        return left, cv2.GaussianBlur(right, (0, 0), deviation_px)
+    return cv2.GaussianBlur(left, (0, 0), deviation_px), right
+
+
+def _darkened_corners(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
+    """Each lens with corners of its own darkness."""
+    own, other = (_vignette(left.shape[0], left.shape[1], rng.uniform(0.2, 0.7)) for _ in range(2))
+    return left * own, right * other
+
+
+def _interpolated(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
+    """Colours of which each pixel of one or both sensors saw but one."""
+    which = rng.integers(3)
+    return left if which == 1 else demosaiced(left), right if which == 2 else demosaiced(right)
+
+
+FAULTS = (_lowered, _blurred, _darkened_corners, _interpolated)
+
+
+def demosaiced(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """The image (0..255) behind a Bayer filter, the other two colours of each pixel interpolated."""
+    levels = np.round(image * 256).astype(np.uint16)
+    mosaic = levels[..., 1].copy()
+    mosaic[::2, ::2], mosaic[1::2, 1::2] = levels[::2, ::2, 0], levels[1::2, 1::2, 2]
+    return cv2.demosaicing(mosaic, cv2.COLOR_BayerBG2RGB).astype(np.float32) / 256
+
+
+def _draw_tone(rng: np.random.Generator, spread: float) -> Float[np.ndarray, "3 1021"]:
+    gains = np.exp(rng.normal(0, spread) + rng.normal(0, min(spread, 0.06) / 2, 3))
+    bent = 255 * (LEVELS / 255) ** np.exp(rng.normal(0, spread))
+    return (gains[:, None] * bent + rng.normal(0, 30 * min(spread, 0.1))).astype(np.float32)
+
+
+def _shifted_down(image: Float[np.ndarray, "h w 3"], shift_px: float) -> Float[np.ndarray, "h w 3"]:
+    move = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, shift_px]])
+    size = (image.shape[1], image.shape[0])
+    moved = cv2.warpAffine(image, move, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return np.clip(moved, 0, 255)
+
+
+def _vignette(height: int, width: int, strength: float) -> Float[np.ndarray, "h w 1"]:
+    y, x = np.ogrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
+    return (1 - strength * (x * x + y * y) / 2).astype(np.float32)[..., None]
+
+
+def _through_jpeg(image: UInt8[np.ndarray, "h w 3"], quality: int) -> UInt8[np.ndarray, "h w 3"]:
+    _, data = cv2.imencode(
+        ".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality]
+    )
+    return cv2.imdecode(data, cv2.IMREAD_COLOR_RGB)  # type: ignore[return-value]  # None only for bad data

@@ -1,0 +1,68 @@
+"""What a collage is made of: surfaces within silhouettes, painted, in layers."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from stereoweave.learn.data.paint_kernels import Paint, Sheet, surface
+from stereoweave.learn.data.silhouettes import Patch
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surface:
+    """Disparity over left-image x, y: a sum of products of a function of x and one of y, within 0..limit_px.
+
+    Attributes:
+        plane: disparity at the centre, its slopes along x and y, the centre's x and y.
+        waves: rows of amplitude_px, angular frequencies along x and y, phase.
+        hills: rows of height_px, centre x and y, inverse radii along x and y (0: a ridge, as on a cylinder).
+        limit_px: the greatest disparity of the scene.
+    """
+
+    plane: tuple[float, float, float, float, float]
+    waves: tuple[tuple[float, float, float, float], ...] = ()
+    hills: tuple[tuple[float, float, float, float, float], ...] = ()
+    limit_px: float
+
+    def plane_px(self, x: float, y: float) -> float:
+        """Disparity at a point, without waves and hills."""
+        level, slope_x, slope_y, centre_x, centre_y = self.plane
+        return min(max(level + slope_x * (x - centre_x) + slope_y * (y - centre_y), 0.0), self.limit_px)
+
+    def over(self, patch: Patch) -> Float[np.ndarray, "h w"]:
+        """Disparity float32 at each pixel of the patch."""
+        x = np.arange(patch.field.shape[1], dtype=np.float32) + patch.left
+        y = np.arange(patch.field.shape[0], dtype=np.float32) + patch.top
+        level, slope_x, slope_y, centre_x, centre_y = self.plane
+        columns = [level + slope_x * (x - centre_x), np.ones_like(x)]
+        rows = [np.ones_like(y), slope_y * (y - centre_y)]
+        for amplitude, along_x, along_y, phase in self.waves:
+            columns += [amplitude * np.sin(along_x * x + phase), amplitude * np.cos(along_x * x + phase)]
+            rows += [np.cos(along_y * y), np.sin(along_y * y)]
+        for height, middle_x, middle_y, inverse_x, inverse_y in self.hills:
+            columns.append(height * np.exp(-(((x - middle_x) * inverse_x) ** 2)))
+            rows.append(np.exp(-(((y - middle_y) * inverse_y) ** 2)))
+        return surface(np.stack(columns).astype(np.float32), np.stack(rows).astype(np.float32), self.limit_px)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layer:
+    """A surface within a silhouette, painted."""
+
+    patch: Patch
+    surface: Surface
+    paint: Paint
+
+    def sheet(self) -> Sheet:
+        """The layer as the left camera sees it."""
+        return Sheet(self.patch.field, self.surface.over(self.patch), self.patch.left, self.patch.top)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """Layers from far to near (by their centres), and the size of the views in px."""
+
+    layers: tuple[Layer, ...]
+    height: int
+    width: int

@@ -1,0 +1,47 @@
+"""Collages as a set on disk, in shards like a rendered one, for `stereoweave bench pairs` to read."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from stereoweave.data.packing import packed
+from stereoweave.data.shards import write_shard
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.files import SMALLEST_SIDE_PX, make_folder
+from stereoweave.io.output_lock import lock_output
+from stereoweave.learn.data.collage import sample
+
+SET_NAME = "collage"
+_PAIRS_A_SHARD = 50
+
+
+def write_collages(out: Path, pairs: int, seed: int, size_px: tuple[int, int]) -> None:
+    """Write the first `pairs` collages of a seed, epoch 0, as shards.
+
+    Args:
+        out: The folder, new or empty.
+        pairs: How many.
+        seed: `sources.VALIDATION_SEED` gives the pairs that a training validates on.
+        size_px: Height and width.
+
+    Raises:
+        StereoweaveError: A side is too small, or the folder has files in it or cannot be written.
+    """
+    if min(size_px) < SMALLEST_SIDE_PX:
+        raise StereoweaveError(
+            f"--size: expected at least {SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX} pixels, "
+            f"found {size_px[1]}x{size_px[0]}"
+        )
+    make_folder(out)
+    with lock_output(out):
+        if any(out.glob("[!.]*")):
+            raise StereoweaveError(
+                f"{out}: expected a new or empty folder, found files in it; name another one"
+            )
+        for first in range(0, pairs, _PAIRS_A_SHARD):
+            numbers = range(first, min(first + _PAIRS_A_SHARD, pairs))
+            write_shard(out, SET_NAME, first, list(_packed_collages(seed, numbers, size_px)))
+
+
+def _packed_collages(seed: int, numbers: range, size_px: tuple[int, int]) -> Iterator[dict[str, bytes]]:
+    for number in numbers:
+        yield packed(sample(seed, 0, number, *size_px), views={})

@@ -1,0 +1,95 @@
+"""Collage pairs made once and kept on disk: a step then pays for cutting and recolouring alone."""
+
+import hashlib
+import multiprocessing
+import os
+from collections.abc import Iterable
+from dataclasses import fields
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from stereoweave.io.output_lock import lock_output
+from stereoweave.learn.data.collage import sample as make_sample
+from stereoweave.stereo import Sample
+
+# Disparity is kept as 16-bit fixed point, KITTI's 1/256 px: half the bytes of float32, and exact enough.
+_DISPARITY_SCALE = 256
+# A collage has no camera.
+_MAPS = [field.name for field in fields(Sample) if field.name != "camera"]
+_SOURCES = (
+    *(f"learn/data/collage{part}.py" for part in ("", "_kinds", "_layers", "_scene")),
+    "learn/data/paint_kernels.py",
+    "learn/data/silhouettes.py",
+    "learn/data/textures.py",
+)
+
+
+class KeptPairs:
+    """The first `count` collage pairs of (seed, epoch 0), kept in a folder of their own in `folder`."""
+
+    def __init__(self, folder: Path, seed: int, count: int, size: tuple[int, int]) -> None:
+        self.folder = folder / f"seed{seed}-{size[0]}x{size[1]}-{generator_version()}"
+        self.seed, self.count, self.size = seed, count, size
+
+    def missing(self) -> list[int]:
+        """Indices of the pairs that are still to be made."""
+        return [i for i in range(self.count) if not self._file(i).exists()]
+
+    def make(self, console: Console) -> Iterable[int]:
+        """Make the missing pairs in parallel, yielding the index of each as it is done.
+
+        Trainings in one folder share their pairs: a second one says that it waits for the first.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        note = f"{self.folder}: another training makes these pairs; waiting until it is done"
+        tell = partial(console.print, note, markup=False, highlight=False, soft_wrap=True)
+        # Started afresh, because a forked child inherits PyTorch's threads in an unknown state.
+        start_afresh = multiprocessing.get_context("spawn")
+        with lock_output(self.folder, before_waiting=tell), start_afresh.Pool(os.cpu_count()) as workers:
+            yield from workers.imap_unordered(partial(_make, self), self.missing(), chunksize=8)
+
+    def keep(self, index: int, sample: Sample) -> None:
+        """Write a pair whole or not at all."""
+        file = self._file(index)
+        temporary = file.with_suffix(".part")
+        arrays: dict[str, Any] = {name: _packed(getattr(sample, name)) for name in _MAPS}
+        with temporary.open("wb") as stream:
+            np.savez(stream, **arrays)
+        temporary.replace(file)
+
+    def __getitem__(self, index: int) -> Sample:
+        with np.load(self._file(index)) as arrays:
+            maps: dict[str, Any] = {name: _unpacked(arrays[name]) for name in _MAPS}
+        return Sample(**maps)
+
+    def name(self, index: int) -> str:
+        return str(self._file(index))
+
+    def _file(self, index: int) -> Path:
+        return self.folder / f"{index:06d}.npz"
+
+
+def generator_version() -> str:
+    """8 hexadecimal digits that change with the code that makes pairs."""
+    package = Path(__file__).parents[2]
+    return hashlib.sha256(b"".join((package / source).read_bytes() for source in _SOURCES)).hexdigest()[:8]
+
+
+def _make(pairs: KeptPairs, index: int) -> int:
+    pairs.keep(index, make_sample(pairs.seed, 0, index, *pairs.size))
+    return index
+
+
+def _packed(values: np.ndarray) -> np.ndarray:
+    if values.dtype == np.float32:
+        assert np.isfinite(values).all() and values.max() < 65536 / _DISPARITY_SCALE
+        return np.round(values * _DISPARITY_SCALE).astype(np.uint16)
+    return values
+
+
+def _unpacked(values: np.ndarray) -> np.ndarray:
+    return values.astype(np.float32) / _DISPARITY_SCALE if values.dtype == np.uint16 else values

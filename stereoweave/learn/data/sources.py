@@ -1,0 +1,229 @@
+"""Where a recipe's pairs come from: collages, rendered sets mixed in, or a dataset's frames on disk."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Int
+from rich.console import Console
+
+from stereoweave.data.readers import DATASETS, Frame, open_dataset, split_frames
+from stereoweave.data.shards import Shards, list_shards
+from stereoweave.errors import FormatError
+from stereoweave.learn.data import collage
+from stereoweave.learn.data.pair_cache import KeptPairs
+from stereoweave.learn.recipe import COLLAGE, Recipe
+from stereoweave.stereo import Sample
+from stereoweave.system.progress import progress
+
+# Validation pairs come from this seed; a recipe's own is small.
+VALIDATION_SEED = 1_000_003
+
+
+@runtime_checkable
+class Source(Protocol):
+    """Samples by their index."""
+
+    @property
+    def count(self) -> int: ...
+
+    def __getitem__(self, index: int) -> Sample: ...
+
+    def name(self, index: int) -> str:
+        """What an error calls the sample."""
+        ...
+
+
+@runtime_checkable
+class Ordered(Protocol):
+    """A source that is read faster in some orders than in others."""
+
+    def order(self, rng: np.random.Generator) -> Int[np.ndarray, " n"] | range:
+        """All of its indices, in an order to read them in."""
+        ...
+
+
+@dataclass(frozen=True)
+class Mix:
+    """Sets one behind another as one source, and the weights by which training draws from them."""
+
+    sets: tuple[Source, ...]
+    weights: tuple[float, ...]
+
+    @property
+    def count(self) -> int:
+        return sum(one.count for one in self.sets)
+
+    def __getitem__(self, index: int) -> Sample:
+        source, own = self._own(index)
+        return source[own]
+
+    def name(self, index: int) -> str:
+        source, own = self._own(index)
+        return source.name(own)
+
+    def first(self, which: int) -> int:
+        """The index of the first pair of a set."""
+        return sum(one.count for one in self.sets[:which])
+
+    def drawn(self, places: int, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
+        """The set of each place, by weight; fewer places from the same numbers are the first of more."""
+        bounds = np.cumsum(self.weights) / np.sum(self.weights)
+        return np.searchsorted(bounds[:-1], rng.random(places), side="right")
+
+    def _own(self, index: int) -> tuple[Source, int]:
+        for one in self.sets:
+            if index < one.count:
+                return one, index
+            index -= one.count
+        raise IndexError(index)
+
+
+@dataclass(frozen=True)
+class FreshCollages:
+    """Collages of the training's kinds, painted when they are drawn; none is kept."""
+
+    seed: int
+    size: tuple[int, int]
+    count: int = 10**9
+
+    def __getitem__(self, index: int) -> Sample:
+        return collage.training_sample(self.seed, 0, index, *self.size)
+
+    def name(self, index: int) -> str:
+        return f"collage {index} of seed {self.seed}"
+
+    def order(self, rng: np.random.Generator) -> range:
+        """In turn: each is as random as the next."""
+        return range(self.count)
+
+
+@dataclass(frozen=True)
+class Photographed:
+    """A rendered set, whose views are ideal, as two real cameras would give it; each pair always alike."""
+
+    shards: Shards
+
+    @property
+    def count(self) -> int:
+        return self.shards.count
+
+    def __getitem__(self, index: int) -> Sample:
+        sample = self.shards[index]
+        # As collages are: without noise, blur and other tones in one of the views, matching is too easy.
+        left, right = collage.photograph(
+            np.random.default_rng(index), sample.left.astype(np.float32), sample.right.astype(np.float32)
+        )
+        return replace(sample, left=left, right=right)
+
+    def name(self, index: int) -> str:
+        return self.shards.name(index)
+
+    def order(self, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
+        return self.shards.order(rng)
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Frames of a dataset on disk, read when they are asked for."""
+
+    frames: list[Frame]
+
+    @property
+    def count(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, index: int) -> Sample:
+        return self.frames[index].read()
+
+    def name(self, index: int) -> str:
+        return self.frames[index].name
+
+
+def sources(recipe: Recipe, folder: Path, whole: bool = False) -> tuple[Source, Source]:
+    """What a recipe trains on, and what it is scored on; collages are kept in folders below `folder`.
+
+    Of the held-out frames of a dataset `validation_pairs` are taken, evenly spread, or all if `whole`.
+    """
+    if recipe.dataset == COLLAGE:
+        collages = _collages(recipe, folder)
+        return (
+            _mixed(recipe, collages) if recipe.mix else collages,
+            KeptPairs(folder, VALIDATION_SEED, recipe.validation_pairs, recipe.pair_size),
+        )
+    if recipe.dataset not in DATASETS:
+        raise FormatError(
+            f"{recipe.name}: dataset = {recipe.dataset!r}, expected {COLLAGE} or {', '.join(DATASETS)}"
+        )
+    frames = open_dataset(recipe.dataset, recipe.root)
+    training, held_out = split_frames(frames, recipe.dataset, recipe.split)
+    count = len(held_out) if whole else min(recipe.validation_pairs, len(held_out))
+    spread = np.linspace(0, len(held_out) - 1, count).round().astype(int)
+    return Frames(training), Frames([held_out[i] for i in spread])
+
+
+def _collages(recipe: Recipe, folder: Path) -> Source:
+    if recipe.fresh:
+        return FreshCollages(recipe.seed, recipe.pair_size)
+    return KeptPairs(folder, recipe.seed, recipe.pairs, recipe.pair_size)
+
+
+def _mixed(recipe: Recipe, collages: Source) -> Mix:
+    sets: list[Source] = []
+    weights: list[float] = []
+    for name, weight in recipe.mix:
+        found = [collages] if name == COLLAGE else _rendered(recipe, Path(name))
+        count = sum(one.count for one in found)
+        sets += found
+        weights += [weight * one.count / count for one in found]
+    return Mix(tuple(sets), tuple(weights))
+
+
+def held_out_sets(recipe: Recipe) -> dict[str, Source]:
+    """The further sets that a recipe is scored on, by name; FormatError where one is not there."""
+    sets: dict[str, Source] = {}
+    for name, folder in recipe.held_out:
+        found = tuple(Photographed(Shards(path)) for path in _folders(recipe, "held_out", Path(folder)))
+        sets[name] = Mix(found, (1.0,) * len(found))
+    return sets
+
+
+def _folders(recipe: Recipe, key: str, folder: Path) -> list[Path]:
+    """The folder of a rendered set, or those in it; FormatError for none."""
+    folders = [path for path in (folder, *sorted(folder.glob("*/"))) if list_shards(path)]
+    if not folders:
+        raise FormatError(
+            f"{recipe.name}: {key}: {folder}: expected pairs of `stereoweave synth make`, or folders of "
+            "such, found none; make them first"
+        )
+    return folders
+
+
+def _rendered(recipe: Recipe, folder: Path) -> list[Source]:
+    """The set in a folder, or those in the folders in it; FormatError for none, or one too small to cut."""
+    folders = _folders(recipe, "mix", folder)
+    sets: list[Source] = [Photographed(Shards(path)) for path in folders]
+    for path, one in zip(folders, sets, strict=True):
+        rows, columns = one[0].disparity_px.shape
+        if recipe.crop_size[0] > rows or recipe.crop_size[1] > columns:
+            raise FormatError(
+                f"{recipe.name}: crop_size = {list(recipe.crop_size)}, expected at most {[rows, columns]}, "
+                f"the size of the pairs in {path}; cut less"
+            )
+    return sets
+
+
+def kept(pairs: Source, console: Console) -> Source:
+    """The pairs; collages are made before if they were not there."""
+    if isinstance(pairs, Mix):
+        for one in pairs.sets:
+            kept(one, console)
+    if isinstance(pairs, KeptPairs) and (missing := len(pairs.missing())):
+        with progress(console) as bar:
+            task = bar.add_task("making pairs", total=missing, loss="", rate="")
+            for _ in pairs.make(console):
+                bar.advance(task)
+            # Another training may have made some of them.
+            bar.update(task, completed=missing)
+    return pairs

@@ -1,0 +1,71 @@
+"""The processes that train one network together: torchrun's, or this one alone."""
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.system.threads import usable_cores
+
+# How long a process waits with an error for another one to tell it, by which torchrun ends them all.
+_PATIENCE_S = 20.0
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """Which of the processes this is, how many there are, and how many of them on this machine."""
+
+    rank: int = 0
+    count: int = 1
+    count_here: int = 1
+
+    def share(self, parts: int) -> range:
+        """Those of so many micro-batches that this process makes: neighbours, and nobody else's."""
+        own = parts // self.count
+        return range(self.rank * own, (self.rank + 1) * own)
+
+
+def ranks() -> Ranks:
+    """As torchrun started this process; one process alone where it did not."""
+    if "TORCHELASTIC_RUN_ID" not in os.environ:
+        return Ranks()
+    return Ranks(*(int(os.environ[name]) for name in ("RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE")))
+
+
+@contextmanager
+def told_once() -> Iterator[None]:
+    """An error leaves the block in one process alone: in the first one, where all of them have it.
+
+    The others wait until torchrun ends them for that, and so does the first one where it only finds that
+    another one is gone. An error that is theirs alone leaves it a little later.
+    """
+    try:
+        yield
+    except Exception as error:
+        own = ranks()
+        to_tell = isinstance(error, StereoweaveError | OSError)
+        if own.rank > 0 or (own.count > 1 and not to_tell):
+            time.sleep(_PATIENCE_S)
+        raise
+
+
+def threads_each() -> int | None:
+    """Threads for each of torchrun's processes here; None where PyTorch or the user has decided.
+
+    Where the user has not, torchrun gives each process one, however many cores there are.
+    """
+    here = ranks().count_here
+    if here == 1 or "OMP_NUM_THREADS" in _environment_of_torchrun():
+        return None
+    return max(1, usable_cores() // here)
+
+
+def _environment_of_torchrun() -> str:
+    """What torchrun was started with, before it set variables itself; "" where that cannot be read."""
+    try:
+        return Path(f"/proc/{os.getppid()}/environ").read_text(errors="replace")
+    except OSError:
+        return ""

@@ -1,0 +1,136 @@
+"""The matcher files of `stereoweave export`: of a trained network, or of another such file."""
+
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.files import place_for, replacing
+from stereoweave.learn import checkpoint
+from stereoweave.learn.export.confidence import draw_reliability
+from stereoweave.learn.export.fixed_size import check_size, fix_size
+from stereoweave.learn.export.float16 import halve
+from stereoweave.learn.export.from_checkpoint import export
+from stereoweave.learn.export.graph import write_card
+from stereoweave.learn.export.int8 import quantise
+from stereoweave.matching.matcher import Matcher, model_file, shipped_models
+from stereoweave.stereo import StereoPair
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatcherFiles:
+    """Which files to write.
+
+    Attributes:
+        out: In float32.
+        half: In 16 bits.
+        eight_bits: With convolutions in 8 bits.
+        size: Width and height of the only pairs that they are to take; any where None.
+    """
+
+    out: Path | None = None
+    half: Path | None = None
+    eight_bits: Path | None = None
+    size: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.wanted:
+            raise StereoweaveError("export: expected a file to write, found none; give --out or --half")
+        for file in self.wanted:
+            if file.suffix != ".onnx":
+                raise StereoweaveError(f"{file}: expected a name that ends in .onnx, as --model takes it")
+        if len(set(self.wanted)) < len(self.wanted):
+            raise StereoweaveError(f"{self.wanted[0]}: expected a file of its own for each variant")
+
+    @property
+    def wanted(self) -> list[Path]:
+        return [file for file in (self.out, self.half, self.eight_bits) if file]
+
+
+def write_matcher_files(
+    source: str, files: MatcherFiles, pairs: Iterable[StereoPair] = (), reliability: Path | None = None
+) -> Iterator[str]:
+    """Write them; a line to tell of each.
+
+    Args:
+        source: The folder of a run, a checkpoint, a shipped name, or a matcher file in float32 for any size.
+        files: Which.
+        pairs: Of a trained network: pairs on which ONNX Runtime and PyTorch must agree.
+        reliability: Of a trained network: a picture to write, how often its confidence comes true.
+    """
+    for file in files.wanted:
+        place_for(file)
+    with tempfile.TemporaryDirectory() as folder:
+        if is_matcher(source):
+            made = model_file(source)
+            _check_apart(made, files)
+        else:
+            made = Path(folder, "any_size.onnx")
+            yield _exported(Path(source), made, pairs, reliability)
+        if files.size:
+            check_size(*files.size, Matcher(made).multiple_of)
+        yield from _written(made, files)
+
+
+def write_weights(run: Path, out: Path) -> str:
+    """Write the averaged weights of a run in half precision, for recipes to start from; returns a line on it.
+
+    Args:
+        run: The folder of a run, or a checkpoint.
+        out: The .pt file.
+
+    Raises:
+        StereoweaveError: `run` has no checkpoint, or `out` another ending.
+    """
+    if out.suffix != ".pt":
+        raise StereoweaveError(f"{out}: expected a name that ends in .pt, as start_from takes it")
+    kept = checkpoint.load(run / "last.pt" if run.is_dir() else run)
+    place_for(out)
+    checkpoint.save(checkpoint.averaged_alone(kept), out)
+    return f"{out}: averaged weights after {kept.step} steps, in 16 bits"
+
+
+def is_matcher(source: str) -> bool:
+    """Whether the source of an export is a matcher file already, and no trained network."""
+    return source.endswith(".onnx") or source in shipped_models()
+
+
+def _exported(run: Path, made: Path, pairs: Iterable[StereoPair], reliability: Path | None) -> str:
+    card = export(run, made, pairs)
+    if reliability and "confidence" in card:
+        draw_reliability(card["confidence"], reliability)
+    return (
+        f"{run}: ONNX Runtime and PyTorch differ by at most {card['onnx_differs_px']:.4f} px "
+        f"over {card['compared_pairs']} pairs"
+    )
+
+
+def _written(made: Path, files: MatcherFiles) -> Iterator[str]:
+    if files.out:
+        _copy(made, files.out)
+        yield f"{files.out}: float32"
+    if files.half:
+        change_px = halve(made, files.half)["differs_px_from_32_bits"]
+        yield f"{files.half}: 16 bits change disparity by {change_px:.4f} px in the mean"
+    if files.eight_bits:
+        card = quantise(made, files.eight_bits)
+        lost_px = card["epe_px"] - card["epe_px_of_32_bits"]
+        yield f"{files.eight_bits}: 8 bits change the mean error by {lost_px:+.3f} px"
+    if files.size:
+        for file in files.wanted:
+            fix_size(file, file, *files.size)
+            yield f"{file}: for pairs of {files.size[0]}x{files.size[1]} alone"
+
+
+def _check_apart(source: Path, files: MatcherFiles) -> None:
+    for file in files.wanted:
+        if file.resolve() == source.resolve():
+            raise StereoweaveError(f"{file}: expected another file than the one to make it from")
+
+
+def _copy(source: Path, out: Path) -> None:
+    with replacing(out) as temporary:
+        shutil.copyfile(source, temporary)
+    write_card(source, out, {})

@@ -1,0 +1,71 @@
+"""A matcher file for pairs of one size alone, one at a time: what TensorRT and small devices want."""
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import onnx
+from onnxscript import optimizer
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.files import SMALLEST_SIDE_PX, make_folder, replacing
+from stereoweave.learn.export.graph import write_card
+from stereoweave.matching.matcher import Matcher
+
+# What a runtime of fixed shapes cannot plan: its results' shapes depend on values, or its path does.
+SHAPES_BY_VALUE = ("If", "Loop", "NonZero", "Range", "Scan", "Shape", "Unique")
+
+
+def fix_size(source: Path, out: Path, width: int, height: int) -> dict[str, Any]:
+    """Write a matcher file that takes one pair of that size alone, and its card as .json; returns the card.
+
+    What it computes is the same; every shape in it is a number, and nothing computes shapes any more.
+
+    Args:
+        source: A matcher file for pairs of any size, in float32, 16 or 8 bits.
+        out: The .onnx file to write; it may be the same.
+        width: In pixels.
+        height: Likewise.
+
+    Raises:
+        StereoweaveError: The network cannot take that size, or the source is for one size already.
+    """
+    matcher = Matcher(source)
+    if matcher.fixed_size:
+        found = f"{matcher.fixed_size[1]}x{matcher.fixed_size[0]}"
+        raise StereoweaveError(
+            f"{source}: expected a matcher file for pairs of any size, found one for {found} alone; "
+            "take the file that it was made from"
+        )
+    check_size(width, height, matcher.multiple_of)
+    make_folder(out.parent)
+    graph = fixed(onnx.load(source), width, height)
+    with replacing(out) as temporary:
+        onnx.save(graph, temporary)
+        Matcher(temporary)
+    return write_card(source, out, {"size": [width, height]})
+
+
+def check_size(width: int, height: int, multiple_of: int) -> None:
+    """StereoweaveError for a size that the network cannot take."""
+    if min(width, height) < SMALLEST_SIDE_PX or width % multiple_of or height % multiple_of:
+        suggested = "x".join(str(max(-(-x // multiple_of), 2) * multiple_of) for x in (width, height))
+        raise StereoweaveError(
+            f"--size: expected multiples of {multiple_of} of at least {SMALLEST_SIDE_PX}, found "
+            f"{width}x{height}; the next is {suggested}, and smaller pictures are padded to it"
+        )
+
+
+def fixed(graph: onnx.ModelProto, width: int, height: int) -> onnx.ModelProto:
+    """The graph for one pair of that size, with its shapes worked out."""
+    graph = copy.deepcopy(graph)
+    for value in (*graph.graph.input, *graph.graph.output):
+        sides = value.type.tensor_type.shape.dim
+        for side, length in zip(sides, (1, sides[1].dim_value, height, width), strict=True):
+            side.dim_value = length
+    del graph.graph.value_info[:]  # of any size
+    made = optimizer.optimize(graph)
+    onnx.checker.check_model(made, full_check=True)
+    left = sorted({node.op_type for node in made.graph.node} & set(SHAPES_BY_VALUE))
+    assert not left, f"not worked out: {left}"
+    return made

@@ -1,0 +1,231 @@
+"""A checkpoint becomes a matcher file: calibrated, exported, and proved to answer as PyTorch does."""
+
+import json
+import logging
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.files import make_folder, replacing
+from stereoweave.learn import checkpoint
+from stereoweave.learn.checkpoint import Checkpoint
+from stereoweave.learn.export import confidence as calibrate
+from stereoweave.learn.models import CodeNetwork, network_of
+from stereoweave.learn.models.psmnet import PSMNet
+from stereoweave.learn.models.weave import WeaveNet
+from stereoweave.learn.recipe import Recipe
+from stereoweave.learn.training.objective import CodeObjective
+from stereoweave.matching.matcher import Matcher
+from stereoweave.stereo import StereoPair
+
+# WeaveNet gives all of them; the paper's network and its rivals the first.
+OUTPUTS = ["disparity_px", "right_disparity_px", "confidence_logit"]
+# The two runtimes may differ by rounding; more than this is another network.
+LARGEST_DIFFERENCE_PX = 0.01
+LARGEST_DIFFERENCE_OF_CONFIDENCE = 0.01
+
+
+def export(trained: Path, out: Path, pairs: Iterable[StereoPair] = ()) -> dict[str, Any]:
+    """Write the averaged network of a checkpoint as a matcher file, and its card as .json; returns the card.
+
+    Args:
+        trained: A checkpoint, or the folder of a run, whose last one is taken.
+        out: The .onnx file.
+        pairs: Pairs on which ONNX Runtime and PyTorch must agree, beside one of the project's own.
+
+    Raises:
+        StereoweaveError: If they differ by 0.01 px, or by 0.01 of confidence, or more; nothing is written
+            then.
+    """
+    kept = checkpoint.load(trained / "last.pt" if trained.is_dir() else trained)
+    network = matcher_network(kept)
+    reliability = {"confidence": calibrate.calibrate(network)} if isinstance(network, WeaveNet) else {}
+    make_folder(out.parent)
+    with replacing(out) as temporary:
+        onnx.save(graph_of(network, kept), temporary)
+        matcher = Matcher(temporary)
+        found = [differences(network, matcher, pair) for pair in [calibrate.unseen_pair(), *pairs]]
+        px, of_confidence = np.max(found, axis=0).tolist()
+        if not (px < LARGEST_DIFFERENCE_PX and of_confidence < LARGEST_DIFFERENCE_OF_CONFIDENCE):
+            raise StereoweaveError(
+                f"{trained}: ONNX Runtime and PyTorch differ by {px:.3f} px and {of_confidence:.3f} of "
+                f"confidence, expected under {LARGEST_DIFFERENCE_PX} and {LARGEST_DIFFERENCE_OF_CONFIDENCE}; "
+                "nothing was written"
+            )
+    agreement = {
+        "onnx_differs_px": px,
+        "onnx_differs_confidence": of_confidence,
+        "compared_pairs": len(found),
+    }
+    card = _card(kept, network) | agreement | reliability
+    with replacing(out.with_suffix(".json")) as card_file:
+        card_file.write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
+    return card
+
+
+class DisparityNetwork(nn.Module):
+    """A network of the paper's kind as a matcher: disparity of the left view in pixels, [B, 1, H, W]."""
+
+    def __init__(self, network: Any, recipe: Recipe) -> None:
+        super().__init__()
+        self.network, self.objective = network, CodeObjective(recipe, network)
+        self.multiple_of = network.multiple_of
+        self.max_disparity_px = int(recipe.max_disparity_px)
+
+    def forward(self, left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor]:
+        return (self.objective.disparity_px(self.network(left, right), {}),)
+
+
+def matcher_network(kept: Checkpoint) -> Any:
+    """The averaged network of a checkpoint, ready to match.
+
+    Raises:
+        StereoweaveError: It estimates depth, or is a PSMNet.
+    """
+    network = network_of(kept.recipe)
+    network.load_state_dict(kept.averaged)
+    network.eval()
+    if not isinstance(network, CodeNetwork):
+        return network
+    if kept.recipe.target != "disparity":
+        raise StereoweaveError(
+            f"{kept.recipe.name}: a matcher file gives disparity, expected target = 'disparity', found "
+            f"{kept.recipe.target!r}; the network needs each pair's camera"
+        )
+    if isinstance(network, PSMNet):
+        raise StereoweaveError(
+            f"{kept.recipe.name}: a matcher file serves pairs of any size, expected another network, "
+            "found psmnet, whose pooling windows depend on the size; score it by stereoweave bench networks"
+        )
+    return DisparityNetwork(network, kept.recipe)
+
+
+def graph_of(network: Any, kept: Checkpoint) -> onnx.ModelProto:
+    """The network as an ONNX graph with a matcher's metadata, for any height and width that it can divide.
+
+    And for any number of pairs: what it costs to leave that free cannot be measured (under 1 %).
+    """
+    height, width = (network.multiple_of * torch.export.Dim(name, min=2, max=1024) for name in ("h", "w"))
+    sides = {0: torch.export.Dim("batch"), 2: height, 3: width}
+    graph = _exported(network, 4 * network.multiple_of, 8 * network.multiple_of, (sides, sides))
+    first, *_ = graph.graph.input[0].type.tensor_type.shape.dim
+    # The exporter does not tell where a network's code fixes what was to be free.
+    assert first.dim_param, "the network's code fixes the number of pairs"
+    properties = {
+        "name": kept.recipe.name,
+        "multiple_of": network.multiple_of,
+        "max_disparity_px": network.max_disparity_px,
+        "recipe": json.dumps(vars(kept.recipe)),
+        "commit": kept.commit,
+    }
+    onnx.helper.set_model_props(
+        graph, {f"stereoweave.{key}": str(value) for key, value in properties.items()}
+    )
+    return graph
+
+
+def fixed_graph_of(network: Any, height: int, width: int) -> onnx.ModelProto:
+    """The network as an ONNX graph for pairs of that size alone."""
+    return _exported(network, height, width, None)
+
+
+def noted_graph(network: Any, height: int, width: int, dynamic_shapes: Any) -> onnx.ModelProto:
+    """The network as an ONNX graph, with the exporter's notes of where each node is from."""
+    # Two tensors: given the same one twice, the exporter would take both inputs to be one. Two pairs where
+    # their number is free: an axis of 1 it would take to be always so.
+    left, right = torch.rand(2, 1 if dynamic_shapes is None else 2, 3, height, width)
+    with _quietly(), torch.no_grad():
+        program = torch.onnx.export(
+            network,
+            (left, right),
+            dynamo=True,
+            opset_version=20,
+            input_names=["left", "right"],
+            output_names=OUTPUTS[:1] if isinstance(network, DisparityNetwork) else OUTPUTS,
+            dynamic_shapes=dynamic_shapes,
+            verbose=False,
+        )
+    assert program is not None
+    program.optimize()
+    return program.model_proto
+
+
+def _exported(network: Any, height: int, width: int, dynamic_shapes: Any) -> onnx.ModelProto:
+    graph = noted_graph(network, height, width, dynamic_shapes)
+    # The exporter notes where each part comes from, with this machine's paths.
+    for part in (graph.graph, *graph.graph.node, *graph.graph.value_info):
+        del part.metadata_props[:]
+    for part in (*graph.graph.input, *graph.graph.output):
+        del part.metadata_props[:]
+    return graph
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """Without what the exporter tells unasked: of torchvision's operators, of names of repeated axes."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            yield
+    finally:
+        logger.setLevel(level)
+
+
+def differences(network: Any, matcher: Matcher, pair: StereoPair) -> tuple[float, float]:
+    """The largest differences of PyTorch and ONNX Runtime: of both disparities in px, and of confidence."""
+    multiple = network.multiple_of
+    height, width = (side // multiple * multiple for side in pair.left.shape[:2])
+    left, right = pair.left[:height, :width], pair.right[:height, :width]
+    tensors = [torch.from_numpy(x).permute(2, 0, 1)[None].float() / 255 for x in (left, right)]
+    with torch.no_grad():
+        expected = [x[0, 0] for x in network(*tensors)]
+    # In one piece, because the strips of a large pair answer a little differently.
+    found = [torch.from_numpy(x) for x in matcher._run(left, right) if x is not None]
+    largest_px = max(float((found[i] - x).abs().max()) for i, x in enumerate(expected[:2]))
+    if len(expected) < len(OUTPUTS):
+        return largest_px, 0.0
+    return largest_px, float((found[2].sigmoid() - expected[2].sigmoid()).abs().max())
+
+
+def multiply_adds(network: nn.Module, height: int = 480, width: int = 640) -> int:
+    """Multiply-adds of the whole graph, both views and every comparison of features included."""
+    image = torch.rand(1, 3, height, width)
+    with FlopCounterMode(display=False) as counter, torch.no_grad():
+        network(image, image)
+    counted = counter.get_total_flops() // 2
+    if not isinstance(network, WeaveNet):
+        return counted
+    # The counter sees convolutions and matrix products; the refinement compares features of both views by
+    # plain products, at one column more than it gives matches for where it interpolates between products.
+    nearby = 2 * network.refinement.radius + 1 + (not network.size.warps)
+    counted += 2 * (height // 2) * (width // 2) * network.size.compared * nearby
+    if network.sharpening is None:
+        return counted
+    return counted + 2 * height * width * network.size.sharpening * (2 * network.sharpening.radius + 1)
+
+
+def _card(kept: Checkpoint, network: nn.Module) -> dict[str, Any]:
+    return {
+        "name": kept.recipe.name,
+        "licence": "Apache-2.0",
+        "recipe": vars(kept.recipe),
+        "commit": kept.commit,
+        "steps": kept.step,
+        "origin": kept.origin,
+        "hours": round(kept.hours, 2),
+        "data": "collages and rendered pairs of the project's own making (docs/training-data.md)",
+        "parameters": sum(parameter.numel() for parameter in network.parameters()),
+        "multiply_adds_640x480": multiply_adds(network),
+        "validation": kept.scores,
+    }

@@ -1,0 +1,71 @@
+"""Matcher files as graphs, from which others are made: in half the bits, in 8, for one size."""
+
+import json
+from collections import defaultdict
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import onnx
+from onnx import TensorProto
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.files import replacing
+from stereoweave.matching.matcher import Matcher
+
+
+def read_graph(source: Path) -> onnx.ModelProto:
+    """The graph of a matcher file in float32 for pairs of any size.
+
+    Raises:
+        StereoweaveError: It is none, or one of those made from it.
+    """
+    fixed_size = Matcher(source).fixed_size
+    graph = onnx.load(source)
+    found = None
+    if fixed_size:
+        found = f"one for {fixed_size[1]}x{fixed_size[0]} alone"
+    elif any(node.op_type == "QuantizeLinear" for node in graph.graph.node):
+        found = "one in 8 bits"
+    elif any(value.data_type == TensorProto.FLOAT16 for value in graph.graph.initializer):
+        found = "one in 16 bits"
+    if found:
+        raise StereoweaveError(
+            f"{source}: expected a matcher file in float32 for pairs of any size, found {found}; "
+            "take the file that it was made from"
+        )
+    return graph
+
+
+def write_card(source: Path, out: Path, facts: dict[str, Any]) -> dict[str, Any]:
+    """Write the card of a file made from another one: that one's, and what is new; returns it."""
+    file = source.with_suffix(".json")
+    card = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+    card |= facts
+    with replacing(out.with_suffix(".json")) as temporary:
+        temporary.write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
+    return card
+
+
+def with_what_stands_between(
+    graph: onnx.ModelProto, names: Iterable[str], operations: tuple[str, ...]
+) -> set[str]:
+    """The named nodes, those of the given operations that only such nodes read, and convolutions' ReLUs."""
+    readers = defaultdict(list)
+    for node in graph.graph.node:
+        for value in node.input:
+            readers[value].append(node)
+    chosen = set(names)
+    # Backwards, because a node is between others if all that read it are.
+    for node in reversed(graph.graph.node):
+        following = {reader.name for value in node.output for reader in readers[value]}
+        if node.op_type in operations and following and following <= chosen:
+            chosen.add(node.name)
+    relus = {
+        reader.name
+        for node in graph.graph.node
+        if node.op_type == "Conv" and node.name in chosen
+        for reader in readers[node.output[0]]
+        if reader.op_type == "Relu"
+    }
+    return chosen | relus

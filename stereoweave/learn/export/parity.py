@@ -1,0 +1,249 @@
+"""How far every runtime of a shipped network is from PyTorch in float32, and how fast, a row a variant."""
+
+import contextlib
+import math
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import onnx
+import onnxruntime  # type: ignore[import-untyped]
+import torch
+from jaxtyping import Float32
+from onnx import numpy_helper
+
+from stereoweave.errors import MatcherError
+from stereoweave.learn import checkpoint
+from stereoweave.learn.checkpoint import code_commit
+from stereoweave.learn.data.collage import sample
+from stereoweave.learn.export.fixed_size import fix_size
+from stereoweave.learn.export.float16 import halve
+from stereoweave.learn.export.from_checkpoint import matcher_network
+from stereoweave.learn.export.int8 import quantise
+from stereoweave.learn.models.weave import WeaveNet
+from stereoweave.matching.matcher import model_file
+from stereoweave.matching.providers import CPU, PROVIDERS, open_session
+from stereoweave.system.threads import thread_count
+
+# Apart from the seeds of recipes, of validation, of the confidence and of the variants' own proofs.
+_SEED, _PAIRS = 7_000_003, 4
+# Height and width of the pairs. The times are of the last one, which the file of one size takes.
+SIZES = ((240, 320), (320, 512), (480, 640))
+_TURNS = 7
+
+
+@dataclass(frozen=True, kw_only=True)
+class ParityRow:
+    """How one way to run a network differs from PyTorch in float32, over all pixels of painted pairs.
+
+    Attributes:
+        network: The shipped network.
+        variant: Of its matcher file.
+        provider: What ran it, a name in PROVIDERS.
+        onnxruntime: The version.
+        file_mb: Size of the file, in millions of bytes.
+        pairs: How many were compared.
+        left_mean_px, left_max_px: Absolute differences of the left view's disparity.
+        right_mean_px, right_max_px: Of the right one's.
+        confidence_mean, confidence_max: Of the confidence, a probability.
+        time_ms: Of a pair of 640x480, the shortest of several turns.
+        time_relative: As a multiple of float32 on the same provider, in the same turns.
+        commit: Of the code.
+    """
+
+    network: str
+    variant: str
+    provider: str
+    onnxruntime: str
+    file_mb: float
+    pairs: int
+    left_mean_px: float
+    left_max_px: float
+    right_mean_px: float
+    right_max_px: float
+    confidence_mean: float
+    confidence_max: float
+    time_ms: float
+    time_relative: float
+    commit: str
+
+
+class Variant(NamedTuple):
+    """A matcher file, and how many pairs it is given at once; `sizes` as in SIZES."""
+
+    file: Path
+    batch: int
+    sizes: Sequence[tuple[int, int]]
+
+
+class Maps(NamedTuple):
+    """What a network gives: disparity of both views, and the left one's confidence in 0..1."""
+
+    left_px: Float32[np.ndarray, "b 1 h w"]
+    right_px: Float32[np.ndarray, "b 1 h w"]
+    confidence: Float32[np.ndarray, "b 1 h w"]
+
+
+def parity(checkpoints: Sequence[Path]) -> list[ParityRow]:
+    """A row for every variant of every network, on every provider that the installed ONNX Runtime has.
+
+    Args:
+        checkpoints: Of the shipped networks.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        return [row for path in checkpoints for row in _rows_of(path, Path(folder))]
+
+
+def markdown(rows: Sequence[ParityRow]) -> str:
+    """The rows as a table."""
+    what = ["network", "variant", "provider"]
+    numbers = ["file, MB", "left, px", "right, px", "confidence", "time, of float32's"]
+    lines = [what + numbers, ["---"] * 3 + ["---:"] * 5]
+    lines += [
+        [
+            row.network,
+            row.variant,
+            f"{row.provider}, {row.onnxruntime}",
+            f"{row.file_mb:.2f}",
+            f"{row.left_mean_px:.5f} / {row.left_max_px:.3f}",
+            f"{row.right_mean_px:.5f} / {row.right_max_px:.3f}",
+            f"{row.confidence_mean:.5f} / {row.confidence_max:.3f}",
+            f"{row.time_relative:.2f}",
+        ]
+        for row in rows
+    ]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def _rows_of(path: Path, folder: Path) -> list[ParityRow]:
+    kept = checkpoint.load(path)
+    file = model_file(kept.recipe.name)
+    network = as_shipped(matcher_network(kept), file)
+    made = variants(file, folder)
+    inputs = {size: painted_pairs(size, _PAIRS) for size in SIZES}
+    expected = {size: in_pytorch(network, views) for size, views in inputs.items()}
+    rows = []
+    for provider in providers_here():
+        sessions = _sessions(made, provider)
+        times_ms = _times_ms(sessions, made, inputs[SIZES[-1]])
+        for name, session in sessions.items():
+            variant = made[name]
+            found = {size: in_onnx_runtime(session, variant.batch, inputs[size]) for size in variant.sizes}
+            rows.append(
+                ParityRow(
+                    network=kept.recipe.name,
+                    variant=name,
+                    provider=provider,
+                    onnxruntime=onnxruntime.__version__,
+                    file_mb=variant.file.stat().st_size / 1e6,
+                    pairs=_PAIRS * len(found),
+                    **differences(expected, found),
+                    time_ms=times_ms[name],
+                    time_relative=times_ms[name] / times_ms.get("float32", math.nan),
+                    commit=code_commit(),
+                )
+            )
+    return rows
+
+
+def variants(file: Path, folder: Path) -> dict[str, Variant]:
+    """Every variant of a shipped matcher file by name, made in the folder where it does not ship."""
+    height, width = SIZES[-1]
+    half, eight_bits, fixed = (folder / f"{file.stem}_{x}.onnx" for x in ("fp16", "8bit", "fixed"))
+    halve(file, half)
+    quantise(file, eight_bits)
+    fix_size(file, fixed, width, height)
+    return {
+        "float32": Variant(file, 1, SIZES),
+        "batch of 4": Variant(file, 4, SIZES),
+        f"static {width}x{height}": Variant(fixed, 1, SIZES[-1:]),
+        "fp16": Variant(half, 1, SIZES),
+        "8-bit": Variant(eight_bits, 1, SIZES),
+    }
+
+
+def as_shipped(network: WeaveNet, file: Path) -> WeaveNet:
+    """The network of a checkpoint, its confidence calibrated as it was for the matcher file."""
+    weights = {x.name: x for x in onnx.load(file).graph.initializer}
+    with torch.no_grad():
+        for name, parameter in network.named_parameters():
+            if ".confidence." in name:
+                stored = numpy_helper.to_array(weights[name])
+                parameter.copy_(torch.from_numpy(stored.copy()))
+    return network
+
+
+def painted_pairs(size: tuple[int, int], count: int) -> dict[str, Float32[np.ndarray, "b 3 h w"]]:
+    """Pairs that no training sees, as a network takes them: the left views and the right ones."""
+    made = [sample(_SEED, size[1], index, *size) for index in range(count)]
+    return {
+        side: np.stack([getattr(x, side).transpose(2, 0, 1) for x in made]).astype(np.float32) / 255
+        for side in ("left", "right")
+    }
+
+
+def in_pytorch(network: Any, views: Mapping[str, np.ndarray]) -> Maps:
+    """What the network says in float32, a pair at a time."""
+    each = []
+    with torch.inference_mode():
+        for i in range(len(views["left"])):
+            left_px, right_px, logit = network(*(torch.from_numpy(x[i : i + 1]) for x in views.values()))
+            each.append(Maps(left_px.numpy(), right_px.numpy(), logit.sigmoid().numpy()))
+    return Maps(*map(np.concatenate, zip(*each, strict=True)))
+
+
+def in_onnx_runtime(session: Any, batch: int, views: Mapping[str, np.ndarray]) -> Maps:
+    """What a matcher file says of the pairs, so many at a time."""
+    each = []
+    for i in range(0, len(views["left"]), batch):
+        taken = {side: x[i : i + batch] for side, x in views.items()}
+        left_px, right_px, logit = session.run(None, taken)
+        each.append(Maps(left_px, right_px, (1 + np.tanh(logit / 2)) / 2))
+    return Maps(*map(np.concatenate, zip(*each, strict=True)))
+
+
+def differences(
+    expected: Mapping[tuple[int, int], Maps], found: Mapping[tuple[int, int], Maps]
+) -> dict[str, float]:
+    """Mean and largest absolute differences over all pixels of all sizes, by the row's fields."""
+    summary = {}
+    for field, unit in (("left", "_px"), ("right", "_px"), ("confidence", "")):
+        name = field + unit
+        apart = [np.abs(getattr(found[x], name) - getattr(expected[x], name)).ravel() for x in found]
+        summary[f"{field}_mean{unit}"] = float(np.concatenate(apart).mean())
+        summary[f"{field}_max{unit}"] = float(np.concatenate(apart).max())
+    return summary
+
+
+def providers_here() -> list[str]:
+    """The providers that the installed ONNX Runtime has."""
+    there = onnxruntime.get_available_providers()
+    return [name for name, provider in PROVIDERS.items() if provider.name in there]
+
+
+def _sessions(made: Mapping[str, Variant], provider: str) -> dict[str, Any]:
+    """ONNX Runtime's sessions by variant, without those that a provider other than the processor refuses."""
+    sessions = {}
+    for name, variant in made.items():
+        with contextlib.nullcontext() if provider == CPU else contextlib.suppress(MatcherError):
+            sessions[name] = open_session(variant.file, provider, thread_count(None))
+    return sessions
+
+
+def _times_ms(
+    sessions: Mapping[str, Any], made: Mapping[str, Variant], views: Mapping[str, np.ndarray]
+) -> dict[str, float]:
+    """The shortest time for a pair, in turns, so that a machine that slows down slows all alike."""
+    times_ms: dict[str, list[float]] = {name: [] for name in sessions}
+    for turn in range(-1, _TURNS):  # the first one warms up
+        for name, session in sessions.items():
+            batch = {side: x[: made[name].batch] for side, x in views.items()}
+            start_s = time.perf_counter()
+            session.run(None, batch)
+            if turn >= 0:
+                times_ms[name].append(1000 * (time.perf_counter() - start_s) / len(batch["left"]))
+    return {name: min(times) for name, times in times_ms.items()}

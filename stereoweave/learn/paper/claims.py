@@ -1,0 +1,297 @@
+"""What the paper claims, what was measured here, and the difference."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats  # type: ignore[import-untyped]
+
+from stereoweave.learn.paper.trials import ADJUSTMENT, DECODER, NETWORKS, NETWORKS_SHORT, PAPER, PROJECTION
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperRow:
+    """What one training of the experiment gave on the held-out pairs.
+
+    Attributes:
+        claim, setting: What the training is for; one that serves several claims has a row for each.
+        seed: Of first weights, training pairs and their order.
+        steps: Of the training; pairs it saw are steps * batch.
+        prediction: Loss between codes, as the network was trained with it.
+        squared_error: The same between codes without exponent, which can be compared between exponents.
+        epe_px, epe_cm, mae_sourced, sourced_percent, mae_filled, psnr_db, ssim: See `ViewRow`.
+        minutes: Wall time of the training and of the one it started from, beside others on the same machine.
+    """
+
+    claim: str
+    setting: str
+    seed: int
+    model: str
+    loss: str
+    exponent: float
+    alpha_p: float
+    steps: int
+    batch: int
+    crop: str
+    prediction: float
+    squared_error: float
+    epe_px: float
+    epe_cm: float
+    mae_sourced: float
+    sourced_percent: float
+    mae_filled: float
+    psnr_db: float
+    ssim: float
+    minutes: float
+    commit: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """A claim of the paper: how many percent less of `measure` a setting has than the reference.
+
+    Attributes:
+        paper: The paper's words or numbers; `paper_percent` is what they come to, None where it has none.
+    """
+
+    text: str
+    paper: str
+    paper_percent: float | None
+    claim: str
+    reference: str
+    changed: str
+    measure: str
+
+    @property
+    def fair(self) -> bool:
+        """Whether both settings are measured alike; codes of two exponents are not."""
+        return (self.claim, self.measure) != (ADJUSTMENT, "prediction")
+
+
+# Table I: end-point error and MAE of the right view, for Sintel, Driving, Monkaa (px) and Propeller (cm).
+TABLE_I = {
+    "dispnet": ((5.38, 15.62, 5.99, 9.73), (9.87, 13.93, 12.84, 59.34)),
+    "densemapnet": ((4.41, 6.56, 4.45, 8.67), (8.34, 9.43, 9.78, 54.69)),
+    "psmnet": ((3.85, 8.12, 3.88, 2.38), (7.94, 10.32, 7.36, 41.22)),
+    "fast_depth": ((3.95, 6.42, 4.08, 2.32), (7.99, 8.24, 7.93, 37.31)),
+}
+# The only column whose target is depth.
+_PROPELLER = 3
+_COLUMNS = {
+    "epe_cm": ("EPE cm", ".1f"),
+    "epe_px": ("EPE px", ".2f"),
+    "squared_error": ("squared error", ".5f"),
+    "mae_filled": ("MAE", ".2f"),
+    "mae_sourced": ("MAE of sourced", ".2f"),
+    "sourced_percent": ("sourced %", ".1f"),
+    "psnr_db": ("PSNR dB", ".2f"),
+    "ssim": ("SSIM", ".3f"),
+    "minutes": ("minutes", ".1f"),
+}
+# What a setting is claimed to lower: the measure, what we call it, the paper's words, percent.
+_Measured = tuple[str, str, str, float | None]
+_VIEW: _Measured = ("mae_filled", "MAE of the right view", "-", None)
+_ADJUSTMENT: tuple[_Measured, ...] = (
+    (
+        "prediction",
+        "validation loss, each in its own code, smaller by construction",
+        "about 15 %",
+        15.0,
+    ),
+    ("squared_error", "validation loss, codes without exponent", "about 15 %", 15.0),
+    ("epe_px", "end-point error", "up to 20 %", 20.0),
+    _VIEW,
+)
+_PROJECTION: tuple[_Measured, ...] = (
+    ("epe_px", "end-point error", "about 20 %, up to 25 %", 20.0),
+    ("prediction", "loss between codes", "about 20 %", 20.0),
+    _VIEW,
+)
+# The paper has no number of the decoder alone: in Table I it comes with the two contributions.
+_DECODER: tuple[_Measured, ...] = (("epe_px", "end-point error", "-", None), _VIEW)
+# The text of a claim, its name in trials.py, reference, changed setting, and measures.
+_VARIANTS = (
+    ("depth adjustment, p = 1.5 against 1", ADJUSTMENT, "p = 1", "p = 1.5", _ADJUSTMENT),
+    ("projection loss", PROJECTION, "without", PAPER, _PROJECTION),
+    ("step-wise decoder with skips", DECODER, "upsampled at once, no skips", PAPER, _DECODER),
+)
+# Run time as a multiple of DenseMapNet's, on GPUs: section IV.
+RUN_TIMES = {"fast_depth": 1.05, "densemapnet": 1.0, "dispnet": 2.0, "psmnet": 10.0}
+
+
+def comparisons(depth: bool = False) -> Iterator[Comparison]:
+    """The claims that one number can decide; with `depth` as target end-point errors are in cm."""
+    for text, claim, reference, changed, measures in (*_VARIANTS, *_rivals(depth)):
+        for measure, name, paper, percent in measures:
+            yield Comparison(
+                text=f"{text}: {name}",
+                paper=paper,
+                paper_percent=percent,
+                claim=claim,
+                reference=reference,
+                changed=changed,
+                measure="epe_cm" if depth and measure == "epe_px" else measure,
+            )
+
+
+def _rivals(depth: bool) -> Iterator[tuple[str, str, str, str, tuple[_Measured, ...]]]:
+    """What Table I comes to for each rival, as rows of _VARIANTS; with `depth` its column of depth alone."""
+    for rival in ("densemapnet", "dispnet", "psmnet"):
+        claim = NETWORKS_SHORT if rival == "psmnet" else NETWORKS
+        measures = (
+            _in_table_i(rival, 0, "epe_px", "end-point error", depth),
+            _in_table_i(rival, 1, "mae_filled", "MAE of the right view", depth),
+        )
+        yield f"the paper's network against {rival}", claim, rival, "fast_depth", measures
+
+
+def _in_table_i(rival: str, column: int, measure: str, name: str, depth: bool) -> _Measured:
+    numbers = zip(TABLE_I[rival][column], TABLE_I["fast_depth"][column], strict=True)
+    less = [less_percent(*both) for both in numbers]
+    where = "Table I"
+    if depth:
+        less, where = [less[_PROPELLER]], "Table I, Propeller"
+    return measure, name, f"{' '.join(f'{value:z.0f}' for value in less)} % ({where})", float(np.mean(less))
+
+
+def less_percent(reference: float, changed: float) -> float:
+    """How many percent less `changed` is than `reference`."""
+    return 100 * (1 - changed / reference)
+
+
+def by_seed(rows: Sequence[PaperRow], comparison: Comparison) -> list[float]:
+    """Percent less, for each seed that both settings were trained with."""
+    reference, changed = (
+        {row.seed: getattr(row, comparison.measure) for row in rows if _of(row, comparison.claim, setting)}
+        for setting in (comparison.reference, comparison.changed)
+    )
+    return [
+        less_percent(reference[seed], changed[seed]) for seed in sorted(reference.keys() & changed.keys())
+    ]
+
+
+def half_width(values: Sequence[float]) -> float:
+    """Half of the 95 % interval of the mean, by Student's t over the seeds; NaN for less than two."""
+    if len(values) < 2:
+        return float("nan")
+    return float(stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values)))
+
+
+def claims_table(rows: Sequence[PaperRow], depth: bool = False) -> str:
+    """Markdown: what the paper says, what was measured, the difference, and whether that holds here.
+
+    With `depth` as target end-point errors are in cm, and of Table I only Propeller's are compared.
+    """
+    lines = [
+        "| claim: percent less | paper | here (95 % interval) | difference (points) | verdict |",
+        "|---|---|---|---|---|",
+    ]
+    for comparison in comparisons(depth):
+        values = by_seed(rows, comparison)
+        if not values:
+            lines.append(f"| {comparison.text} | {comparison.paper} | not run | | |")
+            continue
+        mean, half = float(np.mean(values)), half_width(values)
+        interval = f"{mean - half:z.0f} to {mean + half:z.0f}" if len(values) > 1 else "one seed"
+        lines.append(
+            f"| {comparison.text} | {comparison.paper} | {mean:z.0f} ({interval}) "
+            f"| {_difference(mean, comparison.paper_percent, 0)} | {_verdict(comparison, mean, half)} |"
+        )
+    return "\n".join(lines)
+
+
+def propeller_table(rows: Sequence[PaperRow]) -> str:
+    """Markdown: the networks, on pairs of our own, beside Table I's column of depth, Propeller."""
+    columns = "network", "steps", "EPE cm: paper", "here", "difference", "MAE of the right view: paper"
+    lines = [f"| {' | '.join((*columns, 'here', 'difference'))} |", "|---" * 8 + "|"]
+    found = [row for row in rows if row.claim in (NETWORKS, NETWORKS_SHORT)]
+    for network, steps in sorted({(row.model, row.steps) for row in found}, key=_as_table_i):
+        chosen = [row for row in found if (row.model, row.steps) == (network, steps)]
+        cells = [network, str(steps)]
+        for column, measure in zip(TABLE_I[network], ("epe_cm", "mae_filled"), strict=True):
+            paper, here = column[_PROPELLER], _mean(chosen, measure)
+            cells += [f"{paper:.2f}", f"{here:.2f}", _difference(here, paper, 2)]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def settings_table(rows: Sequence[PaperRow], claim: str, depth: bool = False) -> str:
+    """Markdown: the settings of one claim with the means over their seeds; the lowest filled MAE first.
+
+    Settings of one seed come after those of several: a single score is no rival of a mean. With `depth` as
+    target there are end-point errors in cm too.
+    """
+    columns = {name: column for name, column in _COLUMNS.items() if depth or name != "epe_cm"}
+    headings = ["setting", "seeds", *(heading for heading, _ in columns.values())]
+    lines = [f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
+    first = next(iter(columns))
+    settings = dict.fromkeys(row.setting for row in rows if row.claim == claim)
+    chosen = {name: [row for row in rows if _of(row, claim, name)] for name in settings}
+    ranked = sorted(chosen.items(), key=lambda item: (len(item[1]) == 1, _mean(item[1], "mae_filled")))
+    for name, found in ranked:
+        numbers = [f"{_mean(found, measure):{digits}}" for measure, (_, digits) in columns.items()]
+        if len(found) > 1:
+            numbers[0] += f" ± {np.std([getattr(row, first) for row in found], ddof=1):{columns[first][1]}}"
+        lines.append(f"| {name} | {len(found)} | {' | '.join(numbers)} |")
+    return "\n".join(lines)
+
+
+def run_time_table(rows: Iterable[Mapping[str, str]]) -> str:
+    """Markdown: the run times of `stereoweave bench speed`, and the paper's as multiples of DenseMapNet's.
+
+    Args:
+        rows: The lines of its CSV file; a network that the paper does not time has no number of its.
+    """
+    columns = (
+        "network",
+        "parameters",
+        "G multiply-adds",
+        "PyTorch ms",
+        "x DenseMapNet",
+        "ONNX Runtime ms",
+        "x DenseMapNet",
+        "paper: x DenseMapNet",
+        "difference for ONNX Runtime",
+    )
+    lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
+    for row in rows:
+        paper, onnx_relative = RUN_TIMES.get(row["network"]), float(row["onnx_relative"])
+        lines.append(
+            f"| {row['network']} | {row['parameters']} | {float(row['multiply_adds']) / 1e9:.1f} "
+            f"| {float(row['eager_ms']):.0f} | {float(row['eager_relative']):.2f} "
+            f"| {float(row['onnx_ms']):.0f} | {onnx_relative:.2f} "
+            f"| {'-' if paper is None else f'{paper:g}'} | {_difference(onnx_relative, paper, 2)} |"
+        )
+    return "\n".join(lines)
+
+
+def _difference(here: float, paper: float | None, digits: int) -> str:
+    return "" if paper is None else f"{here - paper:+z.{digits}f}"
+
+
+def _verdict(comparison: Comparison, mean: float, half: float) -> str:
+    if not comparison.fair:
+        return "not a fair test"
+    if np.isnan(half):
+        return "one seed: no verdict"
+    low, high = mean - half, mean + half
+    if high < 0:
+        return "the opposite"
+    if low <= 0:
+        return "undecided"
+    if comparison.paper_percent is None:
+        return "better"
+    return "better, but less than claimed" if high < comparison.paper_percent else "holds"
+
+
+def _as_table_i(trained: tuple[str, int]) -> tuple[int, int]:
+    """The order of Table I's rows, and of the steps."""
+    return list(TABLE_I).index(trained[0]), trained[1]
+
+
+def _of(row: PaperRow, claim: str, setting: str) -> bool:
+    return row.claim == claim and row.setting == setting
+
+
+def _mean(rows: Iterable[PaperRow], measure: str) -> float:
+    return float(np.mean([getattr(row, measure) for row in rows]))

@@ -1,0 +1,98 @@
+"""The paper's experiment, run for real: every training of trials.py, on the same pairs in the same order."""
+
+import multiprocessing
+import os
+from collections.abc import Collection, Iterable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from rich.console import Console
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.learn.data.sources import kept, sources
+from stereoweave.learn.paper.trials import CLAIMS, SHORT, Trial, trials
+from stereoweave.learn.recipe import COLLAGE, Recipe
+from stereoweave.learn.training.loop import train_recipe
+from stereoweave.learn.training.objective import fitted
+
+
+def plan(
+    base: Recipe, runs: Path, seeds: int, console: Console, claims: Collection[str] = CLAIMS
+) -> list[Trial]:
+    """The trials for these claims, their training pairs made, and the exponent fitted to those of the base.
+
+    Args:
+        base: The paper's recipe for the data at hand.
+        runs: The folder of the runs, and of kept pairs below it.
+        seeds: How often each training is repeated.
+        console: Where progress is told.
+        claims: Names in CLAIMS.
+
+    Raises:
+        StereoweaveError: The base is not of the paper's network, is too short, or has depth as its target
+            where pairs have no camera.
+    """
+    _check(base)
+    training, _ = (kept(pairs, console) for pairs in sources(base, runs / "pairs"))
+    exponent = fitted(replace(base, fit_exponent=True), training).exponent
+    planned = [_below(trial, runs) for trial in trials(base, seeds, exponent) if trial.claim in claims]
+    for trial in planned:
+        for pairs in sources(trial.recipe, runs / "pairs"):
+            kept(pairs, console)
+    return planned
+
+
+def run_trials(planned: Iterable[Trial], runs: Path, jobs: int, console: Console) -> None:
+    """Train each trial in a folder of its own in `runs`; one that was killed goes on where it was.
+
+    Args:
+        planned: Trials whose pairs are made: no two trainings make the same ones.
+        runs: The folder.
+        jobs: Trainings at a time, which share the processor's cores.
+        console: Where progress is told.
+    """
+    recipes = {trial.recipe.name: trial.recipe for trial in planned}.values()
+    # What starts from another training comes when that one is there.
+    _train_all([recipe for recipe in recipes if not recipe.start_from], runs, jobs, console)
+    _train_all([recipe for recipe in recipes if recipe.start_from], runs, jobs, console)
+
+
+def _check(base: Recipe) -> None:
+    # A collage has no camera.
+    target = {"target": "disparity"} if base.dataset == COLLAGE else {}
+    for key, expected in {"model": "fast_depth", **target}.items():
+        if (found := getattr(base, key)) != expected:
+            raise StereoweaveError(
+                f"{base.name}: {key} = {found!r}, expected {expected!r}, which the experiment starts from"
+            )
+    if base.steps < SHORT:
+        raise StereoweaveError(
+            f"{base.name}: steps = {base.steps}, expected at least {SHORT}: "
+            "some trainings have a quarter of them"
+        )
+
+
+def _below(trial: Trial, runs: Path) -> Trial:
+    start = trial.recipe.start_from
+    # In full, so that the folder may be spelled otherwise when the experiment is started again.
+    start_from = str((runs / start).resolve()) if start else ""
+    return replace(trial, recipe=replace(trial.recipe, start_from=start_from))
+
+
+def _train_all(recipes: Iterable[Recipe], runs: Path, jobs: int, console: Console) -> None:
+    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as workers:
+        started = {
+            workers.submit(_train, recipe, runs / recipe.name, jobs): recipe.name for recipe in recipes
+        }
+        for done in as_completed(started):
+            if error := done.exception():
+                workers.shutdown(cancel_futures=True)
+                raise error
+            console.print(started[done])
+
+
+def _train(recipe: Recipe, folder: Path, jobs: int) -> None:
+    torch.set_num_threads(max(1, (os.cpu_count() or 1) // jobs))
+    train_recipe(recipe, folder, Console(quiet=True))

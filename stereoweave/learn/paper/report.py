@@ -1,0 +1,326 @@
+"""The report of the paper's experiment: rows as CSV, tables as Markdown, and the paper's figures."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from rich.console import Console
+
+from stereoweave.bench.pairs import write_csv
+from stereoweave.bench.projected_views import Method, ViewRow
+from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.io.files import make_folder, replacing
+from stereoweave.learn import checkpoint
+from stereoweave.learn.checkpoint import Checkpoint
+from stereoweave.learn.data.sources import Source, sources
+from stereoweave.learn.evaluation import evaluate, held_out_of, method_of
+from stereoweave.learn.paper.claims import (
+    PaperRow,
+    claims_table,
+    propeller_table,
+    run_time_table,
+    settings_table,
+)
+from stereoweave.learn.paper.figures import draw_exponent_curves, draw_iterations, draw_validation, draw_views
+from stereoweave.learn.paper.trials import (
+    ADJUSTMENT,
+    FITTED,
+    ITERATIONS,
+    NETWORKS,
+    NETWORKS_SHORT,
+    PROJECTION,
+    SCRATCH,
+    TRANSFER,
+    TUNED,
+    Trial,
+)
+from stereoweave.learn.recipe import COLLAGE, Recipe
+from stereoweave.learn.training.loop import CURVE, read_record
+from stereoweave.learn.training.objective import truth_histogram
+
+# Held-out pairs that the figures show, counted round where there are fewer.
+SHOWN = (3, 11, 24)
+# In the report's folder, where `stereoweave bench speed` wrote it there.
+SPEED = "speed.csv"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """What the tables and figures are made of.
+
+    Attributes:
+        training, held_out: The pairs of the base.
+        planned: All trials.
+        trained: Those that are trained to their end.
+        missing: The names of the others' recipes.
+        kept: The checkpoints of the trained ones by their recipe's name.
+        curves: Their scores by step.
+        rows: A row for each of them.
+        common: The methods that every table has, on the base's held-out pairs.
+    """
+
+    base: Recipe
+    training: Source
+    held_out: Source
+    planned: list[Trial]
+    trained: list[Trial]
+    missing: list[str]
+    kept: dict[str, Checkpoint]
+    curves: dict[str, list[dict[str, float]]]
+    rows: list[PaperRow]
+    common: list[ViewRow]
+
+    @property
+    def depth(self) -> bool:
+        """Whether depth is what was learned, which is scored in cm."""
+        return self.base.target == "depth"
+
+
+def write_report(base: Recipe, planned: Sequence[Trial], runs: Path, out: Path) -> None:
+    """Write paper.csv, paper.md and the figures into a folder, from the trials that are trained.
+
+    Args:
+        base: The recipe that the trials start from.
+        planned: All trials; paper.md names those that are not trained to their end.
+        runs: The folder of their runs.
+        out: The folder to write into; run times that lie in it, as speed.csv, join paper.md.
+
+    Raises:
+        StereoweaveError: No trial is trained to its end.
+    """
+    run_time = _run_time(out / SPEED)
+    report = _gathered(base, planned, runs)
+    make_folder(out)
+    write_csv(out / "paper.csv", report.rows)
+    with replacing(out / "paper.md") as temporary:
+        temporary.write_text(_markdown(report, run_time), encoding="utf-8")
+    _draw(report, out)
+
+
+def _gathered(base: Recipe, planned: Sequence[Trial], runs: Path) -> Report:
+    files = {trial.recipe.name: runs / trial.recipe.name / "last.pt" for trial in planned}
+    kept = {name: checkpoint.load(file) for name, file in files.items() if file.exists()}
+    trained = [trial for trial in planned if _finished(trial, kept)]
+    if not trained:
+        raise StereoweaveError(
+            f"{runs}: expected a trial trained to its end, found none of {len(files)}; "
+            "`stereoweave bench paper` goes on with them"
+        )
+    scores, common = _scores([base, *(trial.recipe for trial in trained)], runs)
+    names = {trial.recipe.name for trial in trained}
+    training, held_out = sources(base, runs / "pairs", whole=True)
+    return Report(
+        base=base,
+        training=training,
+        held_out=held_out,
+        planned=list(planned),
+        trained=trained,
+        missing=sorted(files.keys() - names),
+        kept={name: kept[name] for name in names},
+        curves={name: read_record(runs / name / CURVE) for name in names},
+        rows=[_row(trial, kept[trial.recipe.name], scores[trial.recipe.name]) for trial in trained],
+        common=common,
+    )
+
+
+def _finished(trial: Trial, kept: Mapping[str, Checkpoint]) -> bool:
+    found = kept.get(trial.recipe.name)
+    return found is not None and found.step == trial.recipe.steps
+
+
+def _scores(recipes: Sequence[Recipe], runs: Path) -> tuple[dict[str, ViewRow], list[ViewRow]]:
+    """The scores of each run but the first recipe's; and of what every table has, on that one's pairs."""
+    base, *others = recipes
+    scores: dict[str, ViewRow] = {}
+    common: list[ViewRow] = []
+    for pairs in dict.fromkeys(held_out_of(recipe) for recipe in others):
+        names = list(dict.fromkeys(recipe.name for recipe in others if held_out_of(recipe) == pairs))
+        # Quiet, because the plan has made the pairs.
+        found = evaluate([runs / name for name in names], runs / "pairs", Console(quiet=True))
+        scores |= {row.method: row for row in found if row.method in names}
+        if pairs == held_out_of(base):
+            common = [row for row in found if row.method not in names]
+    return scores, common
+
+
+def _row(trial: Trial, kept: Checkpoint, score: ViewRow) -> PaperRow:
+    recipe = kept.recipe
+    return PaperRow(
+        claim=trial.claim,
+        setting=trial.setting,
+        seed=recipe.seed,
+        model=recipe.model,
+        loss=recipe.loss,
+        exponent=recipe.exponent,
+        alpha_p=recipe.alpha_p,
+        steps=recipe.steps,
+        batch=recipe.batch,
+        crop=f"{recipe.crop_size[1]}x{recipe.crop_size[0]}",
+        prediction=kept.scores["prediction"],
+        squared_error=kept.scores["squared_error"],
+        epe_px=score.epe_px,
+        epe_cm=score.epe_cm,
+        mae_sourced=score.mae_sourced,
+        sourced_percent=score.sourced_percent,
+        mae_filled=score.mae_filled,
+        psnr_db=score.psnr_db,
+        ssim=score.ssim,
+        minutes=60 * kept.hours,
+        commit=kept.commit,
+    )
+
+
+def _markdown(report: Report, run_time: str) -> str:
+    """The tables, and what was not run."""
+    parts = [
+        "# The paper's experiment: what was measured",
+        *_head(report),
+        "## The claims",
+        claims_table(report.rows, report.depth),
+    ]
+    if report.depth and any(row.claim in (NETWORKS, NETWORKS_SHORT) for row in report.rows):
+        parts += ["## Table I, Propeller", propeller_table(report.rows)]
+    for claim in dict.fromkeys(row.claim for row in report.rows):
+        parts += [f"## {claim.capitalize()}", settings_table(report.rows, claim, report.depth)]
+        if claim == ADJUSTMENT and (fitted := _fitted(report.planned)):
+            parts.append(fitted)
+    parts += ["## What needs no training", _common_table(report.common, report.depth)]
+    if reached := _transfer(report):
+        parts += ["## Transfer: steps to one validation loss", reached]
+    if run_time:
+        parts += ["## Run time", run_time]
+    if report.missing:
+        parts += ["## Not run", "\n".join(f"- {name}" for name in report.missing)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _head(report: Report) -> list[str]:
+    """What all trainings share, what of it is not the paper's, and how the tables are read."""
+    base = report.base
+    another_set = " (in the transfer, of another set)" if base.dataset == COLLAGE else ""
+    unknown = (
+        f" Beyond {base.max_depth_m:g} m ground truth is unknown and gives no source." if report.depth else ""
+    )
+    return [
+        f"Written by `stereoweave bench paper`. {_pairs(report)}, batch {base.batch}, {base.steps} steps "
+        f"unless a table says otherwise, Adam at {base.learning_rate:g}; scores over "
+        f"{report.held_out.count} held-out pairs. Right view: made from the left image by forward "
+        "projection; MAE, 0 to 255, over all pixels after one row fill, then over the pixels that received a "
+        f"source, and their share.{unknown}",
+        f"Not the paper's: what is scored are weights averaged over about {base.averaged_steps} steps; "
+        "gradients are clipped at norm 5; precision is bf16-mixed where the processor has it, else float32; "
+        f"PyTorch is {torch.__version__}. The rivals train with the losses of their own papers (DispNet with "
+        "its learning rate too), without this paper's depth adjustment and projection loss.",
+        f"± is the standard deviation over the seeds. A row of one seed is of seed {base.seed} alone"
+        f"{another_set}; it comes after the means over several and is not ranked against them.",
+    ]
+
+
+def _pairs(report: Report) -> str:
+    """What was trained on."""
+    base = report.base
+    size = f"{base.crop_size[1]}x{base.crop_size[0]}"
+    if base.dataset == COLLAGE:
+        return f"{base.pairs} collage pairs of {size} a seed"
+    target = f"depth up to {base.max_depth_m:g} m" if report.depth else "disparity"
+    return (
+        f"{report.training.count} pairs of {base.root}, the same for every seed, in cuts of {size}; split "
+        f"{base.split}, target {target}"
+    )
+
+
+def _fitted(planned: Sequence[Trial]) -> str:
+    """The fitted exponent, and which planned one it is, if it is one."""
+    settings = {trial.setting: trial.recipe for trial in reversed(planned) if trial.claim == ADJUSTMENT}
+    for setting, recipe in settings.items():
+        if setting.endswith(FITTED):
+            same = [name for name in settings if name != setting and settings[name].name == recipe.name]
+            also = f", which is {same[0]}: both rows are the same trainings" if same else ""
+            return f"Fitted to the histogram of the training truth, p is {recipe.exponent:.4g}{also}."
+    return ""
+
+
+def _run_time(path: Path) -> str:
+    """The table of run times; empty where there is no such file."""
+    if not path.exists():
+        return ""
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            table = run_time_table(csv.DictReader(file))
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(
+            f"{path}: expected the rows of `stereoweave bench speed`, found {error}; "
+            "write it anew or remove it"
+        ) from error
+    return f"A pair of 640x480, all cores of a processor; the paper's are of GPUs.\n\n{table}"
+
+
+def _common_table(rows: Sequence[ViewRow], depth: bool) -> str:
+    columns = ["method", *(["EPE cm"] if depth else []), "EPE px", "MAE", "MAE of sourced", "sourced %"]
+    lines = [f"| {' | '.join((*columns, 'PSNR dB', 'SSIM'))} |", "|---" * (len(columns) + 2) + "|"]
+    for row in rows:
+        in_cm = f" {row.epe_cm:.1f} |" if depth else ""
+        lines.append(
+            f"| {row.method} |{in_cm} {row.epe_px:.2f} | {row.mae_filled:.2f} | {row.mae_sourced:.2f} "
+            f"| {row.sourced_percent:.1f} | {row.psnr_db:.2f} | {row.ssim:.3f} |"
+        )
+    return "\n".join(lines)
+
+
+def _transfer(report: Report) -> str:
+    """When the tuned network first reached what the one from scratch reached at its best."""
+    curves = {
+        trial.setting: report.curves[trial.recipe.name] for trial in report.trained if trial.claim == TRANSFER
+    }
+    if len(curves) < 2:
+        return ""
+    best = min(curves[SCRATCH], key=lambda point: point["loss"])
+    reached = [point["step"] for point in curves[TUNED] if point["loss"] <= best["loss"]]
+    tuned = (
+        f"is reached after {reached[0]:.0f} steps"
+        if reached
+        else f"is never reached: the run ended at {curves[TUNED][-1]['step']:.0f} steps"
+    )
+    return (
+        f"The reference is the best validation loss {SCRATCH}: {best['loss']:.5f}, after {best['step']:.0f} "
+        f"steps. {TUNED.capitalize()} it {tuned}. One seed; scores are {report.base.validate_every} steps "
+        "apart."
+    )
+
+
+def _draw(report: Report, out: Path) -> None:
+    """Fig. 2, left and right, and the same of the projection loss; Fig. 3; Fig. 5; as far as trained."""
+    held_out = report.held_out
+    claims = {row.claim for row in report.rows}
+    if ADJUSTMENT in claims:
+        exponents = {row.exponent for row in report.rows if row.claim == ADJUSTMENT}
+        histogram = truth_histogram(report.base, report.training)
+        draw_exponent_curves(out / "exponent_curves.png", sorted(exponents), histogram)
+    for claim, name in ((ADJUSTMENT, "exponent"), (PROJECTION, "projection")):
+        if claim in claims:
+            draw_validation(out / f"{name}_validation.png", dict(sorted(_by_setting(report, claim).items())))
+    samples = [held_out[index] for index in dict.fromkeys(shown % held_out.count for shown in SHOWN)]
+    for claim, draw, name in ((ITERATIONS, draw_iterations, "iterations"), (NETWORKS, draw_views, "views")):
+        if claim in claims:
+            methods = _first_of_each(report, claim)
+            estimates = [{setting: match(sample) for setting, match in methods.items()} for sample in samples]
+            draw(out / f"{name}.jpg", list(zip(samples, estimates, strict=True)))
+
+
+def _first_of_each(report: Report, claim: str) -> dict[str, Method]:
+    """For each setting its first seed's network."""
+    names = {t.setting: t.recipe.name for t in reversed(report.trained) if t.claim == claim}
+    return {setting: method_of(report.kept[name]) for setting, name in reversed(names.items())}
+
+
+def _by_setting(report: Report, claim: str) -> dict[str, list[list[tuple[int, float]]]]:
+    """For each setting the (step, squared error) of each seed; of settings with one training the first."""
+    # Listed backwards, so that the first one of a name is kept.
+    once = {trial.recipe.name: trial for trial in reversed(report.trained) if trial.claim == claim}
+    found: dict[str, list[list[tuple[int, float]]]] = {}
+    for name, trial in reversed(once.items()):
+        curve = [(int(point["step"]), point["squared_error"]) for point in report.curves[name]]
+        found.setdefault(trial.setting, []).append(curve)
+    return found

@@ -1,0 +1,1 @@
+"""Studies of the networks: ablations, costs, speed."""

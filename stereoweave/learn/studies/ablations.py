@@ -1,0 +1,173 @@
+"""WeaveNet's choices made otherwise, one at a time and at equal budget: the rows of results/ablations.csv."""
+
+import csv
+import hashlib
+import os
+import platform
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+
+from stereoweave.bench.edge_metrics import edge_bad_percent, edge_epe_px, flying_percent
+from stereoweave.bench.projected_views import Method
+from stereoweave.data.shards import Shards
+from stereoweave.io.files import make_folder, replacing
+from stereoweave.learn import checkpoint
+from stereoweave.learn.checkpoint import Checkpoint
+from stereoweave.learn.data.sources import Photographed, Source, kept, sources
+from stereoweave.learn.evaluation import method_of
+from stereoweave.learn.export.from_checkpoint import multiply_adds
+from stereoweave.learn.models import network_of
+from stereoweave.learn.paper.trials import Trial
+from stereoweave.learn.recipe import COLLAGE, Recipe
+from stereoweave.learn.training.loop import train_recipe
+from stereoweave.learn.training.scores import validate
+
+BASE = "base"
+MIX = ((COLLAGE, 0.55), ("runs/synth/rooms", 0.33), ("runs/synth/scenes", 0.12))
+# The choice, and what is made otherwise in the base recipe.
+VARIATIONS: dict[str, dict[str, dict[str, Any]]] = {
+    "what all are compared with": {BASE: {}},
+    "correlation resolution": {"eighth": {"model": "weave_small_eighth"}},
+    "correlation grouping": {"four_groups": {"model": "weave_small_grouped"}},
+    "distribution loss against regression": {
+        "regression": {"distribution": 0.0},
+        "regression_all_levels": {"distribution": 0.0, "model": "weave_small_all_levels"},
+    },
+    "sharpening at edges": {"all_levels": {"model": "weave_small_all_levels"}},
+    "dilated dense blocks": {
+        "undilated": {"model": "weave_small_undilated"},
+        "without_dense": {"model": "weave_small_without_dense"},
+    },
+    "context at 1/16": {"without_context": {"model": "weave_small_without_context"}},
+    "upsampling": {
+        "bilinear": {"model": "weave_small_bilinear"},
+        "nine_neighbours": {"model": "weave_small_nine_neighbours"},
+    },
+    "comparison at 1/2": {"looked_up": {"model": "weave_small_looked_up"}},
+    "exponent p on the normalised disparity": {"exponent_1.5": {"exponent": 1.5}},
+    "projection loss": {"projection": {"alpha_p": 100.0}},
+    "mix of data": {"mix": {"mix": MIX}},
+}
+
+_CPU = torch.device("cpu")
+
+
+def plan(base: Recipe, seeds: int) -> list[Trial]:
+    """Every variation with the first seed, then every one with the next; all recipes named after the two."""
+    return [
+        Trial(
+            claim=choice,
+            setting=name,
+            recipe=replace(base, seed=seed, name=f"{name}-seed{seed}", **changes),
+        )
+        for seed in range(base.seed, base.seed + seeds)
+        for choice, variations in VARIATIONS.items()
+        for name, changes in variations.items()
+    ]
+
+
+def run_ablations(
+    planned: Sequence[Trial], runs: Path, rendered: Path, report: Path, console: Console
+) -> None:
+    """Train each variation in a folder of its own, and write the report anew after each.
+
+    A row that the report has of the same recipe is taken as it is; other rows are not kept.
+
+    Args:
+        planned: What to train.
+        runs: The folder of the runs, and of kept pairs below it.
+        rendered: A set of held-out rendered pairs, which are scored beside the held-out collages.
+        report: The CSV file.
+        console: Where progress is told.
+
+    Raises:
+        StereoweaveError: Training or held-out pairs are missing; said before anything is trained.
+    """
+    rendered_pairs = Photographed(Shards(rendered))
+    for trial in planned:
+        for pairs in sources(trial.recipe, runs / "pairs"):
+            kept(pairs, console)
+    before = {row.get("fingerprint"): row for row in _read(report)}
+    rows = {i: row for i, trial in enumerate(planned) if (row := before.get(fingerprint(trial.recipe)))}
+    for i, trial in enumerate(planned):
+        if i in rows:
+            continue
+        trained = checkpoint.load(train_recipe(trial.recipe, runs / trial.recipe.name, console))
+        _, collages = sources(trial.recipe, runs / "pairs")
+        held_out = {"collage": collages, "rendered": rendered_pairs}
+        rows[i] = {key: _text(value) for key, value in _row(trial, trained, held_out).items()}
+        _write(report, [rows[j] for j in sorted(rows)])
+        console.print(f"{trial.recipe.name}: {len(rows)} of {len(planned)}")
+
+
+def fingerprint(recipe: Recipe) -> str:
+    """8 hexadecimal digits that change with anything in a recipe but its name."""
+    return hashlib.sha256(repr(replace(recipe, name="")).encode()).hexdigest()[:8]
+
+
+def _row(trial: Trial, trained: Checkpoint, held_out: dict[str, Source]) -> dict[str, object]:
+    network = network_of(trained.recipe)
+    network.load_state_dict(trained.averaged)
+    network.eval()
+    changes = VARIATIONS[trial.claim][trial.setting]
+    scores = {
+        f"{pairs}_{name}": value
+        for pairs, source in held_out.items()
+        for name, value in (validate(network, source, _CPU) | _near_edges(method_of(trained), source)).items()
+    }
+    return {
+        "choice": trial.claim,
+        "variation": trial.setting,
+        "seed": trained.recipe.seed,
+        "changes": ", ".join(f"{key} = {value}" for key, value in changes.items()),
+        "fingerprint": fingerprint(trial.recipe),
+        "commit": trained.commit,
+        "machine": f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}, {os.cpu_count()} cores",
+        "steps": trained.step,
+        "pairs_seen": trained.step * trained.recipe.batch,
+        "hours": trained.hours,
+        "parameters": sum(parameter.numel() for parameter in network.parameters()),
+        "multiply_adds": multiply_adds(network),
+        **scores,
+    }
+
+
+def _near_edges(match: Method, pairs: Source) -> dict[str, float]:
+    """Means over the pairs, of which one without a depth edge does not count."""
+    rows = []
+    for index in range(pairs.count):
+        sample = pairs[index]
+        found_px, truth_px = match(sample), sample.disparity_px
+        rows.append(
+            {
+                "edge_epe_px": edge_epe_px(found_px, truth_px),
+                "edge_bad1_percent": edge_bad_percent(found_px, truth_px, 1),
+                "flying_percent": flying_percent(found_px, truth_px),
+            }
+        )
+    return {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}
+
+
+def _text(value: object) -> str:
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
+def _read(report: Path) -> list[dict[str, str]]:
+    if not report.exists():
+        return []
+    with report.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def _write(report: Path, rows: Sequence[dict[str, str]]) -> None:
+    make_folder(report.parent)
+    with replacing(report) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[-1]))
+        writer.writeheader()
+        writer.writerows(rows)

@@ -1,0 +1,107 @@
+"""How long each network takes for a pair, in one run, as ratios to DenseMapNet."""
+
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime  # type: ignore[import-untyped]
+import torch
+
+from stereoweave.learn.export.from_checkpoint import DisparityNetwork, fixed_graph_of, multiply_adds
+from stereoweave.learn.models import network_of
+from stereoweave.learn.recipe import Recipe
+from stereoweave.system.threads import thread_count
+
+REFERENCE = "densemapnet"
+NETWORKS = ("fast_depth", REFERENCE, "dispnet", "psmnet")
+HEIGHT_PX, WIDTH_PX = 480, 640
+DISPARITIES = 192.0
+TURNS = 7
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpeedRow:
+    """What a pair of 640x480 costs a network of the paper's comparison.
+
+    Attributes:
+        eager_ms, onnx_ms: Median of the turns, in PyTorch and in ONNX Runtime, float32, with all cores.
+        eager_relative, onnx_relative: The same as multiples of DenseMapNet's.
+    """
+
+    network: str
+    parameters: int
+    multiply_adds: int
+    eager_ms: float
+    eager_relative: float
+    onnx_ms: float
+    onnx_relative: float
+
+
+def run_times(recipe: Recipe, networks: Sequence[str] = NETWORKS, turns: int = TURNS) -> list[SpeedRow]:
+    """A row per network, timed in turns, so that a machine that slows down slows all alike.
+
+    Args:
+        recipe: All are built as it would build them, but for disparity up to 192 px; the loss costs nothing.
+        networks: Names in MODELS, DenseMapNet's among them.
+        turns: How often each is timed; PSMNet, which takes a minute for all of them, a third as often.
+    """
+    torch.set_num_threads(thread_count(None))
+    pair = torch.rand(2, 1, 3, HEIGHT_PX, WIDTH_PX)
+    recipe = replace(recipe, target="disparity", max_disparity_px=DISPARITIES, loss="l2")
+    built = {
+        name: DisparityNetwork(network_of(replace(recipe, model=name)).eval(), recipe) for name in networks
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        calls = {
+            name: (_eager(network, pair), _onnx(network, pair, Path(folder) / f"{name}.onnx"))
+            for name, network in built.items()
+        }
+        times_ms = _times_ms(calls, turns)
+    return [
+        SpeedRow(
+            network=name,
+            parameters=sum(parameter.numel() for parameter in network.parameters()),
+            multiply_adds=multiply_adds(network, HEIGHT_PX, WIDTH_PX),
+            eager_ms=times_ms[name][0],
+            eager_relative=times_ms[name][0] / times_ms[REFERENCE][0],
+            onnx_ms=times_ms[name][1],
+            onnx_relative=times_ms[name][1] / times_ms[REFERENCE][1],
+        )
+        for name, network in built.items()
+    ]
+
+
+def _eager(network: DisparityNetwork, pair: torch.Tensor) -> Callable[[], object]:
+    def call() -> object:
+        with torch.inference_mode():
+            return network(*pair)
+
+    return call
+
+
+def _onnx(network: DisparityNetwork, pair: torch.Tensor, file: Path) -> Callable[[], object]:
+    onnx.save(fixed_graph_of(network, HEIGHT_PX, WIDTH_PX), file)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = thread_count(None)
+    session = onnxruntime.InferenceSession(file, options, providers=["CPUExecutionProvider"])
+    inputs = {"left": pair[0].numpy(), "right": pair[1].numpy()}
+    return lambda: session.run(None, inputs)
+
+
+def _times_ms(calls: Mapping[str, tuple[Callable[[], object], ...]], turns: int) -> dict[str, list[float]]:
+    """The median time of each call."""
+    taken: dict[str, list[list[float]]] = {name: [[] for _ in both] for name, both in calls.items()}
+    for turn in range(-1, turns):  # the first one warms up
+        for name, both in calls.items():
+            if name == "psmnet" and max(turn, 0) % 3:
+                continue
+            for times, call in zip(taken[name], both, strict=True):
+                start_s = time.perf_counter()
+                call()
+                if turn >= 0:
+                    times.append(1000 * (time.perf_counter() - start_s))
+    return {name: [float(np.median(times)) for times in both] for name, both in taken.items()}

@@ -1,0 +1,301 @@
+"""What each stage of a WeaveNet costs under ONNX Runtime: multiply-adds, bytes moved, time on the CPU."""
+
+import ast
+import json
+import tempfile
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime  # type: ignore[import-untyped]
+from onnx import TensorProto, helper
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.learn import checkpoint
+from stereoweave.learn.export.from_checkpoint import matcher_network, noted_graph
+from stereoweave.learn.models.weave import WeaveNet
+
+HEIGHT_PX, WIDTH_PX = 480, 640
+PRODUCT_SIDE = 2048
+TURNS = 15
+PRODUCT = f"product of two {PRODUCT_SIDE}x{PRODUCT_SIDE} matrices"
+TOTAL = "total"
+
+# The stage of a module that is not called after it.
+_STAGES = {
+    "to_match": "correlation",
+    "weights": "upsampling",
+    "to_match_half": "matching at 1/2",
+    "to_half": "refinement",
+}
+# The stage of an operation that belongs to no part of the module it is in ("" for the network itself), by
+# that module and by the network's part that ran last.
+_STAGES_BETWEEN = {
+    ("", ""): "encoder",
+    ("", "encoder"): "mirroring",
+    ("", "aggregation"): "disparity from scores",
+    ("", "completion"): "completion",
+    ("", "propagation"): "upsampling",
+    ("", "sharpening"): "sharpening",
+    ("", "refinement"): "upsampling",
+    ("refinement", "to_half"): "matching at 1/2",
+}
+# Kernels that give what they read another shape, and move nothing.
+_VIEWS = {"Reshape", "Squeeze", "Unsqueeze", "Flatten", "Identity"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageCost:
+    """What a stage costs for a pair of 640x480, both views, in float32.
+
+    Attributes:
+        network: The name of its recipe; "" for PRODUCT.
+        stage: Its name; TOTAL for all stages; PRODUCT for what the peak is measured with.
+        multiply_adds: Of convolutions, matrix products and sums of products.
+        moved_mb: What its kernels read and write, weights included, in 10^6 bytes; caches save much of it.
+        one_thread_ms, two_threads_ms: The least of the turns: other work on the machine only ever adds.
+        one_thread_peak_percent, two_threads_peak_percent: Its multiply-adds a second, of PRODUCT's.
+    """
+
+    network: str
+    stage: str
+    multiply_adds: int
+    moved_mb: float
+    one_thread_ms: float
+    two_threads_ms: float
+    one_thread_peak_percent: float
+    two_threads_peak_percent: float
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A stage's multiply-adds, bytes moved, and milliseconds with one thread and with two."""
+
+    multiply_adds: int
+    moved: int
+    times_ms: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Profile:
+    """What ONNX Runtime did: kernels by name, their bytes, their milliseconds in every turn; whole turns.
+
+    `optimised` is the graph that it made of the one it was given; its nodes are the kernels.
+    """
+
+    optimised: onnx.ModelProto
+    moved: dict[str, int]
+    kernels_ms: dict[str, list[float]]
+    total_ms: list[float]
+
+
+def stage_costs(runs: Sequence[Path], turns: int = TURNS) -> list[StageCost]:
+    """A large matrix product first; then each network's stages in the order in which they run, and its total.
+
+    Args:
+        runs: Checkpoints of WeaveNets, or folders of runs, whose last ones are taken.
+        turns: How often each is timed.
+
+    Raises:
+        StereoweaveError: A network is no WeaveNet.
+    """
+    networks = [_weave_net(run) for run in runs]
+    peak = measured(_product(PRODUCT_SIDE), {}, turns)[TOTAL]
+    rows = [_row("", PRODUCT, peak, peak)]
+    for name, network in networks:
+        graph = traced(network)
+        found = measured(graph, stages_of(graph), turns)
+        rows += [_row(name, stage, cost, peak) for stage, cost in found.items()]
+    return rows
+
+
+def markdown(rows: Sequence[StageCost]) -> str:
+    """The rows as a Markdown table."""
+    lines = [
+        "| network | stage | million multiply-adds | MB moved | ms, one thread | of the peak "
+        "| ms, two threads | of the peak |",
+        "|---|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    lines += [
+        f"| {row.network} | {row.stage} | {row.multiply_adds / 1e6:.1f} | {row.moved_mb:.1f} "
+        f"| {row.one_thread_ms:.2f} | {row.one_thread_peak_percent:.0f} % "
+        f"| {row.two_threads_ms:.2f} | {row.two_threads_peak_percent:.0f} % |"
+        for row in rows
+    ]
+    return "\n".join(lines)
+
+
+def traced(network: WeaveNet) -> onnx.ModelProto:
+    """The graph that `export.fixed_graph_of` gives, with the exporter's notes of where each node is from."""
+    return noted_graph(network, HEIGHT_PX, WIDTH_PX, None)
+
+
+def stages_of(graph: onnx.ModelProto) -> dict[str, str]:
+    """The stage of each node and of what it gives, by name, in the order in which they run."""
+    stages: dict[str, str] = {}
+    last = ""
+    for node in graph.graph.node:
+        notes = {note.key: note.value for note in node.metadata_props}
+        # The network itself, the modules inside one another, and the operation.
+        modules = ast.literal_eval(notes.get("pkg.torch.onnx.name_scopes", "['', '']"))[1:-1]
+        inside = ".".join(modules[-1:])
+        if inside in ("", "refinement"):
+            part = inside or last
+            stage = _STAGES_BETWEEN.get((inside, last), _STAGES.get(part, part))
+        else:
+            last = modules[0]
+            stage = _STAGES.get(last, last)
+        stages |= dict.fromkeys((node.name, *node.output), stage)
+    return stages
+
+
+def multiply_adds_of(graph: onnx.ModelProto) -> Counter[str]:
+    """Multiply-adds by node: of convolutions, matrix products, and products that are only summed."""
+    inferred = onnx.shape_inference.infer_shapes(graph).graph
+    shapes = {tensor.name: list(tensor.dims) for tensor in inferred.initializer}
+    for value in (*inferred.input, *inferred.value_info, *inferred.output):
+        shapes[value.name] = [side.dim_value for side in value.type.tensor_type.shape.dim]
+    readers = defaultdict(set)
+    for node in inferred.node:
+        for value in node.input:
+            readers[value].add(node.op_type)
+    counts: Counter[str] = Counter()
+    for node in inferred.node:
+        given = prod(shapes[node.output[0]])
+        if node.op_type == "Conv":
+            counts[node.name] = given * prod(shapes[node.input[1]][1:])
+        elif node.op_type == "MatMul":
+            counts[node.name] = given * shapes[node.input[0]][-1]
+        elif node.op_type == "Mul" and readers[node.output[0]] == {"ReduceSum"}:
+            counts[node.name] = given
+    return counts
+
+
+def measured(graph: onnx.ModelProto, stages: Mapping[str, str], turns: int) -> dict[str, Measured]:
+    """Each stage, and TOTAL, as they are under ONNX Runtime with one thread and with two.
+
+    Args:
+        graph: For inputs of one fixed size.
+        stages: As `stages_of` gives them; none, and there is only a total.
+        turns: How often it runs, after once to warm up.
+    """
+    profiles = [profile(graph, threads, turns) for threads in (1, 2)]
+    of_kernels = [_stages_of_kernels(each.optimised, stages) for each in profiles]
+    counts = multiply_adds_of(graph)
+    found = {
+        stage: Measured(
+            sum(count for node, count in counts.items() if stages[node] == stage),
+            sum(size for kernel, size in profiles[0].moved.items() if of_kernels[0][kernel] == stage),
+            (
+                _least_ms(profiles[0], of_kernels[0], stage),
+                _least_ms(profiles[1], of_kernels[1], stage),
+            ),
+        )
+        for stage in dict.fromkeys(stages.values())
+    }
+    found[TOTAL] = Measured(
+        counts.total(),
+        sum(profiles[0].moved.values()),
+        (min(profiles[0].total_ms), min(profiles[1].total_ms)),
+    )
+    return found
+
+
+def profile(graph: onnx.ModelProto, threads: int, turns: int) -> Profile:
+    """What ONNX Runtime does with a graph for random inputs, float32, in `turns` turns after the first."""
+    with tempfile.TemporaryDirectory() as folder:
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.log_severity_level = 4  # it warns that the optimised graph suits this machine alone
+        options.optimized_model_filepath = str(Path(folder, "optimised.onnx"))
+        options.enable_profiling = True
+        options.profile_file_prefix = str(Path(folder, "profile"))
+        session = onnxruntime.InferenceSession(
+            graph.SerializeToString(), options, providers=["CPUExecutionProvider"]
+        )
+        draws = np.random.default_rng(0)
+        inputs = {value.name: draws.random(value.shape, np.float32) for value in session.get_inputs()}
+        for _ in range(1 + turns):
+            session.run(None, inputs)
+        events = json.loads(Path(session.end_profiling()).read_text(encoding="utf-8"))
+        return _profile(onnx.load(options.optimized_model_filepath), events)
+
+
+def _profile(optimised: onnx.ModelProto, events: list[dict[str, Any]]) -> Profile:
+    moved, kernels_ms = {}, defaultdict(list)
+    for event in events:
+        if event["name"].endswith("_kernel_time"):
+            name, notes = event["name"].removesuffix("_kernel_time"), event["args"]
+            sizes = ("activation_size", "parameter_size", "output_size")
+            moved[name] = 0 if notes["op_name"] in _VIEWS else sum(int(notes[size]) for size in sizes)
+            kernels_ms[name].append(event["dur"] / 1000)
+    total_ms = [event["dur"] / 1000 for event in events if event["name"] == "model_run"]
+    return Profile(optimised, moved, {name: times[1:] for name, times in kernels_ms.items()}, total_ms[1:])
+
+
+def _stages_of_kernels(optimised: onnx.ModelProto, stages: Mapping[str, str]) -> dict[str, str]:
+    """The stage of each kernel, by its name."""
+    known, found = dict(stages), {}
+    for node in optimised.graph.node:
+        # A kernel made of several nodes is called after what it gives; one that ONNX Runtime adds, to bring
+        # values into another order, belongs to what it reads.
+        names = (node.name, node.name.removesuffix("_nchwc"), *node.output, *node.input)
+        found[node.name] = next((known[name] for name in names if name in known), TOTAL)
+        known |= dict.fromkeys(node.output, found[node.name])
+    return found
+
+
+def _least_ms(profiled: Profile, stages: Mapping[str, str], stage: str) -> float:
+    """The least time of a stage in a turn."""
+    kernels = [times for name, times in profiled.kernels_ms.items() if stages[name] == stage]
+    return min(map(sum, zip(*kernels, strict=True)), default=0.0)
+
+
+def _weave_net(run: Path) -> tuple[str, WeaveNet]:
+    """The averaged network of a checkpoint, with its recipe's name."""
+    kept = checkpoint.load(run / "last.pt" if run.is_dir() else run)
+    network = matcher_network(kept)
+    if not isinstance(network, WeaveNet):
+        raise StereoweaveError(
+            f"{run}: expected a WeaveNet, whose stages are known, found {kept.recipe.model}; "
+            "`stereoweave bench speed` times the others as a whole"
+        )
+    return kept.recipe.name, network
+
+
+def _product(side: int) -> onnx.ModelProto:
+    """The product of two square matrices, float32."""
+    first, second, result = (
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, [side, side])
+        for name in ("first", "second", "result")
+    )
+    node = helper.make_node("MatMul", ["first", "second"], ["result"], "product")
+    # The exporter's versions: those of the onnx package may be newer than ONNX Runtime reads.
+    return helper.make_model(
+        helper.make_graph([node], "product", [first, second], [result]),
+        opset_imports=[helper.make_opsetid("", 20)],
+        ir_version=9,
+    )
+
+
+def _row(network: str, stage: str, cost: Measured, peak: Measured) -> StageCost:
+    one_ms, two_ms = cost.times_ms
+    shares = [
+        100 * cost.multiply_adds / peak.multiply_adds * at_peak_ms / ms if ms else 0.0
+        for ms, at_peak_ms in zip(cost.times_ms, peak.times_ms, strict=True)
+    ]
+    return StageCost(
+        network=network,
+        stage=stage,
+        multiply_adds=cost.multiply_adds,
+        moved_mb=cost.moved / 1e6,
+        one_thread_ms=one_ms,
+        two_threads_ms=two_ms,
+        one_thread_peak_percent=shares[0],
+        two_threads_peak_percent=shares[1],
+    )

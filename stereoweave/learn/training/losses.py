@@ -1,0 +1,166 @@
+"""What training minimises: maps over [B, 1, H, W] in, one number out; truth that is NaN does not count.
+
+`weave_losses` and its terms are WeaveNet's. `CODE_LOSSES` and `projection_loss` are those of "Fast Depth
+Estimation for View Synthesis", for networks that predict the code of a `DepthCurve`; its perceptual loss
+needs weights and is in perceptual.py.
+"""
+
+from collections.abc import Callable
+from functools import partial
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from stereoweave.learn.models.weave import Stages
+from stereoweave.learn.training.warp import reconstruct_left
+
+_ROBUST_SCALE = 2.5
+
+
+def weave_losses(
+    stages: Stages,
+    truth_px: Float[Tensor, "b 1 h w"],
+    occluded: Bool[Tensor, "b 1 h w"],
+    distribution: float = 1.0,
+    compare: Callable[[Tensor, Tensor], Tensor] | None = None,
+) -> dict[str, Tensor]:
+    """The terms of WeaveNet's loss by name, already weighted; their sum is what is minimised.
+
+    Truth beyond the last level counts as unknown. Truth below 0 px, which the network cannot answer, counts
+    for the confidence alone.
+
+    Args:
+        stages: What the network predicted for both views, the second half of the batch mirrored.
+        truth_px: Disparity of the same views; NaN where unknown.
+        occluded: Pixels without a match, which the raw correlation cannot be asked to find.
+        distribution: Weight of the cross-entropies.
+        compare: Loss between disparities in px, estimated and true; `regression` unless given.
+    """
+    compare = compare or regression
+    columns = torch.arange(truth_px.shape[3], device=truth_px.device)
+    unmatched = occluded | (truth_px > columns)
+    # A level is as many pixels as the maps of scores are smaller.
+    step = truth_px.shape[3] // stages.scores.shape[3]
+    centres = (..., slice(step // 2 - 1, None, step), slice(step // 2 - 1, None, step))
+    reach_px = step * (stages.scores.shape[1] - 1)
+    truth_px = truth_px.where(truth_px <= reach_px, torch.nan)
+    ahead_px = truth_px.where(truth_px >= 0, torch.nan)
+    level_truth = truth_px[centres] / step
+    matched_truth = level_truth.masked_fill(unmatched[centres], torch.nan)
+    return {
+        "correlation": 0.5 * distribution * level_cross_entropy(stages.correlation, matched_truth),
+        "scores": distribution * level_cross_entropy(stages.scores, level_truth),
+        "coarse": 0.5 * compare(stages.coarse_px, halved(ahead_px)),
+        "disparity": compare(stages.disparity_px, ahead_px),
+        "confidence": 0.3 * confidence_loss(stages.confidence_logit, stages.disparity_px, truth_px),
+    }
+
+
+def level_cross_entropy(
+    scores: Float[Tensor, "b d h w"], truth: Float[Tensor, "b 1 h w"]
+) -> Float[Tensor, ""]:
+    """Cross-entropy against a truth in levels that is shared between its two neighbouring levels."""
+    levels = scores.shape[1]
+    known = (truth >= 0) & (truth <= levels - 1)
+    truth = truth.where(known, 0)
+    below = truth.floor().clamp(max=levels - 2)
+    log_likelihood = scores.float().log_softmax(1)
+    low, high = (log_likelihood.gather(1, below.long() + i) for i in (0, 1))
+    return -mean_over(low + (truth - below) * (high - low), known)
+
+
+def regression(
+    estimate_px: Float[Tensor, "b 1 h w"], truth_px: Float[Tensor, "b 1 h w"], robust: float = 0.0
+) -> Float[Tensor, ""]:
+    """Mean absolute error e, rounded below half a pixel; the share `robust` of it is 2.5 log(1 + e) instead.
+
+    The logarithm pulls hardest on errors that are nearly small enough to count as right.
+    """
+    known = truth_px.isfinite()
+    # Unknown truth is replaced before it meets the estimate: NaN times a mask is NaN, in the gradient too.
+    loss = F.huber_loss(estimate_px, truth_px.where(known, 0), reduction="none", delta=0.5) / 0.5
+    if robust:
+        loss = (1 - robust) * loss + robust * _ROBUST_SCALE * loss.log1p()
+    return mean_over(loss, known)
+
+
+def confidence_loss(
+    logit: Float[Tensor, "b 1 h w"],
+    disparity_px: Float[Tensor, "b 1 h w"],
+    truth_px: Float[Tensor, "b 1 h w"],
+) -> Float[Tensor, ""]:
+    """Cross-entropy of the claim that the disparity is within 1 px."""
+    within = (disparity_px.detach() - truth_px).abs() <= 1
+    loss = F.binary_cross_entropy_with_logits(logit, within.float(), reduction="none")
+    return mean_over(loss, truth_px.isfinite())
+
+
+def halved(truth_px: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h2 w2"]:
+    """Mean of each 2x2 block, in pixels of the full resolution; NaN where an edge runs through the block."""
+    blocks = F.pixel_unshuffle(truth_px, 2)
+    low, high = blocks.aminmax(dim=1, keepdim=True)
+    return blocks.mean(1, keepdim=True).where(high - low < 1, torch.nan)
+
+
+def l2_loss(code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
+    """Mean squared error of the code: the paper's choice, the first term of its equation (5)."""
+    return _mean_over_known(F.mse_loss, code, truth)
+
+
+def l1_loss(code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
+    """Mean absolute error of the code."""
+    return _mean_over_known(F.l1_loss, code, truth)
+
+
+def smooth_l1_loss(
+    code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"], beta: float = 1 / 192
+) -> Float[Tensor, ""]:
+    """Mean absolute error of the code less beta / 2, and its square / (2 beta) where it is below beta.
+
+    PSMNet and others turn at 1 px. That is 1 / max_disparity_px of a code whose exponent is 1, and 1 / 192
+    is it for PSMNet's range.
+    """
+    return _mean_over_known(partial(F.smooth_l1_loss, beta=beta), code, truth)
+
+
+def cross_entropy_loss(code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
+    """Mean binary cross-entropy of the code, both in 0..1; least, but not 0, where the code is the truth.
+
+    PyTorch bounds it by 100 and its gradient by 1e12, so both are finite where a code is exactly 0 or 1;
+    behind a sigmoid, whose slope is 0 there, such a code learns nothing.
+    """
+    return _mean_over_known(F.binary_cross_entropy, code, truth)
+
+
+CODE_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "l2": l2_loss,
+    "l1": l1_loss,
+    "smooth_l1": smooth_l1_loss,
+    "cross_entropy": cross_entropy_loss,
+}
+
+
+def projection_loss(
+    left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"], disparity_px: Float[Tensor, "b 1 h w"]
+) -> Float[Tensor, ""]:
+    """Mean squared difference of the left image and its reconstruction: equation (5), second term.
+
+    The mean is over the existing pixels of the whole batch, and 0 where none exists. The paper is silent on
+    the images' range and channels. Here they are in 0..1, like the code beside them, so that equal weights
+    weigh like with like; and channels are averaged, so that grey and colour weigh alike.
+    """
+    reconstructed, exists = reconstruct_left(right, disparity_px)
+    return mean_over(((reconstructed - left) ** 2).mean(1, keepdim=True), exists)
+
+
+def mean_over(values: Float[Tensor, "..."], known: Bool[Tensor, "..."]) -> Float[Tensor, ""]:
+    """Mean of the values that are known; 0, with a gradient of 0, where none is."""
+    return values.where(known, 0).sum() / known.sum().clamp(min=1)
+
+
+def _mean_over_known(loss: Callable[..., Tensor], code: Tensor, truth: Tensor) -> Tensor:
+    known = truth.isfinite()
+    # Replaced before it meets the code: NaN times a mask is NaN, in the gradient too.
+    return mean_over(loss(code, truth.where(known, 0), reduction="none"), known)

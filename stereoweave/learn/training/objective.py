@@ -1,0 +1,276 @@
+"""What a recipe minimises and how its network is scored: WeaveNet's own way, or the paper's."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from stereoweave.bench import metrics
+from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.learn.data.batches import collated, known
+from stereoweave.learn.data.sources import Source
+from stereoweave.learn.models import CodeNetwork
+from stereoweave.learn.models.weave import Stages, WeaveNet
+from stereoweave.learn.recipe import Recipe
+from stereoweave.learn.training.losses import (
+    CODE_LOSSES,
+    projection_loss,
+    regression,
+    smooth_l1_loss,
+    weave_losses,
+)
+from stereoweave.learn.training.perceptual import PerceptualLoss
+from stereoweave.learn.training.scores import validate
+from stereoweave.learn.training.warp import disparity_of_depth
+from stereoweave.stereo import DepthCurve, Sample, fit_exponent
+
+Batch = dict[str, Tensor]
+Map = Float[Tensor, "b 1 h w"]
+
+WEAVE, SMOOTH_L1, CROSS_ENTROPY, PERCEPTUAL = "weave", "smooth_l1", "cross_entropy", "perceptual"
+LOSSES = (WEAVE, *CODE_LOSSES, PERCEPTUAL)
+# The histogram of the truth that an exponent is fitted to: of so many training pairs, in so many bins.
+_FITTED_PAIRS, _FITTED_BINS = 200, 256
+
+
+@runtime_checkable
+class Objective(Protocol):
+    """A loss, and scores."""
+
+    def predict(self, network: Any, batch: Batch) -> Any:
+        """Whatever `losses` needs, computed in the precision of the training."""
+        ...
+
+    def losses(self, predicted: Any, batch: Batch) -> dict[str, Tensor]:
+        """The terms by name, already weighted; their sum is what is minimised."""
+        ...
+
+    def scores(self, network: Any, pairs: Source, device: torch.device) -> dict[str, float]:
+        """Means over pairs that the network was not trained on."""
+        ...
+
+
+def objective_of(recipe: Recipe, network: nn.Module) -> Objective:
+    """The objective that a recipe asks for; FormatError for a loss that is unknown or not the network's."""
+    if recipe.loss not in LOSSES:
+        raise FormatError(f"{recipe.name}: loss = {recipe.loss!r}, expected {', '.join(LOSSES)}")
+    if isinstance(network, WeaveNet) != (recipe.loss == WEAVE):
+        fitting = WEAVE if isinstance(network, WeaveNet) else " or ".join(LOSSES[1:])
+        raise FormatError(
+            f"{recipe.name}: loss = {recipe.loss!r}, expected {fitting} for model = {recipe.model!r}"
+        )
+    if not isinstance(network, CodeNetwork):
+        return WeaveObjective(recipe)
+    if recipe.loss == CROSS_ENTROPY and network.predicts != "code":
+        raise FormatError(
+            f"{recipe.name}: loss = {recipe.loss!r}, expected a network that predicts codes, found "
+            f"model = {recipe.model!r}, whose pixels may leave their range; take another loss"
+        )
+    return CodeObjective(recipe, network)
+
+
+class WeaveObjective:
+    """Disparity of both views, with every stage of WeaveNet supervised.
+
+    With an exponent above 1 the regression compares codes of a `DepthCurve`, times max_disparity_px, which is
+    pixels where the exponent is 1.
+    """
+
+    def __init__(self, recipe: Recipe) -> None:
+        self.recipe = recipe
+
+    def predict(self, network: WeaveNet, batch: Batch) -> Stages:
+        return network.stages(batch["left"], batch["right"])
+
+    def losses(self, predicted: Stages, batch: Batch) -> dict[str, Tensor]:
+        truth_px, occluded = batch["disparity_px"], batch["occluded"]
+        terms = weave_losses(predicted, truth_px, occluded, self.recipe.distribution, self._compare)
+        if self.recipe.alpha_p:
+            left_px = predicted.disparity_px.chunk(2)[0]
+            error = projection_loss(batch["left"], batch["right"], left_px)
+            terms["projection"] = self.recipe.alpha_p * error
+        return terms
+
+    def scores(self, network: WeaveNet, pairs: Source, device: torch.device) -> dict[str, float]:
+        return validate(network, pairs, device)
+
+    def _compare(self, estimate_px: Tensor, truth_px: Tensor) -> Tensor:
+        return regression(self._curved(estimate_px), self._curved(truth_px), self.recipe.robust)
+
+    def _curved(self, disparity_px: Tensor) -> Tensor:
+        if self.recipe.exponent == 1:
+            return disparity_px  # as it is, to the last bit
+        curve = DepthCurve(exponent=self.recipe.exponent, max_disparity_px=self.recipe.max_disparity_px)
+        return self.recipe.max_disparity_px * curve.encode_estimate(disparity_px)
+
+
+class CodeObjective:
+    """The paper's: equation (5) between codes of a `DepthCurve`, of the left view alone.
+
+    A network that predicts disparity in pixels is compared in the same code, so that every network trains on
+    every target and with every loss. With loss = "smooth_l1" (or "l1"), exponent = 1 and alpha_p = 0 this is
+    PSMNet's (or DispNet's) own loss up to the factor 1 / d_max, which Adam does not see.
+    """
+
+    def __init__(self, recipe: Recipe, network: CodeNetwork) -> None:
+        self.recipe, self.curve = recipe, curve_of(recipe)
+        self.predicts, self.output_weights = network.predicts, network.output_weights
+        self.compare = _comparison(recipe)
+
+    def predict(self, network: CodeNetwork, batch: Batch) -> tuple[Map, ...]:
+        return network.outputs(batch["left"], batch["right"])
+
+    def losses(self, predicted: tuple[Map, ...], batch: Batch) -> dict[str, Tensor]:
+        truth = self.curve.encode(truth_of(self.recipe, batch))
+        terms = [self._terms(output.float(), truth, batch) for output in predicted]
+        weights = torch.tensor(self.output_weights, device=truth.device)
+        return {name: weights @ torch.stack([term[name] for term in terms]) for name in terms[0]}
+
+    def code(self, output: Map, batch: Batch) -> Map:
+        """A network's output as a code."""
+        return output if self.predicts == "code" else self.curve.encode_estimate(self.quantity(output, batch))
+
+    def quantity(self, output: Map, batch: Batch) -> Map:
+        """A network's output as what the code stands for: disparity in px, or depth in m."""
+        if self.predicts == "code":
+            return self.curve.decode(output)
+        return output if self.recipe.target == "disparity" else self._depth_m(output, batch)
+
+    def disparity_px(self, output: Map, batch: Batch) -> Map:
+        """A network's output as disparity in pixels."""
+        if self.predicts == "disparity_px":
+            return output
+        decoded = self.curve.decode(output)
+        if self.recipe.target == "disparity":
+            return decoded
+        return disparity_of_depth(
+            decoded, batch["focal_baseline_px_m"], batch["doffs_px"], width_px=output.shape[3]
+        )
+
+    @torch.no_grad()
+    def scores(self, network: CodeNetwork, pairs: Source, device: torch.device) -> dict[str, float]:
+        """Mean `loss` and its terms, `epe_px`, and with depth as target `depth_error_m`.
+
+        `squared_error` is that of the straight code, before the exponent: unlike the loss it can be compared
+        between exponents.
+        """
+        network.eval()
+        rows = []
+        for index in range(pairs.count):
+            with naming(pairs.name(index)):
+                rows.append(self._scores_of(network, known(pairs, index), device))
+        return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+
+    def _terms(self, output: Map, code_truth: Map, batch: Batch) -> dict[str, Tensor]:
+        terms = {"prediction": self.recipe.alpha_z * self.compare(self.code(output, batch), code_truth)}
+        if self.recipe.alpha_p:
+            disparity_px = self.disparity_px(output, batch)
+            error = projection_loss(batch["left"], batch["right"], disparity_px)
+            terms["projection"] = self.recipe.alpha_p * error
+        return terms
+
+    def _depth_m(self, disparity_px: Map, batch: Batch) -> Map:
+        """Depth of an estimated disparity; beyond max_depth_m it goes on along the tangent, linearly.
+
+        So it is finite where disparity is 0 or less, and a network that starts there still has a gradient.
+        """
+        focal_baseline, shifted_px = batch["focal_baseline_px_m"], disparity_px + batch["doffs_px"]
+        least_px = focal_baseline / self.recipe.max_depth_m
+        beyond = (1 - shifted_px / least_px).clamp(min=0)
+        return focal_baseline / shifted_px.clamp(min=least_px) + beyond * self.recipe.max_depth_m
+
+    def _scores_of(self, network: CodeNetwork, sample: Sample, device: torch.device) -> dict[str, float]:
+        batch = {name: values.to(device) for name, values in collated([sample]).items()}
+        output, truth = network(batch["left"], batch["right"]), truth_of(self.recipe, batch)
+        terms = self._terms(output, self.curve.encode(truth), batch)
+        scores = {name: float(value) for name, value in terms.items()}
+        quantity = self.quantity(output, batch)
+        straight = curve_of(replace(self.recipe, exponent=1.0))
+        error = (straight.encode_estimate(quantity) - straight.encode(truth)).square()
+        scores["loss"] = sum(scores.values())
+        scores["squared_error"] = float(error.nanmean())
+        scores["epe_px"] = metrics.epe_px(_array(self.disparity_px(output, batch)), sample.disparity_px)
+        if self.recipe.target == "depth":
+            estimate_m = _array(quantity.clamp(max=self.recipe.max_depth_m))
+            scores["depth_error_m"] = metrics.depth_error_m(estimate_m, _array(truth))
+        return scores
+
+
+def _comparison(recipe: Recipe) -> Callable[[Map, Map], Tensor]:
+    """The loss between codes, and the truth's."""
+    if recipe.loss == PERCEPTUAL:
+        if not recipe.vgg16_weights:
+            raise FormatError(
+                f"{recipe.name}: loss = {PERCEPTUAL!r}, expected vgg16_weights, the path of torchvision's "
+                "vgg16-397923af.pth, found none; it is never downloaded by itself"
+            )
+        return PerceptualLoss(Path(recipe.vgg16_weights))
+    if recipe.loss == SMOOTH_L1:
+        # Of straight codes of disparity the corner is at 1 px, as published.
+        return partial(smooth_l1_loss, beta=1 / recipe.max_disparity_px)
+    return CODE_LOSSES[recipe.loss]
+
+
+def curve_of(recipe: Recipe) -> DepthCurve:
+    """The curve between the recipe's target and its code."""
+    if recipe.target == "depth":
+        return DepthCurve(exponent=recipe.exponent, max_depth_m=recipe.max_depth_m)
+    return DepthCurve(exponent=recipe.exponent, max_disparity_px=recipe.max_disparity_px)
+
+
+def fitted(recipe: Recipe, pairs: Source) -> Recipe:
+    """The recipe, with its exponent fitted to the truth of the training pairs where it asks for that."""
+    if not recipe.fit_exponent:
+        return recipe
+    return replace(recipe, exponent=fit_exponent(truth_histogram(recipe, pairs)))
+
+
+def truth_histogram(recipe: Recipe, pairs: Source) -> Float[np.ndarray, " n"]:
+    """Counts of the normalised truth, before the exponent, in equal bins over 0..1; of spread pairs."""
+    straight = curve_of(replace(recipe, exponent=1.0))
+    counts = np.zeros(_FITTED_BINS)
+    for index in range(0, pairs.count, max(1, pairs.count // _FITTED_PAIRS)):
+        with naming(pairs.name(index)):
+            code = _array(straight.encode(truth_of(recipe, collated([known(pairs, index)]))))
+        counts += np.histogram(code[np.isfinite(code)], _FITTED_BINS, (0, 1))[0]
+    return counts
+
+
+def truth_of(recipe: Recipe, batch: Batch) -> Map:
+    """The left views' truth as what the code stands for, disparity in px or depth in m; NaN where unknown.
+
+    Disparity above max_disparity_px counts as unknown, as PSMNet's authors have it; depth beyond max_depth_m
+    does not.
+    """
+    disparity_px = batch["disparity_px"][: len(batch["left"])]
+    if recipe.target == "disparity":
+        return disparity_px.where(disparity_px <= recipe.max_disparity_px, torch.nan)
+    if "focal_baseline_px_m" not in batch:
+        raise StereoweaveError(
+            f"{recipe.name}: target = 'depth', expected pairs with a camera, found dataset = "
+            f"{recipe.dataset!r} without; train on disparity"
+        )
+    depth_m = batch["focal_baseline_px_m"] / (disparity_px + batch["doffs_px"])
+    # A depth of just max_depth_m, kept as disparity, comes back a rounding error farther.
+    return depth_m.where(depth_m > 1.0001 * recipe.max_depth_m, depth_m.clamp(max=recipe.max_depth_m))
+
+
+@contextmanager
+def naming(what: str) -> Iterator[None]:
+    """Says in an error which pair or pairs it is about, where it does not yet."""
+    try:
+        yield
+    except StereoweaveError as error:
+        words = str(error)
+        raise StereoweaveError(words if words.startswith(what) else f"{what}: {words}") from error
+
+
+def _array(values: Map) -> Float[np.ndarray, "h w"]:
+    return values[0, 0].cpu().numpy()

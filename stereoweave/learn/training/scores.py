@@ -1,0 +1,71 @@
+"""Scores of a network on pairs that it was not trained on."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import nn
+
+from stereoweave.bench import metrics
+from stereoweave.bench.error_classes import CLASSES, class_errors, classify
+from stereoweave.learn.data.sources import Source
+from stereoweave.stereo import Sample
+
+Map = Float[np.ndarray, "h w"]
+
+
+@torch.no_grad()
+def validate(network: nn.Module, pairs: Source, device: torch.device) -> dict[str, float]:
+    """Mean scores over the left views of the pairs, occluded pixels included."""
+    rows, confidences, truths = [], [], []
+    for sample, estimate_px, confidence in _answers(network, pairs, device):
+        rows.append(_errors(estimate_px, sample.disparity_px))
+        confidences.append(confidence)
+        truths.append(np.abs(estimate_px - sample.disparity_px) <= 1)
+    return _mean(rows) | {
+        "calibration_error": metrics.calibration_error(np.stack(confidences), np.stack(truths))
+    }
+
+
+@torch.no_grad()
+def validate_by_class(network: nn.Module, pairs: Source, device: torch.device) -> dict[str, float]:
+    """Mean scores over the left views of the pairs, and what each class of pixels adds to bad-1.
+
+    Truth beyond the network's range does not count.
+    """
+    rows = []
+    for sample, estimate_px, _ in _answers(network, pairs, device):
+        truth_px = np.where(sample.disparity_px < network.max_disparity_px, sample.disparity_px, np.nan)
+        classes = class_errors(
+            estimate_px, truth_px, classify(sample.left, truth_px, occluded=sample.occluded)
+        )
+        bad1_percent = {f"{name}_bad1_percent": classes[name].bad1_percent for name in CLASSES}
+        rows.append(_errors(estimate_px, truth_px) | bad1_percent)
+    return _mean(rows)
+
+
+def _answers(network: nn.Module, pairs: Source, device: torch.device) -> Iterator[tuple[Sample, Map, Map]]:
+    """Each sample, its left disparity in px, and its confidence."""
+    network.eval()
+    for index in range(pairs.count):
+        sample = pairs[index]
+        left, right = (
+            torch.from_numpy(image).permute(2, 0, 1)[None].to(device).float() / 255
+            for image in (sample.left, sample.right)
+        )
+        found_px, _, confidence_logit = (x[0, 0].float().cpu() for x in network(left, right))
+        yield sample, found_px.numpy(), confidence_logit.sigmoid().numpy()
+
+
+def _errors(estimate_px: Map, truth_px: Map) -> dict[str, float]:
+    return {
+        "epe_px": metrics.epe_px(estimate_px, truth_px),
+        "bad1_percent": metrics.bad_percent(estimate_px, truth_px, 1),
+        "bad2_percent": metrics.bad_percent(estimate_px, truth_px, 2),
+        "d1_percent": metrics.d1_percent(estimate_px, truth_px),
+    }
+
+
+def _mean(rows: list[dict[str, float]]) -> dict[str, float]:
+    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}

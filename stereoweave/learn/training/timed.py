@@ -1,0 +1,231 @@
+"""Training by the clock, for a machine that is lent for minutes and reached by commands of limited length.
+
+`train` counts steps. Here a command ends on time, the rate falls to 0 when the minutes of all commands are
+used, and the files that one leaves are where the next one goes on.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.files import make_folder
+from stereoweave.learn import checkpoint
+from stereoweave.learn.data.painters import Painters, cooling
+from stereoweave.learn.data.pair_cache import KeptPairs
+from stereoweave.learn.data.sources import Source, sources
+from stereoweave.learn.recipe import Recipe
+from stereoweave.learn.training.clock import RESERVE_S, Clock, cools_at, learning_rate_at
+from stereoweave.learn.training.timed_run import NETWORK, Progress, TimedRun, standing
+
+Report = Callable[[str], None]
+
+_REPORT_EVERY_S, _SAVE_EVERY_S = 15.0, 60.0
+# A step without a finite loss and gradient is skipped; a second one within this many ends the run.
+_STEPS_BETWEEN_SKIPS = 500
+_TRIED_STEPS = 3
+# bfloat16 keeps 8 bits: a loss computed in it is off by less than this share.
+_BFLOAT16_SHARE = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """One command of a run.
+
+    Attributes:
+        out: Folder to write to, and to go on from where it holds a run.
+        earlier: Folder with what an earlier command left; what is further counts.
+        began_s: When the command began, by `time.monotonic`.
+        minutes: Of this command.
+        total_minutes: Of all commands.
+        device: "cuda" or "cpu".
+        processes: That paint and cut batches beside the training.
+        cool_down_crop: Height and width of the crops while the rate falls; None for those of the recipe.
+        commit: Of the code, where the machine has no git; "" asks git.
+    """
+
+    out: Path
+    earlier: Path | None = None
+    began_s: float
+    minutes: float
+    total_minutes: float
+    device: str
+    processes: int
+    cool_down_crop: tuple[int, int] | None = None
+    commit: str = ""
+
+
+@dataclass(frozen=True)
+class _Mark:
+    """A moment of the training, and the counts at it."""
+
+    at_s: float
+    pairs: int = 0
+    taken: int = 0
+    late: int = 0
+
+
+def train_by_clock(recipe: Recipe, command: Command, report: Report) -> Progress:
+    """Train for the minutes of a command; returns how far the run is.
+
+    Raises:
+        StereoweaveError: There is nothing sound to go on from, no batches are made, or losses are not finite.
+    """
+    make_folder(command.out)
+    start = standing(recipe, command.out, command.earlier, command.commit or checkpoint.code_commit())
+    clock = Clock(
+        began_s=command.began_s,
+        used_s=start.progress.seconds,
+        minutes=command.minutes,
+        total_minutes=command.total_minutes,
+    )
+    if clock.left_at(time.monotonic()) <= 0:
+        report(f"the {command.total_minutes:g} minutes are used; {command.out} is not changed")
+        return start.progress
+    recipes = [recipe, *([cooling(recipe, command.cool_down_crop)] if command.cool_down_crop else [])]
+    with ExitStack() as stack:
+        kept = Path(stack.enter_context(TemporaryDirectory()))
+        pinned = command.device == "cuda"
+        painters = Painters(recipes, kept, command.processes, start.progress.batches, pinned)
+        stack.enter_context(painters)
+        run = TimedRun(start.checkpoint, start.optimiser, torch.device(command.device))
+        training = _Training(run, painters, clock, command.out, report)
+        training.go_on_from(start.progress)
+        training.end(sources(recipe, kept)[1])
+        return training.progress
+
+
+class _Training:
+    """The loop of a command."""
+
+    def __init__(self, run: TimedRun, painters: Painters, clock: Clock, out: Path, report: Report) -> None:
+        self.run, self.painters, self.clock, self.out, self.report = run, painters, clock, out, report
+        self.recipe = run.start.recipe
+        self.progress, self.losses = Progress(), list[float]()
+
+    def go_on_from(self, progress: Progress) -> None:
+        """Step until the command's time is over; a report and a checkpoint now and then."""
+        self.progress = progress
+        batch = self._try_out()
+        self.reported = self._mark()
+        while self.clock.left_at(time.monotonic()) > 0:
+            share = self.clock.share_at(time.monotonic())
+            rate = learning_rate_at(self.recipe, self.progress.optimiser_steps, share)
+            if cools_at(self.recipe, share):
+                self.painters.switch(len(self.painters.recipes) - 1)
+            pairs, loss = len(batch["left"]), self.run.begin(batch)
+            # Now, because a GPU is still computing the gradient.
+            batch = self.run.moved(self.painters.take())
+            self._count(pairs, self.run.finish(loss, rate))
+            if time.monotonic() - self.reported.at_s > _REPORT_EVERY_S:
+                self._report(rate)
+            if time.monotonic() - self.saved_s > _SAVE_EVERY_S:
+                self._save({})
+
+    def end(self, held_out: Source) -> None:
+        """Save the run with its scores, and say what is next."""
+        too_late = self.clock.left_at(time.monotonic()) < -RESERVE_S
+        if too_late or (isinstance(held_out, KeptPairs) and held_out.missing()):
+            self.report("not scored: the time is over" if too_late else "not scored: no held-out pairs")
+            return self._save({})
+        scores = self.run.scores(held_out)
+        self._save(scores)
+        self.report("held-out pairs: " + "  ".join(f"{name} {score:.4g}" for name, score in scores.items()))
+        for file in sorted(self.out.iterdir()):
+            self.report(f"{file}  {file.stat().st_size / 2**20:.1f} MiB")
+        seconds, progress = self.clock.used_at(time.monotonic()), self.progress
+        self.report(
+            f"{seconds / 60:.1f} of {self.clock.total_minutes:g} minutes used: {progress.steps} steps, "
+            f"{progress.pairs} pairs, {progress.skipped} steps skipped"
+        )
+        return None
+
+    def _try_out(self) -> dict[str, torch.Tensor]:
+        """Try everything once on the first batch, which is returned: no later command may find a fault.
+
+        A loss in bfloat16 that is not float32's turns bfloat16 off.
+        """
+        batch = self.run.moved(self.painters.take())
+        plain = self.run.loss(batch, bfloat16=False)
+        self.report(f"{self._used()}  the first batch is there; its loss is {plain:.4g}")
+        if self.run.bfloat16:
+            rounded = self.run.loss(batch, bfloat16=True)
+            self.run.bfloat16 = abs(rounded - plain) < _BFLOAT16_SHARE * abs(plain)
+            taken = "bfloat16" if self.run.bfloat16 else "float32"
+            self.report(f"in bfloat16 it is {rounded:.4g}; trains in {taken}")
+        pairs_per_s = len(batch["left"]) / self._seconds_a_step(batch)
+        self._save({})
+        checkpoint.load(self.out / NETWORK)
+        self.report(
+            f"{self._used()}  smoke test passed: files are written and read, and the network alone takes "
+            f"{pairs_per_s:.1f} pairs/s"
+        )
+        return batch
+
+    def _seconds_a_step(self, batch: dict[str, torch.Tensor]) -> float:
+        """The mean over a few steps at a rate of 0, after one in which the device sets itself up."""
+        for step in range(1 + _TRIED_STEPS):
+            if step == 1:
+                began_s = time.monotonic()
+            if math.isnan(self.run.finish(self.run.begin(batch), 0.0)):
+                raise StereoweaveError(
+                    "the first batch: expected a finite loss and gradient, found none; use other weights"
+                )
+        return (time.monotonic() - began_s) / _TRIED_STEPS
+
+    def _count(self, pairs: int, loss: float) -> None:
+        before = self.progress
+        self.progress = replace(
+            before,
+            steps=before.steps + 1,
+            optimiser_steps=before.optimiser_steps + 1,
+            pairs=before.pairs + pairs,
+        )
+        if math.isnan(loss):
+            self._skip(before)
+        else:
+            self.losses.append(loss)
+
+    def _skip(self, before: Progress) -> None:
+        self.report(f"step {before.steps}: the loss or its gradient is not finite; skipped")
+        last = before.last_skipped
+        if last is not None and before.steps - last < _STEPS_BETWEEN_SKIPS:
+            raise StereoweaveError(
+                f"steps {last} and {before.steps}: expected a finite loss and gradient, found none; "
+                f"lower the learning rate, and go on from {self.out}"
+            )
+        self.progress = replace(self.progress, skipped=before.skipped + 1, last_skipped=before.steps)
+
+    def _report(self, rate: float) -> None:
+        before, self.reported = self.reported, self._mark()
+        late = (self.reported.late - before.late) / max(self.reported.taken - before.taken, 1)
+        speed = (self.reported.pairs - before.pairs) / (self.reported.at_s - before.at_s)
+        left_s = 60 * self.clock.total_minutes - self.clock.used_at(self.reported.at_s)
+        self.report(
+            f"{self._used()}  step {self.progress.steps}  loss {np.mean(self.losses):.4g}  rate {rate:.3g}  "
+            f"{speed:.1f} pairs/s  late {100 * late:.0f} %  cuts {self.painters.cuts:.1f}  "
+            f"{self.progress.pairs + speed * left_s:.3g} pairs in the end"
+        )
+        self.painters.adapt(late)
+        self.losses.clear()
+
+    def _save(self, scores: dict[str, float]) -> None:
+        self.saved_s = time.monotonic()
+        self.progress = replace(
+            self.progress, seconds=self.clock.used_at(self.saved_s), batches=self.painters.number
+        )
+        hours = self.run.start.hours + (self.saved_s - self.clock.began_s) / 3600
+        self.run.save(self.out, self.progress, hours, scores)
+
+    def _mark(self) -> _Mark:
+        return _Mark(time.monotonic(), self.progress.pairs, self.painters.taken, self.painters.starved)
+
+    def _used(self) -> str:
+        return f"{self.clock.used_at(time.monotonic()):5.0f} s"

@@ -1,0 +1,196 @@
+"""The state of a timed run: what a step changes, and the files from which another machine goes on."""
+
+import json
+import math
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.io.files import replacing
+from stereoweave.learn import checkpoint
+from stereoweave.learn.checkpoint import Checkpoint, Weights
+from stereoweave.learn.models import network_of
+from stereoweave.learn.recipe import Recipe
+from stereoweave.learn.training.objective import objective_of
+
+# A checkpoint without the optimiser's state, which `stereoweave train` starts from and `export` takes; that
+# state; and how far the run is.
+NETWORK, OPTIMISER, PROGRESS = "network.pt", "optimiser.pt", "progress.json"
+
+_LARGEST_GRADIENT = 5.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """How far a run is.
+
+    Attributes:
+        seconds: Of all commands.
+        steps: Of the optimiser, skipped ones among them.
+        optimiser_steps: Those since the optimiser began without a state.
+        pairs: Trained on.
+        batches: Number of the next batch to order.
+        skipped: Steps not taken, because the loss or the gradient was not finite.
+        last_skipped: The last of them, counted from 0.
+    """
+
+    seconds: float = 0.0
+    steps: int = 0
+    optimiser_steps: int = 0
+    pairs: int = 0
+    batches: int = 0
+    skipped: int = 0
+    last_skipped: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Standing:
+    """Where a run stands: its checkpoint, its optimiser's state ({} for none), and how far it is."""
+
+    checkpoint: Checkpoint
+    optimiser: dict[str, Any]
+    progress: Progress
+
+
+def standing(recipe: Recipe, out: Path, earlier: Path | None, commit: str) -> Standing:
+    """Where the run in `out` or `earlier` stands, whichever is further; else the start of a new run.
+
+    Raises:
+        FormatError: A file is broken or missing, or `start_from` shares no weights with the network.
+        StereoweaveError: The run is of another network.
+    """
+    if earlier and not (earlier / PROGRESS).exists():
+        raise FormatError(
+            f"{earlier}: expected {PROGRESS} of an earlier command, found none; bring all its files"
+        )
+    folders = [folder for folder in (out, earlier) if folder and (folder / PROGRESS).exists()]
+    found = [(_progress(folder / PROGRESS), folder) for folder in folders]
+    if not found:
+        return Standing(checkpoint=checkpoint.start_of(recipe, commit), optimiser={}, progress=Progress())
+    progress, folder = max(found, key=lambda one: one[0].seconds)
+    last = checkpoint.load(folder / NETWORK)
+    if last.recipe.model != recipe.model:
+        raise StereoweaveError(
+            f"{folder / NETWORK}: expected a run of {recipe.model}, found one of {last.recipe.model}; "
+            "take another folder"
+        )
+    optimiser = _optimiser(folder / OPTIMISER)
+    if not optimiser:
+        progress = replace(progress, optimiser_steps=0)
+    state = replace(last, recipe=recipe, commit=commit)
+    return Standing(checkpoint=state, optimiser=optimiser, progress=progress)
+
+
+def _progress(path: Path) -> Progress:
+    try:
+        return Progress(**json.loads(path.read_text(encoding="utf-8")))
+    except (ValueError, TypeError) as error:
+        raise FormatError(f"{path}: expected the progress of a timed run, found: {error}") from error
+
+
+def _optimiser(path: Path) -> dict[str, Any]:
+    """The optimiser's state; {} where there is none, as it may have stayed behind."""
+    return torch.load(path, map_location="cpu", weights_only=True) if path.exists() else {}
+
+
+class TimedRun:
+    """Network, average and optimiser of a run, on a device."""
+
+    def __init__(self, start: Checkpoint, optimiser: dict[str, Any], device: torch.device) -> None:
+        recipe = start.recipe
+        self.start, self.device = start, device
+        self.bfloat16 = device.type == "cuda" and torch.cuda.is_bf16_supported()
+        self.network: Any = network_of(recipe)
+        self.network.load_state_dict(start.weights)
+        self.network.to(device=device, memory_format=torch.channels_last)
+        self.objective = objective_of(recipe, self.network)
+        average = get_ema_multi_avg_fn(1 - 1 / recipe.averaged_steps)  # type: ignore[no-untyped-call]
+        self.averaged = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
+        self.averaged.module.load_state_dict(start.averaged)
+        # From 0 the first update would take the weights themselves. On the CPU it is read without waiting.
+        self.averaged.n_averaged = torch.ones((), dtype=torch.long)
+        self.optimiser = torch.optim.AdamW(
+            self.network.parameters(), recipe.learning_rate, weight_decay=recipe.weight_decay, fused=True
+        )
+        if optimiser:
+            self.optimiser.load_state_dict(optimiser)
+
+    def moved(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """A batch of `Painters` on the device, with images in 0..1."""
+        there = {name: value.to(self.device, non_blocking=True) for name, value in batch.items()}
+        return there | {side: there[side].float() / 255 for side in ("left", "right")}
+
+    @torch.no_grad()
+    def loss(self, batch: dict[str, Tensor], bfloat16: bool) -> float:
+        """The loss of a batch, in either precision; nothing is learned."""
+        self.network.train()
+        value = float(self._loss(batch, bfloat16))
+        self._restore_statistics()
+        return value
+
+    def begin(self, batch: dict[str, Tensor]) -> Tensor:
+        """Start on the gradient of a step, and return its loss; a GPU computes both later."""
+        self.network.train()
+        self.optimiser.zero_grad()
+        loss = self._loss(batch, self.bfloat16)
+        loss.backward()  # type: ignore[no-untyped-call]
+        return loss.detach()
+
+    def finish(self, loss: Tensor, learning_rate: float) -> float:
+        """Take the step where its loss and gradient are finite; returns the loss, NaN where they are not."""
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), _LARGEST_GRADIENT)
+        value, length = torch.stack([loss.float(), norm.float()]).tolist()
+        if not (math.isfinite(value) and math.isfinite(length)):
+            self._restore_statistics()
+            return math.nan
+        for group in self.optimiser.param_groups:
+            group["lr"] = learning_rate
+        self.optimiser.step()
+        self.averaged.update_parameters(self.network)
+        return value
+
+    @torch.no_grad()
+    def scores(self, held_out: Any) -> dict[str, float]:
+        """The average's scores on held-out pairs."""
+        return self.objective.scores(self.averaged.module, held_out, self.device)
+
+    def save(self, folder: Path, progress: Progress, hours: float, scores: dict[str, float]) -> None:
+        """Write network, optimiser and progress, each whole or not at all.
+
+        Raises:
+            StereoweaveError: A weight is not finite; the files of before stay.
+        """
+        weights, averaged = _on_cpu(self.network), _on_cpu(self.averaged.module)
+        if not all(bool(value.isfinite().all()) for value in (*weights.values(), *averaged.values())):
+            raise StereoweaveError(
+                f"step {progress.steps}: expected finite weights, found some that are not; {folder} keeps "
+                "those of the last checkpoint: lower the learning rate"
+            )
+        state = replace(
+            self.start, step=progress.steps, weights=weights, averaged=averaged, hours=hours, scores=scores
+        )
+        checkpoint.save(state, folder / NETWORK)
+        with replacing(folder / OPTIMISER) as temporary:
+            torch.save(self.optimiser.state_dict(), temporary)
+        with replacing(folder / PROGRESS) as temporary:
+            temporary.write_text(json.dumps(asdict(progress)) + "\n", encoding="utf-8")
+
+    def _loss(self, batch: dict[str, Tensor], bfloat16: bool) -> Tensor:
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=bfloat16):
+            predicted = self.objective.predict(self.network, batch)
+        return torch.stack(list(self.objective.losses(predicted, batch).values())).sum()
+
+    @torch.no_grad()
+    def _restore_statistics(self) -> None:
+        """Give the batch norms the average's statistics: their own may no longer be finite."""
+        for value, kept in zip(self.network.buffers(), self.averaged.module.buffers(), strict=True):
+            value.copy_(kept)
+
+
+def _on_cpu(network: nn.Module) -> Weights:
+    return {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}

@@ -1,0 +1,219 @@
+"""An estimate brought to fit the photographs: matched once more at full resolution, the network's as prior.
+
+Semi-global matching (Hirschmueller 2008) over the disparities between the network's least and greatest. A
+candidate costs what the photographs differ by there, in colour and in which neighbours are darker, and how
+far it is from the network's disparity, by how confident that is. What both views find alike takes the place
+of what the network said: thin things that its coarse steps cannot see, and edges.
+"""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8, UInt16
+
+from stereoweave.matching.exposure import match_exposure, recoloured
+from stereoweave.stereo import Estimate, StereoPair, check_fits
+from stereoweave.system.threads import in_bands, thread_count
+
+if TYPE_CHECKING:
+    from stereoweave.matching.refine_kernels import Cues
+
+# Candidates go this far beyond the network's least and greatest disparity, and are as many as fill vectors.
+_MARGIN_PX = 4
+_CANDIDATES_MULTIPLE = 16
+# They take 3 bytes each; so larger pictures are refined in strips, which see this many rows beyond their own.
+_CANDIDATES_AT_ONCE = 100_000_000
+_OVERLAP_PX = 24
+# A jump between two pixels costs most where they are equally bright, half of it at this difference.
+_LARGEST_STEP, _LEAST_LARGE_STEP = 125, 30
+_HALVING_LEVELS = 30
+# What is left of a pixel's confidence where the other view's network says something else.
+_DOUBTED = 0.2
+_SAME_PX = 1.0
+_MOST_THREADS = 4
+
+
+def refine(
+    left: UInt8[np.ndarray, "h w 3"],
+    right: UInt8[np.ndarray, "h w 3"],
+    estimate: Estimate,
+    threads: int | None = None,
+) -> Estimate:
+    """The estimate with the disparities of both views changed where the photographs say otherwise.
+
+    Where the two agree to 1.5 px the estimate's own stays, which is the more precise, and so it does where it
+    is certain, or where the two views find different things. The confidence stays as it is. Photographs of
+    different exposure are brought to one look before they are compared.
+
+    Args:
+        left: The left photograph, uint8 RGB [H, W, 3].
+        right: The right one, of the same size.
+        estimate: Of these two photographs (`stereoweave.estimate`).
+        threads: How many threads may be used, of which four at most are; all cores if left out.
+    """
+    pair = StereoPair(left=left, right=right)
+    check_fits(estimate, pair)
+    looks = match_exposure(left, right, estimate)
+    if looks is not None:
+        pair = StereoPair(left=left, right=recoloured(right, looks.tables(0)[1]))
+    found_px, right_found_px = _matched(pair, estimate, min(_MOST_THREADS, thread_count(threads)))
+    trust, right_trust = np.asarray(estimate.confidence, np.float32, order="C"), right_confidence(estimate)
+    disparity_px = _settled(estimate.disparity_px, found_px, right_found_px, trust, -1)
+    right_disparity_px = _settled(estimate.right_disparity_px, right_found_px, found_px, right_trust, 1)
+    seen_px, inside = _at_match(right_disparity_px, disparity_px, -1)
+    return Estimate(
+        disparity_px=disparity_px,
+        right_disparity_px=right_disparity_px,
+        confidence=estimate.confidence,
+        occluded=~inside | (seen_px - disparity_px > _SAME_PX),
+    )
+
+
+def _settled(
+    disparity_px: Float[np.ndarray, "h w"],
+    found_px: Float32[np.ndarray, "h w"],
+    other_px: Float32[np.ndarray, "h w"],
+    trust: Float32[np.ndarray, "h w"],
+    towards: int,
+) -> Float32[np.ndarray, "h w"]:
+    """A view's disparity with what was found in its place, where both views found it."""
+    from stereoweave.matching import refine_kernels as kernels  # Numba takes half a second to import
+
+    settled_px = np.array(disparity_px, np.float32, order="C")
+    agreed = np.empty(settled_px.shape, bool)
+    kernels.settle(found_px, other_px, trust, towards, settled_px, agreed)
+    kernels.extend(agreed, trust, towards, settled_px)
+    return settled_px
+
+
+def _matched(
+    pair: StereoPair, estimate: Estimate, threads: int
+) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+    """The disparities of least cost of both views."""
+    first_px, count = _candidates(estimate)
+    left = _cues(pair.left, estimate.disparity_px - first_px, estimate.confidence)
+    right = _cues(pair.right, estimate.right_disparity_px - first_px, right_confidence(estimate))
+    mirrored = _part(right, np.s_[..., ::-1]), _part(left, np.s_[..., ::-1])
+    views = [(own, _backwards(other, first_px, count)) for own, other in ((left, right), mirrored)]
+    height, width = left.grey.shape
+    found_px = np.empty((2, height, width), np.float32)
+    step = max(_CANDIDATES_AT_ONCE // (width * count), 4 * _OVERLAP_PX) - 2 * _OVERLAP_PX
+    for top in range(0, height, step):
+        rows = slice(max(top - _OVERLAP_PX, 0), min(top + step + _OVERLAP_PX, height))
+        strip = [(_part(own, rows), _part(other, rows)) for own, other in views]
+        strip_px = _strip(strip, first_px, count, threads)
+        found_px[:, top : top + step] = strip_px[:, top - rows.start :][:, :step]
+    return found_px[0], np.ascontiguousarray(found_px[1, :, ::-1])
+
+
+def _strip(
+    views: list[tuple["Cues", "Cues"]], first_px: int, count: int, threads: int
+) -> Float32[np.ndarray, "2 h w"]:
+    """The disparities of least cost of some rows, of both views, each as the left one of its pair."""
+    size = (*views[0][0].grey.shape, count)
+    # Memory that is new takes as long to get as a path: both views work in the same.
+    costs, sums = np.empty(size, np.uint8), np.empty(size, np.uint16)
+    return np.stack([_found(own, other, (costs, sums), first_px, threads) for own, other in views])
+
+
+def _found(
+    own: "Cues",
+    other: "Cues",
+    volumes: tuple[UInt8[np.ndarray, "h w d"], UInt16[np.ndarray, "h w d"]],
+    first_px: int,
+    threads: int,
+) -> Float32[np.ndarray, "h w"]:
+    """The disparities of least cost of a left view; its costs and their sums are written into `volumes`."""
+    from stereoweave.matching import refine_kernels as kernels
+
+    height, width = own.grey.shape
+    costs, sums = volumes
+    steps_along, steps_down = (_large_steps(own.grey, axis) for axis in (1, 0))
+    found_px = np.empty((height, width), np.float32)
+
+    def match(first: int, last: int) -> None:
+        kernels.match(own, other, first, last, costs)
+        kernels.along_rows(costs, steps_along, first, last, sums)
+
+    in_bands(match, height, threads, threads)
+    in_bands(
+        lambda first, last: kernels.along_columns(costs, steps_down, first, last, sums),
+        width,
+        threads,
+        threads,
+    )
+    in_bands(
+        lambda first, last: kernels.pick(sums, first_px, first, last, found_px), height, threads, threads
+    )
+    return found_px
+
+
+def _candidates(estimate: Estimate) -> tuple[int, int]:
+    """The first disparity in px that is looked at, and how many are."""
+    both = estimate.disparity_px, estimate.right_disparity_px
+    least_px = math.floor(min(view.min() for view in both))
+    # Parallel cameras give none below 0: a plain sky would take them.
+    first_px = least_px - _MARGIN_PX if least_px < 0 else max(least_px - _MARGIN_PX, 0)
+    last_px = math.ceil(max(view.max() for view in both)) + _MARGIN_PX
+    count = last_px - first_px + 1
+    return first_px, count + -count % _CANDIDATES_MULTIPLE
+
+
+def _cues(photo: UInt8[np.ndarray, "h w 3"], above_first_px: np.ndarray, trust: np.ndarray) -> "Cues":
+    from stereoweave.matching import refine_kernels as kernels
+
+    grey = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
+    codes = np.empty(grey.shape, np.uint32)
+    kernels.census(grey, codes)
+    colour = np.ascontiguousarray(photo.transpose(0, 2, 1))
+    around = np.pad(colour, ((0, 0), (0, 0), (1, 1)), mode="edge").astype(np.uint16)
+    halfway = ((around[..., 1:] + around[..., :-1]) // 2).astype(np.uint8)
+    return kernels.Cues(
+        grey=grey,
+        census=codes,
+        colour=colour,
+        darkest=np.minimum(colour, np.minimum(halfway[..., :-1], halfway[..., 1:])),
+        brightest=np.maximum(colour, np.maximum(halfway[..., :-1], halfway[..., 1:])),
+        prior=np.rint(above_first_px * kernels.SUBSTEPS).astype(np.uint16),
+        trust=np.rint(trust * kernels.MOST_TRUST).astype(np.uint16),
+    )
+
+
+def _backwards(cues: "Cues", first_px: int, count: int) -> "Cues":
+    """The other photograph's columns as the kernels take them; beyond its borders these go on."""
+    width = cues.grey.shape[1]
+    columns = np.clip(width - 1 - first_px - np.arange(width + count - 1), 0, width - 1)
+    return type(cues)(*(cue.take(columns, -1) for cue in cues))
+
+
+def _part(cues: "Cues", index: Any) -> "Cues":
+    """Rows or columns of all cues."""
+    return type(cues)(*(np.ascontiguousarray(cue[index]) for cue in cues))
+
+
+def right_confidence(estimate: Estimate) -> Float32[np.ndarray, "h w"]:
+    """The confidence of the right view's disparities, for which the left one's speaks at their matches."""
+    seen_px, inside = _at_match(estimate.disparity_px, estimate.right_disparity_px, 1)
+    confidence, _ = _at_match(np.asarray(estimate.confidence, np.float32), estimate.right_disparity_px, 1)
+    agreed = inside & (np.abs(seen_px - estimate.right_disparity_px) <= _SAME_PX)
+    return np.where(agreed, confidence, np.float32(_DOUBTED) * confidence)
+
+
+def _at_match(
+    values: Float[np.ndarray, "h w"], disparity_px: Float[np.ndarray, "h w"], towards: int
+) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """The other view's values at x + towards * disparity_px, and whether that is in the picture."""
+    height, width = disparity_px.shape
+    columns = (np.arange(width) + towards * disparity_px).astype(np.float32)
+    rows = np.broadcast_to(np.arange(height, dtype=np.float32)[:, None], columns.shape)
+    seen = cv2.remap(values, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+    return seen, (columns > -0.5) & (columns < width - 0.5)
+
+
+def _large_steps(grey: UInt8[np.ndarray, "h w"], axis: int) -> UInt16[np.ndarray, "h w"]:
+    """What a jump between a pixel and the one before it costs: less where their grey values differ more."""
+    before = grey.take([0, *range(grey.shape[axis] - 1)], axis)
+    costs = _LARGEST_STEP / (1 + cv2.absdiff(grey, before).astype(np.float32) / _HALVING_LEVELS)
+    return np.maximum(costs, _LEAST_LARGE_STEP).astype(np.uint16)

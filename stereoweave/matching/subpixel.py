@@ -1,0 +1,157 @@
+"""An estimate that is right to about a pixel becomes one that is right to a small part of one."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from stereoweave.stereo import Estimate
+from stereoweave.system.threads import in_bands, thread_count
+
+_LARGEST_CHANGE_PX = 1.0
+# Neighbours whose disparities differ by more than about this are of two surfaces.
+_SAME_PX = 0.6
+# The variance of a slope that noise of 3 grey levels alone gives: plain places stay as they are.
+_PLAIN = 4.0
+# The slope of a picture along its rows, without the blur of a Sobel filter.
+_SLOPE = np.array([[1, -8, 0, 8, -1]], np.float32) / 12
+# Widths on the grid of half as many rows and columns, where everything that is smooth is worked out: before
+# the photographs are compared, the window they are compared in, and after.
+_SMOOTH_SIGMA, _WINDOW_SIGMA, _FOUND_SIGMA = 2.0, 0.8, 3.0
+# A depth edge is where the disparity differs by this from its mean over so many places of that grid.
+_EDGE_PX, _EDGE_PLACES = 0.5, 5
+# How far below and above the rows of a band what it finds there depends on; the least rows worth a thread,
+# and the most pixels at once, which take 40 bytes each.
+_REACH_PX = 32
+_LEAST_BAND_PX = 64
+_BAND_PIXELS = 2_000_000
+_GAIN_STEP_PX = 4
+
+
+def to_subpixel(
+    left: UInt8[np.ndarray, "h w 3"],
+    right: UInt8[np.ndarray, "h w 3"],
+    estimate: Estimate,
+    threads: int | None = None,
+) -> Estimate:
+    """The estimate with the left view's disparity moved by at most 1 px, to where the photographs agree best.
+
+    Source: B. Lucas and T. Kanade, "An iterative image registration technique with an application to stereo
+    vision", 1981: around each pixel least squares between the left view and the right one shifted by the
+    disparity, after which the slopes say how much is missing. Three deviations: contrast is made alike and
+    means within the window are taken off, so that a difference in exposure does not shift anything; before
+    and after the one step the disparity is smoothed, not across edges, for neighbours that err to either
+    side hold each other (median error of depth of walls 0.9 -> 0.5 %); and near depth edges, where a window
+    sees two surfaces, nothing is added (bad-1 there 31.3 -> 30.1 %). What the right camera does not see
+    stays.
+
+    Args:
+        left: The left photograph, uint8 RGB [H, W, 3].
+        right: The right one, of the same size.
+        estimate: Of these two photographs.
+        threads: How many threads may be used; all cores if left out.
+    """
+    here, there = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right))
+    gain = _gain(here, there, estimate)
+    here, there = _even(here), _even(there)
+    given_px = _even(estimate.disparity_px.astype(np.float32))
+    # Parallel cameras give none below 0, and a sky must not either.
+    least_px = min(float(given_px.min()), 0.0)
+    found_px = np.empty_like(given_px)
+
+    def move(first: int, last: int) -> None:
+        top = max(2 * first - _REACH_PX, 0)
+        seen = slice(top, 2 * last + _REACH_PX)
+        moved_px = _moved(here[seen], there[seen], given_px[seen], gain)
+        np.maximum(moved_px[2 * first - top : 2 * last - top], least_px, out=found_px[2 * first : 2 * last])
+
+    count = thread_count(threads)
+    bands = max(1, min(max(count, here.size // _BAND_PIXELS), len(here) // _LEAST_BAND_PX))
+    # By pairs of rows, so that no place of the coarse grid is in two bands.
+    if bands == 1:
+        move(0, len(here) // 2)  # a thread of its own would take a fifth longer, in getting memory
+    else:
+        in_bands(move, len(here) // 2, bands, count)
+    height, width = estimate.disparity_px.shape
+    kept_px = np.where(estimate.occluded, given_px[:height, :width], found_px[:height, :width])
+    return replace(estimate, disparity_px=kept_px)
+
+
+def _even(values: np.ndarray) -> np.ndarray:
+    """The map with its last row and column twice where they are odd in number."""
+    height, width = values.shape
+    return cv2.copyMakeBorder(values, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+
+
+def _gain(here: UInt8[np.ndarray, "h w"], there: UInt8[np.ndarray, "h w"], estimate: Estimate) -> float:
+    """The left view's contrast by the right one's, as standard deviations of some of what both see."""
+    some = np.s_[::_GAIN_STEP_PX, ::_GAIN_STEP_PX]
+    rows, columns = _GAIN_STEP_PX * np.argwhere(~estimate.occluded[some]).T
+    if not rows.size:
+        return 1.0
+    matches = np.rint(columns - estimate.disparity_px[rows, columns]).astype(int)
+    seen = here[rows, columns], there[rows, matches.clip(0, there.shape[1] - 1)]
+    # 1 at least, for a picture without any.
+    own, other = (max(float(values.std()), 1.0) for values in seen)
+    return own / other
+
+
+def _moved(
+    here: UInt8[np.ndarray, "h w"],
+    there: UInt8[np.ndarray, "h w"],
+    given_px: Float32[np.ndarray, "h w"],
+    gain: float,
+) -> Float32[np.ndarray, "h w"]:
+    """The disparity of rows of the left view, of even size."""
+    coarse_px = _halved(given_px)
+    smooth_px = _doubled(_smoothed(coarse_px, _SMOOTH_SIGMA))
+    start_px = np.where(cv2.absdiff(smooth_px, given_px) < _SAME_PX, smooth_px, given_px)
+    missing_px = _missing_px(here, there, start_px, gain)
+    missing_px[_near_edge(coarse_px)] = 0
+    coarse_px = _halved(start_px)
+    found_px = start_px + _doubled(_smoothed(coarse_px + missing_px, _FOUND_SIGMA) - coarse_px)
+    return given_px + np.clip(found_px - given_px, -_LARGEST_CHANGE_PX, _LARGEST_CHANGE_PX)
+
+
+def _missing_px(
+    here: UInt8[np.ndarray, "h w"],
+    there: UInt8[np.ndarray, "h w"],
+    disparity_px: Float32[np.ndarray, "h w"],
+    gain: float,
+) -> Float32[np.ndarray, "h2 w2"]:
+    """What least squares adds to a disparity, on the coarse grid."""
+    height, width = disparity_px.shape
+    columns = np.arange(width, dtype=np.float32) - disparity_px
+    rows = np.broadcast_to(np.arange(height, dtype=np.float32)[:, None], columns.shape)
+    shifted = cv2.remap(there, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    difference = cv2.addWeighted(shifted, gain, here, -1, 0, dtype=cv2.CV_32F)
+    slope = cv2.filter2D(here, cv2.CV_32F, _SLOPE)
+    mean = _window(slope)
+    together = _window(slope * difference) - mean * _window(difference)
+    return together / (_window(slope * slope) - mean * mean + _PLAIN)
+
+
+def _near_edge(coarse_px: Float32[np.ndarray, "h2 w2"]) -> Bool[np.ndarray, "h2 w2"]:
+    """Where a surface ends, and around it; a slanted one, whose mean is its middle, has none inside."""
+    around = (_EDGE_PLACES, _EDGE_PLACES)
+    off_px = cv2.absdiff(coarse_px, cv2.blur(coarse_px, around))
+    return cv2.dilate(off_px, np.ones(around, np.uint8)) > _EDGE_PX
+
+
+def _smoothed(coarse_px: Float32[np.ndarray, "h2 w2"], sigma: float) -> Float32[np.ndarray, "h2 w2"]:
+    """The disparity smoothed, but not across steps."""
+    return cv2.bilateralFilter(coarse_px, -1, _SAME_PX, sigma)
+
+
+def _window(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h2 w2"]:
+    """Means around each place of the coarse grid."""
+    return cv2.GaussianBlur(_halved(values), (0, 0), _WINDOW_SIGMA)
+
+
+def _halved(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h2 w2"]:
+    return cv2.resize(values, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+
+
+def _doubled(values: Float[np.ndarray, "h2 w2"]) -> Float32[np.ndarray, "h w"]:
+    return cv2.resize(values, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)

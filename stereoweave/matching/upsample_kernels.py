@@ -1,0 +1,215 @@
+"""The loops of `enlarging` over pixels and candidates, compiled by Numba; `enlarge` calls them in this order.
+
+A plain version of all this is in tests/plain_enlarging.py, and has to agree. All is for a left view: the
+right one is the left one of the mirrored pair. A pixel has two bands of BAND candidates, one for the farthest
+surface that the smaller pictures show around it and one for the nearest: candidate i of band b is the
+disparity first_candidate[y, x, b] + i. Volumes are [H, W, 2 * BAND]. Rows are a strip of the picture's.
+"""
+
+import typing
+
+import numpy as np
+
+from stereoweave.matching.refine_kernels import bits
+from stereoweave.system.jit import inlined, kernel
+
+BAND = 16
+MIDDLE = 8
+"""The candidate of a band that is its surface's disparity."""
+SMALL_STEP = 12
+"""What a change by one candidate between two pixels of a path costs."""
+MOST_DIFFERENCE = np.uint8(40)
+"""Grey levels that differ by more belong to different surfaces, however much more that is."""
+AGREED_PX = 1.0
+"""The most by which two views' disparities of one point differ."""
+FILL_PX = 8.0
+"""What fills a gap is at most so far before or behind the surfaces around it."""
+# A band of the pixel before may begin so many candidates before or behind this one's: these cost the most.
+_BESIDE = BAND + 2
+_ROOM = BAND + 2 * _BESIDE
+PATH = 2 * _ROOM
+"""The costs that a path carries from pixel to pixel."""
+NEVER = np.uint16(30000)
+
+
+@inlined
+@typing.no_type_check
+def _compare(code, level, codes, levels, pull, costs):
+    """Write what the candidates of a band cost, by their neighbours, their grey levels and their place."""
+    for i in range(BAND):
+        apart = np.uint8(max(level, levels[i]) - min(level, levels[i]))
+        apart = np.uint8(min(apart, MOST_DIFFERENCE) >> np.uint8(1))
+        costs[i] = np.uint8(3 * bits(code ^ codes[i]) + apart + pull[i])
+
+
+@kernel
+@typing.no_type_check
+def match(own, other, first_candidate, pull, rows, costs):
+    """Write into some rows of costs, uint8, what each candidate costs.
+
+    own and other are the census codes and the grey levels of both pictures; the columns of the other one run
+    backwards, with BAND more of them at both ends. pull [BAND] is what a place in a band costs.
+    """
+    codes, levels = own
+    other_codes, other_levels = other
+    _, width, _ = costs.shape
+    for y in range(rows[0], rows[1]):
+        for x in range(width):
+            for band in range(2):
+                start = min(max(width - 1 - x + first_candidate[y, x, band], -BAND), width) + BAND
+                end = start + BAND
+                out = costs[y, x, band * BAND : (band + 1) * BAND]
+                there, levels_there = other_codes[y, start:end], other_levels[y, start:end]
+                _compare(codes[y, x], levels[y, x], there, levels_there, pull, out)
+
+
+@inlined
+@typing.no_type_check
+def _step(before, least, moved, costs, large_step, after, sums):
+    """One step of a band's path: writes its costs into after and adds them to sums; the least of them.
+
+    moved is by how many candidates this pixel's band begins behind that of the pixel before.
+    """
+    limit = np.uint16(least + large_step)
+    at = _BESIDE + min(max(moved, -BAND - 1), BAND + 1)
+    same, nearer, farther = before[at : at + BAND], before[at - 1 : at + BAND], before[at + 1 : at + BAND + 1]
+    into = after[_BESIDE : _BESIDE + BAND]
+    lowest = NEVER
+    for i in range(BAND):
+        beside = np.uint16(min(nearer[i], farther[i]) + np.uint16(SMALL_STEP))
+        cost = np.uint16(min(min(same[i], beside), limit) - least + np.uint16(costs[i]))
+        into[i] = cost
+        sums[i] = np.uint16(sums[i] + cost)
+        lowest = min(lowest, cost)
+    return lowest
+
+
+@inlined
+@typing.no_type_check
+def _step_both(before, least, first, first_before, costs, large_step, after, sums):
+    """One step of both bands' path; the least of its costs."""
+    lowest = NEVER
+    for band in range(2):
+        room = slice(band * _ROOM, (band + 1) * _ROOM)
+        part = slice(band * BAND, (band + 1) * BAND)
+        moved = first[band] - first_before[band]
+        cost = _step(before[room], least, moved, costs[part], large_step, after[room], sums[part])
+        lowest = min(lowest, cost)
+    return lowest
+
+
+@kernel
+@typing.no_type_check
+def along_rows(costs, first_candidate, large_step, rows, sums):
+    """Write into some rows of sums the costs of the paths from the left and from the right.
+
+    large_step [H, W + 1] is what a jump between a column and the one before it costs, 0 at both ends.
+    """
+    _, width, _ = costs.shape
+    paths = np.full((2, PATH), NEVER, np.uint16)
+    for y in range(rows[0], rows[1]):
+        sums[y] = 0
+        for backwards in range(2):
+            least = np.uint16(0)
+            column = width - 1 if backwards else 0
+            for i in range(width):
+                x = width - 1 - i if backwards else i
+                first, first_before = first_candidate[y, x], first_candidate[y, column]
+                before, after = paths[i & 1], paths[1 - (i & 1)]
+                jump = large_step[y, x + backwards]
+                least = _step_both(before, least, first, first_before, costs[y, x], jump, after, sums[y, x])
+                column = x
+
+
+@kernel
+@typing.no_type_check
+def along_columns(costs, first_candidate, large_step, backwards, columns, paths, least, first_before, sums):
+    """Add to some columns of sums the costs of the paths from above, or from below if backwards is 1.
+
+    large_step [H + 1, W] is what a jump between a row and the one before it costs, 0 at both ends of the
+    picture. paths [W, PATH], least [W] and first_before [W, 2] are what the paths bring along from the strip
+    that they come from, and are made what they take to the next one.
+    """
+    height, _, _ = costs.shape
+    before = np.empty(PATH, np.uint16)
+    for i in range(height):
+        y = height - 1 - i if backwards else i
+        for x in range(columns[0], columns[1]):
+            before[:] = paths[x]
+            first = first_candidate[y, x]
+            jump = large_step[y + backwards, x]
+            least[x] = _step_both(
+                before, least[x], first, first_before[x], costs[y, x], jump, paths[x], sums[y, x]
+            )
+            first_before[x] = first
+
+
+@kernel
+@typing.no_type_check
+def pick(sums, first_candidate, rows, found_px):
+    """Write into some rows of found_px the disparities of least cost, where two alike slopes would meet."""
+    _, width, _ = sums.shape
+    for y in range(rows[0], rows[1]):
+        for x in range(width):
+            costs = sums[y, x]
+            lowest = costs[0]
+            for i in range(2 * BAND):
+                lowest = min(lowest, costs[i])
+            i = 0
+            while costs[i] != lowest:
+                i += 1
+            place = i % BAND
+            found_px[y, x] = first_candidate[y, x, i // BAND] + place
+            if 0 < place < BAND - 1:
+                before, after = np.int32(costs[i - 1]), np.int32(costs[i + 1])
+                rise = max(before, after) - np.int32(lowest)
+                if rise > 0:
+                    found_px[y, x] += 0.5 * (before - after) / rise
+
+
+@kernel
+@typing.no_type_check
+def agree(found_px, other_px, agreed):
+    """Write into agreed whether the other view found the same at each pixel's match."""
+    height, width = found_px.shape
+    for y in range(height):
+        for x in range(width):
+            column = np.int64(np.rint(x - found_px[y, x]))
+            inside = 0 <= column < width
+            agreed[y, x] = inside and abs(other_px[y, column] - found_px[y, x]) <= AGREED_PX
+
+
+@kernel
+@typing.no_type_check
+def fill(known, gap, farthest_px, nearest_px, disparity_px):
+    """Fill gaps from the farther of the known pixels to their left and right in the row.
+
+    What is in a gap one camera alone sees, for a nearer surface hides it from the other. It is filled if that
+    fits the surfaces around it, which are farthest_px to nearest_px.
+    """
+    height, width = known.shape
+    for y in range(height):
+        start = 0
+        for x in range(width + 1):
+            if (x == width or known[y, x]) and x - start < width:
+                left = start - 1 if start > 0 else x
+                right = x if x < width else start - 1
+                beyond_px = min(disparity_px[y, left], disparity_px[y, right])
+                for i in range(start, x):
+                    fits = farthest_px[y, i] - FILL_PX <= beyond_px <= nearest_px[y, i] + FILL_PX
+                    if gap[y, i] and fits:
+                        disparity_px[y, i] = beyond_px
+            if x < width and known[y, x]:
+                start = x + 1
+
+
+@kernel
+@typing.no_type_check
+def hide(disparity_px, right_disparity_px, occluded):
+    """Write into occluded whether a pixel's match is outside of the right picture or behind something."""
+    height, width = disparity_px.shape
+    for y in range(height):
+        for x in range(width):
+            column = np.int64(np.rint(x - disparity_px[y, x]))
+            inside = 0 <= column < width
+            occluded[y, x] = not inside or right_disparity_px[y, column] - disparity_px[y, x] > AGREED_PX

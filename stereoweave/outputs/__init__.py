@@ -1,0 +1,1 @@
+"""What is made of an estimate: maps, reports, point clouds, measurements."""

@@ -1,0 +1,272 @@
+"""What `depth` writes of a pair: maps, masks, pictures of them, points and surfaces, and the report.
+
+Where the left picture shows nothing (`StereoPair.left_seen`) disparity and depth are unknown: infinite in a
+PFM file, which is Middlebury's way, NaN in NPY and TIFF files, and 0 in a PNG. What is infinitely far is
+infinite in all files of depth but the PNG, where it is 0 too.
+"""
+
+import hashlib
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from stereoweave import __version__
+from stereoweave.cameras.calibration_files import calibration_bytes
+from stereoweave.cameras.diagnosis import hints
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.colormap import colour_disparity, colour_range_px, grey_confidence
+from stereoweave.io.files import (
+    RangeError,
+    make_folder,
+    place_for,
+    reading,
+    write_depth_png,
+    write_disparity_png,
+    write_float_tiff,
+    write_image,
+    write_npy,
+    write_pfm,
+)
+from stereoweave.io.output_lock import lock_output
+from stereoweave.matching.estimate import match
+from stereoweave.matching.matcher import Matcher, check_steps
+from stereoweave.matching.providers import CPU
+from stereoweave.outputs.point_cloud import (
+    MOST_POINTS,
+    NO_CAMERA,
+    Cloud,
+    EmptyError,
+    Surface,
+    needed_camera,
+    needing_the_mesh_extra,
+    point_cloud,
+    surface,
+    write_glb,
+    write_ply,
+)
+from stereoweave.outputs.report import Summary, summarize, write_report
+from stereoweave.pictures.prepare import Request, prepare
+from stereoweave.stereo import Estimate, StereoPair
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """What the files are made of."""
+
+    pair: StereoPair
+    estimate: Estimate
+    summary: Summary
+    threads: int | None = None
+
+    @property
+    def seen(self) -> Bool[np.ndarray, "h w"]:
+        """Where the left picture shows something."""
+        seen = self.pair.left_seen
+        return np.ones(self.estimate.disparity_px.shape, bool) if seen is None else seen
+
+    def disparity_px(self, unknown: float = np.nan) -> Float32[np.ndarray, "h w"]:
+        """The left view's disparity, with `unknown` where there is none."""
+        return np.where(self.seen, self.estimate.disparity_px, np.float32(unknown)).astype(np.float32)
+
+    def depth_m(self, unknown: float = np.nan) -> Float[np.ndarray, "h w"]:
+        """Its depth, likewise."""
+        depth_m = needed_camera(self.pair).depth_m(self.estimate.disparity_px)
+        return np.where(self.seen, depth_m, np.float32(unknown))
+
+    @cached_property
+    def cloud(self) -> Cloud:
+        return point_cloud(self.pair, self.estimate)
+
+    @cached_property
+    def surface(self) -> Surface:
+        return surface(self.pair, self.estimate)
+
+
+def _write_preview(path: Path, result: Result) -> None:
+    disparity_px = result.estimate.disparity_px
+    range_px = colour_range_px(disparity_px[result.seen][None])
+    write_image(path, colour_disparity(disparity_px, range_px) * result.seen[..., None])
+
+
+# Every file that `depth` can write.
+FILES: dict[str, Callable[[Path, Result], None]] = {
+    "disparity.pfm": lambda path, result: write_pfm(path, result.disparity_px(np.inf)),
+    "disparity.png": lambda path, result: write_disparity_png(path, result.disparity_px()),
+    "disparity.npy": lambda path, result: write_npy(path, result.disparity_px()),
+    "disparity.tiff": lambda path, result: write_float_tiff(path, result.disparity_px()),
+    "depth.png": lambda path, result: write_depth_png(path, result.depth_m()),
+    "depth.pfm": lambda path, result: write_pfm(path, result.depth_m(np.inf)),
+    "depth.npy": lambda path, result: write_npy(path, result.depth_m()),
+    "depth.tiff": lambda path, result: write_float_tiff(path, result.depth_m()),
+    "preview.png": _write_preview,
+    "confidence.png": lambda path, result: write_image(path, grey_confidence(result.estimate.confidence)),
+    "occluded.png": lambda path, result: write_image(path, np.uint8(255) * result.estimate.occluded),
+    "cloud.ply": lambda path, result: write_ply(path, result.cloud),
+    "cloud.glb": lambda path, result: write_glb(path, result.cloud),
+    "mesh.ply": lambda path, result: write_ply(path, result.surface),
+    "mesh.glb": lambda path, result: write_glb(path, result.surface),
+    "report.html": lambda path, result: write_report(
+        path, result.pair, result.estimate, result.summary, result.threads
+    ),
+}
+ALWAYS = ("disparity.pfm", "disparity.png", "preview.png", "confidence.png", "occluded.png", "report.html")
+ALL = "all"
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthOrder:
+    """What is to be made of every pair: what is said of the pictures, with which network and how.
+
+    Attributes:
+        request: What is said of the pictures.
+        model: The name of the network, for the summary.
+        threads: How many threads may be used; all cores if left out.
+        provider: What the network is run on, a name in `providers.PROVIDERS`.
+        range_px: The least and the greatest disparity; found from the pair where None.
+        refined: As for `matching.match`.
+        raw: As for `matching.match`.
+        files: What is written beside `always`, names in FILES, or "all"; depth.png is with any camera.
+        always: What is written of every pair.
+    """
+
+    request: Request = Request()
+    model: str = "small"
+    threads: int | None = None
+    provider: str = CPU
+    range_px: tuple[float, float] | None = None
+    refined: bool = False
+    raw: bool = False
+    files: tuple[str, ...] = ()
+    always: tuple[str, ...] = ALWAYS
+
+    def __post_init__(self) -> None:
+        check_steps(refined=self.refined, raw=self.raw)
+        for file in self.files:
+            if file not in FILES and file != ALL:
+                raise StereoweaveError(
+                    f"--write: expected {ALL} or one of {', '.join(FILES)}, found {file!r}"
+                )
+
+
+def make_depth(
+    pictures: Sequence[Path], out: Path, order: DepthOrder, matcher: Matcher
+) -> tuple[Summary, list[str]]:
+    """Writes the results of a pair into the folder `out`, all or none; its numbers, and lines to tell."""
+    prepared = prepare(pictures, order.request)
+    pair = prepared.pair
+    files, left_out = _files_of(order, pair)
+    with _results_in(out) as folder:
+        start_s = time.perf_counter()
+        estimate = match(matcher, pair, range_px=order.range_px, refined=order.refined, raw=order.raw)
+        estimate_ms = 1000 * (time.perf_counter() - start_s)
+        names = tuple(picture.name for picture in pictures)
+        model = order.model if matcher.provider == CPU else f"{order.model} on {matcher.provider}"
+        summary = summarize(pair, estimate, pictures=names, model=model, estimate_ms=estimate_ms)
+        result = Result(pair=pair, estimate=estimate, summary=summary, threads=order.threads)
+        notes = [*prepared.notes, *left_out, *write_files(folder, files, result)]
+        notes += hints(pair, estimate)
+    return summary, notes
+
+
+def order_facts(order: DepthOrder) -> dict[str, Any]:
+    """All that decides the results of a pair beside its pictures, files by what is in them.
+
+    What it is computed with does not: a batch whose GPU fails can be finished on the processor.
+    """
+    facts = {"stereoweave": __version__, **asdict(order)}
+    del facts["threads"], facts["provider"]
+    facts |= facts.pop("request")
+    if facts["model"].endswith(".onnx"):
+        with reading(facts["model"], "a model"):
+            facts["model"] = _by_content(facts["model"], Path(facts["model"]).read_bytes())
+    if facts["calibration"]:
+        facts["calibration"] = _by_content(facts["calibration"], calibration_bytes(facts["calibration"]))
+    return facts
+
+
+def _by_content(path: str | Path, content: bytes) -> str:
+    return f"{Path(path).name} {hashlib.sha256(content).hexdigest()[:12]}"
+
+
+def needs_camera(file: str) -> bool:
+    """Whether a file in FILES is in metres."""
+    return file.startswith(("depth.", "cloud.", "mesh."))
+
+
+def _files_of(order: DepthOrder, pair: StereoPair) -> tuple[list[str], list[str]]:
+    """What is to be written of a pair, and lines to tell; an error where it cannot be."""
+    wanted, notes = {*order.always, *order.files}, []
+    if pair.camera:
+        wanted.add("depth.png")
+    if ALL in wanted:
+        wanted |= {file for file in FILES if pair.camera or not needs_camera(file)}
+        if not pair.camera:
+            notes.append(f"no depth, points or surface in metres: {NO_CAMERA}")
+    files = [file for file in FILES if file in wanted]
+    in_metres = [file for file in files if needs_camera(file)]
+    if in_metres and not pair.camera:
+        raise StereoweaveError(f"{in_metres[0]}: {NO_CAMERA}")
+    if any(file.endswith((".ply", ".glb")) for file in files):
+        needing_the_mesh_extra()
+    return files, notes
+
+
+@contextmanager
+def _results_in(out: Path) -> Iterator[Path]:
+    """A temporary folder, whose files move into `out` in the end; after an error nothing of either is left.
+
+    Files of an earlier result that this one does not have are removed, so that all in `out` belong together.
+    Where no disparity.pfm is there, which every result has and is moved first, they are the user's, and stay.
+    """
+    standing = place_for(*(out / file for file in FILES))
+    with tempfile.TemporaryDirectory(prefix=".stereoweave-", dir=standing) as name:
+        yield Path(name)
+        # Two commands would leave some files of each.
+        with lock_output(make_folder(out)):
+            is_earlier_result = (out / "disparity.pfm").exists()
+            for file in FILES:
+                fresh = Path(name, file)
+                if fresh.exists():
+                    fresh.replace(out / file)
+                elif is_earlier_result:
+                    (out / file).unlink(missing_ok=True)
+
+
+def write_files(folder: Path, files: Sequence[str], result: Result) -> list[str]:
+    """Writes them; the lines that say which of them could not be or hold less, and why."""
+    notes = []
+    for file in files:
+        try:
+            FILES[file](folder / file, result)
+            notes += _thinned(file, result)
+        except RangeError:
+            notes.append(
+                "no disparity.png: it holds 0 to 255.99 px, found "
+                f"{result.summary.disparity_min_px:.2f} to {result.summary.disparity_max_px:.2f} px; "
+                "disparity.pfm has them"
+            )
+        except EmptyError as nothing:
+            notes.append(f"no {file}: {nothing}")
+    return notes
+
+
+def _thinned(file: str, result: Result) -> list[str]:
+    """A line where points or a surface leave out pixels of a large picture."""
+    match file.split("."):
+        case ["cloud", _]:
+            step_px = result.cloud.step_px
+        case ["mesh", _]:
+            step_px = result.surface.step_px
+        case _:
+            step_px = 1
+    if step_px == 1:
+        return []
+    return [f"{file}: of every {step_px}x{step_px} pixels one, for at most {MOST_POINTS:,} points"]

@@ -1,0 +1,249 @@
+"""Stereo pictures as people own them: two files, or one that holds both views in whatever way."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.io import exif
+from stereoweave.io.decoding import (
+    Photograph,
+    check_size,
+    decode,
+    opening,
+    read_frame,
+    read_photograph,
+    view_frames,
+)
+from stereoweave.io.files import check_large_enough, pair_of
+from stereoweave.pictures.frame_packing import ARRANGEMENTS, Arrangement, guess_arrangement, resemblance
+from stereoweave.stereo import StereoPair
+
+# What --format takes for one file that holds both views: how one picture holds them, or which kind of file
+# it is whatever its name says.
+FORMATS = (*ARRANGEMENTS, "mpo", "jps")
+TWO_PICTURES = "two_pictures"
+
+# What `layouts` writes that holds no two eyes, and whose halves may yet resemble each other.
+_OTHER_LAYOUTS = {"a quilt of many views": r"_qs\d+x\d+a[\d.]+$", "a picture and its depth": r"_RGBD$"}
+
+_JPS_MARK, _JPS_STEREO, _JPS_BESIDE, _JPS_ABOVE = b"_JPSJPS_", 1, 2, 3
+_JPS_HALF_HEIGHT, _JPS_HALF_WIDTH, _JPS_LEFT_FIRST = 1, 2, 4
+_CROSSED_ENDINGS = (".jps", ".pns")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Opened:
+    """A pair as it was taken, not rectified.
+
+    Attributes:
+        pair: Both views, upright, in sRGB.
+        arrangement: How the files held them: a name in `ARRANGEMENTS`, "mpo" or "two_pictures".
+        notes: What was guessed or changed, in a line each.
+        lens: What the tags of the files say of the cameras, in pixels of the pair; None for nothing.
+    """
+
+    pair: StereoPair
+    arrangement: str
+    notes: tuple[str, ...] = ()
+    lens: exif.Lens | None = None
+
+
+def open_pictures(paths: Sequence[Path], arrangement: str | None = None) -> Opened:
+    """The pair of two pictures, left first, or of one file that holds both views.
+
+    Args:
+        paths: One or two files.
+        arrangement: How one file holds both views, a name in `FORMATS`; guessed unless given: as the file's
+            kind says, as its name says, as it looks.
+
+    Raises:
+        FormatError: A file that cannot be read, holds no two views, is too large, or is of a kind that is not
+            read, which the error names; or two pictures of different sizes.
+        StereoweaveError: An unknown arrangement, one beside two files, or not one or two files.
+    """
+    if arrangement not in (None, *FORMATS):
+        raise StereoweaveError(f"--format: expected one of {', '.join(FORMATS)}, found {arrangement!r}")
+    match paths:
+        case [left, right]:
+            if arrangement is not None:
+                raise StereoweaveError(
+                    f"--format {arrangement}: expected with one picture that holds both views, found two, "
+                    f"{left} and {right}; give them alone, the left one first"
+                )
+            return _two(left, right)
+        case [both]:
+            return _one(both, arrangement)
+    names = " ".join(map(str, paths))
+    raise StereoweaveError(
+        f"expected LEFT RIGHT or SIDE_BY_SIDE, one or two pictures, found {len(paths)}: {names}"
+    )
+
+
+def pixel_factor(path: Path, picture: Image.Image, arrangement: str | None) -> int:
+    """How many times as many pixels both views have as the head of the opened picture that holds them says.
+
+    Two for an MPO file, and for half views that `arrangement` or the file's JPS mark names.
+    """
+    if arrangement in (None, "mpo") and view_frames(path, picture):
+        return 2
+    known = ARRANGEMENTS.get(_declared(path, picture, arrangement)[0] or "")
+    return 2 if known is not None and known.half else 1
+
+
+def _two(left: Path, right: Path) -> Opened:
+    photographs = [read_photograph(path) for path in (left, right)]
+    lies, notes = _upright(*photographs)
+    eyes = [each.upright(lie) for each, lie in zip(photographs, lies, strict=True)]
+    return Opened(
+        pair=pair_of(left, eyes[0], right, eyes[1]),
+        arrangement=TWO_PICTURES,
+        notes=(*notes, *_colour_notes(photographs)),
+        lens=_lens(photographs),
+    )
+
+
+def _one(path: Path, arrangement: str | None) -> Opened:
+    with opening(path, views=2) as picture:
+        frames = view_frames(path, picture) if arrangement in (None, "mpo") else []
+        if frames:
+            return _of_frames(path, picture, frames)
+        if arrangement == "mpo":
+            raise FormatError(f"{path}: expected an MPO file with two pictures of one size, found one")
+        name, why = _declared(path, picture, arrangement)
+        photograph = decode(path, picture)
+    lies = exif.orientation(photograph.tags)
+    image = photograph.upright(lies)
+    if name is None:
+        name, why = _guessed(path, image), "guessed from name and looks"
+    left, right = _halves(path, image, ARRANGEMENTS[name])
+    height_px, width_px = left.shape[:2]
+    notes = [f"{name}, {why}; --format names another"] if why else []
+    return Opened(
+        pair=StereoPair(left=left, right=right),
+        arrangement=name,
+        notes=(*notes, *_turn_notes(lies), *_colour_notes([photograph])),
+        lens=exif.lens_of(photograph.tags, width_px, height_px),
+    )
+
+
+def _of_frames(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opened:
+    """The pair of an MPO file, both turned as the first one lies: the lenses are in one body."""
+    photographs = [read_frame(path, picture, index) for index in frames]
+    lies = exif.orientation(photographs[0].tags)
+    # CIPA DC-007 counts viewpoints from the left; many files leave that out, and have the left one first.
+    photographs.sort(key=lambda each: exif.viewpoint(each.tags))
+    left, right = (each.upright(lies) for each in photographs)
+    if left.shape != right.shape:
+        sizes = " and ".join(f"{eye.shape[1]}x{eye.shape[0]}" for eye in (left, right))
+        raise FormatError(f"{path}: expected an MPO file with two pictures of one size, found {sizes}")
+    check_large_enough(path, left)
+    return Opened(
+        pair=StereoPair(left=left, right=right),
+        arrangement="mpo",
+        notes=(
+            "mpo, the two pictures of the file; --format names another",
+            *_turn_notes(lies),
+            *_colour_notes(photographs),
+        ),
+        lens=_lens(photographs),
+    )
+
+
+def _upright(left: Photograph, right: Photograph) -> tuple[tuple[int | None, int | None], list[str]]:
+    """How each of two pictures lies, and a note on it.
+
+    Each as its tag says, unless that makes their sizes differ or one has no tag, which editors lose, some of
+    them with the picture turned, some without: then both as the one, if their sizes fit so, and look so.
+    """
+    own = exif.orientation(left.tags), exif.orientation(right.tags)
+    if own[0] == own[1] or {*own} <= {None, 1}:
+        return own, _turn_notes(own[0])
+    alike = (own[0] or own[1],) * 2
+    fitting = [
+        lies
+        for lies in (own, alike)
+        if exif.turned(left.image, lies[0]).size == exif.turned(right.image, lies[1]).size
+    ]
+    if len(fitting) == 2 and None not in own:
+        return own, ["each picture turned upright as its EXIF says"]
+    best = max(fitting or [own], key=lambda lies: np.nan_to_num(_likeness(left, right, lies), nan=-1))
+    if best == alike:
+        which = "the other says" if None in own else "the left one says, though the right one differs"
+        return best, [f"both pictures turned upright as EXIF of {which}"]
+    return best, ["one picture turned upright as EXIF says, the other left as it is"]
+
+
+def _likeness(left: Photograph, right: Photograph, lies: tuple[int | None, int | None]) -> float:
+    return resemblance(left.upright(lies[0]), right.upright(lies[1]))
+
+
+def _declared(path: Path, picture: Image.Image, arrangement: str | None) -> tuple[str | None, str | None]:
+    """The name in `ARRANGEMENTS` that the user or a JPS file gives, and why where it is the file; else None.
+
+    Source: VRex's JPS, the four bytes after its mark and their count: separation, flags, layout, type.
+    """
+    if arrangement not in (None, "jps"):
+        return arrangement, None
+    segments = [content for _, content in getattr(picture, "applist", [])]
+    mark = next((content for content in segments if content.startswith(_JPS_MARK)), b"")
+    if len(mark) < 14 or mark[13] != _JPS_STEREO:
+        is_jps = arrangement == "jps" or path.suffix.lower() in _CROSSED_ENDINGS
+        return ("crossed", "as is usual of .jps files") if is_jps else (None, None)
+    flags, layout = mark[11], mark[12]
+    if layout not in (_JPS_BESIDE, _JPS_ABOVE):
+        raise FormatError(
+            f"{path}: expected two views side by side or one above the other, found JPS that is interleaved "
+            "or an anaglyph, which is not read; save it side by side"
+        )
+    beside = layout == _JPS_BESIDE
+    half = bool(flags & (_JPS_HALF_WIDTH if beside else _JPS_HALF_HEIGHT))
+    known = Arrangement(beside=beside, half=half, right_first=not flags & _JPS_LEFT_FIRST)
+    return next(name for name, each in ARRANGEMENTS.items() if each == known), "as its JPS mark says"
+
+
+def _guessed(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> str:
+    for kind, mark in _OTHER_LAYOUTS.items():
+        if re.search(mark, path.stem):
+            raise FormatError(
+                f"{path}: expected two views, found {kind}, by its name; --format says how else it is"
+            )
+    return guess_arrangement(str(path), [image], photograph=True)
+
+
+def _halves(
+    path: Path, image: UInt8[np.ndarray, "h w 3"], arrangement: Arrangement
+) -> tuple[UInt8[np.ndarray, "h2 w2 3"], UInt8[np.ndarray, "h2 w2 3"]]:
+    """Left and right view at their full size."""
+    height_px, width_px = image.shape[:2]
+    try:
+        view_px = arrangement.eye_size_px(width_px, height_px)
+    except FormatError as error:
+        raise FormatError(f"{path}: {error}") from error
+    check_size(path, view_px)
+    left, right = arrangement.eyes(image)
+    check_large_enough(path, left)
+    return left, right
+
+
+def _lens(photographs: Sequence[Photograph]) -> exif.Lens | None:
+    """What the tags of either picture say of both; the first one's where both do."""
+    first, second = photographs
+    return exif.lens_of({**second.tags, **first.tags}, *first.image.size)
+
+
+def _turn_notes(lies: int | None) -> list[str]:
+    return [] if lies in (None, 1) else ["turned upright as EXIF says"]
+
+
+def _colour_notes(photographs: Sequence[Photograph]) -> list[str]:
+    """What was done to the colours, once if it is the same of both."""
+    notes = [each.note for each in photographs]
+    if len(set(notes)) == 1:
+        return [note for note in notes[:1] if note]
+    return [f"{side} picture: {note}" for side, note in zip(("left", "right"), notes, strict=True) if note]

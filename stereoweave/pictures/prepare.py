@@ -1,0 +1,106 @@
+"""Pictures as they were given become a pair that can be matched: opened, rectified, with its camera."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from stereoweave.cameras.calibration_files import read_rig
+from stereoweave.cameras.rectify import Rectified, rectify
+from stereoweave.cameras.rectify_uncalibrated import rectify_by_features
+from stereoweave.cameras.rig import size_of
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.exif import Lens
+from stereoweave.pictures.loading import open_pictures
+from stereoweave.stereo import StereoCamera, StereoPair
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """What a user says about a pair beside its pictures.
+
+    Attributes:
+        arrangement: How one picture holds both views, a name in `pictures.FORMATS`; guessed where None.
+        calibration: A calibration file of the two cameras (`calibration_files.read_rig`).
+        focal_px, baseline_m: Without one, what is known of the cameras; else EXIF may say it.
+        rectify: Whether the rows are brought to match: by the calibration, or by features without one.
+    """
+
+    arrangement: str | None = None
+    calibration: Path | None = None
+    focal_px: float | None = None
+    baseline_m: float | None = None
+    rectify: bool = False
+
+    def __post_init__(self) -> None:
+        if self.calibration and not (self.focal_px is None and self.baseline_m is None):
+            raise StereoweaveError(
+                f"{self.calibration}: expected a calibration, or focal length and baseline given, found both"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prepared:
+    """A pair that can be matched, and what was found and done on the way, in a line each."""
+
+    pair: StereoPair
+    notes: tuple[str, ...] = ()
+
+
+def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
+    """The pair of two pictures, left first, or of one that holds both views.
+
+    Its camera comes from the calibration, from what is known by hand, or from EXIF; where none of them says
+    both focal length and baseline, or features alone rectified the pair, it has none.
+
+    Raises:
+        StereoweaveError: As `open_pictures`, `read_rig`, `rectify` and `rectify_by_features`; or only one of
+            focal length and baseline is known though the other one was given.
+    """
+    opened = open_pictures(pictures, request.arrangement)
+    if request.calibration:
+        ready = _calibrated(opened.pair, request.calibration, request.rectify)
+    else:
+        camera, notes = _camera(opened.pair, opened.lens or Lens(), request)
+        ready = Rectified(pair=replace(opened.pair, camera=camera), notes=notes)
+        if request.rectify:
+            ready = _by_features(ready)
+    return Prepared(pair=ready.pair, notes=(*opened.notes, *ready.notes))
+
+
+def _calibrated(pair: StereoPair, path: Path, rectified: bool) -> Rectified:
+    """The pair with the camera of a calibration, rectified by it where that is asked for."""
+    rig = read_rig(path, size_of(pair))
+    if rectified:
+        return rectify(pair, rig)
+    rig.check_size(pair)
+    unlike = rig.unlike_rectified()
+    if unlike:
+        raise StereoweaveError(
+            f"{path}: expected a calibration of rectified pictures, found {unlike}; --rectify rectifies by it"
+        )
+    return Rectified(pair=replace(pair, camera=rig.camera()), notes=rig.notes)
+
+
+def _camera(pair: StereoPair, lens: Lens, request: Request) -> tuple[StereoCamera | None, tuple[str, ...]]:
+    """The camera of what was given by hand, completed from EXIF; and what came from there, in a line."""
+    focal_px = lens.focal_px if request.focal_px is None else request.focal_px
+    baseline_m = lens.baseline_m if request.baseline_m is None else request.baseline_m
+    if focal_px is not None and baseline_m is not None:
+        camera = StereoCamera.centred(pair.left, focal_px=focal_px, baseline_m=baseline_m)
+        told = [] if request.focal_px is not None else [f"focal length {focal_px:.0f} px"]
+        told += [] if request.baseline_m is not None else [f"baseline {1000 * baseline_m:.1f} mm"]
+        return camera, (f"from EXIF: {', '.join(told)}",) if told else ()
+    if request.focal_px is not None:
+        raise StereoweaveError("metres: expected a baseline beside the focal length; give --baseline-m")
+    if request.baseline_m is not None:
+        raise StereoweaveError(
+            "metres: expected a focal length in EXIF beside the baseline, found none; give --focal-px"
+        )
+    return None, ()
+
+
+def _by_features(ready: Rectified) -> Rectified:
+    """The pair rectified by what it shows, without its camera: the turn put in is known but for infinity."""
+    rectified = rectify_by_features(ready.pair)
+    lost = () if ready.pair.camera is None else ("no metres after rectification by features: give --calib",)
+    return Rectified(pair=rectified.pair, notes=(*rectified.notes, *lost))

@@ -1,0 +1,72 @@
+"""A finished view moved along its rows, each pixel by a way of its own; transposed, along its columns."""
+
+import math
+import typing
+
+import numpy as np
+
+from stereoweave.rendering.canvas_kernels import SAME_SURFACE_PX
+from stereoweave.system.jit import compiled, kernel
+
+
+@kernel
+@typing.no_type_check
+def move(image, surface_px, drawn, targets, disparity_px, canvas):
+    """Write the view whose pixel (y, x) goes to the real column targets[y, x] of the canvas; near wins.
+
+    Neighbours on one surface are joined, so that nothing cracks where it grows. Where nothing comes to lie,
+    the canvas is not pure.
+
+    Args:
+        image: uint8 RGB [H, W, 3].
+        surface_px: float32 [H, W], what tells surfaces apart.
+        drawn: bool [H, W].
+        targets: float32 [H, W].
+        disparity_px: float32 [H, W], after the move.
+        canvas: An empty one.
+    """
+    for y in range(image.shape[0]):
+        _move_row(image[y], surface_px[y], drawn[y], targets[y], disparity_px[y], y, canvas)
+
+
+@compiled
+@typing.no_type_check
+def _move_row(image, surface_px, drawn, targets, disparity_px, y, canvas):
+    width = image.shape[0]
+    right_end = True
+    for x in range(width):
+        left_end = right_end
+        after = min(x + 1, width - 1)
+        right_end = x == width - 1 or abs(surface_px[after] - surface_px[x]) > SAME_SURFACE_PX
+        begin = targets[x] - 0.5 if left_end else targets[x]
+        # A pixel that has no neighbour on its surface reaches half a pixel to either side.
+        end = targets[x] + 0.5 if right_end else targets[after]
+        stretch = 1.0 if right_end else targets[after] - targets[x]
+        if stretch <= 0:
+            continue
+        for u in range(max(math.ceil(begin), 0), min(math.ceil(end) - 1, width - 1) + 1):
+            part = min(max((u - targets[x]) / stretch, 0.0), 1.0) if not right_end else 0.0
+            near_px = disparity_px[x] + part * (disparity_px[after] - disparity_px[x])
+            if near_px > canvas.surface_px[y, u]:
+                _copy(image, surface_px, x, part, canvas.image[y, u])
+                canvas.surface_px[y, u], canvas.pure[y, u] = near_px, True
+                canvas.drawn[y, u] = drawn[x if part < 0.5 else after]
+
+
+@compiled
+@typing.no_type_check
+def _copy(image, surface_px, x, part, colour):
+    """Write the colour between pixel x and the next; by a cubic where all four are of one surface."""
+    width = image.shape[0]
+    a, b, c, d = max(x - 1, 0), x, min(x + 1, width - 1), min(x + 2, width - 1)
+    w0, w1, w2, w3 = 0.0, 1.0 - part, part, 0.0
+    low_px = min(min(surface_px[a], surface_px[b]), min(surface_px[c], surface_px[d]))
+    high_px = max(max(surface_px[a], surface_px[b]), max(surface_px[c], surface_px[d]))
+    if high_px - low_px <= SAME_SURFACE_PX:
+        w0 = ((-0.5 * part + 1.0) * part - 0.5) * part
+        w1 = (1.5 * part - 2.5) * part * part + 1.0
+        w3 = (0.5 * part - 0.5) * part * part
+        w2 = 1.0 - w0 - w1 - w3
+    for k in range(3):
+        level = w0 * image[a, k] + w1 * image[b, k] + w2 * image[c, k] + w3 * image[d, k]
+        colour[k] = np.uint8(min(max(level, 0.0), 255.0) + 0.5)

@@ -1,0 +1,112 @@
+"""What colour a pixel of the new view has that no photograph shows: the background's, continued."""
+
+import math
+import typing
+
+from stereoweave.rendering.canvas_kernels import NOTHING, SAME_SURFACE_PX
+from stereoweave.system.jit import compiled, kernel
+
+NARROW_PX = 8
+"""A hole of at most so many pixels needs no texture."""
+
+
+@kernel
+@typing.no_type_check
+def lay(hidden_px, colours, shift, offset_px, canvas):
+    """Write the hidden background (hidden_kernels.uncover) where the canvas has no pure colour.
+
+    A pixel on the rim of something keeps its colour if it is farther than that: a gap in a fence stays open.
+    """
+    height, width = hidden_px.shape
+    for y in range(height):
+        for k in range(width):
+            # What lands on one pixel comes nearest first, so that nothing is laid twice.
+            x = k if shift > 0 else width - 1 - k
+            d = hidden_px[y, x]
+            if d == NOTHING:
+                continue
+            at = x + shift * d + offset_px
+            for u in range(max(math.ceil(at - 0.5), 0), min(math.ceil(at + 0.5) - 1, width - 1) + 1):
+                own_px = canvas.surface_px[y, u]
+                farther = own_px > NOTHING and own_px < d - SAME_SURFACE_PX
+                if farther or canvas.pure[y, u]:
+                    continue
+                _mix(hidden_px[y], colours[y], x, u - at, canvas.image[y, u])
+                canvas.surface_px[y, u], canvas.pure[y, u], canvas.drawn[y, u] = d, True, False
+
+
+@compiled
+@typing.no_type_check
+def _mix(hidden_px, colours, x, beyond, colour):
+    """Write the colour between the hidden pixel x and its neighbour, `beyond` pixels from it."""
+    beside = x + (1 if beyond > 0 else -1)
+    part = abs(beyond)
+    if beside < 0 or beside >= hidden_px.shape[0] or abs(hidden_px[beside] - hidden_px[x]) > SAME_SURFACE_PX:
+        part = 0.0
+        beside = x
+    for channel in range(3):
+        colour[channel] = (1.0 - part) * colours[x, channel] + part * colours[beside, channel] + 0.5
+
+
+@kernel
+@typing.no_type_check
+def fill(canvas):
+    """Give every run of pixels that are still not pure what is seen beside its farther end.
+
+    That is one mean colour for a narrow run, which errs least. A wide one shows texture, mirrored at that
+    end, and so does one at the picture's border, which has one end only. As in `lay`, a farther pixel on the
+    rim keeps its colour.
+    """
+    surface_px, pure, drawn = canvas.surface_px, canvas.pure, canvas.drawn
+    height, width = pure.shape
+    for y in range(height):
+        start = 0
+        while start < width:
+            if pure[y, start]:
+                start += 1
+                continue
+            end = start
+            while end < width and not pure[y, end]:
+                drawn[y, end] = surface_px[y, end] > NOTHING
+                end += 1
+            from_left = end == width or (start > 0 and surface_px[y, start - 1] <= surface_px[y, end])
+            source = start - 1 if from_left else end
+            mirrors = start == 0 or end == width or end - start > NARROW_PX
+            if source >= 0:
+                colour = _mean_beside(canvas, y, source, -1 if from_left else 1)
+                for u in range(start, end):
+                    if not drawn[y, u] or surface_px[y, u] >= surface_px[y, source] - SAME_SURFACE_PX:
+                        _write(canvas, y, u, source, colour, mirrors)
+            start = end
+
+
+@compiled
+@typing.no_type_check
+def _mean_beside(canvas, y, column, inwards):
+    """The mean colour of the surface at (y, column): two columns of three rows, its own counting twice."""
+    height, width = canvas.pure.shape
+    here_px = canvas.surface_px[y, column]
+    red = green = blue = total = 0.0
+    for row in range(max(y - 1, 0), min(y + 2, height)):
+        for x in (column, min(max(column + inwards, 0), width - 1)):
+            if canvas.pure[row, x] and abs(canvas.surface_px[row, x] - here_px) <= SAME_SURFACE_PX:
+                weight = 2.0 if row == y else 1.0
+                red += weight * canvas.image[row, x, 0]
+                green += weight * canvas.image[row, x, 1]
+                blue += weight * canvas.image[row, x, 2]
+                total += weight
+    return red / total + 0.5, green / total + 0.5, blue / total + 0.5
+
+
+@compiled
+@typing.no_type_check
+def _write(canvas, y, u, source, colour, mirrors):
+    """Write a colour, or what lies as far beyond the source as u lies before it if that is of its surface."""
+    width = canvas.pure.shape[1]
+    mirrored = min(max(2 * source - u, 0), width - 1)
+    apart_px = abs(canvas.surface_px[y, mirrored] - canvas.surface_px[y, source])
+    if mirrors and canvas.pure[y, mirrored] and apart_px <= SAME_SURFACE_PX:
+        canvas.image[y, u] = canvas.image[y, mirrored]
+    else:
+        canvas.image[y, u, 0], canvas.image[y, u, 1], canvas.image[y, u, 2] = colour
+    canvas.surface_px[y, u], canvas.drawn[y, u] = canvas.surface_px[y, source], False

@@ -1,0 +1,153 @@
+"""Which surface a pixel of the new view shows: where the photographs' sides agree, and where they do not."""
+
+import math
+import typing
+
+import numpy as np
+
+from stereoweave.rendering.canvas_kernels import (
+    NOTHING,
+    SAME_SURFACE_PX,
+    lies_on,
+    linear,
+    support_at,
+    support_in_row,
+)
+from stereoweave.system.jit import compiled, inlined
+
+NOISE_LEVELS = 10.0
+"""Differences below this, summed over the channels, say little about which of two surfaces is right."""
+PRIOR = 0.3
+"""What a disparity of no confidence is granted: a certain one outweighs it about four times."""
+
+
+@compiled
+@typing.no_type_check
+def choose_row(left, right, confidence, y, landed_left, landed_right, row):
+    """Write the surface of every pixel of a row, and where there is a second one, that and the shares.
+
+    There are two where the sides contradict each other, and where a nearer surface ends within the pixel.
+    """
+    front_px, back_px = row.front_px, row.back_px
+    width = front_px.shape[0]
+    row.share[:] = 1
+    for u in range(width):
+        a, b = landed_left[u], landed_right[u]
+        same = abs(a - b) <= SAME_SURFACE_PX
+        front_px[u] = np.float32(0.5) * (a + b) if same else max(a, b)
+        back_px[u] = NOTHING if same else min(a, b)
+    for u in range(width):
+        if back_px[u] > NOTHING:
+            a, b = landed_left[u], landed_right[u]
+            part = _share_of_left(left, right, confidence, y, u, a, b)
+            front_px[u] = a if part > 0 else b
+            back_px[u] = b if 0 < part < 1 else NOTHING
+            row.share[u] = part if part > 0 else 1.0
+        before, after = max(u - 1, 0), min(u + 1, width - 1)
+        beside_px = max(
+            max(landed_left[before], landed_left[after]), max(landed_right[before], landed_right[after])
+        )
+        alone = back_px[u] == NOTHING and front_px[u] > NOTHING
+        if alone and beside_px > front_px[u] + SAME_SURFACE_PX:
+            covered = left.nearness * _coverage(left, y, u, beside_px)
+            covered += right.nearness * _coverage(right, y, u, beside_px)
+            if covered > 0:
+                front_px[u], back_px[u], row.share[u] = beside_px, front_px[u], covered
+    support_in_row(left, y, front_px, row.in_left)
+    support_in_row(right, y, front_px, row.in_right)
+
+
+@compiled
+@typing.no_type_check
+def _coverage(side, y, u, d):
+    """How much of the photograph shows the surface of disparity d at (y, u), pure or not: 0..1, 0 outside."""
+    last = side.disparity_px.shape[1] - 1
+    x = _column(side.shift, side.offset_px, u, d)
+    if x < -0.5 or x > last + 0.5:
+        return 0.0
+    i = math.floor(x)
+    before = lies_on(side.disparity_px[y, max(i, 0)] - d)
+    after = lies_on(side.disparity_px[y, min(i + 1, last)] - d)
+    return before + (x - i) * (after - before)
+
+
+@inlined
+@typing.no_type_check
+def _column(shift, offset_px, u, d):
+    """The real column of the photograph that shows disparity d at column u of the new view."""
+    return u - offset_px - shift * d
+
+
+@compiled
+@typing.no_type_check
+def _share_of_left(left, right, confidence, y, u, a, b):
+    """The left side's part, of 1, of a pixel in which the two sides have different surfaces, a and b."""
+    gap_a_px = _gap_px(right, y, u, a)
+    gap_b_px = _gap_px(left, y, u, b)
+    # The nearer surface hides the other, unless the camera that does not have it looks through it.
+    if a > b and gap_a_px >= -SAME_SURFACE_PX:
+        return 1.0
+    if b > a and gap_b_px >= -SAME_SURFACE_PX:
+        return 0.0
+    trust_a = linear(confidence[y], _column(left.shift, left.offset_px, u, a))
+    trust_b = linear(confidence[y], _column(left.shift, left.offset_px, u, b))
+    # The confidence is about the left map, which may have something else at b's place: nearer, so that it
+    # knows nothing of b, or farther, so that it denies b.
+    if gap_b_px > SAME_SURFACE_PX:
+        trust_b = 0.5
+    elif gap_b_px < -SAME_SURFACE_PX:
+        trust_b = 1.0 - trust_b
+    mismatch_a = _mismatch_levels(left, right, y, u, a)
+    mismatch_b = _mismatch_levels(left, right, y, u, b)
+    if min(mismatch_a, mismatch_b) < 0:
+        mismatch_a = mismatch_b = 0.0
+    score_a = (PRIOR + trust_a) / (NOISE_LEVELS + mismatch_a) * _weight(left, right, y, u, a)
+    score_b = (PRIOR + trust_b) / (NOISE_LEVELS + mismatch_b) * _weight(left, right, y, u, b)
+    return score_a / (score_a + score_b) if score_a > 0 else 0.0
+
+
+@compiled
+@typing.no_type_check
+def _gap_px(side, y, u, d):
+    """How much nearer than d is what this side has there: the more similar one of two pixels; 0 outside."""
+    last = side.disparity_px.shape[1] - 1
+    x = _column(side.shift, side.offset_px, u, d)
+    if x < 0 or x > last:
+        return 0.0
+    i = math.floor(x)
+    before = side.disparity_px[y, i] - d
+    after = side.disparity_px[y, min(i + 1, last)] - d
+    return before if abs(before) < abs(after) else after
+
+
+@compiled
+@typing.no_type_check
+def _mismatch_levels(left, right, y, u, d):
+    """How the photographs differ over three pixels around u if d is right: the channels' sum; -1 outside."""
+    left_photo, right_photo = left.photo[y], right.photo[y]
+    last = left_photo.shape[0] - 1
+    total, count = 0.0, 0
+    for column in range(u - 1, u + 2):
+        x = _column(left.shift, left.offset_px, column, d)
+        z = _column(right.shift, right.offset_px, column, d)
+        if min(x, z) < 0 or max(x, z) > last:
+            continue
+        i, k = int(x), int(z)
+        j, m = min(i + 1, last), min(k + 1, last)
+        count += 1
+        for channel in range(3):
+            here = (1 - x + i) * left_photo[i, channel] + (x - i) * left_photo[j, channel]
+            there = (1 - z + k) * right_photo[k, channel] + (z - k) * right_photo[m, channel]
+            total += abs(here - there)
+    return total / count if count else -1.0
+
+
+@compiled
+@typing.no_type_check
+def _weight(left, right, y, u, d):
+    """How well both photographs together show the surface of disparity d at (y, u) of the new view."""
+    total = 0.0
+    for side in (left, right):
+        x = _column(side.shift, side.offset_px, u, d)
+        total += side.nearness * support_at(side.disparity_px[y], side.nearer_px[y], side.shift, x, d)
+    return total

@@ -1,0 +1,221 @@
+"""What the service makes of the pictures of a request: disparity, depth or a view, as the bytes of a file."""
+
+import json
+import re
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from stereoweave.cameras.diagnosis import hints
+from stereoweave.cameras.rectify import cropped
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.decoding import MOST_PIXELS, opening
+from stereoweave.io.files import RangeError, write_image
+from stereoweave.matching.estimate import match_many
+from stereoweave.matching.matcher import Matcher
+from stereoweave.outputs.point_cloud import needed_camera
+from stereoweave.outputs.report import Summary, summarize
+from stereoweave.outputs.results import FILES, Result, needs_camera
+from stereoweave.pictures.loading import pixel_factor
+from stereoweave.pictures.prepare import Prepared, Request, prepare
+from stereoweave.rendering.renderer import Renderer, check_position
+from stereoweave.stereo import Estimate, StereoPair
+
+MOST_MEGAPIXELS = MOST_PIXELS // 1_000_000
+MEDIA_TYPES = {
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
+    ".tiff": "image/tiff",
+    ".pfm": "image/x-portable-floatmap",
+    ".npy": "application/x-npy",
+}
+_VIEW = "view"
+# A note may quote its picture, and what carries them is the head of a response.
+_LONGEST_NOTE = 300
+
+
+class TooLargeError(StereoweaveError):
+    """A picture of more pixels than the service takes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Order:
+    """What a request wants.
+
+    Attributes:
+        folder: Its own, where its pictures are.
+        pictures: Two, left first, or one that holds both views.
+        file: What it gets: a disparity or a depth in `results.FILES`, or a view, such as view.png.
+        request: What is said of the pictures.
+        range_px: As for `matching.match`.
+        refined: Likewise; a view is always made of a refined estimate.
+        position: Where a view is seen from.
+        strength: As for `rendering.Renderer`.
+        checked: Whether the notes say what is amiss with the pair, which takes half as long again.
+        most_megapixels: Of a view.
+    """
+
+    folder: Path
+    pictures: tuple[Path, ...]
+    file: str
+    request: Request = Request()
+    range_px: tuple[float, float] | None = None
+    refined: bool = False
+    position: float = 0.5
+    strength: float = 1.0
+    checked: bool = False
+    most_megapixels: float = MOST_MEGAPIXELS
+
+    def __post_init__(self) -> None:
+        if self.is_view:
+            check_position(0.5 + self.strength * (self.position - 0.5))
+
+    @property
+    def is_view(self) -> bool:
+        """Whether a view is wanted, and not a map."""
+        return self.file.startswith(_VIEW)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """The bytes of a file, and in JSON what is said of it: the numbers of its `Summary`, and notes."""
+
+    content: bytes
+    report: str
+
+
+Answering = Callable[[Sequence[Order]], list[Answer | Exception]]
+
+
+def check_pixels(order: Order) -> float:
+    """The megapixels that are matched, as the heads of the order's pictures say, before memory is spent.
+
+    Raises:
+        TooLargeError: More than the order's views may have.
+        FormatError: No picture, or none of a kind that is read.
+    """
+    views, megapixels = 3 - len(order.pictures), 0.0
+    for path in order.pictures:
+        with opening(path, views=views) as picture:
+            factor = pixel_factor(path, picture, order.request.arrangement) if views == 2 else 1
+            megapixels += factor * _checked_megapixels(
+                path, picture.size, order.most_megapixels * views / factor
+            )
+    return megapixels
+
+
+def _checked_megapixels(path: Path, size_px: tuple[int, ...], most_megapixels: float) -> float:
+    width_px, height_px = size_px
+    megapixels = width_px * height_px / 1e6
+    if megapixels > most_megapixels:
+        raise TooLargeError(
+            f"{path}: expected at most {most_megapixels:g} megapixels, "
+            f"found {width_px}x{height_px}; scale it down"
+        )
+    return megapixels
+
+
+def measuring() -> Callable[[Order], float]:
+    """For a `ChildProcess`: the function that measures the pictures of an order."""
+    return check_pixels
+
+
+def answering(model: str, provider: str, threads: int) -> Answering:
+    """For a `ChildProcess`: loads a network, and returns the function that answers orders with it."""
+    return partial(answer_many, Matcher(model, threads=threads, provider=provider))
+
+
+def answer_many(matcher: Matcher, orders: Sequence[Order]) -> list[Answer | Exception]:
+    """What each order gets, or why it gets nothing; those of one range are matched together."""
+    outcome: dict[int, Any] = {}
+    alike: dict[object, list[int]] = {}
+    for at, order in enumerate(orders):
+        outcome[at] = _attempt(_prepared, order)
+        if isinstance(outcome[at], Prepared):
+            alike.setdefault((order.range_px, order.refined or order.is_view), []).append(at)
+    for places in alike.values():
+        found = _matched(matcher, orders[places[0]], [outcome[at].pair for at in places])
+        for at, estimate in zip(places, found, strict=True):
+            failed = isinstance(estimate, Exception)
+            outcome[at] = (
+                estimate if failed else _attempt(_answered, matcher, orders[at], outcome[at], estimate)
+            )
+    return [outcome[at] for at in range(len(orders))]
+
+
+def told(error: Exception, folder: Path) -> str:
+    """An error in one line and in the words of a request: no path of this machine, fields for options."""
+    text = str(error).replace(f"{folder}/", "")
+    text = re.sub(r"(?<![^\s'\"(])/(?:[^\s/]+/)+", "", text)  # where a network is
+    text = re.sub(r"--([a-z][a-z-]+)", lambda option: option[1].replace("-", "_"), text)
+    return " ".join(text.split())
+
+
+def _attempt(work: Callable[..., Any], *given: Any, **options: Any) -> Any:
+    """What the work gives, or its error."""
+    try:
+        return work(*given, **options)
+    except Exception as error:  # whatever it is: the others of the batch shall not be told it
+        return error
+
+
+def _prepared(order: Order) -> Prepared:
+    prepared = prepare(order.pictures, order.request)
+    # Again: half views that are guessed are larger than the head of their picture says.
+    _checked_megapixels(order.pictures[0], prepared.pair.left.shape[1::-1], order.most_megapixels)
+    if needs_camera(order.file):
+        needed_camera(prepared.pair)
+    return replace(prepared, pair=cropped(prepared.pair)) if order.is_view else prepared
+
+
+def _matched(
+    matcher: Matcher, order: Order, pairs: Sequence[StereoPair]
+) -> Sequence[tuple[Estimate, float] | Exception]:
+    """The estimates of pairs that are matched as the order says, each with its share of the time in ms."""
+    start_s = time.perf_counter()
+    refined = order.refined or order.is_view
+    estimates = _attempt(match_many, matcher, pairs, range_px=order.range_px, refined=refined)
+    if not isinstance(estimates, Exception):
+        estimate_ms = 1000 * (time.perf_counter() - start_s) / len(pairs)
+        return [(estimate, estimate_ms) for estimate in estimates]
+    if len(pairs) == 1:
+        return [estimates]
+    # One by one, so that those that can be matched are.
+    return [found for pair in pairs for found in _matched(matcher, order, [pair])]
+
+
+def _answered(matcher: Matcher, order: Order, prepared: Prepared, found: tuple[Estimate, float]) -> Answer:
+    pair, (estimate, estimate_ms) = prepared.pair, found
+    names = tuple(picture.name for picture in order.pictures)
+    summary = summarize(pair, estimate, pictures=names, model=matcher.name, estimate_ms=estimate_ms)
+    result = Result(pair=pair, estimate=estimate, summary=summary, threads=matcher.threads)
+    notes = [*prepared.notes, *(hints(pair, estimate) if order.checked else ())]
+    # Not beside its pictures: where the client went away their folder is removed, and would be made again.
+    with TemporaryDirectory(prefix="stereoweave-") as folder:
+        path = Path(folder, order.file)
+        if order.is_view:
+            renderer = Renderer(pair, estimate, strength=order.strength, threads=matcher.threads)
+            write_image(path, renderer.view(order.position).image)
+        else:
+            _write_map(path, result)
+        return Answer(content=path.read_bytes(), report=_report(summary, notes, order.folder))
+
+
+def _write_map(path: Path, result: Result) -> None:
+    try:
+        FILES[path.name](path, result)
+    except RangeError as error:
+        summary = result.summary
+        raise StereoweaveError(
+            f"{path.name}: expected 0 to 255.99 px, which a PNG holds, found "
+            f"{summary.disparity_min_px:.2f} to {summary.disparity_max_px:.2f} px; ask for pfm, npy or tiff"
+        ) from error
+
+
+def _report(summary: Summary, notes: Sequence[str], folder: Path) -> str:
+    told_notes = [told(StereoweaveError(note), folder)[:_LONGEST_NOTE] for note in notes]
+    return json.dumps(asdict(summary) | {"notes": told_notes}, allow_nan=False)

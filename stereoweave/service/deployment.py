@@ -1,0 +1,325 @@
+"""The service: pictures are posted, depth and views come back. Ray Serve runs it.
+
+Each replica has a network of its own. A request waits until what came before it is matched, and is then
+matched together with those that waited with it.
+"""
+
+import asyncio
+import logging
+import math
+import os
+import re
+import socket
+import time
+import urllib.request
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any
+
+import ray
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.core import Metric
+from prometheus_client.parser import text_string_to_metric_families
+from prometheus_client.registry import Collector
+from pydantic import BaseModel, ConfigDict, Field
+from ray import serve
+from ray.exceptions import RayActorError
+from ray.serve.handle import DeploymentHandle
+from ray.serve.schema import LoggingConfig
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.matching.matcher import Matcher
+from stereoweave.service.admission import Budget, work_of
+from stereoweave.service.answers import Answer, Order, answering
+from stereoweave.service.asgi import FAILURES, Guard, Limits, make_app
+from stereoweave.service.folders import own_folder
+from stereoweave.service.server import Patience, http_server
+from stereoweave.service.worker import Task, Worker
+from stereoweave.system.child_process import ProcessDiedError
+from stereoweave.system.ray_engine import Engine, connect, room
+from stereoweave.system.threads import usable_cores
+
+NAME = "stereoweave"
+GPU_PROVIDERS = ("cuda", "tensorrt")
+# Those that are woken together come within this.
+_GATHERED_WITHIN_S = 0.005
+# The pairs of a batch are in memory at once: of large ones there are fewer.
+_MEGAPIXELS_AT_ONCE = 32
+# Beyond those that wait: it refuses them, or says how it is.
+_MOST_AT_DOOR = 200
+# Of what Ray counts: pairs matched together, requests accepted, requests that wait before replicas.
+_METRICS = (
+    r"ray_(stereoweave_|serve_(actual_batch_size|replica_processing_queries|deployment_queued_queries))"
+)
+_METRICS_WITHIN_S = 5
+_QUIET = LoggingConfig(log_level="ERROR", enable_access_log=False)
+
+
+class Settings(BaseModel):
+    """What the service is made of.
+
+    Attributes:
+        model: As for `Matcher`.
+        provider: Likewise.
+        threads: Likewise, of each replica.
+        replicas: So many processes, each with its network.
+        batch: At most so many pairs are matched together. A processor gains nothing by it: of two cores, a
+            pair of 640x480 px takes 400, 390 and 405 ms by one, two and four.
+        limits: What each replica accepts.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    model: str = "small"
+    provider: str = "cpu"
+    threads: Annotated[int, Field(ge=1)] = 1
+    replicas: Annotated[int, Field(ge=1)] = 1
+    batch: Annotated[int, Field(ge=1)] = 1
+    limits: Limits = Limits()
+
+    @property
+    def gpus_each(self) -> int:
+        """The GPUs that each replica has to itself."""
+        return 1 if self.provider in GPU_PROVIDERS else 0
+
+
+@serve.ingress()
+class Replica:
+    """A process of the service, which answers orders, and on a cluster HTTP as well."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings, self._opened = settings, ExitStack()
+        self._folder = self._opened.enter_context(own_folder())
+        make = partial(answering, settings.model, settings.provider, settings.threads)
+        self._worker = Worker(make, self._folder)
+        self._opened.callback(self._worker.close)
+        self._budget = Budget(self._worker.warm_up())
+        # One thread for each process of the worker: what waits for it is not sent, and can be cancelled.
+        self._measuring, self._answering = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
+        self._free = asyncio.Event()
+        self._free.set()
+        self._together = serve.batch(
+            max_batch_size=settings.batch, batch_wait_timeout_s=_GATHERED_WITHIN_S, batch_size_fn=self._size
+        )(self._answered)
+
+    def __del__(self) -> None:  # called by Ray Serve when a replica is to end
+        self._opened.close()
+
+    def __serve_build_asgi_app__(self) -> Guard:
+        limits = self._settings.limits
+        return Guard(make_app(self._answer, limits, metrics, self._folder), limits)
+
+    async def outcome(self, order: Order, left_s: float) -> Answer | Exception:
+        """What an order gets within the seconds that are left for it, or why it gets nothing."""
+        try:
+            return await self._answer(order, left_s)
+        except FAILURES as error:
+            return error
+
+    async def _answer(self, order: Order, left_s: float) -> Answer:
+        """The answer to an order; what is cancelled while it waits is never begun."""
+        deadline_s = time.monotonic() + left_s
+        loop = asyncio.get_running_loop()
+        megapixels = await loop.run_in_executor(self._measuring, self._worker.measure, order, left_s)
+        with self._budget.admit(order, megapixels, deadline_s - time.monotonic()):
+            # Else each that comes while another is matched would be a batch of its own.
+            await self._free.wait()
+            answer = await self._together(Task(order, megapixels, deadline_s))
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    async def _answered(self, tasks: list[Task]) -> list[Answer | Exception]:
+        self._free.clear()
+        start_s = time.perf_counter()
+        try:
+            loop = asyncio.get_running_loop()
+            answers = await loop.run_in_executor(self._answering, self._worker.answer, tasks)
+        finally:
+            self._free.set()
+        if all(isinstance(answer, Answer | TimeoutError) for answer in answers):
+            work = sum(work_of(task.order, task.megapixels) for task in tasks)
+            finished = all(isinstance(answer, Answer) for answer in answers)
+            self._budget.learn(work, time.perf_counter() - start_s, finished=finished)
+        return answers
+
+    def _size(self, tasks: Sequence[Task]) -> int:
+        """How much of a batch they fill, counted in pairs."""
+        most = self._settings.batch
+        return sum(min(math.ceil(task.megapixels * most / _MEGAPIXELS_AT_ONCE), most) for task in tasks)
+
+
+def application(settings: Settings) -> serve.Application:
+    """The service for `serve.run`, or for a Serve config file as stereoweave.service:application."""
+    deployed = serve.deployment(
+        name=NAME,
+        num_replicas=settings.replicas,
+        ray_actor_options={"num_cpus": settings.threads, "num_gpus": settings.gpus_each},
+        max_ongoing_requests=settings.limits.waiting + _MOST_AT_DOOR,
+        max_queued_requests=_MOST_AT_DOOR,
+        graceful_shutdown_timeout_s=settings.limits.timeout_s,
+        # What hinders a network once hinders it again.
+        max_constructor_retry_count=2,
+        logging_config=_QUIET,
+    )
+    return deployed(Replica).bind(settings)
+
+
+def metrics() -> bytes:
+    """What the exporters of Ray's nodes have of the service, in Prometheus' text format.
+
+    They gather it every ten seconds. They also have what Ray and its Serve count of themselves.
+    """
+    merged: dict[str, Metric] = {}
+    for family in (each for url in _exporters() for each in _exported(url)):
+        known = merged.setdefault(family.name, family)
+        known.samples += family.samples if known is not family else []
+    registry = CollectorRegistry()
+    registry.register(_Gathered(merged.values()))
+    return generate_latest(registry)
+
+
+def _exporters() -> Iterator[str]:
+    for node in ray.nodes():  # type: ignore[no-untyped-call]
+        if node["Alive"]:
+            yield f"http://{node['NodeManagerAddress']}:{node['MetricsExportPort']}/metrics"
+
+
+def _exported(url: str) -> Iterable[Metric]:
+    """What an exporter has of the service; the rest is hundreds of times as much."""
+    with urllib.request.urlopen(url, timeout=_METRICS_WITHIN_S) as response:
+        lines = response.read().decode().splitlines()
+    ours = [line for line in lines if re.match(rf"(# (HELP|TYPE) )?{_METRICS}", line)]
+    return text_string_to_metric_families("\n".join([*ours, ""]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Gathered(Collector):
+    """Metrics that were counted elsewhere."""
+
+    metrics: Iterable[Metric]
+
+    def collect(self) -> Iterable[Metric]:
+        return self.metrics
+
+
+@contextmanager
+def serving(settings: Settings, listener: socket.socket, address: str | None = None) -> Iterator[None]:
+    """The service, for as long as the block lasts; what it accepted is done before it ends.
+
+    Args:
+        settings: What it is made of.
+        listener: Where it is served. On a cluster it is closed, and Ray's own proxies listen there on each
+            machine that has a replica.
+        address: As for `Engine`; a cluster that serves nothing yet.
+
+    Raises:
+        StereoweaveError: There is no room for all replicas, or Ray or the network is not as it should be.
+    """
+    address = address or os.environ.get("RAY_ADDRESS")
+    engine = Engine(address, cpus_each=settings.threads, gpus_each=settings.gpus_each)
+    if address is None:
+        _check_room(settings, usable_cores() // settings.threads)
+        Matcher(settings.model, provider=settings.provider)  # its errors come before Ray takes seconds
+    logging.getLogger("ray.serve").setLevel(logging.CRITICAL)
+    with connect(engine):
+        _check_free(address)
+        _check_room(settings, _room(engine))
+        with (_at_proxies if address else _at_server)(settings, listener):
+            yield
+
+
+@contextmanager
+def _at_server(settings: Settings, listener: socket.socket) -> Iterator[None]:
+    """The service behind an HTTP server of this process, which hands orders to the replicas."""
+    limits = settings.limits
+    limits = limits.model_copy(update={"waiting": limits.waiting * settings.replicas})
+    serve.start(proxy_location="Disabled", logging_config=_QUIET)
+    with ExitStack() as ending:
+        ending.callback(_end)
+        handle = _run(settings)
+
+        async def answer(order: Order, left_s: float) -> Answer:
+            response = handle.outcome.remote(order, left_s)
+            try:
+                outcome = await response
+            except asyncio.CancelledError:
+                response.cancel()  # type: ignore[no-untyped-call]
+                raise
+            except RayActorError as error:
+                raise ProcessDiedError(
+                    "expected a replica that answers, found that it ended; come again"
+                ) from error
+            if isinstance(outcome, Exception):
+                raise outcome
+            return outcome
+
+        folder = ending.enter_context(own_folder())
+        app = Guard(make_app(answer, limits, metrics, folder), limits)
+        ending.enter_context(http_server(app, listener, Patience(end_s=limits.timeout_s)))
+        yield
+
+
+@contextmanager
+def _at_proxies(settings: Settings, listener: socket.socket) -> Iterator[None]:
+    """The service behind the HTTP proxies of Ray Serve, one on each machine."""
+    host, port = listener.getsockname()[:2]
+    listener.close()
+    serve.start(http_options={"host": host, "port": port}, logging_config=_QUIET)
+    try:
+        _run(settings)
+        yield
+    finally:
+        _end()
+        serve.shutdown()  # type: ignore[no-untyped-call]
+
+
+def _check_free(address: str | None) -> None:
+    """An error where a cluster serves already: its Serve listens where it does, and at no second port."""
+    others = serve.status().applications
+    if others:
+        raise StereoweaveError(
+            f"{address}: expected a cluster that serves nothing yet, found {', '.join(others)}; "
+            "`serve shutdown` ends that, or add stereoweave.service:application to its Serve config file"
+        )
+
+
+def _run(settings: Settings) -> DeploymentHandle[Any]:
+    """Start the replicas, and wait until their networks are loaded."""
+    try:
+        return serve.run(application(settings), name=NAME, route_prefix="/")
+    except RuntimeError as error:
+        told = "\n".join(each.message for each in serve.status().applications[NAME].deployments.values())
+        ours = re.findall(r"^stereoweave\.errors\.\w+: (.+)", told, re.MULTILINE)
+        raise StereoweaveError(
+            f"expected a network that loads where the service runs, found {(ours or [error])[-1]}; "
+            "is the model there too?"
+        ) from error
+
+
+def _end() -> None:
+    """Ends the replicas, each when what it accepted is done."""
+    while NAME in serve.status().applications:
+        with suppress(TimeoutError):  # it waits for a minute, and a request may take longer
+            serve.delete(NAME)
+
+
+def _check_room(settings: Settings, found: int) -> None:
+    """An error where there is room for fewer replicas: Ray would wait for more, without a word."""
+    if settings.replicas > found:
+        gpu = " and a GPU" if settings.gpus_each else ""
+        raise StereoweaveError(
+            f"--replicas {settings.replicas} --threads {settings.threads}: expected at most {found}, for "
+            f"which there is room, found {settings.replicas}; each takes {settings.threads} cores{gpu}"
+        )
+
+
+def _room(engine: Engine) -> int:
+    """How many replicas the machines have room for."""
+    try:
+        return room(engine)
+    except StereoweaveError:  # there is none: it names options of another command
+        return 0

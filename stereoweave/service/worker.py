@@ -1,0 +1,94 @@
+"""Where the service reads and matches: processes that are killed and replaced when they overrun or crash."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from stereoweave.errors import FormatError
+from stereoweave.pictures.prepare import Request
+from stereoweave.service.answers import Answer, Answering, Order, measuring
+from stereoweave.system.child_process import ChildProcess, ProcessDiedError
+
+# The head of a picture takes milliseconds.
+_MEASURED_WITHIN_S = 10
+_SAMPLE = Path(__file__).parents[1] / "sample"
+
+
+@dataclass(frozen=True)
+class Task:
+    """An order, its megapixels, and when its time is up, in seconds of `time.monotonic`."""
+
+    order: Order
+    megapixels: float
+    deadline_s: float
+
+    @property
+    def left_s(self) -> float:
+        """The seconds that are left for it, 0 or more."""
+        return max(0.0, self.deadline_s - time.monotonic())
+
+
+class Worker:
+    """Two processes: one measures pictures by their heads, the other one decodes and matches them.
+
+    Args:
+        make_answering: Makes the function of the second one, such as `partial(answering, "small", "cpu", 1)`.
+        folder: For the temporary files of both.
+    """
+
+    def __init__(self, make_answering: Callable[[], Answering], folder: Path) -> None:
+        self._measuring = ChildProcess(measuring, folder / "measuring")
+        self._answering = ChildProcess(make_answering, folder / "answering")
+
+    def close(self) -> None:
+        """End the processes."""
+        self._measuring.close()
+        self._answering.close()
+
+    def warm_up(self) -> float:
+        """The seconds per megapixel of a plain disparity; whatever is compiled once is compiled before.
+
+        Raises:
+            MatcherError: The network cannot be loaded.
+        """
+        pictures = (_SAMPLE / "left.jpg", _SAMPLE / "right.jpg")
+        plain = Order(folder=_SAMPLE, pictures=pictures, file="disparity.png")
+        every_option = replace(plain, file="view.png", request=Request(rectify=True), checked=True)
+        for order in (every_option, plain):
+            start_s = time.perf_counter()
+            (answer,) = self._answering([order], timeout_s=None)
+            took_s = time.perf_counter() - start_s
+            if isinstance(answer, Exception):
+                raise answer
+        return took_s / self._measuring(plain, timeout_s=None)
+
+    def measure(self, order: Order, left_s: float) -> float:
+        """The megapixels of an order's pictures, before they are decoded.
+
+        Raises:
+            StereoweaveError: As of `check_pixels`; or the process crashed.
+            TimeoutError: It takes longer than that.
+        """
+        try:
+            return self._measuring(order, min(left_s, _MEASURED_WITHIN_S))
+        except TimeoutError as error:
+            if left_s < _MEASURED_WITHIN_S:
+                raise
+            raise FormatError(
+                f"expected pictures whose sizes are known within {_MEASURED_WITHIN_S} s, found that it takes "
+                "longer; save them again"
+            ) from error
+
+    def answer(self, tasks: Sequence[Task]) -> list[Answer | Exception]:
+        """What each task gets, or why it gets nothing.
+
+        At the deadline of any of them the process is killed, and the others begin again in a new one, each
+        alone; so they do when the process crashes.
+        """
+        try:
+            return self._answering([task.order for task in tasks], min(task.left_s for task in tasks))
+        except (TimeoutError, ProcessDiedError) as error:
+            if len(tasks) == 1:
+                return [error]
+        return [outcome for task in tasks for outcome in self.answer([task])]

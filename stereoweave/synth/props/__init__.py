@@ -1,0 +1,1 @@
+"""The things of which scenes are made."""

@@ -1,0 +1,159 @@
+"""Many things spread through what a camera may see, near and far, standing and floating."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from stereoweave.synth.props.furniture import FURNITURE
+from stereoweave.synth.props.primitives import turn
+from stereoweave.synth.props.solids import SOLIDS, Skin, Thing
+from stereoweave.synth.props.surfaces import surface
+from stereoweave.synth.props.thin_things import THIN
+from stereoweave.synth.rigs import Orbit
+from stereoweave.synth.stage import Palette
+from stereoweave.synth.world import Mesh
+
+COUNT = (15, 40)
+_SIZES_M = (0.05, 1.5)
+_NEAREST_M = 0.75
+# Things look 5 to 55 % as large as they are far, so that they fill the picture at all depths.
+_SIZE_PER_DISTANCE = (0.05, 0.55)
+_TYPICAL_FOCAL_PX = 600
+_THIN_PX = (1.0, 6.0)
+_CANDIDATES = 24
+_CLEAR_M = 0.6  # between a camera and what is nearest
+
+
+@dataclass(frozen=True, kw_only=True)
+class Space:
+    """Where things may be.
+
+    Attributes:
+        orbit: where the cameras are; things keep away from all of it.
+        low_m, high_m: [3], the corners of the box that things stay in; its floor is at low_m[2].
+        far_m: how far from the cameras things may be.
+        count: of things, from..to.
+        standing: the share of things that stand on the floor.
+    """
+
+    orbit: Orbit
+    low_m: Float[np.ndarray, "3"]
+    high_m: Float[np.ndarray, "3"]
+    far_m: float
+    count: tuple[int, int] = COUNT
+    standing: float = 0.4
+
+    def eyes_m(self) -> Float[np.ndarray, "n 3"]:
+        """Places all over the orbit."""
+        orbit = self.orbit
+        ranges = (orbit.distance_m, orbit.azimuth_deg, orbit.elevation_deg)
+        grids = np.meshgrid(*(np.linspace(start, end, 3) for start, end in ranges))
+        distance, azimuth, elevation = (grid.ravel() for grid in grids)
+        azimuth, elevation = np.radians(azimuth), np.radians(elevation)
+        level = np.cos(elevation)
+        outwards = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], -1)
+        eyes_m = np.array(orbit.centre_m) + distance[:, None] * outwards
+        eyes_m[:, 2] = np.maximum(eyes_m[:, 2], orbit.floor_m)
+        return eyes_m
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Place:
+    """Where a thing goes and how large it is; distance_m is from the nearest camera."""
+
+    middle_m: Float[np.ndarray, "3"]
+    distance_m: float
+    size_m: float
+    standing: bool
+
+
+def clutter(rng: np.random.Generator, palette: Palette, space: Space) -> list[Mesh]:
+    """15 to 40 things of 5 cm to 1.5 m; in half of the draws many of them are 1 to 6 px thin."""
+    count = int(rng.integers(space.count[0], space.count[1] + 1))
+    thin_share = rng.uniform(0.25, 0.5) if rng.random() < 0.5 else 0.0
+    bars_px = _log_uniform(rng, *_THIN_PX, (count,))
+    things, skins = [], []
+    for place, bar_px in zip(_places(rng, space, count), bars_px, strict=True):
+        skins.append(palette.add(surface(rng, place.distance_m)))
+        bar_m = bar_px / 2 * place.distance_m / _TYPICAL_FOCAL_PX
+        other = skins[rng.integers(len(skins))]
+        skin = Skin(main=skins[-1], other=other, bar_m=min(float(bar_m / place.size_m), 0.05))
+        things.append(_set(rng, _kind(rng, thin_share)(rng, skin), place, float(space.low_m[2])))
+    return things
+
+
+def _log_uniform(rng: np.random.Generator, low: float, high: float, shape: tuple[int, ...]) -> np.ndarray:
+    return np.exp(rng.uniform(np.log(low), np.log(high), shape))
+
+
+def _kind(rng: np.random.Generator, thin_share: float) -> Thing:
+    """One of all kinds; thin ones as often as asked for."""
+    others = SOLIDS if rng.random() < 0.65 else FURNITURE
+    kinds = THIN if rng.random() < thin_share else others
+    return kinds[rng.integers(len(kinds))]
+
+
+def _places(rng: np.random.Generator, space: Space, count: int) -> list[_Place]:
+    """Where things go, the seemingly largest first, while there is room.
+
+    Each takes the best of some candidates: away from all cameras is a must, apart from the rest is not.
+    """
+    eyes_m = space.eyes_m()
+    shape = (count, _CANDIDATES)
+    sizes = np.sort(_log_uniform(rng, *_SIZE_PER_DISTANCE, (count,)))[::-1]
+    standing = rng.random(count) < space.standing
+    depths_m = _log_uniform(rng, _NEAREST_M, space.far_m, shape)
+    sizes_m = np.clip(sizes[:, None] * depths_m, *_SIZES_M)
+    spots = _seen_at(rng, space, eyes_m[rng.integers(len(eyes_m), size=shape)], depths_m)
+    half_m = 0.45 * sizes_m[..., None]
+    spots = np.clip(spots, space.low_m + half_m, space.high_m - half_m)
+    spots[standing, :, 2] = space.low_m[2] + sizes_m[standing] / 2
+    clear_m = np.sqrt(np.square(spots[:, :, None] - eyes_m).sum(-1).min(-1))
+    safe_m = np.minimum(clear_m - _CLEAR_M - 0.55 * sizes_m, 0)
+    taken, radii_m, places = np.full((count, 3), np.inf), np.zeros(count), []
+    for k in range(count):
+        apart_m = np.sqrt(np.square(spots[k, :, None] - taken[:k]).sum(-1)) - radii_m[:k]
+        best = int((9 * safe_m[k] + np.minimum(apart_m.min(1, initial=9) - 0.4 * sizes_m[k], 0)).argmax())
+        size_m = min(sizes_m[k, best], max(clear_m[k, best] - _CLEAR_M, 0.03) / 0.55)
+        taken[k], radii_m[k] = spots[k, best], 0.4 * size_m
+        places.append(
+            _Place(
+                middle_m=spots[k, best],
+                distance_m=float(clear_m[k, best]),
+                size_m=float(size_m),
+                standing=bool(standing[k]),
+            )
+        )
+    return places
+
+
+def _seen_at(
+    rng: np.random.Generator,
+    space: Space,
+    eyes_m: Float[np.ndarray, "n k 3"],
+    depths_m: Float[np.ndarray, "n k"],
+) -> Float[np.ndarray, "n k 3"]:
+    """Points anywhere in the pictures of cameras that look at the orbit's centre."""
+    forward = np.array(space.orbit.centre_m) - eyes_m
+    forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    # Focal lengths are drawn later: some keep within the narrowest picture, some reach the widest one's edge.
+    reach = rng.uniform(0.25, 0.6, depths_m.shape)
+    x, y = reach * rng.uniform(-1, 1, depths_m.shape), 0.75 * reach * rng.uniform(-1, 1, depths_m.shape)
+    seen = forward + x[..., None] * right + y[..., None] * np.cross(right, forward)
+    return eyes_m + depths_m[..., None] * seen
+
+
+def _set(rng: np.random.Generator, mesh: Mesh, place: _Place, floor_m: float) -> Mesh:
+    """The mesh turned and scaled to its size, texture too, around its place or on the floor under it."""
+    low, high = mesh.corners_m.min((0, 1)), mesh.corners_m.max((0, 1))
+    scale = place.size_m / float((high - low).max())
+    axis = np.array([0, 0, 1]) if place.standing else rng.normal(size=3)
+    pose = turn(tuple(axis.tolist()), rng.uniform(0, 360))
+    pose[:3, :3] *= scale
+    pose[:3, 3] = place.middle_m - pose[:3, :3] @ ((low + high) / 2)
+    if place.standing:
+        pose[2, 3] = floor_m - scale * float(low[2])
+    return replace(mesh.placed(pose), uv_m=mesh.uv_m * np.float32(scale))

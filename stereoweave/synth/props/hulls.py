@@ -1,0 +1,118 @@
+"""Hulls of ships: the skin in its paints, the deck, and places on both for what is fixed to them."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from stereoweave.synth.props.primitives import sheet, sweep
+from stereoweave.synth.world import Mesh, joined
+
+Values = float | np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hull:
+    """A hull whose bow is at +x and whose waterline is z = 0.
+
+    Attributes:
+        length_m: at the waterline, from -length_m / 2 to length_m / 2.
+        beam_m: the whole breadth of the deck where it is widest.
+        draft_m: how deep the keel is.
+        freeboard_m: how high the bulwark's edge is amidships.
+        sheer_m: how much higher it is at the stern and at the bow.
+        stern: the transom's breadth as a share of the beam.
+        rise: how much of the draft the keel rises by at the stern.
+        rise_to: the share of the length over which it does so.
+        rake_m: how far the stem leans forward.
+        bulwark_m: how much lower the deck is than the bulwark's edge.
+    """
+
+    length_m: float
+    beam_m: float
+    draft_m: float
+    freeboard_m: float
+    sheer_m: tuple[float, float] = (0.1, 0.5)
+    stern: float = 0.75
+    rise: float = 0.4
+    rise_to: float = 0.3
+    rake_m: float = 0.6
+    bulwark_m: float = 0.25
+
+    def edge_m(self, share: Values) -> Values:
+        """Height of the bulwark's edge at a share of the length, 0 at the stern to 1 at the bow."""
+        aft, forward = np.clip((0.4 - share) / 0.4, 0, 1), np.clip((share - 0.4) / 0.6, 0, 1)
+        return self.freeboard_m + self.sheer_m[0] * aft**2 + self.sheer_m[1] * forward**2
+
+    def deck_m(self, x: float) -> float:
+        """Height of the deck at x."""
+        return float(self.edge_m(x / self.length_m + 0.5)) - self.bulwark_m
+
+    def keel_m(self, share: Values) -> Values:
+        """Height of the keel, negative."""
+        aft = np.clip(1.35 - 1.35 * share / self.rise_to, 0, 1)
+        return -self.draft_m * (1 - self.rise * aft * aft * (3 - 2 * aft))
+
+    def side_m(self, share: Values, z: Values, side: Values) -> Float[np.ndarray, "... 3"]:
+        """Points of the skin at a share of the length and a height; side: 1 is port (+y), -1 starboard."""
+        share, z, side = np.broadcast_arrays(share, z, side)
+        keel = self.keel_m(share)
+        level = np.clip((z - keel) / (self.edge_m(share) - keel), 0, 1.2)
+        aft, forward = np.clip((0.4 - share) / 0.4, 0, 1), np.clip((share - 0.45) / 0.55, 0, 1)
+        plan = (1 - (1 - self.stern) * aft**2) * np.maximum(1 - forward**2.4, 0) ** 0.8
+        # U-shaped amidships, V-shaped with flare at the bow.
+        y = (self.beam_m / 2 * plan) * level ** (0.2 + 0.25 * aft + 0.75 * forward**1.5) + 0.02
+        x = self.length_m * (share - 0.5) + self.rake_m * level**1.3 * forward**2
+        x = x - 0.35 * self.rake_m * level * aft**3
+        return np.stack([x, side * y, z], -1)
+
+    def skin(self, bottom: int, stripe: int, topside: int, stripe_m: float = 0.12) -> Mesh:
+        """The outside, with a stripe of paint above the waterline, and the transom."""
+        share, dry = self._topside(stripe_m)
+        wet = self.keel_m(share) * (1 - np.linspace(0, 1, 10) ** 3)
+        z = np.concatenate([wet, dry], 1)
+        port, starboard = (self.side_m(share, z, side) for side in (1, -1))
+        middle = port[:, :1] * [1, 0, 1]
+        skin = sheet(np.concatenate([port[:, ::-1], middle, starboard], 1)[:, ::-1], topside)
+        paint = np.full(z.shape[1], topside)
+        paint[:10], paint[10] = bottom, stripe
+        cells = np.concatenate([paint[:0:-1], [bottom, bottom], paint[1:]])
+        material = np.broadcast_to(cells[None, :, None], (60, len(cells), 2)).ravel()
+        return joined([replace(skin, material=material.astype(np.int32)), self._transom(z[0], paint)])
+
+    def deck(self, planks: int, inside: int, rail: int) -> Mesh:
+        """The deck, the bulwark's inside and the rail on its edge."""
+        share = np.linspace(0, 0.985, 41)
+        edge = self.edge_m(share)
+        port, starboard = (self.side_m(share, edge - self.bulwark_m, side) for side in (1, -1))
+        across = np.linspace(0.02, 0.98, 9)[None, :, None]
+        floor = sheet((starboard[:, None] + across * (port - starboard)[:, None]).swapaxes(0, 1), planks)
+        walls, rails = [], []
+        for side in (1, -1):
+            foot, top = (
+                self.side_m(share, edge - drop, side) * [1, 0.985, 1] for drop in (self.bulwark_m, 0)
+            )
+            walls.append(sheet(np.stack([foot, top])[::side], inside))
+            rails.append(sweep(self.side_m(share, edge, side), 0.022, rail, sides=6))
+        return joined([floor, *walls, *rails])
+
+    def patch(self, stations: tuple[int, int], levels: tuple[int, int], side: int, material: int) -> Mesh:
+        """A plate on the skin, over some of its 60 cells along and, from the stripe up, 7 cells high."""
+        share, z = self._topside(0.12)
+        cells = np.s_[stations[0] : stations[1] + 1, levels[0] : levels[1] + 1]
+        points = self.side_m(np.broadcast_to(share, z.shape)[cells], z[cells], side)
+        # Along the same triangles as the skin's, so that it nowhere sinks below them.
+        plate = sheet(points[:, ::side], material)
+        uv = side * np.stack([-plate.uv_m[..., 1], plate.uv_m[..., 0]], -1)
+        outside = plate.corners_m + np.float32(0.012) * plate.normals
+        return replace(plate, corners_m=outside, uv_m=uv - uv.min((0, 1)))
+
+    def _topside(self, stripe_m: float) -> tuple[np.ndarray, np.ndarray]:
+        """Shares of the length [61, 1], and heights [61, 8] from the stripe's edge to the bulwark's."""
+        share = np.linspace(0, 1, 61)[:, None]
+        return share, stripe_m + (self.edge_m(share) - stripe_m) * np.linspace(0, 1, 8)
+
+    def _transom(self, z: np.ndarray, paint: np.ndarray) -> Mesh:
+        port, starboard = (self.side_m(np.zeros(len(z)), z, side) for side in (1, -1))
+        flat = sheet(np.stack([port, starboard], 1), 0)
+        return replace(flat, material=np.repeat(paint[1:], 2).astype(np.int32))

@@ -1,0 +1,127 @@
+"""Ships' screws: pitched, skewed blades with round outlines on a hub, drawn at random."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from stereoweave.synth.props.primitives import copies, lathe, loft, tubes, turn
+from stereoweave.synth.world import Mesh, joined
+
+
+@dataclass(frozen=True, kw_only=True)
+class Screw:
+    """A ship's screw that turns about x; aft is +x.
+
+    Attributes:
+        radius_m: from the axis to the blades' tips.
+        blades: how many.
+        hub_share: the hub's radius as a share of radius_m.
+        pitch_share: how far a turn would screw it forward, as a share of the diameter.
+        skew_deg: how far the tips are swept back.
+        rake_m: how far the tips lean aft.
+        chord_m: the blade's width where it is widest.
+        tip: 3 for slender tips to 9 for blunt ones.
+        hand: 1 or -1, which way it turns.
+    """
+
+    radius_m: float
+    blades: int
+    hub_share: float
+    pitch_share: float
+    skew_deg: float
+    rake_m: float
+    chord_m: float
+    tip: float
+    hand: int
+
+    @property
+    def hub_m(self) -> float:
+        """The hub's radius."""
+        return self.hub_share * self.radius_m
+
+    @property
+    def hub_half_m(self) -> float:
+        """Half the hub's length: it covers the blades' roots."""
+        return 0.5 * 0.5 * self.chord_m * float(np.sin(self._pitch(self.hub_m))) + 0.08
+
+    def sections_m(self, spans: int = 40, points: int = 32) -> Float[np.ndarray, "k m 3"]:
+        """Outlines of one blade's sections from inside the hub to the tip, which is up: rings for a loft."""
+        # The outline is round at the tip, where the sections are therefore close to each other.
+        span = np.sin(np.linspace(0, 0.992 * np.pi / 2, spans))[:, None]
+        inner_m = 0.85 * self.hub_m
+        radius = inner_m + (self.radius_m - inner_m) * span
+        chord = self.chord_m * (0.5 + 0.5 * np.sin(np.pi / 2 * np.minimum(span / 0.65, 1)))
+        chord = chord * np.sqrt(1 - span**self.tip)
+        # Thickest at the root, where it swells into the hub.
+        thick = self.radius_m * (0.065 * (1 - span) + 0.007) * (1 + 0.9 * np.exp(-span / 0.07))
+        thick = np.minimum(thick, 0.6 * chord)
+        angle = np.linspace(0, 2 * np.pi, points, endpoint=False)
+        along, sine = np.cos(angle) / 2 * chord, np.sin(angle)
+        off = thick / 2 * np.sign(sine) * np.abs(sine) ** 1.25 + 0.03 * chord * np.sin(angle) ** 2
+        pitch = self._pitch(radius)
+        skew = np.radians(self.skew_deg) * (span**2 - 0.3 * np.sin(np.pi * span))
+        turned = skew + (along * np.cos(pitch) - off * np.sin(pitch)) / radius
+        x = self.rake_m * span + along * np.sin(pitch) + off * np.cos(pitch)
+        rings = np.stack([x, -self.hand * radius * np.sin(turned), radius * np.cos(turned)], -1)
+        return rings[:, :: self.hand]
+
+    def _pitch(self, radius_m: float | np.ndarray) -> float | np.ndarray:
+        """The blade's slope against the plane of rotation in radians."""
+        return np.arctan(self.pitch_share * 2 * self.radius_m / (2 * np.pi * radius_m))
+
+
+def draw_screw(rng: np.random.Generator) -> Screw:
+    """Three to six blades, from narrow and straight to broad and swept."""
+    blades = int(rng.choice([3, 4, 5, 6], p=[0.2, 0.4, 0.3, 0.1]))
+    radius_m = rng.uniform(2.3, 2.8)
+    return Screw(
+        radius_m=radius_m,
+        blades=blades,
+        hub_share=rng.uniform(0.16, 0.22),
+        pitch_share=rng.uniform(0.75, 1.15),
+        skew_deg=rng.uniform(8, 38),
+        rake_m=rng.uniform(0, 0.12) * radius_m,
+        chord_m=rng.uniform(2.0, 2.7) / blades * radius_m,
+        tip=rng.uniform(3.5, 7),
+        hand=int(rng.choice([-1, 1])),
+    )
+
+
+def screw_mesh(screw: Screw, bronze: int, hub: int, bolt: int) -> Mesh:
+    """Blades, hub, cap and bolts around the origin; one blade points up."""
+    blade = loft(screw.sections_m(), bronze)
+    # Laid on flat, so that the texture is not squeezed at the tip.
+    blade = replace(blade, uv_m=blade.corners_m[..., 1:].copy())
+    around = np.stack([turn((1, 0, 0), k * 360 / screw.blades) for k in range(screw.blades)])
+    return joined([copies(blade, around), _hub(screw, hub), _bolts(screw, bolt)])
+
+
+def along_x(mesh: Mesh) -> Mesh:
+    """The mesh, turned so that what was up is aft."""
+    return mesh.placed(turn((0, 1, 0), 90))
+
+
+def _hub(screw: Screw, material: int) -> Mesh:
+    r, half = screw.hub_m, screw.hub_half_m
+    ogive = np.linspace(0, 1, 9)[:, None]
+    cap = np.concatenate([0.78 * r * np.sqrt(1 - ogive**2), half + 0.1 + 1.15 * r * ogive], 1)
+    body = [
+        (0, -half),
+        (0.93 * r, -half),
+        (0.99 * r, -0.4 * half),
+        (r, 0),
+        (0.97 * r, 0.6 * half),
+        (0.9 * r, half),
+    ]
+    flange = [(0.86 * r, half + 0.015), (0.86 * r, half + 0.085), (0.79 * r, half + 0.1)]
+    return along_x(lathe(np.concatenate([body, flange, cap]), material, sections=56))
+
+
+def _bolts(screw: Screw, material: int) -> Mesh:
+    """Hexagonal heads around the cap's flange and the hub's front."""
+    angle = np.arange(12) * np.pi / 6
+    circle = np.stack([0 * angle, np.cos(angle), np.sin(angle)], -1)
+    size = 0.055 * screw.hub_m / 0.5
+    start = circle * 0.82 * screw.hub_m + [screw.hub_half_m + 0.05, 0, 0]
+    return tubes(start, start + [0.09, 0, 0], size, material, sides=6)

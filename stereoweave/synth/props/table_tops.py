@@ -1,0 +1,97 @@
+"""A table close to the cameras: its top, boards that stand on it, and a wall close behind it.
+
+Everything is built with the cameras towards x and the middle of what they see above the origin, z = 0 being
+the floor of the room.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereoweave.synth.props.primitives import boxes, turn
+from stereoweave.synth.props.surfaces import broad
+from stereoweave.synth.stage import Palette
+from stereoweave.synth.world import Mesh, joined
+
+_TOPS = ("wood", "concrete", "stone", "cloth", "tiles", "photograph", "paint")
+_BACKDROPS = ("plaster", "brick", "photograph", "concrete", "cloth", "wood", "paint")
+_BOARDS = ("photograph", "sign", "wood", "cloth", "paint")
+_THICK_M = 0.04
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableTop:
+    """Sizes of a table top.
+
+    Attributes:
+        distance_m: of the cameras from the middle.
+        height_m: of the table's surface above the floor.
+        behind_m: from the middle to the wall behind; the table reaches up to it.
+        before_m: from the middle to the table's edge towards the cameras.
+        width_m: of the table, across the view.
+    """
+
+    distance_m: float
+    height_m: float
+    behind_m: float
+    before_m: float
+    width_m: float
+
+
+def draw_table_top(rng: np.random.Generator) -> TableTop:
+    """Draw the sizes of a table top; most fill the width of the picture."""
+    distance_m = rng.uniform(1.5, 2.3)
+    return TableTop(
+        distance_m=distance_m,
+        height_m=rng.uniform(0.5, 0.9),
+        behind_m=distance_m * rng.uniform(0.15, 0.75),
+        before_m=distance_m * rng.uniform(0.2, 0.7),
+        width_m=distance_m * rng.uniform(0.7, 2.0),
+    )
+
+
+def table_top(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> Mesh:
+    """Build a table, up to three boards on it, and one or two walls behind it in nine of ten draws."""
+    parts = [_table(rng, palette, sizes), *_boards(rng, palette, sizes)]
+    if rng.random() < 0.9:
+        parts.append(_backdrop(rng, palette, sizes))
+    return joined(parts)
+
+
+def _table(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> Mesh:
+    """A slab on a plinth as deep as the slab, but narrower."""
+    material = palette.add(broad(rng, _TOPS, sizes.distance_m))
+    length_m = sizes.behind_m + sizes.before_m
+    x = (sizes.before_m - sizes.behind_m) / 2
+    under_m = sizes.height_m - _THICK_M
+    slab = boxes([[x, 0, sizes.height_m - _THICK_M / 2]], [[length_m, sizes.width_m, _THICK_M]], material)
+    plinth = boxes([[x - 0.05, 0, under_m / 2]], [[length_m - 0.15, 0.8 * sizes.width_m, under_m]], material)
+    return joined([slab, plinth])
+
+
+def _boards(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> list[Mesh]:
+    """Upright boards that lean a little, of two materials at most."""
+    materials = [palette.add(broad(rng, _BOARDS, sizes.distance_m)) for _ in range(2)]
+    boards = []
+    for _ in range(int(rng.integers(0, 4))):
+        wide_m, high_m = sizes.distance_m * rng.uniform([0.15, 0.12], [0.6, 0.45])
+        board = boxes([[0, 0, high_m / 2]], [[0.02, wide_m, high_m]], materials[int(rng.integers(2))])
+        pose = turn((0, 0, 1), rng.normal(0, 35)) @ turn((0, 1, 0), rng.uniform(-20, 5))
+        x = rng.uniform(-0.9 * sizes.behind_m, min(sizes.before_m, 0.4 * sizes.distance_m))
+        y = rng.uniform(-0.4, 0.4) * sizes.distance_m
+        boards.append(board.placed(pose).moved(x, y, sizes.height_m))
+    return boards
+
+
+def _backdrop(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> Mesh:
+    """A wall across the view, or two that meet in a corner."""
+    material = palette.add(broad(rng, _BACKDROPS, sizes.distance_m + sizes.behind_m))
+    wide_m, high_m = sizes.distance_m * rng.uniform(1.4, 3.0), rng.uniform(1.3, 2.4)
+    wall = boxes([[-0.03, 0, high_m / 2]], [[0.06, wide_m, high_m]], material)
+    if rng.random() < 0.3:
+        other = palette.add(broad(rng, _BACKDROPS, sizes.distance_m + sizes.behind_m))
+        # It ends well before the cameras.
+        deep_m = min(wide_m * rng.uniform(0.3, 0.6), sizes.behind_m + 0.35 * sizes.distance_m)
+        side = boxes([[deep_m / 2, 0.0, high_m / 2]], [[deep_m, 0.06, high_m]], other)
+        wall = joined([wall, side.moved(y=rng.choice([-1, 1]) * rng.uniform(0.2, 0.45) * wide_m)])
+    return wall.placed(turn((0, 0, 1), rng.normal(0, 12))).moved(x=-sizes.behind_m)

@@ -1,0 +1,152 @@
+"""What turns on top of a wind turbine's tower: twisted blades, hub with spinner, nacelle with masts."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from stereoweave.synth.props.lattice import bars, railing
+from stereoweave.synth.props.primitives import boxes, copies, lathe, loft, spheres, turn
+from stereoweave.synth.world import Material, Mesh, joined
+
+STATIONS = 22  # along a blade
+OVERHANG_M = 0.34  # from the tower's axis to the rotor's plane
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rotor:
+    """A rotor's measures; its axis is x, upwind is +x, and z is up.
+
+    Attributes:
+        radius_m: from the axis to the blades' tips.
+        chord_m: the blades' greatest width.
+        pitch_deg: of the blades against the rotor's plane; 90 is feathered.
+        angle_deg: of the first blade, from upright.
+        tilt_deg: of the axis, upwards.
+    """
+
+    radius_m: float
+    chord_m: float
+    pitch_deg: float
+    angle_deg: float
+    tilt_deg: float = 4.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finish:
+    """Materials; `tip` marks bands near the blades' tips and may be the blades' own."""
+
+    white: int
+    tip: int
+    steel: int
+    dark: int
+    lamp: int
+
+
+def composite(rng: np.random.Generator) -> Material:
+    """The white or light grey skin of blades and towers, a little dirty."""
+    grey = rng.uniform(0.68, 0.85)
+    return Material(
+        texture="plain",
+        variant=int(rng.integers(64)),
+        tint=(grey, grey, 0.98 * grey),
+        span_m=2.5,
+        roughness=rng.uniform(0.35, 0.6),
+        relief=0.05,
+    )
+
+
+def head(rotor: Rotor, finish: Finish, around: int = 18) -> Mesh:
+    """Nacelle, hub and blades over the origin, where the tower ends; `around`: points of a section."""
+    blades = copies(_blade(rotor, finish, around), _turns(rotor.angle_deg, 3))
+    turning = joined([blades, _hub(rotor, finish)]).moved(OVERHANG_M)
+    return joined([turning, _nacelle(finish)]).placed(turn((0, 1, 0), -rotor.tilt_deg)).moved(z=0.17)
+
+
+def _turns(angle_deg: float, count: int) -> Float[np.ndarray, "n 4 4"]:
+    return np.stack([turn((1, 0, 0), angle_deg + 360 * k / count) for k in range(count)])
+
+
+def _blade(rotor: Rotor, finish: Finish, around: int) -> Mesh:
+    """A blade along z: round at the root, widest at a fifth of its length, twisted, bent upwind."""
+    share = np.linspace(0, 1, STATIONS)
+    radius = 0.05 * rotor.radius_m + 0.95 * rotor.radius_m * share
+    root = 0.3 * rotor.chord_m
+    grown = np.clip((share - 0.03) / 0.17, 0, 1)
+    grown = grown * grown * (3 - 2 * grown)
+    taper = np.interp(share, (0, 0.2, 0.6, 0.93, 1), (1, 1, 0.52, 0.24, 0.05)) * rotor.chord_m
+    chord = root + grown * (taper - root)
+    thickness = root + grown * (np.interp(share, (0, 0.2, 0.5, 1), (1, 0.3, 0.2, 0.14)) * taper - root)
+    angle = np.arange(around) * 2 * np.pi / around
+    # Round where it has not grown; behind its thickest point a section thins out to its edge.
+    belly = 1 - grown[:, None] * 0.45 * (1 - np.cos(angle))
+    along = chord[:, None] * (np.cos(angle) / 2 - 0.2 * grown[:, None])
+    across = thickness[:, None] * np.sin(angle) / 2 * belly
+    twist = np.radians(rotor.pitch_deg + 16 * (1 - share) ** 2)[:, None]
+    y = along * np.cos(twist) - across * np.sin(twist)
+    x = -(along * np.sin(twist) + across * np.cos(twist)) + 0.025 * rotor.radius_m * share[:, None] ** 2
+    z = np.broadcast_to(radius[:, None], y.shape)
+    mesh = loft(np.stack([x, y, z], -1), finish.white)
+    middle = mesh.corners_m[:, :, 2].mean(1)
+    first, last = radius[[STATIONS - 8, STATIONS - 4]]
+    marked = ((middle > first) & (middle < last)) | (middle > radius[-2])
+    return replace(mesh, material=np.where(marked, finish.tip, mesh.material).astype(np.int32))
+
+
+def _hub(rotor: Rotor, finish: Finish) -> Mesh:
+    """The spinner, pointed upwind, and collars around the blades' roots."""
+    size = max(0.06 * rotor.radius_m, 0.12)
+    profile = np.array(
+        [(0, -1.0), (0.95, -1.0), (1.0, -0.5), (1.0, 0.3), (0.86, 0.85), (0.55, 1.25), (0.2, 1.42), (0, 1.45)]
+    )
+    collar = lathe(
+        [(0, 0), (0.2 * rotor.chord_m, 0), (0.2 * rotor.chord_m, 1.12 * size), (0, 1.12 * size)],
+        finish.steel,
+        20,
+    )
+    return joined(
+        [
+            lathe(profile * size, finish.white, 28).placed(turn((0, 1, 0), 90)),
+            copies(collar, _turns(rotor.angle_deg, 3)),
+        ]
+    )
+
+
+def _nacelle(finish: Finish) -> Mesh:
+    """A rounded box on the tower, with cooler, railing, wind vanes, lightning rod and lamps."""
+    x = np.array([0.24, 0.21, 0.1, -0.25, -0.5, -0.62, -0.65])
+    half = np.array([0.1, 0.135, 0.15, 0.155, 0.145, 0.12, 0.08])
+    angle = np.arange(24) * 2 * np.pi / 24
+    corner = (np.abs(np.cos(angle)) ** 5 + np.abs(np.sin(angle)) ** 5) ** -0.2
+    y = -half[:, None] * corner * np.cos(angle)
+    z = half[:, None] * corner * np.sin(angle) + 0.02
+    skin = loft(np.stack([np.broadcast_to(x[:, None], y.shape), y, z], -1)[::-1], finish.white)
+    roof = np.array(
+        [
+            [0.05, 0.13, 0.165],
+            [-0.5, 0.13, 0.165],
+            [-0.5, -0.13, 0.165],
+            [0.05, -0.13, 0.165],
+            [0.05, 0.13, 0.165],
+        ]
+    )
+    masts = np.array(
+        [
+            [(-0.55, 0.09, 0.15), (-0.55, 0.09, 0.46)],
+            [(-0.55, -0.09, 0.15), (-0.55, -0.09, 0.42)],
+            [(-0.3, 0, 0.15), (-0.3, 0, 0.6)],
+        ]
+    )
+    arms = np.array([[(-0.6, 0.09, 0.4), (-0.5, 0.09, 0.4)], [(-0.55, -0.13, 0.38), (-0.55, -0.05, 0.38)]])
+    return joined(
+        [
+            skin,
+            lathe([(0.13, -0.2), (0.13, -0.1), (0.1, -0.1)], finish.steel, 24),
+            boxes((-0.6, 0, 0.24), (0.06, 0.26, 0.16), finish.dark),
+            boxes((-0.15, 0, 0.165), (0.2, 0.16, 0.02), finish.dark),
+            railing(roof, 0.09, 0.14, 0.005, finish.steel),
+            bars(np.concatenate([masts, arms]), 0.006, finish.steel, sides=4),
+            spheres(arms.reshape(-1, 3), 0.015, finish.dark, 1),
+            spheres([(-0.42, 0.1, 0.2), (-0.42, -0.1, 0.2)], 0.028, finish.lamp, 1),
+        ]
+    )

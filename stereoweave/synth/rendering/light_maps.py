@@ -1,0 +1,83 @@
+"""What light needs to know of a world, as textures: the sun's shadow map and the crowd's grid."""
+
+from typing import Any
+
+import moderngl
+import numpy as np
+from jaxtyping import Float
+
+from stereoweave.synth.rendering.gpu_buffers import Geometry
+from stereoweave.synth.rendering.light_tables import CELLS, SunView, crowd, sun_view
+from stereoweave.synth.rendering.shader_programs import Programs
+from stereoweave.synth.world import Sky
+
+# The square around the target and the wide one lie side by side in one shadow map. More texels would not be
+# seen at 640x480: they are as small as samples there.
+_INNER_PX, _WIDE_PX = 1536, 1024
+_REACH_M = 40.0
+_SHADOW_MAP, _CROWD = 2, 3  # texture units
+
+
+class LightMaps:
+    """The textures, made anew for each world, and the uniforms that surfaces read them with."""
+
+    def __init__(self, gl: moderngl.Context, programs: Programs) -> None:
+        self._gl = gl
+        self._programs = programs
+        self._map = gl.depth_texture((_INNER_PX + _WIDE_PX, _INNER_PX))
+        self._map.filter = moderngl.LINEAR, moderngl.LINEAR
+        self._map.compare_func = "<="
+        self._map.use(_SHADOW_MAP)
+        self._frame = gl.framebuffer(depth_attachment=self._map)
+        self._crowd = gl.texture3d((CELLS, CELLS, CELLS), 1)
+        self._crowd.filter = moderngl.LINEAR, moderngl.LINEAR
+        self._crowd.repeat_x = self._crowd.repeat_y = self._crowd.repeat_z = False
+        self._crowd.use(_CROWD)
+        programs.bind(shadow_map=_SHADOW_MAP, crowd=_CROWD)
+
+    def cast(self, geometry: Geometry, sky: Sky) -> dict[str, Any]:
+        """The sun's shadows."""
+        self._frame.use()
+        self._frame.clear()
+        if not any(sky.sun_light):
+            return {}
+        view = sun_view(geometry.corners_m, geometry.target_m, sky.sun, _REACH_M)
+        # Away from the sun, so that a surface does not fall into its own shadow.
+        self._gl.polygon_offset = 2.0, 4.0
+        for left_px, side_px, to_unit, triangles in (
+            (0, _INNER_PX, view.to_unit, view.inside),
+            (_INNER_PX, _WIDE_PX, _widened(view), view.beyond),
+        ):
+            self._frame.viewport = left_px, 0, side_px, side_px
+            self._programs.set("sun", to_unit=to_unit.T)
+            geometry.draw(self._programs["sun"], triangles)
+        self._gl.polygon_offset = 0.0, 0.0
+        width_px, height_px = self._map.size
+        return {
+            "to_unit": view.to_unit.T,
+            "inner_m": view.inner_m,
+            "wide": view.wide,
+            "squares": (
+                _INNER_PX / width_px,
+                _WIDE_PX / width_px,
+                _INNER_PX / height_px,
+                _WIDE_PX / height_px,
+            ),
+            "texels": (1 / _INNER_PX, view.wide / _WIDE_PX),
+        }
+
+    def occlude(self, geometry: Geometry) -> dict[str, Any]:
+        """Where the sky is hidden."""
+        counted = crowd(geometry.corners_m, geometry.target_m)
+        self._crowd.write(counted.share)
+        side_m = counted.cell_m * CELLS
+        return {"crowd_frame": (*counted.low_m, 1 / side_m)}
+
+
+def _widened(view: SunView) -> Float[np.ndarray, "3 4"]:
+    """From (x, y, z, 1) to 0..1 across and down the wide square."""
+    scale = np.diag([1 / view.wide, 1 / view.wide, 1])
+    middle = np.array([0.5, 0.5, 0])
+    wide = scale @ view.to_unit
+    wide[:, 3] += middle - scale @ middle
+    return wide

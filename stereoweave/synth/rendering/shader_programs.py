@@ -1,0 +1,80 @@
+"""The renderer's programs for the graphics card, from the files in shaders/."""
+
+from importlib import resources
+from typing import Any
+
+import moderngl
+import numpy as np
+
+from stereoweave.synth.rendering.effects import Effects
+from stereoweave.synth.rendering.light_tables import CELLS
+
+MOST_MATERIALS = 64
+MOST_LAMPS = 4
+
+# Vertex shader, then what the fragment shader is joined from.
+_PARTS = {
+    "depth": ("depth.vert", "depth.frag"),
+    "sun": ("sun.vert", "sun.frag"),
+    "sky": ("whole.vert", "light.glsl", "sky.frag"),
+    "resolve": ("whole.vert", "resolve.frag"),
+}
+_SURFACE = ("surface.vert", "light.glsl", "surface.frag")
+
+
+class Programs:
+    """Every program by its name, compiled with the effects that are switched on.
+
+    The program for surfaces is there once for each number of lamps (`surface`), because llvmpipe takes a
+    quarter longer for a loop over lamps whose number it learns from a uniform, even if that is 0; and once
+    more for each without a sun, whose shadows and gloss nobody sees in a closed room.
+    """
+
+    def __init__(self, gl: moderngl.Context, effects: Effects) -> None:
+        def program(vertices: str, *fragments: str, lamps: int = 0, sun: bool = True) -> moderngl.Program:
+            defined = _definitions(effects, lamps, sun)
+            return gl.program(
+                vertex_shader=defined + _text(vertices),
+                fragment_shader=defined + "".join(map(_text, fragments)),
+            )
+
+        self._programs = {name: program(*parts) for name, parts in _PARTS.items()}
+        for lamps in range(MOST_LAMPS + 1):
+            for sun in (False, True):
+                self._programs[surface(lamps, sun)] = program(*_SURFACE, lamps=lamps, sun=sun)
+
+    def __getitem__(self, name: str) -> moderngl.Program:
+        return self._programs[name]
+
+    def bind(self, **units: int) -> None:
+        """Tells every program in which texture units its samplers find their textures."""
+        for program in self._programs.values():
+            for key, unit in units.items():
+                if key in program:
+                    program[key] = unit
+
+    def set(self, name: str, **values: Any) -> None:
+        """Sets a program's uniforms, matrices by columns; those that no effect uses are passed over."""
+        program = self._programs[name]
+        for key, value in values.items():
+            uniform = program.get(key, None)
+            if isinstance(uniform, moderngl.Uniform):
+                uniform.write(np.ascontiguousarray(value, np.float32).tobytes())
+
+
+def surface(lamps: int, sun: bool) -> str:
+    """The name of the program for surfaces in the light of a number of lamps, with or without a sun."""
+    return f"surface, {lamps} lamps{', sun' * sun}"
+
+
+def _definitions(effects: Effects, lamps: int, sun: bool) -> str:
+    switches = ("shadows",) * sun + ("ambient_occlusion", "gloss", "fog", "relief")
+    numbers = {"MATERIALS": MOST_MATERIALS, "LAMPS": lamps, "SAMPLES": effects.samples, "CELLS": CELLS}
+    lines = [f"#define {name.upper()}" for name in switches if getattr(effects, name)]
+    lines += ["#define SUN"] * sun
+    lines += [f"#define {name} {number}" for name, number in numbers.items()]
+    return "\n".join(["#version 330 core", *lines, ""])
+
+
+def _text(name: str) -> str:
+    return (resources.files("stereoweave.synth.rendering") / "shaders" / name).read_text()

@@ -1,0 +1,1 @@
+"""Sets of rendered pairs: made, checked, shown."""

@@ -1,0 +1,290 @@
+"""Whether a set on disk is whole and true: checksums; disparities against the pictures and each other."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache, partial
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from rich.console import Console
+
+from stereoweave.data.paper_layout import check_frame, paper
+from stereoweave.data.shards import Shards
+from stereoweave.errors import FormatError
+from stereoweave.stereo import Sample
+from stereoweave.synth.sets.make import read_set
+from stereoweave.synth.sets.workers import in_workers, step_done
+
+_DISPARITY_EDGES_PX = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
+_DEPTH_EDGES_M = (0.0, 1.0, 2.0, 3.0, 5.0, 7.5, 10.0, 15.0, 25.0, 50.0, 100.0)
+_WIDEST_BAR = 40
+_PAIRS_A_TASK = 20
+# Rounding on disk is at most 0.002 px of it.
+_AGREE_PX = 0.05
+# Of rendered pairs of all scenes 98 % agree and more at 64x48, 99.1 % at 160x120 and 99.9 % at 640x480; with
+# one of the two maps 0.1 px off, 29 % at most.
+_LEAST_AGREEING = 0.95
+# Rendered pairs differ by at most 0.90, 0.76 and 0.66 of what they differ by a pixel beside the disparity;
+# those whose disparity is a pixel off by 1.1 and more, those that have changed sides by 0.99 and more.
+_LARGEST_RATIO = 0.97
+# The mean over fewer pixels is chance.
+_FEWEST_PIXELS = 200
+# What is farther, the sky above all, looks alike in both pictures even where these have changed sides.
+_NEAR_PX = 1.0
+_JUMP_PX = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Findings:
+    """What was found in pairs; those of several add up.
+
+    Attributes:
+        pairs: how many were looked at.
+        disparity: how many known pixels of left views lie in each of the 10 bars of the histogram.
+        depth: the same in its 11 bars of depth; the last one has the sky in it.
+        unknown: pixels without truth.
+        occluded: pixels that the left camera alone sees.
+        grey_levels: [3], sums over the pairs of the mean difference of the left picture and the right one,
+            fetched by the disparity - 1 px, by it, and by it + 1 px.
+        compared: of how many pairs that is: those with near things in both views.
+        agreeing: sum over the pairs of the share of pixels at which both disparities agree.
+        matched: of how many pairs that is: those with both disparities.
+        problems: a line each.
+    """
+
+    pairs: int
+    disparity: Int[np.ndarray, "10"]
+    depth: Int[np.ndarray, "11"]
+    unknown: int
+    occluded: int
+    grey_levels: Float[np.ndarray, "3"]
+    compared: int
+    agreeing: float
+    matched: int
+    problems: tuple[str, ...]
+
+    def __add__(self, other: "Findings") -> "Findings":
+        return Findings(**{name: value + getattr(other, name) for name, value in vars(self).items()})
+
+
+class _Pairs(NamedTuple):
+    """Names and files of the pairs, a folder's frames being files of their own; and what reads one."""
+
+    names: list[str]
+    files: list[str]
+    read: Callable[[int], Sample]
+
+    def runs(self) -> list[range]:
+        """The pairs in runs, none of which ends within a file."""
+        starts = [0, *(i for i in range(1, len(self.files)) if self.files[i] != self.files[i - 1])]
+        if len(starts) == len(self.files):
+            starts = starts[::_PAIRS_A_TASK]
+        return [range(start, end) for start, end in pairwise([*starts, len(self.files)])]
+
+
+def check(folder: Path, jobs: int = 1, console: Console | None = None) -> Findings:
+    """What all pairs of a set come to; `problems` is empty where the set is in order.
+
+    Raises:
+        FormatError: There is no set in the folder, or files are missing between others.
+    """
+    facts = read_set(folder)
+    pairs = _opened(folder, facts["layout"], facts["scene"])
+    count = len(pairs.names)
+    look = partial(_look, folder, facts["layout"], facts["scene"])
+    found = _nothing()
+    for part in in_workers(look, pairs.runs(), jobs, console or Console(), "checking pairs", count):
+        found += part
+    if count < facts["pairs"]:
+        lacking = f"{folder}: expected {facts['pairs']} pairs, as were asked for, found {count}"
+        found += _nothing(f"{lacking}; the same stereoweave synth make goes on")
+    return found
+
+
+def lines(found: Findings) -> Iterator[str]:
+    """The statistics of a set as text, with histograms of disparity and depth; then problems and how many."""
+    if found.pairs:
+        yield from _statistics(found)
+    yield from found.problems
+    count = len(found.problems)
+    yield f"{count} problem{'s' * (count > 1)}" if count else "in order"
+
+
+def problem(sample: Sample) -> str | None:
+    """What is wrong between the disparities and pictures of a pair, or None."""
+    if not np.isfinite(sample.disparity_px).any():
+        return "expected a disparity, found every pixel unknown"
+    before, at, after = _grey_levels(sample)
+    if at > _LARGEST_RATIO * min(before, after):
+        return (
+            "expected the left picture to fit the right one best at the disparity, found them to differ by "
+            f"{at:.2f} grey levels there, {before:.2f} at 1 px less and {after:.2f} at 1 px more"
+        )
+    agreeing = _agreeing(sample)
+    if agreeing < _LEAST_AGREEING:
+        return (
+            f"expected both disparities to agree at {_LEAST_AGREEING:.0%} of the pixels that both see, "
+            f"found {agreeing:.1%}"
+        )
+    return None
+
+
+def _look(folder: Path, layout: str, scene: str, run: range) -> Findings:
+    pairs = _opened(folder, layout, scene)
+    found, damaged = _nothing(), dict[str, str]()
+    for index in run:
+        try:
+            sample = pairs.read(index)
+            wrong = problem(sample)
+            found += _found(sample, f"{folder}: {pairs.names[index]}: {wrong}" if wrong else None)
+        except FormatError as error:
+            # A damaged shard is to be deleted whole, and so its first damage says enough.
+            damaged.setdefault(pairs.files[index], str(error))
+        step_done()
+    return found + _nothing(*damaged.values())
+
+
+@cache
+def _opened(folder: Path, layout: str, scene: str) -> _Pairs:
+    if layout == "shards":
+        shards = Shards(folder, scene)
+
+        def unpacked(index: int) -> Sample:
+            shards.views(index)
+            return shards[index]
+
+        files = [shard.path.name for shard in shards.shards for _ in range(shard.first, shard.last + 1)]
+        return _Pairs([shards.name(index) for index in range(shards.count)], files, unpacked)
+    frames = paper(folder)
+
+    def read(index: int) -> Sample:
+        check_frame(folder, frames[index].name)
+        return frames[index].read()
+
+    names = [frame.name for frame in frames]
+    return _Pairs(names, names, read)
+
+
+def _nothing(*problems: str) -> Findings:
+    return Findings(
+        pairs=0,
+        disparity=np.zeros(len(_DISPARITY_EDGES_PX), int),
+        depth=np.zeros(len(_DEPTH_EDGES_M), int),
+        unknown=0,
+        occluded=0,
+        grey_levels=np.zeros(3),
+        compared=0,
+        agreeing=0.0,
+        matched=0,
+        problems=problems,
+    )
+
+
+def _found(sample: Sample, problem: str | None) -> Findings:
+    known_px = sample.disparity_px[np.isfinite(sample.disparity_px)]
+    assert sample.camera is not None
+    grey_levels, agreeing = _grey_levels(sample), _agreeing(sample)
+    return Findings(
+        pairs=1,
+        disparity=_counts(known_px, _DISPARITY_EDGES_PX),
+        depth=_counts(sample.camera.depth_m(known_px[None]), _DEPTH_EDGES_M),
+        unknown=sample.disparity_px.size - known_px.size,
+        occluded=int(sample.occluded.sum()),
+        grey_levels=np.nan_to_num(grey_levels),
+        compared=int(np.isfinite(grey_levels).all()),
+        agreeing=float(np.nan_to_num(agreeing)),
+        matched=int(np.isfinite(agreeing)),
+        problems=(problem,) if problem else (),
+    )
+
+
+def _grey_levels(sample: Sample) -> Float[np.ndarray, "3"]:
+    """Mean difference of both pictures at near things that both see, by the disparity - 1, + 0 and + 1 px.
+
+    NaN where there is next to nothing near.
+    """
+    left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (sample.left, sample.right))
+    columns = _columns(sample)
+    rows = np.broadcast_to(np.arange(len(columns), dtype=np.float32)[:, None], columns.shape).copy()
+    last = columns.shape[1] - 1
+    # False where the disparity is unknown.
+    seen = ~sample.occluded & (columns >= 1) & (columns <= last - 1) & (sample.disparity_px >= _NEAR_PX)
+    if seen.sum() < _FEWEST_PIXELS:
+        return np.full(3, np.nan)
+    differences = (
+        cv2.remap(right, columns - shift_px, rows, cv2.INTER_LINEAR).astype(np.float32) - left
+        for shift_px in (-1, 0, 1)
+    )
+    return np.array([np.abs(difference[seen]).mean() for difference in differences])
+
+
+def _agreeing(sample: Sample) -> float:
+    """The share of what both views see, jumps left out, at which their disparities agree; NaN of nothing.
+
+    A disparity agrees that lies between those of the two columns beside its match: so a crease between the
+    two, where no interpolation is right, does not count as wrong.
+    """
+    columns = _columns(sample)
+    inside = (columns >= 0) & (columns <= columns.shape[1] - 1)
+    columns = np.where(inside, columns, 0)
+    beside = [
+        np.take_along_axis(sample.right_disparity_px, rounded(columns).astype(np.intp), axis=1)
+        for rounded in (np.floor, np.ceil)
+    ]
+    low_px, high_px = np.minimum(*beside), np.maximum(*beside)
+    # A wire narrower than a pixel may be in one view and fall between the columns of the other one.
+    level = _level(sample.disparity_px) & (high_px - low_px <= _JUMP_PX)
+    seen = inside & level & ~sample.occluded
+    if seen.sum() < _FEWEST_PIXELS:
+        return np.nan
+    outside_px = np.maximum(low_px - sample.disparity_px, sample.disparity_px - high_px)
+    return float((outside_px[seen] <= _AGREE_PX).mean())
+
+
+def _columns(sample: Sample) -> Float[np.ndarray, "h w"]:
+    """The column, in the right picture, of what each pixel of the left one shows."""
+    return np.arange(sample.disparity_px.shape[1], dtype=np.float32) - sample.disparity_px
+
+
+def _level(disparity_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels without a jump of the disparity, or an unknown one, in the column before or after them."""
+    padded_px = np.pad(disparity_px, ((0, 0), (1, 1)), mode="edge")
+    level = np.abs(np.diff(padded_px, axis=1)) <= _JUMP_PX
+    return level[:, 1:] & level[:, :-1]
+
+
+def _counts(values: Float[np.ndarray, "*n"], edges: tuple[float, ...]) -> Int[np.ndarray, " m"]:
+    places = np.searchsorted(edges, values.ravel(), side="right") - 1
+    return np.bincount(places, minlength=len(edges))
+
+
+def _statistics(found: Findings) -> Iterator[str]:
+    pixels = found.disparity.sum() + found.unknown
+    yield f"{found.pairs} pair{'s' * (found.pairs > 1)}"
+    yield f"occluded {found.occluded / pixels:.1%}, unknown {found.unknown / pixels:.1%} of the left views"
+    if found.compared:
+        before, at, after = found.grey_levels / found.compared
+        yield (
+            f"left pictures differ from right ones by {at:.2f} grey levels at the disparity, "
+            f"{before:.2f} at 1 px less, {after:.2f} at 1 px more"
+        )
+    if found.matched:
+        share = found.agreeing / found.matched
+        yield f"both disparities agree to {_AGREE_PX} px at {share:.3%} of what both see, edges left out"
+    yield from _histogram("disparity", "px", _DISPARITY_EDGES_PX, found.disparity)
+    yield from _histogram("depth", "m", _DEPTH_EDGES_M, found.depth)
+
+
+def _histogram(
+    name: str, unit: str, edges: tuple[float, ...], counts: Int[np.ndarray, " m"]
+) -> Iterator[str]:
+    yield f"{name}, {unit}"
+    shares = counts / max(counts.sum(), 1)
+    for low, high, share in zip(edges, (*edges[1:], None), shares, strict=True):
+        label = f"{low:g} to {high:g}" if high else f"{low:g} and more"
+        bar = "█" * round(_WIDEST_BAR * share / max(shares.max(), 1e-9))
+        yield f"{label:>13} {share:6.1%} {bar}".rstrip()

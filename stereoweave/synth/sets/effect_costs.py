@@ -1,0 +1,61 @@
+"""What each effect costs."""
+
+import time
+from dataclasses import dataclass, replace
+
+from stereoweave.synth.rendering.effects import PLAIN, Effects
+from stereoweave.synth.rendering.opengl import Renderer
+from stereoweave.synth.rigs import Rig
+from stereoweave.synth.sets.samples import Order, staged
+from stereoweave.synth.world import World
+
+_OFF = {
+    "shadows": replace(Effects(), shadows=False),
+    "ambient occlusion": replace(Effects(), ambient_occlusion=False),
+    "gloss": replace(Effects(), gloss=False),
+    "fog": replace(Effects(), fog=False),
+    "relief": replace(Effects(), relief=False),
+    "2x2 samples": replace(Effects(), samples=1),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cost:
+    """How many milliseconds of one core a pair takes longer with an effect, or takes in all."""
+
+    effect: str
+    ms_a_pair: float
+
+
+def costs(scene: str = "propeller", pairs: int = 3, size_px: tuple[int, int] = (640, 480)) -> list[Cost]:
+    """All effects together, what each adds to them, and no effect: both views and depths, scene apart."""
+    order = Order(scene=scene, size_px=size_px)
+    renderer = Renderer(PLAIN)
+    stages = [staged(renderer, order, index) for index in range(pairs)]
+    renderer.close()
+    views = [(stage.world, rig) for stage, rig in stages]
+    everything_ms = _ms_a_pair(Effects(), views)
+    return [
+        Cost(effect="everything", ms_a_pair=everything_ms),
+        *(
+            Cost(effect=name, ms_a_pair=everything_ms - _ms_a_pair(rest, views))
+            for name, rest in _OFF.items()
+        ),
+        Cost(effect="none (plain)", ms_a_pair=_ms_a_pair(PLAIN, views)),
+    ]
+
+
+def _ms_a_pair(effects: Effects, views: list[tuple[World, Rig]]) -> float:
+    """The mean over the views of the better of two tries, each with a world that is new to the renderer."""
+    renderer = Renderer(effects)
+    renderer.shots(*views[0], (0.0, 1.0))
+    total_s = 0.0
+    for world, rig in views:
+        tries = []
+        for _ in range(2):
+            fresh, start = replace(world), time.process_time()
+            renderer.shots(fresh, rig, (0.0, 1.0))
+            tries.append(time.process_time() - start)
+        total_s += min(tries)
+    renderer.close()
+    return 1e3 * total_s / len(views)

@@ -1,0 +1,1 @@
+"""Stereo videos: reading, converting, writing."""

@@ -1,0 +1,394 @@
+"""A 3-D film made into another, frame by frame: matched, held steady, and shown as depth, view or layout."""
+
+import hashlib
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from itertools import chain, islice
+from math import isfinite
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, UInt16
+from rich.console import Console
+from rich.progress import Progress, TaskID
+
+from stereoweave import __version__
+from stereoweave.cameras.diagnosis import hints
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.colormap import colour_disparity, colour_range_px
+from stereoweave.io.output_lock import lock_output
+from stereoweave.matching.estimate import match
+from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.providers import CPU
+from stereoweave.pictures.frame_packing import ARRANGEMENTS
+from stereoweave.rendering.layouts import LAYOUTS, Choices, check_reach, middle_px
+from stereoweave.rendering.renderer import Renderer
+from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.system.progress import progress
+from stereoweave.system.threads import thread_count
+from stereoweave.video.reader import Footage, StereoFrame
+from stereoweave.video.temporal_filter import Steadier
+from stereoweave.video.tracks import picture_files
+from stereoweave.video.writer import GREY16, H264, Packing, Picture, Recorder, check_film, growing
+
+# A part is lost when a run is interrupted; each begins with a key frame.
+_PART_S = 10
+_SURVEYED_FRAMES, _HINTED_FRAMES = 24, 3
+_SURVEYED_EVERY_PX = 4
+# Single wrong pixels do not widen the range of a film, and what moves may come nearer between those frames.
+_OUTER_PERCENT, _MARGIN_PX = 0.5, 8.0
+_NAMED_PROBLEMS = 3
+_STEPS_PER_PX, _MOST_GREY16_PX = 256, 255.99
+
+PACKINGS = {
+    "side_by_side": Packing("left_right", 3),
+    "side_by_side_half": Packing("left_right", 3),
+    "crossed": Packing("right_left", None),
+    "top_bottom": Packing("top_bottom", 4),
+    "top_bottom_half": Packing("top_bottom", 4),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Order:
+    """What a film is made into: one of depth, depth16, position and layout.
+
+    Attributes:
+        depth: The left view's disparity in colours, one range for the whole film.
+        depth16: The same as 16-bit grey, px * 256 as in disparity.png; clipped to 1/256 to 255.99 px.
+        position: A view: 0 is the left camera, 1 the right one.
+        layout: A name in `LAYOUTS`.
+        strength: Multiplies the baseline.
+        convergence_px: The disparity that stays in place from view to view. None is that of the film's middle
+            for layouts whose views lie upon one another, and 0 for all else.
+        model: The name of a shipped network, or an .onnx file.
+        threads: How many threads may be used; all cores unless given.
+        provider: What the network is run on, a name in `providers.PROVIDERS`.
+    """
+
+    depth: bool = False
+    depth16: bool = False
+    position: float | None = None
+    layout: str | None = None
+    strength: float = 1.0
+    convergence_px: float | None = None
+    model: str = "small"
+    threads: int | None = None
+    provider: str = CPU
+
+    def __post_init__(self) -> None:
+        wanted = {
+            "--depth": self.depth,
+            "--depth16": self.depth16,
+            "--position": self.position is not None,
+            "--layout": self.layout is not None,
+        }
+        found = [word for word, given in wanted.items() if given]
+        if len(found) != 1:
+            raise StereoweaveError(
+                f"what to make: expected one of {', '.join(wanted)}, found {' and '.join(found) or 'none'}"
+            )
+        if self.layout not in (None, *LAYOUTS):
+            raise StereoweaveError(f"layout: expected one of {', '.join(LAYOUTS)}, found {self.layout!r}")
+        self._check_numbers(found[0] if self.layout is None else f"--layout {self.layout}")
+        check_reach(self._positions, self.strength)
+
+    def _check_numbers(self, wanted: str) -> None:
+        """Refuses numbers that are none, or that what is wanted would not heed."""
+        numbers = {"--strength": (self.strength, 1.0), "--convergence": (self.convergence_px, None)}
+        for word, (value, unset) in numbers.items():
+            if value == unset or value is None:
+                continue
+            if not isfinite(value):
+                raise StereoweaveError(
+                    f"{word}: expected a number that is not infinite or nan, found {value}"
+                )
+            if not self._positions:
+                raise StereoweaveError(f"{word}: expected a view or a layout of views for it, found {wanted}")
+
+    @property
+    def _positions(self) -> tuple[float, ...]:
+        if self.layout:
+            return LAYOUTS[self.layout].positions
+        return () if self.position is None else (self.position,)
+
+    def picture(self, pair: StereoPair, estimate: Estimate, survey: "Survey") -> Picture:
+        """What is shown of one frame."""
+        if self.depth:
+            return colour_disparity(estimate.disparity_px, survey.range_px)
+        if self.depth16:
+            return _grey16(estimate.disparity_px)
+        renderer = Renderer(
+            pair,
+            estimate,
+            strength=self.strength,
+            convergence_px=self._plane_px(survey),
+            threads=self.threads,
+        )
+        if self.position is not None:
+            return renderer.view(self.position).image
+        return LAYOUTS[str(self.layout)].compose(renderer, Choices(range_px=survey.range_px))
+
+    def _plane_px(self, survey: "Survey") -> float:
+        """The disparity that stays in place from view to view."""
+        if self.convergence_px is not None:
+            return self.convergence_px
+        return survey.middle_px if self.layout and LAYOUTS[self.layout].converged else 0.0
+
+    def loses(self, survey: "Survey") -> list[str]:
+        """A line for what the file cannot hold of the film; none where it holds all."""
+        low_px, high_px = survey.range_px
+        if not self.depth16 or (low_px >= 0 and high_px <= _MOST_GREY16_PX):
+            return []
+        return [
+            f"--depth16 holds 0 to {_MOST_GREY16_PX} px: of this film's disparities, {low_px:.1f} to "
+            f"{high_px:.1f} px, what lies beyond is clipped; --depth shows all of them in colours"
+        ]
+
+    def says(self, survey: "Survey") -> dict[str, str]:
+        """What the file says about itself: how to get back from its pictures to disparities."""
+        low_px, high_px = survey.range_px
+        if self.depth16:
+            return {"comment": f"16-bit grey: disparity of the left view in pixels = value / {_STEPS_PER_PX}"}
+        if self.depth:
+            return {
+                "comment": f"disparity of the left view: {low_px:.2f} px is blue, {high_px:.2f} px is red"
+            }
+        if self.layout == "rgbd":
+            return {"comment": f"disparity in grey: {low_px:.2f} px is black, {high_px:.2f} px is white"}
+        return {}
+
+
+class Survey(NamedTuple):
+    """What was found in frames from all over the film.
+
+    Attributes:
+        range_px: The disparities that colours are spread over.
+        middle_px: That of the middle of the scene.
+        within_px: The range that is matched; None where the network's own has all of it, as far as is known.
+    """
+
+    range_px: tuple[float, float]
+    middle_px: float
+    within_px: tuple[float, float] | None
+
+
+@dataclass
+class Tally:
+    """What was met on the way: frames, cuts, and frames with a problem, of which the first ones are named."""
+
+    frames: int = 0
+    cuts: int = 0
+    problems: int = 0
+    named: list[str] = field(default_factory=list)
+
+    def note(self, frame: StereoFrame) -> None:
+        """Counts a frame."""
+        self.frames += 1
+        if frame.problem is not None:
+            self.problems += 1
+            if len(self.named) < _NAMED_PROBLEMS:
+                self.named.append(f"{_clock(frame.time)} {frame.problem}")
+
+
+def make_film(footage: Footage, sources: Sequence[Path], out: Path, order: Order, console: Console) -> Tally:
+    """Writes the film that was ordered; one that was begun and interrupted goes on after its last part.
+
+    Args:
+        footage: The film to make it from.
+        sources: What the footage was opened from, to go on only while it is the same.
+        out: The file to write; its ending chooses the container.
+        order: What it is made into.
+        console: Where progress is told, and before it what seems amiss with the film.
+
+    Returns:
+        What was met on the way, in all runs together.
+
+    Raises:
+        StereoweaveError: `out` cannot be such a film, is in use, or cannot be written, for instance on a full
+            disk.
+    """
+    _check_out(out, order, footage, sources)
+    matcher = Matcher(order.model, threads=order.threads, provider=order.provider)
+    recorder = Recorder(
+        encoding=GREY16 if order.depth16 else H264,
+        time_base=footage.time_base,
+        # FFmpeg's fractions have 32 bits.
+        rate=footage.rate.limit_denominator(100_000),
+        packing=PACKINGS.get(order.layout or ""),
+        threads=thread_count(order.threads),
+    )
+    with (
+        lock_output(out),
+        growing(out, _settings(order, footage, sources)) as parts,
+        progress(console) as bar,
+    ):
+        if parts.files:
+            maker = _Maker.from_state(order, matcher, parts.state())
+        else:
+            survey, lines = _look(footage, matcher, bar)
+            maker = _Maker(order, matcher, survey)
+            for line in [*lines, *order.loses(survey)]:
+                console.print(line, markup=False, highlight=False, soft_wrap=True)
+        done, total = maker.tally.frames, footage.frame_count
+        shown = bar.add_task(out.name, total=total, completed=done, loss="", rate="")
+        frames = footage.frames(done)
+        for first in frames:
+            part = islice(chain([first], frames), round(_PART_S * footage.rate) or 1)
+            with parts.next(maker.state) as path:
+                recorder.write_part(path, maker.pictures(part, bar, shown))
+        recorder.join(parts.files, footage.sound, out, order.says(maker.survey))
+    return maker.tally
+
+
+class _Maker:
+    """Makes a picture of each frame, and can go on where it was left."""
+
+    def __init__(self, order: Order, matcher: Matcher, survey: Survey) -> None:
+        self.survey, self.tally = survey, Tally()
+        self._order, self._matcher, self._steadier = order, matcher, Steadier(order.threads)
+
+    @classmethod
+    def from_state(cls, order: Order, matcher: Matcher, state: dict[str, np.ndarray]) -> "_Maker":
+        """One that goes on as the one whose `state` this was would have."""
+        low_px, high_px, middle_px, *within_px = state.pop("survey_px").tolist()
+        survey = Survey((low_px, high_px), middle_px, (within_px[0], within_px[1]) if within_px else None)
+        maker = cls(order, matcher, survey)
+        frames, cuts, problems = state.pop("tally").tolist()
+        maker.tally = Tally(frames, cuts, problems, state.pop("named").tolist())
+        maker._steadier = Steadier.from_state(state, order.threads)
+        return maker
+
+    def state(self) -> dict[str, np.ndarray]:
+        """All that the next frame's picture depends on."""
+        tally = self.tally
+        return {
+            "survey_px": np.array(
+                [*self.survey.range_px, self.survey.middle_px, *(self.survey.within_px or ())]
+            ),
+            "tally": np.array([tally.frames, tally.cuts, tally.problems]),
+            "named": np.array(tally.named, dtype=np.str_),
+            **self._steadier.state(),
+        }
+
+    def pictures(
+        self, frames: Iterable[StereoFrame], bar: Progress, shown: TaskID
+    ) -> Iterator[tuple[Fraction, Picture]]:
+        """What is shown of each frame, with its time; the bar follows."""
+        for frame in frames:
+            pair = StereoPair(left=frame.left, right=frame.right)
+            estimate = match(self._matcher, pair, range_px=self.survey.within_px)
+            estimate = self._steadier(frame.left, frame.right, estimate)
+            self.tally.note(frame)
+            self.tally.cuts = self._steadier.cuts
+            bar.update(shown, completed=self.tally.frames)
+            yield frame.time, self._order.picture(pair, estimate, self.survey)
+
+
+def _look(footage: Footage, matcher: Matcher, bar: Progress) -> tuple[Survey, list[str]]:
+    """Range and middle of the disparities all over the film; and what seems amiss.
+
+    All over: titles, with which a film may begin, say nothing about its range.
+    """
+    picked = _spread(footage.frame_count, _SURVEYED_FRAMES)
+    hinted = set(picked[len(picked) // 6 :: -(-len(picked) // _HINTED_FRAMES)])
+    shown = bar.add_task("looking at its depth", total=len(picked), loss="", rate="")
+    thinned, middles_px, amiss = [], [], []
+    frames = islice(footage.frames(), picked.start, picked.stop, picked.step)
+    for index, frame in zip(picked, frames, strict=True):
+        pair = StereoPair(left=frame.left, right=frame.right)
+        estimate = match(matcher, pair)
+        thinned.append(estimate.disparity_px[::_SURVEYED_EVERY_PX, ::_SURVEYED_EVERY_PX])
+        middles_px.append(middle_px(estimate))
+        if index in hinted:
+            amiss.append([f"{_clock(frame.time)} {line}" for line in hints(pair, estimate)])
+        bar.advance(shown)
+    all_px = np.vstack(thinned)
+    survey = Survey(colour_range_px(all_px), float(np.median(middles_px)), _within_px(all_px, matcher))
+    return survey, _told(amiss, footage.arrangement)
+
+
+def _within_px(disparity_px: Float[np.ndarray, "h w"], matcher: Matcher) -> tuple[float, float] | None:
+    """The range of a film that goes beyond the network's own, by disparities from all over it."""
+    low_px, high_px = np.percentile(disparity_px, [_OUTER_PERCENT, 100 - _OUTER_PERCENT]).tolist()
+    if low_px >= 0 and high_px <= matcher.max_disparity_px:
+        return None
+    # A plain sky is taken for what is at the lower end of a range: that of parallel cameras stays at 0.
+    return min(low_px, max(low_px - _MARGIN_PX, 0.0)), high_px + _MARGIN_PX
+
+
+def _spread(count: int, wanted: int) -> range:
+    """So many frames of the first `count`, evenly spread, or all if there are fewer."""
+    step = -(-count // wanted)
+    return range(step // 2, count, step)
+
+
+def _told(amiss: Sequence[Sequence[str]], arrangement: str | None) -> list[str]:
+    """The lines of the last frame with any, where most have some: a film may begin with a black picture."""
+    some = [lines for lines in amiss if lines]
+    if 2 * len(some) <= len(amiss):
+        return []
+    other = _other_way_round(arrangement)
+    return [
+        line.replace("give them the other way round", f"give --arrangement {other}") if other else line
+        for line in some[-1]
+    ]
+
+
+def _other_way_round(arrangement: str | None) -> str | None:
+    """The arrangement that differs only in which eye comes first, if it has a name."""
+    if arrangement is None:
+        return None
+    split = ARRANGEMENTS[arrangement]
+    other = split._replace(right_first=not split.right_first)
+    return next((name for name, known in ARRANGEMENTS.items() if known == other), None)
+
+
+def _grey16(disparity_px: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
+    # 0 would mean that it is unknown, as in disparity.png.
+    return np.clip(np.rint(_STEPS_PER_PX * disparity_px), 1, 65535).astype(np.uint16)
+
+
+def _check_out(out: Path, order: Order, footage: Footage, sources: Sequence[Path]) -> None:
+    if order.depth16 and out.suffix.lower() != ".mkv":
+        raise StereoweaveError(f"{out}: expected the ending .mkv for depth in 16 bits, found {out.suffix!r}")
+    for source in sources:
+        if source.exists() and out.exists() and out.samefile(source):
+            raise StereoweaveError(f"{out}: expected another file than the film it is made from")
+    check_film(out, footage.sound)
+
+
+def _settings(order: Order, footage: Footage, sources: Sequence[Path]) -> dict[str, object]:
+    """All that the film depends on but for what computes it, as users call it, in words that JSON has."""
+    model = Path(order.model)
+    return {
+        "--depth": order.depth,
+        "--depth16": order.depth16,
+        "--position": order.position,
+        "--layout": order.layout,
+        "--strength": order.strength,
+        "--convergence": order.convergence_px,
+        "--arrangement": footage.arrangement,
+        "--rate": str(footage.rate),
+        "--model": _known_by(model) if model.exists() else order.model,
+        "FILM": [_known_by(source) for source in sources],
+        "stereoweave": __version__,
+    }
+
+
+def _known_by(path: Path) -> list[object]:
+    """A name, and a digest of the names, sizes and times of the files that it stands for."""
+    files = picture_files(path)
+    digest = hashlib.sha256()
+    for file in [path] if files is None else files:
+        status = file.stat()
+        digest.update(f"{file.name} {status.st_size} {status.st_mtime_ns}\n".encode(errors="surrogateescape"))
+    return [str(path), digest.hexdigest()]
+
+
+def _clock(time_s: Fraction) -> str:
+    """0:01:02.345 for 62.345 s."""
+    minutes, seconds = divmod(float(time_s), 60)
+    return f"{int(minutes) // 60}:{int(minutes) % 60:02}:{seconds:06.3f}"

@@ -1,0 +1,410 @@
+"""One video file, or one series of pictures: when each frame is shown, and those that can be decoded."""
+
+import re
+from array import array
+from bisect import bisect_left
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from fractions import Fraction
+from functools import partial
+from itertools import count, islice, pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import UInt8
+
+from stereoweave.errors import FormatError, StereoweaveError, needing_extra
+from stereoweave.io.decoding import ENDINGS
+from stereoweave.io.files import read_image
+
+if TYPE_CHECKING:
+    import av
+
+_SAMPLES = 0.1, 0.3, 0.5, 0.7, 0.9
+
+# What players take for the matrix of untagged colours, as mpv does: BT.709 from this width or height on.
+_HD_WIDTH_PX, _HD_HEIGHT_PX = 1280, 577
+_BT709, _BT601, _FULL_RANGE = 1, 5, 2  # av.video.reformatter's Colorspace and ColorRange
+_UNTAGGED = 0, 2  # AVCOL_SPC_RGB, which some write where they know nothing, and AVCOL_SPC_UNSPECIFIED
+
+# AVStereo3D begins with its type, one of these but for 0, not stereo, and 8, unknown; and with its flags, the
+# lowest of which says that the right eye comes first.
+_STEREO_3D = {
+    1: "side_by_side",
+    2: "top_bottom",
+    3: "frame_sequence",
+    4: "checkerboard",
+    5: "side_by_side_quincunx",
+    6: "lines",
+    7: "columns",
+}
+
+# What an MP4 or MOV file begins with, after four bytes of length.
+_MP4_BOXES = b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot"
+
+# How much earlier than it claims a file may end before it counts as cut off.
+_CUT_OFF_S = Fraction(1, 5)
+
+
+class Shot(NamedTuple):
+    """A frame that could be decoded.
+
+    Attributes:
+        number: Which frame of the track it is.
+        picture: Makes its picture, uint8 RGB [H, W, 3]; where it is not called, nothing is converted.
+        fresh: Whether it is made without any frame before it.
+    """
+
+    number: int
+    picture: Callable[[], UInt8[np.ndarray, "h w 3"]]
+    fresh: bool
+
+
+class VideoTrack:
+    """The frames of one video file.
+
+    Attributes:
+        name: As the caller gave it.
+        steps: When each frame is shown, rising, in steps of `time_base`: one for each frame in the file.
+        moved: Frames whose time stamp was missing or another's, and which got one after it.
+        time_base: Seconds.
+        rate: Average frames a second.
+        size_px: Width and height of a whole frame, turned as a player would.
+        declared: The arrangement of the two eyes that the file declares, if any: one of full size, or
+            another word than `ARRANGEMENTS` has.
+        sound: The file, if it has sound.
+        broken_off: What is wrong with the file's end, if anything.
+
+    Raises:
+        FormatError: No such file, no video, or one without a frame that can be decoded.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.name = str(path)
+        self._path = path
+        with _reading(path) as (container, stream):
+            self.sound = path if container.streams.audio else None
+            self._read_times(container, stream)
+        with _reading(path) as (container, stream):
+            first = next(_intact(_decoded(container, stream)), None)
+            if first is None:
+                raise FormatError(f"{path}: expected a video, found no frame in it that can be decoded")
+            self._frame_size_px = first.width, first.height
+            self.size_px = self._frame_size_px if first.rotation % 180 == 0 else self._frame_size_px[::-1]
+            self.declared = _declared(first)
+
+    def shots(self, start: int) -> Iterator[Shot]:
+        """The frames that can be decoded, as they are shown, from the first one on whatever `start` is.
+
+        Only so are they the same frames every time: what a damaged frame leaves behind in those after it
+        depends on all before it.
+        """
+        with _reading(self._path) as (container, stream):
+            frames = _decoded(container, stream)
+            placed = _by_rank(frames, stream) if self._stamps is None else _by_stamp(frames, self._stamps)
+            for index, frame in placed:
+                if not frame.is_corrupt and (frame.width, frame.height) == self._frame_size_px:
+                    yield Shot(index, partial(_rgb, frame), frame.key_frame)
+
+    def samples(self) -> list[UInt8[np.ndarray, "h w 3"]]:
+        """Some pictures from all over the film, at least one."""
+        import av
+
+        pictures: list[UInt8[np.ndarray, "h w 3"]] = []
+        with _reading(self._path) as (container, stream):
+            pictures += map(_rgb, islice(_intact(_decoded(container, stream)), 1))
+            for share in _SAMPLES:
+                with suppress(av.error.FFmpegError):
+                    container.seek(int(share * (container.duration or 0)))
+                    pictures += map(_rgb, islice(_intact(_decoded(container, stream)), 1))
+        return pictures
+
+    def _read_times(self, container: "av.container.InputContainer", stream: "av.VideoStream") -> None:
+        import av
+
+        stamps, end_s, reason = _stamps(container, stream)
+        rate = stream.guessed_rate or Fraction(25)
+        self.moved: Collection[int] = ()
+        self.steps: Sequence[int] = range(len(stamps))
+        self.time_base = 1 / rate
+        self._stamps: Sequence[int] | None = None
+        # Bare streams, and some AVI, have no times to go by: there the order decides.
+        if 2 * len(set(stamps) - {None}) > len(stamps):
+            self.time_base = Fraction(stream.time_base or 1)
+            self._stamps = array("q", sorted(_filled(stamps)))
+            self.steps, self.moved = _separated(self._stamps, round(1 / rate / self.time_base))
+        self.rate = _rate(self.steps, self.time_base, rate)
+        claimed_s = Fraction(container.duration or 0, av.time_base)
+        if reason is None and claimed_s > end_s + _CUT_OFF_S:
+            reason = f"it claims to last {float(claimed_s):.1f} s"
+        self.broken_off = f"{self.name} breaks off after this frame ({reason})" if reason else None
+
+
+class PictureTrack:
+    """The frames of a series of pictures, one after the other; attributes as in `VideoTrack`.
+
+    Raises:
+        FormatError: No picture among `files` can be read.
+    """
+
+    declared: str | None = None
+    moved: Collection[int] = ()
+    sound: Path | None = None
+    broken_off: str | None = None
+
+    def __init__(self, name: str, files: Sequence[Path], rate: Fraction) -> None:
+        self.name = name
+        self._files = files
+        self.steps: Sequence[int] = range(len(files))
+        self.rate, self.time_base = rate, 1 / rate
+        first = self._first()
+        self.size_px = first.shape[1], first.shape[0]
+
+    def shots(self, start: int) -> Iterator[Shot]:
+        """The pictures that can be read, from the last one at or before `start` on."""
+        before = next((index for index in range(start, 0, -1) if self._shot(index)), 0)
+        yield from filter(None, map(self._shot, self.steps[before:]))
+
+    def samples(self) -> list[UInt8[np.ndarray, "h w 3"]]:
+        """Some pictures from all over the series, at least one."""
+        starts = [int(share * len(self._files)) for share in (0.0, *_SAMPLES)]
+        return [shot.picture() for start in starts for shot in islice(self.shots(start), 1)]
+
+    def _first(self) -> UInt8[np.ndarray, "h w 3"]:
+        """The first picture that can be read."""
+        problem: FormatError | None = None
+        for file in self._files:
+            try:
+                return read_image(file)
+            except FormatError as error:
+                problem = problem or error
+        raise FormatError(f"{self.name}: expected pictures, found none that can be read: {problem}")
+
+    def _shot(self, index: int) -> Shot | None:
+        picture = self._read(index)
+        return None if picture is None else Shot(index, lambda: picture, fresh=True)
+
+    def _read(self, index: int) -> UInt8[np.ndarray, "h w 3"] | None:
+        with suppress(FormatError):
+            picture = read_image(self._files[index])
+            if self.size_px == (picture.shape[1], picture.shape[0]):
+                return picture
+        return None
+
+
+Track = VideoTrack | PictureTrack
+
+
+def open_track(path: Path, rate: Fraction | None) -> Track:
+    """The frames of a video file, of a folder of pictures, or of the pictures that a glob pattern finds.
+
+    Args:
+        path: The file, the folder, or the pattern, such as frames/left_*.png; 2 comes before 10.
+        rate: Frames a second, for pictures, 25 unless given.
+
+    Raises:
+        FormatError: No such file, folder or picture, or nothing in it can be read.
+        StereoweaveError: A rate for a video.
+    """
+    files = picture_files(path)
+    if files is None:
+        if rate is not None:
+            raise StereoweaveError(f"{path}: expected pictures for a rate, found a video, which has its own")
+        return VideoTrack(path)
+    if not files:
+        raise FormatError(f"{path}: expected a video or pictures, found no picture there")
+    return PictureTrack(str(path), files, rate or Fraction(25))
+
+
+def picture_files(path: Path) -> list[Path] | None:
+    """The pictures in a folder, or that a glob pattern finds, in counting order; None for any other path."""
+    if path.is_dir():
+        found = path.iterdir()
+    elif not path.exists() and re.search(r"[*?\[]", path.name):
+        found = path.parent.glob(path.name)
+    else:
+        return None
+    return sorted(filter(_is_picture, found), key=_in_counting_order)
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[tuple["av.container.InputContainer", "av.VideoStream"]]:
+    with needing_extra("video", f"{path}: reading video needs PyAV"):
+        import av
+    try:
+        container = av.open(str(path), metadata_errors="replace")
+    except av.error.FFmpegError as error:
+        raise FormatError(f"{path}: expected a video, found {_unopened(path, error)}") from error
+    with container:
+        stream = container.streams.best("video")
+        if not isinstance(stream, av.VideoStream) or stream.codec_context is None:
+            raise FormatError(f"{path}: expected a video, found no picture track that can be decoded")
+        # With more threads FFmpeg mends damaged H.264 badly or not at all, and not always alike.
+        stream.codec_context.thread_count = 1
+        stream.codec_context.copy_opaque = True  # the packet's rank, to the frame
+        if stream.codec_context.name == "mjpeg":
+            # Unasked, it hands out pictures whose lower part is grey and calls them sound.
+            stream.codec_context.options = {"err_detect": "explode"}
+        yield container, stream
+
+
+def _decoded(container: "av.container.InputContainer", stream: "av.VideoStream") -> Iterator["av.VideoFrame"]:
+    """What the decoder makes of every packet up to where the file ends or breaks off, in order of display."""
+    import av
+
+    ranks = count()
+    with suppress(av.error.FFmpegError):
+        for packet in container.demux(stream):
+            if _is_frame(packet):
+                packet.opaque = next(ranks)
+            with suppress(av.error.FFmpegError):
+                yield from stream.decode(packet)
+    # Where the file could be read to its end the decoder is empty already, and says so.
+    with suppress(av.error.FFmpegError):
+        yield from stream.decode(None)
+
+
+def _stamps(
+    container: "av.container.InputContainer", stream: "av.VideoStream"
+) -> tuple[list[int | None], Fraction, str | None]:
+    """The time stamp of every frame in the file; when all tracks end; why it cannot be read on, if so."""
+    import av
+
+    stamps: list[int | None] = []
+    end_s = Fraction(0)
+    try:
+        for packet in container.demux():
+            if packet.stream is stream and _is_frame(packet):
+                stamps.append(packet.pts)
+            if packet.pts is not None and packet.time_base:
+                end_s = max(end_s, (packet.pts + (packet.duration or 0)) * packet.time_base)
+    except av.error.FFmpegError as error:
+        return stamps, end_s, _words(error)
+    return stamps, end_s, None
+
+
+def _is_frame(packet: "av.Packet[Any]") -> bool:
+    return bool(packet.size) and not packet.is_discard
+
+
+def _filled(stamps: Sequence[int | None]) -> list[int]:
+    """Time stamps, with that of the frame before it in the file for one that is missing."""
+    known = next(stamp for stamp in stamps if stamp is not None)
+    return [known := known if stamp is None else stamp for stamp in stamps]
+
+
+def _separated(stamps: Sequence[int], usual: int) -> tuple["array[int]", list[int]]:
+    """Rising times from sorted stamps, and the numbers of those moved: one frame on, or halfway to the next.
+
+    Args:
+        stamps: In steps of a time base.
+        usual: From frame to frame, in the same steps.
+    """
+    steps, moved = array("q", stamps[:1]), []
+    later = [b for a, b in pairwise(stamps) if b > a]
+    after = 0
+    for index in range(1, len(stamps)):
+        if stamps[index] > stamps[index - 1]:
+            after += 1
+            steps.append(max(stamps[index], steps[-1] + 1))
+            continue
+        room = (later[after] - steps[-1]) // 2 if after < len(later) else usual
+        steps.append(steps[-1] + max(min(usual, room), 1))
+        moved.append(index)
+    return steps, moved
+
+
+def _by_stamp(
+    frames: Iterator["av.VideoFrame"], stamps: Sequence[int]
+) -> Iterator[tuple[int, "av.VideoFrame"]]:
+    """Frames with their numbers, as their time stamps tell; those of one stamp in the order they come."""
+    last = -1
+    for frame in frames:
+        stamp = stamps[max(last, 0)] if frame.pts is None else frame.pts
+        index = max(bisect_left(stamps, stamp), last + 1)
+        if index < len(stamps) and stamps[index] == stamp:
+            yield index, frame
+            last = index
+
+
+def _by_rank(
+    frames: Iterator["av.VideoFrame"], stream: "av.VideoStream"
+) -> Iterator[tuple[int, "av.VideoFrame"]]:
+    """Frames with their numbers, as the ranks of their packets in the file tell.
+
+    No frame is shown before its rank, but for those that are coded out of turn: among these, what was lost is
+    noticed at the next key frame.
+    """
+    index = -1
+    for frame in frames:
+        ranked: Any = frame
+        in_turn = frame.key_frame or not stream.codec_context.has_b_frames
+        index = max(index + 1, ranked.opaque) if in_turn and ranked.opaque is not None else index + 1
+        yield index, frame
+
+
+def _intact(frames: Iterator["av.VideoFrame"]) -> Iterator["av.VideoFrame"]:
+    return (frame for frame in frames if not frame.is_corrupt)
+
+
+def _unopened(path: Path, error: "av.error.FFmpegError") -> str:
+    """What was found instead of a video."""
+    beginning = b""
+    with suppress(OSError), path.open("rb") as file:
+        beginning = file.read(8)
+        if not beginning:
+            return "an empty file"
+    found = f"one that cannot be opened ({_words(error)})"
+    if beginning[4:] in _MP4_BOXES:
+        found += "; a file of this kind that was cut off has lost its index: record or fetch it again"
+    return found
+
+
+def _words(error: "av.error.FFmpegError") -> str:
+    return (error.strerror or "error in FFmpeg").lower()
+
+
+def _rgb(frame: "av.VideoFrame") -> UInt8[np.ndarray, "h w 3"]:
+    from av.video.reformatter import Interpolation
+
+    large = frame.width >= _HD_WIDTH_PX or frame.height >= _HD_HEIGHT_PX
+    picture = frame.to_ndarray(
+        format="rgb24",
+        src_colorspace=(_BT709 if large else _BT601) if frame.colorspace in _UNTAGGED else None,
+        dst_color_range=_FULL_RANGE,
+        # Without the last two, FFmpeg's quick way from 4:2:0 darkens by more than one level of 255.
+        interpolation=Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT,
+        threads=1,
+    )
+    return np.ascontiguousarray(np.rot90(picture, frame.rotation // 90))
+
+
+def _declared(frame: "av.VideoFrame") -> str | None:
+    from av.sidedata.sidedata import Type
+
+    # PyAV's types know of fewer kinds of side data than it has.
+    side_data: Any = frame.side_data
+    if Type.STEREO3D not in side_data:
+        return None
+    kind, flags = np.frombuffer(bytes(side_data[Type.STEREO3D]), np.int32, 2)
+    name = _STEREO_3D.get(int(kind))
+    right_first = {None: None, "side_by_side": "crossed"}
+    return right_first.get(name, f"{name}_right_first") if flags & 1 else name
+
+
+def _rate(steps: Sequence[int], time_base: Fraction, average: Fraction) -> Fraction:
+    """Frames a second: what the container says, unless the frames' times tell otherwise by more than 1 %."""
+    if len(steps) < 2:
+        return average
+    measured = Fraction(len(steps) - 1) / ((steps[-1] - steps[0]) * time_base)
+    return average if abs(average / measured - 1) <= Fraction(1, 100) else measured
+
+
+def _is_picture(file: Path) -> bool:
+    return file.suffix.lower() in ENDINGS and not file.name.startswith(".")
+
+
+def _in_counting_order(file: Path) -> list[tuple[int, str]]:
+    parts = re.split(r"(\d+)", file.name)
+    return [(int(part), part) if part.isdigit() else (0, part) for part in parts]

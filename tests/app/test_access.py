@@ -1,0 +1,284 @@
+"""What a visitor of the page may have read: his own uploads and results and the sample, and no other file."""
+
+import json
+import os
+import signal
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import pytest
+from page_examples import Visitor, file_data, start, stop
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse
+from starlette.routing import Route
+from starlette.testclient import TestClient
+
+from stereoweave.app.access import OwnFiles
+from stereoweave.io.files import read_image, write_image
+
+pytestmark = pytest.mark.system
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+REFUSED = (403, "expected a file that you gave to this page or that it made of yours; give it again")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("page")
+
+
+@pytest.fixture(scope="module")
+def address(folder) -> Iterator[str]:
+    server, address = start(folder)
+    yield address
+    assert stop(server) == ""
+    assert list(folder.glob("stereoweave-page-*")) == []
+
+
+@pytest.fixture
+def visitor(address) -> Iterator[Visitor]:
+    with Visitor(address) as visitor:
+        yield visitor
+
+
+@pytest.fixture(scope="module")
+def small_pair(tmp_path_factory) -> list[Path]:
+    """A pair that is quickly matched."""
+    files = [tmp_path_factory.mktemp("pair") / f"{side}.png" for side in ("left", "right")]
+    for file in files:
+        write_image(file, read_image(EXAMPLES / file.name)[200:264, 200:328])
+    return files
+
+
+@pytest.fixture(scope="module")
+def resident(address, small_pair) -> Iterator[tuple[Visitor, list[str], str]]:
+    """Another visitor, his uploads, and the answer to them."""
+    with Visitor(address) as visitor:
+        left, right = uploads = visitor.upload(*small_pair)
+        status, said = visitor.answer(visitor.press(left=file_data(left), right=file_data(right)))
+        assert status == 200
+        yield visitor, uploads, said
+
+
+def paths_in(said: str) -> list[str]:
+    """The paths of the files in an answer of the page."""
+    found: list[str] = []
+    json.loads(said, object_hook=lambda part: found.append(part.get("path")) or part)
+    return [path for path in found if path]
+
+
+def spellings(file: Path, uploaded: str, listener: socket.socket) -> list[str]:
+    """Ways to name a file of the server's disk, for who has uploaded one file himself."""
+    relative, url = os.path.relpath(file), f"http://127.0.0.1:{listener.getsockname()[1]}/left.png"
+    link = file.with_name(f"link-to-{file.name}")
+    link.symlink_to(file)
+    return [
+        str(file),
+        str(link),
+        relative,
+        f"./{relative}",
+        f"/{file}",
+        f"{file.parent}/./{file.name}",
+        f"{uploaded}/{os.path.relpath(file, uploaded)}",
+        f"{Path(uploaded).parent}/{os.path.relpath(file, Path(uploaded).parent)}",
+        quote(str(file), safe=""),
+        f"file://{file}",
+        f"/gradio_api/file={file}",
+        f"{file}\0",
+        f"{uploaded}\0{file}",
+        url,
+        url.replace("http", "https"),
+    ]
+
+
+def forged_bodies(visitor: Visitor, path: str, uploaded: str) -> Iterator[dict[str, Any]]:
+    """Requests of the form that name a file which is not the visitor's."""
+    for field in ("left", "right", "calibration"):
+        yield visitor.press(**{"left": file_data(uploaded), field: file_data(path)})
+    yield visitor.press(left=[file_data(path)])
+    yield visitor.press(left=file_data(path, is_stream=True, url=path))
+    yield visitor.press(left=file_data(uploaded), position={"value": file_data(path)})
+    yield visitor.press(left=file_data(uploaded)) | {"event_data": file_data(path)}
+
+
+def other_ways(path: str) -> Iterator[tuple[str, str]]:
+    """Addresses under which Gradio has handed out files, or has fetched them from elsewhere."""
+    encoded = quote(path, safe="").replace(".", "%2E")
+    for route in ("file=", "file/", "proxy=", "stream/", "custom_component/0/client/component/"):
+        yield "GET", f"/gradio_api/{route}{encoded}"
+    for route in ("static", "assets", "svelte"):
+        yield "GET", f"/{route}/{encoded}"
+    for route in ("run/_found", "api/_found", "call/_found", "call/v2/_found", "component_server"):
+        yield "POST", f"/gradio_api/{route}"
+
+
+def refusals(visitor: Visitor, path: str, uploaded: str) -> Iterator[tuple[int, str]]:
+    """The answers to all forged requests for one spelling of a file."""
+    for body in forged_bodies(visitor, path, uploaded):
+        yield visitor.answer(body)
+    for method, url in other_ways(path):
+        body = visitor.press(left=file_data(path)) if method == "POST" else None
+        answer = visitor.http.request(method, url, json=body)
+        yield answer.status_code, answer.text
+
+
+def test_no_forged_request_reads_a_file_or_tells_whether_it_is_there(visitor, folder, small_pair, tmp_path):
+    [uploaded] = visitor.upload(small_pair[0])
+    before, count = sorted(folder.rglob("*")), 0
+    there, missing = tmp_path / "there.png", tmp_path / "missing.png"
+    there.write_bytes((EXAMPLES / "left.png").read_bytes())
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        for file in (there, missing):
+            for path in spellings(file, uploaded, listener):
+                for refusal in refusals(visitor, path, uploaded):
+                    assert refusal == REFUSED, path
+                    count += 1
+        listener.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            listener.accept()
+    assert count == 2 * 15 * 20
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_what_a_visitor_uploaded_is_matched_and_its_results_are_his(resident):
+    visitor, uploads, said = resident
+    assert r"128\u00d764 px, matched in" in said
+    shown = paths_in(said)
+    assert len(shown) == 4  # view, depth, confidence, photograph
+    for path in (*shown, *uploads):
+        answer = visitor.http.get(f"/gradio_api/file={quote(path)}")
+        assert answer.status_code == 200
+        assert len(answer.content) == Path(path).stat().st_size
+
+
+def test_another_visitors_uploads_and_results_are_refused_though_their_paths_are_known(resident, visitor):
+    _, uploads, said = resident
+    for path in (*uploads, *paths_in(said)):
+        assert visitor.answer(visitor.press(left=file_data(path))) == REFUSED
+        answer = visitor.http.get(f"/gradio_api/file={quote(path)}")
+        assert (answer.status_code, answer.text) == REFUSED
+
+
+def test_who_keeps_no_cookie_has_no_files(resident, visitor):
+    visitor.http.cookies.clear()
+    [path] = visitor.upload(EXAMPLES / "right.png")
+    for named in (path, resident[1][0]):
+        assert visitor.answer(visitor.press(left=file_data(named))) == REFUSED
+
+
+def test_the_sample_is_read_by_who_asked_for_it_alone(visitor, resident, small_pair):
+    status, said = visitor.answer(visitor.press("sample"))
+    assert status == 200
+    left, *_ = paths_in(said)
+    [right] = visitor.upload(small_pair[1])
+    body = visitor.press(left=file_data(left), right=file_data(right))
+    assert "expected left and right pictures of one size" in visitor.answer(body)[1]
+    assert resident[0].answer(body) == REFUSED
+
+
+def test_an_upload_whose_name_has_blanks_and_accents_is_its_visitors(visitor, tmp_path):
+    file = tmp_path / "été à gauche #1 100%.txt"
+    file.write_text("no picture")
+    [path] = visitor.upload(file)
+    assert visitor.http.get(f"/gradio_api/file={quote(path)}").text == "no picture"
+    status, said = visitor.answer(visitor.press(left=file_data(path), right=file_data(path)))
+    assert status == 200
+    assert ": expected a picture" in said
+
+
+@pytest.mark.parametrize("content", ["[" * 100_000, "{", '"', " " * 2_000_000, "\xff", '{"path": 1}'])
+def test_what_is_no_request_of_the_form_is_refused(visitor, content):
+    answer = visitor.http.post("/gradio_api/queue/join", content=content.encode("latin-1"))
+    assert (answer.status_code, answer.text) == REFUSED
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_uploads_are_removed_when_a_signal_ends_the_page(tmp_path, small_pair, number):
+    server, address = start(tmp_path)
+    with Visitor(address) as visitor:
+        [path] = visitor.upload(small_pair[0])
+    assert Path(path).is_relative_to(tmp_path)
+    stop(server, number)
+    assert list(tmp_path.glob("stereoweave-page-*")) == []
+
+
+async def name_again(request: Request) -> JSONResponse:
+    return JSONResponse(await request.json())
+
+
+async def show_file(request: Request) -> PlainTextResponse:
+    assert request.cookies == {}  # as Gradio reads them
+    return PlainTextResponse("content")
+
+
+@pytest.fixture
+def page() -> Iterator[TestClient]:
+    """The gate before a little page: an upload lists the files that are named to its visitor."""
+    routes = [
+        Route("/gradio_api/upload", name_again, methods=["POST"]),
+        Route("/gradio_api/file={path:path}", show_file),
+    ]
+    with TestClient(OwnFiles(Starlette(routes=routes))) as page:
+        yield page
+
+
+def cookie_of(number: int) -> str:
+    return f"stereoweave-visitor={number:043}"
+
+
+def name_files(page: TestClient, cookie: str, *paths: str) -> None:
+    answer = page.post("/gradio_api/upload", json=list(paths), headers={"cookie": cookie})
+    assert answer.json() == list(paths)
+
+
+def status_of(page: TestClient, cookie: str, path: str) -> int:
+    return page.get(f"/gradio_api/file={path}", headers={"cookie": cookie}).status_code
+
+
+@pytest.mark.parametrize(
+    "others", ["theme=dark mode", "novalue", "path/x=1", 'x={"a":1}', "é=1"], ids=lambda text: ascii(text)
+)
+def test_a_visitor_keeps_their_files_beside_the_cookies_of_other_servers_on_the_host(page, others):
+    name_files(page, cookie_of(1), "/own.png")
+    for header in (f"{others}; {cookie_of(1)}", f"{cookie_of(1)}; {others}"):
+        answer = page.get("/gradio_api/file=/own.png", headers={"cookie": header.encode("utf-8")})
+        assert (answer.status_code, answer.text) == (200, "content")
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "PATCH", "DELETE", "OPTIONS", "BREW"])
+def test_a_body_is_checked_whatever_the_method_is(page, method):
+    answer = page.request(method, "/gradio_api/queue/join", json={"path": "/foreign.png"})
+    assert (answer.status_code, answer.text) == REFUSED
+
+
+def test_a_long_cookie_of_another_server_does_not_hold_the_page_up(page):
+    other = (
+        'other="' + r"\a" * 30_000 + '"'
+    )  # some versions of Python take the square of its length to read it
+    name_files(page, cookie_of(1), "/own.png")
+    start_s = time.process_time()
+    assert status_of(page, f"{other}; {cookie_of(1)}", "/own.png") == 200
+    assert time.process_time() - start_s < 1
+
+
+def test_no_visitor_takes_the_files_of_another_by_naming_many(page):
+    name_files(page, cookie_of(1), "/own.png")
+    name_files(page, cookie_of(2), *(f"/{number}.png" for number in range(100_001)))
+    assert status_of(page, cookie_of(1), "/own.png") == 200
+    # The last 10,000 stay.
+    assert status_of(page, cookie_of(2), "/90000.png") == 403
+    assert status_of(page, cookie_of(2), "/90001.png") == 200
+
+
+def test_of_more_than_1000_visitors_the_one_longest_unused_is_forgotten(page):
+    for number in range(1000):
+        name_files(page, cookie_of(number), "/own.png")
+    assert status_of(page, cookie_of(0), "/own.png") == 200  # now 1 is the longest unused
+    name_files(page, cookie_of(1000), "/own.png")
+    kept = [status_of(page, cookie_of(number), "/own.png") for number in (0, 1, 2, 1000)]
+    assert kept == [200, 403, 200, 200]

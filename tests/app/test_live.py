@@ -1,0 +1,316 @@
+import http.client
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import cv2
+import numpy as np
+import pytest
+
+from stereoweave.app.live import Capture, Screen, Tally, composed, followed, range_words, show
+from stereoweave.cameras.calibration_files import read_rig
+from stereoweave.cli.live import live
+from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.io.colormap import colour_disparity
+from stereoweave.matching.matcher import Matcher
+from stereoweave.stereo import StereoCamera, StereoPair
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+COMMAND = [sys.executable, "-c", "import typer; from stereoweave.cli.live import live; typer.run(live)"]
+_STEP = 20
+
+
+def write_film(path: Path, frames: Sequence[np.ndarray], rate: float = 25) -> str:
+    """A film of these RGB pictures; motion JPEG, of which each frame stands for itself."""
+    size_px = frames[0].shape[1], frames[0].shape[0]
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), rate, size_px)
+    assert writer.isOpened()
+    for frame in frames:
+        writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+    writer.release()
+    return str(path)
+
+
+def greys(count: int) -> list[np.ndarray]:
+    """Pictures that tell their number: each is 20 levels brighter than the one before."""
+    return [np.full((64, 96, 3), _STEP * number, np.uint8) for number in range(count)]
+
+
+def number_of(picture: np.ndarray) -> int:
+    return round(float(picture.mean()) / _STEP)
+
+
+def example_frame() -> np.ndarray:
+    """The example pair in one frame, at a quarter of its size."""
+    left, right = (cv2.imread(str(EXAMPLES / name)) for name in ("left.png", "right.png"))
+    both = cv2.resize(np.hstack([left, right]), (320, 120), interpolation=cv2.INTER_AREA)
+    return cv2.cvtColor(both, cv2.COLOR_BGR2RGB)
+
+
+def parts(response: http.client.HTTPResponse) -> Iterator[np.ndarray]:
+    """The pictures of a stream in RGB, read as the format says: boundary, header, as many bytes."""
+    boundary = response.headers.get_boundary()
+    assert response.headers.get_content_type() == "multipart/x-mixed-replace"
+    while line := response.readline():
+        if line.strip() != f"--{boundary}".encode():
+            continue
+        header = http.client.parse_headers(response)
+        if header["Content-Type"] is None:
+            return
+        assert header["Content-Type"] == "image/jpeg"
+        jpeg = np.frombuffer(response.read(int(header["Content-Length"])), np.uint8)
+        picture = cv2.imdecode(jpeg, cv2.IMREAD_COLOR)
+        assert picture is not None
+        yield cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+
+
+def asked(url: str, path: str = "/", **headers: str) -> http.client.HTTPResponse:
+    connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=20)
+    connection.request("GET", path, headers=headers)
+    return connection.getresponse()
+
+
+def begun(process: subprocess.Popen[str]) -> str:
+    """The address of the page, which the command says first."""
+    assert process.stdout is not None
+    found = re.search(r"http://127\.0\.0\.1:\d+/", process.stdout.readline())
+    assert found is not None
+    return found[0]
+
+
+def test_a_film_gives_its_frames_in_order_up_to_the_last_one_and_ends(tmp_path):
+    last = -1
+    with Capture([write_film(tmp_path / "film.avi", greys(8))]) as capture:
+        while moment := capture.newest(last):
+            assert moment.number > last
+            assert number_of(moment.pictures[0]) == moment.number
+            last = moment.number
+    assert last == 7
+
+
+def test_who_comes_late_gets_the_newest_frame_and_not_those_before_it(tmp_path):
+    with Capture([write_film(tmp_path / "film.avi", greys(8), rate=50)]) as capture:
+        assert capture.newest(6) is not None  # waits for the last one
+        late = capture.newest(-1)
+        assert late is not None
+        assert (late.number, number_of(late.pictures[0])) == (7, 7)
+
+
+def test_two_films_are_read_in_step_until_the_shorter_one_ends(tmp_path):
+    sources = [
+        write_film(tmp_path / "left.avi", greys(5)),
+        write_film(tmp_path / "right.avi", [255 - grey for grey in greys(9)]),
+    ]
+    last = -1
+    with Capture(sources) as capture:
+        while moment := capture.newest(last):
+            left, right = moment.pictures
+            assert number_of(left) == number_of(255 - right) == moment.number
+            last = moment.number
+    assert last == 4
+
+
+def test_a_series_of_pictures_is_a_film(tmp_path):
+    for number, picture in enumerate(greys(3)):
+        cv2.imwrite(str(tmp_path / f"frame{number:03}.png"), picture)
+    with Capture([str(tmp_path / "frame%03d.png")]) as capture:
+        moment = capture.newest(1)
+        assert moment is not None
+        assert number_of(moment.pictures[0]) == 2
+        assert capture.newest(2) is None
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("nowhere.mp4", "no such file"),
+        (str(EXAMPLES / "calib.txt"), "something else"),
+        ("999", "no camera of that number"),
+        ("http://127.0.0.1:1/stream", "no stream at that address"),
+    ],
+)
+def test_a_source_that_is_none_is_named_with_what_was_expected(source, found):
+    with pytest.raises(FormatError, match=rf"^{re.escape(source)}: expected a camera's number.*{found}"):
+        Capture([source])
+
+
+def test_more_than_two_sources_are_refused():
+    with pytest.raises(StereoweaveError, match="found 3: 0 1 2"):
+        Capture(["0", "1", "2"])
+
+
+def test_a_picture_and_a_stream_in_a_file_are_films_that_end(tmp_path):
+    cv2.imwrite(str(tmp_path / "one.png"), greys(3)[2])
+    jpegs = [cv2.imencode(".jpg", grey)[1].tobytes() for grey in greys(3)]
+    (tmp_path / "camera.mjpeg").write_bytes(b"".join(jpegs))
+    for name, last in (("one.png", 0), ("camera.mjpeg", 2)):
+        with Capture([str(tmp_path / name)]) as capture:
+            assert capture.newest(last - 1) is not None
+            assert capture.newest(last) is None
+
+
+def test_a_stream_that_stops_is_told_and_is_no_end_of_a_film():
+    grey = greys(6)[5]
+    with Screen(0) as screen:
+        screen.show(grey)
+        # It asks for some pictures before it knows what they are.
+        ended = threading.Event()
+        shown = threading.Thread(target=keep_showing, args=(screen, grey, ended))
+        shown.start()
+        with Capture([f"{screen.url}stream"]) as capture:
+            moment = capture.newest(-1)
+            assert moment is not None
+            assert number_of(moment.pictures[0]) == 5
+            ended.set()
+            shown.join()
+            screen.close()
+            with pytest.raises(StereoweaveError, match=r"/stream: expected frames, found the end.*connected"):
+                capture.newest(10**6)
+
+
+def keep_showing(screen: Screen, picture: np.ndarray, ended: threading.Event) -> None:
+    while not ended.wait(0.01):
+        screen.show(picture)
+
+
+def test_the_page_has_the_stream_and_the_stream_the_newest_pictures():
+    first, second = greys(8)[3], greys(8)[7]
+    with Screen(0) as screen:
+        page = asked(screen.url)
+        assert page.status == 200
+        assert b'<img src="/stream"' in page.read()
+        screen.show(first)
+        screen.show(second)
+        stream = parts(asked(screen.url, "/stream"))
+        assert number_of(next(stream)) == 7
+        screen.show(first)
+        assert number_of(next(stream)) == 3
+        screen.close()
+        assert list(stream) == []
+
+
+def test_the_page_is_for_this_machine_alone():
+    with Screen(0) as screen:
+        assert asked(screen.url, Host="somewhere.example:80").status == 403
+        assert asked(screen.url, Host=f"localhost:{screen.server_port}").status == 200
+        assert asked(screen.url, Host="localhost").status == 200  # as browsers write port 80
+        assert asked(screen.url, "/other").status == 404
+        assert asked(screen.url).headers["Cross-Origin-Resource-Policy"] == "same-origin"
+
+
+def test_a_port_that_is_taken_is_named():
+    with (
+        Screen(0) as screen,
+        pytest.raises(StereoweaveError, match=f"--port: .* found {screen.server_port}"),
+    ):
+        Screen(screen.server_port)
+
+
+def test_the_colours_follow_a_new_range_by_a_tenth():
+    near_px = np.full((40, 40), 50, np.float32)
+    assert followed(None, near_px) == (50, 51)  # at least a pixel
+    assert followed((0.0, 20.0), near_px) == pytest.approx((5, 23.1))
+
+
+def test_the_disparity_is_beside_the_left_picture_and_black_where_nothing_is_seen(rng):
+    left = rng.integers(0, 256, (40, 60, 3), dtype=np.uint8)
+    seen = np.ones((40, 60), bool)
+    seen[:, :7] = False
+    disparity_px = rng.uniform(0, 9, (40, 60)).astype(np.float32)
+    pair = StereoPair(left=left, right=left, left_seen=seen)
+    picture = composed(pair, disparity_px, (0, 9), "12.0 frames/s")
+    strip, below = picture[:-40], picture[-40:]
+    assert strip.max() > 0
+    np.testing.assert_array_equal(below[:, :60], left)
+    np.testing.assert_array_equal(below[:, 67:], colour_disparity(disparity_px, (0, 9))[:, 7:])
+    assert (below[:, 60:67] == 0).all()
+
+
+def test_with_a_camera_the_colours_stand_for_metres():
+    camera = StereoCamera(focal_px=600, baseline_m=0.1, cx_px=320, cy_px=240)
+    assert range_words(camera, (6.0, 40.0)) == "depth 10.00 m (blue) to 1.50 m (red)"
+    assert range_words(None, (6.0, 40.0)) == "disparity 6.0 px (blue) to 40.0 px (red)"
+
+
+def test_a_tally_counts_frames_their_rate_and_how_long_they_took(tmp_path):
+    with Capture([write_film(tmp_path / "film.avi", greys(1))]) as capture:
+        moment = capture.newest(-1)
+    assert moment is not None
+    tally = Tally()
+    assert tally.line() == "nothing was shown"
+    for number, (taken_s, now_s) in enumerate([(0.0, 0.5), (0.75, 1.0), (2.25, 2.5)]):
+        tally.add(moment._replace(number=2 * number, taken_s=taken_s), now_s)
+    assert tally.rate == 1.0
+    assert tally.line() == "3 frames shown of 5, 1.0 a second, 333 ms after they came"
+
+
+def test_what_is_shown_of_two_films_is_their_left_picture_and_its_disparity(tmp_path):
+    left, right = np.split(cv2.resize(example_frame(), (640, 240)), 2, axis=1)
+    sources = [write_film(tmp_path / "left.avi", [left]), write_film(tmp_path / "right.avi", [right])]
+    # calib.txt, for pictures of half its size.
+    calibration = "cam0=[300 0 159.5; 0 300 119.5; 0 0 1]\ncam1=[300 0 159.5; 0 300 119.5; 0 0 1]\n"
+    (tmp_path / "calib.txt").write_text(f"{calibration}doffs=0\nbaseline=100\nwidth=320\nheight=240\n")
+    tally = Tally()
+    with Screen(0) as screen, Capture(sources) as capture:
+        show(capture, screen, Matcher(), tally, rig=read_rig(tmp_path / "calib.txt"))
+        picture = next(parts(asked(screen.url, "/stream")))
+    assert (tally.shown, tally.last) == (1, 0)
+    assert picture.shape == (240 + 32, 640, 3)
+    assert np.abs(picture[32:, :320].astype(int) - left).mean() < 8
+    # The example's top is far, and blue; its bottom near, and red.
+    top, bottom = picture[42:72, 340:620].mean((0, 1)), picture[242:, 340:620].mean((0, 1))
+    assert top[2] > top[0]
+    assert bottom[0] > bottom[2]
+
+
+def test_the_command_shows_a_film_and_sums_it_up_at_its_end(tmp_path):
+    film = write_film(tmp_path / "film.avi", 30 * [example_frame()], rate=10)
+    with subprocess.Popen(
+        [*COMMAND, film, "--port", "0", "--no-browser"], stdout=subprocess.PIPE, text=True
+    ) as process:
+        stream = parts(asked(begun(process), "/stream"))
+        for picture in (next(stream), next(stream)):
+            assert picture.shape == (120 + 32, 320, 3)
+        rest, _ = process.communicate(timeout=60)
+    assert process.returncode == 0
+    counted = re.fullmatch(
+        rf"{re.escape(film)}: (\d+) frames shown of 30, [\d.]+ a second, \d+ ms .*\n", rest
+    )
+    assert counted is not None
+    assert 2 <= int(counted[1]) <= 30
+
+
+def test_an_interrupt_ends_the_command_in_order(tmp_path):
+    film = write_film(tmp_path / "film.avi", 20 * [example_frame()], rate=0.2)
+    process = subprocess.Popen(
+        [*COMMAND, film, "--port", "0", "--no-browser"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # A shell that starts the tests in the background has interrupts ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    with process:
+        next(parts(asked(begun(process), "/stream")))
+        process.send_signal(signal.SIGINT)
+        said, complaint = process.communicate(timeout=60)
+    assert (process.returncode, complaint) == (0, "")
+    assert "1 frames shown of 1" in said
+
+
+def test_an_arrangement_that_is_none_is_refused_before_anything_is_opened():
+    with pytest.raises(StereoweaveError, match=r"side_by_side, .* found beside of nowhere.mp4"):
+        live(["nowhere.mp4"], arrangement="beside")
+    with pytest.raises(StereoweaveError, match=r"of one source .* found crossed of 0 1"):
+        live(["0", "1"], arrangement="crossed")
+
+
+def test_a_frame_that_cannot_be_halved_is_refused(tmp_path):
+    cv2.imwrite(str(tmp_path / "frame000.png"), np.zeros((64, 95, 3), np.uint8))
+    with pytest.raises(FormatError, match="found 95x64"):
+        live([str(tmp_path / "frame%03d.png")], arrangement="side_by_side", port=0, browser=False)

@@ -1,0 +1,394 @@
+"""Large batches on a real Ray: what is made, what a bad pair or a killed process costs, and going on."""
+
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import fsspec
+import numpy as np
+import pyarrow.dataset
+import pytest
+from film_examples import example_pairs, packets, write_side_by_side
+from other_processes import halted, processes_of
+
+from stereoweave.batch import worker as cluster_worker
+from stereoweave.batch.cluster import _carried, _ready, run_cluster
+from stereoweave.batch.manifest import extend_plan, read_chunk, read_rows
+from stereoweave.batch.worker import FILM, Worker, remove_left_behind
+from stereoweave.cli.root import main
+from stereoweave.errors import MatcherError, OutputInUseError, ProviderError, StereoweaveError
+from stereoweave.io.files import read_image, read_pfm, write_image
+from stereoweave.io.output_lock import lock_output
+from stereoweave.io.stores import store_at
+from stereoweave.matching.matcher import Matcher
+from stereoweave.outputs.results import DepthOrder, make_depth
+from stereoweave.system.ray_engine import Engine, connect
+from stereoweave.video.writer import parts_folder
+
+pytestmark = pytest.mark.system
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+ORDER = DepthOrder(always=("disparity.pfm", "confidence.png"))
+
+
+@pytest.fixture(scope="module")
+def engine(ray_address):
+    engine = Engine(ray_address, workers=1)
+    with connect(engine):
+        yield engine
+
+
+def write_pairs(folder: Path, names, size_px=(64, 48)) -> Path:
+    """Small pairs, each another part of the example."""
+    width, height = size_px
+    for side in ("left", "right"):
+        image = read_image(EXAMPLES / f"{side}.png")
+        for index, name in enumerate(names):
+            crop = image[3 * index :][:height, 200 : 200 + width]
+            write_image(folder / side / f"{name}.png", crop)
+    return folder
+
+
+def numbered(count: int) -> list[str]:
+    return [f"{index:02d}" for index in range(count)]
+
+
+def manifest(out: str | Path) -> dict[str, dict]:
+    """The rows of all parts, read as others would, each pair once."""
+    files, path = fsspec.url_to_fs(str(out))
+    rows = pyarrow.dataset.dataset(f"{path}/manifest", filesystem=files).to_table().to_pylist()
+    assert len({row["pair"] for row in rows}) == len(rows)
+    return {row["pair"]: row for row in rows}
+
+
+def made_at_ns(out: Path) -> dict[str, int]:
+    return {path.parent.name: path.stat().st_mtime_ns for path in out.glob("*/disparity.pfm")}
+
+
+def test_bad_pairs_become_rows_and_the_next_run_makes_what_is_missing_changed_or_new(engine, tmp_path):
+    source, out = write_pairs(tmp_path / "pairs", numbered(8)), tmp_path / "out"
+    write_image(source / "left" / "alone.png", read_image(source / "left" / "00.png"))
+    bad, odd = source / "right" / "01.png", source / "right" / "02.png"
+    whole = {path: path.read_bytes() for path in (bad, odd)}
+    bad.write_bytes(whole[bad][:500])
+    write_image(odd, read_image(odd)[:-4])
+    tally = run_cluster(source, out, ORDER, engine)
+    assert (tally.made, tally.there, tally.failed, tally.manifest) == (6, 0, 3, str(out / "manifest"))
+    rows = manifest(out)
+    assert list(sorted(rows)) == [*numbered(8), "alone"]
+    assert str(bad) in rows["01"]["error"]
+    assert "of one size, found" in rows["02"]["error"]
+    assert rows["alone"]["error"].endswith(
+        "alone.png: expected a picture (PNG, JPEG, TIFF or the like), found no such file"
+    )
+    assert dict(tally.named) == {name: rows[name]["error"] for name in ("01", "02", "alone")}
+
+    pictures = [source / side / "03.png" for side in ("left", "right")]
+    summary, notes = make_depth(pictures, tmp_path / "alone", ORDER, Matcher(threads=1))
+    for file in ORDER.always:
+        assert (out / "03" / file).read_bytes() == (tmp_path / "alone" / file).read_bytes()
+    row = rows["03"]
+    assert (row["width_px"], row["height_px"], row["error"]) == (64, 48, None)
+    assert row["disparity_median_px"] == pytest.approx(summary.disparity_median_px)
+    assert row["confident_percent"] == pytest.approx(summary.confident_percent)
+    assert (row["pictures"], row["checks"]) == (["03.png", "03.png"], notes)
+
+    before = made_at_ns(out)
+    for path, content in whole.items():
+        path.write_bytes(content)
+    (source / "left" / "alone.png").unlink()
+    write_image(source / "left" / "04.png", read_image(source / "left" / "05.png"))
+    (out / "06" / "confidence.png").unlink()
+    write_pairs(source, ["new"])
+    tally = run_cluster(source, out, ORDER, engine)
+    assert (tally.made, tally.there, tally.failed) == (5, 4, 1)  # 01, 02, 04, 06, new; alone is still missing
+    after = made_at_ns(out)
+    assert {name for name in after if after[name] != before.get(name)} == {"01", "02", "04", "06", "new"}
+    rows = manifest(out)
+    assert {name for name, row in rows.items() if row["error"]} == {"alone"}
+    assert set(rows) == {*numbered(8), "alone", "new"}
+    assert not list((out / "begun").iterdir())
+
+
+def test_killed_workers_and_a_killed_driver_lose_nothing_and_double_nothing(ray_address, engine, tmp_path):
+    names = numbered(40)
+    source, out = write_pairs(tmp_path / "pairs", names, (256, 192)), tmp_path / "out"
+    program = "import sys; from stereoweave.cli.root import main; sys.exit(main())"
+    words = ["batch", str(source), str(out), "--address", ray_address, "--workers", "2"]
+    driver = subprocess.Popen([sys.executable, "-c", program, *words], stderr=subprocess.DEVNULL)
+
+    def parts() -> int:
+        return len(list((out / "manifest").glob("part-*.parquet")))
+
+    def wait_for(count: int) -> None:
+        while parts() < count and driver.poll() is None:
+            time.sleep(0.01)
+
+    wait_for(2)
+    workers = [process for process in processes_of(os.getpid()) if b"MapWorker" in command_of(process)]
+    os.kill(workers[0], signal.SIGKILL)
+    wait_for(6)
+    with halted(driver):
+        with pytest.raises(OutputInUseError, match=f"{out}: .* found one that is in use"):
+            run_cluster(source, out, DepthOrder(), engine)
+        driver.kill()
+    assert driver.wait() == -signal.SIGKILL
+    assert 6 <= parts() < 20
+    kept = made_at_ns(out)
+    complete = set(manifest(out))
+
+    order = DepthOrder()
+    tally = run_cluster(source, out, order, engine)
+    assert (tally.made + tally.there, tally.failed) == (40, 0)
+    assert tally.there >= len(complete) > 0
+    rows = manifest(out)
+    assert sorted(rows) == names
+    assert not any(row["error"] for row in rows.values())
+    now = made_at_ns(out)
+    assert {name: now[name] for name in complete} == {name: kept[name] for name in complete}
+    for name in names:
+        assert read_pfm(out / name / "disparity.pfm").shape == (192, 256)
+        assert read_image(out / name / "preview.png").shape == (192, 256, 3)
+
+
+def command_of(process: int) -> bytes:
+    try:
+        return Path(f"/proc/{process}/cmdline").read_bytes()
+    except OSError:
+        return b""
+
+
+class Deadly(Worker):
+    """A worker whose process is killed by the pair 01."""
+
+    def row(self, planned):
+        if planned.name == "01":
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().row(planned)
+
+
+def test_a_pair_that_kills_its_process_becomes_a_row_and_costs_no_other(tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster_worker, "_MOST_TRIES", 2)
+    source, out = store_at(write_pairs(tmp_path / "pairs", numbered(3))), store_at(tmp_path / "out")
+    monkeypatch.setattr("stereoweave.batch.manifest._CHUNKS_OF_A_WORKER", 1)
+    [first] = extend_plan(source, out, workers=1).chunks
+    out.write_bytes(f"begun/{first:08d}.json", b"{}")  # as the worker leaves it that is killed with the pair
+    counts = Deadly(source, out, ORDER)([first])
+    assert (counts.made, counts.failed) == (2, 1)
+    rows = read_rows(out, first)
+    assert [row["error"] for row in rows.values()] == [
+        None,
+        "its process was killed every time; is the memory full?",
+        None,
+    ]
+    assert not out.exists(f"begun/{first:08d}.json")
+
+
+class Stillborn(Worker):
+    """A worker of which every further process is killed while it starts."""
+
+    def _order(self):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Overtaxed(Worker):
+    """A worker whose provider has no memory for the pair 01."""
+
+    def _pair(self, planned, *more):
+        if planned.name == "01":
+            raise ProviderError("provider cpu: expected to run small.onnx, found that it failed: alloc")
+        return super()._pair(planned, *more)
+
+
+@pytest.fixture
+def places(tmp_path, monkeypatch):
+    """Source and destination of a chunk of three pairs, and its number."""
+    monkeypatch.setattr("stereoweave.batch.manifest._CHUNKS_OF_A_WORKER", 1)
+    source, out = store_at(write_pairs(tmp_path / "pairs", numbered(3))), store_at(tmp_path / "out")
+    [chunk] = extend_plan(source, out, workers=1).chunks
+    return source, out, chunk
+
+
+def test_rows_that_a_killed_worker_noted_count_while_their_results_are_there(places):
+    source, out, chunk = places
+    worker = Worker(source, out, ORDER)
+    planned = read_chunk(out, chunk)
+    rows = [worker._empty_row(one) | {"checks": ["noted"]} for one in planned[:2]]
+    rows[0]["files"] = ["disparity.pfm"]  # which is not there
+    mark = f"begun/{chunk:08d}.json"
+    out.write_bytes(mark, json.dumps({"rows": rows}).encode())
+    assert worker([chunk]).made == 3
+    assert [row["checks"] == ["noted"] for row in read_rows(out, chunk).values()] == [False, True, False]
+    out.write_bytes(mark, b"")  # lost with a machine's power
+    assert worker._notes(mark) == {}
+    out.remove(mark)  # by another run, which has just made the chunk
+    assert worker._notes(mark) == {}
+
+
+def test_processes_that_are_killed_while_they_start_end_the_run(places, monkeypatch):
+    monkeypatch.setattr(cluster_worker, "_MOST_FALSE_STARTS", 2)
+    source, out, chunk = places
+    out.write_bytes(f"begun/{chunk:08d}.json", b"{}")
+    with pytest.raises(
+        StereoweaveError, match="loads the network, found it killed 2 times in a row; is the mem"
+    ):
+        Stillborn(source, out, ORDER)([chunk])
+
+
+def test_a_pair_that_is_too_much_for_the_provider_is_a_row_and_one_that_fails_always_ends_the_run(
+    places, monkeypatch
+):
+    source, out, chunk = places
+    with monkeypatch.context() as patch:
+        patch.setattr(Matcher, "estimate_many", fails)
+        with pytest.raises(ProviderError, match=r"^provider cpu: .* it failed: lost$"):
+            Overtaxed(source, out, ORDER)([chunk])
+    assert read_rows(out, chunk) == {}
+    out.remove(f"begun/{chunk:08d}.json")
+    counts = Overtaxed(source, out, ORDER)([chunk])
+    assert (counts.made, counts.failed) == (2, 1)
+    assert read_rows(out, chunk)["01"]["error"].endswith("found that it failed: alloc")
+    counts = Worker(source, out, ORDER)([chunk])
+    assert (counts.made, counts.there) == (1, 2)
+
+
+def fails(*_: object, **__: object) -> None:
+    raise ProviderError("provider cpu: expected to run small.onnx, found that it failed: lost")
+
+
+def test_a_provider_that_a_workers_machine_has_not_ends_the_run_and_is_no_row(places):
+    source, out, chunk = places
+    with pytest.raises(MatcherError, match="provider directml: expected an ONNX Runtime that has it"):
+        Worker(source, out, replace(ORDER, provider="directml"))([chunk])
+    assert read_rows(out, chunk) == {}
+
+
+def test_a_machine_that_does_not_see_a_folder_is_named(places, tmp_path):
+    source, out, _ = places
+    worker = Worker(source, out, ORDER)
+    assert _ready(worker) is worker
+    for places_there in ((store_at(tmp_path / "none"), out), (source, store_at(tmp_path / "none"))):
+        with pytest.raises(
+            StereoweaveError, match="none: expected a folder, found no such folder; all"
+        ) as told:
+            _ready(Worker(*places_there, ORDER))
+        assert str(told.value).startswith(f"{platform.node()}: ")
+
+
+def test_a_film_goes_on_without_the_parts_of_another(tmp_path):
+    (tmp_path / "films").mkdir()
+    write_side_by_side(tmp_path / "films" / "sea.mkv", example_pairs(3))
+    source, out = store_at(tmp_path / "films"), store_at(tmp_path / "out")
+    parts = parts_folder(tmp_path / "out" / "sea.mkv" / FILM)
+    parts.mkdir(parents=True)
+    (parts / "000001.nut").touch()
+    np.savez(parts / "state-000001.npz")
+    (parts / "settings.json").write_text("{}")
+    [chunk] = extend_plan(source, out, workers=1).chunks
+    assert Worker(source, out, ORDER)([chunk]).made == 1
+    [row] = read_rows(out, chunk).values()
+    assert (row["files"], row["error"], row["width_px"]) == ([FILM], None, 160)
+    assert len(packets(tmp_path / "out" / "sea.mkv" / FILM, "video")) == 3
+    assert not parts.exists()
+
+
+def test_a_film_that_another_process_makes_is_a_row_with_an_error_and_keeps_its_parts(tmp_path):
+    (tmp_path / "films").mkdir()
+    write_side_by_side(tmp_path / "films" / "sea.mkv", example_pairs(3))
+    source, out = store_at(tmp_path / "films"), store_at(tmp_path / "out")
+    film = tmp_path / "out" / "sea.mkv" / FILM
+    parts_folder(film).mkdir(parents=True)
+    (parts_folder(film) / "000001.nut").touch()
+    [chunk] = extend_plan(source, out, workers=1).chunks
+    with lock_output(film):
+        assert Worker(source, out, ORDER)([chunk]).failed == 1
+    [row] = read_rows(out, chunk).values()
+    assert "found one that is in use" in row["error"]
+    assert [path.name for path in parts_folder(film).iterdir()] == ["000001.nut"]
+
+
+def test_what_killed_workers_left_is_removed_after_a_while(tmp_path):
+    for age_s in (0, 3600):
+        for name in (f".stereoweave-{age_s:08d}", f".part-{age_s:08d}.parquet", f".mine-{age_s}"):
+            path = tmp_path / name
+            path.mkdir() if "weave" in name else path.touch()
+            os.utime(path, (time.time() - age_s,) * 2)
+    remove_left_behind(tmp_path)
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {".stereoweave-00000000", ".part-00000000.parquet", ".mine-0", ".mine-3600"}
+
+
+def test_a_file_beside_that_is_called_like_a_network_is_none(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("small").write_bytes(b"something else")
+    assert list(_carried(DepthOrder())) == []
+
+
+def test_a_name_that_is_no_text_is_told(tmp_path):
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+        Path(os.fsdecode(os.fsencode(tmp_path / side) + b"/\xff.png")).touch()
+    with pytest.raises(StereoweaveError, match=r"names in UTF-8, found '.*\\udcff.*'; rename it"):
+        extend_plan(store_at(tmp_path), store_at(tmp_path / "out"), workers=1)
+
+
+def test_another_runs_destination_is_refused_and_so_is_a_source_with_nothing_in_it(engine, tmp_path):
+    source, out = write_pairs(tmp_path / "pairs", ["00"]), tmp_path / "out"
+    assert run_cluster(source, out, ORDER, engine).made == 1
+    with pytest.raises(StereoweaveError, match=r"batch.json: expected always = .*, found .* another folder"):
+        run_cluster(source, out, DepthOrder(), engine)
+    other = write_pairs(tmp_path / "other", ["00"])
+    with pytest.raises(StereoweaveError, match=r"batch.json: expected source = .*other.*, found .*pairs"):
+        run_cluster(other, out, ORDER, engine)
+    with pytest.raises(StereoweaveError, match=r"other: expected a new folder, or one with a batch.json"):
+        run_cluster(source, other, ORDER, engine)
+    with pytest.raises(StereoweaveError, match="none: expected a folder, found no such folder"):
+        run_cluster(tmp_path / "none", tmp_path / "new", ORDER, engine)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(StereoweaveError, match="expected pairs of pictures or films in it, found none"):
+        run_cluster(tmp_path / "empty", tmp_path / "new", ORDER, engine)
+
+
+def test_pairs_go_from_a_bucket_to_a_bucket_with_a_calibration_and_a_bad_one_is_told_by_its_url(
+    engine, bucket, tmp_path
+):
+    local = write_pairs(tmp_path / "pairs", numbered(3))
+    (local / "right" / "02.png").write_bytes(b"none")
+    store = store_at(f"{bucket}/in")
+    for path in local.rglob("*.png"):
+        store.put(path, path.relative_to(local).as_posix())
+    for name in ("left.png", "right.png", "calib.txt"):
+        store.put(EXAMPLES / name, f"room/{name}")
+    tally = run_cluster(f"{bucket}/in", f"{bucket}/out", ORDER, engine)
+    assert (tally.made, tally.failed, tally.manifest) == (3, 1, f"{bucket}/out/manifest")
+    rows = manifest(f"{bucket}/out")
+    assert rows["02"]["error"].startswith(f"{bucket}/in/right/02.png: expected a picture")
+    assert "depth.png" in rows["room"]["files"]
+    out = store_at(f"{bucket}/out")
+    pictures = [local / side / "00.png" for side in ("left", "right")]
+    make_depth(pictures, tmp_path / "alone", ORDER, Matcher(threads=1))
+    for file in ORDER.always:
+        assert out.read_bytes(f"00/{file}") == (tmp_path / "alone" / file).read_bytes()
+    tally = run_cluster(f"{bucket}/in", f"{bucket}/out", ORDER, engine)
+    assert (tally.made, tally.there, tally.failed) == (0, 3, 1)
+    with pytest.raises(StereoweaveError, match="expected a bucket, found none that is called nobodys"):
+        run_cluster("s3://nobodys/in", f"{bucket}/new", ORDER, engine)
+
+
+def test_the_command_tells_how_it_went(engine, tmp_path, capsys):
+    source, out = write_pairs(tmp_path / "pairs", numbered(2)), tmp_path / "out"
+    (source / "left" / "01.png").write_bytes(b"none")
+    assert main(["batch", str(source), str(out), "--workers", "1"]) == 1
+    told = capsys.readouterr()
+    assert told.out.splitlines()[0] == f"{out}: 2 pairs: 1 made, 1 failed"
+    assert told.out.splitlines()[1].startswith(f"failed: 01: {source}/left/01.png: expected a picture")
+    assert told.out.splitlines()[2] == f"manifest: {out / 'manifest'}"
+    assert main(["batch", str(source), str(out), "--json"]) == 1
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["made"], facts["there"], facts["failed"], list(facts["named"])) == (0, 1, 1, ["01"])

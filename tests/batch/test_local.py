@@ -1,0 +1,307 @@
+"""Batches with real processes: what they make, what a bad pair or a killed process costs, and going on."""
+
+import csv
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from other_processes import halted
+from rich.console import Console
+
+from stereoweave.batch.local import DONE_FILE, Tally, depth_of_many, run_batch
+from stereoweave.cli.root import main
+from stereoweave.errors import OutputInUseError, StereoweaveError
+from stereoweave.io.files import read_image, read_pixels, write_image
+from stereoweave.matching.matcher import Matcher
+from stereoweave.outputs.results import DepthOrder, make_depth
+from stereoweave.pictures.pair_finding import Job, Pairs, pairs_in
+from stereoweave.pictures.prepare import Request
+from stereoweave.system.threads import usable_cores
+
+pytestmark = pytest.mark.system
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+ORDER = DepthOrder(threads=1, always=("disparity.pfm", "preview.png", "confidence.png"))
+PROGRAM = """
+import sys
+from pathlib import Path
+from stereoweave.batch.local import depth_of_many
+from stereoweave.pictures.pair_finding import pairs_in
+from stereoweave.outputs.results import DepthOrder
+
+if __name__ == "__main__":
+    order = DepthOrder(threads=1, always=("disparity.pfm", "preview.png", "confidence.png"))
+    sys.exit(depth_of_many(pairs_in(Path(sys.argv[1])), Path(sys.argv[2]), order, processes=2))
+"""
+
+
+class Deadly(Job):
+    """A job that kills the process it is sent to."""
+
+    def __reduce__(self):
+        return os.kill, (_own_id(), signal.SIGKILL)
+
+
+class Noting(Job):
+    """A job that notes beside its left picture how many threads the process has that it is sent to."""
+
+    def __reduce__(self):
+        return noted_job, (self.name, self.pictures)
+
+
+def noted_job(name: str, pictures: tuple[Path, ...]) -> Job:
+    threads = cv2.getNumThreads(), os.environ["OPENBLAS_NUM_THREADS"]
+    pictures[0].with_suffix(".txt").write_text("{} {}".format(*threads))
+    return Job(name, pictures)
+
+
+class _own_id:
+    """The id of whichever process unpickles it."""
+
+    def __reduce__(self):
+        return os.getpid, ()
+
+
+def write_pairs(folder: Path, count: int, size_px=(96, 64)) -> Path:
+    """Small pairs 00, 01, ..., each another part of the example."""
+    width, height = size_px
+    for side in ("left", "right"):
+        (folder / side).mkdir(parents=True)
+        image = read_image(EXAMPLES / f"{side}.png")
+        for index in range(count):
+            write_image(folder / side / f"{index:02d}.png", image[4 * index :][:height, 200 : 200 + width])
+    return folder
+
+
+def batch(folder: Path, out: Path, order: DepthOrder = ORDER, **options) -> tuple[Tally, str]:
+    """The tally, and what was shown meanwhile."""
+    shown = io.StringIO()
+    options.setdefault("jobs", pairs_in(folder).jobs)
+    return run_batch(out=out, order=order, console=Console(file=shown), **options), shown.getvalue()
+
+
+def made_at_ns(out: Path) -> dict[str, int]:
+    return {path.parent.name: path.stat().st_mtime_ns for path in out.glob(f"*/{DONE_FILE}")}
+
+
+def table(out: Path) -> dict[str, dict[str, str]]:
+    with (out / "summary.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len({row["name"] for row in rows}) == len(rows)
+    return {row["name"]: row for row in rows}
+
+
+def test_a_bad_pair_is_told_and_the_others_are_as_they_are_alone_and_the_next_run_does_what_is_missing(
+    tmp_path,
+):
+    folder, out = write_pairs(tmp_path / "pairs", 4), tmp_path / "out"
+    bad = folder / "right" / "01.png"
+    whole = bad.read_bytes()
+    bad.write_bytes(whole[:3000])
+    start_s = time.perf_counter()
+    tally, shown = batch(folder, out, processes=2)
+    elapsed_s = time.perf_counter() - start_s
+    [(name, reason)] = tally.failed
+    assert (tally.done, tally.skipped, name) == (3, 0, "01")
+    assert str(bad) in reason
+    assert f"01: {reason}\n" in shown
+
+    make_depth(
+        (folder / "left" / "02.png", folder / "right" / "02.png"), tmp_path / "alone", ORDER, Matcher()
+    )
+    for file in ("disparity.pfm", "preview.png", "confidence.png"):
+        assert (out / "02" / file).read_bytes() == (tmp_path / "alone" / file).read_bytes()
+    rows = table(out)
+    assert list(rows) == ["00", "01", "02", "03"]
+    assert rows["01"]["error"] == reason
+    assert rows["02"]["pictures"] == "02.png + 02.png"
+    assert 0 < float(rows["02"]["seconds"]) < elapsed_s
+
+    before = made_at_ns(out)
+    bad.write_bytes(whole)
+    write_image(folder / "left" / "03.png", read_image(folder / "left" / "03.png")[::-1])
+    (out / "00" / "disparity.pfm").unlink()
+    tally, shown = batch(folder, out, processes=1)
+    assert tally == Tally(done=3, skipped=1, failed=())
+    after = made_at_ns(out)
+    assert {name for name in after if after[name] != before.get(name)} == {"00", "01", "03"}
+    assert [row["error"] for row in table(out).values()] == [""] * 4
+    assert sorted(path.name for path in out.iterdir()) == [
+        "00",
+        "01",
+        "02",
+        "03",
+        "batch.json",
+        "summary.csv",
+    ]
+
+
+def test_a_pair_that_fails_when_it_is_made_again_is_finished_no_more(tmp_path):
+    folder, out = write_pairs(tmp_path / "pairs", 2), tmp_path / "out"
+    assert batch(folder, out, processes=1)[0].done == 2
+    first, second = pairs_in(folder).jobs
+    second.pictures[1].write_bytes(b"no picture")
+    tally, _ = batch(folder, out, processes=1)
+    assert [name for name, _ in tally.failed] == ["01"]
+    assert list(made_at_ns(out)) == ["00"]
+    batch(folder, out, jobs=[first], processes=1)
+    assert list(table(out)) == ["00"]
+
+
+def test_a_pair_is_there_only_with_its_pictures_and_its_mark_unharmed(tmp_path, capsys):
+    folder, out = write_pairs(tmp_path / "pairs", 3), tmp_path / "out"
+    out.mkdir()
+    (out / ".DS_Store").touch()  # a folder of which only this is in it is a new one
+    jobs = pairs_in(folder).jobs
+    assert batch(folder, out, processes=1)[0].done == 3
+    (out / "00" / DONE_FILE).write_text("{")
+    jobs[1].pictures[0].unlink()
+    tally, _ = batch(folder, out, jobs=jobs, processes=1)
+    assert (tally.done, tally.skipped, [name for name, _ in tally.failed]) == (1, 1, ["01"])
+    assert depth_of_many(Pairs(jobs[:1], ("a note",)), out, ORDER) == 0
+    told = capsys.readouterr()
+    assert told.out.splitlines()[0] == f"{out}: 1 pair: 0 made, 1 were there"
+    assert told.err.splitlines()[0] == "a note"
+
+
+@pytest.mark.parametrize(("processes", "threads"), [(2, 1), (1, usable_cores())])
+def test_several_processes_have_a_thread_each_and_a_single_one_has_all_cores(
+    tmp_path, monkeypatch, processes, threads
+):
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
+    folder = write_pairs(tmp_path / "pairs", 2)
+    jobs = [Noting(job.name, job.pictures) for job in pairs_in(folder).jobs]
+    order = DepthOrder(always=("disparity.pfm",))
+    assert batch(folder, tmp_path / "out", order, jobs=jobs, processes=processes)[0].done == 2
+    notes = [job.pictures[0].with_suffix(".txt").read_text() for job in jobs]
+    assert notes == [f"{threads} {threads}"] * 2
+    assert os.environ["OPENBLAS_NUM_THREADS"] == "7"
+
+
+def test_a_killed_batch_goes_on_and_so_does_an_interrupted_one_but_none_beside_another(tmp_path, capsys):
+    folder, out = write_pairs(tmp_path / "pairs", 24, (256, 192)), tmp_path / "out"
+    before = {}
+    for end, goal in ((signal.SIGKILL, 3), (signal.SIGINT, 8)):
+        process = subprocess.Popen(
+            [sys.executable, "-c", PROGRAM, folder, out],
+            start_new_session=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            # Where a shell starts the tests in the background, Ctrl-C is ignored by all that they start.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        )
+        while len(made_at_ns(out)) < goal and process.poll() is None:
+            time.sleep(0.002)
+        with halted(process):
+            with pytest.raises(OutputInUseError, match=f"{out}: .* found one that is in use"):
+                batch(folder, out)
+            os.killpg(process.pid, end)
+        told, errors = process.communicate()
+        made = made_at_ns(out)
+        assert goal <= len(made) < 24
+        assert made.items() >= before.items()
+        before = made
+    assert process.returncode == 130
+    assert told == ""
+    assert errors.splitlines()[-1] == (
+        f"stereoweave: {out}: stopped; what is finished stays, and the same command goes on"
+    )
+    assert "Traceback" not in errors
+    assert not list(out.glob(".*"))
+
+    assert depth_of_many(pairs_in(folder), out, ORDER, processes=2) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        f"{out}: 24 pairs: {24 - len(before)} made, {len(before)} were there",
+        f"table: {out / 'summary.csv'}",
+    ]
+    assert made_at_ns(out).items() >= before.items()
+    names = [f"{index:02d}" for index in range(24)]
+    assert sorted(made_at_ns(out)) == names
+    assert list(table(out)) == names
+    assert not list(out.rglob(".*"))
+
+
+def test_a_pair_that_kills_its_process_is_named_and_costs_no_other(tmp_path, capsys):
+    folder, out = write_pairs(tmp_path / "pairs", 3), tmp_path / "out"
+    first, second, third = pairs_in(folder).jobs
+    jobs = [first, Deadly(second.name, second.pictures), third]
+    assert depth_of_many(Pairs(jobs), out, ORDER, processes=2, as_json=True) == 1
+    told = capsys.readouterr()
+    assert json.loads(told.out) == {
+        "done": 2,
+        "skipped": 0,
+        "failed": {"01": "its process was killed; is the memory full?"},
+        "summary": str(out / "summary.csv"),
+    }
+    assert "01: its process was killed" in told.err
+    assert sorted(made_at_ns(out)) == ["00", "02"]
+
+
+def test_another_order_or_another_folder_is_refused_before_anything_starts(tmp_path):
+    folder, out = write_pairs(tmp_path / "pairs", 1), tmp_path / "out"
+    calibration = tmp_path / "calib.txt"
+    calibration.write_text("first")
+    order = DepthOrder(request=Request(calibration=calibration))
+    assert batch(folder, out, order, jobs=[])[0] == Tally(done=0, skipped=0, failed=())
+    with pytest.raises(StereoweaveError, match='batch.json: expected model = "base", .* found "small"'):
+        batch(folder, out, DepthOrder(request=Request(calibration=calibration), model="base"))
+    calibration.write_text("second")
+    with pytest.raises(
+        StereoweaveError, match=r"expected calibration = .calib.txt \w{12}., .* another folder"
+    ):
+        batch(folder, out, order)
+    with pytest.raises(
+        StereoweaveError, match="expected a new folder, or one with a batch.json, found left in"
+    ):
+        batch(folder, folder)
+    with pytest.raises(StereoweaveError, match="nonsense"):
+        batch(folder, tmp_path / "new", DepthOrder(model="nonsense"))
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_scenes_own_calibration_gives_its_depth_in_metres_unless_one_is_named_for_all(tmp_path):
+    folder, out = tmp_path / "scenes", tmp_path / "out"
+    (folder / "room").mkdir(parents=True)
+    for name in ("left.png", "right.png", "calib.txt"):
+        (folder / "room" / name).write_bytes((EXAMPLES / name).read_bytes())
+    tally, _ = batch(folder, out, processes=1)
+    assert tally == Tally(done=1, skipped=0, failed=())
+    own_mm = read_pixels(out / "room" / "depth.png", "I;16")
+
+    calibration = tmp_path / "twice.txt"
+    words = (EXAMPLES / "calib.txt").read_text().replace("baseline=100", "baseline=200")
+    calibration.write_text(words)
+    order = DepthOrder(request=Request(calibration=calibration))
+    batch(folder, tmp_path / "other", order, processes=1)
+    other_mm = read_pixels(tmp_path / "other" / "room" / "depth.png", "I;16")
+    assert np.median(other_mm / own_mm) == pytest.approx(2, rel=1e-3)
+
+
+def test_the_command_takes_a_list_and_makes_no_reports_unless_they_are_asked_for(tmp_path, capsys):
+    folder, out = write_pairs(tmp_path / "pairs", 2), tmp_path / "out"
+    (folder / "list.txt").write_text("left/00.png right/00.png quay\nleft/01.png right/none.png\n")
+    words = ["depth", "--list", str(folder / "list.txt"), "--jobs", "1", "--threads", "1", "-o"]
+    assert main([*words, str(out)]) == 1
+    told = capsys.readouterr()
+    reason = f"01: {folder / 'right' / 'none.png'}: expected a picture, found no such file"
+    assert told.out.splitlines() == [
+        f"{out}: 2 pairs: 1 made, 1 failed",
+        f"failed: {reason}",
+        f"table: {out / 'summary.csv'}",
+    ]
+    assert reason in told.err
+    assert (out / "quay" / "disparity.pfm").exists()
+    assert not (out / "quay" / "report.html").exists()
+    assert main([*words, str(tmp_path / "reports"), "--write", "report.html"]) == 1
+    assert (tmp_path / "reports" / "quay" / "report.html").exists()
+    assert main([*words, str(out), "--left", "*.png"]) == 2
+    assert "expected pictures or a folder, or --left and --right, or --list" in capsys.readouterr().err

@@ -1,0 +1,172 @@
+"""Rendered sets and scores by the workers of a cluster: the same as without one."""
+
+import csv
+import io
+import os
+import platform
+import signal
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dataset_examples import error_of
+from rich.console import Console
+from shard_examples import PaintedStudio, box_before_a_wall, contents
+
+from stereoweave.bench import pairs as benchmark
+from stereoweave.bench.pairs import network, score_pairs, write_csv
+from stereoweave.cli.root import main
+from stereoweave.data.packing import packed
+from stereoweave.data.readers import list_scenes
+from stereoweave.data.shards import write_shard
+from stereoweave.errors import StereoweaveError
+from stereoweave.synth.sets import make as making
+from stereoweave.synth.sets.make import make
+from stereoweave.synth.sets.samples import Order
+from stereoweave.system.ray_engine import Engine, connect
+
+pytestmark = pytest.mark.system
+
+ORDER = Order(scene="pylon", seed=3, size_px=(48, 32))
+STUDIO = PaintedStudio()
+MEASURED = {"time_ms", "time_relative", "memory_mb"}
+
+
+@dataclass(frozen=True)
+class KilledOnce(PaintedStudio):
+    """Its process is killed at pair 6, the first time."""
+
+    note: Path = Path()
+
+    def __call__(self, order, index):
+        if index == 6 and not self.note.exists():
+            self.note.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().__call__(order, index)
+
+
+@dataclass(frozen=True)
+class KeptToItself(PaintedStudio):
+    """The shard before pair 4 is seen by no other machine."""
+
+    out: Path = Path()
+
+    def __call__(self, order, index):
+        if index == 4:
+            (self.out / "pylon-000000-000003.tar").unlink()
+        return super().__call__(order, index)
+
+
+@pytest.fixture(scope="module")
+def cluster(ray_address):
+    """Its address; this process stays its driver for all tests here."""
+    with connect(Engine(ray_address)):
+        yield ray_address
+
+
+@pytest.fixture(autouse=True)
+def small_shards(monkeypatch):
+    monkeypatch.setitem(making.LAYOUTS, "shards", making.LAYOUTS["shards"]._replace(pairs_a_run=4))
+
+
+def made(out, pairs=10, studio=STUDIO, engine=None):
+    return make(ORDER, pairs, out, engine=engine, studio=studio, console=Console(file=io.StringIO()))
+
+
+@pytest.fixture(scope="module")
+def sets(tmp_path_factory):
+    """Two sets of a pair each, with a further view."""
+    folder = tmp_path_factory.mktemp("sets")
+    for number, name in enumerate(("crane", "ship")):
+        sample = box_before_a_wall(np.random.default_rng(number), (96, 64))
+        write_shard(folder / name, name, 0, [packed(sample, {0.5: sample.left})])
+    return folder
+
+
+# Rendered sets
+
+
+def test_a_cluster_goes_on_to_the_bytes_of_one_process_though_a_worker_is_killed(tmp_path, cluster):
+    made(tmp_path / "one")
+    made(tmp_path / "many", pairs=4)
+    studio = KilledOnce(note=tmp_path / "killed")
+    assert made(tmp_path / "many", studio=studio, engine=Engine(cluster)) == 6
+    assert studio.note.exists()
+    assert contents(tmp_path / "many") == contents(tmp_path / "one")
+
+
+def test_pairs_that_a_cluster_made_where_nobody_else_sees_them_are_missed(tmp_path, cluster):
+    message = error_of(made, tmp_path, 10, KeptToItself(out=tmp_path), Engine(cluster, workers=1))
+    assert message.startswith(
+        f"{tmp_path}: expected all pairs that the cluster made, found 4 of them missing"
+    )
+    assert made(tmp_path) == 4
+
+
+def test_a_machine_that_sees_another_folder_or_would_make_other_pairs_is_named(tmp_path):
+    made(tmp_path / "set", pairs=1)
+    message = error_of(making._on_a_node, ORDER, tmp_path / "nowhere", "shards", STUDIO)
+    words = ["set.json: expected the description of a set", "found no such file", platform.node()]
+    assert [word for word in words if word not in message] == []
+    message = error_of(making._on_a_node, replace(ORDER, seed=4), tmp_path / "set", "shards", STUDIO)
+    assert "expected seed = 4, as this run would make, found 3" in message
+    assert message.endswith("on a disk that they share, and the same versions of all")
+
+
+@pytest.mark.needs_egl
+def test_a_rendered_set_is_the_same_from_a_cluster(tmp_path, cluster, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    line = "synth make pylon --pairs 2 --size 48x32 --plain --jobs 1"
+    assert main(f"{line} -o one".split()) == 0
+    assert main(f"{line} -o many --cluster {cluster}".split()) == 0
+    assert contents(tmp_path / "many") == contents(tmp_path / "one")
+
+
+# Scores
+
+
+def test_a_cluster_finds_the_errors_that_one_process_finds(sets, tmp_path, cluster):
+    line = f"bench pairs {sets} --model small --threads 1 -o {tmp_path}/many.csv --cluster {cluster}"
+    assert main(line.split()) == 0
+    makers = {"small": partial(network, "small", 1), "small refined": partial(network, "small", 1, True)}
+    expected = score_pairs(makers, partial(list_scenes, sets))
+    write_csv(tmp_path / "one.csv", expected.rows, expected.machine)
+    many = _rows(tmp_path / "many.csv")
+    assert [_errors(row) for row in many] == [_errors(row) for row in _rows(tmp_path / "one.csv")]
+    assert len(many) == 3 * 6
+    assert all(float(row["time_ms"]) > 0 for row in many)
+
+
+def test_a_cluster_finds_the_views_that_one_process_finds(sets, tmp_path, cluster):
+    line = f"bench views {sets} --model small --threads 1"
+    assert main(f"{line} -o {tmp_path}/one.csv".split()) == 0
+    assert main(f"{line} -o {tmp_path}/many.csv --cluster {cluster}".split()) == 0
+    one, many = (list(map(_errors, _rows(tmp_path / name))) for name in ("one.csv", "many.csv"))
+    assert many == one
+    assert len(many) == 3 * 6
+
+
+def test_a_machine_that_sees_other_scenes_is_named(sets):
+    with pytest.raises(StereoweaveError) as raised:
+        benchmark._Scorer({}, partial(list_scenes, sets), len, expected=3)
+    assert str(raised.value) == (
+        f"{platform.node()}: expected the 3 scenes that are where the command was started, found 2; "
+        "put them on a disk that every node of the cluster sees"
+    )
+
+
+def test_machines_that_differ_are_named_side_by_side():
+    machines = [{"cpu": "B", "cores": "2"}, {"cpu": "A", "cores": "2"}, {"cpu": "B", "cores": "2"}]
+    scored = [benchmark.Scored(number, None, machine) for number, machine in enumerate(machines)]
+    assert benchmark.machine_of_all(scored) == {"cpu": "A + B", "cores": "2"}
+
+
+def _rows(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def _errors(row):
+    return {name: value for name, value in row.items() if name not in MEASURED}

@@ -1,0 +1,224 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stereoweave.bench.flicker import FRAME_BY_FRAME, STEADY, FlickerRow, flicker_rows, means
+from stereoweave.bench.flicker_films import (
+    LEFT,
+    MIDDLE,
+    NOISE_LEVELS,
+    Film,
+    noisy,
+    panning,
+    passing,
+    reprojected,
+    still,
+)
+from stereoweave.bench.flicker_metrics import flicker, seen_again
+from stereoweave.errors import StereoweaveError
+from stereoweave.stereo import StereoCamera, StereoPair
+from stereoweave.synth.rigs import Rig
+from stereoweave.synth.sets.samples import Order
+
+REST = np.zeros((1, 4, 2), np.float32)
+ALL = np.ones((1, 4), bool)
+LENS = StereoCamera(focal_px=100, baseline_m=0.1, cx_px=20, cy_px=15)
+RIG = Rig(camera=LENS, size_px=(41, 31), position_m=np.zeros(3), axes=np.eye(3))
+
+
+def row(*values):
+    return np.array([values], np.float32)
+
+
+def to_the_right(*px):
+    return np.stack([row(*px), row(*np.zeros(4))], axis=-1)
+
+
+def test_flicker_at_rest_is_the_mean_absolute_change():
+    assert flicker(row(1, 2, 3, 4), row(2, 2, 1, 5), REST, ALL) == 1.0  # of 1, 0, 2, 1
+
+
+def test_what_moves_as_it_truly_does_does_not_flicker():
+    before, after = row(7, 9, 1, 1), row(1, 7, 9, 1)
+    visible = np.array([[True, True, True, False]])
+    assert flicker(before, after, to_the_right(1, 1, 1, 1), visible) == 0.0
+    assert flicker(before, after, REST, visible) == (6 + 2 + 8) / 3
+
+
+def test_half_a_pixel_of_motion_is_interpolated():
+    visible = np.array([[True, False, False, False]])
+    assert flicker(row(5, 0, 0, 0), row(4, 8, 0, 0), to_the_right(0.5, 0, 0, 0), visible) == 1.0  # of 6 and 5
+
+
+def test_a_true_change_of_disparity_is_no_flicker_and_neither_is_an_error_that_stays():
+    truth_px = row(10, 10, 20, 20)
+    nearing_px = row(0, 0, 3, 3)
+    assert flicker(truth_px + 1, truth_px + nearing_px + 1, REST, ALL, nearing_px) == 0.0
+    assert flicker(truth_px, truth_px, REST, ALL, nearing_px) == 1.5  # of 0, 0, 3, 3
+
+
+def test_flicker_of_a_picture_is_the_mean_over_its_channels():
+    before = np.zeros((1, 4, 3), np.uint8)
+    after = before.copy()
+    after[0, 1] = 3, 6, 9
+    assert flicker(before, after, REST, ALL) == 18 / 12
+    assert flicker(before, after, REST, np.array([[False, True, False, False]])) == 6.0
+
+
+def test_flicker_of_no_point_is_nan():
+    assert np.isnan(flicker(row(1, 2, 3, 4), row(1, 2, 3, 4), REST, ~ALL))
+
+
+def test_frames_of_two_sizes_and_points_that_leave_are_refused(without_shape_checks):
+    with pytest.raises(StereoweaveError, match="of one size, got .*1, 4.*1, 3"):
+        flicker(row(1, 2, 3, 4), row(1, 2, 3), REST, ALL)
+    with pytest.raises(StereoweaveError, match="found 1 that leave it"):
+        flicker(row(1, 2, 3, 4), row(1, 2, 3, 4), to_the_right(0, 0, 0, 1), ALL)
+
+
+def test_a_point_is_seen_again_inside_and_where_its_own_surface_is():
+    before_px, after_px = row(5, 5, 5, 5), row(5, 9, 5, 5)
+    found = seen_again(before_px, after_px, to_the_right(0, 0, 0, 1), row(0, 0, 0, 0))
+    np.testing.assert_array_equal(found, [[True, False, True, False]])  # stays; is covered; stays; leaves
+    # Between two pixels both have to show it.
+    found = seen_again(before_px, after_px, to_the_right(0.5, 1, 0.5, 0), row(0, 0, 0, 0))
+    np.testing.assert_array_equal(found, [[False, True, True, True]])
+    assert seen_again(before_px, after_px, REST, row(4, 4, 4, 4)).tolist() == [[False, True, False, False]]
+
+
+def at(change, x, y):
+    motion_px, change_px = change
+    return [*motion_px[y, x], change_px[y, x]]
+
+
+def test_a_camera_that_steps_aside_moves_points_by_their_share_of_the_baseline():
+    # Half a baseline to the right: half the disparity to the left.
+    aside = replace(RIG, position_m=np.array([0.05, 0, 0]))
+    disparity_px = np.full((31, 41), 8, np.float32)
+    disparity_px[0, 0] = 0
+    change = reprojected(disparity_px, RIG, aside, LEFT)
+    np.testing.assert_allclose(at(change, 30, 20), [-4, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(at(change, 0, 0), [0, 0, 0], atol=1e-5)  # the sky
+
+
+@pytest.mark.parametrize("position", [LEFT, MIDDLE])
+def test_a_camera_that_goes_half_the_way_doubles_disparity_and_size(position):
+    nearer = replace(RIG, position_m=np.array([0, 0, 0.5]))
+    change = reprojected(np.full((31, 41), 10, np.float32), RIG, nearer, position)  # 1 m away
+    np.testing.assert_allclose(at(change, 30, 12), [10, -3, 10], atol=1e-5)
+
+
+def test_a_camera_that_turns_moves_even_the_sky():
+    right, down, forward = np.array([0.8, 0, -0.6]), np.array([0, 1, 0]), np.array([0.6, 0, 0.8])
+    turned = replace(RIG, axes=np.stack([right, down, forward]))
+    change = reprojected(np.zeros((31, 41), np.float32), RIG, turned, LEFT)
+    np.testing.assert_allclose(at(change, 20, 15), [-75, 0, 0], atol=1e-4)  # tan = 0.6 / 0.8
+
+
+@pytest.fixture
+def three_frames(rng):
+    """A film of three frames of which `still` and `passing` take the first: a plane at 4 px."""
+    image = rng.integers(0, 256, (96, 128, 3), dtype=np.uint8)
+    flat_px = np.full((96, 128), 4, np.float32)
+    return Film(
+        name="any",
+        pairs=[StereoPair(left=image, right=np.roll(image, -4, axis=1))] * 3,
+        disparities_px=[{LEFT: flat_px, MIDDLE: flat_px}] * 3,
+        moving=[np.zeros((96, 128), bool)] * 3,
+        change=lambda frame, other, position: (np.zeros((96, 128, 2)), np.zeros((96, 128))),
+    )
+
+
+def test_a_still_film_does_not_change_and_its_noise_does(three_frames):
+    film = still(three_frames)
+    assert len(film.pairs) == 3
+    motion_px, _ = film.change(0, 2, LEFT)
+    assert film.seen_again(0, 2, LEFT).all()
+    assert flicker(film.pairs[0].left, film.pairs[2].left, motion_px, film.seen_again(0, 2, LEFT)) == 0
+    grey = StereoPair(left=np.full((96, 128, 3), 99, np.uint8), right=np.full((96, 128, 3), 99, np.uint8))
+    one, other = (noisy(grey, np.random.default_rng(seed)) for seed in (1, 2))
+    for a, b in ((one.left, one.right), (one.left, other.left), (one.right, other.right)):
+        assert np.std(a.astype(float) - b) == pytest.approx(np.sqrt(2) * NOISE_LEVELS, rel=0.03)
+
+
+def test_what_passes_is_where_its_truth_says(three_frames):
+    film = passing(three_frames, "passing", (4.0, 2.0), nearing_px=2.0)
+    assert not film.moving[0].all()
+    for frame, near_px in enumerate((12, 14, 16)):
+        oval = film.moving[frame]
+        np.testing.assert_array_equal(film.disparities_px[frame][LEFT], np.where(oval, near_px, 4))
+        rows, columns = np.nonzero(oval)
+        # An oval of 32 x 24 px, whose rim it shares with what is behind.
+        assert len(rows) == pytest.approx(np.pi / 4 * 32 * 24, rel=0.1)
+        middle = (np.abs(rows - rows.mean()) < 6) & (np.abs(columns - columns.mean()) < 8)
+        rows, columns = rows[middle], columns[middle]
+        pair = film.pairs[frame]
+        np.testing.assert_array_equal(pair.left[rows, columns], pair.right[rows, columns - near_px])
+        if frame:
+            earlier = film.pairs[frame - 1].left
+            np.testing.assert_array_equal(pair.left[rows, columns], earlier[rows - 2, columns - 4])
+
+
+def test_what_passes_covers_and_uncovers(three_frames):
+    film = passing(three_frames, "passing", (4.0, 0.0))
+    before, after = film.moving[0], film.moving[1]
+    np.testing.assert_array_equal(film.seen_again(0, 1, LEFT) | (after & ~before), np.ones_like(before))
+    np.testing.assert_array_equal(film.seen_again(1, 0, LEFT), ~(before & ~after))
+    motion_px, change_px = film.change(0, 2, LEFT)
+    np.testing.assert_array_equal(motion_px[before], np.tile([8, 0], (before.sum(), 1)))
+    assert not motion_px[~before].any() and not change_px.any()
+
+
+def test_what_comes_nearer_moves_less_to_the_right_in_the_middle_view(three_frames):
+    film = passing(three_frames, "nearing", (3.25, 0.0), nearing_px=0.5)
+    motion_px, change_px = film.change(0, 1, MIDDLE)
+    assert motion_px[..., 0].max() == 3.0
+    assert change_px.max() == 0.5
+
+
+@pytest.mark.needs_egl
+def test_a_rendered_pan_looks_the_same_along_its_true_motion():
+    film = panning(Order(scene="ship", seed=4, size_px=(160, 120), frames=12), 2)
+    motion_px, change_px = film.change(0, 1, LEFT)
+    visible = film.seen_again(0, 1, LEFT)
+    assert visible.mean() > 0.8
+    before_px, after_px = (maps[LEFT] for maps in film.disparities_px)
+    at_rest_px = flicker(before_px, after_px, 0 * motion_px, visible)
+    assert flicker(before_px, after_px, motion_px, visible, change_px) < 0.05 * at_rest_px
+    before, after = (pair.left for pair in film.pairs)
+    assert flicker(before, after, motion_px, visible) < 0.5 * flicker(before, after, 0 * motion_px, visible)
+
+
+@pytest.mark.needs_egl
+def test_the_rows_say_what_steadying_is_worth():
+    rows = list(flicker_rows(["rooms"], frames=4, size_px=(160, 120), seed=3, threads=1))
+    assert [row.film for row in rows[::2]] == ["still", "passing", "nearing", "panning"]
+    assert [row.method for row in rows] == [FRAME_BY_FRAME, STEADY] * 4
+    for by_frame, steady in zip(rows[::2], rows[1::2], strict=True):
+        assert steady.flicker_px < by_frame.flicker_px
+        assert steady.epe_px < 1.01 * by_frame.epe_px
+        assert steady.time_ms > 0
+    passing_by_frame, passing_steady = rows[2:4]
+    assert passing_steady.moving_epe_px <= 1.01 * passing_by_frame.moving_epe_px
+    assert np.isnan(rows[0].moving_epe_px) and np.isnan(rows[0].uncovered_epe_px)
+
+
+def test_a_film_of_one_frame_is_refused():
+    with pytest.raises(StereoweaveError, match="frames: expected 2 or more"):
+        list(flicker_rows(["rooms"], frames=1))
+
+
+def test_means_are_over_the_scenes_of_a_film_and_a_method():
+    def row(scene, method, value):
+        numbers = dict.fromkeys(("view_flicker_levels", "epe_px", "moving_epe_px", "uncovered_epe_px"), value)
+        return FlickerRow(
+            film="still", scene=scene, model="small", method=method, width_px=8, height_px=6, frames=3,
+            noise_levels=4.0, flicker_px=value, time_ms=float("nan"), **numbers,
+        )  # fmt: skip
+
+    found = means([row("a", STEADY, 1.0), row("a", FRAME_BY_FRAME, 5.0), row("b", STEADY, 2.0)])
+    assert [(mean.film, mean.scene, mean.flicker_px) for mean in found] == [
+        ("still, steady", "mean", 1.5),
+        ("still, frame by frame", "mean", 5.0),
+    ]

@@ -1,0 +1,127 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from stereoweave.cameras.alignment import DEFECTS, check_pair
+from stereoweave.io.files import read_image, read_pair
+from stereoweave.learn.data.collage import sample
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+SEED = 77
+# Painted pairs whose two exposures are alike.
+ALIKE = 2, 6
+
+
+def turned(photo, degrees):
+    """The photograph turned clockwise about its middle."""
+    height, width = photo.shape[:2]
+    turn = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), -degrees, 1)
+    return cv2.warpAffine(photo, turn, (width, height), borderMode=cv2.BORDER_REPLICATE)
+
+
+def brighter(photo, stops):
+    return np.clip(255 * (2.0**stops * (photo / 255) ** 2.2) ** (1 / 2.2), 0, 255).astype(np.uint8)
+
+
+def cut(photo, rows=slice(None), columns=slice(None)):
+    return np.ascontiguousarray(photo[rows, columns])
+
+
+ONE_DEFECT = {
+    "swapped": lambda left, right: (right, left),
+    "vertical_shift": lambda left, right: (cut(left, slice(2, None)), cut(right, slice(-2))),
+    "rotation": lambda left, right: (left, turned(right, 1)),
+    "exposure": lambda left, right: (left, brighter(right, -1)),
+}
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    """The example, then painted ones."""
+    example = read_pair(EXAMPLES / "left.png", EXAMPLES / "right.png")
+    painted = [sample(SEED, 0, index, 480, 640) for index in ALIKE]
+    return [(pair.left, pair.right) for pair in (example, *painted)]
+
+
+def test_sound_pairs_have_no_defect(pairs):
+    assert [check_pair(*pair).defects for pair in pairs] == [()] * len(pairs)
+
+
+@pytest.mark.parametrize("defect", ONE_DEFECT)
+def test_one_defect_put_in_is_the_one_that_is_named(pairs, defect):
+    for pair in pairs:
+        assert check_pair(*ONE_DEFECT[defect](*pair)).defects == (defect,)
+
+
+def test_far_things_at_negative_disparities_are_named(pairs):
+    for left, right in pairs:
+        least_px = check_pair(left, right).range_px[0]
+        columns = round(least_px) + 8
+        found = check_pair(cut(left, columns=slice(columns, None)), cut(right, columns=slice(-columns)))
+        assert found.defects == ("negative_disparity",)
+        assert found.range_px[0] == pytest.approx(-8, abs=2)
+        assert found.warnings() == []
+
+
+def test_amounts_are_those_put_in(pairs):
+    left, right = pairs[0]
+    lower = check_pair(*ONE_DEFECT["vertical_shift"](left, right))
+    assert lower.vertical_shift_px == pytest.approx(2, abs=0.3)
+    assert lower.vertical_error_px == pytest.approx(2, abs=0.3)
+    assert check_pair(left, turned(right, 1)).rotation_degrees == pytest.approx(1, abs=0.1)
+    assert check_pair(left, turned(right, -1)).rotation_degrees == pytest.approx(-1, abs=0.1)
+    assert check_pair(left, brighter(right, -1)).exposure_ratio == pytest.approx(0.5, rel=0.1)
+    assert check_pair(left, right).exposure_ratio == pytest.approx(1, rel=0.1)
+
+
+def test_the_lines_say_what_to_do(pairs):
+    left, right = pairs[0]
+    lower = check_pair(*ONE_DEFECT["vertical_shift"](left, right))
+    assert lower.lines()[-1] == "the right picture lies 2.0 px lower: --rectify mends it"
+    assert lower.warnings() == lower.lines()[-1:]
+    assert check_pair(left, turned(right, -1)).lines()[-1] == (
+        "the right picture is turned 1.0 degrees anticlockwise: --rectify mends it"
+    )
+    assert "2.0 times the other's light" in check_pair(left, brighter(right, -1)).lines()[-1]
+    assert check_pair(right, left).lines()[-1].startswith("left and right are swapped")
+    assert check_pair(left, right).lines()[-1].startswith("nothing is amiss")
+
+
+def test_convergence_is_named_as_rows_that_do_not_match(pairs):
+    left, right = pairs[0]
+    height, width = left.shape[:2]
+    camera = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]])
+    turn = camera @ cv2.Rodrigues(np.array([0, 0.08, 0]))[0] @ np.linalg.inv(camera)
+    toed_in = cv2.warpPerspective(right, turn, (width, height), borderMode=cv2.BORDER_REPLICATE)
+    assert "not_rectified" in check_pair(left, toed_in).defects
+
+
+def test_pictures_of_two_scenes_and_plain_ones_have_too_few_matches(pairs):
+    plain = np.full((100, 200, 3), 90, np.uint8)
+    for left, right in ((pairs[1][0], pairs[2][1]), (plain, plain)):
+        found = check_pair(left, right)
+        assert found.defects == ("too_few_matches",)
+        assert found.lines() == found.warnings()
+        assert found.lines()[0].startswith("expected two pictures of one scene, found ")
+
+
+def test_each_defect_has_its_words(pairs):
+    found = check_pair(*pairs[0])
+    assert all(len(found._told(defect)) > 20 for defect in DEFECTS)
+
+
+@pytest.mark.testdata
+def test_real_pairs_have_no_defect(testdata):
+    folders = sorted(left.parent for left in (testdata / "stereo").glob("pairs/*/left.png"))
+    assert len(folders) == 12
+    for folder in folders[::4]:
+        assert check_pair(read_image(folder / "left.png"), read_image(folder / "right.png")).defects == ()
+
+
+@pytest.mark.parametrize("size", [(32, 32_000), (32_000, 32)])
+def test_a_strip_of_a_picture_is_checked_like_any_other(rng, size):
+    left = np.zeros((*size, 3), np.uint8)
+    left[:1000, :1000] = rng.integers(0, 256, left[:1000, :1000].shape, dtype=np.uint8)
+    assert set(check_pair(left, np.roll(left, -4, axis=1)).defects) <= set(DEFECTS)

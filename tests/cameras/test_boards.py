@@ -1,0 +1,256 @@
+import shutil
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from rig_examples import Cameras, Plane, fisheye, pinhole, rig_of, turned
+
+from stereoweave.cameras import boards
+from stereoweave.cameras.boards import Board
+from stereoweave.cameras.calibration_files import read_rig, write_rig
+from stereoweave.cli.root import main
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.files import write_image
+
+CHESSBOARD = Board(columns=9, rows=6, square_m=0.025)
+CHARUCO = Board(columns=7, rows=5, square_m=0.04, marker_m=0.03, dictionary="DICT_4X4_50")
+TEXEL_M = 0.001
+# Where the board's middle is, in metres, and how it is turned, in degrees about x, y and z.
+POSES = [
+    ((-0.14, -0.14, 0.70), (25, 20, 5)),
+    ((0.05, -0.16, 0.65), (-25, 20, -8)),
+    ((0.24, -0.14, 0.70), (20, -25, 3)),
+    ((-0.14, 0.14, 0.70), (-20, -25, 10)),
+    ((0.05, 0.16, 0.65), (30, 0, 0)),
+    ((0.24, 0.14, 0.70), (-15, 25, -5)),
+    ((-0.02, -0.04, 0.45), (0, 30, 4)),
+    ((0.12, -0.04, 0.45), (15, -25, 8)),
+    ((-0.02, 0.05, 0.45), (-30, 5, 2)),
+    ((0.12, 0.05, 0.45), (30, 10, -3)),
+]
+
+
+def printed(board):
+    """The board on a large white sheet."""
+    side = round(board.square_m / TEXEL_M)
+    if board.dictionary:
+        picture = board.charuco().generateImage((board.columns * side, board.rows * side))
+    else:
+        rows, columns = np.mgrid[: board.rows + 1, : board.columns + 1]
+        picture = np.kron(((rows + columns) % 2 * 255).astype(np.uint8), np.ones((side, side), np.uint8))
+    sheet = cv2.copyMakeBorder(picture, *(4 * [600]), cv2.BORDER_CONSTANT, value=235)
+    return np.repeat(sheet[..., None], 3, axis=2)
+
+
+def take_pictures(folder, rig, board):
+    cameras, sheet = Cameras(rig, samples=1), printed(board)
+    for number, (middle_m, degrees) in enumerate(POSES):
+        turn = turned(*degrees)
+        pair = cameras.photograph([Plane(np.array(middle_m), turn[:, 0], turn[:, 1])], sheet, TEXEL_M)
+        write_image(folder / "left" / f"{number:02}.png", pair.left)
+        write_image(folder / "right" / f"{number:02}.png", pair.right)
+
+
+@pytest.fixture(scope="module")
+def charucos(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("charuco")
+    take_pictures(folder, rig_of(pinhole), CHARUCO)
+    return folder
+
+
+@pytest.fixture(
+    scope="module",
+    params=[(pinhole, CHESSBOARD), (pinhole, CHARUCO), (fisheye, CHESSBOARD), (fisheye, CHARUCO)],
+)
+def taken(request, tmp_path_factory, charucos):
+    """Pictures in a folder, what is on them, and the true rig that took them."""
+    lens, board = request.param
+    if (lens, board) == (pinhole, CHARUCO):
+        return charucos, board, rig_of(lens)
+    folder = tmp_path_factory.mktemp("boards")
+    take_pictures(folder, rig_of(lens), board)
+    return folder, board, rig_of(lens)
+
+
+@pytest.fixture
+def copied(charucos, tmp_path):
+    return shutil.copytree(charucos, tmp_path / "pictures")
+
+
+def test_the_rig_that_took_the_pictures_is_found(taken, tmp_path):
+    folder, board, rig = taken
+    found = boards.calibrate(folder, board, fisheye=rig.left.fisheye)
+    for one, other in ((found.rig.left, rig.left), (found.rig.right, rig.right)):
+        np.testing.assert_allclose(np.diag(one.matrix), np.diag(other.matrix), rtol=0.005)
+    assert found.rig.baseline_m == pytest.approx(rig.baseline_m, rel=0.005)
+    off = cv2.Rodrigues(found.rig.rotation @ rig.rotation.T)[0]
+    assert np.degrees(np.linalg.norm(off)) < 0.1
+    assert found.error_px < 0.3 and found.epipolar_error_px < 0.15
+    assert len(found.used) >= 9
+    write_rig(tmp_path / "rig.yml", found.rig)
+    np.testing.assert_array_equal(read_rig(tmp_path / "rig.yml").right.matrix, found.rig.right.matrix)
+
+
+def test_what_was_found_is_told_in_plain_words(charucos):
+    told = boards.calibrate(charucos, CHARUCO).lines()
+    assert told[0].startswith("left camera: focal length 5") and told[0].endswith("640x480 px")
+    assert "turned by 2.6" in told[1]
+    assert "reprojection error 0." in told[2]
+    assert told[-1].startswith("fair: 0.") and "over 10 pairs; corners cover only" in told[-1]
+
+
+def test_the_command_writes_the_calibration_and_says_how_good_it_is(charucos, tmp_path, capsys):
+    out = tmp_path / "new" / "rig.yml"
+    board = ["--board", "7x5", "--square-mm", "40", "--charuco", "DICT_4X4_50", "--marker-mm", "30"]
+    assert main(["calibrate", str(charucos), *board, "-o", str(out)]) == 0
+    assert read_rig(out).baseline_m == pytest.approx(0.1, rel=0.005)
+    told = capsys.readouterr().out
+    assert told.startswith(f"{out}: ") and "reprojection error 0." in told
+    assert main(["calibrate", str(charucos), *board, "--board", "seven", "-o", str(out)]) == 2
+    assert "such as 9x6" in capsys.readouterr().err
+
+
+def test_a_bad_pair_is_named_and_the_rest_go_on(copied):
+    shutil.copy(copied / "left" / "03.png", copied / "left" / "99.png")
+    Image.fromarray(np.full((480, 640, 3), 90, np.uint8)).save(copied / "right" / "01.png")
+    (copied / "left" / "02.png").write_bytes((copied / "left" / "02.png").read_bytes()[:3000])
+    with Image.open(copied / "right" / "04.png") as picture:
+        smaller = picture.resize((320, 240))
+    smaller.save(copied / "right" / "04.png")
+    found = boards.calibrate(copied, CHARUCO)
+    assert set(found.left_out) == {f"left/{number}.png" for number in ("01", "02", "04", "99")}
+    assert "no board was found in the right picture" in found.left_out["left/01.png"]
+    assert "02.png" in found.left_out["left/02.png"]
+    assert "left picture is of 640x480, the right one of 320x240" in found.left_out["left/04.png"]
+    assert "partner" in found.left_out["left/99.png"]
+    assert len(found.used) == 7
+    assert found.rig.baseline_m == pytest.approx(0.1, rel=0.02)
+    assert "left/01.png: left out, no board" in "\n".join(found.lines())
+
+
+def test_a_pair_in_motion_is_dropped(copied):
+    with Image.open(copied / "right" / "05.png") as picture:
+        shifted = np.roll(np.asarray(picture), 6, axis=0)
+    Image.fromarray(shifted).save(copied / "right" / "05.png")
+    found = boards.calibrate(copied, CHARUCO)
+    assert list(found.left_out) == ["left/05.png"]
+    assert "times as much as the other pairs" in found.left_out["left/05.png"]
+
+
+def test_pairs_of_another_size_than_most_are_left_out(copied):
+    for side in ("left", "right"):
+        with Image.open(copied / side / "08.png") as picture:
+            larger = picture.resize((1280, 960))
+        larger.save(copied / side / "08.png")
+    found = boards.calibrate(copied, CHARUCO)
+    assert found.left_out == {"left/08.png": "of 1280x960, where most are of 640x480"}
+
+
+@pytest.mark.parametrize(
+    "names", [("left{}.png", "right{}.png"), ("{}_L.png", "{}_R.png"), ("cam0/{}.png", "cam1/{}.png")]
+)
+def test_pairs_are_known_by_their_names(tmp_path, names):
+    for name in names:
+        for number in ("01", "02"):
+            path = tmp_path / name.format(number)
+            path.parent.mkdir(exist_ok=True)
+            path.touch()
+    (tmp_path / "notes.txt").touch()
+    pairs, left_out = boards._pairs(tmp_path)
+    assert [[str(path.relative_to(tmp_path)) for path in pair] for pair in pairs.values()] == [
+        [name.format(number) for name in names] for number in ("01", "02")
+    ]
+    assert left_out == {}
+
+
+def test_another_board_than_the_one_named_is_refused(charucos):
+    other = replace(CHARUCO, dictionary="DICT_6X6_50")
+    with pytest.raises(
+        StereoweaveError, match=r"7x5 squares \(DICT_6X6_50\) .* found it in 0 of 10"
+    ) as caught:
+        boards.calibrate(charucos, other)
+    assert "\n" not in str(caught.value)
+
+
+def test_too_few_pairs_are_refused(copied):
+    for number in range(4, 10):
+        (copied / "left" / f"{number:02}.png").unlink()
+    with pytest.raises(StereoweaveError, match="at least 5 pairs, found it in 4 of 4"):
+        boards.calibrate(copied, CHARUCO)
+
+
+@pytest.mark.parametrize("name", ["nowhere", "empty"])
+def test_a_folder_without_pairs_is_refused(tmp_path, name):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(StereoweaveError, match=f"{name}: expected .*, found none"):
+        boards.calibrate(tmp_path / name, CHESSBOARD)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"columns": 2}, "at least 3x3"),
+        ({"square_m": 0.0}, "0 mm"),
+        ({"marker_m": 0.02}, "both the dictionary"),
+        ({"marker_m": 0.03, "dictionary": "DICT_4X4_50"}, "smaller than the squares"),
+        ({"marker_m": 0.02, "dictionary": "DICT_9X9_50"}, "expected one of DICT_4X4"),
+    ],
+)
+def test_a_board_without_sense_is_refused(change, said):
+    with pytest.raises(StereoweaveError, match=said):
+        replace(CHESSBOARD, **change)
+
+
+def judged(**change):
+    """The verdict on a sound calibration with something changed."""
+    sound = {
+        "rig": rig_of(pinhole),
+        "left_error_px": 0.2,
+        "right_error_px": 0.2,
+        "epipolar_error_px": 0.1,
+        "cover_percent": 80.0,
+        "tilt_degrees": 30.0,
+        "used": tuple(f"{number}.png" for number in range(18)),
+        "left_out": {},
+    }
+    return boards.Calibration(**(sound | change)).verdict
+
+
+def test_the_verdict_says_how_good_it_is_and_what_to_do():
+    assert judged() == "good: 0.20 px over 18 pairs"
+    assert judged(cover_percent=50.0).startswith("fair: 0.20 px over 18 pairs; corners cover only 50 %")
+    assert judged(cover_percent=30.0).endswith("add pictures with the board near the edges")
+    assert judged(cover_percent=30.0).startswith("poor")
+    # The root of the mean of 0.6^2 and 0.8^2 is 0.71, that of 1 and 2^2 is 1.58.
+    assert judged(left_error_px=0.6, right_error_px=0.8).startswith("fair: 0.71 px")
+    assert judged(left_error_px=1.0, right_error_px=2.0).startswith("poor: 1.58 px")
+    assert judged(tilt_degrees=5.0).startswith("poor") and "tilted board" in judged(tilt_degrees=5.0)
+    assert judged(used=("1.png",) * 6).startswith("fair")
+    swapped = replace(rig_of(pinhole), translation_m=np.array([0.1, 0, 0]))
+    assert judged(rig=swapped).endswith("the left and the right pictures are swapped: rename them")
+
+
+def test_pictures_that_do_not_tell_how_a_lens_sees_are_refused_in_one_line(tmp_path):
+    # One picture again and again, of a board that is not tilted and in the middle.
+    flat = Plane(np.array([0.02, 0, 0.8]), np.array([1.0, 0, 0]), np.array([0, 1.0, 0]))
+    pair = Cameras(rig_of(fisheye), samples=1).photograph([flat], printed(CHARUCO), TEXEL_M)
+    for number in range(5):
+        write_image(tmp_path / f"left{number}.png", pair.left)
+        write_image(tmp_path / f"right{number}.png", pair.right)
+    with pytest.raises(StereoweaveError, match="5 pairs from which OpenCV cannot") as caught:
+        boards.calibrate(tmp_path, CHARUCO, fisheye=True)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_chessboard_that_was_counted_from_another_corner_is_turned_back():
+    square = Board(columns=4, rows=4, square_m=0.02)
+    for board, turns in ((CHESSBOARD, (0, 2)), (square, (0, 1, 2, 3))):
+        left_px = board.corners_m()[:, :2] * 1000
+        numbers = np.arange(len(left_px))
+        for turn in turns:
+            grid = (left_px - (40, 3)).reshape(board.rows, board.columns, 2)
+            there = boards._Found(numbers, np.rot90(grid, turn).reshape(-1, 2))
+            ordered = boards._ordered_alike(boards._Found(numbers, left_px), there, board)
+            np.testing.assert_allclose(ordered.at_px, left_px - (40, 3))

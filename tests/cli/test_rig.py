@@ -1,0 +1,104 @@
+"""The commands check and rectify; calibrate has its test in test_boards.py, where the boards are."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from stereoweave.cameras.alignment import check_pair
+from stereoweave.cameras.calibration_files import calibrated
+from stereoweave.cli.root import main
+from stereoweave.io.files import read_image, read_pair, write_image
+from stereoweave.io.output_lock import lock_output
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+LEFT, RIGHT = str(EXAMPLES / "left.png"), str(EXAMPLES / "right.png")
+
+
+@pytest.fixture
+def turned(tmp_path) -> str:
+    """The example's right picture as a camera turned by 1 degree sees it."""
+    right = read_image(RIGHT)
+    turn = cv2.getRotationMatrix2D((319.5, 239.5), 1.0, 1.0)
+    write_image(
+        tmp_path / "turned.png", cv2.warpAffine(right, turn, (640, 480), borderMode=cv2.BORDER_REFLECT)
+    )
+    return str(tmp_path / "turned.png")
+
+
+def test_a_sound_pair_passes_the_check(capsys):
+    assert main(["check", LEFT, RIGHT]) == 0
+    assert "nothing is amiss" in capsys.readouterr().out
+
+
+def test_swapped_pictures_fail_the_check_and_are_told_so(capsys):
+    assert main(["check", RIGHT, LEFT]) == 1
+    assert "swapped: give them the other way round" in capsys.readouterr().out
+
+
+def test_the_check_gives_its_numbers_as_json(turned, capsys):
+    assert main(["check", LEFT, turned, "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found["defects"] == ["rotation"]
+    assert abs(found["rotation_degrees"]) == pytest.approx(1, abs=0.1)
+
+
+def test_what_is_not_known_of_a_plain_pair_is_null_in_json(tmp_path, capsys):
+    write_image(tmp_path / "plain.png", np.full((64, 96, 3), 90, np.uint8))
+    assert main(["check", str(tmp_path / "plain.png"), str(tmp_path / "plain.png"), "--json"]) == 1
+    found = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert found["defects"] == ["too_few_matches"]
+    assert found["exposure_ratio"] is None
+
+
+def test_a_pair_is_rectified_by_what_it_shows_into_files_that_fit(turned, tmp_path, capsys):
+    assert main(["rectify", LEFT, turned, "-o", str(tmp_path / "out")]) == 0
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["left.png", "right.png"]
+    pair = read_pair(tmp_path / "out" / "left.png", tmp_path / "out" / "right.png")
+    assert check_pair(pair.left, pair.right).defects == ()
+    assert "rectified by" in capsys.readouterr().out
+
+
+def test_the_new_calibration_belongs_to_the_new_pictures(tmp_path):
+    out = tmp_path / "out"
+    assert main(["rectify", LEFT, RIGHT, "--calib", str(EXAMPLES / "calib.txt"), "-o", str(out)]) == 0
+    pair = read_pair(out / "left.png", out / "right.png")
+    assert calibrated(pair, out / "calib.yml").camera == calibrated(pair, EXAMPLES / "calib.txt").camera
+
+
+def test_rectification_spares_the_pictures_and_the_calibration_that_are_there(tmp_path, capsys):
+    files = {name: tmp_path / name for name in ("left.png", "right.png", "calib.yml")}
+    for path, source in zip(files.values(), (LEFT, RIGHT, EXAMPLES / "calib.txt"), strict=True):
+        path.write_bytes(Path(source).read_bytes())
+    before = {name: path.read_bytes() for name, path in files.items()}
+    pictures = [str(files["left.png"]), str(files["right.png"])]
+    for words, named in (
+        (pictures, "left.png"),
+        ([LEFT, RIGHT, "--calib", str(files["calib.yml"])], "calib.yml"),
+        ([LEFT, RIGHT], "calib.yml"),
+    ):
+        assert main(["rectify", *words, "-o", str(tmp_path)]) == 2
+        assert f"{files[named]}: expected" in capsys.readouterr().err
+    assert {name: path.read_bytes() for name, path in files.items()} == before
+
+
+def test_a_pair_is_not_rectified_into_a_folder_that_another_command_writes_to(tmp_path, capsys):
+    with lock_output(tmp_path):
+        assert main(["rectify", LEFT, RIGHT, "-o", str(tmp_path)]) == 2
+    assert "found one that is in use" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_depth_and_views_warn_by_themselves_and_rectify_mends(turned, tmp_path, capsys):
+    assert main(["depth", LEFT, turned, "-o", str(tmp_path / "as_it_is")]) == 0
+    assert "is turned 1.0 degrees" in capsys.readouterr().out
+    assert main(["depth", LEFT, turned, "--rectify", "-o", str(tmp_path / "mended")]) == 0
+    assert "is turned" not in capsys.readouterr().out
+    assert main(["view", LEFT, turned, "-o", str(tmp_path / "view.png")]) == 0
+    assert "is turned 1.0 degrees" in capsys.readouterr().out
+    assert main(["view", LEFT, turned, "--rectify", "-o", str(tmp_path / "view.png")]) == 0
+    assert "is turned" not in capsys.readouterr().out
+    # The borders that rectification leaves are cut off.
+    assert np.array_equal(np.less(read_image(tmp_path / "view.png").shape[:2], (480, 640)), [True, True])

@@ -1,0 +1,185 @@
+"""What the tests of video share: small real films made with PyAV, their sound, and ways of damaging them."""
+
+from collections.abc import Iterable, Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+
+from stereoweave.io.files import read_image
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+FRAME_MS = 40  # 25 frames a second
+SOUND_RATE = 48_000
+
+Pair = tuple[np.ndarray, np.ndarray]
+
+
+def example_pairs(count: int, *, width: int = 160, height: int = 96, step_px: int = 2) -> list[Pair]:
+    """Windows of the example pair that wander to the right: a film of a camera that moves sideways."""
+    left, right = (read_image(EXAMPLES / f"{eye}.png") for eye in ("left", "right"))
+    top_px, first_px = 200, 180
+    return [
+        tuple(
+            np.ascontiguousarray(picture[top_px : top_px + height, start : start + width])
+            for picture in (left, right)
+        )
+        for start in range(first_px, first_px + count * step_px, step_px)
+    ]
+
+
+def flat_pairs(count: int, *, width: int = 64, height: int = 48) -> list[Pair]:
+    """Pairs of one colour each, by which a test tells eyes and frames apart: the right eye is bluer."""
+    return [
+        tuple(np.full((height, width, 3), (20 + 8 * index, 100, blue), np.uint8) for blue in (60, 180))
+        for index in range(count)
+    ]
+
+
+def packed(left: np.ndarray, right: np.ndarray, arrangement: str = "side_by_side") -> np.ndarray:
+    """One picture of both eyes."""
+    height_px, width_px = left.shape[:2]
+    match arrangement:
+        case "side_by_side":
+            return np.hstack([left, right])
+        case "crossed":
+            return np.hstack([right, left])
+        case "top_bottom":
+            return np.vstack([left, right])
+        case "top_bottom_right_first":
+            return np.vstack([right, left])
+        case "side_by_side_half":
+            return np.hstack([shrunk(eye, width_px // 2, height_px) for eye in (left, right)])
+        case "top_bottom_half":
+            return np.vstack([shrunk(eye, width_px, height_px // 2) for eye in (left, right)])
+        case "crossed_half" | "top_bottom_right_first_half":
+            return packed(right, left, "side_by_side_half" if "crossed" in arrangement else "top_bottom_half")
+    raise ValueError(arrangement)
+
+
+def shrunk(image: np.ndarray, width_px: int, height_px: int) -> np.ndarray:
+    return cv2.resize(image, (width_px, height_px), interpolation=cv2.INTER_AREA)
+
+
+def write_side_by_side(
+    path: Path,
+    pairs: Iterable[Pair],
+    *,
+    times_ms: Sequence[int] | None = None,
+    sound: bool = False,
+    arrangement: str = "side_by_side",
+    codec: str = "mpeg4",
+    **more: object,
+) -> Path:
+    """A video of pairs in one picture each; `more` goes to `write_video`."""
+    frames = [packed(left, right, arrangement) for left, right in pairs]
+    return write_video(path, frames, times_ms=times_ms, sound=sound, codec=codec, **more)
+
+
+def write_video(
+    path: Path,
+    frames: Sequence[np.ndarray],
+    *,
+    times_ms: Sequence[int] | None = None,
+    sound: bool = False,
+    codec: str = "mpeg4",
+    pix_fmt: str | None = None,
+    colorspace: int = 2,
+    color_range: int = 0,
+    stereo_mode: str | None = None,
+    rotation: int = 0,
+    options: dict[str, str] | None = None,
+) -> Path:
+    """A video of RGB frames, 25 a second unless `times_ms` says when each is shown; with sound, a sine.
+
+    Args:
+        path: Where; the ending chooses the container.
+        frames: uint8 RGB [H, W, 3], each of one size.
+        times_ms: When each frame is shown, rising.
+        sound: Whether there is a sine of 440 Hz, AAC, as long as the frames.
+        codec: FFmpeg's name of an encoder: mpeg4, libx264, libx264rgb, ffv1, mjpeg, ...
+        pix_fmt: The layout of pixels; what the encoder likes best unless given.
+        colorspace: FFmpeg's AVCOL_SPC_*: 2 is none said, 1 BT.709, 5 and 6 BT.601.
+        color_range: 0 none said, 1 limited, 2 full.
+        stereo_mode: What Matroska says of the arrangement, such as "left_right".
+        rotation: What a player has to turn the picture by, anticlockwise, in degrees.
+        options: More for the encoder, such as {"g": "12"}, a key frame every 12.
+    """
+    times_ms = times_ms if times_ms is not None else [FRAME_MS * index for index in range(len(frames))]
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=Fraction(1000, FRAME_MS))
+        height_px, width_px = frames[0].shape[:2]
+        stream.width, stream.height = width_px, height_px
+        stream.pix_fmt = pix_fmt or _likes_best(codec)
+        stream.codec_context.time_base = Fraction(1, 1000)
+        stream.codec_context.colorspace = colorspace
+        stream.codec_context.color_range = color_range
+        stream.codec_context.options = {**_GOOD.get(codec, {}), **(options or {})}
+        if stereo_mode:
+            stream.metadata["stereo_mode"] = stereo_mode
+        if rotation:
+            stream.set_display_rotation(rotation)
+        track = container.add_stream("aac", rate=SOUND_RATE) if sound else None
+        for image, time_ms in zip(frames, times_ms, strict=True):
+            frame = av.VideoFrame.from_ndarray(image, "rgb24").reformat(
+                format=stream.pix_fmt,
+                dst_colorspace=colorspace if colorspace != 2 else None,
+                dst_color_range=color_range or None,
+                interpolation="BICUBIC",
+            )
+            frame.pts, frame.time_base = time_ms, Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+        if track:
+            _write_sine(container, track, (times_ms[-1] + FRAME_MS) / 1000)
+    return path
+
+
+def packets(path: Path, kind: str) -> list[tuple[int, bytes]]:
+    """Time, in steps of its stream, and content of each packet of a kind, "video" or "audio"."""
+    with av.open(str(path)) as container:
+        return [
+            (packet.pts, bytes(packet)) for packet in container.demux(**{kind: 0}) if packet.pts is not None
+        ]
+
+
+def damage(path: Path, *frames: int, length: int = 60) -> Path:
+    """Overwrites bytes in the middle of the packets of some frames, counted in the order of the file."""
+    content = bytearray(path.read_bytes())
+    bodies = [body for _, body in packets(path, "video")]
+    for frame in frames:
+        start = content.find(bodies[frame])
+        assert start >= 0
+        start += min(len(bodies[frame]) // 3, 40)
+        length = min(length, len(bodies[frame]) // 2)
+        content[start : start + length] = np.random.default_rng(frame).bytes(length)
+    path.write_bytes(content)
+    return path
+
+
+def truncate(path: Path, share: float) -> Path:
+    """Leaves the first part of a file, as a broken download does."""
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    return path
+
+
+_GOOD = {"mpeg4": {"qmin": "2", "qmax": "2"}, "libx264": {"crf": "12"}, "libx264rgb": {"crf": "0"}}
+
+
+def _likes_best(codec: str) -> str:
+    return {"ffv1": "bgr0", "libx264rgb": "rgb24", "mjpeg": "yuvj420p"}.get(codec, "yuv420p")
+
+
+def _write_sine(container: av.container.OutputContainer, track: av.AudioStream, length_s: float) -> None:
+    samples = np.arange(int(length_s * SOUND_RATE))
+    wave = (0.3 * np.sin(2 * np.pi * 440 / SOUND_RATE * samples)).astype(np.float32)
+    for start in range(0, len(wave), 1024):
+        frame = av.AudioFrame.from_ndarray(
+            np.tile(wave[None, start : start + 1024], (2, 1)), format="fltp", layout="stereo"
+        )
+        frame.pts, frame.rate, frame.time_base = start, SOUND_RATE, Fraction(1, SOUND_RATE)
+        container.mux(track.encode(frame))
+    container.mux(track.encode())

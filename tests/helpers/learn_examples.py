@@ -1,0 +1,193 @@
+"""What the tests of training share: a pair whose truth is known by construction, a network trained on it."""
+
+import functools
+import json
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.learn.checkpoint import Checkpoint
+from stereoweave.learn.data.batches import collated
+from stereoweave.learn.data.pair_cache import KeptPairs
+from stereoweave.learn.models import network_of
+from stereoweave.learn.models.weave import WeaveNet
+from stereoweave.learn.recipe import Recipe
+from stereoweave.learn.training.losses import weave_losses
+from stereoweave.stereo import Sample, StereoCamera
+
+# Pictures this small cost more to share among threads than to compute.
+torch.set_num_threads(1)
+
+PAIR_SIZE = (64, 96)
+RECIPE = Recipe(
+    name="tiny",
+    model="weave_small",
+    steps=20,
+    batch=2,
+    learning_rate=1e-3,
+    warm_up_steps=2,
+    cool_down_steps=2,
+    pairs=4,
+    pair_size=PAIR_SIZE,
+    crop_size=(64, 64),
+    validation_pairs=2,
+    validate_every=2,
+)
+# f B = 24 px m: the box of `box_before_a_wall` is at 2 m, its wall at 6 m.
+CAMERA = StereoCamera(focal_px=120.0, baseline_m=0.2, cx_px=47.5, cy_px=31.5)
+
+
+def recipe_of(model, **changes):
+    """RECIPE with another model: its loss changes with it, and PSMNet has a few candidates alone.
+
+    48 of them, because with 32 a volume is 2 levels deep, for which oneDNN's bfloat16 gradient is garbage.
+    """
+    loss = "weave" if model.startswith("weave") else "l2"
+    return replace(RECIPE, **{"model": model, "loss": loss, "max_disparity_px": 48.0, **changes})
+
+
+def texture(rng, height, width):
+    blocks = rng.integers(30, 226, (height // 4 + 1, width // 4 + 1, 3)).repeat(4, 0).repeat(4, 1)
+    return (blocks[:height, :width] + rng.integers(-30, 30, (height, width, 3))).astype(np.uint8)
+
+
+def box_before_a_wall(rng, size=PAIR_SIZE, wall_px=4, box_px=12):
+    """A sample of two flat surfaces: the box covers the middle half of the left view's rows and columns."""
+    height, width = size
+    wall, box = texture(rng, height, width + wall_px), texture(rng, height // 2, width // 2)
+    rows, start = slice(height // 4, height // 4 + height // 2), width // 4
+    in_left, in_right = np.zeros((2, height, width), bool)
+    in_left[rows, start : start + width // 2] = True
+    in_right[rows, start - box_px : start - box_px + width // 2] = True
+    left, right = wall[:, :width].copy(), wall[:, wall_px:].copy()
+    left[in_left], right[in_right] = box.reshape(-1, 3), box.reshape(-1, 3)
+    # The wall's column x in the left view is at x - wall_px in the right one.
+    occluded, right_occluded = np.ones((2, height, width), bool)
+    occluded[:, wall_px:] = in_right[:, :-wall_px]
+    right_occluded[:, :-wall_px] = in_left[:, wall_px:]
+    return Sample(
+        left=left,
+        right=right,
+        disparity_px=np.where(in_left, box_px, wall_px).astype(np.float32),
+        right_disparity_px=np.where(in_right, box_px, wall_px).astype(np.float32),
+        occluded=occluded & ~in_left,
+        right_occluded=right_occluded & ~in_right,
+    )
+
+
+def keep_pairs(folder, seed, count, size=PAIR_SIZE):
+    """Pairs of this file in place of the collages that training would make."""
+    pairs = KeptPairs(folder, seed, count, size)
+    pairs.folder.mkdir(parents=True, exist_ok=True)
+    for index in range(count):
+        pairs.keep(index, box_before_a_wall(np.random.default_rng((seed, index)), size))
+    return pairs
+
+
+def make_batches_in_place(patch):
+    """Have a training's batches come in its own process: another one takes seconds to load PyTorch."""
+    patch.setattr(
+        "stereoweave.learn.training.loop._numbered_batches",
+        lambda batches, first: ((step, batches[step]) for step in range(first, batches.recipe.steps)),
+    )
+
+
+def untrained(name="weave_small"):
+    torch.manual_seed(0)
+    return network_of(recipe_of(name)).eval()
+
+
+def checkpoint_of(network, recipe=RECIPE):
+    weights = network.state_dict()
+    return Checkpoint(
+        recipe=recipe,
+        step=recipe.steps,
+        weights=weights,
+        averaged=weights,
+        optimiser={},
+        random_state=torch.get_rng_state(),
+        scores={"epe_px": 1.5},
+        commit="0123abc",
+        hours=0.25,
+    )
+
+
+def complaint(call, *arguments) -> str:
+    """The one line of the error in which the call must end."""
+    with pytest.raises(StereoweaveError) as caught:
+        call(*arguments)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@dataclass(frozen=True)
+class Listed:
+    """Samples in memory as a source."""
+
+    samples: list[Sample]
+
+    @property
+    def count(self) -> int:
+        return len(self.samples)
+
+    def __getitem__(self, index: int) -> Sample:
+        return self.samples[index]
+
+    def name(self, index: int) -> str:
+        return f"sample {index}"
+
+
+@dataclass(frozen=True)
+class Overfitted:
+    network: WeaveNet
+    sample: Sample
+    error_before_px: float
+    error_after_px: float
+
+
+@functools.cache
+def overfitted(name="weave_small", steps=45) -> Overfitted:
+    """A network that has seen one pair again and again, and its mean error on that pair before and after."""
+    network, sample = untrained(name), box_before_a_wall(np.random.default_rng(0))
+    batch = collated([sample])
+    before_px = mean_error_px(network, batch)
+    optimiser = torch.optim.AdamW(network.parameters(), 2e-3)
+    network.train()
+    for _ in range(steps):
+        stages = network.stages(batch["left"], batch["right"])
+        loss = torch.stack(
+            list(weave_losses(stages, batch["disparity_px"], batch["occluded"]).values())
+        ).sum()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    network.eval()
+    return Overfitted(network, sample, before_px, mean_error_px(network, batch))
+
+
+@torch.no_grad()
+def mean_error_px(network, batch) -> float:
+    found_px = network.stages(batch["left"], batch["right"]).disparity_px
+    return float((found_px - batch["disparity_px"]).abs().mean())
+
+
+def write(recipe, file):
+    """The file, which holds the recipe now."""
+    lines = (f"{name} = {json.dumps(value)}" for name, value in asdict(recipe).items())
+    file.write_text("\n".join(lines) + "\n")
+    return file
+
+
+def assert_same(one, other):
+    """Equal to the last bit, through dictionaries and lists."""
+    if isinstance(one, torch.Tensor):
+        assert torch.equal(one, other)
+    elif isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for key in one:
+            assert_same(one[key], other[key])
+    else:
+        assert one == other

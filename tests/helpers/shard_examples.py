@@ -1,0 +1,73 @@
+"""What the tests of sets on disk share: pairs whose truth is known by construction, made in no time."""
+
+import os
+import signal
+import time
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from stereoweave.data.samples import make_sample
+from stereoweave.stereo import Sample, StereoCamera, StereoPair
+from stereoweave.synth.sets.samples import Order, Rendered
+from stereoweave.synth.world import Shot
+
+# f B = 12 px m: the box of `box_before_a_wall` is at 1.2 m, its wall at 4 m.
+CAMERA = StereoCamera(focal_px=60.0, baseline_m=0.2, cx_px=23.5, cy_px=15.5)
+WALL_PX, BOX_PX = 3, 10
+
+
+def box_before_a_wall(rng: np.random.Generator, size_px: tuple[int, int] = (48, 32)) -> Sample:
+    """A wall below a sky, and a box before it in the middle third of the left view's columns and rows."""
+    width, height = size_px
+    left_px, right_px = (np.full((height, width), WALL_PX, np.float32) for _ in range(2))
+    rows, start, end = slice(height // 3, 2 * height // 3), width // 3, 2 * width // 3
+    left_px[rows, start:end] = BOX_PX
+    right_px[rows, start - BOX_PX : end - BOX_PX] = BOX_PX
+    for disparity_px in (left_px, right_px):
+        disparity_px[: height // 4] = 0
+    surface = rng.integers(0, 256, (height, width + BOX_PX, 3), dtype=np.uint8)
+    box = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
+    left, right = surface[:, :width].copy(), surface[:, WALL_PX : WALL_PX + width].copy()
+    right[: height // 4] = left[: height // 4]
+    left[rows, start:end] = right[rows, start - BOX_PX : end - BOX_PX] = box[rows, start:end]
+    return make_sample(StereoPair(left=left, right=right, camera=CAMERA), left_px, right_px)
+
+
+@dataclass(frozen=True)
+class PaintedStudio:
+    """Makes pairs without rendering; at a pair it kills its process, or halts the one that started it."""
+
+    dies_at: int | None = None
+    halts_at: int | None = None
+
+    def renderer(self) -> str:
+        return "paint"
+
+    def __call__(self, order: Order, index: int) -> Rendered:
+        if index == self.dies_at:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if index == self.halts_at:
+            os.kill(os.getppid(), signal.SIGSTOP)
+            time.sleep(600)
+        sample = box_before_a_wall(np.random.default_rng((order.seed, index)), order.size_px)
+        shot = Shot(image=sample.right, depth_m=sample.disparity_px, target=sample.occluded)
+        views = tuple((position, shot) for position in order.views)
+        return Rendered(sample=sample, views=views)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """All files in a folder and below it."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def assert_equal(found: Sample, made: Sample) -> None:
+    for field in fields(Sample):
+        np.testing.assert_array_equal(
+            getattr(found, field.name), getattr(made, field.name), err_msg=field.name
+        )

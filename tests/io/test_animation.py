@@ -1,0 +1,184 @@
+"""Animations as they are read again, and what is left of those that fail."""
+
+import resource
+import sys
+import weakref
+
+import av
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.animation import animation_ending, write_animation
+
+ENDINGS = [".mp4", ".gif", ".webp"]
+
+
+@pytest.fixture
+def moving(rng) -> list[np.ndarray]:
+    """Seven pictures of 64x48: a soft pattern of many colours that goes to the left by 4 px a frame."""
+    coarse = Image.fromarray(rng.integers(0, 256, (6, 11, 3), dtype=np.uint8))
+    wide = np.asarray(coarse.resize((88, 48), Image.BICUBIC))
+    return [wide[:, start : start + 64].copy() for start in range(0, 28, 4)]
+
+
+def read_again(path) -> list[np.ndarray]:
+    if path.suffix == ".mp4":
+        with av.open(path) as film:
+            return [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+    with Image.open(path) as file:
+        return [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(file)]
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_the_frames_come_back_in_their_order(tmp_path, moving, ending):
+    write_animation(tmp_path / f"a{ending}", iter(moving), 60)
+    found = read_again(tmp_path / f"a{ending}")
+    assert len(found) == 7
+    for frame, expected in zip(found, moving, strict=True):
+        assert np.abs(frame.astype(int) - expected).mean() < 12  # one frame beside, it is 50
+    assert [file.name for file in tmp_path.iterdir()] == [f"a{ending}"]
+
+
+def test_an_mp4_is_what_every_player_takes_and_keeps_its_times(tmp_path, moving):
+    write_animation(tmp_path / "a.mp4", moving, 60)
+    with av.open(tmp_path / "a.mp4") as film:
+        (stream,) = film.streams
+        context = stream.codec_context
+        assert (context.name, context.pix_fmt) == ("h264", "yuv420p")
+        times_ms = [float(1000 * frame.pts * frame.time_base) for frame in film.decode(video=0)]
+    assert times_ms == [60 * index for index in range(7)]
+    content = (tmp_path / "a.mp4").read_bytes()
+    assert content.index(b"moov") < content.index(b"mdat")  # begins to play before it is there whole
+
+
+@pytest.mark.parametrize("ending", [".gif", ".webp"])
+def test_a_gif_and_a_webp_keep_their_times_and_never_end(tmp_path, moving, ending):
+    write_animation(tmp_path / f"a{ending}", moving, 60)
+    with Image.open(tmp_path / f"a{ending}") as file:
+        assert file.info["loop"] == 0
+        durations_ms = []
+        for index in range(file.n_frames):
+            file.seek(index)
+            file.load()
+            durations_ms.append(file.info["duration"])
+    assert durations_ms == [60] * 7
+
+
+def test_an_mp4_says_how_its_colours_are_meant(tmp_path):
+    colours = [(200, 30, 40), (20, 180, 60), (10, 40, 210), (230, 230, 230)]
+    frame = np.repeat(np.array([colours], np.uint8), 16, axis=1).repeat(32, axis=0)
+    write_animation(tmp_path / "a.mp4", [frame] * 2, 40)
+    with av.open(tmp_path / "a.mp4") as film:
+        picture = next(film.decode(video=0))
+    # BT.709 of limited range, which players take for granted in high definition: 16 + 219 * (0.2126 R + ...)
+    luma = picture.to_ndarray()[8, 8::16]
+    expected = [
+        16 + 219 / 255 * (0.2126 * red + 0.7152 * green + 0.0722 * blue) for red, green, blue in colours
+    ]
+    np.testing.assert_allclose(luma, expected, atol=1.5)
+    assert (picture.colorspace, picture.color_range) == (1, 1)
+    np.testing.assert_allclose(picture.to_ndarray(format="rgb24")[8, 8::16], colours, atol=4)
+
+
+def test_the_last_column_and_row_of_odd_sides_are_repeated_in_an_mp4(tmp_path, moving):
+    odd = [frame[:47, :63] for frame in moving]
+    write_animation(tmp_path / "a.mp4", odd, 40)
+    found = read_again(tmp_path / "a.mp4")[0].astype(int)
+    assert found.shape == (48, 64, 3)
+    assert np.abs(found[:47, :63] - odd[0]).mean() < 10
+    assert np.abs(found[:47, 63] - odd[0][:, 62]).mean() < 12
+
+
+@pytest.mark.parametrize("ending", [".gif", ".webp"])
+def test_odd_sides_stay_where_the_format_allows_them(tmp_path, moving, ending):
+    write_animation(tmp_path / f"a{ending}", [frame[:47, :63] for frame in moving], 40)
+    assert read_again(tmp_path / f"a{ending}")[0].shape == (47, 63, 3)
+
+
+def test_the_frames_of_an_mp4_are_never_held_together(tmp_path):
+    alive: list[weakref.ref] = []
+    most = 0
+
+    def coming():
+        nonlocal most
+        for level in range(40):
+            frame = np.full((64, 64, 3), level, np.uint8)
+            alive.append(weakref.ref(frame))
+            most = max(most, sum(each() is not None for each in alive))
+            yield frame
+
+    write_animation(tmp_path / "a.mp4", coming(), 40)
+    assert len(read_again(tmp_path / "a.mp4")) == 40
+    assert most <= 4
+
+
+def test_the_frames_of_a_gif_share_their_256_colours(tmp_path, moving):
+    write_animation(tmp_path / "a.gif", moving, 40)
+    colours = np.concatenate(read_again(tmp_path / "a.gif")).reshape(-1, 3)
+    assert 128 < len(np.unique(colours, axis=0)) <= 256
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_single_frame_is_enough_and_none_is_not(tmp_path, moving, ending):
+    write_animation(tmp_path / f"a{ending}", moving[:1], 40)
+    assert len(read_again(tmp_path / f"a{ending}")) == 1
+    with pytest.raises(StereoweaveError, match="frames: expected one or more"):
+        write_animation(tmp_path / f"b{ending}", [], 40)
+    assert [file.name for file in tmp_path.iterdir()] == [f"a{ending}"]
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_frames_of_two_sizes_are_told_and_leave_nothing_behind(
+    tmp_path, moving, ending, without_shape_checks
+):
+    with pytest.raises(StereoweaveError, match="frames: expected all of one size, found 64x48 and 60x48"):
+        write_animation(tmp_path / f"a{ending}", [*moving, moving[0][:, :60]], 40)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_an_error_half_way_keeps_the_file_that_was_there(tmp_path, moving, ending):
+    (tmp_path / f"a{ending}").write_text("kept")
+
+    def breaking():
+        yield from moving
+        raise StereoweaveError("no more views")
+
+    with pytest.raises(StereoweaveError, match="no more views"):
+        write_animation(tmp_path / f"a{ending}", breaking(), 40)
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["kept"]
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_disk_that_is_full_is_told_in_one_line_and_left_as_it_was(tmp_path, rng, ending):
+    noise = rng.integers(0, 256, (4, 128, 128, 3), dtype=np.uint8)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        with pytest.raises(StereoweaveError, match=f"a{ending}: expected a file that can be written") as told:
+            write_animation(tmp_path / f"a{ending}", noise, 40)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert len(str(told.value).splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("path", ["a.avi", "a.png", "a"])
+def test_another_ending_is_told_with_those_there_are(path):
+    with pytest.raises(StereoweaveError, match=rf"{path}: expected .* \.mp4, \.gif, \.webp, found"):
+        animation_ending(path)
+
+
+def test_an_mp4_without_pyav_names_the_extra_before_a_frame_is_made(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+
+    def never():
+        raise AssertionError
+        yield
+
+    with pytest.raises(StereoweaveError, match=r"an MP4 file needs PyAV, .*'stereoweave\[video\]'"):
+        write_animation(tmp_path / "a.mp4", never(), 40)
+    assert list(tmp_path.iterdir()) == []
+    assert animation_ending("a.gif") == ".gif"

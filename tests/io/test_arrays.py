@@ -1,0 +1,158 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.arrays import as_rgb
+from stereoweave.io.files import read_image
+
+# Neighbouring values differ everywhere, so that no mix-up of axes or channels stays unseen.
+COLOURS = np.arange(40 * 50 * 3).reshape(40, 50, 3).astype(np.uint8)
+
+
+def test_a_uint8_rgb_array_is_given_back_itself():
+    assert as_rgb(COLOURS) is COLOURS
+
+
+def test_grey_is_repeated_in_two_and_in_three_dimensions():
+    grey = COLOURS[..., 0]
+    for picture in (grey, grey[..., None], grey[None]):
+        np.testing.assert_array_equal(as_rgb(picture), np.stack([grey, grey, grey], axis=2))
+
+
+def test_alpha_is_dropped():
+    with_alpha = np.dstack([COLOURS, np.full((40, 50), 7, np.uint8)])
+    np.testing.assert_array_equal(as_rgb(with_alpha), COLOURS)
+    np.testing.assert_array_equal(as_rgb(np.moveaxis(with_alpha, 2, 0)), COLOURS)
+
+
+def test_of_16_bits_the_upper_byte_stays_in_either_byte_order():
+    deep = COLOURS.astype(np.uint16) * 256 + 255
+    np.testing.assert_array_equal(as_rgb(deep), COLOURS)
+    np.testing.assert_array_equal(as_rgb(deep.astype(">u2")), COLOURS)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_a_float_is_the_share_of_white(dtype):
+    shares = np.broadcast_to(np.array([0, 0.5, 1], dtype), (40, 50, 3))
+    assert as_rgb(shares)[0, 0].tolist() == [0, 128, 255]  # 127.5 is rounded to even
+
+
+def test_what_rounds_to_a_level_is_no_float_outside_of_the_range():
+    for dtype in (np.float16, np.float32, np.float64):
+        assert as_rgb(np.full((40, 50), 1.001, dtype))[0, 0].tolist() == [255, 255, 255]
+        assert as_rgb(np.full((40, 50), -0.001, dtype))[0, 0].tolist() == [0, 0, 0]
+
+
+def test_what_comes_out_is_contiguous():
+    for picture in (COLOURS[:, ::-1], np.moveaxis(COLOURS, 2, 0), np.dstack([COLOURS, COLOURS[..., :1]])):
+        assert as_rgb(picture).flags.c_contiguous
+
+
+def test_the_last_axis_of_three_counts_as_the_channels_before_the_first_does():
+    assert as_rgb(np.zeros((3, 50, 3), np.uint8)).shape == (3, 50, 3)
+    assert as_rgb(np.zeros((3, 50, 40), np.uint8)).shape == (50, 40, 3)
+
+
+@pytest.mark.parametrize(
+    "mode",
+    [
+        "1",
+        "CMYK",
+        "F",
+        "HSV",
+        "I",
+        "I;16",
+        "I;16B",
+        "L",
+        "LA",
+        "La",
+        "LAB",
+        "P",
+        "PA",
+        "RGBA",
+        "RGBX",
+        "RGBa",
+    ],
+)
+def test_a_pil_image_of_any_mode_is_taken(mode):
+    image = as_rgb(Image.new(mode, (50, 40)))
+    assert (image.shape, image.dtype) == ((40, 50, 3), np.uint8)
+
+
+def test_a_pil_image_in_colours_has_the_pixels_of_the_array_it_was_made_from():
+    picture = Image.fromarray(COLOURS)
+    np.testing.assert_array_equal(as_rgb(picture), COLOURS)
+    assert as_rgb(picture).flags.writeable
+
+
+@pytest.mark.parametrize("values", [[[0, 255], [128, 7]], [[0, 65535], [32768, 256]]])
+def test_a_32_bit_pil_image_is_read_as_the_same_file_is(tmp_path, values):
+    picture = Image.fromarray(np.kron(np.array(values, np.int32), np.ones((32, 32), np.int32)))
+    picture.save(tmp_path / "deep.tif")
+    np.testing.assert_array_equal(as_rgb(picture), read_image(tmp_path / "deep.tif"))
+
+
+def test_a_pil_image_is_not_turned_by_its_exif_tag():
+    picture = Image.fromarray(COLOURS)
+    picture.getexif()[0x0112] = 6  # to be shown turned by a quarter
+    assert as_rgb(picture).shape == (40, 50, 3)
+
+
+@pytest.mark.parametrize(
+    "arrange",
+    [lambda t: t, lambda t: t.permute(2, 0, 1), lambda t: t.permute(2, 0, 1)[None], lambda t: t[None]],
+    ids=["h w 3", "3 h w", "1 3 h w", "1 h w 3"],
+)
+@pytest.mark.parametrize("as_kind", [lambda t: t, lambda t: t.float() / 255, lambda t: t.double() / 255])
+def test_a_tensor_is_taken_whichever_its_axes_and_type(arrange, as_kind):
+    tensor = arrange(as_kind(torch.from_numpy(COLOURS)))
+    np.testing.assert_array_equal(as_rgb(tensor), COLOURS)
+
+
+def test_a_tensor_that_needs_its_gradient_or_has_half_a_float_is_taken():
+    white = torch.ones(3, 40, 50, requires_grad=True)
+    for tensor in (white, white.half(), white.bfloat16()):
+        assert (as_rgb(tensor) == 255).all()
+
+
+def test_a_grey_tensor_is_repeated():
+    assert as_rgb(torch.full((1, 40, 50), 9, dtype=torch.uint8))[3, 4].tolist() == [9, 9, 9]
+
+
+def test_taking_pictures_does_not_import_pytorch():
+    program = "import sys, stereoweave.io.arrays; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+@pytest.mark.usefixtures("without_shape_checks")
+@pytest.mark.parametrize(
+    ("thing", "words"),
+    [
+        ("left.png", ["got str", "PIL.Image.open"]),
+        (None, ["got NoneType"]),
+        (np.zeros((2, 40, 50, 3), np.uint8), ["got [2, 40, 50, 3]", "one picture at a time"]),
+        (np.zeros((40, 50, 2), np.uint8), ["got [40, 50, 2]"]),
+        (np.zeros(3), ["got [3]"]),
+        (np.zeros((40, 50, 3), np.int64), ["int64 [40, 50, 3]", "astype('uint8')"]),
+        (np.zeros((40, 50), bool), ["bool [40, 50]", "uint8, uint16 or a float"]),
+        (torch.full((3, 40, 50), 255.0), ["float32 [3, 40, 50]", "of 255 to 255", "divide"]),
+        (np.full((40, 50, 3), -0.1), ["float64", "-0.1", "0..1"]),
+        (np.full((40, 50), np.nan), ["nan", "fill NaN"]),
+        (np.full((40, 50), 1e308), ["of 1e+308 to 1e+308"]),
+        (torch.full((40, 50), 300.0).half().numpy(), ["float16", "of 300 to 300"]),
+        (Image.new("I", (0, 0)), ["int32 [0, 0]"]),
+        (Image.new("F", (50, 40), 3), ["float32 [40, 50]", "of 3 to 3"]),
+        (Image.new("I", (50, 40), 70000), ["int32"]),
+    ],
+)
+def test_anything_else_is_refused_in_a_line_that_says_what_it_is(thing, words):
+    with pytest.raises(StereoweaveError, match=r"^left picture: expected") as refusal:
+        as_rgb(thing, "left picture")
+    assert "\n" not in str(refusal.value)
+    for word in words:
+        assert word in str(refusal.value)

@@ -1,0 +1,172 @@
+"""What WeaveNet's design promises, beside the tests of every network in test_models.py."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from learn_examples import overfitted, untrained
+from torch import nn
+
+from stereoweave.learn.export.from_checkpoint import multiply_adds
+from stereoweave.learn.models.layers import mirrored
+from stereoweave.learn.models.weave import BASE, BASE_GROWN, WeaveNet
+from stereoweave.learn.models.weave_stages import OFFSETS, Completion
+from stereoweave.learn.training.losses import weave_losses
+
+
+def random_pair(batch, height, width):
+    torch.manual_seed(1)
+    return torch.rand(batch, 3, height, width), torch.rand(batch, 3, height, width)
+
+
+@pytest.mark.parametrize("size", [(16, 16), (32, 32), (16, 112), (48, 80), (112, 32)])
+def test_any_size_that_the_network_divides_gives_maps_of_that_size(size):
+    with torch.no_grad():
+        maps = untrained()(*random_pair(1, *size))
+    assert len(maps) == 3
+    for values in maps:
+        assert values.shape == (1, 1, *size)
+        assert values.dtype == torch.float32
+        assert values.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("name", "most"), [("weave_small", 3e9), ("weave_base", 16e9), ("weave_base_grown", 16e9)]
+)
+def test_the_whole_graph_of_both_views_costs_at_most_what_was_promised(name, most):
+    count = multiply_adds(untrained(name))
+    assert count <= most
+    assert f"{count / 1e9:.2f} G multiply-adds" in WeaveNet.__doc__
+
+
+def test_a_network_that_grows_answers_as_before_until_it_is_trained_on():
+    torch.manual_seed(0)
+    before = WeaveNet(replace(BASE, convolutions=(1, 2, 2, 2), propagation=0, refinement=2)).eval()
+    grown = WeaveNet(BASE).eval()
+    shared = before.state_dict()
+    assert len(shared) < len(grown.state_dict())
+    grown.load_state_dict(grown.state_dict() | shared)
+    pair = random_pair(1, 48, 80)
+    with torch.no_grad():
+        for found, expected in zip(grown(*pair), before(*pair), strict=True):
+            torch.testing.assert_close(found, expected, atol=1e-3, rtol=0)
+
+
+def test_the_network_overfits_one_pair():
+    trained = overfitted()
+    assert trained.error_after_px < 1
+    assert trained.error_after_px < trained.error_before_px / 5
+
+
+def test_a_mirrored_pair_gives_mirrored_answers():
+    """Exactly so if the features are those of a mirror-symmetric encoder; training has to teach the rest."""
+    # In double precision rounding decides nothing between two levels that match as well.
+    network = untrained().double()
+    with torch.no_grad():
+        for layer in network.encoder.modules():
+            if isinstance(layer, nn.Conv2d):
+                layer.weight += mirrored(layer.weight.clone())
+        left, right = (image.double() for image in random_pair(1, 48, 80))
+        left_px, right_px, _ = network(left, right)
+        mirrored_left_px, mirrored_right_px, _ = network(mirrored(right), mirrored(left))
+    torch.testing.assert_close(right_px, mirrored(mirrored_left_px), atol=1e-3, rtol=0)
+    torch.testing.assert_close(left_px, mirrored(mirrored_right_px), atol=1e-3, rtol=0)
+    assert (left_px - right_px).abs().max() > 0.1
+
+
+def test_the_stages_hold_both_views_the_right_one_mirrored():
+    network = untrained()
+    pair = random_pair(2, 32, 64)
+    with torch.no_grad():
+        stages = network.stages(*pair)
+        left_px, right_px, logit = network(*pair)
+    torch.testing.assert_close(stages.disparity_px.clamp(min=0), torch.cat([left_px, mirrored(right_px)]))
+    torch.testing.assert_close(stages.confidence_logit[:2], logit)
+    assert stages.correlation.shape == stages.scores.shape == (4, network.levels, 8, 16)
+    assert stages.coarse_px.shape == (4, 1, 16, 32)
+
+
+def test_a_disparity_below_zero_comes_out_as_zero():
+    network = untrained()
+    # Half resolution's coarse estimate stays near 0 px, and the refinement takes 2 px off.
+    torch.nn.init.zeros_(network.refinement.scores.weight)
+    with torch.no_grad():
+        network.aggregation.scores.bias[0] = 1e4
+        network.refinement.scores.bias[0] = 1e4
+        pair = random_pair(1, 32, 64)
+        assert network.stages(*pair).disparity_px.max() < 0
+        for values in network(*pair)[:2]:
+            assert (values == 0).all()
+
+
+def test_forty_eight_levels_reach_192_px():
+    assert untrained().max_disparity_px == 192
+
+
+@pytest.mark.parametrize("part", ["wider", "completion", "sharpening"])
+def test_each_stage_that_a_network_grows_by_adds_nothing_until_it_is_trained(part):
+    torch.manual_seed(0)
+    before = WeaveNet(BASE).eval()
+    grown = WeaveNet(replace(BASE, **{part: getattr(BASE_GROWN, part)})).eval()
+    grown.load_state_dict(grown.state_dict() | before.state_dict())
+    pair = random_pair(1, 64, 96)
+    with torch.no_grad():
+        for found, expected in zip(grown(*pair), before(*pair), strict=True):
+            assert torch.equal(found, expected)
+
+
+def test_every_stage_of_a_grown_network_learns():
+    """In bfloat16 too, in which oneDNN's gradients of some convolutions are not finite."""
+    torch.manual_seed(0)
+    network = WeaveNet(BASE_GROWN).train()
+    left, right = random_pair(2, 64, 96)
+    truth_px = torch.full((4, 1, 64, 96), 9.0)
+    for _ in range(4):  # what is silent passes a gradient on once it has moved
+        with torch.autocast("cpu", torch.bfloat16):
+            stages = network.stages(left, right)
+        terms = weave_losses(stages, truth_px, torch.zeros_like(truth_px, dtype=torch.bool))
+        network.zero_grad()
+        sum(terms.values()).backward()
+        assert all(parameter.grad.isfinite().all() for parameter in network.parameters())
+        with torch.no_grad():
+            for parameter in network.parameters():
+                parameter -= 1e-2 * parameter.grad
+    grown_by = ("sharpening.", "completion.", "aggregation.context.wider.")
+    for name, parameter in network.named_parameters():
+        assert not name.startswith(grown_by) or parameter.grad.any(), name
+
+
+def test_a_mirrored_pair_is_completed_and_sharpened_alike():
+    """Whatever the features are: the stages are shown each view with the other one in its own columns."""
+    torch.manual_seed(0)
+    network = WeaveNet(BASE_GROWN).eval().double()
+    for layer in (network.completion.share, network.sharpening.scores):
+        nn.init.normal_(layer.weight, std=0.5)
+    with torch.no_grad():
+        for part in (network.encoder, network.sharpening.features, network.sharpening.to_match):
+            for layer in part.modules():
+                if isinstance(layer, nn.Conv2d):
+                    layer.weight += mirrored(layer.weight.clone())
+        left, right = (image.double() for image in random_pair(1, 64, 96))
+        left_px, right_px, _ = network(left, right)
+        mirrored_left_px, mirrored_right_px, _ = network(mirrored(right), mirrored(left))
+    torch.testing.assert_close(right_px, mirrored(mirrored_left_px), atol=1e-3, rtol=0)
+    torch.testing.assert_close(left_px, mirrored(mirrored_right_px), atol=1e-3, rtol=0)
+
+
+def test_a_completion_takes_the_surface_that_its_affinities_point_to():
+    """A hole of 3 columns in a wall at 2: each pixel takes the one 8 columns to the left instead."""
+    torch.manual_seed(0)
+    completion = Completion(quarter=4, channels=8).eval()
+    disparity = torch.full((1, 1, 6, 24), 2.0)
+    disparity[..., 12:15] = 7.0
+    with torch.no_grad():
+        completion.affinity.weight.zero_()
+        completion.affinity.bias.fill_(-1e4)
+        completion.affinity.bias[OFFSETS.index((0, -8))] = 0
+        completion.share.bias.fill_(100.0)
+        found, decoded = completion(
+            disparity, torch.full_like(disparity, 2.0), torch.rand(1, 4, 6, 24), torch.rand(1, 32, 6, 24)
+        )
+    assert found[..., 12:15].tolist() == [[[[2.0] * 3] * 6]]
+    assert found[..., 20:23].tolist() == [[[[7.0] * 3] * 6]]

@@ -1,0 +1,116 @@
+from collections import Counter
+from dataclasses import asdict, replace
+
+import pytest
+from learn_examples import recipe_of
+
+from stereoweave.learn.paper.trials import (
+    ADJUSTMENT,
+    CLAIMS,
+    DECODER,
+    ITERATIONS,
+    LOSS,
+    NETWORKS,
+    NETWORKS_SHORT,
+    PAPER,
+    PROJECTION,
+    SCRATCH,
+    TRANSFER,
+    TUNED,
+    trials,
+)
+
+BASE = recipe_of("fast_depth", steps=600, exponent=1.5, alpha_p=1.0, seed=5, max_disparity_px=32.0)
+PLAIN = {"exponent": 1.0, "alpha_p": 0.0}
+DENSEMAPNET = {"model": "densemapnet", **PLAIN}
+DISPNET = {"model": "dispnet", **PLAIN, "loss": "l1", "learning_rate": 1e-4}
+PSMNET = {"model": "psmnet", **PLAIN, "loss": "smooth_l1"}
+# Collages of 96x64 and 32 px, half as large again.
+OTHER = {"seed": 100, "pairs": 500, "pair_size": (96, 144), "max_disparity_px": 48.0}
+FIRST = "fast_depth-l2-p1.5-projection1-steps600-seed5"
+DIFFERENCES = {
+    (PROJECTION, PAPER): {},
+    (PROJECTION, "without"): {"alpha_p": 0.0},
+    (NETWORKS, "fast_depth"): {},
+    (NETWORKS, "densemapnet"): DENSEMAPNET,
+    (NETWORKS, "dispnet"): DISPNET,
+    (NETWORKS_SHORT, "fast_depth"): {"steps": 150},
+    (NETWORKS_SHORT, "densemapnet"): {"steps": 150, **DENSEMAPNET},
+    (NETWORKS_SHORT, "dispnet"): {"steps": 150, **DISPNET},
+    (NETWORKS_SHORT, "psmnet"): {"steps": 150, **PSMNET},
+    (ADJUSTMENT, "p = 1"): {"exponent": 1.0},
+    (ADJUSTMENT, "p = 1.25"): {"exponent": 1.25},
+    (ADJUSTMENT, "p = 1.5"): {},
+    (ADJUSTMENT, "p = 2"): {"exponent": 2.0},
+    (ADJUSTMENT, "p = 1.37 (fitted)"): {"exponent": 1.37},
+    (DECODER, PAPER): {},
+    (DECODER, "step-wise, no skips"): {"model": "fast_depth_without_skips"},
+    (DECODER, "upsampled at once, no skips"): {"model": "densemapnet"},
+    (LOSS, "l2"): {},
+    (LOSS, "l1"): {"loss": "l1"},
+    (LOSS, "smooth_l1"): {"loss": "smooth_l1"},
+    (LOSS, "cross_entropy"): {"loss": "cross_entropy"},
+    (TRANSFER, SCRATCH): OTHER,
+    (TRANSFER, TUNED): {**OTHER, "start_from": f"{FIRST}/last.pt"},
+    (ITERATIONS, "10 steps"): {"steps": 10},
+    (ITERATIONS, "50 steps"): {"steps": 50},
+    (ITERATIONS, "250 steps"): {"steps": 250},
+}
+SEVERAL = {
+    *((claim, setting) for claim, setting in DIFFERENCES if claim in (PROJECTION, ADJUSTMENT, DECODER, LOSS)),
+    (NETWORKS, "fast_depth"),
+    (NETWORKS, "densemapnet"),
+}
+
+
+def difference(recipe):
+    """Where a recipe is not the base's, its name aside."""
+    ours, theirs = asdict(recipe), asdict(BASE)
+    return {field: ours[field] for field in ours if ours[field] != theirs[field] and field != "name"}
+
+
+def test_a_trial_differs_from_the_base_in_what_its_setting_says_alone():
+    found = {(trial.claim, trial.setting): difference(trial.recipe) for trial in trials(BASE, 1, 1.37)}
+    assert found == DIFFERENCES
+    assert {claim for claim, _ in found} == set(CLAIMS)
+
+
+def test_what_is_compared_with_an_interval_is_trained_with_every_seed():
+    planned = trials(BASE, 3, 1.37)
+    counts = Counter((trial.claim, trial.setting) for trial in planned)
+    assert counts == {key: 3 if key in SEVERAL else 1 for key in DIFFERENCES}
+    for key in SEVERAL:
+        found = [trial.recipe for trial in planned if (trial.claim, trial.setting) == key]
+        assert [recipe.seed for recipe in found] == [5, 6, 7]
+        assert len({replace(recipe, seed=5, name="") for recipe in found}) == 1
+
+
+@pytest.mark.parametrize("fitted", [1.0, 1.37, 1.5])
+def test_a_name_stands_for_one_recipe_and_a_recipe_has_one_name(fitted):
+    recipes = {trial.recipe for trial in trials(BASE, 3, fitted)}
+    assert len({recipe.name for recipe in recipes}) == len(recipes)
+    assert len({replace(recipe, name="") for recipe in recipes}) == len(recipes)
+
+
+def test_the_papers_recipe_is_trained_once_for_five_claims():
+    claims = [trial.claim for trial in trials(BASE, 1, 1.37) if trial.recipe.name == FIRST]
+    assert claims == [PROJECTION, NETWORKS, ADJUSTMENT, DECODER, LOSS]
+
+
+def test_a_base_that_fits_its_exponent_does_not_make_the_others_fit():
+    assert trials(replace(BASE, fit_exponent=True), 1, 1.37) == trials(BASE, 1, 1.37)
+
+
+def test_pairs_on_disk_have_all_trials_but_the_transfer():
+    on_disk = trials(replace(BASE, dataset="paper", root="propeller", target="depth"), 2, 1.37)
+    collages = trials(BASE, 2, 1.37)
+    assert [trial.recipe.name for trial in on_disk] == [
+        trial.recipe.name for trial in collages if trial.claim != TRANSFER
+    ]
+    assert {trial.recipe.target for trial in on_disk} == {"depth"}
+
+
+def test_the_perceptual_loss_waits_for_its_file():
+    with_file = trials(replace(BASE, vgg16_weights="vgg16.npz"), 1, 1.37)
+    losses = [trial.recipe.loss for trial in with_file if trial.claim == LOSS]
+    assert losses == ["l2", "l1", "smooth_l1", "cross_entropy", "perceptual"]

@@ -1,0 +1,86 @@
+from collections import Counter
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from learn_examples import RECIPE
+
+from stereoweave.learn.studies import speed
+
+HEIGHT, WIDTH = 64, 96
+SHARE = HEIGHT * WIDTH / (480 * 640)
+
+
+@pytest.fixture(scope="module")
+def timed():
+    """Rows of the two cheap networks at a small size, what was called, and the graphs."""
+    graphs, calls = [], {}
+    with pytest.MonkeyPatch.context() as patch:
+        exported, times_ms = speed.fixed_graph_of, speed._times_ms
+        patch.setattr(speed, "HEIGHT_PX", HEIGHT)
+        patch.setattr(speed, "WIDTH_PX", WIDTH)
+        patch.setattr(speed, "thread_count", lambda _: 1)
+        patch.setattr(
+            speed, "fixed_graph_of", lambda *arguments: graphs.append(exported(*arguments)) or graphs[-1]
+        )
+        patch.setattr(speed, "_times_ms", lambda given, turns: calls.update(given) or times_ms(given, turns))
+        # A recipe of another kind: what is timed does not depend on its loss.
+        rows = speed.run_times(RECIPE, ("fast_depth", "densemapnet"), turns=2)
+        torch.manual_seed(0)
+    return {row.network: row for row in rows}, calls, graphs
+
+
+def test_a_ratio_is_to_densemapnet(timed):
+    rows, _, _ = timed
+    ours, reference = rows["fast_depth"], rows["densemapnet"]
+    assert (reference.eager_relative, reference.onnx_relative) == (1, 1)
+    assert ours.eager_relative == ours.eager_ms / reference.eager_ms
+    assert ours.onnx_relative == ours.onnx_ms / reference.onnx_ms
+    assert min(ours.eager_ms, ours.onnx_ms) > 0
+
+
+def test_a_row_has_the_published_parameters_and_multiply_adds(timed):
+    rows, _, _ = timed
+    assert {name: row.parameters for name, row in rows.items()} == {
+        "fast_depth": 314_722,
+        "densemapnet": 290_290,
+    }
+    # At 640x480, 7.39 and 8.41 thousand million.
+    assert rows["fast_depth"].multiply_adds == pytest.approx(7.39e9 * SHARE, rel=2e-3)
+    assert rows["densemapnet"].multiply_adds == pytest.approx(8.41e9 * SHARE, rel=2e-3)
+
+
+def test_what_is_timed_in_both_runtimes_gives_the_same_disparity(timed):
+    _, calls, _ = timed
+    for eager, in_onnx in calls.values():
+        (expected_px,), (found_px,) = eager(), in_onnx()
+        assert expected_px.shape == (1, 1, HEIGHT, WIDTH)
+        np.testing.assert_allclose(found_px, expected_px.numpy(), atol=0.01)
+    # Random weights, but different ones: the two networks do not answer alike.
+    assert np.abs(calls["fast_depth"][1]()[0] - calls["densemapnet"][1]()[0]).max() > 1
+
+
+def test_the_graph_is_for_that_size_alone(timed):
+    _, _, graphs = timed
+    for graph in graphs:
+        onnx.checker.check_model(graph)
+        shapes = {
+            value.name: [side.dim_value for side in value.type.tensor_type.shape.dim]
+            for value in (*graph.graph.input, *graph.graph.output)
+        }
+        assert shapes == {
+            "left": [1, 3, HEIGHT, WIDTH],
+            "right": [1, 3, HEIGHT, WIDTH],
+            "disparity_px": [1, 1, HEIGHT, WIDTH],
+        }
+
+
+def test_every_network_is_warmed_up_and_psmnet_is_called_a_third_as_often():
+    called = []
+    calls = {name: (lambda name=name: called.append(name),) * 2 for name in ("densemapnet", "psmnet")}
+    times_ms = speed._times_ms(calls, turns=7)
+    # Turns 0, 3 and 6 of seven, and one before that is not timed; both runtimes each.
+    assert Counter(called) == {"densemapnet": 2 * 8, "psmnet": 2 * 4}
+    assert called[:4] == ["densemapnet"] * 2 + ["psmnet"] * 2
+    assert {name: len(both) for name, both in times_ms.items()} == {"densemapnet": 2, "psmnet": 2}

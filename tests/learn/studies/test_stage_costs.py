@@ -1,0 +1,204 @@
+import csv
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from learn_examples import RECIPE, checkpoint_of, complaint, recipe_of, untrained
+from onnx import TensorProto, helper
+
+from stereoweave.cli.root import main
+from stereoweave.learn import checkpoint
+from stereoweave.learn.export.from_checkpoint import multiply_adds
+from stereoweave.learn.studies import stage_costs as costs
+
+HEIGHT, WIDTH = 32, 64
+
+
+def noted(operation, read, given, *modules):
+    """A node as the exporter writes it, with the modules that it was called in."""
+    node = helper.make_node(operation, read, [given], f"node_{given}")
+    note = node.metadata_props.add()
+    note.key, note.value = "pkg.torch.onnx.name_scopes", str(["", *modules, given])
+    return node
+
+
+def graph_of(nodes, shapes, given, constants=()):
+    """A graph of those nodes; its inputs are all of `shapes`."""
+    inputs = [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in shapes.items()]
+    outputs = [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in given]
+    graph = helper.make_graph(nodes, "graph", inputs, outputs, list(constants))
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=9)
+
+
+@pytest.fixture(scope="module")
+def rows(tmp_path_factory):
+    """Rows of a small run: its file, and the network."""
+    file = tmp_path_factory.mktemp("run") / "last.pt"
+    network = untrained()
+    checkpoint.save(checkpoint_of(network), file)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(costs, "HEIGHT_PX", HEIGHT)
+        patch.setattr(costs, "WIDTH_PX", WIDTH)
+        patch.setattr(costs, "PRODUCT_SIDE", 64)
+        return network, costs.stage_costs([file.parent], turns=2)
+
+
+def test_an_operation_belongs_to_the_stage_of_its_module_or_of_what_ran_before_it():
+    graph = graph_of(
+        [
+            noted("Concat", ["left", "right"], "both"),
+            noted("Relu", ["both"], "maps", "encoder", "encoder.down"),
+            noted("Neg", ["maps"], "mirror"),
+            noted("Relu", ["mirror"], "features", "to_match"),
+            noted("Neg", ["features"], "products"),
+            noted("Add", ["products", "maps"], "scores", "aggregation"),
+            noted("Neg", ["scores"], "coarse"),
+            noted("Neg", ["coarse"], "handed", "to_half"),
+            noted("Neg", ["handed"], "shuffled"),
+            noted("Neg", ["shuffled"], "looked_up", "refinement"),
+            noted("Relu", ["looked_up"], "joined", "refinement", "refinement.join"),
+            noted("Neg", ["joined"], "fine", "refinement"),
+            noted("Neg", ["fine"], "disparity"),
+        ],
+        {"left": [1], "right": [1]},
+        ["disparity"],
+    )
+    stages = costs.stages_of(graph)
+    assert {name: stage for name, stage in stages.items() if not name.startswith("node_")} == {
+        "both": "encoder",
+        "maps": "encoder",
+        "mirror": "mirroring",
+        "features": "correlation",
+        "products": "correlation",
+        "scores": "aggregation",
+        "coarse": "disparity from scores",
+        "handed": "refinement",
+        "shuffled": "refinement",
+        "looked_up": "matching at 1/2",
+        "joined": "refinement",
+        "fine": "refinement",
+        "disparity": "upsampling",
+    }
+    assert stages["node_coarse"] == stages["coarse"]
+
+
+def test_multiply_adds_are_of_convolutions_products_and_sums_of_products():
+    ones = helper.make_tensor("axis", TensorProto.INT64, [1], [1])
+    graph = graph_of(
+        [
+            helper.make_node("Conv", ["image", "kernel"], ["maps"], "conv", pads=[1, 1, 1, 1]),
+            helper.make_node("MatMul", ["first", "second"], ["product"], "matmul"),
+            helper.make_node("Mul", ["a", "b"], ["summed"], "mul"),
+            helper.make_node("ReduceSum", ["summed", "axis"], ["sum"], "sum"),
+            helper.make_node("Mul", ["a", "b"], ["kept"], "mul_alone"),
+        ],
+        {
+            "image": [1, 2, 5, 6],
+            "kernel": [4, 2, 3, 3],
+            "first": [2, 3, 4],
+            "second": [4, 5],
+            "a": [7, 1],
+            "b": [1, 8],
+        },
+        ["maps", "product", "sum", "kept"],
+        [ones],
+    )
+    counts = costs.multiply_adds_of(graph)
+    # 4 maps of 5x6 from 2 at 3x3; 2x3x5 sums of 4 products; 7x8 products.
+    assert counts == {"conv": 4 * 5 * 6 * 2 * 9, "matmul": 2 * 3 * 5 * 4, "mul": 7 * 8}
+
+
+def test_a_product_of_matrices_moves_both_and_the_result_and_runs_every_turn():
+    found = costs.profile(costs._product(16), threads=1, turns=3)
+    assert found.moved == {"product": 3 * 16 * 16 * 4}
+    assert len(found.kernels_ms["product"]) == len(found.total_ms) == 3
+    for kernel_ms, total_ms in zip(found.kernels_ms["product"], found.total_ms, strict=True):
+        assert 0 < kernel_ms < total_ms
+
+
+def test_the_least_time_of_a_stage_is_that_of_its_kernels_in_one_turn():
+    profiled = costs.Profile(
+        costs._product(2), {}, {"a": [1.0, 5.0], "b": [4.0, 1.0], "c": [9.0, 9.0]}, [14.0, 15.0]
+    )
+    stages = {"a": "encoder", "b": "encoder", "c": "refinement"}
+    assert costs._least_ms(profiled, stages, "encoder") == 5
+    assert costs._least_ms(profiled, stages, "mirroring") == 0
+
+
+def test_the_first_turn_warms_up_and_views_move_nothing():
+    sizes = {"activation_size": "8", "parameter_size": "4", "output_size": "2"}
+    events = [
+        {"name": name, "dur": dur, "args": {"op_name": operation, **sizes}}
+        for dur in (9000, 1000, 2000)
+        for name, operation in (("a_kernel_time", "Conv"), ("b_kernel_time", "Reshape"), ("model_run", ""))
+    ]
+    found = costs._profile(costs._product(2), json.loads(json.dumps(events)))
+    assert found.moved == {"a": 14, "b": 0}
+    assert found.kernels_ms == {"a": [1, 2], "b": [1, 2]}
+    assert found.total_ms == [1, 2]
+
+
+def test_the_product_is_the_peak_and_the_stages_come_in_order_with_their_total(rows):
+    _, (product, *stages, total) = rows
+    assert (product.network, product.stage) == ("", costs.PRODUCT)
+    assert product.multiply_adds == 64**3
+    assert product.one_thread_peak_percent == pytest.approx(100)
+    assert product.two_threads_peak_percent == pytest.approx(100)
+    assert {row.network for row in (*stages, total)} == {RECIPE.name}
+    assert total.stage == costs.TOTAL
+    assert [row.stage for row in stages] == [
+        "encoder",
+        "mirroring",
+        "correlation",
+        "aggregation",
+        "disparity from scores",
+        "upsampling",
+        "matching at 1/2",
+        "refinement",
+    ]
+
+
+def test_the_total_is_what_the_stages_sum_to(rows):
+    network, (product, *stages, total) = rows
+    assert sum(row.multiply_adds for row in stages) == total.multiply_adds
+    # Every kernel is in a stage.
+    assert sum(row.moved_mb for row in stages) == pytest.approx(total.moved_mb)
+    assert total.one_thread_ms >= max(row.one_thread_ms for row in stages) > 0
+    # Beside what the network's card counts, the sums of weighted neighbours.
+    assert total.multiply_adds == pytest.approx(multiply_adds(network, HEIGHT, WIDTH), rel=0.02)
+    speed, peak = total.multiply_adds / total.one_thread_ms, product.multiply_adds / product.one_thread_ms
+    assert total.one_thread_peak_percent == pytest.approx(100 * speed / peak)
+
+
+def test_the_convolutions_of_the_encoder_are_counted_there(rows):
+    network, (_, encoder, *_) = rows
+    with torch.no_grad(), torch.utils.flop_counter.FlopCounterMode(display=False) as counter:
+        network.encoder(torch.rand(2, 3, HEIGHT, WIDTH))
+    assert encoder.multiply_adds == counter.get_total_flops() // 2
+
+
+def test_the_table_has_a_line_for_each_row(rows):
+    _, found = rows
+    lines = costs.markdown(found).splitlines()
+    assert len(lines) == 2 + len(found)
+    assert {line.count("|") for line in lines} == {9}
+    assert lines[2].startswith(f"|  | {costs.PRODUCT} | 0.3 | 0.0 | ")
+    assert lines[2].endswith("| 100 % |")
+
+
+def test_another_network_is_one_line_that_says_where_it_is_timed(tmp_path):
+    recipe = recipe_of("fast_depth", target="disparity")
+    checkpoint.save(checkpoint_of(untrained("fast_depth"), recipe), tmp_path / "last.pt")
+    assert "expected a WeaveNet" in complaint(costs.stage_costs, [tmp_path / "last.pt"])
+
+
+def test_the_command_prints_the_table_and_writes_the_rows(rows, monkeypatch, tmp_path, capsys):
+    _, found = rows
+    asked = []
+    monkeypatch.setattr(costs, "stage_costs", lambda runs: asked.append(runs) or found)
+    assert main(["bench", "costs", "a", "b.pt", "-o", str(tmp_path / "costs.csv")]) == 0
+    assert asked == [[Path("a"), Path("b.pt")]]
+    assert capsys.readouterr().out == costs.markdown(found) + "\n"
+    with (tmp_path / "costs.csv").open(newline="") as file:
+        assert [row["stage"] for row in csv.DictReader(file)] == [row.stage for row in found]

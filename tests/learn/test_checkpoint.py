@@ -1,0 +1,209 @@
+import re
+import subprocess
+from dataclasses import asdict, replace
+
+import pytest
+import torch
+from learn_examples import RECIPE, checkpoint_of, untrained
+from torch import nn
+
+from stereoweave.errors import FormatError
+from stereoweave.learn import checkpoint
+from stereoweave.learn.training.perceptual import PerceptualLoss
+
+
+@pytest.fixture
+def trained():
+    """A checkpoint with all that a run leaves, of a network that is a single layer."""
+    torch.manual_seed(0)
+    layer = nn.Conv2d(3, 4, 3).to(memory_format=torch.channels_last)
+    optimiser = torch.optim.AdamW(layer.parameters(), 1e-3, fused=True)
+    layer(torch.rand(1, 3, 5, 5)).sum().backward()
+    optimiser.step()
+    return replace(checkpoint_of(layer), optimiser=optimiser.state_dict())
+
+
+def assert_same(one, other):
+    assert type(one) is type(other)
+    if isinstance(one, torch.Tensor):
+        assert torch.equal(one, other)
+        assert one.stride() == other.stride()
+    elif isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for key, value in one.items():
+            assert_same(value, other[key])
+    else:
+        assert one == other
+
+
+def test_a_checkpoint_comes_back_as_it_was(tmp_path, trained):
+    path = tmp_path / "last.pt"
+    checkpoint.save(trained, path)
+    found = checkpoint.load(path)
+    assert found.recipe == RECIPE
+    assert_same(vars(trained), vars(found))
+
+
+def test_saving_that_fails_leaves_the_earlier_checkpoint(tmp_path, trained):
+    path = tmp_path / "last.pt"
+    checkpoint.save(trained, path)
+    before = path.read_bytes()
+    with pytest.raises(AttributeError, match="lambda|pickle"):
+        checkpoint.save(replace(trained, optimiser={"large": torch.zeros(10_000), "no": lambda: 0}), path)
+    assert path.read_bytes() == before
+
+
+def test_a_saved_checkpoint_leaves_no_other_file(tmp_path, trained):
+    checkpoint.save(trained, tmp_path / "last.pt")
+    checkpoint.save(trained, tmp_path / "last.pt")
+    assert [file.name for file in tmp_path.iterdir()] == ["last.pt"]
+
+
+def test_a_checkpoint_from_before_there_was_an_origin_has_none(tmp_path, trained):
+    path = tmp_path / "old.pt"
+    values = {**vars(trained), "recipe": asdict(RECIPE)}
+    del values["origin"]
+    torch.save(values, path)
+    assert checkpoint.load(path).origin == ()
+
+
+def truncated(path, trained):
+    checkpoint.save(trained, path)
+    path.write_bytes(path.read_bytes()[:-1000])
+
+
+def of_another_recipe_version(path, trained):
+    values = {**vars(trained), "recipe": {"name": "x", "colour": "red"}}
+    torch.save(values, path)
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda path, _: path.write_bytes(bytes(range(256)) * 8),
+        lambda path, _: path.write_bytes(b""),
+        lambda path, _: path.write_text("hello, I am a text file\nof two lines\n"),
+        lambda path, _: path.write_text("question\n"),
+        lambda path, _: path.mkdir(),
+        lambda path, _: torch.save([1, 2, 3], path),
+        lambda path, _: torch.save({"weights": torch.zeros(3)}, path),
+        lambda path, trained: torch.save(nn.Linear(2, 2), path),
+        truncated,
+        of_another_recipe_version,
+    ],
+    ids=["bytes", "empty", "text", "word", "folder", "list", "weights", "module", "truncated", "recipe"],
+)
+def test_a_file_that_is_no_checkpoint_is_named_in_one_line(tmp_path, trained, write):
+    path = tmp_path / "no.pt"
+    write(path, trained)
+    with pytest.raises(FormatError) as caught:
+        checkpoint.load(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+class Program:
+    """What calls a program when it is unpickled."""
+
+    def __init__(self, words):
+        self.words = words
+
+    def __reduce__(self):
+        return subprocess.check_call, (self.words,)
+
+
+def test_a_checkpoint_that_holds_a_program_is_refused_in_one_line_and_the_program_is_not_run(
+    tmp_path, trained
+):
+    path, made = tmp_path / "no.pt", tmp_path / "made"
+    values = {
+        **vars(trained),
+        "recipe": asdict(RECIPE),
+        "optimiser": {"state": Program(["touch", str(made)])},
+    }
+    torch.save(values, path)
+    with pytest.raises(FormatError) as caught:
+        checkpoint.load(path)
+    assert str(caught.value).startswith(f"{path}: expected a checkpoint")
+    assert "\n" not in str(caught.value)
+    assert not made.exists()
+
+
+def test_a_checkpoint_that_is_not_there_is_named_with_what_makes_one(tmp_path):
+    with pytest.raises(FormatError, match=r"nowhere\.pt: no such checkpoint; `stereoweave train`"):
+        checkpoint.load(tmp_path / "nowhere.pt")
+
+
+def test_the_commit_of_the_code_is_a_short_hash_or_unknown():
+    assert re.fullmatch(r"[0-9a-f]{7,40}\+?|unknown", checkpoint.code_commit())
+
+
+def test_the_commit_of_code_installed_in_somebody_elses_repository_is_unknown(tmp_path, monkeypatch):
+    (tmp_path / "venv/stereoweave/learn").mkdir(parents=True)
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=x", "-c", "user.email=x"]
+    for command in (["init", "-q"], ["commit", "-q", "--allow-empty", "-m", "x"]):
+        subprocess.run([*git, *command], check=True)
+    monkeypatch.setattr(checkpoint, "__file__", str(tmp_path / "venv/stereoweave/learn/checkpoint.py"))
+    assert checkpoint.code_commit() == "unknown"
+    monkeypatch.setattr(checkpoint, "__file__", str(tmp_path / "stereoweave/learn/checkpoint.py"))
+    assert re.fullmatch(r"[0-9a-f]{7,40}", checkpoint.code_commit())
+
+
+def test_a_run_starts_with_the_weights_of_its_seed_and_nothing_behind_it():
+    start, again, other = (checkpoint.start_of(replace(RECIPE, seed=seed), "0123abc") for seed in (1, 1, 2))
+    assert (start.step, start.hours, start.origin) == (0, 0, ())
+    assert_same(start.weights, again.weights)
+    assert torch.equal(start.random_state, again.random_state)
+    assert any(not torch.equal(value, other.weights[name]) for name, value in start.weights.items())
+
+
+def gone_on(start, value):
+    """A run from `start` of a network of one weight."""
+    return replace(start, averaged={"weight": torch.tensor([value])}, origin=start.as_origin(), hours=3.0)
+
+
+def test_the_mean_of_two_runs_lies_half_way_and_names_both_and_their_start_once(trained):
+    start = replace(trained, hours=2.0)
+    first, second = gone_on(start, 1.0), replace(gone_on(start, 4.0), commit="another")
+    found = checkpoint.mean(first, second, start)
+    assert found.averaged["weight"].item() == 2.5
+    assert found.hours == 4.0
+    commits = [run["commit"] for run in found.origin]
+    assert commits == [start.commit, first.commit, "another"]
+
+
+def test_runs_that_did_not_start_alike_have_no_mean(trained):
+    first = gone_on(trained, 1.0)
+    with pytest.raises(FormatError, match="found one that did not"):
+        checkpoint.mean(first, trained, trained)
+
+
+def test_averaged_weights_alone_are_small_and_a_run_can_start_from_them(tmp_path):
+    network = untrained()
+    kept = replace(checkpoint_of(network), optimiser={"state": torch.zeros(10)})
+    checkpoint.save(checkpoint.averaged_alone(kept), tmp_path / "weights.pt")
+    count = sum(value.numel() for value in network.state_dict().values())
+    assert (tmp_path / "weights.pt").stat().st_size < 2 * count + 120_000
+    found = checkpoint.load(tmp_path / "weights.pt")
+    assert found.optimiser == {}
+    start = checkpoint.start_of(replace(RECIPE, start_from=str(tmp_path / "weights.pt")), "0123abc")
+    assert start.origin[-1]["step"] == RECIPE.steps
+    for name, value in network.state_dict().items():
+        # 11 bits of a float16's fraction.
+        torch.testing.assert_close(start.weights[name], value, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("content", [b"", b"no checkpoint", b"\x80", b"PK\x03\x04"])
+def test_what_is_no_checkpoint_is_refused_with_a_reason(tmp_path, content):
+    path = tmp_path / "last.pt"
+    path.write_bytes(content)
+    for load, expected in (
+        (checkpoint.load, "a checkpoint of `stereoweave train`"),
+        (PerceptualLoss, "vgg16"),
+    ):
+        with pytest.raises(FormatError) as raised:
+            load(path)
+        told = str(raised.value)
+        assert re.fullmatch(rf"{re.escape(str(path))}: expected {expected}.*, found one that \S.+", told), (
+            told
+        )

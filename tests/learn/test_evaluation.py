@@ -1,0 +1,168 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from learn_examples import (
+    CAMERA,
+    PAIR_SIZE,
+    RECIPE,
+    Listed,
+    box_before_a_wall,
+    checkpoint_of,
+    complaint,
+    keep_pairs,
+    recipe_of,
+)
+from rich.console import Console
+
+from stereoweave.bench.metrics import epe_px
+from stereoweave.bench.projected_views import score_views, view_errors
+from stereoweave.bench.projection import project_right
+from stereoweave.learn import checkpoint
+from stereoweave.learn.data.batches import collated
+from stereoweave.learn.data.pair_cache import KeptPairs
+from stereoweave.learn.data.sources import VALIDATION_SEED
+from stereoweave.learn.evaluation import evaluate, median_method, method_of
+from stereoweave.learn.models import network_of
+
+QUIET = Console(quiet=True)
+PAPER = recipe_of("fast_depth", max_disparity_px=32.0, exponent=2.0)
+
+
+def kept_of(recipe, change=lambda network: None):
+    """A checkpoint of a network with random weights, changed before they are kept."""
+    torch.manual_seed(0)
+    network = network_of(recipe)
+    change(network)
+    return checkpoint_of(network.eval(), recipe)
+
+
+@torch.no_grad()
+def answer_half(network):
+    """Have the network give the code 0.5 everywhere, which is the sigmoid of 0."""
+    network.head.to_code.weight.zero_()
+    network.head.to_code.bias.zero_()
+
+
+KEPT = {
+    "half": kept_of(PAPER, answer_half),
+    "straight": kept_of(replace(PAPER, exponent=1.0), answer_half),
+    "random": kept_of(PAPER),
+    "psmnet": kept_of(recipe_of("psmnet")),
+    "weave_small": kept_of(RECIPE),
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Runs, and pairs: of 6 and 14 px for training, of 4 and 12 px for scores; a quarter of each is near."""
+    folder = tmp_path_factory.mktemp("runs")
+    keep_pairs(folder / "pairs", VALIDATION_SEED, PAPER.validation_pairs)
+    training = KeptPairs(folder / "pairs", PAPER.seed, PAPER.pairs, PAIR_SIZE)
+    training.folder.mkdir()
+    for index in range(training.count):
+        pair = box_before_a_wall(np.random.default_rng(index), wall_px=6, box_px=14)
+        training.keep(index, pair)
+    for name, kept in KEPT.items():
+        (folder / name).mkdir()
+        checkpoint.save(kept, folder / name / "last.pt")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def rows(folder):
+    return {row.method: row for row in evaluate([folder / name for name in KEPT], folder / "pairs", QUIET)}
+
+
+def test_the_runs_follow_what_every_table_has(rows):
+    assert list(rows) == ["ground truth", "no warping", "sgbm", "median", *KEPT]
+
+
+def test_a_checkpoint_is_scored_as_the_folder_of_its_run_is(folder, rows):
+    (folder / "kept.pt").write_bytes((folder / "random" / "last.pt").read_bytes())
+    *_, row = evaluate([folder / "kept.pt"], folder / "pairs", QUIET)
+    assert row == replace(rows["random"], method="kept", epe_cm=row.epe_cm)
+
+
+def test_a_disparity_that_is_the_same_everywhere_has_the_error_that_it_must(rows):
+    assert rows["ground truth"].epe_px == 0
+    assert rows["no warping"].epe_px == 0.75 * 4 + 0.25 * 12
+    # Of the training pairs, where the wall's 6 px are the median.
+    assert rows["median"].epe_px == 0.75 * 2 + 0.25 * 6
+    # Half of 32 px; and with p = 2 its 32 sqrt(0.5) px.
+    assert rows["straight"].epe_px == pytest.approx(0.75 * 12 + 0.25 * 4)
+    assert rows["half"].epe_px == pytest.approx(0.75 * 18.627417 + 0.25 * 10.627417)
+
+
+@torch.no_grad()
+def disparity_px(name, sample):
+    """The left view's disparity, straight from the network."""
+    network = network_of(KEPT[name].recipe)
+    network.load_state_dict(KEPT[name].averaged)
+    batch = collated([sample])
+    output = network.eval()(batch["left"], batch["right"])
+    match name:
+        case "weave_small":
+            return output[0][0, 0].numpy()
+        case "psmnet":
+            return output[0, 0].numpy()
+    return 32 * np.sqrt(output[0, 0].numpy())
+
+
+@pytest.mark.parametrize("name", ["random", "psmnet", "weave_small"])
+def test_a_row_has_the_means_over_the_held_out_pairs(folder, rows, name):
+    held_out = KeptPairs(folder / "pairs", VALIDATION_SEED, PAPER.validation_pairs, PAIR_SIZE)
+    samples = [held_out[index] for index in range(held_out.count)]
+    found_px = [disparity_px(name, sample) for sample in samples]
+    errors = [epe_px(found, sample.disparity_px) for found, sample in zip(found_px, samples, strict=True)]
+    views = [
+        view_errors(sample.right, project_right(sample.left, found))
+        for found, sample in zip(found_px, samples, strict=True)
+    ]
+    assert rows[name].epe_px == pytest.approx(np.mean(errors), rel=1e-4)
+    for measure in ("mae_sourced", "sourced_percent", "mae_filled", "psnr_db", "ssim"):
+        mean = np.mean([getattr(view, measure) for view in views])
+        assert getattr(rows[name], measure) == pytest.approx(mean, rel=1e-4)
+
+
+def test_the_averaged_weights_are_scored(rng):
+    kept = kept_of(PAPER, answer_half)
+    other = replace(kept, weights=kept_of(PAPER).weights)
+    found_px = method_of(other)(box_before_a_wall(rng))
+    np.testing.assert_allclose(found_px, 32 * np.sqrt(0.5), rtol=1e-6)
+
+
+def test_a_depth_becomes_the_disparity_of_each_pair_s_own_camera():
+    # The code 0.5 is 4 m: 24 / 4 px, and 12 / 4 - 1 px.
+    recipe = recipe_of("fast_depth", target="depth", max_depth_m=8.0)
+    sample = replace(box_before_a_wall(np.random.default_rng(0)), camera=CAMERA)
+    other = replace(sample, camera=replace(CAMERA, focal_px=60.0, doffs_px=1.0))
+    match = method_of(kept_of(recipe, answer_half))
+    for pair, expected_px in ((sample, 6.0), (other, 2.0)):
+        np.testing.assert_allclose(match(pair), np.full(PAIR_SIZE, expected_px), rtol=1e-6)
+    # The wall, 4 px, and the box, 12 px, are 6 m and 2 m away; for the other camera 12 / 5 and 12 / 13 m.
+    errors_m = 2.0, 0.75 * (4 - 12 / 5) + 0.25 * (4 - 12 / 13)
+    *_, row = score_views({"half": match}, [sample, other], recipe.max_depth_m)
+    assert row.epe_cm == pytest.approx(100 * np.mean(errors_m), rel=1e-5)
+
+
+def test_the_median_is_of_what_is_known(rng):
+    sample = box_before_a_wall(rng, wall_px=4, box_px=12)
+    unknown = np.where(sample.disparity_px == 4, np.float32("nan"), sample.disparity_px)
+    match = median_method(Listed([replace(sample, disparity_px=unknown)]))
+    np.testing.assert_array_equal(match(sample), np.full(PAIR_SIZE, 12.0))
+
+
+def test_runs_with_other_held_out_pairs_are_scored_apart(folder):
+    (folder / "more").mkdir()
+    checkpoint.save(kept_of(replace(PAPER, validation_pairs=3)), folder / "more" / "last.pt")
+    message = complaint(evaluate, [folder / "random", folder / "more"], folder / "pairs", QUIET)
+    assert message.startswith("more: expected the pairs of random, (")
+    assert message.endswith("; score it apart")
+
+
+@pytest.mark.parametrize("other", ["elsewhere/random", "median"])
+def test_two_rows_of_one_name_are_refused(folder, other):
+    message = complaint(evaluate, [folder / "random", folder / other], folder / "pairs", QUIET)
+    assert message.startswith(f"{other.split('/')[-1]}: expected run folders of different names")

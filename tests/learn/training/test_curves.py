@@ -1,0 +1,59 @@
+import csv
+
+import pytest
+from learn_examples import RECIPE, checkpoint_of, complaint, untrained
+
+from stereoweave.cli.root import main
+from stereoweave.learn import checkpoint
+from stereoweave.learn.training.curves import fit_power_law, record_curve
+from stereoweave.learn.training.loop import CURVE, record
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A run of batches of 2 that was scored five times; its bad-1 falls as the fourth root of the pairs."""
+    run = tmp_path / "weave_tiny"
+    run.mkdir()
+    checkpoint.save(checkpoint_of(untrained()), run / "last.pt")
+    for step in (500, 1000, 2000, 4000, 8000):
+        record(run / CURVE, step, {"epe_px": 2.0, "bad1_percent": 20 * (2 * step / 10_000) ** -0.25})
+    return run
+
+
+def test_a_power_law_is_found_again():
+    pairs = [1e3, 1e4, 4e4]
+    assert fit_power_law(pairs, [12 * (p / 1e4) ** -0.2 for p in pairs]) == pytest.approx((12, 0.2))
+
+
+def test_a_curve_is_written_against_the_pairs_seen_and_fitted(run, tmp_path):
+    fits = record_curve(run, tmp_path / "curve.csv")
+    assert fits["bad1_percent"] == pytest.approx((20, 0.25), abs=1e-4)
+    assert fits["epe_px"] == pytest.approx((2, 0), abs=1e-4)
+    with (tmp_path / "curve.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["pairs"] for row in rows] == ["1000", "2000", "4000", "8000", "16000"]
+    assert rows[0]["recipe"] == "weave_tiny"
+    assert rows[0]["commit"] == "0123abc"
+    assert float(rows[0]["bad1_percent"]) == pytest.approx(20 * 0.1**-0.25, abs=1e-4)
+
+
+def test_rows_of_other_runs_stay_and_those_of_the_run_are_replaced(run, tmp_path):
+    out = tmp_path / "curve.csv"
+    out.write_text("recipe,step,epe_px\nearlier,200,3.5\nweave_tiny,7,9.9\n")
+    for _ in range(2):
+        record_curve(run, out)
+    with out.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["recipe"] for row in rows] == ["earlier"] + 5 * ["weave_tiny"]
+    assert (rows[0]["epe_px"], rows[0]["pairs"]) == ("3.5", "")
+
+
+def test_a_run_without_scores_is_named(tmp_path):
+    checkpoint.save(checkpoint_of(untrained(), RECIPE), tmp_path / "last.pt")
+    message = complaint(record_curve, tmp_path, tmp_path / "curve.csv")
+    assert message.startswith(f"{tmp_path / CURVE}: expected scores of a run, found none")
+
+
+def test_the_command_prints_the_fits(run, tmp_path, capsys):
+    assert main(["bench", "training", str(run), "-o", str(tmp_path / "curve.csv")]) == 0
+    assert "bad1_percent: 20 * (pairs / 10,000)^-0.250" in capsys.readouterr().out

@@ -1,0 +1,381 @@
+import atexit
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from dataset_examples import write_map, write_picture
+from learn_examples import (
+    CAMERA,
+    PAIR_SIZE,
+    RECIPE,
+    Listed,
+    assert_same,
+    box_before_a_wall,
+    checkpoint_of,
+    complaint,
+    keep_pairs,
+    make_batches_in_place,
+    recipe_of,
+    untrained,
+    write,
+)
+from lightning_fabric.loggers.tensorboard import TensorBoardLogger
+from lightning_fabric.utilities.distributed import _destroy_dist_connection
+from other_processes import halted
+from rich.console import Console
+
+from stereoweave.bench.error_classes import CLASSES
+from stereoweave.data.packing import packed
+from stereoweave.data.shards import write_shard
+from stereoweave.errors import FormatError, OutputInUseError, StereoweaveError
+from stereoweave.learn import checkpoint
+from stereoweave.learn.data.batches import Batches
+from stereoweave.learn.data.pair_cache import KeptPairs
+from stereoweave.learn.data.sources import VALIDATION_SEED
+from stereoweave.learn.models import MODELS
+from stereoweave.learn.recipe import read_recipe
+from stereoweave.learn.training import loop as training
+from stereoweave.learn.training.loop import Run, train
+
+RECIPES = sorted((Path(__file__).parents[3] / "recipes").rglob("*.toml"))
+QUIET = Console(quiet=True)
+CAMERA_PAIRS = Listed(
+    [replace(box_before_a_wall(np.random.default_rng(seed)), camera=CAMERA) for seed in range(4)]
+)
+
+
+def in_memory(recipe):
+    """The recipe for `CAMERA_PAIRS`, so small that PSMNet is quick; Table I has five such."""
+    return replace(
+        recipe,
+        name=recipe.model,
+        seed=0,
+        start_from="",
+        dataset=RECIPE.dataset,
+        root="",
+        pair_size=PAIR_SIZE,
+        crop_size=(64, 64),
+        batch=2,
+        micro_batch=0,
+        # A long warm-up moves some weights by less than float32 can tell.
+        warm_up_steps=min(recipe.warm_up_steps, 2),
+        held_out=(),
+        max_disparity_px=48.0,
+    )
+
+
+FIRST_STEPS = {in_memory(read_recipe(file)): file.stem for file in RECIPES}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Where runs go, with the pairs that they train on and are scored on."""
+    folder = tmp_path_factory.mktemp("runs")
+    keep_pairs(folder / "pairs", RECIPE.seed, RECIPE.pairs)
+    keep_pairs(folder / "pairs", VALIDATION_SEED, RECIPE.validation_pairs)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def recipe_file(folder):
+    return write(RECIPE, folder / "tiny.toml")
+
+
+@pytest.fixture(scope="module")
+def finished(folder, recipe_file):
+    """The last checkpoint of a run that nothing stopped."""
+    with pytest.MonkeyPatch.context() as patch:
+        make_batches_in_place(patch)
+        return train(recipe_file, folder / "finished", QUIET)
+
+
+@pytest.fixture
+def in_place(monkeypatch):
+    make_batches_in_place(monkeypatch)
+
+
+@pytest.fixture
+def logger(tmp_path):
+    with training.closing_curves(TensorBoardLogger(tmp_path, name="", version="")) as logger:
+        yield logger
+
+
+def test_a_run_that_is_killed_and_then_started_again_ends_as_one_that_was_not(folder, recipe_file, finished):
+    last = folder / "killed" / "last.pt"
+    code = (
+        "import sys; from pathlib import Path; from stereoweave.learn.training.loop import train; "
+        "train(Path(sys.argv[1]), Path(sys.argv[2]))"
+    )
+    with (folder / "killed.log").open("w") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-c", code, str(recipe_file), str(last.parent)],
+            stdout=log,
+            stderr=log,
+            env={**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads())},
+        )
+        while not last.exists() and process.poll() is None:
+            time.sleep(0.005)
+        with halted(process):
+            with pytest.raises(OutputInUseError, match="killed: .* found one that is in use"):
+                train(recipe_file, last.parent, QUIET)
+            process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL, (folder / "killed.log").read_text()
+    killed = checkpoint.load(last)
+    assert 0 < killed.step < RECIPE.steps
+
+    train(recipe_file, last.parent, QUIET)
+    resumed, whole = checkpoint.load(last), checkpoint.load(finished)
+    assert resumed.step == whole.step == RECIPE.steps
+    for name in ("weights", "averaged", "optimiser", "random_state", "scores"):
+        assert_same(getattr(resumed, name), getattr(whole, name))
+    assert resumed.hours > killed.hours
+
+
+def test_a_run_keeps_its_weights_scores_and_curves(folder, finished):
+    kept = checkpoint.load(finished)
+    assert kept.recipe == RECIPE
+    assert kept.scores.keys() == {"epe_px", "bad1_percent", "bad2_percent", "d1_percent", "calibration_error"}
+    assert not torch.equal(kept.weights["to_match.weight"], kept.averaged["to_match.weight"])
+    assert any(file.name.startswith("events.out.tfevents") for file in finished.parent.iterdir())
+
+
+def test_a_folder_with_a_run_of_another_recipe_is_refused(folder, finished, tmp_path):
+    other = write(replace(RECIPE, name="other", learning_rate=2e-3), tmp_path / "other.toml")
+    before = finished.read_bytes()
+    with pytest.raises(
+        StereoweaveError, match=r"last\.pt: is of another recipe \(tiny\); train into a folder"
+    ):
+        train(other, finished.parent, QUIET)
+    assert finished.read_bytes() == before
+
+
+def test_a_run_goes_on_with_another_end_and_other_data(folder, finished):
+    recipe = replace(
+        RECIPE, steps=RECIPE.steps + 2, cool_down_steps=1, mix=(("collage", 1.0),), crop_size=(32, 64)
+    )
+    start = training._starting_point(recipe, finished)
+    assert (start.step, start.recipe) == (RECIPE.steps, recipe)
+    assert_same(start.optimiser, checkpoint.load(finished).optimiser)
+
+
+def test_a_run_is_kept_every_ten_minutes(folder, recipe_file, tmp_path, logger, monkeypatch):
+    last = tmp_path / "last.pt"
+    run = Run(RECIPE, training._starting_point(RECIPE, last), logger)
+    run.keep_now_and_then(3, last)
+    assert not last.exists()
+    now = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now + 601)
+    run.keep_now_and_then(3, last)
+    assert checkpoint.load(last).step == 3
+    run.keep_now_and_then(4, last)
+    assert checkpoint.load(last).step == 3
+
+
+def test_a_run_is_scored_by_class_on_the_held_out_sets_of_its_recipe(folder, in_place, tmp_path):
+    sample = replace(box_before_a_wall(np.random.default_rng(0)), camera=CAMERA)
+    (tmp_path / "boxes").mkdir()
+    write_shard(tmp_path / "boxes", "boxes", 0, [packed(sample, {})])
+    recipe = replace(RECIPE, name="scored", steps=2, held_out=(("boxes", str(tmp_path / "boxes")),))
+    kept = checkpoint.load(train(write(recipe, tmp_path / "scored.toml"), folder / "scored", QUIET))
+    assert kept.scores["boxes_epe_px"] > 0
+    parts = [kept.scores[f"boxes_{name}_bad1_percent"] for name in CLASSES]
+    assert sum(parts) == pytest.approx(kept.scores["boxes_bad1_percent"])
+
+
+def test_a_run_starts_from_the_averaged_weights_of_another(folder, finished):
+    recipe = replace(RECIPE, name="second", start_from=str(finished))
+    start = training._starting_point(recipe, folder / "second" / "last.pt")
+    first = checkpoint.load(finished)
+    assert start.step == 0
+    assert start.hours == first.hours
+    assert start.origin == ({"recipe": asdict(RECIPE), "step": RECIPE.steps, "commit": first.commit},)
+    assert_same(start.weights, first.averaged)
+
+
+def test_a_loss_that_is_not_finite_twice_stops_and_names_the_pairs(folder, in_place, tmp_path):
+    broken = untrained()
+    torch.nn.init.constant_(broken.to_match.weight, torch.nan)
+    checkpoint.save(checkpoint_of(broken), tmp_path / "broken.pt")
+    recipe = replace(RECIPE, name="broken", start_from=str(tmp_path / "broken.pt"))
+    file = write(recipe, tmp_path / "broken.toml")
+    pairs = KeptPairs(folder / "pairs", recipe.seed, recipe.pairs, PAIR_SIZE)
+    names = ", ".join(pairs.name(index) for index in Batches(recipe, pairs).chosen(1))
+    with pytest.raises(StereoweaveError) as caught:
+        train(file, folder / "broken", QUIET)
+    assert str(caught.value) == (
+        f"step 1: the loss is nan; its pairs are {names}; step 0 was skipped for the like"
+    )
+    assert not (folder / "broken" / "last.pt").exists()
+
+
+def test_a_process_that_fails_does_not_wait_for_the_others_to_leave_their_gpus(tmp_path, monkeypatch):
+    left_out = []
+    monkeypatch.setattr(atexit, "unregister", left_out.append)
+    complaint(train, tmp_path / "none.toml", tmp_path / "run", QUIET)
+    assert left_out == [_destroy_dist_connection]
+
+
+def test_a_pair_that_cannot_be_trained_on_is_named_in_one_line(tmp_path):
+    """Although it is read in a process beside, where PyTorch would put a traceback before the words."""
+    for frame in ("a", "b"):
+        for side in ("left", "right"):
+            write_picture(tmp_path / "set" / side / f"{frame}.png", 7)
+        # No depth is known.
+        write_map(tmp_path / "set" / "depth" / f"{frame}.png", [0], 0, np.uint16)
+    (tmp_path / "set" / "calib.txt").write_text(
+        "cam0=[300 0 19.5; 0 300 15.5; 0 0 1]\ndoffs=0\nbaseline=100\nwidth=40\nheight=32\n"
+    )
+    changes = {"dataset": "paper", "root": str(tmp_path / "set"), "crop_size": (32, 32), "batch": 1}
+    file = write(recipe_of("fast_depth", **changes), tmp_path / "unknown.toml")
+    message = complaint(train, file, tmp_path / "run", QUIET)
+    assert re.fullmatch(r"[ab]: expected at least one pixel of known disparity, found none; .*", message)
+
+
+def test_a_truth_out_of_range_is_named_with_the_pairs_of_its_step(tmp_path, logger):
+    recipe = recipe_of("fast_depth", target="depth", max_depth_m=1.0)
+    run = Run(recipe, training._starting_point(recipe, tmp_path / "last.pt"), logger)
+    batches = Batches(recipe, CAMERA_PAIRS)
+    message = complaint(run.step, 0, batches[0], batches)
+    assert message.startswith(f"step 0: one of {', '.join(batches.names(0))}: depth: expected more than 0")
+
+
+def test_weights_of_another_network_are_refused_as_a_start(finished, tmp_path):
+    recipe = recipe_of("fast_depth", start_from=str(finished))
+    assert complaint(training._starting_point, recipe, tmp_path / "last.pt") == (
+        f"tiny: start_from = {str(finished)!r}, expected a checkpoint that shares weights with fast_depth, "
+        "found one of weave_small"
+    )
+
+
+def test_a_gradient_that_is_not_finite_never_reaches_the_weights_and_twice_stops(tmp_path, logger, caplog):
+    recipe = recipe_of("fast_depth")
+    run = Run(recipe, training._starting_point(recipe, tmp_path / "last.pt"), logger)
+    network = run.network
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    # A product with infinity makes the gradient infinite and leaves the loss as it was.
+    network.head.to_code.bias.register_hook(lambda gradient: gradient * torch.inf)
+    batches = Batches(recipe, CAMERA_PAIRS)
+    found = f"step 7: the norm of the gradient is inf; its pairs are {', '.join(batches.names(7))}"
+    run.step(7, batches[7], batches)
+    assert run.skipped == [7]
+    assert caplog.messages[-1] == f"{found}; skipped"
+    run.step(507, batches[507], batches)  # 500 steps later it is isolated still
+    assert complaint(run.step, 1006, batches[1006], batches).endswith("; step 507 was skipped for the like")
+    # Batch norms' statistics included.
+    assert_same(network.state_dict(), before)
+    assert_same(run.averaged.module.state_dict(), before)
+    assert not run.optimiser.state_dict()["state"]
+
+
+def test_a_recipe_for_an_unknown_network_is_refused(tmp_path):
+    file = write(replace(RECIPE, model="spider"), tmp_path / "spider.toml")
+    with pytest.raises(FormatError, match=r"tiny: model = 'spider', expected weave_small"):
+        train(file, tmp_path / "run", QUIET)
+
+
+@pytest.mark.parametrize("sizes", [{"crop_size": (64, 56)}, {"pair_size": (64, 100)}])
+def test_a_recipe_with_sizes_that_the_network_cannot_divide_is_refused(tmp_path, sizes):
+    file = write(replace(RECIPE, **sizes), tmp_path / "odd.toml")
+    with pytest.raises(FormatError, match=r"tiny: pair_size = .*, expected multiples of 16 for weave_small"):
+        train(file, tmp_path / "run", QUIET)
+
+
+def test_a_run_into_a_file_fails_before_any_pair_is_made(recipe_file, tmp_path):
+    (tmp_path / "file").write_text("kept")
+    with pytest.raises(StereoweaveError, match="file: expected a folder that can be written"):
+        train(recipe_file, tmp_path / "file", QUIET)
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["kept"]
+
+
+def step_of(recipe, folder, logger, steps=1):
+    """The first steps of a recipe on pairs in memory: the run after them, and every parameter before."""
+    run = Run(recipe, training._starting_point(recipe, folder / "last.pt"), logger)
+    before = {name: value.clone() for name, value in run.network.named_parameters()}
+    batches = Batches(recipe, CAMERA_PAIRS)
+    for step in range(steps):
+        assert 0 < run.step(step, batches[step], batches) < 100
+    return run, before
+
+
+def assert_all_moved(run, before):
+    for name, value in run.network.named_parameters():
+        assert value.isfinite().all()
+        assert not torch.equal(value, before[name]), name
+
+
+@pytest.mark.parametrize("recipe", FIRST_STEPS, ids=FIRST_STEPS.values())
+def test_every_shipped_recipe_takes_its_first_steps(recipe, tmp_path, logger):
+    # WeaveNet's first two only wake what adds nothing until it is trained, one behind the other.
+    steps = 3 if recipe.model.startswith("weave") else 1
+    assert_all_moved(*step_of(recipe, tmp_path, logger, steps))
+
+
+@pytest.mark.parametrize("model", [name for name in MODELS if not name.startswith("weave")])
+def test_any_of_the_papers_networks_trains_by_changing_one_word(model, tmp_path, logger):
+    """All of equation (5) on depth with an exponent, in the one batch that all of them see."""
+    recipe = recipe_of("fast_depth", target="depth", exponent=1.5, alpha_p=1.0, averaged_steps=1)
+    run, before = step_of(replace(recipe, model=model), tmp_path, logger)
+    assert_all_moved(run, before)
+    # An average over one step is that step's weights.
+    assert_same(dict(run.averaged.module.state_dict()), dict(run.network.state_dict()))
+
+
+def test_a_code_network_that_is_resumed_ends_as_one_that_was_not(folder, in_place):
+    """Dropout included, whose draws go on where they were."""
+    recipe = recipe_of("fast_depth", name="paper", steps=4, alpha_p=1.0)
+    whole = checkpoint.load(training.train_recipe(recipe, folder / "paper", QUIET))
+    last = folder / "paper_resumed" / "last.pt"
+
+    class Killed(Exception):
+        pass
+
+    def kill(self, *arguments):
+        keep(self, *arguments)
+        raise Killed
+
+    with pytest.MonkeyPatch.context() as patch:
+        keep = Run.keep
+        patch.setattr(Run, "keep", kill)
+        with pytest.raises(Killed):
+            training.train_recipe(recipe, last.parent, QUIET)
+    assert checkpoint.load(last).step == 2
+    torch.manual_seed(99)
+    resumed = checkpoint.load(training.train_recipe(recipe, last.parent, QUIET))
+    assert resumed.step == whole.step == 4
+    for name in ("weights", "averaged", "optimiser", "random_state", "scores"):
+        assert_same(getattr(resumed, name), getattr(whole, name))
+
+
+def test_the_scores_of_a_run_are_recorded_step_by_step(folder, finished):
+    rows = training.read_record(finished.with_name(training.CURVE))
+    assert [row["step"] for row in rows] == list(range(2, RECIPE.steps + 1, 2))
+    assert rows[-1] == {"step": RECIPE.steps, **checkpoint.load(finished).scores}
+
+
+def test_a_record_that_is_written_again_replaces_what_came_later(tmp_path):
+    for step, score in ((10, 3.0), (20, 2.0), (30, 1.0), (20, 2.5)):
+        training.record(tmp_path / "curve.csv", step, {"loss": score})
+    rows = training.read_record(tmp_path / "curve.csv")
+    assert rows == [{"step": 10, "loss": 3.0}, {"step": 20, "loss": 2.5}]
+    assert training.read_record(tmp_path / "nowhere.csv") == []
+
+
+@pytest.mark.parametrize(("precision", "dtype"), [("bf16-mixed", torch.bfloat16), ("32-true", torch.float32)])
+def test_a_step_computes_in_bfloat16_where_the_device_does(
+    folder, tmp_path, monkeypatch, logger, precision, dtype
+):
+    monkeypatch.setattr(training, "_precision", lambda: precision)
+    run = Run(RECIPE, training._starting_point(RECIPE, tmp_path / "last.pt"), logger)
+    seen = []
+    run.network.to_match.register_forward_hook(lambda _layer, _inputs, output: seen.append(output.dtype))
+    batches = Batches(RECIPE, KeptPairs(folder / "pairs", RECIPE.seed, RECIPE.pairs, PAIR_SIZE))
+    run.step(0, batches[0], batches)
+    assert set(seen) == {dtype}

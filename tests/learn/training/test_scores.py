@@ -1,0 +1,53 @@
+import math
+
+import pytest
+import torch
+from learn_examples import keep_pairs
+from torch import nn
+
+from stereoweave.bench.error_classes import CLASSES
+from stereoweave.learn.training.scores import validate, validate_by_class
+
+
+class Constant(nn.Module):
+    """Finds 5 px everywhere, and is sure of it by 3 to 1."""
+
+    def forward(self, left, right):
+        flat = torch.zeros_like(left[:, :1])
+        return flat + 5, flat + 5, flat + math.log(3)
+
+
+def test_scores_are_those_of_the_left_views(tmp_path):
+    # Of each left view a quarter is the box at 12 px, the rest the wall at 4 px: errors of 7 and 1 px.
+    pairs = keep_pairs(tmp_path, 0, 2)
+    scores = validate(Constant(), pairs, torch.device("cpu"))
+    expected = {
+        "epe_px": 0.25 * 7 + 0.75 * 1,
+        "bad1_percent": 25,
+        "bad2_percent": 25,
+        "d1_percent": 25,
+        "calibration_error": 0,  # 3 to 1 it is
+    }
+    assert scores == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_network_is_scored_as_it_will_be_used(tmp_path):
+    network = Constant().train()
+    validate(network, keep_pairs(tmp_path, 0, 1), torch.device("cpu"))
+    assert not network.training
+
+
+def test_scores_by_class_add_up_and_leave_out_what_the_network_cannot_reach(tmp_path):
+    pairs = keep_pairs(tmp_path, 0, 2)
+    network = Constant()
+    network.max_disparity_px = 192
+    scores = validate_by_class(network, pairs, torch.device("cpu"))
+    assert scores["epe_px"] == pytest.approx(0.25 * 7 + 0.75 * 1)
+    # Off by over 1 px is the box alone, none of which is hidden.
+    assert scores["bad1_percent"] == pytest.approx(25)
+    classes = [scores[f"{name}_bad1_percent"] for name in CLASSES]
+    assert sum(classes) == pytest.approx(25)
+    assert classes[:2] == [0, 0]
+    # A network that reaches 8 px is asked for the wall alone.
+    network.max_disparity_px = 8
+    assert validate_by_class(network, pairs, torch.device("cpu"))["epe_px"] == pytest.approx(1)

@@ -1,0 +1,436 @@
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from matcher_examples import matcher_file, of_fixed_size, painted, red_of
+from PIL import Image
+
+import stereoweave as sw
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.files import read_pair
+from stereoweave.matching import estimate as matching
+from stereoweave.matching import matcher as matcher_module
+from stereoweave.matching.estimate import match, match_many
+from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.providers import PROVIDERS
+
+FIELDS = ("disparity_px", "right_disparity_px", "confidence", "occluded")
+
+
+@pytest.fixture(scope="module")
+def matcher():
+    return Matcher("small")
+
+
+@pytest.fixture(scope="module")
+def examples():
+    return read_pair("examples/left.png", "examples/right.png")
+
+
+def same(one, other):
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def moved(pair, by_px):
+    """The pair with by_px columns less and disparities by_px lower."""
+    return sw.StereoPair(
+        left=np.ascontiguousarray(pair.left[:, by_px:]), right=np.ascontiguousarray(pair.right[:, :-by_px])
+    )
+
+
+def sure(estimate, confidence=0.9):
+    return (estimate.confidence > confidence) & ~estimate.occluded
+
+
+@pytest.mark.parametrize("refined", [False, True])
+def test_a_pair_that_the_network_sees_all_of_is_what_the_matcher_estimates(matcher, examples, refined):
+    found = sw.estimate(examples.left, examples.right, refined=refined)
+    same(found, matcher.estimate(examples.left, examples.right, refined=refined))
+
+
+def test_raw_is_the_networks_own_disparity_alone_and_among_others(matcher, examples):
+    alone = matcher.estimate(examples.left, examples.right, raw=True)
+    same(sw.estimate(examples.left, examples.right, raw=True), alone)
+    same(match_many(matcher, [examples], raw=True)[0], alone)
+    filled = matcher.estimate(examples.left, examples.right)
+    assert (np.abs(filled.disparity_px - alone.disparity_px)[alone.occluded] > 1).mean() > 0.1
+    assert np.abs(filled.disparity_px - alone.disparity_px)[~alone.occluded].max() < 1.001
+
+
+def test_a_pair_of_pillow_is_what_its_pixels_are(examples):
+    pictures = (Image.fromarray(photo) for photo in (examples.left, examples.right))
+    same(sw.estimate(*pictures), sw.estimate(examples.left, examples.right))
+
+
+@pytest.mark.parametrize("by_px", [60, 100])
+def test_a_pair_with_columns_cut_off_has_so_much_less_disparity_negative_ones_too(matcher, examples, by_px):
+    whole = matcher.estimate(examples.left, examples.right)
+    found = match(matcher, moved(examples, by_px))
+    clear = sure(whole)[:, by_px:] & sure(found)
+    assert clear.mean() > 0.3
+    off_px = found.disparity_px - (whole.disparity_px[:, by_px:] - by_px)
+    assert found.disparity_px[clear].min() < -5
+    assert np.mean(np.abs(off_px[clear]) > 1) < 0.03
+    assert abs(np.median(off_px[clear])) < 0.1
+
+
+def test_what_is_given_as_the_range_counts_and_not_what_is_found(matcher, examples):
+    whole = matcher.estimate(examples.left, examples.right)
+    same(match(matcher, examples, range_px=(0, 192)), whole)
+    found = match(matcher, examples, range_px=(-20, 120))
+    clear = sure(whole) & sure(found)
+    assert np.mean(np.abs(found.disparity_px - whole.disparity_px)[clear] > 1) < 0.03
+
+
+def test_a_picture_twice_as_large_has_twice_the_disparity_even_if_it_is_matched_smaller(matcher, examples):
+    twice = sw.StereoPair(
+        left=cv2.resize(examples.left, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC),
+        right=cv2.resize(examples.right, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC),
+    )
+    whole = matcher.estimate(examples.left, examples.right)
+    found = match(matcher, twice, range_px=(0, 440))
+    expected_px = 2 * cv2.resize(whole.disparity_px, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
+    clear = cv2.resize(sure(whole).astype(np.uint8), None, fx=2, fy=2) > 0
+    off_px = (found.disparity_px - expected_px)[clear & sure(found)]
+    assert np.mean(np.abs(off_px) > 2) < 0.03
+    assert abs(np.median(off_px)) < 0.2
+
+
+def flat(rng, disparity_px, size=(160, 480)):
+    """A pair of soft noise that is everywhere at one disparity."""
+    height, width = size
+    wide = cv2.GaussianBlur(rng.integers(0, 256, (height, width + disparity_px, 3), np.uint8), (0, 0), 3)
+    wide = cv2.normalize(wide, None, 0, 255, cv2.NORM_MINMAX)
+    return sw.StereoPair(
+        left=np.ascontiguousarray(wide[:, :width]), right=np.ascontiguousarray(wide[:, disparity_px:])
+    )
+
+
+@pytest.mark.parametrize("range_px", [(0, 300), (0, 500), (-200, 200), (None)])
+def test_a_disparity_of_37_px_is_37_px_however_much_the_pair_is_reduced(matcher, rng, range_px):
+    found = match(matcher, flat(rng, 37), range_px=range_px)
+    inner = np.s_[10:-10, 60:-60]
+    assert abs(np.median(found.disparity_px[inner]) - 37) < 0.3
+    assert abs(np.median(found.right_disparity_px[inner]) - 37) < 0.3
+    assert np.mean(np.abs(found.disparity_px[inner] - 37) > 1) < 0.02
+
+
+def test_a_part_that_is_nearer_than_the_networks_range_is_found(matcher, rng):
+    pair = flat(rng, 37, size=(320, 720))
+    board = flat(rng, 0, size=(160, 200)).left
+    pair.left[80:240, 450:650] = pair.right[80:240, 450 - 260 : 650 - 260] = board
+    found_px = match(matcher, pair).disparity_px
+    assert abs(np.median(found_px[90:230, 460:640]) - 260) < 1
+    assert abs(np.median(found_px[:60, 200:600]) - 37) < 1
+
+
+def test_a_pair_larger_than_what_is_seen_at_once_is_matched_smaller(matcher, rng, monkeypatch):
+    pair = flat(rng, 37, size=(320, 480))
+    for module in (matching, matcher_module):
+        monkeypatch.setattr(module, "PIXEL_PAIRS_AT_ONCE", 400 * 400 * 266)
+    small = matching._seen_whole(matcher, pair)
+    assert matcher.sees_whole(small.left.shape[1], small.left.shape[0])
+    assert 385 < small.left.shape[1] < 400
+    found_px = match(matcher, pair).disparity_px
+    assert abs(np.median(found_px[10:-10, 60:-60]) - 37) < 0.3
+
+
+@pytest.mark.parametrize("size", [(1500, 2000), (4000, 6000), (5774, 8660), (1000, 5000), (9000, 2000)])
+def test_what_is_matched_smaller_is_seen_whole_so_that_no_seam_can_show(matcher, size):
+    photo = np.broadcast_to(np.zeros((1, 1, 3), np.uint8), (*size, 3))
+    seen = matching._seen_whole(matcher, sw.StereoPair(left=photo, right=photo)).left
+    assert matcher.sees_whole(seen.shape[1], seen.shape[0])
+    assert seen.shape[1] ** 2 * seen.shape[0] > 0.85 * matching.PIXEL_PAIRS_AT_ONCE
+    assert abs(seen.shape[1] / seen.shape[0] - size[1] / size[0]) < 0.01 * size[1] / size[0]
+
+
+def test_a_film_frame_of_1920x1080_is_seen_whole(matcher):
+    assert matcher.sees_whole(1920, 1080)
+
+
+@pytest.mark.parametrize("by_px", [40, 60])
+def test_something_just_below_zero_is_matched_as_such(matcher, rng, by_px):
+    """A wall 3 px behind the plane of the screen of a 3-D film, and a board before it."""
+    pair = flat(rng, 37, size=(240, 480))
+    board = flat(rng, 0, size=(100, 120)).left
+    pair.left[70:170, 300:420] = pair.right[70:170, 300 - by_px : 420 - by_px] = board
+    found_px = match(matcher, moved(pair, 40)).disparity_px
+    assert abs(np.median(found_px[:60, 60:-60]) + 3) < 0.3
+    assert abs(np.median(found_px[80:160, 270:370]) - (by_px - 40)) < 0.5
+
+
+@pytest.fixture(scope="module")
+def best():
+    return Matcher("best")
+
+
+@pytest.fixture(scope="module")
+def part(examples):
+    """160x96 px of the example."""
+    left, right = (np.ascontiguousarray(x[200:296, 240:400]) for x in (examples.left, examples.right))
+    return sw.StereoPair(left=left, right=right)
+
+
+def test_best_is_base_at_one_and_a_half_times_the_size_and_refined(best, part):
+    # All of it is looked at closer, since nothing is surer of another surface at its own size.
+    found = sw.estimate(part.left, part.right, model="best")
+    larger = (cv2.resize(x, (240, 144), interpolation=cv2.INTER_CUBIC) for x in (part.left, part.right))
+    expected = sw.estimate(*larger, model="base", refined=True)
+    expected_px = cv2.resize(expected.disparity_px, (160, 96), interpolation=cv2.INTER_NEAREST_EXACT) / 1.5
+    assert found.disparity_px.shape == found.confidence.shape == found.occluded.shape == (96, 160)
+    # All but what a median over 3x3 px moves.
+    assert np.mean(np.abs(found.disparity_px - expected_px) > 0.2) < 0.05
+    same(match_many(best, [part])[0], found)
+
+
+def test_best_is_refined_whether_it_is_asked_for_or_not(best, part):
+    same(match(best, part, refined=True), match(best, part))
+
+
+def test_the_best_estimate_mixes_no_surfaces():
+    stripes_px = np.repeat([[6.0, 60.0, 6.0, 60.0]], 9, axis=1).repeat(90, axis=0).astype(np.float32)
+    found = sw.Estimate(
+        disparity_px=stripes_px,
+        right_disparity_px=stripes_px,
+        confidence=np.ones_like(stripes_px),
+        occluded=stripes_px > 10,
+    )
+    grey = np.zeros((60, 24, 3), np.uint8)
+    shrunk = matching._shrunk(found, sw.StereoPair(left=grey, right=grey))
+    np.testing.assert_allclose(np.unique(shrunk.disparity_px), [4, 40])
+    np.testing.assert_array_equal(shrunk.occluded, shrunk.disparity_px > 10)
+
+
+@pytest.mark.parametrize("range_px", [None, (0, 150), (-20, 60)])
+def test_a_disparity_of_37_px_is_37_px_for_best(best, rng, range_px):
+    texture = rng.integers(0, 256, (96, 400, 3), np.uint8)
+    texture = cv2.GaussianBlur(texture, (0, 0), 1.5)
+    left, right = (np.ascontiguousarray(texture[:, at : at + 300]) for at in (50, 87))
+    found = match(best, sw.StereoPair(left=left, right=right), range_px=range_px)
+    assert found.disparity_px.shape == (96, 300)
+    assert np.median(np.abs(found.disparity_px - 37)[:, 60:]) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("size", "least", "most"), [((64, 80), 1.2, 1.5), ((60, 60), 1.5, 1.5), ((200, 200), 0, 0)]
+)
+def test_best_looks_closer_by_as_much_as_is_seen_whole(best, rng, monkeypatch, size, least, most):
+    for module in (matcher_module, matching):
+        monkeypatch.setattr(module, "PIXEL_PAIRS_AT_ONCE", 100 * 100 * 100)
+    seen = []
+    estimate_many = Matcher.estimate_many
+
+    def noted(matcher, pairs, **options):
+        seen.extend(pair.left.shape for pair in pairs)
+        return estimate_many(matcher, pairs, **options)
+
+    monkeypatch.setattr(Matcher, "estimate_many", noted)
+    left, right = rng.integers(0, 256, (2, *size, 3), np.uint8)
+    match(best, sw.StereoPair(left=left, right=right), range_px=(0, 40))
+    assert all(best.sees_whole(width, height) for height, width, _ in seen)
+    closer = [width / size[1] for _, width, _ in seen[1:]]
+    assert [least <= magnification <= most for magnification in closer] == [True] * (most > 0)
+
+
+def test_a_smaller_look_counts_where_it_is_surer_of_another_surface():
+    closer, found = (
+        sw.Estimate(
+            disparity_px=np.full(size, px, np.float32),
+            right_disparity_px=np.full(size, px, np.float32),
+            confidence=np.full(size, confidence, np.float32),
+            occluded=np.zeros(size, bool),
+        )
+        for size, px, confidence in (((36, 48), 9, 0.5), ((24, 32), 6, 0.5))
+    )
+    closer.confidence[:, 40:] = 0.4
+    found.disparity_px[:12], found.right_disparity_px[:12] = 16, 16  # 24 px of the larger picture
+    found.disparity_px[12:], found.right_disparity_px[12:] = 7, 7  # 10.5 px
+    merged = matching._surer(closer, found)
+    expected_px = np.full((36, 48), 9)
+    expected_px[:18, 40:] = 24
+    np.testing.assert_allclose(merged.disparity_px, expected_px)
+    np.testing.assert_allclose(merged.confidence[:, :40], 0.5)
+    np.testing.assert_allclose(merged.confidence[18:, 40:], 0.4)
+    np.testing.assert_allclose(merged.confidence[:18, 40:], 0.5)
+
+
+def test_masks_are_made_smaller_with_the_pictures(rng):
+    pair = flat(rng, 37)
+    seen = np.ones(pair.left.shape[:2], bool)
+    seen[:, :120] = False
+    small = matching._resized(replace(pair, left_seen=seen), 2)
+    assert small.right_seen is None
+    np.testing.assert_array_equal(small.left_seen[:, [59, 60]], np.tile([False, True], (80, 1)))
+
+
+def test_what_the_pictures_do_not_show_has_no_confidence_and_matches_in_it_are_occluded(matcher, rng):
+    pair = flat(rng, 37)
+    left_seen, right_seen = np.ones((2, *pair.left.shape[:2]), bool)
+    left_seen[:, :100] = False
+    right_seen[:, 300:320] = False
+    found = match(matcher, replace(pair, left_seen=left_seen, right_seen=right_seen))
+    assert (found.confidence[:, :100] == 0).all()
+    assert np.median(found.confidence[:, 120:]) > 0.9
+    assert found.occluded[20:-20, 338:356].mean() > 0.98
+    assert found.occluded[20:-20, 120:330].mean() < 0.02
+
+
+def test_matches_beyond_the_right_picture_are_occluded_whatever_the_range(matcher, rng):
+    pair = flat(rng, 37)
+    found = match(matcher, sw.StereoPair(left=pair.right, right=pair.left))
+    assert abs(np.median(found.disparity_px[:, 60:-60]) + 37) < 0.3
+    assert found.occluded[20:-20, -35:].mean() > 0.9
+    assert found.occluded[20:-20, 40:-40].mean() < 0.02
+
+
+def test_where_a_match_is_beyond_the_right_picture_its_last_column_is_asked(matcher, rng):
+    pair = flat(rng, 37)
+    right_seen = np.ones(pair.left.shape[:2], bool)
+    right_seen[:, -1] = False
+    found = match(matcher, sw.StereoPair(left=pair.right, right=pair.left, right_seen=right_seen))
+    assert found.occluded[20:-20, -30:].mean() > 0.9
+    assert found.occluded[20:-20, 40:-40].mean() < 0.02
+
+
+def test_a_disparity_outside_of_the_range_that_is_given_is_brought_to_its_end_and_not_believed(matcher, rng):
+    for range_px, end_px in [((50, 90), 50), ((-20, 20), 20)]:
+        found = match(matcher, flat(rng, 37), range_px=range_px)
+        for disparity_px in (found.disparity_px, found.right_disparity_px):
+            assert range_px[0] <= disparity_px.min()
+            assert disparity_px.max() <= range_px[1]
+        inner = np.s_[10:-10, 60:-60]
+        assert np.median(found.disparity_px[inner]) == end_px
+        assert (found.confidence[inner] == 0).mean() > 0.98
+
+
+@pytest.mark.parametrize("range_px", [(160, 170), (-170, -160)])
+def test_a_range_that_no_pixel_can_have_is_refused_in_one_line(matcher, rng, range_px):
+    with pytest.raises(StereoweaveError, match="expected disparities of -160 to 160 px, the width") as caught:
+        match(matcher, flat(rng, 12, (64, 160)), range_px=range_px)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_range_beyond_the_pictures_width_is_as_good_as_the_width(matcher, rng):
+    pair = flat(rng, 12, (64, 160))
+    same(match(matcher, pair, range_px=(-9000, 20)), match(matcher, pair, range_px=(-160, 20)))
+    same(match(matcher, pair, range_px=(0, 9000)), match(matcher, pair, range_px=(0, 160)))
+
+
+@pytest.mark.parametrize("range_px", [(10, 10), (50, 0), (0, float("nan")), (float("-inf"), 10)])
+def test_a_range_that_is_none_is_refused_in_one_line(matcher, examples, range_px):
+    with pytest.raises(StereoweaveError, match="range_px: expected the least and the greatest") as caught:
+        match(matcher, examples, range_px=range_px)
+    assert "\n" not in str(caught.value)
+
+
+def test_plain_pictures_and_pictures_that_are_no_pair_are_matched_all_the_same(matcher, rng):
+    plain = np.full((64, 96, 3), 90, np.uint8)
+    assert (match(matcher, sw.StereoPair(left=plain, right=plain)).confidence == 0).all()
+    noise = rng.integers(0, 256, (2, 64, 96, 3), np.uint8)
+    pair = sw.StereoPair(left=noise[0], right=noise[1])
+    same(match(matcher, pair), matcher.estimate(*noise))
+
+
+def test_a_model_is_loaded_once_and_kept(rng):
+    matching._kept_matcher.cache_clear()
+    left, right = rng.integers(0, 256, (2, 32, 32, 3), np.uint8)
+    for _ in range(3):
+        sw.estimate(left, right)
+    assert matching._kept_matcher.cache_info().misses == 1
+
+
+def test_a_file_that_was_written_anew_is_loaded_anew_whatever_its_path_is_relative_to(
+    tmp_path, rng, monkeypatch
+):
+    left, right = (painted(rng.integers(0, 255, (32, 48))) for _ in range(2))
+    found = []
+    for turn, (folder, image) in enumerate([("a", "left"), ("a", "right"), ("b", "left")]):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        monkeypatch.chdir(tmp_path / folder)
+        file = matcher_file(Path("matcher.onnx"), red_of(image, "disparity_px"), ["disparity_px"])
+        os.utime(file, ns=(turn, turn))
+        found.append(sw.estimate(left, right, model="matcher.onnx", raw=True).disparity_px)
+    for disparity_px, image in zip(found, (left, right, left), strict=True):
+        np.testing.assert_allclose(disparity_px, image[:, :, 0], atol=1e-4)
+
+
+def test_the_answer_does_not_depend_on_earlier_calls_of_other_sizes(rng):
+    left, right = rng.integers(0, 256, (2, 64, 80, 3), np.uint8)
+    first = sw.estimate(left, right)
+    sw.estimate(left[:40, :70], right[:40, :70])
+    np.testing.assert_array_equal(sw.estimate(left, right).disparity_px, first.disparity_px)
+
+
+def test_a_pair_that_is_moved_is_still_seen_whole(rng, monkeypatch):
+    for module in (matcher_module, matching):  # 8 px more than 96 columns are too many
+        monkeypatch.setattr(module, "PIXEL_PAIRS_AT_ONCE", 96 * 96 * 64)
+    seen = []
+    estimate_many = Matcher.estimate_many
+
+    def noted(matcher, pairs, **options):
+        seen.extend(matcher.sees_whole(pair.left.shape[1], pair.left.shape[0]) for pair in pairs)
+        return estimate_many(matcher, pairs, **options)
+
+    monkeypatch.setattr(Matcher, "estimate_many", noted)
+    left, right = rng.integers(0, 256, (2, 64, 96, 3), np.uint8)
+    found = match(Matcher(), sw.StereoPair(left=left, right=right), range_px=(-8, 40))
+    assert found.disparity_px.shape == (64, 96)
+    assert seen == [True]
+
+
+def test_a_pair_is_shown_no_smaller_than_its_range_asks_for(matcher, rng, monkeypatch):
+    seen = []
+    estimate_many = Matcher.estimate_many
+
+    def noted(matcher, pairs, **options):
+        seen.extend(pair.left.shape for pair in pairs)
+        return estimate_many(matcher, pairs, **options)
+
+    monkeypatch.setattr(Matcher, "estimate_many", noted)
+    match(matcher, flat(rng, 37), range_px=(-100, 300))
+    # 400 px in the 188 that are seen well: 480x160 px become 226x75, of which the least is -47.1 px.
+    assert seen == [(75, 226 + 48, 3)]
+
+
+@pytest.mark.parametrize("given", [{}, {"range_px": (-8, 100), "refined": True}])
+def test_pairs_of_any_sizes_and_ranges_matched_together_are_as_each_is_alone(rng, monkeypatch, given):
+    monkeypatch.setitem(PROVIDERS, "cpu", replace(PROVIDERS["cpu"], batches=True))  # as a GPU takes them
+    matcher = Matcher()
+    noise = rng.integers(0, 256, (2, 64, 96, 3), np.uint8)
+    shorter, negative = flat(rng, 12, (64, 96)), flat(rng, 30, (96, 160))
+    seen = np.arange(96) > 20
+    pairs = [
+        flat(rng, 20, (64, 96)),
+        sw.StereoPair(left=negative.right, right=negative.left),
+        replace(shorter, left_seen=np.tile(seen, (64, 1))),
+        sw.StereoPair(left=noise[0], right=noise[1]),
+    ]
+    for pair, found in zip(pairs, match_many(matcher, pairs, **given), strict=True):
+        alone = match(matcher, pair, **given)
+        np.testing.assert_array_equal(found.occluded, alone.occluded)
+        for name in FIELDS[:3]:
+            np.testing.assert_allclose(getattr(found, name), getattr(alone, name), atol=1e-3)
+
+
+@pytest.mark.parametrize("range_px", [None, (0, 80), (-60, 80)])
+def test_a_pair_larger_than_the_only_size_of_a_matcher_file_is_matched_smaller(tmp_path, rng, range_px):
+    fixed = Matcher(of_fixed_size("small", tmp_path / "fixed.onnx", 160, 320))
+    found_px = match(fixed, flat(rng, 37, (200, 480)), range_px=range_px).disparity_px
+    assert found_px.shape == (200, 480)
+    assert abs(np.median(found_px[10:-10, 60:-60]) - 37) < 0.5
+
+
+@pytest.mark.parametrize("size", [(160, 321), (161, 320), (100, 321), (480, 640), (40, 2000), (320, 160)])
+@pytest.mark.parametrize("least_px", [0, -1, -7, -31])
+def test_whatever_is_shown_to_a_file_for_one_size_fits_it(tmp_path, size, least_px):
+    fixed = Matcher(of_fixed_size("small", tmp_path / "fixed.onnx", 160, 320))
+    blank = np.zeros((*size, 3), np.uint8)
+    shown = matching._shown_first(fixed, sw.StereoPair(left=blank, right=blank), (least_px, 60))
+    height, width = matching._moved(shown).left.shape[:2]
+    assert fixed.sees_whole(width, height)
+    # No smaller than it has to be.
+    assert max(height / 160, width / 320) > 0.97 or size[0] < 160

@@ -1,0 +1,217 @@
+import cv2
+import numpy as np
+import pytest
+from plain_refining import plain_census, plain_costs, plain_pick, plain_settled, plain_sums
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.matching import refine as refining
+from stereoweave.matching import refine_kernels as kernels
+from stereoweave.matching.refine import refine
+from stereoweave.stereo import Estimate, StereoPair
+
+FAR_PX, NEAR_PX, STICK_PX = 6, 16, 12
+STICK = slice(60, 65)
+BLOCK = (slice(20, 50), slice(90, 120))
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(7)
+
+
+def photographs(rng, true_px, size):
+    """A pair of noise, shown at the disparities `true_px` of the right view, each row far to near."""
+    height, width = size
+    right = rng.integers(0, 256, (height, width, 3), np.uint8)
+    left = rng.integers(0, 256, (height, width, 3), np.uint8)
+    left_px = np.full(size, np.nan)
+    for y in range(height):
+        for x in np.argsort(true_px[y], kind="stable"):
+            column = x + true_px[y, x]
+            if 0 <= column < width:
+                left[y, column], left_px[y, column] = right[y, x], true_px[y, x]
+    return left, right, left_px
+
+
+def estimate_of(disparity_px, right_disparity_px, confidence=0.2):
+    return Estimate(
+        disparity_px=disparity_px.astype(np.float32),
+        right_disparity_px=right_disparity_px.astype(np.float32),
+        confidence=np.full(disparity_px.shape, confidence, np.float32),
+        occluded=np.zeros(disparity_px.shape, bool),
+    )
+
+
+@pytest.fixture
+def scene(rng):
+    """A stick and a block before a far wall: photographs, true disparities of both views, and the wall's."""
+    right_px = np.full((64, 160), FAR_PX)
+    right_px[:, STICK] = STICK_PX
+    right_px[BLOCK] = NEAR_PX
+    left, right, left_px = photographs(rng, right_px, right_px.shape)
+    return left, right, left_px, right_px
+
+
+def without_stick(left_px, right_px):
+    return tuple(np.where(view == NEAR_PX, NEAR_PX, FAR_PX) for view in (left_px, right_px))
+
+
+def test_a_stick_that_the_network_missed_comes_back_in_both_views(scene):
+    left, right, left_px, right_px = scene
+    refined = refine(left, right, estimate_of(*without_stick(left_px, right_px)))
+    stick = np.zeros(left_px.shape, bool)
+    stick[:, STICK.start + STICK_PX : STICK.stop + STICK_PX] = True
+    assert (abs(refined.disparity_px[stick] - STICK_PX) < 1).mean() > 0.95
+    assert (abs(refined.right_disparity_px[:, STICK] - STICK_PX) < 1).mean() > 0.95
+
+
+def test_what_a_certain_network_says_stays(scene):
+    left, right, left_px, right_px = scene
+    given = estimate_of(*without_stick(left_px, right_px), confidence=0.9)
+    np.testing.assert_array_equal(refine(left, right, given).disparity_px, given.disparity_px)
+
+
+def test_what_is_right_stays_to_the_last_bit(scene):
+    left, right, left_px, right_px = scene
+    given = estimate_of(np.where(np.isnan(left_px), FAR_PX, left_px) + 0.3, right_px + 0.3, confidence=0.8)
+    refined = refine(left, right, given)
+    inner = np.isfinite(left_px) & (np.arange(160) >= NEAR_PX)
+    # In noise, a pixel in some thousands finds a better match elsewhere.
+    assert (refined.disparity_px == given.disparity_px)[inner].mean() > 0.999
+
+
+def test_the_part_beyond_the_other_picture_continues_the_surface_beside_it(scene):
+    left, right, left_px, right_px = scene
+    wrong_px = np.where(np.arange(160) < FAR_PX, 1, FAR_PX) * np.ones((64, 1))
+    refined = refine(left, right, estimate_of(wrong_px, right_px))
+    np.testing.assert_allclose(refined.disparity_px[:, :FAR_PX], FAR_PX, atol=1)
+
+
+def test_what_the_network_sees_far_from_that_surface_stays(scene):
+    left, right, left_px, right_px = scene
+    near_px = np.where(np.arange(160) < FAR_PX, FAR_PX + 30, FAR_PX) * np.ones((64, 1))
+    refined = refine(left, right, estimate_of(near_px, right_px))
+    assert (refined.disparity_px[:, 0] == FAR_PX + 30).all()
+
+
+def test_what_a_nearer_surface_hides_is_occluded(scene):
+    left, right, left_px, right_px = scene
+    refined = refine(left, right, estimate_of(*without_stick(left_px, right_px)))
+    hidden = slice(STICK.start + FAR_PX, STICK.stop + FAR_PX)  # the wall that the stick hides from the right
+    assert refined.occluded[:, hidden].mean() > 0.9
+    assert refined.occluded[:, 30:60].mean() < 0.02
+
+
+def test_disparities_behind_the_plane_of_convergence_are_found_alike(rng):
+    right_px = np.full((48, 120), 13)
+    right_px[:, 50:55] = 19
+    left, right, _ = photographs(rng, right_px, right_px.shape)
+    flat_px = np.full(right_px.shape, 13.0)
+    flat_px[10:20, 20:40] = 19  # so that the range holds both
+    there = refine(left, right, estimate_of(flat_px, flat_px))
+    moved = refine(left, np.roll(right, 20, 1), estimate_of(flat_px - 20, np.roll(flat_px, 20, 1) - 20))
+    inner = (slice(None), slice(40, 90))
+    np.testing.assert_allclose(moved.disparity_px[inner], there.disparity_px[inner] - 20, atol=1e-4)
+    assert (there.disparity_px[:, 69:74] > 18).mean() > 0.9
+
+
+def test_parallel_cameras_are_given_nothing_below_zero(rng):
+    # The network's least is 0, and a plain sky would take whatever is offered.
+    photo = np.full((48, 120, 3), 200, np.uint8)
+    photo[20:30, 40:80] = rng.integers(0, 256, (10, 40, 3), dtype=np.uint8)
+    flat_px = np.zeros((48, 120))
+    found = refine(photo, photo, estimate_of(flat_px, flat_px))
+    assert found.disparity_px.min() >= 0
+    assert found.right_disparity_px.min() >= 0
+
+
+def random_pair(rng):
+    """Photographs and an estimate with no sense in them, in which every branch is taken."""
+    left, right = (cv2.blur(rng.integers(0, 256, (24, 50, 3), np.uint8), (3, 3)) for _ in range(2))
+    maps = [np.repeat(rng.uniform(-3, 9, (24, 10)), 5, 1) for _ in range(2)]
+    given = estimate_of(*maps)
+    return left, right, Estimate(**vars(given) | {"confidence": rng.random((24, 50), np.float32)})
+
+
+def test_the_kernels_equal_the_plain_ones(rng):
+    left, right, given = random_pair(rng)
+    first_px, count = refining._candidates(given)
+    own = refining._cues(left, given.disparity_px - first_px, given.confidence)
+    other = refining._cues(right, given.right_disparity_px - first_px, refining.right_confidence(given))
+    for view in (own, other):
+        np.testing.assert_array_equal(view.census, plain_census(view.grey))
+    costs = np.empty((24, 50, count), np.uint8)
+    kernels.match(own, refining._backwards(other, first_px, count), 0, 24, costs)
+    np.testing.assert_array_equal(costs, plain_costs(own, other, first_px, count))
+    found_px = refining._matched(StereoPair(left=left, right=right), given, 1)
+    expected_px = plain_pick(plain_sums(costs.astype(int), own.grey), first_px)
+    np.testing.assert_allclose(found_px[0], expected_px, atol=1e-5)
+
+
+def test_both_views_settle_as_the_plain_ones(rng):
+    left, right, given = random_pair(rng)
+    found_px = refining._matched(StereoPair(left=left, right=right), given, 1)
+    refined = refine(left, right, given)
+    expected = plain_settled(given.disparity_px, *found_px, given.confidence, -1)
+    np.testing.assert_array_equal(refined.disparity_px, expected)
+    expected = plain_settled(given.right_disparity_px, *found_px[::-1], refining.right_confidence(given), 1)
+    np.testing.assert_array_equal(refined.right_disparity_px, expected)
+    assert (refined.disparity_px != given.disparity_px).any()
+
+
+def test_a_right_view_is_matched_as_the_left_one_of_the_mirrored_pair(scene):
+    left, right, _, right_px = scene
+    pair, given = StereoPair(left=left, right=right), estimate_of(right_px, right_px, confidence=0)
+    found_px, right_found_px = refining._matched(pair, given, 1)
+    mirrored_px, right_mirrored_px = refining._matched(pair.mirrored(), given, 1)
+    np.testing.assert_array_equal(mirrored_px[:, ::-1], right_found_px)
+    np.testing.assert_array_equal(right_mirrored_px[:, ::-1], found_px)
+    assert (abs(right_found_px - right_px) < 1).mean() > 0.9
+
+
+def test_a_brighter_right_photograph_changes_little(scene):
+    left, right, left_px, right_px = (np.tile(values, (2, 1, 1)[: values.ndim]) for values in scene)
+    left, right = (80 + photo // 4 for photo in (left, right))
+    given = estimate_of(*without_stick(left_px, right_px), confidence=0.6)
+    brighter = np.rint(1.3 * right).astype(np.uint8)
+    alike, different = (refine(left, photo, given) for photo in (right, brighter))
+    for side in ("disparity_px", "right_disparity_px"):
+        apart_px = abs(getattr(alike, side) - getattr(different, side))
+        assert (apart_px > 1).mean() < 0.01
+    assert (abs(different.right_disparity_px[:, STICK] - STICK_PX) < 1).mean() > 0.95
+
+
+def test_a_right_view_settles_as_a_mirrored_left_one(rng):
+    found_px, other_px, disparity_px = rng.integers(2, 5, (3, 30, 40)).astype(np.float32)
+    disparity_px += 30 * (rng.random((30, 40)) < 0.2)
+    trust = rng.random((30, 40), np.float32)
+    right_px = refining._settled(disparity_px, found_px, other_px, trust, 1)
+    np.testing.assert_array_equal(right_px, plain_settled(disparity_px, found_px, other_px, trust, 1))
+    mirrored = (np.ascontiguousarray(values[:, ::-1]) for values in (disparity_px, found_px, other_px, trust))
+    np.testing.assert_array_equal(refining._settled(*mirrored, -1)[:, ::-1], right_px)
+
+
+def test_the_number_of_threads_changes_nothing(scene):
+    left, right, left_px, right_px = scene
+    given = estimate_of(*without_stick(left_px, right_px))
+    one, three = (refine(left, right, given, threads=threads) for threads in (1, 3))
+    np.testing.assert_array_equal(one.disparity_px, three.disparity_px)
+    np.testing.assert_array_equal(one.right_disparity_px, three.right_disparity_px)
+
+
+def test_strips_of_rows_find_what_the_whole_finds(rng, monkeypatch):
+    right_px = np.full((200, 100), FAR_PX)
+    right_px[:, 40:43] = STICK_PX
+    left, right, _ = photographs(rng, right_px, right_px.shape)
+    given = estimate_of(np.full((200, 100), FAR_PX), np.full((200, 100), FAR_PX))
+    whole = refine(left, right, given)
+    monkeypatch.setattr(refining, "_CANDIDATES_AT_ONCE", 1)
+    strips = refine(left, right, given)
+    assert (abs(whole.disparity_px - strips.disparity_px) > 0.5).mean() < 0.002
+
+
+def test_an_estimate_of_other_photographs_is_refused(scene):
+    left, right, _, right_px = scene
+    given = estimate_of(right_px, right_px)
+    with pytest.raises(StereoweaveError, match="estimate: expected the photographs' size 159x64, got 160x64"):
+        refine(left[:, 1:], right[:, 1:], given)

@@ -1,0 +1,142 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.files import read_pair
+from stereoweave.matching.estimate import match
+from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.sgbm_interface import StereoMatcher
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+# calib.txt beside it: 600 px, centre 319.5, 239.5, baseline 0.1 m.
+Q = np.array([[1, 0, 0, -319.5], [0, 1, 0, -239.5], [0, 0, 0, 600], [0, 0, 10, 0]], np.float32)
+
+
+def photographs() -> tuple[np.ndarray, np.ndarray]:
+    """The example pair as users of OpenCV have it, in BGR."""
+    left, right = (cv2.imread(str(EXAMPLES / name)) for name in ("left.png", "right.png"))
+    assert left is not None
+    assert right is not None
+    return left, right
+
+
+def moved_pair(by_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """A textured wall of 96x160 in BGR, each column x of the left one at x - by_px in the right."""
+    coarse = np.random.default_rng(0).integers(0, 256, (24, 64, 3), dtype=np.uint8)
+    wall = cv2.resize(coarse, (256, 96), interpolation=cv2.INTER_CUBIC)
+    return wall[:, 48 : 48 + 160], wall[:, 48 + by_px : 48 + by_px + 160]
+
+
+def sgbm() -> cv2.StereoSGBM:
+    return cv2.StereoSGBM.create(
+        minDisparity=0,
+        numDisparities=64,
+        blockSize=5,
+        P1=600,
+        P2=2400,
+        disp12MaxDiff=1,
+        uniquenessRatio=10,
+        speckleWindowSize=100,
+        speckleRange=2,
+    )
+
+
+def points_of(matcher: cv2.StereoMatcher | StereoMatcher) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What programs written for StereoSGBM do: disparity in px, the points it gives, and which are some."""
+    left, right = photographs()
+    disparity = matcher.compute(left, right)
+    assert disparity.dtype == np.int16
+    disparity_px = disparity.astype(np.float32) / 16.0
+    known = disparity_px > matcher.getMinDisparity() - 1
+    return disparity_px, cv2.reprojectImageTo3D(disparity_px, Q), known
+
+
+def test_a_program_for_sgbm_finds_the_same_points_through_it():
+    theirs_px, their_points, known_to_them = points_of(sgbm())
+    ours_px, our_points, known_to_us = points_of(StereoMatcher(minDisparity=0, numDisparities=64))
+    both = known_to_them & known_to_us
+    assert both.mean() > 0.8
+    assert np.mean(np.abs(theirs_px - ours_px)[both] < 1) > 0.97
+    depths_m = [np.median(points[both][:, 2]) for points in (their_points, our_points)]
+    assert abs(depths_m[0] - depths_m[1]) < 0.02 * depths_m[0]
+
+
+def test_what_is_known_is_the_estimate_times_16_and_the_rest_says_so():
+    left, right = photographs()
+    pair = read_pair(EXAMPLES / "left.png", EXAMPLES / "right.png")
+    estimate = match(Matcher(), pair, range_px=(0, 64))
+    disparity = StereoMatcher(0, 64, min_confidence=0.25).compute(left, right)
+    known = ~estimate.occluded & (estimate.confidence >= 0.25)
+    known &= (estimate.disparity_px >= 0) & (estimate.disparity_px <= 64)
+    assert 0.05 < 1 - known.mean() < 0.5
+    np.testing.assert_allclose(disparity[known] / 16, estimate.disparity_px[known], atol=1 / 32)
+    assert (disparity[~known] == -16).all()
+
+
+def test_a_wall_beyond_the_range_is_not_known_and_one_within_it_is():
+    left, right = moved_pair(12)
+    matcher = StereoMatcher(minDisparity=0, numDisparities=32)
+    disparity = matcher.compute(left, right)
+    assert abs(np.median(disparity[:, 40:]) - 12 * 16) <= 4
+    matcher.setNumDisparities(8)
+    assert np.median(matcher.compute(left, right)) == -16
+
+
+def test_converged_cameras_have_disparities_below_0_and_the_mark_below_those():
+    left, right = moved_pair(-9)
+    matcher = StereoMatcher(minDisparity=-16, numDisparities=48)
+    disparity = matcher.compute(left, right)
+    assert abs(np.median(disparity[:, 20:-20]) + 9 * 16) <= 4
+    assert disparity.min() == -17 * 16
+
+
+def test_grey_pictures_are_taken():
+    left, right = (cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) for picture in moved_pair(12))
+    disparity = StereoMatcher(0, 32).compute(left, right)
+    assert abs(np.median(disparity[:, 40:]) - 12 * 16) <= 4
+
+
+def test_what_was_set_is_what_is_got():
+    matcher = StereoMatcher(-8, 40)
+    assert (matcher.getMinDisparity(), matcher.getNumDisparities()) == (-8, 40)
+    matcher.setMinDisparity(3)
+    matcher.setNumDisparities(50)
+    assert (matcher.getMinDisparity(), matcher.getNumDisparities()) == (3, 50)
+
+
+@pytest.mark.parametrize(("least", "count"), [(0, 0), (0, 2048), (2000, 48), (-2047, 1)])
+def test_a_range_that_int16_does_not_hold_is_refused(least, count):
+    with pytest.raises(StereoweaveError, match="-2046 to 2047 px"):
+        StereoMatcher(least, count)
+    with pytest.raises(StereoweaveError, match=f"numDisparities {count}"):
+        matcher = StereoMatcher(min(least, 0), 1)
+        matcher.setMinDisparity(least)
+        matcher.setNumDisparities(count)
+
+
+def test_a_confidence_in_percent_is_refused():
+    with pytest.raises(StereoweaveError, match=r"^min_confidence: expected .* 0 to 1, found 50"):
+        StereoMatcher(0, 64, min_confidence=50)
+
+
+def test_the_widest_ranges_that_int16_holds_are_taken():
+    assert StereoMatcher(-2046, 4093).getNumDisparities() == 4093
+
+
+def test_what_steers_sgbm_is_refused_by_its_name():
+    with pytest.raises(TypeError, match="blockSize"):
+        StereoMatcher(0, 64, blockSize=5)
+
+
+@pytest.mark.usefixtures("without_shape_checks")
+@pytest.mark.parametrize(
+    ("picture", "found"),
+    [(Image.new("RGB", (64, 64)), "got Image"), (np.zeros((64, 64), np.float32), "got float32")],
+)
+def test_what_cv2_would_not_read_is_refused(picture, found):
+    with pytest.raises(StereoweaveError, match=found):
+        StereoMatcher(0, 64).compute(picture, picture)

@@ -1,0 +1,146 @@
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from stereoweave.matching.subpixel import to_subpixel
+from stereoweave.stereo import Estimate
+
+HEIGHT, WIDTH = 120, 200
+
+
+def estimate_of(disparity_px, occluded=None):
+    disparity_px = np.asarray(disparity_px, np.float32)
+    return Estimate(
+        disparity_px=disparity_px,
+        right_disparity_px=disparity_px,
+        confidence=np.ones_like(disparity_px),
+        occluded=np.zeros(disparity_px.shape, bool) if occluded is None else occluded,
+    )
+
+
+def pair_with(disparity_px, texture):
+    """A right picture, and a left one that shows at x what the right one shows at x - disparity."""
+    right = texture[:HEIGHT, :WIDTH]
+    rows, columns = np.indices((HEIGHT, WIDTH), np.float32)
+    left = cv2.remap(
+        right, columns - disparity_px, rows, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT_101
+    )
+    return left, np.ascontiguousarray(right)
+
+
+def ramp_px():
+    """Disparity of a slanted floor: 6 px on top, 12 px below."""
+    rows = np.linspace(6, 12, HEIGHT, dtype=np.float32)
+    return np.repeat(rows[:, None], WIDTH, axis=1)
+
+
+def errors_px(found, truth_px):
+    # Away from the border, which mirrors.
+    return np.abs(found.disparity_px - truth_px)[8:-8, 20:-8]
+
+
+@pytest.fixture
+def texture(rng):
+    return cv2.GaussianBlur(rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8), (0, 0), 1)
+
+
+def test_disparity_off_by_noise_and_bias_is_brought_to_a_tenth_of_its_error(rng, texture):
+    truth_px = ramp_px()
+    left, right = pair_with(truth_px, texture)
+    noise = cv2.GaussianBlur(rng.normal(size=truth_px.shape).astype(np.float32), (0, 0), 2)
+    given = estimate_of(truth_px + 0.1 + 0.2 * noise / noise.std())
+    found = to_subpixel(left, right, given)
+    before, after = (np.median(errors_px(estimate, truth_px)) for estimate in (given, found))
+    assert before > 0.12
+    assert after < 0.02
+
+
+def test_a_difference_in_exposure_shifts_nothing(texture):
+    truth_px = ramp_px()
+    left, right = pair_with(truth_px, texture)
+    darker = np.rint(right * 0.6 + 20).astype(np.uint8)
+    found = to_subpixel(left, darker, estimate_of(truth_px + 0.3))
+    assert np.median(errors_px(found, truth_px)) < 0.03
+
+
+def test_disparity_that_is_right_stays(texture):
+    truth_px = ramp_px()
+    left, right = pair_with(truth_px, texture)
+    assert np.percentile(errors_px(to_subpixel(left, right, estimate_of(truth_px)), truth_px), 95) < 0.03
+
+
+def test_no_disparity_moves_by_more_than_a_pixel(rng, texture):
+    left, right = pair_with(ramp_px(), texture)
+    given = estimate_of(ramp_px() + rng.uniform(-5, 5, (HEIGHT, WIDTH)).astype(np.float32))
+    found = to_subpixel(left, right, given)
+    assert np.abs(found.disparity_px - given.disparity_px).max() < 1 + 1e-5
+
+
+def test_an_edge_between_two_depths_stays_where_it_is(texture):
+    truth_px = np.full((HEIGHT, WIDTH), 5, np.float32)
+    truth_px[:, 100:] = 15
+    left, right = pair_with(truth_px, texture)
+    found = to_subpixel(left, right, estimate_of(truth_px))
+    np.testing.assert_allclose(found.disparity_px, truth_px, atol=1)
+    assert np.median(errors_px(found, truth_px)) < 0.01
+
+
+def test_plain_and_occluded_places_and_all_but_the_left_disparity_stay(rng, texture):
+    truth_px = ramp_px()
+    left, right = pair_with(truth_px, texture)
+    occluded = np.zeros((HEIGHT, WIDTH), bool)
+    occluded[40:80, 60:120] = True
+    given = estimate_of(truth_px + 0.3, occluded)
+    found = to_subpixel(left, right, given)
+    np.testing.assert_array_equal(found.disparity_px[occluded], given.disparity_px[occluded])
+    assert found.right_disparity_px is given.right_disparity_px
+    assert found.confidence is given.confidence
+    plain = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
+    flat = estimate_of(np.full((HEIGHT, WIDTH), 7.3))
+    for estimate in (flat, replace(flat, occluded=np.ones((HEIGHT, WIDTH), bool))):
+        np.testing.assert_allclose(to_subpixel(plain, plain, estimate).disparity_px, 7.3, atol=1e-5)
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_bands_of_rows_find_what_the_whole_picture_does(rng, threads):
+    left, right = rng.integers(0, 256, (2, 230, 90, 3), dtype=np.uint8)
+    given = estimate_of(cv2.GaussianBlur(rng.uniform(0, 30, (230, 90)).astype(np.float32), (0, 0), 2))
+    whole = to_subpixel(left, right, given, threads=1)
+    in_bands = to_subpixel(left, right, given, threads=threads)
+    assert np.abs(whole.disparity_px - given.disparity_px).mean() > 0.05
+    np.testing.assert_allclose(in_bands.disparity_px, whole.disparity_px, atol=1e-3)
+
+
+@pytest.mark.parametrize(("height", "width"), [(HEIGHT - 1, WIDTH - 1), (HEIGHT - 1, WIDTH), (HEIGHT, 91)])
+def test_odd_sizes_are_as_good_as_even_ones(texture, height, width):
+    truth_px = ramp_px()
+    left, right = (np.ascontiguousarray(image[:height, :width]) for image in pair_with(truth_px, texture))
+    truth_px = truth_px[:height, :width]
+    found = to_subpixel(left, right, estimate_of(truth_px + 0.3))
+    assert found.disparity_px.shape == (height, width)
+    assert np.median(errors_px(found, truth_px)) < 0.03
+
+
+def test_a_steep_slant_is_no_edge(texture):
+    truth_px = np.repeat(np.linspace(5, 29, HEIGHT, dtype=np.float32)[:, None], WIDTH, axis=1)
+    left, right = pair_with(truth_px, texture)
+    found = to_subpixel(left, right, estimate_of(truth_px + 0.2))
+    assert np.median(np.abs(found.disparity_px - truth_px)[8:-8, 40:-8]) < 0.05
+
+
+def test_no_threads_are_refused(texture):
+    left, right = pair_with(ramp_px(), texture)
+    with pytest.raises(ValueError, match="threads: expected 1 or more, got 0"):
+        to_subpixel(left, right, estimate_of(ramp_px()), threads=0)
+
+
+def test_disparity_falls_below_zero_only_where_some_was_given_so(texture):
+    left, right = pair_with(np.full((HEIGHT, WIDTH), -0.4, np.float32), texture)
+    given_px = np.full((HEIGHT, WIDTH), 0.1, np.float32)
+    parallel = to_subpixel(left, right, estimate_of(given_px))
+    assert parallel.disparity_px.min() == 0
+    given_px[0, 0] = -2
+    converged = to_subpixel(left, right, estimate_of(given_px))
+    assert np.median(errors_px(converged, -0.4)) < 0.05

@@ -1,0 +1,292 @@
+import base64
+import io
+import json
+import os
+import re
+import subprocess
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stereoweave.outputs.report import POSITIONS, Summary, shrunk, summarize, write_report
+from stereoweave.stereo import Estimate, StereoCamera, StereoPair
+
+CAMERA = StereoCamera(focal_px=400, baseline_m=0.04, cx_px=160, cy_px=60, doffs_px=0)
+SHIFT_PX = 32
+
+
+def texture(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
+    """Soft coloured blobs, so that neither JPEG nor scaling changes them much."""
+    coarse = rng.integers(0, 256, (height // 16 + 2, width // 16 + 2, 3), dtype=np.uint8)
+    return np.asarray(Image.fromarray(coarse).resize((width, height), Image.Resampling.BICUBIC))
+
+
+def wall(photograph: np.ndarray, shift_px: int, camera: StereoCamera | None) -> tuple[StereoPair, Estimate]:
+    """A wall of one disparity in front of both cameras: the right one sees it `shift_px` further left."""
+    pair = StereoPair(left=photograph[:, :-shift_px], right=photograph[:, shift_px:], camera=camera)
+    disparity_px = np.full(pair.left.shape[:2], shift_px, np.float32)
+    return pair, Estimate(
+        disparity_px=disparity_px,
+        right_disparity_px=disparity_px,
+        confidence=np.ones_like(disparity_px),
+        occluded=np.zeros(disparity_px.shape, bool),
+    )
+
+
+def summary_of(pair: StereoPair, estimate: Estimate, *pictures: str) -> Summary:
+    return summarize(pair, estimate, pictures=pictures, model="small", estimate_ms=12.34)
+
+
+def pictures_in(page: str) -> dict[str, np.ndarray]:
+    """The pictures of the page by their alternative text."""
+    tags = re.findall(r'src="data:image/jpeg;base64,([^"]+)" alt="([^"]+)"', page)
+    return {alt: np.asarray(Image.open(io.BytesIO(base64.b64decode(jpeg)))) for jpeg, alt in tags}
+
+
+def difference(one: np.ndarray, other: np.ndarray) -> float:
+    return float(np.abs(one.astype(float) - other).mean())
+
+
+def test_the_summary_has_the_numbers_of_the_estimate():
+    disparity_px = np.array([[1, 2, 4, 8, 16]] * 32, np.float32)
+    estimate = Estimate(
+        disparity_px=disparity_px,
+        right_disparity_px=disparity_px,
+        confidence=np.array([[0.1, 0.49, 0.5, 0.9, 1.0]] * 32, np.float32),
+        occluded=np.array([[True, False, False, False, False]] * 32),
+    )
+    picture = np.zeros((32, 5, 3), np.uint8)
+    summary = summary_of(StereoPair(left=picture, right=picture, camera=CAMERA), estimate, "a.png", "b.png")
+    assert (summary.width_px, summary.height_px) == (5, 32)
+    assert (summary.disparity_min_px, summary.disparity_median_px, summary.disparity_max_px) == (1, 4, 16)
+    # 400 px * 0.04 m = 16 px m
+    assert (summary.depth_min_m, summary.depth_median_m, summary.depth_max_m) == (1, 4, 16)
+    assert summary.occluded_percent == 20
+    assert summary.confident_percent == 60
+    assert summary.estimate_ms == 12.3
+
+
+def test_a_depth_is_none_without_a_camera_and_at_infinity(rng):
+    photograph = texture(rng, 40, 100)
+    pair, estimate = wall(photograph, SHIFT_PX, None)
+    assert summary_of(pair, estimate, "a.png").depth_min_m is None
+    toed_in = StereoCamera(focal_px=400, baseline_m=0.04, cx_px=0, cy_px=0, doffs_px=-SHIFT_PX)
+    assert summary_of(*wall(photograph, SHIFT_PX, toed_in), "a.png").depth_max_m is None
+
+
+def test_each_view_of_the_page_is_the_wall_seen_from_there(rng, tmp_path):
+    photograph = texture(rng, 120, 320 + SHIFT_PX)
+    pair, estimate = wall(photograph, SHIFT_PX, CAMERA)
+    write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"))
+    pictures = pictures_in((tmp_path / "report.html").read_text(encoding="utf-8"))
+    for position in (0.0, 0.25, 0.5, 1.0):
+        moved_px = int(position * SHIFT_PX)
+        expected = photograph[:, moved_px : moved_px + 320]
+        assert difference(pictures[f"View at position {position}"], expected) < 3
+
+
+def test_a_long_picture_is_shrunk_and_its_disparity_with_it(rng, tmp_path):
+    photograph = texture(rng, 160, 2000 + 80)
+    pair, estimate = wall(photograph, 80, None)
+    write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"))
+    pictures = pictures_in((tmp_path / "report.html").read_text(encoding="utf-8"))
+    halfway = np.asarray(Image.fromarray(photograph[:, 40:2040]).resize((1000, 80)))
+    assert pictures["The left photograph"].shape == (80, 1000, 3)
+    assert difference(pictures["View at position 0.5"], halfway) < 5
+
+
+def test_what_the_left_picture_does_not_show_has_no_colour_of_depth(rng, tmp_path):
+    pair, estimate = wall(texture(rng, 120, 320 + SHIFT_PX), SHIFT_PX, CAMERA)
+    seen = np.ones((120, 320), bool)
+    seen[:, :80] = False
+    pair = replace(pair, left_seen=seen)
+    write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"))
+    depth = pictures_in((tmp_path / "report.html").read_text(encoding="utf-8"))["Depth in colour"]
+    assert depth[:, :72].max() < 8
+    assert depth[:, 88:].max(axis=2).min() > 40
+    shown, _ = shrunk(pair, estimate, 160)
+    assert (shown.left_seen == seen[::2, ::2]).all()
+
+
+def test_the_page_is_one_file_that_refers_to_no_other(rng, tmp_path):
+    pair, estimate = wall(texture(rng, 120, 352), SHIFT_PX, CAMERA)
+    write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png", "b.png"))
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
+    assert "http:" not in page
+    assert "https:" not in page
+    addresses = re.findall(r'(?:src|href)="([^"]*)"', page)
+    assert len(addresses) == len(POSITIONS) + 4
+    assert all(address.startswith("data:") for address in addresses)
+
+
+def test_a_file_name_cannot_add_to_the_page(rng, tmp_path):
+    pair, estimate = wall(texture(rng, 60, 132), SHIFT_PX, None)
+    summary = summary_of(pair, estimate, "<img src=x>$title.png", "</script>")
+    write_report(tmp_path / "report.html", pair, estimate, summary)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "&lt;img src=x&gt;$title.png + &lt;/script&gt;" in page
+    assert "<img src=x>" not in page
+
+
+def test_the_legend_is_in_metres_with_a_camera_and_in_pixels_without(rng, tmp_path):
+    photograph = texture(rng, 60, 132)
+    for camera, legend in ((CAMERA, "<span>0.500 m</span>"), (None, "<span>32.0 px</span>")):
+        pair, estimate = wall(photograph, SHIFT_PX, camera)
+        write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"))
+        assert legend in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+class Browser:
+    """Chromium without a window, driven through its DevTools pipe: commands on descriptor 3, answers on 4."""
+
+    def __init__(self, folder: Path) -> None:
+        for name in ("commands", "answers"):
+            os.mkfifo(folder / name)
+        flags = (
+            "--headless --no-sandbox --disable-gpu --disable-dev-shm-usage --disable-background-networking "
+            f"--no-first-run --user-data-dir={folder}/profile --remote-debugging-pipe"
+        )
+        with (folder / "log").open("w") as log:
+            self._process = subprocess.Popen(
+                ["sh", "-c", f"exec chromium {flags} 3<{folder}/commands 4>{folder}/answers"], stderr=log
+            )
+        self._commands = (folder / "commands").open("wb", buffering=0)
+        self._answers = (folder / "answers").open("rb", buffering=0)
+        self._unread = b""
+        self._session: dict[str, str] = {}
+        self._count = 0
+        self.requested: list[str] = []
+        target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        self._session = {
+            "sessionId": self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        }
+        self.call("Network.enable")
+        self.call("Page.enable")
+        self.call(
+            "Emulation.setDeviceMetricsOverride", width=1200, height=1600, deviceScaleFactor=1, mobile=False
+        )
+
+    def call(self, method: str, **parameters: object) -> dict[str, Any]:
+        self._count += 1
+        command = {"id": self._count, "method": method, "params": parameters} | self._session
+        self._commands.write(json.dumps(command).encode() + b"\0")
+        while (message := self._message()).get("id") != self._count:
+            pass
+        return message["result"]
+
+    def open(self, page: Path) -> None:
+        self.call("Page.navigate", url=page.as_uri())
+        while self._message().get("method") != "Page.loadEventFired":
+            pass
+
+    def run(self, script: str) -> Any:
+        return self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
+
+    def box(self, selector: str) -> dict[str, float]:
+        return json.loads(
+            self.run(f"JSON.stringify(document.querySelector('{selector}').getBoundingClientRect())")
+        )
+
+    def picture(self, selector: str) -> np.ndarray:
+        box = self.box(selector)
+        clip = {name: box[name] for name in ("x", "y", "width", "height")} | {"scale": 1}
+        png = base64.b64decode(self.call("Page.captureScreenshot", clip=clip)["data"])
+        return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
+
+    def press(self, key: str, code: int) -> None:
+        for kind in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code)
+
+    def mouse(self, kind: str, x: float, y: float) -> None:
+        button = "none" if kind == "mouseMoved" else "left"
+        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button=button, clickCount=1)
+
+    def close(self) -> None:
+        self.call("Browser.close")
+        self._commands.close()
+        self._answers.close()
+        self._process.wait(timeout=20)
+
+    def _message(self) -> dict[str, Any]:
+        while b"\0" not in self._unread:
+            chunk = self._answers.read(1 << 16)
+            assert chunk, "chromium has ended"
+            self._unread += chunk
+        text, _, self._unread = self._unread.partition(b"\0")
+        message = json.loads(text)
+        if message.get("method") == "Network.requestWillBeSent":
+            self.requested.append(message["params"]["request"]["url"])
+        return message
+
+
+@pytest.fixture
+def browser(tmp_path) -> Iterator[Browser]:
+    (tmp_path / "browser").mkdir()
+    browser = Browser(tmp_path / "browser")
+    yield browser
+    browser.close()
+
+
+@pytest.fixture
+def photograph(rng) -> np.ndarray:
+    return texture(rng, 240, 320 + SHIFT_PX)
+
+
+@pytest.fixture
+def page(photograph, tmp_path) -> Path:
+    """A report about a wall 0.5 m away."""
+    pair, estimate = wall(photograph, SHIFT_PX, CAMERA)
+    write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png", "b.png"))
+    return tmp_path / "report.html"
+
+
+@pytest.mark.needs_chromium
+def test_the_slider_changes_the_picture(browser, page, photograph):
+    def seen_from(position: float) -> float:
+        """How far what the browser shows is from the wall as the camera at `position` sees it."""
+        shown = browser.picture("#stage")
+        moved_px = round(position * SHIFT_PX)
+        expected = Image.fromarray(photograph[:, moved_px : moved_px + 320]).resize(shown.shape[1::-1])
+        return difference(shown, np.asarray(expected))
+
+    browser.open(page)
+    assert seen_from(0.5) < 4
+    assert seen_from(0.75) > 12
+
+    browser.press("Tab", 9)
+    for _ in range(2):
+        browser.press("ArrowRight", 39)
+    assert browser.run("document.querySelector('#where').textContent").startswith("0.75, between the cameras")
+    assert seen_from(0.75) < 4
+    assert seen_from(0.5) > 12
+
+    slider = browser.box("#position")
+    left_end = browser.box(".ends span")
+    for kind in ("mousePressed", "mouseReleased"):
+        browser.mouse(kind, left_end["x"] + left_end["width"] / 2, slider["y"] + slider["height"] / 2)
+    assert browser.run("document.querySelector('#where').textContent").startswith("0, at the left camera")
+    assert seen_from(0) < 4
+
+
+@pytest.mark.needs_chromium
+def test_pointing_at_the_depth_reads_it(browser, page):
+    browser.open(page)
+    depth = browser.box("#depth")
+    browser.mouse("mouseMoved", depth["x"] + depth["width"] / 4, depth["y"] + depth["height"] / 2)
+    # 400 px * 0.04 m / 32 px
+    expected = "(80, 120): disparity 32.00 px, depth 0.500 m"
+    assert browser.run("document.querySelector('#reading').textContent") == expected
+
+
+@pytest.mark.needs_chromium
+def test_opening_the_page_asks_for_that_file_alone(browser, page):
+    browser.open(page)
+    browser.press("Tab", 9)
+    browser.press("ArrowRight", 39)
+    assert [url for url in browser.requested if not url.startswith("data:")] == [page.as_uri()]

@@ -1,0 +1,230 @@
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from stereoweave.cli.depth import depth
+from stereoweave.errors import OutputInUseError, StereoweaveError
+from stereoweave.io.files import read_disparity_png, read_image, read_pfm, read_pixels, write_image
+from stereoweave.io.output_lock import lock_output
+from stereoweave.matching.matcher import Matcher
+from stereoweave.outputs.report import summarize
+from stereoweave.outputs.results import ALWAYS, FILES, DepthOrder, Result, make_depth, needs_camera
+from stereoweave.pictures.prepare import Request
+from stereoweave.stereo import Estimate, StereoCamera, StereoPair
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+CALIBRATION = "cam0=[100 0 48; 0 100 32; 0 0 1]\ndoffs=0\nbaseline=80\nwidth=96\nheight=64\n"
+CAMERA = StereoCamera(focal_px=100.0, baseline_m=0.08, cx_px=48.0, cy_px=32.0)
+PICTURES = [Path("left.png"), Path("right.png")]
+WITH_CAMERA = DepthOrder(request=Request(calibration=Path("calib.txt")))
+
+
+@pytest.fixture(scope="module")
+def matcher() -> Matcher:
+    return Matcher("small", threads=1)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """The folder that the test runs in: a piece of the example, 96x64, and its calibration."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("left.png", "right.png"):
+        write_image(name, np.ascontiguousarray(read_image(EXAMPLES / name)[200:264, 300:396]))
+    Path("calib.txt").write_text(CALIBRATION)
+    return tmp_path
+
+
+def names_in(folder: str) -> set[str]:
+    return {file.name for file in Path(folder).iterdir()}
+
+
+def test_what_is_written_unless_more_is_asked_for(folder, matcher):
+    make_depth(PICTURES, Path("plain"), DepthOrder(), matcher)
+    assert names_in("plain") == set(ALWAYS)
+    make_depth(PICTURES, Path("metric"), WITH_CAMERA, matcher)
+    assert names_in("metric") == {*ALWAYS, "depth.png"}
+
+
+def test_all_files_say_the_same(folder, matcher):
+    _, notes = make_depth(PICTURES, Path("out"), replace(WITH_CAMERA, files=("all",)), matcher)
+    assert names_in("out") == set(FILES)
+    assert notes == []
+    out, disparity_px = Path("out"), read_pfm("out/disparity.pfm")
+    for found in (np.load(out / "disparity.npy"), np.asarray(Image.open(out / "disparity.tiff"))):
+        assert found.dtype == np.float32
+        np.testing.assert_array_equal(found, disparity_px)
+    depth_m = CAMERA.depth_m(disparity_px)
+    tiff_m = np.asarray(Image.open(out / "depth.tiff"))
+    for found in (np.load(out / "depth.npy"), tiff_m, read_pfm(out / "depth.pfm")):
+        assert found.dtype == np.float32
+        np.testing.assert_array_equal(found, depth_m)
+    within = depth_m < 65
+    np.testing.assert_allclose(
+        read_pixels(out / "depth.png", "I;16")[within] / 1000, depth_m[within], atol=6e-4
+    )
+    points_m = trimesh.load(out / "cloud.ply").vertices
+    assert 0 < len(points_m) <= 64 * 96
+    (from_glb,) = trimesh.load(out / "cloud.glb").geometry.values()
+    np.testing.assert_array_equal(from_glb.vertices, points_m)
+    assert set(-points_m[:, 2].astype(np.float32)) <= set(depth_m.ravel())
+    mesh = trimesh.load(out / "mesh.ply", process=False)
+    (glb_mesh,) = trimesh.load(out / "mesh.glb", process=False).geometry.values()
+    np.testing.assert_array_equal(glb_mesh.faces, mesh.faces)
+
+
+def test_the_mask_is_white_where_the_left_camera_alone_sees(folder, matcher):
+    make_depth(PICTURES, Path("out"), DepthOrder(), matcher)
+    estimate = matcher.estimate(read_image("left.png"), read_image("right.png"))
+    mask = read_pixels("out/occluded.png", "L")
+    np.testing.assert_array_equal(mask == 255, estimate.occluded)
+    np.testing.assert_array_equal(mask == 0, ~estimate.occluded)
+
+
+def test_files_of_an_earlier_result_go(folder, matcher):
+    make_depth(PICTURES, Path("out"), replace(WITH_CAMERA, files=("all",)), matcher)
+    Path("out/mine.txt").write_text("kept")
+    make_depth(PICTURES, Path("out"), DepthOrder(), matcher)
+    assert names_in("out") == {*ALWAYS, "mine.txt"}
+
+
+def test_files_of_the_same_names_that_are_no_earlier_result_stay(folder, matcher):
+    for name in ("mesh.ply", "depth.npy"):
+        Path(name).write_text("of another program")
+    make_depth(PICTURES, Path(), DepthOrder(), matcher)
+    assert {Path(name).read_text() for name in ("mesh.ply", "depth.npy")} == {"of another program"}
+
+
+def test_results_do_not_move_into_a_folder_that_another_command_writes_to(folder, matcher):
+    make_depth(PICTURES, Path("out"), DepthOrder(), matcher)
+    before = {file: file.read_bytes() for file in Path("out").iterdir()}
+    with lock_output(Path("out")), pytest.raises(OutputInUseError, match="^out: .* found one that is in use"):
+        make_depth(PICTURES, Path("out"), WITH_CAMERA, matcher)
+    assert {file: file.read_bytes() for file in Path("out").iterdir()} == before
+
+
+def test_an_unknown_file_is_told_with_those_that_there_are():
+    with pytest.raises(StereoweaveError, match=r"^--write: .*disparity.npy.*mesh.glb.*found 'cloud.obj'$"):
+        DepthOrder(files=("depth.npy", "cloud.obj"))
+
+
+@pytest.mark.parametrize("file", [file for file in FILES if needs_camera(file)])
+def test_metres_without_a_camera_are_refused_before_anything_is_written(folder, matcher, file):
+    with pytest.raises(StereoweaveError, match=f"^{file}: .*--calib.*--focal-px and --baseline-m"):
+        make_depth(PICTURES, Path("out"), DepthOrder(files=(file,)), matcher)
+    assert not Path("out").exists()
+
+
+def test_all_without_a_camera_is_all_but_metres_and_says_so(folder, matcher):
+    _, notes = make_depth(PICTURES, Path("out"), DepthOrder(files=("all",)), matcher)
+    assert names_in("out") == {*ALWAYS, "disparity.npy", "disparity.tiff"}
+    assert [note for note in notes if "--focal-px and --baseline-m" in note] != []
+
+
+def test_points_without_trimesh_name_the_extra_before_anything_is_written(folder, matcher, monkeypatch):
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    with pytest.raises(StereoweaveError, match=r"stereoweave\[mesh\]"):
+        make_depth(PICTURES, Path("out"), replace(WITH_CAMERA, files=("cloud.ply",)), matcher)
+    assert not Path("out").exists()
+
+
+def test_a_pair_without_a_point_gets_the_rest_and_a_line(folder, matcher):
+    for name in PICTURES:
+        Image.new("RGB", (96, 64)).save(name)
+    order = replace(WITH_CAMERA, files=("cloud.ply", "mesh.glb"))
+    _, notes = make_depth(PICTURES, Path("out"), order, matcher)
+    assert names_in("out") == {*ALWAYS, "depth.png"}
+    assert [note[:13] for note in notes if note.startswith("no ")] == ["no cloud.ply:", "no mesh.glb: "]
+
+
+def result_half_seen() -> Result:
+    """Disparities of 4 px, 0 in the right third; the left half of the left picture shows nothing."""
+    disparity_px = np.full((64, 96), 4, np.float32)
+    disparity_px[:, 64:] = 0
+    left_seen = np.ones((64, 96), bool)
+    left_seen[:, :48] = False
+    picture = np.full((64, 96, 3), 100, np.uint8)
+    pair = StereoPair(left=picture, right=picture, camera=CAMERA, left_seen=left_seen)
+    estimate = Estimate(
+        disparity_px=disparity_px,
+        right_disparity_px=disparity_px,
+        confidence=left_seen.astype(np.float32),
+        occluded=np.zeros((64, 96), bool),
+    )
+    summary = summarize(pair, estimate, pictures=("left.png", "right.png"), model="small", estimate_ms=1.0)
+    return Result(pair=pair, estimate=estimate, summary=summary)
+
+
+def test_what_the_left_picture_does_not_show_is_unknown_in_every_file(tmp_path):
+    result = result_half_seen()
+    for file, write in FILES.items():
+        write(tmp_path / file, result)
+    rows = {
+        "disparity.pfm": (read_pfm, np.inf, 4, 0),
+        "disparity.png": (read_disparity_png, np.nan, 4, 1 / 256),
+        "disparity.npy": (np.load, np.nan, 4, 0),
+        "disparity.tiff": (lambda path: np.asarray(Image.open(path)), np.nan, 4, 0),
+        # 100 px * 0.08 m / 4 px
+        "depth.pfm": (read_pfm, np.inf, 2, np.inf),
+        "depth.npy": (np.load, np.nan, 2, np.inf),
+        "depth.tiff": (lambda path: np.asarray(Image.open(path)), np.nan, 2, np.inf),
+        "depth.png": (lambda path: read_pixels(path, "I;16"), 0, 2000, 0),
+        "confidence.png": (lambda path: read_pixels(path, "L"), 0, 255, 255),
+    }
+    for file, (read, *expected) in rows.items():
+        found = read(tmp_path / file)
+        for columns, value in zip((np.s_[:48], np.s_[48:64], np.s_[64:]), expected, strict=True):
+            np.testing.assert_array_equal(found[:, columns], value, err_msg=file)
+    assert len(trimesh.load(tmp_path / "cloud.ply").vertices) == 64 * 16
+    preview = read_image(tmp_path / "preview.png")
+    assert (preview[:, :48] == 0).all() and (preview[:, 48:].max(axis=2) > 0).all()
+
+
+def test_the_summary_counts_what_the_left_picture_shows():
+    summary = result_half_seen().summary
+    # 4 px in 16 of the 48 columns, 0 in 32; outside of them nothing is confident.
+    assert (summary.disparity_median_px, summary.disparity_max_px) == (0, 4)
+    assert (summary.confident_percent, summary.depth_min_m) == (100, 2)
+
+
+def test_what_is_asked_of_the_estimate_is_handed_on(folder, matcher):
+    found_px = {}
+    for name, order in {
+        "plain": DepthOrder(),
+        "moved": DepthOrder(range_px=(-40.0, 100.0)),
+        "refined": DepthOrder(refined=True),
+        "raw": DepthOrder(raw=True),
+    }.items():
+        make_depth(PICTURES, Path(name), order, matcher)
+        found_px[name] = read_pfm(f"{name}/disparity.pfm")
+    assert (found_px["moved"] != found_px["plain"]).any()
+    for how in ("refined", "raw"):
+        expected = matcher.estimate(read_image("left.png"), read_image("right.png"), **{how: True})
+        np.testing.assert_array_equal(found_px[how], expected.disparity_px)
+
+
+def test_an_order_cannot_be_both_refined_and_raw():
+    with pytest.raises(StereoweaveError, match="raw: expected without refined"):
+        DepthOrder(refined=True, raw=True)
+
+
+def test_the_command_gives_the_networks_own_disparity_on_request(folder, matcher):
+    depth(Path("out"), PICTURES, raw=True)
+    expected = matcher.estimate(read_image("left.png"), read_image("right.png"), raw=True)
+    np.testing.assert_array_equal(read_pfm("out/disparity.pfm"), expected.disparity_px)
+
+
+def test_the_command_writes_what_it_is_told(folder, capfd):
+    depth(Path("out"), PICTURES, calib=Path("calib.txt"), write=["cloud.ply", "depth.npy"])
+    assert names_in("out") == {*ALWAYS, "depth.png", "cloud.ply", "depth.npy"}
+    assert "report: out/report.html" in capfd.readouterr().out
+
+
+def test_a_camera_by_hand_looks_through_the_middle():
+    image = np.zeros((480, 640, 3), np.uint8)
+    expected = StereoCamera(focal_px=550.0, baseline_m=0.1, cx_px=319.5, cy_px=239.5)
+    assert StereoCamera.centred(image, focal_px=550.0, baseline_m=0.1) == expected

@@ -1,0 +1,281 @@
+from pathlib import Path
+
+import pytest
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.pictures.pair_finding import (
+    Job,
+    ListedPair,
+    Pairs,
+    find_pairs,
+    pairs_among,
+    pairs_by_globs,
+    pairs_in,
+    pairs_in_list,
+)
+
+
+def put(folder: Path, *names: str) -> Path:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    return folder
+
+
+def listed(folder: Path, jobs: list[Job]) -> dict[str, tuple[str, ...]]:
+    return {job.name: tuple(path.relative_to(folder).as_posix() for path in job.pictures) for job in jobs}
+
+
+@pytest.mark.parametrize(
+    ("name", "left", "right"),
+    [
+        ("0001", "left/0001.png", "right/0001.png"),
+        ("sea", "sea_L.jpg", "sea_R.jpg"),
+        ("sea", "sea_left.JPG", "sea_right.JPG"),
+        ("0001", "left_0001.png", "right_0001.png"),
+        ("01", "left01.jpg", "right01.jpg"),
+        ("DSC_0001", "DSC_0001L.jpg", "DSC_0001R.jpg"),
+        ("castle", "castle/left.png", "castle/right.png"),
+        ("castle", "castle/im0.png", "castle/im1.png"),
+        ("castle_0001", "castle/Left/0001.png", "castle/Right/0001.png"),
+        ("Img8bit_a_1_Img8bit", "leftImg8bit/a_1_leftImg8bit.png", "rightImg8bit/a_1_rightImg8bit.png"),
+        ("img_7", "imgLeft/img_7.tif", "imgRight/img_7.tif"),
+        ("to", "left_to_right/left.png", "left_to_right/right.png"),
+    ],
+)
+def test_a_folders_pairs_are_found_by_the_marks_of_their_sides(tmp_path, name, left, right):
+    folder = put(tmp_path, left, right)
+    if name.startswith("img"):
+        name = "img_img_7"
+    assert listed(folder, pairs_in(folder).jobs) == {name: (left, right)}
+
+
+def test_a_pair_right_in_the_folder_has_the_folders_name(tmp_path):
+    folder = put(tmp_path / "castle", "left.png", "right.png")
+    assert listed(folder, pairs_in(folder).jobs) == {"castle": ("left.png", "right.png")}
+
+
+def test_words_that_only_begin_like_a_mark_are_none(tmp_path):
+    folder = put(tmp_path, "leftover.png", "lake.png", "Room.png", "im0001.png", "ball.png")
+    expected = {Path(name).stem: (name,) for name in ("leftover.png", "lake.png", "Room.png", "im0001.png")}
+    assert listed(folder, pairs_in(folder).jobs) == expected | {"ball": ("ball.png",)}
+
+
+def test_half_a_pair_is_a_pair_whose_other_picture_is_missing(tmp_path):
+    folder = put(tmp_path, "left/1.png", "right/1.png", "left/2.png", "right/3.png")
+    assert listed(folder, pairs_in(folder).jobs) == {
+        name: (f"left/{name}.png", f"right/{name}.png") for name in ("1", "2", "3")
+    }
+
+
+def test_marks_mean_nothing_where_not_one_pair_is_whole(tmp_path):
+    folder = put(tmp_path, "turn_left.jpg", "sea.jpg")
+    assert listed(folder, pairs_in(folder).jobs) == {"sea": ("sea.jpg",), "turn_left": ("turn_left.jpg",)}
+
+
+def test_files_of_both_views_are_pairs_and_the_camera_s_copy_beside_them_is_left_out(tmp_path):
+    folder = put(tmp_path, "DSCF1.MPO", "DSCF1.JPG", "tree.jps", "notes.txt")
+    pairs = pairs_in(folder)
+    assert listed(folder, pairs.jobs) == {"DSCF1": ("DSCF1.MPO",), "tree": ("tree.jps",)}
+    assert pairs.notes == (f"{folder}: 1 picture left out, whose names do not say left or right: DSCF1.JPG",)
+
+
+def test_a_scene_folder_brings_its_calibration_and_not_its_ground_truth(tmp_path):
+    names = ["left.png", "right.png", "disparity.png"]
+    folder = put(tmp_path, *(f"{scene}/{name}" for scene in ("a", "b") for name in names), "b/calib.txt")
+    pairs = pairs_in(folder)
+    assert [(job.name, job.calibration) for job in pairs.jobs] == [
+        ("a", None),
+        ("b", folder / "b" / "calib.txt"),
+    ]
+    assert "2 pictures left out" in pairs.notes[0]
+
+
+def test_hidden_files_and_results_of_a_batch_are_no_pictures(tmp_path):
+    folder = put(tmp_path, "a_l.png", "a_r.png", "._a_l.png", ".trash/b_l.png")
+    put(folder, "out/batch.json", "out/a/preview.png", "out/a/left.png", "out/a/right.png")
+    assert listed(folder, pairs_in(folder).jobs) == {"a": ("a_l.png", "a_r.png")}
+
+
+def test_two_pairs_of_one_name_are_refused_before_the_start_even_if_capitals_alone_differ(tmp_path):
+    folder = put(tmp_path, "a_L.png", "a_R.png", "A_L.jpg", "A_R.jpg")
+    with pytest.raises(
+        StereoweaveError, match="pairs of different names, found a for .*A_L.jpg and for .*a_L.png"
+    ):
+        pairs_in(folder)
+
+
+def test_a_folder_without_pictures_is_told_in_one_line(tmp_path):
+    with pytest.raises(StereoweaveError, match="expected pictures in it, .* found none"):
+        pairs_in(put(tmp_path, "film.mp4"))
+    with pytest.raises(StereoweaveError, match="expected a folder of pictures, found no such folder"):
+        pairs_in(tmp_path / "none")
+
+
+def test_pairs_among_the_files_of_a_store_are_those_of_a_folder_with_the_same_files(tmp_path):
+    names = ["a/left.png", "a/right.png", "a/calib.txt", "b_l.png", "b_r.png", "c/1.jps", "d.png", "left.png"]
+    names += ["out/batch.json", "out/e/left.png", "out/e/right.png", "right.png", "calib.txt", "c/calib.txt"]
+    folder = put(tmp_path / "castle", *names)
+    among = pairs_among("s3://bucket/castle", iter(names))
+    assert among.pairs == [
+        ListedPair("c_1", ("c/1.jps",)),
+        ListedPair("a", ("a/left.png", "a/right.png"), "a/calib.txt"),
+        ListedPair("b", ("b_l.png", "b_r.png")),
+        ListedPair("castle", ("left.png", "right.png"), "calib.txt"),
+    ]
+    assert among.left_out == ["d.png"]
+    jobs = pairs_in(folder).jobs
+    assert listed(folder, jobs) == {pair.name: pair.files for pair in among.pairs}
+    assert [job.calibration for job in jobs] == [
+        folder / pair.calibration if pair.calibration else None for pair in among.pairs
+    ]
+
+
+def test_films_have_their_endings_in_their_names_and_are_no_pictures():
+    files = ["a_l.png", "a_r.png", "a.mp4", "trip/a.MKV", "a.webm", "old/batch.json", "old/made.mov", "a.txt"]
+    among = pairs_among("pairs", files)
+    assert [pair.name for pair in among.pairs] == ["a"]
+    assert among.films == [
+        ListedPair("a.mp4", ("a.mp4",)),
+        ListedPair("a.webm", ("a.webm",)),
+        ListedPair("trip_a.MKV", ("trip/a.MKV",)),
+    ]
+    assert among.left_out == []
+
+
+def test_two_films_of_one_name_are_refused():
+    with pytest.raises(StereoweaveError, match="found a_b.mp4 for a/b.mp4 and for a_b.mp4"):
+        pairs_among("pairs", ["a/b.mp4", "a_b.mp4"])
+
+
+def test_a_file_named_like_a_kind_of_file_is_nothing():
+    assert pairs_among("pairs", ["picture", "film", "both views"]) == ([], [], [])
+
+
+def test_nothing_is_found_in_the_folder_that_a_batch_was_written_to():
+    assert pairs_among("out", ["batch.json", "a/left.png", "a/right.png"]) == ([], [], [])
+
+
+def test_a_side_may_be_told_by_folder_and_name_or_by_the_name_alone():
+    files = ["left/a_l.png", "right/a_r.png", "left_run/b_l.png", "left_run/b_r.png"]
+    assert [pair.files for pair in pairs_among("x", files).pairs] == [
+        ("left/a_l.png", "right/a_r.png"),
+        ("left_run/b_l.png", "left_run/b_r.png"),
+    ]
+
+
+def test_globs_are_paired_in_the_order_of_their_names(tmp_path):
+    folder = put(tmp_path, "l/2.png", "l/1.png", "r/c.png", "r/b.png", "l/3.txt")
+    jobs = pairs_by_globs(f"{folder}/l/*.png", f"{folder}/r/*.png")
+    assert listed(folder, jobs) == {"1": ("l/1.png", "r/b.png"), "2": ("l/2.png", "r/c.png")}
+
+
+def test_names_from_globs_tell_folders_apart(tmp_path):
+    folder = put(tmp_path, "a/left.png", "a/right.png", "b/c/left.png", "b/c/right.png")
+    jobs = pairs_by_globs(f"{folder}/**/left.png", f"{folder}/**/right.png")
+    assert listed(folder, jobs) == {
+        "a": ("a/left.png", "a/right.png"),
+        "b_c": ("b/c/left.png", "b/c/right.png"),
+    }
+
+
+def test_a_file_whose_name_has_brackets_is_no_pattern(tmp_path):
+    folder = put(tmp_path, "sea [1].png", "sea [2].png")
+    jobs = pairs_by_globs(f"{folder}/sea [1].png", f"{folder}/sea [2].png")
+    assert listed(folder, jobs) == {"sea [1]": ("sea [1].png", "sea [2].png")}
+
+
+def test_unequal_counts_are_refused_with_both(tmp_path):
+    folder = put(tmp_path, "l/1.png", "l/2.png", "r/1.png")
+    with pytest.raises(StereoweaveError, match=r"found 2 for --left .* and 1 for --right"):
+        pairs_by_globs(f"{folder}/l/*", f"{folder}/r/*")
+    with pytest.raises(StereoweaveError, match=r"--right .*expected pictures, found none"):
+        pairs_by_globs(f"{folder}/l/*", f"{folder}/x/*")
+
+
+@pytest.mark.parametrize(
+    ("line", "name", "pictures"),
+    [
+        ("l/1.png r/1.png", "1", ("l/1.png", "r/1.png")),
+        ("l/1.png   r/1.png", "1", ("l/1.png", "r/1.png")),
+        ("l/1.png\tr/1.png\tquay wall", "quay wall", ("l/1.png", "r/1.png")),
+        ("l/1.png, r/1.png, quay", "quay", ("l/1.png", "r/1.png")),
+        ('"my l.png" "my r.png"', "my", ("my l.png", "my r.png")),
+        ('"a, b.png","c, d.png"', "a, b", ("a, b.png", "c, d.png")),
+        ("l'arbre.png r'arbre.png", "l'arbre", ("l'arbre.png", "r'arbre.png")),
+        ("both.jps", "both", ("both.jps",)),
+        ("both.jps,,tree", "tree", ("both.jps",)),
+        ("a.png b.png ../x:y?", "_x_y_", ("a.png", "b.png")),
+        ("a.png b.png CON", "CON_", ("a.png", "b.png")),
+        ("a.png b.png nul.png", "nul.png_", ("a.png", "b.png")),
+        ("a.png b.png summary.csv", "summary.csv_", ("a.png", "b.png")),
+        ("a.png b.png Plan", "Plan_", ("a.png", "b.png")),
+    ],
+)
+def test_a_line_of_a_list_is_a_pair(tmp_path, line, name, pictures):
+    (tmp_path / "list.txt").write_text(f"# left right\n\n{line}\n", encoding="utf-8-sig")
+    assert listed(tmp_path, pairs_in_list(tmp_path / "list.txt")) == {name: pictures}
+
+
+def test_a_pair_named_like_a_folder_of_a_batch_is_renamed_and_may_not_take_another_s_name(tmp_path):
+    folder = put(
+        tmp_path, *(f"{name}/{side}.png" for name in ("begun", "manifest") for side in ("left", "right"))
+    )
+    assert [job.name for job in pairs_in(folder).jobs] == ["begun_", "manifest_"]
+    put(tmp_path, "manifest_/left.png", "manifest_/right.png")
+    with pytest.raises(
+        StereoweaveError, match="different names, found manifest_ for manifest.*and for manifest_"
+    ):
+        pairs_in(folder)
+
+
+def test_paths_of_a_list_are_relative_to_its_folder_and_those_elsewhere_keep_their_names_apart(tmp_path):
+    (tmp_path / "lists").mkdir()
+    path = tmp_path / "lists" / "list.txt"
+    path.write_text(f"../a/l.png ../a/r.png\n{tmp_path}/b/l.png {tmp_path}/b/r.png\n")
+    first, second = pairs_in_list(path)
+    assert first.pictures == (path.parent / "../a/l.png", path.parent / "../a/r.png")
+    stem = "_".join(tmp_path.parts[1:])
+    assert [first.name, second.name] == [f"{stem}_a", f"{stem}_b"]
+
+
+def test_what_cannot_be_a_picture_is_noticed_only_when_it_is_read(tmp_path):
+    long = "a" * 300  # no file system has such names
+    (tmp_path / "list.txt").write_text(f"/ right.png\n{long}/left.png {long}/right.png\n")
+    assert [job.pictures for job in pairs_in_list(tmp_path / "list.txt")] == [
+        (Path("/"), tmp_path / "right.png"),
+        (tmp_path / long / "left.png", tmp_path / long / "right.png"),
+    ]
+
+
+def test_a_bad_line_is_told_by_its_number(tmp_path):
+    path = tmp_path / "list.txt"
+    path.write_text("a.png b.png\na b c d\n")
+    with pytest.raises(StereoweaveError, match=r"list.txt, line 2: .*found 4 columns: a b c d"):
+        pairs_in_list(path)
+    path.write_text(f"a.png {'b' * 140_000}\n")
+    with pytest.raises(StereoweaveError, match=r"list.txt, line 1: expected .*field larger than"):
+        pairs_in_list(path)
+    path.write_text("# nothing\n")
+    with pytest.raises(StereoweaveError, match="expected a pair in each line, found none"):
+        pairs_in_list(path)
+    with pytest.raises(StereoweaveError, match="expected a list of pairs, found no such file"):
+        pairs_in_list(tmp_path / "none.txt")
+
+
+def test_the_words_of_the_command_line_name_one_source(tmp_path):
+    folder = put(tmp_path, "a_l.png", "a_r.png")
+    left, right = (str(folder / f"a_{side}.png") for side in "lr")
+    (folder / "list.txt").write_text("a_l.png a_r.png a\n")
+    job = Job("a", (Path(left), Path(right)))
+    assert find_pairs([folder], None, None, None) == Pairs([job])
+    assert find_pairs([], left, right, None) == Pairs([job])
+    assert find_pairs([], None, None, folder / "list.txt") == Pairs([job])
+    assert find_pairs([Path(left), Path(right)], None, None, None) is None
+    for words, found in {
+        ((), None, None, None): "none",
+        ((folder,), left, right, None): "pictures with --left and --right",
+        ((), left, None, None): "one of the two patterns",
+    }.items():
+        with pytest.raises(StereoweaveError, match=f"or --list, found {found}"):
+            find_pairs(*words)

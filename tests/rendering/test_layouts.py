@@ -1,0 +1,318 @@
+"""Layouts by values worked out by hand, and by the views that they are made of."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.files import read_image
+from stereoweave.rendering.layouts import (
+    LAYOUTS,
+    MOTIONS,
+    Choices,
+    check_reach,
+    frames,
+    layout_of,
+    marked,
+    middle_px,
+    write_picture,
+)
+from stereoweave.rendering.renderer import Renderer
+from stereoweave.stereo import Estimate, StereoPair
+
+PAIR_LAYOUTS = ["side_by_side", "side_by_side_half", "crossed", "top_bottom", "top_bottom_half"]
+ANAGLYPHS = ["anaglyph_grey", "anaglyph_colour", "anaglyph_half_colour", "anaglyph_dubois"]
+
+
+def estimate_of(disparity_px: np.ndarray, confidence: np.ndarray | None = None) -> Estimate:
+    disparity_px = disparity_px.astype(np.float32)
+    return Estimate(
+        disparity_px=disparity_px,
+        right_disparity_px=disparity_px,
+        confidence=(np.ones_like(disparity_px) if confidence is None else confidence).astype(np.float32),
+        occluded=np.zeros(disparity_px.shape, bool),
+    )
+
+
+def renderer_of(left: np.ndarray, right: np.ndarray, disparity_px: float = 0.0) -> Renderer:
+    estimate = estimate_of(np.full(left.shape[:2], disparity_px))
+    return Renderer(StereoPair(left=left, right=right), estimate, threads=1)
+
+
+def composed(name: str, renderer: Renderer, **choices) -> np.ndarray:
+    return LAYOUTS[name].compose(renderer, Choices(**choices))
+
+
+def plain(*colour: int, height: int = 2, width: int = 2) -> np.ndarray:
+    return np.full((height, width, 3), colour, np.uint8)
+
+
+@pytest.fixture
+def wall(rng) -> Renderer:
+    """A wall 4 px apart in the two pictures of 48x33, with a pattern of 3 px."""
+    wide = np.asarray(
+        Image.fromarray(rng.integers(0, 256, (11, 18, 3), dtype=np.uint8)).resize((54, 33), Image.BICUBIC)
+    )
+    return renderer_of(wide[:, :48].copy(), wide[:, 4:52].copy(), 4.0)
+
+
+def test_the_left_eye_is_on_the_left_on_the_right_where_eyes_cross_and_above():
+    renderer = renderer_of(plain(1, 2, 3), plain(7, 8, 9))
+    assert composed("side_by_side", renderer)[0].tolist() == [[1, 2, 3]] * 2 + [[7, 8, 9]] * 2
+    assert composed("crossed", renderer)[0].tolist() == [[7, 8, 9]] * 2 + [[1, 2, 3]] * 2
+    assert composed("top_bottom", renderer)[:, 0].tolist() == [[1, 2, 3]] * 2 + [[7, 8, 9]] * 2
+
+
+def test_halves_are_means_of_two_columns_and_the_last_of_an_odd_width_is_kept():
+    row = np.repeat(np.array([[10, 20, 30, 50, 90]], np.uint8)[..., None], 3, axis=2)
+    picture = composed("side_by_side_half", renderer_of(row, row + 100))
+    assert picture[..., 1].tolist() == [[15, 40, 90, 115, 140, 190]]
+
+
+def test_halves_are_means_of_two_rows_and_the_last_of_an_odd_height_is_kept():
+    column = np.repeat(np.array([[10], [20], [60]], np.uint8)[..., None], 3, axis=2)
+    picture = composed("top_bottom_half", renderer_of(column, column + 100))
+    assert picture[..., 1].tolist() == [[15], [60], [115], [160]]
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        # 0.299 * 100 + 0.587 * 50 + 0.114 * 200 = 82.05; 0.299 * 40 + 0.587 * 120 + 0.114 * 80 = 91.52
+        ("anaglyph_grey", [82, 92, 92]),
+        ("anaglyph_colour", [100, 120, 80]),
+        ("anaglyph_half_colour", [82, 120, 80]),
+        # 105.91 - 12.42; -9.05 + 101.70; -3.65 + 81.67
+        ("anaglyph_dubois", [93, 93, 78]),
+    ],
+)
+def test_red_is_of_the_left_eye_and_cyan_of_the_right_one(name, expected):
+    picture = composed(name, renderer_of(plain(100, 50, 200), plain(40, 120, 80)))
+    assert picture[0, 0].tolist() == expected
+
+
+@pytest.mark.parametrize("name", ANAGLYPHS)
+@pytest.mark.parametrize("level", [0, 100, 255])
+def test_a_grey_that_both_eyes_see_stays_what_it_is(name, level):
+    grey = plain(level, level, level)
+    np.testing.assert_array_equal(composed(name, renderer_of(grey, grey)), grey)
+
+
+def test_what_an_anaglyph_cannot_show_is_cut_off():
+    # Dubois's green of this pair is -0.04 * 255, his red 0.456 * 255.
+    picture = composed("anaglyph_dubois", renderer_of(plain(255, 0, 0), plain(0, 0, 0)))
+    assert picture[0, 0].tolist() == [116, 0, 0]
+
+
+def test_depth_is_white_where_it_is_near_and_cut_off_beyond_its_range():
+    left = plain(1, 2, 3, height=1, width=4)
+    pair = StereoPair(left=left, right=plain(7, 8, 9, height=1, width=4))
+    renderer = Renderer(pair, estimate_of(np.array([[-3.0, 2.0, 10.0, 20.0]])), threads=1)
+    picture = composed("rgbd", renderer, range_px=(0.0, 10.0))
+    np.testing.assert_array_equal(picture[:, :4], left)
+    assert picture[0, 4:].tolist() == [[0] * 3, [51] * 3, [255] * 3, [255] * 3]
+
+
+def test_depth_takes_the_range_of_its_own_disparities_unless_it_is_given_one(rng):
+    disparity_px = np.linspace(5.0, 25.0, 1000).reshape(20, 50)
+    pair = StereoPair(left=plain(1, 2, 3, height=20, width=50), right=plain(7, 8, 9, height=20, width=50))
+    depth = composed("rgbd", Renderer(pair, estimate_of(disparity_px), threads=1))[:, 50:]
+    assert (depth.min(), depth.max()) == (0, 255)
+    assert depth[10, 0, 0] == 128
+
+
+def test_a_quilt_begins_at_the_bottom_left_and_ends_at_the_top_right(wall):
+    picture = composed("quilt", wall, columns=3, rows=2)
+    # Six views from -0.5 to 1.5 are 0.4 apart.
+    expected = [(0.7, 1.1, 1.5), (-0.5, -0.1, 0.3)]
+    rows = [np.hstack([wall.view(position).image for position in row]) for row in expected]
+    np.testing.assert_array_equal(picture, np.vstack(rows))
+
+
+def test_in_a_quilt_the_wall_goes_to_the_left_as_the_camera_goes_to_the_right(wall):
+    tiles = np.split(composed("quilt", wall, columns=3, rows=1), 3, axis=1)
+    # The three cameras are one baseline apart, and so 4 px.
+    np.testing.assert_allclose(tiles[0][:, 8:40].astype(int), tiles[1][:, 4:36].astype(int), atol=24)
+    np.testing.assert_allclose(tiles[1][:, 8:40].astype(int), tiles[2][:, 4:36].astype(int), atol=24)
+
+
+def test_a_quilt_is_made_smaller_where_it_would_go_beyond_8192_px():
+    renderer = renderer_of(*np.zeros((2, 20, 200, 3), np.uint8))
+    # 50 * 200 px are 1.2207 times 8192 px: views of 163x16 px.
+    assert composed("quilt", renderer, columns=50, rows=4).shape == (4 * 16, 50 * 163, 3)
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(0, 6), (1, 1), (-2, -3), (21, 10)])
+def test_a_quilt_has_2_to_200_views(columns, rows):
+    with pytest.raises(StereoweaveError, match=f"2 to 200 views, got {columns}x{rows}"):
+        Choices(columns=columns, rows=rows)
+
+
+def test_a_contact_sheet_is_read_from_the_left_camera_s_side_to_the_right_one_s(wall):
+    sheet = composed("contact_sheet", wall)
+    assert sheet.shape == (33, 48, 3)
+    left, middle, right = (
+        np.asarray(Image.fromarray(wall.view(position).image).resize((16, 11), Image.BOX)).astype(int)
+        for position in (-0.5, 0.5, 1.5)
+    )
+    np.testing.assert_allclose(sheet[:11, :16], left, atol=1)
+    np.testing.assert_allclose(sheet[11:22, 16:32], middle, atol=1)
+    np.testing.assert_allclose(sheet[22:, 32:], right, atol=1)
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_every_layout_takes_odd_sizes_and_leaves_the_pair_as_it_was(name, rng):
+    left, right = rng.integers(0, 256, (2, 33, 45, 3), dtype=np.uint8)
+    before = left.copy(), right.copy()
+    picture = composed(name, renderer_of(left, right, 2.0))
+    assert picture.dtype == np.uint8
+    assert picture.shape[2] == 3
+    np.testing.assert_array_equal((left, right), before)
+
+
+def test_a_motion_goes_there_and_back_without_a_stop_where_it_begins_anew():
+    for motion in MOTIONS.values():
+        positions = np.array(motion.positions)
+        assert positions[0] == 0
+        assert positions.max() <= 1
+        np.testing.assert_allclose(positions[1:], positions[:0:-1], atol=1e-12)
+        assert (np.diff(np.append(positions, positions[0])) != 0).all()
+        assert motion.frame_ms % 10 == 0
+
+
+def test_a_wiggle_is_seen_from_both_cameras():
+    assert {0.0, 1.0} <= set(MOTIONS["wiggle"].positions)
+
+
+def test_an_mp4_wiggles_for_a_few_seconds_and_what_repeats_itself_once():
+    wiggle = MOTIONS["wiggle"]
+    assert (wiggle.turns("a.gif"), wiggle.turns("a.webp")) == (1, 1)
+    assert 3000 < wiggle.turns("a.MP4") * len(wiggle.positions) * wiggle.frame_ms < 5000
+
+
+def test_frames_are_rendered_when_they_are_asked_for(wall):
+    coming = frames(wall, [1.0, 7.0])
+    np.testing.assert_array_equal(next(coming), wall.pair.right)
+    with pytest.raises(StereoweaveError, match="position"):
+        next(coming)
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "expected"),
+    [
+        ("quilt", "view.png", "view_qs8x6a0.75.png"),
+        ("quilt", "a.b/view.v2.jpg", "a.b/view.v2_qs8x6a0.75.jpg"),
+        ("quilt", "view_qs8x6a0.75.png", "view_qs8x6a0.75.png"),
+        ("side_by_side", "view.png", "view_LRF_Full_SBS.png"),
+        ("side_by_side", "view.MPO", "view.MPO"),
+        ("side_by_side_half", "view.png", "view_half_LR.png"),
+        ("crossed", "view.png", "view_RLF_cross.png"),
+        ("crossed", "view.jps", "view.jps"),
+        ("top_bottom", "view.png", "view_TBF_fulltb.png"),
+        ("top_bottom_half", "view.png", "view_half_TB.png"),
+        ("rgbd", "view.png", "view_RGBD.png"),
+        ("anaglyph_dubois", "view.png", "view.png"),
+        ("contact_sheet", "view.png", "view.png"),
+    ],
+)
+def test_a_file_has_the_mark_that_its_viewers_look_for(name, given, expected):
+    picture = plain(0, 0, 0, height=8, width=6)
+    assert marked(given, name, StereoPair(left=picture, right=picture), Choices()) == Path(expected)
+
+
+def test_the_mark_of_a_quilt_says_what_it_has():
+    picture = plain(0, 0, 0, height=9, width=16)
+    pair = StereoPair(left=picture, right=picture)
+    assert marked("view.png", "quilt", pair, Choices(columns=5, rows=9)) == Path("view_qs5x9a1.778.png")
+
+
+@pytest.mark.parametrize(
+    ("path", "name", "expected"),
+    [
+        ("view.png", None, None),
+        ("view.mpo", None, "side_by_side"),
+        ("view.JPS", None, "crossed"),
+        ("view.mpo", "side_by_side", "side_by_side"),
+        ("view.webp", "quilt", "quilt"),
+        ("view.webp", "wiggle", "wiggle"),
+    ],
+)
+def test_a_layout_is_known_by_its_name_or_by_the_ending_of_the_file(path, name, expected):
+    assert layout_of(path, name) == expected
+
+
+@pytest.mark.parametrize(
+    ("path", "name", "expected"),
+    [
+        ("view.png", "quild", "side_by_side, .*, quilt, .*, wiggle, found 'quild'"),
+        ("view.mpo", "crossed", r"view\.mpo: expected the layout side_by_side .* found crossed"),
+        ("view.jps", "quilt", r"view\.jps: expected the layout crossed .* found quilt"),
+        ("view.png", "wiggle", r"view\.png: expected the ending of an animation, \.mp4, \.gif, \.webp"),
+        ("view.gif", "quilt", r"view\.gif: expected the ending of a picture, \.png"),
+        ("view.mp4", None, r"view\.mp4: expected the ending of a picture, \.png"),
+    ],
+)
+def test_an_unknown_layout_or_an_ending_that_does_not_fit_it_is_told(path, name, expected):
+    with pytest.raises(StereoweaveError, match=expected):
+        layout_of(path, name)
+
+
+@pytest.mark.parametrize(
+    ("positions", "strength"),
+    [((-1.0, 2.0), 1.0), ((0.0, 1.0), 3.0), ((-0.5, 1.5), 1.5), ((2.5,), 0.5), ((), 100.0)],
+)
+def test_what_a_renderer_reaches_is_accepted(positions, strength):
+    check_reach(positions, strength)
+
+
+@pytest.mark.parametrize(
+    ("positions", "strength", "found"),
+    [
+        ((7.0,), 1.0, "got 7"),
+        ((float("nan"),), 1.0, "got nan"),
+        ((0.0, 1.0), 4.0, "got -1.5, where strength 4 takes 0"),
+        ((0.5, 1.5), 2.0, "got 2.5, where strength 2 takes 1.5"),
+        ((0.5,), float("nan"), "got nan"),
+    ],
+)
+def test_what_no_renderer_reaches_is_told(positions, strength, found):
+    with pytest.raises(StereoweaveError, match=f"expected -1 to 2 .*, {found}"):
+        check_reach(positions, strength)
+
+
+def test_the_middle_of_a_scene_is_where_half_of_the_confidence_is_nearer():
+    disparity_px, confidence = np.array([[1.0, 100, 6, 7, 5]]), np.array([[1.0, 0.1, 0.1, 0.1, 1]])
+    # In order 1, 5, 6, 7, 100 px: half of the sum, 1.15, is reached at 5 px.
+    assert middle_px(estimate_of(disparity_px, confidence)) == 5
+    assert middle_px(estimate_of(disparity_px, np.zeros((1, 5)))) == 6
+
+
+def test_an_mpo_file_holds_two_pictures_the_left_eye_s_first(tmp_path, wall):
+    write_picture(tmp_path / "view.mpo", composed("side_by_side", wall))
+    with Image.open(tmp_path / "view.mpo") as file:
+        assert (file.format, file.n_frames) == ("MPO", 2)
+        for index, eye in enumerate((wall.pair.left, wall.pair.right)):
+            file.seek(index)
+            assert np.abs(np.asarray(file.convert("RGB")).astype(int) - eye).mean() < 4  # the other eye's: 50
+    assert [file.name for file in tmp_path.iterdir()] == ["view.mpo"]
+
+
+def test_a_jps_file_is_a_jpeg_that_says_which_eye_is_where(tmp_path, wall):
+    picture = composed("crossed", wall)
+    write_picture(tmp_path / "view.jps", picture)
+    with Image.open(io.BytesIO((tmp_path / "view.jps").read_bytes())) as file:
+        segments = dict(file.applist)
+        assert file.format == "JPEG"
+        assert np.abs(np.asarray(file).astype(int) - picture).mean() < 4
+    # By ExifTool's table: flags without "left field first", layout 2 side by side, type 1 stereo.
+    assert segments["APP3"][:8] == b"_JPSJPS_"
+    assert list(segments["APP3"][10:14]) == [0, 0, 2, 1]
+
+
+def test_other_endings_are_pictures_as_any(tmp_path, wall):
+    picture = composed("quilt", wall)
+    write_picture(tmp_path / "view.png", picture)
+    np.testing.assert_array_equal(read_image(tmp_path / "view.png"), picture)

@@ -1,0 +1,47 @@
+import numpy as np
+import pytest
+
+import stereoweave as sw
+from stereoweave.bench.metrics import psnr_db
+from stereoweave.errors import MatcherError
+from stereoweave.io.files import read_image
+from stereoweave.matching.estimate import estimate
+from stereoweave.rendering.renderer import render
+from stereoweave.rendering.synthesize import synthesize
+
+
+@pytest.fixture
+def pair(rng):
+    coarse = rng.integers(0, 256, (12, 30, 3)).repeat(8, axis=0).repeat(8, axis=1).astype(np.uint8)
+    return coarse[:, :160], coarse[:, 10:170]  # 10 px of disparity everywhere
+
+
+def test_synthesizing_is_estimating_and_then_rendering(pair):
+    view = synthesize(*pair, position=0.3)
+    expected = render(*pair, estimate(*pair, model="base", refined=True), 0.3)
+    np.testing.assert_array_equal(view.image, expected.image)
+    np.testing.assert_array_equal(view.drawn, expected.drawn)
+
+
+def test_the_model_is_the_callers_choice(pair):
+    with pytest.raises(MatcherError, match="no_such_model"):
+        synthesize(*pair, 0.5, model="no_such_model")
+
+
+def test_a_position_out_of_range_is_refused_before_a_model_is_loaded(pair):
+    with pytest.raises(ValueError, match="^position: expected"):
+        synthesize(*pair, 2.5, model="no_such_model")
+
+
+@pytest.mark.testdata
+def test_a_real_photograph_from_between_is_met_better_than_by_fading(testdata):
+    scene = testdata / "stereo/views/tsukuba"
+    left, right, truth = (read_image(scene / f"{name}.png") for name in ("left", "right", "view_0.5"))
+    faded = np.round((left.astype(float) + right) / 2).astype(np.uint8)
+    assert psnr_db(synthesize(left, right, 0.5).image, truth) > psnr_db(faded, truth) + 6
+
+
+def test_render_is_still_the_function_after_synthesize_was_used(pair):
+    view = sw.synthesize(*pair, position=0.5)
+    again = sw.render(*pair, sw.estimate(*pair, model="base", refined=True), position=0.5)
+    np.testing.assert_array_equal(again.image, view.image)

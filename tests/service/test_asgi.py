@@ -1,0 +1,290 @@
+"""The service without a server, and with functions that do its work."""
+
+import asyncio
+import tempfile
+import threading
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from service_examples import BOTH
+
+from stereoweave.errors import ProviderError
+from stereoweave.service.admission import BusyError
+from stereoweave.service.answers import Answer, Order, TooLargeError
+from stereoweave.system.child_process import ProcessDiedError
+
+# What Ray Serve is warned of by Pydantic when it is imported.
+pytestmark = pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`:DeprecationWarning")
+
+
+def guarded(
+    answering: Any, metrics: Callable[[], bytes] = bytes, folder: Path | None = None, **limits: Any
+) -> httpx.AsyncClient:
+    """A client of the service without a server, whose work is done by a function."""
+    from stereoweave.service.asgi import Guard, Limits, make_app
+
+    allowed = Limits(**limits)
+    app = Guard(make_app(answering, allowed, metrics, folder or Path(tempfile.gettempdir())), allowed)
+    return httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://service")
+
+
+FORM = {"Content-Type": "multipart/form-data; boundary=b"}
+
+
+def ask_guarded(
+    answering: Any, content: AsyncIterator[bytes] | bytes | None = None, **limits: Any
+) -> httpx.Response:
+    """The response of a guard that allows a fifth of a second, unless told otherwise."""
+
+    async def ask() -> httpx.Response:
+        async with guarded(answering, **{"timeout_s": 0.2, **limits}) as client:
+            if content is None:
+                return await client.post("/disparity", files=BOTH)
+            return await client.post("/disparity", content=content, headers=FORM)
+
+    return asyncio.run(ask())
+
+
+async def never(order: Order, left_s: float) -> Answer:
+    await asyncio.Event().wait()
+
+
+def test_a_provider_that_fails_is_no_fault_of_the_request():
+    async def fails(order: Order, left_s: float) -> Answer:
+        raise ProviderError(
+            "provider cuda: expected to run /srv/net.onnx, found that it failed: out of memory"
+        )
+
+    response = ask_guarded(fails)
+    assert response.status_code == 503
+    assert response.json()["detail"] == (
+        "provider cuda: expected to run net.onnx, found that it failed: out of memory"
+    )
+
+
+def test_what_takes_too_long_is_cancelled():
+    response = ask_guarded(never)
+    assert response.status_code == 504
+    assert response.json()["detail"].startswith("expected to be done within 0.2 s")
+
+
+def test_a_request_that_does_not_arrive_is_not_waited_for():
+    async def stalls() -> AsyncIterator[bytes]:
+        yield b"--b\r\n"
+        await asyncio.Event().wait()
+
+    response = ask_guarded(never, stalls())
+    assert response.status_code == 408
+    assert "found a part of it" in response.json()["detail"]
+
+
+def test_as_many_requests_are_accepted_at_a_time_as_may_wait_and_no_more():
+    async def ask() -> list[int]:
+        done, accepted = asyncio.Event(), []
+
+        async def waits(order: Order, left_s: float) -> Answer:
+            accepted.append(order)
+            await done.wait()
+            return Answer(content=b"", report="{}")
+
+        async with guarded(waits, waiting=2, timeout_s=20) as client:
+            first = [asyncio.create_task(client.post("/disparity", files=BOTH)) for _ in range(2)]
+            while len(accepted) < 2:
+                await asyncio.sleep(0)
+            third = await client.post("/disparity", files=BOTH)
+            done.set()
+            answered = await asyncio.gather(*first)
+            after = await client.post("/disparity", files=BOTH)
+            return [response.status_code for response in (third, *answered, after)]
+
+    assert asyncio.run(ask()) == [503, 200, 200, 200]
+
+
+def test_a_request_without_a_length_is_refused_once_more_bytes_arrive_than_are_taken():
+    sent = []
+
+    async def streams() -> AsyncIterator[bytes]:
+        yield b'--b\r\nContent-Disposition: form-data; name="left"; filename="l"\r\n\r\n'
+        for _ in range(30):
+            sent.append(100_000)
+            yield bytes(100_000)
+
+    response = ask_guarded(never, streams(), megabytes=1, timeout_s=60)
+    assert response.status_code == 413
+    assert "expected a request of at most 1 MB" in response.json()["detail"]
+    assert sum(sent) == 1_000_000  # with the head of the part more than 1 MB
+
+
+@pytest.mark.parametrize(
+    ("headers", "path", "status"),
+    [
+        ({"Authorization": "Bearer secret-1"}, "/openapi.json", 200),
+        ({"Authorization": "Bearer secret-2"}, "/openapi.json", 401),
+        ({"Authorization": "Bearer secret-1 "}, "/metrics", 401),
+        ({"Authorization": "Basic secret-1"}, "/metrics", 401),
+        ({"Authorization": "Bearer \xe4"}, "/metrics", 401),
+        ({}, "/metrics", 401),
+        ({}, "/nothing", 401),
+        ({}, "/health/", 401),
+        ({}, "/health", 200),
+    ],
+)
+def test_where_there_is_a_token_all_but_health_need_it(headers, path, status):
+    async def get() -> httpx.Response:
+        async with guarded(never, token="secret-1") as client:
+            return await client.get(path, headers={k: v.encode("latin-1") for k, v in headers.items()})
+
+    response = asyncio.run(get())
+    assert response.status_code == status
+    if status == 401:
+        assert response.headers["WWW-Authenticate"] == "Bearer"
+        assert "secret" not in response.text
+        assert response.json()["detail"].startswith("expected the header Authorization: Bearer")
+
+
+def test_without_the_token_not_even_the_body_of_a_form_is_read():
+    async def never_sent() -> AsyncIterator[bytes]:
+        await asyncio.Event().wait()
+        yield b""
+
+    assert ask_guarded(never, never_sent(), token="secret").status_code == 401
+
+
+def test_work_for_a_client_that_goes_away_is_cancelled():
+    from stereoweave.service.asgi import Guard, Limits, make_app
+
+    async def leave() -> bool:
+        begun, cancelled = asyncio.Event(), asyncio.Event()
+
+        async def waits(order: Order, left_s: float) -> Answer:
+            begun.set()
+            try:
+                await asyncio.Event().wait()
+            finally:
+                cancelled.set()
+
+        request = httpx.Request("POST", "http://service/disparity", files=BOTH)
+        messages = [{"type": "http.request", "body": request.read()}]
+
+        async def receive() -> dict[str, Any]:
+            if messages:
+                return messages.pop()
+            await begun.wait()
+            return {"type": "http.disconnect"}
+
+        async def send(message: Any) -> None:
+            raise AssertionError("nobody listens")
+
+        scope = {
+            "type": "http",
+            "method": "POST",
+            "path": "/disparity",
+            "query_string": b"",
+            "headers": [(name.lower(), value) for name, value in request.headers.raw],
+        }
+        app = Guard(make_app(waits, Limits(), bytes, Path(tempfile.gettempdir())), Limits())
+        await asyncio.wait_for(app(scope, receive, send), 10)
+        return cancelled.is_set()
+
+    assert asyncio.run(leave())
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "header"),
+    [
+        (TooLargeError("too large"), 413, None),
+        (BusyError("busy", retry_after_s=7), 503, "7"),
+        (ProcessDiedError("it crashed"), 503, None),
+        (TimeoutError("late"), 504, None),
+    ],
+)
+def test_what_the_work_came_to_is_told_by_the_status(error, status, header):
+    async def fails(order: Order, left_s: float) -> Answer:
+        raise error
+
+    response = ask_guarded(fails, timeout_s=60)
+    assert response.status_code == status
+    assert response.json() == {"detail": str(error)}
+    assert response.headers.get("Retry-After") == header
+
+
+async def at_once(order: Order, left_s: float) -> Answer:
+    return Answer(content=order.pictures[0].read_bytes(), report="{}")
+
+
+def test_a_folder_that_was_removed_meanwhile_is_made_again(tmp_path):
+    folder = tmp_path / "emptied" / "own"
+    response = ask_guarded(at_once, folder=folder, timeout_s=60)
+    assert (response.status_code, response.content) == (200, BOTH["left"])
+    assert folder.stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.parametrize(
+    ("error", "found"),
+    [
+        (OSError(28, "No space left on device", "/srv/files/left"), "No space left on device: 'left'"),
+        (MemoryError("Unable to allocate\n4 GiB"), "Unable to allocate 4 GiB"),
+        (MemoryError(), "too little memory"),
+    ],
+)
+def test_a_machine_without_room_is_no_fault_of_the_request(error, found):
+    async def fails(order: Order, left_s: float) -> Answer:
+        raise error
+
+    response = ask_guarded(fails, timeout_s=60)
+    assert response.status_code == 503
+    detail = response.json()["detail"]
+    assert detail.startswith("expected room for the request on the disk and in memory, found ")
+    assert found in detail
+    assert "\n" not in detail
+
+
+def test_a_flood_of_requests_for_metrics_holds_no_other_up_and_gathers_them_once():
+    gathered, allowed = [], threading.Event()
+
+    def gather() -> bytes:
+        gathered.append(threading.get_ident())
+        allowed.wait(10)
+        return b"counted 1\n"
+
+    async def flood() -> tuple[int, set[tuple[int, bytes]]]:
+        async with guarded(at_once, gather, timeout_s=3) as client:
+            asked = [asyncio.create_task(client.get("/metrics")) for _ in range(50)]
+            while not gathered:
+                await asyncio.sleep(0)
+            posted = await client.post("/disparity", files=BOTH)
+            allowed.set()
+            return posted.status_code, {
+                (each.status_code, each.content) for each in await asyncio.gather(*asked)
+            }
+
+    assert asyncio.run(flood()) == (200, {(200, b"counted 1\n")})
+    assert len(gathered) == 1
+
+
+def test_a_response_that_could_not_be_begun_in_time_becomes_one_that_says_so():
+    from stereoweave.service.asgi import Guard, Limits, make_app
+
+    async def answers(order: Order, left_s: float) -> Answer:
+        return Answer(content=b"done", report="{}")
+
+    async def ask() -> httpx.Response:
+        limits, unread = Limits(timeout_s=0.2), [asyncio.Event()]
+        guard = Guard(make_app(answers, limits, bytes, Path(tempfile.gettempdir())), limits)
+
+        async def to_a_slow_reader(scope: Any, receive: Any, send: Any) -> None:
+            async def send_when_read(message: Any) -> None:
+                if unread:  # an earlier response, the first time
+                    await unread.pop().wait()
+                await send(message)
+
+            await guard(scope, receive, send_when_read)
+
+        transport = httpx.ASGITransport(to_a_slow_reader)
+        async with httpx.AsyncClient(transport=transport, base_url="http://service") as client:
+            return await client.post("/disparity", files=BOTH)
+
+    assert asyncio.run(ask()).status_code == 504

@@ -1,0 +1,388 @@
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import httpx
+import numpy as np
+import pytest
+import watching
+from hostile_calibrations import HOSTILE
+from hostile_requests import hostile
+from prometheus_client.parser import text_string_to_metric_families
+from service_examples import BOTH, CALIB, EXAMPLES, Sender, malformed
+
+import stereoweave as sw
+from stereoweave.cameras.calibration_files import calibrated
+from stereoweave.cli.root import main
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.files import read_disparity_png, read_image, read_pair, read_pfm, write_image
+
+WAITING, MEGABYTES = 3, 4
+
+# What Ray Serve is warned of by Pydantic when it is imported.
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`:DeprecationWarning"),
+]
+
+
+class Running(NamedTuple):
+    client: httpx.Client
+    pid: int
+    uploads: Path
+
+
+@pytest.fixture(scope="module")
+def service(running) -> httpx.Client:
+    return running.client
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory) -> Iterator[Running]:
+    limits = ["--waiting", WAITING, "--max-megabytes", MEGABYTES, "--max-megapixels", 1, "--timeout-s", 20]
+    with served(tmp_path_factory.mktemp("uploads"), "--batch", 2, *limits) as running:
+        yield running
+
+
+@contextmanager
+def served(uploads: Path, *words: object) -> Iterator[Running]:
+    """The command, in a process of its own, which has to end by itself, and all that it started with it."""
+    # Metrics each second, and not each ten. The names of the sockets of Ray may not be long.
+    ray = {"RAY_metrics_report_interval_ms": "1000", "RAY_TMPDIR": "/tmp"}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "stereoweave", "serve", "--port", "0", *map(str, words)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **ray, "TMPDIR": str(uploads)},
+    )
+    try:
+        with process.stdout:
+            url = re.search(r"http://[\d.:]+", process.stdout.readline())[0]
+            started = set(watching.children(process.pid))
+            # Each request has a connection of its own, as those of many clients.
+            alone = httpx.Limits(max_keepalive_connections=0)
+            with httpx.Client(base_url=url, timeout=60, limits=alone) as client:
+                yield Running(client, process.pid, uploads)
+            started |= set(watching.children(process.pid))
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(30) == 0
+            assert not still_running(started, within_s=10)
+            assert not list(uploads.glob("stereoweave-*"))
+    finally:
+        process.kill()
+        process.wait()
+
+
+def still_running(pids: set[int], within_s: float) -> list[int]:
+    """The processes that have not ended by then."""
+    deadline_s = time.monotonic() + within_s
+    while (left := [pid for pid in pids if Path(f"/proc/{pid}").exists()]) and time.monotonic() < deadline_s:
+        time.sleep(0.05)
+    return left
+
+
+def post(service: httpx.Client, path: str, files: Any = BOTH, **data: Any) -> httpx.Response:
+    return service.post(path, files=files, data=data)
+
+
+def saved(response: httpx.Response, path: Path) -> Path:
+    assert response.status_code == 200, response.text
+    path.write_bytes(response.content)
+    return path
+
+
+@pytest.fixture(scope="module")
+def photos() -> tuple[np.ndarray, np.ndarray]:
+    pair = read_pair(EXAMPLES / "left.png", EXAMPLES / "right.png")
+    return pair.left, pair.right
+
+
+@pytest.fixture(scope="module")
+def estimate(photos) -> sw.Estimate:
+    return sw.estimate(*photos, model="small")
+
+
+def test_a_pair_gets_the_disparity_that_the_library_finds(service, estimate, tmp_path):
+    pfm = saved(post(service, "/disparity", file="pfm"), tmp_path / "disparity.pfm")
+    np.testing.assert_allclose(read_pfm(pfm), estimate.disparity_px, atol=1e-3)
+    png = saved(post(service, "/disparity"), tmp_path / "disparity.png")
+    np.testing.assert_allclose(read_disparity_png(png), estimate.disparity_px, atol=1 / 256)
+
+
+def test_a_pair_and_its_calibration_get_depth_in_metres(service, estimate, photos, tmp_path):
+    camera = calibrated(sw.StereoPair(left=photos[0], right=photos[1]), EXAMPLES / "calib.txt").camera
+    response = post(service, "/depth", {**BOTH, "calib": CALIB}, file="npy")
+    depth_m = np.load(saved(response, tmp_path / "depth.npy"), allow_pickle=False)
+    np.testing.assert_allclose(depth_m, camera.depth_m(estimate.disparity_px), rtol=1e-3)
+    report = json.loads(response.headers["X-Stereoweave-Report"])
+    assert report["width_px"] == 640
+    assert report["camera"]["focal_px"] == 600
+
+
+def test_a_view_is_the_one_of_the_library(service, photos, tmp_path):
+    view = saved(post(service, "/view", position=0.3), tmp_path / "view.png")
+    expected = sw.synthesize(*photos, 0.3, model="small").image.astype(int)
+    assert np.abs(read_image(view) - expected).mean() < 0.01
+
+
+def test_one_picture_of_both_views_is_as_good_as_two(service, photos, tmp_path):
+    write_image(tmp_path / "both.png", np.hstack(photos))
+    picture = {"picture": (tmp_path / "both.png").read_bytes()}
+    response = post(service, "/disparity", picture, format="side_by_side", file="tiff")
+    whole = post(service, "/disparity", file="tiff")
+    assert response.content == whole.content
+
+
+def test_a_range_that_is_given_is_kept(service, tmp_path):
+    pfm = saved(post(service, "/disparity", range="8,16", file="pfm"), tmp_path / "disparity.pfm")
+    assert read_pfm(pfm).min() == 8
+    assert read_pfm(pfm).max() == 16
+
+
+def test_no_malformed_request_is_answered_with_a_server_error(service):
+    requests = malformed(MEGABYTES)
+    assert len(requests) >= 100
+    with ThreadPoolExecutor(WAITING - 1) as pool:
+        answers = dict(zip(requests, pool.map(lambda send: send(service), requests.values()), strict=True))
+    wrong = {name: answer for name, answer in answers.items() if not 400 <= answer[0] < 500}
+    assert not wrong
+    details = {
+        name: json.loads(text)["detail"] for name, (_, text) in answers.items() if text.startswith("{")
+    }
+    assert len(details) > len(requests) - 5  # to HTTP that is none, the server itself speaks
+    for name, detail in details.items():
+        assert "\n" not in detail, name
+        assert "/tmp" not in detail, name
+    assert post(service, "/disparity").status_code == 200
+
+
+def test_a_service_that_is_full_refuses_and_does_what_it_accepted(service):
+    with ThreadPoolExecutor(16) as pool:
+        responses = list(pool.map(lambda _: post(service, "/disparity", refined=True), range(16)))
+        health = service.get("/health")
+    assert health.json()["status"] == "ok"
+    done, refused = ([each for each in responses if each.status_code == status] for status in (200, 503))
+    assert len(done) >= WAITING
+    assert len(done) + len(refused) == 16
+    assert {response.headers["Retry-After"] for response in refused} == {"1"}
+    assert "come again" in refused[0].json()["detail"]
+
+
+def test_hostile_requests_and_calibrations_leave_it_answering_at_once_and_small(running):
+    calibrations = dict(list(HOSTILE.items())[:: max(1, len(HOSTILE) // 60)])
+    requests = {name: partial(post_calibration, content) for name, content in calibrations.items()}
+    requests |= hostile() | malformed(MEGABYTES)
+    assert len(calibrations) >= 60
+    assert len(requests) >= 260
+    watcher = [sys.executable, watching.__file__, str(running.client.base_url), str(running.pid)]
+    with (
+        subprocess.Popen(watcher, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as watch,
+        ThreadPoolExecutor(12) as pool,
+    ):
+        sent = {name: pool.submit(send_until_taken, send, running.client) for name, send in requests.items()}
+        statuses = {name: status.result() for name, status in sent.items()}
+        seen = json.loads(watch.communicate()[0])
+    assert not {name: status for name, status in statuses.items() if status >= 500}
+    assert not {name for name in calibrations if statuses[name] == 200}
+    assert len(seen["health_s"]) > 20
+    assert max(seen["health_s"]) < 1
+    assert max(seen["megabytes"]) < 2000
+    assert post(running.client, "/disparity").status_code == 200
+
+
+def post_calibration(content: bytes, client: httpx.Client) -> tuple[int, str]:
+    try:
+        response = post(client, "/depth", {**BOTH, "calib": content})
+    except (httpx.ReadError, httpx.WriteError):  # refused, and closed, while it was still being sent
+        return 503, ""
+    return response.status_code, response.text
+
+
+def send_until_taken(send: Sender, client: httpx.Client) -> int:
+    """The status that is answered once others have made room; 503 where they do not within five minutes.
+
+    The slow ones among the others take all the time that the service allows, one after another.
+    """
+    deadline_s = time.monotonic() + 300
+    while (status := send(client)[0]) == 503 and time.monotonic() < deadline_s:
+        time.sleep(0.5)
+    return status
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("localhost", 200),
+        ("LOCALHOST:1", 200),
+        ("127.0.0.1:99", 200),
+        ("evil.example", 400),
+        ("127.0.0.1.evil", 400),
+    ],
+)
+def test_only_requests_to_a_name_of_this_machine_are_answered(service, host, status):
+    for path in ("/health", "/openapi.json"):
+        assert service.get(path, headers={"Host": host}).status_code == status
+
+
+def test_temporary_folders_that_were_removed_are_made_again_and_one_that_cannot_be_made_is_said(running):
+    for folder in running.uploads.glob("stereoweave-service-*/"):
+        shutil.rmtree(folder)
+    assert post(running.client, "/disparity").status_code == 200
+    [measuring] = running.uploads.glob("stereoweave-service-*/measuring")
+    measuring.rmdir()
+    measuring.touch()
+    refused = post(running.client, "/disparity")
+    assert refused.status_code == 503
+    assert refused.json()["detail"].startswith(
+        "expected room for the request on the disk and in memory, found "
+    )
+    measuring.unlink()
+    assert post(running.client, "/disparity").status_code == 200
+
+
+def test_its_description_names_every_path_and_field(service):
+    description = service.get("/openapi.json").json()
+    assert description["openapi"].startswith("3.1")
+    assert set(description["paths"]) == {"/disparity", "/depth", "/view", "/health", "/metrics"}
+    for what, form in {"disparity": "MapForm", "depth": "MapForm", "view": "ViewForm"}.items():
+        said = description["paths"][f"/{what}"]["post"]
+        schema = said["requestBody"]["content"]["multipart/form-data"]["schema"]
+        assert schema == {"$ref": f"#/components/schemas/{form}"}
+        responses = said["responses"]
+        assert set(responses) == {"200", "400", "401", "408", "413", "415", "422", "503", "504"}
+        assert "X-Stereoweave-Report" in responses.pop("200")["headers"]
+        for refusal in responses.values():
+            assert refusal["content"]["application/json"]["schema"] == {
+                "$ref": "#/components/schemas/Refusal"
+            }
+    fields = description["components"]["schemas"]["ViewForm"]["properties"]
+    assert {"left", "right", "picture", "position", "file", "range", "calib"} <= set(fields)
+
+
+def test_its_metrics_count_requests_by_status(service):
+    assert post(service, "/depth").status_code == 422  # no camera
+    with pytest.raises(httpx.ReadTimeout):  # the client goes away
+        service.post("/view", files=BOTH, timeout=httpx.Timeout(60, read=0.05))
+    expected = {("/depth", "422"), ("/view", "499"), ("/disparity", "200"), ("/disparity", "503")}
+    deadline_s = time.monotonic() + 30
+    while time.monotonic() < deadline_s:
+        families = {
+            family.name: family for family in text_string_to_metric_families(service.get("/metrics").text)
+        }
+        counted = families.get("ray_stereoweave_requests")
+        seen = {(s.labels["path"], s.labels["status"]) for s in counted.samples} if counted else set()
+        if expected <= seen:
+            break
+        time.sleep(0.2)
+    assert expected <= seen
+    assert families["ray_stereoweave_request_seconds"].type == "histogram"
+    batches = {s.labels.get("le"): s.value for s in families["ray_serve_actual_batch_size"].samples}
+    assert batches["+Inf"] > batches["1.0"]  # some were of two
+
+
+def test_a_port_that_is_taken_is_one_line(capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert main(["serve", "--port", str(port)]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"stereoweave: --host 127.0.0.1 --port {port}: expected an address that is free")
+    assert told.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--model", "none.onnx"], "none.onnx: expected an ONNX matcher"),
+        (["--timeout-s", "inf"], "--timeout-s: expected a finite number, found inf"),
+        (["--provider", "abacus"], "abacus"),
+        (["--address", "127.0.0.1:1"], "127.0.0.1:1: expected the head of a Ray cluster"),
+        (["--replicas", "999"], "--replicas 999 --threads 1: expected at most"),
+        (["--host", "0.0.0.0"], "--host 0.0.0.0: expected an address of this machine alone"),
+        (
+            ["--host", "0.0.0.0", "--address", "127.0.0.1:1"],
+            "put a proxy before the service (deploy/nginx.conf)",
+        ),
+        (["--host", "0.0.0.0", "--behind-proxy", "--replicas", "999"], "--replicas 999 --threads 1"),
+        (["--token-file", "none"], "--token-file none: expected a file with a token, found"),
+        (["--token-file", os.devnull], "expected a token of letters, digits and -._~+/=, found nothing"),
+        (["--token-file", str(EXAMPLES / "left.png")], "left.png: expected a file with a token, found"),
+        (
+            ["--token-file", str(EXAMPLES / "calib.txt")],
+            "found other characters; make one with",
+        ),
+    ],
+)
+def test_what_cannot_be_served_is_said_before_ray_starts(words, expected, capsys):
+    assert main(["serve", "--port", "0", *words]) == 2
+    told = capsys.readouterr().err
+    assert expected in told
+    assert told.count("\n") == 1
+
+
+def test_a_cluster_without_room_is_said_and_not_waited_for(ray_address, capsys):
+    assert main(["serve", "--port", "0", "--address", ray_address, "--threads", "3"]) == 2
+    told = capsys.readouterr().err
+    assert told == (
+        "stereoweave: --replicas 1 --threads 3: expected at most 0, for which there is room, found 1; "
+        "each takes 3 cores\n"
+    )
+
+
+def test_a_network_that_the_cluster_does_not_have_is_named(ray_address, capsys):
+    words = ["--address", ray_address, "--threads", "1", "--model", "none.onnx"]
+    assert main(["serve", "--port", "0", *words]) == 2
+    told = capsys.readouterr().err
+    assert "found none.onnx: expected an ONNX matcher, found no such file; is the model there too?" in told
+    assert told.count("\n") == 1
+
+
+def test_what_the_command_says_of_hosts_and_the_token_holds_for_the_service(tmp_path, monkeypatch):
+    kept = []
+
+    def serving(settings: Any, listener: socket.socket, address: str | None) -> None:
+        kept.append(settings.limits)
+        raise StereoweaveError("not now")
+
+    monkeypatch.setattr("stereoweave.service.deployment.serving", serving)
+    (tmp_path / "token").write_text(" se-cret\n")
+    hosts = {
+        (): ("127.0.0.1", "localhost"),
+        ("--host", "::1"): ("[::1]", "localhost"),
+        ("--host", "127.1"): ("127.0.0.1", "localhost", "127.1"),
+        ("--host", "0.0.0.0", "--behind-proxy"): None,
+        ("--behind-proxy",): None,
+    }
+    for words in hosts:
+        assert main(["serve", "--port", "0", "--token-file", str(tmp_path / "token"), *words]) == 2
+    assert [limits.hosts for limits in kept] == list(hosts.values())
+    assert {limits.token.get_secret_value() for limits in kept} == {"se-cret"}
+    assert "se-cret" not in repr(kept)
+
+
+def test_on_a_cluster_the_proxies_of_ray_serve_the_same(ray_address, tmp_path):
+    with served(tmp_path, "--address", ray_address, "--threads", 1) as running:
+        assert post(running.client, "/disparity").status_code == 200
+        assert running.client.get("/health", headers={"Host": "evil.example"}).status_code == 400
+        assert running.client.get("/health").status_code == 200
+
+
+def test_what_was_accepted_is_answered_before_it_ends(running):
+    """The last test: it ends the service."""
+    with ThreadPoolExecutor(1) as pool:
+        answer = pool.submit(post, running.client, "/view")
+        while not answer.done() and not list(running.uploads.glob("stereoweave-service-*/tmp*")):
+            time.sleep(0.01)
+        os.kill(running.pid, signal.SIGTERM)
+        assert answer.result().status_code == 200

@@ -1,0 +1,160 @@
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from stereoweave.system.child_process import ChildProcess, ProcessDiedError
+
+pytestmark = pytest.mark.system
+
+
+def child_of(function, folder: Path) -> ChildProcess:
+    return ChildProcess(partial(partial, function), folder)
+
+
+def _sleep_then_make(seconds: float):
+    time.sleep(seconds)
+    return abs
+
+
+def wait_for_end(pid: int) -> None:
+    deadline_s = time.monotonic() + 10
+    while Path(f"/proc/{pid}").exists() and "Z" not in Path(f"/proc/{pid}/stat").read_text():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+
+
+@pytest.fixture
+def waiting(tmp_path):
+    child = child_of(time.sleep, tmp_path / "files")
+    yield child
+    child.close()
+
+
+def test_a_function_gives_its_result_or_its_error_from_another_process(tmp_path):
+    child = child_of(os.path.getsize, tmp_path / "files")
+    (tmp_path / "seven").write_bytes(bytes(7))
+    assert child(tmp_path / "seven", timeout_s=10) == 7
+    with pytest.raises(FileNotFoundError):
+        child(tmp_path / "none", timeout_s=10)
+    assert child.pid != os.getpid()
+    child.close()
+
+
+def test_a_call_that_takes_too_long_ends_its_process_and_the_next_one_is_answered(waiting):
+    assert waiting(0, timeout_s=10) is None
+    first, start_s = waiting.pid, time.monotonic()
+    with pytest.raises(TimeoutError):
+        waiting(60, timeout_s=0.2)
+    assert time.monotonic() - start_s < 5
+    assert not Path(f"/proc/{first}").exists()
+    assert waiting(0, timeout_s=10) is None
+
+
+def test_a_crash_is_one_line_and_the_next_call_is_answered(tmp_path):
+    child = child_of(signal.raise_signal, tmp_path / "files")
+    with pytest.raises(ProcessDiedError, match=r"found that it ended \(SIGSEGV\); ") as crash:
+        child(signal.SIGSEGV, timeout_s=10)
+    assert "\n" not in str(crash.value)
+    assert child(0, timeout_s=10) is None  # signal 0 is none
+    child.close()
+
+
+def test_a_process_that_is_still_starting_is_not_replaced(tmp_path):
+    child = ChildProcess(partial(_sleep_then_make, 0.5), tmp_path / "files")
+    pid = child.pid
+    for _ in range(2):
+        with pytest.raises(TimeoutError):
+            child(0, timeout_s=0.01)
+    assert child(7, timeout_s=10) == 7
+    assert child.pid == pid
+    child.close()
+
+
+def test_a_call_that_is_late_already_is_not_begun(waiting):
+    assert waiting(0, timeout_s=10) is None
+    pid = waiting.pid
+    with pytest.raises(TimeoutError):
+        waiting(60, timeout_s=0)
+    assert waiting.pid == pid
+
+
+def test_temporary_files_of_a_killed_process_are_removed(tmp_path):
+    child = child_of(partial(subprocess.run, shell=True), tmp_path / "files")
+    with pytest.raises(TimeoutError):
+        child("touch $TMPDIR/left; sleep 60", timeout_s=0.7)
+    assert not list((tmp_path / "files").iterdir())
+    child.close()
+    assert not (tmp_path / "files").exists()
+
+
+def test_a_function_that_cannot_be_made_says_so_at_each_call(tmp_path):
+    child = ChildProcess(partial(open, tmp_path / "none"), tmp_path / "files")
+    for _ in range(2):
+        with pytest.raises(FileNotFoundError):
+            child(0, timeout_s=10)
+    child.close()
+
+
+def test_what_a_function_prints_is_no_part_of_its_result(tmp_path):
+    child = child_of(partial(os.write, 1), tmp_path / "files")
+    assert child(b"printed\n", timeout_s=10) == 8
+    child.close()
+
+
+def test_a_busy_process_ends_with_its_parent(tmp_path):
+    program = (
+        "import sys, time, threading; from functools import partial; from pathlib import Path; "
+        "from stereoweave.system.child_process import ChildProcess; "
+        "child = ChildProcess(partial(partial, time.sleep), Path(sys.argv[1])); child(0, 10); "
+        "print(child.pid, flush=True); child(60, 60)"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path / "files")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+        pid = int(parent.stdout.readline())
+        parent.kill()
+    wait_for_end(pid)
+
+
+def test_a_file_of_the_current_folder_is_not_taken_for_a_module(tmp_path, monkeypatch):
+    (tmp_path / "textwrap.py").write_text(
+        f"from pathlib import Path\nPath({str(tmp_path)!r}, 'run').touch()\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    child = child_of(abs, tmp_path / "files")
+    with suppress(ProcessDiedError):  # where that file was run, it lacks what is imported from the real one
+        child(-7, timeout_s=10)
+    child.close()
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_temporary_folder_is_made_again_where_it_was_removed(tmp_path):
+    child = child_of(partial(subprocess.run, shell=True, check=True), tmp_path / "own" / "files")
+    child("touch $TMPDIR/first", timeout_s=10)
+    shutil.rmtree(tmp_path / "own")
+    child("touch $TMPDIR/second", timeout_s=10)
+    folder = tmp_path / "own" / "files"
+    assert [file.name for file in folder.iterdir()] == ["second"]
+    assert folder.stat().st_mode & 0o777 == 0o700
+    child.close()
+
+
+def test_a_process_that_could_not_be_started_again_is_started_at_a_later_call(tmp_path):
+    child, folder = (
+        child_of(partial(subprocess.run, shell=True, check=True), tmp_path / "files"),
+        tmp_path / "files",
+    )
+    with pytest.raises(FileExistsError):
+        child("rmdir $TMPDIR; touch $TMPDIR; kill -9 $PPID", timeout_s=10)
+    folder.unlink()
+    with pytest.raises(ProcessDiedError):
+        child("true", timeout_s=10)
+    assert child("true", timeout_s=10).returncode == 0
+    child.close()

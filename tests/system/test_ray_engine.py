@@ -1,0 +1,133 @@
+"""The engine on a real Ray: what comes back, what a dead worker costs, what is said of a wrong address."""
+
+import importlib
+import os
+import signal
+import socket
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+import ray
+from ray.data import DataContext
+
+from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.system import ray_engine as engine_module
+from stereoweave.system.ray_engine import Engine, connect, room, stream
+
+pytestmark = pytest.mark.system
+
+
+@pytest.fixture(scope="module")
+def engine(ray_address):
+    engine = Engine(ray_address, workers=2)
+    with connect(engine):
+        yield engine
+
+
+def make_reporter():
+    import cv2
+
+    made_in = os.getpid()
+    return lambda task: (task, made_in, os.getpid(), cv2.getNumThreads(), os.environ["OMP_NUM_THREADS"])
+
+
+def make_mortal(folder: Path):
+    """A worker that is killed by each task whose number divides by 5, the first time that it comes."""
+
+    def work(task: int) -> int:
+        (folder / f"{task} by {os.getpid()}").touch()
+        if task % 5 == 0 and len(list(folder.glob(f"{task} by *"))) == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return -task
+
+    return work
+
+
+def make_slow(seconds: float):
+    def work(task: int) -> int:
+        time.sleep(seconds)
+        return task
+
+    return work
+
+
+def make_failing(error: Exception):
+    def work(task: int) -> int:
+        if task == 3:
+            raise error
+        return task
+
+    return work
+
+
+def test_each_task_comes_back_once_from_workers_that_are_made_once_and_keep_to_their_core(engine):
+    results = list(stream(make_reporter, range(40), engine))
+    assert sorted(result[0] for result in results) == list(range(40))
+    assert {result[1:3] for result in results} == {(pid, pid) for _, pid, *_ in results}
+    assert 1 <= len({pid for _, pid, *_ in results}) <= 2
+    assert {result[3:] for result in results} == {(1, "1")}
+    assert list(stream(make_reporter, [], engine)) == []
+
+
+def test_the_tasks_of_a_killed_worker_are_done_again_by_its_successor(engine, tmp_path):
+    results = sorted(stream(partial(make_mortal, tmp_path), range(12), engine))
+    assert results == sorted(-task for task in range(12))
+    assert len(list(tmp_path.glob("10 by *"))) == 2
+
+
+def test_a_task_may_take_longer_than_ray_data_waits_for_progress(engine, monkeypatch):
+    context = DataContext.get_current()
+    monkeypatch.setattr(context, "execution_no_progress_timeout_s", 1)
+    assert list(stream(partial(make_slow, 3), [1], engine)) == [1]
+
+
+def test_what_a_worker_raises_is_raised_here_as_it_was(engine):
+    with pytest.raises(FormatError, match=r"^that is none$"):
+        list(stream(partial(make_failing, FormatError("that is none")), range(8), engine))
+    with pytest.raises(KeyError) as caught:
+        list(stream(partial(make_failing, KeyError("mistake")), range(8), engine))
+    assert "in work" in caught.value.__notes__[0]
+
+
+def test_workers_that_lack_a_module_are_told_in_a_line(engine, tmp_path, monkeypatch, capfd):
+    (tmp_path / "only_here.py").write_text("def make():\n    return str\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(engine_module, "_MOST_FALSE_STARTS", 0)
+    make = importlib.import_module("only_here").make
+    with pytest.raises(StereoweaveError, match="begin, found .*No module named 'only_here'; see") as caught:
+        list(stream(make, [1], engine))
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr().out == ""
+
+
+def test_a_worker_that_fits_no_machine_is_refused_and_parts_of_a_core_are_counted(engine):
+    assert room(engine) == 2
+    assert room(Engine(cpus_each=0.1)) == 20
+    with pytest.raises(StereoweaveError, match=r"a machine with 3 cores and 0 GPUs .* found 2 and 0"):
+        list(stream(make_reporter, [1], Engine(cpus_each=3)))
+    with pytest.raises(StereoweaveError, match=r"a machine with 1 cores and 0.5 GPUs .* found 2 and 0"):
+        room(Engine(gpus_each=0.5))
+    nan, inf = float("nan"), float("inf")
+    shares = ({"cpus_each": cpus} for cpus in (0, 1e-5, nan, inf))
+    gpus = ({"gpus_each": gpus} for gpus in (-1, 1e-5, 1.5, nan, inf))
+    for wrong in ({"workers": 0}, *shares, *gpus):
+        with pytest.raises(StereoweaveError, match="expected"):
+            Engine(**wrong)
+
+
+def test_a_wrong_address_is_told_in_one_line(engine, monkeypatch):
+    ray.shutdown()  # where there is a connection already, the address is not asked for
+    monkeypatch.setattr(engine_module, "_ANSWERS_WITHIN_S", 1)
+    with socket.create_server(("127.0.0.1", 0)) as deaf:
+        addresses = {
+            "127.0.0.1:1": "expected the head of a Ray cluster that answers, found .*refused",
+            "ray://127.0.0.1:1": "expected the head of a Ray cluster that answers, found .*refused",
+            f"127.0.0.1:{deaf.getsockname()[1]}": "found something else that listens there",
+            "nonsense": "expected host:port, ray://host:port, auto or local, found 'nonsense'",
+        }
+        for address, told in addresses.items():
+            with pytest.raises(StereoweaveError, match=told) as caught, connect(Engine(address)):
+                pass
+            assert "\n" not in str(caught.value)

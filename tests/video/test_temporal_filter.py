@@ -1,0 +1,419 @@
+"""Each film is a list of (left, right, estimate); pictures are random textures, and noise has a seed."""
+
+import threading
+
+import cv2
+import numpy as np
+import pytest
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.stereo import Estimate
+from stereoweave.video.temporal_filter import (
+    MOST_FRAMES,
+    NEIGHBOUR_PX,
+    SAME_PX,
+    SAME_SHARE,
+    STEP_PX,
+    STEPS,
+    Motion,
+    Steadier,
+    Track,
+    blend,
+    carry,
+    measure_drift,
+)
+
+HEIGHT, WIDTH = 120, 176
+# Odd places are in no neighbourhood that drift is measured by.
+PIXEL = (61, 83)
+
+
+def texture(rng, height=HEIGHT, width=WIDTH):
+    image = cv2.GaussianBlur(rng.uniform(0, 255, (height, width, 3)), (0, 0), 1.5)
+    return np.clip(128 + 4 * (image - 128), 0, 255).astype(np.uint8)
+
+
+def estimate(disparity_px, right_disparity_px=None, confidence=0.8):
+    disparity_px = np.asarray(disparity_px, np.float32)
+    right_px = disparity_px if right_disparity_px is None else np.asarray(right_disparity_px, np.float32)
+    return Estimate(
+        disparity_px=disparity_px,
+        right_disparity_px=right_px,
+        confidence=np.full(disparity_px.shape, confidence, np.float32),
+        occluded=np.zeros(disparity_px.shape, bool),
+    )
+
+
+def plain(value_px, at_pixel_px=None):
+    disparity_px = np.full((HEIGHT, WIDTH), value_px, np.float32)
+    disparity_px[PIXEL] = value_px if at_pixel_px is None else at_pixel_px
+    return estimate(disparity_px)
+
+
+def steadied(film):
+    steadier = Steadier()
+    return [steadier(*frame) for frame in film], steadier
+
+
+def disparities(estimates):
+    return np.stack([each.disparity_px for each in estimates])
+
+
+def at_rest(rng, estimates):
+    left, right = texture(rng), texture(rng)
+    return [(left, right, each) for each in estimates]
+
+
+def square_film(rng, frames, velocity_px, nearing_px=0.0):
+    """A textured square of 48 px with a disparity of 30 px at first, over a plane of 10 px; and the truth."""
+    back, front = texture(rng), texture(rng, 48, 48)
+    film, truths_px, masks = [], [], []
+    for number in range(frames):
+        near_px = 30 + nearing_px * number
+        images, maps, squares = [], [], []
+        for position in (0, 1):
+            # What passes is cut out at whole pixels of both views.
+            column = 60 + round(velocity_px * number - position * (near_px - 10))
+            image, square = back.copy(), np.zeros((HEIGHT, WIDTH), bool)
+            image[36:84, column : column + 48], square[36:84, column : column + 48] = front, True
+            noise_px = rng.normal(0, 0.3, square.shape)
+            images.append(np.clip(image + rng.normal(0, 3, image.shape), 0, 255).astype(np.uint8))
+            maps.append(np.where(square, near_px, 10.0) + noise_px)
+            squares.append(square)
+        film.append((*images, estimate(*maps)))
+        truths_px.append(np.where(squares[0], near_px, 10.0))
+        masks.append(squares[0])
+    return film, np.stack(truths_px), np.stack(masks)
+
+
+def test_the_first_frame_is_its_own_estimate(rng):
+    only = estimate(rng.uniform(0, 40, (HEIGHT, WIDTH)))
+    (first,), steadier = steadied(at_rest(rng, [only]))
+    np.testing.assert_array_equal(first.disparity_px, only.disparity_px)
+    np.testing.assert_array_equal(first.confidence, only.confidence)
+    assert steadier.cuts == 0
+
+
+def test_a_pixel_at_rest_becomes_the_mean_of_its_frames(rng):
+    film = at_rest(rng, [plain(10, 10.0), plain(10, 10.6), plain(10, 10.0), plain(10, 9.8)])
+    found = disparities(steadied(film)[0])
+    np.testing.assert_allclose(found[:, *PIXEL], [10.0, 10.3, 10.2, 10.1], atol=1e-5)
+    assert (np.delete(found.reshape(4, -1), PIXEL[0] * WIDTH + PIXEL[1], axis=1) == 10).all()
+
+
+def test_what_a_surface_changes_in_common_is_followed_without_lag(rng):
+    found = disparities(steadied(at_rest(rng, [plain(10 + 0.5 * t) for t in range(8)]))[0])
+    np.testing.assert_allclose(found[:, 50, 60], 10 + 0.5 * np.arange(8), atol=1e-5)
+
+
+def test_at_rest_a_contradiction_is_outvoted_until_it_has_lasted_as_long(rng):
+    film = at_rest(rng, [plain(10), plain(10), *[plain(10, 40)] * 4])
+    found = disparities(steadied(film)[0])
+    np.testing.assert_allclose(found[:, *PIXEL], [10, 10, 10, 10, 40, 40], atol=1e-5)
+
+
+def test_what_a_frame_contradicts_is_less_certain(rng):
+    film = at_rest(rng, [plain(10), plain(10, 40), plain(10)])
+    found = [each.confidence[PIXEL] for each in steadied(film)[0]]
+    # One claim of 0.8, then one of nothing; by then the two have cancelled each other.
+    np.testing.assert_allclose(found, [0.8, 0.4, 0.8], atol=1e-6)
+
+
+def test_flicker_of_a_still_film_at_least_halves_in_both_views(rng):
+    left, right = texture(rng), texture(rng)
+    film = []
+    for _ in range(12):
+        noisy = (
+            np.clip(image + rng.normal(0, 4, image.shape), 0, 255).astype(np.uint8) for image in (left, right)
+        )
+        film.append((*noisy, estimate(*(10 + rng.normal(0, 0.3, (2, HEIGHT, WIDTH))))))
+    found, steadier = steadied(film)
+    for name in ("disparity_px", "right_disparity_px"):
+        before, after = (
+            np.abs(np.diff([getattr(each, name) for each in maps], axis=0)).mean()
+            for maps in ([each for *_, each in film], found)
+        )
+        assert after < 0.5 * before
+    assert steadier.cuts == 0
+
+
+@pytest.mark.parametrize(("velocity_px", "nearing_px"), [(4, 0), (-3, 0), (1, 0), (2, 1)])
+def test_nothing_trails_behind_what_moves(rng, velocity_px, nearing_px):
+    film, truth_px, moving = square_film(rng, 10, velocity_px, nearing_px)
+    found = disparities(steadied(film)[0])
+    error_px = np.abs(found - truth_px)[1:]
+    error_by_frame_px = np.abs(disparities([each for *_, each in film]) - truth_px)[1:]
+    uncovered = moving[:-1] & ~moving[1:]
+    assert error_px[moving[1:]].mean() <= error_by_frame_px[moving[1:]].mean()
+    assert error_px[uncovered].mean() <= 1.02 * error_by_frame_px[uncovered].mean()
+    assert error_px.mean() < 0.7 * error_by_frame_px.mean()
+
+
+def test_what_comes_nearer_is_followed_without_lag(rng):
+    film, truth_px, moving = square_film(rng, 12, 0, nearing_px=0.5)
+    found = disparities(steadied(film)[0])
+    inside = cv2.erode(moving[0].astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    lag_px = (truth_px - found)[1:, inside].mean(axis=1)
+    assert np.abs(lag_px).max() < 0.1
+
+
+def test_a_pan_is_filtered_along_its_motion(rng):
+    wide = texture(rng, HEIGHT, WIDTH + 60)
+    # Stairs, which are elsewhere in every frame.
+    wide_px = 10.0 + 6 * (np.arange(WIDTH + 60) // 12 % 2)[None].repeat(HEIGHT, 0)
+    film, truths_px = [], []
+    for number in range(10):
+        seen = slice(6 * number, 6 * number + WIDTH)
+        truths_px.append(wide_px[:, seen])
+        film.append(
+            (
+                wide[:, seen].copy(),
+                wide[:, seen].copy(),
+                estimate(truths_px[-1] + rng.normal(0, 0.3, (HEIGHT, WIDTH))),
+            )
+        )
+    found = disparities(steadied(film)[0])
+    inner = np.s_[4:, 16:-16, 16:-16]
+    error_px = np.abs(found - truths_px)[inner].mean()
+    assert error_px < 0.6 * np.abs(disparities([each for *_, each in film]) - truths_px)[inner].mean()
+
+
+def test_a_cut_starts_anew_and_is_counted(rng):
+    before = at_rest(rng, [plain(10)] * 3)
+    after = at_rest(rng, [plain(10, 10.5), plain(10, 10.5)])
+    found, steadier = steadied(before + after)
+    np.testing.assert_array_equal(found[3].disparity_px, after[0][2].disparity_px)
+    np.testing.assert_array_equal(found[3].right_disparity_px, after[0][2].right_disparity_px)
+    np.testing.assert_array_equal(found[3].confidence, after[0][2].confidence)
+    assert steadier.cuts == 1
+
+
+def test_a_frame_of_another_size_is_a_cut(rng):
+    film = at_rest(rng, [plain(10)])
+    film.append((texture(rng, 90, 91), texture(rng, 90, 91), estimate(np.full((90, 91), 7.0))))
+    found, steadier = steadied(film)
+    assert (found[1].disparity_px == 7).all()
+    assert steadier.cuts == 1
+
+
+def plain_with_patch(rng, row, column, disparity_px):
+    left, right = (np.full((HEIGHT, WIDTH, 3), 128, np.uint8) for _ in range(2))
+    patch = texture(rng, 20, 20)
+    left[row : row + 20, column : column + 20] = patch
+    right[row : row + 20, column - disparity_px : column - disparity_px + 20] = patch
+    return left, right, plain(disparity_px)
+
+
+def test_a_cut_between_plain_scenes_shows_in_their_disparity(rng):
+    before, after = plain_with_patch(rng, 20, 40, 10), plain_with_patch(rng, 70, 120, 30)
+    found, steadier = steadied([before] * 3 + [after] * 2)
+    assert (disparities(found)[3:] == 30).all()
+    assert steadier.cuts == 1
+
+
+def test_a_thing_that_comes_and_goes_over_plain_ground_is_no_cut(rng):
+    film = [plain_with_patch(rng, row, column, 10) for row, column in [(20, 40), (70, 120), (20, 100)]]
+    assert steadied(film)[1].cuts == 0
+
+
+@pytest.mark.parametrize("contrast", [0.25, 0.1])
+def test_a_cut_between_faint_scenes_is_one(rng, contrast):
+    def faint(disparity_px):
+        images = [cv2.convertScaleAbs(texture(rng), alpha=contrast, beta=100) for _ in range(2)]
+        return *images, plain(disparity_px)
+
+    before, after = faint(10), faint(10.5)
+    found, steadier = steadied([before, before, after, after])
+    assert (found[2].disparity_px == 10.5).all()
+    assert steadier.cuts == 1
+
+
+@pytest.mark.parametrize("jump_px", [3, 6, -6])
+def test_what_moves_in_the_right_view_alone_is_not_outvoted(rng, jump_px):
+    left, wide = texture(rng), texture(rng, HEIGHT, WIDTH + 20)
+    near_px = np.array([20, 20, 20, 20 + jump_px])
+    rights = [wide[:, 10 + shift_px : 10 + shift_px + WIDTH].copy() for shift_px in near_px - 20]
+    film = [(left, right, plain(px)) for right, px in zip(rights, near_px, strict=True)]
+    found, steadier = steadied(film)
+    assert np.abs(found[-1].disparity_px - near_px[-1]).mean() < 0.1
+    assert steadier.cuts == 0
+
+
+def test_a_small_thing_that_moves_in_the_right_view_alone_is_not_outvoted(rng):
+    ground, thing = texture(rng), texture(rng, 12, 12)
+    film, square = [], np.s_[60:72, 100:112]
+    for near_px in range(12, 33, 3):
+        left, right = ground.copy(), ground.copy()
+        column = 100 - near_px
+        left[square] = right[60:72, column : column + 12] = thing
+        disparity_px = np.zeros((HEIGHT, WIDTH))
+        disparity_px[square] = near_px
+        film.append((left, right, estimate(disparity_px)))
+    found = disparities(steadied(film)[0])
+    np.testing.assert_allclose(found[:, *square].mean(axis=(1, 2)), range(12, 33, 3), atol=0.2)
+
+
+@pytest.mark.parametrize(("gain", "offset_levels"), [(0.6, 0), (0.8, 50), (1.0, -20)])
+def test_a_fade_is_no_cut_and_keeps_what_was_found(rng, gain, offset_levels):
+    left, right = (cv2.convertScaleAbs(texture(rng), alpha=0.6, beta=40) for _ in range(2))
+    faded = [np.clip(gain * image + offset_levels, 0, 255).astype(np.uint8) for image in (left, right)]
+    found, steadier = steadied([(left, right, plain(10, 10.0)), (*faded, plain(10, 10.6))])
+    assert steadier.cuts == 0
+    np.testing.assert_allclose(found[1].disparity_px[PIXEL], 10.3, atol=1e-5)
+
+
+def test_a_state_goes_on_bit_for_bit(rng, tmp_path):
+    film, _, _ = square_film(rng, 6, 3, 1)
+    found, steadier = steadied(film[:3])
+    np.savez(tmp_path / "state.npz", **steadier.state())
+    with np.load(tmp_path / "state.npz") as state:
+        again = Steadier.from_state(state)
+    assert again.cuts == steadier.cuts
+    for frame in film[3:]:
+        one, other = steadier(*frame), again(*frame)
+        for name in ("disparity_px", "right_disparity_px", "confidence", "occluded"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+@pytest.mark.parametrize(
+    "start", [Steadier, lambda threads: Steadier.from_state(Steadier().state(), threads)]
+)
+@pytest.mark.parametrize("threads", [1, 2])
+def test_no_more_threads_work_than_asked_for(rng, start, threads):
+    workers = set()
+    steadier = start(threads)
+    threading.setprofile(lambda *_: workers.add(threading.get_ident()))
+    try:
+        for frame in at_rest(rng, [plain(10)] * 2):
+            steadier(*frame)
+    finally:
+        threading.setprofile(None)
+    assert len(workers) <= threads
+
+
+def test_the_number_of_threads_changes_nothing(rng):
+    film, _, _ = square_film(rng, 3, 3, 1)
+    one, two = Steadier(1), Steadier(2)
+    for frame in film:
+        found, expected = one(*frame), two(*frame)
+        np.testing.assert_array_equal(found.disparity_px, expected.disparity_px)
+        np.testing.assert_array_equal(found.right_disparity_px, expected.right_disparity_px)
+
+
+def test_the_state_before_the_first_frame_and_the_cuts_are_kept(rng):
+    assert Steadier.from_state(Steadier().state()).state() == {"cuts": 0}
+    _, steadier = steadied(at_rest(rng, [plain(10)]) + at_rest(rng, [plain(10)]))
+    assert Steadier.from_state(steadier.state()).cuts == 1
+
+
+def test_the_state_does_not_grow_with_the_film(rng):
+    def state_bytes(frames):
+        return sum(
+            values.nbytes for values in steadied(at_rest(rng, [plain(10)] * frames))[1].state().values()
+        )
+
+    assert state_bytes(2) == state_bytes(9)
+
+
+@pytest.mark.parametrize(("height", "width"), [(33, 35), (65, 98), (48, 131)])
+def test_odd_sizes(rng, height, width):
+    left, right = texture(rng, height, width), texture(rng, height, width)
+    maps_px = 10 + rng.normal(0, 0.2, (6, height, width))
+    found = disparities(steadied([(left, right, estimate(each)) for each in maps_px])[0])
+    assert found.shape == (6, height, width)
+    assert np.abs(found[-1] - 10).mean() < 0.6 * np.abs(maps_px - 10).mean()
+
+
+def test_an_estimate_of_another_size_is_refused(rng, without_shape_checks):
+    with pytest.raises(StereoweaveError, match="estimate: expected the size of both pictures, got .90, 91."):
+        Steadier()(texture(rng), texture(rng), estimate(np.ones((90, 91))))
+
+
+def random_track(rng, shape):
+    return Track(
+        rng.choice([5.0, 5.4, 7.0, 30.0], shape).astype(np.float32),
+        rng.uniform(0, 1, shape).astype(np.float32),
+        rng.integers(0, 14, shape).astype(np.float32),
+    )
+
+
+def random_motion(rng, shape):
+    half = ((shape[0] + 1) // 2, (shape[1] + 1) // 2)
+    # No halves: NumPy and the kernel need not round them alike.
+    to_before_px = rng.integers(-5, 6, (*half, 2)) + rng.uniform(-0.4, 0.4, (*half, 2))
+    return Motion(to_before_px.astype(np.float32), rng.random(half) < 0.8, rng.random(half) < 0.5, 1.0)
+
+
+def empty_track(shape):
+    return Track(*(np.full(shape, np.nan, np.float32) for _ in range(3)))
+
+
+def plain_carry(new_px, track, motion):
+    carried = Track(*(np.zeros(new_px.shape, np.float32) for _ in range(3)))
+    height, width = new_px.shape
+    for y, x in np.ndindex(new_px.shape):
+        half = y // 2, x // 2
+        column, row = (np.array([x, y]) + np.rint(motion.to_before_px[half])).astype(int)
+        if not motion.explained[half] or not (0 <= row < height and 0 <= column < width):
+            continue
+        source = row, column
+        if not motion.calm[half]:
+            around = [(row + j, column + i) for j in (-1, 0, 1) for i in (-1, 0, 1)]
+            around = [place for place in around if 0 <= place[0] < height and 0 <= place[1] < width]
+            apart_px = [abs(track.disparity_px[place] - new_px[y, x]) for place in around]
+            if min(apart_px) < abs(track.disparity_px[source] - new_px[y, x]) - 0.5:
+                source = around[int(np.argmin(apart_px))]
+        for to, values in zip(carried, track, strict=True):
+            to[y, x] = values[source]
+    return carried
+
+
+def plain_drift(new_px, carried, shape):
+    drift_px = np.zeros(shape)
+    offsets = STEP_PX * np.arange(-STEPS, STEPS + 1)
+    for i, j in np.ndindex(shape):
+        places = [(2 * i + dy, 2 * j + dx) for dy in offsets for dx in offsets]
+        places = [(y, x) for y, x in places if 0 <= y < new_px.shape[0] and 0 <= x < new_px.shape[1]]
+        places = [place for place in places if carried.frames[place] > 0]
+        places = [place for place in places if abs(new_px[place] - new_px[2 * i, 2 * j]) < NEIGHBOUR_PX]
+        changes_px = np.array([float(new_px[place]) - carried.disparity_px[place] for place in places])
+        changes_px = changes_px[np.abs(changes_px) < NEIGHBOUR_PX]
+        if len(changes_px) > 1:
+            mean_px = changes_px.mean()
+            error_px = changes_px.std(ddof=1) / np.sqrt(len(changes_px))
+            if abs(mean_px) > error_px:
+                drift_px[i, j] = mean_px * (1 - (error_px / mean_px) ** 2)
+    return drift_px
+
+
+def plain_blend(new, carried, calm, drift_px):
+    full = tuple(np.s_[:side] for side in new.frames.shape)
+    calm, drift_px = (values.repeat(2, 0).repeat(2, 1)[full] for values in (calm, drift_px))
+    expected_px = carried.disparity_px + drift_px
+    apart_px = new.disparity_px - expected_px
+    known = carried.frames >= 1
+    contradicted = known & (np.abs(apart_px) > SAME_PX + SAME_SHARE * np.abs(new.disparity_px))
+    kept = contradicted & calm
+    frames = np.minimum(np.where(known & ~contradicted, carried.frames, 0) + 1, MOST_FRAMES)
+    claim = carried.confidence + (new.confidence - carried.confidence) / frames
+    return Track(
+        np.where(kept, expected_px, expected_px + apart_px / frames),
+        np.where(kept, carried.confidence * carried.frames / (carried.frames + 1), claim),
+        np.where(kept, carried.frames - 1, frames),
+    )
+
+
+@pytest.mark.parametrize("shape", [(40, 50), (41, 33)])
+def test_the_kernels_equal_the_plain_ones(rng, shape):
+    track, new, motion = random_track(rng, shape), random_track(rng, shape), random_motion(rng, shape)
+    carried = empty_track(shape)
+    carry(new.disparity_px, track, motion, carried)
+    for found, expected in zip(carried, plain_carry(new.disparity_px, track, motion), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    drift_px = np.full(motion.calm.shape, np.nan, np.float32)
+    measure_drift(new.disparity_px, carried, drift_px)
+    np.testing.assert_allclose(drift_px, plain_drift(new.disparity_px, carried, drift_px.shape), atol=1e-5)
+    mean = empty_track(shape)
+    blend(new, carried, motion.calm, drift_px, mean)
+    for found, expected in zip(mean, plain_blend(new, carried, motion.calm, drift_px), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-5)
