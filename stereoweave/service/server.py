@@ -76,6 +76,7 @@ class _Connection(H11Protocol, asyncio.BufferedProtocol):
     def send_400_response(self, msg: str) -> None:
         can_respond = self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE)
         if self._is_busy():
+            can_respond = can_respond and self.scope["method"] != "HEAD"  # its response may have no body
             self.cycle.disconnected = True  # drops what the application still sends
             self.cycle.message_event.set()
         if can_respond:

@@ -97,6 +97,14 @@ def test_what_is_no_http_behind_a_response_closes_the_connection_without_an_erro
     assert caplog.messages == []
 
 
+def test_a_request_for_a_head_that_goes_on_as_no_http_is_closed_without_an_error(connection, caplog):
+    ALLOWED.clear()
+    connection.sendall(b"HEAD /later HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\nno chunk\r\n")
+    assert read_to_end(connection) == b""  # a response with a body would be none
+    ALLOWED.set()
+    assert caplog.messages == []
+
+
 def test_a_request_that_takes_longer_than_a_head_may_take_is_answered(connection):
     ALLOWED.clear()
     connection.sendall(b"GET /later HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
