@@ -68,7 +68,7 @@ LEFT_OUT = pytest.StashKey[dict[str, int]]()
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     # Those of no room first, which are the longest: at the end one process would wait for them.
-    items.sort(key=lambda item: len(item.path.parts))
+    items.sort(key=lambda item: item.path.parent != Path(__file__).parent)
     if os.environ.get("STEREOWEAVE_REQUIRE_ALL") == "1":
         return
     left_out = [item for item in items if any(map(item.get_closest_marker, MISSING))]
