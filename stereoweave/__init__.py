@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from stereoweave.rendering.synthesize import synthesize
     from stereoweave.stereo import DepthCurve, Estimate, Sample, StereoCamera, StereoPair, View
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOMES = {
     "DepthCurve": "stereo",
