@@ -56,6 +56,9 @@ CAPABILITIES = {
         "no nginx: apt install nginx-light",
     ),
     "needs_egl": Capability(renders(), "of the renderer", "no EGL: apt install libegl1 libgl1-mesa-dri"),
+    "needs_git": Capability(
+        (Path(__file__).resolve().parent.parent / ".git").exists(), "of what git tracks", "no git checkout"
+    ),
 }
 
 # The garbage collector would go through all that is imported, again and again: a quarter of the tests' time.

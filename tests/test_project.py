@@ -1,11 +1,14 @@
 """The project's metadata: files at the root that repeat what the package and pyproject.toml say."""
 
+import re
 import tomllib
 from pathlib import Path
 
+import pytest
 import yaml
 
 import stereoweave
+from mutate.trees import repository_files
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -25,3 +28,28 @@ def test_the_citation_refers_to_the_paper():
     assert f'# "{paper["title"]}"' in (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
     names = [author["family-names"] for author in paper["authors"]]
     assert names == ["Anantrasirichai", "Geravand", "Braendler", "Bull"]
+
+
+def hooks():
+    (repository,) = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
+    assert repository["repo"] == "local"
+    return {hook["id"]: hook for hook in repository["hooks"]}
+
+
+def test_pre_commit_runs_the_tools_that_constraints_txt_pins():
+    packages = {"ruff": "ruff", "check-added-large-files": "pre-commit-hooks"}
+    programs = [re.match(r"\.venv/bin/(\S+) ", hook["entry"])[1] for hook in hooks().values()]
+    assert set(programs) == set(packages)
+    pinned = re.findall(r"^([\w-]+)==", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+    needed = {re.match(r"[\w-]+", line)[0] for line in PROJECT["optional-dependencies"]["dev"]}
+    for package in {"pre-commit", *packages.values()}:
+        assert package in pinned
+        assert package in needed
+
+
+@pytest.mark.needs_git
+def test_files_above_500_kb_are_trained_networks_alone():
+    hook = hooks()["check-added-large-files"]
+    assert "--maxkb=500" in hook["entry"]
+    large = [name for name in repository_files(ROOT) if (ROOT / name).stat().st_size > 500 * 1024]
+    assert [name for name in large if not re.search(hook["exclude"], name)] == []
