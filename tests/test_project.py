@@ -53,3 +53,8 @@ def test_files_above_500_kb_are_trained_networks_alone():
     assert "--maxkb=500" in hook["entry"]
     large = [name for name in repository_files(ROOT) if (ROOT / name).stat().st_size > 500 * 1024]
     assert [name for name in large if not re.search(hook["exclude"], name)] == []
+
+
+@pytest.mark.needs_git
+def test_the_tree_stays_below_30_mb():
+    assert sum((ROOT / name).stat().st_size for name in repository_files(ROOT)) < 30e6
