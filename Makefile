@@ -5,7 +5,7 @@
 # make fuzz    damaged files and requests for SECONDS=60, each answered by our own errors or kept in tests/corpus
 # make bench   accuracy and time on the real pairs in STEREOWEAVE_TESTDATA
 # make audit   licences of all that is installed, and known vulnerabilities where their service is reached
-# make release the wheel, and the lists of what it needs (SBOM), in dist
+# make release the wheel and the source distribution, tried in empty environments, and the lists of what they need (SBOM), in dist
 # make gallery the README's pictures, docs/gallery, from a pair that is rendered for them
 # Each first sets up the virtual environment that it needs, once.
 
@@ -78,10 +78,14 @@ audit: $(DEV)/installed $(AUDIT)/installed
 	elif grep '^Found' log.txt; then cat found.txt; exit 1; \
 	else echo "Known vulnerabilities: not looked up, no answer from the service ($$(tail -n 1 log.txt))"; fi
 
+# The wheel is built from the source distribution, which so has all that this needs. Files that an earlier build left
+# would get into both.
 release: $(CORE)/installed $(DEV)/installed $(AUDIT)/installed
-	$(CORE)/bin/python -m pip wheel --no-deps --wheel-dir dist .
+	rm -rf build stereoweave.egg-info dist/stereoweave-$(VERSION)*
+	$(AUDIT)/bin/python -m build --outdir dist .
 	$(SBOM) --output-file dist/stereoweave-$(VERSION).cdx.json $(CORE)
 	$(SBOM) --output-file dist/stereoweave-$(VERSION)-all-extras.cdx.json $(DEV)
+	$(AUDIT)/bin/python -m release.check dist/stereoweave-$(VERSION)-py3-none-any.whl dist/stereoweave-$(VERSION).tar.gz
 
 # The wiggle's frames are smaller, because it is as large as all other pictures together else.
 gallery: $(DEV)/installed
@@ -109,5 +113,5 @@ $(DEV)/installed: pyproject.toml constraints.txt
 
 $(AUDIT)/installed: constraints.txt
 	$(PYTHON) -m venv $(AUDIT)
-	$(AUDIT)/bin/python -m pip install --constraint constraints.txt cyclonedx-bom pip-audit pip-licenses
+	$(AUDIT)/bin/python -m pip install --constraint constraints.txt build cyclonedx-bom pip-audit pip-licenses
 	touch $@
