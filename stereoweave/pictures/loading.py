@@ -86,9 +86,9 @@ def open_pictures(paths: Sequence[Path], arrangement: str | None = None) -> Open
 
 
 def pixel_factor(path: Path, picture: Image.Image, arrangement: str | None) -> int:
-    """How many times as many pixels both views have as the head of the opened picture that holds them says.
+    """The pixels of both views divided by those that the head of their common file states: 1 or 2.
 
-    Two for an MPO file, and for half views that `arrangement` or the file's JPS mark names.
+    It is 2 for MPO files, and for half views that `arrangement` or the JPS mark of the file declares.
     """
     if arrangement in (None, "mpo") and view_frames(path, picture):
         return 2

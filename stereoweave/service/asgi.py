@@ -65,7 +65,7 @@ _Message = MutableMapping[str, Any]
 _Receive = Callable[[], Awaitable[_Message]]
 _Send = Callable[[_Message], Awaitable[None]]
 _Server = Callable[[_Message, _Receive, _Send], Coroutine[Any, Any, None]]
-# The errors of an order that its client is told. A TimeoutError is an OSError.
+# Errors whose message is sent to the client. TimeoutError is an OSError.
 FAILURES = (StereoweaveError, OSError, MemoryError)
 # Of an order, and the seconds that are left for it.
 Answering = Callable[[Order, float], Awaitable[Answer]]
