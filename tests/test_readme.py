@@ -1,4 +1,4 @@
-"""What the README says, done as a user would do it: in environments of their own, outside the repository."""
+"""The commands and programs of the README and the pages, run as users run them: outside the repository."""
 
 import csv
 import os
@@ -20,11 +20,24 @@ from stereoweave.rendering.layouts import MOTIONS
 pytestmark = pytest.mark.system
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-DEMO, INSTALL, COMMANDS, OWN_PICTURES, VIDEO, BEYOND, SYNTHETIC, RESEARCH = re.findall(
-    r"```sh\n(.*?)```", README, re.DOTALL
+PAGES = {
+    page: (REPOSITORY / page).read_text(encoding="utf-8")
+    for page in ("README.md", *sorted(f"docs/{path.name}" for path in (REPOSITORY / "docs").glob("*.md")))
+}
+
+
+def blocks(page: str, language: str = "sh") -> list[str]:
+    """The code blocks of a page in a language."""
+    return re.findall(rf"```{language}\n(.*?)```", PAGES[page], re.DOTALL)
+
+
+README = PAGES["README.md"]
+DEMO, INSTALL, COMMANDS = blocks("README.md")
+PROGRAMS = blocks("README.md", "python") + blocks("docs/python.md", "python")
+(PICTURES,), (VIEWS,), (VIDEO,), (SYNTHETIC,), (RESEARCH,) = (
+    blocks(f"docs/{page}.md") for page in ("pictures", "views", "video", "synthetic", "paper")
 )
-(PROGRAM,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+BATCH = blocks("docs/cluster.md")[0]
 # 700e6 with the bytecode of all packages, which the tests leave out.
 LARGEST_ENVIRONMENT_BYTES = 650e6
 # The trainings of the README, in fewer steps and of fewer and smaller pairs.
@@ -140,19 +153,36 @@ def test_the_commands_run_from_the_wheel_in_an_environment_of_users(installed, p
     assert "torch" not in packages_in(installed)
     path = f"{installed / 'bin'}:{os.environ['PATH']}"
     run(["bash", "-ec", COMMANDS], pictures, PATH=path, NUMBA_CACHE_DIR=caches)
-    described = re.findall(r"^\| `([\w.]+)` \|", README, re.MULTILINE)
+    described = re.findall(r"^\| `([\w.]+)` \|", PAGES["docs/outputs.md"], re.MULTILINE)
     assert sorted(path.name for path in (pictures / "metric").iterdir()) == sorted(described)
+    assert read_image(pictures / "view.png").shape == (64, 96, 3)
+    assert read_image(pictures / "anaglyph.png").shape == (64, 96, 3)
+    assert (pictures / "many" / "wall" / "disparity.pfm").is_file()
+
+
+def test_the_views_are_made_from_the_wheel_in_an_environment_of_users(installed, pictures, caches):
+    path = f"{installed / 'bin'}:{os.environ['PATH']}"
+    run(["bash", "-ec", VIEWS], pictures, PATH=path, NUMBA_CACHE_DIR=caches)
     assert read_image(pictures / "view.png").shape == (64, 96, 3)
     assert read_image(pictures / "quilt_qs8x6a1.5.png").shape == (6 * 64, 8 * 96, 3)
     with Image.open(pictures / "wiggle.webp") as wiggle:
         # Of 12 frames those that are alike become one, which is shown for longer.
         shown_ms = [frame.info["duration"] for frame in ImageSequence.all_frames(wiggle)]
         assert sum(shown_ms) == 12 * MOTIONS["wiggle"].frame_ms
+
+
+def test_the_scores_of_own_scenes_run_from_the_wheel(installed, pictures, caches):
+    command = "stereoweave bench pairs scenes -o rows.csv"
+    assert f"{command}\n" in PAGES["docs/scores.md"]
+    path = f"{installed / 'bin'}:{os.environ['PATH']}"
+    run(["bash", "-ec", command], pictures, PATH=path, NUMBA_CACHE_DIR=caches)
     assert (pictures / "rows.csv").is_file()
 
 
-def test_the_program_runs_from_the_wheel_in_an_environment_of_users(installed, pictures, caches):
-    run([installed / "bin" / "python", "-c", PROGRAM], pictures, NUMBA_CACHE_DIR=caches)
+def test_the_programs_run_from_the_wheel_in_an_environment_of_users(installed, pictures, caches):
+    for program in PROGRAMS:
+        run([installed / "bin" / "python", "-c", program], pictures, NUMBA_CACHE_DIR=caches)
+    assert len(PROGRAMS) == 2
     assert read_image(pictures / "view.png").shape == (64, 96, 3)
 
 
@@ -163,7 +193,7 @@ def test_pictures_of_ones_own_go_through_the_commands_for_them(tmp_path):
     for eye in ("left", "right"):
         shutil.copy(tmp_path / f"{eye}.png", tmp_path / "photographs" / f"1_{eye[0].upper()}.png")
     printed = run(
-        ["bash", "-ec", OWN_PICTURES], tmp_path, PATH=f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+        ["bash", "-ec", PICTURES], tmp_path, PATH=f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     )
     assert "nothing is amiss" in printed
     assert "(68 %)" in printed
@@ -183,13 +213,13 @@ def test_films_are_made_by_the_commands_for_them(pictures):
 
 
 def test_an_archive_is_worked_through_by_the_command_for_it(pictures):
-    (pictures / "scenes").rename(pictures / "photographs")
+    (pictures / "scenes").rename(pictures / "pairs")
     printed = run(
-        ["bash", "-ec", BEYOND], pictures, PATH=f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+        ["bash", "-ec", BATCH], pictures, PATH=f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     )
     assert "1 pair: 1 made" in printed
-    assert parquet.read_table(pictures / "depths" / "manifest")["pair"].to_pylist() == ["wall"]
-    assert (pictures / "depths" / "wall" / "disparity.pfm").is_file()
+    assert parquet.read_table(pictures / "depth" / "manifest")["pair"].to_pylist() == ["wall"]
+    assert (pictures / "depth" / "wall" / "disparity.pfm").is_file()
 
 
 @pytest.mark.needs_egl
@@ -227,15 +257,26 @@ def test_two_trainings_are_resumed_and_scored_by_the_commands_for_researchers(tm
 
 def test_each_command_that_is_mentioned_exists(pictures):
     command = Path(sys.executable).with_name("stereoweave")
-    mentioned = set(re.findall(r"`stereoweave (\w+)`", README))
-    assert mentioned == {"train", "export", "app"}
+    mentioned = set(re.findall(r"`stereoweave (\w+)[` ]", "".join(PAGES.values())))
+    assert {"app", "bench", "depth", "live", "serve", "synth", "video"} <= mentioned
     for name in mentioned:
         assert "Usage: stereoweave" in run([command, name, "--help"], pictures)
 
 
-def test_each_file_that_is_linked_exists():
-    links = [link.split("#")[0] for link in re.findall(r"\]\(([^)]+)\)", README) if "://" not in link]
-    assert [link for link in links if not (REPOSITORY / link).exists()] == []
+def test_each_file_that_a_page_links_to_exists():
+    missing = [
+        (page, link)
+        for page, text in PAGES.items()
+        for link in re.findall(r"\]\(([^)\s#]+)", text)
+        if "://" not in link and not ((REPOSITORY / page).parent / link).exists()
+    ]
+    assert missing == []
+
+
+def test_the_index_links_to_each_page():
+    index = PAGES["docs/index.md"]
+    pages = {Path(page).name for page in PAGES} - {"index.md"}
+    assert sorted(page for page in pages if f"]({page})" not in index and f"(../{page})" not in index) == []
 
 
 def test_the_table_of_results_says_what_the_csv_says():
