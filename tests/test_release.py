@@ -1,5 +1,6 @@
 """The check of a release: which files it misses and which it finds too many, and which Pythons it takes."""
 
+import ast
 import re
 import subprocess
 import sys
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from release import check
+from release import check, words
 
 ROOT = Path(__file__).resolve().parent.parent
 THIS_VERSION = "{}.{}".format(*sys.version_info)
@@ -34,8 +35,8 @@ def repository(tmp_path, monkeypatch) -> Path:
     for name in ("stereoweave/a.py", "stereoweave/b.py", "README.md", "stereoweave/left.py"):
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).touch()
-    for words in (["init", "-q"], ["add", "stereoweave/a.py", "stereoweave/b.py", "README.md"]):
-        subprocess.run(["git", *words], cwd=root, check=True)
+    for arguments in (["init", "-q"], ["add", "stereoweave/a.py", "stereoweave/b.py", "README.md"]):
+        subprocess.run(["git", *arguments], cwd=root, check=True)
     monkeypatch.setattr(check, "ROOT", root)
     return root
 
@@ -113,3 +114,15 @@ def test_the_manifest_names_each_folder_of_the_repository():
     folders = {name.partition("/")[0] for name in check.tracked_files(ROOT) if "/" in name}
     grafted = re.findall(r"^graft (\S+)$", (ROOT / "MANIFEST.in").read_text(), re.MULTILINE)
     assert grafted == sorted(folders)
+
+
+def test_a_draw_of_texts_has_all_kinds_and_depends_on_its_seed_alone():
+    drawn = words.draw(seed=1, count=50, kind="errors")
+    assert drawn == words.draw(seed=1, count=50, kind="errors")
+    assert len(set(drawn)) == 50
+    assert drawn != words.draw(seed=2, count=50, kind="errors")
+    tree = ast.parse(
+        '"""A module."""\ndef f():\n    """A function."""\n    raise ValueError(f"too {long}")\n'
+    )
+    assert list(words.docstrings(tree)) == [(1, "A module."), (3, "A function.")]
+    assert list(words.error_messages(tree)) == [(4, "ValueError(f'too {long}')")]
