@@ -16,7 +16,7 @@ from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.providers import CPU
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoPair
-from stereoweave.synth.sets.samples import Order
+from stereoweave.synth.sets.pair_rendering import Order
 from stereoweave.video.temporal_filter import Steadier
 
 MEAN = "mean"

@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float, UInt8
 
 from stereoweave.bench.flicker_metrics import seen_again
 from stereoweave.stereo import StereoPair
-from stereoweave.synth.rigs import Rig
 from stereoweave.synth.sets.make import camera
-from stereoweave.synth.sets.samples import Order, staged
+from stereoweave.synth.sets.pair_rendering import Order, staged
+from stereoweave.synth.viewpoints import Rig
 
 LEFT, MIDDLE, RIGHT = 0.0, 0.5, 1.0
 NOISE_LEVELS = 4.0

@@ -53,7 +53,7 @@ def make(  # noqa: PLR0913 - each is a word of the command line
     with needing_the_synth_extra():
         from stereoweave.synth.sets.make import RenderingStudio
         from stereoweave.synth.sets.make import make as make_set
-        from stereoweave.synth.sets.samples import Order
+        from stereoweave.synth.sets.pair_rendering import Order
     order = Order(
         scene=scene, seed=seed, size_px=parse_size_px(size), frames=frames, views=tuple(view or ()), rig=rig
     )

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from stereoweave.synth.rigs import NEAREST_PX, Orbit
+from stereoweave.synth.viewpoints import NEAREST_PX, Orbit
 from stereoweave.synth.world import Material, World
 
 

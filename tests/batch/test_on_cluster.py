@@ -24,7 +24,7 @@ from stereoweave.data.shards import write_shard
 from stereoweave.errors import StereoweaveError
 from stereoweave.synth.sets import make as making
 from stereoweave.synth.sets.make import make
-from stereoweave.synth.sets.samples import Order
+from stereoweave.synth.sets.pair_rendering import Order
 from stereoweave.system.ray_engine import Engine, connect
 
 pytestmark = pytest.mark.system

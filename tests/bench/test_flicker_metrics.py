@@ -18,8 +18,8 @@ from stereoweave.bench.flicker_films import (
 from stereoweave.bench.flicker_metrics import flicker, seen_again
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import StereoCamera, StereoPair
-from stereoweave.synth.rigs import Rig
-from stereoweave.synth.sets.samples import Order
+from stereoweave.synth.sets.pair_rendering import Order
+from stereoweave.synth.viewpoints import Rig
 
 REST = np.zeros((1, 4, 2), np.float32)
 ALL = np.ones((1, 4), bool)

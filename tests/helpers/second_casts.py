@@ -4,7 +4,7 @@ import numpy as np
 
 from stereoweave.synth.rendering.frustum import rays
 from stereoweave.synth.rendering.raycast import Raycaster
-from stereoweave.synth.rigs import Rig
+from stereoweave.synth.viewpoints import Rig
 from stereoweave.synth.world import World
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from stereoweave.data.samples import make_sample
 from stereoweave.stereo import Sample, StereoCamera, StereoPair
-from stereoweave.synth.sets.samples import Order, Rendered
+from stereoweave.synth.sets.pair_rendering import Order, Rendered
 from stereoweave.synth.world import Shot
 
 # f B = 12 px m: the box of `box_before_a_wall` is at 1.2 m, its wall at 4 m.

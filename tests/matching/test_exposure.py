@@ -11,7 +11,7 @@ from stereoweave.matching.matcher import Matcher
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.synth.rendering.effects import PLAIN
 from stereoweave.synth.rendering.raycast import Raycaster
-from stereoweave.synth.sets.samples import Order, rendered
+from stereoweave.synth.sets.pair_rendering import Order, rendered
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 LEVELS = np.arange(256)

@@ -7,11 +7,11 @@ from jaxtyping import Float
 
 from stereoweave.synth.props.furniture import FURNITURE
 from stereoweave.synth.props.primitives import turn
+from stereoweave.synth.props.random_materials import surface
 from stereoweave.synth.props.solids import SOLIDS, Skin, Thing
-from stereoweave.synth.props.surfaces import surface
 from stereoweave.synth.props.thin_things import THIN
-from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette
+from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Mesh
 
 COUNT = (15, 40)

@@ -7,8 +7,8 @@ from jaxtyping import Float
 
 from stereoweave.synth.props.furniture import shelf
 from stereoweave.synth.props.primitives import boxes, lathe, sheet, spheres, tubes
+from stereoweave.synth.props.random_materials import broad, chosen, muted, surface
 from stereoweave.synth.props.solids import Skin
-from stereoweave.synth.props.surfaces import broad, chosen, muted, surface
 from stereoweave.synth.stage import Palette
 from stereoweave.synth.world import Colour, Lamp, Material, Mesh, Sky, joined
 

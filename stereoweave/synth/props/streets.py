@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.synth.props.figures import draw_clothes, person
 from stereoweave.synth.props.lattice import galvanised
+from stereoweave.synth.props.people_and_animals import draw_clothes, person
 from stereoweave.synth.props.primitives import boxes, polyline_tubes, prism, spheres, tubes, turn
-from stereoweave.synth.props.surfaces import chosen, muted
+from stereoweave.synth.props.random_materials import chosen, muted
 from stereoweave.synth.props.surroundings import bollards, bushes, fence, trees
 from stereoweave.synth.props.vehicles import fleet
 from stereoweave.synth.stage import Palette

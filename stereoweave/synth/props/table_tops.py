@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stereoweave.synth.props.primitives import boxes, turn
-from stereoweave.synth.props.surfaces import broad
+from stereoweave.synth.props.random_materials import broad
 from stereoweave.synth.stage import Palette
 from stereoweave.synth.world import Mesh, joined
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from stereoweave.synth.rigs import Rig
+from stereoweave.synth.viewpoints import Rig
 
 # What is nearer is not seen. The depth buffer's 24 bits are spread from here to infinity.
 NEAR_M = 0.1

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from stereoweave.synth.rendering.gpu_buffers import Geometry
-from stereoweave.synth.rendering.light_tables import CELLS, SunView, crowd, sun_view
 from stereoweave.synth.rendering.shader_programs import Programs
+from stereoweave.synth.rendering.shadow_and_occlusion import CELLS, SunView, crowd, sun_view
 from stereoweave.synth.world import Sky
 
 # The square around the target and the wide one lie side by side in one shadow map. More texels would not be

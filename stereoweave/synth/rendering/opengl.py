@@ -13,8 +13,8 @@ from stereoweave.synth.rendering.frustum import in_view, projection, to_directio
 from stereoweave.synth.rendering.gpu_buffers import Frames, Geometry, MaterialBlock, texture_array
 from stereoweave.synth.rendering.light_maps import LightMaps
 from stereoweave.synth.rendering.shader_programs import Programs, surface
-from stereoweave.synth.rigs import Rig
 from stereoweave.synth.textures.bank import bank
+from stereoweave.synth.viewpoints import Rig
 from stereoweave.synth.world import Shot, World
 
 _TEXTURES, _SAMPLES = 0, 1  # texture units

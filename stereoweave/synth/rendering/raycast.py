@@ -15,8 +15,8 @@ from jaxtyping import Float, Int, UInt8
 
 from stereoweave.synth.rendering.effects import Effects
 from stereoweave.synth.rendering.frustum import NEAR_M, rays
-from stereoweave.synth.rigs import Rig
 from stereoweave.synth.textures.bank import bank, linear
+from stereoweave.synth.viewpoints import Rig
 from stereoweave.synth.world import Mesh, Shot, Sky, World
 
 Vectors = Float[np.ndarray, "p 3"]

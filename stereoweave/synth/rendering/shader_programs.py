@@ -7,7 +7,7 @@ import moderngl
 import numpy as np
 
 from stereoweave.synth.rendering.effects import Effects
-from stereoweave.synth.rendering.light_tables import CELLS
+from stereoweave.synth.rendering.shadow_and_occlusion import CELLS
 
 MOST_MATERIALS = 64
 MOST_LAMPS = 4

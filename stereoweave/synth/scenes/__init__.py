@@ -5,10 +5,10 @@ from collections.abc import Callable
 import numpy as np
 
 from stereoweave.synth.scenes.antenna import antenna
-from stereoweave.synth.scenes.boards import boards
 from stereoweave.synth.scenes.bridge import bridge
 from stereoweave.synth.scenes.crane import crane
 from stereoweave.synth.scenes.figures import figures
+from stereoweave.synth.scenes.plain_boards import boards
 from stereoweave.synth.scenes.propeller import propeller
 from stereoweave.synth.scenes.pylon import pylon
 from stereoweave.synth.scenes.refinery import refinery

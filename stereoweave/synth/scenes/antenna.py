@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.synth.props.aerials import dipoles, drum, panel, whip, yagi
+from stereoweave.synth.props.antennas import dipoles, drum, panel, whip, yagi
 from stereoweave.synth.props.lattice import (
     Bracing,
     aviation,
@@ -32,10 +32,10 @@ from stereoweave.synth.props.surroundings import (
     terrain,
     trees,
 )
-from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.scenes.radio_dish import radio_dish
-from stereoweave.synth.scenes.roof_aerials import roof_aerials
+from stereoweave.synth.scenes.roof_antennas import roof_aerials
 from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Material, Mesh, World, joined
 
 

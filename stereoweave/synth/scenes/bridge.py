@@ -10,8 +10,8 @@ from stereoweave.synth.props.primitives import boxes, sheet, shift, turn
 from stereoweave.synth.props.surroundings import bushes, daylight, hills, houses, places, rocks, sea, trees
 from stereoweave.synth.props.truss_bridges import lift_bridge, truss_girder
 from stereoweave.synth.props.vehicles import fleet
-from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Material, Mesh, World, joined
 
 KINDS: dict[str, Callable[[np.random.Generator, Palette, Plan], Mesh]] = {

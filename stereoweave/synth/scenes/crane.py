@@ -22,9 +22,9 @@ from stereoweave.synth.props.lattice import (
 )
 from stereoweave.synth.props.primitives import boxes, lathe, sweep, tubes, turn
 from stereoweave.synth.props.surroundings import daylight
-from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.scenes.quay_crane import quay_crane
 from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Colour, Material, Mesh, World, joined
 
 PAINTS: tuple[Colour, ...] = (

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from stereoweave.synth.props.clutter import Space, clutter
-from stereoweave.synth.props.figures import animal, draw_clothes, person
 from stereoweave.synth.props.interiors import indoor_light, lamp_spots, lamps_at, pendants, shell
+from stereoweave.synth.props.people_and_animals import animal, draw_clothes, person
 from stereoweave.synth.props.primitives import turn
 from stereoweave.synth.props.surroundings import (
     bushes,
@@ -18,8 +18,8 @@ from stereoweave.synth.props.surroundings import (
     terrain,
     trees,
 )
-from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Colour, Mesh, Sky, World, joined
 
 # A figure before the lens, a background far behind it.

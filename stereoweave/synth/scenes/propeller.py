@@ -11,8 +11,8 @@ from stereoweave.synth.props.propellers import Screw, draw_screw, screw_mesh
 from stereoweave.synth.props.shipyards import blocks, dock, lamps, litter, scaffold, yard
 from stereoweave.synth.props.sterns import stern
 from stereoweave.synth.props.surroundings import daylight, places, varied
-from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Colour, Lamp, Material, Mesh, Sky, World, joined
 
 # How a screw may look: texture and variants, colour, roughness, metal.

@@ -22,8 +22,8 @@ from stereoweave.synth.props.lattice import (
 )
 from stereoweave.synth.props.primitives import Points, boxes, copies, shift, spheres
 from stereoweave.synth.props.surroundings import bushes, daylight, hills, houses, places, terrain, trees
-from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Material, Mesh, World, joined
 
 # Each arm: its height and its reach, as shares of the tower's height, and the conductors on each side.

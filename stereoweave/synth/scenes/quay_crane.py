@@ -19,8 +19,8 @@ from stereoweave.synth.props.lattice import (
 )
 from stereoweave.synth.props.primitives import boxes, copies, lathe, prism, shift, tubes, turn
 from stereoweave.synth.props.surroundings import bollards, daylight, hills, sea
-from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Colour, Material, Mesh, World, joined
 
 PAINTS: tuple[Colour, ...] = ((0.1, 0.22, 0.42), (0.55, 0.1, 0.06), (0.7, 0.7, 0.68), (0.68, 0.45, 0.08))

@@ -3,13 +3,13 @@
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.synth.props.aerials import paraboloid
+from stereoweave.synth.props.antennas import paraboloid
 from stereoweave.synth.props.lattice import bars, cage, chains, galvanised, ladder, railing, truss
 from stereoweave.synth.props.primitives import boxes, copies, lathe, shift, spheres, tubes, turn
 from stereoweave.synth.props.surroundings import bushes, daylight, hills, houses, places, terrain, trees
 from stereoweave.synth.props.wind_rotors import composite
-from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Material, Mesh, World, joined
 
 RIBS = 16

@@ -28,8 +28,8 @@ from stereoweave.synth.props.surroundings import (
     terrain,
     trees,
 )
-from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Material, Mesh, World, joined
 
 UNITS: dict[str, Callable[[np.random.Generator, Coats], Unit]] = {

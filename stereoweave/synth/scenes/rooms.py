@@ -8,7 +8,7 @@ from jaxtyping import Float
 from stereoweave.synth.props.clutter import Space, clutter
 from stereoweave.synth.props.interiors import indoor_light, lamp_spots, lamps_at, pendants, shell
 from stereoweave.synth.props.primitives import boxes, turn
-from stereoweave.synth.props.surfaces import chosen
+from stereoweave.synth.props.random_materials import chosen
 from stereoweave.synth.props.surroundings import (
     bushes,
     daylight,
@@ -20,8 +20,8 @@ from stereoweave.synth.props.surroundings import (
     trees,
 )
 from stereoweave.synth.props.table_tops import draw_table_top, table_top
-from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Mesh, World, joined
 
 # The cameras of one world see nearly the same, so that things can be placed where all of them see them.

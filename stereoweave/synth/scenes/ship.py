@@ -10,10 +10,10 @@ from stereoweave.synth.props.harbours import harbour, open_water
 from stereoweave.synth.props.hulls import Hull
 from stereoweave.synth.props.lattice import galvanised, ladder, painted, railing
 from stereoweave.synth.props.primitives import Point, lathe, sheet, tubes, turn
+from stereoweave.synth.props.ships import TRADES, Plan
 from stereoweave.synth.props.surroundings import daylight, varied
-from stereoweave.synth.props.vessels import TRADES, Plan
-from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Colour, Material, Mesh, World, joined
 
 

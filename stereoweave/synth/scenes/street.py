@@ -11,8 +11,8 @@ from stereoweave.synth.props.streets import (
     walkers,
 )
 from stereoweave.synth.props.surroundings import daylight, hills, terrain
-from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import World, joined
 
 # Between the road before the car and the horizon.

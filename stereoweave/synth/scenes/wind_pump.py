@@ -15,8 +15,8 @@ from stereoweave.synth.props.lattice import (
 )
 from stereoweave.synth.props.primitives import boxes, copies, lathe, sheet, spheres, tubes, turn
 from stereoweave.synth.props.surroundings import bushes, daylight, fence, hills, places, rocks, terrain, trees
-from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Material, Mesh, World, joined
 
 

@@ -28,9 +28,9 @@ from stereoweave.synth.props.surroundings import (
     trees,
 )
 from stereoweave.synth.props.wind_rotors import Finish, Rotor, composite, head
-from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.scenes.wind_pump import wind_pump
 from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Colour, Material, Mesh, World, joined
 
 KINDS = {"tube": 0.45, "sea": 0.25, "lattice": 0.15, "pump": 0.15}

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from stereoweave.io.colormap import OCCLUDED_RGB, colour_disparity, colour_range_px
 from stereoweave.stereo import Sample
-from stereoweave.synth.sets.samples import Camera, Order, rendered
+from stereoweave.synth.sets.pair_rendering import Camera, Order, rendered
 from stereoweave.system.progress import progress
 
 COLUMNS = ("left", "right", "depth", "seen by this camera alone: left", "right")

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 from stereoweave.synth.rendering.effects import PLAIN, Effects
 from stereoweave.synth.rendering.opengl import Renderer
-from stereoweave.synth.rigs import Rig
-from stereoweave.synth.sets.samples import Order, staged
+from stereoweave.synth.sets.pair_rendering import Order, staged
+from stereoweave.synth.viewpoints import Rig
 from stereoweave.synth.world import World
 
 _OFF = {

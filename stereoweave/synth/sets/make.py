@@ -21,7 +21,7 @@ from stereoweave.io.files import SMALLEST_SIDE_PX, make_folder, reading, remove_
 from stereoweave.io.output_lock import lock_output
 from stereoweave.io.run_folder import check_claim, check_unclaimed, description
 from stereoweave.rendering.renderer import FIRST_POSITION, LAST_POSITION
-from stereoweave.synth.sets.samples import Camera, Order, Rendered, rendered
+from stereoweave.synth.sets.pair_rendering import Camera, Order, Rendered, rendered
 from stereoweave.synth.sets.workers import in_engine, in_workers, step_done
 from stereoweave.system.ray_engine import Engine
 
@@ -292,7 +292,7 @@ def _tidy_frames(out: Path) -> None:
 def camera(plain: bool = False) -> Camera:
     """The best renderer that this machine has, one a process; `plain` leaves every effect out."""
     from stereoweave.synth.rendering.effects import PLAIN, Effects
-    from stereoweave.synth.sets.camera import camera_for
+    from stereoweave.synth.sets.renderers import camera_for
 
     return camera_for(PLAIN if plain else Effects())
 

@@ -15,10 +15,10 @@ from stereoweave.synth.props.primitives import boxes, sheet, spheres, tubes
 from stereoweave.synth.rendering.effects import PLAIN, Effects
 from stereoweave.synth.rendering.opengl import Renderer
 from stereoweave.synth.rendering.raycast import Raycaster
-from stereoweave.synth.rigs import Orbit, Rig, Viewpoint, rig_at
 from stereoweave.synth.scenes import SCENES
-from stereoweave.synth.sets.samples import Order, staged
+from stereoweave.synth.sets.pair_rendering import Order, staged
 from stereoweave.synth.textures.bank import bank, linear
+from stereoweave.synth.viewpoints import Orbit, Rig, Viewpoint, rig_at
 from stereoweave.synth.world import Fog, Lamp, Material, Mesh, Sky, World, joined
 
 pytestmark = pytest.mark.needs_egl

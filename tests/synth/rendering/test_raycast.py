@@ -11,9 +11,9 @@ from stereoweave.synth.props.primitives import boxes, sheet, spheres
 from stereoweave.synth.rendering import opengl as renderer
 from stereoweave.synth.rendering.effects import PLAIN, Effects
 from stereoweave.synth.rendering.raycast import Raycaster
-from stereoweave.synth.rigs import Rig
-from stereoweave.synth.sets.camera import camera_for
-from stereoweave.synth.sets.samples import Camera
+from stereoweave.synth.sets.pair_rendering import Camera
+from stereoweave.synth.sets.renderers import camera_for
+from stereoweave.synth.viewpoints import Rig
 from stereoweave.synth.world import Material, Mesh, Sky, World, joined
 
 WHITE = (1.0, 1.0, 1.0)

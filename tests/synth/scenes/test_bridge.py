@@ -5,9 +5,9 @@ import pytest
 
 from stereoweave.stereo import StereoCamera
 from stereoweave.synth.props.bridges import abutments, beams, planned
-from stereoweave.synth.rigs import draw_viewpoint, rig_at
 from stereoweave.synth.scenes.bridge import KINDS, bridge
 from stereoweave.synth.stage import Palette
+from stereoweave.synth.viewpoints import draw_viewpoint, rig_at
 
 
 @functools.cache

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from stereoweave.synth.props.figures import animal
-from stereoweave.synth.rigs import draw_viewpoint
+from stereoweave.synth.props.people_and_animals import animal
 from stereoweave.synth.scenes.figures import figures
 from stereoweave.synth.stage import Palette
+from stereoweave.synth.viewpoints import draw_viewpoint
 
 SEEDS = range(8)
 

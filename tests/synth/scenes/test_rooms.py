@@ -6,14 +6,14 @@ import pytest
 
 from stereoweave.synth.props.clutter import COUNT, Space, clutter
 from stereoweave.synth.props.furniture import FURNITURE
+from stereoweave.synth.props.random_materials import PERIODIC, broad, surface
 from stereoweave.synth.props.solids import SOLIDS, Skin
-from stereoweave.synth.props.surfaces import PERIODIC, broad, surface
 from stereoweave.synth.props.table_tops import draw_table_top, table_top
 from stereoweave.synth.props.thin_things import THIN
-from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.scenes.rooms import rooms
 from stereoweave.synth.stage import Palette
 from stereoweave.synth.textures.bank import FAMILIES
+from stereoweave.synth.viewpoints import Orbit
 
 THINGS = {thing.__name__: thing for thing in (*SOLIDS, *THIN, *FURNITURE)}
 SPACE = Space(

@@ -9,8 +9,8 @@ import trimesh
 
 from stereoweave.stereo import StereoCamera
 from stereoweave.synth.rendering.frustum import rays
-from stereoweave.synth.rigs import Rig, draw_viewpoint, rig_at
 from stereoweave.synth.scenes import SCENES
+from stereoweave.synth.viewpoints import Rig, draw_viewpoint, rig_at
 
 NAMES = ("antenna", "pylon", "crane", "wind_turbine")
 # Between them every kind of each scene: roof, mast, dish; tower and quay; sea, tube, lattice, pump.

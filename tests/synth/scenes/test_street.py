@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from stereoweave.synth.props.figures import draw_clothes, person
+from stereoweave.synth.props.people_and_animals import draw_clothes, person
 from stereoweave.synth.props.streets import StreetPlan, carriageway, draw_street_plan, fronts, traffic
-from stereoweave.synth.rigs import draw_viewpoint
 from stereoweave.synth.scenes.street import street
 from stereoweave.synth.stage import Palette
+from stereoweave.synth.viewpoints import draw_viewpoint
 
 PLAN = StreetPlan(half_m=5.0, pavement_m=2.5, lane_m=-1.5)
 

@@ -13,7 +13,7 @@ from stereoweave.data.shards import write_shard
 from stereoweave.stereo import StereoPair
 from stereoweave.synth.sets.check import check, lines, problem
 from stereoweave.synth.sets.make import camera
-from stereoweave.synth.sets.samples import Order, rendered
+from stereoweave.synth.sets.pair_rendering import Order, rendered
 
 FACTS = '{"format": 1, "layout": "LAYOUT", "scene": "pylon", "pairs": 3}'
 SCENES_IN_SMALL = ("propeller", "ship", "refinery", "pylon", "wind_turbine")

@@ -21,7 +21,7 @@ from stereoweave.synth.rendering.opengl import Renderer
 from stereoweave.synth.sets import make as making
 from stereoweave.synth.sets.check import check
 from stereoweave.synth.sets.make import RenderingStudio, generator_version, make, read_set
-from stereoweave.synth.sets.samples import Order
+from stereoweave.synth.sets.pair_rendering import Order
 
 ORDER = Order(scene="pylon", seed=3, size_px=(48, 32), views=(0.5,))
 STUDIO = PaintedStudio()
@@ -31,7 +31,7 @@ import resource
 from pathlib import Path
 from shard_examples import PaintedStudio
 from stereoweave.synth.sets import make as making
-from stereoweave.synth.sets.samples import Order
+from stereoweave.synth.sets.pair_rendering import Order
 if __name__ == "__main__":
     making.LAYOUTS["shards"] = making.LAYOUTS["shards"]._replace(pairs_a_run=4)
     making.generator_version = lambda: "01234567"

@@ -8,7 +8,7 @@ from stereoweave.data.samples import make_sample
 from stereoweave.stereo import StereoPair
 from stereoweave.synth.rendering.effects import PLAIN
 from stereoweave.synth.rendering.raycast import Raycaster
-from stereoweave.synth.sets.samples import Order, rendered, staged
+from stereoweave.synth.sets.pair_rendering import Order, rendered, staged
 
 ORDER = Order(scene="pylon", seed=3, size_px=(160, 120))
 BLACK = np.zeros((240, 320, 3), np.uint8)

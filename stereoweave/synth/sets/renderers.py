@@ -4,7 +4,7 @@ import warnings
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.synth.rendering.effects import Effects
-from stereoweave.synth.sets.samples import Camera
+from stereoweave.synth.sets.pair_rendering import Camera
 
 _PACKAGES = "on Debian: apt install libegl1 libgl1-mesa-dri"
 

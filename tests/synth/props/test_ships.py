@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from stereoweave.synth.props.deckhouses import Paints
-from stereoweave.synth.props.vessels import TRADES
+from stereoweave.synth.props.ships import TRADES
 
 PAINTS = Paints(house=0, roof=1, trim=2, white=3, dark=4, glass=5, steel=6, orange=7, rope=8)
 

@@ -5,10 +5,10 @@ import pytest
 from learn_examples import complaint
 
 from stereoweave.stereo import StereoCamera
-from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.scenes import SCENES
-from stereoweave.synth.sets.samples import Order, rendered, staged
+from stereoweave.synth.sets.pair_rendering import Order, rendered, staged
 from stereoweave.synth.stage import Stage
+from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Mesh, Shot, Sky, World
 
 ORDER = Order(scene="propeller", size_px=(320, 240))

@@ -13,10 +13,10 @@ from jaxtyping import Float
 from stereoweave.synth.props.furniture import FURNITURE, book_stack, picture, plant
 from stereoweave.synth.props.interiors import lamps_at, pendants, shell
 from stereoweave.synth.props.primitives import boxes, tubes, turn
+from stereoweave.synth.props.random_materials import chosen, muted, surface
 from stereoweave.synth.props.solids import SOLIDS, Skin
-from stereoweave.synth.props.surfaces import chosen, muted, surface
-from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Colour, Lamp, Material, Mesh, Sky, World, joined
 
 # The cameras look along y, so that what is near can be set before them.

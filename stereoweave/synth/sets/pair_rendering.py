@@ -11,7 +11,9 @@ from jaxtyping import Float, UInt8
 from stereoweave.data.samples import make_sample
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import Sample, StereoCamera, StereoPair
-from stereoweave.synth.rigs import (
+from stereoweave.synth.scenes import SCENES
+from stereoweave.synth.stage import Stage
+from stereoweave.synth.viewpoints import (
     Rig,
     between,
     draw_focal_px,
@@ -19,8 +21,6 @@ from stereoweave.synth.rigs import (
     draw_viewpoint,
     rig_at,
 )
-from stereoweave.synth.scenes import SCENES
-from stereoweave.synth.stage import Stage
 from stereoweave.synth.world import Shot, World
 
 # What is nearer than this share of the picture decides the baseline: a single blade of grass does not.

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from stereoweave.stereo import StereoCamera
-from stereoweave.synth.rigs import (
+from stereoweave.synth.viewpoints import (
     Orbit,
     Viewpoint,
     between,

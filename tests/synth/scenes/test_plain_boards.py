@@ -5,8 +5,8 @@ import pytest
 
 from stereoweave.synth.rendering.effects import PLAIN
 from stereoweave.synth.rendering.raycast import Raycaster
-from stereoweave.synth.scenes.boards import boards
-from stereoweave.synth.sets.samples import Order, rendered, staged
+from stereoweave.synth.scenes.plain_boards import boards
+from stereoweave.synth.sets.pair_rendering import Order, rendered, staged
 
 ORDER = Order(scene="boards", seed=77, size_px=(160, 120))
 PAIRS = range(12)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from stereoweave.synth.props.primitives import loft, spheres, sweep
-from stereoweave.synth.props.surfaces import chosen
+from stereoweave.synth.props.random_materials import chosen
 from stereoweave.synth.stage import Palette
 from stereoweave.synth.world import Material, Mesh, joined
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stereoweave.synth.props.aerials import dipoles, drum, panel, paraboloid, satellite_dish, whip, yagi
+from stereoweave.synth.props.antennas import dipoles, drum, panel, paraboloid, satellite_dish, whip, yagi
 
 
 def test_a_paraboloid_reflects_what_comes_along_its_axis_to_its_focus():

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from stereoweave.synth.props.aerials import dipoles, panel, satellite_dish, whip, yagi
+from stereoweave.synth.props.antennas import dipoles, panel, satellite_dish, whip, yagi
 from stereoweave.synth.props.lattice import bars, cables, galvanised, painted
 from stereoweave.synth.props.primitives import boxes, lathe, sweep, tubes, turn
 from stereoweave.synth.props.surroundings import daylight, hills, houses, places, terrain, trees
-from stereoweave.synth.rigs import Orbit
 from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Material, Mesh, World, joined
 
 STREET_M = -8.0  # the roof is at 0
