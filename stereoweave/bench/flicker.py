@@ -16,7 +16,7 @@ from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.providers import CPU
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoPair
-from stereoweave.synth.sets.pair_rendering import Order
+from stereoweave.synth.sets.pair_rendering import RenderSpec
 from stereoweave.video.temporal_filter import Steadier
 
 MEAN = "mean"
@@ -90,7 +90,7 @@ def flicker_rows(  # noqa: PLR0913 - each is a word of the command line
     """
     if frames < 2:
         raise StereoweaveError(f"frames: expected 2 or more, for flicker is between two; got {frames}")
-    orders = [Order(scene=scene, seed=seed, size_px=size_px, frames=_WAY_FRAMES) for scene in scenes]
+    orders = [RenderSpec(scene=scene, seed=seed, size_px=size_px, frames=_WAY_FRAMES) for scene in scenes]
     matcher = Matcher(model, threads=threads, provider=provider)
     for order in orders:
         for film in _films(order, frames):
@@ -127,7 +127,7 @@ def _mean_row(name: str, rows: Sequence[FlickerRow]) -> FlickerRow:
     return replace(rows[0], film=name, scene=MEAN, **values)
 
 
-def _films(order: Order, frames: int) -> Iterator[Film]:
+def _films(order: RenderSpec, frames: int) -> Iterator[Film]:
     pan = panning(order, frames)
     yield still(pan)
     yield passing(pan, "passing", (3.25, 0.75))

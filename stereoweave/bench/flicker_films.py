@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float, UInt8
 
 from stereoweave.bench.flicker_metrics import seen_again
 from stereoweave.stereo import StereoPair
-from stereoweave.synth.sets.make import camera
-from stereoweave.synth.sets.pair_rendering import Order, staged
-from stereoweave.synth.viewpoints import Rig
+from stereoweave.synth.sets.pair_rendering import RenderSpec, draw_stage_and_rig
+from stereoweave.synth.sets.renderers import shared_renderer
+from stereoweave.synth.viewpoints import PosedRig
 
 LEFT, MIDDLE, RIGHT = 0.0, 0.5, 1.0
 NOISE_LEVELS = 4.0
@@ -59,12 +59,12 @@ def noisy(pair: StereoPair, rng: np.random.Generator) -> StereoPair:
     return StereoPair(left=with_noise(pair.left), right=with_noise(pair.right))
 
 
-def panning(order: Order, frames: int) -> Film:
+def panning(order: RenderSpec, frames: int) -> Film:
     """A film of a camera that moves: so many frames from the middle of the order's, where it is fastest."""
     first = (order.frames - frames) // 2
-    stages = [staged(camera(), order, 0, first + number) for number in range(frames)]
+    stages = [draw_stage_and_rig(shared_renderer(), order, 0, first + number) for number in range(frames)]
     rigs = [rig for _, rig in stages]
-    shots = [camera().shots(stage.world, rig, (LEFT, MIDDLE, RIGHT)) for stage, rig in stages]
+    shots = [shared_renderer().render_views(stage.world, rig, (LEFT, MIDDLE, RIGHT)) for stage, rig in stages]
     disparities_px = [
         {
             position: rig.camera.disparity_px(shot.depth_m).astype(np.float32)
@@ -85,7 +85,9 @@ def panning(order: Order, frames: int) -> Film:
     )
 
 
-def reprojected(disparity_px: Float[np.ndarray, "h w"], rig: Rig, other: Rig, position: float) -> Change:
+def reprojected(
+    disparity_px: Float[np.ndarray, "h w"], rig: PosedRig, other: PosedRig, position: float
+) -> Change:
     """What becomes of the points of a view at a position when the rig moves to where the other one is.
 
     Args:

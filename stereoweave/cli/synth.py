@@ -51,25 +51,24 @@ def make(  # noqa: PLR0913 - each is a word of the command line
 ) -> None:
     """Make a set of rendered pairs, or go on with one that was stopped or shall have more."""
     with needing_the_synth_extra():
-        from stereoweave.synth.sets.make import RenderingStudio
+        from stereoweave.synth.sets.make import PairRenderer
         from stereoweave.synth.sets.make import make as make_set
-        from stereoweave.synth.sets.pair_rendering import Order
-    order = Order(
+        from stereoweave.synth.sets.pair_rendering import RenderSpec
+    spec = RenderSpec(
         scene=scene, seed=seed, size_px=parse_size_px(size), frames=frames, views=tuple(view or ()), rig=rig
     )
-    studio, engine = RenderingStudio(plain), engine_of(cluster, workers=jobs)
-    made = make_set(order, pairs, out, layout=layout, jobs=_jobs(jobs), engine=engine, studio=studio)
+    pair_maker, engine = PairRenderer(plain), engine_of(cluster, workers=jobs)
+    made = make_set(spec, pairs, out, layout=layout, jobs=_jobs(jobs), engine=engine, pair_maker=pair_maker)
     typer.echo(f"{out}: {made} pair{'s' * (made != 1)} made, {pairs - made} there before")
 
 
 @synth.command()
 def check(folder: Annotated[Path, typer.Argument(help="What synth make made.")], jobs: Jobs = None) -> None:
     """Check a set: checksums, disparity against the pictures, statistics; exit status 1 if one is wrong."""
-    from stereoweave.synth.sets.check import check as check_set
-    from stereoweave.synth.sets.check import lines
+    from stereoweave.synth.sets.check import check_set, report_lines
 
     found = check_set(folder, _jobs(jobs))
-    typer.echo("\n".join(lines(found)))
+    typer.echo("\n".join(report_lines(found)))
     if found.problems:
         raise typer.Exit(1)
 
@@ -88,15 +87,15 @@ def sheet(
     picture_kind(out)
     with needing_the_synth_extra():
         from stereoweave.synth.scenes import SCENES
-        from stereoweave.synth.sets import contact_sheet
-        from stereoweave.synth.sets.make import camera
+        from stereoweave.synth.sets.contact_sheet import contact_sheet, quiz_sheet
+        from stereoweave.synth.sets.renderers import shared_renderer
     if quiz:
-        picture, answers = contact_sheet.quiz(
-            camera(), [name for name in SCENES if name not in ("boards", "rooms")], seed
+        picture, answers = quiz_sheet(
+            shared_renderer(), [name for name in SCENES if name not in ("boards", "rooms")], seed
         )
         typer.echo("by row: " + ", ".join(answers))
     else:
-        picture = contact_sheet.sheet(camera(), list(SCENES), seed)
+        picture = contact_sheet(shared_renderer(), list(SCENES), seed)
     write_image(out, picture)
     typer.echo(f"{out}: {picture.shape[1]}x{picture.shape[0]} pixels")
 
@@ -110,8 +109,8 @@ def costs(
     # As in `make`: Mesa reads it when the renderer starts.
     os.environ["LP_NUM_THREADS"] = "1"
     with needing_the_synth_extra():
-        from stereoweave.synth.sets.effect_costs import costs as measured
-    for cost in measured(scene, pairs):
+        from stereoweave.synth.sets.effect_costs import measure_effect_costs
+    for cost in measure_effect_costs(scene, pairs):
         typer.echo(f"{cost.ms_a_pair:6.0f} ms  {cost.effect}")
 
 

@@ -12,7 +12,7 @@ NEAREST_PX = (18.0, 160.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rig:
+class PosedRig:
     """A stereo camera in the world.
 
     Attributes:
@@ -92,7 +92,7 @@ def draw_nearest_px(
     return float(np.exp(rng.uniform(*np.log(range_px))) * width_px / 640)
 
 
-def rig_at(orbit: Orbit, viewpoint: Viewpoint, camera: StereoCamera, size_px: tuple[int, int]) -> Rig:
+def place_rig(orbit: Orbit, viewpoint: Viewpoint, camera: StereoCamera, size_px: tuple[int, int]) -> PosedRig:
     """The rig at a viewpoint, looking at its aim; the middle between the two cameras is on the orbit."""
     azimuth, elevation = np.radians([viewpoint.azimuth_deg, viewpoint.elevation_deg])
     outwards = np.array(
@@ -108,7 +108,7 @@ def rig_at(orbit: Orbit, viewpoint: Viewpoint, camera: StereoCamera, size_px: tu
     roll = np.radians(viewpoint.roll_deg)
     turned = np.cos(roll) * right + np.sin(roll) * down
     axes = np.stack([turned, np.cross(forward, turned), forward])
-    return Rig(
+    return PosedRig(
         camera=camera,
         size_px=size_px,
         position_m=middle_m - camera.baseline_m / 2 * axes[0],
@@ -116,7 +116,7 @@ def rig_at(orbit: Orbit, viewpoint: Viewpoint, camera: StereoCamera, size_px: tu
     )
 
 
-def between(start: Viewpoint, end: Viewpoint, share: float) -> Viewpoint:
+def interpolate_viewpoints(start: Viewpoint, end: Viewpoint, share: float) -> Viewpoint:
     """The viewpoint at a share 0..1 of the way, starting and stopping gently, for a camera that moves."""
     eased = share * share * (3 - 2 * share)
 

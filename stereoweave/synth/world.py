@@ -141,7 +141,7 @@ class World:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Shot:
+class RenderedView:
     """A picture of a world with its truth.
 
     Attributes:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from dataset_examples import error_of
 from rich.console import Console
-from shard_examples import PaintedStudio, box_before_a_wall, contents
+from shard_examples import PaintedPairMaker, box_before_a_wall, contents
 
 from stereoweave.bench import pairs as benchmark
 from stereoweave.bench.pairs import network, score_pairs, write_csv
@@ -24,39 +24,39 @@ from stereoweave.data.shards import write_shard
 from stereoweave.errors import StereoweaveError
 from stereoweave.synth.sets import make as making
 from stereoweave.synth.sets.make import make
-from stereoweave.synth.sets.pair_rendering import Order
+from stereoweave.synth.sets.pair_rendering import RenderSpec
 from stereoweave.system.ray_engine import Engine, connect
 
 pytestmark = pytest.mark.system
 
-ORDER = Order(scene="pylon", seed=3, size_px=(48, 32))
-STUDIO = PaintedStudio()
+SPEC = RenderSpec(scene="pylon", seed=3, size_px=(48, 32))
+PAIR_MAKER = PaintedPairMaker()
 MEASURED = {"time_ms", "time_relative", "memory_mb"}
 
 
 @dataclass(frozen=True)
-class KilledOnce(PaintedStudio):
+class KilledOnce(PaintedPairMaker):
     """Its process is killed at pair 6, the first time."""
 
     note: Path = Path()
 
-    def __call__(self, order, index):
+    def __call__(self, spec, index):
         if index == 6 and not self.note.exists():
             self.note.touch()
             os.kill(os.getpid(), signal.SIGKILL)
-        return super().__call__(order, index)
+        return super().__call__(spec, index)
 
 
 @dataclass(frozen=True)
-class KeptToItself(PaintedStudio):
+class KeptToItself(PaintedPairMaker):
     """The shard before pair 4 is seen by no other machine."""
 
     out: Path = Path()
 
-    def __call__(self, order, index):
+    def __call__(self, spec, index):
         if index == 4:
             (self.out / "pylon-000000-000003.tar").unlink()
-        return super().__call__(order, index)
+        return super().__call__(spec, index)
 
 
 @pytest.fixture(scope="module")
@@ -71,8 +71,8 @@ def small_shards(monkeypatch):
     monkeypatch.setitem(making.LAYOUTS, "shards", making.LAYOUTS["shards"]._replace(pairs_a_run=4))
 
 
-def made(out, pairs=10, studio=STUDIO, engine=None):
-    return make(ORDER, pairs, out, engine=engine, studio=studio, console=Console(file=io.StringIO()))
+def made(out, pairs=10, pair_maker=PAIR_MAKER, engine=None):
+    return make(SPEC, pairs, out, engine=engine, pair_maker=pair_maker, console=Console(file=io.StringIO()))
 
 
 @pytest.fixture(scope="module")
@@ -91,9 +91,9 @@ def sets(tmp_path_factory):
 def test_a_cluster_goes_on_to_the_bytes_of_one_process_though_a_worker_is_killed(tmp_path, cluster):
     made(tmp_path / "one")
     made(tmp_path / "many", pairs=4)
-    studio = KilledOnce(note=tmp_path / "killed")
-    assert made(tmp_path / "many", studio=studio, engine=Engine(cluster)) == 6
-    assert studio.note.exists()
+    pair_maker = KilledOnce(note=tmp_path / "killed")
+    assert made(tmp_path / "many", pair_maker=pair_maker, engine=Engine(cluster)) == 6
+    assert pair_maker.note.exists()
     assert contents(tmp_path / "many") == contents(tmp_path / "one")
 
 
@@ -107,10 +107,10 @@ def test_pairs_that_a_cluster_made_where_nobody_else_sees_them_are_missed(tmp_pa
 
 def test_a_machine_that_sees_another_folder_or_would_make_other_pairs_is_named(tmp_path):
     made(tmp_path / "set", pairs=1)
-    message = error_of(making._on_a_node, ORDER, tmp_path / "nowhere", "shards", STUDIO)
+    message = error_of(making._prepare_node, SPEC, tmp_path / "nowhere", "shards", PAIR_MAKER)
     words = ["set.json: expected the description of a set", "found no such file", platform.node()]
     assert [word for word in words if word not in message] == []
-    message = error_of(making._on_a_node, replace(ORDER, seed=4), tmp_path / "set", "shards", STUDIO)
+    message = error_of(making._prepare_node, replace(SPEC, seed=4), tmp_path / "set", "shards", PAIR_MAKER)
     assert "expected seed = 4, as this run would make, found 3" in message
     assert message.endswith("on a disk that they share, and the same versions of all")
 

@@ -18,13 +18,13 @@ from stereoweave.bench.flicker_films import (
 from stereoweave.bench.flicker_metrics import flicker, seen_again
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import StereoCamera, StereoPair
-from stereoweave.synth.sets.pair_rendering import Order
-from stereoweave.synth.viewpoints import Rig
+from stereoweave.synth.sets.pair_rendering import RenderSpec
+from stereoweave.synth.viewpoints import PosedRig
 
 REST = np.zeros((1, 4, 2), np.float32)
 ALL = np.ones((1, 4), bool)
 LENS = StereoCamera(focal_px=100, baseline_m=0.1, cx_px=20, cy_px=15)
-RIG = Rig(camera=LENS, size_px=(41, 31), position_m=np.zeros(3), axes=np.eye(3))
+RIG = PosedRig(camera=LENS, size_px=(41, 31), position_m=np.zeros(3), axes=np.eye(3))
 
 
 def row(*values):
@@ -179,7 +179,7 @@ def test_what_comes_nearer_moves_less_to_the_right_in_the_middle_view(three_fram
 
 @pytest.mark.needs_egl
 def test_a_rendered_pan_looks_the_same_along_its_true_motion():
-    film = panning(Order(scene="ship", seed=4, size_px=(160, 120), frames=12), 2)
+    film = panning(RenderSpec(scene="ship", seed=4, size_px=(160, 120), frames=12), 2)
     motion_px, change_px = film.change(0, 1, LEFT)
     visible = film.seen_again(0, 1, LEFT)
     assert visible.mean() > 0.8

@@ -12,11 +12,11 @@ from shard_examples import contents
 from stereoweave.cli.root import main
 from stereoweave.cli.synth import SCENE_NAMES
 from stereoweave.data.shards import Shards
-from stereoweave.synth.rendering.gpu_buffers import Frames
+from stereoweave.synth.rendering.gpu_buffers import FrameBuffers
 from stereoweave.synth.scenes import SCENES
-from stereoweave.synth.sets.contact_sheet import quiz, sheet
-from stereoweave.synth.sets.effect_costs import costs
-from stereoweave.synth.sets.make import camera
+from stereoweave.synth.sets.contact_sheet import contact_sheet, quiz_sheet
+from stereoweave.synth.sets.effect_costs import measure_effect_costs
+from stereoweave.synth.sets.renderers import shared_renderer
 
 
 def run(line: str) -> int:
@@ -65,7 +65,7 @@ def test_a_set_is_found_in_order_and_a_damaged_one_ends_with_1(words, capsys):
 
 @pytest.mark.needs_egl
 def test_a_sheet_has_a_row_of_five_pictures_for_each_scene(capsys):
-    picture = sheet(camera(plain=True), ["pylon", "rooms"], seed=0)
+    picture = contact_sheet(shared_renderer(plain=True), ["pylon", "rooms"], seed=0)
     assert picture.shape == (20 + 2 * (20 + 240), 5 * 320, 3)
     assert "2/2" in capsys.readouterr().out
     tiles = picture[40:280].reshape(240, 5, 320, 3)
@@ -76,7 +76,7 @@ def test_a_sheet_has_a_row_of_five_pictures_for_each_scene(capsys):
 
 @pytest.mark.needs_egl
 def test_a_quiz_shows_every_scene_and_tells_them_by_place():
-    picture, answers = quiz(camera(plain=True), ["pylon", "rooms"], seed=2, pictures=6)
+    picture, answers = quiz_sheet(shared_renderer(plain=True), ["pylon", "rooms"], seed=2, pictures=6)
     assert picture.shape == (2 * 240, 4 * 320, 3)
     assert sorted(answers) == ["pylon"] * 3 + ["rooms"] * 3
     assert answers != sorted(answers)
@@ -86,7 +86,10 @@ def test_a_quiz_shows_every_scene_and_tells_them_by_place():
 @pytest.mark.needs_egl
 def test_the_costs_of_the_effects_are_told_in_milliseconds(monkeypatch, capsys):
     monkeypatch.setenv("LP_NUM_THREADS", "1")
-    monkeypatch.setattr("stereoweave.synth.sets.effect_costs.costs", partial(costs, size_px=(64, 48)))
+    monkeypatch.setattr(
+        "stereoweave.synth.sets.effect_costs.measure_effect_costs",
+        partial(measure_effect_costs, size_px=(64, 48)),
+    )
     assert run("synth costs pylon --pairs 1") == 0
     told = [re.fullmatch(r" *(-?\d+) ms  (.+)", line) for line in capsys.readouterr().out.splitlines()]
     assert [found[2] for found in told] == [
@@ -161,7 +164,7 @@ def test_the_help_names_every_scene(capsys):
 
 def test_costs_of_an_unknown_scene_are_refused_before_a_renderer_starts(monkeypatch, capsys):
     monkeypatch.setenv("LP_NUM_THREADS", "1")
-    monkeypatch.setattr("stereoweave.synth.sets.effect_costs.Renderer", None)
+    monkeypatch.setattr("stereoweave.synth.sets.effect_costs.OpenGLRenderer", None)
     assert run("synth costs cathedral") == 2
     assert "scene: expected one of" in capsys.readouterr().err
 
@@ -169,7 +172,7 @@ def test_costs_of_an_unknown_scene_are_refused_before_a_renderer_starts(monkeypa
 @pytest.mark.needs_egl
 def test_what_opengl_has_no_room_for_is_told_in_a_line():
     gl = moderngl.create_context(standalone=True, backend="egl")
-    message = error_of(Frames, gl, (100_000, 32), 2)
+    message = error_of(FrameBuffers, gl, (100_000, 32), 2)
     assert message.startswith("pictures of 100000x32 px: expected OpenGL to have room for them, found ")
     gl.release()
 

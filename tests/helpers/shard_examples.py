@@ -10,8 +10,8 @@ import numpy as np
 
 from stereoweave.data.samples import make_sample
 from stereoweave.stereo import Sample, StereoCamera, StereoPair
-from stereoweave.synth.sets.pair_rendering import Order, Rendered
-from stereoweave.synth.world import Shot
+from stereoweave.synth.sets.pair_rendering import RenderedPair, RenderSpec
+from stereoweave.synth.world import RenderedView
 
 # f B = 12 px m: the box of `box_before_a_wall` is at 1.2 m, its wall at 4 m.
 CAMERA = StereoCamera(focal_px=60.0, baseline_m=0.2, cx_px=23.5, cy_px=15.5)
@@ -36,7 +36,7 @@ def box_before_a_wall(rng: np.random.Generator, size_px: tuple[int, int] = (48, 
 
 
 @dataclass(frozen=True)
-class PaintedStudio:
+class PaintedPairMaker:
     """Makes pairs without rendering; at a pair it kills its process, or halts the one that started it."""
 
     dies_at: int | None = None
@@ -45,16 +45,16 @@ class PaintedStudio:
     def renderer(self) -> str:
         return "paint"
 
-    def __call__(self, order: Order, index: int) -> Rendered:
+    def __call__(self, spec: RenderSpec, index: int) -> RenderedPair:
         if index == self.dies_at:
             os.kill(os.getpid(), signal.SIGKILL)
         if index == self.halts_at:
             os.kill(os.getppid(), signal.SIGSTOP)
             time.sleep(600)
-        sample = box_before_a_wall(np.random.default_rng((order.seed, index)), order.size_px)
-        shot = Shot(image=sample.right, depth_m=sample.disparity_px, target=sample.occluded)
-        views = tuple((position, shot) for position in order.views)
-        return Rendered(sample=sample, views=views)
+        sample = box_before_a_wall(np.random.default_rng((spec.seed, index)), spec.size_px)
+        shot = RenderedView(image=sample.right, depth_m=sample.disparity_px, target=sample.occluded)
+        views = tuple((position, shot) for position in spec.views)
+        return RenderedPair(sample=sample, views=views)
 
 
 def contents(folder: Path) -> dict[str, bytes]:

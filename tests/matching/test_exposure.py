@@ -11,7 +11,7 @@ from stereoweave.matching.matcher import Matcher
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.synth.rendering.effects import PLAIN
 from stereoweave.synth.rendering.raycast import Raycaster
-from stereoweave.synth.sets.pair_rendering import Order, rendered
+from stereoweave.synth.sets.pair_rendering import RenderSpec, render_pair
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 LEVELS = np.arange(256)
@@ -90,7 +90,7 @@ def test_what_was_done_to_the_right_photograph_is_found_within_2_levels(name, ex
 
 
 def test_in_a_rendered_pair_too(matcher):
-    sample = rendered(Raycaster(PLAIN), Order(scene="bridge", seed=3, size_px=(320, 240)), 1).sample
+    sample = render_pair(Raycaster(PLAIN), RenderSpec(scene="bridge", seed=3, size_px=(320, 240)), 1).sample
     right = recoloured(sample.right, DISTORTIONS["gain"].astype(np.float32))
     looks = match_exposure(sample.left, right, matcher.estimate(sample.left, right))
     assert_recovered(looks, sample.left, DISTORTIONS["gain"], within=2)

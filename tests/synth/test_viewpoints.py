@@ -5,11 +5,11 @@ from stereoweave.stereo import StereoCamera
 from stereoweave.synth.viewpoints import (
     Orbit,
     Viewpoint,
-    between,
     draw_focal_px,
     draw_nearest_px,
     draw_viewpoint,
-    rig_at,
+    interpolate_viewpoints,
+    place_rig,
 )
 
 CAMERA = StereoCamera(focal_px=500.0, baseline_m=0.2, cx_px=319.5, cy_px=239.5)
@@ -28,7 +28,7 @@ def viewpoint(**changes):
 
 
 def rig(orbit=ORBIT, **changes):
-    return rig_at(orbit, viewpoint(**changes), CAMERA, (640, 480))
+    return place_rig(orbit, viewpoint(**changes), CAMERA, (640, 480))
 
 
 def test_a_level_rig_east_of_its_aim_looks_west_with_north_at_its_right():
@@ -45,7 +45,7 @@ def test_the_right_camera_is_a_baseline_to_the_right_of_the_left_one():
 @pytest.mark.parametrize("seed", range(5))
 def test_axes_are_at_right_angles_and_right_handed_and_the_aim_is_straight_ahead(seed):
     drawn = draw_viewpoint(np.random.default_rng(seed), ORBIT)
-    made = rig_at(ORBIT, drawn, CAMERA, (640, 480))
+    made = place_rig(ORBIT, drawn, CAMERA, (640, 480))
     np.testing.assert_allclose(made.axes @ made.axes.T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(np.cross(made.axes[0], made.axes[1]), made.axes[2], atol=1e-12)
     ahead = made.axes @ (drawn.aim_m - made.eye_m(0.5))
@@ -76,11 +76,11 @@ def test_viewpoints_are_within_the_ranges_of_their_orbit():
 
 def test_a_moving_camera_starts_and_stops_gently_and_is_half_way_at_half_time():
     start, end = viewpoint(), viewpoint(distance_m=7.0, azimuth_deg=40.0)
-    assert between(start, end, 0.0).azimuth_deg == 0
-    assert between(start, end, 0.5).azimuth_deg == 20
-    assert between(start, end, 1.0).distance_m == 7
+    assert interpolate_viewpoints(start, end, 0.0).azimuth_deg == 0
+    assert interpolate_viewpoints(start, end, 0.5).azimuth_deg == 20
+    assert interpolate_viewpoints(start, end, 1.0).distance_m == 7
     # Near its ends it moves by 3 t^2 of the way.
-    assert between(start, end, 0.01).azimuth_deg == pytest.approx(40 * 3e-4, rel=0.01)
+    assert interpolate_viewpoints(start, end, 0.01).azimuth_deg == pytest.approx(40 * 3e-4, rel=0.01)
 
 
 def test_focal_lengths_give_fields_of_view_of_42_to_72_degrees():

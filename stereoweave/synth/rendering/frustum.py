@@ -5,13 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from stereoweave.synth.viewpoints import Rig
+from stereoweave.synth.viewpoints import PosedRig
 
 # What is nearer is not seen. The depth buffer's 24 bits are spread from here to infinity.
 NEAR_M = 0.1
 
 
-def projection(rig: Rig) -> Float[np.ndarray, "4 4"]:
+def projection(rig: PosedRig) -> Float[np.ndarray, "4 4"]:
     """From camera coordinates (right, down, forward, 1) to OpenGL's clip space.
 
     Rows of the frame buffer count downwards as those of the image do, so that nothing is turned over on
@@ -29,8 +29,8 @@ def projection(rig: Rig) -> Float[np.ndarray, "4 4"]:
     )
 
 
-def in_view(
-    corners_m: Float[np.ndarray, "3 3 n"], rig: Rig, positions: Sequence[float]
+def triangles_in_view(
+    corners_m: Float[np.ndarray, "3 3 n"], rig: PosedRig, positions: Sequence[float]
 ) -> Int[np.ndarray, " k"]:
     """The triangles that any of the positions may see, the nearest to the rig first.
 
@@ -39,7 +39,7 @@ def in_view(
     """
     away_m = corners_m.reshape(3, -1) - rig.position_m.astype(np.float32)[:, None]
     right, down, forward = (rig.axes.astype(np.float32) @ away_m).reshape(corners_m.shape)
-    (left_edge, right_edge), (upper_edge, lower_edge) = _edges(rig).astype(np.float32)
+    (left_edge, right_edge), (upper_edge, lower_edge) = _image_edges(rig).astype(np.float32)
     shift_m = np.float32(rig.camera.baseline_m) * np.array([min(positions), max(positions)], np.float32)
     outside = (
         (forward < NEAR_M).all(0)
@@ -55,14 +55,14 @@ def in_view(
     return seen[np.argsort((farthest_m.view(np.uint32) >> 16).astype(np.uint16), kind="stable")]
 
 
-def _edges(rig: Rig) -> Float[np.ndarray, "2 2"]:
+def _image_edges(rig: PosedRig) -> Float[np.ndarray, "2 2"]:
     """The picture's borders at depth 1: left and right, upper and lower."""
     camera, (width_px, height_px) = rig.camera, rig.size_px
     borders_px = np.array([[-0.5, width_px - 0.5], [-0.5, height_px - 0.5]])
     return (borders_px - [[camera.cx_px], [camera.cy_px]]) / camera.focal_px
 
 
-def to_direction(rig: Rig, samples: int) -> Float[np.ndarray, "3 3"]:
+def direction_matrix(rig: PosedRig, samples: int) -> Float[np.ndarray, "3 3"]:
     """From OpenGL's (column, row, 1), samples x samples a pixel, to a direction in the world of depth 1."""
     camera = rig.camera
     to_camera = np.array(
@@ -75,8 +75,8 @@ def to_direction(rig: Rig, samples: int) -> Float[np.ndarray, "3 3"]:
     return rig.axes.T @ to_camera / camera.focal_px
 
 
-def rays(rig: Rig, samples: int = 1) -> Float[np.ndarray, "h w 3"]:
+def rays(rig: PosedRig, samples: int = 1) -> Float[np.ndarray, "h w 3"]:
     """Directions in the world of depth 1 through the pixels' centres, or samples x samples a pixel."""
     width, height = (side * samples for side in rig.size_px)
     column, row = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    return np.stack([column, row, np.ones_like(row)], -1) @ to_direction(rig, samples).T
+    return np.stack([column, row, np.ones_like(row)], -1) @ direction_matrix(rig, samples).T

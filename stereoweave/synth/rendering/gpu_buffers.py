@@ -28,14 +28,14 @@ class Geometry:
     """
 
     def __init__(self, gl: moderngl.Context, world: World) -> None:
-        _check(world)
+        _check_limits(world)
         self._gl = gl
         self.world = world
         mesh = world.mesh
         self.corners_m = np.ascontiguousarray(mesh.corners_m.T, np.float32)
         self.target_m = self.corners_m[..., mesh.target] if mesh.target.any() else self.corners_m
         tag = np.repeat(mesh.material + MOST_MATERIALS * mesh.target, 3)
-        with _finding_room(f"a world of {len(mesh.material)} triangles"):
+        with _reporting_lack_of_memory(f"a world of {len(mesh.material)} triangles"):
             self._attributes = {
                 "corner_m": (self._buffer(mesh.corners_m, np.float32), "3f"),
                 "normal": (self._buffer(mesh.normals, np.float32), "3f"),
@@ -64,7 +64,7 @@ class Geometry:
 
 
 @contextmanager
-def _finding_room(what: str) -> Iterator[None]:
+def _reporting_lack_of_memory(what: str) -> Iterator[None]:
     try:
         yield
     except moderngl.Error as error:
@@ -73,7 +73,7 @@ def _finding_room(what: str) -> Iterator[None]:
         ) from error
 
 
-def _check(world: World) -> None:
+def _check_limits(world: World) -> None:
     for name, most, remedy in (
         ("materials", MOST_MATERIALS, "let parts share some"),
         ("lamps", MOST_LAMPS, "leave out the faintest"),
@@ -107,7 +107,7 @@ class MaterialBlock:
         self._buffer.write(rows)
 
 
-def texture_array(
+def upload_textures(
     gl: moderngl.Context, pixels: UInt8[np.ndarray, "layers side side 4"]
 ) -> moderngl.TextureArray:
     """All textures with their mipmaps, colours coded as square roots of their light.
@@ -126,13 +126,13 @@ def texture_array(
     return array
 
 
-class Frames:
+class FrameBuffers:
     """The frame buffers for pictures of one size: depth, samples, and pixels; `release` gives them back."""
 
     def __init__(self, gl: moderngl.Context, size_px: tuple[int, int], samples: int) -> None:
         self.size_px = size_px
         fine = size_px[0] * samples, size_px[1] * samples
-        with _finding_room(f"pictures of {size_px[0]}x{size_px[1]} px"):
+        with _reporting_lack_of_memory(f"pictures of {size_px[0]}x{size_px[1]} px"):
             self.sampled = gl.texture(fine, 4)
             self._renderbuffers = [
                 gl.renderbuffer(size_px, 2, dtype="f4"),

@@ -1,4 +1,4 @@
-"""What light needs to know of a world, as textures: the sun's shadow map and the crowd's grid."""
+"""What light needs to know of a world, as textures: the sun's shadow map and the occlusion's grid."""
 
 from typing import Any
 
@@ -8,14 +8,14 @@ from jaxtyping import Float
 
 from stereoweave.synth.rendering.gpu_buffers import Geometry
 from stereoweave.synth.rendering.shader_programs import Programs
-from stereoweave.synth.rendering.shadow_and_occlusion import CELLS, SunView, crowd, sun_view
+from stereoweave.synth.rendering.shadow_and_occlusion import CELLS, SunView, count_occlusion, fit_sun_view
 from stereoweave.synth.world import Sky
 
 # The square around the target and the wide one lie side by side in one shadow map. More texels would not be
 # seen at 640x480: they are as small as samples there.
 _INNER_PX, _WIDE_PX = 1536, 1024
 _REACH_M = 40.0
-_SHADOW_MAP, _CROWD = 2, 3  # texture units
+_SHADOW_MAP, _OCCLUSION = 2, 3  # texture units
 
 
 class LightMaps:
@@ -29,27 +29,27 @@ class LightMaps:
         self._map.compare_func = "<="
         self._map.use(_SHADOW_MAP)
         self._frame = gl.framebuffer(depth_attachment=self._map)
-        self._crowd = gl.texture3d((CELLS, CELLS, CELLS), 1)
-        self._crowd.filter = moderngl.LINEAR, moderngl.LINEAR
-        self._crowd.repeat_x = self._crowd.repeat_y = self._crowd.repeat_z = False
-        self._crowd.use(_CROWD)
-        programs.bind(shadow_map=_SHADOW_MAP, crowd=_CROWD)
+        self._occlusion = gl.texture3d((CELLS, CELLS, CELLS), 1)
+        self._occlusion.filter = moderngl.LINEAR, moderngl.LINEAR
+        self._occlusion.repeat_x = self._occlusion.repeat_y = self._occlusion.repeat_z = False
+        self._occlusion.use(_OCCLUSION)
+        programs.bind_textures(shadow_map=_SHADOW_MAP, occlusion=_OCCLUSION)
 
-    def cast(self, geometry: Geometry, sky: Sky) -> dict[str, Any]:
+    def render_shadow_map(self, geometry: Geometry, sky: Sky) -> dict[str, Any]:
         """The sun's shadows."""
         self._frame.use()
         self._frame.clear()
         if not any(sky.sun_light):
             return {}
-        view = sun_view(geometry.corners_m, geometry.target_m, sky.sun, _REACH_M)
+        view = fit_sun_view(geometry.corners_m, geometry.target_m, sky.sun, _REACH_M)
         # Away from the sun, so that a surface does not fall into its own shadow.
         self._gl.polygon_offset = 2.0, 4.0
         for left_px, side_px, to_unit, triangles in (
             (0, _INNER_PX, view.to_unit, view.inside),
-            (_INNER_PX, _WIDE_PX, _widened(view), view.beyond),
+            (_INNER_PX, _WIDE_PX, _widen(view), view.beyond),
         ):
             self._frame.viewport = left_px, 0, side_px, side_px
-            self._programs.set("sun", to_unit=to_unit.T)
+            self._programs.set_uniforms("sun", to_unit=to_unit.T)
             geometry.draw(self._programs["sun"], triangles)
         self._gl.polygon_offset = 0.0, 0.0
         width_px, height_px = self._map.size
@@ -66,15 +66,15 @@ class LightMaps:
             "texels": (1 / _INNER_PX, view.wide / _WIDE_PX),
         }
 
-    def occlude(self, geometry: Geometry) -> dict[str, Any]:
+    def write_occlusion(self, geometry: Geometry) -> dict[str, Any]:
         """Where the sky is hidden."""
-        counted = crowd(geometry.corners_m, geometry.target_m)
-        self._crowd.write(counted.share)
+        counted = count_occlusion(geometry.corners_m, geometry.target_m)
+        self._occlusion.write(counted.share)
         side_m = counted.cell_m * CELLS
-        return {"crowd_frame": (*counted.low_m, 1 / side_m)}
+        return {"occlusion_frame": (*counted.low_m, 1 / side_m)}
 
 
-def _widened(view: SunView) -> Float[np.ndarray, "3 4"]:
+def _widen(view: SunView) -> Float[np.ndarray, "3 4"]:
     """From (x, y, z, 1) to 0..1 across and down the wide square."""
     scale = np.diag([1 / view.wide, 1 / view.wide, 1])
     middle = np.array([0.5, 0.5, 0])

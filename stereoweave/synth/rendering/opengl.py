@@ -9,18 +9,18 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.synth.rendering.effects import Effects
-from stereoweave.synth.rendering.frustum import in_view, projection, to_direction
-from stereoweave.synth.rendering.gpu_buffers import Frames, Geometry, MaterialBlock, texture_array
+from stereoweave.synth.rendering.frustum import direction_matrix, projection, triangles_in_view
+from stereoweave.synth.rendering.gpu_buffers import FrameBuffers, Geometry, MaterialBlock, upload_textures
 from stereoweave.synth.rendering.light_maps import LightMaps
-from stereoweave.synth.rendering.shader_programs import Programs, surface
+from stereoweave.synth.rendering.shader_programs import Programs, surface_program
 from stereoweave.synth.textures.bank import bank
-from stereoweave.synth.viewpoints import Rig
-from stereoweave.synth.world import Shot, World
+from stereoweave.synth.viewpoints import PosedRig
+from stereoweave.synth.world import RenderedView, World
 
 _TEXTURES, _SAMPLES = 0, 1  # texture units
 
 
-class Renderer:
+class OpenGLRenderer:
     """Takes pictures of worlds; a `synth.samples.Camera`.
 
     A world and a rig give the same bytes, whatever was rendered before. Depth is rasterised apart from the
@@ -31,93 +31,101 @@ class Renderer:
 
     def __init__(self, effects: Effects = Effects()) -> None:  # noqa: B008, frozen
         self.effects = effects
-        self._gl = _context()
+        self._gl = _create_context()
         self._gl.enable(moderngl.DEPTH_TEST)
         self._programs = Programs(self._gl, effects)
-        self._whole = {name: self._gl.vertex_array(self._programs[name], []) for name in ("sky", "resolve")}
+        self._full_screen = {
+            name: self._gl.vertex_array(self._programs[name], []) for name in ("sky", "resolve")
+        }
         self._bank = bank()
-        self._textures = texture_array(self._gl, self._bank.pixels)
+        self._textures = upload_textures(self._gl, self._bank.pixels)
         self._textures.use(_TEXTURES)
-        self._programs.bind(textures=_TEXTURES, samples=_SAMPLES)
+        self._programs.bind_textures(textures=_TEXTURES, samples=_SAMPLES)
         self._materials = MaterialBlock(self._gl)
         self._light_maps = LightMaps(self._gl, self._programs)
         self._geometry: Geometry | None = None
-        self._frames: Frames | None = None
-        self._lit: World | None = None
+        self._last_frame_buffers: FrameBuffers | None = None
+        self._lit_world: World | None = None
 
     @property
     def name(self) -> str:
         """Which OpenGL draws, and of what version."""
         return f"{self._gl.info['GL_RENDERER']}, OpenGL {self._gl.info['GL_VERSION']}"
 
-    def depth_m(self, world: World, rig: Rig, position: float) -> Float[np.ndarray, "h w"]:
+    def depth_m(self, world: World, rig: PosedRig, position: float) -> Float[np.ndarray, "h w"]:
         """float32 [H, W] in metres along the optical axis; infinite where nothing is."""
         with self._gl:
-            geometry = self._uploaded(world)
-            triangles = in_view(geometry.corners_m, rig, (position,))
-            return self._truth(geometry, triangles, rig, position)[0]
+            geometry = self._upload(world)
+            triangles = triangles_in_view(geometry.corners_m, rig, (position,))
+            return self._render_depth(geometry, triangles, rig, position)[0]
 
-    def shots(self, world: World, rig: Rig, positions: Sequence[float]) -> list[Shot]:
+    def render_views(self, world: World, rig: PosedRig, positions: Sequence[float]) -> list[RenderedView]:
         """A picture with its truth for each position."""
         with self._gl:
-            geometry = self._uploaded(world)
-            self._light(world, geometry)
-            triangles = in_view(geometry.corners_m, rig, positions)
-            return [self._shot(geometry, triangles, rig, position) for position in positions]
+            geometry = self._upload(world)
+            self._set_light(world, geometry)
+            triangles = triangles_in_view(geometry.corners_m, rig, positions)
+            return [self._render_view(geometry, triangles, rig, position) for position in positions]
 
     def close(self) -> None:
         """Gives back all memory; the renderer is of no use afterwards."""
         self._gl.release()
 
-    def _shot(self, geometry: Geometry, triangles: Int[np.ndarray, " k"], rig: Rig, position: float) -> Shot:
-        depth_m, target = self._truth(geometry, triangles, rig, position)
-        return Shot(image=self._image(geometry, triangles, rig, position), depth_m=depth_m, target=target)
+    def _render_view(
+        self, geometry: Geometry, triangles: Int[np.ndarray, " k"], rig: PosedRig, position: float
+    ) -> RenderedView:
+        depth_m, target = self._render_depth(geometry, triangles, rig, position)
+        return RenderedView(
+            image=self._render_image(geometry, triangles, rig, position), depth_m=depth_m, target=target
+        )
 
-    def _truth(
-        self, geometry: Geometry, triangles: Int[np.ndarray, " k"], rig: Rig, position: float
+    def _render_depth(
+        self, geometry: Geometry, triangles: Int[np.ndarray, " k"], rig: PosedRig, position: float
     ) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
         """Depth, and whether it is the target's."""
-        frame = self._framed(rig).depth
+        frame = self._frame_buffers(rig).depth
         frame.use()
         frame.clear(red=np.inf)
-        self._aim("depth", rig, position)
+        self._set_view("depth", rig, position)
         geometry.draw(self._programs["depth"], triangles)
         values = np.frombuffer(frame.read(components=2, dtype="f4"), np.float32)
         depth_m, target = np.moveaxis(values.reshape(*rig.size_px[::-1], 2), -1, 0)
         return np.ascontiguousarray(depth_m), target > 0.5
 
-    def _image(
-        self, geometry: Geometry, triangles: Int[np.ndarray, " k"], rig: Rig, position: float
+    def _render_image(
+        self, geometry: Geometry, triangles: Int[np.ndarray, " k"], rig: PosedRig, position: float
     ) -> UInt8[np.ndarray, "h w 3"]:
-        frames = self._framed(rig)
+        frames = self._frame_buffers(rig)
         frames.samples.use()
         frames.samples.clear()
-        name = surface(len(geometry.world.lamps), any(geometry.world.sky.sun_light))
-        self._aim(name, rig, position)
+        name = surface_program(len(geometry.world.lamps), any(geometry.world.sky.sun_light))
+        self._set_view(name, rig, position)
         geometry.draw(self._programs[name], triangles)
         # The sky lies at the far end of the depth buffer, which is what it was cleared to.
         self._gl.depth_func = "<="
-        self._programs.set("sky", to_direction=to_direction(rig, self.effects.samples).T)
-        self._whole["sky"].render(vertices=3)
+        self._programs.set_uniforms("sky", direction_matrix=direction_matrix(rig, self.effects.samples).T)
+        self._full_screen["sky"].render(vertices=3)
         self._gl.depth_func = "<"
         frames.pixels.use()
         frames.sampled.use(_SAMPLES)
-        self._whole["resolve"].render(vertices=3)
+        self._full_screen["resolve"].render(vertices=3)
         pixels = np.frombuffer(frames.pixels.read(components=3), np.uint8)
         return pixels.reshape(*rig.size_px[::-1], 3)
 
-    def _aim(self, program: str, rig: Rig, position: float) -> None:
-        self._programs.set(program, projection=projection(rig).T, axes=rig.axes.T, eye_m=rig.eye_m(position))
+    def _set_view(self, program: str, rig: PosedRig, position: float) -> None:
+        self._programs.set_uniforms(
+            program, projection=projection(rig).T, axes=rig.axes.T, eye_m=rig.eye_m(position)
+        )
 
-    def _framed(self, rig: Rig) -> Frames:
+    def _frame_buffers(self, rig: PosedRig) -> FrameBuffers:
         """Frame buffers of the rig's size; those of the last size are kept."""
-        if self._frames is None or self._frames.size_px != rig.size_px:
-            if self._frames is not None:
-                self._frames.release()
-            self._frames = Frames(self._gl, rig.size_px, self.effects.samples)
-        return self._frames
+        if self._last_frame_buffers is None or self._last_frame_buffers.size_px != rig.size_px:
+            if self._last_frame_buffers is not None:
+                self._last_frame_buffers.release()
+            self._last_frame_buffers = FrameBuffers(self._gl, rig.size_px, self.effects.samples)
+        return self._last_frame_buffers
 
-    def _uploaded(self, world: World) -> Geometry:
+    def _upload(self, world: World) -> Geometry:
         """The world's triangles; those of the last world are kept."""
         if self._geometry is None or self._geometry.world is not world:
             fresh = Geometry(self._gl, world)
@@ -126,9 +134,9 @@ class Renderer:
             self._geometry = fresh
         return self._geometry
 
-    def _light(self, world: World, geometry: Geometry) -> None:
+    def _set_light(self, world: World, geometry: Geometry) -> None:
         """Everything about materials and light that pictures of one world share."""
-        if world is self._lit:
+        if world is self._lit_world:
             return
         self._materials.write(world, self._bank)
         sky, fog = world.sky, world.fog
@@ -138,18 +146,18 @@ class Renderer:
         shared["exposure"] = world.exposure
         shared["fog"] = (*fog.colour, fog.density_per_m) if fog else (0.0,) * 4
         layer = self._bank.layer("sky", sky.cloud_variant)
-        self._programs.set("sky", **shared, cloud_layer=layer, clouds=sky.clouds)
+        self._programs.set_uniforms("sky", **shared, cloud_layer=layer, clouds=sky.clouds)
         shared["lamp_m"] = [lamp.position_m for lamp in world.lamps]
         shared["lamp_light"] = [lamp.light for lamp in world.lamps]
         if self.effects.shadows:
-            shared |= self._light_maps.cast(geometry, sky)
+            shared |= self._light_maps.render_shadow_map(geometry, sky)
         if self.effects.ambient_occlusion:
-            shared |= self._light_maps.occlude(geometry)
-        self._programs.set(surface(len(world.lamps), any(sky.sun_light)), **shared)
-        self._lit = world
+            shared |= self._light_maps.write_occlusion(geometry)
+        self._programs.set_uniforms(surface_program(len(world.lamps), any(sky.sun_light)), **shared)
+        self._lit_world = world
 
 
-def _context() -> moderngl.Context:
+def _create_context() -> moderngl.Context:
     # The stub of create_context takes keywords for a dictionary.
     options: dict[str, Any] = {"standalone": True, "backend": "egl"}
     try:

@@ -16,8 +16,8 @@ from jaxtyping import Float, Int, UInt8
 from stereoweave.synth.rendering.effects import Effects
 from stereoweave.synth.rendering.frustum import NEAR_M, rays
 from stereoweave.synth.textures.bank import bank, linear
-from stereoweave.synth.viewpoints import Rig
-from stereoweave.synth.world import Mesh, Shot, Sky, World
+from stereoweave.synth.viewpoints import PosedRig
+from stereoweave.synth.world import Mesh, RenderedView, Sky, World
 
 Vectors = Float[np.ndarray, "p 3"]
 
@@ -42,11 +42,11 @@ class Raycaster:
         """What casts the rays, and its version."""
         return f"embree {version('embreex')}"
 
-    def depth_m(self, world: World, rig: Rig, position: float) -> Float[np.ndarray, "h w"]:
+    def depth_m(self, world: World, rig: PosedRig, position: float) -> Float[np.ndarray, "h w"]:
         """float32 [H, W] in metres along the optical axis; infinite where nothing is."""
-        return self.seen(world, rig.eye_m(position), rays(rig))[0].astype(np.float32)
+        return self.cast_rays(world, rig.eye_m(position), rays(rig))[0].astype(np.float32)
 
-    def seen(
+    def cast_rays(
         self, world: World, eye_m: Float[np.ndarray, "3"], directions: Float[np.ndarray, "h w 3"]
     ) -> tuple[Float[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
         """What rays from one point meet: how far away, in lengths of their directions, and which triangle.
@@ -57,24 +57,24 @@ class Raycaster:
         shape = directions.shape[:2]
         return hits.distance.reshape(shape), hits.triangle.reshape(shape)
 
-    def shots(self, world: World, rig: Rig, positions: Sequence[float]) -> list[Shot]:
+    def render_views(self, world: World, rig: PosedRig, positions: Sequence[float]) -> list[RenderedView]:
         """A picture with its truth for each position."""
-        return [self._shot(world, rig, position) for position in positions]
+        return [self._render_view(world, rig, position) for position in positions]
 
-    def _shot(self, world: World, rig: Rig, position: float) -> Shot:
-        depth_m, triangle = self.seen(world, rig.eye_m(position), rays(rig))
+    def _render_view(self, world: World, rig: PosedRig, position: float) -> RenderedView:
+        depth_m, triangle = self.cast_rays(world, rig.eye_m(position), rays(rig))
         target = (triangle >= 0) & world.mesh.target[triangle]
-        image = self._image(world, rig, position)
-        return Shot(image=image, depth_m=depth_m.astype(np.float32), target=target)
+        image = self._render_image(world, rig, position)
+        return RenderedView(image=image, depth_m=depth_m.astype(np.float32), target=target)
 
-    def _image(self, world: World, rig: Rig, position: float) -> UInt8[np.ndarray, "h w 3"]:
+    def _render_image(self, world: World, rig: PosedRig, position: float) -> UInt8[np.ndarray, "h w 3"]:
         samples = self.effects.samples
         directions = rays(rig, samples)
         hits = self._cast(world, rig.eye_m(position), directions.reshape(-1, 3))
         ray_width = 1 / (rig.camera.focal_px * samples)
-        light = self._light(world, rig.eye_m(position), directions.reshape(-1, 3), hits, ray_width)
+        light = self._shade(world, rig.eye_m(position), directions.reshape(-1, 3), hits, ray_width)
         height, width = rig.size_px[::-1]
-        shown = _developed(world.exposure * light).reshape(height, samples, width, samples, 3).mean((1, 3))
+        shown = _tone_map(world.exposure * light).reshape(height, samples, width, samples, 3).mean((1, 3))
         coded = np.where(shown < 0.0031308, 12.92 * shown, 1.055 * shown ** (1 / 2.4) - 0.055)
         return np.round(255 * coded).astype(np.uint8)
 
@@ -85,9 +85,9 @@ class Raycaster:
             self._world = world
         starts_m = eye_m + NEAR_M * directions
         triangle = self._scene.run(starts_m.astype(np.float32), directions.astype(np.float32))
-        return _met(world.mesh, eye_m, directions, triangle.astype(np.int64))
+        return _intersect_planes(world.mesh, eye_m, directions, triangle.astype(np.int64))
 
-    def _light(
+    def _shade(
         self,
         world: World,
         eye_m: Float[np.ndarray, "3"],
@@ -96,24 +96,24 @@ class Raycaster:
         ray_width: float,
     ) -> Vectors:
         """What comes from each direction, along rays so wide at depth 1."""
-        light = _sky_towards(world.sky, directions)
+        light = _sky_radiance(world.sky, directions)
         met = hits.triangle >= 0
-        surface = hits.of(met)
+        surface = hits.select(met)
         away_m = surface.distance[:, None] * directions[met]
         place_m = eye_m + away_m
-        normal = _smooth_normals(world.mesh, surface, directions[met])
+        normal = _interpolate_normals(world.mesh, surface, directions[met])
         facing = np.maximum(normal @ np.array(world.sky.sun), 0)
         if self.effects.shadows and any(world.sky.sun_light):
-            facing *= self._sunlit(world, place_m + _OFF_M * normal)
-        received = _sky_around(world.sky, normal) + facing[:, None] * np.array(world.sky.sun_light)
-        given = _colours(world, surface, ray_width * surface.distance) * received
+            facing *= self._sun_visibility(world, place_m + _OFF_M * normal)
+        received = _sky_irradiance(world.sky, normal) + facing[:, None] * np.array(world.sky.sun_light)
+        given = _look_up_colours(world, surface, ray_width * surface.distance) * received
         if self.effects.fog and world.fog is not None:
             clear = np.exp(-world.fog.density_per_m * np.linalg.norm(away_m, axis=1))[:, None]
             given = clear * given + (1 - clear) * np.array(world.fog.colour)
         light[met] = given
         return light
 
-    def _sunlit(self, world: World, places_m: Vectors) -> Float[np.ndarray, " p"]:
+    def _sun_visibility(self, world: World, places_m: Vectors) -> Float[np.ndarray, " p"]:
         """1 where nothing is between a place and the sun, else 0."""
         assert self._scene is not None
         towards = np.broadcast_to(np.array(world.sky.sun, np.float32), places_m.shape)
@@ -129,13 +129,15 @@ class _Hits:
     distance: Float[np.ndarray, " p"]
     shares: Vectors
 
-    def of(self, chosen: np.ndarray) -> "_Hits":
+    def select(self, chosen: np.ndarray) -> "_Hits":
         return _Hits(
             triangle=self.triangle[chosen], distance=self.distance[chosen], shares=self.shares[chosen]
         )
 
 
-def _met(mesh: Mesh, eye_m: np.ndarray, directions: Vectors, triangle: Int[np.ndarray, " p"]) -> _Hits:
+def _intersect_planes(
+    mesh: Mesh, eye_m: np.ndarray, directions: Vectors, triangle: Int[np.ndarray, " p"]
+) -> _Hits:
     """Where rays meet the triangles' planes, in double precision; embree says only which triangle."""
     met = triangle >= 0
     first, second, third = mesh.corners_m[triangle[met]].astype(np.float64).transpose(1, 0, 2)
@@ -150,7 +152,7 @@ def _met(mesh: Mesh, eye_m: np.ndarray, directions: Vectors, triangle: Int[np.nd
     return _Hits(triangle=triangle, distance=distance, shares=shares)
 
 
-def _smooth_normals(mesh: Mesh, hits: _Hits, directions: Vectors) -> Vectors:
+def _interpolate_normals(mesh: Mesh, hits: _Hits, directions: Vectors) -> Vectors:
     """Unit normals on the side that is seen."""
     first, second, third = mesh.corners_m[hits.triangle].transpose(1, 0, 2)
     face = np.cross(second - first, third - first)
@@ -160,7 +162,7 @@ def _smooth_normals(mesh: Mesh, hits: _Hits, directions: Vectors) -> Vectors:
     return np.where(turned[:, None], -normal, normal)
 
 
-def _colours(world: World, hits: _Hits, ray_m: Float[np.ndarray, " p"]) -> Vectors:
+def _look_up_colours(world: World, hits: _Hits, ray_m: Float[np.ndarray, " p"]) -> Vectors:
     """The share of each colour's light that surfaces throw back; ray_m: how wide the rays end."""
     material = world.mesh.material[hits.triangle]
     uv_m = np.einsum("pc,pcx->px", hits.shares, world.mesh.uv_m[hits.triangle])
@@ -168,7 +170,7 @@ def _colours(world: World, hits: _Hits, ray_m: Float[np.ndarray, " p"]) -> Vecto
     for index in np.unique(material):
         chosen = material == index
         made = world.materials[index]
-        levels = _pyramid(bank().layer(made.texture, made.variant))
+        levels = _mipmaps(bank().layer(made.texture, made.variant))
         side = len(levels[0])
         spans = uv_m[chosen] * [1, -1] / made.span_m
         level = np.log2(np.maximum(ray_m[chosen] / made.span_m * side, 1)).round().astype(int)
@@ -183,7 +185,7 @@ def _colours(world: World, hits: _Hits, ray_m: Float[np.ndarray, " p"]) -> Vecto
 
 
 @functools.lru_cache(maxsize=24)
-def _pyramid(layer: int) -> list[Float[np.ndarray, "side side 3"]]:
+def _mipmaps(layer: int) -> list[Float[np.ndarray, "side side 3"]]:
     """A texture's light in ever fewer texels, each of them the mean of four of the level before."""
     levels = [linear(bank().pixels[layer, ..., :3].astype(np.float32))]
     while len(levels[-1]) > 1:
@@ -192,7 +194,7 @@ def _pyramid(layer: int) -> list[Float[np.ndarray, "side side 3"]]:
     return levels
 
 
-def _sky_towards(sky: Sky, directions: Vectors) -> Vectors:
+def _sky_radiance(sky: Sky, directions: Vectors) -> Vectors:
     """The sky's light from directions: shaders/light.glsl in NumPy."""
     height = (directions[:, 2] / np.linalg.norm(directions, axis=1))[:, None]
     zenith, horizon, ground = (np.array(colour) for colour in (sky.zenith, sky.horizon, sky.ground))
@@ -202,7 +204,7 @@ def _sky_towards(sky: Sky, directions: Vectors) -> Vectors:
     return above + below**2 * (3 - 2 * below) * (ground - above)
 
 
-def _sky_around(sky: Sky, normals: Vectors) -> Vectors:
+def _sky_irradiance(sky: Sky, normals: Vectors) -> Vectors:
     """The sky's light from all sides on white surfaces: shaders/light.glsl in NumPy."""
     zenith, horizon, ground = (np.array(colour) for colour in (sky.zenith, sky.horizon, sky.ground))
     up = 0.5 + 0.5 * normals[:, 2:]
@@ -210,6 +212,6 @@ def _sky_around(sky: Sky, normals: Vectors) -> Vectors:
     return (1 - up) * ((1 - up) * ground + up * horizon) + up * upper
 
 
-def _developed(exposed: Vectors) -> Vectors:
+def _tone_map(exposed: Vectors) -> Vectors:
     dense = exposed**1.5
     return dense / (dense + 0.25)

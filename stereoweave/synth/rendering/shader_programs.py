@@ -16,8 +16,8 @@ MOST_LAMPS = 4
 _PARTS = {
     "depth": ("depth.vert", "depth.frag"),
     "sun": ("sun.vert", "sun.frag"),
-    "sky": ("whole.vert", "light.glsl", "sky.frag"),
-    "resolve": ("whole.vert", "resolve.frag"),
+    "sky": ("full_screen.vert", "light.glsl", "sky.frag"),
+    "resolve": ("full_screen.vert", "resolve.frag"),
 }
 _SURFACE = ("surface.vert", "light.glsl", "surface.frag")
 
@@ -34,26 +34,26 @@ class Programs:
         def program(vertices: str, *fragments: str, lamps: int = 0, sun: bool = True) -> moderngl.Program:
             defined = _definitions(effects, lamps, sun)
             return gl.program(
-                vertex_shader=defined + _text(vertices),
-                fragment_shader=defined + "".join(map(_text, fragments)),
+                vertex_shader=defined + _read_shader(vertices),
+                fragment_shader=defined + "".join(map(_read_shader, fragments)),
             )
 
         self._programs = {name: program(*parts) for name, parts in _PARTS.items()}
         for lamps in range(MOST_LAMPS + 1):
             for sun in (False, True):
-                self._programs[surface(lamps, sun)] = program(*_SURFACE, lamps=lamps, sun=sun)
+                self._programs[surface_program(lamps, sun)] = program(*_SURFACE, lamps=lamps, sun=sun)
 
     def __getitem__(self, name: str) -> moderngl.Program:
         return self._programs[name]
 
-    def bind(self, **units: int) -> None:
+    def bind_textures(self, **units: int) -> None:
         """Tells every program in which texture units its samplers find their textures."""
         for program in self._programs.values():
             for key, unit in units.items():
                 if key in program:
                     program[key] = unit
 
-    def set(self, name: str, **values: Any) -> None:
+    def set_uniforms(self, name: str, **values: Any) -> None:
         """Sets a program's uniforms, matrices by columns; those that no effect uses are passed over."""
         program = self._programs[name]
         for key, value in values.items():
@@ -62,7 +62,7 @@ class Programs:
                 uniform.write(np.ascontiguousarray(value, np.float32).tobytes())
 
 
-def surface(lamps: int, sun: bool) -> str:
+def surface_program(lamps: int, sun: bool) -> str:
     """The name of the program for surfaces in the light of a number of lamps, with or without a sun."""
     return f"surface, {lamps} lamps{', sun' * sun}"
 
@@ -76,5 +76,5 @@ def _definitions(effects: Effects, lamps: int, sun: bool) -> str:
     return "\n".join(["#version 330 core", *lines, ""])
 
 
-def _text(name: str) -> str:
+def _read_shader(name: str) -> str:
     return (resources.files("stereoweave.synth.rendering") / "shaders" / name).read_text()

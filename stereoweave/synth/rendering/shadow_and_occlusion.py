@@ -40,15 +40,15 @@ class SunView:
     beyond: Int[np.ndarray, " l"]
 
 
-def sun_view(
+def fit_sun_view(
     corners_m: Corners, target_m: Corners, sun: tuple[float, float, float], reach_m: float
 ) -> SunView:
     """The sun's view; a target's shadow fills the same square as the target, wherever it falls."""
-    axes = _across(np.array(sun))
-    low, high = _extent(_turned(target_m, axes))
+    axes = _sun_axes(np.array(sun))
+    low, high = _extent(_rotate(target_m, axes))
     middle = (low + high) / 2
     half_m = 1.04 * float((high - low)[:2].max()) / 2
-    across, down, away = _turned(corners_m, axes)
+    across, down, away = _rotate(corners_m, axes)
     near = np.stack([across - middle[0], down - middle[1]])
     lowest, highest = near.min(1), near.max(1)
     inside = ((highest > -half_m) & (lowest < half_m)).all(0)
@@ -67,14 +67,14 @@ def sun_view(
     )
 
 
-def _across(sun: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+def _sun_axes(sun: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """Two directions across the sun's rays and the one along them."""
     across = np.cross([0, 1, 0] if abs(sun[2]) > 0.9 else [0, 0, 1], sun)
     across = across / np.linalg.norm(across)
     return np.stack([across, np.cross(sun, across), -sun])
 
 
-def _turned(corners_m: Corners, axes: Float[np.ndarray, "3 3"]) -> Corners:
+def _rotate(corners_m: Corners, axes: Float[np.ndarray, "3 3"]) -> Corners:
     return (axes.astype(np.float32) @ corners_m.reshape(3, -1)).reshape(corners_m.shape)
 
 
@@ -83,7 +83,7 @@ def _extent(corners_m: Corners) -> tuple[Float[np.ndarray, "3"], Float[np.ndarra
 
 
 @dataclass(frozen=True, kw_only=True)
-class Crowd:
+class OcclusionGrid:
     """How much surface there is around places near the target.
 
     Attributes:
@@ -97,22 +97,22 @@ class Crowd:
     cell_m: float
 
 
-def crowd(corners_m: Corners, target_m: Corners) -> Crowd:
+def count_occlusion(corners_m: Corners, target_m: Corners) -> OcclusionGrid:
     """The surface around the target, counted on a grid from points spread evenly over the triangles."""
     low, high = _extent(target_m)
     cell_m = 1.1 * float((high - low).max()) / (CELLS - 2 * _SPARE_CELLS)
     low_m = (low + high) / 2 - np.float32(cell_m * CELLS / 2)
-    points, areas = _spread(_pieces(corners_m, low_m, cell_m), cell_m)
+    points, areas = _sample_points(_cut_large(corners_m, low_m, cell_m), cell_m)
     place = ((points - low_m[:, None]) / np.float32(cell_m)).astype(np.int32)
     x, y, z = place
     inside = ((place >= 0) & (place < CELLS)).all(0)
     index = ((z * CELLS + y) * CELLS + x)[inside]
     counted = np.bincount(index, areas[inside] / cell_m**2, CELLS**3).astype(np.float32)
     surface = np.minimum(counted, 1).reshape(CELLS, CELLS, CELLS)
-    return Crowd(share=_hidden(surface), low_m=low_m, cell_m=cell_m)
+    return OcclusionGrid(share=_hidden_share(surface), low_m=low_m, cell_m=cell_m)
 
 
-def _hidden(surface: Float[np.ndarray, "z y x"]) -> UInt8[np.ndarray, "z y x"]:
+def _hidden_share(surface: Float[np.ndarray, "z y x"]) -> UInt8[np.ndarray, "z y x"]:
     """The share of the sky hidden by surface in the cell itself and, less, in a cube about it.
 
     A plane, which hides nothing from a place on it, is taken off the latter.
@@ -129,24 +129,24 @@ def _hidden(surface: Float[np.ndarray, "z y x"]) -> UInt8[np.ndarray, "z y x"]:
     return (255 * np.minimum(inner, 0.85)).astype(np.uint8)
 
 
-def _pieces(corners_m: Corners, low_m: Float[np.ndarray, "3"], cell_m: float) -> Corners:
+def _cut_large(corners_m: Corners, low_m: Float[np.ndarray, "3"], cell_m: float) -> Corners:
     """The triangles that touch the grid; large ones in pieces, so that few points are spread beside it."""
     done = []
-    rest = _touching(corners_m, low_m, cell_m * CELLS)
+    rest = _select_near(corners_m, low_m, cell_m * CELLS)
     while rest.size:
         large = _areas(rest) > _LARGE_CELLS * cell_m**2
         done.append(rest[..., ~large])
-        rest = _touching(_quartered(rest[..., large]), low_m, cell_m * CELLS)
+        rest = _select_near(_quarter(rest[..., large]), low_m, cell_m * CELLS)
     return np.concatenate(done, axis=-1)
 
 
-def _touching(corners_m: Corners, low_m: Float[np.ndarray, "3"], side_m: float) -> Corners:
+def _select_near(corners_m: Corners, low_m: Float[np.ndarray, "3"], side_m: float) -> Corners:
     low = low_m[:, None]
     near = ((corners_m.max(1) > low) & (corners_m.min(1) < low + np.float32(side_m))).all(0)
     return corners_m[..., near]
 
 
-def _quartered(corners_m: Corners) -> Corners:
+def _quarter(corners_m: Corners) -> Corners:
     """Each triangle as four, cut through the middles of its edges."""
     a, b, c = corners_m.transpose(1, 0, 2)
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
@@ -160,7 +160,9 @@ def _areas(corners_m: Corners) -> Float[np.ndarray, " p"]:
     return np.sqrt((normal**2).sum(0)) / 2
 
 
-def _spread(corners_m: Corners, cell_m: float) -> tuple[Float[np.ndarray, "3 p"], Float[np.ndarray, " p"]]:
+def _sample_points(
+    corners_m: Corners, cell_m: float
+) -> tuple[Float[np.ndarray, "3 p"], Float[np.ndarray, " p"]]:
     """Points on the triangles, about two a cell, and the area that each stands for."""
     first = corners_m[:, 0]
     edge, other = corners_m[:, 1] - first, corners_m[:, 2] - first

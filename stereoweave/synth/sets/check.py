@@ -17,7 +17,7 @@ from stereoweave.data.shards import Shards
 from stereoweave.errors import FormatError
 from stereoweave.stereo import Sample
 from stereoweave.synth.sets.make import read_set
-from stereoweave.synth.sets.workers import in_workers, step_done
+from stereoweave.synth.sets.workers import count_step, run_in_workers
 
 _DISPARITY_EDGES_PX = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 _DEPTH_EDGES_M = (0.0, 1.0, 2.0, 3.0, 5.0, 7.5, 10.0, 15.0, 25.0, 50.0, 100.0)
@@ -86,26 +86,26 @@ class _Pairs(NamedTuple):
         return [range(start, end) for start, end in pairwise([*starts, len(self.files)])]
 
 
-def check(folder: Path, jobs: int = 1, console: Console | None = None) -> Findings:
+def check_set(folder: Path, jobs: int = 1, console: Console | None = None) -> Findings:
     """What all pairs of a set come to; `problems` is empty where the set is in order.
 
     Raises:
         FormatError: There is no set in the folder, or files are missing between others.
     """
     facts = read_set(folder)
-    pairs = _opened(folder, facts["layout"], facts["scene"])
+    pairs = _open_pairs(folder, facts["layout"], facts["scene"])
     count = len(pairs.names)
-    look = partial(_look, folder, facts["layout"], facts["scene"])
-    found = _nothing()
-    for part in in_workers(look, pairs.runs(), jobs, console or Console(), "checking pairs", count):
+    look = partial(_check_run, folder, facts["layout"], facts["scene"])
+    found = _no_findings()
+    for part in run_in_workers(look, pairs.runs(), jobs, console or Console(), "checking pairs", count):
         found += part
     if count < facts["pairs"]:
         lacking = f"{folder}: expected {facts['pairs']} pairs, as were asked for, found {count}"
-        found += _nothing(f"{lacking}; the same stereoweave synth make goes on")
+        found += _no_findings(f"{lacking}; the same stereoweave synth make goes on")
     return found
 
 
-def lines(found: Findings) -> Iterator[str]:
+def report_lines(found: Findings) -> Iterator[str]:
     """The statistics of a set as text, with histograms of disparity and depth; then problems and how many."""
     if found.pairs:
         yield from _statistics(found)
@@ -114,17 +114,17 @@ def lines(found: Findings) -> Iterator[str]:
     yield f"{count} problem{'s' * (count > 1)}" if count else "in order"
 
 
-def problem(sample: Sample) -> str | None:
+def find_problem(sample: Sample) -> str | None:
     """What is wrong between the disparities and pictures of a pair, or None."""
     if not np.isfinite(sample.disparity_px).any():
         return "expected a disparity, found every pixel unknown"
-    before, at, after = _grey_levels(sample)
+    before, at, after = _grey_level_differences(sample)
     if at > _LARGEST_RATIO * min(before, after):
         return (
             "expected the left picture to fit the right one best at the disparity, found them to differ by "
             f"{at:.2f} grey levels there, {before:.2f} at 1 px less and {after:.2f} at 1 px more"
         )
-    agreeing = _agreeing(sample)
+    agreeing = _agreeing_share(sample)
     if agreeing < _LEAST_AGREEING:
         return (
             f"expected both disparities to agree at {_LEAST_AGREEING:.0%} of the pixels that both see, "
@@ -133,23 +133,23 @@ def problem(sample: Sample) -> str | None:
     return None
 
 
-def _look(folder: Path, layout: str, scene: str, run: range) -> Findings:
-    pairs = _opened(folder, layout, scene)
-    found, damaged = _nothing(), dict[str, str]()
+def _check_run(folder: Path, layout: str, scene: str, run: range) -> Findings:
+    pairs = _open_pairs(folder, layout, scene)
+    found, damaged = _no_findings(), dict[str, str]()
     for index in run:
         try:
             sample = pairs.read(index)
-            wrong = problem(sample)
-            found += _found(sample, f"{folder}: {pairs.names[index]}: {wrong}" if wrong else None)
+            wrong = find_problem(sample)
+            found += _measure(sample, f"{folder}: {pairs.names[index]}: {wrong}" if wrong else None)
         except FormatError as error:
             # A damaged shard is to be deleted whole, and so its first damage says enough.
             damaged.setdefault(pairs.files[index], str(error))
-        step_done()
-    return found + _nothing(*damaged.values())
+        count_step()
+    return found + _no_findings(*damaged.values())
 
 
 @cache
-def _opened(folder: Path, layout: str, scene: str) -> _Pairs:
+def _open_pairs(folder: Path, layout: str, scene: str) -> _Pairs:
     if layout == "shards":
         shards = Shards(folder, scene)
 
@@ -169,7 +169,7 @@ def _opened(folder: Path, layout: str, scene: str) -> _Pairs:
     return _Pairs(names, names, read)
 
 
-def _nothing(*problems: str) -> Findings:
+def _no_findings(*problems: str) -> Findings:
     return Findings(
         pairs=0,
         disparity=np.zeros(len(_DISPARITY_EDGES_PX), int),
@@ -184,14 +184,14 @@ def _nothing(*problems: str) -> Findings:
     )
 
 
-def _found(sample: Sample, problem: str | None) -> Findings:
+def _measure(sample: Sample, problem: str | None) -> Findings:
     known_px = sample.disparity_px[np.isfinite(sample.disparity_px)]
     assert sample.camera is not None
-    grey_levels, agreeing = _grey_levels(sample), _agreeing(sample)
+    grey_levels, agreeing = _grey_level_differences(sample), _agreeing_share(sample)
     return Findings(
         pairs=1,
-        disparity=_counts(known_px, _DISPARITY_EDGES_PX),
-        depth=_counts(sample.camera.depth_m(known_px[None]), _DEPTH_EDGES_M),
+        disparity=_count(known_px, _DISPARITY_EDGES_PX),
+        depth=_count(sample.camera.depth_m(known_px[None]), _DEPTH_EDGES_M),
         unknown=sample.disparity_px.size - known_px.size,
         occluded=int(sample.occluded.sum()),
         grey_levels=np.nan_to_num(grey_levels),
@@ -202,13 +202,13 @@ def _found(sample: Sample, problem: str | None) -> Findings:
     )
 
 
-def _grey_levels(sample: Sample) -> Float[np.ndarray, "3"]:
+def _grey_level_differences(sample: Sample) -> Float[np.ndarray, "3"]:
     """Mean difference of both pictures at near things that both see, by the disparity - 1, + 0 and + 1 px.
 
     NaN where there is next to nothing near.
     """
     left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (sample.left, sample.right))
-    columns = _columns(sample)
+    columns = _matching_columns(sample)
     rows = np.broadcast_to(np.arange(len(columns), dtype=np.float32)[:, None], columns.shape).copy()
     last = columns.shape[1] - 1
     # False where the disparity is unknown.
@@ -222,13 +222,13 @@ def _grey_levels(sample: Sample) -> Float[np.ndarray, "3"]:
     return np.array([np.abs(difference[seen]).mean() for difference in differences])
 
 
-def _agreeing(sample: Sample) -> float:
+def _agreeing_share(sample: Sample) -> float:
     """The share of what both views see, jumps left out, at which their disparities agree; NaN of nothing.
 
     A disparity agrees that lies between those of the two columns beside its match: so a crease between the
     two, where no interpolation is right, does not count as wrong.
     """
-    columns = _columns(sample)
+    columns = _matching_columns(sample)
     inside = (columns >= 0) & (columns <= columns.shape[1] - 1)
     columns = np.where(inside, columns, 0)
     beside = [
@@ -237,7 +237,7 @@ def _agreeing(sample: Sample) -> float:
     ]
     low_px, high_px = np.minimum(*beside), np.maximum(*beside)
     # A wire narrower than a pixel may be in one view and fall between the columns of the other one.
-    level = _level(sample.disparity_px) & (high_px - low_px <= _JUMP_PX)
+    level = _find_level(sample.disparity_px) & (high_px - low_px <= _JUMP_PX)
     seen = inside & level & ~sample.occluded
     if seen.sum() < _FEWEST_PIXELS:
         return np.nan
@@ -245,19 +245,19 @@ def _agreeing(sample: Sample) -> float:
     return float((outside_px[seen] <= _AGREE_PX).mean())
 
 
-def _columns(sample: Sample) -> Float[np.ndarray, "h w"]:
+def _matching_columns(sample: Sample) -> Float[np.ndarray, "h w"]:
     """The column, in the right picture, of what each pixel of the left one shows."""
     return np.arange(sample.disparity_px.shape[1], dtype=np.float32) - sample.disparity_px
 
 
-def _level(disparity_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def _find_level(disparity_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Pixels without a jump of the disparity, or an unknown one, in the column before or after them."""
     padded_px = np.pad(disparity_px, ((0, 0), (1, 1)), mode="edge")
     level = np.abs(np.diff(padded_px, axis=1)) <= _JUMP_PX
     return level[:, 1:] & level[:, :-1]
 
 
-def _counts(values: Float[np.ndarray, "*n"], edges: tuple[float, ...]) -> Int[np.ndarray, " m"]:
+def _count(values: Float[np.ndarray, "*n"], edges: tuple[float, ...]) -> Int[np.ndarray, " m"]:
     places = np.searchsorted(edges, values.ravel(), side="right") - 1
     return np.bincount(places, minlength=len(edges))
 

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from stereoweave.io.colormap import OCCLUDED_RGB, colour_disparity, colour_range_px
 from stereoweave.stereo import Sample
-from stereoweave.synth.sets.pair_rendering import Camera, Order, rendered
+from stereoweave.synth.sets.pair_rendering import RenderSpec, SceneRenderer, render_pair
 from stereoweave.system.progress import progress
 
 COLUMNS = ("left", "right", "depth", "seen by this camera alone: left", "right")
@@ -18,17 +18,19 @@ _TILE_PX = 320, 240
 _LABEL_PX = 20
 
 
-def sheet(camera: Camera, scenes: Sequence[str], seed: int, index: int = 0) -> UInt8[np.ndarray, "h w 3"]:
+def contact_sheet(
+    renderer: SceneRenderer, scenes: Sequence[str], seed: int, index: int = 0
+) -> UInt8[np.ndarray, "h w 3"]:
     """Pair `index` of each scene in a row: left, right, depth in colour (red is near), and both masks."""
-    rows = [np.hstack([_label(text) for text in COLUMNS])]
-    for scene, sample in _samples(camera, [(scene, index) for scene in scenes], seed):
-        tiles = [_shrunk(picture) for picture in _pictures(sample)]
-        rows += [_label(f"{scene} {index}", len(tiles) * _TILE_PX[0]), np.hstack(tiles)]
+    rows = [np.hstack([_draw_label(text) for text in COLUMNS])]
+    for scene, sample in _render_samples(renderer, [(scene, index) for scene in scenes], seed):
+        tiles = [_shrink(picture) for picture in _row_of_pictures(sample)]
+        rows += [_draw_label(f"{scene} {index}", len(tiles) * _TILE_PX[0]), np.hstack(tiles)]
     return np.vstack(rows)
 
 
-def quiz(
-    camera: Camera, scenes: Sequence[str], seed: int, pictures: int = 16
+def quiz_sheet(
+    renderer: SceneRenderer, scenes: Sequence[str], seed: int, pictures: int = 16
 ) -> tuple[UInt8[np.ndarray, "h w 3"], list[str]]:
     """Left pictures in four columns without a label, in an order of chance; and the scene of each, by row."""
     order = np.random.default_rng(seed).permutation(
@@ -36,37 +38,44 @@ def quiz(
     )
     names = order.tolist()
     numbered = [(name, place) for place, name in enumerate(names)]
-    tiles = [_shrunk(sample.left) for _, sample in _samples(camera, numbered, seed)]
+    tiles = [_shrink(sample.left) for _, sample in _render_samples(renderer, numbered, seed)]
     tiles += [np.zeros_like(tiles[0])] * (-pictures % 4)
     return np.vstack([np.hstack(tiles[start : start + 4]) for start in range(0, len(tiles), 4)]), names
 
 
-def _samples(camera: Camera, pairs: Sequence[tuple[str, int]], seed: int) -> Iterator[tuple[str, Sample]]:
+def _render_samples(
+    renderer: SceneRenderer, pairs: Sequence[tuple[str, int]], seed: int
+) -> Iterator[tuple[str, Sample]]:
     """Scene and sample of each pair; a bar shows how far it is."""
     with progress(Console()) as bar:
         shown = bar.add_task("rendering pairs", total=len(pairs), loss="", rate="")
         for scene, index in pairs:
-            yield scene, rendered(camera, Order(scene=scene, seed=seed), index).sample
+            yield scene, render_pair(renderer, RenderSpec(scene=scene, seed=seed), index).sample
             bar.advance(shown)
 
 
-def _pictures(sample: Sample) -> list[UInt8[np.ndarray, "h w 3"]]:
+def _row_of_pictures(sample: Sample) -> list[UInt8[np.ndarray, "h w 3"]]:
     depth = colour_disparity(sample.disparity_px, colour_range_px(sample.disparity_px))
-    left, right = _masked(sample.left, sample.occluded), _masked(sample.right, sample.right_occluded)
+    left, right = (
+        _overlay_mask(sample.left, sample.occluded),
+        _overlay_mask(sample.right, sample.right_occluded),
+    )
     return [sample.left, sample.right, depth, left, right]
 
 
-def _masked(image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+def _overlay_mask(
+    image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
+) -> UInt8[np.ndarray, "h w 3"]:
     """The picture in dark grey, the mask in orange."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) // 2
     return np.where(mask[..., None], np.array(OCCLUDED_RGB, np.uint8), grey[..., None])
 
 
-def _shrunk(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "240 320 3"]:
+def _shrink(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "240 320 3"]:
     return cv2.resize(image, _TILE_PX, interpolation=cv2.INTER_AREA)
 
 
-def _label(text: str, width_px: int = _TILE_PX[0]) -> UInt8[np.ndarray, "h w 3"]:
+def _draw_label(text: str, width_px: int = _TILE_PX[0]) -> UInt8[np.ndarray, "h w 3"]:
     strip = Image.new("RGB", (width_px, _LABEL_PX), "white")
     ImageDraw.Draw(strip).text((6, 2), text, fill="black", font=ImageFont.load_default(14))
     return np.array(strip)

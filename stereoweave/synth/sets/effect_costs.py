@@ -4,9 +4,9 @@ import time
 from dataclasses import dataclass, replace
 
 from stereoweave.synth.rendering.effects import PLAIN, Effects
-from stereoweave.synth.rendering.opengl import Renderer
-from stereoweave.synth.sets.pair_rendering import Order, staged
-from stereoweave.synth.viewpoints import Rig
+from stereoweave.synth.rendering.opengl import OpenGLRenderer
+from stereoweave.synth.sets.pair_rendering import RenderSpec, draw_stage_and_rig
+from stereoweave.synth.viewpoints import PosedRig
 from stereoweave.synth.world import World
 
 _OFF = {
@@ -27,11 +27,13 @@ class Cost:
     ms_a_pair: float
 
 
-def costs(scene: str = "propeller", pairs: int = 3, size_px: tuple[int, int] = (640, 480)) -> list[Cost]:
+def measure_effect_costs(
+    scene: str = "propeller", pairs: int = 3, size_px: tuple[int, int] = (640, 480)
+) -> list[Cost]:
     """All effects together, what each adds to them, and no effect: both views and depths, scene apart."""
-    order = Order(scene=scene, size_px=size_px)
-    renderer = Renderer(PLAIN)
-    stages = [staged(renderer, order, index) for index in range(pairs)]
+    spec = RenderSpec(scene=scene, size_px=size_px)
+    renderer = OpenGLRenderer(PLAIN)
+    stages = [draw_stage_and_rig(renderer, spec, index) for index in range(pairs)]
     renderer.close()
     views = [(stage.world, rig) for stage, rig in stages]
     everything_ms = _ms_a_pair(Effects(), views)
@@ -45,16 +47,16 @@ def costs(scene: str = "propeller", pairs: int = 3, size_px: tuple[int, int] = (
     ]
 
 
-def _ms_a_pair(effects: Effects, views: list[tuple[World, Rig]]) -> float:
+def _ms_a_pair(effects: Effects, views: list[tuple[World, PosedRig]]) -> float:
     """The mean over the views of the better of two tries, each with a world that is new to the renderer."""
-    renderer = Renderer(effects)
-    renderer.shots(*views[0], (0.0, 1.0))
+    renderer = OpenGLRenderer(effects)
+    renderer.render_views(*views[0], (0.0, 1.0))
     total_s = 0.0
     for world, rig in views:
         tries = []
         for _ in range(2):
             fresh, start = replace(world), time.process_time()
-            renderer.shots(fresh, rig, (0.0, 1.0))
+            renderer.render_views(fresh, rig, (0.0, 1.0))
             tries.append(time.process_time() - start)
         total_s += min(tries)
     renderer.close()

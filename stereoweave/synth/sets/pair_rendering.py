@@ -14,14 +14,14 @@ from stereoweave.stereo import Sample, StereoCamera, StereoPair
 from stereoweave.synth.scenes import SCENES
 from stereoweave.synth.stage import Stage
 from stereoweave.synth.viewpoints import (
-    Rig,
-    between,
+    PosedRig,
     draw_focal_px,
     draw_nearest_px,
     draw_viewpoint,
-    rig_at,
+    interpolate_viewpoints,
+    place_rig,
 )
-from stereoweave.synth.world import Shot, World
+from stereoweave.synth.world import RenderedView, World
 
 # What is nearer than this share of the picture decides the baseline: a single blade of grass does not.
 _NEAREST_SHARE = 0.01
@@ -32,19 +32,19 @@ _LOOK_WIDTH_PX = 160
 
 
 @runtime_checkable
-class Camera(Protocol):
+class SceneRenderer(Protocol):
     """Takes pictures of worlds: `renderer.Renderer`, or `raycast.Raycaster`, which is slower and plainer."""
 
     @property
     def name(self) -> str: ...
 
-    def depth_m(self, world: World, rig: Rig, position: float) -> Float[np.ndarray, "h w"]: ...
+    def depth_m(self, world: World, rig: PosedRig, position: float) -> Float[np.ndarray, "h w"]: ...
 
-    def shots(self, world: World, rig: Rig, positions: Sequence[float]) -> list[Shot]: ...
+    def render_views(self, world: World, rig: PosedRig, positions: Sequence[float]) -> list[RenderedView]: ...
 
 
 @dataclass(frozen=True, kw_only=True)
-class Order:
+class RenderSpec:
     """What is to be rendered.
 
     Attributes:
@@ -67,11 +67,11 @@ class Order:
         if self.scene not in SCENES:
             raise StereoweaveError(f"scene: expected one of {', '.join(SCENES)}, found {self.scene!r}")
         if self.rig is not None:
-            _camera(*self.rig, self.size_px)  # which refuses nonsense
+            _centred_camera(*self.rig, self.size_px)  # which refuses nonsense
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rendered:
+class RenderedPair:
     """A pair with its truth.
 
     Attributes:
@@ -80,55 +80,59 @@ class Rendered:
     """
 
     sample: Sample
-    views: tuple[tuple[float, Shot], ...]
+    views: tuple[tuple[float, RenderedView], ...]
 
 
-def rendered(camera: Camera, order: Order, index: int) -> Rendered:
+def render_pair(camera: SceneRenderer, spec: RenderSpec, index: int) -> RenderedPair:
     """Pair number `index` of an order, the same in every process."""
-    sequence, frame = divmod(index, order.frames)
-    stage, rig = staged(camera, order, sequence, frame)
-    left, right, *others = camera.shots(stage.world, rig, (0.0, 1.0, *order.views))
+    sequence, frame = divmod(index, spec.frames)
+    stage, rig = draw_stage_and_rig(camera, spec, sequence, frame)
+    left, right, *others = camera.render_views(stage.world, rig, (0.0, 1.0, *spec.views))
     left_px, right_px = (rig.camera.disparity_px(shot.depth_m).astype(np.float32) for shot in (left, right))
-    rng = np.random.default_rng((*_seed(order, sequence), frame))
-    left_image, right_image = (_with_noise(rng, shot.image, stage.noise_levels) for shot in (left, right))
+    rng = np.random.default_rng((*_seed(spec, sequence), frame))
+    left_image, right_image = (_add_noise(rng, shot.image, stage.noise_levels) for shot in (left, right))
     pair = StereoPair(left=left_image, right=right_image, camera=rig.camera)
-    return Rendered(
+    return RenderedPair(
         sample=make_sample(pair, left_px, right_px),
-        views=tuple(zip(order.views, others, strict=True)),
+        views=tuple(zip(spec.views, others, strict=True)),
     )
 
 
-def staged(camera: Camera, order: Order, sequence: int, frame: int = 0) -> tuple[Stage, Rig]:
+def draw_stage_and_rig(
+    camera: SceneRenderer, spec: RenderSpec, sequence: int, frame: int = 0
+) -> tuple[Stage, PosedRig]:
     """The stage and rig of a frame of a sequence; (seed, scene, sequence) decide all but the frame."""
-    rng = np.random.default_rng(_seed(order, sequence))
-    stage = SCENES[order.scene](rng)
-    focal_px = draw_focal_px(rng, order.size_px[0])
-    nearest_px = draw_nearest_px(rng, order.size_px[0], stage.nearest_px)
+    rng = np.random.default_rng(_seed(spec, sequence))
+    stage = SCENES[spec.scene](rng)
+    focal_px = draw_focal_px(rng, spec.size_px[0])
+    nearest_px = draw_nearest_px(rng, spec.size_px[0], stage.nearest_px)
     start = draw_viewpoint(rng, stage.orbit)
     # A film pans over a part of the orbit.
-    end = between(start, draw_viewpoint(rng, stage.orbit), rng.uniform(0.15, 0.4))
-    ends = (start,) if order.frames == 1 else (start, end)
-    if order.rig is not None:
-        focal_px, baseline_m = order.rig
+    end = interpolate_viewpoints(start, draw_viewpoint(rng, stage.orbit), rng.uniform(0.15, 0.4))
+    ends = (start,) if spec.frames == 1 else (start, end)
+    if spec.rig is not None:
+        focal_px, baseline_m = spec.rig
     else:
 
-        def rigs(baseline_m: float) -> list[Rig]:
-            scale = _LOOK_WIDTH_PX / order.size_px[0]
-            size_px = (_LOOK_WIDTH_PX, max(round(scale * order.size_px[1]), 1))
-            small = _camera(scale * focal_px, baseline_m, size_px)
-            return [rig_at(stage.orbit, place, small, size_px) for place in ends]
+        def rigs(baseline_m: float) -> list[PosedRig]:
+            scale = _LOOK_WIDTH_PX / spec.size_px[0]
+            size_px = (_LOOK_WIDTH_PX, max(round(scale * spec.size_px[1]), 1))
+            small = _centred_camera(scale * focal_px, baseline_m, size_px)
+            return [place_rig(stage.orbit, place, small, size_px) for place in ends]
 
-        baseline_m = _baseline_m(camera, stage.world, rigs, nearest_px / focal_px)
-    share = frame / max(order.frames - 1, 1)
-    camera_model = _camera(focal_px, baseline_m, order.size_px)
-    return stage, rig_at(stage.orbit, between(start, end, share), camera_model, order.size_px)
-
-
-def _seed(order: Order, sequence: int) -> tuple[int, int, int]:
-    return order.seed, zlib.crc32(order.scene.encode()), sequence
+        baseline_m = _choose_baseline_m(camera, stage.world, rigs, nearest_px / focal_px)
+    share = frame / max(spec.frames - 1, 1)
+    camera_model = _centred_camera(focal_px, baseline_m, spec.size_px)
+    return stage, place_rig(
+        stage.orbit, interpolate_viewpoints(start, end, share), camera_model, spec.size_px
+    )
 
 
-def _with_noise(
+def _seed(spec: RenderSpec, sequence: int) -> tuple[int, int, int]:
+    return spec.seed, zlib.crc32(spec.scene.encode()), sequence
+
+
+def _add_noise(
     rng: np.random.Generator, image: UInt8[np.ndarray, "h w 3"], levels: float
 ) -> UInt8[np.ndarray, "h w 3"]:
     """The picture with a sensor's noise, which grows with the root of the brightness as photons' does."""
@@ -138,8 +142,8 @@ def _with_noise(
     return np.clip(np.rint(image + deviation * rng.standard_normal(image.shape)), 0, 255).astype(np.uint8)
 
 
-def _baseline_m(
-    camera: Camera, world: World, rigs: Callable[[float], Sequence[Rig]], metres_px: float
+def _choose_baseline_m(
+    camera: SceneRenderer, world: World, rigs: Callable[[float], Sequence[PosedRig]], metres_px: float
 ) -> float:
     """The baseline that gives what is nearest, seen from half way between the two eyes, its disparity.
 
@@ -161,7 +165,7 @@ def _baseline_m(
     return min(baseline_m, _EXCESS * metres_px * nearest_m(baseline_m, (0.0, 1.0), _WIRE_SHARE))
 
 
-def _camera(focal_px: float, baseline_m: float, size_px: tuple[int, int]) -> StereoCamera:
+def _centred_camera(focal_px: float, baseline_m: float, size_px: tuple[int, int]) -> StereoCamera:
     width_px, height_px = size_px
     return StereoCamera(
         focal_px=focal_px, baseline_m=baseline_m, cx_px=(width_px - 1) / 2, cy_px=(height_px - 1) / 2

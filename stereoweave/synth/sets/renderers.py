@@ -1,20 +1,27 @@
-"""Which camera takes the pictures: OpenGL where it works, else ray casting."""
+"""Choice of the renderer: OpenGL where it works, otherwise ray casting."""
 
 import warnings
+from functools import cache
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.synth.rendering.effects import Effects
-from stereoweave.synth.sets.pair_rendering import Camera
+from stereoweave.synth.rendering.effects import PLAIN, Effects
+from stereoweave.synth.sets.pair_rendering import SceneRenderer
 
 _PACKAGES = "on Debian: apt install libegl1 libgl1-mesa-dri"
 
 
-def camera_for(effects: Effects) -> Camera:
-    """A `Renderer`; where OpenGL does not start a `Raycaster`, and a warning that says so."""
-    try:
-        from stereoweave.synth.rendering.opengl import Renderer
+@cache
+def shared_renderer(plain: bool = False) -> SceneRenderer:
+    """The best renderer of this machine, one per process; `plain` turns all effects off."""
+    return choose_renderer(PLAIN if plain else Effects())
 
-        return Renderer(effects)
+
+def choose_renderer(effects: Effects) -> SceneRenderer:
+    """An `OpenGLRenderer`; where OpenGL does not start, a `Raycaster` and a warning."""
+    try:
+        from stereoweave.synth.rendering.opengl import OpenGLRenderer
+
+        return OpenGLRenderer(effects)
     except (ImportError, StereoweaveError) as error:
         without_opengl = error
     try:
@@ -25,7 +32,7 @@ def camera_for(effects: Effects) -> Camera:
             f"pip install 'stereoweave[synth]', and {_PACKAGES}"
         ) from error
     warnings.warn(
-        f"rendering by embree, which is slower and plainer, because: {without_opengl}",
+        f"rendering with embree, which is slower and plainer, because OpenGL did not start: {without_opengl}",
         stacklevel=2,
     )
     return Raycaster(effects)

@@ -23,7 +23,7 @@ Result = TypeVar("Result")
 _done: "Synchronized[int] | None" = None
 
 
-def in_workers(  # noqa: PLR0913 - what, on what, by how many, and how it is told
+def run_in_workers(  # noqa: PLR0913 - what, on what, by how many, and how it is told
     work: Callable[[Task], Result],
     tasks: Sequence[Task],
     jobs: int,
@@ -70,7 +70,7 @@ def in_workers(  # noqa: PLR0913 - what, on what, by how many, and how it is tol
             raise
 
 
-def in_engine(  # noqa: PLR0913 - as `in_workers`
+def run_in_engine(  # noqa: PLR0913 - as `in_workers`
     make_work: Callable[[], Callable[[Task], int]],
     tasks: Sequence[Task],
     engine: Engine,
@@ -93,11 +93,11 @@ def in_engine(  # noqa: PLR0913 - as `in_workers`
     """
     with connect(engine), progress(console) as bar:
         shown = bar.add_task(description, total=steps, loss="", rate="")
-        for done in stream(partial(_begun, make_work), tasks, engine):
+        for done in stream(partial(_begin_in_engine, make_work), tasks, engine):
             bar.update(shown, advance=done)
 
 
-def step_done() -> None:
+def count_step() -> None:
     """Called by `work` after each step, for the bar."""
     if _done is not None:
         with _done.get_lock():
@@ -111,7 +111,7 @@ def _begin(done: "Synchronized[int]") -> None:
     begin_work(threads=1)
 
 
-def _begun(make_work: Callable[[], Callable[[Task], int]]) -> Callable[[Task], int]:
+def _begin_in_engine(make_work: Callable[[], Callable[[Task], int]]) -> Callable[[Task], int]:
     _draw_with_one_thread()
     return make_work()
 

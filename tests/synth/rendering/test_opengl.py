@@ -13,12 +13,12 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import StereoCamera
 from stereoweave.synth.props.primitives import boxes, sheet, spheres, tubes
 from stereoweave.synth.rendering.effects import PLAIN, Effects
-from stereoweave.synth.rendering.opengl import Renderer
+from stereoweave.synth.rendering.opengl import OpenGLRenderer
 from stereoweave.synth.rendering.raycast import Raycaster
 from stereoweave.synth.scenes import SCENES
-from stereoweave.synth.sets.pair_rendering import Order, staged
+from stereoweave.synth.sets.pair_rendering import RenderSpec, draw_stage_and_rig
 from stereoweave.synth.textures.bank import bank, linear
-from stereoweave.synth.viewpoints import Orbit, Rig, Viewpoint, rig_at
+from stereoweave.synth.viewpoints import Orbit, PosedRig, Viewpoint, place_rig
 from stereoweave.synth.world import Fog, Lamp, Material, Mesh, Sky, World, joined
 
 pytestmark = pytest.mark.needs_egl
@@ -35,35 +35,35 @@ SKY = Sky(
 
 
 @pytest.fixture(scope="module")
-def renderer() -> Iterator[Renderer]:
-    made = Renderer()
+def renderer() -> Iterator[OpenGLRenderer]:
+    made = OpenGLRenderer()
     yield made
     made.close()
 
 
 @pytest.fixture(scope="module")
-def plain() -> Iterator[Renderer]:
-    made = Renderer(PLAIN)
+def plain() -> Iterator[OpenGLRenderer]:
+    made = OpenGLRenderer(PLAIN)
     yield made
     made.close()
 
 
 @pytest.fixture(scope="module")
-def small_scene(plain) -> Callable[[str], tuple[World, Rig]]:
+def small_scene(plain) -> Callable[[str], tuple[World, PosedRig]]:
     @functools.cache
-    def world_and_rig(name: str) -> tuple[World, Rig]:
-        stage, rig = staged(plain, Order(scene=name, size_px=(160, 120)), 0)
+    def world_and_rig(name: str) -> tuple[World, PosedRig]:
+        stage, rig = draw_stage_and_rig(plain, RenderSpec(scene=name, size_px=(160, 120)), 0)
         return stage.world, rig
 
     return world_and_rig
 
 
 @pytest.fixture
-def make() -> Iterator[Callable[[Effects], Renderer]]:
+def make() -> Iterator[Callable[[Effects], OpenGLRenderer]]:
     made = []
 
-    def renderer_with(effects: Effects) -> Renderer:
-        made.append(Renderer(effects))
+    def renderer_with(effects: Effects) -> OpenGLRenderer:
+        made.append(OpenGLRenderer(effects))
         return made[-1]
 
     yield renderer_with
@@ -71,24 +71,26 @@ def make() -> Iterator[Callable[[Effects], Renderer]]:
         each.close()
 
 
-def ahead(size_px: tuple[int, int] = (160, 120), focal_px: float = 100.0, baseline_m: float = 0.2) -> Rig:
+def ahead(
+    size_px: tuple[int, int] = (160, 120), focal_px: float = 100.0, baseline_m: float = 0.2
+) -> PosedRig:
     """At the origin, looking along y, z up."""
     width_px, height_px = size_px
     camera = StereoCamera(
         focal_px=focal_px, baseline_m=baseline_m, cx_px=(width_px - 1) / 2, cy_px=(height_px - 1) / 2
     )
     axes = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    return Rig(camera=camera, size_px=size_px, position_m=np.zeros(3), axes=axes)
+    return PosedRig(camera=camera, size_px=size_px, position_m=np.zeros(3), axes=axes)
 
 
-def orbiting(size_px: tuple[int, int] = (320, 240)) -> Rig:
+def orbiting(size_px: tuple[int, int] = (320, 240)) -> PosedRig:
     place = Viewpoint(
         distance_m=8, azimuth_deg=-65, elevation_deg=14, aim_m=np.array([0, 0, 2.0]), roll_deg=1.5
     )
     camera = StereoCamera(
         focal_px=0.95 * size_px[0], baseline_m=0.4, cx_px=(size_px[0] - 1) / 2, cy_px=(size_px[1] - 1) / 2
     )
-    return rig_at(Orbit(centre_m=(0, 0, 2), distance_m=(5, 12)), place, camera, size_px)
+    return place_rig(Orbit(centre_m=(0, 0, 2), distance_m=(5, 12)), place, camera, size_px)
 
 
 def wall(
@@ -146,7 +148,9 @@ def test_a_wall_at_4_m_is_4_m_deep_everywhere(plain):
 def test_a_box_hides_the_wall_where_it_stands(plain):
     # Its front is at 2 m, so 1 cm is half a pixel: 20.5 px to each side of the middle, 41 of 161 columns.
     box = boxes(np.array([[0, 2.2, 0]]), np.array([[0.82, 0.4, 0.42]]), 0).as_target()
-    left, right = plain.shots(world_of(joined([wall(4.0), box])), ahead(size_px=(161, 121)), (0.0, 1.0))
+    left, right = plain.render_views(
+        world_of(joined([wall(4.0), box])), ahead(size_px=(161, 121)), (0.0, 1.0)
+    )
     expected = np.zeros((121, 161), bool)
     expected[50:71, 60:101] = True
     np.testing.assert_array_equal(left.target, expected)
@@ -169,7 +173,9 @@ def test_the_sky_is_infinitely_far(plain):
 def test_a_world_without_a_sun_looks_like_one_whose_sun_gives_no_light_to_speak_of(renderer, rng):
     world, rig = cluttered(rng), orbiting()
     without, faint = (
-        renderer.shots(replace(world, sky=replace(world.sky, sun_light=3 * (light,))), rig, (0.0,))[0].image
+        renderer.render_views(replace(world, sky=replace(world.sky, sun_light=3 * (light,))), rig, (0.0,))[
+            0
+        ].image
         for light in (0.0, 1e-12)
     )
     np.testing.assert_array_equal(without, faint)
@@ -216,7 +222,7 @@ def test_diffuse_images_are_not_shifted_against_their_truth(make, samples):
     slanted = sheet(np.stack([x, 5 + 0.35 * x + 0.1 * np.sin(3 * z), z], -1), 0)
     rig = ahead(size_px=(640, 480), focal_px=600.0, baseline_m=0.3)
     world = world_of(slanted, Material(texture="photograph", span_m=4.0, relief=0.2))
-    left, right = diffuse.shots(world, rig, (0.0, 1.0))
+    left, right = diffuse.render_views(world, rig, (0.0, 1.0))
     disparity_px = rig.camera.disparity_px(left.depth_m)
     columns = np.arange(640)
     seen, other = (shot.image.mean(2) for shot in (left, right))
@@ -241,7 +247,7 @@ def test_a_shadow_falls_where_geometry_says(plain, make):
     shadowing = make(replace(PLAIN, shadows=True))
     world = world_of(joined([ground, slab]), sky=sky)
     shadowed, lit, dark = (
-        camera.shots(stage, rig, (0.0,))[0].image.astype(int)
+        camera.render_views(stage, rig, (0.0,))[0].image.astype(int)
         for camera, stage in (
             (shadowing, world),
             (plain, world),
@@ -265,7 +271,7 @@ def test_crowded_places_get_less_light_from_the_sky(plain, make):
     rig = replace(ahead(), position_m=np.array([0, -2.0, 0.3]))
     world = world_of(joined([floor, table]), Material(texture="plain"), sky=evenly)
     open_to_the_sky, crowded = (
-        light_of(camera.shots(world, rig, (0.0,))[0].image)
+        light_of(camera.render_views(world, rig, (0.0,))[0].image)
         for camera in (plain, make(replace(PLAIN, ambient_occlusion=True)))
     )
     under, beside = (slice(64, 66), slice(70, 90)), (slice(90, 110), slice(70, 90))
@@ -280,7 +286,7 @@ def test_gloss_alone_differs_between_the_eyes(plain, make):
     lamps = (Lamp(position_m=(0.5, 1.0, 0.0), light=(3.0, 3.0, 3.0)),)
     for camera, gloss in ((plain, False), (make(replace(PLAIN, gloss=True)), True)):
         # 100 px * 1 m / 5 m: whole pixels, so that samples fall on the same places of the wall.
-        shots = camera.shots(world_of(wall(5.0), paint, lamps=lamps), rig, (0.0, 1.0))
+        shots = camera.render_views(world_of(wall(5.0), paint, lamps=lamps), rig, (0.0, 1.0))
         left, right = (shot.image.astype(int) for shot in shots)
         differs = np.abs(left[:, 20:] - right[:, :-20]).max() > 3
         assert differs == gloss
@@ -294,7 +300,7 @@ def test_fog_mixes_its_colour_in_by_distance(plain, make):
         fog=Fog(colour=(0.5, 0.5, 0.5), density_per_m=0.1),
     )
     for camera, expected in ((make(replace(PLAIN, fog=True)), level(0.1967)), (plain, 0)):
-        image = camera.shots(world, ahead(size_px=(161, 121)), (0.0,))[0].image
+        image = camera.render_views(world, ahead(size_px=(161, 121)), (0.0,))[0].image
         np.testing.assert_allclose(image[60, 80], expected, atol=1)
 
 
@@ -303,7 +309,7 @@ def test_a_textures_mean_colour_survives(plain, span_m):
     """Under a white sky a wall gives off what its texture is, tint times mean, from near and from afar."""
     even = replace(SKY, sun_light=BLACK, zenith=WHITE, horizon=WHITE)
     world = world_of(wall(5.0), Material(texture="concrete", tint=(0.9, 0.7, 0.5), span_m=span_m), sky=even)
-    image = plain.shots(world, ahead(size_px=(160, 160)), (0.0,))[0].image
+    image = plain.render_views(world, ahead(size_px=(160, 160)), (0.0,))[0].image
     layer = bank().pixels[bank().layer("concrete", 0), ..., :3]
     expected = np.array([0.9, 0.7, 0.5]) * linear(layer.astype(np.float32)).mean((0, 1))
     np.testing.assert_allclose(light_of(image).mean((0, 1)), expected, rtol=0.04)
@@ -313,7 +319,9 @@ def test_plain_is_what_ray_casting_shows(plain):
     """Diffuse colours in sun and sky without shadows, by two ways; texels differ by their filter."""
     world = replace(cluttered(np.random.default_rng(3)), lamps=())
     world = replace(world, sky=replace(SKY, clouds=0.0))
-    shot, expected = (camera.shots(world, orbiting(), (0.0,))[0] for camera in (plain, Raycaster(PLAIN)))
+    shot, expected = (
+        camera.render_views(world, orbiting(), (0.0,))[0] for camera in (plain, Raycaster(PLAIN))
+    )
     difference = shot.image.astype(int) - expected.image
     assert np.abs(difference.mean()) < 2
     assert np.median(np.abs(difference)) < 8
@@ -322,12 +330,12 @@ def test_plain_is_what_ray_casting_shows(plain):
 def test_the_same_bytes_whatever_was_rendered_before(renderer, plain, make):
     worlds = [cluttered(np.random.default_rng(seed)) for seed in range(2)]
     rig = orbiting((160, 120))
-    first = renderer.shots(worlds[0], rig, (0.0, 1.0))
-    plain.shots(worlds[0], rig, (0.0,))
-    renderer.shots(worlds[1], orbiting((96, 64)), (0.5,))
+    first = renderer.render_views(worlds[0], rig, (0.0, 1.0))
+    plain.render_views(worlds[0], rig, (0.0,))
+    renderer.render_views(worlds[1], orbiting((96, 64)), (0.5,))
     for again in (
-        renderer.shots(worlds[0], rig, (0.0, 1.0)),
-        make(Effects()).shots(worlds[0], rig, (0.0, 1.0)),
+        renderer.render_views(worlds[0], rig, (0.0, 1.0)),
+        make(Effects()).render_views(worlds[0], rig, (0.0, 1.0)),
     ):
         for one, other in zip(first, again, strict=True):
             for name in ("image", "depth_m", "target"):
@@ -336,8 +344,8 @@ def test_the_same_bytes_whatever_was_rendered_before(renderer, plain, make):
 
 def test_a_shot_does_not_depend_on_the_others(renderer, rng):
     world, rig = cluttered(rng), orbiting((160, 120))
-    alone = renderer.shots(world, rig, (1.0,))[0]
-    np.testing.assert_array_equal(alone.image, renderer.shots(world, rig, (0.0, 1.0))[1].image)
+    alone = renderer.render_views(world, rig, (1.0,))[0]
+    np.testing.assert_array_equal(alone.image, renderer.render_views(world, rig, (0.0, 1.0))[1].image)
 
 
 @pytest.mark.parametrize(
@@ -355,7 +363,7 @@ def test_a_shot_does_not_depend_on_the_others(renderer, rng):
 )
 def test_more_than_a_world_may_have_is_an_error(plain, others, message):
     with pytest.raises(StereoweaveError, match=message):
-        plain.shots(replace(world_of(wall(4.0)), **others), ahead(), (0.0,))
+        plain.render_views(replace(world_of(wall(4.0)), **others), ahead(), (0.0,))
 
 
 def test_a_pixel_takes_one_sample_or_2x2():

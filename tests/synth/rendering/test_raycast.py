@@ -11,19 +11,19 @@ from stereoweave.synth.props.primitives import boxes, sheet, spheres
 from stereoweave.synth.rendering import opengl as renderer
 from stereoweave.synth.rendering.effects import PLAIN, Effects
 from stereoweave.synth.rendering.raycast import Raycaster
-from stereoweave.synth.sets.pair_rendering import Camera
-from stereoweave.synth.sets.renderers import camera_for
-from stereoweave.synth.viewpoints import Rig
+from stereoweave.synth.sets.pair_rendering import SceneRenderer
+from stereoweave.synth.sets.renderers import choose_renderer
+from stereoweave.synth.viewpoints import PosedRig
 from stereoweave.synth.world import Material, Mesh, Sky, World, joined
 
 WHITE = (1.0, 1.0, 1.0)
 
 
-def ahead(width_px: int = 81, height_px: int = 61) -> Rig:
+def ahead(width_px: int = 81, height_px: int = 61) -> PosedRig:
     """At the origin, looking along y, z up."""
     camera = StereoCamera(focal_px=50.0, baseline_m=0.2, cx_px=(width_px - 1) / 2, cy_px=(height_px - 1) / 2)
     axes = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    return Rig(camera=camera, size_px=(width_px, height_px), position_m=np.zeros(3), axes=axes)
+    return PosedRig(camera=camera, size_px=(width_px, height_px), position_m=np.zeros(3), axes=axes)
 
 
 def wall(distance_m: float) -> Mesh:
@@ -41,7 +41,7 @@ def test_depth_through_the_pixels_centres_is_exact():
     ball = spheres(np.array([[0.0, 5, 0]]), 1.0, 0, subdivisions=5).as_target()
     below = wall(8.0)
     below.corners_m[..., 2] = np.minimum(below.corners_m[..., 2], 2.0)
-    shot = Raycaster(PLAIN).shots(world_of(joined([ball, below])), ahead(), (0.0,))[0]
+    shot = Raycaster(PLAIN).render_views(world_of(joined([ball, below])), ahead(), (0.0,))[0]
     assert shot.depth_m[30, 40] == pytest.approx(4.0, abs=2e-3)  # the ball's flat triangles
     assert shot.depth_m[30, 0] == pytest.approx(8.0, abs=1e-6)
     assert shot.target[30, 40] and not shot.target[30, 0]
@@ -51,7 +51,7 @@ def test_depth_through_the_pixels_centres_is_exact():
 
 def test_the_right_camera_sees_the_ball_shifted_by_its_disparity():
     ball = world_of(boxes(np.array([[0.0, 2.1, 0]]), np.array([[0.41, 0.2, 0.41]]), 0).as_target())
-    left, right = Raycaster(PLAIN).shots(ball, ahead(), (0.0, 1.0))
+    left, right = Raycaster(PLAIN).render_views(ball, ahead(), (0.0, 1.0))
     assert left.target.sum() > 100
     np.testing.assert_array_equal(right.target, np.roll(left.target, -5, axis=1))  # 50 px * 0.2 m / 2 m
 
@@ -61,7 +61,7 @@ def test_light_is_albedo_times_what_falls_in(effects):
     """Sky 1 from all sides and sun 0.5 square on: 1.5 times the albedo."""
     from stereoweave.synth.textures.bank import bank, linear
 
-    image = Raycaster(effects).shots(world_of(wall(2.0)), ahead(), (0.0,))[0].image
+    image = Raycaster(effects).render_views(world_of(wall(2.0)), ahead(), (0.0,))[0].image
     layer = bank().pixels[bank().layer("plain", 0), ..., :3]
     shown = linear(image.astype(np.float32))
     light = (0.25 * shown / (1 - shown)) ** (2 / 3)
@@ -76,7 +76,7 @@ def test_what_stands_before_the_sun_takes_its_light():
     sun = (np.sqrt(0.5), -np.sqrt(0.5), 0.0)
     world = world_of(joined([wall(4.0), box]), sun=sun, sun_light=1.0)
     lit, shadowed = (
-        Raycaster(effects).shots(world, ahead(), (0.0,))[0].image.mean(2)
+        Raycaster(effects).render_views(world, ahead(), (0.0,))[0].image.mean(2)
         for effects in (PLAIN, Effects(samples=1))
     )
     # 12.5 px a metre at the wall: columns 40 - 1.5 * 12.5 to 40 - 0.5 * 12.5.
@@ -87,9 +87,9 @@ def test_what_stands_before_the_sun_takes_its_light():
 
 @pytest.mark.needs_egl
 def test_both_are_cameras():
-    assert isinstance(Raycaster(), Camera)
-    made = camera_for(PLAIN)
-    assert isinstance(made, renderer.Renderer) and isinstance(made, Camera)
+    assert isinstance(Raycaster(), SceneRenderer)
+    made = choose_renderer(PLAIN)
+    assert isinstance(made, renderer.OpenGLRenderer) and isinstance(made, SceneRenderer)
     made.close()
 
 
@@ -99,7 +99,7 @@ def test_without_egl_embree_takes_the_pictures_and_says_so(monkeypatch):
 
     monkeypatch.setattr(renderer.moderngl, "create_context", broken)
     with pytest.warns(UserWarning, match=r"embree.*libEGL.so: not found.*libegl1 libgl1-mesa-dri") as warned:
-        assert isinstance(camera_for(PLAIN), Raycaster)
+        assert isinstance(choose_renderer(PLAIN), Raycaster)
     assert len(warned) == 1 and "\n" not in str(warned[0].message)
 
 
@@ -111,5 +111,5 @@ def test_with_neither_the_error_says_what_to_install(monkeypatch):
     with pytest.raises(
         StereoweaveError, match=r"pip install 'stereoweave\[synth\]'.*libgl1-mesa-dri"
     ) as raised:
-        camera_for(PLAIN)
+        choose_renderer(PLAIN)
     assert "\n" not in str(raised.value)

@@ -7,11 +7,11 @@ from stereoweave.stereo import StereoCamera
 from stereoweave.synth.props.bridges import abutments, beams, planned
 from stereoweave.synth.scenes.bridge import KINDS, bridge
 from stereoweave.synth.stage import Palette
-from stereoweave.synth.viewpoints import draw_viewpoint, rig_at
+from stereoweave.synth.viewpoints import draw_viewpoint, place_rig
 
 
 @functools.cache
-def staged(seed):
+def draw_stage_and_rig(seed):
     return bridge(np.random.default_rng(seed))
 
 
@@ -31,7 +31,7 @@ def test_every_kind_spans_the_river_within_its_bounds(kind):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_target_is_about_ten_metres_wide_and_the_cameras_stand_clear_of_everything(seed):
-    rng, stage = np.random.default_rng(seed), staged(seed)
+    rng, stage = np.random.default_rng(seed), draw_stage_and_rig(seed)
     mesh = stage.world.mesh
     target_m = mesh.corners_m[mesh.target].reshape(-1, 3)
     assert 8 < np.ptp(target_m[:, 0]) < 12
@@ -39,7 +39,7 @@ def test_the_target_is_about_ten_metres_wide_and_the_cameras_stand_clear_of_ever
     camera = StereoCamera(focal_px=600, baseline_m=0.1, cx_px=319.5, cy_px=239.5)
     points_m = mesh.corners_m.reshape(-1, 3)
     for _ in range(20):
-        eye_m = rig_at(stage.orbit, draw_viewpoint(rng, stage.orbit), camera, (640, 480)).position_m
+        eye_m = place_rig(stage.orbit, draw_viewpoint(rng, stage.orbit), camera, (640, 480)).position_m
         below_m = points_m[np.linalg.norm(points_m[:, :2] - eye_m[:2], axis=1) < 0.5]
         assert (below_m[:, 2] < eye_m[2]).all()
 

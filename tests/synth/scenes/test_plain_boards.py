@@ -6,9 +6,9 @@ import pytest
 from stereoweave.synth.rendering.effects import PLAIN
 from stereoweave.synth.rendering.raycast import Raycaster
 from stereoweave.synth.scenes.plain_boards import boards
-from stereoweave.synth.sets.pair_rendering import Order, rendered, staged
+from stereoweave.synth.sets.pair_rendering import RenderSpec, draw_stage_and_rig, render_pair
 
-ORDER = Order(scene="boards", seed=77, size_px=(160, 120))
+SPEC = RenderSpec(scene="boards", seed=77, size_px=(160, 120))
 PAIRS = range(12)
 # A training's crop of 384x256, as a share of a picture of 640x480.
 CROP = 0.32
@@ -24,8 +24,8 @@ def left_views(camera):
     """Depth, disparity at 640 px width, and where the near plain surfaces are seen, of each pair."""
     views = []
     for index in PAIRS:
-        stage, rig = staged(camera, ORDER, index)
-        (shot,) = camera.shots(stage.world, rig, (0.0,))
+        stage, rig = draw_stage_and_rig(camera, SPEC, index)
+        (shot,) = camera.render_views(stage.world, rig, (0.0,))
         views.append((shot.depth_m, 4 * rig.camera.disparity_px(shot.depth_m), shot.target))
     return views
 
@@ -65,9 +65,9 @@ def test_the_target_is_plain_and_the_rest_mostly_is_not():
 
 
 def test_both_cameras_have_noise_of_their_own_and_the_truth_has_none(camera):
-    stage, rig = staged(camera, ORDER, 0)
-    ideal = [shot.image.astype(float) for shot in camera.shots(stage.world, rig, (0.0, 1.0))]
-    sample = rendered(camera, ORDER, 0).sample
+    stage, rig = draw_stage_and_rig(camera, SPEC, 0)
+    ideal = [shot.image.astype(float) for shot in camera.render_views(stage.world, rig, (0.0, 1.0))]
+    sample = render_pair(camera, SPEC, 0).sample
     noise = [seen - image for seen, image in zip((sample.left, sample.right), ideal, strict=True)]
     assert 0.5 <= stage.noise_levels <= 1.5
     for levels in noise:

@@ -11,13 +11,13 @@ COATS = Coats(shells=(0, 1, 2), steel=3, rail=4, red=5, white=6, concrete=7, sig
 
 
 @functools.cache
-def staged(seed):
+def draw_stage_and_rig(seed):
     return refinery(np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_target_is_the_plant_that_all_cameras_stand_outside_of(seed):
-    stage = staged(seed)
+    stage = draw_stage_and_rig(seed)
     mesh = stage.world.mesh
     target_m = mesh.corners_m[mesh.target].reshape(-1, 3)
     assert np.linalg.norm(target_m[:, :2], axis=1).max() < stage.orbit.distance_m[0] * np.cos(np.radians(24))

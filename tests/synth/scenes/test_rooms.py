@@ -25,7 +25,7 @@ SPACE = Space(
 
 
 @functools.cache
-def staged(seed):
+def draw_stage_and_rig(seed):
     return rooms(np.random.default_rng(seed))
 
 
@@ -56,7 +56,7 @@ def test_cameras_are_where_their_orbit_says():
 
 def test_only_the_things_are_the_target():
     for seed in range(4):
-        stage = staged(seed)
+        stage = draw_stage_and_rig(seed)
         mesh = stage.world.mesh
         assert 0.1 < mesh.target.mean() < 0.95
         target_m = mesh.corners_m[mesh.target]

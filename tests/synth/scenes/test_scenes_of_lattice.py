@@ -10,7 +10,7 @@ import trimesh
 from stereoweave.stereo import StereoCamera
 from stereoweave.synth.rendering.frustum import rays
 from stereoweave.synth.scenes import SCENES
-from stereoweave.synth.viewpoints import Rig, draw_viewpoint, rig_at
+from stereoweave.synth.viewpoints import PosedRig, draw_viewpoint, place_rig
 
 NAMES = ("antenna", "pylon", "crane", "wind_turbine")
 # Between them every kind of each scene: roof, mast, dish; tower and quay; sea, tube, lattice, pump.
@@ -23,12 +23,12 @@ def stages():
     return {name: [SCENES[name](np.random.default_rng(seed)) for seed in SEEDS[name]] for name in NAMES}
 
 
-def eyes(stage, count: int) -> Iterator[Rig]:
+def eyes(stage, count: int) -> Iterator[PosedRig]:
     """Rigs that may be drawn for a stage."""
     rng = np.random.default_rng(1)
     camera = StereoCamera(focal_px=580.0, baseline_m=0.2, cx_px=319.5, cy_px=239.5)
     for _ in range(count):
-        yield rig_at(stage.orbit, draw_viewpoint(rng, stage.orbit), camera, (640, 480))
+        yield place_rig(stage.orbit, draw_viewpoint(rng, stage.orbit), camera, (640, 480))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -62,7 +62,7 @@ def test_the_thin_share_counts_what_no_square_of_six_fits_into():
     assert thin_share(mask) == 0.5
 
 
-def target_mask(stage, rig: Rig) -> np.ndarray:
+def target_mask(stage, rig: PosedRig) -> np.ndarray:
     """Pixels whose ray meets the target first, by a ray cast."""
     mesh = stage.world.mesh
     corners_m = mesh.corners_m.astype(np.float64)

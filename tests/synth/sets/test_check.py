@@ -11,9 +11,9 @@ from stereoweave.data.paper_layout import write_frame
 from stereoweave.data.samples import make_sample
 from stereoweave.data.shards import write_shard
 from stereoweave.stereo import StereoPair
-from stereoweave.synth.sets.check import check, lines, problem
-from stereoweave.synth.sets.make import camera
-from stereoweave.synth.sets.pair_rendering import Order, rendered
+from stereoweave.synth.sets.check import check_set, find_problem, report_lines
+from stereoweave.synth.sets.pair_rendering import RenderSpec, render_pair
+from stereoweave.synth.sets.renderers import shared_renderer
 
 FACTS = '{"format": 1, "layout": "LAYOUT", "scene": "pylon", "pairs": 3}'
 SCENES_IN_SMALL = ("propeller", "ship", "refinery", "pylon", "wind_turbine")
@@ -38,40 +38,40 @@ def folder(request, tmp_path):
 
 
 def checked(folder):
-    return check(folder, console=Console(file=io.StringIO()))
+    return check_set(folder, console=Console(file=io.StringIO()))
 
 
 # One pair
 
 
 def test_a_true_pair_has_no_problem(sample):
-    assert problem(sample) is None
+    assert find_problem(sample) is None
 
 
 @pytest.mark.parametrize("shift_px", [-1, 1, 5])
 def test_a_disparity_that_is_off_by_a_pixel_is_noticed(sample, shift_px):
     shifted = {name: getattr(sample, name) + shift_px for name in ("disparity_px", "right_disparity_px")}
-    assert "expected the left picture to fit the right one" in problem(replace(sample, **shifted))
+    assert "expected the left picture to fit the right one" in find_problem(replace(sample, **shifted))
 
 
 def test_pictures_that_changed_sides_are_noticed(sample):
-    assert "expected the left picture" in problem(replace(sample, left=sample.right, right=sample.left))
+    assert "expected the left picture" in find_problem(replace(sample, left=sample.right, right=sample.left))
 
 
 def test_disparities_that_disagree_are_noticed(sample):
     wrong_px = np.where(sample.right_disparity_px > 0, sample.right_disparity_px + 0.1, 0).astype(np.float32)
-    message = problem(replace(sample, right_disparity_px=wrong_px))
+    message = find_problem(replace(sample, right_disparity_px=wrong_px))
     assert message.startswith("expected both disparities to agree at 95%")
 
 
 def test_a_pair_without_truth_is_a_problem(sample):
     nothing = np.full_like(sample.disparity_px, np.nan)
-    assert "found every pixel unknown" in problem(replace(sample, disparity_px=nothing))
+    assert "found every pixel unknown" in find_problem(replace(sample, disparity_px=nothing))
 
 
 def test_a_pair_with_nothing_near_is_not_wrong(sample):
     far_px = np.full_like(sample.disparity_px, 0.5)
-    assert problem(replace(sample, disparity_px=far_px, right_disparity_px=far_px)) is None
+    assert find_problem(replace(sample, disparity_px=far_px, right_disparity_px=far_px)) is None
 
 
 def test_a_slope_with_a_crease_agrees_with_itself_and_not_with_one_that_is_off():
@@ -83,9 +83,9 @@ def test_a_slope_with_a_crease_agrees_with_itself_and_not_with_one_that_is_off()
     right_px = np.broadcast_to(right_px, (32, width)).astype(np.float32)
     pair = StereoPair(left=np.zeros((32, width, 3), np.uint8), right=np.zeros((32, width, 3), np.uint8))
     crease = make_sample(replace(pair, camera=CAMERA), left_px, right_px)
-    assert problem(crease) is None
+    assert find_problem(crease) is None
     off = replace(crease, right_disparity_px=right_px + np.float32(0.2))
-    assert "both disparities to agree" in problem(off)
+    assert "both disparities to agree" in find_problem(off)
 
 
 # Rendered pairs, in small
@@ -96,10 +96,10 @@ def rendered_pairs():
     """Five scenes at 160x120, two of which at 64x48 too, as they come from the disk."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LP_NUM_THREADS", "1")
-        renderer = camera(plain=True)
-    orders = [Order(scene=scene, size_px=(160, 120)) for scene in SCENES_IN_SMALL]
-    orders += [Order(scene=scene, size_px=(64, 48)) for scene in SCENES_IN_SMALL[:2]]
-    return [unpacked(packed(rendered(renderer, order, 0).sample, {})) for order in orders]
+        renderer = shared_renderer(plain=True)
+    orders = [RenderSpec(scene=scene, size_px=(160, 120)) for scene in SCENES_IN_SMALL]
+    orders += [RenderSpec(scene=scene, size_px=(64, 48)) for scene in SCENES_IN_SMALL[:2]]
+    return [unpacked(packed(render_pair(renderer, spec, 0).sample, {})) for spec in orders]
 
 
 def shifted(sample, shift_px):
@@ -109,7 +109,7 @@ def shifted(sample, shift_px):
 
 @pytest.mark.needs_egl
 def test_rendered_pairs_of_all_sizes_are_in_order(rendered_pairs):
-    assert [problem(sample) for sample in rendered_pairs] == [None] * len(rendered_pairs)
+    assert [find_problem(sample) for sample in rendered_pairs] == [None] * len(rendered_pairs)
 
 
 @pytest.mark.needs_egl
@@ -126,7 +126,7 @@ def test_rendered_pairs_of_all_sizes_are_in_order(rendered_pairs):
     ids=["sides", "a pixel more", "a pixel less", "scale", "sign", "a tenth of a pixel"],
 )
 def test_rendered_pairs_that_were_spoiled_are_found(rendered_pairs, spoil):
-    assert all(problem(spoil(sample)) for sample in rendered_pairs)
+    assert all(find_problem(spoil(sample)) for sample in rendered_pairs)
 
 
 # A set
@@ -151,7 +151,7 @@ def test_a_set_in_order_has_statistics_and_no_problem(folder):
 
 
 def test_the_statistics_are_told_with_histograms(folder):
-    told = "\n".join(lines(checked(folder)))
+    told = "\n".join(report_lines(checked(folder)))
     assert told.endswith("\nin order")
     assert "3 pairs" in told
     assert "8 to 16  " in told
@@ -169,7 +169,7 @@ def test_a_damaged_file_is_named_and_the_other_pairs_are_checked(folder):
     assert "found it damaged" in message
     assert str(folder) in message
     assert found.pairs == 2
-    assert list(lines(found))[-2:] == [message, "1 problem"]
+    assert list(report_lines(found))[-2:] == [message, "1 problem"]
 
 
 def test_a_damaged_shard_is_told_once_however_many_of_its_pairs_are_lost(folder):
@@ -179,7 +179,7 @@ def test_a_damaged_shard_is_told_once_however_many_of_its_pairs_are_lost(folder)
     count = 1 if next(folder.glob("*.tar"), None) else 3
     assert len(found.problems) == count
     assert all("and the same stereoweave synth make makes" in message for message in found.problems)
-    assert list(lines(found))[-1] == f"{count} problem{'s' * (count > 1)}"
+    assert list(report_lines(found))[-1] == f"{count} problem{'s' * (count > 1)}"
 
 
 def test_pairs_that_are_wrong_in_themselves_are_named(tmp_path):
@@ -199,5 +199,5 @@ def test_a_set_that_was_not_finished_is_a_problem(folder):
 
 
 def test_several_processes_find_what_one_finds(folder):
-    one, several = checked(folder), check(folder, jobs=2, console=Console(file=io.StringIO()))
-    assert list(lines(one)) == list(lines(several))
+    one, several = checked(folder), check_set(folder, jobs=2, console=Console(file=io.StringIO()))
+    assert list(report_lines(one)) == list(report_lines(several))

@@ -10,34 +10,34 @@ import numpy as np
 import pytest
 from dataset_examples import error_of, read_frame
 from rich.console import Console
-from shard_examples import PaintedStudio, assert_equal, contents
+from shard_examples import PaintedPairMaker, assert_equal, contents
 
 from stereoweave.data.paper_layout import check_frame, write_frame
 from stereoweave.data.readers import open_dataset
 from stereoweave.data.shards import Shards
 from stereoweave.errors import FormatError
 from stereoweave.synth.rendering.effects import PLAIN
-from stereoweave.synth.rendering.opengl import Renderer
+from stereoweave.synth.rendering.opengl import OpenGLRenderer
 from stereoweave.synth.sets import make as making
-from stereoweave.synth.sets.check import check
-from stereoweave.synth.sets.make import RenderingStudio, generator_version, make, read_set
-from stereoweave.synth.sets.pair_rendering import Order
+from stereoweave.synth.sets.check import check_set
+from stereoweave.synth.sets.make import PairRenderer, generator_version, make, read_set
+from stereoweave.synth.sets.pair_rendering import RenderSpec
 
-ORDER = Order(scene="pylon", seed=3, size_px=(48, 32), views=(0.5,))
-STUDIO = PaintedStudio()
+SPEC = RenderSpec(scene="pylon", seed=3, size_px=(48, 32), views=(0.5,))
+PAIR_MAKER = PaintedPairMaker()
 # What a killed process would have run.
 PROGRAM = """
 import resource
 from pathlib import Path
-from shard_examples import PaintedStudio
+from shard_examples import PaintedPairMaker
 from stereoweave.synth.sets import make as making
-from stereoweave.synth.sets.pair_rendering import Order
+from stereoweave.synth.sets.pair_rendering import RenderSpec
 if __name__ == "__main__":
     making.LAYOUTS["shards"] = making.LAYOUTS["shards"]._replace(pairs_a_run=4)
     making.generator_version = lambda: "01234567"
     {first}
-    order = Order(scene="pylon", seed=3, size_px=(48, 32), views=(0.5,))
-    making.make(order, 10, Path({out!r}), studio={studio})
+    spec = RenderSpec(scene="pylon", seed=3, size_px=(48, 32), views=(0.5,))
+    making.make(spec, 10, Path({out!r}), pair_maker={pair_maker})
 """
 
 
@@ -52,14 +52,14 @@ def prepared(monkeypatch):
     prepare(monkeypatch)
 
 
-def made(out, pairs=10, order=ORDER, studio=STUDIO, **options):
-    return make(order, pairs, out, studio=studio, console=Console(file=io.StringIO()), **options)
+def made(out, pairs=10, spec=SPEC, pair_maker=PAIR_MAKER, **options):
+    return make(spec, pairs, out, pair_maker=pair_maker, console=Console(file=io.StringIO()), **options)
 
 
-def start(folder, out, studio="PaintedStudio()", first=""):
+def start(folder, out, pair_maker="PaintedPairMaker()", first=""):
     """The same in a process of its own."""
     program = folder / "program.py"
-    program.write_text(PROGRAM.format(out=str(out), studio=studio, first=first))
+    program.write_text(PROGRAM.format(out=str(out), pair_maker=pair_maker, first=first))
     root = Path(__file__).parents[3]
     paths = {"PYTHONPATH": f"{root}/tests/helpers:{root}", "PATH": "/usr/bin:/bin"}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
@@ -94,7 +94,7 @@ def test_a_set_has_the_pairs_of_its_order_by_number(finished):
     ]
     pairs = Shards(finished)
     for number in range(10):
-        assert_equal(pairs[number], STUDIO(ORDER, number).sample)
+        assert_equal(pairs[number], PAIR_MAKER(SPEC, number).sample)
 
 
 def test_a_set_says_what_it_is(finished):
@@ -114,7 +114,7 @@ def test_a_set_says_what_it_is(finished):
 
 
 def test_a_killed_worker_is_told_in_a_line_and_the_same_call_goes_on_to_the_same_bytes(finished, tmp_path):
-    message = error_of(made, tmp_path, 10, ORDER, PaintedStudio(dies_at=6))
+    message = error_of(made, tmp_path, 10, SPEC, PaintedPairMaker(dies_at=6))
     assert "found one killed" in message
     assert message.endswith("what is there is whole, and the same command goes on")
     assert sorted(contents(tmp_path)) == ["pylon-000000-000003.tar", "set.json"]
@@ -125,7 +125,7 @@ def test_a_killed_worker_is_told_in_a_line_and_the_same_call_goes_on_to_the_same
 
 def test_no_other_process_goes_on_before_one_is_killed_with_its_workers(finished, tmp_path):
     out = tmp_path / "set"
-    first = start(tmp_path, out, studio="PaintedStudio(halts_at=6)")
+    first = start(tmp_path, out, pair_maker="PaintedPairMaker(halts_at=6)")
     try:
         os.waitpid(first.pid, os.WUNTRACED)
         assert "expected an output that nobody writes to, found one that is in use" in error_of(made, out)
@@ -155,7 +155,7 @@ def test_more_pairs_later_leave_the_first_ones_as_they_are(finished, tmp_path):
     assert sorted(after.keys() - before.keys()) == ["pylon-000010-000011.tar", "pylon-000012-000012.tar"]
     assert all(after[name] == before[name] for name in before if name != "set.json")
     for number in (9, 10, 12):
-        assert_equal(Shards(tmp_path)[number], STUDIO(ORDER, number).sample)
+        assert_equal(Shards(tmp_path)[number], PAIR_MAKER(SPEC, number).sample)
 
 
 def test_fewer_pairs_are_there_already(finished, tmp_path):
@@ -182,7 +182,7 @@ def test_a_damaged_shard_is_made_again_once_it_is_deleted(finished, tmp_path):
 def test_a_shard_too_many_is_named_alike_by_making_and_checking(finished, tmp_path, name):
     copied(finished, tmp_path)
     (tmp_path / name).touch()
-    messages = [error_of(made, tmp_path), error_of(check, tmp_path)]
+    messages = [error_of(made, tmp_path), error_of(check_set, tmp_path)]
     assert messages[0] == messages[1]
     assert messages[0].startswith(f"{tmp_path / name}: expected ")
     (tmp_path / name).unlink()
@@ -192,32 +192,32 @@ def test_a_shard_too_many_is_named_alike_by_making_and_checking(finished, tmp_pa
 def test_further_views_are_kept(finished):
     ((position, image),) = Shards(finished).views(7).items()
     assert position == 0.5
-    np.testing.assert_array_equal(image, STUDIO(ORDER, 7).sample.right)
+    np.testing.assert_array_equal(image, PAIR_MAKER(SPEC, 7).sample.right)
 
 
 # The paper's folders
 
 
 def test_each_of_the_jobs_has_work_in_a_small_set_of_frames(tmp_path):
-    order = replace(ORDER, views=())
-    made(tmp_path / "one", 6, order, layout="paper")
-    runs = making._runs(range(6), making.LAYOUTS["paper"].pairs_a_run)
+    spec = replace(SPEC, views=())
+    made(tmp_path / "one", 6, spec, layout="paper")
+    runs = making._split_into_runs(range(6), making.LAYOUTS["paper"].pairs_a_run)
     assert runs == [[0, 1, 2, 3], [4, 5]]
-    made(tmp_path / "two", 6, order, layout="paper", jobs=2)
+    made(tmp_path / "two", 6, spec, layout="paper", jobs=2)
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
 
 
 def test_the_paper_s_folders_go_on_after_a_kill_to_the_same_bytes(tmp_path):
     out, whole = tmp_path / "set", tmp_path / "whole"
-    order = replace(ORDER, views=())
-    error_of(lambda: made(out, 6, order, PaintedStudio(dies_at=5), layout="paper"))
+    spec = replace(SPEC, views=())
+    error_of(lambda: made(out, 6, spec, PaintedPairMaker(dies_at=5), layout="paper"))
     assert [frame.name for frame in open_dataset("paper", out)] == [f"pylon/{i:06d}" for i in range(5)]
     (out / "sums" / "pylon" / "000002.sha256").unlink()  # as if all were killed just before
     (out / "depth" / "pylon" / "000002.png").unlink()
     (out / "left" / "pylon" / ".000005-0123abcd.png").touch()
-    assert made(out, 6, order, layout="paper") == 2
+    assert made(out, 6, spec, layout="paper") == 2
     for number in range(6):
-        write_frame(whole, f"pylon/{number:06d}", STUDIO(ORDER, number).sample)
+        write_frame(whole, f"pylon/{number:06d}", PAIR_MAKER(SPEC, number).sample)
     found = contents(out)
     assert found.pop("set.json")
     assert found == contents(whole)
@@ -225,7 +225,7 @@ def test_the_paper_s_folders_go_on_after_a_kill_to_the_same_bytes(tmp_path):
 
 @pytest.fixture
 def frame(tmp_path):
-    sample = STUDIO(ORDER, 0).sample
+    sample = PAIR_MAKER(SPEC, 0).sample
     write_frame(tmp_path, "pylon/000000", sample)
     return tmp_path, sample
 
@@ -249,7 +249,7 @@ def test_every_frame_may_have_a_camera_of_its_own(frame):
 def test_a_frame_is_on_the_disk_before_its_checksums_appear(tmp_path, monkeypatch):
     sums, at_each = tmp_path / "sums" / "pylon" / "000000.sha256", []
     monkeypatch.setattr("os.fsync", lambda file: at_each.append(sums.exists()))
-    write_frame(tmp_path, "pylon/000000", STUDIO(ORDER, 0).sample)
+    write_frame(tmp_path, "pylon/000000", PAIR_MAKER(SPEC, 0).sample)
     assert at_each == [False] * 4
     assert sums.exists()
 
@@ -275,12 +275,12 @@ def test_a_sample_without_a_camera_has_no_place_in_the_paper_s_folders(frame):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"order": replace(ORDER, seed=4)}, "expected seed = 4, as this run would make, found 3"),
-        ({"order": replace(ORDER, size_px=(64, 32))}, "expected size_px = [64, 32]"),
-        ({"order": replace(ORDER, frames=2)}, "expected frames = 2"),
-        ({"order": replace(ORDER, views=(0.25,))}, "expected views = [0.25]"),
-        ({"order": replace(ORDER, scene="rooms")}, 'expected scene = "rooms"'),
-        ({"order": replace(ORDER, views=()), "layout": "paper"}, 'expected layout = "paper"'),
+        ({"spec": replace(SPEC, seed=4)}, "expected seed = 4, as this run would make, found 3"),
+        ({"spec": replace(SPEC, size_px=(64, 32))}, "expected size_px = [64, 32]"),
+        ({"spec": replace(SPEC, frames=2)}, "expected frames = 2"),
+        ({"spec": replace(SPEC, views=(0.25,))}, "expected views = [0.25]"),
+        ({"spec": replace(SPEC, scene="rooms")}, 'expected scene = "rooms"'),
+        ({"spec": replace(SPEC, views=()), "layout": "paper"}, 'expected layout = "paper"'),
     ],
 )
 def test_another_set_in_the_folder_is_refused_and_kept(finished, changes, words):
@@ -295,7 +295,7 @@ def test_a_set_of_another_version_or_renderer_is_refused(finished, monkeypatch):
     monkeypatch.setattr(making, "generator_version", lambda: "89abcdef")
     assert 'expected generator = "89abcdef", as this run would make' in error_of(made, finished)
     prepare(monkeypatch)
-    monkeypatch.setattr(PaintedStudio, "renderer", lambda self: "oil")
+    monkeypatch.setattr(PaintedPairMaker, "renderer", lambda self: "oil")
     assert 'expected renderer = "oil", as this run would make, found "paint"' in error_of(made, finished)
 
 
@@ -335,17 +335,17 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
     [
         (0, {}, "pairs: expected at least 1, found 0"),
         (-3, {}, "pairs: expected at least 1, found -3"),
-        (1, {"order": replace(ORDER, seed=-1)}, "seed: expected at least 0, found -1"),
-        (1, {"order": replace(ORDER, frames=0)}, "frames: expected at least 1, found 0"),
+        (1, {"spec": replace(SPEC, seed=-1)}, "seed: expected at least 0, found -1"),
+        (1, {"spec": replace(SPEC, frames=0)}, "frames: expected at least 1, found 0"),
         (
             1,
-            {"order": replace(ORDER, size_px=(640, 0))},
+            {"spec": replace(SPEC, size_px=(640, 0))},
             "--size: expected 32 to 4096 px a side, found 640x0",
         ),
-        (1, {"order": replace(ORDER, size_px=(4097, 32))}, "--size: expected 32 to 4096 px a side"),
-        (1, {"order": replace(ORDER, views=(0.5, 0.501))}, "view: expected positions that differ"),
-        (1, {"order": replace(ORDER, views=(float("nan"),))}, "view: expected positions of -1.0 "),
-        (1, {"order": replace(ORDER, views=(0.5, 2.1))}, "view: expected positions of -1.0 "),
+        (1, {"spec": replace(SPEC, size_px=(4097, 32))}, "--size: expected 32 to 4096 px a side"),
+        (1, {"spec": replace(SPEC, views=(0.5, 0.501))}, "view: expected positions that differ"),
+        (1, {"spec": replace(SPEC, views=(float("nan"),))}, "view: expected positions of -1.0 "),
+        (1, {"spec": replace(SPEC, views=(0.5, 2.1))}, "view: expected positions of -1.0 "),
         (1, {"layout": "paper"}, "view: expected none"),
         (1, {"layout": "zip"}, "layout: expected one of shards, paper, found 'zip'"),
     ],
@@ -389,8 +389,8 @@ def test_the_version_changes_with_what_makes_pairs_and_not_with_what_comes_after
 @pytest.mark.needs_egl
 def test_a_set_names_the_opengl_that_draws(monkeypatch):
     monkeypatch.setenv("LP_NUM_THREADS", "1")
-    renderer = Renderer(PLAIN)
+    renderer = OpenGLRenderer(PLAIN)
     name = renderer.name
     renderer.close()
     assert "OpenGL" in name
-    assert RenderingStudio(plain=True).renderer() == f"{name}, plain"
+    assert PairRenderer(plain=True).renderer() == f"{name}, plain"

@@ -6,12 +6,12 @@ from learn_examples import complaint
 
 from stereoweave.stereo import StereoCamera
 from stereoweave.synth.scenes import SCENES
-from stereoweave.synth.sets.pair_rendering import Order, rendered, staged
+from stereoweave.synth.sets.pair_rendering import RenderSpec, draw_stage_and_rig, render_pair
 from stereoweave.synth.stage import Stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Mesh, Shot, Sky, World
+from stereoweave.synth.world import Mesh, RenderedView, Sky, World
 
-ORDER = Order(scene="propeller", size_px=(320, 240))
+SPEC = RenderSpec(scene="propeller", size_px=(320, 240))
 TRIANGLE = Mesh(
     corners_m=np.eye(3, dtype=np.float32)[None],
     normals=np.full((1, 3, 3), 3**-0.5, np.float32),
@@ -39,14 +39,14 @@ class Wall:
     def depth_m(self, world, rig, position):
         return np.full(rig.size_px[::-1], 4.0, np.float32)
 
-    def shots(self, world, rig, positions):
+    def render_views(self, world, rig, positions):
         return []
 
 
 @pytest.mark.parametrize("index", [0, 1])
 def test_a_given_rig_takes_every_pair_from_where_any_rig_stands(index):
-    _, fixed = staged(Wall(), replace(ORDER, rig=(260.0, 0.5)), index)
-    _, drawn = staged(Wall(), ORDER, index)
+    _, fixed = draw_stage_and_rig(Wall(), replace(SPEC, rig=(260.0, 0.5)), index)
+    _, drawn = draw_stage_and_rig(Wall(), SPEC, index)
     assert fixed.camera == StereoCamera(focal_px=260.0, baseline_m=0.5, cx_px=159.5, cy_px=119.5)
     assert drawn.camera != fixed.camera
     np.testing.assert_allclose(fixed.eye_m(0.5), drawn.eye_m(0.5))
@@ -55,35 +55,38 @@ def test_a_given_rig_takes_every_pair_from_where_any_rig_stands(index):
 
 def test_a_drawn_rig_has_its_nearest_disparity_between_18_and_160_px_of_640():
     nearest_px = [
-        staged(Wall(), ORDER, index)[1].camera.disparity_px(np.array([[4.0]])) for index in range(4)
+        draw_stage_and_rig(Wall(), SPEC, index)[1].camera.disparity_px(np.array([[4.0]]))
+        for index in range(4)
     ]
     assert all(9 <= px <= 80 for px in np.ravel(nearest_px))
 
 
 def test_a_scene_may_have_a_range_of_its_own_for_the_nearest_disparity(monkeypatch):
     monkeypatch.setitem(SCENES, "propeller", lambda rng: replace(STAGE, nearest_px=(100.0, 100.0)))
-    _, rig = staged(Wall(), ORDER, 0)
+    _, rig = draw_stage_and_rig(Wall(), SPEC, 0)
     np.testing.assert_allclose(rig.camera.disparity_px(np.array([[4.0]])), 50.0)  # of 320 px width
 
 
 class Grey(Wall):
     """A camera that takes even pictures, white on the left and black on the right."""
 
-    def shots(self, world, rig, positions):
+    def render_views(self, world, rig, positions):
         levels = [np.full((*rig.size_px[::-1], 3), 255 * (position == 0), np.uint8) for position in positions]
         known = np.ones(rig.size_px[::-1], bool)
-        return [Shot(image=level, depth_m=4 * known.astype(np.float32), target=known) for level in levels]
+        return [
+            RenderedView(image=level, depth_m=4 * known.astype(np.float32), target=known) for level in levels
+        ]
 
 
 def test_noise_grows_with_the_root_of_brightness_and_comes_from_the_seed(monkeypatch):
-    assert rendered(Grey(), ORDER, 0).sample.left.min() == 255
+    assert render_pair(Grey(), SPEC, 0).sample.left.min() == 255
     monkeypatch.setitem(SCENES, "propeller", lambda rng: replace(STAGE, noise_levels=4.0))
-    sample = rendered(Grey(), ORDER, 0).sample
+    sample = render_pair(Grey(), SPEC, 0).sample
     # Half of the values are cut off at white and at black: of a normal one, 0.399 of its deviation is left.
     assert (255 - sample.left).mean() == pytest.approx(0.399 * 4, rel=0.05)
     assert sample.right.mean() == pytest.approx(0.399 * 4 * 0.2**0.5, rel=0.05)
-    np.testing.assert_array_equal(rendered(Grey(), ORDER, 0).sample.left, sample.left)
-    assert not np.array_equal(rendered(Grey(), ORDER, 1).sample.left, sample.left)
+    np.testing.assert_array_equal(render_pair(Grey(), SPEC, 0).sample.left, sample.left)
+    assert not np.array_equal(render_pair(Grey(), SPEC, 1).sample.left, sample.left)
 
 
 class Wire(Wall):
@@ -101,11 +104,11 @@ class Wire(Wall):
 
 @pytest.mark.parametrize(("share", "shrunk"), [(1.0, 1.0), (0.9, 1.0), (0.5, 0.5 * 1.25), (0.1, 0.1 * 1.25)])
 def test_a_wire_close_to_one_eye_shrinks_the_baseline_to_a_quarter_above_the_drawn_disparity(share, shrunk):
-    (_, wired), (_, clear) = (staged(camera, ORDER, 0) for camera in (Wire(share), Wall()))
+    (_, wired), (_, clear) = (draw_stage_and_rig(camera, SPEC, 0) for camera in (Wire(share), Wall()))
     assert wired.camera.baseline_m == pytest.approx(shrunk * clear.camera.baseline_m)
     assert wired.camera.focal_px == clear.camera.focal_px
 
 
 @pytest.mark.parametrize("rig", [(0.0, 0.5), (260.0, -0.5), (float("inf"), 0.5)])
 def test_a_rig_that_cannot_be_is_refused(rig):
-    assert "must be" in complaint(lambda: replace(ORDER, rig=rig))
+    assert "must be" in complaint(lambda: replace(SPEC, rig=rig))

@@ -8,9 +8,9 @@ from stereoweave.data.samples import make_sample
 from stereoweave.stereo import StereoPair
 from stereoweave.synth.rendering.effects import PLAIN
 from stereoweave.synth.rendering.raycast import Raycaster
-from stereoweave.synth.sets.pair_rendering import Order, rendered, staged
+from stereoweave.synth.sets.pair_rendering import RenderSpec, draw_stage_and_rig, render_pair
 
-ORDER = Order(scene="pylon", seed=3, size_px=(160, 120))
+SPEC = RenderSpec(scene="pylon", seed=3, size_px=(160, 120))
 BLACK = np.zeros((240, 320, 3), np.uint8)
 
 
@@ -21,20 +21,20 @@ def camera():
 
 @pytest.fixture(scope="module")
 def with_a_view(camera):
-    return rendered(camera, replace(ORDER, views=(0.5,)), 1)
+    return render_pair(camera, replace(SPEC, views=(0.5,)), 1)
 
 
 def test_a_pair_depends_on_its_seed_scene_and_index_alone(camera, with_a_view):
-    again = rendered(camera, ORDER, 1).sample
+    again = render_pair(camera, SPEC, 1).sample
     for name in ("left", "right", "disparity_px", "right_disparity_px", "occluded", "right_occluded"):
         np.testing.assert_array_equal(getattr(again, name), getattr(with_a_view.sample, name), err_msg=name)
-    others = [rendered(camera, ORDER, 2), rendered(camera, replace(ORDER, seed=4), 1)]
+    others = [render_pair(camera, SPEC, 2), render_pair(camera, replace(SPEC, seed=4), 1)]
     assert not any(np.array_equal(other.sample.left, again.left) for other in others)
     assert len({again.camera, *(other.sample.camera for other in others)}) == 3
 
 
 def test_disparity_is_that_of_the_cameras_depth_and_zero_in_the_sky(camera, with_a_view):
-    stage, rig = staged(camera, ORDER, 1)
+    stage, rig = draw_stage_and_rig(camera, SPEC, 1)
     for position, disparity_px in enumerate(
         (with_a_view.sample.disparity_px, with_a_view.sample.right_disparity_px)
     ):
@@ -48,8 +48,8 @@ def test_disparity_is_that_of_the_cameras_depth_and_zero_in_the_sky(camera, with
 @pytest.mark.parametrize("scene", ["refinery", "antenna", "pylon", "rooms"])
 def test_masks_are_what_a_cast_from_the_other_eye_finds_hidden(camera, scene):
     """Pixels know the other view at its columns alone: 1 % of them or fewer may be missed, as many extra."""
-    order = Order(scene=scene, size_px=(320, 240))
-    stage, rig = staged(camera, order, 0)
+    spec = RenderSpec(scene=scene, size_px=(320, 240))
+    stage, rig = draw_stage_and_rig(camera, spec, 0)
     left_px, right_px = (
         rig.camera.disparity_px(camera.depth_m(stage.world, rig, position)) for position in (0, 1)
     )
@@ -85,10 +85,10 @@ def test_a_view_half_way_sees_each_visible_pixel_half_its_disparity_to_the_left(
 
 
 def test_a_film_shows_one_world_through_one_camera_that_moves_a_little_from_frame_to_frame(camera):
-    film = replace(ORDER, frames=8)
-    stages, rigs = zip(*(staged(camera, film, 2, frame) for frame in range(8)), strict=True)
+    film = replace(SPEC, frames=8)
+    stages, rigs = zip(*(draw_stage_and_rig(camera, film, 2, frame) for frame in range(8)), strict=True)
     np.testing.assert_array_equal(stages[0].world.mesh.corners_m, stages[7].world.mesh.corners_m)
     assert len({rig.camera for rig in rigs}) == 1
     steps_m = np.linalg.norm(np.diff([rig.position_m for rig in rigs], axis=0), axis=1)
     assert 0 < steps_m.max() < 0.25 * steps_m.sum()
-    assert rendered(camera, film, 17).sample.camera == rigs[1].camera
+    assert render_pair(camera, film, 17).sample.camera == rigs[1].camera

@@ -10,21 +10,21 @@ uniform float exposure;
 const float PI = 3.14159265;
 
 // The sky's light from one direction.
-vec3 sky_towards(vec3 direction) {
+vec3 sky_radiance(vec3 direction) {
     float up = max(direction.z, 0);
     vec3 above = mix(horizon, zenith, 1.3 * up / (up + 0.3));
     return mix(above, ground, smoothstep(0.0, 0.12, -direction.z));
 }
 
 // The sky's light from all sides on a white surface that faces a direction.
-vec3 sky_around(vec3 direction) {
+vec3 sky_irradiance(vec3 direction) {
     float up = 0.5 + 0.5 * direction.z;
     return mix(mix(ground, horizon, up), mix(horizon, mix(horizon, zenith, 0.7), up), up);
 }
 
 // A curve with a soft toe and shoulder: 0.18 becomes 0.23, 1 becomes 0.8. Coded as a square root,
 // so that eight bits hold it without steps.
-vec4 developed(vec3 light) {
+vec4 tone_mapped(vec3 light) {
     vec3 exposed = exposure * light;
     vec3 dense = exposed * sqrt(exposed);
     return vec4(sqrt(dense / (dense + 0.25)), 1);

@@ -1,6 +1,6 @@
 // What is behind everything: the gradient, clouds, a glare about the sun.
 
-uniform mat3 to_direction;  // from the place in the frame buffer
+uniform mat3 direction_matrix;  // from the place in the frame buffer
 uniform sampler2DArray textures;
 uniform float cloud_layer;
 uniform float clouds;
@@ -9,8 +9,8 @@ uniform vec4 fog;  // colour, and density per metre
 out vec4 colour;
 
 void main() {
-    vec3 direction = normalize(to_direction * vec3(gl_FragCoord.xy, 1));
-    vec3 seen = sky_towards(direction);
+    vec3 direction = normalize(direction_matrix * vec3(gl_FragCoord.xy, 1));
+    vec3 seen = sky_radiance(direction);
     float up = max(direction.z, 0);
     // The texture is how much cloud there is; clouds lie on a plane overhead.
     vec2 overhead = direction.xy / (up + 0.15);
@@ -25,5 +25,5 @@ void main() {
 #ifdef FOG
     seen = mix(seen, fog.rgb, fog.a > 0 ? exp(-10 * up) : 0);
 #endif
-    colour = developed(seen);
+    colour = tone_mapped(seen);
 }

@@ -24,7 +24,7 @@ uniform vec4 fog;  // colour, and density per metre
 
 in vec3 place_m;
 in vec3 outwards;
-in vec2 cloth_m;
+in vec2 uv_at_m;
 flat in int material;
 
 out vec4 colour;
@@ -38,7 +38,7 @@ uniform vec2 texels;     // one texel of each, as a share of the inner square's 
 uniform float inner_m;
 
 // The share of the sun that is seen. Off the surface by two texels, because the map is read three texels wide.
-float sunlit(vec3 normal) {
+float sun_visibility(vec3 normal) {
     vec3 unit = to_unit * vec4(place_m, 1);
     vec3 off = mat3(to_unit) * normal * (2 * inner_m);
     vec3 narrow = unit + texels.x * off;
@@ -57,19 +57,19 @@ float sunlit(vec3 normal) {
 #endif
 
 #ifdef AMBIENT_OCCLUSION
-uniform sampler3D crowd;
-uniform vec4 crowd_frame;  // the lower corner, and 1 / side
+uniform sampler3D occlusion;
+uniform vec4 occlusion_frame;  // the lower corner, and 1 / side
 
 // The share of the sky that is seen: looked up two cells off the surface, where the surface itself has no part.
-float open_sky(vec3 normal) {
-    vec3 at = (place_m - crowd_frame.xyz) * crowd_frame.w + normal * (2.0 / CELLS);
-    return 1 - texture(crowd, at).r;
+float sky_visibility(vec3 normal) {
+    vec3 at = (place_m - occlusion_frame.xyz) * occlusion_frame.w + normal * (2.0 / CELLS);
+    return 1 - texture(occlusion, at).r;
 }
 #endif
 
 #ifdef RELIEF
 // The normal of a surface raised by a height (Mikkelsen, "Bump mapping unparametrized surfaces on the GPU", 2010).
-vec3 bent(vec3 normal, vec3 across, vec3 down, float height_m) {
+vec3 bumped(vec3 normal, vec3 across, vec3 down, float height_m) {
     vec3 r = cross(down, normal), s = cross(normal, across);
     float size = dot(across, r);
     vec3 gradient = (dFdx(height_m) * r + dFdy(height_m) * s) / (abs(size) < 1e-12 ? 1e-12 : size);
@@ -79,7 +79,7 @@ vec3 bent(vec3 normal, vec3 across, vec3 down, float height_m) {
 #endif
 
 // What is thrown back of light from a direction, as a share of what a white sheet facing it throws back.
-vec3 thrown_back(vec3 light, vec3 normal, vec3 viewer, vec3 diffuse, vec3 mirror, float roughness) {
+vec3 reflected_share(vec3 light, vec3 normal, vec3 viewer, vec3 diffuse, vec3 mirror, float roughness) {
     float facing = max(dot(normal, light), 0);
 #ifdef GLOSS
     // Cook and Torrance with GGX; Schlick's Fresnel and shadowing.
@@ -99,7 +99,7 @@ vec3 thrown_back(vec3 light, vec3 normal, vec3 viewer, vec3 diffuse, vec3 mirror
 
 void main() {
     Material made = materials[material];
-    vec4 texel = texture(textures, vec3(cloth_m * made.repeats_per_m, made.layer));
+    vec4 texel = texture(textures, vec3(uv_at_m * made.repeats_per_m, made.layer));
     vec3 own = made.tint * texel.rgb * texel.rgb;
 
     // Normals point to the viewer's side, because sheets are seen from both.
@@ -110,17 +110,17 @@ void main() {
     smooth_normal *= dot(smooth_normal, face) * dot(face, away_m) > 0 ? -1 : 1;
     vec3 normal = smooth_normal;
 #ifdef RELIEF
-    normal = bent(normal, across, down, texel.a * made.relief_m);
+    normal = bumped(normal, across, down, texel.a * made.relief_m);
 #endif
 
     float distance_m = length(away_m);
     vec3 viewer = -away_m / distance_m;
     float sunny = 1, open = 1;
 #ifdef SHADOWS
-    sunny = sunlit(smooth_normal);
+    sunny = sun_visibility(smooth_normal);
 #endif
 #ifdef AMBIENT_OCCLUSION
-    open = open_sky(smooth_normal);
+    open = sky_visibility(smooth_normal);
 #endif
 
     vec3 diffuse = own, mirror = vec3(0);
@@ -136,16 +136,16 @@ void main() {
     // Soil, leaves and chalk swallow in their pores much of what they would mirror.
     mirror = mix(vec3(mix(0.05, 0.01, roughness)), own, made.metal);
 #endif
-    vec3 light = open * diffuse * sky_around(normal);
+    vec3 light = open * diffuse * sky_irradiance(normal);
 #ifdef SUN
-    light += sunny * sun_light * thrown_back(sun, normal, viewer, diffuse, mirror, roughness);
+    light += sunny * sun_light * reflected_share(sun, normal, viewer, diffuse, mirror, roughness);
 #endif
 #if LAMPS > 0
     for (int k = 0; k < LAMPS; ++k) {
         vec3 towards_m = lamp_m[k] - place_m;
         float nearness = inversesqrt(dot(towards_m, towards_m));
         light += open * lamp_light[k] * nearness * nearness
-               * thrown_back(towards_m * nearness, normal, viewer, diffuse, mirror, roughness);
+               * reflected_share(towards_m * nearness, normal, viewer, diffuse, mirror, roughness);
     }
 #endif
 #ifdef GLOSS
@@ -153,11 +153,11 @@ void main() {
     float grazing = 1 - max(dot(normal, viewer), 0);
     float square = grazing * grazing;
     vec3 share = mirror + (max(vec3(1 - roughness), mirror) - mirror) * square * square * grazing;
-    light += open * share * mix(sky_towards(reflected), sky_around(reflected), roughness);
+    light += open * share * mix(sky_radiance(reflected), sky_irradiance(reflected), roughness);
 #endif
     light += made.glow * own;
 #ifdef FOG
     light = mix(fog.rgb, light, exp(-fog.a * distance_m));
 #endif
-    colour = developed(light);
+    colour = tone_mapped(light);
 }
