@@ -10,7 +10,7 @@ from jaxtyping import Int, UInt8
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.synth.rendering.shader_programs import MOST_LAMPS, MOST_MATERIALS
-from stereoweave.synth.textures.bank import Bank, linear
+from stereoweave.synth.textures.bank import TextureBank, srgb_to_linear
 from stereoweave.synth.world import World
 
 # How high the height of a texture rises at full relief, as a share of what the texture spans.
@@ -91,7 +91,7 @@ class MaterialBlock:
         self._buffer = gl.buffer(reserve=4 * _FLOATS * MOST_MATERIALS)
         self._buffer.bind_to_uniform_block(0)
 
-    def write(self, world: World, textures: Bank) -> None:
+    def write(self, world: World, textures: TextureBank) -> None:
         """Takes over the materials of a world."""
         rows = np.zeros((MOST_MATERIALS, _FLOATS), np.float32)
         for row, material in zip(rows, world.materials, strict=False):
@@ -117,7 +117,7 @@ def upload_textures(
     layers, height, width, channels = pixels.shape
     array = gl.texture_array((width, height, layers), channels)
     levels = np.arange(256)
-    root = np.round(255 * np.sqrt(linear(levels.astype(np.float32))))
+    root = np.round(255 * np.sqrt(srgb_to_linear(levels.astype(np.float32))))
     table = np.stack([root, root, root, levels], -1).astype(np.uint8)[None]
     for k, layer in enumerate(pixels):
         array.write(cv2.LUT(layer, table), viewport=(0, 0, k, width, height, 1))

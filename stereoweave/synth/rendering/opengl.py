@@ -13,7 +13,7 @@ from stereoweave.synth.rendering.frustum import direction_matrix, projection, tr
 from stereoweave.synth.rendering.gpu_buffers import FrameBuffers, Geometry, MaterialBlock, upload_textures
 from stereoweave.synth.rendering.light_maps import LightMaps
 from stereoweave.synth.rendering.shader_programs import Programs, surface_program
-from stereoweave.synth.textures.bank import bank
+from stereoweave.synth.textures.bank import texture_bank
 from stereoweave.synth.viewpoints import PosedRig
 from stereoweave.synth.world import RenderedView, World
 
@@ -37,7 +37,7 @@ class OpenGLRenderer:
         self._full_screen = {
             name: self._gl.vertex_array(self._programs[name], []) for name in ("sky", "resolve")
         }
-        self._bank = bank()
+        self._bank = texture_bank()
         self._textures = upload_textures(self._gl, self._bank.pixels)
         self._textures.use(_TEXTURES)
         self._programs.bind_textures(textures=_TEXTURES, samples=_SAMPLES)

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, UInt8
 
 from stereoweave.synth.rendering.effects import Effects
 from stereoweave.synth.rendering.frustum import NEAR_M, rays
-from stereoweave.synth.textures.bank import bank, linear
+from stereoweave.synth.textures.bank import srgb_to_linear, texture_bank
 from stereoweave.synth.viewpoints import PosedRig
 from stereoweave.synth.world import Mesh, RenderedView, Sky, World
 
@@ -170,7 +170,7 @@ def _look_up_colours(world: World, hits: _Hits, ray_m: Float[np.ndarray, " p"]) 
     for index in np.unique(material):
         chosen = material == index
         made = world.materials[index]
-        levels = _mipmaps(bank().layer(made.texture, made.variant))
+        levels = _mipmaps(texture_bank().layer(made.texture, made.variant))
         side = len(levels[0])
         spans = uv_m[chosen] * [1, -1] / made.span_m
         level = np.log2(np.maximum(ray_m[chosen] / made.span_m * side, 1)).round().astype(int)
@@ -187,7 +187,7 @@ def _look_up_colours(world: World, hits: _Hits, ray_m: Float[np.ndarray, " p"]) 
 @functools.lru_cache(maxsize=24)
 def _mipmaps(layer: int) -> list[Float[np.ndarray, "side side 3"]]:
     """A texture's light in ever fewer texels, each of them the mean of four of the level before."""
-    levels = [linear(bank().pixels[layer, ..., :3].astype(np.float32))]
+    levels = [srgb_to_linear(texture_bank().pixels[layer, ..., :3].astype(np.float32))]
     while len(levels[-1]) > 1:
         half = len(levels[-1]) // 2
         levels.append(levels[-1].reshape(half, 2, half, 2, 3).mean((1, 3)))

@@ -16,17 +16,25 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.synth.textures import cloth, ground, metal, photographs, roofs, stone, walls
-from stereoweave.synth.textures import lettering as signs
-from stereoweave.synth.textures import vegetation as plants
-from stereoweave.synth.textures import water_and_sky as open_air
-from stereoweave.synth.textures.tiling import SIDE, Colours, Surface
+from stereoweave.synth.textures import (
+    cloth,
+    ground,
+    lettering,
+    metal,
+    photographs,
+    roofs,
+    stone,
+    vegetation,
+    walls,
+    water_and_sky,
+)
+from stereoweave.synth.textures.tiling import SIDE, Colours, Texture
 from stereoweave.system.jit import cache_folder
 
 BANK_SEED = 20_241_121
 _KEPT_DAYS = 30
 
-Procedure = Callable[[np.random.Generator], Surface]
+Procedure = Callable[[np.random.Generator], Texture]
 Pixels = UInt8[np.ndarray, "layers side side 4"]
 
 # Those of patterns.PHOTOGRAPHS that could be a surface, a print or a poster.
@@ -37,7 +45,7 @@ _PHOTOGRAPHS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Family:
+class TextureFamily:
     """Textures of one kind.
 
     Attributes:
@@ -50,38 +58,64 @@ class Family:
 
 
 FAMILIES = {
-    "rust": Family(variants=4 * (metal.rust,), albedo=(0.07, 0.13)),
-    "paint": Family(variants=4 * (metal.paint,), albedo=(0.55, 0.72)),
-    "steel": Family(
-        variants=(metal.brushed, metal.spangled, metal.scratched, metal.tread_plate), albedo=(0.28, 0.42)
+    "rust": TextureFamily(variants=4 * (metal.rust,), albedo=(0.07, 0.13)),
+    "paint": TextureFamily(variants=4 * (metal.paint,), albedo=(0.55, 0.72)),
+    "steel": TextureFamily(
+        variants=(metal.brushed_steel, metal.spangled_steel, metal.scratched_steel, metal.tread_plate),
+        albedo=(0.28, 0.42),
     ),
-    "concrete": Family(variants=(walls.cast, walls.cracked, walls.stained, walls.slabs), albedo=(0.28, 0.40)),
-    "plaster": Family(variants=2 * (walls.trowelled, walls.roughcast), albedo=(0.45, 0.62)),
-    "brick": Family(variants=4 * (walls.brick,), albedo=(0.12, 0.24)),
-    "stone": Family(variants=2 * (stone.rubble, stone.coursed), albedo=(0.16, 0.30)),
-    "bark": Family(
-        variants=(plants.furrowed, plants.plated, plants.furrowed, plants.smooth), albedo=(0.08, 0.14)
+    "concrete": TextureFamily(
+        variants=(walls.cast_concrete, walls.cracked_concrete, walls.stained_concrete, walls.paving_slabs),
+        albedo=(0.28, 0.40),
     ),
-    "wood": Family(variants=4 * (plants.planks,), albedo=(0.15, 0.28)),
-    "cloth": Family(variants=(cloth.woven, cloth.twill, cloth.knitted, cloth.checked), albedo=(0.10, 0.24)),
-    "leaves": Family(variants=4 * (plants.leaves,), albedo=(0.05, 0.09)),
-    "grass": Family(variants=4 * (plants.grass,), albedo=(0.05, 0.10)),
-    "soil": Family(variants=(*3 * (ground.soil,), ground.dried_mud), albedo=(0.07, 0.14)),
-    "gravel": Family(variants=4 * (ground.gravel,), albedo=(0.15, 0.28)),
-    "asphalt": Family(variants=4 * (ground.asphalt,), albedo=(0.06, 0.11)),
-    "water": Family(variants=4 * (open_air.water,), albedo=(0.02, 0.04)),
-    "sky": Family(variants=(open_air.cumulus, open_air.cirrus, open_air.cumulus, open_air.overcast)),
-    "sign": Family(variants=(signs.notices, signs.numbers, signs.notices, signs.poster), albedo=(0.25, 0.45)),
-    "tiles": Family(
+    "plaster": TextureFamily(
+        variants=2 * (walls.trowelled_plaster, walls.roughcast_plaster), albedo=(0.45, 0.62)
+    ),
+    "brick": TextureFamily(variants=4 * (walls.brickwork,), albedo=(0.12, 0.24)),
+    "stone": TextureFamily(variants=2 * (stone.rubble_wall, stone.coursed_wall), albedo=(0.16, 0.30)),
+    "bark": TextureFamily(
+        variants=(
+            vegetation.furrowed_bark,
+            vegetation.plated_bark,
+            vegetation.furrowed_bark,
+            vegetation.smooth_bark,
+        ),
+        albedo=(0.08, 0.14),
+    ),
+    "wood": TextureFamily(variants=4 * (vegetation.planks,), albedo=(0.15, 0.28)),
+    "cloth": TextureFamily(
+        variants=(cloth.woven_cloth, cloth.twill, cloth.knitted_cloth, cloth.tartan), albedo=(0.10, 0.24)
+    ),
+    "leaves": TextureFamily(variants=4 * (vegetation.foliage,), albedo=(0.05, 0.09)),
+    "grass": TextureFamily(variants=4 * (vegetation.grass,), albedo=(0.05, 0.10)),
+    "soil": TextureFamily(variants=(*3 * (ground.soil,), ground.dried_mud), albedo=(0.07, 0.14)),
+    "gravel": TextureFamily(variants=4 * (ground.gravel,), albedo=(0.15, 0.28)),
+    "asphalt": TextureFamily(variants=4 * (ground.asphalt,), albedo=(0.06, 0.11)),
+    "water": TextureFamily(variants=4 * (water_and_sky.water,), albedo=(0.02, 0.04)),
+    "sky": TextureFamily(
+        variants=(water_and_sky.cumulus, water_and_sky.cirrus, water_and_sky.cumulus, water_and_sky.overcast)
+    ),
+    "sign": TextureFamily(
+        variants=(
+            lettering.notice_board,
+            lettering.stencilled_numbers,
+            lettering.notice_board,
+            lettering.posters,
+        ),
+        albedo=(0.25, 0.45),
+    ),
+    "tiles": TextureFamily(
         variants=(roofs.pantiles, roofs.plain_tiles, roofs.slates, roofs.plain_tiles), albedo=(0.09, 0.18)
     ),
-    "plain": Family(variants=3 * (walls.plain,), albedo=(0.70, 0.78)),
-    "photograph": Family(variants=tuple(functools.partial(photographs.crop, name) for name in _PHOTOGRAPHS)),
+    "plain": TextureFamily(variants=3 * (walls.near_plain,), albedo=(0.70, 0.78)),
+    "photograph": TextureFamily(
+        variants=tuple(functools.partial(photographs.photograph_crop, name) for name in _PHOTOGRAPHS)
+    ),
 }
 
 
 @dataclass(frozen=True)
-class Bank:
+class TextureBank:
     """All textures: `pixels` uint8 [L, 512, 512, 4], sRGB and height (128 is the middle)."""
 
     pixels: Pixels
@@ -96,53 +130,53 @@ class Bank:
 
 
 @functools.cache
-def bank() -> Bank:
+def texture_bank() -> TextureBank:
     """The bank, the same in every process; drawn once on a machine, and kept in the user's cache folder."""
-    file = cache_folder().with_name("textures") / f"{_version()}.rgba"
-    pixels = _read(file)
+    file = cache_folder().with_name("textures") / f"{_source_version()}.rgba"
+    pixels = _read_cache(file)
     if pixels is None:
-        pixels = _drawn()
-        _keep(file, pixels)
-    return Bank(pixels)
+        pixels = _draw_all()
+        _write_cache(file, pixels)
+    return TextureBank(pixels)
 
 
-def _drawn() -> Pixels:
+def _draw_all() -> Pixels:
     counts = {name: len(family.variants) for name, family in FAMILIES.items()}
-    return np.stack([texture(name, k) for name, count in counts.items() for k in range(count)])
+    return np.stack([draw_texture(name, k) for name, count in counts.items() for k in range(count)])
 
 
-def texture(family: str, variant: int) -> UInt8[np.ndarray, "side side 4"]:
+def draw_texture(family: str, variant: int) -> UInt8[np.ndarray, "side side 4"]:
     """One texture, drawn anew."""
     rng = np.random.default_rng((BANK_SEED, zlib.crc32(family.encode()), variant))
     levels = FAMILIES[family].variants[variant](rng)
     albedo = FAMILIES[family].albedo
     if albedo is not None:
-        levels[..., :3] = _exposed(levels[..., :3], rng.uniform(*albedo))
+        levels[..., :3] = _scale_to_albedo(levels[..., :3], rng.uniform(*albedo))
     return np.clip(levels, 0, 255).astype(np.uint8)
 
 
-def linear(levels: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+def srgb_to_linear(levels: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Light 0..1 of sRGB levels 0..255."""
     values = levels / 255
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
-def _exposed(colours: Colours, albedo: float) -> Colours:
+def _scale_to_albedo(colours: Colours, albedo: float) -> Colours:
     """The colours, made lighter or darker until their linear mean is the albedo."""
     few, gain = colours[::4, ::4], 1.0
     # Light goes about with the 2.2nd power of the levels; what clips takes some rounds.
     for _ in range(6):
-        gain *= float(albedo / linear(np.clip(few * gain, 0, 255)).mean()) ** (1 / 2.2)
+        gain *= float(albedo / srgb_to_linear(np.clip(few * gain, 0, 255)).mean()) ** (1 / 2.2)
     return colours * gain
 
 
-def _version() -> str:
+def _source_version() -> str:
     """Digits that change with the code that draws."""
     files = sorted(Path(__file__).parent.glob("*.py"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
 
 
-def _read(file: Path) -> Pixels | None:
+def _read_cache(file: Path) -> Pixels | None:
     """What was kept, or None where there is nothing, or nothing whole."""
     try:
         kept = np.fromfile(file, np.uint8)
@@ -155,7 +189,7 @@ def _read(file: Path) -> Pixels | None:
     return texels.reshape(count, SIDE, SIDE, 4)
 
 
-def _keep(file: Path, pixels: Pixels) -> None:
+def _write_cache(file: Path, pixels: Pixels) -> None:
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=file.parent) as folder:

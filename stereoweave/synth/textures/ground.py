@@ -6,25 +6,25 @@ from stereoweave.synth.textures.tiling import (
     SIDE,
     Canvas,
     Colour,
-    Surface,
-    blades,
-    blurred,
-    cells,
-    mixed,
-    neutral,
+    Texture,
+    blade_outlines,
+    blur,
+    mix,
     noise,
-    painted,
+    paint_polygons,
     ramp,
-    step,
-    surface,
+    smoothstep,
+    stack_texture,
+    tint_grey,
+    voronoi_cells,
 )
-from stereoweave.synth.textures.wear import crack_lines
+from stereoweave.synth.textures.wear import crack_map
 
 
-def soil(rng: np.random.Generator) -> Surface:
+def soil(rng: np.random.Generator) -> Texture:
     """Earth: clods, small stones, bits of straw."""
-    clods = cells(rng, 36, 36, 0.5, rough=5)
-    size = clods.each(rng.uniform(0.3, 1, clods.number))
+    clods = voronoi_cells(rng, 36, 36, 0.5, rough=5)
+    size = clods.per_texel(rng.uniform(0.3, 1, clods.number))
     lump = size * np.clip((clods.rim + noise(rng, 0.9, 10)) / 6, 0, 1)
     broad, fine = noise(rng, 1.4, 2), noise(rng, 0.8, 8)
     colours = ramp(
@@ -37,20 +37,20 @@ def soil(rng: np.random.Generator) -> Surface:
     canvas = np.dstack([colours, 100 + 60 * lump]).clip(0, 255).astype(np.uint8)
     _paint_stones(rng, canvas, 260, 3.2, ((126, 116, 102), (106, 98, 88), (148, 138, 124)))
     _paint_straw(rng, canvas, 160)
-    return surface(canvas[..., :3] + (4 * fine)[..., None], canvas[..., 3] / 127.5 - 1 + 0.15 * fine)
+    return stack_texture(canvas[..., :3] + (4 * fine)[..., None], canvas[..., 3] / 127.5 - 1 + 0.15 * fine)
 
 
-def dried_mud(rng: np.random.Generator) -> Surface:
+def dried_mud(rng: np.random.Generator) -> Texture:
     """Mud that dried and broke into plates."""
-    plates, parts = cells(rng, 9, 9, 0.5, rough=5), cells(rng, 22, 22, 0.5, rough=3)
+    plates, parts = voronoi_cells(rng, 9, 9, 0.5, rough=5), voronoi_cells(rng, 22, 22, 0.5, rough=3)
     edge = plates.rim + 0.6 * noise(rng, 0.9, 20)
-    gap = step(3.2, 1.2, edge)
-    hair = step(1.5, 0.5, parts.rim) * step(-0.2, 0.8, noise(rng, 1.5, 3))
+    gap = smoothstep(3.2, 1.2, edge)
+    hair = smoothstep(1.5, 0.5, parts.rim) * smoothstep(-0.2, 0.8, noise(rng, 1.5, 3))
     broad, fine = noise(rng, 1.4, 2), noise(rng, 0.8, 10)
-    tone = 0.5 + 0.13 * broad + 0.1 * fine + plates.each(rng.normal(0, 0.07, plates.number))
+    tone = 0.5 + 0.13 * broad + 0.1 * fine + plates.per_texel(rng.normal(0, 0.07, plates.number))
     colours = ramp(tone, (104, 88, 70), (132, 116, 96), (152, 138, 118))
-    colours = mixed(colours, (44, 36, 29), gap) * (1 - 0.4 * hair)[..., None]
-    return surface(colours, 0.35 * np.clip(edge / 12, 0, 1) + 0.1 * fine - gap - 0.3 * hair)
+    colours = mix(colours, (44, 36, 29), gap) * (1 - 0.4 * hair)[..., None]
+    return stack_texture(colours, 0.35 * np.clip(edge / 12, 0, 1) + 0.1 * fine - gap - 0.3 * hair)
 
 
 _PEBBLES = (
@@ -60,7 +60,7 @@ _PEBBLES = (
 )
 
 
-def gravel(rng: np.random.Generator) -> Surface:
+def gravel(rng: np.random.Generator) -> Texture:
     """Pebbles of several sizes on each other."""
     canvas = np.full((SIDE, SIDE, 4), (58, 54, 48, 20), np.uint8)
     palette = _PEBBLES[rng.integers(len(_PEBBLES))]
@@ -69,22 +69,24 @@ def gravel(rng: np.random.Generator) -> Surface:
         _paint_stones(rng, canvas, int(1.3 * (SIDE / (2 * size * share)) ** 2), size * share, palette)
     fine = noise(rng, 0.6, 4)
     colours = canvas[..., :3] * (1 + 0.06 * fine + 0.05 * noise(rng, 1.4, 2))[..., None]
-    return surface(colours, blurred(canvas[..., 3] / np.float32(127.5) - 1, 1.0) + 0.05 * fine)
+    return stack_texture(colours, blur(canvas[..., 3] / np.float32(127.5) - 1, 1.0) + 0.05 * fine)
 
 
-def asphalt(rng: np.random.Generator) -> Surface:
+def asphalt(rng: np.random.Generator) -> Texture:
     """A road: stones in bitumen, cracks, sealed cracks, mended patches, oil."""
-    stones = blurred(noise(rng, 0.0), 0.8)
+    stones = blur(noise(rng, 0.0), 0.8)
     stones = stones / stones.std()
     broad = noise(rng, 1.4, 2)
-    grey = 66 + 6 * broad + 9 * stones + 26 * step(1.9, 2.6, stones) - 14 * step(-1.6, -2.4, stones)
-    patch = step(1.25, 1.3, noise(rng, 2.2, 2) + 0.02 * noise(rng, 0.8, 20))
-    oil = step(1.4, 2.6, noise(rng, 1.7, 3))
-    cracks = crack_lines(rng, 5, 0.4)
-    sealed = crack_lines(rng, 2, 0.4, width=4.5)
+    grey = (
+        66 + 6 * broad + 9 * stones + 26 * smoothstep(1.9, 2.6, stones) - 14 * smoothstep(-1.6, -2.4, stones)
+    )
+    patch = smoothstep(1.25, 1.3, noise(rng, 2.2, 2) + 0.02 * noise(rng, 0.8, 20))
+    oil = smoothstep(1.4, 2.6, noise(rng, 1.7, 3))
+    cracks = crack_map(rng, 5, 0.4)
+    sealed = crack_map(rng, 2, 0.4, width=4.5)
     grey *= (1 - 0.2 * patch) * (1 - 0.25 * oil) * (1 - 0.7 * cracks)
     grey = grey + sealed * (36 + 4 * stones - grey)
-    return surface(neutral(grey, 1.02, 0.97), 0.1 + 0.17 * stones * (1 - sealed) - 0.6 * cracks)
+    return stack_texture(tint_grey(grey, 1.02, 0.97), 0.1 + 0.17 * stones * (1 - sealed) - 0.6 * cracks)
 
 
 def _paint_stones(
@@ -102,13 +104,13 @@ def _paint_stones(
     rings = [(1.0, 0.66, 0), (0.8, 1.0, 70)]
     shapes = np.stack([at + scale * ring for scale, _, _ in rings], 1).reshape(-1, 9, 2)
     levels = np.stack([np.column_stack([shade * gain, base + up]) for _, gain, up in rings], 1).reshape(-1, 4)
-    painted(canvas, shapes, levels)
+    paint_polygons(canvas, shapes, levels)
 
 
 def _paint_straw(rng: np.random.Generator, canvas: Canvas, count: int) -> None:
     at, turn = rng.uniform(0, SIDE, (count, 2)), rng.uniform(0, 2 * np.pi, count)
     length = rng.uniform(8, 30, count)
     turns = np.stack([turn, turn + rng.normal(0, 0.3, count)], 1)
-    straw = blades(at, turns, length, rng.uniform(0.5, 1.1, count))
+    straw = blade_outlines(at, turns, length, rng.uniform(0.5, 1.1, count))
     shade = np.array((150, 132, 98)) * np.exp(rng.normal(0, 0.2, (count, 1)))
-    painted(canvas, straw, np.column_stack([shade, rng.uniform(120, 180, count)]))
+    paint_polygons(canvas, straw, np.column_stack([shade, rng.uniform(120, 180, count)]))

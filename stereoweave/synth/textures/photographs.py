@@ -6,30 +6,32 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from stereoweave.synth.textures.tiling import SIDE, Surface, blurred, surface
+from stereoweave.synth.textures.tiling import SIDE, Texture, blur, stack_texture
 
 # A crop is so much larger than its texture, and faded into its other side there.
 _OVERLAP = SIDE // 4
 
 
-def crop(name: str, rng: np.random.Generator) -> Surface:
+def photograph_crop(name: str, rng: np.random.Generator) -> Texture:
     """A part of a photograph of `patterns.PHOTOGRAPHS`; what is brighter counts as a little higher."""
-    part = _muted(rng, _part(rng, _photograph(name)))
-    rows = _joined(part)
-    colours = _joined(rows.transpose(1, 0, 2)).transpose(1, 0, 2)
+    part = _mute(rng, _draw_crop(rng, _load_photograph(name)))
+    rows = _blend_ends(part)
+    colours = _blend_ends(rows.transpose(1, 0, 2)).transpose(1, 0, 2)
     grey = colours.mean(-1)
-    return surface(colours, (grey - blurred(grey, 24)) / 160)
+    return stack_texture(colours, (grey - blur(grey, 24)) / 160)
 
 
 @functools.cache
-def _photograph(name: str) -> UInt8[np.ndarray, "_ _ 3"]:
+def _load_photograph(name: str) -> UInt8[np.ndarray, "_ _ 3"]:
     from skimage import data
 
     picture = getattr(data, name)()
     return np.dstack([picture] * 3) if picture.ndim == 2 else picture
 
 
-def _part(rng: np.random.Generator, photograph: UInt8[np.ndarray, "_ _ 3"]) -> Float[np.ndarray, "_ _ 3"]:
+def _draw_crop(
+    rng: np.random.Generator, photograph: UInt8[np.ndarray, "_ _ 3"]
+) -> Float[np.ndarray, "_ _ 3"]:
     height, width = photograph.shape[:2]
     side = int(min(height, width) * rng.uniform(0.55, 1))
     y, x = rng.integers(height - side + 1), rng.integers(width - side + 1)
@@ -39,14 +41,14 @@ def _part(rng: np.random.Generator, photograph: UInt8[np.ndarray, "_ _ 3"]) -> F
     return part[:, :: rng.choice([-1, 1])].astype(np.float32)
 
 
-def _muted(rng: np.random.Generator, part: Float[np.ndarray, "_ _ 3"]) -> Float[np.ndarray, "_ _ 3"]:
+def _mute(rng: np.random.Generator, part: Float[np.ndarray, "_ _ 3"]) -> Float[np.ndarray, "_ _ 3"]:
     """The part with less colour, as print fades, and a tint of its own."""
     grey = part.mean(-1, keepdims=True)
     warm = rng.normal(0, 0.03)
     return (grey + rng.uniform(0.3, 0.5) * (part - grey)) * np.array([1 + warm, 1, 1 - warm], np.float32)
 
 
-def _joined(part: Float[np.ndarray, "_ _ 3"]) -> Float[np.ndarray, "_ _ 3"]:
+def _blend_ends(part: Float[np.ndarray, "_ _ 3"]) -> Float[np.ndarray, "_ _ 3"]:
     """The first SIDE rows; the foremost of them are faded in from those that follow the last."""
     share = np.linspace(0, 1, _OVERLAP, dtype=np.float32)[:, None, None]
     share = share * share * (3 - 2 * share)

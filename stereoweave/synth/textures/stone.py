@@ -5,14 +5,14 @@ import numpy as np
 from stereoweave.synth.textures.tiling import (
     SIDE,
     Map,
-    Surface,
-    bent,
-    cells,
-    mixed,
+    Texture,
+    mix,
     noise,
     ramp,
-    step,
-    surface,
+    smoothstep,
+    stack_texture,
+    voronoi_cells,
+    warp,
 )
 
 _ROCKS = (
@@ -22,23 +22,23 @@ _ROCKS = (
 )
 
 
-def rubble(rng: np.random.Generator) -> Surface:
+def rubble_wall(rng: np.random.Generator) -> Texture:
     """A wall of field stones in mortar."""
     rows = int(rng.choice([9, 12]))
-    stones = cells(rng, rows, int(rows * 0.65), 0.42, rough=7)
+    stones = voronoi_cells(rng, rows, int(rows * 0.65), 0.42, rough=7)
     edge = stones.rim + 0.7 * noise(rng, 1.0, 16)
-    mortar = step(4.5, 2.0, edge)
+    mortar = smoothstep(4.5, 2.0, edge)
     return _masonry(rng, stones.label, stones.number, edge, mortar)
 
 
-def coursed(rng: np.random.Generator) -> Surface:
+def coursed_wall(rng: np.random.Generator) -> Texture:
     """A wall of hewn blocks in courses, no two of one length."""
-    label, edge, count = _courses(rng)
+    label, edge, count = _lay_courses(rng)
     edge = edge + 0.8 * noise(rng, 1.0, 16)
-    return _masonry(rng, label, count, edge, step(3.4, 1.4, edge))
+    return _masonry(rng, label, count, edge, smoothstep(3.4, 1.4, edge))
 
 
-def _courses(rng: np.random.Generator) -> tuple[np.ndarray, Map, int]:
+def _lay_courses(rng: np.random.Generator) -> tuple[np.ndarray, Map, int]:
     """Label, distance to the joint in texels and number of blocks."""
     heights = rng.choice([2, 3, 4], 12)
     edges = np.round(np.concatenate([[0], np.cumsum(heights)]) * SIDE / heights.sum()).astype(int)
@@ -54,22 +54,22 @@ def _courses(rng: np.random.Generator) -> tuple[np.ndarray, Map, int]:
         edge[top:bottom] = np.minimum(away, np.minimum(y - top, bottom - y)[:, None])
         count += len(ends)
     wander = noise(rng, 1.5, 6), noise(rng, 1.5, 6)
-    label = bent(label.astype(np.float32), 2.0 * wander[0], 2.0 * wander[1], 0).astype(int)
-    return label, bent(edge, 2.0 * wander[0], 2.0 * wander[1]), count
+    label = warp(label.astype(np.float32), 2.0 * wander[0], 2.0 * wander[1], 0).astype(int)
+    return label, warp(edge, 2.0 * wander[0], 2.0 * wander[1]), count
 
 
-def _masonry(rng: np.random.Generator, label: np.ndarray, count: int, edge: Map, mortar: Map) -> Surface:
+def _masonry(rng: np.random.Generator, label: np.ndarray, count: int, edge: Map, mortar: Map) -> Texture:
     """Stones of one quarry, each with its own shade, rounded towards the mortar."""
     palette = np.array(_ROCKS[rng.integers(len(_ROCKS))])
     shades = palette[rng.integers(0, 4, count)] * np.exp(rng.normal(0, 0.08, (count, 1)))
     grain, veins = noise(rng, 0.8, 8), noise(rng, 1.4, 8)
     colours = shades.astype(np.float32)[label] * (1 + 0.06 * grain + 0.06 * veins)[..., None]
-    colours *= (0.72 + 0.28 * step(0, 11, edge))[..., None]
+    colours *= (0.72 + 0.28 * smoothstep(0, 11, edge))[..., None]
     bed = ramp(0.5 + 0.2 * noise(rng, 0.6), (118, 112, 102), (146, 138, 126)) * rng.uniform(0.45, 0.7)
-    colours = mixed(colours, bed, mortar)
-    grime = step(0.2, 2.5, noise(rng, 1.3, 3, stretch=(3, 1)))
-    moss = step(1.4, 2.6, noise(rng, 1.4, 3) + 0.4 * mortar)
-    colours = mixed(colours * (1 - 0.3 * grime)[..., None], (88, 92, 64), 0.45 * moss)
+    colours = mix(colours, bed, mortar)
+    grime = smoothstep(0.2, 2.5, noise(rng, 1.3, 3, stretch=(3, 1)))
+    moss = smoothstep(1.4, 2.6, noise(rng, 1.4, 3) + 0.4 * mortar)
+    colours = mix(colours * (1 - 0.3 * grime)[..., None], (88, 92, 64), 0.45 * moss)
     round_top = np.clip(edge / 14, 0, 1) ** 0.5
     proud = rng.normal(0, 0.12, count).astype(np.float32)[label]
-    return surface(colours, (0.5 * round_top + proud + 0.12 * veins) * (1 - mortar) - 0.6 * mortar)
+    return stack_texture(colours, (0.5 * round_top + proud + 0.12 * veins) * (1 - mortar) - 0.6 * mortar)

@@ -14,7 +14,7 @@ SIDE = 512
 
 Map = Float[np.ndarray, "side side"]
 Colours = Float[np.ndarray, "side side 3"]
-Surface = Float[np.ndarray, "side side 4"]  # colour and height
+Texture = Float[np.ndarray, "side side 4"]  # colour and height
 Canvas = UInt8[np.ndarray, "side side 4"]
 Colour = tuple[float, float, float]
 
@@ -32,7 +32,7 @@ class Cells(NamedTuple):
     rim: Map
     number: int
 
-    def each(self, values: np.ndarray) -> np.ndarray:
+    def per_texel(self, values: np.ndarray) -> np.ndarray:
         """For each texel the value [N] or [N, C] of its cell."""
         return values.astype(np.float32)[self.label]
 
@@ -62,13 +62,13 @@ def noise(
     return values / values.std()
 
 
-def grid() -> tuple[Map, Map]:
+def texel_grid() -> tuple[Map, Map]:
     """The texels' y and x."""
     y, x = np.mgrid[:SIDE, :SIDE].astype(np.float32)
     return y, x
 
 
-def cells(
+def voronoi_cells(
     rng: np.random.Generator, rows: int, columns: int, jitter: float = 0.45, rough: float = 0.0
 ) -> Cells:
     """Cells around sites on a jittered grid of rows x columns; borders wander by about `rough` texels."""
@@ -80,15 +80,15 @@ def cells(
     wide = cv2.copyMakeBorder(away, SIDE // 2, SIDE // 2, SIDE // 2, SIDE // 2, cv2.BORDER_WRAP)
     _, nearest = cv2.distanceTransformWithLabels(wide, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     number = np.zeros(nearest.max() + 1, np.float32)
-    number[nearest[wide == 0]] = np.pad(_numbered(away), SIDE // 2, mode="wrap")[wide == 0]
+    number[nearest[wide == 0]] = np.pad(_number_sites(away), SIDE // 2, mode="wrap")[wide == 0]
     label = number[nearest[SIDE // 2 : -SIDE // 2, SIDE // 2 : -SIDE // 2]]
     if rough:
         wander = [rough * noise(rng, 1.8, 5) for _ in range(2)]
-        label = bent(label, wander[0], wander[1], cv2.INTER_NEAREST)
+        label = warp(label, wander[0], wander[1], cv2.INTER_NEAREST)
     return Cells(label.astype(np.int32), _rim(label), int(label.max()) + 1)
 
 
-def _numbered(away: UInt8[np.ndarray, "side side"]) -> Map:
+def _number_sites(away: UInt8[np.ndarray, "side side"]) -> Map:
     return (np.cumsum(away == 0) - 1).reshape(away.shape).astype(np.float32)
 
 
@@ -97,30 +97,30 @@ def _rim(label: Map) -> Map:
     wide = cv2.copyMakeBorder((~edge).astype(np.uint8), 64, 64, 64, 64, cv2.BORDER_WRAP)
     distance = cv2.distanceTransform(wide, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[64:-64, 64:-64]
     # Whole texels make jagged joints.
-    return blurred(distance, 0.7)
+    return blur(distance, 0.7)
 
 
-def bent(image: np.ndarray, down: Map, right: Map, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
+def warp(image: np.ndarray, down: Map, right: Map, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
     """The image, looked up so many texels further down and right."""
-    y, x = grid()
+    y, x = texel_grid()
     return cv2.remap(image, x + right, y + down, interpolation, borderMode=cv2.BORDER_WRAP)
 
 
-def blurred(image: np.ndarray, sigma: float) -> np.ndarray:
+def blur(image: np.ndarray, sigma: float) -> np.ndarray:
     """The image under a Gaussian of `sigma` texels."""
     margin = int(4 * sigma) + 1
     padded = cv2.copyMakeBorder(image, margin, margin, margin, margin, cv2.BORDER_WRAP)
     return cv2.GaussianBlur(padded, (0, 0), sigma)[margin:-margin, margin:-margin]
 
 
-def run_down(source: Map, length: float) -> Map:
+def smear_down(source: Map, length: float) -> Map:
     """What flows down from a source, fading over `length` texels, as rust and dirt do in the rain."""
     tail = np.exp(-np.arange(SIDE, dtype=np.float32) / length)
     spectrum = np.fft.rfft(source, axis=0) * np.fft.rfft(tail / tail.sum())[:, None]
     return np.fft.irfft(spectrum, SIDE, axis=0).astype(np.float32)
 
 
-def painted(
+def paint_polygons(
     canvas: Canvas,
     polygons: Float[np.ndarray, "n k 2"],
     levels: Float[np.ndarray, "n 4"],
@@ -139,7 +139,7 @@ def painted(
     canvas[:] = wide[margin:-margin, margin:-margin]
 
 
-def blades(
+def blade_outlines(
     at: Float[np.ndarray, "n 2"],
     turns: Float[np.ndarray, "n 2"],
     length: Float[np.ndarray, " n"],
@@ -157,18 +157,18 @@ def blades(
     return np.concatenate([spine - across, (spine + across)[:, ::-1]], 1)
 
 
-def from_line(position: np.ndarray, first: float, period: float) -> Map:
+def distance_to_lines(position: np.ndarray, first: float, period: float) -> Map:
     """Distance to the nearest of the lines at first, first + period, ..."""
     return np.abs((position - first + period / 2) % period - period / 2).astype(np.float32)
 
 
-def step(low: float, high: float, values: Map) -> Map:
+def smoothstep(low: float, high: float, values: Map) -> Map:
     """0 below low, 1 above high, smooth in between; low > high turns it round."""
     share = np.clip((values - low) / (high - low), 0, 1)
     return share * share * (3 - 2 * share)
 
 
-def mixed(first: np.ndarray | Colour, second: np.ndarray | Colour, share: Map) -> Colours:
+def mix(first: np.ndarray | Colour, second: np.ndarray | Colour, share: Map) -> Colours:
     """(1 - share) of the first and share of the second, each a picture or one colour."""
     first, second = np.asarray(first, np.float32), np.asarray(second, np.float32)
     return first + share[..., None] * (second - first)
@@ -181,11 +181,11 @@ def ramp(values: Map, *colours: Colour) -> Colours:
     return table.astype(np.float32)[np.clip(values * 1023, 0, 1023).astype(np.int32)]
 
 
-def neutral(levels: Map, red: float, blue: float) -> Colours:
+def tint_grey(levels: Map, red: float, blue: float) -> Colours:
     """Grey levels, their red and blue multiplied."""
     return np.dstack([levels * red, levels, levels * blue]).astype(np.float32)
 
 
-def surface(colours: Colours, height: Map) -> Surface:
+def stack_texture(colours: Colours, height: Map) -> Texture:
     """Colour and height, which is given as -1..1 about the middle, and clipped to it."""
     return np.dstack([colours, 128 + 127 * np.clip(height, -1, 1)]).astype(np.float32)

@@ -17,7 +17,7 @@ from stereoweave.synth.rendering.opengl import OpenGLRenderer
 from stereoweave.synth.rendering.raycast import Raycaster
 from stereoweave.synth.scenes import SCENES
 from stereoweave.synth.sets.pair_rendering import RenderSpec, draw_stage_and_rig
-from stereoweave.synth.textures.bank import bank, linear
+from stereoweave.synth.textures.bank import srgb_to_linear, texture_bank
 from stereoweave.synth.viewpoints import Orbit, PosedRig, Viewpoint, place_rig
 from stereoweave.synth.world import Fog, Lamp, Material, Mesh, Sky, World, joined
 
@@ -134,7 +134,7 @@ def level(light: float) -> float:
 
 
 def light_of(image: np.ndarray) -> np.ndarray:
-    shown = linear(image.astype(np.float32))
+    shown = srgb_to_linear(image.astype(np.float32))
     return (0.25 * shown / (1 - shown)) ** (2 / 3)
 
 
@@ -310,8 +310,8 @@ def test_a_textures_mean_colour_survives(plain, span_m):
     even = replace(SKY, sun_light=BLACK, zenith=WHITE, horizon=WHITE)
     world = world_of(wall(5.0), Material(texture="concrete", tint=(0.9, 0.7, 0.5), span_m=span_m), sky=even)
     image = plain.render_views(world, ahead(size_px=(160, 160)), (0.0,))[0].image
-    layer = bank().pixels[bank().layer("concrete", 0), ..., :3]
-    expected = np.array([0.9, 0.7, 0.5]) * linear(layer.astype(np.float32)).mean((0, 1))
+    layer = texture_bank().pixels[texture_bank().layer("concrete", 0), ..., :3]
+    expected = np.array([0.9, 0.7, 0.5]) * srgb_to_linear(layer.astype(np.float32)).mean((0, 1))
     np.testing.assert_allclose(light_of(image).mean((0, 1)), expected, rtol=0.04)
 
 

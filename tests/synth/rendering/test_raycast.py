@@ -59,13 +59,13 @@ def test_the_right_camera_sees_the_ball_shifted_by_its_disparity():
 @pytest.mark.parametrize("effects", [PLAIN, Effects()])
 def test_light_is_albedo_times_what_falls_in(effects):
     """Sky 1 from all sides and sun 0.5 square on: 1.5 times the albedo."""
-    from stereoweave.synth.textures.bank import bank, linear
+    from stereoweave.synth.textures.bank import srgb_to_linear, texture_bank
 
     image = Raycaster(effects).render_views(world_of(wall(2.0)), ahead(), (0.0,))[0].image
-    layer = bank().pixels[bank().layer("plain", 0), ..., :3]
-    shown = linear(image.astype(np.float32))
+    layer = texture_bank().pixels[texture_bank().layer("plain", 0), ..., :3]
+    shown = srgb_to_linear(image.astype(np.float32))
     light = (0.25 * shown / (1 - shown)) ** (2 / 3)
-    expected = 1.5 * 0.5 * linear(layer.astype(np.float32)).mean((0, 1))
+    expected = 1.5 * 0.5 * srgb_to_linear(layer.astype(np.float32)).mean((0, 1))
     np.testing.assert_allclose(light.mean((0, 1)), expected, rtol=0.03)
 
 

@@ -10,17 +10,17 @@ import pytest
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn.data.textures import PHOTOGRAPHS
 from stereoweave.synth.textures import bank as textures
-from stereoweave.synth.textures.bank import FAMILIES, Family, bank, texture
+from stereoweave.synth.textures.bank import FAMILIES, TextureFamily, draw_texture, texture_bank
 from stereoweave.synth.textures.tiling import (
     SIDE,
-    blurred,
-    cells,
-    from_line,
-    mixed,
+    blur,
+    distance_to_lines,
+    mix,
     noise,
-    painted,
-    run_down,
-    step,
+    paint_polygons,
+    smear_down,
+    smoothstep,
+    voronoi_cells,
 )
 
 # As surfaces outdoors have it: linear mean colour, black 0 and white 1.
@@ -48,7 +48,7 @@ def layers(*left_out):
     for family, members in FAMILIES.items():
         if family not in left_out:
             for variant in range(len(members.variants)):
-                yield f"{family} {variant}", bank().pixels[bank().layer(family, variant)]
+                yield f"{family} {variant}", texture_bank().pixels[texture_bank().layer(family, variant)]
 
 
 def slope(grey):
@@ -74,21 +74,27 @@ def greatest_seam(pixels):
 
 def test_every_layer_is_a_texture_of_its_own():
     count = sum(len(family.variants) for family in FAMILIES.values())
-    assert bank().pixels.shape == (count, 512, 512, 4)
-    assert bank().pixels.dtype == np.uint8
+    assert texture_bank().pixels.shape == (count, 512, 512, 4)
+    assert texture_bank().pixels.dtype == np.uint8
     assert len({pixels.tobytes() for _, pixels in layers()}) == count
 
 
 def test_layers_are_found_by_family_and_variant_counted_on_past_the_last():
-    np.testing.assert_array_equal(bank().pixels[bank().layer("brick", 1)], texture("brick", 1))
-    assert bank().layer("brick", 5) == bank().layer("brick", 1)
-    places = [bank().layer(name, k) for name, family in FAMILIES.items() for k in range(len(family.variants))]
-    assert places == list(range(len(bank().pixels)))
+    np.testing.assert_array_equal(
+        texture_bank().pixels[texture_bank().layer("brick", 1)], draw_texture("brick", 1)
+    )
+    assert texture_bank().layer("brick", 5) == texture_bank().layer("brick", 1)
+    places = [
+        texture_bank().layer(name, k)
+        for name, family in FAMILIES.items()
+        for k in range(len(family.variants))
+    ]
+    assert places == list(range(len(texture_bank().pixels)))
 
 
 def test_an_unknown_family_is_named_with_those_there_are():
     with pytest.raises(StereoweaveError, match="texture: expected one of rust, paint, .*, found 'marmalade'"):
-        bank().layer("marmalade", 0)
+        texture_bank().layer("marmalade", 0)
 
 
 def test_every_texture_goes_on_at_its_other_side():
@@ -98,7 +104,7 @@ def test_every_texture_goes_on_at_its_other_side():
 
 @pytest.mark.parametrize("family", ["rust", "leaves", "stone", "water", "photograph"])
 def test_a_part_of_a_texture_does_not_go_on_at_its_other_side(family):
-    assert greatest_seam(bank().pixels[bank().layer(family, 0), :400, :400]) > 1.3
+    assert greatest_seam(texture_bank().pixels[texture_bank().layer(family, 0), :400, :400]) > 1.3
 
 
 def test_there_is_structure_at_every_scale_as_in_photographs():
@@ -129,7 +135,7 @@ def test_surfaces_lose_next_to_nothing_in_black_and_white():
 
 def test_the_sky_is_grey_and_has_no_height():
     for variant in range(len(FAMILIES["sky"].variants)):
-        pixels = bank().pixels[bank().layer("sky", variant)]
+        pixels = texture_bank().pixels[texture_bank().layer("sky", variant)]
         assert (np.ptp(pixels[..., :3], axis=-1) == 0).all()
         assert (pixels[..., 3] == 128).all()
 
@@ -137,14 +143,14 @@ def test_the_sky_is_grey_and_has_no_height():
 def test_mortar_lies_lower_than_bricks():
     # 20 courses: a joint at each multiple of 25.6 rows, the middle of a brick 12.8 below.
     for variant in range(4):
-        height = bank().pixels[bank().layer("brick", variant), ..., 3].mean(axis=1)
+        height = texture_bank().pixels[texture_bank().layer("brick", variant), ..., 3].mean(axis=1)
         joints = np.round(np.arange(20) * 25.6).astype(int)
         assert height[joints].mean() < height[joints + 13].mean() - 40
 
 
 def test_where_paint_came_off_it_is_darker_and_lower():
     for variant in range(4):
-        pixels = bank().pixels[bank().layer("paint", variant)]
+        pixels = texture_bank().pixels[texture_bank().layer("paint", variant)]
         chips = pixels[..., 3] < 90
         assert 0 < chips.mean() < 0.1
         assert pixels[chips, :3].mean() < 0.7 * pixels[~chips, :3].mean()
@@ -153,11 +159,11 @@ def test_where_paint_came_off_it_is_darker_and_lower():
 @pytest.mark.parametrize(("family", "variant"), [("leaves", 1), ("sign", 0), ("photograph", 3)])
 def test_another_process_draws_the_same_bytes(family, variant):
     code = (
-        "import hashlib; from stereoweave.synth.textures.bank import texture; "
-        f"print(hashlib.sha256(texture({family!r}, {variant}).tobytes()).hexdigest())"
+        "import hashlib; from stereoweave.synth.textures.bank import draw_texture; "
+        f"print(hashlib.sha256(draw_texture({family!r}, {variant}).tobytes()).hexdigest())"
     )
     there = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
-    assert there.strip() == hashlib.sha256(texture(family, variant).tobytes()).hexdigest()
+    assert there.strip() == hashlib.sha256(draw_texture(family, variant).tobytes()).hexdigest()
 
 
 def test_only_photographs_of_known_licence_are_used():
@@ -179,14 +185,14 @@ def small_bank(tmp_path, monkeypatch):
         drawn.append(1)
         return plain(rng)
 
-    monkeypatch.setattr(textures, "FAMILIES", {"plain": Family(variants=(once,), albedo=(0.7, 0.8))})
+    monkeypatch.setattr(textures, "FAMILIES", {"plain": TextureFamily(variants=(once,), albedo=(0.7, 0.8))})
     monkeypatch.setattr(textures, "cache_folder", lambda: tmp_path / "kernels")
     return tmp_path / "textures", drawn
 
 
 def fresh_bank():
     """The bank of a new process."""
-    return bank.__wrapped__().pixels
+    return texture_bank.__wrapped__().pixels
 
 
 def test_a_kept_bank_is_read_and_not_drawn_again(small_bank):
@@ -223,7 +229,7 @@ def test_a_bank_of_other_code_is_drawn_anew_and_banks_of_last_month_are_removed(
     folder, drawn = small_bank
     month_s = 31 * 24 * 60 * 60
     for version, age_s in [("oldest", 2 * month_s), ("old", 0), ("new", 0)]:
-        monkeypatch.setattr(textures, "_version", lambda version=version: version)
+        monkeypatch.setattr(textures, "_source_version", lambda version=version: version)
         fresh_bank()
         written_s = (folder / f"{version}.rgba").stat().st_mtime
         os.utime(folder / f"{version}.rgba", (written_s, written_s - age_s))
@@ -253,18 +259,18 @@ def test_stretched_noise_is_longer_than_wide(rng):
 
 def test_cells_are_those_of_the_nearest_site(rng):
     # Without jitter the cells are squares of 64 texels; their rims are 32 from their middles.
-    found = cells(rng, 8, 8, jitter=0)
+    found = voronoi_cells(rng, 8, 8, jitter=0)
     assert found.number == 64
     assert (found.label[1:63, 1:63] == found.label[32, 32]).all()
     assert found.label[32, 66] != found.label[32, 32]
     assert abs(found.rim[32, 32] - 32) < 1.5
-    np.testing.assert_array_equal(found.each(np.arange(64)), found.label)
+    np.testing.assert_array_equal(found.per_texel(np.arange(64)), found.label)
 
 
 def test_what_is_painted_over_a_border_comes_out_at_the_other_side():
     canvas = np.zeros((SIDE, SIDE, 4), np.uint8)
     square = np.array([[[-10.0, 100.0], [10.0, 100.0], [10.0, 120.0], [-10.0, 120.0]]])
-    painted(canvas, square, np.array([[200.0, 150.0, 100.0, 50.0]]))
+    paint_polygons(canvas, square, np.array([[200.0, 150.0, 100.0, 50.0]]))
     for x in (0, 5, SIDE - 5, SIDE - 1):
         assert canvas[110, x].tolist() == [200, 150, 100, 50]
     assert not canvas[110, 20 : SIDE - 20].any()
@@ -273,7 +279,7 @@ def test_what_is_painted_over_a_border_comes_out_at_the_other_side():
 def test_what_runs_down_keeps_its_amount_and_goes_on_at_the_top():
     source = np.zeros((SIDE, SIDE), np.float32)
     source[SIDE - 1, 7] = 1
-    run = run_down(source, 30)
+    run = smear_down(source, 30)
     assert abs(run.sum() - 1) < 1e-4
     # After 30 texels 1 / e is left.
     assert abs(run[29, 7] / run[SIDE - 1, 7] - np.exp(-1)) < 1e-3
@@ -282,15 +288,17 @@ def test_what_runs_down_keeps_its_amount_and_goes_on_at_the_top():
 def test_blur_keeps_the_mean_and_crosses_the_border():
     source = np.zeros((SIDE, SIDE), np.float32)
     source[0, 0] = 1
-    soft = blurred(source, 2.0)
+    soft = blur(source, 2.0)
     assert abs(soft.sum() - 1) < 1e-4
     assert abs(soft[-1, -1] - soft[1, 1]) < 1e-7
 
 
 def test_steps_lines_and_mixtures():
     values = np.array([[0.0, 1.5], [2.0, 9.0]], np.float32)
-    np.testing.assert_allclose(step(1, 2, values), [[0, 0.5], [1, 1]])
-    np.testing.assert_allclose(step(2, 1, values), [[1, 0.5], [0, 0]])
-    np.testing.assert_allclose(from_line(np.array([[0.0, 3.0], [9.0, 12.0]]), 2, 10), [[2, 1], [3, 0]])
+    np.testing.assert_allclose(smoothstep(1, 2, values), [[0, 0.5], [1, 1]])
+    np.testing.assert_allclose(smoothstep(2, 1, values), [[1, 0.5], [0, 0]])
+    np.testing.assert_allclose(
+        distance_to_lines(np.array([[0.0, 3.0], [9.0, 12.0]]), 2, 10), [[2, 1], [3, 0]]
+    )
     half = np.full((1, 1), 0.25, np.float32)
-    np.testing.assert_allclose(mixed((0, 100, 40), (100, 0, 40), half), [[[25, 75, 40]]])
+    np.testing.assert_allclose(mix((0, 100, 40), (100, 0, 40), half), [[[25, 75, 40]]])
