@@ -27,7 +27,7 @@ class Mesh:
     material: Int[np.ndarray, " n"]
     target: Bool[np.ndarray, " n"]
 
-    def placed(self, pose: Float[np.ndarray, "4 4"]) -> "Mesh":
+    def transform(self, pose: Float[np.ndarray, "4 4"]) -> "Mesh":
         """The mesh under a rotation, uniform or not scaling and shift; its texture moves along unscaled."""
         # In one product: NumPy is slow at many small ones.
         corners_m = self.corners_m.reshape(-1, 3) @ pose[:3, :3].T.astype(np.float32)
@@ -39,7 +39,7 @@ class Mesh:
             normals=normals.reshape(-1, 3, 3),
         )
 
-    def moved(self, x: float = 0, y: float = 0, z: float = 0) -> "Mesh":
+    def translate(self, x: float = 0, y: float = 0, z: float = 0) -> "Mesh":
         """The mesh, shifted in metres."""
         return replace(self, corners_m=self.corners_m + np.array([x, y, z], np.float32))
 
@@ -48,7 +48,7 @@ class Mesh:
         return replace(self, target=np.ones_like(self.target))
 
 
-def joined(meshes: Iterable[Mesh]) -> Mesh:
+def join_meshes(meshes: Iterable[Mesh]) -> Mesh:
     """All triangles in one mesh."""
     parts = list(meshes)
     names = ("corners_m", "normals", "uv_m", "material", "target")

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from stereoweave.synth.props.lattice import bars, chains
-from stereoweave.synth.props.primitives import boxes, lathe, spheres, tubes, turn
-from stereoweave.synth.world import Mesh, joined
+from stereoweave.synth.props.lattice import bars, chain_segments
+from stereoweave.synth.props.primitives import boxes, lathe, rotation, spheres, tubes
+from stereoweave.synth.world import Mesh, join_meshes
 
-FORWARD = turn((0, 1, 0), 90)  # of what is turned about z
+FORWARD = rotation((0, 1, 0), 90)  # of what is turned about z
 
 
 def panel(height_m: float, cover: int, steel: int) -> Mesh:
@@ -21,14 +21,14 @@ def panel(height_m: float, cover: int, steel: int) -> Mesh:
     )
     angle = np.linspace(-np.pi / 2, np.pi / 2, 9)
     front = np.column_stack([0.055 + 0.05 * np.cos(angle), 0.075 * np.sin(angle), 0 * angle])
-    return joined(
+    return join_meshes(
         [
             tubes((0.06, 0, -half), (0.06, 0, half), 0.055, cover, 12),
             boxes((0.03, 0, 0), (0.06, 0.15, height_m), cover),
             boxes((front[0, 0], 0, -half), (0.09, 0.13, 0.02), steel),
             bars(brackets, 0.014, steel),
             boxes((-0.12, 0, -0.3 * half), (0.07, 0.14, 0.45 * half), cover),
-            bars(chains(leads), 0.006, steel, sides=4),
+            bars(chain_segments(leads), 0.006, steel, sides=4),
         ]
     )
 
@@ -54,10 +54,10 @@ def drum(radius_m: float, cover: int, steel: int) -> Mesh:
             (0, depth + 0.1 * r),
         ]
     )
-    return joined(
+    return join_meshes(
         [
-            lathe(np.concatenate([profile, bulge]), cover, 28).placed(FORWARD),
-            lathe([(0, -0.12), (0.22 * r, -0.12), (0.25 * r, 0.03), (0, 0.03)], steel, 16).placed(FORWARD),
+            lathe(np.concatenate([profile, bulge]), cover, 28).transform(FORWARD),
+            lathe([(0, -0.12), (0.22 * r, -0.12), (0.25 * r, 0.03), (0, 0.03)], steel, 16).transform(FORWARD),
             bars(np.array([[(-0.12, 0, 0), (0.02, 0, 0)]]), 0.025, steel),
         ]
     )
@@ -69,7 +69,7 @@ def paraboloid(radius_m: float, focal_m: float, skin: int, back: int, sections: 
     front = np.column_stack([radius, radius**2 / (4 * focal_m)])
     thick = 0.018 * radius_m + 0.004
     behind = np.concatenate([front - [0, thick], front[-1:] + [[0.01 * radius_m, 0]]])
-    return joined(
+    return join_meshes(
         [lathe(behind, back, sections), lathe(np.concatenate([behind[-1:], front[::-1]]), skin, sections)]
     )
 
@@ -84,15 +84,15 @@ def satellite_dish(radius_m: float, cover: int, steel: int) -> Mesh:
             [(0.3 * radius_m, 0, rim / 9), (-0.2 * radius_m, 0, focal)],
         ]
     )
-    dish = joined(
+    dish = join_meshes(
         [
             paraboloid(radius_m, focal, cover, cover),
             bars(arm[:1], 0.009, steel, sides=4),
             tubes((-0.22 * radius_m, 0, focal + 0.03), (-0.18 * radius_m, 0, focal - 0.06), 0.025, steel, 10),
         ]
     )
-    tilted = dish.placed(turn((0, 1, 0), 60)).moved(0.1)
-    return joined([tilted, bars(np.array([[(0, 0, 0), (0.12, 0, 0)]]), 0.02, steel)])
+    tilted = dish.transform(rotation((0, 1, 0), 60)).translate(0.1)
+    return join_meshes([tilted, bars(np.array([[(0, 0, 0), (0.12, 0, 0)]]), 0.02, steel)])
 
 
 def yagi(length_m: float, count: int, steel: int, end: int) -> Mesh:
@@ -110,10 +110,10 @@ def yagi(length_m: float, count: int, steel: int, end: int) -> Mesh:
         0,
     ]
     boom = np.array([[(back - 0.03, 0, 0), (0.7 * length_m, 0, 0)]])
-    return joined(
+    return join_meshes(
         [
             bars(boom, 0.011, steel),
-            bars(np.concatenate([rods, grid, spars, chains(loop[None])]), 0.0045, steel, sides=4),
+            bars(np.concatenate([rods, grid, spars, chain_segments(loop[None])]), 0.0045, steel, sides=4),
             boxes(loop[0] + [0, 0.15, -0.01], (0.06, 0.05, 0.05), end),
             boxes((0, 0, -0.01), (0.06, 0.06, 0.05), end),
         ]
@@ -122,7 +122,7 @@ def yagi(length_m: float, count: int, steel: int, end: int) -> Mesh:
 
 def whip(height_m: float, cover: int, steel: int) -> Mesh:
     """A rod upright beside its bracket."""
-    return joined(
+    return join_meshes(
         [
             tubes((0, 0, 0), (0, 0, height_m), np.array([[0.014, 0.007]]), cover, 8),
             tubes((0, 0, -0.06), (0, 0, 0.1), 0.022, steel, 8),
@@ -138,6 +138,10 @@ def dipoles(count: int, steel: int) -> Mesh:
     z = (np.arange(count) * 0.42)[:, None, None] * [0.0, 0, 1]
     arms = np.concatenate([z + [[0, 0, 0]], z + [[0.11, 0, 0]]], 1)
     pole = np.array([[(0, 0, -0.2), (0, 0, 0.42 * count - 0.1)]])
-    return joined(
-        [bars(chains(loop + z), 0.007, steel, sides=4), bars(arms, 0.01, steel), bars(pole, 0.016, steel)]
+    return join_meshes(
+        [
+            bars(chain_segments(loop + z), 0.007, steel, sides=4),
+            bars(arms, 0.01, steel),
+            bars(pole, 0.016, steel),
+        ]
     )

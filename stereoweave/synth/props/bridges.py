@@ -5,20 +5,20 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.synth.props.lattice import galvanised, painted, railing
+from stereoweave.synth.props.lattice import galvanised_steel, painted_steel, railing
 from stereoweave.synth.props.primitives import (
     Numbers,
     boxes,
     copies,
-    frames,
+    orthogonal_frames,
     prism,
+    rotation,
     sheet,
-    shift,
     sweep,
-    turn,
+    translation,
 )
 from stereoweave.synth.stage import Palette
-from stereoweave.synth.world import Colour, Material, Mesh, joined
+from stereoweave.synth.world import Colour, Material, Mesh, join_meshes
 
 # Everything is a tenth of its real size.
 SCALE = 0.1
@@ -33,7 +33,7 @@ _STEEL_PAINTS: tuple[Colour, ...] = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class BridgePlan:
     """The sizes that the parts of a bridge agree on, and its materials.
 
     Attributes:
@@ -58,7 +58,7 @@ class Plan:
         return self.width_m / 2 + 0.05
 
 
-def planned(rng: np.random.Generator, palette: Palette) -> Plan:
+def draw_bridge_plan(rng: np.random.Generator, palette: Palette) -> BridgePlan:
     """A plan with fresh materials."""
     paint = _STEEL_PAINTS[rng.integers(len(_STEEL_PAINTS))]
     masonry = Material(
@@ -78,15 +78,15 @@ def planned(rng: np.random.Generator, palette: Palette) -> Plan:
     )
     rusty = Material(texture="rust", variant=int(rng.integers(64)), span_m=0.9, relief=0.4)
     asphalt = Material(texture="asphalt", variant=int(rng.integers(64)), span_m=0.8, roughness=0.9)
-    return Plan(
+    return BridgePlan(
         level_m=rng.uniform(1.15, 1.6),
         half_m=rng.uniform(4.0, 4.4),
         width_m=rng.uniform(0.85, 1.1),
-        steel=palette.add(rusty if rng.random() < 0.15 else painted(rng, paint)),
+        steel=palette.add(rusty if rng.random() < 0.15 else painted_steel(rng, paint)),
         masonry=palette.add(masonry),
         dressed=palette.add(dressed),
         asphalt=palette.add(asphalt),
-        rail=palette.add(galvanised(rng)),
+        rail=palette.add(galvanised_steel(rng)),
     )
 
 
@@ -96,12 +96,12 @@ def beams(starts_m: Numbers, ends_m: Numbers, size_m: tuple[float, float], mater
     along = ends - starts
     length = np.linalg.norm(along, axis=1, keepdims=True)
     along = along / length
-    turns = np.stack([along, *frames(along)], -1)
+    turns = np.stack([along, *orthogonal_frames(along)], -1)
     sizes = np.concatenate([length, np.broadcast_to(size_m, (len(along), 2))], 1)
     return boxes((starts + ends) / 2, sizes, material, turns)
 
 
-def roadway(plan: Plan, start_m: float, end_m: float, *, deep_m: float = 0.1) -> Mesh:
+def roadway(plan: BridgePlan, start_m: float, end_m: float, *, deep_m: float = 0.1) -> Mesh:
     """Slab, asphalt, kerbs and railings from x = start_m to end_m at level 0."""
     middle_m, length_m = (start_m + end_m) / 2, end_m - start_m
     slab = boxes([[middle_m, 0, -deep_m / 2 - 0.01]], [[length_m, plan.width_m, deep_m]], plan.masonry)
@@ -114,37 +114,37 @@ def roadway(plan: Plan, start_m: float, end_m: float, *, deep_m: float = 0.1) ->
         railing(np.array([[start_m, y, 0.025], [end_m, y, 0.025]]), 0.11, 0.16, 0.006, plan.rail, rails=3)
         for y in (-0.49 * plan.width_m, 0.49 * plan.width_m)
     ]
-    return joined([slab, asphalt, kerbs, *rails])
+    return join_meshes([slab, asphalt, kerbs, *rails])
 
 
-def lamps(plan: Plan, start_m: float, end_m: float, material: int, glass: int) -> Mesh:
+def street_lamps(plan: BridgePlan, start_m: float, end_m: float, material: int, glass: int) -> Mesh:
     """Street lamps on both sides, with arms over the road, at level 0."""
     angle = np.linspace(0, np.pi / 2, 6)
     bow = np.stack([0 * angle, 0.12 - 0.12 * np.cos(angle), 0.6 + 0.12 * np.sin(angle)], -1)
     mast = sweep(np.concatenate([[[0, 0, 0.02]], bow, [[0, 0.2, 0.72]]]), 0.011, material, 6)
     head = boxes([[0, 0.2, 0.725], [0, 0.2, 0.712]], [[0.035, 0.1, 0.02], [0.025, 0.08, 0.01]], material)
     lens = boxes([[0, 0.2, 0.706]], [[0.022, 0.07, 0.006]], glass)
-    lamp = joined([mast, head, lens])
+    lamp = join_meshes([mast, head, lens])
     x = np.arange(start_m + 0.5, end_m, 1.1)
-    near = [shift(at, -0.45 * plan.width_m) for at in x]
-    far = [shift(at + 0.55, 0.45 * plan.width_m) @ turn((0, 0, 1), 180) for at in x[:-1]]
+    near = [translation(at, -0.45 * plan.width_m) for at in x]
+    far = [translation(at + 0.55, 0.45 * plan.width_m) @ rotation((0, 0, 1), 180) for at in x[:-1]]
     return copies(lamp, np.stack(near + far))
 
 
-def pier(plan: Plan, at_m: float, top_m: float, *, thick_m: float = 0.32, wide_m: float = 0.3) -> Mesh:
+def pier(plan: BridgePlan, at_m: float, top_m: float, *, thick_m: float = 0.32, wide_m: float = 0.3) -> Mesh:
     """A pier that stands in the river, pointed against the stream, wide_m wider than the road."""
     y = plan.width_m / 2 + wide_m / 2
     outline = np.array([(0.5, -y), (0.5, y), (0, y + 0.2), (-0.5, y), (-0.5, -y), (0, -y - 0.2)]) * [
         thick_m,
         1,
     ]
-    cap = prism(outline * [1.25, 1.04], 0.08, plan.masonry).moved(x=at_m, z=top_m - 0.08)
-    foot = prism(outline * [1.5, 1.08], 0.85, plan.masonry).moved(x=at_m, z=-0.7)
-    shaft = prism(outline, top_m + 0.62, plan.masonry).moved(x=at_m, z=-0.7)
-    return joined([foot, shaft, cap])
+    cap = prism(outline * [1.25, 1.04], 0.08, plan.masonry).translate(x=at_m, z=top_m - 0.08)
+    foot = prism(outline * [1.5, 1.08], 0.85, plan.masonry).translate(x=at_m, z=-0.7)
+    shaft = prism(outline, top_m + 0.62, plan.masonry).translate(x=at_m, z=-0.7)
+    return join_meshes([foot, shaft, cap])
 
 
-def abutments(plan: Plan) -> Mesh:
+def abutments(plan: BridgePlan) -> Mesh:
     """Walls at both ends, on which the bridge ends and the banks begin."""
     size_m = [0.9, plan.width_m + 0.24, plan.level_m + 0.88]
     x = (plan.half_m + 0.42) * np.array([-1.0, 1.0])
@@ -158,10 +158,10 @@ def abutments(plan: Plan) -> Mesh:
         [[0.14, 0.14, 0.3]],
         plan.masonry,
     )
-    return joined([walls, posts])
+    return join_meshes([walls, posts])
 
 
-def stone_arches(rng: np.random.Generator, palette: Palette, plan: Plan) -> Mesh:
+def stone_arches(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
     """Two to five arches with voussoirs, pointed piers and a parapet."""
     count = int(rng.integers(2, 6))
     wide_m = 2 * plan.half_m / count
@@ -171,19 +171,19 @@ def stone_arches(rng: np.random.Generator, palette: Palette, plan: Plan) -> Mesh
     middles_m = -plan.half_m + wide_m * (np.arange(count) + 0.5)
     angle = np.linspace(np.pi, 0, 21)
     arch = np.stack([half_m * np.cos(angle), spring_m + rise_m * np.sin(angle)], -1)
-    parts = [_arch(plan, arch, wide_m / 2).moved(x=x) for x in middles_m]
+    parts = [_arch(plan, arch, wide_m / 2).translate(x=x) for x in middles_m]
     inner_m = middles_m[:-1] + wide_m / 2
     parts += [pier(plan, x, spring_m + 0.1, thick_m=pier_m * 0.96, wide_m=0.06) for x in inner_m]
     cutwaters = [(x, side) for x in inner_m for side in (-1, 1)]
     buttress = prism([(-pier_m / 2, 0), (pier_m / 2, 0), (0, 0.2)], plan.level_m - 0.12, plan.masonry)
     parts += [
-        buttress.placed(turn((0, 0, 1), 0 if side > 0 else 180)).moved(x, side * plan.width_m / 2)
+        buttress.transform(rotation((0, 0, 1), 0 if side > 0 else 180)).translate(x, side * plan.width_m / 2)
         for x, side in cutwaters
     ]
-    return joined([*parts, _parapets(plan)])
+    return join_meshes([*parts, _parapets(plan)])
 
 
-def _arch(plan: Plan, arch_m: Float[np.ndarray, "k 2"], reach_m: float) -> Mesh:
+def _arch(plan: BridgePlan, arch_m: Float[np.ndarray, "k 2"], reach_m: float) -> Mesh:
     """One arch with the wall above it: faces on both sides, the vault, and a ring of wedge stones."""
     y, top_m = plan.width_m / 2, plan.level_m
     below = np.concatenate(
@@ -208,10 +208,10 @@ def _arch(plan: Plan, arch_m: Float[np.ndarray, "k 2"], reach_m: float) -> Mesh:
         sheet(back[:, ::-1], plan.masonry),
         sheet(vault[:, ::-1], plan.masonry),
     ]
-    return joined([*skins, *wedges])
+    return join_meshes([*skins, *wedges])
 
 
-def _parapets(plan: Plan) -> Mesh:
+def _parapets(plan: BridgePlan) -> Mesh:
     y = plan.width_m / 2
     length_m = 2 * plan.half_m + 0.5
     walls = boxes([[0, at, plan.level_m + 0.02] for at in (-y, y)], [[length_m, 0.07, 0.2]], plan.masonry)
@@ -220,7 +220,7 @@ def _parapets(plan: Plan) -> Mesh:
         [[length_m, 0.12, 0.035]],
         plan.dressed,
     )
-    return joined([walls, ledges])
+    return join_meshes([walls, ledges])
 
 
 def _upright(points_m: Float[np.ndarray, "k 2"], y_m: float) -> Float[np.ndarray, "k 3"]:

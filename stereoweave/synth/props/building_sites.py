@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from stereoweave.synth.props.lattice import bars, galvanised, painted, railing
+from stereoweave.synth.props.lattice import bars, galvanised_steel, painted_steel, railing
 from stereoweave.synth.props.primitives import boxes, lathe
-from stereoweave.synth.props.surroundings import hills, houses, pallets, places, terrain, trees
+from stereoweave.synth.props.surroundings import draw_spots, hills, houses, pallets, terrain, trees
 from stereoweave.synth.stage import Palette
-from stereoweave.synth.world import Colour, Material, Mesh, joined
+from stereoweave.synth.world import Colour, Material, Mesh, join_meshes
 
 SCALE = 0.4  # of the surroundings' things: the crane is smaller than a real one
 BAY_M, STOREY_M = 0.95, 0.52
@@ -15,19 +15,19 @@ BAY_M, STOREY_M = 0.95, 0.52
 def building_site(rng: np.random.Generator, palette: Palette) -> Mesh:
     """A site whose shell stands at negative y, so that the crane at the origin is seen from positive y."""
     small = np.diag([SCALE, SCALE, SCALE, 1.0])
-    town = places(rng, 20, 17 / SCALE, 60 / SCALE)
-    stacks = places(rng, 7, 2 / SCALE, 5 / SCALE)
-    return joined(
+    town = draw_spots(rng, 20, 17 / SCALE, 60 / SCALE)
+    stacks = draw_spots(rng, 7, 2 / SCALE, 5 / SCALE)
+    return join_meshes(
         [
             terrain(rng, palette, str(rng.choice(["grass", "asphalt"])), extent_m=110, flat_radius_m=14),
             _yard(rng, palette),
-            _shell(rng, palette).moved(rng.uniform(-1.8, 0.2), rng.uniform(-3.6, -2.9)),
+            _shell(rng, palette).translate(rng.uniform(-1.8, 0.2), rng.uniform(-3.6, -2.9)),
             _huts(rng, palette),
             _hoarding(rng, palette),
             _heaps(rng, palette),
-            pallets(rng, palette, stacks).placed(small),
-            houses(rng, palette, town).placed(small),
-            trees(rng, palette, places(rng, 18, 13, 60), height_m=(1.6, 3.6)),
+            pallets(rng, palette, stacks).transform(small),
+            houses(rng, palette, town).transform(small),
+            trees(rng, palette, draw_spots(rng, 18, 13, 60), height_m=(1.6, 3.6)),
             hills(rng, palette, distance_m=rng.uniform(85, 130)),
         ]
     )
@@ -49,7 +49,7 @@ def _shell(rng: np.random.Generator, palette: Palette) -> Mesh:
     board = palette.add(
         Material(texture="wood", variant=int(rng.integers(8)), tint=(0.85, 0.65, 0.35), span_m=1.0)
     )
-    tube = palette.add(galvanised(rng))
+    tube = palette.add(galvanised_steel(rng))
     bays, deep, floors = int(rng.integers(3, 6)), 2, int(rng.integers(2, 5))
     x = (np.arange(bays + 1) - bays / 2) * BAY_M
     y = (np.arange(deep + 1) - deep / 2) * BAY_M
@@ -70,7 +70,7 @@ def _shell(rng: np.random.Generator, palette: Palette) -> Mesh:
         railing(edge + [0, 0, levels[-1]], 0.2, 0.35, 0.007, board),
         _scaffolding(size, floors, tube, board),
     ]
-    return joined(parts)
+    return join_meshes(parts)
 
 
 def _starters(tops: np.ndarray) -> np.ndarray:
@@ -103,20 +103,20 @@ def _scaffolding(size_m: np.ndarray, floors: int, tube: int, board: int) -> Mesh
         (brace, brace + [x[1] - x[0], 0, STOREY_M]),
     ]
     frame = np.concatenate([np.stack(ends, 1) for ends in segments])
-    return joined([bars(frame, 0.009, tube, sides=4), boxes(planks, (x[-1] - x[0], 0.22, 0.014), board)])
+    return join_meshes([bars(frame, 0.009, tube, sides=4), boxes(planks, (x[-1] - x[0], 0.22, 0.014), board)])
 
 
 def _huts(rng: np.random.Generator, palette: Palette) -> Mesh:
     """Site offices, two high, with windows and doors."""
     tints: tuple[Colour, ...] = ((0.75, 0.75, 0.72), (0.2, 0.32, 0.45), (0.62, 0.5, 0.2))
-    wall = palette.add(painted(rng, tints[int(rng.integers(3))], roughness=0.7))
+    wall = palette.add(painted_steel(rng, tints[int(rng.integers(3))], roughness=0.7))
     glass = palette.add(Material(texture="plain", tint=(0.06, 0.08, 0.1), roughness=0.15))
     at = np.array([(a, 0, b) for a in (-1.25, 0, 1.25) for b in (0.22, 0.68)])
     rows = np.array([(a, 0.24, 0.05) for a in (-0.35, 0.1, 0.4)])
     panes = (at[:, None] + rows).reshape(-1, 3)
     huts = [boxes(at, (1.22, 0.48, 0.43), wall), boxes(panes, (0.2, 0.02, 0.15), glass)]
     roofs = boxes(at + [0, 0, 0.22], (1.24, 0.52, 0.02), glass)
-    return joined([*huts, roofs]).moved(rng.choice([-4.6, 4.4]), rng.uniform(-4.2, -2.5))
+    return join_meshes([*huts, roofs]).translate(rng.choice([-4.6, 4.4]), rng.uniform(-4.2, -2.5))
 
 
 def _hoarding(rng: np.random.Generator, palette: Palette) -> Mesh:
@@ -126,7 +126,9 @@ def _hoarding(rng: np.random.Generator, palette: Palette) -> Mesh:
     )
     x = np.arange(-8.5, 8.6, 0.5)
     at = np.stack([x, -6.4 + rng.normal(0, 0.015, len(x)), np.full_like(x, 0.35)], -1)
-    return joined([boxes(at, (0.49, 0.03, 0.8), wood), boxes(at - [0.25, 0.05, 0], (0.06, 0.06, 0.84), wood)])
+    return join_meshes(
+        [boxes(at, (0.49, 0.03, 0.8), wood), boxes(at - [0.25, 0.05, 0], (0.06, 0.06, 0.84), wood)]
+    )
 
 
 def _heaps(rng: np.random.Generator, palette: Palette) -> Mesh:
@@ -135,5 +137,5 @@ def _heaps(rng: np.random.Generator, palette: Palette) -> Mesh:
         Material(texture="soil", variant=int(rng.integers(8)), tint=(1.0, 0.9, 0.7), span_m=0.7, relief=0.6)
     )
     heap = lathe([(0.75, -0.05), (0.45, 0.2), (0.2, 0.36), (0.08, 0.4), (0, 0.41)], sand, 24, crease_deg=60)
-    spots = places(rng, 3, 2.4, 5.5)
-    return joined([heap.moved(x, y) for x, y, _ in spots])
+    spots = draw_spots(rng, 3, 2.4, 5.5)
+    return join_meshes([heap.translate(x, y) for x, y, _ in spots])

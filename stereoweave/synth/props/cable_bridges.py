@@ -2,22 +2,22 @@
 
 import numpy as np
 
-from stereoweave.synth.props.bridges import Plan, beams, pier, roadway
+from stereoweave.synth.props.bridges import BridgePlan, beams, pier, roadway
 from stereoweave.synth.props.primitives import boxes, loft, sweep, tubes
 from stereoweave.synth.stage import Palette
-from stereoweave.synth.world import Mesh, joined
+from stereoweave.synth.world import Mesh, join_meshes
 
 
-def suspension(rng: np.random.Generator, palette: Palette, plan: Plan) -> Mesh:
+def suspension(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
     """Two towers, cables that hang between them down to both banks, hangers, and a stiff girder."""
     tower_m, top_m = rng.uniform(2.2, 2.6), plan.level_m + rng.uniform(1.35, 1.9)
     low_m, anchor_m = plan.level_m + 0.14, plan.half_m + 0.5
     masonry_towers = rng.random() < 0.35
     material, thick_m = (plan.masonry, 0.24) if masonry_towers else (plan.steel, 0.13)
-    parts = [_girder(plan), roadway(plan, -plan.half_m, plan.half_m).moved(z=plan.level_m)]
+    parts = [_girder(plan), roadway(plan, -plan.half_m, plan.half_m).translate(z=plan.level_m)]
     for at in (-tower_m, tower_m):
         portal = _portal(plan, top_m, thick_m, material, crossings=int(rng.integers(2, 4)))
-        parts += [portal.moved(x=at), pier(plan, at, 0.45, thick_m=0.6, wide_m=0.5)]
+        parts += [portal.translate(x=at), pier(plan, at, 0.45, thick_m=0.6, wide_m=0.5)]
     for y in (-plan.side_m - 0.02, plan.side_m + 0.02):
         x = np.linspace(-tower_m, tower_m, 49)
         main_m = np.stack([x, np.full(49, y), low_m + (top_m + 0.03 - low_m) * (x / tower_m) ** 2], -1)
@@ -27,10 +27,10 @@ def suspension(rng: np.random.Generator, palette: Palette, plan: Plan) -> Mesh:
         side_m = np.stack([outer, np.full(15, y), side_z], -1)
         cable = np.concatenate([side_m[:0:-1] * [-1, 1, 1], main_m, side_m[1:]])
         parts += [sweep(cable, 0.022, plan.steel, 8), _hangers(plan, cable)]
-    return joined([*parts, _anchors(plan, anchor_m)])
+    return join_meshes([*parts, _anchors(plan, anchor_m)])
 
 
-def cable_stayed(rng: np.random.Generator, palette: Palette, plan: Plan) -> Mesh:
+def cable_stayed(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
     """One or two towers, from which straight cables fan out to the edges of the road."""
     single = rng.random() < 0.5
     towers_m = [rng.uniform(-0.4, 0.4)] if single else [-0.5 * plan.half_m, 0.5 * plan.half_m]
@@ -39,11 +39,11 @@ def cable_stayed(rng: np.random.Generator, palette: Palette, plan: Plan) -> Mesh
     leaning, harp = bool(rng.random() < 0.5), bool(rng.random() < 0.4)
     count = 11 if single else 8
     slab = boxes([[0, 0, plan.level_m - 0.13]], [[2 * plan.half_m, 0.7 * plan.width_m, 0.14]], plan.dressed)
-    parts = [slab, roadway(plan, -plan.half_m, plan.half_m).moved(z=plan.level_m)]
+    parts = [slab, roadway(plan, -plan.half_m, plan.half_m).translate(z=plan.level_m)]
     cable = plan.rail if rng.random() < 0.5 else plan.steel
     for at in towers_m:
         head = _leaning(plan, top_m) if leaning else _portal(plan, top_m, 0.17, plan.dressed, crossings=2)
-        parts += [head.moved(x=at), pier(plan, at, 0.35, thick_m=0.7, wide_m=0.6)]
+        parts += [head.translate(x=at), pier(plan, at, 0.35, thick_m=0.7, wide_m=0.6)]
         steps = (np.arange(count) + 1) / count
         for side in (-1, 1):
             for y in (-plan.width_m / 2, plan.width_m / 2):
@@ -55,10 +55,10 @@ def cable_stayed(rng: np.random.Generator, palette: Palette, plan: Plan) -> Mesh
                 inset = _inset(plan, z, top_m) if leaning else plan.side_m + 0.04
                 heads = np.stack([np.full(count, at), np.sign(y) * inset * np.ones(count), z], -1)
                 parts.append(tubes(feet, heads, 0.010, cable, 6))
-    return joined(parts)
+    return join_meshes(parts)
 
 
-def _girder(plan: Plan) -> Mesh:
+def _girder(plan: BridgePlan) -> Mesh:
     """A low truss along both edges under the road."""
     x = np.linspace(-plan.half_m, plan.half_m, 45)
     parts = []
@@ -68,10 +68,10 @@ def _girder(plan: Plan) -> Mesh:
         zigzag = np.where((np.arange(45) % 2 == 0)[:, None], top, low)
         parts += [chords, tubes(zigzag[:-1], zigzag[1:], 0.012, plan.steel, 5)]
     across = np.stack([x, np.full(45, plan.side_m), np.full(45, plan.level_m - 0.2)], -1)
-    return joined([*parts, beams(across * [1, -1, 1], across, (0.025, 0.04), plan.steel)])
+    return join_meshes([*parts, beams(across * [1, -1, 1], across, (0.025, 0.04), plan.steel)])
 
 
-def _hangers(plan: Plan, cable: np.ndarray) -> Mesh:
+def _hangers(plan: BridgePlan, cable: np.ndarray) -> Mesh:
     """Upright rods from the cable to the girder, evenly along the road."""
     x = np.arange(-plan.half_m + 0.12, plan.half_m - 0.1, 0.15)
     tops = np.stack([x, np.full(len(x), cable[0, 1]), np.interp(x, cable[:, 0], cable[:, 2])], -1)
@@ -80,7 +80,7 @@ def _hangers(plan: Plan, cable: np.ndarray) -> Mesh:
     return tubes(feet[far], tops[far], 0.007, plan.steel, 5)
 
 
-def _anchors(plan: Plan, at_m: float) -> Mesh:
+def _anchors(plan: BridgePlan, at_m: float) -> Mesh:
     size_m = [0.8, 0.3, 0.5]
     places = [
         [x, y, plan.level_m - 0.1] for x in (-at_m, at_m) for y in (-plan.side_m - 0.04, plan.side_m + 0.04)
@@ -88,17 +88,17 @@ def _anchors(plan: Plan, at_m: float) -> Mesh:
     return boxes(places, [size_m], plan.dressed)
 
 
-def _portal(plan: Plan, top_m: float, thick_m: float, material: int, crossings: int) -> Mesh:
+def _portal(plan: BridgePlan, top_m: float, thick_m: float, material: int, crossings: int) -> Mesh:
     """Two tapering legs beside the road, joined below it and crossings times above."""
     y = plan.side_m + 0.04 + thick_m / 2
     legs = [_leg((0, side * (y + 0.06), 0.2), (0, side * y, top_m), thick_m, material) for side in (-1, 1)]
     heights = [plan.level_m - 0.22, *np.linspace(top_m - 0.1, plan.level_m + 0.85, crossings)]
     bars = boxes([[0, 0, z] for z in heights], [[0.7 * thick_m, 2 * y, 0.13]], material)
     caps = boxes([[0, side * y, top_m] for side in (-1, 1)], [[1.5 * thick_m, 1.5 * thick_m, 0.07]], material)
-    return joined([*legs, bars, caps])
+    return join_meshes([*legs, bars, caps])
 
 
-def _leaning(plan: Plan, top_m: float) -> Mesh:
+def _leaning(plan: BridgePlan, top_m: float) -> Mesh:
     """Two legs that meet in a mast above the road."""
     fork_m = _fork_m(plan, top_m)
     foot_y = plan.side_m + 0.3
@@ -106,14 +106,14 @@ def _leaning(plan: Plan, top_m: float) -> Mesh:
     mast = _leg((0, 0, fork_m - 0.12), (0, 0, top_m + 0.08), 0.2, plan.dressed)
     share = (plan.level_m - 0.42) / (fork_m - 0.2)
     below = boxes([[0, 0, plan.level_m - 0.22]], [[0.14, 2 * foot_y * (1 - share) + 0.1, 0.14]], plan.dressed)
-    return joined([*legs, mast, below])
+    return join_meshes([*legs, mast, below])
 
 
-def _fork_m(plan: Plan, top_m: float) -> float:
+def _fork_m(plan: BridgePlan, top_m: float) -> float:
     return plan.level_m + 0.62 * (top_m - plan.level_m)
 
 
-def _inset(plan: Plan, z: np.ndarray, top_m: float) -> np.ndarray:
+def _inset(plan: BridgePlan, z: np.ndarray, top_m: float) -> np.ndarray:
     """How far from the axis the cables end at heights z of a leaning tower."""
     fork_m = _fork_m(plan, top_m)
     return 0.05 + np.clip((fork_m - z) / (fork_m - 0.2), 0, 1) * (plan.side_m + 0.25)

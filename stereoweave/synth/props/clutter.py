@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from stereoweave.synth.props.furniture import FURNITURE
-from stereoweave.synth.props.primitives import turn
-from stereoweave.synth.props.random_materials import surface
-from stereoweave.synth.props.solids import SOLIDS, Skin, Thing
+from stereoweave.synth.props.primitives import rotation
+from stereoweave.synth.props.random_materials import draw_material
+from stereoweave.synth.props.solids import SOLIDS, PropBuilder, PropStyle
 from stereoweave.synth.props.thin_things import THIN
 from stereoweave.synth.stage import Palette
 from stereoweave.synth.viewpoints import Orbit
@@ -26,7 +26,7 @@ _CLEAR_M = 0.6  # between a camera and what is nearest
 
 
 @dataclass(frozen=True, kw_only=True)
-class Space:
+class ClutterSpace:
     """Where things may be.
 
     Attributes:
@@ -59,7 +59,7 @@ class Space:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Place:
+class _Placement:
     """Where a thing goes and how large it is; distance_m is from the nearest camera."""
 
     middle_m: Float[np.ndarray, "3"]
@@ -68,18 +68,18 @@ class _Place:
     standing: bool
 
 
-def clutter(rng: np.random.Generator, palette: Palette, space: Space) -> list[Mesh]:
+def clutter(rng: np.random.Generator, palette: Palette, space: ClutterSpace) -> list[Mesh]:
     """15 to 40 things of 5 cm to 1.5 m; in half of the draws many of them are 1 to 6 px thin."""
     count = int(rng.integers(space.count[0], space.count[1] + 1))
     thin_share = rng.uniform(0.25, 0.5) if rng.random() < 0.5 else 0.0
     bars_px = _log_uniform(rng, *_THIN_PX, (count,))
     things, skins = [], []
-    for place, bar_px in zip(_places(rng, space, count), bars_px, strict=True):
-        skins.append(palette.add(surface(rng, place.distance_m)))
+    for place, bar_px in zip(_draw_placements(rng, space, count), bars_px, strict=True):
+        skins.append(palette.add(draw_material(rng, place.distance_m)))
         bar_m = bar_px / 2 * place.distance_m / _TYPICAL_FOCAL_PX
         other = skins[rng.integers(len(skins))]
-        skin = Skin(main=skins[-1], other=other, bar_m=min(float(bar_m / place.size_m), 0.05))
-        things.append(_set(rng, _kind(rng, thin_share)(rng, skin), place, float(space.low_m[2])))
+        style = PropStyle(main=skins[-1], other=other, bar_m=min(float(bar_m / place.size_m), 0.05))
+        things.append(_place_mesh(rng, _draw_kind(rng, thin_share)(rng, style), place, float(space.low_m[2])))
     return things
 
 
@@ -87,14 +87,14 @@ def _log_uniform(rng: np.random.Generator, low: float, high: float, shape: tuple
     return np.exp(rng.uniform(np.log(low), np.log(high), shape))
 
 
-def _kind(rng: np.random.Generator, thin_share: float) -> Thing:
+def _draw_kind(rng: np.random.Generator, thin_share: float) -> PropBuilder:
     """One of all kinds; thin ones as often as asked for."""
     others = SOLIDS if rng.random() < 0.65 else FURNITURE
     kinds = THIN if rng.random() < thin_share else others
     return kinds[rng.integers(len(kinds))]
 
 
-def _places(rng: np.random.Generator, space: Space, count: int) -> list[_Place]:
+def _draw_placements(rng: np.random.Generator, space: ClutterSpace, count: int) -> list[_Placement]:
     """Where things go, the seemingly largest first, while there is room.
 
     Each takes the best of some candidates: away from all cameras is a must, apart from the rest is not.
@@ -105,7 +105,7 @@ def _places(rng: np.random.Generator, space: Space, count: int) -> list[_Place]:
     standing = rng.random(count) < space.standing
     depths_m = _log_uniform(rng, _NEAREST_M, space.far_m, shape)
     sizes_m = np.clip(sizes[:, None] * depths_m, *_SIZES_M)
-    spots = _seen_at(rng, space, eyes_m[rng.integers(len(eyes_m), size=shape)], depths_m)
+    spots = _points_in_view(rng, space, eyes_m[rng.integers(len(eyes_m), size=shape)], depths_m)
     half_m = 0.45 * sizes_m[..., None]
     spots = np.clip(spots, space.low_m + half_m, space.high_m - half_m)
     spots[standing, :, 2] = space.low_m[2] + sizes_m[standing] / 2
@@ -118,7 +118,7 @@ def _places(rng: np.random.Generator, space: Space, count: int) -> list[_Place]:
         size_m = min(sizes_m[k, best], max(clear_m[k, best] - _CLEAR_M, 0.03) / 0.55)
         taken[k], radii_m[k] = spots[k, best], 0.4 * size_m
         places.append(
-            _Place(
+            _Placement(
                 middle_m=spots[k, best],
                 distance_m=float(clear_m[k, best]),
                 size_m=float(size_m),
@@ -128,9 +128,9 @@ def _places(rng: np.random.Generator, space: Space, count: int) -> list[_Place]:
     return places
 
 
-def _seen_at(
+def _points_in_view(
     rng: np.random.Generator,
-    space: Space,
+    space: ClutterSpace,
     eyes_m: Float[np.ndarray, "n k 3"],
     depths_m: Float[np.ndarray, "n k"],
 ) -> Float[np.ndarray, "n k 3"]:
@@ -146,14 +146,14 @@ def _seen_at(
     return eyes_m + depths_m[..., None] * seen
 
 
-def _set(rng: np.random.Generator, mesh: Mesh, place: _Place, floor_m: float) -> Mesh:
+def _place_mesh(rng: np.random.Generator, mesh: Mesh, place: _Placement, floor_m: float) -> Mesh:
     """The mesh turned and scaled to its size, texture too, around its place or on the floor under it."""
     low, high = mesh.corners_m.min((0, 1)), mesh.corners_m.max((0, 1))
     scale = place.size_m / float((high - low).max())
     axis = np.array([0, 0, 1]) if place.standing else rng.normal(size=3)
-    pose = turn(tuple(axis.tolist()), rng.uniform(0, 360))
+    pose = rotation(tuple(axis.tolist()), rng.uniform(0, 360))
     pose[:3, :3] *= scale
     pose[:3, 3] = place.middle_m - pose[:3, :3] @ ((low + high) / 2)
     if place.standing:
         pose[2, 3] = floor_m - scale * float(low[2])
-    return replace(mesh.placed(pose), uv_m=mesh.uv_m * np.float32(scale))
+    return replace(mesh.transform(pose), uv_m=mesh.uv_m * np.float32(scale))

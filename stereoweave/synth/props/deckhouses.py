@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.synth.props.lattice import towards
+from stereoweave.synth.props.lattice import poses_towards
 from stereoweave.synth.props.primitives import (
     Point,
     Points,
@@ -14,11 +14,11 @@ from stereoweave.synth.props.primitives import (
     facets,
     lathe,
     loft,
+    rotation,
     spheres,
     tubes,
-    turn,
 )
-from stereoweave.synth.world import Mesh, joined
+from stereoweave.synth.world import Mesh, join_meshes
 
 Quads = Float[np.ndarray, "n 4 3"]
 
@@ -27,7 +27,7 @@ _FRAME_M, _GLASS_M = 0.006, 0.012
 
 
 @dataclass(frozen=True, kw_only=True)
-class Paints:
+class ShipMaterials:
     """Materials of a ship.
 
     Attributes:
@@ -89,7 +89,7 @@ class House:
     def mesh(self, walls: int, roof: int, eaves_m: float = 0.05) -> Mesh:
         """Walls, and a roof that stands out over them."""
         _, top = self.corners_m(eaves_m)
-        return joined([_quads(self.walls_m(), walls), slab(top, top + [0, 0, 0.05], roof)])
+        return join_meshes([_quads(self.walls_m(), walls), slab(top, top + [0, 0, 0.05], roof)])
 
 
 def slab(low_m: Points, high_m: Points, material: int) -> Mesh:
@@ -99,7 +99,11 @@ def slab(low_m: Points, high_m: Points, material: int) -> Mesh:
 
 
 def windows(
-    wall_m: Float[np.ndarray, "4 3"], count: int, band: tuple[float, float], paints: Paints, gap: float = 0.25
+    wall_m: Float[np.ndarray, "4 3"],
+    count: int,
+    band: tuple[float, float],
+    materials: ShipMaterials,
+    gap: float = 0.25,
 ) -> Mesh:
     """A row of panes in frames on a wall, between two shares of its height."""
     edges = np.linspace(0.06, 0.94, count + 1)
@@ -107,23 +111,25 @@ def windows(
     left, right = edges[:-1] + half, edges[1:] - half
     frame_share = 0.08 * (right - left)[:1]
     tall = 0.08 * (band[1] - band[0])
-    frames = _lifted(
+    frames = _quads_on_wall(
         wall_m, (left - frame_share, right + frame_share), (band[0] - tall, band[1] + tall), _FRAME_M
     )
-    panes = _lifted(wall_m, (left, right), band, _GLASS_M)
-    return joined([_quads(frames, paints.dark), _quads(panes, paints.glass)])
+    panes = _quads_on_wall(wall_m, (left, right), band, _GLASS_M)
+    return join_meshes([_quads(frames, materials.dark), _quads(panes, materials.glass)])
 
 
-def door(wall_m: Float[np.ndarray, "4 3"], at: float, paints: Paints) -> Mesh:
+def door(wall_m: Float[np.ndarray, "4 3"], at: float, materials: ShipMaterials) -> Mesh:
     """A door with a small window, at a share of a wall's length."""
     length, height = (float(np.linalg.norm(wall_m[k] - wall_m[0])) for k in (1, 3))
     half = 0.3 * min(height, 1.0) / length
-    leaf = _lifted(wall_m, (np.array([at - half]), np.array([at + half])), (0.06, 0.82), _FRAME_M)
-    pane = _lifted(wall_m, (np.array([at - half / 2]), np.array([at + half / 2])), (0.55, 0.72), _GLASS_M)
-    return joined([_quads(leaf, paints.trim), _quads(pane, paints.glass)])
+    leaf = _quads_on_wall(wall_m, (np.array([at - half]), np.array([at + half])), (0.06, 0.82), _FRAME_M)
+    pane = _quads_on_wall(
+        wall_m, (np.array([at - half / 2]), np.array([at + half / 2])), (0.55, 0.72), _GLASS_M
+    )
+    return join_meshes([_quads(leaf, materials.trim), _quads(pane, materials.glass)])
 
 
-def funnel(foot_m: Point, size_m: tuple[float, float, float], paints: Paints) -> Mesh:
+def funnel(foot_m: Point, size_m: tuple[float, float, float], materials: ShipMaterials) -> Mesh:
     """An oval funnel that leans aft, with a band and a dark top; size_m: length, width, height."""
     length, width, height = size_m
     angle = np.linspace(0, 2 * np.pi, 28, endpoint=False)
@@ -132,74 +138,80 @@ def funnel(foot_m: Point, size_m: tuple[float, float, float], paints: Paints) ->
     def ring(share: float) -> Points:
         return foot_m + oval * (1 - 0.12 * share) + [-0.22 * height * share, 0, height * share]
 
-    bands = ((0, 0.42, paints.house), (0.42, 0.72, paints.trim), (0.72, 1, paints.dark))
+    bands = ((0, 0.42, materials.house), (0.42, 0.72, materials.trim), (0.72, 1, materials.dark))
     body = [loft(np.stack([ring(a), ring(b)]), paint) for a, b, paint in bands]
     top = foot_m + [-0.22 * height, 0, height]
     pipes = tubes(
         top + np.array([[0.15 * length, 0, -0.1], [-0.15 * length, 0, -0.1]]),
         top + np.array([[0.1 * length, 0, 0.14], [-0.25 * length, 0, 0.16]]),
         0.045,
-        paints.dark,
+        materials.dark,
         sides=12,
     )
-    return joined([*body, pipes])
+    return join_meshes([*body, pipes])
 
 
-def mast(rng: np.random.Generator, foot_m: Point, height_m: float, paints: Paints) -> Mesh:
+def ship_mast(rng: np.random.Generator, foot_m: Point, height_m: float, materials: ShipMaterials) -> Mesh:
     """A mast with crosstrees, radars, lights and aerials."""
     top = foot_m + [-0.06 * height_m, 0, height_m]
-    pole = tubes(foot_m, top, np.array([[0.06, 0.03]]), paints.white, sides=14)
+    pole = tubes(foot_m, top, np.array([[0.06, 0.03]]), materials.white, sides=14)
     legs = tubes(
         foot_m + np.array([[-0.45, 0.3, 0], [-0.45, -0.3, 0]]),
         foot_m + 0.75 * (top - foot_m),
         0.022,
-        paints.white,
+        materials.white,
     )
     levels = np.array([0.5, 0.72, 0.9])
     at = foot_m + levels[:, None] * (top - foot_m)
     reach = np.array([[0, 0.55, 0], [0, 0.4, 0], [0, 0.28, 0]])
-    yards = tubes(at - reach, at + reach, 0.016, paints.white)
+    yards = tubes(at - reach, at + reach, 0.016, materials.white)
     whips = np.concatenate([at - reach, at + reach, [top]])
-    aerials = tubes(whips, whips + [0, 0, 1] * rng.uniform(0.25, 0.8, (7, 1)), 0.007, paints.white, sides=5)
-    lights = spheres(at + [0.05, 0, 0.06], 0.035, paints.glass, 1)
-    ball = spheres(at[0] + [0.0, 0.35, 0.14], 0.12, paints.white, 2)
-    return joined([pole, legs, yards, aerials, lights, ball, _radar(rng, at[1] + [0.14, 0, 0.04], paints)])
+    aerials = tubes(
+        whips, whips + [0, 0, 1] * rng.uniform(0.25, 0.8, (7, 1)), 0.007, materials.white, sides=5
+    )
+    lights = spheres(at + [0.05, 0, 0.06], 0.035, materials.glass, 1)
+    ball = spheres(at[0] + [0.0, 0.35, 0.14], 0.12, materials.white, 2)
+    return join_meshes(
+        [pole, legs, yards, aerials, lights, ball, _radar(rng, at[1] + [0.14, 0, 0.04], materials)]
+    )
 
 
-def _radar(rng: np.random.Generator, at_m: Point, paints: Paints) -> Mesh:
+def _radar(rng: np.random.Generator, at_m: Point, materials: ShipMaterials) -> Mesh:
     """A turning bar on a pedestal, on a bracket before the mast."""
-    spin = turn((0, 0, 1), rng.uniform(0, 180))[None, :3, :3]
-    bar = boxes(at_m + [0, 0, 0.14], (0.07, 0.75, 0.07), paints.white, spin)
-    bracket = boxes(at_m + [-0.06, 0, -0.02], (0.24, 0.1, 0.03), paints.white)
-    return joined([bar, bracket, lathe([(0.07, 0), (0.05, 0.1), (0, 0.1)], paints.white, 12).moved(*at_m)])
+    spin = rotation((0, 0, 1), rng.uniform(0, 180))[None, :3, :3]
+    bar = boxes(at_m + [0, 0, 0.14], (0.07, 0.75, 0.07), materials.white, spin)
+    bracket = boxes(at_m + [-0.06, 0, -0.02], (0.24, 0.1, 0.03), materials.white)
+    return join_meshes(
+        [bar, bracket, lathe([(0.07, 0), (0.05, 0.1), (0, 0.1)], materials.white, 12).translate(*at_m)]
+    )
 
 
-def stays(tops_m: Points, feet_m: Points, paints: Paints) -> Mesh:
+def stays(tops_m: Points, feet_m: Points, materials: ShipMaterials) -> Mesh:
     """Wires from points to points."""
-    return tubes(tops_m, feet_m, 0.006, paints.steel, sides=4)
+    return tubes(tops_m, feet_m, 0.006, materials.steel, sides=4)
 
 
-def lifebuoys(at_m: Points, outwards: Points, paints: Paints) -> Mesh:
+def lifebuoys(at_m: Points, outwards: Points, materials: ShipMaterials) -> Mesh:
     """Rings of four orange and four white pieces, flat against what is behind them."""
     angle = np.linspace(0, 2 * np.pi, 9)
     ring = lathe(
-        np.stack([0.15 + 0.04 * np.cos(angle), 0.04 * np.sin(angle)], -1), paints.orange, sections=24
+        np.stack([0.15 + 0.04 * np.cos(angle), 0.04 * np.sin(angle)], -1), materials.orange, sections=24
     )
     x, y, _ = ring.corners_m.mean(1).T
     white = np.arctan2(y, x) % (np.pi / 2) < np.pi / 6
-    ring = replace(ring, material=np.where(white, paints.white, ring.material).astype(np.int32))
-    return copies(ring, towards(at_m, outwards))
+    ring = replace(ring, material=np.where(white, materials.white, ring.material).astype(np.int32))
+    return copies(ring, poses_towards(at_m, outwards))
 
 
-def tyres(at_m: Points, along: Points, paints: Paints) -> Mesh:
+def tyres(at_m: Points, along: Points, materials: ShipMaterials) -> Mesh:
     """Car tyres that hang flat against the hull; along: the direction that the hull runs in."""
     angle = np.linspace(0, 2 * np.pi, 9)
     profile = np.stack([0.17 + 0.055 * np.cos(angle), 0.06 * np.sin(angle)], -1)
-    tyre = lathe(profile, paints.dark, sections=18)
-    return copies(tyre, towards(at_m, np.cross(along, [0.0, 0.0, 1.0])))
+    tyre = lathe(profile, materials.dark, sections=18)
+    return copies(tyre, poses_towards(at_m, np.cross(along, [0.0, 0.0, 1.0])))
 
 
-def _lifted(
+def _quads_on_wall(
     wall_m: Float[np.ndarray, "4 3"],
     across: tuple[np.ndarray, np.ndarray],
     up: tuple[float, float],

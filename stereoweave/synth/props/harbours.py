@@ -4,11 +4,11 @@ import numpy as np
 
 from stereoweave.synth.props import surroundings
 from stereoweave.synth.props.hulls import Hull
-from stereoweave.synth.props.lattice import cables, galvanised, ladder, painted
-from stereoweave.synth.props.primitives import Points, boxes, copies, lathe, shift, tubes, turn
-from stereoweave.synth.props.surroundings import places, varied
+from stereoweave.synth.props.lattice import cables, galvanised_steel, ladder, painted_steel
+from stereoweave.synth.props.primitives import Points, boxes, copies, lathe, rotation, translation, tubes
+from stereoweave.synth.props.surroundings import draw_spots, vary_colour
 from stereoweave.synth.stage import Palette
-from stereoweave.synth.world import Material, Mesh, joined
+from stereoweave.synth.world import Material, Mesh, join_meshes
 
 _BOLLARDS_M = np.array([-5.2, -1.0, 1.2, 6.0, -14.0, 14.0])
 
@@ -19,23 +19,23 @@ def open_water(rng: np.random.Generator, palette: Palette) -> Mesh:
         surroundings.sea(rng, palette),
         surroundings.hills(rng, palette, distance_m=rng.uniform(110, 170)),
     ]
-    pieces.append(_buoys(rng, palette, places(rng, 5, 16, 60)))
-    return joined(pieces)
+    pieces.append(_buoys(rng, palette, draw_spots(rng, 5, 16, 60)))
+    return join_meshes(pieces)
 
 
 def _buoys(rng: np.random.Generator, palette: Palette, spots: Points) -> Mesh:
     """Red and green buoys, leaning in the current."""
     kinds = []
     for colour in ((0.5, 0.08, 0.06), (0.08, 0.3, 0.14)):
-        paint = palette.add(painted(rng, colour))
+        paint = palette.add(painted_steel(rng, colour))
         body = lathe(
             [(0, -0.3), (0.6, -0.3), (0.65, 0.25), (0.2, 0.4), (0.12, 1.5), (0.3, 1.5), (0.02, 2.1)],
             paint,
             20,
         )
-        kinds.append(body.placed(turn((1, 0.4, 0), rng.uniform(-9, 9))))
-    return joined(
-        [copies(kind, np.stack([shift(*spot) for spot in spots[k::2]])) for k, kind in enumerate(kinds)]
+        kinds.append(body.transform(rotation((1, 0.4, 0), rng.uniform(-9, 9))))
+    return join_meshes(
+        [copies(kind, np.stack([translation(*spot) for spot in spots[k::2]])) for k, kind in enumerate(kinds)]
     )
 
 
@@ -46,7 +46,7 @@ def harbour(rng: np.random.Generator, palette: Palette, hull: Hull) -> Mesh:
         Material(
             texture=str(rng.choice(["concrete", "asphalt", "stone"])),
             variant=int(rng.integers(64)),
-            tint=varied(rng, (0.85, 0.83, 0.8)),
+            tint=vary_colour(rng, (0.85, 0.83, 0.8)),
             span_m=6.0,
         )
     )
@@ -59,7 +59,7 @@ def harbour(rng: np.random.Generator, palette: Palette, hull: Hull) -> Mesh:
         )
     )
     rope = palette.add(Material(texture="cloth", variant=1, tint=(1.5, 1.4, 1.2), span_m=0.3))
-    iron = palette.add(galvanised(rng))
+    iron = palette.add(galvanised_steel(rng))
     quay = boxes(
         [(0, edge_m - 60, top_m - 3), (0, edge_m - 0.2, top_m - 3.0)], [(240, 120, 6), (240, 0.5, 6.04)], wall
     )
@@ -76,8 +76,8 @@ def harbour(rng: np.random.Generator, palette: Palette, hull: Hull) -> Mesh:
         palette.add(Material(texture="wood", tint=(0.5, 0.45, 0.4))),
         10,
     )
-    things = _on_quay(rng, palette, edge_m).moved(z=top_m)
-    return joined(
+    things = _on_quay(rng, palette, edge_m).translate(z=top_m)
+    return join_meshes(
         [
             surroundings.sea(rng, palette),
             quay,
@@ -109,17 +109,17 @@ def _on_quay(rng: np.random.Generator, palette: Palette, edge_m: float) -> Mesh:
     ]
     house_x = np.arange(-44, 45, 14.0)
     rows = np.stack([house_x + rng.normal(0, 1.5, 7), edge_m - rng.uniform(14, 24, 7), np.zeros(7)], -1)
-    trees = places(rng, 24, 28, 80)
+    trees = draw_spots(rng, 24, 28, 80)
     lamp_x = np.arange(-22, 23, 11.0)
     lamps = np.stack([lamp_x, np.full(5, edge_m - 1.8), np.zeros(5)], -1)
-    steel = palette.add(galvanised(rng))
-    return joined(
+    steel = palette.add(galvanised_steel(rng))
+    return join_meshes(
         [
             surroundings.bollards(rng, palette, beside),
             *things,
             surroundings.houses(rng, palette, rows),
             surroundings.trees(rng, palette, trees[trees[:, 1] < edge_m - 26]),
-            surroundings.hills(rng, palette, distance_m=120).moved(z=-1),
+            surroundings.hills(rng, palette, distance_m=120).translate(z=-1),
             tubes(lamps, lamps + [0, 0, 4.6], 0.05, steel, 8),
             tubes(lamps + [0, 0, 4.6], lamps + [0, 0.9, 4.7], 0.035, steel, 6),
         ]

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from stereoweave.synth.props.primitives import sheet, sweep
-from stereoweave.synth.world import Mesh, joined
+from stereoweave.synth.world import Mesh, join_meshes
 
 Values = float | np.ndarray
 
@@ -78,7 +78,7 @@ class Hull:
         paint[:10], paint[10] = bottom, stripe
         cells = np.concatenate([paint[:0:-1], [bottom, bottom], paint[1:]])
         material = np.broadcast_to(cells[None, :, None], (60, len(cells), 2)).ravel()
-        return joined([replace(skin, material=material.astype(np.int32)), self._transom(z[0], paint)])
+        return join_meshes([replace(skin, material=material.astype(np.int32)), self._transom(z[0], paint)])
 
     def deck(self, planks: int, inside: int, rail: int) -> Mesh:
         """The deck, the bulwark's inside and the rail on its edge."""
@@ -94,7 +94,7 @@ class Hull:
             )
             walls.append(sheet(np.stack([foot, top])[::side], inside))
             rails.append(sweep(self.side_m(share, edge, side), 0.022, rail, sides=6))
-        return joined([floor, *walls, *rails])
+        return join_meshes([floor, *walls, *rails])
 
     def patch(self, stations: tuple[int, int], levels: tuple[int, int], side: int, material: int) -> Mesh:
         """A plate on the skin, over some of its 60 cells along and, from the stripe up, 7 cells high."""

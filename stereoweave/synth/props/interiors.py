@@ -7,10 +7,15 @@ from jaxtyping import Float
 
 from stereoweave.synth.props.furniture import shelf
 from stereoweave.synth.props.primitives import boxes, lathe, sheet, spheres, tubes
-from stereoweave.synth.props.random_materials import broad, chosen, muted, surface
-from stereoweave.synth.props.solids import Skin
+from stereoweave.synth.props.random_materials import (
+    draw_broad_material,
+    draw_material,
+    draw_material_from,
+    draw_muted_colour,
+)
+from stereoweave.synth.props.solids import PropStyle
 from stereoweave.synth.stage import Palette
-from stereoweave.synth.world import Colour, Lamp, Material, Mesh, Sky, joined
+from stereoweave.synth.world import Colour, Lamp, Material, Mesh, Sky, join_meshes
 
 Corner = tuple[float, float, float]
 Hanging = Callable[[np.random.Generator, Palette, float, float, int], Mesh]
@@ -34,39 +39,39 @@ def shell(
     """
     x, y, height_m = (float(v) for v in size_m)
     distance_m = 0.6 * max(x, y)
-    floor = palette.add(broad(rng, _FLOORS, distance_m))
+    floor = palette.add(draw_broad_material(rng, _FLOORS, distance_m))
     parts = [_panel(rng, (-x / 2, -y / 2, 0), (x, 0, 0), (0, y, 0), floor)]
     if not open_roof:
-        ceiling = palette.add(broad(rng, _CEILINGS, distance_m))
+        ceiling = palette.add(draw_broad_material(rng, _CEILINGS, distance_m))
         parts.append(_panel(rng, (-x / 2, y / 2, height_m), (x, 0, 0), (0, -y, 0), ceiling))
-    common = palette.add(broad(rng, _WALLS, distance_m))
-    trim = palette.add(chosen(rng, ("wood", "paint", "plain"), distance_m))
+    common = palette.add(draw_broad_material(rng, _WALLS, distance_m))
+    trim = palette.add(draw_material_from(rng, ("wood", "paint", "plain"), distance_m))
     for side in range(4):
         if side == open_side:
             continue
-        wall = common if rng.random() < 0.6 else palette.add(broad(rng, _WALLS, distance_m))
+        wall = common if rng.random() < 0.6 else palette.add(draw_broad_material(rng, _WALLS, distance_m))
         length_m, away_m = (y, x / 2) if side % 2 == 0 else (x, y / 2)
         panel = _panel(rng, (-length_m / 2, 0, 0), (0, 0, height_m), (length_m, 0, 0), wall)
         skirting = boxes([[0, 0.01, 0.05]], [[length_m, 0.05, 0.1]], trim)
-        on_it = _hung(rng, palette, length_m, height_m, trim)
-        parts.append(joined([panel, skirting, *on_it]).placed(_towards_room(side, away_m)))
-    return joined(parts)
+        on_it = _hang_on_wall(rng, palette, length_m, height_m, trim)
+        parts.append(join_meshes([panel, skirting, *on_it]).transform(_wall_pose(side, away_m)))
+    return join_meshes(parts)
 
 
 def pendants(
     rng: np.random.Generator, palette: Palette, spots_m: Float[np.ndarray, "n 3"], ceiling_m: float
 ) -> Mesh:
     """Shades with glowing bulbs at the spots, on cords from the ceiling."""
-    shade = palette.add(Material(texture="plain", tint=muted(rng, 0.4), roughness=0.5))
+    shade = palette.add(Material(texture="plain", tint=draw_muted_colour(rng, 0.4), roughness=0.5))
     bulb = palette.add(Material(texture="plain", tint=(1.0, 0.95, 0.85), glow=4.0))
     wide_m, high_m = rng.uniform(0.1, 0.25), rng.uniform(0.1, 0.25)
     outside, inside = [[1.0, -0.3], [0.7, 0.3], [0.12, 1.0]], [[0.08, 1.0], [0.65, 0.27], [0.95, -0.3]]
     body = lathe(np.array(outside + inside) * [wide_m, high_m], shade, 36)
     cords = tubes(spots_m + [0, 0, high_m], spots_m * [1, 1, 0] + [0, 0, ceiling_m], 0.006, shade)
-    return joined([*(body.moved(*spot) for spot in spots_m), cords, spheres(spots_m, 0.05, bulb)])
+    return join_meshes([*(body.translate(*spot) for spot in spots_m), cords, spheres(spots_m, 0.05, bulb)])
 
 
-def lamps_at(rng: np.random.Generator, spots_m: Float[np.ndarray, "n 3"]) -> tuple[Lamp, ...]:
+def draw_lamps(rng: np.random.Generator, spots_m: Float[np.ndarray, "n 3"]) -> tuple[Lamp, ...]:
     """Lamps of one room, warm or cold, one of them often the strongest."""
     warm = rng.uniform(0, 1)
     colour = np.array([1.0, 0.95 - 0.2 * warm, 0.92 - 0.5 * warm])
@@ -78,7 +83,7 @@ def lamps_at(rng: np.random.Generator, spots_m: Float[np.ndarray, "n 3"]) -> tup
     )
 
 
-def lamp_spots(
+def draw_lamp_spots(
     rng: np.random.Generator, size_m: Float[np.ndarray, "3"], eyes_m: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Spots of one to four lamps in the upper part of a room, away from the cameras."""
@@ -116,7 +121,7 @@ def _panel(rng: np.random.Generator, origin: Corner, along: Corner, up: Corner, 
     )
 
 
-def _towards_room(side: int, away_m: float) -> Float[np.ndarray, "4 4"]:
+def _wall_pose(side: int, away_m: float) -> Float[np.ndarray, "4 4"]:
     """From a wall's x along it, y into the room, z up to the room's coordinates."""
     angle = side * np.pi / 2
     inwards = -np.array([np.cos(angle), np.sin(angle), 0])
@@ -126,7 +131,7 @@ def _towards_room(side: int, away_m: float) -> Float[np.ndarray, "4 4"]:
     return pose
 
 
-def _hung(
+def _hang_on_wall(
     rng: np.random.Generator, palette: Palette, length_m: float, height_m: float, trim: int
 ) -> list[Mesh]:
     """What is on one wall, each in its own stretch of it."""
@@ -137,7 +142,7 @@ def _hung(
     for k in range(count):
         kind = kinds[rng.choice(len(kinds), p=[0.2, 0.12, 0.28, 0.2, 0.1, 0.1])]
         mesh = kind(rng, palette, min(stretch_m * 0.8, 1.8), height_m, trim)
-        hung.append(mesh.moved(x=(k + 0.5) * stretch_m - length_m / 2))
+        hung.append(mesh.translate(x=(k + 0.5) * stretch_m - length_m / 2))
     return hung
 
 
@@ -148,7 +153,7 @@ def _frame(width_m: float, low_m: float, high_m: float, bar_m: float, trim: int)
     upright = boxes(
         [[x, 0.02, middle_m] for x in (-width_m / 2, width_m / 2)], [bar_m, 0.08, tall_m - bar_m], trim
     )
-    return joined([level, upright])
+    return join_meshes([level, upright])
 
 
 def _window(rng: np.random.Generator, palette: Palette, width_m: float, height_m: float, trim: int) -> Mesh:
@@ -171,16 +176,16 @@ def _window(rng: np.random.Generator, palette: Palette, width_m: float, height_m
         trim,
     )
     sill = boxes([[0, 0.09, low_m - 0.05]], [width_m + 0.2, 0.22, 0.04], trim)
-    return joined([pane, bars, sill, _frame(width_m, low_m, high_m, 0.07, trim)])
+    return join_meshes([pane, bars, sill, _frame(width_m, low_m, high_m, 0.07, trim)])
 
 
 def _door(rng: np.random.Generator, palette: Palette, width_m: float, height_m: float, trim: int) -> Mesh:
     """A panelled door with a handle."""
     width_m, high_m = min(width_m, 0.95), min(height_m - 0.15, 2.05)
-    leaf = palette.add(chosen(rng, ("wood", "paint", "plain"), 4.0))
+    leaf = palette.add(draw_material_from(rng, ("wood", "paint", "plain"), 4.0))
     panels = boxes([[0, 0.04, z * high_m] for z in (0.27, 0.72)], [0.7 * width_m, 0.03, 0.36 * high_m], leaf)
     handle = tubes([[0.4 * width_m, 0.1, 1.02]], [[0.27 * width_m, 0.1, 1.02]], 0.012, trim, 8)
-    return joined(
+    return join_meshes(
         [
             boxes([[0, 0.02, high_m / 2]], [width_m, 0.04, high_m], leaf),
             panels,
@@ -194,16 +199,16 @@ def _poster(rng: np.random.Generator, palette: Palette, width_m: float, height_m
     """A poster or a framed picture at eye level."""
     width_m, tall_m = width_m * rng.uniform(0.4, 0.9), rng.uniform(0.4, 1.2)
     low_m = min(1.55, 0.55 * height_m) - tall_m / 2
-    face = palette.add(chosen(rng, ("photograph", "photograph", "sign", "cloth"), tall_m * 3))
+    face = palette.add(draw_material_from(rng, ("photograph", "photograph", "sign", "cloth"), tall_m * 3))
     print_ = boxes([[0, 0.015, low_m + tall_m / 2]], [width_m, 0.02, tall_m], face)
-    return joined([print_, _frame(width_m, low_m, low_m + tall_m, rng.uniform(0.02, 0.06), trim)])
+    return join_meshes([print_, _frame(width_m, low_m, low_m + tall_m, rng.uniform(0.02, 0.06), trim)])
 
 
 def _shelves(rng: np.random.Generator, palette: Palette, width_m: float, height_m: float, trim: int) -> Mesh:
     """A rack of books that stands at the wall."""
-    skin = Skin(main=trim, other=palette.add(surface(rng, 4.0)), bar_m=0.01)
+    skin = PropStyle(main=trim, other=palette.add(draw_material(rng, 4.0)), bar_m=0.01)
     pose = np.diag([width_m / 0.75, 1.2, min(0.8 * height_m, rng.uniform(0.8, 2.2)), 1.0])
-    return shelf(rng, skin).placed(pose).moved(y=0.2)
+    return shelf(rng, skin).transform(pose).translate(y=0.2)
 
 
 def _radiator(rng: np.random.Generator, palette: Palette, width_m: float, height_m: float, trim: int) -> Mesh:
@@ -215,14 +220,14 @@ def _radiator(rng: np.random.Generator, palette: Palette, width_m: float, height
     pipes = tubes(
         [[x[0], 0.09, z] for z in (0.18, 0.72)], [[x[-1], 0.09, z] for z in (0.18, 0.72)], 0.03, trim, 10
     )
-    return joined([ribs, pipes])
+    return join_meshes([ribs, pipes])
 
 
 def _curtain(rng: np.random.Generator, palette: Palette, width_m: float, height_m: float, trim: int) -> Mesh:
     """Cloth in folds from a rod."""
-    cloth = palette.add(chosen(rng, ("cloth", "plain", "photograph"), 4.0))
+    cloth = palette.add(draw_material_from(rng, ("cloth", "plain", "photograph"), 4.0))
     high_m = min(height_m - 0.1, 2.4)
     x, z = np.meshgrid(np.linspace(-0.5, 0.5, 60) * width_m, np.linspace(0.05, high_m, 14))
     folds = 0.04 * np.sin(x * rng.uniform(25, 45) + 0.6 * np.sin(2 * z)) * (1.3 - 0.3 * z / high_m)
     rod = tubes([[-0.55 * width_m, 0.1, high_m]], [[0.55 * width_m, 0.1, high_m]], 0.015, trim, 8)
-    return joined([sheet(np.stack([-x, 0.1 + folds, z], -1), cloth), rod])
+    return join_meshes([sheet(np.stack([-x, 0.1 + folds, z], -1), cloth), rod])

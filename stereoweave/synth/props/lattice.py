@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.synth.props.primitives import Numbers, Points, copies, frames, lathe, tubes
-from stereoweave.synth.world import Colour, Material, Mesh, joined
+from stereoweave.synth.props.primitives import Numbers, Points, copies, lathe, orthogonal_frames, tubes
+from stereoweave.synth.world import Colour, Material, Mesh, join_meshes
 
 Segments = Float[np.ndarray, "_ 2 3"]
 Bracing = Literal["cross", "zigzag", "single"]
@@ -35,14 +35,14 @@ class Truss:
     def mesh(self, leg_radius_m: float, brace_radius_m: float, material: int, sides: int = 5) -> Mesh:
         """Round bars."""
         others = np.concatenate([self.struts, self.braces])
-        return joined(
+        return join_meshes(
             [
                 bars(self.legs, leg_radius_m, material, sides + 1, capped=False),
                 bars(others, brace_radius_m, material, sides, capped=False),
             ]
         )
 
-    def banded(
+    def banded_mesh(
         self,
         leg_radius_m: float,
         brace_radius_m: float,
@@ -50,7 +50,7 @@ class Truss:
         bands_m: tuple[float, float],
     ) -> Mesh:
         """Round bars, painted in turn by where their middle lies; bands_m: how long a band is in x, in z."""
-        return joined(
+        return join_meshes(
             self._within(band, len(materials), bands_m).mesh(leg_radius_m, brace_radius_m, material)
             for band, material in enumerate(materials)
         )
@@ -62,7 +62,7 @@ class Truss:
         return Truss(legs=chosen(self.legs), struts=chosen(self.struts), braces=chosen(self.braces))
 
 
-def levels(
+def mast_levels(
     stations_m: Sequence[float], widths_m: Sequence[float], ratio: float
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Heights of the joints of a tapering mast, and its width at each of them.
@@ -79,7 +79,7 @@ def levels(
     return joints, np.interp(joints, stations_m, widths_m)
 
 
-def rings(
+def mast_rings(
     heights_m: Float[np.ndarray, " k"], widths_m: float | Float[np.ndarray, " k"], corners: int = 4
 ) -> Float[np.ndarray, "k m 3"]:
     """Joints of an upright mast: at each height a square, its sides along x and y, or another polygon.
@@ -119,12 +119,12 @@ def bars(
     return tubes(segments_m[:, 0], segments_m[:, 1], radius_m, material, sides, capped)
 
 
-def chains(points_m: Float[np.ndarray, "n k 3"]) -> Segments:
+def chain_segments(points_m: Float[np.ndarray, "n k 3"]) -> Segments:
     """The segments from each point to the next of N polylines."""
     return _segments(points_m[:, :-1], points_m[:, 1:])
 
 
-def hanging(
+def sagging_points(
     starts_m: Numbers, ends_m: Numbers, sag_m: float | Float[np.ndarray, " n"], count: int = 12
 ) -> Float[np.ndarray, "n k 3"]:
     """Points along cables whose middle hangs sag_m below the straight line, a parabola: [N, count + 1, 3]."""
@@ -145,8 +145,8 @@ def cables(  # noqa: PLR0913, cables differ in so much
     count: int = 12,
 ) -> Mesh:
     """Cables [N] that hang between two points each."""
-    path = hanging(starts_m, ends_m, sag_m, count)
-    return bars(chains(path), radius_m, material, sides=5, capped=False)
+    path = sagging_points(starts_m, ends_m, sag_m, count)
+    return bars(chain_segments(path), radius_m, material, sides=5, capped=False)
 
 
 def ladder(
@@ -163,7 +163,7 @@ def ladder(
     share = (np.arange(count) + 0.5) / count
     middles = foot + share[:, None] * (head - foot)
     rails = np.stack([[foot - half, head - half], [foot + half, head + half]])
-    return joined(
+    return join_meshes(
         [
             bars(rails, 0.075 * width_m, material, sides=4),
             bars(_segments(middles - half, middles + half), 0.05 * width_m, material, sides=4, capped=False),
@@ -187,7 +187,7 @@ def cage(
     count = max(int(np.linalg.norm(head - foot) / (1.6 * width_m)), 1) + 1
     hoops = np.linspace(foot, head, count)[:, None] + bow
     strips = hoops[:, 1:-1].swapaxes(0, 1)
-    members = np.concatenate([chains(hoops), chains(strips)])
+    members = np.concatenate([chain_segments(hoops), chain_segments(strips)])
     return bars(members, 0.045 * width_m, material, sides=4, capped=False)
 
 
@@ -206,20 +206,20 @@ def railing(  # noqa: PLR0913, railings differ in so much
     )
     up = np.array([0.0, 0.0, height_m])
     heights = (np.arange(rails) + 1)[:, None, None] / rails * up
-    return joined(
+    return join_meshes(
         [
             bars(_segments(feet, feet + up), radius_m, material, sides=4, capped=False),
-            bars(chains(path_m[None] + heights), 0.8 * radius_m, material, sides=4, capped=False),
+            bars(chain_segments(path_m[None] + heights), 0.8 * radius_m, material, sides=4, capped=False),
         ]
     )
 
 
-def towards(at_m: Numbers, directions: Numbers) -> Float[np.ndarray, "n 4 4"]:
+def poses_towards(at_m: Numbers, directions: Numbers) -> Float[np.ndarray, "n 4 4"]:
     """Poses [N] at points, whose z looks along a direction and whose x stays level."""
     at, along = np.broadcast_arrays(np.atleast_2d(at_m), np.atleast_2d(directions))
     z = along / np.linalg.norm(along, axis=1, keepdims=True)
     poses = np.tile(np.eye(4), (len(z), 1, 1))
-    poses[:, :3, :3] = np.stack([*frames(z), z], -1)
+    poses[:, :3, :3] = np.stack([*orthogonal_frames(z), z], -1)
     poses[:, :3, 3] = at
     return poses
 
@@ -231,10 +231,12 @@ def insulators(starts_m: Points, ends_m: Points, radius_m: float, discs: int, ma
     bell = np.array([[0.0, 0.15], [0.95, 0.15], [1.0, 0.3], [0.35, 0.75], [0.3, 1.0]]) * (radius_m, pitch)
     share = np.arange(1, discs + 1)[:, None, None] / discs
     at = (starts_m + share * (ends_m - starts_m)).reshape(-1, 3)
-    return copies(lathe(bell, material, sections=8), towards(at, np.tile(starts_m - ends_m, (discs, 1))))
+    return copies(
+        lathe(bell, material, sections=8), poses_towards(at, np.tile(starts_m - ends_m, (discs, 1)))
+    )
 
 
-def galvanised(rng: np.random.Generator) -> Material:
+def galvanised_steel(rng: np.random.Generator) -> Material:
     """Zinc-coated steel, fresh and bright to dull and dark."""
     grey = rng.uniform(0.35, 0.85)
     return Material(
@@ -248,7 +250,7 @@ def galvanised(rng: np.random.Generator) -> Material:
     )
 
 
-def painted(rng: np.random.Generator, tint: Colour, roughness: float = 0.55) -> Material:
+def painted_steel(rng: np.random.Generator, tint: Colour, roughness: float = 0.55) -> Material:
     """Coated steel, its colour a little off from the given one."""
     shade = rng.uniform(0.85, 1.1)
     red, green, blue = (float(np.clip(shade * part, 0, 1)) for part in tint)
@@ -262,9 +264,9 @@ def painted(rng: np.random.Generator, tint: Colour, roughness: float = 0.55) -> 
     )
 
 
-def aviation(rng: np.random.Generator) -> tuple[Material, Material]:
+def aviation_paints(rng: np.random.Generator) -> tuple[Material, Material]:
     """The red and the white of obstacles to aircraft."""
-    return painted(rng, (0.55, 0.07, 0.04)), painted(rng, (0.8, 0.8, 0.77))
+    return painted_steel(rng, (0.55, 0.07, 0.04)), painted_steel(rng, (0.8, 0.8, 0.77))
 
 
 def _segments(starts_m: np.ndarray, ends_m: np.ndarray) -> Segments:

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from stereoweave.synth.props.primitives import loft, spheres, sweep
-from stereoweave.synth.props.random_materials import chosen
+from stereoweave.synth.props.random_materials import draw_material_from
 from stereoweave.synth.stage import Palette
-from stereoweave.synth.world import Material, Mesh, joined
+from stereoweave.synth.world import Material, Mesh, join_meshes
 
 _CLOTHS = ("cloth", "plain", "plain", "paint")
 # Half widths of a trunk 1.7 m tall: height, along x, along y.
@@ -42,10 +42,10 @@ def draw_clothes(rng: np.random.Generator, palette: Palette) -> Clothes:
     brown = rng.uniform(0.15, 1.0)
     skin = (0.75 * brown, 0.5 * brown, 0.38 * brown)
     return Clothes(
-        coat=palette.add(chosen(rng, _CLOTHS, 2.0)),
-        trousers=palette.add(chosen(rng, _CLOTHS, 2.0)),
+        coat=palette.add(draw_material_from(rng, _CLOTHS, 2.0)),
+        trousers=palette.add(draw_material_from(rng, _CLOTHS, 2.0)),
         skin=palette.add(Material(texture="plain", tint=skin, roughness=0.55, relief=0.05)),
-        hair=palette.add(chosen(rng, ("bark", "plain", "cloth"), 3.0)),
+        hair=palette.add(draw_material_from(rng, ("bark", "plain", "cloth"), 3.0)),
     )
 
 
@@ -55,14 +55,16 @@ def person(rng: np.random.Generator, clothes: Clothes) -> Mesh:
     limbs = [limb for side in (-1, 1) for limb in _limbs(rng, clothes, side, stride_m)]
     head = spheres([[0.015, 0, 1.655]], [[0.095, 0.078, 0.12]], clothes.skin, subdivisions=3)
     hair = spheres([[-0.012, 0, 1.69]], [[0.095, 0.085, 0.1]], clothes.hair, subdivisions=3)
-    trunk = loft(_rings(_TRUNK_M * [1, rng.uniform(0.9, 1.5), rng.uniform(0.9, 1.2)]), clothes.coat)
+    trunk = loft(_ellipses(_TRUNK_M * [1, rng.uniform(0.9, 1.5), rng.uniform(0.9, 1.2)]), clothes.coat)
     scale = rng.uniform(0.88, 1.1)
-    return joined([trunk, head, hair, *limbs]).placed(np.diag([scale, scale, scale, 1.0]))
+    return join_meshes([trunk, head, hair, *limbs]).transform(np.diag([scale, scale, scale, 1.0]))
 
 
 def animal(rng: np.random.Generator, palette: Palette) -> Mesh:
     """An animal about 1 m long on four legs, plump or slender, with ears and a tail."""
-    fur, other = (palette.add(chosen(rng, ("plain", "cloth", "plain", "bark"), 1.5)) for _ in range(2))
+    fur, other = (
+        palette.add(draw_material_from(rng, ("plain", "cloth", "plain", "bark"), 1.5)) for _ in range(2)
+    )
     eye = palette.add(Material(texture="plain", tint=(0.03, 0.03, 0.03), roughness=0.12))
     plump, leg_m, head_m = rng.uniform(0.16, 0.3), rng.uniform(0.15, 0.45), rng.uniform(0.13, 0.24)
     back_m = leg_m + 0.8 * plump
@@ -82,24 +84,24 @@ def animal(rng: np.random.Generator, palette: Palette) -> Mesh:
     )
     eyes = spheres(face + both * head_m * [0.78, 0.42, 0.3], 0.13 * head_m, eye)
     feet = np.array([[x, y, 0.0] for x in (-0.35, 0.3) for y in (-0.5 * plump, 0.5 * plump)])
-    legs = [_bent(foot + [0, 0, back_m], foot + [0, 0, 0.05], 0.06, (0.09, 0.055), fur) for foot in feet]
+    legs = [_bent_limb(foot + [0, 0, back_m], foot + [0, 0, 0.05], 0.06, (0.09, 0.055), fur) for foot in feet]
     tip = np.array([-0.8, rng.normal(0, 0.2), back_m + rng.uniform(-0.3, 0.5)])
-    tail = _bent(np.array([-0.25 - plump, 0, back_m]), tip, 0.1, (0.06, 0.02), fur)
-    return joined([body, head, snout, ears, eyes, *legs, tail])
+    tail = _bent_limb(np.array([-0.25 - plump, 0, back_m]), tip, 0.1, (0.06, 0.02), fur)
+    return join_meshes([body, head, snout, ears, eyes, *legs, tail])
 
 
 def _limbs(rng: np.random.Generator, clothes: Clothes, side: int, stride_m: float) -> list[Mesh]:
     """A leg with its shoe, and an arm with its hand, at y of a side -1 or 1."""
     ankle = np.array([side * stride_m, 0.1 * side, 0.08])
-    leg = _bent(np.array([0, 0.09 * side, 0.93]), ankle, 0.04, (0.1, 0.055), clothes.trousers)
+    leg = _bent_limb(np.array([0, 0.09 * side, 0.93]), ankle, 0.04, (0.1, 0.055), clothes.trousers)
     shoe = spheres([ankle + [0.05, 0, -0.03]], [[0.14, 0.05, 0.06]], clothes.hair)
     shoulder = np.array([0, 0.19 * side, 1.4])
     hand = np.array([rng.uniform(-0.15, 0.35), rng.uniform(0.2, 0.5) * side, rng.uniform(0.8, 1.25)])
-    arm = _bent(shoulder, hand, -0.08, (0.065, 0.038), clothes.coat)
+    arm = _bent_limb(shoulder, hand, -0.08, (0.065, 0.038), clothes.coat)
     return [leg, shoe, arm, spheres([hand], 0.05, clothes.skin)]
 
 
-def _bent(
+def _bent_limb(
     start_m: Float[np.ndarray, "3"],
     end_m: Float[np.ndarray, "3"],
     bulge_m: float,
@@ -112,7 +114,7 @@ def _bent(
     return sweep(path_m, np.linspace(*radii_m, 9), material, 12)
 
 
-def _rings(heights_and_halves_m: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 24 3"]:
+def _ellipses(heights_and_halves_m: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 24 3"]:
     """Ellipses, one above another."""
     angle = np.arange(24) * 2 * np.pi / 24
     z, along, across = (column[:, None] for column in heights_and_halves_m.T)

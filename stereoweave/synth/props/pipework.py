@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Float
 
 from stereoweave.synth.props.bridges import beams
-from stereoweave.synth.props.lattice import towards
+from stereoweave.synth.props.lattice import poses_towards
 from stereoweave.synth.props.primitives import copies, lathe, spheres, tubes
-from stereoweave.synth.props.refinery_units import Coats
-from stereoweave.synth.world import Mesh, joined
+from stereoweave.synth.props.refinery_units import RefineryMaterials
+from stereoweave.synth.world import Mesh, join_meshes
 
 Path = Float[np.ndarray, "_ 3"]
 
@@ -28,7 +28,7 @@ def pipes(paths_m: Sequence[Path], radii_m: Sequence[float], material: int) -> M
     along = (ends - starts)[long] / length[long, None]
     middle, half = (0.6 * starts + 0.4 * ends)[long], 0.4 * radii[long, None] * along
     flanges = tubes(middle - half, middle + half, 1.6 * radii[long], material, 8)
-    return joined([tubes(starts, ends, radii, material, 6, capped=False), flanges, bent])
+    return join_meshes([tubes(starts, ends, radii, material, 6, capped=False), flanges, bent])
 
 
 def valves(at_m: Path, axes: Path, radius_m: float, body: int, wheel: int) -> Mesh:
@@ -42,11 +42,17 @@ def valves(at_m: Path, axes: Path, radius_m: float, body: int, wheel: int) -> Me
     rim = lathe(tube_m + [1.8 * radius_m, 0], wheel, 10)
     spokes_m = 1.8 * radius_m * np.eye(3)[:2]
     spokes = tubes(-spokes_m, spokes_m, 0.2 * radius_m, wheel, 4)
-    return joined([*parts, copies(joined([rim, spokes]), towards(at_m + 3.6 * radius_m * axes, axes))])
+    return join_meshes(
+        [*parts, copies(join_meshes([rim, spokes]), poses_towards(at_m + 3.6 * radius_m * axes, axes))]
+    )
 
 
 def rack(
-    rng: np.random.Generator, half_m: float, levels_m: Sequence[float], lines: Sequence[int], coats: Coats
+    rng: np.random.Generator,
+    half_m: float,
+    levels_m: Sequence[float],
+    lines: Sequence[int],
+    materials: RefineryMaterials,
 ) -> Mesh:
     """A steel rack along x with layers of parallel pipes, of the materials `lines`; some rise in loops."""
     by_coat: dict[int, list[tuple[Path, float]]] = {}
@@ -60,8 +66,12 @@ def rack(
     laid = [pipes([p for p, _ in bunch], [r for _, r in bunch], coat) for coat, bunch in by_coat.items()]
     at = rng.uniform([-0.9 * half_m, -0.3, 0], [0.9 * half_m, 0.3, 0], (8, 3)) + [0, 0, levels_m[-1] + 0.04]
     upright = np.tile([0.0, 0.0, 1.0], (8, 1))
-    return joined(
-        [_frame(half_m, levels_m, coats.steel), *laid, valves(at, upright, 0.035, coats.steel, coats.red)]
+    return join_meshes(
+        [
+            _frame(half_m, levels_m, materials.steel),
+            *laid,
+            valves(at, upright, 0.035, materials.steel, materials.red),
+        ]
     )
 
 
@@ -71,7 +81,7 @@ def _frame(half_m: float, levels_m: Sequence[float], steel: int) -> Mesh:
     feet = np.array([[at, y, 0.0] for at in x for y in (-half_y, half_y)])
     across = np.array([[at, -half_y, z - 0.03] for at in x for z in levels_m])
     ends = np.array([[x[0], y, z - 0.05] for y in (-half_y, half_y) for z in levels_m])
-    return joined(
+    return join_meshes(
         [
             beams(feet, feet + [0, 0, levels_m[-1] + 0.02], (0.05, 0.05), steel),
             beams(across, across * [1, -1, 1], (0.04, 0.06), steel),

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from stereoweave.synth.world import Mesh, joined
+from stereoweave.synth.world import Mesh, join_meshes
 
 Point = Float[np.ndarray, "3"]
 Points = Float[np.ndarray, "_ 3"]
@@ -53,8 +53,8 @@ def tubes(  # noqa: PLR0913, bars differ in so much
     along = ends - starts
     length = np.linalg.norm(along, axis=1)
     along = along / length[:, None]
-    across, other = frames(along)
-    plan = _bar(sides, capped)
+    across, other = orthogonal_frames(along)
+    plan = _tube_topology(sides, capped)
     outwards = plan.circle @ np.stack([across, other], 1)
     middles = np.stack([starts, ends], 1)
     rings = middles[:, :, None] + radii[..., None, None] * outwards[:, None]
@@ -70,10 +70,10 @@ def tubes(  # noqa: PLR0913, bars differ in so much
         [*sides_uv, ends_uv.reshape(count, 2 * len(plan.circle), 2), np.zeros((count, 2, 2))], 1
     )
     corners = points.astype(np.float32)[:, plan.points]
-    mesh = _mesh(
+    mesh = _make_mesh(
         corners, normals.astype(np.float32)[:, plan.normals], uv.astype(np.float32)[:, plan.uv], material
     )
-    return mesh if radii.all() else _solid(mesh)
+    return mesh if radii.all() else _drop_degenerate(mesh)
 
 
 def boxes(
@@ -88,7 +88,7 @@ def boxes(
     if turns is not None:
         across = turns.swapaxes(1, 2)[:, None]
         corners, normals = corners @ across, normals @ across
-    return _mesh(corners + centres[:, None, None], normals, uv, material)
+    return _make_mesh(corners + centres[:, None, None], normals, uv, material)
 
 
 def lathe(profile_m: Numbers, material: int, sections: int = 32, crease_deg: float = 35) -> Mesh:
@@ -112,7 +112,7 @@ def lathe(profile_m: Numbers, material: int, sections: int = 32, crease_deg: flo
     girth = spans[:, :, 0].max(1)[:, None, None] * angle
     height = np.stack([arc[:-1], arc[1:]], 1)[..., None]
     uv = np.stack(np.broadcast_arrays(girth, height), -1)
-    return _grids(_around(circle, spans), _around(circle, np.stack([below, above], 1)), uv, material)
+    return _mesh_grids(_revolve(circle, spans), _revolve(circle, np.stack([below, above], 1)), uv, material)
 
 
 def loft(rings_m: Float[np.ndarray, "k m 3"], material: int, capped: bool = True) -> Mesh:
@@ -126,7 +126,7 @@ def loft(rings_m: Float[np.ndarray, "k m 3"], material: int, capped: bool = True
     skin = sheet(rings, material, closed=True)
     if not capped:
         return skin
-    return _with_caps(skin, rings[[0, -1]][None], material)
+    return _add_caps(skin, rings[[0, -1]][None], material)
 
 
 def sweep(path_m: Numbers, radius_m: Numbers, material: int, sides: int = 8) -> Mesh:
@@ -134,7 +134,7 @@ def sweep(path_m: Numbers, radius_m: Numbers, material: int, sides: int = 8) -> 
     path = np.asarray(path_m, np.float64)
     along = np.gradient(path, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    across, other = _carried_frames(along)
+    across, other = _transport_frames(along)
     angle = np.arange(sides) * 2 * np.pi / sides
     outwards = np.cos(angle)[None, :, None] * across[:, None] + np.sin(angle)[None, :, None] * other[:, None]
     radii = np.broadcast_to(np.asarray(radius_m, np.float64), len(path))
@@ -154,9 +154,9 @@ def sheet(points_m: Float[np.ndarray, "r c 3"], material: int, closed: bool = Fa
         along_columns = np.gradient(points, axis=1)
     normals = np.cross(along_columns, np.gradient(points, axis=0))
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
-    u = _lengths(points, 1).mean(0)[None] * np.ones((len(points), 1))
-    v = _lengths(points, 0).mean(1)[:, None] * np.ones((1, points.shape[1]))
-    return _grids(points[None], normals[None], np.stack([u, v], -1)[None], material)
+    u = _arc_lengths_m(points, 1).mean(0)[None] * np.ones((len(points), 1))
+    v = _arc_lengths_m(points, 0).mean(1)[:, None] * np.ones((1, points.shape[1]))
+    return _mesh_grids(points[None], normals[None], np.stack([u, v], -1)[None], material)
 
 
 def spheres(centres_m: Numbers, radii_m: Numbers, material: int, subdivisions: int = 2) -> Mesh:
@@ -171,7 +171,7 @@ def spheres(centres_m: Numbers, radii_m: Numbers, material: int, subdivisions: i
     uv = _box_uv(
         corners, np.broadcast_to(ball.mean(1, keepdims=True), ball.shape)[None].repeat(len(radii), 0)
     )
-    return _mesh(corners + centres[:, None, None], normals, uv, material)
+    return _make_mesh(corners + centres[:, None, None], normals, uv, material)
 
 
 def facets(triangles_m: Numbers, material: int) -> Mesh:
@@ -180,7 +180,7 @@ def facets(triangles_m: Numbers, material: int) -> Mesh:
     across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
     normals = np.repeat(across[:, None], 3, axis=1)
-    return _mesh(triangles, normals, _box_uv(triangles, normals), material)
+    return _make_mesh(triangles, normals, _box_uv(triangles, normals), material)
 
 
 def prism(outline_m: Numbers, depth_m: float, material: int) -> Mesh:
@@ -214,21 +214,21 @@ def copies(mesh: Mesh, poses: Float[np.ndarray, "n 4 4"]) -> Mesh:
     )
 
 
-def turn(axis: tuple[float, float, float], angle_deg: float) -> Float[np.ndarray, "4 4"]:
+def rotation(axis: tuple[float, float, float], angle_deg: float) -> Float[np.ndarray, "4 4"]:
     """The pose that rotates about an axis through the origin, counter-clockwise seen from its tip."""
     pose = np.eye(4)
     pose[:3, :3] = cv2.Rodrigues(np.radians(angle_deg) * np.array(axis) / np.linalg.norm(axis))[0]
     return pose
 
 
-def shift(x: float = 0, y: float = 0, z: float = 0) -> Float[np.ndarray, "4 4"]:
+def translation(x: float = 0, y: float = 0, z: float = 0) -> Float[np.ndarray, "4 4"]:
     """The pose that moves by metres."""
     pose = np.eye(4)
     pose[:3, 3] = x, y, z
     return pose
 
 
-def frames(along: Points) -> tuple[Points, Points]:
+def orthogonal_frames(along: Points) -> tuple[Points, Points]:
     """Two unit vectors across each unit direction [N], the first one level; with it they are right-handed.
 
     What is within 2.5 degrees of upright has its first along -y.
@@ -245,7 +245,7 @@ def polyline_tubes(points_m: Numbers, radius_m: float, material: int, sides: int
     return tubes(points[:-1], points[1:], radius_m, material, sides)
 
 
-def _grids(
+def _mesh_grids(
     points: Float[np.ndarray, "n r c 3"],
     normals: Float[np.ndarray, "n r c 3"],
     uv: Float[np.ndarray, "n r c 2"],
@@ -260,10 +260,10 @@ def _grids(
     corners, corner_normals, corner_uv = (
         cells(values.astype(np.float32)) for values in (points, normals, uv)
     )
-    return _solid(_mesh(corners, corner_normals, corner_uv, material))
+    return _drop_degenerate(_make_mesh(corners, corner_normals, corner_uv, material))
 
 
-def _solid(mesh: Mesh) -> Mesh:
+def _drop_degenerate(mesh: Mesh) -> Mesh:
     """The mesh without triangles of no area: at a pole a grid's cell has no second triangle."""
     a, b, c = mesh.corners_m.swapaxes(0, 1)
     kept = (np.abs(np.cross(b - a, c - a)) > 1e-12).any(1)
@@ -278,7 +278,7 @@ def _solid(mesh: Mesh) -> Mesh:
     )
 
 
-def _with_caps(walls: Mesh, ends: Float[np.ndarray, "n 2 m 3"], material: int) -> Mesh:
+def _add_caps(walls: Mesh, ends: Float[np.ndarray, "n 2 m 3"], material: int) -> Mesh:
     """The walls, and fans over first and last rings whose last point is the first again."""
     fans = [walls]
     for k in (0, 1):
@@ -291,11 +291,11 @@ def _with_caps(walls: Mesh, ends: Float[np.ndarray, "n 2 m 3"], material: int) -
         summed = summed / np.maximum(np.linalg.norm(summed, axis=-1, keepdims=True), 1e-12)
         normals = np.broadcast_to(summed[:, :, None], corners.shape)
         uv = _box_uv(corners, normals)
-        fans.append(_mesh(corners[solid], normals[solid], uv[solid], material))
-    return joined(fans)
+        fans.append(_make_mesh(corners[solid], normals[solid], uv[solid], material))
+    return join_meshes(fans)
 
 
-def _mesh(corners: np.ndarray, normals: np.ndarray, uv: np.ndarray, material: int) -> Mesh:
+def _make_mesh(corners: np.ndarray, normals: np.ndarray, uv: np.ndarray, material: int) -> Mesh:
     count = corners.size // 9
     return Mesh(
         corners_m=corners.reshape(-1, 3, 3).astype(np.float32, copy=False),
@@ -306,9 +306,9 @@ def _mesh(corners: np.ndarray, normals: np.ndarray, uv: np.ndarray, material: in
     )
 
 
-def _carried_frames(along: Points) -> tuple[Points, Points]:
+def _transport_frames(along: Points) -> tuple[Points, Points]:
     """As `frames`, each nearly the one before it, so that a pipe does not twist."""
-    across = frames(along[:1])[0][0]
+    across = orthogonal_frames(along[:1])[0][0]
     carried = []
     # In plain numbers, because arrays of three are slow.
     u, v, w = across.tolist()
@@ -322,14 +322,14 @@ def _carried_frames(along: Points) -> tuple[Points, Points]:
     return stacked, np.cross(along, stacked)
 
 
-def _around(circle: Float[np.ndarray, "s 2"], radius_and_height: np.ndarray) -> np.ndarray:
+def _revolve(circle: Float[np.ndarray, "s 2"], radius_and_height: np.ndarray) -> np.ndarray:
     """Rings [..., S, 3] from radii and heights [..., 2]."""
     radius, height = radius_and_height[..., None, :1], radius_and_height[..., None, 1:]
     level = radius * circle
     return np.concatenate([level, np.broadcast_to(height, (*level.shape[:-1], 1))], -1)
 
 
-def _lengths(points: Float[np.ndarray, "r c 3"], axis: int) -> Float[np.ndarray, "r c"]:
+def _arc_lengths_m(points: Float[np.ndarray, "r c 3"], axis: int) -> Float[np.ndarray, "r c"]:
     """How far each point is from the first along the grid."""
     step = np.linalg.norm(np.diff(points, axis=axis), axis=-1)
     start = np.zeros_like(np.take(step, [0], axis=axis))
@@ -346,7 +346,7 @@ def _box_uv(corners: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return np.stack([u, v], -1)
 
 
-class _Bar(NamedTuple):
+class _TubeTopology(NamedTuple):
     """How a bar's triangles are joined: places in its tables of points, normals and texture, each [T, 3].
 
     Points: the start's ring [S + 1], the end's, both middles. Normals: a ring [S + 1], back, ahead. Texture:
@@ -360,7 +360,7 @@ class _Bar(NamedTuple):
 
 
 @functools.cache
-def _bar(sides: int, capped: bool) -> _Bar:
+def _tube_topology(sides: int, capped: bool) -> _TubeTopology:
     angle = np.arange(sides + 1) * 2 * np.pi / sides
     k, ring = np.arange(sides), sides + 1
     walls = np.concatenate([np.stack([k, k + 1, k + 1 + ring], 1), np.stack([k, k + 1 + ring, k + ring], 1)])
@@ -368,7 +368,7 @@ def _bar(sides: int, capped: bool) -> _Bar:
     ahead = np.stack([np.full(sides, 2 * ring + 1), k + ring, k + 1 + ring], 1)
     if not capped:
         back, ahead = back[:0], ahead[:0]
-    return _Bar(
+    return _TubeTopology(
         circle=np.stack([np.cos(angle), np.sin(angle)], -1),
         points=np.concatenate([walls, back, ahead]),
         normals=np.concatenate([walls % ring, np.full_like(back, ring), np.full_like(ahead, ring + 1)]),

@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.synth.props.primitives import copies, lathe, loft, tubes, turn
-from stereoweave.synth.world import Mesh, joined
+from stereoweave.synth.props.primitives import copies, lathe, loft, rotation, tubes
+from stereoweave.synth.world import Mesh, join_meshes
 
 
 @dataclass(frozen=True, kw_only=True)
-class Screw:
+class Propeller:
     """A ship's screw that turns about x; aft is +x.
 
     Attributes:
@@ -71,11 +71,11 @@ class Screw:
         return np.arctan(self.pitch_share * 2 * self.radius_m / (2 * np.pi * radius_m))
 
 
-def draw_screw(rng: np.random.Generator) -> Screw:
+def draw_propeller(rng: np.random.Generator) -> Propeller:
     """Three to six blades, from narrow and straight to broad and swept."""
     blades = int(rng.choice([3, 4, 5, 6], p=[0.2, 0.4, 0.3, 0.1]))
     radius_m = rng.uniform(2.3, 2.8)
-    return Screw(
+    return Propeller(
         radius_m=radius_m,
         blades=blades,
         hub_share=rng.uniform(0.16, 0.22),
@@ -88,22 +88,22 @@ def draw_screw(rng: np.random.Generator) -> Screw:
     )
 
 
-def screw_mesh(screw: Screw, bronze: int, hub: int, bolt: int) -> Mesh:
+def propeller_mesh(propeller: Propeller, bronze: int, hub: int, bolt: int) -> Mesh:
     """Blades, hub, cap and bolts around the origin; one blade points up."""
-    blade = loft(screw.sections_m(), bronze)
+    blade = loft(propeller.sections_m(), bronze)
     # Laid on flat, so that the texture is not squeezed at the tip.
     blade = replace(blade, uv_m=blade.corners_m[..., 1:].copy())
-    around = np.stack([turn((1, 0, 0), k * 360 / screw.blades) for k in range(screw.blades)])
-    return joined([copies(blade, around), _hub(screw, hub), _bolts(screw, bolt)])
+    around = np.stack([rotation((1, 0, 0), k * 360 / propeller.blades) for k in range(propeller.blades)])
+    return join_meshes([copies(blade, around), _hub(propeller, hub), _bolts(propeller, bolt)])
 
 
-def along_x(mesh: Mesh) -> Mesh:
+def turn_aft(mesh: Mesh) -> Mesh:
     """The mesh, turned so that what was up is aft."""
-    return mesh.placed(turn((0, 1, 0), 90))
+    return mesh.transform(rotation((0, 1, 0), 90))
 
 
-def _hub(screw: Screw, material: int) -> Mesh:
-    r, half = screw.hub_m, screw.hub_half_m
+def _hub(propeller: Propeller, material: int) -> Mesh:
+    r, half = propeller.hub_m, propeller.hub_half_m
     ogive = np.linspace(0, 1, 9)[:, None]
     cap = np.concatenate([0.78 * r * np.sqrt(1 - ogive**2), half + 0.1 + 1.15 * r * ogive], 1)
     body = [
@@ -115,13 +115,13 @@ def _hub(screw: Screw, material: int) -> Mesh:
         (0.9 * r, half),
     ]
     flange = [(0.86 * r, half + 0.015), (0.86 * r, half + 0.085), (0.79 * r, half + 0.1)]
-    return along_x(lathe(np.concatenate([body, flange, cap]), material, sections=56))
+    return turn_aft(lathe(np.concatenate([body, flange, cap]), material, sections=56))
 
 
-def _bolts(screw: Screw, material: int) -> Mesh:
+def _bolts(propeller: Propeller, material: int) -> Mesh:
     """Hexagonal heads around the cap's flange and the hub's front."""
     angle = np.arange(12) * np.pi / 6
     circle = np.stack([0 * angle, np.cos(angle), np.sin(angle)], -1)
-    size = 0.055 * screw.hub_m / 0.5
-    start = circle * 0.82 * screw.hub_m + [screw.hub_half_m + 0.05, 0, 0]
+    size = 0.055 * propeller.hub_m / 0.5
+    start = circle * 0.82 * propeller.hub_m + [propeller.hub_half_m + 0.05, 0, 0]
     return tubes(start, start + [0.09, 0, 0], size, material, sides=6)

@@ -19,69 +19,71 @@ NATURAL = (
 _TYPICAL_FOCAL_PX = 600
 
 
-def surface(rng: np.random.Generator, distance_m: float) -> Material:
+def draw_material(rng: np.random.Generator, distance_m: float) -> Material:
     """Any surface, its texture as fine as the pixels of a picture taken from distance_m."""
-    family = _family(rng)
+    family = _draw_family(rng)
     glossy = rng.random() < 0.2
     return Material(
         texture=family,
         variant=int(rng.integers(1000)),
-        tint=muted(rng, 0.45) if family == "plain" else natural_tint(rng),
-        span_m=fine_span_m(rng, distance_m),
+        tint=draw_muted_colour(rng, 0.45) if family == "plain" else draw_natural_tint(rng),
+        span_m=draw_fine_span_m(rng, distance_m),
         roughness=rng.uniform(0.1, 0.4) if glossy else rng.uniform(0.5, 1.0),
         metal=float(glossy and rng.random() < 0.35),
         relief=rng.uniform(0.0, 0.6),
     )
 
 
-def chosen(rng: np.random.Generator, families: tuple[str, ...], distance_m: float) -> Material:
+def draw_material_from(rng: np.random.Generator, families: tuple[str, ...], distance_m: float) -> Material:
     """A dull surface of one of the families, its texture as fine as pixels from distance_m."""
     family = families[rng.integers(len(families))]
     return Material(
         texture=family,
         variant=int(rng.integers(1000)),
-        tint=muted(rng, 0.25) if family in ("plain", "paint", "plaster") else natural_tint(rng),
-        span_m=fine_span_m(rng, distance_m),
+        tint=draw_muted_colour(rng, 0.25)
+        if family in ("plain", "paint", "plaster")
+        else draw_natural_tint(rng),
+        span_m=draw_fine_span_m(rng, distance_m),
         roughness=rng.uniform(0.5, 1.0),
         relief=rng.uniform(0.1, 0.5),
     )
 
 
-def broad(rng: np.random.Generator, families: tuple[str, ...], distance_m: float) -> Material:
+def draw_broad_material(rng: np.random.Generator, families: tuple[str, ...], distance_m: float) -> Material:
     """A surface for a wall, a floor or a table: plain more often than not, else of one of the families."""
     if rng.random() >= _BROAD_PLAIN:
-        return chosen(rng, families, distance_m)
+        return draw_material_from(rng, families, distance_m)
     return Material(
         texture="plain",
         variant=int(rng.integers(1000)),
-        tint=muted(rng, 0.3),
+        tint=draw_muted_colour(rng, 0.3),
         # Up to six times coarser than pixels, so that little of the texture's own unevenness is left.
-        span_m=fine_span_m(rng, distance_m) * rng.uniform(1, 6),
+        span_m=draw_fine_span_m(rng, distance_m) * rng.uniform(1, 6),
         roughness=rng.uniform(0.35, 1.0),
         relief=rng.uniform(0.0, 0.1),
     )
 
 
-def fine_span_m(rng: np.random.Generator, distance_m: float) -> float:
+def draw_fine_span_m(rng: np.random.Generator, distance_m: float) -> float:
     """What a texture of 512 texels must span so that 1 to 3 of them, at times less, fall on a pixel."""
     across_px = np.exp(rng.uniform(np.log(170), np.log(800)))
     return float(distance_m * across_px / _TYPICAL_FOCAL_PX)
 
 
-def muted(rng: np.random.Generator, saturation: float) -> Colour:
+def draw_muted_colour(rng: np.random.Generator, saturation: float) -> Colour:
     """A colour that walls and things have: greyish, from dark to almost white."""
     hue = rng.choice([rng.uniform(0.02, 0.16), rng.uniform()], p=[0.6, 0.4])
     red, green, blue = colorsys.hsv_to_rgb(hue, rng.uniform(0, saturation), rng.uniform(0.15, 0.9))
     return red, green, blue
 
 
-def natural_tint(rng: np.random.Generator) -> Colour:
+def draw_natural_tint(rng: np.random.Generator) -> Colour:
     """Nearly no change of colour, some of brightness."""
     red, green, blue = rng.uniform(0.55, 1.0) * rng.uniform(0.88, 1.0, 3)
     return float(red), float(green), float(blue)
 
 
-def _family(rng: np.random.Generator) -> str:
+def _draw_family(rng: np.random.Generator) -> str:
     kind = rng.random()
     if kind < _PHOTOGRAPHS:
         return "photograph"

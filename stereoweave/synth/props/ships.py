@@ -5,15 +5,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereoweave.synth.props import deck_gear as gear
-from stereoweave.synth.props.deckhouses import House, Paints
+from stereoweave.synth.props import deck_gear
+from stereoweave.synth.props.deckhouses import House, ShipMaterials
 from stereoweave.synth.props.hulls import Hull
 from stereoweave.synth.props.primitives import Point, tubes
-from stereoweave.synth.world import Mesh, joined
+from stereoweave.synth.world import Mesh, join_meshes
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class ShipPlan:
     """What a ship is built from.
 
     Attributes:
@@ -30,14 +30,14 @@ class Plan:
     funnels: tuple[tuple[float, float], ...]
     mast_m: tuple[float, float]
     fenders: bool
-    fitted: Callable[[np.random.Generator, "Plan", Paints, tuple[int, ...]], Mesh]
+    build_gear: Callable[[np.random.Generator, "ShipPlan", ShipMaterials, tuple[int, ...]], Mesh]
 
     def on_deck(self, x: float, y: float = 0.0) -> Point:
         """A spot on deck."""
         return np.array([x, y, self.hull.deck_m(x)])
 
 
-def tug(rng: np.random.Generator) -> Plan:
+def tug(rng: np.random.Generator) -> ShipPlan:
     """Short and broad, low aft, tyres all round, a winch and a gantry for towing."""
     hull = Hull(
         length_m=rng.uniform(6.8, 7.4),
@@ -58,18 +58,18 @@ def tug(rng: np.random.Generator) -> Plan:
     )
     bridge = House(x_m=(0.2, 1.45), width_m=1.3, z_m=(0.49 + high, 1.25 + high), lean_m=(-0.05, -0.16, -0.06))
     chimneys = ((-0.3, 0.48), (-0.3, -0.48)) if rng.random() < 0.6 else ((-0.25, 0.0),)
-    return Plan(
+    return ShipPlan(
         hull=hull,
         house=house,
         bridge=bridge,
         funnels=chimneys,
         mast_m=(0.5, rng.uniform(1.2, 1.6)),
         fenders=True,
-        fitted=_towing_gear,
+        build_gear=_towing_gear,
     )
 
 
-def trawler(rng: np.random.Generator) -> Plan:
+def trawler(rng: np.random.Generator) -> ShipPlan:
     """A high bow, a mast with a derrick, a gantry aft, a drum with nets."""
     hull = Hull(
         length_m=rng.uniform(7.0, 7.8),
@@ -89,18 +89,18 @@ def trawler(rng: np.random.Generator) -> Plan:
         lean_m=(0, 0.12, 0.03),
     )
     bridge = House(x_m=(at + 0.4, at + 1.7), width_m=1.25, z_m=(1.49, 2.25), lean_m=(0.0, -0.12, -0.03))
-    return Plan(
+    return ShipPlan(
         hull=hull,
         house=house,
         bridge=bridge,
         funnels=((at + 0.05, 0.42),),
         mast_m=(at + 0.8, rng.uniform(1.1, 1.4)),
         fenders=bool(rng.random() < 0.3),
-        fitted=_fishing_gear,
+        build_gear=_fishing_gear,
     )
 
 
-def coaster(rng: np.random.Generator) -> Plan:
+def coaster(rng: np.random.Generator) -> ShipPlan:
     """Long and low, the house aft, hatches and often containers before it."""
     hull = Hull(
         length_m=rng.uniform(7.8, 8.4),
@@ -116,18 +116,18 @@ def coaster(rng: np.random.Generator) -> Plan:
         x_m=(-3.4, -1.95), width_m=1.45, z_m=(hull.deck_m(-1.9) - 0.05, 1.75), lean_m=(0, 0.0, 0.02)
     )
     bridge = House(x_m=(-3.1, -1.9), width_m=1.75, z_m=(1.79, 2.45), lean_m=(0.0, -0.08, -0.02))
-    return Plan(
+    return ShipPlan(
         hull=hull,
         house=house,
         bridge=bridge,
         funnels=((-3.35, 0.0),),
         mast_m=(-2.6, rng.uniform(0.8, 1.1)),
         fenders=False,
-        fitted=_cargo,
+        build_gear=_cargo,
     )
 
 
-def patrol_boat(rng: np.random.Generator) -> Plan:
+def patrol_boat(rng: np.random.Generator) -> ShipPlan:
     """Slender, with sloping walls, a boat aft and a crane for it."""
     hull = Hull(
         length_m=rng.uniform(7.6, 8.2),
@@ -141,97 +141,109 @@ def patrol_boat(rng: np.random.Generator) -> Plan:
     )
     house = House(x_m=(-1.5, 1.7), width_m=1.3, z_m=(hull.deck_m(0.0) - 0.1, 1.35), lean_m=(0.15, 0.7, 0.1))
     bridge = House(x_m=(-0.5, 0.95), width_m=1.15, z_m=(1.39, 2.0), lean_m=(0.1, 0.35, 0.12))
-    return Plan(
+    return ShipPlan(
         hull=hull,
         house=house,
         bridge=bridge,
         funnels=(),
         mast_m=(-0.1, rng.uniform(1.0, 1.4)),
         fenders=False,
-        fitted=_rescue_gear,
+        build_gear=_rescue_gear,
     )
 
 
-def _towing_gear(rng: np.random.Generator, plan: Plan, paints: Paints, colours: tuple[int, ...]) -> Mesh:
+def _towing_gear(
+    rng: np.random.Generator, plan: ShipPlan, materials: ShipMaterials, colours: tuple[int, ...]
+) -> Mesh:
     aft = -plan.hull.length_m / 2
-    return joined(
+    return join_meshes(
         [
-            gear.winch(plan.on_deck(aft + 2.0), 0.9, paints, paints.rope),
-            gear.gantry(plan.on_deck(aft + 1.0), 1.3, 0.75, paints),
-            gear.coil(plan.on_deck(aft + 0.7, 0.5), paints),
-            gear.rafts(np.array([[0.0, side * 0.45, plan.house.z_m[1] + 0.05] for side in (1, -1)]), paints)
+            deck_gear.winch(plan.on_deck(aft + 2.0), 0.9, materials, materials.rope),
+            deck_gear.gantry(plan.on_deck(aft + 1.0), 1.3, 0.75, materials),
+            deck_gear.coil(plan.on_deck(aft + 0.7, 0.5), materials),
+            deck_gear.rafts(
+                np.array([[0.0, side * 0.45, plan.house.z_m[1] + 0.05] for side in (1, -1)]), materials
+            )
             if len(plan.funnels) == 1
-            else gear.coil(plan.on_deck(aft + 0.8, -0.6), paints),
+            else deck_gear.coil(plan.on_deck(aft + 0.8, -0.6), materials),
         ]
     )
 
 
-def _fishing_gear(rng: np.random.Generator, plan: Plan, paints: Paints, colours: tuple[int, ...]) -> Mesh:
+def _fishing_gear(
+    rng: np.random.Generator, plan: ShipPlan, materials: ShipMaterials, colours: tuple[int, ...]
+) -> Mesh:
     aft = -plan.hull.length_m / 2
     foot = np.array([plan.house.x_m[0] - 0.12, 0, plan.hull.deck_m(0.0)])
     top = foot + [0, 0, rng.uniform(2.9, 3.3)]
     swing = rng.uniform(-0.4, 0.4)
     tip = foot + np.array([-rng.uniform(1.8, 2.3), swing, rng.uniform(2.2, 2.7)])
-    return joined(
+    return join_meshes(
         [
-            tubes(foot, top, 0.055, paints.trim, 14),
-            gear.derrick(foot + [-0.06, 0, 0.6], tip, top, paints),
-            gear.gantry(plan.on_deck(aft + 0.45), 0.7 * plan.hull.beam_m, rng.uniform(1.4, 1.8), paints),
-            gear.winch(plan.on_deck(aft + 1.1), 1.2, paints, paints.rope),
-            gear.nets(rng, plan.on_deck(aft + 2.3, rng.uniform(-0.2, 0.2)), (1.1, 1.3), paints),
-            gear.coil(plan.on_deck(plan.house.x_m[1] + 0.4, 0.3), paints),
+            tubes(foot, top, 0.055, materials.trim, 14),
+            deck_gear.derrick(foot + [-0.06, 0, 0.6], tip, top, materials),
+            deck_gear.gantry(
+                plan.on_deck(aft + 0.45), 0.7 * plan.hull.beam_m, rng.uniform(1.4, 1.8), materials
+            ),
+            deck_gear.winch(plan.on_deck(aft + 1.1), 1.2, materials, materials.rope),
+            deck_gear.nets(rng, plan.on_deck(aft + 2.3, rng.uniform(-0.2, 0.2)), (1.1, 1.3), materials),
+            deck_gear.coil(plan.on_deck(plan.house.x_m[1] + 0.4, 0.3), materials),
         ]
     )
 
 
-def _cargo(rng: np.random.Generator, plan: Plan, paints: Paints, colours: tuple[int, ...]) -> Mesh:
+def _cargo(
+    rng: np.random.Generator, plan: ShipPlan, materials: ShipMaterials, colours: tuple[int, ...]
+) -> Mesh:
     deck = plan.hull.deck_m(0.0)
     hold = (-1.5, 2.4)
-    pieces = [gear.hatches(hold, 1.3, deck, paints)]
+    pieces = [deck_gear.hatches(hold, 1.3, deck, materials)]
     if rng.random() < 0.6:
         x, y = (v.ravel() for v in np.meshgrid([-0.7, 0.85], [-0.325, 0.325]))
         spots = np.stack([x, y, np.full(4, deck + 0.33)], -1)
         high = spots[rng.random(4) < 0.6] + [0, 0, 0.67]
         stack = np.concatenate([spots, high])
-        pieces.append(gear.containers(stack[rng.permutation(len(stack))], colours))
+        pieces.append(deck_gear.containers(stack[rng.permutation(len(stack))], colours))
     foot = np.array([hold[1] + 0.3, 0, deck])
     top = foot + [0, 0, rng.uniform(2.0, 2.6)]
     tip = foot + np.array([-rng.uniform(1.6, 2.4), rng.uniform(-0.5, 0.5), rng.uniform(1.7, 2.1)])
     pieces += [
-        tubes(foot, top, 0.06, paints.trim, 14),
-        gear.derrick(foot + [-0.06, 0, 0.5], tip, top, paints),
+        tubes(foot, top, 0.06, materials.trim, 14),
+        deck_gear.derrick(foot + [-0.06, 0, 0.5], tip, top, materials),
     ]
-    pieces.append(gear.coil(plan.on_deck(3.0, 0.2), paints))
-    return joined(pieces)
+    pieces.append(deck_gear.coil(plan.on_deck(3.0, 0.2), materials))
+    return join_meshes(pieces)
 
 
-def _rescue_gear(rng: np.random.Generator, plan: Plan, paints: Paints, colours: tuple[int, ...]) -> Mesh:
+def _rescue_gear(
+    rng: np.random.Generator, plan: ShipPlan, materials: ShipMaterials, colours: tuple[int, ...]
+) -> Mesh:
     aft = -plan.hull.length_m / 2
     foot = plan.on_deck(aft + 2.15, 0.45)
     top = foot + [0, 0, 1.1]
     tip = foot + np.array([-1.0, -0.4, 1.35])
     monitor = np.array([plan.house.x_m[1] - 0.95, 0.0, plan.house.z_m[1] + 0.05])
-    return joined(
+    return join_meshes(
         [
-            gear.boat(plan.on_deck(aft + 1.2), 1.7, paints),
-            tubes(foot, top, 0.06, paints.trim, 14),
-            gear.derrick(top - [0, 0, 0.2], tip, top, paints),
-            gear.rafts(
-                np.array([[-1.05, side * 0.42, plan.house.z_m[1] + 0.05] for side in (1, -1)]), paints
+            deck_gear.boat(plan.on_deck(aft + 1.2), 1.7, materials),
+            tubes(foot, top, 0.06, materials.trim, 14),
+            deck_gear.derrick(top - [0, 0, 0.2], tip, top, materials),
+            deck_gear.rafts(
+                np.array([[-1.05, side * 0.42, plan.house.z_m[1] + 0.05] for side in (1, -1)]), materials
             ),
-            tubes(monitor, monitor + [0, 0, 0.3], 0.035, paints.trim, 12),
+            tubes(monitor, monitor + [0, 0, 0.3], 0.035, materials.trim, 12),
             tubes(
                 monitor + [-0.1, 0, 0.26],
                 monitor + [0.4, 0, 0.42],
                 np.array([[0.04, 0.025]]),
-                paints.trim,
+                materials.trim,
                 12,
             ),
         ]
     )
 
 
-TRADES: dict[str, Callable[[np.random.Generator], Plan]] = {
+TRADES: dict[str, Callable[[np.random.Generator], ShipPlan]] = {
     "tug": tug,
     "trawler": trawler,
     "coaster": coaster,

@@ -8,12 +8,12 @@ from collections.abc import Callable
 import numpy as np
 
 from stereoweave.synth.props import surroundings
-from stereoweave.synth.props.lattice import bars, galvanised, ladder, railing
-from stereoweave.synth.props.primitives import Points, boxes, sheet, shift, sweep, tubes, turn
+from stereoweave.synth.props.lattice import bars, galvanised_steel, ladder, railing
+from stereoweave.synth.props.primitives import Points, boxes, rotation, sheet, sweep, translation, tubes
 from stereoweave.synth.props.sterns import Stern
-from stereoweave.synth.props.surroundings import varied
+from stereoweave.synth.props.surroundings import vary_colour
 from stereoweave.synth.stage import Palette
-from stereoweave.synth.world import Lamp, Material, Mesh, joined
+from stereoweave.synth.world import Lamp, Material, Mesh, join_meshes
 
 Clutter = Callable[[np.random.Generator, Palette, Points], Mesh]
 
@@ -37,35 +37,40 @@ def dock(rng: np.random.Generator, palette: Palette, floor_m: float, half_m: flo
         pieces.append(
             boxes(centres, np.stack([np.full(3, 60.0), np.full(3, 4.0), rise_m * (steps + 1)], -1), wall)
         )
-    steel = palette.add(galvanised(rng))
+    steel = palette.add(galvanised_steel(rng))
     pieces += [_stairs(floor_m, top_m, half_m * side, steel, wall) for side in (1, -1)]
-    pieces += [_edge(top_m, half_m + 3 * _STEP_M + 0.4, steel), _above(rng, palette, half_m).moved(z=top_m)]
-    return joined(pieces)
+    pieces += [
+        _edge(top_m, half_m + 3 * _STEP_M + 0.4, steel),
+        _above(rng, palette, half_m).translate(z=top_m),
+    ]
+    return join_meshes(pieces)
 
 
 def yard(rng: np.random.Generator, palette: Palette, floor_m: float) -> Mesh:
     """A shipyard's open ground with sheds, a fence, trees and hills."""
     ground = str(rng.choice(["concrete", "asphalt", "gravel"]))
     base = surroundings.terrain(rng, palette, ground, bumps_m=0.1, flat_radius_m=25)
-    sheds = surroundings.places(rng, 14, 20, 60)
+    sheds = surroundings.draw_spots(rng, 14, 20, 60)
     bounds = np.array([[-45, 16, 0], [14, 17, 0], [16, -17, 0], [-45, -16, 0]], float)
-    greens = surroundings.places(rng, 16, 45, 100)
-    return joined(
+    greens = surroundings.draw_spots(rng, 16, 45, 100)
+    return join_meshes(
         [
             base,
-            surroundings.houses(rng, palette, _beside(sheds, 17)),
+            surroundings.houses(rng, palette, _keep_clear_of_ship(sheds, 17)),
             surroundings.fence(rng, palette, bounds),
-            surroundings.trees(rng, palette, _beside(greens, 20)),
+            surroundings.trees(rng, palette, _keep_clear_of_ship(greens, 20)),
             surroundings.hills(rng, palette),
         ]
-    ).moved(z=floor_m)
+    ).translate(z=floor_m)
 
 
 def blocks(rng: np.random.Generator, palette: Palette, stern: Stern, floor_m: float) -> Mesh:
     """Blocks under the keel and timbers that shore up the hull."""
     concrete = _concrete(rng, palette, 0.6)
     timber = palette.add(
-        Material(texture="wood", variant=int(rng.integers(64)), tint=varied(rng, (0.6, 0.5, 0.4)), span_m=1.5)
+        Material(
+            texture="wood", variant=int(rng.integers(64)), tint=vary_colour(rng, (0.6, 0.5, 0.4)), span_m=1.5
+        )
     )
     x = np.arange(-2.6, -28, -1.6)[:, None] * [1, 0, 0]
     cap_m, high_m = 0.25, stern.keel_m - floor_m
@@ -77,22 +82,27 @@ def blocks(rng: np.random.Generator, palette: Palette, stern: Stern, floor_m: fl
         heads = stern.side_m(along, np.full(len(along), stern.water_m + 0.3), side)
         feet = heads * [1, 1, 0] + [0, side * 2.2, floor_m]
         props.append(tubes(feet, heads, 0.11, timber, sides=10))
-    return joined([lower, upper, *props])
+    return join_meshes([lower, upper, *props])
 
 
 def scaffold(rng: np.random.Generator, palette: Palette, floor_m: float, high_m: float) -> Mesh:
     """Scaffolds to both sides before the screw, with planks, ladders, and netting on some."""
-    steel = palette.add(galvanised(rng))
+    steel = palette.add(galvanised_steel(rng))
     planks = palette.add(
         Material(
-            texture="wood", variant=int(rng.integers(64)), tint=varied(rng, (0.75, 0.65, 0.5)), span_m=1.2
+            texture="wood",
+            variant=int(rng.integers(64)),
+            tint=vary_colour(rng, (0.75, 0.65, 0.5)),
+            span_m=1.2,
         )
     )
     cloth = palette.add(
         Material(
             texture="cloth",
             variant=int(rng.integers(2)),
-            tint=varied(rng, [(0.78, 0.8, 0.74), (1.0, 0.98, 0.94), (0.62, 0.65, 0.7)][int(rng.integers(3))]),
+            tint=vary_colour(
+                rng, [(0.78, 0.8, 0.74), (1.0, 0.98, 0.94), (0.62, 0.65, 0.7)][int(rng.integers(3))]
+            ),
             span_m=0.7,
             roughness=1.0,
         )
@@ -103,11 +113,11 @@ def scaffold(rng: np.random.Generator, palette: Palette, floor_m: float, high_m:
         if rng.random() < 0.6:
             tower.append(_netting(rng, high_m, cloth))
         near_m = rng.uniform(1.7, 2.6)
-        pose = shift(-rng.uniform(2.6, 4.0), side * (near_m + 2.25), floor_m) @ turn(
+        pose = translation(-rng.uniform(2.6, 4.0), side * (near_m + 2.25), floor_m) @ rotation(
             (0, 0, 1), rng.normal(0, 4)
         )
-        pieces.append(joined(tower).placed(pose))
-    return joined(pieces)
+        pieces.append(join_meshes(tower).transform(pose))
+    return join_meshes(pieces)
 
 
 def litter(rng: np.random.Generator, palette: Palette, floor_m: float, half_m: float) -> Mesh:
@@ -126,13 +136,13 @@ def litter(rng: np.random.Generator, palette: Palette, floor_m: float, half_m: f
         kind(rng, palette, spots[4 * k : 4 * k + int(rng.integers(2, 5))]) for k, kind in enumerate(kinds)
     ]
     rubber = palette.add(Material(texture="plain", tint=(0.05, 0.05, 0.06), roughness=0.7))
-    hoses = [sweep(_wandering(rng, half_m), rng.uniform(0.025, 0.05), rubber, sides=6) for _ in range(3)]
-    return joined([*things, *hoses]).moved(z=floor_m)
+    hoses = [sweep(_hose_path(rng, half_m), rng.uniform(0.025, 0.05), rubber, sides=6) for _ in range(3)]
+    return join_meshes([*things, *hoses]).translate(z=floor_m)
 
 
-def lamps(rng: np.random.Generator, palette: Palette, floor_m: float) -> tuple[Mesh, tuple[Lamp, ...]]:
+def work_lamps(rng: np.random.Generator, palette: Palette, floor_m: float) -> tuple[Mesh, tuple[Lamp, ...]]:
     """Two work lamps on tripods beside the screw, and their light."""
-    steel = palette.add(Material(texture="paint", tint=varied(rng, (0.22, 0.2, 0.16)), roughness=0.5))
+    steel = palette.add(Material(texture="paint", tint=vary_colour(rng, (0.22, 0.2, 0.16)), roughness=0.5))
     glass = palette.add(Material(texture="plain", tint=(1.0, 0.97, 0.9), glow=2.5))
     strength = rng.uniform(2, 7)
     pieces, lights = [], []
@@ -146,7 +156,7 @@ def lamps(rng: np.random.Generator, palette: Palette, floor_m: float) -> tuple[M
         # The light stands before its lamp, which would otherwise be the brightest thing in the picture.
         light = head + [-0.4, -side * 0.4, 0.4]
         lights.append(Lamp(position_m=_triple(light), light=(strength, 0.93 * strength, 0.8 * strength)))
-    return joined(pieces), tuple(lights)
+    return join_meshes(pieces), tuple(lights)
 
 
 def _land(floor_m: float, top_m: float, half_m: float, stern_m: float, material: int) -> Mesh:
@@ -163,14 +173,16 @@ def _land(floor_m: float, top_m: float, half_m: float, stern_m: float, material:
 
 def _above(rng: np.random.Generator, palette: Palette, half_m: float) -> Mesh:
     """What stands on the land around a dock: sheds, bollards, trees, hills."""
-    far = _beside(surroundings.places(rng, 14, 22, 60), half_m + 9)
+    far = _keep_clear_of_ship(surroundings.draw_spots(rng, 14, 22, 60), half_m + 9)
     x = np.arange(-28, 13, 8.0)
     beside = np.concatenate([np.stack([x, 0 * x + side * (half_m + 3.4), 0 * x], -1) for side in (1, -1)])
-    return joined(
+    return join_meshes(
         [
             surroundings.houses(rng, palette, far),
             surroundings.bollards(rng, palette, beside),
-            surroundings.trees(rng, palette, _beside(surroundings.places(rng, 16, 40, 90), half_m + 20)),
+            surroundings.trees(
+                rng, palette, _keep_clear_of_ship(surroundings.draw_spots(rng, 16, 40, 90), half_m + 20)
+            ),
             surroundings.hills(rng, palette),
         ]
     )
@@ -178,7 +190,7 @@ def _above(rng: np.random.Generator, palette: Palette, half_m: float) -> Mesh:
 
 def _edge(top_m: float, half_m: float, steel: int) -> Mesh:
     paths = [np.array([[-36.0, side * half_m, top_m], [12.0, side * half_m, top_m]]) for side in (1, -1)]
-    return joined([railing(path, 1.1, 2.5, 0.03, steel) for path in paths])
+    return join_meshes([railing(path, 1.1, 2.5, 0.03, steel) for path in paths])
 
 
 def _stairs(floor_m: float, top_m: float, wall_m: float, steel: int, concrete: int) -> Mesh:
@@ -191,7 +203,7 @@ def _stairs(floor_m: float, top_m: float, wall_m: float, steel: int, concrete: i
     centres = np.stack([x, y, floor_m + heights / 2], -1)
     flight = boxes(centres, np.stack([np.full(count, 0.32), np.full(count, 1.3), heights], -1), concrete)
     rail = np.stack([x, y + inside * 0.55, floor_m + heights], -1)[[0, -1]]
-    return joined([flight, railing(rail, 0.95, 1.2, 0.025, steel)])
+    return join_meshes([flight, railing(rail, 0.95, 1.2, 0.025, steel)])
 
 
 def _tower(rng: np.random.Generator, high_m: float, steel: int, planks: int) -> Mesh:
@@ -217,7 +229,7 @@ def _tower(rng: np.random.Generator, high_m: float, steel: int, planks: int) -> 
     boards = boxes(np.stack([boards_x, 0 * boards_x, boards_z], -1), (0.26, 4.8, 0.04), planks)
     at = float(rng.uniform(-1.5, 1.5))
     climb = ladder((1.0, at, 0.0), (0.5, at, float(levels[-1]) + 0.9), (0, 1, 0), 0.4, steel)
-    return joined([bars(segments, 0.028, steel, sides=6), boards, climb])
+    return join_meshes([bars(segments, 0.028, steel, sides=6), boards, climb])
 
 
 def _netting(rng: np.random.Generator, high_m: float, cloth: int) -> Mesh:
@@ -227,7 +239,7 @@ def _netting(rng: np.random.Generator, high_m: float, cloth: int) -> Mesh:
     return sheet(np.stack([0.53 + abs(folds), y, z], -1), cloth)
 
 
-def _wandering(rng: np.random.Generator, half_m: float) -> Points:
+def _hose_path(rng: np.random.Generator, half_m: float) -> Points:
     """A path of a hose over the floor."""
     share = np.linspace(0, 1, 40)
     sway = sum(rng.normal(0, 0.6) / k * np.sin(k * np.pi * share + rng.uniform(0, 6)) for k in (2, 3, 5))
@@ -236,7 +248,7 @@ def _wandering(rng: np.random.Generator, half_m: float) -> Points:
     return np.stack([x, ends[0] + (ends[1] - ends[0]) * share + np.roll(sway, 7), np.full(40, 0.04)], -1)
 
 
-def _beside(spots: Points, half_m: float) -> Points:
+def _keep_clear_of_ship(spots: Points, half_m: float) -> Points:
     """The spots that keep half_m away from the ship's middle line."""
     return spots[np.abs(spots[:, 1]) > half_m]
 
@@ -246,7 +258,7 @@ def _concrete(rng: np.random.Generator, palette: Palette, tone: float) -> int:
         Material(
             texture="concrete",
             variant=int(rng.integers(64)),
-            tint=varied(rng, (tone, tone * 0.98, tone * 0.94)),
+            tint=vary_colour(rng, (tone, tone * 0.98, tone * 0.94)),
             span_m=rng.uniform(3, 6),
             roughness=0.9,
             relief=0.5,

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.synth.props.primitives import boxes, lathe, loft, sheet, spheres, sweep, tubes, turn
-from stereoweave.synth.world import Mesh, joined
+from stereoweave.synth.props.primitives import boxes, lathe, loft, rotation, sheet, spheres, sweep, tubes
+from stereoweave.synth.world import Mesh, join_meshes
 
 
 @dataclass(frozen=True, kw_only=True)
-class Skin:
+class PropStyle:
     """What a thing is made of.
 
     Attributes:
@@ -24,56 +24,58 @@ class Skin:
     bar_m: float
 
 
-Thing = Callable[[np.random.Generator, Skin], Mesh]
+PropBuilder = Callable[[np.random.Generator, PropStyle], Mesh]
 
 
-def box(rng: np.random.Generator, skin: Skin) -> Mesh:
+def box(rng: np.random.Generator, style: PropStyle) -> Mesh:
     """A block, flat or tall, at times with a lid or a band around it."""
     size_m = rng.uniform(0.2, 1.0, 3)
-    block = boxes(np.zeros(3), size_m, skin.main)
+    block = boxes(np.zeros(3), size_m, style.main)
     band_m = size_m * np.array([1.03, 1.03, rng.uniform(0.08, 0.3)])
     height_m = rng.uniform(-0.5, 0.5) * size_m[2]
-    return joined([block, boxes(np.array([0, 0, height_m]), band_m, skin.other)])
+    return join_meshes([block, boxes(np.array([0, 0, height_m]), band_m, style.other)])
 
 
-def ball(rng: np.random.Generator, skin: Skin) -> Mesh:
+def ball(rng: np.random.Generator, style: PropStyle) -> Mesh:
     """A ball."""
-    return spheres(np.zeros(3), 0.5, skin.main, subdivisions=3)
+    return spheres(np.zeros(3), 0.5, style.main, subdivisions=3)
 
 
-def ellipsoid(rng: np.random.Generator, skin: Skin) -> Mesh:
+def ellipsoid(rng: np.random.Generator, style: PropStyle) -> Mesh:
     """A ball pressed or drawn along its axes."""
-    return spheres(np.zeros(3), rng.uniform(0.15, 0.5, (1, 3)), skin.main, subdivisions=3)
+    return spheres(np.zeros(3), rng.uniform(0.15, 0.5, (1, 3)), style.main, subdivisions=3)
 
 
-def cylinder(rng: np.random.Generator, skin: Skin) -> Mesh:
+def cylinder(rng: np.random.Generator, style: PropStyle) -> Mesh:
     """A drum or a can with a bevelled rim, and a band."""
     radius_m, height_m, bevel_m = rng.uniform(0.15, 0.5), rng.uniform(0.2, 1.0), rng.uniform(0.01, 0.04)
     rim = np.array([[radius_m - bevel_m, 0], [radius_m, bevel_m]])
     top = np.array([[radius_m, height_m - bevel_m], [radius_m - bevel_m, height_m], [0, height_m]])
-    drum = lathe(np.concatenate([[[0.0, 0.0]], rim, top]), skin.main, sections=48)
+    drum = lathe(np.concatenate([[[0.0, 0.0]], rim, top]), style.main, sections=48)
     low_m, high_m = np.sort(rng.uniform(0.2, 0.8, 2)) * height_m
     band_m = np.array([[radius_m, low_m], [radius_m * 1.02, low_m], [radius_m * 1.02, high_m]])
-    return joined([drum, lathe(np.concatenate([band_m, [[radius_m, high_m]]]), skin.other, sections=48)])
+    return join_meshes(
+        [drum, lathe(np.concatenate([band_m, [[radius_m, high_m]]]), style.other, sections=48)]
+    )
 
 
-def cone(rng: np.random.Generator, skin: Skin) -> Mesh:
+def cone(rng: np.random.Generator, style: PropStyle) -> Mesh:
     """A cone, at times cut off."""
     radius_m, height_m, tip_m = rng.uniform(0.2, 0.5), rng.uniform(0.4, 1.0), rng.uniform(0, 0.15)
     share = np.linspace(0, 1, 9)[:, None]
     side_m = (1 - share) * [[radius_m, 0]] + share * [[tip_m, height_m]]
-    return lathe(np.concatenate([[[0.0, 0.0]], side_m, [[0.0, height_m]]]), skin.main, sections=40)
+    return lathe(np.concatenate([[[0.0, 0.0]], side_m, [[0.0, height_m]]]), style.main, sections=40)
 
 
-def torus(rng: np.random.Generator, skin: Skin) -> Mesh:
+def torus(rng: np.random.Generator, style: PropStyle) -> Mesh:
     """A ring, thin or fat, upright or not round it all turned anyhow later."""
     tube_m = rng.uniform(0.04, 0.17)
     angle = np.linspace(0, 2 * np.pi, 17)
     circle_m = tube_m * np.stack([np.cos(angle), np.sin(angle)], -1)
-    return lathe(circle_m + [[0.5 - tube_m, tube_m]], skin.main, sections=48)
+    return lathe(circle_m + [[0.5 - tube_m, tube_m]], style.main, sections=48)
 
 
-def vase(rng: np.random.Generator, skin: Skin) -> Mesh:
+def vase(rng: np.random.Generator, style: PropStyle) -> Mesh:
     """A vase or turned post: a smooth profile that goes in and out."""
     share = np.linspace(0, 1, 18)
     waves = sum(rng.uniform(-1, 1) / k * np.cos(np.pi * k * share + rng.uniform(0, 6)) for k in range(1, 6))
@@ -81,10 +83,10 @@ def vase(rng: np.random.Generator, skin: Skin) -> Mesh:
     outside = np.stack([radii_m, share], -1)
     # The wall turns at the rim and goes down again inside.
     inside = np.stack([radii_m[:11:-1] * 0.86, share[:11:-1]], -1)
-    return lathe(np.concatenate([[[0.0, 0.0]], outside, inside, [[0.0, share[12]]]]), skin.main, sections=40)
+    return lathe(np.concatenate([[[0.0, 0.0]], outside, inside, [[0.0, share[12]]]]), style.main, sections=40)
 
 
-def bottle(rng: np.random.Generator, skin: Skin) -> Mesh:
+def bottle(rng: np.random.Generator, style: PropStyle) -> Mesh:
     """A bottle with a label and a cap."""
     radius_m, neck_m, shoulder = rng.uniform(0.12, 0.22), rng.uniform(0.03, 0.06), rng.uniform(0.5, 0.75)
     share = np.linspace(0, 1, 8)
@@ -94,19 +96,21 @@ def bottle(rng: np.random.Generator, skin: Skin) -> Mesh:
     cap = np.array([[neck_m, 0.94], [neck_m * 1.25, 0.94], [neck_m * 1.25, 1.0], [0.0, 1.0]])
     label_m = radius_m * 1.01
     label = np.array([[label_m, 0.15], [label_m, shoulder * 0.85]])
-    return joined([lathe(body, skin.main), lathe(cap, skin.other, 20), lathe(label, skin.other, sections=36)])
+    return join_meshes(
+        [lathe(body, style.main), lathe(cap, style.other, 20), lathe(label, style.other, sections=36)]
+    )
 
 
-def lamp(rng: np.random.Generator, skin: Skin) -> Mesh:
+def lamp(rng: np.random.Generator, style: PropStyle) -> Mesh:
     """A standing lamp: foot, rod, shade."""
     foot_m, rod_m, low_m = rng.uniform(0.12, 0.22), rng.uniform(0.012, 0.03), rng.uniform(0.55, 0.7)
     stand = np.array([[0, 0], [foot_m, 0], [foot_m, 0.03], [rod_m, 0.06], [rod_m, 0.9], [0.0, 0.9]])
     wide_m, narrow_m = rng.uniform(0.2, 0.32), rng.uniform(0.08, 0.2)
     shade = np.array([[wide_m, low_m], [narrow_m, 1.0], [narrow_m - 0.01, 1.0], [wide_m - 0.01, low_m]])
-    return joined([lathe(stand, skin.main, 24), lathe(shade, skin.other, 48)])
+    return join_meshes([lathe(stand, style.main, 24), lathe(shade, style.other, 48)])
 
 
-def twisted_prism(rng: np.random.Generator, skin: Skin) -> Mesh:
+def twisted_prism(rng: np.random.Generator, style: PropStyle) -> Mesh:
     """A column of three to six sides that twists and tapers."""
     corners, steps = int(rng.integers(3, 7)), 5
     angle = np.arange(corners * steps) / steps
@@ -118,16 +122,16 @@ def twisted_prism(rng: np.random.Generator, skin: Skin) -> Mesh:
     size_m = rng.uniform(0.15, 0.4) * (1 + rng.uniform(-0.6, 0.6) * share)
     x = size_m[:, None] * (np.cos(twist)[:, None] * polygon[:, 0] - np.sin(twist)[:, None] * polygon[:, 1])
     y = size_m[:, None] * (np.sin(twist)[:, None] * polygon[:, 0] + np.cos(twist)[:, None] * polygon[:, 1])
-    return loft(np.stack([x, y, share[:, None] + 0 * x], -1), skin.main)
+    return loft(np.stack([x, y, share[:, None] + 0 * x], -1), style.main)
 
 
-def bent_pipe(rng: np.random.Generator, skin: Skin) -> Mesh:
+def bent_pipe(rng: np.random.Generator, style: PropStyle) -> Mesh:
     """A pipe that wanders, its thickness too."""
     path_m = wander_m(rng, 26)
-    return sweep(path_m, rng.uniform(0.02, 0.12) * (1 + 0.3 * np.sin(np.linspace(0, 9, 26))), skin.main, 14)
+    return sweep(path_m, rng.uniform(0.02, 0.12) * (1 + 0.3 * np.sin(np.linspace(0, 9, 26))), style.main, 14)
 
 
-def blob(rng: np.random.Generator, skin: Skin) -> Mesh:
+def blob(rng: np.random.Generator, style: PropStyle) -> Mesh:
     """A boulder: a ball with smooth bumps."""
     polar, around = np.linspace(3.12, 0.02, 24)[:, None], np.arange(36) * 2 * np.pi / 36
     radius_m = 0.4 + np.sum(
@@ -139,49 +143,51 @@ def blob(rng: np.random.Generator, skin: Skin) -> Mesh:
     )
     x, y = np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around)
     directions = np.stack([x, y, np.cos(polar) + 0 * around], -1)
-    return loft(radius_m[..., None] * directions * rng.uniform(0.5, 1.0, 3), skin.main)
+    return loft(radius_m[..., None] * directions * rng.uniform(0.5, 1.0, 3), style.main)
 
 
-def plate(rng: np.random.Generator, skin: Skin) -> Mesh:
+def plate(rng: np.random.Generator, style: PropStyle) -> Mesh:
     """A thin flat board."""
-    return boxes(np.zeros(3), np.array([rng.uniform(0.4, 1.0), rng.uniform(0.01, 0.04), 1.0]), skin.main)
+    return boxes(np.zeros(3), np.array([rng.uniform(0.4, 1.0), rng.uniform(0.01, 0.04), 1.0]), style.main)
 
 
-def bowl(rng: np.random.Generator, skin: Skin) -> Mesh:
+def bowl(rng: np.random.Generator, style: PropStyle) -> Mesh:
     """An open bowl, deep or flat."""
     depth_m, angle = rng.uniform(0.12, 0.4), np.linspace(0.05, np.pi / 2, 10)
     outside = np.stack([0.5 * np.sin(angle), depth_m * (1 - np.cos(angle))], -1)
     inside = outside[::-1] * [0.94, 0.94] + [0, 0.06 * depth_m]
-    return lathe(np.concatenate([[[0.0, outside[0, 1]]], outside, inside]), skin.main, sections=44)
+    return lathe(np.concatenate([[[0.0, outside[0, 1]]], outside, inside]), style.main, sections=44)
 
 
-def dumbbell(rng: np.random.Generator, skin: Skin) -> Mesh:
+def dumbbell(rng: np.random.Generator, style: PropStyle) -> Mesh:
     """Two or three balls on a rod."""
     count = int(rng.integers(2, 4))
     centres_m = np.stack([np.zeros(count), np.zeros(count), np.linspace(-0.4, 0.4, count)], -1)
-    balls = spheres(centres_m, rng.uniform(0.06, 0.5 / count, count), skin.main, subdivisions=3)
-    return joined([balls, tubes(centres_m[:1], centres_m[-1:], rng.uniform(0.01, 0.04), skin.other, 12)])
+    balls = spheres(centres_m, rng.uniform(0.06, 0.5 / count, count), style.main, subdivisions=3)
+    return join_meshes(
+        [balls, tubes(centres_m[:1], centres_m[-1:], rng.uniform(0.01, 0.04), style.other, 12)]
+    )
 
 
-def cloth(rng: np.random.Generator, skin: Skin) -> Mesh:
+def cloth(rng: np.random.Generator, style: PropStyle) -> Mesh:
     """A hanging or flying sheet with waves."""
     x, z = np.meshgrid(np.linspace(-0.5, 0.5, 36), np.linspace(0, rng.uniform(0.6, 1.1), 26))
     y = sum(
         rng.uniform(0.01, 0.12) / np.sqrt(k) * np.sin(k * rng.uniform(2, 6) * x + rng.normal(0, 3) * z)
         for k in range(1, 5)
     )
-    return sheet(np.stack([x, y, z], -1), skin.main)
+    return sheet(np.stack([x, y, z], -1), style.main)
 
 
-def arch(rng: np.random.Generator, skin: Skin) -> Mesh:
+def arch(rng: np.random.Generator, style: PropStyle) -> Mesh:
     """A half ring on two posts."""
     angle, radius_m, leg_m = np.linspace(0, np.pi, 24), rng.uniform(0.25, 0.45), rng.uniform(0.1, 0.5)
     bend = np.stack([radius_m * np.cos(angle), 0 * angle, leg_m + radius_m * np.sin(angle)], -1)
     path_m = np.concatenate([[[radius_m, 0, 0]], bend, [[-radius_m, 0, 0]]])
-    return sweep(path_m, rng.uniform(0.03, 0.12), skin.main, 16)
+    return sweep(path_m, rng.uniform(0.03, 0.12), style.main, 16)
 
 
-def stairs(rng: np.random.Generator, skin: Skin) -> Mesh:
+def stairs(rng: np.random.Generator, style: PropStyle) -> Mesh:
     """Steps, each a block on the one before."""
     count = int(rng.integers(4, 9))
     step_m, wide_m = 1.0 / count, rng.uniform(0.3, 0.8)
@@ -189,22 +195,22 @@ def stairs(rng: np.random.Generator, skin: Skin) -> Mesh:
     heights_m = (k + 1) * step_m * rng.uniform(0.5, 0.9)
     sizes_m = np.stack([np.full(count, step_m), np.full(count, wide_m), heights_m], -1)
     centres_m = np.stack([k * step_m, np.zeros(count), heights_m / 2], -1)
-    return joined(
-        [boxes(centres_m[::2], sizes_m[::2], skin.main), boxes(centres_m[1::2], sizes_m[1::2], skin.other)]
+    return join_meshes(
+        [boxes(centres_m[::2], sizes_m[::2], style.main), boxes(centres_m[1::2], sizes_m[1::2], style.other)]
     )
 
 
-def tower_of_blocks(rng: np.random.Generator, skin: Skin) -> Mesh:
+def tower_of_blocks(rng: np.random.Generator, style: PropStyle) -> Mesh:
     """Blocks piled up, each turned a little."""
     count = int(rng.integers(3, 7))
     sizes_m = np.stack([*rng.uniform(0.2, 0.45, (2, count)), rng.uniform(0.6, 1.0, count) / count], -1)
     tops_m = np.cumsum(sizes_m[:, 2])
     centres_m = np.stack([*rng.normal(0, 0.03, (2, count)), tops_m - sizes_m[:, 2] / 2], -1)
-    turns = np.stack([turn((0, 0, 1), angle)[:3, :3] for angle in rng.uniform(0, 90, count)])
+    turns = np.stack([rotation((0, 0, 1), angle)[:3, :3] for angle in rng.uniform(0, 90, count)])
     pick = np.arange(count) % 2 == 0
-    return joined(
+    return join_meshes(
         boxes(centres_m[rows], sizes_m[rows], material, turns[rows])
-        for rows, material in ((pick, skin.main), (~pick, skin.other))
+        for rows, material in ((pick, style.main), (~pick, style.other))
     )
 
 
@@ -221,7 +227,7 @@ def _on_circle(turns: np.ndarray) -> Float[np.ndarray, "n 2"]:
     return np.stack([np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)], -1)
 
 
-SOLIDS: tuple[Thing, ...] = (
+SOLIDS: tuple[PropBuilder, ...] = (
     (box, ball, ellipsoid, cylinder, cone, torus, vase, bottle, lamp, twisted_prism, bent_pipe, blob)
     + (plate, bowl, dumbbell, cloth, arch, stairs, tower_of_blocks)
 )  # fmt: skip

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.synth.props.lattice import galvanised
+from stereoweave.synth.props.lattice import galvanised_steel
 from stereoweave.synth.props.people_and_animals import draw_clothes, person
-from stereoweave.synth.props.primitives import boxes, polyline_tubes, prism, spheres, tubes, turn
-from stereoweave.synth.props.random_materials import chosen, muted
+from stereoweave.synth.props.primitives import boxes, polyline_tubes, prism, rotation, spheres, tubes
+from stereoweave.synth.props.random_materials import draw_material_from, draw_muted_colour
 from stereoweave.synth.props.surroundings import bollards, bushes, fence, trees
 from stereoweave.synth.props.vehicles import fleet
 from stereoweave.synth.stage import Palette
-from stereoweave.synth.world import Material, Mesh, joined
+from stereoweave.synth.world import Material, Mesh, join_meshes
 
 _FRONTS = ("brick", "plaster", "plain", "concrete", "paint", "stone", "wood")
 _KERB_M = 0.12
@@ -68,15 +68,15 @@ def carriageway(rng: np.random.Generator, palette: Palette, plan: StreetPlan) ->
         stripes = np.arange(-plan.half_m + 0.5, plan.half_m - 0.3, 1.0)
         at_m = rng.uniform(0, 20)
         parts.append(boxes([[at_m, y, 0.005] for y in stripes], [3.0, 0.5, 0.014], white))
-    return joined(parts)
+    return join_meshes(parts)
 
 
 def fronts(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mesh:
     """Houses in two rows with gaps between some; or, on one side at times, a fence with bushes and trees."""
-    walls = [palette.add(chosen(rng, _FRONTS, 12.0)) for _ in range(6)]
+    walls = [palette.add(draw_material_from(rng, _FRONTS, 12.0)) for _ in range(6)]
     glass = palette.add(Material(texture="plain", tint=(0.07, 0.09, 0.11), roughness=0.08))
-    trim = palette.add(Material(texture="plain", tint=muted(rng, 0.2), roughness=0.7, relief=0.1))
-    roof = palette.add(chosen(rng, ("tiles",), 15.0))
+    trim = palette.add(Material(texture="plain", tint=draw_muted_colour(rng, 0.2), roughness=0.7, relief=0.1))
+    roof = palette.add(draw_material_from(rng, ("tiles",), 15.0))
     green = int(rng.choice([-1, 1])) if rng.random() < 0.3 else 0
     parts = []
     for side in (-1, 1):
@@ -87,12 +87,12 @@ def fronts(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mesh
         while x < _END_M:
             size_m = rng.uniform([6, 7, 4], [18, 10, 15])
             house = _house(rng, size_m, walls[int(rng.integers(6))], glass, trim)
-            roofed = joined([house, _ridge(size_m, roof)]) if rng.random() < 0.5 else house
+            roofed = join_meshes([house, _ridge(size_m, roof)]) if rng.random() < 0.5 else house
             away_m = plan.fronts_m + rng.choice([0.0, rng.uniform(0, 3)])
-            facing = roofed if side > 0 else roofed.placed(turn((0, 0, 1), 180)).moved(x=size_m[0])
-            parts.append(facing.moved(x=x, y=side * away_m))
+            facing = roofed if side > 0 else roofed.transform(rotation((0, 0, 1), 180)).translate(x=size_m[0])
+            parts.append(facing.translate(x=x, y=side * away_m))
             x += size_m[0] + rng.choice([0.0, rng.uniform(2, 9)], p=[0.75, 0.25])
-    return joined(parts)
+    return join_meshes(parts)
 
 
 def traffic(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mesh:
@@ -114,9 +114,9 @@ def traffic(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mes
     vehicles = []
     for x, y, heading_deg, choice in poses:
         vehicle = choice[int(rng.integers(len(choice)))]
-        turned = vehicle.placed(turn((0, 0, 1), heading_deg + rng.normal(0, 1.5)))
-        vehicles.append(turned.moved(x, y + rng.normal(0, 0.1)))
-    return joined(vehicles) if vehicles else kinds[0].moved(25.0, plan.half_m - 1.1)
+        turned = vehicle.transform(rotation((0, 0, 1), heading_deg + rng.normal(0, 1.5)))
+        vehicles.append(turned.translate(x, y + rng.normal(0, 0.1)))
+    return join_meshes(vehicles) if vehicles else kinds[0].translate(25.0, plan.half_m - 1.1)
 
 
 def walkers(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mesh:
@@ -128,15 +128,15 @@ def walkers(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mes
         y = rng.uniform(-0.8, 0.8) * plan.half_m if crossing else side * _on_pavement(rng, plan)
         z = 0.0 if crossing else _KERB_M
         heading_deg = rng.uniform(0, 360) if crossing else rng.choice([0, 180]) + rng.normal(0, 15)
-        mesh = person(rng, clothes[int(rng.integers(3))]).placed(turn((0, 0, 1), heading_deg))
-        people.append(mesh.moved(rng.uniform(-3, 28), y, z))
-    return joined(people)
+        mesh = person(rng, clothes[int(rng.integers(3))]).transform(rotation((0, 0, 1), heading_deg))
+        people.append(mesh.translate(rng.uniform(-3, 28), y, z))
+    return join_meshes(people)
 
 
 def street_furniture(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mesh:
     """Lamp posts, signs, bollards, trees in the pavements, and wires over the street in half of the draws."""
-    steel = palette.add(galvanised(rng))
-    signs = [palette.add(chosen(rng, ("sign", "paint", "plain"), 6.0)) for _ in range(2)]
+    steel = palette.add(galvanised_steel(rng))
+    signs = [palette.add(draw_material_from(rng, ("sign", "paint", "plain"), 6.0)) for _ in range(2)]
     at_m = np.arange(rng.uniform(-8, 4), 80, rng.uniform(12, 26))
     sides = np.where(np.arange(len(at_m)) % 2 == 0, 1.0, -1.0) if rng.random() < 0.5 else np.ones(len(at_m))
     kerb_m = plan.half_m + 0.35
@@ -144,14 +144,14 @@ def street_furniture(rng: np.random.Generator, palette: Palette, plan: StreetPla
     if rng.random() < 0.5:
         parts += [_wires(rng, at_m, sides[0] * kerb_m, steel)]
     for x in rng.uniform(-5, 40, int(rng.integers(2, 7))):
-        parts.append(_sign(rng, steel, signs).moved(x, rng.choice([-1, 1]) * kerb_m))
+        parts.append(_sign(rng, steel, signs).translate(x, rng.choice([-1, 1]) * kerb_m))
     if rng.random() < 0.6:
         spots = np.array([[x, s * kerb_m, 0] for x in np.arange(-4, 60, rng.uniform(7, 14)) for s in (-1, 1)])
         parts.append(trees(rng, palette, spots[rng.random(len(spots)) < 0.7].reshape(-1, 3), (4, 8)))
     if rng.random() < 0.4:
         line = np.array([[x, rng.choice([-1, 1]) * kerb_m, 0.1] for x in np.arange(-2, 14, 2.0)])
         parts.append(bollards(rng, palette, line))
-    return joined(parts)
+    return join_meshes(parts)
 
 
 def _ground(rng: np.random.Generator, family: str, span_m: float) -> Material:
@@ -190,7 +190,7 @@ def _house(
         parts.append(boxes([[middles_m[door], 0, 1.1]], [[1.0, 0.16, 2.2]], trim))
         rest = [(x, 1.6) for k, x in enumerate(middles_m) if k != door]
         parts += [_panes(rest, width_m, 1.3, glass, trim)] if rest else []
-    return joined(parts)
+    return join_meshes(parts)
 
 
 def _panes(spots_m: list[tuple[float, float]], width_m: float, high_m: float, glass: int, trim: int) -> Mesh:
@@ -199,7 +199,7 @@ def _panes(spots_m: list[tuple[float, float]], width_m: float, high_m: float, gl
     frames = boxes(centres, [width_m + 0.2, 0.1, high_m + 0.2], trim)
     panes = boxes(centres, [width_m, 0.16, high_m], glass)
     bars = boxes(centres, [0.06, 0.2, high_m], trim)
-    return joined([frames, panes, bars])
+    return join_meshes([frames, panes, bars])
 
 
 def _ridge(size_m: Float[np.ndarray, "3"], material: int) -> Mesh:
@@ -207,7 +207,7 @@ def _ridge(size_m: Float[np.ndarray, "3"], material: int) -> Mesh:
     length_m, deep_m, high_m = (float(v) for v in size_m)
     outline = [(-0.3, high_m), (deep_m + 0.3, high_m), (deep_m / 2, high_m + 0.35 * deep_m)]
     upright = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-    return prism(outline, length_m, material).placed(upright)
+    return prism(outline, length_m, material).transform(upright)
 
 
 def _green(rng: np.random.Generator, palette: Palette, plan: StreetPlan, side: int) -> Mesh:
@@ -217,7 +217,7 @@ def _green(rng: np.random.Generator, palette: Palette, plan: StreetPlan, side: i
     x = np.arange(-10, 60, 3.0)
     shrubs = np.stack([x + rng.normal(0, 0.5, len(x)), y + side * rng.uniform(1, 4, len(x)), 0 * x], -1)
     far = np.stack([x[::2], y + side * rng.uniform(5, 14, len(x[::2])), 0 * x[::2]], -1)
-    return joined(
+    return join_meshes(
         [fence(rng, palette, line), bushes(rng, palette, shrubs), trees(rng, palette, far, (5, 11))]
     )
 
@@ -226,7 +226,7 @@ def _lamp_post(x: float, y: float, inwards: float, steel: int) -> Mesh:
     """A post with an arm over the carriageway."""
     top, arm = [x, y, 6.2], [x, y + 1.3 * inwards, 6.5]
     post = tubes([[x, y, 0], top], [top, arm], [[0.09, 0.06], [0.05, 0.04]], steel, 10)
-    return joined([post, spheres([arm], [[0.12, 0.35, 0.08]], steel)])
+    return join_meshes([post, spheres([arm], [[0.12, 0.35, 0.08]], steel)])
 
 
 def _wires(rng: np.random.Generator, at_m: Float[np.ndarray, " n"], y: float, steel: int) -> Mesh:
@@ -239,7 +239,7 @@ def _wires(rng: np.random.Generator, at_m: Float[np.ndarray, " n"], y: float, st
             z = 5.9 - 0.25 * k - 4 * sag_m * share * (1 - share)
             points = np.stack([start + share * (end - start), y + 0 * share, z], -1)
             wires.append(polyline_tubes(points, 0.012, steel, 5))
-    return joined(wires)
+    return join_meshes(wires)
 
 
 def _sign(rng: np.random.Generator, steel: int, faces: list[int]) -> Mesh:
@@ -252,4 +252,4 @@ def _sign(rng: np.random.Generator, steel: int, faces: list[int]) -> Mesh:
     # From the outline's x, y, z to across the street, up and towards the traffic.
     facing = np.array([[0.0, 0, -1, -0.06], [-1, 0, 0, 0], [0, 1, 0, high_m - half_m], [0, 0, 0, 1]])
     post = tubes([[0, 0, 0]], [[0, 0, high_m]], 0.035, steel, 8)
-    return joined([post, plate.placed(turn((0, 0, 1), rng.normal(0, 8)) @ facing)])
+    return join_meshes([post, plate.transform(rotation((0, 0, 1), rng.normal(0, 8)) @ facing)])

@@ -16,14 +16,14 @@ from stereoweave.synth.props.primitives import (
     facets,
     lathe,
     prism,
+    rotation,
     sheet,
-    shift,
     spheres,
+    translation,
     tubes,
-    turn,
 )
 from stereoweave.synth.stage import Palette
-from stereoweave.synth.world import Colour, Fog, Material, Mesh, Sky, joined
+from stereoweave.synth.world import Colour, Fog, Material, Mesh, Sky, join_meshes
 
 Spots = Float[np.ndarray, "n 3"]
 
@@ -52,7 +52,7 @@ def daylight(rng: np.random.Generator) -> tuple[Sky, Fog | None, float]:
     }[kind]
     sky = Sky(
         sun=tuple(float(v) for v in sun),  # type: ignore[arg-type]
-        sun_light=_times(sun_light, strength),
+        sun_light=_scale_colour(sun_light, strength),
         zenith=zenith,
         horizon=horizon,
         ground=(0.2, 0.18, 0.15),
@@ -60,7 +60,7 @@ def daylight(rng: np.random.Generator) -> tuple[Sky, Fog | None, float]:
         clouds=float(clouds),
     )
     density = {"clear": 0.0, "hazy": 0.0035, "overcast": 0.0015, "low": 0.001}[kind] * rng.uniform(0.5, 1.2)
-    fog = Fog(colour=_times(horizon, 0.9), density_per_m=density) if density else None
+    fog = Fog(colour=_scale_colour(horizon, 0.9), density_per_m=density) if density else None
     return sky, fog, float(rng.uniform(0.85, 1.1))
 
 
@@ -84,13 +84,13 @@ def terrain(  # noqa: PLR0913, grounds differ in so much
         Material(
             texture=family,
             variant=int(rng.integers(64)),
-            tint=varied(rng, tint),
+            tint=vary_colour(rng, tint),
             span_m=span_m,
             roughness=0.95,
             relief=0.6,
         )
     )
-    x, y = _square(extent_m, near_m=8.0, steps=44)
+    x, y = _widening_grid(extent_m, near_m=8.0, steps=44)
     bumps = sum(
         np.sin((x * np.cos(way) + y * np.sin(way)) * 2 * np.pi / length + phase)
         for way, length, phase in zip(
@@ -99,7 +99,7 @@ def terrain(  # noqa: PLR0913, grounds differ in so much
     )
     away = np.clip((np.hypot(x, y) - flat_radius_m) / max(flat_radius_m, 1), 0, 1)
     height = level_m + bumps_m / 5 * bumps * away * away * (3 - 2 * away)
-    return _from_above(sheet(np.stack([x, y, height], -1), material))
+    return _map_texture_from_above(sheet(np.stack([x, y, height], -1), material))
 
 
 def sea(rng: np.random.Generator, palette: Palette, *, extent_m: float = 200.0, level_m: float = 0.0) -> Mesh:
@@ -109,13 +109,13 @@ def sea(rng: np.random.Generator, palette: Palette, *, extent_m: float = 200.0, 
         Material(
             texture="water",
             variant=int(rng.integers(64)),
-            tint=varied(rng, tint),
+            tint=vary_colour(rng, tint),
             span_m=rng.uniform(4, 7),
             roughness=0.12,
             relief=rng.uniform(0.5, 0.9),
         )
     )
-    x, y = _square(extent_m, near_m=4.0, steps=60)
+    x, y = _widening_grid(extent_m, near_m=4.0, steps=60)
     wind, roughness_m = rng.uniform(0, 2 * np.pi), rng.uniform(0.4, 1.0)
     height = np.full_like(x, level_m)
     for length in np.geomspace(2.2, 16, 8) * rng.uniform(0.9, 1.1, 8):
@@ -124,7 +124,7 @@ def sea(rng: np.random.Generator, palette: Palette, *, extent_m: float = 200.0, 
         carried = np.clip(1.5 - np.maximum(abs(x), abs(y)) * 0.2 / length, 0, 1)
         wave = np.sin((x * np.cos(way) + y * np.sin(way)) * 2 * np.pi / length + phase)
         height += 0.008 * roughness_m * length * carried * wave
-    return _from_above(sheet(np.stack([x, y, height], -1), material))
+    return _map_texture_from_above(sheet(np.stack([x, y, height], -1), material))
 
 
 def hills(rng: np.random.Generator, palette: Palette, *, distance_m: float = 140.0) -> Mesh:
@@ -133,7 +133,7 @@ def hills(rng: np.random.Generator, palette: Palette, *, distance_m: float = 140
         Material(
             texture="leaves",
             variant=int(rng.integers(64)),
-            tint=varied(rng, (0.85, 0.86, 0.86)),
+            tint=vary_colour(rng, (0.85, 0.86, 0.86)),
             span_m=14.0,
             roughness=1.0,
             relief=0.8,
@@ -155,7 +155,7 @@ def hills(rng: np.random.Generator, palette: Palette, *, distance_m: float = 140
     return sheet(points, material, closed=True)
 
 
-def places(rng: np.random.Generator, count: int, nearest_m: float, farthest_m: float) -> Spots:
+def draw_spots(rng: np.random.Generator, count: int, nearest_m: float, farthest_m: float) -> Spots:
     """Spots [count, 3] around the origin at z = 0, evenly over the ring's area, not too near each other."""
     # A jittered sunflower: every spot has the same area to itself.
     order = np.arange(count)
@@ -173,31 +173,31 @@ def trees(
 ) -> Mesh:
     """Trees at the spots, broad and slender ones, of heights from..to."""
     bark = palette.add(Material(texture="bark", variant=int(rng.integers(64)), span_m=1.5, relief=0.8))
-    leaves = [_leaves(rng, palette) for _ in range(2)]
+    leaves = [_add_foliage(rng, palette) for _ in range(2)]
     kinds = [_tree(rng, bark, leaves[0], 0.42), _tree(rng, bark, leaves[1], 0.36), _fir(rng, bark, leaves[0])]
-    return _scattered(rng, kinds, spots, rng.uniform(*height_m, len(spots)))
+    return _scatter(rng, kinds, spots, rng.uniform(*height_m, len(spots)))
 
 
 def bushes(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
     """Bushes at the spots, 0.6 to 1.8 m high."""
-    leaves = _leaves(rng, palette)
+    leaves = _add_foliage(rng, palette)
     middles = rng.uniform((-0.35, -0.35, 0.2), (0.35, 0.35, 0.6), (2, 3, 3))
     shapes = [_lumps(rng, places, (0.42, 0.42, 0.38), leaves) for places in middles]
-    kinds = [joined([shape, _tufts(rng, shape, 50, 0.09)]) for shape in shapes]
-    return _scattered(rng, kinds, spots, rng.uniform(0.6, 1.8, len(spots)))
+    kinds = [join_meshes([shape, _tufts(rng, shape, 50, 0.09)]) for shape in shapes]
+    return _scatter(rng, kinds, spots, rng.uniform(0.6, 1.8, len(spots)))
 
 
 def rocks(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
     """Boulders at the spots, 0.3 to 1.5 m across, half sunk."""
     stone = palette.add(Material(texture="stone", variant=int(rng.integers(64)), relief=0.7, roughness=0.9))
     kinds = [_lumps(rng, np.zeros((1, 3)), rng.uniform(0.3, 0.55, 3), stone) for _ in range(3)]
-    return _scattered(rng, kinds, spots, rng.uniform(0.4, 1.5, len(spots)))
+    return _scatter(rng, kinds, spots, rng.uniform(0.4, 1.5, len(spots)))
 
 
 def houses(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
     """Houses at the spots, of two kinds, with gable roofs, windows, doors and chimneys, 6 to 9 m high."""
     kinds = [_house(rng, palette) for _ in range(2)]
-    return _scattered(rng, kinds, spots, rng.uniform(0.9, 1.25, len(spots)))
+    return _scatter(rng, kinds, spots, rng.uniform(0.9, 1.25, len(spots)))
 
 
 def posts(rng: np.random.Generator, palette: Palette, spots: Spots, height_m: float = 1.2) -> Mesh:
@@ -220,7 +220,7 @@ def fence(rng: np.random.Generator, palette: Palette, corners_m: Spots) -> Mesh:
         tubes(line[:-1] + [0, 0, height * share], line[1:] + [0, 0, height * share], 0.02, steel)
         for share in (0.35, 0.65, 0.97)
     ]
-    return joined([tubes(line - [0, 0, 0.5], line + [0, 0, height], 0.03, steel), *rails])
+    return join_meshes([tubes(line - [0, 0, 0.5], line + [0, 0, height], 0.03, steel), *rails])
 
 
 def crates(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
@@ -228,8 +228,10 @@ def crates(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
     wood = palette.add(Material(texture="wood", variant=int(rng.integers(64)), tint=(1.1, 1.02, 0.9)))
     frame = palette.add(Material(texture="wood", variant=int(rng.integers(64)), tint=(0.8, 0.7, 0.6)))
     lower = _crate(wood, frame)
-    upper = _crate(wood, frame).placed(shift(0.05, 0.03, 1.0) @ turn((0, 0, 1), rng.uniform(5, 40)))
-    return _scattered(rng, [lower, joined([lower, upper])], spots, rng.uniform(0.6, 1.0, len(spots)))
+    upper = _crate(wood, frame).transform(
+        translation(0.05, 0.03, 1.0) @ rotation((0, 0, 1), rng.uniform(5, 40))
+    )
+    return _scatter(rng, [lower, join_meshes([lower, upper])], spots, rng.uniform(0.6, 1.0, len(spots)))
 
 
 def pallets(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
@@ -237,17 +239,20 @@ def pallets(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
     wood = palette.add(Material(texture="wood", variant=int(rng.integers(64)), tint=(1.1, 1.0, 0.88)))
     boards = boxes([[0, y, 0.13] for y in np.linspace(-0.35, 0.35, 6)], (1.2, 0.1, 0.022), wood)
     beams = boxes([[x, 0, 0.06] for x in (-0.55, 0, 0.55)], (0.1, 0.8, 0.12), wood)
-    one = joined([boards, beams])
-    kinds = [copies(one, np.stack([shift(z=0.145 * k) for k in range(layers)])) for layers in (1, 4)]
-    return _scattered(rng, kinds, spots, np.ones(len(spots)))
+    one = join_meshes([boards, beams])
+    kinds = [copies(one, np.stack([translation(z=0.145 * k) for k in range(layers)])) for layers in (1, 4)]
+    return _scatter(rng, kinds, spots, np.ones(len(spots)))
 
 
 def barrels(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
     """Steel drums at the spots, of two colours, 0.9 m high."""
     profile = [(0, 0), (0.29, 0), (0.29, 0.3), (0.305, 0.31), (0.29, 0.32), (0.29, 0.58), (0.305, 0.59)]
     profile += [(0.29, 0.6), (0.29, 0.88), (0.27, 0.88), (0.27, 0.86), (0, 0.86)]
-    kinds = [lathe(profile, _painted(rng, palette), 16), lathe(profile, _painted(rng, palette, "rust"), 16)]
-    return _scattered(rng, kinds, spots, np.ones(len(spots)))
+    kinds = [
+        lathe(profile, _add_paint(rng, palette), 16),
+        lathe(profile, _add_paint(rng, palette, "rust"), 16),
+    ]
+    return _scatter(rng, kinds, spots, np.ones(len(spots)))
 
 
 def bollards(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
@@ -263,7 +268,7 @@ def bollards(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
         (0.22, 0.5),
         (0, 0.55),
     ]
-    return _scattered(rng, [lathe(profile, iron, 20)], spots, np.ones(len(spots)))
+    return _scatter(rng, [lathe(profile, iron, 20)], spots, np.ones(len(spots)))
 
 
 def cones(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
@@ -273,11 +278,11 @@ def cones(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
     below = lathe([(0.14, 0.03), (0.1, 0.2)], orange, 16)
     band = lathe([(0.1, 0.2), (0.065, 0.35)], white, 16)
     above = lathe([(0.065, 0.35), (0.025, 0.55), (0, 0.55)], orange, 16)
-    cone = joined([boxes((0, 0, 0.015), (0.36, 0.36, 0.03), orange), below, band, above])
-    return _scattered(rng, [cone], spots, np.ones(len(spots)))
+    cone = join_meshes([boxes((0, 0, 0.015), (0.36, 0.36, 0.03), orange), below, band, above])
+    return _scatter(rng, [cone], spots, np.ones(len(spots)))
 
 
-def _scattered(
+def _scatter(
     rng: np.random.Generator, kinds: Sequence[Mesh], spots: Spots, scales: Float[np.ndarray, " n"]
 ) -> Mesh:
     """One of the kinds at each spot, turned any way about z, scaled."""
@@ -289,10 +294,10 @@ def _scattered(
     poses[:, 0, 1] = -poses[:, 1, 0]
     poses[:, 2, 2] = scales
     poses[:, :3, 3] = spots
-    return joined([copies(kind, poses[which == k]) for k, kind in enumerate(kinds)])
+    return join_meshes([copies(kind, poses[which == k]) for k, kind in enumerate(kinds)])
 
 
-def _square(extent_m: float, near_m: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
+def _widening_grid(extent_m: float, near_m: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates x and y [steps + 1, steps + 1] of a grid that is fine within near_m and widens outwards."""
     end = np.arcsinh(extent_m / near_m)
     axis = near_m * np.sinh(np.linspace(-end, end, steps + 1))
@@ -300,18 +305,18 @@ def _square(extent_m: float, near_m: float, steps: int) -> tuple[np.ndarray, np.
     return x, y
 
 
-def _from_above(mesh: Mesh) -> Mesh:
+def _map_texture_from_above(mesh: Mesh) -> Mesh:
     """The mesh with its texture laid on straight from above."""
     return replace(mesh, uv_m=mesh.corners_m[..., :2].copy())
 
 
-def _leaves(rng: np.random.Generator, palette: Palette) -> int:
+def _add_foliage(rng: np.random.Generator, palette: Palette) -> int:
     tint: Colour = [(1.1, 1.15, 0.9), (0.9, 1.05, 0.85), (1.25, 1.15, 0.85)][int(rng.integers(3))]
     return palette.add(
         Material(
             texture="leaves",
             variant=int(rng.integers(64)),
-            tint=varied(rng, tint),
+            tint=vary_colour(rng, tint),
             span_m=0.3,
             roughness=0.9,
             relief=1.0,
@@ -327,7 +332,7 @@ def _tree(rng: np.random.Generator, bark: int, leaves: int, spread: float) -> Me
     branches = tubes(fork, tips, [[0.02, 0.008]] * 4, bark, 4, capped=False)
     centres = np.concatenate([tips * [1, 1, 0.95], [[0, 0, 0.62]]])
     crown = _lumps(rng, centres, (spread * 0.6, spread * 0.6, 0.22), leaves)
-    return joined([trunk, branches, crown, _tufts(rng, crown, 70, 0.055)])
+    return join_meshes([trunk, branches, crown, _tufts(rng, crown, 70, 0.055)])
 
 
 def _fir(rng: np.random.Generator, bark: int, leaves: int) -> Mesh:
@@ -339,8 +344,8 @@ def _fir(rng: np.random.Generator, bark: int, leaves: int) -> Mesh:
         skirt = lathe(
             [(radius * 0.3, z + 0.02), (radius, z), (radius * 0.35, z + 0.13), (0, z + 0.2)], leaves, 10
         )
-        skirts.append(_shaken(rng, skirt, 0.16))
-    return joined([trunk, *skirts])
+        skirts.append(_perturb(rng, skirt, 0.16))
+    return join_meshes([trunk, *skirts])
 
 
 def _lumps(
@@ -348,7 +353,7 @@ def _lumps(
 ) -> Mesh:
     """Uneven balls, as of leaves or stone."""
     radii = np.asarray(radii_m) * rng.uniform(0.8, 1.2, (len(centres_m), 1))
-    return _shaken(rng, spheres(centres_m, radii, material, 1), 0.22)
+    return _perturb(rng, spheres(centres_m, radii, material, 1), 0.22)
 
 
 def _tufts(rng: np.random.Generator, crown: Mesh, count: int, size_m: float) -> Mesh:
@@ -364,7 +369,7 @@ def _tufts(rng: np.random.Generator, crown: Mesh, count: int, size_m: float) -> 
     return replace(tufts, corners_m=outwards, normals=np.repeat(normals, 3, axis=1).astype(np.float32))
 
 
-def _shaken(rng: np.random.Generator, mesh: Mesh, share: float) -> Mesh:
+def _perturb(rng: np.random.Generator, mesh: Mesh, share: float) -> Mesh:
     """The mesh with its corners moved by up to a share of its size, half faceted."""
     corners = mesh.corners_m
     size = np.ptp(corners.reshape(-1, 3), axis=0).max() / 2
@@ -381,18 +386,18 @@ def _shaken(rng: np.random.Generator, mesh: Mesh, share: float) -> Mesh:
 def _house(rng: np.random.Generator, palette: Palette) -> Mesh:
     """A house about 8 m long, its ridge along x."""
     family = str(rng.choice(["brick", "plaster", "wood"]))
-    tint = varied(rng, (1.1, 1.04, 0.95) if family == "plaster" else (1.0, 0.96, 0.92))
+    tint = vary_colour(rng, (1.1, 1.04, 0.95) if family == "plaster" else (1.0, 0.96, 0.92))
     walls = palette.add(Material(texture=family, variant=int(rng.integers(64)), tint=tint, span_m=2.5))
     tiles = palette.add(
-        Material(texture="tiles", variant=int(rng.integers(64)), tint=varied(rng, (1.0, 0.96, 0.95)))
+        Material(texture="tiles", variant=int(rng.integers(64)), tint=vary_colour(rng, (1.0, 0.96, 0.95)))
     )
     glass = palette.add(Material(texture="plain", tint=(0.08, 0.1, 0.12), roughness=0.08))
-    white = palette.add(Material(texture="paint", tint=varied(rng, (0.8, 0.8, 0.78)), roughness=0.6))
+    white = palette.add(Material(texture="paint", tint=vary_colour(rng, (0.8, 0.8, 0.78)), roughness=0.6))
     length, width, eaves = rng.uniform(6, 11), rng.uniform(5, 7), rng.uniform(2.8, 5.5)
     rise = width / 2 * np.tan(np.radians(rng.uniform(30, 48)))
-    return joined(
+    return join_meshes(
         [
-            _gabled(length, width, eaves, rise, walls),
+            _gabled_walls(length, width, eaves, rise, walls),
             _roof(length, width, eaves, rise, tiles),
             _openings((length, width, eaves), int(rng.integers(3, 5)), glass, white),
             boxes((length * 0.25, width * 0.15, eaves + rise), (0.6, 0.6, 1.8), walls),
@@ -400,7 +405,7 @@ def _house(rng: np.random.Generator, palette: Palette) -> Mesh:
     )
 
 
-def _gabled(length: float, width: float, eaves: float, rise: float, material: int) -> Mesh:
+def _gabled_walls(length: float, width: float, eaves: float, rise: float, material: int) -> Mesh:
     outline = [
         (-width / 2, -0.6),
         (width / 2, -0.6),
@@ -409,14 +414,14 @@ def _gabled(length: float, width: float, eaves: float, rise: float, material: in
         (-width / 2, eaves),
     ]
     upright = np.array([[0.0, 0, 1, -length / 2], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-    return prism(np.array(outline), length, material).placed(upright)
+    return prism(np.array(outline), length, material).transform(upright)
 
 
 def _roof(length: float, width: float, eaves: float, rise: float, material: int) -> Mesh:
     """Two slabs that stand out over the walls by 0.4 m."""
     slope = np.arctan2(rise, width / 2)
     across = width / 2 / np.cos(slope) + 0.4
-    turns = np.stack([turn((1, 0, 0), side * np.degrees(slope))[:3, :3] for side in (1, -1)])
+    turns = np.stack([rotation((1, 0, 0), side * np.degrees(slope))[:3, :3] for side in (1, -1)])
     middle = np.array([0, -across / 2 * np.cos(slope), eaves + rise - across / 2 * np.sin(slope) + 0.09])
     return boxes([middle, middle * [1, -1, 1]], (length + 0.8, across + 0.1, 0.16), material, turns)
 
@@ -437,7 +442,7 @@ def _openings(size_m: tuple[float, float, float], columns: int, glass: int, fram
     panes = boxes(centres, np.where(thin < 0.5, 0.16, thin), glass)
     bars = boxes(centres, np.where(thin < 0.5, 0.22, [0.06, 0.06, 1.2]), frame)
     door = boxes((along[0] + 1.3, -width / 2, 1.0), (0.95, 0.18, 2.05), frame)
-    return joined([frames, panes, bars, door])
+    return join_meshes([frames, panes, bars, door])
 
 
 def _crate(wood: int, frame: int) -> Mesh:
@@ -446,26 +451,26 @@ def _crate(wood: int, frame: int) -> Mesh:
     along_x = boxes(np.insert(ends, 0, 0, axis=1), (1.02, 0.1, 0.1), frame)
     along_y = boxes(np.insert(ends, 1, 0, axis=1), (0.1, 1.02, 0.1), frame)
     upright = [(a, b, 0.5) for a in (-0.47, 0.47) for b in (-0.47, 0.47)]
-    return joined(
+    return join_meshes(
         [boxes((0, 0, 0.5), (0.96, 0.96, 0.96), wood), along_x, along_y, boxes(upright, (0.1, 0.1, 1), frame)]
     )
 
 
-def _painted(rng: np.random.Generator, palette: Palette, family: str = "paint") -> int:
+def _add_paint(rng: np.random.Generator, palette: Palette, family: str = "paint") -> int:
     tint: Colour = [(0.2, 0.3, 0.42), (0.5, 0.16, 0.12), (0.6, 0.5, 0.2), (0.22, 0.35, 0.25)][
         int(rng.integers(4))
     ]
     tint = tint if family == "paint" else (0.9, 0.9, 0.9)
     return palette.add(
-        Material(texture=family, variant=int(rng.integers(64)), tint=varied(rng, tint), roughness=0.5)
+        Material(texture=family, variant=int(rng.integers(64)), tint=vary_colour(rng, tint), roughness=0.5)
     )
 
 
-def _times(colour: Colour, factor: float) -> Colour:
+def _scale_colour(colour: Colour, factor: float) -> Colour:
     return tuple(float(c * factor) for c in colour)  # type: ignore[return-value]
 
 
-def varied(rng: np.random.Generator, colour: Colour) -> Colour:
+def vary_colour(rng: np.random.Generator, colour: Colour) -> Colour:
     """The colour, a little brighter or darker, a little warmer or cooler."""
     red, green, blue = np.array(colour) * rng.uniform(0.85, 1.1) * rng.uniform(0.96, 1.04, 3)
     return float(red), float(green), float(blue)

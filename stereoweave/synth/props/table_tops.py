@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereoweave.synth.props.primitives import boxes, turn
-from stereoweave.synth.props.random_materials import broad
+from stereoweave.synth.props.primitives import boxes, rotation
+from stereoweave.synth.props.random_materials import draw_broad_material
 from stereoweave.synth.stage import Palette
-from stereoweave.synth.world import Mesh, joined
+from stereoweave.synth.world import Mesh, join_meshes
 
 _TOPS = ("wood", "concrete", "stone", "cloth", "tiles", "photograph", "paint")
 _BACKDROPS = ("plaster", "brick", "photograph", "concrete", "cloth", "wood", "paint")
@@ -55,43 +55,43 @@ def table_top(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> Me
     parts = [_table(rng, palette, sizes), *_boards(rng, palette, sizes)]
     if rng.random() < 0.9:
         parts.append(_backdrop(rng, palette, sizes))
-    return joined(parts)
+    return join_meshes(parts)
 
 
 def _table(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> Mesh:
     """A slab on a plinth as deep as the slab, but narrower."""
-    material = palette.add(broad(rng, _TOPS, sizes.distance_m))
+    material = palette.add(draw_broad_material(rng, _TOPS, sizes.distance_m))
     length_m = sizes.behind_m + sizes.before_m
     x = (sizes.before_m - sizes.behind_m) / 2
     under_m = sizes.height_m - _THICK_M
     slab = boxes([[x, 0, sizes.height_m - _THICK_M / 2]], [[length_m, sizes.width_m, _THICK_M]], material)
     plinth = boxes([[x - 0.05, 0, under_m / 2]], [[length_m - 0.15, 0.8 * sizes.width_m, under_m]], material)
-    return joined([slab, plinth])
+    return join_meshes([slab, plinth])
 
 
 def _boards(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> list[Mesh]:
     """Upright boards that lean a little, of two materials at most."""
-    materials = [palette.add(broad(rng, _BOARDS, sizes.distance_m)) for _ in range(2)]
+    materials = [palette.add(draw_broad_material(rng, _BOARDS, sizes.distance_m)) for _ in range(2)]
     boards = []
     for _ in range(int(rng.integers(0, 4))):
         wide_m, high_m = sizes.distance_m * rng.uniform([0.15, 0.12], [0.6, 0.45])
         board = boxes([[0, 0, high_m / 2]], [[0.02, wide_m, high_m]], materials[int(rng.integers(2))])
-        pose = turn((0, 0, 1), rng.normal(0, 35)) @ turn((0, 1, 0), rng.uniform(-20, 5))
+        pose = rotation((0, 0, 1), rng.normal(0, 35)) @ rotation((0, 1, 0), rng.uniform(-20, 5))
         x = rng.uniform(-0.9 * sizes.behind_m, min(sizes.before_m, 0.4 * sizes.distance_m))
         y = rng.uniform(-0.4, 0.4) * sizes.distance_m
-        boards.append(board.placed(pose).moved(x, y, sizes.height_m))
+        boards.append(board.transform(pose).translate(x, y, sizes.height_m))
     return boards
 
 
 def _backdrop(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> Mesh:
     """A wall across the view, or two that meet in a corner."""
-    material = palette.add(broad(rng, _BACKDROPS, sizes.distance_m + sizes.behind_m))
+    material = palette.add(draw_broad_material(rng, _BACKDROPS, sizes.distance_m + sizes.behind_m))
     wide_m, high_m = sizes.distance_m * rng.uniform(1.4, 3.0), rng.uniform(1.3, 2.4)
     wall = boxes([[-0.03, 0, high_m / 2]], [[0.06, wide_m, high_m]], material)
     if rng.random() < 0.3:
-        other = palette.add(broad(rng, _BACKDROPS, sizes.distance_m + sizes.behind_m))
+        other = palette.add(draw_broad_material(rng, _BACKDROPS, sizes.distance_m + sizes.behind_m))
         # It ends well before the cameras.
         deep_m = min(wide_m * rng.uniform(0.3, 0.6), sizes.behind_m + 0.35 * sizes.distance_m)
         side = boxes([[deep_m / 2, 0.0, high_m / 2]], [[deep_m, 0.06, high_m]], other)
-        wall = joined([wall, side.moved(y=rng.choice([-1, 1]) * rng.uniform(0.2, 0.45) * wide_m)])
-    return wall.placed(turn((0, 0, 1), rng.normal(0, 12))).moved(x=-sizes.behind_m)
+        wall = join_meshes([wall, side.translate(y=rng.choice([-1, 1]) * rng.uniform(0.2, 0.45) * wide_m)])
+    return wall.transform(rotation((0, 0, 1), rng.normal(0, 12))).translate(x=-sizes.behind_m)

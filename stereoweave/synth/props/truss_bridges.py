@@ -3,18 +3,18 @@
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.synth.props.bridges import Plan, beams, pier, roadway
-from stereoweave.synth.props.lattice import bars, rings, truss
-from stereoweave.synth.props.primitives import boxes, lathe, tubes, turn
+from stereoweave.synth.props.bridges import BridgePlan, beams, pier, roadway
+from stereoweave.synth.props.lattice import bars, mast_rings, truss
+from stereoweave.synth.props.primitives import boxes, lathe, rotation, tubes
 from stereoweave.synth.stage import Palette
-from stereoweave.synth.world import Material, Mesh, joined
+from stereoweave.synth.world import Material, Mesh, join_meshes
 
 Joints = Float[np.ndarray, "_ 3"]
 
 _TOWER_M = 0.5  # along the road
 
 
-def truss_girder(rng: np.random.Generator, palette: Palette, plan: Plan) -> Mesh:
+def truss_girder(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
     """One or two spans between piers, with straight or curved upper chords."""
     count = int(rng.integers(1, 3))
     length_m = 2 * plan.half_m / count
@@ -23,34 +23,34 @@ def truss_girder(rng: np.random.Generator, palette: Palette, plan: Plan) -> Mesh
     crown = rng.uniform(0.2, 0.45) * rng.integers(2)
     span = _span(rng, plan, length_m, panels, height_m, crown)
     starts_m = -plan.half_m + length_m * np.arange(count)
-    spans = [span.moved(x=start + length_m / 2, z=plan.level_m) for start in starts_m]
+    spans = [span.translate(x=start + length_m / 2, z=plan.level_m) for start in starts_m]
     piers = [pier(plan, start, plan.level_m - 0.16) for start in starts_m[1:]]
-    return joined([*spans, *piers, roadway(plan, -plan.half_m, plan.half_m).moved(z=plan.level_m)])
+    return join_meshes([*spans, *piers, roadway(plan, -plan.half_m, plan.half_m).translate(z=plan.level_m)])
 
 
-def lift_bridge(rng: np.random.Generator, palette: Palette, plan: Plan) -> Mesh:
+def lift_bridge(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
     """A truss span between two lattice towers, at times raised, with counterweights, cables and wheels."""
     gap_m, height_m = rng.uniform(1.5, 1.8), rng.uniform(2.3, 2.8)
     raised_m = rng.uniform(0.3, 1.1) * float(rng.random() < 0.6)
-    lifted = joined(
+    lifted = join_meshes(
         [_span(rng, plan, 2 * gap_m - 0.06, 8, 0.55, 0.0), roadway(plan, -gap_m + 0.02, gap_m - 0.02)]
     )
     concrete = palette.add(Material(texture="concrete", variant=int(rng.integers(64)), span_m=1.0))
     glass = palette.add(Material(texture="plain", tint=(0.08, 0.1, 0.12), roughness=0.1))
     tower = _lift_tower(plan, height_m, raised_m, concrete)
-    cabin = _cabin(plan, glass).moved(z=0.75 * height_m)
+    cabin = _cabin(plan, glass).translate(z=0.75 * height_m)
     middle_m, edge_m = gap_m + _TOWER_M / 2, gap_m + _TOWER_M
-    approach = _span(rng, plan, plan.half_m - edge_m, 6, 0.42, 0.0).moved(x=(edge_m + plan.half_m) / 2)
-    end = joined([tower.moved(x=middle_m), approach, roadway(plan, gap_m + 0.02, plan.half_m)])
-    other_end = joined([end, cabin.moved(x=middle_m)]).placed(turn((0, 0, 1), 180))
+    approach = _span(rng, plan, plan.half_m - edge_m, 6, 0.42, 0.0).translate(x=(edge_m + plan.half_m) / 2)
+    end = join_meshes([tower.translate(x=middle_m), approach, roadway(plan, gap_m + 0.02, plan.half_m)])
+    other_end = join_meshes([end, cabin.translate(x=middle_m)]).transform(rotation((0, 0, 1), 180))
     piers = [pier(plan, x, plan.level_m - 0.14, thick_m=0.75) for x in (-middle_m, middle_m)]
-    return joined(
-        [*piers, *(part.moved(z=plan.level_m) for part in (end, other_end, lifted.moved(z=raised_m)))]
+    return join_meshes(
+        [*piers, *(part.translate(z=plan.level_m) for part in (end, other_end, lifted.translate(z=raised_m)))]
     )
 
 
 def _span(  # noqa: PLR0913, spans differ in so much
-    rng: np.random.Generator, plan: Plan, length_m: float, panels: int, height_m: float, crown: float
+    rng: np.random.Generator, plan: BridgePlan, length_m: float, panels: int, height_m: float, crown: float
 ) -> Mesh:
     """Two trusses, the bracing over the road, and the beams under it, around x = 0; the road is at z = 0.
 
@@ -73,10 +73,10 @@ def _span(  # noqa: PLR0913, spans differ in so much
     else:
         over = []
     under = beams(low - out, low + out, (0.05, 0.1), plan.steel)
-    return joined([*sides, *over, under])
+    return join_meshes([*sides, *over, under])
 
 
-def _plane(plan: Plan, low: Joints, top: Joints, braced: str) -> Mesh:
+def _plane(plan: BridgePlan, low: Joints, top: Joints, braced: str) -> Mesh:
     """One truss: chords, end posts, uprights, diagonals, and plates at the joints."""
     count = len(top)
     chords = beams(
@@ -96,13 +96,13 @@ def _plane(plan: Plan, low: Joints, top: Joints, braced: str) -> Mesh:
     }[braced]
     diagonals = beams(low[pairs[:, 0]], top[pairs[:, 1]], (0.035, 0.045), plan.steel)
     plates = boxes(np.concatenate([low, top]), [[0.16, 0.078, 0.13]], plan.steel)
-    return joined([chords, posts, uprights, diagonals, plates])
+    return join_meshes([chords, posts, uprights, diagonals, plates])
 
 
-def _lift_tower(plan: Plan, height_m: float, raised_m: float, concrete: int) -> Mesh:
+def _lift_tower(plan: BridgePlan, height_m: float, raised_m: float, concrete: int) -> Mesh:
     """A tower around the road, the lifted span at smaller x; its weight is down where the span is up."""
     z = np.linspace(-0.12, height_m, 9)
-    frame = truss(rings(z, _TOWER_M, 4) * [1, 2 * plan.side_m / _TOWER_M, 1], "cross")
+    frame = truss(mast_rings(z, _TOWER_M, 4) * [1, 2 * plan.side_m / _TOWER_M, 1], "cross")
     others = np.concatenate([frame.struts, frame.braces])
     # The two faces across the road stay open, so that it passes.
     along_road, overhead = abs(np.diff(others[..., 1], axis=1))[:, 0] < 1e-6, others[..., 2].min(1) > 0.5
@@ -113,13 +113,13 @@ def _lift_tower(plan: Plan, height_m: float, raised_m: float, concrete: int) -> 
     ]
     weight_m = 0.45 * height_m - raised_m + 0.55
     weight = boxes([[0.0, 0, weight_m]], [[0.3, 1.5 * plan.side_m, 0.5]], concrete)
-    return joined([*steel, weight, _hoist(plan, height_m, raised_m, weight_m)])
+    return join_meshes([*steel, weight, _hoist(plan, height_m, raised_m, weight_m)])
 
 
-def _hoist(plan: Plan, height_m: float, raised_m: float, weight_m: float) -> Mesh:
+def _hoist(plan: BridgePlan, height_m: float, raised_m: float, weight_m: float) -> Mesh:
     """Two wheels on top of a tower, and the ropes over them from the span to the weight."""
     groove = [(0.03, -0.03), (0.24, -0.03), (0.22, 0), (0.24, 0.03), (0.03, 0.03)]
-    wheel = lathe(groove, plan.steel, 28).placed(turn((1, 0, 0), 90))
+    wheel = lathe(groove, plan.steel, 28).transform(rotation((1, 0, 0), 90))
     y, top_m = np.array([-0.6, 0.6]) * plan.side_m, height_m + 0.3
     sides = [[0, at + d, height_m + 0.19] for at in y for d in (-0.06, 0.06)]
     strands = np.concatenate([y - 0.02, y, y + 0.02])
@@ -128,15 +128,15 @@ def _hoist(plan: Plan, height_m: float, raised_m: float, weight_m: float) -> Mes
         tubes(front, front * [1, 1, 0] + [-0.04, 0, 0.55 + raised_m], 0.006, plan.rail, 4),
         tubes(back, back * [0.5, 1, 0] + [0, 0, weight_m + 0.25], 0.006, plan.rail, 4),
     ]
-    return joined(
-        [*(wheel.moved(y=at, z=top_m) for at in y), boxes(sides, [[0.12, 0.03, 0.3]], plan.steel), *ropes]
+    return join_meshes(
+        [*(wheel.translate(y=at, z=top_m) for at in y), boxes(sides, [[0.12, 0.03, 0.3]], plan.steel), *ropes]
     )
 
 
-def _cabin(plan: Plan, glass: int) -> Mesh:
+def _cabin(plan: BridgePlan, glass: int) -> Mesh:
     """The house of whoever works the bridge, at the side of a tower."""
     at_y = -plan.side_m - 0.2
-    return joined(
+    return join_meshes(
         [
             boxes([[0, at_y, 0]], [[0.4, 0.34, 0.3]], plan.dressed),
             boxes([[0, at_y, 0.05]], [[0.41, 0.35, 0.12]], glass),

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from stereoweave.synth.props.lattice import painted
-from stereoweave.synth.props.primitives import boxes, prism, tubes, turn
+from stereoweave.synth.props.lattice import painted_steel
+from stereoweave.synth.props.primitives import boxes, prism, rotation, tubes
 from stereoweave.synth.stage import Palette
-from stereoweave.synth.world import Colour, Material, Mesh, joined
+from stereoweave.synth.world import Colour, Material, Mesh, join_meshes
 
 _PAINTS: tuple[Colour, ...] = (
     (0.85, 0.85, 0.84),
@@ -22,7 +22,7 @@ def fleet(rng: np.random.Generator, palette: Palette) -> list[Mesh]:
     glass = palette.add(Material(texture="plain", tint=(0.06, 0.08, 0.1), roughness=0.1))
     tyre = palette.add(Material(texture="plain", tint=(0.04, 0.04, 0.045), roughness=0.9))
     first, second, third = (
-        palette.add(painted(rng, _PAINTS[k], roughness=0.25)) for k in rng.permutation(len(_PAINTS))[:3]
+        palette.add(painted_steel(rng, _PAINTS[k], roughness=0.25)) for k in rng.permutation(len(_PAINTS))[:3]
     )
     return [
         _car(first, glass, tyre),
@@ -36,11 +36,11 @@ def _car(paint: int, glass: int, tyre: int) -> Mesh:
     body = [(-2.1, 0.35), (2.1, 0.35), (2.15, 0.7), (1.0, 0.95), (-1.9, 0.98), (-2.15, 0.75)]
     cabin = [(-1.75, 0.95), (0.95, 0.93), (0.25, 1.38), (-1.2, 1.4)]
     roof = [(-1.25, 1.37), (0.3, 1.35), (0.15, 1.45), (-1.1, 1.46)]
-    return joined(
+    return join_meshes(
         [
-            _pulled(body, 1.75, paint),
-            _pulled(cabin, 1.5, glass),
-            _pulled(roof, 1.45, paint),
+            _extrude(body, 1.75, paint),
+            _extrude(cabin, 1.5, glass),
+            _extrude(roof, 1.45, paint),
             _wheels((-1.35, 1.3), 0.32, 1.6, tyre),
         ]
     )
@@ -48,10 +48,10 @@ def _car(paint: int, glass: int, tyre: int) -> Mesh:
 
 def _lorry(cab: int, box: int, glass: int, tyre: int) -> Mesh:
     nose = [(2.3, 0.5), (4.2, 0.5), (4.25, 1.5), (4.0, 2.7), (2.3, 2.8)]
-    return joined(
+    return join_meshes(
         [
-            _pulled(nose, 2.3, cab),
-            _pulled([(4.16, 1.6), (4.24, 1.6), (4.06, 2.45), (3.98, 2.45)], 2.1, glass),
+            _extrude(nose, 2.3, cab),
+            _extrude([(4.16, 1.6), (4.24, 1.6), (4.06, 2.45), (3.98, 2.45)], 2.1, glass),
             boxes([[-1.0, 0, 2.2]], [[6.2, 2.4, 2.6]], box),
             boxes([[0, 0, 0.72]], [[8.2, 1.0, 0.3]], tyre),
             _wheels((-3.2, -2.1, 3.2), 0.48, 2.2, tyre),
@@ -62,7 +62,7 @@ def _lorry(cab: int, box: int, glass: int, tyre: int) -> Mesh:
 def _bus(paint: int, glass: int, tyre: int) -> Mesh:
     panes = boxes([[x, 0, 2.0] for x in np.linspace(-4.6, 4.6, 8)], [[1.15, 2.53, 0.85]], glass)
     front = boxes([[5.48, 0, 1.9]], [[0.06, 2.2, 1.2]], glass)
-    return joined(
+    return join_meshes(
         [
             boxes([[0, 0, 1.65]], [[11.0, 2.5, 2.5]], paint),
             panes,
@@ -72,9 +72,9 @@ def _bus(paint: int, glass: int, tyre: int) -> Mesh:
     )
 
 
-def _pulled(outline_m: list[tuple[float, float]], width_m: float, material: int) -> Mesh:
+def _extrude(outline_m: list[tuple[float, float]], width_m: float, material: int) -> Mesh:
     """A side view, x and z, pulled out to both sides."""
-    return prism(outline_m, width_m, material).placed(turn((1, 0, 0), 90)).moved(y=width_m / 2)
+    return prism(outline_m, width_m, material).transform(rotation((1, 0, 0), 90)).translate(y=width_m / 2)
 
 
 def _wheels(at_m: tuple[float, ...], radius_m: float, track_m: float, tyre: int) -> Mesh:

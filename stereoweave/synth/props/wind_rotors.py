@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from stereoweave.synth.props.lattice import bars, railing
-from stereoweave.synth.props.primitives import boxes, copies, lathe, loft, spheres, turn
-from stereoweave.synth.world import Material, Mesh, joined
+from stereoweave.synth.props.primitives import boxes, copies, lathe, loft, rotation, spheres
+from stereoweave.synth.world import Material, Mesh, join_meshes
 
 STATIONS = 22  # along a blade
 OVERHANG_M = 0.34  # from the tower's axis to the rotor's plane
@@ -33,7 +33,7 @@ class Rotor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finish:
+class TurbineMaterials:
     """Materials; `tip` marks bands near the blades' tips and may be the blades' own."""
 
     white: int
@@ -43,7 +43,7 @@ class Finish:
     lamp: int
 
 
-def composite(rng: np.random.Generator) -> Material:
+def composite_skin(rng: np.random.Generator) -> Material:
     """The white or light grey skin of blades and towers, a little dirty."""
     grey = rng.uniform(0.68, 0.85)
     return Material(
@@ -56,18 +56,22 @@ def composite(rng: np.random.Generator) -> Material:
     )
 
 
-def head(rotor: Rotor, finish: Finish, around: int = 18) -> Mesh:
+def turbine_head(rotor: Rotor, materials: TurbineMaterials, around: int = 18) -> Mesh:
     """Nacelle, hub and blades over the origin, where the tower ends; `around`: points of a section."""
-    blades = copies(_blade(rotor, finish, around), _turns(rotor.angle_deg, 3))
-    turning = joined([blades, _hub(rotor, finish)]).moved(OVERHANG_M)
-    return joined([turning, _nacelle(finish)]).placed(turn((0, 1, 0), -rotor.tilt_deg)).moved(z=0.17)
+    blades = copies(_blade(rotor, materials, around), _turns(rotor.angle_deg, 3))
+    turning = join_meshes([blades, _hub(rotor, materials)]).translate(OVERHANG_M)
+    return (
+        join_meshes([turning, _nacelle(materials)])
+        .transform(rotation((0, 1, 0), -rotor.tilt_deg))
+        .translate(z=0.17)
+    )
 
 
 def _turns(angle_deg: float, count: int) -> Float[np.ndarray, "n 4 4"]:
-    return np.stack([turn((1, 0, 0), angle_deg + 360 * k / count) for k in range(count)])
+    return np.stack([rotation((1, 0, 0), angle_deg + 360 * k / count) for k in range(count)])
 
 
-def _blade(rotor: Rotor, finish: Finish, around: int) -> Mesh:
+def _blade(rotor: Rotor, materials: TurbineMaterials, around: int) -> Mesh:
     """A blade along z: round at the root, widest at a fifth of its length, twisted, bent upwind."""
     share = np.linspace(0, 1, STATIONS)
     radius = 0.05 * rotor.radius_m + 0.95 * rotor.radius_m * share
@@ -86,14 +90,14 @@ def _blade(rotor: Rotor, finish: Finish, around: int) -> Mesh:
     y = along * np.cos(twist) - across * np.sin(twist)
     x = -(along * np.sin(twist) + across * np.cos(twist)) + 0.025 * rotor.radius_m * share[:, None] ** 2
     z = np.broadcast_to(radius[:, None], y.shape)
-    mesh = loft(np.stack([x, y, z], -1), finish.white)
+    mesh = loft(np.stack([x, y, z], -1), materials.white)
     middle = mesh.corners_m[:, :, 2].mean(1)
     first, last = radius[[STATIONS - 8, STATIONS - 4]]
     marked = ((middle > first) & (middle < last)) | (middle > radius[-2])
-    return replace(mesh, material=np.where(marked, finish.tip, mesh.material).astype(np.int32))
+    return replace(mesh, material=np.where(marked, materials.tip, mesh.material).astype(np.int32))
 
 
-def _hub(rotor: Rotor, finish: Finish) -> Mesh:
+def _hub(rotor: Rotor, materials: TurbineMaterials) -> Mesh:
     """The spinner, pointed upwind, and collars around the blades' roots."""
     size = max(0.06 * rotor.radius_m, 0.12)
     profile = np.array(
@@ -101,18 +105,18 @@ def _hub(rotor: Rotor, finish: Finish) -> Mesh:
     )
     collar = lathe(
         [(0, 0), (0.2 * rotor.chord_m, 0), (0.2 * rotor.chord_m, 1.12 * size), (0, 1.12 * size)],
-        finish.steel,
+        materials.steel,
         20,
     )
-    return joined(
+    return join_meshes(
         [
-            lathe(profile * size, finish.white, 28).placed(turn((0, 1, 0), 90)),
+            lathe(profile * size, materials.white, 28).transform(rotation((0, 1, 0), 90)),
             copies(collar, _turns(rotor.angle_deg, 3)),
         ]
     )
 
 
-def _nacelle(finish: Finish) -> Mesh:
+def _nacelle(materials: TurbineMaterials) -> Mesh:
     """A rounded box on the tower, with cooler, railing, wind vanes, lightning rod and lamps."""
     x = np.array([0.24, 0.21, 0.1, -0.25, -0.5, -0.62, -0.65])
     half = np.array([0.1, 0.135, 0.15, 0.155, 0.145, 0.12, 0.08])
@@ -120,7 +124,7 @@ def _nacelle(finish: Finish) -> Mesh:
     corner = (np.abs(np.cos(angle)) ** 5 + np.abs(np.sin(angle)) ** 5) ** -0.2
     y = -half[:, None] * corner * np.cos(angle)
     z = half[:, None] * corner * np.sin(angle) + 0.02
-    skin = loft(np.stack([np.broadcast_to(x[:, None], y.shape), y, z], -1)[::-1], finish.white)
+    skin = loft(np.stack([np.broadcast_to(x[:, None], y.shape), y, z], -1)[::-1], materials.white)
     roof = np.array(
         [
             [0.05, 0.13, 0.165],
@@ -138,15 +142,15 @@ def _nacelle(finish: Finish) -> Mesh:
         ]
     )
     arms = np.array([[(-0.6, 0.09, 0.4), (-0.5, 0.09, 0.4)], [(-0.55, -0.13, 0.38), (-0.55, -0.05, 0.38)]])
-    return joined(
+    return join_meshes(
         [
             skin,
-            lathe([(0.13, -0.2), (0.13, -0.1), (0.1, -0.1)], finish.steel, 24),
-            boxes((-0.6, 0, 0.24), (0.06, 0.26, 0.16), finish.dark),
-            boxes((-0.15, 0, 0.165), (0.2, 0.16, 0.02), finish.dark),
-            railing(roof, 0.09, 0.14, 0.005, finish.steel),
-            bars(np.concatenate([masts, arms]), 0.006, finish.steel, sides=4),
-            spheres(arms.reshape(-1, 3), 0.015, finish.dark, 1),
-            spheres([(-0.42, 0.1, 0.2), (-0.42, -0.1, 0.2)], 0.028, finish.lamp, 1),
+            lathe([(0.13, -0.2), (0.13, -0.1), (0.1, -0.1)], materials.steel, 24),
+            boxes((-0.6, 0, 0.24), (0.06, 0.26, 0.16), materials.dark),
+            boxes((-0.15, 0, 0.165), (0.2, 0.16, 0.02), materials.dark),
+            railing(roof, 0.09, 0.14, 0.005, materials.steel),
+            bars(np.concatenate([masts, arms]), 0.006, materials.steel, sides=4),
+            spheres(arms.reshape(-1, 3), 0.015, materials.dark, 1),
+            spheres([(-0.42, 0.1, 0.2), (-0.42, -0.1, 0.2)], 0.028, materials.lamp, 1),
         ]
     )

@@ -8,7 +8,7 @@ from stereoweave.synth.scenes.antenna import antenna
 from stereoweave.synth.scenes.bridge import bridge
 from stereoweave.synth.scenes.crane import crane
 from stereoweave.synth.scenes.figures import figures
-from stereoweave.synth.scenes.plain_boards import boards
+from stereoweave.synth.scenes.plain_boards import plain_boards
 from stereoweave.synth.scenes.propeller import propeller
 from stereoweave.synth.scenes.pylon import pylon
 from stereoweave.synth.scenes.refinery import refinery
@@ -20,7 +20,7 @@ from stereoweave.synth.stage import Stage
 
 SCENES: dict[str, Callable[[np.random.Generator], Stage]] = {
     "antenna": antenna,
-    "boards": boards,
+    "boards": plain_boards,
     "bridge": bridge,
     "crane": crane,
     "figures": figures,

@@ -4,17 +4,33 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from stereoweave.synth.props.bridges import SCALE, Plan, abutments, lamps, planned, stone_arches
+from stereoweave.synth.props.bridges import (
+    SCALE,
+    BridgePlan,
+    abutments,
+    draw_bridge_plan,
+    stone_arches,
+    street_lamps,
+)
 from stereoweave.synth.props.cable_bridges import cable_stayed, suspension
-from stereoweave.synth.props.primitives import boxes, sheet, shift, turn
-from stereoweave.synth.props.surroundings import bushes, daylight, hills, houses, places, rocks, sea, trees
+from stereoweave.synth.props.primitives import boxes, rotation, sheet, translation
+from stereoweave.synth.props.surroundings import (
+    bushes,
+    daylight,
+    draw_spots,
+    hills,
+    houses,
+    rocks,
+    sea,
+    trees,
+)
 from stereoweave.synth.props.truss_bridges import lift_bridge, truss_girder
 from stereoweave.synth.props.vehicles import fleet
 from stereoweave.synth.stage import Palette, Stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Material, Mesh, World, joined
+from stereoweave.synth.world import Material, Mesh, World, join_meshes
 
-KINDS: dict[str, Callable[[np.random.Generator, Palette, Plan], Mesh]] = {
+KINDS: dict[str, Callable[[np.random.Generator, Palette, BridgePlan], Mesh]] = {
     "truss": truss_girder,
     "suspension": suspension,
     "stayed": cable_stayed,
@@ -26,25 +42,25 @@ KINDS: dict[str, Callable[[np.random.Generator, Palette, Plan], Mesh]] = {
 def bridge(rng: np.random.Generator) -> Stage:
     """A bridge of one of five kinds, seen whole from the water or from a bank."""
     palette = Palette()
-    plan = planned(rng, palette)
+    plan = draw_bridge_plan(rng, palette)
     kind = str(rng.choice(list(KINDS)))
     parts = [KINDS[kind](rng, palette, plan), abutments(plan)]
     # Nothing stands or drives where the road may be lifted.
     parts.append(_traffic(rng, palette, plan, (0, 4) if kind == "lift" else (0, 1, 2, 3, 4)))
     if kind != "lift":
-        parts.append(_road_lamps(rng, palette, plan))
+        parts.append(_street_lamps(rng, palette, plan))
     sky, fog, exposure = daylight(rng)
     around = [
         sea(rng, palette, extent_m=90.0),
         *_banks(rng, palette, plan),
         hills(rng, palette, distance_m=rng.uniform(60, 110)),
     ]
-    mesh = joined([joined(parts).as_target(), *around])
+    mesh = join_meshes([join_meshes(parts).as_target(), *around])
     world = World(mesh=mesh, materials=tuple(palette.materials), sky=sky, fog=fog, exposure=exposure)
     return Stage(world=world, orbit=_orbit(rng, plan))
 
 
-def _orbit(rng: np.random.Generator, plan: Plan) -> Orbit:
+def _orbit(rng: np.random.Generator, plan: BridgePlan) -> Orbit:
     """From a boat in the middle of the river, or higher, three-quarter, from one of the banks."""
     side_deg = 90.0 if rng.random() < 0.5 else 270.0
     centre_m = (0.0, 0.0, plan.level_m + 0.3)
@@ -67,27 +83,27 @@ def _orbit(rng: np.random.Generator, plan: Plan) -> Orbit:
     )
 
 
-def _road_lamps(rng: np.random.Generator, palette: Palette, plan: Plan) -> Mesh:
+def _street_lamps(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
     glass = palette.add(Material(texture="plain", tint=(0.9, 0.88, 0.8), roughness=0.3))
-    return lamps(plan, -plan.half_m, plan.half_m, plan.rail, glass).moved(z=plan.level_m)
+    return street_lamps(plan, -plan.half_m, plan.half_m, plan.rail, glass).translate(z=plan.level_m)
 
 
-def _traffic(rng: np.random.Generator, palette: Palette, plan: Plan, fifths: Sequence[int]) -> Mesh:
+def _traffic(rng: np.random.Generator, palette: Palette, plan: BridgePlan, fifths: Sequence[int]) -> Mesh:
     """Two or more vehicles in two lanes, on the right, on some fifths of the road's length."""
-    kinds = [vehicle.placed(np.diag([SCALE, SCALE, SCALE, 1.0])) for vehicle in fleet(rng, palette)]
+    kinds = [vehicle.transform(np.diag([SCALE, SCALE, SCALE, 1.0])) for vehicle in fleet(rng, palette)]
     slots = rng.permutation([(fifth, lane) for fifth in fifths for lane in (0, 1)])
     placed = []
     for fifth, lane in slots[: int(rng.integers(2, len(slots)))].tolist():
         kind = kinds[rng.choice(len(kinds), p=[0.35, 0.35, 0.2, 0.1])]
         x = plan.half_m * ((2 * fifth + 1) / 5 - 1) + rng.uniform(-0.12, 0.12)
-        pose = shift(x, (lane - 0.5) * 0.36 * plan.width_m, plan.level_m + 0.012) @ turn(
+        pose = translation(x, (lane - 0.5) * 0.36 * plan.width_m, plan.level_m + 0.012) @ rotation(
             (0, 0, 1), 180.0 * lane
         )
-        placed.append(kind.placed(pose))
-    return joined(placed)
+        placed.append(kind.transform(pose))
+    return join_meshes(placed)
 
 
-def _banks(rng: np.random.Generator, palette: Palette, plan: Plan) -> list[Mesh]:
+def _banks(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> list[Mesh]:
     """Ground on both sides at the level of the road, its slope to the water, and what grows there."""
     grass = palette.add(
         Material(
@@ -116,7 +132,7 @@ def _banks(rng: np.random.Generator, palette: Palette, plan: Plan) -> list[Mesh]
     return [*ground, road, *_growth(rng, palette, plan)]
 
 
-def _bank(rng: np.random.Generator, plan: Plan, side: int, grass: int, slope: int) -> Mesh:
+def _bank(rng: np.random.Generator, plan: BridgePlan, side: int, grass: int, slope: int) -> Mesh:
     """The slope from below the water up to the road's level, and the land behind it."""
     y = 9 * np.sinh(np.linspace(-3.0, 3.0, 61))
     edge = (
@@ -143,26 +159,26 @@ def _bank(rng: np.random.Generator, plan: Plan, side: int, grass: int, slope: in
     land = np.stack([x, np.broadcast_to(y, x.shape), plan.level_m - 0.05 + level * bumps], -1)
     # Seen from above along y x x, so the rows of the side at smaller x count the other way.
     order = slice(None, None, -1)
-    return joined(
+    return join_meshes(
         sheet((points if side < 0 else points[:, order]) * [side, 1, 1], material)
         for points, material in ((bank, slope), (land, grass))
     )
 
 
-def _growth(rng: np.random.Generator, palette: Palette, plan: Plan) -> list[Mesh]:
+def _growth(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> list[Mesh]:
     """Trees, bushes, boulders and houses on the banks, as small as the bridge, away from the road."""
 
     def spots(count: int, nearest_m: float, farthest_m: float) -> np.ndarray:
-        around = places(rng, count, nearest_m, farthest_m)
+        around = draw_spots(rng, count, nearest_m, farthest_m)
         dry = (abs(around[:, 0]) > plan.half_m + 2.2) & (abs(around[:, 1]) > 1.3)
         return around[dry] + [0, 0, plan.level_m - 0.08]
 
     houses_at = spots(14, 12, 45)
     shrink = 0.22
-    village = houses(rng, palette, houses_at / shrink).placed(np.diag([shrink, shrink, shrink, 1.0]))
+    village = houses(rng, palette, houses_at / shrink).transform(np.diag([shrink, shrink, shrink, 1.0]))
     wood = trees(rng, palette, spots(60, 7, 50), (0.7, 2.0))
-    low = bushes(rng, palette, spots(45, 5, 25) / 0.3).placed(np.diag([0.3, 0.3, 0.3, 1.0]))
+    low = bushes(rng, palette, spots(45, 5, 25) / 0.3).transform(np.diag([0.3, 0.3, 0.3, 1.0]))
     y = rng.uniform(1.0, 7.0, 16) * rng.choice([-1, 1], 16)
     shore = np.stack([rng.choice([-1, 1], 16) * (plan.half_m + rng.uniform(-0.2, 0.3, 16)), y, 0 * y], -1)
-    boulders = rocks(rng, palette, shore / 0.4).placed(np.diag([0.4, 0.4, 0.4, 1.0]))
+    boulders = rocks(rng, palette, shore / 0.4).transform(np.diag([0.4, 0.4, 0.4, 1.0]))
     return [village, wood, low, boulders]

@@ -4,23 +4,23 @@ from dataclasses import replace
 
 import numpy as np
 
-from stereoweave.synth.props.clutter import Space, clutter
-from stereoweave.synth.props.interiors import indoor_light, lamp_spots, lamps_at, pendants, shell
+from stereoweave.synth.props.clutter import ClutterSpace, clutter
+from stereoweave.synth.props.interiors import draw_lamp_spots, draw_lamps, indoor_light, pendants, shell
 from stereoweave.synth.props.people_and_animals import animal, draw_clothes, person
-from stereoweave.synth.props.primitives import turn
+from stereoweave.synth.props.primitives import rotation
 from stereoweave.synth.props.surroundings import (
     bushes,
     daylight,
+    draw_spots,
     hills,
     houses,
-    places,
     rocks,
     terrain,
     trees,
 )
 from stereoweave.synth.stage import Palette, Stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Colour, Mesh, Sky, World, joined
+from stereoweave.synth.world import Colour, Mesh, Sky, World, join_meshes
 
 # A figure before the lens, a background far behind it.
 _NEAREST_PX = (55.0, 175.0)
@@ -55,16 +55,18 @@ def _cast(rng: np.random.Generator, palette: Palette, distance_m: float) -> Mesh
         else:
             # Its nose stays away from the lens.
             figure, size = kinds[int(rng.integers(2))], min(rng.uniform(0.7, 1.6), 0.65 * depth_m)
-        pose = turn((0, 0, 1), rng.uniform(-100, 100)) @ np.diag([size, size, size, 1.0])
-        cast.append(figure.placed(pose).moved(distance_m - depth_m, 0.45 * depth_m * rng.uniform(-1, 1)))
-    return joined(cast)
+        pose = rotation((0, 0, 1), rng.uniform(-100, 100)) @ np.diag([size, size, size, 1.0])
+        cast.append(
+            figure.transform(pose).translate(distance_m - depth_m, 0.45 * depth_m * rng.uniform(-1, 1))
+        )
+    return join_meshes(cast)
 
 
 def _hall(rng: np.random.Generator, palette: Palette, orbit: Orbit, cast: Mesh) -> World:
     """A large room with lamps, and a few things on its floor and in the air."""
     size_m = 2 * orbit.distance_m[1] + rng.uniform(1.5, 8.0, 3)
     size_m[2] = rng.uniform(2.8, 5.0)
-    space = Space(
+    space = ClutterSpace(
         orbit=orbit,
         low_m=np.array([-0.5, -0.5, 0]) * size_m,
         high_m=np.array([0.5, 0.5, 1]) * size_m,
@@ -72,8 +74,8 @@ def _hall(rng: np.random.Generator, palette: Palette, orbit: Orbit, cast: Mesh) 
         count=(3, 10),
         standing=0.8,
     )
-    spots_m = lamp_spots(rng, size_m, space.eyes_m())
-    lamps = lamps_at(rng, spots_m)
+    spots_m = draw_lamp_spots(rng, size_m, space.eyes_m())
+    lamps = draw_lamps(rng, spots_m)
     parts = [
         cast,
         *clutter(rng, palette, space),
@@ -82,7 +84,7 @@ def _hall(rng: np.random.Generator, palette: Palette, orbit: Orbit, cast: Mesh) 
     ]
     sky, exposure = indoor_light(rng, daylight(rng)[0], lamps)
     materials = tuple(palette.materials)
-    return World(mesh=joined(parts), materials=materials, sky=sky, lamps=lamps, exposure=exposure)
+    return World(mesh=join_meshes(parts), materials=materials, sky=sky, lamps=lamps, exposure=exposure)
 
 
 def _open_air(rng: np.random.Generator, palette: Palette, orbit: Orbit, cast: Mesh) -> World:
@@ -91,20 +93,22 @@ def _open_air(rng: np.random.Generator, palette: Palette, orbit: Orbit, cast: Me
     parts = [
         cast,
         terrain(rng, palette, family, extent_m=120.0, bumps_m=2.5, flat_radius_m=8.0),
-        trees(rng, palette, places(rng, int(rng.integers(4, 20)), 10.0, 60.0)),
-        rocks(rng, palette, places(rng, int(rng.integers(4, 16)), 7.0, 30.0)),
-        bushes(rng, palette, places(rng, int(rng.integers(0, 14)) + 1, 8.0, 30.0)),
+        trees(rng, palette, draw_spots(rng, int(rng.integers(4, 20)), 10.0, 60.0)),
+        rocks(rng, palette, draw_spots(rng, int(rng.integers(4, 16)), 7.0, 30.0)),
+        bushes(rng, palette, draw_spots(rng, int(rng.integers(0, 14)) + 1, 8.0, 30.0)),
     ]
     if rng.random() < 0.7:
         parts.append(hills(rng, palette, distance_m=rng.uniform(60, 110)))
     if rng.random() < 0.4:
-        parts.append(houses(rng, palette, places(rng, int(rng.integers(1, 5)), 16.0, 50.0)))
+        parts.append(houses(rng, palette, draw_spots(rng, int(rng.integers(1, 5)), 16.0, 50.0)))
     sky, fog, exposure = daylight(rng)
     materials = tuple(palette.materials)
-    return World(mesh=joined(parts), materials=materials, sky=_softened(rng, sky), fog=fog, exposure=exposure)
+    return World(
+        mesh=join_meshes(parts), materials=materials, sky=_soften(rng, sky), fog=fog, exposure=exposure
+    )
 
 
-def _softened(rng: np.random.Generator, sky: Sky) -> Sky:
+def _soften(rng: np.random.Generator, sky: Sky) -> Sky:
     """The sky with a part of the sun's light, in half of the draws nearly all of it."""
     share = rng.choice([1.0, rng.uniform(0.1, 0.6)])
 

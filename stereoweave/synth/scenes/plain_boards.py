@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Float
 
 from stereoweave.synth.props.furniture import FURNITURE, book_stack, picture, plant
-from stereoweave.synth.props.interiors import lamps_at, pendants, shell
-from stereoweave.synth.props.primitives import boxes, tubes, turn
-from stereoweave.synth.props.random_materials import chosen, muted, surface
-from stereoweave.synth.props.solids import SOLIDS, Skin
+from stereoweave.synth.props.interiors import draw_lamps, pendants, shell
+from stereoweave.synth.props.primitives import boxes, rotation, tubes
+from stereoweave.synth.props.random_materials import draw_material, draw_material_from, draw_muted_colour
+from stereoweave.synth.props.solids import SOLIDS, PropStyle
 from stereoweave.synth.stage import Palette, Stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Colour, Lamp, Material, Mesh, Sky, World, joined
+from stereoweave.synth.world import Colour, Lamp, Material, Mesh, Sky, World, join_meshes
 
 # The cameras look along y, so that what is near can be set before them.
 _AHEAD_DEG, _SWING_DEG = 270.0, 6.0
@@ -37,7 +37,7 @@ _SMALL = (*SOLIDS, book_stack, picture, plant)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Near:
+class _Foreground:
     """What is near the cameras.
 
     Attributes:
@@ -53,31 +53,31 @@ class _Near:
     end_m: float
 
 
-def boards(rng: np.random.Generator) -> Stage:
+def plain_boards(rng: np.random.Generator) -> Stage:
     """A room seen past boards that stand before the cameras, over a table top, or along or onto a wall."""
     palette = Palette()
-    near = (_standing_boards, _table_top, _wall)[rng.integers(3)](rng, palette)
+    foreground = (_standing_boards, _table_top, _wall)[rng.integers(3)](rng, palette)
     width_m, depth_m, height_m = rng.uniform([3.5, 1.5, 2.5], [6.5, 3.5, 3.4]).tolist()
-    front_m = -near.orbit.distance_m[1] - rng.uniform(0.8, 1.5)
-    size_m = np.array([width_m, near.end_m + depth_m - front_m, height_m])
+    front_m = -foreground.orbit.distance_m[1] - rng.uniform(0.8, 1.5)
+    size_m = np.array([width_m, foreground.end_m + depth_m - front_m, height_m])
     middle_m = np.array([rng.uniform(-0.1, 0.1) * width_m, front_m + size_m[1] / 2, 0])
-    walls = shell(rng, palette, size_m, open_roof=False, open_side=None).moved(*middle_m.tolist())
+    walls = shell(rng, palette, size_m, open_roof=False, open_side=None).translate(*middle_m.tolist())
     lamp_spots_m = middle_m + size_m * rng.uniform([-0.4, -0.4, 0.78], [0.4, 0.4, 0.85], (4, 3))
-    lamps = lamps_at(rng, lamp_spots_m[: rng.integers(2, 5)])
-    spots_m = np.concatenate([near.spots_m, _floor_spots(rng, near, depth_m)])
-    away_m = near.orbit.distance_m[0] + spots_m[:, 1]
-    skins = [palette.add(surface(rng, away)) for away in rng.choice(away_m, _SURFACES).tolist()]
+    lamps = draw_lamps(rng, lamp_spots_m[: rng.integers(2, 5)])
+    spots_m = np.concatenate([foreground.spots_m, _floor_spots(rng, foreground, depth_m)])
+    away_m = foreground.orbit.distance_m[0] + spots_m[:, 1]
+    skins = [palette.add(draw_material(rng, away)) for away in rng.choice(away_m, _SURFACES).tolist()]
     things = [_thing(rng, skins, spot_m) for spot_m in spots_m]
     shades = pendants(rng, palette, lamp_spots_m[: len(lamps)], height_m)
     sky, exposure = _light(rng, lamps)
-    mesh = joined([near.plain.as_target(), walls, shades, *things])
+    mesh = join_meshes([foreground.plain.as_target(), walls, shades, *things])
     world = World(mesh=mesh, materials=tuple(palette.materials), sky=sky, lamps=lamps, exposure=exposure)
     return Stage(
-        world=world, orbit=near.orbit, nearest_px=_NEAREST_PX, noise_levels=rng.uniform(*_NOISE_LEVELS)
+        world=world, orbit=foreground.orbit, nearest_px=_NEAREST_PX, noise_levels=rng.uniform(*_NOISE_LEVELS)
     )
 
 
-def _standing_boards(rng: np.random.Generator, palette: Palette) -> _Near:
+def _standing_boards(rng: np.random.Generator, palette: Palette) -> _Foreground:
     """One to three boards, partitions and cupboards, each with an upright edge in the picture."""
     distance_m, eye_m = rng.uniform(1.2, 1.9), rng.uniform(0.9, 1.4)
     away_m = [rng.uniform(0.65, 1.0), *rng.uniform(1.0, 1.8, rng.integers(0, 3)).tolist()]
@@ -88,16 +88,19 @@ def _standing_boards(rng: np.random.Generator, palette: Palette) -> _Near:
         # Those behind leave a gap beside the first: boards alone would show no outline.
         edge_m = rng.uniform(*((-0.6, 0.4) if k == 0 else (0.65, 0.85))) * away * _HALF_VIEW
         top_m = eye_m + away * rng.uniform(0.05, 0.5)
-        pose = turn((0, 0, 1), rng.normal(0, 15))
+        pose = rotation((0, 0, 1), rng.normal(0, 15))
         pose[:2, 3] = side * (-1) ** k * (edge_m + width_m / 2), away - distance_m
-        parts.append(_board(rng, palette, width_m, top_m).placed(pose))
+        parts.append(_board(rng, palette, width_m, top_m).transform(pose))
     orbit = _orbit(rng, distance_m, eye_m, elevation_deg=rng.uniform(-5, 8))
-    return _Near(
-        plain=joined(parts), orbit=orbit, spots_m=np.zeros((0, 4)), end_m=max(max(away_m) - distance_m, 0.2)
+    return _Foreground(
+        plain=join_meshes(parts),
+        orbit=orbit,
+        spots_m=np.zeros((0, 4)),
+        end_m=max(max(away_m) - distance_m, 0.2),
     )
 
 
-def _table_top(rng: np.random.Generator, palette: Palette) -> _Near:
+def _table_top(rng: np.random.Generator, palette: Palette) -> _Foreground:
     """A table that reaches out of the picture, with things on it, and at times a board at its end."""
     distance_m, table_m, end_m = rng.uniform(0.8, 1.3), rng.uniform(0.65, 0.85), rng.uniform(0.15, 0.7)
     width_m, length_m = rng.uniform(1.6, 3.0), distance_m + end_m + 0.4
@@ -105,20 +108,20 @@ def _table_top(rng: np.random.Generator, palette: Palette) -> _Near:
     corners_m = np.array([[x, y, -0.03] for x in (-0.45, 0.45) for y in (-0.45, 0.45)])
     corners_m *= [width_m, length_m, 1]
     legs = tubes(corners_m, corners_m * [1, 1, 0] - [0, 0, table_m], 0.025, palette.add(_trim(rng)), 10)
-    table = joined([top, legs]).placed(turn((0, 0, 1), rng.normal(0, 6)))
-    parts = [table.moved(rng.uniform(-0.3, 0.3), end_m - length_m / 2, table_m)]
+    table = join_meshes([top, legs]).transform(rotation((0, 0, 1), rng.normal(0, 6)))
+    parts = [table.translate(rng.uniform(-0.3, 0.3), end_m - length_m / 2, table_m)]
     if rng.random() < 0.5:
         screen = _board(rng, palette, rng.uniform(0.5, 1.4), rng.uniform(0.35, 0.8))
-        screen = screen.placed(turn((0, 0, 1), rng.normal(0, 12)))
-        parts.append(screen.moved(rng.uniform(-0.5, 0.5), end_m - 0.15, table_m))
+        screen = screen.transform(rotation((0, 0, 1), rng.normal(0, 12)))
+        parts.append(screen.translate(rng.uniform(-0.5, 0.5), end_m - 0.15, table_m))
     count = int(rng.integers(6, 13))
     reach_m = np.linspace(-0.45 * distance_m, end_m - 0.25, count)
     spots_m = _spots(rng, reach_m, distance_m, table_m, (0.1, 0.35))
     orbit = _orbit(rng, distance_m, table_m + 0.05, elevation_deg=rng.uniform(16, 34))
-    return _Near(plain=joined(parts), orbit=orbit, spots_m=spots_m, end_m=end_m)
+    return _Foreground(plain=join_meshes(parts), orbit=orbit, spots_m=spots_m, end_m=end_m)
 
 
-def _wall(rng: np.random.Generator, palette: Palette) -> _Near:
+def _wall(rng: np.random.Generator, palette: Palette) -> _Foreground:
     """A wall that the cameras look onto or along, and a sideboard at it with things on it."""
     distance_m, eye_m = rng.uniform(1.1, 1.7), rng.uniform(0.95, 1.3)
     turned_deg = rng.choice([-1, 1]) * rng.uniform(0, 60)
@@ -129,9 +132,9 @@ def _wall(rng: np.random.Generator, palette: Palette) -> _Near:
     parts = [wall, low]
     if rng.random() < 0.5:
         print_m = rng.uniform([0.2, 0.01, 0.15], [0.6, 0.03, 0.5])
-        face = palette.add(chosen(rng, ("photograph", "sign", "cloth"), distance_m))
+        face = palette.add(draw_material_from(rng, ("photograph", "sign", "cloth"), distance_m))
         parts.append(boxes([[rng.uniform(-0.5, 0.5), -0.01, eye_m + 0.2]], [print_m], face))
-    pose = turn((0, 0, 1), turned_deg)
+    pose = rotation((0, 0, 1), turned_deg)
     pose[1, 3] = end_m
     count = int(rng.integers(2, 6))
     x = (np.arange(count) + rng.uniform(0.3, 0.7, count)) / count - 0.5
@@ -139,7 +142,7 @@ def _wall(rng: np.random.Generator, palette: Palette) -> _Near:
     sizes_m = rng.uniform(0.4, 1.0, count) * min(side_m[1], side_m[0] / count)
     spots_m = np.column_stack([feet_m @ pose[:3, :3].T + pose[:3, 3], sizes_m])
     orbit = _orbit(rng, distance_m, eye_m, elevation_deg=rng.uniform(-4, 8))
-    return _Near(plain=joined(parts).placed(pose), orbit=orbit, spots_m=spots_m, end_m=end_m)
+    return _Foreground(plain=join_meshes(parts).transform(pose), orbit=orbit, spots_m=spots_m, end_m=end_m)
 
 
 def _board(rng: np.random.Generator, palette: Palette, width_m: float, top_m: float) -> Mesh:
@@ -158,7 +161,7 @@ def _board(rng: np.random.Generator, palette: Palette, width_m: float, top_m: fl
             [[x, 0, middle_m] for x in (-width_m / 2, width_m / 2)], [bar_m, 0.02, tall_m - bar_m], trim
         )
         parts += [across, upright]
-    return joined(parts)
+    return join_meshes(parts)
 
 
 def _orbit(rng: np.random.Generator, distance_m: float, aim_m: float, elevation_deg: float) -> Orbit:
@@ -180,7 +183,7 @@ def _plain(rng: np.random.Generator) -> Material:
     return Material(
         texture="plain",
         variant=int(rng.integers(1000)),
-        tint=muted(rng, 0.3),
+        tint=draw_muted_colour(rng, 0.3),
         span_m=_EVEN_SPAN_M if even else rng.uniform(2.0, 8.0),
         roughness=rng.uniform(0.25, 0.5) if rng.random() < 0.25 else rng.uniform(0.6, 1.0),
         relief=0.0 if even else rng.uniform(0.0, 0.1),
@@ -188,7 +191,7 @@ def _plain(rng: np.random.Generator) -> Material:
 
 
 def _trim(rng: np.random.Generator) -> Material:
-    return chosen(rng, ("wood", "steel", "paint", "plain"), 1.0)
+    return draw_material_from(rng, ("wood", "steel", "paint", "plain"), 1.0)
 
 
 def _spots(
@@ -205,23 +208,25 @@ def _spots(
     return np.stack([x, along_m, np.full_like(x, level_m), sizes_m], -1)
 
 
-def _floor_spots(rng: np.random.Generator, near: _Near, depth_m: float) -> Float[np.ndarray, "n 4"]:
+def _floor_spots(
+    rng: np.random.Generator, foreground: _Foreground, depth_m: float
+) -> Float[np.ndarray, "n 4"]:
     """Places of 8 to 16 things behind what is near."""
-    along_m = near.end_m + np.linspace(0.35, depth_m - 0.4, int(rng.integers(8, 17)))
-    return _spots(rng, along_m, near.orbit.distance_m[0], 0.0, (0.25, 0.6))
+    along_m = foreground.end_m + np.linspace(0.35, depth_m - 0.4, int(rng.integers(8, 17)))
+    return _spots(rng, along_m, foreground.orbit.distance_m[0], 0.0, (0.25, 0.6))
 
 
 def _thing(rng: np.random.Generator, skins: Sequence[int], spot_m: Float[np.ndarray, "4"]) -> Mesh:
     """A solid or a piece of furniture that stands at a spot."""
     kinds = FURNITURE if spot_m[2] == 0 and rng.random() < 0.6 else _SMALL
     main, other = (skins[k] for k in rng.integers(len(skins), size=2))
-    mesh = kinds[rng.integers(len(kinds))](rng, Skin(main=main, other=other, bar_m=_BAR_M))
+    mesh = kinds[rng.integers(len(kinds))](rng, PropStyle(main=main, other=other, bar_m=_BAR_M))
     low, high = mesh.corners_m.min((0, 1)), mesh.corners_m.max((0, 1))
     scale = float(spot_m[3]) / float((high - low).max())
-    pose = turn((0, 0, 1), rng.uniform(0, 360))
+    pose = rotation((0, 0, 1), rng.uniform(0, 360))
     pose[:3, :3] *= scale
     pose[:3, 3] = spot_m[:3] - pose[:3, :3] @ np.array([*(low + high)[:2] / 2, low[2]])
-    return replace(mesh.placed(pose), uv_m=mesh.uv_m * np.float32(scale))
+    return replace(mesh.transform(pose), uv_m=mesh.uv_m * np.float32(scale))
 
 
 def _light(rng: np.random.Generator, lamps: Sequence[Lamp]) -> tuple[Sky, float]:

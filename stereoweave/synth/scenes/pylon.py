@@ -8,23 +8,23 @@ from jaxtyping import Float
 from stereoweave.synth.props.lattice import (
     Segments,
     Truss,
-    aviation,
+    aviation_paints,
     bars,
     cables,
-    chains,
-    galvanised,
-    hanging,
+    chain_segments,
+    galvanised_steel,
     insulators,
-    levels,
-    painted,
-    rings,
+    mast_levels,
+    mast_rings,
+    painted_steel,
+    sagging_points,
     truss,
 )
-from stereoweave.synth.props.primitives import Points, boxes, copies, shift, spheres
-from stereoweave.synth.props.surroundings import bushes, daylight, hills, houses, places, terrain, trees
+from stereoweave.synth.props.primitives import Points, boxes, copies, spheres, translation
+from stereoweave.synth.props.surroundings import bushes, daylight, draw_spots, hills, houses, terrain, trees
 from stereoweave.synth.stage import Palette, Stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Material, Mesh, World, joined
+from stereoweave.synth.world import Material, Mesh, World, join_meshes
 
 # Each arm: its height and its reach, as shares of the tower's height, and the conductors on each side.
 KINDS: dict[str, tuple[tuple[float, float, int], ...]] = {
@@ -38,7 +38,7 @@ REACH_M = 4.4  # of what is near enough to count as the tower's own
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class PylonPlan:
     """A tower's measures; its line runs along y, its arms reach along x.
 
     Attributes:
@@ -63,14 +63,14 @@ class Plan:
 
 def pylon(rng: np.random.Generator) -> Stage:
     """A tower of 6.5 to 7.5 m."""
-    palette, plan = Palette(), _plan(rng)
+    palette, plan = Palette(), _draw_plan(rng)
     tower, steel = _tower(rng, palette, plan)
     lines, wire = _lines(rng, palette, plan)
     far = _far_towers(plan, steel, wire)
     land = _land(rng, palette)
     sky, fog, exposure = daylight(rng)
     world = World(
-        mesh=joined([tower.as_target(), _near(lines, plan), far, land]),
+        mesh=join_meshes([tower.as_target(), _mark_near(lines, plan), far, land]),
         materials=tuple(palette.materials),
         sky=sky,
         fog=fog,
@@ -79,11 +79,11 @@ def pylon(rng: np.random.Generator) -> Stage:
     return Stage(world=world, orbit=_orbit(rng, plan))
 
 
-def _plan(rng: np.random.Generator) -> Plan:
+def _draw_plan(rng: np.random.Generator) -> PylonPlan:
     height = rng.uniform(6.5, 7.5)
     kind = KINDS[str(rng.choice(list(KINDS)))]
     slim = rng.uniform(0.85, 1.2)
-    return Plan(
+    return PylonPlan(
         height_m=height,
         arms=tuple((z * height, rng.uniform(0.92, 1.08) * reach * height, n) for z, reach, n in kind),
         widths_m=(0.19 * slim * height, 0.075 * slim * height, 0.06 * slim * height),
@@ -97,7 +97,7 @@ def _plan(rng: np.random.Generator) -> Plan:
     )
 
 
-def _orbit(rng: np.random.Generator, plan: Plan) -> Orbit:
+def _orbit(rng: np.random.Generator, plan: PylonPlan) -> Orbit:
     """Low anywhere, or beside the line at any height: above the wires' path nothing may be in the way."""
     beside = bool(rng.random() < 0.6)
     middle = float(rng.choice([90, 270]))
@@ -116,19 +116,24 @@ def _orbit(rng: np.random.Generator, plan: Plan) -> Orbit:
     )
 
 
-def _trusses(plan: Plan) -> list[Truss]:
+def _trusses(plan: PylonPlan) -> list[Truss]:
     """The body below the arms, the body above, and the arms of both sides."""
     foot, waist, neck = plan.widths_m
     lowest, highest = plan.arms[0][0], plan.arms[-1][0] + plan.depth_m
-    below = levels((0.0, lowest), (foot, waist), 0.95)
+    below = mast_levels((0.0, lowest), (foot, waist), 0.95)
     stations = [z for height, _, _ in plan.arms for z in (height, height + plan.depth_m)]
     widths = np.interp(stations, (lowest, highest), (waist, neck))
-    above = levels([*stations, plan.height_m], [*widths, 0.03], 1.1)
+    above = mast_levels([*stations, plan.height_m], [*widths, 0.03], 1.1)
     arms = [truss(_arm(plan, height, reach), "zigzag") for height, reach, _ in plan.arms]
-    return [truss(rings(*below), "cross"), truss(rings(*above), "cross"), *arms, *map(_mirrored, arms)]
+    return [
+        truss(mast_rings(*below), "cross"),
+        truss(mast_rings(*above), "cross"),
+        *arms,
+        *map(_mirror, arms),
+    ]
 
 
-def _arm(plan: Plan, height_m: float, reach_m: float) -> Float[np.ndarray, "k 4 3"]:
+def _arm(plan: PylonPlan, height_m: float, reach_m: float) -> Float[np.ndarray, "k 4 3"]:
     """Joints from the body's side to the tip; the first two of each ring are below."""
     low, high = (_width(plan, z) / 2 for z in (height_m, height_m + plan.depth_m))
     top = height_m + plan.depth_m
@@ -138,17 +143,17 @@ def _arm(plan: Plan, height_m: float, reach_m: float) -> Float[np.ndarray, "k 4 
     return root + share * (tip - root)
 
 
-def _width(plan: Plan, z_m: float) -> float:
+def _width(plan: PylonPlan, z_m: float) -> float:
     lowest, highest = plan.arms[0][0], plan.arms[-1][0] + plan.depth_m
     return float(np.interp(z_m, (lowest, highest), plan.widths_m[1:]))
 
 
-def _mirrored(arm: Truss) -> Truss:
+def _mirror(arm: Truss) -> Truss:
     flip = np.array([-1.0, 1.0, 1.0])
     return Truss(legs=arm.legs * flip, struts=arm.struts * flip, braces=arm.braces * flip)
 
 
-def _hooks(plan: Plan) -> Points:
+def _hooks(plan: PylonPlan) -> Points:
     """Where the strings are fixed, below the arms."""
     inner = []
     for height, reach, count in plan.arms:
@@ -159,27 +164,29 @@ def _hooks(plan: Plan) -> Points:
     return np.concatenate([right, right * [-1, 1, 1]])
 
 
-def _tower(rng: np.random.Generator, palette: Palette, plan: Plan) -> tuple[Mesh, int]:
+def _tower(rng: np.random.Generator, palette: Palette, plan: PylonPlan) -> tuple[Mesh, int]:
     """The tower with its fittings, and the material of its steel."""
     steel = palette.add(_steel(rng))
     leg, brace = 0.028 * plan.bar_m, 0.013 * plan.bar_m
     trusses = _trusses(plan)
     if rng.random() < 0.3:
-        bands = [palette.add(material) for material in aviation(rng)]
-        lattice = [part.banded(leg, brace, bands, (np.inf, plan.height_m / 7)) for part in trusses]
+        bands = [palette.add(material) for material in aviation_paints(rng)]
+        lattice = [part.banded_mesh(leg, brace, bands, (np.inf, plan.height_m / 7)) for part in trusses]
     else:
         lattice = [trusses[0].mesh(leg, brace, steel), trusses[1].mesh(0.8 * leg, brace, steel)]
         lattice += [arm.mesh(0.65 * leg, 0.8 * brace, steel) for arm in trusses[2:]]
-    return joined([*lattice, *_fittings(rng, palette, plan, trusses[0], steel)]), steel
+    return join_meshes([*lattice, *_fittings(rng, palette, plan, trusses[0], steel)]), steel
 
 
 def _steel(rng: np.random.Generator) -> Material:
     """Bare zinc, or the greens and greys that towers are painted with."""
     tints = ((0.22, 0.3, 0.24), (0.35, 0.38, 0.38), (0.3, 0.2, 0.15))
-    return galvanised(rng) if rng.random() < 0.6 else painted(rng, tints[int(rng.integers(3))])
+    return galvanised_steel(rng) if rng.random() < 0.6 else painted_steel(rng, tints[int(rng.integers(3))])
 
 
-def _fittings(rng: np.random.Generator, palette: Palette, plan: Plan, body: Truss, steel: int) -> list[Mesh]:
+def _fittings(
+    rng: np.random.Generator, palette: Palette, plan: PylonPlan, body: Truss, steel: int
+) -> list[Mesh]:
     """Footings, plates at the joints, step bolts, the guard against climbers, signs."""
     concrete = palette.add(Material(texture="concrete", variant=int(rng.integers(8)), span_m=1.0))
     yellow = palette.add(
@@ -198,17 +205,17 @@ def _fittings(rng: np.random.Generator, palette: Palette, plan: Plan, body: Trus
         boxes(corner * 1.02 - [0, 0, 0.1], (0.26, 0.26, 0.5), concrete),
         boxes(joints, (0.065, 0.065, 0.1), steel),
         bars(_steps(plan), 0.006, steel, sides=4),
-        bars(np.concatenate([chains(closed), spikes]), 0.005, steel, sides=4),
+        bars(np.concatenate([chain_segments(closed), spikes]), 0.005, steel, sides=4),
         bars(beam, 0.012, steel),
         boxes(beam.mean(1) - [0, 0.02, 0], (0.24, 0.012, 0.3), yellow),
     ]
 
 
-def _body_width(plan: Plan, z_m: float) -> float:
+def _body_width(plan: PylonPlan, z_m: float) -> float:
     return float(np.interp(z_m, (0, plan.arms[0][0]), plan.widths_m[:2]))
 
 
-def _steps(plan: Plan) -> Segments:
+def _steps(plan: PylonPlan) -> Segments:
     """Bolts up the first leg, to the left and to the right in turn."""
     heights = np.arange(0.2 * plan.height_m, plan.arms[0][0], 0.075)
     half = np.interp(heights, (0, plan.arms[0][0]), plan.widths_m[:2]) / 2
@@ -217,13 +224,13 @@ def _steps(plan: Plan) -> Segments:
     return np.stack([at, at + 0.07 * np.where(odd, [1.0, 0, 0], [0, 1.0, 0])], 1)
 
 
-def _lines(rng: np.random.Generator, palette: Palette, plan: Plan) -> tuple[Mesh, int]:
+def _lines(rng: np.random.Generator, palette: Palette, plan: PylonPlan) -> tuple[Mesh, int]:
     """Strings, conductors both ways, earth wire; and the wires' material."""
     tints = ((0.32, 0.16, 0.1), (0.55, 0.62, 0.6), (0.2, 0.22, 0.24))
     glass = palette.add(
         Material(texture="plain", tint=tints[int(rng.integers(3))], roughness=0.2, span_m=0.5)
     )
-    wire = palette.add(galvanised(rng))
+    wire = palette.add(galvanised_steel(rng))
     hooks = _hooks(plan)
     drop = np.array([0, 0.25, -0.15]) if plan.strained else np.array([0, 0, -1.0])
     strings = [drop * [1, way, 1] * plan.string_m / np.linalg.norm(drop) for way in (1, -1)]
@@ -239,10 +246,10 @@ def _lines(rng: np.random.Generator, palette: Palette, plan: Plan) -> tuple[Mesh
         )
     if plan.strained:
         parts.append(cables(ends[0], ends[1], 0.009, wire, sag_m=0.9 * plan.string_m))
-    return joined(parts), wire
+    return join_meshes(parts), wire
 
 
-def _wires(plan: Plan, starts_m: Points, way: int, wire: int) -> Mesh:
+def _wires(plan: PylonPlan, starts_m: Points, way: int, wire: int) -> Mesh:
     """Conductors to the next tower but one, single or as pairs with spacers."""
     aside = np.array([plan.bundle_m / 2, 0, 0])
     along = np.array([0, way * plan.span_m, 0])
@@ -252,41 +259,41 @@ def _wires(plan: Plan, starts_m: Points, way: int, wire: int) -> Mesh:
         parts.append(cables(start, start + along, 0.009, wire, sag_m=plan.sag_m, count=24))
         parts.append(cables(start + along, start + 2 * along, 0.009, wire, sag_m=plan.sag_m))
     if plan.bundle_m:
-        middles = hanging(starts_m, starts_m + along, plan.sag_m, 16)[:, 1:-1].reshape(-1, 3)
+        middles = sagging_points(starts_m, starts_m + along, plan.sag_m, 16)[:, 1:-1].reshape(-1, 3)
         parts.append(bars(np.stack([middles - aside, middles + aside], 1), 0.012, wire, sides=4))
-    weights = hanging(starts_m, starts_m + along, plan.sag_m, 80)[:, 1]
+    weights = sagging_points(starts_m, starts_m + along, plan.sag_m, 80)[:, 1]
     parts.append(spheres(weights - [0, 0, 0.02], [[0.016, 0.05, 0.014]], wire, 1))
-    return joined(parts)
+    return join_meshes(parts)
 
 
-def _near(lines: Mesh, plan: Plan) -> Mesh:
+def _mark_near(lines: Mesh, plan: PylonPlan) -> Mesh:
     """The lines, those around the tower as its own."""
     away = lines.corners_m - np.array([0, 0, 0.52 * plan.height_m], np.float32)
     return replace(lines, target=(np.linalg.norm(away, axis=2) < REACH_M).all(1))
 
 
-def _far_towers(plan: Plan, steel: int, wire: int) -> Mesh:
+def _far_towers(plan: PylonPlan, steel: int, wire: int) -> Mesh:
     """Plainer copies along the line."""
     hooks = _hooks(plan)
     tower = [part.mesh(0.03, 0.015, steel, sides=3) for part in _trusses(plan)]
     strings = [] if plan.strained else [cables(hooks, hooks - [0, 0, plan.string_m], 0.03, wire, count=1)]
-    poses = np.stack([shift(0, along * plan.span_m) for along in (-1, 1, 2)])
-    return copies(joined([*tower, *strings]), poses)
+    poses = np.stack([translation(0, along * plan.span_m) for along in (-1, 1, 2)])
+    return copies(join_meshes([*tower, *strings]), poses)
 
 
 def _land(rng: np.random.Generator, palette: Palette) -> Mesh:
     """Fields or meadows, trees beside the line, hills behind."""
     small = np.diag([0.4, 0.4, 0.4, 1.0])
     family = str(rng.choice(["grass", "grass", "grass", "soil"]))
-    spots = places(rng, int(rng.integers(16, 34)), 11, 60)
+    spots = draw_spots(rng, int(rng.integers(16, 34)), 11, 60)
     # Nothing grows tall below the wires.
     spots = spots[np.abs(spots[:, 0]) > 4]
-    return joined(
+    return join_meshes(
         [
-            houses(rng, palette, places(rng, 5, 26 / 0.4, 60 / 0.4)).placed(small),
+            houses(rng, palette, draw_spots(rng, 5, 26 / 0.4, 60 / 0.4)).transform(small),
             terrain(rng, palette, family, extent_m=110, level_m=0.0, bumps_m=0.5, flat_radius_m=12),
             trees(rng, palette, spots, height_m=(1.4, 3.0)),
-            bushes(rng, palette, places(rng, 14, 4 / 0.4, 30 / 0.4)).placed(small),
+            bushes(rng, palette, draw_spots(rng, 14, 4 / 0.4, 30 / 0.4)).transform(small),
             hills(rng, palette, distance_m=rng.uniform(80, 120)),
         ]
     )

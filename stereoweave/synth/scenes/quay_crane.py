@@ -5,23 +5,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stereoweave.synth.props.lattice import (
-    aviation,
+    aviation_paints,
     bars,
     cables,
     cage,
-    chains,
-    galvanised,
-    hanging,
+    chain_segments,
+    galvanised_steel,
     ladder,
-    painted,
+    painted_steel,
     railing,
+    sagging_points,
     truss,
 )
-from stereoweave.synth.props.primitives import boxes, copies, lathe, prism, shift, tubes, turn
+from stereoweave.synth.props.primitives import boxes, copies, lathe, prism, rotation, translation, tubes
 from stereoweave.synth.props.surroundings import bollards, daylight, hills, sea
 from stereoweave.synth.stage import Palette, Stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Colour, Material, Mesh, World, joined
+from stereoweave.synth.world import Colour, Material, Mesh, World, join_meshes
 
 PAINTS: tuple[Colour, ...] = ((0.1, 0.22, 0.42), (0.55, 0.1, 0.06), (0.7, 0.7, 0.68), (0.68, 0.45, 0.08))
 BOXES: tuple[Colour, ...] = (
@@ -36,7 +36,7 @@ WATER_M = -0.55
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finish:
+class QuayCraneMaterials:
     """Materials of the crane's parts."""
 
     portal: int
@@ -50,15 +50,17 @@ class Finish:
 def quay_crane(rng: np.random.Generator) -> Stage:
     """The crane, its boom along x, on a quay along y."""
     palette = Palette()
-    finish = _finish(rng, palette)
-    colours = [palette.add(painted(rng, colour, roughness=0.6)) for colour in BOXES]
-    crane = joined([_portal(finish), _boom(finish), _stays(finish), _trolley(rng, finish, colours)])
-    mesh = joined([crane.as_target(), _quay(rng, palette, colours)])
+    materials = _draw_materials(rng, palette)
+    colours = [palette.add(painted_steel(rng, colour, roughness=0.6)) for colour in BOXES]
+    crane = join_meshes(
+        [_portal(materials), _boom(materials), _stays(materials), _trolley(rng, materials, colours)]
+    )
+    mesh = join_meshes([crane.as_target(), _quay(rng, palette, colours)])
     # From the land to along the quay: there the boom and the portal show from their side.
     mirrored = rng.random() < 0.5
     sky, fog, exposure = daylight(rng)
     world = World(
-        mesh=_mirrored(mesh) if mirrored else mesh,
+        mesh=_mirror(mesh) if mirrored else mesh,
         materials=tuple(palette.materials),
         sky=sky,
         fog=fog,
@@ -75,61 +77,65 @@ def quay_crane(rng: np.random.Generator) -> Stage:
     return Stage(world=world, orbit=orbit)
 
 
-def _finish(rng: np.random.Generator, palette: Palette) -> Finish:
-    portal = palette.add(painted(rng, PAINTS[int(rng.integers(len(PAINTS)))]))
-    boom = tuple(palette.add(material) for material in aviation(rng)) if rng.random() < 0.4 else (portal,)
-    return Finish(
+def _draw_materials(rng: np.random.Generator, palette: Palette) -> QuayCraneMaterials:
+    portal = palette.add(painted_steel(rng, PAINTS[int(rng.integers(len(PAINTS)))]))
+    boom = (
+        tuple(palette.add(material) for material in aviation_paints(rng)) if rng.random() < 0.4 else (portal,)
+    )
+    return QuayCraneMaterials(
         portal=portal,
         boom=boom,
-        steel=palette.add(galvanised(rng)),
+        steel=palette.add(galvanised_steel(rng)),
         dark=palette.add(Material(texture="plain", tint=(0.06, 0.06, 0.06), roughness=0.8)),
-        house=palette.add(painted(rng, (0.75, 0.75, 0.72))),
+        house=palette.add(painted_steel(rng, (0.75, 0.75, 0.72))),
         glass=palette.add(Material(texture="plain", tint=(0.05, 0.07, 0.08), roughness=0.1)),
     )
 
 
-def _portal(finish: Finish) -> Mesh:
+def _portal(materials: QuayCraneMaterials) -> Mesh:
     """Legs, beams between them, braces, bogies on rails, a lift, ladders with landings."""
     corner = np.array([(a, b, 0) for a in (GAUGE_M, -GAUGE_M) for b in (BASE_M, -BASE_M)])
     sides = np.array([[1, BASE_M, 1], [1, -BASE_M, 1]])
     wheels = (corner[:, None] + [[0, d, 0.08] for d in (-0.24, -0.08, 0.08, 0.24)]).reshape(-1, 3)
     low, high = sides * [-GAUGE_M, 1, 1.45], sides * [GAUGE_M, 1, GIRDER_M - 0.15]
     height = GIRDER_M - 0.3
-    return joined(
+    return join_meshes(
         [
-            boxes(corner + [0, 0, 0.3 + height / 2], (0.16, 0.14, height), finish.portal),
-            boxes([(a, 0, 0.34) for a in (GAUGE_M, -GAUGE_M)], (0.18, 2 * BASE_M + 0.3, 0.16), finish.portal),
+            boxes(corner + [0, 0, 0.3 + height / 2], (0.16, 0.14, height), materials.portal),
+            boxes(
+                [(a, 0, 0.34) for a in (GAUGE_M, -GAUGE_M)], (0.18, 2 * BASE_M + 0.3, 0.16), materials.portal
+            ),
             boxes(
                 [(a, 0, GIRDER_M - 0.1) for a in (GAUGE_M, -GAUGE_M)],
                 (0.17, 2 * BASE_M + 0.14, 0.2),
-                finish.portal,
+                materials.portal,
             ),
-            boxes(sides * [0, 1, 1.4], (2 * GAUGE_M, 0.13, 0.16), finish.portal),
-            tubes(low, high, 0.045, finish.portal, 10),
-            boxes(corner + [0, 0, 0.17], (0.12, 0.62, 0.14), finish.dark),
-            tubes(wheels - [0.05, 0, 0], wheels + [0.05, 0, 0], 0.08, finish.steel, 14),
-            boxes((-GAUGE_M, -BASE_M - 0.15, 2.0), (0.15, 0.14, GIRDER_M - 0.6), finish.house),
-            _climb(finish),
+            boxes(sides * [0, 1, 1.4], (2 * GAUGE_M, 0.13, 0.16), materials.portal),
+            tubes(low, high, 0.045, materials.portal, 10),
+            boxes(corner + [0, 0, 0.17], (0.12, 0.62, 0.14), materials.dark),
+            tubes(wheels - [0.05, 0, 0], wheels + [0.05, 0, 0], 0.08, materials.steel, 14),
+            boxes((-GAUGE_M, -BASE_M - 0.15, 2.0), (0.15, 0.14, GIRDER_M - 0.6), materials.house),
+            _climb(materials),
         ]
     )
 
 
-def _climb(finish: Finish) -> Mesh:
+def _climb(materials: QuayCraneMaterials) -> Mesh:
     """Caged ladders up the landward leg, from landing to landing."""
     y = BASE_M + 0.12
     landings = np.array([1.5, 2.6, GIRDER_M - 0.02])
-    parts = [boxes([(-GAUGE_M, y + 0.02, z) for z in landings], (0.5, 0.26, 0.015), finish.steel)]
+    parts = [boxes([(-GAUGE_M, y + 0.02, z) for z in landings], (0.5, 0.26, 0.015), materials.steel)]
     for x, low, high in zip((0.0, 0.14, -0.14), (0.0, *landings), landings, strict=False):
         foot, head = (x - GAUGE_M, y, low), (x - GAUGE_M, y, high + 0.2)
-        parts.append(ladder(foot, head, (1, 0, 0), 0.1, finish.steel))
-        parts.append(cage((foot[0], y, low + 0.3), head, (0, 1, 0), 0.1, finish.steel))
+        parts.append(ladder(foot, head, (1, 0, 0), 0.1, materials.steel))
+        parts.append(cage((foot[0], y, low + 0.3), head, (0, 1, 0), 0.1, materials.steel))
     for z in landings:
         path = np.array([[-0.25, -0.1, z], [-0.25, 0.15, z], [0.25, 0.15, z], [0.25, -0.1, z]])
-        parts.append(railing(path + [-GAUGE_M, y, 0], 0.2, 0.25, 0.007, finish.steel))
-    return joined(parts)
+        parts.append(railing(path + [-GAUGE_M, y, 0], 0.2, 0.25, 0.007, materials.steel))
+    return join_meshes(parts)
 
 
-def _boom(finish: Finish) -> Mesh:
+def _boom(materials: QuayCraneMaterials) -> Mesh:
     """Two lattice girders with walkways, joined by cross beams; machinery house at the back."""
     x = np.linspace(BACK_M, TIP_M, 22)
     square = np.array([[-0.06, -0.0], [0.06, -0.0], [0.06, 0.26], [-0.06, 0.26]])
@@ -138,26 +144,30 @@ def _boom(finish: Finish) -> Mesh:
         joints = np.stack(
             [np.column_stack([x, 0 * x + a + side * 0.28, 0 * x + b + GIRDER_M]) for a, b in square], 1
         )
-        parts.append(truss(joints, "zigzag").banded(0.02, 0.011, finish.boom, (0.6, np.inf)))
+        parts.append(truss(joints, "zigzag").banded_mesh(0.02, 0.011, materials.boom, (0.6, np.inf)))
         path = np.array([[BACK_M, 0.44 * side, GIRDER_M], [TIP_M, 0.44 * side, GIRDER_M]])
-        parts.append(railing(path, 0.2, 0.3, 0.007, finish.steel))
-        parts.append(boxes(path.mean(0) - [0, 0.06 * side, 0], (TIP_M - BACK_M, 0.16, 0.012), finish.steel))
+        parts.append(railing(path, 0.2, 0.3, 0.007, materials.steel))
+        parts.append(
+            boxes(path.mean(0) - [0, 0.06 * side, 0], (TIP_M - BACK_M, 0.16, 0.012), materials.steel)
+        )
     across = [(a, 0, GIRDER_M + 0.13) for a in (BACK_M, -GAUGE_M, GAUGE_M, TIP_M)]
     loops = np.linspace(BACK_M + 0.1, 3.0, 15)
     ends = np.column_stack([loops, 0 * loops - 0.28, 0 * loops + GIRDER_M - 0.02])
-    return joined(
+    return join_meshes(
         [
             *parts,
-            boxes(across, (0.14, 0.68, 0.2), finish.portal),
-            boxes((-1.75, 0, GIRDER_M + 0.56), (0.95, 0.62, 0.5), finish.house),
-            boxes((-1.75, 0, GIRDER_M + 0.84), (1.02, 0.7, 0.06), finish.portal),
-            boxes((-1.75, 0, GIRDER_M + 0.285), (1.05, 0.8, 0.05), finish.portal),
-            bars(chains(hanging(ends[:-1], ends[1:], 0.16, 8)), 0.008, finish.dark, sides=4),
+            boxes(across, (0.14, 0.68, 0.2), materials.portal),
+            boxes((-1.75, 0, GIRDER_M + 0.56), (0.95, 0.62, 0.5), materials.house),
+            boxes((-1.75, 0, GIRDER_M + 0.84), (1.02, 0.7, 0.06), materials.portal),
+            boxes((-1.75, 0, GIRDER_M + 0.285), (1.05, 0.8, 0.05), materials.portal),
+            bars(
+                chain_segments(sagging_points(ends[:-1], ends[1:], 0.16, 8)), 0.008, materials.dark, sides=4
+            ),
         ]
     )
 
 
-def _stays(finish: Finish) -> Mesh:
+def _stays(materials: QuayCraneMaterials) -> Mesh:
     """The frame above the seaward legs, its back legs, and the stays to the boom."""
     sides = np.array([[1, 1.0, 1], [1, -1.0, 1]])
     apex = sides * [GAUGE_M + 0.1, 0.2, GIRDER_M + 1.95]
@@ -165,20 +175,20 @@ def _stays(finish: Finish) -> Mesh:
     cross = 0.5 * (front + apex)
     stays = [np.stack([apex, sides * [x, 0.28, GIRDER_M + 0.26]], 1) for x in (2.2, 3.75, BACK_M + 0.1)]
     lights = np.array([[GAUGE_M + 0.1, y, GIRDER_M + 1.98] for y in (-0.15, 0.0, 0.15)])
-    return joined(
+    return join_meshes(
         [
-            tubes(front, apex, np.array([[0.065, 0.05]]), finish.portal, 10),
-            tubes(back, apex, 0.04, finish.portal, 10),
-            tubes(cross[0], cross[1], 0.03, finish.portal, 8),
-            boxes((GAUGE_M + 0.1, 0, GIRDER_M + 1.95), (0.14, 0.56, 0.1), finish.portal),
-            bars(np.concatenate(stays), 0.012, finish.steel),
-            railing(lights[[0, 2]] + [0, 0, 0.02], 0.16, 0.15, 0.006, finish.steel),
-            bars(np.stack([lights, lights + [0, 0, 0.4]], 1)[1:2], 0.007, finish.steel),
+            tubes(front, apex, np.array([[0.065, 0.05]]), materials.portal, 10),
+            tubes(back, apex, 0.04, materials.portal, 10),
+            tubes(cross[0], cross[1], 0.03, materials.portal, 8),
+            boxes((GAUGE_M + 0.1, 0, GIRDER_M + 1.95), (0.14, 0.56, 0.1), materials.portal),
+            bars(np.concatenate(stays), 0.012, materials.steel),
+            railing(lights[[0, 2]] + [0, 0, 0.02], 0.16, 0.15, 0.006, materials.steel),
+            bars(np.stack([lights, lights + [0, 0, 0.4]], 1)[1:2], 0.007, materials.steel),
         ]
     )
 
 
-def _trolley(rng: np.random.Generator, finish: Finish, colours: list[int]) -> Mesh:
+def _trolley(rng: np.random.Generator, materials: QuayCraneMaterials, colours: list[int]) -> Mesh:
     """Trolley, cab, ropes, spreader, at times with a container."""
     x, low = rng.uniform(-0.4, 3.4), rng.uniform(1.2, 2.6)
     z = GIRDER_M - 0.08
@@ -187,19 +197,19 @@ def _trolley(rng: np.random.Generator, finish: Finish, colours: list[int]) -> Me
     rim = np.concatenate([corners, corners[:1]]) * [0.14, CONTAINER_M[0] / 2 - 0.03, 0] + [x, 0, low]
     cab = np.array([x - 0.34, 0.14, z - 0.2])
     parts = [
-        boxes((x, 0, z), (0.5, 0.5, 0.1), finish.portal),
-        boxes(cab, (0.22, 0.24, 0.26), finish.house),
-        boxes(cab + [0.02, 0, -0.04], (0.2, 0.25, 0.15), finish.glass),
-        boxes(cab + [0, 0, 0.16], (0.04, 0.2, 0.1), finish.portal),
-        cables(top, bottom, 0.006, finish.steel, count=1),
-        boxes((x, 0, low + 0.04), (0.3, 0.24, 0.07), finish.portal),
-        bars(chains(rim[None]), 0.022, finish.boom[0], sides=4),
-        boxes((x, 0, low), (0.1, CONTAINER_M[0] - 0.06, 0.04), finish.boom[0]),
+        boxes((x, 0, z), (0.5, 0.5, 0.1), materials.portal),
+        boxes(cab, (0.22, 0.24, 0.26), materials.house),
+        boxes(cab + [0.02, 0, -0.04], (0.2, 0.25, 0.15), materials.glass),
+        boxes(cab + [0, 0, 0.16], (0.04, 0.2, 0.1), materials.portal),
+        cables(top, bottom, 0.006, materials.steel, count=1),
+        boxes((x, 0, low + 0.04), (0.3, 0.24, 0.07), materials.portal),
+        bars(chain_segments(rim[None]), 0.022, materials.boom[0], sides=4),
+        boxes((x, 0, low), (0.1, CONTAINER_M[0] - 0.06, 0.04), materials.boom[0]),
     ]
     if rng.random() < 0.7:
-        carried = _container(colours[int(rng.integers(5))], finish.dark).placed(turn((0, 0, 1), 90))
-        parts.append(carried.moved(x, 0, low - CONTAINER_M[2] - 0.03))
-    return joined(parts)
+        carried = _container(colours[int(rng.integers(5))], materials.dark).transform(rotation((0, 0, 1), 90))
+        parts.append(carried.translate(x, 0, low - CONTAINER_M[2] - 0.03))
+    return join_meshes(parts)
 
 
 def _container(colour: int, dark: int) -> Mesh:
@@ -209,7 +219,7 @@ def _container(colour: int, dark: int) -> Mesh:
     ribs = np.array([(a, b * (width / 2 - 0.004), height / 2) for a in x for b in (1, -1)])
     posts = [(a * (length / 2 - 0.01), b * (width / 2 - 0.01), height / 2) for a in (1, -1) for b in (1, -1)]
     rods = np.array([(length / 2, b, 0.03) for b in (-0.09, -0.03, 0.03, 0.09)])
-    return joined(
+    return join_meshes(
         [
             boxes((0, 0, height / 2), (length - 0.02, width - 0.02, height - 0.01), colour),
             boxes(ribs, (0.06, 0.014, height - 0.04), colour),
@@ -227,18 +237,18 @@ def _quay(rng: np.random.Generator, palette: Palette, colours: list[int]) -> Mes
         )
     )
     rubber = palette.add(Material(texture="plain", tint=(0.05, 0.05, 0.05), roughness=0.9))
-    rail = palette.add(galvanised(rng))
+    rail = palette.add(galvanised_steel(rng))
     y = np.arange(-30, 31, 1.5)
     fender = lathe([(0, 0), (0.1, 0), (0.1, 0.42), (0, 0.42)], rubber, 12)
     spots = np.stack([np.full_like(y, EDGE_M - 0.22), y + 0.7, 0 * y], -1) / 0.4
     small = np.diag([0.4, 0.4, 0.4, 1.0])
-    return joined(
+    return join_meshes(
         [
             boxes(((EDGE_M - 60) / 2, 0, -1.5), (EDGE_M + 60, 160, 3.0), concrete),
             boxes((EDGE_M - 0.05, 0, 0.04), (0.12, 160, 0.08), concrete),
             boxes([(a, 0, 0.0) for a in (GAUGE_M, -GAUGE_M)], (0.035, 160, 0.02), rail),
-            copies(fender, np.stack([shift(EDGE_M + 0.08, value, -0.5) for value in y])),
-            bollards(rng, palette, spots).placed(small),
+            copies(fender, np.stack([translation(EDGE_M + 0.08, value, -0.5) for value in y])),
+            bollards(rng, palette, spots).transform(small),
             _yard(rng, colours, rubber),
             *([_ship(rng, palette, colours, rubber)] if rng.random() < 0.65 else []),
             sea(rng, palette, extent_m=200, level_m=WATER_M),
@@ -250,16 +260,16 @@ def _quay(rng: np.random.Generator, palette: Palette, colours: list[int]) -> Mes
 def _ship(rng: np.random.Generator, palette: Palette, colours: list[int], dark: int) -> Mesh:
     """A container ship alongside, its bow beyond the crane, bridge and stacks at its stern."""
     hull = palette.add(
-        painted(rng, ((0.08, 0.12, 0.2), (0.3, 0.06, 0.05), (0.07, 0.2, 0.15))[int(rng.integers(3))])
+        painted_steel(rng, ((0.08, 0.12, 0.2), (0.3, 0.06, 0.05), (0.07, 0.2, 0.15))[int(rng.integers(3))])
     )
-    white = palette.add(painted(rng, (0.78, 0.78, 0.75)))
+    white = palette.add(painted_steel(rng, (0.78, 0.78, 0.75)))
     outline = [(2.3, -15), (4.7, -15), (4.7, -0.2), (4.4, 1.0), (3.5, 2.3), (2.6, 1.0), (2.3, -0.2)]
     deck_m = 0.3
     rim = np.insert(np.array(outline)[2:], 2, deck_m, axis=1)
     x, y = (values.ravel() for values in np.meshgrid(2.6 + 0.36 * np.arange(6), -1.6 - 1.25 * np.arange(5)))
-    return joined(
+    return join_meshes(
         [
-            prism(outline, 1.3, hull).moved(z=deck_m - 1.3),
+            prism(outline, 1.3, hull).translate(z=deck_m - 1.3),
             railing(rim, 0.16, 0.4, 0.008, white),
             boxes((3.5, -9.6, 1.3), (2.2, 1.2, 2.2), white),
             boxes((3.5, -9.0, 1.95), (2.0, 0.04, 0.3), dark),
@@ -281,12 +291,12 @@ def _stacks(rng: np.random.Generator, colours: list[int], dark: int, feet_m: np.
     level = np.concatenate([np.arange(count) for count in high])
     at = np.repeat(feet_m, high, axis=0) + level[:, None] * [0, 0, CONTAINER_M[2]]
     colour = rng.integers(len(colours), size=len(at))
-    poses = np.tile(turn((0, 0, 1), 90), (len(at), 1, 1))
+    poses = np.tile(rotation((0, 0, 1), 90), (len(at), 1, 1))
     poses[:, :3, 3] = at
-    return joined([copies(_container(tint, dark), poses[colour == k]) for k, tint in enumerate(colours)])
+    return join_meshes([copies(_container(tint, dark), poses[colour == k]) for k, tint in enumerate(colours)])
 
 
-def _mirrored(mesh: Mesh) -> Mesh:
+def _mirror(mesh: Mesh) -> Mesh:
     """The mesh with y turned to -y, its triangles still counter-clockwise."""
     flip = np.array([1, -1, 1], np.float32)
     return replace(

@@ -4,13 +4,21 @@ import numpy as np
 from jaxtyping import Float
 
 from stereoweave.synth.props.antennas import paraboloid
-from stereoweave.synth.props.lattice import bars, cage, chains, galvanised, ladder, railing, truss
-from stereoweave.synth.props.primitives import boxes, copies, lathe, shift, spheres, tubes, turn
-from stereoweave.synth.props.surroundings import bushes, daylight, hills, houses, places, terrain, trees
-from stereoweave.synth.props.wind_rotors import composite
+from stereoweave.synth.props.lattice import (
+    bars,
+    cage,
+    chain_segments,
+    galvanised_steel,
+    ladder,
+    railing,
+    truss,
+)
+from stereoweave.synth.props.primitives import boxes, copies, lathe, rotation, spheres, translation, tubes
+from stereoweave.synth.props.surroundings import bushes, daylight, draw_spots, hills, houses, terrain, trees
+from stereoweave.synth.props.wind_rotors import composite_skin
 from stereoweave.synth.stage import Palette, Stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Material, Mesh, World, joined
+from stereoweave.synth.world import Material, Mesh, World, join_meshes
 
 RIBS = 16
 
@@ -18,21 +26,23 @@ RIBS = 16
 def radio_dish(rng: np.random.Generator) -> Stage:
     """A dish of 3.6 to 4.4 m towards +x, and others of its kind behind."""
     palette = Palette()
-    white, steel = palette.add(composite(rng)), palette.add(galvanised(rng))
+    white, steel = palette.add(composite_skin(rng)), palette.add(galvanised_steel(rng))
     back = white if rng.random() < 0.5 else steel
     concrete = palette.add(Material(texture="concrete", variant=int(rng.integers(8)), span_m=2.0))
     dark = palette.add(Material(texture="plain", tint=(0.1, 0.1, 0.11), roughness=0.6))
     radius, axis = rng.uniform(1.8, 2.2), rng.uniform(2.5, 2.9)
     upwards_deg = rng.uniform(18, 62)
     reflector = _reflector(rng, radius, (white, back, steel, dark))
-    aimed = reflector.placed(shift(z=axis) @ turn((0, 1, 0), 90 - upwards_deg) @ shift(z=0.42))
+    aimed = reflector.transform(
+        translation(z=axis) @ rotation((0, 1, 0), 90 - upwards_deg) @ translation(z=0.42)
+    )
     mount = (_pedestal if rng.random() < 0.5 else _alidade)(axis, (white, steel, concrete, dark))
-    dish = joined([aimed, mount])
+    dish = join_meshes([aimed, mount])
     sky, fog, exposure = daylight(rng)
     land = _land(rng, palette, concrete)
     far = _far(rng, white, (radius, axis, upwards_deg))
     world = World(
-        mesh=joined([dish.as_target(), far, land]),
+        mesh=join_meshes([dish.as_target(), far, land]),
         materials=tuple(palette.materials),
         sky=sky,
         fog=fog,
@@ -55,10 +65,12 @@ def _far(rng: np.random.Generator, white: int, measures: tuple[float, float, flo
     radius, axis, upwards_deg = measures
     reflector = paraboloid(radius, 0.8 * radius, white, white, 20)
     dish = [
-        reflector.placed(shift(z=axis) @ turn((0, 1, 0), 90 - upwards_deg) @ shift(z=0.42)),
+        reflector.transform(
+            translation(z=axis) @ rotation((0, 1, 0), 90 - upwards_deg) @ translation(z=0.42)
+        ),
         lathe([(0.5, 0), (0.3, axis - 0.4), (0, axis + 0.3)], white, 16),
     ]
-    return copies(joined(dish), np.stack([shift(x, y) for x, y, _ in places(rng, 4, 26, 70)]))
+    return copies(join_meshes(dish), np.stack([translation(x, y) for x, y, _ in draw_spots(rng, 4, 26, 70)]))
 
 
 def _reflector(rng: np.random.Generator, radius_m: float, skins: tuple[int, int, int, int]) -> Mesh:
@@ -95,13 +107,13 @@ def _reflector(rng: np.random.Generator, radius_m: float, skins: tuple[int, int,
     )
     feed = lathe([(0.17, 0.0), (0.12, 0.3), (0.13, 0.34), (0, 0.34)], white, 24)
     cassegrain = rng.random() < 0.6
-    return joined(
+    return join_meshes(
         [
             paraboloid(radius_m, focal, white, back, 64),
             bars(_ribs(radius_m, focal), 0.013, steel, sides=4, capped=False),
             bars(_seams(radius_m, focal), 0.0035, steel, sides=4, capped=False),
             bars(np.stack([feet, tips], 1), 0.022, white, sides=7),
-            joined([secondary, feed]) if cassegrain else horn,
+            join_meshes([secondary, feed]) if cassegrain else horn,
             lathe([(0, -0.42), (0.34, -0.42), (0.36, -0.3), (0.36, -0.02), (0, 0.0)], back, 32),
             tubes(tips[0], tips[0] + [0, 0, 0.35], 0.008, steel),
             spheres(tips, 0.03, dark, 1),
@@ -115,7 +127,7 @@ def _seams(radius_m: float, focal_m: float) -> Float[np.ndarray, "n 2 3"]:
         np.linspace(0.2, 0.97, 9) * radius_m, np.linspace(0, 2 * np.pi, 4 * RIBS + 1), indexing="ij"
     )
     points = np.stack([radius * np.cos(angle), radius * np.sin(angle), radius**2 / (4 * focal_m)], -1)
-    return np.concatenate([chains(points[[0, 4]]), chains(points[:, ::2].swapaxes(0, 1))])
+    return np.concatenate([chain_segments(points[[0, 4]]), chain_segments(points[:, ::2].swapaxes(0, 1))])
 
 
 def _ribs(radius_m: float, focal_m: float) -> Float[np.ndarray, "n 2 3"]:
@@ -144,7 +156,7 @@ def _yoke(axis_m: float, foot_m: float, skins: tuple[int, int, int, int]) -> Mes
     white, steel, _, dark = skins
     height = axis_m - foot_m
     arms = [boxes((-0.05, y, foot_m + height / 2), (0.34, 0.12, height + 0.24), white) for y in (0.46, -0.46)]
-    return joined(
+    return join_meshes(
         [
             *arms,
             tubes((0, -0.56, axis_m), (0, 0.56, axis_m), 0.1, steel, 18),
@@ -162,7 +174,7 @@ def _pedestal(axis_m: float, skins: tuple[int, int, int, int]) -> Mesh:
     top = axis_m - 0.75
     angle = np.linspace(0, 2 * np.pi, 21)
     rim = 0.72 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
-    return joined(
+    return join_meshes(
         [
             lathe([(0, -0.1), (1.0, -0.1), (0.98, 0.12), (0, 0.12)], concrete, 40),
             lathe([(0.6, 0.12), (0.62, 0.16), (0.36, top - 0.1), (0.42, top), (0, top)], white, 36),
@@ -187,7 +199,7 @@ def _alidade(axis_m: float, skins: tuple[int, int, int, int]) -> Mesh:
     track = 1.49
     frame = truss(joints, "cross")
     rim = np.concatenate([corner, corner[:1]]) * 0.62 + [0, 0, top]
-    return joined(
+    return join_meshes(
         [
             lathe(
                 [(track - 0.22, 0), (track - 0.22, 0.05), (track + 0.22, 0.05), (track + 0.22, -0.1)][::-1],
@@ -218,14 +230,16 @@ def _land(rng: np.random.Generator, palette: Palette, concrete: int) -> Mesh:
     """Open ground with a control building far away, trees, hills."""
     small = np.diag([0.4, 0.4, 0.4, 1.0])
     family = str(rng.choice(["grass", "grass", "gravel", "soil"]))
-    path = boxes((1.0, 8.0, 0.0), (0.9, 17.0, 0.02), concrete).placed(turn((0, 0, 1), rng.uniform(0, 360)))
-    return joined(
+    path = boxes((1.0, 8.0, 0.0), (0.9, 17.0, 0.02), concrete).transform(
+        rotation((0, 0, 1), rng.uniform(0, 360))
+    )
+    return join_meshes(
         [
             terrain(rng, palette, family, extent_m=110, bumps_m=0.6, flat_radius_m=17),
             path,
-            trees(rng, palette, places(rng, 16, 14, 60), height_m=(1.5, 3.5)),
-            bushes(rng, palette, places(rng, 12, 4 / 0.4, 30 / 0.4)).placed(small),
-            houses(rng, palette, places(rng, 3, 22 / 0.4, 50 / 0.4)).placed(small),
+            trees(rng, palette, draw_spots(rng, 16, 14, 60), height_m=(1.5, 3.5)),
+            bushes(rng, palette, draw_spots(rng, 12, 4 / 0.4, 30 / 0.4)).transform(small),
+            houses(rng, palette, draw_spots(rng, 3, 22 / 0.4, 50 / 0.4)).transform(small),
             hills(rng, palette, distance_m=rng.uniform(80, 120)),
         ]
     )

@@ -5,38 +5,38 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.synth.props.lattice import aviation, galvanised, painted, railing
+from stereoweave.synth.props.lattice import aviation_paints, galvanised_steel, painted_steel, railing
 from stereoweave.synth.props.pipework import pipes, rack
-from stereoweave.synth.props.primitives import boxes, lathe, shift, turn
+from stereoweave.synth.props.primitives import boxes, lathe, rotation, translation
 from stereoweave.synth.props.refinery_units import (
-    Coats,
-    Unit,
+    RefineryMaterials,
+    RefineryUnit,
     ball_tank,
     chimney,
     column,
     drum_tank,
     flare,
-    vessels,
+    pressure_vessels,
 )
 from stereoweave.synth.props.surroundings import (
     barrels,
     daylight,
+    draw_spots,
     hills,
     houses,
     pallets,
-    places,
     terrain,
     trees,
 )
 from stereoweave.synth.stage import Palette, Stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Material, Mesh, World, joined
+from stereoweave.synth.world import Material, Mesh, World, join_meshes
 
-UNITS: dict[str, Callable[[np.random.Generator, Coats], Unit]] = {
+UNITS: dict[str, Callable[[np.random.Generator, RefineryMaterials], RefineryUnit]] = {
     "column": column,
     "ball tank": ball_tank,
     "drum tank": drum_tank,
-    "vessels": vessels,
+    "vessels": pressure_vessels,
     "chimney": chimney,
     "flare": flare,
 }
@@ -60,22 +60,22 @@ _SMALL = np.diag([0.3, 0.3, 0.3, 1.0])
 def refinery(rng: np.random.Generator) -> Stage:
     """A refinery of 10 to 12 units, seen from all around."""
     palette = Palette()
-    coats = _coats(rng, palette)
+    materials = _draw_materials(rng, palette)
     rusty = Material(texture="rust", variant=int(rng.integers(64)), span_m=0.8)
-    paints = [painted(rng, colour) for colour in ((0.5, 0.4, 0.1), (0.2, 0.3, 0.24))]
-    lines = (*coats.shells[:4], *(palette.add(material) for material in (rusty, *paints)))
-    plant = [*_units(rng, coats, lines), _rack(rng, coats, lines), *_yard(rng, palette, coats)]
+    paints = [painted_steel(rng, colour) for colour in ((0.5, 0.4, 0.1), (0.2, 0.3, 0.24))]
+    lines = (*materials.shells[:4], *(palette.add(material) for material in (rusty, *paints)))
+    plant = [*_units(rng, materials, lines), _rack(rng, materials, lines), *_yard(rng, palette, materials)]
     corners = _YARD_M * np.array([(x, y, 0.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))])
     around = [
         _ground(rng, palette),
-        railing(corners, 0.28, 1.2, 0.012, coats.rail, rails=3),
-        _tank_farm(rng, coats),
-        trees(rng, palette, places(rng, 7, 17.0, 60.0), (1.0, 2.6)),
-        houses(rng, palette, places(rng, 6, 20.0, 50.0) / 0.3).placed(_SMALL),
+        railing(corners, 0.28, 1.2, 0.012, materials.rail, rails=3),
+        _tank_farm(rng, materials),
+        trees(rng, palette, draw_spots(rng, 7, 17.0, 60.0), (1.0, 2.6)),
+        houses(rng, palette, draw_spots(rng, 6, 20.0, 50.0) / 0.3).transform(_SMALL),
         hills(rng, palette, distance_m=rng.uniform(70, 120)),
     ]
     sky, fog, exposure = daylight(rng)
-    mesh = joined([*(part.as_target() for part in plant), *around])
+    mesh = join_meshes([*(part.as_target() for part in plant), *around])
     world = World(mesh=mesh, materials=tuple(palette.materials), sky=sky, fog=fog, exposure=exposure)
     orbit = Orbit(
         centre_m=(0.0, 0.0, 1.5), distance_m=(7.5, 11.0), elevation_deg=(-4.0, 24.0), aim_m=0.7, floor_m=0.6
@@ -83,8 +83,8 @@ def refinery(rng: np.random.Generator) -> Stage:
     return Stage(world=world, orbit=orbit)
 
 
-def _coats(rng: np.random.Generator, palette: Palette) -> Coats:
-    red, white = aviation(rng)
+def _draw_materials(rng: np.random.Generator, palette: Palette) -> RefineryMaterials:
+    red, white = aviation_paints(rng)
     bare = Material(
         texture="steel",
         variant=int(rng.integers(64)),
@@ -94,15 +94,15 @@ def _coats(rng: np.random.Generator, palette: Palette) -> Coats:
         metal=0.6,
     )
     shells = (
-        galvanised(rng),
+        galvanised_steel(rng),
         bare,
-        painted(rng, (0.75, 0.75, 0.72)),
-        painted(rng, (0.5, 0.53, 0.52)),
-        painted(rng, (0.55, 0.5, 0.4)),
+        painted_steel(rng, (0.75, 0.75, 0.72)),
+        painted_steel(rng, (0.5, 0.53, 0.52)),
+        painted_steel(rng, (0.55, 0.5, 0.4)),
     )
-    structure = painted(rng, [(0.25, 0.27, 0.28), (0.3, 0.16, 0.1), (0.2, 0.28, 0.33)][rng.integers(3)])
-    rails = painted(rng, (0.62, 0.45, 0.06) if rng.random() < 0.6 else (0.6, 0.6, 0.58))
-    return Coats(
+    structure = painted_steel(rng, [(0.25, 0.27, 0.28), (0.3, 0.16, 0.1), (0.2, 0.28, 0.33)][rng.integers(3)])
+    rails = painted_steel(rng, (0.62, 0.45, 0.06) if rng.random() < 0.6 else (0.6, 0.6, 0.58))
+    return RefineryMaterials(
         shells=tuple(palette.add(shell) for shell in shells),
         steel=palette.add(structure),
         rail=palette.add(rails),
@@ -116,7 +116,7 @@ def _coats(rng: np.random.Generator, palette: Palette) -> Coats:
     )
 
 
-def _units(rng: np.random.Generator, coats: Coats, lines: tuple[int, ...]) -> list[Mesh]:
+def _units(rng: np.random.Generator, materials: RefineryMaterials, lines: tuple[int, ...]) -> list[Mesh]:
     """The units on their plots, and a pipe or two from each to the rack."""
     plots = iter(np.array([(x, y) for x in _PLOTS_X_M for y in _PLOTS_Y_M])[rng.permutation(16)])
     meshes: list[Mesh] = []
@@ -124,12 +124,12 @@ def _units(rng: np.random.Generator, coats: Coats, lines: tuple[int, ...]) -> li
     for name, counts in _COUNTS.items():
         count = int(rng.integers(counts[0], counts[1] + 1))
         # Two are often of one make, and building is what takes time.
-        kinds = [UNITS[name](rng, coats) for _ in range((count + 1) // 2)]
+        kinds = [UNITS[name](rng, materials) for _ in range((count + 1) // 2)]
         for k in range(count):
             x, y = next(plots)
-            pose = shift(x, y) @ turn((0, 0, 1), 90.0 * int(rng.integers(4)))
+            pose = translation(x, y) @ rotation((0, 0, 1), 90.0 * int(rng.integers(4)))
             unit = kinds[k % len(kinds)]
-            meshes.append(unit.mesh.placed(pose))
+            meshes.append(unit.mesh.transform(pose))
             for nozzle in unit.nozzles_m @ pose[:3, :3].T + pose[:3, 3]:
                 routes.setdefault(int(rng.choice(lines[:4])), []).append(_route(rng, nozzle, (x, y)))
     radii_m = {coat: rng.choice([0.02, 0.028, 0.036], len(paths)).tolist() for coat, paths in routes.items()}
@@ -150,21 +150,21 @@ def _route(
     )
 
 
-def _rack(rng: np.random.Generator, coats: Coats, lines: tuple[int, ...]) -> Mesh:
+def _rack(rng: np.random.Generator, materials: RefineryMaterials, lines: tuple[int, ...]) -> Mesh:
     levels_m = (0.72, 1.08) if rng.random() < 0.6 else (0.72, 1.08, 1.42)
-    return rack(rng, _HALF_RACK_M, levels_m, lines, coats)
+    return rack(rng, _HALF_RACK_M, levels_m, lines, materials)
 
 
-def _yard(rng: np.random.Generator, palette: Palette, coats: Coats) -> list[Mesh]:
+def _yard(rng: np.random.Generator, palette: Palette, materials: RefineryMaterials) -> list[Mesh]:
     """What stands between: a slab under the plant, a control house, boards with signs, drums, pallets."""
-    slab = boxes([[0, 0, 0.0]], [[8.4, 8.0, 0.03]], coats.concrete)
+    slab = boxes([[0, 0, 0.0]], [[8.4, 8.0, 0.03]], materials.concrete)
     spots = np.column_stack(
         [rng.uniform(-3.6, 3.6, 6), rng.choice([-1, 1], 6) * rng.uniform(3.5, 3.9, 6), np.zeros(6)]
     )
-    boards = [boxes([spot + [0, 0, 0.28]], [[0.34, 0.015, 0.22]], coats.sign) for spot in spots[:3]]
-    legs = boxes(spots[:3] + [0, 0, 0.12], [[0.03, 0.012, 0.26]], coats.rail)
-    drums = barrels(rng, palette, _cluster(rng, 6) / 0.3).placed(_SMALL)
-    stacks = pallets(rng, palette, _cluster(rng, 4) / 0.3).placed(_SMALL)
+    boards = [boxes([spot + [0, 0, 0.28]], [[0.34, 0.015, 0.22]], materials.sign) for spot in spots[:3]]
+    legs = boxes(spots[:3] + [0, 0, 0.12], [[0.03, 0.012, 0.26]], materials.rail)
+    drums = barrels(rng, palette, _cluster(rng, 6) / 0.3).transform(_SMALL)
+    stacks = pallets(rng, palette, _cluster(rng, 4) / 0.3).transform(_SMALL)
     return [slab, *boards, legs, drums, stacks]
 
 
@@ -176,20 +176,20 @@ def _ground(rng: np.random.Generator, palette: Palette) -> Mesh:
     )
     yard = boxes([[0, 0, -0.2]], [[2.02 * _YARD_M, 2.02 * _YARD_M, 0.4]], palette.add(paving))
     land = str(rng.choice(["grass", "grass", "soil"]))
-    return joined(
+    return join_meshes(
         [yard, terrain(rng, palette, land, extent_m=110.0, level_m=-0.1, bumps_m=0.8, flat_radius_m=20.0)]
     )
 
 
-def _tank_farm(rng: np.random.Generator, coats: Coats) -> Mesh:
+def _tank_farm(rng: np.random.Generator, materials: RefineryMaterials) -> Mesh:
     """Large tanks on one side in the distance."""
-    spots = places(rng, 24, 18.0, 42.0)
+    spots = draw_spots(rng, 24, 18.0, 42.0)
     spots = spots[np.argsort(-spots @ [np.cos(way := rng.uniform(0, 6)), np.sin(way), 0])[:7]]
     profile = np.array(
         [[0, 0], [2.2, 0], [2.2, 0.7], [2.24, 0.72], [2.2, 0.74], [2.2, 1.5], [0.05, 1.8], [0, 1.8]]
     )
-    tanks = [lathe(profile * rng.uniform([0.7, 0.9], [1.1, 1.5]), coats.shell(rng), 24) for _ in range(2)]
-    return joined(tanks[k % 2].moved(x, y, -0.1) for k, (x, y, _) in enumerate(spots))
+    tanks = [lathe(profile * rng.uniform([0.7, 0.9], [1.1, 1.5]), materials.shell(rng), 24) for _ in range(2)]
+    return join_meshes(tanks[k % 2].translate(x, y, -0.1) for k, (x, y, _) in enumerate(spots))
 
 
 def _cluster(rng: np.random.Generator, count: int) -> Float[np.ndarray, "n 3"]:

@@ -5,16 +5,16 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.synth.props.clutter import Space, clutter
-from stereoweave.synth.props.interiors import indoor_light, lamp_spots, lamps_at, pendants, shell
-from stereoweave.synth.props.primitives import boxes, turn
-from stereoweave.synth.props.random_materials import chosen
+from stereoweave.synth.props.clutter import ClutterSpace, clutter
+from stereoweave.synth.props.interiors import draw_lamp_spots, draw_lamps, indoor_light, pendants, shell
+from stereoweave.synth.props.primitives import boxes, rotation
+from stereoweave.synth.props.random_materials import draw_material_from
 from stereoweave.synth.props.surroundings import (
     bushes,
     daylight,
+    draw_spots,
     hills,
     houses,
-    places,
     rocks,
     terrain,
     trees,
@@ -22,7 +22,7 @@ from stereoweave.synth.props.surroundings import (
 from stereoweave.synth.props.table_tops import draw_table_top, table_top
 from stereoweave.synth.stage import Palette, Stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Mesh, World, joined
+from stereoweave.synth.world import Mesh, World, join_meshes
 
 # The cameras of one world see nearly the same, so that things can be placed where all of them see them.
 _SWING_DEG = 12.0
@@ -52,7 +52,7 @@ def _table_top(rng: np.random.Generator) -> Stage:
         floor_m=sizes.height_m + 0.2,
     )
     half_m = 0.5 * max(sizes.width_m, 2 * sizes.behind_m)
-    space = Space(
+    space = ClutterSpace(
         orbit=orbit,
         low_m=np.array([-half_m, -half_m, sizes.height_m]),
         high_m=np.array([half_m, half_m, sizes.height_m + 1.4]),
@@ -61,16 +61,16 @@ def _table_top(rng: np.random.Generator) -> Stage:
         standing=0.75,
     )
     things = clutter(rng, palette, space)
-    towards_cameras = turn((0, 0, 1), azimuth_deg + _SWING_DEG / 2)
-    spots_m = lamp_spots(rng, size_m, space.eyes_m())
-    lamps = lamps_at(rng, spots_m)
+    towards_cameras = rotation((0, 0, 1), azimuth_deg + _SWING_DEG / 2)
+    spots_m = draw_lamp_spots(rng, size_m, space.eyes_m())
+    lamps = draw_lamps(rng, spots_m)
     parts = [
-        table_top(rng, palette, sizes).placed(towards_cameras),
+        table_top(rng, palette, sizes).transform(towards_cameras),
         shell(rng, palette, size_m, open_roof=False, open_side=None),
         pendants(rng, palette, spots_m, float(size_m[2])),
     ]
     sky, exposure = indoor_light(rng, daylight(rng)[0], lamps)
-    mesh = joined([*parts, *(thing.as_target() for thing in things)])
+    mesh = join_meshes([*parts, *(thing.as_target() for thing in things)])
     world = World(mesh=mesh, materials=tuple(palette.materials), sky=sky, lamps=lamps, exposure=exposure)
     return Stage(world=world, orbit=orbit, nearest_px=_NEAREST_PX)
 
@@ -80,15 +80,15 @@ def _room(rng: np.random.Generator) -> Stage:
     size_m = rng.uniform([5.0, 5.0, 2.5], [10.0, 10.0, 4.2])
     open_roof, open_side = rng.random() < 0.2, int(rng.integers(4)) if rng.random() < 0.25 else None
     orbit = _orbit_inside(rng, size_m)
-    space = Space(
+    space = ClutterSpace(
         orbit=orbit,
         low_m=np.array([-0.5, -0.5, 0]) * size_m,
         high_m=np.array([0.5, 0.5, 1]) * size_m,
         far_m=orbit.distance_m[1] + 0.45 * float(size_m[:2].max()),
     )
     things = clutter(rng, palette, space)
-    spots_m = lamp_spots(rng, size_m, space.eyes_m())
-    lamps = lamps_at(rng, spots_m)
+    spots_m = draw_lamp_spots(rng, size_m, space.eyes_m())
+    lamps = draw_lamps(rng, spots_m)
     parts = [shell(rng, palette, size_m, open_roof=open_roof, open_side=open_side)]
     sky, _, exposure = daylight(rng)
     if not open_roof:
@@ -97,8 +97,8 @@ def _room(rng: np.random.Generator) -> Stage:
         sky, exposure = indoor_light(rng, sky, lamps)
     else:
         parts.append(terrain(rng, palette, "grass", extent_m=80.0, level_m=-0.2, flat_radius_m=9.0))
-        parts.append(trees(rng, palette, places(rng, 14, 12.0, 40.0)))
-    mesh = joined([*parts, *(thing.as_target() for thing in things)])
+        parts.append(trees(rng, palette, draw_spots(rng, 14, 12.0, 40.0)))
+    mesh = join_meshes([*parts, *(thing.as_target() for thing in things)])
     world = World(mesh=mesh, materials=tuple(palette.materials), sky=sky, lamps=lamps, exposure=exposure)
     return Stage(world=world, orbit=orbit, nearest_px=_NEAREST_PX)
 
@@ -115,7 +115,7 @@ def _ground(rng: np.random.Generator) -> Stage:
         floor_m=0.45,
     )
     reach_m = rng.uniform(3.5, 8.0)
-    space = Space(
+    space = ClutterSpace(
         orbit=orbit,
         low_m=np.array([-9.0, -9.0, 0.0]),
         high_m=np.array([9.0, 9.0, 4.5]),
@@ -126,11 +126,11 @@ def _ground(rng: np.random.Generator) -> Stage:
     parts = [
         terrain(rng, palette, family, extent_m=90.0, bumps_m=1.5, flat_radius_m=9.5),
         _walls(rng, palette, azimuth_deg + _SWING_DEG / 2, reach_m),
-        trees(rng, palette, places(rng, int(rng.integers(5, 20)), 12.0, 45.0)),
-        bushes(rng, palette, places(rng, int(rng.integers(4, 20)), 10.0, 30.0)),
+        trees(rng, palette, draw_spots(rng, int(rng.integers(5, 20)), 12.0, 45.0)),
+        bushes(rng, palette, draw_spots(rng, int(rng.integers(4, 20)), 10.0, 30.0)),
         *_far_off(rng, palette),
     ]
-    mesh = joined([*parts, *(thing.as_target() for thing in things)])
+    mesh = join_meshes([*parts, *(thing.as_target() for thing in things)])
     sky, fog, exposure = daylight(rng)
     exposure *= float(np.exp(rng.normal(-0.12, 0.25)))
     materials = tuple(palette.materials)
@@ -144,9 +144,9 @@ def _far_off(rng: np.random.Generator, palette: Palette) -> Sequence[Mesh]:
     if rng.random() < 0.6:
         far.append(hills(rng, palette, distance_m=rng.uniform(70, 130)))
     if rng.random() < 0.6:
-        far.append(houses(rng, palette, places(rng, int(rng.integers(2, 6)), 18.0, 50.0)))
+        far.append(houses(rng, palette, draw_spots(rng, int(rng.integers(2, 6)), 18.0, 50.0)))
     if rng.random() < 0.6:
-        far.append(rocks(rng, palette, places(rng, int(rng.integers(4, 16)), 10.0, 25.0)))
+        far.append(rocks(rng, palette, draw_spots(rng, int(rng.integers(4, 16)), 10.0, 25.0)))
     return far
 
 
@@ -155,15 +155,15 @@ def _walls(rng: np.random.Generator, palette: Palette, cameras_deg: float, away_
     walls = []
     for _ in range(int(rng.integers(1, 5))):
         material = palette.add(
-            chosen(rng, ("brick", "stone", "plaster", "concrete", "wood", "photograph"), 7.0)
+            draw_material_from(rng, ("brick", "stone", "plaster", "concrete", "wood", "photograph"), 7.0)
         )
         size_m = rng.uniform([2.0, 0.15, 1.0], [7.0, 0.4, 3.2])
         wall = boxes([[0, 0, size_m[2] / 2 - 0.3]], size_m[None], material)
         coping = boxes([[0, 0, size_m[2] - 0.27]], (size_m * [1.02, 1.3, 0])[None] + [[0, 0, 0.08]], material)
-        around = turn((0, 0, 1), cameras_deg + 180 + rng.uniform(-55, 55))
-        facing = joined([wall, coping]).placed(turn((0, 0, 1), 90 + rng.normal(0, 25)))
-        walls.append(facing.moved(x=away_m * rng.uniform(0.9, 1.5)).placed(around))
-    return joined(walls)
+        around = rotation((0, 0, 1), cameras_deg + 180 + rng.uniform(-55, 55))
+        facing = join_meshes([wall, coping]).transform(rotation((0, 0, 1), 90 + rng.normal(0, 25)))
+        walls.append(facing.translate(x=away_m * rng.uniform(0.9, 1.5)).transform(around))
+    return join_meshes(walls)
 
 
 def _orbit_inside(rng: np.random.Generator, size_m: Float[np.ndarray, "3"]) -> Orbit:

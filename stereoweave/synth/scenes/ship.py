@@ -4,30 +4,39 @@ from dataclasses import replace
 
 import numpy as np
 
-from stereoweave.synth.props import deck_gear as gear
-from stereoweave.synth.props.deckhouses import Paints, door, funnel, lifebuoys, mast, stays, tyres, windows
+from stereoweave.synth.props import deck_gear
+from stereoweave.synth.props.deckhouses import (
+    ShipMaterials,
+    door,
+    funnel,
+    lifebuoys,
+    ship_mast,
+    stays,
+    tyres,
+    windows,
+)
 from stereoweave.synth.props.harbours import harbour, open_water
 from stereoweave.synth.props.hulls import Hull
-from stereoweave.synth.props.lattice import galvanised, ladder, painted, railing
-from stereoweave.synth.props.primitives import Point, lathe, sheet, tubes, turn
-from stereoweave.synth.props.ships import TRADES, Plan
-from stereoweave.synth.props.surroundings import daylight, varied
+from stereoweave.synth.props.lattice import galvanised_steel, ladder, painted_steel, railing
+from stereoweave.synth.props.primitives import Point, lathe, rotation, sheet, tubes
+from stereoweave.synth.props.ships import TRADES, ShipPlan
+from stereoweave.synth.props.surroundings import daylight, vary_colour
 from stereoweave.synth.stage import Palette, Stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Colour, Material, Mesh, World, joined
+from stereoweave.synth.world import Colour, Material, Mesh, World, join_meshes
 
 
 def ship(rng: np.random.Generator) -> Stage:
     """A ship of 7 to 8.5 m, all of it in the picture or most."""
     palette = Palette()
     plan = TRADES[str(rng.choice(list(TRADES)))](rng)
-    heel = turn((1, 0, 0), rng.normal(0, 0.8)) @ turn((0, 1, 0), rng.normal(0, 0.6))
-    vessel = _built(rng, palette, plan).placed(heel)
+    heel = rotation((1, 0, 0), rng.normal(0, 0.8)) @ rotation((0, 1, 0), rng.normal(0, 0.6))
+    vessel = _build_ship(rng, palette, plan).transform(heel)
     moored = rng.random() < 0.5
     around = harbour(rng, palette, plan.hull) if moored else open_water(rng, palette)
     sky, fog, exposure = daylight(rng)
     world = World(
-        mesh=joined([vessel.as_target(), around]),
+        mesh=join_meshes([vessel.as_target(), around]),
         materials=tuple(palette.materials),
         sky=sky,
         fog=fog,
@@ -56,53 +65,53 @@ _LIVERIES: tuple[tuple[Colour, Colour, Colour, Colour, Colour], ...] = (
 )
 
 
-def _built(rng: np.random.Generator, palette: Palette, plan: Plan) -> Mesh:
+def _build_ship(rng: np.random.Generator, palette: Palette, plan: ShipPlan) -> Mesh:
     """The whole ship, afloat."""
     side, stripe, bottom, walls, trim = _LIVERIES[rng.integers(len(_LIVERIES))]
     coats = [
-        palette.add(replace(painted(rng, colour), span_m=rng.uniform(3, 5)))
+        palette.add(replace(painted_steel(rng, colour), span_m=rng.uniform(3, 5)))
         for colour in (bottom, stripe, side)
     ]
-    paints = _paints(rng, palette, walls, trim)
+    materials = _draw_materials(rng, palette, walls, trim)
     sign = palette.add(Material(texture="sign", variant=1, span_m=1.0, roughness=0.6))
-    cloth = palette.add(Material(texture="cloth", variant=0, tint=varied(rng, trim), span_m=0.5))
+    cloth = palette.add(Material(texture="cloth", variant=0, tint=vary_colour(rng, trim), span_m=0.5))
     boxes = tuple(
-        palette.add(painted(rng, colour))
+        palette.add(painted_steel(rng, colour))
         for colour in ((0.35, 0.12, 0.08), (0.12, 0.2, 0.35), (0.5, 0.48, 0.42))
     )
     hull = plan.hull
     pieces = [
         hull.skin(*coats),
-        hull.deck(paints.roof, paints.house, paints.trim),
-        _houses(rng, plan, paints),
-        _forward(plan, paints),
+        hull.deck(materials.roof, materials.house, materials.trim),
+        _houses(rng, plan, materials),
+        _forward(plan, materials),
         _name(hull, sign),
-        plan.fitted(rng, plan, paints, boxes),
-        gear.flag(rng, plan.on_deck(-hull.length_m / 2 + 0.12), 1.0, paints, cloth),
+        plan.build_gear(rng, plan, materials, boxes),
+        deck_gear.flag(rng, plan.on_deck(-hull.length_m / 2 + 0.12), 1.0, materials, cloth),
     ]
     if plan.fenders:
-        pieces.append(_fenders(hull, paints))
+        pieces.append(_fenders(hull, materials))
     if hull.bulwark_m < 0.2:
-        pieces.append(_rails(hull, paints))
-    return joined(pieces)
+        pieces.append(_rails(hull, materials))
+    return join_meshes(pieces)
 
 
-def _paints(rng: np.random.Generator, palette: Palette, walls: Colour, trim: Colour) -> Paints:
+def _draw_materials(rng: np.random.Generator, palette: Palette, walls: Colour, trim: Colour) -> ShipMaterials:
     decks: tuple[Colour, ...] = ((0.14, 0.21, 0.17), (0.3, 0.14, 0.1), (0.33, 0.34, 0.35))
-    return Paints(
-        house=palette.add(painted(rng, walls)),
-        roof=palette.add(painted(rng, decks[int(rng.integers(3))], 0.8)),
-        trim=palette.add(painted(rng, trim)),
-        white=palette.add(painted(rng, (0.95, 0.95, 0.92))),
+    return ShipMaterials(
+        house=palette.add(painted_steel(rng, walls)),
+        roof=palette.add(painted_steel(rng, decks[int(rng.integers(3))], 0.8)),
+        trim=palette.add(painted_steel(rng, trim)),
+        white=palette.add(painted_steel(rng, (0.95, 0.95, 0.92))),
         dark=palette.add(Material(texture="plain", tint=(0.05, 0.05, 0.055), roughness=0.7)),
         glass=palette.add(Material(texture="plain", tint=(0.05, 0.07, 0.08), roughness=0.06)),
-        steel=palette.add(galvanised(rng)),
+        steel=palette.add(galvanised_steel(rng)),
         orange=palette.add(Material(texture="plain", tint=(0.75, 0.2, 0.05), roughness=0.6)),
         rope=palette.add(
             Material(
                 texture="cloth",
                 variant=int(rng.integers(3)),
-                tint=varied(
+                tint=vary_colour(
                     rng, [(0.6, 0.9, 0.75), (0.65, 0.75, 1.0), (1.6, 1.4, 1.1)][int(rng.integers(3))]
                 ),
                 span_m=0.3,
@@ -112,27 +121,28 @@ def _paints(rng: np.random.Generator, palette: Palette, walls: Colour, trim: Col
     )
 
 
-def _houses(rng: np.random.Generator, plan: Plan, paints: Paints) -> Mesh:
+def _houses(rng: np.random.Generator, plan: ShipPlan, materials: ShipMaterials) -> Mesh:
     """House and bridge with all that is on and about them."""
     house, bridge = plan.house, plan.bridge
     starboard, front, port, back = house.walls_m()
-    pieces = [house.mesh(paints.house, paints.roof), bridge.mesh(paints.house, paints.roof, 0.09)]
+    pieces = [house.mesh(materials.house, materials.roof), bridge.mesh(materials.house, materials.roof, 0.09)]
     pieces += [
-        windows(wall, max(int(house.x_m[1] - house.x_m[0]) * 2, 3), (0.58, 0.8), paints, 0.55)
+        windows(wall, max(int(house.x_m[1] - house.x_m[0]) * 2, 3), (0.58, 0.8), materials, 0.55)
         for wall in (starboard, port)
     ]
-    pieces += [windows(front, 3, (0.55, 0.8), paints, 0.5), door(back, rng.uniform(0.3, 0.7), paints)]
+    pieces += [windows(front, 3, (0.55, 0.8), materials, 0.5), door(back, rng.uniform(0.3, 0.7), materials)]
     for wall, count in zip(bridge.walls_m(), (3, 5, 3, 3), strict=True):
-        pieces.append(windows(wall, count, (0.44, 0.82), paints, 0.3))
+        pieces.append(windows(wall, count, (0.44, 0.82), materials, 0.3))
     top = house.z_m[1] + 0.05
     pieces += [
-        funnel(np.array([x, y, top - 0.05]), (0.5, 0.34 if y else 0.5, 1.0), paints) for x, y in plan.funnels
+        funnel(np.array([x, y, top - 0.05]), (0.5, 0.34 if y else 0.5, 1.0), materials)
+        for x, y in plan.funnels
     ]
     foot = np.array([plan.mast_m[0], 0, bridge.z_m[1] + 0.04])
     pieces += [
-        mast(rng, foot, plan.mast_m[1], paints),
-        _rigging(plan, foot, paints),
-        _roof_rails(plan, paints),
+        ship_mast(rng, foot, plan.mast_m[1], materials),
+        _rigging(plan, foot, materials),
+        _roof_rails(plan, materials),
     ]
     half = house.width_m / 2
     at = np.array(
@@ -141,26 +151,26 @@ def _houses(rng: np.random.Generator, plan: Plan, paints: Paints) -> Mesh:
             for side in (1, -1)
         ]
     )
-    pieces.append(lifebuoys(at, np.array([[0, 1.0, 0], [0, -1.0, 0]]), paints))
-    return joined(pieces)
+    pieces.append(lifebuoys(at, np.array([[0, 1.0, 0], [0, -1.0, 0]]), materials))
+    return join_meshes(pieces)
 
 
-def _rigging(plan: Plan, foot: Point, paints: Paints) -> Mesh:
+def _rigging(plan: ShipPlan, foot: Point, materials: ShipMaterials) -> Mesh:
     """Wires from the mast to bow and stern, and a searchlight on the bridge's front."""
     top = foot + [-0.05 * plan.mast_m[1], 0, 0.92 * plan.mast_m[1]]
     bow, aft = plan.hull.length_m / 2, -plan.hull.length_m / 2
     ends = np.array(
         [plan.on_deck(bow + 0.2) + [0, 0, plan.hull.bulwark_m], plan.on_deck(aft + 0.1) + [0, 0, 0.9]]
     )
-    lamp = lathe([(0.05, 0), (0.09, 0.05), (0.09, 0.12), (0, 0.12)], paints.white, 14).placed(
-        turn((0, 1, 0), 85)
+    lamp = lathe([(0.05, 0), (0.09, 0.05), (0.09, 0.12), (0, 0.12)], materials.white, 14).transform(
+        rotation((0, 1, 0), 85)
     )
     light = np.array([plan.bridge.x_m[1] - 0.15, 0.3, plan.bridge.z_m[1] + 0.17])
-    post = tubes(light - [0, 0, 0.15], light, 0.02, paints.white)
-    return joined([stays(np.stack([top, top]), ends, paints), lamp.moved(*light), post])
+    post = tubes(light - [0, 0, 0.15], light, 0.02, materials.white)
+    return join_meshes([stays(np.stack([top, top]), ends, materials), lamp.translate(*light), post])
 
 
-def _roof_rails(plan: Plan, paints: Paints) -> Mesh:
+def _roof_rails(plan: ShipPlan, materials: ShipMaterials) -> Mesh:
     """A railing round the after part of the house's roof, and a ladder up to the bridge's."""
     _, top = plan.house.corners_m(-0.05)
     top = top + [0, 0, 0.05]
@@ -169,12 +179,15 @@ def _roof_rails(plan: Plan, paints: Paints) -> Mesh:
     path = np.stack([top[0] + ahead * (top[1] - top[0]), top[0], top[3], top[3] + ahead * (top[2] - top[3])])
     back = plan.bridge.x_m[0]
     foot, head = (back - 0.14, -0.3, plan.bridge.z_m[0]), (back - 0.1, -0.3, plan.bridge.z_m[1] + 0.2)
-    return joined(
-        [railing(path, 0.38, 0.4, 0.012, paints.white, 3), ladder(foot, head, (0, 1, 0), 0.26, paints.white)]
+    return join_meshes(
+        [
+            railing(path, 0.38, 0.4, 0.012, materials.white, 3),
+            ladder(foot, head, (0, 1, 0), 0.26, materials.white),
+        ]
     )
 
 
-def _forward(plan: Plan, paints: Paints) -> Mesh:
+def _forward(plan: ShipPlan, materials: ShipMaterials) -> Mesh:
     """A windlass, bitts, anchors and a rope on the forecastle, vents and bitts elsewhere."""
     hull = plan.hull
     bow = hull.length_m / 2
@@ -183,13 +196,15 @@ def _forward(plan: Plan, paints: Paints) -> Mesh:
     anchors = []
     for side in (1.0, -1.0):
         at = hull.side_m(0.93, hull.edge_m(0.93) - 0.32, side)
-        anchors.append(gear.anchor(at, side, paints))
-    windlass = gear.winch(np.zeros(3), 0.6, paints, paints.rope).placed(np.diag([0.6, 0.6, 0.6, 1]))
-    return joined(
+        anchors.append(deck_gear.anchor(at, side, materials))
+    windlass = deck_gear.winch(np.zeros(3), 0.6, materials, materials.rope).transform(
+        np.diag([0.6, 0.6, 0.6, 1])
+    )
+    return join_meshes(
         [
-            windlass.moved(*plan.on_deck(bow - 0.75)),
-            gear.bitts(inboard.reshape(-1, 3), paints),
-            gear.vents(np.stack([plan.on_deck(bow - 1.15, side * 0.22) for side in (1, -1)]), paints),
+            windlass.translate(*plan.on_deck(bow - 0.75)),
+            deck_gear.bitts(inboard.reshape(-1, 3), materials),
+            deck_gear.vents(np.stack([plan.on_deck(bow - 1.15, side * 0.22) for side in (1, -1)]), materials),
             *anchors,
         ]
     )
@@ -203,21 +218,21 @@ def _name(hull: Hull, sign: int) -> Mesh:
     z = hull.edge_m(0.0) - np.array([0.4, 0.12])
     at = hull.side_m(np.zeros(2), z, 0.0) - [0.03, 0, 0]
     plates.append(sheet(np.stack([at + [0, y, 0] for y in (0.45, -0.45)], 1), sign))
-    return joined(plates)
+    return join_meshes(plates)
 
 
-def _fenders(hull: Hull, paints: Paints) -> Mesh:
+def _fenders(hull: Hull, materials: ShipMaterials) -> Mesh:
     """Tyres along both sides."""
     share = np.linspace(0.06, 0.76, 9)
     hung = []
     for side in (1, -1):
         at, ahead = (hull.side_m(s, hull.edge_m(s) - 0.2, side) for s in (share, share + 0.01))
-        hung.append(tyres(at + [0, side * 0.05, 0], (ahead - at) * [1, 1, 0], paints))
-    return joined(hung)
+        hung.append(tyres(at + [0, side * 0.05, 0], (ahead - at) * [1, 1, 0], materials))
+    return join_meshes(hung)
 
 
-def _rails(hull: Hull, paints: Paints) -> Mesh:
+def _rails(hull: Hull, materials: ShipMaterials) -> Mesh:
     """Railings along both sides and the stern."""
     share = np.linspace(0.985, 0.0, 14)
     port, starboard = (hull.side_m(share, hull.edge_m(share), side) * [1, 0.97, 1] for side in (1, -1))
-    return railing(np.concatenate([port, starboard[::-1]]), 0.36, 0.6, 0.011, paints.white, 3)
+    return railing(np.concatenate([port, starboard[::-1]]), 0.36, 0.6, 0.011, materials.white, 3)

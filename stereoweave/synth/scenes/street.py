@@ -13,7 +13,7 @@ from stereoweave.synth.props.streets import (
 from stereoweave.synth.props.surroundings import daylight, hills, terrain
 from stereoweave.synth.stage import Palette, Stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import World, joined
+from stereoweave.synth.world import World, join_meshes
 
 # Between the road before the car and the horizon.
 _NEAREST_PX = (25.0, 130.0)
@@ -22,7 +22,7 @@ _NEAREST_PX = (25.0, 130.0)
 def street(rng: np.random.Generator) -> Stage:
     """A street with house fronts, vehicles, people and posts, along x, from 1.2 to 2 m above its lane."""
     palette, plan = Palette(), draw_street_plan(rng)
-    target = joined([traffic(rng, palette, plan), walkers(rng, palette, plan)]).as_target()
+    target = join_meshes([traffic(rng, palette, plan), walkers(rng, palette, plan)]).as_target()
     parts = [
         carriageway(rng, palette, plan),
         fronts(rng, palette, plan),
@@ -33,7 +33,11 @@ def street(rng: np.random.Generator) -> Stage:
         parts.append(hills(rng, palette, distance_m=160.0))
     sky, fog, exposure = daylight(rng)
     world = World(
-        mesh=joined([target, *parts]), materials=tuple(palette.materials), sky=sky, fog=fog, exposure=exposure
+        mesh=join_meshes([target, *parts]),
+        materials=tuple(palette.materials),
+        sky=sky,
+        fog=fog,
+        exposure=exposure,
     )
     turned_deg = float(rng.normal(180.0, 3.0))
     orbit = Orbit(

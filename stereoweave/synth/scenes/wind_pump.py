@@ -4,41 +4,52 @@ import numpy as np
 
 from stereoweave.synth.props.lattice import (
     bars,
-    chains,
-    galvanised,
+    chain_segments,
+    galvanised_steel,
     ladder,
-    levels,
-    painted,
+    mast_levels,
+    mast_rings,
+    painted_steel,
     railing,
-    rings,
     truss,
 )
-from stereoweave.synth.props.primitives import boxes, copies, lathe, sheet, spheres, tubes, turn
-from stereoweave.synth.props.surroundings import bushes, daylight, fence, hills, places, rocks, terrain, trees
+from stereoweave.synth.props.primitives import boxes, copies, lathe, rotation, sheet, spheres, tubes
+from stereoweave.synth.props.surroundings import (
+    bushes,
+    daylight,
+    draw_spots,
+    fence,
+    hills,
+    rocks,
+    terrain,
+    trees,
+)
 from stereoweave.synth.stage import Palette, Stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Material, Mesh, World, joined
+from stereoweave.synth.world import Material, Mesh, World, join_meshes
 
 
 def wind_pump(rng: np.random.Generator) -> Stage:
     """A pump about 5 m high, its wheel towards +x."""
     palette = Palette()
-    steel = palette.add(galvanised(rng))
-    blades = palette.add(galvanised(rng) if rng.random() < 0.6 else painted(rng, (0.7, 0.68, 0.62)))
-    tail = palette.add(painted(rng, (0.5, 0.08, 0.05)))
+    steel = palette.add(galvanised_steel(rng))
+    blades = palette.add(
+        galvanised_steel(rng) if rng.random() < 0.6 else painted_steel(rng, (0.7, 0.68, 0.62))
+    )
+    tail = palette.add(painted_steel(rng, (0.5, 0.08, 0.05)))
     rust = palette.add(Material(texture="rust", variant=int(rng.integers(8)), span_m=1.0))
     hub, radius = rng.uniform(3.9, 4.4), rng.uniform(0.95, 1.3)
-    target = joined(
+    target = join_meshes(
         [
-            _wheel(rng, radius, (blades, tail, steel)).moved(0.3, 0, hub),
-            _tail(rng, radius, (tail, steel)).moved(0, 0, hub),
+            _wheel(rng, radius, (blades, tail, steel)).translate(0.3, 0, hub),
+            _tail(rng, radius, (tail, steel)).translate(0, 0, hub),
             _tower(hub - 0.12, steel, rust),
             _tank(rng, palette, steel, rust),
         ]
     )
     sky, fog, exposure = daylight(rng)
     world = World(
-        mesh=joined([target.as_target(), _country(rng, palette)]),
+        mesh=join_meshes([target.as_target(), _country(rng, palette)]),
         materials=tuple(palette.materials),
         sky=sky,
         fog=fog,
@@ -70,7 +81,7 @@ def _wheel(rng: np.random.Generator, radius_m: float, skins: tuple[int, int, int
     x = across * width * np.sin(tilt) + bowl * np.cos(tilt)
     blade = np.stack([x, y, z], -1)
     both = [sheet(blade, blades), sheet(blade[:, ::-1] - [0.006, 0, 0], blades)]
-    turns = np.stack([turn((1, 0, 0), 360 * (k + rng.uniform(0, 0.02)) / count) for k in range(count)])
+    turns = np.stack([rotation((1, 0, 0), 360 * (k + rng.uniform(0, 0.02)) / count) for k in range(count)])
     angle = np.linspace(0, 2 * np.pi, 4 * count + 1)
     circle = np.column_stack([0 * angle, np.cos(angle), np.sin(angle)])
     hoops = np.stack([circle * 0.46 * radius_m - [0.02, 0, 0], circle * 0.86 * radius_m - [0.05, 0, 0]])
@@ -78,12 +89,12 @@ def _wheel(rng: np.random.Generator, radius_m: float, skins: tuple[int, int, int
     starts = np.concatenate([spokes * 0.06, spokes * 0.06 - [0.16, 0, 0]])
     ends = np.tile(spokes * 0.86 * radius_m - [0.05, 0, 0], (2, 1))
     hub = lathe([(0, -0.2), (0.08, -0.2), (0.08, 0.02), (0.04, 0.08), (0, 0.09)], marked, 20)
-    return joined(
+    return join_meshes(
         [
-            copies(joined(both), turns),
-            bars(chains(hoops), 0.011, steel),
+            copies(join_meshes(both), turns),
+            bars(chain_segments(hoops), 0.011, steel),
             bars(np.stack([starts, ends], 1), 0.01, steel),
-            hub.placed(turn((0, 1, 0), 90)),
+            hub.transform(rotation((0, 1, 0), 90)),
         ]
     )
 
@@ -104,7 +115,7 @@ def _tail(rng: np.random.Generator, radius_m: float, skins: tuple[int, int]) -> 
         [[(0.55 * end, -0.5 * half), (1.3 * end, -half)], [(0.55 * end, 0.5 * half), (1.3 * end, half)]]
     )
     board = np.insert(outline, 1, 0.012, axis=2)
-    return joined(
+    return join_meshes(
         [
             boxes((0.05, 0, 0), (0.26, 0.2, 0.26), vane),
             bars(boom, 0.014, steel),
@@ -116,10 +127,10 @@ def _tail(rng: np.random.Generator, radius_m: float, skins: tuple[int, int]) -> 
 
 def _tower(top_m: float, steel: int, rust: int) -> Mesh:
     """Four legs, crossed braces, platform with railing, ladder, pump rod, footings."""
-    joints = rings(*levels((0.0, top_m), (1.3, 0.14), 0.9))
+    joints = mast_rings(*mast_levels((0.0, top_m), (1.3, 0.14), 0.9))
     deck = 0.86 * top_m
     rim = 0.28 * np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0], [1, 1, 0]])
-    return joined(
+    return join_meshes(
         [
             truss(joints, "cross").mesh(0.02, 0.0085, steel),
             boxes((0, 0, deck), (0.58, 0.58, 0.02), rust),
@@ -143,10 +154,10 @@ def _tank(rng: np.random.Generator, palette: Palette, steel: int, rust: int) -> 
     surface = lathe([(radius - 0.01, height - 0.08), (0, height - 0.08)], water, 32)
     x, y = -0.4, float(rng.choice([-1, 1])) * (radius + 0.95)
     pipe = np.array([[0, 0, height + 0.14], [x, y * 0.8, height + 0.14], [x, y * 0.8, height - 0.02]])
-    return joined(
+    return join_meshes(
         [
-            joined([tank, surface]).moved(x, y),
-            bars(chains(pipe[None]), 0.02, rust, sides=8),
+            join_meshes([tank, surface]).translate(x, y),
+            bars(chain_segments(pipe[None]), 0.02, rust, sides=8),
             spheres(pipe[1], 0.024, rust, 1),
             tubes((0, 0, 0.4), (0, 0, height + 0.14), 0.02, rust, 8),
             boxes((x + 1.1, y, 0.1), (0.9, 0.3, 0.2), rust),
@@ -159,15 +170,15 @@ def _country(rng: np.random.Generator, palette: Palette) -> Mesh:
     """Dry ground with scrub, stones, a few trees, a fence, hills."""
     small = np.diag([0.5, 0.5, 0.5, 1.0])
     corners = np.array([(-40, 14, 0), (-6, 11, 0), (18, 12, 0), (50, 18, 0)]) * [1, rng.choice([-1, 1]), 1]
-    return joined(
+    return join_meshes(
         [
             terrain(
                 rng, palette, str(rng.choice(["soil", "grass"])), extent_m=110, bumps_m=0.8, flat_radius_m=9
             ),
-            bushes(rng, palette, places(rng, 26, 3.5 / 0.5, 40 / 0.5)).placed(small),
-            rocks(rng, palette, places(rng, 14, 2.5 / 0.5, 25 / 0.5)).placed(small),
-            trees(rng, palette, places(rng, 12, 12, 60), height_m=(1.5, 3.5)),
-            fence(rng, palette, corners / 0.5).placed(small),
+            bushes(rng, palette, draw_spots(rng, 26, 3.5 / 0.5, 40 / 0.5)).transform(small),
+            rocks(rng, palette, draw_spots(rng, 14, 2.5 / 0.5, 25 / 0.5)).transform(small),
+            trees(rng, palette, draw_spots(rng, 12, 12, 60), height_m=(1.5, 3.5)),
+            fence(rng, palette, corners / 0.5).transform(small),
             hills(rng, palette, distance_m=rng.uniform(85, 130)),
         ]
     )

@@ -7,37 +7,46 @@ import numpy as np
 from stereoweave.synth.props.lattice import (
     bars,
     cables,
-    galvanised,
+    galvanised_steel,
     ladder,
-    levels,
-    painted,
+    mast_levels,
+    mast_rings,
+    painted_steel,
     railing,
-    rings,
     truss,
 )
-from stereoweave.synth.props.primitives import boxes, copies, lathe, sheet, shift, spheres, tubes, turn
+from stereoweave.synth.props.primitives import (
+    boxes,
+    copies,
+    lathe,
+    rotation,
+    sheet,
+    spheres,
+    translation,
+    tubes,
+)
 from stereoweave.synth.props.surroundings import (
     bushes,
     daylight,
+    draw_spots,
     fence,
     hills,
     houses,
-    places,
     sea,
     terrain,
     trees,
 )
-from stereoweave.synth.props.wind_rotors import Finish, Rotor, composite, head
+from stereoweave.synth.props.wind_rotors import Rotor, TurbineMaterials, composite_skin, turbine_head
 from stereoweave.synth.scenes.wind_pump import wind_pump
 from stereoweave.synth.stage import Palette, Stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Colour, Material, Mesh, World, joined
+from stereoweave.synth.world import Colour, Material, Mesh, World, join_meshes
 
 KINDS = {"tube": 0.45, "sea": 0.25, "lattice": 0.15, "pump": 0.15}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class TurbinePlan:
     """A turbine's measures.
 
     Attributes:
@@ -60,23 +69,23 @@ def wind_turbine(rng: np.random.Generator) -> Stage:
 
 
 def _turbine(rng: np.random.Generator, kind: str) -> Stage:
-    palette, plan = Palette(), _plan(rng, kind)
-    finish = _finish(rng, palette)
-    parts = [head(plan.rotor, finish).moved(z=plan.hub_m)]
+    palette, plan = Palette(), _draw_plan(rng, kind)
+    materials = _draw_materials(rng, palette)
+    parts = [turbine_head(plan.rotor, materials).translate(z=plan.hub_m)]
     if kind == "tube":
         parts += [
-            _tube(rng, palette, plan, finish),
-            _entrance(rng, palette, plan, finish),
-            _mast(rng, plan, finish),
+            _tube(rng, palette, plan, materials),
+            _entrance(rng, palette, plan, materials),
+            _mast(rng, plan, materials),
         ]
     elif kind == "lattice":
-        parts += [_lattice(plan, finish), _mast(rng, plan, finish)]
+        parts += [_lattice(plan, materials), _mast(rng, plan, materials)]
     else:
-        parts += [_tube(rng, palette, plan, finish), _foundation(rng, palette, plan, finish)]
+        parts += [_tube(rng, palette, plan, materials), _foundation(rng, palette, plan, materials)]
     sky, fog, exposure = daylight(rng)
-    land = (_sea if kind == "sea" else _fields)(rng, palette, plan, finish)
+    land = (_sea if kind == "sea" else _fields)(rng, palette, plan, materials)
     world = World(
-        mesh=joined([joined(parts).as_target(), land]),
+        mesh=join_meshes([join_meshes(parts).as_target(), land]),
         materials=tuple(palette.materials),
         sky=sky,
         fog=fog,
@@ -96,7 +105,7 @@ def _turbine(rng: np.random.Generator, kind: str) -> Stage:
     return Stage(world=world, orbit=orbit)
 
 
-def _plan(rng: np.random.Generator, kind: str) -> Plan:
+def _draw_plan(rng: np.random.Generator, kind: str) -> TurbinePlan:
     radius = rng.uniform(1.5, 1.9) if kind == "lattice" else rng.uniform(2.0, 2.5)
     hub = rng.uniform(4.2, 4.7) if kind == "sea" else rng.uniform(3.8, 4.4)
     rotor = Rotor(
@@ -106,7 +115,7 @@ def _plan(rng: np.random.Generator, kind: str) -> Plan:
         angle_deg=rng.uniform(0, 120),
     )
     wide = rng.uniform(0.17, 0.22)
-    return Plan(
+    return TurbinePlan(
         kind=kind,
         rotor=rotor,
         foot_m=rng.uniform(0.9, 1.2) if kind == "sea" else 0.0,
@@ -115,125 +124,132 @@ def _plan(rng: np.random.Generator, kind: str) -> Plan:
     )
 
 
-def _finish(rng: np.random.Generator, palette: Palette) -> Finish:
-    white = palette.add(composite(rng))
+def _draw_materials(rng: np.random.Generator, palette: Palette) -> TurbineMaterials:
+    white = palette.add(composite_skin(rng))
     red = rng.random() < 0.35
-    return Finish(
+    return TurbineMaterials(
         white=white,
-        tip=palette.add(painted(rng, (0.55, 0.07, 0.05))) if red else white,
-        steel=palette.add(galvanised(rng)),
+        tip=palette.add(painted_steel(rng, (0.55, 0.07, 0.05))) if red else white,
+        steel=palette.add(galvanised_steel(rng)),
         dark=palette.add(Material(texture="plain", tint=(0.07, 0.07, 0.08), roughness=0.6)),
         lamp=palette.add(Material(texture="plain", tint=(0.5, 0.05, 0.04), roughness=0.3, glow=0.4)),
     )
 
 
-def _tube(rng: np.random.Generator, palette: Palette, plan: Plan, finish: Finish) -> Mesh:
+def _tube(rng: np.random.Generator, palette: Palette, plan: TurbinePlan, materials: TurbineMaterials) -> Mesh:
     """A tapering tower with the flanges of its sections; at times its foot is green, or it has a red band."""
     low, high = plan.foot_m, plan.hub_m
     z = np.linspace(low, high, 21)
     radius = np.interp(z, (low, high), plan.radii_m)
-    skins = [finish.white] * 20
+    skins = [materials.white] * 20
     mark = rng.random()
     if mark < 0.3 and plan.kind == "tube":
         greens = [
-            palette.add(painted(rng, (0.1 + 0.15 * k, 0.26 + 0.12 * k, 0.12 + 0.15 * k))) for k in range(4)
+            palette.add(painted_steel(rng, (0.1 + 0.15 * k, 0.26 + 0.12 * k, 0.12 + 0.15 * k)))
+            for k in range(4)
         ]
         skins[:4] = greens
     elif mark < 0.6:
-        skins[11:13] = [palette.add(painted(rng, (0.55, 0.07, 0.05)))] * 2
+        skins[11:13] = [palette.add(painted_steel(rng, (0.55, 0.07, 0.05)))] * 2
     shells = [lathe([(radius[k], z[k]), (radius[k + 1], z[k + 1])], skin, 36) for k, skin in enumerate(skins)]
     at = np.linspace(low, high, 4)
     wide = np.interp(at, (low, high), plan.radii_m) + 0.006
     flanges = [
-        lathe([(r, h - 0.012), (r, h + 0.012)], finish.steel, 36) for r, h in zip(wide, at, strict=True)
+        lathe([(r, h - 0.012), (r, h + 0.012)], materials.steel, 36) for r, h in zip(wide, at, strict=True)
     ]
-    return joined([*shells, *flanges])
+    return join_meshes([*shells, *flanges])
 
 
-def _entrance(rng: np.random.Generator, palette: Palette, plan: Plan, finish: Finish) -> Mesh:
+def _entrance(
+    rng: np.random.Generator, palette: Palette, plan: TurbinePlan, materials: TurbineMaterials
+) -> Mesh:
     """Foundation, door with stairs and railings, a transformer kiosk with a fence around it."""
     concrete = palette.add(Material(texture="concrete", variant=int(rng.integers(8)), span_m=1.2))
-    kiosk = palette.add(painted(rng, (0.25, 0.33, 0.26)))
+    kiosk = palette.add(painted_steel(rng, (0.25, 0.33, 0.26)))
     foot = plan.radii_m[0]
     steps = np.arange(6)
     treads = np.column_stack([foot + 0.44 - 0.06 * steps, 0 * steps, 0.05 + 0.05 * steps])
     slope = np.array([[foot + 0.47, 0.0, 0.04], [foot + 0.13, 0.0, 0.31], [foot + 0.0, 0.0, 0.31]])
     block = lathe([(0, -0.1), (foot + 0.3, -0.1), (foot + 0.26, 0.05), (0, 0.06)], concrete, 36)
     stairs = [
-        boxes(treads, (0.07, 0.2, 0.012), finish.steel),
-        boxes((foot + 0.07, 0, 0.31), (0.16, 0.22, 0.015), finish.steel),
+        boxes(treads, (0.07, 0.2, 0.012), materials.steel),
+        boxes((foot + 0.07, 0, 0.31), (0.16, 0.22, 0.015), materials.steel),
         bars(
             np.array([[(foot + 0.47, y, 0.03), (foot + 0.1, y, 0.31)] for y in (0.1, -0.1)]),
             0.012,
-            finish.steel,
+            materials.steel,
         ),
-        *[railing(slope + [0, y, 0], 0.18, 0.15, 0.006, finish.steel) for y in (0.1, -0.1)],
-        boxes((foot - 0.01, 0, 0.5), (0.04, 0.16, 0.36), finish.steel),
+        *[railing(slope + [0, y, 0], 0.18, 0.15, 0.006, materials.steel) for y in (0.1, -0.1)],
+        boxes((foot - 0.01, 0, 0.5), (0.04, 0.16, 0.36), materials.steel),
         boxes((foot - 0.005, 0, 0.5), (0.04, 0.13, 0.33), kiosk),
-        boxes((foot + 0.01, 0, 0.73), (0.12, 0.22, 0.012), finish.steel),
+        boxes((foot + 0.01, 0, 0.73), (0.12, 0.22, 0.012), materials.steel),
     ]
     box = np.array([-0.2, rng.choice([-1.0, 1.0]) * rng.uniform(0.75, 1.1), 0.0])
-    return joined(
+    return join_meshes(
         [
             block,
-            joined(stairs).placed(turn((0, 0, 1), rng.uniform(-70, 70))),
+            join_meshes(stairs).transform(rotation((0, 0, 1), rng.uniform(-70, 70))),
             boxes(box + [0, 0, 0.2], (0.55, 0.36, 0.42), kiosk),
             boxes(box + [0, 0, 0.43], (0.62, 0.43, 0.05), concrete),
-            boxes(box + [[0.277, y, 0.2] for y in (-0.08, 0.08)], (0.012, 0.13, 0.32), finish.steel),
+            boxes(box + [[0.277, y, 0.2] for y in (-0.08, 0.08)], (0.012, 0.13, 0.32), materials.steel),
         ]
     )
 
 
-def _mast(rng: np.random.Generator, plan: Plan, finish: Finish) -> Mesh:
+def _mast(rng: np.random.Generator, plan: TurbinePlan, materials: TurbineMaterials) -> Mesh:
     """A guyed lattice mast that measures the wind, on its sides booms with cups and vanes."""
     top = rng.uniform(0.75, 0.92) * plan.hub_m
-    lattice = truss(rings(*levels((0.0, top), (0.11, 0.11), 1.3), corners=3)).mesh(0.011, 0.006, finish.steel)
+    lattice = truss(mast_rings(*mast_levels((0.0, top), (0.11, 0.11), 1.3), corners=3)).mesh(
+        0.011, 0.006, materials.steel
+    )
     levels_m = top * np.array([0.55, 0.8, 0.97])
     booms = np.array([[(0.0, -0.28, z), (0.0, 0.28, z)] for z in levels_m])
     ends = booms.reshape(-1, 3)
     around = np.radians([30, 150, 270])
     feet = 1.1 * np.column_stack([np.cos(around), np.sin(around), 0 * around])
     tops = np.array([0, 0, 1.0]) * top
-    guys = [cables(share * tops, feet, 0.005, finish.steel, sag_m=0.02, count=6) for share in (0.5, 0.93)]
-    mesh = joined(
+    guys = [cables(share * tops, feet, 0.005, materials.steel, sag_m=0.02, count=6) for share in (0.5, 0.93)]
+    mesh = join_meshes(
         [
             lattice,
-            bars(booms, 0.007, finish.steel),
-            bars(np.stack([ends, ends + [0, 0, 0.09]], 1), 0.005, finish.steel),
-            spheres(ends + [0, 0, 0.1], [[0.03, 0.03, 0.016]], finish.dark, 1),
-            tubes(tops, tops + [0, 0, 0.25], 0.006, finish.steel),
+            bars(booms, 0.007, materials.steel),
+            bars(np.stack([ends, ends + [0, 0, 0.09]], 1), 0.005, materials.steel),
+            spheres(ends + [0, 0, 0.1], [[0.03, 0.03, 0.016]], materials.dark, 1),
+            tubes(tops, tops + [0, 0, 0.25], 0.006, materials.steel),
             *guys,
-            boxes(feet, (0.12, 0.12, 0.1), finish.dark),
-            boxes((0, 0, 0.02), (0.3, 0.3, 0.1), finish.dark),
+            boxes(feet, (0.12, 0.12, 0.1), materials.dark),
+            boxes((0, 0, 0.02), (0.3, 0.3, 0.1), materials.dark),
         ]
     )
     angle = rng.choice([-1, 1]) * rng.uniform(60, 110)
-    return mesh.placed(turn((0, 0, 1), angle)).moved(
+    return mesh.transform(rotation((0, 0, 1), angle)).translate(
         1.9 * np.cos(np.radians(angle)), 1.9 * np.sin(np.radians(angle))
     )
 
 
-def _lattice(plan: Plan, finish: Finish) -> Mesh:
+def _lattice(plan: TurbinePlan, materials: TurbineMaterials) -> Mesh:
     """Four legs with crossed braces, a ladder, a platform below the nacelle, footings."""
     wide = 2 * np.array(plan.radii_m)
-    joints = rings(*levels((0.0, plan.hub_m - 0.1), tuple(wide), 0.95))
+    joints = mast_rings(*mast_levels((0.0, plan.hub_m - 0.1), tuple(wide), 0.95))
     top = plan.hub_m - 0.45
     rim = 0.26 * np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0], [1, 1, 0]])
-    return joined(
+    return join_meshes(
         [
-            truss(joints, "cross").mesh(0.024, 0.011, finish.steel),
-            tubes((0, 0, plan.hub_m - 0.35), (0, 0, plan.hub_m), 0.1, finish.white, 20),
-            boxes((0, 0, top), (0.52, 0.52, 0.015), finish.steel),
-            railing(rim + [0, 0, top], 0.17, 0.2, 0.006, finish.steel),
-            ladder((0, wide[0] / 2, 0.1), (0, wide[1] / 2 + 0.03, top), (1, 0, 0), 0.1, finish.steel),
-            boxes(joints[0], (0.2, 0.2, 0.14), finish.dark),
+            truss(joints, "cross").mesh(0.024, 0.011, materials.steel),
+            tubes((0, 0, plan.hub_m - 0.35), (0, 0, plan.hub_m), 0.1, materials.white, 20),
+            boxes((0, 0, top), (0.52, 0.52, 0.015), materials.steel),
+            railing(rim + [0, 0, top], 0.17, 0.2, 0.006, materials.steel),
+            ladder((0, wide[0] / 2, 0.1), (0, wide[1] / 2 + 0.03, top), (1, 0, 0), 0.1, materials.steel),
+            boxes(joints[0], (0.2, 0.2, 0.14), materials.dark),
         ]
     )
 
 
-def _foundation(rng: np.random.Generator, palette: Palette, plan: Plan, finish: Finish) -> Mesh:
+def _foundation(
+    rng: np.random.Generator, palette: Palette, plan: TurbinePlan, materials: TurbineMaterials
+) -> Mesh:
     """Yellow steel out of the sea: a pile or a lattice, platform with railing, boat landing, crane."""
-    yellow = palette.add(painted(rng, (0.75, 0.5, 0.04)))
+    yellow = palette.add(painted_steel(rng, (0.75, 0.5, 0.04)))
     weathered = palette.add(
         Material(texture="rust", variant=int(rng.integers(8)), tint=(0.6, 0.5, 0.35), span_m=0.8)
     )
@@ -241,19 +257,23 @@ def _foundation(rng: np.random.Generator, palette: Palette, plan: Plan, finish: 
     angle = np.linspace(0, 2 * np.pi, 17)
     rim = 0.5 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
     parts = [
-        lathe([(0, top - 0.06), (0.52, top - 0.06), (0.52, top - 0.02), (0, top - 0.02)], finish.steel, 32),
+        lathe(
+            [(0, top - 0.06), (0.52, top - 0.06), (0.52, top - 0.02), (0, top - 0.02)], materials.steel, 32
+        ),
         railing(rim + [0, 0, top - 0.02], 0.2, 0.3, 0.007, yellow),
-        boxes((foot, 0, top + 0.22), (0.04, 0.15, 0.36), finish.dark),
-        _davit(top, yellow, finish),
+        boxes((foot, 0, top + 0.22), (0.04, 0.15, 0.36), materials.dark),
+        _davit(top, yellow, materials),
     ]
     if rng.random() < 0.35:
-        joints = rings(*levels((-0.6, top - 0.06), (1.5, 0.75), 0.7))
+        joints = mast_rings(*mast_levels((-0.6, top - 0.06), (1.5, 0.75), 0.7))
         parts.append(truss(joints, "cross").mesh(0.05, 0.03, yellow, sides=9))
         out = 0.62
     else:
         parts.append(lathe([(foot + 0.05, -0.8), (foot + 0.05, 0.18)], weathered, 36))
         parts.append(lathe([(foot + 0.045, 0.18), (foot + 0.045, top)], yellow, 36))
-        parts.append(tubes([(0, foot + 0.09, -0.5)], [(0, foot + 0.09, top - 0.05)], 0.025, finish.dark, 8))
+        parts.append(
+            tubes([(0, foot + 0.09, -0.5)], [(0, foot + 0.09, top - 0.05)], 0.025, materials.dark, 8)
+        )
         out = foot + 0.16
     fenders = np.array([[(out, y, -0.5), (out, y, top - 0.25)] for y in (-0.09, 0.09)])
     stubs = np.array([[(out, y, z), (foot, y, z)] for y in (-0.09, 0.09) for z in (0.15, top - 0.28)])
@@ -261,10 +281,10 @@ def _foundation(rng: np.random.Generator, palette: Palette, plan: Plan, finish: 
         bars(np.concatenate([fenders, stubs]), 0.025, yellow, sides=8),
         ladder((out - 0.03, 0, -0.3), (out - 0.03, 0, top + 0.05), (0, 1, 0), 0.09, yellow),
     ]
-    return joined(parts).placed(turn((0, 0, 1), rng.uniform(-60, 60)))
+    return join_meshes(parts).transform(rotation((0, 0, 1), rng.uniform(-60, 60)))
 
 
-def _davit(top_m: float, yellow: int, finish: Finish) -> Mesh:
+def _davit(top_m: float, yellow: int, materials: TurbineMaterials) -> Mesh:
     """The small crane on the platform."""
     mast = np.array(
         [
@@ -272,17 +292,17 @@ def _davit(top_m: float, yellow: int, finish: Finish) -> Mesh:
             [(-0.1, 0.4, top_m + 0.38), (0.12, 0.72, top_m + 0.46)],
         ]
     )
-    rope = cables(mast[1, 1], mast[1, 1] - [0, 0, 0.4], 0.005, finish.steel, count=1)
-    return joined(
+    rope = cables(mast[1, 1], mast[1, 1] - [0, 0, 0.4], 0.005, materials.steel, count=1)
+    return join_meshes(
         [bars(mast, 0.022, yellow, sides=8), rope, spheres(mast[1, 1] - [0, 0, 0.42], 0.025, yellow, 1)]
     )
 
 
-def _far(rng: np.random.Generator, plan: Plan, finish: Finish, base: int) -> Mesh:
+def _far(rng: np.random.Generator, plan: TurbinePlan, materials: TurbineMaterials, base: int) -> Mesh:
     """Other turbines of the farm, plainer, their rotors the same way."""
     tower = lathe([(1.1 * plan.radii_m[0], -0.3), (1.1 * plan.radii_m[0], plan.foot_m + 0.1)], base, 12)
-    tube = lathe([(plan.radii_m[0], plan.foot_m), (plan.radii_m[1], plan.hub_m)], finish.white, 12)
-    at = places(rng, int(rng.integers(3, 7)), 16, 75)
+    tube = lathe([(plan.radii_m[0], plan.foot_m), (plan.radii_m[1], plan.hub_m)], materials.white, 12)
+    at = draw_spots(rng, int(rng.integers(3, 7)), 16, 75)
     kinds = []
     for k in range(2):
         rotor = Rotor(
@@ -291,20 +311,22 @@ def _far(rng: np.random.Generator, plan: Plan, finish: Finish, base: int) -> Mes
             pitch_deg=4,
             angle_deg=rng.uniform(0, 120),
         )
-        turbine = joined([tower, tube, head(rotor, finish, around=6).moved(z=plan.hub_m)])
-        kinds.append(copies(turbine, np.stack([shift(x, y) for x, y, _ in at[k::2]])))
-    return joined(kinds)
+        turbine = join_meshes([tower, tube, turbine_head(rotor, materials, around=6).translate(z=plan.hub_m)])
+        kinds.append(copies(turbine, np.stack([translation(x, y) for x, y, _ in at[k::2]])))
+    return join_meshes(kinds)
 
 
-def _sea(rng: np.random.Generator, palette: Palette, plan: Plan, finish: Finish) -> Mesh:
-    yellow = palette.add(painted(rng, (0.75, 0.5, 0.04)))
-    parts = [sea(rng, palette, extent_m=220), _far(rng, plan, finish, yellow)]
+def _sea(rng: np.random.Generator, palette: Palette, plan: TurbinePlan, materials: TurbineMaterials) -> Mesh:
+    yellow = palette.add(painted_steel(rng, (0.75, 0.5, 0.04)))
+    parts = [sea(rng, palette, extent_m=220), _far(rng, plan, materials, yellow)]
     if rng.random() < 0.4:
         parts.append(hills(rng, palette, distance_m=180))
-    return joined(parts)
+    return join_meshes(parts)
 
 
-def _fields(rng: np.random.Generator, palette: Palette, plan: Plan, finish: Finish) -> Mesh:
+def _fields(
+    rng: np.random.Generator, palette: Palette, plan: TurbinePlan, materials: TurbineMaterials
+) -> Mesh:
     """Fields with a track to the turbine, trees, a farm, hills, and the rest of the farm of turbines."""
     family = str(rng.choice(["grass", "grass", "grass", "soil"]))
     small = np.diag([0.4, 0.4, 0.4, 1.0])
@@ -313,16 +335,16 @@ def _fields(rng: np.random.Generator, palette: Palette, plan: Plan, finish: Fini
         1,
         1,
     ]
-    return joined(
+    return join_meshes(
         [
             terrain(rng, palette, family, extent_m=120, bumps_m=0.6, flat_radius_m=40),
             _track(rng, palette),
-            trees(rng, palette, places(rng, int(rng.integers(10, 22)), 13, 70), height_m=(1.2, 3.0)),
-            bushes(rng, palette, places(rng, 14, 4 / 0.4, 30 / 0.4)).placed(small),
-            houses(rng, palette, places(rng, 3, 25 / 0.4, 60 / 0.4)).placed(small),
-            fence(rng, palette, corners / 0.4).placed(small),
+            trees(rng, palette, draw_spots(rng, int(rng.integers(10, 22)), 13, 70), height_m=(1.2, 3.0)),
+            bushes(rng, palette, draw_spots(rng, 14, 4 / 0.4, 30 / 0.4)).transform(small),
+            houses(rng, palette, draw_spots(rng, 3, 25 / 0.4, 60 / 0.4)).transform(small),
+            fence(rng, palette, corners / 0.4).transform(small),
             hills(rng, palette, distance_m=rng.uniform(85, 130)),
-            _far(rng, plan, finish, finish.white),
+            _far(rng, plan, materials, materials.white),
         ]
     )
 
@@ -338,4 +360,4 @@ def _track(rng: np.random.Generator, palette: Palette) -> Mesh:
     across = np.array([-0.55, 0.0, 0.55])[:, None]
     path = np.stack(np.broadcast_arrays(along, bend + across, 0.015 - 0.02 * np.abs(across)), -1)
     yard = boxes((0.4, 0.3, 0.0), (3.2, 2.6, 0.02), gravel)
-    return joined([sheet(path, gravel), yard]).placed(turn((0, 0, 1), rng.uniform(0, 360)))
+    return join_meshes([sheet(path, gravel), yard]).transform(rotation((0, 0, 1), rng.uniform(0, 360)))

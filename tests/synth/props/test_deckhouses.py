@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from stereoweave.synth.props.deckhouses import House, Paints, lifebuoys, tyres, windows
+from stereoweave.synth.props.deckhouses import House, ShipMaterials, lifebuoys, tyres, windows
 
-PAINTS = Paints(house=0, roof=1, trim=2, white=3, dark=4, glass=5, steel=6, orange=7, rope=8)
+PAINTS = ShipMaterials(house=0, roof=1, trim=2, white=3, dark=4, glass=5, steel=6, orange=7, rope=8)
 HOUSE = House(x_m=(-1.0, 2.0), width_m=2.0, z_m=(0.0, 1.0), lean_m=(0.0, 0.5, 0.1))
 
 

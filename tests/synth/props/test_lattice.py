@@ -4,24 +4,24 @@ import numpy as np
 import pytest
 
 from stereoweave.synth.props.lattice import (
-    aviation,
+    aviation_paints,
     bars,
     cables,
     cage,
-    chains,
-    galvanised,
-    hanging,
+    chain_segments,
+    galvanised_steel,
     insulators,
     ladder,
-    levels,
-    painted,
+    mast_levels,
+    mast_rings,
+    painted_steel,
+    poses_towards,
     railing,
-    rings,
-    towards,
+    sagging_points,
     truss,
 )
 
-UPRIGHT_M = rings(np.array([0.0, 1.0, 2.0]), 1.0)
+UPRIGHT_M = mast_rings(np.array([0.0, 1.0, 2.0]), 1.0)
 
 
 def lengths_m(segments):
@@ -33,14 +33,14 @@ def extent_m(mesh):
 
 
 def test_square_rings_have_their_sides_along_x_and_y():
-    joints = rings(np.array([0.0, 3.0]), np.array([2.0, 1.0]))
+    joints = mast_rings(np.array([0.0, 3.0]), np.array([2.0, 1.0]))
     np.testing.assert_allclose(joints[0], [[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]], atol=1e-12)
     np.testing.assert_allclose(joints[1, 0], [0.5, 0.5, 3.0])
 
 
 @pytest.mark.parametrize("corners", [3, 4, 5])
 def test_the_width_of_rings_is_the_length_of_a_side(corners):
-    joints = rings(np.array([0.0]), 0.7, corners)[0]
+    joints = mast_rings(np.array([0.0]), 0.7, corners)[0]
     np.testing.assert_allclose(np.linalg.norm(joints - np.roll(joints, 1, axis=0), axis=1), 0.7)
 
 
@@ -68,13 +68,13 @@ def test_zigzag_braces_meet_from_one_panel_to_the_next():
 
 
 def test_a_straight_mast_has_equal_panels():
-    heights, widths = levels((0.0, 2.0), (1.0, 1.0), 0.5)
+    heights, widths = mast_levels((0.0, 2.0), (1.0, 1.0), 0.5)
     np.testing.assert_allclose(heights, [0.0, 0.5, 1.0, 1.5, 2.0])
     np.testing.assert_allclose(widths, 1.0)
 
 
 def test_panels_of_a_tapering_mast_keep_their_proportions():
-    heights, widths = levels((0.0, 6.0), (4.0, 1.0), 1.0)
+    heights, widths = mast_levels((0.0, 6.0), (4.0, 1.0), 1.0)
     # The root of 4 * 1 is 2, so 6 m make three panels; each is 4 to the power of -1/3 times the one below.
     assert len(heights) == 4
     assert (heights[0], heights[-1]) == (0.0, 6.0)
@@ -83,14 +83,14 @@ def test_panels_of_a_tapering_mast_keep_their_proportions():
 
 
 def test_every_station_is_a_joint():
-    heights, widths = levels((0.0, 3.1, 3.7, 5.0), (1.0, 0.4, 0.35, 0.03), 1.0)
+    heights, widths = mast_levels((0.0, 3.1, 3.7, 5.0), (1.0, 0.4, 0.35, 0.03), 1.0)
     assert {0.0, 3.1, 3.7, 5.0} <= {round(float(z), 9) for z in heights}
     assert widths[np.isclose(heights, 3.1)] == pytest.approx(0.4)
 
 
 def test_bands_take_the_materials_in_turn_and_leave_no_member_out():
     mast = truss(UPRIGHT_M, "zigzag")
-    banded = mast.banded(0.02, 0.01, (5, 6), (np.inf, 1.0))
+    banded = mast.banded_mesh(0.02, 0.01, (5, 6), (np.inf, 1.0))
     assert len(banded.material) == len(mast.mesh(0.02, 0.01, 0).material)
     legs_and_braces = banded.corners_m[:, :, 2].mean(1)
     # Struts at 1 and 2 m begin the band above them; those at 2 m are the first material's again.
@@ -101,7 +101,7 @@ def test_bands_take_the_materials_in_turn_and_leave_no_member_out():
 
 
 def test_a_cable_keeps_its_ends_and_sags_in_its_middle():
-    path = hanging([0.0, 0, 1], [[2.0, 0, 3], [4.0, 0, 1]], 0.5, count=4)
+    path = sagging_points([0.0, 0, 1], [[2.0, 0, 3], [4.0, 0, 1]], 0.5, count=4)
     np.testing.assert_allclose(path[:, 0], [[0, 0, 1], [0, 0, 1]])
     np.testing.assert_allclose(path[:, -1], [[2, 0, 3], [4, 0, 1]])
     np.testing.assert_allclose(path[:, 2], [[1, 0, 1.5], [2, 0, 0.5]])
@@ -117,7 +117,7 @@ def test_cables_follow_what_hangs():
 
 def test_chains_join_each_point_to_the_next():
     path = np.array([[[0.0, 0, 0], [1, 0, 0], [1, 2, 0]]])
-    np.testing.assert_array_equal(chains(path), [[[0, 0, 0], [1, 0, 0]], [[1, 0, 0], [1, 2, 0]]])
+    np.testing.assert_array_equal(chain_segments(path), [[[0, 0, 0], [1, 0, 0]], [[1, 0, 0], [1, 2, 0]]])
 
 
 def test_uncapped_bars_have_two_triangles_a_side():
@@ -150,7 +150,7 @@ def test_a_railing_has_posts_at_its_corners_and_between():
 
 def test_poses_look_along_their_direction_and_stay_level():
     along = np.array([[1.0, 0, 0], [0.0, 0, 2], [-1.0, 2, 0.5]])
-    poses = towards([1.0, 2, 3], along)
+    poses = poses_towards([1.0, 2, 3], along)
     turns = poses[:, :3, :3]
     np.testing.assert_allclose(turns[:, :, 2], along / np.linalg.norm(along, axis=1, keepdims=True))
     np.testing.assert_allclose(turns @ turns.swapaxes(1, 2), np.tile(np.eye(3), (3, 1, 1)), atol=1e-12)
@@ -169,7 +169,12 @@ def test_a_string_of_insulators_reaches_from_end_to_end():
 
 
 def test_finishes_differ_and_stay_colours(rng):
-    finishes = [galvanised(rng), painted(rng, (0.95, 0.5, 0.0)), *aviation(rng), galvanised(rng)]
+    finishes = [
+        galvanised_steel(rng),
+        painted_steel(rng, (0.95, 0.5, 0.0)),
+        *aviation_paints(rng),
+        galvanised_steel(rng),
+    ]
     assert all(0 <= part <= 1 for finish in finishes for part in finish.tint)
     red, white = finishes[2:4]
     assert red.tint[0] > 4 * red.tint[1]

@@ -8,19 +8,19 @@ from stereoweave.synth.props.primitives import (
     boxes,
     copies,
     facets,
-    frames,
     lathe,
     loft,
+    orthogonal_frames,
     polyline_tubes,
     prism,
+    rotation,
     sheet,
-    shift,
     spheres,
     sweep,
+    translation,
     tubes,
-    turn,
 )
-from stereoweave.synth.world import Mesh, joined
+from stereoweave.synth.world import Mesh, join_meshes
 
 ANGLE = np.linspace(0, 2 * np.pi, 64, endpoint=False)
 CIRCLE = np.stack([np.cos(ANGLE), np.sin(ANGLE), 0 * ANGLE], -1)
@@ -98,7 +98,7 @@ def test_the_texture_goes_along_a_tube_in_metres():
 
 
 def test_a_box_turned_by_a_quarter_swaps_length_and_breadth():
-    box = boxes([1, 0, 0], [4, 2, 1], 0, turn((0, 0, 1), 90)[None, :3, :3])
+    box = boxes([1, 0, 0], [4, 2, 1], 0, rotation((0, 0, 1), 90)[None, :3, :3])
     corners = box.corners_m.reshape(-1, 3)
     np.testing.assert_allclose((corners.min(0), corners.max(0)), [(0, -2, -0.5), (2, 2, 0.5)], atol=1e-6)
 
@@ -146,9 +146,11 @@ def test_facets_are_flat():
 
 
 def test_copies_are_what_placing_one_by_one_gives():
-    piece = joined([boxes([1, 2, 3], [1, 2, 3], 0), tubes([0, 0, 0], [1, 1, 1], 0.2, 5).as_target()])
-    poses = np.stack([turn((1, 2, 3), 50) @ shift(3, 4, 5), shift(z=2) @ np.diag([2.0, 2, 2, 1])])
-    both, one_by_one = copies(piece, poses), joined([piece.placed(pose) for pose in poses])
+    piece = join_meshes([boxes([1, 2, 3], [1, 2, 3], 0), tubes([0, 0, 0], [1, 1, 1], 0.2, 5).as_target()])
+    poses = np.stack(
+        [rotation((1, 2, 3), 50) @ translation(3, 4, 5), translation(z=2) @ np.diag([2.0, 2, 2, 1])]
+    )
+    both, one_by_one = copies(piece, poses), join_meshes([piece.transform(pose) for pose in poses])
     np.testing.assert_allclose(both.corners_m, one_by_one.corners_m, atol=2e-6)
     np.testing.assert_allclose(both.normals, one_by_one.normals, atol=2e-6)
     assert (both.material == one_by_one.material).all()
@@ -156,17 +158,17 @@ def test_copies_are_what_placing_one_by_one_gives():
 
 
 def test_a_quarter_turn_about_z_takes_x_to_y():
-    np.testing.assert_allclose(turn((0, 0, 1), 90) @ (1, 0, 0, 1), (0, 1, 0, 1), atol=1e-12)
+    np.testing.assert_allclose(rotation((0, 0, 1), 90) @ (1, 0, 0, 1), (0, 1, 0, 1), atol=1e-12)
 
 
 def test_a_shift_moves_by_its_metres():
-    np.testing.assert_allclose(shift(1, 2, 3) @ (10, 20, 30, 1), (11, 22, 33, 1))
+    np.testing.assert_allclose(translation(1, 2, 3) @ (10, 20, 30, 1), (11, 22, 33, 1))
 
 
 def test_frames_are_right_handed_and_their_first_vector_is_level():
     along = np.array([[1.0, 0, 0], [0.0, 0, 1], [0, 0, -1], [0.6, 0, 0.8], [0.04, 0.0, 0.9992]])
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    across, other = frames(along)
+    across, other = orthogonal_frames(along)
     turns = np.stack([across, other, along], -1)
     np.testing.assert_allclose(turns @ turns.swapaxes(1, 2), np.tile(np.eye(3), (5, 1, 1)), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(turns), 1.0)

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from stereoweave.synth.props.primitives import loft
-from stereoweave.synth.props.propellers import Screw, draw_screw, screw_mesh
+from stereoweave.synth.props.propellers import Propeller, draw_propeller, propeller_mesh
 
 
-def screw(**changed: object) -> Screw:
+def propeller(**changed: object) -> Propeller:
     measures = {
         "radius_m": 2.0,
         "blades": 4,
@@ -17,7 +17,7 @@ def screw(**changed: object) -> Screw:
         "tip": 5.0,
         "hand": 1,
     }
-    return Screw(**(measures | changed))
+    return Propeller(**(measures | changed))
 
 
 def volume(sections_m: np.ndarray) -> float:
@@ -28,7 +28,7 @@ def volume(sections_m: np.ndarray) -> float:
 @pytest.mark.parametrize("hand", [1, -1])
 def test_a_blades_edges_lie_on_the_helix_of_its_pitch(hand):
     """Between its edges a section rises by pitch * turns: 4 m a turn for a diameter of 4 m."""
-    sections_m = screw(hand=hand, rake_m=0.0).sections_m()[5:30]
+    sections_m = propeller(hand=hand, rake_m=0.0).sections_m()[5:30]
     chords = sections_m[:, 0] - sections_m[:, 16]
     if hand == -1:
         chords = sections_m[:, -1] - sections_m[:, 15]
@@ -38,24 +38,24 @@ def test_a_blades_edges_lie_on_the_helix_of_its_pitch(hand):
 
 
 def test_a_left_handed_blade_is_the_mirror_image():
-    right, left = screw().sections_m(), screw(hand=-1).sections_m()
+    right, left = propeller().sections_m(), propeller(hand=-1).sections_m()
     np.testing.assert_allclose(left[:, ::-1] * [1, -1, 1], right)
 
 
 @pytest.mark.parametrize("hand", [1, -1])
 def test_a_blade_is_solid_and_not_inside_out(hand):
     thick_m, area_m2 = 0.08, 1.2
-    assert volume(screw(hand=hand).sections_m()) == pytest.approx(thick_m * area_m2, rel=0.6)
+    assert volume(propeller(hand=hand).sections_m()) == pytest.approx(thick_m * area_m2, rel=0.6)
 
 
 def test_the_blades_reach_the_radius_and_no_further():
-    mesh = screw_mesh(screw(), 0, 1, 2)
+    mesh = propeller_mesh(propeller(), 0, 1, 2)
     reach_m = np.linalg.norm(mesh.corners_m[mesh.material == 0][..., 1:], axis=-1)
     assert reach_m.max() == pytest.approx(2.0, abs=0.01)
 
 
 def test_a_screw_looks_the_same_after_a_blades_share_of_a_turn():
-    blades = screw_mesh(screw(blades=5), 0, 1, 2).corners_m[: 5 * 2560].reshape(5, -1, 3)
+    blades = propeller_mesh(propeller(blades=5), 0, 1, 2).corners_m[: 5 * 2560].reshape(5, -1, 3)
     angle = 2 * np.pi / 5
     turned = blades @ np.array(
         [[1, 0, 0], [0, np.cos(angle), np.sin(angle)], [0, -np.sin(angle), np.cos(angle)]]
@@ -65,7 +65,7 @@ def test_a_screw_looks_the_same_after_a_blades_share_of_a_turn():
 
 def test_the_hub_covers_the_blades_roots():
     for seed in range(20):
-        drawn = draw_screw(np.random.default_rng(seed))
+        drawn = draw_propeller(np.random.default_rng(seed))
         root = drawn.sections_m()[0]
         assert np.abs(root[:, 0]).max() < drawn.hub_half_m + drawn.rake_m
         assert np.linalg.norm(root[:, 1:], axis=1).max() < drawn.hub_m * 1.05

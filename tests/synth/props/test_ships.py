@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from stereoweave.synth.props.deckhouses import Paints
+from stereoweave.synth.props.deckhouses import ShipMaterials
 from stereoweave.synth.props.ships import TRADES
 
-PAINTS = Paints(house=0, roof=1, trim=2, white=3, dark=4, glass=5, steel=6, orange=7, rope=8)
+PAINTS = ShipMaterials(house=0, roof=1, trim=2, white=3, dark=4, glass=5, steel=6, orange=7, rope=8)
 
 
 @pytest.mark.parametrize("trade", TRADES)
@@ -31,7 +31,7 @@ def test_its_gear_stands_above_its_deck_and_uses_its_paints(trade):
     for seed in range(4):
         rng = np.random.default_rng(seed)
         plan = TRADES[trade](rng)
-        gear = plan.fitted(rng, plan, PAINTS, (9, 10, 11))
+        gear = plan.build_gear(rng, plan, PAINTS, (9, 10, 11))
         assert gear.corners_m[..., 2].min() > plan.hull.deck_m(0.0) - 0.06
         assert set(np.unique(gear.material)) <= set(range(12))
         assert np.abs(gear.corners_m[..., 0]).max() < plan.hull.length_m / 2 + 0.6

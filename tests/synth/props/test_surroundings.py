@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from stereoweave.synth.props import surroundings
-from stereoweave.synth.props.surroundings import daylight, fence, hills, places, sea, terrain, trees
+from stereoweave.synth.props.surroundings import daylight, draw_spots, fence, hills, sea, terrain, trees
 from stereoweave.synth.stage import Palette
 from stereoweave.synth.textures.bank import FAMILIES
 from stereoweave.synth.world import Mesh
@@ -85,7 +85,7 @@ def test_trees_are_as_high_as_asked_for():
 
 
 def test_places_share_a_ring_evenly():
-    spots = places(np.random.default_rng(0), 400, 10, 50)
+    spots = draw_spots(np.random.default_rng(0), 400, 10, 50)
     radius_m = np.linalg.norm(spots[:, :2], axis=1)
     assert not spots[:, 2].any()
     assert radius_m.min() >= 10
@@ -97,7 +97,7 @@ def test_places_share_a_ring_evenly():
 
 
 def test_places_keep_apart_and_come_in_no_order():
-    spots = places(np.random.default_rng(0), 400, 10, 50)
+    spots = draw_spots(np.random.default_rng(0), 400, 10, 50)
     apart = np.linalg.norm(spots[:, None] - spots[None], axis=-1) + 1e9 * np.eye(400)
     # Each has pi (2500 - 100) / 400 = 18.8 m^2, a square of 4.3 m, to itself.
     assert apart.min() > 1.2

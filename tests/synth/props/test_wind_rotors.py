@@ -3,9 +3,15 @@
 import numpy as np
 import pytest
 
-from stereoweave.synth.props.wind_rotors import OVERHANG_M, Finish, Rotor, composite, head
+from stereoweave.synth.props.wind_rotors import (
+    OVERHANG_M,
+    Rotor,
+    TurbineMaterials,
+    composite_skin,
+    turbine_head,
+)
 
-FINISH = Finish(white=0, tip=1, steel=2, dark=3, lamp=4)
+FINISH = TurbineMaterials(white=0, tip=1, steel=2, dark=3, lamp=4)
 
 
 def blades_m(**changes):
@@ -17,7 +23,7 @@ def blades_m(**changes):
         "angle_deg": 0.0,
         "tilt_deg": 0.0,
     } | changes
-    mesh = head(Rotor(**measures), FINISH)
+    mesh = turbine_head(Rotor(**measures), FINISH)
     corners = mesh.corners_m.reshape(-1, 3) - np.array([OVERHANG_M, 0, 0.17])
     return corners[np.linalg.norm(corners[:, 1:], axis=1) > 0.7]
 
@@ -45,7 +51,7 @@ def test_feathered_blades_are_flat_seen_from_before_and_others_seen_from_the_sid
 
 
 def test_marked_tips_are_bands_of_whole_rings():
-    mesh = head(Rotor(radius_m=2.0, chord_m=0.24, pitch_deg=0, angle_deg=0, tilt_deg=0), FINISH)
+    mesh = turbine_head(Rotor(radius_m=2.0, chord_m=0.24, pitch_deg=0, angle_deg=0, tilt_deg=0), FINISH)
     # Twenty-two stations from 0.1 to 2 m: the bands are between the 15th and the 19th, and beyond the 21st.
     station_m = np.linspace(0.1, 2.0, 22)
     marked = mesh.corners_m[mesh.material == 1] - np.array([OVERHANG_M, 0, 0.17])
@@ -54,5 +60,5 @@ def test_marked_tips_are_bands_of_whole_rings():
 
 
 def test_composite_is_a_light_grey(rng):
-    tint = composite(rng).tint
+    tint = composite_skin(rng).tint
     assert 0.6 < min(tint) <= max(tint) < 0.9

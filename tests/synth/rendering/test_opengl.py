@@ -19,7 +19,7 @@ from stereoweave.synth.scenes import SCENES
 from stereoweave.synth.sets.pair_rendering import RenderSpec, draw_stage_and_rig
 from stereoweave.synth.textures.bank import srgb_to_linear, texture_bank
 from stereoweave.synth.viewpoints import Orbit, PosedRig, Viewpoint, place_rig
-from stereoweave.synth.world import Fog, Lamp, Material, Mesh, Sky, World, joined
+from stereoweave.synth.world import Fog, Lamp, Material, Mesh, Sky, World, join_meshes
 
 pytestmark = pytest.mark.needs_egl
 
@@ -108,7 +108,7 @@ def world_of(mesh: Mesh, *materials: Material, **others: object) -> World:
 def cluttered(rng: np.random.Generator) -> World:
     starts, ends = rng.uniform(-2.5, 2.5, (2, 120, 3)) + [0, 0, 2.5]
     x, y = np.meshgrid(np.linspace(-40, 40, 21), np.linspace(-40, 40, 21))
-    mesh = joined(
+    mesh = join_meshes(
         [
             sheet(np.stack([x, y, 0.1 * np.sin(x)], -1), 0),
             tubes(starts, ends, 0.03, 1).as_target(),
@@ -149,7 +149,7 @@ def test_a_box_hides_the_wall_where_it_stands(plain):
     # Its front is at 2 m, so 1 cm is half a pixel: 20.5 px to each side of the middle, 41 of 161 columns.
     box = boxes(np.array([[0, 2.2, 0]]), np.array([[0.82, 0.4, 0.42]]), 0).as_target()
     left, right = plain.render_views(
-        world_of(joined([wall(4.0), box])), ahead(size_px=(161, 121)), (0.0, 1.0)
+        world_of(join_meshes([wall(4.0), box])), ahead(size_px=(161, 121)), (0.0, 1.0)
     )
     expected = np.zeros((121, 161), bool)
     expected[50:71, 60:101] = True
@@ -245,7 +245,7 @@ def test_a_shadow_falls_where_geometry_says(plain, make):
     down = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
     rig = replace(ahead(size_px=(161, 161)), position_m=np.array([0, 0, 10.0]), axes=down)
     shadowing = make(replace(PLAIN, shadows=True))
-    world = world_of(joined([ground, slab]), sky=sky)
+    world = world_of(join_meshes([ground, slab]), sky=sky)
     shadowed, lit, dark = (
         camera.render_views(stage, rig, (0.0,))[0].image.astype(int)
         for camera, stage in (
@@ -269,7 +269,7 @@ def test_crowded_places_get_less_light_from_the_sky(plain, make):
     table = boxes(np.array([[0, 4.0, 0.45]]), np.array([[3.0, 3.0, 0.1]]), 0).as_target()
     evenly = replace(SKY, sun_light=BLACK, zenith=WHITE, horizon=WHITE)
     rig = replace(ahead(), position_m=np.array([0, -2.0, 0.3]))
-    world = world_of(joined([floor, table]), Material(texture="plain"), sky=evenly)
+    world = world_of(join_meshes([floor, table]), Material(texture="plain"), sky=evenly)
     open_to_the_sky, crowded = (
         light_of(camera.render_views(world, rig, (0.0,))[0].image)
         for camera in (plain, make(replace(PLAIN, ambient_occlusion=True)))

@@ -14,7 +14,7 @@ from stereoweave.synth.rendering.raycast import Raycaster
 from stereoweave.synth.sets.pair_rendering import SceneRenderer
 from stereoweave.synth.sets.renderers import choose_renderer
 from stereoweave.synth.viewpoints import PosedRig
-from stereoweave.synth.world import Material, Mesh, Sky, World, joined
+from stereoweave.synth.world import Material, Mesh, Sky, World, join_meshes
 
 WHITE = (1.0, 1.0, 1.0)
 
@@ -41,7 +41,7 @@ def test_depth_through_the_pixels_centres_is_exact():
     ball = spheres(np.array([[0.0, 5, 0]]), 1.0, 0, subdivisions=5).as_target()
     below = wall(8.0)
     below.corners_m[..., 2] = np.minimum(below.corners_m[..., 2], 2.0)
-    shot = Raycaster(PLAIN).render_views(world_of(joined([ball, below])), ahead(), (0.0,))[0]
+    shot = Raycaster(PLAIN).render_views(world_of(join_meshes([ball, below])), ahead(), (0.0,))[0]
     assert shot.depth_m[30, 40] == pytest.approx(4.0, abs=2e-3)  # the ball's flat triangles
     assert shot.depth_m[30, 0] == pytest.approx(8.0, abs=1e-6)
     assert shot.target[30, 40] and not shot.target[30, 0]
@@ -74,7 +74,7 @@ def test_what_stands_before_the_sun_takes_its_light():
     box = boxes(np.array([[1.0, 2.0, 0]]), np.array([[1.0, 0.02, 1.0]]), 0)
     # From the box, the sun's rays go on towards -x: at the wall, 2 m on, the shadow is about x = -1.
     sun = (np.sqrt(0.5), -np.sqrt(0.5), 0.0)
-    world = world_of(joined([wall(4.0), box]), sun=sun, sun_light=1.0)
+    world = world_of(join_meshes([wall(4.0), box]), sun=sun, sun_light=1.0)
     lit, shadowed = (
         Raycaster(effects).render_views(world, ahead(), (0.0,))[0].image.mean(2)
         for effects in (PLAIN, Effects(samples=1))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stereoweave.stereo import StereoCamera
-from stereoweave.synth.props.bridges import abutments, beams, planned
+from stereoweave.synth.props.bridges import abutments, beams, draw_bridge_plan
 from stereoweave.synth.scenes.bridge import KINDS, bridge
 from stereoweave.synth.stage import Palette
 from stereoweave.synth.viewpoints import draw_viewpoint, place_rig
@@ -18,7 +18,7 @@ def draw_stage_and_rig(seed):
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_spans_the_river_within_its_bounds(kind):
     rng, palette = np.random.default_rng(5), Palette()
-    plan = planned(rng, palette)
+    plan = draw_bridge_plan(rng, palette)
     mesh = KINDS[kind](rng, palette, plan)
     low_m, high_m = mesh.corners_m.min((0, 1)), mesh.corners_m.max((0, 1))
     assert low_m[0] < -0.99 * plan.half_m
@@ -53,7 +53,7 @@ def test_a_beam_lies_where_it_is_told():
 
 
 def test_the_abutments_carry_the_road_at_both_ends():
-    plan = planned(np.random.default_rng(0), Palette())
+    plan = draw_bridge_plan(np.random.default_rng(0), Palette())
     corners_m = abutments(plan).corners_m
     for side in (-1, 1):
         end_m = corners_m[side * corners_m[..., 0] > 0]

@@ -5,7 +5,7 @@ import pytest
 
 from stereoweave.synth.rendering.effects import PLAIN
 from stereoweave.synth.rendering.raycast import Raycaster
-from stereoweave.synth.scenes.plain_boards import boards
+from stereoweave.synth.scenes.plain_boards import plain_boards
 from stereoweave.synth.sets.pair_rendering import RenderSpec, draw_stage_and_rig, render_pair
 
 SPEC = RenderSpec(scene="boards", seed=77, size_px=(160, 120))
@@ -52,7 +52,7 @@ def test_nothing_touches_the_cameras_and_the_room_is_closed(left_views):
 def test_the_target_is_plain_and_the_rest_mostly_is_not():
     plain_families, other_families = [], []
     for seed in range(6):
-        world = boards(np.random.default_rng(seed)).world
+        world = plain_boards(np.random.default_rng(seed)).world
         families = np.array([material.texture for material in world.materials])
         areas = partial(np.linalg.norm, axis=1)
         a, b, c = world.mesh.corners_m.swapaxes(0, 1)

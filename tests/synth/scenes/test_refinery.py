@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from stereoweave.synth.props.pipework import pipes
-from stereoweave.synth.props.refinery_units import Coats
+from stereoweave.synth.props.refinery_units import RefineryMaterials
 from stereoweave.synth.scenes.refinery import UNITS, refinery
 
-COATS = Coats(shells=(0, 1, 2), steel=3, rail=4, red=5, white=6, concrete=7, sign=8, flame=9)
+COATS = RefineryMaterials(shells=(0, 1, 2), steel=3, rail=4, red=5, white=6, concrete=7, sign=8, flame=9)
 
 
 @functools.cache

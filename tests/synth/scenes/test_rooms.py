@@ -4,10 +4,10 @@ import itertools
 import numpy as np
 import pytest
 
-from stereoweave.synth.props.clutter import COUNT, Space, clutter
+from stereoweave.synth.props.clutter import COUNT, ClutterSpace, clutter
 from stereoweave.synth.props.furniture import FURNITURE
-from stereoweave.synth.props.random_materials import PERIODIC, broad, surface
-from stereoweave.synth.props.solids import SOLIDS, Skin
+from stereoweave.synth.props.random_materials import PERIODIC, draw_broad_material, draw_material
+from stereoweave.synth.props.solids import SOLIDS, PropStyle
 from stereoweave.synth.props.table_tops import draw_table_top, table_top
 from stereoweave.synth.props.thin_things import THIN
 from stereoweave.synth.scenes.rooms import rooms
@@ -16,7 +16,7 @@ from stereoweave.synth.textures.bank import FAMILIES
 from stereoweave.synth.viewpoints import Orbit
 
 THINGS = {thing.__name__: thing for thing in (*SOLIDS, *THIN, *FURNITURE)}
-SPACE = Space(
+SPACE = ClutterSpace(
     orbit=Orbit(centre_m=(0, 0, 1), distance_m=(2, 2.5), azimuth_deg=(30, 55), elevation_deg=(0, 8)),
     low_m=np.array([-3.0, -3.0, 0.0]),
     high_m=np.array([3.0, 3.0, 3.0]),
@@ -65,7 +65,7 @@ def test_only_the_things_are_the_target():
 
 
 def test_a_fifth_of_the_surfaces_is_nearly_plain_and_a_third_shows_photographs(rng):
-    families = [surface(rng, 3.0).texture for _ in range(4000)]
+    families = [draw_material(rng, 3.0).texture for _ in range(4000)]
     assert 0.15 < families.count("plain") / 4000 < 0.25
     assert 0.30 < families.count("photograph") / 4000 < 0.40
     assert 0.08 < sum(families.count(name) for name in PERIODIC) / 4000 < 0.16
@@ -73,7 +73,7 @@ def test_a_fifth_of_the_surfaces_is_nearly_plain_and_a_third_shows_photographs(r
 
 
 def test_two_thirds_of_the_walls_floors_and_tables_are_plain_and_flat(rng):
-    materials = [broad(rng, ("brick", "wood"), 3.0) for _ in range(2000)]
+    materials = [draw_broad_material(rng, ("brick", "wood"), 3.0) for _ in range(2000)]
     plain = [material for material in materials if material.texture == "plain"]
     assert 0.61 < len(plain) / 2000 < 0.69
     assert {material.texture for material in materials} == {"plain", "brick", "wood"}
@@ -103,7 +103,7 @@ def test_boards_and_walls_of_a_table_keep_a_quarter_of_the_distance_away_from_th
 
 
 def test_a_fifth_of_the_surfaces_shines(rng):
-    materials = [surface(rng, 3.0) for _ in range(4000)]
+    materials = [draw_material(rng, 3.0) for _ in range(4000)]
     glossy = [material for material in materials if material.roughness <= 0.4]
     assert 0.17 < len(glossy) / 4000 < 0.23
     assert all(material in glossy for material in materials if material.metal)
@@ -111,14 +111,14 @@ def test_a_fifth_of_the_surfaces_shines(rng):
 
 def test_textures_are_as_fine_as_pixels_at_any_distance(rng):
     for distance_m in (1.0, 4.0, 10.0):
-        spans_px = [surface(rng, distance_m).span_m / distance_m * 600 for _ in range(300)]
+        spans_px = [draw_material(rng, distance_m).span_m / distance_m * 600 for _ in range(300)]
         assert min(spans_px) >= 169.9  # at 600 px focal length
         assert max(spans_px) <= 800.1
 
 
 @pytest.mark.parametrize("name", THINGS)
 def test_every_thing_has_about_a_metre_and_faces_outwards(name):
-    skin = Skin(main=3, other=5, bar_m=0.01)
+    skin = PropStyle(main=3, other=5, bar_m=0.01)
     for seed in range(3):
         mesh = THINGS[name](np.random.default_rng(seed), skin)
         assert set(np.unique(mesh.material)) <= {3, 5}
@@ -130,7 +130,7 @@ def test_every_thing_has_about_a_metre_and_faces_outwards(name):
 
 
 def test_thin_bars_are_as_thick_as_asked():
-    for name, bar_m in itertools.product(("mast", "lattice"), (0.002, 0.02)):
-        mesh = THINGS[name](np.random.default_rng(0), Skin(main=0, other=1, bar_m=bar_m))
+    for name, bar_m in itertools.product(("lattice_mast", "bar_grid"), (0.002, 0.02)):
+        mesh = THINGS[name](np.random.default_rng(0), PropStyle(main=0, other=1, bar_m=bar_m))
         rim_m = mesh.corners_m[:, 1] - mesh.corners_m[:, 2]
         assert np.linalg.norm(rim_m, axis=1).min() < 2 * bar_m
