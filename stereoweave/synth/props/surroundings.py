@@ -22,7 +22,7 @@ from stereoweave.synth.props.primitives import (
     translation,
     tubes,
 )
-from stereoweave.synth.stage import Palette
+from stereoweave.synth.stage import Daylight, Palette
 from stereoweave.synth.world import Colour, Fog, Material, Mesh, Sky, join_meshes
 
 Spots = Float[np.ndarray, "n 3"]
@@ -37,7 +37,7 @@ _GROUND_TINTS: dict[str, tuple[Colour, float]] = {  # tint, and how many metres 
 }
 
 
-def daylight(rng: np.random.Generator) -> tuple[Sky, Fog | None, float]:
+def daylight(rng: np.random.Generator) -> Daylight:
     """Sky with sun, haze or none, exposure: a clear, hazy or overcast day, or a low warm sun."""
     kind = rng.choice(["clear", "hazy", "overcast", "low"], p=[0.4, 0.25, 0.15, 0.2])
     height_deg = rng.uniform(15, 26) if kind == "low" else rng.uniform(30, 65)
@@ -61,7 +61,7 @@ def daylight(rng: np.random.Generator) -> tuple[Sky, Fog | None, float]:
     )
     density = {"clear": 0.0, "hazy": 0.0035, "overcast": 0.0015, "low": 0.001}[kind] * rng.uniform(0.5, 1.2)
     fog = Fog(colour=_scale_colour(horizon, 0.9), density_per_m=density) if density else None
-    return sky, fog, float(rng.uniform(0.85, 1.1))
+    return Daylight(sky, fog, float(rng.uniform(0.85, 1.1)))
 
 
 def terrain(  # noqa: PLR0913, grounds differ in so much

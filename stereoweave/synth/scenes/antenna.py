@@ -34,9 +34,9 @@ from stereoweave.synth.props.surroundings import (
 )
 from stereoweave.synth.scenes.radio_dish import radio_dish
 from stereoweave.synth.scenes.roof_antennas import roof_antennas
-from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.stage import Palette, Stage, outdoor_stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Material, Mesh, World, join_meshes
+from stereoweave.synth.world import Material, Mesh, join_meshes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,14 +85,8 @@ def _mast_site(rng: np.random.Generator) -> Stage:
         ]
     )
     site = _site(rng, palette, materials)
-    sky, fog, exposure = daylight(rng)
-    world = World(
-        mesh=join_meshes([mast.as_target(), site, _land(rng, palette)]),
-        materials=tuple(palette.materials),
-        sky=sky,
-        fog=fog,
-        exposure=exposure,
-    )
+    light = daylight(rng)
+    mesh = join_meshes([mast.as_target(), site, _land(rng, palette)])
     orbit = Orbit(
         centre_m=(0.0, 0.0, 0.57 * plan.height_m),
         distance_m=(8.2, 11.4),
@@ -100,7 +94,7 @@ def _mast_site(rng: np.random.Generator) -> Stage:
         aim_m=0.5,
         floor_m=0.6,
     )
-    return Stage(world=world, orbit=orbit)
+    return outdoor_stage(mesh, palette, light, orbit)
 
 
 def _draw_plan(rng: np.random.Generator) -> MastPlan:

@@ -26,9 +26,9 @@ from stereoweave.synth.props.surroundings import (
 )
 from stereoweave.synth.props.truss_bridges import lift_bridge, truss_girder
 from stereoweave.synth.props.vehicles import fleet
-from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.stage import Palette, Stage, outdoor_stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Material, Mesh, World, join_meshes
+from stereoweave.synth.world import Material, Mesh, join_meshes
 
 KINDS: dict[str, Callable[[np.random.Generator, Palette, BridgePlan], Mesh]] = {
     "truss": truss_girder,
@@ -49,15 +49,14 @@ def bridge(rng: np.random.Generator) -> Stage:
     parts.append(_traffic(rng, palette, plan, (0, 4) if kind == "lift" else (0, 1, 2, 3, 4)))
     if kind != "lift":
         parts.append(_street_lamps(rng, palette, plan))
-    sky, fog, exposure = daylight(rng)
+    light = daylight(rng)
     around = [
         sea(rng, palette, extent_m=90.0),
         *_banks(rng, palette, plan),
         hills(rng, palette, distance_m=rng.uniform(60, 110)),
     ]
     mesh = join_meshes([join_meshes(parts).as_target(), *around])
-    world = World(mesh=mesh, materials=tuple(palette.materials), sky=sky, fog=fog, exposure=exposure)
-    return Stage(world=world, orbit=_orbit(rng, plan))
+    return outdoor_stage(mesh, palette, light, _orbit(rng, plan))
 
 
 def _orbit(rng: np.random.Generator, plan: BridgePlan) -> Orbit:

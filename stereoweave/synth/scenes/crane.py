@@ -23,9 +23,9 @@ from stereoweave.synth.props.lattice import (
 from stereoweave.synth.props.primitives import boxes, lathe, rotation, sweep, tubes
 from stereoweave.synth.props.surroundings import daylight
 from stereoweave.synth.scenes.quay_crane import quay_crane
-from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.stage import Palette, Stage, outdoor_stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Colour, Material, Mesh, World, join_meshes
+from stereoweave.synth.world import Colour, Material, Mesh, join_meshes
 
 PAINTS: tuple[Colour, ...] = (
     (0.72, 0.46, 0.05),
@@ -86,14 +86,8 @@ def _tower_crane(rng: np.random.Generator) -> Stage:
     # Away from the shell at negative y, so that no load swings into it.
     target = _crane(rng, palette, plan).transform(rotation((0, 0, 1), rng.uniform(-8, 30)))
     site = building_site(rng, palette)
-    sky, fog, exposure = daylight(rng)
-    world = World(
-        mesh=join_meshes([target.as_target(), site]),
-        materials=tuple(palette.materials),
-        sky=sky,
-        fog=fog,
-        exposure=exposure,
-    )
+    light = daylight(rng)
+    mesh = join_meshes([target.as_target(), site])
     orbit = Orbit(
         centre_m=((plan.jib_m - plan.counter_m) * 0.42, 0.0, 0.5 * (plan.deck_m + plan.head_m) + 0.1),
         distance_m=(7.3, 9.8),
@@ -102,7 +96,7 @@ def _tower_crane(rng: np.random.Generator) -> Stage:
         aim_m=0.6,
         floor_m=0.6,
     )
-    return Stage(world=world, orbit=orbit)
+    return outdoor_stage(mesh, palette, light, orbit)
 
 
 def _draw_plan(rng: np.random.Generator) -> TowerCranePlan:

@@ -22,9 +22,9 @@ from stereoweave.synth.props.lattice import (
 )
 from stereoweave.synth.props.primitives import Points, boxes, copies, spheres, translation
 from stereoweave.synth.props.surroundings import bushes, daylight, draw_spots, hills, houses, terrain, trees
-from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.stage import Palette, Stage, outdoor_stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Material, Mesh, World, join_meshes
+from stereoweave.synth.world import Material, Mesh, join_meshes
 
 # Each arm: its height and its reach, as shares of the tower's height, and the conductors on each side.
 KINDS: dict[str, tuple[tuple[float, float, int], ...]] = {
@@ -68,15 +68,9 @@ def pylon(rng: np.random.Generator) -> Stage:
     lines, wire = _lines(rng, palette, plan)
     far = _far_towers(plan, steel, wire)
     land = _land(rng, palette)
-    sky, fog, exposure = daylight(rng)
-    world = World(
-        mesh=join_meshes([tower.as_target(), _mark_near(lines, plan), far, land]),
-        materials=tuple(palette.materials),
-        sky=sky,
-        fog=fog,
-        exposure=exposure,
-    )
-    return Stage(world=world, orbit=_orbit(rng, plan))
+    light = daylight(rng)
+    mesh = join_meshes([tower.as_target(), _mark_near(lines, plan), far, land])
+    return outdoor_stage(mesh, palette, light, _orbit(rng, plan))
 
 
 def _draw_plan(rng: np.random.Generator) -> PylonPlan:

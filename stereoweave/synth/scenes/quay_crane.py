@@ -19,9 +19,9 @@ from stereoweave.synth.props.lattice import (
 )
 from stereoweave.synth.props.primitives import boxes, copies, lathe, prism, rotation, translation, tubes
 from stereoweave.synth.props.surroundings import bollards, daylight, hills, sea
-from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.stage import Palette, Stage, outdoor_stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Colour, Material, Mesh, World, join_meshes
+from stereoweave.synth.world import Colour, Material, Mesh, join_meshes
 
 PAINTS: tuple[Colour, ...] = ((0.1, 0.22, 0.42), (0.55, 0.1, 0.06), (0.7, 0.7, 0.68), (0.68, 0.45, 0.08))
 BOXES: tuple[Colour, ...] = (
@@ -58,14 +58,8 @@ def quay_crane(rng: np.random.Generator) -> Stage:
     mesh = join_meshes([crane.as_target(), _quay(rng, palette, colours)])
     # From the land to along the quay: there the boom and the portal show from their side.
     mirrored = rng.random() < 0.5
-    sky, fog, exposure = daylight(rng)
-    world = World(
-        mesh=_mirror(mesh) if mirrored else mesh,
-        materials=tuple(palette.materials),
-        sky=sky,
-        fog=fog,
-        exposure=exposure,
-    )
+    light = daylight(rng)
+    mesh = _mirror(mesh) if mirrored else mesh
     orbit = Orbit(
         centre_m=(0.7, 0.0, 2.8),
         distance_m=(7.5, 10.5),
@@ -74,7 +68,7 @@ def quay_crane(rng: np.random.Generator) -> Stage:
         aim_m=0.6,
         floor_m=0.6,
     )
-    return Stage(world=world, orbit=orbit)
+    return outdoor_stage(mesh, palette, light, orbit)
 
 
 def _draw_materials(rng: np.random.Generator, palette: Palette) -> QuayCraneMaterials:

@@ -16,9 +16,9 @@ from stereoweave.synth.props.lattice import (
 from stereoweave.synth.props.primitives import boxes, copies, lathe, rotation, spheres, translation, tubes
 from stereoweave.synth.props.surroundings import bushes, daylight, draw_spots, hills, houses, terrain, trees
 from stereoweave.synth.props.wind_rotors import composite_skin
-from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.stage import Palette, Stage, outdoor_stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Material, Mesh, World, join_meshes
+from stereoweave.synth.world import Material, Mesh, join_meshes
 
 RIBS = 16
 
@@ -38,16 +38,10 @@ def radio_dish(rng: np.random.Generator) -> Stage:
     )
     mount = (_pedestal if rng.random() < 0.5 else _alidade)(axis, (white, steel, concrete, dark))
     dish = join_meshes([aimed, mount])
-    sky, fog, exposure = daylight(rng)
+    light = daylight(rng)
     land = _land(rng, palette, concrete)
     far = _far(rng, white, (radius, axis, upwards_deg))
-    world = World(
-        mesh=join_meshes([dish.as_target(), far, land]),
-        materials=tuple(palette.materials),
-        sky=sky,
-        fog=fog,
-        exposure=exposure,
-    )
+    mesh = join_meshes([dish.as_target(), far, land])
     front = 0.0 if rng.random() < 0.75 else 180.0
     orbit = Orbit(
         centre_m=(0.2, 0.0, 0.9 * axis),
@@ -57,7 +51,7 @@ def radio_dish(rng: np.random.Generator) -> Stage:
         aim_m=0.6,
         floor_m=0.6,
     )
-    return Stage(world=world, orbit=orbit)
+    return outdoor_stage(mesh, palette, light, orbit)
 
 
 def _far(rng: np.random.Generator, white: int, measures: tuple[float, float, float]) -> Mesh:

@@ -28,9 +28,9 @@ from stereoweave.synth.props.surroundings import (
     terrain,
     trees,
 )
-from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.stage import Palette, Stage, outdoor_stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Material, Mesh, World, join_meshes
+from stereoweave.synth.world import Material, Mesh, join_meshes
 
 UNITS: dict[str, Callable[[np.random.Generator, RefineryMaterials], RefineryUnit]] = {
     "column": column,
@@ -74,13 +74,12 @@ def refinery(rng: np.random.Generator) -> Stage:
         houses(rng, palette, draw_spots(rng, 6, 20.0, 50.0) / 0.3).transform(_SMALL),
         hills(rng, palette, distance_m=rng.uniform(70, 120)),
     ]
-    sky, fog, exposure = daylight(rng)
+    light = daylight(rng)
     mesh = join_meshes([*(part.as_target() for part in plant), *around])
-    world = World(mesh=mesh, materials=tuple(palette.materials), sky=sky, fog=fog, exposure=exposure)
     orbit = Orbit(
         centre_m=(0.0, 0.0, 1.5), distance_m=(7.5, 11.0), elevation_deg=(-4.0, 24.0), aim_m=0.7, floor_m=0.6
     )
-    return Stage(world=world, orbit=orbit)
+    return outdoor_stage(mesh, palette, light, orbit)
 
 
 def _draw_materials(rng: np.random.Generator, palette: Palette) -> RefineryMaterials:

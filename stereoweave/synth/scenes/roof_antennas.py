@@ -6,9 +6,9 @@ from stereoweave.synth.props.antennas import dipoles, panel, satellite_dish, whi
 from stereoweave.synth.props.lattice import bars, cables, galvanised_steel, painted_steel
 from stereoweave.synth.props.primitives import boxes, lathe, rotation, sweep, tubes
 from stereoweave.synth.props.surroundings import daylight, draw_spots, hills, houses, terrain, trees
-from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.stage import Palette, Stage, outdoor_stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Material, Mesh, World, join_meshes
+from stereoweave.synth.world import Material, Mesh, join_meshes
 
 STREET_M = -8.0  # the roof is at 0
 SPOTS_M = np.array([(0.1, 0.2, 0), (0.7, -1.5, 0), (0.5, 1.7, 0), (-1.1, -0.8, 0), (-1.2, 1.0, 0)])
@@ -28,14 +28,8 @@ def roof_antennas(rng: np.random.Generator) -> Stage:
         for height, foot in zip(heights, feet, strict=True)
     ]
     roof = _roof(rng, palette, feet, dark)
-    sky, fog, exposure = daylight(rng)
-    world = World(
-        mesh=join_meshes([join_meshes(masts).as_target(), roof, _town(rng, palette)]),
-        materials=tuple(palette.materials),
-        sky=sky,
-        fog=fog,
-        exposure=exposure,
-    )
+    light = daylight(rng)
+    mesh = join_meshes([join_meshes(masts).as_target(), roof, _town(rng, palette)])
     orbit = Orbit(
         centre_m=(0.0, 0.0, 1.6),
         distance_m=(4.5, 6.3),
@@ -44,7 +38,7 @@ def roof_antennas(rng: np.random.Generator) -> Stage:
         aim_m=0.4,
         floor_m=0.9,
     )
-    return Stage(world=world, orbit=orbit)
+    return outdoor_stage(mesh, palette, light, orbit)
 
 
 def _mast(rng: np.random.Generator, height_m: float, skins: tuple[int, int, int], steel: int) -> Mesh:

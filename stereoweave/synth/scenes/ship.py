@@ -21,9 +21,9 @@ from stereoweave.synth.props.lattice import galvanised_steel, ladder, painted_st
 from stereoweave.synth.props.primitives import Point, lathe, rotation, sheet, tubes
 from stereoweave.synth.props.ships import TRADES, ShipPlan
 from stereoweave.synth.props.surroundings import daylight, vary_colour
-from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.stage import Palette, Stage, outdoor_stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Colour, Material, Mesh, World, join_meshes
+from stereoweave.synth.world import Colour, Material, Mesh, join_meshes
 
 
 def ship(rng: np.random.Generator) -> Stage:
@@ -34,14 +34,8 @@ def ship(rng: np.random.Generator) -> Stage:
     vessel = _build_ship(rng, palette, plan).transform(heel)
     moored = rng.random() < 0.5
     around = harbour(rng, palette, plan.hull) if moored else open_water(rng, palette)
-    sky, fog, exposure = daylight(rng)
-    world = World(
-        mesh=join_meshes([vessel.as_target(), around]),
-        materials=tuple(palette.materials),
-        sky=sky,
-        fog=fog,
-        exposure=exposure,
-    )
+    light = daylight(rng)
+    mesh = join_meshes([vessel.as_target(), around])
     orbit = Orbit(
         centre_m=(0.0, 0.0, 0.8),
         distance_m=(6.6, 9.6),
@@ -50,7 +44,7 @@ def ship(rng: np.random.Generator) -> Stage:
         aim_m=0.6,
         floor_m=0.8,
     )
-    return Stage(world=world, orbit=orbit)
+    return outdoor_stage(mesh, palette, light, orbit)
 
 
 # Hull, stripe, bottom, house, second colour, as fleets paint them.

@@ -11,9 +11,9 @@ from stereoweave.synth.props.streets import (
     walkers,
 )
 from stereoweave.synth.props.surroundings import daylight, hills, terrain
-from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.stage import Palette, Stage, outdoor_stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import World, join_meshes
+from stereoweave.synth.world import join_meshes
 
 # Between the road before the car and the horizon.
 _NEAREST_PX = (25.0, 130.0)
@@ -31,14 +31,8 @@ def street(rng: np.random.Generator) -> Stage:
     ]
     if rng.random() < 0.5:
         parts.append(hills(rng, palette, distance_m=160.0))
-    sky, fog, exposure = daylight(rng)
-    world = World(
-        mesh=join_meshes([target, *parts]),
-        materials=tuple(palette.materials),
-        sky=sky,
-        fog=fog,
-        exposure=exposure,
-    )
+    light = daylight(rng)
+    mesh = join_meshes([target, *parts])
     turned_deg = float(rng.normal(180.0, 3.0))
     orbit = Orbit(
         centre_m=(0.0, plan.lane_m, rng.uniform(1.2, 1.6)),
@@ -47,4 +41,4 @@ def street(rng: np.random.Generator) -> Stage:
         elevation_deg=(0.0, 1.6),
         aim_m=1.2,
     )
-    return Stage(world=world, orbit=orbit, nearest_px=_NEAREST_PX)
+    return outdoor_stage(mesh, palette, light, orbit, nearest_px=_NEAREST_PX)

@@ -24,9 +24,9 @@ from stereoweave.synth.props.surroundings import (
     terrain,
     trees,
 )
-from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.stage import Palette, Stage, outdoor_stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Material, Mesh, World, join_meshes
+from stereoweave.synth.world import Material, Mesh, join_meshes
 
 
 def wind_pump(rng: np.random.Generator) -> Stage:
@@ -47,14 +47,8 @@ def wind_pump(rng: np.random.Generator) -> Stage:
             _tank(rng, palette, steel, rust),
         ]
     )
-    sky, fog, exposure = daylight(rng)
-    world = World(
-        mesh=join_meshes([target.as_target(), _country(rng, palette)]),
-        materials=tuple(palette.materials),
-        sky=sky,
-        fog=fog,
-        exposure=exposure,
-    )
+    light = daylight(rng)
+    mesh = join_meshes([target.as_target(), _country(rng, palette)])
     front = float(rng.choice([0, 180]))
     orbit = Orbit(
         centre_m=(0.0, 0.0, 0.5 * (hub + radius)),
@@ -64,7 +58,7 @@ def wind_pump(rng: np.random.Generator) -> Stage:
         aim_m=0.5,
         floor_m=0.5,
     )
-    return Stage(world=world, orbit=orbit)
+    return outdoor_stage(mesh, palette, light, orbit)
 
 
 def _wheel(rng: np.random.Generator, radius_m: float, skins: tuple[int, int, int]) -> Mesh:

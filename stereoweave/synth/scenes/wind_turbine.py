@@ -38,9 +38,9 @@ from stereoweave.synth.props.surroundings import (
 )
 from stereoweave.synth.props.wind_rotors import Rotor, TurbineMaterials, composite_skin, turbine_head
 from stereoweave.synth.scenes.wind_pump import wind_pump
-from stereoweave.synth.stage import Palette, Stage
+from stereoweave.synth.stage import Palette, Stage, outdoor_stage
 from stereoweave.synth.viewpoints import Orbit
-from stereoweave.synth.world import Colour, Material, Mesh, World, join_meshes
+from stereoweave.synth.world import Colour, Material, Mesh, join_meshes
 
 KINDS = {"tube": 0.45, "sea": 0.25, "lattice": 0.15, "pump": 0.15}
 
@@ -82,15 +82,9 @@ def _turbine(rng: np.random.Generator, kind: str) -> Stage:
         parts += [_lattice(plan, materials), _mast(rng, plan, materials)]
     else:
         parts += [_tube(rng, palette, plan, materials), _foundation(rng, palette, plan, materials)]
-    sky, fog, exposure = daylight(rng)
+    light = daylight(rng)
     land = (_sea if kind == "sea" else _fields)(rng, palette, plan, materials)
-    world = World(
-        mesh=join_meshes([join_meshes(parts).as_target(), land]),
-        materials=tuple(palette.materials),
-        sky=sky,
-        fog=fog,
-        exposure=exposure,
-    )
+    mesh = join_meshes([join_meshes(parts).as_target(), land])
     top_m = plan.hub_m + plan.rotor.radius_m
     # From before or from behind: seen from its side a rotor is a line.
     front = float(rng.choice([0, 180], p=[0.7, 0.3]))
@@ -102,7 +96,7 @@ def _turbine(rng: np.random.Generator, kind: str) -> Stage:
         aim_m=0.5,
         floor_m=0.6,
     )
-    return Stage(world=world, orbit=orbit)
+    return outdoor_stage(mesh, palette, light, orbit)
 
 
 def _draw_plan(rng: np.random.Generator, kind: str) -> TurbinePlan:
