@@ -32,12 +32,13 @@ from stereoweave.synth.props.surroundings import (
     fence,
     hills,
     houses,
+    rocks,
     sea,
     terrain,
     trees,
 )
+from stereoweave.synth.props.wind_pumps import wind_pump
 from stereoweave.synth.props.wind_rotors import Rotor, TurbineMaterials, composite_skin, turbine_head
-from stereoweave.synth.scenes.wind_pump import wind_pump
 from stereoweave.synth.stage import Palette, Stage, outdoor_stage
 from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Colour, Material, Mesh, join_meshes
@@ -65,7 +66,24 @@ class TurbinePlan:
 def wind_turbine(rng: np.random.Generator) -> Stage:
     """A turbine about 6.5 m high to the tip of its blades, its rotor towards +x; or a wind pump of 5 m."""
     kind = str(rng.choice(list(KINDS), p=list(KINDS.values())))
-    return wind_pump(rng) if kind == "pump" else _turbine(rng, kind)
+    return _wind_pump(rng) if kind == "pump" else _turbine(rng, kind)
+
+
+def _wind_pump(rng: np.random.Generator) -> Stage:
+    palette = Palette()
+    pump = wind_pump(rng, palette)
+    light = daylight(rng)
+    mesh = join_meshes([pump.mesh.as_target(), _dry_land(rng, palette)])
+    front = float(rng.choice([0, 180]))
+    orbit = Orbit(
+        centre_m=(0.0, 0.0, 0.5 * pump.top_m),
+        distance_m=(6.0, 8.5),
+        azimuth_deg=(front - 60, front + 60),
+        elevation_deg=(-16, 16),
+        aim_m=0.5,
+        floor_m=0.5,
+    )
+    return outdoor_stage(mesh, palette, light, orbit)
 
 
 def _turbine(rng: np.random.Generator, kind: str) -> Stage:
@@ -355,3 +373,21 @@ def _track(rng: np.random.Generator, palette: Palette) -> Mesh:
     path = np.stack(np.broadcast_arrays(along, bend + across, 0.015 - 0.02 * np.abs(across)), -1)
     yard = boxes((0.4, 0.3, 0.0), (3.2, 2.6, 0.02), gravel)
     return join_meshes([sheet(path, gravel), yard]).transform(rotation((0, 0, 1), rng.uniform(0, 360)))
+
+
+def _dry_land(rng: np.random.Generator, palette: Palette) -> Mesh:
+    """Dry ground with scrub, stones, a few trees, a fence, hills."""
+    small = np.diag([0.5, 0.5, 0.5, 1.0])
+    corners = np.array([(-40, 14, 0), (-6, 11, 0), (18, 12, 0), (50, 18, 0)]) * [1, rng.choice([-1, 1]), 1]
+    return join_meshes(
+        [
+            terrain(
+                rng, palette, str(rng.choice(["soil", "grass"])), extent_m=110, bumps_m=0.8, flat_radius_m=9
+            ),
+            bushes(rng, palette, draw_spots(rng, 26, 3.5 / 0.5, 40 / 0.5)).transform(small),
+            rocks(rng, palette, draw_spots(rng, 14, 2.5 / 0.5, 25 / 0.5)).transform(small),
+            trees(rng, palette, draw_spots(rng, 12, 12, 60), height_m=(1.5, 3.5)),
+            fence(rng, palette, corners / 0.5).transform(small),
+            hills(rng, palette, distance_m=rng.uniform(85, 130)),
+        ]
+    )

@@ -1,4 +1,6 @@
-"""A wind pump: a wheel of many sheet-iron blades with a tail on a lattice tower, a tank, dry country."""
+"""Wind pumps: a wheel of sheet-iron blades with a tail on a lattice tower, and a water tank."""
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,24 +16,24 @@ from stereoweave.synth.props.lattice import (
     truss,
 )
 from stereoweave.synth.props.primitives import boxes, copies, lathe, rotation, sheet, spheres, tubes
-from stereoweave.synth.props.surroundings import (
-    bushes,
-    daylight,
-    draw_spots,
-    fence,
-    hills,
-    rocks,
-    terrain,
-    trees,
-)
-from stereoweave.synth.stage import Palette, Stage, outdoor_stage
-from stereoweave.synth.viewpoints import Orbit
+from stereoweave.synth.stage import Palette
 from stereoweave.synth.world import Material, Mesh, join_meshes
 
 
-def wind_pump(rng: np.random.Generator) -> Stage:
-    """A pump about 5 m high, its wheel towards +x."""
-    palette = Palette()
+class WindPump(NamedTuple):
+    """A wind pump around the z axis, its wheel towards +x.
+
+    Attributes:
+        mesh: wheel, tail, tower and tank.
+        top_m: height of the wheel's upper edge.
+    """
+
+    mesh: Mesh
+    top_m: float
+
+
+def wind_pump(rng: np.random.Generator, palette: Palette) -> WindPump:
+    """A wind pump about 5 m high."""
     steel = palette.add(galvanised_steel(rng))
     blades = palette.add(
         galvanised_steel(rng) if rng.random() < 0.6 else painted_steel(rng, (0.7, 0.68, 0.62))
@@ -39,7 +41,7 @@ def wind_pump(rng: np.random.Generator) -> Stage:
     tail = palette.add(painted_steel(rng, (0.5, 0.08, 0.05)))
     rust = palette.add(Material(texture="rust", variant=int(rng.integers(8)), span_m=1.0))
     hub, radius = rng.uniform(3.9, 4.4), rng.uniform(0.95, 1.3)
-    target = join_meshes(
+    mesh = join_meshes(
         [
             _wheel(rng, radius, (blades, tail, steel)).translate(0.3, 0, hub),
             _tail(rng, radius, (tail, steel)).translate(0, 0, hub),
@@ -47,18 +49,7 @@ def wind_pump(rng: np.random.Generator) -> Stage:
             _tank(rng, palette, steel, rust),
         ]
     )
-    light = daylight(rng)
-    mesh = join_meshes([target.as_target(), _country(rng, palette)])
-    front = float(rng.choice([0, 180]))
-    orbit = Orbit(
-        centre_m=(0.0, 0.0, 0.5 * (hub + radius)),
-        distance_m=(6.0, 8.5),
-        azimuth_deg=(front - 60, front + 60),
-        elevation_deg=(-16, 16),
-        aim_m=0.5,
-        floor_m=0.5,
-    )
-    return outdoor_stage(mesh, palette, light, orbit)
+    return WindPump(mesh, hub + radius)
 
 
 def _wheel(rng: np.random.Generator, radius_m: float, skins: tuple[int, int, int]) -> Mesh:
@@ -156,23 +147,5 @@ def _tank(rng: np.random.Generator, palette: Palette, steel: int, rust: int) -> 
             tubes((0, 0, 0.4), (0, 0, height + 0.14), 0.02, rust, 8),
             boxes((x + 1.1, y, 0.1), (0.9, 0.3, 0.2), rust),
             boxes((x + 1.1, y, 0.195), (0.82, 0.24, 0.02), water),
-        ]
-    )
-
-
-def _country(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """Dry ground with scrub, stones, a few trees, a fence, hills."""
-    small = np.diag([0.5, 0.5, 0.5, 1.0])
-    corners = np.array([(-40, 14, 0), (-6, 11, 0), (18, 12, 0), (50, 18, 0)]) * [1, rng.choice([-1, 1]), 1]
-    return join_meshes(
-        [
-            terrain(
-                rng, palette, str(rng.choice(["soil", "grass"])), extent_m=110, bumps_m=0.8, flat_radius_m=9
-            ),
-            bushes(rng, palette, draw_spots(rng, 26, 3.5 / 0.5, 40 / 0.5)).transform(small),
-            rocks(rng, palette, draw_spots(rng, 14, 2.5 / 0.5, 25 / 0.5)).transform(small),
-            trees(rng, palette, draw_spots(rng, 12, 12, 60), height_m=(1.5, 3.5)),
-            fence(rng, palette, corners / 0.5).transform(small),
-            hills(rng, palette, distance_m=rng.uniform(85, 130)),
         ]
     )
