@@ -11,6 +11,8 @@ from stereoweave.synth.props.hulls import Hull
 from stereoweave.synth.props.primitives import Point, tubes
 from stereoweave.synth.world import Mesh, join_meshes
 
+Range = tuple[float, float]
+
 
 @dataclass(frozen=True, kw_only=True)
 class ShipPlan:
@@ -37,18 +39,88 @@ class ShipPlan:
         return np.array([x, y, self.hull.deck_m(x)])
 
 
-def tug(rng: np.random.Generator) -> ShipPlan:
-    """Short and broad, low aft, tyres all round, a winch and a gantry for towing."""
-    hull = Hull(
-        length_m=rng.uniform(6.8, 7.4),
-        beam_m=rng.uniform(2.6, 3.0),
+@dataclass(frozen=True, kw_only=True)
+class _HullRanges:
+    """The sizes that hulls of one trade are drawn from, each fixed or from..to; see `Hull`."""
+
+    length_m: Range
+    beam_m: Range
+    draft_m: float
+    freeboard_m: Range
+    sheer_aft_m: float
+    sheer_forward_m: Range
+    stern: Range | float
+    rake_m: Range | float
+    bulwark_m: float
+
+
+_HULLS = {
+    "tug": _HullRanges(
+        length_m=(6.8, 7.4),
+        beam_m=(2.6, 3.0),
         draft_m=0.9,
-        freeboard_m=rng.uniform(0.6, 0.75),
-        sheer_m=(0.12, rng.uniform(0.5, 0.75)),
+        freeboard_m=(0.6, 0.75),
+        sheer_aft_m=0.12,
+        sheer_forward_m=(0.5, 0.75),
         stern=0.88,
         rake_m=0.35,
         bulwark_m=0.3,
+    ),
+    "trawler": _HullRanges(
+        length_m=(7.0, 7.8),
+        beam_m=(2.2, 2.6),
+        draft_m=0.9,
+        freeboard_m=(0.65, 0.8),
+        sheer_aft_m=0.25,
+        sheer_forward_m=(0.7, 1.0),
+        stern=(0.7, 0.85),
+        rake_m=(0.5, 0.9),
+        bulwark_m=0.3,
+    ),
+    "coaster": _HullRanges(
+        length_m=(7.8, 8.4),
+        beam_m=(1.9, 2.2),
+        draft_m=0.9,
+        freeboard_m=(0.55, 0.75),
+        sheer_aft_m=0.2,
+        sheer_forward_m=(0.4, 0.6),
+        stern=0.8,
+        rake_m=(0.4, 0.7),
+        bulwark_m=0.1,
+    ),
+    "patrol boat": _HullRanges(
+        length_m=(7.6, 8.2),
+        beam_m=(1.8, 2.1),
+        draft_m=0.7,
+        freeboard_m=(0.6, 0.75),
+        sheer_aft_m=0.0,
+        sheer_forward_m=(0.4, 0.6),
+        stern=0.9,
+        rake_m=(0.9, 1.2),
+        bulwark_m=0.06,
+    ),
+}
+
+
+def _draw_hull(rng: np.random.Generator, ranges: _HullRanges) -> Hull:
+    def draw(size: Range | float) -> float:
+        return rng.uniform(*size) if isinstance(size, tuple) else size
+
+    return Hull(
+        length_m=draw(ranges.length_m),
+        beam_m=draw(ranges.beam_m),
+        draft_m=ranges.draft_m,
+        freeboard_m=draw(ranges.freeboard_m),
+        sheer_m=(ranges.sheer_aft_m, draw(ranges.sheer_forward_m)),
+        stern=draw(ranges.stern),
+        rake_m=draw(ranges.rake_m),
+        bulwark_m=ranges.bulwark_m,
     )
+
+
+def tug(rng: np.random.Generator) -> ShipPlan:
+    """Short and broad, low aft, tyres all round, a winch and a gantry for towing."""
+    hull = _draw_hull(rng, _HULLS["tug"])
     high = rng.uniform(0.8, 0.95)
     house = House(
         x_m=(-0.7, 1.9),
@@ -71,16 +143,7 @@ def tug(rng: np.random.Generator) -> ShipPlan:
 
 def trawler(rng: np.random.Generator) -> ShipPlan:
     """A high bow, a mast with a derrick, a gantry aft, a drum with nets."""
-    hull = Hull(
-        length_m=rng.uniform(7.0, 7.8),
-        beam_m=rng.uniform(2.2, 2.6),
-        draft_m=0.9,
-        freeboard_m=rng.uniform(0.65, 0.8),
-        sheer_m=(0.25, rng.uniform(0.7, 1.0)),
-        stern=rng.uniform(0.7, 0.85),
-        rake_m=rng.uniform(0.5, 0.9),
-        bulwark_m=0.3,
-    )
+    hull = _draw_hull(rng, _HULLS["trawler"])
     at = rng.uniform(-0.2, 0.2)
     house = House(
         x_m=(at, at + 1.9),
@@ -102,16 +165,7 @@ def trawler(rng: np.random.Generator) -> ShipPlan:
 
 def coaster(rng: np.random.Generator) -> ShipPlan:
     """Long and low, the house aft, hatches and often containers before it."""
-    hull = Hull(
-        length_m=rng.uniform(7.8, 8.4),
-        beam_m=rng.uniform(1.9, 2.2),
-        draft_m=0.9,
-        freeboard_m=rng.uniform(0.55, 0.75),
-        sheer_m=(0.2, rng.uniform(0.4, 0.6)),
-        stern=0.8,
-        rake_m=rng.uniform(0.4, 0.7),
-        bulwark_m=0.1,
-    )
+    hull = _draw_hull(rng, _HULLS["coaster"])
     house = House(
         x_m=(-3.4, -1.95), width_m=1.45, z_m=(hull.deck_m(-1.9) - 0.05, 1.75), lean_m=(0, 0.0, 0.02)
     )
@@ -129,16 +183,7 @@ def coaster(rng: np.random.Generator) -> ShipPlan:
 
 def patrol_boat(rng: np.random.Generator) -> ShipPlan:
     """Slender, with sloping walls, a boat aft and a crane for it."""
-    hull = Hull(
-        length_m=rng.uniform(7.6, 8.2),
-        beam_m=rng.uniform(1.8, 2.1),
-        draft_m=0.7,
-        freeboard_m=rng.uniform(0.6, 0.75),
-        sheer_m=(0.0, rng.uniform(0.4, 0.6)),
-        stern=0.9,
-        rake_m=rng.uniform(0.9, 1.2),
-        bulwark_m=0.06,
-    )
+    hull = _draw_hull(rng, _HULLS["patrol boat"])
     house = House(x_m=(-1.5, 1.7), width_m=1.3, z_m=(hull.deck_m(0.0) - 0.1, 1.35), lean_m=(0.15, 0.7, 0.1))
     bridge = House(x_m=(-0.5, 0.95), width_m=1.15, z_m=(1.39, 2.0), lean_m=(0.1, 0.35, 0.12))
     return ShipPlan(
