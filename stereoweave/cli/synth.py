@@ -8,48 +8,52 @@ import typer
 
 from stereoweave.cli.options import Cluster, engine_of, needing_the_synth_extra, parse_size_px
 
-synth = typer.Typer(help="Rendered stereo with exact ground truth: make it, check it, look at it.")
+synth = typer.Typer(help="Make, check and view rendered stereo pairs with exact ground truth.")
 
-# Named here, because the help imports nothing heavy.
+# Listed here so that --help imports nothing heavy.
 SCENE_NAMES = (
     "antenna", "boards", "bridge", "crane", "figures", "propeller", "pylon", "refinery", "rooms", "ship",
     "street", "wind_turbine",
 )  # fmt: skip
 
 Scene = Annotated[str, typer.Argument(help=f"One of {', '.join(SCENE_NAMES)}.")]
-Jobs = Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores unless given.")]
+Jobs = Annotated[int | None, typer.Option(min=1, help="Number of processes (default: all cores).")]
 
 
 @synth.command()
-def make(  # noqa: PLR0913 - each is a word of the command line
+def make(  # noqa: PLR0913 - each is an option of the command
     scene: Scene,
-    pairs: Annotated[int, typer.Option(min=1, help="How many there shall be in the folder.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The folder of the set.")],
-    seed: Annotated[int, typer.Option(min=0, help="Another one gives other pairs.")] = 0,
+    pairs: Annotated[int, typer.Option(min=1, help="Size of the finished set.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the set.")],
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random draws.")] = 0,
     size: Annotated[str, typer.Option(help="Width and height in pixels.")] = "640x480",
     plain: Annotated[
-        bool, typer.Option("--plain", help="Without shadows, gloss and the like: faster.")
+        bool, typer.Option("--plain", help="Turn off shadows, gloss and the other effects: faster.")
     ] = False,
-    layout: Annotated[str, typer.Option(help="shards, or paper: folders left, right and depth.")] = "shards",
-    frames: Annotated[int, typer.Option(min=1, help="Pairs in a row as a film, from a moving camera.")] = 1,
+    layout: Annotated[
+        str, typer.Option(help="shards (tar files), or paper (folders left, right and depth).")
+    ] = "shards",
+    frames: Annotated[
+        int, typer.Option(min=1, help="Length of videos by a moving camera, in pairs; 1 makes stills.")
+    ] = 1,
     view: Annotated[
         list[float] | None,
-        typer.Option(help="A further picture, 0.5 from half way, -1 to 2; again for more."),
+        typer.Option(help="Position of an additional view, -1 to 2; 0.5 is halfway. Repeatable."),
     ] = None,
     rig: Annotated[
         tuple[float, float] | None,
-        typer.Option(metavar="FOCAL_PX BASELINE_M", help="Of all pairs; drawn for each unless given."),
+        typer.Option(metavar="FOCAL_PX BASELINE_M", help="Rig of all pairs (default: drawn for each)."),
     ] = None,
     jobs: Annotated[
         int | None,
         typer.Option(
             min=1,
-            help="Processes, as many as cores unless given; each makes a shard of 50 pairs at a time.",
+            help="Number of processes (default: all cores); each makes shards of 50 pairs.",
         ),
     ] = None,
     cluster: Cluster = None,
 ) -> None:
-    """Make a set of rendered pairs, or go on with one that was stopped or shall have more."""
+    """Make a set of rendered pairs, or resume or extend one."""
     with needing_the_synth_extra():
         from stereoweave.synth.sets.make import PairRenderer
         from stereoweave.synth.sets.make import make as make_set
@@ -59,12 +63,14 @@ def make(  # noqa: PLR0913 - each is a word of the command line
     )
     pair_maker, engine = PairRenderer(plain), engine_of(cluster, workers=jobs)
     made = make_set(spec, pairs, out, layout=layout, jobs=_jobs(jobs), engine=engine, pair_maker=pair_maker)
-    typer.echo(f"{out}: {made} pair{'s' * (made != 1)} made, {pairs - made} there before")
+    typer.echo(f"{out}: {made} pair{'s' * (made != 1)} made, {pairs - made} already there")
 
 
 @synth.command()
-def check(folder: Annotated[Path, typer.Argument(help="What synth make made.")], jobs: Jobs = None) -> None:
-    """Check a set: checksums, disparity against the pictures, statistics; exit status 1 if one is wrong."""
+def check(
+    folder: Annotated[Path, typer.Argument(help="Folder of a set made by synth make.")], jobs: Jobs = None
+) -> None:
+    """Check a set's checksums and disparities, and print statistics; exit status 1 if a check fails."""
     from stereoweave.synth.sets.check import check_set, report_lines
 
     found = check_set(folder, _jobs(jobs))
@@ -75,13 +81,13 @@ def check(folder: Annotated[Path, typer.Argument(help="What synth make made.")],
 
 @synth.command()
 def sheet(
-    out: Annotated[Path, typer.Option("--out", "-o", help="The picture to write.")],
-    seed: Annotated[int, typer.Option(min=0, help="As for make.")] = 0,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")],
+    seed: Annotated[int, typer.Option(min=0, help="Seed, see synth make.")] = 0,
     quiz: Annotated[
-        bool, typer.Option("--quiz", help="16 left pictures without a label; what they show is printed.")
+        bool, typer.Option("--quiz", help="Show 16 unlabelled left pictures, and print their scenes.")
     ] = False,
 ) -> None:
-    """A picture of all scenes, a row each: left, right, depth, and what one camera alone sees."""
+    """Write a contact sheet with a row per scene: left, right, depth, and occlusion masks."""
     from stereoweave.io.files import picture_kind, write_image
 
     picture_kind(out)
@@ -103,10 +109,10 @@ def sheet(
 @synth.command()
 def costs(
     scene: Scene = "propeller",
-    pairs: Annotated[int, typer.Option(min=1, help="How many, of which the mean is told.")] = 3,
+    pairs: Annotated[int, typer.Option(min=1, help="Number of pairs to average.")] = 3,
 ) -> None:
-    """Measure what each effect of the renderer costs: milliseconds of one core for a pair of 640x480."""
-    # As in `make`: Mesa reads it when the renderer starts.
+    """Measure the time of each rendering effect: milliseconds per 640x480 pair on one core."""
+    # One thread, see synth make; Mesa reads it when the renderer starts.
     os.environ["LP_NUM_THREADS"] = "1"
     with needing_the_synth_extra():
         from stereoweave.synth.sets.effect_costs import measure_effect_costs

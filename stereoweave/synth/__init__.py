@@ -1,1 +1,1 @@
-"""Synthetic stereo with exact ground truth: scenes, textures, and the renderer."""
+"""Synthetic stereo with exact ground truth: scenes, textures, renderers, and sets of pairs."""

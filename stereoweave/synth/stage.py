@@ -1,4 +1,4 @@
-"""What a scene gives: a world, and where to see it from."""
+"""Stages, which scenes return: a world and the viewpoints on it."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -9,13 +9,13 @@ from stereoweave.synth.world import Fog, Material, Mesh, Sky, World
 
 @dataclass(frozen=True, kw_only=True)
 class Stage:
-    """A world and the places that a rig may stand at in it.
+    """A world and the viewpoints on it.
 
     Attributes:
-        world: what is seen.
-        orbit: where from.
-        nearest_px: the disparity of the nearest surface in a picture 640 px wide, from..to.
-        noise_levels: standard deviation of the cameras' noise in a white surface, in grey levels of 0..255.
+        world: what the cameras see.
+        orbit: the viewpoints.
+        nearest_px: range of the nearest surface's disparity in a picture 640 px wide.
+        noise_levels: standard deviation of the sensor noise on white, in grey levels of 0..255.
     """
 
     world: World
@@ -26,18 +26,18 @@ class Stage:
 
 @dataclass
 class Palette:
-    """The materials of a scene while it is being built."""
+    """The materials of a scene under construction."""
 
     materials: list[Material] = field(default_factory=list)
 
     def add(self, material: Material) -> int:
-        """Takes a material in; returns its index, for the meshes made of it."""
+        """Add a material. Returns its index, which meshes refer to."""
         self.materials.append(material)
         return len(self.materials) - 1
 
 
 class Daylight(NamedTuple):
-    """The light of a day: sky with sun, fog if any, and the exposure for both."""
+    """Outdoor light: sky with sun, fog (or None), and the exposure for them."""
 
     sky: Sky
     fog: Fog | None
@@ -51,7 +51,7 @@ def outdoor_stage(
     orbit: Orbit,
     nearest_px: tuple[float, float] = NEAREST_PX,
 ) -> Stage:
-    """A stage in daylight, its materials taken from the palette."""
+    """Build an outdoor stage with the materials of a palette."""
     world = World(
         mesh=mesh,
         materials=tuple(palette.materials),

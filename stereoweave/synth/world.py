@@ -1,4 +1,4 @@
-"""What a scene is made of: triangles, materials, sky, lamps, fog. Metres; z is up."""
+"""Scene description: triangles, materials, sky, lamps and fog. Metres; z is up."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -6,19 +6,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-Colour = tuple[float, float, float]  # RGB, linear, 1 is as bright as a white sheet in the sun
+Colour = tuple[float, float, float]  # linear RGB; 1 is a white sheet in the sun
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mesh:
-    """Triangles, each with corners of its own, so that neighbours may differ in normal and texture.
+    """Triangles with unshared vertices, so that neighbours may differ in normals and texture coordinates.
 
     Attributes:
         corners_m: float32 [N, 3, 3]: triangle, corner, x y z; counter-clockwise seen from outside.
-        normals: float32 [N, 3, 3], of unit length, outwards.
-        uv_m: float32 [N, 3, 2], where the texture is looked up, in metres along the surface.
-        material: int32 [N], index in the world's materials.
-        target: bool [N], whether the triangle belongs to what the scene is named after.
+        normals: float32 [N, 3, 3], outward unit vectors.
+        uv_m: float32 [N, 3, 2], texture coordinates in metres along the surface.
+        material: int32 [N], index into the world's materials.
+        target: bool [N], whether the triangle belongs to the scene's subject.
     """
 
     corners_m: Float[np.ndarray, "n 3 3"]
@@ -28,8 +28,8 @@ class Mesh:
     target: Bool[np.ndarray, " n"]
 
     def transform(self, pose: Float[np.ndarray, "4 4"]) -> "Mesh":
-        """The mesh under a rotation, uniform or not scaling and shift; its texture moves along unscaled."""
-        # In one product: NumPy is slow at many small ones.
+        """The mesh under an affine pose; texture coordinates stay unchanged."""
+        # One large product: NumPy is slow at many small ones.
         corners_m = self.corners_m.reshape(-1, 3) @ pose[:3, :3].T.astype(np.float32)
         normals = self.normals.reshape(-1, 3) @ np.linalg.inv(pose[:3, :3]).astype(np.float32)
         normals /= np.sqrt(np.einsum("ij,ij->i", normals, normals))[:, None]
@@ -40,16 +40,16 @@ class Mesh:
         )
 
     def translate(self, x: float = 0, y: float = 0, z: float = 0) -> "Mesh":
-        """The mesh, shifted in metres."""
+        """The mesh, translated in metres."""
         return replace(self, corners_m=self.corners_m + np.array([x, y, z], np.float32))
 
     def as_target(self) -> "Mesh":
-        """The mesh as part of what the scene is named after."""
+        """The mesh, marked as the scene's subject."""
         return replace(self, target=np.ones_like(self.target))
 
 
 def join_meshes(meshes: Iterable[Mesh]) -> Mesh:
-    """All triangles in one mesh."""
+    """Join meshes into one."""
     parts = list(meshes)
     names = ("corners_m", "normals", "uv_m", "material", "target")
     return Mesh(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
@@ -57,17 +57,17 @@ def join_meshes(meshes: Iterable[Mesh]) -> Mesh:
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """How a surface looks.
+    """Appearance of a surface.
 
     Attributes:
-        texture: a family of the texture bank (textures.FAMILIES), such as "rust".
-        variant: which texture of the family, counted on past its end.
+        texture: a family of the texture bank (textures.bank.FAMILIES), such as "rust".
+        variant: number of the texture in its family, modulo the family's size.
         tint: multiplies the texture's colour.
-        span_m: how many metres the texture spans before it repeats.
+        span_m: period of the texture in metres.
         roughness: 0 is a mirror, 1 is chalk.
-        metal: 0 for paint, stone, cloth; 1 for bare metal.
-        relief: 0 to 1, how strongly the texture's height bends the normal.
-        glow: light given off, as a multiple of the colour.
+        metal: 0 for paint, stone and cloth, 1 for bare metal.
+        relief: strength of the bump map, 0 to 1.
+        glow: emitted light, as a multiple of the colour.
     """
 
     texture: str
@@ -82,15 +82,15 @@ class Material:
 
 @dataclass(frozen=True, kw_only=True)
 class Sky:
-    """Sky, sun and the light that both give.
+    """Sky and sun, and their light.
 
     Attributes:
         sun: unit vector towards the sun.
-        sun_light: its colour and strength; (0, 0, 0) under an overcast sky or indoors.
-        zenith, horizon, ground: colours that surfaces are lit with, and that are seen, from above, from the
+        sun_light: the sun's colour and strength; (0, 0, 0) indoors.
+        zenith, horizon, ground: colours of the gradient, visible and as ambient light from above, from the
             side and from below.
-        cloud_variant: which texture of the family "sky" lies over the gradient.
-        clouds: 0 for a clear sky to 1 for a covered one.
+        cloud_variant: number of the cloud texture in the family "sky".
+        clouds: cloud cover, 0 (clear) to 1 (overcast).
     """
 
     sun: tuple[float, float, float]
@@ -104,9 +104,11 @@ class Sky:
 
 @dataclass(frozen=True, kw_only=True)
 class Lamp:
-    """A lamp that shines to all sides without a shadow; its light falls with the square of the distance.
+    """A point light without shadow; its light falls with the square of the distance.
 
-    light is its colour and strength at 1 m.
+    Attributes:
+        position_m: in the world.
+        light: colour and strength at 1 m.
     """
 
     position_m: tuple[float, float, float]
@@ -115,7 +117,7 @@ class Lamp:
 
 @dataclass(frozen=True, kw_only=True)
 class Fog:
-    """Haze: what is at distance d keeps exp(-density_per_m * d) of its colour."""
+    """Haze: a surface at distance d keeps the share exp(-density_per_m * d) of its colour."""
 
     colour: Colour
     density_per_m: float
@@ -123,13 +125,13 @@ class Fog:
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """Everything that a renderer needs but the camera.
+    """All that a renderer needs, except the camera.
 
     Attributes:
         mesh: all triangles.
-        materials: what `mesh.material` counts; at most 64.
+        materials: at most 64; `mesh.material` is an index into them.
         lamps: at most 4.
-        exposure: what colours are multiplied with before the tone curve.
+        exposure: multiplies colours before tone mapping.
     """
 
     mesh: Mesh
@@ -142,12 +144,12 @@ class World:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderedView:
-    """A picture of a world with its truth.
+    """An image of a world with its ground truth.
 
     Attributes:
         image: uint8 RGB [H, W, 3].
-        depth_m: float32 [H, W], along the optical axis through the pixels' centres; infinite for the sky.
-        target: bool [H, W], whether the pixel's centre shows what the scene is named after.
+        depth_m: float32 [H, W], along the optical axis at the pixels' centres; infinite for the sky.
+        target: bool [H, W], whether the pixel's centre shows the scene's subject.
     """
 
     image: UInt8[np.ndarray, "h w 3"]

@@ -40,7 +40,7 @@ def test_a_set_is_made_once(words, capsys):
     out = Path(words.split()[-1])
     before = contents(out)
     assert run(words) == 0
-    assert f"{out}: 0 pairs made, 2 there before" in capsys.readouterr().out
+    assert f"{out}: 0 pairs made, 2 already there" in capsys.readouterr().out
     assert contents(out) == before
     assert Shards(out)[1].left.shape == (120, 160, 3)
     assert list(Shards(out).views(1)) == [0.5]
@@ -151,7 +151,7 @@ def test_a_cluster_that_does_not_answer_is_told_in_one_line(tmp_path, capsys):
     told = capsys.readouterr()
     assert told.out == ""
     assert "127.0.0.1:1: expected the head of a Ray cluster that answers, found " in told.err
-    assert told.err.endswith("; what is there is whole, and the same command goes on\n")
+    assert told.err.endswith("; all finished pairs are complete: rerun the same command to resume\n")
     assert told.err.count("\n") == 1
 
 
@@ -173,7 +173,7 @@ def test_costs_of_an_unknown_scene_are_refused_before_a_renderer_starts(monkeypa
 def test_what_opengl_has_no_room_for_is_told_in_a_line():
     gl = moderngl.create_context(standalone=True, backend="egl")
     message = error_of(FrameBuffers, gl, (100_000, 32), 2)
-    assert message.startswith("pictures of 100000x32 px: expected OpenGL to have room for them, found ")
+    assert message.startswith("pictures of 100000x32 px: expected OpenGL to have enough memory, found ")
     gl.release()
 
 

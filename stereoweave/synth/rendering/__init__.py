@@ -1,1 +1,1 @@
-"""From a scene to pictures, depth and normals."""
+"""Rendering of worlds: images and depth."""

@@ -1,4 +1,4 @@
-"""What may be switched off in a picture for speed, or to see what it does."""
+"""Rendering effects, each of which can be turned off."""
 
 from dataclasses import dataclass
 
@@ -7,15 +7,15 @@ from stereoweave.errors import StereoweaveError
 
 @dataclass(frozen=True, kw_only=True)
 class Effects:
-    """What makes a picture look real; each costs time (costs.py measures how much).
+    """Switches of the effects; `synth costs` measures the time of each.
 
     Attributes:
         shadows: of the sun.
-        ambient_occlusion: corners and crowded places get less light from the sky.
+        ambient_occlusion: less light from the sky in corners and narrow places.
         gloss: highlights of sun and lamps, reflections of the sky.
-        fog: haze over the distance.
-        relief: the texture's height bends the normals.
-        samples: 2 takes 2x2 samples a pixel, 1 takes its centre alone.
+        fog: haze.
+        relief: bump mapping by the texture's height.
+        samples: 2 for 2x2 samples per pixel, 1 for the centre only.
     """
 
     shadows: bool = True

@@ -1,4 +1,4 @@
-"""What lies in the graphics card's memory: a world's triangles and materials, the textures, frame buffers."""
+"""GPU memory: a world's triangles and materials, the textures, and frame buffers."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,18 +13,18 @@ from stereoweave.synth.rendering.shader_programs import MOST_LAMPS, MOST_MATERIA
 from stereoweave.synth.textures.bank import TextureBank, srgb_to_linear
 from stereoweave.synth.world import World
 
-# How high the height of a texture rises at full relief, as a share of what the texture spans.
+# Height of a texture at full relief, as a share of its period.
 _RELIEF_SHARE = 0.018
 _FLOATS = 12  # of a material in std140: three vectors of four
 
 
 class Geometry:
-    """A world's triangles; `release` gives their memory back.
+    """A world's triangles in GPU memory; `release` frees it.
 
     Attributes:
-        world: whose they are.
-        corners_m: float32 [3, 3, N]: axis, corner, triangle, for whole columns at once.
-        target_m: the target's, or all where the world has none.
+        world: the triangles' world.
+        corners_m: float32 [3, 3, N]: axis, corner, triangle.
+        target_m: the target's triangles, or all if the world has no target.
     """
 
     def __init__(self, gl: moderngl.Context, world: World) -> None:
@@ -44,7 +44,7 @@ class Geometry:
             }
 
     def draw(self, program: moderngl.Program, triangles: Int[np.ndarray, " k"]) -> None:
-        """Draws some of the triangles, in their order."""
+        """Draw triangles in the given order."""
         if len(triangles) == 0:
             return
         corners = self._buffer(3 * triangles[:, None] + np.arange(3), np.int32)
@@ -69,14 +69,14 @@ def _reporting_lack_of_memory(what: str) -> Iterator[None]:
         yield
     except moderngl.Error as error:
         raise StereoweaveError(
-            f"{what}: expected OpenGL to have room for them, found {error}; ask for smaller ones"
+            f"{what}: expected OpenGL to have enough memory, found {error}; request fewer or smaller ones"
         ) from error
 
 
 def _check_limits(world: World) -> None:
     for name, most, remedy in (
-        ("materials", MOST_MATERIALS, "let parts share some"),
-        ("lamps", MOST_LAMPS, "leave out the faintest"),
+        ("materials", MOST_MATERIALS, "share materials between parts"),
+        ("lamps", MOST_LAMPS, "omit the faintest"),
     ):
         count = len(getattr(world, name))
         if count > most:
@@ -84,15 +84,15 @@ def _check_limits(world: World) -> None:
 
 
 class MaterialBlock:
-    """The shader's uniform block `Materials`."""
+    """Uniform block `Materials` of the shaders."""
 
     def __init__(self, gl: moderngl.Context) -> None:
-        # The only block of its program, and so at binding 0.
+        # Binding 0, because it is the program's only block.
         self._buffer = gl.buffer(reserve=4 * _FLOATS * MOST_MATERIALS)
         self._buffer.bind_to_uniform_block(0)
 
     def write(self, world: World, textures: TextureBank) -> None:
-        """Takes over the materials of a world."""
+        """Upload a world's materials."""
         rows = np.zeros((MOST_MATERIALS, _FLOATS), np.float32)
         for row, material in zip(rows, world.materials, strict=False):
             row[:9] = (
@@ -110,9 +110,9 @@ class MaterialBlock:
 def upload_textures(
     gl: moderngl.Context, pixels: UInt8[np.ndarray, "layers side side 4"]
 ) -> moderngl.TextureArray:
-    """All textures with their mipmaps, colours coded as square roots of their light.
+    """Upload all textures with mipmaps; colours are stored as square roots of linear light.
 
-    llvmpipe filters bytes faster than anything else, and the shader undoes the root by one multiplication.
+    llvmpipe filters bytes fastest, and one multiplication in the shader undoes the root.
     """
     layers, height, width, channels = pixels.shape
     array = gl.texture_array((width, height, layers), channels)
@@ -127,7 +127,7 @@ def upload_textures(
 
 
 class FrameBuffers:
-    """The frame buffers for pictures of one size: depth, samples, and pixels; `release` gives them back."""
+    """Frame buffers for one image size: depth, samples and pixels; `release` frees them."""
 
     def __init__(self, gl: moderngl.Context, size_px: tuple[int, int], samples: int) -> None:
         self.size_px = size_px

@@ -1,4 +1,4 @@
-"""Pictures and exact depth of a world by OpenGL, without a window; Mesa needs no graphics card."""
+"""Off-screen OpenGL renderer: images and exact depth; Mesa needs no graphics card."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -21,12 +21,12 @@ _TEXTURES, _SAMPLES = 0, 1  # texture units
 
 
 class OpenGLRenderer:
-    """Takes pictures of worlds; a `synth.samples.Camera`.
+    """Renders worlds with OpenGL; a `pair_rendering.SceneRenderer`.
 
-    A world and a rig give the same bytes, whatever was rendered before. Depth is rasterised apart from the
-    picture, through the pixels' centres. The picture takes 2x2 samples a pixel, their mean position its
-    centre, and shades each of them: under llvmpipe that takes little more than half the time of
-    multisampling, which shades what is hidden too, and it smooths highlights and shadows' edges as well.
+    World and rig determine the bytes, whatever was rendered before. Depth is rasterised separately, through
+    the pixels' centres. The image takes 2x2 samples per pixel, centred on the pixel, and shades each of
+    them: with llvmpipe that takes little more than half the time of multisampling, which also shades hidden
+    surfaces, and it smooths highlights and edges of shadows as well.
     """
 
     def __init__(self, effects: Effects = Effects()) -> None:  # noqa: B008, frozen
@@ -49,18 +49,18 @@ class OpenGLRenderer:
 
     @property
     def name(self) -> str:
-        """Which OpenGL draws, and of what version."""
+        """OpenGL's driver and version."""
         return f"{self._gl.info['GL_RENDERER']}, OpenGL {self._gl.info['GL_VERSION']}"
 
     def depth_m(self, world: World, rig: PosedRig, position: float) -> Float[np.ndarray, "h w"]:
-        """float32 [H, W] in metres along the optical axis; infinite where nothing is."""
+        """Depth in metres along the optical axis, float32 [H, W]; infinite for the sky."""
         with self._gl:
             geometry = self._upload(world)
             triangles = triangles_in_view(geometry.corners_m, rig, (position,))
             return self._render_depth(geometry, triangles, rig, position)[0]
 
     def render_views(self, world: World, rig: PosedRig, positions: Sequence[float]) -> list[RenderedView]:
-        """A picture with its truth for each position."""
+        """Render an image with its ground truth at each position."""
         with self._gl:
             geometry = self._upload(world)
             self._set_light(world, geometry)
@@ -68,7 +68,7 @@ class OpenGLRenderer:
             return [self._render_view(geometry, triangles, rig, position) for position in positions]
 
     def close(self) -> None:
-        """Gives back all memory; the renderer is of no use afterwards."""
+        """Release the OpenGL context and its memory; the renderer cannot be used afterwards."""
         self._gl.release()
 
     def _render_view(
@@ -82,7 +82,7 @@ class OpenGLRenderer:
     def _render_depth(
         self, geometry: Geometry, triangles: Int[np.ndarray, " k"], rig: PosedRig, position: float
     ) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-        """Depth, and whether it is the target's."""
+        """Depth and target mask."""
         frame = self._frame_buffers(rig).depth
         frame.use()
         frame.clear(red=np.inf)
@@ -101,7 +101,7 @@ class OpenGLRenderer:
         name = surface_program(len(geometry.world.lamps), any(geometry.world.sky.sun_light))
         self._set_view(name, rig, position)
         geometry.draw(self._programs[name], triangles)
-        # The sky lies at the far end of the depth buffer, which is what it was cleared to.
+        # The sky lies at the far plane, the depth buffer's clear value.
         self._gl.depth_func = "<="
         self._programs.set_uniforms("sky", direction_matrix=direction_matrix(rig, self.effects.samples).T)
         self._full_screen["sky"].render(vertices=3)
@@ -118,7 +118,7 @@ class OpenGLRenderer:
         )
 
     def _frame_buffers(self, rig: PosedRig) -> FrameBuffers:
-        """Frame buffers of the rig's size; those of the last size are kept."""
+        """Frame buffers of the rig's size; the last size is cached."""
         if self._last_frame_buffers is None or self._last_frame_buffers.size_px != rig.size_px:
             if self._last_frame_buffers is not None:
                 self._last_frame_buffers.release()
@@ -126,7 +126,7 @@ class OpenGLRenderer:
         return self._last_frame_buffers
 
     def _upload(self, world: World) -> Geometry:
-        """The world's triangles; those of the last world are kept."""
+        """Upload the world's triangles; the last world is cached."""
         if self._geometry is None or self._geometry.world is not world:
             fresh = Geometry(self._gl, world)
             if self._geometry is not None:
@@ -135,7 +135,7 @@ class OpenGLRenderer:
         return self._geometry
 
     def _set_light(self, world: World, geometry: Geometry) -> None:
-        """Everything about materials and light that pictures of one world share."""
+        """Set materials and light, which all images of one world share."""
         if world is self._lit_world:
             return
         self._materials.write(world, self._bank)
@@ -158,11 +158,11 @@ class OpenGLRenderer:
 
 
 def _create_context() -> moderngl.Context:
-    # The stub of create_context takes keywords for a dictionary.
+    # The stub of create_context mistypes its keywords.
     options: dict[str, Any] = {"standalone": True, "backend": "egl"}
     try:
         return moderngl.create_context(**options)
-    except Exception as error:  # glcontext and moderngl raise no class of their own for this
+    except Exception as error:  # glcontext and moderngl have no exception class for this
         raise StereoweaveError(
             f"OpenGL: expected EGL to start, found {error}; on Debian: apt install libegl1 libgl1-mesa-dri"
         ) from error

@@ -1,6 +1,6 @@
-"""Pictures and exact depth of a world by ray casting (embree): slower and plainer than `renderer`.
+"""Ray caster (embree): images and exact depth, slower and plainer than `opengl`.
 
-It stands in where OpenGL is missing, and it is the renderer's independent reference in the tests.
+It is the fallback without OpenGL, and the tests' independent reference for the OpenGL renderer.
 """
 
 import functools
@@ -21,15 +21,15 @@ from stereoweave.synth.world import Mesh, RenderedView, Sky, World
 
 Vectors = Float[np.ndarray, "p 3"]
 
-# A ray towards the sun starts so far off the surface that rounding does not let the surface shade itself.
+# Offset of shadow rays from the surface, against self-shadowing by rounding.
 _OFF_M = 2e-3
 
 
 class Raycaster:
-    """Takes pictures of worlds; a `synth.samples.Camera`.
+    """Renders worlds by ray casting; a `pair_rendering.SceneRenderer`.
 
-    Of the effects it has shadows (with hard edges), fog and samples. Surfaces are diffuse, the sky has no
-    clouds, and lamps give no light.
+    Supported effects: shadows (with hard edges), fog and samples. Surfaces are diffuse; clouds and lamps are
+    ignored.
     """
 
     def __init__(self, effects: Effects = Effects()) -> None:  # noqa: B008, frozen
@@ -39,26 +39,26 @@ class Raycaster:
 
     @property
     def name(self) -> str:
-        """What casts the rays, and its version."""
+        """Embree and its version."""
         return f"embree {version('embreex')}"
 
     def depth_m(self, world: World, rig: PosedRig, position: float) -> Float[np.ndarray, "h w"]:
-        """float32 [H, W] in metres along the optical axis; infinite where nothing is."""
+        """Depth in metres along the optical axis, float32 [H, W]; infinite for the sky."""
         return self.cast_rays(world, rig.eye_m(position), rays(rig))[0].astype(np.float32)
 
     def cast_rays(
         self, world: World, eye_m: Float[np.ndarray, "3"], directions: Float[np.ndarray, "h w 3"]
     ) -> tuple[Float[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
-        """What rays from one point meet: how far away, in lengths of their directions, and which triangle.
+        """Cast rays from one point. Returns distances, in lengths of the directions, and triangle indices.
 
-        Infinity and -1 where nothing is.
+        Infinity and -1 where a ray hits nothing.
         """
         hits = self._cast(world, eye_m, directions.reshape(-1, 3))
         shape = directions.shape[:2]
         return hits.distance.reshape(shape), hits.triangle.reshape(shape)
 
     def render_views(self, world: World, rig: PosedRig, positions: Sequence[float]) -> list[RenderedView]:
-        """A picture with its truth for each position."""
+        """Render an image with its ground truth at each position."""
         return [self._render_view(world, rig, position) for position in positions]
 
     def _render_view(self, world: World, rig: PosedRig, position: float) -> RenderedView:
@@ -95,7 +95,7 @@ class Raycaster:
         hits: "_Hits",
         ray_width: float,
     ) -> Vectors:
-        """What comes from each direction, along rays so wide at depth 1."""
+        """Light from each direction; ray_width is a ray's width at depth 1."""
         light = _sky_radiance(world.sky, directions)
         met = hits.triangle >= 0
         surface = hits.select(met)
@@ -114,7 +114,7 @@ class Raycaster:
         return light
 
     def _sun_visibility(self, world: World, places_m: Vectors) -> Float[np.ndarray, " p"]:
-        """1 where nothing is between a place and the sun, else 0."""
+        """1 where nothing occludes the sun, otherwise 0."""
         assert self._scene is not None
         towards = np.broadcast_to(np.array(world.sky.sun, np.float32), places_m.shape)
         met = self._scene.run(places_m.astype(np.float32), np.ascontiguousarray(towards))
@@ -123,7 +123,7 @@ class Raycaster:
 
 @dataclass(frozen=True, kw_only=True)
 class _Hits:
-    """What rays met: triangle (-1 for none), distance in lengths of the ray (inf), the corners' shares."""
+    """Hits of rays: triangle (-1 for none), distance in lengths of the ray (inf), barycentric coordinates."""
 
     triangle: Int[np.ndarray, " p"]
     distance: Float[np.ndarray, " p"]
@@ -138,7 +138,7 @@ class _Hits:
 def _intersect_planes(
     mesh: Mesh, eye_m: np.ndarray, directions: Vectors, triangle: Int[np.ndarray, " p"]
 ) -> _Hits:
-    """Where rays meet the triangles' planes, in double precision; embree says only which triangle."""
+    """Intersect rays and their triangles' planes in double precision; embree only finds the triangle."""
     met = triangle >= 0
     first, second, third = mesh.corners_m[triangle[met]].astype(np.float64).transpose(1, 0, 2)
     edge, other, from_first = second - first, third - first, eye_m - first
@@ -153,7 +153,7 @@ def _intersect_planes(
 
 
 def _interpolate_normals(mesh: Mesh, hits: _Hits, directions: Vectors) -> Vectors:
-    """Unit normals on the side that is seen."""
+    """Interpolated unit normals, on the side facing the ray."""
     first, second, third = mesh.corners_m[hits.triangle].transpose(1, 0, 2)
     face = np.cross(second - first, third - first)
     normal = np.einsum("pc,pcx->px", hits.shares, mesh.normals[hits.triangle])
@@ -163,7 +163,7 @@ def _interpolate_normals(mesh: Mesh, hits: _Hits, directions: Vectors) -> Vector
 
 
 def _look_up_colours(world: World, hits: _Hits, ray_m: Float[np.ndarray, " p"]) -> Vectors:
-    """The share of each colour's light that surfaces throw back; ray_m: how wide the rays end."""
+    """Albedo at the hits; ray_m is the rays' width there."""
     material = world.mesh.material[hits.triangle]
     uv_m = np.einsum("pc,pcx->px", hits.shares, world.mesh.uv_m[hits.triangle])
     colours = np.empty((len(material), 3))
@@ -186,7 +186,7 @@ def _look_up_colours(world: World, hits: _Hits, ray_m: Float[np.ndarray, " p"]) 
 
 @functools.lru_cache(maxsize=24)
 def _mipmaps(layer: int) -> list[Float[np.ndarray, "side side 3"]]:
-    """A texture's light in ever fewer texels, each of them the mean of four of the level before."""
+    """Mipmaps of a texture in linear light."""
     levels = [srgb_to_linear(texture_bank().pixels[layer, ..., :3].astype(np.float32))]
     while len(levels[-1]) > 1:
         half = len(levels[-1]) // 2
@@ -195,7 +195,7 @@ def _mipmaps(layer: int) -> list[Float[np.ndarray, "side side 3"]]:
 
 
 def _sky_radiance(sky: Sky, directions: Vectors) -> Vectors:
-    """The sky's light from directions: shaders/light.glsl in NumPy."""
+    """The sky's radiance in directions; shaders/light.glsl in NumPy."""
     height = (directions[:, 2] / np.linalg.norm(directions, axis=1))[:, None]
     zenith, horizon, ground = (np.array(colour) for colour in (sky.zenith, sky.horizon, sky.ground))
     up = np.maximum(height, 0)
@@ -205,7 +205,7 @@ def _sky_radiance(sky: Sky, directions: Vectors) -> Vectors:
 
 
 def _sky_irradiance(sky: Sky, normals: Vectors) -> Vectors:
-    """The sky's light from all sides on white surfaces: shaders/light.glsl in NumPy."""
+    """The sky's irradiance on surfaces with these normals; shaders/light.glsl in NumPy."""
     zenith, horizon, ground = (np.array(colour) for colour in (sky.zenith, sky.horizon, sky.ground))
     up = 0.5 + 0.5 * normals[:, 2:]
     upper = horizon + 0.7 * up * (zenith - horizon)

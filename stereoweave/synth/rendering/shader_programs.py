@@ -1,4 +1,4 @@
-"""The renderer's programs for the graphics card, from the files in shaders/."""
+"""Shader programs of the OpenGL renderer, built from the files in shaders/."""
 
 from importlib import resources
 from typing import Any
@@ -12,7 +12,7 @@ from stereoweave.synth.rendering.shadow_and_occlusion import CELLS
 MOST_MATERIALS = 64
 MOST_LAMPS = 4
 
-# Vertex shader, then what the fragment shader is joined from.
+# Vertex shader, then the parts of the fragment shader.
 _PARTS = {
     "depth": ("depth.vert", "depth.frag"),
     "sun": ("sun.vert", "sun.frag"),
@@ -23,11 +23,11 @@ _SURFACE = ("surface.vert", "light.glsl", "surface.frag")
 
 
 class Programs:
-    """Every program by its name, compiled with the effects that are switched on.
+    """All programs by name, compiled for the active effects.
 
-    The program for surfaces is there once for each number of lamps (`surface`), because llvmpipe takes a
-    quarter longer for a loop over lamps whose number it learns from a uniform, even if that is 0; and once
-    more for each without a sun, whose shadows and gloss nobody sees in a closed room.
+    The surface program exists for each number of lamps, because llvmpipe takes a quarter longer for a loop
+    whose count is a uniform, even if that is 0. Each exists with and without a sun, because closed rooms
+    need none of its shadows and gloss.
     """
 
     def __init__(self, gl: moderngl.Context, effects: Effects) -> None:
@@ -47,14 +47,14 @@ class Programs:
         return self._programs[name]
 
     def bind_textures(self, **units: int) -> None:
-        """Tells every program in which texture units its samplers find their textures."""
+        """Set the texture units of all programs' samplers."""
         for program in self._programs.values():
             for key, unit in units.items():
                 if key in program:
                     program[key] = unit
 
     def set_uniforms(self, name: str, **values: Any) -> None:
-        """Sets a program's uniforms, matrices by columns; those that no effect uses are passed over."""
+        """Set a program's uniforms, matrices column by column; unused ones are ignored."""
         program = self._programs[name]
         for key, value in values.items():
             uniform = program.get(key, None)
@@ -63,7 +63,7 @@ class Programs:
 
 
 def surface_program(lamps: int, sun: bool) -> str:
-    """The name of the program for surfaces in the light of a number of lamps, with or without a sun."""
+    """Name of the surface program for a number of lamps, with or without sun."""
     return f"surface, {lamps} lamps{', sun' * sun}"
 
 

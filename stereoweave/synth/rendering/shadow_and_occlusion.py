@@ -1,6 +1,6 @@
-"""What light needs to know of a world beforehand: how the sun sees it, and where it is crowded.
+"""Geometry of shadows and ambient occlusion: the sun's view, and a grid of nearby surface.
 
-Triangles come as `Mesh.corners_m.T`, contiguous: axis, corner, triangle.
+Triangles are `Mesh.corners_m.T`, contiguous: axis, corner, triangle.
 """
 
 from dataclasses import dataclass
@@ -11,26 +11,26 @@ from jaxtyping import Float, Int, UInt8
 
 Corners = Float[np.ndarray, "3 3 _"]
 
-# Cells of the crowd's grid along an axis; around a target of 8 m they measure 17 cm.
+# Grid cells along each axis; 17 cm each around a target of 8 m.
 CELLS = 64
-# Between the target and the grid's border.
+# Margin between the target and the grid's border.
 _SPARE_CELLS = 8
-# A triangle larger than this many cells' sides is cut into pieces.
+# A triangle of a larger area, in faces of a cell, is subdivided.
 _LARGE_CELLS = 64
-# The side of the cube around a place that hides the sky from it: 1.5 m around a target of 8 m.
+# Side of the cube whose surface occludes its centre: 1.5 m around a target of 8 m.
 _WIDE_CELLS = 9
 
 
 @dataclass(frozen=True, kw_only=True)
 class SunView:
-    """The world as the sun sees it: a square around the target, and a wide one with the same middle.
+    """The sun's orthographic view: an inner square around the target, and a concentric wide one.
 
     Attributes:
         to_unit: [3, 4], from (x, y, z, 1) to 0..1 across and down the inner square, and away from the sun.
-        inner_m: the inner square's side.
-        wide: how many times as wide the other one is.
-        inside: the triangles that cast shadows into the inner square.
-        beyond: those that cast shadows into the wide square and do not lie in the inner one altogether.
+        inner_m: side of the inner square.
+        wide: side of the wide square over that of the inner one.
+        inside: indices of the triangles that cast shadows into the inner square.
+        beyond: indices of those that cast shadows into the wide square and are not entirely in the inner one.
     """
 
     to_unit: Float[np.ndarray, "3 4"]
@@ -43,7 +43,7 @@ class SunView:
 def fit_sun_view(
     corners_m: Corners, target_m: Corners, sun: tuple[float, float, float], reach_m: float
 ) -> SunView:
-    """The sun's view; a target's shadow fills the same square as the target, wherever it falls."""
+    """Fit the sun's view to the target; along the sun's rays, target and shadow cover the same square."""
     axes = _sun_axes(np.array(sun))
     low, high = _extent(_rotate(target_m, axes))
     middle = (low + high) / 2
@@ -68,7 +68,7 @@ def fit_sun_view(
 
 
 def _sun_axes(sun: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Two directions across the sun's rays and the one along them."""
+    """Rotation [3, 3]: two axes across the sun's rays, and their direction."""
     across = np.cross([0, 1, 0] if abs(sun[2]) > 0.9 else [0, 0, 1], sun)
     across = across / np.linalg.norm(across)
     return np.stack([across, np.cross(sun, across), -sun])
@@ -84,12 +84,12 @@ def _extent(corners_m: Corners) -> tuple[Float[np.ndarray, "3"], Float[np.ndarra
 
 @dataclass(frozen=True, kw_only=True)
 class OcclusionGrid:
-    """How much surface there is around places near the target.
+    """Ambient occlusion around the target.
 
     Attributes:
-        share: uint8 [CELLS, CELLS, CELLS], z y x: the share of the sky that it hides from there, 255 for all.
-        low_m: the cube's lower corner.
-        cell_m: the side of a cell.
+        share: uint8 [CELLS, CELLS, CELLS], z y x: hidden share of the sky, 255 is all of it.
+        low_m: lower corner of the grid.
+        cell_m: side of a cell.
     """
 
     share: UInt8[np.ndarray, "z y x"]
@@ -98,7 +98,7 @@ class OcclusionGrid:
 
 
 def count_occlusion(corners_m: Corners, target_m: Corners) -> OcclusionGrid:
-    """The surface around the target, counted on a grid from points spread evenly over the triangles."""
+    """Estimate occlusion from the surface area in each cell, sampled at points on the triangles."""
     low, high = _extent(target_m)
     cell_m = 1.1 * float((high - low).max()) / (CELLS - 2 * _SPARE_CELLS)
     low_m = (low + high) / 2 - np.float32(cell_m * CELLS / 2)
@@ -113,9 +113,9 @@ def count_occlusion(corners_m: Corners, target_m: Corners) -> OcclusionGrid:
 
 
 def _hidden_share(surface: Float[np.ndarray, "z y x"]) -> UInt8[np.ndarray, "z y x"]:
-    """The share of the sky hidden by surface in the cell itself and, less, in a cube about it.
+    """Share of the sky hidden by surface in the cell itself and, with less weight, in the cube around it.
 
-    A plane, which hides nothing from a place on it, is taken off the latter.
+    A plane hides no sky from points on it, so its area is subtracted from the cube's.
     """
     around = surface
     for axis in range(3):
@@ -123,14 +123,14 @@ def _hidden_share(surface: Float[np.ndarray, "z y x"]) -> UInt8[np.ndarray, "z y
         blurred = cv2.blur(layers.reshape(CELLS, -1), (1, _WIDE_CELLS), borderType=cv2.BORDER_CONSTANT)
         around = np.moveaxis(blurred.reshape(layers.shape), 0, axis)
     hidden = 0.35 * surface + 5 * np.maximum(around - 1.2 / _WIDE_CELLS, 0)
-    # What is outside the grid looks like its border.
+    # Lookups outside the grid return its border.
     inner = np.zeros_like(hidden)
     inner[1:-1, 1:-1, 1:-1] = hidden[1:-1, 1:-1, 1:-1]
     return (255 * np.minimum(inner, 0.85)).astype(np.uint8)
 
 
 def _cut_large(corners_m: Corners, low_m: Float[np.ndarray, "3"], cell_m: float) -> Corners:
-    """The triangles that touch the grid; large ones in pieces, so that few points are spread beside it."""
+    """Triangles that touch the grid; large ones are subdivided, so that few sample points miss it."""
     done = []
     rest = _select_near(corners_m, low_m, cell_m * CELLS)
     while rest.size:
@@ -147,7 +147,7 @@ def _select_near(corners_m: Corners, low_m: Float[np.ndarray, "3"], side_m: floa
 
 
 def _quarter(corners_m: Corners) -> Corners:
-    """Each triangle as four, cut through the middles of its edges."""
+    """Split each triangle into four at the midpoints of its edges."""
     a, b, c = corners_m.transpose(1, 0, 2)
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
     parts = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
@@ -163,13 +163,13 @@ def _areas(corners_m: Corners) -> Float[np.ndarray, " p"]:
 def _sample_points(
     corners_m: Corners, cell_m: float
 ) -> tuple[Float[np.ndarray, "3 p"], Float[np.ndarray, " p"]]:
-    """Points on the triangles, about two a cell, and the area that each stands for."""
+    """Sample points on the triangles, about two per cell, and the area that each represents."""
     first = corners_m[:, 0]
     edge, other = corners_m[:, 1] - first, corners_m[:, 2] - first
     areas = _areas(corners_m)
     counts = np.maximum(np.ceil(areas * np.float32(2 / cell_m**2)), 1).astype(np.int32)
     which = np.repeat(np.arange(len(areas)), counts)
-    # The powers of the plastic number fill a square evenly (Roberts, 2018); folded over, a triangle.
+    # Roberts's R2 sequence (2018) fills a square evenly; folded, it fills a triangle.
     number = np.arange(len(which))
     s, t = ((number * step % 1).astype(np.float32) for step in (0.7548776662, 0.5698402910))
     folded = s + t > 1

@@ -1,1 +1,1 @@
-"""Sets of rendered pairs: made, checked, shown."""
+"""Sets of rendered pairs: making, checking, contact sheets."""

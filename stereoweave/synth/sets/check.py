@@ -1,4 +1,4 @@
-"""Whether a set on disk is whole and true: checksums; disparities against the pictures and each other."""
+"""Verification of sets: checksums, disparities against the images and against each other."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -23,37 +23,37 @@ _DISPARITY_EDGES_PX = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 _DEPTH_EDGES_M = (0.0, 1.0, 2.0, 3.0, 5.0, 7.5, 10.0, 15.0, 25.0, 50.0, 100.0)
 _WIDEST_BAR = 40
 _PAIRS_A_TASK = 20
-# Rounding on disk is at most 0.002 px of it.
+# Rounding on disk contributes at most 0.002 px.
 _AGREE_PX = 0.05
-# Of rendered pairs of all scenes 98 % agree and more at 64x48, 99.1 % at 160x120 and 99.9 % at 640x480; with
-# one of the two maps 0.1 px off, 29 % at most.
+# Rendered pairs of all scenes agree at 98 % of the pixels or more at 64x48, 99.1 % at 160x120 and 99.9 % at
+# 640x480; with one of the two maps 0.1 px off, at 29 % at most.
 _LEAST_AGREEING = 0.95
-# Rendered pairs differ by at most 0.90, 0.76 and 0.66 of what they differ by a pixel beside the disparity;
-# those whose disparity is a pixel off by 1.1 and more, those that have changed sides by 0.99 and more.
+# Difference at the disparity over that one pixel beside it: at these sizes at most 0.90, 0.76 and 0.66 for
+# correct pairs, at least 1.1 for disparities 1 px off, and at least 0.99 for swapped sides.
 _LARGEST_RATIO = 0.97
-# The mean over fewer pixels is chance.
+# Means over fewer pixels are too noisy.
 _FEWEST_PIXELS = 200
-# What is farther, the sky above all, looks alike in both pictures even where these have changed sides.
+# Farther surfaces, above all the sky, look the same in both images even with swapped sides.
 _NEAR_PX = 1.0
 _JUMP_PX = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
 class Findings:
-    """What was found in pairs; those of several add up.
+    """Statistics and problems of checked pairs; findings add up.
 
     Attributes:
-        pairs: how many were looked at.
-        disparity: how many known pixels of left views lie in each of the 10 bars of the histogram.
-        depth: the same in its 11 bars of depth; the last one has the sky in it.
-        unknown: pixels without truth.
-        occluded: pixels that the left camera alone sees.
-        grey_levels: [3], sums over the pairs of the mean difference of the left picture and the right one,
-            fetched by the disparity - 1 px, by it, and by it + 1 px.
-        compared: of how many pairs that is: those with near things in both views.
-        agreeing: sum over the pairs of the share of pixels at which both disparities agree.
-        matched: of how many pairs that is: those with both disparities.
-        problems: a line each.
+        pairs: number of pairs.
+        disparity: histogram [10] of the left views' known disparities.
+        depth: histogram [11] of their depths; the last bin includes the sky.
+        unknown: number of pixels without ground truth.
+        occluded: number of pixels that only the left camera sees.
+        grey_levels: [3], sums over the compared pairs of the mean difference between the left image and the
+            right one warped by the disparity - 1 px, + 0 px and + 1 px.
+        compared: number of compared pairs: those with near surfaces in both views.
+        agreeing: sum over the matched pairs of the share of pixels whose two disparities agree.
+        matched: number of matched pairs: those with both disparities.
+        problems: one line each.
     """
 
     pairs: int
@@ -72,14 +72,14 @@ class Findings:
 
 
 class _Pairs(NamedTuple):
-    """Names and files of the pairs, a folder's frames being files of their own; and what reads one."""
+    """Names and files of the pairs, and the function that reads one; in folders each frame is a file."""
 
     names: list[str]
     files: list[str]
     read: Callable[[int], Sample]
 
     def runs(self) -> list[range]:
-        """The pairs in runs, none of which ends within a file."""
+        """Split the pairs into runs that end at file boundaries."""
         starts = [0, *(i for i in range(1, len(self.files)) if self.files[i] != self.files[i - 1])]
         if len(starts) == len(self.files):
             starts = starts[::_PAIRS_A_TASK]
@@ -87,10 +87,10 @@ class _Pairs(NamedTuple):
 
 
 def check_set(folder: Path, jobs: int = 1, console: Console | None = None) -> Findings:
-    """What all pairs of a set come to; `problems` is empty where the set is in order.
+    """Check all pairs of a set; `problems` is empty if the set is in order.
 
     Raises:
-        FormatError: There is no set in the folder, or files are missing between others.
+        FormatError: The folder holds no set, or files are missing between others.
     """
     facts = read_set(folder)
     pairs = _open_pairs(folder, facts["layout"], facts["scene"])
@@ -100,13 +100,13 @@ def check_set(folder: Path, jobs: int = 1, console: Console | None = None) -> Fi
     for part in run_in_workers(look, pairs.runs(), jobs, console or Console(), "checking pairs", count):
         found += part
     if count < facts["pairs"]:
-        lacking = f"{folder}: expected {facts['pairs']} pairs, as were asked for, found {count}"
-        found += _no_findings(f"{lacking}; the same stereoweave synth make goes on")
+        lacking = f"{folder}: expected {facts['pairs']} pairs, as requested, found {count}"
+        found += _no_findings(f"{lacking}; rerun the same stereoweave synth make to resume")
     return found
 
 
 def report_lines(found: Findings) -> Iterator[str]:
-    """The statistics of a set as text, with histograms of disparity and depth; then problems and how many."""
+    """Yield the report: statistics, histograms of disparity and depth, then the problems and their number."""
     if found.pairs:
         yield from _statistics(found)
     yield from found.problems
@@ -115,13 +115,13 @@ def report_lines(found: Findings) -> Iterator[str]:
 
 
 def find_problem(sample: Sample) -> str | None:
-    """What is wrong between the disparities and pictures of a pair, or None."""
+    """The first inconsistency between a pair's disparities and images, or None."""
     if not np.isfinite(sample.disparity_px).any():
         return "expected a disparity, found every pixel unknown"
     before, at, after = _grey_level_differences(sample)
     if at > _LARGEST_RATIO * min(before, after):
         return (
-            "expected the left picture to fit the right one best at the disparity, found them to differ by "
+            "expected the left picture to fit the right one best at the disparity, found differences of "
             f"{at:.2f} grey levels there, {before:.2f} at 1 px less and {after:.2f} at 1 px more"
         )
     agreeing = _agreeing_share(sample)
@@ -142,7 +142,7 @@ def _check_run(folder: Path, layout: str, scene: str, run: range) -> Findings:
             wrong = find_problem(sample)
             found += _measure(sample, f"{folder}: {pairs.names[index]}: {wrong}" if wrong else None)
         except FormatError as error:
-            # A damaged shard is to be deleted whole, and so its first damage says enough.
+            # A damaged shard must be deleted as a whole, so one line per shard suffices.
             damaged.setdefault(pairs.files[index], str(error))
         count_step()
     return found + _no_findings(*damaged.values())
@@ -203,15 +203,15 @@ def _measure(sample: Sample, problem: str | None) -> Findings:
 
 
 def _grey_level_differences(sample: Sample) -> Float[np.ndarray, "3"]:
-    """Mean difference of both pictures at near things that both see, by the disparity - 1, + 0 and + 1 px.
+    """Mean difference of both images on near surfaces seen by both, at the disparity - 1, + 0 and + 1 px.
 
-    NaN where there is next to nothing near.
+    NaN if too few pixels are near.
     """
     left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (sample.left, sample.right))
     columns = _matching_columns(sample)
     rows = np.broadcast_to(np.arange(len(columns), dtype=np.float32)[:, None], columns.shape).copy()
     last = columns.shape[1] - 1
-    # False where the disparity is unknown.
+    # Also false where the disparity is unknown.
     seen = ~sample.occluded & (columns >= 1) & (columns <= last - 1) & (sample.disparity_px >= _NEAR_PX)
     if seen.sum() < _FEWEST_PIXELS:
         return np.full(3, np.nan)
@@ -223,10 +223,10 @@ def _grey_level_differences(sample: Sample) -> Float[np.ndarray, "3"]:
 
 
 def _agreeing_share(sample: Sample) -> float:
-    """The share of what both views see, jumps left out, at which their disparities agree; NaN of nothing.
+    """Share of the pixels seen by both views whose disparities agree, excluding jumps; NaN if too few.
 
-    A disparity agrees that lies between those of the two columns beside its match: so a crease between the
-    two, where no interpolation is right, does not count as wrong.
+    A disparity agrees if it lies between the values at the two columns next to its match. This tolerates a
+    crease between them, where no interpolation would be right.
     """
     columns = _matching_columns(sample)
     inside = (columns >= 0) & (columns <= columns.shape[1] - 1)
@@ -236,7 +236,7 @@ def _agreeing_share(sample: Sample) -> float:
         for rounded in (np.floor, np.ceil)
     ]
     low_px, high_px = np.minimum(*beside), np.maximum(*beside)
-    # A wire narrower than a pixel may be in one view and fall between the columns of the other one.
+    # A wire narrower than a pixel may show in one view and fall between the columns of the other.
     level = _find_level(sample.disparity_px) & (high_px - low_px <= _JUMP_PX)
     seen = inside & level & ~sample.occluded
     if seen.sum() < _FEWEST_PIXELS:
@@ -246,12 +246,12 @@ def _agreeing_share(sample: Sample) -> float:
 
 
 def _matching_columns(sample: Sample) -> Float[np.ndarray, "h w"]:
-    """The column, in the right picture, of what each pixel of the left one shows."""
+    """Column in the right image that each left pixel matches."""
     return np.arange(sample.disparity_px.shape[1], dtype=np.float32) - sample.disparity_px
 
 
 def _find_level(disparity_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels without a jump of the disparity, or an unknown one, in the column before or after them."""
+    """Pixels without a disparity jump or unknown disparity in the column before or after them."""
     padded_px = np.pad(disparity_px, ((0, 0), (1, 1)), mode="edge")
     level = np.abs(np.diff(padded_px, axis=1)) <= _JUMP_PX
     return level[:, 1:] & level[:, :-1]
@@ -274,7 +274,7 @@ def _statistics(found: Findings) -> Iterator[str]:
         )
     if found.matched:
         share = found.agreeing / found.matched
-        yield f"both disparities agree to {_AGREE_PX} px at {share:.3%} of what both see, edges left out"
+        yield f"both disparities agree within {_AGREE_PX} px at {share:.3%} of shared pixels, edges excluded"
     yield from _histogram("disparity", "px", _DISPARITY_EDGES_PX, found.disparity)
     yield from _histogram("depth", "m", _DEPTH_EDGES_M, found.depth)
 

@@ -1,4 +1,4 @@
-"""All scenes at one look: a picture with a row for each."""
+"""Contact sheets: one row per scene, or unlabelled pictures as a quiz."""
 
 from collections.abc import Iterator, Sequence
 
@@ -21,7 +21,7 @@ _LABEL_PX = 20
 def contact_sheet(
     renderer: SceneRenderer, scenes: Sequence[str], seed: int, index: int = 0
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Pair `index` of each scene in a row: left, right, depth in colour (red is near), and both masks."""
+    """One row per scene for pair `index`: left, right, coloured depth (red is near), both occlusion masks."""
     rows = [np.hstack([_draw_label(text) for text in COLUMNS])]
     for scene, sample in _render_samples(renderer, [(scene, index) for scene in scenes], seed):
         tiles = [_shrink(picture) for picture in _row_of_pictures(sample)]
@@ -32,7 +32,7 @@ def contact_sheet(
 def quiz_sheet(
     renderer: SceneRenderer, scenes: Sequence[str], seed: int, pictures: int = 16
 ) -> tuple[UInt8[np.ndarray, "h w 3"], list[str]]:
-    """Left pictures in four columns without a label, in an order of chance; and the scene of each, by row."""
+    """Unlabelled left images in four columns in random order. Returns the sheet and its scenes by row."""
     order = np.random.default_rng(seed).permutation(
         [scenes[place % len(scenes)] for place in range(pictures)]
     )
@@ -46,7 +46,7 @@ def quiz_sheet(
 def _render_samples(
     renderer: SceneRenderer, pairs: Sequence[tuple[str, int]], seed: int
 ) -> Iterator[tuple[str, Sample]]:
-    """Scene and sample of each pair; a bar shows how far it is."""
+    """Yield scene and sample of each pair, with a progress bar."""
     with progress(Console()) as bar:
         shown = bar.add_task("rendering pairs", total=len(pairs), loss="", rate="")
         for scene, index in pairs:
@@ -66,7 +66,7 @@ def _row_of_pictures(sample: Sample) -> list[UInt8[np.ndarray, "h w 3"]]:
 def _overlay_mask(
     image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture in dark grey, the mask in orange."""
+    """The image in dark grey with the mask in orange."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) // 2
     return np.where(mask[..., None], np.array(OCCLUDED_RGB, np.uint8), grey[..., None])
 

@@ -1,4 +1,4 @@
-"""What each effect costs."""
+"""Time that each rendering effect costs."""
 
 import time
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ _OFF = {
 
 @dataclass(frozen=True, kw_only=True)
 class Cost:
-    """How many milliseconds of one core a pair takes longer with an effect, or takes in all."""
+    """Time per pair on one core in milliseconds: an effect's share, or the total."""
 
     effect: str
     ms_a_pair: float
@@ -30,7 +30,7 @@ class Cost:
 def measure_effect_costs(
     scene: str = "propeller", pairs: int = 3, size_px: tuple[int, int] = (640, 480)
 ) -> list[Cost]:
-    """All effects together, what each adds to them, and no effect: both views and depths, scene apart."""
+    """Measure all effects together, each one's share, and no effects; building the scene is excluded."""
     spec = RenderSpec(scene=scene, size_px=size_px)
     renderer = OpenGLRenderer(PLAIN)
     stages = [draw_stage_and_rig(renderer, spec, index) for index in range(pairs)]
@@ -48,7 +48,7 @@ def measure_effect_costs(
 
 
 def _ms_a_pair(effects: Effects, views: list[tuple[World, PosedRig]]) -> float:
-    """The mean over the views of the better of two tries, each with a world that is new to the renderer."""
+    """Mean over the views of the faster of two runs, each with a world new to the renderer."""
     renderer = OpenGLRenderer(effects)
     renderer.render_views(*views[0], (0.0, 1.0))
     total_s = 0.0

@@ -1,4 +1,4 @@
-"""Sets of rendered pairs on disk, made by several processes; one that was stopped goes on where it was."""
+"""Resumable making of sets of rendered pairs in several processes."""
 
 import hashlib
 import json
@@ -28,24 +28,24 @@ from stereoweave.system.ray_engine import Engine
 
 SET_FILE = "set.json"
 FORMAT = 1
-# 50 MB of 640x480: enough to read at the disk's full speed, and half a minute's work to lose.
+# 50 MB at 640x480: large enough to read at the disk's full speed; half a minute of work at stake.
 PAIRS_A_SHARD = 50
-# Frames have files of their own, so that a worker's run may be short, and no worker be without one.
+# Each frame has its own files, so runs may be short and keep every worker busy.
 _FRAMES_A_RUN = 4
-# Colour and depth of the samples of such a picture take half a gigabyte.
+# The sample buffers of such a picture take half a gigabyte.
 _LARGEST_SIDE_PX = 4096
-_NOT_OF_THE_PAIRS = {"make.py", "workers.py", "check.py", "contact_sheet.py", "effect_costs.py"}
-_OF_THE_PAIRS_TOO = ("stereo.py", "data/samples.py", "data/packing.py", "data/paper_layout.py")
-# What casts the rays, or draws the triangles, is in the renderer's name.
+_EXCLUDED_SOURCES = {"make.py", "workers.py", "check.py", "contact_sheet.py", "effect_costs.py"}
+_ADDED_SOURCES = ("stereo.py", "data/samples.py", "data/packing.py", "data/paper_layout.py")
+# Embree's and OpenGL's versions are part of the renderer's name.
 _PACKAGES = ("moderngl", "numpy", "opencv-python-headless", "pillow", "scikit-image")
 
 
 @runtime_checkable
 class PairMaker(Protocol):
-    """What makes pairs, in whichever process it is sent to."""
+    """Makes pairs; it is pickled and sent to worker processes."""
 
     def renderer(self) -> str:
-        """What decides the bytes of a pair besides the order and the generator's version."""
+        """Name of the renderer: with the spec and the generator's version it determines a pair's bytes."""
         ...
 
     def __call__(self, spec: RenderSpec, index: int) -> RenderedPair: ...
@@ -53,12 +53,12 @@ class PairMaker(Protocol):
 
 @dataclass(frozen=True)
 class PairRenderer:
-    """Makes pairs with the best renderer that this machine has; `plain` leaves every effect out."""
+    """Makes pairs with the best renderer of this machine; `plain` turns all effects off."""
 
     plain: bool = False
 
     def renderer(self) -> str:
-        # In a process that ends at once: a renderer takes more memory than all else here.
+        # In a short-lived process, because a renderer takes much memory.
         (name,) = run_in_workers(
             _renderer_name, [self.plain], 1, Console(quiet=True), "starting the renderer", 1
         )
@@ -69,13 +69,13 @@ class PairRenderer:
 
 
 class Layout(NamedTuple):
-    """A way to lay pairs out in a folder.
+    """A storage layout of pairs in a folder.
 
     Attributes:
-        whole_pairs: the numbers of a scene's pairs that are whole.
-        write: writes pairs of these numbers as they come.
-        remove_unfinished: removes what was not written to the end.
-        pairs_a_run: how many pairs one worker makes at a time; no run reaches past a multiple of it.
+        whole_pairs: lists the numbers of a scene's complete pairs.
+        write: writes a run of pairs as they arrive.
+        remove_unfinished: deletes partly written files.
+        pairs_a_run: pairs that a worker makes in one task; no run crosses a multiple of it.
     """
 
     whole_pairs: Callable[[Path, str], set[int]]
@@ -84,7 +84,7 @@ class Layout(NamedTuple):
     pairs_a_run: int
 
 
-def make(  # noqa: PLR0913 - each is a word of the command line
+def make(  # noqa: PLR0913 - mirrors the command's options
     spec: RenderSpec,
     pairs: int,
     out: Path,
@@ -95,23 +95,23 @@ def make(  # noqa: PLR0913 - each is a word of the command line
     pair_maker: PairMaker = PairRenderer(),
     console: Console | None = None,
 ) -> int:
-    """How many pairs were made to have the first `pairs` of an order in a folder; the others were there.
+    """Make the missing ones of the first `pairs` pairs of a set. Returns the number of pairs made.
 
     Args:
         spec: Scene, seed, size and so on.
-        pairs: How many there shall be.
-        out: The folder, new or with the same set.
+        pairs: Size of the finished set.
+        out: The set's folder, new or to be resumed.
         layout: A name in LAYOUTS.
-        jobs: Processes at a time; the bytes do not depend on it.
-        engine: Where the pairs are made instead; all its machines have to see `out`, and the bytes do not
-            depend on it either. What a killed worker was making is made again.
-        pair_maker: What makes the pairs.
-        console: Where the progress is shown.
+        jobs: Number of worker processes; the bytes do not depend on it.
+        engine: Cluster to use instead of local processes; all its machines must see `out`. The bytes do not
+            depend on it. The tasks of killed workers are repeated.
+        pair_maker: Makes the pairs.
+        console: Shows the progress.
 
     Raises:
-        StereoweaveError: Nonsense was asked for, `out` has another set in it, is in use or cannot be written,
-            the disk is full, a worker was killed, or a machine does not see `out` or would make other pairs.
-            All that is there then is whole, and the same call goes on.
+        StereoweaveError: An argument is invalid; `out` holds another set, is in use or cannot be written; the
+            disk is full; a worker was killed; or a machine does not see `out` or would make other pairs. All
+            finished pairs are then complete, and the same call resumes.
     """
     _check(spec, pairs, layout)
     make_folder(out)
@@ -119,20 +119,22 @@ def make(  # noqa: PLR0913 - each is a word of the command line
         _claim(out, _set_facts(spec, layout, pair_maker), pairs)
         runs = _split_into_runs(_missing_pairs(spec, pairs, out, layout), LAYOUTS[layout].pairs_a_run)
         missing = sum(map(len, runs))
-        told = console or Console(), f"making {spec.scene}", missing
+        progress = console or Console(), f"making {spec.scene}", missing
         try:
             if engine is None:
-                for _ in run_in_workers(partial(_make_run, spec, out, layout, pair_maker), runs, jobs, *told):
+                for _ in run_in_workers(
+                    partial(_make_run, spec, out, layout, pair_maker), runs, jobs, *progress
+                ):
                     pass
             else:
-                # Absolute, because its workers have another current folder.
+                # Absolute, because the workers have another working directory.
                 run_in_engine(
-                    partial(_prepare_node, spec, out.absolute(), layout, pair_maker), runs, engine, *told
+                    partial(_prepare_node, spec, out.absolute(), layout, pair_maker), runs, engine, *progress
                 )
                 _check_shared(out, _missing_pairs(spec, pairs, out, layout))
         except StereoweaveError as error:
             raise StereoweaveError(
-                f"{error}; what is there is whole, and the same command goes on"
+                f"{error}; all finished pairs are complete: rerun the same command to resume"
             ) from error
         finally:
             LAYOUTS[layout].remove_unfinished(out)
@@ -140,29 +142,29 @@ def make(  # noqa: PLR0913 - each is a word of the command line
 
 
 def read_set(folder: Path) -> dict[str, Any]:
-    """What is written about a set: its order, its layout, what made it, and how many pairs were asked for.
+    """Read a set's description: spec, layout, generator, renderer and number of pairs.
 
     Raises:
-        FormatError: There is no set in the folder, one in another version's format, or a damaged description.
+        FormatError: The folder holds no set, one of another format version, or a damaged description.
     """
     path = folder / SET_FILE
-    with reading(path, "the description of a set that stereoweave synth make made"):
+    with reading(path, "the description of a set made by stereoweave synth make"):
         facts = json.loads(path.read_text(encoding="utf-8"))
     if not (isinstance(facts, dict) and facts.get("format") == FORMAT):
         raise FormatError(
-            f"{path}: expected a set of format {FORMAT}, found one that another version of stereoweave made; "
-            "read it with that one, or make it anew"
+            f"{path}: expected a set of format {FORMAT}, found one made by another version of stereoweave; "
+            "read it with that version, or make the set again"
         )
     _check_facts(path, facts)
     return facts
 
 
 def generator_version() -> str:
-    """8 hexadecimal digits that change with the code that makes pairs, and with the packages it uses."""
+    """Hash (8 hexadecimal digits) of the sources that make pairs and of their packages' versions."""
     folder = Path(__file__).parents[1]
     sources = sorted(path for path in folder.rglob("*.*") if path.suffix != ".pyc" and path.is_file())
-    sources = [path for path in sources if path.name not in _NOT_OF_THE_PAIRS]
-    sources += [folder.parent / name for name in _OF_THE_PAIRS_TOO]
+    sources = [path for path in sources if path.name not in _EXCLUDED_SOURCES]
+    sources += [folder.parent / name for name in _ADDED_SOURCES]
     contents = [path.read_bytes() for path in sources]
     versions = [f"{package}=={version(package)}".encode() for package in _PACKAGES]
     return hashlib.sha256(b"".join(contents + versions)).hexdigest()[:8]
@@ -176,7 +178,7 @@ def _check_facts(path: Path, facts: dict[str, Any]) -> None:
     if wrong:
         raise FormatError(
             f"{path}: expected layout ({' or '.join(LAYOUTS)}), scene and number of pairs as written, "
-            f"found {wrong[0]} = {json.dumps(facts.get(wrong[0]))}; put back the file, or make the set anew"
+            f"found {wrong[0]} = {json.dumps(facts.get(wrong[0]))}; restore the file, or make the set again"
         )
 
 
@@ -214,7 +216,7 @@ def _set_facts(spec: RenderSpec, layout: str, pair_maker: PairMaker) -> dict[str
 
 
 def _claim(out: Path, facts: dict[str, Any], pairs: int) -> None:
-    """Writes down whose folder this is, or refuses one that is another's."""
+    """Write the set's description; raises StereoweaveError if the folder holds another set."""
     if (out / SET_FILE).exists():
         found = read_set(out)
         pairs = max(pairs, found.pop("pairs"))
@@ -233,15 +235,15 @@ def _missing_pairs(spec: RenderSpec, pairs: int, out: Path, layout: str) -> list
 def _prepare_node(
     spec: RenderSpec, out: Path, layout: str, pair_maker: PairMaker
 ) -> Callable[[Sequence[int]], int]:
-    """What makes runs of the set here; StereoweaveError where it is not seen, or would become another."""
+    """Check that this node sees the set and makes the same pairs. Returns the function that makes runs."""
     try:
         found = read_set(out)
         del found["pairs"]
         check_claim(out / SET_FILE, _set_facts(spec, layout, pair_maker), found)
     except StereoweaveError as error:
         raise StereoweaveError(
-            f"{platform.node()}: {error}; all nodes of a cluster need the folder on a disk that they share, "
-            "and the same versions of all"
+            f"{platform.node()}: {error}; all nodes of a cluster need the folder on a shared disk "
+            "and the same versions of all packages"
         ) from error
     return partial(_make_run, spec, out, layout, pair_maker)
 
@@ -250,12 +252,12 @@ def _check_shared(out: Path, lacking: Sequence[int]) -> None:
     if lacking:
         raise StereoweaveError(
             f"{out}: expected all pairs that the cluster made, found {len(lacking)} of them missing; "
-            "do all its nodes share the disk?"
+            "check that all its nodes share the disk"
         )
 
 
 def _split_into_runs(numbers: Sequence[int], most: int) -> list[list[int]]:
-    """Sorted numbers in runs without a gap, none of which reaches past a multiple of `most`."""
+    """Split sorted numbers into runs of consecutive ones; no run crosses a multiple of `most`."""
     places = enumerate(numbers)
     groups = groupby(places, key=lambda item: (item[1] - item[0], item[1] // most))
     return [[number for _, number in group] for _, group in groups]

@@ -1,4 +1,4 @@
-"""Pair number `index` of a scene: a stage, a rig, its pictures, and the exact truth."""
+"""Rendering of single pairs: stage, rig, images and exact ground truth."""
 
 import zlib
 from collections.abc import Callable, Sequence
@@ -23,17 +23,17 @@ from stereoweave.synth.viewpoints import (
 )
 from stereoweave.synth.world import RenderedView, World
 
-# What is nearer than this share of the picture decides the baseline: a single blade of grass does not.
+# This quantile of depth decides the baseline: a single blade of grass does not count.
 _NEAREST_SHARE = 0.01
-# Of what stands right before one of the two eyes even a wire counts, if it is so much nearer than drawn.
+# Right in front of either camera even a wire counts, if its disparity exceeds the drawn one by this factor.
 _WIRE_SHARE, _EXCESS = 0.002, 1.25
-# Looking for what is nearest takes a small picture only.
+# A small picture suffices to find the nearest surface.
 _LOOK_WIDTH_PX = 160
 
 
 @runtime_checkable
 class SceneRenderer(Protocol):
-    """Takes pictures of worlds: `renderer.Renderer`, or `raycast.Raycaster`, which is slower and plainer."""
+    """Renders worlds: `OpenGLRenderer`, or `Raycaster`, which is slower and plainer."""
 
     @property
     def name(self) -> str: ...
@@ -45,15 +45,15 @@ class SceneRenderer(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSpec:
-    """What is to be rendered.
+    """Specification of the pairs of a set.
 
     Attributes:
         scene: a name in SCENES.
-        seed: of everything random, together with the scene's name and the index.
+        seed: determines all random draws, together with the scene's name and the pair's index.
         size_px: width and height.
-        frames: pairs in a row that show one world, from a camera that moves smoothly; 1 for stills.
-        views: positions of further views between (or beyond) the two cameras, such as 0.5.
-        rig: focal length in px and baseline in m of all pairs; None to draw them anew for each world.
+        frames: consecutive pairs that form a video of one world by a moving camera; 1 for stills.
+        views: positions of additional views between (or beyond) the two cameras, such as 0.5.
+        rig: focal length in px and baseline in m of all pairs; None draws them for each world.
     """
 
     scene: str
@@ -67,27 +67,27 @@ class RenderSpec:
         if self.scene not in SCENES:
             raise StereoweaveError(f"scene: expected one of {', '.join(SCENES)}, found {self.scene!r}")
         if self.rig is not None:
-            _centred_camera(*self.rig, self.size_px)  # which refuses nonsense
+            _centred_camera(*self.rig, self.size_px)  # raises if invalid
 
 
 @dataclass(frozen=True, kw_only=True)
 class RenderedPair:
-    """A pair with its truth.
+    """A pair with its ground truth.
 
     Attributes:
         sample: the pair, its disparities (0 for the sky), occlusion masks and camera.
-        views: position and picture of each further view.
+        views: position and image of each additional view.
     """
 
     sample: Sample
     views: tuple[tuple[float, RenderedView], ...]
 
 
-def render_pair(camera: SceneRenderer, spec: RenderSpec, index: int) -> RenderedPair:
-    """Pair number `index` of an order, the same in every process."""
+def render_pair(renderer: SceneRenderer, spec: RenderSpec, index: int) -> RenderedPair:
+    """Render pair number `index` of a set; the result is the same in every process."""
     sequence, frame = divmod(index, spec.frames)
-    stage, rig = draw_stage_and_rig(camera, spec, sequence, frame)
-    left, right, *others = camera.render_views(stage.world, rig, (0.0, 1.0, *spec.views))
+    stage, rig = draw_stage_and_rig(renderer, spec, sequence, frame)
+    left, right, *others = renderer.render_views(stage.world, rig, (0.0, 1.0, *spec.views))
     left_px, right_px = (rig.camera.disparity_px(shot.depth_m).astype(np.float32) for shot in (left, right))
     rng = np.random.default_rng((*_seed(spec, sequence), frame))
     left_image, right_image = (_add_noise(rng, shot.image, stage.noise_levels) for shot in (left, right))
@@ -99,15 +99,15 @@ def render_pair(camera: SceneRenderer, spec: RenderSpec, index: int) -> Rendered
 
 
 def draw_stage_and_rig(
-    camera: SceneRenderer, spec: RenderSpec, sequence: int, frame: int = 0
+    renderer: SceneRenderer, spec: RenderSpec, sequence: int, frame: int = 0
 ) -> tuple[Stage, PosedRig]:
-    """The stage and rig of a frame of a sequence; (seed, scene, sequence) decide all but the frame."""
+    """Draw stage and rig of a frame; all but its viewpoint depend on (seed, scene, sequence) only."""
     rng = np.random.default_rng(_seed(spec, sequence))
     stage = SCENES[spec.scene](rng)
     focal_px = draw_focal_px(rng, spec.size_px[0])
     nearest_px = draw_nearest_px(rng, spec.size_px[0], stage.nearest_px)
     start = draw_viewpoint(rng, stage.orbit)
-    # A film pans over a part of the orbit.
+    # A video covers a part of the orbit.
     end = interpolate_viewpoints(start, draw_viewpoint(rng, stage.orbit), rng.uniform(0.15, 0.4))
     ends = (start,) if spec.frames == 1 else (start, end)
     if spec.rig is not None:
@@ -120,12 +120,10 @@ def draw_stage_and_rig(
             small = _centred_camera(scale * focal_px, baseline_m, size_px)
             return [place_rig(stage.orbit, place, small, size_px) for place in ends]
 
-        baseline_m = _choose_baseline_m(camera, stage.world, rigs, nearest_px / focal_px)
+        baseline_m = _choose_baseline_m(renderer, stage.world, rigs, nearest_px / focal_px)
     share = frame / max(spec.frames - 1, 1)
-    camera_model = _centred_camera(focal_px, baseline_m, spec.size_px)
-    return stage, place_rig(
-        stage.orbit, interpolate_viewpoints(start, end, share), camera_model, spec.size_px
-    )
+    camera = _centred_camera(focal_px, baseline_m, spec.size_px)
+    return stage, place_rig(stage.orbit, interpolate_viewpoints(start, end, share), camera, spec.size_px)
 
 
 def _seed(spec: RenderSpec, sequence: int) -> tuple[int, int, int]:
@@ -135,7 +133,7 @@ def _seed(spec: RenderSpec, sequence: int) -> tuple[int, int, int]:
 def _add_noise(
     rng: np.random.Generator, image: UInt8[np.ndarray, "h w 3"], levels: float
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture with a sensor's noise, which grows with the root of the brightness as photons' does."""
+    """Add sensor noise; like shot noise it grows with the root of the brightness."""
     if not levels:
         return image
     deviation = levels * np.sqrt((0.25 + image / 255) / 1.25)
@@ -143,23 +141,23 @@ def _add_noise(
 
 
 def _choose_baseline_m(
-    camera: SceneRenderer, world: World, rigs: Callable[[float], Sequence[PosedRig]], metres_px: float
+    renderer: SceneRenderer, world: World, rigs: Callable[[float], Sequence[PosedRig]], metres_px: float
 ) -> float:
-    """The baseline that gives what is nearest, seen from half way between the two eyes, its disparity.
+    """Baseline in metres that gives the nearest surface, seen from the rig's centre, the wanted disparity.
 
-    Where the eyes then stand something may be nearer: if its disparity exceeds the wanted one by more than a
-    quarter, the baseline is so much shorter.
+    From the cameras' actual centres something else may be nearer. If its disparity exceeds the wanted one by
+    more than a quarter, the baseline is shortened to that limit.
 
     Args:
-        camera: which looks at the world.
-        world: what there is.
-        rigs: for a baseline in metres.
-        metres_px: the wanted disparity through the focal length: of baseline, for each metre of depth.
+        renderer: Renders depth.
+        world: The world to look at.
+        rigs: Returns the rigs for a baseline in metres.
+        metres_px: Wanted disparity over focal length: metres of baseline per metre of depth.
     """
 
     def nearest_m(baseline_m: float, positions: Sequence[float], share: float) -> float:
         views = [(rig, position) for rig in rigs(baseline_m) for position in positions]
-        return min(float(np.quantile(camera.depth_m(world, *view), share)) for view in views)
+        return min(float(np.quantile(renderer.depth_m(world, *view), share)) for view in views)
 
     baseline_m = metres_px * nearest_m(1e-6, (0.0,), _NEAREST_SHARE)
     return min(baseline_m, _EXCESS * metres_px * nearest_m(baseline_m, (0.0, 1.0), _WIRE_SHARE))

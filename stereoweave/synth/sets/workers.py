@@ -1,4 +1,4 @@
-"""Work shared among processes, one core each, that end with the one that started them; or among machines."""
+"""Parallel work in local processes, one core each, or on a cluster."""
 
 import multiprocessing
 import os
@@ -19,11 +19,11 @@ from stereoweave.system.ray_engine import Engine, connect, stream
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-# Of a worker of this machine: how many steps all of them have done.
+# In a local worker: the number of steps done by all of them.
 _done: "Synchronized[int] | None" = None
 
 
-def run_in_workers(  # noqa: PLR0913 - what, on what, by how many, and how it is told
+def run_in_workers(  # noqa: PLR0913 - work, workers, and progress
     work: Callable[[Task], Result],
     tasks: Sequence[Task],
     jobs: int,
@@ -31,20 +31,20 @@ def run_in_workers(  # noqa: PLR0913 - what, on what, by how many, and how it is
     description: str,
     steps: int,
 ) -> Iterator[Result]:
-    """The results of `work`, as they come, which is in no order.
+    """Yield the results of `work` in order of completion.
 
     Args:
-        work: A function of a module, or what else can be pickled; it calls `step_done` for each step.
-        tasks: What it is called with.
-        jobs: Processes at a time.
-        console: Where the progress is shown.
-        description: What the bar says.
-        steps: How many there are in all.
+        work: A picklable function; it calls `count_step` after each step.
+        tasks: Its arguments.
+        jobs: Number of processes.
+        console: Shows the progress.
+        description: Label of the progress bar.
+        steps: Total number of steps.
 
     Raises:
         StereoweaveError: A worker was killed.
     """
-    # Started afresh, because a forked child inherits OpenGL's and OpenCV's threads in an unknown state.
+    # Spawned: a forked child would inherit the threads of OpenGL and OpenCV in an unknown state.
     context = multiprocessing.get_context("spawn")
     done = context.Value("L", 0)
     others = multiprocessing.active_children()
@@ -55,7 +55,7 @@ def run_in_workers(  # noqa: PLR0913 - what, on what, by how many, and how it is
                 pending = {pool.submit(work, task) for task in tasks}
                 while pending:
                     finished, pending = wait(pending, timeout=0.5, return_when=FIRST_COMPLETED)
-                    # Without its lock, which a killed worker may hold for ever.
+                    # Without the lock, because a killed worker may hold it forever.
                     bar.update(shown, completed=done.get_obj().value)
                     yield from (future.result() for future in finished)
         except BaseException as error:
@@ -65,12 +65,12 @@ def run_in_workers(  # noqa: PLR0913 - what, on what, by how many, and how it is
                     child.terminate()
             if isinstance(error, BrokenProcessPool):
                 raise StereoweaveError(
-                    f"{description}: expected every worker to live, found one killed; is the memory full?"
+                    f"{description}: expected every worker to survive, found one killed; is memory full?"
                 ) from error
             raise
 
 
-def run_in_engine(  # noqa: PLR0913 - as `in_workers`
+def run_in_engine(  # noqa: PLR0913 - see `run_in_workers`
     make_work: Callable[[], Callable[[Task], int]],
     tasks: Sequence[Task],
     engine: Engine,
@@ -78,18 +78,19 @@ def run_in_engine(  # noqa: PLR0913 - as `in_workers`
     description: str,
     steps: int,
 ) -> None:
-    """Does what `in_workers` does by an engine's workers, whose tasks are done again where one is killed.
+    """Do all tasks on a cluster; the tasks of killed workers are repeated.
 
     Args:
-        make_work: Makes, once in each worker, what gives the number of steps that a task was.
-        tasks: As for `in_workers`, and so are the last three.
-        engine: Where.
-        console: See there.
-        description: See there.
-        steps: See there.
+        make_work: Called once in each worker. Returns the function that does a task and returns its number
+            of steps.
+        tasks: The function's arguments.
+        engine: The cluster.
+        console: Shows the progress.
+        description: Label of the progress bar.
+        steps: Total number of steps.
 
     Raises:
-        StereoweaveError: As in `engine.stream`.
+        StereoweaveError: See `ray_engine.stream`.
     """
     with connect(engine), progress(console) as bar:
         shown = bar.add_task(description, total=steps, loss="", rate="")
@@ -98,7 +99,7 @@ def run_in_engine(  # noqa: PLR0913 - as `in_workers`
 
 
 def count_step() -> None:
-    """Called by `work` after each step, for the bar."""
+    """Advance the progress bar; called by `work` after each step."""
     if _done is not None:
         with _done.get_lock():
             _done.value += 1
@@ -117,5 +118,5 @@ def _begin_in_engine(make_work: Callable[[], Callable[[Task], int]]) -> Callable
 
 
 def _draw_with_one_thread() -> None:
-    # Mesa reads it when the first context is made; more threads than cores slow all of them down.
+    # Mesa reads it when it creates the first context; more threads than cores would slow down all of them.
     os.environ["LP_NUM_THREADS"] = "1"

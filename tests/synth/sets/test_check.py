@@ -195,7 +195,7 @@ def test_a_set_that_was_not_finished_is_a_problem(folder):
     text = (folder / "set.json").read_text().replace("3}", "5}")
     (folder / "set.json").write_text(text)
     (message,) = checked(folder).problems
-    assert message.startswith(f"{folder}: expected 5 pairs, as were asked for, found 3")
+    assert message.startswith(f"{folder}: expected 5 pairs, as requested, found 3")
 
 
 def test_several_processes_find_what_one_finds(folder):

@@ -1,6 +1,6 @@
-// The sky, and what a film makes of light.
+// Sky light and tone mapping.
 
-uniform vec3 sun;  // towards it
+uniform vec3 sun;  // direction towards it
 uniform vec3 sun_light;
 uniform vec3 zenith;
 uniform vec3 horizon;
@@ -9,21 +9,21 @@ uniform float exposure;
 
 const float PI = 3.14159265;
 
-// The sky's light from one direction.
+// The sky's radiance in a direction.
 vec3 sky_radiance(vec3 direction) {
     float up = max(direction.z, 0);
     vec3 above = mix(horizon, zenith, 1.3 * up / (up + 0.3));
     return mix(above, ground, smoothstep(0.0, 0.12, -direction.z));
 }
 
-// The sky's light from all sides on a white surface that faces a direction.
+// The sky's irradiance on a surface with this normal.
 vec3 sky_irradiance(vec3 direction) {
     float up = 0.5 + 0.5 * direction.z;
     return mix(mix(ground, horizon, up), mix(horizon, mix(horizon, zenith, 0.7), up), up);
 }
 
-// A curve with a soft toe and shoulder: 0.18 becomes 0.23, 1 becomes 0.8. Coded as a square root,
-// so that eight bits hold it without steps.
+// Tone curve with soft toe and shoulder: 0.18 becomes 0.23, 1 becomes 0.8. Stored as a square root to avoid
+// banding in eight bits.
 vec4 tone_mapped(vec3 light) {
     vec3 exposed = exposure * light;
     vec3 dense = exposed * sqrt(exposed);

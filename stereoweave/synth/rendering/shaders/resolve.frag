@@ -1,4 +1,4 @@
-// A pixel from its samples: their mean in light as it leaves a screen, then sRGB.
+// Pixel from its samples: mean of the tone-mapped light, then sRGB.
 
 uniform sampler2D samples;
 

@@ -1,6 +1,6 @@
-// What is behind everything: the gradient, clouds, a glare about the sun.
+// Background: the sky's gradient, clouds, and glare around the sun.
 
-uniform mat3 direction_matrix;  // from the place in the frame buffer
+uniform mat3 direction_matrix;  // from frame buffer coordinates
 uniform sampler2DArray textures;
 uniform float cloud_layer;
 uniform float clouds;
@@ -12,7 +12,7 @@ void main() {
     vec3 direction = normalize(direction_matrix * vec3(gl_FragCoord.xy, 1));
     vec3 seen = sky_radiance(direction);
     float up = max(direction.z, 0);
-    // The texture is how much cloud there is; clouds lie on a plane overhead.
+    // The texture is the cloud density; clouds lie on a plane overhead.
     vec2 overhead = direction.xy / (up + 0.15);
     float cloud = texture(textures, vec3(0.2 * overhead, cloud_layer)).r;
     float cover = smoothstep(0.7 - 0.7 * clouds, 1.2 - 0.6 * clouds, cloud) * smoothstep(0.0, 0.15, up);

@@ -1,4 +1,4 @@
-// A surface in the light of sun, sky and lamps.
+// Surface lit by sun, sky and lamps.
 
 struct Material {
     vec3 tint;
@@ -31,13 +31,13 @@ out vec4 colour;
 
 #ifdef SHADOWS
 uniform sampler2DShadow shadow_map;
-uniform mat4x3 to_unit;  // the square around the target, as the sun sees it
-uniform float wide;      // how many times as wide the other square is
-uniform vec4 squares;    // how much of the map's width each takes, and of its height
-uniform vec2 texels;     // one texel of each, as a share of the inner square's side
+uniform mat4x3 to_unit;  // to the inner square of the sun's view
+uniform float wide;      // side of the wide square over that of the inner one
+uniform vec4 squares;    // each square's share of the map's width and height
+uniform vec2 texels;     // texel of each, as a share of the inner square's side
 uniform float inner_m;
 
-// The share of the sun that is seen. Off the surface by two texels, because the map is read three texels wide.
+// Visible share of the sun. Offset from the surface by two texels, because the filter is three texels wide.
 float sun_visibility(vec3 normal) {
     vec3 unit = to_unit * vec4(place_m, 1);
     vec3 off = mat3(to_unit) * normal * (2 * inner_m);
@@ -60,7 +60,7 @@ float sun_visibility(vec3 normal) {
 uniform sampler3D occlusion;
 uniform vec4 occlusion_frame;  // the lower corner, and 1 / side
 
-// The share of the sky that is seen: looked up two cells off the surface, where the surface itself has no part.
+// Visible share of the sky, sampled two cells off the surface to exclude the surface itself.
 float sky_visibility(vec3 normal) {
     vec3 at = (place_m - occlusion_frame.xyz) * occlusion_frame.w + normal * (2.0 / CELLS);
     return 1 - texture(occlusion, at).r;
@@ -68,7 +68,7 @@ float sky_visibility(vec3 normal) {
 #endif
 
 #ifdef RELIEF
-// The normal of a surface raised by a height (Mikkelsen, "Bump mapping unparametrized surfaces on the GPU", 2010).
+// Bump-mapped normal (Mikkelsen, "Bump mapping unparametrized surfaces on the GPU", 2010).
 vec3 bumped(vec3 normal, vec3 across, vec3 down, float height_m) {
     vec3 r = cross(down, normal), s = cross(normal, across);
     float size = dot(across, r);
@@ -78,7 +78,7 @@ vec3 bumped(vec3 normal, vec3 across, vec3 down, float height_m) {
 }
 #endif
 
-// What is thrown back of light from a direction, as a share of what a white sheet facing it throws back.
+// Reflected share of light from a direction, relative to a white diffuse surface facing it.
 vec3 reflected_share(vec3 light, vec3 normal, vec3 viewer, vec3 diffuse, vec3 mirror, float roughness) {
     float facing = max(dot(normal, light), 0);
 #ifdef GLOSS
@@ -102,7 +102,7 @@ void main() {
     vec4 texel = texture(textures, vec3(uv_at_m * made.repeats_per_m, made.layer));
     vec3 own = made.tint * texel.rgb * texel.rgb;
 
-    // Normals point to the viewer's side, because sheets are seen from both.
+    // Normals face the viewer, because sheets are two-sided.
     vec3 across = dFdx(place_m), down = dFdy(place_m);
     vec3 face = cross(across, down);
     vec3 away_m = place_m - eye_m;
@@ -126,14 +126,14 @@ void main() {
     vec3 diffuse = own, mirror = vec3(0);
     float roughness = 1;
 #ifdef GLOSS
-    // Where the normal turns within a sample the highlight widens instead of sparkling (Tokuyoshi and Kaplanyan,
+    // Where the normal varies within a sample, widen the highlight to avoid sparkling (Tokuyoshi and Kaplanyan,
     // "Improved geometric specular antialiasing", 2019).
     vec3 turn_across = dFdx(normal), turn_down = dFdy(normal);
     float turn = 0.5 * (dot(turn_across, turn_across) + dot(turn_down, turn_down));
     roughness = max(made.roughness, 0.1);
     roughness = sqrt(sqrt(roughness * roughness * roughness * roughness + min(turn, 0.2)));
     diffuse = own * (1 - made.metal);
-    // Soil, leaves and chalk swallow in their pores much of what they would mirror.
+    // Porous surfaces (soil, leaves, chalk) have little specular reflection.
     mirror = mix(vec3(mix(0.05, 0.01, roughness)), own, made.metal);
 #endif
     vec3 light = open * diffuse * sky_irradiance(normal);
