@@ -1,1 +1,1 @@
-"""What draws the textures: each procedure makes one surface from a generator of random numbers."""
+"""Procedural textures, each drawn from a random generator."""

@@ -1,6 +1,6 @@
-"""The bank of textures that scenes are dressed in: colour and height, going on across their borders.
+"""The bank of tileable textures, colour and height, for all scenes.
 
-The photographs among them are scikit-image's; docs/training-data.md has their licences.
+Some are cut from scikit-image's photographs; docs/training-data.md lists their licences.
 """
 
 import functools
@@ -37,7 +37,7 @@ _KEPT_DAYS = 30
 Procedure = Callable[[np.random.Generator], Texture]
 Pixels = UInt8[np.ndarray, "layers side side 4"]
 
-# Those of patterns.PHOTOGRAPHS that could be a surface, a print or a poster.
+# The photographs that could be a surface, a print or a poster.
 _PHOTOGRAPHS = (
     "brick", "grass", "gravel", "coins", "coffee", "cat", "astronaut", "camera",
     "text", "rocket", "immunohistochemistry", "coffee", "grass", "camera", "astronaut", "cat",
@@ -49,8 +49,8 @@ class TextureFamily:
     """Textures of one kind.
 
     Attributes:
-        variants: what draws each of them.
-        albedo: where their mean colour lies, in linear light: 0 is black, 1 white. None leaves it as drawn.
+        variants: one procedure per texture.
+        albedo: range of the mean colour in linear light, 0 (black) to 1 (white). None keeps it as drawn.
     """
 
     variants: tuple[Procedure, ...]
@@ -116,12 +116,12 @@ FAMILIES = {
 
 @dataclass(frozen=True)
 class TextureBank:
-    """All textures: `pixels` uint8 [L, 512, 512, 4], sRGB and height (128 is the middle)."""
+    """All textures: `pixels` uint8 [L, 512, 512, 4], sRGB and height (128 is the mean level)."""
 
     pixels: Pixels
 
     def layer(self, family: str, variant: int) -> int:
-        """Where in `pixels` a texture of a family is; variants are counted on past the last."""
+        """Index of a texture in `pixels`; variant is taken modulo the family's size."""
         if family not in FAMILIES:
             raise StereoweaveError(f"texture: expected one of {', '.join(FAMILIES)}, found {family!r}")
         counts = {name: len(each.variants) for name, each in FAMILIES.items()}
@@ -131,7 +131,7 @@ class TextureBank:
 
 @functools.cache
 def texture_bank() -> TextureBank:
-    """The bank, the same in every process; drawn once on a machine, and kept in the user's cache folder."""
+    """The bank, identical in every process; drawn once per machine and cached in the user's cache folder."""
     file = cache_folder().with_name("textures") / f"{_source_version()}.rgba"
     pixels = _read_cache(file)
     if pixels is None:
@@ -146,7 +146,7 @@ def _draw_all() -> Pixels:
 
 
 def draw_texture(family: str, variant: int) -> UInt8[np.ndarray, "side side 4"]:
-    """One texture, drawn anew."""
+    """Draw one texture."""
     rng = np.random.default_rng((BANK_SEED, zlib.crc32(family.encode()), variant))
     levels = FAMILIES[family].variants[variant](rng)
     albedo = FAMILIES[family].albedo
@@ -156,28 +156,28 @@ def draw_texture(family: str, variant: int) -> UInt8[np.ndarray, "side side 4"]:
 
 
 def srgb_to_linear(levels: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Light 0..1 of sRGB levels 0..255."""
+    """Linear light 0..1 from sRGB levels 0..255."""
     values = levels / 255
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
 def _scale_to_albedo(colours: Colours, albedo: float) -> Colours:
-    """The colours, made lighter or darker until their linear mean is the albedo."""
+    """Scale the colours until their linear mean is the albedo."""
     few, gain = colours[::4, ::4], 1.0
-    # Light goes about with the 2.2nd power of the levels; what clips takes some rounds.
+    # Light is about the 2.2nd power of the levels; clipping makes some iterations necessary.
     for _ in range(6):
         gain *= float(albedo / srgb_to_linear(np.clip(few * gain, 0, 255)).mean()) ** (1 / 2.2)
     return colours * gain
 
 
 def _source_version() -> str:
-    """Digits that change with the code that draws."""
+    """Hash of the sources of all textures."""
     files = sorted(Path(__file__).parent.glob("*.py"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
 
 
 def _read_cache(file: Path) -> Pixels | None:
-    """What was kept, or None where there is nothing, or nothing whole."""
+    """The cached textures, or None if they are missing or damaged."""
     try:
         kept = np.fromfile(file, np.uint8)
     except OSError:
@@ -198,12 +198,12 @@ def _write_cache(file: Path, pixels: Pixels) -> None:
                 stream.write(pixels.data)
                 stream.write(_checksum(pixels))
             whole.replace(file)
-        # Not at once: versions side by side, in use by turns, would throw out one another's.
+        # Not at once: two versions in alternating use would delete each other's.
         for other in file.parent.glob(f"*{file.suffix}"):
             if time.time() - other.stat().st_mtime > _KEPT_DAYS * 86_400:
                 other.unlink()
     except OSError:
-        # Where nothing can be kept, each process draws the bank for itself, and that is all the harm.
+        # Without a cache each process draws the bank itself.
         return
 
 

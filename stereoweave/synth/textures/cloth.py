@@ -8,7 +8,7 @@ from jaxtyping import Bool
 from stereoweave.synth.textures.tiling import SIDE, Colour, Map, Texture, noise, stack_texture, texel_grid
 
 _Choice = Bool[np.ndarray, "side side"]
-_Rule = Callable[[Map, Map], _Choice]  # of a thread's row and column
+_Rule = Callable[[Map, Map], _Choice]  # from a thread's row and column
 
 
 def woven_cloth(rng: np.random.Generator) -> Texture:
@@ -69,7 +69,7 @@ def _draw_cloth_colour(rng: np.random.Generator) -> Colour:
 
 
 def _weave(rng: np.random.Generator, threads: int, warp_on_top: _Rule) -> tuple[Map, _Choice]:
-    """Height 0..1 of a weave, and whether the warp (along y) is on top."""
+    """Height 0..1 of a weave, and mask of the warp (along y) on top."""
     y, x = texel_grid()
     pitch = SIDE / threads
     y, x = y + 0.8 * noise(rng, 1.5, 6), x + 0.8 * noise(rng, 1.5, 6)

@@ -41,7 +41,7 @@ def soil(rng: np.random.Generator) -> Texture:
 
 
 def dried_mud(rng: np.random.Generator) -> Texture:
-    """Mud that dried and broke into plates."""
+    """Dried mud, cracked into plates."""
     plates, parts = voronoi_cells(rng, 9, 9, 0.5, rough=5), voronoi_cells(rng, 22, 22, 0.5, rough=3)
     edge = plates.rim + 0.6 * noise(rng, 0.9, 20)
     gap = smoothstep(3.2, 1.2, edge)
@@ -61,7 +61,7 @@ _PEBBLES = (
 
 
 def gravel(rng: np.random.Generator) -> Texture:
-    """Pebbles of several sizes on each other."""
+    """Overlapping pebbles of several sizes."""
     canvas = np.full((SIDE, SIDE, 4), (58, 54, 48, 20), np.uint8)
     palette = _PEBBLES[rng.integers(len(_PEBBLES))]
     size = rng.uniform(5, 12)
@@ -73,7 +73,7 @@ def gravel(rng: np.random.Generator) -> Texture:
 
 
 def asphalt(rng: np.random.Generator) -> Texture:
-    """A road: stones in bitumen, cracks, sealed cracks, mended patches, oil."""
+    """Asphalt: stones in bitumen, cracks, sealed cracks, patches, oil."""
     stones = blur(noise(rng, 0.0), 0.8)
     stones = stones / stones.std()
     broad = noise(rng, 1.4, 2)
@@ -92,7 +92,7 @@ def asphalt(rng: np.random.Generator) -> Texture:
 def _paint_stones(
     rng: np.random.Generator, canvas: Canvas, count: int, size: float, palette: tuple[Colour, ...]
 ) -> None:
-    """Rounded stones, each darker and lower around its rim."""
+    """Paint rounded stones, each darker and lower around its rim."""
     angle = np.arange(9) * 2 * np.pi / 9
     radius = size * np.exp(rng.normal(0, 0.28, count))[:, None] * np.exp(rng.normal(0, 0.1, (count, 9)))
     flat, turn = rng.uniform(0.6, 1, count)[:, None], rng.uniform(0, np.pi, count)[:, None]

@@ -1,4 +1,4 @@
-"""Writing: plates on boards, stencilled numbers, printed bills."""
+"""Lettering: sign plates, stencilled numbers, posters."""
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -35,7 +35,7 @@ _WORDS = (
 
 
 def notice_board(rng: np.random.Generator) -> Texture:
-    """A board full of plates with writing."""
+    """A board covered with sign plates."""
     page = Image.new("RGB", (SIDE, SIDE), (118, 112, 102))
     mask = Image.new("L", (SIDE, SIDE), 0)
     tall = SIDE // int(rng.choice([4, 5, 6]))
@@ -49,7 +49,7 @@ def notice_board(rng: np.random.Generator) -> Texture:
 
 
 def stencilled_numbers(rng: np.random.Generator) -> Texture:
-    """Large stencilled letters and numbers on one colour, as on containers and hulls."""
+    """Large stencilled letters and numbers on a plain ground, as on containers and hulls."""
     ground, ink = _SIGN_COLOURS[rng.integers(len(_SIGN_COLOURS))]
     page = Image.new("RGB", (SIDE, SIDE), _integer_colour(ground))
     pen = ImageDraw.Draw(page)
@@ -64,7 +64,7 @@ def stencilled_numbers(rng: np.random.Generator) -> Texture:
 
 
 def posters(rng: np.random.Generator) -> Texture:
-    """Printed sheets pasted side by side: headlines, columns of small type."""
+    """Posters side by side: headlines, columns of small type."""
     page = Image.new("RGB", (SIDE, SIDE), (150, 140, 124))
     pen = ImageDraw.Draw(page)
     for left in (0, SIDE // 2):
@@ -80,7 +80,7 @@ def _integer_colour(colour: Colour) -> tuple[int, int, int]:
 
 
 def _write_text(pen: ImageDraw.ImageDraw, box: Box, text: str, ink: Colour) -> None:
-    """The text as large as the box lets it be, in its middle."""
+    """Write text centred in a box, as large as it fits."""
     wide, high = box[2] - box[0], box[3] - box[1]
     font = ImageFont.load_default(100)
     left, top, right, bottom = font.getbbox(text)
@@ -107,7 +107,7 @@ def _paint_plate(rng: np.random.Generator, page: Image.Image, mask: Image.Image,
 
 
 def _paint_bill(rng: np.random.Generator, pen: ImageDraw.ImageDraw, box: Box) -> None:
-    # Most bills are printed on pale paper.
+    # Most posters are printed on pale paper.
     ground, ink = _SIGN_COLOURS[rng.choice([0, 0, 0, 1, 2, 4])]
     pen.rectangle(box, fill=_integer_colour(ground))
     left, top, right, bottom = box[0] + 10, box[1] + 8, box[2] - 10, box[3] - 8
@@ -123,7 +123,7 @@ def _paint_bill(rng: np.random.Generator, pen: ImageDraw.ImageDraw, box: Box) ->
 
 
 def _weather_print(rng: np.random.Generator, page: Image.Image, height: Map) -> Texture:
-    """What was printed or painted, after some weather."""
+    """Fade and scuff a printed page."""
     colours = np.asarray(page, np.float32)
     faded = 0.12 * smoothstep(-1, 2, noise(rng, 1.6, 2))
     colours = mix(colours, (176, 170, 160), faded)

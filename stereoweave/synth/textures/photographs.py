@@ -1,4 +1,4 @@
-"""Textures out of scikit-image's photographs, made to go on across their borders."""
+"""Tileable textures cut from scikit-image's photographs."""
 
 import functools
 
@@ -8,12 +8,12 @@ from jaxtyping import Float, UInt8
 
 from stereoweave.synth.textures.tiling import SIDE, Texture, blur, stack_texture
 
-# A crop is so much larger than its texture, and faded into its other side there.
+# A crop exceeds its texture by this margin, which is blended with the opposite side.
 _OVERLAP = SIDE // 4
 
 
 def photograph_crop(name: str, rng: np.random.Generator) -> Texture:
-    """A part of a photograph of `patterns.PHOTOGRAPHS`; what is brighter counts as a little higher."""
+    """A random crop of one of scikit-image's photographs; brighter texels are slightly higher."""
     part = _mute(rng, _draw_crop(rng, _load_photograph(name)))
     rows = _blend_ends(part)
     colours = _blend_ends(rows.transpose(1, 0, 2)).transpose(1, 0, 2)
@@ -42,14 +42,14 @@ def _draw_crop(
 
 
 def _mute(rng: np.random.Generator, part: Float[np.ndarray, "_ _ 3"]) -> Float[np.ndarray, "_ _ 3"]:
-    """The part with less colour, as print fades, and a tint of its own."""
+    """Reduce saturation, like faded print, and add a slight tint."""
     grey = part.mean(-1, keepdims=True)
     warm = rng.normal(0, 0.03)
     return (grey + rng.uniform(0.3, 0.5) * (part - grey)) * np.array([1 + warm, 1, 1 - warm], np.float32)
 
 
 def _blend_ends(part: Float[np.ndarray, "_ _ 3"]) -> Float[np.ndarray, "_ _ 3"]:
-    """The first SIDE rows; the foremost of them are faded in from those that follow the last."""
+    """The first SIDE rows; the rows after them are blended into the beginning, so that the rows tile."""
     share = np.linspace(0, 1, _OVERLAP, dtype=np.float32)[:, None, None]
     share = share * share * (3 - 2 * share)
     rows = part[:SIDE].copy()

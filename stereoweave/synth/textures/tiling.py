@@ -1,7 +1,7 @@
-"""What textures are made of: noise, cells and drawing that go on across the borders.
+"""Building blocks of tileable textures: noise, Voronoi cells, and drawing with wraparound.
 
-Everything is SIDE texels wide and high and goes on at its other side. Colours are sRGB levels 0..255, and
-so are heights, 128 being the middle.
+All maps are SIDE x SIDE texels and periodic. Colours are sRGB levels 0..255, and heights are levels
+0..255 around 128.
 """
 
 from typing import NamedTuple
@@ -23,9 +23,9 @@ class Cells(NamedTuple):
     """The Voronoi cells of scattered sites.
 
     Attributes:
-        label: int [SIDE, SIDE], which cell a texel belongs to.
-        rim: float32, distance to the border of the next cell in texels, about.
-        number: how many cells there are.
+        label: int [SIDE, SIDE], each texel's cell.
+        rim: float32 [SIDE, SIDE], approximate distance to the cell's border in texels.
+        number: number of cells.
     """
 
     label: Int[np.ndarray, "side side"]
@@ -33,7 +33,7 @@ class Cells(NamedTuple):
     number: int
 
     def per_texel(self, values: np.ndarray) -> np.ndarray:
-        """For each texel the value [N] or [N, C] of its cell."""
+        """Look up values [N] or [N, C] of the cells for each texel."""
         return values.astype(np.float32)[self.label]
 
 
@@ -43,18 +43,18 @@ def noise(
     cycles: float = 2.0,
     stretch: tuple[float, float] = (1.0, 1.0),
 ) -> Map:
-    """Noise whose amplitude falls as frequency**-exponent (1 in photographs); mean 0, deviation 1.
+    """Periodic noise with amplitude ~ frequency**-exponent (1 in photographs), mean 0, deviation 1.
 
     Args:
-        rng: Where the noise comes from.
-        exponent: How smooth the noise is.
-        cycles: Up to so many waves a side all are equally strong, so that no blot marks every tile.
-        stretch: How much longer than wide structures are, along y and along x.
+        rng: Source of the noise.
+        exponent: Smoothness of the noise.
+        cycles: The spectrum is flat below this many periods per side, so that no blot marks every tile.
+        stretch: Elongation of structures along y and along x.
     """
     along_y, along_x = stretch[0] * np.fft.fftfreq(SIDE), stretch[1] * np.fft.rfftfreq(SIDE)
     squared = np.add.outer((along_y**2).astype(np.float32), (along_x**2).astype(np.float32))
     strength = np.maximum(squared, (cycles / SIDE) ** 2) ** (-exponent / 2)
-    # So many waves add up to a normal distribution whatever theirs is; a flat one is drawn fastest.
+    # The sum of many waves is normally distributed anyway; uniform amplitudes are drawn fastest.
     waves = rng.random((SIDE, SIDE // 2 + 1, 2), np.float32).view(np.complex64)[..., 0] - (0.5 + 0.5j)
     spectrum = waves.astype(np.complex64) * strength
     spectrum[0, 0] = 0
@@ -63,7 +63,7 @@ def noise(
 
 
 def texel_grid() -> tuple[Map, Map]:
-    """The texels' y and x."""
+    """The texels' coordinates y and x."""
     y, x = np.mgrid[:SIDE, :SIDE].astype(np.float32)
     return y, x
 
@@ -71,7 +71,7 @@ def texel_grid() -> tuple[Map, Map]:
 def voronoi_cells(
     rng: np.random.Generator, rows: int, columns: int, jitter: float = 0.45, rough: float = 0.0
 ) -> Cells:
-    """Cells around sites on a jittered grid of rows x columns; borders wander by about `rough` texels."""
+    """Voronoi cells of a jittered grid of rows x columns sites; borders wander by about `rough` texels."""
     home = np.indices((rows, columns)).reshape(2, -1).T + 0.5
     sites = home + jitter * rng.uniform(-1, 1, home.shape)
     y, x = (sites * [SIDE / rows, SIDE / columns]).astype(int).T % SIDE
@@ -96,25 +96,25 @@ def _rim(label: Map) -> Map:
     edge = (label != np.roll(label, 1, 0)) | (label != np.roll(label, 1, 1))
     wide = cv2.copyMakeBorder((~edge).astype(np.uint8), 64, 64, 64, 64, cv2.BORDER_WRAP)
     distance = cv2.distanceTransform(wide, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[64:-64, 64:-64]
-    # Whole texels make jagged joints.
+    # Whole-texel distances would make jagged joints.
     return blur(distance, 0.7)
 
 
 def warp(image: np.ndarray, down: Map, right: Map, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
-    """The image, looked up so many texels further down and right."""
+    """Warp an image: look it up displaced by `down` and `right` texels."""
     y, x = texel_grid()
     return cv2.remap(image, x + right, y + down, interpolation, borderMode=cv2.BORDER_WRAP)
 
 
 def blur(image: np.ndarray, sigma: float) -> np.ndarray:
-    """The image under a Gaussian of `sigma` texels."""
+    """Gaussian blur with wraparound; sigma in texels."""
     margin = int(4 * sigma) + 1
     padded = cv2.copyMakeBorder(image, margin, margin, margin, margin, cv2.BORDER_WRAP)
     return cv2.GaussianBlur(padded, (0, 0), sigma)[margin:-margin, margin:-margin]
 
 
 def smear_down(source: Map, length: float) -> Map:
-    """What flows down from a source, fading over `length` texels, as rust and dirt do in the rain."""
+    """Smear a source down, fading over `length` texels, like streaks of rust and dirt."""
     tail = np.exp(-np.arange(SIDE, dtype=np.float32) / length)
     spectrum = np.fft.rfft(source, axis=0) * np.fft.rfft(tail / tail.sum())[:, None]
     return np.fft.irfft(spectrum, SIDE, axis=0).astype(np.float32)
@@ -125,11 +125,11 @@ def paint_polygons(
     polygons: Float[np.ndarray, "n k 2"],
     levels: Float[np.ndarray, "n 4"],
 ) -> None:
-    """Paints polygons, x y in texels, one over the other, into colour and height."""
+    """Paint polygons (x, y in texels) in order into colour and height, with wraparound."""
     low, high = polygons.min(1), polygons.max(1)
     shifts = SIDE * (np.indices((3, 3)).reshape(2, 9).T - 1)
     seen = ((high[:, None] + shifts > -1) & (low[:, None] + shifts < SIDE)).all(-1)
-    # OpenCV draws smooth edges less well along the border of a picture.
+    # OpenCV antialiases less well along the image's border.
     margin = 4
     wide = cv2.copyMakeBorder(canvas, margin, margin, margin, margin, cv2.BORDER_WRAP)
     corners = np.round((polygons + margin) * 16).astype(np.int32)
@@ -145,9 +145,9 @@ def blade_outlines(
     length: Float[np.ndarray, " n"],
     wide: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, "n 8 2"]:
-    """Outlines of blades of grass or straw, which begin at a point and become narrow.
+    """Outlines of tapering blades of grass or straw.
 
-    turns: their direction at the beginning and at the tip, in radians.
+    turns: direction at the root and at the tip, in radians.
     """
     share = np.linspace(0, 1, 4)
     way = turns[:, :1] + share * (turns[:, 1:] - turns[:, :1])
@@ -158,34 +158,34 @@ def blade_outlines(
 
 
 def distance_to_lines(position: np.ndarray, first: float, period: float) -> Map:
-    """Distance to the nearest of the lines at first, first + period, ..."""
+    """Distance to the nearest line of those at first, first + period, ..."""
     return np.abs((position - first + period / 2) % period - period / 2).astype(np.float32)
 
 
 def smoothstep(low: float, high: float, values: Map) -> Map:
-    """0 below low, 1 above high, smooth in between; low > high turns it round."""
+    """Smoothstep: 0 below low, 1 above high; reversed if low > high."""
     share = np.clip((values - low) / (high - low), 0, 1)
     return share * share * (3 - 2 * share)
 
 
 def mix(first: np.ndarray | Colour, second: np.ndarray | Colour, share: Map) -> Colours:
-    """(1 - share) of the first and share of the second, each a picture or one colour."""
+    """Linear blend, (1 - share) of the first and share of the second; each is an image or one colour."""
     first, second = np.asarray(first, np.float32), np.asarray(second, np.float32)
     return first + share[..., None] * (second - first)
 
 
 def ramp(values: Map, *colours: Colour) -> Colours:
-    """0..1 to colours, which are evenly spaced from the first to the last."""
+    """Map values 0..1 to a ramp of evenly spaced colours."""
     at, stops = np.linspace(0, len(colours) - 1, 1024), range(len(colours))
     table = np.stack([np.interp(at, stops, channel) for channel in np.transpose(colours)], -1)
     return table.astype(np.float32)[np.clip(values * 1023, 0, 1023).astype(np.int32)]
 
 
 def tint_grey(levels: Map, red: float, blue: float) -> Colours:
-    """Grey levels, their red and blue multiplied."""
+    """RGB from grey levels, with factors for red and blue."""
     return np.dstack([levels * red, levels, levels * blue]).astype(np.float32)
 
 
 def stack_texture(colours: Colours, height: Map) -> Texture:
-    """Colour and height, which is given as -1..1 about the middle, and clipped to it."""
+    """Stack colours and a height of -1..1, clipped, into a texture."""
     return np.dstack([colours, 128 + 127 * np.clip(height, -1, 1)]).astype(np.float32)

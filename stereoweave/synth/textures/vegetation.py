@@ -24,7 +24,7 @@ from stereoweave.synth.textures.wear import dirt_map
 
 
 def furrowed_bark(rng: np.random.Generator) -> Texture:
-    """The bark of an oak: ridges along y that split and join, dark furrows between."""
+    """Oak bark: ridges along y that split and join, with dark furrows."""
     wander = 5 * noise(rng, 1.6, 5)
     fibres = warp(noise(rng, 0.9, 8, stretch=(6, 1)), wander, wander)
     furrows = np.abs(warp(noise(rng, 1.9, 9, stretch=(4.5, 1)), wander, wander))
@@ -38,7 +38,7 @@ def furrowed_bark(rng: np.random.Generator) -> Texture:
 
 
 def plated_bark(rng: np.random.Generator) -> Texture:
-    """The bark of a pine: scaly plates, reddish, flaking."""
+    """Pine bark: scaly, reddish, flaking plates."""
     plates, flakes = voronoi_cells(rng, 8, 13, 0.5, rough=9), voronoi_cells(rng, 24, 30, 0.5, rough=5)
     depth = np.clip((plates.rim + 0.9 * noise(rng, 1.1, 12)) / 8, 0, 1)
     leaf = flakes.per_texel(rng.normal(0, 1, flakes.number)) - 0.8 * smoothstep(2.0, 0.5, flakes.rim)
@@ -48,7 +48,7 @@ def plated_bark(rng: np.random.Generator) -> Texture:
 
 
 def smooth_bark(rng: np.random.Generator) -> Texture:
-    """The bark of a beech or a young birch: grey, lens-shaped marks across, scars, lichen."""
+    """Beech or birch bark: grey, with lens-shaped marks, scars, lichen."""
     lens = noise(rng, 1.1, 12, stretch=(1, 6))
     marks, lips = smoothstep(1.5, 1.9, lens), smoothstep(1.0, 1.5, lens)
     wrinkles = warp(noise(rng, 1.1, 6, stretch=(1, 5)), 8 * noise(rng, 1.8, 3), 8 * noise(rng, 1.8, 3))
@@ -92,21 +92,21 @@ _FOLIAGE: tuple[tuple[Colour, ...], ...] = (
 
 
 def foliage(rng: np.random.Generator) -> Texture:
-    """Foliage from some metres: leaf over leaf, dark where one looks in between."""
+    """Foliage seen from some metres: overlapping leaves with dark gaps."""
     palette = np.array(_FOLIAGE[rng.integers(len(_FOLIAGE))])
     size, slim = rng.uniform(9, 17), rng.uniform(0.28, 0.5)
     canvas = np.full((SIDE, SIDE, 4), (20, 24, 16, 10), np.uint8)
     count = int(5.5 * SIDE**2 / (size * size * slim * 4))
     depth = np.sort(rng.uniform(0, 1, count))
     at = rng.uniform(0, SIDE, (count, 2))
-    # Twigs carry leaves in bunches; between them one sees into the shade.
+    # Leaves grow in bunches with shade between them.
     bunch = noise(rng, 1.3, 6)[at[:, 1].astype(int), at[:, 0].astype(int)]
     light = np.clip(0.25 + 0.7 * depth + 0.17 * bunch, 0.15, 1.2) * np.exp(rng.normal(0, 0.13, count))
     shade = palette[rng.integers(0, 4, count)] * light[:, None] + rng.normal(0, 3, (count, 3))
     turn = rng.normal(np.pi / 2, 0.9, count)
     length = size * np.exp(rng.normal(0, 0.25, count))
     halves = _leaf_halves(at, turn, length, slim)
-    # One half lies more in the light than the other.
+    # One half of each leaf is brighter.
     lit = shade[:, None] * np.array([1.12, 0.86])[:, None]
     levels = np.concatenate([lit, np.broadcast_to(25 + 200 * depth, (2, count)).T[..., None]], -1)
     paint_polygons(canvas, halves.reshape(-1, 6, 2), levels.reshape(-1, 4))
@@ -115,7 +115,7 @@ def foliage(rng: np.random.Generator) -> Texture:
 
 
 def grass(rng: np.random.Generator) -> Texture:
-    """Grass from above: blades in all directions, dry ones among them, earth between."""
+    """Grass from above: blades in all directions, some dry, with earth between them."""
     fresh = np.array(((64, 78, 40), (78, 92, 50), (94, 106, 60), (86, 94, 62)))
     dry = np.array(((136, 126, 92), (122, 112, 84)))
     dryness, count = rng.uniform(0.02, 0.25), 8500
@@ -149,7 +149,7 @@ def _knots(rng: np.random.Generator, boards: int) -> Map:
 
 
 def _shift_boards(values: Map, shift: np.ndarray, board: np.ndarray) -> Map:
-    """The values, moved along y by another amount on each board."""
+    """Shift the values along y by a separate amount per board."""
     rows = (np.arange(SIDE)[:, None] + shift[board]) % SIDE
     return np.take_along_axis(values, rows, 0)
 
@@ -160,7 +160,7 @@ def _leaf_halves(
     length: Float[np.ndarray, " n"],
     slim: float,
 ) -> Float[np.ndarray, "n 2 6 2"]:
-    """Outlines of both halves of pointed leaves around `at`; `length` is from the middle to the tip."""
+    """Outlines of both halves of pointed leaves around `at`; `length` is half a leaf's length."""
     along = np.linspace(-1, 1, 6)
     bow = slim * (1 - np.abs(along) ** 1.7)
     halves = np.stack([np.stack([along, side * bow], -1) for side in (1, -1)])

@@ -1,4 +1,4 @@
-"""Walls and floors of concrete, plaster and brick, and what is nearly white and plain."""
+"""Walls and floors: concrete, plaster, brick, and a nearly plain surface."""
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from stereoweave.synth.textures.wear import crack_map, dirt_map
 
 
 def cast_concrete(rng: np.random.Generator) -> Texture:
-    """Concrete as it came from the formwork: joints between boards, holes of ties, air bubbles."""
+    """Cast concrete: joints of the formwork, tie holes, air bubbles."""
     colours, height = _concrete(rng)
     y, x = texel_grid()
     joint = np.minimum(distance_to_lines(y, 0, SIDE / 2), distance_to_lines(x, 0, SIDE / 2))
@@ -38,7 +38,7 @@ def cast_concrete(rng: np.random.Generator) -> Texture:
 
 
 def cracked_concrete(rng: np.random.Generator) -> Texture:
-    """Concrete with cracks and patches that were mended."""
+    """Concrete with cracks and repaired patches."""
     colours, height = _concrete(rng)
     cracks = crack_map(rng, 4, 0.0)
     patch = smoothstep(1.35, 1.45, noise(rng, 2.0, 2))
@@ -47,7 +47,7 @@ def cracked_concrete(rng: np.random.Generator) -> Texture:
 
 
 def stained_concrete(rng: np.random.Generator) -> Texture:
-    """Concrete that water has run down for years: black and pale streaks, moss."""
+    """Stained concrete: black and pale streaks from water, moss."""
     colours, height = _concrete(rng)
     soot = smear_down(smoothstep(1.0, 2.2, noise(rng, 0.9, 6, stretch=(1, 0.4))), 150)
     lime = smear_down(smoothstep(1.6, 2.4, noise(rng, 0.9, 8)), 70)
@@ -58,7 +58,7 @@ def stained_concrete(rng: np.random.Generator) -> Texture:
 
 
 def paving_slabs(rng: np.random.Generator) -> Texture:
-    """Paving of square slabs, each weathered in its own way."""
+    """Square paving slabs, each differently weathered."""
     colours, height = _concrete(rng)
     y, x = texel_grid()
     pitch = SIDE / 4
@@ -73,7 +73,7 @@ def paving_slabs(rng: np.random.Generator) -> Texture:
 
 
 def trowelled_plaster(rng: np.random.Generator) -> Texture:
-    """Plaster put on by hand: strokes, hair cracks, damp."""
+    """Hand-trowelled plaster: strokes, hairline cracks, damp."""
     strokes = warp(noise(rng, 1.2, 5, stretch=(1, 3)), 22 * noise(rng, 1.8, 2), 22 * noise(rng, 1.8, 2))
     broad = noise(rng, 1.6, 2)
     colours = ramp(0.5 + 0.2 * broad, (188, 178, 160), (206, 198, 182), (218, 212, 200))
@@ -85,7 +85,7 @@ def trowelled_plaster(rng: np.random.Generator) -> Texture:
 
 
 def roughcast_plaster(rng: np.random.Generator) -> Texture:
-    """Plaster thrown on with grit: grains that cast small shadows, and places where it came off."""
+    """Roughcast plaster: gritty grains with small shadows, and bare patches."""
     grain = blur(noise(rng, 0.0), 1.2)
     grain = grain / grain.std() + 0.4 * noise(rng, 1.0, 10)
     broad = noise(rng, 1.5, 2)
@@ -105,7 +105,7 @@ _BRICKS = (
 
 
 def brickwork(rng: np.random.Generator) -> Texture:
-    """Brickwork in stretching bond: each brick fired differently, the mortar set back."""
+    """Brickwork in stretcher bond: each brick in its own shade, recessed mortar."""
     y, x = texel_grid()
     wander = noise(rng, 1.4, 8)
     y, x = y + 0.8 * wander, x + 0.8 * noise(rng, 1.4, 8)
@@ -130,7 +130,7 @@ def brickwork(rng: np.random.Generator) -> Texture:
 
 
 def near_plain(rng: np.random.Generator) -> Texture:
-    """Nearly white, nearly even: what leaves a matcher little to hold on to."""
+    """Nearly white and even: almost no texture to match."""
     broad, fine = noise(rng, 1.5, 1), noise(rng, 0.8, 6)
     share = rng.uniform(0.008, 0.02)
     grey = 226 * (1 + share * (0.8 * broad + 0.6 * fine))
@@ -138,7 +138,7 @@ def near_plain(rng: np.random.Generator) -> Texture:
 
 
 def _concrete(rng: np.random.Generator) -> tuple[Colours, Map]:
-    """Colour and height of concrete without anything on it."""
+    """Colour and height of clean concrete."""
     broad, fine = noise(rng, 1.5, 2), noise(rng, 0.7, 10)
     colours = ramp(0.5 + 0.16 * broad + 0.06 * fine, (128, 124, 116), (158, 154, 146), (184, 181, 173))
     colours = colours + (3.5 * fine)[..., None]
