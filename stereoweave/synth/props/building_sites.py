@@ -1,4 +1,4 @@
-"""What a tower crane stands over: a concrete shell half built, scaffolding, huts, a hoarding, a town."""
+"""The building site below a tower crane: concrete shell, scaffolding, site offices, hoarding, town."""
 
 import numpy as np
 
@@ -8,12 +8,12 @@ from stereoweave.synth.props.surroundings import draw_spots, hills, houses, pall
 from stereoweave.synth.stage import Palette
 from stereoweave.synth.world import Colour, Material, Mesh, join_meshes
 
-SCALE = 0.4  # of the surroundings' things: the crane is smaller than a real one
+SCALE = 0.4  # of the surroundings; the crane is smaller than a real one
 BAY_M, STOREY_M = 0.95, 0.52
 
 
 def building_site(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """A site whose shell stands at negative y, so that the crane at the origin is seen from positive y."""
+    """A site whose shell stands at negative y, so that it is behind the crane seen from positive y."""
     small = np.diag([SCALE, SCALE, SCALE, 1.0])
     town = draw_spots(rng, 20, 17 / SCALE, 60 / SCALE)
     stacks = draw_spots(rng, 7, 2 / SCALE, 5 / SCALE)
@@ -34,14 +34,14 @@ def building_site(rng: np.random.Generator, palette: Palette) -> Mesh:
 
 
 def _yard(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """The ground that is laid bare."""
+    """The bare ground of the site."""
     family = str(rng.choice(["soil", "gravel", "gravel"]))
     ground = palette.add(Material(texture=family, variant=int(rng.integers(64)), span_m=2.5, relief=0.6))
     return boxes((0, 2, 0.0), (19, 17, 0.03), ground)
 
 
 def _shell(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """Slabs on columns around a core, bars that stand out of the top, props, railings, scaffolding."""
+    """Slabs on columns around a core, starter bars on top, props, railings, scaffolding."""
     concrete = palette.add(
         Material(texture="concrete", variant=int(rng.integers(8)), span_m=1.6, roughness=0.9)
     )
@@ -74,20 +74,20 @@ def _shell(rng: np.random.Generator, palette: Palette) -> Mesh:
 
 
 def _starters(tops: np.ndarray) -> np.ndarray:
-    """Bars that stand out of the columns' heads."""
+    """Starter bars on the columns' heads."""
     around = np.array([(a, b, 0.0) for a in (-0.035, 0.0, 0.035) for b in (-0.035, 0.035)])
     feet = (tops[:, None] + around).reshape(-1, 3)
     return np.stack([feet, feet + [0, 0, 0.36]], 1)
 
 
 def _props(rng: np.random.Generator, x: np.ndarray, y: np.ndarray, floor_m: float) -> np.ndarray:
-    """Props that carry the highest slab while it hardens."""
+    """Props below the highest slab."""
     at = rng.uniform((x[0], y[0], 0), (x[-1], y[-1], 0), (40, 3)) + [0, 0, floor_m]
     return np.stack([at, at + [0, 0, STOREY_M - 0.07]], 1)
 
 
 def _scaffolding(size_m: np.ndarray, floors: int, tube: int, board: int) -> Mesh:
-    """Uprights, ledgers, braces and planks before the side that is seen."""
+    """Standards, ledgers, braces and planks in front of the visible side."""
     x = np.linspace(-size_m[0] / 2, 0.1 * size_m[0], 6)
     y = size_m[1] / 2 + np.array([0.06, 0.3])
     z = np.arange(0, floors + 1) * STOREY_M
@@ -107,7 +107,7 @@ def _scaffolding(size_m: np.ndarray, floors: int, tube: int, board: int) -> Mesh
 
 
 def _huts(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """Site offices, two high, with windows and doors."""
+    """Site offices in two storeys, with windows and doors."""
     tints: tuple[Colour, ...] = ((0.75, 0.75, 0.72), (0.2, 0.32, 0.45), (0.62, 0.5, 0.2))
     wall = palette.add(painted_steel(rng, tints[int(rng.integers(3))], roughness=0.7))
     glass = palette.add(Material(texture="plain", tint=(0.06, 0.08, 0.1), roughness=0.15))
@@ -120,7 +120,7 @@ def _huts(rng: np.random.Generator, palette: Palette) -> Mesh:
 
 
 def _hoarding(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """Boards behind the site, each a little out of line."""
+    """Boards behind the site, slightly out of line."""
     wood = palette.add(
         Material(texture="wood", variant=int(rng.integers(8)), tint=(0.75, 0.72, 0.66), span_m=1.5)
     )
@@ -132,7 +132,7 @@ def _hoarding(rng: np.random.Generator, palette: Palette) -> Mesh:
 
 
 def _heaps(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """Sand and gravel."""
+    """Heaps of sand and gravel."""
     sand = palette.add(
         Material(texture="soil", variant=int(rng.integers(8)), tint=(1.0, 0.9, 0.7), span_m=0.7, relief=0.6)
     )

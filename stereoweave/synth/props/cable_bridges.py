@@ -9,7 +9,7 @@ from stereoweave.synth.world import Mesh, join_meshes
 
 
 def suspension(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
-    """Two towers, cables that hang between them down to both banks, hangers, and a stiff girder."""
+    """Two towers, main cables to both banks, hangers, and a stiffening girder."""
     tower_m, top_m = rng.uniform(2.2, 2.6), plan.level_m + rng.uniform(1.35, 1.9)
     low_m, anchor_m = plan.level_m + 0.14, plan.half_m + 0.5
     masonry_towers = rng.random() < 0.35
@@ -31,7 +31,7 @@ def suspension(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> 
 
 
 def cable_stayed(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
-    """One or two towers, from which straight cables fan out to the edges of the road."""
+    """One or two towers, with straight stays that fan out to the edges of the road."""
     single = rng.random() < 0.5
     towers_m = [rng.uniform(-0.4, 0.4)] if single else [-0.5 * plan.half_m, 0.5 * plan.half_m]
     top_m = plan.level_m + (rng.uniform(2.4, 3.0) if single else rng.uniform(1.5, 1.9))
@@ -72,7 +72,7 @@ def _girder(plan: BridgePlan) -> Mesh:
 
 
 def _hangers(plan: BridgePlan, cable: np.ndarray) -> Mesh:
-    """Upright rods from the cable to the girder, evenly along the road."""
+    """Vertical rods from the cable to the girder, evenly spaced along the road."""
     x = np.arange(-plan.half_m + 0.12, plan.half_m - 0.1, 0.15)
     tops = np.stack([x, np.full(len(x), cable[0, 1]), np.interp(x, cable[:, 0], cable[:, 2])], -1)
     feet = tops * [1, 1, 0] + [0, 0, plan.level_m - 0.02]
@@ -89,7 +89,7 @@ def _anchors(plan: BridgePlan, at_m: float) -> Mesh:
 
 
 def _portal(plan: BridgePlan, top_m: float, thick_m: float, material: int, crossings: int) -> Mesh:
-    """Two tapering legs beside the road, joined below it and crossings times above."""
+    """Two tapering legs beside the road, with a cross beam below it and `crossings` above."""
     y = plan.side_m + 0.04 + thick_m / 2
     legs = [_leg((0, side * (y + 0.06), 0.2), (0, side * y, top_m), thick_m, material) for side in (-1, 1)]
     heights = [plan.level_m - 0.22, *np.linspace(top_m - 0.1, plan.level_m + 0.85, crossings)]
@@ -99,7 +99,7 @@ def _portal(plan: BridgePlan, top_m: float, thick_m: float, material: int, cross
 
 
 def _leaning(plan: BridgePlan, top_m: float) -> Mesh:
-    """Two legs that meet in a mast above the road."""
+    """An inverted Y: two legs that meet in a mast above the road."""
     fork_m = _fork_m(plan, top_m)
     foot_y = plan.side_m + 0.3
     legs = [_leg((0, side * foot_y, 0.2), (0, side * 0.05, fork_m), 0.17, plan.dressed) for side in (-1, 1)]
@@ -114,7 +114,7 @@ def _fork_m(plan: BridgePlan, top_m: float) -> float:
 
 
 def _inset(plan: BridgePlan, z: np.ndarray, top_m: float) -> np.ndarray:
-    """How far from the axis the cables end at heights z of a leaning tower."""
+    """Distance from the axis at which cables end at heights z of a leaning tower."""
     fork_m = _fork_m(plan, top_m)
     return 0.05 + np.clip((fork_m - z) / (fork_m - 0.2), 0, 1) * (plan.side_m + 0.25)
 
@@ -122,7 +122,7 @@ def _inset(plan: BridgePlan, z: np.ndarray, top_m: float) -> np.ndarray:
 def _leg(
     foot_m: tuple[float, float, float], head_m: tuple[float, float, float], thick_m: float, material: int
 ) -> Mesh:
-    """A shaft with chamfered corners that narrows upwards."""
+    """A tapering shaft with chamfered corners."""
     square = (
         np.array([(1, 0.7), (0.7, 1), (-0.7, 1), (-1, 0.7), (-1, -0.7), (-0.7, -1), (0.7, -1), (1, -0.7)]) / 2
     )

@@ -1,6 +1,6 @@
-"""What ships carry on deck: winches, nets, derricks, containers, boats, rafts, vents, flags. Bow at +x.
+"""Deck gear of ships: winches, nets, derricks, containers, boats, rafts, vents, flags. Bow at +x.
 
-Each stands at its spot on deck, `at_m`.
+Each stands on deck at `at_m`.
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ from stereoweave.synth.world import Mesh, join_meshes
 
 
 def winch(at_m: Point, width_m: float, materials: ShipMaterials, load: int) -> Mesh:
-    """A drum across the ship, full of rope or net, between cheeks on a bed."""
+    """A transverse drum, full of rope or net, between cheeks on a bed."""
     half = width_m / 2
     turns = np.linspace(-0.82 * half, 0.82 * half, 24)
     bulge = 0.19 + 0.05 * np.cos(turns / half * 1.4) + 0.012 * np.sin(np.arange(24) * 2.1)
@@ -43,7 +43,7 @@ def winch(at_m: Point, width_m: float, materials: ShipMaterials, load: int) -> M
 
 
 def gantry(at_m: Point, width_m: float, height_m: float, materials: ShipMaterials) -> Mesh:
-    """A portal over the stern, leaning aft, with blocks that hang from it."""
+    """A portal over the stern, leaning aft, with hanging blocks."""
     half, lean = width_m / 2, -0.25 * height_m
     frame = [(0, -half, 0), (lean, -0.85 * half, height_m), (lean, 0.85 * half, height_m), (0, half, 0)]
     portal = polyline_tubes(frame, 0.06, materials.trim, sides=12)
@@ -63,7 +63,7 @@ def gantry(at_m: Point, width_m: float, height_m: float, materials: ShipMaterial
 
 
 def derrick(foot_m: Point, tip_m: Point, top_m: Point, materials: ShipMaterials) -> Mesh:
-    """A boom from its foot to its tip, held by wires from top_m, with a hook."""
+    """A boom from foot to tip, held by wires from top_m, with a hook."""
     middle = (foot_m + tip_m) / 2
     boom = tubes(
         [foot_m, middle], [middle, tip_m], np.array([[0.03, 0.05], [0.05, 0.025]]), materials.trim, sides=12
@@ -93,7 +93,7 @@ def derrick(foot_m: Point, tip_m: Point, top_m: Point, materials: ShipMaterials)
 def nets(
     rng: np.random.Generator, at_m: Point, size_m: tuple[float, float], materials: ShipMaterials
 ) -> Mesh:
-    """A heap of net with floats; size_m: along and across the ship."""
+    """A heap of nets with floats; size_m: along and across the ship."""
     x, y = np.meshgrid(np.linspace(-1, 1, 22), np.linspace(-1, 1, 20))
     mound = np.clip(1 - x**4, 0, 1) * np.clip(1 - y**4, 0, 1)
     rough = sum(
@@ -110,7 +110,7 @@ def nets(
 
 
 def containers(at_m: Points, colours: tuple[int, ...]) -> Mesh:
-    """Containers [N] of 1.5 m, their walls ribbed, at their floors' middles; their colours take turns."""
+    """Ribbed containers [N] of 1.5 m in alternating colours; at_m is the centre of each floor."""
     ribs = np.linspace(-0.68, 0.68, 18)
     meshes = []
     for k, material in enumerate(colours):
@@ -131,7 +131,7 @@ def containers(at_m: Points, colours: tuple[int, ...]) -> Mesh:
 
 
 def hatches(x_m: tuple[float, float], width_m: float, z_m: float, materials: ShipMaterials) -> Mesh:
-    """A coaming with ribbed covers over a hold."""
+    """A hatch coaming with ribbed covers."""
     length, middle = x_m[1] - x_m[0], sum(x_m) / 2
     coaming = boxes((middle, 0, z_m + 0.1), (length, width_m, 0.3), materials.trim)
     count = max(int(length / 0.55), 2)
@@ -169,7 +169,7 @@ def boat(at_m: Point, length_m: float, materials: ShipMaterials) -> Mesh:
 
 
 def rafts(at_m: Points, materials: ShipMaterials) -> Mesh:
-    """Life rafts in their white barrels [N], lying along the ship on cradles."""
+    """Life rafts [N] in white canisters on cradles, along the ship."""
     barrel = [(0, -0.27), (0.1, -0.26), (0.14, -0.22), (0.145, 0.0), (0.14, 0.22), (0.1, 0.26), (0, 0.27)]
     bands = [lathe([(0.147, z), (0.147, z + 0.025)], materials.dark, 20) for z in (-0.15, -0.01, 0.12)]
     lying = (
@@ -188,7 +188,7 @@ def vents(at_m: Points, materials: ShipMaterials) -> Mesh:
 
 
 def bitts(at_m: Points, materials: ShipMaterials) -> Mesh:
-    """Pairs of posts [N] for ropes, along the ship, a rope belayed on each pair."""
+    """Pairs of posts [N] along the ship, with a belayed rope on each."""
     post = [(0.045, 0), (0.045, 0.17), (0.06, 0.18), (0.06, 0.21), (0, 0.22)]
     pair = [lathe(post, materials.dark, 12).translate(x=x) for x in (-0.1, 0.1)]
     angle = np.linspace(0, 6 * np.pi, 49)
@@ -198,7 +198,7 @@ def bitts(at_m: Points, materials: ShipMaterials) -> Mesh:
 
 
 def coil(at_m: Point, materials: ShipMaterials) -> Mesh:
-    """A rope laid in rings."""
+    """A coil of rope."""
     angle = np.linspace(0, 12 * np.pi, 110)
     radius = 0.2 - 0.05 * (angle / (12 * np.pi)) + 0.03 * np.sin(angle * 0.51)
     path = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.02 + angle * 0.0035], -1)
@@ -208,7 +208,7 @@ def coil(at_m: Point, materials: ShipMaterials) -> Mesh:
 def flag(
     rng: np.random.Generator, foot_m: Point, height_m: float, materials: ShipMaterials, cloth: int
 ) -> Mesh:
-    """A flag that blows aft from a staff."""
+    """A flag blowing aft from a staff."""
     top = foot_m + [-0.1, 0, height_m]
     staff = tubes(foot_m, top, 0.011, materials.white)
     x, z = np.meshgrid(np.linspace(0, 0.5, 20), np.linspace(-0.3, 0, 8))
@@ -218,7 +218,7 @@ def flag(
 
 
 def anchor(at_m: Point, side: float, materials: ShipMaterials) -> Mesh:
-    """An anchor against the bow, its shank up into its pipe."""
+    """An anchor at the bow, its shank in the hawsepipe."""
     out = np.array([0.1, side, 0])
     shank = tubes(at_m + 0.03 * out, at_m + 0.05 * out + [0, 0, -0.26], 0.022, materials.dark, 8)
     crown = at_m + 0.06 * out + [0, 0, -0.27]

@@ -1,4 +1,4 @@
-"""What is built on decks: houses with windows, funnels, masts, lifebuoys, fenders. Bow at +x."""
+"""Superstructures: deckhouses with windows, funnels, masts, lifebuoys, fenders. Bow at +x."""
 
 from dataclasses import dataclass, replace
 
@@ -22,7 +22,7 @@ from stereoweave.synth.world import Mesh, join_meshes
 
 Quads = Float[np.ndarray, "n 4 3"]
 
-# Paint over steel, glass before its frame: far enough apart to keep their order at any distance.
+# Offsets from the wall, far enough apart to keep their depth order at any distance.
 _FRAME_M, _GLASS_M = 0.006, 0.012
 
 
@@ -32,13 +32,13 @@ class ShipMaterials:
 
     Attributes:
         house: walls of the houses.
-        roof: their roofs, and decks.
-        trim: a second colour, of funnels, cranes and rails.
+        roof: roofs and decks.
+        trim: second colour, for funnels, cranes and rails.
         white: light paint of masts and rails.
         dark: black paint, rubber.
         glass: panes.
         steel: bare or galvanised metal.
-        orange: what saves lives.
+        orange: lifesaving gear.
         rope: ropes and nets.
     """
 
@@ -58,10 +58,10 @@ class House:
     """A block with sloping walls on a deck.
 
     Attributes:
-        x_m: its after and forward end at the foot.
+        x_m: after and forward end at the foot.
         width_m: at the foot.
         z_m: foot and top.
-        lean_m: how far the after, forward and side walls lean inwards at the top; negative leans out.
+        lean_m: inward lean of the after, forward and side walls at the top; negative leans outwards.
     """
 
     x_m: tuple[float, float]
@@ -70,7 +70,7 @@ class House:
     lean_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def corners_m(self, spare_m: float = 0.0) -> tuple[Points, Points]:
-        """The foot's and the top's corners: after starboard, forward starboard, forward port, after port."""
+        """Corners of foot and top: after starboard, forward starboard, forward port, after port."""
         aft, forward, side = self.lean_m
         half = self.width_m / 2 + spare_m
         low = [(self.x_m[0] - spare_m, -half), (self.x_m[1] + spare_m, -half)]
@@ -87,13 +87,13 @@ class House:
         return np.stack([foot, np.roll(foot, -1, 0), np.roll(top, -1, 0), top], 1)
 
     def mesh(self, walls: int, roof: int, eaves_m: float = 0.05) -> Mesh:
-        """Walls, and a roof that stands out over them."""
+        """Walls and an overhanging roof."""
         _, top = self.corners_m(eaves_m)
         return join_meshes([_quads(self.walls_m(), walls), slab(top, top + [0, 0, 0.05], roof)])
 
 
 def slab(low_m: Points, high_m: Points, material: int) -> Mesh:
-    """The block between two quads, both counter-clockwise seen from above."""
+    """Solid between two quads, both counter-clockwise seen from above."""
     sides = np.stack([low_m, np.roll(low_m, -1, 0), np.roll(high_m, -1, 0), high_m], 1)
     return _quads(np.concatenate([sides, high_m[None], low_m[None, ::-1]]), material)
 
@@ -105,7 +105,7 @@ def windows(
     materials: ShipMaterials,
     gap: float = 0.25,
 ) -> Mesh:
-    """A row of panes in frames on a wall, between two shares of its height."""
+    """A row of framed panes on a wall; band: lower and upper edge as shares of its height."""
     edges = np.linspace(0.06, 0.94, count + 1)
     half = gap / 2 * (edges[1] - edges[0])
     left, right = edges[:-1] + half, edges[1:] - half
@@ -119,7 +119,7 @@ def windows(
 
 
 def door(wall_m: Float[np.ndarray, "4 3"], at: float, materials: ShipMaterials) -> Mesh:
-    """A door with a small window, at a share of a wall's length."""
+    """A door with a small window; `at` is its position as a share of the wall's length."""
     length, height = (float(np.linalg.norm(wall_m[k] - wall_m[0])) for k in (1, 3))
     half = 0.3 * min(height, 1.0) / length
     leaf = _quads_on_wall(wall_m, (np.array([at - half]), np.array([at + half])), (0.06, 0.82), _FRAME_M)
@@ -130,7 +130,7 @@ def door(wall_m: Float[np.ndarray, "4 3"], at: float, materials: ShipMaterials) 
 
 
 def funnel(foot_m: Point, size_m: tuple[float, float, float], materials: ShipMaterials) -> Mesh:
-    """An oval funnel that leans aft, with a band and a dark top; size_m: length, width, height."""
+    """An oval funnel, leaning aft, with a band and a dark top; size_m: length, width, height."""
     length, width, height = size_m
     angle = np.linspace(0, 2 * np.pi, 28, endpoint=False)
     oval = np.stack([length / 2 * np.cos(angle), width / 2 * np.sin(angle), 0 * angle], -1)
@@ -177,7 +177,7 @@ def ship_mast(rng: np.random.Generator, foot_m: Point, height_m: float, material
 
 
 def _radar(rng: np.random.Generator, at_m: Point, materials: ShipMaterials) -> Mesh:
-    """A turning bar on a pedestal, on a bracket before the mast."""
+    """A radar scanner on a pedestal, on a bracket in front of the mast."""
     spin = rotation((0, 0, 1), rng.uniform(0, 180))[None, :3, :3]
     bar = boxes(at_m + [0, 0, 0.14], (0.07, 0.75, 0.07), materials.white, spin)
     bracket = boxes(at_m + [-0.06, 0, -0.02], (0.24, 0.1, 0.03), materials.white)
@@ -187,12 +187,12 @@ def _radar(rng: np.random.Generator, at_m: Point, materials: ShipMaterials) -> M
 
 
 def stays(tops_m: Points, feet_m: Points, materials: ShipMaterials) -> Mesh:
-    """Wires from points to points."""
+    """Wires between pairs of points."""
     return tubes(tops_m, feet_m, 0.006, materials.steel, sides=4)
 
 
 def lifebuoys(at_m: Points, outwards: Points, materials: ShipMaterials) -> Mesh:
-    """Rings of four orange and four white pieces, flat against what is behind them."""
+    """Lifebuoys of four orange and four white pieces, facing `outwards`."""
     angle = np.linspace(0, 2 * np.pi, 9)
     ring = lathe(
         np.stack([0.15 + 0.04 * np.cos(angle), 0.04 * np.sin(angle)], -1), materials.orange, sections=24
@@ -204,7 +204,7 @@ def lifebuoys(at_m: Points, outwards: Points, materials: ShipMaterials) -> Mesh:
 
 
 def tyres(at_m: Points, along: Points, materials: ShipMaterials) -> Mesh:
-    """Car tyres that hang flat against the hull; along: the direction that the hull runs in."""
+    """Car tyres flat against the hull; along: direction of the hull."""
     angle = np.linspace(0, 2 * np.pi, 9)
     profile = np.stack([0.17 + 0.055 * np.cos(angle), 0.06 * np.sin(angle)], -1)
     tyre = lathe(profile, materials.dark, sections=18)
@@ -217,7 +217,7 @@ def _quads_on_wall(
     up: tuple[float, float],
     off_m: float,
 ) -> Quads:
-    """Quads on a wall, between shares of its length and height, off_m before it."""
+    """Quads on a wall between shares of its length and height, off_m in front of it."""
     a, b, c, d = wall_m
     out = np.cross(b - a, d - a)
     out = off_m * out / np.linalg.norm(out)

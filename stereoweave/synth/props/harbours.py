@@ -1,4 +1,4 @@
-"""Water for ships: a harbour's quay, or the open sea before a coast."""
+"""Surroundings of ships: a harbour's quay, or open sea with a coast."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ _BOLLARDS_M = np.array([-5.2, -1.0, 1.2, 6.0, -14.0, 14.0])
 
 
 def open_water(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """Sea with buoys, and a wooded coast far away with a few houses."""
+    """Sea with buoys, and a distant wooded coast with a few houses."""
     pieces = [
         surroundings.sea(rng, palette),
         surroundings.hills(rng, palette, distance_m=rng.uniform(110, 170)),
@@ -40,7 +40,7 @@ def _buoys(rng: np.random.Generator, palette: Palette, spots: Points) -> Mesh:
 
 
 def harbour(rng: np.random.Generator, palette: Palette, hull: Hull) -> Mesh:
-    """A quay along the ship's starboard side with ropes to it, and what stands on quays."""
+    """A quay along the ship's starboard side, with mooring ropes, goods and buildings."""
     edge_m, top_m = -hull.beam_m / 2 - rng.uniform(0.3, 0.45), rng.uniform(0.7, 1.1)
     paving = palette.add(
         Material(
@@ -91,7 +91,7 @@ def harbour(rng: np.random.Generator, palette: Palette, hull: Hull) -> Mesh:
 
 
 def _moorings(hull: Hull, edge_m: float, top_m: float, rope: int) -> Mesh:
-    """Ropes from the ship's bow and stern to the bollards on the quay."""
+    """Mooring ropes from bow and stern to the quay's bollards."""
     share = np.array([0.08, 0.12, 0.85, 0.9])
     starts = hull.side_m(share, hull.edge_m(share) - 0.05, -1)
     x = _BOLLARDS_M[[0, 1, 2, 3]]

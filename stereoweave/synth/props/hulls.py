@@ -1,4 +1,4 @@
-"""Hulls of ships: the skin in its paints, the deck, and places on both for what is fixed to them."""
+"""Hulls of ships: painted skin, deck, and points on both for fittings."""
 
 from dataclasses import dataclass, replace
 
@@ -17,15 +17,15 @@ class Hull:
 
     Attributes:
         length_m: at the waterline, from -length_m / 2 to length_m / 2.
-        beam_m: the whole breadth of the deck where it is widest.
-        draft_m: how deep the keel is.
-        freeboard_m: how high the bulwark's edge is amidships.
-        sheer_m: how much higher it is at the stern and at the bow.
-        stern: the transom's breadth as a share of the beam.
-        rise: how much of the draft the keel rises by at the stern.
-        rise_to: the share of the length over which it does so.
-        rake_m: how far the stem leans forward.
-        bulwark_m: how much lower the deck is than the bulwark's edge.
+        beam_m: greatest breadth of the deck.
+        draft_m: depth of the keel.
+        freeboard_m: height of the bulwark's edge amidships.
+        sheer_m: additional height of that edge at the stern and at the bow.
+        stern: breadth of the transom as a share of the beam.
+        rise: rise of the keel at the stern as a share of the draft.
+        rise_to: share of the length over which the keel rises.
+        rake_m: forward lean of the stem.
+        bulwark_m: height of the bulwark above the deck.
     """
 
     length_m: float
@@ -54,7 +54,7 @@ class Hull:
         return -self.draft_m * (1 - self.rise * aft * aft * (3 - 2 * aft))
 
     def side_m(self, share: Values, z: Values, side: Values) -> Float[np.ndarray, "... 3"]:
-        """Points of the skin at a share of the length and a height; side: 1 is port (+y), -1 starboard."""
+        """Points on the skin at a share of the length and a height; side: 1 is port (+y), -1 starboard."""
         share, z, side = np.broadcast_arrays(share, z, side)
         keel = self.keel_m(share)
         level = np.clip((z - keel) / (self.edge_m(share) - keel), 0, 1.2)
@@ -97,11 +97,11 @@ class Hull:
         return join_meshes([floor, *walls, *rails])
 
     def patch(self, stations: tuple[int, int], levels: tuple[int, int], side: int, material: int) -> Mesh:
-        """A plate on the skin, over some of its 60 cells along and, from the stripe up, 7 cells high."""
+        """A plate on the skin, over ranges of its 60 cells along and 7 cells above the stripe."""
         share, z = self._topside(0.12)
         cells = np.s_[stations[0] : stations[1] + 1, levels[0] : levels[1] + 1]
         points = self.side_m(np.broadcast_to(share, z.shape)[cells], z[cells], side)
-        # Along the same triangles as the skin's, so that it nowhere sinks below them.
+        # On the skin's own triangles, so that it never sinks below them.
         plate = sheet(points[:, ::side], material)
         uv = side * np.stack([-plate.uv_m[..., 1], plate.uv_m[..., 0]], -1)
         outside = plate.corners_m + np.float32(0.012) * plate.normals

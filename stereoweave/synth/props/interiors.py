@@ -1,4 +1,4 @@
-"""A room: floor, walls, ceiling, and what is on its walls."""
+"""Interiors: floor, walls, ceiling, lamps, and objects on the walls."""
 
 from collections.abc import Callable, Sequence
 
@@ -33,9 +33,9 @@ def shell(
     open_roof: bool,
     open_side: int | None,
 ) -> Mesh:
-    """Floor at z = 0, up to four walls with what hangs on them, and a ceiling, around the z axis.
+    """Floor at z = 0, up to four walls with objects on them, and a ceiling, around the z axis.
 
-    open_side: the wall left out, counted counter-clockwise from the one at the largest x.
+    open_side: the missing wall, counted counter-clockwise from the one at the largest x.
     """
     x, y, height_m = (float(v) for v in size_m)
     distance_m = 0.6 * max(x, y)
@@ -61,7 +61,7 @@ def shell(
 def pendants(
     rng: np.random.Generator, palette: Palette, spots_m: Float[np.ndarray, "n 3"], ceiling_m: float
 ) -> Mesh:
-    """Shades with glowing bulbs at the spots, on cords from the ceiling."""
+    """Lampshades with glowing bulbs at the spots, on cords from the ceiling."""
     shade = palette.add(Material(texture="plain", tint=draw_muted_colour(rng, 0.4), roughness=0.5))
     bulb = palette.add(Material(texture="plain", tint=(1.0, 0.95, 0.85), glow=4.0))
     wide_m, high_m = rng.uniform(0.1, 0.25), rng.uniform(0.1, 0.25)
@@ -72,7 +72,7 @@ def pendants(
 
 
 def draw_lamps(rng: np.random.Generator, spots_m: Float[np.ndarray, "n 3"]) -> tuple[Lamp, ...]:
-    """Lamps of one room, warm or cold, one of them often the strongest."""
+    """Draw a room's lamps, warm or cold; one of them is often the strongest."""
     warm = rng.uniform(0, 1)
     colour = np.array([1.0, 0.95 - 0.2 * warm, 0.92 - 0.5 * warm])
     strengths = np.exp(rng.normal(0, 0.6, len(spots_m)))
@@ -86,7 +86,7 @@ def draw_lamps(rng: np.random.Generator, spots_m: Float[np.ndarray, "n 3"]) -> t
 def draw_lamp_spots(
     rng: np.random.Generator, size_m: Float[np.ndarray, "3"], eyes_m: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Spots of one to four lamps in the upper part of a room, away from the cameras."""
+    """Draw positions of one to four lamps in a room's upper part, away from the cameras."""
     low_m, high_m = size_m * [-0.4, -0.4, 0.68], size_m * [0.4, 0.4, 0.85]
     spots_m = rng.uniform(low_m, high_m, (40, 3))
     clear_m = np.linalg.norm(spots_m[:, None] - eyes_m, axis=2).min(1)
@@ -94,7 +94,7 @@ def draw_lamp_spots(
 
 
 def indoor_light(rng: np.random.Generator, sky: Sky, lamps: Sequence[Lamp]) -> tuple[Sky, float]:
-    """A sky whose light comes from walls rather than from the sun, and the exposure for a room."""
+    """Ambient light of a room, as a sky without sun, and the exposure."""
     ambient = rng.uniform(0.15, 0.6)
     warm = np.array([1.0, 0.95, 0.87])
 
@@ -110,7 +110,7 @@ def indoor_light(rng: np.random.Generator, sky: Sky, lamps: Sequence[Lamp]) -> t
 
 
 def _panel(rng: np.random.Generator, origin: Corner, along: Corner, up: Corner, material: int) -> Mesh:
-    """A surface that is not quite even, seen from along x up; it reaches too far, to close corners."""
+    """A slightly uneven surface facing along x up; it overlaps its corners to close them."""
     share = np.linspace(-0.01, 1.01, 29)
     u, v = np.meshgrid(share, share)
     normal = np.cross(along, up) / np.linalg.norm(np.cross(along, up))
@@ -122,7 +122,7 @@ def _panel(rng: np.random.Generator, origin: Corner, along: Corner, up: Corner, 
 
 
 def _wall_pose(side: int, away_m: float) -> Float[np.ndarray, "4 4"]:
-    """From a wall's x along it, y into the room, z up to the room's coordinates."""
+    """Pose of a wall: from x along it, y into the room and z up to the room's coordinates."""
     angle = side * np.pi / 2
     inwards = -np.array([np.cos(angle), np.sin(angle), 0])
     pose = np.eye(4)
@@ -134,7 +134,7 @@ def _wall_pose(side: int, away_m: float) -> Float[np.ndarray, "4 4"]:
 def _hang_on_wall(
     rng: np.random.Generator, palette: Palette, length_m: float, height_m: float, trim: int
 ) -> list[Mesh]:
-    """What is on one wall, each in its own stretch of it."""
+    """Objects on one wall, each in its own section."""
     count = int(rng.integers(1, min(int(length_m / 1.4), 3) + 1))
     stretch_m = length_m / count
     kinds: list[Hanging] = [_window, _door, _poster, _shelves, _radiator, _curtain]
@@ -157,7 +157,7 @@ def _frame(width_m: float, low_m: float, high_m: float, bar_m: float, trim: int)
 
 
 def _window(rng: np.random.Generator, palette: Palette, width_m: float, height_m: float, trim: int) -> Mesh:
-    """Panes with daylight behind them, bars between, a sill."""
+    """A window with daylight behind its panes, glazing bars, a sill."""
     low_m, high_m = 0.85, min(height_m - 0.25, 2.2)
     outside = Material(
         texture=str(rng.choice(["photograph", "sky", "leaves"])),
@@ -205,14 +205,14 @@ def _poster(rng: np.random.Generator, palette: Palette, width_m: float, height_m
 
 
 def _shelves(rng: np.random.Generator, palette: Palette, width_m: float, height_m: float, trim: int) -> Mesh:
-    """A rack of books that stands at the wall."""
+    """A bookcase at the wall."""
     skin = PropStyle(main=trim, other=palette.add(draw_material(rng, 4.0)), bar_m=0.01)
     pose = np.diag([width_m / 0.75, 1.2, min(0.8 * height_m, rng.uniform(0.8, 2.2)), 1.0])
     return shelf(rng, skin).transform(pose).translate(y=0.2)
 
 
 def _radiator(rng: np.random.Generator, palette: Palette, width_m: float, height_m: float, trim: int) -> Mesh:
-    """Upright ribs between two pipes."""
+    """Vertical ribs between two pipes."""
     x = np.linspace(-0.45, 0.45, int(rng.integers(8, 24))) * width_m
     ribs = tubes(
         [[at, 0.09, 0.16] for at in x], [[at, 0.09, 0.75] for at in x], 0.35 * (x[1] - x[0]), trim, 10
@@ -224,7 +224,7 @@ def _radiator(rng: np.random.Generator, palette: Palette, width_m: float, height
 
 
 def _curtain(rng: np.random.Generator, palette: Palette, width_m: float, height_m: float, trim: int) -> Mesh:
-    """Cloth in folds from a rod."""
+    """Folded cloth on a rod."""
     cloth = palette.add(draw_material_from(rng, ("cloth", "plain", "photograph"), 4.0))
     high_m = min(height_m - 0.1, 2.4)
     x, z = np.meshgrid(np.linspace(-0.5, 0.5, 60) * width_m, np.linspace(0.05, high_m, 14))

@@ -1,7 +1,7 @@
-"""Lattice work and what belongs to it: masts and jibs, cables, ladders, railings, strings of insulators.
+"""Lattice structures: masts, jibs, cables, ladders, railings, insulator strings.
 
-A lattice is worked out as segments from joint to joint first, so that its members meet exactly, and becomes
-tubes at the end. Metres; z is up.
+A lattice is built as segments from joint to joint, so that its members meet exactly, and converted to tubes
+at the end. Metres; z is up.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ Bracing = Literal["cross", "zigzag", "single"]
 
 @dataclass(frozen=True, kw_only=True)
 class Truss:
-    """The members of a lattice, each from one joint to another, in metres.
+    """The members of a lattice, segments from joint to joint in metres.
 
     Attributes:
         legs: along the lattice, [N, 2, 3].
@@ -33,7 +33,7 @@ class Truss:
     braces: Segments
 
     def mesh(self, leg_radius_m: float, brace_radius_m: float, material: int, sides: int = 5) -> Mesh:
-        """Round bars."""
+        """The members as round bars."""
         others = np.concatenate([self.struts, self.braces])
         return join_meshes(
             [
@@ -49,7 +49,7 @@ class Truss:
         materials: Sequence[int],
         bands_m: tuple[float, float],
     ) -> Mesh:
-        """Round bars, painted in turn by where their middle lies; bands_m: how long a band is in x, in z."""
+        """The members as round bars, painted in bands by their midpoints; bands_m: band length in x and z."""
         return join_meshes(
             self._within(band, len(materials), bands_m).mesh(leg_radius_m, brace_radius_m, material)
             for band, material in enumerate(materials)
@@ -65,14 +65,14 @@ class Truss:
 def mast_levels(
     stations_m: Sequence[float], widths_m: Sequence[float], ratio: float
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Heights of the joints of a tapering mast, and its width at each of them.
+    """Heights of a tapering mast's joints, and its widths there.
 
-    Every station is a joint; between two of them the panels are about `ratio` times as high as wide.
+    Every station is a joint; the panels between are about `ratio` times as high as wide.
     """
     heights = [np.array(stations_m[:1], float)]
     for low, high, width, top in zip(stations_m, stations_m[1:], widths_m, widths_m[1:], strict=False):
         count = max(round((high - low) / (ratio * np.sqrt(width * top))), 1)
-        # Panels that keep their proportions shrink by the same factor from one to the next.
+        # Panels of constant proportions shrink by a constant factor.
         sizes = (top / width) ** (np.arange(count) / count)
         heights.append(low + (high - low) * np.cumsum(sizes) / sizes.sum())
     joints = np.concatenate(heights)
@@ -82,9 +82,9 @@ def mast_levels(
 def mast_rings(
     heights_m: Float[np.ndarray, " k"], widths_m: float | Float[np.ndarray, " k"], corners: int = 4
 ) -> Float[np.ndarray, "k m 3"]:
-    """Joints of an upright mast: at each height a square, its sides along x and y, or another polygon.
+    """Joints of an upright mast: a square along x and y, or another polygon, at each height.
 
-    widths_m: the length of a side.
+    widths_m: side length.
     """
     angle = (np.arange(corners) + 0.5) * 2 * np.pi / corners
     radius = np.broadcast_to(widths_m, heights_m.shape) / (2 * np.sin(np.pi / corners))
@@ -95,8 +95,8 @@ def mast_rings(
 def truss(rings_m: Float[np.ndarray, "k m 3"], bracing: Bracing = "zigzag") -> Truss:
     """The lattice through rings of joints.
 
-    Each face between two rings is braced by both of its diagonals ("cross"), by one that changes its
-    direction from ring to ring ("zigzag"), or by one that keeps it ("single").
+    Each face between two rings is braced by both diagonals ("cross"), by diagonals of alternating direction
+    ("zigzag"), or by diagonals of one direction ("single").
     """
     ahead = np.roll(rings_m, -1, axis=1)
     rising = _segments(rings_m[:-1], ahead[1:])
@@ -115,19 +115,19 @@ def truss(rings_m: Float[np.ndarray, "k m 3"], bracing: Bracing = "zigzag") -> T
 def bars(
     segments_m: Segments, radius_m: float | np.ndarray, material: int, sides: int = 5, capped: bool = True
 ) -> Mesh:
-    """Round bars along segments; without caps where their ends are hidden in a joint."""
+    """Round bars along segments; capped=False if joints hide their ends."""
     return tubes(segments_m[:, 0], segments_m[:, 1], radius_m, material, sides, capped)
 
 
 def chain_segments(points_m: Float[np.ndarray, "n k 3"]) -> Segments:
-    """The segments from each point to the next of N polylines."""
+    """Segments of N polylines."""
     return _segments(points_m[:, :-1], points_m[:, 1:])
 
 
 def sagging_points(
     starts_m: Numbers, ends_m: Numbers, sag_m: float | Float[np.ndarray, " n"], count: int = 12
 ) -> Float[np.ndarray, "n k 3"]:
-    """Points along cables whose middle hangs sag_m below the straight line, a parabola: [N, count + 1, 3]."""
+    """Points [N, count + 1, 3] on parabolic cables that sag by sag_m in the middle."""
     starts, ends = np.broadcast_arrays(np.atleast_2d(starts_m), np.atleast_2d(ends_m))
     share = np.linspace(0, 1, count + 1)
     points = starts[:, None] + share[:, None] * (ends - starts)[:, None]
@@ -144,7 +144,7 @@ def cables(  # noqa: PLR0913, cables differ in so much
     sag_m: float | Float[np.ndarray, " n"] = 0.0,
     count: int = 12,
 ) -> Mesh:
-    """Cables [N] that hang between two points each."""
+    """Sagging cables [N] between pairs of points."""
     path = sagging_points(starts_m, ends_m, sag_m, count)
     return bars(chain_segments(path), radius_m, material, sides=5, capped=False)
 
@@ -156,7 +156,7 @@ def ladder(
     width_m: float,
     material: int,
 ) -> Mesh:
-    """Two rails and rungs; its rungs run along `sideways`, a quarter narrower apart than wide."""
+    """A ladder with rungs along `sideways`, spaced by 3/4 of its width."""
     foot, head = np.array(foot_m), np.array(head_m)
     half = width_m / 2 * np.array(sideways) / np.linalg.norm(sideways)
     count = max(round(np.linalg.norm(head - foot) / (0.75 * width_m)), 2)
@@ -178,7 +178,7 @@ def cage(
     width_m: float,
     material: int,
 ) -> Mesh:
-    """The hoops and strips around whoever climbs an upright ladder."""
+    """Safety cage (hoops and strips) of an upright ladder."""
     foot, head = np.array(foot_m), np.array(head_m)
     out = np.array(outwards) / np.linalg.norm(outwards)
     side = np.cross(out, [0.0, 0.0, 1.0])
@@ -194,7 +194,7 @@ def cage(
 def railing(  # noqa: PLR0913, railings differ in so much
     path_m: Points, height_m: float, spacing_m: float, radius_m: float, material: int, rails: int = 2
 ) -> Mesh:
-    """Posts along a path, at its corners and at most spacing_m apart, and rails from corner to corner."""
+    """Posts along a path, at its corners and at most spacing_m apart, with rails between corners."""
     lengths = np.linalg.norm(np.diff(path_m, axis=0), axis=1)
     counts = np.maximum(np.ceil(lengths / spacing_m), 1).astype(int)
     feet = np.concatenate(
@@ -215,7 +215,7 @@ def railing(  # noqa: PLR0913, railings differ in so much
 
 
 def poses_towards(at_m: Numbers, directions: Numbers) -> Float[np.ndarray, "n 4 4"]:
-    """Poses [N] at points, whose z looks along a direction and whose x stays level."""
+    """Poses [N] at points, with z along a direction and x horizontal."""
     at, along = np.broadcast_arrays(np.atleast_2d(at_m), np.atleast_2d(directions))
     z = along / np.linalg.norm(along, axis=1, keepdims=True)
     poses = np.tile(np.eye(4), (len(z), 1, 1))
@@ -225,7 +225,7 @@ def poses_towards(at_m: Numbers, directions: Numbers) -> Float[np.ndarray, "n 4 
 
 
 def insulators(starts_m: Points, ends_m: Points, radius_m: float, discs: int, material: int) -> Mesh:
-    """Strings of bell-shaped discs, the bells open towards the end of each string."""
+    """Insulator strings of bell-shaped discs that open towards each string's end."""
     starts_m, ends_m = np.broadcast_arrays(np.atleast_2d(starts_m), np.atleast_2d(ends_m))
     pitch = float(np.linalg.norm(ends_m - starts_m, axis=1).mean()) / discs
     bell = np.array([[0.0, 0.15], [0.95, 0.15], [1.0, 0.3], [0.35, 0.75], [0.3, 1.0]]) * (radius_m, pitch)
@@ -237,7 +237,7 @@ def insulators(starts_m: Points, ends_m: Points, radius_m: float, discs: int, ma
 
 
 def galvanised_steel(rng: np.random.Generator) -> Material:
-    """Zinc-coated steel, fresh and bright to dull and dark."""
+    """Galvanised steel, from bright to dull and dark."""
     grey = rng.uniform(0.35, 0.85)
     return Material(
         texture="steel",
@@ -251,7 +251,7 @@ def galvanised_steel(rng: np.random.Generator) -> Material:
 
 
 def painted_steel(rng: np.random.Generator, tint: Colour, roughness: float = 0.55) -> Material:
-    """Coated steel, its colour a little off from the given one."""
+    """Painted steel with a slight variation of the given colour."""
     shade = rng.uniform(0.85, 1.1)
     red, green, blue = (float(np.clip(shade * part, 0, 1)) for part in tint)
     return Material(
@@ -265,7 +265,7 @@ def painted_steel(rng: np.random.Generator, tint: Colour, roughness: float = 0.5
 
 
 def aviation_paints(rng: np.random.Generator) -> tuple[Material, Material]:
-    """The red and the white of obstacles to aircraft."""
+    """Red and white paint of aviation obstacles."""
     return painted_steel(rng, (0.55, 0.07, 0.04)), painted_steel(rng, (0.8, 0.8, 0.77))
 
 

@@ -1,4 +1,4 @@
-"""Rounded figures that stand on z = 0 and look towards x: people and animals without faces."""
+"""Rounded people and animals without faces, standing on z = 0 and facing x."""
 
 from dataclasses import dataclass
 
@@ -29,7 +29,7 @@ _TRUNK_M = np.array(
 
 @dataclass(frozen=True, kw_only=True)
 class Clothes:
-    """The materials of a person."""
+    """Materials of a person."""
 
     coat: int
     trousers: int
@@ -38,7 +38,7 @@ class Clothes:
 
 
 def draw_clothes(rng: np.random.Generator, palette: Palette) -> Clothes:
-    """Draw the materials of a person, most of them plain."""
+    """Draw a person's materials, most of them plain."""
     brown = rng.uniform(0.15, 1.0)
     skin = (0.75 * brown, 0.5 * brown, 0.38 * brown)
     return Clothes(
@@ -91,7 +91,7 @@ def animal(rng: np.random.Generator, palette: Palette) -> Mesh:
 
 
 def _limbs(rng: np.random.Generator, clothes: Clothes, side: int, stride_m: float) -> list[Mesh]:
-    """A leg with its shoe, and an arm with its hand, at y of a side -1 or 1."""
+    """Leg with shoe and arm with hand; side is -1 or 1 along y."""
     ankle = np.array([side * stride_m, 0.1 * side, 0.08])
     leg = _bent_limb(np.array([0, 0.09 * side, 0.93]), ankle, 0.04, (0.1, 0.055), clothes.trousers)
     shoe = spheres([ankle + [0.05, 0, -0.03]], [[0.14, 0.05, 0.06]], clothes.hair)
@@ -108,14 +108,14 @@ def _bent_limb(
     radii_m: tuple[float, float],
     material: int,
 ) -> Mesh:
-    """A round limb between two points that bulges towards x in its middle."""
+    """A round limb between two points, its middle bent towards x."""
     share = np.linspace(0, 1, 9)[:, None]
     path_m = (1 - share) * start_m + share * end_m + 4 * share * (1 - share) * [bulge_m, 0, 0]
     return sweep(path_m, np.linspace(*radii_m, 9), material, 12)
 
 
 def _ellipses(heights_and_halves_m: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 24 3"]:
-    """Ellipses, one above another."""
+    """Stacked ellipses."""
     angle = np.arange(24) * 2 * np.pi / 24
     z, along, across = (column[:, None] for column in heights_and_halves_m.T)
     return np.stack([along * np.cos(angle), across * np.sin(angle), z + 0 * angle], -1)

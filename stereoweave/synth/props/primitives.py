@@ -1,7 +1,7 @@
-"""The pieces that scenes are built from: tubes, boxes, solids of revolution, lofts, sheets, spheres.
+"""Geometric primitives: tubes, boxes, solids of revolution, lofts, sheets, spheres.
 
-All at once for arrays of pieces, because a lattice mast has a thousand struts. Metres; z is up. Points and
-sizes are [N, 3], or one [3] for all. Textures are laid on in metres along the surface.
+Vectorised over arrays of pieces, because a lattice mast has a thousand struts. Metres; z is up. Points and
+sizes are [N, 3], or one [3] for all. Texture coordinates are metres along the surface.
 """
 
 import functools
@@ -18,15 +18,15 @@ from stereoweave.synth.world import Mesh, join_meshes
 
 Point = Float[np.ndarray, "3"]
 Points = Float[np.ndarray, "_ 3"]
-Numbers = np.ndarray | Sequence[Any] | float  # an array, or lists that make one
+Numbers = np.ndarray | Sequence[Any] | float  # an array, or nested sequences
 
-# Two triangles a side, by their corners, counter-clockwise from outside; corner 4 x + 2 y + z is at the ends
-# of the axes where these are 1.
+# Two triangles per side, counter-clockwise from outside. Corner 4 x + 2 y + z has the coordinates x, y, z in
+# {0, 1}.
 _CUBE_FACES = (
     *((1, 3, 0), (4, 1, 0), (0, 3, 2), (2, 4, 0), (1, 7, 3), (5, 1, 4)),
     *((5, 7, 1), (3, 7, 2), (6, 4, 2), (2, 7, 6), (6, 5, 4), (7, 5, 6)),
 )
-# Its corners are those of three golden rectangles, one after the other.
+# Corner indices: those of three golden rectangles in order.
 _ICOSAHEDRON_FACES = (
     *((0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2)),
     *((10, 7, 6), (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5)),
@@ -34,7 +34,7 @@ _ICOSAHEDRON_FACES = (
 )
 
 
-def tubes(  # noqa: PLR0913, bars differ in so much
+def tubes(  # noqa: PLR0913 - dimensions and options
     starts_m: Numbers,
     ends_m: Numbers,
     radii_m: Numbers,
@@ -42,9 +42,9 @@ def tubes(  # noqa: PLR0913, bars differ in so much
     sides: int = 6,
     capped: bool = True,
 ) -> Mesh:
-    """Straight round bars [N] from start to end; `capped` closes both ends by cones of no height.
+    """Straight round bars [N] from start to end; `capped` closes both ends by flat caps.
 
-    radii_m: one for all, [N], or [N, 2] for the start's and the end's.
+    radii_m: one for all, [N], or [N, 2] for start and end.
     """
     starts, ends = np.broadcast_arrays(np.atleast_2d(starts_m), np.atleast_2d(ends_m))
     count = len(starts)
@@ -60,7 +60,7 @@ def tubes(  # noqa: PLR0913, bars differ in so much
     rings = middles[:, :, None] + radii[..., None, None] * outwards[:, None]
     around = np.arctan2(plan.circle[:, 1], plan.circle[:, 0]) % (2 * np.pi) * radii.max(1)[:, None]
     around[:, -1] = 2 * np.pi * radii.max(1)
-    # Every piece shows another part of its texture.
+    # Each piece shows a different part of its texture.
     offset = np.broadcast_to((np.arange(count) * 0.618)[:, None] % 7, around.shape)
     sides_uv = [np.stack([around, offset + up], -1) for up in (0, length[:, None])]
     ends_uv = radii[..., None, None] * plan.circle
@@ -79,7 +79,7 @@ def tubes(  # noqa: PLR0913, bars differ in so much
 def boxes(
     centres_m: Numbers, sizes_m: Numbers, material: int, turns: Float[np.ndarray, "_ 3 3"] | None = None
 ) -> Mesh:
-    """Blocks [N] with flat faces; `turns` rotates each about its centre."""
+    """Boxes [N]; `turns` rotates each about its centre."""
     centres, sizes = np.broadcast_arrays(np.atleast_2d(centres_m), np.atleast_2d(sizes_m))
     cube, face_normals = _cube()
     corners = cube[None] * (sizes / 2)[:, None, None]
@@ -92,16 +92,16 @@ def boxes(
 
 
 def lathe(profile_m: Numbers, material: int, sections: int = 32, crease_deg: float = 35) -> Mesh:
-    """A solid of revolution about z; profile_m [K, 2]: radius and height, from bottom to top outside.
+    """Solid of revolution around z; profile_m [K, 2]: radius and height, outside from bottom to top.
 
-    Edges of the profile sharper than `crease_deg` stay sharp.
+    Profile edges sharper than `crease_deg` stay sharp.
     """
     profile = np.asarray(profile_m, np.float64)
     angle = np.arange(sections + 1) * 2 * np.pi / sections
     circle = np.stack([np.cos(angle), np.sin(angle)], -1)
     step = np.diff(profile, axis=0)
     slope = step / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
-    flat = np.stack([slope[:, 1], -slope[:, 0]], -1)  # outwards, for a profile that rises outside
+    flat = np.stack([slope[:, 1], -slope[:, 0]], -1)  # outwards for an outside that rises
     below, above = flat.copy(), flat.copy()
     smooth = (flat[:-1] * flat[1:]).sum(1) > np.cos(np.radians(crease_deg))
     mean = flat[:-1] + flat[1:]
@@ -116,10 +116,10 @@ def lathe(profile_m: Numbers, material: int, sections: int = 32, crease_deg: flo
 
 
 def loft(rings_m: Float[np.ndarray, "k m 3"], material: int, capped: bool = True) -> Mesh:
-    """A smooth closed surface through rings of points, such as a hull, a blade or a bent pipe.
+    """Smooth closed surface through rings of points, such as a hull, a blade or a bent pipe.
 
-    Rings go counter-clockwise, seen from the last ring towards the first; their last point is not the first
-    one again. `capped` closes both ends by fans around the middle of the first and the last ring.
+    Rings run counter-clockwise, seen from the last ring towards the first, without a repeated point. `capped`
+    closes the first and the last ring by triangle fans.
     """
     rings = np.asarray(rings_m, np.float64)
     rings = np.concatenate([rings, rings[:, :1]], axis=1)
@@ -130,7 +130,7 @@ def loft(rings_m: Float[np.ndarray, "k m 3"], material: int, capped: bool = True
 
 
 def sweep(path_m: Numbers, radius_m: Numbers, material: int, sides: int = 8) -> Mesh:
-    """A round pipe or cable along a path [K, 3]; radius_m: one, or one a point."""
+    """Round pipe or cable along a path [K, 3]; radius_m: one, or one per point."""
     path = np.asarray(path_m, np.float64)
     along = np.gradient(path, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -142,9 +142,9 @@ def sweep(path_m: Numbers, radius_m: Numbers, material: int, sides: int = 8) -> 
 
 
 def sheet(points_m: Float[np.ndarray, "r c 3"], material: int, closed: bool = False) -> Mesh:
-    """A smooth surface through a grid of points, seen from where columns x rows points to.
+    """Smooth surface through a grid of points; its normal is columns x rows.
 
-    With x along columns and y along rows the front is up. `closed`: the last column is the first one again.
+    With x along columns and y along rows it faces up. `closed`: the last column repeats the first.
     """
     points = np.asarray(points_m, np.float64)
     if closed:
@@ -160,7 +160,7 @@ def sheet(points_m: Float[np.ndarray, "r c 3"], material: int, closed: bool = Fa
 
 
 def spheres(centres_m: Numbers, radii_m: Numbers, material: int, subdivisions: int = 2) -> Mesh:
-    """Balls [N]; radii_m: one for all, [N], or [N, 3] for ellipsoids along the axes."""
+    """Spheres [N]; radii_m: one for all, [N], or [N, 3] for ellipsoids along the axes."""
     centres = np.atleast_2d(np.asarray(centres_m, np.float64))
     radii = np.asarray(radii_m, np.float64)
     radii = np.broadcast_to(radii[:, None] if radii.ndim == 1 else radii, (len(centres), 3))
@@ -175,7 +175,7 @@ def spheres(centres_m: Numbers, radii_m: Numbers, material: int, subdivisions: i
 
 
 def facets(triangles_m: Numbers, material: int) -> Mesh:
-    """Flat triangles [N, 3, 3] as given, counter-clockwise seen from outside."""
+    """Flat triangles [N, 3, 3], counter-clockwise seen from outside."""
     triangles = np.asarray(triangles_m, np.float64)
     across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
@@ -184,7 +184,7 @@ def facets(triangles_m: Numbers, material: int) -> Mesh:
 
 
 def prism(outline_m: Numbers, depth_m: float, material: int) -> Mesh:
-    """A convex outline [K, 2], counter-clockwise from above, pulled up from z = 0 by depth_m."""
+    """Convex outline [K, 2], counter-clockwise from above, extruded from z = 0 to depth_m."""
     floor = np.pad(np.asarray(outline_m, np.float64), ((0, 0), (0, 1)))
     roof = floor + [0, 0, depth_m]
     after, above = np.roll(floor, -1, axis=0), np.roll(roof, -1, axis=0)
@@ -197,7 +197,7 @@ def prism(outline_m: Numbers, depth_m: float, material: int) -> Mesh:
 
 
 def copies(mesh: Mesh, poses: Float[np.ndarray, "n 4 4"]) -> Mesh:
-    """The mesh once for each pose, without scaling that differs by axis."""
+    """One copy of the mesh per pose [N, 4, 4]; poses may scale uniformly."""
     turns = poses[:, :3, :3].swapaxes(1, 2)
     scales = np.cbrt(np.abs(np.linalg.det(turns)))[:, None, None]
     corners = mesh.corners_m.reshape(-1, 3) @ turns.astype(np.float32)
@@ -215,23 +215,23 @@ def copies(mesh: Mesh, poses: Float[np.ndarray, "n 4 4"]) -> Mesh:
 
 
 def rotation(axis: tuple[float, float, float], angle_deg: float) -> Float[np.ndarray, "4 4"]:
-    """The pose that rotates about an axis through the origin, counter-clockwise seen from its tip."""
+    """Pose [4, 4] that rotates about an axis through the origin, counter-clockwise seen from its tip."""
     pose = np.eye(4)
     pose[:3, :3] = cv2.Rodrigues(np.radians(angle_deg) * np.array(axis) / np.linalg.norm(axis))[0]
     return pose
 
 
 def translation(x: float = 0, y: float = 0, z: float = 0) -> Float[np.ndarray, "4 4"]:
-    """The pose that moves by metres."""
+    """Pose [4, 4] that translates by metres."""
     pose = np.eye(4)
     pose[:3, 3] = x, y, z
     return pose
 
 
 def orthogonal_frames(along: Points) -> tuple[Points, Points]:
-    """Two unit vectors across each unit direction [N], the first one level; with it they are right-handed.
+    """Two unit vectors across each unit direction [N], forming right-handed frames; the first is horizontal.
 
-    What is within 2.5 degrees of upright has its first along -y.
+    For directions within 2.5 degrees of vertical the first is along -y.
     """
     helper = np.where(np.abs(along[:, 2:]) < 0.999, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     across = np.cross(helper, along)
@@ -240,7 +240,7 @@ def orthogonal_frames(along: Points) -> tuple[Points, Points]:
 
 
 def polyline_tubes(points_m: Numbers, radius_m: float, material: int, sides: int = 6) -> Mesh:
-    """Tubes from each point to the next: railings, frames, cables with corners."""
+    """Tubes along a polyline: railings, frames, cables with corners."""
     points = np.asarray(points_m)
     return tubes(points[:-1], points[1:], radius_m, material, sides)
 
@@ -251,7 +251,7 @@ def _mesh_grids(
     uv: Float[np.ndarray, "n r c 2"],
     material: int,
 ) -> Mesh:
-    """Two triangles for each cell of each grid."""
+    """Two triangles per cell of each grid."""
 
     def cells(values: np.ndarray) -> np.ndarray:
         a, b, c, d = values[:, :-1, :-1], values[:, :-1, 1:], values[:, 1:, 1:], values[:, 1:, :-1]
@@ -264,7 +264,7 @@ def _mesh_grids(
 
 
 def _drop_degenerate(mesh: Mesh) -> Mesh:
-    """The mesh without triangles of no area: at a pole a grid's cell has no second triangle."""
+    """Remove triangles without area, such as those of grid cells at a pole."""
     a, b, c = mesh.corners_m.swapaxes(0, 1)
     kept = (np.abs(np.cross(b - a, c - a)) > 1e-12).any(1)
     if kept.all():
@@ -279,7 +279,7 @@ def _drop_degenerate(mesh: Mesh) -> Mesh:
 
 
 def _add_caps(walls: Mesh, ends: Float[np.ndarray, "n 2 m 3"], material: int) -> Mesh:
-    """The walls, and fans over first and last rings whose last point is the first again."""
+    """Add triangle fans over the first and last rings, whose last point repeats the first."""
     fans = [walls]
     for k in (0, 1):
         ring = ends[:, k] if k else ends[:, k, ::-1]
@@ -307,10 +307,10 @@ def _make_mesh(corners: np.ndarray, normals: np.ndarray, uv: np.ndarray, materia
 
 
 def _transport_frames(along: Points) -> tuple[Points, Points]:
-    """As `frames`, each nearly the one before it, so that a pipe does not twist."""
+    """Frames along a path by parallel transport, so that a pipe does not twist."""
     across = orthogonal_frames(along[:1])[0][0]
     carried = []
-    # In plain numbers, because arrays of three are slow.
+    # Plain floats, because arrays of three are slow.
     u, v, w = across.tolist()
     for x, y, z in along.tolist():
         off = u * x + v * y + w * z
@@ -330,14 +330,14 @@ def _revolve(circle: Float[np.ndarray, "s 2"], radius_and_height: np.ndarray) ->
 
 
 def _arc_lengths_m(points: Float[np.ndarray, "r c 3"], axis: int) -> Float[np.ndarray, "r c"]:
-    """How far each point is from the first along the grid."""
+    """Arc length from the first point along one axis of the grid."""
     step = np.linalg.norm(np.diff(points, axis=axis), axis=-1)
     start = np.zeros_like(np.take(step, [0], axis=axis))
     return np.concatenate([start, np.cumsum(step, axis=axis)], axis=axis)
 
 
 def _box_uv(corners: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Texture places from the two axes across the one that each face looks along the most."""
+    """Texture coordinates by box projection: the two axes across the normal's dominant one."""
     axis = np.abs(normals[..., :1, :]).argmax(-1)[..., None]
     x, y, z = corners[..., 0], corners[..., 1], corners[..., 2]
     axis = axis[..., 0] * np.ones(x.shape, int)
@@ -347,10 +347,10 @@ def _box_uv(corners: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 class _TubeTopology(NamedTuple):
-    """How a bar's triangles are joined: places in its tables of points, normals and texture, each [T, 3].
+    """Topology of a tube: indices [T, 3] into its points, normals and texture coordinates.
 
-    Points: the start's ring [S + 1], the end's, both middles. Normals: a ring [S + 1], back, ahead. Texture:
-    both rings for the sides, then as the points for the ends.
+    Points: the start's ring [S + 1], the end's ring, both centres. Normals: a ring [S + 1], back, ahead.
+    Texture coordinates: both rings for the sides, then the points for the ends.
     """
 
     circle: Float[np.ndarray, "s 2"]
@@ -378,7 +378,7 @@ def _tube_topology(sides: int, capped: bool) -> _TubeTopology:
 
 @functools.cache
 def _cube() -> tuple[Float[np.ndarray, "12 3 3"], Float[np.ndarray, "12 3 3"]]:
-    """The triangles of a cube of side 2 about the origin, and their normals."""
+    """Triangles and normals of a cube of side 2 around the origin."""
     corners = np.array(list(product((-1.0, 1.0), repeat=3)))
     triangles = corners[np.array(_CUBE_FACES)]
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]) / 4
@@ -387,7 +387,7 @@ def _cube() -> tuple[Float[np.ndarray, "12 3 3"], Float[np.ndarray, "12 3 3"]]:
 
 @functools.cache
 def _ball(subdivisions: int) -> Float[np.ndarray, "n 3 3"]:
-    """The triangles of a ball of radius 1 about the origin: an icosahedron's, divided into four each time."""
+    """Triangles of a unit sphere: an icosahedron, each triangle split into four per subdivision."""
     golden_ratio = (1 + math.sqrt(5)) / 2
     rectangle = np.array([(y, x * golden_ratio, 0) for x, y in product((1, -1), (-1, 1))])
     corners = np.concatenate([np.roll(rectangle, turn, axis=1) for turn in range(3)])

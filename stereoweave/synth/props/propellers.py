@@ -1,4 +1,4 @@
-"""Ships' screws: pitched, skewed blades with round outlines on a hub, drawn at random."""
+"""Random ship propellers: pitched, skewed blades with round outlines on a hub."""
 
 from dataclasses import dataclass, replace
 
@@ -11,18 +11,18 @@ from stereoweave.synth.world import Mesh, join_meshes
 
 @dataclass(frozen=True, kw_only=True)
 class Propeller:
-    """A ship's screw that turns about x; aft is +x.
+    """A ship's propeller around the x axis; aft is +x.
 
     Attributes:
-        radius_m: from the axis to the blades' tips.
-        blades: how many.
-        hub_share: the hub's radius as a share of radius_m.
-        pitch_share: how far a turn would screw it forward, as a share of the diameter.
-        skew_deg: how far the tips are swept back.
-        rake_m: how far the tips lean aft.
-        chord_m: the blade's width where it is widest.
+        radius_m: from the axis to the tips.
+        blades: number of blades.
+        hub_share: radius of the hub as a share of radius_m.
+        pitch_share: pitch as a share of the diameter.
+        skew_deg: sweep of the tips.
+        rake_m: aft lean of the tips.
+        chord_m: greatest width of a blade.
         tip: 3 for slender tips to 9 for blunt ones.
-        hand: 1 or -1, which way it turns.
+        hand: 1 or -1, the direction of rotation.
     """
 
     radius_m: float
@@ -37,17 +37,17 @@ class Propeller:
 
     @property
     def hub_m(self) -> float:
-        """The hub's radius."""
+        """Radius of the hub."""
         return self.hub_share * self.radius_m
 
     @property
     def hub_half_m(self) -> float:
-        """Half the hub's length: it covers the blades' roots."""
+        """Half the length of the hub, which covers the blades' roots."""
         return 0.5 * 0.5 * self.chord_m * float(np.sin(self._pitch(self.hub_m))) + 0.08
 
     def sections_m(self, spans: int = 40, points: int = 32) -> Float[np.ndarray, "k m 3"]:
-        """Outlines of one blade's sections from inside the hub to the tip, which is up: rings for a loft."""
-        # The outline is round at the tip, where the sections are therefore close to each other.
+        """Sections of one blade from inside the hub up to the tip: rings for a loft."""
+        # Sections are denser at the tip, because the outline is round there.
         span = np.sin(np.linspace(0, 0.992 * np.pi / 2, spans))[:, None]
         inner_m = 0.85 * self.hub_m
         radius = inner_m + (self.radius_m - inner_m) * span
@@ -67,12 +67,12 @@ class Propeller:
         return rings[:, :: self.hand]
 
     def _pitch(self, radius_m: float | np.ndarray) -> float | np.ndarray:
-        """The blade's slope against the plane of rotation in radians."""
+        """Pitch angle of the blade in radians."""
         return np.arctan(self.pitch_share * 2 * self.radius_m / (2 * np.pi * radius_m))
 
 
 def draw_propeller(rng: np.random.Generator) -> Propeller:
-    """Three to six blades, from narrow and straight to broad and swept."""
+    """Draw a propeller of three to six blades, from narrow and straight to broad and swept."""
     blades = int(rng.choice([3, 4, 5, 6], p=[0.2, 0.4, 0.3, 0.1]))
     radius_m = rng.uniform(2.3, 2.8)
     return Propeller(
@@ -89,16 +89,16 @@ def draw_propeller(rng: np.random.Generator) -> Propeller:
 
 
 def propeller_mesh(propeller: Propeller, bronze: int, hub: int, bolt: int) -> Mesh:
-    """Blades, hub, cap and bolts around the origin; one blade points up."""
+    """Mesh of blades, hub, cap and bolts around the origin; one blade points up."""
     blade = loft(propeller.sections_m(), bronze)
-    # Laid on flat, so that the texture is not squeezed at the tip.
+    # Planar texture coordinates, so that the texture is not squeezed at the tip.
     blade = replace(blade, uv_m=blade.corners_m[..., 1:].copy())
     around = np.stack([rotation((1, 0, 0), k * 360 / propeller.blades) for k in range(propeller.blades)])
     return join_meshes([copies(blade, around), _hub(propeller, hub), _bolts(propeller, bolt)])
 
 
 def turn_aft(mesh: Mesh) -> Mesh:
-    """The mesh, turned so that what was up is aft."""
+    """Rotate the mesh from z to x (aft)."""
     return mesh.transform(rotation((0, 1, 0), 90))
 
 
@@ -119,7 +119,7 @@ def _hub(propeller: Propeller, material: int) -> Mesh:
 
 
 def _bolts(propeller: Propeller, material: int) -> Mesh:
-    """Hexagonal heads around the cap's flange and the hub's front."""
+    """Hexagon bolts around the cap's flange and the hub's front."""
     angle = np.arange(12) * np.pi / 6
     circle = np.stack([0 * angle, np.cos(angle), np.sin(angle)], -1)
     size = 0.055 * propeller.hub_m / 0.5

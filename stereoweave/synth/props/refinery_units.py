@@ -1,6 +1,6 @@
-"""The units of a refinery, a tenth of their real size: columns, tanks, vessels, stacks.
+"""Units of a refinery at a tenth of their real size: columns, tanks, pressure vessels, stacks.
 
-Each stands on z = 0 around the z axis, and says where its pipes begin.
+Each stands on z = 0 around the z axis and lists its nozzles.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from stereoweave.synth.world import Mesh, join_meshes
 
 @dataclass(frozen=True, kw_only=True)
 class RefineryMaterials:
-    """The materials of a refinery: painted and bare shells, structure, railings, and so on."""
+    """Materials of a refinery: painted and bare shells, structure, railings, and so on."""
 
     shells: tuple[int, ...]
     steel: int
@@ -36,13 +36,13 @@ class RefineryMaterials:
     flame: int
 
     def shell(self, rng: np.random.Generator) -> int:
-        """One of the shells."""
+        """Draw a shell's material."""
         return self.shells[rng.integers(len(self.shells))]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RefineryUnit:
-    """A unit and the ends of its pipes: [N, 3] in metres."""
+    """A unit and the positions [N, 3] of its nozzles."""
 
     mesh: Mesh
     nozzles_m: Float[np.ndarray, "n 3"]
@@ -65,7 +65,7 @@ def column(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUn
     climb = _caged_ladder(radius_m + 0.1, floors_m[0] + 0.1, materials)
     turns = np.stack([rotation((0, 0, 1), 150.0 * k) for k in range(len(floors_m))])
     parts.append(copies(climb, _poses_at_heights(floors_m - floors_m[0]) @ turns))
-    # The vapour leaves at the top and comes down along the shell.
+    # The vapour pipe runs down along the shell from the top.
     line = np.array(
         [[0, 0, high_m], [0, 0, high_m + 0.3], [radius_m + 0.12, 0, high_m + 0.3], [radius_m + 0.12, 0, 0.5]]
     )
@@ -78,7 +78,7 @@ def column(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUn
 
 
 def ball_tank(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUnit:
-    """A spherical tank on braced legs, with a stair around it and a platform on top."""
+    """A spherical tank on braced legs, with a winding stair and a platform on top."""
     radius_m = rng.uniform(0.5, 0.6)
     middle_m, legs = radius_m + 0.28, 9
     angle = np.arange(legs) * 2 * np.pi / legs
@@ -121,7 +121,7 @@ def ball_tank(rng: np.random.Generator, materials: RefineryMaterials) -> Refiner
 
 
 def drum_tank(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUnit:
-    """An upright storage tank with a low cone as its roof, a winding stair, a railing, and its number."""
+    """A storage tank with a low conical roof, a winding stair, a railing, and its number."""
     radius_m, high_m = rng.uniform(0.5, 0.62), rng.uniform(0.6, 1.1)
     seams_m = np.linspace(0, high_m, 5)[1:-1]
     shell = lathe(
@@ -159,7 +159,7 @@ def drum_tank(rng: np.random.Generator, materials: RefineryMaterials) -> Refiner
 
 
 def pressure_vessels(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUnit:
-    """One to three lying vessels with round ends on saddles, some stacked, with a platform and a ladder."""
+    """One to three horizontal vessels with round ends on saddles, some stacked, with platform and ladder."""
     radius_m, long_m = rng.uniform(0.14, 0.2), rng.uniform(0.55, 0.7)
     bend = np.linspace(0, np.pi / 2, 6)[:-1]
     cap = np.column_stack([radius_m * np.sin(bend), -0.5 * radius_m * np.cos(bend)])
@@ -229,7 +229,7 @@ def chimney(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryU
 
 
 def flare(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUnit:
-    """A slender flare stack with guy wires at two heights, and mostly its flame."""
+    """A slender flare stack with guy wires at two heights, mostly with a flame."""
     high_m = rng.uniform(4.4, 5.4)
     stack = lathe(
         [
@@ -267,7 +267,7 @@ def flare(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUni
 
 
 def _flame(rng: np.random.Generator, materials: RefineryMaterials) -> Mesh:
-    """A flame that leans with the wind."""
+    """A flame leaning with the wind."""
     share = np.linspace(0, 1, 12)
     width_m = 0.11 * np.sin(np.pi * (0.15 + 0.85 * share)) ** 0.8 * rng.uniform(0.8, 1.2, 12)
     flame = lathe(np.column_stack([np.append(width_m[:-1], 0.0), 0.55 * share]), materials.flame, 18)
@@ -277,7 +277,7 @@ def _flame(rng: np.random.Generator, materials: RefineryMaterials) -> Mesh:
 
 
 def _deck(inner_m: float, wide_m: float, materials: RefineryMaterials) -> Mesh:
-    """A round platform with its railing, and brackets under it."""
+    """A round platform with railing and brackets."""
     outer_m = inner_m + wide_m
     plate = lathe(
         [[inner_m, -0.02], [outer_m, -0.02], [outer_m, 0.0], [inner_m, 0.0]],
@@ -294,14 +294,14 @@ def _deck(inner_m: float, wide_m: float, materials: RefineryMaterials) -> Mesh:
 
 
 def _railing(path_m: Float[np.ndarray, "n 3"], materials: RefineryMaterials) -> Mesh:
-    """Posts at the points of a path, and two rails."""
+    """A railing with posts at the points of a path, and two rails."""
     rails = [np.stack([path_m[:-1], path_m[1:]], 1) + [0, 0, z] for z in (0.055, 0.11)]
     posts = np.stack([path_m, path_m + [0, 0, 0.11]], 1)
     return bars(np.concatenate([*rails, posts]), 0.0065, materials.rail, 3, capped=False)
 
 
 def _caged_ladder(at_m: float, high_m: float, materials: RefineryMaterials) -> Mesh:
-    """A ladder at distance at_m from the axis, and the hoops and strips of its cage."""
+    """A caged ladder at distance at_m from the axis."""
     angle = np.radians(np.linspace(-90, 90, 5))
     bow = np.stack([at_m + 0.12 * np.cos(angle), 0.07 * np.sin(angle), 0 * angle], -1)
     hoops = bow + np.arange(0.24, high_m, 0.2)[:, None, None] * [0, 0, 1]
@@ -313,14 +313,14 @@ def _caged_ladder(at_m: float, high_m: float, materials: RefineryMaterials) -> M
 
 
 def _poses_at_heights(heights_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
-    """Poses at heights on the axis."""
+    """Poses at heights on the z axis."""
     poses = np.tile(np.eye(4), (len(heights_m), 1, 1))
     poses[:, 2, 3] = heights_m
     return poses
 
 
 def _stair(path_m: Float[np.ndarray, "n 3"], materials: RefineryMaterials) -> Mesh:
-    """Steps along a path around the z axis, with handrails on posts."""
+    """Steps along a path around the z axis, with handrails."""
     angle = np.arctan2(path_m[:, 1], path_m[:, 0])
     out = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
     turns = np.stack(

@@ -1,4 +1,4 @@
-"""Plans of small ships of four trades, drawn at random, and the gear that each trade needs. Bow at +x."""
+"""Random plans of small ships of four trades, and the gear of each trade. Bow at +x."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,14 +16,16 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class ShipPlan:
-    """What a ship is built from.
+    """The plan of a ship.
 
     Attributes:
-        house: on deck; bridge: on the house, with windows all round.
-        funnels: x and y of each, on the house.
-        mast_m: the mast's x on the bridge, and its height.
+        hull: the hull.
+        house: deckhouse.
+        bridge: wheelhouse on the deckhouse, with windows on all sides.
+        funnels: x and y of each funnel on the deckhouse.
+        mast_m: x of the mast on the bridge, and its height.
         fenders: whether tyres hang along its sides.
-        fitted: builds the gear of its trade from the ship's paints and the colours of its containers.
+        build_gear: builds the trade's gear from the ship's materials and the materials of containers.
     """
 
     hull: Hull
@@ -35,13 +37,13 @@ class ShipPlan:
     build_gear: Callable[[np.random.Generator, "ShipPlan", ShipMaterials, tuple[int, ...]], Mesh]
 
     def on_deck(self, x: float, y: float = 0.0) -> Point:
-        """A spot on deck."""
+        """Point on deck."""
         return np.array([x, y, self.hull.deck_m(x)])
 
 
 @dataclass(frozen=True, kw_only=True)
 class _HullRanges:
-    """The sizes that hulls of one trade are drawn from, each fixed or from..to; see `Hull`."""
+    """Dimensions of one trade's hulls, each fixed or a range; see `Hull`."""
 
     length_m: Range
     beam_m: Range
@@ -119,7 +121,7 @@ def _draw_hull(rng: np.random.Generator, ranges: _HullRanges) -> Hull:
 
 
 def tug(rng: np.random.Generator) -> ShipPlan:
-    """Short and broad, low aft, tyres all round, a winch and a gantry for towing."""
+    """A short, broad tug, low aft, with tyres all round, a towing winch and a gantry."""
     hull = _draw_hull(rng, _HULLS["tug"])
     high = rng.uniform(0.8, 0.95)
     house = House(
@@ -142,7 +144,7 @@ def tug(rng: np.random.Generator) -> ShipPlan:
 
 
 def trawler(rng: np.random.Generator) -> ShipPlan:
-    """A high bow, a mast with a derrick, a gantry aft, a drum with nets."""
+    """A trawler with a high bow, a derrick on a mast, a gantry aft, and nets on a drum."""
     hull = _draw_hull(rng, _HULLS["trawler"])
     at = rng.uniform(-0.2, 0.2)
     house = House(
@@ -164,7 +166,7 @@ def trawler(rng: np.random.Generator) -> ShipPlan:
 
 
 def coaster(rng: np.random.Generator) -> ShipPlan:
-    """Long and low, the house aft, hatches and often containers before it."""
+    """A long, low coaster, its deckhouse aft behind hatches and often containers."""
     hull = _draw_hull(rng, _HULLS["coaster"])
     house = House(
         x_m=(-3.4, -1.95), width_m=1.45, z_m=(hull.deck_m(-1.9) - 0.05, 1.75), lean_m=(0, 0.0, 0.02)
@@ -182,7 +184,7 @@ def coaster(rng: np.random.Generator) -> ShipPlan:
 
 
 def patrol_boat(rng: np.random.Generator) -> ShipPlan:
-    """Slender, with sloping walls, a boat aft and a crane for it."""
+    """A slender patrol boat with sloping walls, and a dinghy with crane aft."""
     hull = _draw_hull(rng, _HULLS["patrol boat"])
     house = House(x_m=(-1.5, 1.7), width_m=1.3, z_m=(hull.deck_m(0.0) - 0.1, 1.35), lean_m=(0.15, 0.7, 0.1))
     bridge = House(x_m=(-0.5, 0.95), width_m=1.15, z_m=(1.39, 2.0), lean_m=(0.1, 0.35, 0.12))

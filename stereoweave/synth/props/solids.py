@@ -1,4 +1,4 @@
-"""Solid things of about one metre, each drawn at random: boxes, balls, vases, twisted prisms, bent pipes."""
+"""Random solid objects of about one metre: boxes, balls, vases, twisted prisms, bent pipes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,11 +12,11 @@ from stereoweave.synth.world import Mesh, join_meshes
 
 @dataclass(frozen=True, kw_only=True)
 class PropStyle:
-    """What a thing is made of.
+    """Materials and bar thickness of an object.
 
     Attributes:
         main, other: materials.
-        bar_m: the radius of thin bars, where the thing's size is 1 m.
+        bar_m: radius of thin bars, for an object of 1 m.
     """
 
     main: int
@@ -28,7 +28,7 @@ PropBuilder = Callable[[np.random.Generator, PropStyle], Mesh]
 
 
 def box(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A block, flat or tall, at times with a lid or a band around it."""
+    """A box, flat or tall, at times with a lid or a band."""
     size_m = rng.uniform(0.2, 1.0, 3)
     block = boxes(np.zeros(3), size_m, style.main)
     band_m = size_m * np.array([1.03, 1.03, rng.uniform(0.08, 0.3)])
@@ -42,12 +42,12 @@ def ball(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def ellipsoid(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A ball pressed or drawn along its axes."""
+    """A ball scaled along its axes."""
     return spheres(np.zeros(3), rng.uniform(0.15, 0.5, (1, 3)), style.main, subdivisions=3)
 
 
 def cylinder(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A drum or a can with a bevelled rim, and a band."""
+    """A cylinder with a bevelled rim and a band."""
     radius_m, height_m, bevel_m = rng.uniform(0.15, 0.5), rng.uniform(0.2, 1.0), rng.uniform(0.01, 0.04)
     rim = np.array([[radius_m - bevel_m, 0], [radius_m, bevel_m]])
     top = np.array([[radius_m, height_m - bevel_m], [radius_m - bevel_m, height_m], [0, height_m]])
@@ -60,7 +60,7 @@ def cylinder(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def cone(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A cone, at times cut off."""
+    """A cone, at times truncated."""
     radius_m, height_m, tip_m = rng.uniform(0.2, 0.5), rng.uniform(0.4, 1.0), rng.uniform(0, 0.15)
     share = np.linspace(0, 1, 9)[:, None]
     side_m = (1 - share) * [[radius_m, 0]] + share * [[tip_m, height_m]]
@@ -68,7 +68,7 @@ def cone(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def torus(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A ring, thin or fat, upright or not round it all turned anyhow later."""
+    """A ring, thin or thick."""
     tube_m = rng.uniform(0.04, 0.17)
     angle = np.linspace(0, 2 * np.pi, 17)
     circle_m = tube_m * np.stack([np.cos(angle), np.sin(angle)], -1)
@@ -76,12 +76,12 @@ def torus(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def vase(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A vase or turned post: a smooth profile that goes in and out."""
+    """A vase or turned post with a smooth wavy profile."""
     share = np.linspace(0, 1, 18)
     waves = sum(rng.uniform(-1, 1) / k * np.cos(np.pi * k * share + rng.uniform(0, 6)) for k in range(1, 6))
     radii_m = rng.uniform(0.12, 0.3) * np.exp(0.45 * waves)
     outside = np.stack([radii_m, share], -1)
-    # The wall turns at the rim and goes down again inside.
+    # The profile continues down the inside.
     inside = np.stack([radii_m[:11:-1] * 0.86, share[:11:-1]], -1)
     return lathe(np.concatenate([[[0.0, 0.0]], outside, inside, [[0.0, share[12]]]]), style.main, sections=40)
 
@@ -102,7 +102,7 @@ def bottle(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def lamp(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A standing lamp: foot, rod, shade."""
+    """A floor lamp: foot, rod, shade."""
     foot_m, rod_m, low_m = rng.uniform(0.12, 0.22), rng.uniform(0.012, 0.03), rng.uniform(0.55, 0.7)
     stand = np.array([[0, 0], [foot_m, 0], [foot_m, 0.03], [rod_m, 0.06], [rod_m, 0.9], [0.0, 0.9]])
     wide_m, narrow_m = rng.uniform(0.2, 0.32), rng.uniform(0.08, 0.2)
@@ -111,7 +111,7 @@ def lamp(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def twisted_prism(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A column of three to six sides that twists and tapers."""
+    """A twisted, tapering prism of three to six sides."""
     corners, steps = int(rng.integers(3, 7)), 5
     angle = np.arange(corners * steps) / steps
     part = (angle % 1)[:, None]
@@ -126,13 +126,13 @@ def twisted_prism(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def bent_pipe(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A pipe that wanders, its thickness too."""
+    """A pipe along a random curve, of varying thickness."""
     path_m = wander_m(rng, 26)
     return sweep(path_m, rng.uniform(0.02, 0.12) * (1 + 0.3 * np.sin(np.linspace(0, 9, 26))), style.main, 14)
 
 
 def blob(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A boulder: a ball with smooth bumps."""
+    """A boulder: a sphere with smooth bumps."""
     polar, around = np.linspace(3.12, 0.02, 24)[:, None], np.arange(36) * 2 * np.pi / 36
     radius_m = 0.4 + np.sum(
         [
@@ -170,7 +170,7 @@ def dumbbell(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def cloth(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A hanging or flying sheet with waves."""
+    """A wavy sheet, hanging or flying."""
     x, z = np.meshgrid(np.linspace(-0.5, 0.5, 36), np.linspace(0, rng.uniform(0.6, 1.1), 26))
     y = sum(
         rng.uniform(0.01, 0.12) / np.sqrt(k) * np.sin(k * rng.uniform(2, 6) * x + rng.normal(0, 3) * z)
@@ -188,7 +188,7 @@ def arch(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def stairs(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Steps, each a block on the one before."""
+    """Stairs of stacked blocks."""
     count = int(rng.integers(4, 9))
     step_m, wide_m = 1.0 / count, rng.uniform(0.3, 0.8)
     k = np.arange(count)
@@ -201,7 +201,7 @@ def stairs(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def tower_of_blocks(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Blocks piled up, each turned a little."""
+    """A tower of slightly rotated blocks."""
     count = int(rng.integers(3, 7))
     sizes_m = np.stack([*rng.uniform(0.2, 0.45, (2, count)), rng.uniform(0.6, 1.0, count) / count], -1)
     tops_m = np.cumsum(sizes_m[:, 2])
@@ -215,7 +215,7 @@ def tower_of_blocks(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def wander_m(rng: np.random.Generator, count: int) -> Float[np.ndarray, "n 3"]:
-    """A smooth path within about a metre."""
+    """Draw a smooth random path of about one metre."""
     share = np.linspace(0, 1, count)[:, None]
     waves = sum(
         rng.normal(0, 0.22 / k, 3) * np.sin(np.pi * k * share + rng.uniform(0, 6, 3)) for k in (1, 2, 3)

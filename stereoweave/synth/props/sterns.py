@@ -1,4 +1,4 @@
-"""The after end of a large ship above its screw: hull, skeg or bracket, shaft, rudder. Aft is +x."""
+"""The stern of a large ship above its propeller: hull, skeg or bracket, shaft, rudder. Aft is +x."""
 
 from dataclasses import dataclass
 
@@ -18,13 +18,13 @@ _LENGTH_M = 34.0
 
 @dataclass(frozen=True, kw_only=True)
 class Stern:
-    """A ship's after end around the origin, where its screw turns.
+    """A ship's stern, with the propeller at the origin.
 
     Attributes:
-        mesh: hull and all that is fixed to it, without the screw.
+        mesh: hull with fittings, without the propeller.
         keel_m: height of the keel.
-        hull: the hull in its own place: bow at +x, waterline at z = 0.
-        end_m: how far aft the hull reaches.
+        hull: the hull in its own coordinates: bow at +x, waterline at z = 0.
+        end_m: x of the hull's after end.
         water_m: height of the waterline.
     """
 
@@ -35,14 +35,14 @@ class Stern:
     water_m: float
 
     def side_m(self, x: np.ndarray, z: np.ndarray, side: float) -> Points:
-        """Points of the hull's skin about at x and z."""
+        """Points on the hull's skin near x and z."""
         share = (self.end_m - x) / _LENGTH_M
         at = self.hull.side_m(share, z - self.water_m, -side)
         return np.stack([self.end_m - _LENGTH_M / 2 - at[:, 0], -at[:, 1], z], -1)
 
 
 def stern(rng: np.random.Generator, palette: Palette, propeller: Propeller) -> Stern:
-    """A hull over the screw, with a skeg or a bracket and, at times, a rudder."""
+    """A hull above the propeller, with a skeg or a bracket and, at times, a rudder."""
     bottom = palette.add(_coat(rng, _BOTTOMS))
     stripe = palette.add(_coat(rng, ((0.75, 0.75, 0.72), (0.6, 0.5, 0.15))))
     topside = palette.add(_coat(rng, _SIDES))
@@ -93,7 +93,7 @@ def _shaft(rng: np.random.Generator) -> Material:
 
 
 def _skeg(sole: Stern, propeller: Propeller, material: int) -> Mesh:
-    """The thin body below the hull that carries the shaft, with its boss around it."""
+    """The skeg below the hull, with the boss of the shaft."""
     after_m = -propeller.hub_half_m - 0.25
     away = np.linspace(0, 1, 30)[::-1, None] ** 1.5
     x = after_m - 13 * away
@@ -109,7 +109,7 @@ def _skeg(sole: Stern, propeller: Propeller, material: int) -> Mesh:
 
 
 def _bracket(propeller: Propeller, clear_m: float, material: int, steel: int) -> Mesh:
-    """A bearing on two struts, and the bare shaft into the hull."""
+    """A shaft bracket of two struts, and the exposed shaft."""
     r, front_m = propeller.hub_m, -propeller.hub_half_m - 0.05
     profile = [
         (0, -1.5),
@@ -132,14 +132,14 @@ def _bracket(propeller: Propeller, clear_m: float, material: int, steel: int) ->
 
 
 def _collar(propeller: Propeller, material: int) -> Mesh:
-    """The guard over the gap between the hub and its bearing."""
+    """The rope guard between hub and bearing."""
     r = 0.95 * propeller.hub_m
     ring = [(0.5 * r, 0), (1.05 * r, 0), (1.05 * r, 0.3), (0.9 * r, 0.33), (0.5 * r, 0.33)]
     return turn_aft(lathe(ring, material, 40)).translate(x=-propeller.hub_half_m - 0.35)
 
 
 def _rudder(rng: np.random.Generator, propeller: Propeller, clear_m: float, material: int, zinc: int) -> Mesh:
-    """A rudder with its stock, put over to one side."""
+    """A rudder with its stock, turned to one side."""
     chord_m = rng.uniform(0.95, 1.3)
     foot_m, head_m = -rng.uniform(0.45, 0.75) * propeller.radius_m, clear_m - 0.25
     angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
@@ -161,7 +161,7 @@ def _rudder(rng: np.random.Generator, propeller: Propeller, clear_m: float, mate
 
 
 def _anodes(sole: Stern, zinc: int) -> Mesh:
-    """Zinc blocks in rows on both sides, a little above the screw."""
+    """Zinc anodes in rows on both sides, slightly above the propeller."""
     x = np.linspace(-8, 1, 5)
     level = np.full(5, sole.water_m - 0.28)
     at = np.concatenate([sole.side_m(x, level, side) for side in (1, -1)])

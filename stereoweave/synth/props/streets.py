@@ -1,4 +1,4 @@
-"""A street along x: carriageway, house fronts, vehicles, people, and what stands on its pavements."""
+"""Streets along x: carriageway, house fronts, vehicles, people, street furniture."""
 
 from dataclasses import dataclass
 
@@ -21,12 +21,12 @@ _START_M, _END_M = -30.0, 110.0
 
 @dataclass(frozen=True, kw_only=True)
 class StreetPlan:
-    """Measures of a street.
+    """Dimensions of a street.
 
     Attributes:
         half_m: half of the carriageway's width.
-        pavement_m: the width of each pavement.
-        lane_m: y of the lane that the cameras are in.
+        pavement_m: width of each pavement.
+        lane_m: y of the cameras' lane.
     """
 
     half_m: float
@@ -35,12 +35,12 @@ class StreetPlan:
 
     @property
     def fronts_m(self) -> float:
-        """How far from the street's middle the house fronts begin."""
+        """Distance of the house fronts from the street's centre line."""
         return self.half_m + self.pavement_m
 
 
 def draw_street_plan(rng: np.random.Generator) -> StreetPlan:
-    """Draw a street with a lane each way and room to park; traffic keeps to the right or to the left."""
+    """Draw a street with one lane each way and parking; traffic keeps right or left."""
     half_m = rng.uniform(4.2, 6.5)
     side = float(rng.choice([-1.0, 1.0], p=[0.75, 0.25]))
     return StreetPlan(half_m=half_m, pavement_m=rng.uniform(1.6, 4.0), lane_m=side * (half_m - 2.1) / 2)
@@ -72,7 +72,7 @@ def carriageway(rng: np.random.Generator, palette: Palette, plan: StreetPlan) ->
 
 
 def fronts(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mesh:
-    """Houses in two rows with gaps between some; or, on one side at times, a fence with bushes and trees."""
+    """Two rows of houses with some gaps; at times one side is a fence with bushes and trees instead."""
     walls = [palette.add(draw_material_from(rng, _FRONTS, 12.0)) for _ in range(6)]
     glass = palette.add(Material(texture="plain", tint=(0.07, 0.09, 0.11), roughness=0.08))
     trim = palette.add(Material(texture="plain", tint=draw_muted_colour(rng, 0.2), roughness=0.7, relief=0.1))
@@ -96,7 +96,7 @@ def fronts(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mesh
 
 
 def traffic(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mesh:
-    """Vehicles parked along both kerbs, at most one ahead in the lane, and up to two that come closer."""
+    """Vehicles: parked along both kerbs, at most one ahead in the lane, and up to two oncoming."""
     kinds = [*fleet(rng, palette), *fleet(rng, palette)[:2]]
     cars = [kinds[k] for k in (0, 1, 4, 5)]
     poses = []
@@ -120,7 +120,7 @@ def traffic(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mes
 
 
 def walkers(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mesh:
-    """Two to ten people on the pavements, now and then one who crosses."""
+    """Two to ten people on the pavements, at times one crossing."""
     clothes = [draw_clothes(rng, palette) for _ in range(3)]
     people = []
     for _ in range(int(rng.integers(2, 11))):
@@ -134,7 +134,7 @@ def walkers(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mes
 
 
 def street_furniture(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mesh:
-    """Lamp posts, signs, bollards, trees in the pavements, and wires over the street in half of the draws."""
+    """Lamp posts, signs, bollards and trees on the pavements, in half of the draws overhead wires."""
     steel = palette.add(galvanised_steel(rng))
     signs = [palette.add(draw_material_from(rng, ("sign", "paint", "plain"), 6.0)) for _ in range(2)]
     at_m = np.arange(rng.uniform(-8, 4), 80, rng.uniform(12, 26))
@@ -173,7 +173,7 @@ def _on_pavement(rng: np.random.Generator, plan: StreetPlan) -> float:
 def _house(
     rng: np.random.Generator, size_m: Float[np.ndarray, "3"], wall: int, glass: int, trim: int
 ) -> Mesh:
-    """A block from the origin along x and y, its front at y = 0: floors of windows over doors or shops."""
+    """A house from the origin along x and y, its front at y = 0: windows above doors or shops."""
     length_m, deep_m, high_m = (float(v) for v in size_m)
     block = boxes([[length_m / 2, deep_m / 2, high_m / 2 - 0.3]], [[length_m, deep_m, high_m + 0.6]], wall)
     cornice = boxes([[length_m / 2, 0, high_m - 0.15]], [[length_m, 0.5, 0.3]], trim)
@@ -194,7 +194,7 @@ def _house(
 
 
 def _panes(spots_m: list[tuple[float, float]], width_m: float, high_m: float, glass: int, trim: int) -> Mesh:
-    """Windows at (x, z) of a front; frames stand out from the wall, panes from the frames."""
+    """Windows at (x, z) of a front; frames protrude from the wall, panes from the frames."""
     centres = np.array([[x, 0, z] for x, z in spots_m])
     frames = boxes(centres, [width_m + 0.2, 0.1, high_m + 0.2], trim)
     panes = boxes(centres, [width_m, 0.16, high_m], glass)
@@ -203,7 +203,7 @@ def _panes(spots_m: list[tuple[float, float]], width_m: float, high_m: float, gl
 
 
 def _ridge(size_m: Float[np.ndarray, "3"], material: int) -> Mesh:
-    """A roof with its ridge along x, over a block."""
+    """A roof over a house, its ridge along x."""
     length_m, deep_m, high_m = (float(v) for v in size_m)
     outline = [(-0.3, high_m), (deep_m + 0.3, high_m), (deep_m / 2, high_m + 0.35 * deep_m)]
     upright = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -211,7 +211,7 @@ def _ridge(size_m: Float[np.ndarray, "3"], material: int) -> Mesh:
 
 
 def _green(rng: np.random.Generator, palette: Palette, plan: StreetPlan, side: int) -> Mesh:
-    """A fence along the pavement, bushes behind it, and trees behind these."""
+    """A fence along the pavement, with bushes and trees behind it."""
     y = side * (plan.fronts_m + 0.3)
     line = np.array([[x, y, 0.0] for x in (_START_M / 2, 70.0)])
     x = np.arange(-10, 60, 3.0)
@@ -230,7 +230,7 @@ def _lamp_post(x: float, y: float, inwards: float, steel: int) -> Mesh:
 
 
 def _wires(rng: np.random.Generator, at_m: Float[np.ndarray, " n"], y: float, steel: int) -> Mesh:
-    """One to four wires that sag from post to post."""
+    """One to four wires sagging from post to post."""
     share = np.linspace(0, 1, 9)
     sag_m = rng.uniform(0.2, 0.6)
     wires = []
@@ -243,13 +243,13 @@ def _wires(rng: np.random.Generator, at_m: Float[np.ndarray, " n"], y: float, st
 
 
 def _sign(rng: np.random.Generator, steel: int, faces: list[int]) -> Mesh:
-    """A round, square or three-cornered plate on a post, facing the traffic."""
+    """A round, square or triangular sign on a post, facing the traffic."""
     high_m, half_m = rng.uniform(2.0, 2.8), rng.uniform(0.25, 0.45)
     corners = int(rng.choice([3, 4, 24]))
     angle = np.arange(corners) * 2 * np.pi / corners + np.pi / 2
     outline = half_m * np.stack([np.cos(angle), np.sin(angle)], -1)
     plate = prism(outline, 0.02, faces[int(rng.integers(len(faces)))])
-    # From the outline's x, y, z to across the street, up and towards the traffic.
+    # Maps the outline's x, y, z to across the street, up, and towards the traffic.
     facing = np.array([[0.0, 0, -1, -0.06], [-1, 0, 0, 0], [0, 1, 0, high_m - half_m], [0, 0, 0, 1]])
     post = tubes([[0, 0, 0]], [[0, 0, high_m]], 0.035, steel, 8)
     return join_meshes([post, plate.transform(rotation((0, 0, 1), rng.normal(0, 8)) @ facing)])

@@ -1,7 +1,7 @@
-"""What stands around the targets: light, ground, water, trees, houses, and the clutter of yards and quays.
+"""Surroundings of the targets: daylight, ground, water, trees, houses, and goods of yards and quays.
 
-Each function takes the materials that it needs from the palette. Things stand at their spots, which have
-z = 0 unless the caller lifts them; they reach a little below, so that uneven ground hides their feet.
+Each function adds its materials to the palette. Objects stand at their spots, usually at z = 0, and extend
+slightly below, so that uneven ground hides their feet.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ from stereoweave.synth.world import Colour, Fog, Material, Mesh, Sky, join_meshe
 
 Spots = Float[np.ndarray, "n 3"]
 
-_GROUND_TINTS: dict[str, tuple[Colour, float]] = {  # tint, and how many metres the texture spans
+_GROUND_TINTS: dict[str, tuple[Colour, float]] = {  # tint, and span of the texture in metres
     "grass": ((1.0, 1.0, 0.9), 5.0),
     "soil": ((1.0, 0.97, 0.93), 5.0),
     "gravel": ((0.9, 0.88, 0.85), 3.0),
@@ -38,7 +38,7 @@ _GROUND_TINTS: dict[str, tuple[Colour, float]] = {  # tint, and how many metres 
 
 
 def daylight(rng: np.random.Generator) -> Daylight:
-    """Sky with sun, haze or none, exposure: a clear, hazy or overcast day, or a low warm sun."""
+    """Draw the light of a clear, hazy or overcast day, or of a low warm sun."""
     kind = rng.choice(["clear", "hazy", "overcast", "low"], p=[0.4, 0.25, 0.15, 0.2])
     height_deg = rng.uniform(15, 26) if kind == "low" else rng.uniform(30, 65)
     azimuth, height = rng.uniform(0, 2 * np.pi), np.radians(height_deg)
@@ -64,7 +64,7 @@ def daylight(rng: np.random.Generator) -> Daylight:
     return Daylight(sky, fog, float(rng.uniform(0.85, 1.1)))
 
 
-def terrain(  # noqa: PLR0913, grounds differ in so much
+def terrain(  # noqa: PLR0913 - family and dimensions
     rng: np.random.Generator,
     palette: Palette,
     family: str,
@@ -74,10 +74,10 @@ def terrain(  # noqa: PLR0913, grounds differ in so much
     bumps_m: float = 0.3,
     flat_radius_m: float = 5.0,
 ) -> Mesh:
-    """Ground that reaches extent_m to each side, flat around the origin, with bumps of bumps_m beyond.
+    """Ground that extends extent_m to each side, flat around the origin, with bumps of bumps_m beyond.
 
-    family: of the texture, one of "grass", "soil", "gravel", "asphalt", "concrete", or "plain" for
-    sand and snow.
+    family: texture family, one of "grass", "soil", "gravel", "asphalt", "concrete", or "plain" for sand and
+    snow.
     """
     tint, span_m = _GROUND_TINTS[family]
     material = palette.add(
@@ -103,7 +103,7 @@ def terrain(  # noqa: PLR0913, grounds differ in so much
 
 
 def sea(rng: np.random.Generator, palette: Palette, *, extent_m: float = 200.0, level_m: float = 0.0) -> Mesh:
-    """Water with waves that reaches extent_m to each side; the waves are highest near the origin's view."""
+    """Water that extends extent_m to each side, with the highest waves near the origin."""
     tint: Colour = [(0.7, 0.75, 0.75), (0.8, 0.8, 0.65), (0.9, 0.8, 0.75)][int(rng.integers(3))]
     material = palette.add(
         Material(
@@ -120,7 +120,7 @@ def sea(rng: np.random.Generator, palette: Palette, *, extent_m: float = 200.0, 
     height = np.full_like(x, level_m)
     for length in np.geomspace(2.2, 16, 8) * rng.uniform(0.9, 1.1, 8):
         way, phase = wind + rng.normal(0, 0.5), rng.uniform(0, 6)
-        # The grid widens outwards and cannot carry short waves there.
+        # The grid coarsens outwards and cannot represent short waves there.
         carried = np.clip(1.5 - np.maximum(abs(x), abs(y)) * 0.2 / length, 0, 1)
         wave = np.sin((x * np.cos(way) + y * np.sin(way)) * 2 * np.pi / length + phase)
         height += 0.008 * roughness_m * length * carried * wave
@@ -128,7 +128,7 @@ def sea(rng: np.random.Generator, palette: Palette, *, extent_m: float = 200.0, 
 
 
 def hills(rng: np.random.Generator, palette: Palette, *, distance_m: float = 140.0) -> Mesh:
-    """A far wooded ridge all round, 5 to 25 m high."""
+    """A distant ring of wooded hills, 5 to 25 m high."""
     material = palette.add(
         Material(
             texture="leaves",
@@ -156,8 +156,8 @@ def hills(rng: np.random.Generator, palette: Palette, *, distance_m: float = 140
 
 
 def draw_spots(rng: np.random.Generator, count: int, nearest_m: float, farthest_m: float) -> Spots:
-    """Spots [count, 3] around the origin at z = 0, evenly over the ring's area, not too near each other."""
-    # A jittered sunflower: every spot has the same area to itself.
+    """Draw spots [count, 3] at z = 0 in a ring around the origin, evenly spread and apart."""
+    # A jittered sunflower pattern: every spot has the same area.
     order = np.arange(count)
     ring = farthest_m**2 - nearest_m**2
     radius = np.sqrt(nearest_m**2 + ring * (order + rng.uniform(0.2, 0.8, count)) / max(count, 1))
@@ -171,7 +171,7 @@ def draw_spots(rng: np.random.Generator, count: int, nearest_m: float, farthest_
 def trees(
     rng: np.random.Generator, palette: Palette, spots: Spots, height_m: tuple[float, float] = (4, 9)
 ) -> Mesh:
-    """Trees at the spots, broad and slender ones, of heights from..to."""
+    """Broad and slender trees at the spots; height_m: minimum and maximum."""
     bark = palette.add(Material(texture="bark", variant=int(rng.integers(64)), span_m=1.5, relief=0.8))
     leaves = [_add_foliage(rng, palette) for _ in range(2)]
     kinds = [_tree(rng, bark, leaves[0], 0.42), _tree(rng, bark, leaves[1], 0.36), _fir(rng, bark, leaves[0])]
@@ -195,7 +195,7 @@ def rocks(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
 
 
 def houses(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
-    """Houses at the spots, of two kinds, with gable roofs, windows, doors and chimneys, 6 to 9 m high."""
+    """Houses of two kinds at the spots, 6 to 9 m high, with gable roofs, windows, doors and chimneys."""
     kinds = [_house(rng, palette) for _ in range(2)]
     return _scatter(rng, kinds, spots, rng.uniform(0.9, 1.25, len(spots)))
 
@@ -208,7 +208,7 @@ def posts(rng: np.random.Generator, palette: Palette, spots: Spots, height_m: fl
 
 
 def fence(rng: np.random.Generator, palette: Palette, corners_m: Spots) -> Mesh:
-    """A fence of posts and rails from corner to corner [N, 3], a post about every 2 m."""
+    """A fence of posts and rails along corners [N, 3], with a post about every 2 m."""
     steps = [
         np.linspace(a, b, max(int(np.linalg.norm(b - a) / 2), 1), endpoint=False)
         for a, b in zip(corners_m[:-1], corners_m[1:], strict=True)
@@ -224,7 +224,7 @@ def fence(rng: np.random.Generator, palette: Palette, corners_m: Spots) -> Mesh:
 
 
 def crates(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
-    """Wooden crates at the spots, some with a second one on top."""
+    """Wooden crates at the spots, some in stacks of two."""
     wood = palette.add(Material(texture="wood", variant=int(rng.integers(64)), tint=(1.1, 1.02, 0.9)))
     frame = palette.add(Material(texture="wood", variant=int(rng.integers(64)), tint=(0.8, 0.7, 0.6)))
     lower = _crate(wood, frame)
@@ -256,7 +256,7 @@ def barrels(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
 
 
 def bollards(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
-    """Iron bollards for ropes at the spots, 0.55 m high."""
+    """Iron mooring bollards at the spots, 0.55 m high."""
     iron = palette.add(Material(texture="rust", variant=int(rng.integers(64)), tint=(0.75, 0.72, 0.7)))
     profile = [
         (0, 0),
@@ -285,7 +285,7 @@ def cones(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
 def _scatter(
     rng: np.random.Generator, kinds: Sequence[Mesh], spots: Spots, scales: Float[np.ndarray, " n"]
 ) -> Mesh:
-    """One of the kinds at each spot, turned any way about z, scaled."""
+    """Put one of the kinds at each spot, randomly rotated about z, and scaled."""
     which = rng.integers(len(kinds), size=len(spots))
     angle = rng.uniform(0, 2 * np.pi, len(spots))
     poses = np.tile(np.eye(4), (len(spots), 1, 1))
@@ -298,7 +298,7 @@ def _scatter(
 
 
 def _widening_grid(extent_m: float, near_m: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates x and y [steps + 1, steps + 1] of a grid that is fine within near_m and widens outwards."""
+    """Coordinates x and y [steps + 1, steps + 1] of a grid, fine within near_m and coarser outwards."""
     end = np.arcsinh(extent_m / near_m)
     axis = near_m * np.sinh(np.linspace(-end, end, steps + 1))
     x, y = np.meshgrid(axis, axis)
@@ -306,7 +306,7 @@ def _widening_grid(extent_m: float, near_m: float, steps: int) -> tuple[np.ndarr
 
 
 def _map_texture_from_above(mesh: Mesh) -> Mesh:
-    """The mesh with its texture laid on straight from above."""
+    """Project the mesh's texture from above."""
     return replace(mesh, uv_m=mesh.corners_m[..., :2].copy())
 
 
@@ -325,7 +325,7 @@ def _add_foliage(rng: np.random.Generator, palette: Palette) -> int:
 
 
 def _tree(rng: np.random.Generator, bark: int, leaves: int, spread: float) -> Mesh:
-    """A broad tree of height 1: a trunk that forks, and lumps of leaves."""
+    """A broad tree of height 1: a forked trunk, and lumps of foliage."""
     fork = np.array([0, 0, 0.35])
     tips = rng.uniform((-0.2, -0.2, 0.6), (0.2, 0.2, 0.8), (4, 3))
     trunk = tubes([0, 0, -0.1], fork, [[0.04, 0.028]], bark, 7, capped=False)
@@ -336,7 +336,7 @@ def _tree(rng: np.random.Generator, bark: int, leaves: int, spread: float) -> Me
 
 
 def _fir(rng: np.random.Generator, bark: int, leaves: int) -> Mesh:
-    """A slender tree of height 1: skirts of needles, one above another."""
+    """A fir of height 1: stacked skirts of needles."""
     trunk = tubes([[0, 0, -0.1]], [[0, 0, 0.9]], np.array([[0.022, 0.005]]), bark, 6)
     skirts = []
     for z in np.linspace(0.15, 0.8, 6):
@@ -351,13 +351,13 @@ def _fir(rng: np.random.Generator, bark: int, leaves: int) -> Mesh:
 def _lumps(
     rng: np.random.Generator, centres_m: Spots, radii_m: Sequence[float] | np.ndarray, material: int
 ) -> Mesh:
-    """Uneven balls, as of leaves or stone."""
+    """Uneven balls of foliage or stone."""
     radii = np.asarray(radii_m) * rng.uniform(0.8, 1.2, (len(centres_m), 1))
     return _perturb(rng, spheres(centres_m, radii, material, 1), 0.22)
 
 
 def _tufts(rng: np.random.Generator, crown: Mesh, count: int, size_m: float) -> Mesh:
-    """Twigs, a triangle each, that stick out of a crown and make its outline uneven."""
+    """Twigs, one triangle each, that roughen the outline of a crown."""
     pick = rng.integers(len(crown.material), size=count)
     normals = crown.normals[pick].mean(1, keepdims=True)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
@@ -370,10 +370,10 @@ def _tufts(rng: np.random.Generator, crown: Mesh, count: int, size_m: float) -> 
 
 
 def _perturb(rng: np.random.Generator, mesh: Mesh, share: float) -> Mesh:
-    """The mesh with its corners moved by up to a share of its size, half faceted."""
+    """Displace the vertices by up to a share of the mesh's size, and roughen the normals."""
     corners = mesh.corners_m
     size = np.ptp(corners.reshape(-1, 3), axis=0).max() / 2
-    # Corners at one place move together, because the shift is a function of the place alone.
+    # Coincident vertices move together, because the displacement depends on the position alone.
     waves = rng.normal(0, 9, (3, 3)) / size
     moved = corners + share * size * 0.5 * np.sin(corners @ waves + rng.uniform(0, 6, 3))
     flat = np.cross(moved[:, 1] - moved[:, 0], moved[:, 2] - moved[:, 0])
@@ -418,7 +418,7 @@ def _gabled_walls(length: float, width: float, eaves: float, rise: float, materi
 
 
 def _roof(length: float, width: float, eaves: float, rise: float, material: int) -> Mesh:
-    """Two slabs that stand out over the walls by 0.4 m."""
+    """Two slabs that overhang the walls by 0.4 m."""
     slope = np.arctan2(rise, width / 2)
     across = width / 2 / np.cos(slope) + 0.4
     turns = np.stack([rotation((1, 0, 0), side * np.degrees(slope))[:3, :3] for side in (1, -1)])
@@ -427,7 +427,7 @@ def _roof(length: float, width: float, eaves: float, rise: float, material: int)
 
 
 def _openings(size_m: tuple[float, float, float], columns: int, glass: int, frame: int) -> Mesh:
-    """Windows in rows on the long walls and the gables, and a door; size_m: length, width, eaves."""
+    """Rows of windows on long walls and gables, and a door; size_m: length, width, height of the eaves."""
     length, width, eaves = size_m
     floors = np.arange(1.5, eaves - 0.6, 2.6)
     along = np.linspace(-length / 2 + 1.2, length / 2 - 1.2, columns)
@@ -437,7 +437,7 @@ def _openings(size_m: tuple[float, float, float], columns: int, glass: int, fram
         [np.stack([x, side * width / 2, z], -1), np.stack([end * length / 2, y, z2], -1)]
     )
     thin = np.concatenate([np.tile([1.0, 0.1, 1.2], (len(x), 1)), np.tile([0.1, 1.0, 1.2], (len(y), 1))])
-    # The frames stand out less than the panes' bars, so that none fights with another for depth.
+    # Frames protrude less than panes, and these less than their bars, against z-fighting.
     frames = boxes(centres, thin + np.where(thin < 0.5, 0.0, 0.2), frame)
     panes = boxes(centres, np.where(thin < 0.5, 0.16, thin), glass)
     bars = boxes(centres, np.where(thin < 0.5, 0.22, [0.06, 0.06, 1.2]), frame)
@@ -446,7 +446,7 @@ def _openings(size_m: tuple[float, float, float], columns: int, glass: int, fram
 
 
 def _crate(wood: int, frame: int) -> Mesh:
-    """A crate of 1 m with battens on its edges."""
+    """A crate of 1 m with battens along its edges."""
     ends = np.array([(a, b) for a in (-0.47, 0.47) for b in (0.03, 0.97)])
     along_x = boxes(np.insert(ends, 0, 0, axis=1), (1.02, 0.1, 0.1), frame)
     along_y = boxes(np.insert(ends, 1, 0, axis=1), (0.1, 1.02, 0.1), frame)
@@ -471,6 +471,6 @@ def _scale_colour(colour: Colour, factor: float) -> Colour:
 
 
 def vary_colour(rng: np.random.Generator, colour: Colour) -> Colour:
-    """The colour, a little brighter or darker, a little warmer or cooler."""
+    """Vary a colour slightly in brightness and temperature."""
     red, green, blue = np.array(colour) * rng.uniform(0.85, 1.1) * rng.uniform(0.96, 1.04, 3)
     return float(red), float(green), float(blue)

@@ -1,7 +1,6 @@
-"""A table close to the cameras: its top, boards that stand on it, and a wall close behind it.
+"""Tables close to the cameras, with upright boards and a wall close behind.
 
-Everything is built with the cameras towards x and the middle of what they see above the origin, z = 0 being
-the floor of the room.
+The cameras are towards x, the centre of their view is above the origin, and the floor is at z = 0.
 """
 
 from dataclasses import dataclass
@@ -21,14 +20,14 @@ _THICK_M = 0.04
 
 @dataclass(frozen=True, kw_only=True)
 class TableTop:
-    """Sizes of a table top.
+    """Dimensions of a table.
 
     Attributes:
-        distance_m: of the cameras from the middle.
-        height_m: of the table's surface above the floor.
-        behind_m: from the middle to the wall behind; the table reaches up to it.
-        before_m: from the middle to the table's edge towards the cameras.
-        width_m: of the table, across the view.
+        distance_m: from the cameras to the centre.
+        height_m: height of the table's surface.
+        behind_m: from the centre to the wall behind, where the table ends.
+        before_m: from the centre to the front edge.
+        width_m: across the view.
     """
 
     distance_m: float
@@ -39,7 +38,7 @@ class TableTop:
 
 
 def draw_table_top(rng: np.random.Generator) -> TableTop:
-    """Draw the sizes of a table top; most fill the width of the picture."""
+    """Draw the dimensions of a table; most fill the picture's width."""
     distance_m = rng.uniform(1.5, 2.3)
     return TableTop(
         distance_m=distance_m,
@@ -51,7 +50,7 @@ def draw_table_top(rng: np.random.Generator) -> TableTop:
 
 
 def table_top(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> Mesh:
-    """Build a table, up to three boards on it, and one or two walls behind it in nine of ten draws."""
+    """Build a table with up to three boards and, in nine of ten draws, one or two walls behind."""
     parts = [_table(rng, palette, sizes), *_boards(rng, palette, sizes)]
     if rng.random() < 0.9:
         parts.append(_backdrop(rng, palette, sizes))
@@ -59,7 +58,7 @@ def table_top(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> Me
 
 
 def _table(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> Mesh:
-    """A slab on a plinth as deep as the slab, but narrower."""
+    """A slab on a narrower plinth."""
     material = palette.add(draw_broad_material(rng, _TOPS, sizes.distance_m))
     length_m = sizes.behind_m + sizes.before_m
     x = (sizes.before_m - sizes.behind_m) / 2
@@ -70,7 +69,7 @@ def _table(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> Mesh:
 
 
 def _boards(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> list[Mesh]:
-    """Upright boards that lean a little, of two materials at most."""
+    """Slightly leaning boards of at most two materials."""
     materials = [palette.add(draw_broad_material(rng, _BOARDS, sizes.distance_m)) for _ in range(2)]
     boards = []
     for _ in range(int(rng.integers(0, 4))):
@@ -84,13 +83,13 @@ def _boards(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> list
 
 
 def _backdrop(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> Mesh:
-    """A wall across the view, or two that meet in a corner."""
+    """A wall across the view, or two walls with a corner."""
     material = palette.add(draw_broad_material(rng, _BACKDROPS, sizes.distance_m + sizes.behind_m))
     wide_m, high_m = sizes.distance_m * rng.uniform(1.4, 3.0), rng.uniform(1.3, 2.4)
     wall = boxes([[-0.03, 0, high_m / 2]], [[0.06, wide_m, high_m]], material)
     if rng.random() < 0.3:
         other = palette.add(draw_broad_material(rng, _BACKDROPS, sizes.distance_m + sizes.behind_m))
-        # It ends well before the cameras.
+        # It ends well in front of the cameras.
         deep_m = min(wide_m * rng.uniform(0.3, 0.6), sizes.behind_m + 0.35 * sizes.distance_m)
         side = boxes([[deep_m / 2, 0.0, high_m / 2]], [[deep_m, 0.06, high_m]], other)
         wall = join_meshes([wall, side.translate(y=rng.choice([-1, 1]) * rng.uniform(0.2, 0.45) * wide_m)])

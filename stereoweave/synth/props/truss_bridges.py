@@ -1,4 +1,4 @@
-"""Bridges of steel trusses: fixed girders, and the lift bridge. The road runs along x."""
+"""Steel truss bridges: fixed girders, and lift bridges. The road runs along x."""
 
 import numpy as np
 from jaxtyping import Float
@@ -29,7 +29,7 @@ def truss_girder(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -
 
 
 def lift_bridge(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
-    """A truss span between two lattice towers, at times raised, with counterweights, cables and wheels."""
+    """A truss span between two lattice towers, at times raised, with counterweights, ropes and sheaves."""
     gap_m, height_m = rng.uniform(1.5, 1.8), rng.uniform(2.3, 2.8)
     raised_m = rng.uniform(0.3, 1.1) * float(rng.random() < 0.6)
     lifted = join_meshes(
@@ -49,12 +49,12 @@ def lift_bridge(rng: np.random.Generator, palette: Palette, plan: BridgePlan) ->
     )
 
 
-def _span(  # noqa: PLR0913, spans differ in so much
+def _span(  # noqa: PLR0913 - dimensions
     rng: np.random.Generator, plan: BridgePlan, length_m: float, panels: int, height_m: float, crown: float
 ) -> Mesh:
-    """Two trusses, the bracing over the road, and the beams under it, around x = 0; the road is at z = 0.
+    """Two trusses, bracing over the road and beams under it, around x = 0; the road is at z = 0.
 
-    crown: by how much the middle is higher than the ends, as a share of the height.
+    crown: additional height in the middle, as a share of the height.
     """
     x = np.linspace(-length_m / 2, length_m / 2, panels + 1)
     share = x[1:-1] / x[-1]
@@ -77,7 +77,7 @@ def _span(  # noqa: PLR0913, spans differ in so much
 
 
 def _plane(plan: BridgePlan, low: Joints, top: Joints, braced: str) -> Mesh:
-    """One truss: chords, end posts, uprights, diagonals, and plates at the joints."""
+    """One truss: chords, end posts, verticals, diagonals, gusset plates."""
     count = len(top)
     chords = beams(
         np.concatenate([low[:-1], top[:-1]]), np.concatenate([low[1:], top[1:]]), (0.07, 0.085), plan.steel
@@ -100,11 +100,11 @@ def _plane(plan: BridgePlan, low: Joints, top: Joints, braced: str) -> Mesh:
 
 
 def _lift_tower(plan: BridgePlan, height_m: float, raised_m: float, concrete: int) -> Mesh:
-    """A tower around the road, the lifted span at smaller x; its weight is down where the span is up."""
+    """A tower around the road, with the span at smaller x; its counterweight is down when the span is up."""
     z = np.linspace(-0.12, height_m, 9)
     frame = truss(mast_rings(z, _TOWER_M, 4) * [1, 2 * plan.side_m / _TOWER_M, 1], "cross")
     others = np.concatenate([frame.struts, frame.braces])
-    # The two faces across the road stay open, so that it passes.
+    # The two faces across the road stay open.
     along_road, overhead = abs(np.diff(others[..., 1], axis=1))[:, 0] < 1e-6, others[..., 2].min(1) > 0.5
     steel = [
         beams(frame.legs[:, 0], frame.legs[:, 1], (0.07, 0.07), plan.steel),
@@ -117,7 +117,7 @@ def _lift_tower(plan: BridgePlan, height_m: float, raised_m: float, concrete: in
 
 
 def _hoist(plan: BridgePlan, height_m: float, raised_m: float, weight_m: float) -> Mesh:
-    """Two wheels on top of a tower, and the ropes over them from the span to the weight."""
+    """Two sheaves on top of a tower, with ropes from the span to the counterweight."""
     groove = [(0.03, -0.03), (0.24, -0.03), (0.22, 0), (0.24, 0.03), (0.03, 0.03)]
     wheel = lathe(groove, plan.steel, 28).transform(rotation((1, 0, 0), 90))
     y, top_m = np.array([-0.6, 0.6]) * plan.side_m, height_m + 0.3
@@ -134,7 +134,7 @@ def _hoist(plan: BridgePlan, height_m: float, raised_m: float, weight_m: float) 
 
 
 def _cabin(plan: BridgePlan, glass: int) -> Mesh:
-    """The house of whoever works the bridge, at the side of a tower."""
+    """The operator's cabin at the side of a tower."""
     at_y = -plan.side_m - 0.2
     return join_meshes(
         [

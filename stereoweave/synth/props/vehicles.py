@@ -1,4 +1,4 @@
-"""Cars, lorries and buses, in their real size, along x, on z = 0."""
+"""Cars, lorries and buses in real size, along x on z = 0."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ _PAINTS: tuple[Colour, ...] = (
 
 
 def fleet(rng: np.random.Generator, palette: Palette) -> list[Mesh]:
-    """Two cars, a lorry and a bus in colours of their own."""
+    """Two cars, a lorry and a bus in random colours."""
     glass = palette.add(Material(texture="plain", tint=(0.06, 0.08, 0.1), roughness=0.1))
     tyre = palette.add(Material(texture="plain", tint=(0.04, 0.04, 0.045), roughness=0.9))
     first, second, third = (
@@ -73,7 +73,7 @@ def _bus(paint: int, glass: int, tyre: int) -> Mesh:
 
 
 def _extrude(outline_m: list[tuple[float, float]], width_m: float, material: int) -> Mesh:
-    """A side view, x and z, pulled out to both sides."""
+    """Extrude a side view (x, z) to both sides."""
     return prism(outline_m, width_m, material).transform(rotation((1, 0, 0), 90)).translate(y=width_m / 2)
 
 

@@ -53,7 +53,7 @@ def wind_pump(rng: np.random.Generator, palette: Palette) -> WindPump:
 
 
 def _wheel(rng: np.random.Generator, radius_m: float, skins: tuple[int, int, int]) -> Mesh:
-    """Curved blades set at an angle, two rings, spokes, a hub; the wheel's axis is x."""
+    """Angled curved blades, two rings, spokes, a hub; the wheel's axis is x."""
     blades, marked, steel = skins
     count = int(rng.choice([12, 15, 18]))
     share = np.linspace(0, 1, 5)[:, None]
@@ -85,7 +85,7 @@ def _wheel(rng: np.random.Generator, radius_m: float, skins: tuple[int, int, int
 
 
 def _tail(rng: np.random.Generator, radius_m: float, skins: tuple[int, int]) -> Mesh:
-    """Gear case, boom, and the vane that turns the wheel into the wind, with the maker's name."""
+    """Gear case, boom, and vane."""
     vane, steel = skins
     end = -1.25 * radius_m
     half = rng.uniform(0.26, 0.34)
@@ -129,7 +129,7 @@ def _tower(top_m: float, steel: int, rust: int) -> Mesh:
 
 
 def _tank(rng: np.random.Generator, palette: Palette, steel: int, rust: int) -> Mesh:
-    """A tank of corrugated iron full of water, the pipe into it, a trough."""
+    """A corrugated water tank with its pipe, and a trough."""
     water = palette.add(Material(texture="water", tint=(0.3, 0.38, 0.36), roughness=0.1, relief=0.1))
     radius, height = rng.uniform(0.55, 0.8), rng.uniform(0.5, 0.75)
     z = np.linspace(0, height, 25)

@@ -1,4 +1,4 @@
-"""What turns on top of a wind turbine's tower: twisted blades, hub with spinner, nacelle with masts."""
+"""Wind turbine heads: twisted blades, hub with spinner, nacelle."""
 
 from dataclasses import dataclass, replace
 
@@ -15,14 +15,14 @@ OVERHANG_M = 0.34  # from the tower's axis to the rotor's plane
 
 @dataclass(frozen=True, kw_only=True)
 class Rotor:
-    """A rotor's measures; its axis is x, upwind is +x, and z is up.
+    """Dimensions of a rotor around x; upwind is +x.
 
     Attributes:
-        radius_m: from the axis to the blades' tips.
-        chord_m: the blades' greatest width.
-        pitch_deg: of the blades against the rotor's plane; 90 is feathered.
-        angle_deg: of the first blade, from upright.
-        tilt_deg: of the axis, upwards.
+        radius_m: from the axis to the tips.
+        chord_m: greatest width of a blade.
+        pitch_deg: angle between blades and rotor plane; 90 is feathered.
+        angle_deg: angle of the first blade from vertical.
+        tilt_deg: upward tilt of the axis.
     """
 
     radius_m: float
@@ -34,7 +34,7 @@ class Rotor:
 
 @dataclass(frozen=True, kw_only=True)
 class TurbineMaterials:
-    """Materials; `tip` marks bands near the blades' tips and may be the blades' own."""
+    """Materials of a wind turbine; `tip` marks bands near the tips and may equal `white`."""
 
     white: int
     tip: int
@@ -44,7 +44,7 @@ class TurbineMaterials:
 
 
 def composite_skin(rng: np.random.Generator) -> Material:
-    """The white or light grey skin of blades and towers, a little dirty."""
+    """White or light grey skin of blades and towers, slightly dirty."""
     grey = rng.uniform(0.68, 0.85)
     return Material(
         texture="plain",
@@ -57,7 +57,7 @@ def composite_skin(rng: np.random.Generator) -> Material:
 
 
 def turbine_head(rotor: Rotor, materials: TurbineMaterials, around: int = 18) -> Mesh:
-    """Nacelle, hub and blades over the origin, where the tower ends; `around`: points of a section."""
+    """Nacelle, hub and blades above the tower's top at the origin; `around`: points per blade section."""
     blades = copies(_blade(rotor, materials, around), _turns(rotor.angle_deg, 3))
     turning = join_meshes([blades, _hub(rotor, materials)]).translate(OVERHANG_M)
     return (
@@ -72,7 +72,7 @@ def _turns(angle_deg: float, count: int) -> Float[np.ndarray, "n 4 4"]:
 
 
 def _blade(rotor: Rotor, materials: TurbineMaterials, around: int) -> Mesh:
-    """A blade along z: round at the root, widest at a fifth of its length, twisted, bent upwind."""
+    """A blade along z: round root, widest at a fifth of its length, twisted, bent upwind."""
     share = np.linspace(0, 1, STATIONS)
     radius = 0.05 * rotor.radius_m + 0.95 * rotor.radius_m * share
     root = 0.3 * rotor.chord_m
@@ -82,7 +82,7 @@ def _blade(rotor: Rotor, materials: TurbineMaterials, around: int) -> Mesh:
     chord = root + grown * (taper - root)
     thickness = root + grown * (np.interp(share, (0, 0.2, 0.5, 1), (1, 0.3, 0.2, 0.14)) * taper - root)
     angle = np.arange(around) * 2 * np.pi / around
-    # Round where it has not grown; behind its thickest point a section thins out to its edge.
+    # A circle at the root; farther out each section thins from its thickest point to the trailing edge.
     belly = 1 - grown[:, None] * 0.45 * (1 - np.cos(angle))
     along = chord[:, None] * (np.cos(angle) / 2 - 0.2 * grown[:, None])
     across = thickness[:, None] * np.sin(angle) / 2 * belly
@@ -98,7 +98,7 @@ def _blade(rotor: Rotor, materials: TurbineMaterials, around: int) -> Mesh:
 
 
 def _hub(rotor: Rotor, materials: TurbineMaterials) -> Mesh:
-    """The spinner, pointed upwind, and collars around the blades' roots."""
+    """Spinner, pointing upwind, and collars around the blades' roots."""
     size = max(0.06 * rotor.radius_m, 0.12)
     profile = np.array(
         [(0, -1.0), (0.95, -1.0), (1.0, -0.5), (1.0, 0.3), (0.86, 0.85), (0.55, 1.25), (0.2, 1.42), (0, 1.45)]
@@ -117,7 +117,7 @@ def _hub(rotor: Rotor, materials: TurbineMaterials) -> Mesh:
 
 
 def _nacelle(materials: TurbineMaterials) -> Mesh:
-    """A rounded box on the tower, with cooler, railing, wind vanes, lightning rod and lamps."""
+    """A rounded nacelle with cooler, railing, wind vanes, lightning rod and lamps."""
     x = np.array([0.24, 0.21, 0.1, -0.25, -0.5, -0.62, -0.65])
     half = np.array([0.1, 0.135, 0.15, 0.155, 0.145, 0.12, 0.08])
     angle = np.arange(24) * 2 * np.pi / 24

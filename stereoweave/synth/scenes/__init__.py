@@ -1,4 +1,4 @@
-"""The scenes by name; each draws a stage from a generator of random numbers."""
+"""Registry of scenes; each draws a stage from a random generator."""
 
 from collections.abc import Callable
 

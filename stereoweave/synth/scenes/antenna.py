@@ -1,4 +1,4 @@
-"""Antennas: a radio mast with panels and drums, aerials on a roof, or a great dish on its mount."""
+"""Scene `antenna`: a radio mast with panels and drums, roof antennas, or a large dish."""
 
 from dataclasses import dataclass
 
@@ -41,12 +41,13 @@ from stereoweave.synth.world import Material, Mesh, join_meshes
 
 @dataclass(frozen=True, kw_only=True)
 class MastPlan:
-    """A mast's measures.
+    """Dimensions of a mast.
 
     Attributes:
-        corners: 3 or 4 legs.
-        widths_m: of its sides, at the foot and at the top.
-        guyed: whether it is slim and held by wires, or stands on its own.
+        corners: number of legs, 3 or 4.
+        widths_m: side lengths at foot and top.
+        guyed: slim and held by wires, or free-standing.
+        banded: painted in red and white bands.
     """
 
     height_m: float
@@ -58,7 +59,7 @@ class MastPlan:
 
 @dataclass(frozen=True, kw_only=True)
 class MastMaterials:
-    """Materials of the mast and its antennas."""
+    """Materials of a mast and its antennas."""
 
     steel: int
     bands: tuple[int, ...]
@@ -68,7 +69,7 @@ class MastMaterials:
 
 
 def antenna(rng: np.random.Generator) -> Stage:
-    """A mast of 6.5 m, a roof's aerials of 3 m, or a dish of 4 m."""
+    """A mast of 6.5 m, roof antennas of 3 m, or a dish of 4 m."""
     kind = str(rng.choice(["mast", "roof", "dish"], p=[0.5, 0.25, 0.25]))
     return {"mast": _mast_site, "roof": roof_antennas, "dish": radio_dish}[kind](rng)
 
@@ -127,7 +128,7 @@ def _width(plan: MastPlan, z_m: float) -> float:
 
 
 def _mast(rng: np.random.Generator, plan: MastPlan, materials: MastMaterials) -> Mesh:
-    """The lattice with ladder, cables, landings, and guy wires where it is slim."""
+    """The lattice with ladder, cables, and landings or guy wires."""
     joints = mast_rings(*mast_levels((0.0, plan.height_m), plan.widths_m, 1.0), corners=plan.corners)
     thick = 1.0 if plan.guyed else 1.35
     bracing: Bracing = "zigzag" if plan.guyed or rng.random() < 0.5 else "cross"
@@ -166,7 +167,7 @@ def _landing(plan: MastPlan, z_m: float, materials: MastMaterials) -> Mesh:
 
 
 def _guys(plan: MastPlan, materials: MastMaterials) -> Mesh:
-    """Wires from three heights to three anchors, with strainers near the ground."""
+    """Guy wires from three heights to three anchors, with strainers near the ground."""
     angle = np.radians([60, 180, 300])
     around = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
     radius = plan.widths_m[0] / np.sqrt(3)
@@ -180,7 +181,7 @@ def _guys(plan: MastPlan, materials: MastMaterials) -> Mesh:
 
 
 def _sectors(rng: np.random.Generator, plan: MastPlan, materials: MastMaterials) -> Mesh:
-    """One or two crowns of panels on frames around the mast."""
+    """One or two rings of sector panels around the mast."""
     heights = [0.93] if rng.random() < 0.5 else [0.93, 0.78]
     turned = rng.uniform(0, 120)
     crowns = []
@@ -193,7 +194,7 @@ def _sectors(rng: np.random.Generator, plan: MastPlan, materials: MastMaterials)
 
 
 def _crown(plan: MastPlan, z_m: float, side_m: float, panel_m: float, materials: MastMaterials) -> Mesh:
-    """Three frames, each with two panels, held off the mast."""
+    """A ring of three frames with two panels each."""
     out = 0.42 * side_m + 0.5 * _width(plan, z_m)
     half = side_m / 2
     rails = np.array([[(out, -half, z), (out, half, z)] for z in (-0.2, 0.2)])
@@ -209,7 +210,7 @@ def _crown(plan: MastPlan, z_m: float, side_m: float, panel_m: float, materials:
 
 
 def _links(rng: np.random.Generator, plan: MastPlan, materials: MastMaterials) -> Mesh:
-    """Drums, and now and then a yagi or loops, at the mast's side."""
+    """Drums, yagis and dipoles at the mast's sides."""
     parts = []
     for share in rng.uniform(0.35, 0.68, int(rng.integers(2, 5))):
         radius = rng.uniform(0.14, 0.32)
@@ -226,7 +227,7 @@ def _links(rng: np.random.Generator, plan: MastPlan, materials: MastMaterials) -
 def _on_arm(
     rng: np.random.Generator, plan: MastPlan, share: float, mesh: Mesh, materials: MastMaterials
 ) -> Mesh:
-    """Something on an arm at a share of the mast's height, anywhere around."""
+    """Mount a mesh on an arm at a share of the mast's height, in a random direction."""
     z = share * plan.height_m
     out = 0.55 * _width(plan, z) + 0.16
     arm = bars(
@@ -239,7 +240,7 @@ def _on_arm(
 
 
 def _top(rng: np.random.Generator, plan: MastPlan, materials: MastMaterials) -> Mesh:
-    """Whips, lightning rod, lamp."""
+    """Whip antennas, lightning rod, lamp."""
     z = plan.height_m
     around = 0.5 * plan.widths_m[1] * np.array([(1, 1), (-1, 1), (0, -1.2)])
     rods = [
@@ -250,7 +251,7 @@ def _top(rng: np.random.Generator, plan: MastPlan, materials: MastMaterials) -> 
 
 
 def _site(rng: np.random.Generator, palette: Palette, materials: MastMaterials) -> Mesh:
-    """The cabin, the bridge that carries the cables to it, the fence around all."""
+    """Equipment cabin, cable bridge to it, and fence."""
     wall = palette.add(
         painted_steel(rng, ((0.45, 0.5, 0.44), (0.7, 0.68, 0.62))[int(rng.integers(2))], roughness=0.8)
     )

@@ -1,4 +1,4 @@
-"""A crane: a tower crane over a concrete shell that is being built, or a container crane at a quay."""
+"""Scene `crane`: a tower crane over a building site, or a container crane at a quay."""
 
 from dataclasses import dataclass
 
@@ -38,12 +38,12 @@ PAINTS: tuple[Colour, ...] = (
 
 @dataclass(frozen=True, kw_only=True)
 class TowerCranePlan:
-    """A tower crane's measures; the jib reaches along x, the counter-jib along -x.
+    """Dimensions of a tower crane; the jib points along x, the counter-jib along -x.
 
     Attributes:
-        ring_m: height of the slewing ring, on top of the mast.
-        head_m: height of the head above the ring; 0 for a crane without one.
-        trolley_m: its x.
+        ring_m: height of the slewing ring on top of the mast.
+        head_m: height of the head above the ring; 0 without head.
+        trolley_m: x of the trolley.
         rope_m: from the jib to the hook.
     """
 
@@ -58,13 +58,13 @@ class TowerCranePlan:
 
     @property
     def deck_m(self) -> float:
-        """The z of the jib's lower chords and the counter-jib."""
+        """Height of the jib's lower chords and the counter-jib."""
         return self.ring_m + 0.22
 
 
 @dataclass(frozen=True, kw_only=True)
 class TowerCraneMaterials:
-    """Materials of the crane's parts."""
+    """Materials of a tower crane."""
 
     mast: tuple[int, ...]
     jib: tuple[int, ...]
@@ -83,7 +83,7 @@ def crane(rng: np.random.Generator) -> Stage:
 
 def _tower_crane(rng: np.random.Generator) -> Stage:
     palette, plan = Palette(), _draw_plan(rng)
-    # Away from the shell at negative y, so that no load swings into it.
+    # Turned away from the shell at negative y, so that the load does not intersect it.
     target = _crane(rng, palette, plan).transform(rotation((0, 0, 1), rng.uniform(-8, 30)))
     site = building_site(rng, palette)
     light = daylight(rng)
@@ -151,7 +151,7 @@ def _crane(rng: np.random.Generator, palette: Palette, plan: TowerCranePlan) -> 
 
 
 def _mast(plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
-    """Mast with ladder and landings, on its slab with the four anchored feet."""
+    """Mast with ladder and landings, on a slab with four anchors."""
     joints = mast_rings(*mast_levels((0.3, plan.ring_m - 0.1), (plan.side_m, plan.side_m), 0.95))
     lattice = truss(joints, "zigzag").banded_mesh(0.024, 0.012, materials.mast, (np.inf, 0.8))
     landings = np.arange(1.0, plan.ring_m - 0.4, 0.9)[:, None] * [0, 0, 1]
@@ -176,7 +176,7 @@ def _mast(plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
 
 
 def _slewing(plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
-    """Ring, platform with railing, cab, and the head where there is one."""
+    """Slewing ring, platform with railing, cab, and head if any."""
     z, half = plan.ring_m, plan.side_m / 2
     ring = lathe(
         [(0, -0.06), (half, -0.06), (half + 0.02, 0.0), (half, 0.03), (0, 0.03)], materials.steel, 28
@@ -206,7 +206,7 @@ def _slewing(plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
 
 
 def _jib(plan: TowerCranePlan) -> Float[np.ndarray, "k 3 3"]:
-    """Joints of the jib: two chords below and one above, lower towards the tip."""
+    """Joints of the jib: two lower chords and one upper chord, tapering towards the tip."""
     count = max(round((plan.jib_m - 0.2) / 0.3), 2)
     x = np.linspace(0.2, plan.jib_m, count + 1)
     share = (x - 0.2) / (plan.jib_m - 0.2)
@@ -219,7 +219,7 @@ def _jib(plan: TowerCranePlan) -> Float[np.ndarray, "k 3 3"]:
 def _jib_mesh(plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
     joints = _jib(plan)
     lattice: Truss = truss(joints, "zigzag")
-    # The trolley's rope runs along the jib, between its chords.
+    # The trolley's rope runs along the jib between its chords.
     start, end = (joints[k, :2].mean(0) + [0, 0, 0.05] for k in (0, -1))
     return join_meshes(
         [
@@ -231,7 +231,7 @@ def _jib_mesh(plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
 
 
 def _counter_jib(rng: np.random.Generator, plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
-    """Two beams with a deck and railings, concrete blocks at the end, winch and cabinet, a sign."""
+    """Two beams with deck and railings, counterweights, winch, cabinet, signs."""
     end, half, z = -plan.counter_m, 0.42 * plan.side_m, plan.deck_m
     beams = [(0.5 * end, side * half, z) for side in (1, -1)]
     count = int(rng.integers(3, 6))
@@ -268,7 +268,7 @@ def _counter_jib(rng: np.random.Generator, plan: TowerCranePlan, materials: Towe
 
 
 def _pendants(plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
-    """Ties from the head to both jibs; without a head, a strut to the jib's upper chord."""
+    """Ties from the head to both jibs; without head, struts to the jib's upper chord."""
     joints = _jib(plan)
     half = 0.42 * plan.side_m
     sides = np.array([[1, half, 1], [1, -half, 1]])
@@ -316,7 +316,7 @@ def _hook(plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
 
 
 def _load(rng: np.random.Generator, plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
-    """What hangs from the hook by slings: a concrete panel, a bundle of bars, or a bucket."""
+    """The load: a concrete panel or a bundle of bars in slings, or a bucket."""
     at = np.array([plan.trolley_m, 0, plan.deck_m - plan.rope_m - 0.19])
     kind = str(rng.choice(["panel", "bars", "bucket"]))
     if kind == "bucket":

@@ -1,7 +1,7 @@
-"""Near plain boards, tables and walls, with textured things on them, beside them and behind them.
+"""Scene `boards`: near plain boards, tables and walls, with textured things on, beside and behind them.
 
-Nothing inside a plain surface can be matched, so its disparity follows from its outlines alone. Real rooms
-are full of such surfaces, near the cameras and larger than the crops that a network is trained on.
+The interior of a plain surface cannot be matched, so its disparity follows from its outlines alone. Real
+rooms are full of such surfaces, near the cameras and larger than training crops.
 """
 
 from collections.abc import Sequence
@@ -19,32 +19,32 @@ from stereoweave.synth.stage import Palette, Stage
 from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Colour, Lamp, Material, Mesh, Sky, World, join_meshes
 
-# The cameras look along y, so that what is near can be set before them.
+# The cameras look along y, so that the foreground can be placed in front of them.
 _AHEAD_DEG, _SWING_DEG = 270.0, 6.0
-# Half the width that the narrowest lens of `rigs.draw_focal_px` sees at 1 m.
+# Half of the view's width at 1 m for the longest focal length of `viewpoints.draw_focal_px`.
 _HALF_VIEW = 0.38
-# So that most plain surfaces have 20 to 120 px.
+# Gives most plain surfaces 20 to 120 px.
 _NEAREST_PX = (32.0, 130.0)
 _BAR_M = 0.015
-# A texel of the faint noise is then larger than what is seen.
+# A texel of the faint noise is then larger than the visible surface.
 _EVEN_SPAN_M = 200.0
-# Without a sensor's noise the least change of shade would match, which no photograph allows.
+# Without sensor noise the slightest shading would be matchable, unlike in photographs.
 _NOISE_LEVELS = (0.5, 1.5)
-# Of things. With those of the room they stay within a renderer's 64 materials.
+# Materials of things; with those of the room they stay within a renderer's 64.
 _SURFACES = 16
-# Chairs and the like would be toys on a table.
+# Chairs and the like would look like toys on a table.
 _SMALL = (*SOLIDS, book_stack, picture, plant)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Foreground:
-    """What is near the cameras.
+    """The foreground.
 
     Attributes:
         plain: the near plain surfaces.
-        orbit: where the cameras are, around a point on the z axis.
-        spots_m: [N, 4], where small things stand on them: x, y, z and size.
-        end_m: the y at which they end; the room goes on behind.
+        orbit: viewpoints around a point on the z axis.
+        spots_m: [N, 4], spots of small things on them: x, y, z and size.
+        end_m: y at which the foreground ends; the room continues behind.
     """
 
     plain: Mesh
@@ -54,7 +54,7 @@ class _Foreground:
 
 
 def plain_boards(rng: np.random.Generator) -> Stage:
-    """A room seen past boards that stand before the cameras, over a table top, or along or onto a wall."""
+    """A room behind standing boards, a table top or a wall, all close to the cameras."""
     palette = Palette()
     foreground = (_standing_boards, _table_top, _wall)[rng.integers(3)](rng, palette)
     width_m, depth_m, height_m = rng.uniform([3.5, 1.5, 2.5], [6.5, 3.5, 3.4]).tolist()
@@ -78,14 +78,14 @@ def plain_boards(rng: np.random.Generator) -> Stage:
 
 
 def _standing_boards(rng: np.random.Generator, palette: Palette) -> _Foreground:
-    """One to three boards, partitions and cupboards, each with an upright edge in the picture."""
+    """One to three boards, partitions or cupboards, each with a vertical edge in the picture."""
     distance_m, eye_m = rng.uniform(1.2, 1.9), rng.uniform(0.9, 1.4)
     away_m = [rng.uniform(0.65, 1.0), *rng.uniform(1.0, 1.8, rng.integers(0, 3)).tolist()]
     side = rng.choice([-1, 1])
     parts = []
     for k, away in enumerate(away_m):
         width_m = away * rng.uniform(0.7, 1.4)
-        # Those behind leave a gap beside the first: boards alone would show no outline.
+        # Boards behind leave a gap beside the first: otherwise no outline would be visible.
         edge_m = rng.uniform(*((-0.6, 0.4) if k == 0 else (0.65, 0.85))) * away * _HALF_VIEW
         top_m = eye_m + away * rng.uniform(0.05, 0.5)
         pose = rotation((0, 0, 1), rng.normal(0, 15))
@@ -101,7 +101,7 @@ def _standing_boards(rng: np.random.Generator, palette: Palette) -> _Foreground:
 
 
 def _table_top(rng: np.random.Generator, palette: Palette) -> _Foreground:
-    """A table that reaches out of the picture, with things on it, and at times a board at its end."""
+    """A table larger than the picture, with things on it, and at times a board at its end."""
     distance_m, table_m, end_m = rng.uniform(0.8, 1.3), rng.uniform(0.65, 0.85), rng.uniform(0.15, 0.7)
     width_m, length_m = rng.uniform(1.6, 3.0), distance_m + end_m + 0.4
     top = boxes([[0, 0, -0.02]], [[width_m, length_m, 0.04]], palette.add(_plain(rng)))
@@ -122,7 +122,7 @@ def _table_top(rng: np.random.Generator, palette: Palette) -> _Foreground:
 
 
 def _wall(rng: np.random.Generator, palette: Palette) -> _Foreground:
-    """A wall that the cameras look onto or along, and a sideboard at it with things on it."""
+    """A wall, seen frontally or obliquely, with a sideboard and things on it."""
     distance_m, eye_m = rng.uniform(1.1, 1.7), rng.uniform(0.95, 1.3)
     turned_deg = rng.choice([-1, 1]) * rng.uniform(0, 60)
     length_m, end_m = rng.uniform(0.9, 1.6) * distance_m, rng.uniform(-0.1, 0.3)
@@ -146,7 +146,7 @@ def _wall(rng: np.random.Generator, palette: Palette) -> _Foreground:
 
 
 def _board(rng: np.random.Generator, palette: Palette, width_m: float, top_m: float) -> Mesh:
-    """A board, a partition or a cupboard with its front at y = 0, from the floor or on feet to top_m."""
+    """A board, partition or cupboard with its front at y = 0, up to top_m, on the floor or on feet."""
     low_m = 0.0 if rng.random() < 0.6 else rng.uniform(0.05, 0.3) * top_m
     depth_m, tall_m = rng.choice([rng.uniform(0.01, 0.04), rng.uniform(0.15, 0.5)]), top_m - low_m
     middle_m, trim = low_m + tall_m / 2, palette.add(_trim(rng))
@@ -165,7 +165,7 @@ def _board(rng: np.random.Generator, palette: Palette, width_m: float, top_m: fl
 
 
 def _orbit(rng: np.random.Generator, distance_m: float, aim_m: float, elevation_deg: float) -> Orbit:
-    """Cameras on a small part of a circle around the point at height aim_m on the z axis."""
+    """A small arc of viewpoints around the point at height aim_m on the z axis."""
     turned_deg = _AHEAD_DEG + rng.normal(0, 4)
     return Orbit(
         centre_m=(0.0, 0.0, aim_m),
@@ -178,7 +178,7 @@ def _orbit(rng: np.random.Generator, distance_m: float, aim_m: float, elevation_
 
 
 def _plain(rng: np.random.Generator) -> Material:
-    """A surface of one muted colour, three in ten with faint noise; a quarter shines."""
+    """Draw a material of one muted colour; 30 % have faint noise, 25 % are glossy."""
     even = rng.random() < 0.7
     return Material(
         texture="plain",
@@ -201,7 +201,7 @@ def _spots(
     level_m: float,
     sizes: tuple[float, float],
 ) -> Float[np.ndarray, "n 4"]:
-    """Places at each y, anywhere in the picture's width; sizes are shares of the distance to the cameras."""
+    """Spots at each y, across the picture's width; sizes are shares of the distance to the cameras."""
     away_m = along_m + distance_m
     x = rng.permutation(np.linspace(-1.3, 1.3, len(along_m))) * _HALF_VIEW * away_m
     sizes_m = rng.uniform(*sizes, len(along_m)) * away_m
@@ -211,13 +211,13 @@ def _spots(
 def _floor_spots(
     rng: np.random.Generator, foreground: _Foreground, depth_m: float
 ) -> Float[np.ndarray, "n 4"]:
-    """Places of 8 to 16 things behind what is near."""
+    """Spots of 8 to 16 things behind the foreground."""
     along_m = foreground.end_m + np.linspace(0.35, depth_m - 0.4, int(rng.integers(8, 17)))
     return _spots(rng, along_m, foreground.orbit.distance_m[0], 0.0, (0.25, 0.6))
 
 
 def _thing(rng: np.random.Generator, skins: Sequence[int], spot_m: Float[np.ndarray, "4"]) -> Mesh:
-    """A solid or a piece of furniture that stands at a spot."""
+    """A solid or a piece of furniture at a spot."""
     kinds = FURNITURE if spot_m[2] == 0 and rng.random() < 0.6 else _SMALL
     main, other = (skins[k] for k in rng.integers(len(skins), size=2))
     mesh = kinds[rng.integers(len(kinds))](rng, PropStyle(main=main, other=other, bar_m=_BAR_M))
@@ -230,7 +230,7 @@ def _thing(rng: np.random.Generator, skins: Sequence[int], spot_m: Float[np.ndar
 
 
 def _light(rng: np.random.Generator, lamps: Sequence[Lamp]) -> tuple[Sky, float]:
-    """Light from walls and ceiling instead of a sun, and the exposure for it and the lamps."""
+    """Ambient light from walls and ceiling, without sun, and the exposure for it and the lamps."""
     ambient = rng.uniform(0.25, 0.6)
     tint = np.array([1.0, 0.97, 0.92]) * rng.uniform(0.96, 1.04, 3)
 

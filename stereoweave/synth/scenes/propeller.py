@@ -1,4 +1,4 @@
-"""A ship's screw: under its ship in a dry dock or a yard, or as a monument in a park. Aft is +x."""
+"""Scene `propeller`: a ship's propeller in a dry dock or a yard, or as a monument. Aft is +x."""
 
 from dataclasses import dataclass, replace
 
@@ -15,11 +15,11 @@ from stereoweave.synth.stage import Palette, Stage
 from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Colour, Lamp, Material, Mesh, Sky, World, join_meshes
 
-# How a screw may look: texture and variants, colour, roughness, metal.
+# Finishes of propellers: texture and variants, colour, roughness, metal.
 _FINISHES: tuple[tuple[str, tuple[int, ...], Colour, float, float], ...] = (
     ("steel", (0, 2), (1.6, 1.15, 0.6), 0.3, 0.9),  # polished bronze
-    ("steel", (1, 2), (1.1, 0.8, 0.45), 0.45, 0.7),  # bronze that has run for years
-    ("plaster", (0, 2), (0.5, 0.42, 0.27), 0.6, 0.35),  # the same with a crust
+    ("steel", (1, 2), (1.1, 0.8, 0.45), 0.45, 0.7),  # worn bronze
+    ("plaster", (0, 2), (0.5, 0.42, 0.27), 0.6, 0.35),  # encrusted bronze
     ("paint", (0, 1, 2, 3), (0.42, 0.14, 0.1), 0.5, 0.0),
     ("paint", (0, 1, 2, 3), (0.8, 0.78, 0.72), 0.45, 0.0),
 )
@@ -27,7 +27,7 @@ _FINISHES: tuple[tuple[str, tuple[int, ...], Colour, float, float], ...] = (
 
 @dataclass(frozen=True, kw_only=True)
 class _Surroundings:
-    """What is around a screw, the height of its floor, and lamps."""
+    """Surroundings of a propeller: mesh, height of the floor, and lamps."""
 
     mesh: Mesh
     floor_m: float
@@ -35,7 +35,7 @@ class _Surroundings:
 
 
 def propeller(rng: np.random.Generator) -> Stage:
-    """A screw of 4.6 to 5.6 m, seen from abaft."""
+    """A propeller of 4.6 to 5.6 m, seen from aft."""
     palette, propeller = Palette(), draw_propeller(rng)
     bolt = palette.add(Material(texture="steel", tint=(0.5, 0.5, 0.5), roughness=0.5, metal=0.7))
     bronze = palette.add(_draw_finish(rng))
@@ -82,7 +82,7 @@ def _draw_finish(rng: np.random.Generator) -> Material:
 
 
 def _turn_sun_aft(rng: np.random.Generator, sky: Sky) -> Sky:
-    """The sky, turned so that the sun mostly shines under the hull and onto the blades."""
+    """Rotate the sun aft in most draws, so that it shines under the hull onto the blades."""
     if rng.random() < 0.15:
         return sky
     level, azimuth = np.hypot(*sky.sun[:2]), np.radians(rng.uniform(-65, 65))
@@ -92,7 +92,7 @@ def _turn_sun_aft(rng: np.random.Generator, sky: Sky) -> Sky:
 def _shipyard(
     rng: np.random.Generator, palette: Palette, propeller: Propeller, docked: bool
 ) -> _Surroundings:
-    """The ship's stern over the screw, on blocks, with what shipwrights need."""
+    """The ship's stern on blocks above the propeller, with equipment of the yard."""
     ship = stern(rng, palette, propeller)
     floor_m, half_m = ship.keel_m - rng.uniform(0.9, 1.3), rng.uniform(8.0, 9.5)
     light, shining = work_lamps(rng, palette, floor_m)
@@ -110,7 +110,7 @@ def _shipyard(
 
 
 def _park(rng: np.random.Generator, palette: Palette, propeller: Propeller) -> _Surroundings:
-    """A plinth that carries the screw on a short shaft, among paths, benches, trees and houses."""
+    """A plinth with the propeller on a short shaft, among paths, benches, trees and houses."""
     floor_m = -propeller.radius_m - rng.uniform(0.7, 1.1)
     angle = np.radians(np.arange(95, 266, 5.5)) + rng.normal(0, 0.01, 32)
     close = draw_spots(rng, 22, 9.5, 14)
@@ -131,7 +131,7 @@ def _park(rng: np.random.Generator, palette: Palette, propeller: Propeller) -> _
 
 
 def _plinth(rng: np.random.Generator, palette: Palette, propeller: Propeller, floor_m: float) -> Mesh:
-    """Two steps, and a tapering pier behind the hub with a plate on it."""
+    """Two steps, a tapering pier behind the hub, and a plaque."""
     texture = str(rng.choice(["stone", "concrete", "brick"]))
     stone = palette.add(
         Material(texture=texture, variant=int(rng.integers(64)), tint=vary_colour(rng, (0.8, 0.78, 0.74)))
@@ -159,7 +159,7 @@ def _plinth(rng: np.random.Generator, palette: Palette, propeller: Propeller, fl
 
 
 def _path(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """A round place paved around the plinth."""
+    """A paved circle around the plinth, and a path to it."""
     paving = palette.add(
         Material(
             texture=str(rng.choice(["gravel", "stone", "concrete"])),

@@ -1,4 +1,4 @@
-"""A high-voltage line: a lattice tower near by, its conductors on to others far away, over fields."""
+"""Scene `pylon`: a high-voltage line over fields, with one lattice tower close and others far away."""
 
 from dataclasses import dataclass, replace
 
@@ -26,7 +26,7 @@ from stereoweave.synth.stage import Palette, Stage, outdoor_stage
 from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Material, Mesh, join_meshes
 
-# Each arm: its height and its reach, as shares of the tower's height, and the conductors on each side.
+# Per arm: height and reach as shares of the tower's height, and conductors on each side.
 KINDS: dict[str, tuple[tuple[float, float, int], ...]] = {
     "single level": ((0.76, 0.33, 3),),
     "danube": ((0.64, 0.30, 2), (0.80, 0.19, 1)),
@@ -34,19 +34,19 @@ KINDS: dict[str, tuple[tuple[float, float, int], ...]] = {
     "fir tree": ((0.55, 0.24, 1), (0.70, 0.19, 1), (0.85, 0.14, 1)),
 }
 ARM_PANELS = 6
-REACH_M = 4.4  # of what is near enough to count as the tower's own
+REACH_M = 4.4  # lines within this distance belong to the target
 
 
 @dataclass(frozen=True, kw_only=True)
 class PylonPlan:
-    """A tower's measures; its line runs along y, its arms reach along x.
+    """Dimensions of a tower; the line runs along y, the arms along x.
 
     Attributes:
         arms: height_m, reach_m and conductors on each side, from the lowest up.
-        widths_m: of the body at the ground, at the lowest arm, at the highest.
-        span_m: to the next tower.
-        strained: whether the strings pull along the line, as at the ends of a section, or hang.
-        bundle_m: between the wires of a pair; 0 for single ones.
+        widths_m: width of the body at the ground, at the lowest and at the highest arm.
+        span_m: distance to the next tower.
+        strained: tension insulators along the line instead of suspension insulators.
+        bundle_m: distance between the wires of a twin bundle; 0 for single wires.
     """
 
     height_m: float
@@ -92,7 +92,7 @@ def _draw_plan(rng: np.random.Generator) -> PylonPlan:
 
 
 def _orbit(rng: np.random.Generator, plan: PylonPlan) -> Orbit:
-    """Low anywhere, or beside the line at any height: above the wires' path nothing may be in the way."""
+    """Low viewpoints, or beside the line at any height, so that no wire is right in front of the cameras."""
     beside = bool(rng.random() < 0.6)
     middle = float(rng.choice([90, 270]))
     if beside:
@@ -111,7 +111,7 @@ def _orbit(rng: np.random.Generator, plan: PylonPlan) -> Orbit:
 
 
 def _trusses(plan: PylonPlan) -> list[Truss]:
-    """The body below the arms, the body above, and the arms of both sides."""
+    """Trusses of the body below and above the lowest arm, and of the arms on both sides."""
     foot, waist, neck = plan.widths_m
     lowest, highest = plan.arms[0][0], plan.arms[-1][0] + plan.depth_m
     below = mast_levels((0.0, lowest), (foot, waist), 0.95)
@@ -128,7 +128,7 @@ def _trusses(plan: PylonPlan) -> list[Truss]:
 
 
 def _arm(plan: PylonPlan, height_m: float, reach_m: float) -> Float[np.ndarray, "k 4 3"]:
-    """Joints from the body's side to the tip; the first two of each ring are below."""
+    """Joints of an arm from body to tip; the first two of each ring are the lower ones."""
     low, high = (_width(plan, z) / 2 for z in (height_m, height_m + plan.depth_m))
     top = height_m + plan.depth_m
     root = np.array([[low, -low, height_m], [low, low, height_m], [high, high, top], [high, -high, top]])
@@ -148,7 +148,7 @@ def _mirror(arm: Truss) -> Truss:
 
 
 def _hooks(plan: PylonPlan) -> Points:
-    """Where the strings are fixed, below the arms."""
+    """Attachment points of the insulator strings below the arms."""
     inner = []
     for height, reach, count in plan.arms:
         low = _width(plan, height) / 2
@@ -159,7 +159,7 @@ def _hooks(plan: PylonPlan) -> Points:
 
 
 def _tower(rng: np.random.Generator, palette: Palette, plan: PylonPlan) -> tuple[Mesh, int]:
-    """The tower with its fittings, and the material of its steel."""
+    """The tower with fittings, and the index of its steel."""
     steel = palette.add(_steel(rng))
     leg, brace = 0.028 * plan.bar_m, 0.013 * plan.bar_m
     trusses = _trusses(plan)
@@ -173,7 +173,7 @@ def _tower(rng: np.random.Generator, palette: Palette, plan: PylonPlan) -> tuple
 
 
 def _steel(rng: np.random.Generator) -> Material:
-    """Bare zinc, or the greens and greys that towers are painted with."""
+    """Draw galvanised steel, or steel painted green, grey or brown."""
     tints = ((0.22, 0.3, 0.24), (0.35, 0.38, 0.38), (0.3, 0.2, 0.15))
     return galvanised_steel(rng) if rng.random() < 0.6 else painted_steel(rng, tints[int(rng.integers(3))])
 
@@ -181,7 +181,7 @@ def _steel(rng: np.random.Generator) -> Material:
 def _fittings(
     rng: np.random.Generator, palette: Palette, plan: PylonPlan, body: Truss, steel: int
 ) -> list[Mesh]:
-    """Footings, plates at the joints, step bolts, the guard against climbers, signs."""
+    """Footings, gusset plates, step bolts, anti-climbing guard, sign."""
     concrete = palette.add(Material(texture="concrete", variant=int(rng.integers(8)), span_m=1.0))
     yellow = palette.add(
         Material(texture="sign", variant=int(rng.integers(8)), tint=(0.9, 0.7, 0.1), span_m=0.3)
@@ -210,7 +210,7 @@ def _body_width(plan: PylonPlan, z_m: float) -> float:
 
 
 def _steps(plan: PylonPlan) -> Segments:
-    """Bolts up the first leg, to the left and to the right in turn."""
+    """Step bolts on the first leg, on alternating sides."""
     heights = np.arange(0.2 * plan.height_m, plan.arms[0][0], 0.075)
     half = np.interp(heights, (0, plan.arms[0][0]), plan.widths_m[:2]) / 2
     at = np.column_stack([half, half, heights])
@@ -219,7 +219,7 @@ def _steps(plan: PylonPlan) -> Segments:
 
 
 def _lines(rng: np.random.Generator, palette: Palette, plan: PylonPlan) -> tuple[Mesh, int]:
-    """Strings, conductors both ways, earth wire; and the wires' material."""
+    """Insulator strings, conductors both ways and earth wire; and the index of the wires' material."""
     tints = ((0.32, 0.16, 0.1), (0.55, 0.62, 0.6), (0.2, 0.22, 0.24))
     glass = palette.add(
         Material(texture="plain", tint=tints[int(rng.integers(3))], roughness=0.2, span_m=0.5)
@@ -244,7 +244,7 @@ def _lines(rng: np.random.Generator, palette: Palette, plan: PylonPlan) -> tuple
 
 
 def _wires(plan: PylonPlan, starts_m: Points, way: int, wire: int) -> Mesh:
-    """Conductors to the next tower but one, single or as pairs with spacers."""
+    """Conductors over two spans, single or as twin bundles with spacers."""
     aside = np.array([plan.bundle_m / 2, 0, 0])
     along = np.array([0, way * plan.span_m, 0])
     parts = []
@@ -261,13 +261,13 @@ def _wires(plan: PylonPlan, starts_m: Points, way: int, wire: int) -> Mesh:
 
 
 def _mark_near(lines: Mesh, plan: PylonPlan) -> Mesh:
-    """The lines, those around the tower as its own."""
+    """Mark the lines close to the tower as target."""
     away = lines.corners_m - np.array([0, 0, 0.52 * plan.height_m], np.float32)
     return replace(lines, target=(np.linalg.norm(away, axis=2) < REACH_M).all(1))
 
 
 def _far_towers(plan: PylonPlan, steel: int, wire: int) -> Mesh:
-    """Plainer copies along the line."""
+    """Simpler copies of the tower along the line."""
     hooks = _hooks(plan)
     tower = [part.mesh(0.03, 0.015, steel, sides=3) for part in _trusses(plan)]
     strings = [] if plan.strained else [cables(hooks, hooks - [0, 0, plan.string_m], 0.03, wire, count=1)]
@@ -280,7 +280,7 @@ def _land(rng: np.random.Generator, palette: Palette) -> Mesh:
     small = np.diag([0.4, 0.4, 0.4, 1.0])
     family = str(rng.choice(["grass", "grass", "grass", "soil"]))
     spots = draw_spots(rng, int(rng.integers(16, 34)), 11, 60)
-    # Nothing grows tall below the wires.
+    # No trees below the wires.
     spots = spots[np.abs(spots[:, 0]) > 4]
     return join_meshes(
         [

@@ -1,4 +1,4 @@
-"""Aerials on a flat roof: masts with yagis, dishes and whips among chimneys, over the roofs of a town."""
+"""Roof antennas: masts with yagis, dishes and whips among chimneys on a flat roof in a town."""
 
 import numpy as np
 
@@ -42,7 +42,7 @@ def roof_antennas(rng: np.random.Generator) -> Stage:
 
 
 def _mast(rng: np.random.Generator, height_m: float, skins: tuple[int, int, int], steel: int) -> Mesh:
-    """A pole on a foot or with guys, aerials one below another, their cables taped to it."""
+    """A pole on a tripod or with guys, with antennas one below another, and a cable."""
     mast, cover, dark = skins
     parts = [
         tubes((0, 0, 0), (0, 0, height_m), 0.022, mast, 10),
@@ -62,13 +62,13 @@ def _mast(rng: np.random.Generator, height_m: float, skins: tuple[int, int, int]
 
 
 def _draw_antenna(rng: np.random.Generator, skins: tuple[int, int, int]) -> tuple[Mesh, float]:
-    """Something to receive with, and how much of the mast it takes."""
+    """Draw an antenna. Returns its mesh and the length of mast it occupies."""
     steel, cover, dark = skins
     kind = str(rng.choice(["yagi", "wide", "dish", "dipoles", "panel"], p=[0.4, 0.2, 0.24, 0.1, 0.06]))
     if kind == "yagi":
         return yagi(rng.uniform(0.8, 1.3), int(rng.integers(9, 16)), steel, dark), 0.5
     if kind == "wide":
-        # For the long waves: few and long rods, as wide as the boom is long.
+        # For long waves: a few long rods, as wide as the boom is long.
         broad = yagi(0.45, 4, steel, dark)
         return broad.transform(np.diag([2.2, 2.2, 2.2, 1.0])), 0.85
     if kind == "dish":
@@ -92,7 +92,7 @@ def _tripod(steel: int) -> Mesh:
 
 
 def _roof(rng: np.random.Generator, palette: Palette, feet: np.ndarray, dark: int) -> Mesh:
-    """The building with its parapet; on it chimneys, vents, a shed for the stairs, coolers, cables."""
+    """The building with parapet, chimneys, vents, stair shed, coolers and cables."""
     gravel = palette.add(
         Material(
             texture=str(rng.choice(["gravel", "asphalt", "concrete"])),
@@ -129,7 +129,7 @@ def _roof(rng: np.random.Generator, palette: Palette, feet: np.ndarray, dark: in
 
 
 def _windows(half_m: np.ndarray, dark: int, white: int) -> Mesh:
-    """Rows of windows on the walls towards the street."""
+    """Rows of windows on the street walls."""
     y, z = (values.ravel() for values in np.meshgrid(np.linspace(-2.8, 2.8, 5), [-1.7, -4.2, -6.7]))
     x = np.full_like(y, half_m[0])
     front = np.stack([x, y, z], -1)
@@ -145,7 +145,7 @@ def _windows(half_m: np.ndarray, dark: int, white: int) -> Mesh:
 
 
 def _chimneys(rng: np.random.Generator, wall: int, dark: int, zinc: int) -> Mesh:
-    """A stack with pots, and ventilators."""
+    """A chimney stack with pots, and ventilators."""
     x, y = -2.2, rng.uniform(-0.4, 0.4)
     pots = np.array([(x, y + d, 1.28) for d in (-0.3, 0.0, 0.3)])
     vent = lathe([(0.07, 0), (0.07, 0.35), (0.13, 0.36), (0.15, 0.42), (0.1, 0.52), (0, 0.54)], zinc, 20)
@@ -160,7 +160,7 @@ def _chimneys(rng: np.random.Generator, wall: int, dark: int, zinc: int) -> Mesh
 
 
 def _cooler(white: int, dark: int) -> Mesh:
-    """A cooling unit on feet, its fan to the front."""
+    """A cooling unit on feet with its fan in front."""
     fan = lathe([(0.2, 0), (0.2, 0.03), (0.17, 0.035), (0, 0.02)], dark, 20)
     return join_meshes(
         [
@@ -172,7 +172,7 @@ def _cooler(white: int, dark: int) -> Mesh:
 
 
 def _run(foot_m: np.ndarray, dark: int) -> Mesh:
-    """A cable that lies on the roof from a mast to the shed."""
+    """A cable on the roof from a mast to the shed."""
     share = np.linspace(0, 1, 14)[:, None]
     path = foot_m + share * (np.array([-2.36, 1.1, 0.02]) - foot_m) + [0, 0, 0.012]
     path[:, 1] += 0.25 * np.sin(share[:, 0] * 2 * np.pi)
@@ -180,7 +180,7 @@ def _run(foot_m: np.ndarray, dark: int) -> Mesh:
 
 
 def _town(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """Streets with houses and trees, below."""
+    """Houses and trees at street level."""
     street = np.array([0, 0, STREET_M])
     return join_meshes(
         [

@@ -1,4 +1,4 @@
-"""A street seen from a car in one of its lanes."""
+"""Scene `street`: a street seen from a car."""
 
 import numpy as np
 
@@ -15,12 +15,12 @@ from stereoweave.synth.stage import Palette, Stage, outdoor_stage
 from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import join_meshes
 
-# Between the road before the car and the horizon.
+# The nearest surface is the road in front of the car.
 _NEAREST_PX = (25.0, 130.0)
 
 
 def street(rng: np.random.Generator) -> Stage:
-    """A street with house fronts, vehicles, people and posts, along x, from 1.2 to 2 m above its lane."""
+    """A street along x with house fronts, vehicles, people and posts, seen from 1.2 to 2 m above a lane."""
     palette, plan = Palette(), draw_street_plan(rng)
     target = join_meshes([traffic(rng, palette, plan), walkers(rng, palette, plan)]).as_target()
     parts = [

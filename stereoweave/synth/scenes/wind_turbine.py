@@ -1,4 +1,4 @@
-"""A wind turbine: on a tube in fields, at sea on yellow steel, on an old lattice tower, or a wind pump."""
+"""Scene `wind_turbine`: a wind turbine on a tube or lattice tower, at sea, or a wind pump."""
 
 from dataclasses import dataclass
 
@@ -48,12 +48,12 @@ KINDS = {"tube": 0.45, "sea": 0.25, "lattice": 0.15, "pump": 0.15}
 
 @dataclass(frozen=True, kw_only=True)
 class TurbinePlan:
-    """A turbine's measures.
+    """Dimensions of a wind turbine.
 
     Attributes:
         foot_m: height of the tower's foot: the ground, or the platform at sea.
         hub_m: height of the tower's top.
-        radii_m: of the tower at its foot and at its top; of a lattice tower half its width.
+        radii_m: radius of the tower at foot and top; half the width of a lattice tower.
     """
 
     kind: str
@@ -64,7 +64,7 @@ class TurbinePlan:
 
 
 def wind_turbine(rng: np.random.Generator) -> Stage:
-    """A turbine about 6.5 m high to the tip of its blades, its rotor towards +x; or a wind pump of 5 m."""
+    """A turbine about 6.5 m high to the blade tips, its rotor facing +x; or a wind pump of 5 m."""
     kind = str(rng.choice(list(KINDS), p=list(KINDS.values())))
     return _wind_pump(rng) if kind == "pump" else _turbine(rng, kind)
 
@@ -104,7 +104,7 @@ def _turbine(rng: np.random.Generator, kind: str) -> Stage:
     land = (_sea if kind == "sea" else _fields)(rng, palette, plan, materials)
     mesh = join_meshes([join_meshes(parts).as_target(), land])
     top_m = plan.hub_m + plan.rotor.radius_m
-    # From before or from behind: seen from its side a rotor is a line.
+    # From the front or from behind: from the side a rotor is a line.
     front = float(rng.choice([0, 180], p=[0.7, 0.3]))
     orbit = Orbit(
         centre_m=(0.0, 0.0, 0.5 * top_m),
@@ -149,7 +149,7 @@ def _draw_materials(rng: np.random.Generator, palette: Palette) -> TurbineMateri
 
 
 def _tube(rng: np.random.Generator, palette: Palette, plan: TurbinePlan, materials: TurbineMaterials) -> Mesh:
-    """A tapering tower with the flanges of its sections; at times its foot is green, or it has a red band."""
+    """A tapering tower with flanges, at times with a green foot or a red band."""
     low, high = plan.foot_m, plan.hub_m
     z = np.linspace(low, high, 21)
     radius = np.interp(z, (low, high), plan.radii_m)
@@ -175,7 +175,7 @@ def _tube(rng: np.random.Generator, palette: Palette, plan: TurbinePlan, materia
 def _entrance(
     rng: np.random.Generator, palette: Palette, plan: TurbinePlan, materials: TurbineMaterials
 ) -> Mesh:
-    """Foundation, door with stairs and railings, a transformer kiosk with a fence around it."""
+    """Foundation, door with stairs and railings, transformer kiosk."""
     concrete = palette.add(Material(texture="concrete", variant=int(rng.integers(8)), span_m=1.2))
     kiosk = palette.add(painted_steel(rng, (0.25, 0.33, 0.26)))
     foot = plan.radii_m[0]
@@ -209,7 +209,7 @@ def _entrance(
 
 
 def _mast(rng: np.random.Generator, plan: TurbinePlan, materials: TurbineMaterials) -> Mesh:
-    """A guyed lattice mast that measures the wind, on its sides booms with cups and vanes."""
+    """A guyed lattice met mast with cup anemometers and vanes on booms."""
     top = rng.uniform(0.75, 0.92) * plan.hub_m
     lattice = truss(mast_rings(*mast_levels((0.0, top), (0.11, 0.11), 1.3), corners=3)).mesh(
         0.011, 0.006, materials.steel
@@ -240,7 +240,7 @@ def _mast(rng: np.random.Generator, plan: TurbinePlan, materials: TurbineMateria
 
 
 def _lattice(plan: TurbinePlan, materials: TurbineMaterials) -> Mesh:
-    """Four legs with crossed braces, a ladder, a platform below the nacelle, footings."""
+    """Four legs with cross bracing, ladder, platform below the nacelle, footings."""
     wide = 2 * np.array(plan.radii_m)
     joints = mast_rings(*mast_levels((0.0, plan.hub_m - 0.1), tuple(wide), 0.95))
     top = plan.hub_m - 0.45
@@ -260,7 +260,7 @@ def _lattice(plan: TurbinePlan, materials: TurbineMaterials) -> Mesh:
 def _foundation(
     rng: np.random.Generator, palette: Palette, plan: TurbinePlan, materials: TurbineMaterials
 ) -> Mesh:
-    """Yellow steel out of the sea: a pile or a lattice, platform with railing, boat landing, crane."""
+    """Yellow offshore foundation: monopile or lattice, platform with railing, boat landing, crane."""
     yellow = palette.add(painted_steel(rng, (0.75, 0.5, 0.04)))
     weathered = palette.add(
         Material(texture="rust", variant=int(rng.integers(8)), tint=(0.6, 0.5, 0.35), span_m=0.8)
@@ -297,7 +297,7 @@ def _foundation(
 
 
 def _davit(top_m: float, yellow: int, materials: TurbineMaterials) -> Mesh:
-    """The small crane on the platform."""
+    """The platform's small crane."""
     mast = np.array(
         [
             [(-0.1, 0.4, top_m), (-0.1, 0.4, top_m + 0.38)],
@@ -311,7 +311,7 @@ def _davit(top_m: float, yellow: int, materials: TurbineMaterials) -> Mesh:
 
 
 def _far(rng: np.random.Generator, plan: TurbinePlan, materials: TurbineMaterials, base: int) -> Mesh:
-    """Other turbines of the farm, plainer, their rotors the same way."""
+    """Simpler distant turbines of the wind farm, facing the same way."""
     tower = lathe([(1.1 * plan.radii_m[0], -0.3), (1.1 * plan.radii_m[0], plan.foot_m + 0.1)], base, 12)
     tube = lathe([(plan.radii_m[0], plan.foot_m), (plan.radii_m[1], plan.hub_m)], materials.white, 12)
     at = draw_spots(rng, int(rng.integers(3, 7)), 16, 75)
@@ -339,7 +339,7 @@ def _sea(rng: np.random.Generator, palette: Palette, plan: TurbinePlan, material
 def _fields(
     rng: np.random.Generator, palette: Palette, plan: TurbinePlan, materials: TurbineMaterials
 ) -> Mesh:
-    """Fields with a track to the turbine, trees, a farm, hills, and the rest of the farm of turbines."""
+    """Fields with a track, trees, houses, hills, and the other turbines of the wind farm."""
     family = str(rng.choice(["grass", "grass", "grass", "soil"]))
     small = np.diag([0.4, 0.4, 0.4, 1.0])
     corners = np.array([(9.0, -30, 0), (9.5, -8, 0), (-9, -10, 0), (-30, -13, 0)]) * [
@@ -362,7 +362,7 @@ def _fields(
 
 
 def _track(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """A gravel track past the tower, and the yard where the crane stood that built it."""
+    """A gravel track past the tower, and a crane pad."""
     tint: Colour = (0.9, 0.87, 0.82)
     gravel = palette.add(
         Material(texture="gravel", variant=int(rng.integers(8)), tint=tint, span_m=2.0, relief=0.6)
