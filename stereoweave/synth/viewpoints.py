@@ -120,13 +120,13 @@ def interpolate_viewpoints(start: Viewpoint, end: Viewpoint, share: float) -> Vi
     """Interpolate two viewpoints at a share 0..1 of the way, with a smooth start and stop."""
     eased = share * share * (3 - 2 * share)
 
-    def mixed(name: str) -> float:
+    def mix(name: str) -> float:
         return (1 - eased) * getattr(start, name) + eased * getattr(end, name)
 
     return Viewpoint(
-        distance_m=mixed("distance_m"),
-        azimuth_deg=mixed("azimuth_deg"),
-        elevation_deg=mixed("elevation_deg"),
+        distance_m=mix("distance_m"),
+        azimuth_deg=mix("azimuth_deg"),
+        elevation_deg=mix("elevation_deg"),
         aim_m=(1 - eased) * start.aim_m + eased * end.aim_m,
-        roll_deg=mixed("roll_deg"),
+        roll_deg=mix("roll_deg"),
     )

@@ -161,7 +161,7 @@ def abutments(plan: BridgePlan) -> Mesh:
     return join_meshes([walls, posts])
 
 
-def stone_arches(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
+def stone_arch_bridge(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
     """Two to five arches with voussoirs, pointed piers and a parapet."""
     count = int(rng.integers(2, 6))
     wide_m = 2 * plan.half_m / count

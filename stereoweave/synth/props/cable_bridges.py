@@ -8,7 +8,7 @@ from stereoweave.synth.stage import Palette
 from stereoweave.synth.world import Mesh, join_meshes
 
 
-def suspension(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
+def suspension_bridge(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
     """Two towers, main cables to both banks, hangers, and a stiffening girder."""
     tower_m, top_m = rng.uniform(2.2, 2.6), plan.level_m + rng.uniform(1.35, 1.9)
     low_m, anchor_m = plan.level_m + 0.14, plan.half_m + 0.5
@@ -30,7 +30,7 @@ def suspension(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> 
     return join_meshes([*parts, _anchors(plan, anchor_m)])
 
 
-def cable_stayed(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
+def cable_stayed_bridge(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
     """One or two towers, with straight stays that fan out to the edges of the road."""
     single = rng.random() < 0.5
     towers_m = [rng.uniform(-0.4, 0.4)] if single else [-0.5 * plan.half_m, 0.5 * plan.half_m]
@@ -42,7 +42,11 @@ def cable_stayed(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -
     parts = [slab, roadway(plan, -plan.half_m, plan.half_m).translate(z=plan.level_m)]
     cable = plan.rail if rng.random() < 0.5 else plan.steel
     for at in towers_m:
-        head = _leaning(plan, top_m) if leaning else _portal(plan, top_m, 0.17, plan.dressed, crossings=2)
+        head = (
+            _inverted_y_tower(plan, top_m)
+            if leaning
+            else _portal(plan, top_m, 0.17, plan.dressed, crossings=2)
+        )
         parts += [head.translate(x=at), pier(plan, at, 0.35, thick_m=0.7, wide_m=0.6)]
         steps = (np.arange(count) + 1) / count
         for side in (-1, 1):
@@ -98,7 +102,7 @@ def _portal(plan: BridgePlan, top_m: float, thick_m: float, material: int, cross
     return join_meshes([*legs, bars, caps])
 
 
-def _leaning(plan: BridgePlan, top_m: float) -> Mesh:
+def _inverted_y_tower(plan: BridgePlan, top_m: float) -> Mesh:
     """An inverted Y: two legs that meet in a mast above the road."""
     fork_m = _fork_m(plan, top_m)
     foot_y = plan.side_m + 0.3

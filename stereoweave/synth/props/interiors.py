@@ -98,12 +98,16 @@ def indoor_light(rng: np.random.Generator, sky: Sky, lamps: Sequence[Lamp]) -> t
     ambient = rng.uniform(0.15, 0.6)
     warm = np.array([1.0, 0.95, 0.87])
 
-    def shaded(share: float) -> Colour:
+    def scale_ambient(share: float) -> Colour:
         red, green, blue = (ambient * share * warm * rng.uniform(0.95, 1.05, 3)).tolist()
         return red, green, blue
 
     room_light = Sky(
-        sun=sky.sun, sun_light=(0.0, 0.0, 0.0), zenith=shaded(1.0), horizon=shaded(0.8), ground=shaded(0.5)
+        sun=sky.sun,
+        sun_light=(0.0, 0.0, 0.0),
+        zenith=scale_ambient(1.0),
+        horizon=scale_ambient(0.8),
+        ground=scale_ambient(0.5),
     )
     lamp_light = sum(lamp.light[1] / (1.0 + np.sum(np.square(lamp.position_m))) for lamp in lamps)
     return room_light, float(1.1 * np.exp(rng.normal(0, 0.3)) / (ambient + lamp_light))

@@ -56,10 +56,10 @@ class Truss:
         )
 
     def _within(self, band: int, count: int, bands_m: tuple[float, float]) -> "Truss":
-        def chosen(segments: Segments) -> Segments:
+        def select(segments: Segments) -> Segments:
             return segments[np.floor((segments.mean(1)[:, ::2] / bands_m).sum(1)) % count == band]
 
-        return Truss(legs=chosen(self.legs), struts=chosen(self.struts), braces=chosen(self.braces))
+        return Truss(legs=select(self.legs), struts=select(self.struts), braces=select(self.braces))
 
 
 def mast_levels(

@@ -14,7 +14,7 @@ Joints = Float[np.ndarray, "_ 3"]
 _TOWER_M = 0.5  # along the road
 
 
-def truss_girder(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
+def truss_bridge(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
     """One or two spans between piers, with straight or curved upper chords."""
     count = int(rng.integers(1, 3))
     length_m = 2 * plan.half_m / count

@@ -9,10 +9,10 @@ from stereoweave.synth.props.bridges import (
     BridgePlan,
     abutments,
     draw_bridge_plan,
-    stone_arches,
+    stone_arch_bridge,
     street_lamps,
 )
-from stereoweave.synth.props.cable_bridges import cable_stayed, suspension
+from stereoweave.synth.props.cable_bridges import cable_stayed_bridge, suspension_bridge
 from stereoweave.synth.props.primitives import boxes, rotation, sheet, translation
 from stereoweave.synth.props.surroundings import (
     bushes,
@@ -24,17 +24,17 @@ from stereoweave.synth.props.surroundings import (
     sea,
     trees,
 )
-from stereoweave.synth.props.truss_bridges import lift_bridge, truss_girder
+from stereoweave.synth.props.truss_bridges import lift_bridge, truss_bridge
 from stereoweave.synth.props.vehicles import fleet
 from stereoweave.synth.stage import Palette, Stage, outdoor_stage
 from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Material, Mesh, join_meshes
 
 KINDS: dict[str, Callable[[np.random.Generator, Palette, BridgePlan], Mesh]] = {
-    "truss": truss_girder,
-    "suspension": suspension,
-    "stayed": cable_stayed,
-    "arches": stone_arches,
+    "truss": truss_bridge,
+    "suspension": suspension_bridge,
+    "stayed": cable_stayed_bridge,
+    "arches": stone_arch_bridge,
     "lift": lift_bridge,
 }
 

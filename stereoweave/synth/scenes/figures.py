@@ -112,8 +112,8 @@ def _soften(rng: np.random.Generator, sky: Sky) -> Sky:
     """Dim the sun; in half of the draws it keeps its full strength."""
     share = rng.choice([1.0, rng.uniform(0.1, 0.6)])
 
-    def dimmed(colour: Colour) -> Colour:
+    def dim(colour: Colour) -> Colour:
         red, green, blue = (float(share * part) for part in colour)
         return red, green, blue
 
-    return replace(sky, sun_light=dimmed(sky.sun_light))
+    return replace(sky, sun_light=dim(sky.sun_light))

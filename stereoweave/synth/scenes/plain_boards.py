@@ -234,16 +234,16 @@ def _light(rng: np.random.Generator, lamps: Sequence[Lamp]) -> tuple[Sky, float]
     ambient = rng.uniform(0.25, 0.6)
     tint = np.array([1.0, 0.97, 0.92]) * rng.uniform(0.96, 1.04, 3)
 
-    def shaded(share: float) -> Colour:
+    def scale_ambient(share: float) -> Colour:
         red, green, blue = (ambient * share * tint).tolist()
         return red, green, blue
 
     sky = Sky(
         sun=(0.0, 0.0, 1.0),
         sun_light=(0.0, 0.0, 0.0),
-        zenith=shaded(1.0),
-        horizon=shaded(0.85),
-        ground=shaded(0.55),
+        zenith=scale_ambient(1.0),
+        horizon=scale_ambient(0.85),
+        ground=scale_ambient(0.55),
     )
     lamp_light = sum(lamp.light[1] / (1.0 + lamp.position_m[2] ** 2) for lamp in lamps)
     return sky, float(1.3 * np.exp(rng.normal(0, 0.25)) / (ambient + lamp_light))

@@ -153,12 +153,12 @@ def _open_pairs(folder: Path, layout: str, scene: str) -> _Pairs:
     if layout == "shards":
         shards = Shards(folder, scene)
 
-        def unpacked(index: int) -> Sample:
+        def unpack(index: int) -> Sample:
             shards.views(index)
             return shards[index]
 
         files = [shard.path.name for shard in shards.shards for _ in range(shard.first, shard.last + 1)]
-        return _Pairs([shards.name(index) for index in range(shards.count)], files, unpacked)
+        return _Pairs([shards.name(index) for index in range(shards.count)], files, unpack)
     frames = paper(folder)
 
     def read(index: int) -> Sample:
