@@ -23,7 +23,7 @@ Jobs = Annotated[int | None, typer.Option(min=1, help="Number of processes (defa
 @synth.command()
 def make(  # noqa: PLR0913 - each is an option of the command
     scene: Scene,
-    pairs: Annotated[int, typer.Option(min=1, help="Size of the finished set.")],
+    pairs: Annotated[int, typer.Option(min=1, help="Number of pairs in the finished set.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the set.")],
     seed: Annotated[int, typer.Option(min=0, help="Seed of all random draws.")] = 0,
     size: Annotated[str, typer.Option(help="Width and height in pixels.")] = "640x480",
@@ -42,7 +42,10 @@ def make(  # noqa: PLR0913 - each is an option of the command
     ] = None,
     rig: Annotated[
         tuple[float, float] | None,
-        typer.Option(metavar="FOCAL_PX BASELINE_M", help="Rig of all pairs (default: drawn for each)."),
+        typer.Option(
+            metavar="FOCAL_PX BASELINE_M",
+            help="Focal length and baseline of all pairs (default: drawn for each).",
+        ),
     ] = None,
     jobs: Annotated[
         int | None,

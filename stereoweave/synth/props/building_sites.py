@@ -13,7 +13,7 @@ BAY_M, STOREY_M = 0.95, 0.52
 
 
 def building_site(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """A site whose shell stands at negative y, so that it is behind the crane seen from positive y."""
+    """A site with its shell at negative y, behind the crane seen from positive y."""
     small = np.diag([SCALE, SCALE, SCALE, 1.0])
     town = draw_spots(rng, 20, 17 / SCALE, 60 / SCALE)
     stacks = draw_spots(rng, 7, 2 / SCALE, 5 / SCALE)

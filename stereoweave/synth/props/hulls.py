@@ -13,7 +13,7 @@ Values = float | np.ndarray
 
 @dataclass(frozen=True, kw_only=True)
 class Hull:
-    """A hull whose bow is at +x and whose waterline is z = 0.
+    """A hull with its bow at +x and its waterline at z = 0.
 
     Attributes:
         length_m: at the waterline, from -length_m / 2 to length_m / 2.
