@@ -271,11 +271,11 @@ def speed(
     out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("speed.csv"),
 ) -> None:
     """Time of the paper's network and its rivals for a pair of 640x480, in PyTorch and in ONNX Runtime."""
-    from stereoweave.learn.recipe import read_recipe
-
     place_for(out)
-    read = read_recipe(recipe)
     with needing_the_train_extra():
+        from stereoweave.learn.recipe import read_recipe
+
+        read = read_recipe(recipe)
         from stereoweave.learn.studies.speed import run_times
     _write_and_tell(out, "A pair of 640x480", run_times(read))
 
@@ -360,11 +360,11 @@ def ablations(
     """
     from rich.console import Console
 
-    from stereoweave.learn.recipe import read_recipe
-
-    base = read_recipe(recipe)
-    place_for(report)
     with needing_the_train_extra():
+        from stereoweave.learn.recipe import read_recipe
+
+        base = read_recipe(recipe)
+        place_for(report)
         from stereoweave.learn.studies.ablations import plan, run_ablations
     run_ablations(plan(base, seeds), out, rendered, report, Console())
     typer.echo(f"rows: {report}")
@@ -417,10 +417,11 @@ def _experiment(  # noqa: PLR0913 - the words of two command lines
 ) -> None:
     from rich.console import Console
 
-    from stereoweave.learn.recipe import read_recipe
-
-    base, console = read_recipe(recipe), Console()
+    console = Console()
     with needing_the_train_extra():
+        from stereoweave.learn.recipe import read_recipe
+
+        base = read_recipe(recipe)
         from stereoweave.learn.paper.experiment import plan, run_trials
         from stereoweave.learn.paper.report import write_report
     planned = plan(base, out, seeds, console, claims)

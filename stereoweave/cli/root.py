@@ -71,9 +71,10 @@ def train(
 ) -> None:
     """Train the network of a recipe; a run that was stopped continues where it was."""
     from stereoweave.learn.distributed import told_once
-    from stereoweave.learn.recipe import read_recipe
 
-    with told_once():
+    with told_once(), needing_the_train_extra():
+        from stereoweave.learn.recipe import read_recipe
+
         read_recipe(recipe)  # what is wrong with it is said before PyTorch takes seconds to load
     with needing_the_train_extra():
         from stereoweave.learn.training.loop import train as train_recipe

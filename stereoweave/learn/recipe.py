@@ -1,10 +1,12 @@
 """A recipe: everything that a training run depends on, in one TOML file."""
 
-import math
 import tomllib
 from dataclasses import MISSING, dataclass, fields
+from operator import gt
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
 from stereoweave.errors import FormatError
 from stereoweave.io.files import read_small, reading
@@ -14,32 +16,40 @@ _LONGEST = 10_000
 # In an error.
 _LONGEST_VALUE = 100
 # TOML's whole numbers; Python's may have any number of digits.
-_WHOLE_BITS = 64
-_POSITIVE = (
-    "steps",
-    "batch",
-    "learning_rate",
-    "pairs",
-    "validation_pairs",
-    "validate_every",
-    "averaged_steps",
-    "max_disparity_px",
-    "max_depth_m",
-)
-_AT_LEAST = {"micro_batch": 0, "exponent": 1, "alpha_z": 0, "alpha_p": 0, "distribution": 0}
-_SHARES = ("offset_share", "robust")
+_MOST = 2**63 - 1
 COLLAGE = "collage"
-Weights = tuple[tuple[str, float], ...]
-Folders = tuple[tuple[str, str], ...]
-TARGETS = ("disparity", "depth")
-_KINDS: dict[object, str] = {
-    int: f"a whole number of at most {_WHOLE_BITS} bits",
-    float: "a number",
-    str: "a text in quotes",
-    bool: "true or false",
-    Weights: "a table of sets and their weights, such as collage = 0.5",
-    Folders: 'a table of names and folders, such as rooms = "held_out/rooms"',
-}
+
+
+def _as_pairs(table: object) -> object:
+    """A TOML table as pairs of name and value, which is how recipes and checkpoints hold it."""
+    return tuple(table.items()) if isinstance(table, dict) else table
+
+
+# A description is what errors say was expected.
+Text = Annotated[str, Field(strict=True, description="a text in quotes")]
+Switch = Annotated[bool, Field(strict=True, description="true or false")]
+Target = Annotated[Literal["disparity", "depth"], Field(description="'disparity' or 'depth'")]
+Whole = Annotated[
+    int, Field(strict=True, ge=-_MOST, le=_MOST, description="a whole number of at most 64 bits")
+]
+CountOrZero = Annotated[Whole, Field(ge=0, description="a whole number of at least 0 and at most 64 bits")]
+Count = Annotated[Whole, Field(ge=1, description="a whole number of at least 1 and at most 64 bits")]
+Size = Annotated[tuple[Count, Count], Field(description="two whole numbers of at least 1")]
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[Number, Field(gt=0, description="a number above 0")]
+NonNegative = Annotated[Number, Field(ge=0, description="a number of at least 0")]
+AtLeastOne = Annotated[Number, Field(ge=1, description="a number of at least 1")]
+Share = Annotated[Number, Field(ge=0, le=1, description="a number from 0 to 1")]
+Weights = Annotated[
+    tuple[tuple[Text, Positive], ...],
+    BeforeValidator(_as_pairs),
+    Field(description="a table of sets and their weights above 0, such as collage = 0.5"),
+]
+Folders = Annotated[
+    tuple[tuple[Text, Text], ...],
+    BeforeValidator(_as_pairs),
+    Field(description='a table of names and folders, such as rooms = "held_out/rooms"'),
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,42 +95,44 @@ class Recipe:
         vgg16_weights: file of the VGG-16 behind the perceptual loss.
     """
 
-    name: str
-    model: str
-    seed: int = 0
-    start_from: str = ""
-    steps: int
-    batch: int
-    micro_batch: int = 0
-    learning_rate: float
-    warm_up_steps: int
-    cool_down_steps: int
-    weight_decay: float = 1e-4
-    averaged_steps: int = 500
-    dataset: str = COLLAGE
-    root: str = ""
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
+    name: Text
+    model: Text
+    seed: Whole = 0
+    start_from: Text = ""
+    steps: Count
+    batch: Count
+    micro_batch: CountOrZero = 0
+    learning_rate: Positive
+    warm_up_steps: Whole
+    cool_down_steps: Whole
+    weight_decay: NonNegative = 1e-4
+    averaged_steps: Count = 500
+    dataset: Text = COLLAGE
+    root: Text = ""
     mix: Weights = ()
-    split: str = "random"
-    pairs: int = 4000
-    fresh: bool = False
-    pair_size: tuple[int, int] = (320, 512)
-    crop_size: tuple[int, int] = (256, 384)
-    augment: bool = True
-    offset_share: float = 0.0
-    validation_pairs: int = 64
+    split: Text = "random"
+    pairs: Count = 4000
+    fresh: Switch = False
+    pair_size: Size = (320, 512)
+    crop_size: Size = (256, 384)
+    augment: Switch = True
+    offset_share: Share = 0.0
+    validation_pairs: Count = 64
     held_out: Folders = ()
-    validate_every: int = 500
-    loss: str = "weave"
-    target: str = "disparity"
-    max_disparity_px: float = 192.0
-    max_depth_m: float = 15.0
-    exponent: float = 1.0
-    fit_exponent: bool = False
-    alpha_z: float = 1.0
-    alpha_p: float = 0.0
-    distribution: float = 1.0
-    robust: float = 0.0
-    vgg16_weights: str = ""
+    validate_every: Count = 500
+    loss: Text = "weave"
+    target: Target = "disparity"
+    max_disparity_px: Positive = 192.0
+    max_depth_m: Positive = 15.0
+    exponent: AtLeastOne = 1.0
+    fit_exponent: Switch = False
+    alpha_z: NonNegative = 1.0
+    alpha_p: NonNegative = 0.0
+    distribution: NonNegative = 1.0
+    robust: Share = 0.0
+    vgg16_weights: Text = ""
 
     @property
     def micro_batches(self) -> int:
@@ -132,6 +144,9 @@ class Recipe:
         warm_up = (step + 1) / max(self.warm_up_steps, 1)
         cool_down = (self.steps - step) / max(self.cool_down_steps, 1)
         return self.learning_rate * min(warm_up, cool_down, 1.0)
+
+
+_RECIPES = TypeAdapter(Recipe)
 
 
 def read_recipe(path: Path) -> Recipe:
@@ -146,66 +161,42 @@ def read_recipe(path: Path) -> Recipe:
 
 def recipe_from(values: dict[str, Any], source: str) -> Recipe:
     """The recipe with these values; FormatError, which names their `source`, if they make none."""
-    known = {field.name: field.type for field in fields(Recipe)}
-    if unknown := sorted(values.keys() - known.keys()):
-        raise FormatError(f"{source}: unknown key {unknown[0]!r}; a recipe has {', '.join(known)}")
-    for name, value in values.items():
-        if not _fits(value, known[name]):
-            kind = _KINDS.get(known[name], "two whole numbers")
-            raise FormatError(f"{source}: {name} = {_written(value)}, expected {kind}")
-    needed = [field.name for field in fields(Recipe) if field.default is MISSING]
-    if missing := [name for name in needed if name not in values]:
-        raise FormatError(f"{source}: missing key {missing[0]!r}; a recipe needs {', '.join(needed)}")
-    settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-    # A table in TOML, pairs of set and weight in a checkpoint.
-    tables = {name: tuple(dict(settings.get(name, ())).items()) for name in ("mix", "held_out")}
-    recipe = Recipe(**{**settings, **tables})
-    _check_numbers(recipe, source)
-    _check_sizes(recipe, source)
-    _check_mix(recipe, source)
-    if recipe.target not in TARGETS:
-        raise FormatError(f"{source}: target = {recipe.target!r}, expected {' or '.join(TARGETS)}")
-    if (recipe.dataset == COLLAGE) == bool(recipe.root):
-        raise FormatError(
-            f"{source}: dataset = {recipe.dataset!r} with root = {recipe.root!r}, expected a root for a "
-            "dataset on disk and none for collage"
-        )
+    try:
+        recipe = _RECIPES.validate_python(values)
+    except ValidationError as error:
+        raise FormatError(f"{source}: {_first_mistake(error, values)}") from error
+    if contradiction := _contradiction(recipe):
+        raise FormatError(f"{source}: {contradiction}")
     return recipe
 
 
-def _check_numbers(recipe: Recipe, source: str) -> None:
-    for name in _POSITIVE:
-        if not 0 < getattr(recipe, name) < math.inf:
-            raise FormatError(f"{source}: {name} = {getattr(recipe, name)}, expected more than 0")
-    for name, least in _AT_LEAST.items():
-        if not least <= getattr(recipe, name) < math.inf:
-            raise FormatError(f"{source}: {name} = {getattr(recipe, name)}, expected at least {least}")
-    for name in _SHARES:
-        if not 0 <= getattr(recipe, name) <= 1:
-            raise FormatError(f"{source}: {name} = {getattr(recipe, name)}, expected 0 to 1")
+def _first_mistake(error: ValidationError, values: dict[str, Any]) -> str:
+    known: dict[str, Any] = {field.name: field.type for field in fields(Recipe)}
+    if unknown := sorted(values.keys() - known.keys()):
+        return f"unknown key {unknown[0]!r}; a recipe has {', '.join(known)}"
+    first = min(error.errors(), key=lambda mistake: mistake["type"] == "missing")
+    name = str(first["loc"][0])
+    if name not in values:
+        needed = [field.name for field in fields(Recipe) if field.default is MISSING]
+        return f"missing key {name!r}; a recipe needs {', '.join(needed)}"
+    expected = known[name].__metadata__[-1].description
+    return f"{name}: expected {expected}, found {_written(values[name])}"
+
+
+def _contradiction(recipe: Recipe) -> str | None:
+    """The first two settings that exclude each other, in one line."""
+    collage = recipe.dataset == COLLAGE
     if recipe.batch % (recipe.micro_batch or recipe.batch):
-        raise FormatError(
-            f"{source}: micro_batch = {recipe.micro_batch}, expected a divisor of batch = {recipe.batch}"
-        )
-
-
-def _check_sizes(recipe: Recipe, source: str) -> None:
-    limits = recipe.pair_size if recipe.dataset == COLLAGE else (math.inf, math.inf)
-    if not all(0 < crop <= side for crop, side in zip(recipe.crop_size, limits, strict=True)):
-        raise FormatError(
-            f"{source}: crop_size = {list(recipe.crop_size)}, expected more than 0 and "
-            f"at most pair_size = {list(recipe.pair_size)}"
-        )
-
-
-def _check_mix(recipe: Recipe, source: str) -> None:
-    for name, weight in recipe.mix:
-        if not 0 < weight < math.inf:
-            raise FormatError(f"{source}: mix: weight {weight} of {name!r}, expected more than 0")
-    if recipe.mix and recipe.dataset != COLLAGE:
-        raise FormatError(
-            f"{source}: mix with dataset = {recipe.dataset!r}, expected {COLLAGE!r}, which a mix is scored on"
-        )
+        return f"micro_batch: expected a divisor of batch = {recipe.batch}, found {recipe.micro_batch}"
+    if collage and any(map(gt, recipe.crop_size, recipe.pair_size)):
+        limit, found = list(recipe.pair_size), list(recipe.crop_size)
+        return f"crop_size: expected at most pair_size = {limit}, found {found}"
+    if recipe.mix and not collage:
+        return f"mix: expected dataset = {COLLAGE!r}, which a mix is scored on, found {recipe.dataset!r}"
+    if collage == bool(recipe.root):
+        expected = "none for collage" if collage else "the dataset's folder"
+        return f"root: expected {expected}, found {recipe.root!r} with dataset = {recipe.dataset!r}"
+    return None
 
 
 def _written(value: object) -> str:
@@ -215,22 +206,3 @@ def _written(value: object) -> str:
     except (ValueError, RecursionError):  # of a number of more than 4,300 digits, of nested arrays
         return "a value too long to be written"
     return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}..."
-
-
-def _fits(value: object, expected: Any) -> bool:
-    if type(value) is int:
-        return expected in (int, float) and value.bit_length() < _WHOLE_BITS
-    if expected is float:
-        return isinstance(value, float)
-    if expected in (int, str, bool):
-        return type(value) is expected
-    if expected in (Weights, Folders):
-        pairs = list(value.items()) if isinstance(value, dict) else value
-        of = float if expected is Weights else str
-        return isinstance(pairs, list | tuple) and all(_is_named(pair, of) for pair in pairs)
-    return isinstance(value, list | tuple) and len(value) == 2 and all(_fits(v, int) for v in value)
-
-
-def _is_named(pair: object, kind: type) -> bool:
-    """Whether it is a name and a value of that kind."""
-    return isinstance(pair, list | tuple) and len(pair) == 2 and _fits(pair[0], str) and _fits(pair[1], kind)

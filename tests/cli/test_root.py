@@ -449,7 +449,10 @@ def test_bench_networks_takes_a_checkpoint_and_pairs_from_where_it_is_told(netwo
         ("bench speed none.toml -o rows.csv", ["none.toml", "expected a recipe"]),
         ("bench speed words.toml -o rows.csv", ["words.toml", "expected a recipe"]),
         ("bench paper none.toml -o runs --report report", ["none.toml", "expected a recipe"]),
-        ("bench paper low.toml -o runs --report report", ["low.toml", "exponent = 0.5", "at least 1"]),
+        (
+            "bench paper low.toml -o runs --report report",
+            ["low.toml", "exponent: expected a number of at least 1", "found 0.5"],
+        ),
         (f"bench paper {RECIPE} -o runs --report report", ["small", "expected 'fast_depth'"]),
         (f"bench paper {RECIPE} -o runs", ["--report"]),
         (f"bench paper {RECIPE} -o runs --report report --seeds 0", ["--seeds"]),

@@ -18,6 +18,8 @@ NEEDED = {
     "warm_up_steps": 4,
     "cool_down_steps": 2,
 }
+COUNT = "expected a whole number of at least 1 and at most 64 bits"
+TABLE = "expected a table of sets and their weights above 0"
 
 
 @pytest.mark.parametrize("file", RECIPES, ids=lambda file: file.name)
@@ -97,7 +99,10 @@ def test_the_learning_rate_without_slopes_is_constant():
     [
         ("a = " + "[" * 3000, "maximum recursion depth"),
         (f"steps = {'9' * 5000}", "integer string conversion"),
-        (f"steps = 0x{'f' * 5000}", "steps = a value too long to be written, expected a whole number"),
+        (
+            f"steps = 0x{'f' * 5000}",
+            "steps: expected a whole number .*, found a value too long to be written",
+        ),
         ("a" + ".a" * 50_000 + " = 1", "more than 10000 characters"),
     ],
 )
@@ -112,60 +117,63 @@ def test_a_recipe_made_to_do_harm_is_refused_at_once(tmp_path, text, found):
     ("changes", "message"),
     [
         ({"stepz": 3}, "unknown key 'stepz'; a recipe has name, model, seed, "),
-        ({"steps": "many"}, "steps = 'many', expected a whole number"),
-        ({"steps": 1.5}, "steps = 1.5, expected a whole number"),
-        ({"steps": True}, "steps = True, expected a whole number"),
-        ({"steps": 2**63}, "steps = 9223372036854775808, expected a whole number of at most 64 bits"),
-        ({"learning_rate": 10**400}, f"learning_rate = 1{'0' * 99}..., expected a number"),
-        ({"learning_rate": "high"}, "learning_rate = 'high', expected a number"),
-        ({"learning_rate": False}, "learning_rate = False, expected a number"),
-        ({"name": 3}, "name = 3, expected a text in quotes"),
-        ({"crop_size": 256}, "crop_size = 256, expected two whole numbers"),
-        ({"crop_size": [256]}, r"crop_size = [256], expected two whole numbers"),
-        ({"crop_size": [256, 1.5]}, r"crop_size = [256, 1.5], expected two whole numbers"),
+        ({"steps": "many"}, f"steps: {COUNT}, found 'many'"),
+        ({"steps": 1.5}, f"steps: {COUNT}, found 1.5"),
+        ({"steps": True}, f"steps: {COUNT}, found True"),
+        ({"steps": 2**63}, f"steps: {COUNT}, found 9223372036854775808"),
+        ({"learning_rate": 10**400}, f"learning_rate: expected a number above 0, found 1{'0' * 99}..."),
+        ({"learning_rate": "high"}, "learning_rate: expected a number above 0, found 'high'"),
+        ({"learning_rate": False}, "learning_rate: expected a number above 0, found False"),
+        ({"name": 3}, "name: expected a text in quotes, found 3"),
+        ({"crop_size": 256}, "crop_size: expected two whole numbers of at least 1, found 256"),
+        ({"crop_size": [256]}, "crop_size: expected two whole numbers of at least 1, found [256]"),
+        ({"crop_size": [256, 1.5]}, "crop_size: expected two whole numbers of at least 1, found [256, 1.5]"),
+        ({"crop_size": [0, 64]}, "crop_size: expected two whole numbers of at least 1, found [0, 64]"),
+        ({"crop_size": [64, 528]}, "crop_size: expected at most pair_size = [320, 512], found [64, 528]"),
+        ({"batch": 0}, f"batch: {COUNT}, found 0"),
+        ({"steps": -1}, f"steps: {COUNT}, found -1"),
+        ({"pairs": 0}, f"pairs: {COUNT}, found 0"),
+        ({"validation_pairs": 0}, f"validation_pairs: {COUNT}, found 0"),
+        ({"validate_every": 0}, f"validate_every: {COUNT}, found 0"),
+        ({"averaged_steps": 0}, f"averaged_steps: {COUNT}, found 0"),
+        ({"seed": 2**63}, "seed: expected a whole number of at most 64 bits, found 9223372036854775808"),
         (
-            {"crop_size": [0, 64]},
-            "crop_size = [0, 64], expected more than 0 and at most pair_size = [320, 512]",
+            {"micro_batch": -1},
+            "micro_batch: expected a whole number of at least 0 and at most 64 bits, found",
         ),
-        ({"crop_size": [64, 528]}, "crop_size = [64, 528], expected more than 0 and at most pair_size = ["),
-        ({"batch": 0}, "batch = 0, expected more than 0"),
-        ({"steps": -1}, "steps = -1, expected more than 0"),
-        ({"pairs": 0}, "pairs = 0, expected more than 0"),
-        ({"validation_pairs": 0}, "validation_pairs = 0, expected more than 0"),
-        ({"validate_every": 0}, "validate_every = 0, expected more than 0"),
-        ({"averaged_steps": 0}, "averaged_steps = 0, expected more than 0"),
-        ({"max_disparity_px": 0.0}, "max_disparity_px = 0.0, expected more than 0"),
-        ({"max_disparity_px": float("inf")}, "max_disparity_px = inf, expected more than 0"),
-        ({"max_depth_m": 0.0}, "max_depth_m = 0.0, expected more than 0"),
-        ({"fit_exponent": "yes"}, "fit_exponent = 'yes', expected true or false"),
-        ({"loss": 2}, "loss = 2, expected a text in quotes"),
-        ({"exponent": float("nan")}, "exponent = nan, expected at least 1"),
-        ({"alpha_z": float("inf")}, "alpha_z = inf, expected at least 0"),
-        ({"augment": 1}, "augment = 1, expected true or false"),
-        ({"exponent": 0.5}, "exponent = 0.5, expected at least 1"),
-        ({"exponent": float("inf")}, "exponent = inf, expected at least 1"),
-        ({"alpha_z": -1.0}, "alpha_z = -1.0, expected at least 0"),
-        ({"alpha_p": -0.1}, "alpha_p = -0.1, expected at least 0"),
-        ({"target": "height"}, "target = 'height', expected disparity or depth"),
-        ({"dataset": "sintel"}, "dataset = 'sintel' with root = '', expected a root for a dataset on disk"),
-        ({"root": "sintel"}, "dataset = 'collage' with root = 'sintel', expected a root for a dataset on"),
-        ({"mix": "collage"}, "mix = 'collage', expected a table of sets and their weights, such as collage"),
+        ({"max_disparity_px": 0.0}, "max_disparity_px: expected a number above 0, found 0.0"),
+        ({"max_disparity_px": float("inf")}, "max_disparity_px: expected a number above 0, found inf"),
+        ({"max_depth_m": 0.0}, "max_depth_m: expected a number above 0, found 0.0"),
+        ({"fit_exponent": "yes"}, "fit_exponent: expected true or false, found 'yes'"),
+        ({"loss": 2}, "loss: expected a text in quotes, found 2"),
+        ({"exponent": float("nan")}, "exponent: expected a number of at least 1, found nan"),
+        ({"alpha_z": float("inf")}, "alpha_z: expected a number of at least 0, found inf"),
+        ({"augment": 1}, "augment: expected true or false, found 1"),
+        ({"exponent": 0.5}, "exponent: expected a number of at least 1, found 0.5"),
+        ({"exponent": float("inf")}, "exponent: expected a number of at least 1, found inf"),
+        ({"alpha_z": -1.0}, "alpha_z: expected a number of at least 0, found -1.0"),
+        ({"alpha_p": -0.1}, "alpha_p: expected a number of at least 0, found -0.1"),
+        ({"weight_decay": -0.1}, "weight_decay: expected a number of at least 0, found -0.1"),
+        ({"target": "height"}, "target: expected 'disparity' or 'depth', found 'height'"),
+        ({"dataset": "sintel"}, "root: expected the dataset's folder, found '' with dataset = 'sintel'"),
+        ({"root": "sintel"}, "root: expected none for collage, found 'sintel' with dataset = 'collage'"),
+        ({"mix": "collage"}, f"mix: {TABLE}, such as collage = 0.5, found 'collage'"),
+        ({"mix": {"collage": "half"}}, f"mix: {TABLE}, such as collage = 0.5, found {{'collage': 'half'}}"),
+        ({"mix": [["collage", 1, 2]]}, f"mix: {TABLE}, such as collage = 0.5, found [['collage', 1, 2]]"),
+        ({"mix": {"collage": 1.0, "rooms": 0}}, f"mix: {TABLE}, such as collage = 0.5, found {{'collage': "),
         (
-            {"mix": {"collage": "half"}},
-            "mix = {'collage': 'half'}, expected a table of sets and their weights",
+            {"mix": {"collage": float("nan")}},
+            f"mix: {TABLE}, such as collage = 0.5, found {{'collage': nan}}",
         ),
-        ({"mix": [["collage", 1, 2]]}, "mix = [['collage', 1, 2]], expected a table of sets and their weig"),
-        ({"mix": {"collage": 1.0, "rooms": 0}}, "mix: weight 0 of 'rooms', expected more than 0"),
-        ({"mix": {"collage": float("nan")}}, "mix: weight nan of 'collage', expected more than 0"),
         (
             {"mix": {"collage": 1.0}, "dataset": "sintel", "root": "sintel"},
-            "mix with dataset = 'sintel', expected 'collage', which a mix is scored on",
+            "mix: expected dataset = 'collage', which a mix is scored on, found 'sintel'",
         ),
-        ({"learning_rate": float("nan")}, "learning_rate = nan, expected more than 0"),
-        ({"offset_share": 1.5}, "offset_share = 1.5, expected 0 to 1"),
-        ({"robust": -0.1}, "robust = -0.1, expected 0 to 1"),
-        ({"fresh": 1}, "fresh = 1, expected true or false"),
-        ({"held_out": {"rooms": 1}}, "held_out = {'rooms': 1}, expected a table of names and folders"),
+        ({"learning_rate": float("nan")}, "learning_rate: expected a number above 0, found nan"),
+        ({"offset_share": 1.5}, "offset_share: expected a number from 0 to 1, found 1.5"),
+        ({"robust": -0.1}, "robust: expected a number from 0 to 1, found -0.1"),
+        ({"fresh": 1}, "fresh: expected true or false, found 1"),
+        ({"held_out": {"rooms": 1}}, "held_out: expected a table of names and folders, such as rooms"),
     ],
 )
 def test_a_wrong_key_or_value_is_named_in_one_line(changes, message):
@@ -220,8 +228,8 @@ def test_a_step_has_one_micro_batch_unless_the_recipe_says_otherwise():
 
 
 @pytest.mark.parametrize(
-    ("micro_batch", "expected"), [(3, "a divisor of batch = 4"), (8, "a divisor"), (-1, "at least 0")]
+    ("micro_batch", "expected"), [(3, "a divisor of batch = 4"), (8, "a divisor"), (-1, "a .* at least 0")]
 )
 def test_micro_batches_that_a_batch_cannot_be_parted_into_are_refused(micro_batch, expected):
-    with pytest.raises(FormatError, match=f"here: micro_batch = {micro_batch}, expected {expected}"):
+    with pytest.raises(FormatError, match=f"here: micro_batch: expected {expected}.*, found {micro_batch}"):
         recipe_from(NEEDED | {"micro_batch": micro_batch}, "here")
