@@ -8,15 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from PIL import Image
+from PIL.ExifTags import IFD, Base
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from stereoweave.errors import StereoweaveError
 
 # Tags by their numbers, those of EXIF and those of CIPA DC-007, the Multi-Picture Format.
 Tags = Mapping[int, Any]
-_MODEL, _ORIENTATION, _EXIF = 0x0110, 0x0112, 0x8769
-_FOCAL_MM, _FOCAL_35_MM, _WIDTH_PX = 0x920A, 0xA405, 0xA002
-_FOCAL_PLANE_X, _FOCAL_PLANE_UNIT = 0xA20E, 0xA210
 _VIEWPOINT, _BASELINE = 0xB101, 0xB206
 _UNKNOWN = 0xFFFFFFFF
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
@@ -64,7 +62,7 @@ def read_tags(picture: Image.Image) -> Tags:
 
 def orientation(tags: Tags) -> int | None:
     """EXIF's 1 to 8 for how the picture lies, 1 is upright; None where it does not say."""
-    value = tags.get(_ORIENTATION)
+    value = tags.get(Base.Orientation)
     return value if value in (1, *_TURNS) else None
 
 
@@ -91,7 +89,7 @@ def lens_of(tags: Tags, width_px: int, height_px: int) -> Lens | None:
 def _exif_tags(picture: Image.Image) -> dict[int, Any]:
     try:
         tags = picture.getexif()
-        return dict(tags) | dict(tags.get_ifd(_EXIF))
+        return dict(tags) | dict(tags.get_ifd(IFD.Exif))
     except Exception:  # whatever Pillow raises of damaged ones, as in `picture_files`
         return {}
 
@@ -124,21 +122,21 @@ def _focal_px(tags: Tags, width_px: int, height_px: int) -> float | None:
 
 
 def _focal_on_film_px(tags: Tags, diagonal_px: float) -> float | None:
-    of_film_mm = _positive(tags.get(_FOCAL_35_MM))
+    of_film_mm = _positive(tags.get(Base.FocalLengthIn35mmFilm))
     return of_film_mm / _FILM_DIAGONAL_MM * diagonal_px if of_film_mm else None
 
 
 def _focal_on_sensor_px(tags: Tags, width_px: int) -> float | None:
-    focal_mm, density = _positive(tags.get(_FOCAL_MM)), _positive(tags.get(_FOCAL_PLANE_X))
-    taken_px = _positive(tags.get(_WIDTH_PX))
-    unit_mm = _UNIT_MM.get(tags.get(_FOCAL_PLANE_UNIT, 2))
+    focal_mm, density = _positive(tags.get(Base.FocalLength)), _positive(tags.get(Base.FocalPlaneXResolution))
+    taken_px = _positive(tags.get(Base.ExifImageWidth))
+    unit_mm = _UNIT_MM.get(tags.get(Base.FocalPlaneResolutionUnit, 2))
     if focal_mm and density and taken_px and unit_mm:
         return focal_mm * density / unit_mm * width_px / taken_px
     return None
 
 
 def _baseline_m(tags: Tags) -> float | None:
-    model = str(tags.get(_MODEL, "")).strip("\0 ")
+    model = str(tags.get(Base.Model, "")).strip("\0 ")
     return _positive(tags.get(_BASELINE)) or _BASELINES_M.get(model)
 
 
