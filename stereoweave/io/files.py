@@ -148,10 +148,8 @@ def _pfm_header(path: str | Path, content: bytes) -> tuple[tuple[int, int], str,
 
 def write_pfm(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
     """Writes a PFM file of one channel, float32 and little-endian; NaN and infinity stay what they are."""
-    height_px, width_px = values.shape
     with replacing(path) as temporary:
-        header = f"Pf\n{width_px} {height_px}\n-1.0\n".encode()
-        temporary.write_bytes(header + values[::-1].astype("<f4").tobytes())
+        Image.fromarray(values.astype(np.float32)).save(temporary, "PPM")
 
 
 def write_float_tiff(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
