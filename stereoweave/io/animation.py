@@ -1,4 +1,4 @@
-"""Pictures one after another, as a file that moves: MP4, GIF or animated WebP."""
+"""Writer of animations: MP4, GIF and animated WebP."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -17,18 +17,19 @@ Frames = Iterator[UInt8[np.ndarray, "h w 3"]]
 
 
 def write_animation(path: str | Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], frame_ms: int) -> None:
-    """Writes frames in the format that the name's ending asks for: .mp4, .gif or .webp.
+    """Write frames in the format of the file's ending: .mp4, .gif or .webp.
 
-    A GIF and a WebP begin anew for ever, and all their frames are held in memory. An MP4 takes one frame at a
-    time, and plays once; its sides are even: the last column or row of an odd number is repeated.
+    GIF and WebP repeat forever and keep all frames in memory. An MP4 plays once and keeps one frame at a
+    time; its sides are made even by repeating the last column or row.
 
     Args:
-        path: The file; it is whole or not there.
-        frames: uint8 RGB [H, W, 3], one or more, of one size.
-        frame_ms: How long each is shown. A GIF counts in steps of 10 ms.
+        path: The file, written atomically.
+        frames: uint8 RGB [H, W, 3], at least one, all of one size.
+        frame_ms: Duration of a frame. GIF rounds it to 10 ms.
 
     Raises:
-        StereoweaveError: Another ending, no frame, sizes that differ, no PyAV, or no room on the disk.
+        StereoweaveError: if the ending is another, there is no frame, sizes differ, PyAV is missing, or the
+            disk is full.
     """
     write = _KINDS[animation_ending(path)]
     alike = _of_one_size(frames)
@@ -37,10 +38,10 @@ def write_animation(path: str | Path, frames: Iterable[UInt8[np.ndarray, "h w 3"
 
 
 def animation_ending(path: str | Path) -> str:
-    """The ending of `path` in small letters.
+    """Lower-case ending of an animation's path.
 
     Raises:
-        StereoweaveError: It stands for no animation, or for an MP4 where there is no PyAV.
+        StereoweaveError: if it is not an animation's, or it is .mp4 and PyAV is missing.
     """
     ending = Path(path).suffix.lower()
     if ending not in _KINDS:
@@ -49,19 +50,19 @@ def animation_ending(path: str | Path) -> str:
         )
     if ending == ".mp4":
         with needing_the_video_extra("an MP4 file"):
-            import av  # noqa: F401 - said before frames are made, which takes longer
+            import av  # noqa: F401 - fail before the frames are rendered, which takes longer
     return ending
 
 
 @contextmanager
 def needing_the_video_extra(what: str) -> Iterator[None]:
-    """Turns the lack of PyAV into one line that names the extra."""
+    """Turn a missing PyAV into an error that names the extra."""
     with needing_extra("video", f"{what} needs PyAV"):
         yield
 
 
 def _of_one_size(frames: Iterable[UInt8[np.ndarray, "h w 3"]]) -> Frames:
-    """The frames, the first of them made at once, so that its errors come before a file is begun."""
+    """Check that frames have one size; render the first now, so that it fails before a file is created."""
     coming = iter(frames)
     first = next(coming, None)
     if first is None:
@@ -87,8 +88,8 @@ def _write_mp4(path: Path, frames: Frames, frame_ms: int) -> None:
         stream = film.add_stream("libx264", rate=Fraction(1000, frame_ms), options={"crf": "18"})
         context = stream.codec_context
         context.height, context.width = first.shape[:2]
-        context.pix_fmt = "yuv420p"  # the one that every player takes
-        # Said in the file, because players guess from the size else, and shift the colours.
+        context.pix_fmt = "yuv420p"  # the only format that every player supports
+        # Stored in the file: players would guess from the size instead, and shift the colours.
         context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
         context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
         for frame in chain([first], map(_with_even_sides, frames)):
@@ -106,10 +107,10 @@ def _with_even_sides(frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2
 
 
 def _write_gif(path: Path, frames: Frames, frame_ms: int) -> None:
-    """One palette, the first frame's, for all: they show one scene, whose colours would flicker with many."""
+    """Write a GIF with the first frame's palette throughout: colours would flicker with one per frame."""
     pictures = (Image.fromarray(frame) for frame in frames)
     first = next(pictures)
-    # The nearest of Pillow's to the example's colours, and quickest: 39.1 dB, MEDIANCUT 35.2, both dithered.
+    # Pillow's most accurate and fastest: 39.1 dB on the example, MEDIANCUT 35.2, both dithered.
     palette = first.quantize(256, method=Image.Quantize.FASTOCTREE)
     _save(path, "GIF", (picture.quantize(palette=palette) for picture in chain([first], pictures)), frame_ms)
 

@@ -1,4 +1,4 @@
-"""Pictures as other libraries hold them, NumPy arrays, PIL images, torch tensors, become uint8 RGB."""
+"""Conversion of NumPy arrays, PIL images and PyTorch tensors to uint8 RGB."""
 
 import numpy as np
 from jaxtyping import Shaped, UInt8
@@ -8,33 +8,32 @@ from stereoweave.arguments import is_plain_array
 from stereoweave.errors import StereoweaveError
 
 _CHANNELS = (1, 3, 4)
-# As a share of white: it is less than half a level, so that it rounds to 0 or 255.
+# Tolerance beyond 0..1: less than half a level, so that it rounds to 0 or 255.
 _FORGIVEN = 0.4 / 255
-# What Pillow cannot turn into RGB in one step.
+# Modes that Pillow cannot convert to RGB in one step.
 _BETWEEN = {"La": "LA", "RGBa": "RGBA"}
 
 
 def as_rgb(image: object, name: str = "image") -> UInt8[np.ndarray, "h w 3"]:
-    """The picture as uint8 RGB [H, W, 3], contiguous; an array that is one already is given back as it is.
+    """Convert an image to contiguous uint8 RGB [H, W, 3]; an array that is one already is returned itself.
 
-    Grey is repeated, alpha dropped, 16 bits become the upper 8; a float is a share of white, 0 to 1, and is
-    rounded. The axis of 1, 3 or 4 channels is the last one, or, where that has another length, the first. So
-    [3, W, 3] counts as 3 rows of W pixels. A leading axis of length 1, a batch of one picture, is dropped.
+    Grey is repeated, alpha dropped, 16 bits are reduced to the upper 8, and floats in 0..1 are scaled and
+    rounded. Channels (1, 3 or 4) are the last axis if its length fits, else the first; so [3, W, 3] is 3 rows
+    of W pixels. A leading axis of length 1, a batch of one image, is dropped.
 
-    The order of the channels cannot be told from an array: what OpenCV reads is BGR, and has to be turned by
-    `image[..., ::-1]` first. A PIL image is taken as its pixels lie: `PIL.ImageOps.exif_transpose` turns it
-    upright.
+    Channels are taken as RGB: reverse images of OpenCV, which are BGR, with `image[..., ::-1]` first. The
+    EXIF orientation of a PIL image is ignored: apply `PIL.ImageOps.exif_transpose` first.
 
     Args:
-        image: A NumPy array, a PIL image of any mode that has colours, or a torch tensor on any device.
-        name: What an error calls the picture.
+        image: NumPy array, PIL image of any colour mode, or PyTorch tensor on any device.
+        name: Name of the image in errors.
 
     Raises:
-        StereoweaveError: Another kind of thing, shape or dtype, or a float outside of 0..1.
+        StereoweaveError: if type, shape or dtype is unsupported, or a float is outside of 0..1.
     """
     if isinstance(image, Image.Image):
         image = _of_pil(image)
-    elif hasattr(image, "detach"):  # a tensor; PyTorch itself is not needed to ask it for its numbers
+    elif hasattr(image, "detach"):  # a tensor, detected without importing PyTorch
         tensor = image.detach().cpu()
         # NumPy has no bfloat16.
         image = (tensor.float() if tensor.is_floating_point() else tensor).numpy()
@@ -57,11 +56,11 @@ def as_rgb(image: object, name: str = "image") -> UInt8[np.ndarray, "h w 3"]:
 def _of_pil(picture: Image.Image) -> Shaped[np.ndarray, "h w *channels"]:
     if not picture.mode.startswith(("I", "F")):
         direct = picture.convert(_BETWEEN[picture.mode]) if picture.mode in _BETWEEN else picture
-        # A copy: Pillow lends its pixels read-only, for which Numba compiles anew and PyTorch warns.
+        # A copy: Pillow's read-only pixels would make Numba compile again and PyTorch warn.
         return np.array(direct.convert("RGB"))
     values = np.asarray(picture)
     if picture.mode == "I" and values.size and values.min() >= 0 and values.max() <= 65535:
-        # Mode I has 32 bits, and what files hold in it 16 or 8, as `io.read_image` takes it.
+        # Mode I has 32 bits; files store 16 or 8 in it. `io.read_image` converts it the same way.
         return values.astype(np.uint16 if values.max() > 255 else np.uint8)
     return values
 
@@ -76,7 +75,7 @@ def _eight_bits(values: Shaped[np.ndarray, "..."], name: str) -> UInt8[np.ndarra
         raise StereoweaveError(
             f"{name}: expected uint8, uint16 or a float in 0..1, got {got}; convert 0..255 by astype('uint8')"
         )
-    # Not the opposite comparison, which would let NaN pass; and before the product, which may overflow.
+    # The opposite comparison would accept NaN; the product below may overflow, so it comes later.
     if not ((values >= -_FORGIVEN) & (values <= 1 + _FORGIVEN)).all():
         raise StereoweaveError(
             f"{name}: expected floats in 0..1, got {got} of {values.min():g} to {values.max():g}; "
@@ -94,6 +93,6 @@ def _channels_last(levels: UInt8[np.ndarray, "..."], name: str) -> UInt8[np.ndar
     if picture.ndim == 3 and picture.shape[0] in _CHANNELS:
         return np.moveaxis(picture, 0, 2)
     raise StereoweaveError(
-        f"{name}: expected one picture, [H, W], [H, W, 3], [H, W, 4] or [3, H, W], got "
-        f"{list(levels.shape)}; hand in one picture at a time, channels last"
+        f"{name}: expected one image, [H, W], [H, W, 3], [H, W, 4] or [3, H, W], got "
+        f"{list(levels.shape)}; pass one image at a time, channels last"
     )

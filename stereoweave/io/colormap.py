@@ -1,4 +1,4 @@
-"""Disparity and confidence as pictures: one colouring for the preview, the report and its legend."""
+"""Colour maps of disparity and confidence for the preview, the report and its legend."""
 
 import cv2
 import numpy as np
@@ -9,9 +9,9 @@ OCCLUDED_RGB = (217, 72, 15)
 
 
 def colour_range_px(disparity_px: Float[np.ndarray, "h w"]) -> tuple[float, float]:
-    """The disparities (px) that get the first and the last colour.
+    """Disparities (px) of the first and the last colour.
 
-    Half a percent at either end is left out, so that a few stray pixels do not take the contrast of all.
+    Half a percent at either end is ignored, so that a few outliers do not reduce the contrast.
     """
     low_px, high_px = np.percentile(disparity_px, [_OUTLIERS_PERCENT, 100 - _OUTLIERS_PERCENT])
     return float(low_px), max(float(high_px), float(low_px) + 1.0)
@@ -20,7 +20,7 @@ def colour_range_px(disparity_px: Float[np.ndarray, "h w"]) -> tuple[float, floa
 def colour_disparity(
     disparity_px: Float[np.ndarray, "h w"], range_px: tuple[float, float]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """RGB picture [H, W, 3] of a disparity: blue is the low end of `range_px` (far), red the high one."""
+    """Disparity as an RGB image [H, W, 3]: blue is the low end of `range_px` (far), red the high end."""
     low_px, high_px = range_px
     share = (disparity_px - low_px) / (high_px - low_px)
     levels = np.round(np.clip(share, 0, 1) * 255).astype(np.uint8)
@@ -28,25 +28,25 @@ def colour_disparity(
 
 
 def grey_confidence(confidence: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
-    """Grey picture [H, W] of a confidence in 0..1: black is 0, white is 1."""
+    """Confidence in 0..1 as a grey image [H, W]: black is 0, white is 1."""
     return np.round(confidence * 255).astype(np.uint8)
 
 
 def colour_confidence(
     confidence: Float[np.ndarray, "h w"], occluded: Bool[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """RGB picture [H, W, 3] of a confidence in grey; orange is what the left camera alone sees."""
+    """Confidence as an RGB image [H, W, 3] in grey, with occluded pixels in orange."""
     picture = np.repeat(grey_confidence(confidence)[..., None], 3, axis=2)
     picture[occluded] = OCCLUDED_RGB
     return picture
 
 
 def legend_colours(count: int) -> list[str]:
-    """`count` CSS colours from the low end of the disparity colours to the high one, evenly spaced."""
+    """`count` evenly spaced CSS colours, from the low end of the disparity colours to the high end."""
     ramp = colour_disparity(np.linspace(0, 1, count, dtype=np.float32)[None], (0.0, 1.0))[0]
     return [css_colour(tuple(rgb)) for rgb in ramp.tolist()]
 
 
 def css_colour(rgb: tuple[int, ...]) -> str:
-    """The colour in CSS's words."""
+    """CSS notation of a colour."""
     return "rgb({},{},{})".format(*rgb)

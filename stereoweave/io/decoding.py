@@ -1,7 +1,7 @@
-"""The one gate for files of pictures: each is refused by its name, or decoded, with its tags.
+"""The only decoder of pictures: decodes a file with its metadata, or refuses it by name.
 
-Every way in passes here: commands, Python, video, boards, benchmarks, datasets, the page and the service.
-They all read the same kinds, with the same limits, colours, orientation and errors.
+Commands, Python, video, boards, benchmarks, datasets, the page and the service all use it, so that they share
+formats, limits, colours, orientation and errors.
 """
 
 import io
@@ -21,15 +21,15 @@ from stereoweave.errors import FormatError, reason
 from stereoweave.io import exif
 from stereoweave.stereo import LONGEST_SIDE_PX
 
-# 50 megapixels a view are supported, and cameras of that class have up to 64. Known from the file's head,
-# before memory is spent.
+# 50 megapixels per view are supported; cameras of that class have up to 64. Checked on the file's header,
+# before memory is allocated.
 MOST_PIXELS = 65_000_000
 A_PICTURE = "a picture (PNG, JPEG, TIFF or the like)"
-# The usual endings of what is read, to find pictures in a folder by; what a file is, its content decides.
+# File name endings for finding pictures in a folder; the format of a file is detected from its content.
 ENDINGS = frozenset(
     {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".jp2", ".pgm", ".ppm", ".avif"}
 )
-# Not all that Pillow opens: PostScript, for one, would run as a program. Of JPEG are MPO and JPS.
+# Not every format of Pillow's: PostScript, for example, would run as a program. JPEG includes MPO and JPS.
 _KINDS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "AVIF", "JPEG2000")
 _RAW_ENDINGS = {
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".kdc", ".mrw", ".nef", ".nrw", ".orf"),
@@ -40,32 +40,32 @@ _HEIF_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b
 _AVIF_BRANDS = {b"avif", b"avis"}
 _MP_ENTRIES, _DISPARITY = 0xB002, "Multi-Frame Image: (Disparity)"
 _LONGEST_WORDS = 100
-# How the colours of a mode are stored, where a profile can say what they mean.
+# Colour space of a mode to which an ICC profile may apply.
 _PROFILED = {"RGB": "RGB", "RGBA": "RGB", "P": "RGB", "L": "L", "LA": "L", "CMYK": "CMYK"}
 
-# Pillow also logs what it then raises, and Python writes what nobody handles to stderr.
+# Pillow logs errors before raising them, and Python writes unhandled log records to stderr.
 logging.getLogger("PIL").addHandler(logging.NullHandler())
 
 
 class Photograph(NamedTuple):
-    """A decoded picture as it lies in its file, in RGB and sRGB; its tags; what was done to its colours."""
+    """A decoded picture in sRGB, not yet upright, with its metadata tags and a note on its colours."""
 
     image: Image.Image
     tags: exif.Tags
     note: str | None
 
     def upright(self, lies: int | None) -> UInt8[np.ndarray, "h w 3"]:
-        """Its pixels, turned upright if it lies so."""
-        # A copy: Pillow lends its pixels read-only, for which Numba compiles anew and PyTorch warns.
+        """Pixels turned upright from an EXIF orientation, uint8 RGB [H, W, 3]."""
+        # A copy: Pillow's read-only pixels would make Numba compile again and PyTorch warn.
         return np.array(exif.turned(self.image, lies))
 
 
 @contextmanager
 def opening(path: Path, *, views: int = 1, expected: str = A_PICTURE) -> Iterator[Image.Image]:
-    """An opened picture of one or two views, not yet decoded, whose size and kind can be worked with.
+    """Open a picture of one or two views, of a supported format and size, without decoding it.
 
     Raises:
-        FormatError: It cannot; the other functions that take it raise one where its content is damaged.
+        FormatError: if format or size are unsupported; decoding raises one if the content is damaged.
     """
     check_regular(path, expected)
     with _decoding(path, expected), path.open("rb") as file:
@@ -80,15 +80,15 @@ def opening(path: Path, *, views: int = 1, expected: str = A_PICTURE) -> Iterato
 
 
 def read_photograph(path: Path) -> Photograph:
-    """The picture of a file that holds one view."""
+    """Decode a file that holds one view."""
     with opening(path) as picture:
         return decode(path, picture)
 
 
 def decode(path: Path, picture: Image.Image) -> Photograph:
-    """The picture that was opened, or the frame of it at hand."""
+    """Decode an opened picture, or its current frame."""
     with _decoding(path):
-        # First, since TIFF is turned upright by this, and then says so in its tags.
+        # Before reading the tags: loading turns a TIFF upright and updates its orientation tag.
         picture.load()
     tags = exif.read_tags(picture)
     if picture.mode.startswith(("I", "F")):
@@ -99,14 +99,14 @@ def decode(path: Path, picture: Image.Image) -> Photograph:
 
 
 def stored_values(path: str | Path, picture: Image.Image) -> Shaped[np.ndarray, "h w *channels"]:
-    """The numbers of an opened picture as they are stored, for a measurement or a mask."""
+    """Decode the stored values of an opened picture, such as a measurement or a mask."""
     with _decoding(path):
         picture.load()
         return np.array(picture)
 
 
 def unpacked_values(name: str, content: bytes) -> Shaped[np.ndarray, "h w *channels"]:
-    """The numbers of a picture that lies within another file, `name` in errors."""
+    """Decode the stored values of a picture within another file; errors call it `name`."""
     with _decoding(name):
         picture = _opened(name, io.BytesIO(content), 1)
     check_size(name, picture.size)
@@ -114,10 +114,10 @@ def unpacked_values(name: str, content: bytes) -> Shaped[np.ndarray, "h w *chann
 
 
 def check_regular(path: Path, expected: str) -> None:
-    """Raise a FormatError for all but a file: a pipe would be waited for, a device read without end."""
+    """Raise a FormatError unless the path is a regular file: a pipe may block, a device may be endless."""
     try:
         mode = path.stat().st_mode
-    except (OSError, ValueError) as error:  # of a name with a zero byte a ValueError
+    except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
         raise FormatError(f"{path}: expected {expected}, found {reason(error)}") from error
     if not stat.S_ISREG(mode):
         found = "a folder" if stat.S_ISDIR(mode) else "a pipe or a device; copy it into a file first"
@@ -125,27 +125,27 @@ def check_regular(path: Path, expected: str) -> None:
 
 
 def check_size(path: str | Path, size_px: tuple[int, int], *, views: int = 1) -> None:
-    """Raise a FormatError for width and height that are more than can be worked with."""
+    """Raise a FormatError if width, height or the number of pixels exceeds the limit."""
     width_px, height_px = size_px
     if width_px * height_px > views * MOST_PIXELS:
         raise FormatError(f"{path}: expected {_most(views)}, found {width_px}x{height_px}; scale it down")
     if max(size_px) > views * LONGEST_SIDE_PX:
         raise FormatError(
             f"{path}: expected at most {views * LONGEST_SIDE_PX} pixels a side, "
-            f"found {width_px}x{height_px}; scale it down or cut it"
+            f"found {width_px}x{height_px}; scale it down or crop it"
         )
 
 
 @contextmanager
 def _decoding(path: str | Path, expected: str = A_PICTURE) -> Iterator[None]:
-    """Turns whatever Pillow raises into a FormatError: in one line, expected and found.
+    """Turn any exception of Pillow into a one-line FormatError.
 
-    Only for calls into Pillow. Its decoders raise whatever a damaged file makes them trip over, IndexError,
-    KeyError, TypeError, struct.error, zlib.error and more, and document none of it: a list of these would
-    never be complete. An error of our own code must not be taken for a damaged file, so it stays outside.
+    Only for calls of Pillow. Its decoders raise undocumented exceptions for damaged files, such as
+    IndexError, KeyError, TypeError, struct.error and zlib.error; a list would never be complete. Code of this
+    package stays outside: its bugs must not be reported as damaged files.
     """
     try:
-        # Pillow warns about odd tags before it gives up on a file; the error below says it in one line.
+        # Pillow warns about odd tags before it fails; the error below is enough.
         with warnings.catch_warnings(action="ignore"):
             yield
     except FormatError:
@@ -168,7 +168,7 @@ def _most(views: int) -> str:
 
 
 def _refuse_by_name(path: Path, head: bytes) -> None:
-    """Raise a FormatError for a kind that is not read, by the ending of the name or by the first bytes."""
+    """Raise a FormatError for an unsupported format, detected from the file name or the first bytes."""
     ending = path.suffix.lower()
     if ending in _RAW_ENDINGS:
         raise FormatError(
@@ -180,7 +180,7 @@ def _refuse_by_name(path: Path, head: bytes) -> None:
             raise FormatError(f"{path}: expected {A_PICTURE}, found AVIF, which this Pillow does not read")
     elif brands & _HEIF_BRANDS:
         raise FormatError(
-            f"{path}: expected {A_PICTURE}, found HEIC, such as a spatial photograph, which is not read; "
+            f"{path}: expected {A_PICTURE}, found HEIC, such as a spatial photograph, which is unsupported; "
             "export it as two JPEG files, or as one with both views side by side"
         )
     elif brands or ending in _VIDEO_ENDINGS:
@@ -188,13 +188,13 @@ def _refuse_by_name(path: Path, head: bytes) -> None:
 
 
 def _refuse_by_content(path: Path, picture: Any) -> None:
-    """Raise a FormatError for a picture that is no plain photograph, or more than one."""
+    """Raise a FormatError for a panorama, VR180 or an animation."""
     description = picture.info.get("xmp", b"")
     words = description if isinstance(description, bytes) else str(description).encode(errors="replace")
     if b"GImage:" in words or b"equirectangular" in words.lower():
         raise FormatError(
             f"{path}: expected a photograph, found VR180 or a panorama of 360 degrees, by its XMP, "
-            "which is not read; export two plain views from it"
+            "which is unsupported; export two plain views from it"
         )
     if picture.format in ("GIF", "PNG", "WEBP", "AVIF"):
         with _decoding(path):
@@ -206,7 +206,7 @@ def _refuse_by_content(path: Path, picture: Any) -> None:
 
 
 def _eight_bits(path: Path, picture: Image.Image) -> Image.Image:
-    """A loaded grey picture of 16 bits, or of 32 that hold no more, in RGB."""
+    """Convert a loaded 16-bit grey picture, or a 32-bit one with 16-bit values, to 8-bit RGB."""
     with _decoding(path):
         values = np.asarray(picture)
     if picture.mode == "F" or values.min() < 0 or values.max() > 65535:
@@ -214,13 +214,13 @@ def _eight_bits(path: Path, picture: Image.Image) -> Image.Image:
             f"{path}: expected {A_PICTURE}, found one that cannot be read (more than 16 bits a channel or "
             f"values below 0, mode {picture.mode})"
         )
-    # The upper byte, as Pillow reduces colour pictures of 16 bits; a file of 32 bits may hold 8 of them.
+    # The upper byte, as Pillow converts 16-bit colour; a 32-bit file may hold 8-bit values.
     bits = 8 if picture.mode != "I" or values.max() > 255 else 0
     return Image.fromarray((values >> bits).astype(np.uint8)).convert("RGB")
 
 
 def _in_srgb(picture: Image.Image) -> tuple[Image.Image, str | None]:
-    """The picture with its colours in sRGB, and in words what was done for that, if anything."""
+    """Convert a picture to sRGB; also returns a note if it has another colour profile, or a damaged one."""
     profile, mode = picture.info.get("icc_profile"), _PROFILED.get(picture.mode)
     if not profile or mode is None:
         return picture, None
@@ -239,18 +239,18 @@ def _in_srgb(picture: Image.Image) -> tuple[Image.Image, str | None]:
             outputMode="RGB",
             flags=ImageCms.Flags.BLACKPOINTCOMPENSATION,
         )
-    except Exception as error:  # whatever Pillow raises of a damaged one, as in `_decoding`
+    except Exception as error:  # of any type for a damaged profile, as in `_decoding`
         return picture, f"the colour profile cannot be used, colours are taken as sRGB ({_words(str(error))})"
     return converted or picture, f"colours converted from {name}"
 
 
 def _words(text: str) -> str:
-    """A text from a file as a part of a line that is shown."""
+    """Text from a file, safe to show within a line."""
     return "".join(filter(str.isprintable, " ".join(text.split())))[:_LONGEST_WORDS]
 
 
 def view_frames(path: Path, picture: Any) -> list[int]:
-    """The numbers of the two frames of an MPO file that are its views; none if the others are previews."""
+    """Indices of an MPO file's two frames that are its views; none if it has one view and previews."""
     if picture.format != "MPO":
         return []
     with _decoding(path):
@@ -268,16 +268,16 @@ def view_frames(path: Path, picture: Any) -> list[int]:
 
 
 def read_frame(path: Path, picture: Image.Image, index: int) -> Photograph:
-    """One of the pictures of an MPO file."""
+    """Decode a frame of an MPO file."""
     _seek(path, picture, index)
     check_size(path, picture.size)
     photograph = decode(path, picture)
-    # A copy: Pillow decodes the next frame into the same place.
+    # A copy: Pillow reuses the memory for the next frame.
     return photograph._replace(image=photograph.image.copy())
 
 
 def _seek(path: Path, picture: Image.Image, index: int) -> None:
-    """Goes to a frame of an MPO file, whose tags and profile are then its own, and not of one before it."""
+    """Go to a frame of an MPO file, without keeping the tags and the profile of the previous frame."""
     if picture.tell() == index:
         return
     for key in ("mp", "icc_profile"):
@@ -285,8 +285,8 @@ def _seek(path: Path, picture: Image.Image, index: int) -> None:
     try:
         with warnings.catch_warnings(action="ignore"):
             picture.seek(index)
-    except Exception as error:  # whatever Pillow raises of a damaged one, as in `_decoding`
+    except Exception as error:  # of any type for a damaged file, as in `_decoding`
         raise FormatError(
-            f"{path}: expected an MPO file of whole pictures, found number {index + 1} cut off or damaged "
+            f"{path}: expected an undamaged MPO file, found picture {index + 1} truncated or damaged "
             f"({_words(str(error))})"
         ) from error

@@ -1,4 +1,4 @@
-"""What cameras write beside their pixels: which way is up, the focal length, the distance of two lenses."""
+"""Metadata of pictures: orientation, focal length and baseline, from EXIF and the Multi-Picture Format."""
 
 import io
 import math
@@ -13,16 +13,16 @@ from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from stereoweave.errors import StereoweaveError
 
-# Tags by their numbers, those of EXIF and those of CIPA DC-007, the Multi-Picture Format.
+# Values by tag number, of EXIF and of CIPA DC-007, the Multi-Picture Format.
 Tags = Mapping[int, Any]
 _VIEWPOINT, _BASELINE = 0xB101, 0xB206
 _UNKNOWN = 0xFFFFFFFF
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-# CIPA DCG-001: a focal length "in 35 mm film" is one of the same diagonal angle on 36 mm x 24 mm.
+# CIPA DCG-001: a "35 mm film" focal length has the same diagonal angle of view on 36 mm x 24 mm.
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
-# Shares of a view's diagonal: a fisheye lens has 0.15 and more, a telescope up to 50. Else the tag is wrong.
+# Plausible focal lengths in view diagonals: a fisheye lens has 0.15 or more, a telescope up to 50.
 _SHORTEST, _LONGEST = 0.1, 100
-# Of 3-D cameras that do not write it down, by the makers' data sheets.
+# Baselines of 3-D cameras that do not store it, from the makers' data sheets.
 _BASELINES_M = {"FinePix REAL 3D W1": 0.077, "FinePix REAL 3D W3": 0.075, "Nintendo 3DS": 0.035}
 _TURNS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -37,11 +37,11 @@ _TURNS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Lens:
-    """What a picture's tags say of the cameras; None for what they do not say.
+    """Focal length and baseline from a picture's metadata.
 
     Attributes:
-        focal_px: The focal length in pixels of one view.
-        baseline_m: The distance of the two lenses in metres.
+        focal_px: Focal length in pixels of one view; None if unknown.
+        baseline_m: Distance between the two lenses in metres; None if unknown.
     """
 
     focal_px: float | None = None
@@ -54,33 +54,33 @@ class Lens:
 
 
 def read_tags(picture: Image.Image) -> Tags:
-    """The tags of an opened picture, of an MPO file those of the frame at hand; damaged ones are left out."""
-    # Pillow warns about each tag that it leaves out.
+    """Read the tags of an opened picture, or of an MPO file's current frame, without damaged ones."""
+    # Pillow warns about each damaged tag.
     with warnings.catch_warnings(action="ignore"):
         return _exif_tags(picture) | _multi_picture_tags(picture.info.get("mp", b""))
 
 
 def orientation(tags: Tags) -> int | None:
-    """EXIF's 1 to 8 for how the picture lies, 1 is upright; None where it does not say."""
+    """EXIF orientation, 1 (upright) to 8; None if missing or invalid."""
     value = tags.get(Base.Orientation)
     return value if value in (1, *_TURNS) else None
 
 
 def turned(picture: Image.Image, lies: int | None) -> Image.Image:
-    """The picture upright, which lies as an `orientation` says."""
+    """Turn a picture upright from an EXIF orientation, which may be another picture's."""
     return picture.transpose(_TURNS[lies]) if lies in _TURNS else picture
 
 
 def viewpoint(tags: Tags) -> int:
-    """The number of a frame of an MPO file, of which cameras count from the left; 0 where it does not say."""
+    """Viewpoint number of an MPO file's frame, counted from the left; 0 if missing."""
     value = tags.get(_VIEWPOINT)
     return value if isinstance(value, int) else 0
 
 
 def lens_of(tags: Tags, width_px: int, height_px: int) -> Lens | None:
-    """What the tags say of the cameras, for views of this size; None where they say nothing.
+    """Focal length and baseline for views of this size; None if the tags have neither.
 
-    The views have to show what the camera saw, at whatever scale: a cut-out has a wrong focal length.
+    The views must show the camera's full image, at any scale: a crop would get a wrong focal length.
     """
     lens = Lens(focal_px=_focal_px(tags, width_px, height_px), baseline_m=_baseline_m(tags))
     return None if lens == Lens() else lens
@@ -90,12 +90,12 @@ def _exif_tags(picture: Image.Image) -> dict[int, Any]:
     try:
         tags = picture.getexif()
         return dict(tags) | dict(tags.get_ifd(IFD.Exif))
-    except Exception:  # whatever Pillow raises of damaged ones, as in `picture_files`
+    except Exception:  # of any type for damaged tags, see `decoding._decoding`
         return {}
 
 
 def _multi_picture_tags(content: bytes) -> dict[int, Any]:
-    """The tags of a frame of an MPO file: those of the file, where the frame is its first, and its own."""
+    """Tags of an MPO file's frame: its own, and for the first frame the file's."""
     tags: dict[int, Any] = {}
     try:
         directory = ImageFileDirectory_v2(content[:8])
@@ -105,7 +105,7 @@ def _multi_picture_tags(content: bytes) -> dict[int, Any]:
                 file.seek(directory.next)
                 directory.load(file)
                 tags |= dict(directory)
-    except Exception:  # likewise
+    except Exception:  # of any type for damaged tags
         return tags
     if getattr(tags.get(_BASELINE), "numerator", _UNKNOWN) == _UNKNOWN:
         tags.pop(_BASELINE, None)
@@ -141,7 +141,7 @@ def _baseline_m(tags: Tags) -> float | None:
 
 
 def _positive(value: Any) -> float | None:
-    """The number of a tag; None for 0, which says that it is not known, and for what is no number."""
+    """Positive number of a tag; None for 0, which means unknown, and for an invalid value."""
     try:
         number = float(value)
     except (TypeError, ValueError, ZeroDivisionError):

@@ -1,6 +1,6 @@
-"""One writer at a time: a command that fills a folder or a file for long keeps others out until it ends.
+"""Lock that keeps an output to one command at a time.
 
-The operating system holds the lock, so that it ends with the process, in whatever way that ends.
+The operating system holds the lock, so that it is released when the process ends, even if it is killed.
 """
 
 import errno
@@ -14,27 +14,27 @@ from filelock import FileLock, Timeout
 from stereoweave.errors import OutputInUseError, StereoweaveError
 from stereoweave.io.files import make_folder
 
-# Some network file systems have no locks. Systems differ in how they say so; the last two are one on Linux.
+# Errors of network file systems without locks, which differ by system; Linux has one number for the last two.
 _NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.EINVAL, errno.EOPNOTSUPP, errno.ENOTSUP}
 
 
 @contextmanager
 def lock_output(output: Path, before_waiting: Callable[[], None] | None = None) -> Iterator[None]:
-    """Keep other processes from writing to an output, under whatever name they know it.
+    """Lock an output against other processes, also under another path of it.
 
-    The lock file is `.lock` in a folder, `.NAME.lock` beside a file, and is removed at the end. A killed
-    process leaves the file, which the next one uses and removes. On a disk without locks nobody is kept out.
+    The lock file, `.lock` in a folder or `.NAME.lock` beside a file, is removed at the end. A killed process
+    leaves it behind, unlocked; the next one reuses and removes it. A disk without locks gives no protection.
 
     Args:
-        output: A folder that exists, or a file, whose folder is made where it is missing.
-        before_waiting: Called if somebody else has the lock, which is then waited for.
+        output: An existing folder, or a file, whose folder is created if it is missing.
+        before_waiting: Called before waiting for another process to release the lock. None: do not wait.
 
     Raises:
-        OutputInUseError: Somebody else has the lock, and it is not to be waited for.
-        StereoweaveError: The lock file cannot be written.
+        OutputInUseError: if another process has the lock and `before_waiting` is None.
+        StereoweaveError: if the lock file cannot be written.
     """
     file = _lock_file(Path(os.path.realpath(output)))
-    # Without `fallback_to_soft`, which would be a file that a killed process leaves locked.
+    # No soft lock: its file would stay locked after a kill.
     lock = FileLock(file, blocking=False, fallback_to_soft=False)
     try:
         _acquire(lock, before_waiting)
@@ -52,8 +52,8 @@ def lock_output(output: Path, before_waiting: Callable[[], None] | None = None) 
     try:
         yield
     finally:
-        # Still locked, so that nobody else's is removed: filelock takes no lock on a removed file. Windows
-        # removes no open file; there filelock does it.
+        # Remove before the release, so that no other process's file is removed: filelock does not lock a
+        # removed file. Windows cannot remove an open file; there filelock removes it.
         with suppress(OSError):
             file.unlink()
         lock.release()

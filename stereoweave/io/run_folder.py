@@ -1,6 +1,6 @@
-"""Whose folder this is: a JSON file in it says what was made there and how, and refuses another's run.
+"""Claim of an output folder: a JSON description of its run, which other runs check before they write.
 
-What the file says is handed in and out as values and text, so that the folder may be on a disk or in a store.
+The functions take and return the text of the description, so that the folder may be on a disk or in a store.
 """
 
 import json
@@ -12,20 +12,20 @@ from stereoweave.errors import FormatError, StereoweaveError
 
 
 def description(facts: Mapping[str, Any]) -> str:
-    """The text of a description: facts as JSON, which `described` reads."""
+    """Write a run's facts as the JSON text of a description, which `described` parses."""
     return json.dumps(facts, indent=1, default=str) + "\n"
 
 
 def described(place: str | Path, text: str, expected: str) -> dict[str, Any]:
-    """The facts of a description.
+    """Parse the facts of a description.
 
     Args:
-        place: Path or URL of the description, for the error.
-        text: What is written there.
-        expected: What it was taken for, such as "the description of a batch".
+        place: Path or URL of the description, for errors.
+        text: Content of the description.
+        expected: Name of the description in errors, such as "the description of a batch".
 
     Raises:
-        FormatError: It is no description.
+        FormatError: if the text is not a JSON object.
     """
     try:
         facts = json.loads(text)
@@ -37,35 +37,35 @@ def described(place: str | Path, text: str, expected: str) -> dict[str, Any]:
 
 
 def check_claim(place: str | Path, facts: Mapping[str, Any], found: Mapping[str, Any]) -> None:
-    """Refuses a folder whose description has other facts than this run's.
+    """Refuse a folder that another run has claimed.
 
     Args:
-        place: Path or URL of the description.
-        facts: This run's, as `description` takes them.
-        found: Those that are described there.
+        place: Path or URL of the folder's description, for the error.
+        facts: This run's facts, as for `description`.
+        found: The facts in the folder's description.
 
     Raises:
-        StereoweaveError: They differ; the first that does is named.
+        StereoweaveError: if a fact differs; the error names the first that does.
     """
-    expected = json.loads(description(facts))  # where tuples have become lists
+    expected = json.loads(description(facts))  # JSON turns tuples into lists
     for name in expected | dict(found):
         if found.get(name) != expected.get(name):
             raise StereoweaveError(
                 f"{place}: expected {name} = {json.dumps(expected.get(name))}, as this run would make, "
-                f"found {json.dumps(found.get(name))}; ask for the same, or take another folder"
+                f"found {json.dumps(found.get(name))}; use the same settings or another folder"
             )
 
 
 def check_unclaimed(folder: str | Path, file: str, others: Iterable[str]) -> None:
-    """Refuses a folder that has files in it, and not the one that says whose it is.
+    """Refuse a folder that has files but no description.
 
     Args:
-        folder: Path or URL.
-        file: The name of the description.
-        others: The names of what is in the folder.
+        folder: Path or URL, for the error.
+        file: Name of the missing description.
+        others: Names of the files in the folder.
 
     Raises:
-        StereoweaveError: Something is in the folder.
+        StereoweaveError: if there is any file.
     """
     if other := min(others, default=None):
         raise StereoweaveError(f"{folder}: expected a new folder, or one with a {file}, found {other} in it")

@@ -1,8 +1,7 @@
-"""Folders on a disk or in an object store, by one interface: s3://, gs://, az:// and abfs:// through fsspec.
+"""One interface to folders on a disk and in object stores: s3://, gs://, az:// and abfs:// through fsspec.
 
-Endpoint, region and keys are those of the environment and of the provider's own files, such as
-AWS_ENDPOINT_URL and ~/.aws/credentials. A request that a store answers with "slow down" or with an error of
-its own is repeated by the store's library.
+Endpoint, region and keys come from the environment and the provider's own files, such as AWS_ENDPOINT_URL and
+~/.aws/credentials. The store's library retries requests that fail with "slow down" or a server error.
 """
 
 import importlib
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class _Kind(NamedTuple):
-    """A kind of object store: its library, where that finds the keys and the endpoint, and its settings."""
+    """An object store's library, the variables with its keys and endpoint, and the library's settings."""
 
     library: str
     keys: str
@@ -32,7 +31,7 @@ class _Kind(NamedTuple):
 
 
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://(.*)", re.DOTALL)
-# A request is made 3 times at most, so that a refused connection is told after 3 seconds.
+# Three attempts at most, so that a refused connection is reported within 3 seconds.
 _OF_S3 = {"connect_timeout": 5, "read_timeout": 30, "retries": {"mode": "standard", "total_max_attempts": 3}}
 _AZURE = _Kind("adlfs", "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY", "the account's name", {})
 _KINDS = {
@@ -46,7 +45,7 @@ _KINDS = {
     "az": _AZURE,
     "abfs": _AZURE,
 }
-# All repetitions together may take minutes: right in the middle of a run, and wrong at its beginning.
+# Retries may take minutes in all: acceptable during a run, not at its start.
 _ANSWER_S = 15.0
 _NO_KEYS = {
     *("NoCredentialsError", "PartialCredentialsError", "CredentialRetrievalError", "ProfileNotFound"),
@@ -56,12 +55,12 @@ _UNREACHABLE = {
     *("EndpointConnectionError", "HTTPClientError", "ConnectionError", "ClientConnectionError"),
     *("ServiceRequestError", "ServiceResponseError", "TimeoutError", "TransportError"),
 }
-# A change of a file's content changes it; the first that a store tells of.
+# Metadata that changes with a file's content; the first that a store reports counts.
 _VERSIONS = ("ETag", "etag", "md5Hash", "updated", "last_modified")
 
 
 class StoredFile(NamedTuple):
-    """A file of a store: its path below the folder, parted by "/"; bytes; what changes with its content."""
+    """A file in a store: its path below the folder, separated by "/", its size, and its content's version."""
 
     path: str
     size_bytes: int
@@ -70,72 +69,75 @@ class StoredFile(NamedTuple):
 
 @runtime_checkable
 class Store(Protocol):
-    """A folder on a disk or in an object store; it can be pickled, and costs nothing until it is used.
+    """A folder on a disk or in an object store. It can be pickled, and connects on first use.
 
-    A path is relative to the folder, and parted by "/". Every method raises a StereoweaveError in one line
-    where the folder cannot be reached, or the file is not there or may not be read or written.
+    Paths are relative to the folder and separated by "/".
+
+    Raises:
+        StereoweaveError: in every method, if the folder is unreachable, or the file is missing or access to
+            it is denied.
     """
 
     @property
     def place(self) -> str:
-        """Path or URL, without a slash at its end."""
+        """Path or URL without a trailing slash."""
         ...
 
     @property
     def folder(self) -> Path | None:
-        """The folder itself where it is on a disk; files there need neither `fetch` nor `put`."""
+        """Path of a folder on a disk, where files need neither `fetch` nor `put`; None in an object store."""
         ...
 
     def check_source(self) -> None:
-        """Raises where the folder cannot be reached or listed, or is not there."""
+        """Raise a StereoweaveError if the folder is missing, unreachable or cannot be listed."""
         ...
 
     def check_destination(self) -> None:
-        """Raises where the folder cannot be reached, or its bucket is not there; makes a folder on a disk."""
+        """Create a folder on a disk; raise a StereoweaveError if it is unreachable or its bucket missing."""
         ...
 
     def files(self, below: str = "") -> Iterator[StoredFile]:
-        """The files below the folder, or below a folder in it; hidden ones are left out.
+        """List the files below the folder, or below one of its subfolders, without hidden ones.
 
-        None where there is no such folder. In s3:// and on a disk they come as they are listed; the other
-        stores' libraries list all before the first.
+        A missing folder has no files. On a disk and in s3:// the listing is lazy; the libraries of the other
+        stores list all files before the first.
         """
         ...
 
     def fetch(self, path: str, into: Path) -> Path:
-        """A file on a disk: itself where it is on one already, else a copy, `into`/path."""
+        """Return a local path of the file: a copy, `into`/path, or the file itself if it is on a disk."""
         ...
 
     def put(self, file: Path, path: str) -> None:
-        """Copies a file from a disk to the path, where it is whole or not there."""
+        """Copy a local file to the path, atomically."""
         ...
 
     def read_bytes(self, path: str) -> bytes:
-        """What is in a file."""
+        """Read a file."""
         ...
 
     def write_bytes(self, path: str, content: bytes) -> None:
-        """Writes a file, which is whole or not there."""
+        """Write a file atomically."""
         ...
 
     def exists(self, path: str) -> bool:
-        """Whether there is such a file."""
+        """Whether the file exists."""
         ...
 
     def remove(self, path: str) -> None:
-        """Removes a file, if it is there."""
+        """Remove a file if it exists."""
         ...
 
     def at(self, path: str) -> str:
-        """The whole path or URL of a file."""
+        """Full path or URL of a file."""
         ...
 
 
 def store_at(place: str | Path) -> Store:
-    """The store of a path or a URL, of which nothing is read yet.
+    """Return the store of a path or URL, without connecting to it.
 
     Raises:
-        StereoweaveError: A protocol that is not known, whose library is missing, or no bucket in the URL.
+        StereoweaveError: if the protocol is unknown, its library missing, or the URL without a bucket.
     """
     url = _URL.fullmatch(str(place))
     if url is None:
@@ -158,7 +160,7 @@ def store_at(place: str | Path) -> Store:
 
 @dataclass(frozen=True)
 class DiskStore:
-    """A folder on a disk, or what is mounted as one."""
+    """A folder on a local or mounted disk."""
 
     folder: Path
 
@@ -186,7 +188,7 @@ class DiskStore:
                 if status := _status(entry):
                     yield StoredFile(path, status.st_size, str(status.st_mtime_ns))
             folders = zip(entries, paths, strict=True)
-            # Not through links, which may lead back here.
+            # Links are not followed: they may form a cycle.
             waiting += [path for entry, path in folders if entry.is_dir(follow_symlinks=False)][::-1]
 
     def fetch(self, path: str, into: Path) -> Path:
@@ -217,7 +219,7 @@ class DiskStore:
 
 @dataclass(frozen=True)
 class ObjectStore:
-    """A folder in an object store: all whose names begin with its own, for there are no folders in one."""
+    """A folder in an object store: all objects whose names begin with the folder's."""
 
     place: str
 
@@ -228,7 +230,7 @@ class ObjectStore:
     def check_source(self) -> None:
         if not self._has_any():
             raise StereoweaveError(
-                f"{self.place}: expected a folder, found nothing whose name begins so; is it spelt right?"
+                f"{self.place}: expected a folder, found no object below it; check the spelling"
             )
 
     def check_destination(self) -> None:
@@ -239,7 +241,7 @@ class ObjectStore:
             start = len(folder) - len(below) + (not below)
             for file in (_listed_in_s3 if self._is_s3() else _listed)(library, folder):
                 path = file.path[start:]
-                # A name that ends in "/" is an empty object that some programs make for a folder.
+                # Some programs mark a folder by an empty object whose name ends in "/".
                 if path and "/." not in f"/{path}" and not path.endswith("/"):
                     yield file._replace(path=path)
 
@@ -284,37 +286,37 @@ class ObjectStore:
         return self.place.startswith("s3://")
 
     def _has_any(self) -> bool:
-        """Whether something is in the folder; an error within seconds where nobody answers."""
+        """Whether the folder has any object; an unreachable store fails within seconds."""
         with self._library("", "a folder that can be listed") as (library, folder):
             bucket = folder.partition("/")[0]
             try:
                 if self._is_s3():
-                    # Not `info`, which begins with a HEAD request, to which S3 says no more than "Forbidden".
+                    # `info` would begin with a HEAD request, whose error has no reason but "Forbidden".
                     return bool(_page(library, folder, MaxKeys=1, timeout=_ANSWER_S).get("Contents"))
                 with suppress(FileNotFoundError):
                     library.info(folder, timeout=_ANSWER_S)
                     return True
-                with suppress(PermissionError):  # to see a bucket is a right of its own
+                with suppress(PermissionError):  # seeing a bucket needs a permission of its own
                     library.info(bucket, timeout=_ANSWER_S)
             except FileNotFoundError as error:
                 raise StereoweaveError(
-                    f"{self.place}: expected a bucket, found none that is called {bucket}; "
-                    f"is it spelt right, and {self._kind().endpoint} as well?"
+                    f"{self.place}: expected a bucket, found none named {bucket}; "
+                    f"check its spelling and {self._kind().endpoint}"
                 ) from error
         return False
 
     @contextmanager
     def _library(self, path: str, expected: str) -> Iterator[tuple["AsyncFileSystem", str]]:
-        """The store's library, and what it calls a path; its errors become one line."""
+        """Yield the store's library and its name for a path; turn its errors into a StereoweaveError."""
         import fsspec
 
         try:
-            # What it remembered of a listing would hide what other processes write. It keeps its connections.
+            # A cached listing would hide files that other processes write. Connections stay cached.
             library, name = fsspec.url_to_fs(self.at(path), use_listings_cache=False, **self._kind().settings)
             yield library, name
         except StereoweaveError:
             raise
-        except Exception as error:  # each library has its own, and they have little in common
+        except Exception as error:  # the libraries' exceptions have no common base
             raise StereoweaveError(
                 f"{self.at(path)}: expected {expected}, found {_found(error, self._kind())}"
             ) from error
@@ -324,21 +326,21 @@ class ObjectStore:
 
 
 def _entries(folder: Path) -> list[os.DirEntry[str]]:
-    """What is in a folder, by name, but for hidden entries; nothing where it is not there or is another's."""
+    """Entries of a folder by name, without hidden ones; none if the folder is missing or unreadable."""
     with suppress(FileNotFoundError, PermissionError), os.scandir(folder) as entries:
         return sorted((entry for entry in entries if entry.name[0] != "."), key=lambda entry: entry.name)
     return []
 
 
 def _status(entry: os.DirEntry[str]) -> os.stat_result | None:
-    """Size and time of a file; None of anything else, and of one that has just been removed."""
+    """Status of a file; None for anything else, and for a file that was just removed."""
     with suppress(FileNotFoundError):
         return entry.stat() if entry.is_file() else None
     return None
 
 
 def _listed_in_s3(library: "AsyncFileSystem", folder: str) -> Iterator[StoredFile]:
-    """The files below a folder by their whole names, asked for a thousand at a time, as they are used."""
+    """List the files below a folder by their full names, lazily, in pages of a thousand."""
     bucket = folder.partition("/")[0]
     more: dict[str, Any] | None = {}
     while more is not None:
@@ -362,14 +364,14 @@ def _page(library: "AsyncFileSystem", folder: str, **more: Any) -> dict[str, Any
 
 def _found(error: Exception, kind: _Kind) -> str:
     names = {name.__name__ for name in type(error).__mro__}
-    text = " ".join(str(error).split()) or "none in time"
-    # Azure's library has no error of its own for it.
+    text = " ".join(str(error).split()) or "timeout"
+    # Azure's library raises a plain ValueError.
     if names & _NO_KEYS or (isinstance(error, ValueError) and "credentials" in text):
-        return f"no keys that can be used ({text}); set {kind.keys}"
+        return f"no usable keys ({text}); set {kind.keys}"
     if names & _UNREACHABLE:
-        return f"no answer ({text}); is the network there, and {kind.endpoint} right?"
+        return f"no answer ({text}); check the network and {kind.endpoint}"
     if isinstance(error, PermissionError):
-        return f"no permission ({text}); are the keys right, and may they be used for this?"
+        return f"no permission ({text}); check the keys and their permissions"
     if isinstance(error, FileNotFoundError):
-        return f"none ({text})"
+        return f"no such file ({text})"
     return f"{type(error).__name__}: {text}"

@@ -1,7 +1,7 @@
-"""Plain values from YAML, JSON and XML that may have been written to do harm.
+"""Safe parser of YAML, JSON and XML from untrusted files, to plain values.
 
-The text is read without anchors, aliases, DTDs or types of the writer's choice, and nothing recurses before
-its depth and its count have been checked. Its size is the caller's to limit: the time grows with it.
+Anchors, aliases, DTDs and custom types are refused, and depth and number of values are checked before any
+recursion. The caller limits the length of the text, to which the time is proportional.
 """
 
 import re
@@ -12,22 +12,23 @@ import yaml
 
 _MOST_DEEP, _MOST_VALUES = 20, 10_000
 _NULLS = ("", "~", "null", "Null", "NULL")
-BASE64 = "$base64$"  # OpenCV's own mark in JSON
+BASE64 = "$base64$"  # OpenCV's mark of binary data in JSON
 _DECLARATION = re.compile(r"<!(?!--|\[CDATA\[)")
 _XML_ITEM = re.compile(r'"[^"]*"|\S+')
-# What OpenCV and others write in JSON and YAML does not allow there; a string is taken whole, ended or not.
+# Comments and tabs in JSON by OpenCV and others. Strings, terminated or not, match too, and are kept.
 _JSON_ALONE = re.compile(r'("(?:[^"\\]|\\.)*+"?)|//.*|\t')
 
 
 def parse_entries(text: str) -> dict[str, Any]:
-    """The entries of YAML, of JSON or of XML as cv2.FileStorage writes it.
+    """Parse YAML, JSON, or XML as cv2.FileStorage writes it.
 
-    Each value is a string, as it stands, or a list or a dict of values. An entry of YAML's or JSON's null is
-    left out. Binary data is a string that begins with BASE64.
+    Returns:
+        Entries by name. A value is an unconverted string, or a list or dict of values; binary data is a
+        string that begins with BASE64. Entries that are null in YAML or JSON are left out.
 
     Raises:
-        ValueError or SyntaxError: It is none of them, or more deeply nested or of more values than any
-            calibration; it has an anchor, an alias or a DTD.
+        ValueError or SyntaxError: if the text has another format, an anchor, an alias or a DTD, is nested
+            more than 20 deep or has more than 10,000 values.
     """
     start = text.lstrip()[:1]
     if start == "<":
@@ -35,12 +36,12 @@ def parse_entries(text: str) -> dict[str, Any]:
     else:
         entries = _parse_yaml(_JSON_ALONE.sub(r"\1 ", text) if start == "{" else text)
     if not isinstance(entries, dict):
-        raise ValueError("no entries with names")
+        raise ValueError("no named entries")
     return entries
 
 
 class _Gate:
-    """Counts the values that a parser enters, before it goes on."""
+    """Limits on nesting and number of values, which a parser checks before it enters each value."""
 
     def __init__(self) -> None:
         self._depth = self._values = 0
@@ -64,7 +65,7 @@ class _Gate:
 
 
 class _Loader(yaml.BaseLoader):
-    """PyYAML's loader of strings, lists and dicts alone, whatever the tags say."""
+    """PyYAML loader of strings, lists and dicts only; other tags are ignored."""
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
@@ -75,7 +76,7 @@ class _Loader(yaml.BaseLoader):
             raise ValueError("an alias (*); write its value in its place")
         self._gate.enter()
         node = super().compose_node(parent, index)
-        if self.anchors:  # of no use without aliases
+        if self.anchors:  # useless without aliases
             raise ValueError("an anchor (&); leave it out")
         self._gate.leave()
         return node
@@ -103,7 +104,7 @@ _Loader.add_constructor("tag:yaml.org,2002:binary", _marked)
 
 def _parse_yaml(text: str) -> Any:
     try:
-        # Not YAML: OpenCV writes a colon in it.
+        # OpenCV writes an invalid directive, with a colon.
         return yaml.load(re.sub(r"\A\s*%YAML.*", "", text), _Loader)
     except yaml.MarkedYAMLError as error:
         where = f" in line {error.problem_mark.line + 1}" if error.problem_mark else ""
@@ -113,7 +114,7 @@ def _parse_yaml(text: str) -> Any:
 
 
 class _Builder(ElementTree.TreeBuilder):
-    """ElementTree's elements, while their depth and the count of values are allowed."""
+    """ElementTree builder with limits on nesting and number of values."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -133,12 +134,12 @@ class _Builder(ElementTree.TreeBuilder):
 
 
 def _parse_xml(text: str) -> Any:
-    # Before the parser sees them: entities can name files, and can grow without end.
+    # Before parsing: entities can include files, and expand without limit.
     if _DECLARATION.search(text):
         raise ValueError("XML with a DTD")
     root = ElementTree.fromstring(text, parser=ElementTree.XMLParser(target=_Builder()))
     if root.tag != "opencv_storage":
-        raise ValueError("XML that OpenCV did not write")
+        raise ValueError("XML not written by OpenCV")
     return _xml_value(root)
 
 
@@ -155,5 +156,5 @@ def _xml_value(element: ElementTree.Element) -> Any:
 
 
 def _xml_items(text: str) -> list[Any]:
-    """The numbers and words of a sequence; words of several parts stand in quotes."""
+    """Split a sequence into numbers and words; words with spaces are quoted."""
     return [item.strip('"') for item in _XML_ITEM.findall(text)]

@@ -1,4 +1,4 @@
-"""Texts and tables that every reader takes, whatever names of files are in them."""
+"""Text files and CSV tables that stay valid and safe with any file name in them."""
 
 import csv
 import re
@@ -10,20 +10,20 @@ from typing import Any, TextIO
 
 from stereoweave.io.files import replacing
 
-# What spreadsheets take for a formula (OWASP, "CSV Injection"); and the mark itself, so that different names
-# stay different.
+# Beginnings of formulas in spreadsheets (OWASP, "CSV Injection"), and the quote that marks a text, so that
+# different names stay different.
 _COMPUTED = ("=", "+", "-", "@", "\t", "\r", "\n", "'")
-# Where a spreadsheet may begin a cell: its language sets what it splits at, and quotes inside a cell do not
-# keep it from that.
+# Where a spreadsheet may begin a cell: the separator depends on its language, and quotes within a cell do
+# not prevent a split.
 _CELL_STARTS = re.compile(r"(?<=[;\t\r\n])(?![\t\r\n])")
 _NUMBER = re.compile(r"-([0-9.]+(e[-+]?[0-9]+)?|inf)")
 
 
 @contextmanager
 def writing_text(path: str | Path) -> Iterator[TextIO]:
-    r"""A UTF-8 text file to write to, with no line ends translated; it is whole in the end or not there.
+    r"""Write a UTF-8 text file atomically, without translating line ends.
 
-    Bytes of a name that are no UTF-8 stand there as Python writes them: gr\udcfcn for b"gr\xfcn".
+    Bytes of a name that are not UTF-8 are escaped as in Python: gr\udcfcn for b"gr\xfcn".
     """
     with (
         replacing(path) as temporary,
@@ -33,7 +33,7 @@ def writing_text(path: str | Path) -> Iterator[TextIO]:
 
 
 def write_table(path: str | Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Writes a CSV file with a header; a text that a spreadsheet would compute has a ' before it."""
+    """Write a CSV file with a header; a text that a spreadsheet would run as a formula gets a leading '."""
     with writing_text(path) as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
@@ -47,5 +47,5 @@ def _inert(value: Any) -> Any:
 
 
 def _is_computed(cell: str) -> bool:
-    """Whether it begins with a mark of formulas, also of full width (＝) or after blanks."""
+    """Whether it begins like a formula, also with a full-width sign (＝) or after blanks."""
     return cell.startswith(_COMPUTED) or unicodedata.normalize("NFKC", cell).lstrip().startswith(_COMPUTED)

@@ -1,4 +1,4 @@
-"""A recipe: everything that a training run depends on, in one TOML file."""
+"""Recipes: TOML files with all settings of a training run."""
 
 import tomllib
 from dataclasses import MISSING, dataclass, fields
@@ -11,21 +11,21 @@ from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, Validation
 from stereoweave.errors import FormatError
 from stereoweave.io.files import read_small, reading
 
-# In characters; our longest recipe has 1,064. Python's time for a key grows with the square of its dots.
+# Characters. The longest shipped recipe has 1,064; tomllib takes quadratic time for a key with many dots.
 _LONGEST = 10_000
-# In an error.
+# Characters of a value in an error.
 _LONGEST_VALUE = 100
-# TOML's whole numbers; Python's may have any number of digits.
+# TOML's range of whole numbers; tomllib reads larger ones too.
 _MOST = 2**63 - 1
 COLLAGE = "collage"
 
 
 def _as_pairs(table: object) -> object:
-    """A TOML table as pairs of name and value, which is how recipes and checkpoints hold it."""
+    """Items of a TOML table; recipes and checkpoints hold tables as pairs, which are hashable."""
     return tuple(table.items()) if isinstance(table, dict) else table
 
 
-# A description is what errors say was expected.
+# Errors quote the description as what was expected.
 Text = Annotated[str, Field(strict=True, description="a text in quotes")]
 Switch = Annotated[bool, Field(strict=True, description="true or false")]
 Target = Annotated[Literal["disparity", "depth"], Field(description="'disparity' or 'depth'")]
@@ -54,45 +54,49 @@ Folders = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """What to train, on what, for how long.
+    """Model, data, loss and schedule of a training run.
 
     Attributes:
-        model: a name in MODELS or, for ablations, in VARIANTS.
-        seed: of the first weights, the pairs and every draw.
-        start_from: checkpoint whose averaged weights are the first ones where the network has such, of the
-            same name and shape; the others, and all if empty, are random.
-        steps: optimiser steps in all.
-        batch: pairs a step.
-        micro_batch: pairs that go through the network at once, which batch norms take their statistics from;
-            a step goes along the mean gradient of its micro-batches. 0 is the whole batch.
-        learning_rate: between warm-up and cool-down, along which it rises and falls linearly.
-        weight_decay: AdamW's; with 0 it is Adam.
-        averaged_steps: length of the running average of the weights, which is what scores and ships; longer
-            lags behind, shorter keeps the noise of single batches, and 1 is the weights themselves.
-        dataset: "collage", or a name in DATASETS.
-        root: folder of the dataset as its authors unpack it; empty for collage.
-        mix: what to train on instead of the dataset alone: sets, which are "collage" or folders of rendered
-            pairs (data/shards.py), and their weights, of which the ratios count. Scores stay the dataset's.
-        split: how the frames of a dataset are parted, a name in SPLITS (data/splits.py).
-        pairs: collage pairs made once and kept; later steps cut them differently.
-        fresh: whether a collage is painted each time one is drawn, and none is kept.
-        pair_size: height and width of a kept collage pair.
-        crop_size: height and width of what a step sees of a pair.
-        augment: whether cuts are also scaled, mirrored and recoloured.
-        offset_share: share of the pairs whose right crop is moved to the right, so that the disparity grows.
-        validation_pairs: pairs to score on, never trained on: of another seed, or from the held-out frames.
-        held_out: names of further sets to score on, and their folders of rendered pairs.
-        validate_every: steps between two validations, each followed by a checkpoint.
-        loss: a name in LOSSES: "weave" for WeaveNet, and the others, between codes, for the other networks.
-        target: what a code stands for, "disparity" or "depth".
-        max_disparity_px: code 1 as a disparity; truth above it counts as unknown.
-        max_depth_m: code 0 as a depth; truth beyond it is an error.
-        exponent: the paper's p.
-        fit_exponent: p is fitted to the histogram of the training truth instead.
-        alpha_z, alpha_p: weights of the loss between codes and of the projection loss.
-        distribution: weight of WeaveNet's cross-entropies between levels; 0 leaves regression alone.
-        robust: share of the logarithm in WeaveNet's regression, which counts large errors less.
-        vgg16_weights: file of the VGG-16 behind the perceptual loss.
+        name: Name of the run and of the network.
+        model: Key of MODELS or, for ablations, of VARIANTS.
+        seed: Seed of the initial weights, the pairs and all random draws.
+        start_from: Checkpoint that initialises all weights of the same name and shape with its averaged
+            weights; the other weights are random. Empty: all are random.
+        steps: Optimiser steps in total.
+        batch: Pairs per step.
+        micro_batch: Pairs per forward pass, over which batch norm takes its statistics; a step follows the
+            mean gradient of its micro-batches. 0: the whole batch.
+        learning_rate: Peak rate: the rate rises linearly in the warm-up and falls linearly in the cool-down.
+        warm_up_steps: First steps, with a rising learning rate.
+        cool_down_steps: Last steps, with a falling learning rate.
+        weight_decay: Weight decay of AdamW; 0: Adam.
+        averaged_steps: Length of the running average of the weights. Validation and export use the average.
+            A longer one lags behind, a shorter one keeps the noise of single batches; 1: no averaging.
+        dataset: "collage" or a key of DATASETS.
+        root: Folder of the unpacked dataset; empty for collage.
+        mix: Training sets that replace the dataset, with their relative weights. A set is "collage" or a
+            folder of rendered pairs (data/shards.py). Validation keeps to the dataset.
+        split: Key of SPLITS (data/splits.py): how frames are divided into training and held-out ones.
+        pairs: Number of collage pairs to keep; every step crops them differently.
+        fresh: Paint a new collage for each draw, and keep none.
+        pair_size: Height and width of a collage pair.
+        crop_size: Height and width of the crops that a step trains on.
+        augment: Also scale, mirror and recolour crops.
+        offset_share: Share of pairs whose right crop is shifted to the right, which increases disparity.
+        validation_pairs: Number of pairs to validate on: collages of another seed, or held-out frames.
+        held_out: Further sets to validate on, as pairs of name and folder of rendered pairs.
+        validate_every: Steps between validations; a checkpoint follows each.
+        loss: Key of LOSSES: "weave" for WeaveNet; the others compare codes, for all other networks.
+        target: Quantity that a code encodes, "disparity" or "depth".
+        max_disparity_px: Disparity of code 1; larger true disparities count as unknown.
+        max_depth_m: Depth of code 0; a larger true depth is an error.
+        exponent: The paper's p.
+        fit_exponent: Fit p to the histogram of the training truth instead.
+        alpha_z: Weight of the loss between codes.
+        alpha_p: Weight of the projection loss.
+        distribution: Weight of WeaveNet's cross-entropy between levels; 0: regression only.
+        robust: Share of the logarithm in WeaveNet's regression loss, which weakens large errors.
+        vgg16_weights: File of VGG-16 weights for the perceptual loss.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")
@@ -136,11 +140,11 @@ class Recipe:
 
     @property
     def micro_batches(self) -> int:
-        """How many of them a step has."""
+        """Number of micro-batches per step."""
         return self.batch // (self.micro_batch or self.batch)
 
     def learning_rate_at(self, step: int) -> float:
-        """The learning rate of a step, counted from 0."""
+        """Learning rate of a step; the first step is 0."""
         warm_up = (step + 1) / max(self.warm_up_steps, 1)
         cool_down = (self.steps - step) / max(self.cool_down_steps, 1)
         return self.learning_rate * min(warm_up, cool_down, 1.0)
@@ -150,7 +154,11 @@ _RECIPES = TypeAdapter(Recipe)
 
 
 def read_recipe(path: Path) -> Recipe:
-    """The recipe of a TOML file; FormatError for a key that is unknown, missing, mistyped or out of range."""
+    """Read a recipe from a TOML file.
+
+    Raises:
+        FormatError: if the file is unreadable, or a key is unknown, missing, of a wrong type or out of range.
+    """
     with reading(path, "a recipe in TOML"):
         text = read_small(path).decode()
         if len(text) > _LONGEST:
@@ -160,7 +168,11 @@ def read_recipe(path: Path) -> Recipe:
 
 
 def recipe_from(values: dict[str, Any], source: str) -> Recipe:
-    """The recipe with these values; FormatError, which names their `source`, if they make none."""
+    """Make a recipe from its values.
+
+    Raises:
+        FormatError: if they are invalid; the message begins with `source`.
+    """
     try:
         recipe = _RECIPES.validate_python(values)
     except ValidationError as error:
@@ -171,6 +183,7 @@ def recipe_from(values: dict[str, Any], source: str) -> Recipe:
 
 
 def _first_mistake(error: ValidationError, values: dict[str, Any]) -> str:
+    """Describe one mistake in a line: an unknown key, else an invalid value, else a missing key."""
     known: dict[str, Any] = {field.name: field.type for field in fields(Recipe)}
     if unknown := sorted(values.keys() - known.keys()):
         return f"unknown key {unknown[0]!r}; a recipe has {', '.join(known)}"
@@ -184,7 +197,7 @@ def _first_mistake(error: ValidationError, values: dict[str, Any]) -> str:
 
 
 def _contradiction(recipe: Recipe) -> str | None:
-    """The first two settings that exclude each other, in one line."""
+    """Describe the first two settings that exclude each other, in one line; None if none do."""
     collage = recipe.dataset == COLLAGE
     if recipe.batch % (recipe.micro_batch or recipe.batch):
         return f"micro_batch: expected a divisor of batch = {recipe.batch}, found {recipe.micro_batch}"
@@ -192,7 +205,7 @@ def _contradiction(recipe: Recipe) -> str | None:
         limit, found = list(recipe.pair_size), list(recipe.crop_size)
         return f"crop_size: expected at most pair_size = {limit}, found {found}"
     if recipe.mix and not collage:
-        return f"mix: expected dataset = {COLLAGE!r}, which a mix is scored on, found {recipe.dataset!r}"
+        return f"mix: expected dataset = {COLLAGE!r}, on which a mix is validated, found {recipe.dataset!r}"
     if collage == bool(recipe.root):
         expected = "none for collage" if collage else "the dataset's folder"
         return f"root: expected {expected}, found {recipe.root!r} with dataset = {recipe.dataset!r}"
@@ -200,9 +213,9 @@ def _contradiction(recipe: Recipe) -> str | None:
 
 
 def _written(value: object) -> str:
-    """The value as Python writes it, or its beginning."""
+    """Shortened repr of a value."""
     try:
         text = repr(value)
-    except (ValueError, RecursionError):  # of a number of more than 4,300 digits, of nested arrays
-        return "a value too long to be written"
+    except (ValueError, RecursionError):  # over 4,300 digits; deeply nested arrays
+        return "a value too long to show"
     return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}..."

@@ -377,7 +377,7 @@ def test_pairs_go_from_a_bucket_to_a_bucket_with_a_calibration_and_a_bad_one_is_
         assert out.read_bytes(f"00/{file}") == (tmp_path / "alone" / file).read_bytes()
     tally = run_cluster(f"{bucket}/in", f"{bucket}/out", ORDER, engine)
     assert (tally.made, tally.there, tally.failed) == (0, 3, 1)
-    with pytest.raises(StereoweaveError, match="expected a bucket, found none that is called nobodys"):
+    with pytest.raises(StereoweaveError, match="expected a bucket, found none named nobodys"):
         run_cluster("s3://nobodys/in", f"{bucket}/new", ORDER, engine)
 
 

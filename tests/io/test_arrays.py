@@ -135,7 +135,7 @@ def test_taking_pictures_does_not_import_pytorch():
     [
         ("left.png", ["got str", "PIL.Image.open"]),
         (None, ["got NoneType"]),
-        (np.zeros((2, 40, 50, 3), np.uint8), ["got [2, 40, 50, 3]", "one picture at a time"]),
+        (np.zeros((2, 40, 50, 3), np.uint8), ["got [2, 40, 50, 3]", "one image at a time"]),
         (np.zeros((40, 50, 2), np.uint8), ["got [40, 50, 2]"]),
         (np.zeros(3), ["got [3]"]),
         (np.zeros((40, 50, 3), np.int64), ["int64 [40, 50, 3]", "astype('uint8')"]),

@@ -326,7 +326,7 @@ def test_an_mpo_file_cut_within_the_head_of_its_second_picture_is_refused(tmp_pa
     path = tmp_path / "cut.mpo"
     for length in range(start, start + 150):
         path.write_bytes(whole[:length])
-        assert "found number 2 cut off or damaged" in refusal(open_pictures, [path])
+        assert "found picture 2 truncated or damaged" in refusal(open_pictures, [path])
 
 
 @pytest.mark.parametrize("mark", [b"!", b","])

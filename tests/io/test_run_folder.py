@@ -15,7 +15,7 @@ def test_what_was_written_down_is_the_same_claim():
     [
         ({"model": "base", "sizes": [3, 4]}, 'expected model = "small", as this run .*, found "base"'),
         ({"model": "small"}, r"expected sizes = \[3, 4\], as this run would make, found null"),
-        ({"model": "small", "sizes": [3, 4], "old": 1}, "expected old = null, .* found 1; ask for the same"),
+        ({"model": "small", "sizes": [3, 4], "old": 1}, "expected old = null, .* found 1; use the same"),
         ({}, 'expected model = "small", as this run would make, found null'),
     ],
 )

@@ -197,7 +197,8 @@ def test_a_wrong_bucket_is_told_by_its_name(s3, tmp_path):
     store = store_at("s3://nobodys-bucket/pairs")
     for check in (store.check_source, store.check_destination):
         message = error_of(check)
-        assert message.startswith("s3://nobodys-bucket/pairs: expected a bucket, found none that is called ")
+        expected = "s3://nobodys-bucket/pairs: expected a bucket, found none named nobodys-bucket"
+        assert message.startswith(expected)
         assert "AWS_ENDPOINT_URL" in message
     assert "bucket does not exist" in error_of(lambda: store.write_bytes("a", b""))
     assert "bucket does not exist" in error_of(lambda: list(store.files()))
@@ -228,7 +229,7 @@ def test_missing_keys_are_told_with_the_variables_that_hold_them(bucket, monkeyp
     with another_environment(monkeypatch), monkeypatch.context() as patch:
         patch.delenv("AWS_ACCESS_KEY_ID")
         message = error_of(store_at(bucket).check_source)
-    assert "found no keys that can be used (Unable to locate credentials); set AWS_ACCESS_KEY_ID" in message
+    assert "found no usable keys (Unable to locate credentials); set AWS_ACCESS_KEY_ID" in message
 
 
 def test_an_endpoint_where_nobody_listens_is_told(bucket, monkeypatch):
@@ -238,7 +239,7 @@ def test_an_endpoint_where_nobody_listens_is_told(bucket, monkeypatch):
         with another_environment(monkeypatch, AWS_ENDPOINT_URL=endpoint):
             message = error_of(store_at(bucket).check_source)
     assert "found no answer (Could not connect to the endpoint URL" in message
-    assert message.endswith("is the network there, and AWS_ENDPOINT_URL right?")
+    assert message.endswith("check the network and AWS_ENDPOINT_URL")
 
 
 def test_an_endpoint_that_says_nothing_is_given_up_in_seconds(bucket, monkeypatch):
@@ -282,7 +283,7 @@ def test_an_account_of_azure_that_is_not_named_is_told_with_the_variables(monkey
     monkeypatch.delenv("AZURE_STORAGE_ACCOUNT_NAME", raising=False)
     monkeypatch.delenv("AZURE_STORAGE_CONNECTION_STRING", raising=False)
     message = error_of(store_at("az://container/pairs").check_source)
-    assert "found no keys that can be used (" in message
+    assert "found no usable keys (" in message
     assert "AZURE_STORAGE_ACCOUNT_NAME" in message
 
 

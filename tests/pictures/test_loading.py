@@ -282,7 +282,7 @@ def test_a_truncated_mpo_file_is_refused_in_one_line(tmp_path, pair):
         cut.write_bytes(whole[: int(share * len(whole))])
         assert refusal(cut).startswith(f"{cut}: expected")
     cut.write_bytes(whole[: whole.index(b"\xff\xd8", 2)])
-    assert "found number 2 cut off or damaged" in refusal(cut)
+    assert "found picture 2 truncated or damaged" in refusal(cut)
 
 
 def test_two_mpo_files_are_two_pictures(tmp_path, pair):
