@@ -276,7 +276,7 @@ def speed(
         from stereoweave.learn.recipe import read_recipe
 
         read = read_recipe(recipe)
-        from stereoweave.learn.studies.speed import run_times
+        from experiments.speed.timing import run_times
     _write_and_tell(out, "A pair of 640x480", run_times(read))
 
 
@@ -314,7 +314,7 @@ def costs(
     if out:
         place_for(out)
     with needing_the_train_extra():
-        from stereoweave.learn.studies.stage_costs import markdown, stage_costs
+        from experiments.stage_costs.profiling import markdown, stage_costs
     rows = stage_costs(runs)
     if out:
         write_csv(out, rows)
@@ -333,7 +333,7 @@ def paper(
 
     Stopped and started again it goes on where it was.
     """
-    from stereoweave.learn.paper.trials import CLAIMS
+    from experiments.paper.trials import CLAIMS
 
     _experiment(recipe, out, report, seeds, jobs, CLAIMS)
 
@@ -365,7 +365,7 @@ def ablations(
 
         base = read_recipe(recipe)
         place_for(report)
-        from stereoweave.learn.studies.ablations import plan, run_ablations
+        from experiments.ablations.experiment import plan, run_ablations
     run_ablations(plan(base, seeds), out, rendered, report, Console())
     typer.echo(f"rows: {report}")
 
@@ -392,7 +392,7 @@ def exponent(
     jobs: Jobs = 1,
 ) -> None:
     """The paper's Fig. 2: the curves of the depth adjustment, and the validation loss with and without it."""
-    from stereoweave.learn.paper.trials import ADJUSTMENT
+    from experiments.paper.trials import ADJUSTMENT
 
     _experiment(recipe, out, report, seeds, jobs, (ADJUSTMENT,))
 
@@ -422,8 +422,8 @@ def _experiment(  # noqa: PLR0913 - the words of two command lines
         from stereoweave.learn.recipe import read_recipe
 
         base = read_recipe(recipe)
-        from stereoweave.learn.paper.experiment import plan, run_trials
-        from stereoweave.learn.paper.report import write_report
+        from experiments.paper.experiment import plan, run_trials
+        from experiments.paper.report import write_report
     planned = plan(base, out, seeds, console, claims)
     run_trials(planned, out, jobs, console)
     write_report(base, planned, out, report)

@@ -475,7 +475,7 @@ def test_a_mistake_with_a_benchmark_of_networks_is_told_in_one_line(mistakes, ca
 
 
 def test_bench_speed_writes_a_row_a_network(tmp_path, monkeypatch, capfd):
-    from stereoweave.learn.studies import speed
+    from experiments.speed import timing as speed
 
     monkeypatch.chdir(tmp_path)
     given = []
@@ -504,9 +504,9 @@ def test_bench_speed_writes_a_row_a_network(tmp_path, monkeypatch, capfd):
     ("command", "claims"), [("paper", None), ("exponent", ("depth adjustment",))], ids=["paper", "exponent"]
 )
 def test_the_experiment_is_planned_trained_and_reported(tmp_path, monkeypatch, capfd, command, claims):
-    from stereoweave.learn.paper import experiment as paper
-    from stereoweave.learn.paper import report as paper_report
-    from stereoweave.learn.paper.trials import CLAIMS
+    from experiments.paper import experiment as paper
+    from experiments.paper import report as paper_report
+    from experiments.paper.trials import CLAIMS
 
     monkeypatch.chdir(tmp_path)
     done = []

@@ -18,17 +18,12 @@ from learn_examples import (
 )
 from rich.console import Console
 
-from stereoweave.data.paper_layout import write_frame
-from stereoweave.io.files import read_image
-from stereoweave.learn import checkpoint
-from stereoweave.learn.data.pair_cache import KeptPairs
-from stereoweave.learn.data.sources import VALIDATION_SEED
-from stereoweave.learn.paper import experiment as paper
-from stereoweave.learn.paper import report as paper_report
-from stereoweave.learn.paper import trials as the_trials
-from stereoweave.learn.paper.experiment import plan, run_trials
-from stereoweave.learn.paper.report import Report, write_report
-from stereoweave.learn.paper.trials import (
+from experiments.paper import experiment as paper
+from experiments.paper import report as paper_report
+from experiments.paper import trials as the_trials
+from experiments.paper.experiment import plan, run_trials
+from experiments.paper.report import Report, write_report
+from experiments.paper.trials import (
     ADJUSTMENT,
     FITTED,
     ITERATIONS,
@@ -39,6 +34,11 @@ from stereoweave.learn.paper.trials import (
     Trial,
     trials,
 )
+from stereoweave.data.paper_layout import write_frame
+from stereoweave.io.files import read_image
+from stereoweave.learn import checkpoint
+from stereoweave.learn.data.pair_cache import KeptPairs
+from stereoweave.learn.data.sources import VALIDATION_SEED
 from stereoweave.learn.training.loop import CURVE, Run, read_record
 from stereoweave.stereo import fit_exponent
 

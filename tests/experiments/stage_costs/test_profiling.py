@@ -7,10 +7,10 @@ import torch
 from learn_examples import RECIPE, checkpoint_of, complaint, recipe_of, untrained
 from onnx import TensorProto, helper
 
+from experiments.stage_costs import profiling as costs
 from stereoweave.cli.root import main
 from stereoweave.learn import checkpoint
 from stereoweave.learn.export.from_checkpoint import multiply_adds
-from stereoweave.learn.studies import stage_costs as costs
 
 HEIGHT, WIDTH = 32, 64
 

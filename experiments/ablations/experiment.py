@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from rich.console import Console
 
+from experiments.paper.trials import Trial
 from stereoweave.bench.edge_metrics import edge_bad_percent, edge_epe_px, flying_percent
 from stereoweave.bench.projected_views import Method
 from stereoweave.data.shards import Shards
@@ -23,7 +24,6 @@ from stereoweave.learn.data.sources import Photographed, Source, kept, sources
 from stereoweave.learn.evaluation import method_of
 from stereoweave.learn.export.from_checkpoint import multiply_adds
 from stereoweave.learn.models import network_of
-from stereoweave.learn.paper.trials import Trial
 from stereoweave.learn.recipe import COLLAGE, Recipe
 from stereoweave.learn.training.loop import train_recipe
 from stereoweave.learn.training.scores import validate

@@ -8,23 +8,15 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
-from stereoweave.bench.pairs import write_csv
-from stereoweave.bench.projected_views import Method, ViewRow
-from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io.files import make_folder, replacing
-from stereoweave.learn import checkpoint
-from stereoweave.learn.checkpoint import Checkpoint
-from stereoweave.learn.data.sources import Source, sources
-from stereoweave.learn.evaluation import evaluate, held_out_of, method_of
-from stereoweave.learn.paper.claims import (
+from experiments.paper.claims import (
     PaperRow,
     claims_table,
     propeller_table,
     run_time_table,
     settings_table,
 )
-from stereoweave.learn.paper.figures import draw_exponent_curves, draw_iterations, draw_validation, draw_views
-from stereoweave.learn.paper.trials import (
+from experiments.paper.figures import draw_exponent_curves, draw_iterations, draw_validation, draw_views
+from experiments.paper.trials import (
     ADJUSTMENT,
     FITTED,
     ITERATIONS,
@@ -36,6 +28,14 @@ from stereoweave.learn.paper.trials import (
     TUNED,
     Trial,
 )
+from stereoweave.bench.pairs import write_csv
+from stereoweave.bench.projected_views import Method, ViewRow
+from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.io.files import make_folder, replacing
+from stereoweave.learn import checkpoint
+from stereoweave.learn.checkpoint import Checkpoint
+from stereoweave.learn.data.sources import Source, sources
+from stereoweave.learn.evaluation import evaluate, held_out_of, method_of
 from stereoweave.learn.recipe import COLLAGE, Recipe
 from stereoweave.learn.training.loop import CURVE, read_record
 from stereoweave.learn.training.objective import truth_histogram

@@ -6,7 +6,7 @@ import pytest
 import torch
 from learn_examples import RECIPE
 
-from stereoweave.learn.studies import speed
+from experiments.speed import timing as speed
 
 HEIGHT, WIDTH = 64, 96
 SHARE = HEIGHT * WIDTH / (480 * 640)

@@ -4,7 +4,7 @@ from dataclasses import asdict, replace
 import pytest
 from learn_examples import recipe_of
 
-from stereoweave.learn.paper.trials import (
+from experiments.paper.trials import (
     ADJUSTMENT,
     CLAIMS,
     DECODER,

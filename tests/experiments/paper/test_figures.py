@@ -4,8 +4,8 @@ import pytest
 from learn_examples import box_before_a_wall
 from matplotlib.colors import to_rgb
 
+from experiments.paper import figures
 from stereoweave.io.files import read_image
-from stereoweave.learn.paper import figures
 
 LARGEST_BYTES = 300_000
 CURVES = {

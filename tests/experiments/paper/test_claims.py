@@ -3,7 +3,7 @@ import random
 
 import pytest
 
-from stereoweave.learn.paper.claims import (
+from experiments.paper.claims import (
     TABLE_I,
     PaperRow,
     by_seed,
@@ -15,7 +15,7 @@ from stereoweave.learn.paper.claims import (
     run_time_table,
     settings_table,
 )
-from stereoweave.learn.paper.trials import ADJUSTMENT, DECODER, NETWORKS, NETWORKS_SHORT, PAPER, PROJECTION
+from experiments.paper.trials import ADJUSTMENT, DECODER, NETWORKS, NETWORKS_SHORT, PAPER, PROJECTION
 
 COMPARISONS = {comparison.text: comparison for comparison in comparisons()}
 PROJECTED = "projection loss: end-point error"

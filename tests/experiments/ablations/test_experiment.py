@@ -8,6 +8,8 @@ import pytest
 from learn_examples import CAMERA, RECIPE, box_before_a_wall, checkpoint_of, complaint, keep_pairs
 from rich.console import Console
 
+from experiments.ablations import experiment as ablations
+from experiments.ablations.experiment import BASE, VARIATIONS, fingerprint, plan, run_ablations
 from stereoweave.cli import root as cli
 from stereoweave.data.packing import packed
 from stereoweave.data.shards import write_shard
@@ -16,8 +18,6 @@ from stereoweave.learn.data.sources import VALIDATION_SEED
 from stereoweave.learn.export.from_checkpoint import multiply_adds
 from stereoweave.learn.models import network_of
 from stereoweave.learn.recipe import read_recipe
-from stereoweave.learn.studies import ablations
-from stereoweave.learn.studies.ablations import BASE, VARIATIONS, fingerprint, plan, run_ablations
 from stereoweave.learn.training.objective import objective_of
 
 REPOSITORY = Path(__file__).resolve().parents[3]

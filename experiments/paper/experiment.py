@@ -10,9 +10,9 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
+from experiments.paper.trials import CLAIMS, SHORT, Trial, trials
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn.data.sources import kept, sources
-from stereoweave.learn.paper.trials import CLAIMS, SHORT, Trial, trials
 from stereoweave.learn.recipe import COLLAGE, Recipe
 from stereoweave.learn.training.loop import train_recipe
 from stereoweave.learn.training.objective import fitted

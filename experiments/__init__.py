@@ -1,0 +1,1 @@
+"""Experiments behind the tables of this repository; not part of the package."""

@@ -1,0 +1,1 @@
+"""Run times of the paper's network and its rivals."""

@@ -1,0 +1,1 @@
+"""Costs of WeaveNet's stages."""

@@ -1,0 +1,5 @@
+"""Type checker for jaxtyping's import hook, whose pytest option takes such a call for one package only."""
+
+from beartype import BeartypeConf, beartype
+
+check = beartype(conf=BeartypeConf(is_pep484_tower=True))
