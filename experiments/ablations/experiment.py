@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from rich.console import Console
 
+from experiments.ablations.networks import VARIANTS
 from experiments.paper.trials import Trial
 from stereoweave.bench.edge_metrics import edge_bad_percent, edge_epe_px, flying_percent
 from stereoweave.bench.projected_views import Method
@@ -23,7 +24,7 @@ from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.data.sources import Photographed, Source, kept, sources
 from stereoweave.learn.evaluation import method_of
 from stereoweave.learn.export.from_checkpoint import multiply_adds
-from stereoweave.learn.models import network_of
+from stereoweave.learn.models import MODELS, network_of
 from stereoweave.learn.recipe import COLLAGE, Recipe
 from stereoweave.learn.training.loop import train_recipe
 from stereoweave.learn.training.scores import validate
@@ -89,6 +90,7 @@ def run_ablations(
     Raises:
         StereoweaveError: Training or held-out pairs are missing; said before anything is trained.
     """
+    MODELS.update(VARIANTS)
     rendered_pairs = Photographed(Shards(rendered))
     for trial in planned:
         for pairs in sources(trial.recipe, runs / "pairs"):

@@ -58,7 +58,7 @@ class Recipe:
 
     Attributes:
         name: Name of the run and of the network.
-        model: Key of MODELS or, for ablations, of VARIANTS.
+        model: Key of MODELS.
         seed: Seed of the initial weights, the pairs and all random draws.
         start_from: Checkpoint that initialises all weights of the same name and shape with its averaged
             weights; the other weights are random. Empty: all are random.

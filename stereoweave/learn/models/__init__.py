@@ -11,7 +11,6 @@ from stereoweave.learn.models.densemapnet import DenseMapNet
 from stereoweave.learn.models.dispnet import DispNet
 from stereoweave.learn.models.fast_depth import FastDepthNet
 from stereoweave.learn.models.psmnet import PSMNet
-from stereoweave.learn.models.variants import VARIANTS
 from stereoweave.learn.models.weave import BASE, BASE_GROWN, SMALL, WeaveNet
 from stereoweave.learn.recipe import Recipe
 
@@ -52,10 +51,9 @@ class CodeNetwork(Protocol):
 
 def network_of(recipe: Recipe) -> Any:
     """The network of a recipe with random weights; FormatError for an unknown name."""
-    models = MODELS | VARIANTS
-    if recipe.model not in models:
+    if recipe.model not in MODELS:
         raise FormatError(f"{recipe.name}: model = {recipe.model!r}, expected {' or '.join(MODELS)}")
     if recipe.model == "psmnet":
         # The only one that has its range of disparities built in and lets one choose it.
         return PSMNet(int(recipe.max_disparity_px))
-    return models[recipe.model]()
+    return MODELS[recipe.model]()

@@ -2,6 +2,7 @@ import csv
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -10,13 +11,14 @@ from rich.console import Console
 
 from experiments.ablations import experiment as ablations
 from experiments.ablations.experiment import BASE, VARIATIONS, fingerprint, plan, run_ablations
+from experiments.ablations.networks import VARIANTS
 from stereoweave.cli import root as cli
 from stereoweave.data.packing import packed
 from stereoweave.data.shards import write_shard
 from stereoweave.learn import checkpoint
 from stereoweave.learn.data.sources import VALIDATION_SEED
 from stereoweave.learn.export.from_checkpoint import multiply_adds
-from stereoweave.learn.models import network_of
+from stereoweave.learn.models import MODELS, network_of
 from stereoweave.learn.recipe import read_recipe
 from stereoweave.learn.training.objective import objective_of
 
@@ -44,6 +46,13 @@ SCORES = [
     "flying_percent",
 ]
 QUIET = Console(quiet=True)
+
+
+@pytest.fixture(autouse=True)
+def models():
+    """Networks as they were before; an ablation adds its own."""
+    with patch.dict(MODELS):
+        yield
 
 
 @pytest.fixture
@@ -113,6 +122,7 @@ def test_every_variation_is_planned_with_the_first_seed_before_any_with_the_next
 
 
 def test_every_variation_has_a_network_and_a_loss():
+    MODELS.update(VARIANTS)
     for recipe in {replace(trial.recipe, name="", seed=0) for trial in plan(RECIPE, 1)}:
         objective_of(recipe, network_of(recipe))
 

@@ -5,8 +5,9 @@ import torch
 from learn_examples import untrained
 from torch import nn
 
+from experiments.ablations.networks import VARIANTS, soft_argmax, upsample_bilinear
+from stereoweave.learn.models import MODELS
 from stereoweave.learn.models.layers import local_soft_argmax
-from stereoweave.learn.models.variants import VARIANTS, soft_argmax, upsample_bilinear
 from stereoweave.learn.training.losses import weave_losses
 
 CONTEXT = "aggregation.context"
@@ -23,6 +24,13 @@ DIFFERENT = {
     "weave_small_nine_neighbours": {"weights", "refinement.weights"},
     "weave_small_looked_up": {"to_match_half", "to_half", "refinement.join"},
 }  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def registered(monkeypatch):
+    """Let recipes name the variants."""
+    for name, network in VARIANTS.items():
+        monkeypatch.setitem(MODELS, name, network)
 
 
 @pytest.fixture(params=VARIANTS)
