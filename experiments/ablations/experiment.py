@@ -14,7 +14,7 @@ import torch
 from rich.console import Console
 
 from experiments.ablations.networks import VARIANTS
-from experiments.paper.trials import Trial
+from experiments.trial import Trial
 from stereoweave.bench.edge_metrics import edge_bad_percent, edge_epe_px, flying_percent
 from stereoweave.bench.projected_views import Method
 from stereoweave.data.shards import Shards

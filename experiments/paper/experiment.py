@@ -10,7 +10,8 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
-from experiments.paper.trials import CLAIMS, SHORT, Trial, trials
+from experiments.paper.trials import CLAIMS, SHORT, trials
+from experiments.trial import Trial
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn.data.sources import kept, sources
 from stereoweave.learn.recipe import COLLAGE, Recipe

@@ -26,8 +26,8 @@ from experiments.paper.trials import (
     SCRATCH,
     TRANSFER,
     TUNED,
-    Trial,
 )
+from experiments.trial import Trial
 from stereoweave.bench.pairs import write_csv
 from stereoweave.bench.projected_views import Method, ViewRow
 from stereoweave.errors import FormatError, StereoweaveError

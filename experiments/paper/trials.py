@@ -1,9 +1,10 @@
 """The trainings of the paper's experiment: for each claim recipes that differ in one thing alone."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
+from experiments.trial import Trial
 from stereoweave.learn.recipe import COLLAGE, Recipe
 
 CLAIMS = NETWORKS, NETWORKS_SHORT, ADJUSTMENT, PROJECTION, LOSS, DECODER, TRANSFER, ITERATIONS = (
@@ -32,15 +33,6 @@ FIGURE_3_STEPS = (10, 50, 250)
 OTHER_SEED = 100
 OTHER_PAIRS = 500
 OTHER_SIZE = 1.5
-
-
-@dataclass(frozen=True, kw_only=True)
-class Trial:
-    """One training: the claim it is for, what is special about it there, and its recipe."""
-
-    claim: str
-    setting: str
-    recipe: Recipe
 
 
 def trials(base: Recipe, seeds: int, fitted_exponent: float) -> list[Trial]:

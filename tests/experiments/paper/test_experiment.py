@@ -31,9 +31,9 @@ from experiments.paper.trials import (
     PAPER,
     PROJECTION,
     TRANSFER,
-    Trial,
     trials,
 )
+from experiments.trial import Trial
 from stereoweave.data.paper_layout import write_frame
 from stereoweave.io.files import read_image
 from stereoweave.learn import checkpoint
