@@ -1,8 +1,6 @@
 """The commands stereoweave bench pairs | views | networks | speed | costs | parity | paper, more."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,71 +18,17 @@ from stereoweave.cli.options import (
     parse_size_px,
     place_for,
 )
+from stereoweave.cli.tables import (
+    FLICKER_TABLES,
+    PAIRS_TABLES,
+    VIEWS_TABLES,
+    print_classes,
+    print_means,
+    write_and_print,
+)
 
 # What is added to a network's name where `refining` comes after it.
 REFINED = " refined"
-# What stereoweave bench pairs shows of its rows, by heading and column.
-PAIRS_TABLES = {
-    "Errors, mean over the scenes": {
-        "EPE px": "epe_px",
-        "bad-1 %": "bad1_percent",
-        "bad-2 %": "bad2_percent",
-        "D1 %": "d1_percent",
-        "edge EPE": "edge_epe_px",
-        "edge bad-1": "edge_bad1_percent",
-        "flying %": "flying_percent",
-    },
-    "Cost and confidence, mean over the scenes": {
-        "ms": "time_ms",
-        "x SGBM": "time_relative",
-        "RAM MB": "memory_mb",
-        "AUSE px": "ause_px",
-        "AUSE %": "ause_bad1_percent",
-        "calibr. error": "calibration_error",
-    },
-}
-
-# What stereoweave bench pairs --classes shows: a column for each class.
-CLASS_TABLES = {
-    "Pixels by class, % of the known ones": "share_percent",
-    "bad-1 by class, points: together they make bad-1": "bad1_percent",
-    "bad-2 by class, points": "bad2_percent",
-    "EPE within each class, px": "epe_px",
-}
-
-# As short as eight columns have to be in 80 characters.
-CLASS_HEADINGS = {"thin_or_edge": "edges", "weak_texture": "weak", "textured": "texture"}
-
-# The same of stereoweave bench views.
-FLICKER_TABLES = {
-    "Disparity and the view half-way, mean over the scenes": {
-        "flicker px": "flicker_px",
-        "of the view": "view_flicker_levels",
-        "EPE px": "epe_px",
-        "moving": "moving_epe_px",
-        "uncovered": "uncovered_epe_px",
-        "ms": "time_ms",
-    },
-}
-VIEWS_TABLES = {
-    "New views, PSNR in dB, mean over the scenes": {
-        "all": "psnr_db",
-        "smooth": "smooth_psnr_db",
-        "edges": "edge_psnr_db",
-        "one sees": "one_psnr_db",
-        "neither": "neither_psnr_db",
-        "ms": "time_ms",
-    },
-    "New views, mean absolute error in levels of 0..255, and SSIM": {
-        "all": "mae",
-        "smooth": "smooth_mae",
-        "edges": "edge_mae",
-        "one sees": "one_mae",
-        "neither": "neither_mae",
-        "SSIM": "ssim",
-    },
-}
-
 RecipeFile = Annotated[
     Path, typer.Argument(metavar="RECIPE", help="A TOML file, such as recipes/paper/experiment.toml.")
 ]
@@ -156,7 +100,7 @@ def pairs(  # noqa: PLR0913 - each is a word of the command line
     means = [row for row in rows if row.scene == MEAN]
     if plot or sparsification:
         _draw_plots(plot, sparsification, means, {name: scores.curves[name] for name in (*makers, SGBM)})
-    _tell_means(PAIRS_TABLES, "matcher", means)
+    print_means(PAIRS_TABLES, "matcher", means)
     if classes:
         _write_classes(classes, scores)
     typer.echo(f"rows: {out}")
@@ -215,7 +159,7 @@ def views(  # noqa: PLR0913 - each is a word of the command line
     scenes = partial(list_view_scenes, folder.absolute())
     scores = score_scenes(_makers(model, threads, provider), scenes, threads, engine)
     write_csv(out, scores.rows, scores.machine)
-    _tell_means(VIEWS_TABLES, "method", [row for row in scores.rows if row.scene == MEAN])
+    print_means(VIEWS_TABLES, "method", [row for row in scores.rows if row.scene == MEAN])
     typer.echo(f"rows: {out}")
 
 
@@ -236,7 +180,7 @@ def flicker(  # noqa: PLR0913 - each is a word of the command line
 
     rows = list(flicker_rows(scenes, model, frames=frames, threads=threads, provider=provider))
     write_csv(out, rows)
-    _tell_means(FLICKER_TABLES, "film", means(rows))
+    print_means(FLICKER_TABLES, "film", means(rows))
     typer.echo(f"rows: {out}")
 
 
@@ -262,7 +206,7 @@ def networks(
     with needing_the_train_extra():
         from stereoweave.learn.evaluation import evaluate
     rows = evaluate(runs, pairs or runs[0].parent / "pairs", Console())
-    _write_and_tell(out, "Means over the held-out pairs", rows)
+    write_and_print(out, "Means over the held-out pairs", rows)
 
 
 @bench.command()
@@ -277,7 +221,7 @@ def speed(
 
         read = read_recipe(recipe)
         from experiments.speed.timing import run_times
-    _write_and_tell(out, "A pair of 640x480", run_times(read))
+    write_and_print(out, "A pair of 640x480", run_times(read))
 
 
 @bench.command()
@@ -430,26 +374,6 @@ def _experiment(  # noqa: PLR0913 - the words of two command lines
     typer.echo(f"tables: {report / 'paper.md'}")
 
 
-def _tell_means(tables: Mapping[str, Mapping[str, str]], who: str, rows: Sequence[Any]) -> None:
-    """Print rows in several tables, since one would be wider than a terminal.
-
-    Args:
-        tables: By title, the columns' fields by heading.
-        who: The field that names a row.
-        rows: Dataclasses of one kind.
-    """
-    from rich.console import Console
-    from rich.table import Column, Table
-
-    for title, columns in tables.items():
-        numbers = (Column(name, justify="right") for name in columns)
-        table = Table(Column(who, no_wrap=True), *numbers, title=title)
-        for row in rows:
-            cells = [getattr(row, field) for field in columns.values()]
-            table.add_row(Path(getattr(row, who)).name, *map(_cell, cells))
-        Console().print(table)
-
-
 def _check_plots(*pictures: Path | None) -> None:
     """Fail before anything is scored where a picture cannot be drawn or written."""
     from stereoweave.io.files import picture_kind
@@ -477,48 +401,5 @@ def _write_classes(file: Path, scores: Any) -> None:
     from stereoweave.bench.pairs import MEAN, write_csv
 
     write_csv(file, scores.class_rows, scores.machine)
-    _print_classes([row for row in scores.class_rows if row.scene == MEAN])
+    print_classes([row for row in scores.class_rows if row.scene == MEAN])
     typer.echo(f"errors by class: {file}")
-
-
-def _print_classes(means: Sequence[Any]) -> None:
-    """Print the mean rows of errors by class, a row for each matcher and a column for each class."""
-    from rich.console import Console
-    from rich.table import Column, Table
-
-    matchers = list(dict.fromkeys(row.matcher for row in means))
-    names = list(dict.fromkeys(row.pixel_class for row in means))
-    found = {(row.matcher, row.pixel_class): row for row in means}
-    for title, field in CLASS_TABLES.items():
-        headings = (Column(CLASS_HEADINGS.get(name, name), justify="right") for name in names)
-        table = Table(Column("matcher", no_wrap=True), *headings, title=title)
-        # The share of a class is the same for every matcher.
-        rows = {"any": matchers[0]} if field == "share_percent" else {Path(m).name: m for m in matchers}
-        for label, matcher in rows.items():
-            table.add_row(label, *(_cell(getattr(found[matcher, name], field)) for name in names))
-        Console().print(table)
-
-
-def _cell(number: float) -> str:
-    return "–" if math.isnan(number) else f"{number:.2f}"
-
-
-def _write_and_tell(out: Path, title: str, rows: Sequence[Any]) -> None:
-    """Write dataclass rows as CSV, print them as a table, and name the file."""
-    from stereoweave.bench.pairs import write_csv
-
-    write_csv(out, rows)
-    _tell_table(title, rows)
-    typer.echo(f"rows: {out}")
-
-
-def _tell_table(title: str, rows: Sequence[Any]) -> None:
-    """Print dataclass rows as a table, under their fields' names; nothing is cut to fit a terminal."""
-    from rich.console import Console
-    from rich.table import Column, Table
-
-    table = Table(*(Column(name, overflow="fold") for name in asdict(rows[0])), title=title)
-    for row in rows:
-        cells = asdict(row).values()
-        table.add_row(*(f"{cell:.2f}" if isinstance(cell, float) else str(cell) for cell in cells))
-    Console().print(table)
