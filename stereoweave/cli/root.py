@@ -29,16 +29,21 @@ app.add_typer(synth, name="synth")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """0 where the command line went well; 2 after a mistake of the caller's, told in one line on stderr."""
+    """Run the command `stereoweave`. Returns its exit code, as `run` does."""
+    return run(app, "stereoweave", arguments)
+
+
+def run(commands: typer.Typer, program: str, arguments: Sequence[str] | None) -> int:
+    """Run a command line. Returns 0, or 2 after a user's mistake, which is reported on stderr in one line."""
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # as stderr is, for names that are no UTF-8
+        sys.stdout.reconfigure(errors="backslashreplace")  # as stderr does, for names that are not UTF-8
     try:
-        return app(arguments, prog_name="stereoweave", standalone_mode=False) or 0
+        return commands(arguments, prog_name=program, standalone_mode=False) or 0
     except typer.TyperException as error:
-        message = error.format_message().rstrip(".") + "; see stereoweave --help"
+        message = error.format_message().rstrip(".") + f"; see {program} --help"
     except (StereoweaveError, OSError) as error:
         message = str(error)
-    typer.echo("stereoweave: " + " ".join(message.splitlines()), err=True)
+    typer.echo(f"{program}: " + " ".join(message.splitlines()), err=True)
     return 2
 
 
