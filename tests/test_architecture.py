@@ -10,6 +10,7 @@ import pytest
 REPOSITORY = Path(__file__).resolve().parent.parent
 CONTRACTS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
 
+PYTORCH = "The package imports PyTorch under learn alone, and no experiment"
 # A contract, a file, and the line in it that the contract forbids.
 BREACHES = [
     ("Rooms import downwards", "matching/matcher.py", "import stereoweave.cameras.rig"),
@@ -17,9 +18,11 @@ BREACHES = [
     ("Rooms import downwards", "new_file.py", "import stereoweave.stereo"),
     ("No circle of imports", "learn/recipe.py", "import stereoweave.learn.training.loop"),
     ("No circle of imports", "synth/world.py", "import stereoweave.synth.stage"),
+    ("No circle of imports", "../experiments/trial.py", "import experiments.paper.trials"),
     ("One network never imports another", "learn/models/rival.py", "import stereoweave.learn.models.weave"),
-    ("PyTorch is imported under learn alone", "io/files.py", "def tensor():\n    import torch"),
-    ("PyTorch is imported under learn alone", "io/files.py", "from lightning_fabric import Fabric"),
+    (PYTORCH, "io/files.py", "def tensor():\n    import torch"),
+    (PYTORCH, "io/files.py", "from lightning_fabric import Fabric"),
+    (PYTORCH, "learn/checkpoint.py", "def trials():\n    import experiments.paper.trials"),
 ]
 
 
@@ -67,7 +70,8 @@ def test_the_imports_of_the_package_keep_every_contract():
 
 @pytest.mark.parametrize(("contract", "file", "line"), BREACHES)
 def test_a_breach_of_a_contract_is_caught(tmp_path, contract, file, line):
-    shutil.copytree(REPOSITORY / "stereoweave", tmp_path / "stereoweave")
+    for package in ("stereoweave", "experiments"):
+        shutil.copytree(REPOSITORY / package, tmp_path / package)
     shutil.copy(REPOSITORY / "pyproject.toml", tmp_path)
     with (tmp_path / "stereoweave" / file).open("a") as stream:
         stream.write(f"\n{line}\n")

@@ -237,10 +237,11 @@ def settings_table(rows: Sequence[PaperRow], claim: str, depth: bool = False) ->
 
 
 def run_time_table(rows: Iterable[Mapping[str, str]]) -> str:
-    """Markdown: the run times of `stereoweave bench speed`, and the paper's as multiples of DenseMapNet's.
+    """Markdown table of run times, with the paper's as multiples of DenseMapNet's.
 
     Args:
-        rows: The lines of its CSV file; a network that the paper does not time has no number of its.
+        rows: Rows of the CSV file that `python -m experiments.speed` writes. The paper's column is empty
+            where the paper has no time.
     """
     columns = (
         "network",

@@ -42,7 +42,7 @@ from stereoweave.learn.training.objective import truth_histogram
 
 # Held-out pairs that the figures show, counted round where there are fewer.
 SHOWN = (3, 11, 24)
-# In the report's folder, where `stereoweave bench speed` wrote it there.
+# In the report's folder, where `python -m experiments.speed` wrote it there.
 SPEED = "speed.csv"
 
 
@@ -106,7 +106,7 @@ def _gathered(base: Recipe, planned: Sequence[Trial], runs: Path) -> Report:
     if not trained:
         raise StereoweaveError(
             f"{runs}: expected a trial trained to its end, found none of {len(files)}; "
-            "`stereoweave bench paper` goes on with them"
+            "run `python -m experiments.paper`"
         )
     scores, common = _scores([base, *(trial.recipe for trial in trained)], runs)
     names = {trial.recipe.name for trial in trained}
@@ -204,7 +204,7 @@ def _head(report: Report) -> list[str]:
         f" Beyond {base.max_depth_m:g} m ground truth is unknown and gives no source." if report.depth else ""
     )
     return [
-        f"Written by `stereoweave bench paper`. {_pairs(report)}, batch {base.batch}, {base.steps} steps "
+        f"Written by `python -m experiments.paper`. {_pairs(report)}, batch {base.batch}, {base.steps} steps "
         f"unless a table says otherwise, Adam at {base.learning_rate:g}; scores over "
         f"{report.held_out.count} held-out pairs. Right view: made from the left image by forward "
         "projection; MAE, 0 to 255, over all pixels after one row fill, then over the pixels that received a "
@@ -251,8 +251,8 @@ def _run_time(path: Path) -> str:
             table = run_time_table(csv.DictReader(file))
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(
-            f"{path}: expected the rows of `stereoweave bench speed`, found {error}; "
-            "write it anew or remove it"
+            f"{path}: expected the rows of `python -m experiments.speed`, found {error}; "
+            "write it again or remove it"
         ) from error
     return f"A pair of 640x480, all cores of a processor; the paper's are of GPUs.\n\n{table}"
 

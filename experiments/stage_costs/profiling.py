@@ -263,7 +263,7 @@ def _weave_net(run: Path) -> tuple[str, WeaveNet]:
     if not isinstance(network, WeaveNet):
         raise StereoweaveError(
             f"{run}: expected a WeaveNet, whose stages are known, found {kept.recipe.model}; "
-            "`stereoweave bench speed` times the others as a whole"
+            "`python -m experiments.speed` times other networks as a whole"
         )
     return kept.recipe.name, network
 

@@ -1,4 +1,4 @@
-"""The commands stereoweave bench pairs | views | networks | speed | costs | parity | paper, more."""
+"""The commands stereoweave bench pairs | collages | views | flicker | networks | parity | training."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -29,11 +29,7 @@ from stereoweave.cli.tables import (
 
 # What is added to a network's name where `refining` comes after it.
 REFINED = " refined"
-RecipeFile = Annotated[
-    Path, typer.Argument(metavar="RECIPE", help="A TOML file, such as recipes/paper/experiment.toml.")
-]
-RunsFolder = Annotated[Path, typer.Option("--out", "-o", help="The folder of the trainings.")]
-ReportFolder = Annotated[Path, typer.Option(help="The folder for rows, tables and figures.")]
+
 Classes = Annotated[
     Path | None,
     typer.Option(
@@ -42,8 +38,6 @@ Classes = Annotated[
         "where plain, weakly textured, textured.",
     ),
 ]
-Seeds = Annotated[int, typer.Option(min=1, help="How often each training is repeated.")]
-Jobs = Annotated[int, typer.Option(min=1, help="Trainings at a time.")]
 
 bench = typer.Typer(help="Score matchers side by side.")
 
@@ -210,21 +204,6 @@ def networks(
 
 
 @bench.command()
-def speed(
-    recipe: RecipeFile,
-    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("speed.csv"),
-) -> None:
-    """Time of the paper's network and its rivals for a pair of 640x480, in PyTorch and in ONNX Runtime."""
-    place_for(out)
-    with needing_the_train_extra():
-        from stereoweave.learn.recipe import read_recipe
-
-        read = read_recipe(recipe)
-        from experiments.speed.timing import run_times
-    write_and_print(out, "A pair of 640x480", run_times(read))
-
-
-@bench.command()
 def parity(
     checkpoints: Annotated[
         list[Path], typer.Argument(metavar="CHECKPOINT...", help="Of shipped networks, as in checkpoints/.")
@@ -245,76 +224,6 @@ def parity(
 
 
 @bench.command()
-def costs(
-    runs: Annotated[list[Path], typer.Argument(help="Folders of runs, or checkpoints in them.")],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="A CSV file to write, too.")] = None,
-) -> None:
-    """What every stage of trained WeaveNets costs: multiply-adds, bytes moved, time; a Markdown table.
-
-    The last columns compare it with the peak, a large matrix product measured in the same run.
-    """
-    from stereoweave.bench.pairs import write_csv
-
-    if out:
-        place_for(out)
-    with needing_the_train_extra():
-        from experiments.stage_costs.profiling import markdown, stage_costs
-    rows = stage_costs(runs)
-    if out:
-        write_csv(out, rows)
-    typer.echo(markdown(rows))
-
-
-@bench.command()
-def paper(
-    recipe: RecipeFile,
-    out: RunsFolder,
-    report: ReportFolder,
-    seeds: Seeds = 3,
-    jobs: Jobs = 1,
-) -> None:
-    """The paper's experiment: train its network, its rivals and every variant, and compare with its tables.
-
-    Stopped and started again it goes on where it was.
-    """
-    from experiments.paper.trials import CLAIMS
-
-    _experiment(recipe, out, report, seeds, jobs, CLAIMS)
-
-
-@bench.command()
-def ablations(
-    recipe: RecipeFile,
-    out: RunsFolder,
-    report: Annotated[
-        Path,
-        typer.Option(
-            help="The CSV file to write, a row a training. Rows of other recipes are dropped, those of the "
-            "same are taken as they are: remove the file after a change of code."
-        ),
-    ],
-    rendered: Annotated[
-        Path, typer.Option(metavar="FOLDER", help="Held-out pairs of stereoweave synth make.")
-    ] = Path("runs/synth_val/rooms"),
-    seeds: Seeds = 2,
-) -> None:
-    """WeaveNet's choices made otherwise, one at a time: train each, score it on collages and rendered pairs.
-
-    Stopped and started again it goes on where it was.
-    """
-    from rich.console import Console
-
-    with needing_the_train_extra():
-        from stereoweave.learn.recipe import read_recipe
-
-        base = read_recipe(recipe)
-        place_for(report)
-        from experiments.ablations.experiment import plan, run_ablations
-    run_ablations(plan(base, seeds), out, rendered, report, Console())
-    typer.echo(f"rows: {report}")
-
-
-@bench.command()
 def training(
     run: Annotated[Path, typer.Argument(help="The folder of a run of stereoweave train.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file; rows of other runs in it stay.")],
@@ -325,20 +234,6 @@ def training(
         from stereoweave.learn.training.curves import record_curve
     for name, law in record_curve(run, out).items():
         typer.echo(f"{name}: {law.at_10000_pairs:.4g} * (pairs / 10,000)^-{law.exponent:.3f}")
-
-
-@bench.command()
-def exponent(
-    recipe: RecipeFile,
-    out: RunsFolder,
-    report: ReportFolder,
-    seeds: Seeds = 3,
-    jobs: Jobs = 1,
-) -> None:
-    """The paper's Fig. 2: the curves of the depth adjustment, and the validation loss with and without it."""
-    from experiments.paper.trials import ADJUSTMENT
-
-    _experiment(recipe, out, report, seeds, jobs, (ADJUSTMENT,))
 
 
 def _makers(models: Sequence[str] | None, threads: int | None, provider: str) -> dict[str, Callable[[], Any]]:
@@ -354,24 +249,6 @@ def _makers(models: Sequence[str] | None, threads: int | None, provider: str) ->
         if name not in MODES:  # which refine by themselves
             makers[name + REFINED] = partial(network, model, threads, refined=True, provider=provider)
     return makers
-
-
-def _experiment(  # noqa: PLR0913 - the words of two command lines
-    recipe: Path, out: Path, report: Path, seeds: int, jobs: int, claims: Sequence[str]
-) -> None:
-    from rich.console import Console
-
-    console = Console()
-    with needing_the_train_extra():
-        from stereoweave.learn.recipe import read_recipe
-
-        base = read_recipe(recipe)
-        from experiments.paper.experiment import plan, run_trials
-        from experiments.paper.report import write_report
-    planned = plan(base, out, seeds, console, claims)
-    run_trials(planned, out, jobs, console)
-    write_report(base, planned, out, report)
-    typer.echo(f"tables: {report / 'paper.md'}")
 
 
 def _check_plots(*pictures: Path | None) -> None:

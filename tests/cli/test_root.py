@@ -446,24 +446,9 @@ def test_bench_networks_takes_a_checkpoint_and_pairs_from_where_it_is_told(netwo
         ("bench networks here here -o rows.csv", ["here", "different names"]),
         ("bench networks folder -o taken.png", ["taken.png", "expected a file", "found a folder"]),
         ("bench networks", ["RUN..."]),
-        ("bench speed none.toml -o rows.csv", ["none.toml", "expected a recipe"]),
-        ("bench speed words.toml -o rows.csv", ["words.toml", "expected a recipe"]),
-        ("bench paper none.toml -o runs --report report", ["none.toml", "expected a recipe"]),
-        (
-            "bench paper low.toml -o runs --report report",
-            ["low.toml", "exponent: expected a number of at least 1", "found 0.5"],
-        ),
-        (f"bench paper {RECIPE} -o runs --report report", ["small", "expected 'fast_depth'"]),
-        (f"bench paper {RECIPE} -o runs", ["--report"]),
-        (f"bench paper {RECIPE} -o runs --report report --seeds 0", ["--seeds"]),
-        ("bench exponent words.toml -o runs --report report", ["words.toml", "expected a recipe"]),
-        (f"bench exponent {RECIPE} -o runs --report report --jobs 0", ["--jobs"]),
     ],
 )
 def test_a_mistake_with_a_benchmark_of_networks_is_told_in_one_line(mistakes, capfd, arguments, fragments):
-    Path("words.toml").write_text("these are words")
-    text = (REPOSITORY / "recipes/paper/experiment.toml").read_text()
-    Path("low.toml").write_text(text.replace("exponent = 1.5", "exponent = 0.5"))
     before = sorted(mistakes.rglob("*"))
     assert run(arguments) == 2
     printed, told = capfd.readouterr()
@@ -472,65 +457,6 @@ def test_a_mistake_with_a_benchmark_of_networks_is_told_in_one_line(mistakes, ca
     assert line.startswith("stereoweave: ")
     assert [fragment for fragment in fragments if fragment not in line] == []
     assert sorted(mistakes.rglob("*")) == before
-
-
-def test_bench_speed_writes_a_row_a_network(tmp_path, monkeypatch, capfd):
-    from experiments.speed import timing as speed
-
-    monkeypatch.chdir(tmp_path)
-    given = []
-    row = speed.SpeedRow(
-        network="densemapnet",
-        parameters=290290,
-        multiply_adds=8_410_000_000,
-        eager_ms=400.0,
-        eager_relative=1.0,
-        onnx_ms=80.0,
-        onnx_relative=1.0,
-    )
-    monkeypatch.setattr(speed, "run_times", lambda recipe: given.append(recipe.name) or [row])
-    assert run(f"bench speed {REPOSITORY}/recipes/paper/experiment.toml") == 0
-    assert given == ["experiment"]
-    (written,) = read_rows("speed.csv")
-    assert (written["network"], written["parameters"], written["eager_ms"]) == (
-        "densemapnet",
-        "290290",
-        "400",
-    )
-    assert capfd.readouterr().out.endswith("rows: speed.csv\n")
-
-
-@pytest.mark.parametrize(
-    ("command", "claims"), [("paper", None), ("exponent", ("depth adjustment",))], ids=["paper", "exponent"]
-)
-def test_the_experiment_is_planned_trained_and_reported(tmp_path, monkeypatch, capfd, command, claims):
-    from experiments.paper import experiment as paper
-    from experiments.paper import report as paper_report
-    from experiments.paper.trials import CLAIMS
-
-    monkeypatch.chdir(tmp_path)
-    done = []
-
-    def plan(base, runs, seeds, console, chosen):
-        done.append(("plan", base.name, runs, seeds, chosen))
-        return ["trials"]
-
-    monkeypatch.setattr(paper, "plan", plan)
-    monkeypatch.setattr(paper, "run_trials", lambda *given: done.append(("train", *given[:3])))
-    monkeypatch.setattr(
-        paper_report,
-        "write_report",
-        lambda base, *given: done.append(("report", base.name, *given)),
-    )
-    recipe = REPOSITORY / "recipes/paper/experiment.toml"
-    assert run(f"bench {command} {recipe} -o runs --report results --seeds 2 --jobs 4") == 0
-    runs, report = Path("runs"), Path("results")
-    assert done == [
-        ("plan", "experiment", runs, 2, claims or CLAIMS),
-        ("train", ["trials"], runs, 4),
-        ("report", "experiment", ["trials"], runs, report),
-    ]
-    assert capfd.readouterr().out == "tables: results/paper.md\n"
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,9 @@ from learn_examples import CAMERA, RECIPE, box_before_a_wall, checkpoint_of, com
 from rich.console import Console
 
 from experiments.ablations import experiment as ablations
+from experiments.ablations.__main__ import main
 from experiments.ablations.experiment import BASE, VARIATIONS, fingerprint, plan, run_ablations
 from experiments.ablations.networks import VARIANTS
-from stereoweave.cli import root as cli
 from stereoweave.data.packing import packed
 from stereoweave.data.shards import write_shard
 from stereoweave.learn import checkpoint
@@ -200,8 +200,8 @@ def test_the_command_trains_what_is_planned(rendered, runs, trained, tmp_path, m
     lines += [f"{key} = {np.array(getattr(RECIPE, key)).tolist()}" for key in sizes]
     recipe.write_text("\n".join(['name = "tiny"', *lines]))
     report = tmp_path / "ablations.csv"
-    words = ["bench", "ablations", recipe, "-o", runs, "--report", report, "--rendered", rendered]
-    assert cli.main([str(word) for word in words]) == 0
+    words = [recipe, "-o", runs, "--report", report, "--rendered", rendered]
+    assert main([str(word) for word in words]) == 0
     assert trained == ["base-seed0", "base-seed1"]
     assert str(report) in capfd.readouterr().out
     assert [row["seed"] for row in read(report)] == ["0", "1"]

@@ -406,8 +406,8 @@ def test_run_times_beside_the_report_join_it(experiment, tmp_path):
     speed.write_text("network\nfast_depth\n")
     words = complaint(write_report, BASE, experiment.of(EARLY), experiment.runs, tmp_path)
     assert words == (
-        f"{speed}: expected the rows of `stereoweave bench speed`, found 'onnx_relative'; "
-        "write it anew or remove it"
+        f"{speed}: expected the rows of `python -m experiments.speed`, found 'onnx_relative'; "
+        "write it again or remove it"
     )
 
 
@@ -417,7 +417,7 @@ def test_a_report_of_nothing_is_refused(tmp_path):
     names = {trial.recipe.name for trial in planned}
     assert complaint(write_report, BASE, planned, tmp_path / "runs", out) == (
         f"{tmp_path}/runs: expected a trial trained to its end, found none of {len(names)}; "
-        "`stereoweave bench paper` goes on with them"
+        "run `python -m experiments.paper`"
     )
     assert not out.exists()
 

@@ -8,7 +8,7 @@ from learn_examples import RECIPE, checkpoint_of, complaint, recipe_of, untraine
 from onnx import TensorProto, helper
 
 from experiments.stage_costs import profiling as costs
-from stereoweave.cli.root import main
+from experiments.stage_costs.__main__ import main
 from stereoweave.learn import checkpoint
 from stereoweave.learn.export.from_checkpoint import multiply_adds
 
@@ -197,7 +197,7 @@ def test_the_command_prints_the_table_and_writes_the_rows(rows, monkeypatch, tmp
     _, found = rows
     asked = []
     monkeypatch.setattr(costs, "stage_costs", lambda runs: asked.append(runs) or found)
-    assert main(["bench", "costs", "a", "b.pt", "-o", str(tmp_path / "costs.csv")]) == 0
+    assert main(["a", "b.pt", "-o", str(tmp_path / "costs.csv")]) == 0
     assert asked == [[Path("a"), Path("b.pt")]]
     assert capsys.readouterr().out == costs.markdown(found) + "\n"
     with (tmp_path / "costs.csv").open(newline="") as file:

@@ -1,0 +1,51 @@
+"""The command `python -m experiments.ablations`."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from experiments.command_line import RecipeFile, RunsFolder, Seeds, run
+from stereoweave.cli.options import needing_the_train_extra, place_for
+
+
+def ablations(
+    recipe: RecipeFile,
+    out: RunsFolder,
+    report: Annotated[
+        Path,
+        typer.Option(
+            help="CSV file to write, one row per training. Rows of the same recipe are reused, others are "
+            "dropped: remove the file after a change of the code."
+        ),
+    ],
+    rendered: Annotated[
+        Path, typer.Option(metavar="FOLDER", help="Held-out pairs from stereoweave synth make.")
+    ] = Path("runs/synth_val/rooms"),
+    seeds: Seeds = 2,
+) -> None:
+    """Change one design choice of WeaveNet at a time, train it, and score it on collages and rendered pairs.
+
+    Rerun the same command to resume after an interruption.
+    """
+    from rich.console import Console
+
+    from stereoweave.learn.recipe import read_recipe
+
+    base = read_recipe(recipe)
+    place_for(report)
+    with needing_the_train_extra():
+        from experiments.ablations.experiment import plan, run_ablations
+    run_ablations(plan(base, seeds), out, rendered, report, Console())
+    typer.echo(f"rows: {report}")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line. Returns its exit code."""
+    return run(ablations, "experiments.ablations", arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

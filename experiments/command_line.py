@@ -1,0 +1,22 @@
+"""Options and error handling that the experiments' command lines share."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stereoweave.cli import root
+
+RecipeFile = Annotated[
+    Path, typer.Argument(metavar="RECIPE", help="TOML file, such as recipes/paper/experiment.toml.")
+]
+RunsFolder = Annotated[Path, typer.Option("--out", "-o", help="Folder of the trainings.")]
+Seeds = Annotated[int, typer.Option(min=1, help="Repetitions of each training, with different seeds.")]
+
+
+def run(command: Callable[..., None], module: str, arguments: Sequence[str] | None) -> int:
+    """Run an experiment's only command, as `python -m MODULE`. Returns its exit code, as `root.run` does."""
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+    app.command()(command)
+    return root.run(app, f"python -m {module}", arguments)

@@ -1,0 +1,49 @@
+"""The command `python -m experiments.paper`."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from experiments.command_line import RecipeFile, RunsFolder, Seeds, run
+from experiments.paper.trials import ADJUSTMENT, CLAIMS
+from stereoweave.cli.options import needing_the_train_extra
+
+
+def paper(  # noqa: PLR0913 - each is an option of the command line
+    recipe: RecipeFile,
+    out: RunsFolder,
+    report: Annotated[Path, typer.Option(help="Folder for rows, tables and figures.")],
+    seeds: Seeds = 3,
+    jobs: Annotated[int, typer.Option(min=1, help="Trainings that run at the same time.")] = 1,
+    exponent_only: Annotated[
+        bool, typer.Option("--exponent-only", help="Run the depth adjustment (Fig. 2) only.")
+    ] = False,
+) -> None:
+    """Train the paper's network, its rivals and every variant, and compare them with the paper's tables.
+
+    Rerun the same command to resume after an interruption.
+    """
+    from rich.console import Console
+
+    from stereoweave.learn.recipe import read_recipe
+
+    base, console = read_recipe(recipe), Console()
+    with needing_the_train_extra():
+        from experiments.paper.experiment import plan, run_trials
+        from experiments.paper.report import write_report
+    planned = plan(base, out, seeds, console, (ADJUSTMENT,) if exponent_only else CLAIMS)
+    run_trials(planned, out, jobs, console)
+    write_report(base, planned, out, report)
+    typer.echo(f"tables: {report / 'paper.md'}")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line. Returns its exit code."""
+    return run(paper, "experiments.paper", arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,40 @@
+"""The command `python -m experiments.stage_costs`."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from experiments.command_line import run
+from stereoweave.cli.options import needing_the_train_extra, place_for
+
+
+def stage_costs(
+    runs: Annotated[list[Path], typer.Argument(help="Checkpoints, or folders of stereoweave train.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="CSV file to write as well.")] = None,
+) -> None:
+    """Measure each stage of trained WeaveNets: multiply-adds, bytes moved, time; print a Markdown table.
+
+    The "of the peak" columns compare a stage's speed with that of a large matrix product in the same run.
+    """
+    from stereoweave.bench.pairs import write_csv
+
+    if out:
+        place_for(out)
+    with needing_the_train_extra():
+        from experiments.stage_costs import profiling
+    rows = profiling.stage_costs(runs)
+    if out:
+        write_csv(out, rows)
+    typer.echo(profiling.markdown(rows))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line. Returns its exit code."""
+    return run(stage_costs, "experiments.stage_costs", arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,127 @@
+import csv
+import os
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from experiments.paper.trials import CLAIMS
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+RECIPE = REPOSITORY / "recipes" / "weave_small.toml"
+PAPER_RECIPE = REPOSITORY / "recipes" / "paper" / "experiment.toml"
+EXPERIMENTS = "ablations", "paper", "speed", "stage_costs"
+
+
+def run(line):
+    experiment, *arguments = line.split()
+    return import_module(f"experiments.{experiment}.__main__").main(arguments)
+
+
+def read_rows(file):
+    with Path(file).open() as stream:
+        return list(csv.DictReader(stream))
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("words.toml").write_text("these are words")
+    Path("low.toml").write_text(PAPER_RECIPE.read_text().replace("exponent = 1.5", "exponent = 0.5"))
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("line", "fragments"),
+    [
+        ("speed none.toml -o rows.csv", ["none.toml", "expected a recipe"]),
+        ("speed words.toml -o rows.csv", ["words.toml", "expected a recipe"]),
+        ("paper none.toml -o runs --report report", ["none.toml", "expected a recipe"]),
+        ("paper low.toml -o runs --report report", ["low.toml", "exponent = 0.5", "at least 1"]),
+        (f"paper {RECIPE} -o runs --report report", ["small", "expected 'fast_depth'"]),
+        (f"paper {RECIPE} -o runs", ["--report", "--help"]),
+        (f"paper {RECIPE} -o runs --report report --seeds 0", ["--seeds"]),
+        ("paper words.toml -o runs --report report --exponent-only", ["words.toml", "expected a recipe"]),
+        (f"paper {RECIPE} -o runs --report report --exponent-only --jobs 0", ["--jobs"]),
+        ("ablations none.toml -o runs --report rows.csv", ["none.toml", "expected a recipe"]),
+        ("stage_costs none.pt -o rows.csv", ["none.pt", "no such checkpoint"]),
+    ],
+)
+def test_a_mistake_with_an_experiment_is_reported_in_one_line(folder, capfd, line, fragments):
+    before = sorted(folder.rglob("*"))
+    assert run(line) == 2
+    printed, reported = capfd.readouterr()
+    assert printed == ""
+    (message,) = reported.splitlines()
+    assert message.startswith(f"python -m experiments.{line.split()[0]}: ")
+    assert [fragment for fragment in fragments if fragment not in message] == []
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_every_experiment_is_a_program_of_its_own():
+    packages = {file.parent.name for file in (REPOSITORY / "experiments").glob("*/__main__.py")}
+    assert packages == set(EXPERIMENTS)
+    for name in EXPERIMENTS:
+        command = [sys.executable, "-m", f"experiments.{name}", "--help"]
+        environment = os.environ | {"COLUMNS": "200"}
+        done = subprocess.run(
+            command, cwd=REPOSITORY, env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        assert f"Usage: python -m experiments.{name} [OPTIONS]" in done.stdout
+
+
+def test_run_times_are_written_one_row_per_network(folder, monkeypatch, capfd):
+    from experiments.speed import timing
+
+    given = []
+    row = timing.SpeedRow(
+        network="densemapnet",
+        parameters=290290,
+        multiply_adds=8_410_000_000,
+        eager_ms=400.0,
+        eager_relative=1.0,
+        onnx_ms=80.0,
+        onnx_relative=1.0,
+    )
+    monkeypatch.setattr(timing, "run_times", lambda recipe: given.append(recipe.name) or [row])
+    assert run(f"speed {PAPER_RECIPE}") == 0
+    assert given == ["experiment"]
+    (written,) = read_rows("speed.csv")
+    assert (written["network"], written["parameters"], written["eager_ms"]) == (
+        "densemapnet",
+        "290290",
+        "400",
+    )
+    assert capfd.readouterr().out.endswith("rows: speed.csv\n")
+
+
+@pytest.mark.parametrize(
+    ("option", "claims"),
+    [("", CLAIMS), ("--exponent-only", ("depth adjustment",))],
+    ids=["all claims", "exponent only"],
+)
+def test_the_papers_experiment_is_planned_trained_and_reported(folder, monkeypatch, capfd, option, claims):
+    from experiments.paper import experiment, report
+
+    done = []
+
+    def plan(base, runs, seeds, console, chosen):
+        done.append(("plan", base.name, runs, seeds, chosen))
+        return ["trials"]
+
+    monkeypatch.setattr(experiment, "plan", plan)
+    monkeypatch.setattr(experiment, "run_trials", lambda *given: done.append(("train", *given[:3])))
+    monkeypatch.setattr(
+        report, "write_report", lambda base, *given: done.append(("report", base.name, *given))
+    )
+    assert run(f"paper {PAPER_RECIPE} -o runs --report results --seeds 2 --jobs 4 {option}") == 0
+    runs, results = Path("runs"), Path("results")
+    assert done == [
+        ("plan", "experiment", runs, 2, claims),
+        ("train", ["trials"], runs, 4),
+        ("report", "experiment", ["trials"], runs, results),
+    ]
+    assert capfd.readouterr().out == "tables: results/paper.md\n"
