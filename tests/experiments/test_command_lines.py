@@ -1,5 +1,6 @@
 import csv
 import os
+import re
 import subprocess
 import sys
 from importlib import import_module
@@ -13,6 +14,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 RECIPE = REPOSITORY / "recipes" / "weave_small.toml"
 PAPER_RECIPE = REPOSITORY / "recipes" / "paper" / "experiment.toml"
 EXPERIMENTS = "ablations", "paper", "speed", "stage_costs"
+README = (REPOSITORY / "experiments" / "README.md").read_text(encoding="utf-8")
 
 
 def run(line):
@@ -71,6 +73,18 @@ def test_every_experiment_is_a_program_of_its_own():
         )
         assert done.returncode == 0, done.stderr
         assert f"Usage: python -m experiments.{name} [OPTIONS]" in done.stdout
+
+
+def test_the_readme_has_a_command_for_every_experiment():
+    commands = re.findall(r"`experiments\.(\w+) (\S+)", README)
+    assert {name for name, _ in commands} == set(EXPERIMENTS)
+    assert [file for _, file in commands if not (REPOSITORY / file).is_file()] == []
+
+
+def test_each_file_that_the_readme_links_to_exists():
+    links = re.findall(r"\]\(([^)\s#]+)", README)
+    assert {"paper", "../results/costs.csv", "../docs/paper.md"} <= set(links)
+    assert [link for link in links if not (REPOSITORY / "experiments" / link).exists()] == []
 
 
 def test_run_times_are_written_one_row_per_network(folder, monkeypatch, capfd):
