@@ -89,9 +89,9 @@ _COLUMNS = {
     "minutes": ("minutes", ".1f"),
 }
 # What a setting is claimed to lower: the measure, what we call it, the paper's words, percent.
-_Measured = tuple[str, str, str, float | None]
-_VIEW: _Measured = ("mae_filled", "MAE of the right view", "-", None)
-_ADJUSTMENT: tuple[_Measured, ...] = (
+_Measure = tuple[str, str, str, float | None]
+_VIEW: _Measure = ("mae_filled", "MAE of the right view", "-", None)
+_ADJUSTMENT: tuple[_Measure, ...] = (
     (
         "prediction",
         "validation loss, each in its own code, smaller by construction",
@@ -102,15 +102,15 @@ _ADJUSTMENT: tuple[_Measured, ...] = (
     ("epe_px", "end-point error", "up to 20 %", 20.0),
     _VIEW,
 )
-_PROJECTION: tuple[_Measured, ...] = (
+_PROJECTION: tuple[_Measure, ...] = (
     ("epe_px", "end-point error", "about 20 %, up to 25 %", 20.0),
     ("prediction", "loss between codes", "about 20 %", 20.0),
     _VIEW,
 )
 # The paper has no number of the decoder alone: in Table I it comes with the two contributions.
-_DECODER: tuple[_Measured, ...] = (("epe_px", "end-point error", "-", None), _VIEW)
+_DECODER: tuple[_Measure, ...] = (("epe_px", "end-point error", "-", None), _VIEW)
 # The text of a claim, its name in trials.py, reference, changed setting, and measures.
-_VARIANTS = (
+_CHANGES = (
     ("depth adjustment, p = 1.5 against 1", ADJUSTMENT, "p = 1", "p = 1.5", _ADJUSTMENT),
     ("projection loss", PROJECTION, "without", PAPER, _PROJECTION),
     ("step-wise decoder with skips", DECODER, "upsampled at once, no skips", PAPER, _DECODER),
@@ -119,9 +119,9 @@ _VARIANTS = (
 RUN_TIMES = {"fast_depth": 1.05, "densemapnet": 1.0, "dispnet": 2.0, "psmnet": 10.0}
 
 
-def comparisons(depth: bool = False) -> Iterator[Comparison]:
+def list_comparisons(depth: bool = False) -> Iterator[Comparison]:
     """The claims that one number can decide; with `depth` as target end-point errors are in cm."""
-    for text, claim, reference, changed, measures in (*_VARIANTS, *_rivals(depth)):
+    for text, claim, reference, changed, measures in (*_CHANGES, *_rival_changes(depth)):
         for measure, name, paper, percent in measures:
             yield Comparison(
                 text=f"{text}: {name}",
@@ -134,43 +134,42 @@ def comparisons(depth: bool = False) -> Iterator[Comparison]:
             )
 
 
-def _rivals(depth: bool) -> Iterator[tuple[str, str, str, str, tuple[_Measured, ...]]]:
-    """What Table I comes to for each rival, as rows of _VARIANTS; with `depth` its column of depth alone."""
+def _rival_changes(depth: bool) -> Iterator[tuple[str, str, str, str, tuple[_Measure, ...]]]:
+    """What Table I comes to for each rival, as rows of _CHANGES; with `depth` its column of depth alone."""
     for rival in ("densemapnet", "dispnet", "psmnet"):
         claim = NETWORKS_SHORT if rival == "psmnet" else NETWORKS
         measures = (
-            _in_table_i(rival, 0, "epe_px", "end-point error", depth),
-            _in_table_i(rival, 1, "mae_filled", "MAE of the right view", depth),
+            _table_i_measure(rival, 0, "epe_px", "end-point error", depth),
+            _table_i_measure(rival, 1, "mae_filled", "MAE of the right view", depth),
         )
         yield f"the paper's network against {rival}", claim, rival, "fast_depth", measures
 
 
-def _in_table_i(rival: str, column: int, measure: str, name: str, depth: bool) -> _Measured:
+def _table_i_measure(rival: str, column: int, measure: str, name: str, depth: bool) -> _Measure:
     numbers = zip(TABLE_I[rival][column], TABLE_I["fast_depth"][column], strict=True)
-    less = [less_percent(*both) for both in numbers]
+    less = [reduction_percent(*both) for both in numbers]
     where = "Table I"
     if depth:
         less, where = [less[_PROPELLER]], "Table I, Propeller"
     return measure, name, f"{' '.join(f'{value:z.0f}' for value in less)} % ({where})", float(np.mean(less))
 
 
-def less_percent(reference: float, changed: float) -> float:
+def reduction_percent(reference: float, changed: float) -> float:
     """How many percent less `changed` is than `reference`."""
     return 100 * (1 - changed / reference)
 
 
-def by_seed(rows: Sequence[PaperRow], comparison: Comparison) -> list[float]:
+def reductions_by_seed(rows: Sequence[PaperRow], comparison: Comparison) -> list[float]:
     """Percent less, for each seed that both settings were trained with."""
     reference, changed = (
-        {row.seed: getattr(row, comparison.measure) for row in rows if _of(row, comparison.claim, setting)}
+        {row.seed: getattr(row, comparison.measure) for row in _select(rows, comparison.claim, setting)}
         for setting in (comparison.reference, comparison.changed)
     )
-    return [
-        less_percent(reference[seed], changed[seed]) for seed in sorted(reference.keys() & changed.keys())
-    ]
+    shared = sorted(reference.keys() & changed.keys())
+    return [reduction_percent(reference[seed], changed[seed]) for seed in shared]
 
 
-def half_width(values: Sequence[float]) -> float:
+def interval_half_width(values: Sequence[float]) -> float:
     """Half of the 95 % interval of the mean, by Student's t over the seeds; NaN for less than two."""
     if len(values) < 2:
         return float("nan")
@@ -186,16 +185,16 @@ def claims_table(rows: Sequence[PaperRow], depth: bool = False) -> str:
         "| claim: percent less | paper | here (95 % interval) | difference (points) | verdict |",
         "|---|---|---|---|---|",
     ]
-    for comparison in comparisons(depth):
-        values = by_seed(rows, comparison)
+    for comparison in list_comparisons(depth):
+        values = reductions_by_seed(rows, comparison)
         if not values:
             lines.append(f"| {comparison.text} | {comparison.paper} | not run | | |")
             continue
-        mean, half = float(np.mean(values)), half_width(values)
+        mean, half = float(np.mean(values)), interval_half_width(values)
         interval = f"{mean - half:z.0f} to {mean + half:z.0f}" if len(values) > 1 else "one seed"
         lines.append(
             f"| {comparison.text} | {comparison.paper} | {mean:z.0f} ({interval}) "
-            f"| {_difference(mean, comparison.paper_percent, 0)} | {_verdict(comparison, mean, half)} |"
+            f"| {_format_difference(mean, comparison.paper_percent, 0)} | {_judge(comparison, mean, half)} |"
         )
     return "\n".join(lines)
 
@@ -205,12 +204,12 @@ def propeller_table(rows: Sequence[PaperRow]) -> str:
     columns = "network", "steps", "EPE cm: paper", "here", "difference", "MAE of the right view: paper"
     lines = [f"| {' | '.join((*columns, 'here', 'difference'))} |", "|---" * 8 + "|"]
     found = [row for row in rows if row.claim in (NETWORKS, NETWORKS_SHORT)]
-    for network, steps in sorted({(row.model, row.steps) for row in found}, key=_as_table_i):
+    for network, steps in sorted({(row.model, row.steps) for row in found}, key=_table_i_order):
         chosen = [row for row in found if (row.model, row.steps) == (network, steps)]
         cells = [network, str(steps)]
         for column, measure in zip(TABLE_I[network], ("epe_cm", "mae_filled"), strict=True):
             paper, here = column[_PROPELLER], _mean(chosen, measure)
-            cells += [f"{paper:.2f}", f"{here:.2f}", _difference(here, paper, 2)]
+            cells += [f"{paper:.2f}", f"{here:.2f}", _format_difference(here, paper, 2)]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
@@ -226,7 +225,7 @@ def settings_table(rows: Sequence[PaperRow], claim: str, depth: bool = False) ->
     lines = [f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
     first = next(iter(columns))
     settings = dict.fromkeys(row.setting for row in rows if row.claim == claim)
-    chosen = {name: [row for row in rows if _of(row, claim, name)] for name in settings}
+    chosen = {name: _select(rows, claim, name) for name in settings}
     ranked = sorted(chosen.items(), key=lambda item: (len(item[1]) == 1, _mean(item[1], "mae_filled")))
     for name, found in ranked:
         numbers = [f"{_mean(found, measure):{digits}}" for measure, (_, digits) in columns.items()]
@@ -261,16 +260,16 @@ def run_time_table(rows: Iterable[Mapping[str, str]]) -> str:
             f"| {row['network']} | {row['parameters']} | {float(row['multiply_adds']) / 1e9:.1f} "
             f"| {float(row['eager_ms']):.0f} | {float(row['eager_relative']):.2f} "
             f"| {float(row['onnx_ms']):.0f} | {onnx_relative:.2f} "
-            f"| {'-' if paper is None else f'{paper:g}'} | {_difference(onnx_relative, paper, 2)} |"
+            f"| {'-' if paper is None else f'{paper:g}'} | {_format_difference(onnx_relative, paper, 2)} |"
         )
     return "\n".join(lines)
 
 
-def _difference(here: float, paper: float | None, digits: int) -> str:
+def _format_difference(here: float, paper: float | None, digits: int) -> str:
     return "" if paper is None else f"{here - paper:+z.{digits}f}"
 
 
-def _verdict(comparison: Comparison, mean: float, half: float) -> str:
+def _judge(comparison: Comparison, mean: float, half: float) -> str:
     if not comparison.fair:
         return "not a fair test"
     if np.isnan(half):
@@ -285,13 +284,13 @@ def _verdict(comparison: Comparison, mean: float, half: float) -> str:
     return "better, but less than claimed" if high < comparison.paper_percent else "holds"
 
 
-def _as_table_i(trained: tuple[str, int]) -> tuple[int, int]:
+def _table_i_order(trained: tuple[str, int]) -> tuple[int, int]:
     """The order of Table I's rows, and of the steps."""
     return list(TABLE_I).index(trained[0]), trained[1]
 
 
-def _of(row: PaperRow, claim: str, setting: str) -> bool:
-    return row.claim == claim and row.setting == setting
+def _select(rows: Iterable[PaperRow], claim: str, setting: str) -> list[PaperRow]:
+    return [row for row in rows if row.claim == claim and row.setting == setting]
 
 
 def _mean(rows: Iterable[PaperRow], measure: str) -> float:

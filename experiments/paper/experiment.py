@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
-from experiments.paper.trials import CLAIMS, SHORT, trials
+from experiments.paper.trials import CLAIMS, SHORT, list_trials
 from experiments.trial import Trial
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn.data.sources import kept, sources
@@ -35,10 +35,11 @@ def plan(
         StereoweaveError: The base is not of the paper's network, is too short, or has depth as its target
             where pairs have no camera.
     """
-    _check(base)
+    _check_base(base)
     training, _ = (kept(pairs, console) for pairs in sources(base, runs / "pairs"))
     exponent = fitted(replace(base, fit_exponent=True), training).exponent
-    planned = [_below(trial, runs) for trial in trials(base, seeds, exponent) if trial.claim in claims]
+    chosen = (trial for trial in list_trials(base, seeds, exponent) if trial.claim in claims)
+    planned = [_resolve_start(trial, runs) for trial in chosen]
     for trial in planned:
         for pairs in sources(trial.recipe, runs / "pairs"):
             kept(pairs, console)
@@ -60,7 +61,7 @@ def run_trials(planned: Iterable[Trial], runs: Path, jobs: int, console: Console
     _train_all([recipe for recipe in recipes if recipe.start_from], runs, jobs, console)
 
 
-def _check(base: Recipe) -> None:
+def _check_base(base: Recipe) -> None:
     # A collage has no camera.
     target = {"target": "disparity"} if base.dataset == COLLAGE else {}
     for key, expected in {"model": "fast_depth", **target}.items():
@@ -75,7 +76,7 @@ def _check(base: Recipe) -> None:
         )
 
 
-def _below(trial: Trial, runs: Path) -> Trial:
+def _resolve_start(trial: Trial, runs: Path) -> Trial:
     start = trial.recipe.start_from
     # In full, so that the folder may be spelled otherwise when the experiment is started again.
     start_from = str((runs / start).resolve()) if start else ""

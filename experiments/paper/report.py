@@ -90,25 +90,25 @@ def write_report(base: Recipe, planned: Sequence[Trial], runs: Path, out: Path) 
     Raises:
         StereoweaveError: No trial is trained to its end.
     """
-    run_time = _run_time(out / SPEED)
-    report = _gathered(base, planned, runs)
+    run_time = _read_run_times(out / SPEED)
+    report = _gather(base, planned, runs)
     make_folder(out)
     write_csv(out / "paper.csv", report.rows)
     with replacing(out / "paper.md") as temporary:
-        temporary.write_text(_markdown(report, run_time), encoding="utf-8")
+        temporary.write_text(_format_report(report, run_time), encoding="utf-8")
     _draw(report, out)
 
 
-def _gathered(base: Recipe, planned: Sequence[Trial], runs: Path) -> Report:
+def _gather(base: Recipe, planned: Sequence[Trial], runs: Path) -> Report:
     files = {trial.recipe.name: runs / trial.recipe.name / "last.pt" for trial in planned}
     kept = {name: checkpoint.load(file) for name, file in files.items() if file.exists()}
-    trained = [trial for trial in planned if _finished(trial, kept)]
+    trained = [trial for trial in planned if _is_finished(trial, kept)]
     if not trained:
         raise StereoweaveError(
             f"{runs}: expected a trial trained to its end, found none of {len(files)}; "
             "run `python -m experiments.paper`"
         )
-    scores, common = _scores([base, *(trial.recipe for trial in trained)], runs)
+    scores, common = _score([base, *(trial.recipe for trial in trained)], runs)
     names = {trial.recipe.name for trial in trained}
     training, held_out = sources(base, runs / "pairs", whole=True)
     return Report(
@@ -125,12 +125,12 @@ def _gathered(base: Recipe, planned: Sequence[Trial], runs: Path) -> Report:
     )
 
 
-def _finished(trial: Trial, kept: Mapping[str, Checkpoint]) -> bool:
+def _is_finished(trial: Trial, kept: Mapping[str, Checkpoint]) -> bool:
     found = kept.get(trial.recipe.name)
     return found is not None and found.step == trial.recipe.steps
 
 
-def _scores(recipes: Sequence[Recipe], runs: Path) -> tuple[dict[str, ViewRow], list[ViewRow]]:
+def _score(recipes: Sequence[Recipe], runs: Path) -> tuple[dict[str, ViewRow], list[ViewRow]]:
     """The scores of each run but the first recipe's; and of what every table has, on that one's pairs."""
     base, *others = recipes
     scores: dict[str, ViewRow] = {}
@@ -172,11 +172,11 @@ def _row(trial: Trial, kept: Checkpoint, score: ViewRow) -> PaperRow:
     )
 
 
-def _markdown(report: Report, run_time: str) -> str:
+def _format_report(report: Report, run_time: str) -> str:
     """The tables, and what was not run."""
     parts = [
         "# The paper's experiment: what was measured",
-        *_head(report),
+        *_describe_setup(report),
         "## The claims",
         claims_table(report.rows, report.depth),
     ]
@@ -184,10 +184,10 @@ def _markdown(report: Report, run_time: str) -> str:
         parts += ["## Table I, Propeller", propeller_table(report.rows)]
     for claim in dict.fromkeys(row.claim for row in report.rows):
         parts += [f"## {claim.capitalize()}", settings_table(report.rows, claim, report.depth)]
-        if claim == ADJUSTMENT and (fitted := _fitted(report.planned)):
+        if claim == ADJUSTMENT and (fitted := _describe_fit(report.planned)):
             parts.append(fitted)
     parts += ["## What needs no training", _common_table(report.common, report.depth)]
-    if reached := _transfer(report):
+    if reached := _describe_transfer(report):
         parts += ["## Transfer: steps to one validation loss", reached]
     if run_time:
         parts += ["## Run time", run_time]
@@ -196,7 +196,7 @@ def _markdown(report: Report, run_time: str) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _head(report: Report) -> list[str]:
+def _describe_setup(report: Report) -> list[str]:
     """What all trainings share, what of it is not the paper's, and how the tables are read."""
     base = report.base
     another_set = " (in the transfer, of another set)" if base.dataset == COLLAGE else ""
@@ -204,8 +204,8 @@ def _head(report: Report) -> list[str]:
         f" Beyond {base.max_depth_m:g} m ground truth is unknown and gives no source." if report.depth else ""
     )
     return [
-        f"Written by `python -m experiments.paper`. {_pairs(report)}, batch {base.batch}, {base.steps} steps "
-        f"unless a table says otherwise, Adam at {base.learning_rate:g}; scores over "
+        f"Written by `python -m experiments.paper`. {_describe_pairs(report)}, batch {base.batch}, "
+        f"{base.steps} steps unless a table says otherwise, Adam at {base.learning_rate:g}; scores over "
         f"{report.held_out.count} held-out pairs. Right view: made from the left image by forward "
         "projection; MAE, 0 to 255, over all pixels after one row fill, then over the pixels that received a "
         f"source, and their share.{unknown}",
@@ -218,7 +218,7 @@ def _head(report: Report) -> list[str]:
     ]
 
 
-def _pairs(report: Report) -> str:
+def _describe_pairs(report: Report) -> str:
     """What was trained on."""
     base = report.base
     size = f"{base.crop_size[1]}x{base.crop_size[0]}"
@@ -231,7 +231,7 @@ def _pairs(report: Report) -> str:
     )
 
 
-def _fitted(planned: Sequence[Trial]) -> str:
+def _describe_fit(planned: Sequence[Trial]) -> str:
     """The fitted exponent, and which planned one it is, if it is one."""
     settings = {trial.setting: trial.recipe for trial in reversed(planned) if trial.claim == ADJUSTMENT}
     for setting, recipe in settings.items():
@@ -242,7 +242,7 @@ def _fitted(planned: Sequence[Trial]) -> str:
     return ""
 
 
-def _run_time(path: Path) -> str:
+def _read_run_times(path: Path) -> str:
     """The table of run times; empty where there is no such file."""
     if not path.exists():
         return ""
@@ -269,7 +269,7 @@ def _common_table(rows: Sequence[ViewRow], depth: bool) -> str:
     return "\n".join(lines)
 
 
-def _transfer(report: Report) -> str:
+def _describe_transfer(report: Report) -> str:
     """When the tuned network first reached what the one from scratch reached at its best."""
     curves = {
         trial.setting: report.curves[trial.recipe.name] for trial in report.trained if trial.claim == TRANSFER
@@ -300,22 +300,23 @@ def _draw(report: Report, out: Path) -> None:
         draw_exponent_curves(out / "exponent_curves.png", sorted(exponents), histogram)
     for claim, name in ((ADJUSTMENT, "exponent"), (PROJECTION, "projection")):
         if claim in claims:
-            draw_validation(out / f"{name}_validation.png", dict(sorted(_by_setting(report, claim).items())))
+            curves = dict(sorted(_curves_by_setting(report, claim).items()))
+            draw_validation(out / f"{name}_validation.png", curves)
     samples = [held_out[index] for index in dict.fromkeys(shown % held_out.count for shown in SHOWN)]
     for claim, draw, name in ((ITERATIONS, draw_iterations, "iterations"), (NETWORKS, draw_views, "views")):
         if claim in claims:
-            methods = _first_of_each(report, claim)
+            methods = _load_first_seeds(report, claim)
             estimates = [{setting: match(sample) for setting, match in methods.items()} for sample in samples]
             draw(out / f"{name}.jpg", list(zip(samples, estimates, strict=True)))
 
 
-def _first_of_each(report: Report, claim: str) -> dict[str, Method]:
+def _load_first_seeds(report: Report, claim: str) -> dict[str, Method]:
     """For each setting its first seed's network."""
     names = {t.setting: t.recipe.name for t in reversed(report.trained) if t.claim == claim}
     return {setting: method_of(report.kept[name]) for setting, name in reversed(names.items())}
 
 
-def _by_setting(report: Report, claim: str) -> dict[str, list[list[tuple[int, float]]]]:
+def _curves_by_setting(report: Report, claim: str) -> dict[str, list[list[tuple[int, float]]]]:
     """For each setting the (step, squared error) of each seed; of settings with one training the first."""
     # Listed backwards, so that the first one of a name is kept.
     once = {trial.recipe.name: trial for trial in reversed(report.trained) if trial.claim == claim}

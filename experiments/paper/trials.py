@@ -35,7 +35,7 @@ OTHER_PAIRS = 500
 OTHER_SIZE = 1.5
 
 
-def trials(base: Recipe, seeds: int, fitted_exponent: float) -> list[Trial]:
+def list_trials(base: Recipe, seeds: int, fitted_exponent: float) -> list[Trial]:
     """All trainings of the experiment, the most wanted first.
 
     One that serves several claims comes once for each, under the same recipe name. The transfer, to other
@@ -48,31 +48,32 @@ def trials(base: Recipe, seeds: int, fitted_exponent: float) -> list[Trial]:
     """
     # Else every p would be the fitted one.
     base = replace(base, fit_exponent=False)
-    every = {"psmnet": _rival("psmnet"), "fast_depth": {}, **{rival: _rival(rival) for rival in OWN}}
+    rivals = {rival: _rival_changes(rival) for rival in OWN}
+    every = {"psmnet": rivals["psmnet"], "fast_depth": {}, **rivals}
     return [
-        *_each(seeds, base, PROJECTION, {PAPER: {}, "without": {"alpha_p": 0.0}}),
-        *_each(seeds, base, NETWORKS, {"fast_depth": {}, "densemapnet": _rival("densemapnet")}),
-        *_each(seeds, base, ADJUSTMENT, {f"p = {p:g}": {"exponent": p} for p in (1.0, 1.5, 2.0, 1.25)}),
-        *_each(
+        *_repeat(seeds, base, PROJECTION, {PAPER: {}, "without": {"alpha_p": 0.0}}),
+        *_repeat(seeds, base, NETWORKS, {"fast_depth": {}, "densemapnet": rivals["densemapnet"]}),
+        *_repeat(seeds, base, ADJUSTMENT, {f"p = {p:g}": {"exponent": p} for p in (1.0, 1.5, 2.0, 1.25)}),
+        *_repeat(
             seeds, base, ADJUSTMENT, {f"p = {fitted_exponent:.3g} {FITTED}": {"exponent": fitted_exponent}}
         ),
-        *_each(1, replace(base, steps=base.steps // SHORT), NETWORKS_SHORT, every),
-        *_each(seeds, base, DECODER, {PAPER: {}, "upsampled at once, no skips": {"model": "densemapnet"}}),
-        *_each(seeds, base, DECODER, {"step-wise, no skips": {"model": "fast_depth_without_skips"}}),
-        *_each(seeds, base, LOSS, {"l2": {}, **{loss: {"loss": loss} for loss in _other_losses(base)}}),
-        *(_transfer(base) if base.dataset == COLLAGE else ()),
-        *_each(1, base, ITERATIONS, {f"{steps} steps": {"steps": steps} for steps in FIGURE_3_STEPS}),
-        *_each(1, base, NETWORKS, {"dispnet": _rival("dispnet")}),
+        *_repeat(1, replace(base, steps=base.steps // SHORT), NETWORKS_SHORT, every),
+        *_repeat(seeds, base, DECODER, {PAPER: {}, "upsampled at once, no skips": {"model": "densemapnet"}}),
+        *_repeat(seeds, base, DECODER, {"step-wise, no skips": {"model": "fast_depth_without_skips"}}),
+        *_repeat(seeds, base, LOSS, {"l2": {}, **{loss: {"loss": loss} for loss in _other_losses(base)}}),
+        *(_list_transfer(base) if base.dataset == COLLAGE else ()),
+        *_repeat(1, base, ITERATIONS, {f"{steps} steps": {"steps": steps} for steps in FIGURE_3_STEPS}),
+        *_repeat(1, base, NETWORKS, {"dispnet": rivals["dispnet"]}),
     ]
 
 
-def _each(seeds: int, base: Recipe, claim: str, settings: dict[str, dict[str, Any]]) -> Iterator[Trial]:
+def _repeat(seeds: int, base: Recipe, claim: str, settings: dict[str, dict[str, Any]]) -> Iterator[Trial]:
     for setting, changes in settings.items():
         for seed in range(base.seed, base.seed + seeds):
-            yield Trial(claim=claim, setting=setting, recipe=_named(replace(base, seed=seed, **changes)))
+            yield Trial(claim=claim, setting=setting, recipe=_with_name(replace(base, seed=seed, **changes)))
 
 
-def _transfer(base: Recipe) -> Iterator[Trial]:
+def _list_transfer(base: Recipe) -> Iterator[Trial]:
     height, width = (int(OTHER_SIZE * side) for side in base.pair_size)
     other = replace(
         base,
@@ -81,12 +82,12 @@ def _transfer(base: Recipe) -> Iterator[Trial]:
         pair_size=(height, width),
         max_disparity_px=OTHER_SIZE * base.max_disparity_px,
     )
-    yield Trial(claim=TRANSFER, setting=SCRATCH, recipe=_named(other))
-    start = f"{_named(base).name}/last.pt"  # below the folder of the runs
-    yield Trial(claim=TRANSFER, setting=TUNED, recipe=_named(replace(other, start_from=start)))
+    yield Trial(claim=TRANSFER, setting=SCRATCH, recipe=_with_name(other))
+    start = f"{_with_name(base).name}/last.pt"  # below the folder of the runs
+    yield Trial(claim=TRANSFER, setting=TUNED, recipe=_with_name(replace(other, start_from=start)))
 
 
-def _rival(model: str) -> dict[str, Any]:
+def _rival_changes(model: str) -> dict[str, Any]:
     return {"model": model, **OWN[model]}
 
 
@@ -95,7 +96,7 @@ def _other_losses(base: Recipe) -> tuple[str, ...]:
     return ("l1", "smooth_l1", "cross_entropy", *(("perceptual",) if base.vgg16_weights else ()))
 
 
-def _named(recipe: Recipe) -> Recipe:
+def _with_name(recipe: Recipe) -> Recipe:
     """The recipe, named after everything in which trials differ."""
     parts = [
         recipe.model,

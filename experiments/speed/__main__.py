@@ -22,8 +22,8 @@ def speed(
     place_for(out)
     read = read_recipe(recipe)
     with needing_the_train_extra():
-        from experiments.speed.timing import run_times
-    write_and_print(out, "A pair of 640x480", run_times(read))
+        from experiments.speed.timing import measure_run_times
+    write_and_print(out, "A pair of 640x480", measure_run_times(read))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

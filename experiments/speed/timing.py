@@ -41,7 +41,9 @@ class SpeedRow:
     onnx_relative: float
 
 
-def run_times(recipe: Recipe, networks: Sequence[str] = NETWORKS, turns: int = TURNS) -> list[SpeedRow]:
+def measure_run_times(
+    recipe: Recipe, networks: Sequence[str] = NETWORKS, turns: int = TURNS
+) -> list[SpeedRow]:
     """A row per network, timed in turns, so that a machine that slows down slows all alike.
 
     Args:
@@ -60,7 +62,7 @@ def run_times(recipe: Recipe, networks: Sequence[str] = NETWORKS, turns: int = T
             name: (_eager(network, pair), _onnx(network, pair, Path(folder) / f"{name}.onnx"))
             for name, network in built.items()
         }
-        times_ms = _times_ms(calls, turns)
+        times_ms = _measure_ms(calls, turns)
     return [
         SpeedRow(
             network=name,
@@ -92,7 +94,7 @@ def _onnx(network: DisparityNetwork, pair: torch.Tensor, file: Path) -> Callable
     return lambda: session.run(None, inputs)
 
 
-def _times_ms(calls: Mapping[str, tuple[Callable[[], object], ...]], turns: int) -> dict[str, list[float]]:
+def _measure_ms(calls: Mapping[str, tuple[Callable[[], object], ...]], turns: int) -> dict[str, list[float]]:
     """The median time of each call."""
     taken: dict[str, list[list[float]]] = {name: [[] for _ in both] for name, both in calls.items()}
     for turn in range(-1, turns):  # the first one warms up

@@ -25,10 +25,10 @@ def stage_costs(
         place_for(out)
     with needing_the_train_extra():
         from experiments.stage_costs import profiling
-    rows = profiling.stage_costs(runs)
+    rows = profiling.measure_stage_costs(runs)
     if out:
         write_csv(out, rows)
-    typer.echo(profiling.markdown(rows))
+    typer.echo(profiling.format_table(rows))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -73,7 +73,7 @@ class StageCost:
 
 
 @dataclass(frozen=True)
-class Measured:
+class StageMeasurement:
     """A stage's multiply-adds, bytes moved, and milliseconds with one thread and with two."""
 
     multiply_adds: int
@@ -94,7 +94,7 @@ class Profile:
     total_ms: list[float]
 
 
-def stage_costs(runs: Sequence[Path], turns: int = TURNS) -> list[StageCost]:
+def measure_stage_costs(runs: Sequence[Path], turns: int = TURNS) -> list[StageCost]:
     """A large matrix product first; then each network's stages in the order in which they run, and its total.
 
     Args:
@@ -104,17 +104,17 @@ def stage_costs(runs: Sequence[Path], turns: int = TURNS) -> list[StageCost]:
     Raises:
         StereoweaveError: A network is no WeaveNet.
     """
-    networks = [_weave_net(run) for run in runs]
-    peak = measured(_product(PRODUCT_SIDE), {}, turns)[TOTAL]
+    networks = [_load_weave_net(run) for run in runs]
+    peak = measure(_matrix_product(PRODUCT_SIDE), {}, turns)[TOTAL]
     rows = [_row("", PRODUCT, peak, peak)]
     for name, network in networks:
-        graph = traced(network)
-        found = measured(graph, stages_of(graph), turns)
+        graph = trace(network)
+        found = measure(graph, find_stages(graph), turns)
         rows += [_row(name, stage, cost, peak) for stage, cost in found.items()]
     return rows
 
 
-def markdown(rows: Sequence[StageCost]) -> str:
+def format_table(rows: Sequence[StageCost]) -> str:
     """The rows as a Markdown table."""
     lines = [
         "| network | stage | million multiply-adds | MB moved | ms, one thread | of the peak "
@@ -130,12 +130,12 @@ def markdown(rows: Sequence[StageCost]) -> str:
     return "\n".join(lines)
 
 
-def traced(network: WeaveNet) -> onnx.ModelProto:
+def trace(network: WeaveNet) -> onnx.ModelProto:
     """The graph that `export.fixed_graph_of` gives, with the exporter's notes of where each node is from."""
     return noted_graph(network, HEIGHT_PX, WIDTH_PX, None)
 
 
-def stages_of(graph: onnx.ModelProto) -> dict[str, str]:
+def find_stages(graph: onnx.ModelProto) -> dict[str, str]:
     """The stage of each node and of what it gives, by name, in the order in which they run."""
     stages: dict[str, str] = {}
     last = ""
@@ -154,7 +154,7 @@ def stages_of(graph: onnx.ModelProto) -> dict[str, str]:
     return stages
 
 
-def multiply_adds_of(graph: onnx.ModelProto) -> Counter[str]:
+def count_multiply_adds(graph: onnx.ModelProto) -> Counter[str]:
     """Multiply-adds by node: of convolutions, matrix products, and products that are only summed."""
     inferred = onnx.shape_inference.infer_shapes(graph).graph
     shapes = {tensor.name: list(tensor.dims) for tensor in inferred.initializer}
@@ -176,29 +176,29 @@ def multiply_adds_of(graph: onnx.ModelProto) -> Counter[str]:
     return counts
 
 
-def measured(graph: onnx.ModelProto, stages: Mapping[str, str], turns: int) -> dict[str, Measured]:
+def measure(graph: onnx.ModelProto, stages: Mapping[str, str], turns: int) -> dict[str, StageMeasurement]:
     """Each stage, and TOTAL, as they are under ONNX Runtime with one thread and with two.
 
     Args:
         graph: For inputs of one fixed size.
-        stages: As `stages_of` gives them; none, and there is only a total.
+        stages: As `find_stages` gives them; none, and there is only a total.
         turns: How often it runs, after once to warm up.
     """
     profiles = [profile(graph, threads, turns) for threads in (1, 2)]
-    of_kernels = [_stages_of_kernels(each.optimised, stages) for each in profiles]
-    counts = multiply_adds_of(graph)
+    of_kernels = [_assign_kernels(each.optimised, stages) for each in profiles]
+    counts = count_multiply_adds(graph)
     found = {
-        stage: Measured(
+        stage: StageMeasurement(
             sum(count for node, count in counts.items() if stages[node] == stage),
             sum(size for kernel, size in profiles[0].moved.items() if of_kernels[0][kernel] == stage),
             (
-                _least_ms(profiles[0], of_kernels[0], stage),
-                _least_ms(profiles[1], of_kernels[1], stage),
+                _min_ms(profiles[0], of_kernels[0], stage),
+                _min_ms(profiles[1], of_kernels[1], stage),
             ),
         )
         for stage in dict.fromkeys(stages.values())
     }
-    found[TOTAL] = Measured(
+    found[TOTAL] = StageMeasurement(
         counts.total(),
         sum(profiles[0].moved.values()),
         (min(profiles[0].total_ms), min(profiles[1].total_ms)),
@@ -223,10 +223,10 @@ def profile(graph: onnx.ModelProto, threads: int, turns: int) -> Profile:
         for _ in range(1 + turns):
             session.run(None, inputs)
         events = json.loads(Path(session.end_profiling()).read_text(encoding="utf-8"))
-        return _profile(onnx.load(options.optimized_model_filepath), events)
+        return _parse_profile(onnx.load(options.optimized_model_filepath), events)
 
 
-def _profile(optimised: onnx.ModelProto, events: list[dict[str, Any]]) -> Profile:
+def _parse_profile(optimised: onnx.ModelProto, events: list[dict[str, Any]]) -> Profile:
     moved, kernels_ms = {}, defaultdict(list)
     for event in events:
         if event["name"].endswith("_kernel_time"):
@@ -238,7 +238,7 @@ def _profile(optimised: onnx.ModelProto, events: list[dict[str, Any]]) -> Profil
     return Profile(optimised, moved, {name: times[1:] for name, times in kernels_ms.items()}, total_ms[1:])
 
 
-def _stages_of_kernels(optimised: onnx.ModelProto, stages: Mapping[str, str]) -> dict[str, str]:
+def _assign_kernels(optimised: onnx.ModelProto, stages: Mapping[str, str]) -> dict[str, str]:
     """The stage of each kernel, by its name."""
     known, found = dict(stages), {}
     for node in optimised.graph.node:
@@ -250,13 +250,13 @@ def _stages_of_kernels(optimised: onnx.ModelProto, stages: Mapping[str, str]) ->
     return found
 
 
-def _least_ms(profiled: Profile, stages: Mapping[str, str], stage: str) -> float:
+def _min_ms(profiled: Profile, stages: Mapping[str, str], stage: str) -> float:
     """The least time of a stage in a turn."""
     kernels = [times for name, times in profiled.kernels_ms.items() if stages[name] == stage]
     return min(map(sum, zip(*kernels, strict=True)), default=0.0)
 
 
-def _weave_net(run: Path) -> tuple[str, WeaveNet]:
+def _load_weave_net(run: Path) -> tuple[str, WeaveNet]:
     """The averaged network of a checkpoint, with its recipe's name."""
     kept = checkpoint.load(run / "last.pt" if run.is_dir() else run)
     network = matcher_network(kept)
@@ -268,7 +268,7 @@ def _weave_net(run: Path) -> tuple[str, WeaveNet]:
     return kept.recipe.name, network
 
 
-def _product(side: int) -> onnx.ModelProto:
+def _matrix_product(side: int) -> onnx.ModelProto:
     """The product of two square matrices, float32."""
     first, second, result = (
         helper.make_tensor_value_info(name, TensorProto.FLOAT, [side, side])
@@ -283,7 +283,7 @@ def _product(side: int) -> onnx.ModelProto:
     )
 
 
-def _row(network: str, stage: str, cost: Measured, peak: Measured) -> StageCost:
+def _row(network: str, stage: str, cost: StageMeasurement, peak: StageMeasurement) -> StageCost:
     one_ms, two_ms = cost.times_ms
     shares = [
         100 * cost.multiply_adds / peak.multiply_adds * at_peak_ms / ms if ms else 0.0

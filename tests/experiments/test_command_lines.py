@@ -100,7 +100,7 @@ def test_run_times_are_written_one_row_per_network(folder, monkeypatch, capfd):
         onnx_ms=80.0,
         onnx_relative=1.0,
     )
-    monkeypatch.setattr(timing, "run_times", lambda recipe: given.append(recipe.name) or [row])
+    monkeypatch.setattr(timing, "measure_run_times", lambda recipe: given.append(recipe.name) or [row])
     assert run(f"speed {PAPER_RECIPE}") == 0
     assert given == ["experiment"]
     (written,) = read_rows("speed.csv")

@@ -6,18 +6,18 @@ import pytest
 from experiments.paper.claims import (
     TABLE_I,
     PaperRow,
-    by_seed,
     claims_table,
-    comparisons,
-    half_width,
-    less_percent,
+    interval_half_width,
+    list_comparisons,
     propeller_table,
+    reduction_percent,
+    reductions_by_seed,
     run_time_table,
     settings_table,
 )
 from experiments.paper.trials import ADJUSTMENT, DECODER, NETWORKS, NETWORKS_SHORT, PAPER, PROJECTION
 
-COMPARISONS = {comparison.text: comparison for comparison in comparisons()}
+COMPARISONS = {comparison.text: comparison for comparison in list_comparisons()}
 PROJECTED = "projection loss: end-point error"
 
 
@@ -56,8 +56,8 @@ def line_of(table, text):
 
 
 def test_less_is_counted_from_the_reference():
-    assert less_percent(4.0, 3.0) == 25
-    assert less_percent(4.0, 5.0) == -25
+    assert reduction_percent(4.0, 3.0) == 25
+    assert reduction_percent(4.0, 5.0) == -25
 
 
 def test_a_seed_is_compared_with_itself():
@@ -71,14 +71,14 @@ def test_a_seed_is_compared_with_itself():
     ]
     random.Random(0).shuffle(rows)
     # Only 1 and 2 have both: 8 of 10, 10 of 20.
-    assert by_seed(rows, COMPARISONS[PROJECTED]) == pytest.approx([20, 50])
+    assert reductions_by_seed(rows, COMPARISONS[PROJECTED]) == pytest.approx([20, 50])
 
 
 def test_half_of_the_interval_is_students():
     # t is 4.303 for two degrees of freedom, 12.706 for one; the deviations are 1 and sqrt(2).
-    assert half_width([1.0, 2.0, 3.0]) == pytest.approx(4.303 / math.sqrt(3), rel=1e-3)
-    assert half_width([0.0, 2.0]) == pytest.approx(12.706, rel=1e-4)
-    assert math.isnan(half_width([5.0]))
+    assert interval_half_width([1.0, 2.0, 3.0]) == pytest.approx(4.303 / math.sqrt(3), rel=1e-3)
+    assert interval_half_width([0.0, 2.0]) == pytest.approx(12.706, rel=1e-4)
+    assert math.isnan(interval_half_width([5.0]))
 
 
 @pytest.mark.parametrize(
@@ -183,7 +183,7 @@ def test_the_settings_of_a_claim_are_ranked_by_the_mae_of_the_filled_view():
 
 
 def test_depth_is_claimed_of_the_error_in_cm_and_of_propeller_alone():
-    found = {comparison.text: comparison for comparison in comparisons(depth=True)}
+    found = {comparison.text: comparison for comparison in list_comparisons(depth=True)}
     assert found.keys() == COMPARISONS.keys()
     assert {one.measure for one in found.values()} == {"prediction", "squared_error", "epe_cm", "mae_filled"}
     # 1 - 2.32 / 8.67, and 1 - 37.31 / 41.22.

@@ -31,7 +31,7 @@ from experiments.paper.trials import (
     PAPER,
     PROJECTION,
     TRANSFER,
-    trials,
+    list_trials,
 )
 from experiments.trial import Trial
 from stereoweave.data.paper_layout import write_frame
@@ -267,7 +267,7 @@ def test_what_starts_from_another_training_comes_after_it(monkeypatch, tmp_path)
     monkeypatch.setattr(
         paper, "_train_all", lambda recipes, *_: rounds.append([recipe.name for recipe in recipes])
     )
-    run_trials(trials(BASE, 1, 1.37)[::-1], tmp_path, 1, QUIET)
+    run_trials(list_trials(BASE, 1, 1.37)[::-1], tmp_path, 1, QUIET)
     first, second = rounds
     assert second == ["fast_depth-l2-p1.5-projection1-steps4-seed100-tuned"]
     assert FIRST in first
@@ -275,9 +275,9 @@ def test_what_starts_from_another_training_comes_after_it(monkeypatch, tmp_path)
 
 
 def test_a_tuned_trial_starts_from_a_run_below_the_folder_of_the_runs():
-    tuned = next(trial for trial in trials(BASE, 1, 1.37) if trial.recipe.start_from)
+    tuned = next(trial for trial in list_trials(BASE, 1, 1.37) if trial.recipe.start_from)
     for spelled in (Path("runs"), Path("runs/../runs")):
-        start_from = paper._below(tuned, spelled).recipe.start_from
+        start_from = paper._resolve_start(tuned, spelled).recipe.start_from
         assert start_from == str(Path.cwd() / "runs" / FIRST / "last.pt")
 
 
@@ -298,11 +298,12 @@ def report_of(trained, curves):
 
 def transfer_of(scratch, tuned):
     """What the report says of two trainings with these (step, loss)."""
-    trained = [trial for trial in trials(BASE, 1, 1.37) if trial.claim == TRANSFER]
+    trained = [trial for trial in list_trials(BASE, 1, 1.37) if trial.claim == TRANSFER]
     curves = [[{"step": step, "loss": loss} for step, loss in curve] for curve in (scratch, tuned)]
     named = {trial.recipe.name: curve for trial, curve in zip(trained, curves, strict=True)}
     report = report_of(trained, named)
-    return paper_report._transfer(report), paper_report._transfer(replace(report, trained=trained[:1]))
+    alone = replace(report, trained=trained[:1])
+    return paper_report._describe_transfer(report), paper_report._describe_transfer(alone)
 
 
 def test_transfer_counts_the_steps_to_the_best_loss_from_scratch():
@@ -318,16 +319,16 @@ def test_transfer_counts_the_steps_to_the_best_loss_from_scratch():
 
 
 def test_a_fitted_exponent_that_was_planned_anyway_is_named_and_drawn_once():
-    planned = [trial for trial in trials(BASE, 2, 1.5) if trial.claim == ADJUSTMENT]
-    assert paper_report._fitted(planned) == (
+    planned = [trial for trial in list_trials(BASE, 2, 1.5) if trial.claim == ADJUSTMENT]
+    assert paper_report._describe_fit(planned) == (
         "Fitted to the histogram of the training truth, p is 1.5, which is p = 1.5: "
         "both rows are the same trainings."
     )
-    assert paper_report._fitted(trials(BASE, 1, 1.3742)) == (
+    assert paper_report._describe_fit(list_trials(BASE, 1, 1.3742)) == (
         "Fitted to the histogram of the training truth, p is 1.374."
     )
     curves = {trial.recipe.name: [{"step": 2.0, "squared_error": 0.5}] for trial in planned}
-    drawn = paper_report._by_setting(report_of(planned, curves), ADJUSTMENT)
+    drawn = paper_report._curves_by_setting(report_of(planned, curves), ADJUSTMENT)
     assert drawn == dict.fromkeys(("p = 1", "p = 1.25", "p = 1.5", "p = 2"), [[(2, 0.5)]] * 2)
 
 
@@ -413,7 +414,7 @@ def test_run_times_beside_the_report_join_it(experiment, tmp_path):
 
 def test_a_report_of_nothing_is_refused(tmp_path):
     out = tmp_path / "report"
-    planned = trials(BASE, 1, 1.37)
+    planned = list_trials(BASE, 1, 1.37)
     names = {trial.recipe.name for trial in planned}
     assert complaint(write_report, BASE, planned, tmp_path / "runs", out) == (
         f"{tmp_path}/runs: expected a trial trained to its end, found none of {len(names)}; "

@@ -17,16 +17,18 @@ def timed():
     """Rows of the two cheap networks at a small size, what was called, and the graphs."""
     graphs, calls = [], {}
     with pytest.MonkeyPatch.context() as patch:
-        exported, times_ms = speed.fixed_graph_of, speed._times_ms
+        exported, measure_ms = speed.fixed_graph_of, speed._measure_ms
         patch.setattr(speed, "HEIGHT_PX", HEIGHT)
         patch.setattr(speed, "WIDTH_PX", WIDTH)
         patch.setattr(speed, "thread_count", lambda _: 1)
         patch.setattr(
             speed, "fixed_graph_of", lambda *arguments: graphs.append(exported(*arguments)) or graphs[-1]
         )
-        patch.setattr(speed, "_times_ms", lambda given, turns: calls.update(given) or times_ms(given, turns))
+        patch.setattr(
+            speed, "_measure_ms", lambda given, turns: calls.update(given) or measure_ms(given, turns)
+        )
         # A recipe of another kind: what is timed does not depend on its loss.
-        rows = speed.run_times(RECIPE, ("fast_depth", "densemapnet"), turns=2)
+        rows = speed.measure_run_times(RECIPE, ("fast_depth", "densemapnet"), turns=2)
         torch.manual_seed(0)
     return {row.network: row for row in rows}, calls, graphs
 
@@ -79,7 +81,7 @@ def test_the_graph_is_for_that_size_alone(timed):
 def test_every_network_is_warmed_up_and_psmnet_is_called_a_third_as_often():
     called = []
     calls = {name: (lambda name=name: called.append(name),) * 2 for name in ("densemapnet", "psmnet")}
-    times_ms = speed._times_ms(calls, turns=7)
+    times_ms = speed._measure_ms(calls, turns=7)
     # Turns 0, 3 and 6 of seven, and one before that is not timed; both runtimes each.
     assert Counter(called) == {"densemapnet": 2 * 8, "psmnet": 2 * 4}
     assert called[:4] == ["densemapnet"] * 2 + ["psmnet"] * 2

@@ -41,7 +41,7 @@ def rows(tmp_path_factory):
         patch.setattr(costs, "HEIGHT_PX", HEIGHT)
         patch.setattr(costs, "WIDTH_PX", WIDTH)
         patch.setattr(costs, "PRODUCT_SIDE", 64)
-        return network, costs.stage_costs([file.parent], turns=2)
+        return network, costs.measure_stage_costs([file.parent], turns=2)
 
 
 def test_an_operation_belongs_to_the_stage_of_its_module_or_of_what_ran_before_it():
@@ -64,7 +64,7 @@ def test_an_operation_belongs_to_the_stage_of_its_module_or_of_what_ran_before_i
         {"left": [1], "right": [1]},
         ["disparity"],
     )
-    stages = costs.stages_of(graph)
+    stages = costs.find_stages(graph)
     assert {name: stage for name, stage in stages.items() if not name.startswith("node_")} == {
         "both": "encoder",
         "maps": "encoder",
@@ -104,13 +104,13 @@ def test_multiply_adds_are_of_convolutions_products_and_sums_of_products():
         ["maps", "product", "sum", "kept"],
         [ones],
     )
-    counts = costs.multiply_adds_of(graph)
+    counts = costs.count_multiply_adds(graph)
     # 4 maps of 5x6 from 2 at 3x3; 2x3x5 sums of 4 products; 7x8 products.
     assert counts == {"conv": 4 * 5 * 6 * 2 * 9, "matmul": 2 * 3 * 5 * 4, "mul": 7 * 8}
 
 
 def test_a_product_of_matrices_moves_both_and_the_result_and_runs_every_turn():
-    found = costs.profile(costs._product(16), threads=1, turns=3)
+    found = costs.profile(costs._matrix_product(16), threads=1, turns=3)
     assert found.moved == {"product": 3 * 16 * 16 * 4}
     assert len(found.kernels_ms["product"]) == len(found.total_ms) == 3
     for kernel_ms, total_ms in zip(found.kernels_ms["product"], found.total_ms, strict=True):
@@ -119,11 +119,11 @@ def test_a_product_of_matrices_moves_both_and_the_result_and_runs_every_turn():
 
 def test_the_least_time_of_a_stage_is_that_of_its_kernels_in_one_turn():
     profiled = costs.Profile(
-        costs._product(2), {}, {"a": [1.0, 5.0], "b": [4.0, 1.0], "c": [9.0, 9.0]}, [14.0, 15.0]
+        costs._matrix_product(2), {}, {"a": [1.0, 5.0], "b": [4.0, 1.0], "c": [9.0, 9.0]}, [14.0, 15.0]
     )
     stages = {"a": "encoder", "b": "encoder", "c": "refinement"}
-    assert costs._least_ms(profiled, stages, "encoder") == 5
-    assert costs._least_ms(profiled, stages, "mirroring") == 0
+    assert costs._min_ms(profiled, stages, "encoder") == 5
+    assert costs._min_ms(profiled, stages, "mirroring") == 0
 
 
 def test_the_first_turn_warms_up_and_views_move_nothing():
@@ -133,7 +133,7 @@ def test_the_first_turn_warms_up_and_views_move_nothing():
         for dur in (9000, 1000, 2000)
         for name, operation in (("a_kernel_time", "Conv"), ("b_kernel_time", "Reshape"), ("model_run", ""))
     ]
-    found = costs._profile(costs._product(2), json.loads(json.dumps(events)))
+    found = costs._parse_profile(costs._matrix_product(2), json.loads(json.dumps(events)))
     assert found.moved == {"a": 14, "b": 0}
     assert found.kernels_ms == {"a": [1, 2], "b": [1, 2]}
     assert found.total_ms == [1, 2]
@@ -180,7 +180,7 @@ def test_the_convolutions_of_the_encoder_are_counted_there(rows):
 
 def test_the_table_has_a_line_for_each_row(rows):
     _, found = rows
-    lines = costs.markdown(found).splitlines()
+    lines = costs.format_table(found).splitlines()
     assert len(lines) == 2 + len(found)
     assert {line.count("|") for line in lines} == {9}
     assert lines[2].startswith(f"|  | {costs.PRODUCT} | 0.3 | 0.0 | ")
@@ -190,15 +190,15 @@ def test_the_table_has_a_line_for_each_row(rows):
 def test_another_network_is_one_line_that_says_where_it_is_timed(tmp_path):
     recipe = recipe_of("fast_depth", target="disparity")
     checkpoint.save(checkpoint_of(untrained("fast_depth"), recipe), tmp_path / "last.pt")
-    assert "expected a WeaveNet" in complaint(costs.stage_costs, [tmp_path / "last.pt"])
+    assert "expected a WeaveNet" in complaint(costs.measure_stage_costs, [tmp_path / "last.pt"])
 
 
 def test_the_command_prints_the_table_and_writes_the_rows(rows, monkeypatch, tmp_path, capsys):
     _, found = rows
     asked = []
-    monkeypatch.setattr(costs, "stage_costs", lambda runs: asked.append(runs) or found)
+    monkeypatch.setattr(costs, "measure_stage_costs", lambda runs: asked.append(runs) or found)
     assert main(["a", "b.pt", "-o", str(tmp_path / "costs.csv")]) == 0
     assert asked == [[Path("a"), Path("b.pt")]]
-    assert capsys.readouterr().out == costs.markdown(found) + "\n"
+    assert capsys.readouterr().out == costs.format_table(found) + "\n"
     with (tmp_path / "costs.csv").open(newline="") as file:
         assert [row["stage"] for row in csv.DictReader(file)] == [row.stage for row in found]
