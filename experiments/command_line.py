@@ -9,7 +9,7 @@ import typer
 from stereoweave.cli import root
 
 RecipeFile = Annotated[
-    Path, typer.Argument(metavar="RECIPE", help="TOML file, such as recipes/paper/experiment.toml.")
+    Path, typer.Argument(metavar="RECIPE", help="TOML file of the base recipe, in recipes/.")
 ]
 RunsFolder = Annotated[Path, typer.Option("--out", "-o", help="Folder of the trainings.")]
 Seeds = Annotated[int, typer.Option(min=1, help="Repetitions of each training, with different seeds.")]

@@ -1,4 +1,4 @@
-"""WeaveNet's choices made otherwise, one at a time and at equal budget: the rows of results/ablations.csv."""
+"""Ablations: WeaveNet with one design choice changed at a time, at equal budget."""
 
 import csv
 import hashlib
@@ -31,7 +31,7 @@ from stereoweave.learn.training.scores import validate
 
 BASE = "base"
 MIX = ((COLLAGE, 0.55), ("runs/synth/rooms", 0.33), ("runs/synth/scenes", 0.12))
-# The choice, and what is made otherwise in the base recipe.
+# For each design choice, its variations and their changes of the base recipe.
 VARIATIONS: dict[str, dict[str, dict[str, Any]]] = {
     "what all are compared with": {BASE: {}},
     "correlation resolution": {"eighth": {"model": "weave_small_eighth"}},
@@ -60,7 +60,7 @@ _CPU = torch.device("cpu")
 
 
 def plan(base: Recipe, seeds: int) -> list[Trial]:
-    """Every variation with the first seed, then every one with the next; all recipes named after the two."""
+    """Plan all variations with the first seed, then all with the next one. Recipes are named after both."""
     return [
         Trial(
             claim=choice,
@@ -76,21 +76,21 @@ def plan(base: Recipe, seeds: int) -> list[Trial]:
 def run_ablations(
     planned: Sequence[Trial], runs: Path, rendered: Path, report: Path, console: Console
 ) -> None:
-    """Train each variation in a folder of its own, and write the report anew after each.
+    """Train each variation in its own folder, and rewrite the report after each training.
 
-    A row that the report has of the same recipe is taken as it is; other rows are not kept.
+    Rows of the report with the same recipe are reused; other rows are dropped.
 
     Args:
-        planned: What to train.
-        runs: The folder of the runs, and of kept pairs below it.
-        rendered: A set of held-out rendered pairs, which are scored beside the held-out collages.
-        report: The CSV file.
-        console: Where progress is told.
+        planned: Trainings to run.
+        runs: Folder of the runs, with the kept pairs in `pairs`.
+        rendered: Set of held-out rendered pairs, scored in addition to the held-out collages.
+        report: CSV file to write.
+        console: Shows the progress.
 
     Raises:
-        StereoweaveError: Training or held-out pairs are missing; said before anything is trained.
+        StereoweaveError: If training or held-out pairs are missing; raised before the first training.
     """
-    MODELS.update(VARIANTS)
+    MODELS.update(VARIANTS)  # so that recipes can name them
     rendered_pairs = Photographed(Shards(rendered))
     for trial in planned:
         for pairs in sources(trial.recipe, runs / "pairs"):
@@ -109,7 +109,7 @@ def run_ablations(
 
 
 def fingerprint(recipe: Recipe) -> str:
-    """8 hexadecimal digits that change with anything in a recipe but its name."""
+    """Hash of a recipe without its name, in 8 hexadecimal digits."""
     return hashlib.sha256(repr(replace(recipe, name="")).encode()).hexdigest()[:8]
 
 
@@ -141,7 +141,7 @@ def _row(trial: Trial, trained: Checkpoint, held_out: dict[str, Source]) -> dict
 
 
 def _near_edges(match: Method, pairs: Source) -> dict[str, float]:
-    """Means over the pairs, of which one without a depth edge does not count."""
+    """Mean errors near depth edges, over the pairs that have edges."""
     rows = []
     for index in range(pairs.count):
         sample = pairs[index]

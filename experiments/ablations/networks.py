@@ -1,4 +1,4 @@
-"""WeaveNets that differ from SMALL in one thing each, to be trained beside it: the ablations' networks."""
+"""Variants of SMALL for the ablations: WeaveNets that differ from it in one thing each."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,37 +26,37 @@ from stereoweave.learn.models.weave import (
 
 
 def upsample_bilinear(x: Float[Tensor, "b 1 h w"], weights: Tensor) -> Float[Tensor, "b 1 h2 w2"]:
-    """Twice the size, whatever the weights."""
+    """Enlarge to twice the size. Ignores the weights, which `upsample` takes in other networks."""
     return F.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
 
 
 def soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
-    """Expected level under a softmax over all levels (Kendall et al. 2017); at an edge between its sides."""
+    """Expected level under a softmax over all levels (Kendall et al. 2017); a mixture at edges."""
     levels = torch.arange(logits.shape[1], device=logits.device).view(1, -1, 1, 1)
     return (logits.softmax(1) * levels).sum(1, keepdim=True)
 
 
 class Bilinear(WeaveNet):
-    """Upsampled without looking at the image."""
+    """Bilinear upsampling, without weights from the image."""
 
     upsample = staticmethod(upsample_bilinear)
 
     def __init__(self) -> None:
         super().__init__()
-        # Nothing computes the weights that nothing reads.
+        # The weights would be computed and never read.
         self.register_module("weights", nn.Identity())
         self.refinement.register_module("weights", nn.Identity())
 
 
 class AllLevels(WeaveNet):
-    """Disparity as the expectation over all levels, not over those around the best."""
+    """Disparity as the expectation over all levels instead of those around the best one."""
 
     def read(self, scores: Tensor, decoded: Tensor) -> Tensor:
         return soft_argmax(scores)
 
 
 class Grouped(WeaveNet):
-    """Features correlated in `groups` of channels, each with scores of its own (GwcNet, Guo et al. 2019)."""
+    """Group-wise correlation (GwcNet, Guo et al. 2019): scores for each of `groups` groups of channels."""
 
     def __init__(self, groups: int = 4) -> None:
         super().__init__()
@@ -73,13 +73,13 @@ class Grouped(WeaveNet):
             for group in match.chunk(self.groups, 1)
         ]
         correlation = torch.stack(volumes).sum(0)
-        # The sum of all says what the last one is.
+        # The last group is redundant beside the sum of all.
         beside = first._replace(quarter=torch.cat([first.quarter, *volumes[:-1]], 1))
         return correlation, *self.aggregation(correlation, beside)
 
 
 class EighthAggregation(Aggregation):
-    """Scores that enter and leave at 1/8; the decoder still ends at 1/4."""
+    """Aggregation of scores at 1/8; the decoder still ends at 1/4."""
 
     def __init__(self, levels: int) -> None:
         super().__init__(levels, SMALL)
@@ -97,7 +97,7 @@ class EighthAggregation(Aggregation):
 
 
 class Eighth(WeaveNet):
-    """Correlated at 1/8, in half as many levels of 8 px."""
+    """Correlation at 1/8, with half as many levels of 8 px."""
 
     def __init__(self) -> None:
         super().__init__(SMALL, levels=24)
@@ -118,14 +118,14 @@ class Eighth(WeaveNet):
 
 
 class NoContext(nn.Module):
-    """Nothing, in the place of Context."""
+    """Placeholder for Context that returns zero."""
 
     def forward(self, dense: Tensor, sixteenth: Tensor) -> Tensor:
         return dense.new_zeros(())
 
 
 class WithoutContext(WeaveNet):
-    """Without the aggregation's view of the wider surroundings at 1/16."""
+    """Aggregation without its context at 1/16."""
 
     def __init__(self) -> None:
         super().__init__()

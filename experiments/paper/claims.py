@@ -1,4 +1,4 @@
-"""What the paper claims, what was measured here, and the difference."""
+"""The paper's claims beside our measurements, as Markdown tables."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,16 +11,16 @@ from experiments.paper.trials import ADJUSTMENT, DECODER, NETWORKS, NETWORKS_SHO
 
 @dataclass(frozen=True, kw_only=True)
 class PaperRow:
-    """What one training of the experiment gave on the held-out pairs.
+    """Scores of one training of the experiment on the held-out pairs.
 
     Attributes:
-        claim, setting: What the training is for; one that serves several claims has a row for each.
-        seed: Of first weights, training pairs and their order.
-        steps: Of the training; pairs it saw are steps * batch.
-        prediction: Loss between codes, as the network was trained with it.
-        squared_error: The same between codes without exponent, which can be compared between exponents.
+        claim, setting: Purpose of the training. A training that serves several claims has a row for each.
+        seed: Seed of the first weights, the training pairs and their order.
+        steps: Steps of the training; it has seen steps * batch pairs.
+        prediction: Loss between codes that the network was trained with.
+        squared_error: Squared error between codes without exponent, which is comparable between exponents.
         epe_px, epe_cm, mae_sourced, sourced_percent, mae_filled, psnr_db, ssim: See `ViewRow`.
-        minutes: Wall time of the training and of the one it started from, beside others on the same machine.
+        minutes: Wall time of the training and of the one it started from; trainings may share the machine.
     """
 
     claim: str
@@ -48,10 +48,11 @@ class PaperRow:
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """A claim of the paper: how many percent less of `measure` a setting has than the reference.
+    """A claim of the paper: a setting lowers `measure` by some percent, relative to a reference setting.
 
     Attributes:
-        paper: The paper's words or numbers; `paper_percent` is what they come to, None where it has none.
+        paper: The paper's words or numbers.
+        paper_percent: These as one number; None if the paper gives none.
     """
 
     text: str
@@ -64,7 +65,7 @@ class Comparison:
 
     @property
     def fair(self) -> bool:
-        """Whether both settings are measured alike; codes of two exponents are not."""
+        """Whether the measure means the same for both settings. Codes of two exponents are not comparable."""
         return (self.claim, self.measure) != (ADJUSTMENT, "prediction")
 
 
@@ -75,7 +76,7 @@ TABLE_I = {
     "psmnet": ((3.85, 8.12, 3.88, 2.38), (7.94, 10.32, 7.36, 41.22)),
     "fast_depth": ((3.95, 6.42, 4.08, 2.32), (7.99, 8.24, 7.93, 37.31)),
 }
-# The only column whose target is depth.
+# The only column with depth as its target.
 _PROPELLER = 3
 _COLUMNS = {
     "epe_cm": ("EPE cm", ".1f"),
@@ -88,7 +89,7 @@ _COLUMNS = {
     "ssim": ("SSIM", ".3f"),
     "minutes": ("minutes", ".1f"),
 }
-# What a setting is claimed to lower: the measure, what we call it, the paper's words, percent.
+# A measure that a setting is claimed to lower: column, label, the paper's words, percent.
 _Measure = tuple[str, str, str, float | None]
 _VIEW: _Measure = ("mae_filled", "MAE of the right view", "-", None)
 _ADJUSTMENT: tuple[_Measure, ...] = (
@@ -107,20 +108,20 @@ _PROJECTION: tuple[_Measure, ...] = (
     ("prediction", "loss between codes", "about 20 %", 20.0),
     _VIEW,
 )
-# The paper has no number of the decoder alone: in Table I it comes with the two contributions.
+# The paper has no number for the decoder alone: Table I combines it with the two contributions.
 _DECODER: tuple[_Measure, ...] = (("epe_px", "end-point error", "-", None), _VIEW)
-# The text of a claim, its name in trials.py, reference, changed setting, and measures.
+# Text of a claim, its name in trials.py, reference setting, changed setting, measures.
 _CHANGES = (
     ("depth adjustment, p = 1.5 against 1", ADJUSTMENT, "p = 1", "p = 1.5", _ADJUSTMENT),
     ("projection loss", PROJECTION, "without", PAPER, _PROJECTION),
     ("step-wise decoder with skips", DECODER, "upsampled at once, no skips", PAPER, _DECODER),
 )
-# Run time as a multiple of DenseMapNet's, on GPUs: section IV.
+# Run time as a multiple of DenseMapNet's, on GPUs (section IV).
 RUN_TIMES = {"fast_depth": 1.05, "densemapnet": 1.0, "dispnet": 2.0, "psmnet": 10.0}
 
 
 def list_comparisons(depth: bool = False) -> Iterator[Comparison]:
-    """The claims that one number can decide; with `depth` as target end-point errors are in cm."""
+    """Yield the claims that one number can decide. With `depth` as the target, end-point errors are in cm."""
     for text, claim, reference, changed, measures in (*_CHANGES, *_rival_changes(depth)):
         for measure, name, paper, percent in measures:
             yield Comparison(
@@ -135,7 +136,7 @@ def list_comparisons(depth: bool = False) -> Iterator[Comparison]:
 
 
 def _rival_changes(depth: bool) -> Iterator[tuple[str, str, str, str, tuple[_Measure, ...]]]:
-    """What Table I comes to for each rival, as rows of _CHANGES; with `depth` its column of depth alone."""
+    """Yield Table I's claims about each rival, as rows of _CHANGES; with `depth`, its depth column only."""
     for rival in ("densemapnet", "dispnet", "psmnet"):
         claim = NETWORKS_SHORT if rival == "psmnet" else NETWORKS
         measures = (
@@ -155,12 +156,12 @@ def _table_i_measure(rival: str, column: int, measure: str, name: str, depth: bo
 
 
 def reduction_percent(reference: float, changed: float) -> float:
-    """How many percent less `changed` is than `reference`."""
+    """Reduction from `reference` to `changed`, in percent."""
     return 100 * (1 - changed / reference)
 
 
 def reductions_by_seed(rows: Sequence[PaperRow], comparison: Comparison) -> list[float]:
-    """Percent less, for each seed that both settings were trained with."""
+    """Reductions in percent, one for each seed that both settings were trained with."""
     reference, changed = (
         {row.seed: getattr(row, comparison.measure) for row in _select(rows, comparison.claim, setting)}
         for setting in (comparison.reference, comparison.changed)
@@ -170,16 +171,16 @@ def reductions_by_seed(rows: Sequence[PaperRow], comparison: Comparison) -> list
 
 
 def interval_half_width(values: Sequence[float]) -> float:
-    """Half of the 95 % interval of the mean, by Student's t over the seeds; NaN for less than two."""
+    """Half the width of the mean's 95 % interval, by Student's t over the seeds; NaN for fewer than two."""
     if len(values) < 2:
         return float("nan")
     return float(stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values)))
 
 
 def claims_table(rows: Sequence[PaperRow], depth: bool = False) -> str:
-    """Markdown: what the paper says, what was measured, the difference, and whether that holds here.
+    """Markdown table of the claims: the paper's number, ours, the difference and a verdict.
 
-    With `depth` as target end-point errors are in cm, and of Table I only Propeller's are compared.
+    With `depth` as the target, end-point errors are in cm, and Table I is compared by its Propeller column.
     """
     lines = [
         "| claim: percent less | paper | here (95 % interval) | difference (points) | verdict |",
@@ -200,7 +201,7 @@ def claims_table(rows: Sequence[PaperRow], depth: bool = False) -> str:
 
 
 def propeller_table(rows: Sequence[PaperRow]) -> str:
-    """Markdown: the networks, on pairs of our own, beside Table I's column of depth, Propeller."""
+    """Markdown table of the networks on our own propeller pairs, beside Table I's Propeller column."""
     columns = "network", "steps", "EPE cm: paper", "here", "difference", "MAE of the right view: paper"
     lines = [f"| {' | '.join((*columns, 'here', 'difference'))} |", "|---" * 8 + "|"]
     found = [row for row in rows if row.claim in (NETWORKS, NETWORKS_SHORT)]
@@ -215,10 +216,10 @@ def propeller_table(rows: Sequence[PaperRow]) -> str:
 
 
 def settings_table(rows: Sequence[PaperRow], claim: str, depth: bool = False) -> str:
-    """Markdown: the settings of one claim with the means over their seeds; the lowest filled MAE first.
+    """Markdown table of a claim's settings, as means over their seeds, by ascending filled MAE.
 
-    Settings of one seed come after those of several: a single score is no rival of a mean. With `depth` as
-    target there are end-point errors in cm too.
+    Settings with one seed come last, because a single score does not compare with a mean. With `depth` as the
+    target, end-point errors are given in cm too.
     """
     columns = {name: column for name, column in _COLUMNS.items() if depth or name != "epe_cm"}
     headings = ["setting", "seeds", *(heading for heading, _ in columns.values())]
@@ -285,7 +286,7 @@ def _judge(comparison: Comparison, mean: float, half: float) -> str:
 
 
 def _table_i_order(trained: tuple[str, int]) -> tuple[int, int]:
-    """The order of Table I's rows, and of the steps."""
+    """Sort key: the order of Table I's rows, then the number of steps."""
     return list(TABLE_I).index(trained[0]), trained[1]
 
 

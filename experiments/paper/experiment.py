@@ -1,4 +1,4 @@
-"""The paper's experiment, run for real: every training of trials.py, on the same pairs in the same order."""
+"""Run the paper's experiment: every training of trials.py, on the same pairs in the same order."""
 
 import multiprocessing
 import os
@@ -22,18 +22,18 @@ from stereoweave.learn.training.objective import fitted
 def plan(
     base: Recipe, runs: Path, seeds: int, console: Console, claims: Collection[str] = CLAIMS
 ) -> list[Trial]:
-    """The trials for these claims, their training pairs made, and the exponent fitted to those of the base.
+    """Plan the trials of some claims, create their missing pairs, and fit the exponent.
 
     Args:
-        base: The paper's recipe for the data at hand.
-        runs: The folder of the runs, and of kept pairs below it.
-        seeds: How often each training is repeated.
-        console: Where progress is told.
+        base: The paper's recipe for the data at hand; the exponent is fitted to its training pairs.
+        runs: Folder of the runs, with the kept pairs in `pairs`.
+        seeds: Repetitions of each training.
+        console: Shows the progress.
         claims: Names in CLAIMS.
 
     Raises:
-        StereoweaveError: The base is not of the paper's network, is too short, or has depth as its target
-            where pairs have no camera.
+        StereoweaveError: If the base has another network, too few steps, or depth as the target of pairs
+            without a camera.
     """
     _check_base(base)
     training, _ = (kept(pairs, console) for pairs in sources(base, runs / "pairs"))
@@ -47,16 +47,16 @@ def plan(
 
 
 def run_trials(planned: Iterable[Trial], runs: Path, jobs: int, console: Console) -> None:
-    """Train each trial in a folder of its own in `runs`; one that was killed goes on where it was.
+    """Train each trial in its own folder of `runs`. Interrupted trainings resume.
 
     Args:
-        planned: Trials whose pairs are made: no two trainings make the same ones.
-        runs: The folder.
-        jobs: Trainings at a time, which share the processor's cores.
-        console: Where progress is told.
+        planned: Trials, all of whose training pairs exist, so that no two trainings create the same ones.
+        runs: Folder of the runs.
+        jobs: Trainings that run at the same time and share the processor's cores.
+        console: Shows the progress.
     """
     recipes = {trial.recipe.name: trial.recipe for trial in planned}.values()
-    # What starts from another training comes when that one is there.
+    # A training that starts from another one must wait for its checkpoint.
     _train_all([recipe for recipe in recipes if not recipe.start_from], runs, jobs, console)
     _train_all([recipe for recipe in recipes if recipe.start_from], runs, jobs, console)
 
@@ -78,7 +78,7 @@ def _check_base(base: Recipe) -> None:
 
 def _resolve_start(trial: Trial, runs: Path) -> Trial:
     start = trial.recipe.start_from
-    # In full, so that the folder may be spelled otherwise when the experiment is started again.
+    # Absolute, so that a resumed experiment may spell the folder differently.
     start_from = str((runs / start).resolve()) if start else ""
     return replace(trial, recipe=replace(trial.recipe, start_from=start_from))
 

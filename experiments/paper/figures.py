@@ -1,6 +1,7 @@
-"""The figures of "Fast Depth Estimation for View Synthesis", from this project's own runs.
+"""Figures of "Fast Depth Estimation for View Synthesis", drawn from our own runs.
 
-The ending of a path says what is written. Name figures of photographs .jpg: as PNG they are ten times larger.
+The extension of a path sets the format. Use .jpg for figures of photographs, which as PNG are ten
+times larger.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,9 +20,9 @@ from stereoweave.io.files import replacing
 from stereoweave.stereo import DepthCurve, Sample
 
 Estimated = tuple[Sample, Mapping[str, Float[np.ndarray, "_ _"]]]
-"""A sample, and disparities (px) of its left view [H, W] by their columns' names; rows may differ in size."""
+"""A sample, and its left view's disparities in px [H, W] by column title. Rows may differ in size."""
 
-# Okabe and Ito's colours, which colour-blind readers tell apart.
+# Okabe and Ito's colours, distinguishable by colour-blind readers.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _HISTOGRAM_HEIGHT = 0.5
 _PICTURE_WIDTH_IN = 2.2
@@ -31,13 +32,13 @@ _TITLE_HEIGHT_IN = 0.3
 def draw_exponent_curves(
     path: str | Path, exponents: Sequence[float], histogram: Real[np.ndarray, " n"] | None = None
 ) -> None:
-    """Write Fig. 2, left: the code against normalised depth, one curve an exponent.
+    """Write Fig. 2, left: the code against normalised depth, one curve per exponent.
 
     Args:
-        path: The picture's file.
-        exponents: Each at least 1.
-        histogram: Counts [N] of the training truth in equal bins over 0..1, as `fit_exponent` takes them;
-            drawn behind the curves, scaled to half of their height.
+        path: Picture to write.
+        exponents: Exponents, each at least 1.
+        histogram: Counts [N] of the training truth in equal bins over 0..1, as for `fit_exponent`; drawn
+            behind the curves at half their height.
     """
     figure, axes = _plot()
     if histogram is not None:
@@ -53,12 +54,12 @@ def draw_exponent_curves(
 
 
 def draw_validation(path: str | Path, curves: Mapping[str, Sequence[Sequence[tuple[int, float]]]]) -> None:
-    """Write Fig. 2, right: error on held-out pairs against steps; thin lines are seeds, bold ones their mean.
+    """Write Fig. 2, right: error on held-out pairs against steps; thin lines are seeds, bold lines means.
 
     Args:
-        path: The picture's file.
-        curves: For each setting a list of (step, squared error of the straight code) per seed. The mean is
-            over the steps that all have.
+        path: Picture to write.
+        curves: For each setting, one list of (step, squared error of the straight code) per seed. Means are
+            drawn at the steps that all seeds have.
     """
     figure, axes = _plot()
     for (setting, seeds), colour in zip(curves.items(), _colours(len(curves)), strict=True):
@@ -66,7 +67,7 @@ def draw_validation(path: str | Path, curves: Mapping[str, Sequence[Sequence[tup
             axes.plot(*zip(*seed, strict=True), color=colour, linewidth=0.8, alpha=0.4)
         axes.plot(*_mean_curve(seeds), color=colour, linewidth=2.5, label=setting)
     axes.set(yscale="log", xlabel="training step", ylabel="validation: squared error of the straight code")
-    # Matplotlib labels whole decades, of which a loss may cross none.
+    # Matplotlib would label whole decades only, and a loss may cross none.
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
     axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
     axes.yaxis.set_minor_locator(NullLocator())
@@ -76,9 +77,9 @@ def draw_validation(path: str | Path, curves: Mapping[str, Sequence[Sequence[tup
 
 
 def draw_iterations(path: str | Path, rows: Sequence[Estimated]) -> None:
-    """Write Fig. 3: left image, the estimates as they come to be, and the truth; unknown truth is black.
+    """Write Fig. 3: left image, estimates after growing numbers of steps, and ground truth (unknown: black).
 
-    A row's colours span its truth's range: blue is far, red is near.
+    The colours of a row span the range of its ground truth: blue is far, red is near.
     """
     pictures = []
     for sample, estimates_px in rows:
@@ -92,7 +93,7 @@ def draw_iterations(path: str | Path, rows: Sequence[Estimated]) -> None:
 
 
 def draw_views(path: str | Path, rows: Sequence[Estimated]) -> None:
-    """Write Fig. 5: left and right image, and the right view made with the truth and with each estimate.
+    """Write Fig. 5: left and right image, and the right view from ground truth and from each estimate.
 
     Pixels without a source are black.
     """
@@ -107,14 +108,14 @@ def draw_views(path: str | Path, rows: Sequence[Estimated]) -> None:
 
 
 def _mean_curve(seeds: Sequence[Sequence[tuple[int, float]]]) -> tuple[list[int], list[float]]:
-    """Steps and mean losses where every seed has one."""
+    """Steps that all seeds have, and their mean losses."""
     losses = [dict(seed) for seed in seeds]
     steps = sorted(set.intersection(*(set(loss) for loss in losses)))
     return steps, [float(np.mean([loss[step] for loss in losses])) for step in steps]
 
 
 def _draw_grid(path: str | Path, rows: Sequence[Mapping[str, UInt8[np.ndarray, "_ _ 3"]]]) -> None:
-    """Write pictures in rows; the names of the first row head the columns."""
+    """Write pictures in rows; the first row's names are the column titles."""
     heights_in = [
         max(_PICTURE_WIDTH_IN * picture.shape[0] / picture.shape[1] for picture in row.values())
         for row in rows

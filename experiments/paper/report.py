@@ -1,4 +1,4 @@
-"""The report of the paper's experiment: rows as CSV, tables as Markdown, and the paper's figures."""
+"""Report of the paper's experiment: rows as CSV, tables as Markdown, and the paper's figures."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -40,25 +40,26 @@ from stereoweave.learn.recipe import COLLAGE, Recipe
 from stereoweave.learn.training.loop import CURVE, read_record
 from stereoweave.learn.training.objective import truth_histogram
 
-# Held-out pairs that the figures show, counted round where there are fewer.
+# Held-out pairs that the figures show, modulo their number.
 SHOWN = (3, 11, 24)
-# In the report's folder, where `python -m experiments.speed` wrote it there.
+# Optional input in the report's folder, from `python -m experiments.speed`.
 SPEED = "speed.csv"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """What the tables and figures are made of.
+    """Data behind the tables and figures.
 
     Attributes:
-        training, held_out: The pairs of the base.
+        base: Recipe that the trials start from.
+        training, held_out: Pairs of the base.
         planned: All trials.
-        trained: Those that are trained to their end.
-        missing: The names of the others' recipes.
-        kept: The checkpoints of the trained ones by their recipe's name.
-        curves: Their scores by step.
-        rows: A row for each of them.
-        common: The methods that every table has, on the base's held-out pairs.
+        trained: Trials that are trained to their end.
+        missing: Names of the other trials' recipes.
+        kept: Checkpoints of the trained trials, by name of the recipe.
+        curves: Scores of the trained trials by step, by name of the recipe.
+        rows: One row per trained trial.
+        common: Scores of methods without training, on the base's held-out pairs.
     """
 
     base: Recipe
@@ -74,21 +75,22 @@ class Report:
 
     @property
     def depth(self) -> bool:
-        """Whether depth is what was learned, which is scored in cm."""
+        """Whether the target is depth, which is scored in cm."""
         return self.base.target == "depth"
 
 
 def write_report(base: Recipe, planned: Sequence[Trial], runs: Path, out: Path) -> None:
-    """Write paper.csv, paper.md and the figures into a folder, from the trials that are trained.
+    """Write paper.csv, paper.md and the figures of the trained trials to a folder.
 
     Args:
-        base: The recipe that the trials start from.
-        planned: All trials; paper.md names those that are not trained to their end.
-        runs: The folder of their runs.
-        out: The folder to write into; run times that lie in it, as speed.csv, join paper.md.
+        base: Recipe that the trials start from.
+        planned: All trials; paper.md lists those that are not trained to their end.
+        runs: Folder of the runs.
+        out: Folder to write to. If it contains speed.csv, paper.md includes these run times.
 
     Raises:
-        StereoweaveError: No trial is trained to its end.
+        StereoweaveError: If no trial is trained to its end.
+        FormatError: If speed.csv is damaged.
     """
     run_time = _read_run_times(out / SPEED)
     report = _gather(base, planned, runs)
@@ -131,13 +133,13 @@ def _is_finished(trial: Trial, kept: Mapping[str, Checkpoint]) -> bool:
 
 
 def _score(recipes: Sequence[Recipe], runs: Path) -> tuple[dict[str, ViewRow], list[ViewRow]]:
-    """The scores of each run but the first recipe's; and of what every table has, on that one's pairs."""
+    """Scores of all runs but the first recipe's, and of methods without training on the first one's pairs."""
     base, *others = recipes
     scores: dict[str, ViewRow] = {}
     common: list[ViewRow] = []
     for pairs in dict.fromkeys(held_out_of(recipe) for recipe in others):
         names = list(dict.fromkeys(recipe.name for recipe in others if held_out_of(recipe) == pairs))
-        # Quiet, because the plan has made the pairs.
+        # Quiet: all pairs exist since the plan was made.
         found = evaluate([runs / name for name in names], runs / "pairs", Console(quiet=True))
         scores |= {row.method: row for row in found if row.method in names}
         if pairs == held_out_of(base):
@@ -173,7 +175,7 @@ def _row(trial: Trial, kept: Checkpoint, score: ViewRow) -> PaperRow:
 
 
 def _format_report(report: Report, run_time: str) -> str:
-    """The tables, and what was not run."""
+    """The whole report: setup, tables, and trials that were not run."""
     parts = [
         "# The paper's experiment: what was measured",
         *_describe_setup(report),
@@ -197,7 +199,7 @@ def _format_report(report: Report, run_time: str) -> str:
 
 
 def _describe_setup(report: Report) -> list[str]:
-    """What all trainings share, what of it is not the paper's, and how the tables are read."""
+    """Settings that all trainings share, deviations from the paper, and how to read the tables."""
     base = report.base
     another_set = " (in the transfer, of another set)" if base.dataset == COLLAGE else ""
     unknown = (
@@ -219,7 +221,7 @@ def _describe_setup(report: Report) -> list[str]:
 
 
 def _describe_pairs(report: Report) -> str:
-    """What was trained on."""
+    """The training pairs, in words."""
     base = report.base
     size = f"{base.crop_size[1]}x{base.crop_size[0]}"
     if base.dataset == COLLAGE:
@@ -232,7 +234,7 @@ def _describe_pairs(report: Report) -> str:
 
 
 def _describe_fit(planned: Sequence[Trial]) -> str:
-    """The fitted exponent, and which planned one it is, if it is one."""
+    """The fitted exponent in words, and the planned exponent that it equals, if any."""
     settings = {trial.setting: trial.recipe for trial in reversed(planned) if trial.claim == ADJUSTMENT}
     for setting, recipe in settings.items():
         if setting.endswith(FITTED):
@@ -243,7 +245,7 @@ def _describe_fit(planned: Sequence[Trial]) -> str:
 
 
 def _read_run_times(path: Path) -> str:
-    """The table of run times; empty where there is no such file."""
+    """Markdown table of the run times in a file; empty if there is no file."""
     if not path.exists():
         return ""
     try:
@@ -270,7 +272,7 @@ def _common_table(rows: Sequence[ViewRow], depth: bool) -> str:
 
 
 def _describe_transfer(report: Report) -> str:
-    """When the tuned network first reached what the one from scratch reached at its best."""
+    """Steps after which the tuned network reaches the best loss of the one from scratch, in words."""
     curves = {
         trial.setting: report.curves[trial.recipe.name] for trial in report.trained if trial.claim == TRANSFER
     }
@@ -291,7 +293,7 @@ def _describe_transfer(report: Report) -> str:
 
 
 def _draw(report: Report, out: Path) -> None:
-    """Fig. 2, left and right, and the same of the projection loss; Fig. 3; Fig. 5; as far as trained."""
+    """Draw Figs. 2, 3 and 5, and Fig. 2 for the projection loss, as far as their trials are trained."""
     held_out = report.held_out
     claims = {row.claim for row in report.rows}
     if ADJUSTMENT in claims:
@@ -311,14 +313,14 @@ def _draw(report: Report, out: Path) -> None:
 
 
 def _load_first_seeds(report: Report, claim: str) -> dict[str, Method]:
-    """For each setting its first seed's network."""
+    """Load the first seed's network for each setting."""
     names = {t.setting: t.recipe.name for t in reversed(report.trained) if t.claim == claim}
     return {setting: method_of(report.kept[name]) for setting, name in reversed(names.items())}
 
 
 def _curves_by_setting(report: Report, claim: str) -> dict[str, list[list[tuple[int, float]]]]:
-    """For each setting the (step, squared error) of each seed; of settings with one training the first."""
-    # Listed backwards, so that the first one of a name is kept.
+    """Lists of (step, squared error) for each setting, one per seed; a training counts once."""
+    # Reversed, so that the first trial of a name is kept.
     once = {trial.recipe.name: trial for trial in reversed(report.trained) if trial.claim == claim}
     found: dict[str, list[list[tuple[int, float]]]] = {}
     for name, trial in reversed(once.items()):

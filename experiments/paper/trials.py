@@ -1,4 +1,4 @@
-"""The trainings of the paper's experiment: for each claim recipes that differ in one thing alone."""
+"""Trainings of the paper's experiment: for each claim, recipes that differ in one thing only."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -20,33 +20,34 @@ CLAIMS = NETWORKS, NETWORKS_SHORT, ADJUSTMENT, PROJECTION, LOSS, DECODER, TRANSF
 PAPER = "the paper's recipe"
 FITTED = "(fitted)"
 SCRATCH, TUNED = "from scratch", "from the synthetic checkpoint"
-# What the rivals are trained with: the losses of their own papers, without this paper's two contributions.
+# The rivals train with the losses of their own papers, without this paper's two contributions.
 OWN: dict[str, dict[str, Any]] = {
     "densemapnet": {"exponent": 1.0, "alpha_p": 0.0},
     "dispnet": {"exponent": 1.0, "alpha_p": 0.0, "loss": "l1", "learning_rate": 1e-4},
     "psmnet": {"exponent": 1.0, "alpha_p": 0.0, "loss": "smooth_l1"},
 }
-# PSMNet costs 59 times as many multiply-adds as the paper's network: it is compared after fewer steps.
+# PSMNet takes 59 times the multiply-adds of the paper's network, so the two are compared after fewer steps.
 SHORT = 4
 FIGURE_3_STEPS = (10, 50, 250)
-# The other set that a trained network is tuned on: few collages, larger, with larger disparities.
+# The set of the transfer: fewer and larger collages with larger disparities.
 OTHER_SEED = 100
 OTHER_PAIRS = 500
 OTHER_SIZE = 1.5
 
 
 def list_trials(base: Recipe, seeds: int, fitted_exponent: float) -> list[Trial]:
-    """All trainings of the experiment, the most wanted first.
+    """List all trainings of the experiment, the most important first.
 
-    One that serves several claims comes once for each, under the same recipe name. The transfer, to other
-    collages, is for collages alone: of a dataset on disk the recipe knows no other set.
+    A training that serves several claims is listed once for each, with the same recipe name. The transfer to
+    another set needs collages, because a recipe names only one dataset on disk.
 
     Args:
-        base: The paper's recipe, for the data at hand.
-        seeds: How many of each; DispNet and PSMNet, the transfer and the iterations come once.
-        fitted_exponent: p fitted to the histogram of the base's training truth.
+        base: The paper's recipe for the data at hand.
+        seeds: Repetitions of each training, except of DispNet, PSMNet, the transfer and the iterations, which
+            run once.
+        fitted_exponent: The exponent p fitted to the histogram of the base's training truth.
     """
-    # Else every p would be the fitted one.
+    # Otherwise training would replace every p by the fitted one.
     base = replace(base, fit_exponent=False)
     rivals = {rival: _rival_changes(rival) for rival in OWN}
     every = {"psmnet": rivals["psmnet"], "fast_depth": {}, **rivals}
@@ -83,7 +84,7 @@ def _list_transfer(base: Recipe) -> Iterator[Trial]:
         max_disparity_px=OTHER_SIZE * base.max_disparity_px,
     )
     yield Trial(claim=TRANSFER, setting=SCRATCH, recipe=_with_name(other))
-    start = f"{_with_name(base).name}/last.pt"  # below the folder of the runs
+    start = f"{_with_name(base).name}/last.pt"  # relative to the folder of the runs
     yield Trial(claim=TRANSFER, setting=TUNED, recipe=_with_name(replace(other, start_from=start)))
 
 
@@ -92,12 +93,12 @@ def _rival_changes(model: str) -> dict[str, Any]:
 
 
 def _other_losses(base: Recipe) -> tuple[str, ...]:
-    """Those the paper compared l2 with; the perceptual one needs a file that cannot be shipped."""
+    """Losses that the paper compares with l2; the perceptual loss needs a file that cannot be shipped."""
     return ("l1", "smooth_l1", "cross_entropy", *(("perceptual",) if base.vgg16_weights else ()))
 
 
 def _with_name(recipe: Recipe) -> Recipe:
-    """The recipe, named after everything in which trials differ."""
+    """The recipe with a name that spells out everything in which trials differ."""
     parts = [
         recipe.model,
         recipe.loss,

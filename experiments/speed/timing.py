@@ -1,4 +1,4 @@
-"""How long each network takes for a pair, in one run, as ratios to DenseMapNet."""
+"""Run times of the paper's network and its rivals in one run, relative to DenseMapNet."""
 
 import tempfile
 import time
@@ -25,11 +25,11 @@ TURNS = 7
 
 @dataclass(frozen=True, kw_only=True)
 class SpeedRow:
-    """What a pair of 640x480 costs a network of the paper's comparison.
+    """Cost of a 640x480 pair for one network of the paper's comparison.
 
     Attributes:
-        eager_ms, onnx_ms: Median of the turns, in PyTorch and in ONNX Runtime, float32, with all cores.
-        eager_relative, onnx_relative: The same as multiples of DenseMapNet's.
+        eager_ms, onnx_ms: Median time in PyTorch and in ONNX Runtime, in float32, on all cores.
+        eager_relative, onnx_relative: The same times as multiples of DenseMapNet's.
     """
 
     network: str
@@ -44,12 +44,12 @@ class SpeedRow:
 def measure_run_times(
     recipe: Recipe, networks: Sequence[str] = NETWORKS, turns: int = TURNS
 ) -> list[SpeedRow]:
-    """A row per network, timed in turns, so that a machine that slows down slows all alike.
+    """Time networks in turns, so that a slower phase of the machine affects all alike. Returns a row each.
 
     Args:
-        recipe: All are built as it would build them, but for disparity up to 192 px; the loss costs nothing.
-        networks: Names in MODELS, DenseMapNet's among them.
-        turns: How often each is timed; PSMNet, which takes a minute for all of them, a third as often.
+        recipe: Builds the networks, with its target and range replaced by disparity up to 192 px.
+        networks: Names in MODELS, including DenseMapNet's.
+        turns: Repetitions. PSMNet, by far the slowest, is timed a third as often.
     """
     torch.set_num_threads(thread_count(None))
     pair = torch.rand(2, 1, 3, HEIGHT_PX, WIDTH_PX)
@@ -95,9 +95,9 @@ def _onnx(network: DisparityNetwork, pair: torch.Tensor, file: Path) -> Callable
 
 
 def _measure_ms(calls: Mapping[str, tuple[Callable[[], object], ...]], turns: int) -> dict[str, list[float]]:
-    """The median time of each call."""
+    """Median time of each call in milliseconds, by network."""
     taken: dict[str, list[list[float]]] = {name: [[] for _ in both] for name, both in calls.items()}
-    for turn in range(-1, turns):  # the first one warms up
+    for turn in range(-1, turns):  # the first turn warms up
         for name, both in calls.items():
             if name == "psmnet" and max(turn, 0) % 3:
                 continue

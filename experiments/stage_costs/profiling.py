@@ -1,4 +1,4 @@
-"""What each stage of a WeaveNet costs under ONNX Runtime: multiply-adds, bytes moved, time on the CPU."""
+"""Costs of WeaveNet's stages under ONNX Runtime: multiply-adds, bytes moved, time on the CPU."""
 
 import ast
 import json
@@ -26,15 +26,15 @@ TURNS = 15
 PRODUCT = f"product of two {PRODUCT_SIDE}x{PRODUCT_SIDE} matrices"
 TOTAL = "total"
 
-# The stage of a module that is not called after it.
+# Stages of modules that have another name than their stage.
 _STAGES = {
     "to_match": "correlation",
     "weights": "upsampling",
     "to_match_half": "matching at 1/2",
     "to_half": "refinement",
 }
-# The stage of an operation that belongs to no part of the module it is in ("" for the network itself), by
-# that module and by the network's part that ran last.
+# Stages of operations between a module's parts, by that module ("" for the network itself) and by the part of
+# the network that ran last.
 _STAGES_BETWEEN = {
     ("", ""): "encoder",
     ("", "encoder"): "mirroring",
@@ -45,21 +45,21 @@ _STAGES_BETWEEN = {
     ("", "refinement"): "upsampling",
     ("refinement", "to_half"): "matching at 1/2",
 }
-# Kernels that give what they read another shape, and move nothing.
+# Kernels that change shapes only, and move no data.
 _VIEWS = {"Reshape", "Squeeze", "Unsqueeze", "Flatten", "Identity"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class StageCost:
-    """What a stage costs for a pair of 640x480, both views, in float32.
+    """Cost of one stage for a 640x480 pair, both views, in float32.
 
     Attributes:
-        network: The name of its recipe; "" for PRODUCT.
-        stage: Its name; TOTAL for all stages; PRODUCT for what the peak is measured with.
-        multiply_adds: Of convolutions, matrix products and sums of products.
-        moved_mb: What its kernels read and write, weights included, in 10^6 bytes; caches save much of it.
-        one_thread_ms, two_threads_ms: The least of the turns: other work on the machine only ever adds.
-        one_thread_peak_percent, two_threads_peak_percent: Its multiply-adds a second, of PRODUCT's.
+        network: Name of the recipe; "" for PRODUCT.
+        stage: Name of the stage; TOTAL for all stages; PRODUCT for the matrix product that measures the peak.
+        multiply_adds: Multiply-adds of convolutions, matrix products and sums of products.
+        moved_mb: 10^6 bytes that the kernels read and write, weights included; caches save much of it.
+        one_thread_ms, two_threads_ms: Minimum over the turns, since other work only adds time.
+        one_thread_peak_percent, two_threads_peak_percent: Multiply-adds per second, relative to PRODUCT's.
     """
 
     network: str
@@ -74,7 +74,7 @@ class StageCost:
 
 @dataclass(frozen=True)
 class StageMeasurement:
-    """A stage's multiply-adds, bytes moved, and milliseconds with one thread and with two."""
+    """A stage's multiply-adds, bytes moved, and milliseconds with one and with two threads."""
 
     multiply_adds: int
     moved: int
@@ -83,9 +83,13 @@ class StageMeasurement:
 
 @dataclass(frozen=True)
 class Profile:
-    """What ONNX Runtime did: kernels by name, their bytes, their milliseconds in every turn; whole turns.
+    """Profile of a graph under ONNX Runtime.
 
-    `optimised` is the graph that it made of the one it was given; its nodes are the kernels.
+    Attributes:
+        optimised: ONNX Runtime's optimised graph, with the kernels as its nodes.
+        moved: Bytes moved by each kernel.
+        kernels_ms: Milliseconds of each kernel in every turn.
+        total_ms: Milliseconds of every turn.
     """
 
     optimised: onnx.ModelProto
@@ -95,14 +99,14 @@ class Profile:
 
 
 def measure_stage_costs(runs: Sequence[Path], turns: int = TURNS) -> list[StageCost]:
-    """A large matrix product first; then each network's stages in the order in which they run, and its total.
+    """Measure a large matrix product, then each network's stages in the order of execution and their total.
 
     Args:
-        runs: Checkpoints of WeaveNets, or folders of runs, whose last ones are taken.
-        turns: How often each is timed.
+        runs: Checkpoints of WeaveNets, or folders of runs for their last checkpoints.
+        turns: Repetitions of each measurement.
 
     Raises:
-        StereoweaveError: A network is no WeaveNet.
+        StereoweaveError: If a network is not a WeaveNet.
     """
     networks = [_load_weave_net(run) for run in runs]
     peak = measure(_matrix_product(PRODUCT_SIDE), {}, turns)[TOTAL]
@@ -131,17 +135,17 @@ def format_table(rows: Sequence[StageCost]) -> str:
 
 
 def trace(network: WeaveNet) -> onnx.ModelProto:
-    """The graph that `export.fixed_graph_of` gives, with the exporter's notes of where each node is from."""
+    """Graph of the network as in `export.fixed_graph_of`, with the exporter's notes on each node's module."""
     return noted_graph(network, HEIGHT_PX, WIDTH_PX, None)
 
 
 def find_stages(graph: onnx.ModelProto) -> dict[str, str]:
-    """The stage of each node and of what it gives, by name, in the order in which they run."""
+    """Stage of each node and of each of its outputs, by name, in the order of execution."""
     stages: dict[str, str] = {}
     last = ""
     for node in graph.graph.node:
         notes = {note.key: note.value for note in node.metadata_props}
-        # The network itself, the modules inside one another, and the operation.
+        # A note lists the network, the nested modules and the operation.
         modules = ast.literal_eval(notes.get("pkg.torch.onnx.name_scopes", "['', '']"))[1:-1]
         inside = ".".join(modules[-1:])
         if inside in ("", "refinement"):
@@ -155,7 +159,7 @@ def find_stages(graph: onnx.ModelProto) -> dict[str, str]:
 
 
 def count_multiply_adds(graph: onnx.ModelProto) -> Counter[str]:
-    """Multiply-adds by node: of convolutions, matrix products, and products that are only summed."""
+    """Multiply-adds by node: convolutions, matrix products, and elementwise products that are only summed."""
     inferred = onnx.shape_inference.infer_shapes(graph).graph
     shapes = {tensor.name: list(tensor.dims) for tensor in inferred.initializer}
     for value in (*inferred.input, *inferred.value_info, *inferred.output):
@@ -177,12 +181,12 @@ def count_multiply_adds(graph: onnx.ModelProto) -> Counter[str]:
 
 
 def measure(graph: onnx.ModelProto, stages: Mapping[str, str], turns: int) -> dict[str, StageMeasurement]:
-    """Each stage, and TOTAL, as they are under ONNX Runtime with one thread and with two.
+    """Measure each stage and TOTAL under ONNX Runtime, with one and with two threads.
 
     Args:
-        graph: For inputs of one fixed size.
-        stages: As `find_stages` gives them; none, and there is only a total.
-        turns: How often it runs, after once to warm up.
+        graph: Graph with inputs of one fixed size.
+        stages: Result of `find_stages`; if empty, only TOTAL is measured.
+        turns: Repetitions, after one to warm up.
     """
     profiles = [profile(graph, threads, turns) for threads in (1, 2)]
     of_kernels = [_assign_kernels(each.optimised, stages) for each in profiles]
@@ -207,11 +211,11 @@ def measure(graph: onnx.ModelProto, stages: Mapping[str, str], turns: int) -> di
 
 
 def profile(graph: onnx.ModelProto, threads: int, turns: int) -> Profile:
-    """What ONNX Runtime does with a graph for random inputs, float32, in `turns` turns after the first."""
+    """Profile a graph on random float32 inputs, for `turns` turns after one to warm up."""
     with tempfile.TemporaryDirectory() as folder:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
-        options.log_severity_level = 4  # it warns that the optimised graph suits this machine alone
+        options.log_severity_level = 4  # no warning that the optimised graph suits this machine only
         options.optimized_model_filepath = str(Path(folder, "optimised.onnx"))
         options.enable_profiling = True
         options.profile_file_prefix = str(Path(folder, "profile"))
@@ -239,11 +243,11 @@ def _parse_profile(optimised: onnx.ModelProto, events: list[dict[str, Any]]) -> 
 
 
 def _assign_kernels(optimised: onnx.ModelProto, stages: Mapping[str, str]) -> dict[str, str]:
-    """The stage of each kernel, by its name."""
+    """Stage of each kernel, by the kernel's name."""
     known, found = dict(stages), {}
     for node in optimised.graph.node:
-        # A kernel made of several nodes is called after what it gives; one that ONNX Runtime adds, to bring
-        # values into another order, belongs to what it reads.
+        # A kernel fused from several nodes is named after its output. A kernel that ONNX Runtime adds to
+        # reorder values belongs to its input.
         names = (node.name, node.name.removesuffix("_nchwc"), *node.output, *node.input)
         found[node.name] = next((known[name] for name in names if name in known), TOTAL)
         known |= dict.fromkeys(node.output, found[node.name])
@@ -251,31 +255,31 @@ def _assign_kernels(optimised: onnx.ModelProto, stages: Mapping[str, str]) -> di
 
 
 def _min_ms(profiled: Profile, stages: Mapping[str, str], stage: str) -> float:
-    """The least time of a stage in a turn."""
+    """Minimum over the turns of a stage's time."""
     kernels = [times for name, times in profiled.kernels_ms.items() if stages[name] == stage]
     return min(map(sum, zip(*kernels, strict=True)), default=0.0)
 
 
 def _load_weave_net(run: Path) -> tuple[str, WeaveNet]:
-    """The averaged network of a checkpoint, with its recipe's name."""
+    """Name of a checkpoint's recipe, and its averaged network."""
     kept = checkpoint.load(run / "last.pt" if run.is_dir() else run)
     network = matcher_network(kept)
     if not isinstance(network, WeaveNet):
         raise StereoweaveError(
-            f"{run}: expected a WeaveNet, whose stages are known, found {kept.recipe.model}; "
-            "`python -m experiments.speed` times other networks as a whole"
+            f"{run}: expected a WeaveNet, found {kept.recipe.model}; "
+            "time other networks with `python -m experiments.speed`"
         )
     return kept.recipe.name, network
 
 
 def _matrix_product(side: int) -> onnx.ModelProto:
-    """The product of two square matrices, float32."""
+    """Graph of the product of two square float32 matrices."""
     first, second, result = (
         helper.make_tensor_value_info(name, TensorProto.FLOAT, [side, side])
         for name in ("first", "second", "result")
     )
     node = helper.make_node("MatMul", ["first", "second"], ["result"], "product")
-    # The exporter's versions: those of the onnx package may be newer than ONNX Runtime reads.
+    # The exporter's versions; the onnx package's own may be too new for ONNX Runtime.
     return helper.make_model(
         helper.make_graph([node], "product", [first, second], [result]),
         opset_imports=[helper.make_opsetid("", 20)],

@@ -1,4 +1,4 @@
-"""The commands stereoweave bench pairs | collages | views | flicker | networks | parity | training."""
+"""Commands stereoweave bench pairs | collages | views | flicker | networks | parity | training."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -27,52 +27,54 @@ from stereoweave.cli.tables import (
     write_and_print,
 )
 
-# What is added to a network's name where `refining` comes after it.
+# Suffix of a network's name when its estimate is refined.
 REFINED = " refined"
 
 Classes = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="A second CSV file to write: errors outside the right picture, where occluded, near edges, "
-        "where plain, weakly textured, textured.",
+        help="Second CSV file to write: errors by class of pixels (outside the right picture, occluded, near "
+        "edges, plain, weakly textured, textured).",
     ),
 ]
+CsvFile = Annotated[Path, typer.Option("--out", "-o", help="CSV file to write.")]
+Models = Annotated[
+    list[str] | None,
+    typer.Option(help="As for depth; repeat for several (default: all shipped networks)."),
+]
 
-bench = typer.Typer(help="Score matchers side by side.")
+bench = typer.Typer(help="Score matchers, views, videos and trained networks.")
 
 
 @bench.command()
-def pairs(  # noqa: PLR0913 - each is a word of the command line
+def pairs(  # noqa: PLR0913 - each is an option of the command line
     folder: Annotated[
         Path,
         typer.Argument(
-            help="Holds a folder a scene, of left.png, right.png, disparity.png; or what synth make made."
+            help="One folder per scene, with left.png, right.png and disparity.png; or a set from synth make."
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("pairs.csv"),
-    model: Annotated[
-        list[str] | None,
-        typer.Option(help="As for depth; may be given again. All shipped networks unless given."),
-    ] = None,
+    out: CsvFile = Path("pairs.csv"),
+    model: Models = None,
     dataset: Annotated[
-        str | None, typer.Option(help="The folder holds this dataset, as its authors' archives unpack.")
+        str | None, typer.Option(help="Dataset that the folder contains, as its authors distribute it.")
     ] = None,
     plot: Annotated[
-        Path | None, typer.Option(help="A picture to write: errors against time. Extra 'train'.")
+        Path | None, typer.Option(help="Picture to write: errors against time. Extra 'train'.")
     ] = None,
     sparsification: Annotated[
-        Path | None, typer.Option(help="A picture to write: errors by confidence. Extra 'train'.")
+        Path | None, typer.Option(help="Picture to write: errors by confidence. Extra 'train'.")
     ] = None,
     classes: Classes = None,
     cluster: Cluster = None,
     threads: Threads = None,
     provider: Provider = "cpu",
 ) -> None:
-    """Errors, edges, confidence, time and memory of networks and OpenCV's matchers on known disparity.
+    """Score networks and OpenCV's matchers on known disparity: errors, edges, confidence, time, memory.
 
-    With --cluster each scene is scored by one worker of --threads cores, 1 unless given, so that the times
-    beside SGBM's stay comparable; the memory is measured here.
+    With --cluster, one worker of --threads cores (default: 1) scores each scene, so that times compare with
+    SGBM's. Memory is measured on this machine.
     """
     import cv2
 
@@ -102,14 +104,14 @@ def pairs(  # noqa: PLR0913 - each is a word of the command line
 
 @bench.command()
 def collages(
-    out: Annotated[Path, typer.Option("--out", "-o", help="The folder of the set, new or empty.")],
-    pairs: Annotated[int, typer.Option(min=1, help="How many.")] = 16,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the set, new or empty.")],
+    pairs: Annotated[int, typer.Option(min=1, help="Number of pairs.")] = 16,
     seed: Annotated[
-        int, typer.Option(min=0, help="1000003 gives the pairs that trainings validate on.")
+        int, typer.Option(min=0, help="The default gives the validation pairs of trainings.")
     ] = 1_000_003,
     size: Annotated[str, typer.Option(help="Width and height in pixels.")] = "384x256",
 ) -> None:
-    """Write held-out collages, the painted pairs that networks train on, as a set that bench pairs reads."""
+    """Write held-out collages, painted like the training pairs, as a set for bench pairs."""
     with needing_the_train_extra():
         from stereoweave.learn.data.collage_set import write_collages
     width_px, height_px = parse_size_px(size)
@@ -118,26 +120,23 @@ def collages(
 
 
 @bench.command()
-def views(  # noqa: PLR0913 - each is a word of the command line
+def views(  # noqa: PLR0913 - each is an option of the command line
     folder: Annotated[
         Path,
         typer.Argument(
-            help="Holds a folder a scene, of left.png, right.png and view_<position>.png; or what "
-            "synth make --view made."
+            help="One folder per scene, with left.png, right.png and view_<position>.png; or a set from "
+            "synth make --view."
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("views.csv"),
-    model: Annotated[
-        list[str] | None,
-        typer.Option(help="As for depth; may be given again. All shipped networks unless given."),
-    ] = None,
+    out: CsvFile = Path("views.csv"),
+    model: Models = None,
     cluster: Cluster = None,
     threads: Threads = None,
     provider: Provider = "cpu",
 ) -> None:
-    """Errors of new views against pictures taken there: all pixels, smooth ones, depth edges, hidden ones.
+    """Score new views against pictures taken there: all pixels, smooth regions, depth edges, hidden pixels.
 
-    With --cluster each scene is scored by one worker of --threads cores, 1 unless given.
+    With --cluster, one worker of --threads cores (default: 1) scores each scene.
     """
     import cv2
 
@@ -158,15 +157,15 @@ def views(  # noqa: PLR0913 - each is a word of the command line
 
 
 @bench.command()
-def flicker(  # noqa: PLR0913 - each is a word of the command line
+def flicker(  # noqa: PLR0913 - each is an option of the command line
     scenes: Annotated[list[str], typer.Argument(metavar="SCENE...", help="As for synth make.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("flicker.csv"),
+    out: CsvFile = Path("flicker.csv"),
     model: Model = "small",
-    frames: Annotated[int, typer.Option(min=2, max=120, help="Of each film.")] = 12,
+    frames: Annotated[int, typer.Option(min=2, max=120, help="Frames of each video.")] = 12,
     threads: Threads = None,
     provider: Provider = "cpu",
 ) -> None:
-    """What steadying is worth: flicker and errors of depth with it and without, on rendered noisy films."""
+    """Score the temporal filter on rendered noisy videos: flicker and errors with it and without."""
     place_for(out)
     with needing_the_synth_extra():
         from stereoweave.bench.flicker import flicker_rows, means
@@ -184,16 +183,16 @@ def networks(
         list[Path],
         typer.Argument(metavar="RUN...", help="Folders of stereoweave train, or checkpoints."),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("networks.csv"),
+    out: CsvFile = Path("networks.csv"),
     pairs: Annotated[
         Path | None,
         typer.Option(
             metavar="FOLDER",
-            help="Where kept pairs are, or are made; beside the first run unless given.",
+            help="Folder of the kept pairs; missing ones are created (default: pairs, beside the first run).",
         ),
     ] = None,
 ) -> None:
-    """Errors of trained networks on the pairs held out from them, and of the right views made with them."""
+    """Score trained networks on their held-out pairs, with the errors of right views made from them."""
     from rich.console import Console
 
     place_for(out)
@@ -206,11 +205,12 @@ def networks(
 @bench.command()
 def parity(
     checkpoints: Annotated[
-        list[Path], typer.Argument(metavar="CHECKPOINT...", help="Of shipped networks, as in checkpoints/.")
+        list[Path],
+        typer.Argument(metavar="CHECKPOINT...", help="Checkpoints of shipped networks, as in checkpoints/."),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file to write.")] = Path("parity.csv"),
+    out: CsvFile = Path("parity.csv"),
 ) -> None:
-    """How far every variant of shipped networks is from PyTorch, on every provider that is here."""
+    """Compare every variant of shipped networks with PyTorch, on every provider available here."""
     from stereoweave.bench.pairs import write_csv
 
     place_for(out)
@@ -225,10 +225,10 @@ def parity(
 
 @bench.command()
 def training(
-    run: Annotated[Path, typer.Argument(help="The folder of a run of stereoweave train.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The CSV file; rows of other runs in it stay.")],
+    run: Annotated[Path, typer.Argument(help="Folder of a run of stereoweave train.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="CSV file to write; rows of other runs are kept.")],
 ) -> None:
-    """Learning curve of a run: its held-out scores against the pairs seen, and the power laws they follow."""
+    """Record the learning curve of a run: held-out scores by pairs seen, and the power laws that fit them."""
     place_for(out)
     with needing_the_train_extra():
         from stereoweave.learn.training.curves import record_curve
@@ -237,29 +237,29 @@ def training(
 
 
 def _makers(models: Sequence[str] | None, threads: int | None, provider: str) -> dict[str, Callable[[], Any]]:
-    """What makes each network, as it is and refined; all shipped ones unless some are named."""
+    """Constructors of the named networks, plain and refined; default: all shipped networks."""
     from stereoweave.bench.pairs import network
     from stereoweave.matching.matcher import MODES, shipped_models
 
     makers: dict[str, Callable[[], Any]] = {}
     for name in models or shipped_models():
-        # A worker of a cluster has another current folder.
+        # Absolute, because cluster workers have another current folder.
         model = str(Path(name).absolute()) if Path(name).is_file() else name
         makers[name] = partial(network, model, threads, provider=provider)
-        if name not in MODES:  # which refine by themselves
+        if name not in MODES:  # modes choose refinement themselves
             makers[name + REFINED] = partial(network, model, threads, refined=True, provider=provider)
     return makers
 
 
 def _check_plots(*pictures: Path | None) -> None:
-    """Fail before anything is scored where a picture cannot be drawn or written."""
+    """Fail before scoring starts if a plot cannot be drawn or written."""
     from stereoweave.io.files import picture_kind
 
     for picture in filter(None, pictures):
         picture_kind(picture)
         place_for(picture)
         with needing_the_train_extra("a plot needs matplotlib"):
-            from stereoweave.bench import plots as benchmark_plots  # noqa: F401 - imported to see that it can be
+            from stereoweave.bench import plots as benchmark_plots  # noqa: F401 - checks that it can be
 
 
 def _draw_plots(
@@ -274,7 +274,7 @@ def _draw_plots(
 
 
 def _write_classes(file: Path, scores: Any) -> None:
-    """Write the errors by class, and print their means."""
+    """Write errors by class, and print their means."""
     from stereoweave.bench.pairs import MEAN, write_csv
 
     write_csv(file, scores.class_rows, scores.machine)

@@ -1,4 +1,4 @@
-"""Tables that `stereoweave bench` prints of its rows."""
+"""Tables of scores, printed to the console."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -8,7 +8,7 @@ from typing import Any
 
 import typer
 
-# What stereoweave bench pairs shows of its rows, by heading and column.
+# Columns of the tables of stereoweave bench pairs, by title and heading.
 PAIRS_TABLES = {
     "Errors, mean over the scenes": {
         "EPE px": "epe_px",
@@ -29,7 +29,7 @@ PAIRS_TABLES = {
     },
 }
 
-# What stereoweave bench pairs --classes shows: a column for each class.
+# Fields of the tables of stereoweave bench pairs --classes, by title; they have a column per class.
 CLASS_TABLES = {
     "Pixels by class, % of the known ones": "share_percent",
     "bad-1 by class, points: together they make bad-1": "bad1_percent",
@@ -37,10 +37,10 @@ CLASS_TABLES = {
     "EPE within each class, px": "epe_px",
 }
 
-# As short as eight columns have to be in 80 characters.
+# Short enough for eight columns in 80 characters.
 CLASS_HEADINGS = {"thin_or_edge": "edges", "weak_texture": "weak", "textured": "texture"}
 
-# The same of stereoweave bench views.
+# Columns of the tables of stereoweave bench flicker and views.
 FLICKER_TABLES = {
     "Disparity and the view half-way, mean over the scenes": {
         "flicker px": "flicker_px",
@@ -72,12 +72,12 @@ VIEWS_TABLES = {
 
 
 def print_means(tables: Mapping[str, Mapping[str, str]], who: str, rows: Sequence[Any]) -> None:
-    """Print rows in several tables, since one would be wider than a terminal.
+    """Print rows in several tables, because a single one would be wider than a terminal.
 
     Args:
-        tables: By title, the columns' fields by heading.
-        who: The field that names a row.
-        rows: Dataclasses of one kind.
+        tables: Fields of the rows, by title and column heading.
+        who: Field that names a row.
+        rows: Dataclasses of one type.
     """
     from rich.console import Console
     from rich.table import Column, Table
@@ -92,7 +92,7 @@ def print_means(tables: Mapping[str, Mapping[str, str]], who: str, rows: Sequenc
 
 
 def print_classes(means: Sequence[Any]) -> None:
-    """Print the mean rows of errors by class, a row for each matcher and a column for each class."""
+    """Print mean errors by class, with a row per matcher and a column per class."""
     from rich.console import Console
     from rich.table import Column, Table
 
@@ -102,7 +102,7 @@ def print_classes(means: Sequence[Any]) -> None:
     for title, field in CLASS_TABLES.items():
         headings = (Column(CLASS_HEADINGS.get(name, name), justify="right") for name in names)
         table = Table(Column("matcher", no_wrap=True), *headings, title=title)
-        # The share of a class is the same for every matcher.
+        # All matchers have the same share.
         rows = {"any": matchers[0]} if field == "share_percent" else {Path(m).name: m for m in matchers}
         for label, matcher in rows.items():
             table.add_row(label, *(_cell(getattr(found[matcher, name], field)) for name in names))
@@ -114,7 +114,7 @@ def _cell(number: float) -> str:
 
 
 def write_and_print(out: Path, title: str, rows: Sequence[Any]) -> None:
-    """Write dataclass rows as CSV, print them as a table, and name the file."""
+    """Write dataclass rows as CSV, and print them as a table, followed by the file's name."""
     from stereoweave.bench.pairs import write_csv
 
     write_csv(out, rows)
@@ -123,7 +123,7 @@ def write_and_print(out: Path, title: str, rows: Sequence[Any]) -> None:
 
 
 def _print_rows(title: str, rows: Sequence[Any]) -> None:
-    """Print dataclass rows as a table, under their fields' names; nothing is cut to fit a terminal."""
+    """Print dataclass rows as a table with the fields' names as headings. Long cells wrap."""
     from rich.console import Console
     from rich.table import Column, Table
 
