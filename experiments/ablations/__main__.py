@@ -32,13 +32,11 @@ def ablations(
     """
     from rich.console import Console
 
-    from stereoweave.learn.recipe import read_recipe
-
-    base = read_recipe(recipe)
     place_for(report)
     with needing_the_train_extra():
         from experiments.ablations.experiment import plan, run_ablations
-    run_ablations(plan(base, seeds), out, rendered, report, Console())
+        from stereoweave.learn.recipe import read_recipe
+    run_ablations(plan(read_recipe(recipe), seeds), out, rendered, report, Console())
     typer.echo(f"rows: {report}")
 
 

@@ -28,12 +28,12 @@ def paper(  # noqa: PLR0913 - each is an option of the command line
     """
     from rich.console import Console
 
-    from stereoweave.learn.recipe import read_recipe
-
-    base, console = read_recipe(recipe), Console()
+    console = Console()
     with needing_the_train_extra():
         from experiments.paper.experiment import plan, run_trials
         from experiments.paper.report import write_report
+        from stereoweave.learn.recipe import read_recipe
+    base = read_recipe(recipe)
     planned = plan(base, out, seeds, console, (ADJUSTMENT,) if exponent_only else CLAIMS)
     run_trials(planned, out, jobs, console)
     write_report(base, planned, out, report)

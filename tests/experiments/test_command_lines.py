@@ -41,7 +41,10 @@ def folder(tmp_path, monkeypatch):
         ("speed none.toml -o rows.csv", ["none.toml", "expected a recipe"]),
         ("speed words.toml -o rows.csv", ["words.toml", "expected a recipe"]),
         ("paper none.toml -o runs --report report", ["none.toml", "expected a recipe"]),
-        ("paper low.toml -o runs --report report", ["low.toml", "exponent = 0.5", "at least 1"]),
+        (
+            "paper low.toml -o runs --report report",
+            ["low.toml", "exponent: expected a number of at least 1", "found 0.5"],
+        ),
         (f"paper {RECIPE} -o runs --report report", ["small", "expected 'fast_depth'"]),
         (f"paper {RECIPE} -o runs", ["--report", "--help"]),
         (f"paper {RECIPE} -o runs --report report --seeds 0", ["--seeds"]),
