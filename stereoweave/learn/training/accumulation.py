@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Float
 from lightning_fabric import Fabric
 from torch import Tensor, nn
-from torch.nn.modules.batchnorm import _BatchNorm
+
+_BATCH_NORMS = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm)
 
 
 class StepSums:
@@ -19,7 +20,7 @@ class StepSums:
 
     def __init__(self, network: nn.Module) -> None:
         self.parameters = list(network.parameters())
-        self.norms = [layer for layer in network.modules() if isinstance(layer, _BatchNorm)]
+        self.norms = [layer for layer in network.modules() if isinstance(layer, _BATCH_NORMS)]
         found = [value for layer in self.norms for value in (layer.running_mean, layer.running_var)]
         self.statistics = [value for value in found if value is not None]
         self.before = [value.clone() for value in self.statistics]
