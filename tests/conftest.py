@@ -61,6 +61,9 @@ CAPABILITIES = {
     ),
 }
 
+# As `ray_engine.set_environment` sets it before Ray is imported; tests import Ray at their beginning.
+os.environ["RAY_DEDUP_LOGS_SKIP_REGEX"] = ".*"
+
 # The garbage collector would go through all that is imported, again and again: a quarter of the tests' time.
 gc.disable()
 
@@ -136,8 +139,15 @@ def ray_address(s3: str) -> Iterator[str]:
         yield address
 
 
+@pytest.fixture
+def guarded_ray_address() -> Iterator[str]:
+    """The address of a Ray whose token is 64 times the letter a."""
+    with ray_head(cpus=1, RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=64 * "a") as address:
+        yield address
+
+
 @contextmanager
-def ray_head(cpus: int) -> Iterator[str]:
+def ray_head(cpus: int, **variables: str) -> Iterator[str]:
     """Ray, started by its own command and on ports of its own, for as long as the block lasts."""
     port, client_port = free_ports(2)
     # Directly below /tmp: the names of Unix sockets have at most 107 bytes.
@@ -166,6 +176,7 @@ def ray_head(cpus: int) -> Iterator[str]:
                 "RAY_USAGE_STATS_REPORT_URL": "http://127.0.0.1:9",
                 # Workers import what tests define.
                 "PYTHONPATH": os.pathsep.join(paths),
+                **variables,
             }
             head = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=environment)
         try:

@@ -5,6 +5,7 @@ import math
 import os
 import pickle
 import socket
+import subprocess
 import sys
 import time
 import traceback
@@ -13,6 +14,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from importlib.metadata import distribution
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from stereoweave.errors import StereoweaveError, needing_extra
@@ -24,8 +26,7 @@ if TYPE_CHECKING:
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-_ANSWERS_WITHIN_S = 10
-_QUESTION = "/ray.rpc.NodeInfoGcsService/GetClusterId"
+_CONNECTS_WITHIN_S, _ANSWERS_WITHIN_S = 10, 20
 # Tasks and results alone pass through it.
 _OBJECT_STORE_BYTES = 200_000_000
 _LOOKED_AT_EVERY_S, _BACK_WITHIN_S = 2, 10
@@ -33,10 +34,12 @@ _LOOKED_AT_EVERY_S, _BACK_WITHIN_S = 2, 10
 _LEAST_SHARE = 0.0001
 # Workers that end while they start, one after another: more are no accident.
 _MOST_FALSE_STARTS = 20
-# No warning of what Ray will change, no lines from its C++ parts.
 _SILENCE = {
+    # No warning of what Ray will change, no errors of its C++ parts: those that matter are raised too.
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "RAY_BACKEND_LOG_LEVEL": "fatal",
+    # No line of the cluster's logs, such as one for each killed worker, on the standard output among ours.
+    "RAY_DEDUP_LOGS_SKIP_REGEX": ".*",
 }
 # Where this is 0, as by default on macOS and Windows, a Ray that is started here takes the loopback address
 # for that of its machine, and listens there alone. If `ray.init` is given a loopback address, it replaces it.
@@ -102,11 +105,9 @@ def connect(engine: Engine) -> Iterator[None]:
     with needing_extra("cluster", "this needs Ray"):
         already = "ray" in sys.modules and sys.modules["ray"].is_initialized()
         if address and not already:
-            _check_answers(address)  # before Ray is loaded, and reads whether there is a token to show
-        with _without_words():
-            import ray
-    # It would tell of killed workers on the standard output, in the midst of ours.
-    ray._private.worker._worker_logs_enabled = False
+            distribution("ray")  # raises ModuleNotFoundError, without the import
+            _check_head(address)  # before the import, which reads whether to show a token
+        import ray
     if already:
         yield
         return
@@ -277,7 +278,7 @@ def _start() -> None:
 
     # Ray starts the process of a dashboard in any case, and that asks the metadata services of three clouds,
     # though nothing is reported (2.60). If the port of that process is taken, Ray goes on without it.
-    with _without_words(), socket.create_server(("127.0.0.1", 0)) as taken:
+    with _muted_stderr(), socket.create_server(("127.0.0.1", 0)) as taken:
         ray.init(
             address="local",
             num_cpus=usable_cores(),
@@ -290,35 +291,34 @@ def _start() -> None:
 
 
 def _join(address: str) -> None:
-    """Makes this process a driver of the cluster at an address."""
+    """Make this process a driver of the cluster at an address."""
     import ray
 
     try:
-        with _without_words():
+        with _muted_stderr():
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except Exception as error:  # Ray's own, gRPC's and Python's, which have no common base class
-        raise StereoweaveError(
-            f"{address}: expected the head of a Ray cluster, found {_first_line(error)}; "
-            "see that Ray and Python are of the cluster's versions, and that its token is here"
-        ) from error
+        raise _not_joined(address, _first_line(error)) from error
 
 
-def _check_answers(address: str) -> None:
-    """Refuses an address where no Ray answers: Ray itself would try for minutes, and say so in many lines."""
-    import grpc  # type: ignore[import-untyped]
+def _not_joined(address: str, found: str) -> StereoweaveError:
+    return StereoweaveError(
+        f"{address}: expected the head of a Ray cluster, found {found}; "
+        "see that Ray and Python are of the cluster's versions, and that its token is here"
+    )
 
-    if address == "auto":
-        return
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    if not (host and port.isdigit() and 0 < int(port) < 65536):
-        raise StereoweaveError(
-            f"a cluster's address: expected host:port, ray://host:port, auto or local, found {address!r}"
-        )
+
+def _check_head(address: str) -> None:
+    """Raise an error if no head answers: `ray.init` would retry for minutes, and then exit the process.
+
+    At a port of Ray's client (ray://) it gives up after half a minute, and raises an error itself.
+    """
     try:
-        socket.create_connection((host, int(port)), _ANSWERS_WITHIN_S).close()
-        if os.environ.get("RAY_USE_TLS") != "1":
-            _ask(f"{host}:{port}", "" if address.startswith("ray://") else _QUESTION)
-    except (OSError, grpc.FutureTimeoutError, grpc.RpcError) as error:
+        if address != "auto":
+            _check_port(address)
+        if not address.startswith("ray://"):
+            _check_status(address)
+    except (OSError, subprocess.TimeoutExpired) as error:
         found = _first_line(error) if isinstance(error, OSError) else "something else that listens there"
         raise StereoweaveError(
             f"{address}: expected the head of a Ray cluster that answers, found {found}; "
@@ -326,28 +326,43 @@ def _check_answers(address: str) -> None:
         ) from error
 
 
-def _ask(place: str, question: str) -> None:
-    """Asks a head who it is; where it wants to see a token, Ray is told to show the one that it has.
+def _check_port(address: str) -> None:
+    """Raise an error if the address is malformed, an OSError if nothing listens at it."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not (host and port.isdigit() and 0 < int(port) < 65536):
+        raise StereoweaveError(
+            f"a cluster's address: expected host:port, ray://host:port, auto or local, found {address!r}"
+        )
+    socket.create_connection((host, int(port)), _CONNECTS_WITHIN_S).close()
 
-    Ray never shows one by itself, and where it shows one that nobody asked for, actors end at once (2.60).
+
+def _check_status(address: str) -> None:
+    """Raise an error if `ray status` fails; have Ray show its token if the head requires one.
+
+    Ray shows none by default, and if it shows one to a head that requires none, actors end at once (2.60).
+
+    Raises:
+        StereoweaveError: The head refused: wrong version, wrong token.
+        subprocess.TimeoutExpired: Nothing that understands Ray answers.
     """
-    import grpc
+    status = _status(address)
+    if "AuthenticationError" in status.stderr and "RAY_AUTH_MODE" not in os.environ:
+        os.environ["RAY_AUTH_MODE"] = "token"
+        status = _status(address)
+    if status.returncode:
+        raise _not_joined(address, status.stderr.strip().splitlines()[-1].rstrip(".;"))
 
-    with grpc.insecure_channel(place) as channel:
-        grpc.channel_ready_future(channel).result(_ANSWERS_WITHIN_S)
-        if not question:
-            return
-        try:
-            channel.unary_unary(question)(b"", timeout=_ANSWERS_WITHIN_S)
-        except grpc.RpcError as error:
-            if error.code() != grpc.StatusCode.UNAUTHENTICATED:
-                raise
-            os.environ.setdefault("RAY_AUTH_MODE", "token")
+
+def _status(address: str) -> subprocess.CompletedProcess[str]:
+    """The outcome of the command `ray status`, in a process of its own."""
+    # -P: else a file in the current folder may have the name of a library.
+    command = [sys.executable, "-P", "-m", "ray.scripts.scripts", "status", "--address", address]
+    return subprocess.run(command, capture_output=True, text=True, timeout=_ANSWERS_WITHIN_S, check=False)
 
 
 @contextmanager
-def _without_words() -> Iterator[None]:
-    """What Ray's C++ parts write to the error output meanwhile goes nowhere; an exception says it as well."""
+def _muted_stderr() -> Iterator[None]:
+    """Discard what Ray writes to the standard error: a line of C++ that it has read RAY_BACKEND_LOG_LEVEL."""
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)

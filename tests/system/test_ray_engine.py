@@ -4,6 +4,8 @@ import importlib
 import os
 import signal
 import socket
+import subprocess
+import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -102,6 +104,34 @@ def test_workers_that_lack_a_module_are_told_in_a_line(engine, tmp_path, monkeyp
     assert capfd.readouterr().out == ""
 
 
+def test_a_killed_worker_is_no_line_on_the_output(ray_address, tmp_path):
+    program = """
+import os, sys, time
+from pathlib import Path
+from stereoweave.system.ray_engine import Engine, stream
+
+folder = Path(sys.argv[2])
+
+def make():
+    def work(task):
+        if len(list(folder.iterdir())) < 3:
+            (folder / str(os.getpid())).touch()
+            os.kill(os.getpid(), 9)
+        return task
+    return work
+
+for result in stream(make, range(3), Engine(sys.argv[1], workers=1)):
+    print(result)
+time.sleep(3)  # until Ray has reported
+"""
+    command = [sys.executable, "-c", program, ray_address, str(tmp_path)]
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_DEDUP")}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert len(list(tmp_path.iterdir())) == 3
+    assert sorted(done.stdout.split()) == ["0", "1", "2"]
+    assert done.stderr == ""
+
+
 def test_a_worker_that_fits_no_machine_is_refused_and_parts_of_a_core_are_counted(engine):
     assert room(engine) == 2
     assert room(Engine(cpus_each=0.1)) == 20
@@ -131,3 +161,32 @@ def test_a_wrong_address_is_told_in_one_line(engine, monkeypatch):
             with pytest.raises(StereoweaveError, match=told) as caught, connect(Engine(address)):
                 pass
             assert "\n" not in str(caught.value)
+
+
+def test_the_token_is_shown_to_a_head_that_requires_it_and_a_wrong_one_is_told_in_one_line(
+    guarded_ray_address,
+):
+    program = """
+import sys
+from stereoweave.errors import StereoweaveError
+from stereoweave.system.ray_engine import Engine, connect, room
+
+engine = Engine(sys.argv[1])
+try:
+    with connect(engine):
+        print(room(engine), "worker")
+except StereoweaveError as error:
+    print(error)
+"""
+    printed = {}
+    for letter in "ab":
+        command = [sys.executable, "-c", program, guarded_ray_address]
+        environment = {**os.environ, "RAY_AUTH_TOKEN": 64 * letter}
+        environment.pop("RAY_AUTH_MODE", None)
+        done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+        assert done.stderr == ""
+        printed[letter] = done.stdout
+    assert printed["a"] == "1 worker\n"
+    assert printed["b"].count("\n") == 1
+    assert printed["b"].startswith(f"{guarded_ray_address}: expected the head of a Ray cluster, found ")
+    assert "token is missing or incorrect" in printed["b"]
