@@ -1,8 +1,10 @@
+import ast
 import re
 import shutil
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,11 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 CONTRACTS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
 
 PYTORCH = "The package imports PyTorch under learn alone, and no experiment"
+# Public in spite of their underscores: in named tuples and in the module os.
+DOCUMENTED = {"_asdict", "_exit", "_fields", "_replace"}
+# Lightning registers it with atexit, from where only its name removes it.
+TOLERATED = {"_destroy_dist_connection"}
+
 # A contract, a file, and the line in it that the contract forbids.
 BREACHES = [
     ("Rooms import downwards", "matching/matcher.py", "import stereoweave.cameras.rig"),
@@ -40,6 +47,27 @@ def modules_without_pytorch() -> list[str]:
     files = (path.relative_to(REPOSITORY) for path in (REPOSITORY / "stereoweave").rglob("*.py"))
     names = (".".join(path.with_suffix("").parts).removesuffix(".__init__") for path in files)
     return sorted(name for name in names if not name.startswith("stereoweave.learn"))
+
+
+def private_names(nodes: Iterable[ast.AST]) -> Iterator[str]:
+    """The names with one underscore that are imported, or read as attributes."""
+    for node in nodes:
+        names: list[str] = []
+        if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
+            names = [node.attr]
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            paths = [alias.name for alias in node.names] + [getattr(node, "module", None) or ""]
+            names = [name for path in paths for name in path.split(".")]
+        yield from (name for name in names if re.match("_[^_]", name))
+
+
+def defined_names(nodes: Iterable[ast.AST]) -> Iterator[str]:
+    """The names of functions and classes, and of variables and attributes that are assigned."""
+    for node in nodes:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            yield node.name
+        elif isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store):
+            yield node.id if isinstance(node, ast.Name) else node.attr
 
 
 def test_importing_the_package_imports_nothing_but_itself_and_the_standard_library():
@@ -82,3 +110,23 @@ def test_a_breach_of_a_contract_is_caught(tmp_path, contract, file, line):
 
 def test_each_contract_has_a_breach_that_is_tried():
     assert {contract["name"] for contract in CONTRACTS} == {contract for contract, _, _ in BREACHES}
+
+
+def test_no_private_name_of_a_library_is_used():
+    files = sorted((REPOSITORY / "stereoweave").rglob("*.py"))
+    nodes = [node for file in files for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))]
+    assert set(private_names(nodes)) - set(defined_names(nodes)) - DOCUMENTED == TOLERATED
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "ray._private.worker.show = False",
+        "from ray import _raylet",
+        "import ray._private.worker as worker",
+        "from torch.nn.modules.batchnorm import _BatchNorm",
+    ],
+)
+def test_a_private_name_of_a_library_is_caught(line):
+    nodes = list(ast.walk(ast.parse(line)))
+    assert set(private_names(nodes)) - set(defined_names(nodes)) - DOCUMENTED
