@@ -5,6 +5,8 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
+from prometheus_client import CollectorRegistry
+
 from fuzz.requests import Application, repair_length, request_bytes, send
 from fuzz.targets import Target, calibrations
 from fuzz.targets.pictures import encoded, eyes
@@ -48,7 +50,9 @@ def _application() -> Application:
             raise answer
         return answer
 
-    return Guard(make_app(answering, _LIMITS, bytes, Path(tempfile.gettempdir())), _LIMITS)
+    registry = CollectorRegistry()
+    app = make_app(answering, _LIMITS, Path(tempfile.gettempdir()), registry)
+    return Guard(app, _LIMITS, registry)
 
 
 def _read(path: Path) -> None:

@@ -1,11 +1,9 @@
 """How the service speaks HTTP: what its requests say, and the guard before them, who refuses some."""
 
 import asyncio
-import math
 import secrets
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, MutableMapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,8 +12,8 @@ from typing import Annotated, Any
 from fastapi import FastAPI, Form, HTTPException, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, SecretStr
-from ray.serve.metrics import Counter, Histogram
 from starlette.datastructures import Headers
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
@@ -29,7 +27,6 @@ from stereoweave.system.child_process import ProcessDiedError
 # In so long some of those that wait are done.
 _RETRY_AFTER_S = 1
 _LATENCIES_S = [0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 60]
-_METRICS_KEPT_S = 1
 _PATHS = ("/disparity", "/depth", "/view")
 _HEALTH = "/health"
 # As nginx has it: the client went away, and nobody was answered.
@@ -97,8 +94,13 @@ _MapForm = Annotated[MapForm, Form(media_type="multipart/form-data")]
 _ViewForm = Annotated[ViewForm, Form(media_type="multipart/form-data")]
 
 
-def make_app(answering: Answering, limits: Limits, metrics: Callable[[], bytes], folder: Path) -> FastAPI:
-    """The application; `answering` does the work, and uploads lie in the folder until it is done."""
+def make_app(
+    answering: Answering, limits: Limits, folder: Path, registry: CollectorRegistry | None = None
+) -> FastAPI:
+    """The application: `answering` does the work, and uploads lie in the folder until it is done.
+
+    The metrics of the registry are at /metrics; without a registry there is no such path.
+    """
     app = FastAPI(
         title="Stereoweave",
         version=__version__,
@@ -114,7 +116,6 @@ def make_app(answering: Answering, limits: Limits, metrics: Callable[[], bytes],
     async def _refuse(_: Request, error: RequestValidationError) -> Response:
         return JSONResponse({"detail": _in_one_line(error)}, 422)
 
-    counted = _Metrics(metrics)
     answered = _Answers(answering, limits.megapixels, folder)
 
     @app.post("/disparity", responses=_responses(".png", ".pfm", ".npy", ".tiff"), response_class=Response)
@@ -137,35 +138,14 @@ def make_app(answering: Answering, limits: Limits, metrics: Callable[[], bytes],
         """That the network is loaded, and requests are taken."""
         return {"status": "ok", "version": __version__}
 
-    @app.get("/metrics", response_class=Response)
-    async def prometheus() -> Response:
-        """What is counted, in Prometheus' text format."""
-        try:
-            text = await counted()
-        except OSError as error:
-            raise HTTPException(503, f"expected Ray's exporters of metrics, found {error}") from error
-        return Response(text, media_type="text/plain; version=0.0.4")
+    if registry is not None:
+
+        @app.get("/metrics", response_class=Response)
+        async def metrics() -> Response:
+            """The counts of requests, in Prometheus' text format."""
+            return Response(generate_latest(registry), media_type="text/plain; version=0.0.4")
 
     return app
-
-
-class _Metrics:
-    """The text of a function, at most a second old.
-
-    One thread of its own gathers it: however many ask, the threads that uploads need stay free.
-    """
-
-    def __init__(self, gather: Callable[[], bytes]) -> None:
-        self._gather, self._thread, self._gathering = gather, ThreadPoolExecutor(1), asyncio.Lock()
-        self._text, self._until_s = b"", -math.inf
-
-    async def __call__(self) -> bytes:
-        async with self._gathering:
-            if time.monotonic() >= self._until_s:
-                loop = asyncio.get_running_loop()
-                self._text = await loop.run_in_executor(self._thread, self._gather)
-                self._until_s = time.monotonic() + _METRICS_KEPT_S
-            return self._text
 
 
 def _responses(*endings: str) -> dict[int | str, dict[str, Any]]:
@@ -245,18 +225,17 @@ def _status(error: Exception) -> int:
 class Guard:
     """Before an application: refuses what is posted and too much, too large or no form, and counts all."""
 
-    def __init__(self, app: _Server, limits: Limits) -> None:
+    def __init__(self, app: _Server, limits: Limits, registry: CollectorRegistry | None = None) -> None:
         self._app, self._limits, self._accepted = app, limits, 0
         self._requests = Counter(
-            "stereoweave_requests",
-            "Requests by path and status.",
-            tag_keys=("path", "status"),  # type: ignore[arg-type]
+            "stereoweave_requests", "Requests by path and status.", ["path", "status"], registry=registry
         )
         self._seconds = Histogram(
             "stereoweave_request_seconds",
             "From the head of a request to its response, of those accepted.",
-            boundaries=_LATENCIES_S,
-            tag_keys=("path",),
+            ["path"],
+            buckets=_LATENCIES_S,
+            registry=registry,
         )
 
     async def __call__(self, scope: _Message, receive: _Receive, send: _Send) -> None:
@@ -278,12 +257,12 @@ class Guard:
         try:
             if refusal is None:
                 await self._accept(scope, exchange)
-                self._seconds.observe(time.perf_counter() - start_s, tags={"path": path})
+                self._seconds.labels(path).observe(time.perf_counter() - start_s)
             else:
                 await refusal(scope, receive, exchange.send)
         finally:
             status = str(exchange.status or _CLIENT_GONE)
-            self._requests.inc(tags={"path": path, "status": status})
+            self._requests.labels(path, status).inc()
 
     def _refusal(self, headers: Headers) -> Response | None:
         """The response to a request of which the head says that it is not accepted."""

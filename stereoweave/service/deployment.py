@@ -11,19 +11,13 @@ import os
 import re
 import socket
 import time
-import urllib.request
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
 
-import ray
-from prometheus_client import CollectorRegistry, generate_latest
-from prometheus_client.core import Metric
-from prometheus_client.parser import text_string_to_metric_families
-from prometheus_client.registry import Collector
+from prometheus_client import CollectorRegistry
 from pydantic import BaseModel, ConfigDict, Field
 from ray import serve
 from ray.exceptions import RayActorError
@@ -50,11 +44,6 @@ _GATHERED_WITHIN_S = 0.005
 _MEGAPIXELS_AT_ONCE = 32
 # Beyond those that wait: it refuses them, or says how it is.
 _MOST_AT_DOOR = 200
-# Of what Ray counts: pairs matched together, requests accepted, requests that wait before replicas.
-_METRICS = (
-    r"ray_(stereoweave_|serve_(actual_batch_size|replica_processing_queries|deployment_queued_queries))"
-)
-_METRICS_WITHIN_S = 5
 _QUIET = LoggingConfig(log_level="ERROR", enable_access_log=False)
 
 
@@ -110,7 +99,7 @@ class Replica:
 
     def __serve_build_asgi_app__(self) -> Guard:
         limits = self._settings.limits
-        return Guard(make_app(self._answer, limits, metrics, self._folder), limits)
+        return Guard(make_app(self._answer, limits, self._folder), limits)
 
     async def outcome(self, order: Order, left_s: float) -> Answer | Exception:
         """What an order gets within the seconds that are left for it, or why it gets nothing."""
@@ -168,44 +157,6 @@ def application(settings: Settings) -> serve.Application:
     return deployed(Replica).bind(settings)
 
 
-def metrics() -> bytes:
-    """What the exporters of Ray's nodes have of the service, in Prometheus' text format.
-
-    They gather it every ten seconds. They also have what Ray and its Serve count of themselves.
-    """
-    merged: dict[str, Metric] = {}
-    for family in (each for url in _exporters() for each in _exported(url)):
-        known = merged.setdefault(family.name, family)
-        known.samples += family.samples if known is not family else []
-    registry = CollectorRegistry()
-    registry.register(_Gathered(merged.values()))
-    return generate_latest(registry)
-
-
-def _exporters() -> Iterator[str]:
-    for node in ray.nodes():  # type: ignore[no-untyped-call]
-        if node["Alive"]:
-            yield f"http://{node['NodeManagerAddress']}:{node['MetricsExportPort']}/metrics"
-
-
-def _exported(url: str) -> Iterable[Metric]:
-    """What an exporter has of the service; the rest is hundreds of times as much."""
-    with urllib.request.urlopen(url, timeout=_METRICS_WITHIN_S) as response:
-        lines = response.read().decode().splitlines()
-    ours = [line for line in lines if re.match(rf"(# (HELP|TYPE) )?{_METRICS}", line)]
-    return text_string_to_metric_families("\n".join([*ours, ""]))
-
-
-@dataclass(frozen=True, eq=False)
-class _Gathered(Collector):
-    """Metrics that were counted elsewhere."""
-
-    metrics: Iterable[Metric]
-
-    def collect(self) -> Iterable[Metric]:
-        return self.metrics
-
-
 @contextmanager
 def serving(settings: Settings, listener: socket.socket, address: str | None = None) -> Iterator[None]:
     """The service, for as long as the block lasts; what it accepted is done before it ends.
@@ -258,7 +209,8 @@ def _at_server(settings: Settings, listener: socket.socket) -> Iterator[None]:
             return outcome
 
         folder = ending.enter_context(own_folder())
-        app = Guard(make_app(answer, limits, metrics, folder), limits)
+        registry = CollectorRegistry()
+        app = Guard(make_app(answer, limits, folder, registry), limits, registry)
         ending.enter_context(http_server(app, listener, Patience(end_s=limits.timeout_s)))
         yield
 

@@ -2,13 +2,13 @@
 
 import asyncio
 import tempfile
-import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
+from prometheus_client import CollectorRegistry
 from service_examples import BOTH
 
 from stereoweave.errors import ProviderError
@@ -21,13 +21,14 @@ pytestmark = pytest.mark.filterwarnings("ignore:Using extra keyword arguments on
 
 
 def guarded(
-    answering: Any, metrics: Callable[[], bytes] = bytes, folder: Path | None = None, **limits: Any
+    answering: Any, registry: CollectorRegistry | None = None, folder: Path | None = None, **limits: Any
 ) -> httpx.AsyncClient:
     """A client of the service without a server, whose work is done by a function."""
     from stereoweave.service.asgi import Guard, Limits, make_app
 
     allowed = Limits(**limits)
-    app = Guard(make_app(answering, allowed, metrics, folder or Path(tempfile.gettempdir())), allowed)
+    app = make_app(answering, allowed, folder or Path(tempfile.gettempdir()), registry)
+    app = Guard(app, allowed, registry)
     return httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://service")
 
 
@@ -185,7 +186,7 @@ def test_work_for_a_client_that_goes_away_is_cancelled():
             "query_string": b"",
             "headers": [(name.lower(), value) for name, value in request.headers.raw],
         }
-        app = Guard(make_app(waits, Limits(), bytes, Path(tempfile.gettempdir())), Limits())
+        app = Guard(make_app(waits, Limits(), Path(tempfile.gettempdir())), Limits())
         await asyncio.wait_for(app(scope, receive, send), 10)
         return cancelled.is_set()
 
@@ -242,27 +243,26 @@ def test_a_machine_without_room_is_no_fault_of_the_request(error, found):
     assert "\n" not in detail
 
 
-def test_a_flood_of_requests_for_metrics_holds_no_other_up_and_gathers_them_once():
-    gathered, allowed = [], threading.Event()
-
-    def gather() -> bytes:
-        gathered.append(threading.get_ident())
-        allowed.wait(10)
-        return b"counted 1\n"
-
-    async def flood() -> tuple[int, set[tuple[int, bytes]]]:
-        async with guarded(at_once, gather, timeout_s=3) as client:
+def test_a_flood_of_requests_for_metrics_holds_no_other_up():
+    async def flood() -> tuple[int, set[int], str]:
+        async with guarded(at_once, CollectorRegistry(), timeout_s=3) as client:
             asked = [asyncio.create_task(client.get("/metrics")) for _ in range(50)]
-            while not gathered:
-                await asyncio.sleep(0)
             posted = await client.post("/disparity", files=BOTH)
-            allowed.set()
-            return posted.status_code, {
-                (each.status_code, each.content) for each in await asyncio.gather(*asked)
-            }
+            statuses = {each.status_code for each in await asyncio.gather(*asked)}
+            return posted.status_code, statuses, (await client.get("/metrics")).text
 
-    assert asyncio.run(flood()) == (200, {(200, b"counted 1\n")})
-    assert len(gathered) == 1
+    posted, asked, text = asyncio.run(flood())
+    assert (posted, asked) == (200, {200})
+    assert 'stereoweave_requests_total{path="/disparity",status="200"} 1.0\n' in text
+    assert 'stereoweave_request_seconds_count{path="/disparity"} 1.0\n' in text
+
+
+def test_without_a_registry_there_are_no_metrics():
+    async def get() -> httpx.Response:
+        async with guarded(at_once) as client:
+            return await client.get("/metrics")
+
+    assert asyncio.run(get()).status_code == 404
 
 
 def test_a_response_that_could_not_be_begun_in_time_becomes_one_that_says_so():
@@ -273,7 +273,7 @@ def test_a_response_that_could_not_be_begun_in_time_becomes_one_that_says_so():
 
     async def ask() -> httpx.Response:
         limits, unread = Limits(timeout_s=0.2), [asyncio.Event()]
-        guard = Guard(make_app(answers, limits, bytes, Path(tempfile.gettempdir())), limits)
+        guard = Guard(make_app(answers, limits, Path(tempfile.gettempdir())), limits)
 
         async def to_a_slow_reader(scope: Any, receive: Any, send: Any) -> None:
             async def send_when_read(message: Any) -> None:

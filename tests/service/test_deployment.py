@@ -9,17 +9,19 @@ import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import httpx
 import numpy as np
+import psutil
 import pytest
 import watching
 from hostile_calibrations import HOSTILE
 from hostile_requests import hostile
+from prometheus_client import Metric
 from prometheus_client.parser import text_string_to_metric_families
 from service_examples import BOTH, CALIB, EXAMPLES, Sender, malformed
 
@@ -271,6 +273,10 @@ def test_its_description_names_every_path_and_field(service):
     assert {"left", "right", "picture", "position", "file", "range", "calib"} <= set(fields)
 
 
+def families_of(text: str) -> dict[str, Metric]:
+    return {family.name: family for family in text_string_to_metric_families(text)}
+
+
 def test_its_metrics_count_requests_by_status(service):
     assert post(service, "/depth").status_code == 422  # no camera
     with pytest.raises(httpx.ReadTimeout):  # the client goes away
@@ -278,18 +284,33 @@ def test_its_metrics_count_requests_by_status(service):
     expected = {("/depth", "422"), ("/view", "499"), ("/disparity", "200"), ("/disparity", "503")}
     deadline_s = time.monotonic() + 30
     while time.monotonic() < deadline_s:
-        families = {
-            family.name: family for family in text_string_to_metric_families(service.get("/metrics").text)
-        }
-        counted = families.get("ray_stereoweave_requests")
-        seen = {(s.labels["path"], s.labels["status"]) for s in counted.samples} if counted else set()
+        families = families_of(service.get("/metrics").text)
+        seen = {(s.labels["path"], s.labels["status"]) for s in families["stereoweave_requests"].samples}
         if expected <= seen:
             break
         time.sleep(0.2)
     assert expected <= seen
-    assert families["ray_stereoweave_request_seconds"].type == "histogram"
+    assert families["stereoweave_request_seconds"].type == "histogram"
+
+
+def test_ray_s_own_exporter_has_what_replicas_count(running):
+    deadline_s = time.monotonic() + 30
+    while not (families := exported_by_ray(running.pid)) and time.monotonic() < deadline_s:
+        time.sleep(0.2)
     batches = {s.labels.get("le"): s.value for s in families["ray_serve_actual_batch_size"].samples}
     assert batches["+Inf"] > batches["1.0"]  # some were of two
+
+
+def exported_by_ray(pid: int) -> dict[str, Metric]:
+    """The metrics at the port of Ray's exporter, which is one of the ports that the service opens."""
+    for process in psutil.Process(pid).children(recursive=True):
+        for connection in process.net_connections("tcp"):
+            if connection.status == psutil.CONN_LISTEN:
+                with suppress(httpx.HTTPError):
+                    text = httpx.get(f"http://127.0.0.1:{connection.laddr.port}/metrics", timeout=2).text
+                    if "ray_serve_actual_batch_size" in text:
+                        return families_of(text)
+    return {}
 
 
 def test_a_port_that_is_taken_is_one_line(capsys):
