@@ -16,8 +16,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from browsers import chromium
 from page_examples import start, stop
 from PIL import Image
+from playwright.sync_api import Browser
 
 from stereoweave.app.session import Uploads, matched, zipped
 from stereoweave.cli.root import main
@@ -31,15 +33,6 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SIZE = (640, 480)
 UNDRAWN = "does not draw in three dimensions"
 WINDOW = {"width": 1280, "height": 1000}
-FLAGS = [
-    "--no-sandbox",
-    "--enable-unsafe-swiftshader",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 # A cold computer compiles the loops over pixels first.
 PATIENCE_MS = 60_000
 
@@ -56,13 +49,9 @@ def address(tmp_path_factory) -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
+def browser() -> Iterator[Browser]:
+    with chromium() as browser:
         yield browser
-        browser.close()
 
 
 class Visit:

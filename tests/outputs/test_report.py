@@ -1,17 +1,15 @@
 import base64
 import io
-import json
-import os
 import re
-import subprocess
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from browsers import chromium
 from PIL import Image
+from playwright.sync_api import Browser, Page
 
 from stereoweave.outputs.report import POSITIONS, Summary, shrunk, summarize, write_report
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
@@ -142,95 +140,10 @@ def test_the_legend_is_in_metres_with_a_camera_and_in_pixels_without(rng, tmp_pa
         assert legend in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-class Browser:
-    """Chromium without a window, driven through its DevTools pipe: commands on descriptor 3, answers on 4."""
-
-    def __init__(self, folder: Path) -> None:
-        for name in ("commands", "answers"):
-            os.mkfifo(folder / name)
-        flags = (
-            "--headless --no-sandbox --disable-gpu --disable-dev-shm-usage --disable-background-networking "
-            f"--no-first-run --user-data-dir={folder}/profile --remote-debugging-pipe"
-        )
-        with (folder / "log").open("w") as log:
-            self._process = subprocess.Popen(
-                ["sh", "-c", f"exec chromium {flags} 3<{folder}/commands 4>{folder}/answers"], stderr=log
-            )
-        self._commands = (folder / "commands").open("wb", buffering=0)
-        self._answers = (folder / "answers").open("rb", buffering=0)
-        self._unread = b""
-        self._session: dict[str, str] = {}
-        self._count = 0
-        self.requested: list[str] = []
-        target = self.call("Target.createTarget", url="about:blank")["targetId"]
-        self._session = {
-            "sessionId": self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
-        }
-        self.call("Network.enable")
-        self.call("Page.enable")
-        self.call(
-            "Emulation.setDeviceMetricsOverride", width=1200, height=1600, deviceScaleFactor=1, mobile=False
-        )
-
-    def call(self, method: str, **parameters: object) -> dict[str, Any]:
-        self._count += 1
-        command = {"id": self._count, "method": method, "params": parameters} | self._session
-        self._commands.write(json.dumps(command).encode() + b"\0")
-        while (message := self._message()).get("id") != self._count:
-            pass
-        return message["result"]
-
-    def open(self, page: Path) -> None:
-        self.call("Page.navigate", url=page.as_uri())
-        while self._message().get("method") != "Page.loadEventFired":
-            pass
-
-    def run(self, script: str) -> Any:
-        return self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
-
-    def box(self, selector: str) -> dict[str, float]:
-        return json.loads(
-            self.run(f"JSON.stringify(document.querySelector('{selector}').getBoundingClientRect())")
-        )
-
-    def picture(self, selector: str) -> np.ndarray:
-        box = self.box(selector)
-        clip = {name: box[name] for name in ("x", "y", "width", "height")} | {"scale": 1}
-        png = base64.b64decode(self.call("Page.captureScreenshot", clip=clip)["data"])
-        return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
-
-    def press(self, key: str, code: int) -> None:
-        for kind in ("keyDown", "keyUp"):
-            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code)
-
-    def mouse(self, kind: str, x: float, y: float) -> None:
-        button = "none" if kind == "mouseMoved" else "left"
-        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button=button, clickCount=1)
-
-    def close(self) -> None:
-        self.call("Browser.close")
-        self._commands.close()
-        self._answers.close()
-        self._process.wait(timeout=20)
-
-    def _message(self) -> dict[str, Any]:
-        while b"\0" not in self._unread:
-            chunk = self._answers.read(1 << 16)
-            assert chunk, "chromium has ended"
-            self._unread += chunk
-        text, _, self._unread = self._unread.partition(b"\0")
-        message = json.loads(text)
-        if message.get("method") == "Network.requestWillBeSent":
-            self.requested.append(message["params"]["request"]["url"])
-        return message
-
-
-@pytest.fixture
-def browser(tmp_path) -> Iterator[Browser]:
-    (tmp_path / "browser").mkdir()
-    browser = Browser(tmp_path / "browser")
-    yield browser
-    browser.close()
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as browser:
+        yield browser
 
 
 @pytest.fixture
@@ -239,54 +152,64 @@ def photograph(rng) -> np.ndarray:
 
 
 @pytest.fixture
-def page(photograph, tmp_path) -> Path:
+def report(photograph, tmp_path) -> Path:
     """A report about a wall 0.5 m away."""
     pair, estimate = wall(photograph, SHIFT_PX, CAMERA)
     write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png", "b.png"))
     return tmp_path / "report.html"
 
 
+@pytest.fixture
+def page(browser) -> Iterator[Page]:
+    """An empty page of the browser, whose scripts may not fail."""
+    page = browser.new_page(viewport={"width": 1200, "height": 1600})
+    errors: list[str] = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    yield page
+    page.close()
+    assert errors == []
+
+
 @pytest.mark.needs_chromium
-def test_the_slider_changes_the_picture(browser, page, photograph):
+def test_the_slider_changes_the_picture(page, report, photograph):
     def seen_from(position: float) -> float:
         """How far what the browser shows is from the wall as the camera at `position` sees it."""
-        shown = browser.picture("#stage")
+        shown = np.asarray(Image.open(io.BytesIO(page.locator("#stage").screenshot())).convert("RGB"))
         moved_px = round(position * SHIFT_PX)
         expected = Image.fromarray(photograph[:, moved_px : moved_px + 320]).resize(shown.shape[1::-1])
         return difference(shown, np.asarray(expected))
 
-    browser.open(page)
+    page.goto(report.as_uri())
     assert seen_from(0.5) < 4
     assert seen_from(0.75) > 12
 
-    browser.press("Tab", 9)
-    for _ in range(2):
-        browser.press("ArrowRight", 39)
-    assert browser.run("document.querySelector('#where').textContent").startswith("0.75, between the cameras")
+    for key in ("Tab", "ArrowRight", "ArrowRight"):
+        page.keyboard.press(key)
+    assert page.text_content("#where").startswith("0.75, between the cameras")
     assert seen_from(0.75) < 4
     assert seen_from(0.5) > 12
 
-    slider = browser.box("#position")
-    left_end = browser.box(".ends span")
-    for kind in ("mousePressed", "mouseReleased"):
-        browser.mouse(kind, left_end["x"] + left_end["width"] / 2, slider["y"] + slider["height"] / 2)
-    assert browser.run("document.querySelector('#where').textContent").startswith("0, at the left camera")
+    slider = page.locator("#position").bounding_box()
+    left_end = page.locator(".ends span").first.bounding_box()
+    page.mouse.click(left_end["x"] + left_end["width"] / 2, slider["y"] + slider["height"] / 2)
+    assert page.text_content("#where").startswith("0, at the left camera")
     assert seen_from(0) < 4
 
 
 @pytest.mark.needs_chromium
-def test_pointing_at_the_depth_reads_it(browser, page):
-    browser.open(page)
-    depth = browser.box("#depth")
-    browser.mouse("mouseMoved", depth["x"] + depth["width"] / 4, depth["y"] + depth["height"] / 2)
+def test_pointing_at_the_depth_reads_it(page, report):
+    page.goto(report.as_uri())
+    depth = page.locator("#depth").bounding_box()
+    page.mouse.move(depth["x"] + depth["width"] / 4, depth["y"] + depth["height"] / 2)
     # 400 px * 0.04 m / 32 px
-    expected = "(80, 120): disparity 32.00 px, depth 0.500 m"
-    assert browser.run("document.querySelector('#reading').textContent") == expected
+    assert page.text_content("#reading") == "(80, 120): disparity 32.00 px, depth 0.500 m"
 
 
 @pytest.mark.needs_chromium
-def test_opening_the_page_asks_for_that_file_alone(browser, page):
-    browser.open(page)
-    browser.press("Tab", 9)
-    browser.press("ArrowRight", 39)
-    assert [url for url in browser.requested if not url.startswith("data:")] == [page.as_uri()]
+def test_opening_the_page_asks_for_that_file_alone(page, report):
+    requested: list[str] = []
+    page.on("request", lambda request: requested.append(request.url))
+    page.goto(report.as_uri())
+    for key in ("Tab", "ArrowRight"):
+        page.keyboard.press(key)
+    assert [url for url in requested if not url.startswith("data:")] == [report.as_uri()]
