@@ -1,4 +1,4 @@
-"""Which requests reach the page: those on the routes that it needs, for the visitor's own files."""
+"""Access control of the page: only the routes that it needs, and only the visitor's own files."""
 
 import json
 import re
@@ -12,30 +12,30 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-# What a browser may load: nothing from elsewhere, whatever the page asks for.
+# A browser may load nothing from other servers, whatever the page requests.
 _POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:"
 _REFUSED = "expected a file that you gave to this page or that it made of yours; give it again"
 _COOKIE = "stereoweave-visitor"
 _VISITOR = re.compile(r"[\w-]{43}", re.ASCII)
 _API = "/gradio_api"
 _FILE = f"{_API}/file="
-# Gradio has more: calls without its queue, a proxy, recordings, streams, functions of components.
+# Gradio's other routes stay closed: unqueued calls, a proxy, recordings, streams, component functions.
 _ROUTES = re.compile(
     r"/|/(config|theme\.css|favicon\.ico|manifest\.json|robots\.txt)|/(static|assets|svelte)(/[\w-][\w.-]*)+"
     rf"|{_API}/(info|app_id|startup-events|upload|upload_progress|queue/join|queue/data|reset|cancel)/?"
     rf"|{_API}/heartbeat/\w+|{_FILE}.+",
     re.DOTALL,
 )
-# Those whose answers name files to the visitor.
+# Routes whose responses name files to the visitor.
 _NAMING = (f"{_API}/upload", f"{_API}/queue/data")
 _MOST_BODY_BYTES = 1_000_000
-# About 200 bytes each; a visitor who looks at a pair for an hour is shown hundreds.
+# About 200 bytes each; a visitor who studies a pair for an hour receives hundreds.
 _MOST_NAMED = 10_000
 _MOST_VISITORS = 1_000
 
 
 class ContentPolicy:
-    """Tells browsers to load nothing from anywhere else."""
+    """Middleware that forbids browsers to load anything from other servers."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -45,10 +45,11 @@ class ContentPolicy:
 
 
 class OwnFiles:
-    """Lets a visitor name only files that the page has named to them: their uploads and results, the sample.
+    """Middleware that restricts visitors to files that the page has named to them: uploads, results, sample.
 
-    A path is compared as text with those in earlier answers to the same cookie: for a foreign one nothing is
-    looked up on the disk. Gradio checks paths only in a server that it started itself, and not by visitor.
+    A requested path is compared as text with the paths in earlier responses to the same cookie, so a foreign
+    path is never looked up on disk. Gradio checks paths only in servers that it starts itself, and not by
+    visitor.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -73,7 +74,7 @@ class OwnFiles:
         await self._app(_without_cookies(scope), receive, send)
 
     async def _checked(self, scope: Scope, receive: Receive, visitor: str) -> Receive:
-        """What to read the request from, if all that it names is the visitor's; a PermissionError if not."""
+        """The channel to read the request from; raises PermissionError if it names a file of someone else."""
         path, method = scope["path"], scope.get("method")
         if scope["type"] != "http" or not _ROUTES.fullmatch(path):
             raise PermissionError
@@ -90,7 +91,7 @@ class OwnFiles:
             raise PermissionError
 
     def _remembering(self, send: Send, visitor: str) -> Send:
-        """Remembers the files of an answer before it is sent: of uploads a list, of events a line each."""
+        """Remember the files that a response names: a list of uploads, or one event a line."""
         kept = b""
 
         async def send_and_remember(message: Message) -> None:
@@ -116,7 +117,7 @@ class OwnFiles:
 
 
 class _Named:
-    """The paths named to each visitor: each has a limit, so that no visitor takes those of another."""
+    """The paths named to each visitor, limited per visitor, so that none displaces another's."""
 
     def __init__(self) -> None:
         self._visitors: OrderedDict[str, OrderedDict[str, None]] = OrderedDict()
@@ -135,15 +136,15 @@ class _Named:
 
 
 def _use(entries: OrderedDict[str, Any], key: str, most: int) -> None:
-    """Puts an entry last, and removes the first where there are more than `most`."""
+    """Move an entry to the end, and remove the first if there are more than `most`."""
     entries.move_to_end(key)
     if len(entries) > most:
         entries.popitem(last=False)
 
 
 def _visitor(scope: Scope) -> str:
-    """Who asks, by the cookie; empty where there is none."""
-    # Some versions of Python take the square of a cookie's length to unquote it.
+    """The visitor's cookie; empty if there is none."""
+    # In some versions of Python the time to unquote a cookie grows with the square of its length.
     for header in Headers(scope=scope).getlist("cookie"):
         for cookie in header.split(";"):
             name, _, value = (part.strip() for part in cookie.partition("="))
@@ -153,7 +154,7 @@ def _visitor(scope: Scope) -> str:
 
 
 def _without_cookies(scope: Scope) -> Scope:
-    """The request as Gradio gets it, which would unquote cookies of other servers too."""
+    """The request without cookies: Gradio would unquote those of other servers too."""
     return {**scope, "headers": [(name, value) for name, value in scope["headers"] if name != b"cookie"]}
 
 
@@ -167,10 +168,10 @@ def _with_header(send: Send, name: str, value: str) -> Send:
 
 
 async def _json(request: Request) -> tuple[Any, bytes]:
-    """The value of a request's body, and its text written anew: what is checked is what Gradio reads.
+    """The value of a request's JSON body, and the body encoded again, so that Gradio reads what is checked.
 
     Raises:
-        PermissionError: It is no JSON, or too large.
+        PermissionError: If the body is not JSON, or too large.
     """
     body = b""
     try:
@@ -185,7 +186,7 @@ async def _json(request: Request) -> tuple[Any, bytes]:
 
 
 def _paths(value: Any) -> Iterator[Any]:
-    """Every `path` in a value: Gradio takes any mapping that has one for a file."""
+    """Yield every `path` in a value: Gradio treats any mapping with this key as a file."""
     waiting = [value]
     while waiting:
         match waiting.pop():
@@ -198,7 +199,7 @@ def _paths(value: Any) -> Iterator[Any]:
 
 
 def _replay(body: bytes, receive: Receive) -> Receive:
-    """Gives a body that was read already, then what comes after it."""
+    """A channel that gives a body that was read already, then the messages after it."""
     messages = [{"type": "http.request", "body": body, "more_body": False}]
 
     async def receive_again() -> Message:

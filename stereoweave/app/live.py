@@ -1,7 +1,7 @@
-"""What cameras see, and its disparity in colours beside it: on a page of this machine, as it comes.
+"""Live view of cameras on a local web page: the left image, and its disparity in colour beside it.
 
-OpenCV as it is installed here has no windows, and a rig often has no screen. A browser shows a stream of JPEG
-pictures (multipart/x-mixed-replace) by itself, from another machine too, through a tunnel.
+The headless build of OpenCV has no windows, and a rig often has no screen. Browsers show a stream of JPEG
+images (multipart/x-mixed-replace) without a script, on another machine through a tunnel.
 """
 
 import threading
@@ -34,9 +34,9 @@ Picture = UInt8[np.ndarray, "h w 3"]
 Frame = UInt8[np.ndarray, "rows columns 3"]
 
 _ADDRESS = "127.0.0.1"
-# A name that another site's DNS server gives this address must not open the page to that site.
+# Other names are refused: another site could point its own name at this address (DNS rebinding).
 _OWN_NAMES = (_ADDRESS, "localhost")
-# Not "picture": FFmpeg, which may look too, takes its first letters for those of a QuickTime file.
+# Not "picture": FFmpeg, a possible client, mistakes its first letters for the start of a QuickTime file.
 _BOUNDARY = "frame"
 _PAGE = b"""<!doctype html>
 <html lang="en">
@@ -50,9 +50,9 @@ _PAGE = b"""<!doctype html>
 </html>
 """
 _USUAL_RATE = 25.0
-# A network's address may take its time; a camera that gives nothing for so long is gone.
+# A network stream may be slow; a camera without a frame for this long is disconnected.
 _SILENT_S = 10.0
-# How far the colours follow the range of a new frame: at once, they would flicker.
+# The share by which the colour range follows that of a new frame; at 1 the colours would flicker.
 _FOLLOWED = 0.1
 _RANGED_EVERY_PX = 4
 _RATED_FRAMES = 30
@@ -61,7 +61,7 @@ _JPEG_QUALITY = 85
 
 
 class Moment(NamedTuple):
-    """What the sources gave at once: RGB pictures, their number from 0 on, and when (time.monotonic)."""
+    """Simultaneous RGB images of all sources, their number from 0, and their time (time.monotonic)."""
 
     number: int
     pictures: tuple[Picture, ...]
@@ -69,16 +69,16 @@ class Moment(NamedTuple):
 
 
 class Capture:
-    """One source or two, read in step by a thread that keeps the newest moment and drops older ones.
+    """One or two sources, read in step by a thread that keeps only the newest moment.
 
-    A film is read at its own rate, as if a camera gave it.
+    A video is read at its own frame rate, like a camera.
 
     Args:
-        sources: What OpenCV opens: a camera's number, a video file, a stream's address, or a series of
-            pictures as frame%03d.png; of both views, or two, the left one first.
+        sources: A source with both views, or two, the left one first. Each is a camera's number, a video
+            file, a stream's address, or a series of pictures such as frame%03d.png.
 
     Raises:
-        FormatError: If there is none of that name.
+        FormatError: If a source cannot be opened.
         StereoweaveError: If there are more than two.
     """
 
@@ -91,7 +91,7 @@ class Capture:
         self.name, self.count = " and ".join(sources), len(sources)
         self._captures = [_opened(source) for source in sources]
         first = self._captures[0]
-        # Of a picture, or a stream that was written down, no number of frames is known.
+        # A picture or a recorded stream has no frame count.
         self._is_film = first.get(cv2.CAP_PROP_FRAME_COUNT) > 0 or Path(sources[0]).is_file()
         rate = first.get(cv2.CAP_PROP_FPS)
         self._step_s = 1 / (rate if rate > 0 else _USUAL_RATE)
@@ -108,13 +108,13 @@ class Capture:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stopped.set()
-        self._thread.join(timeout=1)  # a camera that hangs is left to the end of the process
+        self._thread.join(timeout=1)  # a camera that hangs ends with the process
 
     def newest(self, after: int) -> Moment | None:
-        """The newest moment of a number above `after`, which is waited for; None at the end of a film.
+        """Wait for the newest moment with a number above `after`; None at the end of a video.
 
         Raises:
-            StereoweaveError: A camera or a stream gives nothing more, or a film nothing at all.
+            StereoweaveError: If a camera or stream stops, or a video has no frame.
         """
         with self._changed:
             came = self._changed.wait_for(lambda: self._ended or self._has(after), _SILENT_S)
@@ -149,7 +149,7 @@ class Capture:
                 self._changed.notify_all()
 
     def _read(self) -> tuple[Picture, ...] | None:
-        # All are grabbed before any is decoded, so that two cameras are as near in time as can be.
+        # Grab all before decoding any, so that two cameras are as close in time as possible.
         if not all([capture.grab() for capture in self._captures]):
             return None
         frames = [capture.retrieve() for capture in self._captures]
@@ -159,13 +159,13 @@ class Capture:
 
 
 class Screen(ThreadingHTTPServer):
-    """A page on loopback that shows the newest picture to whoever opens it.
+    """A web page on loopback that shows the newest image to every visitor.
 
     Args:
-        port: Where; any free one for 0.
+        port: The port; 0 for any free one.
 
     Raises:
-        StereoweaveError: If it is taken.
+        StereoweaveError: If the port is in use.
     """
 
     def __init__(self, port: int) -> None:
@@ -190,13 +190,13 @@ class Screen(ThreadingHTTPServer):
         self.server_close()
 
     def close(self) -> None:
-        """Ends the streams, after the newest picture."""
+        """End the streams after the newest image."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
 
     def show(self, picture: Picture) -> None:
-        """Shows an RGB picture from now on."""
+        """Show an RGB image from now on."""
         _, jpeg = cv2.imencode(
             ".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
         )
@@ -205,11 +205,11 @@ class Screen(ThreadingHTTPServer):
             self._changed.notify_all()
 
     def pictures(self) -> Iterator[bytes]:
-        """The pictures as JPEG, from the one that is shown on; those that come too fast are left out."""
+        """Yield the images as JPEG, from the current one on; images that come too fast are skipped."""
         shown = 0
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._closed or self._number > shown)  # noqa: B023 - at once
+                self._changed.wait_for(lambda: self._closed or self._number > shown)  # noqa: B023 - called at once
                 if self._number == shown:
                     return
                 jpeg, shown = self._jpeg, self._number
@@ -224,13 +224,13 @@ class _Handler(BaseHTTPRequestHandler):
             self._begin("text/html; charset=utf-8")
             self.wfile.write(_PAGE)
         elif self.path == "/stream":
-            with suppress(ConnectionError):  # who looked has gone
+            with suppress(ConnectionError):  # the visitor has left
                 self._stream()
         else:
             self.send_error(404)
 
     def log_message(self, format: str, *values: object) -> None:
-        """Nothing: each request would be a line on the terminal."""
+        """Log nothing: each request would print a line on the terminal."""
 
     def _begin(self, kind: str) -> None:
         self.send_response(200)
@@ -245,13 +245,13 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(boundary)
         for jpeg in cast(Screen, self.server).pictures():
             header = f"Content-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n".encode()
-            # The boundary at once, for a browser shows a picture when it sees the end of it.
+            # Send the boundary at once: a browser shows an image when it reaches its end.
             self.wfile.write(header + jpeg + boundary)
 
 
 @dataclass
 class Tally:
-    """What was shown so far."""
+    """Statistics of the frames shown so far."""
 
     shown: int = 0
     last: int = -1
@@ -260,7 +260,7 @@ class Tally:
     last_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RATED_FRAMES))
 
     def add(self, moment: Moment, now_s: float) -> None:
-        """Counts a moment that is shown now."""
+        """Count a moment that is shown now."""
         self.first_s = self.first_s if self.shown else now_s
         self.shown, self.last = self.shown + 1, moment.number
         self.waited_s += now_s - moment.taken_s
@@ -268,11 +268,11 @@ class Tally:
 
     @property
     def rate(self) -> float:
-        """Frames a second, of those that were shown last; 0 of a single one."""
+        """Frames per second over the last frames; 0 for a single one."""
         return _rate(len(self.last_s), self.last_s[-1] - self.last_s[0])
 
     def line(self) -> str:
-        """All of it in a line."""
+        """The statistics in one line."""
         if not self.shown:
             return "nothing was shown"
         rate = _rate(self.shown, self.last_s[-1] - self.first_s)
@@ -282,7 +282,7 @@ class Tally:
         )
 
 
-def show(  # noqa: PLR0913 - what to look at, where, and how
+def show(  # noqa: PLR0913 - source, output and settings
     capture: Capture,
     screen: Screen,
     matcher: Matcher,
@@ -291,15 +291,15 @@ def show(  # noqa: PLR0913 - what to look at, where, and how
     arrangement: str | None = None,
     rig: Rig | None = None,
 ) -> None:
-    """Shows what is captured, and its disparity, until its end.
+    """Show captured images and their disparity until the sources end.
 
     Args:
-        capture: What to look at.
-        screen: Where it is shown.
-        matcher: What finds the disparity.
-        tally: Where it is counted, also when something ends it before.
-        arrangement: How one source holds both views, a name in `ARRANGEMENTS`; guessed unless given.
-        rig: The cameras, by which the pictures are rectified; without one they have to be rectified already.
+        capture: The sources.
+        screen: The page to show them on.
+        matcher: The matcher for the disparity.
+        tally: Updated with each frame, so that it is valid even after an error.
+        arrangement: The frame packing of a single source, a name in `ARRANGEMENTS`. Default: detected.
+        rig: The calibration to rectify the images with. Default: they are rectified already.
     """
     range_px: tuple[float, float] | None = None
     while moment := capture.newest(tally.last):
@@ -317,7 +317,7 @@ def show(  # noqa: PLR0913 - what to look at, where, and how
 def followed(
     range_px: tuple[float, float] | None, disparity_px: Float[np.ndarray, "h w"]
 ) -> tuple[float, float]:
-    """The disparities of the first and the last colour after a frame: a step towards those of it alone."""
+    """The colour range after a frame: a step from the previous one towards the frame's own range."""
     wanted_px = colour_range_px(disparity_px[::_RANGED_EVERY_PX, ::_RANGED_EVERY_PX])
     if range_px is None:
         return wanted_px
@@ -328,7 +328,7 @@ def followed(
 def composed(
     pair: StereoPair, disparity_px: Float[np.ndarray, "h w"], range_px: tuple[float, float], words: str
 ) -> Frame:
-    """The left picture, the disparity beside it, and a strip of words above both."""
+    """The left image, its disparity beside it, and a line of text above both."""
     colours = colour_disparity(disparity_px, range_px)
     if pair.left_seen is not None:
         colours[~pair.left_seen] = 0
@@ -341,7 +341,7 @@ def composed(
 
 
 def range_words(camera: StereoCamera | None, range_px: tuple[float, float]) -> str:
-    """What the first and the last colour stand for: metres where the camera is known."""
+    """The meaning of the first and the last colour, in metres if the camera is known, else in pixels."""
     if camera is None:
         return "disparity {:.1f} px (blue) to {:.1f} px (red)".format(*range_px)
     far_m, near_m = camera.depth_m(np.array([range_px]))[0]
@@ -353,14 +353,14 @@ def _pair(pictures: Sequence[Picture], arrangement: str | None) -> StereoPair:
         left, right = pictures
     else:
         [both] = pictures
-        ARRANGEMENTS[arrangement].eye_size_px(both.shape[1], both.shape[0])  # refuses what cannot be halved
+        ARRANGEMENTS[arrangement].eye_size_px(both.shape[1], both.shape[0])  # raises if it cannot be halved
         left, right = ARRANGEMENTS[arrangement].eyes(both)
     return StereoPair(left=left, right=right)
 
 
 def _opened(source: str) -> cv2.VideoCapture:
     level = cv2.utils.logging.getLogLevel()
-    # What goes wrong is said once, by the error below.
+    # The error below reports a failure; OpenCV would print it too.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
     cv2.utils.logging.setLogLevel(level)

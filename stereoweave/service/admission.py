@@ -1,4 +1,4 @@
-"""The time that a request will take, estimated before its pictures are decoded; too much of it is refused."""
+"""Admission of requests by their estimated time, before their pictures are decoded."""
 
 import math
 from collections import deque
@@ -9,15 +9,15 @@ from statistics import median
 from stereoweave.errors import StereoweaveError
 from stereoweave.service.answers import Order, TooLargeError
 
-# What large pictures take longer, for each of their pixels, and what full resolution takes longer. Checks and
-# rectification take a fraction of a second whatever the size.
+# Factors of time per pixel for large pictures, and for full resolution. Checks and rectification take a
+# fraction of a second at any size.
 _LARGE_FROM_MEGAPIXELS, _LARGE, _REFINED = 2, 2.5, 1.3
-# Speeds that are remembered: an odd request or two do not change their median.
+# The number of recent speeds; one or two outliers do not change their median.
 _LATEST = 9
 
 
 class BusyError(StereoweaveError):
-    """A request that can be done, but not in time after those that were accepted before it."""
+    """A request that would be late only because of those accepted before it."""
 
     def __init__(self, message: str, retry_after_s: int = 1) -> None:
         super().__init__(message)
@@ -25,11 +25,10 @@ class BusyError(StereoweaveError):
 
 
 class Budget:
-    """The work that one process has accepted, and the seconds that each unit of `work_of` takes it.
+    """The accepted work of one process, and its time per unit of `work_of`.
 
-    A request that could not be done in time at the best speed so far is refused for good. One that has to
-    wait for others is refused for now if their work and its own take too long at the usual speed, the median
-    of the last few.
+    A request is refused permanently if it could not finish in time at the best speed so far. It is refused
+    temporarily if it would be late after the accepted ones at the usual speed, the median of the last few.
     """
 
     def __init__(self, seconds_each: float) -> None:
@@ -39,11 +38,11 @@ class Budget:
 
     @contextmanager
     def admit(self, order: Order, megapixels: float, left_s: float) -> Iterator[None]:
-        """Within the block the order counts as accepted.
+        """Count the order as accepted within the block.
 
         Raises:
-            TooLargeError: It takes longer than the `left_s` seconds that are left for it.
-            BusyError: It does after what was accepted before it.
+            TooLargeError: If the order alone takes longer than `left_s`.
+            BusyError: If it takes longer than that after the accepted ones.
         """
         work = work_of(order, megapixels)
         least_s = work * self._best_each_s
@@ -65,17 +64,17 @@ class Budget:
             self._accepted.remove(work)
 
     def learn(self, work: float, took_s: float, *, finished: bool = True) -> None:
-        """Take into account how long an amount of work took, or after how long it was stopped unfinished."""
+        """Update the speeds with the time that work took, or after which it was stopped unfinished."""
         each_s = took_s / work
         if finished:
             self._best_each_s = min(self._best_each_s, each_s)
-        else:  # it would have taken longer than that
+        else:  # it would have taken longer
             each_s = max(each_s, median(self._latest_each_s))
         self._latest_each_s.append(each_s)
 
 
 def work_of(order: Order, megapixels: float) -> float:
-    """The work of an order: as many megapixels of a plain disparity of small pictures take as long."""
+    """The work of an order, in megapixels of unrefined disparity of small pictures that take as long."""
     large = _LARGE if megapixels > _LARGE_FROM_MEGAPIXELS else 1
     refined = _REFINED if order.refined or order.is_view else 1
     return megapixels * large * refined

@@ -1,7 +1,7 @@
-"""The service: pictures are posted, depth and views come back. Ray Serve runs it.
+"""Runs the HTTP service on Ray Serve: clients post pictures and receive depth or views.
 
-Each replica has a network of its own. A request waits until what came before it is matched, and is then
-matched together with those that waited with it.
+Each replica has its own network. A request waits for the current batch to finish; then all waiting requests
+are matched together.
 """
 
 import asyncio
@@ -38,26 +38,26 @@ from stereoweave.system.threads import usable_cores
 
 NAME = "stereoweave"
 GPU_PROVIDERS = ("cuda", "tensorrt")
-# Those that are woken together come within this.
+# Requests that wake up together arrive within this time.
 _GATHERED_WITHIN_S = 0.005
-# The pairs of a batch are in memory at once: of large ones there are fewer.
+# All pairs of a batch are in memory at once, so a batch holds fewer large ones.
 _MEGAPIXELS_AT_ONCE = 32
-# Beyond those that wait: it refuses them, or says how it is.
+# In addition to waiting requests: these are refused, or ask for its health.
 _MOST_AT_DOOR = 200
 _QUIET = LoggingConfig(log_level="ERROR", enable_access_log=False)
 
 
 class Settings(BaseModel):
-    """What the service is made of.
+    """Settings of the service.
 
     Attributes:
-        model: As for `Matcher`.
-        provider: Likewise.
-        threads: Likewise, of each replica.
-        replicas: So many processes, each with its network.
-        batch: At most so many pairs are matched together. A processor gains nothing by it: of two cores, a
-            pair of 640x480 px takes 400, 390 and 405 ms by one, two and four.
-        limits: What each replica accepts.
+        model: As in `Matcher`.
+        provider: As in `Matcher`.
+        threads: Threads of each replica.
+        replicas: The number of processes, each with its own network.
+        batch: The maximum number of pairs to match together. On a CPU a batch is no faster: on two cores a
+            pair of 640x480 px takes 400, 390 and 405 ms in batches of one, two and four.
+        limits: Limits of each replica.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -71,13 +71,13 @@ class Settings(BaseModel):
 
     @property
     def gpus_each(self) -> int:
-        """The GPUs that each replica has to itself."""
+        """The number of GPUs reserved for each replica."""
         return 1 if self.provider in GPU_PROVIDERS else 0
 
 
 @serve.ingress()
 class Replica:
-    """A process of the service, which answers orders, and on a cluster HTTP as well."""
+    """A process of the service that answers orders; on a cluster also HTTP requests."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings, self._opened = settings, ExitStack()
@@ -86,7 +86,8 @@ class Replica:
         self._worker = Worker(make, self._folder)
         self._opened.callback(self._worker.close)
         self._budget = Budget(self._worker.warm_up())
-        # One thread for each process of the worker: what waits for it is not sent, and can be cancelled.
+        # One thread for each process of the worker: calls that wait for it are not sent yet, and can be
+        # cancelled.
         self._measuring, self._answering = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
         self._free = asyncio.Event()
         self._free.set()
@@ -94,7 +95,7 @@ class Replica:
             max_batch_size=settings.batch, batch_wait_timeout_s=_GATHERED_WITHIN_S, batch_size_fn=self._size
         )(self._answered)
 
-    def __del__(self) -> None:  # called by Ray Serve when a replica is to end
+    def __del__(self) -> None:  # Ray Serve calls it to end a replica
         self._opened.close()
 
     def __serve_build_asgi_app__(self) -> Guard:
@@ -102,19 +103,19 @@ class Replica:
         return Guard(make_app(self._answer, limits, self._folder), limits)
 
     async def outcome(self, order: Order, left_s: float) -> Answer | Exception:
-        """What an order gets within the seconds that are left for it, or why it gets nothing."""
+        """The answer to an order within the seconds that are left for it, or the error."""
         try:
             return await self._answer(order, left_s)
         except FAILURES as error:
             return error
 
     async def _answer(self, order: Order, left_s: float) -> Answer:
-        """The answer to an order; what is cancelled while it waits is never begun."""
+        """The answer to an order. An order that is cancelled while it waits never starts."""
         deadline_s = time.monotonic() + left_s
         loop = asyncio.get_running_loop()
         megapixels = await loop.run_in_executor(self._measuring, self._worker.measure, order, left_s)
         with self._budget.admit(order, megapixels, deadline_s - time.monotonic()):
-            # Else each that comes while another is matched would be a batch of its own.
+            # Otherwise each order that arrives during a match would become a batch of its own.
             await self._free.wait()
             answer = await self._together(Task(order, megapixels, deadline_s))
         if isinstance(answer, Exception):
@@ -136,13 +137,13 @@ class Replica:
         return answers
 
     def _size(self, tasks: Sequence[Task]) -> int:
-        """How much of a batch they fill, counted in pairs."""
+        """The share of a batch that tasks fill, in pairs."""
         most = self._settings.batch
         return sum(min(math.ceil(task.megapixels * most / _MEGAPIXELS_AT_ONCE), most) for task in tasks)
 
 
 def application(settings: Settings) -> serve.Application:
-    """The service for `serve.run`, or for a Serve config file as stereoweave.service:application."""
+    """The service for `serve.run`, and as stereoweave.service:application for a Serve config file."""
     deployed = serve.deployment(
         name=NAME,
         num_replicas=settings.replicas,
@@ -150,7 +151,7 @@ def application(settings: Settings) -> serve.Application:
         max_ongoing_requests=settings.limits.waiting + _MOST_AT_DOOR,
         max_queued_requests=_MOST_AT_DOOR,
         graceful_shutdown_timeout_s=settings.limits.timeout_s,
-        # What hinders a network once hinders it again.
+        # If a network fails to load, further tries fail too.
         max_constructor_retry_count=2,
         logging_config=_QUIET,
     )
@@ -159,22 +160,23 @@ def application(settings: Settings) -> serve.Application:
 
 @contextmanager
 def serving(settings: Settings, listener: socket.socket, address: str | None = None) -> Iterator[None]:
-    """The service, for as long as the block lasts; what it accepted is done before it ends.
+    """Run the service within the block; at its end finish the accepted requests.
 
     Args:
-        settings: What it is made of.
-        listener: Where it is served. On a cluster it is closed, and Ray's own proxies listen there on each
-            machine that has a replica.
-        address: As for `Engine`; a cluster that serves nothing yet.
+        settings: Settings of the service.
+        listener: The socket to serve at. On a cluster it is closed, and Ray's own proxies listen at its port
+            on each machine that has a replica.
+        address: As in `Engine`; the cluster must not serve another application.
 
     Raises:
-        StereoweaveError: There is no room for all replicas, or Ray or the network is not as it should be.
+        StereoweaveError: If the replicas do not fit, Ray cannot be reached, or the network does not load.
     """
     address = address or os.environ.get("RAY_ADDRESS")
     engine = Engine(address, cpus_each=settings.threads, gpus_each=settings.gpus_each)
     if address is None:
         _check_room(settings, usable_cores() // settings.threads)
-        Matcher(settings.model, provider=settings.provider)  # its errors come before Ray takes seconds
+        # Report its errors before Ray starts, which takes seconds.
+        Matcher(settings.model, provider=settings.provider)
     logging.getLogger("ray.serve").setLevel(logging.CRITICAL)
     with connect(engine):
         _check_free(address)
@@ -185,7 +187,7 @@ def serving(settings: Settings, listener: socket.socket, address: str | None = N
 
 @contextmanager
 def _at_server(settings: Settings, listener: socket.socket) -> Iterator[None]:
-    """The service behind an HTTP server of this process, which hands orders to the replicas."""
+    """Serve from an HTTP server in this process that passes orders to the replicas."""
     limits = settings.limits
     limits = limits.model_copy(update={"waiting": limits.waiting * settings.replicas})
     serve.start(proxy_location="Disabled", logging_config=_QUIET)
@@ -217,7 +219,7 @@ def _at_server(settings: Settings, listener: socket.socket) -> Iterator[None]:
 
 @contextmanager
 def _at_proxies(settings: Settings, listener: socket.socket) -> Iterator[None]:
-    """The service behind the HTTP proxies of Ray Serve, one on each machine."""
+    """Serve from the HTTP proxies of Ray Serve, one on each machine."""
     host, port = listener.getsockname()[:2]
     listener.close()
     serve.start(http_options={"host": host, "port": port}, logging_config=_QUIET)
@@ -230,7 +232,7 @@ def _at_proxies(settings: Settings, listener: socket.socket) -> Iterator[None]:
 
 
 def _check_free(address: str | None) -> None:
-    """An error where a cluster serves already: its Serve listens where it does, and at no second port."""
+    """Raise an error if the cluster serves already: Ray Serve cannot listen at a second port."""
     others = serve.status().applications
     if others:
         raise StereoweaveError(
@@ -240,7 +242,7 @@ def _check_free(address: str | None) -> None:
 
 
 def _run(settings: Settings) -> DeploymentHandle[Any]:
-    """Start the replicas, and wait until their networks are loaded."""
+    """Start the replicas and wait until their networks are loaded."""
     try:
         return serve.run(application(settings), name=NAME, route_prefix="/")
     except RuntimeError as error:
@@ -253,14 +255,14 @@ def _run(settings: Settings) -> DeploymentHandle[Any]:
 
 
 def _end() -> None:
-    """Ends the replicas, each when what it accepted is done."""
+    """End the replicas, each after its accepted requests."""
     while NAME in serve.status().applications:
-        with suppress(TimeoutError):  # it waits for a minute, and a request may take longer
+        with suppress(TimeoutError):  # raised after a minute; a request may take longer
             serve.delete(NAME)
 
 
 def _check_room(settings: Settings, found: int) -> None:
-    """An error where there is room for fewer replicas: Ray would wait for more, without a word."""
+    """Raise an error if the replicas do not fit: Ray would wait for more room without a message."""
     if settings.replicas > found:
         gpu = " and a GPU" if settings.gpus_each else ""
         raise StereoweaveError(
@@ -270,8 +272,8 @@ def _check_room(settings: Settings, found: int) -> None:
 
 
 def _room(engine: Engine) -> int:
-    """How many replicas the machines have room for."""
+    """The number of replicas that fit on the cluster."""
     try:
         return room(engine)
-    except StereoweaveError:  # there is none: it names options of another command
+    except StereoweaveError:  # none fits; the error names options of another command
         return 0

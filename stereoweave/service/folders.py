@@ -1,4 +1,4 @@
-"""The temporary folder of a process of the service; what a killed process left behind is removed."""
+"""Temporary folders of the service's processes, and the removal of those that killed processes left."""
 
 import shutil
 import tempfile
@@ -14,9 +14,9 @@ _PREFIX, _LOCK = "stereoweave-service-", ".lock"
 
 @contextmanager
 def own_folder() -> Iterator[Path]:
-    """A temporary folder for as long as the block lasts, and of this user alone.
+    """Make a temporary folder for the block, readable by this user only.
 
-    A lock beside it, which the system releases when its process ends in whatever way, says that it is in use.
+    A lock file beside it marks it as in use. The system releases the lock when the process ends in any way.
     """
     _remove_abandoned()
     folder = Path(tempfile.gettempdir(), f"{_PREFIX}{uuid4().hex}")
@@ -27,14 +27,14 @@ def own_folder() -> Iterator[Path]:
             yield folder
         finally:
             shutil.rmtree(folder, ignore_errors=True)
-            # What cleans /tmp may have removed it, and Windows keeps it while it is open.
+            # A cleaner of /tmp may have removed it, and Windows keeps it while it is open.
             with suppress(OSError):
                 Path(lock.lock_file).unlink()
 
 
 def _remove_abandoned() -> None:
     for path in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*{_LOCK}"):
-        # In use, or another user's.
+        # OSError: it is in use, or belongs to another user.
         with suppress(OSError), FileLock(path, blocking=False):
             shutil.rmtree(path.with_suffix(""), ignore_errors=True)
             path.unlink()

@@ -1,6 +1,6 @@
-"""The HTTP server of `stereoweave serve`: uvicorn, with limits on the time and the bytes of a connection.
+"""HTTP server of `stereoweave serve`: uvicorn with limits on the time and the bytes of a connection.
 
-Ray Serve's own proxy has none: it keeps a head without an end in memory.
+Ray Serve's own proxy has no such limits: it keeps a request head of any length in memory.
 """
 
 import asyncio
@@ -18,21 +18,21 @@ import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 _MOST_HEAD_BYTES = 16 * 1024
-# So many bytes are parsed at a time: h11 takes 40 us for a chunk, which may be of one byte, and others wait.
+# Bytes to parse at a time: h11 takes 40 us for a chunk, even of one byte, while other connections wait.
 _PARSED_BYTES = 4096
-# Each takes a file descriptor, of which a process usually has 1024. As many as wait to be accepted are
-# accepted at once, before any is closed.
+# Each takes a file descriptor; a process usually has 1024. All waiting connections are accepted at once,
+# before any is closed.
 _MOST_CONNECTIONS, _WAITING_CONNECTIONS = 500, 100
 
 
 @dataclass(frozen=True)
 class Patience:
-    """The seconds that a server waits for its clients.
+    """How long a server waits for its clients.
 
     Attributes:
-        head_s: For all of the head of the next request.
-        reader_s: For a client to read a response, which is in memory until then.
-        end_s: At its own end, for requests that are worked on.
+        head_s: Seconds for the whole head of the next request.
+        reader_s: Seconds for a client to read a response, which stays in memory meanwhile.
+        end_s: Seconds for requests in progress when the server ends.
     """
 
     head_s: float = 10
@@ -41,9 +41,9 @@ class Patience:
 
 
 class _Connection(H11Protocol, asyncio.BufferedProtocol):
-    """A connection that is closed if a head or a reader is late.
+    """A connection that closes if a head or a reader is late.
 
-    Where there are too many connections, the one that has waited longest for a head is closed.
+    If there are too many connections, the one that has waited longest for a head is closed.
     """
 
     def __init__(self, patience: Patience, *args: Any, **options: Any) -> None:
@@ -60,7 +60,7 @@ class _Connection(H11Protocol, asyncio.BufferedProtocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        transport.set_write_buffer_limits(high=0)  # writing is paused while the client leaves a byte unread
+        transport.set_write_buffer_limits(high=0)  # pauses writing until the client has read all
         self._expect_head()
         if len(self.connections) > _MOST_CONNECTIONS:
             waiting = [each for each in self.connections if isinstance(each, _Connection) and each._is_idle()]
@@ -76,8 +76,8 @@ class _Connection(H11Protocol, asyncio.BufferedProtocol):
     def send_400_response(self, msg: str) -> None:
         can_respond = self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE)
         if self._is_busy():
-            can_respond = can_respond and self.scope["method"] != "HEAD"  # its response may have no body
-            self.cycle.disconnected = True  # drops what the application still sends
+            can_respond = can_respond and self.scope["method"] != "HEAD"  # no body allowed
+            self.cycle.disconnected = True  # drops further output of the application
             self.cycle.message_event.set()
         if can_respond:
             super().send_400_response(msg)
@@ -114,7 +114,7 @@ class _Connection(H11Protocol, asyncio.BufferedProtocol):
         return math.inf if self._deadline is None else self._deadline.when()
 
     def _expect_head(self) -> None:
-        """Starts to wait for the next head, unless it has arrived or the client has yet to read."""
+        """Start to wait for the next head, unless it has arrived or the client is still reading."""
         if self._is_idle():
             self._close_within(self._patience.head_s)
 
@@ -126,13 +126,13 @@ class _Connection(H11Protocol, asyncio.BufferedProtocol):
 
 @contextmanager
 def http_server(app: Any, listener: socket.socket, patience: Patience) -> Iterator[None]:
-    """Serve an ASGI application at a socket for as long as the block lasts, in a thread."""
+    """Serve an ASGI application at a socket within the block, in a thread."""
     config = uvicorn.Config(
         app,
         http=partial(_Connection, patience),  # type: ignore[arg-type]
         h11_max_incomplete_event_size=_MOST_HEAD_BYTES,
         ws="none",
-        loop="asyncio",  # uvloop fails at its end where a connection was aborted
+        loop="asyncio",  # uvloop fails at its end if a connection was aborted
         proxy_headers=False,
         server_header=False,
         access_log=False,

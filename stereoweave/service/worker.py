@@ -1,4 +1,4 @@
-"""Where the service reads and matches: processes that are killed and replaced when they overrun or crash."""
+"""Child processes that read and match for the service; replaced when they overrun or crash."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -10,14 +10,14 @@ from stereoweave.pictures.prepare import Request
 from stereoweave.service.answers import Answer, Answering, Order, measuring
 from stereoweave.system.child_process import ChildProcess, ProcessDiedError
 
-# The head of a picture takes milliseconds.
+# Reading the head of a picture takes milliseconds.
 _MEASURED_WITHIN_S = 10
 _SAMPLE = Path(__file__).parents[1] / "sample"
 
 
 @dataclass(frozen=True)
 class Task:
-    """An order, its megapixels, and when its time is up, in seconds of `time.monotonic`."""
+    """An order, its megapixels, and its deadline as a value of `time.monotonic`."""
 
     order: Order
     megapixels: float
@@ -25,15 +25,15 @@ class Task:
 
     @property
     def left_s(self) -> float:
-        """The seconds that are left for it, 0 or more."""
+        """The seconds until the deadline, at least 0."""
         return max(0.0, self.deadline_s - time.monotonic())
 
 
 class Worker:
-    """Two processes: one measures pictures by their heads, the other one decodes and matches them.
+    """Two processes: one measures pictures from their heads, the other decodes and matches them.
 
     Args:
-        make_answering: Makes the function of the second one, such as `partial(answering, "small", "cpu", 1)`.
+        make_answering: Makes the second one's function, such as `partial(answering, "small", "cpu", 1)`.
         folder: For the temporary files of both.
     """
 
@@ -47,10 +47,10 @@ class Worker:
         self._answering.close()
 
     def warm_up(self) -> float:
-        """The seconds per megapixel of a plain disparity; whatever is compiled once is compiled before.
+        """Compile all kernels, then measure the seconds per megapixel of an unrefined disparity.
 
         Raises:
-            MatcherError: The network cannot be loaded.
+            MatcherError: If the network cannot be loaded.
         """
         pictures = (_SAMPLE / "left.jpg", _SAMPLE / "right.jpg")
         plain = Order(folder=_SAMPLE, pictures=pictures, file="disparity.png")
@@ -64,11 +64,11 @@ class Worker:
         return took_s / self._measuring(plain, timeout_s=None)
 
     def measure(self, order: Order, left_s: float) -> float:
-        """The megapixels of an order's pictures, before they are decoded.
+        """The megapixels of an order's pictures, from their heads.
 
         Raises:
-            StereoweaveError: As of `check_pixels`; or the process crashed.
-            TimeoutError: It takes longer than that.
+            StereoweaveError: If `check_pixels` raises it, or the process crashed.
+            TimeoutError: If it takes longer than `left_s`.
         """
         try:
             return self._measuring(order, min(left_s, _MEASURED_WITHIN_S))
@@ -81,10 +81,10 @@ class Worker:
             ) from error
 
     def answer(self, tasks: Sequence[Task]) -> list[Answer | Exception]:
-        """What each task gets, or why it gets nothing.
+        """The answer to each task, or its error.
 
-        At the deadline of any of them the process is killed, and the others begin again in a new one, each
-        alone; so they do when the process crashes.
+        At the first deadline, or if the process crashes, it is replaced, and the other tasks start again, one
+        by one.
         """
         try:
             return self._answering([task.order for task in tasks], min(task.left_s for task in tasks))

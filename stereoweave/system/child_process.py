@@ -1,4 +1,4 @@
-"""A function that runs in a process of its own, which can be killed in the middle of a call and replaced."""
+"""A function in a child process that can be killed in the middle of a call and replaced."""
 
 import os
 import pickle
@@ -22,15 +22,15 @@ _Reply = tuple[Any, Exception | None]
 
 
 class ProcessDiedError(StereoweaveError):
-    """The process ended in the middle of a call, by a crash or for want of memory."""
+    """The process ended in the middle of a call: it crashed, or memory ran out."""
 
 
 class ChildProcess:
-    """Calls a function in a process of its own, one call at a time.
+    """A function that runs in a child process, one call at a time.
 
     Args:
-        make: Called once in that process, returns the function. It is pickled, as are arguments and results.
-        folder: A folder for the temporary files of the process, which are removed with it.
+        make: Called once in the child; returns the function. It is pickled, as are arguments and results.
+        folder: For the child's temporary files; removed when the child ends.
     """
 
     def __init__(self, make: Callable[[], Function], folder: Path) -> None:
@@ -39,12 +39,12 @@ class ChildProcess:
         self._start()
 
     def __call__(self, argument: Any, timeout_s: float | None) -> Any:
-        """The result of the function, after at most that time.
+        """Call the function, for at most `timeout_s`, and return its result.
 
         Raises:
-            TimeoutError: It took longer, and the process was replaced; or the process was still starting.
-            ProcessDiedError: The process ended by itself, and was replaced.
-            Exception: Whatever the function, or `make`, raised.
+            TimeoutError: If the call took longer, and the process was replaced; or if it is still starting.
+            ProcessDiedError: If the process ended by itself, and was replaced.
+            Exception: The error that the function or `make` raised.
         """
         start_s = time.monotonic()
         wait([self._started], timeout_s)
@@ -74,20 +74,20 @@ class ChildProcess:
     def _start(self) -> None:
         self._make_folder()
         environment = {"TMPDIR": str(self._folder), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-        # -P: else the current folder comes first, and a file there may have the name of a library.
+        # -P: otherwise a file in the current folder could shadow a library.
         command, pipe = [sys.executable, "-P", "-m", __name__], subprocess.PIPE
         self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, env=os.environ | environment)
         self._started = self._exchanges.submit(_exchange, self._process, self._make)
 
     def _make_folder(self) -> None:
-        """Make the folder where it is missing: what cleans /tmp removes what has not been used for days."""
+        """Make the folder if it is missing: cleaners of /tmp remove folders that are unused for days."""
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
 
     def _open(self, reply: Future[_Reply]) -> Any:
-        """What is in a reply that has arrived: a result, or an error to raise."""
+        """Return the result in a reply that has arrived, or raise its error."""
         try:
             result, error = reply.result()
-        # ValueError: of the pipes of a process that was ended, and could not be replaced then.
+        # ValueError: the pipes are closed, because the process ended and could not be replaced.
         except (OSError, EOFError, ValueError, pickle.UnpicklingError):
             status = self._replace()
             raise ProcessDiedError(
@@ -99,33 +99,33 @@ class ChildProcess:
         return result
 
     def _replace(self) -> str:
-        """Start another process; returns how the old one ended."""
+        """Replace the process; return how the old one ended."""
         status = self._end()
         self._start()
         return f"exit code {status}" if status >= 0 else signal.Signals(-status).name
 
     def _end(self) -> int:
-        # A process that has ended by itself keeps its own status.
+        # If the process has ended by itself, this does not change its status.
         self._process.kill()
         status = self._process.wait()
         for pipe in filter(None, (self._process.stdin, self._process.stdout)):
-            with suppress(BrokenPipeError):  # the rest of an argument that it never read
+            with suppress(BrokenPipeError):  # an argument that it did not finish reading
                 pipe.close()
         shutil.rmtree(self._folder, ignore_errors=True)
         return status
 
 
 def _exchange(process: Any, message: bytes) -> _Reply:
-    """The reply of a process to a message."""
-    pickle.dump(message, process.stdin)  # pickled once more, which tells the reader where it ends
+    """Send a message to a process and return its reply."""
+    pickle.dump(message, process.stdin)  # the pickle marks the end of the message
     process.stdin.flush()
     return pickle.load(process.stdout)
 
 
 def _work() -> None:
-    """What the process does: it makes the function, and calls it with each message at its standard input."""
+    """Main loop of the child: make the function, then call it with each message from the standard input."""
     replies = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what libraries print is no reply
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # keep libraries' output out of the replies
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent handles it
     messages: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_receive, args=(messages,), daemon=True).start()
@@ -137,7 +137,7 @@ def _work() -> None:
 
 
 def _receive(messages: "queue.SimpleQueue[bytes]") -> None:
-    """Receive messages; end the process, even in the middle of a call, when its parent has ended."""
+    """Receive messages until the parent ends; then end this process, even in the middle of a call."""
     try:
         while True:
             messages.put(pickle.load(sys.stdin.buffer))
@@ -146,13 +146,13 @@ def _receive(messages: "queue.SimpleQueue[bytes]") -> None:
 
 
 def _reply(function: Function, argument: bytes) -> bytes:
-    """The result of the function, or the error that it raised, pickled."""
+    """The function's result, or the error that it raised, pickled."""
     try:
         return pickle.dumps((function(pickle.loads(argument)), None))
     except Exception as error:
         try:
             return pickle.dumps((None, error))
-        except Exception:  # an error that holds an open file, or the like
+        except Exception:  # an error that cannot be pickled: it holds an open file, for example
             return pickle.dumps((None, RuntimeError(repr(error))))
 
 

@@ -1,4 +1,4 @@
-"""What a process of its own does before it works for another one."""
+"""Set-up of worker processes."""
 
 import multiprocessing
 import os
@@ -7,11 +7,11 @@ import threading
 
 
 def begin_work(threads: int) -> None:
-    """Called first in a worker: so many threads for OpenCV, and an end when the parent ends."""
+    """Set up a worker process: limit OpenCV's threads, ignore Ctrl-C, and end when the parent ends."""
     import cv2
 
     cv2.setNumThreads(threads)
-    # Ctrl-C reaches the whole group, and the parent alone is to answer it.
+    # Ctrl-C reaches the whole process group; only the parent handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_the_parent, daemon=True).start()
 

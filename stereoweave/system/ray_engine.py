@@ -1,4 +1,4 @@
-"""Work on many machines, or on the cores of one: tasks stream through a pool of workers, by Ray Data."""
+"""Runs tasks on the cores of one machine or many: they stream through a pool of Ray Data's workers."""
 
 import logging
 import math
@@ -27,37 +27,37 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 _CONNECTS_WITHIN_S, _ANSWERS_WITHIN_S = 10, 20
-# Tasks and results alone pass through it.
+# It carries only tasks and results.
 _OBJECT_STORE_BYTES = 200_000_000
 _LOOKED_AT_EVERY_S, _BACK_WITHIN_S = 2, 10
-# Ray counts cores and GPUs in such parts.
+# The resolution of Ray's counts of cores and GPUs.
 _LEAST_SHARE = 0.0001
-# Workers that end while they start, one after another: more are no accident.
+# Consecutive workers that die while starting, before the run fails.
 _MOST_FALSE_STARTS = 20
 _SILENCE = {
-    # No warning of what Ray will change, no errors of its C++ parts: those that matter are raised too.
+    # Hide deprecation warnings, and errors of Ray's C++ parts: those that matter are raised as well.
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "RAY_BACKEND_LOG_LEVEL": "fatal",
-    # No line of the cluster's logs, such as one for each killed worker, on the standard output among ours.
+    # Keep the cluster's logs, with a line for each killed worker, off our standard output.
     "RAY_DEDUP_LOGS_SKIP_REGEX": ".*",
 }
-# Where this is 0, as by default on macOS and Windows, a Ray that is started here takes the loopback address
-# for that of its machine, and listens there alone. If `ray.init` is given a loopback address, it replaces it.
+# If this is 0, the default on macOS and Windows, a Ray that is started here uses the loopback address as its
+# machine's, and listens only there. A loopback address passed to `ray.init` has no effect: Ray replaces it.
 _OPEN_TO_OTHER_MACHINES = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 _INDEX, _CONTENT = "index", "content"
 
 
 @dataclass(frozen=True)
 class Engine:
-    """Where the work is done, and by how many.
+    """A Ray cluster, and the number and size of the workers on it.
 
     Attributes:
-        address: A cluster's head as host:port, ray://host:port, or "auto", the one that runs here. "local"
-            starts Ray on this machine for as long as the work takes; None joins the one that RAY_ADDRESS
-            names, and starts one only where it names none.
-        workers: At most so many at a time; as many as find room unless given.
-        cpus_each: The cores that each has to itself; a part of one is allowed.
-        gpus_each: The GPUs, likewise: with 0.25 four workers share one.
+        address: The cluster's head as host:port or ray://host:port; "auto" for the Ray that runs on this
+            machine; "local" to start Ray on this machine for the duration of the work. Default: the cluster
+            in RAY_ADDRESS, or "local" if that is not set.
+        workers: The maximum number of workers. Default: as many as fit.
+        cpus_each: Cores reserved for each worker; fractions are allowed.
+        gpus_each: GPUs reserved for each worker; at 0.25 four workers share one.
     """
 
     address: str | None = None
@@ -81,9 +81,10 @@ class Engine:
 
 
 def set_environment(address: str | None) -> str | None:
-    """The address of the cluster to join; None where Ray is started here, to listen on loopback alone.
+    """Set the variables that Ray reads when it is imported, except those that the user has set.
 
-    Sets the variables that Ray reads when it is imported, except those that the user has set.
+    Returns:
+        The address of the cluster to join; None to start Ray on this machine, listening on loopback only.
     """
     for name, value in _SILENCE.items():
         os.environ.setdefault(name, value)
@@ -96,10 +97,10 @@ def set_environment(address: str | None) -> str | None:
 
 @contextmanager
 def connect(engine: Engine) -> Iterator[None]:
-    """Within the block this process is Ray's driver; nothing is done where it is one already.
+    """Make this process a driver of Ray within the block, unless it already is one.
 
     Raises:
-        StereoweaveError: Ray is missing, or nothing at the address answers as its head.
+        StereoweaveError: If Ray is not installed, or no head answers at the address.
     """
     address = set_environment(engine.address)
     with needing_extra("cluster", "this needs Ray"):
@@ -121,19 +122,19 @@ def connect(engine: Engine) -> Iterator[None]:
 def stream(
     make_worker: Callable[[], Callable[[Task], Result]], tasks: Sequence[Task], engine: Engine
 ) -> Generator[Result, None, None]:
-    """What each task's result is, as they come, in no order.
+    """Yield the tasks' results as they arrive, in any order.
 
-    A task whose worker or machine dies is done again, so it may be done twice, though its result comes once.
-    Where a machine is lost for good, the others take over its part. The memory that this takes grows
-    with the number of tasks, by less than a kilobyte each: some thousand are well.
+    If a worker or a machine dies, its tasks run again: a task may run twice, but its result is yielded once.
+    If a machine does not return, the others take over its tasks. Memory grows by less than a kilobyte per
+    task; thousands of tasks are fine.
 
     Args:
-        make_worker: Makes, once in each worker's process, what is called with each task.
-        tasks: Small values that can be pickled; what they stand for is read in the workers.
-        engine: Where.
+        make_worker: Called once in each worker's process; returns the function to call with each task.
+        tasks: Small values that can be pickled; workers load the data themselves.
+        engine: The cluster and its workers.
 
     Raises:
-        StereoweaveError: What a worker raised, or the cluster cannot be reached or has no room for a worker.
+        StereoweaveError: If a worker raised it, the cluster cannot be reached, or no worker fits on it.
     """
     with connect(engine):
         waiting = dict(enumerate(tasks))
@@ -147,13 +148,13 @@ def stream(
 
 
 class _LostMachineError(Exception):
-    """Workers wait for a machine that does not come back."""
+    """Workers wait for a machine that does not return."""
 
 
 def _run(
     make_worker: Callable[[], Callable[[Task], Result]], tasks: dict[int, Task], engine: Engine
 ) -> Iterator[tuple[int, Result]]:
-    """Number and result of each task, until all are done or a machine is lost."""
+    """Yield each task's number and result until all are done; raises _LostMachineError."""
     from ray.exceptions import RayError
 
     batches = _dataset(make_worker, tasks, engine).iter_batches(batch_size=None, prefetch_batches=0)
@@ -174,7 +175,7 @@ def _run(
 def _dataset(
     make_worker: Callable[[], Callable[[Task], Result]], tasks: dict[int, Task], engine: Engine
 ) -> "Dataset":
-    """The results, which are made while they are read."""
+    """A lazy data set of the results: tasks run while it is read."""
     from ray.data import ActorPoolStrategy, DataContext, from_items
 
     logging.getLogger("ray.data").setLevel(logging.CRITICAL)
@@ -193,16 +194,16 @@ def _dataset(
 
 
 def _context(engine: Engine) -> "DataContext":
-    """How Ray Data works here: without a word, and with an eye on the machines."""
+    """Settings of Ray Data: no output, and a watch over the machines."""
     from ray.data import DataContext
 
-    with warnings.catch_warnings(action="ignore"):  # it warns of its own settings
+    with warnings.catch_warnings(action="ignore"):  # about its own default settings
         context = DataContext.get_current().copy()
     context.enable_progress_bars = False
     context.enable_auto_log_stats = False
     context.print_on_execution_start = False
     context.max_consecutive_actor_init_deaths = _MOST_FALSE_STARTS
-    # A film, or a task of many pairs, may take longer than the half hour after which Ray Data gives up.
+    # A video, or a task of many pairs, may take longer than the half hour after which Ray Data gives up.
     context.execution_no_progress_timeout_s = -1
     watch: Any = partial(_Watch, engine)  # called as a class
     context.custom_execution_callback_classes = [watch]
@@ -210,9 +211,9 @@ def _context(engine: Engine) -> "DataContext":
 
 
 class _Watch:
-    """Called by Ray Data while it works; ends a run whose workers wait for a machine that was lost.
+    """Ray Data's callback that ends a run whose workers wait for a lost machine.
 
-    Ray starts them again where there is room. Where there is none, what they had begun would wait for ever.
+    Ray restarts such workers if there is room elsewhere. If there is none, their tasks would wait for ever.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -241,7 +242,7 @@ class _Watch:
 
 
 def room(engine: Engine) -> int:
-    """How many workers the machines have room for; StereoweaveError where there is none for a single one."""
+    """The number of workers that fit on the cluster; raises StereoweaveError if none does."""
     if found := _rooms(engine):
         return found
     largest = max(_machines(), key=lambda has: has.get("CPU", 0))
@@ -257,7 +258,7 @@ def _rooms(engine: Engine) -> int:
 
 
 def _machines() -> list[dict[str, float]]:
-    """What each machine of the cluster has."""
+    """The resources of each live machine of the cluster."""
     import ray
 
     nodes: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
@@ -265,19 +266,19 @@ def _machines() -> list[dict[str, float]]:
 
 
 def _places(has: dict[str, float], engine: Engine) -> int:
-    """How many workers a machine has room for."""
+    """The number of workers that fit on a machine."""
     places = has.get("CPU", 0) / engine.cpus_each
     if engine.gpus_each:
         places = min(places, has.get("GPU", 0) / engine.gpus_each)
-    return int(places + 1e-6)  # ten tenths are one
+    return int(places + 1e-6)  # ten tenths make one
 
 
 def _start() -> None:
-    """Ray on this machine, with all cores that this process may use."""
+    """Start Ray on this machine with all cores that this process may use."""
     import ray
 
-    # Ray starts the process of a dashboard in any case, and that asks the metadata services of three clouds,
-    # though nothing is reported (2.60). If the port of that process is taken, Ray goes on without it.
+    # Ray always starts a dashboard process, which queries the metadata services of three clouds even if usage
+    # reports are off (2.60). If the port of that process is in use, Ray continues without it.
     with _muted_stderr(), socket.create_server(("127.0.0.1", 0)) as taken:
         ray.init(
             address="local",
@@ -380,12 +381,12 @@ def _first_line(error: Exception) -> str:
 
 
 def _last_line(error: Exception) -> str:
-    """Where Ray says what it came of."""
+    """The last line of an error of Ray, which names the cause."""
     return str(error).strip().splitlines()[-1].rstrip(".;")
 
 
 class _Worker:
-    """What lives in a worker's process: made once, called with a row for each task."""
+    """Callable of a worker's process for Ray Data: made once, called with a row for each task."""
 
     def __init__(self, make_worker: Callable[[], Callable[[Any], Any]], threads: int) -> None:
         import cv2
@@ -398,13 +399,13 @@ class _Worker:
         return {_INDEX: batch[_INDEX], _CONTENT: [self._outcome(content) for content in batch[_CONTENT]]}
 
     def _outcome(self, content: bytes) -> bytes:
-        """The task's result, or what went wrong, which the driver raises: Ray would tell it in many lines."""
+        """A task's pickled result, or its error for the driver to raise: Ray's own report has many lines."""
         try:
             if self._worker is None:
                 self._worker = self._make_worker()
             return pickle.dumps((self._worker(pickle.loads(content)), None))
         except StereoweaveError as error:
             return pickle.dumps((None, error))
-        except Exception as error:  # ours to mend: with all that it takes for that
+        except Exception as error:  # a bug: keep the traceback
             error.add_note(traceback.format_exc())
             return pickle.dumps((None, error))

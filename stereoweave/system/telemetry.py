@@ -1,9 +1,9 @@
-"""The one place that turns off what libraries would send to their makers."""
+"""Turns off the usage reports of libraries."""
 
 import os
 
-# Each library reads its variable when it is imported or soon after. onnxruntime.disable_telemetry_events() is
-# no substitute: the reports of 1.31 go on after it.
+# Each library reads its variable when it is imported or soon after. onnxruntime.disable_telemetry_events()
+# does not replace it: ONNX Runtime 1.31 sends reports even after that call.
 _SWITCHES = {
     "ORT_DISABLE_TELEMETRY": "1",
     "GRADIO_ANALYTICS_ENABLED": "False",
@@ -12,7 +12,7 @@ _SWITCHES = {
 
 
 def disable_telemetry() -> None:
-    """Turn off the reports of ONNX Runtime, Gradio and Ray, here and in child processes.
+    """Turn off the usage reports of ONNX Runtime, Gradio and Ray, in this process and its children.
 
     A variable that the user has set keeps its value.
     """

@@ -1,4 +1,4 @@
-"""How many threads a call may use, and rows shared out among them."""
+"""Numbers of threads, and work on bands of rows in threads."""
 
 import os
 from collections.abc import Callable
@@ -11,7 +11,7 @@ _MOST_THREADS = 1024
 
 
 def thread_count(threads: int | None) -> int:
-    """The number asked for, or `usable_cores` where none is; StereoweaveError for what is no such number."""
+    """The requested number of threads, default: all cores; raises StereoweaveError if it is out of range."""
     if threads is not None:
         check_whole_number("threads", threads)
         if not 1 <= threads <= _MOST_THREADS:
@@ -20,14 +20,14 @@ def thread_count(threads: int | None) -> int:
 
 
 def usable_cores() -> int:
-    """The cores that this process may run on, which can be fewer than the machine has."""
+    """The number of cores that this process may use, at most those of the machine."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def in_bands(work: Callable[[int, int], None], height: int, count: int, threads: int) -> None:
-    """Do the work on that many bands of rows, from one row to before another, in threads."""
+    """Call `work(first_row, end_row)` for each of `count` bands of rows, in threads."""
     ends = [height * band // count for band in range(count + 1)]
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(work, ends[:-1], ends[1:]))
