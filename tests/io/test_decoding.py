@@ -116,6 +116,17 @@ def test_every_way_turns_a_picture_upright_and_converts_its_colours(tmp_path, pi
     np.testing.assert_array_equal(pair.right, pair.left)
 
 
+def test_an_icc_tagged_png_gives_the_same_pixels_by_the_api_and_by_every_other_way(tmp_path):
+    swapped = profile("Swapped", SRGB[2], SRGB[1], SRGB[0])
+    image = np.full((64, 96, 3), (200, 60, 60), np.uint8)
+    folder = fill(tmp_path / "scene", encoded(image, "PNG", icc_profile=swapped))
+    Image.new("I;16", (96, 64), 256).save(folder / "disparity.png")
+    pixels = {way: read(folder).left for way, read in WAYS.items()}
+    np.testing.assert_allclose(pixels["read_image"].astype(int), image[..., ::-1], atol=2)
+    for way in WAYS:
+        np.testing.assert_array_equal(pixels[way], pixels["read_image"], err_msg=way)
+
+
 def by_command(folder: Path, capsys: pytest.CaptureFixture[str]) -> str:
     assert main(["check", str(folder / "left.png"), str(folder / "right.png")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
