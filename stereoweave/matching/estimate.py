@@ -21,12 +21,12 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.io.arrays import as_rgb
 from stereoweave.io.files import SMALLEST_SIDE_PX
 from stereoweave.matching.disparity_range import find_range, goes_beyond
+from stereoweave.matching.left_right_check import at_match, find_occluded
 from stereoweave.matching.matcher import (
     MODES,
     PIXEL_PAIRS_AT_ONCE,
     Matcher,
     check_steps,
-    find_occluded,
     model_file,
 )
 from stereoweave.matching.providers import CPU, check_provider
@@ -447,14 +447,6 @@ def _as_seen(found: Estimate, pair: StereoPair) -> Estimate:
     if pair.left_seen is not None:
         confidence = np.where(pair.left_seen, confidence, np.float32(0))
     if pair.right_seen is not None:
-        occluded = occluded | ~_at_match(pair.right_seen, found.disparity_px)
+        seen, _ = at_match(pair.right_seen.astype(np.uint8), found.disparity_px, -1)
+        occluded = occluded | (seen == 0)
     return replace(found, confidence=confidence, occluded=occluded)
-
-
-def _at_match(
-    seen: Bool[np.ndarray, "h w"], disparity_px: Float[np.ndarray, "h w"]
-) -> Bool[np.ndarray, "h w"]:
-    """Whether the right picture shows something where each left pixel has its match."""
-    height, width = seen.shape
-    columns = np.clip(np.rint(np.arange(width) - disparity_px), 0, width - 1).astype(np.int32)
-    return np.take_along_axis(seen, columns, axis=1)

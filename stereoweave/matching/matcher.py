@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, UInt8
 from stereoweave.arguments import check_flag, check_kind
 from stereoweave.errors import MatcherError, StereoweaveError
 from stereoweave.io.files import SMALLEST_SIDE_PX
+from stereoweave.matching.left_right_check import OCCLUSION_STEP_PX, is_occluded, measure_disagreement
 from stereoweave.matching.occlusion_fill import fill_occluded
 from stereoweave.matching.providers import CPU, PROVIDERS, open_session, running
 from stereoweave.matching.subpixel import to_subpixel
@@ -31,8 +32,6 @@ PIXEL_PAIRS_AT_ONCE = 1920 * 1920 * 1088
 _KEPT_PIXEL_PAIRS = 1280 * 1280 * 960
 # What a strip sees beyond its own rows; about 1 % of the pixels then differ by over 1 px from the whole.
 _STRIP_OVERLAP_PX = 64
-# A nearer surface this much in front of a pixel's match hides it; less is the two views' disagreement.
-_OCCLUSION_STEP_PX = 1.0
 # Pictures are padded up to it.
 _MOST_MULTIPLE_OF = 1024
 # Within such a square a picture whose means over 9x9 px vary by no more than this says nothing about
@@ -391,33 +390,13 @@ def _estimate(left: UInt8[np.ndarray, "h w 3"], maps: Maps) -> Estimate:
     """The network's own estimate from the maps of both views."""
     right_px = maps.right_disparity_px
     assert right_px is not None
-    seen_px, inside = _right_disparity_at_match(maps.disparity_px, right_px)
-    disagreement_px = seen_px - maps.disparity_px
+    disagreement_px, inside = measure_disagreement(maps.disparity_px, right_px)
     return Estimate(
         disparity_px=maps.disparity_px,
         right_disparity_px=right_px,
         confidence=_confidence(maps.confidence_logit, disagreement_px, inside, _plain(left)),
-        occluded=~inside | (disagreement_px > _OCCLUSION_STEP_PX),
+        occluded=is_occluded(disagreement_px, inside),
     )
-
-
-def find_occluded(
-    disparity_px: Float[np.ndarray, "h w"], right_disparity_px: Float[np.ndarray, "h w"]
-) -> Bool[np.ndarray, "h w"]:
-    """Left pixels whose match is outside of the right picture, or hidden there by a nearer surface."""
-    seen_px, inside = _right_disparity_at_match(disparity_px, right_disparity_px)
-    return ~inside | (seen_px - disparity_px > _OCCLUSION_STEP_PX)
-
-
-def _right_disparity_at_match(
-    disparity_px: Float[np.ndarray, "h w"], right_disparity_px: Float[np.ndarray, "h w"]
-) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """The right view's disparity where each left pixel has its match, and whether that is in the image."""
-    height, width = disparity_px.shape
-    columns = np.arange(width, dtype=np.float32) - disparity_px
-    rows = np.broadcast_to(np.arange(height, dtype=np.float32)[:, None], columns.shape)
-    seen_px = cv2.remap(right_disparity_px, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
-    return seen_px, (columns > -0.5) & (columns < width - 0.5)
 
 
 def _confidence(
@@ -444,7 +423,7 @@ def _confidence(
     else:
         # The logistic function, in a form that cannot overflow.
         probability = 0.5 * (1 + np.tanh(logit / 2))
-        contradicted = inside & (disagreement_px < -_OCCLUSION_STEP_PX)
+        contradicted = inside & (disagreement_px < -OCCLUSION_STEP_PX)
         np.multiply(probability, 0.5, out=probability, where=contradicted)
     probability[plain] = 0
     return probability

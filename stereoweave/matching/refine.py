@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8, UInt16
+from jaxtyping import Float, Float32, UInt8, UInt16
 
 from stereoweave.matching.exposure import match_exposure, recoloured
+from stereoweave.matching.left_right_check import at_match, find_occluded
 from stereoweave.stereo import Estimate, StereoPair, check_fits
 from stereoweave.system.threads import in_bands, thread_count
 
@@ -62,12 +63,11 @@ def refine(
     trust, right_trust = np.asarray(estimate.confidence, np.float32, order="C"), right_confidence(estimate)
     disparity_px = _settled(estimate.disparity_px, found_px, right_found_px, trust, -1)
     right_disparity_px = _settled(estimate.right_disparity_px, right_found_px, found_px, right_trust, 1)
-    seen_px, inside = _at_match(right_disparity_px, disparity_px, -1)
     return Estimate(
         disparity_px=disparity_px,
         right_disparity_px=right_disparity_px,
         confidence=estimate.confidence,
-        occluded=~inside | (seen_px - disparity_px > _SAME_PX),
+        occluded=find_occluded(disparity_px, right_disparity_px),
     )
 
 
@@ -195,21 +195,10 @@ def _part(cues: "Cues", index: Any) -> "Cues":
 
 def right_confidence(estimate: Estimate) -> Float32[np.ndarray, "h w"]:
     """The confidence of the right view's disparities, for which the left one's speaks at their matches."""
-    seen_px, inside = _at_match(estimate.disparity_px, estimate.right_disparity_px, 1)
-    confidence, _ = _at_match(np.asarray(estimate.confidence, np.float32), estimate.right_disparity_px, 1)
+    seen_px, inside = at_match(estimate.disparity_px, estimate.right_disparity_px, 1)
+    confidence, _ = at_match(np.asarray(estimate.confidence, np.float32), estimate.right_disparity_px, 1)
     agreed = inside & (np.abs(seen_px - estimate.right_disparity_px) <= _SAME_PX)
     return np.where(agreed, confidence, np.float32(_DOUBTED) * confidence)
-
-
-def _at_match(
-    values: Float[np.ndarray, "h w"], disparity_px: Float[np.ndarray, "h w"], towards: int
-) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """The other view's values at x + towards * disparity_px, and whether that is in the picture."""
-    height, width = disparity_px.shape
-    columns = (np.arange(width) + towards * disparity_px).astype(np.float32)
-    rows = np.broadcast_to(np.arange(height, dtype=np.float32)[:, None], columns.shape)
-    seen = cv2.remap(values, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
-    return seen, (columns > -0.5) & (columns < width - 0.5)
 
 
 def _large_steps(grey: UInt8[np.ndarray, "h w"], axis: int) -> UInt16[np.ndarray, "h w"]:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int16, Shaped, UInt8, UInt16, UInt32
 
+from stereoweave.matching.left_right_check import find_occluded
 from stereoweave.stereo import Estimate
 from stereoweave.system.threads import in_bands, thread_count
 
@@ -175,22 +176,17 @@ def _level(
     left: UInt8[np.ndarray, "h w"], right: UInt8[np.ndarray, "h w"], smaller: Estimate, threads: int
 ) -> Estimate:
     """The estimate at the size of these grey pictures."""
-    from stereoweave.matching import upsample_kernels as kernels
-
     view = _View(left, right, smaller.disparity_px)
     right_view = _View(_mirrored(right), _mirrored(left), _mirrored(smaller.right_disparity_px))
     found_px, right_found_px = _found(view, threads), _found(right_view, threads)
     disparity_px, doubt = _settled(view, found_px, _mirrored(right_found_px), threads)
     right_disparity_px = _mirrored(_settled(right_view, right_found_px, _mirrored(found_px), threads)[0])
     del view, right_view, found_px, right_found_px  # as large as the result: 1 GB of 50 megapixels
-    confidence = _confidence(smaller.confidence, doubt)
-    occluded = np.empty(left.shape, bool)
-    kernels.hide(disparity_px, right_disparity_px, occluded)
     return Estimate(
         disparity_px=disparity_px,
         right_disparity_px=right_disparity_px,
-        confidence=confidence,
-        occluded=occluded,
+        confidence=_confidence(smaller.confidence, doubt),
+        occluded=find_occluded(disparity_px, right_disparity_px),
     )
 
 

@@ -201,15 +201,3 @@ def fill(known, gap, farthest_px, nearest_px, disparity_px):
                         disparity_px[y, i] = beyond_px
             if x < width and known[y, x]:
                 start = x + 1
-
-
-@kernel
-@typing.no_type_check
-def hide(disparity_px, right_disparity_px, occluded):
-    """Write into occluded whether a pixel's match is outside of the right picture or behind something."""
-    height, width = disparity_px.shape
-    for y in range(height):
-        for x in range(width):
-            column = np.int64(np.rint(x - disparity_px[y, x]))
-            inside = 0 <= column < width
-            occluded[y, x] = not inside or right_disparity_px[y, column] - disparity_px[y, x] > AGREED_PX

@@ -5,7 +5,6 @@ from plain_enlarging import (
     plain_agreed,
     plain_costs,
     plain_filled,
-    plain_hidden,
     plain_pick,
     plain_sums,
 )
@@ -165,14 +164,11 @@ def test_bands_are_around_the_surfaces_that_the_smaller_copy_shows_near_a_pixel(
     np.testing.assert_array_equal(first[34:], [[32, 32]] * 26)
 
 
-def test_agreeing_filling_and_hiding_are_what_the_plain_loops_do(rng):
+def test_agreeing_and_filling_are_what_the_plain_loops_do(rng):
     found_px, other_px = (rng.integers(-2, 6, (30, 40)) + rng.random((2, 30, 40))).astype(np.float32)
     agreed = np.empty(found_px.shape, bool)
     kernels.agree(found_px, other_px, agreed)
     np.testing.assert_array_equal(agreed, plain_agreed(found_px, other_px))
-    hidden = np.empty(found_px.shape, bool)
-    kernels.hide(found_px, other_px, hidden)
-    np.testing.assert_array_equal(hidden, plain_hidden(found_px, other_px))
     known, gap = rng.random((2, 30, 40)) < 0.3, rng.random((30, 40)) < 0.8
     known = known[0]
     known[3] = False  # a row of which nothing is known stays

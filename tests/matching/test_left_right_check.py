@@ -1,0 +1,22 @@
+import numpy as np
+import pytest
+from plain_enlarging import plain_hidden
+
+from stereoweave.matching.left_right_check import at_match, find_occluded
+
+
+@pytest.mark.parametrize("height", [30, 256, 700])
+def test_the_check_is_what_the_plain_loops_do_however_many_rows_there_are(rng, height):
+    disparity_px, right_disparity_px = rng.uniform(-2, 7, (2, height, 40)).astype(np.float32)
+    found = find_occluded(disparity_px, right_disparity_px)
+    np.testing.assert_array_equal(found, plain_hidden(disparity_px, right_disparity_px))
+
+
+def test_beyond_a_border_the_last_column_is_taken_and_the_match_is_outside():
+    values = np.array([[10, 20, 30, 40]], np.float32)
+    seen, inside = at_match(values, np.full((1, 4), 2, np.float32), -1)
+    assert seen.tolist() == [[10, 10, 10, 20]]
+    assert inside.tolist() == [[False, False, True, True]]
+    seen, inside = at_match(values, np.full((1, 4), 2, np.float32), 1)
+    assert seen.tolist() == [[30, 40, 40, 40]]
+    assert inside.tolist() == [[True, True, False, False]]
