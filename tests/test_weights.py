@@ -23,6 +23,7 @@ from stereoweave.learn.models import network_of
 from stereoweave.learn.models.layers import local_soft_argmax
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher, shipped_models
+from stereoweave.matching.options import MatchOptions
 
 ROOT = Path(__file__).parent.parent
 WEIGHTS = ROOT / "stereoweave/weights"
@@ -86,7 +87,7 @@ def found_raw(testdata, name):
     matcher, scenes = Matcher(name, threads=1), list(read_scenes(testdata / "stereo/pairs"))
     # Whole, as `estimate` matches what a network can see at once.
     assert all(matcher.sees_whole(*scene.pair.left.shape[1::-1]) for scene in scenes)
-    return [(scene, match(matcher, scene.pair, raw=True)) for scene in scenes]
+    return [(scene, match(matcher, scene.pair, MatchOptions(raw=True))) for scene in scenes]
 
 
 @pytest.mark.testdata

@@ -18,6 +18,7 @@ from stereo_msgs.msg import DisparityImage
 
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.options import MatchOptions
 from stereoweave.stereo import StereoPair
 
 
@@ -53,7 +54,7 @@ class StereoweaveNode(Node):
         try:
             camera = camera_of(left_info, right_info)
             pair = StereoPair(left=rgb_of(left), right=rgb_of(right))
-            estimate = match(self._matcher, pair, range_px=self._range_px)
+            estimate = match(self._matcher, pair, MatchOptions(range_px=self._range_px))
         except ValueError as error:
             self.get_logger().error(str(error), throttle_duration_sec=5.0)
             return

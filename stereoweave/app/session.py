@@ -16,6 +16,7 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.io.colormap import colour_disparity, colour_range_px
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU
 from stereoweave.outputs.measure import distance
 from stereoweave.outputs.point_cloud import EmptyError, point_cloud, write_glb
@@ -76,7 +77,7 @@ def matched(uploads: Uploads, folder: Path, tell: Callable[[float, str], None]) 
     height, width = pair.left.shape[:2]
     tell(0.3, f"matching {width}×{height} px")
     start_s = time.perf_counter()
-    estimate = match(_matcher(uploads.model, uploads.provider), pair, refined=True)
+    estimate = match(_matcher(uploads.model, uploads.provider), pair, MatchOptions(refined=True))
     estimate_ms = 1000 * (time.perf_counter() - start_s)
     names = tuple(picture.name for picture in uploads.pictures)
     summary = summarize(pair, estimate, pictures=names, model=uploads.model, estimate_ms=estimate_ms)

@@ -32,6 +32,7 @@ from stereoweave.io.text import write_table
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.opencv import OPENCV_MATCHERS, SGBM, fill_rows, left_right_confidence
+from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.system.ray_engine import Engine, stream
@@ -164,7 +165,8 @@ def network(
 ) -> Match:
     """What `stereoweave.estimate` does with a model, refined or not; errors as for `Matcher`."""
     matcher = Matcher(model, threads=threads, provider=provider)
-    return lambda pair: match(matcher, pair, refined=refined)
+    options = MatchOptions(refined=refined)
+    return lambda pair: match(matcher, pair, options)
 
 
 def score_pairs(makers: Mapping[str, Maker], scenes: Lister[Scene], engine: Engine | None = None) -> Scores:

@@ -83,6 +83,7 @@ def depth(  # noqa: PLR0913 - each is a word of the command line
     as_json: AsJson = False,
 ) -> None:
     """Depth of a stereo pair, or of many: maps, pictures of them, and a report to open in a browser."""
+    from stereoweave.matching.options import MatchOptions
     from stereoweave.outputs.results import DepthOrder, make_depth
     from stereoweave.pictures.pair_finding import find_pairs
 
@@ -91,9 +92,7 @@ def depth(  # noqa: PLR0913 - each is a word of the command line
         model=model,
         threads=threads,
         provider=provider,
-        range_px=range_of(range_px),
-        refined=refined,
-        raw=raw,
+        options=MatchOptions(range_px=range_of(range_px), refined=refined, raw=raw),
         files=tuple(write or ()),
     )
     pictures = pictures or []
@@ -128,16 +127,17 @@ def measure(  # noqa: PLR0913 - each is a word of the command line
     The pixels are those of the left picture as it is matched: of the rectified one with --rectify.
     """
     from stereoweave.matching.estimate import match
+    from stereoweave.matching.options import MatchOptions
     from stereoweave.outputs.measure import CameraError, distance
     from stereoweave.outputs.point_cloud import needed_camera
     from stereoweave.pictures.prepare import prepare
 
     places = pixel_of("--from", first), pixel_of("--to", second)
-    within_px = range_of(range_px)
+    options = MatchOptions(range_px=range_of(range_px), refined=refined)
     prepared = prepare(pictures, request_of(arrangement, calib, focal_px, baseline_m, rectify))
     camera = needed_camera(prepared.pair)
     matcher = load_matcher(model, threads, provider)
-    estimate = match(matcher, prepared.pair, range_px=within_px, refined=refined)
+    estimate = match(matcher, prepared.pair, options)
     error = CameraError(focal=focal_error_percent / 100, baseline=baseline_error_percent / 100)
     found = distance(estimate, camera, *places, camera_error=error)
     if as_json:

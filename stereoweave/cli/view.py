@@ -97,6 +97,7 @@ def view(  # noqa: PLR0913 - each is a word of the command line
     from stereoweave.cameras.diagnosis import hints
     from stereoweave.cameras.rectify import cropped
     from stereoweave.matching.estimate import match
+    from stereoweave.matching.options import MatchOptions
     from stereoweave.pictures.prepare import prepare
     from stereoweave.rendering.layouts import LAYOUTS, check_reach, layout_of, marked, middle_px
     from stereoweave.rendering.renderer import Renderer, check_position
@@ -110,13 +111,13 @@ def view(  # noqa: PLR0913 - each is a word of the command line
     positions, converged = _needs(name, _MIDDLE if position is None else position)
     check_reach(positions, strength)
     plane_px = _plane_px(("auto" if converged else "0") if convergence is None else convergence)
-    within_px = range_of(range_px)
+    options = MatchOptions(range_px=range_of(range_px), refined=True)
     prepared = prepare(pictures, request_of(arrangement, calib, rectify=rectify))
     pair = cropped(prepared.pair)
     if name in LAYOUTS:
         out = marked(out, name, pair, choices)
     place_for(out)
-    estimate = match(load_matcher(model, threads, provider), pair, range_px=within_px, refined=True)
+    estimate = match(load_matcher(model, threads, provider), pair, options)
     if plane_px is None:
         plane_px = middle_px(estimate)
     renderer = Renderer(pair, estimate, strength=strength, convergence_px=plane_px, threads=threads)

@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-from stereoweave.arguments import check_number
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.arrays import as_rgb
 from stereoweave.io.files import SMALLEST_SIDE_PX
@@ -26,9 +25,9 @@ from stereoweave.matching.matcher import (
     MODES,
     PIXEL_PAIRS_AT_ONCE,
     Matcher,
-    check_steps,
     model_file,
 )
+from stereoweave.matching.options import DEFAULT_OPTIONS, MatchOptions
 from stereoweave.matching.providers import CPU, check_provider
 from stereoweave.matching.refine import right_confidence
 from stereoweave.matching.upsample import enlarge
@@ -85,65 +84,47 @@ def estimate(  # noqa: PLR0913 - each has a name, and all but the pictures can b
             path of an .onnx matcher; loaded at the first call, and kept.
         threads: How many threads may be used; all cores if left out.
         provider: What the network is run on: cpu, cuda, tensorrt, openvino, coreml or directml.
-        refined: As for `match`.
-        raw: As for `match`.
-        range_px: As for `match`.
+        refined: As in `MatchOptions`.
+        raw: As in `MatchOptions`.
+        range_px: As in `MatchOptions`.
 
     Raises:
-        ValueError: MatcherError for a model that is none or a provider that is not there, ProviderError for
-            one that fails, StereoweaveError for images that are none.
+        ValueError: MatcherError for an unknown model or an unavailable provider, ProviderError for one that
+            fails, StereoweaveError for invalid images or options.
     """
+    options = MatchOptions(range_px=range_px, refined=refined, raw=raw)
     check_provider(provider)
     thread_count(threads)
     pair = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
     path = model_file(model).absolute()
     named = model if str(model) in MODES else path
     matcher = _kept_matcher(named, path.stat().st_mtime_ns, threads, provider)
-    return match(matcher, pair, range_px=range_px, refined=refined, raw=raw)
+    return match(matcher, pair, options)
 
 
-def match(
-    matcher: Matcher,
-    pair: StereoPair,
-    *,
-    range_px: tuple[float, float] | None = None,
-    refined: bool = False,
-    raw: bool = False,
-) -> Estimate:
-    """What a matcher finds in a pair of any size; the same as `matcher.estimate` where that sees all of it.
+def match(matcher: Matcher, pair: StereoPair, options: MatchOptions = DEFAULT_OPTIONS) -> Estimate:
+    """The estimate of a pair of any size; equals `matcher.estimate` where the network sees all of it at once.
 
     Args:
         matcher: The network.
         pair: The photographs, rectified. Where the left one shows nothing the confidence is 0, and what has
             its match where the right one shows nothing is occluded.
-        range_px: The least and the greatest disparity of the left view in px: what is found outside of it is
-            brought to its nearer end, with confidence 0. If left out, it is looked for where the network,
-            within its own range, is not certain of nearly all.
-        refined: As for `Matcher.estimate`, at the size that the network sees.
-        raw: As for `Matcher.estimate`, at the size that the network sees; a larger pair's disparities are
-            brought to its size by `enlarging` all the same.
+        options: How it is matched; `refined` and `raw` apply at the size that the network sees. A larger
+            pair's disparities are upsampled even if `raw`.
 
     Raises:
-        StereoweaveError: For a range that is none, pictures under 32 px in a direction, or both refined and
-            raw.
+        StereoweaveError: The range is outside the pictures' width, or a picture is under 32 px in a
+            direction.
     """
-    check_steps(refined=refined, raw=raw)
-    shown = _shown_first(matcher, pair, range_px)
-    (found,) = matcher.estimate_many([_moved(shown)], raw=True)
-    return _finished(matcher, pair, shown, found, range_px=range_px, refined=refined, raw=raw)
+    (found,) = match_many(matcher, [pair], options)
+    return found
 
 
 def match_many(
-    matcher: Matcher,
-    pairs: Sequence[StereoPair],
-    *,
-    range_px: tuple[float, float] | None = None,
-    refined: bool = False,
-    raw: bool = False,
+    matcher: Matcher, pairs: Sequence[StereoPair], options: MatchOptions = DEFAULT_OPTIONS
 ) -> list[Estimate]:
-    """As `match` of each, of pairs of any sizes, by `Matcher.estimate_many` where they look alike to it."""
-    check_steps(refined=refined, raw=raw)
-    every_shown = [_shown_first(matcher, pair, range_px) for pair in pairs]
+    """Estimates of pairs of any sizes, as by `match`; those of one size for the network share a batch."""
+    every_shown = [_shown_first(matcher, pair, options.range_px) for pair in pairs]
     moved = [_moved(shown) for shown in every_shown]
     of_size: dict[tuple[int, ...], list[int]] = {}
     for i, pair in enumerate(moved):
@@ -152,7 +133,7 @@ def match_many(
     for alike in of_size.values():
         found |= zip(alike, matcher.estimate_many([moved[i] for i in alike], raw=True), strict=True)
     return [
-        _finished(matcher, pair, shown, found[i], range_px=range_px, refined=refined, raw=raw)
+        _finished(matcher, pair, shown, found[i], options)
         for i, (pair, shown) in enumerate(zip(pairs, every_shown, strict=True))
     ]
 
@@ -163,14 +144,9 @@ def _kept_matcher(model: str | Path, modified_ns: int, threads: int | None, prov
     return Matcher(model, threads=threads, provider=provider)
 
 
-def _checked(range_px: tuple[float, float], width_px: int) -> tuple[float, float]:
+def _within_width(range_px: tuple[float, float], width_px: int) -> tuple[float, float]:
     """The part of a range that pictures of this width can have."""
-    low_px, high_px = _two_numbers(range_px)
-    if not (math.isfinite(low_px) and math.isfinite(high_px) and low_px < high_px):
-        raise StereoweaveError(
-            f"range_px: expected the least and the greatest disparity in px, got {low_px:g} and {high_px:g}; "
-            "leave it out to have it found"
-        )
+    low_px, high_px = range_px
     if low_px >= width_px or high_px <= -width_px:
         raise StereoweaveError(
             f"range_px: expected disparities of {-width_px} to {width_px} px, the width of the pictures, "
@@ -179,42 +155,22 @@ def _checked(range_px: tuple[float, float], width_px: int) -> tuple[float, float
     return max(low_px, -width_px), min(high_px, width_px)
 
 
-def _two_numbers(range_px: tuple[float, float]) -> tuple[float, float]:
-    is_row = isinstance(range_px, Sequence) or (isinstance(range_px, np.ndarray) and range_px.ndim == 1)
-    if not is_row or len(range_px) != 2:
-        raise StereoweaveError(
-            "range_px: expected the least and the greatest disparity in px, such as (-20, 150); "
-            "leave it out to have it found"
-        )
-    for value in range_px:
-        check_number("range_px", value)
-    low_px, high_px = range_px
-    return low_px, high_px
-
-
 def _shown_first(matcher: Matcher, pair: StereoPair, range_px: tuple[float, float] | None) -> _Shown:
     """What the network is shown before anything is known of the pair but the range, if that is given."""
     seen = _seen_whole(matcher, pair)
     if range_px is None:
         return _Shown(seen)
     width = pair.left.shape[1]
-    low_px, high_px = (px * seen.left.shape[1] / width for px in _checked(range_px, width))
+    low_px, high_px = (px * seen.left.shape[1] / width for px in _within_width(range_px, width))
     return _shown_within(matcher, pair, seen, (low_px, high_px))
 
 
-def _finished(  # noqa: PLR0913 - all that is known of a pair by then
-    matcher: Matcher,
-    pair: StereoPair,
-    shown: _Shown,
-    found: Estimate,
-    *,
-    range_px: tuple[float, float] | None,
-    refined: bool,
-    raw: bool,
+def _finished(
+    matcher: Matcher, pair: StereoPair, shown: _Shown, found: Estimate, options: MatchOptions
 ) -> Estimate:
     """The estimate of a pair from the network's own of what it was shown first; shown again if need be."""
     found = _unmoved(shown, found)
-    if range_px is None:
+    if options.range_px is None:
         beyond_px = _range_beyond(shown.small, found, matcher.max_disparity_px)
         if beyond_px is not None:
             shown = _shown_within(matcher, pair, shown.small, beyond_px)
@@ -223,14 +179,14 @@ def _finished(  # noqa: PLR0913 - all that is known of a pair by then
     small = shown.small
     if matcher.magnification > 1:
         small, found = _look_closer(matcher, pair, small, found)
-    if not raw:
-        found = matcher.finish(small, _as_seen(found, small), refined=refined)
+    if not options.raw:
+        found = matcher.finish(small, _as_seen(found, small), refined=options.refined)
     if small.left.shape[1] > pair.left.shape[1]:
         found = _shrunk(found, pair)
     elif small.left.shape != pair.left.shape:
         found = enlarge(pair.left, pair.right, found, matcher.threads)
-    if range_px is not None:
-        found = _clipped(found, *range_px)
+    if options.range_px is not None:
+        found = _clipped(found, *options.range_px)
     return _as_seen(found, pair)
 
 

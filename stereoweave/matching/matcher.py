@@ -15,11 +15,12 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from stereoweave.arguments import check_flag, check_kind
+from stereoweave.arguments import check_kind
 from stereoweave.errors import MatcherError, StereoweaveError
 from stereoweave.io.files import SMALLEST_SIDE_PX
 from stereoweave.matching.left_right_check import OCCLUSION_STEP_PX, is_occluded, measure_disagreement
 from stereoweave.matching.occlusion_fill import fill_occluded
+from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU, PROVIDERS, open_session, running
 from stereoweave.matching.subpixel import to_subpixel
 from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
@@ -140,7 +141,7 @@ class Matcher:
         Raises:
             ValueError: As for `estimate`, or if the pairs are not all of one size.
         """
-        check_steps(refined=refined, raw=raw)
+        MatchOptions(refined=refined, raw=raw)  # refuses both at once
         check_kind("pairs", pairs, Sequence)
         for pair in pairs:
             check_kind("pairs", pair, StereoPair)
@@ -374,16 +375,6 @@ def _strip_weights(rows: slice, height: int) -> Float[np.ndarray, "h 1"]:
     # Nothing from the outermost quarter of the overlap, where the strip's own border shows.
     inset = np.minimum(from_top, from_bottom) - _STRIP_OVERLAP_PX / 2
     return np.clip(inset / _STRIP_OVERLAP_PX, 1e-6, 1).astype(np.float32)
-
-
-def check_steps(*, refined: bool, raw: bool) -> None:
-    """Raise a StereoweaveError where an estimate is to be both refined and raw."""
-    check_flag("refined", refined)
-    check_flag("raw", raw)
-    if refined and raw:
-        raise StereoweaveError(
-            "raw: expected without refined: it is the network's own disparity; leave one of them out"
-        )
 
 
 def _estimate(left: UInt8[np.ndarray, "h w 3"], maps: Maps) -> Estimate:

@@ -10,6 +10,7 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.io.arrays import as_rgb
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU
 from stereoweave.stereo import StereoPair
 
@@ -68,7 +69,8 @@ class StereoMatcher:
         """
         pair = StereoPair(left=_rgb_of_bgr(left, "left picture"), right=_rgb_of_bgr(right, "right picture"))
         least_px, most_px = self._least_px, self._least_px + self._count
-        found = match(self._matcher, pair, range_px=(least_px, most_px), refined=self._refined)
+        options = MatchOptions(range_px=(least_px, most_px), refined=self._refined)
+        found = match(self._matcher, pair, options)
         known = ~found.occluded & (found.confidence >= self._min_confidence)
         known &= (found.disparity_px >= least_px) & (found.disparity_px <= most_px)
         steps = np.rint(found.disparity_px * _STEPS_PER_PX)

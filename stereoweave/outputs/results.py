@@ -37,7 +37,8 @@ from stereoweave.io.files import (
 )
 from stereoweave.io.output_lock import lock_output
 from stereoweave.matching.estimate import match
-from stereoweave.matching.matcher import Matcher, check_steps
+from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU
 from stereoweave.outputs.point_cloud import (
     MOST_POINTS,
@@ -130,9 +131,7 @@ class DepthOrder:
         model: The name of the network, for the summary.
         threads: How many threads may be used; all cores if left out.
         provider: What the network is run on, a name in `providers.PROVIDERS`.
-        range_px: The least and the greatest disparity; found from the pair where None.
-        refined: As for `matching.match`.
-        raw: As for `matching.match`.
+        options: How the pair is matched.
         files: What is written beside `always`, names in FILES, or "all"; depth.png is with any camera.
         always: What is written of every pair.
     """
@@ -141,14 +140,11 @@ class DepthOrder:
     model: str = "small"
     threads: int | None = None
     provider: str = CPU
-    range_px: tuple[float, float] | None = None
-    refined: bool = False
-    raw: bool = False
+    options: MatchOptions = MatchOptions()
     files: tuple[str, ...] = ()
     always: tuple[str, ...] = ALWAYS
 
     def __post_init__(self) -> None:
-        check_steps(refined=self.refined, raw=self.raw)
         for file in self.files:
             if file not in FILES and file != ALL:
                 raise StereoweaveError(
@@ -165,7 +161,7 @@ def make_depth(
     files, left_out = _files_of(order, pair)
     with _results_in(out) as folder:
         start_s = time.perf_counter()
-        estimate = match(matcher, pair, range_px=order.range_px, refined=order.refined, raw=order.raw)
+        estimate = match(matcher, pair, order.options)
         estimate_ms = 1000 * (time.perf_counter() - start_s)
         names = tuple(picture.name for picture in pictures)
         model = order.model if matcher.provider == CPU else f"{order.model} on {matcher.provider}"
@@ -183,7 +179,7 @@ def order_facts(order: DepthOrder) -> dict[str, Any]:
     """
     facts = {"stereoweave": __version__, **asdict(order)}
     del facts["threads"], facts["provider"]
-    facts |= facts.pop("request")
+    facts |= facts.pop("request") | facts.pop("options")
     if facts["model"].endswith(".onnx"):
         with reading(facts["model"], "a model"):
             facts["model"] = _by_content(facts["model"], Path(facts["model"]).read_bytes())

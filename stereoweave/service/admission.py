@@ -76,5 +76,5 @@ class Budget:
 def work_of(order: Order, megapixels: float) -> float:
     """The work of an order, in megapixels of unrefined disparity of small pictures that take as long."""
     large = _LARGE if megapixels > _LARGE_FROM_MEGAPIXELS else 1
-    refined = _REFINED if order.refined or order.is_view else 1
+    refined = _REFINED if order.match_options.refined else 1
     return megapixels * large * refined

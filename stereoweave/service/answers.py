@@ -17,6 +17,7 @@ from stereoweave.io.decoding import MOST_PIXELS, opening
 from stereoweave.io.files import RangeError, write_image
 from stereoweave.matching.estimate import match_many
 from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.point_cloud import needed_camera
 from stereoweave.outputs.report import Summary, summarize
 from stereoweave.outputs.results import FILES, Result, needs_camera
@@ -51,8 +52,7 @@ class Order:
         pictures: Two, left first, or one that holds both views.
         file: What it gets: a disparity or a depth in `results.FILES`, or a view, such as view.png.
         request: What is said of the pictures.
-        range_px: As for `matching.match`.
-        refined: Likewise; a view is always made of a refined estimate.
+        options: How the pair is matched; see `match_options`.
         position: Where a view is seen from.
         strength: As for `rendering.Renderer`.
         checked: Whether the notes say what is amiss with the pair, which takes half as long again.
@@ -63,8 +63,7 @@ class Order:
     pictures: tuple[Path, ...]
     file: str
     request: Request = Request()
-    range_px: tuple[float, float] | None = None
-    refined: bool = False
+    options: MatchOptions = MatchOptions()
     position: float = 0.5
     strength: float = 1.0
     checked: bool = False
@@ -78,6 +77,11 @@ class Order:
     def is_view(self) -> bool:
         """Whether a view is wanted, and not a map."""
         return self.file.startswith(_VIEW)
+
+    @property
+    def match_options(self) -> MatchOptions:
+        """The options, refined for a view: it shows every error at an edge."""
+        return replace(self.options, refined=True) if self.is_view else self.options
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,13 +134,13 @@ def answering(model: str, provider: str, threads: int) -> Answering:
 
 
 def answer_many(matcher: Matcher, orders: Sequence[Order]) -> list[Answer | Exception]:
-    """What each order gets, or why it gets nothing; those of one range are matched together."""
+    """What each order gets, or why it gets nothing; those of the same options are matched together."""
     outcome: dict[int, Any] = {}
-    alike: dict[object, list[int]] = {}
+    alike: dict[MatchOptions, list[int]] = {}
     for at, order in enumerate(orders):
         outcome[at] = _attempt(_prepared, order)
         if isinstance(outcome[at], Prepared):
-            alike.setdefault((order.range_px, order.refined or order.is_view), []).append(at)
+            alike.setdefault(order.match_options, []).append(at)
     for places in alike.values():
         found = _matched(matcher, orders[places[0]], [outcome[at].pair for at in places])
         for at, estimate in zip(places, found, strict=True):
@@ -177,8 +181,7 @@ def _matched(
 ) -> Sequence[tuple[Estimate, float] | Exception]:
     """The estimates of pairs that are matched as the order says, each with its share of the time in ms."""
     start_s = time.perf_counter()
-    refined = order.refined or order.is_view
-    estimates = _attempt(match_many, matcher, pairs, range_px=order.range_px, refined=refined)
+    estimates = _attempt(match_many, matcher, pairs, order.match_options)
     if not isinstance(estimates, Exception):
         estimate_ms = 1000 * (time.perf_counter() - start_s) / len(pairs)
         return [(estimate, estimate_ms) for estimate in estimates]

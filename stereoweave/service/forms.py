@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,6 +19,7 @@ from pydantic import (
 from starlette import datastructures
 
 from stereoweave.io.files import MOST_SMALL_BYTES
+from stereoweave.matching.options import MatchOptions
 from stereoweave.pictures.loading import FORMATS
 from stereoweave.pictures.prepare import Request
 from stereoweave.service.answers import Order, TooLargeError
@@ -81,7 +83,6 @@ class PairForm(BaseModel):
 
     def said(self, calibration: Path | None) -> dict[str, Any]:
         """What an `Order` takes of it."""
-        low_high = tuple(float(word) for word in self.range.split(",")) if self.range else None
         request = Request(
             arrangement=self.format,
             calibration=calibration,
@@ -89,7 +90,17 @@ class PairForm(BaseModel):
             baseline_m=self.baseline_m,
             rectify=self.rectify,
         )
-        return {"request": request, "range_px": low_high, "checked": self.check}
+        return {"request": request, "options": self.options(), "checked": self.check}
+
+    def options(self) -> MatchOptions:
+        """How the pair is matched."""
+        return MatchOptions(range_px=self._range_px())
+
+    def _range_px(self) -> tuple[float, float] | None:
+        if self.range is None:
+            return None
+        low_px, high_px = map(float, self.range.split(","))
+        return low_px, high_px
 
 
 class MapForm(PairForm):
@@ -101,9 +112,9 @@ class MapForm(PairForm):
         Field(description="png is of 16 bits, px * 256 or millimetres; the others are of float32."),
     ] = "png"
 
-    def said(self, calibration: Path | None) -> dict[str, Any]:
-        """As before, and whether it is refined."""
-        return super().said(calibration) | {"refined": self.refined}
+    def options(self) -> MatchOptions:
+        """As before, refined on request."""
+        return replace(super().options(), refined=self.refined)
 
 
 class ViewForm(PairForm):

@@ -21,6 +21,7 @@ from stereoweave.io.colormap import colour_disparity, colour_range_px
 from stereoweave.io.output_lock import lock_output
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU
 from stereoweave.pictures.frame_packing import ARRANGEMENTS
 from stereoweave.rendering.layouts import LAYOUTS, Choices, check_reach, middle_px
@@ -248,6 +249,7 @@ class _Maker:
 
     def __init__(self, order: Order, matcher: Matcher, survey: Survey) -> None:
         self.survey, self.tally = survey, Tally()
+        self._options = MatchOptions(range_px=survey.within_px)
         self._order, self._matcher, self._steadier = order, matcher, Steadier(order.threads)
 
     @classmethod
@@ -279,7 +281,7 @@ class _Maker:
         """What is shown of each frame, with its time; the bar follows."""
         for frame in frames:
             pair = StereoPair(left=frame.left, right=frame.right)
-            estimate = match(self._matcher, pair, range_px=self.survey.within_px)
+            estimate = match(self._matcher, pair, self._options)
             estimate = self._steadier(frame.left, frame.right, estimate)
             self.tally.note(frame)
             self.tally.cuts = self._steadier.cuts

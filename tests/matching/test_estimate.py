@@ -15,6 +15,7 @@ from stereoweave.matching import estimate as matching
 from stereoweave.matching import matcher as matcher_module
 from stereoweave.matching.estimate import match, match_many
 from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import PROVIDERS
 
 FIELDS = ("disparity_px", "right_disparity_px", "confidence", "occluded")
@@ -55,7 +56,7 @@ def test_a_pair_that_the_network_sees_all_of_is_what_the_matcher_estimates(match
 def test_raw_is_the_networks_own_disparity_alone_and_among_others(matcher, examples):
     alone = matcher.estimate(examples.left, examples.right, raw=True)
     same(sw.estimate(examples.left, examples.right, raw=True), alone)
-    same(match_many(matcher, [examples], raw=True)[0], alone)
+    same(match_many(matcher, [examples], MatchOptions(raw=True))[0], alone)
     filled = matcher.estimate(examples.left, examples.right)
     assert (np.abs(filled.disparity_px - alone.disparity_px)[alone.occluded] > 1).mean() > 0.1
     assert np.abs(filled.disparity_px - alone.disparity_px)[~alone.occluded].max() < 1.001
@@ -80,8 +81,8 @@ def test_a_pair_with_columns_cut_off_has_so_much_less_disparity_negative_ones_to
 
 def test_what_is_given_as_the_range_counts_and_not_what_is_found(matcher, examples):
     whole = matcher.estimate(examples.left, examples.right)
-    same(match(matcher, examples, range_px=(0, 192)), whole)
-    found = match(matcher, examples, range_px=(-20, 120))
+    same(match(matcher, examples, MatchOptions(range_px=(0, 192))), whole)
+    found = match(matcher, examples, MatchOptions(range_px=(-20, 120)))
     clear = sure(whole) & sure(found)
     assert np.mean(np.abs(found.disparity_px - whole.disparity_px)[clear] > 1) < 0.03
 
@@ -92,7 +93,7 @@ def test_a_picture_twice_as_large_has_twice_the_disparity_even_if_it_is_matched_
         right=cv2.resize(examples.right, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC),
     )
     whole = matcher.estimate(examples.left, examples.right)
-    found = match(matcher, twice, range_px=(0, 440))
+    found = match(matcher, twice, MatchOptions(range_px=(0, 440)))
     expected_px = 2 * cv2.resize(whole.disparity_px, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
     clear = cv2.resize(sure(whole).astype(np.uint8), None, fx=2, fy=2) > 0
     off_px = (found.disparity_px - expected_px)[clear & sure(found)]
@@ -112,7 +113,7 @@ def flat(rng, disparity_px, size=(160, 480)):
 
 @pytest.mark.parametrize("range_px", [(0, 300), (0, 500), (-200, 200), (None)])
 def test_a_disparity_of_37_px_is_37_px_however_much_the_pair_is_reduced(matcher, rng, range_px):
-    found = match(matcher, flat(rng, 37), range_px=range_px)
+    found = match(matcher, flat(rng, 37), MatchOptions(range_px=range_px))
     inner = np.s_[10:-10, 60:-60]
     assert abs(np.median(found.disparity_px[inner]) - 37) < 0.3
     assert abs(np.median(found.right_disparity_px[inner]) - 37) < 0.3
@@ -188,7 +189,7 @@ def test_best_is_base_at_one_and_a_half_times_the_size_and_refined(best, part):
 
 
 def test_best_is_refined_whether_it_is_asked_for_or_not(best, part):
-    same(match(best, part, refined=True), match(best, part))
+    same(match(best, part, MatchOptions(refined=True)), match(best, part))
 
 
 def test_the_best_estimate_mixes_no_surfaces():
@@ -210,7 +211,7 @@ def test_a_disparity_of_37_px_is_37_px_for_best(best, rng, range_px):
     texture = rng.integers(0, 256, (96, 400, 3), np.uint8)
     texture = cv2.GaussianBlur(texture, (0, 0), 1.5)
     left, right = (np.ascontiguousarray(texture[:, at : at + 300]) for at in (50, 87))
-    found = match(best, sw.StereoPair(left=left, right=right), range_px=range_px)
+    found = match(best, sw.StereoPair(left=left, right=right), MatchOptions(range_px=range_px))
     assert found.disparity_px.shape == (96, 300)
     assert np.median(np.abs(found.disparity_px - 37)[:, 60:]) < 0.1
 
@@ -230,7 +231,7 @@ def test_best_looks_closer_by_as_much_as_is_seen_whole(best, rng, monkeypatch, s
 
     monkeypatch.setattr(Matcher, "estimate_many", noted)
     left, right = rng.integers(0, 256, (2, *size, 3), np.uint8)
-    match(best, sw.StereoPair(left=left, right=right), range_px=(0, 40))
+    match(best, sw.StereoPair(left=left, right=right), MatchOptions(range_px=(0, 40)))
     assert all(best.sees_whole(width, height) for height, width, _ in seen)
     closer = [width / size[1] for _, width, _ in seen[1:]]
     assert [least <= magnification <= most for magnification in closer] == [True] * (most > 0)
@@ -298,7 +299,7 @@ def test_where_a_match_is_beyond_the_right_picture_its_last_column_is_asked(matc
 
 def test_a_disparity_outside_of_the_range_that_is_given_is_brought_to_its_end_and_not_believed(matcher, rng):
     for range_px, end_px in [((50, 90), 50), ((-20, 20), 20)]:
-        found = match(matcher, flat(rng, 37), range_px=range_px)
+        found = match(matcher, flat(rng, 37), MatchOptions(range_px=range_px))
         for disparity_px in (found.disparity_px, found.right_disparity_px):
             assert range_px[0] <= disparity_px.min()
             assert disparity_px.max() <= range_px[1]
@@ -310,20 +311,26 @@ def test_a_disparity_outside_of_the_range_that_is_given_is_brought_to_its_end_an
 @pytest.mark.parametrize("range_px", [(160, 170), (-170, -160)])
 def test_a_range_that_no_pixel_can_have_is_refused_in_one_line(matcher, rng, range_px):
     with pytest.raises(StereoweaveError, match="expected disparities of -160 to 160 px, the width") as caught:
-        match(matcher, flat(rng, 12, (64, 160)), range_px=range_px)
+        match(matcher, flat(rng, 12, (64, 160)), MatchOptions(range_px=range_px))
     assert "\n" not in str(caught.value)
 
 
 def test_a_range_beyond_the_pictures_width_is_as_good_as_the_width(matcher, rng):
     pair = flat(rng, 12, (64, 160))
-    same(match(matcher, pair, range_px=(-9000, 20)), match(matcher, pair, range_px=(-160, 20)))
-    same(match(matcher, pair, range_px=(0, 9000)), match(matcher, pair, range_px=(0, 160)))
+    same(
+        match(matcher, pair, MatchOptions(range_px=(-9000, 20))),
+        match(matcher, pair, MatchOptions(range_px=(-160, 20))),
+    )
+    same(
+        match(matcher, pair, MatchOptions(range_px=(0, 9000))),
+        match(matcher, pair, MatchOptions(range_px=(0, 160))),
+    )
 
 
 @pytest.mark.parametrize("range_px", [(10, 10), (50, 0), (0, float("nan")), (float("-inf"), 10)])
 def test_a_range_that_is_none_is_refused_in_one_line(matcher, examples, range_px):
     with pytest.raises(StereoweaveError, match="range_px: expected the least and the greatest") as caught:
-        match(matcher, examples, range_px=range_px)
+        match(matcher, examples, MatchOptions(range_px=range_px))
     assert "\n" not in str(caught.value)
 
 
@@ -377,7 +384,7 @@ def test_a_pair_that_is_moved_is_still_seen_whole(rng, monkeypatch):
 
     monkeypatch.setattr(Matcher, "estimate_many", noted)
     left, right = rng.integers(0, 256, (2, 64, 96, 3), np.uint8)
-    found = match(Matcher(), sw.StereoPair(left=left, right=right), range_px=(-8, 40))
+    found = match(Matcher(), sw.StereoPair(left=left, right=right), MatchOptions(range_px=(-8, 40)))
     assert found.disparity_px.shape == (64, 96)
     assert seen == [True]
 
@@ -391,13 +398,13 @@ def test_a_pair_is_shown_no_smaller_than_its_range_asks_for(matcher, rng, monkey
         return estimate_many(matcher, pairs, **options)
 
     monkeypatch.setattr(Matcher, "estimate_many", noted)
-    match(matcher, flat(rng, 37), range_px=(-100, 300))
+    match(matcher, flat(rng, 37), MatchOptions(range_px=(-100, 300)))
     # 400 px in the 188 that are seen well: 480x160 px become 226x75, of which the least is -47.1 px.
     assert seen == [(75, 226 + 48, 3)]
 
 
-@pytest.mark.parametrize("given", [{}, {"range_px": (-8, 100), "refined": True}])
-def test_pairs_of_any_sizes_and_ranges_matched_together_are_as_each_is_alone(rng, monkeypatch, given):
+@pytest.mark.parametrize("options", [MatchOptions(), MatchOptions(range_px=(-8, 100), refined=True)])
+def test_pairs_of_any_sizes_and_ranges_matched_together_are_as_each_is_alone(rng, monkeypatch, options):
     monkeypatch.setitem(PROVIDERS, "cpu", replace(PROVIDERS["cpu"], batches=True))  # as a GPU takes them
     matcher = Matcher()
     noise = rng.integers(0, 256, (2, 64, 96, 3), np.uint8)
@@ -409,8 +416,8 @@ def test_pairs_of_any_sizes_and_ranges_matched_together_are_as_each_is_alone(rng
         replace(shorter, left_seen=np.tile(seen, (64, 1))),
         sw.StereoPair(left=noise[0], right=noise[1]),
     ]
-    for pair, found in zip(pairs, match_many(matcher, pairs, **given), strict=True):
-        alone = match(matcher, pair, **given)
+    for pair, found in zip(pairs, match_many(matcher, pairs, options), strict=True):
+        alone = match(matcher, pair, options)
         np.testing.assert_array_equal(found.occluded, alone.occluded)
         for name in FIELDS[:3]:
             np.testing.assert_allclose(getattr(found, name), getattr(alone, name), atol=1e-3)
@@ -419,7 +426,7 @@ def test_pairs_of_any_sizes_and_ranges_matched_together_are_as_each_is_alone(rng
 @pytest.mark.parametrize("range_px", [None, (0, 80), (-60, 80)])
 def test_a_pair_larger_than_the_only_size_of_a_matcher_file_is_matched_smaller(tmp_path, rng, range_px):
     fixed = Matcher(of_fixed_size("small", tmp_path / "fixed.onnx", 160, 320))
-    found_px = match(fixed, flat(rng, 37, (200, 480)), range_px=range_px).disparity_px
+    found_px = match(fixed, flat(rng, 37, (200, 480)), MatchOptions(range_px=range_px)).disparity_px
     assert found_px.shape == (200, 480)
     assert abs(np.median(found_px[10:-10, 60:-60]) - 37) < 0.5
 

@@ -10,6 +10,7 @@ from stereoweave.io.files import read_pair
 from stereoweave.matching import matcher
 from stereoweave.matching.estimate import match, match_many
 from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import PROVIDERS
 from stereoweave.stereo import StereoPair
 
@@ -94,8 +95,8 @@ def test_an_estimate_cannot_be_both_refined_and_raw(both_views, call):
         "estimate": lambda: both_views.estimate(grey, grey, **both),
         "estimate_many": lambda: both_views.estimate_many([pair], **both),
         "sw.estimate": lambda: sw.estimate(grey, grey, **both),
-        "match": lambda: match(both_views, pair, **both),
-        "match_many": lambda: match_many(both_views, [pair], **both),
+        "match": lambda: match(both_views, pair, MatchOptions(**both)),
+        "match_many": lambda: match_many(both_views, [pair], MatchOptions(**both)),
     }
     with pytest.raises(sw.StereoweaveError, match="raw: expected without refined"):
         calls[call]()

@@ -9,6 +9,7 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import read_pair
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.sgbm_interface import StereoMatcher
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -68,7 +69,7 @@ def test_a_program_for_sgbm_finds_the_same_points_through_it():
 def test_what_is_known_is_the_estimate_times_16_and_the_rest_says_so():
     left, right = photographs()
     pair = read_pair(EXAMPLES / "left.png", EXAMPLES / "right.png")
-    estimate = match(Matcher(), pair, range_px=(0, 64))
+    estimate = match(Matcher(), pair, MatchOptions(range_px=(0, 64)))
     disparity = StereoMatcher(0, 64, min_confidence=0.25).compute(left, right)
     known = ~estimate.occluded & (estimate.confidence >= 0.25)
     known &= (estimate.disparity_px >= 0) & (estimate.disparity_px <= 64)

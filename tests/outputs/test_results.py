@@ -12,6 +12,7 @@ from stereoweave.errors import OutputInUseError, StereoweaveError
 from stereoweave.io.files import read_disparity_png, read_image, read_pfm, read_pixels, write_image
 from stereoweave.io.output_lock import lock_output
 from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.report import summarize
 from stereoweave.outputs.results import ALWAYS, FILES, DepthOrder, Result, make_depth, needs_camera
 from stereoweave.pictures.prepare import Request
@@ -195,9 +196,9 @@ def test_what_is_asked_of_the_estimate_is_handed_on(folder, matcher):
     found_px = {}
     for name, order in {
         "plain": DepthOrder(),
-        "moved": DepthOrder(range_px=(-40.0, 100.0)),
-        "refined": DepthOrder(refined=True),
-        "raw": DepthOrder(raw=True),
+        "moved": DepthOrder(options=MatchOptions(range_px=(-40.0, 100.0))),
+        "refined": DepthOrder(options=MatchOptions(refined=True)),
+        "raw": DepthOrder(options=MatchOptions(raw=True)),
     }.items():
         make_depth(PICTURES, Path(name), order, matcher)
         found_px[name] = read_pfm(f"{name}/disparity.pfm")
@@ -209,7 +210,7 @@ def test_what_is_asked_of_the_estimate_is_handed_on(folder, matcher):
 
 def test_an_order_cannot_be_both_refined_and_raw():
     with pytest.raises(StereoweaveError, match="raw: expected without refined"):
-        DepthOrder(refined=True, raw=True)
+        MatchOptions(refined=True, raw=True)
 
 
 def test_the_command_gives_the_networks_own_disparity_on_request(folder, matcher):

@@ -2,6 +2,7 @@ from pathlib import Path
 
 import pytest
 
+from stereoweave.matching.options import MatchOptions
 from stereoweave.service.admission import Budget, BusyError, work_of
 from stereoweave.service.answers import Order, TooLargeError
 
@@ -68,4 +69,4 @@ def test_what_was_stopped_unfinished_makes_the_usual_speed_slower_and_the_best_n
 def test_large_pictures_and_full_resolution_are_more_work():
     assert work_of(order(), 0.6) == 0.6
     assert work_of(order(), 50) == 125
-    assert work_of(order(refined=True), 1) == work_of(order(file="view.png"), 1) == 1.3
+    assert work_of(order(options=MatchOptions(refined=True)), 1) == work_of(order(file="view.png"), 1) == 1.3

@@ -13,6 +13,7 @@ from service_examples import BOTH, EXAMPLES
 import stereoweave as sw
 from stereoweave.io.files import read_pair, write_image
 from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.options import MatchOptions
 from stereoweave.pictures.prepare import Request
 from stereoweave.service.answers import Order, TooLargeError, answer_many, check_pixels
 
@@ -41,8 +42,8 @@ def test_those_that_are_matched_together_get_what_each_gets_alone(estimate, tmp_
         order(tmp_path / "first"),
         order(tmp_path / "damaged", left=b"no picture"),
         order(tmp_path / "second"),
-        order(tmp_path / "with a range", range_px=(8, 16)),
-        order(tmp_path / "with a range that is none", range_px=(5000, 6000)),
+        order(tmp_path / "with a range", options=MatchOptions(range_px=(8, 16))),
+        order(tmp_path / "with a range that is none", options=MatchOptions(range_px=(5000, 6000))),
     ]
     first, damaged, second, within, beyond = answer_many(Matcher("small"), orders)
     for answer in (first, second):

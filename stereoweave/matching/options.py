@@ -1,0 +1,62 @@
+"""How a pair is matched: the options that every way to an estimate takes."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereoweave.arguments import check_flag, check_number
+from stereoweave.errors import StereoweaveError
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchOptions:
+    """How a pair is matched; invalid options are refused before any work.
+
+    Attributes:
+        range_px: Least and greatest disparity of the left view in px; what is found outside is clipped, with
+            confidence 0. Default: found from the pair where the network, within its own range, is uncertain.
+        refined: Match once more at full resolution, with the network's disparity as prior: thin things and
+            sharper edges, in more time.
+        raw: Return the network's own disparity: occluded pixels not filled, no subpixel refinement.
+
+    Raises:
+        StereoweaveError: `range_px` is not two finite numbers in ascending order, or both `refined` and `raw`
+            are set.
+    """
+
+    range_px: tuple[float, float] | None = None
+    refined: bool = False
+    raw: bool = False
+
+    def __post_init__(self) -> None:
+        check_flag("refined", self.refined)
+        check_flag("raw", self.raw)
+        if self.refined and self.raw:
+            raise StereoweaveError(
+                "raw: expected without refined: it is the network's own disparity; leave one of them out"
+            )
+        if self.range_px is not None:
+            object.__setattr__(self, "range_px", _checked_range(self.range_px))
+
+
+DEFAULT_OPTIONS = MatchOptions()
+
+
+def _checked_range(range_px: tuple[float, float]) -> tuple[float, float]:
+    is_row = isinstance(range_px, Sequence) or (isinstance(range_px, np.ndarray) and range_px.ndim == 1)
+    if not is_row or len(range_px) != 2:
+        raise StereoweaveError(
+            "range_px: expected the least and the greatest disparity in px, such as (-20, 150); "
+            "leave it out to have it found"
+        )
+    for value in range_px:
+        check_number("range_px", value)
+    low_px, high_px = map(float, range_px)
+    if not (math.isfinite(low_px) and math.isfinite(high_px) and low_px < high_px):
+        raise StereoweaveError(
+            f"range_px: expected the least and the greatest disparity in px, got {low_px:g} and {high_px:g}; "
+            "leave it out to have it found"
+        )
+    return low_px, high_px
