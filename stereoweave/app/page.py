@@ -37,6 +37,7 @@ from stereoweave.app.session import (
 )
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.colormap import OCCLUDED_RGB, colour_confidence, css_colour, legend_colours
+from stereoweave.matching.backend import Backend
 from stereoweave.matching.providers import CPU
 from stereoweave.pictures.loading import FORMATS
 from stereoweave.pictures.prepare import Request
@@ -273,7 +274,8 @@ class Page:
             rectify=given[self._rectify],
         )
         pictures = tuple(Path(file) for file in (given[self._left], given[self._right]) if file)
-        return Uploads(pictures=pictures, request=request, model=given[self._model], provider=self._provider)
+        backend = Backend(model=given[self._model], provider=self._provider)
+        return Uploads(pictures=pictures, request=request, backend=backend)
 
     def _shown(self, kept: Kept, position: float) -> dict[Any, Any]:
         pair, estimate = kept.renderer.pair, kept.renderer.estimate

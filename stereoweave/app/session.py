@@ -1,6 +1,5 @@
 """What the web page makes of a pair, without the page: a result that is kept, measured, drawn and written."""
 
-import functools
 import time
 import zipfile
 from collections.abc import Callable, Sequence
@@ -14,10 +13,9 @@ from jaxtyping import UInt8
 from stereoweave.cameras.diagnosis import hints
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.colormap import colour_disparity, colour_range_px
+from stereoweave.matching.backend import Backend
 from stereoweave.matching.estimate import match
-from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
-from stereoweave.matching.providers import CPU
 from stereoweave.outputs.measure import distance
 from stereoweave.outputs.point_cloud import EmptyError, point_cloud, write_glb
 from stereoweave.outputs.report import Summary, shrunk, summarize
@@ -57,8 +55,7 @@ class Uploads:
 
     pictures: tuple[Path, ...]
     request: Request
-    model: str
-    provider: str = CPU
+    backend: Backend
 
 
 def matched(uploads: Uploads, folder: Path, tell: Callable[[float, str], None]) -> Kept:
@@ -77,10 +74,12 @@ def matched(uploads: Uploads, folder: Path, tell: Callable[[float, str], None]) 
     height, width = pair.left.shape[:2]
     tell(0.3, f"matching {width}×{height} px")
     start_s = time.perf_counter()
-    estimate = match(_matcher(uploads.model, uploads.provider), pair, MatchOptions(refined=True))
+    estimate = match(uploads.backend.matcher(), pair, MatchOptions(refined=True))
     estimate_ms = 1000 * (time.perf_counter() - start_s)
     names = tuple(picture.name for picture in uploads.pictures)
-    summary = summarize(pair, estimate, pictures=names, model=uploads.model, estimate_ms=estimate_ms)
+    summary = summarize(
+        pair, estimate, pictures=names, model=str(uploads.backend.model), estimate_ms=estimate_ms
+    )
     tell(0.6, "showing")
     return Kept(
         result=Result(pair=pair, estimate=estimate, summary=summary),
@@ -200,8 +199,3 @@ def _supposed_camera(estimate: Estimate) -> StereoCamera:
         cy_px=(height - 1) / 2,
         doffs_px=max(0.0, -float(np.percentile(estimate.disparity_px, 1))),
     )
-
-
-@functools.cache
-def _matcher(model: str, provider: str) -> Matcher:
-    return Matcher(model, provider=provider)

@@ -27,7 +27,7 @@ from stereoweave.io.files import reading
 from stereoweave.io.output_lock import lock_output
 from stereoweave.io.run_folder import check_claim, check_unclaimed, described, description
 from stereoweave.io.stores import Store, store_at
-from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.providers import CPU
 from stereoweave.outputs.results import DepthOrder, order_facts
 from stereoweave.pictures.pair_finding import BATCH_FILE
 from stereoweave.system.progress import progress
@@ -84,8 +84,8 @@ def run_cluster(
     order = _for_many(order or DepthOrder(), engine)
     console = console or Console(quiet=True)
     read_from, write_to = _store(source), _store(destination)
-    if order.provider == "cpu":
-        Matcher(order.model, threads=1)  # said once, here, if there is no such network
+    if order.backend.provider == CPU:
+        replace(order.backend, threads=1).matcher()  # an unknown network is one error, not one for each pair
     read_from.check_source()
     write_to.check_destination()
     with _alone(write_to), connect(engine):
@@ -163,7 +163,7 @@ def _ready(worker: Worker) -> Worker:
 def _for_many(order: DepthOrder, engine: Engine) -> DepthOrder:
     """The order without reports, unless they are asked for, with the threads that a worker has to itself."""
     always = tuple(file for file in order.always if file != "report.html")
-    return replace(order, always=always, threads=engine.threads_each)
+    return replace(order, always=always, backend=replace(order.backend, threads=engine.threads_each))
 
 
 def _store(place: str | Path) -> Store:
@@ -192,8 +192,8 @@ def _claim(destination: Store, order: DepthOrder, source: Store) -> None:
 
 def _carried(order: DepthOrder) -> Iterator[tuple[str, str, bytes]]:
     """The order's own files, which workers on other machines cannot read: kind, name and content."""
-    model, calibration = Path(order.model), order.request.calibration
-    if order.model.endswith(".onnx") and model.is_file():  # else a name that they all know
+    model, calibration = Path(order.backend.model), order.request.calibration
+    if str(model).endswith(".onnx") and model.is_file():  # else a name that they all know
         with reading(model, "a model"):
             yield "model", model.name, model.read_bytes()
     if calibration and calibration.is_file():

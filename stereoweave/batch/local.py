@@ -27,7 +27,6 @@ from stereoweave.io.files import make_folder, reading, remove_leftovers, replaci
 from stereoweave.io.output_lock import lock_output
 from stereoweave.io.run_folder import check_claim, check_unclaimed, described, description
 from stereoweave.io.text import write_table
-from stereoweave.matching.matcher import Matcher
 from stereoweave.outputs.results import DepthOrder, make_depth, order_facts
 from stereoweave.pictures.pair_finding import BATCH_FILE, SUMMARY_FILE, Job, Pairs
 from stereoweave.system.processes import begin_work
@@ -74,16 +73,17 @@ def run_batch(
             matcher.
     """
     processes = min(processes or usable_cores(), max(len(jobs), 1))
-    if processes > 1 and order.threads is None:
-        order = replace(order, threads=1)
-    # Said once, here, if there is no such network or provider.
-    Matcher(order.model, threads=1, provider=order.provider)
+    if processes > 1 and order.backend.threads is None:
+        order = replace(order, backend=replace(order.backend, threads=1))
+    # An unknown network or unavailable provider is one error here, not one for each pair.
+    replace(order.backend, threads=1).matcher()
+    threads = order.backend.threads
     make_folder(out)
     with lock_output(out):
         _claim(out, order)
         missing = [job for job in jobs if not _is_finished(out / job.name, job)]
         try:
-            failed = _run(functools.partial(_make, out, order), missing, processes, order.threads, console)
+            failed = _run(functools.partial(_make, out, order), missing, processes, threads, console)
         finally:
             _tidy(out)
         _write_summary(out, jobs, dict(failed))
@@ -219,8 +219,7 @@ def _make(out: Path, order: DepthOrder, job: Job) -> str | None:
         if job.calibration and not order.request.calibration:
             order = replace(order, request=replace(order.request, calibration=job.calibration))
         start_s = time.perf_counter()
-        matcher = _matcher(order.model, order.threads, order.provider)
-        summary, notes = make_depth(job.pictures, folder, order, matcher)
+        summary, notes = make_depth(job.pictures, folder, order)
         seconds = round(time.perf_counter() - start_s, 3)
         files = sorted(path.name for path in folder.iterdir() if path.name[0] != ".")
         facts = {"sources": sources, "files": files, "seconds": seconds, "notes": notes}
@@ -231,12 +230,6 @@ def _make(out: Path, order: DepthOrder, job: Job) -> str | None:
     except Exception as error:  # whatever a library makes of a bad picture, the other pairs go on
         return " ".join(f"{type(error).__name__}: {error}".split())
     return None
-
-
-@functools.cache
-def _matcher(model: str, threads: int | None, provider: str) -> Matcher:
-    """The matcher of this process, kept between pairs."""
-    return Matcher(model, threads=threads, provider=provider)
 
 
 def _sources(job: Job) -> list[list[Any]]:

@@ -150,13 +150,13 @@ class Worker:
         """
         start_s = time.perf_counter()
         row, order = self._empty_row(planned), self._order()
-        matcher = _matcher(order.model, order.threads, order.provider)
+        matcher = order.backend.matcher()
         with tempfile.TemporaryDirectory(prefix="stereoweave-") as name:
             try:
                 if planned.is_film:
                     row |= self._film(planned, Path(name), order)
                 else:
-                    row |= self._pair(planned, Path(name), order, matcher)
+                    row |= self._pair(planned, Path(name), order)
             except _StoreError:
                 raise
             except Exception as error:  # whatever a library makes of a bad picture, the others go on
@@ -184,12 +184,12 @@ class Worker:
             }
         )
 
-    def _pair(self, planned: Planned, scratch: Path, order: DepthOrder, matcher: Matcher) -> Row:
+    def _pair(self, planned: Planned, scratch: Path, order: DepthOrder) -> Row:
         pictures, calibration = self._fetched(planned, scratch / "pictures")
         if calibration and not order.request.calibration:
             order = replace(order, request=replace(order.request, calibration=calibration))
         with self._results(planned, scratch) as out:
-            summary, notes = make_depth(pictures, out, order, matcher)
+            summary, notes = make_depth(pictures, out, order)
         return {
             "disparity_min_px": summary.disparity_min_px,
             "disparity_median_px": summary.disparity_median_px,
@@ -212,7 +212,7 @@ class Worker:
             from stereoweave.video.writer import parts_folder
 
         films, _ = self._fetched(planned, scratch / "pictures")
-        ordered = Order(depth16=True, model=order.model, threads=order.threads, provider=order.provider)
+        ordered = Order(depth16=True, backend=order.backend)
         footage = open_footage(films, order.request.arrangement)
         with self._results(planned, scratch) as out:
             make = partial(make_film, footage, films, out / FILM, ordered, Console(quiet=True))
@@ -271,7 +271,7 @@ class Worker:
         for kind, name, content in self.carried:
             path = _carried(name, content)
             if kind == "model":
-                order = replace(order, model=str(path))
+                order = replace(order, backend=replace(order.backend, model=str(path)))
             else:
                 order = replace(order, request=replace(order.request, calibration=path))
         return order
@@ -307,7 +307,7 @@ class _Apart:
         """Waits for the process, if there is none."""
         false_starts = 0
         while self._pool is None:
-            threads = self._worker.order.threads or 1
+            threads = self._worker.order.backend.threads or 1
             pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), begin_work, (threads,))
             try:
                 pool.submit(_warm, self._worker).result()
@@ -336,14 +336,7 @@ class _Apart:
 
 def _warm(worker: Worker) -> None:
     """Loads what a row takes, so that a try counts only while a pair is made."""
-    order = worker._order()
-    _matcher(order.model, order.threads, order.provider)
-
-
-@functools.cache
-def _matcher(model: str, threads: int | None, provider: str) -> Matcher:
-    """The matcher of this process, kept between pairs."""
-    return Matcher(model, threads=threads, provider=provider)
+    worker._order().backend.matcher()
 
 
 @functools.cache

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from stereoweave.bench.flicker_films import LEFT, MIDDLE, NOISE_LEVELS, Film, noisy, panning, passing, still
 from stereoweave.bench.flicker_metrics import flicker
 from stereoweave.errors import StereoweaveError
-from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.backend import Backend
 from stereoweave.matching.providers import CPU
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoPair
@@ -91,7 +91,7 @@ def flicker_rows(  # noqa: PLR0913 - each is a word of the command line
     if frames < 2:
         raise StereoweaveError(f"frames: expected 2 or more, for flicker is between two; got {frames}")
     orders = [RenderSpec(scene=scene, seed=seed, size_px=size_px, frames=_WAY_FRAMES) for scene in scenes]
-    matcher = Matcher(model, threads=threads, provider=provider)
+    matcher = Backend(model=model, threads=threads, provider=provider).matcher()
     for order in orders:
         for film in _films(order, frames):
             pairs = [

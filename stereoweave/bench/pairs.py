@@ -29,8 +29,8 @@ from stereoweave.bench.metrics import (
 from stereoweave.data.readers import Scene
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.text import write_table
+from stereoweave.matching.backend import Backend
 from stereoweave.matching.estimate import match
-from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.opencv import OPENCV_MATCHERS, SGBM, fill_rows, left_right_confidence
 from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU
@@ -164,7 +164,7 @@ def network(
     model: str | Path, threads: int | None = None, refined: bool = False, provider: str = CPU
 ) -> Match:
     """What `stereoweave.estimate` does with a model, refined or not; errors as for `Matcher`."""
-    matcher = Matcher(model, threads=threads, provider=provider)
+    matcher = Backend(model=model, threads=threads, provider=provider).matcher()
     options = MatchOptions(refined=refined)
     return lambda pair: match(matcher, pair, options)
 

@@ -70,14 +70,14 @@ def batch(  # noqa: PLR0913 - each is a word of the command line
     Stopped in whatever way, the same command goes on, and tries again what failed.
     """
     from stereoweave.batch.cluster import batch_on_cluster
+    from stereoweave.matching.backend import Backend
     from stereoweave.matching.options import MatchOptions
     from stereoweave.outputs.results import DepthOrder
     from stereoweave.system.ray_engine import Engine
 
     order = DepthOrder(
         request=request_of(arrangement, calib, focal_px, baseline_m, rectify),
-        model=model,
-        provider=provider,
+        backend=Backend(model=model, provider=provider),
         options=MatchOptions(range_px=range_of(range_px), refined=refined, raw=raw),
         files=tuple(write or ()),
     )

@@ -21,7 +21,6 @@ from stereoweave.cli.options import (
     Rectify,
     Refined,
     Threads,
-    load_matcher,
     pixel_of,
     range_of,
     request_of,
@@ -83,15 +82,14 @@ def depth(  # noqa: PLR0913 - each is a word of the command line
     as_json: AsJson = False,
 ) -> None:
     """Depth of a stereo pair, or of many: maps, pictures of them, and a report to open in a browser."""
+    from stereoweave.matching.backend import Backend
     from stereoweave.matching.options import MatchOptions
     from stereoweave.outputs.results import DepthOrder, make_depth
     from stereoweave.pictures.pair_finding import find_pairs
 
     order = DepthOrder(
         request=request_of(arrangement, calib, focal_px, baseline_m, rectify),
-        model=model,
-        threads=threads,
-        provider=provider,
+        backend=Backend(model=model, threads=threads, provider=provider),
         options=MatchOptions(range_px=range_of(range_px), refined=refined, raw=raw),
         files=tuple(write or ()),
     )
@@ -100,7 +98,7 @@ def depth(  # noqa: PLR0913 - each is a word of the command line
         from stereoweave.batch.local import depth_of_many
 
         raise typer.Exit(depth_of_many(pairs, out, order, processes=jobs, as_json=as_json))
-    summary, notes = make_depth(pictures, out, order, load_matcher(model, threads, provider))
+    summary, notes = make_depth(pictures, out, order)
     (_tell_json if as_json else _tell)(summary, notes, out)
 
 
@@ -126,6 +124,7 @@ def measure(  # noqa: PLR0913 - each is a word of the command line
 
     The pixels are those of the left picture as it is matched: of the rectified one with --rectify.
     """
+    from stereoweave.matching.backend import Backend
     from stereoweave.matching.estimate import match
     from stereoweave.matching.options import MatchOptions
     from stereoweave.outputs.measure import CameraError, distance
@@ -136,7 +135,7 @@ def measure(  # noqa: PLR0913 - each is a word of the command line
     options = MatchOptions(range_px=range_of(range_px), refined=refined)
     prepared = prepare(pictures, request_of(arrangement, calib, focal_px, baseline_m, rectify))
     camera = needed_camera(prepared.pair)
-    matcher = load_matcher(model, threads, provider)
+    matcher = Backend(model=model, threads=threads, provider=provider).matcher()
     estimate = match(matcher, prepared.pair, options)
     error = CameraError(focal=focal_error_percent / 100, baseline=baseline_error_percent / 100)
     found = distance(estimate, camera, *places, camera_error=error)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from stereoweave.cli.options import Model, Provider, Threads, load_matcher
+from stereoweave.cli.options import Model, Provider, Threads
 from stereoweave.errors import StereoweaveError
 
 Sources = Annotated[
@@ -51,6 +51,7 @@ def live(  # noqa: PLR0913 - each is a word of the command line
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     from stereoweave.app.live import Capture, Screen, Tally, show
     from stereoweave.cameras.calibration_files import read_rig
+    from stereoweave.matching.backend import Backend
     from stereoweave.pictures.frame_packing import ARRANGEMENTS
 
     if arrangement not in (None, *ARRANGEMENTS) or (arrangement and len(sources) > 1):
@@ -59,7 +60,7 @@ def live(  # noqa: PLR0913 - each is a word of the command line
             f"{arrangement} of {' '.join(sources)}"
         )
     rig = read_rig(calib) if calib else None
-    matcher, tally = load_matcher(model, threads, provider), Tally()
+    matcher, tally = Backend(model=model, threads=threads, provider=provider).matcher(), Tally()
     with Screen(port) as screen, Capture(sources) as capture:
         typer.echo(f"{capture.name}: shown at {screen.url}; Ctrl-C ends it")
         if browser:

@@ -14,7 +14,6 @@ import typer
 from stereoweave.errors import StereoweaveError, needing_extra
 
 if TYPE_CHECKING:
-    from stereoweave.matching.matcher import Matcher
     from stereoweave.pictures.prepare import Request
     from stereoweave.system.ray_engine import Engine
 
@@ -149,13 +148,6 @@ def _two_numbers(option: str, text: str, expected: str) -> tuple[float, float]:
     if not (math.isfinite(first) and math.isfinite(second)):
         raise StereoweaveError(f"{option}: expected {expected}, found {text!r}")
     return first, second
-
-
-def load_matcher(model: str, threads: int | None, provider: str = "cpu") -> "Matcher":
-    """The matcher that a command was asked for."""
-    from stereoweave.matching.matcher import Matcher
-
-    return Matcher(model, threads=threads, provider=provider)
 
 
 def engine_of(cluster: str | None, workers: int | None = None, cpus_each: float = 1) -> "Engine | None":

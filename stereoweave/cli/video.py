@@ -85,6 +85,7 @@ def video(  # noqa: PLR0913 - each is a word of the command line
     from rich.console import Console
 
     from stereoweave.io.animation import needing_the_video_extra
+    from stereoweave.matching.backend import Backend
     from stereoweave.video.reader import open_footage
 
     with needing_the_video_extra("a film"):
@@ -99,9 +100,7 @@ def video(  # noqa: PLR0913 - each is a word of the command line
             layout=layout,
             strength=strength,
             convergence_px=convergence,
-            model=model,
-            threads=threads,
-            provider=provider,
+            backend=Backend(model=model, threads=threads, provider=provider),
         )
         footage = open_footage(films, arrangement, rate=None if rate is None else _fraction(rate))
         if layout:

@@ -16,7 +16,6 @@ from stereoweave.cli.options import (
     Rectify,
     Strength,
     Threads,
-    load_matcher,
     place_for,
     range_of,
     request_of,
@@ -96,6 +95,7 @@ def view(  # noqa: PLR0913 - each is a word of the command line
     """A new view of a stereo pair, or many, as 3-D viewers and displays take them."""
     from stereoweave.cameras.diagnosis import hints
     from stereoweave.cameras.rectify import cropped
+    from stereoweave.matching.backend import Backend
     from stereoweave.matching.estimate import match
     from stereoweave.matching.options import MatchOptions
     from stereoweave.pictures.prepare import prepare
@@ -117,7 +117,7 @@ def view(  # noqa: PLR0913 - each is a word of the command line
     if name in LAYOUTS:
         out = marked(out, name, pair, choices)
     place_for(out)
-    estimate = match(load_matcher(model, threads, provider), pair, options)
+    estimate = match(Backend(model=model, threads=threads, provider=provider).matcher(), pair, options)
     if plane_px is None:
         plane_px = middle_px(estimate)
     renderer = Renderer(pair, estimate, strength=strength, convergence_px=plane_px, threads=threads)

@@ -5,7 +5,6 @@ brought there: the right picture is moved along the rows, or both are made small
 smaller pictures is brought to the full size by `enlarging`.
 """
 
-import functools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,20 +18,18 @@ from jaxtyping import Bool, Float, Shaped
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.arrays import as_rgb
 from stereoweave.io.files import SMALLEST_SIDE_PX
+from stereoweave.matching.backend import Backend
 from stereoweave.matching.disparity_range import find_range, goes_beyond
 from stereoweave.matching.left_right_check import at_match, find_occluded
 from stereoweave.matching.matcher import (
-    MODES,
     PIXEL_PAIRS_AT_ONCE,
     Matcher,
-    model_file,
 )
 from stereoweave.matching.options import DEFAULT_OPTIONS, MatchOptions
-from stereoweave.matching.providers import CPU, check_provider
+from stereoweave.matching.providers import CPU
 from stereoweave.matching.refine import right_confidence
 from stereoweave.matching.upsample import enlarge
 from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
-from stereoweave.system.threads import thread_count
 
 # A network that is shown what is beyond its range often believes in the end of it, but not quite.
 _CONFIDENT, _CONFIDENT_AT_END = 0.5, 0.9
@@ -93,12 +90,8 @@ def estimate(  # noqa: PLR0913 - each has a name, and all but the pictures can b
             fails, StereoweaveError for invalid images or options.
     """
     options = MatchOptions(range_px=range_px, refined=refined, raw=raw)
-    check_provider(provider)
-    thread_count(threads)
     pair = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
-    path = model_file(model).absolute()
-    named = model if str(model) in MODES else path
-    matcher = _kept_matcher(named, path.stat().st_mtime_ns, threads, provider)
+    matcher = Backend(model=model, threads=threads, provider=provider).matcher()
     return match(matcher, pair, options)
 
 
@@ -136,12 +129,6 @@ def match_many(
         _finished(matcher, pair, shown, found[i], options)
         for i, (pair, shown) in enumerate(zip(pairs, every_shown, strict=True))
     ]
-
-
-@functools.lru_cache(maxsize=4)
-def _kept_matcher(model: str | Path, modified_ns: int, threads: int | None, provider: str) -> Matcher:
-    # modified_ns is part of the key alone: a file that was written anew is loaded anew.
-    return Matcher(model, threads=threads, provider=provider)
 
 
 def _within_width(range_px: tuple[float, float], width_px: int) -> tuple[float, float]:

@@ -8,8 +8,8 @@ from jaxtyping import Int16, UInt8
 from stereoweave.arguments import check_flag, check_number, check_whole_number
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.arrays import as_rgb
+from stereoweave.matching.backend import Backend
 from stereoweave.matching.estimate import match
-from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU
 from stereoweave.stereo import StereoPair
@@ -53,7 +53,7 @@ class StereoMatcher:
         if not 0 <= min_confidence <= 1:
             raise StereoweaveError(f"min_confidence: expected a probability, 0 to 1, found {min_confidence}")
         self._check_range()
-        self._matcher = Matcher(model, threads=threads, provider=provider)
+        self._matcher = Backend(model=model, threads=threads, provider=provider).matcher()
 
     def compute(
         self, left: UInt8[np.ndarray, "h w *channels"], right: UInt8[np.ndarray, "h w *channels"]

@@ -36,8 +36,8 @@ from stereoweave.io.files import (
     write_pfm,
 )
 from stereoweave.io.output_lock import lock_output
+from stereoweave.matching.backend import Backend
 from stereoweave.matching.estimate import match
-from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU
 from stereoweave.outputs.point_cloud import (
@@ -128,18 +128,14 @@ class DepthOrder:
 
     Attributes:
         request: What is said of the pictures.
-        model: The name of the network, for the summary.
-        threads: How many threads may be used; all cores if left out.
-        provider: What the network is run on, a name in `providers.PROVIDERS`.
+        backend: What matches them.
         options: How the pair is matched.
         files: What is written beside `always`, names in FILES, or "all"; depth.png is with any camera.
         always: What is written of every pair.
     """
 
     request: Request = Request()
-    model: str = "small"
-    threads: int | None = None
-    provider: str = CPU
+    backend: Backend = Backend()
     options: MatchOptions = MatchOptions()
     files: tuple[str, ...] = ()
     always: tuple[str, ...] = ALWAYS
@@ -152,10 +148,9 @@ class DepthOrder:
                 )
 
 
-def make_depth(
-    pictures: Sequence[Path], out: Path, order: DepthOrder, matcher: Matcher
-) -> tuple[Summary, list[str]]:
-    """Writes the results of a pair into the folder `out`, all or none; its numbers, and lines to tell."""
+def make_depth(pictures: Sequence[Path], out: Path, order: DepthOrder) -> tuple[Summary, list[str]]:
+    """Write all results of a pair to `out` atomically; returns the summary and user-facing notes."""
+    matcher = order.backend.matcher()
     prepared = prepare(pictures, order.request)
     pair = prepared.pair
     files, left_out = _files_of(order, pair)
@@ -164,9 +159,11 @@ def make_depth(
         estimate = match(matcher, pair, order.options)
         estimate_ms = 1000 * (time.perf_counter() - start_s)
         names = tuple(picture.name for picture in pictures)
-        model = order.model if matcher.provider == CPU else f"{order.model} on {matcher.provider}"
+        model = str(order.backend.model)
+        if matcher.provider != CPU:
+            model = f"{model} on {matcher.provider}"
         summary = summarize(pair, estimate, pictures=names, model=model, estimate_ms=estimate_ms)
-        result = Result(pair=pair, estimate=estimate, summary=summary, threads=order.threads)
+        result = Result(pair=pair, estimate=estimate, summary=summary, threads=matcher.threads)
         notes = [*prepared.notes, *left_out, *write_files(folder, files, result)]
         notes += hints(pair, estimate)
     return summary, notes
@@ -177,14 +174,14 @@ def order_facts(order: DepthOrder) -> dict[str, Any]:
 
     What it is computed with does not: a batch whose GPU fails can be finished on the processor.
     """
-    facts = {"stereoweave": __version__, **asdict(order)}
-    del facts["threads"], facts["provider"]
-    facts |= facts.pop("request") | facts.pop("options")
-    if facts["model"].endswith(".onnx"):
-        with reading(facts["model"], "a model"):
-            facts["model"] = _by_content(facts["model"], Path(facts["model"]).read_bytes())
-    if facts["calibration"]:
-        facts["calibration"] = _by_content(facts["calibration"], calibration_bytes(facts["calibration"]))
+    model, calibration = str(order.backend.model), order.request.calibration
+    if model.endswith(".onnx"):
+        with reading(model, "a model"):
+            model = _by_content(model, Path(model).read_bytes())
+    facts = {"stereoweave": __version__, "model": model, **asdict(order.options)}
+    facts |= {"files": order.files, "always": order.always, **asdict(order.request)}
+    if calibration:
+        facts["calibration"] = _by_content(calibration, calibration_bytes(calibration))
     return facts
 
 

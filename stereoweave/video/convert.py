@@ -19,10 +19,10 @@ from stereoweave.cameras.diagnosis import hints
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.colormap import colour_disparity, colour_range_px
 from stereoweave.io.output_lock import lock_output
+from stereoweave.matching.backend import Backend
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
-from stereoweave.matching.providers import CPU
 from stereoweave.pictures.frame_packing import ARRANGEMENTS
 from stereoweave.rendering.layouts import LAYOUTS, Choices, check_reach, middle_px
 from stereoweave.rendering.renderer import Renderer
@@ -64,9 +64,7 @@ class Order:
         strength: Multiplies the baseline.
         convergence_px: The disparity that stays in place from view to view. None is that of the film's middle
             for layouts whose views lie upon one another, and 0 for all else.
-        model: The name of a shipped network, or an .onnx file.
-        threads: How many threads may be used; all cores unless given.
-        provider: What the network is run on, a name in `providers.PROVIDERS`.
+        backend: What matches its frames.
     """
 
     depth: bool = False
@@ -75,9 +73,7 @@ class Order:
     layout: str | None = None
     strength: float = 1.0
     convergence_px: float | None = None
-    model: str = "small"
-    threads: int | None = None
-    provider: str = CPU
+    backend: Backend = Backend()
 
     def __post_init__(self) -> None:
         wanted = {
@@ -126,7 +122,7 @@ class Order:
             estimate,
             strength=self.strength,
             convergence_px=self._plane_px(survey),
-            threads=self.threads,
+            threads=self.backend.threads,
         )
         if self.position is not None:
             return renderer.view(self.position).image
@@ -212,14 +208,14 @@ def make_film(footage: Footage, sources: Sequence[Path], out: Path, order: Order
             disk.
     """
     _check_out(out, order, footage, sources)
-    matcher = Matcher(order.model, threads=order.threads, provider=order.provider)
+    matcher = order.backend.matcher()
     recorder = Recorder(
         encoding=GREY16 if order.depth16 else H264,
         time_base=footage.time_base,
         # FFmpeg's fractions have 32 bits.
         rate=footage.rate.limit_denominator(100_000),
         packing=PACKINGS.get(order.layout or ""),
-        threads=thread_count(order.threads),
+        threads=thread_count(order.backend.threads),
     )
     with (
         lock_output(out),
@@ -250,7 +246,7 @@ class _Maker:
     def __init__(self, order: Order, matcher: Matcher, survey: Survey) -> None:
         self.survey, self.tally = survey, Tally()
         self._options = MatchOptions(range_px=survey.within_px)
-        self._order, self._matcher, self._steadier = order, matcher, Steadier(order.threads)
+        self._order, self._matcher, self._steadier = order, matcher, Steadier(order.backend.threads)
 
     @classmethod
     def from_state(cls, order: Order, matcher: Matcher, state: dict[str, np.ndarray]) -> "_Maker":
@@ -260,7 +256,7 @@ class _Maker:
         maker = cls(order, matcher, survey)
         frames, cuts, problems = state.pop("tally").tolist()
         maker.tally = Tally(frames, cuts, problems, state.pop("named").tolist())
-        maker._steadier = Steadier.from_state(state, order.threads)
+        maker._steadier = Steadier.from_state(state, order.backend.threads)
         return maker
 
     def state(self) -> dict[str, np.ndarray]:
@@ -364,7 +360,7 @@ def _check_out(out: Path, order: Order, footage: Footage, sources: Sequence[Path
 
 def _settings(order: Order, footage: Footage, sources: Sequence[Path]) -> dict[str, object]:
     """All that the film depends on but for what computes it, as users call it, in words that JSON has."""
-    model = Path(order.model)
+    model = Path(order.backend.model)
     return {
         "--depth": order.depth,
         "--depth16": order.depth16,
@@ -374,7 +370,7 @@ def _settings(order: Order, footage: Footage, sources: Sequence[Path]) -> dict[s
         "--convergence": order.convergence_px,
         "--arrangement": footage.arrangement,
         "--rate": str(footage.rate),
-        "--model": _known_by(model) if model.exists() else order.model,
+        "--model": _known_by(model) if model.exists() else str(order.backend.model),
         "FILM": [_known_by(source) for source in sources],
         "stereoweave": __version__,
     }

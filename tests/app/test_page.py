@@ -26,6 +26,7 @@ from stereoweave.cli.root import main
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.colormap import colour_disparity, colour_range_px
 from stereoweave.io.files import read_image, read_pfm
+from stereoweave.matching.backend import Backend
 from stereoweave.outputs.results import FILES
 from stereoweave.pictures.prepare import Request
 
@@ -266,7 +267,7 @@ def test_a_browser_that_draws_no_points_is_told(browser, address):
 def test_an_upload_that_was_put_away_is_asked_for_again(tmp_path):
     request = Request(calibration=tmp_path / "calib.txt")
     uploads = Uploads(
-        pictures=(EXAMPLES / "left.png", EXAMPLES / "right.png"), request=request, model="small"
+        pictures=(EXAMPLES / "left.png", EXAMPLES / "right.png"), request=request, backend=Backend()
     )
     with pytest.raises(StereoweaveError, match=r"^calib.txt has been put away, .*; give it again$"):
         matched(uploads, tmp_path, lambda share, what: None)

@@ -26,6 +26,7 @@ from stereoweave.errors import MatcherError, OutputInUseError, ProviderError, St
 from stereoweave.io.files import read_image, read_pfm, write_image
 from stereoweave.io.output_lock import lock_output
 from stereoweave.io.stores import store_at
+from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher
 from stereoweave.outputs.results import DepthOrder, make_depth
 from stereoweave.system.ray_engine import Engine, connect
@@ -90,7 +91,7 @@ def test_bad_pairs_become_rows_and_the_next_run_makes_what_is_missing_changed_or
     assert dict(tally.named) == {name: rows[name]["error"] for name in ("01", "02", "alone")}
 
     pictures = [source / side / "03.png" for side in ("left", "right")]
-    summary, notes = make_depth(pictures, tmp_path / "alone", ORDER, Matcher(threads=1))
+    summary, notes = make_depth(pictures, tmp_path / "alone", replace(ORDER, backend=Backend(threads=1)))
     for file in ORDER.always:
         assert (out / "03" / file).read_bytes() == (tmp_path / "alone" / file).read_bytes()
     row = rows["03"]
@@ -265,7 +266,7 @@ def fails(*_: object, **__: object) -> None:
 def test_a_provider_that_a_workers_machine_has_not_ends_the_run_and_is_no_row(places):
     source, out, chunk = places
     with pytest.raises(MatcherError, match="provider directml: expected an ONNX Runtime that has it"):
-        Worker(source, out, replace(ORDER, provider="directml"))([chunk])
+        Worker(source, out, replace(ORDER, backend=Backend(provider="directml")))([chunk])
     assert read_rows(out, chunk) == {}
 
 
@@ -372,7 +373,7 @@ def test_pairs_go_from_a_bucket_to_a_bucket_with_a_calibration_and_a_bad_one_is_
     assert "depth.png" in rows["room"]["files"]
     out = store_at(f"{bucket}/out")
     pictures = [local / side / "00.png" for side in ("left", "right")]
-    make_depth(pictures, tmp_path / "alone", ORDER, Matcher(threads=1))
+    make_depth(pictures, tmp_path / "alone", replace(ORDER, backend=Backend(threads=1)))
     for file in ORDER.always:
         assert out.read_bytes(f"00/{file}") == (tmp_path / "alone" / file).read_bytes()
     tally = run_cluster(f"{bucket}/in", f"{bucket}/out", ORDER, engine)

@@ -20,7 +20,7 @@ from stereoweave.batch.local import DONE_FILE, Tally, depth_of_many, run_batch
 from stereoweave.cli.root import main
 from stereoweave.errors import OutputInUseError, StereoweaveError
 from stereoweave.io.files import read_image, read_pixels, write_image
-from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.backend import Backend
 from stereoweave.outputs.results import DepthOrder, make_depth
 from stereoweave.pictures.pair_finding import Job, Pairs, pairs_in
 from stereoweave.pictures.prepare import Request
@@ -29,16 +29,17 @@ from stereoweave.system.threads import usable_cores
 pytestmark = pytest.mark.system
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-ORDER = DepthOrder(threads=1, always=("disparity.pfm", "preview.png", "confidence.png"))
+ORDER = DepthOrder(backend=Backend(threads=1), always=("disparity.pfm", "preview.png", "confidence.png"))
 PROGRAM = """
 import sys
 from pathlib import Path
 from stereoweave.batch.local import depth_of_many
+from stereoweave.matching.backend import Backend
 from stereoweave.pictures.pair_finding import pairs_in
 from stereoweave.outputs.results import DepthOrder
 
 if __name__ == "__main__":
-    order = DepthOrder(threads=1, always=("disparity.pfm", "preview.png", "confidence.png"))
+    order = DepthOrder(backend=Backend(threads=1), always=("disparity.pfm", "preview.png", "confidence.png"))
     sys.exit(depth_of_many(pairs_in(Path(sys.argv[1])), Path(sys.argv[2]), order, processes=2))
 """
 
@@ -114,9 +115,7 @@ def test_a_bad_pair_is_told_and_the_others_are_as_they_are_alone_and_the_next_ru
     assert str(bad) in reason
     assert f"01: {reason}\n" in shown
 
-    make_depth(
-        (folder / "left" / "02.png", folder / "right" / "02.png"), tmp_path / "alone", ORDER, Matcher()
-    )
+    make_depth((folder / "left" / "02.png", folder / "right" / "02.png"), tmp_path / "alone", ORDER)
     for file in ("disparity.pfm", "preview.png", "confidence.png"):
         assert (out / "02" / file).read_bytes() == (tmp_path / "alone" / file).read_bytes()
     rows = table(out)
@@ -253,7 +252,9 @@ def test_another_order_or_another_folder_is_refused_before_anything_starts(tmp_p
     order = DepthOrder(request=Request(calibration=calibration))
     assert batch(folder, out, order, jobs=[])[0] == Tally(done=0, skipped=0, failed=())
     with pytest.raises(StereoweaveError, match='batch.json: expected model = "base", .* found "small"'):
-        batch(folder, out, DepthOrder(request=Request(calibration=calibration), model="base"))
+        batch(
+            folder, out, DepthOrder(request=Request(calibration=calibration), backend=Backend(model="base"))
+        )
     calibration.write_text("second")
     with pytest.raises(
         StereoweaveError, match=r"expected calibration = .calib.txt \w{12}., .* another folder"
@@ -264,7 +265,7 @@ def test_another_order_or_another_folder_is_refused_before_anything_starts(tmp_p
     ):
         batch(folder, folder)
     with pytest.raises(StereoweaveError, match="nonsense"):
-        batch(folder, tmp_path / "new", DepthOrder(model="nonsense"))
+        batch(folder, tmp_path / "new", DepthOrder(backend=Backend(model="nonsense")))
     assert not (tmp_path / "new").exists()
 
 

@@ -23,6 +23,7 @@ from stereoweave.cli.root import main
 from stereoweave.data.readers import list_scenes
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.files import read_disparity_png, read_image, read_pair, read_pfm, read_pixels, write_image
+from stereoweave.matching.backend import Backend
 from stereoweave.pictures.loading import open_pictures
 from stereoweave.pictures.prepare import Request, prepare
 from stereoweave.service.answers import check_pixels
@@ -69,7 +70,7 @@ def by_service(folder: Path):
 
 def by_page(folder: Path):
     pictures = folder / "left.png", folder / "right.png"
-    uploads = page_kept.Uploads(pictures=pictures, request=Request(), model="small")
+    uploads = page_kept.Uploads(pictures=pictures, request=Request(), backend=Backend())
     return page_kept.matched(uploads, folder / "kept", lambda *_: None).result.pair
 
 

@@ -1,11 +1,9 @@
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from matcher_examples import matcher_file, of_fixed_size, painted, red_of
+from matcher_examples import of_fixed_size
 from PIL import Image
 
 import stereoweave as sw
@@ -340,29 +338,6 @@ def test_plain_pictures_and_pictures_that_are_no_pair_are_matched_all_the_same(m
     noise = rng.integers(0, 256, (2, 64, 96, 3), np.uint8)
     pair = sw.StereoPair(left=noise[0], right=noise[1])
     same(match(matcher, pair), matcher.estimate(*noise))
-
-
-def test_a_model_is_loaded_once_and_kept(rng):
-    matching._kept_matcher.cache_clear()
-    left, right = rng.integers(0, 256, (2, 32, 32, 3), np.uint8)
-    for _ in range(3):
-        sw.estimate(left, right)
-    assert matching._kept_matcher.cache_info().misses == 1
-
-
-def test_a_file_that_was_written_anew_is_loaded_anew_whatever_its_path_is_relative_to(
-    tmp_path, rng, monkeypatch
-):
-    left, right = (painted(rng.integers(0, 255, (32, 48))) for _ in range(2))
-    found = []
-    for turn, (folder, image) in enumerate([("a", "left"), ("a", "right"), ("b", "left")]):
-        (tmp_path / folder).mkdir(exist_ok=True)
-        monkeypatch.chdir(tmp_path / folder)
-        file = matcher_file(Path("matcher.onnx"), red_of(image, "disparity_px"), ["disparity_px"])
-        os.utime(file, ns=(turn, turn))
-        found.append(sw.estimate(left, right, model="matcher.onnx", raw=True).disparity_px)
-    for disparity_px, image in zip(found, (left, right, left), strict=True):
-        np.testing.assert_allclose(disparity_px, image[:, :, 0], atol=1e-4)
 
 
 def test_the_answer_does_not_depend_on_earlier_calls_of_other_sizes(rng):

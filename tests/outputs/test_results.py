@@ -11,6 +11,7 @@ from stereoweave.cli.depth import depth
 from stereoweave.errors import OutputInUseError, StereoweaveError
 from stereoweave.io.files import read_disparity_png, read_image, read_pfm, read_pixels, write_image
 from stereoweave.io.output_lock import lock_output
+from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.report import summarize
@@ -22,7 +23,8 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 CALIBRATION = "cam0=[100 0 48; 0 100 32; 0 0 1]\ndoffs=0\nbaseline=80\nwidth=96\nheight=64\n"
 CAMERA = StereoCamera(focal_px=100.0, baseline_m=0.08, cx_px=48.0, cy_px=32.0)
 PICTURES = [Path("left.png"), Path("right.png")]
-WITH_CAMERA = DepthOrder(request=Request(calibration=Path("calib.txt")))
+PLAIN = DepthOrder(backend=Backend(threads=1))
+WITH_CAMERA = replace(PLAIN, request=Request(calibration=Path("calib.txt")))
 
 
 @pytest.fixture(scope="module")
@@ -44,15 +46,15 @@ def names_in(folder: str) -> set[str]:
     return {file.name for file in Path(folder).iterdir()}
 
 
-def test_what_is_written_unless_more_is_asked_for(folder, matcher):
-    make_depth(PICTURES, Path("plain"), DepthOrder(), matcher)
+def test_what_is_written_unless_more_is_asked_for(folder):
+    make_depth(PICTURES, Path("plain"), PLAIN)
     assert names_in("plain") == set(ALWAYS)
-    make_depth(PICTURES, Path("metric"), WITH_CAMERA, matcher)
+    make_depth(PICTURES, Path("metric"), WITH_CAMERA)
     assert names_in("metric") == {*ALWAYS, "depth.png"}
 
 
-def test_all_files_say_the_same(folder, matcher):
-    _, notes = make_depth(PICTURES, Path("out"), replace(WITH_CAMERA, files=("all",)), matcher)
+def test_all_files_say_the_same(folder):
+    _, notes = make_depth(PICTURES, Path("out"), replace(WITH_CAMERA, files=("all",)))
     assert names_in("out") == set(FILES)
     assert notes == []
     out, disparity_px = Path("out"), read_pfm("out/disparity.pfm")
@@ -79,32 +81,32 @@ def test_all_files_say_the_same(folder, matcher):
 
 
 def test_the_mask_is_white_where_the_left_camera_alone_sees(folder, matcher):
-    make_depth(PICTURES, Path("out"), DepthOrder(), matcher)
+    make_depth(PICTURES, Path("out"), PLAIN)
     estimate = matcher.estimate(read_image("left.png"), read_image("right.png"))
     mask = read_pixels("out/occluded.png", "L")
     np.testing.assert_array_equal(mask == 255, estimate.occluded)
     np.testing.assert_array_equal(mask == 0, ~estimate.occluded)
 
 
-def test_files_of_an_earlier_result_go(folder, matcher):
-    make_depth(PICTURES, Path("out"), replace(WITH_CAMERA, files=("all",)), matcher)
+def test_files_of_an_earlier_result_go(folder):
+    make_depth(PICTURES, Path("out"), replace(WITH_CAMERA, files=("all",)))
     Path("out/mine.txt").write_text("kept")
-    make_depth(PICTURES, Path("out"), DepthOrder(), matcher)
+    make_depth(PICTURES, Path("out"), PLAIN)
     assert names_in("out") == {*ALWAYS, "mine.txt"}
 
 
-def test_files_of_the_same_names_that_are_no_earlier_result_stay(folder, matcher):
+def test_files_of_the_same_names_that_are_no_earlier_result_stay(folder):
     for name in ("mesh.ply", "depth.npy"):
         Path(name).write_text("of another program")
-    make_depth(PICTURES, Path(), DepthOrder(), matcher)
+    make_depth(PICTURES, Path(), PLAIN)
     assert {Path(name).read_text() for name in ("mesh.ply", "depth.npy")} == {"of another program"}
 
 
-def test_results_do_not_move_into_a_folder_that_another_command_writes_to(folder, matcher):
-    make_depth(PICTURES, Path("out"), DepthOrder(), matcher)
+def test_results_do_not_move_into_a_folder_that_another_command_writes_to(folder):
+    make_depth(PICTURES, Path("out"), PLAIN)
     before = {file: file.read_bytes() for file in Path("out").iterdir()}
     with lock_output(Path("out")), pytest.raises(OutputInUseError, match="^out: .* found one that is in use"):
-        make_depth(PICTURES, Path("out"), WITH_CAMERA, matcher)
+        make_depth(PICTURES, Path("out"), WITH_CAMERA)
     assert {file: file.read_bytes() for file in Path("out").iterdir()} == before
 
 
@@ -114,30 +116,30 @@ def test_an_unknown_file_is_told_with_those_that_there_are():
 
 
 @pytest.mark.parametrize("file", [file for file in FILES if needs_camera(file)])
-def test_metres_without_a_camera_are_refused_before_anything_is_written(folder, matcher, file):
+def test_metres_without_a_camera_are_refused_before_anything_is_written(folder, file):
     with pytest.raises(StereoweaveError, match=f"^{file}: .*--calib.*--focal-px and --baseline-m"):
-        make_depth(PICTURES, Path("out"), DepthOrder(files=(file,)), matcher)
+        make_depth(PICTURES, Path("out"), DepthOrder(files=(file,)))
     assert not Path("out").exists()
 
 
-def test_all_without_a_camera_is_all_but_metres_and_says_so(folder, matcher):
-    _, notes = make_depth(PICTURES, Path("out"), DepthOrder(files=("all",)), matcher)
+def test_all_without_a_camera_is_all_but_metres_and_says_so(folder):
+    _, notes = make_depth(PICTURES, Path("out"), DepthOrder(files=("all",)))
     assert names_in("out") == {*ALWAYS, "disparity.npy", "disparity.tiff"}
     assert [note for note in notes if "--focal-px and --baseline-m" in note] != []
 
 
-def test_points_without_trimesh_name_the_extra_before_anything_is_written(folder, matcher, monkeypatch):
+def test_points_without_trimesh_name_the_extra_before_anything_is_written(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
     with pytest.raises(StereoweaveError, match=r"stereoweave\[mesh\]"):
-        make_depth(PICTURES, Path("out"), replace(WITH_CAMERA, files=("cloud.ply",)), matcher)
+        make_depth(PICTURES, Path("out"), replace(WITH_CAMERA, files=("cloud.ply",)))
     assert not Path("out").exists()
 
 
-def test_a_pair_without_a_point_gets_the_rest_and_a_line(folder, matcher):
+def test_a_pair_without_a_point_gets_the_rest_and_a_line(folder):
     for name in PICTURES:
         Image.new("RGB", (96, 64)).save(name)
     order = replace(WITH_CAMERA, files=("cloud.ply", "mesh.glb"))
-    _, notes = make_depth(PICTURES, Path("out"), order, matcher)
+    _, notes = make_depth(PICTURES, Path("out"), order)
     assert names_in("out") == {*ALWAYS, "depth.png"}
     assert [note[:13] for note in notes if note.startswith("no ")] == ["no cloud.ply:", "no mesh.glb: "]
 
@@ -195,12 +197,12 @@ def test_the_summary_counts_what_the_left_picture_shows():
 def test_what_is_asked_of_the_estimate_is_handed_on(folder, matcher):
     found_px = {}
     for name, order in {
-        "plain": DepthOrder(),
-        "moved": DepthOrder(options=MatchOptions(range_px=(-40.0, 100.0))),
-        "refined": DepthOrder(options=MatchOptions(refined=True)),
-        "raw": DepthOrder(options=MatchOptions(raw=True)),
+        "plain": PLAIN,
+        "moved": replace(PLAIN, options=MatchOptions(range_px=(-40.0, 100.0))),
+        "refined": replace(PLAIN, options=MatchOptions(refined=True)),
+        "raw": replace(PLAIN, options=MatchOptions(raw=True)),
     }.items():
-        make_depth(PICTURES, Path(name), order, matcher)
+        make_depth(PICTURES, Path(name), order)
         found_px[name] = read_pfm(f"{name}/disparity.pfm")
     assert (found_px["moved"] != found_px["plain"]).any()
     for how in ("refined", "raw"):
