@@ -28,7 +28,7 @@ from stereoweave.io.output_lock import lock_output
 from stereoweave.io.run_folder import check_claim, check_unclaimed, described, description
 from stereoweave.io.text import write_table
 from stereoweave.outputs.results import DepthOrder, make_depth, order_facts
-from stereoweave.pictures.pair_finding import BATCH_FILE, SUMMARY_FILE, Job, Pairs
+from stereoweave.pictures.pair_finding import BATCH_FILE, SUMMARY_FILE, FoundPairs, NamedPair
 from stereoweave.system.processes import begin_work
 from stereoweave.system.progress import progress
 from stereoweave.system.threads import usable_cores
@@ -38,9 +38,9 @@ DONE_FILE = "done.json"
 _NUMBERS = ("disparity_min_px", "disparity_median_px", "disparity_max_px", "confident_percent")
 _COLUMNS = ("name", "pictures", "seconds", *_NUMBERS, "notes", "error")
 
-Work = Callable[[Job], str | None]
-# A job, and what went wrong with it, None where nothing did.
-Outcome = tuple[Job, str | None]
+Work = Callable[[NamedPair], str | None]
+# A pair, and what went wrong with it, None where nothing did.
+Outcome = tuple[NamedPair, str | None]
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,12 @@ class Tally:
 
 
 def run_batch(
-    jobs: Sequence[Job], out: Path, order: DepthOrder, *, processes: int | None = None, console: Console
+    pairs: Sequence[NamedPair],
+    out: Path,
+    order: DepthOrder,
+    *,
+    processes: int | None = None,
+    console: Console,
 ) -> Tally:
     """Makes the results of every pair in `out`/name, but for those that are there, and a table of all.
 
@@ -61,7 +66,7 @@ def run_batch(
     is killed. summary.csv has a row for each pair in the folder, earlier runs' and failed ones included.
 
     Args:
-        jobs: The pairs.
+        pairs: The pairs.
         out: A new folder, or one that a batch with the same order was begun in.
         order: What is made of each pair.
         processes: How many at a time, as many as cores unless given; more than one have a thread each, unless
@@ -72,7 +77,7 @@ def run_batch(
         StereoweaveError: `out` has something else in it, is in use or cannot be written, or there is no such
             matcher.
     """
-    processes = min(processes or usable_cores(), max(len(jobs), 1))
+    processes = min(processes or usable_cores(), max(len(pairs), 1))
     if processes > 1 and order.backend.threads is None:
         order = replace(order, backend=replace(order.backend, threads=1))
     # An unknown network or unavailable provider is one error here, not one for each pair.
@@ -81,27 +86,27 @@ def run_batch(
     make_folder(out)
     with lock_output(out):
         _claim(out, order)
-        missing = [job for job in jobs if not _is_finished(out / job.name, job)]
+        missing = [pair for pair in pairs if not _is_finished(out / pair.name, pair)]
         try:
             failed = _run(functools.partial(_make, out, order), missing, processes, threads, console)
         finally:
             _tidy(out)
-        _write_summary(out, jobs, dict(failed))
-    return Tally(len(missing) - len(failed), len(jobs) - len(missing), tuple(failed))
+        _write_summary(out, pairs, dict(failed))
+    return Tally(len(missing) - len(failed), len(pairs) - len(missing), tuple(failed))
 
 
 def depth_of_many(
-    pairs: Pairs, out: Path, order: DepthOrder, *, processes: int | None = None, as_json: bool = False
+    found: FoundPairs, out: Path, order: DepthOrder, *, processes: int | None = None, as_json: bool = False
 ) -> int:
     """Makes a batch and tells how it went; the exit code: 1 if a pair failed, 130 if Ctrl-C ended it.
 
     Reports are made only where the order's files name report.html or all: each takes as long as all else.
     """
     order = replace(order, always=tuple(file for file in order.always if file != "report.html"))
-    for note in pairs.notes:
+    for note in found.notes:
         typer.echo(note, err=True)
     try:
-        tally = run_batch(pairs.jobs, out, order, processes=processes, console=Console(stderr=True))
+        tally = run_batch(found.pairs, out, order, processes=processes, console=Console(stderr=True))
     except KeyboardInterrupt:
         kept = "what is finished stays, and the same command goes on"
         typer.echo(f"stereoweave: {out}: stopped; {kept}", err=True)
@@ -125,17 +130,17 @@ def _tell(tally: Tally, out: Path) -> None:
 
 
 def _run(
-    work: Work, jobs: Sequence[Job], processes: int, threads: int | None, console: Console
+    work: Work, pairs: Sequence[NamedPair], processes: int, threads: int | None, console: Console
 ) -> list[tuple[str, str]]:
-    """Does the work on all jobs; names and reasons of those that failed, which are shown at once as well."""
+    """Does the work on all pairs; names and reasons of those that failed, which are shown at once as well."""
     failed: list[tuple[str, str]] = []
     start_s = time.perf_counter()
-    with closing(_outcomes(work, jobs, processes, threads)) as outcomes, progress(console) as bar:
-        shown = bar.add_task("depth", total=len(jobs), loss="", rate="")
-        for made, (job, error) in enumerate(outcomes, 1):
+    with closing(_outcomes(work, pairs, processes, threads)) as outcomes, progress(console) as bar:
+        shown = bar.add_task("depth", total=len(pairs), loss="", rate="")
+        for made, (pair, error) in enumerate(outcomes, 1):
             if error:
-                failed.append((job.name, error))
-                line = f"{job.name}: {error}"
+                failed.append((pair.name, error))
+                line = f"{pair.name}: {error}"
                 console.print(line, markup=False, highlight=False, soft_wrap=True)
             rate = f"{made / (time.perf_counter() - start_s):.1f} pairs/s"
             bar.update(shown, advance=1, rate=rate, loss=f"{len(failed)} failed" if failed else "")
@@ -143,21 +148,21 @@ def _run(
 
 
 def _outcomes(
-    work: Work, jobs: Sequence[Job], processes: int, threads: int | None
+    work: Work, pairs: Sequence[NamedPair], processes: int, threads: int | None
 ) -> Generator[Outcome, None, None]:
     """The outcomes as they come. When a process is killed, its pair is found by making each suspect alone."""
-    waiting = deque(jobs)
+    waiting = deque(pairs)
     while waiting:
-        for job in (yield from _until_one_is_killed(work, waiting, processes, threads)):
-            if (yield from _until_one_is_killed(work, deque([job]), 1, threads)):
-                yield job, "its process was killed; is the memory full?"
+        for pair in (yield from _until_one_is_killed(work, waiting, processes, threads)):
+            if (yield from _until_one_is_killed(work, deque([pair]), 1, threads)):
+                yield pair, "its process was killed; is the memory full?"
 
 
 def _until_one_is_killed(
-    work: Work, waiting: deque[Job], processes: int, threads: int | None
-) -> Generator[Outcome, None, list[Job]]:
-    """Outcomes of the jobs that wait; returns those that were being made when a process was killed."""
-    pending: dict[Future[str | None], Job] = {}
+    work: Work, waiting: deque[NamedPair], processes: int, threads: int | None
+) -> Generator[Outcome, None, list[NamedPair]]:
+    """Outcomes of the pairs that wait; returns those that were being made when a process was killed."""
+    pending: dict[Future[str | None], NamedPair] = {}
     with _pool(processes, threads or usable_cores()) as pool:
         try:
             while waiting or pending:
@@ -211,15 +216,15 @@ def _few_blas_threads(threads: int) -> Iterator[None]:
             os.environ[_BLAS_THREADS] = before
 
 
-def _make(out: Path, order: DepthOrder, job: Job) -> str | None:
+def _make(out: Path, order: DepthOrder, pair: NamedPair) -> str | None:
     """Makes the results of a pair and marks them as finished; what went wrong in one line, or None."""
     try:
-        folder, sources = out / job.name, _sources(job)
+        folder, sources = out / pair.name, _sources(pair)
         (folder / DONE_FILE).unlink(missing_ok=True)
-        if job.calibration and not order.request.calibration:
-            order = replace(order, request=replace(order.request, calibration=job.calibration))
+        if pair.calibration and not order.request.calibration:
+            order = replace(order, request=replace(order.request, calibration=pair.calibration))
         start_s = time.perf_counter()
-        summary, notes = make_depth(job.pictures, folder, order)
+        summary, notes = make_depth(pair.pictures, folder, order)
         seconds = round(time.perf_counter() - start_s, 3)
         files = sorted(path.name for path in folder.iterdir() if path.name[0] != ".")
         facts = {"sources": sources, "files": files, "seconds": seconds, "notes": notes}
@@ -232,20 +237,20 @@ def _make(out: Path, order: DepthOrder, job: Job) -> str | None:
     return None
 
 
-def _sources(job: Job) -> list[list[Any]]:
+def _sources(pair: NamedPair) -> list[list[Any]]:
     """What tells whether a pair's files are still the same: name, bytes and time of change of each."""
     sources = []
-    for path in (*job.pictures, *([job.calibration] if job.calibration else [])):
+    for path in (*pair.pictures, *([pair.calibration] if pair.calibration else [])):
         with reading(path, "a picture"):
             status = path.stat()
         sources.append([path.name, status.st_size, status.st_mtime_ns])
     return sources
 
 
-def _is_finished(folder: Path, job: Job) -> bool:
+def _is_finished(folder: Path, pair: NamedPair) -> bool:
     facts = _finished(folder)
     try:
-        return bool(facts) and facts["sources"] == _sources(job)
+        return bool(facts) and facts["sources"] == _sources(pair)
     except StereoweaveError:
         return False
 
@@ -281,8 +286,8 @@ def _tidy(out: Path) -> None:
     remove_leftovers(out)
 
 
-def _write_summary(out: Path, jobs: Sequence[Job], failed: dict[str, str]) -> None:
-    pictures = {job.name: job.pictures for job in jobs}
+def _write_summary(out: Path, pairs: Sequence[NamedPair], failed: dict[str, str]) -> None:
+    pictures = {pair.name: pair.pictures for pair in pairs}
     rows = {folder.parent.name: _row(folder.parent) for folder in out.glob(f"*/{DONE_FILE}")}
     rows |= {
         name: {"name": name, "pictures": " + ".join(path.name for path in pictures[name]), "error": error}

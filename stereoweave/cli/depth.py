@@ -94,10 +94,10 @@ def depth(  # noqa: PLR0913 - each is a word of the command line
         files=tuple(write or ()),
     )
     pictures = pictures or []
-    if pairs := find_pairs(pictures, left, right, listed):
+    if found := find_pairs(pictures, left, right, listed):
         from stereoweave.batch.local import depth_of_many
 
-        raise typer.Exit(depth_of_many(pairs, out, order, processes=jobs, as_json=as_json))
+        raise typer.Exit(depth_of_many(found, out, order, processes=jobs, as_json=as_json))
     summary, notes = make_depth(pictures, out, order)
     (_tell_json if as_json else _tell)(summary, notes, out)
 

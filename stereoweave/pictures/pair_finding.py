@@ -41,8 +41,8 @@ _TAKEN = re.compile(
 
 
 @dataclass(frozen=True)
-class Job:
-    """A pair of a batch.
+class NamedPair:
+    """A pair of a batch, by the name of its results.
 
     Attributes:
         name: The folder of its results; no other pair of the batch has it.
@@ -78,16 +78,16 @@ class Listed(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Pairs:
-    """The pairs of a batch, and lines to tell about how they were found."""
+class FoundPairs:
+    """The pairs of a batch, and notes on how they were found."""
 
-    jobs: list[Job]
+    pairs: list[NamedPair]
     notes: tuple[str, ...] = ()
 
 
 def find_pairs(
     pictures: Sequence[Path], left: str | None, right: str | None, listed: Path | None
-) -> Pairs | None:
+) -> FoundPairs | None:
     """The pairs that the words of a command line name in one of three ways; None for one pair's pictures.
 
     Args:
@@ -108,13 +108,13 @@ def find_pairs(
             f"expected pictures or a folder, or --left and --right, or --list, found {found or 'none'}"
         )
     if listed:
-        return Pairs(pairs_in_list(listed))
+        return FoundPairs(pairs_in_list(listed))
     if left and right:
-        return Pairs(pairs_by_globs(left, right))
+        return FoundPairs(pairs_by_globs(left, right))
     return pairs_in(pictures[0]) if len(pictures) == 1 and pictures[0].is_dir() else None
 
 
-def pairs_in(folder: Path) -> Pairs:
+def pairs_in(folder: Path) -> FoundPairs:
     """The pairs in a folder and below it, as `pairs_among` finds them; the note tells of pictures left out.
 
     Raises:
@@ -125,15 +125,15 @@ def pairs_in(folder: Path) -> Pairs:
     listed = pairs_among(folder, (file.path for file in store_at(folder).files()))
     if not listed.pairs:
         raise StereoweaveError(f"{folder}: expected pictures in it, {_endings()}, found none")
-    jobs = [
-        Job(
+    pairs = [
+        NamedPair(
             pair.name,
             tuple(folder / path for path in pair.files),
             folder / pair.calibration if pair.calibration else None,
         )
         for pair in listed.pairs
     ]
-    return Pairs(jobs, left_out_note(folder, listed.left_out))
+    return FoundPairs(pairs, left_out_note(folder, listed.left_out))
 
 
 def pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
@@ -176,7 +176,7 @@ def left_out_note(folder: str | Path, pictures: Sequence[str]) -> tuple[str, ...
     return (f"{folder}: {count} left out, whose names do not say left or right: {pictures[0]}",)
 
 
-def pairs_by_globs(left: str, right: str) -> list[Job]:
+def pairs_by_globs(left: str, right: str) -> list[NamedPair]:
     """The pairs of the pictures that two patterns find, such as 'left/*.png', each in the order of its names.
 
     Raises:
@@ -193,10 +193,10 @@ def pairs_by_globs(left: str, right: str) -> list[Job]:
             f"{len(rights)} for --right {right}"
         )
     fixed = takewhile(lambda part: not re.search(r"[*?\[]", part), Path(left).parent.parts)
-    return _jobs(zip(lefts, rights, strict=True), Path(*fixed))
+    return _named_pairs(zip(lefts, rights, strict=True), Path(*fixed))
 
 
-def pairs_in_list(path: Path) -> list[Job]:
+def pairs_in_list(path: Path) -> list[NamedPair]:
     """The pairs of a text file, one a line: left, right, and, where it is to be another, the pair's name.
 
     Between them are tabs, commas or spaces; what has such in it stands in double quotes. A picture of both
@@ -223,7 +223,7 @@ def pairs_in_list(path: Path) -> list[Job]:
     if not rows:
         raise FormatError(f"{path}: expected a pair in each line, found none")
     pictures = [tuple(path.parent / column for column in row[:2] if column) for row in rows.values()]
-    return _jobs(pictures, path.parent, [row[2] if len(row) == 3 else "" for row in rows.values()])
+    return _named_pairs(pictures, path.parent, [row[2] if len(row) == 3 else "" for row in rows.values()])
 
 
 def _found(path: Path) -> str:
@@ -315,11 +315,13 @@ def _columns(where: str, line: str) -> list[str]:
     return [column.strip() for column in row if column or delimiter != " "]
 
 
-def _jobs(pictures: Iterable[tuple[Path, ...]], root: Path, names: Iterable[str] = repeat("")) -> list[Job]:
-    """A job for each pair, called by the name that is given, else by its path below `root` without marks."""
+def _named_pairs(
+    pictures: Iterable[tuple[Path, ...]], root: Path, names: Iterable[str] = repeat("")
+) -> list[NamedPair]:
+    """A pair for each, called by the name that is given, else by its path below `root` without marks."""
     # Without following links, as `resolve` would: the names are to be those that the user sees.
     above = Path(os.path.abspath(root))  # noqa: PTH100
-    jobs = []
+    pairs = []
     for paths, given in zip(pictures, names, strict=False):
         first = Path(os.path.abspath(paths[0]))  # noqa: PTH100
         below = first.relative_to(above if first.is_relative_to(above) else first.anchor).as_posix()
@@ -327,9 +329,9 @@ def _jobs(pictures: Iterable[tuple[Path, ...]], root: Path, names: Iterable[str]
         beside = paths[0].parent / _CALIBRATION
         # Not Path.exists, which fails where a name is too long.
         is_own = _brings_one(below, len(paths)) and os.path.exists(beside)  # noqa: PTH110
-        jobs.append(Job(name, paths, beside if is_own else None))
-    _check_names((job.name, job.pictures[0]) for job in jobs)
-    return jobs
+        pairs.append(NamedPair(name, paths, beside if is_own else None))
+    _check_names((pair.name, pair.pictures[0]) for pair in pairs)
+    return pairs
 
 
 def _check_names(names: Iterable[tuple[str, str | Path]]) -> None:

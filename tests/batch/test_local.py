@@ -22,7 +22,7 @@ from stereoweave.errors import OutputInUseError, StereoweaveError
 from stereoweave.io.files import read_image, read_pixels, write_image
 from stereoweave.matching.backend import Backend
 from stereoweave.outputs.results import DepthOrder, make_depth
-from stereoweave.pictures.pair_finding import Job, Pairs, pairs_in
+from stereoweave.pictures.pair_finding import FoundPairs, NamedPair, pairs_in
 from stereoweave.pictures.prepare import Request
 from stereoweave.system.threads import usable_cores
 
@@ -44,24 +44,24 @@ if __name__ == "__main__":
 """
 
 
-class Deadly(Job):
-    """A job that kills the process it is sent to."""
+class Deadly(NamedPair):
+    """A pair that kills the process it is sent to."""
 
     def __reduce__(self):
         return os.kill, (_own_id(), signal.SIGKILL)
 
 
-class Noting(Job):
-    """A job that notes beside its left picture how many threads the process has that it is sent to."""
+class Noting(NamedPair):
+    """A pair that notes beside its left picture how many threads the process has that it is sent to."""
 
     def __reduce__(self):
-        return noted_job, (self.name, self.pictures)
+        return noted_pair, (self.name, self.pictures)
 
 
-def noted_job(name: str, pictures: tuple[Path, ...]) -> Job:
+def noted_pair(name: str, pictures: tuple[Path, ...]) -> NamedPair:
     threads = cv2.getNumThreads(), os.environ["OPENBLAS_NUM_THREADS"]
     pictures[0].with_suffix(".txt").write_text("{} {}".format(*threads))
-    return Job(name, pictures)
+    return NamedPair(name, pictures)
 
 
 class _own_id:
@@ -85,7 +85,7 @@ def write_pairs(folder: Path, count: int, size_px=(96, 64)) -> Path:
 def batch(folder: Path, out: Path, order: DepthOrder = ORDER, **options) -> tuple[Tally, str]:
     """The tally, and what was shown meanwhile."""
     shown = io.StringIO()
-    options.setdefault("jobs", pairs_in(folder).jobs)
+    options.setdefault("pairs", pairs_in(folder).pairs)
     return run_batch(out=out, order=order, console=Console(file=shown), **options), shown.getvalue()
 
 
@@ -146,12 +146,12 @@ def test_a_bad_pair_is_told_and_the_others_are_as_they_are_alone_and_the_next_ru
 def test_a_pair_that_fails_when_it_is_made_again_is_finished_no_more(tmp_path):
     folder, out = write_pairs(tmp_path / "pairs", 2), tmp_path / "out"
     assert batch(folder, out, processes=1)[0].done == 2
-    first, second = pairs_in(folder).jobs
+    first, second = pairs_in(folder).pairs
     second.pictures[1].write_bytes(b"no picture")
     tally, _ = batch(folder, out, processes=1)
     assert [name for name, _ in tally.failed] == ["01"]
     assert list(made_at_ns(out)) == ["00"]
-    batch(folder, out, jobs=[first], processes=1)
+    batch(folder, out, pairs=[first], processes=1)
     assert list(table(out)) == ["00"]
 
 
@@ -159,13 +159,13 @@ def test_a_pair_is_there_only_with_its_pictures_and_its_mark_unharmed(tmp_path, 
     folder, out = write_pairs(tmp_path / "pairs", 3), tmp_path / "out"
     out.mkdir()
     (out / ".DS_Store").touch()  # a folder of which only this is in it is a new one
-    jobs = pairs_in(folder).jobs
+    pairs = pairs_in(folder).pairs
     assert batch(folder, out, processes=1)[0].done == 3
     (out / "00" / DONE_FILE).write_text("{")
-    jobs[1].pictures[0].unlink()
-    tally, _ = batch(folder, out, jobs=jobs, processes=1)
+    pairs[1].pictures[0].unlink()
+    tally, _ = batch(folder, out, pairs=pairs, processes=1)
     assert (tally.done, tally.skipped, [name for name, _ in tally.failed]) == (1, 1, ["01"])
-    assert depth_of_many(Pairs(jobs[:1], ("a note",)), out, ORDER) == 0
+    assert depth_of_many(FoundPairs(pairs[:1], ("a note",)), out, ORDER) == 0
     told = capsys.readouterr()
     assert told.out.splitlines()[0] == f"{out}: 1 pair: 0 made, 1 were there"
     assert told.err.splitlines()[0] == "a note"
@@ -177,10 +177,10 @@ def test_several_processes_have_a_thread_each_and_a_single_one_has_all_cores(
 ):
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
     folder = write_pairs(tmp_path / "pairs", 2)
-    jobs = [Noting(job.name, job.pictures) for job in pairs_in(folder).jobs]
+    pairs = [Noting(pair.name, pair.pictures) for pair in pairs_in(folder).pairs]
     order = DepthOrder(always=("disparity.pfm",))
-    assert batch(folder, tmp_path / "out", order, jobs=jobs, processes=processes)[0].done == 2
-    notes = [job.pictures[0].with_suffix(".txt").read_text() for job in jobs]
+    assert batch(folder, tmp_path / "out", order, pairs=pairs, processes=processes)[0].done == 2
+    notes = [pair.pictures[0].with_suffix(".txt").read_text() for pair in pairs]
     assert notes == [f"{threads} {threads}"] * 2
     assert os.environ["OPENBLAS_NUM_THREADS"] == "7"
 
@@ -231,9 +231,9 @@ def test_a_killed_batch_goes_on_and_so_does_an_interrupted_one_but_none_beside_a
 
 def test_a_pair_that_kills_its_process_is_named_and_costs_no_other(tmp_path, capsys):
     folder, out = write_pairs(tmp_path / "pairs", 3), tmp_path / "out"
-    first, second, third = pairs_in(folder).jobs
-    jobs = [first, Deadly(second.name, second.pictures), third]
-    assert depth_of_many(Pairs(jobs), out, ORDER, processes=2, as_json=True) == 1
+    first, second, third = pairs_in(folder).pairs
+    pairs = [first, Deadly(second.name, second.pictures), third]
+    assert depth_of_many(FoundPairs(pairs), out, ORDER, processes=2, as_json=True) == 1
     told = capsys.readouterr()
     assert json.loads(told.out) == {
         "done": 2,
@@ -250,7 +250,7 @@ def test_another_order_or_another_folder_is_refused_before_anything_starts(tmp_p
     calibration = tmp_path / "calib.txt"
     calibration.write_text("first")
     order = DepthOrder(request=Request(calibration=calibration))
-    assert batch(folder, out, order, jobs=[])[0] == Tally(done=0, skipped=0, failed=())
+    assert batch(folder, out, order, pairs=[])[0] == Tally(done=0, skipped=0, failed=())
     with pytest.raises(StereoweaveError, match='batch.json: expected model = "base", .* found "small"'):
         batch(
             folder, out, DepthOrder(request=Request(calibration=calibration), backend=Backend(model="base"))

@@ -4,9 +4,9 @@ import pytest
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.pictures.pair_finding import (
-    Job,
+    FoundPairs,
     ListedPair,
-    Pairs,
+    NamedPair,
     find_pairs,
     pairs_among,
     pairs_by_globs,
@@ -22,8 +22,8 @@ def put(folder: Path, *names: str) -> Path:
     return folder
 
 
-def listed(folder: Path, jobs: list[Job]) -> dict[str, tuple[str, ...]]:
-    return {job.name: tuple(path.relative_to(folder).as_posix() for path in job.pictures) for job in jobs}
+def listed(folder: Path, pairs: list[NamedPair]) -> dict[str, tuple[str, ...]]:
+    return {pair.name: tuple(path.relative_to(folder).as_posix() for path in pair.pictures) for pair in pairs}
 
 
 @pytest.mark.parametrize(
@@ -47,54 +47,54 @@ def test_a_folders_pairs_are_found_by_the_marks_of_their_sides(tmp_path, name, l
     folder = put(tmp_path, left, right)
     if name.startswith("img"):
         name = "img_img_7"
-    assert listed(folder, pairs_in(folder).jobs) == {name: (left, right)}
+    assert listed(folder, pairs_in(folder).pairs) == {name: (left, right)}
 
 
 def test_a_pair_right_in_the_folder_has_the_folders_name(tmp_path):
     folder = put(tmp_path / "castle", "left.png", "right.png")
-    assert listed(folder, pairs_in(folder).jobs) == {"castle": ("left.png", "right.png")}
+    assert listed(folder, pairs_in(folder).pairs) == {"castle": ("left.png", "right.png")}
 
 
 def test_words_that_only_begin_like_a_mark_are_none(tmp_path):
     folder = put(tmp_path, "leftover.png", "lake.png", "Room.png", "im0001.png", "ball.png")
     expected = {Path(name).stem: (name,) for name in ("leftover.png", "lake.png", "Room.png", "im0001.png")}
-    assert listed(folder, pairs_in(folder).jobs) == expected | {"ball": ("ball.png",)}
+    assert listed(folder, pairs_in(folder).pairs) == expected | {"ball": ("ball.png",)}
 
 
 def test_half_a_pair_is_a_pair_whose_other_picture_is_missing(tmp_path):
     folder = put(tmp_path, "left/1.png", "right/1.png", "left/2.png", "right/3.png")
-    assert listed(folder, pairs_in(folder).jobs) == {
+    assert listed(folder, pairs_in(folder).pairs) == {
         name: (f"left/{name}.png", f"right/{name}.png") for name in ("1", "2", "3")
     }
 
 
 def test_marks_mean_nothing_where_not_one_pair_is_whole(tmp_path):
     folder = put(tmp_path, "turn_left.jpg", "sea.jpg")
-    assert listed(folder, pairs_in(folder).jobs) == {"sea": ("sea.jpg",), "turn_left": ("turn_left.jpg",)}
+    assert listed(folder, pairs_in(folder).pairs) == {"sea": ("sea.jpg",), "turn_left": ("turn_left.jpg",)}
 
 
 def test_files_of_both_views_are_pairs_and_the_camera_s_copy_beside_them_is_left_out(tmp_path):
     folder = put(tmp_path, "DSCF1.MPO", "DSCF1.JPG", "tree.jps", "notes.txt")
-    pairs = pairs_in(folder)
-    assert listed(folder, pairs.jobs) == {"DSCF1": ("DSCF1.MPO",), "tree": ("tree.jps",)}
-    assert pairs.notes == (f"{folder}: 1 picture left out, whose names do not say left or right: DSCF1.JPG",)
+    found = pairs_in(folder)
+    assert listed(folder, found.pairs) == {"DSCF1": ("DSCF1.MPO",), "tree": ("tree.jps",)}
+    assert found.notes == (f"{folder}: 1 picture left out, whose names do not say left or right: DSCF1.JPG",)
 
 
 def test_a_scene_folder_brings_its_calibration_and_not_its_ground_truth(tmp_path):
     names = ["left.png", "right.png", "disparity.png"]
     folder = put(tmp_path, *(f"{scene}/{name}" for scene in ("a", "b") for name in names), "b/calib.txt")
-    pairs = pairs_in(folder)
-    assert [(job.name, job.calibration) for job in pairs.jobs] == [
+    found = pairs_in(folder)
+    assert [(pair.name, pair.calibration) for pair in found.pairs] == [
         ("a", None),
         ("b", folder / "b" / "calib.txt"),
     ]
-    assert "2 pictures left out" in pairs.notes[0]
+    assert "2 pictures left out" in found.notes[0]
 
 
 def test_hidden_files_and_results_of_a_batch_are_no_pictures(tmp_path):
     folder = put(tmp_path, "a_l.png", "a_r.png", "._a_l.png", ".trash/b_l.png")
     put(folder, "out/batch.json", "out/a/preview.png", "out/a/left.png", "out/a/right.png")
-    assert listed(folder, pairs_in(folder).jobs) == {"a": ("a_l.png", "a_r.png")}
+    assert listed(folder, pairs_in(folder).pairs) == {"a": ("a_l.png", "a_r.png")}
 
 
 def test_two_pairs_of_one_name_are_refused_before_the_start_even_if_capitals_alone_differ(tmp_path):
@@ -124,9 +124,9 @@ def test_pairs_among_the_files_of_a_store_are_those_of_a_folder_with_the_same_fi
         ListedPair("castle", ("left.png", "right.png"), "calib.txt"),
     ]
     assert among.left_out == ["d.png"]
-    jobs = pairs_in(folder).jobs
-    assert listed(folder, jobs) == {pair.name: pair.files for pair in among.pairs}
-    assert [job.calibration for job in jobs] == [
+    pairs = pairs_in(folder).pairs
+    assert listed(folder, pairs) == {pair.name: pair.files for pair in among.pairs}
+    assert [pair.calibration for pair in pairs] == [
         folder / pair.calibration if pair.calibration else None for pair in among.pairs
     ]
 
@@ -166,14 +166,14 @@ def test_a_side_may_be_told_by_folder_and_name_or_by_the_name_alone():
 
 def test_globs_are_paired_in_the_order_of_their_names(tmp_path):
     folder = put(tmp_path, "l/2.png", "l/1.png", "r/c.png", "r/b.png", "l/3.txt")
-    jobs = pairs_by_globs(f"{folder}/l/*.png", f"{folder}/r/*.png")
-    assert listed(folder, jobs) == {"1": ("l/1.png", "r/b.png"), "2": ("l/2.png", "r/c.png")}
+    pairs = pairs_by_globs(f"{folder}/l/*.png", f"{folder}/r/*.png")
+    assert listed(folder, pairs) == {"1": ("l/1.png", "r/b.png"), "2": ("l/2.png", "r/c.png")}
 
 
 def test_names_from_globs_tell_folders_apart(tmp_path):
     folder = put(tmp_path, "a/left.png", "a/right.png", "b/c/left.png", "b/c/right.png")
-    jobs = pairs_by_globs(f"{folder}/**/left.png", f"{folder}/**/right.png")
-    assert listed(folder, jobs) == {
+    pairs = pairs_by_globs(f"{folder}/**/left.png", f"{folder}/**/right.png")
+    assert listed(folder, pairs) == {
         "a": ("a/left.png", "a/right.png"),
         "b_c": ("b/c/left.png", "b/c/right.png"),
     }
@@ -181,8 +181,8 @@ def test_names_from_globs_tell_folders_apart(tmp_path):
 
 def test_a_file_whose_name_has_brackets_is_no_pattern(tmp_path):
     folder = put(tmp_path, "sea [1].png", "sea [2].png")
-    jobs = pairs_by_globs(f"{folder}/sea [1].png", f"{folder}/sea [2].png")
-    assert listed(folder, jobs) == {"sea [1]": ("sea [1].png", "sea [2].png")}
+    pairs = pairs_by_globs(f"{folder}/sea [1].png", f"{folder}/sea [2].png")
+    assert listed(folder, pairs) == {"sea [1]": ("sea [1].png", "sea [2].png")}
 
 
 def test_unequal_counts_are_refused_with_both(tmp_path):
@@ -221,7 +221,7 @@ def test_a_pair_named_like_a_folder_of_a_batch_is_renamed_and_may_not_take_anoth
     folder = put(
         tmp_path, *(f"{name}/{side}.png" for name in ("begun", "manifest") for side in ("left", "right"))
     )
-    assert [job.name for job in pairs_in(folder).jobs] == ["begun_", "manifest_"]
+    assert [pair.name for pair in pairs_in(folder).pairs] == ["begun_", "manifest_"]
     put(tmp_path, "manifest_/left.png", "manifest_/right.png")
     with pytest.raises(
         StereoweaveError, match="different names, found manifest_ for manifest.*and for manifest_"
@@ -242,7 +242,7 @@ def test_paths_of_a_list_are_relative_to_its_folder_and_those_elsewhere_keep_the
 def test_what_cannot_be_a_picture_is_noticed_only_when_it_is_read(tmp_path):
     long = "a" * 300  # no file system has such names
     (tmp_path / "list.txt").write_text(f"/ right.png\n{long}/left.png {long}/right.png\n")
-    assert [job.pictures for job in pairs_in_list(tmp_path / "list.txt")] == [
+    assert [pair.pictures for pair in pairs_in_list(tmp_path / "list.txt")] == [
         (Path("/"), tmp_path / "right.png"),
         (tmp_path / long / "left.png", tmp_path / long / "right.png"),
     ]
@@ -267,10 +267,10 @@ def test_the_words_of_the_command_line_name_one_source(tmp_path):
     folder = put(tmp_path, "a_l.png", "a_r.png")
     left, right = (str(folder / f"a_{side}.png") for side in "lr")
     (folder / "list.txt").write_text("a_l.png a_r.png a\n")
-    job = Job("a", (Path(left), Path(right)))
-    assert find_pairs([folder], None, None, None) == Pairs([job])
-    assert find_pairs([], left, right, None) == Pairs([job])
-    assert find_pairs([], None, None, folder / "list.txt") == Pairs([job])
+    pair = NamedPair("a", (Path(left), Path(right)))
+    assert find_pairs([folder], None, None, None) == FoundPairs([pair])
+    assert find_pairs([], left, right, None) == FoundPairs([pair])
+    assert find_pairs([], None, None, folder / "list.txt") == FoundPairs([pair])
     assert find_pairs([Path(left), Path(right)], None, None, None) is None
     for words, found in {
         ((), None, None, None): "none",
