@@ -250,7 +250,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 @dataclass
-class Tally:
+class LiveTally:
     """Statistics of the frames shown so far."""
 
     shown: int = 0
@@ -286,7 +286,7 @@ def show(  # noqa: PLR0913 - source, output and settings
     capture: Capture,
     screen: Screen,
     matcher: Matcher,
-    tally: Tally,
+    tally: LiveTally,
     *,
     arrangement: str | None = None,
     rig: Rig | None = None,

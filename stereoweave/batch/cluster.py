@@ -19,7 +19,7 @@ from pathlib import Path
 import typer
 from rich.console import Console
 
-from stereoweave.batch.manifest import MANIFEST, PLAN, Plan, extend_plan
+from stereoweave.batch.manifest import MANIFEST, PLAN, ChunkPlan, extend_plan
 from stereoweave.batch.worker import BEGUN, Counts, Worker, remove_left_behind
 from stereoweave.cameras.calibration_files import calibration_bytes
 from stereoweave.errors import StereoweaveError
@@ -28,7 +28,7 @@ from stereoweave.io.output_lock import lock_output
 from stereoweave.io.run_folder import check_claim, check_unclaimed, described, description
 from stereoweave.io.stores import Store, store_at
 from stereoweave.matching.providers import CPU
-from stereoweave.outputs.results import DepthOrder, order_facts
+from stereoweave.outputs.results import DepthJob, job_facts
 from stereoweave.pictures.pair_finding import BATCH_FILE
 from stereoweave.system.progress import progress
 from stereoweave.system.ray_engine import Engine, connect, room, stream
@@ -59,7 +59,7 @@ class ClusterTally:
 def run_cluster(
     source: str | Path,
     destination: str | Path,
-    order: DepthOrder | None = None,
+    job: DepthJob | None = None,
     engine: Engine | None = None,
     *,
     console: Console | None = None,
@@ -71,8 +71,8 @@ def run_cluster(
 
     Args:
         source: A folder, or the URL of one in an object store.
-        destination: A new one, or one that the same order was begun in.
-        order: What is made of each pair.
+        destination: A new one, or one that the same job was begun in.
+        job: What is made of each pair.
         engine: Where.
         console: Where progress is shown; nowhere unless given.
 
@@ -81,31 +81,31 @@ def run_cluster(
             or another run writes to the destination. What is made stays, and the same call goes on.
     """
     engine = engine or Engine()
-    order = _for_many(order or DepthOrder(), engine)
+    job = _for_many(job or DepthJob(), engine)
     console = console or Console(quiet=True)
     read_from, write_to = _store(source), _store(destination)
-    if order.backend.provider == CPU:
-        replace(order.backend, threads=1).matcher()  # an unknown network is one error, not one for each pair
+    if job.backend.provider == CPU:
+        replace(job.backend, threads=1).matcher()  # an unknown network is one error, not one for each pair
     read_from.check_source()
     write_to.check_destination()
     with _alone(write_to), connect(engine):
         workers = room(engine)
-        _claim(write_to, order, read_from)
+        _claim(write_to, job, read_from)
         plan = extend_plan(read_from, write_to, min(workers, engine.workers or workers))
         for note in plan.notes:
             console.print(note, markup=False, highlight=False, soft_wrap=True)
-        worker = Worker(read_from, write_to, order, tuple(_carried(order)))
+        worker = Worker(read_from, write_to, job, tuple(_carried(job)))
         counts = _run(worker, plan, engine, console)
         _tidy(write_to)
     return ClusterTally(counts.made, counts.there, counts.failed, counts.named, write_to.at(MANIFEST))
 
 
 def batch_on_cluster(
-    source: str, destination: str, order: DepthOrder, engine: Engine, *, as_json: bool = False
+    source: str, destination: str, job: DepthJob, engine: Engine, *, as_json: bool = False
 ) -> int:
     """Makes a batch and tells how it went; the exit code: 1 if a pair failed, 130 if Ctrl-C ended it."""
     try:
-        tally = run_cluster(source, destination, order, engine, console=Console(stderr=True))
+        tally = run_cluster(source, destination, job, engine, console=Console(stderr=True))
     except KeyboardInterrupt:
         kept = "what is finished stays, and the same command goes on"
         typer.echo(f"stereoweave: {destination}: stopped; {kept}", err=True)
@@ -131,7 +131,7 @@ def _tell(tally: ClusterTally, destination: str) -> None:
     typer.echo(f"manifest: {tally.manifest}")
 
 
-def _run(worker: Worker, plan: Plan, engine: Engine, console: Console) -> Counts:
+def _run(worker: Worker, plan: ChunkPlan, engine: Engine, console: Console) -> Counts:
     """Makes all chunks of a plan."""
     counts, start_s = Counts(), time.perf_counter()
     of_each = -(-len(plan.chunks) // _MOST_TASKS)
@@ -160,10 +160,10 @@ def _ready(worker: Worker) -> Worker:
     return worker
 
 
-def _for_many(order: DepthOrder, engine: Engine) -> DepthOrder:
-    """The order without reports, unless they are asked for, with the threads that a worker has to itself."""
-    always = tuple(file for file in order.always if file != "report.html")
-    return replace(order, always=always, backend=replace(order.backend, threads=engine.threads_each))
+def _for_many(job: DepthJob, engine: Engine) -> DepthJob:
+    """The job without reports, unless they are asked for, with the threads that a worker has to itself."""
+    always = tuple(file for file in job.always if file != "report.html")
+    return replace(job, always=always, backend=replace(job.backend, threads=engine.threads_each))
 
 
 def _store(place: str | Path) -> Store:
@@ -177,9 +177,9 @@ def _alone(destination: Store) -> AbstractContextManager[None]:
     return lock_output(destination.folder) if destination.folder else nullcontext()
 
 
-def _claim(destination: Store, order: DepthOrder, source: Store) -> None:
+def _claim(destination: Store, job: DepthJob, source: Store) -> None:
     """Writes down whose folder this is, or refuses one that is another's."""
-    facts = {"made by": "stereoweave batch", "source": source.place, **order_facts(order)}
+    facts = {"made by": "stereoweave batch", "source": source.place, **job_facts(job)}
     if destination.exists(BATCH_FILE):
         place = destination.at(BATCH_FILE)
         text = destination.read_bytes(BATCH_FILE).decode("utf-8", "replace")
@@ -190,9 +190,9 @@ def _claim(destination: Store, order: DepthOrder, source: Store) -> None:
     destination.write_bytes(BATCH_FILE, description(facts).encode())
 
 
-def _carried(order: DepthOrder) -> Iterator[tuple[str, str, bytes]]:
-    """The order's own files, which workers on other machines cannot read: kind, name and content."""
-    model, calibration = Path(order.backend.model), order.request.calibration
+def _carried(job: DepthJob) -> Iterator[tuple[str, str, bytes]]:
+    """The job's own files, which workers on other machines cannot read: kind, name and content."""
+    model, calibration = Path(job.backend.model), job.request.calibration
     if str(model).endswith(".onnx") and model.is_file():  # else a name that they all know
         with reading(model, "a model"):
             yield "model", model.name, model.read_bytes()

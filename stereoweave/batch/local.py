@@ -27,7 +27,7 @@ from stereoweave.io.files import make_folder, reading, remove_leftovers, replaci
 from stereoweave.io.output_lock import lock_output
 from stereoweave.io.run_folder import check_claim, check_unclaimed, described, description
 from stereoweave.io.text import write_table
-from stereoweave.outputs.results import DepthOrder, make_depth, order_facts
+from stereoweave.outputs.results import DepthJob, job_facts, make_depth
 from stereoweave.pictures.pair_finding import BATCH_FILE, SUMMARY_FILE, FoundPairs, NamedPair
 from stereoweave.system.processes import begin_work
 from stereoweave.system.progress import progress
@@ -44,7 +44,7 @@ Outcome = tuple[NamedPair, str | None]
 
 
 @dataclass(frozen=True)
-class Tally:
+class LocalTally:
     """How a batch ended: how many pairs were made, how many were there, and name and reason of the others."""
 
     done: int
@@ -55,11 +55,11 @@ class Tally:
 def run_batch(
     pairs: Sequence[NamedPair],
     out: Path,
-    order: DepthOrder,
+    job: DepthJob,
     *,
     processes: int | None = None,
     console: Console,
-) -> Tally:
+) -> LocalTally:
     """Makes the results of every pair in `out`/name, but for those that are there, and a table of all.
 
     A pair that cannot be made is told at once, and the others go on; so it is with a pair whose process
@@ -67,10 +67,10 @@ def run_batch(
 
     Args:
         pairs: The pairs.
-        out: A new folder, or one that a batch with the same order was begun in.
-        order: What is made of each pair.
+        out: A new folder, or one that a batch with the same job was begun in.
+        job: What is made of each pair.
         processes: How many at a time, as many as cores unless given; more than one have a thread each, unless
-            the order says otherwise.
+            the job says otherwise.
         console: Where progress and failures are shown.
 
     Raises:
@@ -78,35 +78,35 @@ def run_batch(
             matcher.
     """
     processes = min(processes or usable_cores(), max(len(pairs), 1))
-    if processes > 1 and order.backend.threads is None:
-        order = replace(order, backend=replace(order.backend, threads=1))
+    if processes > 1 and job.backend.threads is None:
+        job = replace(job, backend=replace(job.backend, threads=1))
     # An unknown network or unavailable provider is one error here, not one for each pair.
-    replace(order.backend, threads=1).matcher()
-    threads = order.backend.threads
+    replace(job.backend, threads=1).matcher()
+    threads = job.backend.threads
     make_folder(out)
     with lock_output(out):
-        _claim(out, order)
+        _claim(out, job)
         missing = [pair for pair in pairs if not _is_finished(out / pair.name, pair)]
         try:
-            failed = _run(functools.partial(_make, out, order), missing, processes, threads, console)
+            failed = _run(functools.partial(_make, out, job), missing, processes, threads, console)
         finally:
             _tidy(out)
         _write_summary(out, pairs, dict(failed))
-    return Tally(len(missing) - len(failed), len(pairs) - len(missing), tuple(failed))
+    return LocalTally(len(missing) - len(failed), len(pairs) - len(missing), tuple(failed))
 
 
 def depth_of_many(
-    found: FoundPairs, out: Path, order: DepthOrder, *, processes: int | None = None, as_json: bool = False
+    found: FoundPairs, out: Path, job: DepthJob, *, processes: int | None = None, as_json: bool = False
 ) -> int:
     """Makes a batch and tells how it went; the exit code: 1 if a pair failed, 130 if Ctrl-C ended it.
 
-    Reports are made only where the order's files name report.html or all: each takes as long as all else.
+    Reports are made only where the job's files name report.html or all: each takes as long as all else.
     """
-    order = replace(order, always=tuple(file for file in order.always if file != "report.html"))
+    job = replace(job, always=tuple(file for file in job.always if file != "report.html"))
     for note in found.notes:
         typer.echo(note, err=True)
     try:
-        tally = run_batch(found.pairs, out, order, processes=processes, console=Console(stderr=True))
+        tally = run_batch(found.pairs, out, job, processes=processes, console=Console(stderr=True))
     except KeyboardInterrupt:
         kept = "what is finished stays, and the same command goes on"
         typer.echo(f"stereoweave: {out}: stopped; {kept}", err=True)
@@ -119,7 +119,7 @@ def depth_of_many(
     return 1 if tally.failed else 0
 
 
-def _tell(tally: Tally, out: Path) -> None:
+def _tell(tally: LocalTally, out: Path) -> None:
     count = tally.done + tally.skipped + len(tally.failed)
     there = f", {tally.skipped} were there" if tally.skipped else ""
     failed = f", {len(tally.failed)} failed" if tally.failed else ""
@@ -216,15 +216,15 @@ def _few_blas_threads(threads: int) -> Iterator[None]:
             os.environ[_BLAS_THREADS] = before
 
 
-def _make(out: Path, order: DepthOrder, pair: NamedPair) -> str | None:
+def _make(out: Path, job: DepthJob, pair: NamedPair) -> str | None:
     """Makes the results of a pair and marks them as finished; what went wrong in one line, or None."""
     try:
         folder, sources = out / pair.name, _sources(pair)
         (folder / DONE_FILE).unlink(missing_ok=True)
-        if pair.calibration and not order.request.calibration:
-            order = replace(order, request=replace(order.request, calibration=pair.calibration))
+        if pair.calibration and not job.request.calibration:
+            job = replace(job, request=replace(job.request, calibration=pair.calibration))
         start_s = time.perf_counter()
-        summary, notes = make_depth(pair.pictures, folder, order)
+        summary, notes = make_depth(pair.pictures, folder, job)
         seconds = round(time.perf_counter() - start_s, 3)
         files = sorted(path.name for path in folder.iterdir() if path.name[0] != ".")
         facts = {"sources": sources, "files": files, "seconds": seconds, "notes": notes}
@@ -264,9 +264,9 @@ def _finished(folder: Path) -> dict[str, Any]:
     return facts if all((folder / file).exists() for file in facts["files"]) else {}
 
 
-def _claim(out: Path, order: DepthOrder) -> None:
+def _claim(out: Path, job: DepthJob) -> None:
     """Writes down whose folder this is, or refuses one that is another's."""
-    facts, path = order_facts(order), out / BATCH_FILE
+    facts, path = job_facts(job), out / BATCH_FILE
     if path.exists():
         expected = "the description of a batch that stereoweave depth made"
         with reading(path, expected):

@@ -47,7 +47,7 @@ class Planned:
 
 
 @dataclass(frozen=True)
-class Plan:
+class ChunkPlan:
     """The numbers of all chunks, how many pairs and films are in them, and lines to tell."""
 
     chunks: tuple[int, ...]
@@ -55,7 +55,7 @@ class Plan:
     notes: tuple[str, ...] = ()
 
 
-def extend_plan(source: Store, destination: Store, workers: int) -> Plan:
+def extend_plan(source: Store, destination: Store, workers: int) -> ChunkPlan:
     """The plan in the destination, brought up to what is in the source now.
 
     What is new in the source gets chunks of its own, and what has changed there its new versions. What is no
@@ -87,7 +87,7 @@ def extend_plan(source: Store, destination: Store, workers: int) -> Plan:
     # Of a plan that was lost, or that two runs extended at the same time.
     for stray in set(_parts(destination, MANIFEST)).difference(numbers):
         destination.remove(_part(MANIFEST, stray))
-    return Plan(numbers, sum(map(sum, counts.values())), left_out_note(source.place, listed.left_out))
+    return ChunkPlan(numbers, sum(map(sum, counts.values())), left_out_note(source.place, listed.left_out))
 
 
 def read_chunk(destination: Store, chunk: int) -> list[Planned]:

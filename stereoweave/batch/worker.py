@@ -28,10 +28,10 @@ from stereoweave.errors import OutputInUseError, ProviderError, StereoweaveError
 from stereoweave.io.files import SMALLEST_SIDE_PX, is_leftover
 from stereoweave.io.stores import Store
 from stereoweave.matching.matcher import Matcher
-from stereoweave.outputs.results import DepthOrder, make_depth
+from stereoweave.outputs.results import DepthJob, make_depth
 from stereoweave.system.processes import begin_work
 
-Row = dict[str, Any]
+ManifestRow = dict[str, Any]
 
 BEGUN = "begun"
 FILM = "depth.mkv"
@@ -72,14 +72,14 @@ class Worker:
     Attributes:
         source: Where the pictures and films are.
         destination: Where plan, rows and results are.
-        order: What is made of each pair.
-        carried: The order's own files, which the driver alone may have: their contents by `model` and
+        job: What is made of each pair.
+        carried: The job's own files, which the driver alone may have: their contents by `model` and
             `calibration`.
     """
 
     source: Store
     destination: Store
-    order: DepthOrder
+    job: DepthJob
     carried: tuple[tuple[str, str, bytes], ...] = ()
 
     def __call__(self, chunks: Sequence[int]) -> Counts:
@@ -99,10 +99,10 @@ class Worker:
         there = len(planned) - len(missing)
         return Counts(len(missing) - len(failed), there, len(failed), failed[:_NAMED_FAILURES])
 
-    def _is_made(self, planned: Planned, row: Row | None) -> bool:
+    def _is_made(self, planned: Planned, row: ManifestRow | None) -> bool:
         return row is not None and not row["error"] and self._holds(planned, row)
 
-    def _holds(self, planned: Planned, row: Row) -> bool:
+    def _holds(self, planned: Planned, row: ManifestRow) -> bool:
         """Whether a row is of these very files, and its results are there."""
         if tuple(row["versions"]) != planned.versions:
             return False
@@ -110,7 +110,7 @@ class Worker:
         there = {file.path.removeprefix(f"{folder}/") for file in self.destination.files(folder)}
         return there.issuperset(row["files"])
 
-    def _rows(self, missing: Sequence[Planned], mark: str) -> list[Row]:
+    def _rows(self, missing: Sequence[Planned], mark: str) -> list[ManifestRow]:
         if not missing:
             return []
         if self.destination.exists(mark):
@@ -118,7 +118,7 @@ class Worker:
         self.destination.write_bytes(mark, b"{}")
         return [self.row(planned) for planned in missing]
 
-    def _rows_apart(self, missing: Sequence[Planned], mark: str) -> list[Row]:
+    def _rows_apart(self, missing: Sequence[Planned], mark: str) -> list[ManifestRow]:
         """The rows, each made in another process; what it was killed by is noted, and not tried for ever."""
         notes = self._notes(mark)
         tries, rows = notes.get("tries", {}), {row["pair"]: row for row in notes.get("rows", [])}
@@ -142,21 +142,21 @@ class Worker:
         except ValueError:  # another run has just made the chunk, or the file was lost with a machine's power
             return {}
 
-    def row(self, planned: Planned) -> Row:
+    def row(self, planned: Planned) -> ManifestRow:
         """The row of a pair or a film that is made now.
 
         Raises:
             StereoweaveError: Not because of the pair: the source, the destination or the provider fails.
         """
         start_s = time.perf_counter()
-        row, order = self._empty_row(planned), self._order()
-        matcher = order.backend.matcher()
+        row, job = self._empty_row(planned), self._local_job()
+        matcher = job.backend.matcher()
         with tempfile.TemporaryDirectory(prefix="stereoweave-") as name:
             try:
                 if planned.is_film:
-                    row |= self._film(planned, Path(name), order)
+                    row |= self._film(planned, Path(name), job)
                 else:
-                    row |= self._pair(planned, Path(name), order)
+                    row |= self._pair(planned, Path(name), job)
             except _StoreError:
                 raise
             except Exception as error:  # whatever a library makes of a bad picture, the others go on
@@ -168,7 +168,7 @@ class Worker:
                 row["error"] = " ".join(told.split())
         return row | {"seconds": round(time.perf_counter() - start_s, 3)}
 
-    def _empty_row(self, planned: Planned) -> Row:
+    def _empty_row(self, planned: Planned) -> ManifestRow:
         empty = dict.fromkeys(
             ("disparity_min_px", "disparity_median_px", "disparity_max_px", "confident_percent")
         )
@@ -184,12 +184,12 @@ class Worker:
             }
         )
 
-    def _pair(self, planned: Planned, scratch: Path, order: DepthOrder) -> Row:
+    def _pair(self, planned: Planned, scratch: Path, job: DepthJob) -> ManifestRow:
         pictures, calibration = self._fetched(planned, scratch / "pictures")
-        if calibration and not order.request.calibration:
-            order = replace(order, request=replace(order.request, calibration=calibration))
+        if calibration and not job.request.calibration:
+            job = replace(job, request=replace(job.request, calibration=calibration))
         with self._results(planned, scratch) as out:
-            summary, notes = make_depth(pictures, out, order)
+            summary, notes = make_depth(pictures, out, job)
         return {
             "disparity_min_px": summary.disparity_min_px,
             "disparity_median_px": summary.disparity_median_px,
@@ -201,21 +201,21 @@ class Worker:
             "files": _names(out),
         }
 
-    def _film(self, planned: Planned, scratch: Path, order: DepthOrder) -> Row:
+    def _film(self, planned: Planned, scratch: Path, job: DepthJob) -> ManifestRow:
         from rich.console import Console
 
         from stereoweave.io.animation import needing_the_video_extra
 
         with needing_the_video_extra("a film"):
-            from stereoweave.video.convert import Order, make_film
+            from stereoweave.video.convert import VideoJob, make_film
             from stereoweave.video.reader import open_footage
             from stereoweave.video.writer import parts_folder
 
         films, _ = self._fetched(planned, scratch / "pictures")
-        ordered = Order(depth16=True, backend=order.backend)
-        footage = open_footage(films, order.request.arrangement)
+        film_job = VideoJob(depth16=True, backend=job.backend)
+        footage = open_footage(films, job.request.arrangement)
         with self._results(planned, scratch) as out:
-            make = partial(make_film, footage, films, out / FILM, ordered, Console(quiet=True))
+            make = partial(make_film, footage, films, out / FILM, film_job, Console(quiet=True))
             begun = parts_folder(out / FILM)
             was_begun = begun.exists()
             try:
@@ -265,16 +265,16 @@ class Worker:
         if any(isinstance(cause, OSError) and cause.errno in _FULL_OR_GONE for cause in _causes(error)):
             raise _StoreError(f"{self.destination.place}: {' '.join(str(error).split())}") from error
 
-    def _order(self) -> DepthOrder:
-        """The order with the files that were carried here."""
-        order = self.order
+    def _local_job(self) -> DepthJob:
+        """The job with the files that were carried here."""
+        job = self.job
         for kind, name, content in self.carried:
             path = _carried(name, content)
             if kind == "model":
-                order = replace(order, backend=replace(order.backend, model=str(path)))
+                job = replace(job, backend=replace(job.backend, model=str(path)))
             else:
-                order = replace(order, request=replace(order.request, calibration=path))
-        return order
+                job = replace(job, request=replace(job.request, calibration=path))
+        return job
 
 
 class _StoreError(StereoweaveError):
@@ -307,7 +307,7 @@ class _Apart:
         """Waits for the process, if there is none."""
         false_starts = 0
         while self._pool is None:
-            threads = self._worker.order.backend.threads or 1
+            threads = self._worker.job.backend.threads or 1
             pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), begin_work, (threads,))
             try:
                 pool.submit(_warm, self._worker).result()
@@ -323,7 +323,7 @@ class _Apart:
                 if self._pool is None:
                     pool.shutdown()
 
-    def row(self, planned: Planned) -> Row | None:
+    def row(self, planned: Planned) -> ManifestRow | None:
         """The row; None where the process was killed."""
         assert self._pool is not None
         try:
@@ -336,7 +336,7 @@ class _Apart:
 
 def _warm(worker: Worker) -> None:
     """Loads what a row takes, so that a try counts only while a pair is made."""
-    worker._order().backend.matcher()
+    worker._local_job().backend.matcher()
 
 
 @functools.cache

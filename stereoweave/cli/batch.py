@@ -72,14 +72,14 @@ def batch(  # noqa: PLR0913 - each is a word of the command line
     from stereoweave.batch.cluster import batch_on_cluster
     from stereoweave.matching.backend import Backend
     from stereoweave.matching.options import MatchOptions
-    from stereoweave.outputs.results import DepthOrder
+    from stereoweave.outputs.results import DepthJob
     from stereoweave.system.ray_engine import Engine
 
-    order = DepthOrder(
+    job = DepthJob(
         request=request_of(arrangement, calib, focal_px, baseline_m, rectify),
         backend=Backend(model=model, provider=provider),
         options=MatchOptions(range_px=range_of(range_px), refined=refined, raw=raw),
         files=tuple(write or ()),
     )
     engine = Engine(address, workers, cpus_each, gpus_each)
-    raise typer.Exit(batch_on_cluster(source, destination, order, engine, as_json=as_json))
+    raise typer.Exit(batch_on_cluster(source, destination, job, engine, as_json=as_json))

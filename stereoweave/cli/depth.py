@@ -84,10 +84,10 @@ def depth(  # noqa: PLR0913 - each is a word of the command line
     """Depth of a stereo pair, or of many: maps, pictures of them, and a report to open in a browser."""
     from stereoweave.matching.backend import Backend
     from stereoweave.matching.options import MatchOptions
-    from stereoweave.outputs.results import DepthOrder, make_depth
+    from stereoweave.outputs.results import DepthJob, make_depth
     from stereoweave.pictures.pair_finding import find_pairs
 
-    order = DepthOrder(
+    job = DepthJob(
         request=request_of(arrangement, calib, focal_px, baseline_m, rectify),
         backend=Backend(model=model, threads=threads, provider=provider),
         options=MatchOptions(range_px=range_of(range_px), refined=refined, raw=raw),
@@ -97,8 +97,8 @@ def depth(  # noqa: PLR0913 - each is a word of the command line
     if found := find_pairs(pictures, left, right, listed):
         from stereoweave.batch.local import depth_of_many
 
-        raise typer.Exit(depth_of_many(found, out, order, processes=jobs, as_json=as_json))
-    summary, notes = make_depth(pictures, out, order)
+        raise typer.Exit(depth_of_many(found, out, job, processes=jobs, as_json=as_json))
+    summary, notes = make_depth(pictures, out, job)
     (_tell_json if as_json else _tell)(summary, notes, out)
 
 

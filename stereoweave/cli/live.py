@@ -49,7 +49,7 @@ def live(  # noqa: PLR0913 - each is a word of the command line
     """What cameras see and its depth in colours, as it comes, on a page in the browser; Ctrl-C ends it."""
     # Else the libraries that OpenCV reads with tell the terminal in their words what the error says in ours.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    from stereoweave.app.live import Capture, Screen, Tally, show
+    from stereoweave.app.live import Capture, LiveTally, Screen, show
     from stereoweave.cameras.calibration_files import read_rig
     from stereoweave.matching.backend import Backend
     from stereoweave.pictures.frame_packing import ARRANGEMENTS
@@ -60,7 +60,7 @@ def live(  # noqa: PLR0913 - each is a word of the command line
             f"{arrangement} of {' '.join(sources)}"
         )
     rig = read_rig(calib) if calib else None
-    matcher, tally = Backend(model=model, threads=threads, provider=provider).matcher(), Tally()
+    matcher, tally = Backend(model=model, threads=threads, provider=provider).matcher(), LiveTally()
     with Screen(port) as screen, Capture(sources) as capture:
         typer.echo(f"{capture.name}: shown at {screen.url}; Ctrl-C ends it")
         if browser:

@@ -10,7 +10,7 @@ from stereoweave.cli.options import Model, Provider, Strength, Threads, place_fo
 from stereoweave.errors import StereoweaveError
 
 if TYPE_CHECKING:
-    from stereoweave.video.convert import Tally
+    from stereoweave.video.convert import VideoTally
 
 _HIGHEST_RATE = 1000
 
@@ -89,11 +89,11 @@ def video(  # noqa: PLR0913 - each is a word of the command line
     from stereoweave.video.reader import open_footage
 
     with needing_the_video_extra("a film"):
-        from stereoweave.video.convert import Order, make_film
+        from stereoweave.video.convert import VideoJob, make_film
         from stereoweave.video.writer import parts_folder
 
     try:
-        order = Order(
+        job = VideoJob(
             depth=depth,
             depth16=depth16,
             position=position,
@@ -106,7 +106,7 @@ def video(  # noqa: PLR0913 - each is a word of the command line
         if layout:
             out = _marked(out, layout, footage.size_px)
         place_for(out)
-        tally = make_film(footage, films, out, order, Console(stderr=True))
+        tally = make_film(footage, films, out, job, Console(stderr=True))
     except KeyboardInterrupt:
         folder = parts_folder(out)
         kept = (
@@ -145,7 +145,7 @@ def _marked(out: Path, layout: str, size_px: tuple[int, int]) -> Path:
     return marked(out, layout, StereoPair(left=blank, right=blank), Choices())
 
 
-def _tell(out: Path, tally: "Tally") -> None:
+def _tell(out: Path, tally: "VideoTally") -> None:
     cuts = "1 cut" if tally.cuts == 1 else f"{tally.cuts} cuts"
     frames = "1 frame" if tally.frames == 1 else f"{tally.frames} frames"
     typer.echo(f"{out}: {frames}, {cuts}")

@@ -123,7 +123,7 @@ ALL = "all"
 
 
 @dataclass(frozen=True, kw_only=True)
-class DepthOrder:
+class DepthJob:
     """What is to be made of every pair: what is said of the pictures, with which network and how.
 
     Attributes:
@@ -148,18 +148,18 @@ class DepthOrder:
                 )
 
 
-def make_depth(pictures: Sequence[Path], out: Path, order: DepthOrder) -> tuple[Summary, list[str]]:
+def make_depth(pictures: Sequence[Path], out: Path, job: DepthJob) -> tuple[Summary, list[str]]:
     """Write all results of a pair to `out` atomically; returns the summary and user-facing notes."""
-    matcher = order.backend.matcher()
-    prepared = prepare(pictures, order.request)
+    matcher = job.backend.matcher()
+    prepared = prepare(pictures, job.request)
     pair = prepared.pair
-    files, left_out = _files_of(order, pair)
+    files, left_out = _files_of(job, pair)
     with _results_in(out) as folder:
         start_s = time.perf_counter()
-        estimate = match(matcher, pair, order.options)
+        estimate = match(matcher, pair, job.options)
         estimate_ms = 1000 * (time.perf_counter() - start_s)
         names = tuple(picture.name for picture in pictures)
-        model = str(order.backend.model)
+        model = str(job.backend.model)
         if matcher.provider != CPU:
             model = f"{model} on {matcher.provider}"
         summary = summarize(pair, estimate, pictures=names, model=model, estimate_ms=estimate_ms)
@@ -169,17 +169,17 @@ def make_depth(pictures: Sequence[Path], out: Path, order: DepthOrder) -> tuple[
     return summary, notes
 
 
-def order_facts(order: DepthOrder) -> dict[str, Any]:
+def job_facts(job: DepthJob) -> dict[str, Any]:
     """All that decides the results of a pair beside its pictures, files by what is in them.
 
     What it is computed with does not: a batch whose GPU fails can be finished on the processor.
     """
-    model, calibration = str(order.backend.model), order.request.calibration
+    model, calibration = str(job.backend.model), job.request.calibration
     if model.endswith(".onnx"):
         with reading(model, "a model"):
             model = _by_content(model, Path(model).read_bytes())
-    facts = {"stereoweave": __version__, "model": model, **asdict(order.options)}
-    facts |= {"files": order.files, "always": order.always, **asdict(order.request)}
+    facts = {"stereoweave": __version__, "model": model, **asdict(job.options)}
+    facts |= {"files": job.files, "always": job.always, **asdict(job.request)}
     if calibration:
         facts["calibration"] = _by_content(calibration, calibration_bytes(calibration))
     return facts
@@ -194,9 +194,9 @@ def needs_camera(file: str) -> bool:
     return file.startswith(("depth.", "cloud.", "mesh."))
 
 
-def _files_of(order: DepthOrder, pair: StereoPair) -> tuple[list[str], list[str]]:
+def _files_of(job: DepthJob, pair: StereoPair) -> tuple[list[str], list[str]]:
     """What is to be written of a pair, and lines to tell; an error where it cannot be."""
-    wanted, notes = {*order.always, *order.files}, []
+    wanted, notes = {*job.always, *job.files}, []
     if pair.camera:
         wanted.add("depth.png")
     if ALL in wanted:

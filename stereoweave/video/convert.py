@@ -53,7 +53,7 @@ PACKINGS = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Order:
+class VideoJob:
     """What a film is made into: one of depth, depth16, position and layout.
 
     Attributes:
@@ -173,7 +173,7 @@ class Survey(NamedTuple):
 
 
 @dataclass
-class Tally:
+class VideoTally:
     """What was met on the way: frames, cuts, and frames with a problem, of which the first ones are named."""
 
     frames: int = 0
@@ -190,14 +190,16 @@ class Tally:
                 self.named.append(f"{_clock(frame.time)} {frame.problem}")
 
 
-def make_film(footage: Footage, sources: Sequence[Path], out: Path, order: Order, console: Console) -> Tally:
+def make_film(
+    footage: Footage, sources: Sequence[Path], out: Path, job: VideoJob, console: Console
+) -> VideoTally:
     """Writes the film that was ordered; one that was begun and interrupted goes on after its last part.
 
     Args:
         footage: The film to make it from.
         sources: What the footage was opened from, to go on only while it is the same.
         out: The file to write; its ending chooses the container.
-        order: What it is made into.
+        job: What it is made into.
         console: Where progress is told, and before it what seems amiss with the film.
 
     Returns:
@@ -207,27 +209,27 @@ def make_film(footage: Footage, sources: Sequence[Path], out: Path, order: Order
         StereoweaveError: `out` cannot be such a film, is in use, or cannot be written, for instance on a full
             disk.
     """
-    _check_out(out, order, footage, sources)
-    matcher = order.backend.matcher()
+    _check_out(out, job, footage, sources)
+    matcher = job.backend.matcher()
     recorder = Recorder(
-        encoding=GREY16 if order.depth16 else H264,
+        encoding=GREY16 if job.depth16 else H264,
         time_base=footage.time_base,
         # FFmpeg's fractions have 32 bits.
         rate=footage.rate.limit_denominator(100_000),
-        packing=PACKINGS.get(order.layout or ""),
-        threads=thread_count(order.backend.threads),
+        packing=PACKINGS.get(job.layout or ""),
+        threads=thread_count(job.backend.threads),
     )
     with (
         lock_output(out),
-        growing(out, _settings(order, footage, sources)) as parts,
+        growing(out, _settings(job, footage, sources)) as parts,
         progress(console) as bar,
     ):
         if parts.files:
-            maker = _Maker.from_state(order, matcher, parts.state())
+            maker = _Maker.from_state(job, matcher, parts.state())
         else:
             survey, lines = _look(footage, matcher, bar)
-            maker = _Maker(order, matcher, survey)
-            for line in [*lines, *order.loses(survey)]:
+            maker = _Maker(job, matcher, survey)
+            for line in [*lines, *job.loses(survey)]:
                 console.print(line, markup=False, highlight=False, soft_wrap=True)
         done, total = maker.tally.frames, footage.frame_count
         shown = bar.add_task(out.name, total=total, completed=done, loss="", rate="")
@@ -236,27 +238,27 @@ def make_film(footage: Footage, sources: Sequence[Path], out: Path, order: Order
             part = islice(chain([first], frames), round(_PART_S * footage.rate) or 1)
             with parts.next(maker.state) as path:
                 recorder.write_part(path, maker.pictures(part, bar, shown))
-        recorder.join(parts.files, footage.sound, out, order.says(maker.survey))
+        recorder.join(parts.files, footage.sound, out, job.says(maker.survey))
     return maker.tally
 
 
 class _Maker:
     """Makes a picture of each frame, and can go on where it was left."""
 
-    def __init__(self, order: Order, matcher: Matcher, survey: Survey) -> None:
-        self.survey, self.tally = survey, Tally()
+    def __init__(self, job: VideoJob, matcher: Matcher, survey: Survey) -> None:
+        self.survey, self.tally = survey, VideoTally()
         self._options = MatchOptions(range_px=survey.within_px)
-        self._order, self._matcher, self._steadier = order, matcher, Steadier(order.backend.threads)
+        self._job, self._matcher, self._steadier = job, matcher, Steadier(job.backend.threads)
 
     @classmethod
-    def from_state(cls, order: Order, matcher: Matcher, state: dict[str, np.ndarray]) -> "_Maker":
+    def from_state(cls, job: VideoJob, matcher: Matcher, state: dict[str, np.ndarray]) -> "_Maker":
         """One that goes on as the one whose `state` this was would have."""
         low_px, high_px, middle_px, *within_px = state.pop("survey_px").tolist()
         survey = Survey((low_px, high_px), middle_px, (within_px[0], within_px[1]) if within_px else None)
-        maker = cls(order, matcher, survey)
+        maker = cls(job, matcher, survey)
         frames, cuts, problems = state.pop("tally").tolist()
-        maker.tally = Tally(frames, cuts, problems, state.pop("named").tolist())
-        maker._steadier = Steadier.from_state(state, order.backend.threads)
+        maker.tally = VideoTally(frames, cuts, problems, state.pop("named").tolist())
+        maker._steadier = Steadier.from_state(state, job.backend.threads)
         return maker
 
     def state(self) -> dict[str, np.ndarray]:
@@ -282,7 +284,7 @@ class _Maker:
             self.tally.note(frame)
             self.tally.cuts = self._steadier.cuts
             bar.update(shown, completed=self.tally.frames)
-            yield frame.time, self._order.picture(pair, estimate, self.survey)
+            yield frame.time, self._job.picture(pair, estimate, self.survey)
 
 
 def _look(footage: Footage, matcher: Matcher, bar: Progress) -> tuple[Survey, list[str]]:
@@ -349,8 +351,8 @@ def _grey16(disparity_px: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]
     return np.clip(np.rint(_STEPS_PER_PX * disparity_px), 1, 65535).astype(np.uint16)
 
 
-def _check_out(out: Path, order: Order, footage: Footage, sources: Sequence[Path]) -> None:
-    if order.depth16 and out.suffix.lower() != ".mkv":
+def _check_out(out: Path, job: VideoJob, footage: Footage, sources: Sequence[Path]) -> None:
+    if job.depth16 and out.suffix.lower() != ".mkv":
         raise StereoweaveError(f"{out}: expected the ending .mkv for depth in 16 bits, found {out.suffix!r}")
     for source in sources:
         if source.exists() and out.exists() and out.samefile(source):
@@ -358,19 +360,19 @@ def _check_out(out: Path, order: Order, footage: Footage, sources: Sequence[Path
     check_film(out, footage.sound)
 
 
-def _settings(order: Order, footage: Footage, sources: Sequence[Path]) -> dict[str, object]:
+def _settings(job: VideoJob, footage: Footage, sources: Sequence[Path]) -> dict[str, object]:
     """All that the film depends on but for what computes it, as users call it, in words that JSON has."""
-    model = Path(order.backend.model)
+    model = Path(job.backend.model)
     return {
-        "--depth": order.depth,
-        "--depth16": order.depth16,
-        "--position": order.position,
-        "--layout": order.layout,
-        "--strength": order.strength,
-        "--convergence": order.convergence_px,
+        "--depth": job.depth,
+        "--depth16": job.depth16,
+        "--position": job.position,
+        "--layout": job.layout,
+        "--strength": job.strength,
+        "--convergence": job.convergence_px,
         "--arrangement": footage.arrangement,
         "--rate": str(footage.rate),
-        "--model": _known_by(model) if model.exists() else str(order.backend.model),
+        "--model": _known_by(model) if model.exists() else str(job.backend.model),
         "FILM": [_known_by(source) for source in sources],
         "stereoweave": __version__,
     }

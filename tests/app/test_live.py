@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stereoweave.app.live import Capture, Screen, Tally, composed, followed, range_words, show
+from stereoweave.app.live import Capture, LiveTally, Screen, composed, followed, range_words, show
 from stereoweave.cameras.calibration_files import read_rig
 from stereoweave.cli.live import live
 from stereoweave.errors import FormatError, StereoweaveError
@@ -241,7 +241,7 @@ def test_a_tally_counts_frames_their_rate_and_how_long_they_took(tmp_path):
     with Capture([write_film(tmp_path / "film.avi", greys(1))]) as capture:
         moment = capture.newest(-1)
     assert moment is not None
-    tally = Tally()
+    tally = LiveTally()
     assert tally.line() == "nothing was shown"
     for number, (taken_s, now_s) in enumerate([(0.0, 0.5), (0.75, 1.0), (2.25, 2.5)]):
         tally.add(moment._replace(number=2 * number, taken_s=taken_s), now_s)
@@ -255,7 +255,7 @@ def test_what_is_shown_of_two_films_is_their_left_picture_and_its_disparity(tmp_
     # calib.txt, for pictures of half its size.
     calibration = "cam0=[300 0 159.5; 0 300 119.5; 0 0 1]\ncam1=[300 0 159.5; 0 300 119.5; 0 0 1]\n"
     (tmp_path / "calib.txt").write_text(f"{calibration}doffs=0\nbaseline=100\nwidth=320\nheight=240\n")
-    tally = Tally()
+    tally = LiveTally()
     with Screen(0) as screen, Capture(sources) as capture:
         show(capture, screen, Matcher(), tally, rig=read_rig(tmp_path / "calib.txt"))
         picture = next(parts(asked(screen.url, "/stream")))

@@ -28,14 +28,14 @@ from stereoweave.io.output_lock import lock_output
 from stereoweave.io.stores import store_at
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher
-from stereoweave.outputs.results import DepthOrder, make_depth
+from stereoweave.outputs.results import DepthJob, make_depth
 from stereoweave.system.ray_engine import Engine, connect
 from stereoweave.video.writer import parts_folder
 
 pytestmark = pytest.mark.system
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-ORDER = DepthOrder(always=("disparity.pfm", "confidence.png"))
+JOB = DepthJob(always=("disparity.pfm", "confidence.png"))
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_bad_pairs_become_rows_and_the_next_run_makes_what_is_missing_changed_or
     whole = {path: path.read_bytes() for path in (bad, odd)}
     bad.write_bytes(whole[bad][:500])
     write_image(odd, read_image(odd)[:-4])
-    tally = run_cluster(source, out, ORDER, engine)
+    tally = run_cluster(source, out, JOB, engine)
     assert (tally.made, tally.there, tally.failed, tally.manifest) == (6, 0, 3, str(out / "manifest"))
     rows = manifest(out)
     assert list(sorted(rows)) == [*numbered(8), "alone"]
@@ -91,8 +91,8 @@ def test_bad_pairs_become_rows_and_the_next_run_makes_what_is_missing_changed_or
     assert dict(tally.named) == {name: rows[name]["error"] for name in ("01", "02", "alone")}
 
     pictures = [source / side / "03.png" for side in ("left", "right")]
-    summary, notes = make_depth(pictures, tmp_path / "alone", replace(ORDER, backend=Backend(threads=1)))
-    for file in ORDER.always:
+    summary, notes = make_depth(pictures, tmp_path / "alone", replace(JOB, backend=Backend(threads=1)))
+    for file in JOB.always:
         assert (out / "03" / file).read_bytes() == (tmp_path / "alone" / file).read_bytes()
     row = rows["03"]
     assert (row["width_px"], row["height_px"], row["error"]) == (64, 48, None)
@@ -107,7 +107,7 @@ def test_bad_pairs_become_rows_and_the_next_run_makes_what_is_missing_changed_or
     write_image(source / "left" / "04.png", read_image(source / "left" / "05.png"))
     (out / "06" / "confidence.png").unlink()
     write_pairs(source, ["new"])
-    tally = run_cluster(source, out, ORDER, engine)
+    tally = run_cluster(source, out, JOB, engine)
     assert (tally.made, tally.there, tally.failed) == (5, 4, 1)  # 01, 02, 04, 06, new; alone is still missing
     after = made_at_ns(out)
     assert {name for name in after if after[name] != before.get(name)} == {"01", "02", "04", "06", "new"}
@@ -137,15 +137,15 @@ def test_killed_workers_and_a_killed_driver_lose_nothing_and_double_nothing(ray_
     wait_for(6)
     with halted(driver):
         with pytest.raises(OutputInUseError, match=f"{out}: .* found one that is in use"):
-            run_cluster(source, out, DepthOrder(), engine)
+            run_cluster(source, out, DepthJob(), engine)
         driver.kill()
     assert driver.wait() == -signal.SIGKILL
     assert 6 <= parts() < 20
     kept = made_at_ns(out)
     complete = set(manifest(out))
 
-    order = DepthOrder()
-    tally = run_cluster(source, out, order, engine)
+    job = DepthJob()
+    tally = run_cluster(source, out, job, engine)
     assert (tally.made + tally.there, tally.failed) == (40, 0)
     assert tally.there >= len(complete) > 0
     rows = manifest(out)
@@ -180,7 +180,7 @@ def test_a_pair_that_kills_its_process_becomes_a_row_and_costs_no_other(tmp_path
     monkeypatch.setattr("stereoweave.batch.manifest._CHUNKS_OF_A_WORKER", 1)
     [first] = extend_plan(source, out, workers=1).chunks
     out.write_bytes(f"begun/{first:08d}.json", b"{}")  # as the worker leaves it that is killed with the pair
-    counts = Deadly(source, out, ORDER)([first])
+    counts = Deadly(source, out, JOB)([first])
     assert (counts.made, counts.failed) == (2, 1)
     rows = read_rows(out, first)
     assert [row["error"] for row in rows.values()] == [
@@ -194,7 +194,7 @@ def test_a_pair_that_kills_its_process_becomes_a_row_and_costs_no_other(tmp_path
 class Stillborn(Worker):
     """A worker of which every further process is killed while it starts."""
 
-    def _order(self):
+    def _local_job(self):
         os.kill(os.getpid(), signal.SIGKILL)
 
 
@@ -218,7 +218,7 @@ def places(tmp_path, monkeypatch):
 
 def test_rows_that_a_killed_worker_noted_count_while_their_results_are_there(places):
     source, out, chunk = places
-    worker = Worker(source, out, ORDER)
+    worker = Worker(source, out, JOB)
     planned = read_chunk(out, chunk)
     rows = [worker._empty_row(one) | {"checks": ["noted"]} for one in planned[:2]]
     rows[0]["files"] = ["disparity.pfm"]  # which is not there
@@ -239,7 +239,7 @@ def test_processes_that_are_killed_while_they_start_end_the_run(places, monkeypa
     with pytest.raises(
         StereoweaveError, match="loads the network, found it killed 2 times in a row; is the mem"
     ):
-        Stillborn(source, out, ORDER)([chunk])
+        Stillborn(source, out, JOB)([chunk])
 
 
 def test_a_pair_that_is_too_much_for_the_provider_is_a_row_and_one_that_fails_always_ends_the_run(
@@ -249,13 +249,13 @@ def test_a_pair_that_is_too_much_for_the_provider_is_a_row_and_one_that_fails_al
     with monkeypatch.context() as patch:
         patch.setattr(Matcher, "estimate_many", fails)
         with pytest.raises(ProviderError, match=r"^provider cpu: .* it failed: lost$"):
-            Overtaxed(source, out, ORDER)([chunk])
+            Overtaxed(source, out, JOB)([chunk])
     assert read_rows(out, chunk) == {}
     out.remove(f"begun/{chunk:08d}.json")
-    counts = Overtaxed(source, out, ORDER)([chunk])
+    counts = Overtaxed(source, out, JOB)([chunk])
     assert (counts.made, counts.failed) == (2, 1)
     assert read_rows(out, chunk)["01"]["error"].endswith("found that it failed: alloc")
-    counts = Worker(source, out, ORDER)([chunk])
+    counts = Worker(source, out, JOB)([chunk])
     assert (counts.made, counts.there) == (1, 2)
 
 
@@ -266,19 +266,19 @@ def fails(*_: object, **__: object) -> None:
 def test_a_provider_that_a_workers_machine_has_not_ends_the_run_and_is_no_row(places):
     source, out, chunk = places
     with pytest.raises(MatcherError, match="provider directml: expected an ONNX Runtime that has it"):
-        Worker(source, out, replace(ORDER, backend=Backend(provider="directml")))([chunk])
+        Worker(source, out, replace(JOB, backend=Backend(provider="directml")))([chunk])
     assert read_rows(out, chunk) == {}
 
 
 def test_a_machine_that_does_not_see_a_folder_is_named(places, tmp_path):
     source, out, _ = places
-    worker = Worker(source, out, ORDER)
+    worker = Worker(source, out, JOB)
     assert _ready(worker) is worker
     for places_there in ((store_at(tmp_path / "none"), out), (source, store_at(tmp_path / "none"))):
         with pytest.raises(
             StereoweaveError, match="none: expected a folder, found no such folder; all"
         ) as told:
-            _ready(Worker(*places_there, ORDER))
+            _ready(Worker(*places_there, JOB))
         assert str(told.value).startswith(f"{platform.node()}: ")
 
 
@@ -292,7 +292,7 @@ def test_a_film_goes_on_without_the_parts_of_another(tmp_path):
     np.savez(parts / "state-000001.npz")
     (parts / "settings.json").write_text("{}")
     [chunk] = extend_plan(source, out, workers=1).chunks
-    assert Worker(source, out, ORDER)([chunk]).made == 1
+    assert Worker(source, out, JOB)([chunk]).made == 1
     [row] = read_rows(out, chunk).values()
     assert (row["files"], row["error"], row["width_px"]) == ([FILM], None, 160)
     assert len(packets(tmp_path / "out" / "sea.mkv" / FILM, "video")) == 3
@@ -308,7 +308,7 @@ def test_a_film_that_another_process_makes_is_a_row_with_an_error_and_keeps_its_
     (parts_folder(film) / "000001.nut").touch()
     [chunk] = extend_plan(source, out, workers=1).chunks
     with lock_output(film):
-        assert Worker(source, out, ORDER)([chunk]).failed == 1
+        assert Worker(source, out, JOB)([chunk]).failed == 1
     [row] = read_rows(out, chunk).values()
     assert "found one that is in use" in row["error"]
     assert [path.name for path in parts_folder(film).iterdir()] == ["000001.nut"]
@@ -328,7 +328,7 @@ def test_what_killed_workers_left_is_removed_after_a_while(tmp_path):
 def test_a_file_beside_that_is_called_like_a_network_is_none(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("small").write_bytes(b"something else")
-    assert list(_carried(DepthOrder())) == []
+    assert list(_carried(DepthJob())) == []
 
 
 def test_a_name_that_is_no_text_is_told(tmp_path):
@@ -341,19 +341,19 @@ def test_a_name_that_is_no_text_is_told(tmp_path):
 
 def test_another_runs_destination_is_refused_and_so_is_a_source_with_nothing_in_it(engine, tmp_path):
     source, out = write_pairs(tmp_path / "pairs", ["00"]), tmp_path / "out"
-    assert run_cluster(source, out, ORDER, engine).made == 1
+    assert run_cluster(source, out, JOB, engine).made == 1
     with pytest.raises(StereoweaveError, match=r"batch.json: expected always = .*, found .* another folder"):
-        run_cluster(source, out, DepthOrder(), engine)
+        run_cluster(source, out, DepthJob(), engine)
     other = write_pairs(tmp_path / "other", ["00"])
     with pytest.raises(StereoweaveError, match=r"batch.json: expected source = .*other.*, found .*pairs"):
-        run_cluster(other, out, ORDER, engine)
+        run_cluster(other, out, JOB, engine)
     with pytest.raises(StereoweaveError, match=r"other: expected a new folder, or one with a batch.json"):
-        run_cluster(source, other, ORDER, engine)
+        run_cluster(source, other, JOB, engine)
     with pytest.raises(StereoweaveError, match="none: expected a folder, found no such folder"):
-        run_cluster(tmp_path / "none", tmp_path / "new", ORDER, engine)
+        run_cluster(tmp_path / "none", tmp_path / "new", JOB, engine)
     (tmp_path / "empty").mkdir()
     with pytest.raises(StereoweaveError, match="expected pairs of pictures or films in it, found none"):
-        run_cluster(tmp_path / "empty", tmp_path / "new", ORDER, engine)
+        run_cluster(tmp_path / "empty", tmp_path / "new", JOB, engine)
 
 
 def test_pairs_go_from_a_bucket_to_a_bucket_with_a_calibration_and_a_bad_one_is_told_by_its_url(
@@ -366,20 +366,20 @@ def test_pairs_go_from_a_bucket_to_a_bucket_with_a_calibration_and_a_bad_one_is_
         store.put(path, path.relative_to(local).as_posix())
     for name in ("left.png", "right.png", "calib.txt"):
         store.put(EXAMPLES / name, f"room/{name}")
-    tally = run_cluster(f"{bucket}/in", f"{bucket}/out", ORDER, engine)
+    tally = run_cluster(f"{bucket}/in", f"{bucket}/out", JOB, engine)
     assert (tally.made, tally.failed, tally.manifest) == (3, 1, f"{bucket}/out/manifest")
     rows = manifest(f"{bucket}/out")
     assert rows["02"]["error"].startswith(f"{bucket}/in/right/02.png: expected a picture")
     assert "depth.png" in rows["room"]["files"]
     out = store_at(f"{bucket}/out")
     pictures = [local / side / "00.png" for side in ("left", "right")]
-    make_depth(pictures, tmp_path / "alone", replace(ORDER, backend=Backend(threads=1)))
-    for file in ORDER.always:
+    make_depth(pictures, tmp_path / "alone", replace(JOB, backend=Backend(threads=1)))
+    for file in JOB.always:
         assert out.read_bytes(f"00/{file}") == (tmp_path / "alone" / file).read_bytes()
-    tally = run_cluster(f"{bucket}/in", f"{bucket}/out", ORDER, engine)
+    tally = run_cluster(f"{bucket}/in", f"{bucket}/out", JOB, engine)
     assert (tally.made, tally.there, tally.failed) == (0, 3, 1)
     with pytest.raises(StereoweaveError, match="expected a bucket, found none named nobodys"):
-        run_cluster("s3://nobodys/in", f"{bucket}/new", ORDER, engine)
+        run_cluster("s3://nobodys/in", f"{bucket}/new", JOB, engine)
 
 
 def test_the_command_tells_how_it_went(engine, tmp_path, capsys):

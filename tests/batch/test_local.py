@@ -16,12 +16,12 @@ import pytest
 from other_processes import halted
 from rich.console import Console
 
-from stereoweave.batch.local import DONE_FILE, Tally, depth_of_many, run_batch
+from stereoweave.batch.local import DONE_FILE, LocalTally, depth_of_many, run_batch
 from stereoweave.cli.root import main
 from stereoweave.errors import OutputInUseError, StereoweaveError
 from stereoweave.io.files import read_image, read_pixels, write_image
 from stereoweave.matching.backend import Backend
-from stereoweave.outputs.results import DepthOrder, make_depth
+from stereoweave.outputs.results import DepthJob, make_depth
 from stereoweave.pictures.pair_finding import FoundPairs, NamedPair, pairs_in
 from stereoweave.pictures.prepare import Request
 from stereoweave.system.threads import usable_cores
@@ -29,18 +29,18 @@ from stereoweave.system.threads import usable_cores
 pytestmark = pytest.mark.system
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-ORDER = DepthOrder(backend=Backend(threads=1), always=("disparity.pfm", "preview.png", "confidence.png"))
+JOB = DepthJob(backend=Backend(threads=1), always=("disparity.pfm", "preview.png", "confidence.png"))
 PROGRAM = """
 import sys
 from pathlib import Path
 from stereoweave.batch.local import depth_of_many
 from stereoweave.matching.backend import Backend
 from stereoweave.pictures.pair_finding import pairs_in
-from stereoweave.outputs.results import DepthOrder
+from stereoweave.outputs.results import DepthJob
 
 if __name__ == "__main__":
-    order = DepthOrder(backend=Backend(threads=1), always=("disparity.pfm", "preview.png", "confidence.png"))
-    sys.exit(depth_of_many(pairs_in(Path(sys.argv[1])), Path(sys.argv[2]), order, processes=2))
+    job = DepthJob(backend=Backend(threads=1), always=("disparity.pfm", "preview.png", "confidence.png"))
+    sys.exit(depth_of_many(pairs_in(Path(sys.argv[1])), Path(sys.argv[2]), job, processes=2))
 """
 
 
@@ -82,11 +82,11 @@ def write_pairs(folder: Path, count: int, size_px=(96, 64)) -> Path:
     return folder
 
 
-def batch(folder: Path, out: Path, order: DepthOrder = ORDER, **options) -> tuple[Tally, str]:
+def batch(folder: Path, out: Path, job: DepthJob = JOB, **options) -> tuple[LocalTally, str]:
     """The tally, and what was shown meanwhile."""
     shown = io.StringIO()
     options.setdefault("pairs", pairs_in(folder).pairs)
-    return run_batch(out=out, order=order, console=Console(file=shown), **options), shown.getvalue()
+    return run_batch(out=out, job=job, console=Console(file=shown), **options), shown.getvalue()
 
 
 def made_at_ns(out: Path) -> dict[str, int]:
@@ -115,7 +115,7 @@ def test_a_bad_pair_is_told_and_the_others_are_as_they_are_alone_and_the_next_ru
     assert str(bad) in reason
     assert f"01: {reason}\n" in shown
 
-    make_depth((folder / "left" / "02.png", folder / "right" / "02.png"), tmp_path / "alone", ORDER)
+    make_depth((folder / "left" / "02.png", folder / "right" / "02.png"), tmp_path / "alone", JOB)
     for file in ("disparity.pfm", "preview.png", "confidence.png"):
         assert (out / "02" / file).read_bytes() == (tmp_path / "alone" / file).read_bytes()
     rows = table(out)
@@ -129,7 +129,7 @@ def test_a_bad_pair_is_told_and_the_others_are_as_they_are_alone_and_the_next_ru
     write_image(folder / "left" / "03.png", read_image(folder / "left" / "03.png")[::-1])
     (out / "00" / "disparity.pfm").unlink()
     tally, shown = batch(folder, out, processes=1)
-    assert tally == Tally(done=3, skipped=1, failed=())
+    assert tally == LocalTally(done=3, skipped=1, failed=())
     after = made_at_ns(out)
     assert {name for name in after if after[name] != before.get(name)} == {"00", "01", "03"}
     assert [row["error"] for row in table(out).values()] == [""] * 4
@@ -165,7 +165,7 @@ def test_a_pair_is_there_only_with_its_pictures_and_its_mark_unharmed(tmp_path, 
     pairs[1].pictures[0].unlink()
     tally, _ = batch(folder, out, pairs=pairs, processes=1)
     assert (tally.done, tally.skipped, [name for name, _ in tally.failed]) == (1, 1, ["01"])
-    assert depth_of_many(FoundPairs(pairs[:1], ("a note",)), out, ORDER) == 0
+    assert depth_of_many(FoundPairs(pairs[:1], ("a note",)), out, JOB) == 0
     told = capsys.readouterr()
     assert told.out.splitlines()[0] == f"{out}: 1 pair: 0 made, 1 were there"
     assert told.err.splitlines()[0] == "a note"
@@ -178,8 +178,8 @@ def test_several_processes_have_a_thread_each_and_a_single_one_has_all_cores(
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
     folder = write_pairs(tmp_path / "pairs", 2)
     pairs = [Noting(pair.name, pair.pictures) for pair in pairs_in(folder).pairs]
-    order = DepthOrder(always=("disparity.pfm",))
-    assert batch(folder, tmp_path / "out", order, pairs=pairs, processes=processes)[0].done == 2
+    job = DepthJob(always=("disparity.pfm",))
+    assert batch(folder, tmp_path / "out", job, pairs=pairs, processes=processes)[0].done == 2
     notes = [pair.pictures[0].with_suffix(".txt").read_text() for pair in pairs]
     assert notes == [f"{threads} {threads}"] * 2
     assert os.environ["OPENBLAS_NUM_THREADS"] == "7"
@@ -217,7 +217,7 @@ def test_a_killed_batch_goes_on_and_so_does_an_interrupted_one_but_none_beside_a
     assert "Traceback" not in errors
     assert not list(out.glob(".*"))
 
-    assert depth_of_many(pairs_in(folder), out, ORDER, processes=2) == 0
+    assert depth_of_many(pairs_in(folder), out, JOB, processes=2) == 0
     assert capsys.readouterr().out.splitlines() == [
         f"{out}: 24 pairs: {24 - len(before)} made, {len(before)} were there",
         f"table: {out / 'summary.csv'}",
@@ -233,7 +233,7 @@ def test_a_pair_that_kills_its_process_is_named_and_costs_no_other(tmp_path, cap
     folder, out = write_pairs(tmp_path / "pairs", 3), tmp_path / "out"
     first, second, third = pairs_in(folder).pairs
     pairs = [first, Deadly(second.name, second.pictures), third]
-    assert depth_of_many(FoundPairs(pairs), out, ORDER, processes=2, as_json=True) == 1
+    assert depth_of_many(FoundPairs(pairs), out, JOB, processes=2, as_json=True) == 1
     told = capsys.readouterr()
     assert json.loads(told.out) == {
         "done": 2,
@@ -249,23 +249,21 @@ def test_another_order_or_another_folder_is_refused_before_anything_starts(tmp_p
     folder, out = write_pairs(tmp_path / "pairs", 1), tmp_path / "out"
     calibration = tmp_path / "calib.txt"
     calibration.write_text("first")
-    order = DepthOrder(request=Request(calibration=calibration))
-    assert batch(folder, out, order, pairs=[])[0] == Tally(done=0, skipped=0, failed=())
+    job = DepthJob(request=Request(calibration=calibration))
+    assert batch(folder, out, job, pairs=[])[0] == LocalTally(done=0, skipped=0, failed=())
     with pytest.raises(StereoweaveError, match='batch.json: expected model = "base", .* found "small"'):
-        batch(
-            folder, out, DepthOrder(request=Request(calibration=calibration), backend=Backend(model="base"))
-        )
+        batch(folder, out, DepthJob(request=Request(calibration=calibration), backend=Backend(model="base")))
     calibration.write_text("second")
     with pytest.raises(
         StereoweaveError, match=r"expected calibration = .calib.txt \w{12}., .* another folder"
     ):
-        batch(folder, out, order)
+        batch(folder, out, job)
     with pytest.raises(
         StereoweaveError, match="expected a new folder, or one with a batch.json, found left in"
     ):
         batch(folder, folder)
     with pytest.raises(StereoweaveError, match="nonsense"):
-        batch(folder, tmp_path / "new", DepthOrder(backend=Backend(model="nonsense")))
+        batch(folder, tmp_path / "new", DepthJob(backend=Backend(model="nonsense")))
     assert not (tmp_path / "new").exists()
 
 
@@ -275,14 +273,14 @@ def test_a_scenes_own_calibration_gives_its_depth_in_metres_unless_one_is_named_
     for name in ("left.png", "right.png", "calib.txt"):
         (folder / "room" / name).write_bytes((EXAMPLES / name).read_bytes())
     tally, _ = batch(folder, out, processes=1)
-    assert tally == Tally(done=1, skipped=0, failed=())
+    assert tally == LocalTally(done=1, skipped=0, failed=())
     own_mm = read_pixels(out / "room" / "depth.png", "I;16")
 
     calibration = tmp_path / "twice.txt"
     words = (EXAMPLES / "calib.txt").read_text().replace("baseline=100", "baseline=200")
     calibration.write_text(words)
-    order = DepthOrder(request=Request(calibration=calibration))
-    batch(folder, tmp_path / "other", order, processes=1)
+    job = DepthJob(request=Request(calibration=calibration))
+    batch(folder, tmp_path / "other", job, processes=1)
     other_mm = read_pixels(tmp_path / "other" / "room" / "depth.png", "I;16")
     assert np.median(other_mm / own_mm) == pytest.approx(2, rel=1e-3)
 

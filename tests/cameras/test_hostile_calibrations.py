@@ -10,7 +10,7 @@ from hostile_calibrations import HARMLESS, HOSTILE, RIG, json_of, xml_of, yaml_o
 from stereoweave.cameras.calibration_files import read_rig
 from stereoweave.errors import FormatError
 from stereoweave.io.files import MOST_SMALL_BYTES
-from stereoweave.outputs.results import DepthOrder, order_facts
+from stereoweave.outputs.results import DepthJob, job_facts
 from stereoweave.pictures.prepare import Request
 
 WITHOUT_LIMIT = ["/dev/zero", "/dev/urandom"]
@@ -92,7 +92,7 @@ def test_what_a_batch_writes_down_of_its_calibration_passes_the_same_gate(tmp_pa
     large.write_bytes(HOSTILE["size: json of a megabyte"])
     for path, found in ((Path("/dev/zero"), "found a pipe or a device"), (large, "bytes, found more")):
         with pytest.raises(FormatError, match=found):
-            order_facts(DepthOrder(request=Request(calibration=path)))
+            job_facts(DepthJob(request=Request(calibration=path)))
 
 
 def test_the_file_beside_opencvs_two_passes_the_same_gate(tmp_path):

@@ -14,7 +14,7 @@ from stereoweave.io.files import read_pair, write_image
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.providers import PROVIDERS
-from stereoweave.outputs.results import DepthOrder, make_depth, order_facts
+from stereoweave.outputs.results import DepthJob, job_facts, make_depth
 from stereoweave.system import jit as compiling
 
 HERE = [name for name, known in PROVIDERS.items() if known.name in onnxruntime.get_available_providers()]
@@ -148,14 +148,14 @@ def test_a_graph_that_cannot_take_the_picture_is_the_files_fault(tmp_path):
 
 @pytest.mark.parametrize("provider", HERE)
 def test_a_result_says_what_it_was_computed_on_unless_it_is_the_processor(pictures, tmp_path, provider):
-    order = DepthOrder(backend=Backend(provider=provider), always=("disparity.pfm",))
-    summary, _ = make_depth(pictures, tmp_path / "out", order)
+    job = DepthJob(backend=Backend(provider=provider), always=("disparity.pfm",))
+    summary, _ = make_depth(pictures, tmp_path / "out", job)
     assert summary.model == ("small" if provider == "cpu" else f"small on {provider}")
 
 
 def test_a_batch_whose_gpu_failed_can_be_finished_on_the_processor():
-    order = DepthOrder()
-    assert order_facts(replace(order, backend=Backend(provider="cuda"))) == order_facts(order)
+    job = DepthJob()
+    assert job_facts(replace(job, backend=Backend(provider="cuda"))) == job_facts(job)
 
 
 def test_tensorrt_keeps_its_engines_in_the_users_cache_where_there_is_one(tmp_path, monkeypatch):

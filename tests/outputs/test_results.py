@@ -15,7 +15,7 @@ from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.report import summarize
-from stereoweave.outputs.results import ALWAYS, FILES, DepthOrder, Result, make_depth, needs_camera
+from stereoweave.outputs.results import ALWAYS, FILES, DepthJob, Result, make_depth, needs_camera
 from stereoweave.pictures.prepare import Request
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
@@ -23,7 +23,7 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 CALIBRATION = "cam0=[100 0 48; 0 100 32; 0 0 1]\ndoffs=0\nbaseline=80\nwidth=96\nheight=64\n"
 CAMERA = StereoCamera(focal_px=100.0, baseline_m=0.08, cx_px=48.0, cy_px=32.0)
 PICTURES = [Path("left.png"), Path("right.png")]
-PLAIN = DepthOrder(backend=Backend(threads=1))
+PLAIN = DepthJob(backend=Backend(threads=1))
 WITH_CAMERA = replace(PLAIN, request=Request(calibration=Path("calib.txt")))
 
 
@@ -112,18 +112,18 @@ def test_results_do_not_move_into_a_folder_that_another_command_writes_to(folder
 
 def test_an_unknown_file_is_told_with_those_that_there_are():
     with pytest.raises(StereoweaveError, match=r"^--write: .*disparity.npy.*mesh.glb.*found 'cloud.obj'$"):
-        DepthOrder(files=("depth.npy", "cloud.obj"))
+        DepthJob(files=("depth.npy", "cloud.obj"))
 
 
 @pytest.mark.parametrize("file", [file for file in FILES if needs_camera(file)])
 def test_metres_without_a_camera_are_refused_before_anything_is_written(folder, file):
     with pytest.raises(StereoweaveError, match=f"^{file}: .*--calib.*--focal-px and --baseline-m"):
-        make_depth(PICTURES, Path("out"), DepthOrder(files=(file,)))
+        make_depth(PICTURES, Path("out"), DepthJob(files=(file,)))
     assert not Path("out").exists()
 
 
 def test_all_without_a_camera_is_all_but_metres_and_says_so(folder):
-    _, notes = make_depth(PICTURES, Path("out"), DepthOrder(files=("all",)))
+    _, notes = make_depth(PICTURES, Path("out"), DepthJob(files=("all",)))
     assert names_in("out") == {*ALWAYS, "disparity.npy", "disparity.tiff"}
     assert [note for note in notes if "--focal-px and --baseline-m" in note] != []
 
@@ -138,8 +138,8 @@ def test_points_without_trimesh_name_the_extra_before_anything_is_written(folder
 def test_a_pair_without_a_point_gets_the_rest_and_a_line(folder):
     for name in PICTURES:
         Image.new("RGB", (96, 64)).save(name)
-    order = replace(WITH_CAMERA, files=("cloud.ply", "mesh.glb"))
-    _, notes = make_depth(PICTURES, Path("out"), order)
+    job = replace(WITH_CAMERA, files=("cloud.ply", "mesh.glb"))
+    _, notes = make_depth(PICTURES, Path("out"), job)
     assert names_in("out") == {*ALWAYS, "depth.png"}
     assert [note[:13] for note in notes if note.startswith("no ")] == ["no cloud.ply:", "no mesh.glb: "]
 
@@ -196,13 +196,13 @@ def test_the_summary_counts_what_the_left_picture_shows():
 
 def test_what_is_asked_of_the_estimate_is_handed_on(folder, matcher):
     found_px = {}
-    for name, order in {
+    for name, job in {
         "plain": PLAIN,
         "moved": replace(PLAIN, options=MatchOptions(range_px=(-40.0, 100.0))),
         "refined": replace(PLAIN, options=MatchOptions(refined=True)),
         "raw": replace(PLAIN, options=MatchOptions(raw=True)),
     }.items():
-        make_depth(PICTURES, Path(name), order)
+        make_depth(PICTURES, Path(name), job)
         found_px[name] = read_pfm(f"{name}/disparity.pfm")
     assert (found_px["moved"] != found_px["plain"]).any()
     for how in ("refined", "raw"):
