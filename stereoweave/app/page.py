@@ -261,7 +261,7 @@ class Page:
         }
 
     def _summary(self, kept: Kept, notes: Sequence[str] = ()) -> str:
-        return _told([numbers(kept.result.summary), *map(self._on_the_page, (*kept.notes, *notes))])
+        return _told([numbers(kept.result.summary), *map(self._on_the_page, (*kept.result.notes, *notes))])
 
     def _uploads(self, given: dict[Any, Any]) -> Uploads:
         arrangement, calibration = given[self._arrangement], given[self._calibration]

@@ -1,6 +1,5 @@
 """What the web page makes of a pair, without the page: a result that is kept, measured, drawn and written."""
 
-import time
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -10,16 +9,15 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from stereoweave.cameras.diagnosis import hints
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.colormap import colour_disparity, colour_range_px
 from stereoweave.matching.backend import Backend
-from stereoweave.matching.estimate import match
 from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.measure import distance
 from stereoweave.outputs.point_cloud import EmptyError, point_cloud, write_glb
-from stereoweave.outputs.report import Summary, shrunk, summarize
-from stereoweave.outputs.results import FILES, Result, needs_camera, write_files
+from stereoweave.outputs.report import Summary, shrunk
+from stereoweave.outputs.results import FILES, needs_camera, write_files
+from stereoweave.outputs.run import Result, run
 from stereoweave.pictures.prepare import Request, prepare
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoCamera
@@ -33,10 +31,9 @@ _NO_METRES = "For metres give a calibration file, or the focal length and how fa
 
 @dataclass(frozen=True, kw_only=True)
 class Kept:
-    """What a session keeps: its result, lines about it, what views are made of, and where its files are."""
+    """What a session keeps: its result, the renderer of its views, and the folder of its files."""
 
     result: Result
-    notes: tuple[str, ...]
     renderer: Renderer
     folder: Path
 
@@ -70,30 +67,19 @@ def matched(uploads: Uploads, folder: Path, tell: Callable[[float, str], None]) 
             raise StereoweaveError(f"{file.name} has been put away, as after an hour; give it again")
     tell(0.1, "reading")
     prepared = prepare(uploads.pictures, uploads.request)
-    pair = prepared.pair
-    height, width = pair.left.shape[:2]
+    height, width = prepared.pair.left.shape[:2]
     tell(0.3, f"matching {width}×{height} px")
-    start_s = time.perf_counter()
-    estimate = match(uploads.backend.matcher(), pair, MatchOptions(refined=True))
-    estimate_ms = 1000 * (time.perf_counter() - start_s)
-    names = tuple(picture.name for picture in uploads.pictures)
-    summary = summarize(
-        pair, estimate, pictures=names, model=str(uploads.backend.model), estimate_ms=estimate_ms
-    )
+    result = run(prepared, uploads.backend.matcher(), MatchOptions(refined=True))
     tell(0.6, "showing")
-    return Kept(
-        result=Result(pair=pair, estimate=estimate, summary=summary),
-        notes=prepared.notes,
-        renderer=Renderer(*shrunk(pair, estimate, _LONGER_SIDE_PX)),
-        folder=folder,
-    )
+    renderer = Renderer(*shrunk(result.pair, result.estimate, _LONGER_SIDE_PX))
+    return Kept(result=result, renderer=renderer, folder=folder)
 
 
 def write_all(kept: Kept) -> tuple[list[Path], list[str]]:
     """The result's files in all formats, and lines about those that could not be, and what is amiss."""
     result = kept.result
     names = [name for name in FILES if result.pair.camera or not needs_camera(name)]
-    notes = write_files(kept.folder, names, result) + hints(result.pair, result.estimate)
+    notes = write_files(kept.folder, names, result) + result.warnings()
     return [file for file in map(kept.folder.joinpath, names) if file.exists()], notes
 
 

@@ -78,6 +78,7 @@ class Matcher:
         provider: What the network is run on, a name in `providers.PROVIDERS`.
 
     Attributes:
+        model: The name or the path that it was loaded by.
         fixed_size: Height and width of the only pictures that the network takes; None where any will do.
         magnification: How many times larger than it is `matching.match` shows a pair to the network at most;
             `estimate` shows it as it is.
@@ -89,7 +90,8 @@ class Matcher:
     def __init__(
         self, model: str | Path = "small", *, threads: int | None = None, provider: str = CPU
     ) -> None:
-        self._path, self.threads, self.provider = model_file(model), threads, provider
+        self._path, self.model = model_file(model), str(model)
+        self.threads, self.provider = threads, provider
         mode = MODES.get(str(model))
         self.magnification = mode.magnification if mode else 1.0
         self._refines = mode is not None and mode.refined

@@ -7,20 +7,16 @@ infinite in all files of depth but the PNG, where it is 0 too.
 
 import hashlib
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
 
 from stereoweave import __version__
 from stereoweave.cameras.calibration_files import calibration_bytes
-from stereoweave.cameras.diagnosis import hints
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.colormap import colour_disparity, colour_range_px, grey_confidence
 from stereoweave.io.files import (
@@ -37,58 +33,19 @@ from stereoweave.io.files import (
 )
 from stereoweave.io.output_lock import lock_output
 from stereoweave.matching.backend import Backend
-from stereoweave.matching.estimate import match
 from stereoweave.matching.options import MatchOptions
-from stereoweave.matching.providers import CPU
 from stereoweave.outputs.point_cloud import (
     MOST_POINTS,
     NO_CAMERA,
-    Cloud,
     EmptyError,
-    Surface,
-    needed_camera,
     needing_the_mesh_extra,
-    point_cloud,
-    surface,
     write_glb,
     write_ply,
 )
-from stereoweave.outputs.report import Summary, summarize, write_report
+from stereoweave.outputs.report import Summary, write_report
+from stereoweave.outputs.run import Result, run
 from stereoweave.pictures.prepare import Request, prepare
-from stereoweave.stereo import Estimate, StereoPair
-
-
-@dataclass(frozen=True, kw_only=True)
-class Result:
-    """What the files are made of."""
-
-    pair: StereoPair
-    estimate: Estimate
-    summary: Summary
-    threads: int | None = None
-
-    @property
-    def seen(self) -> Bool[np.ndarray, "h w"]:
-        """Where the left picture shows something."""
-        seen = self.pair.left_seen
-        return np.ones(self.estimate.disparity_px.shape, bool) if seen is None else seen
-
-    def disparity_px(self, unknown: float = np.nan) -> Float32[np.ndarray, "h w"]:
-        """The left view's disparity, with `unknown` where there is none."""
-        return np.where(self.seen, self.estimate.disparity_px, np.float32(unknown)).astype(np.float32)
-
-    def depth_m(self, unknown: float = np.nan) -> Float[np.ndarray, "h w"]:
-        """Its depth, likewise."""
-        depth_m = needed_camera(self.pair).depth_m(self.estimate.disparity_px)
-        return np.where(self.seen, depth_m, np.float32(unknown))
-
-    @cached_property
-    def cloud(self) -> Cloud:
-        return point_cloud(self.pair, self.estimate)
-
-    @cached_property
-    def surface(self) -> Surface:
-        return surface(self.pair, self.estimate)
+from stereoweave.stereo import StereoPair
 
 
 def _write_preview(path: Path, result: Result) -> None:
@@ -152,21 +109,11 @@ def make_depth(pictures: Sequence[Path], out: Path, job: DepthJob) -> tuple[Summ
     """Write all results of a pair to `out` atomically; returns the summary and user-facing notes."""
     matcher = job.backend.matcher()
     prepared = prepare(pictures, job.request)
-    pair = prepared.pair
-    files, left_out = _files_of(job, pair)
+    files, left_out = _files_of(job, prepared.pair)
     with _results_in(out) as folder:
-        start_s = time.perf_counter()
-        estimate = match(matcher, pair, job.options)
-        estimate_ms = 1000 * (time.perf_counter() - start_s)
-        names = tuple(picture.name for picture in pictures)
-        model = str(job.backend.model)
-        if matcher.provider != CPU:
-            model = f"{model} on {matcher.provider}"
-        summary = summarize(pair, estimate, pictures=names, model=model, estimate_ms=estimate_ms)
-        result = Result(pair=pair, estimate=estimate, summary=summary, threads=matcher.threads)
-        notes = [*prepared.notes, *left_out, *write_files(folder, files, result)]
-        notes += hints(pair, estimate)
-    return summary, notes
+        result = run(prepared, matcher, job.options)
+        notes = [*result.notes, *left_out, *write_files(folder, files, result), *result.warnings()]
+    return result.summary, notes
 
 
 def job_facts(job: DepthJob) -> dict[str, Any]:

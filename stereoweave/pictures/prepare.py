@@ -40,9 +40,10 @@ class Request:
 
 @dataclass(frozen=True, kw_only=True)
 class Prepared:
-    """A pair that can be matched, and what was found and done on the way, in a line each."""
+    """A pair that can be matched, the files it was read from, and notes on what was detected or changed."""
 
     pair: StereoPair
+    pictures: tuple[Path, ...]
     notes: tuple[str, ...] = ()
 
 
@@ -64,7 +65,7 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
         ready = Rectified(pair=replace(opened.pair, camera=camera), notes=notes)
         if request.rectify:
             ready = _by_features(ready)
-    return Prepared(pair=ready.pair, notes=(*opened.notes, *ready.notes))
+    return Prepared(pair=ready.pair, pictures=tuple(pictures), notes=(*opened.notes, *ready.notes))
 
 
 def _calibrated(pair: StereoPair, path: Path, rectified: bool) -> Rectified:

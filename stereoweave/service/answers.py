@@ -2,7 +2,6 @@
 
 import json
 import re
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -10,21 +9,19 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from stereoweave.cameras.diagnosis import hints
 from stereoweave.cameras.rectify import cropped
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.decoding import MOST_PIXELS, opening
 from stereoweave.io.files import RangeError, write_image
-from stereoweave.matching.estimate import match_many
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.point_cloud import needed_camera
-from stereoweave.outputs.report import Summary, summarize
-from stereoweave.outputs.results import FILES, Result, needs_camera
+from stereoweave.outputs.report import Summary
+from stereoweave.outputs.results import FILES, needs_camera
+from stereoweave.outputs.run import Result, run_many
 from stereoweave.pictures.loading import pixel_factor
 from stereoweave.pictures.prepare import Prepared, Request, prepare
 from stereoweave.rendering.renderer import Renderer, check_position
-from stereoweave.stereo import Estimate, StereoPair
 
 MOST_MEGAPIXELS = MOST_PIXELS // 1_000_000
 MEDIA_TYPES = {
@@ -141,13 +138,11 @@ def answer_many(matcher: Matcher, orders: Sequence[Order]) -> list[Answer | Exce
         outcome[at] = _attempt(_prepared, order)
         if isinstance(outcome[at], Prepared):
             alike.setdefault(order.match_options, []).append(at)
-    for places in alike.values():
-        found = _matched(matcher, orders[places[0]], [outcome[at].pair for at in places])
-        for at, estimate in zip(places, found, strict=True):
-            failed = isinstance(estimate, Exception)
-            outcome[at] = (
-                estimate if failed else _attempt(_answered, matcher, orders[at], outcome[at], estimate)
-            )
+    for options, places in alike.items():
+        found = _matched(matcher, options, [outcome[at] for at in places])
+        for at, result in zip(places, found, strict=True):
+            failed = isinstance(result, Exception)
+            outcome[at] = result if failed else _attempt(_answered, matcher, orders[at], result)
     return [outcome[at] for at in range(len(orders))]
 
 
@@ -177,31 +172,27 @@ def _prepared(order: Order) -> Prepared:
 
 
 def _matched(
-    matcher: Matcher, order: Order, pairs: Sequence[StereoPair]
-) -> Sequence[tuple[Estimate, float] | Exception]:
-    """The estimates of pairs that are matched as the order says, each with its share of the time in ms."""
-    start_s = time.perf_counter()
-    estimates = _attempt(match_many, matcher, pairs, order.match_options)
-    if not isinstance(estimates, Exception):
-        estimate_ms = 1000 * (time.perf_counter() - start_s) / len(pairs)
-        return [(estimate, estimate_ms) for estimate in estimates]
-    if len(pairs) == 1:
-        return [estimates]
+    matcher: Matcher, options: MatchOptions, prepared: Sequence[Prepared]
+) -> Sequence[Result | Exception]:
+    """The results of pairs that are matched together, or the error of each that cannot be matched."""
+    results = _attempt(run_many, prepared, matcher, options)
+    if not isinstance(results, Exception):
+        return results
+    if len(prepared) == 1:
+        return [results]
     # One by one, so that those that can be matched are.
-    return [found for pair in pairs for found in _matched(matcher, order, [pair])]
+    return [found for each in prepared for found in _matched(matcher, options, [each])]
 
 
-def _answered(matcher: Matcher, order: Order, prepared: Prepared, found: tuple[Estimate, float]) -> Answer:
-    pair, (estimate, estimate_ms) = prepared.pair, found
-    names = tuple(picture.name for picture in order.pictures)
-    summary = summarize(pair, estimate, pictures=names, model=matcher.name, estimate_ms=estimate_ms)
-    result = Result(pair=pair, estimate=estimate, summary=summary, threads=matcher.threads)
-    notes = [*prepared.notes, *(hints(pair, estimate) if order.checked else ())]
+def _answered(matcher: Matcher, order: Order, result: Result) -> Answer:
+    # The network's own name: the one that it was loaded by may be a path of this machine.
+    summary = replace(result.summary, model=matcher.name)
+    notes = [*result.notes, *(result.warnings() if order.checked else ())]
     # Not beside its pictures: where the client went away their folder is removed, and would be made again.
     with TemporaryDirectory(prefix="stereoweave-") as folder:
         path = Path(folder, order.file)
         if order.is_view:
-            renderer = Renderer(pair, estimate, strength=order.strength, threads=matcher.threads)
+            renderer = Renderer(result.pair, result.estimate, strength=order.strength, threads=result.threads)
             write_image(path, renderer.view(order.position).image)
         else:
             _write_map(path, result)

@@ -15,7 +15,8 @@ from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.report import summarize
-from stereoweave.outputs.results import ALWAYS, FILES, DepthJob, Result, make_depth, needs_camera
+from stereoweave.outputs.results import ALWAYS, FILES, DepthJob, make_depth, needs_camera
+from stereoweave.outputs.run import Result
 from stereoweave.pictures.prepare import Request
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 

@@ -1,0 +1,95 @@
+"""From a prepared pair to a result: one way for commands, batches, the page and the service."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from stereoweave.cameras.diagnosis import hints
+from stereoweave.matching.estimate import match_many
+from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.options import MatchOptions
+from stereoweave.matching.providers import CPU
+from stereoweave.outputs.point_cloud import Cloud, Surface, needed_camera, point_cloud, surface
+from stereoweave.outputs.report import Summary, summarize
+from stereoweave.pictures.prepare import Prepared
+from stereoweave.stereo import Estimate, StereoPair
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """A matched pair and its numbers.
+
+    Attributes:
+        pair: The pair, with its camera where that is known.
+        estimate: Its estimate.
+        summary: The numbers of both.
+        notes: What was detected or changed while the pictures were read, a line each.
+        threads: Threads that may be used to render it; default: all cores.
+    """
+
+    pair: StereoPair
+    estimate: Estimate
+    summary: Summary
+    notes: tuple[str, ...] = ()
+    threads: int | None = None
+
+    @property
+    def seen(self) -> Bool[np.ndarray, "h w"]:
+        """Where the left picture shows something."""
+        seen = self.pair.left_seen
+        return np.ones(self.estimate.disparity_px.shape, bool) if seen is None else seen
+
+    def disparity_px(self, unknown: float = np.nan) -> Float32[np.ndarray, "h w"]:
+        """The left view's disparity, with `unknown` where there is none."""
+        return np.where(self.seen, self.estimate.disparity_px, np.float32(unknown)).astype(np.float32)
+
+    def depth_m(self, unknown: float = np.nan) -> Float[np.ndarray, "h w"]:
+        """The left view's depth in metres, with `unknown` where there is none."""
+        depth_m = needed_camera(self.pair).depth_m(self.estimate.disparity_px)
+        return np.where(self.seen, depth_m, np.float32(unknown))
+
+    def warnings(self) -> list[str]:
+        """Likely defects of the pair, a line each; takes about half as long as matching."""
+        return hints(self.pair, self.estimate)
+
+    @cached_property
+    def cloud(self) -> Cloud:
+        return point_cloud(self.pair, self.estimate)
+
+    @cached_property
+    def surface(self) -> Surface:
+        return surface(self.pair, self.estimate)
+
+
+def run(prepared: Prepared, matcher: Matcher, options: MatchOptions) -> Result:
+    """Match and summarise a prepared pair; raises what `match` raises."""
+    (result,) = run_many([prepared], matcher, options)
+    return result
+
+
+def run_many(prepared: Sequence[Prepared], matcher: Matcher, options: MatchOptions) -> list[Result]:
+    """Match prepared pairs together and summarise each, with an equal share of the time."""
+    start_s = time.perf_counter()
+    estimates = match_many(matcher, [each.pair for each in prepared], options)
+    total_ms = 1000 * (time.perf_counter() - start_s)
+    model = matcher.model if matcher.provider == CPU else f"{matcher.model} on {matcher.provider}"
+    return [
+        Result(
+            pair=each.pair,
+            estimate=estimate,
+            summary=summarize(
+                each.pair,
+                estimate,
+                pictures=tuple(picture.name for picture in each.pictures),
+                model=model,
+                estimate_ms=total_ms / len(prepared),
+            ),
+            notes=each.notes,
+            threads=matcher.threads,
+        )
+        for each, estimate in zip(prepared, estimates, strict=True)
+    ]
