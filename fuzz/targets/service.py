@@ -12,7 +12,7 @@ from fuzz.targets import Target, calibrations
 from fuzz.targets.pictures import encoded, eyes
 from stereoweave.errors import StereoweaveError
 from stereoweave.matching.matcher import Matcher
-from stereoweave.service.answers import Answer, Order, answer_many, check_pixels
+from stereoweave.service.answers import Answer, ServiceJob, answer_many, check_pixels
 from stereoweave.service.asgi import Guard, Limits, make_app
 
 # A first view compiles its kernels.
@@ -43,9 +43,9 @@ def _starts() -> dict[str, bytes]:
 def _application() -> Application:
     matcher = Matcher("small", threads=1)
 
-    async def answering(order: Order, left_s: float) -> Answer:
-        check_pixels(order)
-        (answer,) = await asyncio.to_thread(answer_many, matcher, [order])
+    async def answering(job: ServiceJob, left_s: float) -> Answer:
+        check_pixels(job)
+        (answer,) = await asyncio.to_thread(answer_many, matcher, [job])
         if isinstance(answer, Exception):
             raise answer
         return answer

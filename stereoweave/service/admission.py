@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from statistics import median
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.service.answers import Order, TooLargeError
+from stereoweave.service.answers import ServiceJob, TooLargeError
 
 # Factors of time per pixel for large pictures, and for full resolution. Checks and rectification take a
 # fraction of a second at any size.
@@ -37,14 +37,14 @@ class Budget:
         self._latest_each_s = deque([seconds_each], _LATEST)
 
     @contextmanager
-    def admit(self, order: Order, megapixels: float, left_s: float) -> Iterator[None]:
-        """Count the order as accepted within the block.
+    def admit(self, job: ServiceJob, megapixels: float, left_s: float) -> Iterator[None]:
+        """Count the job as accepted within the block.
 
         Raises:
-            TooLargeError: If the order alone takes longer than `left_s`.
+            TooLargeError: If the job alone takes longer than `left_s`.
             BusyError: If it takes longer than that after the accepted ones.
         """
-        work = work_of(order, megapixels)
+        work = work_of(job, megapixels)
         least_s = work * self._best_each_s
         if least_s > left_s:
             raise TooLargeError(
@@ -73,8 +73,8 @@ class Budget:
         self._latest_each_s.append(each_s)
 
 
-def work_of(order: Order, megapixels: float) -> float:
-    """The work of an order, in megapixels of unrefined disparity of small pictures that take as long."""
+def work_of(job: ServiceJob, megapixels: float) -> float:
+    """The work of a job, in megapixels of unrefined disparity of small pictures that take as long."""
     large = _LARGE if megapixels > _LARGE_FROM_MEGAPIXELS else 1
-    refined = _REFINED if order.match_options.refined else 1
+    refined = _REFINED if job.match_options.refined else 1
     return megapixels * large * refined

@@ -13,6 +13,7 @@ from stereoweave.cameras.rectify import cropped
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.decoding import MOST_PIXELS, opening
 from stereoweave.io.files import RangeError, write_image
+from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.point_cloud import needed_camera
@@ -41,7 +42,7 @@ class TooLargeError(StereoweaveError):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Order:
+class ServiceJob:
     """What a request wants.
 
     Attributes:
@@ -89,22 +90,22 @@ class Answer:
     report: str
 
 
-Answering = Callable[[Sequence[Order]], list[Answer | Exception]]
+Answering = Callable[[Sequence[ServiceJob]], list[Answer | Exception]]
 
 
-def check_pixels(order: Order) -> float:
-    """The megapixels that are matched, as the heads of the order's pictures say, before memory is spent.
+def check_pixels(job: ServiceJob) -> float:
+    """The megapixels that are matched, as the heads of the job's pictures say, before memory is spent.
 
     Raises:
-        TooLargeError: More than the order's views may have.
+        TooLargeError: More than the job's views may have.
         FormatError: No picture, or none of a kind that is read.
     """
-    views, megapixels = 3 - len(order.pictures), 0.0
-    for path in order.pictures:
+    views, megapixels = 3 - len(job.pictures), 0.0
+    for path in job.pictures:
         with opening(path, views=views) as picture:
-            factor = pixel_factor(path, picture, order.request.arrangement) if views == 2 else 1
+            factor = pixel_factor(path, picture, job.request.arrangement) if views == 2 else 1
             megapixels += factor * _checked_megapixels(
-                path, picture.size, order.most_megapixels * views / factor
+                path, picture.size, job.most_megapixels * views / factor
             )
     return megapixels
 
@@ -120,30 +121,30 @@ def _checked_megapixels(path: Path, size_px: tuple[int, ...], most_megapixels: f
     return megapixels
 
 
-def measuring() -> Callable[[Order], float]:
-    """For a `ChildProcess`: the function that measures the pictures of an order."""
+def measuring() -> Callable[[ServiceJob], float]:
+    """For a `ChildProcess`: the function that measures the pictures of a job."""
     return check_pixels
 
 
-def answering(model: str, provider: str, threads: int) -> Answering:
-    """For a `ChildProcess`: loads a network, and returns the function that answers orders with it."""
-    return partial(answer_many, Matcher(model, threads=threads, provider=provider))
+def answering(backend: Backend) -> Answering:
+    """For a `ChildProcess`: load the network and return the function that answers jobs with it."""
+    return partial(answer_many, backend.matcher())
 
 
-def answer_many(matcher: Matcher, orders: Sequence[Order]) -> list[Answer | Exception]:
-    """What each order gets, or why it gets nothing; those of the same options are matched together."""
+def answer_many(matcher: Matcher, jobs: Sequence[ServiceJob]) -> list[Answer | Exception]:
+    """What each job gets, or why it gets nothing; those of the same options are matched together."""
     outcome: dict[int, Any] = {}
     alike: dict[MatchOptions, list[int]] = {}
-    for at, order in enumerate(orders):
-        outcome[at] = _attempt(_prepared, order)
+    for at, job in enumerate(jobs):
+        outcome[at] = _attempt(_prepared, job)
         if isinstance(outcome[at], Prepared):
-            alike.setdefault(order.match_options, []).append(at)
+            alike.setdefault(job.match_options, []).append(at)
     for options, places in alike.items():
         found = _matched(matcher, options, [outcome[at] for at in places])
         for at, result in zip(places, found, strict=True):
             failed = isinstance(result, Exception)
-            outcome[at] = result if failed else _attempt(_answered, matcher, orders[at], result)
-    return [outcome[at] for at in range(len(orders))]
+            outcome[at] = result if failed else _attempt(_answered, matcher, jobs[at], result)
+    return [outcome[at] for at in range(len(jobs))]
 
 
 def told(error: Exception, folder: Path) -> str:
@@ -162,13 +163,13 @@ def _attempt(work: Callable[..., Any], *given: Any, **options: Any) -> Any:
         return error
 
 
-def _prepared(order: Order) -> Prepared:
-    prepared = prepare(order.pictures, order.request)
+def _prepared(job: ServiceJob) -> Prepared:
+    prepared = prepare(job.pictures, job.request)
     # Again: half views that are guessed are larger than the head of their picture says.
-    _checked_megapixels(order.pictures[0], prepared.pair.left.shape[1::-1], order.most_megapixels)
-    if needs_camera(order.file):
+    _checked_megapixels(job.pictures[0], prepared.pair.left.shape[1::-1], job.most_megapixels)
+    if needs_camera(job.file):
         needed_camera(prepared.pair)
-    return replace(prepared, pair=cropped(prepared.pair)) if order.is_view else prepared
+    return replace(prepared, pair=cropped(prepared.pair)) if job.is_view else prepared
 
 
 def _matched(
@@ -184,19 +185,19 @@ def _matched(
     return [found for each in prepared for found in _matched(matcher, options, [each])]
 
 
-def _answered(matcher: Matcher, order: Order, result: Result) -> Answer:
+def _answered(matcher: Matcher, job: ServiceJob, result: Result) -> Answer:
     # The network's own name: the one that it was loaded by may be a path of this machine.
     summary = replace(result.summary, model=matcher.name)
-    notes = [*result.notes, *(result.warnings() if order.checked else ())]
+    notes = [*result.notes, *(result.warnings() if job.checked else ())]
     # Not beside its pictures: where the client went away their folder is removed, and would be made again.
     with TemporaryDirectory(prefix="stereoweave-") as folder:
-        path = Path(folder, order.file)
-        if order.is_view:
-            renderer = Renderer(result.pair, result.estimate, strength=order.strength, threads=result.threads)
-            write_image(path, renderer.view(order.position).image)
+        path = Path(folder, job.file)
+        if job.is_view:
+            renderer = Renderer(result.pair, result.estimate, strength=job.strength, threads=result.threads)
+            write_image(path, renderer.view(job.position).image)
         else:
             _write_map(path, result)
-        return Answer(content=path.read_bytes(), report=_report(summary, notes, order.folder))
+        return Answer(content=path.read_bytes(), report=_report(summary, notes, job.folder))
 
 
 def _write_map(path: Path, result: Result) -> None:

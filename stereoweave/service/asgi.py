@@ -20,7 +20,7 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 from stereoweave import __version__
 from stereoweave.errors import FormatError, MatcherError, StereoweaveError
 from stereoweave.service.admission import BusyError
-from stereoweave.service.answers import MEDIA_TYPES, MOST_MEGAPIXELS, Answer, Order, TooLargeError, told
+from stereoweave.service.answers import MEDIA_TYPES, MOST_MEGAPIXELS, Answer, ServiceJob, TooLargeError, told
 from stereoweave.service.forms import MapForm, PairForm, ViewForm, stored
 from stereoweave.system.child_process import ProcessDiedError
 
@@ -64,8 +64,8 @@ _Send = Callable[[_Message], Awaitable[None]]
 _Server = Callable[[_Message, _Receive, _Send], Coroutine[Any, Any, None]]
 # Errors whose message is sent to the client. TimeoutError is an OSError.
 FAILURES = (StereoweaveError, OSError, MemoryError)
-# Of an order, and the seconds that are left for it.
-Answering = Callable[[Order, float], Awaitable[Answer]]
+# Of a job, and the seconds that are left for it.
+Answering = Callable[[ServiceJob, float], Awaitable[Answer]]
 
 
 class Limits(BaseModel):
@@ -173,8 +173,8 @@ class _Answers:
     async def __call__(self, request: Request, form: PairForm, file: str) -> Response:
         with self._made() as name:
             try:
-                order = await asyncio.to_thread(stored, form, Path(name), file, self.most_megapixels)
-                answer = await self.answering(order, request.state.deadline_s - time.monotonic())
+                job = await asyncio.to_thread(stored, form, Path(name), file, self.most_megapixels)
+                answer = await self.answering(job, request.state.deadline_s - time.monotonic())
             except FAILURES as error:
                 raise _refusal_of(error, Path(name)) from error
         return _file(answer, file)

@@ -25,9 +25,10 @@ from ray.serve.handle import DeploymentHandle
 from ray.serve.schema import LoggingConfig
 
 from stereoweave.errors import StereoweaveError
+from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher
 from stereoweave.service.admission import Budget, work_of
-from stereoweave.service.answers import Answer, Order, answering
+from stereoweave.service.answers import Answer, ServiceJob, answering
 from stereoweave.service.asgi import FAILURES, Guard, Limits, make_app
 from stereoweave.service.folders import own_folder
 from stereoweave.service.server import Patience, http_server
@@ -70,6 +71,11 @@ class Settings(BaseModel):
     limits: Limits = Limits()
 
     @property
+    def backend(self) -> Backend:
+        """What each replica matches with."""
+        return Backend(model=self.model, threads=self.threads, provider=self.provider)
+
+    @property
     def gpus_each(self) -> int:
         """The number of GPUs reserved for each replica."""
         return 1 if self.provider in GPU_PROVIDERS else 0
@@ -77,12 +83,12 @@ class Settings(BaseModel):
 
 @serve.ingress()
 class Replica:
-    """A process of the service that answers orders; on a cluster also HTTP requests."""
+    """A process of the service that answers jobs; on a cluster also HTTP requests."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings, self._opened = settings, ExitStack()
         self._folder = self._opened.enter_context(own_folder())
-        make = partial(answering, settings.model, settings.provider, settings.threads)
+        make = partial(answering, settings.backend)
         self._worker = Worker(make, self._folder)
         self._opened.callback(self._worker.close)
         self._budget = Budget(self._worker.warm_up())
@@ -102,22 +108,22 @@ class Replica:
         limits = self._settings.limits
         return Guard(make_app(self._answer, limits, self._folder), limits)
 
-    async def outcome(self, order: Order, left_s: float) -> Answer | Exception:
-        """The answer to an order within the seconds that are left for it, or the error."""
+    async def outcome(self, job: ServiceJob, left_s: float) -> Answer | Exception:
+        """The answer to a job within the seconds that are left for it, or the error."""
         try:
-            return await self._answer(order, left_s)
+            return await self._answer(job, left_s)
         except FAILURES as error:
             return error
 
-    async def _answer(self, order: Order, left_s: float) -> Answer:
-        """The answer to an order. An order that is cancelled while it waits never starts."""
+    async def _answer(self, job: ServiceJob, left_s: float) -> Answer:
+        """The answer to a job. A job that is cancelled while it waits never starts."""
         deadline_s = time.monotonic() + left_s
         loop = asyncio.get_running_loop()
-        megapixels = await loop.run_in_executor(self._measuring, self._worker.measure, order, left_s)
-        with self._budget.admit(order, megapixels, deadline_s - time.monotonic()):
-            # Otherwise each order that arrives during a match would become a batch of its own.
+        megapixels = await loop.run_in_executor(self._measuring, self._worker.measure, job, left_s)
+        with self._budget.admit(job, megapixels, deadline_s - time.monotonic()):
+            # Otherwise each job that arrives during a match would become a batch of its own.
             await self._free.wait()
-            answer = await self._together(Task(order, megapixels, deadline_s))
+            answer = await self._together(Task(job, megapixels, deadline_s))
         if isinstance(answer, Exception):
             raise answer
         return answer
@@ -131,7 +137,7 @@ class Replica:
         finally:
             self._free.set()
         if all(isinstance(answer, Answer | TimeoutError) for answer in answers):
-            work = sum(work_of(task.order, task.megapixels) for task in tasks)
+            work = sum(work_of(task.job, task.megapixels) for task in tasks)
             finished = all(isinstance(answer, Answer) for answer in answers)
             self._budget.learn(work, time.perf_counter() - start_s, finished=finished)
         return answers
@@ -187,7 +193,7 @@ def serving(settings: Settings, listener: socket.socket, address: str | None = N
 
 @contextmanager
 def _at_server(settings: Settings, listener: socket.socket) -> Iterator[None]:
-    """Serve from an HTTP server in this process that passes orders to the replicas."""
+    """Serve from an HTTP server in this process that passes jobs to the replicas."""
     limits = settings.limits
     limits = limits.model_copy(update={"waiting": limits.waiting * settings.replicas})
     serve.start(proxy_location="Disabled", logging_config=_QUIET)
@@ -195,8 +201,8 @@ def _at_server(settings: Settings, listener: socket.socket) -> Iterator[None]:
         ending.callback(_end)
         handle = _run(settings)
 
-        async def answer(order: Order, left_s: float) -> Answer:
-            response = handle.outcome.remote(order, left_s)
+        async def answer(job: ServiceJob, left_s: float) -> Answer:
+            response = handle.outcome.remote(job, left_s)
             try:
                 outcome = await response
             except asyncio.CancelledError:

@@ -22,7 +22,7 @@ from stereoweave.io.files import MOST_SMALL_BYTES
 from stereoweave.matching.options import MatchOptions
 from stereoweave.pictures.loading import FORMATS
 from stereoweave.pictures.prepare import Request
-from stereoweave.service.answers import Order, TooLargeError
+from stereoweave.service.answers import ServiceJob, TooLargeError
 
 _RANGE = r"^-?\d{1,6}(\.\d{1,6})?,-?\d{1,6}(\.\d{1,6})?$"
 
@@ -82,7 +82,7 @@ class PairForm(BaseModel):
         return pictures
 
     def said(self, calibration: Path | None) -> dict[str, Any]:
-        """What an `Order` takes of it."""
+        """What a `ServiceJob` takes of it."""
         request = Request(
             arrangement=self.format,
             calibration=calibration,
@@ -133,8 +133,8 @@ class ViewForm(PairForm):
         return super().said(calibration) | {"position": self.position, "strength": self.strength}
 
 
-def stored(form: PairForm, folder: Path, file: str, most_megapixels: float) -> Order:
-    """The order of a form, whose files now lie in the folder, under names that the service gives them."""
+def stored(form: PairForm, folder: Path, file: str, most_megapixels: float) -> ServiceJob:
+    """The job of a form, whose files now lie in the folder, under names that the service gives them."""
     uploads = form.uploads()
     for field, upload in uploads.items():
         with (folder / field).open("wb") as out:
@@ -147,7 +147,7 @@ def stored(form: PairForm, folder: Path, file: str, most_megapixels: float) -> O
         calibration = folder / "calib"
         calibration.write_bytes(content)
     pictures = tuple(folder / field for field in uploads)
-    return Order(
+    return ServiceJob(
         folder=folder,
         pictures=pictures,
         file=file,

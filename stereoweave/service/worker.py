@@ -7,7 +7,7 @@ from pathlib import Path
 
 from stereoweave.errors import FormatError
 from stereoweave.pictures.prepare import Request
-from stereoweave.service.answers import Answer, Answering, Order, measuring
+from stereoweave.service.answers import Answer, Answering, ServiceJob, measuring
 from stereoweave.system.child_process import ChildProcess, ProcessDiedError
 
 # Reading the head of a picture takes milliseconds.
@@ -17,9 +17,9 @@ _SAMPLE = Path(__file__).parents[1] / "sample"
 
 @dataclass(frozen=True)
 class Task:
-    """An order, its megapixels, and its deadline as a value of `time.monotonic`."""
+    """A job, its megapixels, and its deadline as a value of `time.monotonic`."""
 
-    order: Order
+    job: ServiceJob
     megapixels: float
     deadline_s: float
 
@@ -53,25 +53,25 @@ class Worker:
             MatcherError: If the network cannot be loaded.
         """
         pictures = (_SAMPLE / "left.jpg", _SAMPLE / "right.jpg")
-        plain = Order(folder=_SAMPLE, pictures=pictures, file="disparity.png")
+        plain = ServiceJob(folder=_SAMPLE, pictures=pictures, file="disparity.png")
         every_option = replace(plain, file="view.png", request=Request(rectify=True), checked=True)
-        for order in (every_option, plain):
+        for job in (every_option, plain):
             start_s = time.perf_counter()
-            (answer,) = self._answering([order], timeout_s=None)
+            (answer,) = self._answering([job], timeout_s=None)
             took_s = time.perf_counter() - start_s
             if isinstance(answer, Exception):
                 raise answer
         return took_s / self._measuring(plain, timeout_s=None)
 
-    def measure(self, order: Order, left_s: float) -> float:
-        """The megapixels of an order's pictures, from their heads.
+    def measure(self, job: ServiceJob, left_s: float) -> float:
+        """The megapixels of a job's pictures, from their heads.
 
         Raises:
             StereoweaveError: If `check_pixels` raises it, or the process crashed.
             TimeoutError: If it takes longer than `left_s`.
         """
         try:
-            return self._measuring(order, min(left_s, _MEASURED_WITHIN_S))
+            return self._measuring(job, min(left_s, _MEASURED_WITHIN_S))
         except TimeoutError as error:
             if left_s < _MEASURED_WITHIN_S:
                 raise
@@ -87,7 +87,7 @@ class Worker:
         by one.
         """
         try:
-            return self._answering([task.order for task in tasks], min(task.left_s for task in tasks))
+            return self._answering([task.job for task in tasks], min(task.left_s for task in tasks))
         except (TimeoutError, ProcessDiedError) as error:
             if len(tasks) == 1:
                 return [error]

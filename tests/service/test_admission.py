@@ -4,28 +4,28 @@ import pytest
 
 from stereoweave.matching.options import MatchOptions
 from stereoweave.service.admission import Budget, BusyError, work_of
-from stereoweave.service.answers import Order, TooLargeError
+from stereoweave.service.answers import ServiceJob, TooLargeError
 
 
-def order(**said) -> Order:
-    return Order(folder=Path(), pictures=(Path("left"), Path("right")), **{"file": "depth.png", **said})
+def job(**said) -> ServiceJob:
+    return ServiceJob(folder=Path(), pictures=(Path("left"), Path("right")), **{"file": "depth.png", **said})
 
 
 def test_what_takes_longer_than_the_time_that_is_left_is_refused():
     budget = Budget(seconds_each=2)
-    with budget.admit(order(), megapixels=4, left_s=20):
+    with budget.admit(job(), megapixels=4, left_s=20):
         pass
     with pytest.raises(TooLargeError, match="at most 20 s, found 4.2 megapixels, which take 21 s"):
-        budget.admit(order(), megapixels=4.2, left_s=20).__enter__()
+        budget.admit(job(), megapixels=4.2, left_s=20).__enter__()
 
 
 def test_what_would_be_late_after_those_before_it_is_to_come_again_when_they_are_done():
     budget = Budget(seconds_each=2)
-    with budget.admit(order(), megapixels=2, left_s=5), budget.admit(order(), megapixels=0.5, left_s=5):
+    with budget.admit(job(), megapixels=2, left_s=5), budget.admit(job(), megapixels=0.5, left_s=5):
         with pytest.raises(BusyError, match="found 2 s more") as busy:
-            budget.admit(order(), megapixels=0.8, left_s=5).__enter__()
+            budget.admit(job(), megapixels=0.8, left_s=5).__enter__()
         assert busy.value.retry_after_s == 2  # 4 + 1 + 1.6 - 5, rounded up
-    with budget.admit(order(), megapixels=2, left_s=5):
+    with budget.admit(job(), megapixels=2, left_s=5):
         pass
 
 
@@ -33,7 +33,7 @@ def test_what_the_best_speed_allows_is_accepted_where_nothing_waits():
     budget = Budget(seconds_each=2)
     budget.learn(work=10, took_s=10)
     budget.learn(work=10, took_s=500)
-    with budget.admit(order(), megapixels=2, left_s=2):
+    with budget.admit(job(), megapixels=2, left_s=2):
         pass
 
 
@@ -41,10 +41,10 @@ def test_what_waits_is_taken_to_be_done_at_the_usual_speed():
     budget = Budget(seconds_each=1)
     for took_s in (30, 30, 500):
         budget.learn(work=10, took_s=took_s)
-    with budget.admit(order(), megapixels=1, left_s=6):
+    with budget.admit(job(), megapixels=1, left_s=6):
         with pytest.raises(BusyError, match="found 3 s more"):
-            budget.admit(order(), megapixels=2, left_s=6).__enter__()
-        with budget.admit(order(), megapixels=1, left_s=6):
+            budget.admit(job(), megapixels=2, left_s=6).__enter__()
+        with budget.admit(job(), megapixels=1, left_s=6):
             pass
 
 
@@ -52,7 +52,7 @@ def test_speeds_of_long_ago_are_forgotten():
     budget = Budget(seconds_each=50)
     for _ in range(9):
         budget.learn(work=1, took_s=2)
-    with budget.admit(order(), megapixels=1, left_s=4), budget.admit(order(), megapixels=1, left_s=4):
+    with budget.admit(job(), megapixels=1, left_s=4), budget.admit(job(), megapixels=1, left_s=4):
         pass
 
 
@@ -60,13 +60,13 @@ def test_what_was_stopped_unfinished_makes_the_usual_speed_slower_and_the_best_n
     budget = Budget(seconds_each=2)
     budget.learn(work=1, took_s=8, finished=False)
     budget.learn(work=8, took_s=1, finished=False)  # had little time left: counts as the median, 5
-    with budget.admit(order(), megapixels=1, left_s=2), pytest.raises(BusyError, match="found 1 s more"):
-        budget.admit(order(), megapixels=1, left_s=9).__enter__()  # the median of 2, 5 and 8, twice, less 9
+    with budget.admit(job(), megapixels=1, left_s=2), pytest.raises(BusyError, match="found 1 s more"):
+        budget.admit(job(), megapixels=1, left_s=9).__enter__()  # the median of 2, 5 and 8, twice, less 9
     with pytest.raises(TooLargeError, match="take 2 s"):
-        budget.admit(order(), megapixels=1, left_s=1.9).__enter__()
+        budget.admit(job(), megapixels=1, left_s=1.9).__enter__()
 
 
 def test_large_pictures_and_full_resolution_are_more_work():
-    assert work_of(order(), 0.6) == 0.6
-    assert work_of(order(), 50) == 125
-    assert work_of(order(options=MatchOptions(refined=True)), 1) == work_of(order(file="view.png"), 1) == 1.3
+    assert work_of(job(), 0.6) == 0.6
+    assert work_of(job(), 50) == 125
+    assert work_of(job(options=MatchOptions(refined=True)), 1) == work_of(job(file="view.png"), 1) == 1.3

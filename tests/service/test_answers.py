@@ -15,7 +15,7 @@ from stereoweave.io.files import read_pair, write_image
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
 from stereoweave.pictures.prepare import Request
-from stereoweave.service.answers import Order, TooLargeError, answer_many, check_pixels
+from stereoweave.service.answers import ServiceJob, TooLargeError, answer_many, check_pixels
 
 
 @pytest.fixture(scope="module")
@@ -29,23 +29,25 @@ def estimate(photos) -> sw.Estimate:
     return sw.estimate(*photos, model="small")
 
 
-def order(folder: Path, left: bytes = BOTH["left"], **said: Any) -> Order:
+def job(folder: Path, left: bytes = BOTH["left"], **said: Any) -> ServiceJob:
     """For disparity.npy of a pair, in a folder that is made."""
     folder.mkdir()
     (folder / "left").write_bytes(left)
     (folder / "right").write_bytes(BOTH["right"])
-    return Order(folder=folder, pictures=(folder / "left", folder / "right"), file="disparity.npy", **said)
+    return ServiceJob(
+        folder=folder, pictures=(folder / "left", folder / "right"), file="disparity.npy", **said
+    )
 
 
 def test_those_that_are_matched_together_get_what_each_gets_alone(estimate, tmp_path):
-    orders = [
-        order(tmp_path / "first"),
-        order(tmp_path / "damaged", left=b"no picture"),
-        order(tmp_path / "second"),
-        order(tmp_path / "with a range", options=MatchOptions(range_px=(8, 16))),
-        order(tmp_path / "with a range that is none", options=MatchOptions(range_px=(5000, 6000))),
+    jobs = [
+        job(tmp_path / "first"),
+        job(tmp_path / "damaged", left=b"no picture"),
+        job(tmp_path / "second"),
+        job(tmp_path / "with a range", options=MatchOptions(range_px=(8, 16))),
+        job(tmp_path / "with a range that is none", options=MatchOptions(range_px=(5000, 6000))),
     ]
-    first, damaged, second, within, beyond = answer_many(Matcher("small"), orders)
+    first, damaged, second, within, beyond = answer_many(Matcher("small"), jobs)
     for answer in (first, second):
         np.testing.assert_allclose(np.load(io.BytesIO(answer.content)), estimate.disparity_px, atol=1e-3)
     assert np.load(io.BytesIO(within.content)).max() == 16
@@ -61,15 +63,15 @@ def test_nothing_is_left_of_a_request_whose_client_goes_away_while_it_is_matched
             shutil.rmtree(folder)
             return super().estimate_many(pairs, **how)
 
-    answer_many(MatcherAtThatMoment("small"), [order(folder)])
+    answer_many(MatcherAtThatMoment("small"), [job(folder)])
     assert not folder.exists()
 
 
 @pytest.fixture
-def halves(photos, tmp_path) -> Order:
+def halves(photos, tmp_path) -> ServiceJob:
     """Two views of 1280x480 px at half their width, of which its name alone tells."""
     write_image(tmp_path / "both_half_LR.png", np.hstack(photos))
-    return Order(folder=tmp_path, pictures=(tmp_path / "both_half_LR.png",), file="disparity.npy")
+    return ServiceJob(folder=tmp_path, pictures=(tmp_path / "both_half_LR.png",), file="disparity.npy")
 
 
 def jps_of(picture: Image.Image, flags: int) -> bytes:
@@ -99,14 +101,16 @@ def test_half_views_that_are_guessed_are_measured_again(halves):
 @pytest.mark.parametrize(("flags", "views"), [(4, 1), (4 | 2, 2), (4 | 1, 1)])
 def test_half_views_of_which_a_jps_file_says_so_are_measured_by_its_head(photos, tmp_path, flags, views):
     (tmp_path / "both").write_bytes(jps_of(Image.fromarray(np.hstack(photos)), flags))
-    both = Order(folder=tmp_path, pictures=(tmp_path / "both",), file="disparity.npy")
+    both = ServiceJob(folder=tmp_path, pictures=(tmp_path / "both",), file="disparity.npy")
     assert check_pixels(both) == views * 1280 * 480 / 1e6
 
 
 def test_both_pictures_of_one_file_are_measured(photos, tmp_path):
     left, right = map(Image.fromarray, photos)
     left.save(tmp_path / "both", "MPO", save_all=True, append_images=[right])
-    both = Order(folder=tmp_path, pictures=(tmp_path / "both",), file="disparity.npy", most_megapixels=0.31)
+    both = ServiceJob(
+        folder=tmp_path, pictures=(tmp_path / "both",), file="disparity.npy", most_megapixels=0.31
+    )
     assert check_pixels(both) == 2 * 640 * 480 / 1e6
     with pytest.raises(TooLargeError, match=r"expected at most 0\.3 megapixels, found 640x480"):
         check_pixels(replace(both, most_megapixels=0.3))

@@ -13,7 +13,7 @@ from service_examples import BOTH
 
 from stereoweave.errors import ProviderError
 from stereoweave.service.admission import BusyError
-from stereoweave.service.answers import Answer, Order, TooLargeError
+from stereoweave.service.answers import Answer, ServiceJob, TooLargeError
 from stereoweave.system.child_process import ProcessDiedError
 
 # What Ray Serve is warned of by Pydantic when it is imported.
@@ -49,12 +49,12 @@ def ask_guarded(
     return asyncio.run(ask())
 
 
-async def never(order: Order, left_s: float) -> Answer:
+async def never(job: ServiceJob, left_s: float) -> Answer:
     await asyncio.Event().wait()
 
 
 def test_a_provider_that_fails_is_no_fault_of_the_request():
-    async def fails(order: Order, left_s: float) -> Answer:
+    async def fails(job: ServiceJob, left_s: float) -> Answer:
         raise ProviderError(
             "provider cuda: expected to run /srv/net.onnx, found that it failed: out of memory"
         )
@@ -86,8 +86,8 @@ def test_as_many_requests_are_accepted_at_a_time_as_may_wait_and_no_more():
     async def ask() -> list[int]:
         done, accepted = asyncio.Event(), []
 
-        async def waits(order: Order, left_s: float) -> Answer:
-            accepted.append(order)
+        async def waits(job: ServiceJob, left_s: float) -> Answer:
+            accepted.append(job)
             await done.wait()
             return Answer(content=b"", report="{}")
 
@@ -160,7 +160,7 @@ def test_work_for_a_client_that_goes_away_is_cancelled():
     async def leave() -> bool:
         begun, cancelled = asyncio.Event(), asyncio.Event()
 
-        async def waits(order: Order, left_s: float) -> Answer:
+        async def waits(job: ServiceJob, left_s: float) -> Answer:
             begun.set()
             try:
                 await asyncio.Event().wait()
@@ -203,7 +203,7 @@ def test_work_for_a_client_that_goes_away_is_cancelled():
     ],
 )
 def test_what_the_work_came_to_is_told_by_the_status(error, status, header):
-    async def fails(order: Order, left_s: float) -> Answer:
+    async def fails(job: ServiceJob, left_s: float) -> Answer:
         raise error
 
     response = ask_guarded(fails, timeout_s=60)
@@ -212,8 +212,8 @@ def test_what_the_work_came_to_is_told_by_the_status(error, status, header):
     assert response.headers.get("Retry-After") == header
 
 
-async def at_once(order: Order, left_s: float) -> Answer:
-    return Answer(content=order.pictures[0].read_bytes(), report="{}")
+async def at_once(job: ServiceJob, left_s: float) -> Answer:
+    return Answer(content=job.pictures[0].read_bytes(), report="{}")
 
 
 def test_a_folder_that_was_removed_meanwhile_is_made_again(tmp_path):
@@ -232,7 +232,7 @@ def test_a_folder_that_was_removed_meanwhile_is_made_again(tmp_path):
     ],
 )
 def test_a_machine_without_room_is_no_fault_of_the_request(error, found):
-    async def fails(order: Order, left_s: float) -> Answer:
+    async def fails(job: ServiceJob, left_s: float) -> Answer:
         raise error
 
     response = ask_guarded(fails, timeout_s=60)
@@ -268,7 +268,7 @@ def test_without_a_registry_there_are_no_metrics():
 def test_a_response_that_could_not_be_begun_in_time_becomes_one_that_says_so():
     from stereoweave.service.asgi import Guard, Limits, make_app
 
-    async def answers(order: Order, left_s: float) -> Answer:
+    async def answers(job: ServiceJob, left_s: float) -> Answer:
         return Answer(content=b"done", report="{}")
 
     async def ask() -> httpx.Response:

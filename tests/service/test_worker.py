@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from stereoweave.errors import FormatError, MatcherError
-from stereoweave.service.answers import Answer, Answering, Order, answering
+from stereoweave.matching.backend import Backend
+from stereoweave.service.answers import Answer, Answering, ServiceJob, answering
 from stereoweave.service.worker import Task, Worker
 
 pytestmark = pytest.mark.system
@@ -17,20 +18,20 @@ PICTURES = (EXAMPLES / "left.png", EXAMPLES / "right.png")
 
 
 def task(file: str = "disparity.png", within_s: float = 60) -> Task:
-    order = Order(folder=EXAMPLES, pictures=PICTURES, file=file)
-    return Task(order, megapixels=0.6, deadline_s=time.monotonic() + within_s)
+    job = ServiceJob(folder=EXAMPLES, pictures=PICTURES, file=file)
+    return Task(job, megapixels=0.6, deadline_s=time.monotonic() + within_s)
 
 
 def answering_by_name() -> Answering:
-    """Instead of a network: orders named so sleep or crash, others get their name."""
+    """Instead of a network: jobs named so sleep or crash, others get their name."""
 
-    def answer(orders: Sequence[Order]) -> list[Answer | Exception]:
-        for order in orders:
-            if order.file == "sleep":
+    def answer(jobs: Sequence[ServiceJob]) -> list[Answer | Exception]:
+        for job in jobs:
+            if job.file == "sleep":
                 time.sleep(60)
-            if order.file == "crash":
+            if job.file == "crash":
                 signal.raise_signal(signal.SIGSEGV)
-        return [Answer(content=order.file.encode(), report="{}") for order in orders]
+        return [Answer(content=job.file.encode(), report="{}") for job in jobs]
 
     return answer
 
@@ -70,7 +71,7 @@ def test_what_is_late_already_is_not_begun(worker):
 
 
 def test_a_match_by_a_network_is_ended_at_its_deadline_and_the_next_one_is_answered(tmp_path):
-    worker = Worker(partial(answering, "small", "cpu", 1), tmp_path / "files")
+    worker = Worker(partial(answering, Backend(threads=1)), tmp_path / "files")
     assert 0 < worker.warm_up() < 60
     assert names(worker.answer([task(within_s=0.01)])) == ["TimeoutError"]
     (answer,) = worker.answer([task()])
@@ -79,20 +80,22 @@ def test_a_match_by_a_network_is_ended_at_its_deadline_and_the_next_one_is_answe
 
 
 def test_pictures_are_measured_by_their_heads(worker, tmp_path):
-    order = task().order
-    assert worker.measure(order, left_s=10) == pytest.approx(2 * 640 * 480 / 1e6)
+    job = task().job
+    assert worker.measure(job, left_s=10) == pytest.approx(2 * 640 * 480 / 1e6)
     (tmp_path / "text").write_text("no picture")
     with pytest.raises(FormatError, match="expected a picture"):
-        worker.measure(Order(folder=tmp_path, pictures=(tmp_path / "text",), file="disparity.png"), left_s=10)
+        worker.measure(
+            ServiceJob(folder=tmp_path, pictures=(tmp_path / "text",), file="disparity.png"), left_s=10
+        )
 
 
 def test_a_picture_whose_head_cannot_be_read_in_time_is_refused(worker):
     with pytest.raises(TimeoutError):
-        worker.measure(task().order, left_s=0)
+        worker.measure(task().job, left_s=0)
 
 
 def test_a_network_that_cannot_be_loaded_is_said_before_any_order(tmp_path):
-    worker = Worker(partial(answering, "none.onnx", "cpu", 1), tmp_path / "files")
+    worker = Worker(partial(answering, Backend(model="none.onnx")), tmp_path / "files")
     with pytest.raises(MatcherError, match=r"none\.onnx: expected an ONNX matcher"):
         worker.warm_up()
     worker.close()
