@@ -15,7 +15,7 @@ from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.report import summarize
-from stereoweave.outputs.results import ALWAYS, FILES, DepthJob, make_depth, needs_camera
+from stereoweave.outputs.results import ALWAYS, FILES, DepthJob, job_facts, make_depth, needs_camera
 from stereoweave.outputs.run import Result
 from stereoweave.pictures.prepare import Request
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
@@ -232,3 +232,21 @@ def test_a_camera_by_hand_looks_through_the_middle():
     image = np.zeros((480, 640, 3), np.uint8)
     expected = StereoCamera(focal_px=550.0, baseline_m=0.1, cx_px=319.5, cy_px=239.5)
     assert StereoCamera.centred(image, focal_px=550.0, baseline_m=0.1) == expected
+
+
+def test_what_a_batch_writes_down_of_its_job_keeps_its_names_so_that_earlier_batches_go_on():
+    options = MatchOptions(range_px=(-20.0, 96.0), refined=True)
+    facts = job_facts(DepthJob(options=options, backend=Backend(threads=2), files=("all",)))
+    assert {name: value for name, value in facts.items() if name != "stereoweave"} == {
+        "model": "small",
+        "range_px": (-20.0, 96.0),
+        "refined": True,
+        "raw": False,
+        "files": ("all",),
+        "always": ALWAYS,
+        "arrangement": None,
+        "calibration": None,
+        "focal_px": None,
+        "baseline_m": None,
+        "rectify": False,
+    }
