@@ -17,9 +17,9 @@ from stereoweave.bench.edge_metrics import flying_percent
 from stereoweave.data.readers import read_scenes
 from stereoweave.io.files import read_image
 from stereoweave.learn import checkpoint
-from stereoweave.learn.data.collage import sample
-from stereoweave.learn.export.from_checkpoint import differences
-from stereoweave.learn.models import network_of
+from stereoweave.learn.data.collage import paint_collage
+from stereoweave.learn.export.from_checkpoint import compare_runtimes
+from stereoweave.learn.models import build_network
 from stereoweave.learn.models.layers import local_soft_argmax
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher, shipped_models
@@ -55,7 +55,7 @@ def test_the_card_names_its_origin_and_its_proofs(card):
 def test_on_pairs_of_no_training_the_network_is_right_and_knows_where(name):
     errors_px, confidence = [], []
     for index in range(8):
-        pair = sample(UNSEEN_SEED, 0, index, 320, 512)
+        pair = paint_collage(UNSEEN_SEED, 0, index, 320, 512)
         found = sw.estimate(pair.left, pair.right, model=name, threads=1)
         errors_px.append(np.abs(found.disparity_px - pair.disparity_px))
         confidence.append(found.confidence)
@@ -68,7 +68,7 @@ def test_on_pairs_of_no_training_the_network_is_right_and_knows_where(name):
 def test_two_thirds_as_many_pixels_fly_as_with_bilinear_upsampling_from_a_quarter():
     network, flying_percents = trained("small"), []
     for index in range(8):
-        pair = sample(UNSEEN_SEED, 1, index, 320, 512)
+        pair = paint_collage(UNSEEN_SEED, 1, index, 320, 512)
         images = (torch.from_numpy(x).permute(2, 0, 1)[None].float() / 255 for x in (pair.left, pair.right))
         with torch.no_grad():
             stages = network.stages(*images)
@@ -142,12 +142,12 @@ def test_on_real_pairs_the_shipped_file_answers_as_its_checkpoint_in_pytorch(tes
     network, matcher = trained(name), Matcher(name, threads=1)
     for scene in read_scenes(testdata / "stereo/pairs"):
         # Only of disparity: the confidence that ships was calibrated after training.
-        difference_px, _ = differences(network, matcher, scene.pair)
+        difference_px, _ = compare_runtimes(network, matcher, scene.pair)
         assert difference_px < 0.01, scene.name
 
 
 def trained(name):
     kept = checkpoint.load(ROOT / "checkpoints" / f"{name}.pt")
-    network = network_of(kept.recipe)
+    network = build_network(kept.recipe)
     network.load_state_dict(kept.averaged)
     return network.eval()

@@ -21,10 +21,10 @@ from stereoweave.data.shards import Shards
 from stereoweave.io.files import make_folder, replacing
 from stereoweave.learn import checkpoint
 from stereoweave.learn.checkpoint import Checkpoint
-from stereoweave.learn.data.sources import Photographed, Source, kept, sources
-from stereoweave.learn.evaluation import method_of
-from stereoweave.learn.export.from_checkpoint import multiply_adds
-from stereoweave.learn.models import MODELS, network_of
+from stereoweave.learn.data.sources import PairSource, PhotographedSet, cache_pairs, open_sources
+from stereoweave.learn.evaluation import make_method
+from stereoweave.learn.export.from_checkpoint import count_multiply_adds
+from stereoweave.learn.models import MODELS, build_network
 from stereoweave.learn.recipe import COLLAGE, Recipe
 from stereoweave.learn.training.loop import train_recipe
 from stereoweave.learn.training.scores import validate
@@ -91,17 +91,17 @@ def run_ablations(
         StereoweaveError: If training or held-out pairs are missing; raised before the first training.
     """
     MODELS.update(VARIANTS)  # so that recipes can name them
-    rendered_pairs = Photographed(Shards(rendered))
+    rendered_pairs = PhotographedSet(Shards(rendered))
     for trial in planned:
-        for pairs in sources(trial.recipe, runs / "pairs"):
-            kept(pairs, console)
+        for pairs in open_sources(trial.recipe, runs / "pairs"):
+            cache_pairs(pairs, console)
     before = {row.get("fingerprint"): row for row in _read(report)}
     rows = {i: row for i, trial in enumerate(planned) if (row := before.get(fingerprint(trial.recipe)))}
     for i, trial in enumerate(planned):
         if i in rows:
             continue
         trained = checkpoint.load(train_recipe(trial.recipe, runs / trial.recipe.name, console))
-        _, collages = sources(trial.recipe, runs / "pairs")
+        _, collages = open_sources(trial.recipe, runs / "pairs")
         held_out = {"collage": collages, "rendered": rendered_pairs}
         rows[i] = {key: _text(value) for key, value in _row(trial, trained, held_out).items()}
         _write(report, [rows[j] for j in sorted(rows)])
@@ -113,15 +113,17 @@ def fingerprint(recipe: Recipe) -> str:
     return hashlib.sha256(repr(replace(recipe, name="")).encode()).hexdigest()[:8]
 
 
-def _row(trial: Trial, trained: Checkpoint, held_out: dict[str, Source]) -> dict[str, object]:
-    network = network_of(trained.recipe)
+def _row(trial: Trial, trained: Checkpoint, held_out: dict[str, PairSource]) -> dict[str, object]:
+    network = build_network(trained.recipe)
     network.load_state_dict(trained.averaged)
     network.eval()
     changes = VARIATIONS[trial.claim][trial.setting]
     scores = {
         f"{pairs}_{name}": value
         for pairs, source in held_out.items()
-        for name, value in (validate(network, source, _CPU) | _near_edges(method_of(trained), source)).items()
+        for name, value in (
+            validate(network, source, _CPU) | _near_edges(make_method(trained), source)
+        ).items()
     }
     return {
         "choice": trial.claim,
@@ -135,12 +137,12 @@ def _row(trial: Trial, trained: Checkpoint, held_out: dict[str, Source]) -> dict
         "pairs_seen": trained.step * trained.recipe.batch,
         "hours": trained.hours,
         "parameters": sum(parameter.numel() for parameter in network.parameters()),
-        "multiply_adds": multiply_adds(network),
+        "multiply_adds": count_multiply_adds(network),
         **scores,
     }
 
 
-def _near_edges(match: Method, pairs: Source) -> dict[str, float]:
+def _near_edges(match: Method, pairs: PairSource) -> dict[str, float]:
     """Mean errors near depth edges, over the pairs that have edges."""
     rows = []
     for index in range(pairs.count):

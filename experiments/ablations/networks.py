@@ -18,7 +18,7 @@ from stereoweave.learn.models.layers import (
 from stereoweave.learn.models.weave import (
     SMALL,
     Aggregation,
-    Features,
+    WeaveFeatures,
     WeaveNet,
     as_left_view,
     as_other_view,
@@ -36,7 +36,7 @@ def soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
     return (logits.softmax(1) * levels).sum(1, keepdim=True)
 
 
-class Bilinear(WeaveNet):
+class BilinearWeaveNet(WeaveNet):
     """Bilinear upsampling, without weights from the image."""
 
     upsample = staticmethod(upsample_bilinear)
@@ -48,14 +48,14 @@ class Bilinear(WeaveNet):
         self.refinement.register_module("weights", nn.Identity())
 
 
-class AllLevels(WeaveNet):
+class AllLevelsWeaveNet(WeaveNet):
     """Disparity as the expectation over all levels instead of those around the best one."""
 
-    def read(self, scores: Tensor, decoded: Tensor) -> Tensor:
+    def read_disparity(self, scores: Tensor, decoded: Tensor) -> Tensor:
         return soft_argmax(scores)
 
 
-class Grouped(WeaveNet):
+class GroupedWeaveNet(WeaveNet):
     """Group-wise correlation (GwcNet, Guo et al. 2019): scores for each of `groups` groups of channels."""
 
     def __init__(self, groups: int = 4) -> None:
@@ -65,7 +65,7 @@ class Grouped(WeaveNet):
         wider = (half, quarter + (groups - 1) * self.levels, eighth, sixteenth)
         self.aggregation = Aggregation(self.levels, replace(SMALL, channels=wider))
 
-    def matched(self, maps: Features, first: Features) -> tuple[Tensor, Tensor, Tensor]:
+    def match(self, maps: WeaveFeatures, first: WeaveFeatures) -> tuple[Tensor, Tensor, Tensor]:
         match = self.to_match(maps.quarter)
         batch = match.shape[0] // 2
         volumes = [
@@ -88,7 +88,7 @@ class EighthAggregation(Aggregation):
         self.join = ConvBlock(SMALL.bottleneck + quarter, 32, kernel=1)
         self.scores = nn.Conv2d(32, levels, 2, stride=2)
 
-    def forward(self, correlation: Tensor, features: Features) -> tuple[Tensor, Tensor]:
+    def forward(self, correlation: Tensor, features: WeaveFeatures) -> tuple[Tensor, Tensor]:
         dense = self.dense(torch.cat([self.down(correlation), features.eighth], 1))
         wide = self.bottleneck(dense) + self.context(dense, features.sixteenth)
         joined = self.join(torch.cat([F.interpolate(wide, scale_factor=2.0), features.quarter], 1))
@@ -96,7 +96,7 @@ class EighthAggregation(Aggregation):
         return correlation + self.scores(decoded), decoded
 
 
-class Eighth(WeaveNet):
+class EighthWeaveNet(WeaveNet):
     """Correlation at 1/8, with half as many levels of 8 px."""
 
     def __init__(self) -> None:
@@ -109,10 +109,10 @@ class Eighth(WeaveNet):
     def max_disparity_px(self) -> int:
         return 8 * self.levels
 
-    def matched(self, maps: Features, first: Features) -> tuple[Tensor, Tensor, Tensor]:
-        return super().matched(maps._replace(quarter=maps.eighth), first)
+    def match(self, maps: WeaveFeatures, first: WeaveFeatures) -> tuple[Tensor, Tensor, Tensor]:
+        return super().match(maps._replace(quarter=maps.eighth), first)
 
-    def read(self, scores: Tensor, decoded: Tensor) -> Tensor:
+    def read_disparity(self, scores: Tensor, decoded: Tensor) -> Tensor:
         weights = self.weights_of_eighth(decoded).float()
         return upsample_convex(2 * local_soft_argmax(scores), weights)
 
@@ -124,7 +124,7 @@ class NoContext(nn.Module):
         return dense.new_zeros(())
 
 
-class WithoutContext(WeaveNet):
+class WeaveNetWithoutContext(WeaveNet):
     """Aggregation without its context at 1/16."""
 
     def __init__(self) -> None:
@@ -133,13 +133,13 @@ class WithoutContext(WeaveNet):
 
 
 VARIANTS: dict[str, Callable[[], WeaveNet]] = {
-    "weave_small_eighth": Eighth,
-    "weave_small_grouped": Grouped,
-    "weave_small_all_levels": AllLevels,
+    "weave_small_eighth": EighthWeaveNet,
+    "weave_small_grouped": GroupedWeaveNet,
+    "weave_small_all_levels": AllLevelsWeaveNet,
     "weave_small_undilated": partial(WeaveNet, replace(SMALL, dilations=(1, 1, 1))),
     "weave_small_without_dense": partial(WeaveNet, replace(SMALL, dilations=())),
-    "weave_small_without_context": WithoutContext,
-    "weave_small_bilinear": Bilinear,
+    "weave_small_without_context": WeaveNetWithoutContext,
+    "weave_small_bilinear": BilinearWeaveNet,
     "weave_small_nine_neighbours": partial(WeaveNet, replace(SMALL, neighbours=9)),
     "weave_small_looked_up": partial(WeaveNet, replace(SMALL, warps=False, compared=16, handed=8)),
 }

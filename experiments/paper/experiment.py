@@ -13,10 +13,10 @@ from rich.console import Console
 from experiments.paper.trials import CLAIMS, SHORT, list_trials
 from experiments.trial import Trial
 from stereoweave.errors import StereoweaveError
-from stereoweave.learn.data.sources import kept, sources
+from stereoweave.learn.data.sources import cache_pairs, open_sources
 from stereoweave.learn.recipe import COLLAGE, Recipe
 from stereoweave.learn.training.loop import train_recipe
-from stereoweave.learn.training.objective import fitted
+from stereoweave.learn.training.objective import fit_recipe
 
 
 def plan(
@@ -36,13 +36,13 @@ def plan(
             without a camera.
     """
     _check_base(base)
-    training, _ = (kept(pairs, console) for pairs in sources(base, runs / "pairs"))
-    exponent = fitted(replace(base, fit_exponent=True), training).exponent
+    training, _ = (cache_pairs(pairs, console) for pairs in open_sources(base, runs / "pairs"))
+    exponent = fit_recipe(replace(base, fit_exponent=True), training).exponent
     chosen = (trial for trial in list_trials(base, seeds, exponent) if trial.claim in claims)
     planned = [_resolve_start(trial, runs) for trial in chosen]
     for trial in planned:
-        for pairs in sources(trial.recipe, runs / "pairs"):
-            kept(pairs, console)
+        for pairs in open_sources(trial.recipe, runs / "pairs"):
+            cache_pairs(pairs, console)
     return planned
 
 

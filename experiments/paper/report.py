@@ -34,11 +34,11 @@ from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.files import make_folder, replacing
 from stereoweave.learn import checkpoint
 from stereoweave.learn.checkpoint import Checkpoint
-from stereoweave.learn.data.sources import Source, sources
-from stereoweave.learn.evaluation import evaluate, held_out_of, method_of
+from stereoweave.learn.data.sources import PairSource, open_sources
+from stereoweave.learn.evaluation import evaluate, identify_held_out, make_method
 from stereoweave.learn.recipe import COLLAGE, Recipe
-from stereoweave.learn.training.loop import CURVE, read_record
-from stereoweave.learn.training.objective import truth_histogram
+from stereoweave.learn.training.loop import SCORES_FILE, read_scores
+from stereoweave.learn.training.objective import count_truth
 
 # Held-out pairs that the figures show, modulo their number.
 SHOWN = (3, 11, 24)
@@ -63,8 +63,8 @@ class Report:
     """
 
     base: Recipe
-    training: Source
-    held_out: Source
+    training: PairSource
+    held_out: PairSource
     planned: list[Trial]
     trained: list[Trial]
     missing: list[str]
@@ -112,7 +112,7 @@ def _gather(base: Recipe, planned: Sequence[Trial], runs: Path) -> Report:
         )
     scores, common = _score([base, *(trial.recipe for trial in trained)], runs)
     names = {trial.recipe.name for trial in trained}
-    training, held_out = sources(base, runs / "pairs", whole=True)
+    training, held_out = open_sources(base, runs / "pairs", whole=True)
     return Report(
         base=base,
         training=training,
@@ -121,7 +121,7 @@ def _gather(base: Recipe, planned: Sequence[Trial], runs: Path) -> Report:
         trained=trained,
         missing=sorted(files.keys() - names),
         kept={name: kept[name] for name in names},
-        curves={name: read_record(runs / name / CURVE) for name in names},
+        curves={name: read_scores(runs / name / SCORES_FILE) for name in names},
         rows=[_row(trial, kept[trial.recipe.name], scores[trial.recipe.name]) for trial in trained],
         common=common,
     )
@@ -137,12 +137,12 @@ def _score(recipes: Sequence[Recipe], runs: Path) -> tuple[dict[str, ViewRow], l
     base, *others = recipes
     scores: dict[str, ViewRow] = {}
     common: list[ViewRow] = []
-    for pairs in dict.fromkeys(held_out_of(recipe) for recipe in others):
-        names = list(dict.fromkeys(recipe.name for recipe in others if held_out_of(recipe) == pairs))
+    for pairs in dict.fromkeys(identify_held_out(recipe) for recipe in others):
+        names = list(dict.fromkeys(recipe.name for recipe in others if identify_held_out(recipe) == pairs))
         # Quiet: all pairs exist since the plan was made.
         found = evaluate([runs / name for name in names], runs / "pairs", Console(quiet=True))
         scores |= {row.method: row for row in found if row.method in names}
-        if pairs == held_out_of(base):
+        if pairs == identify_held_out(base):
             common = [row for row in found if row.method not in names]
     return scores, common
 
@@ -298,7 +298,7 @@ def _draw(report: Report, out: Path) -> None:
     claims = {row.claim for row in report.rows}
     if ADJUSTMENT in claims:
         exponents = {row.exponent for row in report.rows if row.claim == ADJUSTMENT}
-        histogram = truth_histogram(report.base, report.training)
+        histogram = count_truth(report.base, report.training)
         draw_exponent_curves(out / "exponent_curves.png", sorted(exponents), histogram)
     for claim, name in ((ADJUSTMENT, "exponent"), (PROJECTION, "projection")):
         if claim in claims:
@@ -315,7 +315,7 @@ def _draw(report: Report, out: Path) -> None:
 def _load_first_seeds(report: Report, claim: str) -> dict[str, Method]:
     """Load the first seed's network for each setting."""
     names = {t.setting: t.recipe.name for t in reversed(report.trained) if t.claim == claim}
-    return {setting: method_of(report.kept[name]) for setting, name in reversed(names.items())}
+    return {setting: make_method(report.kept[name]) for setting, name in reversed(names.items())}
 
 
 def _curves_by_setting(report: Report, claim: str) -> dict[str, list[list[tuple[int, float]]]]:

@@ -11,8 +11,8 @@ import onnx
 import onnxruntime  # type: ignore[import-untyped]
 import torch
 
-from stereoweave.learn.export.from_checkpoint import DisparityNetwork, fixed_graph_of, multiply_adds
-from stereoweave.learn.models import network_of
+from stereoweave.learn.export.from_checkpoint import DisparityNetwork, count_multiply_adds, export_fixed_graph
+from stereoweave.learn.models import build_network
 from stereoweave.learn.recipe import Recipe
 from stereoweave.system.threads import thread_count
 
@@ -55,7 +55,7 @@ def measure_run_times(
     pair = torch.rand(2, 1, 3, HEIGHT_PX, WIDTH_PX)
     recipe = replace(recipe, target="disparity", max_disparity_px=DISPARITIES, loss="l2")
     built = {
-        name: DisparityNetwork(network_of(replace(recipe, model=name)).eval(), recipe) for name in networks
+        name: DisparityNetwork(build_network(replace(recipe, model=name)).eval(), recipe) for name in networks
     }
     with tempfile.TemporaryDirectory() as folder:
         calls = {
@@ -67,7 +67,7 @@ def measure_run_times(
         SpeedRow(
             network=name,
             parameters=sum(parameter.numel() for parameter in network.parameters()),
-            multiply_adds=multiply_adds(network, HEIGHT_PX, WIDTH_PX),
+            multiply_adds=count_multiply_adds(network, HEIGHT_PX, WIDTH_PX),
             eager_ms=times_ms[name][0],
             eager_relative=times_ms[name][0] / times_ms[REFERENCE][0],
             onnx_ms=times_ms[name][1],
@@ -86,7 +86,7 @@ def _eager(network: DisparityNetwork, pair: torch.Tensor) -> Callable[[], object
 
 
 def _onnx(network: DisparityNetwork, pair: torch.Tensor, file: Path) -> Callable[[], object]:
-    onnx.save(fixed_graph_of(network, HEIGHT_PX, WIDTH_PX), file)
+    onnx.save(export_fixed_graph(network, HEIGHT_PX, WIDTH_PX), file)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = thread_count(None)
     session = onnxruntime.InferenceSession(file, options, providers=["CPUExecutionProvider"])

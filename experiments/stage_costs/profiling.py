@@ -17,7 +17,7 @@ from onnx import TensorProto, helper
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn import checkpoint
-from stereoweave.learn.export.from_checkpoint import matcher_network, noted_graph
+from stereoweave.learn.export.from_checkpoint import export_annotated_graph, load_matcher_network
 from stereoweave.learn.models.weave import WeaveNet
 
 HEIGHT_PX, WIDTH_PX = 480, 640
@@ -135,8 +135,8 @@ def format_table(rows: Sequence[StageCost]) -> str:
 
 
 def trace(network: WeaveNet) -> onnx.ModelProto:
-    """Graph of the network as in `export.fixed_graph_of`, with the exporter's notes on each node's module."""
-    return noted_graph(network, HEIGHT_PX, WIDTH_PX, None)
+    """Graph of the network as in `export.export_fixed_graph`, with the exporter's notes on each node's module."""
+    return export_annotated_graph(network, HEIGHT_PX, WIDTH_PX, None)
 
 
 def find_stages(graph: onnx.ModelProto) -> dict[str, str]:
@@ -263,7 +263,7 @@ def _min_ms(profiled: Profile, stages: Mapping[str, str], stage: str) -> float:
 def _load_weave_net(run: Path) -> tuple[str, WeaveNet]:
     """Name of a checkpoint's recipe, and its averaged network."""
     kept = checkpoint.load(run / "last.pt" if run.is_dir() else run)
-    network = matcher_network(kept)
+    network = load_matcher_network(kept)
     if not isinstance(network, WeaveNet):
         raise StereoweaveError(
             f"{run}: expected a WeaveNet, found {kept.recipe.model}; "

@@ -95,7 +95,7 @@ def _train(options: argparse.Namespace) -> None:
 
     from stereoweave.errors import StereoweaveError
     from stereoweave.learn.recipe import read_recipe
-    from stereoweave.learn.training.timed import Command, train_by_clock
+    from stereoweave.learn.training.timed import TimedCommand, train_by_clock
     from stereoweave.system.threads import usable_cores
 
     recipe = read_recipe(options.recipe)
@@ -109,7 +109,7 @@ def _train(options: argparse.Namespace) -> None:
         torch.backends.cudnn.benchmark = True
         properties = torch.cuda.get_device_properties(0)
         say(f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, CUDA {torch.version.cuda}")
-    command = Command(
+    command = TimedCommand(
         out=options.out,
         earlier=options.earlier,
         began_s=BEGAN_S,

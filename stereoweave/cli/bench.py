@@ -215,11 +215,11 @@ def parity(
 
     place_for(out)
     with needing_the_train_extra():
-        from stereoweave.learn.export.parity import markdown
-        from stereoweave.learn.export.parity import parity as measured
+        from stereoweave.learn.export.parity import format_markdown
+        from stereoweave.learn.export.parity import measure_parity as measured
     rows = measured(checkpoints)
     write_csv(out, rows)
-    typer.echo(markdown(rows))
+    typer.echo(format_markdown(rows))
     typer.echo(f"rows: {out}")
 
 

@@ -75,9 +75,9 @@ def train(
     out: Annotated[Path, typer.Option("--out", "-o", help="The folder of the run.")],
 ) -> None:
     """Train the network of a recipe; a run that was stopped continues where it was."""
-    from stereoweave.learn.distributed import told_once
+    from stereoweave.learn.distributed import report_once
 
-    with told_once(), needing_the_train_extra():
+    with report_once(), needing_the_train_extra():
         from stereoweave.learn.recipe import read_recipe
 
         read_recipe(recipe)  # what is wrong with it is said before PyTorch takes seconds to load

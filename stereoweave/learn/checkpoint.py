@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from stereoweave.errors import FormatError, reason
-from stereoweave.learn.models import network_of
+from stereoweave.learn.models import build_network
 from stereoweave.learn.recipe import Recipe, recipe_from
 
 Weights = dict[str, torch.Tensor]
@@ -46,19 +46,19 @@ class Checkpoint:
         return *self.origin, {"recipe": asdict(self.recipe), "step": self.step, "commit": self.commit}
 
 
-def start_of(recipe: Recipe, commit: str) -> Checkpoint:
+def make_initial(recipe: Recipe, commit: str) -> Checkpoint:
     """The start of a run: the averaged weights of `start_from` where the network has such, else random ones.
 
     Raises:
         FormatError: `start_from` is no checkpoint, or shares no weights with the network.
     """
     torch.manual_seed(recipe.seed)
-    weights: Weights = network_of(recipe).state_dict()
+    weights: Weights = build_network(recipe).state_dict()
     hours = 0.0
     origin: tuple[dict[str, Any], ...] = ()
     if recipe.start_from:
         earlier = load(Path(recipe.start_from))
-        weights, hours, origin = _grown(weights, earlier, recipe), earlier.hours, earlier.as_origin()
+        weights, hours, origin = _take_weights(weights, earlier, recipe), earlier.hours, earlier.as_origin()
     return Checkpoint(
         recipe=recipe,
         step=0,
@@ -73,7 +73,7 @@ def start_of(recipe: Recipe, commit: str) -> Checkpoint:
     )
 
 
-def _grown(fresh: Weights, earlier: Checkpoint, recipe: Recipe) -> Weights:
+def _take_weights(fresh: Weights, earlier: Checkpoint, recipe: Recipe) -> Weights:
     """An earlier network's averaged weights where this one has such of the same shape, else fresh ones."""
     taken = {
         name: value.to(fresh[name].dtype)  # kept in half precision, perhaps
@@ -88,7 +88,7 @@ def _grown(fresh: Weights, earlier: Checkpoint, recipe: Recipe) -> Weights:
     return fresh | taken
 
 
-def averaged_alone(kept: Checkpoint) -> Checkpoint:
+def strip_to_average(kept: Checkpoint) -> Checkpoint:
     """The checkpoint with nothing but its averaged weights, in half precision: to start other runs from."""
     weights = {
         name: value.half() if value.is_floating_point() else value for name, value in kept.averaged.items()
@@ -96,7 +96,7 @@ def averaged_alone(kept: Checkpoint) -> Checkpoint:
     return replace(kept, weights=weights, averaged=weights, optimiser={})
 
 
-def mean(first: Checkpoint, second: Checkpoint, start: Checkpoint) -> Checkpoint:
+def average(first: Checkpoint, second: Checkpoint, start: Checkpoint) -> Checkpoint:
     """What lies half-way between two runs that went on from `start`, to start a further run from.
 
     The mean of two networks that were trained on from one is often better than either (Wortsman et al.,
@@ -106,12 +106,12 @@ def mean(first: Checkpoint, second: Checkpoint, start: Checkpoint) -> Checkpoint
         FormatError: One of the two did not go on from `start`.
     """
     for run in (first, second):
-        if _points(run.origin) != _points(start.as_origin()):
+        if _list_origins(run.origin) != _list_origins(start.as_origin()):
             raise FormatError(
                 f"{run.recipe.name}: expected a run that started from {start.recipe.name} after {start.step} "
                 "steps, found one that did not"
             )
-    weights = {name: _half_way(value, second.averaged[name]) for name, value in first.averaged.items()}
+    weights = {name: _midpoint(value, second.averaged[name]) for name, value in first.averaged.items()}
     return replace(
         first,
         weights=weights,
@@ -123,12 +123,12 @@ def mean(first: Checkpoint, second: Checkpoint, start: Checkpoint) -> Checkpoint
     )
 
 
-def _points(origin: tuple[dict[str, Any], ...]) -> list[tuple[str, int]]:
+def _list_origins(origin: tuple[dict[str, Any], ...]) -> list[tuple[str, int]]:
     # Not the recipes, which have had more keys since.
     return [(past["commit"], past["step"]) for past in origin]
 
 
-def _half_way(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+def _midpoint(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
     # A batch norm counts its batches in whole numbers.
     return (first + second) / 2 if first.is_floating_point() else first
 
@@ -164,7 +164,7 @@ def load(path: Path) -> Checkpoint:
     return Checkpoint(**{**values, "recipe": recipe_from(values["recipe"], str(path))})
 
 
-def code_commit() -> str:
+def find_commit() -> str:
     """The commit of the code that runs, '+' behind it where files were changed; 'unknown' outside git."""
     try:
         # Of the package's own repository alone: an installed package may lie in somebody else's.

@@ -15,28 +15,28 @@ _PATIENCE_S = 20.0
 
 
 @dataclass(frozen=True)
-class Ranks:
+class ProcessRank:
     """Which of the processes this is, how many there are, and how many of them on this machine."""
 
     rank: int = 0
-    count: int = 1
-    count_here: int = 1
+    world_size: int = 1
+    local_world_size: int = 1
 
-    def share(self, parts: int) -> range:
+    def own_micro_batches(self, count: int) -> range:
         """Those of so many micro-batches that this process makes: neighbours, and nobody else's."""
-        own = parts // self.count
+        own = count // self.world_size
         return range(self.rank * own, (self.rank + 1) * own)
 
 
-def ranks() -> Ranks:
+def read_rank() -> ProcessRank:
     """As torchrun started this process; one process alone where it did not."""
     if "TORCHELASTIC_RUN_ID" not in os.environ:
-        return Ranks()
-    return Ranks(*(int(os.environ[name]) for name in ("RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE")))
+        return ProcessRank()
+    return ProcessRank(*(int(os.environ[name]) for name in ("RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE")))
 
 
 @contextmanager
-def told_once() -> Iterator[None]:
+def report_once() -> Iterator[None]:
     """An error leaves the block in one process alone: in the first one, where all of them have it.
 
     The others wait until torchrun ends them for that, and so does the first one where it only finds that
@@ -45,19 +45,19 @@ def told_once() -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        own = ranks()
+        own = read_rank()
         to_tell = isinstance(error, StereoweaveError | OSError)
-        if own.rank > 0 or (own.count > 1 and not to_tell):
+        if own.rank > 0 or (own.world_size > 1 and not to_tell):
             time.sleep(_PATIENCE_S)
         raise
 
 
-def threads_each() -> int | None:
+def choose_thread_count() -> int | None:
     """Threads for each of torchrun's processes here; None where PyTorch or the user has decided.
 
     Where the user has not, torchrun gives each process one, however many cores there are.
     """
-    here = ranks().count_here
+    here = read_rank().local_world_size
     if here == 1 or "OMP_NUM_THREADS" in _environment_of_torchrun():
         return None
     return max(1, usable_cores() // here)

@@ -12,9 +12,9 @@ from stereoweave.bench.projected_views import Method, ViewRow, score_views
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn import checkpoint
 from stereoweave.learn.checkpoint import Checkpoint
-from stereoweave.learn.data.batches import collated, known
-from stereoweave.learn.data.sources import Source, kept, sources
-from stereoweave.learn.models import CodeNetwork, network_of
+from stereoweave.learn.data.batches import collate, read_known
+from stereoweave.learn.data.sources import PairSource, cache_pairs, open_sources
+from stereoweave.learn.models import CodeNetwork, build_network
 from stereoweave.learn.recipe import Recipe
 from stereoweave.learn.training.objective import CodeObjective
 from stereoweave.stereo import Sample
@@ -42,21 +42,24 @@ def evaluate(runs: Sequence[Path], folder: Path, console: Console) -> list[ViewR
     _check_names(names)
     files = [run / "last.pt" if run.is_dir() else run for run in runs]
     networks = {name: checkpoint.load(file) for name, file in zip(names, files, strict=True)}
-    recipe = _common(networks)
-    training, held_out = (kept(pairs, console) for pairs in sources(recipe, folder, whole=True))
-    methods = {MEDIAN: median_method(training), **{name: method_of(one) for name, one in networks.items()}}
-    samples = (known(held_out, index) for index in range(held_out.count))
+    recipe = _find_common_recipe(networks)
+    training, held_out = (cache_pairs(pairs, console) for pairs in open_sources(recipe, folder, whole=True))
+    methods = {
+        MEDIAN: make_median_method(training),
+        **{name: make_method(one) for name, one in networks.items()},
+    }
+    samples = (read_known(held_out, index) for index in range(held_out.count))
     return score_views(methods, samples, recipe.max_depth_m if recipe.target == "depth" else None)
 
 
-def method_of(trained: Checkpoint) -> Method:
+def make_method(trained: Checkpoint) -> Method:
     """The averaged network of a checkpoint as a function from a sample to its left view's disparity in px."""
-    network = network_of(trained.recipe)
+    network = build_network(trained.recipe)
     network.load_state_dict(trained.averaged)
     network.eval()
 
     def match(sample: Sample) -> Float[np.ndarray, "h w"]:
-        batch = collated([sample])
+        batch = collate([sample])
         with torch.no_grad():
             output = network(batch["left"], batch["right"])
             if isinstance(network, CodeNetwork):
@@ -68,10 +71,12 @@ def method_of(trained: Checkpoint) -> Method:
     return match
 
 
-def median_method(training: Source) -> Method:
+def make_median_method(training: PairSource) -> Method:
     """The median disparity of the training pairs, for every pixel of any sample."""
     some = range(0, training.count, max(1, training.count // _MEDIAN_PAIRS))
-    values_px = [known(training, i).disparity_px[::_MEDIAN_STRIDE, ::_MEDIAN_STRIDE].ravel() for i in some]
+    values_px = [
+        read_known(training, i).disparity_px[::_MEDIAN_STRIDE, ::_MEDIAN_STRIDE].ravel() for i in some
+    ]
     median_px = np.nanmedian(np.concatenate(values_px))
     return lambda sample: np.full_like(sample.disparity_px, median_px)
 
@@ -84,9 +89,9 @@ def _check_names(names: Sequence[str]) -> None:
         )
 
 
-def _common(networks: dict[str, Checkpoint]) -> Recipe:
+def _find_common_recipe(networks: dict[str, Checkpoint]) -> Recipe:
     """The recipe of the first run, whose held-out pairs the others have to share."""
-    pairs = {name: held_out_of(one.recipe) for name, one in networks.items()}
+    pairs = {name: identify_held_out(one.recipe) for name, one in networks.items()}
     first, *others = pairs
     for name in others:
         if pairs[name] != pairs[first]:
@@ -96,6 +101,6 @@ def _common(networks: dict[str, Checkpoint]) -> Recipe:
     return networks[first].recipe
 
 
-def held_out_of(recipe: Recipe) -> tuple[object, ...]:
+def identify_held_out(recipe: Recipe) -> tuple[object, ...]:
     """What the recipe's held-out pairs depend on: runs that agree in it are scored on the same ones."""
     return recipe.dataset, recipe.root, recipe.split, recipe.pair_size, recipe.validation_pairs

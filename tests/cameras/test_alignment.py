@@ -6,7 +6,7 @@ import pytest
 
 from stereoweave.cameras.alignment import DEFECTS, check_pair
 from stereoweave.io.files import read_image, read_pair
-from stereoweave.learn.data.collage import sample
+from stereoweave.learn.data.collage import paint_collage
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SEED = 77
@@ -41,7 +41,7 @@ ONE_DEFECT = {
 def pairs():
     """The example, then painted ones."""
     example = read_pair(EXAMPLES / "left.png", EXAMPLES / "right.png")
-    painted = [sample(SEED, 0, index, 480, 640) for index in ALIKE]
+    painted = [paint_collage(SEED, 0, index, 480, 640) for index in ALIKE]
     return [(pair.left, pair.right) for pair in (example, *painted)]
 
 

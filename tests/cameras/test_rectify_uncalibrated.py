@@ -8,7 +8,7 @@ from stereoweave.cameras.alignment import check_pair
 from stereoweave.cameras.rectify_uncalibrated import rectify_by_features
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import read_pair
-from stereoweave.learn.data.collage import sample
+from stereoweave.learn.data.collage import paint_collage
 from stereoweave.stereo import StereoPair
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -57,7 +57,7 @@ def mended(example):
 
 @pytest.mark.parametrize("degrees", [(3, -3, 2), (-3, 3, -2)])
 def test_pairs_turned_by_up_to_three_degrees_end_under_half_a_pixel(degrees):
-    made = sample(77, 0, 2, 480, 640)
+    made = paint_collage(77, 0, 2, 480, 640)
     both = StereoPair(left=turned(made.left, (-1, 3, -1)), right=turned(made.right, degrees))
     left_px, right_px = sift_matches(both.left, both.right)
     assert np.median(np.abs(left_px - right_px)[:, 1]) > 3
@@ -105,7 +105,7 @@ def test_the_same_pair_gives_the_same_result(example):
 
 def test_plain_pictures_and_two_scenes_are_refused(example):
     plain = np.full((100, 200, 3), 90, np.uint8)
-    other = sample(77, 0, 2, *example.left.shape[:2]).right
+    other = paint_collage(77, 0, 2, *example.left.shape[:2]).right
     for pair in (StereoPair(left=plain, right=plain), StereoPair(left=example.left, right=other)):
         with pytest.raises(
             StereoweaveError, match=r"--rectify: expected at least 40 places .*, found \d+ of"

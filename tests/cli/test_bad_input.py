@@ -7,7 +7,7 @@ import pytest
 
 import stereoweave as sw
 from stereoweave.io.files import read_image
-from stereoweave.learn.data.collage import sample
+from stereoweave.learn.data.collage import paint_collage
 
 SIZE = (192, 320)
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -57,18 +57,18 @@ def test_identical_pictures_are_at_disparity_0():
 
 
 def test_pictures_of_two_scenes_are_not_trusted():
-    one, other = (sample(UNSEEN_SEED, 2, index, *SIZE) for index in (0, 1))
+    one, other = (paint_collage(UNSEEN_SEED, 2, index, *SIZE) for index in (0, 1))
     assert estimate(one.left, other.right).confidence.mean() < 0.2
 
 
 @pytest.mark.parametrize("shift_px", [200, 230, 260])
 def test_what_is_nearer_than_the_range_is_not_trusted(shift_px):
-    wide = sample(UNSEEN_SEED, 3, 0, 256, 900).left
+    wide = paint_collage(UNSEEN_SEED, 3, 0, 256, 900).left
     found = estimate(wide[:, :640], wide[:, shift_px : shift_px + 640])
     assert found.confidence.mean() < 0.25
 
 
 def test_what_lies_behind_the_range_is_not_trusted():
-    wide = sample(UNSEEN_SEED, 3, 0, 256, 700).left
+    wide = paint_collage(UNSEEN_SEED, 3, 0, 256, 700).left
     found = estimate(wide[:, 40:680], wide[:, :640])
     assert found.confidence.mean() < 0.2

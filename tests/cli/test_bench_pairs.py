@@ -150,7 +150,7 @@ def test_held_out_collages_are_a_set_and_those_that_trainings_validate_on(tmp_pa
     assert main(f"bench collages -o {tmp_path}/collages --pairs 2 --size 64x48".split()) == 0
     assert capfd.readouterr().out == f"{tmp_path}/collages: 2 pairs made\n"
     for number, scene in enumerate(read_scenes(tmp_path / "collages")):
-        expected = collage.sample(VALIDATION_SEED, 0, number, 48, 64)
+        expected = collage.paint_collage(VALIDATION_SEED, 0, number, 48, 64)
         assert scene.name == f"collage-{number:06d}"
         np.testing.assert_array_equal(scene.pair.left, expected.left)
         np.testing.assert_array_equal(scene.pair.right, expected.right)

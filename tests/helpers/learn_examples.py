@@ -10,9 +10,9 @@ import torch
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn.checkpoint import Checkpoint
-from stereoweave.learn.data.batches import collated
-from stereoweave.learn.data.pair_cache import KeptPairs
-from stereoweave.learn.models import network_of
+from stereoweave.learn.data.batches import collate
+from stereoweave.learn.data.pair_cache import CachedPairs
+from stereoweave.learn.models import build_network
 from stereoweave.learn.models.weave import WeaveNet
 from stereoweave.learn.recipe import Recipe
 from stereoweave.learn.training.losses import weave_losses
@@ -80,7 +80,7 @@ def box_before_a_wall(rng, size=PAIR_SIZE, wall_px=4, box_px=12):
 
 def keep_pairs(folder, seed, count, size=PAIR_SIZE):
     """Pairs of this file in place of the collages that training would make."""
-    pairs = KeptPairs(folder, seed, count, size)
+    pairs = CachedPairs(folder, seed, count, size)
     pairs.folder.mkdir(parents=True, exist_ok=True)
     for index in range(count):
         pairs.keep(index, box_before_a_wall(np.random.default_rng((seed, index)), size))
@@ -90,14 +90,14 @@ def keep_pairs(folder, seed, count, size=PAIR_SIZE):
 def make_batches_in_place(patch):
     """Have a training's batches come in its own process: another one takes seconds to load PyTorch."""
     patch.setattr(
-        "stereoweave.learn.training.loop._numbered_batches",
+        "stereoweave.learn.training.loop._load_batches",
         lambda batches, first: ((step, batches[step]) for step in range(first, batches.recipe.steps)),
     )
 
 
 def untrained(name="weave_small"):
     torch.manual_seed(0)
-    return network_of(recipe_of(name)).eval()
+    return build_network(recipe_of(name)).eval()
 
 
 def checkpoint_of(network, recipe=RECIPE):
@@ -152,7 +152,7 @@ class Overfitted:
 def overfitted(name="weave_small", steps=45) -> Overfitted:
     """A network that has seen one pair again and again, and its mean error on that pair before and after."""
     network, sample = untrained(name), box_before_a_wall(np.random.default_rng(0))
-    batch = collated([sample])
+    batch = collate([sample])
     before_px = mean_error_px(network, batch)
     optimiser = torch.optim.AdamW(network.parameters(), 2e-3)
     network.train()

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from stereoweave.learn.data.paint_kernels import REACH_PX, outline_field
+from stereoweave.learn.data.paint_kernels import REACH_PX, draw_outline_field
 from stereoweave.learn.data.silhouettes import Patch
 
 
 def rectangle(left, top, right, bottom, canvas):
     corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom]], float)
-    return Patch(outline_field((corners,), 0, 0, (canvas[1], canvas[0])), 0, 0)
+    return Patch(draw_outline_field((corners,), 0, 0, (canvas[1], canvas[0])), 0, 0)
 
 
 def sampled(image, shift_px):

@@ -135,7 +135,7 @@ def test_a_checkpoint_that_is_not_there_is_named_with_what_makes_one(tmp_path):
 
 
 def test_the_commit_of_the_code_is_a_short_hash_or_unknown():
-    assert re.fullmatch(r"[0-9a-f]{7,40}\+?|unknown", checkpoint.code_commit())
+    assert re.fullmatch(r"[0-9a-f]{7,40}\+?|unknown", checkpoint.find_commit())
 
 
 def test_the_commit_of_code_installed_in_somebody_elses_repository_is_unknown(tmp_path, monkeypatch):
@@ -144,13 +144,15 @@ def test_the_commit_of_code_installed_in_somebody_elses_repository_is_unknown(tm
     for command in (["init", "-q"], ["commit", "-q", "--allow-empty", "-m", "x"]):
         subprocess.run([*git, *command], check=True)
     monkeypatch.setattr(checkpoint, "__file__", str(tmp_path / "venv/stereoweave/learn/checkpoint.py"))
-    assert checkpoint.code_commit() == "unknown"
+    assert checkpoint.find_commit() == "unknown"
     monkeypatch.setattr(checkpoint, "__file__", str(tmp_path / "stereoweave/learn/checkpoint.py"))
-    assert re.fullmatch(r"[0-9a-f]{7,40}", checkpoint.code_commit())
+    assert re.fullmatch(r"[0-9a-f]{7,40}", checkpoint.find_commit())
 
 
 def test_a_run_starts_with_the_weights_of_its_seed_and_nothing_behind_it():
-    start, again, other = (checkpoint.start_of(replace(RECIPE, seed=seed), "0123abc") for seed in (1, 1, 2))
+    start, again, other = (
+        checkpoint.make_initial(replace(RECIPE, seed=seed), "0123abc") for seed in (1, 1, 2)
+    )
     assert (start.step, start.hours, start.origin) == (0, 0, ())
     assert_same(start.weights, again.weights)
     assert torch.equal(start.random_state, again.random_state)
@@ -165,7 +167,7 @@ def gone_on(start, value):
 def test_the_mean_of_two_runs_lies_half_way_and_names_both_and_their_start_once(trained):
     start = replace(trained, hours=2.0)
     first, second = gone_on(start, 1.0), replace(gone_on(start, 4.0), commit="another")
-    found = checkpoint.mean(first, second, start)
+    found = checkpoint.average(first, second, start)
     assert found.averaged["weight"].item() == 2.5
     assert found.hours == 4.0
     commits = [run["commit"] for run in found.origin]
@@ -175,18 +177,18 @@ def test_the_mean_of_two_runs_lies_half_way_and_names_both_and_their_start_once(
 def test_runs_that_did_not_start_alike_have_no_mean(trained):
     first = gone_on(trained, 1.0)
     with pytest.raises(FormatError, match="found one that did not"):
-        checkpoint.mean(first, trained, trained)
+        checkpoint.average(first, trained, trained)
 
 
 def test_averaged_weights_alone_are_small_and_a_run_can_start_from_them(tmp_path):
     network = untrained()
     kept = replace(checkpoint_of(network), optimiser={"state": torch.zeros(10)})
-    checkpoint.save(checkpoint.averaged_alone(kept), tmp_path / "weights.pt")
+    checkpoint.save(checkpoint.strip_to_average(kept), tmp_path / "weights.pt")
     count = sum(value.numel() for value in network.state_dict().values())
     assert (tmp_path / "weights.pt").stat().st_size < 2 * count + 120_000
     found = checkpoint.load(tmp_path / "weights.pt")
     assert found.optimiser == {}
-    start = checkpoint.start_of(replace(RECIPE, start_from=str(tmp_path / "weights.pt")), "0123abc")
+    start = checkpoint.make_initial(replace(RECIPE, start_from=str(tmp_path / "weights.pt")), "0123abc")
     assert start.origin[-1]["step"] == RECIPE.steps
     for name, value in network.state_dict().items():
         # 11 bits of a float16's fraction.

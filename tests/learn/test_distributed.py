@@ -8,7 +8,7 @@ from learn_examples import complaint
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn import distributed as the_ranks
-from stereoweave.learn.distributed import Ranks, ranks, threads_each, told_once
+from stereoweave.learn.distributed import ProcessRank, choose_thread_count, read_rank, report_once
 
 
 @pytest.fixture
@@ -24,20 +24,20 @@ def started(monkeypatch):
 
 
 def fail():
-    with told_once():
+    with report_once():
         raise StereoweaveError("this and that")
 
 
 def test_a_process_that_torchrun_did_not_start_is_alone(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "8")
-    assert ranks() == Ranks(0, 1, 1)
-    assert list(ranks().share(3)) == [0, 1, 2]
+    assert read_rank() == ProcessRank(0, 1, 1)
+    assert list(read_rank().own_micro_batches(3)) == [0, 1, 2]
 
 
 def test_a_process_of_torchrun_knows_its_place(started):
     started(5, 8, 4)
-    assert ranks() == Ranks(5, 8, 4)
-    assert list(ranks().share(16)) == [10, 11]
+    assert read_rank() == ProcessRank(5, 8, 4)
+    assert list(read_rank().own_micro_batches(16)) == [10, 11]
 
 
 def test_the_first_process_tells_an_error_at_once_and_the_others_wait_to_be_ended(started, monkeypatch):
@@ -54,19 +54,19 @@ def test_who_only_finds_that_another_process_is_gone_waits_too(started, monkeypa
     monkeypatch.setattr(time, "sleep", waited.append)
     for rank, count in ((0, 1), (0, 2), (1, 2)):
         started(rank, count, count)
-        with pytest.raises(RuntimeError, match="closed by peer"), told_once():
+        with pytest.raises(RuntimeError, match="closed by peer"), report_once():
             raise RuntimeError("connection closed by peer")
     assert waited == [20, 20]
 
 
 def test_processes_of_a_machine_share_its_cores_unless_the_user_said_how(started, monkeypatch):
     monkeypatch.setattr(the_ranks, "usable_cores", lambda: 12)
-    assert threads_each() is None
+    assert choose_thread_count() is None
     started(1, 8, 5)
     monkeypatch.setattr(the_ranks, "_environment_of_torchrun", lambda: "PATH=/bin\0HOME=/")
-    assert threads_each() == 2
+    assert choose_thread_count() == 2
     monkeypatch.setattr(the_ranks, "_environment_of_torchrun", lambda: "OMP_NUM_THREADS=1\0HOME=/")
-    assert threads_each() is None
+    assert choose_thread_count() is None
 
 
 def test_the_environment_is_the_one_that_the_parent_was_started_with():

@@ -20,11 +20,11 @@ from stereoweave.bench.metrics import epe_px
 from stereoweave.bench.projected_views import score_views, view_errors
 from stereoweave.bench.projection import project_right
 from stereoweave.learn import checkpoint
-from stereoweave.learn.data.batches import collated
-from stereoweave.learn.data.pair_cache import KeptPairs
+from stereoweave.learn.data.batches import collate
+from stereoweave.learn.data.pair_cache import CachedPairs
 from stereoweave.learn.data.sources import VALIDATION_SEED
-from stereoweave.learn.evaluation import evaluate, median_method, method_of
-from stereoweave.learn.models import network_of
+from stereoweave.learn.evaluation import evaluate, make_median_method, make_method
+from stereoweave.learn.models import build_network
 
 QUIET = Console(quiet=True)
 PAPER = recipe_of("fast_depth", max_disparity_px=32.0, exponent=2.0)
@@ -33,7 +33,7 @@ PAPER = recipe_of("fast_depth", max_disparity_px=32.0, exponent=2.0)
 def kept_of(recipe, change=lambda network: None):
     """A checkpoint of a network with random weights, changed before they are kept."""
     torch.manual_seed(0)
-    network = network_of(recipe)
+    network = build_network(recipe)
     change(network)
     return checkpoint_of(network.eval(), recipe)
 
@@ -59,7 +59,7 @@ def folder(tmp_path_factory):
     """Runs, and pairs: of 6 and 14 px for training, of 4 and 12 px for scores; a quarter of each is near."""
     folder = tmp_path_factory.mktemp("runs")
     keep_pairs(folder / "pairs", VALIDATION_SEED, PAPER.validation_pairs)
-    training = KeptPairs(folder / "pairs", PAPER.seed, PAPER.pairs, PAIR_SIZE)
+    training = CachedPairs(folder / "pairs", PAPER.seed, PAPER.pairs, PAIR_SIZE)
     training.folder.mkdir()
     for index in range(training.count):
         pair = box_before_a_wall(np.random.default_rng(index), wall_px=6, box_px=14)
@@ -98,9 +98,9 @@ def test_a_disparity_that_is_the_same_everywhere_has_the_error_that_it_must(rows
 @torch.no_grad()
 def disparity_px(name, sample):
     """The left view's disparity, straight from the network."""
-    network = network_of(KEPT[name].recipe)
+    network = build_network(KEPT[name].recipe)
     network.load_state_dict(KEPT[name].averaged)
-    batch = collated([sample])
+    batch = collate([sample])
     output = network.eval()(batch["left"], batch["right"])
     match name:
         case "weave_small":
@@ -112,7 +112,7 @@ def disparity_px(name, sample):
 
 @pytest.mark.parametrize("name", ["random", "psmnet", "weave_small"])
 def test_a_row_has_the_means_over_the_held_out_pairs(folder, rows, name):
-    held_out = KeptPairs(folder / "pairs", VALIDATION_SEED, PAPER.validation_pairs, PAIR_SIZE)
+    held_out = CachedPairs(folder / "pairs", VALIDATION_SEED, PAPER.validation_pairs, PAIR_SIZE)
     samples = [held_out[index] for index in range(held_out.count)]
     found_px = [disparity_px(name, sample) for sample in samples]
     errors = [epe_px(found, sample.disparity_px) for found, sample in zip(found_px, samples, strict=True)]
@@ -129,7 +129,7 @@ def test_a_row_has_the_means_over_the_held_out_pairs(folder, rows, name):
 def test_the_averaged_weights_are_scored(rng):
     kept = kept_of(PAPER, answer_half)
     other = replace(kept, weights=kept_of(PAPER).weights)
-    found_px = method_of(other)(box_before_a_wall(rng))
+    found_px = make_method(other)(box_before_a_wall(rng))
     np.testing.assert_allclose(found_px, 32 * np.sqrt(0.5), rtol=1e-6)
 
 
@@ -138,7 +138,7 @@ def test_a_depth_becomes_the_disparity_of_each_pair_s_own_camera():
     recipe = recipe_of("fast_depth", target="depth", max_depth_m=8.0)
     sample = replace(box_before_a_wall(np.random.default_rng(0)), camera=CAMERA)
     other = replace(sample, camera=replace(CAMERA, focal_px=60.0, doffs_px=1.0))
-    match = method_of(kept_of(recipe, answer_half))
+    match = make_method(kept_of(recipe, answer_half))
     for pair, expected_px in ((sample, 6.0), (other, 2.0)):
         np.testing.assert_allclose(match(pair), np.full(PAIR_SIZE, expected_px), rtol=1e-6)
     # The wall, 4 px, and the box, 12 px, are 6 m and 2 m away; for the other camera 12 / 5 and 12 / 13 m.
@@ -150,7 +150,7 @@ def test_a_depth_becomes_the_disparity_of_each_pair_s_own_camera():
 def test_the_median_is_of_what_is_known(rng):
     sample = box_before_a_wall(rng, wall_px=4, box_px=12)
     unknown = np.where(sample.disparity_px == 4, np.float32("nan"), sample.disparity_px)
-    match = median_method(Listed([replace(sample, disparity_px=unknown)]))
+    match = make_median_method(Listed([replace(sample, disparity_px=unknown)]))
     np.testing.assert_array_equal(match(sample), np.full(PAIR_SIZE, 12.0))
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from stereoweave.cli.depth import measure
 from stereoweave.errors import StereoweaveError
-from stereoweave.learn.data.collage import sample
+from stereoweave.learn.data.collage import paint_collage
 from stereoweave.matching.matcher import Matcher
 from stereoweave.outputs.measure import CameraError, Measurement, disparity_error_px, distance
 from stereoweave.stereo import Estimate, StereoCamera
@@ -111,7 +111,7 @@ def test_what_the_network_measures_is_as_certain_as_it_says(rng):
     height, width = 256, 384
     camera = StereoCamera(focal_px=550.0, baseline_m=0.1, cx_px=191.5, cy_px=127.5)
     for index in range(4):
-        pair = sample(7, 0, index, height, width)
+        pair = paint_collage(7, 0, index, height, width)
         estimate, exact = matcher.estimate(pair.left, pair.right), pair.disparity_px
         certain = estimate_of(exact, confidence=1.0)
         known = np.argwhere((estimate.confidence >= 0.5) & ~estimate.occluded & (exact > 2))

@@ -10,7 +10,7 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import Sample, StereoCamera
 
 
-def cut(sample: Sample, height: int, width: int, rng: np.random.Generator) -> Sample:
+def crop(sample: Sample, height: int, width: int, rng: np.random.Generator) -> Sample:
     """A random part of the sample of the size asked for, as it is; StereoweaveError where it is smaller."""
     rows, columns = sample.disparity_px.shape
     if rows < height or columns < width:
@@ -20,7 +20,7 @@ def cut(sample: Sample, height: int, width: int, rng: np.random.Generator) -> Sa
     top, start = int(rng.integers(rows - height + 1)), int(rng.integers(columns - width + 1))
     part = np.s_[top : top + height, start : start + width]
     maps = {name: value[part] for name, value in vars(sample).items() if name != "camera"}
-    return Sample(**maps, camera=moved(sample.camera, start, top))
+    return Sample(**maps, camera=crop_camera(sample.camera, start, top))
 
 
 # The right crop lies at most this share of its width further to the right than the left one.
@@ -41,19 +41,19 @@ def augment(
             width. Their disparity grows by as much, so that plain surfaces are not always far.
     """
     offset = rng.uniform(0, _LARGEST_OFFSET) if offset_share and rng.random() < offset_share else 0.0
-    sample = rescaled_cut(sample, height, width, rng, offset)
+    sample = crop_and_scale(sample, height, width, rng, offset)
     # Without the right view's disparity a mirrored pair has nothing to learn from.
     if rng.random() < 0.5 and np.isfinite(sample.right_disparity_px).any():
-        sample = mirrored(sample)
+        sample = mirror(sample)
     if rng.random() < 0.3:
-        sample = upside_down(sample)
-    left, right = recoloured(sample.left, sample.right, rng)
+        sample = flip_rows(sample)
+    left, right = recolour(sample.left, sample.right, rng)
     if rng.random() < 0.4:
-        right = erased(right, rng)
+        right = erase_patches(right, rng)
     return replace(sample, left=left, right=right)
 
 
-def rescaled_cut(
+def crop_and_scale(
     sample: Sample, height: int, width: int, rng: np.random.Generator, offset: float = 0.0
 ) -> Sample:
     """A random part of the sample, scaled so that it fills height x width; its disparity scales with it.
@@ -96,11 +96,11 @@ def rescaled_cut(
         right_disparity_px=disparity_px(sample.right_disparity_px[there]),
         occluded=nearest(sample.occluded[here].astype(np.uint8)) > 0,
         right_occluded=nearest(sample.right_occluded[there].astype(np.uint8)) > 0,
-        camera=moved(camera, start, top, scale_x, height / part_height),
+        camera=crop_camera(camera, start, top, scale_x, height / part_height),
     )
 
 
-def moved(
+def crop_camera(
     camera: StereoCamera | None, start_px: int, top_px: int, scale_x: float = 1.0, scale_y: float = 1.0
 ) -> StereoCamera | None:
     """The camera of a part that starts at that column and row, scaled.
@@ -116,7 +116,7 @@ def moved(
     )
 
 
-def mirrored(sample: Sample) -> Sample:
+def mirror(sample: Sample) -> Sample:
     """The sample as a mirror shows it: the views change places."""
     camera = sample.camera
     last = sample.left.shape[1] - 1
@@ -131,14 +131,14 @@ def mirrored(sample: Sample) -> Sample:
     )
 
 
-def upside_down(sample: Sample) -> Sample:
+def flip_rows(sample: Sample) -> Sample:
     """The sample with its first row last."""
     maps = {name: value[::-1] for name, value in vars(sample).items() if name != "camera"}
     camera, last = sample.camera, sample.left.shape[0] - 1
     return Sample(**maps, camera=camera and replace(camera, cy_px=last - camera.cy_px))
 
 
-def recoloured(
+def recolour(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], rng: np.random.Generator
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
     """Both views with one change of colour, and each with a small one of its own."""
@@ -147,16 +147,16 @@ def recoloured(
     tables = []
     for _ in range(2):
         own_gain, own_gamma = gain * rng.uniform(0.95, 1.05, 3), gamma * rng.uniform(0.96, 1.04)
-        tables.append(_colour_table(own_gain, own_gamma))
+        tables.append(_make_colour_table(own_gain, own_gamma))
     return cv2.LUT(left[..., order], tables[0]), cv2.LUT(right[..., order], tables[1])
 
 
-def _colour_table(gain: Float[np.ndarray, "3"], gamma: float) -> UInt8[np.ndarray, "256 1 3"]:
+def _make_colour_table(gain: Float[np.ndarray, "3"], gamma: float) -> UInt8[np.ndarray, "256 1 3"]:
     curve = (np.arange(256) / 255) ** gamma
     return np.clip(255 * curve[:, None, None] * gain, 0, 255).astype(np.uint8)
 
 
-def erased(image: UInt8[np.ndarray, "h w 3"], rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
+def erase_patches(image: UInt8[np.ndarray, "h w 3"], rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
     """The image with one or two patches in their mean colour: a match that must be guessed from around it."""
     image = image.copy()
     rows, columns = image.shape[:2]

@@ -5,9 +5,9 @@ import torch
 from torch.utils.data import Dataset
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.learn.data.augment import augment, cut
-from stereoweave.learn.data.sources import Mix, Ordered, Source
-from stereoweave.learn.distributed import Ranks
+from stereoweave.learn.data.augment import augment, crop
+from stereoweave.learn.data.sources import MixedSource, OrderedSource, PairSource
+from stereoweave.learn.distributed import ProcessRank
 from stereoweave.learn.recipe import Recipe
 from stereoweave.stereo import Sample
 
@@ -18,16 +18,16 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
     A micro-batch is drawn from (seed, step, its place in the step) alone, whoever asks and in whatever order.
     """
 
-    def __init__(self, recipe: Recipe, pairs: Source, ranks: Ranks | None = None) -> None:
+    def __init__(self, recipe: Recipe, pairs: PairSource, rank: ProcessRank | None = None) -> None:
         self.recipe, self.pairs = recipe, pairs
-        self.mix = pairs if isinstance(pairs, Mix) else Mix((pairs,), (1.0,))
-        self.parts = (ranks or Ranks()).share(recipe.micro_batches)
+        self.mix = pairs if isinstance(pairs, MixedSource) else MixedSource((pairs,), (1.0,))
+        self.parts = (rank or ProcessRank()).own_micro_batches(recipe.micro_batches)
         self._draw(0)
 
     def __getitem__(self, step: int) -> dict[str, torch.Tensor]:
         chosen = self.chosen(step)
         size = len(chosen) // self.recipe.micro_batches
-        return collated(
+        return collate(
             [
                 sample
                 for part in self.parts
@@ -56,7 +56,7 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
 
     def _draw(self, places: int) -> None:
         """Draw the set of each of the first places, and count how often it was drawn before."""
-        self._drawn = self.mix.drawn(places, np.random.default_rng((self.recipe.seed, 0, 0, 1)))
+        self._drawn = self.mix.draw_sets(places, np.random.default_rng((self.recipe.seed, 0, 0, 1)))
         self._turns = np.zeros(places, np.int64)
         for which in range(len(self.mix.sets)):
             places_of_set = np.flatnonzero(self._drawn == which)
@@ -64,21 +64,21 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
 
     def _cut(self, indices: list[int], key: tuple[int, ...]) -> list[Sample]:
         rng, size = np.random.default_rng(key), self.recipe.crop_size
-        samples = (known(self.pairs, index) for index in indices)
+        samples = (read_known(self.pairs, index) for index in indices)
         if self.recipe.augment:
             return [augment(sample, *size, rng, self.recipe.offset_share) for sample in samples]
-        return [cut(sample, *size, rng) for sample in samples]
+        return [crop(sample, *size, rng) for sample in samples]
 
     def _index(self, which: int, turn: int) -> int:
         """The index of the pair that a set gives when it is drawn for that time, counted from 0."""
         one = self.mix.sets[which]
         epoch, place = divmod(turn, one.count)
         rng = np.random.default_rng((self.recipe.seed, epoch, 1 + which))
-        order = one.order(rng) if isinstance(one, Ordered) else rng.permutation(one.count)
-        return self.mix.first(which) + int(order[place])
+        order = one.order(rng) if isinstance(one, OrderedSource) else rng.permutation(one.count)
+        return self.mix.first_index(which) + int(order[place])
 
 
-class Told(Dataset[dict[str, torch.Tensor] | StereoweaveError]):
+class CaughtBatches(Dataset[dict[str, torch.Tensor] | StereoweaveError]):
     """The batches, or the error where one cannot be made.
 
     Raised in the loader's process it would come with PyTorch's traceback for its words.
@@ -94,7 +94,7 @@ class Told(Dataset[dict[str, torch.Tensor] | StereoweaveError]):
             return error
 
 
-def known(pairs: Source, index: int) -> Sample:
+def read_known(pairs: PairSource, index: int) -> Sample:
     """The sample of that index; StereoweaveError where nothing in it is known."""
     sample = pairs[index]
     if not np.isfinite(sample.disparity_px).any():
@@ -105,7 +105,7 @@ def known(pairs: Source, index: int) -> Sample:
     return sample
 
 
-def collated(samples: list[Sample]) -> dict[str, torch.Tensor]:
+def collate(samples: list[Sample]) -> dict[str, torch.Tensor]:
     """Images [B, 3, H, W] in 0..1; maps [2B, 1, H, W], of the left views, then of the right ones mirrored.
 
     Where every sample has a camera, also `focal_baseline_px_m` and `doffs_px`, [B, 1, 1, 1].
@@ -143,7 +143,7 @@ def collated(samples: list[Sample]) -> dict[str, torch.Tensor]:
     return batch
 
 
-def split(batch: dict[str, torch.Tensor], parts: int) -> list[dict[str, torch.Tensor]]:
+def split_batch(batch: dict[str, torch.Tensor], parts: int) -> list[dict[str, torch.Tensor]]:
     """A collated batch in equal parts, its first pairs first, each as if collated alone."""
     pairs = len(batch["left"])
 

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from stereoweave.learn.data.collage_kinds import draw_scene, draw_training_scene
-from stereoweave.learn.data.collage_scene import Scene
-from stereoweave.learn.data.paint_kernels import Sheet, colour, cover, expose, occlusion, seen_from_right
-from stereoweave.learn.data.textures import LIGHT_MAPS, light_map, natural_colour
+from stereoweave.learn.data.collage_scene import CollageScene
+from stereoweave.learn.data.paint_kernels import Sheet, colour, cover, expose, find_occluded, warp_to_right
+from stereoweave.learn.data.textures import LIGHT_MAPS, draw_natural_colour, make_light_map
 from stereoweave.stereo import Sample
 
 CLEAN_SHARE = 0.25  # pairs without any photometric difference
@@ -29,24 +29,24 @@ View = Float[np.ndarray, "h w 3"]  # 0..255
 
 
 @dataclass(frozen=True, kw_only=True)
-class Painting:
+class PaintedView:
     """One view: image float32 [H, W, 3] in 0..255, and the disparity of what is seen, float32 [H, W]."""
 
     image: Float[np.ndarray, "h w 3"]
     disparity_px: Float[np.ndarray, "h w"]
 
 
-def sample(seed: int, epoch: int, index: int, height: int = 256, width: int = 384) -> Sample:
+def paint_collage(seed: int, epoch: int, index: int, height: int = 256, width: int = 384) -> Sample:
     """Mixed collage number `index` of an epoch, with exact disparity and occlusion for both views.
 
     The same arguments give the same pair in every process. Disparities are finite and >= 0. The textures
     are built at the first call, which takes some seconds.
     """
     rng = np.random.default_rng((seed, epoch, index))
-    return _photographed(rng, *_paint(rng, draw_scene, height, width))
+    return _photograph_views(rng, *_paint_matchable(rng, draw_scene, height, width))
 
 
-def training_sample(seed: int, epoch: int, index: int, height: int = 256, width: int = 384) -> Sample:
+def paint_training_collage(seed: int, epoch: int, index: int, height: int = 256, width: int = 384) -> Sample:
     """A collage of any kind, with what `sample` gives; 6 % of the pairs are for the confidence alone.
 
     In those, disparities are partly or wholly below 0, where a network that clamps at 0 cannot find them.
@@ -56,36 +56,38 @@ def training_sample(seed: int, epoch: int, index: int, height: int = 256, width:
     rng = np.random.default_rng((seed, epoch, index, 1))
     kind = rng.random()
     if kind < NOISE_SHARE:
-        return _plain_noise(rng, height, width)
+        return _paint_plain_noise(rng, height, width)
     if kind < NOISE_SHARE + CUT_APART_SHARE:
-        views = _paint(rng, draw_training_scene, height, width + width // 4)
-        return _photographed(rng, *_cut_apart(rng, *views, width))
-    return _photographed(rng, *_paint(rng, draw_training_scene, height, width))
+        views = _paint_matchable(rng, draw_training_scene, height, width + width // 4)
+        return _photograph_views(rng, *_crop_apart(rng, *views, width))
+    return _photograph_views(rng, *_paint_matchable(rng, draw_training_scene, height, width))
 
 
-def _paint(
+def _paint_matchable(
     rng: np.random.Generator,
-    draw: Callable[[np.random.Generator, int, int], Scene],
+    draw: Callable[[np.random.Generator, int, int], CollageScene],
     height: int,
     width: int,
-) -> tuple[Painting, Painting]:
+) -> tuple[PaintedView, PaintedView]:
     """Both views of a random scene that has something to match."""
     while True:
         left, right = paint_scene(draw(rng, height, width))
-        occluded, right_occluded = _occlusions(left, right)
+        occluded, right_occluded = _find_occlusions(left, right)
         if occluded.mean() < 0.6 and right_occluded.mean() < 0.6 and left.image.std() > 6:
             return left, right
 
 
-def _occlusions(left: Painting, right: Painting) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+def _find_occlusions(
+    left: PaintedView, right: PaintedView
+) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     return (
-        occlusion(left.disparity_px, right.disparity_px, -1),
-        occlusion(right.disparity_px, left.disparity_px, 1),
+        find_occluded(left.disparity_px, right.disparity_px, -1),
+        find_occluded(right.disparity_px, left.disparity_px, 1),
     )
 
 
-def _photographed(rng: np.random.Generator, left: Painting, right: Painting) -> Sample:
-    occluded, right_occluded = _occlusions(left, right)
+def _photograph_views(rng: np.random.Generator, left: PaintedView, right: PaintedView) -> Sample:
+    occluded, right_occluded = _find_occlusions(left, right)
     left_image, right_image = photograph(rng, left.image, right.image)
     return Sample(
         left=left_image,
@@ -97,26 +99,29 @@ def _photographed(rng: np.random.Generator, left: Painting, right: Painting) -> 
     )
 
 
-def _cut_apart(
-    rng: np.random.Generator, left: Painting, right: Painting, width: int
-) -> tuple[Painting, Painting]:
+def _crop_apart(
+    rng: np.random.Generator, left: PaintedView, right: PaintedView, width: int
+) -> tuple[PaintedView, PaintedView]:
     """Views of that width; the left one starts so far to the right that many disparities are below 0."""
     spare = left.image.shape[1] - width
     start = int(np.clip(np.ceil(np.quantile(left.disparity_px, rng.uniform(0.1, 0.7))), 1, spare))
 
-    def cut(view: Painting, first: int) -> Painting:
+    def cut(view: PaintedView, first: int) -> PaintedView:
         columns = np.s_[:, first : first + width]
-        return Painting(
+        return PaintedView(
             image=view.image[columns], disparity_px=view.disparity_px[columns] - np.float32(start)
         )
 
     return cut(left, start), cut(right, 0)
 
 
-def _plain_noise(rng: np.random.Generator, height: int, width: int) -> Sample:
+def _paint_plain_noise(rng: np.random.Generator, height: int, width: int) -> Sample:
     """Two views of one colour under smooth light, and each sensor's noise."""
-    light = 1 + rng.uniform(0, 0.3) * (light_map(int(rng.integers(LIGHT_MAPS))) - 1)
-    shown = natural_colour(rng) * cv2.resize(light, (width, height), interpolation=cv2.INTER_CUBIC)[..., None]
+    light = 1 + rng.uniform(0, 0.3) * (make_light_map(int(rng.integers(LIGHT_MAPS))) - 1)
+    shown = (
+        draw_natural_colour(rng)
+        * cv2.resize(light, (width, height), interpolation=cv2.INTER_CUBIC)[..., None]
+    )
     level = np.exp(rng.uniform(np.log(0.5), np.log(12)))
     views = [shown + level * rng.standard_normal(shown.shape, np.float32) for _ in range(2)]
     left, right = (np.clip(np.round(view), 0, 255).astype(np.uint8) for view in views)
@@ -132,14 +137,14 @@ def _plain_noise(rng: np.random.Generator, height: int, width: int) -> Sample:
     )
 
 
-def paint_scene(scene: Scene) -> tuple[Painting, Painting]:
+def paint_scene(scene: CollageScene) -> tuple[PaintedView, PaintedView]:
     """Both views of a scene, left and right, as ideal cameras see it."""
     left_sheets = [layer.sheet() for layer in scene.layers]
-    right_sheets = [seen_from_right(sheet, scene.width) for sheet in left_sheets]
+    right_sheets = [warp_to_right(sheet, scene.width) for sheet in left_sheets]
     return _paint_view(scene, left_sheets, 0), _paint_view(scene, right_sheets, 1)
 
 
-def _paint_view(scene: Scene, sheets: list[Sheet], side: int) -> Painting:
+def _paint_view(scene: CollageScene, sheets: list[Sheet], side: int) -> PaintedView:
     nearest = np.full((scene.height, scene.width), -1, np.float32)
     nearest_opaque = nearest.copy()
     image = np.full((scene.height, scene.width, 3), 0, np.float32)
@@ -147,7 +152,7 @@ def _paint_view(scene: Scene, sheets: list[Sheet], side: int) -> Painting:
         cover(sheet, nearest, nearest_opaque)
     for layer, sheet in zip(scene.layers, sheets, strict=True):
         colour(image, sheet, layer.paint, nearest_opaque, side)
-    return Painting(image=image, disparity_px=nearest)
+    return PaintedView(image=image, disparity_px=nearest)
 
 
 def photograph(
@@ -157,12 +162,12 @@ def photograph(
     # With numbers of their own, so that a pair without faults stays as it was before there were any.
     fault_rng = rng.spawn(1)[0]
     if fault_rng.random() < FAULTY_SHARE:
-        left, right = _with_faults(fault_rng, left, right)
+        left, right = _add_faults(fault_rng, left, right)
     if rng.random() < CLEAN_SHARE:
         plain, still = np.tile(LEVELS, (3, 1)), np.zeros((3, LEVELS.size), np.float32)
         return expose(left, plain, still, left), expose(right, plain, still, right)
     if rng.random() < 0.33:
-        right = _shifted_down(right, rng.uniform(-0.5, 0.5))
+        right = _shift_down(right, rng.uniform(-0.5, 0.5))
     # One pair in six has plainly different exposures, the others as two cameras of one make have.
     spread = 0.2 if rng.random() < 0.17 else 0.04
     noise_level = float(np.exp(rng.uniform(np.log(0.2), np.log(5)))) if rng.random() < 0.75 else 0.0
@@ -174,29 +179,29 @@ def photograph(
         if rng.random() < blur_share:
             view = cv2.GaussianBlur(view, (0, 0), rng.uniform(0.3, 0.9))
         if vignette:
-            view = view * _vignette(view.shape[0], view.shape[1], vignette)
+            view = view * _make_vignette(view.shape[0], view.shape[1], vignette)
         tone = _draw_tone(rng, spread)
         # Photons are counted: their noise grows with the root of the brightness, over the sensor's own.
         deviation = noise_level * np.sqrt(0.25 + np.clip(tone, 0, 255) / 255)
         noise = rng.standard_normal(view.shape, np.float32) if noise_level else view
         shown = expose(view, tone, deviation, noise)
-        views.append(shown if quality is None else _through_jpeg(shown, quality))
+        views.append(shown if quality is None else _compress_jpeg(shown, quality))
     return views[0], views[1]
 
 
-def _with_faults(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
+def _add_faults(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
     """The views with one to three of the faults, in the order in which light meets them."""
     for fault in np.sort(rng.choice(len(FAULTS), rng.integers(1, 4), replace=False)):
         left, right = FAULTS[fault](rng, left, right)
     return left, right
 
 
-def _lowered(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
+def _misalign_rows(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
     """Cameras that are one or two rows apart in height."""
-    return left, _shifted_down(right, rng.choice([-1, 1]) * rng.uniform(0.8, 2))
+    return left, _shift_down(right, rng.choice([-1, 1]) * rng.uniform(0.8, 2))
 
 
-def _blurred(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
+def _blur_one(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
     """One lens out of focus."""
     deviation_px, which = rng.uniform(0.7, 1.6), rng.integers(2)
     if which:
@@ -204,22 +209,22 @@ def _blurred(rng: np.random.Generator, left: View, right: View) -> tuple[View, V
     return cv2.GaussianBlur(left, (0, 0), deviation_px), right
 
 
-def _darkened_corners(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
+def _darken_corners(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
     """Each lens with corners of its own darkness."""
-    own, other = (_vignette(left.shape[0], left.shape[1], rng.uniform(0.2, 0.7)) for _ in range(2))
+    own, other = (_make_vignette(left.shape[0], left.shape[1], rng.uniform(0.2, 0.7)) for _ in range(2))
     return left * own, right * other
 
 
-def _interpolated(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
+def _interpolate_colours(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
     """Colours of which each pixel of one or both sensors saw but one."""
     which = rng.integers(3)
-    return left if which == 1 else demosaiced(left), right if which == 2 else demosaiced(right)
+    return left if which == 1 else demosaic(left), right if which == 2 else demosaic(right)
 
 
-FAULTS = (_lowered, _blurred, _darkened_corners, _interpolated)
+FAULTS = (_misalign_rows, _blur_one, _darken_corners, _interpolate_colours)
 
 
-def demosaiced(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+def demosaic(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
     """The image (0..255) behind a Bayer filter, the other two colours of each pixel interpolated."""
     levels = np.round(image * 256).astype(np.uint16)
     mosaic = levels[..., 1].copy()
@@ -233,19 +238,19 @@ def _draw_tone(rng: np.random.Generator, spread: float) -> Float[np.ndarray, "3 
     return (gains[:, None] * bent + rng.normal(0, 30 * min(spread, 0.1))).astype(np.float32)
 
 
-def _shifted_down(image: Float[np.ndarray, "h w 3"], shift_px: float) -> Float[np.ndarray, "h w 3"]:
+def _shift_down(image: Float[np.ndarray, "h w 3"], shift_px: float) -> Float[np.ndarray, "h w 3"]:
     move = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, shift_px]])
     size = (image.shape[1], image.shape[0])
     moved = cv2.warpAffine(image, move, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return np.clip(moved, 0, 255)
 
 
-def _vignette(height: int, width: int, strength: float) -> Float[np.ndarray, "h w 1"]:
+def _make_vignette(height: int, width: int, strength: float) -> Float[np.ndarray, "h w 1"]:
     y, x = np.ogrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
     return (1 - strength * (x * x + y * y) / 2).astype(np.float32)[..., None]
 
 
-def _through_jpeg(image: UInt8[np.ndarray, "h w 3"], quality: int) -> UInt8[np.ndarray, "h w 3"]:
+def _compress_jpeg(image: UInt8[np.ndarray, "h w 3"], quality: int) -> UInt8[np.ndarray, "h w 3"]:
     _, data = cv2.imencode(
         ".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality]
     )

@@ -9,31 +9,31 @@ from stereoweave.learn.data.collage_layers import (
     PLANE_SLOPE,
     draw_layer,
     draw_paint,
+    draw_plain_paint,
     draw_plane,
-    plain_paint,
-    unfocused_paint,
+    draw_unfocused_paint,
 )
-from stereoweave.learn.data.collage_scene import Layer, Scene, Surface
+from stereoweave.learn.data.collage_scene import CollageLayer, CollageScene, CollageSurface
 from stereoweave.learn.data.paint_kernels import Paint
 from stereoweave.learn.data.silhouettes import (
     Patch,
-    Place,
-    below,
-    board,
+    Placement,
+    cover_below,
+    cover_canvas,
+    draw_board,
+    draw_pillar,
+    draw_polygon,
+    draw_post,
+    draw_rods,
     draw_shape,
-    everywhere,
-    pillar,
-    polygon,
-    post,
-    rods,
-    softened,
+    soften,
 )
 
 NETWORK_REACH_PX = 188  # no network finds a greater disparity
 
 
 @dataclass(frozen=True, kw_only=True)
-class Canvas:
+class CollageCanvas:
     """What layers are drawn on, by the size of the views in px and the scene's greatest disparity."""
 
     view_width: int
@@ -45,15 +45,15 @@ class Canvas:
         """Columns: those of the left view, and to their right those that only the right camera sees."""
         return self.view_width + int(np.ceil(self.limit_px)) + 2
 
-    def whole(self) -> Place:
+    def whole(self) -> Placement:
         """The place that all of the canvas takes."""
-        return Place(self.width / 2, self.height / 2, self.width / 2, self.width, self.height)
+        return Placement(self.width / 2, self.height / 2, self.width / 2, self.width, self.height)
 
-    def place(self, x: float, y: float, radius_px: float) -> Place:
+    def place(self, x: float, y: float, radius_px: float) -> Placement:
         """A place on the canvas."""
-        return Place(x, y, radius_px, self.width, self.height)
+        return Placement(x, y, radius_px, self.width, self.height)
 
-    def anywhere(self, rng: np.random.Generator, smallest: float, largest: float) -> Place:
+    def anywhere(self, rng: np.random.Generator, smallest: float, largest: float) -> Placement:
         """A random place; its half extent is log-uniform between those shares of the width."""
         radius_px = self.width * float(np.exp(rng.uniform(np.log(smallest), np.log(largest))))
         return self.place(rng.uniform(0, self.width), rng.uniform(0, self.height), radius_px)
@@ -63,10 +63,10 @@ class Canvas:
         return far_px + (self.limit_px - far_px) * nearness
 
 
-Kind = Callable[[np.random.Generator, Canvas], list[Layer]]
+Kind = Callable[[np.random.Generator, CollageCanvas], list[CollageLayer]]
 
 
-def draw_scene(rng: np.random.Generator, height: int, width: int) -> Scene:
+def draw_scene(rng: np.random.Generator, height: int, width: int) -> CollageScene:
     """The description of a mixed scene, as validation has them.
 
     Its greatest disparity is log-uniform, mostly 10 to 110 px of 384, at times 6 to 188.
@@ -76,7 +76,7 @@ def draw_scene(rng: np.random.Generator, height: int, width: int) -> Scene:
     return _draw(rng, draw_mixed, height, width, min(limit_px, NETWORK_REACH_PX))
 
 
-def draw_training_scene(rng: np.random.Generator, height: int, width: int) -> Scene:
+def draw_training_scene(rng: np.random.Generator, height: int, width: int) -> CollageScene:
     """The description of a scene of any kind, with a wider baseline than those of validation.
 
     Its greatest disparity is log-uniform, mostly 22 to 175 px, at times 6 to 188; less below 384 columns.
@@ -88,14 +88,14 @@ def draw_training_scene(rng: np.random.Generator, height: int, width: int) -> Sc
     return _draw(rng, kind, height, width, limit_px)
 
 
-def _draw(rng: np.random.Generator, kind: Kind, height: int, width: int, limit_px: float) -> Scene:
-    canvas = Canvas(view_width=width, height=height, limit_px=limit_px)
+def _draw(rng: np.random.Generator, kind: Kind, height: int, width: int, limit_px: float) -> CollageScene:
+    canvas = CollageCanvas(view_width=width, height=height, limit_px=limit_px)
     # Far to near, so that the nearer of two soft edges is blended last.
     layers = sorted(kind(rng, canvas), key=lambda layer: layer.surface.plane[0])
-    return Scene(layers=tuple(layers), height=height, width=width)
+    return CollageScene(layers=tuple(layers), height=height, width=width)
 
 
-def draw_mixed(rng: np.random.Generator, canvas: Canvas) -> list[Layer]:
+def draw_mixed(rng: np.random.Generator, canvas: CollageCanvas) -> list[CollageLayer]:
     """One or two backgrounds, objects, and in half of the scenes bunches of rods."""
     far_px = rng.uniform(0, 1) if rng.random() < 0.1 else canvas.limit_px * rng.uniform(0.08, 0.5)
     layers = _draw_backgrounds(rng, canvas, far_px)
@@ -105,13 +105,13 @@ def draw_mixed(rng: np.random.Generator, canvas: Canvas) -> list[Layer]:
         place = canvas.anywhere(rng, 0.07 if thin else 0.012, 0.6)
         # Large things stand behind and rods in front more often than not, so that both leave much to see.
         nearness = rng.random() ** (0.8 if thin else 1 + 3 * place.radius_px / canvas.view_width)
-        patch = rods(rng, place) if thin else draw_shape(rng, place)
+        patch = draw_rods(rng, place) if thin else draw_shape(rng, place)
         layers.append(draw_layer(rng, patch, place, canvas.between(far_px, nearness), canvas.limit_px))
     return layers
 
 
-def _draw_backgrounds(rng: np.random.Generator, canvas: Canvas, far_px: float) -> list[Layer]:
-    layers = [draw_layer(rng, _all_of(canvas), canvas.whole(), far_px, canvas.limit_px)]
+def _draw_backgrounds(rng: np.random.Generator, canvas: CollageCanvas, far_px: float) -> list[CollageLayer]:
+    layers = [draw_layer(rng, _cover_canvas(canvas), canvas.whole(), far_px, canvas.limit_px)]
     if rng.random() < 0.5:
         layers.append(_draw_floor(rng, canvas, far_px, 0.3, draw_paint))
     return layers
@@ -119,24 +119,26 @@ def _draw_backgrounds(rng: np.random.Generator, canvas: Canvas, far_px: float) -
 
 def _draw_floor(
     rng: np.random.Generator,
-    canvas: Canvas,
+    canvas: CollageCanvas,
     start_px: float,
     least_rise: float,
-    paint: Callable[[np.random.Generator, Place], Paint],
-) -> Layer:
+    paint: Callable[[np.random.Generator, Placement], Paint],
+) -> CollageLayer:
     """A plane below a line where it has the disparity start_px; it rises by a share of what is left."""
     horizon, tilt = rng.uniform(0.3, 0.8) * canvas.height, rng.normal(0, 0.1)
     # Its disparity is the same along the whole line.
     rise = rng.uniform(least_rise, 1.0) * (canvas.limit_px - start_px) / (canvas.height - horizon)
     slope, middle_x = min(rise, PLANE_SLOPE), canvas.width / 2
-    return Layer(
-        patch=below(horizon - tilt * middle_x, tilt, canvas.width, canvas.height),
-        surface=Surface(plane=(start_px, -tilt * slope, slope, middle_x, horizon), limit_px=canvas.limit_px),
+    return CollageLayer(
+        patch=cover_below(horizon - tilt * middle_x, tilt, canvas.width, canvas.height),
+        surface=CollageSurface(
+            plane=(start_px, -tilt * slope, slope, middle_x, horizon), limit_px=canvas.limit_px
+        ),
         paint=paint(rng, canvas.whole()),
     )
 
 
-def draw_boards(rng: np.random.Generator, canvas: Canvas) -> list[Layer]:
+def draw_boards(rng: np.random.Generator, canvas: CollageCanvas) -> list[CollageLayer]:
     """Near plain boards, walls and tables larger than a training crop, and things behind and before them."""
     far_px = canvas.limit_px * rng.uniform(0.05, 0.4)
     layers = _draw_backgrounds(rng, canvas, far_px)
@@ -146,39 +148,46 @@ def draw_boards(rng: np.random.Generator, canvas: Canvas) -> list[Layer]:
         layers.append(draw_layer(rng, draw_shape(rng, place), place, level_px, canvas.limit_px))
     for _ in range(1 if rng.random() < 0.7 else 2):
         plain = _draw_plain_plane(rng, canvas, far_px)
-        layers += [plain, *_draw_signs(rng, canvas, plain), *_draw_things_before(rng, canvas, plain)]
+        layers += [plain, *_draw_attached(rng, canvas, plain), *_draw_objects_before(rng, canvas, plain)]
     return layers
 
 
-def _draw_plain_plane(rng: np.random.Generator, canvas: Canvas, far_px: float) -> Layer:
+def _draw_plain_plane(rng: np.random.Generator, canvas: CollageCanvas, far_px: float) -> CollageLayer:
     """A board in half of the draws, a table in a quarter, a wall in a quarter."""
     kind = rng.random()
     if kind < 0.25:
-        return _draw_floor(rng, canvas, canvas.between(far_px, rng.uniform(0.1, 0.6)), 0.5, plain_paint)
+        return _draw_floor(rng, canvas, canvas.between(far_px, rng.uniform(0.1, 0.6)), 0.5, draw_plain_paint)
     level_px = canvas.between(far_px, rng.uniform(0.25, 0.85))
     place = canvas.whole()
-    patch = _all_of(canvas)
+    patch = _cover_canvas(canvas)
     if kind < 0.75:
         place = canvas.anywhere(rng, 0.3, 0.8)
-        patch = board(rng, place)
+        patch = draw_board(rng, place)
     surface = draw_plane(rng, place, level_px, canvas.limit_px)
-    return Layer(patch=patch, surface=surface, paint=plain_paint(rng, place))
+    return CollageLayer(patch=patch, surface=surface, paint=draw_plain_paint(rng, place))
 
 
-def _draw_signs(rng: np.random.Generator, canvas: Canvas, plain: Layer) -> list[Layer]:
+def _draw_attached(
+    rng: np.random.Generator, canvas: CollageCanvas, plain: CollageLayer
+) -> list[CollageLayer]:
     """What hangs on the plane or is written on it, in half of the scenes."""
     count = rng.integers(1, 4) if rng.random() < 0.5 else 0
     places = [canvas.anywhere(rng, 0.015, 0.1) for _ in range(count)]
-    return [Layer(patch=draw_shape(rng, p), surface=plain.surface, paint=draw_paint(rng, p)) for p in places]
+    return [
+        CollageLayer(patch=draw_shape(rng, p), surface=plain.surface, paint=draw_paint(rng, p))
+        for p in places
+    ]
 
 
-def _draw_things_before(rng: np.random.Generator, canvas: Canvas, plain: Layer) -> list[Layer]:
+def _draw_objects_before(
+    rng: np.random.Generator, canvas: CollageCanvas, plain: CollageLayer
+) -> list[CollageLayer]:
     """Things that stand before the plane or on it, and in half of the scenes a pillar that parts it."""
     places = [canvas.anywhere(rng, 0.02, 0.2) for _ in range(rng.integers(1, 6))]
     patches = [draw_shape(rng, place) for place in places]
     if rng.random() < 0.5:
         places.append(canvas.anywhere(rng, 0.01, 0.08))
-        patches.append(pillar(rng, places[-1]))
+        patches.append(draw_pillar(rng, places[-1]))
     layers = []
     for place, patch in zip(places, patches, strict=True):
         # The disparity of the plane where the thing's foot is.
@@ -188,46 +197,54 @@ def _draw_things_before(rng: np.random.Generator, canvas: Canvas, plain: Layer) 
     return layers
 
 
-def draw_street(rng: np.random.Generator, canvas: Canvas) -> list[Layer]:
+def draw_street(rng: np.random.Generator, canvas: CollageCanvas) -> list[CollageLayer]:
     """A plane that rises from the horizon to the camera's feet, upright things on it, and a sky."""
     horizon = rng.uniform(0.3, 0.6) * canvas.height
     rise = rng.uniform(0.5, 1.0) * canvas.limit_px / (canvas.height - horizon)
     middle_x = rng.uniform(0.25, 0.6) * canvas.width
     plane = (rng.uniform(0, 0.02) * canvas.limit_px, 0.0, rise, middle_x, horizon)
-    ground = Surface(plane=plane, limit_px=canvas.limit_px)
+    ground = CollageSurface(plane=plane, limit_px=canvas.limit_px)
     layers = [_draw_sky(rng, canvas), _draw_ground(rng, canvas, ground), *_draw_markings(rng, canvas, ground)]
     for _ in range(rng.integers(0, 5)):
-        layers.append(_draw_standing(rng, canvas, ground, rng.uniform(0.01, 0.08), rng.uniform(2, 15)))
+        layers.append(_draw_upright(rng, canvas, ground, rng.uniform(0.01, 0.08), rng.uniform(2, 15)))
     for side in (-1, 1):
         if rng.random() < 0.5:
             layers.append(_draw_facade(rng, canvas, ground, side))
     for _ in range(rng.integers(3, 13)):
-        layers.append(_draw_standing(rng, canvas, ground, rng.uniform(0.1, 0.95), rng.uniform(0.5, 2.5)))
+        layers.append(_draw_upright(rng, canvas, ground, rng.uniform(0.1, 0.95), rng.uniform(0.5, 2.5)))
     return layers
 
 
-def _draw_sky(rng: np.random.Generator, canvas: Canvas) -> Layer:
+def _draw_sky(rng: np.random.Generator, canvas: CollageCanvas) -> CollageLayer:
     """Plain, in two fifths of the streets with clouds."""
     bright = rng.uniform(120, 245) * np.array([rng.uniform(0.6, 1), rng.uniform(0.8, 1), 1.0])
     clouded = rng.random() < 0.4
-    paint = unfocused_paint(rng, canvas.whole()) if clouded else plain_paint(rng, canvas.whole(), bright)
-    surface = Surface(plane=(0.0, 0.0, 0.0, 0.0, 0.0), limit_px=canvas.limit_px)
-    return Layer(patch=_all_of(canvas), surface=surface, paint=paint)
+    paint = (
+        draw_unfocused_paint(rng, canvas.whole())
+        if clouded
+        else draw_plain_paint(rng, canvas.whole(), bright)
+    )
+    surface = CollageSurface(plane=(0.0, 0.0, 0.0, 0.0, 0.0), limit_px=canvas.limit_px)
+    return CollageLayer(patch=_cover_canvas(canvas), surface=surface, paint=paint)
 
 
-def _draw_ground(rng: np.random.Generator, canvas: Canvas, ground: Surface) -> Layer:
-    paint = plain_paint(rng, canvas.whole()) if rng.random() < 0.3 else draw_paint(rng, canvas.whole())
-    return Layer(patch=below(ground.plane[4], 0.0, canvas.width, canvas.height), surface=ground, paint=paint)
+def _draw_ground(rng: np.random.Generator, canvas: CollageCanvas, ground: CollageSurface) -> CollageLayer:
+    paint = draw_plain_paint(rng, canvas.whole()) if rng.random() < 0.3 else draw_paint(rng, canvas.whole())
+    return CollageLayer(
+        patch=cover_below(ground.plane[4], 0.0, canvas.width, canvas.height), surface=ground, paint=paint
+    )
 
 
-def _draw_markings(rng: np.random.Generator, canvas: Canvas, ground: Surface) -> list[Layer]:
+def _draw_markings(
+    rng: np.random.Generator, canvas: CollageCanvas, ground: CollageSurface
+) -> list[CollageLayer]:
     """Strips on the ground that run to one point of the horizon, dashed or not."""
     middle_x, horizon = ground.plane[3:]
     layers = []
     for _ in range(rng.integers(0, 5)):
         foot_x, width = rng.uniform(-0.5, 1.5) * canvas.width, rng.uniform(0.01, 0.08) * canvas.width
         colour = rng.uniform(150, 250) * np.array([1.0, rng.uniform(0.8, 1), rng.uniform(0.3, 1)])
-        paint = plain_paint(rng, canvas.whole(), colour)
+        paint = draw_plain_paint(rng, canvas.whole(), colour)
         # Dashes of equal length shrink towards the horizon as 1 / depth.
         ends = 1 / np.arange(1.0, 1 + rng.integers(1, 9), rng.uniform(0.4, 1.0))
         for near, far in zip(ends[::2], [*ends[1::2], 0.02], strict=False):
@@ -235,14 +252,14 @@ def _draw_markings(rng: np.random.Generator, canvas: Canvas, ground: Surface) ->
             corners = [
                 (middle_x + (x - middle_x) * t, horizon + (canvas.height - horizon) * t) for x, t in sides
             ]
-            patch = polygon(np.array(corners), canvas.whole())
-            layers.append(Layer(patch=patch, surface=ground, paint=paint))
+            patch = draw_polygon(np.array(corners), canvas.whole())
+            layers.append(CollageLayer(patch=patch, surface=ground, paint=paint))
     return layers
 
 
-def _draw_standing(
-    rng: np.random.Generator, canvas: Canvas, ground: Surface, nearness: float, tallness: float
-) -> Layer:
+def _draw_upright(
+    rng: np.random.Generator, canvas: CollageCanvas, ground: CollageSurface, nearness: float, tallness: float
+) -> CollageLayer:
     """A thing at the disparity of its foot; `tallness` is its height in heights of the camera."""
     horizon = ground.plane[4]
     height = nearness * (canvas.height - horizon)
@@ -251,15 +268,17 @@ def _draw_standing(
     place = canvas.place(foot_x, foot_y - 0.8 * radius_px, radius_px)
     level_px = ground.plane_px(foot_x, foot_y)
     thin = rng.random() < 0.25
-    patch = post(place, max(0.6, 0.04 * height), foot_y) if thin else draw_shape(rng, place)
-    return Layer(
+    patch = draw_post(place, max(0.6, 0.04 * height), foot_y) if thin else draw_shape(rng, place)
+    return CollageLayer(
         patch=patch,
-        surface=Surface(plane=(level_px, 0.0, 0.0, place.x, foot_y), limit_px=canvas.limit_px),
+        surface=CollageSurface(plane=(level_px, 0.0, 0.0, place.x, foot_y), limit_px=canvas.limit_px),
         paint=draw_paint(rng, place),
     )
 
 
-def _draw_facade(rng: np.random.Generator, canvas: Canvas, ground: Surface, side: int) -> Layer:
+def _draw_facade(
+    rng: np.random.Generator, canvas: CollageCanvas, ground: CollageSurface, side: int
+) -> CollageLayer:
     """A wall along the street, on its left side (-1) or right side (1), that stands on the ground."""
     start_px, _, rise, middle_x, horizon = ground.plane
     slope = rng.uniform(0.2, 1.0) * min(PLANE_SLOPE, 2 * canvas.limit_px / canvas.width)
@@ -272,54 +291,54 @@ def _draw_facade(rng: np.random.Generator, canvas: Canvas, ground: Surface, side
         (middle_x + side * far, horizon - roof * far),
     ]
     plane = (start_px, side * slope, 0.0, middle_x, horizon)
-    return Layer(
-        patch=polygon(np.array(corners), canvas.whole()),
-        surface=Surface(plane=plane, limit_px=canvas.limit_px),
+    return CollageLayer(
+        patch=draw_polygon(np.array(corners), canvas.whole()),
+        surface=CollageSurface(plane=plane, limit_px=canvas.limit_px),
         paint=draw_paint(rng, canvas.whole()),
     )
 
 
-def draw_film(rng: np.random.Generator, canvas: Canvas) -> list[Layer]:
+def draw_film(rng: np.random.Generator, canvas: CollageCanvas) -> list[CollageLayer]:
     """Figures in focus far before a background that is not, in a third of the scenes past something near."""
     far_px = canvas.limit_px * rng.uniform(0.02, 0.25)
-    layers = [_draw_unfocused(rng, canvas, _all_of(canvas), canvas.whole(), far_px)]
+    layers = [_draw_unfocused(rng, canvas, _cover_canvas(canvas), canvas.whole(), far_px)]
     for _ in range(rng.integers(1, 5)):
         place = canvas.anywhere(rng, 0.08, 0.4)
         level_px = canvas.between(far_px, rng.uniform(0.05, 0.35))
-        layers.append(_draw_unfocused(rng, canvas, softened(draw_shape(rng, place)), place, level_px))
+        layers.append(_draw_unfocused(rng, canvas, soften(draw_shape(rng, place)), place, level_px))
     for _ in range(rng.integers(1, 4)):
         layers += _draw_figure(rng, canvas, canvas.between(far_px, rng.uniform(0.45, 0.9)))
     if rng.random() < 0.35:
         place, level_px = canvas.anywhere(rng, 0.2, 0.5), canvas.between(far_px, rng.uniform(0.85, 1))
-        layers.append(_draw_unfocused(rng, canvas, softened(draw_shape(rng, place)), place, level_px))
+        layers.append(_draw_unfocused(rng, canvas, soften(draw_shape(rng, place)), place, level_px))
     return layers
 
 
 def _draw_unfocused(
-    rng: np.random.Generator, canvas: Canvas, patch: Patch, place: Place, level_px: float
-) -> Layer:
+    rng: np.random.Generator, canvas: CollageCanvas, patch: Patch, place: Placement, level_px: float
+) -> CollageLayer:
     surface = draw_plane(rng, place, level_px, canvas.limit_px)
-    return Layer(patch=patch, surface=surface, paint=unfocused_paint(rng, place))
+    return CollageLayer(patch=patch, surface=surface, paint=draw_unfocused_paint(rng, place))
 
 
-def _draw_figure(rng: np.random.Generator, canvas: Canvas, level_px: float) -> list[Layer]:
+def _draw_figure(rng: np.random.Generator, canvas: CollageCanvas, level_px: float) -> list[CollageLayer]:
     """A large smooth thing with few details, which lie on its surface."""
     place = canvas.anywhere(rng, 0.12, 0.4)
     smooth = rng.random() < 0.6
     body = draw_layer(rng, draw_shape(rng, place), place, level_px, canvas.limit_px)
     if smooth:
-        body = Layer(patch=body.patch, surface=body.surface, paint=plain_paint(rng, place))
+        body = CollageLayer(patch=body.patch, surface=body.surface, paint=draw_plain_paint(rng, place))
     details = []
     for _ in range(rng.integers(0, 6)):
         x, y = rng.normal([place.x, place.y], place.radius_px / 3)
         spot = canvas.place(x, y, place.radius_px * rng.uniform(0.03, 0.2))
         paint = draw_paint(rng, spot)
-        details.append(Layer(patch=draw_shape(rng, spot), surface=body.surface, paint=paint))
+        details.append(CollageLayer(patch=draw_shape(rng, spot), surface=body.surface, paint=paint))
     return [body, *details]
 
 
-def _all_of(canvas: Canvas) -> Patch:
-    return everywhere(canvas.width, canvas.height)
+def _cover_canvas(canvas: CollageCanvas) -> Patch:
+    return cover_canvas(canvas.width, canvas.height)
 
 
 # The share of each kind in training.

@@ -4,18 +4,18 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.learn.data.collage_scene import Layer, Surface
+from stereoweave.learn.data.collage_scene import CollageLayer, CollageSurface
 from stereoweave.learn.data.paint_kernels import Paint
-from stereoweave.learn.data.silhouettes import Patch, Place
+from stereoweave.learn.data.silhouettes import Patch, Placement
 from stereoweave.learn.data.textures import (
     LIGHT_MAPS,
     NATURAL_TEXTURES,
     PERIODIC_TEXTURES,
     SIDE,
-    light_map,
-    natural,
-    natural_colour,
-    periodic,
+    draw_natural_colour,
+    make_light_map,
+    make_natural,
+    make_periodic,
 )
 
 PLANE_SLOPE = 0.3  # px of disparity a px: steeper surfaces are rare and nearly edge-on to one camera
@@ -24,25 +24,29 @@ RELIEF = 0.3  # of the scene's greatest disparity: about how much one surface va
 
 
 def draw_layer(
-    rng: np.random.Generator, patch: Patch, place: Place, level_px: float, limit_px: float
-) -> Layer:
+    rng: np.random.Generator, patch: Patch, place: Placement, level_px: float, limit_px: float
+) -> CollageLayer:
     """A layer of any surface and any paint."""
-    return Layer(
+    return CollageLayer(
         patch=patch,
         surface=draw_surface(rng, place, level_px, limit_px),
         paint=draw_paint(rng, place),
     )
 
 
-def draw_plane(rng: np.random.Generator, place: Place, level_px: float, limit_px: float) -> Surface:
+def draw_plane(
+    rng: np.random.Generator, place: Placement, level_px: float, limit_px: float
+) -> CollageSurface:
     """A plane of that disparity at the centre of the place; one in five faces the camera."""
     slope = min(PLANE_SLOPE, RELIEF * limit_px / place.radius_px)
     flat = rng.random() < 0.2
     slope_x, slope_y = (0.0, 0.0) if flat else (slope * rng.triangular(-1, 0, 1, 2)).tolist()
-    return Surface(plane=(level_px, slope_x, slope_y, place.x, place.y), limit_px=limit_px)
+    return CollageSurface(plane=(level_px, slope_x, slope_y, place.x, place.y), limit_px=limit_px)
 
 
-def draw_surface(rng: np.random.Generator, place: Place, level_px: float, limit_px: float) -> Surface:
+def draw_surface(
+    rng: np.random.Generator, place: Placement, level_px: float, limit_px: float
+) -> CollageSurface:
     """A plane, in half of the layers bent."""
     plane = draw_plane(rng, place, level_px, limit_px).plane
     relief_px = RELIEF * limit_px
@@ -61,36 +65,38 @@ def draw_surface(rng: np.random.Generator, place: Place, level_px: float, limit_
         height_px = min(BEND_SLOPE * radius_px / 0.86, relief_px) * rng.uniform(-0.4, 1)
         keep = [(1, 1), (1, 0), (0, 1)][rng.integers(3)]
         hills.append((height_px, place.x, place.y, keep[0] / radius_px, keep[1] / radius_px))
-    return Surface(plane=plane, waves=tuple(waves), hills=tuple(hills), limit_px=limit_px)
+    return CollageSurface(plane=plane, waves=tuple(waves), hills=tuple(hills), limit_px=limit_px)
 
 
-def draw_paint(rng: np.random.Generator, place: Place) -> Paint:
+def draw_paint(rng: np.random.Generator, place: Placement) -> Paint:
     """A texture of any kind and colour, lit; a near-plain one in a fifth of the layers."""
-    texture, count = (periodic, PERIODIC_TEXTURES) if rng.random() < 0.12 else (natural, NATURAL_TEXTURES)
+    texture, count = (
+        (make_periodic, PERIODIC_TEXTURES) if rng.random() < 0.12 else (make_natural, NATURAL_TEXTURES)
+    )
     texels_per_px = rng.uniform(0.45, 1.0)
     texels_per_light_px = 64 / (2 * place.radius_px + 40) * rng.uniform(0.3, 1.5)
     return Paint(
         texture=texture(int(rng.integers(count))),
         to_texture=_draw_mapping(rng, texels_per_px, SIDE),
         to_colour=_draw_recolouring(rng),
-        light=light_map(int(rng.integers(LIGHT_MAPS))),
+        light=make_light_map(int(rng.integers(LIGHT_MAPS))),
         to_light=_draw_mapping(rng, min(texels_per_light_px, 0.6), 64),
         gloss=_draw_gloss(rng, place),
     )
 
 
-def plain_paint(
-    rng: np.random.Generator, place: Place, colour: Float[np.ndarray, "3"] | None = None
+def draw_plain_paint(
+    rng: np.random.Generator, place: Placement, colour: Float[np.ndarray, "3"] | None = None
 ) -> Paint:
     """A colour with at most 3 % of a texture's contrast, under nearly even light."""
     paint = draw_paint(rng, place)
     contrast = rng.uniform(0, 0.03) if rng.random() < 0.7 else 0.0
     light = 1 + rng.uniform(0, 0.35) * (paint.light - 1)
-    to_colour = _toned_down(contrast, natural_colour(rng) if colour is None else colour)
+    to_colour = _reduce_contrast(contrast, draw_natural_colour(rng) if colour is None else colour)
     return paint._replace(to_colour=to_colour, light=light.astype(np.float32))
 
 
-def unfocused_paint(rng: np.random.Generator, place: Place) -> Paint:
+def draw_unfocused_paint(rng: np.random.Generator, place: Placement) -> Paint:
     """A texture as a lens shows it that is focused elsewhere: without anything finer than 8 to 32 px."""
     paint = draw_paint(rng, place)
     texels, side = int(SIDE / rng.uniform(8, 32)), SIDE // 2
@@ -110,7 +116,7 @@ def _draw_mapping(rng: np.random.Generator, texels_per_px: float, side: int) -> 
 def _draw_recolouring(rng: np.random.Generator) -> Float[np.ndarray, "3 4"]:
     """Of a texel's colour: a near-plain one in a fifth of the layers, else a change of gain, tint and hue."""
     if rng.random() < 0.2:
-        return _toned_down(rng.uniform(0.01, 0.08), natural_colour(rng))
+        return _reduce_contrast(rng.uniform(0.01, 0.08), draw_natural_colour(rng))
     gain = np.exp(rng.normal(0, 0.25) + rng.normal(0, 0.1, 3))
     mix = np.eye(3) * gain
     if rng.random() < 0.1:
@@ -119,11 +125,11 @@ def _draw_recolouring(rng: np.random.Generator) -> Float[np.ndarray, "3 4"]:
     return np.column_stack([mix, np.full(3, lift)]).astype(np.float32)
 
 
-def _toned_down(contrast: float, colour: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 4"]:
+def _reduce_contrast(contrast: float, colour: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 4"]:
     return np.column_stack([contrast * np.eye(3), colour - contrast * 110]).astype(np.float32)
 
 
-def _draw_gloss(rng: np.random.Generator, place: Place) -> Float[np.ndarray, "6"]:
+def _draw_gloss(rng: np.random.Generator, place: Placement) -> Float[np.ndarray, "6"]:
     """A highlight on a fifth of the layers; in the right view it has moved on the surface by up to 8 px."""
     if rng.random() < 0.8:
         return np.zeros(6, np.float32)

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.learn.data.paint_kernels import Paint, Sheet, surface
+from stereoweave.learn.data.paint_kernels import Paint, Sheet, sum_surface
 from stereoweave.learn.data.silhouettes import Patch
 
 
 @dataclass(frozen=True, kw_only=True)
-class Surface:
+class CollageSurface:
     """Disparity over left-image x, y: a sum of products of a function of x and one of y, within 0..limit_px.
 
     Attributes:
@@ -43,15 +43,17 @@ class Surface:
         for height, middle_x, middle_y, inverse_x, inverse_y in self.hills:
             columns.append(height * np.exp(-(((x - middle_x) * inverse_x) ** 2)))
             rows.append(np.exp(-(((y - middle_y) * inverse_y) ** 2)))
-        return surface(np.stack(columns).astype(np.float32), np.stack(rows).astype(np.float32), self.limit_px)
+        return sum_surface(
+            np.stack(columns).astype(np.float32), np.stack(rows).astype(np.float32), self.limit_px
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Layer:
+class CollageLayer:
     """A surface within a silhouette, painted."""
 
     patch: Patch
-    surface: Surface
+    surface: CollageSurface
     paint: Paint
 
     def sheet(self) -> Sheet:
@@ -60,9 +62,9 @@ class Layer:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene:
+class CollageScene:
     """Layers from far to near (by their centres), and the size of the views in px."""
 
-    layers: tuple[Layer, ...]
+    layers: tuple[CollageLayer, ...]
     height: int
     width: int

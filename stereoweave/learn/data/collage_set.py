@@ -8,7 +8,7 @@ from stereoweave.data.shards import write_shard
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import SMALLEST_SIDE_PX, make_folder
 from stereoweave.io.output_lock import lock_output
-from stereoweave.learn.data.collage import sample
+from stereoweave.learn.data.collage import paint_collage
 
 SET_NAME = "collage"
 _PAIRS_A_SHARD = 50
@@ -39,9 +39,9 @@ def write_collages(out: Path, pairs: int, seed: int, size_px: tuple[int, int]) -
             )
         for first in range(0, pairs, _PAIRS_A_SHARD):
             numbers = range(first, min(first + _PAIRS_A_SHARD, pairs))
-            write_shard(out, SET_NAME, first, list(_packed_collages(seed, numbers, size_px)))
+            write_shard(out, SET_NAME, first, list(_pack_collages(seed, numbers, size_px)))
 
 
-def _packed_collages(seed: int, numbers: range, size_px: tuple[int, int]) -> Iterator[dict[str, bytes]]:
+def _pack_collages(seed: int, numbers: range, size_px: tuple[int, int]) -> Iterator[dict[str, bytes]]:
     for number in numbers:
-        yield packed(sample(seed, 0, number, *size_px), views={})
+        yield packed(paint_collage(seed, 0, number, *size_px), views={})

@@ -50,7 +50,7 @@ class Paint(NamedTuple):
     gloss: Float[np.ndarray, "6"]
 
 
-def outline_field(
+def draw_outline_field(
     contours: tuple[Float[np.ndarray, "_ 2"], ...], left: int, top: int, shape: tuple[int, int]
 ) -> Float[np.ndarray, "h w"]:
     """Signed distance in px, float32, to closed contours (x, y) filled by the even-odd rule."""
@@ -64,7 +64,7 @@ def outline_field(
     return field
 
 
-def stroke_field(
+def draw_stroke_field(
     strokes: tuple[tuple[Float[np.ndarray, "_ 2"], float], ...], left: int, top: int, shape: tuple[int, int]
 ) -> Float[np.ndarray, "h w"]:
     """Signed distance in px, float32, to polylines (x, y), each with its half width in px."""
@@ -74,16 +74,16 @@ def stroke_field(
     return field
 
 
-def surface(
+def sum_surface(
     columns: Float[np.ndarray, "k w"], rows: Float[np.ndarray, "k h"], limit_px: float
 ) -> Float[np.ndarray, "h w"]:
     """Disparity float32: the sum of products rows[k, y] * columns[k, x], kept within 0..limit_px."""
-    return _surface(columns, rows, limit_px)
+    return _sum_surface(columns, rows, limit_px)
 
 
-def seen_from_right(sheet: Sheet, width: int) -> Sheet:
+def warp_to_right(sheet: Sheet, width: int) -> Sheet:
     """The left view's sheet as the right camera sees it, cut to columns 0..width-1."""
-    field, disparity_px, left = _seen_from_right(sheet.field, sheet.disparity_px, sheet.left, width)
+    field, disparity_px, left = _warp_to_right(sheet.field, sheet.disparity_px, sheet.left, width)
     return Sheet(field, disparity_px, left, sheet.top)
 
 
@@ -107,7 +107,7 @@ def colour(
     _colour(image, sheet, paint, nearest_opaque, side)
 
 
-def occlusion(
+def find_occluded(
     disparity_px: Float[np.ndarray, "h w"], other_px: Float[np.ndarray, "h w"], sign: int
 ) -> Bool[np.ndarray, "h w"]:
     """Pixels whose match, sign * disparity away, lies outside the other view or behind what it shows there.
@@ -117,7 +117,7 @@ def occlusion(
         other_px: disparity of the other view.
         sign: -1 for the left view (matches lie to the left), +1 for the right one.
     """
-    return _occlusion(disparity_px, other_px, sign)
+    return _find_occluded(disparity_px, other_px, sign)
 
 
 def expose(
@@ -188,7 +188,7 @@ def _negate_inside(field, crossings):
 
 @njit(cache=True, nogil=True)
 @typing.no_type_check
-def _surface(columns, rows, limit):
+def _sum_surface(columns, rows, limit):
     disparity = np.empty((rows.shape[1], columns.shape[1]), np.float32)
     for y in range(disparity.shape[0]):
         line = disparity[y]
@@ -204,7 +204,7 @@ def _surface(columns, rows, limit):
 
 @njit(cache=True, nogil=True)
 @typing.no_type_check
-def _seen_from_right(field, disparity, left, width):
+def _warp_to_right(field, disparity, left, width):
     height, columns = field.shape
     furthest = 0.0
     for y in range(height):
@@ -318,7 +318,7 @@ def _colour(image, sheet, paint, nearest_opaque, side):
 
 @njit(cache=True, nogil=True)
 @typing.no_type_check
-def _occlusion(disparity, other, sign):
+def _find_occluded(disparity, other, sign):
     # Half a pixel of tolerance: rounding, and surfaces that all but touch. On a slope one of the two
     # columns beside the match is never nearer than the surface itself, so that it does not hide itself.
     height, width = disparity.shape

@@ -23,8 +23,8 @@ import torch
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn.data import collage
 from stereoweave.learn.data.batches import Batches
-from stereoweave.learn.data.pair_cache import KeptPairs
-from stereoweave.learn.data.sources import Source, sources
+from stereoweave.learn.data.pair_cache import CachedPairs
+from stereoweave.learn.data.sources import PairSource, open_sources
 from stereoweave.learn.recipe import Recipe
 from stereoweave.stereo import Sample
 
@@ -38,7 +38,7 @@ _MOST_CUTS = 4.0
 _OTHER_SEED = 1000
 
 
-class Job(NamedTuple):
+class PaintJob(NamedTuple):
     """A batch to make: where to, its number, by which of the recipes, and how often a pair is cut."""
 
     slot: int
@@ -47,7 +47,7 @@ class Job(NamedTuple):
     cuts: float
 
 
-class Share(NamedTuple):
+class PainterShare(NamedTuple):
     """The work of one process: the recipes, the folder of the held-out pairs, and which process it is."""
 
     recipes: tuple[Recipe, ...]
@@ -56,14 +56,14 @@ class Share(NamedTuple):
     processes: int
 
 
-class Done(NamedTuple):
+class PaintedBatch(NamedTuple):
     """A batch that is there; `problem` is the traceback where it could not be made."""
 
-    job: Job
+    job: PaintJob
     problem: str = ""
 
 
-class Place(NamedTuple):
+class TensorPlace(NamedTuple):
     """Where a tensor is in a slot: its first byte, its shape and its type."""
 
     offset: int
@@ -71,10 +71,10 @@ class Place(NamedTuple):
     dtype: torch.dtype
 
 
-class Reused:
+class ReusedPairs:
     """A source whose pairs come `cuts` times on average, among others: painting takes longer than cutting."""
 
-    def __init__(self, pairs: Source, held: int = _HELD) -> None:
+    def __init__(self, pairs: PairSource, held: int = _HELD) -> None:
         self.pairs, self.cuts = pairs, 1.0
         self.count = pairs.count
         self._held: deque[Sample] = deque(maxlen=held)
@@ -113,17 +113,17 @@ class Painters:
         self.recipes, self.pinned, self.number, self.recipe = tuple(recipes), pinned, first, 0
         self.cuts, self.taken, self.starved = 1.0, 0, 0
         self.failures: list[str] = []
-        self._ready: deque[tuple[Connection, Done]] = deque()
+        self._ready: deque[tuple[Connection, PaintedBatch]] = deque()
         self._memory: dict[Connection, Any] = {}
         context = multiprocessing.get_context("spawn")
-        size = max(_layout(recipe)[1] for recipe in self.recipes)
+        size = max(_compute_layout(recipe)[1] for recipe in self.recipes)
         self._processes = []
         for place in range(processes):
             here, there = context.Pipe()
             memory = context.RawArray(c_uint8, _SLOTS * size)
             process = context.Process(
-                target=_paint,
-                args=(there, memory, Share(self.recipes, folder, place, processes)),
+                target=_run_painter,
+                args=(there, memory, PainterShare(self.recipes, folder, place, processes)),
                 daemon=True,
             )
             process.start()
@@ -179,7 +179,7 @@ class Painters:
         self.taken += 1
         return batch
 
-    def _failed(self, here: Connection, done: Done) -> None:
+    def _failed(self, here: Connection, done: PaintedBatch) -> None:
         self.failures.append(done.problem)
         if len(self.failures) > 5 + self.taken // 20:
             raise StereoweaveError(
@@ -208,61 +208,61 @@ class Painters:
 
     def _order(self, here: Connection, slot: int) -> None:
         try:
-            here.send(Job(slot, self.number, self.recipe, self.cuts))
+            here.send(PaintJob(slot, self.number, self.recipe, self.cuts))
         except OSError:
             return  # it has ended, which the next `_listen` finds
         self.number += 1
 
-    def _views(self, here: Connection, job: Job) -> dict[str, torch.Tensor]:
-        return _views(self._memory[here], job.slot, self.recipes[job.recipe])
+    def _views(self, here: Connection, job: PaintJob) -> dict[str, torch.Tensor]:
+        return _view_tensors(self._memory[here], job.slot, self.recipes[job.recipe])
 
 
-def _paint(pipe: Connection, memory: Any, share: Share) -> None:
+def _run_painter(pipe: Connection, memory: Any, share: PainterShare) -> None:
     """Make the batches that are ordered, in a process of its own, until the pipe's other end is gone."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    _keep_held_out(share)
-    batches = [_reusing(recipe, share.folder) for recipe in share.recipes]
+    _save_held_out(share)
+    batches = [_make_batches(recipe, share.folder) for recipe in share.recipes]
     while True:
         try:
-            job: Job = pipe.recv()
-            pipe.send(_made(job, batches[job.recipe], memory))
+            job: PaintJob = pipe.recv()
+            pipe.send(_paint_batch(job, batches[job.recipe], memory))
         except (EOFError, OSError):
             return
 
 
-def _keep_held_out(share: Share) -> None:
+def _save_held_out(share: PainterShare) -> None:
     """Make this process's part of the held-out pairs."""
-    held_out = sources(share.recipes[0], share.folder)[1]
-    if isinstance(held_out, KeptPairs):
+    held_out = open_sources(share.recipes[0], share.folder)[1]
+    if isinstance(held_out, CachedPairs):
         held_out.folder.mkdir(parents=True, exist_ok=True)
         for index in range(share.place, held_out.count, share.processes):
-            held_out.keep(index, collage.sample(held_out.seed, 0, index, *held_out.size))
+            held_out.keep(index, collage.paint_collage(held_out.seed, 0, index, *held_out.size))
 
 
-def _reusing(recipe: Recipe, folder: Path) -> Batches:
-    batches = Batches(recipe, sources(recipe, folder)[0])
-    batches.pairs = Reused(batches.pairs)
+def _make_batches(recipe: Recipe, folder: Path) -> Batches:
+    batches = Batches(recipe, open_sources(recipe, folder)[0])
+    batches.pairs = ReusedPairs(batches.pairs)
     return batches
 
 
-def _made(job: Job, batches: Batches, memory: Any) -> Done:
+def _paint_batch(job: PaintJob, batches: Batches, memory: Any) -> PaintedBatch:
     """Make a batch in its slot."""
-    assert isinstance(batches.pairs, Reused)
+    assert isinstance(batches.pairs, ReusedPairs)
     batches.pairs.cuts = job.cuts
     try:
         batch = batches[job.number]
-        for name, view in _views(memory, job.slot, batches.recipe).items():
+        for name, view in _view_tensors(memory, job.slot, batches.recipe).items():
             values = batch[name]
             view.copy_((values * 255).round() if view.dtype == torch.uint8 else values)
     except Exception:  # whatever one batch ends in, the others may be made
-        return Done(job, traceback.format_exc())
-    return Done(job)
+        return PaintedBatch(job, traceback.format_exc())
+    return PaintedBatch(job)
 
 
-def _views(memory: Any, slot: int, recipe: Recipe) -> dict[str, torch.Tensor]:
+def _view_tensors(memory: Any, slot: int, recipe: Recipe) -> dict[str, torch.Tensor]:
     """The tensors of a batch in a slot of the memory."""
-    layout, _ = _layout(recipe)
+    layout, _ = _compute_layout(recipe)
     start = slot * (len(memory) // _SLOTS)
     return {
         name: torch.frombuffer(
@@ -272,10 +272,10 @@ def _views(memory: Any, slot: int, recipe: Recipe) -> dict[str, torch.Tensor]:
     }
 
 
-def _layout(recipe: Recipe) -> tuple[dict[str, Place], int]:
+def _compute_layout(recipe: Recipe) -> tuple[dict[str, TensorPlace], int]:
     """Place of each tensor of a batch in a slot, and how many bytes they take."""
     height, width = recipe.crop_size
-    layout, offset = dict[str, Place](), 0
+    layout, offset = dict[str, TensorPlace](), 0
     for name, channels, dtype in (
         ("disparity_px", 1, torch.float32),  # first, so that it begins at a multiple of four bytes
         ("left", 3, torch.uint8),
@@ -284,12 +284,12 @@ def _layout(recipe: Recipe) -> tuple[dict[str, Place], int]:
     ):
         count = recipe.batch if channels == 3 else 2 * recipe.batch
         shape = (count, channels, height, width)
-        layout[name] = Place(offset, shape, dtype)
+        layout[name] = TensorPlace(offset, shape, dtype)
         offset += prod(shape) * dtype.itemsize
     return layout, -(-offset // 64) * 64
 
 
-def cooling(recipe: Recipe, crop_size: tuple[int, int]) -> Recipe:
+def make_cool_down_recipe(recipe: Recipe, crop_size: tuple[int, int]) -> Recipe:
     """The recipe with other crops of other pairs: margins as before, and about as many pixels a batch."""
     margins = [pair - crop for pair, crop in zip(recipe.pair_size, recipe.crop_size, strict=True)]
     pair_size = (crop_size[0] + margins[0], crop_size[1] + margins[1])

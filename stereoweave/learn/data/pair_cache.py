@@ -13,7 +13,7 @@ import numpy as np
 from rich.console import Console
 
 from stereoweave.io.output_lock import lock_output
-from stereoweave.learn.data.collage import sample as make_sample
+from stereoweave.learn.data.collage import paint_collage as make_sample
 from stereoweave.stereo import Sample
 
 # Disparity is kept as 16-bit fixed point, KITTI's 1/256 px: half the bytes of float32, and exact enough.
@@ -28,7 +28,7 @@ _SOURCES = (
 )
 
 
-class KeptPairs:
+class CachedPairs:
     """The first `count` collage pairs of (seed, epoch 0), kept in a folder of their own in `folder`."""
 
     def __init__(self, folder: Path, seed: int, count: int, size: tuple[int, int]) -> None:
@@ -50,20 +50,20 @@ class KeptPairs:
         # Started afresh, because a forked child inherits PyTorch's threads in an unknown state.
         start_afresh = multiprocessing.get_context("spawn")
         with lock_output(self.folder, before_waiting=tell), start_afresh.Pool(os.cpu_count()) as workers:
-            yield from workers.imap_unordered(partial(_make, self), self.missing(), chunksize=8)
+            yield from workers.imap_unordered(partial(_make_pair, self), self.missing(), chunksize=8)
 
     def keep(self, index: int, sample: Sample) -> None:
         """Write a pair whole or not at all."""
         file = self._file(index)
         temporary = file.with_suffix(".part")
-        arrays: dict[str, Any] = {name: _packed(getattr(sample, name)) for name in _MAPS}
+        arrays: dict[str, Any] = {name: _pack(getattr(sample, name)) for name in _MAPS}
         with temporary.open("wb") as stream:
             np.savez(stream, **arrays)
         temporary.replace(file)
 
     def __getitem__(self, index: int) -> Sample:
         with np.load(self._file(index)) as arrays:
-            maps: dict[str, Any] = {name: _unpacked(arrays[name]) for name in _MAPS}
+            maps: dict[str, Any] = {name: _unpack(arrays[name]) for name in _MAPS}
         return Sample(**maps)
 
     def name(self, index: int) -> str:
@@ -79,17 +79,17 @@ def generator_version() -> str:
     return hashlib.sha256(b"".join((package / source).read_bytes() for source in _SOURCES)).hexdigest()[:8]
 
 
-def _make(pairs: KeptPairs, index: int) -> int:
+def _make_pair(pairs: CachedPairs, index: int) -> int:
     pairs.keep(index, make_sample(pairs.seed, 0, index, *pairs.size))
     return index
 
 
-def _packed(values: np.ndarray) -> np.ndarray:
+def _pack(values: np.ndarray) -> np.ndarray:
     if values.dtype == np.float32:
         assert np.isfinite(values).all() and values.max() < 65536 / _DISPARITY_SCALE
         return np.round(values * _DISPARITY_SCALE).astype(np.uint16)
     return values
 
 
-def _unpacked(values: np.ndarray) -> np.ndarray:
+def _unpack(values: np.ndarray) -> np.ndarray:
     return values.astype(np.float32) / _DISPARITY_SCALE if values.dtype == np.uint16 else values

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.learn.data.paint_kernels import REACH_PX, outline_field, stroke_field
+from stereoweave.learn.data.paint_kernels import REACH_PX, draw_outline_field, draw_stroke_field
 
 MARGIN_PX = 3  # around a silhouette, so that its patch ends plainly outside
 
@@ -25,7 +25,7 @@ class Patch:
 
 
 @dataclass(frozen=True)
-class Place:
+class Placement:
     """Where a silhouette goes: its centre and half extent in px, and the canvas that it is cut to."""
 
     x: float
@@ -47,24 +47,24 @@ class Place:
         return int(low[0]), int(low[1]), (int(high[1] - low[1]), int(high[0] - low[0]))
 
 
-def draw_shape(rng: np.random.Generator, place: Place) -> Patch:
+def draw_shape(rng: np.random.Generator, place: Placement) -> Patch:
     """A silhouette of a random kind."""
     kinds = list(SHAPES)
     return SHAPES[kinds[rng.integers(len(kinds))]](rng, place)
 
 
-def everywhere(width: int, height: int) -> Patch:
+def cover_canvas(width: int, height: int) -> Patch:
     """A patch that covers the whole canvas."""
     return Patch(np.full((height, width), REACH_PX, np.float32), 0, 0)
 
 
-def below(line_y: float, tilt: float, width: int, height: int) -> Patch:
+def cover_below(line_y: float, tilt: float, width: int, height: int) -> Patch:
     """All of the canvas below a line through the height line_y at its left edge."""
     distance = np.arange(height)[:, None] - (line_y + tilt * np.arange(width)[None])
     return Patch(np.clip(distance, -REACH_PX, REACH_PX).astype(np.float32), 0, 0)
 
 
-def rods(rng: np.random.Generator, place: Place) -> Patch:
+def draw_rods(rng: np.random.Generator, place: Placement) -> Patch:
     """A bunch of rods 1 to 6 px wide: parallel bars, a star of branches, or wires that sag."""
     kind = rng.integers(3)
     lean = rng.uniform(0, np.pi)
@@ -78,10 +78,10 @@ def rods(rng: np.random.Generator, place: Place) -> Patch:
         sag = rng.normal(0, 0.15) * (kind != 0 or rng.random() < 0.2)
         points = foot + place.radius_px * (t * along + sag * t * t * across)
         strokes.append((points, float(np.exp(rng.uniform(0, np.log(6))) / 2)))
-    return _from_strokes(tuple(strokes), place)
+    return _fill_strokes(tuple(strokes), place)
 
 
-def board(rng: np.random.Generator, place: Place) -> Patch:
+def draw_board(rng: np.random.Generator, place: Placement) -> Patch:
     """A rectangle seen from aside, mostly upright; its half width is the place's half extent."""
     turn = rng.normal(0, 0.06) if rng.random() < 0.8 else rng.uniform(0, np.pi)
     half_height = rng.uniform(0.4, 1.1)
@@ -89,93 +89,93 @@ def board(rng: np.random.Generator, place: Place) -> Patch:
     # A farther side is a shorter one.
     corners[:, 1] *= 1 + rng.uniform(-0.15, 0.15) * corners[:, 0]
     turned = corners @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-    return polygon([place.x, place.y] + place.radius_px * turned, place)
+    return draw_polygon([place.x, place.y] + place.radius_px * turned, place)
 
 
-def pillar(rng: np.random.Generator, place: Place) -> Patch:
+def draw_pillar(rng: np.random.Generator, place: Placement) -> Patch:
     """A bar across the canvas, mostly upright; its half width is the place's half extent."""
     turn = np.pi / 2 + rng.normal(0, 0.05) if rng.random() < 0.8 else rng.uniform(0, np.pi)
     reach = np.hypot(place.width, place.height) + place.radius_px
     along = reach * np.array([np.cos(turn), np.sin(turn)])
     across = place.radius_px * np.array([-np.sin(turn), np.cos(turn)])
     corners = np.stack([along + across, across - along, -along - across, along - across])
-    return polygon([place.x, place.y] + corners, place)
+    return draw_polygon([place.x, place.y] + corners, place)
 
 
-def post(place: Place, half_width_px: float, foot_y: float) -> Patch:
+def draw_post(place: Placement, half_width_px: float, foot_y: float) -> Patch:
     """An upright stroke from the top of the place down to foot_y."""
     points = np.array([[place.x, place.y - place.radius_px], [place.x, foot_y]])
-    return _from_strokes(((points, half_width_px),), place)
+    return _fill_strokes(((points, half_width_px),), place)
 
 
-def polygon(corners: Points, place: Place) -> Patch:
+def draw_polygon(corners: Points, place: Placement) -> Patch:
     """The inside of a polygon, cut to the canvas of the place."""
-    return _from_outline(place, corners)
+    return _fill_outline(place, corners)
 
 
-def softened(patch: Patch) -> Patch:
+def soften(patch: Patch) -> Patch:
     """The patch with edges 4 px wide, as out of focus; what is plainly inside stays opaque."""
     return Patch(patch.field * np.float32(0.5 / REACH_PX), patch.left, patch.top)
 
 
-def _from_outline(place: Place, *contours: Points) -> Patch:
+def _fill_outline(place: Placement, *contours: Points) -> Patch:
     left, top, shape = place.box(np.concatenate(contours), MARGIN_PX)
-    return Patch(outline_field(contours, left, top, shape), left, top)
+    return Patch(draw_outline_field(contours, left, top, shape), left, top)
 
 
-def _from_strokes(strokes: Strokes, place: Place) -> Patch:
+def _fill_strokes(strokes: Strokes, place: Placement) -> Patch:
     thickest = max(half_width_px for _, half_width_px in strokes)
     left, top, shape = place.box(np.concatenate([points for points, _ in strokes]), thickest + MARGIN_PX)
-    return Patch(stroke_field(strokes, left, top, shape), left, top)
+    return Patch(draw_stroke_field(strokes, left, top, shape), left, top)
 
 
-def _ellipse_points(rng: np.random.Generator, place: Place, scale: float = 1.0) -> Points:
+def _ellipse_points(rng: np.random.Generator, place: Placement, scale: float = 1.0) -> Points:
     angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
     slim, turn = rng.uniform(0.35, 1), rng.uniform(0, np.pi)
     radii = scale * slim / np.sqrt((slim * np.cos(angles)) ** 2 + np.sin(angles) ** 2)
     return place.ring(angles + turn, radii)
 
 
-def _ellipse(rng: np.random.Generator, place: Place) -> Patch:
-    return _from_outline(place, _ellipse_points(rng, place))
+def _draw_ellipse(rng: np.random.Generator, place: Placement) -> Patch:
+    return _fill_outline(place, _ellipse_points(rng, place))
 
 
-def _ring(rng: np.random.Generator, place: Place) -> Patch:
+def _draw_ring(rng: np.random.Generator, place: Placement) -> Patch:
     points = _ellipse_points(rng, place)
     centre = np.array([place.x, place.y])
-    return _from_outline(place, points, centre + rng.uniform(0.4, 0.85) * (points - centre))
+    return _fill_outline(place, points, centre + rng.uniform(0.4, 0.85) * (points - centre))
 
 
-def _polygon(rng: np.random.Generator, place: Place) -> Patch:
+def _draw_random_polygon(rng: np.random.Generator, place: Placement) -> Patch:
     angles = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(3, 8)))
-    return _from_outline(place, place.ring(angles, np.ones(len(angles))))
+    return _fill_outline(place, place.ring(angles, np.ones(len(angles))))
 
 
-def _jagged(rng: np.random.Generator, place: Place) -> Patch:
+def _draw_jagged(rng: np.random.Generator, place: Placement) -> Patch:
     angles = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(6, 16)))
-    return _from_outline(place, place.ring(angles, rng.uniform(0.3, 1, len(angles))))
+    return _fill_outline(place, place.ring(angles, rng.uniform(0.3, 1, len(angles))))
 
 
-def _blob(rng: np.random.Generator, place: Place) -> Patch:
+def _draw_blob(rng: np.random.Generator, place: Placement) -> Patch:
     angles = np.linspace(0, 2 * np.pi, 96, endpoint=False)
     waves = np.arange(2, 7)
     strength = rng.normal(0, 0.35, len(waves)) / waves
     phases = rng.uniform(0, 2 * np.pi, len(waves))
     radii = 0.75 + np.sin(angles[:, None] * waves + phases) @ strength
-    return _from_outline(place, place.ring(angles, np.maximum(radii, 0.15)))
+    return _fill_outline(place, place.ring(angles, np.maximum(radii, 0.15)))
 
 
-def _rectangle(rng: np.random.Generator, place: Place) -> Patch:
+def _draw_rectangle(rng: np.random.Generator, place: Placement) -> Patch:
     angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
     # A superellipse: the larger the power, the sharper the corners.
     power, slim = np.exp(rng.uniform(np.log(4), np.log(40))), rng.uniform(0.25, 1)
     cosine, sine = np.cos(angles), np.sin(angles)
     radii = 0.8 / (np.abs(cosine) ** power + np.abs(sine / slim) ** power) ** (1 / power)
     turn = rng.normal(0, 0.08) if rng.random() < 0.6 else rng.uniform(0, np.pi)
-    return _from_outline(place, place.ring(angles + turn, radii))
+    return _fill_outline(place, place.ring(angles + turn, radii))
 
 
-def _foliage(rng: np.random.Generator, place: Place) -> Patch:
+def _draw_foliage(rng: np.random.Generator, place: Placement) -> Patch:
     around = place.ring(np.arange(4) * np.pi / 2, np.ones(4))
     left, top, (height, width) = place.box(around, 0)
     if height == 0 or width == 0:
@@ -183,7 +183,7 @@ def _foliage(rng: np.random.Generator, place: Place) -> Patch:
     leaf_px = max(3.0, rng.uniform(0.1, 0.5) * place.radius_px)
     coarse = rng.standard_normal((int(height / leaf_px) + 3, int(width / leaf_px) + 3), np.float32)
     fine = rng.standard_normal((coarse.shape[0] * 2, coarse.shape[1] * 2), np.float32)
-    noise = _enlarged(coarse, width, height) + 0.4 * _enlarged(fine, width, height)
+    noise = _enlarge(coarse, width, height) + 0.4 * _enlarge(fine, width, height)
     y, x = np.ogrid[top : top + height, left : left + width]
     fall = np.hypot(x - place.x, y - place.y) / place.radius_px
     # The noise changes by about one within a leaf, so times the leaf's size it is nearly a distance.
@@ -192,11 +192,11 @@ def _foliage(rng: np.random.Generator, place: Place) -> Patch:
     return Patch(np.clip(inside, -REACH_PX, REACH_PX).astype(np.float32), left, top)
 
 
-def _enlarged(noise: Float[np.ndarray, "_ _"], width: int, height: int) -> Float[np.ndarray, "_ _"]:
+def _enlarge(noise: Float[np.ndarray, "_ _"], width: int, height: int) -> Float[np.ndarray, "_ _"]:
     return cv2.resize(noise, (width, height), interpolation=cv2.INTER_CUBIC)
 
 
-def _marks(rng: np.random.Generator, place: Place) -> Patch:
+def _draw_marks(rng: np.random.Generator, place: Placement) -> Patch:
     """A line of strokes that looks like lettering."""
     count = int(rng.integers(2, 9))
     size = 2 * place.radius_px / count
@@ -206,16 +206,16 @@ def _marks(rng: np.random.Generator, place: Place) -> Patch:
         corner = [place.x - place.radius_px + k * size, place.y - size / 2]
         points = corner + rng.random((rng.integers(3, 6), 2)) * [0.8 * size, 1.2 * size]
         strokes.append((points, half_width_px))
-    return _from_strokes(tuple(strokes), place)
+    return _fill_strokes(tuple(strokes), place)
 
 
-SHAPES: dict[str, Callable[[np.random.Generator, Place], Patch]] = {
-    "ellipse": _ellipse,
-    "ring": _ring,
-    "polygon": _polygon,
-    "jagged": _jagged,
-    "blob": _blob,
-    "rectangle": _rectangle,
-    "foliage": _foliage,
-    "marks": _marks,
+SHAPES: dict[str, Callable[[np.random.Generator, Placement], Patch]] = {
+    "ellipse": _draw_ellipse,
+    "ring": _draw_ring,
+    "polygon": _draw_random_polygon,
+    "jagged": _draw_jagged,
+    "blob": _draw_blob,
+    "rectangle": _draw_rectangle,
+    "foliage": _draw_foliage,
+    "marks": _draw_marks,
 }

@@ -12,7 +12,7 @@ from stereoweave.data.readers import DATASETS, Frame, open_dataset, split_frames
 from stereoweave.data.shards import Shards, list_shards
 from stereoweave.errors import FormatError
 from stereoweave.learn.data import collage
-from stereoweave.learn.data.pair_cache import KeptPairs
+from stereoweave.learn.data.pair_cache import CachedPairs
 from stereoweave.learn.recipe import COLLAGE, Recipe
 from stereoweave.stereo import Sample
 from stereoweave.system.progress import progress
@@ -22,7 +22,7 @@ VALIDATION_SEED = 1_000_003
 
 
 @runtime_checkable
-class Source(Protocol):
+class PairSource(Protocol):
     """Samples by their index."""
 
     @property
@@ -36,7 +36,7 @@ class Source(Protocol):
 
 
 @runtime_checkable
-class Ordered(Protocol):
+class OrderedSource(Protocol):
     """A source that is read faster in some orders than in others."""
 
     def order(self, rng: np.random.Generator) -> Int[np.ndarray, " n"] | range:
@@ -45,10 +45,10 @@ class Ordered(Protocol):
 
 
 @dataclass(frozen=True)
-class Mix:
+class MixedSource:
     """Sets one behind another as one source, and the weights by which training draws from them."""
 
-    sets: tuple[Source, ...]
+    sets: tuple[PairSource, ...]
     weights: tuple[float, ...]
 
     @property
@@ -63,16 +63,16 @@ class Mix:
         source, own = self._own(index)
         return source.name(own)
 
-    def first(self, which: int) -> int:
+    def first_index(self, which: int) -> int:
         """The index of the first pair of a set."""
         return sum(one.count for one in self.sets[:which])
 
-    def drawn(self, places: int, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
+    def draw_sets(self, places: int, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
         """The set of each place, by weight; fewer places from the same numbers are the first of more."""
         bounds = np.cumsum(self.weights) / np.sum(self.weights)
         return np.searchsorted(bounds[:-1], rng.random(places), side="right")
 
-    def _own(self, index: int) -> tuple[Source, int]:
+    def _own(self, index: int) -> tuple[PairSource, int]:
         for one in self.sets:
             if index < one.count:
                 return one, index
@@ -89,7 +89,7 @@ class FreshCollages:
     count: int = 10**9
 
     def __getitem__(self, index: int) -> Sample:
-        return collage.training_sample(self.seed, 0, index, *self.size)
+        return collage.paint_training_collage(self.seed, 0, index, *self.size)
 
     def name(self, index: int) -> str:
         return f"collage {index} of seed {self.seed}"
@@ -100,7 +100,7 @@ class FreshCollages:
 
 
 @dataclass(frozen=True)
-class Photographed:
+class PhotographedSet:
     """A rendered set, whose views are ideal, as two real cameras would give it; each pair always alike."""
 
     shards: Shards
@@ -125,7 +125,7 @@ class Photographed:
 
 
 @dataclass(frozen=True)
-class Frames:
+class DatasetFrames:
     """Frames of a dataset on disk, read when they are asked for."""
 
     frames: list[Frame]
@@ -141,16 +141,16 @@ class Frames:
         return self.frames[index].name
 
 
-def sources(recipe: Recipe, folder: Path, whole: bool = False) -> tuple[Source, Source]:
+def open_sources(recipe: Recipe, folder: Path, whole: bool = False) -> tuple[PairSource, PairSource]:
     """What a recipe trains on, and what it is scored on; collages are kept in folders below `folder`.
 
     Of the held-out frames of a dataset `validation_pairs` are taken, evenly spread, or all if `whole`.
     """
     if recipe.dataset == COLLAGE:
-        collages = _collages(recipe, folder)
+        collages = _open_collages(recipe, folder)
         return (
-            _mixed(recipe, collages) if recipe.mix else collages,
-            KeptPairs(folder, VALIDATION_SEED, recipe.validation_pairs, recipe.pair_size),
+            _mix_sets(recipe, collages) if recipe.mix else collages,
+            CachedPairs(folder, VALIDATION_SEED, recipe.validation_pairs, recipe.pair_size),
         )
     if recipe.dataset not in DATASETS:
         raise FormatError(
@@ -160,36 +160,38 @@ def sources(recipe: Recipe, folder: Path, whole: bool = False) -> tuple[Source, 
     training, held_out = split_frames(frames, recipe.dataset, recipe.split)
     count = len(held_out) if whole else min(recipe.validation_pairs, len(held_out))
     spread = np.linspace(0, len(held_out) - 1, count).round().astype(int)
-    return Frames(training), Frames([held_out[i] for i in spread])
+    return DatasetFrames(training), DatasetFrames([held_out[i] for i in spread])
 
 
-def _collages(recipe: Recipe, folder: Path) -> Source:
+def _open_collages(recipe: Recipe, folder: Path) -> PairSource:
     if recipe.fresh:
         return FreshCollages(recipe.seed, recipe.pair_size)
-    return KeptPairs(folder, recipe.seed, recipe.pairs, recipe.pair_size)
+    return CachedPairs(folder, recipe.seed, recipe.pairs, recipe.pair_size)
 
 
-def _mixed(recipe: Recipe, collages: Source) -> Mix:
-    sets: list[Source] = []
+def _mix_sets(recipe: Recipe, collages: PairSource) -> MixedSource:
+    sets: list[PairSource] = []
     weights: list[float] = []
     for name, weight in recipe.mix:
-        found = [collages] if name == COLLAGE else _rendered(recipe, Path(name))
+        found = [collages] if name == COLLAGE else _open_rendered_sets(recipe, Path(name))
         count = sum(one.count for one in found)
         sets += found
         weights += [weight * one.count / count for one in found]
-    return Mix(tuple(sets), tuple(weights))
+    return MixedSource(tuple(sets), tuple(weights))
 
 
-def held_out_sets(recipe: Recipe) -> dict[str, Source]:
+def open_held_out_sets(recipe: Recipe) -> dict[str, PairSource]:
     """The further sets that a recipe is scored on, by name; FormatError where one is not there."""
-    sets: dict[str, Source] = {}
+    sets: dict[str, PairSource] = {}
     for name, folder in recipe.held_out:
-        found = tuple(Photographed(Shards(path)) for path in _folders(recipe, "held_out", Path(folder)))
-        sets[name] = Mix(found, (1.0,) * len(found))
+        found = tuple(
+            PhotographedSet(Shards(path)) for path in _find_set_folders(recipe, "held_out", Path(folder))
+        )
+        sets[name] = MixedSource(found, (1.0,) * len(found))
     return sets
 
 
-def _folders(recipe: Recipe, key: str, folder: Path) -> list[Path]:
+def _find_set_folders(recipe: Recipe, key: str, folder: Path) -> list[Path]:
     """The folder of a rendered set, or those in it; FormatError for none."""
     folders = [path for path in (folder, *sorted(folder.glob("*/"))) if list_shards(path)]
     if not folders:
@@ -200,10 +202,10 @@ def _folders(recipe: Recipe, key: str, folder: Path) -> list[Path]:
     return folders
 
 
-def _rendered(recipe: Recipe, folder: Path) -> list[Source]:
+def _open_rendered_sets(recipe: Recipe, folder: Path) -> list[PairSource]:
     """The set in a folder, or those in the folders in it; FormatError for none, or one too small to cut."""
-    folders = _folders(recipe, "mix", folder)
-    sets: list[Source] = [Photographed(Shards(path)) for path in folders]
+    folders = _find_set_folders(recipe, "mix", folder)
+    sets: list[PairSource] = [PhotographedSet(Shards(path)) for path in folders]
     for path, one in zip(folders, sets, strict=True):
         rows, columns = one[0].disparity_px.shape
         if recipe.crop_size[0] > rows or recipe.crop_size[1] > columns:
@@ -214,12 +216,12 @@ def _rendered(recipe: Recipe, folder: Path) -> list[Source]:
     return sets
 
 
-def kept(pairs: Source, console: Console) -> Source:
+def cache_pairs(pairs: PairSource, console: Console) -> PairSource:
     """The pairs; collages are made before if they were not there."""
-    if isinstance(pairs, Mix):
+    if isinstance(pairs, MixedSource):
         for one in pairs.sets:
-            kept(one, console)
-    if isinstance(pairs, KeptPairs) and (missing := len(pairs.missing())):
+            cache_pairs(one, console)
+    if isinstance(pairs, CachedPairs) and (missing := len(pairs.missing())):
         with progress(console) as bar:
             task = bar.add_task("making pairs", total=missing, loss="", rate="")
             for _ in pairs.make(console):

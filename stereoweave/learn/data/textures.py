@@ -45,38 +45,38 @@ PHOTOGRAPHS = {
 
 
 @functools.cache
-def natural(k: int) -> Texture:
+def make_natural(k: int) -> Texture:
     """Texture number k of 0..NATURAL_TEXTURES - 1, the same in every process; made when first needed."""
-    return photograph_crop(k) if k < PHOTOGRAPH_CROPS else procedural(NATURAL, k - PHOTOGRAPH_CROPS)
+    return crop_photograph(k) if k < PHOTOGRAPH_CROPS else make_procedural(NATURAL, k - PHOTOGRAPH_CROPS)
 
 
 @functools.cache
-def periodic(k: int) -> Texture:
+def make_periodic(k: int) -> Texture:
     """Likewise one of a pattern that repeats, of 0..PERIODIC_TEXTURES - 1."""
-    return procedural(PERIODIC, k)
+    return make_procedural(PERIODIC, k)
 
 
-def photograph_crop(k: int) -> Texture:
+def crop_photograph(k: int) -> Texture:
     """Crop number k: a part of a photograph turned, mirrored, zoomed and recoloured."""
     rng = np.random.default_rng((BANK_SEED, 1, k))
     weights = np.array(list(PHOTOGRAPHS.values()), float)
-    photograph = _photograph(str(rng.choice(list(PHOTOGRAPHS), p=weights / weights.sum())))
-    crop = _turned_crop(rng, photograph)
+    photograph = _load_photograph(str(rng.choice(list(PHOTOGRAPHS), p=weights / weights.sum())))
+    crop = _crop_turned(rng, photograph)
     # A grey photograph gets a tint of its own, a coloured one is shifted a little.
     grey = np.ptp(crop, axis=2).max() < 3
     return _recolour(rng, crop.astype(np.float32), tint=0.16 if grey else 0.08)
 
 
-def procedural(kinds: dict[str, Procedure], k: int) -> Texture:
+def make_procedural(kinds: dict[str, Procedure], k: int) -> Texture:
     """Texture number k of these kinds, which take turns."""
     rng = np.random.default_rng((BANK_SEED, 2, k))
     image = kinds[list(kinds)[k % len(kinds)]](rng)
     # Nothing in a photograph is smooth at the scale of a pixel.
-    detail = rng.uniform(1, 8) * power_noise(rng, rng.uniform(0.3, 0.9))
+    detail = rng.uniform(1, 8) * draw_power_noise(rng, rng.uniform(0.3, 0.9))
     return np.clip(image + detail[..., None], 0, 255).astype(np.uint8)
 
 
-def power_noise(rng: np.random.Generator, exponent: float, side: int = SIDE) -> Pattern:
+def draw_power_noise(rng: np.random.Generator, exponent: float, side: int = SIDE) -> Pattern:
     """Noise whose amplitude falls as frequency**-exponent (1 in photographs); mean 0, deviation 1."""
     frequency = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None])
     frequency[0, 0] = 1
@@ -86,7 +86,7 @@ def power_noise(rng: np.random.Generator, exponent: float, side: int = SIDE) -> 
     return noise / noise.std()
 
 
-def natural_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+def draw_natural_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
     """A colour as surfaces have them, RGB 0..255: mostly muted, of any hue, seldom black or white."""
     hue, saturation, value = rng.random() * 360, rng.beta(1.2, 3.6), 0.1 + 0.85 * rng.beta(2.0, 1.7)
     hsv = np.array([[[hue, saturation, value]]], np.float32)
@@ -94,27 +94,27 @@ def natural_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
 
 
 @functools.cache
-def light_map(k: int) -> Float[np.ndarray, "64 64"]:
+def make_light_map(k: int) -> Float[np.ndarray, "64 64"]:
     """Light map number k, float32 [64, 64] about 1: smooth, and half of them with a soft-edged shadow."""
     rng = np.random.default_rng((BANK_SEED, 3, k))
-    light = 1 + rng.uniform(0.05, 0.2) * power_noise(rng, 2.5, 64)
+    light = 1 + rng.uniform(0.05, 0.2) * draw_power_noise(rng, 2.5, 64)
     if rng.random() < 0.5:
         edge = rng.uniform(1.5, 12)
-        height = power_noise(rng, rng.uniform(1.8, 2.6), 64) - rng.uniform(-0.5, 1)
+        height = draw_power_noise(rng, rng.uniform(1.8, 2.6), 64) - rng.uniform(-0.5, 1)
         shadow = 1 / (1 + np.exp(-edge * height))
         light *= 1 - rng.uniform(0.25, 0.7) * shadow
     return np.clip(light, 0.25, 1.6).astype(np.float32)
 
 
 @functools.cache
-def _photograph(name: str) -> Photograph:
+def _load_photograph(name: str) -> Photograph:
     from skimage import data
 
     image = getattr(data, name)()
     return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB) if image.ndim == 2 else image
 
 
-def _turned_crop(rng: np.random.Generator, photograph: Photograph) -> Texture:
+def _crop_turned(rng: np.random.Generator, photograph: Photograph) -> Texture:
     height, width = photograph.shape[:2]
     # Most of the picture, and hardly enlarged where it is large enough: blur is no texture.
     span = max(min(height, width) * rng.uniform(0.7, 1.0), 0.8 * SIDE)
@@ -136,75 +136,75 @@ def _recolour(rng: np.random.Generator, image: Float[np.ndarray, "_ _ 3"], tint:
     return np.clip((mean + contrast * (image - mean)) * gain, 0, 255).astype(np.uint8)
 
 
-def _coloured(rng: np.random.Generator, pattern: Pattern) -> Picture:
+def _colour_pattern(rng: np.random.Generator, pattern: Pattern) -> Picture:
     """A pattern of 0..1 as a blend of two colours, grained by noise as real surfaces are."""
-    low, high = natural_colour(rng), natural_colour(rng)
+    low, high = draw_natural_colour(rng), draw_natural_colour(rng)
     # Two colours of equal brightness are rare in nature and invisible to a grey matcher.
     if abs(low.mean() - high.mean()) < 30:
         low, high = low * 0.5, high * 0.7 + 70
-    grain = rng.uniform(0.02, 0.12) * power_noise(rng, rng.uniform(0.7, 1.4))
+    grain = rng.uniform(0.02, 0.12) * draw_power_noise(rng, rng.uniform(0.7, 1.4))
     return (low + pattern[..., None] * (high - low)) * (1 + grain[..., None])
 
 
 def _cloud(rng: np.random.Generator) -> Picture:
-    return _coloured_noise(rng, rng.uniform(0.8, 1.7))
+    return _make_coloured_noise(rng, rng.uniform(0.8, 1.7))
 
 
 def _sand(rng: np.random.Generator) -> Picture:
-    return _coloured_noise(rng, rng.uniform(0.3, 0.8))
+    return _make_coloured_noise(rng, rng.uniform(0.3, 0.8))
 
 
-def _coloured_noise(rng: np.random.Generator, exponent: float) -> Picture:
-    bright, warm, green = (power_noise(rng, exponent) for _ in range(3))
+def _make_coloured_noise(rng: np.random.Generator, exponent: float) -> Picture:
+    bright, warm, green = (draw_power_noise(rng, exponent) for _ in range(3))
     # Photographs vary in brightness far more than in blue-yellow, and there more than in green-magenta.
     axes = np.array([[1, 1, 1], [1, 0, -1], [0.5, -1, 0.5]])
     strength = rng.uniform(15, 55) * np.array([1, rng.uniform(0.05, 0.35), rng.uniform(0.03, 0.2)])
     waves = np.stack([bright, warm, green], axis=-1) @ (strength[:, None] * axes).astype(np.float32)
-    return natural_colour(rng) * 0.6 + 45 + waves
+    return draw_natural_colour(rng) * 0.6 + 45 + waves
 
 
 def _marble(rng: np.random.Generator) -> Picture:
-    bend = power_noise(rng, rng.uniform(1.4, 2.0))
-    return _coloured(rng, 0.5 + 0.5 * np.sin(rng.uniform(2, 7) * bend))
+    bend = draw_power_noise(rng, rng.uniform(1.4, 2.0))
+    return _colour_pattern(rng, 0.5 + 0.5 * np.sin(rng.uniform(2, 7) * bend))
 
 
 def _dead_leaves(rng: np.random.Generator) -> Picture:
     """Leaves of all sizes over each other, an old model of what natural images are."""
     # Numbers fall as the cube of the size, so that each size covers as much as the next.
     inverse_squares = rng.uniform(1 / rng.uniform(30, 120) ** 2, 1 / rng.uniform(2, 5) ** 2, 1500)
-    return _strewn(rng, inverse_squares**-0.5, slim=rng.uniform(0.25, 0.9))
+    return _strew(rng, inverse_squares**-0.5, slim=rng.uniform(0.25, 0.9))
 
 
 def _pebbles(rng: np.random.Generator) -> Picture:
     size = rng.uniform(4, 16)
-    return _strewn(rng, size * np.exp(rng.normal(0, 0.25, int(3 * (SIDE / size) ** 2 / 2))), slim=0.7)
+    return _strew(rng, size * np.exp(rng.normal(0, 0.25, int(3 * (SIDE / size) ** 2 / 2))), slim=0.7)
 
 
-def _strewn(rng: np.random.Generator, radii: Float[np.ndarray, " n"], slim: float) -> Picture:
-    palette = [natural_colour(rng) for _ in range(rng.integers(2, 8))]
+def _strew(rng: np.random.Generator, radii: Float[np.ndarray, " n"], slim: float) -> Picture:
+    palette = [draw_natural_colour(rng) for _ in range(rng.integers(2, 8))]
     image = np.full((SIDE, SIDE, 3), palette[0], np.float32)
     for radius in radii.tolist():
         centre = rng.integers(0, SIDE * 16, 2).tolist()
         shade = palette[rng.integers(len(palette))] * np.exp(rng.normal(0, 0.25)) + rng.normal(0, 6, 3)
         axes = [int(radius * 16), int(radius * 16 * rng.uniform(slim, 1) * slim)]
         cv2.ellipse(image, centre, axes, rng.uniform(0, 360), 0, 360, shade.tolist(), -1, cv2.LINE_8, 4)
-    grain = rng.uniform(0, 0.12) * power_noise(rng, rng.uniform(0.7, 1.5))
-    return _softened(image) * (1 + grain[..., None])
+    grain = rng.uniform(0, 0.12) * draw_power_noise(rng, rng.uniform(0.7, 1.5))
+    return _soften(image) * (1 + grain[..., None])
 
 
-def _softened(image: Picture) -> Picture:
+def _soften(image: Picture) -> Picture:
     # What OpenCV draws without antialiasing is sharper than any lens.
     return cv2.GaussianBlur(image, (0, 0), 0.6)
 
 
 def _grain(rng: np.random.Generator) -> Picture:
     """Wood: rings around a far axis, warped, with fibres along them."""
-    x, y = _turned_grid(rng)
-    warp = power_noise(rng, 2.0) * rng.uniform(3, 12)
+    x, y = _make_turned_grid(rng)
+    warp = draw_power_noise(rng, 2.0) * rng.uniform(3, 12)
     rings = np.hypot(x * rng.uniform(0.02, 0.2), y + warp - rng.uniform(-300, 300)) / rng.uniform(6, 30)
-    fibres = cv2.resize(power_noise(rng, 0.6)[:, ::16], (SIDE, SIDE), interpolation=cv2.INTER_CUBIC)
+    fibres = cv2.resize(draw_power_noise(rng, 0.6)[:, ::16], (SIDE, SIDE), interpolation=cv2.INTER_CUBIC)
     pattern = 0.6 * (rings % 1) ** 1.5 + 0.4 * np.clip(0.5 + 0.25 * fibres, 0, 1)
-    return _softened(_coloured(rng, pattern))
+    return _soften(_colour_pattern(rng, pattern))
 
 
 def _writing(rng: np.random.Generator) -> Picture:
@@ -221,13 +221,13 @@ def _writing(rng: np.random.Generator) -> Picture:
                 cv2.polylines(page, [(glyph * 16).astype(np.int32)], False, 255, thickness, cv2.LINE_AA, 4)
             x += size * rng.uniform(0.7, 1.0)
         y += size * rng.uniform(1.3, 2.0)
-    return _coloured(rng, page / np.float32(255))
+    return _colour_pattern(rng, page / np.float32(255))
 
 
 def _gradient(rng: np.random.Generator) -> Picture:
-    x, y = _turned_grid(rng)
+    x, y = _make_turned_grid(rng)
     pattern = np.clip(0.5 + x / SIDE + 0.3 * np.sin(y / rng.uniform(20, 120)), 0, 1)
-    return _coloured(rng, pattern)
+    return _colour_pattern(rng, pattern)
 
 
 def _scratches(rng: np.random.Generator) -> Picture:
@@ -236,67 +236,67 @@ def _scratches(rng: np.random.Generator) -> Picture:
         start, turn = rng.uniform(0, SIDE, 2), rng.uniform(0, 2 * np.pi)
         end = start + rng.uniform(5, 80) * np.array([np.cos(turn), np.sin(turn)])
         ends = (np.stack([start, end]) * 16).astype(int).tolist()
-        shade, thickness = natural_colour(rng).tolist(), int(rng.integers(1, 4))
+        shade, thickness = draw_natural_colour(rng).tolist(), int(rng.integers(1, 4))
         cv2.line(image, ends[0], ends[1], shade, thickness, cv2.LINE_8, 4)
-    return _softened(image)
+    return _soften(image)
 
 
-def _turned_grid(rng: np.random.Generator) -> tuple[Pattern, Pattern]:
+def _make_turned_grid(rng: np.random.Generator) -> tuple[Pattern, Pattern]:
     turn = rng.uniform(0, 2 * np.pi)
     y, x = np.mgrid[:SIDE, :SIDE].astype(np.float32) - SIDE / 2
     return np.cos(turn) * x + np.sin(turn) * y, np.cos(turn) * y - np.sin(turn) * x
 
 
 def _stripes(rng: np.random.Generator) -> Picture:
-    x, _ = _turned_grid(rng)
+    x, _ = _make_turned_grid(rng)
     period, sharpness = rng.uniform(6, 60), rng.uniform(0.8, 6)
     wave = np.sin(x * 2 * np.pi / period) + rng.uniform(-0.5, 0.5)
-    return _coloured(rng, 0.5 + 0.5 * np.tanh(sharpness * wave))
+    return _colour_pattern(rng, 0.5 + 0.5 * np.tanh(sharpness * wave))
 
 
 def _checks(rng: np.random.Generator) -> Picture:
-    x, y = _turned_grid(rng)
+    x, y = _make_turned_grid(rng)
     period = rng.uniform(10, 70)
     product = np.sin(x * 2 * np.pi / period) * np.sin(y * 2 * np.pi / (period * rng.uniform(0.6, 1.6)))
-    return _coloured(rng, 0.5 + 0.5 * np.tanh(rng.uniform(2, 15) * product))
+    return _colour_pattern(rng, 0.5 + 0.5 * np.tanh(rng.uniform(2, 15) * product))
 
 
 def _grid_lines(rng: np.random.Generator) -> Picture:
-    x, y = _turned_grid(rng)
+    x, y = _make_turned_grid(rng)
     period, half_line = rng.uniform(10, 60), rng.uniform(0.8, 4)
-    nearest = np.minimum(_from_joint(x, period), _from_joint(y, period * rng.uniform(0.5, 1.5)))
-    return _coloured(rng, np.clip(nearest - half_line + 0.5, 0, 1))
+    nearest = np.minimum(_distance_to_joint(x, period), _distance_to_joint(y, period * rng.uniform(0.5, 1.5)))
+    return _colour_pattern(rng, np.clip(nearest - half_line + 0.5, 0, 1))
 
 
 def _bricks(rng: np.random.Generator) -> Picture:
-    x, y = _turned_grid(rng)
+    x, y = _make_turned_grid(rng)
     course, length, joint = rng.uniform(10, 40), rng.uniform(20, 110), rng.uniform(0.8, 3)
     row = np.floor(y / course)
     shifted = x + length * (0.5 * (row % 2) if rng.random() < 0.7 else 0)
-    nearest = np.minimum(_from_joint(shifted, length), _from_joint(y, course))
+    nearest = np.minimum(_distance_to_joint(shifted, length), _distance_to_joint(y, course))
     tone = rng.normal(0.75, rng.uniform(0.02, 0.2), (97, 89))  # each brick its own
     bricks = tone[row.astype(int) % 97, np.floor(shifted / length).astype(int) % 89]
-    return _coloured(rng, (np.clip(nearest - joint + 0.5, 0, 1) * bricks).astype(np.float32))
+    return _colour_pattern(rng, (np.clip(nearest - joint + 0.5, 0, 1) * bricks).astype(np.float32))
 
 
 def _dots(rng: np.random.Generator) -> Picture:
-    x, y = _turned_grid(rng)
+    x, y = _make_turned_grid(rng)
     period = rng.uniform(8, 50)
     radius = period * rng.uniform(0.15, 0.42)
     distance = np.hypot((x + 0.5 * period) % period - period / 2, (y + 0.5 * period) % period - period / 2)
-    return _coloured(rng, np.clip(radius - distance + 0.5, 0, 1))
+    return _colour_pattern(rng, np.clip(radius - distance + 0.5, 0, 1))
 
 
 def _weave(rng: np.random.Generator) -> Picture:
-    x, y = _turned_grid(rng)
+    x, y = _make_turned_grid(rng)
     period = rng.uniform(5, 16)
     over = (np.floor(x / period) + np.floor(y / period)) % 2
     warp, weft = (np.abs(np.sin(np.pi * c / period)) for c in (x, y))
     pattern = np.where(over > 0, warp * (0.7 + 0.3 * weft), 0.8 * weft * (0.7 + 0.3 * warp))
-    return _softened(_coloured(rng, pattern))
+    return _soften(_colour_pattern(rng, pattern))
 
 
-def _from_joint(position: Pattern, period: float) -> Pattern:
+def _distance_to_joint(position: Pattern, period: float) -> Pattern:
     return period / 2 - np.abs(position % period - period / 2)
 
 

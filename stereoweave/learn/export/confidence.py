@@ -10,7 +10,7 @@ from torch import Tensor
 
 from stereoweave.bench.metrics import calibration_bins, calibration_error
 from stereoweave.io.files import replacing
-from stereoweave.learn.data.collage import sample
+from stereoweave.learn.data.collage import paint_collage
 from stereoweave.learn.models.weave import WeaveNet
 from stereoweave.stereo import Sample, StereoPair
 
@@ -20,14 +20,14 @@ _PAIRS = 24
 _SIZE = (320, 512)
 
 
-def calibrate(network: WeaveNet) -> dict[str, Any]:
+def calibrate_confidence(network: WeaveNet) -> dict[str, Any]:
     """How often the network's confidence comes true, after scaling and shifting it to come true as it says.
 
     The scale and the shift (Platt 1999) are folded into the last layers. What is returned comes from other
     pairs than they were fitted on: `calibration_error`, and per bin of confidence what was `claimed`, what
     `happened`, and the `share` of pixels.
     """
-    scale, shift = _fitted(*_claims(network, _FIT_SEED))
+    scale, shift = _fit_scale_and_shift(*_predict_claims(network, _FIT_SEED))
     with torch.no_grad():
         for index, layer in enumerate(network.confidence_layers):
             assert layer.bias is not None
@@ -35,41 +35,41 @@ def calibrate(network: WeaveNet) -> dict[str, Any]:
             layer.bias *= scale
             # The outputs add up, so that one of them is shifted.
             layer.bias += shift if index == 0 else 0
-    logits, within = _claims(network, _PROOF_SEED)
-    return reliability(logits.sigmoid().numpy(), within.numpy())
+    logits, within = _predict_claims(network, _PROOF_SEED)
+    return measure_reliability(logits.sigmoid().numpy(), within.numpy())
 
 
-def reliability(probability: np.ndarray, happened: np.ndarray) -> dict[str, Any]:
+def measure_reliability(probability: np.ndarray, happened: np.ndarray) -> dict[str, Any]:
     """What was claimed and what happened, per bin of equal width, and the expected calibration error."""
     bins = calibration_bins(probability, happened).round(4).T.tolist()
     rows = [dict(zip(("claimed", "happened", "share"), row, strict=True)) for row in bins]
     return {"calibration_error": round(calibration_error(probability, happened), 4), "bins": rows}
 
 
-def unseen_pair() -> StereoPair:
+def paint_unseen_pair() -> StereoPair:
     """A pair of the project's own that no training sees."""
-    made = sample(_PROOF_SEED, 1, 0, *_SIZE)
+    made = paint_collage(_PROOF_SEED, 1, 0, *_SIZE)
     return StereoPair(left=made.left, right=made.right)
 
 
-def _claims(network: WeaveNet, seed: int) -> tuple[Tensor, Tensor]:
+def _predict_claims(network: WeaveNet, seed: int) -> tuple[Tensor, Tensor]:
     """Confidence logits, and whether the disparity was within 1 px, over every 29th pixel of fresh pairs."""
     logits, within = [], []
     for index in range(_PAIRS):
-        made = sample(seed, 0, index, *_SIZE)
+        made = paint_collage(seed, 0, index, *_SIZE)
         with torch.no_grad():
-            disparity_px, _, logit = network(_tensor(made, "left"), _tensor(made, "right"))
+            disparity_px, _, logit = network(_to_tensor(made, "left"), _to_tensor(made, "right"))
         error_px = (disparity_px[0, 0] - torch.from_numpy(made.disparity_px)).abs()
         logits.append(logit.flatten()[::29])
         within.append(error_px.flatten()[::29] <= 1)
     return torch.cat(logits), torch.cat(within)
 
 
-def _tensor(made: Sample, side: str) -> Tensor:
+def _to_tensor(made: Sample, side: str) -> Tensor:
     return torch.from_numpy(getattr(made, side)).permute(2, 0, 1)[None].float() / 255
 
 
-def _fitted(logits: Tensor, within: Tensor) -> tuple[float, float]:
+def _fit_scale_and_shift(logits: Tensor, within: Tensor) -> tuple[float, float]:
     """Scale and shift under which the logits are the likeliest explanation of what happened."""
     parameters = torch.tensor([1.0, 0.0], requires_grad=True)
     optimiser = torch.optim.LBFGS([parameters], max_iter=50)

@@ -11,8 +11,8 @@ from stereoweave.io.files import place_for, replacing
 from stereoweave.learn import checkpoint
 from stereoweave.learn.export.confidence import draw_reliability
 from stereoweave.learn.export.fixed_size import check_size, fix_size
-from stereoweave.learn.export.float16 import halve
-from stereoweave.learn.export.from_checkpoint import export
+from stereoweave.learn.export.float16 import convert_to_float16
+from stereoweave.learn.export.from_checkpoint import export_matcher
 from stereoweave.learn.export.graph import write_card
 from stereoweave.learn.export.int8 import quantise
 from stereoweave.matching.matcher import Matcher, model_file, shipped_models
@@ -68,10 +68,10 @@ def write_matcher_files(
             _check_apart(made, files)
         else:
             made = Path(folder, "any_size.onnx")
-            yield _exported(Path(source), made, pairs, reliability)
+            yield _export_run(Path(source), made, pairs, reliability)
         if files.size:
             check_size(*files.size, Matcher(made).multiple_of)
-        yield from _written(made, files)
+        yield from _write_variants(made, files)
 
 
 def write_weights(run: Path, out: Path) -> str:
@@ -88,7 +88,7 @@ def write_weights(run: Path, out: Path) -> str:
         raise StereoweaveError(f"{out}: expected a name that ends in .pt, as start_from takes it")
     kept = checkpoint.load(run / "last.pt" if run.is_dir() else run)
     place_for(out)
-    checkpoint.save(checkpoint.averaged_alone(kept), out)
+    checkpoint.save(checkpoint.strip_to_average(kept), out)
     return f"{out}: averaged weights after {kept.step} steps, in 16 bits"
 
 
@@ -97,8 +97,8 @@ def is_matcher(source: str) -> bool:
     return source.endswith(".onnx") or source in shipped_models()
 
 
-def _exported(run: Path, made: Path, pairs: Iterable[StereoPair], reliability: Path | None) -> str:
-    card = export(run, made, pairs)
+def _export_run(run: Path, made: Path, pairs: Iterable[StereoPair], reliability: Path | None) -> str:
+    card = export_matcher(run, made, pairs)
     if reliability and "confidence" in card:
         draw_reliability(card["confidence"], reliability)
     return (
@@ -107,12 +107,12 @@ def _exported(run: Path, made: Path, pairs: Iterable[StereoPair], reliability: P
     )
 
 
-def _written(made: Path, files: MatcherFiles) -> Iterator[str]:
+def _write_variants(made: Path, files: MatcherFiles) -> Iterator[str]:
     if files.out:
         _copy(made, files.out)
         yield f"{files.out}: float32"
     if files.half:
-        change_px = halve(made, files.half)["differs_px_from_32_bits"]
+        change_px = convert_to_float16(made, files.half)["differs_px_from_32_bits"]
         yield f"{files.half}: 16 bits change disparity by {change_px:.4f} px in the mean"
     if files.eight_bits:
         card = quantise(made, files.eight_bits)

@@ -39,7 +39,7 @@ def fix_size(source: Path, out: Path, width: int, height: int) -> dict[str, Any]
         )
     check_size(width, height, matcher.multiple_of)
     make_folder(out.parent)
-    graph = fixed(onnx.load(source), width, height)
+    graph = fix_graph_size(onnx.load(source), width, height)
     with replacing(out) as temporary:
         onnx.save(graph, temporary)
         Matcher(temporary)
@@ -56,7 +56,7 @@ def check_size(width: int, height: int, multiple_of: int) -> None:
         )
 
 
-def fixed(graph: onnx.ModelProto, width: int, height: int) -> onnx.ModelProto:
+def fix_graph_size(graph: onnx.ModelProto, width: int, height: int) -> onnx.ModelProto:
     """The graph for one pair of that size, with its shapes worked out."""
     graph = copy.deepcopy(graph)
     for value in (*graph.graph.input, *graph.graph.output):

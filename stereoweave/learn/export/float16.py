@@ -10,8 +10,8 @@ from onnx import TensorProto, helper, numpy_helper
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import make_folder, replacing
-from stereoweave.learn.data.collage import sample
-from stereoweave.learn.export.graph import read_graph, with_what_stands_between, write_card
+from stereoweave.learn.data.collage import paint_collage
+from stereoweave.learn.export.graph import add_nodes_between, read_graph, write_card
 from stereoweave.matching.matcher import Matcher
 
 LARGEST_MEAN_DIFFERENCE_PX = 0.02
@@ -20,7 +20,7 @@ _PROOF_SEED, _PROOF_PAIRS = 6_000_011, 8
 _SIZE = (320, 512)
 
 
-def halve(source: Path, out: Path) -> dict[str, Any]:
+def convert_to_float16(source: Path, out: Path) -> dict[str, Any]:
     """Write a WeaveNet's matcher file that computes in 16 bits, and its card as .json; returns the card.
 
     Its inputs and outputs keep 32 bits, and so do disparities on their way.
@@ -36,7 +36,7 @@ def halve(source: Path, out: Path) -> dict[str, Any]:
     graph = read_graph(source)
     make_folder(out.parent)
     with replacing(out) as temporary:
-        onnx.save(in_half(graph, half_nodes(graph)), temporary)
+        onnx.save(cast_to_float16(graph, select_float16_nodes(graph)), temporary)
         mean_px = _mean_difference_px(Matcher(source), Matcher(temporary))
         if not mean_px < LARGEST_MEAN_DIFFERENCE_PX:
             raise StereoweaveError(
@@ -48,7 +48,7 @@ def halve(source: Path, out: Path) -> dict[str, Any]:
     )
 
 
-def half_nodes(graph: onnx.ModelProto) -> set[str]:
+def select_float16_nodes(graph: onnx.ModelProto) -> set[str]:
     """The names of the nodes that compute in 16 bits.
 
     They are the convolutions, the products that compare the views, and what stands between them alone. All
@@ -58,10 +58,10 @@ def half_nodes(graph: onnx.ModelProto) -> set[str]:
     """
     products = (node.name for node in graph.graph.node if node.op_type in ("Conv", "MatMul"))
     between = ("Concat", "Resize", "Relu", "Add", "Slice", "Pad", "Transpose")
-    return with_what_stands_between(graph, products, between)
+    return add_nodes_between(graph, products, between)
 
 
-def in_half(graph: onnx.ModelProto, names: Set[str]) -> onnx.ModelProto:
+def cast_to_float16(graph: onnx.ModelProto, names: Set[str]) -> onnx.ModelProto:
     """The graph with its weights and values in 16 bits at the named nodes, and casts to them and from them.
 
     ONNX Runtime's converter is not used: it rounds to 16 bits between any two nodes that keep 32.
@@ -71,7 +71,9 @@ def in_half(graph: onnx.ModelProto, names: Set[str]) -> onnx.ModelProto:
     for node in graph.graph.node:
         taken = onnx.NodeProto.FromString(node.SerializeToString())
         for place, value in enumerate(node.input):
-            taken.input[place] = cast.half(value) if _is_half(node, place, names) else cast.single(value)
+            taken.input[place] = (
+                cast.half(value) if _takes_float16(node, place, names) else cast.single(value)
+            )
         nodes += [*cast.take(), taken]
     used = {value for node in nodes for value in node.input}
     weights = [x for x in [*graph.graph.initializer, *cast.weights] if x.name in used]
@@ -82,7 +84,7 @@ def in_half(graph: onnx.ModelProto, names: Set[str]) -> onnx.ModelProto:
     return made
 
 
-def _is_half(node: onnx.NodeProto, place: int, names: Set[str]) -> bool:
+def _takes_float16(node: onnx.NodeProto, place: int, names: Set[str]) -> bool:
     """Whether a node takes an input in 16 bits, if it is no whole number; how much it resizes by never is."""
     return node.name in names and not (node.op_type == "Resize" and place > 0)
 
@@ -136,7 +138,7 @@ class _Casts:
 
 def _mean_difference_px(first: Matcher, second: Matcher) -> float:
     """Of two matchers' disparities, on fresh pairs."""
-    pairs = (sample(_PROOF_SEED, 0, index, *_SIZE) for index in range(_PROOF_PAIRS))
+    pairs = (paint_collage(_PROOF_SEED, 0, index, *_SIZE) for index in range(_PROOF_PAIRS))
     differences_px = [
         np.abs(
             first.estimate(pair.left, pair.right).disparity_px

@@ -19,7 +19,7 @@ from stereoweave.io.files import make_folder, replacing
 from stereoweave.learn import checkpoint
 from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.export import confidence as calibrate
-from stereoweave.learn.models import CodeNetwork, network_of
+from stereoweave.learn.models import CodeNetwork, build_network
 from stereoweave.learn.models.psmnet import PSMNet
 from stereoweave.learn.models.weave import WeaveNet
 from stereoweave.learn.recipe import Recipe
@@ -34,7 +34,7 @@ LARGEST_DIFFERENCE_PX = 0.01
 LARGEST_DIFFERENCE_OF_CONFIDENCE = 0.01
 
 
-def export(trained: Path, out: Path, pairs: Iterable[StereoPair] = ()) -> dict[str, Any]:
+def export_matcher(trained: Path, out: Path, pairs: Iterable[StereoPair] = ()) -> dict[str, Any]:
     """Write the averaged network of a checkpoint as a matcher file, and its card as .json; returns the card.
 
     Args:
@@ -47,13 +47,15 @@ def export(trained: Path, out: Path, pairs: Iterable[StereoPair] = ()) -> dict[s
             then.
     """
     kept = checkpoint.load(trained / "last.pt" if trained.is_dir() else trained)
-    network = matcher_network(kept)
-    reliability = {"confidence": calibrate.calibrate(network)} if isinstance(network, WeaveNet) else {}
+    network = load_matcher_network(kept)
+    reliability = (
+        {"confidence": calibrate.calibrate_confidence(network)} if isinstance(network, WeaveNet) else {}
+    )
     make_folder(out.parent)
     with replacing(out) as temporary:
-        onnx.save(graph_of(network, kept), temporary)
+        onnx.save(export_graph(network, kept), temporary)
         matcher = Matcher(temporary)
-        found = [differences(network, matcher, pair) for pair in [calibrate.unseen_pair(), *pairs]]
+        found = [compare_runtimes(network, matcher, pair) for pair in [calibrate.paint_unseen_pair(), *pairs]]
         px, of_confidence = np.max(found, axis=0).tolist()
         if not (px < LARGEST_DIFFERENCE_PX and of_confidence < LARGEST_DIFFERENCE_OF_CONFIDENCE):
             raise StereoweaveError(
@@ -66,7 +68,7 @@ def export(trained: Path, out: Path, pairs: Iterable[StereoPair] = ()) -> dict[s
         "onnx_differs_confidence": of_confidence,
         "compared_pairs": len(found),
     }
-    card = _card(kept, network) | agreement | reliability
+    card = _make_card(kept, network) | agreement | reliability
     with replacing(out.with_suffix(".json")) as card_file:
         card_file.write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
     return card
@@ -85,13 +87,13 @@ class DisparityNetwork(nn.Module):
         return (self.objective.disparity_px(self.network(left, right), {}),)
 
 
-def matcher_network(kept: Checkpoint) -> Any:
+def load_matcher_network(kept: Checkpoint) -> Any:
     """The averaged network of a checkpoint, ready to match.
 
     Raises:
         StereoweaveError: It estimates depth, or is a PSMNet.
     """
-    network = network_of(kept.recipe)
+    network = build_network(kept.recipe)
     network.load_state_dict(kept.averaged)
     network.eval()
     if not isinstance(network, CodeNetwork):
@@ -109,14 +111,14 @@ def matcher_network(kept: Checkpoint) -> Any:
     return DisparityNetwork(network, kept.recipe)
 
 
-def graph_of(network: Any, kept: Checkpoint) -> onnx.ModelProto:
+def export_graph(network: Any, kept: Checkpoint) -> onnx.ModelProto:
     """The network as an ONNX graph with a matcher's metadata, for any height and width that it can divide.
 
     And for any number of pairs: what it costs to leave that free cannot be measured (under 1 %).
     """
     height, width = (network.multiple_of * torch.export.Dim(name, min=2, max=1024) for name in ("h", "w"))
     sides = {0: torch.export.Dim("batch"), 2: height, 3: width}
-    graph = _exported(network, 4 * network.multiple_of, 8 * network.multiple_of, (sides, sides))
+    graph = _export_clean_graph(network, 4 * network.multiple_of, 8 * network.multiple_of, (sides, sides))
     first, *_ = graph.graph.input[0].type.tensor_type.shape.dim
     # The exporter does not tell where a network's code fixes what was to be free.
     assert first.dim_param, "the network's code fixes the number of pairs"
@@ -133,17 +135,17 @@ def graph_of(network: Any, kept: Checkpoint) -> onnx.ModelProto:
     return graph
 
 
-def fixed_graph_of(network: Any, height: int, width: int) -> onnx.ModelProto:
+def export_fixed_graph(network: Any, height: int, width: int) -> onnx.ModelProto:
     """The network as an ONNX graph for pairs of that size alone."""
-    return _exported(network, height, width, None)
+    return _export_clean_graph(network, height, width, None)
 
 
-def noted_graph(network: Any, height: int, width: int, dynamic_shapes: Any) -> onnx.ModelProto:
+def export_annotated_graph(network: Any, height: int, width: int, dynamic_shapes: Any) -> onnx.ModelProto:
     """The network as an ONNX graph, with the exporter's notes of where each node is from."""
     # Two tensors: given the same one twice, the exporter would take both inputs to be one. Two pairs where
     # their number is free: an axis of 1 it would take to be always so.
     left, right = torch.rand(2, 1 if dynamic_shapes is None else 2, 3, height, width)
-    with _quietly(), torch.no_grad():
+    with _mute_exporter(), torch.no_grad():
         program = torch.onnx.export(
             network,
             (left, right),
@@ -159,8 +161,8 @@ def noted_graph(network: Any, height: int, width: int, dynamic_shapes: Any) -> o
     return program.model_proto
 
 
-def _exported(network: Any, height: int, width: int, dynamic_shapes: Any) -> onnx.ModelProto:
-    graph = noted_graph(network, height, width, dynamic_shapes)
+def _export_clean_graph(network: Any, height: int, width: int, dynamic_shapes: Any) -> onnx.ModelProto:
+    graph = export_annotated_graph(network, height, width, dynamic_shapes)
     # The exporter notes where each part comes from, with this machine's paths.
     for part in (graph.graph, *graph.graph.node, *graph.graph.value_info):
         del part.metadata_props[:]
@@ -170,7 +172,7 @@ def _exported(network: Any, height: int, width: int, dynamic_shapes: Any) -> onn
 
 
 @contextmanager
-def _quietly() -> Iterator[None]:
+def _mute_exporter() -> Iterator[None]:
     """Without what the exporter tells unasked: of torchvision's operators, of names of repeated axes."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
@@ -182,7 +184,7 @@ def _quietly() -> Iterator[None]:
         logger.setLevel(level)
 
 
-def differences(network: Any, matcher: Matcher, pair: StereoPair) -> tuple[float, float]:
+def compare_runtimes(network: Any, matcher: Matcher, pair: StereoPair) -> tuple[float, float]:
     """The largest differences of PyTorch and ONNX Runtime: of both disparities in px, and of confidence."""
     multiple = network.multiple_of
     height, width = (side // multiple * multiple for side in pair.left.shape[:2])
@@ -198,7 +200,7 @@ def differences(network: Any, matcher: Matcher, pair: StereoPair) -> tuple[float
     return largest_px, float((found[2].sigmoid() - expected[2].sigmoid()).abs().max())
 
 
-def multiply_adds(network: nn.Module, height: int = 480, width: int = 640) -> int:
+def count_multiply_adds(network: nn.Module, height: int = 480, width: int = 640) -> int:
     """Multiply-adds of the whole graph, both views and every comparison of features included."""
     image = torch.rand(1, 3, height, width)
     with FlopCounterMode(display=False) as counter, torch.no_grad():
@@ -215,7 +217,7 @@ def multiply_adds(network: nn.Module, height: int = 480, width: int = 640) -> in
     return counted + 2 * height * width * network.size.sharpening * (2 * network.sharpening.radius + 1)
 
 
-def _card(kept: Checkpoint, network: nn.Module) -> dict[str, Any]:
+def _make_card(kept: Checkpoint, network: nn.Module) -> dict[str, Any]:
     return {
         "name": kept.recipe.name,
         "licence": "Apache-2.0",
@@ -226,6 +228,6 @@ def _card(kept: Checkpoint, network: nn.Module) -> dict[str, Any]:
         "hours": round(kept.hours, 2),
         "data": "collages and rendered pairs of the project's own making (docs/training-data.md)",
         "parameters": sum(parameter.numel() for parameter in network.parameters()),
-        "multiply_adds_640x480": multiply_adds(network),
+        "multiply_adds_640x480": count_multiply_adds(network),
         "validation": kept.scores,
     }

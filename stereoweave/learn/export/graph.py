@@ -47,9 +47,7 @@ def write_card(source: Path, out: Path, facts: dict[str, Any]) -> dict[str, Any]
     return card
 
 
-def with_what_stands_between(
-    graph: onnx.ModelProto, names: Iterable[str], operations: tuple[str, ...]
-) -> set[str]:
+def add_nodes_between(graph: onnx.ModelProto, names: Iterable[str], operations: tuple[str, ...]) -> set[str]:
     """The named nodes, those of the given operations that only such nodes read, and convolutions' ReLUs."""
     readers = defaultdict(list)
     for node in graph.graph.node:

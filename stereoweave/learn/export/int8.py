@@ -20,8 +20,8 @@ from onnxruntime.quantization import (  # type: ignore[import-untyped]
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import make_folder, replacing
-from stereoweave.learn.data.collage import sample
-from stereoweave.learn.export.graph import read_graph, with_what_stands_between, write_card
+from stereoweave.learn.data.collage import paint_collage
+from stereoweave.learn.export.graph import add_nodes_between, read_graph, write_card
 from stereoweave.matching.matcher import Matcher
 from stereoweave.stereo import Sample
 
@@ -67,7 +67,7 @@ def quantise(source: Path, out: Path) -> dict[str, Any]:
     )
 
 
-def quantised_nodes(graph: onnx.ModelProto) -> list[str]:
+def select_int8_nodes(graph: onnx.ModelProto) -> list[str]:
     """The names of the nodes that compute in 8 bits.
 
     They are the convolutions but those of the refinement and the sharpening, and what stands between them
@@ -79,11 +79,11 @@ def quantised_nodes(graph: onnx.ModelProto) -> list[str]:
         for node in graph.graph.node
         if node.op_type == "Conv" and not node.input[1].startswith(_KEPT)
     )
-    chosen = with_what_stands_between(graph, convolutions, ("Concat", "Resize", "Relu", "Add"))
+    chosen = add_nodes_between(graph, convolutions, ("Concat", "Resize", "Relu", "Add"))
     return [node.name for node in graph.graph.node if node.name in chosen]
 
 
-class _Inputs(CalibrationDataReader):  # type: ignore[misc]
+class _CalibrationPairs(CalibrationDataReader):  # type: ignore[misc]
     """Pairs as ONNX Runtime asks for them."""
 
     def __init__(self, pairs: Iterable[Sample]) -> None:
@@ -100,7 +100,7 @@ class _Inputs(CalibrationDataReader):  # type: ignore[misc]
 
 
 def _write(graph: onnx.ModelProto, out: Path) -> None:
-    nodes = quantised_nodes(graph)
+    nodes = select_int8_nodes(graph)
     # ONNX Runtime prints what it does.
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()):
         with_shapes = Path(folder, "with_shapes.onnx")
@@ -108,7 +108,7 @@ def _write(graph: onnx.ModelProto, out: Path) -> None:
         quantize_static(
             with_shapes,
             out,
-            _Inputs(_pairs(_RANGES_SEED, _RANGES_PAIRS)),
+            _CalibrationPairs(_paint_pairs(_RANGES_SEED, _RANGES_PAIRS)),
             op_types_to_quantize=["Conv", "Concat", "Resize", "Relu", "Add"],
             nodes_to_quantize=nodes,
             per_channel=True,
@@ -120,8 +120,8 @@ def _write(graph: onnx.ModelProto, out: Path) -> None:
         )
 
 
-def _pairs(seed: int, count: int) -> Iterator[Sample]:
-    return (sample(seed, 0, index, *_SIZE) for index in range(count))
+def _paint_pairs(seed: int, count: int) -> Iterator[Sample]:
+    return (paint_collage(seed, 0, index, *_SIZE) for index in range(count))
 
 
 def _mean_error_px(matcher: Matcher) -> float:
@@ -130,6 +130,6 @@ def _mean_error_px(matcher: Matcher) -> float:
         np.abs(matcher.estimate(pair.left, pair.right).disparity_px - pair.disparity_px)[
             ~pair.occluded
         ].mean()
-        for pair in _pairs(_PROOF_SEED, _PROOF_PAIRS)
+        for pair in _paint_pairs(_PROOF_SEED, _PROOF_PAIRS)
     ]
     return float(np.mean(errors_px))

@@ -18,11 +18,11 @@ from onnx import numpy_helper
 
 from stereoweave.errors import MatcherError
 from stereoweave.learn import checkpoint
-from stereoweave.learn.checkpoint import code_commit
-from stereoweave.learn.data.collage import sample
+from stereoweave.learn.checkpoint import find_commit
+from stereoweave.learn.data.collage import paint_collage
 from stereoweave.learn.export.fixed_size import fix_size
-from stereoweave.learn.export.float16 import halve
-from stereoweave.learn.export.from_checkpoint import matcher_network
+from stereoweave.learn.export.float16 import convert_to_float16
+from stereoweave.learn.export.from_checkpoint import load_matcher_network
 from stereoweave.learn.export.int8 import quantise
 from stereoweave.learn.models.weave import WeaveNet
 from stereoweave.matching.matcher import model_file
@@ -72,7 +72,7 @@ class ParityRow:
     commit: str
 
 
-class Variant(NamedTuple):
+class MatcherVariant(NamedTuple):
     """A matcher file, and how many pairs it is given at once; `sizes` as in SIZES."""
 
     file: Path
@@ -80,7 +80,7 @@ class Variant(NamedTuple):
     sizes: Sequence[tuple[int, int]]
 
 
-class Maps(NamedTuple):
+class NetworkMaps(NamedTuple):
     """What a network gives: disparity of both views, and the left one's confidence in 0..1."""
 
     left_px: Float32[np.ndarray, "b 1 h w"]
@@ -88,17 +88,17 @@ class Maps(NamedTuple):
     confidence: Float32[np.ndarray, "b 1 h w"]
 
 
-def parity(checkpoints: Sequence[Path]) -> list[ParityRow]:
+def measure_parity(checkpoints: Sequence[Path]) -> list[ParityRow]:
     """A row for every variant of every network, on every provider that the installed ONNX Runtime has.
 
     Args:
         checkpoints: Of the shipped networks.
     """
     with tempfile.TemporaryDirectory() as folder:
-        return [row for path in checkpoints for row in _rows_of(path, Path(folder))]
+        return [row for path in checkpoints for row in _measure_network(path, Path(folder))]
 
 
-def markdown(rows: Sequence[ParityRow]) -> str:
+def format_markdown(rows: Sequence[ParityRow]) -> str:
     """The rows as a table."""
     what = ["network", "variant", "provider"]
     numbers = ["file, MB", "left, px", "right, px", "confidence", "time, of float32's"]
@@ -119,20 +119,22 @@ def markdown(rows: Sequence[ParityRow]) -> str:
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
-def _rows_of(path: Path, folder: Path) -> list[ParityRow]:
+def _measure_network(path: Path, folder: Path) -> list[ParityRow]:
     kept = checkpoint.load(path)
     file = model_file(kept.recipe.name)
-    network = as_shipped(matcher_network(kept), file)
-    made = variants(file, folder)
-    inputs = {size: painted_pairs(size, _PAIRS) for size in SIZES}
-    expected = {size: in_pytorch(network, views) for size, views in inputs.items()}
+    network = apply_shipped_calibration(load_matcher_network(kept), file)
+    made = make_variants(file, folder)
+    inputs = {size: paint_pairs(size, _PAIRS) for size in SIZES}
+    expected = {size: run_in_pytorch(network, views) for size, views in inputs.items()}
     rows = []
-    for provider in providers_here():
-        sessions = _sessions(made, provider)
-        times_ms = _times_ms(sessions, made, inputs[SIZES[-1]])
+    for provider in list_providers():
+        sessions = _open_sessions(made, provider)
+        times_ms = _measure_times_ms(sessions, made, inputs[SIZES[-1]])
         for name, session in sessions.items():
             variant = made[name]
-            found = {size: in_onnx_runtime(session, variant.batch, inputs[size]) for size in variant.sizes}
+            found = {
+                size: run_in_onnx_runtime(session, variant.batch, inputs[size]) for size in variant.sizes
+            }
             rows.append(
                 ParityRow(
                     network=kept.recipe.name,
@@ -141,32 +143,32 @@ def _rows_of(path: Path, folder: Path) -> list[ParityRow]:
                     onnxruntime=onnxruntime.__version__,
                     file_mb=variant.file.stat().st_size / 1e6,
                     pairs=_PAIRS * len(found),
-                    **differences(expected, found),
+                    **summarise_differences(expected, found),
                     time_ms=times_ms[name],
                     time_relative=times_ms[name] / times_ms.get("float32", math.nan),
-                    commit=code_commit(),
+                    commit=find_commit(),
                 )
             )
     return rows
 
 
-def variants(file: Path, folder: Path) -> dict[str, Variant]:
+def make_variants(file: Path, folder: Path) -> dict[str, MatcherVariant]:
     """Every variant of a shipped matcher file by name, made in the folder where it does not ship."""
     height, width = SIZES[-1]
     half, eight_bits, fixed = (folder / f"{file.stem}_{x}.onnx" for x in ("fp16", "8bit", "fixed"))
-    halve(file, half)
+    convert_to_float16(file, half)
     quantise(file, eight_bits)
     fix_size(file, fixed, width, height)
     return {
-        "float32": Variant(file, 1, SIZES),
-        "batch of 4": Variant(file, 4, SIZES),
-        f"static {width}x{height}": Variant(fixed, 1, SIZES[-1:]),
-        "fp16": Variant(half, 1, SIZES),
-        "8-bit": Variant(eight_bits, 1, SIZES),
+        "float32": MatcherVariant(file, 1, SIZES),
+        "batch of 4": MatcherVariant(file, 4, SIZES),
+        f"static {width}x{height}": MatcherVariant(fixed, 1, SIZES[-1:]),
+        "fp16": MatcherVariant(half, 1, SIZES),
+        "8-bit": MatcherVariant(eight_bits, 1, SIZES),
     }
 
 
-def as_shipped(network: WeaveNet, file: Path) -> WeaveNet:
+def apply_shipped_calibration(network: WeaveNet, file: Path) -> WeaveNet:
     """The network of a checkpoint, its confidence calibrated as it was for the matcher file."""
     weights = {x.name: x for x in onnx.load(file).graph.initializer}
     with torch.no_grad():
@@ -177,37 +179,37 @@ def as_shipped(network: WeaveNet, file: Path) -> WeaveNet:
     return network
 
 
-def painted_pairs(size: tuple[int, int], count: int) -> dict[str, Float32[np.ndarray, "b 3 h w"]]:
+def paint_pairs(size: tuple[int, int], count: int) -> dict[str, Float32[np.ndarray, "b 3 h w"]]:
     """Pairs that no training sees, as a network takes them: the left views and the right ones."""
-    made = [sample(_SEED, size[1], index, *size) for index in range(count)]
+    made = [paint_collage(_SEED, size[1], index, *size) for index in range(count)]
     return {
         side: np.stack([getattr(x, side).transpose(2, 0, 1) for x in made]).astype(np.float32) / 255
         for side in ("left", "right")
     }
 
 
-def in_pytorch(network: Any, views: Mapping[str, np.ndarray]) -> Maps:
+def run_in_pytorch(network: Any, views: Mapping[str, np.ndarray]) -> NetworkMaps:
     """What the network says in float32, a pair at a time."""
     each = []
     with torch.inference_mode():
         for i in range(len(views["left"])):
             left_px, right_px, logit = network(*(torch.from_numpy(x[i : i + 1]) for x in views.values()))
-            each.append(Maps(left_px.numpy(), right_px.numpy(), logit.sigmoid().numpy()))
-    return Maps(*map(np.concatenate, zip(*each, strict=True)))
+            each.append(NetworkMaps(left_px.numpy(), right_px.numpy(), logit.sigmoid().numpy()))
+    return NetworkMaps(*map(np.concatenate, zip(*each, strict=True)))
 
 
-def in_onnx_runtime(session: Any, batch: int, views: Mapping[str, np.ndarray]) -> Maps:
+def run_in_onnx_runtime(session: Any, batch: int, views: Mapping[str, np.ndarray]) -> NetworkMaps:
     """What a matcher file says of the pairs, so many at a time."""
     each = []
     for i in range(0, len(views["left"]), batch):
         taken = {side: x[i : i + batch] for side, x in views.items()}
         left_px, right_px, logit = session.run(None, taken)
-        each.append(Maps(left_px, right_px, (1 + np.tanh(logit / 2)) / 2))
-    return Maps(*map(np.concatenate, zip(*each, strict=True)))
+        each.append(NetworkMaps(left_px, right_px, (1 + np.tanh(logit / 2)) / 2))
+    return NetworkMaps(*map(np.concatenate, zip(*each, strict=True)))
 
 
-def differences(
-    expected: Mapping[tuple[int, int], Maps], found: Mapping[tuple[int, int], Maps]
+def summarise_differences(
+    expected: Mapping[tuple[int, int], NetworkMaps], found: Mapping[tuple[int, int], NetworkMaps]
 ) -> dict[str, float]:
     """Mean and largest absolute differences over all pixels of all sizes, by the row's fields."""
     summary = {}
@@ -219,13 +221,13 @@ def differences(
     return summary
 
 
-def providers_here() -> list[str]:
+def list_providers() -> list[str]:
     """The providers that the installed ONNX Runtime has."""
     there = onnxruntime.get_available_providers()
     return [name for name, provider in PROVIDERS.items() if provider.name in there]
 
 
-def _sessions(made: Mapping[str, Variant], provider: str) -> dict[str, Any]:
+def _open_sessions(made: Mapping[str, MatcherVariant], provider: str) -> dict[str, Any]:
     """ONNX Runtime's sessions by variant, without those that a provider other than the processor refuses."""
     sessions = {}
     for name, variant in made.items():
@@ -234,8 +236,8 @@ def _sessions(made: Mapping[str, Variant], provider: str) -> dict[str, Any]:
     return sessions
 
 
-def _times_ms(
-    sessions: Mapping[str, Any], made: Mapping[str, Variant], views: Mapping[str, np.ndarray]
+def _measure_times_ms(
+    sessions: Mapping[str, Any], made: Mapping[str, MatcherVariant], views: Mapping[str, np.ndarray]
 ) -> dict[str, float]:
     """The shortest time for a pair, in turns, so that a machine that slows down slows all alike."""
     times_ms: dict[str, list[float]] = {name: [] for name in sessions}

@@ -49,7 +49,7 @@ class CodeNetwork(Protocol):
     def eval(self) -> Any: ...
 
 
-def network_of(recipe: Recipe) -> Any:
+def build_network(recipe: Recipe) -> Any:
     """The network of a recipe with random weights; FormatError for an unknown name."""
     if recipe.model not in MODELS:
         raise FormatError(f"{recipe.name}: model = {recipe.model!r}, expected {' or '.join(MODELS)}")

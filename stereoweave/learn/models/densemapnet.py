@@ -67,7 +67,7 @@ class DenseMapNet(nn.Module):
         height, width = left.shape[2:]
         left, right = (pad_to_multiple(view, self.multiple_of) for view in (left, right))
         if self.channels == 1:
-            left, right = _grey(left), _grey(right)
+            left, right = _to_grey(left), _to_grey(right)
         matches, _, left_channel = self.matching(left, right)
         code = self.head(F.interpolate(matches, scale_factor=8.0), left_channel)
         return (code[..., :height, :width],)
@@ -96,7 +96,7 @@ def load_keras(path: str | Path) -> DenseMapNet:
     first = found.get("conv2d_1/conv2d_1/kernel:0")
     network = DenseMapNet(channels=1 if first is not None and first.shape[2:] == (1, 16) else 3)
     with torch.no_grad():
-        for name, values in _keras_views(network):
+        for name, values in _iterate_keras_tensors(network):
             if name not in found:
                 raise FormatError(f"{path}: expected DenseMapNet's weights, found no {name}")
             theirs = found.pop(name)
@@ -131,7 +131,7 @@ def _read_hdf5(path: str | Path) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _keras_views(network: nn.Module) -> Iterator[tuple[str, Tensor]]:
+def _iterate_keras_tensors(network: nn.Module) -> Iterator[tuple[str, Tensor]]:
     """Every tensor of the network under its name in a Keras file, its axes in Keras's order.
 
     Keras numbers the layers of a kind as they are constructed; so does `modules()`.
@@ -150,6 +150,6 @@ def _keras_views(network: nn.Module) -> Iterator[tuple[str, Tensor]]:
                 )
 
 
-def _grey(view: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
+def _to_grey(view: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1 h w"]:
     red, green, blue = view.chunk(3, 1)
     return 0.299 * red + 0.587 * green + 0.114 * blue

@@ -69,7 +69,7 @@ def mean_correlation(
     return correlation_volume(first, second, LEVELS) / first.shape[1]
 
 
-def enlarged(map_: Float[Tensor, "b c h w"], scale: int) -> Float[Tensor, "b c h2 w2"]:
+def enlarge(map_: Float[Tensor, "b c h w"], scale: int) -> Float[Tensor, "b c h2 w2"]:
     """The map, bilinearly, at `scale` times its resolution; its values stay."""
     return F.interpolate(map_, scale_factor=float(scale), mode="bilinear")
 
@@ -92,7 +92,7 @@ class Expansion(nn.Module):
         skipped: Float[Tensor, "b c2 h2 w2"],
     ) -> tuple[Float[Tensor, "b c3 h2 w2"], Float[Tensor, "b 1 h2 w2"]]:
         """Maps and disparity in pixels of the full resolution, both at twice the resolution of `maps`."""
-        maps = self.iconv(torch.cat([self.upconv(maps), enlarged(disparity_px, 2), skipped], 1))
+        maps = self.iconv(torch.cat([self.upconv(maps), enlarge(disparity_px, 2), skipped], 1))
         return maps, self.prediction(maps)
 
 
@@ -156,7 +156,7 @@ class DispNet(nn.Module):
         """Disparities pr6 to pr1, each at full resolution and in its pixels; the last one is the answer."""
         height, width = left.shape[2:]
         return tuple(
-            enlarged(disparity_px.float(), 64 >> level)[..., :height, :width]
+            enlarge(disparity_px.float(), 64 >> level)[..., :height, :width]
             for level, disparity_px in enumerate(self.predictions(left, right))
         )
 

@@ -61,7 +61,7 @@ class Residual(nn.Module):
 Block = TypeVar("Block", Residual, nn.Conv2d)
 
 
-def silent(block: Block) -> Block:
+def zero_initialise(block: Block) -> Block:
     """The block, adding nothing until it is trained: so that a trained network can grow by it."""
     last = block.second[1] if isinstance(block, Residual) else block
     for parameter in last.parameters():
@@ -93,7 +93,7 @@ class DilatedDense(nn.Module):
         return x
 
 
-def mirrored(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+def mirror(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
     """The map as a mirror shows it, left and right exchanged."""
     return x.flip(3)
 
@@ -163,7 +163,7 @@ def expected_step(logits: Float[Tensor, "b k h w"]) -> Float[Tensor, "b 1 h w"]:
     return (weights * steps).sum(1, keepdim=True) / weights.sum(1, keepdim=True)
 
 
-def nearby_matches(
+def correlate_nearby(
     first: Float[Tensor, "b c h w"],
     second: Float[Tensor, "b c h w"],
     disparity: Float[Tensor, "b 1 h w"],
@@ -187,7 +187,7 @@ def nearby_matches(
     return torch.cat([near + between * (far - near) for near, far in pairwise(products)], 1)
 
 
-def warped_matches(
+def correlate_warped(
     first: Float[Tensor, "b c h w"],
     second: Float[Tensor, "b c h w"],
     disparity: Float[Tensor, "b 1 h w"],
@@ -213,7 +213,7 @@ def warped_matches(
     return torch.cat([(left * warped[:, :, x : x + width]).sum(3).unsqueeze(1) for x in steps], 1)
 
 
-def at_match(
+def sample_at_match(
     other: Float[Tensor, "b 1 h w"], disparity: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b 1 h w"]:
     """The other view's map at column x - disparity, between two columns interpolated; outside, its border."""
@@ -226,7 +226,9 @@ def at_match(
     return low + (columns - below) * (high - low)
 
 
-def surroundings(x: Float[Tensor, "b 1 h w"], offsets: Sequence[tuple[int, int]]) -> Float[Tensor, "b k h w"]:
+def gather_neighbours(
+    x: Float[Tensor, "b 1 h w"], offsets: Sequence[tuple[int, int]]
+) -> Float[Tensor, "b k h w"]:
     """The map's values at offsets of rows and columns from each pixel; outside the map, its border's."""
     height, width = x.shape[2:]
     reach = max(abs(side) for offset in offsets for side in offset)

@@ -69,7 +69,9 @@ class BasicBlock(nn.Module):
         return self.body(x) + self.shortcut(x)
 
 
-def basic_blocks(inputs: int, outputs: int, count: int, stride: int = 1, dilation: int = 1) -> nn.Sequential:
+def stack_basic_blocks(
+    inputs: int, outputs: int, count: int, stride: int = 1, dilation: int = 1
+) -> nn.Sequential:
     """`count` basic blocks in a row; the first of them changes channels and resolution."""
     rest = (BasicBlock(outputs, outputs, dilation=dilation) for _ in range(count - 1))
     return nn.Sequential(BasicBlock(inputs, outputs, stride, dilation), *rest)
@@ -91,7 +93,7 @@ class PyramidPooling(nn.Module):
         return torch.cat([F.interpolate(map_, (height, width), mode="bilinear") for map_ in narrowed], 1)
 
 
-class Features(nn.Module):
+class PSMFeatures(nn.Module):
     """Features of a view and its wider surroundings, at a quarter of its resolution [B, 32, H/4, W/4]."""
 
     def __init__(self) -> None:
@@ -102,10 +104,10 @@ class Features(nn.Module):
             ConvBlock(32, 32),
             ConvBlock(32, 32),
         )
-        self.conv1 = basic_blocks(32, 32, 3)
-        self.conv2 = basic_blocks(32, 64, 16, stride=2)
-        self.conv3 = basic_blocks(64, 128, 3, dilation=2)
-        self.conv4 = basic_blocks(128, 128, 3, dilation=4)
+        self.conv1 = stack_basic_blocks(32, 32, 3)
+        self.conv2 = stack_basic_blocks(32, 64, 16, stride=2)
+        self.conv3 = stack_basic_blocks(64, 128, 3, dilation=2)
+        self.conv4 = stack_basic_blocks(128, 128, 3, dilation=4)
         self.pyramid = PyramidPooling(128)
         self.fusion = nn.Sequential(ConvBlock(64 + 128 + 128, 128), nn.Conv2d(128, 32, 1, bias=False))
 
@@ -196,7 +198,7 @@ class PSMNet(nn.Module):
                 f"PSMNet: max_disparity_px must be a multiple of 16, from 16 on, got {max_disparity_px}"
             )
         self.max_disparity_px = max_disparity_px
-        self.features = Features()
+        self.features = PSMFeatures()
         self.narrow = nn.Sequential(
             norm_convolution_3d(64, 32),
             nn.ReLU(inplace=True),
@@ -207,10 +209,10 @@ class PSMNet(nn.Module):
             norm_convolution_3d(32, 32), nn.ReLU(inplace=True), norm_convolution_3d(32, 32)
         )
         self.hourglasses = nn.ModuleList(Hourglass() for _ in self.output_weights)
-        self.heads = nn.ModuleList(_head() for _ in self.output_weights)
+        self.heads = nn.ModuleList(_make_head() for _ in self.output_weights)
         self.apply(_initialise)
 
-    def costs(
+    def compute_costs(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> list[Float[Tensor, "b 1 d4 h4 w4"]]:
         """Matching costs after each hourglass, for 1/4 of the candidates at 1/4 of the padded size."""
@@ -231,16 +233,16 @@ class PSMNet(nn.Module):
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> tuple[Float[Tensor, "b 1 h w"], ...]:
         """Disparities in pixels after each hourglass; the last one is the answer."""
-        return tuple(_disparity_px(cost, left) for cost in self.costs(left, right))
+        return tuple(_disparity_px(cost, left) for cost in self.compute_costs(left, right))
 
     def forward(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> Float[Tensor, "b 1 h w"]:
         """Disparity of the left view in pixels; the images are RGB in 0..1."""
-        return _disparity_px(self.costs(left, right)[-1], left)
+        return _disparity_px(self.compute_costs(left, right)[-1], left)
 
 
-def _head() -> nn.Sequential:
+def _make_head() -> nn.Sequential:
     return nn.Sequential(
         norm_convolution_3d(32, 32), nn.ReLU(inplace=True), nn.Conv3d(32, 1, 3, padding=1, bias=False)
     )

@@ -18,21 +18,21 @@ from stereoweave.learn.models.layers import (
     DilatedDense,
     Halve,
     Residual,
+    correlate_nearby,
+    correlate_warped,
     correlation_volume,
     expected_step,
     local_soft_argmax,
-    mirrored,
-    nearby_matches,
-    silent,
+    mirror,
     upsample_convex,
     upsample_to_a_side,
-    warped_matches,
+    zero_initialise,
 )
 from stereoweave.learn.models.weave_stages import Completion, Sharpening, WiderContext
 
 
 @dataclass(frozen=True, kw_only=True)
-class Size:
+class WeaveSize:
     """How large the parts of a WeaveNet are; of four values each is for one of 1/2, 1/4, 1/8, 1/16.
 
     Attributes:
@@ -74,7 +74,7 @@ class Size:
     sharpening: int = 0
 
 
-SMALL = Size(
+SMALL = WeaveSize(
     channels=(16, 32, 48, 64),
     convolutions=(0, 1, 1, 1),
     dilations=(1, 2, 4),
@@ -89,7 +89,7 @@ SMALL = Size(
     refinement=1,
     neighbours=4,
 )
-BASE = Size(
+BASE = WeaveSize(
     channels=(16, 32, 64, 96),
     convolutions=(1, 4, 4, 4),
     dilations=(1, 2, 4, 8, 1),
@@ -110,7 +110,7 @@ BASE_GROWN = replace(BASE, wider=64, completion=32, sharpening=8)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stages:
+class WeaveStages:
     """Every step of a prediction, for the losses; both views as one batch, the second half mirrored.
 
     Attributes:
@@ -128,7 +128,7 @@ class Stages:
     confidence_logit: Float[Tensor, "b 1 h w"]
 
 
-class Features(NamedTuple):
+class WeaveFeatures(NamedTuple):
     """Feature maps of an image at 1/2, 1/4, 1/8 and 1/16 of its resolution."""
 
     half: Tensor
@@ -139,57 +139,59 @@ class Features(NamedTuple):
 
 def as_left_view(views: Tensor, batch: int | torch.SymInt) -> Tensor:
     """Maps of the left views, then of the right ones mirrored, from those of the left and the right ones."""
-    return torch.cat([views[:batch], mirrored(views[batch:])])
+    return torch.cat([views[:batch], mirror(views[batch:])])
 
 
 def as_other_view(views: Tensor, batch: int | torch.SymInt) -> Tensor:
     """What is matched with `as_left_view`: maps of the right views, then of the left ones mirrored."""
-    return torch.cat([views[batch:], mirrored(views[:batch])])
+    return torch.cat([views[batch:], mirror(views[:batch])])
 
 
-def convolutions(channels: int, count: int) -> list[nn.Module]:
+def stack_convolutions(channels: int, count: int) -> list[nn.Module]:
     """3x3 convolutions one behind the other: residual blocks of two, and one alone where the count is odd."""
     alone: list[nn.Module] = [ConvBlock(channels, channels)] * (count % 2)
     residual = [Residual(channels) for _ in range(count // 2)]
-    return alone + residual[:1] + [silent(block) for block in residual[1:]]
+    return alone + residual[:1] + [zero_initialise(block) for block in residual[1:]]
 
 
 class Encoder(nn.Module):
     """Features of one view: down to 1/16, and up again so that the finer maps know the wider surroundings."""
 
-    def __init__(self, size: Size) -> None:
+    def __init__(self, size: WeaveSize) -> None:
         super().__init__()
         half, quarter, eighth, sixteenth = size.channels
         counts = size.convolutions
-        self.down_to_half = nn.Sequential(Halve(3, half, kernel=4), *convolutions(half, counts[0]))
-        self.down_to_quarter = nn.Sequential(Halve(half, quarter), *convolutions(quarter, counts[1]))
-        self.down_to_eighth = nn.Sequential(Halve(quarter, eighth), *convolutions(eighth, counts[2]))
-        self.down_to_sixteenth = nn.Sequential(Halve(eighth, sixteenth), *convolutions(sixteenth, counts[3]))
+        self.down_to_half = nn.Sequential(Halve(3, half, kernel=4), *stack_convolutions(half, counts[0]))
+        self.down_to_quarter = nn.Sequential(Halve(half, quarter), *stack_convolutions(quarter, counts[1]))
+        self.down_to_eighth = nn.Sequential(Halve(quarter, eighth), *stack_convolutions(eighth, counts[2]))
+        self.down_to_sixteenth = nn.Sequential(
+            Halve(eighth, sixteenth), *stack_convolutions(sixteenth, counts[3])
+        )
         self.up_to_eighth = ConvBlock(sixteenth, eighth, kernel=1)
         self.up_to_quarter = ConvBlock(eighth, quarter, kernel=1)
         self.join = ConvBlock(quarter, quarter, kernel=size.join_kernel)
 
-    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Features:
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> WeaveFeatures:
         half = self.down_to_half(image * 2 - 1)
         quarter = self.down_to_quarter(half)
         eighth = self.down_to_eighth(quarter)
         sixteenth = self.down_to_sixteenth(eighth)
         eighth = eighth + F.interpolate(self.up_to_eighth(sixteenth), scale_factor=2.0)
         quarter = quarter + F.interpolate(self.up_to_quarter(eighth), scale_factor=2.0)
-        return Features(half, self.join(quarter), eighth, sixteenth)
+        return WeaveFeatures(half, self.join(quarter), eighth, sixteenth)
 
 
 class Context(nn.Module):
     """What the wider surroundings say, at 1/16: a plain surface is known by where it ends."""
 
-    def __init__(self, inputs: int, sixteenth: int, size: Size) -> None:
+    def __init__(self, inputs: int, sixteenth: int, size: WeaveSize) -> None:
         super().__init__()
         channels, outputs = size.context, size.bottleneck
         self.down = Halve(inputs, channels)
         self.join = ConvBlock(channels + sixteenth, channels, kernel=1)
         self.body = nn.Sequential(*(Residual(channels, dilation) for dilation in (2, 4)))
         self.wider = WiderContext(channels, size.wider) if size.wider else None
-        self.up = silent(nn.Conv2d(channels, outputs, 1))
+        self.up = zero_initialise(nn.Conv2d(channels, outputs, 1))
 
     def forward(self, dense: Tensor, sixteenth: Tensor) -> Tensor:
         wide = self.body(self.join(torch.cat([self.down(dense), sixteenth], 1)))
@@ -201,7 +203,7 @@ class Context(nn.Module):
 class Aggregation(nn.Module):
     """Matching scores made sure of by their surroundings: dilated dense blocks at 1/8, decoded to 1/4."""
 
-    def __init__(self, levels: int, size: Size) -> None:
+    def __init__(self, levels: int, size: WeaveSize) -> None:
         super().__init__()
         _, quarter, eighth, sixteenth = size.channels
         self.down = Halve(levels + quarter, eighth)
@@ -212,7 +214,7 @@ class Aggregation(nn.Module):
         self.decode = ConvBlock(32, 32)
         self.scores = nn.Conv2d(32, levels, 1)
 
-    def forward(self, correlation: Tensor, features: Features) -> tuple[Tensor, Tensor]:
+    def forward(self, correlation: Tensor, features: WeaveFeatures) -> tuple[Tensor, Tensor]:
         """Scores [B, D, H/4, W/4] and the decoder's features [B, 32, H/4, W/4]."""
         matches = torch.cat([correlation, features.quarter], 1)
         dense = self.dense(torch.cat([self.down(matches), features.eighth], 1))
@@ -228,8 +230,8 @@ class Propagation(nn.Module):
         super().__init__()
         self.join = ConvBlock(32 + quarter + 2, channels, kernel=1)
         self.body = nn.Sequential(*(Residual(channels, dilation) for dilation in (1, 4)))
-        self.correction = silent(nn.Conv2d(channels, 1, 1))
-        self.decoded = silent(nn.Conv2d(channels, 32, 1))
+        self.correction = zero_initialise(nn.Conv2d(channels, 1, 1))
+        self.decoded = zero_initialise(nn.Conv2d(channels, 32, 1))
 
     def forward(self, disparity: Tensor, quarter: Tensor, decoded: Tensor) -> tuple[Tensor, Tensor]:
         """Disparity in levels [B, 1, H/4, W/4] and the decoder's features."""
@@ -242,13 +244,13 @@ class Propagation(nn.Module):
 class Refinement(nn.Module):
     """A correction of at most `radius` pixels at half resolution, read from matches around the estimate."""
 
-    def __init__(self, size: Size, radius: int = 2) -> None:
+    def __init__(self, size: WeaveSize, radius: int = 2) -> None:
         super().__init__()
         self.radius = radius
-        self.matches = warped_matches if size.warps else nearby_matches
+        self.matches = correlate_warped if size.warps else correlate_nearby
         nearby = 2 * radius + 1
         self.join = ConvBlock(nearby + size.channels[0] + size.handed, 16, kernel=1)
-        self.body = nn.Sequential(*convolutions(16, size.refinement))
+        self.body = nn.Sequential(*stack_convolutions(16, size.refinement))
         self.scores = nn.Conv2d(16, nearby, 1)
         self.weights = nn.Conv2d(16, 4 * size.neighbours, 1)
         self.confidence = nn.Conv2d(16, 4, 1)
@@ -272,7 +274,7 @@ class WeaveNet(nn.Module):
     1,470,020 parameters.
     """
 
-    def __init__(self, size: Size = SMALL, levels: int = 48) -> None:
+    def __init__(self, size: WeaveSize = SMALL, levels: int = 48) -> None:
         super().__init__()
         self.size, self.levels = size, levels
         self.multiple_of = 32 if size.wider else 16
@@ -298,16 +300,16 @@ class WeaveNet(nn.Module):
         sharpened = () if self.sharpening is None else (self.sharpening.confidence,)
         return self.refinement.confidence, *sharpened
 
-    def stages(self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]) -> Stages:
+    def stages(self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]) -> WeaveStages:
         """Every step of the prediction for both views."""
         batch = left.shape[0]  # here and below no len() and no chunk(): exported, they would fix the batch
         images = torch.cat([left, right])
         maps = self.encoder(images)
         # In a mirror the right view is a left one, so that one aggregation serves both.
-        first = Features(*(as_left_view(map_, batch) for map_ in maps))
-        correlation, scores, decoded = self.matched(maps, first)
-        quarter = self.read(scores.float(), decoded)
-        spread, decoded = self._propagated(quarter, first.quarter, decoded, batch)
+        first = WeaveFeatures(*(as_left_view(map_, batch) for map_ in maps))
+        correlation, scores, decoded = self.match(maps, first)
+        quarter = self.read_disparity(scores.float(), decoded)
+        spread, decoded = self._propagate(quarter, first.quarter, decoded, batch)
         coarse = self.upsample(spread * 2, self.weights(decoded).float())
         match_half = self.to_match_half(maps.half)
         fine, weights, confidence, context = self.refinement(
@@ -317,10 +319,10 @@ class WeaveNet(nn.Module):
             first.half,
             F.pixel_shuffle(self.to_half(decoded), 2),
         )
-        disparity_px, logit = self._sharpened(
+        disparity_px, logit = self._sharpen(
             self.upsample(fine * 2, weights.float()), confidence.float(), images, context, batch
         )
-        return Stages(
+        return WeaveStages(
             correlation=correlation,
             scores=scores,
             coarse_px=coarse * 2,
@@ -328,7 +330,7 @@ class WeaveNet(nn.Module):
             confidence_logit=logit,
         )
 
-    def matched(self, maps: Features, first: Features) -> tuple[Tensor, Tensor, Tensor]:
+    def match(self, maps: WeaveFeatures, first: WeaveFeatures) -> tuple[Tensor, Tensor, Tensor]:
         """Matching scores before and after aggregation, and the decoder's features.
 
         Args:
@@ -344,22 +346,22 @@ class WeaveNet(nn.Module):
         """Twice the size, guided by weights; in use sharper than in training, which needs the gradient."""
         return upsample_convex(x, weights) if self.training else upsample_to_a_side(x, weights)
 
-    def read(self, scores: Tensor, decoded: Tensor) -> Tensor:
+    def read_disparity(self, scores: Tensor, decoded: Tensor) -> Tensor:
         """Disparity in pixels of 1/4 resolution; scores that are coarser need the decoder's features too."""
         return local_soft_argmax(scores)
 
-    def _propagated(
+    def _propagate(
         self, quarter: Tensor, features: Tensor, decoded: Tensor, batch: int | torch.SymInt
     ) -> tuple[Tensor, Tensor]:
         if self.completion is not None:
             # Of each view the other one, in that one's own columns.
-            other = mirrored(torch.cat([quarter[batch:], quarter[:batch]]))
+            other = mirror(torch.cat([quarter[batch:], quarter[:batch]]))
             quarter, decoded = self.completion(quarter, other, features, decoded)
         if self.propagation is None:
             return quarter, decoded
         return self.propagation(quarter, features, decoded)
 
-    def _sharpened(
+    def _sharpen(
         self, disparity_px: Tensor, logit: Tensor, images: Tensor, context: Tensor, batch: int | torch.SymInt
     ) -> tuple[Tensor, Tensor]:
         if self.sharpening is None:
@@ -380,4 +382,4 @@ class WeaveNet(nn.Module):
         stages, batch = self.stages(left, right), left.shape[0]
         # At infinity noise goes both ways; a rectified pair of parallel cameras has nothing behind that.
         disparity_px = stages.disparity_px.clamp(min=0)
-        return disparity_px[:batch], mirrored(disparity_px[batch:]), stages.confidence_logit[:batch]
+        return disparity_px[:batch], mirror(disparity_px[batch:]), stages.confidence_logit[:batch]

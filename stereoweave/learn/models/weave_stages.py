@@ -9,11 +9,11 @@ from stereoweave.learn.models.layers import (
     ConvBlock,
     Halve,
     Residual,
-    at_match,
+    correlate_warped,
     expected_step,
-    silent,
-    surroundings,
-    warped_matches,
+    gather_neighbours,
+    sample_at_match,
+    zero_initialise,
 )
 
 # Where the completion looks for the surface behind, in pixels of 1/4 resolution: rows, columns.
@@ -34,7 +34,7 @@ class WiderContext(nn.Module):
         super().__init__()
         self.down = Halve(channels, wider)
         self.body = nn.Sequential(*(Residual(wider, dilation) for dilation in (1, 2)))
-        self.up = silent(nn.Conv2d(wider, channels, 1))
+        self.up = zero_initialise(nn.Conv2d(wider, channels, 1))
 
     def forward(self, wide: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         return wide + F.interpolate(self.up(self.body(self.down(wide))), scale_factor=2.0)
@@ -54,8 +54,8 @@ class Completion(nn.Module):
         self.join = ConvBlock(32 + quarter + 4, channels, kernel=1)
         self.body = ConvBlock(channels, channels, dilation=2)
         self.affinity = nn.Conv2d(channels, len(OFFSETS), 1)
-        self.share = silent(nn.Conv2d(channels, 1, 1))
-        self.decoded = silent(nn.Conv2d(channels, 32, 1))
+        self.share = zero_initialise(nn.Conv2d(channels, 1, 1))
+        self.decoded = zero_initialise(nn.Conv2d(channels, 32, 1))
 
     def forward(
         self,
@@ -73,7 +73,7 @@ class Completion(nn.Module):
             decoded: The decoder's features.
         """
         x = self.body(self.join(torch.cat([decoded, quarter, *self._checks(disparity, other)], 1)))
-        around = surroundings(disparity, OFFSETS)
+        around = gather_neighbours(disparity, OFFSETS)
         affinity = self.affinity(x).float()
         weights = (affinity - affinity.amax(1, keepdim=True)).exp()
         mixed = (weights * around).sum(1, keepdim=True) / weights.sum(1, keepdim=True)
@@ -85,7 +85,7 @@ class Completion(nn.Module):
         columns = torch.arange(disparity.shape[3], dtype=torch.float32, device=disparity.device)
         # In float32: beside a disparity of 100 px bfloat16 cannot tell a slope from a plane.
         departure = disparity - F.avg_pool2d(disparity, 9, 1, 4, count_include_pad=False)
-        check = (at_match(other, disparity) - disparity).clamp(-_LARGEST_CHECK, _LARGEST_CHECK)
+        check = (sample_at_match(other, disparity) - disparity).clamp(-_LARGEST_CHECK, _LARGEST_CHECK)
         inside = (columns - disparity).clamp(-_LARGEST_CHECK, _LARGEST_CHECK)
         return departure, disparity / 16, check, inside
 
@@ -102,9 +102,9 @@ class Sharpening(nn.Module):
         self.hand = nn.Conv2d(inputs, 4 * handed, 1)
         self.join = nn.Sequential(nn.Conv2d(nearby + channels + handed, 16, 1), nn.ReLU(inplace=True))
         self.body = nn.Sequential(nn.Conv2d(16, 16, 3, padding=1), nn.ReLU(inplace=True))
-        self.scores = silent(nn.Conv2d(16, nearby, 1))
+        self.scores = zero_initialise(nn.Conv2d(16, nearby, 1))
         self.gain = nn.Parameter(torch.zeros(()))
-        self.confidence = silent(nn.Conv2d(16, 1, 1))
+        self.confidence = zero_initialise(nn.Conv2d(16, 1, 1))
 
     def views(self, images: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, Tensor]:
         """Features of the images, and what is compared of them."""
@@ -123,7 +123,7 @@ class Sharpening(nn.Module):
             features: Of this view.
             context: The refinement's features at half resolution.
         """
-        matches = warped_matches(first, second, disparity, self.radius)
+        matches = correlate_warped(first, second, disparity, self.radius)
         handed = F.pixel_shuffle(self.hand(context), 2)
         x = self.body(self.join(torch.cat([matches, features, handed], 1)))
         scores = (self.scores(x) + self.gain * matches).float()

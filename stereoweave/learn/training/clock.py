@@ -9,7 +9,7 @@ RESERVE_S = 20.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Clock:
+class RunClock:
     """How much of a run's time is used. Times `now_s` are those of `time.monotonic`.
 
     Attributes:
@@ -52,6 +52,6 @@ def learning_rate_at(recipe: Recipe, optimiser_steps: int, share: float) -> floa
     return recipe.learning_rate * min(warm_up, cool_down, 1.0)
 
 
-def cools_at(recipe: Recipe, share: float) -> bool:
+def is_cooling_down(recipe: Recipe, share: float) -> bool:
     """Whether the rate falls at that share of the time."""
     return (1 - share) * recipe.steps < recipe.cool_down_steps

@@ -12,7 +12,7 @@ import torch
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import replacing
 from stereoweave.learn import checkpoint
-from stereoweave.learn.training.loop import CURVE, read_record
+from stereoweave.learn.training.loop import SCORES_FILE, read_scores
 
 # The first scores tell how a run recovers from its start, not how it learns.
 _LEAST_PAIRS_SHARE = 0.1
@@ -45,9 +45,11 @@ def record_curve(run: Path, out: Path) -> dict[str, PowerLaw]:
     Raises:
         StereoweaveError: The run has not been scored yet.
     """
-    kept, record = checkpoint.load(run / "last.pt"), read_record(run / CURVE)
+    kept, record = checkpoint.load(run / "last.pt"), read_scores(run / SCORES_FILE)
     if not record:
-        raise StereoweaveError(f"{run / CURVE}: expected scores of a run, found none; let it validate first")
+        raise StereoweaveError(
+            f"{run / SCORES_FILE}: expected scores of a run, found none; let it validate first"
+        )
     recipe = kept.recipe
     machine = f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}"
     rows = [
@@ -62,10 +64,10 @@ def record_curve(run: Path, out: Path) -> dict[str, PowerLaw]:
         for scores in record
     ]
     _write(out, [*(row for row in _read(out) if row["recipe"] != run.name), *rows])
-    return _fits(rows)
+    return _fit_curves(rows)
 
 
-def _fits(rows: Sequence[dict[str, Any]]) -> dict[str, PowerLaw]:
+def _fit_curves(rows: Sequence[dict[str, Any]]) -> dict[str, PowerLaw]:
     late = [row for row in rows if row["pairs"] >= _LEAST_PAIRS_SHARE * rows[-1]["pairs"]]
     names = [name for name in rows[-1] if name.endswith(("epe_px", "bad1_percent")) and rows[-1][name] > 0]
     known = {name: [row for row in late if row.get(name, 0) > 0] for name in names}

@@ -34,26 +34,26 @@ from stereoweave.io.files import make_folder, replacing
 from stereoweave.io.output_lock import lock_output
 from stereoweave.learn import checkpoint
 from stereoweave.learn.checkpoint import Checkpoint
-from stereoweave.learn.data.batches import Batches, Told, split
-from stereoweave.learn.data.sources import Source, held_out_sets, kept, sources
-from stereoweave.learn.distributed import Ranks, ranks, threads_each, told_once
-from stereoweave.learn.models import network_of
+from stereoweave.learn.data.batches import Batches, CaughtBatches, split_batch
+from stereoweave.learn.data.sources import PairSource, cache_pairs, open_held_out_sets, open_sources
+from stereoweave.learn.distributed import ProcessRank, choose_thread_count, read_rank, report_once
+from stereoweave.learn.models import build_network
 from stereoweave.learn.recipe import COLLAGE, Recipe, read_recipe
 from stereoweave.learn.training.accumulation import StepSums
-from stereoweave.learn.training.objective import fitted, naming, objective_of
+from stereoweave.learn.training.objective import build_objective, fit_recipe, name_in_errors
 from stereoweave.learn.training.scores import validate_by_class
 from stereoweave.system.progress import progress
 
 # Beside a run's checkpoint: its scores after each validation.
-CURVE = "validation.csv"
+SCORES_FILE = "validation.csv"
 # A killed run loses no more than this, beside what it lost since its last validation.
-_KEEP_EVERY_S = 600
+_SAVE_EVERY_S = 600
 # Steps with a loss or gradient that is not finite are skipped; a second one within this many stops the run.
 _STEPS_BETWEEN_SKIPS = 500
 # What a run may go on with where its recipe says otherwise than its last checkpoint's.
 _RESUMABLE = ("steps", "cool_down_steps", "mix", "pair_size", "crop_size", "validate_every", "held_out")
 # The others wait for the first one however long it makes pairs or scores: should it die, torchrun ends them.
-_PATIENCE = timedelta(days=1)
+_TIMEOUT = timedelta(days=1)
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -67,14 +67,14 @@ def train(recipe_path: Path, out: Path, console: Console | None = None) -> Path:
         StereoweaveError: for a recipe that is none, where `out` is in use or holds the run of another one, or
             where the loss is no longer finite.
     """
-    with told_once(), _no_farewell_after_an_error():
-        return train_recipe(read_recipe(recipe_path), out, console or Console(quiet=ranks().rank > 0))
+    with report_once(), _skip_teardown_on_error():
+        return train_recipe(read_recipe(recipe_path), out, console or Console(quiet=read_rank().rank > 0))
 
 
 def train_recipe(recipe: Recipe, out: Path, console: Console) -> Path:
     """As `train`, of a recipe at hand."""
-    _check(recipe)
-    if ranks().rank:  # the first process writes, and locks, for all
+    _check_recipe(recipe)
+    if read_rank().rank:  # the first process writes, and locks, for all
         return _train(recipe, out, console)
     with lock_output(make_folder(out)):
         return _train(recipe, out, console)
@@ -83,22 +83,22 @@ def train_recipe(recipe: Recipe, out: Path, console: Console) -> Path:
 def _train(recipe: Recipe, out: Path, console: Console) -> Path:
     last = out / "last.pt"
     logger = TensorBoardLogger(out, name="", version="")
-    fabric = _fabric(logger)
-    pairs, held_out = _ready(recipe, out, console, fabric)
-    recipe = fitted(recipe, pairs)
-    start = _starting_point(recipe, last)
+    fabric = _make_fabric(logger)
+    pairs, held_out = _prepare_pairs(recipe, out, console, fabric)
+    recipe = fit_recipe(recipe, pairs)
+    start = _load_start(recipe, last)
     if start.step != fabric.broadcast(start.step):
-        raise _not_shared(out)
+        raise _folder_not_shared(out)
     if start.step == recipe.steps:
         return last
-    run = Run(recipe, start, logger, fabric)
-    batches = Batches(recipe, pairs, ranks())
-    with closing_curves(logger), progress(console) as bar:
+    run = TrainingRun(recipe, start, logger, fabric)
+    batches = Batches(recipe, pairs, read_rank())
+    with close_curves(logger), progress(console) as bar:
         task = bar.add_task(recipe.name, total=recipe.steps, completed=run.start.step, loss="", rate="")
         began = time.perf_counter()
-        for step, batch in _numbered_batches(batches, run.start.step):
+        for step, batch in _load_batches(batches, run.start.step):
             loss = run.step(step, batch, batches)
-            run.keep_now_and_then(step + 1, last)
+            run.save_periodically(step + 1, last)
             if (step + 1) % recipe.validate_every == 0 or step + 1 == recipe.steps:
                 if run.fabric.is_global_zero:
                     _validate(run, step + 1, held_out, last, console)
@@ -108,26 +108,28 @@ def _train(recipe: Recipe, out: Path, console: Console) -> Path:
     return last
 
 
-def _ready(recipe: Recipe, out: Path, console: Console, fabric: Fabric) -> tuple[Source, Source]:
+def _prepare_pairs(
+    recipe: Recipe, out: Path, console: Console, fabric: Fabric
+) -> tuple[PairSource, PairSource]:
     """The pairs to train on and to score on, made by the first process where they were not there."""
-    found = sources(recipe, out.parent / "pairs")
+    found = open_sources(recipe, out.parent / "pairs")
     if fabric.is_global_zero:
         for pairs in found:
-            kept(pairs, console)
+            cache_pairs(pairs, console)
     fabric.barrier()
     if not out.is_dir():
-        raise _not_shared(out)
+        raise _folder_not_shared(out)
     return found
 
 
-def _not_shared(out: Path) -> StereoweaveError:
+def _folder_not_shared(out: Path) -> StereoweaveError:
     return StereoweaveError(
         f"{out}: expected what the first process sees there, found something else on {platform.node()}; "
         "train into a folder that all machines share"
     )
 
 
-def _validate(run: "Run", steps: int, held_out: Source, last: Path, console: Console) -> None:
+def _validate(run: "TrainingRun", steps: int, held_out: PairSource, last: Path, console: Console) -> None:
     """Score the run as it is after so many steps, and keep it and its scores."""
     network, device = run.averaged.module, run.fabric.device
     scores = run.objective.scores(network, held_out, device)
@@ -135,21 +137,21 @@ def _validate(run: "Run", steps: int, held_out: Source, last: Path, console: Con
         found = validate_by_class(network, pairs, device)
         scores |= {f"{name}_{key}": value for key, value in found.items()}
     # First, because what is killed between the two then writes the same row again.
-    record(last.with_name(CURVE), steps, scores)
-    run.keep(steps, scores, last)
+    append_scores(last.with_name(SCORES_FILE), steps, scores)
+    run.save(steps, scores, last)
     console.print(f"step {steps}: " + "  ".join(f"{k} {v:.4g}" for k, v in scores.items()))
 
 
-def record(path: Path, step: int, scores: dict[str, float]) -> None:
+def append_scores(path: Path, step: int, scores: dict[str, float]) -> None:
     """Add the scores after `step` steps to a CSV file; rows of that step and later ones are replaced."""
-    rows = [row for row in read_record(path) if row["step"] < step] + [{"step": step, **scores}]
+    rows = [row for row in read_scores(path) if row["step"] < step] + [{"step": step, **scores}]
     with replacing(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[-1]))
         writer.writeheader()
         writer.writerows(rows)
 
 
-def read_record(path: Path) -> list[dict[str, float]]:
+def read_scores(path: Path) -> list[dict[str, float]]:
     """The scores of a run by step, the first ones first; none where there is no file yet."""
     if not path.exists():
         return []
@@ -158,7 +160,7 @@ def read_record(path: Path) -> list[dict[str, float]]:
 
 
 @contextmanager
-def closing_curves(logger: TensorBoardLogger) -> Iterator[TensorBoardLogger]:
+def close_curves(logger: TensorBoardLogger) -> Iterator[TensorBoardLogger]:
     """The logger, whose last values are in its file when the block is left, after an error too."""
     try:
         yield logger
@@ -166,23 +168,23 @@ def closing_curves(logger: TensorBoardLogger) -> Iterator[TensorBoardLogger]:
         logger.finalize("left")
 
 
-class Run:
+class TrainingRun:
     """The moving parts of a training: network, average, optimiser, and the machine they are on."""
 
     def __init__(
         self, recipe: Recipe, start: Checkpoint, logger: TensorBoardLogger, fabric: Fabric | None = None
     ) -> None:
-        self.recipe, self.start, self.by_class = recipe, start, held_out_sets(recipe)
+        self.recipe, self.start, self.by_class = recipe, start, open_held_out_sets(recipe)
         _keep_freed_memory()
-        self.fabric = fabric or _fabric(logger)
-        self.network = network_of(recipe)
+        self.fabric = fabric or _make_fabric(logger)
+        self.network = build_network(recipe)
         self.network.load_state_dict(start.weights)
-        self.objective = objective_of(recipe, self.network)
+        self.objective = build_objective(recipe, self.network)
         for layer in self.network.modules():
             if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
                 # What bfloat16 convolutions on the CPU are fast in: three times the other layout.
                 layer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        average = partial(_move_average, recipe.averaged_steps)
+        average = partial(_update_average, recipe.averaged_steps)
         self.averaged = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
         self.averaged.module.load_state_dict(start.averaged)
         self.averaged.n_averaged.fill_(start.step)
@@ -196,7 +198,7 @@ class Run:
         if start.optimiser:
             self.optimiser.load_state_dict(start.optimiser)
         torch.set_rng_state(start.random_state)
-        self.began = self.kept = time.monotonic()
+        self.began_s = self.saved_s = time.monotonic()
         self.scores = start.scores
         self.skipped: list[int] = []
 
@@ -233,13 +235,13 @@ class Run:
     ) -> dict[str, float]:
         """Give the weights the gradient of a step, of whichever process; returns the loss and its terms."""
         what = f"step {step}: one of {', '.join(batches.names(step))}"
-        for part, values in zip(batches.parts, split(batch, len(batches.parts)), strict=True):
+        for part, values in zip(batches.parts, split_batch(batch, len(batches.parts)), strict=True):
             if self.recipe.micro_batches > 1:
                 # Whichever process it is, dropout is the micro-batch's own.
                 torch.manual_seed(int(np.random.SeedSequence(batches.key(step, part)).generate_state(1)[0]))
             with self.fabric.autocast():
                 predicted = self.objective.predict(self.network, values)
-            with naming(what):
+            with name_in_errors(what):
                 terms = self.objective.losses(predicted, values)
             loss = torch.stack(list(terms.values())).sum()
             self.optimiser.zero_grad()
@@ -256,18 +258,18 @@ class Run:
         self.fabric.log_dict({"skipped_steps": float(len(self.skipped))}, step)
         _LOGGER.warning("%s; skipped", found)
 
-    def keep_now_and_then(self, step: int, path: Path) -> None:
+    def save_periodically(self, step: int, path: Path) -> None:
         """Write the run as it is after `step` steps, if that is ten minutes after it was written last."""
-        if self.fabric.is_global_zero and time.monotonic() - self.kept > _KEEP_EVERY_S:
+        if self.fabric.is_global_zero and time.monotonic() - self.saved_s > _SAVE_EVERY_S:
             self._write(step, self.scores, path)
 
-    def keep(self, step: int, scores: dict[str, float], path: Path) -> None:
+    def save(self, step: int, scores: dict[str, float], path: Path) -> None:
         """Write the run as it is after `step` steps, and its scores to the curves."""
         self.fabric.log_dict({f"validation/{name}": score for name, score in scores.items()}, step)
         self._write(step, scores, path)
 
     def _write(self, step: int, scores: dict[str, float], path: Path) -> None:
-        self.kept, self.scores = time.monotonic(), scores
+        self.saved_s, self.scores = time.monotonic(), scores
         state = replace(
             self.start,
             step=step,
@@ -276,12 +278,12 @@ class Run:
             optimiser=self.optimiser.state_dict(),
             random_state=torch.get_rng_state(),
             scores=scores,
-            hours=self.start.hours + (time.monotonic() - self.began) / 3600,
+            hours=self.start.hours + (time.monotonic() - self.began_s) / 3600,
         )
         checkpoint.save(state, path)
 
 
-def _starting_point(recipe: Recipe, last: Path) -> Checkpoint:
+def _load_start(recipe: Recipe, last: Path) -> Checkpoint:
     """Where the run stands: its own last checkpoint, the averaged weights of another, or random weights."""
     if last.exists():
         found = checkpoint.load(last)
@@ -290,15 +292,15 @@ def _starting_point(recipe: Recipe, last: Path) -> Checkpoint:
                 f"{last}: is of another recipe ({found.recipe.name}); "
                 "train into a folder of its own, or remove it"
             )
-        return replace(found, recipe=recipe, commit=checkpoint.code_commit())
-    return checkpoint.start_of(recipe, checkpoint.code_commit())
+        return replace(found, recipe=recipe, commit=checkpoint.find_commit())
+    return checkpoint.make_initial(recipe, checkpoint.find_commit())
 
 
-def _check(recipe: Recipe) -> None:
+def _check_recipe(recipe: Recipe) -> None:
     """FormatError where the recipe names an unknown network or loss, or sizes or processes it cannot take."""
     with torch.device("meta"):
-        network = network_of(recipe)
-        objective_of(recipe, network)
+        network = build_network(recipe)
+        build_objective(recipe, network)
     multiple = network.multiple_of
     sizes = recipe.crop_size + (recipe.pair_size if recipe.dataset == COLLAGE else ())
     if any(side % multiple for side in sizes):
@@ -306,18 +308,18 @@ def _check(recipe: Recipe) -> None:
             f"{recipe.name}: pair_size = {list(recipe.pair_size)}, crop_size = {list(recipe.crop_size)}, "
             f"expected multiples of {multiple} for {recipe.model}"
         )
-    if recipe.micro_batches % ranks().count:
+    if recipe.micro_batches % read_rank().world_size:
         raise FormatError(
             f"{recipe.name}: {recipe.micro_batches} micro-batches a step, expected a multiple of the "
-            f"{ranks().count} processes; set micro_batch, or --nproc-per-node"
+            f"{read_rank().world_size} processes; set micro_batch, or --nproc-per-node"
         )
 
 
-def _numbered_batches(batches: Batches, first: int) -> Iterator[tuple[int, dict[str, torch.Tensor]]]:
+def _load_batches(batches: Batches, first: int) -> Iterator[tuple[int, dict[str, torch.Tensor]]]:
     """(step, its batch) from step `first` to the last, cut and recoloured in a process beside."""
     steps = range(first, batches.recipe.steps)
     loader = DataLoader(
-        Told(batches),
+        CaughtBatches(batches),
         sampler=steps,
         batch_size=None,
         num_workers=1,
@@ -332,54 +334,54 @@ def _numbered_batches(batches: Batches, first: int) -> Iterator[tuple[int, dict[
         yield step, batch
 
 
-def _fabric(logger: TensorBoardLogger) -> Fabric:
+def _make_fabric(logger: TensorBoardLogger) -> Fabric:
     """This process's device, among torchrun's processes where it has some."""
-    own = ranks()
-    if own.count == 1:
-        return Fabric(accelerator="auto", devices=1, precision=_precision(), loggers=logger)
+    own = read_rank()
+    if own.world_size == 1:
+        return Fabric(accelerator="auto", devices=1, precision=_choose_precision(), loggers=logger)
     cuda = torch.cuda.is_available()
-    if cuda and own.count_here > torch.cuda.device_count():
+    if cuda and own.local_world_size > torch.cuda.device_count():
         raise StereoweaveError(
             f"torchrun: expected at most a process for each of {torch.cuda.device_count()} GPUs, found "
-            f"{own.count_here}; start fewer with --nproc-per-node"
+            f"{own.local_world_size}; start fewer with --nproc-per-node"
         )
-    if (threads := threads_each()) and not cuda:
+    if (threads := choose_thread_count()) and not cuda:
         torch.set_num_threads(threads)
     if own.rank > 0:
         logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
     fabric = Fabric(
         accelerator="cuda" if cuda else "cpu",
-        devices=own.count_here,
-        num_nodes=own.count // own.count_here,
-        strategy=DDPStrategy(timeout=_PATIENCE),
-        precision=_precision(),
+        devices=own.local_world_size,
+        num_nodes=own.world_size // own.local_world_size,
+        strategy=DDPStrategy(timeout=_TIMEOUT),
+        precision=_choose_precision(),
         loggers=logger,
     )
-    if own.count == own.count_here > 1:
-        _meet(own, "nccl" if cuda else "gloo")
+    if own.world_size == own.local_world_size > 1:
+        _join_ranks(own, "nccl" if cuda else "gloo")
     fabric.launch()
     return fabric
 
 
-def _meet(own: Ranks, backend: str) -> None:
+def _join_ranks(own: ProcessRank, backend: str) -> None:
     """Joins the processes that torchrun started together on this machine.
 
     It keeps one store for all its starts: without a place of their own there, those that are started again
     find the addresses of their killed predecessors, and wait for them (PyTorch's issue 135712).
     """
-    store, rank, count = next(rendezvous("env://", own.rank, own.count))
+    store, rank, count = next(rendezvous("env://", own.rank, own.world_size))
     place = f"start {os.environ['TORCHELASTIC_RESTART_COUNT']}"
     torch.distributed.init_process_group(
         backend,
         store=PrefixStore(place, store),
         rank=rank,
         world_size=count,
-        timeout=_PATIENCE,
+        timeout=_TIMEOUT,
     )
 
 
 @contextmanager
-def _no_farewell_after_an_error() -> Iterator[None]:
+def _skip_teardown_on_error() -> Iterator[None]:
     """An error in the block ends this process, although others wait for it on their GPUs.
 
     NCCL is left at exit by all processes together: who leaves it alone waits for the others, and they for it.
@@ -402,7 +404,7 @@ def _keep_freed_memory() -> None:
 
 
 @torch.no_grad()
-def _move_average(
+def _update_average(
     averaged_steps: int,
     averaged: Sequence[torch.Tensor],
     current: Sequence[torch.Tensor],
@@ -417,7 +419,7 @@ def _move_average(
             average.copy_(value)
 
 
-def _precision() -> Literal["bf16-mixed", "32-true"]:
+def _choose_precision() -> Literal["bf16-mixed", "32-true"]:
     """bfloat16 where the device computes in it, float32 elsewhere."""
     if torch.accelerator.is_available():
         computes = torch.cuda.is_bf16_supported()

@@ -13,14 +13,14 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from stereoweave.learn.models.weave import Stages
+from stereoweave.learn.models.weave import WeaveStages
 from stereoweave.learn.training.warp import reconstruct_left
 
 _ROBUST_SCALE = 2.5
 
 
 def weave_losses(
-    stages: Stages,
+    stages: WeaveStages,
     truth_px: Float[Tensor, "b 1 h w"],
     occluded: Bool[Tensor, "b 1 h w"],
     distribution: float = 1.0,
@@ -38,7 +38,7 @@ def weave_losses(
         distribution: Weight of the cross-entropies.
         compare: Loss between disparities in px, estimated and true; `regression` unless given.
     """
-    compare = compare or regression
+    compare = compare or regression_loss
     columns = torch.arange(truth_px.shape[3], device=truth_px.device)
     unmatched = occluded | (truth_px > columns)
     # A level is as many pixels as the maps of scores are smaller.
@@ -52,7 +52,7 @@ def weave_losses(
     return {
         "correlation": 0.5 * distribution * level_cross_entropy(stages.correlation, matched_truth),
         "scores": distribution * level_cross_entropy(stages.scores, level_truth),
-        "coarse": 0.5 * compare(stages.coarse_px, halved(ahead_px)),
+        "coarse": 0.5 * compare(stages.coarse_px, halve(ahead_px)),
         "disparity": compare(stages.disparity_px, ahead_px),
         "confidence": 0.3 * confidence_loss(stages.confidence_logit, stages.disparity_px, truth_px),
     }
@@ -68,10 +68,10 @@ def level_cross_entropy(
     below = truth.floor().clamp(max=levels - 2)
     log_likelihood = scores.float().log_softmax(1)
     low, high = (log_likelihood.gather(1, below.long() + i) for i in (0, 1))
-    return -mean_over(low + (truth - below) * (high - low), known)
+    return -masked_mean(low + (truth - below) * (high - low), known)
 
 
-def regression(
+def regression_loss(
     estimate_px: Float[Tensor, "b 1 h w"], truth_px: Float[Tensor, "b 1 h w"], robust: float = 0.0
 ) -> Float[Tensor, ""]:
     """Mean absolute error e, rounded below half a pixel; the share `robust` of it is 2.5 log(1 + e) instead.
@@ -83,7 +83,7 @@ def regression(
     loss = F.huber_loss(estimate_px, truth_px.where(known, 0), reduction="none", delta=0.5) / 0.5
     if robust:
         loss = (1 - robust) * loss + robust * _ROBUST_SCALE * loss.log1p()
-    return mean_over(loss, known)
+    return masked_mean(loss, known)
 
 
 def confidence_loss(
@@ -94,10 +94,10 @@ def confidence_loss(
     """Cross-entropy of the claim that the disparity is within 1 px."""
     within = (disparity_px.detach() - truth_px).abs() <= 1
     loss = F.binary_cross_entropy_with_logits(logit, within.float(), reduction="none")
-    return mean_over(loss, truth_px.isfinite())
+    return masked_mean(loss, truth_px.isfinite())
 
 
-def halved(truth_px: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h2 w2"]:
+def halve(truth_px: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h2 w2"]:
     """Mean of each 2x2 block, in pixels of the full resolution; NaN where an edge runs through the block."""
     blocks = F.pixel_unshuffle(truth_px, 2)
     low, high = blocks.aminmax(dim=1, keepdim=True)
@@ -106,12 +106,12 @@ def halved(truth_px: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h2 w2"]:
 
 def l2_loss(code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
     """Mean squared error of the code: the paper's choice, the first term of its equation (5)."""
-    return _mean_over_known(F.mse_loss, code, truth)
+    return _mean_known_loss(F.mse_loss, code, truth)
 
 
 def l1_loss(code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
     """Mean absolute error of the code."""
-    return _mean_over_known(F.l1_loss, code, truth)
+    return _mean_known_loss(F.l1_loss, code, truth)
 
 
 def smooth_l1_loss(
@@ -122,7 +122,7 @@ def smooth_l1_loss(
     PSMNet and others turn at 1 px. That is 1 / max_disparity_px of a code whose exponent is 1, and 1 / 192
     is it for PSMNet's range.
     """
-    return _mean_over_known(partial(F.smooth_l1_loss, beta=beta), code, truth)
+    return _mean_known_loss(partial(F.smooth_l1_loss, beta=beta), code, truth)
 
 
 def cross_entropy_loss(code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
@@ -131,7 +131,7 @@ def cross_entropy_loss(code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1
     PyTorch bounds it by 100 and its gradient by 1e12, so both are finite where a code is exactly 0 or 1;
     behind a sigmoid, whose slope is 0 there, such a code learns nothing.
     """
-    return _mean_over_known(F.binary_cross_entropy, code, truth)
+    return _mean_known_loss(F.binary_cross_entropy, code, truth)
 
 
 CODE_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
@@ -152,15 +152,15 @@ def projection_loss(
     weigh like with like; and channels are averaged, so that grey and colour weigh alike.
     """
     reconstructed, exists = reconstruct_left(right, disparity_px)
-    return mean_over(((reconstructed - left) ** 2).mean(1, keepdim=True), exists)
+    return masked_mean(((reconstructed - left) ** 2).mean(1, keepdim=True), exists)
 
 
-def mean_over(values: Float[Tensor, "..."], known: Bool[Tensor, "..."]) -> Float[Tensor, ""]:
+def masked_mean(values: Float[Tensor, "..."], known: Bool[Tensor, "..."]) -> Float[Tensor, ""]:
     """Mean of the values that are known; 0, with a gradient of 0, where none is."""
     return values.where(known, 0).sum() / known.sum().clamp(min=1)
 
 
-def _mean_over_known(loss: Callable[..., Tensor], code: Tensor, truth: Tensor) -> Tensor:
+def _mean_known_loss(loss: Callable[..., Tensor], code: Tensor, truth: Tensor) -> Tensor:
     known = truth.isfinite()
     # Replaced before it meets the code: NaN times a mask is NaN, in the gradient too.
-    return mean_over(loss(code, truth.where(known, 0), reduction="none"), known)
+    return masked_mean(loss(code, truth.where(known, 0), reduction="none"), known)

@@ -14,21 +14,21 @@ from torch import Tensor, nn
 
 from stereoweave.bench import metrics
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.learn.data.batches import collated, known
-from stereoweave.learn.data.sources import Source
+from stereoweave.learn.data.batches import collate, read_known
+from stereoweave.learn.data.sources import PairSource
 from stereoweave.learn.models import CodeNetwork
-from stereoweave.learn.models.weave import Stages, WeaveNet
+from stereoweave.learn.models.weave import WeaveNet, WeaveStages
 from stereoweave.learn.recipe import Recipe
 from stereoweave.learn.training.losses import (
     CODE_LOSSES,
     projection_loss,
-    regression,
+    regression_loss,
     smooth_l1_loss,
     weave_losses,
 )
 from stereoweave.learn.training.perceptual import PerceptualLoss
 from stereoweave.learn.training.scores import validate
-from stereoweave.learn.training.warp import disparity_of_depth
+from stereoweave.learn.training.warp import depth_to_disparity
 from stereoweave.stereo import DepthCurve, Sample, fit_exponent
 
 Batch = dict[str, Tensor]
@@ -52,12 +52,12 @@ class Objective(Protocol):
         """The terms by name, already weighted; their sum is what is minimised."""
         ...
 
-    def scores(self, network: Any, pairs: Source, device: torch.device) -> dict[str, float]:
+    def scores(self, network: Any, pairs: PairSource, device: torch.device) -> dict[str, float]:
         """Means over pairs that the network was not trained on."""
         ...
 
 
-def objective_of(recipe: Recipe, network: nn.Module) -> Objective:
+def build_objective(recipe: Recipe, network: nn.Module) -> Objective:
     """The objective that a recipe asks for; FormatError for a loss that is unknown or not the network's."""
     if recipe.loss not in LOSSES:
         raise FormatError(f"{recipe.name}: loss = {recipe.loss!r}, expected {', '.join(LOSSES)}")
@@ -86,10 +86,10 @@ class WeaveObjective:
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
 
-    def predict(self, network: WeaveNet, batch: Batch) -> Stages:
+    def predict(self, network: WeaveNet, batch: Batch) -> WeaveStages:
         return network.stages(batch["left"], batch["right"])
 
-    def losses(self, predicted: Stages, batch: Batch) -> dict[str, Tensor]:
+    def losses(self, predicted: WeaveStages, batch: Batch) -> dict[str, Tensor]:
         truth_px, occluded = batch["disparity_px"], batch["occluded"]
         terms = weave_losses(predicted, truth_px, occluded, self.recipe.distribution, self._compare)
         if self.recipe.alpha_p:
@@ -98,13 +98,13 @@ class WeaveObjective:
             terms["projection"] = self.recipe.alpha_p * error
         return terms
 
-    def scores(self, network: WeaveNet, pairs: Source, device: torch.device) -> dict[str, float]:
+    def scores(self, network: WeaveNet, pairs: PairSource, device: torch.device) -> dict[str, float]:
         return validate(network, pairs, device)
 
     def _compare(self, estimate_px: Tensor, truth_px: Tensor) -> Tensor:
-        return regression(self._curved(estimate_px), self._curved(truth_px), self.recipe.robust)
+        return regression_loss(self._encode(estimate_px), self._encode(truth_px), self.recipe.robust)
 
-    def _curved(self, disparity_px: Tensor) -> Tensor:
+    def _encode(self, disparity_px: Tensor) -> Tensor:
         if self.recipe.exponent == 1:
             return disparity_px  # as it is, to the last bit
         curve = DepthCurve(exponent=self.recipe.exponent, max_disparity_px=self.recipe.max_disparity_px)
@@ -120,15 +120,15 @@ class CodeObjective:
     """
 
     def __init__(self, recipe: Recipe, network: CodeNetwork) -> None:
-        self.recipe, self.curve = recipe, curve_of(recipe)
+        self.recipe, self.curve = recipe, build_curve(recipe)
         self.predicts, self.output_weights = network.predicts, network.output_weights
-        self.compare = _comparison(recipe)
+        self.compare = _choose_comparison(recipe)
 
     def predict(self, network: CodeNetwork, batch: Batch) -> tuple[Map, ...]:
         return network.outputs(batch["left"], batch["right"])
 
     def losses(self, predicted: tuple[Map, ...], batch: Batch) -> dict[str, Tensor]:
-        truth = self.curve.encode(truth_of(self.recipe, batch))
+        truth = self.curve.encode(compute_target(self.recipe, batch))
         terms = [self._terms(output.float(), truth, batch) for output in predicted]
         weights = torch.tensor(self.output_weights, device=truth.device)
         return {name: weights @ torch.stack([term[name] for term in terms]) for name in terms[0]}
@@ -150,12 +150,12 @@ class CodeObjective:
         decoded = self.curve.decode(output)
         if self.recipe.target == "disparity":
             return decoded
-        return disparity_of_depth(
+        return depth_to_disparity(
             decoded, batch["focal_baseline_px_m"], batch["doffs_px"], width_px=output.shape[3]
         )
 
     @torch.no_grad()
-    def scores(self, network: CodeNetwork, pairs: Source, device: torch.device) -> dict[str, float]:
+    def scores(self, network: CodeNetwork, pairs: PairSource, device: torch.device) -> dict[str, float]:
         """Mean `loss` and its terms, `epe_px`, and with depth as target `depth_error_m`.
 
         `squared_error` is that of the straight code, before the exponent: unlike the loss it can be compared
@@ -164,8 +164,8 @@ class CodeObjective:
         network.eval()
         rows = []
         for index in range(pairs.count):
-            with naming(pairs.name(index)):
-                rows.append(self._scores_of(network, known(pairs, index), device))
+            with name_in_errors(pairs.name(index)):
+                rows.append(self._scores_of(network, read_known(pairs, index), device))
         return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
     def _terms(self, output: Map, code_truth: Map, batch: Batch) -> dict[str, Tensor]:
@@ -187,23 +187,23 @@ class CodeObjective:
         return focal_baseline / shifted_px.clamp(min=least_px) + beyond * self.recipe.max_depth_m
 
     def _scores_of(self, network: CodeNetwork, sample: Sample, device: torch.device) -> dict[str, float]:
-        batch = {name: values.to(device) for name, values in collated([sample]).items()}
-        output, truth = network(batch["left"], batch["right"]), truth_of(self.recipe, batch)
+        batch = {name: values.to(device) for name, values in collate([sample]).items()}
+        output, truth = network(batch["left"], batch["right"]), compute_target(self.recipe, batch)
         terms = self._terms(output, self.curve.encode(truth), batch)
         scores = {name: float(value) for name, value in terms.items()}
         quantity = self.quantity(output, batch)
-        straight = curve_of(replace(self.recipe, exponent=1.0))
+        straight = build_curve(replace(self.recipe, exponent=1.0))
         error = (straight.encode_estimate(quantity) - straight.encode(truth)).square()
         scores["loss"] = sum(scores.values())
         scores["squared_error"] = float(error.nanmean())
-        scores["epe_px"] = metrics.epe_px(_array(self.disparity_px(output, batch)), sample.disparity_px)
+        scores["epe_px"] = metrics.epe_px(_to_array(self.disparity_px(output, batch)), sample.disparity_px)
         if self.recipe.target == "depth":
-            estimate_m = _array(quantity.clamp(max=self.recipe.max_depth_m))
-            scores["depth_error_m"] = metrics.depth_error_m(estimate_m, _array(truth))
+            estimate_m = _to_array(quantity.clamp(max=self.recipe.max_depth_m))
+            scores["depth_error_m"] = metrics.depth_error_m(estimate_m, _to_array(truth))
         return scores
 
 
-def _comparison(recipe: Recipe) -> Callable[[Map, Map], Tensor]:
+def _choose_comparison(recipe: Recipe) -> Callable[[Map, Map], Tensor]:
     """The loss between codes, and the truth's."""
     if recipe.loss == PERCEPTUAL:
         if not recipe.vgg16_weights:
@@ -218,32 +218,32 @@ def _comparison(recipe: Recipe) -> Callable[[Map, Map], Tensor]:
     return CODE_LOSSES[recipe.loss]
 
 
-def curve_of(recipe: Recipe) -> DepthCurve:
+def build_curve(recipe: Recipe) -> DepthCurve:
     """The curve between the recipe's target and its code."""
     if recipe.target == "depth":
         return DepthCurve(exponent=recipe.exponent, max_depth_m=recipe.max_depth_m)
     return DepthCurve(exponent=recipe.exponent, max_disparity_px=recipe.max_disparity_px)
 
 
-def fitted(recipe: Recipe, pairs: Source) -> Recipe:
+def fit_recipe(recipe: Recipe, pairs: PairSource) -> Recipe:
     """The recipe, with its exponent fitted to the truth of the training pairs where it asks for that."""
     if not recipe.fit_exponent:
         return recipe
-    return replace(recipe, exponent=fit_exponent(truth_histogram(recipe, pairs)))
+    return replace(recipe, exponent=fit_exponent(count_truth(recipe, pairs)))
 
 
-def truth_histogram(recipe: Recipe, pairs: Source) -> Float[np.ndarray, " n"]:
+def count_truth(recipe: Recipe, pairs: PairSource) -> Float[np.ndarray, " n"]:
     """Counts of the normalised truth, before the exponent, in equal bins over 0..1; of spread pairs."""
-    straight = curve_of(replace(recipe, exponent=1.0))
+    straight = build_curve(replace(recipe, exponent=1.0))
     counts = np.zeros(_FITTED_BINS)
     for index in range(0, pairs.count, max(1, pairs.count // _FITTED_PAIRS)):
-        with naming(pairs.name(index)):
-            code = _array(straight.encode(truth_of(recipe, collated([known(pairs, index)]))))
+        with name_in_errors(pairs.name(index)):
+            code = _to_array(straight.encode(compute_target(recipe, collate([read_known(pairs, index)]))))
         counts += np.histogram(code[np.isfinite(code)], _FITTED_BINS, (0, 1))[0]
     return counts
 
 
-def truth_of(recipe: Recipe, batch: Batch) -> Map:
+def compute_target(recipe: Recipe, batch: Batch) -> Map:
     """The left views' truth as what the code stands for, disparity in px or depth in m; NaN where unknown.
 
     Disparity above max_disparity_px counts as unknown, as PSMNet's authors have it; depth beyond max_depth_m
@@ -263,7 +263,7 @@ def truth_of(recipe: Recipe, batch: Batch) -> Map:
 
 
 @contextmanager
-def naming(what: str) -> Iterator[None]:
+def name_in_errors(what: str) -> Iterator[None]:
     """Says in an error which pair or pairs it is about, where it does not yet."""
     try:
         yield
@@ -272,5 +272,5 @@ def naming(what: str) -> Iterator[None]:
         raise StereoweaveError(words if words.startswith(what) else f"{what}: {words}") from error
 
 
-def _array(values: Map) -> Float[np.ndarray, "h w"]:
+def _to_array(values: Map) -> Float[np.ndarray, "h w"]:
     return values[0, 0].cpu().numpy()

@@ -56,10 +56,10 @@ class PerceptualLoss(nn.Module):
         self.to(code.device)
         known = truth.isfinite()
         shown, expected = (values.where(known, code.detach()) for values in (code, truth))
-        difference = F.mse_loss(self._seen(shown), self._seen(expected))
+        difference = F.mse_loss(self._extract_features(shown), self._extract_features(expected))
         return difference * known.numel() / known.sum().clamp(min=1)
 
-    def _seen(self, code: Tensor) -> Tensor:
+    def _extract_features(self, code: Tensor) -> Tensor:
         # Three channels come of the one by the three means.
         return self.features((code - self.mean) / self.deviation)
 

@@ -9,43 +9,45 @@ from torch import nn
 
 from stereoweave.bench import metrics
 from stereoweave.bench.error_classes import CLASSES, class_errors, classify
-from stereoweave.learn.data.sources import Source
+from stereoweave.learn.data.sources import PairSource
 from stereoweave.stereo import Sample
 
 Map = Float[np.ndarray, "h w"]
 
 
 @torch.no_grad()
-def validate(network: nn.Module, pairs: Source, device: torch.device) -> dict[str, float]:
+def validate(network: nn.Module, pairs: PairSource, device: torch.device) -> dict[str, float]:
     """Mean scores over the left views of the pairs, occluded pixels included."""
     rows, confidences, truths = [], [], []
-    for sample, estimate_px, confidence in _answers(network, pairs, device):
-        rows.append(_errors(estimate_px, sample.disparity_px))
+    for sample, estimate_px, confidence in _predict(network, pairs, device):
+        rows.append(_compute_errors(estimate_px, sample.disparity_px))
         confidences.append(confidence)
         truths.append(np.abs(estimate_px - sample.disparity_px) <= 1)
-    return _mean(rows) | {
+    return _average(rows) | {
         "calibration_error": metrics.calibration_error(np.stack(confidences), np.stack(truths))
     }
 
 
 @torch.no_grad()
-def validate_by_class(network: nn.Module, pairs: Source, device: torch.device) -> dict[str, float]:
+def validate_by_class(network: nn.Module, pairs: PairSource, device: torch.device) -> dict[str, float]:
     """Mean scores over the left views of the pairs, and what each class of pixels adds to bad-1.
 
     Truth beyond the network's range does not count.
     """
     rows = []
-    for sample, estimate_px, _ in _answers(network, pairs, device):
+    for sample, estimate_px, _ in _predict(network, pairs, device):
         truth_px = np.where(sample.disparity_px < network.max_disparity_px, sample.disparity_px, np.nan)
         classes = class_errors(
             estimate_px, truth_px, classify(sample.left, truth_px, occluded=sample.occluded)
         )
         bad1_percent = {f"{name}_bad1_percent": classes[name].bad1_percent for name in CLASSES}
-        rows.append(_errors(estimate_px, truth_px) | bad1_percent)
-    return _mean(rows)
+        rows.append(_compute_errors(estimate_px, truth_px) | bad1_percent)
+    return _average(rows)
 
 
-def _answers(network: nn.Module, pairs: Source, device: torch.device) -> Iterator[tuple[Sample, Map, Map]]:
+def _predict(
+    network: nn.Module, pairs: PairSource, device: torch.device
+) -> Iterator[tuple[Sample, Map, Map]]:
     """Each sample, its left disparity in px, and its confidence."""
     network.eval()
     for index in range(pairs.count):
@@ -58,7 +60,7 @@ def _answers(network: nn.Module, pairs: Source, device: torch.device) -> Iterato
         yield sample, found_px.numpy(), confidence_logit.sigmoid().numpy()
 
 
-def _errors(estimate_px: Map, truth_px: Map) -> dict[str, float]:
+def _compute_errors(estimate_px: Map, truth_px: Map) -> dict[str, float]:
     return {
         "epe_px": metrics.epe_px(estimate_px, truth_px),
         "bad1_percent": metrics.bad_percent(estimate_px, truth_px, 1),
@@ -67,5 +69,5 @@ def _errors(estimate_px: Map, truth_px: Map) -> dict[str, float]:
     }
 
 
-def _mean(rows: list[dict[str, float]]) -> dict[str, float]:
+def _average(rows: list[dict[str, float]]) -> dict[str, float]:
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}

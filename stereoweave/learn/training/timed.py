@@ -18,12 +18,12 @@ import torch
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import make_folder
 from stereoweave.learn import checkpoint
-from stereoweave.learn.data.painters import Painters, cooling
-from stereoweave.learn.data.pair_cache import KeptPairs
-from stereoweave.learn.data.sources import Source, sources
+from stereoweave.learn.data.painters import Painters, make_cool_down_recipe
+from stereoweave.learn.data.pair_cache import CachedPairs
+from stereoweave.learn.data.sources import PairSource, open_sources
 from stereoweave.learn.recipe import Recipe
-from stereoweave.learn.training.clock import RESERVE_S, Clock, cools_at, learning_rate_at
-from stereoweave.learn.training.timed_run import NETWORK, Progress, TimedRun, standing
+from stereoweave.learn.training.clock import RESERVE_S, RunClock, is_cooling_down, learning_rate_at
+from stereoweave.learn.training.timed_run import NETWORK_FILE, RunProgress, TimedRun, find_resume_point
 
 Report = Callable[[str], None]
 
@@ -36,7 +36,7 @@ _BFLOAT16_SHARE = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
-class Command:
+class TimedCommand:
     """One command of a run.
 
     Attributes:
@@ -63,7 +63,7 @@ class Command:
 
 
 @dataclass(frozen=True)
-class _Mark:
+class _Snapshot:
     """A moment of the training, and the counts at it."""
 
     at_s: float
@@ -72,15 +72,17 @@ class _Mark:
     late: int = 0
 
 
-def train_by_clock(recipe: Recipe, command: Command, report: Report) -> Progress:
+def train_by_clock(recipe: Recipe, command: TimedCommand, report: Report) -> RunProgress:
     """Train for the minutes of a command; returns how far the run is.
 
     Raises:
         StereoweaveError: There is nothing sound to go on from, no batches are made, or losses are not finite.
     """
     make_folder(command.out)
-    start = standing(recipe, command.out, command.earlier, command.commit or checkpoint.code_commit())
-    clock = Clock(
+    start = find_resume_point(
+        recipe, command.out, command.earlier, command.commit or checkpoint.find_commit()
+    )
+    clock = RunClock(
         began_s=command.began_s,
         used_s=start.progress.seconds,
         minutes=command.minutes,
@@ -89,50 +91,53 @@ def train_by_clock(recipe: Recipe, command: Command, report: Report) -> Progress
     if clock.left_at(time.monotonic()) <= 0:
         report(f"the {command.total_minutes:g} minutes are used; {command.out} is not changed")
         return start.progress
-    recipes = [recipe, *([cooling(recipe, command.cool_down_crop)] if command.cool_down_crop else [])]
+    recipes = [
+        recipe,
+        *([make_cool_down_recipe(recipe, command.cool_down_crop)] if command.cool_down_crop else []),
+    ]
     with ExitStack() as stack:
         kept = Path(stack.enter_context(TemporaryDirectory()))
         pinned = command.device == "cuda"
         painters = Painters(recipes, kept, command.processes, start.progress.batches, pinned)
         stack.enter_context(painters)
         run = TimedRun(start.checkpoint, start.optimiser, torch.device(command.device))
-        training = _Training(run, painters, clock, command.out, report)
-        training.go_on_from(start.progress)
-        training.end(sources(recipe, kept)[1])
-        return training.progress
+        loop = _TimedLoop(run, painters, clock, command.out, report)
+        loop.train_from(start.progress)
+        loop.finish(open_sources(recipe, kept)[1])
+        return loop.progress
 
 
-class _Training:
+class _TimedLoop:
     """The loop of a command."""
 
-    def __init__(self, run: TimedRun, painters: Painters, clock: Clock, out: Path, report: Report) -> None:
+    def __init__(self, run: TimedRun, painters: Painters, clock: RunClock, out: Path, report: Report) -> None:
         self.run, self.painters, self.clock, self.out, self.report = run, painters, clock, out, report
         self.recipe = run.start.recipe
-        self.progress, self.losses = Progress(), list[float]()
+        self.progress, self.losses = RunProgress(), list[float]()
 
-    def go_on_from(self, progress: Progress) -> None:
+    def train_from(self, progress: RunProgress) -> None:
         """Step until the command's time is over; a report and a checkpoint now and then."""
         self.progress = progress
-        batch = self._try_out()
+        batch = self._smoke_test()
         self.reported = self._mark()
         while self.clock.left_at(time.monotonic()) > 0:
             share = self.clock.share_at(time.monotonic())
             rate = learning_rate_at(self.recipe, self.progress.optimiser_steps, share)
-            if cools_at(self.recipe, share):
+            if is_cooling_down(self.recipe, share):
                 self.painters.switch(len(self.painters.recipes) - 1)
             pairs, loss = len(batch["left"]), self.run.begin(batch)
             # Now, because a GPU is still computing the gradient.
-            batch = self.run.moved(self.painters.take())
+            batch = self.run.move_to_device(self.painters.take())
             self._count(pairs, self.run.finish(loss, rate))
             if time.monotonic() - self.reported.at_s > _REPORT_EVERY_S:
                 self._report(rate)
             if time.monotonic() - self.saved_s > _SAVE_EVERY_S:
                 self._save({})
 
-    def end(self, held_out: Source) -> None:
+    def finish(self, held_out: PairSource) -> None:
         """Save the run with its scores, and say what is next."""
         too_late = self.clock.left_at(time.monotonic()) < -RESERVE_S
-        if too_late or (isinstance(held_out, KeptPairs) and held_out.missing()):
+        if too_late or (isinstance(held_out, CachedPairs) and held_out.missing()):
             self.report("not scored: the time is over" if too_late else "not scored: no held-out pairs")
             return self._save({})
         scores = self.run.scores(held_out)
@@ -147,12 +152,12 @@ class _Training:
         )
         return None
 
-    def _try_out(self) -> dict[str, torch.Tensor]:
+    def _smoke_test(self) -> dict[str, torch.Tensor]:
         """Try everything once on the first batch, which is returned: no later command may find a fault.
 
         A loss in bfloat16 that is not float32's turns bfloat16 off.
         """
-        batch = self.run.moved(self.painters.take())
+        batch = self.run.move_to_device(self.painters.take())
         plain = self.run.loss(batch, bfloat16=False)
         self.report(f"{self._used()}  the first batch is there; its loss is {plain:.4g}")
         if self.run.bfloat16:
@@ -162,7 +167,7 @@ class _Training:
             self.report(f"in bfloat16 it is {rounded:.4g}; trains in {taken}")
         pairs_per_s = len(batch["left"]) / self._seconds_a_step(batch)
         self._save({})
-        checkpoint.load(self.out / NETWORK)
+        checkpoint.load(self.out / NETWORK_FILE)
         self.report(
             f"{self._used()}  smoke test passed: files are written and read, and the network alone takes "
             f"{pairs_per_s:.1f} pairs/s"
@@ -193,7 +198,7 @@ class _Training:
         else:
             self.losses.append(loss)
 
-    def _skip(self, before: Progress) -> None:
+    def _skip(self, before: RunProgress) -> None:
         self.report(f"step {before.steps}: the loss or its gradient is not finite; skipped")
         last = before.last_skipped
         if last is not None and before.steps - last < _STEPS_BETWEEN_SKIPS:
@@ -224,8 +229,8 @@ class _Training:
         hours = self.run.start.hours + (self.saved_s - self.clock.began_s) / 3600
         self.run.save(self.out, self.progress, hours, scores)
 
-    def _mark(self) -> _Mark:
-        return _Mark(time.monotonic(), self.progress.pairs, self.painters.taken, self.painters.starved)
+    def _mark(self) -> _Snapshot:
+        return _Snapshot(time.monotonic(), self.progress.pairs, self.painters.taken, self.painters.starved)
 
     def _used(self) -> str:
         return f"{self.clock.used_at(time.monotonic()):5.0f} s"

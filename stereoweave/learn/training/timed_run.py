@@ -14,19 +14,19 @@ from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.files import replacing
 from stereoweave.learn import checkpoint
 from stereoweave.learn.checkpoint import Checkpoint, Weights
-from stereoweave.learn.models import network_of
+from stereoweave.learn.models import build_network
 from stereoweave.learn.recipe import Recipe
-from stereoweave.learn.training.objective import objective_of
+from stereoweave.learn.training.objective import build_objective
 
 # A checkpoint without the optimiser's state, which `stereoweave train` starts from and `export` takes; that
 # state; and how far the run is.
-NETWORK, OPTIMISER, PROGRESS = "network.pt", "optimiser.pt", "progress.json"
+NETWORK_FILE, OPTIMISER_FILE, PROGRESS_FILE = "network.pt", "optimiser.pt", "progress.json"
 
 _LARGEST_GRADIENT = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Progress:
+class RunProgress:
     """How far a run is.
 
     Attributes:
@@ -49,51 +49,53 @@ class Progress:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Standing:
+class ResumePoint:
     """Where a run stands: its checkpoint, its optimiser's state ({} for none), and how far it is."""
 
     checkpoint: Checkpoint
     optimiser: dict[str, Any]
-    progress: Progress
+    progress: RunProgress
 
 
-def standing(recipe: Recipe, out: Path, earlier: Path | None, commit: str) -> Standing:
+def find_resume_point(recipe: Recipe, out: Path, earlier: Path | None, commit: str) -> ResumePoint:
     """Where the run in `out` or `earlier` stands, whichever is further; else the start of a new run.
 
     Raises:
         FormatError: A file is broken or missing, or `start_from` shares no weights with the network.
         StereoweaveError: The run is of another network.
     """
-    if earlier and not (earlier / PROGRESS).exists():
+    if earlier and not (earlier / PROGRESS_FILE).exists():
         raise FormatError(
-            f"{earlier}: expected {PROGRESS} of an earlier command, found none; bring all its files"
+            f"{earlier}: expected {PROGRESS_FILE} of an earlier command, found none; bring all its files"
         )
-    folders = [folder for folder in (out, earlier) if folder and (folder / PROGRESS).exists()]
-    found = [(_progress(folder / PROGRESS), folder) for folder in folders]
+    folders = [folder for folder in (out, earlier) if folder and (folder / PROGRESS_FILE).exists()]
+    found = [(_read_progress(folder / PROGRESS_FILE), folder) for folder in folders]
     if not found:
-        return Standing(checkpoint=checkpoint.start_of(recipe, commit), optimiser={}, progress=Progress())
+        return ResumePoint(
+            checkpoint=checkpoint.make_initial(recipe, commit), optimiser={}, progress=RunProgress()
+        )
     progress, folder = max(found, key=lambda one: one[0].seconds)
-    last = checkpoint.load(folder / NETWORK)
+    last = checkpoint.load(folder / NETWORK_FILE)
     if last.recipe.model != recipe.model:
         raise StereoweaveError(
-            f"{folder / NETWORK}: expected a run of {recipe.model}, found one of {last.recipe.model}; "
+            f"{folder / NETWORK_FILE}: expected a run of {recipe.model}, found one of {last.recipe.model}; "
             "take another folder"
         )
-    optimiser = _optimiser(folder / OPTIMISER)
+    optimiser = _read_optimiser(folder / OPTIMISER_FILE)
     if not optimiser:
         progress = replace(progress, optimiser_steps=0)
     state = replace(last, recipe=recipe, commit=commit)
-    return Standing(checkpoint=state, optimiser=optimiser, progress=progress)
+    return ResumePoint(checkpoint=state, optimiser=optimiser, progress=progress)
 
 
-def _progress(path: Path) -> Progress:
+def _read_progress(path: Path) -> RunProgress:
     try:
-        return Progress(**json.loads(path.read_text(encoding="utf-8")))
+        return RunProgress(**json.loads(path.read_text(encoding="utf-8")))
     except (ValueError, TypeError) as error:
         raise FormatError(f"{path}: expected the progress of a timed run, found: {error}") from error
 
 
-def _optimiser(path: Path) -> dict[str, Any]:
+def _read_optimiser(path: Path) -> dict[str, Any]:
     """The optimiser's state; {} where there is none, as it may have stayed behind."""
     return torch.load(path, map_location="cpu", weights_only=True) if path.exists() else {}
 
@@ -105,10 +107,10 @@ class TimedRun:
         recipe = start.recipe
         self.start, self.device = start, device
         self.bfloat16 = device.type == "cuda" and torch.cuda.is_bf16_supported()
-        self.network: Any = network_of(recipe)
+        self.network: Any = build_network(recipe)
         self.network.load_state_dict(start.weights)
         self.network.to(device=device, memory_format=torch.channels_last)
-        self.objective = objective_of(recipe, self.network)
+        self.objective = build_objective(recipe, self.network)
         average = get_ema_multi_avg_fn(1 - 1 / recipe.averaged_steps)  # type: ignore[no-untyped-call]
         self.averaged = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
         self.averaged.module.load_state_dict(start.averaged)
@@ -120,7 +122,7 @@ class TimedRun:
         if optimiser:
             self.optimiser.load_state_dict(optimiser)
 
-    def moved(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    def move_to_device(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """A batch of `Painters` on the device, with images in 0..1."""
         there = {name: value.to(self.device, non_blocking=True) for name, value in batch.items()}
         return there | {side: there[side].float() / 255 for side in ("left", "right")}
@@ -159,13 +161,13 @@ class TimedRun:
         """The average's scores on held-out pairs."""
         return self.objective.scores(self.averaged.module, held_out, self.device)
 
-    def save(self, folder: Path, progress: Progress, hours: float, scores: dict[str, float]) -> None:
+    def save(self, folder: Path, progress: RunProgress, hours: float, scores: dict[str, float]) -> None:
         """Write network, optimiser and progress, each whole or not at all.
 
         Raises:
             StereoweaveError: A weight is not finite; the files of before stay.
         """
-        weights, averaged = _on_cpu(self.network), _on_cpu(self.averaged.module)
+        weights, averaged = _copy_to_cpu(self.network), _copy_to_cpu(self.averaged.module)
         if not all(bool(value.isfinite().all()) for value in (*weights.values(), *averaged.values())):
             raise StereoweaveError(
                 f"step {progress.steps}: expected finite weights, found some that are not; {folder} keeps "
@@ -174,10 +176,10 @@ class TimedRun:
         state = replace(
             self.start, step=progress.steps, weights=weights, averaged=averaged, hours=hours, scores=scores
         )
-        checkpoint.save(state, folder / NETWORK)
-        with replacing(folder / OPTIMISER) as temporary:
+        checkpoint.save(state, folder / NETWORK_FILE)
+        with replacing(folder / OPTIMISER_FILE) as temporary:
             torch.save(self.optimiser.state_dict(), temporary)
-        with replacing(folder / PROGRESS) as temporary:
+        with replacing(folder / PROGRESS_FILE) as temporary:
             temporary.write_text(json.dumps(asdict(progress)) + "\n", encoding="utf-8")
 
     def _loss(self, batch: dict[str, Tensor], bfloat16: bool) -> Tensor:
@@ -192,5 +194,5 @@ class TimedRun:
             value.copy_(kept)
 
 
-def _on_cpu(network: nn.Module) -> Weights:
+def _copy_to_cpu(network: nn.Module) -> Weights:
     return {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}

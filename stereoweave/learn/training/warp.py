@@ -29,7 +29,7 @@ def reconstruct_left(
     return first + (position_px - start) * (second - first), exists
 
 
-def disparity_of_depth(
+def depth_to_disparity(
     depth_m: Float[Tensor, "b 1 h w"],
     focal_baseline_px_m: Float[Tensor, "b 1 1 1"],
     doffs_px: Float[Tensor, "b 1 1 1"],

@@ -17,10 +17,10 @@ from stereoweave.data.packing import packed
 from stereoweave.data.shards import write_shard
 from stereoweave.learn import checkpoint
 from stereoweave.learn.data.sources import VALIDATION_SEED
-from stereoweave.learn.export.from_checkpoint import multiply_adds
-from stereoweave.learn.models import MODELS, network_of
+from stereoweave.learn.export.from_checkpoint import count_multiply_adds
+from stereoweave.learn.models import MODELS, build_network
 from stereoweave.learn.recipe import read_recipe
-from stereoweave.learn.training.objective import objective_of
+from stereoweave.learn.training.objective import build_objective
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 SHIPPED = REPOSITORY / "recipes/ablations/weave_small.toml"
@@ -78,13 +78,13 @@ def trained(monkeypatch):
 
     def train_recipe(recipe, out, console):
         out.mkdir(parents=True, exist_ok=True)
-        checkpoint.save(checkpoint_of(network_of(recipe), recipe), out / "last.pt")
+        checkpoint.save(checkpoint_of(build_network(recipe), recipe), out / "last.pt")
         names.append(recipe.name)
         return out / "last.pt"
 
     monkeypatch.setattr(ablations, "train_recipe", train_recipe)
     # Of a picture this small it is counted in no time too.
-    monkeypatch.setattr(ablations, "multiply_adds", partial(multiply_adds, height=32, width=64))
+    monkeypatch.setattr(ablations, "count_multiply_adds", partial(count_multiply_adds, height=32, width=64))
     return names
 
 
@@ -124,7 +124,7 @@ def test_every_variation_is_planned_with_the_first_seed_before_any_with_the_next
 def test_every_variation_has_a_network_and_a_loss():
     MODELS.update(VARIANTS)
     for recipe in {replace(trial.recipe, name="", seed=0) for trial in plan(RECIPE, 1)}:
-        objective_of(recipe, network_of(recipe))
+        build_objective(recipe, build_network(recipe))
 
 
 def test_each_training_is_a_row_with_the_scores_on_both_kinds_of_pairs(rendered, runs, trained, tmp_path):

@@ -37,9 +37,9 @@ from experiments.trial import Trial
 from stereoweave.data.paper_layout import write_frame
 from stereoweave.io.files import read_image
 from stereoweave.learn import checkpoint
-from stereoweave.learn.data.pair_cache import KeptPairs
+from stereoweave.learn.data.pair_cache import CachedPairs
 from stereoweave.learn.data.sources import VALIDATION_SEED
-from stereoweave.learn.training.loop import CURVE, Run, read_record
+from stereoweave.learn.training.loop import SCORES_FILE, TrainingRun, read_scores
 from stereoweave.stereo import fit_exponent
 
 QUIET = Console(quiet=True)
@@ -112,7 +112,7 @@ def experiment(tmp_path_factory):
     folder = tmp_path_factory.mktemp("experiment")
     runs, out = folder / "runs", folder / "report"
     keep_pairs(runs / "pairs", VALIDATION_SEED, BASE.validation_pairs, SIZE)
-    training = KeptPairs(runs / "pairs", BASE.seed, BASE.pairs, SIZE)
+    training = CachedPairs(runs / "pairs", BASE.seed, BASE.pairs, SIZE)
     training.folder.mkdir()
     for index in range(training.count):
         rng = np.random.default_rng(index)
@@ -228,11 +228,11 @@ def test_every_figure_of_what_was_trained_can_be_read(experiment):
 
 
 def test_started_again_it_trains_what_is_missing_alone(experiment, in_place, monkeypatch):
-    steps, step = [], Run.step
+    steps, step = [], TrainingRun.step
     monkeypatch.setattr(
-        Run, "step", lambda run, *rest: steps.append((run.recipe.name, rest[0])) or step(run, *rest)
+        TrainingRun, "step", lambda run, *rest: steps.append((run.recipe.name, rest[0])) or step(run, *rest)
     )
-    keep = Run.keep
+    keep = TrainingRun.save
     some = experiment.of(FIRST, WITHOUT, SECOND_POWER)
     before = {name: experiment.last(name).read_bytes() for name in TRAINED}
 
@@ -244,7 +244,7 @@ def test_started_again_it_trains_what_is_missing_alone(experiment, in_place, mon
         raise Killed
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(Run, "keep", kill)
+        patch.setattr(TrainingRun, "save", kill)
         run_trials(some, experiment.runs, JOBS, QUIET)
     # Killed as soon as its first checkpoint was written.
     assert steps == [(SECOND_POWER, 0), (SECOND_POWER, 1)]
@@ -256,7 +256,7 @@ def test_started_again_it_trains_what_is_missing_alone(experiment, in_place, mon
     run_trials(some, experiment.runs, JOBS, QUIET)
     assert steps[2:] == [(SECOND_POWER, 2), (SECOND_POWER, 3)]
     assert {name: experiment.last(name).read_bytes() for name in TRAINED} == before
-    recorded = read_record(experiment.runs / SECOND_POWER / CURVE)
+    recorded = read_scores(experiment.runs / SECOND_POWER / SCORES_FILE)
     assert [row["step"] for row in recorded] == [2, 4]
     write_report(BASE, experiment.of(FIRST, SECOND_POWER), experiment.runs, out)
     assert "## Not run" not in (out / "paper.md").read_text()

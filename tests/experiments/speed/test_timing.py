@@ -17,12 +17,12 @@ def timed():
     """Rows of the two cheap networks at a small size, what was called, and the graphs."""
     graphs, calls = [], {}
     with pytest.MonkeyPatch.context() as patch:
-        exported, measure_ms = speed.fixed_graph_of, speed._measure_ms
+        exported, measure_ms = speed.export_fixed_graph, speed._measure_ms
         patch.setattr(speed, "HEIGHT_PX", HEIGHT)
         patch.setattr(speed, "WIDTH_PX", WIDTH)
         patch.setattr(speed, "thread_count", lambda _: 1)
         patch.setattr(
-            speed, "fixed_graph_of", lambda *arguments: graphs.append(exported(*arguments)) or graphs[-1]
+            speed, "export_fixed_graph", lambda *arguments: graphs.append(exported(*arguments)) or graphs[-1]
         )
         patch.setattr(
             speed, "_measure_ms", lambda given, turns: calls.update(given) or measure_ms(given, turns)

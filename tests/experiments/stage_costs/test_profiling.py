@@ -10,7 +10,7 @@ from onnx import TensorProto, helper
 from experiments.stage_costs import profiling as costs
 from experiments.stage_costs.__main__ import main
 from stereoweave.learn import checkpoint
-from stereoweave.learn.export.from_checkpoint import multiply_adds
+from stereoweave.learn.export.from_checkpoint import count_multiply_adds
 
 HEIGHT, WIDTH = 32, 64
 
@@ -166,7 +166,7 @@ def test_the_total_is_what_the_stages_sum_to(rows):
     assert sum(row.moved_mb for row in stages) == pytest.approx(total.moved_mb)
     assert total.one_thread_ms >= max(row.one_thread_ms for row in stages) > 0
     # Beside what the network's card counts, the sums of weighted neighbours.
-    assert total.multiply_adds == pytest.approx(multiply_adds(network, HEIGHT, WIDTH), rel=0.02)
+    assert total.multiply_adds == pytest.approx(count_multiply_adds(network, HEIGHT, WIDTH), rel=0.02)
     speed, peak = total.multiply_adds / total.one_thread_ms, product.multiply_adds / product.one_thread_ms
     assert total.one_thread_peak_percent == pytest.approx(100 * speed / peak)
 

@@ -6,13 +6,13 @@ from learn_examples import complaint
 
 from stereoweave.learn.data.augment import (
     augment,
-    cut,
-    erased,
-    mirrored,
-    moved,
-    recoloured,
-    rescaled_cut,
-    upside_down,
+    crop,
+    crop_and_scale,
+    crop_camera,
+    erase_patches,
+    flip_rows,
+    mirror,
+    recolour,
 )
 from stereoweave.stereo import Sample, StereoCamera
 
@@ -74,7 +74,7 @@ def test_the_example_itself_is_exact(sample):
 
 @pytest.mark.parametrize("seed", range(8))
 def test_a_scaled_cut_stays_exact(sample, seed):
-    part = rescaled_cut(sample, 64, 80, np.random.default_rng(seed))
+    part = crop_and_scale(sample, 64, 80, np.random.default_rng(seed))
     assert part.left.shape == part.right.shape == (64, 80, 3)
     assert_views_agree(part, 4)
 
@@ -82,25 +82,25 @@ def test_a_scaled_cut_stays_exact(sample, seed):
 def test_cuts_are_scaled_up_and_down(sample):
     # The slope of the wall is the same at any scale; its disparity at the left border tells the scale.
     spans = [
-        np.ptp(rescaled_cut(sample, 64, 80, np.random.default_rng(seed)).disparity_px) for seed in range(40)
+        np.ptp(crop_and_scale(sample, 64, 80, np.random.default_rng(seed)).disparity_px) for seed in range(40)
     ]
     assert np.ptp(spans) < 0.2
-    nearest = [rescaled_cut(sample, 64, 80, np.random.default_rng(s)).disparity_px.min() for s in range(40)]
+    nearest = [crop_and_scale(sample, 64, 80, np.random.default_rng(s)).disparity_px.min() for s in range(40)]
     assert min(nearest) < 0.9 * NEAR_PX
     assert max(nearest) > 1.2 * NEAR_PX
 
 
 def test_a_mirrored_sample_stays_exact(sample):
-    assert_views_agree(mirrored(sample), 2)
-    np.testing.assert_array_equal(mirrored(sample).left, sample.right[:, ::-1])
-    np.testing.assert_array_equal(mirrored(sample).occluded, sample.right_occluded[:, ::-1])
+    assert_views_agree(mirror(sample), 2)
+    np.testing.assert_array_equal(mirror(sample).left, sample.right[:, ::-1])
+    np.testing.assert_array_equal(mirror(sample).occluded, sample.right_occluded[:, ::-1])
 
 
 def test_a_sample_upside_down_stays_exact(sample):
-    assert_views_agree(upside_down(sample), 2)
+    assert_views_agree(flip_rows(sample), 2)
 
 
-@pytest.mark.parametrize("change", [mirrored, upside_down])
+@pytest.mark.parametrize("change", [mirror, flip_rows])
 def test_what_is_turned_twice_is_as_before(sample, change):
     assert_same(change(change(sample)), sample)
 
@@ -126,7 +126,7 @@ def test_both_views_keep_one_order_of_colours():
     image = np.full((4, 4, 3), (200, 100, 0), np.uint8)
     darkest = []
     for seed in range(20):
-        left, right = recoloured(image, image, np.random.default_rng(seed))
+        left, right = recolour(image, image, np.random.default_rng(seed))
         assert left[0, 0].argmin() == right[0, 0].argmin()
         darkest.append(left[0, 0].argmin())
     assert len(set(darkest)) > 1
@@ -136,7 +136,7 @@ def test_views_are_recoloured_much_alike():
     ramp = np.tile(np.arange(0, 240, 10, dtype=np.uint8)[None, :, None], (2, 1, 3))
     changes = []
     for seed in range(20):
-        left, right = (image.astype(int) for image in recoloured(ramp, ramp, np.random.default_rng(seed)))
+        left, right = (image.astype(int) for image in recolour(ramp, ramp, np.random.default_rng(seed)))
         # Own gains within 5 %, own gammas within 4 % of at most 1.4, which is steepest at 1 / e of white.
         assert np.abs(left - right).max() < 60
         changes.append(np.abs(left - ramp).mean())
@@ -146,7 +146,7 @@ def test_views_are_recoloured_much_alike():
 def test_erasing_puts_flat_patches_into_a_copy(rng):
     image = rng.integers(0, 256, (80, 100, 3), dtype=np.uint8)
     before = image.copy()
-    found = erased(image, rng)
+    found = erase_patches(image, rng)
     np.testing.assert_array_equal(image, before)
     changed = (found != image).any(2)
     assert 15 * 15 <= changed.sum() <= 2 * 63 * 63
@@ -155,7 +155,7 @@ def test_erasing_puts_flat_patches_into_a_copy(rng):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_cut_keeps_every_value_and_moves_the_camera_s_centre(sample, seed):
-    part = cut(replace(sample, camera=CAMERA), 30, 50, np.random.default_rng(seed))
+    part = crop(replace(sample, camera=CAMERA), 30, 50, np.random.default_rng(seed))
     # The camera tells where the part lies.
     start, top = round(70 - part.camera.cx_px), round(40 - part.camera.cy_px)
     assert 0 <= start <= WIDTH - 50 and 0 <= top <= HEIGHT - 30
@@ -169,29 +169,29 @@ def test_a_cut_keeps_every_value_and_moves_the_camera_s_centre(sample, seed):
 
 def test_cuts_lie_in_different_places_and_the_whole_is_one_of_them(sample):
     whole = replace(sample, camera=CAMERA)
-    centres = {cut(whole, 30, 50, np.random.default_rng(seed)).camera.cx_px for seed in range(20)}
+    centres = {crop(whole, 30, 50, np.random.default_rng(seed)).camera.cx_px for seed in range(20)}
     assert len(centres) > 10
-    assert_same(cut(whole, HEIGHT, WIDTH, np.random.default_rng(0)), whole)
+    assert_same(crop(whole, HEIGHT, WIDTH, np.random.default_rng(0)), whole)
 
 
 @pytest.mark.parametrize("size", [(HEIGHT + 1, 50), (30, WIDTH + 1)])
 def test_a_cut_larger_than_the_sample_is_refused(sample, size):
-    assert complaint(cut, sample, *size, np.random.default_rng(0)) == (
+    assert complaint(crop, sample, *size, np.random.default_rng(0)) == (
         f"crop_size = {list(size)}: expected at most the pictures' [96, 144]; cut less"
     )
 
 
 def test_a_scaled_camera_sees_with_a_longer_focal_length():
-    assert moved(CAMERA, 10, 20, 2.0, 0.5) == StereoCamera(
+    assert crop_camera(CAMERA, 10, 20, 2.0, 0.5) == StereoCamera(
         focal_px=180.0, baseline_m=0.1, cx_px=120.0, cy_px=10.0, doffs_px=12.0
     )
-    assert moved(None, 10, 20) is None
+    assert crop_camera(None, 10, 20) is None
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_depth_stays_when_a_sample_is_scaled(sample, seed):
     # 9 px m over 5 + x / 20 + 6 px: the nearest and the farthest of the wall bound what a part can see.
-    part = rescaled_cut(replace(sample, camera=CAMERA), 64, 80, np.random.default_rng(seed))
+    part = crop_and_scale(replace(sample, camera=CAMERA), 64, 80, np.random.default_rng(seed))
     scale = part.camera.focal_px / 90
     assert part.camera.doffs_px == pytest.approx(6 * scale)
     columns = (part.disparity_px / scale - NEAR_PX) / SLOPE
@@ -213,20 +213,20 @@ def places_m(sample):
 
 def test_a_sample_upside_down_shows_every_place_upside_down(sample):
     sample = replace(sample, camera=CAMERA)
-    turned = places_m(upside_down(sample))[::-1]
+    turned = places_m(flip_rows(sample))[::-1]
     np.testing.assert_allclose(turned, places_m(sample) * [1, -1, 1], rtol=1e-5, atol=1e-6)
 
 
 def test_a_mirrored_sample_shows_every_place_from_the_other_camera(sample):
     sample = replace(sample, camera=CAMERA)
-    mirror = mirrored(sample)
+    seen = mirror(sample)
     # The right camera of the sample, 10 cm further right, whose centre is doffs further right.
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     depth_m = 9 / (sample.right_disparity_px + 6)
     right_m, down_m = (x - 76.0) / 90 * depth_m, (y - 40.0) / 90 * depth_m
     expected = np.stack([-right_m, down_m, depth_m], -1)[:, ::-1]
-    np.testing.assert_allclose(places_m(mirror), expected, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(mirrored(mirror).camera.cx_px, 70)
+    np.testing.assert_allclose(places_m(seen), expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(mirror(seen).camera.cx_px, 70)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -248,7 +248,7 @@ def test_a_pair_without_the_right_view_s_disparity_is_never_mirrored(sample):
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("offset", [0.05, 0.14])
 def test_a_right_crop_further_to_the_right_stays_exact(sample, seed, offset):
-    part = rescaled_cut(sample, 64, 96, np.random.default_rng(seed), offset)
+    part = crop_and_scale(sample, 64, 96, np.random.default_rng(seed), offset)
     assert_views_agree(part, 12)
 
 
@@ -259,7 +259,7 @@ def test_a_right_crop_further_to_the_right_adds_its_offset_to_the_disparity():
         left=picture(x, x), right=picture(x + 5, x), disparity_px=flat, right_disparity_px=flat,
         occluded=flat < 0, right_occluded=flat < 0, camera=CAMERA,
     )  # fmt: skip
-    part = rescaled_cut(sample, 64, 64, np.random.default_rng(0), 0.125)
+    part = crop_and_scale(sample, 64, 64, np.random.default_rng(0), 0.125)
     width = 64 / part.camera.focal_px * 90  # of what was cut
     offset_px = round(0.125 * width)
     assert 0 < offset_px <= 12

@@ -7,10 +7,10 @@ import pytest
 import torch
 from learn_examples import CAMERA, PAIR_SIZE, RECIPE, Listed, box_before_a_wall, complaint
 
-from stereoweave.learn.data.batches import Batches, collated, known, split
-from stereoweave.learn.data.pair_cache import KeptPairs
-from stereoweave.learn.data.sources import Mix
-from stereoweave.learn.distributed import Ranks
+from stereoweave.learn.data.batches import Batches, collate, read_known, split_batch
+from stereoweave.learn.data.pair_cache import CachedPairs
+from stereoweave.learn.data.sources import MixedSource
+from stereoweave.learn.distributed import ProcessRank
 
 
 def samples(count, **changes):
@@ -31,7 +31,7 @@ class Backwards(Listed):
 
 
 def mix_of(*counts, weights):
-    return Mix(tuple(Listed(samples(1) * count) for count in counts), weights)
+    return MixedSource(tuple(Listed(samples(1) * count) for count in counts), weights)
 
 
 def chosen_of(mix, steps, **changes):
@@ -41,7 +41,7 @@ def chosen_of(mix, steps, **changes):
 
 def test_every_pair_comes_once_before_any_comes_again():
     recipe = replace(RECIPE, pairs=7, batch=3)
-    batches = Batches(recipe, KeptPairs(Path("unused"), 0, recipe.pairs, PAIR_SIZE))
+    batches = Batches(recipe, CachedPairs(Path("unused"), 0, recipe.pairs, PAIR_SIZE))
     chosen = [index for step in range(7) for index in batches.chosen(step)]
     epochs = [chosen[:7], chosen[7:14], chosen[14:]]
     assert all(sorted(epoch) == list(range(7)) for epoch in epochs)
@@ -79,14 +79,14 @@ def test_a_step_of_a_mix_depends_on_the_seed_and_the_step_alone():
 
 
 def test_a_set_is_read_in_its_own_order():
-    mix = Mix((Listed(samples(1) * 5), Backwards(samples(1) * 4)), (1.0, 1.0))
+    mix = MixedSource((Listed(samples(1) * 5), Backwards(samples(1) * 4)), (1.0, 1.0))
     drawn = [index for index in chosen_of(mix, 20) if index >= 5]
     assert drawn == [8 - i % 4 for i in range(len(drawn))]
 
 
 def test_a_batch_of_a_mix_has_the_pairs_of_its_sets_and_names_them(pairs):
     cameras = Listed(samples(3, camera=CAMERA))
-    mix = Mix((pairs, cameras), (1.0, 1.0))
+    mix = MixedSource((pairs, cameras), (1.0, 1.0))
     batches = Batches(replace(RECIPE, augment=False, crop_size=PAIR_SIZE, batch=8), mix)
     chosen, batch = batches.chosen(0), batches[0]
     assert min(chosen) < 4 <= max(chosen)
@@ -120,7 +120,7 @@ def test_a_batch_without_augmentation_holds_cuts_of_the_pairs_as_they_are(pairs)
 
 def test_a_batch_holds_the_left_views_maps_and_behind_them_the_right_ones_mirrored():
     first, second = samples(2)
-    batch = collated([first, second])
+    batch = collate([first, second])
     height, width = PAIR_SIZE
     assert batch.keys() == {"left", "right", "disparity_px", "occluded"}
     assert batch["left"].shape == batch["right"].shape == (2, 3, height, width)
@@ -134,7 +134,7 @@ def test_a_batch_holds_the_left_views_maps_and_behind_them_the_right_ones_mirror
 def test_each_sample_keeps_its_own_camera():
     first, second = samples(2, camera=CAMERA)
     second = replace(second, camera=replace(CAMERA, focal_px=60.0, doffs_px=3.0))
-    batch = collated([first, second])
+    batch = collate([first, second])
     # 120 px and 60 px times 0.2 m.
     torch.testing.assert_close(batch["focal_baseline_px_m"], torch.tensor([24.0, 12.0]).view(2, 1, 1, 1))
     torch.testing.assert_close(batch["doffs_px"], torch.tensor([0.0, 3.0]).view(2, 1, 1, 1))
@@ -142,12 +142,12 @@ def test_each_sample_keeps_its_own_camera():
 
 def test_a_batch_in_which_one_sample_has_no_camera_has_none():
     first, second = samples(2, camera=CAMERA)
-    assert "focal_baseline_px_m" not in collated([first, replace(second, camera=None)])
+    assert "focal_baseline_px_m" not in collate([first, replace(second, camera=None)])
 
 
 def test_a_batch_of_mixed_sizes_is_refused():
     mixed = [box_before_a_wall(np.random.default_rng(0), size) for size in ((64, 96), (32, 48), (64, 96))]
-    assert complaint(collated, mixed) == (
+    assert complaint(collate, mixed) == (
         "a batch: expected pairs of one size, found 48x32 and 96x64; cut them to one crop_size"
     )
 
@@ -155,8 +155,8 @@ def test_a_batch_of_mixed_sizes_is_refused():
 def test_a_pair_without_a_single_known_pixel_is_named():
     unknown_px = np.full(PAIR_SIZE, np.nan, np.float32)
     pairs = Listed([*samples(2), *samples(1, disparity_px=unknown_px)])
-    assert known(pairs, 1) is pairs[1]
-    assert complaint(known, pairs, 2) == (
+    assert read_known(pairs, 1) is pairs[1]
+    assert complaint(read_known, pairs, 2) == (
         "sample 2: expected at least one pixel of known disparity, found none; remove it from the dataset"
     )
     batches = Batches(replace(RECIPE, batch=3), pairs)
@@ -167,7 +167,7 @@ def test_one_known_pixel_is_enough():
     disparity_px = np.full(PAIR_SIZE, np.nan, np.float32)
     disparity_px[10, 20] = 0
     (sample,) = samples(1, disparity_px=disparity_px)
-    assert known(Listed([sample]), 0) is sample
+    assert read_known(Listed([sample]), 0) is sample
 
 
 def test_a_crop_larger_than_the_pictures_is_refused(pairs):
@@ -191,7 +191,7 @@ class Watched(Listed):
 def shares_of(recipe, count, step):
     """What each of so many processes reads for a step, and what it makes of it."""
     watched = [Watched(samples(1) * 12, []) for _ in range(count)]
-    batches = [Batches(recipe, pairs, Ranks(rank, count)) for rank, pairs in enumerate(watched)]
+    batches = [Batches(recipe, pairs, ProcessRank(rank, count)) for rank, pairs in enumerate(watched)]
     return [one[step] for one in batches], [one.read for one in watched]
 
 
@@ -212,14 +212,14 @@ def test_processes_read_their_own_neighbouring_pairs_of_a_step_and_no_others():
 def test_processes_make_the_very_micro_batches_that_one_process_makes(count):
     recipe = replace(RECIPE, batch=8, micro_batch=2)
     ((whole,), _), (shares, _) = shares_of(recipe, 1, 3), shares_of(recipe, count, 3)
-    parts = [part for share in shares for part in split(share, 4 // count)]
-    for one, other in zip(parts, split(whole, 4), strict=True):
+    parts = [part for share in shares for part in split_batch(share, 4 // count)]
+    for one, other in zip(parts, split_batch(whole, 4), strict=True):
         assert_same_batches(one, other)
 
 
 def test_the_first_micro_batch_is_cut_as_a_batch_that_is_not_parted(pairs):
     recipe = replace(RECIPE, batch=2)
-    parted = split(Batches(replace(recipe, micro_batch=1), pairs)[4], 2)
+    parted = split_batch(Batches(replace(recipe, micro_batch=1), pairs)[4], 2)
     whole = Batches(recipe, pairs)[4]
     assert torch.equal(parted[0]["left"][0], whole["left"][0])
     # Its own generator, not the first one's going on.
@@ -234,7 +234,7 @@ def test_zeros_behind_seed_and_step_change_no_draw():
 
 def test_a_batch_is_split_into_what_its_samples_would_be_collated_to(pairs):
     for one, other in zip(
-        split(collated(pairs.samples), 2), (pairs.samples[:2], pairs.samples[2:]), strict=True
+        split_batch(collate(pairs.samples), 2), (pairs.samples[:2], pairs.samples[2:]), strict=True
     ):
-        assert_same_batches(one, collated(other))
-    assert_same_batches(split(collated(pairs.samples), 1)[0], collated(pairs.samples))
+        assert_same_batches(one, collate(other))
+    assert_same_batches(split_batch(collate(pairs.samples), 1)[0], collate(pairs.samples))

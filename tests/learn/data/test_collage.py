@@ -10,16 +10,16 @@ from paint_reference import plain_view, rectangle, sampled
 from stereoweave.learn.data.collage import (
     FAULTS,
     NOTHING_PX,
-    demosaiced,
+    demosaic,
+    paint_collage,
     paint_scene,
+    paint_training_collage,
     photograph,
-    sample,
-    training_sample,
 )
 from stereoweave.learn.data.collage_kinds import draw_scene, draw_training_scene
-from stereoweave.learn.data.collage_scene import Layer, Scene, Surface
-from stereoweave.learn.data.paint_kernels import Paint, occlusion
-from stereoweave.learn.data.silhouettes import everywhere
+from stereoweave.learn.data.collage_scene import CollageLayer, CollageScene, CollageSurface
+from stereoweave.learn.data.paint_kernels import Paint, find_occluded
+from stereoweave.learn.data.silhouettes import cover_canvas
 
 HEIGHT, WIDTH = 128, 192
 PLAIN = Paint(
@@ -33,7 +33,7 @@ PLAIN = Paint(
 
 
 def flat(disparity_px):
-    return Surface(plane=(disparity_px, 0.0, 0.0, 0.0, 0.0), waves=(), hills=(), limit_px=100.0)
+    return CollageSurface(plane=(disparity_px, 0.0, 0.0, 0.0, 0.0), waves=(), hills=(), limit_px=100.0)
 
 
 def matt_scene(index, draw=draw_scene):
@@ -51,27 +51,29 @@ def digest(pair):
 
 
 def test_the_same_numbers_give_the_same_pair():
-    assert digest(sample(3, 1, 4, HEIGHT, WIDTH)) == digest(sample(3, 1, 4, HEIGHT, WIDTH))
+    assert digest(paint_collage(3, 1, 4, HEIGHT, WIDTH)) == digest(paint_collage(3, 1, 4, HEIGHT, WIDTH))
 
 
 @pytest.mark.parametrize("other", [(4, 1, 4), (3, 2, 4), (3, 1, 5)])
 def test_another_seed_epoch_or_index_gives_another_pair(other):
-    assert (sample(*other, HEIGHT, WIDTH).left != sample(3, 1, 4, HEIGHT, WIDTH).left).mean() > 0.5
+    assert (
+        paint_collage(*other, HEIGHT, WIDTH).left != paint_collage(3, 1, 4, HEIGHT, WIDTH).left
+    ).mean() > 0.5
 
 
 def test_another_process_makes_the_same_pair():
     code = (
-        "import hashlib; from stereoweave.learn.data.collage import sample; "
-        f"pair = sample(3, 1, 4, {HEIGHT}, {WIDTH}); "
+        "import hashlib; from stereoweave.learn.data.collage import paint_collage; "
+        f"pair = paint_collage(3, 1, 4, {HEIGHT}, {WIDTH}); "
         "maps = b''.join(v.tobytes() for v in vars(pair).values() if v is not None); "
         "print(hashlib.sha256(maps).hexdigest())"
     )
     worker = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    assert worker.stdout.strip() == digest(sample(3, 1, 4, HEIGHT, WIDTH))
+    assert worker.stdout.strip() == digest(paint_collage(3, 1, 4, HEIGHT, WIDTH))
 
 
 def test_samples_have_the_promised_shapes_and_types():
-    pair = sample(0, 0, 0)
+    pair = paint_collage(0, 0, 0)
     assert pair.left.shape == pair.right.shape == (256, 384, 3)
     assert pair.left.dtype == pair.right.dtype == np.uint8
     assert pair.disparity_px.dtype == pair.right_disparity_px.dtype == np.float32
@@ -80,7 +82,7 @@ def test_samples_have_the_promised_shapes_and_types():
 
 def test_disparities_are_finite_not_negative_and_vary():
     for index in range(20):
-        pair = sample(0, 0, index, HEIGHT, WIDTH)
+        pair = paint_collage(0, 0, index, HEIGHT, WIDTH)
         for disparity_px in (pair.disparity_px, pair.right_disparity_px):
             assert np.isfinite(disparity_px).all()
             assert disparity_px.min() >= 0
@@ -88,14 +90,14 @@ def test_disparities_are_finite_not_negative_and_vary():
 
 
 def test_the_greatest_disparities_are_spread_widely():
-    greatest_px = [sample(1, 0, index).disparity_px.max() for index in range(40)]
+    greatest_px = [paint_collage(1, 0, index).disparity_px.max() for index in range(40)]
     assert min(greatest_px) < 20
     assert max(greatest_px) > 80
 
 
 def test_degenerate_pairs_do_not_come():
     for index in range(30):
-        pair = sample(2, 0, index, HEIGHT, WIDTH)
+        pair = paint_collage(2, 0, index, HEIGHT, WIDTH)
         assert pair.occluded.mean() < 0.6
         assert pair.left.std() > 3
 
@@ -105,7 +107,7 @@ def test_degenerate_pairs_do_not_come():
 def test_the_other_view_shifted_by_the_exact_disparity_is_this_view(here, there, sign, draw):
     for index in range(8):
         views = paint_scene(matt_scene(index, draw))
-        hidden = occlusion(views[here].disparity_px, views[there].disparity_px, sign)
+        hidden = find_occluded(views[here].disparity_px, views[there].disparity_px, sign)
         shifted = sampled(views[there].image, sign * views[here].disparity_px)
         error = np.abs(shifted - views[here].image).mean(axis=2)[~hidden]
         assert np.median(error) < 1
@@ -118,7 +120,7 @@ def test_the_disparities_of_both_views_agree_where_both_see_a_surface(here, ther
     for index in range(8):
         views = paint_scene(matt_scene(index, draw))
         disparity_px, other_px = views[here].disparity_px, views[there].disparity_px
-        hidden = occlusion(disparity_px, other_px, sign)
+        hidden = find_occluded(disparity_px, other_px, sign)
         error_px = np.abs(sampled(other_px[..., None], sign * disparity_px)[..., 0] - disparity_px)
         # Away from edges, which lie between two columns.
         match = np.arange(WIDTH) + sign * disparity_px
@@ -134,37 +136,37 @@ def test_a_square_before_a_wall_hides_what_it_must():
     # 4..7, where the square is; columns 0, 1 match nothing. From the right: the wall's 8..11 match 10..13.
     square = rectangle(9.5, -3, 13.5, 12, canvas=(40, 8))
     layers = (
-        Layer(patch=everywhere(40, 8), surface=flat(2.0), paint=PLAIN),
-        Layer(patch=square, surface=flat(6.0), paint=PLAIN),
+        CollageLayer(patch=cover_canvas(40, 8), surface=flat(2.0), paint=PLAIN),
+        CollageLayer(patch=square, surface=flat(6.0), paint=PLAIN),
     )
-    left, right = paint_scene(Scene(layers=layers, height=8, width=30))
+    left, right = paint_scene(CollageScene(layers=layers, height=8, width=30))
     columns = np.arange(30)
     expected_px = np.where((columns >= 10) & (columns <= 13), 6, 2)
     np.testing.assert_array_equal(left.disparity_px, np.tile(expected_px, (8, 1)))
     expected_right_px = np.where((columns >= 4) & (columns <= 7), 6, 2)
     np.testing.assert_array_equal(right.disparity_px, np.tile(expected_right_px, (8, 1)))
-    occluded = occlusion(left.disparity_px, right.disparity_px, -1)
+    occluded = find_occluded(left.disparity_px, right.disparity_px, -1)
     assert np.flatnonzero(occluded[3]).tolist() == [0, 1, 6, 7, 8, 9]
-    right_occluded = occlusion(right.disparity_px, left.disparity_px, 1)
+    right_occluded = find_occluded(right.disparity_px, left.disparity_px, 1)
     assert np.flatnonzero(right_occluded[3]).tolist() == [8, 9, 10, 11, 28, 29]
 
 
 def test_a_slanted_wall_does_not_hide_itself():
     # Disparity falls from 20 by 0.4 a column: the right view sees the wall shrunk, but all of it.
-    falling = Surface(plane=(20.0, -0.4, 0.0, 0.0, 0.0), waves=(), hills=(), limit_px=100.0)
-    layer = Layer(patch=everywhere(90, 4), surface=falling, paint=PLAIN)
-    left, right = paint_scene(Scene(layers=(layer,), height=4, width=40))
+    falling = CollageSurface(plane=(20.0, -0.4, 0.0, 0.0, 0.0), waves=(), hills=(), limit_px=100.0)
+    layer = CollageLayer(patch=cover_canvas(90, 4), surface=falling, paint=PLAIN)
+    left, right = paint_scene(CollageScene(layers=(layer,), height=4, width=40))
     np.testing.assert_allclose(left.disparity_px[0], 20 - 0.4 * np.arange(40), atol=1e-5)
-    occluded = occlusion(left.disparity_px, right.disparity_px, -1)
+    occluded = find_occluded(left.disparity_px, right.disparity_px, -1)
     # x - (20 - 0.4 x) >= 0 from x = 14.3 on
     assert np.flatnonzero(~occluded[0]).tolist() == list(range(15, 40))
 
 
 def test_the_right_view_inverts_a_slope_exactly():
     # d = 10 + 0.25 x, so right column c shows x = (c + 10) / 0.75, with disparity x - c.
-    rising = Surface(plane=(10.0, 0.25, 0.0, 0.0, 0.0), waves=(), hills=(), limit_px=100.0)
-    layer = Layer(patch=everywhere(140, 4), surface=rising, paint=PLAIN)
-    _, right = paint_scene(Scene(layers=(layer,), height=4, width=40))
+    rising = CollageSurface(plane=(10.0, 0.25, 0.0, 0.0, 0.0), waves=(), hills=(), limit_px=100.0)
+    layer = CollageLayer(patch=cover_canvas(140, 4), surface=rising, paint=PLAIN)
+    _, right = paint_scene(CollageScene(layers=(layer,), height=4, width=40))
     columns = np.arange(40)
     np.testing.assert_allclose(right.disparity_px[2], (columns + 10) / 0.75 - columns, atol=1e-4)
 
@@ -189,12 +191,12 @@ def test_the_fast_painter_equals_the_plain_one(index, draw):
 
 @pytest.fixture(scope="module")
 def training_pairs():
-    return [training_sample(6, 0, index, 64, 96) for index in range(150)]
+    return [paint_training_collage(6, 0, index, 64, 96) for index in range(150)]
 
 
 def test_the_same_numbers_give_the_same_training_pair_and_not_the_one_of_validation(training_pairs):
-    assert digest(training_sample(6, 0, 9, 64, 96)) == digest(training_pairs[9])
-    assert digest(sample(6, 0, 9, 64, 96)) != digest(training_pairs[9])
+    assert digest(paint_training_collage(6, 0, 9, 64, 96)) == digest(training_pairs[9])
+    assert digest(paint_collage(6, 0, 9, 64, 96)) != digest(training_pairs[9])
 
 
 def test_some_training_pairs_have_negative_disparities(training_pairs):
@@ -249,9 +251,9 @@ def test_in_some_pairs_the_right_view_is_a_row_or_two_lower_or_higher():
 
 def test_a_bayer_filter_keeps_plain_colours_and_what_its_pixels_saw(rng):
     plain = np.tile(np.array([200.0, 100.0, 50.0], np.float32), (7, 9, 1))
-    np.testing.assert_array_equal(demosaiced(plain), plain)
+    np.testing.assert_array_equal(demosaic(plain), plain)
     image = np.round(rng.uniform(0, 255, (16, 20, 3))).astype(np.float32)
-    inner = demosaiced(image)[2:-2, 2:-2], image[2:-2, 2:-2]
+    inner = demosaic(image)[2:-2, 2:-2], image[2:-2, 2:-2]
     for row, column, channel in [(0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2)]:
         found, seen = (view[row::2, column::2, channel] for view in inner)
         np.testing.assert_array_equal(found, seen)

@@ -3,10 +3,10 @@ import numpy as np
 import pytest
 
 from stereoweave.learn.data.collage import paint_scene
-from stereoweave.learn.data.collage_kinds import Canvas, draw_scene, draw_street, draw_training_scene
-from stereoweave.learn.data.collage_layers import draw_paint, plain_paint, unfocused_paint
-from stereoweave.learn.data.collage_scene import Layer, Scene, Surface
-from stereoweave.learn.data.silhouettes import Place, everywhere
+from stereoweave.learn.data.collage_kinds import CollageCanvas, draw_scene, draw_street, draw_training_scene
+from stereoweave.learn.data.collage_layers import draw_paint, draw_plain_paint, draw_unfocused_paint
+from stereoweave.learn.data.collage_scene import CollageLayer, CollageScene, CollageSurface
+from stereoweave.learn.data.silhouettes import Placement, cover_canvas
 
 HEIGHT, WIDTH = 320, 512
 
@@ -30,9 +30,9 @@ def far_from_texture(image):
 
 
 def wall(paint, height=96, width=128):
-    surface = Surface(plane=(5.0, 0.0, 0.0, 0.0, 0.0), limit_px=10.0)
-    layer = Layer(patch=everywhere(width + 12, height), surface=surface, paint=paint)
-    return paint_scene(Scene(layers=(layer,), height=height, width=width))[0].image
+    surface = CollageSurface(plane=(5.0, 0.0, 0.0, 0.0, 0.0), limit_px=10.0)
+    layer = CollageLayer(patch=cover_canvas(width + 12, height), surface=surface, paint=paint)
+    return paint_scene(CollageScene(layers=(layer,), height=height, width=width))[0].image
 
 
 @pytest.mark.parametrize("draw", [draw_scene, draw_training_scene])
@@ -69,22 +69,22 @@ def test_as_much_of_the_left_view_is_outside_the_right_one_as_in_real_pairs(pain
 
 
 def test_a_plain_paint_has_hardly_any_texture_and_an_unfocused_one_no_fine_one(rng):
-    place = Place(64, 48, 64, 128, 96)
+    place = Placement(64, 48, 64, 128, 96)
     matt = np.zeros(6, np.float32)
-    plain = [gradient(wall(plain_paint(rng, place)._replace(gloss=matt))) for _ in range(20)]
-    unfocused = [gradient(wall(unfocused_paint(rng, place)._replace(gloss=matt))) for _ in range(20)]
+    plain = [gradient(wall(draw_plain_paint(rng, place)._replace(gloss=matt))) for _ in range(20)]
+    unfocused = [gradient(wall(draw_unfocused_paint(rng, place)._replace(gloss=matt))) for _ in range(20)]
     sharp = [gradient(wall(draw_paint(rng, place)._replace(gloss=matt))) for _ in range(20)]
     assert np.mean(np.array(plain) < 1.5) > 0.95
     assert np.mean(unfocused) < np.mean(sharp) / 2
 
 
 def test_a_street_rises_from_the_horizon_to_the_nearest_below():
-    canvas = Canvas(view_width=192, height=128, limit_px=40.0)
+    canvas = CollageCanvas(view_width=192, height=128, limit_px=40.0)
     skies = 0
     for index in range(20):
         layers = draw_street(np.random.default_rng(index), canvas)
         layers.sort(key=lambda layer: layer.surface.plane[0])
-        disparity_px = paint_scene(Scene(layers=tuple(layers), height=128, width=192))[0].disparity_px
+        disparity_px = paint_scene(CollageScene(layers=tuple(layers), height=128, width=192))[0].disparity_px
         # At least half of the limit at the feet, of which the last row is one of at least 51 short.
         assert disparity_px[-1].min() >= 0.5 * 40 * 50 / 51
         skies += disparity_px.min() == 0
@@ -92,7 +92,7 @@ def test_a_street_rises_from_the_horizon_to_the_nearest_below():
 
 
 def test_what_stands_on_a_street_has_the_disparity_of_its_foot():
-    canvas = Canvas(view_width=192, height=128, limit_px=40.0)
+    canvas = CollageCanvas(view_width=192, height=128, limit_px=40.0)
     for index in range(20):
         sky, ground, *others = draw_street(np.random.default_rng(index), canvas)
         flat = [layer.surface for layer in others if layer.surface.plane[1:3] == (0.0, 0.0)]

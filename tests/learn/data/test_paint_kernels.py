@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from stereoweave.learn.data.paint_kernels import REACH_PX, expose, outline_field, stroke_field
+from stereoweave.learn.data.paint_kernels import REACH_PX, draw_outline_field, draw_stroke_field, expose
 
 SQUARE = np.array([[10.0, 10.0], [20.0, 10.0], [20.0, 20.0], [10.0, 20.0]])
 LEVELS = np.tile(np.arange(1021, dtype=np.float32) / 4, (3, 1))
@@ -9,7 +9,7 @@ STILL = np.zeros((3, 1021), np.float32)
 
 
 def test_an_outline_becomes_the_signed_distance_to_it():
-    field = outline_field((SQUARE - 0.25,), 0, 0, (30, 30))
+    field = draw_outline_field((SQUARE - 0.25,), 0, 0, (30, 30))
     # Edges at 9.75 and 19.75 in x and y; beyond 2 px the distance is of no use.
     assert field[15, 10] == pytest.approx(0.25)
     assert field[15, 9] == pytest.approx(-0.75)
@@ -21,25 +21,25 @@ def test_an_outline_becomes_the_signed_distance_to_it():
 
 def test_a_contour_within_a_contour_is_a_hole():
     inner = 15 + 0.5 * (SQUARE - 15)
-    field = outline_field((SQUARE, inner), 0, 0, (30, 30))
+    field = draw_outline_field((SQUARE, inner), 0, 0, (30, 30))
     assert field[15, 15] < 0 < field[15, 11]
 
 
 def test_a_patch_is_a_part_of_the_whole():
-    whole = outline_field((SQUARE,), 0, 0, (30, 30))
-    np.testing.assert_allclose(outline_field((SQUARE,), 7, 12, (6, 9)), whole[12:18, 7:16], atol=1e-6)
+    whole = draw_outline_field((SQUARE,), 0, 0, (30, 30))
+    np.testing.assert_allclose(draw_outline_field((SQUARE,), 7, 12, (6, 9)), whole[12:18, 7:16], atol=1e-6)
 
 
 def test_the_covered_area_is_that_of_the_polygon():
     triangle = np.array([[5.3, 4.1], [52.7, 20.2], [17.9, 55.5]])
     (ax, ay), (bx, by) = triangle[1] - triangle[0], triangle[2] - triangle[0]
-    field = outline_field((triangle,), 0, 0, (60, 60))
+    field = draw_outline_field((triangle,), 0, 0, (60, 60))
     assert np.clip(field + 0.5, 0, 1).sum() == pytest.approx(abs(ax * by - ay * bx) / 2, rel=0.003)
 
 
 def test_a_rod_is_as_thick_as_it_should_be():
     rod = np.array([[5.0, 10.3], [40.0, 10.3]])
-    field = stroke_field(((rod, 1.5),), 0, 0, (20, 50))
+    field = draw_stroke_field(((rod, 1.5),), 0, 0, (20, 50))
     # A rod from 8.8 to 11.8.
     np.testing.assert_allclose(field[7:14, 20], [-1.8, -0.8, 0.2, 1.2, 0.8, -0.2, -1.2], atol=1e-5)
 

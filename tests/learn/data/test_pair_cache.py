@@ -7,8 +7,8 @@ from rich.console import Console
 
 from stereoweave.io.output_lock import lock_output
 from stereoweave.learn.data import pair_cache as pairs_module
-from stereoweave.learn.data.collage import sample
-from stereoweave.learn.data.pair_cache import KeptPairs
+from stereoweave.learn.data.collage import paint_collage
+from stereoweave.learn.data.pair_cache import CachedPairs
 
 HALF_A_STEP_PX = 1 / 512
 
@@ -38,10 +38,10 @@ def test_disparities_are_kept_to_half_of_a_256th(tmp_path, rng):
 
 def test_pairs_of_another_seed_or_size_are_kept_apart(tmp_path):
     keep_pairs(tmp_path, 3, 2)
-    assert KeptPairs(tmp_path, 3, 2, PAIR_SIZE).missing() == []
-    assert KeptPairs(tmp_path, 3, 4, PAIR_SIZE).missing() == [2, 3]
-    assert KeptPairs(tmp_path, 4, 2, PAIR_SIZE).missing() == [0, 1]
-    assert KeptPairs(tmp_path, 3, 2, (96, 64)).missing() == [0, 1]
+    assert CachedPairs(tmp_path, 3, 2, PAIR_SIZE).missing() == []
+    assert CachedPairs(tmp_path, 3, 4, PAIR_SIZE).missing() == [2, 3]
+    assert CachedPairs(tmp_path, 4, 2, PAIR_SIZE).missing() == [0, 1]
+    assert CachedPairs(tmp_path, 3, 2, (96, 64)).missing() == [0, 1]
 
 
 def test_pairs_of_another_version_of_the_generator_are_kept_apart(tmp_path, monkeypatch):
@@ -50,7 +50,7 @@ def test_pairs_of_another_version_of_the_generator_are_kept_apart(tmp_path, monk
         (tmp_path / source).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / source).write_text("changed")
     monkeypatch.setattr(pairs_module, "__file__", str(tmp_path / "learn" / "data" / "pair_cache.py"))
-    assert KeptPairs(tmp_path, 3, 2, PAIR_SIZE).missing() == [0, 1]
+    assert CachedPairs(tmp_path, 3, 2, PAIR_SIZE).missing() == [0, 1]
 
 
 def test_pairs_that_another_training_makes_are_waited_for_and_not_made_again(tmp_path):
@@ -66,7 +66,7 @@ def test_pairs_that_another_training_makes_are_waited_for_and_not_made_again(tmp
     screen = Screen()
     with other:
         other.enter_context(lock_output(folder))
-        made = list(KeptPairs(tmp_path, 3, 3, PAIR_SIZE).make(Console(file=screen, width=1000)))
+        made = list(CachedPairs(tmp_path, 3, 3, PAIR_SIZE).make(Console(file=screen, width=1000)))
     assert made == [2]
     assert screen.getvalue() == f"{folder}: another training makes these pairs; waiting until it is done\n"
 
@@ -75,11 +75,11 @@ def test_what_is_missing_or_half_written_is_made_as_the_generator_makes_it(tmp_p
     pairs = keep_pairs(tmp_path, 3, 1)
     kept = next(pairs.folder.iterdir()).read_bytes()
     (pairs.folder / "000001.part").write_bytes(kept[: len(kept) // 2])
-    pairs = KeptPairs(tmp_path, 3, 3, PAIR_SIZE)
+    pairs = CachedPairs(tmp_path, 3, 3, PAIR_SIZE)
     assert pairs.missing() == [1, 2]
     assert sorted(pairs.make(Console(quiet=True))) == [1, 2]
     assert pairs.missing() == []
     assert sorted(file.name for file in pairs.folder.iterdir()) == ["000000.npz", "000001.npz", "000002.npz"]
     assert (pairs.folder / "000000.npz").read_bytes() == kept
     for index in (1, 2):
-        assert_kept(pairs[index], sample(3, 0, index, *PAIR_SIZE))
+        assert_kept(pairs[index], paint_collage(3, 0, index, *PAIR_SIZE))

@@ -11,9 +11,16 @@ from stereoweave.data.packing import packed
 from stereoweave.data.shards import Shards, write_shard
 from stereoweave.learn.data import pair_cache as the_pairs
 from stereoweave.learn.data.batches import Batches
-from stereoweave.learn.data.collage import training_sample
-from stereoweave.learn.data.pair_cache import KeptPairs
-from stereoweave.learn.data.sources import VALIDATION_SEED, Mix, Source, held_out_sets, kept, sources
+from stereoweave.learn.data.collage import paint_training_collage
+from stereoweave.learn.data.pair_cache import CachedPairs
+from stereoweave.learn.data.sources import (
+    VALIDATION_SEED,
+    MixedSource,
+    PairSource,
+    cache_pairs,
+    open_held_out_sets,
+    open_sources,
+)
 
 CALIBRATION = "cam0=[300 0 19.5; 0 300 15.5; 0 0 1]\ndoffs=0\nbaseline=100\nwidth=40\nheight=32\n"
 FRAMES = [f"mill/{number:04d}" for number in range(40)]
@@ -60,17 +67,17 @@ def names(source):
 
 
 def test_collages_are_kept_apart_from_those_for_validation(tmp_path):
-    training, held_out = sources(RECIPE, tmp_path)
-    assert training.folder == KeptPairs(tmp_path, RECIPE.seed, 4, PAIR_SIZE).folder
-    assert held_out.folder == KeptPairs(tmp_path, VALIDATION_SEED, 2, PAIR_SIZE).folder
+    training, held_out = open_sources(RECIPE, tmp_path)
+    assert training.folder == CachedPairs(tmp_path, RECIPE.seed, 4, PAIR_SIZE).folder
+    assert held_out.folder == CachedPairs(tmp_path, VALIDATION_SEED, 2, PAIR_SIZE).folder
     assert training.folder != held_out.folder
     assert (training.count, held_out.count) == (4, 2)
-    assert isinstance(training, Source)
+    assert isinstance(training, PairSource)
 
 
 def test_each_frame_of_a_dataset_is_trained_on_or_held_out(recipe, tmp_path):
-    training, held_out = sources(recipe, tmp_path)
-    assert isinstance(training, Source)
+    training, held_out = open_sources(recipe, tmp_path)
+    assert isinstance(training, PairSource)
     # The end of the sequence, a tenth of it.
     assert names(training) == FRAMES[:36]
     assert names(held_out) == FRAMES[36:]
@@ -78,13 +85,13 @@ def test_each_frame_of_a_dataset_is_trained_on_or_held_out(recipe, tmp_path):
 
 
 def test_the_split_is_the_recipe_s(recipe, tmp_path):
-    training, held_out = sources(replace(recipe, split="random"), tmp_path)
+    training, held_out = open_sources(replace(recipe, split="random"), tmp_path)
     assert sorted(names(training) + names(held_out)) == FRAMES
     assert names(held_out) != FRAMES[36:]
 
 
 def test_a_frame_is_read_when_it_is_asked_for(recipe, tmp_path):
-    training, _ = sources(recipe, tmp_path)
+    training, _ = open_sources(recipe, tmp_path)
     sample = training[7]
     assert shades(sample) == (7, 100)
     # f B = 30 px m, 5 m away.
@@ -96,32 +103,32 @@ def test_a_frame_is_read_when_it_is_asked_for(recipe, tmp_path):
     ("count", "chosen"), [(1, [36]), (2, [36, 39]), (3, [36, 38, 39]), (4, [36, 37, 38, 39])]
 )
 def test_validation_pairs_are_spread_over_the_held_out_frames(recipe, tmp_path, count, chosen):
-    _, held_out = sources(replace(recipe, validation_pairs=count), tmp_path)
+    _, held_out = open_sources(replace(recipe, validation_pairs=count), tmp_path)
     assert names(held_out) == [FRAMES[number] for number in chosen]
 
 
 def test_all_held_out_frames_are_given_where_all_are_asked_for(recipe, tmp_path):
-    _, held_out = sources(replace(recipe, validation_pairs=1), tmp_path, whole=True)
+    _, held_out = open_sources(replace(recipe, validation_pairs=1), tmp_path, whole=True)
     assert names(held_out) == FRAMES[36:]
 
 
 def test_an_unknown_dataset_is_answered_with_the_known_ones(recipe, tmp_path):
-    message = complaint(sources, replace(recipe, dataset="propeller"), tmp_path)
+    message = complaint(open_sources, replace(recipe, dataset="propeller"), tmp_path)
     assert message.startswith("tiny: dataset = 'propeller', expected collage or sintel, flyingthings3d, ")
 
 
 def test_a_root_that_lacks_a_folder_is_named(recipe, tmp_path):
     assert str(tmp_path / "nowhere") in complaint(
-        sources, replace(recipe, root=str(tmp_path / "nowhere")), tmp_path
+        open_sources, replace(recipe, root=str(tmp_path / "nowhere")), tmp_path
     )
 
 
 def test_a_mix_has_the_pairs_of_its_sets_one_behind_another(rendered, tmp_path):
     keep_pairs(tmp_path, RECIPE.seed, RECIPE.pairs)
-    training, held_out = sources(mixed(rendered, rooms=3.0, collage=1.0), tmp_path)
-    assert isinstance(training, Mix) and isinstance(training, Source)
+    training, held_out = open_sources(mixed(rendered, rooms=3.0, collage=1.0), tmp_path)
+    assert isinstance(training, MixedSource) and isinstance(training, PairSource)
     assert (training.count, held_out.count) == (6 + 4, 2)
-    assert held_out.folder == KeptPairs(tmp_path, VALIDATION_SEED, 2, PAIR_SIZE).folder
+    assert held_out.folder == CachedPairs(tmp_path, VALIDATION_SEED, 2, PAIR_SIZE).folder
     rooms, collages = training.sets
     assert names(training) == [*names(rooms), *names(collages)]
     assert names(rooms)[5] == "rooms-000005"
@@ -132,14 +139,14 @@ def test_a_mix_has_the_pairs_of_its_sets_one_behind_another(rendered, tmp_path):
 
 
 def test_the_sets_in_one_folder_share_its_weight_by_their_pairs(rendered, tmp_path):
-    training, _ = sources(mixed(rendered, collage=0.5, rooms=0.2, scenes=0.3), tmp_path)
+    training, _ = open_sources(mixed(rendered, collage=0.5, rooms=0.2, scenes=0.3), tmp_path)
     assert [one.count for one in training.sets] == [RECIPE.pairs, 6, 4, 2]
     assert training.sets[2].name(0) == "crane-000000"
     assert training.weights == pytest.approx((0.5, 0.2, 0.2, 0.1))
 
 
 def test_rendered_pairs_of_a_mix_are_photographed_each_always_alike(rendered, tmp_path):
-    training, _ = sources(mixed(rendered, rooms=1.0), tmp_path)
+    training, _ = open_sources(mixed(rendered, rooms=1.0), tmp_path)
     ideal = Shards(rendered / "rooms")
     np.testing.assert_array_equal(training[2].disparity_px, ideal[2].disparity_px)
     for index in range(ideal.count):
@@ -151,20 +158,20 @@ def test_rendered_pairs_of_a_mix_are_photographed_each_always_alike(rendered, tm
 
 def test_the_collages_of_a_mix_are_made_like_others(rendered, tmp_path, monkeypatch):
     made = []
-    monkeypatch.setattr(the_pairs.KeptPairs, "make", lambda pairs, _: iter(made.append(pairs.folder) or []))
-    training, _ = sources(mixed(rendered, rooms=1.0, collage=1.0), tmp_path)
-    assert kept(training, Console(quiet=True)) is training
-    assert made == [KeptPairs(tmp_path, RECIPE.seed, RECIPE.pairs, PAIR_SIZE).folder]
+    monkeypatch.setattr(the_pairs.CachedPairs, "make", lambda pairs, _: iter(made.append(pairs.folder) or []))
+    training, _ = open_sources(mixed(rendered, rooms=1.0, collage=1.0), tmp_path)
+    assert cache_pairs(training, Console(quiet=True)) is training
+    assert made == [CachedPairs(tmp_path, RECIPE.seed, RECIPE.pairs, PAIR_SIZE).folder]
 
 
 def test_a_mix_without_collages_makes_none_to_train_on(rendered, tmp_path):
-    training, _ = sources(mixed(rendered, rooms=1.0), tmp_path)
-    kept(training, Console(quiet=True))
+    training, _ = open_sources(mixed(rendered, rooms=1.0), tmp_path)
+    cache_pairs(training, Console(quiet=True))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_set_of_a_mix_that_is_not_there_is_named(rendered, tmp_path):
-    assert complaint(sources, mixed(rendered, caves=1.0), tmp_path) == (
+    assert complaint(open_sources, mixed(rendered, caves=1.0), tmp_path) == (
         f"tiny: mix: {rendered}/caves: expected pairs of `stereoweave synth make`, or folders of such, found "
         "none; make them first"
     )
@@ -172,7 +179,7 @@ def test_a_set_of_a_mix_that_is_not_there_is_named(rendered, tmp_path):
 
 def test_a_set_that_is_smaller_than_the_crop_is_named(rendered, tmp_path):
     recipe = replace(mixed(rendered, scenes=1.0), pair_size=(80, 96), crop_size=(80, 96))
-    assert complaint(sources, recipe, tmp_path) == (
+    assert complaint(open_sources, recipe, tmp_path) == (
         f"tiny: crop_size = [80, 96], expected at most [64, 96], the size of the pairs in {rendered}/scenes/"
         "crane; cut less"
     )
@@ -180,8 +187,8 @@ def test_a_set_that_is_smaller_than_the_crop_is_named(rendered, tmp_path):
 
 def test_fresh_collages_are_those_of_the_seed_and_none_is_kept(tmp_path):
     recipe = replace(RECIPE, fresh=True, pair_size=(32, 48), crop_size=(32, 32))
-    training, held_out = sources(recipe, tmp_path)
-    expected = training_sample(recipe.seed, 0, 5, 32, 48)
+    training, held_out = open_sources(recipe, tmp_path)
+    expected = paint_training_collage(recipe.seed, 0, 5, 32, 48)
     np.testing.assert_array_equal(training[5].left, expected.left)
     np.testing.assert_array_equal(training[5].disparity_px, expected.disparity_px)
     assert training.name(5) == f"collage 5 of seed {recipe.seed}"
@@ -191,12 +198,12 @@ def test_fresh_collages_are_those_of_the_seed_and_none_is_kept(tmp_path):
 
 
 def test_held_out_sets_are_read_from_their_folders(rendered):
-    held_out = held_out_sets(
+    held_out = open_held_out_sets(
         replace(RECIPE, held_out=(("rooms", str(rendered / "rooms")), ("all", str(rendered / "scenes"))))
     )
     assert {name: pairs.count for name, pairs in held_out.items()} == {"rooms": 6, "all": 6}
 
 
 def test_a_held_out_set_that_is_not_there_is_named(tmp_path):
-    message = complaint(held_out_sets, replace(RECIPE, held_out=(("rooms", str(tmp_path / "rooms")),)))
+    message = complaint(open_held_out_sets, replace(RECIPE, held_out=(("rooms", str(tmp_path / "rooms")),)))
     assert message.startswith(f"tiny: held_out: {tmp_path / 'rooms'}: expected pairs of `stereoweave synth")

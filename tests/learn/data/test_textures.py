@@ -13,23 +13,25 @@ from stereoweave.learn.data.textures import (
     PHOTOGRAPH_CROPS,
     PHOTOGRAPHS,
     SIDE,
-    light_map,
-    natural,
-    periodic,
-    photograph_crop,
-    power_noise,
-    procedural,
+    crop_photograph,
+    draw_power_noise,
+    make_light_map,
+    make_natural,
+    make_periodic,
+    make_procedural,
 )
 
 
 @pytest.fixture(scope="module")
 def textures() -> list[np.ndarray]:
     """All of them, those of nature first."""
-    return [natural(k) for k in range(NATURAL_TEXTURES)] + [periodic(k) for k in range(PERIODIC_TEXTURES)]
+    return [make_natural(k) for k in range(NATURAL_TEXTURES)] + [
+        make_periodic(k) for k in range(PERIODIC_TEXTURES)
+    ]
 
 
 def test_the_textures_have_one_size_and_are_made_once(textures):
-    assert natural(3) is natural(3)
+    assert make_natural(3) is make_natural(3)
     for texture in textures:
         assert texture.shape == (SIDE, SIDE, 3)
         assert texture.dtype == np.uint8
@@ -45,14 +47,16 @@ def test_every_texture_shows_something(textures):
 
 def test_a_texture_depends_on_its_number_alone(textures):
     assert len({texture.tobytes() for texture in textures}) == len(textures)
-    np.testing.assert_array_equal(procedural(NATURAL, 40), natural(PHOTOGRAPH_CROPS + 40))
-    np.testing.assert_array_equal(photograph_crop(40), natural(40))
+    np.testing.assert_array_equal(make_procedural(NATURAL, 40), make_natural(PHOTOGRAPH_CROPS + 40))
+    np.testing.assert_array_equal(crop_photograph(40), make_natural(40))
 
 
 @pytest.mark.parametrize("kinds", [NATURAL, PERIODIC])
 def test_two_textures_of_one_kind_differ(kinds):
     for k in range(len(kinds)):
-        assert np.abs(procedural(kinds, k).astype(int) - procedural(kinds, k + len(kinds))).mean() > 1
+        assert (
+            np.abs(make_procedural(kinds, k).astype(int) - make_procedural(kinds, k + len(kinds))).mean() > 1
+        )
 
 
 def test_test_pairs_and_faces_are_not_among_the_photographs():
@@ -60,7 +64,7 @@ def test_test_pairs_and_faces_are_not_among_the_photographs():
 
 
 def test_noise_has_the_spectrum_that_was_asked_for():
-    noise = power_noise(np.random.default_rng(0), 1.0)
+    noise = draw_power_noise(np.random.default_rng(0), 1.0)
     amplitude = np.abs(np.fft.fft2(noise))
     # Amplitude ~ 1 / frequency: four times the frequency, a quarter of the amplitude.
     low = np.sqrt((amplitude[10, -10:] ** 2).mean() + (amplitude[10, 1:11] ** 2).mean())
@@ -71,7 +75,7 @@ def test_noise_has_the_spectrum_that_was_asked_for():
 
 
 def test_light_maps_never_darken_to_black_nor_blind():
-    for light in map(light_map, range(LIGHT_MAPS)):
+    for light in map(make_light_map, range(LIGHT_MAPS)):
         assert light.dtype == np.float32
         assert 0.2 < light.min() <= light.max() < 1.7
 

@@ -6,7 +6,7 @@ import torch
 from learn_examples import PAIR_SIZE, box_before_a_wall, overfitted, untrained
 
 from stereoweave.io.files import read_image
-from stereoweave.learn.data.batches import collated
+from stereoweave.learn.data.batches import collate
 from stereoweave.learn.export import confidence as calibrate
 
 
@@ -21,13 +21,13 @@ def test_the_fit_recovers_a_known_scale_and_shift(scale, shift):
     generator = torch.Generator().manual_seed(0)
     logits = 2 * torch.randn(100_000, generator=generator)
     within = torch.rand(100_000, generator=generator) < (scale * logits + shift).sigmoid()
-    assert calibrate._fitted(logits, within) == pytest.approx((scale, shift), abs=0.05)
+    assert calibrate._fit_scale_and_shift(logits, within) == pytest.approx((scale, shift), abs=0.05)
 
 
 def test_reliability_compares_what_was_claimed_with_what_happened():
     probability = np.array([0.11, 0.13, 0.95, 1.0, 0.95, 0.9])
     happened = np.array([False, True, True, True, True, False])
-    found = calibrate.reliability(probability, happened)
+    found = calibrate.measure_reliability(probability, happened)
     assert found["bins"] == [
         {"claimed": 0.12, "happened": 0.5, "share": 0.3333},
         {"claimed": 0.9, "happened": 0.0, "share": 0.1667},
@@ -40,7 +40,7 @@ def test_reliability_compares_what_was_claimed_with_what_happened():
 def test_reliability_of_honest_claims_has_no_error():
     probability = np.full(8, 0.75, np.float32)
     happened = np.arange(8) % 4 != 0
-    found = calibrate.reliability(probability, happened)
+    found = calibrate.measure_reliability(probability, happened)
     assert found == {
         "calibration_error": 0.0,
         "bins": [{"claimed": 0.75, "happened": 0.75, "share": 1.0}],
@@ -51,23 +51,23 @@ def test_reliability_of_honest_claims_has_no_error():
 def test_calibration_scales_and_shifts_the_confidence_and_leaves_the_disparity():
     network = overfitted().network
     calibrated = copy.deepcopy(network)
-    proof = calibrate.calibrate(calibrated)
+    proof = calibrate.calibrate_confidence(calibrated)
     assert 0 <= proof["calibration_error"] <= 1
     assert sum(row["share"] for row in proof["bins"]) == pytest.approx(1, abs=0.01)
-    batch = collated([box_before_a_wall(np.random.default_rng(0))])
+    batch = collate([box_before_a_wall(np.random.default_rng(0))])
     with torch.no_grad():
         before_px, _, before = network(batch["left"], batch["right"])
         after_px, _, after = calibrated(batch["left"], batch["right"])
     torch.testing.assert_close(after_px, before_px)
-    scale, shift = calibrate._fitted(*calibrate._claims(network, calibrate._FIT_SEED))
+    scale, shift = calibrate._fit_scale_and_shift(*calibrate._predict_claims(network, calibrate._FIT_SEED))
     torch.testing.assert_close(after, before * scale + shift, atol=1e-3, rtol=1e-3)
 
 
 @pytest.mark.usefixtures("few_small_pairs")
 def test_the_unseen_pair_is_none_of_those_of_the_fit_or_the_proof():
-    unseen = calibrate.unseen_pair()
+    unseen = calibrate.paint_unseen_pair()
     for seed in (calibrate._FIT_SEED, calibrate._PROOF_SEED):
-        assert (calibrate.sample(seed, 0, 0, *PAIR_SIZE).left != unseen.left[:64, :96]).mean() > 0.5
+        assert (calibrate.paint_collage(seed, 0, 0, *PAIR_SIZE).left != unseen.left[:64, :96]).mean() > 0.5
 
 
 def test_the_reliability_plot_is_a_picture(tmp_path):
@@ -85,8 +85,8 @@ def test_a_confidence_that_is_a_sum_is_scaled_and_shifted_as_a_whole():
     network = untrained("weave_base_grown")
     torch.nn.init.normal_(network.sharpening.confidence.weight)
     calibrated = copy.deepcopy(network)
-    calibrate.calibrate(calibrated)
-    batch = collated([box_before_a_wall(np.random.default_rng(0))])
+    calibrate.calibrate_confidence(calibrated)
+    batch = collate([box_before_a_wall(np.random.default_rng(0))])
     with torch.no_grad():
         before, after = (net(batch["left"], batch["right"])[2].flatten() for net in (network, calibrated))
     low, high = before.argmin(), before.argmax()

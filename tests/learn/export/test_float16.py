@@ -38,8 +38,8 @@ def a_graph_that_reads_a_disparity():
 
 def test_convolutions_compute_in_16_bits_and_disparities_in_32():
     graph = a_graph_that_reads_a_disparity()
-    assert halve.half_nodes(graph) == {"conv", "relu"}
-    made = halve.in_half(graph, {"conv", "relu"})
+    assert halve.select_float16_nodes(graph) == {"conv", "relu"}
+    made = halve.cast_to_float16(graph, {"conv", "relu"})
     assert [node.op_type for node in made.graph.node] == ["Cast", "Conv", "Relu", "Cast", "Mul", "Sub"]
     session = onnxruntime.InferenceSession(made.SerializeToString(), providers=["CPUExecutionProvider"])
     (found,) = session.run(None, {"image": np.array([[[[0.5, 1.0]]]], np.float32)})
@@ -49,7 +49,7 @@ def test_convolutions_compute_in_16_bits_and_disparities_in_32():
 
 def test_a_file_of_half_the_size_answers_nearly_alike_and_says_what_it_changed(small_pairs, tmp_path):
     out = tmp_path / "weights" / "small16.onnx"
-    card = halve.halve(SMALL, out)
+    card = halve.convert_to_float16(SMALL, out)
     assert out.stat().st_size < 0.55 * SMALL.stat().st_size
     sample = box_before_a_wall(np.random.default_rng(0))
     before, after = (Matcher(file).estimate(sample.left, sample.right) for file in (SMALL, out))
@@ -61,13 +61,13 @@ def test_a_file_of_half_the_size_answers_nearly_alike_and_says_what_it_changed(s
     assert card["parameters"] == json.loads(SMALL.with_suffix(".json").read_text())["parameters"]
 
     # Neither is what a variant is made from.
-    message = complaint(halve.halve, out, tmp_path / "again.onnx")
+    message = complaint(halve.convert_to_float16, out, tmp_path / "again.onnx")
     assert message.endswith("found one in 16 bits; take the file that it was made from")
 
 
 def test_convolutions_and_products_alone_have_weights_of_16_bits():
     graph = onnx.load(SMALL)
-    made = halve.in_half(graph, halve.half_nodes(graph)).graph
+    made = halve.cast_to_float16(graph, halve.select_float16_nodes(graph)).graph
     of_32_bits = {x.name for x in made.initializer if x.data_type == TensorProto.FLOAT}
     readers = {node.op_type for node in made.node if of_32_bits & set(node.input)}
     assert readers & {"Conv", "MatMul", "Relu"} == set()
@@ -76,6 +76,6 @@ def test_convolutions_and_products_alone_have_weights_of_16_bits():
 
 def test_nothing_is_written_where_16_bits_change_too_much(small_pairs, tmp_path, monkeypatch):
     monkeypatch.setattr(halve, "LARGEST_MEAN_DIFFERENCE_PX", 0.0)
-    message = complaint(halve.halve, SMALL, tmp_path / "small16.onnx")
+    message = complaint(halve.convert_to_float16, SMALL, tmp_path / "small16.onnx")
     assert "px in the mean, expected under 0.0; nothing was written" in message
     assert list(tmp_path.iterdir()) == []

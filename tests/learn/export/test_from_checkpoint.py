@@ -57,7 +57,7 @@ def test_the_matcher_file_answers_as_pytorch_does_and_nothing_is_written_otherwi
     run, pair, tmp_path, monkeypatch
 ):
     out = tmp_path / "weights" / "tiny.onnx"
-    card = export.export(run, out, [pair])
+    card = export.export_matcher(run, out, [pair])
     assert 0 <= card["onnx_differs_px"] < 0.01
     assert sorted(file.name for file in out.parent.iterdir()) == ["tiny.json", "tiny.onnx"]
 
@@ -97,12 +97,12 @@ def test_the_matcher_file_answers_as_pytorch_does_and_nothing_is_written_otherwi
     assert abs(found_px - overfitted().sample.disparity_px).mean() < 1
 
     # Here, because the exporter takes its time.
-    monkeypatch.setattr(export, "graph_of", lambda _network, _kept: of_another_network(graph))
+    monkeypatch.setattr(export, "export_graph", lambda _network, _kept: of_another_network(graph))
     elsewhere = tmp_path / "elsewhere" / "tiny.onnx"
     with pytest.raises(
         StereoweaveError, match=r"run.*: ONNX Runtime and PyTorch differ by .* nothing was written"
     ):
-        export.export(run / "last.pt", elsewhere, [pair])
+        export.export_matcher(run / "last.pt", elsewhere, [pair])
     assert list(elsewhere.parent.iterdir()) == []
 
 
@@ -121,7 +121,7 @@ def test_the_papers_network_becomes_a_matcher_that_finds_the_right_view_by_the_m
     paper_run, pair, tmp_path
 ):
     out = tmp_path / "paper.onnx"
-    card = export.export(paper_run, out, [pair])
+    card = export.export_matcher(paper_run, out, [pair])
     assert 0 <= card["onnx_differs_px"] < 0.01
     assert card["onnx_differs_confidence"] == 0
     assert card["parameters"] == 314_722
@@ -130,7 +130,7 @@ def test_the_papers_network_becomes_a_matcher_that_finds_the_right_view_by_the_m
 
     matcher = Matcher(out, threads=1)
     found = matcher.estimate(pair.left, pair.right, raw=True)
-    network = export.matcher_network(checkpoint.load(paper_run / "last.pt"))
+    network = export.load_matcher_network(checkpoint.load(paper_run / "last.pt"))
     for values, view in (
         (found.disparity_px, pair),
         (found.right_disparity_px[:, ::-1], pair.mirrored()),
@@ -156,7 +156,7 @@ def test_a_network_that_predicts_pixels_gives_a_matcher_its_pixels():
 def test_a_network_of_depth_is_no_matcher(tmp_path):
     recipe = recipe_of("fast_depth", target="depth")
     checkpoint.save(checkpoint_of(untrained("fast_depth"), recipe), tmp_path / "last.pt")
-    assert complaint(export.export, tmp_path, tmp_path / "out" / "depth.onnx") == (
+    assert complaint(export.export_matcher, tmp_path, tmp_path / "out" / "depth.onnx") == (
         "tiny: a matcher file gives disparity, expected target = 'disparity', found 'depth'; "
         "the network needs each pair's camera"
     )
@@ -176,7 +176,7 @@ def test_multiply_adds_are_those_of_layers_and_products():
     height, width = 8, 12
     layer = height * width * 8 * 3 * 9
     product = 8 * height * width * height
-    assert export.multiply_adds(OneLayer(), height, width) == layer + product
+    assert export.count_multiply_adds(OneLayer(), height, width) == layer + product
 
 
 def test_multiply_adds_count_the_refinement_of_weavenet():
@@ -185,4 +185,4 @@ def test_multiply_adds_count_the_refinement_of_weavenet():
         network(image, image)
     # Both views at half the resolution compare 16 features with those of 6 columns.
     refinement = 2 * 8 * 16 * 16 * 6
-    assert export.multiply_adds(network, 16, 32) == counter.get_total_flops() // 2 + refinement
+    assert export.count_multiply_adds(network, 16, 32) == counter.get_total_flops() // 2 + refinement

@@ -47,7 +47,7 @@ def test_convolutions_and_what_stands_between_them_alone_take_8_bits():
     image = helper.make_tensor_value_info("image", TensorProto.FLOAT, None)
     last = helper.make_tensor_value_info("j", TensorProto.FLOAT, None)
     graph = helper.make_model(helper.make_graph(nodes, "graph", [image], [last]))
-    assert quantise.quantised_nodes(graph) == [
+    assert quantise.select_int8_nodes(graph) == [
         "conv_a", "Relu_b", "conv_c", "Add_d", "Concat_e", "conv_f", "Relu_g",
     ]  # fmt: skip
 

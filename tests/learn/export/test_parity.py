@@ -13,7 +13,7 @@ from stereoweave.learn import checkpoint
 from stereoweave.learn.export import float16 as halve
 from stereoweave.learn.export import int8 as quantise
 from stereoweave.learn.export import parity
-from stereoweave.learn.export.from_checkpoint import matcher_network
+from stereoweave.learn.export.from_checkpoint import load_matcher_network
 from stereoweave.matching.matcher import model_file
 from stereoweave.matching.providers import open_session
 
@@ -39,7 +39,7 @@ ROWS = rows_of(ROOT / "results/parity.csv")
 def test_the_page_shows_the_rows_as_they_were_measured():
     page = (ROOT / "docs/runtimes.md").read_text()
     for table in sorted((ROOT / "results").glob("parity*.csv")):
-        assert parity.markdown(rows_of(table)) in page
+        assert parity.format_markdown(rows_of(table)) in page
 
 
 def test_the_table_has_every_variant_of_every_network():
@@ -64,21 +64,21 @@ def small(tmp_path_factory):
         for module in (halve, quantise):
             patch.setattr(module, "_PROOF_PAIRS", 1)
         patch.setattr(quantise, "_RANGES_PAIRS", 2)
-        made = parity.variants(file, tmp_path_factory.mktemp("variants"))
-    return parity.as_shipped(matcher_network(kept), file), made
+        made = parity.make_variants(file, tmp_path_factory.mktemp("variants"))
+    return parity.apply_shipped_calibration(load_matcher_network(kept), file), made
 
 
 def test_what_runs_here_differs_from_pytorch_by_no_more_than_the_table_says(small):
     network, made = small
-    views = {size: parity.painted_pairs(size, 1) for size in ((240, 320), (480, 640))}
-    expected = {size: parity.in_pytorch(network, x) for size, x in views.items()}
-    here = [row for row in ROWS if row.network == "small" and row.provider in parity.providers_here()]
+    views = {size: parity.paint_pairs(size, 1) for size in ((240, 320), (480, 640))}
+    expected = {size: parity.run_in_pytorch(network, x) for size, x in views.items()}
+    here = [row for row in ROWS if row.network == "small" and row.provider in parity.list_providers()]
     for row in here:
         variant = made[row.variant]
         size = variant.sizes[0]
         session = open_session(variant.file, row.provider, 1)
-        found = {size: parity.in_onnx_runtime(session, variant.batch, views[size])}
-        for name, value in parity.differences(expected, found).items():
+        found = {size: parity.run_in_onnx_runtime(session, variant.batch, views[size])}
+        for name, value in parity.summarise_differences(expected, found).items():
             # What is nearly equal differs by rounding, and rounding between machines.
             assert value <= MARGIN * getattr(row, name) + 1e-4, (row.variant, row.provider, name)
         assert variant.file.stat().st_size / 1e6 == pytest.approx(row.file_mb, rel=0.02)
@@ -87,12 +87,12 @@ def test_what_runs_here_differs_from_pytorch_by_no_more_than_the_table_says(smal
 
 def test_differences_are_over_all_pixels_of_all_sizes():
     def maps(*values):
-        return parity.Maps(*(np.full((1, 1, 1, 2), x, np.float32) for x in values))
+        return parity.NetworkMaps(*(np.full((1, 1, 1, 2), x, np.float32) for x in values))
 
     small_size, large_size, left_out = (32, 32), (64, 64), (96, 96)
     expected = {small_size: maps(1, 2, 0.5), large_size: maps(1, 2, 0.5), left_out: maps(9, 9, 9)}
     found = {small_size: maps(2, 2, 0.25), large_size: maps(4, 1, 0.5)}
-    assert parity.differences(expected, found) == {
+    assert parity.summarise_differences(expected, found) == {
         "left_mean_px": 2.0,  # of 1 and 3
         "left_max_px": 3.0,
         "right_mean_px": 0.5,  # of 0 and 1
@@ -104,14 +104,14 @@ def test_differences_are_over_all_pixels_of_all_sizes():
 
 def test_the_command_writes_and_shows_a_row_for_each_variant(tmp_path, monkeypatch, capsys):
     sizes = ((32, 64), (64, 96))
-    shipped = parity.Variant(model_file("small"), 2, sizes)
+    shipped = parity.MatcherVariant(model_file("small"), 2, sizes)
     made = {"float32": shipped, "one size": shipped._replace(sizes=sizes[1:])}
-    for name, value in (("SIZES", sizes), ("_TURNS", 1), ("variants", lambda _file, _folder: made)):
+    for name, value in (("SIZES", sizes), ("_TURNS", 1), ("make_variants", lambda _file, _folder: made)):
         monkeypatch.setattr(parity, name, value)
     out, threads = tmp_path / "parity.csv", torch.get_num_threads()
     assert cli.main(["bench", "parity", str(ROOT / "checkpoints/small.pt"), "-o", str(out)]) == 0
     rows = rows_of(out)
-    assert parity.markdown(rows) in capsys.readouterr().out
+    assert parity.format_markdown(rows) in capsys.readouterr().out
     here = [row for row in rows if row.provider == "cpu"]
     assert [(row.network, row.variant, row.pairs) for row in here] == [
         ("small", "float32", 8), ("small", "one size", 4),

@@ -8,16 +8,16 @@ from stereoweave.learn.models.layers import (
     DilatedDense,
     Halve,
     Residual,
-    at_match,
+    correlate_nearby,
+    correlate_warped,
     correlation_volume,
     expected_step,
+    gather_neighbours,
     local_soft_argmax,
-    mirrored,
-    nearby_matches,
-    surroundings,
+    mirror,
+    sample_at_match,
     upsample_convex,
     upsample_to_a_side,
-    warped_matches,
 )
 
 
@@ -96,14 +96,14 @@ def test_nearby_matches_equal_the_plain_loop_between_columns_and_beyond_the_bord
     first, second = torch.randn(2, 2, 4, 2, 7)
     disparity = torch.tensor([0.0, 1.25, 2.5, -1.75, 5.999, 100.3, -40.5]).expand(2, 1, 2, 7)
     expected = nearby_matches_plain(first, second, disparity, radius)
-    found = nearby_matches(first, second, disparity, radius)
+    found = correlate_nearby(first, second, disparity, radius)
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
 
 
 def test_nearby_matches_at_whole_disparities_are_those_of_the_correlation_volume():
     first, second = torch.randn(2, 1, 4, 2, 12)
     volume = correlation_volume(first, second, 7)
-    found = nearby_matches(first, second, torch.full((1, 1, 2, 12), 4.0), radius=2)
+    found = correlate_nearby(first, second, torch.full((1, 1, 2, 12), 4.0), radius=2)
     torch.testing.assert_close(found[..., 6:], volume[:, 2:7, :, 6:])
 
 
@@ -112,10 +112,10 @@ def test_warped_matches_equal_the_plain_loop_between_columns_and_beyond_the_bord
     first, second = torch.randn(2, 2, 4, 2, 7)
     disparity = torch.tensor([0.0, 1.25, 2.5, -1.75, 5.999, 100.3, -40.5]).expand(2, 1, 2, 7)
     expected = warped_matches_plain(first, second, disparity, radius)
-    torch.testing.assert_close(warped_matches(first, second, disparity, radius), expected)
+    torch.testing.assert_close(correlate_warped(first, second, disparity, radius), expected)
 
 
-@pytest.mark.parametrize("matches", [nearby_matches, warped_matches])
+@pytest.mark.parametrize("matches", [correlate_nearby, correlate_warped])
 def test_columns_are_found_as_well_in_bfloat16_which_cannot_count_them(matches):
     first, second = torch.randn(2, 1, 4, 1, 600).bfloat16()
     disparity = torch.full((1, 1, 1, 600), 3.0, dtype=torch.bfloat16)
@@ -197,10 +197,10 @@ def test_where_every_neighbour_is_refused_their_mean_is_taken():
 def test_halving_keeps_the_grid_its_own_mirror_image(kernel):
     halve = Halve(3, 4, kernel=kernel).eval()
     with torch.no_grad():
-        halve[0].weight += mirrored(halve[0].weight.clone())
+        halve[0].weight += mirror(halve[0].weight.clone())
     image = torch.rand(1, 3, 8, 12)
     assert halve(image).shape == (1, 4, 4, 6)
-    torch.testing.assert_close(halve(mirrored(image)), mirrored(halve(image)))
+    torch.testing.assert_close(halve(mirror(image)), mirror(halve(image)))
 
 
 def test_dense_blocks_hand_on_their_input_in_front_of_what_they_add():
@@ -261,11 +261,11 @@ def test_a_map_is_looked_up_at_the_match_between_two_columns_and_at_the_border()
     other = torch.tensor([10.0, 20.0, 40.0, 80.0]).view(1, 1, 1, 4)
     disparity = torch.tensor([0.0, 0.25, 5.0, -3.0]).view(1, 1, 1, 4)
     # Columns 0, 0.75, -3 and 6.
-    assert at_match(other, disparity).flatten().tolist() == pytest.approx([10, 17.5, 10, 80])
+    assert sample_at_match(other, disparity).flatten().tolist() == pytest.approx([10, 17.5, 10, 80])
 
 
 def test_surroundings_are_the_values_at_the_offsets_and_outside_the_border_s():
     x = torch.arange(12.0).view(1, 1, 3, 4)
-    below, left_far = surroundings(x, [(1, 0), (0, -5)])[0]
+    below, left_far = gather_neighbours(x, [(1, 0), (0, -5)])[0]
     assert below.tolist() == [[4, 5, 6, 7], [8, 9, 10, 11], [8, 9, 10, 11]]
     assert left_far.tolist() == [[0] * 4, [4] * 4, [8] * 4]

@@ -9,9 +9,9 @@ from learn_examples import box_before_a_wall, recipe_of, untrained
 from torch import nn
 
 from stereoweave.errors import FormatError
-from stereoweave.learn.data.batches import collated
-from stereoweave.learn.models import MODELS, CodeNetwork, network_of
-from stereoweave.learn.training.objective import objective_of
+from stereoweave.learn.data.batches import collate
+from stereoweave.learn.models import MODELS, CodeNetwork, build_network
+from stereoweave.learn.training.objective import build_objective
 
 PARAMETERS = {
     "weave_small": 278_029,
@@ -117,7 +117,7 @@ def test_the_network_overfits_one_pair(name):
     recipe = recipe_of(name, loss=loss, max_disparity_px=16.0)
     torch.manual_seed(0)
     # In training mode, because the running mean of Keras's batch norm lags 100 steps behind; but all kept.
-    network = network_of(recipe).train()
+    network = build_network(recipe).train()
     for layer in network.modules():
         if isinstance(layer, nn.Dropout):
             layer.p = 0.0
@@ -125,8 +125,8 @@ def test_the_network_overfits_one_pair(name):
         # Nine tenths of its weights, which are slow to train, and of a picture this small see 4x4 places.
         for part in (network.conv4, network.conv5, network.conv6, *network.expansions[:2]):
             part.requires_grad_(False)
-    objective = objective_of(recipe, network)
-    batch = collated([box_before_a_wall(np.random.default_rng(0), (64, 64))])
+    objective = build_objective(recipe, network)
+    batch = collate([box_before_a_wall(np.random.default_rng(0), (64, 64))])
     trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
     optimiser = torch.optim.Adam(trained, learning_rate, fused=True)
     errors_px = []
@@ -142,12 +142,12 @@ def test_the_network_overfits_one_pair(name):
 
 
 def test_psmnet_has_as_many_candidates_as_the_recipe_says():
-    assert network_of(recipe_of("psmnet", max_disparity_px=64.0)).max_disparity_px == 64
+    assert build_network(recipe_of("psmnet", max_disparity_px=64.0)).max_disparity_px == 64
 
 
 def test_an_unknown_name_is_answered_with_the_known_ones():
     with pytest.raises(FormatError) as caught:
-        network_of(recipe_of("spider"))
+        build_network(recipe_of("spider"))
     assert str(caught.value) == (
         "tiny: model = 'spider', expected weave_small or weave_base or weave_base_grown or fast_depth "
         "or fast_depth_without_skips or densemapnet or dispnet or psmnet"

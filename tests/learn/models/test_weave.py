@@ -7,8 +7,8 @@ import torch
 from learn_examples import overfitted, untrained
 from torch import nn
 
-from stereoweave.learn.export.from_checkpoint import multiply_adds
-from stereoweave.learn.models.layers import mirrored
+from stereoweave.learn.export.from_checkpoint import count_multiply_adds
+from stereoweave.learn.models.layers import mirror
 from stereoweave.learn.models.weave import BASE, BASE_GROWN, WeaveNet
 from stereoweave.learn.models.weave_stages import OFFSETS, Completion
 from stereoweave.learn.training.losses import weave_losses
@@ -34,7 +34,7 @@ def test_any_size_that_the_network_divides_gives_maps_of_that_size(size):
     ("name", "most"), [("weave_small", 3e9), ("weave_base", 16e9), ("weave_base_grown", 16e9)]
 )
 def test_the_whole_graph_of_both_views_costs_at_most_what_was_promised(name, most):
-    count = multiply_adds(untrained(name))
+    count = count_multiply_adds(untrained(name))
     assert count <= most
     assert f"{count / 1e9:.2f} G multiply-adds" in WeaveNet.__doc__
 
@@ -65,12 +65,12 @@ def test_a_mirrored_pair_gives_mirrored_answers():
     with torch.no_grad():
         for layer in network.encoder.modules():
             if isinstance(layer, nn.Conv2d):
-                layer.weight += mirrored(layer.weight.clone())
+                layer.weight += mirror(layer.weight.clone())
         left, right = (image.double() for image in random_pair(1, 48, 80))
         left_px, right_px, _ = network(left, right)
-        mirrored_left_px, mirrored_right_px, _ = network(mirrored(right), mirrored(left))
-    torch.testing.assert_close(right_px, mirrored(mirrored_left_px), atol=1e-3, rtol=0)
-    torch.testing.assert_close(left_px, mirrored(mirrored_right_px), atol=1e-3, rtol=0)
+        mirrored_left_px, mirrored_right_px, _ = network(mirror(right), mirror(left))
+    torch.testing.assert_close(right_px, mirror(mirrored_left_px), atol=1e-3, rtol=0)
+    torch.testing.assert_close(left_px, mirror(mirrored_right_px), atol=1e-3, rtol=0)
     assert (left_px - right_px).abs().max() > 0.1
 
 
@@ -80,7 +80,7 @@ def test_the_stages_hold_both_views_the_right_one_mirrored():
     with torch.no_grad():
         stages = network.stages(*pair)
         left_px, right_px, logit = network(*pair)
-    torch.testing.assert_close(stages.disparity_px.clamp(min=0), torch.cat([left_px, mirrored(right_px)]))
+    torch.testing.assert_close(stages.disparity_px.clamp(min=0), torch.cat([left_px, mirror(right_px)]))
     torch.testing.assert_close(stages.confidence_logit[:2], logit)
     assert stages.correlation.shape == stages.scores.shape == (4, network.levels, 8, 16)
     assert stages.coarse_px.shape == (4, 1, 16, 32)
@@ -146,12 +146,12 @@ def test_a_mirrored_pair_is_completed_and_sharpened_alike():
         for part in (network.encoder, network.sharpening.features, network.sharpening.to_match):
             for layer in part.modules():
                 if isinstance(layer, nn.Conv2d):
-                    layer.weight += mirrored(layer.weight.clone())
+                    layer.weight += mirror(layer.weight.clone())
         left, right = (image.double() for image in random_pair(1, 64, 96))
         left_px, right_px, _ = network(left, right)
-        mirrored_left_px, mirrored_right_px, _ = network(mirrored(right), mirrored(left))
-    torch.testing.assert_close(right_px, mirrored(mirrored_left_px), atol=1e-3, rtol=0)
-    torch.testing.assert_close(left_px, mirrored(mirrored_right_px), atol=1e-3, rtol=0)
+        mirrored_left_px, mirrored_right_px, _ = network(mirror(right), mirror(left))
+    torch.testing.assert_close(right_px, mirror(mirrored_left_px), atol=1e-3, rtol=0)
+    torch.testing.assert_close(left_px, mirror(mirrored_right_px), atol=1e-3, rtol=0)
 
 
 def test_a_completion_takes_the_surface_that_its_affinities_point_to():

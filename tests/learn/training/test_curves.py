@@ -6,7 +6,7 @@ from learn_examples import RECIPE, checkpoint_of, complaint, untrained
 from stereoweave.cli.root import main
 from stereoweave.learn import checkpoint
 from stereoweave.learn.training.curves import fit_power_law, record_curve
-from stereoweave.learn.training.loop import CURVE, record
+from stereoweave.learn.training.loop import SCORES_FILE, append_scores
 
 
 @pytest.fixture
@@ -16,7 +16,9 @@ def run(tmp_path):
     run.mkdir()
     checkpoint.save(checkpoint_of(untrained()), run / "last.pt")
     for step in (500, 1000, 2000, 4000, 8000):
-        record(run / CURVE, step, {"epe_px": 2.0, "bad1_percent": 20 * (2 * step / 10_000) ** -0.25})
+        append_scores(
+            run / SCORES_FILE, step, {"epe_px": 2.0, "bad1_percent": 20 * (2 * step / 10_000) ** -0.25}
+        )
     return run
 
 
@@ -51,7 +53,7 @@ def test_rows_of_other_runs_stay_and_those_of_the_run_are_replaced(run, tmp_path
 def test_a_run_without_scores_is_named(tmp_path):
     checkpoint.save(checkpoint_of(untrained(), RECIPE), tmp_path / "last.pt")
     message = complaint(record_curve, tmp_path, tmp_path / "curve.csv")
-    assert message.startswith(f"{tmp_path / CURVE}: expected scores of a run, found none")
+    assert message.startswith(f"{tmp_path / SCORES_FILE}: expected scores of a run, found none")
 
 
 def test_the_command_prints_the_fits(run, tmp_path, capsys):

@@ -60,7 +60,7 @@ def kill(torchrun, rank):
 def train_here(recipe, out, patch):
     """Train in this one process, which also cuts the pairs."""
     steps = lambda batches, first: ((i, batches[i]) for i in range(first, batches.recipe.steps))  # noqa: E731
-    patch.setattr(training, "_numbered_batches", steps)
+    patch.setattr(training, "_load_batches", steps)
     return checkpoint.load(training.train_recipe(recipe, out, QUIET))
 
 

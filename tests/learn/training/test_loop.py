@@ -38,12 +38,12 @@ from stereoweave.data.shards import write_shard
 from stereoweave.errors import FormatError, OutputInUseError, StereoweaveError
 from stereoweave.learn import checkpoint
 from stereoweave.learn.data.batches import Batches
-from stereoweave.learn.data.pair_cache import KeptPairs
+from stereoweave.learn.data.pair_cache import CachedPairs
 from stereoweave.learn.data.sources import VALIDATION_SEED
 from stereoweave.learn.models import MODELS
 from stereoweave.learn.recipe import read_recipe
 from stereoweave.learn.training import loop as training
-from stereoweave.learn.training.loop import Run, train
+from stereoweave.learn.training.loop import TrainingRun, train
 
 RECIPES = sorted((Path(__file__).parents[3] / "recipes").rglob("*.toml"))
 QUIET = Console(quiet=True)
@@ -104,7 +104,7 @@ def in_place(monkeypatch):
 
 @pytest.fixture
 def logger(tmp_path):
-    with training.closing_curves(TensorBoardLogger(tmp_path, name="", version="")) as logger:
+    with training.close_curves(TensorBoardLogger(tmp_path, name="", version="")) as logger:
         yield logger
 
 
@@ -161,21 +161,21 @@ def test_a_run_goes_on_with_another_end_and_other_data(folder, finished):
     recipe = replace(
         RECIPE, steps=RECIPE.steps + 2, cool_down_steps=1, mix=(("collage", 1.0),), crop_size=(32, 64)
     )
-    start = training._starting_point(recipe, finished)
+    start = training._load_start(recipe, finished)
     assert (start.step, start.recipe) == (RECIPE.steps, recipe)
     assert_same(start.optimiser, checkpoint.load(finished).optimiser)
 
 
 def test_a_run_is_kept_every_ten_minutes(folder, recipe_file, tmp_path, logger, monkeypatch):
     last = tmp_path / "last.pt"
-    run = Run(RECIPE, training._starting_point(RECIPE, last), logger)
-    run.keep_now_and_then(3, last)
+    run = TrainingRun(RECIPE, training._load_start(RECIPE, last), logger)
+    run.save_periodically(3, last)
     assert not last.exists()
     now = time.monotonic()
     monkeypatch.setattr(time, "monotonic", lambda: now + 601)
-    run.keep_now_and_then(3, last)
+    run.save_periodically(3, last)
     assert checkpoint.load(last).step == 3
-    run.keep_now_and_then(4, last)
+    run.save_periodically(4, last)
     assert checkpoint.load(last).step == 3
 
 
@@ -192,7 +192,7 @@ def test_a_run_is_scored_by_class_on_the_held_out_sets_of_its_recipe(folder, in_
 
 def test_a_run_starts_from_the_averaged_weights_of_another(folder, finished):
     recipe = replace(RECIPE, name="second", start_from=str(finished))
-    start = training._starting_point(recipe, folder / "second" / "last.pt")
+    start = training._load_start(recipe, folder / "second" / "last.pt")
     first = checkpoint.load(finished)
     assert start.step == 0
     assert start.hours == first.hours
@@ -206,7 +206,7 @@ def test_a_loss_that_is_not_finite_twice_stops_and_names_the_pairs(folder, in_pl
     checkpoint.save(checkpoint_of(broken), tmp_path / "broken.pt")
     recipe = replace(RECIPE, name="broken", start_from=str(tmp_path / "broken.pt"))
     file = write(recipe, tmp_path / "broken.toml")
-    pairs = KeptPairs(folder / "pairs", recipe.seed, recipe.pairs, PAIR_SIZE)
+    pairs = CachedPairs(folder / "pairs", recipe.seed, recipe.pairs, PAIR_SIZE)
     names = ", ".join(pairs.name(index) for index in Batches(recipe, pairs).chosen(1))
     with pytest.raises(StereoweaveError) as caught:
         train(file, folder / "broken", QUIET)
@@ -241,7 +241,7 @@ def test_a_pair_that_cannot_be_trained_on_is_named_in_one_line(tmp_path):
 
 def test_a_truth_out_of_range_is_named_with_the_pairs_of_its_step(tmp_path, logger):
     recipe = recipe_of("fast_depth", target="depth", max_depth_m=1.0)
-    run = Run(recipe, training._starting_point(recipe, tmp_path / "last.pt"), logger)
+    run = TrainingRun(recipe, training._load_start(recipe, tmp_path / "last.pt"), logger)
     batches = Batches(recipe, CAMERA_PAIRS)
     message = complaint(run.step, 0, batches[0], batches)
     assert message.startswith(f"step 0: one of {', '.join(batches.names(0))}: depth: expected more than 0")
@@ -249,7 +249,7 @@ def test_a_truth_out_of_range_is_named_with_the_pairs_of_its_step(tmp_path, logg
 
 def test_weights_of_another_network_are_refused_as_a_start(finished, tmp_path):
     recipe = recipe_of("fast_depth", start_from=str(finished))
-    assert complaint(training._starting_point, recipe, tmp_path / "last.pt") == (
+    assert complaint(training._load_start, recipe, tmp_path / "last.pt") == (
         f"tiny: start_from = {str(finished)!r}, expected a checkpoint that shares weights with fast_depth, "
         "found one of weave_small"
     )
@@ -257,7 +257,7 @@ def test_weights_of_another_network_are_refused_as_a_start(finished, tmp_path):
 
 def test_a_gradient_that_is_not_finite_never_reaches_the_weights_and_twice_stops(tmp_path, logger, caplog):
     recipe = recipe_of("fast_depth")
-    run = Run(recipe, training._starting_point(recipe, tmp_path / "last.pt"), logger)
+    run = TrainingRun(recipe, training._load_start(recipe, tmp_path / "last.pt"), logger)
     network = run.network
     before = {name: value.clone() for name, value in network.state_dict().items()}
     # A product with infinity makes the gradient infinite and leaves the loss as it was.
@@ -297,7 +297,7 @@ def test_a_run_into_a_file_fails_before_any_pair_is_made(recipe_file, tmp_path):
 
 def step_of(recipe, folder, logger, steps=1):
     """The first steps of a recipe on pairs in memory: the run after them, and every parameter before."""
-    run = Run(recipe, training._starting_point(recipe, folder / "last.pt"), logger)
+    run = TrainingRun(recipe, training._load_start(recipe, folder / "last.pt"), logger)
     before = {name: value.clone() for name, value in run.network.named_parameters()}
     batches = Batches(recipe, CAMERA_PAIRS)
     for step in range(steps):
@@ -342,8 +342,8 @@ def test_a_code_network_that_is_resumed_ends_as_one_that_was_not(folder, in_plac
         raise Killed
 
     with pytest.MonkeyPatch.context() as patch:
-        keep = Run.keep
-        patch.setattr(Run, "keep", kill)
+        keep = TrainingRun.save
+        patch.setattr(TrainingRun, "save", kill)
         with pytest.raises(Killed):
             training.train_recipe(recipe, last.parent, QUIET)
     assert checkpoint.load(last).step == 2
@@ -355,27 +355,27 @@ def test_a_code_network_that_is_resumed_ends_as_one_that_was_not(folder, in_plac
 
 
 def test_the_scores_of_a_run_are_recorded_step_by_step(folder, finished):
-    rows = training.read_record(finished.with_name(training.CURVE))
+    rows = training.read_scores(finished.with_name(training.SCORES_FILE))
     assert [row["step"] for row in rows] == list(range(2, RECIPE.steps + 1, 2))
     assert rows[-1] == {"step": RECIPE.steps, **checkpoint.load(finished).scores}
 
 
 def test_a_record_that_is_written_again_replaces_what_came_later(tmp_path):
     for step, score in ((10, 3.0), (20, 2.0), (30, 1.0), (20, 2.5)):
-        training.record(tmp_path / "curve.csv", step, {"loss": score})
-    rows = training.read_record(tmp_path / "curve.csv")
+        training.append_scores(tmp_path / "curve.csv", step, {"loss": score})
+    rows = training.read_scores(tmp_path / "curve.csv")
     assert rows == [{"step": 10, "loss": 3.0}, {"step": 20, "loss": 2.5}]
-    assert training.read_record(tmp_path / "nowhere.csv") == []
+    assert training.read_scores(tmp_path / "nowhere.csv") == []
 
 
 @pytest.mark.parametrize(("precision", "dtype"), [("bf16-mixed", torch.bfloat16), ("32-true", torch.float32)])
 def test_a_step_computes_in_bfloat16_where_the_device_does(
     folder, tmp_path, monkeypatch, logger, precision, dtype
 ):
-    monkeypatch.setattr(training, "_precision", lambda: precision)
-    run = Run(RECIPE, training._starting_point(RECIPE, tmp_path / "last.pt"), logger)
+    monkeypatch.setattr(training, "_choose_precision", lambda: precision)
+    run = TrainingRun(RECIPE, training._load_start(RECIPE, tmp_path / "last.pt"), logger)
     seen = []
     run.network.to_match.register_forward_hook(lambda _layer, _inputs, output: seen.append(output.dtype))
-    batches = Batches(RECIPE, KeptPairs(folder / "pairs", RECIPE.seed, RECIPE.pairs, PAIR_SIZE))
+    batches = Batches(RECIPE, CachedPairs(folder / "pairs", RECIPE.seed, RECIPE.pairs, PAIR_SIZE))
     run.step(0, batches[0], batches)
     assert set(seen) == {dtype}

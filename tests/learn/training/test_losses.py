@@ -3,13 +3,13 @@ import math
 import pytest
 import torch
 
-from stereoweave.learn.models.weave import Stages
+from stereoweave.learn.models.weave import WeaveStages
 from stereoweave.learn.training.losses import (
     confidence_loss,
-    halved,
+    halve,
     level_cross_entropy,
-    mean_over,
-    regression,
+    masked_mean,
+    regression_loss,
     weave_losses,
 )
 
@@ -31,7 +31,7 @@ def stages(height=8, width=16):
         "disparity_px": torch.full((2, 1, height, width), 5.0),
         "confidence_logit": torch.zeros(2, 1, height, width),
     }
-    return Stages(**{name: values.requires_grad_() for name, values in maps.items()})
+    return WeaveStages(**{name: values.requires_grad_() for name, values in maps.items()})
 
 
 def flat_truth(value_px, height=8, width=16):
@@ -58,7 +58,7 @@ def test_cross_entropy_counts_neither_unknown_levels_nor_those_out_of_reach():
 
 def test_regression_is_the_absolute_error_less_a_quarter_and_square_below_half_a_pixel():
     truth_px = a_map(10.0, 10.0, 10.0, NAN)
-    found = regression(a_map(10.2, 11.0, 7.0, 3.0), truth_px)
+    found = regression_loss(a_map(10.2, 11.0, 7.0, 3.0), truth_px)
     assert found.item() == pytest.approx((0.2**2 + 0.75 + 2.75) / 3, abs=1e-6)
 
 
@@ -78,12 +78,12 @@ def test_confidence_does_not_move_the_disparity():
 def test_halved_truth_is_the_mean_of_a_block_and_unknown_at_edges():
     truth_px = torch.tensor([[1.0, 1.2, 1.0, 2.5, 4.0, NAN], [1.4, 1.6, 1.0, 1.0, 4.0, 4.0]])[None, None]
     expected = torch.tensor([[[[1.3, NAN, NAN]]]])
-    torch.testing.assert_close(halved(truth_px), expected, equal_nan=True)
+    torch.testing.assert_close(halve(truth_px), expected, equal_nan=True)
 
 
 def test_a_mean_over_nothing_is_zero_and_pulls_nowhere():
     values = a_map(1.0, 2.0)
-    mean = mean_over(values, torch.zeros(1, 1, 1, 2, dtype=torch.bool))
+    mean = masked_mean(values, torch.zeros(1, 1, 1, 2, dtype=torch.bool))
     mean.backward()
     assert mean.item() == 0
     assert values.grad.tolist() == [[[[0, 0]]]]
@@ -150,7 +150,7 @@ def test_pixels_whose_match_lies_outside_the_other_view_do_not_touch_the_correla
 )
 def test_a_robust_regression_is_the_logarithm_of_what_it_was(robust, expected):
     # An error of 3 px is 2.75 without the logarithm.
-    assert regression(a_map(7.0), a_map(10.0), robust).item() == pytest.approx(expected, abs=1e-6)
+    assert regression_loss(a_map(7.0), a_map(10.0), robust).item() == pytest.approx(expected, abs=1e-6)
 
 
 def test_truth_beyond_the_last_level_enters_no_loss():

@@ -8,17 +8,17 @@ import torch
 from learn_examples import CAMERA, RECIPE, Listed, box_before_a_wall, complaint, recipe_of
 from torch import nn
 
-from stereoweave.learn.models import CodeNetwork, network_of
+from stereoweave.learn.models import CodeNetwork, build_network
 from stereoweave.learn.training.losses import CODE_LOSSES
 from stereoweave.learn.training.objective import (
     LOSSES,
     CodeObjective,
     Objective,
     WeaveObjective,
-    curve_of,
-    fitted,
-    objective_of,
-    truth_of,
+    build_curve,
+    build_objective,
+    compute_target,
+    fit_recipe,
 )
 from stereoweave.stereo import Sample
 
@@ -54,7 +54,7 @@ def batch_of(disparity_px, focal_baseline_px_m=None, doffs_px=None):
 
 
 def losses_of(recipe, network, batch):
-    objective = objective_of(recipe, network)
+    objective = build_objective(recipe, network)
     return objective.losses(objective.predict(network, batch), batch)
 
 
@@ -170,8 +170,8 @@ def test_with_psmnet_s_settings_the_loss_is_its_own_in_units_of_the_range():
 @pytest.mark.parametrize("recipe", [DISPARITY, DEPTH], ids=["disparity", "depth"])
 def test_code_quantity_and_disparity_say_the_same(recipe):
     batch = batch_of([[1.0, 2.0, 4.0]], [4.0], [-0.25])
-    truth = truth_of(recipe, batch)
-    code = curve_of(recipe).encode(truth)
+    truth = compute_target(recipe, batch)
+    code = build_curve(recipe).encode(truth)
     by_code, by_pixels = (
         CodeObjective(recipe, Constant(predicts, 0.0)) for predicts in ("code", "disparity_px")
     )
@@ -188,8 +188,8 @@ def test_a_depth_of_just_the_greatest_passes_and_one_beyond_is_refused():
     # 5.4 px m / 0.9 px is 6 m, and in float32 a little more; 5.4 / 1.8 is 3 m, the code (1/2)^2.
     assert torch.tensor(5.4) / torch.tensor(0.9) > 6
     recipe = replace(DEPTH, max_depth_m=6.0)
-    at_the_end = truth_of(recipe, batch_of([[0.9, 1.8, torch.nan]], [5.4], [0.0]))
-    torch.testing.assert_close(curve_of(recipe).encode(at_the_end)[0, 0, 0, :2], torch.tensor([0.0, 0.25]))
+    at_the_end = compute_target(recipe, batch_of([[0.9, 1.8, torch.nan]], [5.4], [0.0]))
+    torch.testing.assert_close(build_curve(recipe).encode(at_the_end)[0, 0, 0, :2], torch.tensor([0.0, 0.25]))
     beyond = batch_of([[0.89, 1.8, torch.nan]], [5.4], [0.0])
     message = complaint(losses_of, recipe, Constant("code", 0.5), beyond)
     assert message.startswith("depth: expected more than 0 and at most 6.0 m, NaN where unknown, found 6.06")
@@ -215,8 +215,8 @@ def test_depth_without_a_camera_is_refused():
 
 def test_each_network_has_its_objective():
     with torch.device("meta"):
-        weave = objective_of(RECIPE, network_of(RECIPE))
-        paper = objective_of(DISPARITY, network_of(DISPARITY))
+        weave = build_objective(RECIPE, build_network(RECIPE))
+        paper = build_objective(DISPARITY, build_network(DISPARITY))
     assert isinstance(weave, WeaveObjective) and isinstance(weave, Objective)
     assert isinstance(paper, CodeObjective) and isinstance(paper, Objective)
     assert isinstance(Constant("code", 0.5), CodeNetwork)
@@ -226,28 +226,28 @@ def test_a_loss_that_is_unknown_or_another_network_s_is_refused():
     assert LOSSES == ("weave", "l2", "l1", "smooth_l1", "cross_entropy", "perceptual")
     paper, known = Constant("code", 0.5), "l2 or l1 or smooth_l1 or cross_entropy or perceptual"
     with torch.device("meta"):
-        weave = network_of(RECIPE)
+        weave = build_network(RECIPE)
     for recipe, network, expected in (
         (replace(DISPARITY, loss="l3"), paper, ", ".join(LOSSES)),
         (replace(DISPARITY, loss="weave"), paper, f"{known} for model = 'fast_depth'"),
         (replace(RECIPE, loss="l2"), weave, "weave for model = 'weave_small'"),
     ):
-        message = complaint(objective_of, recipe, network)
+        message = complaint(build_objective, recipe, network)
         assert message == f"tiny: loss = {recipe.loss!r}, expected {expected}"
 
 
 def test_cross_entropy_is_refused_for_pixels_which_may_leave_their_range():
     recipe = replace(DISPARITY, loss="cross_entropy")
-    assert complaint(objective_of, recipe, Constant("disparity_px", 2.0)) == (
+    assert complaint(build_objective, recipe, Constant("disparity_px", 2.0)) == (
         "tiny: loss = 'cross_entropy', expected a network that predicts codes, found model = "
         f"{recipe.model!r}, whose pixels may leave their range; take another loss"
     )
-    assert objective_of(recipe, Constant("code", 0.5)).recipe == recipe
+    assert build_objective(recipe, Constant("code", 0.5)).recipe == recipe
 
 
 def test_a_perceptual_loss_without_the_name_of_its_file_is_refused():
     recipe = replace(DISPARITY, loss="perceptual")
-    message = complaint(objective_of, recipe, Constant("code", 0.5))
+    message = complaint(build_objective, recipe, Constant("code", 0.5))
     assert message.startswith("tiny: loss = 'perceptual', expected vgg16_weights, the path of torchvision's")
     assert message.endswith("found none; it is never downloaded by itself")
 
@@ -255,7 +255,7 @@ def test_a_perceptual_loss_without_the_name_of_its_file_is_refused():
 def test_a_perceptual_loss_without_its_file_is_refused(tmp_path):
     file = str(tmp_path / "vgg16.pth")
     recipe = replace(DISPARITY, loss="perceptual", vgg16_weights=file)
-    assert complaint(objective_of, recipe, Constant("code", 0.5)).startswith(
+    assert complaint(build_objective, recipe, Constant("code", 0.5)).startswith(
         f"{file}: no such file; expected "
     )
 
@@ -286,11 +286,11 @@ def test_an_exponent_is_fitted_to_the_truth_of_the_training_pairs(target, expone
     recipe = recipe_of(
         "fast_depth", target=target, max_disparity_px=16.0, max_depth_m=8.0, exponent=1.25, fit_exponent=True
     )
-    found = fitted(recipe, pairs)
+    found = fit_recipe(recipe, pairs)
     assert found.exponent == pytest.approx(exponent, rel=0.01)
-    assert found == replace(recipe, exponent=found.exponent) == fitted(recipe, pairs)
+    assert found == replace(recipe, exponent=found.exponent) == fit_recipe(recipe, pairs)
     kept = replace(recipe, fit_exponent=False)
-    assert fitted(kept, pairs) is kept
+    assert fit_recipe(kept, pairs) is kept
 
 
 def scores_of(recipe, value_px):
@@ -299,7 +299,7 @@ def scores_of(recipe, value_px):
         [replace(box_before_a_wall(np.random.default_rng(0)), camera=CAMERA), sample_of([[4.0, 4.0]])]
     )
     network = Constant("disparity_px", value_px).train()
-    scores = objective_of(recipe, network).scores(network, pairs, torch.device("cpu"))
+    scores = build_objective(recipe, network).scores(network, pairs, torch.device("cpu"))
     assert not network.training
     return scores
 
@@ -325,7 +325,7 @@ def test_scores_are_means_over_pairs_and_the_squared_error_is_that_before_the_ex
 def test_a_perfect_estimate_scores_0_in_everything(target, exponent):
     recipe = recipe_of("fast_depth", target=target, exponent=exponent, alpha_p=1.0)
     network = Constant("disparity_px", 4.0)
-    scores = objective_of(recipe, network).scores(
+    scores = build_objective(recipe, network).scores(
         network, Listed([sample_of([[4.0] * 6])]), torch.device("cpu")
     )
     assert scores.keys() - {"depth_error_m"} == {

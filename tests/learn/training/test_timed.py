@@ -26,13 +26,20 @@ from learn_examples import (
 )
 
 from stereoweave.learn import checkpoint
-from stereoweave.learn.data.batches import collated
-from stereoweave.learn.data.painters import Painters, Reused, cooling
+from stereoweave.learn.data.batches import collate
+from stereoweave.learn.data.painters import Painters, ReusedPairs, make_cool_down_recipe
 from stereoweave.learn.recipe import read_recipe
 from stereoweave.learn.training import timed
-from stereoweave.learn.training.clock import RESERVE_S, Clock, cools_at, learning_rate_at
-from stereoweave.learn.training.timed import Command, train_by_clock
-from stereoweave.learn.training.timed_run import NETWORK, OPTIMISER, PROGRESS, Progress, TimedRun, standing
+from stereoweave.learn.training.clock import RESERVE_S, RunClock, is_cooling_down, learning_rate_at
+from stereoweave.learn.training.timed import TimedCommand, train_by_clock
+from stereoweave.learn.training.timed_run import (
+    NETWORK_FILE,
+    OPTIMISER_FILE,
+    PROGRESS_FILE,
+    RunProgress,
+    TimedRun,
+    find_resume_point,
+)
 
 pytestmark = pytest.mark.system
 
@@ -45,7 +52,7 @@ SCHEDULE = replace(RECIPE, learning_rate=0.01, warm_up_steps=4, steps=1000, cool
 def batch():
     """Two pairs as `Painters` hands them over."""
     samples = [box_before_a_wall(np.random.default_rng(seed)) for seed in range(2)]
-    made = collated(samples)
+    made = collate(samples)
     images = {side: (made[side] * 255).round().to(torch.uint8) for side in ("left", "right")}
     return {**made, **images}
 
@@ -55,7 +62,7 @@ def run_of(start=None, optimiser=None):
 
 
 def step(run, rate=1e-3):
-    return run.finish(run.begin(run.moved(batch())), rate)
+    return run.finish(run.begin(run.move_to_device(batch())), rate)
 
 
 def values_of(network):
@@ -71,11 +78,16 @@ def test_the_rate_rises_over_steps_stays_and_falls_over_the_last_fifth_of_the_ti
 
 
 def test_crops_change_where_the_rate_begins_to_fall():
-    assert [cools_at(SCHEDULE, share) for share in (0.0, 0.79, 0.81, 1.0)] == [False, False, True, True]
+    assert [is_cooling_down(SCHEDULE, share) for share in (0.0, 0.79, 0.81, 1.0)] == [
+        False,
+        False,
+        True,
+        True,
+    ]
 
 
 def test_a_clock_counts_the_commands_before_and_ends_a_command_in_time():
-    clock = Clock(began_s=1000.0, used_s=500.0, minutes=9, total_minutes=26)
+    clock = RunClock(began_s=1000.0, used_s=500.0, minutes=9, total_minutes=26)
     assert clock.used_at(1010) == 510
     assert clock.share_at(1270) == 770 / (26 * 60 - RESERVE_S)
     assert clock.left_at(1010) == 9 * 60 - 10 - RESERVE_S
@@ -87,7 +99,7 @@ def test_a_clock_counts_the_commands_before_and_ends_a_command_in_time():
 def test_a_pair_comes_as_often_as_it_is_to_be_cut():
     sample = box_before_a_wall(np.random.default_rng(0))
     samples = [replace(sample) for _ in range(5000)]
-    fresh, reused = (Reused(Listed(samples), held=10) for _ in range(2))
+    fresh, reused = (ReusedPairs(Listed(samples), held=10) for _ in range(2))
     assert all(fresh[index] is samples[index] for index in range(100))
     reused.cuts = 2.5
     counts = Counter(id(reused[index]) for index in range(5000))
@@ -97,15 +109,15 @@ def test_a_pair_comes_as_often_as_it_is_to_be_cut():
 
 def test_larger_crops_come_from_larger_pairs_in_smaller_batches():
     recipe = replace(RECIPE, batch=32, pair_size=(320, 512), crop_size=(256, 384))
-    cool = cooling(recipe, (384, 640))
+    cool = make_cool_down_recipe(recipe, (384, 640))
     assert (cool.pair_size, cool.crop_size, cool.batch) == ((448, 768), (384, 640), 13)
     assert cool.seed != recipe.seed
 
 
 def test_a_batch_on_the_device_is_the_one_that_was_collated():
     samples = [box_before_a_wall(np.random.default_rng(seed)) for seed in range(2)]
-    moved = run_of().moved(batch())
-    for name, value in collated(samples).items():
+    moved = run_of().move_to_device(batch())
+    for name, value in collate(samples).items():
         assert torch.equal(moved[name], value)
 
 
@@ -121,7 +133,7 @@ def test_a_step_that_is_not_finite_changes_nothing():
     run = run_of()
     step(run)
     before = values_of(run.averaged.module), [value.clone() for value in run.network.parameters()]
-    spoiled = run.moved(batch())
+    spoiled = run.move_to_device(batch())
     spoiled["left"][:] = torch.nan
     assert math.isnan(run.finish(run.begin(spoiled), 1e-3))
     after = values_of(run.averaged.module), list(run.network.parameters())
@@ -137,7 +149,7 @@ def test_a_step_that_is_not_finite_changes_nothing():
 def test_weights_that_are_not_finite_are_not_written(tmp_path):
     run = run_of()
     torch.nn.init.constant_(run.network.to_match.weight, torch.nan)
-    assert "expected finite weights" in complaint(run.save, tmp_path, Progress(), 0.0, {})
+    assert "expected finite weights" in complaint(run.save, tmp_path, RunProgress(), 0.0, {})
     assert not list(tmp_path.iterdir())
 
 
@@ -145,9 +157,9 @@ def test_the_files_of_a_run_are_where_another_goes_on(tmp_path):
     (tmp_path / "out").mkdir()
     run = run_of()
     step(run)
-    progress = Progress(seconds=60.0, steps=1, optimiser_steps=1, pairs=2, batches=3)
+    progress = RunProgress(seconds=60.0, steps=1, optimiser_steps=1, pairs=2, batches=3)
     run.save(tmp_path / "out", progress, 0.5, {"epe_px": 2.0})
-    found = standing(RECIPE, tmp_path / "next", tmp_path / "out", "abc")
+    found = find_resume_point(RECIPE, tmp_path / "next", tmp_path / "out", "abc")
     assert found.progress == progress
     assert (found.checkpoint.commit, found.checkpoint.hours, found.checkpoint.step) == ("abc", 0.5, 1)
     other = run_of(found.checkpoint, found.optimiser)
@@ -161,36 +173,36 @@ def test_of_two_folders_the_one_that_is_further_counts(tmp_path):
     run = run_of()
     for name, seconds in (("out", 10.0), ("earlier", 20.0)):
         (tmp_path / name).mkdir()
-        run.save(tmp_path / name, Progress(seconds=seconds, optimiser_steps=9), 0.0, {})
-    (tmp_path / "earlier" / OPTIMISER).unlink()
-    found = standing(RECIPE, tmp_path / "out", tmp_path / "earlier", "")
+        run.save(tmp_path / name, RunProgress(seconds=seconds, optimiser_steps=9), 0.0, {})
+    (tmp_path / "earlier" / OPTIMISER_FILE).unlink()
+    found = find_resume_point(RECIPE, tmp_path / "out", tmp_path / "earlier", "")
     assert found.progress.seconds == 20
     # Without its state the optimiser warms up again.
     assert (found.optimiser, found.progress.optimiser_steps) == ({}, 0)
 
 
 def test_what_cannot_be_gone_on_from_is_named(tmp_path):
-    assert "bring all its files" in complaint(standing, RECIPE, tmp_path / "out", tmp_path, "")
-    run_of().save(tmp_path, Progress(), 0.0, {})
+    assert "bring all its files" in complaint(find_resume_point, RECIPE, tmp_path / "out", tmp_path, "")
+    run_of().save(tmp_path, RunProgress(), 0.0, {})
     other = replace(RECIPE, model="weave_base")
     assert "expected a run of weave_base, found one of weave_small" in complaint(
-        standing, other, tmp_path, None, ""
+        find_resume_point, other, tmp_path, None, ""
     )
-    (tmp_path / PROGRESS).write_text("{}x")
-    assert "expected the progress of a timed run" in complaint(standing, RECIPE, tmp_path, None, "")
+    (tmp_path / PROGRESS_FILE).write_text("{}x")
+    assert "expected the progress of a timed run" in complaint(find_resume_point, RECIPE, tmp_path, None, "")
 
 
 @pytest.mark.parametrize("name", ["base", "small"])
 def test_what_is_brought_back_is_below_16_mib_a_file(name, tmp_path, monkeypatch):
     monkeypatch.chdir(GPU.parents[1])
     recipe = read_recipe(GPU / f"{name}.toml")
-    start = standing(recipe, tmp_path, None, "").checkpoint
+    start = find_resume_point(recipe, tmp_path, None, "").checkpoint
     run = TimedRun(start, {}, CPU)
-    run.begin(run.moved(batch()))
+    run.begin(run.move_to_device(batch()))
     run.optimiser.step()
-    run.save(tmp_path, Progress(), 0.0, {})
+    run.save(tmp_path, RunProgress(), 0.0, {})
     assert max(file.stat().st_size for file in tmp_path.iterdir()) < 16 * 2**20
-    assert checkpoint.load(tmp_path / NETWORK).recipe == recipe
+    assert checkpoint.load(tmp_path / NETWORK_FILE).recipe == recipe
 
 
 class Seconds:
@@ -232,7 +244,7 @@ def dataset(folder):
 
 def test_painters_go_on_when_one_of_them_is_killed(tmp_path):
     recipe = read_recipe(dataset(tmp_path))
-    with Painters([recipe, cooling(recipe, (16, 32))], tmp_path, processes=2) as painters:
+    with Painters([recipe, make_cool_down_recipe(recipe, (16, 32))], tmp_path, processes=2) as painters:
         first = painters.take()
         assert {name: tuple(value.shape) for name, value in first.items()} == {
             "left": (2, 3, 32, 32),
@@ -260,15 +272,15 @@ def test_a_command_that_is_killed_is_gone_on_from_to_the_end_of_the_time(tmp_pat
             stderr=log,
             env={**os.environ, "OMP_NUM_THREADS": "1"},
         )
-        while not (out / PROGRESS).exists() and process.poll() is None:
+        while not (out / PROGRESS_FILE).exists() and process.poll() is None:
             time.sleep(0.01)
         process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL, (tmp_path / "log").read_text()
-    killed = json.loads((out / PROGRESS).read_text())
+    killed = json.loads((out / PROGRESS_FILE).read_text())
 
     monkeypatch.setattr(timed, "time", Seconds())
     lines = []
-    command = Command(
+    command = TimedCommand(
         out=tmp_path / "next",
         earlier=out,
         began_s=0.0,
@@ -281,7 +293,7 @@ def test_a_command_that_is_killed_is_gone_on_from_to_the_end_of_the_time(tmp_pat
     progress = train_by_clock(read_recipe(recipe_file), command, lines.append)
     assert progress.steps > 5
     assert progress.skipped == 0
-    last = checkpoint.load(command.out / NETWORK)
+    last = checkpoint.load(command.out / NETWORK_FILE)
     assert last.step == progress.steps
     assert all(value.isfinite().all() for value in (*last.weights.values(), *last.averaged.values()))
     assert last.scores["epe_px"] < math.inf
@@ -300,7 +312,7 @@ def test_a_second_step_in_500_that_is_not_finite_ends_the_run(tmp_path, monkeypa
     # The steps of the smoke test have a rate of 0.
     monkeypatch.setattr(TimedRun, "finish", lambda *given: math.nan if given[2] else finish(*given))
     lines = []
-    command = Command(
+    command = TimedCommand(
         out=tmp_path / "out", began_s=0.0, minutes=9, total_minutes=9, device="cpu", processes=1
     )
     assert "steps 0 and 1: expected a finite loss" in complaint(train_by_clock, recipe, command, lines.append)

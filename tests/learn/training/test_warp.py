@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from stereoweave.learn.training.warp import disparity_of_depth, reconstruct_left
+from stereoweave.learn.training.warp import depth_to_disparity, reconstruct_left
 
 
 def reconstructed_plainly(right, disparity_px):
@@ -81,14 +81,14 @@ def test_disparity_is_focal_length_times_baseline_over_depth_less_doffs_for_each
     depth_m = torch.tensor([2.0, 4.0]).view(2, 1, 1, 1)
     focal_baseline_px_m = torch.tensor([100.0, 60.0]).view(2, 1, 1, 1)
     doffs_px = torch.tensor([0.0, 5.0]).view(2, 1, 1, 1)
-    found_px = disparity_of_depth(depth_m, focal_baseline_px_m, doffs_px, width_px=640)
+    found_px = depth_to_disparity(depth_m, focal_baseline_px_m, doffs_px, width_px=640)
     assert found_px.flatten().tolist() == [50.0, 10.0]
 
 
 @pytest.mark.parametrize("doffs_px", [0.0, 30.0, -30.0])
 def test_at_depth_zero_the_disparity_is_finite_and_every_match_outside(doffs_px):
     depth_m = torch.tensor([0.0, 1e-30, 0.05, 4.0], dtype=torch.float64).view(1, 1, 1, 4).requires_grad_()
-    disparity_px = disparity_of_depth(depth_m, constant(60.0), constant(doffs_px), width_px=640)
+    disparity_px = depth_to_disparity(depth_m, constant(60.0), constant(doffs_px), width_px=640)
     disparity_px.sum().backward()
     near_px = disparity_px.flatten()[:3]
     assert ((near_px >= 639.5) & (near_px <= 640 + 2 * 30)).all()
@@ -98,5 +98,5 @@ def test_at_depth_zero_the_disparity_is_finite_and_every_match_outside(doffs_px)
 def test_the_gradient_of_disparity_is_that_of_its_value():
     depth_m = torch.tensor([0.01, 0.5, 3.0], dtype=torch.float64).view(1, 1, 1, 3).requires_grad_()
     assert torch.autograd.gradcheck(
-        lambda z: disparity_of_depth(z, constant(60.0), constant(2.0), 640), depth_m
+        lambda z: depth_to_disparity(z, constant(60.0), constant(2.0), 640), depth_m
     )

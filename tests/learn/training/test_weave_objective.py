@@ -6,9 +6,9 @@ import pytest
 import torch
 from learn_examples import RECIPE, untrained
 
-from stereoweave.learn.models.weave import Stages
-from stereoweave.learn.training.losses import regression, weave_losses
-from stereoweave.learn.training.objective import WeaveObjective, objective_of
+from stereoweave.learn.models.weave import WeaveStages
+from stereoweave.learn.training.losses import regression_loss, weave_losses
+from stereoweave.learn.training.objective import WeaveObjective, build_objective
 
 LEVELS = 4
 
@@ -22,7 +22,7 @@ def prediction(estimate_px=5.0, level_px=4, height=16, width=32):
         "disparity_px": torch.full((2, 1, height, width), estimate_px),
         "confidence_logit": torch.zeros(2, 1, height, width),
     }
-    return Stages(**{name: values.requires_grad_() for name, values in maps.items()})
+    return WeaveStages(**{name: values.requires_grad_() for name, values in maps.items()})
 
 
 def batch_of(truth_px, height=16, width=32):
@@ -44,9 +44,9 @@ def test_a_recipe_that_says_nothing_has_the_loss_as_it_was_to_the_last_bit():
     network, batch = untrained(), batch_of(7.3, 32, 64)
     with torch.no_grad():
         predicted = network.stages(batch["left"], batch["right"])
-    found = objective_of(RECIPE, network).losses(predicted, batch)
+    found = build_objective(RECIPE, network).losses(predicted, batch)
     assert found == weave_losses(predicted, batch["disparity_px"], batch["occluded"])
-    assert found["disparity"] == regression(predicted.disparity_px, batch["disparity_px"])
+    assert found["disparity"] == regression_loss(predicted.disparity_px, batch["disparity_px"])
     assert list(found) == ["correlation", "scores", "coarse", "disparity", "confidence"]
 
 
