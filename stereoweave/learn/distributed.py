@@ -5,7 +5,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.system.threads import usable_cores
@@ -53,19 +52,12 @@ def report_once() -> Iterator[None]:
 
 
 def choose_thread_count() -> int | None:
-    """Threads for each of torchrun's processes here; None where PyTorch or the user has decided.
+    """Threads for this process: an equal share of the machine's cores; None to keep PyTorch's choice.
 
-    Where the user has not, torchrun gives each process one, however many cores there are.
+    None in a single process, and where OMP_NUM_THREADS is above 1. A value of 1 is what torchrun sets by
+    default, however many cores there are, so it does not count as a choice.
     """
     here = read_rank().local_world_size
-    if here == 1 or "OMP_NUM_THREADS" in _environment_of_torchrun():
+    if here == 1 or os.environ.get("OMP_NUM_THREADS", "1") != "1":
         return None
     return max(1, usable_cores() // here)
-
-
-def _environment_of_torchrun() -> str:
-    """What torchrun was started with, before it set variables itself; "" where that cannot be read."""
-    try:
-        return Path(f"/proc/{os.getppid()}/environ").read_text(errors="replace")
-    except OSError:
-        return ""

@@ -1,13 +1,10 @@
-import os
-import subprocess
-import sys
 import time
 
 import pytest
 from learn_examples import complaint
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.learn import distributed as the_ranks
+from stereoweave.learn import distributed
 from stereoweave.learn.distributed import ProcessRank, choose_thread_count, read_rank, report_once
 
 
@@ -59,26 +56,19 @@ def test_who_only_finds_that_another_process_is_gone_waits_too(started, monkeypa
     assert waited == [20, 20]
 
 
-def test_processes_of_a_machine_share_its_cores_unless_the_user_said_how(started, monkeypatch):
-    monkeypatch.setattr(the_ranks, "usable_cores", lambda: 12)
+def test_processes_of_a_machine_share_its_cores_unless_the_user_chose_threads(started, monkeypatch):
+    monkeypatch.setattr(distributed, "usable_cores", lambda: 12)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     assert choose_thread_count() is None
     started(1, 8, 5)
-    monkeypatch.setattr(the_ranks, "_environment_of_torchrun", lambda: "PATH=/bin\0HOME=/")
     assert choose_thread_count() == 2
-    monkeypatch.setattr(the_ranks, "_environment_of_torchrun", lambda: "OMP_NUM_THREADS=1\0HOME=/")
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
     assert choose_thread_count() is None
 
 
-def test_the_environment_is_the_one_that_the_parent_was_started_with():
-    """Not the one it has made of it since, as torchrun does."""
-    child = "from stereoweave.learn.distributed import _environment_of_torchrun as found; print(found())"
-    parent = (
-        "import os, subprocess, sys; os.environ['OMP_NUM_THREADS'] = '1'; "
-        f"subprocess.run([sys.executable, '-c', {child!r}], check=True)"
-    )
-    without = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
-    for environment, named in ((without, False), ({**without, "OMP_NUM_THREADS": "3"}, True)):
-        done = subprocess.run(
-            [sys.executable, "-c", parent], env=environment, capture_output=True, check=True
-        )
-        assert (b"OMP_NUM_THREADS=" in done.stdout) == named
+def test_the_one_thread_that_torchrun_sets_is_no_choice_of_the_user(started, monkeypatch):
+    monkeypatch.setattr(distributed, "usable_cores", lambda: 12)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    assert choose_thread_count() is None
+    started(1, 8, 5)
+    assert choose_thread_count() == 2
