@@ -26,7 +26,6 @@ from rich.console import Console
 from torch import nn
 from torch.distributed.distributed_c10d import PrefixStore
 from torch.distributed.rendezvous import rendezvous
-from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader
 
 from stereoweave.errors import FormatError, StereoweaveError
@@ -40,6 +39,7 @@ from stereoweave.learn.distributed import ProcessRank, choose_thread_count, read
 from stereoweave.learn.models import build_network
 from stereoweave.learn.recipe import COLLAGE, Recipe, read_recipe
 from stereoweave.learn.training.accumulation import StepSums
+from stereoweave.learn.training.model_state import STEPS_BETWEEN_SKIPS, ModelState
 from stereoweave.learn.training.objective import build_objective, fit_recipe, name_in_errors
 from stereoweave.learn.training.scores import validate_by_class
 from stereoweave.system.progress import progress
@@ -48,8 +48,6 @@ from stereoweave.system.progress import progress
 SCORES_FILE = "validation.csv"
 # A killed run loses no more than this, beside what it lost since its last validation.
 _SAVE_EVERY_S = 600
-# Steps with a loss or gradient that is not finite are skipped; a second one within this many stops the run.
-_STEPS_BETWEEN_SKIPS = 500
 # What a run may go on with where its recipe says otherwise than its last checkpoint's.
 _RESUMABLE = ("steps", "cool_down_steps", "mix", "pair_size", "crop_size", "validate_every", "held_out")
 # The others wait for the first one however long it makes pairs or scores: should it die, torchrun ends them.
@@ -81,6 +79,7 @@ def train_recipe(recipe: Recipe, out: Path, console: Console) -> Path:
 
 
 def _train(recipe: Recipe, out: Path, console: Console) -> Path:
+    _keep_freed_memory()
     last = out / "last.pt"
     logger = TensorBoardLogger(out, name="", version="")
     fabric = _make_fabric(logger)
@@ -91,7 +90,7 @@ def _train(recipe: Recipe, out: Path, console: Console) -> Path:
         raise _folder_not_shared(out)
     if start.step == recipe.steps:
         return last
-    run = TrainingRun(recipe, start, logger, fabric)
+    run = TrainingRun(recipe, start, fabric)
     batches = Batches(recipe, pairs, read_rank())
     with close_curves(logger), progress(console) as bar:
         task = bar.add_task(recipe.name, total=recipe.steps, completed=run.start.step, loss="", rate="")
@@ -168,35 +167,16 @@ def close_curves(logger: TensorBoardLogger) -> Iterator[TensorBoardLogger]:
         logger.finalize("left")
 
 
-class TrainingRun:
-    """The moving parts of a training: network, average, optimiser, and the machine they are on."""
+class TrainingRun(ModelState):
+    """The state of a run of `train`, and the processes and devices that train it."""
 
-    def __init__(
-        self, recipe: Recipe, start: Checkpoint, logger: TensorBoardLogger, fabric: Fabric | None = None
-    ) -> None:
-        self.recipe, self.start, self.by_class = recipe, start, open_held_out_sets(recipe)
-        _keep_freed_memory()
-        self.fabric = fabric or _make_fabric(logger)
-        self.network = build_network(recipe)
-        self.network.load_state_dict(start.weights)
-        self.objective = build_objective(recipe, self.network)
-        for layer in self.network.modules():
-            if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
-                # What bfloat16 convolutions on the CPU are fast in: three times the other layout.
-                layer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        average = partial(_update_average, recipe.averaged_steps)
-        self.averaged = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
-        self.averaged.module.load_state_dict(start.averaged)
+    def __init__(self, recipe: Recipe, start: Checkpoint, fabric: Fabric) -> None:
+        self.recipe, self.fabric, self.by_class = recipe, fabric, open_held_out_sets(recipe)
+        update_average = partial(_update_average, recipe.averaged_steps)
+        super().__init__(start, fabric.device, update_average, start.optimiser)
         self.averaged.n_averaged.fill_(start.step)
-        self.averaged.to(self.fabric.device)
-        self.fabric.to_device(self.network)
         if self.fabric.world_size > 1 and self.fabric.device.type == "cuda":
             nn.SyncBatchNorm.convert_sync_batchnorm(self.network)  # type: ignore[no-untyped-call]
-        self.optimiser = torch.optim.AdamW(
-            self.network.parameters(), recipe.learning_rate, weight_decay=recipe.weight_decay, fused=True
-        )
-        if start.optimiser:
-            self.optimiser.load_state_dict(start.optimiser)
         torch.set_rng_state(start.random_state)
         self.began_s = self.saved_s = time.monotonic()
         self.scores = start.scores
@@ -216,7 +196,7 @@ class TrainingRun:
         sums = StepSums(self.network)
         terms = self._gradient(step, self.fabric.to_device(batch), batches, sums)
         value = terms.pop("loss")
-        norm = nn.utils.clip_grad_norm_(self.network.parameters(), max_norm=5.0)
+        norm = self.clip_gradient()
         if not (np.isfinite(value) and norm.isfinite()):
             sums.undo()
             found = f"the loss is {value}"
@@ -252,7 +232,7 @@ class TrainingRun:
 
     def _skip(self, step: int, found: str, batches: Batches) -> None:
         found = f"step {step}: {found}; its pairs are {', '.join(batches.names(step))}"
-        if self.skipped and step - self.skipped[-1] < _STEPS_BETWEEN_SKIPS:
+        if self.skipped and step - self.skipped[-1] < STEPS_BETWEEN_SKIPS:
             raise StereoweaveError(f"{found}; step {self.skipped[-1]} was skipped for the like")
         self.skipped.append(step)
         self.fabric.log_dict({"skipped_steps": float(len(self.skipped))}, step)

@@ -23,13 +23,12 @@ from stereoweave.learn.data.pair_cache import CachedPairs
 from stereoweave.learn.data.sources import PairSource, open_sources
 from stereoweave.learn.recipe import Recipe
 from stereoweave.learn.training.clock import RESERVE_S, RunClock, is_cooling_down, learning_rate_at
+from stereoweave.learn.training.model_state import STEPS_BETWEEN_SKIPS
 from stereoweave.learn.training.timed_run import NETWORK_FILE, RunProgress, TimedRun, find_resume_point
 
 Report = Callable[[str], None]
 
 _REPORT_EVERY_S, _SAVE_EVERY_S = 15.0, 60.0
-# A step without a finite loss and gradient is skipped; a second one within this many ends the run.
-_STEPS_BETWEEN_SKIPS = 500
 _TRIED_STEPS = 3
 # bfloat16 keeps 8 bits: a loss computed in it is off by less than this share.
 _BFLOAT16_SHARE = 0.05
@@ -201,7 +200,7 @@ class _TimedLoop:
     def _skip(self, before: RunProgress) -> None:
         self.report(f"step {before.steps}: the loss or its gradient is not finite; skipped")
         last = before.last_skipped
-        if last is not None and before.steps - last < _STEPS_BETWEEN_SKIPS:
+        if last is not None and before.steps - last < STEPS_BETWEEN_SKIPS:
             raise StereoweaveError(
                 f"steps {last} and {before.steps}: expected a finite loss and gradient, found none; "
                 f"lower the learning rate, and go on from {self.out}"

@@ -8,21 +8,18 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.files import replacing
 from stereoweave.learn import checkpoint
 from stereoweave.learn.checkpoint import Checkpoint, Weights
-from stereoweave.learn.models import build_network
 from stereoweave.learn.recipe import Recipe
-from stereoweave.learn.training.objective import build_objective
+from stereoweave.learn.training.model_state import ModelState
 
 # A checkpoint without the optimiser's state, which `stereoweave train` starts from and `export` takes; that
 # state; and how far the run is.
 NETWORK_FILE, OPTIMISER_FILE, PROGRESS_FILE = "network.pt", "optimiser.pt", "progress.json"
-
-_LARGEST_GRADIENT = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,27 +97,16 @@ def _read_optimiser(path: Path) -> dict[str, Any]:
     return torch.load(path, map_location="cpu", weights_only=True) if path.exists() else {}
 
 
-class TimedRun:
-    """Network, average and optimiser of a run, on a device."""
+class TimedRun(ModelState):
+    """The state of a run on one device, and the steps that change it."""
 
     def __init__(self, start: Checkpoint, optimiser: dict[str, Any], device: torch.device) -> None:
-        recipe = start.recipe
-        self.start, self.device = start, device
+        update_average = get_ema_multi_avg_fn(1 - 1 / start.recipe.averaged_steps)  # type: ignore[no-untyped-call]
+        super().__init__(start, device, update_average, optimiser)
+        self.device = device
         self.bfloat16 = device.type == "cuda" and torch.cuda.is_bf16_supported()
-        self.network: Any = build_network(recipe)
-        self.network.load_state_dict(start.weights)
-        self.network.to(device=device, memory_format=torch.channels_last)
-        self.objective = build_objective(recipe, self.network)
-        average = get_ema_multi_avg_fn(1 - 1 / recipe.averaged_steps)  # type: ignore[no-untyped-call]
-        self.averaged = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
-        self.averaged.module.load_state_dict(start.averaged)
-        # From 0 the first update would take the weights themselves. On the CPU it is read without waiting.
+        # At 0 the first update would copy the weights. On the CPU it is read without waiting for the GPU.
         self.averaged.n_averaged = torch.ones((), dtype=torch.long)
-        self.optimiser = torch.optim.AdamW(
-            self.network.parameters(), recipe.learning_rate, weight_decay=recipe.weight_decay, fused=True
-        )
-        if optimiser:
-            self.optimiser.load_state_dict(optimiser)
 
     def move_to_device(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """A batch of `Painters` on the device, with images in 0..1."""
@@ -145,7 +131,7 @@ class TimedRun:
 
     def finish(self, loss: Tensor, learning_rate: float) -> float:
         """Take the step where its loss and gradient are finite; returns the loss, NaN where they are not."""
-        norm = nn.utils.clip_grad_norm_(self.network.parameters(), _LARGEST_GRADIENT)
+        norm = self.clip_gradient()
         value, length = torch.stack([loss.float(), norm.float()]).tolist()
         if not (math.isfinite(value) and math.isfinite(length)):
             self._restore_statistics()

@@ -168,7 +168,7 @@ def test_a_run_goes_on_with_another_end_and_other_data(folder, finished):
 
 def test_a_run_is_kept_every_ten_minutes(folder, recipe_file, tmp_path, logger, monkeypatch):
     last = tmp_path / "last.pt"
-    run = TrainingRun(RECIPE, training._load_start(RECIPE, last), logger)
+    run = TrainingRun(RECIPE, training._load_start(RECIPE, last), training._make_fabric(logger))
     run.save_periodically(3, last)
     assert not last.exists()
     now = time.monotonic()
@@ -241,7 +241,9 @@ def test_a_pair_that_cannot_be_trained_on_is_named_in_one_line(tmp_path):
 
 def test_a_truth_out_of_range_is_named_with_the_pairs_of_its_step(tmp_path, logger):
     recipe = recipe_of("fast_depth", target="depth", max_depth_m=1.0)
-    run = TrainingRun(recipe, training._load_start(recipe, tmp_path / "last.pt"), logger)
+    run = TrainingRun(
+        recipe, training._load_start(recipe, tmp_path / "last.pt"), training._make_fabric(logger)
+    )
     batches = Batches(recipe, CAMERA_PAIRS)
     message = complaint(run.step, 0, batches[0], batches)
     assert message.startswith(f"step 0: one of {', '.join(batches.names(0))}: depth: expected more than 0")
@@ -257,7 +259,9 @@ def test_weights_of_another_network_are_refused_as_a_start(finished, tmp_path):
 
 def test_a_gradient_that_is_not_finite_never_reaches_the_weights_and_twice_stops(tmp_path, logger, caplog):
     recipe = recipe_of("fast_depth")
-    run = TrainingRun(recipe, training._load_start(recipe, tmp_path / "last.pt"), logger)
+    run = TrainingRun(
+        recipe, training._load_start(recipe, tmp_path / "last.pt"), training._make_fabric(logger)
+    )
     network = run.network
     before = {name: value.clone() for name, value in network.state_dict().items()}
     # A product with infinity makes the gradient infinite and leaves the loss as it was.
@@ -297,7 +301,7 @@ def test_a_run_into_a_file_fails_before_any_pair_is_made(recipe_file, tmp_path):
 
 def step_of(recipe, folder, logger, steps=1):
     """The first steps of a recipe on pairs in memory: the run after them, and every parameter before."""
-    run = TrainingRun(recipe, training._load_start(recipe, folder / "last.pt"), logger)
+    run = TrainingRun(recipe, training._load_start(recipe, folder / "last.pt"), training._make_fabric(logger))
     before = {name: value.clone() for name, value in run.network.named_parameters()}
     batches = Batches(recipe, CAMERA_PAIRS)
     for step in range(steps):
@@ -373,7 +377,9 @@ def test_a_step_computes_in_bfloat16_where_the_device_does(
     folder, tmp_path, monkeypatch, logger, precision, dtype
 ):
     monkeypatch.setattr(training, "_choose_precision", lambda: precision)
-    run = TrainingRun(RECIPE, training._load_start(RECIPE, tmp_path / "last.pt"), logger)
+    run = TrainingRun(
+        RECIPE, training._load_start(RECIPE, tmp_path / "last.pt"), training._make_fabric(logger)
+    )
     seen = []
     run.network.to_match.register_forward_hook(lambda _layer, _inputs, output: seen.append(output.dtype))
     batches = Batches(RECIPE, CachedPairs(folder / "pairs", RECIPE.seed, RECIPE.pairs, PAIR_SIZE))
