@@ -1,4 +1,4 @@
-"""Checkpoints: everything that a killed run needs to go on as if nothing had happened."""
+"""Checkpoints: the complete state of a run, from which an interrupted run resumes exactly."""
 
 import os
 import subprocess
@@ -20,14 +20,14 @@ class Checkpoint:
     """The state of a run after `step` steps.
 
     Attributes:
-        weights: of the network as it is trained.
-        averaged: their running average, which is what scores and ships.
-        optimiser: the optimiser's state; empty in a checkpoint that only starts other runs.
-        random_state: PyTorch's; every other draw depends on (seed, step) alone.
-        scores: of the last validation.
-        commit: of the code that trained.
-        hours: of training so far, over all restarts and the run it started from.
-        origin: recipe, step and commit of the checkpoints it came from, the first one first.
+        weights: The network's current weights.
+        averaged: Running average of the weights; scored and exported.
+        optimiser: The optimiser's state; empty in a checkpoint that only starts other runs.
+        random_state: PyTorch's random state. Every other draw depends on (seed, step) alone.
+        scores: Scores of the last validation.
+        commit: Commit of the code that trained.
+        hours: Training time so far, over all restarts and the run it started from.
+        origin: Recipe, step and commit of each checkpoint the run descends from, oldest first.
     """
 
     recipe: Recipe
@@ -42,15 +42,17 @@ class Checkpoint:
     origin: tuple[dict[str, Any], ...] = ()
 
     def as_origin(self) -> tuple[dict[str, Any], ...]:
-        """The origin of a run that starts from this one."""
+        """The origin of a run that starts from this checkpoint."""
         return *self.origin, {"recipe": asdict(self.recipe), "step": self.step, "commit": self.commit}
 
 
 def make_initial(recipe: Recipe, commit: str) -> Checkpoint:
-    """The start of a run: the averaged weights of `start_from` where the network has such, else random ones.
+    """Make the checkpoint of a new run.
+
+    Its weights are the averaged ones of the recipe's `start_from` where name and shape match, else random.
 
     Raises:
-        FormatError: `start_from` is no checkpoint, or shares no weights with the network.
+        FormatError: `start_from` is not a checkpoint, or shares no weights with the network.
     """
     torch.manual_seed(recipe.seed)
     weights: Weights = build_network(recipe).state_dict()
@@ -74,9 +76,9 @@ def make_initial(recipe: Recipe, commit: str) -> Checkpoint:
 
 
 def _take_weights(fresh: Weights, earlier: Checkpoint, recipe: Recipe) -> Weights:
-    """An earlier network's averaged weights where this one has such of the same shape, else fresh ones."""
+    """The earlier run's averaged weights where name and shape match, else the fresh ones."""
     taken = {
-        name: value.to(fresh[name].dtype)  # kept in half precision, perhaps
+        name: value.to(fresh[name].dtype)  # may be in half precision
         for name, value in earlier.averaged.items()
         if name in fresh and value.shape == fresh[name].shape
     }
@@ -89,7 +91,7 @@ def _take_weights(fresh: Weights, earlier: Checkpoint, recipe: Recipe) -> Weight
 
 
 def strip_to_average(kept: Checkpoint) -> Checkpoint:
-    """The checkpoint with nothing but its averaged weights, in half precision: to start other runs from."""
+    """Strip a checkpoint to its averaged weights in half precision, for other runs to start from."""
     weights = {
         name: value.half() if value.is_floating_point() else value for name, value in kept.averaged.items()
     }
@@ -97,13 +99,13 @@ def strip_to_average(kept: Checkpoint) -> Checkpoint:
 
 
 def average(first: Checkpoint, second: Checkpoint, start: Checkpoint) -> Checkpoint:
-    """What lies half-way between two runs that went on from `start`, to start a further run from.
+    """Average two runs that both continued from `start`, as the start of a further run.
 
-    The mean of two networks that were trained on from one is often better than either (Wortsman et al.,
-    "Model soups", ICML 2022); running variances are means too.
+    The mean of two networks fine-tuned from the same weights is often better than either (Wortsman et al.,
+    "Model soups", ICML 2022). Running variances are averaged too.
 
     Raises:
-        FormatError: One of the two did not go on from `start`.
+        FormatError: One of the two did not continue from `start`.
     """
     for run in (first, second):
         if _list_origins(run.origin) != _list_origins(start.as_origin()):
@@ -124,17 +126,17 @@ def average(first: Checkpoint, second: Checkpoint, start: Checkpoint) -> Checkpo
 
 
 def _list_origins(origin: tuple[dict[str, Any], ...]) -> list[tuple[str, int]]:
-    # Not the recipes, which have had more keys since.
+    # Without the recipes: old ones lack keys that were added later.
     return [(past["commit"], past["step"]) for past in origin]
 
 
 def _midpoint(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    # A batch norm counts its batches in whole numbers.
+    # Batch counts of batch norms are integers.
     return (first + second) / 2 if first.is_floating_point() else first
 
 
 def save(checkpoint: Checkpoint, path: Path) -> None:
-    """Write a checkpoint whole or not at all."""
+    """Write a checkpoint atomically."""
     temporary = path.with_name(path.name + ".part")
     values = {**vars(checkpoint), "recipe": asdict(checkpoint.recipe)}
     with temporary.open("wb") as stream:
@@ -145,18 +147,18 @@ def save(checkpoint: Checkpoint, path: Path) -> None:
 
 
 def load(path: Path) -> Checkpoint:
-    """The checkpoint of a file, on the CPU; FormatError if it is none."""
+    """Load a checkpoint to the CPU. Raises FormatError if the file is missing or not a checkpoint."""
     try:
         values = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise FormatError(
             f"{path}: no such checkpoint; `stereoweave train` writes last.pt into its run"
         ) from error
-    except Exception as error:  # other bytes lead PyTorch's reader to any error whatever
+    except Exception as error:  # PyTorch's reader raises any type of error on invalid bytes
         raise FormatError(
             f"{path}: expected a checkpoint of `stereoweave train`, found {reason(error)}"
         ) from error
-    # Checkpoints written before there was an origin have none.
+    # Older checkpoints have no origin.
     if not isinstance(values, dict) or {*values, "origin"} != {field.name for field in fields(Checkpoint)}:
         raise FormatError(
             f"{path}: expected a checkpoint of `stereoweave train`, found something else that PyTorch saved"
@@ -165,9 +167,9 @@ def load(path: Path) -> Checkpoint:
 
 
 def find_commit() -> str:
-    """The commit of the code that runs, '+' behind it where files were changed; 'unknown' outside git."""
+    """Commit of the running code, followed by '+' if files were changed; 'unknown' outside git."""
     try:
-        # Of the package's own repository alone: an installed package may lie in somebody else's.
+        # Only this package's repository: an installed package may lie inside an unrelated one.
         described = subprocess.run(
             ["git", "--git-dir=.git", "describe", "--always", "--dirty=+", "--exclude=*"],
             cwd=Path(__file__).parents[2], capture_output=True, text=True, check=True,

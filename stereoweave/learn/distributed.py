@@ -1,4 +1,4 @@
-"""The processes that train one network together: torchrun's, or this one alone."""
+"""The processes that train one network together: the ranks that torchrun started, or this process alone."""
 
 import os
 import time
@@ -9,26 +9,26 @@ from dataclasses import dataclass
 from stereoweave.errors import StereoweaveError
 from stereoweave.system.threads import usable_cores
 
-# How long a process waits with an error for another one to tell it, by which torchrun ends them all.
+# Delay of a secondary error: time for the rank that failed first to exit, upon which torchrun ends all ranks.
 _PATIENCE_S = 20.0
 
 
 @dataclass(frozen=True)
 class ProcessRank:
-    """Which of the processes this is, how many there are, and how many of them on this machine."""
+    """This process's rank, and the number of ranks in all and on this machine."""
 
     rank: int = 0
     world_size: int = 1
     local_world_size: int = 1
 
     def own_micro_batches(self, count: int) -> range:
-        """Those of so many micro-batches that this process makes: neighbours, and nobody else's."""
+        """Indices of this rank's micro-batches among the `count` of a step; ranks do not overlap."""
         own = count // self.world_size
         return range(self.rank * own, (self.rank + 1) * own)
 
 
 def read_rank() -> ProcessRank:
-    """As torchrun started this process; one process alone where it did not."""
+    """Read the rank that torchrun gave this process. Without torchrun: rank 0 of 1."""
     if "TORCHELASTIC_RUN_ID" not in os.environ:
         return ProcessRank()
     return ProcessRank(*(int(os.environ[name]) for name in ("RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE")))
@@ -36,17 +36,17 @@ def read_rank() -> ProcessRank:
 
 @contextmanager
 def report_once() -> Iterator[None]:
-    """An error leaves the block in one process alone: in the first one, where all of them have it.
+    """Report an error once: from rank 0 if it occurs in every rank.
 
-    The others wait until torchrun ends them for that, and so does the first one where it only finds that
-    another one is gone. An error that is theirs alone leaves it a little later.
+    Errors of the other ranks, and connection errors of rank 0, leave the block 20 s later. By then torchrun
+    has usually ended the process because of the rank that failed first.
     """
     try:
         yield
     except Exception as error:
         own = read_rank()
-        to_tell = isinstance(error, StereoweaveError | OSError)
-        if own.rank > 0 or (own.world_size > 1 and not to_tell):
+        own_error = isinstance(error, StereoweaveError | OSError)
+        if own.rank > 0 or (own.world_size > 1 and not own_error):
             time.sleep(_PATIENCE_S)
         raise
 

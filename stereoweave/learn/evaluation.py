@@ -1,4 +1,4 @@
-"""Trained networks on the pairs that were held out from them: what `stereoweave bench networks` prints."""
+"""Scores of trained networks on their held-out pairs, for `stereoweave bench networks`."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,23 +20,23 @@ from stereoweave.learn.training.objective import CodeObjective
 from stereoweave.stereo import Sample
 
 MEDIAN = "median"
-# Pairs, and every so many pixels of them along both sides, that a median is taken over.
+# The median is taken over this many pairs, and every 8th row and column.
 _MEDIAN_PAIRS, _MEDIAN_STRIDE = 400, 8
 
 
 def evaluate(runs: Sequence[Path], folder: Path, console: Console) -> list[ViewRow]:
-    """A row per run on all pairs held out from it, after ground truth, no warping, SGBM and the median.
+    """Score each run on all its held-out pairs, after ground truth, no warping, SGBM and the median.
 
-    "median" predicts the median disparity of the training pairs everywhere: what a network that looks at
-    nothing can reach.
+    "median" predicts the median disparity of the training pairs everywhere: the score of a network that
+    ignores the images.
 
     Args:
-        runs: Folders of `stereoweave train`, or checkpoints, all with the same held-out pairs.
-        folder: Where collage pairs are kept; missing ones are made.
-        console: Where that is told.
+        runs: Run folders of `stereoweave train`, or checkpoints, all with the same held-out pairs.
+        folder: Cache folder of collage pairs; missing pairs are made.
+        console: Shows the progress of making pairs.
 
     Raises:
-        StereoweaveError: The runs do not share their held-out pairs, or two rows would bear one name.
+        StereoweaveError: The runs have different held-out pairs, or two rows would have the same name.
     """
     names = [run.name if run.is_dir() else run.stem for run in runs]
     _check_names(names)
@@ -53,7 +53,7 @@ def evaluate(runs: Sequence[Path], folder: Path, console: Console) -> list[ViewR
 
 
 def make_method(trained: Checkpoint) -> Method:
-    """The averaged network of a checkpoint as a function from a sample to its left view's disparity in px."""
+    """Wrap a checkpoint's averaged network as a function from a sample to the left view's disparity in px."""
     network = build_network(trained.recipe)
     network.load_state_dict(trained.averaged)
     network.eval()
@@ -72,7 +72,7 @@ def make_method(trained: Checkpoint) -> Method:
 
 
 def make_median_method(training: PairSource) -> Method:
-    """The median disparity of the training pairs, for every pixel of any sample."""
+    """A method that predicts the median disparity of the training pairs for every pixel."""
     some = range(0, training.count, max(1, training.count // _MEDIAN_PAIRS))
     values_px = [
         read_known(training, i).disparity_px[::_MEDIAN_STRIDE, ::_MEDIAN_STRIDE].ravel() for i in some
@@ -90,17 +90,18 @@ def _check_names(names: Sequence[str]) -> None:
 
 
 def _find_common_recipe(networks: dict[str, Checkpoint]) -> Recipe:
-    """The recipe of the first run, whose held-out pairs the others have to share."""
+    """The first run's recipe. Raises StereoweaveError if another run has other held-out pairs."""
     pairs = {name: identify_held_out(one.recipe) for name, one in networks.items()}
     first, *others = pairs
     for name in others:
         if pairs[name] != pairs[first]:
             raise StereoweaveError(
-                f"{name}: expected the pairs of {first}, {pairs[first]}, found {pairs[name]}; score it apart"
+                f"{name}: expected the pairs of {first}, {pairs[first]}, found {pairs[name]}; "
+                "score it separately"
             )
     return networks[first].recipe
 
 
 def identify_held_out(recipe: Recipe) -> tuple[object, ...]:
-    """What the recipe's held-out pairs depend on: runs that agree in it are scored on the same ones."""
+    """The settings that determine a recipe's held-out pairs; equal where the pairs are the same."""
     return recipe.dataset, recipe.root, recipe.split, recipe.pair_size, recipe.validation_pairs

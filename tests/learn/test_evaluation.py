@@ -159,7 +159,7 @@ def test_runs_with_other_held_out_pairs_are_scored_apart(folder):
     checkpoint.save(kept_of(replace(PAPER, validation_pairs=3)), folder / "more" / "last.pt")
     message = complaint(evaluate, [folder / "random", folder / "more"], folder / "pairs", QUIET)
     assert message.startswith("more: expected the pairs of random, (")
-    assert message.endswith("; score it apart")
+    assert message.endswith("; score it separately")
 
 
 @pytest.mark.parametrize("other", ["elsewhere/random", "median"])

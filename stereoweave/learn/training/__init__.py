@@ -1,1 +1,1 @@
-"""The loop, the objective and its losses."""
+"""Training loops, objectives and losses."""

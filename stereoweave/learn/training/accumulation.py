@@ -1,4 +1,4 @@
-"""A step's sums over its micro-batches, the same whether one process makes them all or many do."""
+"""Sums over a step's micro-batches, independent of how many processes compute them."""
 
 from collections.abc import Sequence
 
@@ -11,11 +11,11 @@ _BATCH_NORMS = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm
 
 
 class StepSums:
-    """Losses, gradients and batch norms' running statistics of the micro-batches of one step.
+    """Losses, gradients and batch-norm statistics, summed over the micro-batches of one step.
 
-    PyTorch's DistributedDataParallel adds gradients in float32, whose sums depend on their order, and so on
-    how many processes there are: losses then differ by 1 % after 50 steps of a small network. Here they are
-    added in float64; what their order changes there is lost again in float32, but for one in millions.
+    PyTorch's DistributedDataParallel adds gradients in float32. Such sums depend on the order of addition,
+    hence on the number of processes: losses differ by 1 % after 50 steps of a small network. Here they are
+    added in float64; rounding back to float32 hides the order, except for one value in millions.
     """
 
     def __init__(self, network: nn.Module) -> None:
@@ -27,19 +27,19 @@ class StepSums:
         self.count, self.total = 0, torch.zeros(())
 
     def add(self, losses: Sequence[Float[Tensor, ""]]) -> None:
-        """Add a micro-batch, after its gradient; the next begins with the statistics it began with."""
+        """Add a micro-batch after its backward pass, and reset the statistics to those before the step."""
         values = [*losses, *self._gradients(), *self.statistics]
-        # Apple's GPUs have no float64; of them there is never more than one.
+        # Apple's GPUs have no float64, but never run in groups either.
         exact = torch.float32 if losses[0].device.type == "mps" else torch.float64
         row = torch.cat([value.detach().flatten().to(exact) for value in values])
-        # In place, as below: of a large network they are as large as its optimiser.
+        # In place, as below: for a large network the sums take as much memory as the optimiser.
         self.total = self.total.add_(row) if self.count else row
         self.count += 1
         for value, before in zip(self.statistics, self.before, strict=True):
             value.copy_(before)
 
     def finish(self, fabric: Fabric, micro_batches: int) -> list[float]:
-        """Mean losses; gradients and statistics are set to their means over all processes' micro-batches."""
+        """Set gradients and statistics to their means over all ranks' micro-batches. Returns mean losses."""
         total = fabric.all_reduce(self.total, reduce_op="sum")
         assert isinstance(total, Tensor)
         into = [*self._gradients(), *self.statistics]
@@ -48,13 +48,13 @@ class StepSums:
         for value, mean in zip(into, means, strict=True):
             value.copy_(mean.view_as(value))
         for layer in self.norms:
-            # One step counts as one batch.
+            # A step counts as one batch.
             if layer.num_batches_tracked is not None:
                 layer.num_batches_tracked -= self.count - 1
         return losses.tolist()
 
     def undo(self) -> None:
-        """Give the batch norms the statistics that they had before the step."""
+        """Restore the batch-norm statistics from before the step."""
         for value, before in zip(self.statistics, self.before, strict=True):
             value.copy_(before)
         for layer in self.norms:

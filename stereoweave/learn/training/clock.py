@@ -1,22 +1,22 @@
-"""The time of a run that is done in several commands, and the learning rate along it."""
+"""Elapsed time of a run that spans several commands, and its learning-rate schedule."""
 
 from dataclasses import dataclass
 
 from stereoweave.learn.recipe import Recipe
 
-# The end of a command is for the validation and the last checkpoint.
+# Reserved at the end of a command for validation and the last checkpoint.
 RESERVE_S = 20.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunClock:
-    """How much of a run's time is used. Times `now_s` are those of `time.monotonic`.
+    """Elapsed and remaining time of a run. Arguments `now_s` are values of `time.monotonic`.
 
     Attributes:
         began_s: When this command began.
-        used_s: By the commands before.
-        minutes: Of this command.
-        total_minutes: Of all commands.
+        used_s: Seconds used by earlier commands.
+        minutes: Time limit of this command.
+        total_minutes: Time limit of all commands together.
     """
 
     began_s: float
@@ -25,27 +25,27 @@ class RunClock:
     total_minutes: float
 
     def used_at(self, now_s: float) -> float:
-        """Seconds of the run that are used."""
+        """Seconds of the run used so far."""
         return self.used_s + now_s - self.began_s
 
     def share_at(self, now_s: float) -> float:
-        """Share of the run's time that is used, 0 to 1; 1 is where the last command stops training."""
+        """Share of the run's time used so far, 0 to 1; at 1 the last command stops training."""
         return min(self.used_at(now_s) / (60 * self.total_minutes - RESERVE_S), 1.0)
 
     def left_at(self, now_s: float) -> float:
-        """Seconds that this command may still train; below 0 when it is late."""
+        """Seconds left to train in this command; negative when overdue."""
         of_run = 60 * self.total_minutes - self.used_at(now_s)
         of_command = 60 * self.minutes - (now_s - self.began_s)
         return min(of_run, of_command) - RESERVE_S
 
 
 def learning_rate_at(recipe: Recipe, optimiser_steps: int, share: float) -> float:
-    """The rate: up along the recipe's warm-up steps, constant, then down to 0 at the end of the time.
+    """The learning rate: linear warm-up over the recipe's steps, constant, then linear decay to 0 at the end.
 
     Args:
-        recipe: It cools down over the share `cool_down_steps / steps` of the time.
-        optimiser_steps: Since the optimiser began without a state.
-        share: Of the run's time that is used.
+        recipe: The decay takes the share `cool_down_steps / steps` of the time.
+        optimiser_steps: Steps since the optimiser started without a state.
+        share: Share of the run's time used so far.
     """
     warm_up = (optimiser_steps + 1) / max(recipe.warm_up_steps, 1)
     cool_down = (1 - share) * recipe.steps / max(recipe.cool_down_steps, 1)
@@ -53,5 +53,5 @@ def learning_rate_at(recipe: Recipe, optimiser_steps: int, share: float) -> floa
 
 
 def is_cooling_down(recipe: Recipe, share: float) -> bool:
-    """Whether the rate falls at that share of the time."""
+    """Whether the learning rate decays at this share of the time."""
     return (1 - share) * recipe.steps < recipe.cool_down_steps

@@ -1,4 +1,4 @@
-"""Learning curves: held-out scores of a run against the pairs seen, and the power laws that they follow."""
+"""Learning curves: a run's validation scores against pairs seen, and power laws fitted to them."""
 
 import csv
 import platform
@@ -14,36 +14,36 @@ from stereoweave.io.files import replacing
 from stereoweave.learn import checkpoint
 from stereoweave.learn.training.loop import SCORES_FILE, read_scores
 
-# The first scores tell how a run recovers from its start, not how it learns.
+# The first scores show how a run recovers from its initial weights, not how it learns.
 _LEAST_PAIRS_SHARE = 0.1
 _LEAST_POINTS = 4
 _KEYS = ("recipe", "step", "pairs")
 
 
 class PowerLaw(NamedTuple):
-    """A score that is at_10000_pairs * (pairs / 10,000) ** -exponent."""
+    """A power law: score = at_10000_pairs * (pairs / 10,000) ** -exponent."""
 
     at_10000_pairs: float
     exponent: float
 
 
 def fit_power_law(pairs: Sequence[float], scores: Sequence[float]) -> PowerLaw:
-    """Least squares between the logarithms of positive scores and those of the pairs seen."""
+    """Fit a power law to positive scores by least squares on logarithms."""
     slope, offset = np.polyfit(np.log(np.divide(pairs, 10_000)), np.log(scores), 1)
     return PowerLaw(at_10000_pairs=float(np.exp(offset)), exponent=float(-slope))
 
 
 def record_curve(run: Path, out: Path) -> dict[str, PowerLaw]:
-    """Write a run's scores to a CSV file, and return the power law of each bad-1 and end-point error.
+    """Write a run's scores to a CSV file. Returns the power law of each bad-1 and end-point error.
 
-    Rows that the file has of other recipes stay, in front.
+    Rows of other recipes in the file are kept and come first.
 
     Args:
-        run: The folder of the run.
+        run: Folder of the run.
         out: The CSV file: recipe, step, pairs seen, scores, commit and machine.
 
     Raises:
-        StereoweaveError: The run has not been scored yet.
+        StereoweaveError: The run has no scores yet.
     """
     kept, record = checkpoint.load(run / "last.pt"), read_scores(run / SCORES_FILE)
     if not record:

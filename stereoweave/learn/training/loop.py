@@ -1,4 +1,4 @@
-"""Training: one loop from a recipe to a network; killed at any moment, it goes on where it was."""
+"""The training loop from a recipe to a network; an interrupted run resumes where it stopped."""
 
 import atexit
 import csv
@@ -44,35 +44,35 @@ from stereoweave.learn.training.objective import build_objective, fit_recipe, na
 from stereoweave.learn.training.scores import validate_by_class
 from stereoweave.system.progress import progress
 
-# Beside a run's checkpoint: its scores after each validation.
+# In the run's folder, beside the checkpoint: the scores of every validation.
 SCORES_FILE = "validation.csv"
-# A killed run loses no more than this, beside what it lost since its last validation.
+# Longest time between two checkpoints: a killed run loses no more.
 _SAVE_EVERY_S = 600
-# What a run may go on with where its recipe says otherwise than its last checkpoint's.
+# Recipe keys that may change when a run resumes.
 _RESUMABLE = ("steps", "cool_down_steps", "mix", "pair_size", "crop_size", "validate_every", "held_out")
-# The others wait for the first one however long it makes pairs or scores: should it die, torchrun ends them.
+# The other ranks wait for rank 0 while it makes pairs or scores. If rank 0 dies, torchrun ends them.
 _TIMEOUT = timedelta(days=1)
 
 _LOGGER = logging.getLogger(__name__)
 
 
 def train(recipe_path: Path, out: Path, console: Console | None = None) -> Path:
-    """Train the network of a recipe in folder `out`, or go on there; returns the last checkpoint's path.
+    """Train the network of a recipe in folder `out`, or resume there. Returns the last checkpoint's path.
 
-    Started by torchrun, its processes share each step's micro-batches, and the first of them alone writes.
+    Under torchrun the ranks share each step's micro-batches; only rank 0 writes.
 
     Raises:
-        StereoweaveError: for a recipe that is none, where `out` is in use or holds the run of another one, or
-            where the loss is no longer finite.
+        StereoweaveError: The recipe is invalid, `out` is in use or holds the run of another recipe, or the
+            loss is not finite.
     """
     with report_once(), _skip_teardown_on_error():
         return train_recipe(read_recipe(recipe_path), out, console or Console(quiet=read_rank().rank > 0))
 
 
 def train_recipe(recipe: Recipe, out: Path, console: Console) -> Path:
-    """As `train`, of a recipe at hand."""
+    """Train a `Recipe`; see `train`."""
     _check_recipe(recipe)
-    if read_rank().rank:  # the first process writes, and locks, for all
+    if read_rank().rank:  # only rank 0 writes and holds the lock
         return _train(recipe, out, console)
     with lock_output(make_folder(out)):
         return _train(recipe, out, console)
@@ -110,7 +110,7 @@ def _train(recipe: Recipe, out: Path, console: Console) -> Path:
 def _prepare_pairs(
     recipe: Recipe, out: Path, console: Console, fabric: Fabric
 ) -> tuple[PairSource, PairSource]:
-    """The pairs to train on and to score on, made by the first process where they were not there."""
+    """Open the training and held-out pairs. Rank 0 makes missing ones."""
     found = open_sources(recipe, out.parent / "pairs")
     if fabric.is_global_zero:
         for pairs in found:
@@ -123,26 +123,26 @@ def _prepare_pairs(
 
 def _folder_not_shared(out: Path) -> StereoweaveError:
     return StereoweaveError(
-        f"{out}: expected what the first process sees there, found something else on {platform.node()}; "
+        f"{out}: expected the run that rank 0 sees there, found another on {platform.node()}; "
         "train into a folder that all machines share"
     )
 
 
 def _validate(run: "TrainingRun", steps: int, held_out: PairSource, last: Path, console: Console) -> None:
-    """Score the run as it is after so many steps, and keep it and its scores."""
+    """Score the run after `steps` steps; save checkpoint and scores."""
     network, device = run.averaged.module, run.fabric.device
     scores = run.objective.scores(network, held_out, device)
     for name, pairs in run.by_class.items():
         found = validate_by_class(network, pairs, device)
         scores |= {f"{name}_{key}": value for key, value in found.items()}
-    # First, because what is killed between the two then writes the same row again.
+    # Before the checkpoint: a run killed in between writes the same row again.
     append_scores(last.with_name(SCORES_FILE), steps, scores)
     run.save(steps, scores, last)
     console.print(f"step {steps}: " + "  ".join(f"{k} {v:.4g}" for k, v in scores.items()))
 
 
 def append_scores(path: Path, step: int, scores: dict[str, float]) -> None:
-    """Add the scores after `step` steps to a CSV file; rows of that step and later ones are replaced."""
+    """Append the scores after `step` steps to a CSV file, replacing rows of that step and later ones."""
     rows = [row for row in read_scores(path) if row["step"] < step] + [{"step": step, **scores}]
     with replacing(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[-1]))
@@ -151,7 +151,7 @@ def append_scores(path: Path, step: int, scores: dict[str, float]) -> None:
 
 
 def read_scores(path: Path) -> list[dict[str, float]]:
-    """The scores of a run by step, the first ones first; none where there is no file yet."""
+    """Read a run's scores in the order of steps; [] if the file does not exist yet."""
     if not path.exists():
         return []
     with path.open(newline="") as file:
@@ -160,7 +160,7 @@ def read_scores(path: Path) -> list[dict[str, float]]:
 
 @contextmanager
 def close_curves(logger: TensorBoardLogger) -> Iterator[TensorBoardLogger]:
-    """The logger, whose last values are in its file when the block is left, after an error too."""
+    """Yield the logger, and flush it when the block ends, also after an error."""
     try:
         yield logger
     finally:
@@ -168,7 +168,7 @@ def close_curves(logger: TensorBoardLogger) -> Iterator[TensorBoardLogger]:
 
 
 class TrainingRun(ModelState):
-    """The state of a run of `train`, and the processes and devices that train it."""
+    """The state of a run of `train`, and the device and ranks that train it."""
 
     def __init__(self, recipe: Recipe, start: Checkpoint, fabric: Fabric) -> None:
         self.recipe, self.fabric, self.by_class = recipe, fabric, open_held_out_sets(recipe)
@@ -183,12 +183,12 @@ class TrainingRun(ModelState):
         self.skipped: list[int] = []
 
     def step(self, step: int, batch: dict[str, torch.Tensor], batches: Batches) -> float:
-        """Take one step down the loss and return the loss.
+        """Take one optimiser step. Returns the loss.
 
-        A step whose loss or gradient is not finite changes nothing, and is counted and logged.
+        A step whose loss or gradient is not finite changes nothing; it is counted and logged.
 
         Raises:
-            StereoweaveError: Two such steps are closer than 500 steps.
+            StereoweaveError: Two such steps are less than 500 steps apart.
         """
         for group in self.optimiser.param_groups:
             group["lr"] = self.recipe.learning_rate_at(step)
@@ -213,11 +213,11 @@ class TrainingRun(ModelState):
     def _gradient(
         self, step: int, batch: dict[str, torch.Tensor], batches: Batches, sums: StepSums
     ) -> dict[str, float]:
-        """Give the weights the gradient of a step, of whichever process; returns the loss and its terms."""
+        """Set the gradient of a step, summed over all ranks. Returns the loss and its terms."""
         what = f"step {step}: one of {', '.join(batches.names(step))}"
         for part, values in zip(batches.parts, split_batch(batch, len(batches.parts)), strict=True):
             if self.recipe.micro_batches > 1:
-                # Whichever process it is, dropout is the micro-batch's own.
+                # Dropout depends on the micro-batch, not on the rank.
                 torch.manual_seed(int(np.random.SeedSequence(batches.key(step, part)).generate_state(1)[0]))
             with self.fabric.autocast():
                 predicted = self.objective.predict(self.network, values)
@@ -233,18 +233,18 @@ class TrainingRun(ModelState):
     def _skip(self, step: int, found: str, batches: Batches) -> None:
         found = f"step {step}: {found}; its pairs are {', '.join(batches.names(step))}"
         if self.skipped and step - self.skipped[-1] < STEPS_BETWEEN_SKIPS:
-            raise StereoweaveError(f"{found}; step {self.skipped[-1]} was skipped for the like")
+            raise StereoweaveError(f"{found}; step {self.skipped[-1]} was skipped for the same reason")
         self.skipped.append(step)
         self.fabric.log_dict({"skipped_steps": float(len(self.skipped))}, step)
         _LOGGER.warning("%s; skipped", found)
 
     def save_periodically(self, step: int, path: Path) -> None:
-        """Write the run as it is after `step` steps, if that is ten minutes after it was written last."""
+        """Save a checkpoint after `step` steps if the last one is ten minutes old."""
         if self.fabric.is_global_zero and time.monotonic() - self.saved_s > _SAVE_EVERY_S:
             self._write(step, self.scores, path)
 
     def save(self, step: int, scores: dict[str, float], path: Path) -> None:
-        """Write the run as it is after `step` steps, and its scores to the curves."""
+        """Save a checkpoint after `step` steps and log its scores."""
         self.fabric.log_dict({f"validation/{name}": score for name, score in scores.items()}, step)
         self._write(step, scores, path)
 
@@ -264,20 +264,20 @@ class TrainingRun(ModelState):
 
 
 def _load_start(recipe: Recipe, last: Path) -> Checkpoint:
-    """Where the run stands: its own last checkpoint, the averaged weights of another, or random weights."""
+    """Load the state to start from: the run's last checkpoint, else `start_from` or random weights."""
     if last.exists():
         found = checkpoint.load(last)
         if replace(found.recipe, **{name: getattr(recipe, name) for name in _RESUMABLE}) != recipe:
             raise StereoweaveError(
-                f"{last}: is of another recipe ({found.recipe.name}); "
-                "train into a folder of its own, or remove it"
+                f"{last}: expected a run of this recipe, found one of another ({found.recipe.name}); "
+                "train into a new folder, or remove the file"
             )
         return replace(found, recipe=recipe, commit=checkpoint.find_commit())
     return checkpoint.make_initial(recipe, checkpoint.find_commit())
 
 
 def _check_recipe(recipe: Recipe) -> None:
-    """FormatError where the recipe names an unknown network or loss, or sizes or processes it cannot take."""
+    """Raise FormatError for an unknown network or loss, or for sizes or rank counts that do not fit."""
     with torch.device("meta"):
         network = build_network(recipe)
         build_objective(recipe, network)
@@ -296,7 +296,7 @@ def _check_recipe(recipe: Recipe) -> None:
 
 
 def _load_batches(batches: Batches, first: int) -> Iterator[tuple[int, dict[str, torch.Tensor]]]:
-    """(step, its batch) from step `first` to the last, cut and recoloured in a process beside."""
+    """Yield (step, batch) from step `first` to the last; another process crops and recolours."""
     steps = range(first, batches.recipe.steps)
     loader = DataLoader(
         CaughtBatches(batches),
@@ -305,7 +305,7 @@ def _load_batches(batches: Batches, first: int) -> Iterator[tuple[int, dict[str,
         num_workers=1,
         prefetch_factor=4,
         multiprocessing_context="spawn",
-        # Its own, because a loader draws a number when it starts, and a restart would draw once more.
+        # Its own generator: a loader draws a seed when it starts, and a restart would draw again.
         generator=torch.Generator(),
     )
     for step, batch in zip(steps, loader, strict=True):
@@ -315,14 +315,14 @@ def _load_batches(batches: Batches, first: int) -> Iterator[tuple[int, dict[str,
 
 
 def _make_fabric(logger: TensorBoardLogger) -> Fabric:
-    """This process's device, among torchrun's processes where it has some."""
+    """Set up this rank's device, and its process group under torchrun."""
     own = read_rank()
     if own.world_size == 1:
         return Fabric(accelerator="auto", devices=1, precision=_choose_precision(), loggers=logger)
     cuda = torch.cuda.is_available()
     if cuda and own.local_world_size > torch.cuda.device_count():
         raise StereoweaveError(
-            f"torchrun: expected at most a process for each of {torch.cuda.device_count()} GPUs, found "
+            f"torchrun: expected at most one process for each of {torch.cuda.device_count()} GPUs, found "
             f"{own.local_world_size}; start fewer with --nproc-per-node"
         )
     if (threads := choose_thread_count()) and not cuda:
@@ -344,16 +344,16 @@ def _make_fabric(logger: TensorBoardLogger) -> Fabric:
 
 
 def _join_ranks(own: ProcessRank, backend: str) -> None:
-    """Joins the processes that torchrun started together on this machine.
+    """Join the ranks that torchrun started together on this machine.
 
-    It keeps one store for all its starts: without a place of their own there, those that are started again
-    find the addresses of their killed predecessors, and wait for them (PyTorch's issue 135712).
+    torchrun reuses one store for all restarts. Without a prefix per restart, new ranks find the addresses of
+    killed ones and wait for them (PyTorch's issue 135712).
     """
     store, rank, count = next(rendezvous("env://", own.rank, own.world_size))
-    place = f"start {os.environ['TORCHELASTIC_RESTART_COUNT']}"
+    prefix = f"start {os.environ['TORCHELASTIC_RESTART_COUNT']}"
     torch.distributed.init_process_group(
         backend,
-        store=PrefixStore(place, store),
+        store=PrefixStore(prefix, store),
         rank=rank,
         world_size=count,
         timeout=_TIMEOUT,
@@ -362,9 +362,9 @@ def _join_ranks(own: ProcessRank, backend: str) -> None:
 
 @contextmanager
 def _skip_teardown_on_error() -> Iterator[None]:
-    """An error in the block ends this process, although others wait for it on their GPUs.
+    """Skip the teardown of the process group after an error, so that this process exits at once.
 
-    NCCL is left at exit by all processes together: who leaves it alone waits for the others, and they for it.
+    NCCL's teardown waits for all ranks, which in turn wait for this one on their GPUs.
     """
     try:
         yield
@@ -374,7 +374,7 @@ def _skip_teardown_on_error() -> Iterator[None]:
 
 
 def _keep_freed_memory() -> None:
-    """Have glibc keep large blocks that are freed: getting them anew from the kernel slows every step."""
+    """Make glibc keep large freed blocks: new ones from the kernel slow down every step."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:
         m_trim_threshold, m_top_pad, m_mmap_max = -1, -2, -4
@@ -400,7 +400,7 @@ def _update_average(
 
 
 def _choose_precision() -> Literal["bf16-mixed", "32-true"]:
-    """bfloat16 where the device computes in it, float32 elsewhere."""
+    """bfloat16 if the device has native support, else float32."""
     if torch.accelerator.is_available():
         computes = torch.cuda.is_bf16_supported()
     else:

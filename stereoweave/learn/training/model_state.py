@@ -1,4 +1,4 @@
-"""Network, weight average, optimiser and objective of a run: the state that both training loops share."""
+"""Network, weight average, optimiser and objective: the state that both training loops share."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,4 @@
-"""What a recipe minimises and how its network is scored: WeaveNet's own way, or the paper's."""
+"""Training objectives: WeaveNet's, and the paper's for all other networks."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -36,29 +36,29 @@ Map = Float[Tensor, "b 1 h w"]
 
 WEAVE, SMOOTH_L1, CROSS_ENTROPY, PERCEPTUAL = "weave", "smooth_l1", "cross_entropy", "perceptual"
 LOSSES = (WEAVE, *CODE_LOSSES, PERCEPTUAL)
-# The histogram of the truth that an exponent is fitted to: of so many training pairs, in so many bins.
+# Training pairs and bins of the ground-truth histogram that an exponent is fitted to.
 _FITTED_PAIRS, _FITTED_BINS = 200, 256
 
 
 @runtime_checkable
 class Objective(Protocol):
-    """A loss, and scores."""
+    """A training loss and the validation scores that go with it."""
 
     def predict(self, network: Any, batch: Batch) -> Any:
-        """Whatever `losses` needs, computed in the precision of the training."""
+        """Predict whatever `losses` needs, in the training's precision."""
         ...
 
     def losses(self, predicted: Any, batch: Batch) -> dict[str, Tensor]:
-        """The terms by name, already weighted; their sum is what is minimised."""
+        """Loss terms by name, already weighted; training minimises their sum."""
         ...
 
     def scores(self, network: Any, pairs: PairSource, device: torch.device) -> dict[str, float]:
-        """Means over pairs that the network was not trained on."""
+        """Mean scores over held-out pairs."""
         ...
 
 
 def build_objective(recipe: Recipe, network: nn.Module) -> Objective:
-    """The objective that a recipe asks for; FormatError for a loss that is unknown or not the network's."""
+    """Build a recipe's objective. Raises FormatError if its loss is unknown or does not fit the network."""
     if recipe.loss not in LOSSES:
         raise FormatError(f"{recipe.name}: loss = {recipe.loss!r}, expected {', '.join(LOSSES)}")
     if isinstance(network, WeaveNet) != (recipe.loss == WEAVE):
@@ -77,10 +77,10 @@ def build_objective(recipe: Recipe, network: nn.Module) -> Objective:
 
 
 class WeaveObjective:
-    """Disparity of both views, with every stage of WeaveNet supervised.
+    """Disparity of both views, with supervision of every stage of WeaveNet.
 
-    With an exponent above 1 the regression compares codes of a `DepthCurve`, times max_disparity_px, which is
-    pixels where the exponent is 1.
+    With an exponent above 1 the regression compares codes of a `DepthCurve` times max_disparity_px; with
+    exponent 1 these are pixels.
     """
 
     def __init__(self, recipe: Recipe) -> None:
@@ -106,17 +106,17 @@ class WeaveObjective:
 
     def _encode(self, disparity_px: Tensor) -> Tensor:
         if self.recipe.exponent == 1:
-            return disparity_px  # as it is, to the last bit
+            return disparity_px  # unchanged to the last bit
         curve = DepthCurve(exponent=self.recipe.exponent, max_disparity_px=self.recipe.max_disparity_px)
         return self.recipe.max_disparity_px * curve.encode_estimate(disparity_px)
 
 
 class CodeObjective:
-    """The paper's: equation (5) between codes of a `DepthCurve`, of the left view alone.
+    """The paper's equation (5) between codes of a `DepthCurve`, for the left view.
 
-    A network that predicts disparity in pixels is compared in the same code, so that every network trains on
-    every target and with every loss. With loss = "smooth_l1" (or "l1"), exponent = 1 and alpha_p = 0 this is
-    PSMNet's (or DispNet's) own loss up to the factor 1 / d_max, which Adam does not see.
+    Disparities in pixels are converted to the same code, so that every network trains on every target and
+    with every loss. With loss = "smooth_l1" (or "l1"), exponent = 1 and alpha_p = 0 this is PSMNet's (or
+    DispNet's) own loss up to the factor 1 / d_max, to which Adam is invariant.
     """
 
     def __init__(self, recipe: Recipe, network: CodeNetwork) -> None:
@@ -134,17 +134,17 @@ class CodeObjective:
         return {name: weights @ torch.stack([term[name] for term in terms]) for name in terms[0]}
 
     def code(self, output: Map, batch: Batch) -> Map:
-        """A network's output as a code."""
+        """Convert a network's output to a code."""
         return output if self.predicts == "code" else self.curve.encode_estimate(self.quantity(output, batch))
 
     def quantity(self, output: Map, batch: Batch) -> Map:
-        """A network's output as what the code stands for: disparity in px, or depth in m."""
+        """Convert a network's output to the target: disparity in px, or depth in m."""
         if self.predicts == "code":
             return self.curve.decode(output)
         return output if self.recipe.target == "disparity" else self._depth_m(output, batch)
 
     def disparity_px(self, output: Map, batch: Batch) -> Map:
-        """A network's output as disparity in pixels."""
+        """Convert a network's output to disparity in pixels."""
         if self.predicts == "disparity_px":
             return output
         decoded = self.curve.decode(output)
@@ -156,9 +156,9 @@ class CodeObjective:
 
     @torch.no_grad()
     def scores(self, network: CodeNetwork, pairs: PairSource, device: torch.device) -> dict[str, float]:
-        """Mean `loss` and its terms, `epe_px`, and with depth as target `depth_error_m`.
+        """Mean `loss` and its terms, `epe_px`, and `depth_error_m` if the target is depth.
 
-        `squared_error` is that of the straight code, before the exponent: unlike the loss it can be compared
+        `squared_error` is that of the linear code, before the exponent. Unlike the loss it can be compared
         between exponents.
         """
         network.eval()
@@ -177,9 +177,9 @@ class CodeObjective:
         return terms
 
     def _depth_m(self, disparity_px: Map, batch: Batch) -> Map:
-        """Depth of an estimated disparity; beyond max_depth_m it goes on along the tangent, linearly.
+        """Depth of an estimated disparity, extended linearly along the tangent beyond max_depth_m.
 
-        So it is finite where disparity is 0 or less, and a network that starts there still has a gradient.
+        So it is finite, with a gradient, for disparities of 0 or less, where an untrained network may start.
         """
         focal_baseline, shifted_px = batch["focal_baseline_px_m"], disparity_px + batch["doffs_px"]
         least_px = focal_baseline / self.recipe.max_depth_m
@@ -204,36 +204,36 @@ class CodeObjective:
 
 
 def _choose_comparison(recipe: Recipe) -> Callable[[Map, Map], Tensor]:
-    """The loss between codes, and the truth's."""
+    """The loss between a predicted and a true code."""
     if recipe.loss == PERCEPTUAL:
         if not recipe.vgg16_weights:
             raise FormatError(
                 f"{recipe.name}: loss = {PERCEPTUAL!r}, expected vgg16_weights, the path of torchvision's "
-                "vgg16-397923af.pth, found none; it is never downloaded by itself"
+                "vgg16-397923af.pth, found none; it is never downloaded automatically"
             )
         return PerceptualLoss(Path(recipe.vgg16_weights))
     if recipe.loss == SMOOTH_L1:
-        # Of straight codes of disparity the corner is at 1 px, as published.
+        # For linear codes of disparity the switch is at 1 px, as published.
         return partial(smooth_l1_loss, beta=1 / recipe.max_disparity_px)
     return CODE_LOSSES[recipe.loss]
 
 
 def build_curve(recipe: Recipe) -> DepthCurve:
-    """The curve between the recipe's target and its code."""
+    """Build the curve between a recipe's target and its code."""
     if recipe.target == "depth":
         return DepthCurve(exponent=recipe.exponent, max_depth_m=recipe.max_depth_m)
     return DepthCurve(exponent=recipe.exponent, max_disparity_px=recipe.max_disparity_px)
 
 
 def fit_recipe(recipe: Recipe, pairs: PairSource) -> Recipe:
-    """The recipe, with its exponent fitted to the truth of the training pairs where it asks for that."""
+    """Fit the recipe's exponent to the training pairs' ground truth if `fit_exponent` is set."""
     if not recipe.fit_exponent:
         return recipe
     return replace(recipe, exponent=fit_exponent(count_truth(recipe, pairs)))
 
 
 def count_truth(recipe: Recipe, pairs: PairSource) -> Float[np.ndarray, " n"]:
-    """Counts of the normalised truth, before the exponent, in equal bins over 0..1; of spread pairs."""
+    """Histogram of the normalised ground truth over evenly spread pairs: linear codes, equal bins."""
     straight = build_curve(replace(recipe, exponent=1.0))
     counts = np.zeros(_FITTED_BINS)
     for index in range(0, pairs.count, max(1, pairs.count // _FITTED_PAIRS)):
@@ -244,10 +244,10 @@ def count_truth(recipe: Recipe, pairs: PairSource) -> Float[np.ndarray, " n"]:
 
 
 def compute_target(recipe: Recipe, batch: Batch) -> Map:
-    """The left views' truth as what the code stands for, disparity in px or depth in m; NaN where unknown.
+    """The left views' ground truth as the recipe's target: disparity in px or depth in m; NaN where unknown.
 
-    Disparity above max_disparity_px counts as unknown, as PSMNet's authors have it; depth beyond max_depth_m
-    does not.
+    Disparity above max_disparity_px counts as unknown, as in PSMNet's code; depth beyond max_depth_m does
+    not.
     """
     disparity_px = batch["disparity_px"][: len(batch["left"])]
     if recipe.target == "disparity":
@@ -255,16 +255,16 @@ def compute_target(recipe: Recipe, batch: Batch) -> Map:
     if "focal_baseline_px_m" not in batch:
         raise StereoweaveError(
             f"{recipe.name}: target = 'depth', expected pairs with a camera, found dataset = "
-            f"{recipe.dataset!r} without; train on disparity"
+            f"{recipe.dataset!r} without one; train on disparity"
         )
     depth_m = batch["focal_baseline_px_m"] / (disparity_px + batch["doffs_px"])
-    # A depth of just max_depth_m, kept as disparity, comes back a rounding error farther.
+    # A depth of exactly max_depth_m, stored as disparity, may come back a rounding error larger.
     return depth_m.where(depth_m > 1.0001 * recipe.max_depth_m, depth_m.clamp(max=recipe.max_depth_m))
 
 
 @contextmanager
 def name_in_errors(what: str) -> Iterator[None]:
-    """Says in an error which pair or pairs it is about, where it does not yet."""
+    """Prefix a StereoweaveError of the block with the pair or pairs in question, unless already named."""
     try:
         yield
     except StereoweaveError as error:

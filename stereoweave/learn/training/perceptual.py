@@ -1,4 +1,4 @@
-"""The perceptual loss: maps are compared as a network that was trained on photographs sees them."""
+"""Perceptual loss: compares maps by the features of a network trained on photographs."""
 
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,13 @@ WEIGHTS = "vgg16-397923af.pth, torchvision's VGG-16 trained on ImageNet"
 
 
 class PerceptualLoss(nn.Module):
-    """The feature reconstruction loss of Johnson et al. (2016) between codes, on VGG-16's relu2_2.
+    """Feature reconstruction loss of Johnson et al. (2016) between codes, on VGG-16's relu2_2.
 
-    relu2_2 is what they use wherever an image is to be reconstructed; deeper layers keep less of where edges
-    are. The weights are frozen; a file needs those of the first four convolutions alone.
+    Johnson et al. use relu2_2 to reconstruct images; deeper layers localise edges less well. The weights are
+    frozen; the file needs only those of the first four convolutions.
 
     Args:
-        weights: File of VGG-16's weights under torchvision's names; never downloaded by itself.
+        weights: File of VGG-16's weights under torchvision's names; never downloaded automatically.
     """
 
     mean: Tensor
@@ -28,8 +28,7 @@ class PerceptualLoss(nn.Module):
 
     def __init__(self, weights: Path) -> None:
         super().__init__()
-        # Without storage, so that no random first weights are drawn: a seed gives the same training
-        # whichever loss is chosen.
+        # Without storage, so that no random weights are drawn: a seed gives the same training with any loss.
         with torch.device("meta"):
             self.features = nn.Sequential(
                 *_convolution(3, 64), *_convolution(64, 64), nn.MaxPool2d(2),
@@ -37,17 +36,17 @@ class PerceptualLoss(nn.Module):
             )  # fmt: skip
         self.load_state_dict(_read(weights, self.state_dict()), assign=True)
         self.requires_grad_(False)
-        # ImageNet's, with which VGG-16 was trained; not in the state, which is the file's.
+        # ImageNet's statistics, with which VGG-16 was trained; not part of the state, which mirrors the file.
         mean, deviation = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
         self.register_buffer("mean", mean.view(3, 1, 1), persistent=False)
         self.register_buffer("deviation", deviation.view(3, 1, 1), persistent=False)
 
     def forward(self, code: Float[Tensor, "b 1 h w"], truth: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
-        """Mean squared difference of the features; 0 where no pixel is known.
+        """Mean squared difference of the features; 0 if no pixel is known.
 
-        A feature sees 14x14 pixels, so unknown ones cannot be left out of the mean afterwards. They are taken
-        from the prediction on both sides, where they differ in nothing and have no gradient; and the mean is
-        divided by the share of known pixels, so that sparse truth weighs as much as it does in other losses.
+        A feature covers 14x14 pixels, so unknown pixels cannot be masked afterwards. They are set to the
+        prediction on both sides, where they are equal and have no gradient. The mean is divided by the
+        share of known pixels, so that sparse ground truth weighs as much as in the other losses.
 
         Args:
             code: Predicted code in 0..1.
@@ -60,7 +59,7 @@ class PerceptualLoss(nn.Module):
         return difference * known.numel() / known.sum().clamp(min=1)
 
     def _extract_features(self, code: Tensor) -> Tensor:
-        # Three channels come of the one by the three means.
+        # Broadcasts the one channel to three.
         return self.features((code - self.mean) / self.deviation)
 
 
@@ -69,7 +68,7 @@ def _convolution(inputs: int, outputs: int) -> tuple[nn.Module, nn.Module]:
 
 
 def _read(path: Path, expected: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors of a file that `expected` names, in float32; FormatError if one is missing or misshapen."""
+    """Read the tensors named in `expected`, in float32. Raises FormatError if one is missing or misshapen."""
     found = _load(path)
     for name, tensor in expected.items():
         shape = list(getattr(found.get(name), "shape", [])) or "nothing"
@@ -85,9 +84,9 @@ def _load(path: Path) -> dict[str, Any]:
         found = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise FormatError(
-            f"{path}: no such file; expected {WEIGHTS}, which is never downloaded by itself"
+            f"{path}: no such file; expected {WEIGHTS}, which is never downloaded automatically"
         ) from error
-    except Exception as error:  # other bytes lead PyTorch's reader to any error whatever
+    except Exception as error:  # PyTorch's reader raises any type of error on invalid bytes
         raise FormatError(f"{path}: expected {WEIGHTS}, found {reason(error)}") from error
     if not isinstance(found, dict):
         raise FormatError(f"{path}: expected {WEIGHTS}, found a {type(found).__name__}")

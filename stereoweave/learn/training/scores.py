@@ -1,4 +1,4 @@
-"""Scores of a network on pairs that it was not trained on."""
+"""Validation scores of a network on held-out pairs."""
 
 from collections.abc import Iterator
 
@@ -30,9 +30,9 @@ def validate(network: nn.Module, pairs: PairSource, device: torch.device) -> dic
 
 @torch.no_grad()
 def validate_by_class(network: nn.Module, pairs: PairSource, device: torch.device) -> dict[str, float]:
-    """Mean scores over the left views of the pairs, and what each class of pixels adds to bad-1.
+    """Mean scores over the left views, and each pixel class's contribution to bad-1.
 
-    Truth beyond the network's range does not count.
+    Ground truth beyond the network's range is ignored.
     """
     rows = []
     for sample, estimate_px, _ in _predict(network, pairs, device):
@@ -48,7 +48,7 @@ def validate_by_class(network: nn.Module, pairs: PairSource, device: torch.devic
 def _predict(
     network: nn.Module, pairs: PairSource, device: torch.device
 ) -> Iterator[tuple[Sample, Map, Map]]:
-    """Each sample, its left disparity in px, and its confidence."""
+    """Each sample with its left disparity in px and its confidence."""
     network.eval()
     for index in range(pairs.count):
         sample = pairs[index]

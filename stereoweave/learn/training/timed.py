@@ -1,7 +1,7 @@
-"""Training by the clock, for a machine that is lent for minutes and reached by commands of limited length.
+"""Training for a fixed time, for a machine available in short sessions with time-limited commands.
 
-`train` counts steps. Here a command ends on time, the rate falls to 0 when the minutes of all commands are
-used, and the files that one leaves are where the next one goes on.
+`train` counts steps. Here a command ends on time, the learning rate reaches 0 when the minutes of all
+commands are used up, and each command resumes from the files of the previous one.
 """
 
 import math
@@ -30,24 +30,24 @@ Report = Callable[[str], None]
 
 _REPORT_EVERY_S, _SAVE_EVERY_S = 15.0, 60.0
 _TRIED_STEPS = 3
-# bfloat16 keeps 8 bits: a loss computed in it is off by less than this share.
+# Largest relative error of a loss computed in bfloat16, which has 8 bits of precision.
 _BFLOAT16_SHARE = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
 class TimedCommand:
-    """One command of a run.
+    """One command of a timed run.
 
     Attributes:
-        out: Folder to write to, and to go on from where it holds a run.
-        earlier: Folder with what an earlier command left; what is further counts.
-        began_s: When the command began, by `time.monotonic`.
-        minutes: Of this command.
-        total_minutes: Of all commands.
+        out: Folder to write to, and to resume from if it holds a run.
+        earlier: Folder with an earlier command's files; the run that is further ahead is resumed.
+        began_s: Start of the command, by `time.monotonic`.
+        minutes: Time limit of this command.
+        total_minutes: Time limit of all commands together.
         device: "cuda" or "cpu".
-        processes: That paint and cut batches beside the training.
-        cool_down_crop: Height and width of the crops while the rate falls; None for those of the recipe.
-        commit: Of the code, where the machine has no git; "" asks git.
+        processes: Number of processes that paint and crop batches.
+        cool_down_crop: Height and width of crops during the cool-down; None: the recipe's.
+        commit: Commit of the code, for a machine without git; "" asks git.
     """
 
     out: Path
@@ -63,7 +63,7 @@ class TimedCommand:
 
 @dataclass(frozen=True)
 class _Snapshot:
-    """A moment of the training, and the counts at it."""
+    """A moment of the training, and the counters at it."""
 
     at_s: float
     pairs: int = 0
@@ -72,10 +72,11 @@ class _Snapshot:
 
 
 def train_by_clock(recipe: Recipe, command: TimedCommand, report: Report) -> RunProgress:
-    """Train for the minutes of a command; returns how far the run is.
+    """Train for a command's minutes. Returns the run's progress.
 
     Raises:
-        StereoweaveError: There is nothing sound to go on from, no batches are made, or losses are not finite.
+        StereoweaveError: The files to resume from are invalid, no batches can be made, or losses are not
+            finite.
     """
     make_folder(command.out)
     start = find_resume_point(
@@ -88,7 +89,7 @@ def train_by_clock(recipe: Recipe, command: TimedCommand, report: Report) -> Run
         total_minutes=command.total_minutes,
     )
     if clock.left_at(time.monotonic()) <= 0:
-        report(f"the {command.total_minutes:g} minutes are used; {command.out} is not changed")
+        report(f"the {command.total_minutes:g} minutes are used up; {command.out} is not changed")
         return start.progress
     recipes = [
         recipe,
@@ -107,7 +108,7 @@ def train_by_clock(recipe: Recipe, command: TimedCommand, report: Report) -> Run
 
 
 class _TimedLoop:
-    """The loop of a command."""
+    """The loop of one command."""
 
     def __init__(self, run: TimedRun, painters: Painters, clock: RunClock, out: Path, report: Report) -> None:
         self.run, self.painters, self.clock, self.out, self.report = run, painters, clock, out, report
@@ -115,7 +116,7 @@ class _TimedLoop:
         self.progress, self.losses = RunProgress(), list[float]()
 
     def train_from(self, progress: RunProgress) -> None:
-        """Step until the command's time is over; a report and a checkpoint now and then."""
+        """Train until the command's time is over, with periodic reports and checkpoints."""
         self.progress = progress
         batch = self._smoke_test()
         self.reported = self._mark()
@@ -125,7 +126,7 @@ class _TimedLoop:
             if is_cooling_down(self.recipe, share):
                 self.painters.switch(len(self.painters.recipes) - 1)
             pairs, loss = len(batch["left"]), self.run.begin(batch)
-            # Now, because a GPU is still computing the gradient.
+            # Here, while the GPU is still computing the gradient.
             batch = self.run.move_to_device(self.painters.take())
             self._count(pairs, self.run.finish(loss, rate))
             if time.monotonic() - self.reported.at_s > _REPORT_EVERY_S:
@@ -134,10 +135,10 @@ class _TimedLoop:
                 self._save({})
 
     def finish(self, held_out: PairSource) -> None:
-        """Save the run with its scores, and say what is next."""
+        """Save the run with its scores, and report them."""
         too_late = self.clock.left_at(time.monotonic()) < -RESERVE_S
         if too_late or (isinstance(held_out, CachedPairs) and held_out.missing()):
-            self.report("not scored: the time is over" if too_late else "not scored: no held-out pairs")
+            self.report("not scored: out of time" if too_late else "not scored: no held-out pairs")
             return self._save({})
         scores = self.run.scores(held_out)
         self._save(scores)
@@ -146,41 +147,42 @@ class _TimedLoop:
             self.report(f"{file}  {file.stat().st_size / 2**20:.1f} MiB")
         seconds, progress = self.clock.used_at(time.monotonic()), self.progress
         self.report(
-            f"{seconds / 60:.1f} of {self.clock.total_minutes:g} minutes used: {progress.steps} steps, "
+            f"{seconds / 60:.1f} of {self.clock.total_minutes:g} minutes used up: {progress.steps} steps, "
             f"{progress.pairs} pairs, {progress.skipped} steps skipped"
         )
         return None
 
     def _smoke_test(self) -> dict[str, torch.Tensor]:
-        """Try everything once on the first batch, which is returned: no later command may find a fault.
+        """Run every part once on the first batch, so that no later command finds a fault. Returns the batch.
 
-        A loss in bfloat16 that is not float32's turns bfloat16 off.
+        Disables bfloat16 if its loss differs from that in float32.
         """
         batch = self.run.move_to_device(self.painters.take())
         plain = self.run.loss(batch, bfloat16=False)
-        self.report(f"{self._used()}  the first batch is there; its loss is {plain:.4g}")
+        self.report(f"{self._used()}  first batch ready; its loss is {plain:.4g}")
         if self.run.bfloat16:
             rounded = self.run.loss(batch, bfloat16=True)
             self.run.bfloat16 = abs(rounded - plain) < _BFLOAT16_SHARE * abs(plain)
             taken = "bfloat16" if self.run.bfloat16 else "float32"
-            self.report(f"in bfloat16 it is {rounded:.4g}; trains in {taken}")
+            self.report(f"in bfloat16 the loss is {rounded:.4g}; training in {taken}")
         pairs_per_s = len(batch["left"]) / self._seconds_a_step(batch)
         self._save({})
         checkpoint.load(self.out / NETWORK_FILE)
         self.report(
-            f"{self._used()}  smoke test passed: files are written and read, and the network alone takes "
+            f"{self._used()}  smoke test passed: files can be written and read, and the network alone takes "
             f"{pairs_per_s:.1f} pairs/s"
         )
         return batch
 
     def _seconds_a_step(self, batch: dict[str, torch.Tensor]) -> float:
-        """The mean over a few steps at a rate of 0, after one in which the device sets itself up."""
+        """Mean time of a few steps at a learning rate of 0, after one warm-up step."""
         for step in range(1 + _TRIED_STEPS):
             if step == 1:
                 began_s = time.monotonic()
             if math.isnan(self.run.finish(self.run.begin(batch), 0.0)):
                 raise StereoweaveError(
-                    "the first batch: expected a finite loss and gradient, found none; use other weights"
+                    "the first batch: expected a finite loss and gradient, found NaN or infinity; "
+                    "use other weights"
                 )
         return (time.monotonic() - began_s) / _TRIED_STEPS
 
@@ -202,8 +204,8 @@ class _TimedLoop:
         last = before.last_skipped
         if last is not None and before.steps - last < STEPS_BETWEEN_SKIPS:
             raise StereoweaveError(
-                f"steps {last} and {before.steps}: expected a finite loss and gradient, found none; "
-                f"lower the learning rate, and go on from {self.out}"
+                f"steps {last} and {before.steps}: expected a finite loss and gradient, "
+                f"found NaN or infinity; lower the learning rate, and resume from {self.out}"
             )
         self.progress = replace(self.progress, skipped=before.skipped + 1, last_skipped=before.steps)
 

@@ -1,4 +1,4 @@
-"""The state of a timed run: what a step changes, and the files from which another machine goes on."""
+"""The state of a timed run, and the files from which another machine can resume it."""
 
 import json
 import math
@@ -17,23 +17,23 @@ from stereoweave.learn.checkpoint import Checkpoint, Weights
 from stereoweave.learn.recipe import Recipe
 from stereoweave.learn.training.model_state import ModelState
 
-# A checkpoint without the optimiser's state, which `stereoweave train` starts from and `export` takes; that
-# state; and how far the run is.
+# A checkpoint without the optimiser's state, which `stereoweave train` and `export` accept; that state; and
+# the progress.
 NETWORK_FILE, OPTIMISER_FILE, PROGRESS_FILE = "network.pt", "optimiser.pt", "progress.json"
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunProgress:
-    """How far a run is.
+    """Progress of a timed run.
 
     Attributes:
-        seconds: Of all commands.
-        steps: Of the optimiser, skipped ones among them.
-        optimiser_steps: Those since the optimiser began without a state.
-        pairs: Trained on.
-        batches: Number of the next batch to order.
-        skipped: Steps not taken, because the loss or the gradient was not finite.
-        last_skipped: The last of them, counted from 0.
+        seconds: Time used by all commands.
+        steps: Optimiser steps, including skipped ones.
+        optimiser_steps: Steps since the optimiser started without a state.
+        pairs: Pairs trained on.
+        batches: Number of the next batch to request.
+        skipped: Steps skipped because the loss or the gradient was not finite.
+        last_skipped: The last skipped step, counted from 0.
     """
 
     seconds: float = 0.0
@@ -47,7 +47,7 @@ class RunProgress:
 
 @dataclass(frozen=True, kw_only=True)
 class ResumePoint:
-    """Where a run stands: its checkpoint, its optimiser's state ({} for none), and how far it is."""
+    """State to resume from: checkpoint, optimiser state ({} if there is none) and progress."""
 
     checkpoint: Checkpoint
     optimiser: dict[str, Any]
@@ -55,15 +55,15 @@ class ResumePoint:
 
 
 def find_resume_point(recipe: Recipe, out: Path, earlier: Path | None, commit: str) -> ResumePoint:
-    """Where the run in `out` or `earlier` stands, whichever is further; else the start of a new run.
+    """Find the run in `out` or `earlier`, whichever is further ahead; else start a new run.
 
     Raises:
         FormatError: A file is broken or missing, or `start_from` shares no weights with the network.
-        StereoweaveError: The run is of another network.
+        StereoweaveError: The run trains another network.
     """
     if earlier and not (earlier / PROGRESS_FILE).exists():
         raise FormatError(
-            f"{earlier}: expected {PROGRESS_FILE} of an earlier command, found none; bring all its files"
+            f"{earlier}: expected {PROGRESS_FILE} of an earlier command, found none; copy all of its files"
         )
     folders = [folder for folder in (out, earlier) if folder and (folder / PROGRESS_FILE).exists()]
     found = [(_read_progress(folder / PROGRESS_FILE), folder) for folder in folders]
@@ -76,7 +76,7 @@ def find_resume_point(recipe: Recipe, out: Path, earlier: Path | None, commit: s
     if last.recipe.model != recipe.model:
         raise StereoweaveError(
             f"{folder / NETWORK_FILE}: expected a run of {recipe.model}, found one of {last.recipe.model}; "
-            "take another folder"
+            "use another folder"
         )
     optimiser = _read_optimiser(folder / OPTIMISER_FILE)
     if not optimiser:
@@ -93,12 +93,12 @@ def _read_progress(path: Path) -> RunProgress:
 
 
 def _read_optimiser(path: Path) -> dict[str, Any]:
-    """The optimiser's state; {} where there is none, as it may have stayed behind."""
+    """Read the optimiser's state; {} if the file was not copied."""
     return torch.load(path, map_location="cpu", weights_only=True) if path.exists() else {}
 
 
 class TimedRun(ModelState):
-    """The state of a run on one device, and the steps that change it."""
+    """The state of a timed run on one device."""
 
     def __init__(self, start: Checkpoint, optimiser: dict[str, Any], device: torch.device) -> None:
         update_average = get_ema_multi_avg_fn(1 - 1 / start.recipe.averaged_steps)  # type: ignore[no-untyped-call]
@@ -109,20 +109,20 @@ class TimedRun(ModelState):
         self.averaged.n_averaged = torch.ones((), dtype=torch.long)
 
     def move_to_device(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """A batch of `Painters` on the device, with images in 0..1."""
+        """Move a batch of `Painters` to the device, with images in 0..1."""
         there = {name: value.to(self.device, non_blocking=True) for name, value in batch.items()}
         return there | {side: there[side].float() / 255 for side in ("left", "right")}
 
     @torch.no_grad()
     def loss(self, batch: dict[str, Tensor], bfloat16: bool) -> float:
-        """The loss of a batch, in either precision; nothing is learned."""
+        """Loss of a batch in the given precision, without learning."""
         self.network.train()
         value = float(self._loss(batch, bfloat16))
         self._restore_statistics()
         return value
 
     def begin(self, batch: dict[str, Tensor]) -> Tensor:
-        """Start on the gradient of a step, and return its loss; a GPU computes both later."""
+        """Compute a step's gradient. Returns its loss; on a GPU both are computed asynchronously."""
         self.network.train()
         self.optimiser.zero_grad()
         loss = self._loss(batch, self.bfloat16)
@@ -130,7 +130,7 @@ class TimedRun(ModelState):
         return loss.detach()
 
     def finish(self, loss: Tensor, learning_rate: float) -> float:
-        """Take the step where its loss and gradient are finite; returns the loss, NaN where they are not."""
+        """Take the step if its loss and gradient are finite. Returns the loss, or NaN if they are not."""
         norm = self.clip_gradient()
         value, length = torch.stack([loss.float(), norm.float()]).tolist()
         if not (math.isfinite(value) and math.isfinite(length)):
@@ -144,20 +144,20 @@ class TimedRun(ModelState):
 
     @torch.no_grad()
     def scores(self, held_out: Any) -> dict[str, float]:
-        """The average's scores on held-out pairs."""
+        """Scores of the averaged network on held-out pairs."""
         return self.objective.scores(self.averaged.module, held_out, self.device)
 
     def save(self, folder: Path, progress: RunProgress, hours: float, scores: dict[str, float]) -> None:
-        """Write network, optimiser and progress, each whole or not at all.
+        """Write network, optimiser and progress, each atomically.
 
         Raises:
-            StereoweaveError: A weight is not finite; the files of before stay.
+            StereoweaveError: A weight is not finite; the previous files are kept.
         """
         weights, averaged = _copy_to_cpu(self.network), _copy_to_cpu(self.averaged.module)
         if not all(bool(value.isfinite().all()) for value in (*weights.values(), *averaged.values())):
             raise StereoweaveError(
-                f"step {progress.steps}: expected finite weights, found some that are not; {folder} keeps "
-                "those of the last checkpoint: lower the learning rate"
+                f"step {progress.steps}: expected finite weights, found NaN or infinity; {folder} keeps "
+                "the last checkpoint: lower the learning rate"
             )
         state = replace(
             self.start, step=progress.steps, weights=weights, averaged=averaged, hours=hours, scores=scores
@@ -175,7 +175,7 @@ class TimedRun(ModelState):
 
     @torch.no_grad()
     def _restore_statistics(self) -> None:
-        """Give the batch norms the average's statistics: their own may no longer be finite."""
+        """Set the batch norms' statistics to the average's: their own may no longer be finite."""
         for value, kept in zip(self.network.buffers(), self.averaged.module.buffers(), strict=True):
             value.copy_(kept)
 

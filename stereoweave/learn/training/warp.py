@@ -1,4 +1,4 @@
-"""The left image made from the right one, differentiable in disparity; and disparity made from depth."""
+"""Differentiable warping of the right image to the left view, and conversion of depth to disparity."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -8,21 +8,21 @@ from torch import Tensor
 def reconstruct_left(
     right: Float[Tensor, "b c h w"], disparity_px: Float[Tensor, "b 1 h w"]
 ) -> tuple[Float[Tensor, "b c h w"], Bool[Tensor, "b 1 h w"]]:
-    """The left image as the right one shows it, and which of its pixels the right one contains.
+    """Warp the right image to the left view. Returns the image and the mask of pixels with a match.
 
-    Pixel (i, j) is read from (i - d, j) of the right image, between its two neighbours in the row, and exists
-    where 0 <= i - d <= W - 1; elsewhere its value means nothing and has no gradient.
+    Pixel (i, j) is interpolated linearly at (i - d, j) of the right image. It has a match if
+    0 <= i - d <= W - 1; elsewhere its value is meaningless and has no gradient.
 
     Args:
         right: Right image [B, C, H, W], at least 2 wide.
-        disparity_px: Disparity of the left view; not finite counts as not existing.
+        disparity_px: Disparity of the left view; non-finite values have no match.
     """
     last = right.shape[3] - 1
-    # In float32: half-precision disparity would draw whole numbers down with it, and bfloat16 ends at 256.
+    # In float32: bfloat16 has no odd integers above 256.
     columns = torch.arange(last + 1, device=right.device, dtype=torch.float32)
     position_px = columns - disparity_px
     exists = (position_px >= 0) & (position_px <= last)
-    # Replaced before it is used: no index outside the row, and no infinity that meets a gradient of 0.
+    # Replaced first, so that no index leaves the row and no infinity is multiplied by a gradient of 0.
     position_px = position_px.where(exists, 0)
     start = position_px.detach().floor().clamp(max=last - 1)
     first, second = (right.gather(3, (start.long() + i).expand_as(right)) for i in (0, 1))
@@ -35,10 +35,10 @@ def depth_to_disparity(
     doffs_px: Float[Tensor, "b 1 1 1"],
     width_px: int,
 ) -> Float[Tensor, "b 1 h w"]:
-    """Disparity f B / z - doffs in pixels, finite in value and gradient for any depth, 0 included.
+    """Disparity f B / z - doffs in pixels, with finite value and gradient for any depth, including 0.
 
-    Nearer than f B / (width + |doffs|) the match lies outside the right image anyway; there the disparity
-    stays at the width or just above, without a gradient.
+    Depth below f B / (width + |doffs|) has its match outside the right image; there the disparity is
+    clamped to that of the limit, without a gradient.
 
     Args:
         depth_m: Depth of the left view.

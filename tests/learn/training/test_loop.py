@@ -151,7 +151,9 @@ def test_a_folder_with_a_run_of_another_recipe_is_refused(folder, finished, tmp_
     other = write(replace(RECIPE, name="other", learning_rate=2e-3), tmp_path / "other.toml")
     before = finished.read_bytes()
     with pytest.raises(
-        StereoweaveError, match=r"last\.pt: is of another recipe \(tiny\); train into a folder"
+        StereoweaveError,
+        match=r"last\.pt: expected a run of this recipe, found one of another \(tiny\); "
+        r"train into a new folder",
     ):
         train(other, finished.parent, QUIET)
     assert finished.read_bytes() == before
@@ -211,7 +213,7 @@ def test_a_loss_that_is_not_finite_twice_stops_and_names_the_pairs(folder, in_pl
     with pytest.raises(StereoweaveError) as caught:
         train(file, folder / "broken", QUIET)
     assert str(caught.value) == (
-        f"step 1: the loss is nan; its pairs are {names}; step 0 was skipped for the like"
+        f"step 1: the loss is nan; its pairs are {names}; step 0 was skipped for the same reason"
     )
     assert not (folder / "broken" / "last.pt").exists()
 
@@ -272,7 +274,9 @@ def test_a_gradient_that_is_not_finite_never_reaches_the_weights_and_twice_stops
     assert run.skipped == [7]
     assert caplog.messages[-1] == f"{found}; skipped"
     run.step(507, batches[507], batches)  # 500 steps later it is isolated still
-    assert complaint(run.step, 1006, batches[1006], batches).endswith("; step 507 was skipped for the like")
+    assert complaint(run.step, 1006, batches[1006], batches).endswith(
+        "; step 507 was skipped for the same reason"
+    )
     # Batch norms' statistics included.
     assert_same(network.state_dict(), before)
     assert_same(run.averaged.module.state_dict(), before)

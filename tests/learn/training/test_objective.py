@@ -208,7 +208,7 @@ def test_a_disparity_below_0_is_refused():
 
 def test_depth_without_a_camera_is_refused():
     assert complaint(losses_of, DEPTH, Constant("code", 0.5), batch_of(TRUTH_PX)) == (
-        "tiny: target = 'depth', expected pairs with a camera, found dataset = 'collage' without; "
+        "tiny: target = 'depth', expected pairs with a camera, found dataset = 'collage' without one; "
         "train on disparity"
     )
 
@@ -249,7 +249,7 @@ def test_a_perceptual_loss_without_the_name_of_its_file_is_refused():
     recipe = replace(DISPARITY, loss="perceptual")
     message = complaint(build_objective, recipe, Constant("code", 0.5))
     assert message.startswith("tiny: loss = 'perceptual', expected vgg16_weights, the path of torchvision's")
-    assert message.endswith("found none; it is never downloaded by itself")
+    assert message.endswith("found none; it is never downloaded automatically")
 
 
 def test_a_perceptual_loss_without_its_file_is_refused(tmp_path):

@@ -147,7 +147,7 @@ def refused(path):
 
 
 def test_a_missing_file_says_which_one_is_expected_and_that_nobody_fetches_it(tmp_path):
-    assert "never downloaded by itself" in refused(tmp_path / "none.pth")
+    assert "never downloaded automatically" in refused(tmp_path / "none.pth")
 
 
 def test_a_file_that_lacks_a_layer_is_refused_by_its_name(tmp_path):

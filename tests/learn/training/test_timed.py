@@ -182,7 +182,7 @@ def test_of_two_folders_the_one_that_is_further_counts(tmp_path):
 
 
 def test_what_cannot_be_gone_on_from_is_named(tmp_path):
-    assert "bring all its files" in complaint(find_resume_point, RECIPE, tmp_path / "out", tmp_path, "")
+    assert "copy all of its files" in complaint(find_resume_point, RECIPE, tmp_path / "out", tmp_path, "")
     run_of().save(tmp_path, RunProgress(), 0.0, {})
     other = replace(RECIPE, model="weave_base")
     assert "expected a run of weave_base, found one of weave_small" in complaint(
@@ -298,7 +298,7 @@ def test_a_command_that_is_killed_is_gone_on_from_to_the_end_of_the_time(tmp_pat
     assert all(value.isfinite().all() for value in (*last.weights.values(), *last.averaged.values()))
     assert last.scores["epe_px"] < math.inf
     assert any("smoke test passed" in line for line in lines)
-    assert "minutes used" in lines[-1]
+    assert "minutes used up" in lines[-1]
     # The same command again finds that no time is left.
     again = train_by_clock(read_recipe(recipe_file), replace(command, earlier=None), lines.append)
     assert again == progress
