@@ -1,4 +1,4 @@
-"""The networks, by the name that a recipe gives."""
+"""The networks by their names in recipes."""
 
 from collections.abc import Callable
 from functools import partial
@@ -28,22 +28,22 @@ MODELS: dict[str, Callable[..., Any]] = {
 
 @runtime_checkable
 class CodeNetwork(Protocol):
-    """The paper's network and its rivals, from images [B, 3, H, W] in 0..1 of any size to maps [B, 1, H, W].
+    """The paper's network and its rivals: images [B, 3, H, W] in 0..1 of any size to maps [B, 1, H, W].
 
     Attributes:
-        predicts: the code of a `DepthCurve`, or disparity in pixels.
-        output_weights: what each of `outputs` counts in the loss.
+        predicts: Code of a `DepthCurve`, or disparity in pixels.
+        output_weights: Weight of each of `outputs` in the loss.
     """
 
     predicts: Literal["code", "disparity_px"]
     output_weights: tuple[float, ...]
 
     def outputs(self, left: Tensor, right: Tensor) -> tuple[Tensor, ...]:
-        """Every output that training supervises; the last one is the answer."""
+        """All supervised outputs; the last one is the estimate."""
         ...
 
     def __call__(self, left: Tensor, right: Tensor) -> Tensor:
-        """The answer."""
+        """The estimate."""
         ...
 
     def eval(self) -> Any: ...
@@ -54,6 +54,6 @@ def build_network(recipe: Recipe) -> Any:
     if recipe.model not in MODELS:
         raise FormatError(f"{recipe.name}: model = {recipe.model!r}, expected {' or '.join(MODELS)}")
     if recipe.model == "psmnet":
-        # The only one that has its range of disparities built in and lets one choose it.
+        # The only network whose disparity range is an argument.
         return PSMNet(int(recipe.max_disparity_px))
     return MODELS[recipe.model]()

@@ -1,11 +1,11 @@
 """DenseMapNet: R. Atienza, "Fast Disparity Estimation Using Dense Networks", ICRA 2018.
 
-The parent of the paper's network: the same matching over both views laid together and pooled by 8, its result
-enlarged by 8 at once. What the two share is in layers.py. The layers are those of the published weights
+The predecessor of the paper's network: the same matching of both views stacked and pooled by 8, with the
+result upsampled by 8 in one step. Shared parts are in layers.py. The layers match the published weights
 (github.com/roatienza/densemapnet, MIT licence), which `load_keras` reads.
 
-Deviation: sides that are no multiples of 8 are padded below and on the right with the border's pixels before
-the network, and the result is cut back; the published code pads its maps with zeros inside.
+Deviation: images whose sides are not multiples of 8 are padded below and on the right by repeating border
+pixels, and the result is cropped; the published code zero-pads its maps internally.
 """
 
 from collections import Counter
@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from stereoweave.errors import FormatError
 from stereoweave.learn.models.layers import CodeHead, PooledMatching, initialise_as_keras, pad_to_multiple
 
-# What a layer is called in a Keras file, and what each of our tensors is called there.
+# Each layer's name in a Keras file, and the Keras names of its tensors.
 _KERAS_NAMES: dict[type[nn.Module], tuple[str, dict[str, str]]] = {
     nn.Conv2d: ("conv2d", {"weight": "kernel", "bias": "bias"}),
     nn.ConvTranspose2d: ("conv2d_transpose", {"weight": "kernel", "bias": "bias"}),
@@ -39,14 +39,14 @@ _KERAS_NAMES: dict[type[nn.Module], tuple[str, dict[str, str]]] = {
 
 
 class DenseMapNet(nn.Module):
-    """The network that the paper builds on: a code of disparity in 0..1 for each pixel of the left view.
+    """The network that the paper builds on: a disparity code in 0..1 for each pixel of the left view.
 
     290,290 parameters; 8.41 G multiply-adds at 640x480.
 
     Args:
-        channels: 3 for RGB; 1 for a network that matches grey pictures (286,240 parameters), as the one
-            published for KITTI 2015 does. It is given RGB like any other and weighs the colours by Rec. 601,
-            as OpenCV and Pillow do; how its author did is not known.
+        channels: 3 for RGB; 1 for grey (286,240 parameters), as published for KITTI 2015. A grey network also
+            takes RGB and converts it by Rec. 601, like OpenCV and Pillow; the author's own conversion is
+            unknown.
     """
 
     multiple_of = 8
@@ -63,7 +63,7 @@ class DenseMapNet(nn.Module):
     def outputs(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> tuple[Float[Tensor, "b 1 h w"]]:
-        """All that training supervises: the code alone."""
+        """All supervised outputs: the code."""
         height, width = left.shape[2:]
         left, right = (pad_to_multiple(view, self.multiple_of) for view in (left, right))
         if self.channels == 1:
@@ -78,19 +78,19 @@ class DenseMapNet(nn.Module):
         """The left view's code [B, 1, H, W] in 0..1, near is high; published networks: disparity / d_max.
 
         Args:
-            left: The left view [B, 3, H, W], RGB in 0..1, of any size.
-            right: The right view, likewise.
+            left: Left view [B, 3, H, W], RGB in 0..1, of any size.
+            right: Right view, in the same format.
         """
         return self.outputs(left, right)[-1]
 
 
 def load_keras(path: str | Path) -> DenseMapNet:
-    """The published network of a Keras HDF5 weight file, in eval mode; grey if the file is.
+    """Load a published network from a Keras HDF5 weight file, in eval mode; grey if the file is.
 
-    Its code is disparity / d_max, but the file does not hold d_max, the largest one in training.
+    Its code is disparity / d_max, but d_max, the largest disparity in training, is not in the file.
 
     Raises:
-        FormatError: If the file is missing, is no HDF5, or holds other layers or shapes than DenseMapNet's.
+        FormatError: The file is missing, is not HDF5, or its layers or shapes are not DenseMapNet's.
     """
     found = _read_hdf5(path)
     first = found.get("conv2d_1/conv2d_1/kernel:0")
@@ -111,7 +111,7 @@ def load_keras(path: str | Path) -> DenseMapNet:
 
 
 def _read_hdf5(path: str | Path) -> dict[str, np.ndarray]:
-    """Every array of the file by its full name."""
+    """Read every array of the file, by full name."""
     import h5py  # type: ignore[import-untyped]
 
     arrays = {}
@@ -126,15 +126,15 @@ def _read_hdf5(path: str | Path) -> dict[str, np.ndarray]:
     except FileNotFoundError as error:
         raise FormatError(f"{path}: expected Keras weights as HDF5, found no such file") from error
     except (OSError, KeyError, RuntimeError, ValueError) as error:
-        # HDF5's own words are long and of several lines; they stay with the cause.
+        # HDF5's own message is long and spans several lines; it stays with the cause.
         raise FormatError(f"{path}: expected Keras weights as HDF5, found something else") from error
     return arrays
 
 
 def _iterate_keras_tensors(network: nn.Module) -> Iterator[tuple[str, Tensor]]:
-    """Every tensor of the network under its name in a Keras file, its axes in Keras's order.
+    """Yield every tensor of the network under its Keras name, with axes in Keras's order.
 
-    Keras numbers the layers of a kind as they are constructed; so does `modules()`.
+    Keras numbers the layers of a kind in the order of construction, as does `modules()`.
     """
     count = Counter[str]()
     for layer in network.modules():

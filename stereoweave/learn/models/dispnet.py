@@ -3,8 +3,8 @@
 N. Mayer et al., A Large Dataset to Train Convolutional Networks for Disparity, Optical Flow, and Scene Flow
 Estimation, CVPR 2016, arXiv:1512.02134.
 
-Parameters, kernel area * inputs * outputs + outputs a layer, channels from Table 1 of the paper; conv1 and
-conv2 serve both views, and 41 candidates with the 64 channels of conv_redir make the 105 that conv3a reads:
+Parameters: kernel area * inputs * outputs + outputs per layer, channels from Table 1 of the paper. conv1 and
+conv2 process both views; 41 candidates and the 64 channels of conv_redir make the 105 inputs of conv3a:
 
     conv1     49 *    3 *   64 +   64 =     9,472
     conv2     25 *   64 *  128 +  128 =   204,928
@@ -27,13 +27,13 @@ conv2 serve both views, and 41 candidates with the 64 channels of conv_redir mak
 
 Deviations, and choices where the paper is silent:
 
-- The paper starts with loss on pr6 alone and moves the weight to finer outputs as training goes on. Here the
-  weights stand still, halved from each output to the coarser one: every output learns from the first step,
-  and the answer weighs as much as all others together, without a schedule that this network alone would need.
-- A prediction reaches the next iconv by bilinear enlargement; the table names no layer for it.
-- A leaky ReLU, slope 0.1, follows every convolution but the predictions.
+- The paper starts with a loss on pr6 alone and shifts the weight to finer outputs during training. Here the
+  weights are constant and halve with each coarser output: every output learns from the first step, the final
+  one weighs as much as all others together, and no schedule for this network alone is needed.
+- A prediction is upsampled bilinearly for the next iconv; the table names no layer for it.
+- A leaky ReLU, slope 0.1, follows every convolution except the predictions.
 - Colours are scaled to -1..1.
-- Images are padded to multiples of 64, the stride of conv6, and the answer is cut to their size.
+- Images are padded to multiples of 64, the stride of conv6, and the result is cropped to their size.
 """
 
 from typing import ClassVar, Literal
@@ -51,14 +51,14 @@ LEVELS = 41
 
 
 def convolution(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Sequential:
-    """Convolution and leaky ReLU; 1 / `stride` of the input's resolution."""
+    """Convolution and leaky ReLU, at 1 / `stride` of the input's resolution."""
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, kernel, stride, padding=kernel // 2), nn.LeakyReLU(SLOPE, inplace=True)
     )
 
 
 def prediction(inputs: int) -> nn.Conv2d:
-    """Disparity in pixels of the full resolution from `inputs` channels."""
+    """Convolution from `inputs` channels to disparity in pixels of the full resolution."""
     return nn.Conv2d(inputs, 1, 3, padding=1)
 
 
@@ -70,12 +70,15 @@ def mean_correlation(
 
 
 def enlarge(map_: Float[Tensor, "b c h w"], scale: int) -> Float[Tensor, "b c h2 w2"]:
-    """The map, bilinearly, at `scale` times its resolution; its values stay."""
+    """Upsample bilinearly by `scale`; values are not scaled."""
     return F.interpolate(map_, scale_factor=float(scale), mode="bilinear")
 
 
 class Expansion(nn.Module):
-    """Twice the resolution: upconv; iconv of it, the disparity so far and the encoder's maps; prediction."""
+    """One decoder step to twice the resolution.
+
+    Layers: upconv; iconv of its output, the current disparity and the encoder's maps; prediction.
+    """
 
     def __init__(self, inputs: int, skipped: int, outputs: int) -> None:
         super().__init__()
@@ -91,16 +94,16 @@ class Expansion(nn.Module):
         disparity_px: Float[Tensor, "b 1 h w"],
         skipped: Float[Tensor, "b c2 h2 w2"],
     ) -> tuple[Float[Tensor, "b c3 h2 w2"], Float[Tensor, "b 1 h2 w2"]]:
-        """Maps and disparity in pixels of the full resolution, both at twice the resolution of `maps`."""
+        """Maps and disparity at twice the resolution of `maps`; disparity in full-resolution pixels."""
         maps = self.iconv(torch.cat([self.upconv(maps), enlarge(disparity_px, 2), skipped], 1))
         return maps, self.prediction(maps)
 
 
 class DispNet(nn.Module):
-    """Disparity of the left view, correlated with the right one over 160 px. 42,174,022 parameters.
+    """Disparity of the left view by correlation over 160 px. 42,174,022 parameters.
 
-    38.17 G multiply-adds at 640x480, which is padded to 640x512: convolutions, and the correlation of all
-    columns with all columns; enlargements and activations are not counted.
+    38.17 G multiply-adds at 640x480, padded to 640x512: convolutions, and the correlation of all columns with
+    all columns; upsampling and activations are not counted.
     """
 
     multiple_of = 64
@@ -132,10 +135,10 @@ class DispNet(nn.Module):
     def predictions(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> list[Float[Tensor, "b 1 _ _"]]:
-        """Disparities pr6 to pr1, at 1/64 to 1/2 of the padded images' size, in pixels of the full one."""
+        """Disparities pr6 to pr1 at 1/64 to 1/2 of the padded images' size, in full-resolution pixels."""
         views = pad_to_multiple(torch.cat([left, right]), self.multiple_of)
         half = self.conv1(views * 2 - 1)
-        batch = left.shape[0]  # and no chunk(): exported, it would fix the batch
+        batch = left.shape[0]  # not chunk(), which would fix the batch size on export
         quarter = self.conv2(half)
         left_quarter, right_quarter = quarter[:batch], quarter[batch:]
         correlation = F.leaky_relu(mean_correlation(left_quarter, right_quarter), SLOPE)
@@ -153,7 +156,7 @@ class DispNet(nn.Module):
     def outputs(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> tuple[Float[Tensor, "b 1 h w"], ...]:
-        """Disparities pr6 to pr1, each at full resolution and in its pixels; the last one is the answer."""
+        """Disparities pr6 to pr1 in pixels, upsampled to full resolution; the last one is the estimate."""
         height, width = left.shape[2:]
         return tuple(
             enlarge(disparity_px.float(), 64 >> level)[..., :height, :width]
@@ -163,15 +166,16 @@ class DispNet(nn.Module):
     def forward(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> Float[Tensor, "b 1 h w"]:
-        """Disparity of the left view in pixels; the images are RGB in 0..1."""
+        """Disparity of the left view in pixels, from RGB images in 0..1."""
         return self.outputs(left, right)[-1]
 
 
 def _initialise(layer: nn.Module) -> None:
-    """Normal weights of variance 2 / (1 + SLOPE^2) / terms (He et al. 2015), `terms` an output's products.
+    """Draw normal weights of variance 2 / (1 + SLOPE^2) / terms (He et al. 2015), `terms` per output.
 
-    Without batch norm nothing else keeps the signal's size through 16 layers; PyTorch's own initialisation
-    loses about two thirds of it a layer. A transposed convolution's output sums 1 / stride^2 of its kernel.
+    Without batch norm the initialisation alone preserves the signal's scale through 16 layers; PyTorch's
+    default loses about two thirds of it per layer. A transposed convolution's output sums 1 / stride^2 of
+    its kernel.
     """
     if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
         kernel, stride = layer.kernel_size[0], layer.stride[0] if layer.transposed else 1

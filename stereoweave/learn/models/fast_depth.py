@@ -1,16 +1,16 @@
 """FastDepthNet: the network of "Fast Depth Estimation for View Synthesis", section III-A.
 
 The matching of DenseMapNet (Atienza, "Fast Disparity Estimation Using Dense Networks", ICRA 2018) with a
-decoder in steps of two, which sees the left view again at each step. What the two share is in layers.py.
+decoder in steps of two, with a skip connection from the left view at each step. Shared parts are in
+layers.py.
 
 The paper gives the structure. Filter counts, dropout of single values and the constants of batch norm are
-those of the published implementations, and add up to their 314,722 parameters. Where both are silent:
+from the published implementations, and add up to their 314,722 parameters. Where neither specifies:
 
-- Upsampling repeats pixels, as Keras does when not told otherwise.
+- Upsampling is by nearest neighbour, Keras's default.
 - Initial weights are Glorot's and biases 0, Keras's defaults.
-- Sides that are no multiples of 8 are padded below and on the right with the border's pixels, and the result
-  is cut back. Both views are padded alike, which leaves every disparity as it was; and nothing is moved, so
-  that the cut is all there is to undo.
+- Images whose sides are not multiples of 8 are padded below and on the right by repeating border pixels,
+  and the result is cropped. Both views are padded alike and keep their origin, so disparities do not change.
 """
 
 from typing import ClassVar, Literal
@@ -35,8 +35,8 @@ class FastDepthNet(nn.Module):
     314,722 parameters; 7.39 G multiply-adds at 640x480.
 
     Args:
-        skips: Whether the steps of the decoder see the left view's pooled features; without, the paper's
-            claim for them can be tested (301,858 parameters).
+        skips: Whether the decoder's steps see the left view's pooled features; False (301,858 parameters)
+            tests the paper's claim for them.
     """
 
     multiple_of = 8
@@ -56,12 +56,12 @@ class FastDepthNet(nn.Module):
     def outputs(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> tuple[Float[Tensor, "b 1 h w"]]:
-        """All that training supervises: the code alone."""
+        """All supervised outputs: the code."""
         height, width = left.shape[2:]
         left, right = (pad_to_multiple(view, self.multiple_of) for view in (left, right))
         matches, features, left_channel = self.matching(left, right)
-        quarter = self.decode_quarter(self._enlarged(matches, features, 4))
-        half = self.decode_half(self._enlarged(quarter, features, 2))
+        quarter = self.decode_quarter(self._enlarge(matches, features, 4))
+        half = self.decode_half(self._enlarge(quarter, features, 2))
         code = self.head(F.interpolate(half, scale_factor=2.0), left_channel)
         return (code[..., :height, :width],)
 
@@ -71,12 +71,12 @@ class FastDepthNet(nn.Module):
         """The left view's code [B, 1, H, W] in 0..1, near is high; `DepthCurve` decodes it.
 
         Args:
-            left: The left view [B, 3, H, W], RGB in 0..1, of any size.
-            right: The right view, likewise.
+            left: Left view [B, 3, H, W], RGB in 0..1, of any size.
+            right: Right view, in the same format.
         """
         return self.outputs(left, right)[-1]
 
-    def _enlarged(self, x: Tensor, features: Tensor, pool: int) -> Tensor:
-        """Twice the size, which is 1/`pool` of the full one, and the left view's features at that size."""
+    def _enlarge(self, x: Tensor, features: Tensor, pool: int) -> Tensor:
+        """Upsample by two, to 1/`pool` of full size, and append the left view's features at that size."""
         enlarged = F.interpolate(x, scale_factor=2.0)
         return torch.cat([enlarged, F.max_pool2d(features, pool)], 1) if self.skips else enlarged

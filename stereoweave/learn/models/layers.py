@@ -1,4 +1,4 @@
-"""What the networks share: convolution blocks, correlation, soft-argmax, guided upsampling."""
+"""Layers shared by the networks: convolution blocks, correlation, soft-argmax, guided upsampling."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -9,15 +9,16 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
-# Of the columns of a correlation. Where images' sides are multiples of 16 and it is at 1/4, four divide every
-# width: an exported graph pads nothing, and has as many matrix products whatever the width is.
+# Column blocks of a correlation. At 1/4 of images whose sides are multiples of 16, four divide every width:
+# an exported graph needs no padding and has the same number of matrix products for every width.
 _BLOCKS = 4
-# Of a neighbour that is refused: where all are, no division by zero, and still a mixture of neighbours alone.
+# Weight of a rejected neighbour: avoids division by zero if all are rejected, and still averages neighbours
+# only.
 _LEAST_SHARE = 1e-4
 
 
 class ConvBlock(nn.Sequential):
-    """Convolution, batch norm, ReLU, at the resolution of the input."""
+    """Convolution, batch norm and ReLU at the input's resolution."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 3, dilation: int = 1) -> None:
         super().__init__(
@@ -32,8 +33,8 @@ class ConvBlock(nn.Sequential):
 class Halve(nn.Sequential):
     """ConvBlock at half the resolution.
 
-    The kernel is even, so that the centre of an output pixel is the centre of the pixels it stands for: a
-    network that mirrors its feature maps needs maps whose grid is its own mirror image.
+    The kernel is even, so that an output pixel is centred on the input pixels that it covers. A network that
+    mirrors its feature maps needs a grid that is its own mirror image.
     """
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 2) -> None:
@@ -62,7 +63,7 @@ Block = TypeVar("Block", Residual, nn.Conv2d)
 
 
 def zero_initialise(block: Block) -> Block:
-    """The block, adding nothing until it is trained: so that a trained network can grow by it."""
+    """Set the block's last weights to zero, so that a trained network can grow by it."""
     last = block.second[1] if isinstance(block, Residual) else block
     for parameter in last.parameters():
         nn.init.zeros_(parameter)
@@ -70,10 +71,10 @@ def zero_initialise(block: Block) -> Block:
 
 
 class DilatedDense(nn.Module):
-    """The paper's densely connected blocks: each narrows all maps so far, looks wider, and adds its own.
+    """The paper's densely connected blocks: each narrows all previous maps, dilates, and appends its own.
 
-    Deviation: convolution, norm, ReLU in this order (the paper: norm, ReLU, convolution), so that every norm
-    folds into its convolution when the network is exported.
+    Deviation: convolution, norm, ReLU (the paper: norm, ReLU, convolution), so that every norm folds into its
+    convolution on export.
     """
 
     def __init__(self, inputs: int, narrow: int, growth: int, dilations: tuple[int, ...]) -> None:
@@ -94,18 +95,18 @@ class DilatedDense(nn.Module):
 
 
 def mirror(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-    """The map as a mirror shows it, left and right exchanged."""
+    """Flip the map left to right."""
     return x.flip(3)
 
 
 def correlation_volume(
     first: Float[Tensor, "b c h w"], second: Float[Tensor, "b c h w"], levels: int
 ) -> Float[Tensor, "b d h w"]:
-    """How well column x of `first` agrees with column x - d of `second`, for d = 0 .. levels - 1; 0 outside.
+    """Correlation of column x of `first` with column x - d of `second`, d = 0 .. levels - 1; 0 outside.
 
-    A matrix product a row compares the columns of a quarter of the width with all that they can meet: at
-    640x480 half of the work of comparing all with all. Plain reference: `correlation_volume_plain` in
-    tests/test_layers.py.
+    Each matrix product compares a quarter of a row's columns with all columns they can match: at 640x480
+    half the work of comparing all with all. Plain reference: `correlation_volume_plain` in
+    tests/learn/models/test_layers.py.
     """
     width = first.shape[3]
     if behind := -width % _BLOCKS:
@@ -123,7 +124,7 @@ def correlation_volume(
 def _diagonals(products: Float[Tensor, "b h n m"], levels: int) -> Float[Tensor, "b h n d"]:
     """products[..., i, i + e] at [..., i, e], for e = 0 .. levels - 1 = m - n.
 
-    Read with rows one element longer, the diagonals are columns.
+    In rows that are one element longer, the diagonals become columns.
     """
     rows = products.shape[2]
     longer = torch.unflatten(F.pad(products.flatten(2), (0, rows)), 2, (rows, rows + levels))
@@ -131,17 +132,18 @@ def _diagonals(products: Float[Tensor, "b h n m"], levels: int) -> Float[Tensor,
 
 
 def local_soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
-    """Expected level under a softmax over the surroundings of the best level.
+    """Expected level under a softmax over levels near the best one.
 
-    The window keeps a second, far-off candidate from pulling the mean off the surface. First it reaches 2
-    levels to each side of the best one; then it moves to the mean found there, fading out over 3 levels,
-    again and again, so that it rests in one place even where rounding decides which of two levels is best.
+    The window keeps a distant second candidate from pulling the mean off the surface. It first covers 2
+    levels on each side of the best one, then moves to the mean found there, fading out over 3 levels.
+    Repeated three times, it converges to the same place even where rounding decides which of two levels is
+    best.
     """
     best = logits.detach().argmax(1, keepdim=True)
     near, reach = 2, 3
     farthest = near + reach
     steps = torch.arange(-farthest, farthest + 1, device=logits.device).view(1, -1, 1, 1)
-    # A level beyond the volume's ends: far less likely than any inside it.
+    # Levels beyond the volume's ends are far less likely than any inside.
     padded = F.pad(logits, (0, 0, 0, 0, farthest, farthest), value=-1e4)
     around = padded.gather(1, best + steps + farthest)
     likelihood = (around - around.amax(1, keepdim=True)).exp()
@@ -155,7 +157,7 @@ def local_soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h 
 def expected_step(logits: Float[Tensor, "b k h w"]) -> Float[Tensor, "b 1 h w"]:
     """Expectation of -radius .. radius under a softmax over channels, k = 2 * radius + 1.
 
-    Written out, because ONNX Runtime's softmax over channels is ten times slower than these steps.
+    Written out because ONNX Runtime's softmax over channels is ten times slower.
     """
     radius = logits.shape[1] // 2
     steps = torch.arange(-radius, radius + 1, device=logits.device).view(1, -1, 1, 1)
@@ -171,8 +173,8 @@ def correlate_nearby(
 ) -> Float[Tensor, "b k h w"]:
     """Correlation of column x of `first` with column x - disparity - k of `second`, k = -radius .. radius.
 
-    Between two columns it is interpolated; columns outside the map count as its border. One column at a
-    time: what is looked up for it stays in the processor's cache until it is summed.
+    Linearly interpolated between columns; columns outside the map take the border's value. One offset at a
+    time, so that gathered features stay in the processor's cache until they are summed.
     """
     batch, channels, height, width = first.shape
     whole = disparity.detach().floor()
@@ -195,9 +197,9 @@ def correlate_warped(
 ) -> Float[Tensor, "b k h w"]:
     """Correlation of column x of `first` with column x - k of the warped `second`, k = -radius .. radius.
 
-    `disparity` warps it. Where the surface is smooth this is `nearby_matches`, and costs less: two columns
-    are looked up for each pixel, whatever the radius. Columns outside the map count as its border; beyond
-    the warped map there is nothing, 0.
+    `disparity` warps it. On smooth surfaces this equals `correlate_nearby` and costs less: two columns per
+    pixel are gathered for any radius. Columns outside the map take the border's value; outside the warped
+    map the correlation is 0.
     """
     batch, channels, height, width = first.shape
     columns = torch.arange(width, dtype=torch.float32, device=first.device) - disparity.detach()
@@ -229,7 +231,7 @@ def sample_at_match(
 def gather_neighbours(
     x: Float[Tensor, "b 1 h w"], offsets: Sequence[tuple[int, int]]
 ) -> Float[Tensor, "b k h w"]:
-    """The map's values at offsets of rows and columns from each pixel; outside the map, its border's."""
+    """The map's values at (row, column) offsets from each pixel; the border is replicated."""
     height, width = x.shape[2:]
     reach = max(abs(side) for offset in offsets for side in offset)
     around = F.pad(x, (reach, reach, reach, reach), mode="replicate")
@@ -239,28 +241,28 @@ def gather_neighbours(
 
 
 def _pixels(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "n c"]:
-    """A pixel's features a row, so that looking one up is one contiguous copy."""
+    """Features as one row per pixel, so that a lookup is one contiguous copy."""
     return x.permute(0, 2, 3, 1).reshape(-1, x.shape[1])
 
 
 def _places(columns: Float[Tensor, "b 1 h w"]) -> Int64[Tensor, " n"]:
-    """The rows of `_pixels` that hold these whole columns or the border's, each in its own line and image."""
+    """Row indices in `_pixels` of these integer columns, clamped to their own line and image."""
     batch, _, height, width = columns.shape
     lines = torch.arange(batch * height, device=columns.device).view(batch, 1, height, 1)
-    # Clamped as whole numbers: a disparity that is NaN is to give a loss that is, not to fail here.
+    # Clamped as integers, so that a NaN disparity gives a NaN loss instead of an error here.
     return (columns.long().clamp(0, width - 1) + lines * width).view(-1)
 
 
 def upsample_convex(
     x: Float[Tensor, "b 1 h w"], weights: Float[Tensor, "b k h w"]
 ) -> Float[Tensor, "b 1 h2 w2"]:
-    """Twice the size: each new pixel a convex mixture of old ones around it (RAFT, Teed & Deng 2020).
+    """Upsample by two: each new pixel is a convex combination of old ones (RAFT, Teed & Deng 2020).
 
-    `weights` are logits, one for each of the old pixels and each of the four new ones: [B, 9 * 4, H, W] mixes
-    the 3x3 old pixels around, [B, 4 * 4, H, W] the 2x2 between whose centres the new one lies. A mixture
-    can put an edge anywhere between two old pixels without inventing values between its two sides.
+    `weights` are logits per old and new pixel: [B, 9 * 4, H, W] combines the 3x3 surrounding old pixels,
+    [B, 4 * 4, H, W] the 2x2 whose centres enclose the new pixel. The combination can place an edge anywhere
+    between two old pixels without values between its two sides.
 
-    Deviation: shares of sigmoids; RAFT's softmax costs ONNX Runtime more than all convolutions.
+    Deviation: normalised sigmoids; RAFT's softmax costs more in ONNX Runtime than all convolutions.
     """
     neighbours, logits = _neighbours(x, weights)
     shares = logits.sigmoid() + _LEAST_SHARE
@@ -270,22 +272,22 @@ def upsample_convex(
 def upsample_to_a_side(
     x: Float[Tensor, "b 1 h w"], weights: Float[Tensor, "b k h w"], step: float = 2.0
 ) -> Float[Tensor, "b 1 h2 w2"]:
-    """As `upsample_convex`, but a mixture of two sides becomes the side that has more of it.
+    """Like `upsample_convex`, but a mixture of two surfaces snaps to the one with the larger share.
 
-    The sides are the neighbours above and below the mixture; they are two surfaces where their means are
-    more than `step` apart. The mean of two surfaces is on neither, and would fly between them. Every choice
-    fades into the other, so that rounding decides nothing: three quarters of the mixture are all of it. Not
-    for training: a side that is wrong gets hardly any gradient towards the other.
+    The neighbours are split at the mixture; they are two surfaces if their means are more than `step` apart.
+    The mean of two surfaces lies on neither and would be a flying pixel. All decisions are blended, so that
+    rounding decides nothing: a share of three quarters snaps fully. Not for training: the losing side gets
+    hardly any gradient.
     """
     neighbours, logits = _neighbours(x, weights)
-    # Written out: ONNX Runtime's sigmoid is off by 1e-7, which is much where all neighbours are refused. Its
-    # gradient is NaN below a logit of -88, so that training takes PyTorch's sigmoid.
+    # Written out: ONNX Runtime's sigmoid has an error of 1e-7, too much where all neighbours are rejected.
+    # The gradient of this form is NaN below a logit of -88, so training uses PyTorch's sigmoid.
     shares = (1 + (-logits).exp()).reciprocal() + _LEAST_SHARE
     share, total = shares.sum(1), (shares * neighbours).sum(1)
     mixed = total / share
     above = shares * (neighbours - (mixed - 0.5).unsqueeze(1)).clamp(0, 1)
     share_above, total_above = above.sum(1), (above * neighbours).sum(1)
-    # 1e-6: where all neighbours are far above or far below there is nothing on the other side.
+    # 1e-6: if all neighbours are far above or far below, the other side is empty.
     mean_above = total_above / (share_above + 1e-6)
     mean_below = (total - total_above) / (share - share_above + 1e-6)
     belongs_above = (2 * share_above / share - 0.5).clamp(0, 1)
@@ -295,14 +297,14 @@ def upsample_to_a_side(
 
 
 def _neighbours(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Old pixels around each new one, [B, 9, 1, H, W], and the logits of their shares, [B, 9, 4, H, W]."""
+    """Old pixels around each new one, [B, 9, 1, H, W], and the logits of their weights, [B, 9, 4, H, W]."""
     batch, channels, height, width = weights.shape
     around = F.pad(x, (1, 1, 1, 1), mode="replicate")
     shifted = [around[:, :, dy : dy + height, dx : dx + width] for dy in range(3) for dx in range(3)]
     if channels == 9 * 4:
         neighbours = torch.stack(shifted, 1)
     else:
-        # Of old pixel (a, b) among the four, for new pixel (i, j) among the four.
+        # Old pixel (a, b) of the four, for new pixel (i, j) of the four.
         corners = [(0, 0), (0, 1), (1, 0), (1, 1)]
         neighbours = torch.cat([shifted[3 * (i + a) + j + b] for a, b in corners for i, j in corners], 1)
         neighbours = neighbours.view(batch, 4, 4, height, width)
@@ -310,11 +312,11 @@ def _neighbours(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def pad_to_multiple(image: Float[Tensor, "b c h w"], multiple: int) -> Float[Tensor, "b c h2 w2"]:
-    """The image with its last row and column repeated until both sides are multiples of `multiple`.
+    """Pad the image by repeating its last row and column until both sides are multiples of `multiple`.
 
-    Everything is added below and on the right, so that a pixel keeps its place: a result is cut back to
-    [..., :height, :width]. An image that already fits comes back itself, and an exported graph whose sides
-    are declared as multiples holds no padding.
+    Padding is below and on the right, so that pixels keep their coordinates; crop results to
+    [..., :height, :width]. An image that fits is returned itself, so an exported graph whose sides are
+    declared as multiples contains no padding.
     """
     below, behind = (-side % multiple for side in image.shape[2:])
     if below == behind == 0:
@@ -323,7 +325,7 @@ def pad_to_multiple(image: Float[Tensor, "b c h w"], multiple: int) -> Float[Ten
 
 
 class NormReluConv(nn.Sequential):
-    """Batch norm, ReLU, convolution, in the order of DenseMapNet and the paper; the resolution stays."""
+    """Batch norm, ReLU, convolution, in the order of DenseMapNet and the paper, at the input's resolution."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 5, dilation: int = 1) -> None:
         super().__init__(
@@ -332,12 +334,12 @@ class NormReluConv(nn.Sequential):
 
 
 class PooledMatching(nn.Module):
-    """DenseMapNet's correspondence network, which the paper takes over: both views in one map, pooled by 8.
+    """DenseMapNet's correspondence network, also used in the paper: both views stacked and pooled by 8.
 
     Layers are registered in the order in which Keras numbers them in DenseMapNet's published weights.
 
     Args:
-        channels: Channels of one view.
+        channels: Channels per view.
     """
 
     def __init__(self, channels: int = 3) -> None:
@@ -357,11 +359,11 @@ class PooledMatching(nn.Module):
     def forward(
         self, left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"]
     ) -> tuple[Float[Tensor, "b 32 h8 w8"], Float[Tensor, "b 16 h w"], Float[Tensor, "b 1 h w"]]:
-        """Matches at 1/8 resolution; the left view's features at full resolution, and one channel of it."""
+        """Matches at 1/8 resolution, and the left view's features and one-channel map at full resolution."""
         features = self.left_features(left)
         stereo = self.stereo_features(torch.cat([left, right], 1))
         stereo = F.relu(self.norm(F.max_pool2d(stereo, 8)))
-        # The widest dilation first: the published weights want the channels in this order.
+        # Widest dilation first: the order of channels in the published weights.
         found = [self.dropout(conv(stereo)) for conv in reversed(self.correspondence)]
         matches = torch.cat([F.max_pool2d(features, 8), *found, stereo], 1)
         for block in self.dense:
@@ -387,20 +389,21 @@ class CodeHead(nn.Module):
 
 
 def same_conv(inputs: int, outputs: int, kernel: int = 5, dilation: int = 1) -> nn.Conv2d:
-    """A convolution with bias that keeps the resolution."""
+    """Convolution with bias at the input's resolution."""
     return nn.Conv2d(inputs, outputs, kernel, padding=dilation * (kernel // 2), dilation=dilation)
 
 
 def keras_norm(channels: int) -> nn.BatchNorm2d:
-    """Batch norm with Keras's defaults, under which DenseMapNet and the paper's network were published."""
+    """Batch norm with Keras's default constants, as in the published DenseMapNet and paper networks."""
     return nn.BatchNorm2d(channels, eps=1e-3, momentum=0.01)
 
 
 def initialise_as_keras(network: nn.Module) -> None:
-    """Give every convolution Glorot's uniform weights and no bias, Keras's defaults.
+    """Initialise every convolution with Glorot-uniform weights and zero biases, Keras's defaults.
 
-    PyTorch's own would start a transposed convolution to one channel with weights more than twice as large:
-    the sigmoid behind it would see logits with a standard deviation of 2 in place of 0.8 (measured).
+    PyTorch's default would start a transposed convolution to one channel with weights more than twice as
+    large: the logits of the sigmoid that follows would have a standard deviation of 2 instead of 0.8
+        (measured).
     """
     for layer in network.modules():
         if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):

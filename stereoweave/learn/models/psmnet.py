@@ -4,18 +4,17 @@ J.-R. Chang and Y.-S. Chen, Pyramid Stereo Matching Network, CVPR 2018, arXiv:18
 
 Deviations, and choices where the paper is silent:
 
-- The batch norms of the features see both views at once: one batch is quicker than two, and weights that
-  serve both want statistics of both. So a single pair can train where pooling leaves one pixel of a map.
-- A pooling window is cut to the map where the map is smaller, so that small crops train.
-- The pyramid's branches have 1x1 kernels, as the paper's text says; with its table's 3x3 ones the count would
-  be 131,072 above the published one.
-- The cost volume is 0 where the candidate is outside the right image; the left features stay there.
-- Colours are scaled to -1..1, and not by a data set's mean and deviation: a batch norm follows.
-- Enlargements regard pixels as areas (align_corners off), whatever the size of the map. Among the candidates
-  that puts level k of the costs at 4 k + 1.5, while the cost volume shifts level k by exactly 4 k px: a sharp
-  minimum at level 10 gives 41.5 px, not 40. Training absorbs the 1.5 px, but not at the end of the scale: the
-  first two candidates always cost the same, so that no answer is below 0.5 px, and disparities under about
-  1.5 px suffer.
+- The features' batch norms see both views in one batch: faster than two batches, and shared weights need
+  shared statistics. This also lets a single pair train where pooling leaves one pixel per map.
+- Pooling windows are limited to the size of the map, so that small crops can train.
+- The pyramid's branches have 1x1 kernels, as in the paper's text; with the 3x3 ones of its table the
+  parameter count would exceed the published one by 131,072.
+- Right features are 0 where the candidate is outside the right image; left features are kept.
+- Colours are scaled to -1..1 instead of by a dataset's mean and deviation: a batch norm follows.
+- Upsampling treats pixels as areas (align_corners=False). This places cost level k at candidate 4 k + 1.5,
+  while the cost volume shifts level k by exactly 4 k px: a sharp minimum at level 10 gives 41.5 px, not 40.
+  Training absorbs the 1.5 px except at the end of the range: the first two candidates always have equal
+  costs, so no estimate is below 0.5 px, and disparities under about 1.5 px are inaccurate.
 """
 
 from typing import ClassVar, Literal
@@ -30,7 +29,7 @@ from stereoweave.learn.models.layers import ConvBlock, pad_to_multiple
 
 
 def norm_convolution(inputs: int, outputs: int, kernel: int, stride: int, dilation: int) -> nn.Sequential:
-    """Convolution and batch norm; 1 / `stride` of the input's resolution."""
+    """Convolution and batch norm, at 1 / `stride` of the input's resolution."""
     padding = dilation * (kernel // 2)
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, kernel, stride, padding, dilation, bias=False), nn.BatchNorm2d(outputs)
@@ -38,14 +37,14 @@ def norm_convolution(inputs: int, outputs: int, kernel: int, stride: int, dilati
 
 
 def norm_convolution_3d(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
-    """3x3x3 convolution and batch norm; 1 / `stride` of the input's resolution, candidates included."""
+    """3x3x3 convolution and batch norm, at 1 / `stride` of the input's resolution and candidates."""
     return nn.Sequential(
         nn.Conv3d(inputs, outputs, 3, stride, padding=1, bias=False), nn.BatchNorm3d(outputs)
     )
 
 
 def norm_expansion_3d(inputs: int, outputs: int) -> nn.Sequential:
-    """3x3x3 transposed convolution and batch norm; twice the input's resolution, candidates included."""
+    """3x3x3 transposed convolution and batch norm, at twice the input's resolution and candidates."""
     return nn.Sequential(
         nn.ConvTranspose3d(inputs, outputs, 3, stride=2, padding=1, output_padding=1, bias=False),
         nn.BatchNorm3d(outputs),
@@ -53,7 +52,7 @@ def norm_expansion_3d(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class BasicBlock(nn.Module):
-    """Two 3x3 convolutions added to their input, which a 1x1 convolution fits to them where it has to."""
+    """Two 3x3 convolutions added to their input, or to its 1x1 convolution if the shape changes."""
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1, dilation: int = 1) -> None:
         super().__init__()
@@ -72,13 +71,13 @@ class BasicBlock(nn.Module):
 def stack_basic_blocks(
     inputs: int, outputs: int, count: int, stride: int = 1, dilation: int = 1
 ) -> nn.Sequential:
-    """`count` basic blocks in a row; the first of them changes channels and resolution."""
+    """Stack `count` basic blocks; the first one changes channels and resolution."""
     rest = (BasicBlock(outputs, outputs, dilation=dilation) for _ in range(count - 1))
     return nn.Sequential(BasicBlock(inputs, outputs, stride, dilation), *rest)
 
 
 class PyramidPooling(nn.Module):
-    """The means of windows of four sizes, narrowed to 32 channels each and enlarged again: [B, 128, H, W]."""
+    """Mean pooling with windows of four sizes, each reduced to 32 channels and upsampled: [B, 128, H, W]."""
 
     windows = (64, 32, 16, 8)
 
@@ -94,7 +93,7 @@ class PyramidPooling(nn.Module):
 
 
 class PSMFeatures(nn.Module):
-    """Features of a view and its wider surroundings, at a quarter of its resolution [B, 32, H/4, W/4]."""
+    """Features of a view with multi-scale context, at a quarter of its resolution [B, 32, H/4, W/4]."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -122,8 +121,8 @@ def cost_volume(
 ) -> Float[Tensor, "b c2 d h w"]:
     """Features of column x of `left`, then of column x - d of `right`, for d = 0 .. levels - 1; 0 outside.
 
-    Windows as wide as the image slide over the right view, to the left of which lies nothing but zeros: the
-    last window is d = 0. Plain reference: `cost_volume_plain` in tests/test_psmnet.py.
+    Windows as wide as the image slide over the right view, zero-padded on the left; the last window is d = 0.
+    Plain reference: `cost_volume_plain` in tests/learn/models/test_psmnet.py.
     """
     windows = F.pad(right, (levels - 1, 0)).unfold(3, right.shape[3], 1)
     shifted = windows.flip(3).transpose(2, 3)
@@ -134,7 +133,7 @@ def soft_argmin(cost: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
     """Expected disparity under a softmax over matching costs (Kendall et al. 2017).
 
     Args:
-        cost: matching cost a candidate [B, D, H, W]; low is good. Candidate i means a disparity of i pixels
+        cost: Matching cost per candidate [B, D, H, W]; low is good. Candidate i means a disparity of i pixels
             at this resolution.
 
     Returns:
@@ -145,7 +144,7 @@ def soft_argmin(cost: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
 
 
 class Hourglass(nn.Module):
-    """Costs regarded at a half and a quarter of their resolution, and brought back."""
+    """Encoder-decoder over the cost volume, down to a quarter of its resolution."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -167,9 +166,9 @@ class Hourglass(nn.Module):
         way_down: Float[Tensor, "b 64 d2 h2 w2"] | None,
         way_up: Float[Tensor, "b 64 d2 h2 w2"] | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """What to add to the volume [B, 32, D, H, W], and the maps of the ways down and up at half of that.
+        """Correction of the volume [B, 32, D, H, W], and the maps on the way down and up at half resolution.
 
-        `way_down` is the first hourglass's, `way_up` the last one's; both None in the first hourglass.
+        `way_down` is from the first hourglass, `way_up` from the previous one; both are None in the first.
         """
         down = self.down(x)
         here = F.relu(down if way_up is None else down + way_up)
@@ -178,13 +177,13 @@ class Hourglass(nn.Module):
 
 
 class PSMNet(nn.Module):
-    """Disparity of the left view, 0.5 to `max_disparity_px` - 1.5: a distribution's mean over whole pixels.
+    """Disparity of the left view, 0.5 to `max_disparity_px` - 1.5: mean of a distribution over pixels.
 
-    5,224,768 parameters. 432.88 G multiply-adds at 640x480 and 192 candidates: the convolutions; batch norm,
-    pooling, the enlargement of the costs and their softmax are not counted.
+    5,224,768 parameters. 432.88 G multiply-adds at 640x480 with 192 candidates: convolutions only, without
+    batch norm, pooling, upsampling of the costs and softmax.
 
     Args:
-        max_disparity_px: number of candidates, a multiple of 16.
+        max_disparity_px: Number of candidates, a multiple of 16.
     """
 
     multiple_of = 16
@@ -195,7 +194,7 @@ class PSMNet(nn.Module):
         super().__init__()
         if max_disparity_px < 16 or max_disparity_px % 16:
             raise StereoweaveError(
-                f"PSMNet: max_disparity_px must be a multiple of 16, from 16 on, got {max_disparity_px}"
+                f"PSMNet: max_disparity_px must be a positive multiple of 16, got {max_disparity_px}"
             )
         self.max_disparity_px = max_disparity_px
         self.features = PSMFeatures()
@@ -232,13 +231,13 @@ class PSMNet(nn.Module):
     def outputs(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> tuple[Float[Tensor, "b 1 h w"], ...]:
-        """Disparities in pixels after each hourglass; the last one is the answer."""
+        """Disparities in pixels after each hourglass; the last one is the estimate."""
         return tuple(_disparity_px(cost, left) for cost in self.compute_costs(left, right))
 
     def forward(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> Float[Tensor, "b 1 h w"]:
-        """Disparity of the left view in pixels; the images are RGB in 0..1."""
+        """Disparity of the left view in pixels, from RGB images in 0..1."""
         return _disparity_px(self.compute_costs(left, right)[-1], left)
 
 
@@ -251,19 +250,19 @@ def _make_head() -> nn.Sequential:
 def _disparity_px(
     cost: Float[Tensor, "b 1 d4 h4 w4"], image: Float[Tensor, "b 3 h w"]
 ) -> Float[Tensor, "b 1 h w"]:
-    """Disparity at the size of `image` of costs at a quarter of its padded size.
+    """Disparity at the size of `image`, from costs at a quarter of its padded size.
 
-    Level k of the costs comes to lie at candidate 4 k + 1.5; the deviations above say what follows.
-    In float32 whatever the costs are in: between 128 and 256, bfloat16 holds whole numbers and no fractions.
+    Level k of the costs is placed at candidate 4 k + 1.5; see the deviations above. In float32 for any type
+    of costs: between 128 and 256 bfloat16 has no fractions.
     """
     full = F.interpolate(cost.float(), scale_factor=4.0, mode="trilinear").squeeze(1)
     return soft_argmin(full)[..., : image.shape[2], : image.shape[3]]
 
 
 def _initialise(layer: nn.Module) -> None:
-    """Normal weights of variance 2 / (kernel volume * outputs), as published."""
+    """Draw normal weights of variance 2 / (kernel volume * outputs), as published."""
     if isinstance(layer, nn.Conv2d | nn.Conv3d):
         nn.init.kaiming_normal_(layer.weight, mode="fan_out", nonlinearity="relu")
     elif isinstance(layer, nn.ConvTranspose3d):
-        # PyTorch keeps these weights the other way round, so that its fan in is the layer's fan out.
+        # PyTorch transposes these weights, so its fan-in is the layer's fan-out.
         nn.init.kaiming_normal_(layer.weight, mode="fan_in", nonlinearity="relu")

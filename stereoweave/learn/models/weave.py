@@ -1,7 +1,7 @@
-"""WeaveNet: the paper's dilated dense blocks and step-wise decoder around a correlation of shared features.
+"""WeaveNet: the paper's dilated dense blocks and stepwise decoder around a correlation of shared features.
 
-The paper matches by convolution over the two views laid on each other and pooled by 8; what it learns is
-tied to the pictures it saw. WeaveNet compares features of one encoder instead, and keeps from the paper the
+The paper matches by convolutions over both views stacked and pooled by 8, which ties what it learns to
+the training pictures. WeaveNet instead correlates features of one shared encoder. It keeps the paper's
 dilated, densely connected blocks, the decoder in steps of two, and the skip connections from the image.
 """
 
@@ -33,27 +33,28 @@ from stereoweave.learn.models.weave_stages import Completion, Sharpening, WiderC
 
 @dataclass(frozen=True, kw_only=True)
 class WeaveSize:
-    """How large the parts of a WeaveNet are; of four values each is for one of 1/2, 1/4, 1/8, 1/16.
+    """Sizes of a WeaveNet's parts. Tuples of four are for 1/2, 1/4, 1/8 and 1/16 of the resolution.
 
     Attributes:
-        channels: of the encoder's maps.
-        convolutions: 3x3 ones of the encoder at each resolution, after the one that halves; an even number
-            makes residual blocks.
-        dilations: of the dense blocks at 1/8.
-        growth: channels that each of them adds.
-        bottleneck: channels that the dense blocks end in.
-        context: channels at 1/16 of the aggregation's view of the wider surroundings.
-        join_kernel: of the last convolution of the features that are correlated.
-        propagation: channels of the blocks at 1/4 that spread sure disparities over unsure ones; 0 for none.
-        compared: channels that are compared at 1/2.
-        handed: channels that the decoder hands to 1/2. Where 4 divides what is joined there ONNX Runtime is
-            quicker; BASE has 29, as the network that it grew from.
-        warps: whether they are compared with the other view warped once, and not looked up step by step.
+        channels: Channels of the encoder's maps.
+        convolutions: 3x3 convolutions of the encoder at each resolution, after the one that halves; an even
+            number makes residual blocks.
+        dilations: Dilations of the dense blocks at 1/8.
+        growth: Channels that each dense block adds.
+        bottleneck: Output channels of the dense blocks.
+        context: Channels of the aggregation's context at 1/16.
+        join_kernel: Kernel of the last convolution before the correlation.
+        propagation: Channels of the blocks at 1/4 that spread confident disparities; 0 for none.
+        compared: Channels that are correlated at 1/2.
+        handed: Channels passed from the decoder to 1/2. ONNX Runtime is faster if 4 divides the number of
+            channels joined there; BASE has 29, like the network that it grew from.
+        warps: Whether `compared` channels are correlated with the other view warped once, instead of looked
+            up for each offset.
         refinement: 3x3 convolutions at 1/2.
-        neighbours: old pixels that an upsampled one is mixed of, 9 or 4.
-        wider: channels of the context at 1/32; 0 for none.
-        completion: channels of the stage at 1/4 that completes what one camera alone sees; 0 for none.
-        sharpening: channels that are compared at full resolution; 0 for none.
+        neighbours: Old pixels that an upsampled pixel combines, 9 or 4.
+        wider: Channels of the context at 1/32; 0 for none.
+        completion: Channels of the stage at 1/4 that completes occluded areas; 0 for none.
+        sharpening: Channels that are correlated at full resolution; 0 for none.
     """
 
     channels: tuple[int, int, int, int]
@@ -105,20 +106,20 @@ BASE = WeaveSize(
     neighbours=9,
 )
 
-# BASE with the stages that it can grow by; they add nothing until they are trained.
+# BASE with its optional stages, which add nothing until trained.
 BASE_GROWN = replace(BASE, wider=64, completion=32, sharpening=8)
 
 
 @dataclass(frozen=True, kw_only=True)
 class WeaveStages:
-    """Every step of a prediction, for the losses; both views as one batch, the second half mirrored.
+    """Every stage of a prediction, for the losses; both views in one batch, the second half mirrored.
 
     Attributes:
-        correlation: raw matching scores a level of 4 px at 1/4 resolution [2B, D, H/4, W/4].
-        scores: the same after aggregation.
-        coarse_px: disparity before the refinement, at half resolution, in pixels of the full one.
-        disparity_px: the final one [2B, 1, H, W].
-        confidence_logit: log odds of being within 1 px [2B, 1, H, W].
+        correlation: Raw matching scores per level of 4 px at 1/4 resolution [2B, D, H/4, W/4].
+        scores: Matching scores after aggregation.
+        coarse_px: Disparity before the refinement, at half resolution, in pixels of the full one.
+        disparity_px: Final disparity [2B, 1, H, W].
+        confidence_logit: Log odds that the disparity is within 1 px [2B, 1, H, W].
     """
 
     correlation: Float[Tensor, "b d h_d w_d"]
@@ -138,24 +139,24 @@ class WeaveFeatures(NamedTuple):
 
 
 def as_left_view(views: Tensor, batch: int | torch.SymInt) -> Tensor:
-    """Maps of the left views, then of the right ones mirrored, from those of the left and the right ones."""
+    """From maps of the left and right views: those of the left views, then of the right views mirrored."""
     return torch.cat([views[:batch], mirror(views[batch:])])
 
 
 def as_other_view(views: Tensor, batch: int | torch.SymInt) -> Tensor:
-    """What is matched with `as_left_view`: maps of the right views, then of the left ones mirrored."""
+    """The counterparts of `as_left_view`: maps of the right views, then of the left views mirrored."""
     return torch.cat([views[batch:], mirror(views[:batch])])
 
 
 def stack_convolutions(channels: int, count: int) -> list[nn.Module]:
-    """3x3 convolutions one behind the other: residual blocks of two, and one alone where the count is odd."""
+    """Make `count` 3x3 convolutions: a single one if the count is odd, then residual blocks of two."""
     alone: list[nn.Module] = [ConvBlock(channels, channels)] * (count % 2)
     residual = [Residual(channels) for _ in range(count // 2)]
     return alone + residual[:1] + [zero_initialise(block) for block in residual[1:]]
 
 
 class Encoder(nn.Module):
-    """Features of one view: down to 1/16, and up again so that the finer maps know the wider surroundings."""
+    """Features of one view: down to 1/16, and up again so that finer maps include context."""
 
     def __init__(self, size: WeaveSize) -> None:
         super().__init__()
@@ -182,7 +183,7 @@ class Encoder(nn.Module):
 
 
 class Context(nn.Module):
-    """What the wider surroundings say, at 1/16: a plain surface is known by where it ends."""
+    """Context at 1/16: a textureless surface is recognised by where it ends."""
 
     def __init__(self, inputs: int, sixteenth: int, size: WeaveSize) -> None:
         super().__init__()
@@ -201,7 +202,7 @@ class Context(nn.Module):
 
 
 class Aggregation(nn.Module):
-    """Matching scores made sure of by their surroundings: dilated dense blocks at 1/8, decoded to 1/4."""
+    """Matching scores refined by their context: dilated dense blocks at 1/8, decoded to 1/4."""
 
     def __init__(self, levels: int, size: WeaveSize) -> None:
         super().__init__()
@@ -224,7 +225,7 @@ class Aggregation(nn.Module):
 
 
 class Propagation(nn.Module):
-    """Disparity at 1/4 made smooth where the surface is, from how it departs from its surroundings."""
+    """Disparity at 1/4, smoothed where the surface is smooth, from its deviation from the local mean."""
 
     def __init__(self, quarter: int, channels: int) -> None:
         super().__init__()
@@ -235,14 +236,14 @@ class Propagation(nn.Module):
 
     def forward(self, disparity: Tensor, quarter: Tensor, decoded: Tensor) -> tuple[Tensor, Tensor]:
         """Disparity in levels [B, 1, H/4, W/4] and the decoder's features."""
-        # Taken in float32: beside a disparity of 100 px bfloat16 cannot tell a slope from a plane.
+        # In float32: near a disparity of 100 px bfloat16 cannot distinguish a slope from a plane.
         departure = disparity - F.avg_pool2d(disparity, 9, 1, 4, count_include_pad=False)
         x = self.body(self.join(torch.cat([decoded, quarter, departure, disparity / 16], 1)))
         return disparity + self.correction(x).float(), decoded + self.decoded(x)
 
 
 class Refinement(nn.Module):
-    """A correction of at most `radius` pixels at half resolution, read from matches around the estimate."""
+    """A correction of at most `radius` pixels at half resolution, from correlations around the estimate."""
 
     def __init__(self, size: WeaveSize, radius: int = 2) -> None:
         super().__init__()
@@ -266,11 +267,11 @@ class Refinement(nn.Module):
 
 
 class WeaveNet(nn.Module):
-    """Disparity of both views of a rectified pair, and the left one's confidence.
+    """Disparity of both views of a rectified pair, and the left view's confidence.
 
-    Sides must be multiples of 16, or of 32 with a context at 1/32. Disparities from 0 to `levels` * 4 - 1 px
-    are found. For both views at 640x480 SMALL takes 2.96 G multiply-adds with its 278,029 parameters, BASE
-    takes 13.41 G multiply-adds with its 1,274,290 parameters, BASE_GROWN takes 15.98 G multiply-adds with its
+    Sides must be multiples of 16, or of 32 with a context at 1/32. The disparity range is 0 to `levels` * 4 -
+    1 px. For both views at 640x480 SMALL takes 2.96 G multiply-adds with its 278,029 parameters, BASE takes
+    13.41 G multiply-adds with its 1,274,290 parameters, BASE_GROWN takes 15.98 G multiply-adds with its
     1,470,020 parameters.
     """
 
@@ -296,16 +297,18 @@ class WeaveNet(nn.Module):
 
     @property
     def confidence_layers(self) -> tuple[nn.Conv2d, ...]:
-        """The layers whose outputs add up to the confidence's logit."""
+        """The layers whose outputs sum to the confidence's logit."""
         sharpened = () if self.sharpening is None else (self.sharpening.confidence,)
         return self.refinement.confidence, *sharpened
 
     def stages(self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]) -> WeaveStages:
-        """Every step of the prediction for both views."""
-        batch = left.shape[0]  # here and below no len() and no chunk(): exported, they would fix the batch
+        """Every stage of the prediction for both views."""
+        batch = left.shape[
+            0
+        ]  # here and below, no len() and no chunk(): they would fix the batch size on export
         images = torch.cat([left, right])
         maps = self.encoder(images)
-        # In a mirror the right view is a left one, so that one aggregation serves both.
+        # Mirrored, the right view is a left view, so that one aggregation serves both.
         first = WeaveFeatures(*(as_left_view(map_, batch) for map_ in maps))
         correlation, scores, decoded = self.match(maps, first)
         quarter = self.read_disparity(scores.float(), decoded)
@@ -335,7 +338,7 @@ class WeaveNet(nn.Module):
 
         Args:
             maps: Features of the left views, then of the right ones.
-            first: The same as left views.
+            first: The same features `as_left_view`.
         """
         match = self.to_match(maps.quarter)
         batch = match.shape[0] // 2
@@ -343,18 +346,18 @@ class WeaveNet(nn.Module):
         return correlation, *self.aggregation(correlation, first)
 
     def upsample(self, x: Tensor, weights: Tensor) -> Tensor:
-        """Twice the size, guided by weights; in use sharper than in training, which needs the gradient."""
+        """Guided upsampling by two; sharper at inference than in training, which needs the gradient."""
         return upsample_convex(x, weights) if self.training else upsample_to_a_side(x, weights)
 
     def read_disparity(self, scores: Tensor, decoded: Tensor) -> Tensor:
-        """Disparity in pixels of 1/4 resolution; scores that are coarser need the decoder's features too."""
+        """Disparity in pixels of 1/4 resolution; coarser variants also use the decoder's features."""
         return local_soft_argmax(scores)
 
     def _propagate(
         self, quarter: Tensor, features: Tensor, decoded: Tensor, batch: int | torch.SymInt
     ) -> tuple[Tensor, Tensor]:
         if self.completion is not None:
-            # Of each view the other one, in that one's own columns.
+            # The other view's disparity, in that view's own columns.
             other = mirror(torch.cat([quarter[batch:], quarter[:batch]]))
             quarter, decoded = self.completion(quarter, other, features, decoded)
         if self.propagation is None:
@@ -368,7 +371,7 @@ class WeaveNet(nn.Module):
             return disparity_px, logit
         features, match = self.sharpening.views(images)
         if self.training:
-            # Of the left views alone, which costs half; the right ones supervise what is to be sharpened.
+            # Left views only, at half the cost; the right ones supervise the disparity before sharpening.
             lefts = (disparity_px[:batch], match[:batch], match[batch:], features[:batch], context[:batch])
             sharp_px, more = self.sharpening(*lefts)
             right_px, right_logit = disparity_px[batch:], logit[batch:]
@@ -380,6 +383,6 @@ class WeaveNet(nn.Module):
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Left disparity, right disparity and the left view's confidence logit, each [B, 1, H, W]."""
         stages, batch = self.stages(left, right), left.shape[0]
-        # At infinity noise goes both ways; a rectified pair of parallel cameras has nothing behind that.
+        # Noise at infinity has both signs; parallel cameras have no negative disparities.
         disparity_px = stages.disparity_px.clamp(min=0)
         return disparity_px[:batch], mirror(disparity_px[batch:]), stages.confidence_logit[:batch]

@@ -1,4 +1,4 @@
-"""Stages that a trained WeaveNet can grow by: each adds nothing until it is trained."""
+"""Optional stages that a trained WeaveNet can grow by; they add nothing until trained."""
 
 import torch
 import torch.nn.functional as F
@@ -16,19 +16,19 @@ from stereoweave.learn.models.layers import (
     zero_initialise,
 )
 
-# Where the completion looks for the surface behind, in pixels of 1/4 resolution: rows, columns.
+# Offsets (rows, columns) at which the completion looks for the background, in pixels of 1/4 resolution.
 OFFSETS = tuple(
     (sign * step * down, sign * step * along)
     for down, along, steps in ((0, 1, (2, 4, 8, 16, 32)), (1, 0, (2, 4, 8, 16)))
     for step in steps
     for sign in (-1, 1)
 )
-# A larger disagreement of the two views says no more than this one, in pixels of 1/4 resolution.
+# Left-right differences are clamped to this, in pixels of 1/4 resolution.
 _LARGEST_CHECK = 4.0
 
 
 class WiderContext(nn.Module):
-    """What the surroundings say at 1/32, added to the context at 1/16."""
+    """Context at 1/32, added to the context at 1/16."""
 
     def __init__(self, channels: int, wider: int) -> None:
         super().__init__()
@@ -41,12 +41,12 @@ class WiderContext(nn.Module):
 
 
 class Completion(nn.Module):
-    """Disparity at 1/4 completed from its surroundings where the two views contradict each other.
+    """Disparity at 1/4, completed from its surroundings where the two views disagree.
 
-    A pixel that one camera alone sees has no match. The left-right check tells where that is, and each such
-    pixel takes a mixture of disparities that stand 2 to 32 pixels away in its row and column: the convex
-    combination of learned affinities of spatial propagation networks (Liu et al., NeurIPS 2017) with fixed,
-    far offsets in place of repeated steps.
+    An occluded pixel has no match. The left-right consistency check finds such pixels, and each takes a
+    convex
+    combination of disparities 2 to 32 pixels away in its row and column: the learned affinities of spatial
+    propagation networks (Liu et al., NeurIPS 2017) with fixed, distant offsets instead of repeated steps.
     """
 
     def __init__(self, quarter: int, channels: int) -> None:
@@ -64,10 +64,10 @@ class Completion(nn.Module):
         quarter: Float[Tensor, "b c h w"],
         decoded: Float[Tensor, "b 32 h w"],
     ) -> tuple[Tensor, Tensor]:
-        """Disparity in pixels of 1/4 resolution and the decoder's features.
+        """Disparity in pixels of 1/4 resolution, and the decoder's features.
 
         Args:
-            disparity: In pixels of 1/4 resolution.
+            disparity: Disparity in pixels of 1/4 resolution.
             other: The other view's disparity, in that view's own columns.
             quarter: The encoder's features.
             decoded: The decoder's features.
@@ -81,9 +81,9 @@ class Completion(nn.Module):
         return disparity + share * (mixed - disparity), decoded + self.decoded(x)
 
     def _checks(self, disparity: Tensor, other: Tensor) -> tuple[Tensor, ...]:
-        """What tells an occluded pixel: the left-right check, the border, and how it departs from around."""
+        """Cues for occlusion: deviation from the local mean, disparity, left-right check, border distance."""
         columns = torch.arange(disparity.shape[3], dtype=torch.float32, device=disparity.device)
-        # In float32: beside a disparity of 100 px bfloat16 cannot tell a slope from a plane.
+        # In float32: near a disparity of 100 px bfloat16 cannot distinguish a slope from a plane.
         departure = disparity - F.avg_pool2d(disparity, 9, 1, 4, count_include_pad=False)
         check = (sample_at_match(other, disparity) - disparity).clamp(-_LARGEST_CHECK, _LARGEST_CHECK)
         inside = (columns - disparity).clamp(-_LARGEST_CHECK, _LARGEST_CHECK)
@@ -91,7 +91,7 @@ class Completion(nn.Module):
 
 
 class Sharpening(nn.Module):
-    """A correction of at most `radius` pixels at full resolution, read from matches around the estimate."""
+    """A correction of at most `radius` pixels at full resolution, from correlations around the estimate."""
 
     def __init__(self, handed: int, inputs: int, channels: int, radius: int = 2) -> None:
         super().__init__()
@@ -107,20 +107,20 @@ class Sharpening(nn.Module):
         self.confidence = zero_initialise(nn.Conv2d(16, 1, 1))
 
     def views(self, images: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, Tensor]:
-        """Features of the images, and what is compared of them."""
+        """Features of the images, and the maps to correlate."""
         features = self.features(images * 2 - 1)
         return features, self.to_match(features)
 
     def forward(
         self, disparity: Tensor, first: Tensor, second: Tensor, features: Tensor, context: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Disparity in pixels, and what it adds to the confidence's logit.
+        """Disparity in pixels, and the change of the confidence's logit.
 
         Args:
-            disparity: In pixels of full resolution.
-            first: What is compared of this view.
-            second: The same of the other one.
-            features: Of this view.
+            disparity: Disparity in pixels of full resolution.
+            first: This view's maps to correlate.
+            second: The other view's maps to correlate.
+            features: This view's features.
             context: The refinement's features at half resolution.
         """
         matches = correlate_warped(first, second, disparity, self.radius)
