@@ -1,1 +1,1 @@
-"""From a checkpoint to the file of a matcher."""
+"""From a checkpoint to a matcher file."""

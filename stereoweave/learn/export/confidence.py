@@ -1,4 +1,4 @@
-"""The network's confidence made a probability, on pairs that it was not trained on."""
+"""Calibration of a network's confidence on held-out pairs."""
 
 from pathlib import Path
 from typing import Any
@@ -14,18 +14,18 @@ from stereoweave.learn.data.collage import paint_collage
 from stereoweave.learn.models.weave import WeaveNet
 from stereoweave.stereo import Sample, StereoPair
 
-# Apart from the seeds of recipes and from that of validation.
+# Different from the seeds of recipes and validation.
 _FIT_SEED, _PROOF_SEED = 2_000_003, 3_000_017
 _PAIRS = 24
 _SIZE = (320, 512)
 
 
 def calibrate_confidence(network: WeaveNet) -> dict[str, Any]:
-    """How often the network's confidence comes true, after scaling and shifting it to come true as it says.
+    """Calibrate the network's confidence in place. Returns its reliability on other pairs.
 
-    The scale and the shift (Platt 1999) are folded into the last layers. What is returned comes from other
-    pairs than they were fitted on: `calibration_error`, and per bin of confidence what was `claimed`, what
-    `happened`, and the `share` of pixels.
+    Scale and shift of the logits (Platt 1999) are folded into the last layers. Reliability is measured on
+    pairs that were not used for fitting: `calibration_error`, and per confidence bin the `claimed` and the
+    observed (`happened`) share within 1 px, and the `share` of pixels.
     """
     scale, shift = _fit_scale_and_shift(*_predict_claims(network, _FIT_SEED))
     with torch.no_grad():
@@ -33,27 +33,27 @@ def calibrate_confidence(network: WeaveNet) -> dict[str, Any]:
             assert layer.bias is not None
             layer.weight *= scale
             layer.bias *= scale
-            # The outputs add up, so that one of them is shifted.
+            # The layers' outputs are summed, so only one of them is shifted.
             layer.bias += shift if index == 0 else 0
     logits, within = _predict_claims(network, _PROOF_SEED)
     return measure_reliability(logits.sigmoid().numpy(), within.numpy())
 
 
 def measure_reliability(probability: np.ndarray, happened: np.ndarray) -> dict[str, Any]:
-    """What was claimed and what happened, per bin of equal width, and the expected calibration error."""
+    """Claimed and observed probability per bin of equal width, and the expected calibration error."""
     bins = calibration_bins(probability, happened).round(4).T.tolist()
     rows = [dict(zip(("claimed", "happened", "share"), row, strict=True)) for row in bins]
     return {"calibration_error": round(calibration_error(probability, happened), 4), "bins": rows}
 
 
 def paint_unseen_pair() -> StereoPair:
-    """A pair of the project's own that no training sees."""
+    """Paint a collage that no training uses."""
     made = paint_collage(_PROOF_SEED, 1, 0, *_SIZE)
     return StereoPair(left=made.left, right=made.right)
 
 
 def _predict_claims(network: WeaveNet, seed: int) -> tuple[Tensor, Tensor]:
-    """Confidence logits, and whether the disparity was within 1 px, over every 29th pixel of fresh pairs."""
+    """Confidence logits, and whether the disparity is within 1 px, at every 29th pixel of held-out pairs."""
     logits, within = [], []
     for index in range(_PAIRS):
         made = paint_collage(seed, 0, index, *_SIZE)
@@ -70,7 +70,7 @@ def _to_tensor(made: Sample, side: str) -> Tensor:
 
 
 def _fit_scale_and_shift(logits: Tensor, within: Tensor) -> tuple[float, float]:
-    """Scale and shift under which the logits are the likeliest explanation of what happened."""
+    """Fit the scale and shift of the logits by maximum likelihood."""
     parameters = torch.tensor([1.0, 0.0], requires_grad=True)
     optimiser = torch.optim.LBFGS([parameters], max_iter=50)
 
@@ -86,7 +86,7 @@ def _fit_scale_and_shift(logits: Tensor, within: Tensor) -> tuple[float, float]:
 
 
 def draw_reliability(reliability: dict[str, Any], picture: Path) -> None:
-    """Write a plot of what was claimed against what happened, with the share of pixels below it."""
+    """Plot claimed against observed probability, with the share of pixels below."""
     from matplotlib.figure import Figure
 
     bins = reliability["bins"]

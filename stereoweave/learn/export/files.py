@@ -1,4 +1,4 @@
-"""The matcher files of `stereoweave export`: of a trained network, or of another such file."""
+"""The matcher files of `stereoweave export`, from a trained network or another matcher file."""
 
 import shutil
 import tempfile
@@ -21,13 +21,13 @@ from stereoweave.stereo import StereoPair
 
 @dataclass(frozen=True, kw_only=True)
 class MatcherFiles:
-    """Which files to write.
+    """Output files of an export.
 
     Attributes:
-        out: In float32.
-        half: In 16 bits.
-        eight_bits: With convolutions in 8 bits.
-        size: Width and height of the only pairs that they are to take; any where None.
+        out: The .onnx file in float32.
+        half: The .onnx file in float16.
+        eight_bits: The .onnx file with 8-bit convolutions.
+        size: The only width and height that the files accept; None for any size.
     """
 
     out: Path | None = None
@@ -37,12 +37,12 @@ class MatcherFiles:
 
     def __post_init__(self) -> None:
         if not self.wanted:
-            raise StereoweaveError("export: expected a file to write, found none; give --out or --half")
+            raise StereoweaveError("export: expected an output file, found none; give --out or --half")
         for file in self.wanted:
             if file.suffix != ".onnx":
                 raise StereoweaveError(f"{file}: expected a name that ends in .onnx, as --model takes it")
         if len(set(self.wanted)) < len(self.wanted):
-            raise StereoweaveError(f"{self.wanted[0]}: expected a file of its own for each variant")
+            raise StereoweaveError(f"{self.wanted[0]}: expected a different file for each variant")
 
     @property
     def wanted(self) -> list[Path]:
@@ -52,13 +52,13 @@ class MatcherFiles:
 def write_matcher_files(
     source: str, files: MatcherFiles, pairs: Iterable[StereoPair] = (), reliability: Path | None = None
 ) -> Iterator[str]:
-    """Write them; a line to tell of each.
+    """Write the files. Yields a note on each.
 
     Args:
-        source: The folder of a run, a checkpoint, a shipped name, or a matcher file in float32 for any size.
-        files: Which.
-        pairs: Of a trained network: pairs on which ONNX Runtime and PyTorch must agree.
-        reliability: Of a trained network: a picture to write, how often its confidence comes true.
+        source: Run folder, checkpoint, shipped model, or float32 matcher file for any size.
+        files: The files to write.
+        pairs: For a trained network: pairs on which ONNX Runtime and PyTorch must agree.
+        reliability: For a trained network: file for a plot of the confidence's reliability.
     """
     for file in files.wanted:
         place_for(file)
@@ -75,14 +75,14 @@ def write_matcher_files(
 
 
 def write_weights(run: Path, out: Path) -> str:
-    """Write the averaged weights of a run in half precision, for recipes to start from; returns a line on it.
+    """Write a run's averaged weights in half precision, for recipes to start from. Returns a note.
 
     Args:
-        run: The folder of a run, or a checkpoint.
+        run: Folder of a run, or a checkpoint.
         out: The .pt file.
 
     Raises:
-        StereoweaveError: `run` has no checkpoint, or `out` another ending.
+        StereoweaveError: `run` has no checkpoint, or `out` does not end in .pt.
     """
     if out.suffix != ".pt":
         raise StereoweaveError(f"{out}: expected a name that ends in .pt, as start_from takes it")
@@ -93,7 +93,7 @@ def write_weights(run: Path, out: Path) -> str:
 
 
 def is_matcher(source: str) -> bool:
-    """Whether the source of an export is a matcher file already, and no trained network."""
+    """Whether an export's source is a matcher file or shipped model instead of a trained network."""
     return source.endswith(".onnx") or source in shipped_models()
 
 
@@ -113,7 +113,7 @@ def _write_variants(made: Path, files: MatcherFiles) -> Iterator[str]:
         yield f"{files.out}: float32"
     if files.half:
         change_px = convert_to_float16(made, files.half)["differs_px_from_32_bits"]
-        yield f"{files.half}: 16 bits change disparity by {change_px:.4f} px in the mean"
+        yield f"{files.half}: 16 bits change disparity by {change_px:.4f} px on average"
     if files.eight_bits:
         card = quantise(made, files.eight_bits)
         lost_px = card["epe_px"] - card["epe_px_of_32_bits"]
@@ -121,13 +121,13 @@ def _write_variants(made: Path, files: MatcherFiles) -> Iterator[str]:
     if files.size:
         for file in files.wanted:
             fix_size(file, file, *files.size)
-            yield f"{file}: for pairs of {files.size[0]}x{files.size[1]} alone"
+            yield f"{file}: only for pairs of {files.size[0]}x{files.size[1]}"
 
 
 def _check_apart(source: Path, files: MatcherFiles) -> None:
     for file in files.wanted:
         if file.resolve() == source.resolve():
-            raise StereoweaveError(f"{file}: expected another file than the one to make it from")
+            raise StereoweaveError(f"{file}: expected an output file other than the source")
 
 
 def _copy(source: Path, out: Path) -> None:

@@ -1,4 +1,4 @@
-"""A matcher file for pairs of one size alone, one at a time: what TensorRT and small devices want."""
+"""Matcher files for a single pair of one fixed size, as TensorRT and small devices need them."""
 
 import copy
 from pathlib import Path
@@ -12,30 +12,30 @@ from stereoweave.io.files import SMALLEST_SIDE_PX, make_folder, replacing
 from stereoweave.learn.export.graph import write_card
 from stereoweave.matching.matcher import Matcher
 
-# What a runtime of fixed shapes cannot plan: its results' shapes depend on values, or its path does.
+# Operators that runtimes with fixed shapes cannot plan: shapes or control flow depend on values.
 SHAPES_BY_VALUE = ("If", "Loop", "NonZero", "Range", "Scan", "Shape", "Unique")
 
 
 def fix_size(source: Path, out: Path, width: int, height: int) -> dict[str, Any]:
-    """Write a matcher file that takes one pair of that size alone, and its card as .json; returns the card.
+    """Write a matcher file for one pair of the given size, and its card as .json. Returns the card.
 
-    What it computes is the same; every shape in it is a number, and nothing computes shapes any more.
+    It computes the same values; all shapes in it are constants, and no operator computes shapes.
 
     Args:
-        source: A matcher file for pairs of any size, in float32, 16 or 8 bits.
-        out: The .onnx file to write; it may be the same.
-        width: In pixels.
-        height: Likewise.
+        source: Matcher file for pairs of any size, in float32, 16 or 8 bits.
+        out: The .onnx file to write; may be the source.
+        width: Width in pixels.
+        height: Height in pixels.
 
     Raises:
-        StereoweaveError: The network cannot take that size, or the source is for one size already.
+        StereoweaveError: The network does not accept the size, or the source is already for one size.
     """
     matcher = Matcher(source)
     if matcher.fixed_size:
         found = f"{matcher.fixed_size[1]}x{matcher.fixed_size[0]}"
         raise StereoweaveError(
-            f"{source}: expected a matcher file for pairs of any size, found one for {found} alone; "
-            "take the file that it was made from"
+            f"{source}: expected a matcher file for pairs of any size, found one for {found} only; "
+            "use the file that it was made from"
         )
     check_size(width, height, matcher.multiple_of)
     make_folder(out.parent)
@@ -47,7 +47,7 @@ def fix_size(source: Path, out: Path, width: int, height: int) -> dict[str, Any]
 
 
 def check_size(width: int, height: int, multiple_of: int) -> None:
-    """StereoweaveError for a size that the network cannot take."""
+    """Raise StereoweaveError for a size that the network does not accept."""
     if min(width, height) < SMALLEST_SIDE_PX or width % multiple_of or height % multiple_of:
         suggested = "x".join(str(max(-(-x // multiple_of), 2) * multiple_of) for x in (width, height))
         raise StereoweaveError(
@@ -57,15 +57,15 @@ def check_size(width: int, height: int, multiple_of: int) -> None:
 
 
 def fix_graph_size(graph: onnx.ModelProto, width: int, height: int) -> onnx.ModelProto:
-    """The graph for one pair of that size, with its shapes worked out."""
+    """The graph for one pair of the given size, with all shapes as constants."""
     graph = copy.deepcopy(graph)
     for value in (*graph.graph.input, *graph.graph.output):
         sides = value.type.tensor_type.shape.dim
         for side, length in zip(sides, (1, sides[1].dim_value, height, width), strict=True):
             side.dim_value = length
-    del graph.graph.value_info[:]  # of any size
+    del graph.graph.value_info[:]  # shapes for any size
     made = optimizer.optimize(graph)
     onnx.checker.check_model(made, full_check=True)
     left = sorted({node.op_type for node in made.graph.node} & set(SHAPES_BY_VALUE))
-    assert not left, f"not worked out: {left}"
+    assert not left, f"operators with dynamic shapes remain: {left}"
     return made

@@ -1,4 +1,4 @@
-"""A matcher file in numbers of 16 bits: half of the size, and faster where a processor computes in them."""
+"""Matcher files in float16: half the size, and faster on processors with native float16."""
 
 from collections.abc import Set
 from pathlib import Path
@@ -15,23 +15,23 @@ from stereoweave.learn.export.graph import add_nodes_between, read_graph, write_
 from stereoweave.matching.matcher import Matcher
 
 LARGEST_MEAN_DIFFERENCE_PX = 0.02
-# Apart from the seeds of recipes, of validation, of the confidence and of 8 bits.
+# Different from the seeds of recipes, validation, confidence and 8 bits.
 _PROOF_SEED, _PROOF_PAIRS = 6_000_011, 8
 _SIZE = (320, 512)
 
 
 def convert_to_float16(source: Path, out: Path) -> dict[str, Any]:
-    """Write a WeaveNet's matcher file that computes in 16 bits, and its card as .json; returns the card.
+    """Write a WeaveNet's matcher file in float16, and its card as .json. Returns the card.
 
-    Its inputs and outputs keep 32 bits, and so do disparities on their way.
+    Inputs, outputs and all disparities stay in float32.
 
     Args:
-        source: A matcher file in float32 for pairs of any size.
+        source: Matcher file in float32 for pairs of any size.
         out: The .onnx file to write.
 
     Raises:
-        StereoweaveError: The source is no such file, or the two differ by 0.02 px or more in the mean;
-            nothing is written then.
+        StereoweaveError: The source is not such a file, or the disparities differ by 0.02 px or more on
+            average; nothing is written.
     """
     graph = read_graph(source)
     make_folder(out.parent)
@@ -40,7 +40,7 @@ def convert_to_float16(source: Path, out: Path) -> dict[str, Any]:
         mean_px = _mean_difference_px(Matcher(source), Matcher(temporary))
         if not mean_px < LARGEST_MEAN_DIFFERENCE_PX:
             raise StereoweaveError(
-                f"{source}: 16 bits change disparity by {mean_px:.3f} px in the mean, expected under "
+                f"{source}: 16 bits change disparity by {mean_px:.3f} px on average, expected under "
                 f"{LARGEST_MEAN_DIFFERENCE_PX}; nothing was written"
             )
     return write_card(
@@ -49,12 +49,12 @@ def convert_to_float16(source: Path, out: Path) -> dict[str, Any]:
 
 
 def select_float16_nodes(graph: onnx.ModelProto) -> set[str]:
-    """The names of the nodes that compute in 16 bits.
+    """Names of the nodes that compute in float16.
 
-    They are the convolutions, the products that compare the views, and what stands between them alone. All
-    that reads a disparity or gives one keeps 32: at 192 px the numbers of 16 bits are 1/8 px apart. So does
-    the sum of matching scores that it is read from. Measured on painted pairs, with all else in 16 bits too
-    the mean difference is the same and the largest one grows.
+    These are the convolutions, the matrix products that correlate the views, and nodes between them.
+    Everything that reads or writes a disparity stays in float32: at 192 px float16 has a resolution of 1/8
+    px. So does the sum of matching scores from which the disparity is read. On painted pairs, converting
+    everything else too leaves the mean difference unchanged and increases the largest one.
     """
     products = (node.name for node in graph.graph.node if node.op_type in ("Conv", "MatMul"))
     between = ("Concat", "Resize", "Relu", "Add", "Slice", "Pad", "Transpose")
@@ -62,9 +62,9 @@ def select_float16_nodes(graph: onnx.ModelProto) -> set[str]:
 
 
 def cast_to_float16(graph: onnx.ModelProto, names: Set[str]) -> onnx.ModelProto:
-    """The graph with its weights and values in 16 bits at the named nodes, and casts to them and from them.
+    """Convert weights and values of the named nodes to float16, and insert casts around them.
 
-    ONNX Runtime's converter is not used: it rounds to 16 bits between any two nodes that keep 32.
+    ONNX Runtime's own converter rounds to float16 between any two float32 nodes, so it is not used.
     """
     cast = _Casts(graph, names)
     nodes = []
@@ -85,12 +85,12 @@ def cast_to_float16(graph: onnx.ModelProto, names: Set[str]) -> onnx.ModelProto:
 
 
 def _takes_float16(node: onnx.NodeProto, place: int, names: Set[str]) -> bool:
-    """Whether a node takes an input in 16 bits, if it is no whole number; how much it resizes by never is."""
+    """Whether a node takes this input in float16. The scale of a Resize stays in float32."""
     return node.name in names and not (node.op_type == "Resize" and place > 0)
 
 
 class _Casts:
-    """The nodes, and the weights, that turn values into 16 bits and back, each once."""
+    """Cast nodes and converted weights, each made once."""
 
     def __init__(self, graph: onnx.ModelProto, names: Set[str]) -> None:
         inferred = onnx.shape_inference.infer_shapes(graph).graph
@@ -104,7 +104,7 @@ class _Casts:
         self.weights: list[TensorProto] = []
 
     def half(self, value: str) -> str:
-        """The name of the value in 16 bits; its own where it is no float or is in them already."""
+        """Name of the value in float16; the value itself if it is not a float or already in float16."""
         if value in self._stored:
             return self._weight(value)
         if value in self._floats - self._halves:
@@ -112,11 +112,11 @@ class _Casts:
         return value
 
     def single(self, value: str) -> str:
-        """The same in 32 bits."""
+        """Name of the value in float32."""
         return self._cast(value, "single", TensorProto.FLOAT) if value in self._halves else value
 
     def take(self) -> list[onnx.NodeProto]:
-        """The casts that were asked for since the last time."""
+        """Return the casts requested since the last call."""
         taken, self._nodes = self._nodes, []
         return taken
 
@@ -137,7 +137,7 @@ class _Casts:
 
 
 def _mean_difference_px(first: Matcher, second: Matcher) -> float:
-    """Of two matchers' disparities, on fresh pairs."""
+    """Mean absolute difference of two matchers' disparities on held-out pairs."""
     pairs = (paint_collage(_PROOF_SEED, 0, index, *_SIZE) for index in range(_PROOF_PAIRS))
     differences_px = [
         np.abs(

@@ -1,4 +1,4 @@
-"""A checkpoint becomes a matcher file: calibrated, exported, and proved to answer as PyTorch does."""
+"""From a checkpoint to a matcher file: calibrate, export, and verify that it agrees with PyTorch."""
 
 import json
 import logging
@@ -27,24 +27,23 @@ from stereoweave.learn.training.objective import CodeObjective
 from stereoweave.matching.matcher import Matcher
 from stereoweave.stereo import StereoPair
 
-# WeaveNet gives all of them; the paper's network and its rivals the first.
+# WeaveNet has all of these outputs; the paper's network and its rivals only the first.
 OUTPUTS = ["disparity_px", "right_disparity_px", "confidence_logit"]
-# The two runtimes may differ by rounding; more than this is another network.
+# The two runtimes may differ by rounding, but by no more than this.
 LARGEST_DIFFERENCE_PX = 0.01
 LARGEST_DIFFERENCE_OF_CONFIDENCE = 0.01
 
 
 def export_matcher(trained: Path, out: Path, pairs: Iterable[StereoPair] = ()) -> dict[str, Any]:
-    """Write the averaged network of a checkpoint as a matcher file, and its card as .json; returns the card.
+    """Write a checkpoint's averaged network as a matcher file, and its card as .json. Returns the card.
 
     Args:
-        trained: A checkpoint, or the folder of a run, whose last one is taken.
+        trained: Checkpoint, or folder of a run, whose last checkpoint is used.
         out: The .onnx file.
-        pairs: Pairs on which ONNX Runtime and PyTorch must agree, beside one of the project's own.
+        pairs: Pairs on which ONNX Runtime and PyTorch must agree, besides one collage.
 
     Raises:
-        StereoweaveError: If they differ by 0.01 px, or by 0.01 of confidence, or more; nothing is written
-            then.
+        StereoweaveError: They differ by 0.01 px, or by 0.01 in confidence, or more; nothing is written.
     """
     kept = checkpoint.load(trained / "last.pt" if trained.is_dir() else trained)
     network = load_matcher_network(kept)
@@ -75,7 +74,7 @@ def export_matcher(trained: Path, out: Path, pairs: Iterable[StereoPair] = ()) -
 
 
 class DisparityNetwork(nn.Module):
-    """A network of the paper's kind as a matcher: disparity of the left view in pixels, [B, 1, H, W]."""
+    """A `CodeNetwork` as a matcher: disparity of the left view in pixels, [B, 1, H, W]."""
 
     def __init__(self, network: Any, recipe: Recipe) -> None:
         super().__init__()
@@ -88,10 +87,10 @@ class DisparityNetwork(nn.Module):
 
 
 def load_matcher_network(kept: Checkpoint) -> Any:
-    """The averaged network of a checkpoint, ready to match.
+    """Load a checkpoint's averaged network for matching.
 
     Raises:
-        StereoweaveError: It estimates depth, or is a PSMNet.
+        StereoweaveError: The network estimates depth, or is a PSMNet.
     """
     network = build_network(kept.recipe)
     network.load_state_dict(kept.averaged)
@@ -112,15 +111,15 @@ def load_matcher_network(kept: Checkpoint) -> Any:
 
 
 def export_graph(network: Any, kept: Checkpoint) -> onnx.ModelProto:
-    """The network as an ONNX graph with a matcher's metadata, for any height and width that it can divide.
+    """Export the network as an ONNX graph with a matcher's metadata, for any batch, height and width.
 
-    And for any number of pairs: what it costs to leave that free cannot be measured (under 1 %).
+    Height and width are multiples of the network's. The free batch size costs under 1 %, within noise.
     """
     height, width = (network.multiple_of * torch.export.Dim(name, min=2, max=1024) for name in ("h", "w"))
     sides = {0: torch.export.Dim("batch"), 2: height, 3: width}
     graph = _export_clean_graph(network, 4 * network.multiple_of, 8 * network.multiple_of, (sides, sides))
     first, *_ = graph.graph.input[0].type.tensor_type.shape.dim
-    # The exporter does not tell where a network's code fixes what was to be free.
+    # The exporter does not report if a network's code fixes a free dimension.
     assert first.dim_param, "the network's code fixes the number of pairs"
     properties = {
         "name": kept.recipe.name,
@@ -136,14 +135,14 @@ def export_graph(network: Any, kept: Checkpoint) -> onnx.ModelProto:
 
 
 def export_fixed_graph(network: Any, height: int, width: int) -> onnx.ModelProto:
-    """The network as an ONNX graph for pairs of that size alone."""
+    """Export the network as an ONNX graph for pairs of one size."""
     return _export_clean_graph(network, height, width, None)
 
 
 def export_annotated_graph(network: Any, height: int, width: int, dynamic_shapes: Any) -> onnx.ModelProto:
-    """The network as an ONNX graph, with the exporter's notes of where each node is from."""
-    # Two tensors: given the same one twice, the exporter would take both inputs to be one. Two pairs where
-    # their number is free: an axis of 1 it would take to be always so.
+    """Export the network as an ONNX graph, with the exporter's notes on the origin of each node."""
+    # Two tensors: the exporter merges inputs that are the same tensor. Two pairs if the batch size is free:
+    # an axis of 1 would be fixed.
     left, right = torch.rand(2, 1 if dynamic_shapes is None else 2, 3, height, width)
     with _mute_exporter(), torch.no_grad():
         program = torch.onnx.export(
@@ -163,7 +162,7 @@ def export_annotated_graph(network: Any, height: int, width: int, dynamic_shapes
 
 def _export_clean_graph(network: Any, height: int, width: int, dynamic_shapes: Any) -> onnx.ModelProto:
     graph = export_annotated_graph(network, height, width, dynamic_shapes)
-    # The exporter notes where each part comes from, with this machine's paths.
+    # The exporter's notes contain this machine's paths.
     for part in (graph.graph, *graph.graph.node, *graph.graph.value_info):
         del part.metadata_props[:]
     for part in (*graph.graph.input, *graph.graph.output):
@@ -173,7 +172,7 @@ def _export_clean_graph(network: Any, height: int, width: int, dynamic_shapes: A
 
 @contextmanager
 def _mute_exporter() -> Iterator[None]:
-    """Without what the exporter tells unasked: of torchvision's operators, of names of repeated axes."""
+    """Suppress the exporter's warnings about torchvision's operators and names of repeated axes."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -185,14 +184,14 @@ def _mute_exporter() -> Iterator[None]:
 
 
 def compare_runtimes(network: Any, matcher: Matcher, pair: StereoPair) -> tuple[float, float]:
-    """The largest differences of PyTorch and ONNX Runtime: of both disparities in px, and of confidence."""
+    """Largest differences of PyTorch and ONNX Runtime: both disparities in px, and confidence."""
     multiple = network.multiple_of
     height, width = (side // multiple * multiple for side in pair.left.shape[:2])
     left, right = pair.left[:height, :width], pair.right[:height, :width]
     tensors = [torch.from_numpy(x).permute(2, 0, 1)[None].float() / 255 for x in (left, right)]
     with torch.no_grad():
         expected = [x[0, 0] for x in network(*tensors)]
-    # In one piece, because the strips of a large pair answer a little differently.
+    # In one piece, because large pairs are matched in strips, with slightly different results.
     found = [torch.from_numpy(x) for x in matcher._run(left, right) if x is not None]
     largest_px = max(float((found[i] - x).abs().max()) for i, x in enumerate(expected[:2]))
     if len(expected) < len(OUTPUTS):
@@ -201,15 +200,15 @@ def compare_runtimes(network: Any, matcher: Matcher, pair: StereoPair) -> tuple[
 
 
 def count_multiply_adds(network: nn.Module, height: int = 480, width: int = 640) -> int:
-    """Multiply-adds of the whole graph, both views and every comparison of features included."""
+    """Count the multiply-adds of the whole graph, including both views and all correlations."""
     image = torch.rand(1, 3, height, width)
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         network(image, image)
     counted = counter.get_total_flops() // 2
     if not isinstance(network, WeaveNet):
         return counted
-    # The counter sees convolutions and matrix products; the refinement compares features of both views by
-    # plain products, at one column more than it gives matches for where it interpolates between products.
+    # The counter covers convolutions and matrix products. The refinement correlates both views by elementwise
+    # products, at one more column than it has matches if it interpolates between products.
     nearby = 2 * network.refinement.radius + 1 + (not network.size.warps)
     counted += 2 * (height // 2) * (width // 2) * network.size.compared * nearby
     if network.sharpening is None:

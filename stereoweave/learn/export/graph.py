@@ -1,4 +1,4 @@
-"""Matcher files as graphs, from which others are made: in half the bits, in 8, for one size."""
+"""Matcher files as ONNX graphs, the basis of the float16, 8-bit and fixed-size variants."""
 
 import json
 from collections import defaultdict
@@ -15,16 +15,16 @@ from stereoweave.matching.matcher import Matcher
 
 
 def read_graph(source: Path) -> onnx.ModelProto:
-    """The graph of a matcher file in float32 for pairs of any size.
+    """Read the graph of a float32 matcher file for pairs of any size.
 
     Raises:
-        StereoweaveError: It is none, or one of those made from it.
+        StereoweaveError: The file is not a matcher file, or is a variant.
     """
     fixed_size = Matcher(source).fixed_size
     graph = onnx.load(source)
     found = None
     if fixed_size:
-        found = f"one for {fixed_size[1]}x{fixed_size[0]} alone"
+        found = f"one for {fixed_size[1]}x{fixed_size[0]} only"
     elif any(node.op_type == "QuantizeLinear" for node in graph.graph.node):
         found = "one in 8 bits"
     elif any(value.data_type == TensorProto.FLOAT16 for value in graph.graph.initializer):
@@ -32,13 +32,13 @@ def read_graph(source: Path) -> onnx.ModelProto:
     if found:
         raise StereoweaveError(
             f"{source}: expected a matcher file in float32 for pairs of any size, found {found}; "
-            "take the file that it was made from"
+            "use the file that it was made from"
         )
     return graph
 
 
 def write_card(source: Path, out: Path, facts: dict[str, Any]) -> dict[str, Any]:
-    """Write the card of a file made from another one: that one's, and what is new; returns it."""
+    """Write the card of a derived file: the source's card updated with `facts`. Returns the card."""
     file = source.with_suffix(".json")
     card = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
     card |= facts
@@ -48,13 +48,13 @@ def write_card(source: Path, out: Path, facts: dict[str, Any]) -> dict[str, Any]
 
 
 def add_nodes_between(graph: onnx.ModelProto, names: Iterable[str], operations: tuple[str, ...]) -> set[str]:
-    """The named nodes, those of the given operations that only such nodes read, and convolutions' ReLUs."""
+    """Add nodes of the given operations that only the named nodes read, and ReLUs of convolutions."""
     readers = defaultdict(list)
     for node in graph.graph.node:
         for value in node.input:
             readers[value].append(node)
     chosen = set(names)
-    # Backwards, because a node is between others if all that read it are.
+    # Backwards: a node is between chosen ones if all its readers are chosen.
     for node in reversed(graph.graph.node):
         following = {reader.name for value in node.output for reader in readers[value]}
         if node.op_type in operations and following and following <= chosen:

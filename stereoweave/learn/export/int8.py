@@ -1,4 +1,4 @@
-"""A matcher file with 8-bit convolutions: a third of the size, and faster where a CPU multiplies 8 bits."""
+"""Matcher files with 8-bit convolutions: a third of the size, and faster on CPUs with 8-bit products."""
 
 import io
 import tempfile
@@ -26,29 +26,29 @@ from stereoweave.matching.matcher import Matcher
 from stereoweave.stereo import Sample
 
 LARGEST_LOSS_PX = 0.05
-# Apart from the seeds of recipes, of validation and of the confidence.
+# Different from the seeds of recipes, validation and confidence.
 _RANGES_SEED, _PROOF_SEED = 4_000_037, 5_000_011
 _RANGES_PAIRS, _PROOF_PAIRS = 6, 24
 _SIZE = (320, 512)
-# Of the values of a map; what lies beyond is cut, so that few far-off ones do not make the steps coarse.
+# Percentile of a map's values that the range covers; outliers are clipped, so that steps stay fine.
 _RANGE_PERCENTILE = 99.99
-# These layers keep float32: they read what is finer than a pixel; in 8 bits too, twice as much is lost.
+# These layers stay in float32, because they resolve fractions of a pixel: in 8 bits they double the loss.
 _KEPT = ("refinement.", "sharpening.")
 
 
 def quantise(source: Path, out: Path) -> dict[str, Any]:
-    """Write a WeaveNet's matcher file with 8-bit convolutions, and its card as .json; returns the card.
+    """Write a WeaveNet's matcher file with 8-bit convolutions, and its card as .json. Returns the card.
 
-    Activations take 8 bits, weights 7 of 8 and a scale a channel: with all 8 the sums of two products
-    overflow on CPUs that have AVX2 and no 8-bit dot product (ONNX Runtime, "Quantize ONNX Models").
+    Activations take 8 bits, weights 7 of 8 with a scale per channel: with all 8, sums of two products
+    overflow on CPUs with AVX2 but without 8-bit dot products (ONNX Runtime, "Quantize ONNX Models").
 
     Args:
-        source: A matcher file in float32 for pairs of any size.
+        source: Matcher file in float32 for pairs of any size.
         out: The .onnx file to write.
 
     Raises:
-        StereoweaveError: The source is no such file, or the mean error grows by 0.05 px or more on pairs
-            other than those that the ranges are from; nothing is written then.
+        StereoweaveError: The source is not such a file, or the mean error grows by 0.05 px or more on pairs
+            that were not used for the ranges; nothing is written.
     """
     graph = read_graph(source)
     make_folder(out.parent)
@@ -68,11 +68,10 @@ def quantise(source: Path, out: Path) -> dict[str, Any]:
 
 
 def select_int8_nodes(graph: onnx.ModelProto) -> list[str]:
-    """The names of the nodes that compute in 8 bits.
+    """Names of the nodes that compute in 8 bits.
 
-    They are the convolutions but those of the refinement and the sharpening, and what stands between them
-    alone. Disparities, correlations and what they are read from never are: eight bits of a disparity are
-    whole pixels.
+    These are all convolutions except those of refinement and sharpening, and nodes that only such nodes read.
+    Disparities, correlations and their inputs stay in float32: 8 bits of a disparity are integer pixels.
     """
     convolutions = (
         node.name
@@ -84,7 +83,7 @@ def select_int8_nodes(graph: onnx.ModelProto) -> list[str]:
 
 
 class _CalibrationPairs(CalibrationDataReader):  # type: ignore[misc]
-    """Pairs as ONNX Runtime asks for them."""
+    """Pairs in the form in which ONNX Runtime's calibration reads them."""
 
     def __init__(self, pairs: Iterable[Sample]) -> None:
         self._pairs = iter(pairs)
@@ -101,7 +100,7 @@ class _CalibrationPairs(CalibrationDataReader):  # type: ignore[misc]
 
 def _write(graph: onnx.ModelProto, out: Path) -> None:
     nodes = select_int8_nodes(graph)
-    # ONNX Runtime prints what it does.
+    # Suppresses ONNX Runtime's progress messages.
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()):
         with_shapes = Path(folder, "with_shapes.onnx")
         quant_pre_process(graph, with_shapes, skip_optimization=True, skip_symbolic_shape=True)
@@ -125,7 +124,7 @@ def _paint_pairs(seed: int, count: int) -> Iterator[Sample]:
 
 
 def _mean_error_px(matcher: Matcher) -> float:
-    """Over the pixels that both views see, of fresh pairs."""
+    """Mean error on held-out pairs, over pixels visible in both views."""
     errors_px = [
         np.abs(matcher.estimate(pair.left, pair.right).disparity_px - pair.disparity_px)[
             ~pair.occluded

@@ -1,4 +1,4 @@
-"""How far every runtime of a shipped network is from PyTorch in float32, and how fast, a row a variant."""
+"""Accuracy of each runtime and variant of a shipped network relative to PyTorch in float32, and its speed."""
 
 import contextlib
 import math
@@ -29,30 +29,30 @@ from stereoweave.matching.matcher import model_file
 from stereoweave.matching.providers import CPU, PROVIDERS, open_session
 from stereoweave.system.threads import thread_count
 
-# Apart from the seeds of recipes, of validation, of the confidence and of the variants' own proofs.
+# Different from the seeds of recipes, validation, confidence and the variants' own checks.
 _SEED, _PAIRS = 7_000_003, 4
-# Height and width of the pairs. The times are of the last one, which the file of one size takes.
+# Height and width of the pairs. Times are measured at the last one, the size of the fixed-size file.
 SIZES = ((240, 320), (320, 512), (480, 640))
 _TURNS = 7
 
 
 @dataclass(frozen=True, kw_only=True)
 class ParityRow:
-    """How one way to run a network differs from PyTorch in float32, over all pixels of painted pairs.
+    """Differences of one variant from PyTorch in float32, over all pixels of painted pairs.
 
     Attributes:
         network: The shipped network.
-        variant: Of its matcher file.
-        provider: What ran it, a name in PROVIDERS.
-        onnxruntime: The version.
-        file_mb: Size of the file, in millions of bytes.
-        pairs: How many were compared.
+        variant: Variant of its matcher file.
+        provider: Execution provider, a name in PROVIDERS.
+        onnxruntime: Version of ONNX Runtime.
+        file_mb: Size of the file in 10^6 bytes.
+        pairs: Number of pairs compared.
         left_mean_px, left_max_px: Absolute differences of the left view's disparity.
-        right_mean_px, right_max_px: Of the right one's.
-        confidence_mean, confidence_max: Of the confidence, a probability.
-        time_ms: Of a pair of 640x480, the shortest of several turns.
-        time_relative: As a multiple of float32 on the same provider, in the same turns.
-        commit: Of the code.
+        right_mean_px, right_max_px: Absolute differences of the right view's disparity.
+        confidence_mean, confidence_max: Absolute differences of the confidence, a probability.
+        time_ms: Time of a pair of 640x480, the shortest of several runs.
+        time_relative: Time relative to float32 on the same provider, measured alternately.
+        commit: Commit of the code.
     """
 
     network: str
@@ -73,7 +73,7 @@ class ParityRow:
 
 
 class MatcherVariant(NamedTuple):
-    """A matcher file, and how many pairs it is given at once; `sizes` as in SIZES."""
+    """A matcher file, the batch size it is run with, and the sizes of SIZES that it accepts."""
 
     file: Path
     batch: int
@@ -81,7 +81,7 @@ class MatcherVariant(NamedTuple):
 
 
 class NetworkMaps(NamedTuple):
-    """What a network gives: disparity of both views, and the left one's confidence in 0..1."""
+    """A network's outputs: disparity of both views, and the left view's confidence in 0..1."""
 
     left_px: Float32[np.ndarray, "b 1 h w"]
     right_px: Float32[np.ndarray, "b 1 h w"]
@@ -89,17 +89,17 @@ class NetworkMaps(NamedTuple):
 
 
 def measure_parity(checkpoints: Sequence[Path]) -> list[ParityRow]:
-    """A row for every variant of every network, on every provider that the installed ONNX Runtime has.
+    """Compare every variant of every network on every provider of the installed ONNX Runtime.
 
     Args:
-        checkpoints: Of the shipped networks.
+        checkpoints: Checkpoints of the shipped networks.
     """
     with tempfile.TemporaryDirectory() as folder:
         return [row for path in checkpoints for row in _measure_network(path, Path(folder))]
 
 
 def format_markdown(rows: Sequence[ParityRow]) -> str:
-    """The rows as a table."""
+    """Format the rows as a Markdown table."""
     what = ["network", "variant", "provider"]
     numbers = ["file, MB", "left, px", "right, px", "confidence", "time, of float32's"]
     lines = [what + numbers, ["---"] * 3 + ["---:"] * 5]
@@ -153,7 +153,7 @@ def _measure_network(path: Path, folder: Path) -> list[ParityRow]:
 
 
 def make_variants(file: Path, folder: Path) -> dict[str, MatcherVariant]:
-    """Every variant of a shipped matcher file by name, made in the folder where it does not ship."""
+    """Make every variant of a shipped matcher file, by name; derived files go to the folder."""
     height, width = SIZES[-1]
     half, eight_bits, fixed = (folder / f"{file.stem}_{x}.onnx" for x in ("fp16", "8bit", "fixed"))
     convert_to_float16(file, half)
@@ -169,7 +169,7 @@ def make_variants(file: Path, folder: Path) -> dict[str, MatcherVariant]:
 
 
 def apply_shipped_calibration(network: WeaveNet, file: Path) -> WeaveNet:
-    """The network of a checkpoint, its confidence calibrated as it was for the matcher file."""
+    """Set a network's confidence layers to the calibrated ones of its shipped matcher file."""
     weights = {x.name: x for x in onnx.load(file).graph.initializer}
     with torch.no_grad():
         for name, parameter in network.named_parameters():
@@ -180,7 +180,7 @@ def apply_shipped_calibration(network: WeaveNet, file: Path) -> WeaveNet:
 
 
 def paint_pairs(size: tuple[int, int], count: int) -> dict[str, Float32[np.ndarray, "b 3 h w"]]:
-    """Pairs that no training sees, as a network takes them: the left views and the right ones."""
+    """Paint held-out pairs as a network's inputs: stacked left views and right views."""
     made = [paint_collage(_SEED, size[1], index, *size) for index in range(count)]
     return {
         side: np.stack([getattr(x, side).transpose(2, 0, 1) for x in made]).astype(np.float32) / 255
@@ -189,7 +189,7 @@ def paint_pairs(size: tuple[int, int], count: int) -> dict[str, Float32[np.ndarr
 
 
 def run_in_pytorch(network: Any, views: Mapping[str, np.ndarray]) -> NetworkMaps:
-    """What the network says in float32, a pair at a time."""
+    """Run the network in float32, one pair at a time."""
     each = []
     with torch.inference_mode():
         for i in range(len(views["left"])):
@@ -199,7 +199,7 @@ def run_in_pytorch(network: Any, views: Mapping[str, np.ndarray]) -> NetworkMaps
 
 
 def run_in_onnx_runtime(session: Any, batch: int, views: Mapping[str, np.ndarray]) -> NetworkMaps:
-    """What a matcher file says of the pairs, so many at a time."""
+    """Run a matcher file on the pairs, `batch` pairs at a time."""
     each = []
     for i in range(0, len(views["left"]), batch):
         taken = {side: x[i : i + batch] for side, x in views.items()}
@@ -222,13 +222,13 @@ def summarise_differences(
 
 
 def list_providers() -> list[str]:
-    """The providers that the installed ONNX Runtime has."""
+    """The providers of the installed ONNX Runtime."""
     there = onnxruntime.get_available_providers()
     return [name for name, provider in PROVIDERS.items() if provider.name in there]
 
 
 def _open_sessions(made: Mapping[str, MatcherVariant], provider: str) -> dict[str, Any]:
-    """ONNX Runtime's sessions by variant, without those that a provider other than the processor refuses."""
+    """ONNX Runtime's sessions by variant, without those that a provider other than the CPU rejects."""
     sessions = {}
     for name, variant in made.items():
         with contextlib.nullcontext() if provider == CPU else contextlib.suppress(MatcherError):
@@ -239,7 +239,7 @@ def _open_sessions(made: Mapping[str, MatcherVariant], provider: str) -> dict[st
 def _measure_times_ms(
     sessions: Mapping[str, Any], made: Mapping[str, MatcherVariant], views: Mapping[str, np.ndarray]
 ) -> dict[str, float]:
-    """The shortest time for a pair, in turns, so that a machine that slows down slows all alike."""
+    """Shortest time per pair, measured alternately, so that slow phases affect all variants alike."""
     times_ms: dict[str, list[float]] = {name: [] for name in sessions}
     for turn in range(-1, _TURNS):  # the first one warms up
         for name, session in sessions.items():

@@ -19,7 +19,7 @@ def test_variants_are_made_of_a_shipped_network(tmp_path, monkeypatch, capsys):
     told = capsys.readouterr().out.splitlines()
     assert told[:2] == ["any.onnx: float32", "all.onnx: float32"]
     assert told[2].startswith("half.onnx: 16 bits change disparity by 0.0")
-    assert told[3:] == [f"{name}.onnx: for pairs of 96x64 alone" for name in ("all", "half")]
+    assert told[3:] == [f"{name}.onnx: only for pairs of 96x64" for name in ("all", "half")]
     for name in ("all", "half"):
         sides = onnx.load(f"{name}.onnx").graph.input[0].type.tensor_type.shape.dim
         assert [side.dim_value for side in sides] == [1, 3, 64, 96]
@@ -31,9 +31,9 @@ def test_variants_are_made_of_a_shipped_network(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        ("export small", "expected a file to write, found none"),
+        ("export small", "expected an output file, found none"),
         ("export small -o out.trt", "out.trt: expected a name that ends in .onnx"),
-        ("export small -o a.onnx --half a.onnx", "a.onnx: expected a file of its own"),
+        ("export small -o a.onnx --half a.onnx", "a.onnx: expected a different file"),
         ("export small -o a.onnx --size 640", "such as 640x480, found '640'"),
         ("export small -o a.onnx --size 641x480", "expected multiples of 16 of at least 32, found 641x480"),
         ("export none.onnx -o a.onnx", "none.onnx: expected an ONNX matcher, found no such file"),
@@ -69,5 +69,5 @@ def test_nothing_takes_the_place_of_the_file_that_it_is_made_from(tmp_path, monk
     monkeypatch.chdir(tmp_path)
     shutil.copyfile(model_file("small"), "mine.onnx")
     assert cli.main(["export", "mine.onnx", option, str(tmp_path / "mine.onnx")]) == 2
-    assert "mine.onnx: expected another file than the one to make it from" in capsys.readouterr().err
+    assert "mine.onnx: expected an output file other than the source" in capsys.readouterr().err
     assert Path("mine.onnx").read_bytes() == model_file("small").read_bytes()

@@ -62,7 +62,7 @@ def test_a_file_of_half_the_size_answers_nearly_alike_and_says_what_it_changed(s
 
     # Neither is what a variant is made from.
     message = complaint(halve.convert_to_float16, out, tmp_path / "again.onnx")
-    assert message.endswith("found one in 16 bits; take the file that it was made from")
+    assert message.endswith("found one in 16 bits; use the file that it was made from")
 
 
 def test_convolutions_and_products_alone_have_weights_of_16_bits():
@@ -77,5 +77,5 @@ def test_convolutions_and_products_alone_have_weights_of_16_bits():
 def test_nothing_is_written_where_16_bits_change_too_much(small_pairs, tmp_path, monkeypatch):
     monkeypatch.setattr(halve, "LARGEST_MEAN_DIFFERENCE_PX", 0.0)
     message = complaint(halve.convert_to_float16, SMALL, tmp_path / "small16.onnx")
-    assert "px in the mean, expected under 0.0; nothing was written" in message
+    assert "px on average, expected under 0.0; nothing was written" in message
     assert list(tmp_path.iterdir()) == []
