@@ -1,4 +1,4 @@
-"""One kept pair seen in many ways: cut, scaled, mirrored, recoloured, partly erased."""
+"""Augmentation of a pair: crop, scale, mirror, recolour, erase patches."""
 
 from dataclasses import replace
 
@@ -11,11 +11,12 @@ from stereoweave.stereo import Sample, StereoCamera
 
 
 def crop(sample: Sample, height: int, width: int, rng: np.random.Generator) -> Sample:
-    """A random part of the sample of the size asked for, as it is; StereoweaveError where it is smaller."""
+    """Crop the sample at random, without scaling. Raises StereoweaveError if it is smaller than the crop."""
     rows, columns = sample.disparity_px.shape
     if rows < height or columns < width:
         raise StereoweaveError(
-            f"crop_size = {[height, width]}: expected at most the pictures' {[rows, columns]}; cut less"
+            f"crop_size = {[height, width]}: expected at most the pictures' {[rows, columns]}; "
+            "use a smaller crop"
         )
     top, start = int(rng.integers(rows - height + 1)), int(rng.integers(columns - width + 1))
     part = np.s_[top : top + height, start : start + width]
@@ -23,26 +24,26 @@ def crop(sample: Sample, height: int, width: int, rng: np.random.Generator) -> S
     return Sample(**maps, camera=crop_camera(sample.camera, start, top))
 
 
-# The right crop lies at most this share of its width further to the right than the left one.
+# Largest shift of the right crop to the right, as a share of its width.
 _LARGEST_OFFSET = 0.14
 
 
 def augment(
     sample: Sample, height: int, width: int, rng: np.random.Generator, offset_share: float = 0.0
 ) -> Sample:
-    """A cut of the sample of the size asked for; disparity is scaled and moved along with it.
+    """Crop and augment the sample; disparity is scaled and shifted accordingly.
 
     Args:
-        sample: What is cut.
-        height: In px.
-        width: In px.
-        rng: What all draws come from.
-        offset_share: Share of the samples whose right view is cut further to the right, by up to 14 % of the
-            width. Their disparity grows by as much, so that plain surfaces are not always far.
+        sample: The sample to augment.
+        height: Height of the crop in px.
+        width: Width of the crop in px.
+        rng: Source of all draws.
+        offset_share: Share of samples whose right crop is shifted to the right, by up to 14 % of the width.
+            Their disparity grows by as much, so that textureless surfaces are not always far.
     """
     offset = rng.uniform(0, _LARGEST_OFFSET) if offset_share and rng.random() < offset_share else 0.0
     sample = crop_and_scale(sample, height, width, rng, offset)
-    # Without the right view's disparity a mirrored pair has nothing to learn from.
+    # Without the right view's disparity a mirrored pair has no ground truth.
     if rng.random() < 0.5 and np.isfinite(sample.right_disparity_px).any():
         sample = mirror(sample)
     if rng.random() < 0.3:
@@ -56,14 +57,14 @@ def augment(
 def crop_and_scale(
     sample: Sample, height: int, width: int, rng: np.random.Generator, offset: float = 0.0
 ) -> Sample:
-    """A random part of the sample, scaled so that it fills height x width; its disparity scales with it.
+    """Crop the sample at random and scale the crop to height x width; disparity scales with it.
 
-    The right view's part begins `offset` of its width, or as much as there is, further to the right.
+    The right view's crop is shifted right by the share `offset` of its width, as far as the sample allows.
     """
     rows, columns = sample.disparity_px.shape
     smallest = max(height / rows, width / columns)
     scale = max(smallest, float(np.exp(rng.uniform(np.log(0.75), np.log(1.4)))))
-    # Height and width may stretch a little apart: cameras and hands do so too.
+    # Height and width are stretched slightly differently, as by real cameras.
     stretch = float(np.exp(rng.uniform(-0.1, 0.1)))
     scale_y = max(scale * stretch, height / rows)
     part_height, part_width = min(round(height / scale_y), rows), min(round(width / scale), columns)
@@ -83,7 +84,7 @@ def crop_and_scale(
         )
 
     def nearest(values: np.ndarray) -> np.ndarray:
-        # Never a mean across an edge.
+        # Never average across an edge.
         return cv2.resize(values, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
 
     def disparity_px(values: np.ndarray) -> np.ndarray:
@@ -103,9 +104,9 @@ def crop_and_scale(
 def crop_camera(
     camera: StereoCamera | None, start_px: int, top_px: int, scale_x: float = 1.0, scale_y: float = 1.0
 ) -> StereoCamera | None:
-    """The camera of a part that starts at that column and row, scaled.
+    """The camera of a crop with this left column and top row, after scaling.
 
-    Its focal length is the one along rows, which depth depends on.
+    The focal length is the horizontal one, which determines depth.
     """
     return camera and replace(
         camera,
@@ -117,7 +118,7 @@ def crop_camera(
 
 
 def mirror(sample: Sample) -> Sample:
-    """The sample as a mirror shows it: the views change places."""
+    """The sample as seen in a mirror: the views swap."""
     camera = sample.camera
     last = sample.left.shape[1] - 1
     return Sample(
@@ -132,7 +133,7 @@ def mirror(sample: Sample) -> Sample:
 
 
 def flip_rows(sample: Sample) -> Sample:
-    """The sample with its first row last."""
+    """The sample upside down."""
     maps = {name: value[::-1] for name, value in vars(sample).items() if name != "camera"}
     camera, last = sample.camera, sample.left.shape[0] - 1
     return Sample(**maps, camera=camera and replace(camera, cy_px=last - camera.cy_px))
@@ -141,7 +142,7 @@ def flip_rows(sample: Sample) -> Sample:
 def recolour(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], rng: np.random.Generator
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
-    """Both views with one change of colour, and each with a small one of its own."""
+    """Apply one colour change to both views, and a small separate one to each."""
     order = rng.permutation(3) if rng.random() < 0.3 else np.arange(3)
     gain, gamma = rng.uniform(0.7, 1.3, 3) * rng.uniform(0.7, 1.3), rng.uniform(0.7, 1.4)
     tables = []
@@ -157,7 +158,7 @@ def _make_colour_table(gain: Float[np.ndarray, "3"], gamma: float) -> UInt8[np.n
 
 
 def erase_patches(image: UInt8[np.ndarray, "h w 3"], rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
-    """The image with one or two patches in their mean colour: a match that must be guessed from around it."""
+    """Fill one or two patches with their mean colour, so that their match must be inferred."""
     image = image.copy()
     rows, columns = image.shape[:2]
     for _ in range(rng.integers(1, 3)):

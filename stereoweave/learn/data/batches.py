@@ -1,4 +1,4 @@
-"""The batch of every step: which pairs, how they are cut, and how they are laid together and parted."""
+"""The batch of every step: which pairs it has, how they are cropped, collated and split."""
 
 import numpy as np
 import torch
@@ -13,9 +13,10 @@ from stereoweave.stereo import Sample
 
 
 class Batches(Dataset[dict[str, torch.Tensor]]):
-    """The batch of every step, or of each the share of one of several processes.
+    """The batch of every step, or one rank's share of it.
 
-    A micro-batch is drawn from (seed, step, its place in the step) alone, whoever asks and in whatever order.
+    A micro-batch depends only on (seed, step, its index in the step), not on who requests it or in what
+    order.
     """
 
     def __init__(self, recipe: Recipe, pairs: PairSource, rank: ProcessRank | None = None) -> None:
@@ -36,26 +37,26 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
         )
 
     def key(self, step: int, part: int) -> tuple[int, ...]:
-        """What the draws of a micro-batch begin from.
+        """Seed of a micro-batch's draws.
 
-        Zeros at the end change no draw: the first one's are those of (seed, step), as before steps had parts.
-        Even, because of the odd ones are the orders of pairs and sets.
+        Trailing zeros do not change a seed: the first micro-batch has the draws of (seed, step), as before
+        steps had micro-batches. The last number is even because odd ones seed the orders of pairs and sets.
         """
         return self.recipe.seed, step, 0, 2 * part
 
     def chosen(self, step: int) -> list[int]:
-        """Indices of the pairs of a step: of each set every pair once before any comes again."""
+        """Indices of a step's pairs. Every pair of a set comes once before any comes again."""
         first, end = step * self.recipe.batch, (step + 1) * self.recipe.batch
         while len(self._drawn) < end:
             self._draw(2 * len(self._drawn) + end)
         return [self._index(int(self._drawn[i]), int(self._turns[i])) for i in range(first, end)]
 
     def names(self, step: int) -> list[str]:
-        """What errors call the pairs of a step."""
+        """Names of a step's pairs for error messages."""
         return [self.pairs.name(index) for index in self.chosen(step)]
 
     def _draw(self, places: int) -> None:
-        """Draw the set of each of the first places, and count how often it was drawn before."""
+        """Draw the set of each of the first `places` pairs, and count its earlier draws."""
         self._drawn = self.mix.draw_sets(places, np.random.default_rng((self.recipe.seed, 0, 0, 1)))
         self._turns = np.zeros(places, np.int64)
         for which in range(len(self.mix.sets)):
@@ -70,7 +71,7 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
         return [crop(sample, *size, rng) for sample in samples]
 
     def _index(self, which: int, turn: int) -> int:
-        """The index of the pair that a set gives when it is drawn for that time, counted from 0."""
+        """Index of the pair of set `which` at its draw number `turn`, counted from 0."""
         one = self.mix.sets[which]
         epoch, place = divmod(turn, one.count)
         rng = np.random.default_rng((self.recipe.seed, epoch, 1 + which))
@@ -79,9 +80,9 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
 
 
 class CaughtBatches(Dataset[dict[str, torch.Tensor] | StereoweaveError]):
-    """The batches, or the error where one cannot be made.
+    """The batches, with errors as values.
 
-    Raised in the loader's process it would come with PyTorch's traceback for its words.
+    An error raised in the loader's process would arrive with PyTorch's traceback as its message.
     """
 
     def __init__(self, batches: Batches) -> None:
@@ -95,7 +96,7 @@ class CaughtBatches(Dataset[dict[str, torch.Tensor] | StereoweaveError]):
 
 
 def read_known(pairs: PairSource, index: int) -> Sample:
-    """The sample of that index; StereoweaveError where nothing in it is known."""
+    """Read a sample. Raises StereoweaveError if no pixel has a known disparity."""
     sample = pairs[index]
     if not np.isfinite(sample.disparity_px).any():
         raise StereoweaveError(
@@ -106,18 +107,18 @@ def read_known(pairs: PairSource, index: int) -> Sample:
 
 
 def collate(samples: list[Sample]) -> dict[str, torch.Tensor]:
-    """Images [B, 3, H, W] in 0..1; maps [2B, 1, H, W], of the left views, then of the right ones mirrored.
+    """Collate samples: images [B, 3, H, W] in 0..1; maps [2B, 1, H, W], left views, then mirrored right ones.
 
-    Where every sample has a camera, also `focal_baseline_px_m` and `doffs_px`, [B, 1, 1, 1].
+    If every sample has a camera, also `focal_baseline_px_m` and `doffs_px`, [B, 1, 1, 1].
 
     Raises:
-        StereoweaveError: The samples are not of one size.
+        StereoweaveError: The samples differ in size.
     """
     sizes = sorted({sample.left.shape[:2] for sample in samples})
     if len(sizes) > 1:
         raise StereoweaveError(
             f"a batch: expected pairs of one size, found {' and '.join(f'{w}x{h}' for h, w in sizes)}; "
-            "cut them to one crop_size"
+            "crop them to one crop_size"
         )
 
     def images(side: str) -> torch.Tensor:
@@ -144,11 +145,11 @@ def collate(samples: list[Sample]) -> dict[str, torch.Tensor]:
 
 
 def split_batch(batch: dict[str, torch.Tensor], parts: int) -> list[dict[str, torch.Tensor]]:
-    """A collated batch in equal parts, its first pairs first, each as if collated alone."""
+    """Split a collated batch into equal parts in the order of its pairs."""
     pairs = len(batch["left"])
 
     def part(values: torch.Tensor, which: int) -> torch.Tensor:
-        # Maps of the left views are before those of the right ones.
+        # Maps of the left views come before those of the right ones.
         return torch.unflatten(values, 0, (len(values) // pairs, parts, -1))[:, which].flatten(0, 1)
 
     return [{name: part(values, which) for name, values in batch.items()} for which in range(parts)]

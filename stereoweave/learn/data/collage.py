@@ -1,7 +1,7 @@
-"""Endless training pairs: layers of paper-thin, slanted and bent surfaces, painted into both views.
+"""Endless training pairs: collages of flat, slanted and bent surfaces, painted into both views.
 
-What transfers to photographs is natural textures and a wide spread of disparities rather than exact
-geometry, so a scene is a collage; its disparity is exact in both views all the same.
+Natural textures and a wide range of disparities matter more for photographs than realistic geometry. Still,
+disparity and occlusion are exact in both views.
 """
 
 from collections.abc import Callable
@@ -18,11 +18,11 @@ from stereoweave.learn.data.textures import LIGHT_MAPS, draw_natural_colour, mak
 from stereoweave.stereo import Sample
 
 CLEAN_SHARE = 0.25  # pairs without any photometric difference
-FAULTY_SHARE = 0.03  # pairs with faults that good cameras do not have
-NOISE_SHARE = 0.02  # training pairs that show noise and nothing else
-CUT_APART_SHARE = 0.04  # training pairs whose disparities are partly negative
-NOTHING_PX = -1000.0  # the disparity of what cannot be found; below 0 however the views are moved
-LEVELS = np.arange(1021, dtype=np.float32) / 4  # grey levels that a tone curve tells apart
+FAULTY_SHARE = 0.03  # pairs with the faults of bad cameras
+NOISE_SHARE = 0.02  # training pairs of plain noise
+CUT_APART_SHARE = 0.04  # training pairs with partly negative disparities
+NOTHING_PX = -1000.0  # disparity of pixels without any match; below 0 however the views are shifted
+LEVELS = np.arange(1021, dtype=np.float32) / 4  # grey levels that a tone curve distinguishes
 
 
 View = Float[np.ndarray, "h w 3"]  # 0..255
@@ -30,27 +30,27 @@ View = Float[np.ndarray, "h w 3"]  # 0..255
 
 @dataclass(frozen=True, kw_only=True)
 class PaintedView:
-    """One view: image float32 [H, W, 3] in 0..255, and the disparity of what is seen, float32 [H, W]."""
+    """One view: image float32 [H, W, 3] in 0..255, and its disparity float32 [H, W]."""
 
     image: Float[np.ndarray, "h w 3"]
     disparity_px: Float[np.ndarray, "h w"]
 
 
 def paint_collage(seed: int, epoch: int, index: int, height: int = 256, width: int = 384) -> Sample:
-    """Mixed collage number `index` of an epoch, with exact disparity and occlusion for both views.
+    """Paint the mixed collage of this index, with exact disparity and occlusion for both views.
 
-    The same arguments give the same pair in every process. Disparities are finite and >= 0. The textures
-    are built at the first call, which takes some seconds.
+    The same arguments give the same pair in every process. Disparities are finite and >= 0. The first call
+    builds the textures, which takes some seconds.
     """
     rng = np.random.default_rng((seed, epoch, index))
     return _photograph_views(rng, *_paint_matchable(rng, draw_scene, height, width))
 
 
 def paint_training_collage(seed: int, epoch: int, index: int, height: int = 256, width: int = 384) -> Sample:
-    """A collage of any kind, with what `sample` gives; 6 % of the pairs are for the confidence alone.
+    """Paint a collage of any kind, in the format of `paint_collage`; 6 % of pairs train only the confidence.
 
-    In those, disparities are partly or wholly below 0, where a network that clamps at 0 cannot find them.
-    Either the views are cut apart, with exact disparities on both sides of 0, or they show plain noise
+    Their disparities are partly or all below 0, where a network that clamps at 0 cannot find them. Either the
+    crops of both views are shifted apart, with exact disparities of both signs, or both views are plain noise
     and all disparities are NOTHING_PX.
     """
     rng = np.random.default_rng((seed, epoch, index, 1))
@@ -69,7 +69,7 @@ def _paint_matchable(
     height: int,
     width: int,
 ) -> tuple[PaintedView, PaintedView]:
-    """Both views of a random scene that has something to match."""
+    """Paint both views of random scenes until one has enough to match."""
     while True:
         left, right = paint_scene(draw(rng, height, width))
         occluded, right_occluded = _find_occlusions(left, right)
@@ -102,7 +102,7 @@ def _photograph_views(rng: np.random.Generator, left: PaintedView, right: Painte
 def _crop_apart(
     rng: np.random.Generator, left: PaintedView, right: PaintedView, width: int
 ) -> tuple[PaintedView, PaintedView]:
-    """Views of that width; the left one starts so far to the right that many disparities are below 0."""
+    """Crop both views to `width`, the left one so far to the right that many disparities are below 0."""
     spare = left.image.shape[1] - width
     start = int(np.clip(np.ceil(np.quantile(left.disparity_px, rng.uniform(0.1, 0.7))), 1, spare))
 
@@ -116,7 +116,7 @@ def _crop_apart(
 
 
 def _paint_plain_noise(rng: np.random.Generator, height: int, width: int) -> Sample:
-    """Two views of one colour under smooth light, and each sensor's noise."""
+    """Two views of one colour under smooth light, each with its own sensor noise."""
     light = 1 + rng.uniform(0, 0.3) * (make_light_map(int(rng.integers(LIGHT_MAPS))) - 1)
     shown = (
         draw_natural_colour(rng)
@@ -138,7 +138,7 @@ def _paint_plain_noise(rng: np.random.Generator, height: int, width: int) -> Sam
 
 
 def paint_scene(scene: CollageScene) -> tuple[PaintedView, PaintedView]:
-    """Both views of a scene, left and right, as ideal cameras see it."""
+    """Paint both views of a scene, left and right, as ideal cameras see it."""
     left_sheets = [layer.sheet() for layer in scene.layers]
     right_sheets = [warp_to_right(sheet, scene.width) for sheet in left_sheets]
     return _paint_view(scene, left_sheets, 0), _paint_view(scene, right_sheets, 1)
@@ -158,8 +158,8 @@ def _paint_view(scene: CollageScene, sheets: list[Sheet], side: int) -> PaintedV
 def photograph(
     rng: np.random.Generator, left: Float[np.ndarray, "h w 3"], right: Float[np.ndarray, "h w 3"]
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
-    """The two images as two real cameras give them: a little apart in height, sharpness, tone and noise."""
-    # With numbers of their own, so that a pair without faults stays as it was before there were any.
+    """Simulate two real cameras: slight differences in height, sharpness, tone and noise."""
+    # A separate generator, so that pairs without faults are the same as before faults were added.
     fault_rng = rng.spawn(1)[0]
     if fault_rng.random() < FAULTY_SHARE:
         left, right = _add_faults(fault_rng, left, right)
@@ -168,7 +168,7 @@ def photograph(
         return expose(left, plain, still, left), expose(right, plain, still, right)
     if rng.random() < 0.33:
         right = _shift_down(right, rng.uniform(-0.5, 0.5))
-    # One pair in six has plainly different exposures, the others as two cameras of one make have.
+    # One pair in six has clearly different exposures; the others differ like two cameras of one model.
     spread = 0.2 if rng.random() < 0.17 else 0.04
     noise_level = float(np.exp(rng.uniform(np.log(0.2), np.log(5)))) if rng.random() < 0.75 else 0.0
     blur_share = 0.5 if rng.random() < 0.4 else 0.0
@@ -181,7 +181,7 @@ def photograph(
         if vignette:
             view = view * _make_vignette(view.shape[0], view.shape[1], vignette)
         tone = _draw_tone(rng, spread)
-        # Photons are counted: their noise grows with the root of the brightness, over the sensor's own.
+        # Shot noise grows with the square root of the brightness, in addition to sensor noise.
         deviation = noise_level * np.sqrt(0.25 + np.clip(tone, 0, 255) / 255)
         noise = rng.standard_normal(view.shape, np.float32) if noise_level else view
         shown = expose(view, tone, deviation, noise)
@@ -190,14 +190,14 @@ def photograph(
 
 
 def _add_faults(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
-    """The views with one to three of the faults, in the order in which light meets them."""
+    """Apply one to three faults, in the order in which they occur in a camera."""
     for fault in np.sort(rng.choice(len(FAULTS), rng.integers(1, 4), replace=False)):
         left, right = FAULTS[fault](rng, left, right)
     return left, right
 
 
 def _misalign_rows(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
-    """Cameras that are one or two rows apart in height."""
+    """Cameras one or two rows apart in height."""
     return left, _shift_down(right, rng.choice([-1, 1]) * rng.uniform(0.8, 2))
 
 
@@ -210,13 +210,13 @@ def _blur_one(rng: np.random.Generator, left: View, right: View) -> tuple[View, 
 
 
 def _darken_corners(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
-    """Each lens with corners of its own darkness."""
+    """Different vignetting in each lens."""
     own, other = (_make_vignette(left.shape[0], left.shape[1], rng.uniform(0.2, 0.7)) for _ in range(2))
     return left * own, right * other
 
 
 def _interpolate_colours(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
-    """Colours of which each pixel of one or both sensors saw but one."""
+    """Bayer interpolation in one or both cameras."""
     which = rng.integers(3)
     return left if which == 1 else demosaic(left), right if which == 2 else demosaic(right)
 
@@ -225,7 +225,7 @@ FAULTS = (_misalign_rows, _blur_one, _darken_corners, _interpolate_colours)
 
 
 def demosaic(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """The image (0..255) behind a Bayer filter, the other two colours of each pixel interpolated."""
+    """Sample the image (0..255) through a Bayer filter and interpolate the missing colours."""
     levels = np.round(image * 256).astype(np.uint16)
     mosaic = levels[..., 1].copy()
     mosaic[::2, ::2], mosaic[1::2, 1::2] = levels[::2, ::2, 0], levels[1::2, 1::2, 2]

@@ -1,4 +1,4 @@
-"""Descriptions of whole collages: mixed things, near plain boards, streets, and shots as in films."""
+"""Kinds of collages: mixed objects, near textureless boards, streets, and film shots."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,12 +29,12 @@ from stereoweave.learn.data.silhouettes import (
     soften,
 )
 
-NETWORK_REACH_PX = 188  # no network finds a greater disparity
+NETWORK_REACH_PX = 188  # largest disparity that a network can find
 
 
 @dataclass(frozen=True, kw_only=True)
 class CollageCanvas:
-    """What layers are drawn on, by the size of the views in px and the scene's greatest disparity."""
+    """The area in which layers are drawn, from the views' size in px and the scene's largest disparity."""
 
     view_width: int
     height: int
@@ -42,24 +42,24 @@ class CollageCanvas:
 
     @property
     def width(self) -> int:
-        """Columns: those of the left view, and to their right those that only the right camera sees."""
+        """Columns of the left view, plus those to its right that only the right camera sees."""
         return self.view_width + int(np.ceil(self.limit_px)) + 2
 
     def whole(self) -> Placement:
-        """The place that all of the canvas takes."""
+        """Placement over the whole canvas."""
         return Placement(self.width / 2, self.height / 2, self.width / 2, self.width, self.height)
 
     def place(self, x: float, y: float, radius_px: float) -> Placement:
-        """A place on the canvas."""
+        """Placement at a point of the canvas."""
         return Placement(x, y, radius_px, self.width, self.height)
 
     def anywhere(self, rng: np.random.Generator, smallest: float, largest: float) -> Placement:
-        """A random place; its half extent is log-uniform between those shares of the width."""
+        """Random placement; its half extent is log-uniform between these shares of the width."""
         radius_px = self.width * float(np.exp(rng.uniform(np.log(smallest), np.log(largest))))
         return self.place(rng.uniform(0, self.width), rng.uniform(0, self.height), radius_px)
 
     def between(self, far_px: float, nearness: float) -> float:
-        """The disparity at a nearness of 0 (far_px) to 1 (the scene's greatest)."""
+        """Disparity at a nearness of 0 (far_px) to 1 (the scene's largest disparity)."""
         return far_px + (self.limit_px - far_px) * nearness
 
 
@@ -67,9 +67,9 @@ Kind = Callable[[np.random.Generator, CollageCanvas], list[CollageLayer]]
 
 
 def draw_scene(rng: np.random.Generator, height: int, width: int) -> CollageScene:
-    """The description of a mixed scene, as validation has them.
+    """Draw a mixed scene, as used for validation.
 
-    Its greatest disparity is log-uniform, mostly 10 to 110 px of 384, at times 6 to 188.
+    Its largest disparity is log-uniform, mostly 10 to 110 px of 384, at times 6 to 188.
     """
     low, high = (10, 110) if rng.random() < 0.7 else (6, 190)
     limit_px = float(np.exp(rng.uniform(np.log(low), np.log(high)))) * width / 384
@@ -77,12 +77,12 @@ def draw_scene(rng: np.random.Generator, height: int, width: int) -> CollageScen
 
 
 def draw_training_scene(rng: np.random.Generator, height: int, width: int) -> CollageScene:
-    """The description of a scene of any kind, with a wider baseline than those of validation.
+    """Draw a scene of any kind, with a wider baseline than for validation.
 
-    Its greatest disparity is log-uniform, mostly 22 to 175 px, at times 6 to 188; less below 384 columns.
+    Its largest disparity is log-uniform, mostly 22 to 175 px, at times 6 to 188; less below 384 columns.
     """
     low, high = (22, 175) if rng.random() < 0.7 else (6, NETWORK_REACH_PX)
-    # Wider views show more of a scene, not larger disparities: the network has an end.
+    # Wider views show more of a scene, not larger disparities: the network's range is limited.
     limit_px = float(np.exp(rng.uniform(np.log(low), np.log(high)))) * min(width / 384, 1)
     kind = list(KINDS)[rng.choice(len(KINDS), p=list(KINDS.values()))]
     return _draw(rng, kind, height, width, limit_px)
@@ -103,7 +103,7 @@ def draw_mixed(rng: np.random.Generator, canvas: CollageCanvas) -> list[CollageL
     for k in range(rng.integers(6, 25)):
         thin = k < bunches
         place = canvas.anywhere(rng, 0.07 if thin else 0.012, 0.6)
-        # Large things stand behind and rods in front more often than not, so that both leave much to see.
+        # Large objects tend to be in the back and rods in front, so that little is hidden.
         nearness = rng.random() ** (0.8 if thin else 1 + 3 * place.radius_px / canvas.view_width)
         patch = draw_rods(rng, place) if thin else draw_shape(rng, place)
         layers.append(draw_layer(rng, patch, place, canvas.between(far_px, nearness), canvas.limit_px))
@@ -124,9 +124,9 @@ def _draw_floor(
     least_rise: float,
     paint: Callable[[np.random.Generator, Placement], Paint],
 ) -> CollageLayer:
-    """A plane below a line where it has the disparity start_px; it rises by a share of what is left."""
+    """Draw a plane below a horizon with disparity start_px; it rises by a share of the remaining range."""
     horizon, tilt = rng.uniform(0.3, 0.8) * canvas.height, rng.normal(0, 0.1)
-    # Its disparity is the same along the whole line.
+    # Its disparity is constant along the horizon.
     rise = rng.uniform(least_rise, 1.0) * (canvas.limit_px - start_px) / (canvas.height - horizon)
     slope, middle_x = min(rise, PLANE_SLOPE), canvas.width / 2
     return CollageLayer(
@@ -139,7 +139,7 @@ def _draw_floor(
 
 
 def draw_boards(rng: np.random.Generator, canvas: CollageCanvas) -> list[CollageLayer]:
-    """Near plain boards, walls and tables larger than a training crop, and things behind and before them."""
+    """Near textureless boards, walls and tables larger than a crop, with objects before and behind them."""
     far_px = canvas.limit_px * rng.uniform(0.05, 0.4)
     layers = _draw_backgrounds(rng, canvas, far_px)
     for _ in range(rng.integers(2, 9)):
@@ -153,7 +153,7 @@ def draw_boards(rng: np.random.Generator, canvas: CollageCanvas) -> list[Collage
 
 
 def _draw_plain_plane(rng: np.random.Generator, canvas: CollageCanvas, far_px: float) -> CollageLayer:
-    """A board in half of the draws, a table in a quarter, a wall in a quarter."""
+    """Draw a board (one half), a table (one quarter) or a wall (one quarter)."""
     kind = rng.random()
     if kind < 0.25:
         return _draw_floor(rng, canvas, canvas.between(far_px, rng.uniform(0.1, 0.6)), 0.5, draw_plain_paint)
@@ -170,7 +170,7 @@ def _draw_plain_plane(rng: np.random.Generator, canvas: CollageCanvas, far_px: f
 def _draw_attached(
     rng: np.random.Generator, canvas: CollageCanvas, plain: CollageLayer
 ) -> list[CollageLayer]:
-    """What hangs on the plane or is written on it, in half of the scenes."""
+    """Draw objects on the plane's surface, in half of the scenes."""
     count = rng.integers(1, 4) if rng.random() < 0.5 else 0
     places = [canvas.anywhere(rng, 0.015, 0.1) for _ in range(count)]
     return [
@@ -182,7 +182,7 @@ def _draw_attached(
 def _draw_objects_before(
     rng: np.random.Generator, canvas: CollageCanvas, plain: CollageLayer
 ) -> list[CollageLayer]:
-    """Things that stand before the plane or on it, and in half of the scenes a pillar that parts it."""
+    """Draw objects before or on the plane, and in half of the scenes a pillar that splits it."""
     places = [canvas.anywhere(rng, 0.02, 0.2) for _ in range(rng.integers(1, 6))]
     patches = [draw_shape(rng, place) for place in places]
     if rng.random() < 0.5:
@@ -190,7 +190,7 @@ def _draw_objects_before(
         patches.append(draw_pillar(rng, places[-1]))
     layers = []
     for place, patch in zip(places, patches, strict=True):
-        # The disparity of the plane where the thing's foot is.
+        # The plane's disparity at the object's foot.
         behind_px = plain.surface.plane_px(place.x, place.y + 0.8 * place.radius_px)
         level_px = canvas.between(behind_px, rng.random() ** 2)
         layers.append(draw_layer(rng, patch, place, level_px, canvas.limit_px))
@@ -198,7 +198,7 @@ def _draw_objects_before(
 
 
 def draw_street(rng: np.random.Generator, canvas: CollageCanvas) -> list[CollageLayer]:
-    """A plane that rises from the horizon to the camera's feet, upright things on it, and a sky."""
+    """A ground plane from the horizon to the camera, upright objects on it, and a sky."""
     horizon = rng.uniform(0.3, 0.6) * canvas.height
     rise = rng.uniform(0.5, 1.0) * canvas.limit_px / (canvas.height - horizon)
     middle_x = rng.uniform(0.25, 0.6) * canvas.width
@@ -216,7 +216,7 @@ def draw_street(rng: np.random.Generator, canvas: CollageCanvas) -> list[Collage
 
 
 def _draw_sky(rng: np.random.Generator, canvas: CollageCanvas) -> CollageLayer:
-    """Plain, in two fifths of the streets with clouds."""
+    """Draw a textureless sky, in two fifths of the streets with clouds."""
     bright = rng.uniform(120, 245) * np.array([rng.uniform(0.6, 1), rng.uniform(0.8, 1), 1.0])
     clouded = rng.random() < 0.4
     paint = (
@@ -238,14 +238,14 @@ def _draw_ground(rng: np.random.Generator, canvas: CollageCanvas, ground: Collag
 def _draw_markings(
     rng: np.random.Generator, canvas: CollageCanvas, ground: CollageSurface
 ) -> list[CollageLayer]:
-    """Strips on the ground that run to one point of the horizon, dashed or not."""
+    """Draw strips on the ground towards a vanishing point, solid or dashed."""
     middle_x, horizon = ground.plane[3:]
     layers = []
     for _ in range(rng.integers(0, 5)):
         foot_x, width = rng.uniform(-0.5, 1.5) * canvas.width, rng.uniform(0.01, 0.08) * canvas.width
         colour = rng.uniform(150, 250) * np.array([1.0, rng.uniform(0.8, 1), rng.uniform(0.3, 1)])
         paint = draw_plain_paint(rng, canvas.whole(), colour)
-        # Dashes of equal length shrink towards the horizon as 1 / depth.
+        # Dashes of equal length shrink as 1 / depth towards the horizon.
         ends = 1 / np.arange(1.0, 1 + rng.integers(1, 9), rng.uniform(0.4, 1.0))
         for near, far in zip(ends[::2], [*ends[1::2], 0.02], strict=False):
             sides = [(foot_x, near), (foot_x + width, near), (foot_x + width, far), (foot_x, far)]
@@ -260,7 +260,7 @@ def _draw_markings(
 def _draw_upright(
     rng: np.random.Generator, canvas: CollageCanvas, ground: CollageSurface, nearness: float, tallness: float
 ) -> CollageLayer:
-    """A thing at the disparity of its foot; `tallness` is its height in heights of the camera."""
+    """Draw an object at the disparity of its foot; `tallness` is its height in camera heights."""
     horizon = ground.plane[4]
     height = nearness * (canvas.height - horizon)
     foot_x, foot_y = rng.uniform(0, canvas.width), horizon + height
@@ -279,7 +279,7 @@ def _draw_upright(
 def _draw_facade(
     rng: np.random.Generator, canvas: CollageCanvas, ground: CollageSurface, side: int
 ) -> CollageLayer:
-    """A wall along the street, on its left side (-1) or right side (1), that stands on the ground."""
+    """Draw a wall on the ground along the left (-1) or right (1) side of the street."""
     start_px, _, rise, middle_x, horizon = ground.plane
     slope = rng.uniform(0.2, 1.0) * min(PLANE_SLOPE, 2 * canvas.limit_px / canvas.width)
     foot, roof = slope / rise, slope / rise * rng.uniform(1, 4)
@@ -299,7 +299,7 @@ def _draw_facade(
 
 
 def draw_film(rng: np.random.Generator, canvas: CollageCanvas) -> list[CollageLayer]:
-    """Figures in focus far before a background that is not, in a third of the scenes past something near."""
+    """Focused figures far before an unfocused background, in a third of the scenes past a near object."""
     far_px = canvas.limit_px * rng.uniform(0.02, 0.25)
     layers = [_draw_unfocused(rng, canvas, _cover_canvas(canvas), canvas.whole(), far_px)]
     for _ in range(rng.integers(1, 5)):
@@ -322,7 +322,7 @@ def _draw_unfocused(
 
 
 def _draw_figure(rng: np.random.Generator, canvas: CollageCanvas, level_px: float) -> list[CollageLayer]:
-    """A large smooth thing with few details, which lie on its surface."""
+    """Draw a large smooth object with few details on its surface."""
     place = canvas.anywhere(rng, 0.12, 0.4)
     smooth = rng.random() < 0.6
     body = draw_layer(rng, draw_shape(rng, place), place, level_px, canvas.limit_px)
@@ -341,7 +341,7 @@ def _cover_canvas(canvas: CollageCanvas) -> Patch:
     return cover_canvas(canvas.width, canvas.height)
 
 
-# The share of each kind in training.
+# Share of each kind in training.
 KINDS: dict[Kind, float] = {
     draw_mixed: 0.6,
     draw_boards: 0.2,

@@ -1,4 +1,4 @@
-"""What a collage is made of: surfaces within silhouettes, painted, in layers."""
+"""A collage's parts: layers of painted surfaces within silhouettes."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,13 @@ from stereoweave.learn.data.silhouettes import Patch
 
 @dataclass(frozen=True, kw_only=True)
 class CollageSurface:
-    """Disparity over left-image x, y: a sum of products of a function of x and one of y, within 0..limit_px.
+    """Disparity over left-image x, y: a sum of products of functions of x and of y, clamped to 0..limit_px.
 
     Attributes:
-        plane: disparity at the centre, its slopes along x and y, the centre's x and y.
-        waves: rows of amplitude_px, angular frequencies along x and y, phase.
-        hills: rows of height_px, centre x and y, inverse radii along x and y (0: a ridge, as on a cylinder).
-        limit_px: the greatest disparity of the scene.
+        plane: Disparity at the centre, its slopes along x and y, the centre's x and y.
+        waves: Rows of amplitude_px, angular frequencies along x and y, phase.
+        hills: Rows of height_px, centre x and y, inverse radii along x and y (0: a ridge, as on a cylinder).
+        limit_px: Largest disparity of the scene.
     """
 
     plane: tuple[float, float, float, float, float]
@@ -50,7 +50,7 @@ class CollageSurface:
 
 @dataclass(frozen=True, kw_only=True)
 class CollageLayer:
-    """A surface within a silhouette, painted."""
+    """A painted surface within a silhouette."""
 
     patch: Patch
     surface: CollageSurface

@@ -1,4 +1,4 @@
-"""Collages as a set on disk, in shards like a rendered one, for `stereoweave bench pairs` to read."""
+"""Collages as a set on disk, in the shards of rendered sets, for `stereoweave bench pairs`."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,12 +19,12 @@ def write_collages(out: Path, pairs: int, seed: int, size_px: tuple[int, int]) -
 
     Args:
         out: The folder, new or empty.
-        pairs: How many.
-        seed: `sources.VALIDATION_SEED` gives the pairs that a training validates on.
+        pairs: Number of pairs.
+        seed: `sources.VALIDATION_SEED` gives the validation pairs of trainings.
         size_px: Height and width.
 
     Raises:
-        StereoweaveError: A side is too small, or the folder has files in it or cannot be written.
+        StereoweaveError: A side is too small, or the folder is not empty or not writable.
     """
     if min(size_px) < SMALLEST_SIDE_PX:
         raise StereoweaveError(
@@ -35,7 +35,7 @@ def write_collages(out: Path, pairs: int, seed: int, size_px: tuple[int, int]) -
     with lock_output(out):
         if any(out.glob("[!.]*")):
             raise StereoweaveError(
-                f"{out}: expected a new or empty folder, found files in it; name another one"
+                f"{out}: expected a new or empty folder, found files in it; give another one"
             )
         for first in range(0, pairs, _PAIRS_A_SHARD):
             numbers = range(first, min(first + _PAIRS_A_SHARD, pairs))

@@ -1,7 +1,7 @@
-"""The painter's kernels: silhouettes into distance fields, layers into views, and who hides whom.
+"""Kernels that paint collages: distance fields of silhouettes, blending of layers, occlusion.
 
-A layer is drawn over left-image columns and rows, as a `Sheet`. Its surface is linear between columns,
-which makes the inversion for the right view exact.
+A layer is defined over left-image columns and rows, as a `Sheet`. Its disparity is linear between columns,
+so that warping to the right view is exact.
 """
 
 import math
@@ -12,16 +12,17 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numba import njit
 
-REACH_PX = 2.0  # beyond it a pixel is plainly inside or outside, even halfway between two columns
+REACH_PX = 2.0  # beyond it a pixel is clearly inside or outside, even halfway between two columns
 
 
 class Sheet(NamedTuple):
-    """A layer as one view sees it, from column `left` and row `top` on.
+    """A layer as seen in one view, from column `left` and row `top` on.
 
     Attributes:
-        field: float32 [h, w], the signed distance in px to the silhouette, positive inside, kept within
-            +-REACH_PX. Colour covers a pixel by field + 0.5, softly; disparity is there where it is >= 0.
-        disparity_px: float32 [h, w].
+        field: Float32 [h, w], signed distance in px to the silhouette, positive inside, clamped to
+            +-REACH_PX. Coverage of a pixel is field + 0.5, clamped to 0..1; disparity is defined where field
+            >= 0.
+        disparity_px: Float32 [h, w].
     """
 
     field: Float[np.ndarray, "h w"]
@@ -31,15 +32,15 @@ class Sheet(NamedTuple):
 
 
 class Paint(NamedTuple):
-    """What a layer looks like. All maps start from left-image x, y; all but the texture are float32.
+    """A layer's appearance. All mappings start from left-image x, y; all but the texture are float32.
 
     Attributes:
         texture: uint8 RGB, tiled by mirroring.
-        to_texture: x, y, 1 to texels.
-        to_colour: a texel's r, g, b, 1 to the layer's colour.
-        light: what the colour is multiplied with, tiled by mirroring.
-        to_light: x, y, 1 to places in the light.
-        gloss: a highlight's centre x, y, inverse radii along x, y, strength, and its shift in the right view.
+        to_texture: Mapping of x, y, 1 to texels.
+        to_colour: Mapping of a texel's r, g, b, 1 to the layer's colour.
+        light: Factor of the colour, tiled by mirroring.
+        to_light: Mapping of x, y, 1 to places in the light map.
+        gloss: A highlight's centre x, y, inverse radii along x, y, strength, and shift in the right view.
     """
 
     texture: UInt8[np.ndarray, "_ _ 3"]
@@ -77,12 +78,12 @@ def draw_stroke_field(
 def sum_surface(
     columns: Float[np.ndarray, "k w"], rows: Float[np.ndarray, "k h"], limit_px: float
 ) -> Float[np.ndarray, "h w"]:
-    """Disparity float32: the sum of products rows[k, y] * columns[k, x], kept within 0..limit_px."""
+    """Disparity float32: the sum of products rows[k, y] * columns[k, x], clamped to 0..limit_px."""
     return _sum_surface(columns, rows, limit_px)
 
 
 def warp_to_right(sheet: Sheet, width: int) -> Sheet:
-    """The left view's sheet as the right camera sees it, cut to columns 0..width-1."""
+    """Warp the left view's sheet to the right view, clipped to columns 0..width-1."""
     field, disparity_px, left = _warp_to_right(sheet.field, sheet.disparity_px, sheet.left, width)
     return Sheet(field, disparity_px, left, sheet.top)
 
@@ -99,10 +100,10 @@ def colour(
     nearest_opaque: Float[np.ndarray, "h w"],
     side: int,
 ) -> None:
-    """Blend the sheet's colours over the float32 image (0..255) wherever no opaque sheet is nearer.
+    """Blend the sheet's colours into the float32 image (0..255) where no opaque sheet is nearer.
 
-    side is 0 in the left view and 1 in the right one: column x shows column x + side * disparity_px of
-    the left image.
+    side is 0 in the left view and 1 in the right one: column x shows column x + side * disparity_px of the
+    left image.
     """
     _colour(image, sheet, paint, nearest_opaque, side)
 
@@ -110,12 +111,12 @@ def colour(
 def find_occluded(
     disparity_px: Float[np.ndarray, "h w"], other_px: Float[np.ndarray, "h w"], sign: int
 ) -> Bool[np.ndarray, "h w"]:
-    """Pixels whose match, sign * disparity away, lies outside the other view or behind what it shows there.
+    """Pixels whose match, at sign * disparity, is outside the other view or behind its surface.
 
     Args:
-        disparity_px: disparity of the view asked about, known everywhere.
-        other_px: disparity of the other view.
-        sign: -1 for the left view (matches lie to the left), +1 for the right one.
+        disparity_px: This view's disparity, known everywhere.
+        other_px: The other view's disparity.
+        sign: -1 for the left view (matches are to the left), +1 for the right one.
     """
     return _find_occluded(disparity_px, other_px, sign)
 
@@ -126,13 +127,13 @@ def expose(
     deviation: Float[np.ndarray, "3 1021"],
     noise: Float[np.ndarray, "h w 3"],
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The image (0..255) through a tone curve per channel, with noise; rounded.
+    """Apply a tone curve per channel and noise to the image (0..255), and round.
 
     Args:
         image: float32, 0..255.
-        tone: the grey level that comes out, four entries to each grey level that goes in.
-        deviation: the noise's standard deviation, likewise.
-        noise: standard normal values.
+        tone: Output grey level, with four entries per input grey level.
+        deviation: Standard deviation of the noise, in the same format.
+        noise: Standard normal values.
     """
     return _expose(image, tone, deviation, noise)
 
@@ -140,7 +141,7 @@ def expose(
 @njit(cache=True, nogil=True)
 @typing.no_type_check
 def _stroke(field, points, half_width):
-    # Boxes of pixels hop along each segment; within a box the distance to the segment is exact.
+    # A box of pixels moves along each segment; inside it the distance to the segment is exact.
     height, width = field.shape
     hop = 4.0
     reach = half_width + REACH_PX + hop / 2
@@ -224,7 +225,7 @@ def _warp_to_right(field, disparity, left, width):
             for column in range(first, min(stop, int(math.ceil(far)))):
                 t = (column - near) / (far - near)
                 field_right[y, column - start] = field[y, x] + t * (field[y, x + 1] - field[y, x])
-                # The column in the left image is exact; the disparity is what lies between the two.
+                # The column in the left image is exact; the disparity is the difference of both columns.
                 disparity_right[y, column - start] = left + x + t - column
     return field_right, disparity_right, start
 
@@ -246,7 +247,7 @@ def _cover(sheet, nearest, nearest_opaque):
 @njit(cache=True, nogil=True)
 @typing.no_type_check
 def _fold(position, last):
-    # Mirrored tiling: 0..last forth and back.
+    # Mirrored tiling: forwards and backwards over 0..last.
     position -= np.float32(2 * last) * np.floor(position * np.float32(0.5 / last))
     position = np.float32(last) - abs(position - np.float32(last))
     index = min(int(position), last - 1)
@@ -256,7 +257,7 @@ def _fold(position, last):
 @njit(cache=True, nogil=True)
 @typing.no_type_check
 def _place(mapping, x, y, map_height, map_width):
-    # Column, row, and how far on towards the next ones.
+    # Column, row, and fractions towards the next ones.
     u, across = _fold(mapping[0, 0] * x + mapping[0, 1] * y + mapping[0, 2], map_width - 1)
     v, down = _fold(mapping[1, 0] * x + mapping[1, 1] * y + mapping[1, 2], map_height - 1)
     return u, v, across, down
@@ -294,7 +295,7 @@ def _shine(gloss, x, y, side):
 @njit(cache=True, nogil=True)
 @typing.no_type_check
 def _colour(image, sheet, paint, nearest_opaque, side):
-    # Single precision throughout: double the speed.
+    # Single precision throughout: twice as fast.
     field, disparity, left, top = sheet
     texture, to_texture, mix, light, to_light, gloss = paint
     side = np.float32(side)
@@ -319,8 +320,8 @@ def _colour(image, sheet, paint, nearest_opaque, side):
 @njit(cache=True, nogil=True)
 @typing.no_type_check
 def _find_occluded(disparity, other, sign):
-    # Half a pixel of tolerance: rounding, and surfaces that all but touch. On a slope one of the two
-    # columns beside the match is never nearer than the surface itself, so that it does not hide itself.
+    # Half a pixel of tolerance for rounding and surfaces that nearly touch. On a slope, one of the two
+    # columns beside the match is never nearer than the surface itself, so that it does not occlude itself.
     height, width = disparity.shape
     occluded = np.empty((height, width), np.bool_)
     for y in range(height):

@@ -1,7 +1,7 @@
-"""Batches that other processes paint and cut beside a training, handed over in shared memory.
+"""Worker processes that paint and crop batches during training, handed over in shared memory.
 
-Each process has two places for batches and a pipe: no lock that a killed process could keep, and its end is
-noticed at once.
+Each process has two slots for batches and a pipe, and no lock that a killed process could hold. A process
+that ends is noticed at once.
 """
 
 import multiprocessing
@@ -28,18 +28,18 @@ from stereoweave.learn.data.sources import PairSource, open_sources
 from stereoweave.learn.recipe import Recipe
 from stereoweave.stereo import Sample
 
-_SLOTS = 2  # of a process: it fills one while the other waits to be taken
-# Compiling the kernels and building the textures takes a minute on a slow machine.
+_SLOTS = 2  # per process: one is filled while the other waits to be taken
+# Compiling kernels and building textures takes a minute on a slow machine.
 _PATIENCE_S = 180.0
-# Pairs that a process holds to cut them again.
+# Pairs that a process holds to crop them again.
 _HELD = 96
 _MOST_CUTS = 4.0
-# What the seed of other crops is greater by: their batches have the same numbers, and need other pairs.
+# Added to the seed for the cool-down: its batches have the same numbers but need other pairs.
 _OTHER_SEED = 1000
 
 
 class PaintJob(NamedTuple):
-    """A batch to make: where to, its number, by which of the recipes, and how often a pair is cut."""
+    """A request for a batch: its slot, its number, the recipe's index, and how often each pair is cropped."""
 
     slot: int
     number: int
@@ -48,7 +48,7 @@ class PaintJob(NamedTuple):
 
 
 class PainterShare(NamedTuple):
-    """The work of one process: the recipes, the folder of the held-out pairs, and which process it is."""
+    """One process's share: recipes, folder of the held-out pairs, index and number of processes."""
 
     recipes: tuple[Recipe, ...]
     folder: Path
@@ -57,14 +57,14 @@ class PainterShare(NamedTuple):
 
 
 class PaintedBatch(NamedTuple):
-    """A batch that is there; `problem` is the traceback where it could not be made."""
+    """A finished batch; `problem` is the traceback if it failed."""
 
     job: PaintJob
     problem: str = ""
 
 
 class TensorPlace(NamedTuple):
-    """Where a tensor is in a slot: its first byte, its shape and its type."""
+    """A tensor's place in a slot: byte offset, shape and type."""
 
     offset: int
     shape: tuple[int, ...]
@@ -72,7 +72,7 @@ class TensorPlace(NamedTuple):
 
 
 class ReusedPairs:
-    """A source whose pairs come `cuts` times on average, among others: painting takes longer than cutting."""
+    """A source that returns each pair `cuts` times on average: painting takes longer than cropping."""
 
     def __init__(self, pairs: PairSource, held: int = _HELD) -> None:
         self.pairs, self.cuts = pairs, 1.0
@@ -91,20 +91,20 @@ class ReusedPairs:
 
 
 class Painters:
-    """Processes that make the batches of a recipe; a context that ends them.
+    """Processes that make a recipe's batches; a context manager that ends them.
 
     Args:
-        recipes: Of the batches; `switch` changes between them.
-        folder: Where the held-out pairs are kept.
-        processes: How many.
-        first: Number of the first batch. Each number has pairs of its own where the recipe paints fresh ones.
-        pinned: Batches are copied to memory that a GPU reads by itself.
+        recipes: Recipes of the batches; `switch` selects one.
+        folder: Folder of the held-out pairs.
+        processes: Number of processes.
+        first: Number of the first batch. Each number has its own pairs if the recipe paints fresh ones.
+        pinned: Copy batches to pinned memory, which a GPU can read directly.
 
     Attributes:
-        cuts: How often each pair is cut from now on: 1 where painting keeps up with the training.
+        cuts: How often each new pair is cropped; 1 while painting keeps up with training.
         taken: Batches taken.
-        starved: Those of them that were not ready when they were asked for.
-        failures: Batches that could not be made, each with its traceback.
+        starved: Batches that were not ready when requested.
+        failures: Tracebacks of failed batches.
     """
 
     def __init__(
@@ -146,21 +146,21 @@ class Painters:
             process.join()
 
     def switch(self, recipe: int) -> None:
-        """Order batches of another of the recipes from now on; those under way come first."""
+        """Request batches of another recipe from now on; pending ones come first."""
         self.recipe = recipe
 
     def adapt(self, starved_share: float) -> None:
-        """Cut each pair more often where batches came late, and less often where none did."""
+        """Crop each pair more often if batches came late, less often if none did."""
         if starved_share > 0.1:
             self.cuts = min(self.cuts * 1.5, _MOST_CUTS)
         elif starved_share == 0:
             self.cuts = max(self.cuts / 1.2, 1.0)
 
     def take(self) -> dict[str, torch.Tensor]:
-        """The next batch that is ready, as `collated` gives it but with images uint8.
+        """Take the next finished batch, in the format of `collate` but with uint8 images.
 
         Raises:
-            StereoweaveError: All processes have ended, most batches fail, or none comes for minutes.
+            StereoweaveError: All processes have ended, most batches fail, or none arrives for minutes.
         """
         self._listen(0)
         self.starved += not self._ready
@@ -170,7 +170,7 @@ class Painters:
             here, done = self._ready.popleft()
             if not done.problem:
                 break
-            self._failed(here, done)
+            self._handle_failure(here, done)
         batch = {
             name: torch.empty(view.shape, dtype=view.dtype, pin_memory=self.pinned).copy_(view)
             for name, view in self._views(here, done.job).items()
@@ -179,20 +179,20 @@ class Painters:
         self.taken += 1
         return batch
 
-    def _failed(self, here: Connection, done: PaintedBatch) -> None:
+    def _handle_failure(self, here: Connection, done: PaintedBatch) -> None:
         self.failures.append(done.problem)
         if len(self.failures) > 5 + self.taken // 20:
             raise StereoweaveError(
-                f"{len(self.failures)} of {len(self.failures) + self.taken} batches could not be made; "
+                f"{len(self.failures)} of {len(self.failures) + self.taken} batches failed; "
                 f"the last: {done.problem}"
             )
         self._order(here, done.job.slot)
 
     def _listen(self, patience_s: float) -> None:
-        """Note the batches that are done; at the end of a process go on with the others."""
+        """Collect finished batches; drop processes that have ended."""
         heard = wait(list(self._memory), patience_s)
         if patience_s and not heard:
-            raise StereoweaveError(f"no batch came for {patience_s:.0f} s; try fewer processes")
+            raise StereoweaveError(f"no batch arrived for {patience_s:.0f} s; use fewer processes")
         for here in heard:
             assert isinstance(here, Connection)
             try:
@@ -204,13 +204,13 @@ class Painters:
         del self._memory[here]
         self._ready = deque(entry for entry in self._ready if entry[0] is not here)
         if not self._memory:
-            raise StereoweaveError("every process that makes batches has ended; is there memory enough?")
+            raise StereoweaveError("every process that makes batches has ended; is there enough memory?")
 
     def _order(self, here: Connection, slot: int) -> None:
         try:
             here.send(PaintJob(slot, self.number, self.recipe, self.cuts))
         except OSError:
-            return  # it has ended, which the next `_listen` finds
+            return  # the process has ended, as the next `_listen` will notice
         self.number += 1
 
     def _views(self, here: Connection, job: PaintJob) -> dict[str, torch.Tensor]:
@@ -218,7 +218,7 @@ class Painters:
 
 
 def _run_painter(pipe: Connection, memory: Any, share: PainterShare) -> None:
-    """Make the batches that are ordered, in a process of its own, until the pipe's other end is gone."""
+    """Main loop of a worker process: make requested batches until the pipe closes."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     _save_held_out(share)
@@ -232,7 +232,7 @@ def _run_painter(pipe: Connection, memory: Any, share: PainterShare) -> None:
 
 
 def _save_held_out(share: PainterShare) -> None:
-    """Make this process's part of the held-out pairs."""
+    """Paint and save this process's share of the held-out pairs."""
     held_out = open_sources(share.recipes[0], share.folder)[1]
     if isinstance(held_out, CachedPairs):
         held_out.folder.mkdir(parents=True, exist_ok=True)
@@ -255,13 +255,13 @@ def _paint_batch(job: PaintJob, batches: Batches, memory: Any) -> PaintedBatch:
         for name, view in _view_tensors(memory, job.slot, batches.recipe).items():
             values = batch[name]
             view.copy_((values * 255).round() if view.dtype == torch.uint8 else values)
-    except Exception:  # whatever one batch ends in, the others may be made
+    except Exception:  # any error of one batch must not stop the others
         return PaintedBatch(job, traceback.format_exc())
     return PaintedBatch(job)
 
 
 def _view_tensors(memory: Any, slot: int, recipe: Recipe) -> dict[str, torch.Tensor]:
-    """The tensors of a batch in a slot of the memory."""
+    """A batch's tensors as views into its slot of the shared memory."""
     layout, _ = _compute_layout(recipe)
     start = slot * (len(memory) // _SLOTS)
     return {
@@ -273,11 +273,11 @@ def _view_tensors(memory: Any, slot: int, recipe: Recipe) -> dict[str, torch.Ten
 
 
 def _compute_layout(recipe: Recipe) -> tuple[dict[str, TensorPlace], int]:
-    """Place of each tensor of a batch in a slot, and how many bytes they take."""
+    """Place of each tensor of a batch in a slot, and the slot's size in bytes."""
     height, width = recipe.crop_size
     layout, offset = dict[str, TensorPlace](), 0
     for name, channels, dtype in (
-        ("disparity_px", 1, torch.float32),  # first, so that it begins at a multiple of four bytes
+        ("disparity_px", 1, torch.float32),  # first, for an offset that is a multiple of four bytes
         ("left", 3, torch.uint8),
         ("right", 3, torch.uint8),
         ("occluded", 1, torch.bool),
@@ -290,7 +290,7 @@ def _compute_layout(recipe: Recipe) -> tuple[dict[str, TensorPlace], int]:
 
 
 def make_cool_down_recipe(recipe: Recipe, crop_size: tuple[int, int]) -> Recipe:
-    """The recipe with other crops of other pairs: margins as before, and about as many pixels a batch."""
+    """The recipe with other crops of other pairs: the same margins, and about as many pixels per batch."""
     margins = [pair - crop for pair, crop in zip(recipe.pair_size, recipe.crop_size, strict=True)]
     pair_size = (crop_size[0] + margins[0], crop_size[1] + margins[1])
     batch = max(1, round(recipe.batch * prod(recipe.crop_size) / prod(crop_size)))

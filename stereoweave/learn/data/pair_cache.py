@@ -1,4 +1,4 @@
-"""Collage pairs made once and kept on disk: a step then pays for cutting and recolouring alone."""
+"""Cache of collage pairs on disk, so that a step only crops and recolours them."""
 
 import hashlib
 import multiprocessing
@@ -16,7 +16,7 @@ from stereoweave.io.output_lock import lock_output
 from stereoweave.learn.data.collage import paint_collage as make_sample
 from stereoweave.stereo import Sample
 
-# Disparity is kept as 16-bit fixed point, KITTI's 1/256 px: half the bytes of float32, and exact enough.
+# Disparity is stored as 16-bit fixed point in KITTI's 1/256 px: half the size of float32, and precise enough.
 _DISPARITY_SCALE = 256
 # A collage has no camera.
 _MAPS = [field.name for field in fields(Sample) if field.name != "camera"]
@@ -29,31 +29,31 @@ _SOURCES = (
 
 
 class CachedPairs:
-    """The first `count` collage pairs of (seed, epoch 0), kept in a folder of their own in `folder`."""
+    """The first `count` collage pairs of (seed, epoch 0), cached in a subfolder of `folder`."""
 
     def __init__(self, folder: Path, seed: int, count: int, size: tuple[int, int]) -> None:
         self.folder = folder / f"seed{seed}-{size[0]}x{size[1]}-{generator_version()}"
         self.seed, self.count, self.size = seed, count, size
 
     def missing(self) -> list[int]:
-        """Indices of the pairs that are still to be made."""
+        """Indices of the pairs not yet made."""
         return [i for i in range(self.count) if not self._file(i).exists()]
 
     def make(self, console: Console) -> Iterable[int]:
-        """Make the missing pairs in parallel, yielding the index of each as it is done.
+        """Make the missing pairs in parallel. Yields the index of each when it is done.
 
-        Trainings in one folder share their pairs: a second one says that it waits for the first.
+        Trainings in one folder share their pairs; a second one prints that it is waiting for the first.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        note = f"{self.folder}: another training makes these pairs; waiting until it is done"
-        tell = partial(console.print, note, markup=False, highlight=False, soft_wrap=True)
-        # Started afresh, because a forked child inherits PyTorch's threads in an unknown state.
-        start_afresh = multiprocessing.get_context("spawn")
-        with lock_output(self.folder, before_waiting=tell), start_afresh.Pool(os.cpu_count()) as workers:
+        note = f"{self.folder}: another training is making these pairs; waiting for it"
+        print_note = partial(console.print, note, markup=False, highlight=False, soft_wrap=True)
+        # Spawned, because a forked child inherits PyTorch's threads in an unknown state.
+        spawn = multiprocessing.get_context("spawn")
+        with lock_output(self.folder, before_waiting=print_note), spawn.Pool(os.cpu_count()) as workers:
             yield from workers.imap_unordered(partial(_make_pair, self), self.missing(), chunksize=8)
 
     def keep(self, index: int, sample: Sample) -> None:
-        """Write a pair whole or not at all."""
+        """Write a pair atomically."""
         file = self._file(index)
         temporary = file.with_suffix(".part")
         arrays: dict[str, Any] = {name: _pack(getattr(sample, name)) for name in _MAPS}
@@ -74,7 +74,7 @@ class CachedPairs:
 
 
 def generator_version() -> str:
-    """8 hexadecimal digits that change with the code that makes pairs."""
+    """8 hexadecimal digits that change with the code that paints collages."""
     package = Path(__file__).parents[2]
     return hashlib.sha256(b"".join((package / source).read_bytes() for source in _SOURCES)).hexdigest()[:8]
 

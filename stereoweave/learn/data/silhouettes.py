@@ -1,4 +1,4 @@
-"""Silhouettes of the collage's layers: each a patch of signed distances in left-image columns and rows."""
+"""Silhouettes of a collage's layers: patches of signed distances in left-image columns and rows."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from stereoweave.learn.data.paint_kernels import REACH_PX, draw_outline_field, draw_stroke_field
 
-MARGIN_PX = 3  # around a silhouette, so that its patch ends plainly outside
+MARGIN_PX = 3  # around a silhouette, so that its patch ends clearly outside
 
 Points = Float[np.ndarray, "_ 2"]
 Strokes = tuple[tuple[Points, float], ...]
@@ -17,7 +17,7 @@ Strokes = tuple[tuple[Points, float], ...]
 
 @dataclass(frozen=True)
 class Patch:
-    """Signed distances in px to a silhouette, float32 [h, w], positive inside; left and top place it."""
+    """Signed distances in px to a silhouette, float32 [h, w], positive inside; left and top locate it."""
 
     field: Float[np.ndarray, "h w"]
     left: int
@@ -26,7 +26,7 @@ class Patch:
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a silhouette goes: its centre and half extent in px, and the canvas that it is cut to."""
+    """A silhouette's centre and half extent in px, and the canvas that it is clipped to."""
 
     x: float
     y: float
@@ -40,7 +40,7 @@ class Placement:
         return np.stack([self.x + reach * np.cos(angles), self.y + reach * np.sin(angles)], axis=1)
 
     def box(self, points: Points, margin_px: float) -> tuple[int, int, tuple[int, int]]:
-        """Left, top and shape (height, width) of what the points reach of the canvas, maybe nothing."""
+        """Left, top and shape (height, width) of the points' bounding box on the canvas; may be empty."""
         canvas = [self.width, self.height]
         low = np.clip(np.floor(points.min(axis=0) - margin_px), 0, canvas).astype(int)
         high = np.clip(np.ceil(points.max(axis=0) + margin_px) + 1, low, canvas).astype(int)
@@ -48,7 +48,7 @@ class Placement:
 
 
 def draw_shape(rng: np.random.Generator, place: Placement) -> Patch:
-    """A silhouette of a random kind."""
+    """Draw a silhouette of a random kind."""
     kinds = list(SHAPES)
     return SHAPES[kinds[rng.integers(len(kinds))]](rng, place)
 
@@ -59,13 +59,13 @@ def cover_canvas(width: int, height: int) -> Patch:
 
 
 def cover_below(line_y: float, tilt: float, width: int, height: int) -> Patch:
-    """All of the canvas below a line through the height line_y at its left edge."""
+    """The canvas below a line that starts at height line_y at the left edge."""
     distance = np.arange(height)[:, None] - (line_y + tilt * np.arange(width)[None])
     return Patch(np.clip(distance, -REACH_PX, REACH_PX).astype(np.float32), 0, 0)
 
 
 def draw_rods(rng: np.random.Generator, place: Placement) -> Patch:
-    """A bunch of rods 1 to 6 px wide: parallel bars, a star of branches, or wires that sag."""
+    """Draw a bunch of rods 1 to 6 px wide: parallel bars, a star of branches, or sagging wires."""
     kind = rng.integers(3)
     lean = rng.uniform(0, np.pi)
     strokes = []
@@ -82,18 +82,18 @@ def draw_rods(rng: np.random.Generator, place: Placement) -> Patch:
 
 
 def draw_board(rng: np.random.Generator, place: Placement) -> Patch:
-    """A rectangle seen from aside, mostly upright; its half width is the place's half extent."""
+    """Draw a rectangle in perspective, mostly upright; its half width is the half extent."""
     turn = rng.normal(0, 0.06) if rng.random() < 0.8 else rng.uniform(0, np.pi)
     half_height = rng.uniform(0.4, 1.1)
     corners = np.array([[-1, -half_height], [1, -half_height], [1, half_height], [-1, half_height]])
-    # A farther side is a shorter one.
+    # The farther side is shorter.
     corners[:, 1] *= 1 + rng.uniform(-0.15, 0.15) * corners[:, 0]
     turned = corners @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     return draw_polygon([place.x, place.y] + place.radius_px * turned, place)
 
 
 def draw_pillar(rng: np.random.Generator, place: Placement) -> Patch:
-    """A bar across the canvas, mostly upright; its half width is the place's half extent."""
+    """Draw a bar across the canvas, mostly upright; its half width is the half extent."""
     turn = np.pi / 2 + rng.normal(0, 0.05) if rng.random() < 0.8 else rng.uniform(0, np.pi)
     reach = np.hypot(place.width, place.height) + place.radius_px
     along = reach * np.array([np.cos(turn), np.sin(turn)])
@@ -103,18 +103,18 @@ def draw_pillar(rng: np.random.Generator, place: Placement) -> Patch:
 
 
 def draw_post(place: Placement, half_width_px: float, foot_y: float) -> Patch:
-    """An upright stroke from the top of the place down to foot_y."""
+    """Draw an upright stroke from the placement's top down to foot_y."""
     points = np.array([[place.x, place.y - place.radius_px], [place.x, foot_y]])
     return _fill_strokes(((points, half_width_px),), place)
 
 
 def draw_polygon(corners: Points, place: Placement) -> Patch:
-    """The inside of a polygon, cut to the canvas of the place."""
+    """Fill a polygon, clipped to the placement's canvas."""
     return _fill_outline(place, corners)
 
 
 def soften(patch: Patch) -> Patch:
-    """The patch with edges 4 px wide, as out of focus; what is plainly inside stays opaque."""
+    """Soften the patch's edges to 4 px, as out of focus; its interior stays opaque."""
     return Patch(patch.field * np.float32(0.5 / REACH_PX), patch.left, patch.top)
 
 
@@ -167,7 +167,7 @@ def _draw_blob(rng: np.random.Generator, place: Placement) -> Patch:
 
 def _draw_rectangle(rng: np.random.Generator, place: Placement) -> Patch:
     angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
-    # A superellipse: the larger the power, the sharper the corners.
+    # A superellipse: larger powers give sharper corners.
     power, slim = np.exp(rng.uniform(np.log(4), np.log(40))), rng.uniform(0.25, 1)
     cosine, sine = np.cos(angles), np.sin(angles)
     radii = 0.8 / (np.abs(cosine) ** power + np.abs(sine / slim) ** power) ** (1 / power)
@@ -186,7 +186,7 @@ def _draw_foliage(rng: np.random.Generator, place: Placement) -> Patch:
     noise = _enlarge(coarse, width, height) + 0.4 * _enlarge(fine, width, height)
     y, x = np.ogrid[top : top + height, left : left + width]
     fall = np.hypot(x - place.x, y - place.y) / place.radius_px
-    # The noise changes by about one within a leaf, so times the leaf's size it is nearly a distance.
+    # The noise changes by about 1 across a leaf; times the leaf's size it approximates a distance.
     field = (noise + 2.5 * (rng.uniform(0.5, 0.8) - fall)) * (0.7 * leaf_px)
     inside = np.minimum(field, (1 - fall) * place.radius_px - 1)
     return Patch(np.clip(inside, -REACH_PX, REACH_PX).astype(np.float32), left, top)
@@ -197,7 +197,7 @@ def _enlarge(noise: Float[np.ndarray, "_ _"], width: int, height: int) -> Float[
 
 
 def _draw_marks(rng: np.random.Generator, place: Placement) -> Patch:
-    """A line of strokes that looks like lettering."""
+    """Draw a line of strokes like lettering."""
     count = int(rng.integers(2, 9))
     size = 2 * place.radius_px / count
     half_width_px = float(max(0.6, size * rng.uniform(0.05, 0.12)))

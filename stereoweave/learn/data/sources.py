@@ -1,4 +1,4 @@
-"""Where a recipe's pairs come from: collages, rendered sets mixed in, or a dataset's frames on disk."""
+"""Sources of a recipe's pairs: collages, rendered sets mixed in, or a dataset on disk."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,13 +17,13 @@ from stereoweave.learn.recipe import COLLAGE, Recipe
 from stereoweave.stereo import Sample
 from stereoweave.system.progress import progress
 
-# Validation pairs come from this seed; a recipe's own is small.
+# Seed of validation pairs; recipes' own seeds are small.
 VALIDATION_SEED = 1_000_003
 
 
 @runtime_checkable
 class PairSource(Protocol):
-    """Samples by their index."""
+    """Samples by index."""
 
     @property
     def count(self) -> int: ...
@@ -31,22 +31,22 @@ class PairSource(Protocol):
     def __getitem__(self, index: int) -> Sample: ...
 
     def name(self, index: int) -> str:
-        """What an error calls the sample."""
+        """Name of the sample in error messages."""
         ...
 
 
 @runtime_checkable
 class OrderedSource(Protocol):
-    """A source that is read faster in some orders than in others."""
+    """A source that is faster to read in some orders."""
 
     def order(self, rng: np.random.Generator) -> Int[np.ndarray, " n"] | range:
-        """All of its indices, in an order to read them in."""
+        """All indices, in an order that is fast to read."""
         ...
 
 
 @dataclass(frozen=True)
 class MixedSource:
-    """Sets one behind another as one source, and the weights by which training draws from them."""
+    """Sets concatenated as one source, and the weights by which training draws from them."""
 
     sets: tuple[PairSource, ...]
     weights: tuple[float, ...]
@@ -64,11 +64,11 @@ class MixedSource:
         return source.name(own)
 
     def first_index(self, which: int) -> int:
-        """The index of the first pair of a set."""
+        """Index of the first pair of a set."""
         return sum(one.count for one in self.sets[:which])
 
     def draw_sets(self, places: int, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
-        """The set of each place, by weight; fewer places from the same numbers are the first of more."""
+        """Draw a set for each place by weight; with the same random numbers, a prefix of a longer draw."""
         bounds = np.cumsum(self.weights) / np.sum(self.weights)
         return np.searchsorted(bounds[:-1], rng.random(places), side="right")
 
@@ -82,7 +82,7 @@ class MixedSource:
 
 @dataclass(frozen=True)
 class FreshCollages:
-    """Collages of the training's kinds, painted when they are drawn; none is kept."""
+    """Training collages painted on demand, never cached."""
 
     seed: int
     size: tuple[int, int]
@@ -95,13 +95,13 @@ class FreshCollages:
         return f"collage {index} of seed {self.seed}"
 
     def order(self, rng: np.random.Generator) -> range:
-        """In turn: each is as random as the next."""
+        """Sequential: all collages are equally random."""
         return range(self.count)
 
 
 @dataclass(frozen=True)
 class PhotographedSet:
-    """A rendered set, whose views are ideal, as two real cameras would give it; each pair always alike."""
+    """A rendered set with simulated camera imperfections, the same for every read of a pair."""
 
     shards: Shards
 
@@ -111,7 +111,7 @@ class PhotographedSet:
 
     def __getitem__(self, index: int) -> Sample:
         sample = self.shards[index]
-        # As collages are: without noise, blur and other tones in one of the views, matching is too easy.
+        # As for collages: without noise, blur and tone differences, matching is too easy.
         left, right = collage.photograph(
             np.random.default_rng(index), sample.left.astype(np.float32), sample.right.astype(np.float32)
         )
@@ -126,7 +126,7 @@ class PhotographedSet:
 
 @dataclass(frozen=True)
 class DatasetFrames:
-    """Frames of a dataset on disk, read when they are asked for."""
+    """Frames of a dataset on disk, read on demand."""
 
     frames: list[Frame]
 
@@ -142,9 +142,9 @@ class DatasetFrames:
 
 
 def open_sources(recipe: Recipe, folder: Path, whole: bool = False) -> tuple[PairSource, PairSource]:
-    """What a recipe trains on, and what it is scored on; collages are kept in folders below `folder`.
+    """Open a recipe's training and held-out pairs; collages are cached in folders below `folder`.
 
-    Of the held-out frames of a dataset `validation_pairs` are taken, evenly spread, or all if `whole`.
+    Of a dataset's held-out frames, `validation_pairs` evenly spread ones are used, or all if `whole`.
     """
     if recipe.dataset == COLLAGE:
         collages = _open_collages(recipe, folder)
@@ -181,7 +181,7 @@ def _mix_sets(recipe: Recipe, collages: PairSource) -> MixedSource:
 
 
 def open_held_out_sets(recipe: Recipe) -> dict[str, PairSource]:
-    """The further sets that a recipe is scored on, by name; FormatError where one is not there."""
+    """Open a recipe's further validation sets by name. Raises FormatError if one is missing."""
     sets: dict[str, PairSource] = {}
     for name, folder in recipe.held_out:
         found = tuple(
@@ -192,18 +192,18 @@ def open_held_out_sets(recipe: Recipe) -> dict[str, PairSource]:
 
 
 def _find_set_folders(recipe: Recipe, key: str, folder: Path) -> list[Path]:
-    """The folder of a rendered set, or those in it; FormatError for none."""
+    """The folder itself if it is a rendered set, else the sets in it. FormatError if there are none."""
     folders = [path for path in (folder, *sorted(folder.glob("*/"))) if list_shards(path)]
     if not folders:
         raise FormatError(
             f"{recipe.name}: {key}: {folder}: expected pairs of `stereoweave synth make`, or folders of "
-            "such, found none; make them first"
+            "them, found none; make them first"
         )
     return folders
 
 
 def _open_rendered_sets(recipe: Recipe, folder: Path) -> list[PairSource]:
-    """The set in a folder, or those in the folders in it; FormatError for none, or one too small to cut."""
+    """Open the set in a folder, or all sets in it. FormatError if there are none or one is too small."""
     folders = _find_set_folders(recipe, "mix", folder)
     sets: list[PairSource] = [PhotographedSet(Shards(path)) for path in folders]
     for path, one in zip(folders, sets, strict=True):
@@ -211,13 +211,13 @@ def _open_rendered_sets(recipe: Recipe, folder: Path) -> list[PairSource]:
         if recipe.crop_size[0] > rows or recipe.crop_size[1] > columns:
             raise FormatError(
                 f"{recipe.name}: crop_size = {list(recipe.crop_size)}, expected at most {[rows, columns]}, "
-                f"the size of the pairs in {path}; cut less"
+                f"the size of the pairs in {path}; use a smaller crop"
             )
     return sets
 
 
 def cache_pairs(pairs: PairSource, console: Console) -> PairSource:
-    """The pairs; collages are made before if they were not there."""
+    """Make the missing collages of a source and return the source."""
     if isinstance(pairs, MixedSource):
         for one in pairs.sets:
             cache_pairs(one, console)

@@ -1,6 +1,6 @@
-"""The bank of textures that the collage paints its layers with: procedures of our own, and photographs.
+"""Textures of the collages: procedural ones, and crops of photographs.
 
-The photographs are those that scikit-image carries in its wheel; docs/training-data.md has their licences.
+The photographs are included in scikit-image's wheel; docs/training-data.md lists their licences.
 """
 
 import functools
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-SIDE = 384  # texels; at 0.35 to 1 texel a pixel it spans the width of a training picture
+SIDE = 384  # texels; at 0.35 to 1 texel per pixel it spans the width of a training picture
 BANK_SEED = 20_240_607
 PHOTOGRAPH_CROPS = 110
 NATURAL_TEXTURES = PHOTOGRAPH_CROPS + 90
@@ -23,8 +23,8 @@ Pattern = Float[np.ndarray, "side side"]
 Photograph = UInt8[np.ndarray, "_ _ 3"]
 Procedure = Callable[[np.random.Generator], Picture]
 
-# Motorcycle is a test pair, lfw_subset shows people who were not asked, moon and page come without a
-# licence: none of them is here. The weights favour things and places over scans and microscopy.
+# Excluded: Motorcycle (a test pair), lfw_subset (people who were not asked), moon and page (no licence).
+# The weights favour objects and places over scans and microscopy.
 PHOTOGRAPHS = {
     "astronaut": 3,
     "brick": 2,
@@ -46,38 +46,38 @@ PHOTOGRAPHS = {
 
 @functools.cache
 def make_natural(k: int) -> Texture:
-    """Texture number k of 0..NATURAL_TEXTURES - 1, the same in every process; made when first needed."""
+    """Texture k of 0..NATURAL_TEXTURES - 1, the same in every process; made on first use."""
     return crop_photograph(k) if k < PHOTOGRAPH_CROPS else make_procedural(NATURAL, k - PHOTOGRAPH_CROPS)
 
 
 @functools.cache
 def make_periodic(k: int) -> Texture:
-    """Likewise one of a pattern that repeats, of 0..PERIODIC_TEXTURES - 1."""
+    """Periodic texture k of 0..PERIODIC_TEXTURES - 1, the same in every process; made on first use."""
     return make_procedural(PERIODIC, k)
 
 
 def crop_photograph(k: int) -> Texture:
-    """Crop number k: a part of a photograph turned, mirrored, zoomed and recoloured."""
+    """Crop k: part of a photograph, turned, mirrored, scaled and recoloured."""
     rng = np.random.default_rng((BANK_SEED, 1, k))
     weights = np.array(list(PHOTOGRAPHS.values()), float)
     photograph = _load_photograph(str(rng.choice(list(PHOTOGRAPHS), p=weights / weights.sum())))
     crop = _crop_turned(rng, photograph)
-    # A grey photograph gets a tint of its own, a coloured one is shifted a little.
+    # A grey photograph gets a tint; the colours of others shift slightly.
     grey = np.ptp(crop, axis=2).max() < 3
     return _recolour(rng, crop.astype(np.float32), tint=0.16 if grey else 0.08)
 
 
 def make_procedural(kinds: dict[str, Procedure], k: int) -> Texture:
-    """Texture number k of these kinds, which take turns."""
+    """Texture k of these kinds, which alternate."""
     rng = np.random.default_rng((BANK_SEED, 2, k))
     image = kinds[list(kinds)[k % len(kinds)]](rng)
-    # Nothing in a photograph is smooth at the scale of a pixel.
+    # Photographs have detail at the scale of a pixel.
     detail = rng.uniform(1, 8) * draw_power_noise(rng, rng.uniform(0.3, 0.9))
     return np.clip(image + detail[..., None], 0, 255).astype(np.uint8)
 
 
 def draw_power_noise(rng: np.random.Generator, exponent: float, side: int = SIDE) -> Pattern:
-    """Noise whose amplitude falls as frequency**-exponent (1 in photographs); mean 0, deviation 1."""
+    """Draw noise whose amplitude falls as frequency**-exponent (1 in photographs); mean 0, deviation 1."""
     frequency = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None])
     frequency[0, 0] = 1
     spectrum = np.fft.rfft2(rng.standard_normal((side, side))) * frequency**-exponent
@@ -87,7 +87,7 @@ def draw_power_noise(rng: np.random.Generator, exponent: float, side: int = SIDE
 
 
 def draw_natural_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
-    """A colour as surfaces have them, RGB 0..255: mostly muted, of any hue, seldom black or white."""
+    """Draw a colour typical of surfaces, RGB 0..255: mostly muted, of any hue, rarely black or white."""
     hue, saturation, value = rng.random() * 360, rng.beta(1.2, 3.6), 0.1 + 0.85 * rng.beta(2.0, 1.7)
     hsv = np.array([[[hue, saturation, value]]], np.float32)
     return cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0, 0] * 255
@@ -95,7 +95,7 @@ def draw_natural_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
 
 @functools.cache
 def make_light_map(k: int) -> Float[np.ndarray, "64 64"]:
-    """Light map number k, float32 [64, 64] about 1: smooth, and half of them with a soft-edged shadow."""
+    """Light map k, float32 [64, 64] around 1: smooth, half of them with a soft-edged shadow."""
     rng = np.random.default_rng((BANK_SEED, 3, k))
     light = 1 + rng.uniform(0.05, 0.2) * draw_power_noise(rng, 2.5, 64)
     if rng.random() < 0.5:
@@ -116,7 +116,7 @@ def _load_photograph(name: str) -> Photograph:
 
 def _crop_turned(rng: np.random.Generator, photograph: Photograph) -> Texture:
     height, width = photograph.shape[:2]
-    # Most of the picture, and hardly enlarged where it is large enough: blur is no texture.
+    # Most of the picture, with little upsampling: blur is not a texture.
     span = max(min(height, width) * rng.uniform(0.7, 1.0), 0.8 * SIDE)
     angle = rng.uniform(0, 360) if rng.random() < 0.4 else rng.integers(4) * 90 + rng.normal(0, 4)
     shrunk = min(1.0, 1.4 * SIDE / span)  # area-averaged first, so that the turn does not alias
@@ -137,9 +137,9 @@ def _recolour(rng: np.random.Generator, image: Float[np.ndarray, "_ _ 3"], tint:
 
 
 def _colour_pattern(rng: np.random.Generator, pattern: Pattern) -> Picture:
-    """A pattern of 0..1 as a blend of two colours, grained by noise as real surfaces are."""
+    """Blend two colours by a pattern in 0..1, with noise as on real surfaces."""
     low, high = draw_natural_colour(rng), draw_natural_colour(rng)
-    # Two colours of equal brightness are rare in nature and invisible to a grey matcher.
+    # Colours of equal brightness are rare in nature and invisible to a grey matcher.
     if abs(low.mean() - high.mean()) < 30:
         low, high = low * 0.5, high * 0.7 + 70
     grain = rng.uniform(0.02, 0.12) * draw_power_noise(rng, rng.uniform(0.7, 1.4))
@@ -156,7 +156,7 @@ def _sand(rng: np.random.Generator) -> Picture:
 
 def _make_coloured_noise(rng: np.random.Generator, exponent: float) -> Picture:
     bright, warm, green = (draw_power_noise(rng, exponent) for _ in range(3))
-    # Photographs vary in brightness far more than in blue-yellow, and there more than in green-magenta.
+    # Photographs vary most in brightness, less in blue-yellow, least in green-magenta.
     axes = np.array([[1, 1, 1], [1, 0, -1], [0.5, -1, 0.5]])
     strength = rng.uniform(15, 55) * np.array([1, rng.uniform(0.05, 0.35), rng.uniform(0.03, 0.2)])
     waves = np.stack([bright, warm, green], axis=-1) @ (strength[:, None] * axes).astype(np.float32)
@@ -169,8 +169,8 @@ def _marble(rng: np.random.Generator) -> Picture:
 
 
 def _dead_leaves(rng: np.random.Generator) -> Picture:
-    """Leaves of all sizes over each other, an old model of what natural images are."""
-    # Numbers fall as the cube of the size, so that each size covers as much as the next.
+    """Dead leaves: overlapping shapes of all sizes, a classic model of natural images."""
+    # Counts fall as the cube of the size, so that every size covers the same area.
     inverse_squares = rng.uniform(1 / rng.uniform(30, 120) ** 2, 1 / rng.uniform(2, 5) ** 2, 1500)
     return _strew(rng, inverse_squares**-0.5, slim=rng.uniform(0.25, 0.9))
 
@@ -193,12 +193,12 @@ def _strew(rng: np.random.Generator, radii: Float[np.ndarray, " n"], slim: float
 
 
 def _soften(image: Picture) -> Picture:
-    # What OpenCV draws without antialiasing is sharper than any lens.
+    # Shapes drawn by OpenCV without antialiasing are sharper than any lens.
     return cv2.GaussianBlur(image, (0, 0), 0.6)
 
 
 def _grain(rng: np.random.Generator) -> Picture:
-    """Wood: rings around a far axis, warped, with fibres along them."""
+    """Wood: warped rings around a distant axis, with fibres along them."""
     x, y = _make_turned_grid(rng)
     warp = draw_power_noise(rng, 2.0) * rng.uniform(3, 12)
     rings = np.hypot(x * rng.uniform(0.02, 0.2), y + warp - rng.uniform(-300, 300)) / rng.uniform(6, 30)
@@ -208,7 +208,7 @@ def _grain(rng: np.random.Generator) -> Picture:
 
 
 def _writing(rng: np.random.Generator) -> Picture:
-    """Rows of marks that look like a script."""
+    """Rows of marks like a script."""
     page = np.zeros((SIDE, SIDE), np.uint8)
     size = rng.uniform(6, 30)
     y = size
@@ -274,7 +274,7 @@ def _bricks(rng: np.random.Generator) -> Picture:
     row = np.floor(y / course)
     shifted = x + length * (0.5 * (row % 2) if rng.random() < 0.7 else 0)
     nearest = np.minimum(_distance_to_joint(shifted, length), _distance_to_joint(y, course))
-    tone = rng.normal(0.75, rng.uniform(0.02, 0.2), (97, 89))  # each brick its own
+    tone = rng.normal(0.75, rng.uniform(0.02, 0.2), (97, 89))  # one tone per brick
     bricks = tone[row.astype(int) % 97, np.floor(shifted / length).astype(int) % 89]
     return _colour_pattern(rng, (np.clip(nearest - joint + 0.5, 0, 1) * bricks).astype(np.float32))
 

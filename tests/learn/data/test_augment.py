@@ -177,7 +177,7 @@ def test_cuts_lie_in_different_places_and_the_whole_is_one_of_them(sample):
 @pytest.mark.parametrize("size", [(HEIGHT + 1, 50), (30, WIDTH + 1)])
 def test_a_cut_larger_than_the_sample_is_refused(sample, size):
     assert complaint(crop, sample, *size, np.random.default_rng(0)) == (
-        f"crop_size = {list(size)}: expected at most the pictures' [96, 144]; cut less"
+        f"crop_size = {list(size)}: expected at most the pictures' [96, 144]; use a smaller crop"
     )
 
 

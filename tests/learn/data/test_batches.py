@@ -148,7 +148,7 @@ def test_a_batch_in_which_one_sample_has_no_camera_has_none():
 def test_a_batch_of_mixed_sizes_is_refused():
     mixed = [box_before_a_wall(np.random.default_rng(0), size) for size in ((64, 96), (32, 48), (64, 96))]
     assert complaint(collate, mixed) == (
-        "a batch: expected pairs of one size, found 48x32 and 96x64; cut them to one crop_size"
+        "a batch: expected pairs of one size, found 48x32 and 96x64; crop them to one crop_size"
     )
 
 
@@ -173,7 +173,7 @@ def test_one_known_pixel_is_enough():
 def test_a_crop_larger_than_the_pictures_is_refused(pairs):
     batches = Batches(replace(RECIPE, augment=False, crop_size=(64, 112)), pairs)
     assert complaint(batches.__getitem__, 0) == (
-        "crop_size = [64, 112]: expected at most the pictures' [64, 96]; cut less"
+        "crop_size = [64, 112]: expected at most the pictures' [64, 96]; use a smaller crop"
     )
 
 

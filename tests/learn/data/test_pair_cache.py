@@ -68,7 +68,7 @@ def test_pairs_that_another_training_makes_are_waited_for_and_not_made_again(tmp
         other.enter_context(lock_output(folder))
         made = list(CachedPairs(tmp_path, 3, 3, PAIR_SIZE).make(Console(file=screen, width=1000)))
     assert made == [2]
-    assert screen.getvalue() == f"{folder}: another training makes these pairs; waiting until it is done\n"
+    assert screen.getvalue() == f"{folder}: another training is making these pairs; waiting for it\n"
 
 
 def test_what_is_missing_or_half_written_is_made_as_the_generator_makes_it(tmp_path):

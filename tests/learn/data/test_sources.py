@@ -172,7 +172,7 @@ def test_a_mix_without_collages_makes_none_to_train_on(rendered, tmp_path):
 
 def test_a_set_of_a_mix_that_is_not_there_is_named(rendered, tmp_path):
     assert complaint(open_sources, mixed(rendered, caves=1.0), tmp_path) == (
-        f"tiny: mix: {rendered}/caves: expected pairs of `stereoweave synth make`, or folders of such, found "
+        f"tiny: mix: {rendered}/caves: expected pairs of `stereoweave synth make`, or folders of them, found "
         "none; make them first"
     )
 
@@ -181,7 +181,7 @@ def test_a_set_that_is_smaller_than_the_crop_is_named(rendered, tmp_path):
     recipe = replace(mixed(rendered, scenes=1.0), pair_size=(80, 96), crop_size=(80, 96))
     assert complaint(open_sources, recipe, tmp_path) == (
         f"tiny: crop_size = [80, 96], expected at most [64, 96], the size of the pairs in {rendered}/scenes/"
-        "crane; cut less"
+        "crane; use a smaller crop"
     )
 
 
