@@ -1,7 +1,6 @@
-"""Train a network by the clock on a lent GPU; recipes/gpu/README.md has the commands.
+"""Train a network for a fixed time on a GPU; recipes/gpu/README.md has the commands.
 
-Nothing but the standard library is imported before the machine is checked, and nothing at all again in the
-processes that paint.
+Only the standard library is imported until the machine is checked. Painting processes import nothing again.
 """
 
 import argparse
@@ -14,11 +13,11 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 BEGAN_S = time.monotonic()
-# At once, so that a command that is killed has said what it did.
+# Flushed, so that a killed command leaves its output.
 say = partial(print, flush=True)
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-# Module, the names it is installed under, and the oldest version that was read or tried.
+# Module, the names it is installed under, and the oldest supported version.
 NEEDS = (
     ("numpy", ("numpy",), (2, 0)),
     ("cv2", ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless"), (4, 11)),
@@ -52,32 +51,38 @@ def main() -> int:
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
     parser.add_argument("recipe", type=Path)
-    parser.add_argument("--out", type=Path, required=True, help="folder of the files to bring back")
-    parser.add_argument("--earlier", type=Path, help="folder with the files of an earlier command")
-    parser.add_argument("--minutes", type=float, default=8.7, help="of this command")
-    parser.add_argument("--total-minutes", type=float, default=26.0, help="of all commands")
-    parser.add_argument("--processes", type=int, help="that paint; default 14, or what the machine has")
-    parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
-    parser.add_argument("--batch", type=int, help="pairs a step, in place of the recipe's")
+    parser.add_argument("--out", type=Path, required=True, help="output folder, to copy back")
+    parser.add_argument("--earlier", type=Path, help="folder with an earlier command's files")
+    parser.add_argument("--minutes", type=float, default=8.7, help="time limit of this command")
+    parser.add_argument("--total-minutes", type=float, default=26.0, help="time limit of all commands")
     parser.add_argument(
-        "--cool-down-crop", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="while the rate falls"
+        "--processes", type=int, help="painting processes; default: 14, fewer on small machines"
     )
-    parser.add_argument("--commit", default="", help="of the code, where the machine has no git")
+    parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
+    parser.add_argument("--batch", type=int, help="pairs per step; default: the recipe's")
+    parser.add_argument(
+        "--cool-down-crop",
+        type=int,
+        nargs=2,
+        metavar=("HEIGHT", "WIDTH"),
+        help="crop size during the cool-down",
+    )
+    parser.add_argument("--commit", default="", help="commit of the code, for a machine without git")
     return parser.parse_args()
 
 
 def _problem(need: tuple[str, tuple[str, ...], tuple[int, int]]) -> str:
-    """Import a library; what is wrong with it, in one line, or ''."""
+    """Import a library. Returns what is wrong with it in one line, or ''."""
     module, names, least = need
     wanted = f"{names[0]} {least[0]}.{least[1]} or later"
     try:
         importlib.import_module(module)
-    except Exception as error:  # a broken installation ends in any error whatever
-        return f"{module}: expected {wanted}, found {type(error).__name__}: {error}; bring its wheel along"
+    except Exception as error:  # a broken installation may raise any type of error
+        return f"{module}: expected {wanted}, found {type(error).__name__}: {error}; install its wheel"
     found = next((have for name in names if (have := _version(name))), "")
     say(f"{module} {found or 'of unknown version'}")
     if found and tuple(int(part) for part in found.split(".")[:2]) < least:
-        return f"{module}: expected {wanted}, found {found}; bring its wheel along"
+        return f"{module}: expected {wanted}, found {found}; install its wheel"
     return ""
 
 
@@ -104,7 +109,7 @@ def _train(options: argparse.Namespace) -> None:
     if options.device == "cuda":
         if not torch.cuda.is_available():
             raise StereoweaveError(
-                "--device cuda: expected a GPU, found none; --device cpu rehearses on the CPU"
+                "--device cuda: expected a GPU, found none; use --device cpu for a rehearsal on the CPU"
             )
         torch.backends.cudnn.benchmark = True
         properties = torch.cuda.get_device_properties(0)
@@ -120,11 +125,11 @@ def _train(options: argparse.Namespace) -> None:
         cool_down_crop=options.cool_down_crop and tuple(options.cool_down_crop),
         commit=options.commit,
     )
-    say(f"{command.processes} processes paint; {time.monotonic() - BEGAN_S:.0f} s used so far")
+    say(f"{command.processes} painting processes; {time.monotonic() - BEGAN_S:.0f} s used so far")
     try:
         train_by_clock(recipe, command, say)
     except torch.cuda.OutOfMemoryError as error:
-        raise StereoweaveError(f"--batch {recipe.batch}: {error}; give a smaller one") from error
+        raise StereoweaveError(f"--batch {recipe.batch}: {error}; use a smaller batch") from error
     if options.device == "cuda":
         say(f"at most {torch.cuda.max_memory_allocated() / 2**30:.1f} GiB of GPU memory used")
 

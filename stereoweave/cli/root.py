@@ -71,16 +71,16 @@ app.command("app")(page)
 
 @app.command()
 def train(
-    recipe: Annotated[Path, typer.Argument(help="A TOML file, such as recipes/weave_small.toml.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The folder of the run.")],
+    recipe: Annotated[Path, typer.Argument(help="Recipe in TOML, such as recipes/weave_small.toml.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the run.")],
 ) -> None:
-    """Train the network of a recipe; a run that was stopped continues where it was."""
+    """Train the network of a recipe, or resume an interrupted run."""
     from stereoweave.learn.distributed import report_once
 
     with report_once(), needing_the_train_extra():
         from stereoweave.learn.recipe import read_recipe
 
-        read_recipe(recipe)  # what is wrong with it is said before PyTorch takes seconds to load
+        read_recipe(recipe)  # reports errors before PyTorch, which takes seconds to load
     with needing_the_train_extra():
         from stereoweave.learn.training.loop import train as train_recipe
     train_recipe(recipe, out)
@@ -90,42 +90,40 @@ def train(
 def export(  # noqa: PLR0913 - each is a word of the command line
     source: Annotated[
         str,
-        typer.Argument(
-            help="The folder of a run, a checkpoint in it, or a matcher: a shipped name, an .onnx file."
-        ),
+        typer.Argument(help="Run folder, checkpoint, shipped model or .onnx matcher file."),
     ],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="The .onnx file to write, in float32.")
-    ] = None,
-    half: Annotated[
-        Path | None, typer.Option(help="An .onnx file to write that computes in 16 bits.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Output .onnx file in float32.")] = None,
+    half: Annotated[Path | None, typer.Option(help="Output .onnx file in 16 bits.")] = None,
     eight_bits: Annotated[
-        Path | None, typer.Option(help="An .onnx file to write whose convolutions compute in 8 bits.")
+        Path | None, typer.Option(help="Output .onnx file with 8-bit convolutions.")
     ] = None,
     weights: Annotated[
         Path | None,
         typer.Option(
-            help="A .pt file to write: a run's averaged weights in 16 bits, for recipes to start from."
+            help="Output .pt file: a run's averaged weights in 16 bits, for start_from of a recipe."
         ),
     ] = None,
     size: Annotated[
         str | None,
         typer.Option(
-            metavar="WxH", help="What is written takes one pair of this size alone, as TensorRT wants it."
+            metavar="WxH",
+            help="Make files for single pairs of this size, as TensorRT needs them; default: any size.",
         ),
     ] = None,
     scenes: Annotated[
-        Path | None, typer.Option(help="Pairs on which both must agree too; a folder as for bench pairs.")
+        Path | None,
+        typer.Option(
+            help="Further pairs on which ONNX Runtime and PyTorch must agree: a folder as for bench pairs."
+        ),
     ] = None,
     reliability: Annotated[
-        Path | None, typer.Option(help="A picture to write: how often the confidence comes true.")
+        Path | None, typer.Option(help="Output picture: plot of the confidence's reliability.")
     ] = None,
 ) -> None:
-    """Turn a trained network into files that --model takes, and prove that they agree with it.
+    """Export a trained network as matcher files for --model, and check that they agree with it.
 
-    A matcher file is made of a trained network, and variants are made of either: in 16 bits, in 8, for one
-    size. Each is compared with what it is made from, and refused if it differs by too much.
+    Variants in 16 bits, in 8 bits or for one size are made from a trained network or from a matcher file.
+    Each is compared with its source, and rejected if it differs too much.
     """
     from stereoweave.data.readers import read_scenes
 

@@ -101,7 +101,7 @@ def measure_parity(checkpoints: Sequence[Path]) -> list[ParityRow]:
 def format_markdown(rows: Sequence[ParityRow]) -> str:
     """Format the rows as a Markdown table."""
     what = ["network", "variant", "provider"]
-    numbers = ["file, MB", "left, px", "right, px", "confidence", "time, of float32's"]
+    numbers = ["file, MB", "left, px", "right, px", "confidence", "time / float32"]
     lines = [what + numbers, ["---"] * 3 + ["---:"] * 5]
     lines += [
         [

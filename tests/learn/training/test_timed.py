@@ -344,6 +344,6 @@ def test_a_library_that_is_missing_is_named_before_anything_else(tmp_path):
     )
     assert found.returncode == 2
     assert found.stderr == (
-        "numba: expected numba 0.61 or later, found ImportError: not for this NumPy; bring its wheel along\n"
+        "numba: expected numba 0.61 or later, found ImportError: not for this NumPy; install its wheel\n"
     )
     assert not (tmp_path / "out").exists()
