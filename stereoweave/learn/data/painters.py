@@ -38,7 +38,7 @@ _MOST_CUTS = 4.0
 _OTHER_SEED = 1000
 
 
-class PaintJob(NamedTuple):
+class BatchRequest(NamedTuple):
     """A request for a batch: its slot, its number, the recipe's index, and how often each pair is cropped."""
 
     slot: int
@@ -59,7 +59,7 @@ class PainterShare(NamedTuple):
 class PaintedBatch(NamedTuple):
     """A finished batch; `problem` is the traceback if it failed."""
 
-    job: PaintJob
+    request: BatchRequest
     problem: str = ""
 
 
@@ -173,9 +173,9 @@ class Painters:
             self._handle_failure(here, done)
         batch = {
             name: torch.empty(view.shape, dtype=view.dtype, pin_memory=self.pinned).copy_(view)
-            for name, view in self._views(here, done.job).items()
+            for name, view in self._views(here, done.request).items()
         }
-        self._order(here, done.job.slot)
+        self._order(here, done.request.slot)
         self.taken += 1
         return batch
 
@@ -186,7 +186,7 @@ class Painters:
                 f"{len(self.failures)} of {len(self.failures) + self.taken} batches failed; "
                 f"the last: {done.problem}"
             )
-        self._order(here, done.job.slot)
+        self._order(here, done.request.slot)
 
     def _listen(self, patience_s: float) -> None:
         """Collect finished batches; drop processes that have ended."""
@@ -208,13 +208,13 @@ class Painters:
 
     def _order(self, here: Connection, slot: int) -> None:
         try:
-            here.send(PaintJob(slot, self.number, self.recipe, self.cuts))
+            here.send(BatchRequest(slot, self.number, self.recipe, self.cuts))
         except OSError:
             return  # the process has ended, as the next `_listen` will notice
         self.number += 1
 
-    def _views(self, here: Connection, job: PaintJob) -> dict[str, torch.Tensor]:
-        return _view_tensors(self._memory[here], job.slot, self.recipes[job.recipe])
+    def _views(self, here: Connection, request: BatchRequest) -> dict[str, torch.Tensor]:
+        return _view_tensors(self._memory[here], request.slot, self.recipes[request.recipe])
 
 
 def _run_painter(pipe: Connection, memory: Any, share: PainterShare) -> None:
@@ -225,8 +225,8 @@ def _run_painter(pipe: Connection, memory: Any, share: PainterShare) -> None:
     batches = [_make_batches(recipe, share.folder) for recipe in share.recipes]
     while True:
         try:
-            job: PaintJob = pipe.recv()
-            pipe.send(_paint_batch(job, batches[job.recipe], memory))
+            request: BatchRequest = pipe.recv()
+            pipe.send(_paint_batch(request, batches[request.recipe], memory))
         except (EOFError, OSError):
             return
 
@@ -246,18 +246,18 @@ def _make_batches(recipe: Recipe, folder: Path) -> Batches:
     return batches
 
 
-def _paint_batch(job: PaintJob, batches: Batches, memory: Any) -> PaintedBatch:
+def _paint_batch(request: BatchRequest, batches: Batches, memory: Any) -> PaintedBatch:
     """Make a batch in its slot."""
     assert isinstance(batches.pairs, ReusedPairs)
-    batches.pairs.cuts = job.cuts
+    batches.pairs.cuts = request.cuts
     try:
-        batch = batches[job.number]
-        for name, view in _view_tensors(memory, job.slot, batches.recipe).items():
+        batch = batches[request.number]
+        for name, view in _view_tensors(memory, request.slot, batches.recipe).items():
             values = batch[name]
             view.copy_((values * 255).round() if view.dtype == torch.uint8 else values)
     except Exception:  # any error of one batch must not stop the others
-        return PaintedBatch(job, traceback.format_exc())
-    return PaintedBatch(job)
+        return PaintedBatch(request, traceback.format_exc())
+    return PaintedBatch(request)
 
 
 def _view_tensors(memory: Any, slot: int, recipe: Recipe) -> dict[str, torch.Tensor]:
