@@ -1,1 +1,1 @@
-"""Networks and their training; the only part that needs PyTorch."""
+"""Networks and their training; the only package that needs PyTorch."""

@@ -1,1 +1,1 @@
-"""What a training sees: painted and rendered pairs, batches."""
+"""Training data: collages, rendered pairs, datasets, batches."""

@@ -32,7 +32,7 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
             [
                 sample
                 for part in self.parts
-                for sample in self._cut(chosen[part * size : (part + 1) * size], self.key(step, part))
+                for sample in self._crop(chosen[part * size : (part + 1) * size], self.key(step, part))
             ]
         )
 
@@ -63,7 +63,7 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
             places_of_set = np.flatnonzero(self._drawn == which)
             self._turns[places_of_set] = np.arange(len(places_of_set))
 
-    def _cut(self, indices: list[int], key: tuple[int, ...]) -> list[Sample]:
+    def _crop(self, indices: list[int], key: tuple[int, ...]) -> list[Sample]:
         rng, size = np.random.default_rng(key), self.recipe.crop_size
         samples = (read_known(self.pairs, index) for index in indices)
         if self.recipe.augment:

@@ -20,7 +20,7 @@ from stereoweave.stereo import Sample
 CLEAN_SHARE = 0.25  # pairs without any photometric difference
 FAULTY_SHARE = 0.03  # pairs with the faults of bad cameras
 NOISE_SHARE = 0.02  # training pairs of plain noise
-CUT_APART_SHARE = 0.04  # training pairs with partly negative disparities
+SHIFTED_APART_SHARE = 0.04  # training pairs with partly negative disparities
 NOTHING_PX = -1000.0  # disparity of pixels without any match; below 0 however the views are shifted
 LEVELS = np.arange(1021, dtype=np.float32) / 4  # grey levels that a tone curve distinguishes
 
@@ -57,7 +57,7 @@ def paint_training_collage(seed: int, epoch: int, index: int, height: int = 256,
     kind = rng.random()
     if kind < NOISE_SHARE:
         return _paint_plain_noise(rng, height, width)
-    if kind < NOISE_SHARE + CUT_APART_SHARE:
+    if kind < NOISE_SHARE + SHIFTED_APART_SHARE:
         views = _paint_matchable(rng, draw_training_scene, height, width + width // 4)
         return _photograph_views(rng, *_crop_apart(rng, *views, width))
     return _photograph_views(rng, *_paint_matchable(rng, draw_training_scene, height, width))
@@ -197,12 +197,12 @@ def _add_faults(rng: np.random.Generator, left: View, right: View) -> tuple[View
 
 
 def _misalign_rows(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
-    """Cameras one or two rows apart in height."""
+    """Shift the cameras one or two rows apart in height."""
     return left, _shift_down(right, rng.choice([-1, 1]) * rng.uniform(0.8, 2))
 
 
 def _blur_one(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
-    """One lens out of focus."""
+    """Defocus one lens."""
     deviation_px, which = rng.uniform(0.7, 1.6), rng.integers(2)
     if which:
         return left, cv2.GaussianBlur(right, (0, 0), deviation_px)
@@ -210,13 +210,13 @@ def _blur_one(rng: np.random.Generator, left: View, right: View) -> tuple[View, 
 
 
 def _darken_corners(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
-    """Different vignetting in each lens."""
+    """Apply different vignetting to each lens."""
     own, other = (_make_vignette(left.shape[0], left.shape[1], rng.uniform(0.2, 0.7)) for _ in range(2))
     return left * own, right * other
 
 
 def _interpolate_colours(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
-    """Bayer interpolation in one or both cameras."""
+    """Apply Bayer interpolation to one or both cameras."""
     which = rng.integers(3)
     return left if which == 1 else demosaic(left), right if which == 2 else demosaic(right)
 

@@ -96,7 +96,7 @@ def _draw(rng: np.random.Generator, kind: Kind, height: int, width: int, limit_p
 
 
 def draw_mixed(rng: np.random.Generator, canvas: CollageCanvas) -> list[CollageLayer]:
-    """One or two backgrounds, objects, and in half of the scenes bunches of rods."""
+    """Draw one or two backgrounds, objects, and in half of the scenes bunches of rods."""
     far_px = rng.uniform(0, 1) if rng.random() < 0.1 else canvas.limit_px * rng.uniform(0.08, 0.5)
     layers = _draw_backgrounds(rng, canvas, far_px)
     bunches = int(rng.integers(1, 5)) if rng.random() < 0.5 else 0
@@ -139,7 +139,7 @@ def _draw_floor(
 
 
 def draw_boards(rng: np.random.Generator, canvas: CollageCanvas) -> list[CollageLayer]:
-    """Near textureless boards, walls and tables larger than a crop, with objects before and behind them."""
+    """Draw near textureless planes larger than a crop, with objects before and behind them."""
     far_px = canvas.limit_px * rng.uniform(0.05, 0.4)
     layers = _draw_backgrounds(rng, canvas, far_px)
     for _ in range(rng.integers(2, 9)):
@@ -198,7 +198,7 @@ def _draw_objects_before(
 
 
 def draw_street(rng: np.random.Generator, canvas: CollageCanvas) -> list[CollageLayer]:
-    """A ground plane from the horizon to the camera, upright objects on it, and a sky."""
+    """Draw a ground plane from the horizon to the camera, upright objects on it, and a sky."""
     horizon = rng.uniform(0.3, 0.6) * canvas.height
     rise = rng.uniform(0.5, 1.0) * canvas.limit_px / (canvas.height - horizon)
     middle_x = rng.uniform(0.25, 0.6) * canvas.width
@@ -299,7 +299,7 @@ def _draw_facade(
 
 
 def draw_film(rng: np.random.Generator, canvas: CollageCanvas) -> list[CollageLayer]:
-    """Focused figures far before an unfocused background, in a third of the scenes past a near object."""
+    """Draw focused figures far before an unfocused background, in a third of scenes past a near object."""
     far_px = canvas.limit_px * rng.uniform(0.02, 0.25)
     layers = [_draw_unfocused(rng, canvas, _cover_canvas(canvas), canvas.whole(), far_px)]
     for _ in range(rng.integers(1, 5)):

@@ -106,7 +106,7 @@ def load_keras(path: str | Path) -> DenseMapNet:
                 )
             values.copy_(torch.from_numpy(theirs))
     if found:
-        raise FormatError(f"{path}: expected DenseMapNet's weights alone, found {min(found)} beside them")
+        raise FormatError(f"{path}: expected only DenseMapNet's weights, found also {min(found)}")
     return network.eval()
 
 

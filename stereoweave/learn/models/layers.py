@@ -218,7 +218,7 @@ def correlate_warped(
 def sample_at_match(
     other: Float[Tensor, "b 1 h w"], disparity: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b 1 h w"]:
-    """The other view's map at column x - disparity, between two columns interpolated; outside, its border."""
+    """The other view's map at column x - disparity, linearly interpolated; the border is replicated."""
     width = other.shape[3]
     columns = torch.arange(width, dtype=torch.float32, device=other.device) - disparity.detach()
     columns = columns.clamp(0, width - 1)

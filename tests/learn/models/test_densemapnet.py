@@ -150,7 +150,7 @@ def test_a_file_of_another_network_is_refused_with_what_is_wrong(tmp_path, rng):
             arrays | {"batch_normalization_3/beta": np.zeros(48, np.float32)},
             r"batch_normalization_3/beta:0 of shape \(64,\), found \(48,\)",
         ),
-        (arrays | {"dense_1/kernel": np.zeros((2, 2))}, "found dense_1/dense_1/kernel:0 beside"),
+        (arrays | {"dense_1/kernel": np.zeros((2, 2))}, "found also dense_1/dense_1/kernel:0"),
         ({}, "found no conv2d_1/conv2d_1/kernel:0"),
     ):
         write_keras(path, changed)
