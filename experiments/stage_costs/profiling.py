@@ -135,7 +135,7 @@ def format_table(rows: Sequence[StageCost]) -> str:
 
 
 def trace(network: WeaveNet) -> onnx.ModelProto:
-    """Graph of the network as in `export.export_fixed_graph`, with the exporter's notes on each node's module."""
+    """Graph of the network as `export_fixed_graph` makes it, with the module of each node noted."""
     return export_annotated_graph(network, HEIGHT_PX, WIDTH_PX, None)
 
 
