@@ -1,6 +1,6 @@
 """Arguments of the Python interface that are of a wrong kind: each is one line of a StereoweaveError.
 
-NumPy is imported inside the functions: `--help` counts threads, and is not to wait for it.
+NumPy is imported inside the functions: the command line's help counts threads, and must not wait for it.
 """
 
 import reprlib

@@ -173,7 +173,8 @@ class Screen(ThreadingHTTPServer):
             super().__init__((_ADDRESS, port), _Handler)
         except OSError as error:
             raise StereoweaveError(
-                f"--port: expected a port that is free, found {port} ({error.strerror}); 0 takes any that is"
+                f"expected a free port, found {port} ({error.strerror}); use 0 for any free port",
+                setting="port",
             ) from error
         self.url = f"http://{_ADDRESS}:{self.server_port}/"
         self._jpeg, self._number, self._closed = b"", 0, False

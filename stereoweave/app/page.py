@@ -35,7 +35,7 @@ from stereoweave.app.session import (
     write_cloud,
     zipped,
 )
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Note, StereoweaveError, worded
 from stereoweave.io.colormap import OCCLUDED_RGB, colour_confidence, css_colour, legend_colours
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.providers import CPU
@@ -60,14 +60,6 @@ side by side, one above the other, MPO or JPS.</li>
 <li>Press <b>Find depth</b>. Pictures straight from two cameras need their rows brought to match first.</li>
 <li>Move between the cameras, turn the point cloud, measure, and take the files with you.</li>
 </ol></div>"""
-_NAMES = {
-    "--rectify": "“Bring the rows to match”",
-    "--focal-px": "the focal length",
-    "--baseline-m": "how far apart the cameras are",
-    "--calib": "a calibration file",
-    "name its --format": "choose “How one file holds both”",
-    "--format": "“How one file holds both”",
-}
 _TO_MEASURE = "Click two points of the photograph: here stands how far each is, and how far apart they are."
 _WITHOUT_WEBGL = """const canvas = document.createElement("canvas");
 if (!canvas.getContext("webgl2") && !canvas.getContext("webgl")) element.innerHTML =
@@ -233,15 +225,25 @@ class Page:
             return self._shown(matched(uploads, folder, partial(_tell, progress)), given[self._position])
         except (StereoweaveError, OSError) as error:
             return {
-                self._status: _told([self._on_the_page(str(error))], problem=True),
+                self._status: _told([self._shown_line(worded(error, self._label_of))], problem=True),
                 self._results: gr.update(visible=False),
                 self._kept: None,
             }
 
-    def _on_the_page(self, line: str) -> str:
-        """A line with the page's names for what the command line calls otherwise, and without our folders."""
-        for option, name in _NAMES.items():
-            line = line.replace(option, name)
+    def _label_of(self, setting: str) -> str | None:
+        """The page's label of a setting; None if the page does not have it."""
+        components = {
+            "arrangement": self._arrangement,
+            "baseline_m": self._baseline_mm,
+            "calibration": self._calibration,
+            "focal_px": self._focal_px,
+            "model": self._model,
+            "rectify": self._rectify,
+        }
+        return f"“{components[setting].label}”" if setting in components else None
+
+    def _shown_line(self, line: str) -> str:
+        """A message in one line, without this machine's folders."""
         return re.sub(rf"{re.escape(str(self._folder))}/\w+/", "", " ".join(line.splitlines()))
 
     def _written(self, kept: Kept | None, progress: Any = gr.Progress()) -> dict[Any, Any]:  # noqa: B008
@@ -253,15 +255,16 @@ class Page:
             files, notes = write_all(kept)
             packed = zipped(kept.folder / "stereoweave.zip", files)
         except (StereoweaveError, OSError) as error:
-            return {self._status: _told([self._on_the_page(str(error))], problem=True)}
+            return {self._status: _told([self._shown_line(worded(error, self._label_of))], problem=True)}
         return {
             self._status: self._summary(kept, notes),
             self._files: [str(file) for file in files],
             self._all: gr.update(value=packed and str(packed), visible=packed is not None),
         }
 
-    def _summary(self, kept: Kept, notes: Sequence[str] = ()) -> str:
-        return _told([numbers(kept.result.summary), *map(self._on_the_page, (*kept.result.notes, *notes))])
+    def _summary(self, kept: Kept, notes: Sequence[Note] = ()) -> str:
+        lines = [self._shown_line(note.worded(self._label_of)) for note in (*kept.result.notes, *notes)]
+        return _told([numbers(kept.result.summary), *lines])
 
     def _uploads(self, given: dict[Any, Any]) -> Uploads:
         arrangement, calibration = given[self._arrangement], given[self._calibration]

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Note, StereoweaveError
 from stereoweave.io.colormap import colour_disparity, colour_range_px
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.options import MatchOptions
@@ -75,8 +75,8 @@ def matched(uploads: Uploads, folder: Path, tell: Callable[[float, str], None]) 
     return Kept(result=result, renderer=renderer, folder=folder)
 
 
-def write_all(kept: Kept) -> tuple[list[Path], list[str]]:
-    """The result's files in all formats, and lines about those that could not be, and what is amiss."""
+def write_all(kept: Kept) -> tuple[list[Path], list[Note]]:
+    """The result's files in all formats, and notes on those that could not be written and on defects."""
     result = kept.result
     names = [name for name in FILES if result.pair.camera or not needs_camera(name)]
     notes = write_files(kept.folder, names, result) + result.warnings()

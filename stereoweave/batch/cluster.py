@@ -66,7 +66,7 @@ def run_cluster(
 ) -> ClusterTally:
     """Makes the results of every pair and film in the source that are not there yet, and a row for each.
 
-    Of a pair it makes what `depth` makes of many, of a film depth.mkv, as `video --depth16` does; each in
+    Of a pair it makes what `depth` makes of many, of a film depth.mkv, its disparity in 16-bit grey; each in
     destination/name. On a cluster both places have to be seen by all machines, under the same names.
 
     Args:

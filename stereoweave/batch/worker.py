@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from stereoweave.batch.manifest import Planned, read_chunk, read_rows, write_rows
-from stereoweave.errors import OutputInUseError, ProviderError, StereoweaveError
+from stereoweave.errors import OutputInUseError, ProviderError, StereoweaveError, worded
 from stereoweave.io.files import SMALLEST_SIDE_PX, is_leftover
 from stereoweave.io.stores import Store
 from stereoweave.matching.matcher import Matcher
@@ -164,8 +164,8 @@ class Worker:
                 if any(isinstance(cause, ProviderError) for cause in _causes(error)):
                     _check_runs(matcher)
                 kind = "" if isinstance(error, StereoweaveError) else f"{type(error).__name__}: "
-                told = f"{kind}{error}".replace(f"{name}/pictures", self.source.place)
-                row["error"] = " ".join(told.split())
+                line = kind + worded(error, job.name_of).replace(f"{name}/pictures", self.source.place)
+                row["error"] = " ".join(line.split())
         return row | {"seconds": round(time.perf_counter() - start_s, 3)}
 
     def _empty_row(self, planned: Planned) -> ManifestRow:
@@ -197,7 +197,7 @@ class Worker:
             "confident_percent": summary.confident_percent,
             "width_px": summary.width_px,
             "height_px": summary.height_px,
-            "checks": notes,
+            "checks": [note.worded(job.name_of) for note in notes],
             "files": _names(out),
         }
 
@@ -212,7 +212,7 @@ class Worker:
             from stereoweave.video.writer import parts_folder
 
         films, _ = self._fetched(planned, scratch / "pictures")
-        film_job = VideoJob(depth16=True, backend=job.backend)
+        film_job = VideoJob(depth16=True, backend=job.backend, name_of=job.name_of)
         footage = open_footage(films, job.request.arrangement)
         with self._results(planned, scratch) as out:
             make = partial(make_film, footage, films, out / FILM, film_job, Console(quiet=True))

@@ -59,7 +59,7 @@ def list_view_scenes(folder: str | Path) -> list[Callable[[], ViewScene]]:
     have disparity.png (16 bit, pixels * 256, 0 = unknown) or disparity.pfm (NaN or infinity = unknown), the
     same as right_disparity, and scene.json, whose "offset_px" {position: [right, down]} says how far a
     photograph lies beside its nominal place. Where there is no such folder, the pairs of all rendered sets
-    (`stereoweave synth make --view`) in `folder` and below it are the scenes.
+    with further views (`stereoweave synth make`) in `folder` and below it are the scenes.
 
     Raises:
         StereoweaveError: No scene in the folder.
@@ -74,7 +74,7 @@ def list_view_scenes(folder: str | Path) -> list[Callable[[], ViewScene]]:
     if not sets:
         raise StereoweaveError(
             f"{root}: expected <scene>/left.png below it, or rendered sets, found neither; "
-            "stereoweave synth make --view 0.5 renders one"
+            "render a set with further views: stereoweave synth make"
         )
     return [partial(_rendered_scene, pairs, index, root) for pairs in sets for index in range(pairs.count)]
 
@@ -86,7 +86,7 @@ def _rendered_scene(pairs: Shards, index: int, root: Path) -> ViewScene:
     if not views:
         raise FormatError(
             f"{folder}: expected pairs with further views, found {name} without; "
-            "stereoweave synth make --view 0.5 renders them"
+            "render a set with further views: stereoweave synth make"
         )
     return ViewScene(name=name, sample=pairs[index], views=views)
 

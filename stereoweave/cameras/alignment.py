@@ -1,4 +1,4 @@
-"""How well two photographs are a rectified stereo pair: what is amiss with them, and what mends it."""
+"""Whether two photographs are a rectified stereo pair: their defects, and the remedies."""
 
 import math
 from dataclasses import dataclass
@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from stereoweave.cameras.disparity_sign import depth_order, surely_negative
 from stereoweave.cameras.feature_matches import Matches, sparse_matches
+from stereoweave.errors import Note, Remedy
 
 Defect = Literal[
     "too_few_matches",
@@ -21,6 +22,9 @@ Defect = Literal[
     "negative_disparity",
 ]
 DEFECTS: tuple[Defect, ...] = get_args(Defect)
+
+SWAPPED = Note("left and right are swapped", Remedy("give them the other way round"))
+_RECTIFY = Remedy("rectify the pair", ("rectify",))
 
 # So far a vertical error is harmless; in pictures of more pixels it grows with their side.
 _TOLERATED_PX = 0.75
@@ -58,7 +62,7 @@ class Alignment:
         rotation_degrees: How far the right photograph is turned clockwise.
         range_px: The least and the greatest disparity, without the outermost 1 %.
         exposure_ratio: How many times as much light the right photograph got; NaN where it cannot be told.
-        defects: Names of what is amiss, of `DEFECTS`; empty for a sound pair.
+        defects: Names in `DEFECTS`; empty for a sound pair.
     """
 
     matches: int
@@ -70,10 +74,10 @@ class Alignment:
     exposure_ratio: float
     defects: tuple[Defect, ...]
 
-    def lines(self) -> list[str]:
-        """All that was found, a line each, with what to do about what is amiss."""
+    def lines(self) -> list[Note]:
+        """All findings, with the remedies of the defects."""
         if "too_few_matches" in self.defects:
-            return [self._told("too_few_matches")]
+            return [self._note("too_few_matches")]
         least_px, greatest_px = self.range_px
         light = f"the right picture got {self.exposure_ratio:.2f} times the left one's light"
         if math.isnan(self.exposure_ratio):
@@ -84,54 +88,54 @@ class Alignment:
             f"disparities: {least_px:.0f} to {greatest_px:.0f} px",
             f"exposure: {light}",
         ]
-        told = [self._told(defect) for defect in self.defects]
-        return found + (told or ["nothing is amiss: a rectified pair, left and right in their places"])
+        defects = [self._note(defect) for defect in self.defects]
+        sound = Note("no defects: a rectified pair, left and right in their places")
+        return [*map(Note, found), *(defects or [sound])]
 
-    def warnings(self) -> list[str]:
-        """The lines for what makes depth wrong or worse; disparities of any sign are matched as they are."""
-        return [self._told(defect) for defect in self.defects if defect != "negative_disparity"]
+    def warnings(self) -> list[Note]:
+        """The notes on defects that make depth wrong or worse; disparities of either sign are matched."""
+        return [self._note(defect) for defect in self.defects if defect != "negative_disparity"]
 
-    def _told(self, defect: Defect) -> str:
+    def _note(self, defect: Defect) -> Note:
         match defect:
             case "too_few_matches":
-                return (
-                    f"expected two pictures of one scene, found {self.matches} places that both show: they "
+                return Note(
+                    f"expected two pictures of one scene, found {self.matches} points that both show: they "
                     "are too plain, too different, or too far apart"
                 )
             case "swapped":
-                return "left and right are swapped: give them the other way round"
+                return SWAPPED
             case "vertical_shift":
                 lower = "lower" if self.vertical_shift_px > 0 else "higher"
-                return (
-                    f"the right picture lies {abs(self.vertical_shift_px):.1f} px {lower}: --rectify mends it"
-                )
+                return Note(f"the right picture lies {abs(self.vertical_shift_px):.1f} px {lower}", _RECTIFY)
             case "rotation":
                 way = "clockwise" if self.rotation_degrees > 0 else "anticlockwise"
-                return (
-                    f"the right picture is turned {abs(self.rotation_degrees):.1f} degrees {way}: "
-                    "--rectify mends it"
+                return Note(
+                    f"the right picture is turned {abs(self.rotation_degrees):.1f} degrees {way}", _RECTIFY
                 )
             case "not_rectified":
-                return (
-                    f"the rows do not match, 95 % only to {self.vertical_error_95_px:.1f} px, and by another "
-                    "amount here than there: --rectify mends it"
+                return Note(
+                    f"the rows do not match, 95 % only to {self.vertical_error_95_px:.1f} px, and the error "
+                    "varies over the picture",
+                    _RECTIFY,
                 )
             case "exposure":
                 ratio = max(self.exposure_ratio, 1 / self.exposure_ratio)
                 which = "right" if self.exposure_ratio > 1 else "left"
-                return (
-                    f"the {which} picture got {ratio:.1f} times the other's light: lock the exposure of both "
-                    "cameras; depth is less certain where one is too dark or too bright"
+                return Note(
+                    f"the {which} picture got {ratio:.1f} times the other's light: depth is less certain "
+                    "where one is too dark or too bright",
+                    Remedy("lock the exposure of both cameras"),
                 )
             case "negative_disparity":
-                return (
+                return Note(
                     f"disparities go down to {self.range_px[0]:.0f} px, as in 3-D films: "
                     "they are matched as they are, but metres from focal length and baseline need doffs"
                 )
 
 
 def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]) -> Alignment:
-    """What is amiss with a pair, rectified or not; it takes 0.1 to 0.2 s at 640x480."""
+    """Defects of a pair, rectified or not; takes 0.1 to 0.2 s at 640x480."""
     matches = sparse_matches(left, right)
     scale = max(1.0, (left.shape[0] * left.shape[1] / _PIXELS_OF_TOLERANCE) ** 0.5)
     count = len(matches.left_px)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from stereoweave.cameras.rig import Optics, Rig, Size, side_by_side, size_of
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.io.files import read_small, reading, replacing
 from stereoweave.io.structured_text import BASE64, parse_entries
 from stereoweave.stereo import StereoPair
@@ -137,8 +137,10 @@ def _opencv(entries: Mapping[str, Any]) -> Rig:
     unit, notes = _unit(translation, plain.get("translationunit"))
     if model is None and left.distortion.size == 4:
         notes += (
-            "the calibration does not say its lenses: taken for pinhole ones, k1 k2 p1 p2; an entry "
-            "distortion_model: fisheye says otherwise",
+            Note(
+                "the calibration does not state its lens model: taken for pinhole with k1 k2 p1 p2",
+                Remedy("add the entry distortion_model: fisheye if that is wrong"),
+            ),
         )
     return Rig(
         left=left,
@@ -210,17 +212,17 @@ def _known_model(named: object) -> str:
     )
 
 
-def _unit(translation: Float[np.ndarray, "3"], stated: object) -> tuple[str, tuple[str, ...]]:
-    """The translation's unit of length, and a line that says so where it is a guess."""
+def _unit(translation: Float[np.ndarray, "3"], stated: object) -> tuple[str, tuple[Note, ...]]:
+    """The translation's unit of length, and a note if it is a guess."""
     if stated is not None:
         if str(stated) not in _METRES:
             raise ValueError(f"translation_unit {reprlib.repr(stated)}, not one of {', '.join(_METRES)}")
         return str(stated), ()
     length = float(np.linalg.norm(translation))
     unit, word = ("mm", "millimetres") if length > _MM_ABOVE else ("m", "metres")
-    note = (
-        f"the calibration does not say its unit of length: its baseline of {length:g} was taken for {word}; "
-        "an entry translation_unit: m, cm or mm says otherwise"
+    note = Note(
+        f"the calibration does not state its unit of length: its baseline of {length:g} was taken for {word}",
+        Remedy("add the entry translation_unit: m, cm or mm if that is wrong"),
     )
     return unit, (note,)
 
@@ -283,7 +285,7 @@ def _kitti(text: str, size_px: Size | None) -> Rig:
         if re.match(r"[PKDRTS]_?(rect_)?\d", key.strip())
     }
     first, second = (2, 3) if {"P3", "P_rect_03", "K_03"} & rows.keys() else (0, 1)
-    notes = (f"of KITTI's cameras, {first} is taken for the left one and {second} for the right one",)
+    notes = (Note(f"of KITTI's cameras, {first} is taken for the left one and {second} for the right one"),)
     raw_px = _kitti_size(rows, f"S_{first:02}")
     keys = (f"P_rect_{first:02}", f"P_rect_{second:02}")
     if keys[0] not in rows:

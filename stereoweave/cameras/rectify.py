@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from stereoweave.cameras.rig import Optics, Rig, size_of
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Note, StereoweaveError
 from stereoweave.stereo import StereoCamera, StereoPair
 
 # A picture is looked at in this many cells along its longer side when the largest rectangle is sought, and
@@ -24,11 +24,11 @@ class Rectified:
 
     Attributes:
         pair: Its masks are False where a picture shows nothing, its camera is there where it is known.
-        notes: What was done, a line each.
+        notes: What was done.
     """
 
     pair: StereoPair
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
 
 
 def rectify(pair: StereoPair, rig: Rig) -> Rectified:
@@ -45,7 +45,7 @@ def rectify(pair: StereoPair, rig: Rig) -> Rectified:
     rig.check_size(pair)
     _check_side_by_side(rig)
     if rig.unlike_rectified() is None:
-        note = f"{rig.name} is for rectified pictures: they are taken as they are"
+        note = Note(f"{rig.name} is for rectified pictures: they are taken as they are")
         return Rectified(pair=replace(pair, camera=rig.camera()), notes=(*rig.notes, note))
     # What cannot be computed is refused where it is not finite.
     with np.errstate(all="ignore"):
@@ -54,7 +54,7 @@ def rectify(pair: StereoPair, rig: Rig) -> Rectified:
     left, left_seen = _turned(pair.left, rig.left, turns[0], camera)
     right, right_seen = _turned(pair.right, rig.right, turns[1], camera)
     rectified = StereoPair(left=left, right=right, camera=camera, left_seen=left_seen, right_seen=right_seen)
-    return Rectified(pair=rectified, notes=(*rig.notes, _what_was_done(rig, turns, rectified)))
+    return Rectified(pair=rectified, notes=(*rig.notes, _summary(rig, turns, rectified)))
 
 
 def cropped(pair: StereoPair) -> StereoPair:
@@ -193,11 +193,11 @@ def _coefficients(optics: Optics) -> Float[np.ndarray, " n"]:
     return optics.distortion if optics.distortion.size else np.zeros(4)
 
 
-def _what_was_done(rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], pair: StereoPair) -> str:
+def _summary(rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], pair: StereoPair) -> Note:
     left, right = (np.degrees(np.linalg.norm(cv2.Rodrigues(turn)[0])) for turn in turns)
     assert pair.left_seen is not None and pair.right_seen is not None
     seen_percent = 100 * (pair.left_seen & pair.right_seen).mean()
-    return (
+    return Note(
         f"rectified by {rig.name}: the left picture turned by {left:.2f} degrees, the right one by "
         f"{right:.2f}; both fill {seen_percent:.0f} % of the pixels"
     )

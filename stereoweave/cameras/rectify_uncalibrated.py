@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from stereoweave.cameras.feature_matches import Matches, sparse_matches
 from stereoweave.cameras.rectify import Rectified
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.stereo import StereoPair
 
 _LEAST_MATCHES = 40
@@ -59,7 +59,7 @@ def rectify_by_features(pair: StereoPair) -> Rectified:
     left, left_seen = _warped(pair.left, turns.left, pair.left_seen)
     right, right_seen = _warped(pair.right, turns.right, pair.right_seen)
     before_px = np.abs(matches.lower_px)
-    note = (
+    note = Note(
         f"rectified by {len(missed_px)} matches: their rows are {np.median(missed_px):.2f} px apart in the "
         f"median, before {np.median(before_px):.2f} px; the right one was moved {moved_px:+.0f} px sideways"
     )
@@ -80,9 +80,11 @@ def _right_ones(found: Matches) -> Matches:
             right_ones = right_ones if mask is None else mask.ravel() > 0
     if right_ones.sum() < max(_LEAST_MATCHES, _LEAST_RIGHT_SHARE * count):
         raise StereoweaveError(
-            f"--rectify: expected at least {_LEAST_MATCHES} places that both pictures show from two sides, "
+            f"expected at least {_LEAST_MATCHES} points that both pictures show from two positions, "
             f"found {right_ones.sum()} of {count} matches that agree; take pictures with more texture and "
-            "more overlap, or give a calibration"
+            "more overlap",
+            setting="rectify",
+            remedy=Remedy("or give a calibration", ("calibration",)),
         )
     return Matches(found.left_px[right_ones], found.right_px[right_ones])
 
@@ -143,9 +145,10 @@ def _check(parameters: Float[np.ndarray, " 6"], residual_px: float, width: int, 
     most_px = _MOST_RESIDUAL_PX * max(1.0, (width * height / _PIXELS_OF_RESIDUAL) ** 0.5)
     if residual_px > most_px or largest_degrees > _MOST_TURN_DEGREES:
         raise StereoweaveError(
-            f"--rectify: expected cameras side by side, turned by under {_MOST_TURN_DEGREES:.0f} degrees, "
-            f"found rows {residual_px:.1f} px apart after a turn of {largest_degrees:.0f} degrees; did the "
-            "camera move forward, or only turn? Take the pictures from two places side by side"
+            f"expected cameras side by side, turned by under {_MOST_TURN_DEGREES:.0f} degrees, found rows "
+            f"{residual_px:.1f} px apart after a turn of {largest_degrees:.0f} degrees; take the pictures "
+            "from two positions side by side, without moving forward",
+            setting="rectify",
         )
 
 

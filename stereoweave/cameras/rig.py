@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.errors import FormatError, Note, StereoweaveError
 from stereoweave.stereo import CAMERA_NUMBERS_BELOW, StereoCamera, StereoPair
 
 # How many coefficients OpenCV's models have; 0 is a lens without distortion.
@@ -66,7 +66,7 @@ class Rig:
             side by side translation_m[0] is minus the baseline.
         size_px: Width and height of the pictures that it is for; None where the file does not say.
         name: What errors call it, such as its file.
-        notes: What the file leaves open and how it was taken, a line each.
+        notes: What the file does not state, and what was assumed.
     """
 
     left: Optics
@@ -75,7 +75,7 @@ class Rig:
     translation_m: Float[np.ndarray, "3"]
     size_px: Size | None = None
     name: str = "the calibration"
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
 
     def __post_init__(self) -> None:
         off = np.abs(self.rotation @ self.rotation.T - np.eye(3)).max()

@@ -16,6 +16,7 @@ from stereoweave.cli.options import (
     Raw,
     Rectify,
     Refined,
+    option_name,
     range_of,
     request_of,
 )
@@ -80,6 +81,7 @@ def batch(  # noqa: PLR0913 - each is a word of the command line
         backend=Backend(model=model, provider=provider),
         options=MatchOptions(range_px=range_of(range_px), refined=refined, raw=raw),
         files=tuple(write or ()),
+        name_of=option_name,
     )
     engine = Engine(address, workers, cpus_each, gpus_each)
     raise typer.Exit(batch_on_cluster(source, destination, job, engine, as_json=as_json))

@@ -21,6 +21,7 @@ from stereoweave.cli.options import (
     Rectify,
     Refined,
     Threads,
+    option_name,
     pixel_of,
     range_of,
     request_of,
@@ -92,6 +93,7 @@ def depth(  # noqa: PLR0913 - each is a word of the command line
         backend=Backend(model=model, threads=threads, provider=provider),
         options=MatchOptions(range_px=range_of(range_px), refined=refined, raw=raw),
         files=tuple(write or ()),
+        name_of=option_name,
     )
     pictures = pictures or []
     if found := find_pairs(pictures, left, right, listed):
@@ -99,7 +101,7 @@ def depth(  # noqa: PLR0913 - each is a word of the command line
 
         raise typer.Exit(depth_of_many(found, out, job, processes=jobs, as_json=as_json))
     summary, notes = make_depth(pictures, out, job)
-    (_tell_json if as_json else _tell)(summary, notes, out)
+    (_tell_json if as_json else _tell)(summary, [note.worded(option_name) for note in notes], out)
 
 
 def measure(  # noqa: PLR0913 - each is a word of the command line
@@ -139,12 +141,11 @@ def measure(  # noqa: PLR0913 - each is a word of the command line
     estimate = match(matcher, prepared.pair, options)
     error = CameraError(focal=focal_error_percent / 100, baseline=baseline_error_percent / 100)
     found = distance(estimate, camera, *places, camera_error=error)
+    notes = [note.worded(option_name) for note in prepared.notes]
     if as_json:
-        typer.echo(json.dumps(asdict(found) | {"notes": prepared.notes}, indent=2, allow_nan=False))
-        return
-    typer.echo(str(found))
-    for note in prepared.notes:
-        typer.echo(note)
+        typer.echo(json.dumps(asdict(found) | {"notes": notes}, indent=2, allow_nan=False))
+    else:
+        typer.echo("\n".join([str(found), *notes]))
 
 
 def _tell_json(summary: "Summary", notes: list[str], out: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from stereoweave.cli.options import Model, Provider, Threads
+from stereoweave.cli.options import Model, Provider, Threads, naming_video_options
 from stereoweave.errors import StereoweaveError
 
 Sources = Annotated[
@@ -36,6 +36,7 @@ Port = Annotated[
 Browser = Annotated[bool, typer.Option(help="Open the page in the browser.")]
 
 
+@naming_video_options()
 def live(  # noqa: PLR0913 - each is a word of the command line
     sources: Sources,
     arrangement: Arrangement = None,

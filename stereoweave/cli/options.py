@@ -104,6 +104,39 @@ Host = Annotated[
 ]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="0 takes any that is free.")]
 
+# Options that are not called after their setting's keyword.
+_OPTIONS = {
+    "arrangement": "--format",
+    "calibration": "--calib",
+    "convergence_px": "--convergence",
+    "files": "--write",
+    "listed": "--list",
+    "range_px": "--range",
+    "size_px": "--size",
+    "views": "--view",
+}
+
+
+def option_name(setting: str) -> str:
+    """The option for a setting, given its Python keyword."""
+    return _OPTIONS.get(setting, f"--{setting.replace('_', '-')}")
+
+
+def video_option_name(setting: str) -> str | None:
+    """The option of the commands for video, which cannot rectify."""
+    if setting == "arrangement":
+        return "--arrangement"
+    return None if setting == "rectify" else option_name(setting)
+
+
+@contextmanager
+def naming_video_options() -> Iterator[None]:
+    """Errors name the options of the commands for video."""
+    try:
+        yield
+    except StereoweaveError as error:
+        raise type(error)(error.worded(video_option_name)) from error
+
 
 def request_of(
     arrangement: str | None = None,

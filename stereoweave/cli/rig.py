@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from stereoweave.cli.options import AsJson, Calib, Format, Pictures, place_for
+from stereoweave.cli.options import AsJson, Calib, Format, Pictures, option_name, place_for
 from stereoweave.errors import StereoweaveError
 
 
@@ -24,12 +24,12 @@ def check(pictures: Pictures, arrangement: Format = None, as_json: AsJson = Fals
 
     opened = open_pictures(pictures, arrangement)
     found = check_pair(opened.pair.left, opened.pair.right)
+    notes = [note.worded(option_name) for note in (*opened.notes, *found.lines())]
     if as_json:
         facts = {name: _known(value) for name, value in asdict(found).items()}
-        facts["notes"] = [*opened.notes, *found.lines()]
-        typer.echo(json.dumps(facts, indent=2, allow_nan=False))
+        typer.echo(json.dumps(facts | {"notes": notes}, indent=2, allow_nan=False))
     else:
-        typer.echo("\n".join([*opened.notes, *found.lines()]))
+        typer.echo("\n".join(notes))
     if found.defects:
         raise typer.Exit(1)
 
@@ -69,7 +69,8 @@ def rectify(
         write_image(out / "right.png", pair.right)
         if pair.camera:
             write_rig(out / "calib.yml", rig_of(pair))
-    typer.echo("\n".join([f"{out}: left.png and right.png, {words(size_of(pair))} px", *prepared.notes]))
+    notes = [note.worded(option_name) for note in prepared.notes]
+    typer.echo("\n".join([f"{out}: left.png and right.png, {words(size_of(pair))} px", *notes]))
 
 
 def _spare(pictures: Sequence[Path], calib: Path | None, out: Path) -> None:

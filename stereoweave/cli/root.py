@@ -15,13 +15,13 @@ from stereoweave.cli.batch import batch
 from stereoweave.cli.bench import bench
 from stereoweave.cli.depth import depth, measure
 from stereoweave.cli.live import live
-from stereoweave.cli.options import needing_the_train_extra
+from stereoweave.cli.options import needing_the_train_extra, option_name
 from stereoweave.cli.rig import calibrate, check, rectify
 from stereoweave.cli.serve import serve
 from stereoweave.cli.synth import synth
 from stereoweave.cli.video import video
 from stereoweave.cli.view import view
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import StereoweaveError, worded
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 app.add_typer(bench, name="bench")
@@ -42,7 +42,7 @@ def run(commands: typer.Typer, program: str, arguments: Sequence[str] | None) ->
     except typer.TyperException as error:
         message = error.format_message().rstrip(".") + f"; see {program} --help"
     except (StereoweaveError, OSError) as error:
-        message = str(error)
+        message = worded(error, option_name)
     typer.echo(f"{program}: " + " ".join(message.splitlines()), err=True)
     return 2
 

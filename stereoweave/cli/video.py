@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoweave.cli.options import Model, Provider, Strength, Threads, place_for
+from stereoweave.cli.options import (
+    Model,
+    Provider,
+    Strength,
+    Threads,
+    naming_video_options,
+    place_for,
+    video_option_name,
+)
 from stereoweave.errors import StereoweaveError
 
 if TYPE_CHECKING:
@@ -66,6 +74,7 @@ Rate = Annotated[
 ]
 
 
+@naming_video_options()
 def video(  # noqa: PLR0913 - each is a word of the command line
     films: Films,
     out: Out,
@@ -101,6 +110,7 @@ def video(  # noqa: PLR0913 - each is a word of the command line
             strength=strength,
             convergence_px=convergence,
             backend=Backend(model=model, threads=threads, provider=provider),
+            name_of=video_option_name,
         )
         footage = open_footage(films, arrangement, rate=None if rate is None else _fraction(rate))
         if layout:

@@ -16,6 +16,7 @@ from stereoweave.cli.options import (
     Rectify,
     Strength,
     Threads,
+    option_name,
     place_for,
     range_of,
     request_of,
@@ -127,7 +128,7 @@ def view(  # noqa: PLR0913 - each is a word of the command line
         told = _write_layout(out, name, renderer, choices)
     typer.echo(f"{out}: {told}")
     for note in (*prepared.notes, *hints(pair, estimate)):
-        typer.echo(note)
+        typer.echo(note.worded(option_name))
 
 
 def _refuse_idle(name: str | None, of_one_view: dict[str, float | None], quilt: str | None) -> None:

@@ -45,7 +45,7 @@ def open_dataset(name: str, root: str | Path) -> list[Frame]:
         FormatError: A file is missing, where the listing shows it; a frame's `read` finds the others.
     """
     if name not in DATASETS:
-        raise StereoweaveError(f"dataset: expected one of {', '.join(DATASETS)}, found {name!r}")
+        raise StereoweaveError(f"expected one of {', '.join(DATASETS)}, found {name!r}", setting="dataset")
     frames = DATASETS[name](existing(Path(root)))
     if not frames:
         raise StereoweaveError(f"{root}: expected the frames of {name}, unpacked as they come, found none")

@@ -38,7 +38,7 @@ def split_frames(frames: list[Frame], dataset: str, split: str) -> tuple[list[Fr
 
 def _rule(dataset: str, split: str) -> dict[str, Any]:
     if split not in SPLITS:
-        raise StereoweaveError(f"split: expected one of {', '.join(SPLITS)}, found {split!r}")
+        raise StereoweaveError(f"expected one of {', '.join(SPLITS)}, found {split!r}", setting="split")
     rules = tomllib.loads((files(__package__) / "split_rules" / f"{split}.toml").read_text(encoding="utf-8"))
     if dataset not in rules:
         raise StereoweaveError(f"split of a dataset: expected one of {', '.join(rules)}, found {dataset!r}")

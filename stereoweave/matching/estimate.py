@@ -136,8 +136,9 @@ def _within_width(range_px: tuple[float, float], width_px: int) -> tuple[float, 
     low_px, high_px = range_px
     if low_px >= width_px or high_px <= -width_px:
         raise StereoweaveError(
-            f"range_px: expected disparities of {-width_px} to {width_px} px, the width of the pictures, "
-            f"got {low_px:g} and {high_px:g}; leave it out to have it found"
+            f"expected disparities of {-width_px} to {width_px} px, the width of the pictures, "
+            f"got {low_px:g} and {high_px:g}; leave it out to have it found",
+            setting="range_px",
         )
     return max(low_px, -width_px), min(high_px, width_px)
 

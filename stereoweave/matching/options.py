@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stereoweave.arguments import check_flag, check_number
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Remedy, StereoweaveError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +35,9 @@ class MatchOptions:
         check_flag("raw", self.raw)
         if self.refined and self.raw:
             raise StereoweaveError(
-                "raw: expected without refined: it is the network's own disparity; leave one of them out"
+                "expected without refined: it is the network's own disparity",
+                setting="raw",
+                remedy=Remedy("leave one of them out", ("raw", "refined")),
             )
         if self.range_px is not None:
             object.__setattr__(self, "range_px", _checked_range(self.range_px))
@@ -48,15 +50,17 @@ def _checked_range(range_px: tuple[float, float]) -> tuple[float, float]:
     is_row = isinstance(range_px, Sequence) or (isinstance(range_px, np.ndarray) and range_px.ndim == 1)
     if not is_row or len(range_px) != 2:
         raise StereoweaveError(
-            "range_px: expected the least and the greatest disparity in px, such as (-20, 150); "
-            "leave it out to have it found"
+            "expected the least and the greatest disparity in px, such as (-20, 150); "
+            "leave it out to have it found",
+            setting="range_px",
         )
     for value in range_px:
         check_number("range_px", value)
     low_px, high_px = map(float, range_px)
     if not (math.isfinite(low_px) and math.isfinite(high_px) and low_px < high_px):
         raise StereoweaveError(
-            f"range_px: expected the least and the greatest disparity in px, got {low_px:g} and {high_px:g}; "
-            "leave it out to have it found"
+            f"expected the least and the greatest disparity in px, got {low_px:g} and {high_px:g}; "
+            "leave it out to have it found",
+            setting="range_px",
         )
     return low_px, high_px

@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from stereoweave.arguments import check_kind
-from stereoweave.errors import MatcherError, ProviderError
+from stereoweave.errors import MatcherError, ProviderError, Remedy
 
 CPU = "cpu"
+_USE_CPU = Remedy(f"or run it on {CPU}", ("provider",))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +122,7 @@ def check_provider(provider: str) -> None:
 
     check_kind("provider", provider, str)
     if provider not in PROVIDERS:
-        raise MatcherError(f"provider: expected one of {', '.join(PROVIDERS)}, found {provider!r}")
+        raise MatcherError(f"expected one of {', '.join(PROVIDERS)}, found {provider!r}", setting="provider")
     there = [name for name, known in PROVIDERS.items() if known.name in onnxruntime.get_available_providers()]
     if provider not in there:
         raise MatcherError(
@@ -150,8 +151,9 @@ def open_session(path: Path, provider: str, threads: int) -> Any:
         raise _cannot_begin(provider, "a library or a device that is missing")
     if _takes_nothing(session, PROVIDERS[provider].name):
         raise MatcherError(
-            f"{path}: expected a matcher with operations that provider {provider} has, found none; "
-            f"`stereoweave export --size` makes one for a fixed size, or take --provider {CPU}"
+            f"{path}: expected a matcher with operations that provider {provider} has, found none; export it "
+            "for a fixed size with `stereoweave export`",
+            remedy=_USE_CPU,
         )
     return session
 
@@ -166,10 +168,10 @@ def running(provider: str, path: Path) -> Iterator[None]:
         unfit = type(error).__name__ == "InvalidArgument"
         if unfit or (provider == CPU and not out_of_memory):
             raise _refused(path, error) from error
-        instead = "" if provider == CPU else f", or --provider {CPU}"
         raise ProviderError(
             f"provider {provider}: expected to run {path.name}, found that it failed: {_line(error)}; "
-            f"try smaller pictures, or fewer processes at a time on the device{instead}"
+            "use smaller pictures, or fewer processes at a time on the device",
+            remedy=None if provider == CPU else _USE_CPU,
         ) from error
 
 

@@ -13,13 +13,16 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 
-from stereoweave.errors import StereoweaveError, needing_extra
+from stereoweave.errors import Note, Remedy, StereoweaveError, needing_extra
 from stereoweave.io.files import replacing
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair, check_fits
 
-NO_CAMERA = (
-    "expected a camera, for metres, found none; give its calibration (--calib), or, of pictures that need no "
-    "--rectify, its focal length and the distance between the two (--focal-px and --baseline-m)"
+NO_CAMERA = Note(
+    "expected a camera, for metres, found none",
+    Remedy(
+        "give a calibration, or the focal length and baseline of a rectified pair",
+        ("calibration", "focal_px", "baseline_m"),
+    ),
 )
 MOST_POINTS = 4_000_000
 # A surface that both cameras see changes by less than this from a pixel to the next: more is a jump.
@@ -120,7 +123,7 @@ def solid(pair: StereoPair, estimate: Estimate, least_confidence: float = 0.5) -
 def needed_camera(pair: StereoPair) -> StereoCamera:
     """The camera of the pair; an error that says what to give where it has none."""
     if pair.camera is None:
-        raise StereoweaveError(NO_CAMERA)
+        raise StereoweaveError(NO_CAMERA.text, remedy=NO_CAMERA.remedy)
     return pair.camera
 
 

@@ -9,7 +9,7 @@ import hashlib
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from stereoweave import __version__
 from stereoweave.cameras.calibration_files import calibration_bytes
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import NameOf, Note, Remedy, StereoweaveError, keyword
 from stereoweave.io.colormap import colour_disparity, colour_range_px, grey_confidence
 from stereoweave.io.files import (
     RangeError,
@@ -89,6 +89,7 @@ class DepthJob:
         options: How the pair is matched.
         files: What is written beside `always`, names in FILES, or "all"; depth.png is with any camera.
         always: What is written of every pair.
+        name_of: The front end's names for settings, in the notes and failures that a batch writes down.
     """
 
     request: Request = Request()
@@ -96,17 +97,18 @@ class DepthJob:
     options: MatchOptions = MatchOptions()
     files: tuple[str, ...] = ()
     always: tuple[str, ...] = ALWAYS
+    name_of: NameOf = keyword
 
     def __post_init__(self) -> None:
         for file in self.files:
             if file not in FILES and file != ALL:
                 raise StereoweaveError(
-                    f"--write: expected {ALL} or one of {', '.join(FILES)}, found {file!r}"
+                    f"expected {ALL} or one of {', '.join(FILES)}, found {file!r}", setting="files"
                 )
 
 
-def make_depth(pictures: Sequence[Path], out: Path, job: DepthJob) -> tuple[Summary, list[str]]:
-    """Write all results of a pair to `out` atomically; returns the summary and user-facing notes."""
+def make_depth(pictures: Sequence[Path], out: Path, job: DepthJob) -> tuple[Summary, list[Note]]:
+    """Write all results of a pair to `out` atomically. Returns the summary and user-facing notes."""
     matcher = job.backend.matcher()
     prepared = prepare(pictures, job.request)
     files, left_out = _files_of(job, prepared.pair)
@@ -141,19 +143,20 @@ def needs_camera(file: str) -> bool:
     return file.startswith(("depth.", "cloud.", "mesh."))
 
 
-def _files_of(job: DepthJob, pair: StereoPair) -> tuple[list[str], list[str]]:
-    """What is to be written of a pair, and lines to tell; an error where it cannot be."""
-    wanted, notes = {*job.always, *job.files}, []
+def _files_of(job: DepthJob, pair: StereoPair) -> tuple[list[str], list[Note]]:
+    """The files to write of a pair, and notes; raises StereoweaveError if they need a camera without one."""
+    wanted, notes = {*job.always, *job.files}, list[Note]()
     if pair.camera:
         wanted.add("depth.png")
     if ALL in wanted:
         wanted |= {file for file in FILES if pair.camera or not needs_camera(file)}
         if not pair.camera:
-            notes.append(f"no depth, points or surface in metres: {NO_CAMERA}")
+            text = f"no depth, points or surface in metres: {NO_CAMERA.text}"
+            notes.append(replace(NO_CAMERA, text=text))
     files = [file for file in FILES if file in wanted]
     in_metres = [file for file in files if needs_camera(file)]
     if in_metres and not pair.camera:
-        raise StereoweaveError(f"{in_metres[0]}: {NO_CAMERA}")
+        raise StereoweaveError(f"{in_metres[0]}: {NO_CAMERA.text}", remedy=NO_CAMERA.remedy)
     if any(file.endswith((".ply", ".glb")) for file in files):
         needing_the_mesh_extra()
     return files, notes
@@ -180,26 +183,26 @@ def _results_in(out: Path) -> Iterator[Path]:
                     (out / file).unlink(missing_ok=True)
 
 
-def write_files(folder: Path, files: Sequence[str], result: Result) -> list[str]:
-    """Writes them; the lines that say which of them could not be or hold less, and why."""
+def write_files(folder: Path, files: Sequence[str], result: Result) -> list[Note]:
+    """Write the files. Returns notes on those that could not be written or hold less, and why."""
     notes = []
     for file in files:
         try:
             FILES[file](folder / file, result)
             notes += _thinned(file, result)
         except RangeError:
-            notes.append(
+            text = (
                 "no disparity.png: it holds 0 to 255.99 px, found "
-                f"{result.summary.disparity_min_px:.2f} to {result.summary.disparity_max_px:.2f} px; "
-                "disparity.pfm has them"
+                f"{result.summary.disparity_min_px:.2f} to {result.summary.disparity_max_px:.2f} px"
             )
+            notes.append(Note(text, Remedy("use disparity.pfm")))
         except EmptyError as nothing:
-            notes.append(f"no {file}: {nothing}")
+            notes.append(Note(f"no {file}: {nothing}"))
     return notes
 
 
-def _thinned(file: str, result: Result) -> list[str]:
-    """A line where points or a surface leave out pixels of a large picture."""
+def _thinned(file: str, result: Result) -> list[Note]:
+    """A note if points or a surface leave out pixels of a large picture."""
     match file.split("."):
         case ["cloud", _]:
             step_px = result.cloud.step_px
@@ -209,4 +212,4 @@ def _thinned(file: str, result: Result) -> list[str]:
             step_px = 1
     if step_px == 1:
         return []
-    return [f"{file}: of every {step_px}x{step_px} pixels one, for at most {MOST_POINTS:,} points"]
+    return [Note(f"{file}: one of every {step_px}x{step_px} pixels, for at most {MOST_POINTS:,} points")]

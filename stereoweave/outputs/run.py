@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from stereoweave.cameras.diagnosis import hints
+from stereoweave.errors import Note
 from stereoweave.matching.estimate import match_many
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
@@ -27,14 +28,14 @@ class Result:
         pair: The pair, with its camera where that is known.
         estimate: Its estimate.
         summary: The numbers of both.
-        notes: What was detected or changed while the pictures were read, a line each.
+        notes: What was detected or changed while the pictures were read.
         threads: Threads that may be used to render it; default: all cores.
     """
 
     pair: StereoPair
     estimate: Estimate
     summary: Summary
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
     threads: int | None = None
 
     @property
@@ -52,8 +53,8 @@ class Result:
         depth_m = needed_camera(self.pair).depth_m(self.estimate.disparity_px)
         return np.where(self.seen, depth_m, np.float32(unknown))
 
-    def warnings(self) -> list[str]:
-        """Likely defects of the pair, a line each; takes about half as long as matching."""
+    def warnings(self) -> list[Note]:
+        """Notes on likely defects of the pair; takes about half as long as matching."""
         return hints(self.pair, self.estimate)
 
     @cached_property

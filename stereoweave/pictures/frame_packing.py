@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from stereoweave.errors import FormatError
+from stereoweave.errors import FormatError, Remedy
 from stereoweave.io.files import SMALLEST_SIDE_PX
 
 Picture = UInt8[np.ndarray, "h w 3"]
@@ -113,7 +113,8 @@ def guess_arrangement(
     if declared not in (None, *ARRANGEMENTS):
         raise FormatError(
             f"{name}: expected two views side by side, or the left one above the right one, found a video "
-            f"that declares {declared}; name its --arrangement ({', '.join(ARRANGEMENTS)}) if that is wrong"
+            f"that declares {declared}",
+            remedy=Remedy(f"if that is wrong, choose one of {', '.join(ARRANGEMENTS)}", ("arrangement",)),
         )
     words = set(re.split(r"[^a-z0-9]+", Path(name).name.lower()))
     named = next((kind for kind, marks in _WORDS_IN_NAMES.items() if marks & words), None)
@@ -193,10 +194,11 @@ def _seen(name: str, frames: Sequence[Frame], photograph: bool) -> str:
     found = (
         "too plain a picture to tell" if np.isnan(alike[best]) else "halves that do not resemble each other"
     )
-    expected, option = ("a stereo picture", "--format") if photograph else ("3-D video", "--arrangement")
+    expected = "a stereo picture" if photograph else "3-D video"
     raise FormatError(
         f"{name}: expected {expected}, two views side by side or one above the other, found {found}; "
-        f"name its {option} ({', '.join(ARRANGEMENTS)}), or give two files, left and right"
+        "give two files, left and right",
+        remedy=Remedy(f"or choose one of {', '.join(ARRANGEMENTS)}", ("arrangement",)),
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
 from stereoweave.io import exif
 from stereoweave.io.decoding import (
     Photograph,
@@ -24,10 +24,10 @@ from stereoweave.io.files import check_large_enough, pair_of
 from stereoweave.pictures.frame_packing import ARRANGEMENTS, Arrangement, guess_arrangement, resemblance
 from stereoweave.stereo import StereoPair
 
-# What --format takes for one file that holds both views: how one picture holds them, or which kind of file
-# it is whatever its name says.
+# Layouts of one file that holds both views: how one picture holds them, or the kind of file.
 FORMATS = (*ARRANGEMENTS, "mpo", "jps")
 TWO_PICTURES = "two_pictures"
+_OVERRIDE = Remedy("override it if it is wrong", ("arrangement",))
 
 # What `layouts` writes that holds no two eyes, and whose halves may yet resemble each other.
 _OTHER_LAYOUTS = {"a quilt of many views": r"_qs\d+x\d+a[\d.]+$", "a picture and its depth": r"_RGBD$"}
@@ -44,13 +44,13 @@ class Opened:
     Attributes:
         pair: Both views, upright, in sRGB.
         arrangement: How the files held them: a name in `ARRANGEMENTS`, "mpo" or "two_pictures".
-        notes: What was guessed or changed, in a line each.
+        notes: What was detected or changed.
         lens: What the tags of the files say of the cameras, in pixels of the pair; None for nothing.
     """
 
     pair: StereoPair
     arrangement: str
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
     lens: exif.Lens | None = None
 
 
@@ -68,13 +68,16 @@ def open_pictures(paths: Sequence[Path], arrangement: str | None = None) -> Open
         StereoweaveError: An unknown arrangement, one beside two files, or not one or two files.
     """
     if arrangement not in (None, *FORMATS):
-        raise StereoweaveError(f"--format: expected one of {', '.join(FORMATS)}, found {arrangement!r}")
+        raise StereoweaveError(
+            f"expected one of {', '.join(FORMATS)}, found {arrangement!r}", setting="arrangement"
+        )
     match paths:
         case [left, right]:
             if arrangement is not None:
                 raise StereoweaveError(
-                    f"--format {arrangement}: expected with one picture that holds both views, found two, "
-                    f"{left} and {right}; give them alone, the left one first"
+                    f"expected one picture that holds both views, found two, {left} and {right}; "
+                    "leave it out, and give the left one first",
+                    setting="arrangement",
                 )
             return _two(left, right)
         case [both]:
@@ -120,10 +123,10 @@ def _one(path: Path, arrangement: str | None) -> Opened:
     lies = exif.orientation(photograph.tags)
     image = photograph.upright(lies)
     if name is None:
-        name, why = _guessed(path, image), "guessed from name and looks"
+        name, why = _guessed(path, image), "detected from name and content"
     left, right = _halves(path, image, ARRANGEMENTS[name])
     height_px, width_px = left.shape[:2]
-    notes = [f"{name}, {why}; --format names another"] if why else []
+    notes = [Note(f"{name}, {why}", _OVERRIDE)] if why else []
     return Opened(
         pair=StereoPair(left=left, right=right),
         arrangement=name,
@@ -147,7 +150,7 @@ def _of_frames(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opene
         pair=StereoPair(left=left, right=right),
         arrangement="mpo",
         notes=(
-            "mpo, the two pictures of the file; --format names another",
+            Note("mpo, the two pictures of the file", _OVERRIDE),
             *_turn_notes(lies),
             *_colour_notes(photographs),
         ),
@@ -155,7 +158,7 @@ def _of_frames(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opene
     )
 
 
-def _upright(left: Photograph, right: Photograph) -> tuple[tuple[int | None, int | None], list[str]]:
+def _upright(left: Photograph, right: Photograph) -> tuple[tuple[int | None, int | None], list[Note]]:
     """How each of two pictures lies, and a note on it.
 
     Each as its tag says, unless that makes their sizes differ or one has no tag, which editors lose, some of
@@ -171,12 +174,12 @@ def _upright(left: Photograph, right: Photograph) -> tuple[tuple[int | None, int
         if exif.turned(left.image, lies[0]).size == exif.turned(right.image, lies[1]).size
     ]
     if len(fitting) == 2 and None not in own:
-        return own, ["each picture turned upright as its EXIF says"]
+        return own, [Note("each picture turned upright as its EXIF says")]
     best = max(fitting or [own], key=lambda lies: np.nan_to_num(_likeness(left, right, lies), nan=-1))
     if best == alike:
         which = "the other says" if None in own else "the left one says, though the right one differs"
-        return best, [f"both pictures turned upright as EXIF of {which}"]
-    return best, ["one picture turned upright as EXIF says, the other left as it is"]
+        return best, [Note(f"both pictures turned upright as EXIF of {which}")]
+    return best, [Note("one picture turned upright as EXIF says, the other left as it is")]
 
 
 def _likeness(left: Photograph, right: Photograph, lies: tuple[int | None, int | None]) -> float:
@@ -210,9 +213,7 @@ def _declared(path: Path, picture: Image.Image, arrangement: str | None) -> tupl
 def _guessed(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> str:
     for kind, mark in _OTHER_LAYOUTS.items():
         if re.search(mark, path.stem):
-            raise FormatError(
-                f"{path}: expected two views, found {kind}, by its name; --format says how else it is"
-            )
+            raise FormatError(f"{path}: expected two views, found {kind}, by its name", remedy=_OVERRIDE)
     return guess_arrangement(str(path), [image], photograph=True)
 
 
@@ -237,13 +238,14 @@ def _lens(photographs: Sequence[Photograph]) -> exif.Lens | None:
     return exif.lens_of({**second.tags, **first.tags}, *first.image.size)
 
 
-def _turn_notes(lies: int | None) -> list[str]:
-    return [] if lies in (None, 1) else ["turned upright as EXIF says"]
+def _turn_notes(lies: int | None) -> list[Note]:
+    return [] if lies in (None, 1) else [Note("turned upright as EXIF says")]
 
 
-def _colour_notes(photographs: Sequence[Photograph]) -> list[str]:
-    """What was done to the colours, once if it is the same of both."""
-    notes = [each.note for each in photographs]
-    if len(set(notes)) == 1:
-        return [note for note in notes[:1] if note]
-    return [f"{side} picture: {note}" for side, note in zip(("left", "right"), notes, strict=True) if note]
+def _colour_notes(photographs: Sequence[Photograph]) -> list[Note]:
+    """Colour conversions, once if both pictures had the same."""
+    texts = [each.note for each in photographs]
+    if len(set(texts)) == 1:
+        return [Note(text) for text in texts[:1] if text]
+    sides = zip(("left", "right"), texts, strict=True)
+    return [Note(f"{side} picture: {text}") for side, text in sides if text]

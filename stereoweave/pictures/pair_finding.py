@@ -12,7 +12,7 @@ from pathlib import Path
 from posixpath import splitext
 from typing import NamedTuple
 
-from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.errors import FormatError, Remedy, StereoweaveError
 from stereoweave.io.decoding import ENDINGS
 from stereoweave.io.files import reading
 from stereoweave.io.stores import store_at
@@ -88,7 +88,7 @@ class FoundPairs:
 def find_pairs(
     pictures: Sequence[Path], left: str | None, right: str | None, listed: Path | None
 ) -> FoundPairs | None:
-    """The pairs that the words of a command line name in one of three ways; None for one pair's pictures.
+    """The pairs that are given in one of three ways; None for one pair's pictures.
 
     Args:
         pictures: A folder, or the pictures of one pair.
@@ -100,12 +100,14 @@ def find_pairs(
         StereoweaveError: None of the ways was taken or more than one, or as in `pairs_in`, `pairs_by_globs`
             and `pairs_in_list`.
     """
-    words = {"pictures": pictures, "--left and --right": left or right, "--list": listed}
-    given = [word for word, value in words.items() if value]
+    ways = {"pictures": pictures, "patterns": left or right, "a list": listed}
+    given = [way for way, value in ways.items() if value]
     if len(given) != 1 or (left is None) != (right is None):
         found = " with ".join(given) if len(given) != 1 else "one of the two patterns"
         raise StereoweaveError(
-            f"expected pictures or a folder, or --left and --right, or --list, found {found or 'none'}"
+            "expected pictures or a folder, patterns of left and right pictures, or a list of pairs, "
+            f"found {found or 'none'}",
+            remedy=Remedy("give exactly one of them", ("left", "right", "listed")),
         )
     if listed:
         return FoundPairs(pairs_in_list(listed))
@@ -184,13 +186,15 @@ def pairs_by_globs(left: str, right: str) -> list[NamedPair]:
             of one name.
     """
     lefts, rights = _matches(left), _matches(right)
-    for option, pattern, found in (("--left", left, lefts), ("--right", right, rights)):
+    for side, pattern, found in (("left", left, lefts), ("right", right, rights)):
         if not found:
-            raise StereoweaveError(f"{option} {pattern}: expected pictures, found none; is it quoted?")
+            raise StereoweaveError(
+                f"expected pictures that match {pattern}, found none; quote the pattern", setting=side
+            )
     if len(lefts) != len(rights):
         raise StereoweaveError(
-            f"expected as many left pictures as right ones, found {len(lefts)} for --left {left} and "
-            f"{len(rights)} for --right {right}"
+            f"expected as many left pictures as right ones, found {len(lefts)} for {left} and "
+            f"{len(rights)} for {right}"
         )
     fixed = takewhile(lambda part: not re.search(r"[*?\[]", part), Path(left).parent.parts)
     return _named_pairs(zip(lefts, rights, strict=True), Path(*fixed))
@@ -342,8 +346,8 @@ def _check_names(names: Iterable[tuple[str, str | Path]]) -> None:
         other = seen.setdefault(name.casefold(), file)
         if other is not file:
             raise StereoweaveError(
-                f"expected pairs of different names, found {name} for {other} and for {file}; "
-                "rename one, or name them in the third column of a --list"
+                f"expected pairs of different names, found {name} for {other} and for {file}; rename one",
+                remedy=Remedy("or name them in the third column of a list", ("listed",)),
             )
 
 

@@ -8,7 +8,7 @@ from stereoweave.cameras.calibration_files import read_rig
 from stereoweave.cameras.rectify import Rectified, rectify
 from stereoweave.cameras.rectify_uncalibrated import rectify_by_features
 from stereoweave.cameras.rig import size_of
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.io.exif import Lens
 from stereoweave.pictures.loading import open_pictures
 from stereoweave.stereo import StereoCamera, StereoPair
@@ -44,7 +44,7 @@ class Prepared:
 
     pair: StereoPair
     pictures: tuple[Path, ...]
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
 
 
 def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
@@ -77,25 +77,30 @@ def _calibrated(pair: StereoPair, path: Path, rectified: bool) -> Rectified:
     unlike = rig.unlike_rectified()
     if unlike:
         raise StereoweaveError(
-            f"{path}: expected a calibration of rectified pictures, found {unlike}; --rectify rectifies by it"
+            f"{path}: expected a calibration of rectified pictures, found {unlike}",
+            remedy=Remedy("rectify the pair by it", ("rectify",)),
         )
     return Rectified(pair=replace(pair, camera=rig.camera()), notes=rig.notes)
 
 
-def _camera(pair: StereoPair, lens: Lens, request: Request) -> tuple[StereoCamera | None, tuple[str, ...]]:
-    """The camera of what was given by hand, completed from EXIF; and what came from there, in a line."""
+def _camera(pair: StereoPair, lens: Lens, request: Request) -> tuple[StereoCamera | None, tuple[Note, ...]]:
+    """The camera of the request, completed from EXIF; and a note on what came from EXIF."""
     focal_px = lens.focal_px if request.focal_px is None else request.focal_px
     baseline_m = lens.baseline_m if request.baseline_m is None else request.baseline_m
     if focal_px is not None and baseline_m is not None:
         camera = StereoCamera.centred(pair.left, focal_px=focal_px, baseline_m=baseline_m)
-        told = [] if request.focal_px is not None else [f"focal length {focal_px:.0f} px"]
-        told += [] if request.baseline_m is not None else [f"baseline {1000 * baseline_m:.1f} mm"]
-        return camera, (f"from EXIF: {', '.join(told)}",) if told else ()
+        from_exif = [] if request.focal_px is not None else [f"focal length {focal_px:.0f} px"]
+        from_exif += [] if request.baseline_m is not None else [f"baseline {1000 * baseline_m:.1f} mm"]
+        return camera, (Note(f"from EXIF: {', '.join(from_exif)}"),) if from_exif else ()
     if request.focal_px is not None:
-        raise StereoweaveError("metres: expected a baseline beside the focal length; give --baseline-m")
+        raise StereoweaveError(
+            "metres: expected a baseline beside the focal length, found none",
+            remedy=Remedy("give the baseline", ("baseline_m",)),
+        )
     if request.baseline_m is not None:
         raise StereoweaveError(
-            "metres: expected a focal length in EXIF beside the baseline, found none; give --focal-px"
+            "metres: expected a focal length in EXIF beside the baseline, found none",
+            remedy=Remedy("give the focal length", ("focal_px",)),
         )
     return None, ()
 
@@ -103,5 +108,7 @@ def _camera(pair: StereoPair, lens: Lens, request: Request) -> tuple[StereoCamer
 def _by_features(ready: Rectified) -> Rectified:
     """The pair rectified by what it shows, without its camera: the turn put in is known but for infinity."""
     rectified = rectify_by_features(ready.pair)
-    lost = () if ready.pair.camera is None else ("no metres after rectification by features: give --calib",)
-    return Rectified(pair=rectified.pair, notes=(*rectified.notes, *lost))
+    if ready.pair.camera is None:
+        return rectified
+    lost = Note("no metres after rectification by features", Remedy("give a calibration", ("calibration",)))
+    return replace(rectified, notes=(*rectified.notes, lost))

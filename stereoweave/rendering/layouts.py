@@ -79,7 +79,8 @@ class Choices:
             )
         if self.range_px is not None and not -math.inf < self.range_px[0] < self.range_px[1] < math.inf:
             raise StereoweaveError(
-                f"range: expected two disparities in px, the lower one first, got {self.range_px}"
+                f"expected two disparities in px, the lower one first, got {self.range_px}",
+                setting="range_px",
             )
 
 
@@ -235,7 +236,9 @@ def layout_of(path: str | Path, name: str | None) -> str | None:
         StereoweaveError: An unknown layout, or a file whose ending does not fit it.
     """
     if name is not None and name not in LAYOUTS | MOTIONS:
-        raise StereoweaveError(f"layout: expected one of {', '.join([*LAYOUTS, *MOTIONS])}, found {name!r}")
+        raise StereoweaveError(
+            f"expected one of {', '.join([*LAYOUTS, *MOTIONS])}, found {name!r}", setting="layout"
+        )
     ending = Path(path).suffix.lower()
     held = _HELD.get(ending)
     if held is not None:
@@ -258,8 +261,9 @@ def check_reach(positions: Iterable[float], strength: float) -> None:
         if not FIRST_POSITION <= seen_from <= LAST_POSITION:
             by_strength = "" if strength == 1 else f", where strength {strength:g} takes {position:g}"
             raise StereoweaveError(
-                f"position: expected {FIRST_POSITION:g} to {LAST_POSITION:g} (0 left camera, 1 right), "
-                f"got {seen_from:g}{by_strength}"
+                f"expected {FIRST_POSITION:g} to {LAST_POSITION:g} (0 left camera, 1 right), "
+                f"got {seen_from:g}{by_strength}",
+                setting="position",
             )
 
 

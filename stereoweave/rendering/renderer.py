@@ -185,12 +185,13 @@ def check_position(position: float, *, up: float = 0.0, forward: float = 0.0) ->
         check_number(name, value)
     if not FIRST_POSITION <= position <= LAST_POSITION:
         raise StereoweaveError(
-            f"position: expected {FIRST_POSITION} to {LAST_POSITION} (0 left camera, 1 right), got {position}"
+            f"expected {FIRST_POSITION} to {LAST_POSITION} (0 left camera, 1 right), got {position}",
+            setting="position",
         )
     for name, value in (("up", up), ("forward", forward)):
         if not abs(value) <= _FARTHEST_MOVE:
             raise StereoweaveError(
-                f"{name}: expected -{_FARTHEST_MOVE:g} to {_FARTHEST_MOVE:g} (baselines), got {value}"
+                f"expected -{_FARTHEST_MOVE:g} to {_FARTHEST_MOVE:g} (baselines), got {value}", setting=name
             )
 
 
@@ -198,11 +199,12 @@ def _check_shifts(strength: float, convergence_px: float, pair: StereoPair) -> N
     check_number("strength", strength)
     check_number("convergence_px", convergence_px)
     if not 0 <= strength < math.inf:
-        raise StereoweaveError(f"strength: expected 0 or more, got {strength}")
+        raise StereoweaveError(f"expected 0 or more, got {strength}", setting="strength")
     width = pair.left.shape[1]
     if not abs(convergence_px) <= width:
         raise StereoweaveError(
-            f"convergence: expected -{width} to {width} px, the picture's width, got {convergence_px}"
+            f"expected -{width} to {width} px, the picture's width, got {convergence_px}",
+            setting="convergence_px",
         )
 
 

@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from stereoweave.cameras.rectify import cropped
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Note, StereoweaveError
 from stereoweave.io.decoding import MOST_PIXELS, opening
 from stereoweave.io.files import RangeError, write_image
 from stereoweave.matching.backend import Backend
@@ -33,6 +33,17 @@ MEDIA_TYPES = {
     ".npy": "application/x-npy",
 }
 _VIEW = "view"
+_FIELDS = {
+    "arrangement": "format",
+    "baseline_m": "baseline_m",
+    "calibration": "calib",
+    "focal_px": "focal_px",
+    "position": "position",
+    "range_px": "range",
+    "rectify": "rectify",
+    "refined": "refined",
+    "strength": "strength",
+}
 # A note may quote its picture, and what carries them is the head of a response.
 _LONGEST_NOTE = 300
 
@@ -147,11 +158,15 @@ def answer_many(matcher: Matcher, jobs: Sequence[ServiceJob]) -> list[Answer | E
     return [outcome[at] for at in range(len(jobs))]
 
 
-def told(error: Exception, folder: Path) -> str:
-    """An error in one line and in the words of a request: no path of this machine, fields for options."""
-    text = str(error).replace(f"{folder}/", "")
+def field_name(setting: str) -> str | None:
+    """The field of a request's form for a setting; None if a request does not have it."""
+    return _FIELDS.get(setting)
+
+
+def without_paths(line: str, folder: Path) -> str:
+    """A message in one line, without the paths of this machine."""
+    text = line.replace(f"{folder}/", "")
     text = re.sub(r"(?<![^\s'\"(])/(?:[^\s/]+/)+", "", text)  # where a network is
-    text = re.sub(r"--([a-z][a-z-]+)", lambda option: option[1].replace("-", "_"), text)
     return " ".join(text.split())
 
 
@@ -211,6 +226,6 @@ def _write_map(path: Path, result: Result) -> None:
         ) from error
 
 
-def _report(summary: Summary, notes: Sequence[str], folder: Path) -> str:
-    told_notes = [told(StereoweaveError(note), folder)[:_LONGEST_NOTE] for note in notes]
-    return json.dumps(asdict(summary) | {"notes": told_notes}, allow_nan=False)
+def _report(summary: Summary, notes: Sequence[Note], folder: Path) -> str:
+    lines = [without_paths(note.worded(field_name), folder)[:_LONGEST_NOTE] for note in notes]
+    return json.dumps(asdict(summary) | {"notes": lines}, allow_nan=False)

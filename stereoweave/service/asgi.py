@@ -18,9 +18,17 @@ from starlette.datastructures import Headers
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from stereoweave import __version__
-from stereoweave.errors import FormatError, MatcherError, StereoweaveError
+from stereoweave.errors import FormatError, MatcherError, StereoweaveError, worded
 from stereoweave.service.admission import BusyError
-from stereoweave.service.answers import MEDIA_TYPES, MOST_MEGAPIXELS, Answer, ServiceJob, TooLargeError, told
+from stereoweave.service.answers import (
+    MEDIA_TYPES,
+    MOST_MEGAPIXELS,
+    Answer,
+    ServiceJob,
+    TooLargeError,
+    field_name,
+    without_paths,
+)
 from stereoweave.service.forms import MapForm, PairForm, ViewForm, stored
 from stereoweave.system.child_process import ProcessDiedError
 
@@ -200,7 +208,7 @@ def _file(answer: Answer, name: str) -> Response:
 
 def _refusal_of(error: Exception, folder: Path) -> HTTPException:
     headers = {"Retry-After": str(error.retry_after_s)} if isinstance(error, BusyError) else None
-    detail = told(error, folder)
+    detail = without_paths(worded(error, field_name), folder)
     if not isinstance(error, StereoweaveError | TimeoutError):
         found = detail or "too little memory"
         detail = f"expected room for the request on the disk and in memory, found {found}; come again"

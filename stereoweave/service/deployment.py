@@ -24,7 +24,7 @@ from ray.exceptions import RayActorError
 from ray.serve.handle import DeploymentHandle
 from ray.serve.schema import LoggingConfig
 
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher
 from stereoweave.service.admission import Budget, work_of
@@ -272,8 +272,10 @@ def _check_room(settings: Settings, found: int) -> None:
     if settings.replicas > found:
         gpu = " and a GPU" if settings.gpus_each else ""
         raise StereoweaveError(
-            f"--replicas {settings.replicas} --threads {settings.threads}: expected at most {found}, for "
-            f"which there is room, found {settings.replicas}; each takes {settings.threads} cores{gpu}"
+            f"expected at most {found}, for which there is room, found {settings.replicas}; each takes "
+            f"{settings.threads} cores{gpu}",
+            setting="replicas",
+            remedy=Remedy("ask for less", ("replicas", "threads")),
         )
 
 
@@ -281,5 +283,5 @@ def _room(engine: Engine) -> int:
     """The number of replicas that fit on the cluster."""
     try:
         return room(engine)
-    except StereoweaveError:  # none fits; the error names options of another command
+    except StereoweaveError:  # none fits; the error names settings of another command
         return 0

@@ -17,7 +17,7 @@ from functools import partial
 from importlib.metadata import distribution
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from stereoweave.errors import StereoweaveError, needing_extra
+from stereoweave.errors import Remedy, StereoweaveError, needing_extra
 from stereoweave.system.threads import usable_cores
 
 if TYPE_CHECKING:
@@ -67,12 +67,16 @@ class Engine:
 
     def __post_init__(self) -> None:
         if self.workers is not None and self.workers < 1:
-            raise StereoweaveError(f"--workers: expected 1 or more, found {self.workers}")
+            raise StereoweaveError(f"expected 1 or more, found {self.workers}", setting="workers")
         if not _LEAST_SHARE <= self.cpus_each < math.inf:
-            raise StereoweaveError(f"--cpus-each: expected {_LEAST_SHARE} or more, found {self.cpus_each}")
+            raise StereoweaveError(
+                f"expected {_LEAST_SHARE} or more, found {self.cpus_each}", setting="cpus_each"
+            )
         gpus = self.gpus_each
         if gpus and not (_LEAST_SHARE <= gpus < 1 or (1 <= gpus < math.inf and gpus % 1 == 0)):
-            raise StereoweaveError(f"--gpus-each: expected 0, a part of 1 or a whole number, found {gpus}")
+            raise StereoweaveError(
+                f"expected 0, a part of 1 or a whole number, found {gpus}", setting="gpus_each"
+            )
 
     @property
     def threads_each(self) -> int:
@@ -247,9 +251,9 @@ def room(engine: Engine) -> int:
         return found
     largest = max(_machines(), key=lambda has: has.get("CPU", 0))
     raise StereoweaveError(
-        f"--cpus-each, --gpus-each: expected a machine with {engine.cpus_each:g} cores and "
-        f"{engine.gpus_each:g} GPUs for a worker, found {largest.get('CPU', 0):g} and "
-        f"{largest.get('GPU', 0):g} in the largest; ask for less, or join such a machine"
+        f"expected a machine with {engine.cpus_each:g} cores and {engine.gpus_each:g} GPUs for a worker, "
+        f"found {largest.get('CPU', 0):g} and {largest.get('GPU', 0):g} in the largest; join such a machine",
+        remedy=Remedy("or ask for less", ("cpus_each", "gpus_each")),
     )
 
 

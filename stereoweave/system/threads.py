@@ -15,7 +15,9 @@ def thread_count(threads: int | None) -> int:
     if threads is not None:
         check_whole_number("threads", threads)
         if not 1 <= threads <= _MOST_THREADS:
-            raise StereoweaveError(f"threads: expected 1 or more, got {threads}; {_MOST_THREADS} at most")
+            raise StereoweaveError(
+                f"expected 1 or more, got {threads}; {_MOST_THREADS} at most", setting="threads"
+            )
     return threads or usable_cores()
 
 

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from itertools import chain, islice
 from math import isfinite
@@ -15,8 +15,9 @@ from rich.console import Console
 from rich.progress import Progress, TaskID
 
 from stereoweave import __version__
+from stereoweave.cameras.alignment import SWAPPED
 from stereoweave.cameras.diagnosis import hints
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import NameOf, Note, Remedy, StereoweaveError, keyword
 from stereoweave.io.colormap import colour_disparity, colour_range_px
 from stereoweave.io.output_lock import lock_output
 from stereoweave.matching.backend import Backend
@@ -65,6 +66,7 @@ class VideoJob:
         convergence_px: The disparity that stays in place from view to view. None is that of the film's middle
             for layouts whose views lie upon one another, and 0 for all else.
         backend: What matches its frames.
+        name_of: The front end's names for settings, in notes.
     """
 
     depth: bool = False
@@ -74,36 +76,40 @@ class VideoJob:
     strength: float = 1.0
     convergence_px: float | None = None
     backend: Backend = Backend()
+    name_of: NameOf = keyword
 
     def __post_init__(self) -> None:
-        wanted = {
-            "--depth": self.depth,
-            "--depth16": self.depth16,
-            "--position": self.position is not None,
-            "--layout": self.layout is not None,
+        kinds = {
+            "depth": self.depth,
+            "depth16": self.depth16,
+            "position": self.position is not None,
+            "layout": self.layout is not None,
         }
-        found = [word for word, given in wanted.items() if given]
-        if len(found) != 1:
+        given = [kind for kind, is_given in kinds.items() if is_given]
+        if len(given) != 1:
             raise StereoweaveError(
-                f"what to make: expected one of {', '.join(wanted)}, found {' and '.join(found) or 'none'}"
+                f"expected one kind of video to make, found {' and '.join(given) or 'none'}",
+                remedy=Remedy("choose one", tuple(kinds)),
             )
         if self.layout not in (None, *LAYOUTS):
-            raise StereoweaveError(f"layout: expected one of {', '.join(LAYOUTS)}, found {self.layout!r}")
-        self._check_numbers(found[0] if self.layout is None else f"--layout {self.layout}")
+            raise StereoweaveError(
+                f"expected one of {', '.join(LAYOUTS)}, found {self.layout!r}", setting="layout"
+            )
+        self._check_numbers(given[0] if self.layout is None else f"layout {self.layout}")
         check_reach(self._positions, self.strength)
 
-    def _check_numbers(self, wanted: str) -> None:
-        """Refuses numbers that are none, or that what is wanted would not heed."""
-        numbers = {"--strength": (self.strength, 1.0), "--convergence": (self.convergence_px, None)}
-        for word, (value, unset) in numbers.items():
+    def _check_numbers(self, kind: str) -> None:
+        """Raise if a number is not finite, or has no effect on this kind of video."""
+        numbers = {"strength": (self.strength, 1.0), "convergence_px": (self.convergence_px, None)}
+        for setting, (value, unset) in numbers.items():
             if value == unset or value is None:
                 continue
             if not isfinite(value):
-                raise StereoweaveError(
-                    f"{word}: expected a number that is not infinite or nan, found {value}"
-                )
+                raise StereoweaveError(f"expected a finite number, found {value}", setting=setting)
             if not self._positions:
-                raise StereoweaveError(f"{word}: expected a view or a layout of views for it, found {wanted}")
+                raise StereoweaveError(
+                    f"expected a view or a layout of views for it, found {kind}", setting=setting
+                )
 
     @property
     def _positions(self) -> tuple[float, ...]:
@@ -134,15 +140,16 @@ class VideoJob:
             return self.convergence_px
         return survey.middle_px if self.layout and LAYOUTS[self.layout].converged else 0.0
 
-    def loses(self, survey: "Survey") -> list[str]:
-        """A line for what the file cannot hold of the film; none where it holds all."""
+    def loses(self, survey: "Survey") -> list[Note]:
+        """A note if the file cannot hold all disparities of the film."""
         low_px, high_px = survey.range_px
         if not self.depth16 or (low_px >= 0 and high_px <= _MOST_GREY16_PX):
             return []
-        return [
-            f"--depth16 holds 0 to {_MOST_GREY16_PX} px: of this film's disparities, {low_px:.1f} to "
-            f"{high_px:.1f} px, what lies beyond is clipped; --depth shows all of them in colours"
-        ]
+        text = (
+            f"16-bit grey holds 0 to {_MOST_GREY16_PX} px: this video's disparities, {low_px:.1f} to "
+            f"{high_px:.1f} px, are clipped"
+        )
+        return [Note(text, Remedy("show all of them in colours", ("depth",)))]
 
     def says(self, survey: "Survey") -> dict[str, str]:
         """What the file says about itself: how to get back from its pictures to disparities."""
@@ -227,9 +234,10 @@ def make_film(
         if parts.files:
             maker = _Maker.from_state(job, matcher, parts.state())
         else:
-            survey, lines = _look(footage, matcher, bar)
+            survey, notes = _look(footage, matcher, bar)
             maker = _Maker(job, matcher, survey)
-            for line in [*lines, *job.loses(survey)]:
+            for note in [*notes, *job.loses(survey)]:
+                line = note.worded(job.name_of)
                 console.print(line, markup=False, highlight=False, soft_wrap=True)
         done, total = maker.tally.frames, footage.frame_count
         shown = bar.add_task(out.name, total=total, completed=done, loss="", rate="")
@@ -287,15 +295,15 @@ class _Maker:
             yield frame.time, self._job.picture(pair, estimate, self.survey)
 
 
-def _look(footage: Footage, matcher: Matcher, bar: Progress) -> tuple[Survey, list[str]]:
-    """Range and middle of the disparities all over the film; and what seems amiss.
+def _look(footage: Footage, matcher: Matcher, bar: Progress) -> tuple[Survey, list[Note]]:
+    """Range and middle of the disparities all over the film; and notes on defects.
 
     All over: titles, with which a film may begin, say nothing about its range.
     """
     picked = _spread(footage.frame_count, _SURVEYED_FRAMES)
     hinted = set(picked[len(picked) // 6 :: -(-len(picked) // _HINTED_FRAMES)])
     shown = bar.add_task("looking at its depth", total=len(picked), loss="", rate="")
-    thinned, middles_px, amiss = [], [], []
+    thinned, middles_px, defects = [], [], []
     frames = islice(footage.frames(), picked.start, picked.stop, picked.step)
     for index, frame in zip(picked, frames, strict=True):
         pair = StereoPair(left=frame.left, right=frame.right)
@@ -303,11 +311,11 @@ def _look(footage: Footage, matcher: Matcher, bar: Progress) -> tuple[Survey, li
         thinned.append(estimate.disparity_px[::_SURVEYED_EVERY_PX, ::_SURVEYED_EVERY_PX])
         middles_px.append(middle_px(estimate))
         if index in hinted:
-            amiss.append([f"{_clock(frame.time)} {line}" for line in hints(pair, estimate)])
+            defects.append([_at(frame.time, note, footage) for note in hints(pair, estimate)])
         bar.advance(shown)
     all_px = np.vstack(thinned)
     survey = Survey(colour_range_px(all_px), float(np.median(middles_px)), _within_px(all_px, matcher))
-    return survey, _told(amiss, footage.arrangement)
+    return survey, _usual(defects)
 
 
 def _within_px(disparity_px: Float[np.ndarray, "h w"], matcher: Matcher) -> tuple[float, float] | None:
@@ -325,16 +333,18 @@ def _spread(count: int, wanted: int) -> range:
     return range(step // 2, count, step)
 
 
-def _told(amiss: Sequence[Sequence[str]], arrangement: str | None) -> list[str]:
-    """The lines of the last frame with any, where most have some: a film may begin with a black picture."""
-    some = [lines for lines in amiss if lines]
-    if 2 * len(some) <= len(amiss):
-        return []
-    other = _other_way_round(arrangement)
-    return [
-        line.replace("give them the other way round", f"give --arrangement {other}") if other else line
-        for line in some[-1]
-    ]
+def _at(time: Fraction, note: Note, footage: Footage) -> Note:
+    """A note on the frame at that time; the remedy for swapped views of one file is another arrangement."""
+    other = _other_way_round(footage.arrangement)
+    if note == SWAPPED and other:
+        note = replace(note, remedy=Remedy(f"choose {other}", ("arrangement",)))
+    return replace(note, text=f"{_clock(time)} {note.text}")
+
+
+def _usual(defects: Sequence[list[Note]]) -> list[Note]:
+    """The notes on the last frame with any, if most have some: a film may begin with a black picture."""
+    some = [notes for notes in defects if notes]
+    return some[-1] if 2 * len(some) > len(defects) else []
 
 
 def _other_way_round(arrangement: str | None) -> str | None:
@@ -361,19 +371,19 @@ def _check_out(out: Path, job: VideoJob, footage: Footage, sources: Sequence[Pat
 
 
 def _settings(job: VideoJob, footage: Footage, sources: Sequence[Path]) -> dict[str, object]:
-    """All that the film depends on but for what computes it, as users call it, in words that JSON has."""
+    """All that the film depends on but for what computes it, by setting, as JSON values."""
     model = Path(job.backend.model)
     return {
-        "--depth": job.depth,
-        "--depth16": job.depth16,
-        "--position": job.position,
-        "--layout": job.layout,
-        "--strength": job.strength,
-        "--convergence": job.convergence_px,
-        "--arrangement": footage.arrangement,
-        "--rate": str(footage.rate),
-        "--model": _known_by(model) if model.exists() else str(job.backend.model),
-        "FILM": [_known_by(source) for source in sources],
+        "depth": job.depth,
+        "depth16": job.depth16,
+        "position": job.position,
+        "layout": job.layout,
+        "strength": job.strength,
+        "convergence_px": job.convergence_px,
+        "arrangement": footage.arrangement,
+        "rate": str(footage.rate),
+        "model": _known_by(model) if model.exists() else str(job.backend.model),
+        "film": [_known_by(source) for source in sources],
         "stereoweave": __version__,
     }
 

@@ -106,7 +106,9 @@ def open_footage(
         StereoweaveError: An unknown arrangement, not one or two paths, a video's rate, or PyAV is missing.
     """
     if arrangement not in (None, *ARRANGEMENTS):
-        raise StereoweaveError(f"expected an arrangement, {', '.join(ARRANGEMENTS)}, found {arrangement!r}")
+        raise StereoweaveError(
+            f"expected one of {', '.join(ARRANGEMENTS)}, found {arrangement!r}", setting="arrangement"
+        )
     if not 1 <= len(paths) <= 2 or (len(paths) == 2 and arrangement):
         raise StereoweaveError(
             "expected one video with both eyes, or two, left and right, without an arrangement, "

@@ -254,8 +254,9 @@ def growing(film: Path, settings: Mapping[str, object]) -> Iterator[Parts]:
         if not parts.files:
             _clear(folder)
         elif isinstance(error, OSError | FFmpegError | StereoweaveError):
-            raise StereoweaveError(
-                f"{error}; what is finished stays in {folder}, and the same command goes on from there"
+            ours = error if isinstance(error, StereoweaveError) else StereoweaveError(str(error))
+            raise ours.extended(
+                f"what is finished stays in {folder}, and the same command goes on from there"
             ) from error
         raise
     _clear(folder)
@@ -281,8 +282,8 @@ def _check_settings(folder: Path, settings: Mapping[str, object]) -> None:
     if other:
         begun = ", ".join(_begun_with(name, found.get(name)) for name in other)
         raise StereoweaveError(
-            f"{folder}: expected parts of the same film, found parts begun {begun}; "
-            "remove that folder, or give the words that it was begun with"
+            f"{folder}: expected parts of the same video, found parts begun {begun}; "
+            "remove that folder, or give the same settings again"
         )
 
 

@@ -206,7 +206,7 @@ def test_the_page_is_for_this_machine_alone():
 def test_a_port_that_is_taken_is_named():
     with (
         Screen(0) as screen,
-        pytest.raises(StereoweaveError, match=f"--port: .* found {screen.server_port}"),
+        pytest.raises(StereoweaveError, match=f"^port: .* found {screen.server_port}"),
     ):
         Screen(screen.server_port)
 

@@ -303,4 +303,6 @@ def test_the_command_takes_a_list_and_makes_no_reports_unless_they_are_asked_for
     assert main([*words, str(tmp_path / "reports"), "--write", "report.html"]) == 1
     assert (tmp_path / "reports" / "quay" / "report.html").exists()
     assert main([*words, str(out), "--left", "*.png"]) == 2
-    assert "expected pictures or a folder, or --left and --right, or --list" in capsys.readouterr().err
+    assert "found patterns with a list; give exactly one of them (--left, --right, --list)" in (
+        capsys.readouterr().err
+    )

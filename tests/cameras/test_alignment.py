@@ -79,14 +79,14 @@ def test_amounts_are_those_put_in(pairs):
 def test_the_lines_say_what_to_do(pairs):
     left, right = pairs[0]
     lower = check_pair(*ONE_DEFECT["vertical_shift"](left, right))
-    assert lower.lines()[-1] == "the right picture lies 2.0 px lower: --rectify mends it"
+    assert str(lower.lines()[-1]) == "the right picture lies 2.0 px lower; rectify the pair (rectify)"
     assert lower.warnings() == lower.lines()[-1:]
-    assert check_pair(left, turned(right, -1)).lines()[-1] == (
-        "the right picture is turned 1.0 degrees anticlockwise: --rectify mends it"
+    assert str(check_pair(left, turned(right, -1)).lines()[-1]) == (
+        "the right picture is turned 1.0 degrees anticlockwise; rectify the pair (rectify)"
     )
-    assert "2.0 times the other's light" in check_pair(left, brighter(right, -1)).lines()[-1]
-    assert check_pair(right, left).lines()[-1].startswith("left and right are swapped")
-    assert check_pair(left, right).lines()[-1].startswith("nothing is amiss")
+    assert "2.0 times the other's light" in str(check_pair(left, brighter(right, -1)).lines()[-1])
+    assert str(check_pair(right, left).lines()[-1]).startswith("left and right are swapped")
+    assert str(check_pair(left, right).lines()[-1]).startswith("no defects")
 
 
 def test_convergence_is_named_as_rows_that_do_not_match(pairs):
@@ -104,12 +104,12 @@ def test_pictures_of_two_scenes_and_plain_ones_have_too_few_matches(pairs):
         found = check_pair(left, right)
         assert found.defects == ("too_few_matches",)
         assert found.lines() == found.warnings()
-        assert found.lines()[0].startswith("expected two pictures of one scene, found ")
+        assert str(found.lines()[0]).startswith("expected two pictures of one scene, found ")
 
 
 def test_each_defect_has_its_words(pairs):
     found = check_pair(*pairs[0])
-    assert all(len(found._told(defect)) > 20 for defect in DEFECTS)
+    assert all(len(str(found._note(defect))) > 20 for defect in DEFECTS)
 
 
 @pytest.mark.testdata

@@ -19,7 +19,7 @@ from rig_examples import (
 
 from stereoweave.cameras import rectify
 from stereoweave.cameras.rig import Optics, Rig
-from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.errors import FormatError, Note, StereoweaveError
 from stereoweave.matching.matcher import Matcher
 from stereoweave.stereo import StereoCamera, StereoPair
 
@@ -160,13 +160,14 @@ def test_a_rectified_rig_gives_its_camera_and_leaves_the_pictures(rng):
     assert rectified.pair.camera == StereoCamera(
         focal_px=500, baseline_m=0.1, cx_px=310, cy_px=240, doffs_px=12
     )
-    assert "taken as they are" in rectified.notes[-1]
+    assert "taken as they are" in rectified.notes[-1].text
 
 
 def test_what_was_assumed_and_done_is_said(wall, rig, rng):
-    assert "turned by" in wall.notes[-1]
-    told = rectify.rectify(noise(rng), replace(rig, name="rig.yml", notes=("metres were assumed",))).notes
-    assert told[0] == "metres were assumed" and "rectified by rig.yml" in told[1]
+    assert "turned by" in wall.notes[-1].text
+    assumed = Note("metres were assumed")
+    notes = rectify.rectify(noise(rng), replace(rig, name="rig.yml", notes=(assumed,))).notes
+    assert notes[0] == assumed and "rectified by rig.yml" in notes[1].text
 
 
 @pytest.mark.parametrize(

@@ -189,7 +189,7 @@ def test_kittis_colour_cameras_are_read_from_calib_txt(tmp_path):
     assert (camera.focal_px, camera.cx_px, camera.cy_px, camera.doffs_px) == (700, 600, 170, 0)
     assert camera.baseline_m == pytest.approx((35 + 336) / 700)
     assert rig.size_px is None
-    assert "2 is taken for the left one" in rig.notes[0]
+    assert "2 is taken for the left one" in rig.notes[0].text
 
 
 def test_kittis_grey_cameras_are_read_where_the_colour_ones_are_missing(tmp_path):
@@ -285,13 +285,13 @@ def test_opencvs_yaml_in_millimetres_is_read_in_metres_and_says_so(tmp_path):
     np.testing.assert_array_equal(rig.left.distortion, [-0.28, 0.09, 0, 0, 0])
     np.testing.assert_array_equal(rig.right.matrix, [[552, 0, 321], [0, 553, 241], [0, 0, 1]])
     assert rig.size_px == (640, 480)
-    assert len(rig.notes) == 1 and "taken for millimetres" in rig.notes[0]
+    assert len(rig.notes) == 1 and "taken for millimetres" in rig.notes[0].text
 
 
 def test_a_short_baseline_without_unit_is_taken_for_metres(tmp_path):
     rig = read_rig(stored(tmp_path, OPENCV.replace("-120., 0., 1.", "-0.12, 0., 0.001")))
     np.testing.assert_allclose(rig.translation_m, [-0.12, 0, 0.001])
-    assert "taken for metres" in rig.notes[0]
+    assert "taken for metres" in rig.notes[0].text
 
 
 def test_a_unit_and_a_lens_that_are_stated_need_no_guess(tmp_path):
@@ -309,7 +309,7 @@ def test_four_coefficients_are_a_pinholes_unless_the_file_says_fisheye(tmp_path)
         "550., 0., 320., 0., 551., 240., 0., 0. ]", "550., 0., 320., 0., 551., 240., 0., 0., 1. ]"
     )
     guessed = read_rig(stored(tmp_path, four))
-    assert not guessed.left.fisheye and "taken for pinhole" in guessed.notes[-1]
+    assert not guessed.left.fisheye and "taken for pinhole" in guessed.notes[-1].text
     for said in ("distortion_model: fisheye", "fisheye_model: 1", "camera_model: Kannala-Brandt"):
         assert read_rig(stored(tmp_path, f"{four}{said}\n")).left.fisheye
 

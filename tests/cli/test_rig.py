@@ -30,12 +30,12 @@ def turned(tmp_path) -> str:
 
 def test_a_sound_pair_passes_the_check(capsys):
     assert main(["check", LEFT, RIGHT]) == 0
-    assert "nothing is amiss" in capsys.readouterr().out
+    assert "no defects" in capsys.readouterr().out
 
 
 def test_swapped_pictures_fail_the_check_and_are_told_so(capsys):
     assert main(["check", RIGHT, LEFT]) == 1
-    assert "swapped: give them the other way round" in capsys.readouterr().out
+    assert "swapped; give them the other way round" in capsys.readouterr().out
 
 
 def test_the_check_gives_its_numbers_as_json(turned, capsys):

@@ -286,7 +286,7 @@ def test_what_is_amiss_with_a_pair_is_part_of_what_is_printed(pictures, capfd, c
     printed, told = capfd.readouterr()
     assert told == ""
     notes = json.loads(printed)["notes"] if "--json" in command else printed.splitlines()
-    assert [note for note in notes if note.startswith("sure of only 0 % of the picture")] != []
+    assert [note for note in notes if note.startswith("only 0 % of the disparities are confident")] != []
 
 
 @pytest.mark.parametrize("disparity_px", [-3.0, 300.0])

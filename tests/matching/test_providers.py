@@ -107,7 +107,7 @@ def test_every_command_that_matches_takes_a_provider_and_leaves_nothing_behind_w
     assert main([*words.split(), "--provider", "gpu"]) == 2
     printed, told = capsys.readouterr()
     assert printed == ""
-    assert told == f"stereoweave: provider: expected one of {', '.join(PROVIDERS)}, found 'gpu'\n"
+    assert told == f"stereoweave: --provider: expected one of {', '.join(PROVIDERS)}, found 'gpu'\n"
     assert {path.name for path in Path().iterdir()} == {"left.png", "right.png"}
 
 
@@ -128,8 +128,8 @@ def test_out_of_memory_is_no_fault_of_the_file(tmp_path):
     ) as caught:
         vast.estimate(*noise())
     line = str(caught.value)
-    assert "try smaller pictures, or fewer processes" in line
-    assert "--provider cpu" not in line
+    assert "use smaller pictures, or fewer processes" in line
+    assert "run it on cpu" not in line
     assert "\n" not in line
 
 

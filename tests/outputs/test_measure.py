@@ -200,7 +200,7 @@ def test_the_command_measures_between_two_pixels(capfd):
         ),
         ("1,2,3", {"calib": EXAMPLES / "calib.txt"}, "--from: .* found '1,2,3'"),
         ("a,b", {"calib": EXAMPLES / "calib.txt"}, "--from: .* found 'a,b'"),
-        ("320,240", {}, "--calib.*--focal-px and --baseline-m"),
+        ("320,240", {}, r"give a calibration.*\(calibration, focal_px, baseline_m\)"),
         ("320,240", {"range_px": "9,3"}, "--range: .* found '9,3'"),
         ("320,240", {"range_px": "nan,3"}, "--range: .* found 'nan,3'"),
     ],

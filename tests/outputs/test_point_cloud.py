@@ -209,7 +209,7 @@ def values(tree: dict, data: bytes, accessor_at: int) -> np.ndarray:
 def test_metres_need_a_camera(tmp_path):
     pair = pair_of((40, 60), camera=None)
     for make in (point_cloud, surface):
-        with pytest.raises(StereoweaveError, match="--calib.*--focal-px and --baseline-m"):
+        with pytest.raises(StereoweaveError, match=r"calibration.*\(calibration, focal_px, baseline_m\)"):
             make(pair, estimate_of(two_planes()))
 
 

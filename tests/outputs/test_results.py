@@ -112,13 +112,13 @@ def test_results_do_not_move_into_a_folder_that_another_command_writes_to(folder
 
 
 def test_an_unknown_file_is_told_with_those_that_there_are():
-    with pytest.raises(StereoweaveError, match=r"^--write: .*disparity.npy.*mesh.glb.*found 'cloud.obj'$"):
+    with pytest.raises(StereoweaveError, match=r"^files: .*disparity.npy.*mesh.glb.*found 'cloud.obj'$"):
         DepthJob(files=("depth.npy", "cloud.obj"))
 
 
 @pytest.mark.parametrize("file", [file for file in FILES if needs_camera(file)])
 def test_metres_without_a_camera_are_refused_before_anything_is_written(folder, file):
-    with pytest.raises(StereoweaveError, match=f"^{file}: .*--calib.*--focal-px and --baseline-m"):
+    with pytest.raises(StereoweaveError, match=rf"^{file}: .*\(calibration, focal_px, baseline_m\)"):
         make_depth(PICTURES, Path("out"), DepthJob(files=(file,)))
     assert not Path("out").exists()
 
@@ -126,7 +126,7 @@ def test_metres_without_a_camera_are_refused_before_anything_is_written(folder, 
 def test_all_without_a_camera_is_all_but_metres_and_says_so(folder):
     _, notes = make_depth(PICTURES, Path("out"), DepthJob(files=("all",)))
     assert names_in("out") == {*ALWAYS, "disparity.npy", "disparity.tiff"}
-    assert [note for note in notes if "--focal-px and --baseline-m" in note] != []
+    assert [note for note in notes if "(calibration, focal_px, baseline_m)" in str(note)] != []
 
 
 def test_points_without_trimesh_name_the_extra_before_anything_is_written(folder, monkeypatch):
@@ -142,7 +142,10 @@ def test_a_pair_without_a_point_gets_the_rest_and_a_line(folder):
     job = replace(WITH_CAMERA, files=("cloud.ply", "mesh.glb"))
     _, notes = make_depth(PICTURES, Path("out"), job)
     assert names_in("out") == {*ALWAYS, "depth.png"}
-    assert [note[:13] for note in notes if note.startswith("no ")] == ["no cloud.ply:", "no mesh.glb: "]
+    assert [note.text[:13] for note in notes if note.text.startswith("no ")] == [
+        "no cloud.ply:",
+        "no mesh.glb: ",
+    ]
 
 
 def result_half_seen() -> Result:

@@ -130,7 +130,7 @@ def test_an_arrangement_is_for_one_file_and_one_of_the_formats(tmp_path):
     two = [tmp_path / "a.png", tmp_path / "b.png"]
     assert "found two" in refusal(*two, arrangement="crossed", kind=StereoweaveError)
     message = refusal(two[0], arrangement="sideways", kind=StereoweaveError)
-    assert message == f"--format: expected one of {', '.join(FORMATS)}, found 'sideways'"
+    assert message == f"arrangement: expected one of {', '.join(FORMATS)}, found 'sideways'"
 
 
 def test_the_help_of_format_names_all_of_them():
@@ -147,7 +147,7 @@ def test_two_files_are_turned_upright_each_as_its_tag_says(tmp_path, pair, lies)
     stored = [np.rot90(eye, quarter_turns) for eye in (pair.left, pair.right)]
     opened = open_pictures(write_two(tmp_path, *stored, tagged(lies), tagged(lies)))
     assert_eyes(opened, pair)
-    assert opened.notes == ("turned upright as EXIF says",)
+    assert list(map(str, opened.notes)) == ["turned upright as EXIF says"]
 
 
 @pytest.mark.parametrize("lost", ["left", "right"])
@@ -157,7 +157,7 @@ def test_a_tag_that_one_of_two_files_has_lost_goes_for_both(tmp_path, pair, lost
     tags = [None if lost == side else tagged(lies) for side in ("left", "right")]
     opened = open_pictures(write_two(tmp_path, *stored, *tags))
     assert_eyes(opened, pair)
-    assert opened.notes == ("both pictures turned upright as EXIF of the other says",)
+    assert list(map(str, opened.notes)) == ["both pictures turned upright as EXIF of the other says"]
 
 
 @pytest.mark.parametrize("lies", [3, 6])
@@ -165,7 +165,9 @@ def test_a_file_that_was_turned_when_it_lost_its_tag_is_left_as_it_is(tmp_path, 
     stored = np.rot90(pair.left, {3: 2, 6: 1}[lies])
     opened = open_pictures(write_two(tmp_path, stored, pair.right, tagged(lies)))
     assert_eyes(opened, pair)
-    assert opened.notes == ("one picture turned upright as EXIF says, the other left as it is",)
+    assert list(map(str, opened.notes)) == [
+        "one picture turned upright as EXIF says, the other left as it is"
+    ]
 
 
 def test_cameras_that_lay_differently_are_each_believed(tmp_path, pair):
@@ -178,7 +180,7 @@ def test_cameras_that_lay_differently_are_each_believed(tmp_path, pair):
 def test_where_two_tags_would_make_two_sizes_the_left_one_is_believed(tmp_path, pair):
     opened = open_pictures(write_two(tmp_path, pair.left, pair.right, tagged(1), tagged(6)))
     assert_eyes(opened, pair)
-    assert "though the right one differs" in opened.notes[0]
+    assert "though the right one differs" in opened.notes[0].text
 
 
 def test_a_side_by_side_picture_is_turned_as_a_whole(tmp_path, pair):
@@ -186,7 +188,7 @@ def test_a_side_by_side_picture_is_turned_as_a_whole(tmp_path, pair):
     Image.fromarray(whole).save(tmp_path / "both.png", exif=tagged(3))
     opened = open_pictures([tmp_path / "both.png"])
     assert_eyes(opened, pair)
-    assert "turned upright as EXIF says" in opened.notes
+    assert "turned upright as EXIF says" in [note.text for note in opened.notes]
 
 
 def test_the_first_picture_of_an_mpo_file_says_how_both_lie(tmp_path, pair):
@@ -213,7 +215,9 @@ def test_an_mpo_file_holds_the_left_picture_and_then_the_right_one(tmp_path, pai
     opened = open_pictures([write_mpo(tmp_path / name, pair.left, pair.right)], arrangement)
     assert_eyes(opened, pair, tolerance=3)
     assert opened.arrangement == "mpo"
-    assert opened.notes == ("mpo, the two pictures of the file; --format names another",)
+    assert list(map(str, opened.notes)) == [
+        "mpo, the two pictures of the file; override it if it is wrong (arrangement)"
+    ]
 
 
 def with_frame_tags(path, numbers, baseline):
@@ -310,7 +314,9 @@ def test_a_jps_file_says_how_it_holds_its_views(tmp_path, pair, flags, layout, a
     for name in ("a.jps", "a.jpg"):
         opened = open_pictures([write_jps(tmp_path / name, image, flags, layout)])
         assert opened.arrangement == arrangement
-        assert opened.notes == (f"{arrangement}, as its JPS mark says; --format names another",)
+        assert list(map(str, opened.notes)) == [
+            f"{arrangement}, as its JPS mark says; override it if it is wrong (arrangement)"
+        ]
         assert_eyes(opened, pair, tolerance=12)
 
 
@@ -326,7 +332,9 @@ def test_a_jps_file_that_says_nothing_is_crossed(tmp_path, pair):
     image.save(tmp_path / "a.jps", "JPEG", **FINE)
     opened = open_pictures([tmp_path / "a.jps"])
     assert_eyes(opened, pair, tolerance=3)
-    assert opened.notes == ("crossed, as is usual of .jps files; --format names another",)
+    assert list(map(str, opened.notes)) == [
+        "crossed, as is usual of .jps files; override it if it is wrong (arrangement)"
+    ]
     image.save(tmp_path / "b.jpg", "JPEG", **FINE)
     assert open_pictures([tmp_path / "b.jpg"], "jps").arrangement == "crossed"
 
@@ -371,7 +379,9 @@ def test_upright_views_beside_each_other_are_not_taken_for_squeezed_ones(tmp_pat
 def test_a_guess_is_told_and_how_to_overrule_it(tmp_path, pair):
     write_image(tmp_path / "view.png", np.hstack([pair.left, pair.right]))
     opened = open_pictures([tmp_path / "view.png"])
-    assert opened.notes == ("side_by_side, guessed from name and looks; --format names another",)
+    assert list(map(str, opened.notes)) == [
+        "side_by_side, detected from name and content; override it if it is wrong (arrangement)"
+    ]
     assert_eyes(opened, pair)
     assert open_pictures([tmp_path / "view.png"], "side_by_side").notes == ()
 
@@ -398,8 +408,8 @@ def test_an_ordinary_photograph_is_refused_with_what_to_do(tmp_path, photograph)
     assert message.startswith(
         f"{path}: expected a stereo picture, two views side by side or one above the other"
     )
-    assert "name its --format (side_by_side, " in message
-    assert message.endswith("or give two files, left and right")
+    assert "; give two files, left and right; or choose one of side_by_side, " in message
+    assert message.endswith(" (arrangement)")
 
 
 def rendered(pair):
@@ -471,7 +481,7 @@ def test_colours_are_converted_from_the_profile_of_the_picture(tmp_path, pair):
         Image.fromarray(eye[..., ::-1].copy()).save(path, icc_profile=swapped)
     opened = open_pictures(paths)
     assert_eyes(opened, pair, tolerance=1)
-    assert opened.notes == ("colours converted from Swapped",)
+    assert list(map(str, opened.notes)) == ["colours converted from Swapped"]
 
 
 def test_the_red_of_srgb_is_found_within_display_p3(tmp_path):
@@ -480,7 +490,7 @@ def test_the_red_of_srgb_is_found_within_display_p3(tmp_path):
     Image.new("RGB", (128, 64), (234, 51, 35)).save(path, icc_profile=profile("Display P3", *DISPLAY_P3))
     opened = open_pictures([path], "side_by_side")
     np.testing.assert_allclose(opened.pair.left[5, 5].astype(int), [255, 0, 0], atol=8)
-    assert opened.notes == ("colours converted from Display P3",)
+    assert list(map(str, opened.notes)) == ["colours converted from Display P3"]
 
 
 def test_a_picture_in_srgb_keeps_its_values(tmp_path, pair):
@@ -498,13 +508,14 @@ def test_a_damaged_profile_is_ignored_and_told(tmp_path, pair, content):
     Image.fromarray(np.hstack([pair.left, pair.right])).save(path, icc_profile=content)
     opened = open_pictures([path], "side_by_side")
     assert_eyes(opened, pair)
-    assert "the colour profile cannot be used" in opened.notes[0]
+    assert "the colour profile cannot be used" in opened.notes[0].text
 
 
 def test_a_profile_of_one_picture_alone_is_told_with_its_side(tmp_path, pair):
     left, right = write_two(tmp_path, pair.left, pair.right)
     Image.fromarray(pair.right).save(right, icc_profile=profile("Display P3", *DISPLAY_P3))
-    assert open_pictures([left, right]).notes == ("right picture: colours converted from Display P3",)
+    (note,) = open_pictures([left, right]).notes
+    assert note.text == "right picture: colours converted from Display P3"
 
 
 def test_a_picture_for_print_becomes_rgb(tmp_path):

@@ -187,9 +187,9 @@ def test_a_file_whose_name_has_brackets_is_no_pattern(tmp_path):
 
 def test_unequal_counts_are_refused_with_both(tmp_path):
     folder = put(tmp_path, "l/1.png", "l/2.png", "r/1.png")
-    with pytest.raises(StereoweaveError, match=r"found 2 for --left .* and 1 for --right"):
+    with pytest.raises(StereoweaveError, match=r"found 2 for .*/l/\* and 1 for .*/r/\*"):
         pairs_by_globs(f"{folder}/l/*", f"{folder}/r/*")
-    with pytest.raises(StereoweaveError, match=r"--right .*expected pictures, found none"):
+    with pytest.raises(StereoweaveError, match=r"^right: expected pictures that match .*/x/\*, found none"):
         pairs_by_globs(f"{folder}/l/*", f"{folder}/x/*")
 
 
@@ -274,8 +274,10 @@ def test_the_words_of_the_command_line_name_one_source(tmp_path):
     assert find_pairs([Path(left), Path(right)], None, None, None) is None
     for words, found in {
         ((), None, None, None): "none",
-        ((folder,), left, right, None): "pictures with --left and --right",
+        ((folder,), left, right, None): "pictures with patterns",
         ((), left, None, None): "one of the two patterns",
     }.items():
-        with pytest.raises(StereoweaveError, match=f"or --list, found {found}"):
+        with pytest.raises(
+            StereoweaveError, match=f"or a list of pairs, found {found}; .*(left, right, listed)"
+        ):
             find_pairs(*words)

@@ -357,7 +357,7 @@ def test_photographs_of_different_exposure_make_one_look_on_the_way_from_one_to_
 @pytest.mark.parametrize("convergence_px", [float("nan"), float("inf"), -41.0])
 def test_a_convergence_beyond_the_pictures_width_is_refused(rng, convergence_px):
     left, right, estimate = random_scene(rng)
-    with pytest.raises(ValueError, match=r"^convergence: expected -40 to 40 px, .*, got "):
+    with pytest.raises(ValueError, match=r"^convergence_px: expected -40 to 40 px, .*, got "):
         Renderer(StereoPair(left=left, right=right), estimate, convergence_px=convergence_px)
 
 

@@ -329,13 +329,13 @@ def test_a_port_that_is_taken_is_one_line(capsys):
         (["--timeout-s", "inf"], "--timeout-s: expected a finite number, found inf"),
         (["--provider", "abacus"], "abacus"),
         (["--address", "127.0.0.1:1"], "127.0.0.1:1: expected the head of a Ray cluster"),
-        (["--replicas", "999"], "--replicas 999 --threads 1: expected at most"),
+        (["--replicas", "999"], "--replicas: expected at most"),
         (["--host", "0.0.0.0"], "--host 0.0.0.0: expected an address of this machine alone"),
         (
             ["--host", "0.0.0.0", "--address", "127.0.0.1:1"],
             "put a proxy before the service (deploy/nginx.conf)",
         ),
-        (["--host", "0.0.0.0", "--behind-proxy", "--replicas", "999"], "--replicas 999 --threads 1"),
+        (["--host", "0.0.0.0", "--behind-proxy", "--replicas", "999"], "--replicas: expected at most"),
         (["--token-file", "none"], "--token-file none: expected a file with a token, found"),
         (["--token-file", os.devnull], "expected a token of letters, digits and -._~+/=, found nothing"),
         (["--token-file", str(EXAMPLES / "left.png")], "left.png: expected a file with a token, found"),
@@ -356,8 +356,8 @@ def test_a_cluster_without_room_is_said_and_not_waited_for(ray_address, capsys):
     assert main(["serve", "--port", "0", "--address", ray_address, "--threads", "3"]) == 2
     told = capsys.readouterr().err
     assert told == (
-        "stereoweave: --replicas 1 --threads 3: expected at most 0, for which there is room, found 1; "
-        "each takes 3 cores\n"
+        "stereoweave: --replicas: expected at most 0, for which there is room, found 1; each takes 3 cores; "
+        "ask for less (--replicas, --threads)\n"
     )
 
 

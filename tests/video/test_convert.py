@@ -160,9 +160,9 @@ def test_disparities_behind_the_screen_are_found_however_late_in_a_film(tmp_path
 def test_depth_in_16_bits_says_what_it_cannot_hold(tmp_path, capsys):
     film = write_side_by_side(tmp_path / "in.mp4", converged_pairs([40, 40]), codec="libx264")
     assert run(film, tmp_path / "out.mkv", "--depth16", "--arrangement", "side_by_side") == 0
-    [line] = [line for line in capsys.readouterr().err.splitlines() if "--depth16" in line]
-    assert line.startswith("--depth16 holds 0 to 255.99 px: of this film's disparities, -2")
-    assert line.endswith("what lies beyond is clipped; --depth shows all of them in colours")
+    [line] = [line for line in capsys.readouterr().err.splitlines() if "16-bit" in line]
+    assert line.startswith("16-bit grey holds 0 to 255.99 px: this video's disparities, -2")
+    assert line.endswith("are clipped; show all of them in colours (--depth)")
 
 
 def _red_from_green(anaglyph: np.ndarray) -> float:
@@ -230,8 +230,8 @@ def test_another_order_does_not_go_on_with_what_was_begun(tmp_path, monkeypatch,
     assert run(film, tmp_path / "out.mp4", "--position", "0.6") == 2
     folder = tmp_path / "out.mp4.parts"
     assert capsys.readouterr().err == (
-        f"stereoweave: {folder}: expected parts of the same film, found parts begun with --position 0.4; "
-        "remove that folder, or give the words that it was begun with\n"
+        f"stereoweave: {folder}: expected parts of the same video, found parts begun with position 0.4; "
+        "remove that folder, or give the same settings again\n"
     )
 
 
@@ -271,22 +271,26 @@ def test_a_damaged_frame_is_told_with_its_time_and_is_not_the_end(tmp_path, caps
 @pytest.mark.parametrize(
     ("out", "words", "told"),
     [
-        ("out.mp4", [], "expected one of --depth, --depth16, --position, --layout, found none"),
-        ("out.mp4", ["--depth", "--position", "0"], "found --depth and --position"),
-        ("out.mp4", ["--layout", "wiggle"], "layout: expected one of side_by_side, "),
-        ("out.mp4", ["--position", "2.5"], "position: expected -1 to 2"),
+        ("out.mp4", [], "found none; choose one (--depth, --depth16, --position, --layout)"),
+        (
+            "out.mp4",
+            ["--depth", "--position", "0"],
+            "expected one kind of video to make, found depth and position; ",
+        ),
+        ("out.mp4", ["--layout", "wiggle"], "--layout: expected one of side_by_side, "),
+        ("out.mp4", ["--position", "2.5"], "--position: expected -1 to 2"),
         ("out.mp4", ["--position", "1", "--strength", "4"], "where strength 4 takes 1"),
         ("out.gif", ["--depth"], "expected the ending of a film, .mp4, .mkv, .mov, found '.gif'"),
         ("out.mp4", ["--depth16"], "expected the ending .mkv for depth in 16 bits, found '.mp4'"),
         ("in.mp4", ["--depth"], "expected another file than the film it is made from"),
         ("out.mp4", ["--depth", "--model", "huge"], "unknown model 'huge'"),
-        ("out.mp4", ["--depth", "--arrangement", "diagonal"], "expected an arrangement, side_by_side"),
-        ("out.mp4", ["--position", "0", "--convergence", "nan"], "--convergence: expected a number that is"),
-        ("out.mp4", ["--layout", "quilt", "--convergence", "-inf"], "not infinite or nan, found -inf"),
-        ("out.mp4", ["--position", "0.5", "--strength", "inf"], "--strength: expected a number that is not"),
+        ("out.mp4", ["--depth", "--arrangement", "diagonal"], "--arrangement: expected one of side_by_side"),
+        ("out.mp4", ["--position", "0", "--convergence", "nan"], "--convergence: expected a finite number"),
+        ("out.mp4", ["--layout", "quilt", "--convergence", "-inf"], "expected a finite number, found -inf"),
+        ("out.mp4", ["--position", "0.5", "--strength", "inf"], "--strength: expected a finite number"),
         ("out.mp4", ["--depth", "--convergence", "3"], "--convergence: expected a view or a layout of views"),
-        ("out.mkv", ["--depth16", "--strength", "2"], "for it, found --depth16"),
-        ("out.mp4", ["--layout", "rgbd", "--convergence", "0"], "for it, found --layout rgbd"),
+        ("out.mkv", ["--depth16", "--strength", "2"], "for it, found depth16"),
+        ("out.mp4", ["--layout", "rgbd", "--convergence", "0"], "for it, found layout rgbd"),
         ("out.mp4", ["--depth", "--rate", "24"], "expected pictures for a rate, found a video"),
         ("out.mp4", ["--depth", "--rate", "1/0"], "--rate: expected frames a second"),
         ("out.mp4", ["--depth", "--rate", "-5"], "--rate: expected frames a second"),
@@ -321,7 +325,7 @@ def test_swapped_sides_are_told_with_the_arrangement_that_mends_them(tmp_path, c
     crossed = write_side_by_side(tmp_path / "in.mp4", pairs, arrangement="crossed", codec="libx264")
     assert run(crossed, tmp_path / "a.mp4", "--depth", "--arrangement", "side_by_side") == 0
     told = capsys.readouterr().err
-    assert told.count("swapped: give --arrangement crossed") == 1
+    assert told.count("swapped; choose crossed (--arrangement)") == 1
     assert run(crossed, tmp_path / "b.mp4", "--depth", "--arrangement", "crossed") == 0
     assert "swapped" not in capsys.readouterr().err
 
@@ -370,7 +374,7 @@ def test_a_series_of_which_one_picture_changed_is_not_gone_on_with(tmp_path, mon
     os.utime(folder / "006.png", ns=(status.st_atime_ns, status.st_mtime_ns + 1_000_000))
     capsys.readouterr()
     assert run(folder / pattern, out, *words) == 2
-    assert "found parts begun with another FILM;" in capsys.readouterr().err
+    assert "found parts begun with another film;" in capsys.readouterr().err
 
 
 def test_a_film_taken_apart_otherwise_is_not_gone_on_with(tmp_path, monkeypatch, capsys):
@@ -380,7 +384,7 @@ def test_a_film_taken_apart_otherwise_is_not_gone_on_with(tmp_path, monkeypatch,
         assert run(film, tmp_path / "out.mp4", "--position", "0.5") == 130
     capsys.readouterr()
     assert run(film, tmp_path / "out.mp4", "--position", "0.5", "--arrangement", "crossed") == 2
-    assert "found parts begun with --arrangement side_by_side;" in capsys.readouterr().err
+    assert "found parts begun with arrangement side_by_side;" in capsys.readouterr().err
 
 
 def test_a_film_stopped_while_it_is_opened_says_what_it_says_later(tmp_path, monkeypatch, capsys):

@@ -136,7 +136,7 @@ def test_a_video_that_is_not_3d_is_refused_with_what_to_do(tmp_path):
     path = write_video(tmp_path / "film.mkv", [left for left, _ in example_pairs(5)])
     message = refusal(path)
     assert message.startswith(f"{path}: expected 3-D video")
-    assert "--arrangement" in message
+    assert "(arrangement)" in message
     assert "two files" in message
     assert open_footage([path], "side_by_side_half").size_px == (160, 96)
 

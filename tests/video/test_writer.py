@@ -324,12 +324,12 @@ def test_a_disk_that_is_full_from_the_start_is_one_line_with_the_file(tmp_path):
 
 @pytest.mark.parametrize(
     ("value", "told"),
-    [(True, "with --x"), (False, "without --x"), (None, "without --x"), (0.5, "with --x 0.5")],
+    [(True, "with x"), (False, "without x"), (None, "without x"), (0.5, "with x 0.5")],
 )
 def test_what_a_film_was_begun_with_is_told_as_users_write_it(tmp_path, value, told):
     film = tmp_path / "film.mp4"
-    begin(film, {"--x": value})
-    with pytest.raises(StereoweaveError, match=f"found parts begun {told}; "), growing(film, {"--x": "else"}):
+    begin(film, {"x": value})
+    with pytest.raises(StereoweaveError, match=f"found parts begun {told}; "), growing(film, {"x": "else"}):
         pass
 
 

@@ -28,8 +28,9 @@ def write_collages(out: Path, pairs: int, seed: int, size_px: tuple[int, int]) -
     """
     if min(size_px) < SMALLEST_SIDE_PX:
         raise StereoweaveError(
-            f"--size: expected at least {SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX} pixels, "
-            f"found {size_px[1]}x{size_px[0]}"
+            f"expected at least {SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX} pixels, "
+            f"found {size_px[1]}x{size_px[0]}",
+            setting="size_px",
         )
     make_folder(out)
     with lock_output(out):

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.io.files import place_for, replacing
 from stereoweave.learn import checkpoint
 from stereoweave.learn.export.confidence import draw_reliability
@@ -37,10 +37,13 @@ class MatcherFiles:
 
     def __post_init__(self) -> None:
         if not self.wanted:
-            raise StereoweaveError("export: expected an output file, found none; give --out or --half")
+            raise StereoweaveError(
+                "export: expected an output file, found none",
+                remedy=Remedy("give at least one", ("out", "half", "eight_bits")),
+            )
         for file in self.wanted:
             if file.suffix != ".onnx":
-                raise StereoweaveError(f"{file}: expected a name that ends in .onnx, as --model takes it")
+                raise StereoweaveError(f"{file}: expected a name that ends in .onnx")
         if len(set(self.wanted)) < len(self.wanted):
             raise StereoweaveError(f"{self.wanted[0]}: expected a different file for each variant")
 

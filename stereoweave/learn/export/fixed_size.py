@@ -51,8 +51,9 @@ def check_size(width: int, height: int, multiple_of: int) -> None:
     if min(width, height) < SMALLEST_SIDE_PX or width % multiple_of or height % multiple_of:
         suggested = "x".join(str(max(-(-x // multiple_of), 2) * multiple_of) for x in (width, height))
         raise StereoweaveError(
-            f"--size: expected multiples of {multiple_of} of at least {SMALLEST_SIDE_PX}, found "
-            f"{width}x{height}; the next is {suggested}, and smaller pictures are padded to it"
+            f"expected multiples of {multiple_of} of at least {SMALLEST_SIDE_PX}, found {width}x{height}; "
+            f"choose {suggested}, to which smaller pictures are padded",
+            setting="size",
         )
 
 

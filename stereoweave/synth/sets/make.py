@@ -133,8 +133,8 @@ def make(  # noqa: PLR0913 - mirrors the command's options
                 )
                 _check_shared(out, _missing_pairs(spec, pairs, out, layout))
         except StereoweaveError as error:
-            raise StereoweaveError(
-                f"{error}; all finished pairs are complete: rerun the same command to resume"
+            raise error.extended(
+                "all finished pairs are complete: rerun the same command to resume"
             ) from error
         finally:
             LAYOUTS[layout].remove_unfinished(out)
@@ -184,30 +184,35 @@ def _check_facts(path: Path, facts: dict[str, Any]) -> None:
 
 def _check(spec: RenderSpec, pairs: int, layout: str) -> None:
     if layout not in LAYOUTS:
-        raise StereoweaveError(f"layout: expected one of {', '.join(LAYOUTS)}, found {layout!r}")
+        raise StereoweaveError(f"expected one of {', '.join(LAYOUTS)}, found {layout!r}", setting="layout")
     least = {"pairs": (pairs, 1), "seed": (spec.seed, 0), "frames": (spec.frames, 1)}
     for name, (value, smallest) in least.items():
         if value < smallest:
-            raise StereoweaveError(f"{name}: expected at least {smallest}, found {value}")
+            raise StereoweaveError(f"expected at least {smallest}, found {value}", setting=name)
     width_px, height_px = spec.size_px
     if min(spec.size_px) < SMALLEST_SIDE_PX or max(spec.size_px) > _LARGEST_SIDE_PX:
         raise StereoweaveError(
-            f"--size: expected {SMALLEST_SIDE_PX} to {_LARGEST_SIDE_PX} px a side, "
-            f"found {width_px}x{height_px}"
+            f"expected {SMALLEST_SIDE_PX} to {_LARGEST_SIDE_PX} px a side, found {width_px}x{height_px}",
+            setting="size_px",
         )
     for position in spec.views:
         if not FIRST_POSITION <= position <= LAST_POSITION:
             raise StereoweaveError(
-                f"view: expected positions of {FIRST_POSITION} (0 is the left camera, 1 the right one) "
-                f"to {LAST_POSITION}, found {position}"
+                f"expected positions of {FIRST_POSITION} (0 is the left camera, 1 the right one) "
+                f"to {LAST_POSITION}, found {position}",
+                setting="views",
             )
     names = {f"{position:.2f}" for position in spec.views}
     if len(names) < len(spec.views):
         raise StereoweaveError(
-            f"view: expected positions that differ in their first two decimals, found {spec.views}"
+            f"expected positions that differ in their first two decimals, found {spec.views}",
+            setting="views",
         )
     if layout == "paper" and spec.views:
-        raise StereoweaveError(f"view: expected none in the paper's layout, found {spec.views}; take shards")
+        raise StereoweaveError(
+            f"expected none in the paper's layout, found {spec.views}; use the layout shards",
+            setting="views",
+        )
 
 
 def _set_facts(spec: RenderSpec, layout: str, pair_maker: PairMaker) -> dict[str, Any]:

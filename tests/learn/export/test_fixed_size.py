@@ -57,7 +57,7 @@ def test_a_matcher_pads_smaller_pictures_to_it(fixed, rng):
 )
 def test_a_size_that_the_network_cannot_take_is_refused(tmp_path, width, height, suggested):
     message = complaint(fixed_size.fix_size, SMALL, tmp_path / "out.onnx", width, height)
-    assert message.startswith(f"--size: expected multiples of 16 of at least 32, found {width}x{height}; ")
+    assert message.startswith(f"size: expected multiples of 16 of at least 32, found {width}x{height}; ")
     assert suggested in message
     assert list(tmp_path.iterdir()) == []
 
