@@ -1,0 +1,78 @@
+"""Error texts and notes of the page, where a setting is named by its label."""
+
+import html
+import json
+import re
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from error_examples import LAYOUTS, write_error_examples
+from page_examples import Visitor, file_data, start, stop
+
+pytestmark = pytest.mark.system
+
+PAIR = {"left": "left.png", "right": "right.png"}
+Say = Callable[..., list[str]]
+
+ERRORS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
+    "left.png: expected a stereo picture, two views side by side or one above the other, found halves that "
+    "do not resemble each other; give two files, left and right; or choose one of "
+    f"{LAYOUTS} (“How one file holds both”)": ({"left": "left.png"}, {}),
+    "“How one file holds both”: expected one picture that holds both views, found two, left.png and "
+    "right.png; leave it out, and give the left one first": (PAIR, {"arrangement": "crossed"}),
+    "turned.yml: expected a calibration of rectified pictures, found lenses that distort; rectify the pair "
+    "by it (“Bring the rows to match”)": ({**PAIR, "calibration": "turned.yml"}, {}),
+    "metres: expected a baseline beside the focal length, found none; give the baseline (“Baseline, mm”)": (
+        PAIR,
+        {"focal": 500},
+    ),
+    "metres: expected a focal length in EXIF beside the baseline, found none; give the focal length (“Focal "
+    "length, px”)": (PAIR, {"baseline": 100}),
+    "“Bring the rows to match”: expected at least 40 points that both pictures show from two positions, "
+    "found 0 of 0 matches that agree; take pictures with more texture and more overlap; or give a "
+    "calibration (“Calibration file, for metres”)": (
+        {"left": "plain.png", "right": "plain.png"},
+        {"rectify": True},
+    ),
+}
+NOTES: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
+    "side_by_side, detected from name and content; override it if it is wrong (“How one file holds both”)": (
+        {"left": "both.png"},
+        {},
+    ),
+    "no metres after rectification by features; give a calibration (“Calibration file, for metres”)": (
+        PAIR,
+        {"focal": 600, "baseline": 100, "rectify": True},
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def say(tmp_path_factory) -> Iterator[Say]:
+    """What the page says, line by line, when these files and fields are given to it."""
+    folder = tmp_path_factory.mktemp("files")
+    write_error_examples(folder)
+    server, address = start(tmp_path_factory.mktemp("page"))
+
+    def say(files: dict[str, str], fields: dict[str, Any]) -> list[str]:
+        paths = visitor.upload(*(folder / name for name in files.values()))
+        given = {field: file_data(path) for field, path in zip(files, paths, strict=True)}
+        status, said = visitor.answer(visitor.press(**given, **fields))
+        assert status == 200
+        shown = next(part for part in json.loads(said)["data"] if 'class="told' in str(part))
+        return [html.unescape(line) for line in re.findall(r"<p>(.*?)</p>", str(shown))]
+
+    with Visitor(address) as visitor:
+        yield say
+    stop(server)
+
+
+@pytest.mark.parametrize("text", ERRORS)
+def test_an_error_names_settings_by_their_label(say, text):
+    assert say(*ERRORS[text]) == [text]
+
+
+@pytest.mark.parametrize("text", NOTES)
+def test_a_note_names_settings_by_their_label(say, text):
+    assert text in say(*NOTES[text])

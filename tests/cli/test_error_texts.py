@@ -1,0 +1,111 @@
+"""Error texts and notes of the command line, where a setting is named by its option."""
+
+from pathlib import Path
+
+import pytest
+from error_examples import LAYOUTS, write_error_examples
+
+from stereoweave.cli.root import main
+from stereoweave.outputs.results import FILES
+from stereoweave.rendering.layouts import LAYOUTS as VIEW_LAYOUTS
+from stereoweave.rendering.layouts import MOTIONS
+
+PAIR = "left.png right.png"
+NO_CAMERA = (
+    "expected a camera, for metres, found none; give a calibration, or the focal length and baseline of a "
+    "rectified pair (--calib, --focal-px, --baseline-m)"
+)
+ERRORS = {
+    "depth left.png -o out": "left.png: expected a stereo picture, two views side by side or one above the "
+    "other, found halves that do not resemble each other; give two files, left and right; or choose one of "
+    f"{LAYOUTS} (--format)",
+    f"depth {PAIR} --format crossed -o out": "--format: expected one picture that holds both views, found "
+    "two, left.png and right.png; leave it out, and give the left one first",
+    "view both.png --format diagonal -o out.png": f"--format: expected one of {LAYOUTS}, mpo, jps, found "
+    "'diagonal'",
+    f"depth {PAIR} --calib turned.yml -o out": "turned.yml: expected a calibration of rectified pictures, "
+    "found lenses that distort; rectify the pair by it (--rectify)",
+    f"depth {PAIR} --focal-px 500 -o out": "metres: expected a baseline beside the focal length, found none; "
+    "give the baseline (--baseline-m)",
+    f"depth {PAIR} --baseline-m 0.1 -o out": "metres: expected a focal length in EXIF beside the baseline, "
+    "found none; give the focal length (--focal-px)",
+    "view plain.png plain.png --rectify -o out.png": "--rectify: expected at least 40 points that both "
+    "pictures show from two positions, found 0 of 0 matches that agree; take pictures with more texture and "
+    "more overlap; or give a calibration (--calib)",
+    f"depth {PAIR} --write depth.npy -o out": f"depth.npy: {NO_CAMERA}",
+    f"depth {PAIR} --write x.obj -o out": "--write: expected all or one of "
+    f"{', '.join(FILES)}, found 'x.obj'",
+    f"measure {PAIR} --from 1,2 --to 3,4": NO_CAMERA,
+    f"depth {PAIR} --raw --refined -o out": "--raw: expected without refined: it is the network's own "
+    "disparity; leave one of them out (--raw, --refined)",
+    f"depth {PAIR} --range 700,800 -o out": "--range: expected disparities of -640 to 640 px, the width of "
+    "the pictures, got 700 and 800; leave it out to have it found",
+    f"depth {PAIR} --provider gpu -o out": "--provider: expected one of cpu, cuda, tensorrt, openvino, "
+    "coreml, directml, found 'gpu'",
+    f"depth {PAIR} --list list.txt -o out": "expected pictures or a folder, patterns of left and right "
+    "pictures, or a list of pairs, found pictures with a list; give exactly one of them (--left, --right, "
+    "--list)",
+    "depth --left none*.png --right right*.png -o out": "--left: expected pictures that match none*.png, "
+    "found none; quote the pattern",
+    "batch . out --gpus-each 1.5": "--gpus-each: expected 0, a part of 1 or a whole number, found 1.5",
+    f"view {PAIR} --position 3 -o out.png": "--position: expected -1 to 2 (0 left camera, 1 right), got 3",
+    f"view {PAIR} --layout diagonal -o out.png": "--layout: expected one of "
+    f"{', '.join([*VIEW_LAYOUTS, *MOTIONS])}, found 'diagonal'",
+    "video plain.png -o out.mp4": "expected one kind of video to make, found none; choose one (--depth, "
+    "--depth16, --position, --layout)",
+    "video plain.png --depth -o out.mp4": "plain.png: expected 3-D video, two views side by side or one "
+    "above the other, found too plain a picture to tell; give two files, left and right; or choose one of "
+    f"{LAYOUTS} (--arrangement)",
+    "video plain.png --depth --arrangement diagonal -o out.mp4": f"--arrangement: expected one of {LAYOUTS}, "
+    "found 'diagonal'",
+    "synth make pylon --pairs 1 --size 8x8 -o set": "--size: expected 32 to 4096 px a side, found 8x8",
+    "synth make pylon --pairs 1 --view 3 -o set": "--view: expected positions of -1.0 (0 is the left camera, "
+    "1 the right one) to 2.0, found 3.0",
+    "export small": "export: expected a file to write, found none; give at least one (--out, --half, "
+    "--eight-bits)",
+    "bench collages -o set --pairs 2 --size 64x16": "--size: expected at least 32x32 pixels, found 64x16",
+}
+NOTES = {
+    "check upper.png lower.png": "the right picture lies 2.0 px lower; rectify the pair (--rectify)",
+    "check both.png": "side_by_side, detected from name and content; override it if it is wrong (--format)",
+    "check right.png left.png": "left and right are swapped; give them the other way round",
+    f"depth {PAIR} --focal-px 600 --baseline-m 0.1 --rectify -o out": "no metres after rectification by "
+    "features; give a calibration (--calib)",
+    f"depth {PAIR} --write all -o out": f"no depth, points or surface in metres: {NO_CAMERA}",
+    "view upper.png lower.png --model small -o out.png": "the right picture lies 2.0 px lower; rectify the "
+    "pair (--rectify)",
+}
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch) -> Path:
+    write_error_examples(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("command", ERRORS)
+def test_an_error_names_settings_by_their_option(capsys, command):
+    assert main(command.split()) == 2
+    assert capsys.readouterr().err == f"stereoweave: {ERRORS[command]}\n"
+
+
+@pytest.mark.parametrize("command", NOTES)
+def test_a_note_names_settings_by_their_option(capsys, command):
+    main(command.split())
+    assert NOTES[command] in capsys.readouterr().out.splitlines()
+
+
+def test_many_pairs_have_the_same_texts(capsys):
+    Path("list.txt").write_text("left.png right.png sound\nupper.png lower.png low\nleft.png\n")
+    assert main(["depth", "--list", "list.txt", "--jobs", "1", "--threads", "1", "-o", "out"]) == 1
+    told = capsys.readouterr().err
+    assert f"left: {ERRORS['depth left.png -o out']}\n" in told
+    low = next(line for line in Path("out/summary.csv").read_text().splitlines() if line.startswith("low,"))
+    assert NOTES["check upper.png lower.png"] in low
+
+
+def test_a_video_cannot_be_rectified_so_that_its_notes_do_not_say_it(capsys):
+    assert main(["video", "upper.png", "lower.png", "--depth", "-o", "out.mkv", "--threads", "1"]) == 0
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "px lower" in line]
+    assert line == "0:00:00.000 the right picture lies 2.0 px lower"

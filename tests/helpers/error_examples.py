@@ -1,0 +1,28 @@
+"""Files that front ends refuse or remark on, each with a remedy that names a setting."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+from rig_examples import pinhole, rig_of
+
+from stereoweave.cameras.calibration_files import write_rig
+from stereoweave.io.files import read_image, write_image
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+LAYOUTS = (
+    "side_by_side, side_by_side_half, top_bottom, top_bottom_half, crossed, crossed_half, "
+    "top_bottom_right_first, top_bottom_right_first_half"
+)
+
+
+def write_error_examples(folder: Path) -> None:
+    """A pair, the same with the right picture 2 px lower, plain pictures, and a calibration to rectify by."""
+    for name in ("left.png", "right.png"):
+        shutil.copy(EXAMPLES / name, folder)
+    left, right = (read_image(EXAMPLES / name) for name in ("left.png", "right.png"))
+    write_image(folder / "upper.png", left[2:])
+    write_image(folder / "lower.png", right[:-2])
+    write_image(folder / "both.png", np.hstack([left, right]))
+    write_image(folder / "plain.png", np.full((480, 640, 3), 90, np.uint8))
+    write_rig(folder / "turned.yml", rig_of(pinhole))

@@ -1,0 +1,104 @@
+"""Error texts and notes of the HTTP service, where a setting is named by its field of the form."""
+
+import asyncio
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from error_examples import LAYOUTS, write_error_examples
+
+from stereoweave.matching.matcher import Matcher
+from stereoweave.service.answers import Answer, Order, answer_many
+
+# What Ray Serve is warned of by Pydantic when it is imported.
+pytestmark = pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`:DeprecationWarning")
+
+PAIR = {"left": "left.png", "right": "right.png"}
+LOWER = {"left": "upper.png", "right": "lower.png"}
+Ask = Callable[..., httpx.Response]
+
+ERRORS: dict[str, tuple[str, dict[str, str], dict[str, Any]]] = {
+    "picture: expected a stereo picture, two views side by side or one above the other, found halves that do "
+    f"not resemble each other; give two files, left and right; or choose one of {LAYOUTS} (format)": (
+        "/disparity",
+        {"picture": "left.png"},
+        {},
+    ),
+    "format: expected one picture that holds both views, found two, left and right; leave it out, and give "
+    "the left one first": ("/disparity", PAIR, {"format": "crossed"}),
+    "calib: expected a calibration of rectified pictures, found lenses that distort; rectify the pair by it "
+    "(rectify)": ("/disparity", {**PAIR, "calib": "turned.yml"}, {}),
+    "metres: expected a baseline beside the focal length, found none; give the baseline (baseline_m)": (
+        "/depth",
+        PAIR,
+        {"focal_px": 500},
+    ),
+    "rectify: expected at least 40 points that both pictures show from two positions, found 0 of 0 matches "
+    "that agree; take pictures with more texture and more overlap; or give a calibration (calib)": (
+        "/view",
+        {"left": "plain.png", "right": "plain.png"},
+        {"rectify": True},
+    ),
+    "expected a camera, for metres, found none; give a calibration, or the focal length and baseline of a "
+    "rectified pair (calib, focal_px, baseline_m)": ("/depth", PAIR, {}),
+    "range: expected disparities of -640 to 640 px, the width of the pictures, got 700 and 800; leave it out "
+    "to have it found": ("/disparity", PAIR, {"range": "700,800"}),
+    "position: expected -1.0 to 2.0 (0 left camera, 1 right), got 3.5": (
+        "/view",
+        PAIR,
+        {"position": 2, "strength": 2},
+    ),
+}
+NOTES: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
+    "the right picture lies 2.0 px lower; rectify the pair (rectify)": (LOWER, {"check": True}),
+    "side_by_side, detected from name and content; override it if it is wrong (format)": (
+        {"picture": "both.png"},
+        {},
+    ),
+    "no metres after rectification by features; give a calibration (calib)": (
+        PAIR,
+        {"focal_px": 600, "baseline_m": 0.1, "rectify": True},
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def ask(tmp_path_factory) -> Ask:
+    """Posts a form with these files and fields to a service that works in this process."""
+    from stereoweave.service.asgi import Guard, Limits, make_app
+
+    folder: Path = tmp_path_factory.mktemp("files")
+    write_error_examples(folder)
+    matcher = Matcher("small", threads=1)
+
+    async def answer(order: Order, left_s: float) -> Answer:
+        (outcome,) = answer_many(matcher, [order])
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    limits = Limits()
+    transport = httpx.ASGITransport(Guard(make_app(answer, limits, bytes, folder), limits))
+
+    async def post(path: str, files: dict[str, str], fields: dict[str, Any]) -> httpx.Response:
+        contents = {field: (folder / name).read_bytes() for field, name in files.items()}
+        async with httpx.AsyncClient(transport=transport, base_url="http://service") as client:
+            return await client.post(path, files=contents, data=fields)
+
+    return lambda *asked: asyncio.run(post(*asked))
+
+
+@pytest.mark.parametrize("text", ERRORS)
+def test_an_error_names_settings_by_their_field(ask, text):
+    response = ask(*ERRORS[text])
+    assert response.status_code in (400, 422)
+    assert response.json() == {"detail": text}
+
+
+@pytest.mark.parametrize("text", NOTES)
+def test_a_note_names_settings_by_their_field(ask, text):
+    response = ask("/disparity", *NOTES[text])
+    assert text in json.loads(response.headers["X-Stereoweave-Report"])["notes"]

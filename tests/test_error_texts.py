@@ -1,0 +1,161 @@
+"""Error texts and notes in Python, where a setting is named by its keyword."""
+
+import ast
+import pickle
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from error_examples import LAYOUTS, write_error_examples
+
+import stereoweave as sw
+from stereoweave import errors
+from stereoweave.cameras.alignment import check_pair
+from stereoweave.errors import Note, Remedy
+from stereoweave.io.files import RangeError, read_image
+from stereoweave.outputs.point_cloud import EmptyError, needed_camera
+from stereoweave.outputs.results import DepthOrder
+from stereoweave.pictures.loading import open_pictures
+from stereoweave.pictures.pair_finding import find_pairs
+from stereoweave.pictures.prepare import Request, prepare
+from stereoweave.service.admission import BusyError
+from stereoweave.service.answers import TooLargeError
+from stereoweave.system.child_process import ProcessDiedError
+from stereoweave.system.ray_engine import Engine
+from stereoweave.video.convert import Order
+
+PACKAGE = Path(sw.__file__).parent
+PAIR = Path("left.png"), Path("right.png")
+PLAIN = Path("plain.png"), Path("plain.png")
+BLACK = np.zeros((64, 64, 3), np.uint8)
+# Options of other programs.
+OTHERS = {
+    "data/checksums.py": {"--check"},
+    "data/paper_layout.py": {"--check"},
+    "learn/checkpoint.py": {"--git-dir", "--always", "--dirty", "--exclude"},
+    "learn/training/loop.py": {"--nproc-per-node"},
+}
+
+ERRORS = {
+    "left.png: expected a stereo picture, two views side by side or one above the other, found halves that "
+    "do not resemble each other; give two files, left and right; or choose one of "
+    f"{LAYOUTS} (arrangement)": lambda: open_pictures(PAIR[:1]),
+    f"arrangement: expected one of {LAYOUTS}, mpo, jps, found 'diagonal'": lambda: open_pictures(
+        PAIR[:1], "diagonal"
+    ),
+    "arrangement: expected one picture that holds both views, found two, left.png and right.png; leave it "
+    "out, and give the left one first": lambda: open_pictures(PAIR, "crossed"),
+    "turned.yml: expected a calibration of rectified pictures, found lenses that distort; rectify "
+    "the pair by it (rectify)": lambda: prepare(PAIR, Request(calibration=Path("turned.yml"))),
+    "metres: expected a baseline beside the focal length, found none; give the baseline (baseline_m)": (
+        lambda: prepare(PAIR, Request(focal_px=500))
+    ),
+    "metres: expected a focal length in EXIF beside the baseline, found none; give the focal length "
+    "(focal_px)": lambda: prepare(PAIR, Request(baseline_m=0.1)),
+    "rectify: expected at least 40 points that both pictures show from two positions, found 0 of 0 matches "
+    "that agree; take pictures with more texture and more overlap; or give a calibration (calibration)": (
+        lambda: prepare(PLAIN, Request(rectify=True))
+    ),
+    "expected a camera, for metres, found none; give a calibration, or the focal length and baseline of a "
+    "rectified pair (calibration, focal_px, baseline_m)": (
+        lambda: needed_camera(sw.StereoPair(left=BLACK, right=BLACK))
+    ),
+    "raw: expected without refined: it is the network's own disparity; leave one of them out "
+    "(raw, refined)": (lambda: DepthOrder(raw=True, refined=True)),
+    "expected pictures or a folder, patterns of left and right pictures, or a list of pairs, found none; "
+    "give exactly one of them (left, right, listed)": lambda: find_pairs([], None, None, None),
+    "provider: expected one of cpu, cuda, tensorrt, openvino, coreml, directml, found 'gpu'": (
+        lambda: sw.Matcher(provider="gpu")
+    ),
+    "range_px: expected disparities of -64 to 64 px, the width of the pictures, got 70 and 80; leave it out "
+    "to have it found": lambda: sw.estimate(BLACK, BLACK, range_px=(70, 80)),
+    "threads: expected 1 or more, got 0; 1024 at most": lambda: sw.Matcher(threads=0),
+    "position: expected -1.0 to 2.0 (0 left camera, 1 right), got 3": (
+        lambda: sw.synthesize(BLACK, BLACK, 3, threads=1)
+    ),
+    "expected one kind of video to make, found none; choose one (depth, depth16, position, layout)": Order,
+    "gpus_each: expected 0, a part of 1 or a whole number, found 1.5": lambda: Engine(gpus_each=1.5),
+}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    write_error_examples(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("text", ERRORS)
+def test_an_error_names_settings_by_their_keyword(folder, text):
+    with pytest.raises(sw.StereoweaveError) as caught:
+        ERRORS[text]()
+    assert str(caught.value) == text
+
+
+def test_a_note_names_settings_by_their_keyword(folder):
+    lower = check_pair(read_image("upper.png"), read_image("lower.png"))
+    assert list(map(str, lower.warnings())) == [
+        "the right picture lies 2.0 px lower; rectify the pair (rectify)"
+    ]
+    assert list(map(str, open_pictures([Path("both.png")]).notes)) == [
+        "side_by_side, detected from name and content; override it if it is wrong (arrangement)"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("remedy", "text"),
+    [
+        (None, "two cameras"),
+        (Remedy("turn one"), "two cameras; turn one"),
+        (Remedy("rectify", ("rectify", "calibration")), "two cameras; rectify (R, C)"),
+        (Remedy("rectify", ("rectify", "provider")), "two cameras; rectify (R)"),
+        (Remedy("run it on cpu", ("provider",)), "two cameras"),
+    ],
+)
+def test_a_remedy_that_a_front_end_does_not_have_is_left_out(remedy, text):
+    names = {"rectify": "R", "calibration": "C"}
+    assert Note("two cameras", remedy).worded(names.get) == text
+    assert sw.StereoweaveError("two cameras", remedy=remedy).worded(names.get) == text
+    assert (
+        sw.StereoweaveError("two cameras", setting="rectify", remedy=remedy).worded(names.get) == f"R: {text}"
+    )
+    assert sw.StereoweaveError("two", setting="provider").worded(names.get) == "provider: two"
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        errors.StereoweaveError,
+        errors.FormatError,
+        errors.MatcherError,
+        errors.ProviderError,
+        errors.OutputInUseError,
+        BusyError,
+        EmptyError,
+        ProcessDiedError,
+        RangeError,
+        TooLargeError,
+    ],
+)
+def test_errors_cross_processes_with_setting_and_remedy(kind):
+    error = kind("expected 1, found 2")
+    error.setting, error.remedy = "rectify", Remedy("give a calibration", ("calibration",))
+    there = pickle.loads(pickle.dumps(error))
+    assert type(there) is kind
+    assert str(there) == "rectify: expected 1, found 2; give a calibration (calibration)"
+    assert vars(there) == vars(error)
+
+
+def test_no_module_outside_the_command_line_spells_an_option():
+    found = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        name = path.relative_to(PACKAGE).as_posix()
+        strings = (
+            node.value for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Constant)
+        )
+        text = "\n".join(string for string in strings if isinstance(string, str))
+        options = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", text)) - OTHERS.get(name, set())
+        if options and not name.startswith("cli/"):
+            found[name] = options
+    assert found == {}
