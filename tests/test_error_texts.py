@@ -14,8 +14,8 @@ from stereoweave import errors
 from stereoweave.cameras.alignment import check_pair
 from stereoweave.errors import Note, Remedy
 from stereoweave.io.files import RangeError, read_image
+from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.point_cloud import EmptyError, needed_camera
-from stereoweave.outputs.results import DepthOrder
 from stereoweave.pictures.loading import open_pictures
 from stereoweave.pictures.pair_finding import find_pairs
 from stereoweave.pictures.prepare import Request, prepare
@@ -23,7 +23,7 @@ from stereoweave.service.admission import BusyError
 from stereoweave.service.answers import TooLargeError
 from stereoweave.system.child_process import ProcessDiedError
 from stereoweave.system.ray_engine import Engine
-from stereoweave.video.convert import Order
+from stereoweave.video.convert import VideoJob
 
 PACKAGE = Path(sw.__file__).parent
 PAIR = Path("left.png"), Path("right.png")
@@ -35,6 +35,7 @@ OTHERS = {
     "data/paper_layout.py": {"--check"},
     "learn/checkpoint.py": {"--git-dir", "--always", "--dirty", "--exclude"},
     "learn/training/loop.py": {"--nproc-per-node"},
+    "system/ray_engine.py": {"--address"},
 }
 
 ERRORS = {
@@ -62,7 +63,7 @@ ERRORS = {
         lambda: needed_camera(sw.StereoPair(left=BLACK, right=BLACK))
     ),
     "raw: expected without refined: it is the network's own disparity; leave one of them out "
-    "(raw, refined)": (lambda: DepthOrder(raw=True, refined=True)),
+    "(raw, refined)": (lambda: MatchOptions(raw=True, refined=True)),
     "expected pictures or a folder, patterns of left and right pictures, or a list of pairs, found none; "
     "give exactly one of them (left, right, listed)": lambda: find_pairs([], None, None, None),
     "provider: expected one of cpu, cuda, tensorrt, openvino, coreml, directml, found 'gpu'": (
@@ -74,7 +75,7 @@ ERRORS = {
     "position: expected -1.0 to 2.0 (0 left camera, 1 right), got 3": (
         lambda: sw.synthesize(BLACK, BLACK, 3, threads=1)
     ),
-    "expected one kind of video to make, found none; choose one (depth, depth16, position, layout)": Order,
+    "expected one kind of video to make, found none; choose one (depth, depth16, position, layout)": VideoJob,
     "gpus_each: expected 0, a part of 1 or a whole number, found 1.5": lambda: Engine(gpus_each=1.5),
 }
 

@@ -11,7 +11,7 @@ import pytest
 from error_examples import LAYOUTS, write_error_examples
 
 from stereoweave.matching.matcher import Matcher
-from stereoweave.service.answers import Answer, Order, answer_many
+from stereoweave.service.answers import Answer, ServiceJob, answer_many
 
 # What Ray Serve is warned of by Pydantic when it is imported.
 pytestmark = pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`:DeprecationWarning")
@@ -74,14 +74,14 @@ def ask(tmp_path_factory) -> Ask:
     write_error_examples(folder)
     matcher = Matcher("small", threads=1)
 
-    async def answer(order: Order, left_s: float) -> Answer:
-        (outcome,) = answer_many(matcher, [order])
+    async def answer(job: ServiceJob, left_s: float) -> Answer:
+        (outcome,) = answer_many(matcher, [job])
         if isinstance(outcome, Exception):
             raise outcome
         return outcome
 
     limits = Limits()
-    transport = httpx.ASGITransport(Guard(make_app(answer, limits, bytes, folder), limits))
+    transport = httpx.ASGITransport(Guard(make_app(answer, limits, folder), limits))
 
     async def post(path: str, files: dict[str, str], fields: dict[str, Any]) -> httpx.Response:
         contents = {field: (folder / name).read_bytes() for field, name in files.items()}
