@@ -8,14 +8,14 @@ import sys
 from pathlib import Path
 
 import stereoweave as sw
-from stereoweave.cameras.calibration_files import calibrated
+from stereoweave.cameras.calibration_files import add_camera
 from stereoweave.io.files import read_pair
 from stereoweave.outputs.measure import CameraError, distance
 
 HERE = Path(__file__).parent
 
 column, row, other_column, other_row = map(int, sys.argv[1:] or (80, 440, 560, 440))
-pair = calibrated(read_pair(HERE / "left.png", HERE / "right.png"), HERE / "calib.txt")
+pair = add_camera(read_pair(HERE / "left.png", HERE / "right.png"), HERE / "calib.txt")
 assert pair.camera is not None
 found = distance(
     sw.estimate(pair.left, pair.right),

@@ -6,13 +6,13 @@ Run: python examples/point_cloud.py
 from pathlib import Path
 
 import stereoweave as sw
-from stereoweave.cameras.calibration_files import calibrated
+from stereoweave.cameras.calibration_files import add_camera
 from stereoweave.io.files import read_pair
 from stereoweave.outputs.point_cloud import point_cloud, surface, write_glb, write_ply
 
 HERE = Path(__file__).parent
 
-pair = calibrated(read_pair(HERE / "left.png", HERE / "right.png"), HERE / "calib.txt")
+pair = add_camera(read_pair(HERE / "left.png", HERE / "right.png"), HERE / "calib.txt")
 estimate = sw.estimate(pair.left, pair.right)
 
 # Pixels of doubtful depth, and those that would fly between two surfaces, give no point.

@@ -6,7 +6,7 @@ import tarfile
 import zlib
 from contextlib import suppress
 
-from stereoweave.data.checksums import checksums
+from stereoweave.data.checksums import make_checksums
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -34,7 +34,7 @@ def repair_shard(content: bytes) -> bytes:
         for pair in sorted({name.partition(".")[0] for name in files}):
             own = {name: body for name, body in files.items() if name.startswith(f"{pair}.")}
             own.pop(f"{pair}.sha256", None)
-            for name, body in {**own, f"{pair}.sha256": checksums(own)}.items():
+            for name, body in {**own, f"{pair}.sha256": make_checksums(own)}.items():
                 head = tarfile.TarInfo(name)
                 head.size = len(body)
                 tar.addfile(head, io.BytesIO(body))

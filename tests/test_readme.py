@@ -15,7 +15,7 @@ from pyarrow import parquet
 
 from stereoweave.io.animation import write_animation
 from stereoweave.io.files import read_image
-from stereoweave.rendering.layouts import MOTIONS
+from stereoweave.rendering.layouts import ANIMATIONS
 
 pytestmark = pytest.mark.system
 
@@ -168,7 +168,7 @@ def test_the_views_are_made_from_the_wheel_in_an_environment_of_users(installed,
     with Image.open(pictures / "wiggle.webp") as wiggle:
         # Of 12 frames those that are alike become one, which is shown for longer.
         shown_ms = [frame.info["duration"] for frame in ImageSequence.all_frames(wiggle)]
-        assert sum(shown_ms) == 12 * MOTIONS["wiggle"].frame_ms
+        assert sum(shown_ms) == 12 * ANIMATIONS["wiggle"].frame_ms
 
 
 def test_the_scores_of_own_scenes_run_from_the_wheel(installed, pictures, caches):

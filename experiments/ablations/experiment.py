@@ -16,7 +16,7 @@ from rich.console import Console
 from experiments.ablations.networks import VARIANTS
 from experiments.trial import Trial
 from stereoweave.bench.edge_metrics import edge_bad_percent, edge_epe_px, flying_percent
-from stereoweave.bench.projected_views import Method
+from stereoweave.bench.projected_views import DisparityMethod
 from stereoweave.data.shards import Shards
 from stereoweave.io.files import make_folder, replacing
 from stereoweave.learn import checkpoint
@@ -142,7 +142,7 @@ def _row(trial: Trial, trained: Checkpoint, held_out: dict[str, PairSource]) -> 
     }
 
 
-def _near_edges(match: Method, pairs: PairSource) -> dict[str, float]:
+def _near_edges(match: DisparityMethod, pairs: PairSource) -> dict[str, float]:
     """Mean errors near depth edges, over the pairs that have edges."""
     rows = []
     for index in range(pairs.count):

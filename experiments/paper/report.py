@@ -29,7 +29,7 @@ from experiments.paper.trials import (
 )
 from experiments.trial import Trial
 from stereoweave.bench.pairs import write_csv
-from stereoweave.bench.projected_views import Method, ViewRow
+from stereoweave.bench.projected_views import DisparityMethod, ProjectionRow
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.files import make_folder, replacing
 from stereoweave.learn import checkpoint
@@ -71,7 +71,7 @@ class Report:
     kept: dict[str, Checkpoint]
     curves: dict[str, list[dict[str, float]]]
     rows: list[PaperRow]
-    common: list[ViewRow]
+    common: list[ProjectionRow]
 
     @property
     def depth(self) -> bool:
@@ -132,11 +132,11 @@ def _is_finished(trial: Trial, kept: Mapping[str, Checkpoint]) -> bool:
     return found is not None and found.step == trial.recipe.steps
 
 
-def _score(recipes: Sequence[Recipe], runs: Path) -> tuple[dict[str, ViewRow], list[ViewRow]]:
+def _score(recipes: Sequence[Recipe], runs: Path) -> tuple[dict[str, ProjectionRow], list[ProjectionRow]]:
     """Scores of all runs but the first recipe's, and of methods without training on the first one's pairs."""
     base, *others = recipes
-    scores: dict[str, ViewRow] = {}
-    common: list[ViewRow] = []
+    scores: dict[str, ProjectionRow] = {}
+    common: list[ProjectionRow] = []
     for pairs in dict.fromkeys(identify_held_out(recipe) for recipe in others):
         names = list(dict.fromkeys(recipe.name for recipe in others if identify_held_out(recipe) == pairs))
         # Quiet: all pairs exist since the plan was made.
@@ -147,7 +147,7 @@ def _score(recipes: Sequence[Recipe], runs: Path) -> tuple[dict[str, ViewRow], l
     return scores, common
 
 
-def _row(trial: Trial, kept: Checkpoint, score: ViewRow) -> PaperRow:
+def _row(trial: Trial, kept: Checkpoint, score: ProjectionRow) -> PaperRow:
     recipe = kept.recipe
     return PaperRow(
         claim=trial.claim,
@@ -259,7 +259,7 @@ def _read_run_times(path: Path) -> str:
     return f"A pair of 640x480, all cores of a processor; the paper's are of GPUs.\n\n{table}"
 
 
-def _common_table(rows: Sequence[ViewRow], depth: bool) -> str:
+def _common_table(rows: Sequence[ProjectionRow], depth: bool) -> str:
     columns = ["method", *(["EPE cm"] if depth else []), "EPE px", "MAE", "MAE of sourced", "sourced %"]
     lines = [f"| {' | '.join((*columns, 'PSNR dB', 'SSIM'))} |", "|---" * (len(columns) + 2) + "|"]
     for row in rows:
@@ -312,7 +312,7 @@ def _draw(report: Report, out: Path) -> None:
             draw(out / f"{name}.jpg", list(zip(samples, estimates, strict=True)))
 
 
-def _load_first_seeds(report: Report, claim: str) -> dict[str, Method]:
+def _load_first_seeds(report: Report, claim: str) -> dict[str, DisparityMethod]:
     """Load the first seed's network for each setting."""
     names = {t.setting: t.recipe.name for t in reversed(report.trained) if t.claim == claim}
     return {setting: make_method(report.kept[name]) for setting, name in reversed(names.items())}

@@ -7,7 +7,7 @@ import numpy as np
 from fuzz.repairs import repair_shard
 from fuzz.targets import Target, written
 from fuzz.targets.pictures import eyes
-from stereoweave.data.packing import packed
+from stereoweave.data.packing import pack
 from stereoweave.data.samples import make_sample
 from stereoweave.data.shards import Shards, write_shard
 from stereoweave.stereo import StereoCamera, StereoPair
@@ -21,7 +21,7 @@ def _starts() -> dict[str, bytes]:
     sample = make_sample(
         StereoPair(left=left, right=right, camera=camera), *np.full((2, *left.shape[:2]), 4, np.float32)
     )
-    pair = packed(sample, {0.5: left})
+    pair = pack(sample, {0.5: left})
     return {_NAME: written(_NAME, lambda path: write_shard(path.parent, "box", 0, [pair]))}
 
 

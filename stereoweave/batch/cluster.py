@@ -21,7 +21,7 @@ from rich.console import Console
 
 from stereoweave.batch.manifest import MANIFEST, PLAN, ChunkPlan, extend_plan
 from stereoweave.batch.worker import BEGUN, Counts, Worker, remove_left_behind
-from stereoweave.cameras.calibration_files import calibration_bytes
+from stereoweave.cameras.calibration_files import read_calibration_bytes
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import reading
 from stereoweave.io.output_lock import lock_output
@@ -197,7 +197,7 @@ def _carried(job: DepthJob) -> Iterator[tuple[str, str, bytes]]:
         with reading(model, "a model"):
             yield "model", model.name, model.read_bytes()
     if calibration and calibration.is_file():
-        yield "calibration", calibration.name, calibration_bytes(calibration)
+        yield "calibration", calibration.name, read_calibration_bytes(calibration)
 
 
 def _tidy(destination: Store) -> None:

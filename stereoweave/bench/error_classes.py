@@ -66,11 +66,11 @@ def classify(
     """
     known = np.isfinite(truth_px)
     known_px = np.where(known, truth_px, np.nan)
-    gradient = _gradient(left)
+    gradient = _measure_gradient(left)
     fitting = {
         "outside": np.arange(truth_px.shape[1]) - known_px < 0,
-        "occluded": covered(known_px) if occluded is None else occluded,
-        "thin_or_edge": near_edge(truth_px) | _thin(known_px),
+        "occluded": find_covered(known_px) if occluded is None else occluded,
+        "thin_or_edge": near_edge(truth_px) | _find_thin(known_px),
         "plain": gradient < PLAIN_LEVELS_PER_PX,
         "weak_texture": gradient < WEAK_LEVELS_PER_PX,
         "textured": known,
@@ -96,12 +96,12 @@ def class_errors(
     """
     known = np.isfinite(truth_px)
     return {
-        name: _errors_within(mask, estimate_px, truth_px, int(known.sum()))
+        name: _measure_errors(mask, estimate_px, truth_px, int(known.sum()))
         for name, mask in {**masks, ALL: known}.items()
     }
 
 
-def covered(truth_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def find_covered(truth_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Known pixels whose column in the right picture shows a surface over 1 px nearer.
 
     Found from the left truth alone: every known pixel is moved to the closest column of the right picture,
@@ -119,7 +119,7 @@ def covered(truth_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     return found
 
 
-def _thin(known_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def _find_thin(known_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Pixels over an edge's step nearer than both their sides, which are less than THIN_PX apart."""
     # Unknown pixels are taken as near, so that they bound nothing.
     surface_px = np.where(np.isnan(known_px), np.inf, known_px).astype(np.float32)
@@ -130,7 +130,7 @@ def _thin(known_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     return known_px - behind_px > EDGE_STEP_PX
 
 
-def _gradient(left: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
+def _measure_gradient(left: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
     """Gradient magnitude of the smoothed grey picture, in levels of 0..255 a pixel."""
     grey = cv2.cvtColor(left, cv2.COLOR_RGB2GRAY).astype(np.float32)
     smooth = cv2.GaussianBlur(grey, (0, 0), _SMOOTHING_PX)
@@ -139,7 +139,7 @@ def _gradient(left: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
     return np.hypot(along_x, along_y)
 
 
-def _errors_within(
+def _measure_errors(
     mask: Bool[np.ndarray, "h w"],
     estimate_px: Float[np.ndarray, "h w"],
     truth_px: Float[np.ndarray, "h w"],

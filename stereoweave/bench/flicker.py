@@ -9,7 +9,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from stereoweave.bench.flicker_films import LEFT, MIDDLE, NOISE_LEVELS, Film, noisy, panning, passing, still
+from stereoweave.bench.flicker_films import (
+    LEFT,
+    MIDDLE,
+    NOISE_LEVELS,
+    RenderedVideo,
+    add_noise,
+    add_passing_oval,
+    freeze,
+    render_panning,
+)
 from stereoweave.bench.flicker_metrics import flicker
 from stereoweave.errors import StereoweaveError
 from stereoweave.matching.backend import Backend
@@ -22,7 +31,7 @@ from stereoweave.video.temporal_filter import Steadier
 MEAN = "mean"
 FRAME_BY_FRAME, STEADY = "frame by frame", "steady"
 # Five seconds of a camera on its way.
-_WAY_FRAMES = 120
+_PATH_FRAMES = 120
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +65,7 @@ class FlickerRow:
     time_ms: float
 
 
-class _Taken(NamedTuple):
+class _Result(NamedTuple):
     """What a method made of a film."""
 
     disparities_px: list[Float[np.ndarray, "h w"]]
@@ -64,7 +73,7 @@ class _Taken(NamedTuple):
     time_ms: float
 
 
-def flicker_rows(  # noqa: PLR0913 - each is a word of the command line
+def score_flicker(  # noqa: PLR0913 - each is a word of the command line
     scenes: Sequence[str],
     model: str | Path = "small",
     *,
@@ -90,15 +99,16 @@ def flicker_rows(  # noqa: PLR0913 - each is a word of the command line
     """
     if frames < 2:
         raise StereoweaveError(f"frames: expected 2 or more, for flicker is between two; got {frames}")
-    orders = [RenderSpec(scene=scene, seed=seed, size_px=size_px, frames=_WAY_FRAMES) for scene in scenes]
+    orders = [RenderSpec(scene=scene, seed=seed, size_px=size_px, frames=_PATH_FRAMES) for scene in scenes]
     matcher = Backend(model=model, threads=threads, provider=provider).matcher()
     for order in orders:
-        for film in _films(order, frames):
+        for film in _render_videos(order, frames):
             pairs = [
-                noisy(pair, np.random.default_rng((seed, number))) for number, pair in enumerate(film.pairs)
+                add_noise(pair, np.random.default_rng((seed, number)))
+                for number, pair in enumerate(film.pairs)
             ]
             estimates = [matcher.estimate(pair.left, pair.right) for pair in pairs]
-            for method, taken in _both(film, pairs, estimates, threads).items():
+            for method, taken in _run_methods(film, pairs, estimates, threads).items():
                 yield FlickerRow(
                     film=film.name,
                     scene=order.scene,
@@ -109,48 +119,48 @@ def flicker_rows(  # noqa: PLR0913 - each is a word of the command line
                     frames=frames,
                     noise_levels=NOISE_LEVELS,
                     time_ms=taken.time_ms,
-                    **_errors(film, taken),
+                    **_measure_errors(film, taken),
                 )
 
 
-def means(rows: Sequence[FlickerRow]) -> list[FlickerRow]:
+def average_rows(rows: Sequence[FlickerRow]) -> list[FlickerRow]:
     """The mean over the scenes of each film and method, the two in one name."""
     groups: dict[tuple[str, str], list[FlickerRow]] = {}
     for row in rows:
         groups.setdefault((row.film, row.method), []).append(row)
-    return [_mean_row(", ".join(name), group) for name, group in groups.items()]
+    return [_average_group(", ".join(name), group) for name, group in groups.items()]
 
 
-def _mean_row(name: str, rows: Sequence[FlickerRow]) -> FlickerRow:
+def _average_group(name: str, rows: Sequence[FlickerRow]) -> FlickerRow:
     numbers = ("flicker_px", "view_flicker_levels", "epe_px", "moving_epe_px", "uncovered_epe_px", "time_ms")
     values: dict[str, Any] = {n: float(np.mean([getattr(row, n) for row in rows])) for n in numbers}
     return replace(rows[0], film=name, scene=MEAN, **values)
 
 
-def _films(order: RenderSpec, frames: int) -> Iterator[Film]:
-    pan = panning(order, frames)
-    yield still(pan)
-    yield passing(pan, "passing", (3.25, 0.75))
-    yield passing(pan, "nearing", (0.25, 0.0), nearing_px=0.5)
+def _render_videos(order: RenderSpec, frames: int) -> Iterator[RenderedVideo]:
+    pan = render_panning(order, frames)
+    yield freeze(pan)
+    yield add_passing_oval(pan, "passing", (3.25, 0.75))
+    yield add_passing_oval(pan, "nearing", (0.25, 0.0), nearing_px=0.5)
     yield pan
 
 
-def _both(
-    film: Film, pairs: list[StereoPair], estimates: list[Estimate], threads: int | None
-) -> dict[str, _Taken]:
+def _run_methods(
+    film: RenderedVideo, pairs: list[StereoPair], estimates: list[Estimate], threads: int | None
+) -> dict[str, _Result]:
     steadier, steady, times_ms = Steadier(threads), [], []
     for pair, estimate in zip(pairs, estimates, strict=True):
         start_s = time.perf_counter()
         steady.append(steadier(pair.left, pair.right, estimate))
         times_ms.append(1000 * (time.perf_counter() - start_s))
     return {
-        FRAME_BY_FRAME: _Taken(*_seen(film, estimates, threads), float("nan")),
-        STEADY: _Taken(*_seen(film, steady, threads), float(np.median(times_ms[1:]))),
+        FRAME_BY_FRAME: _Result(*_render_middle(film, estimates, threads), float("nan")),
+        STEADY: _Result(*_render_middle(film, steady, threads), float(np.median(times_ms[1:]))),
     }
 
 
-def _seen(
-    film: Film, estimates: list[Estimate], threads: int | None
+def _render_middle(
+    film: RenderedVideo, estimates: list[Estimate], threads: int | None
 ) -> tuple[list[Float[np.ndarray, "h w"]], list[UInt8[np.ndarray, "h w 3"]]]:
     """The disparities of the left view, and the views half-way: of the film itself, without the noise."""
     renderers = (
@@ -161,7 +171,7 @@ def _seen(
     return [estimate.disparity_px for estimate in estimates], views
 
 
-def _errors(film: Film, taken: _Taken) -> dict[str, float]:
+def _measure_errors(film: RenderedVideo, taken: _Result) -> dict[str, float]:
     """The columns of a row that are errors."""
     later = range(1, len(film.pairs))
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from stereoweave.bench.flicker_metrics import seen_again
+from stereoweave.bench.flicker_metrics import find_seen_again
 from stereoweave.stereo import StereoPair
 from stereoweave.synth.sets.pair_rendering import RenderSpec, draw_stage_and_rig
 from stereoweave.synth.sets.renderers import shared_renderer
@@ -27,7 +27,7 @@ and down in px, and the change of their disparity in px."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Film:
+class RenderedVideo:
     """A film with its truth.
 
     Attributes:
@@ -47,10 +47,10 @@ class Film:
     def seen_again(self, frame: int, other: int, position: float) -> Bool[np.ndarray, "h w"]:
         """The points of one frame that another one shows too, seen from a position."""
         before_px, after_px = (self.disparities_px[number][position] for number in (frame, other))
-        return seen_again(before_px, after_px, *self.change(frame, other, position))
+        return find_seen_again(before_px, after_px, *self.change(frame, other, position))
 
 
-def noisy(pair: StereoPair, rng: np.random.Generator) -> StereoPair:
+def add_noise(pair: StereoPair, rng: np.random.Generator) -> StereoPair:
     """The pair with a sensor's noise: normal, of NOISE_LEVELS, of each eye, pixel and channel by itself."""
 
     def with_noise(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -59,7 +59,7 @@ def noisy(pair: StereoPair, rng: np.random.Generator) -> StereoPair:
     return StereoPair(left=with_noise(pair.left), right=with_noise(pair.right))
 
 
-def panning(order: RenderSpec, frames: int) -> Film:
+def render_panning(order: RenderSpec, frames: int) -> RenderedVideo:
     """A film of a camera that moves: so many frames from the middle of the order's, where it is fastest."""
     first = (order.frames - frames) // 2
     stages = [draw_stage_and_rig(shared_renderer(), order, 0, first + number) for number in range(frames)]
@@ -74,9 +74,9 @@ def panning(order: RenderSpec, frames: int) -> Film:
     ]
 
     def change(frame: int, other: int, position: float) -> Change:
-        return reprojected(disparities_px[frame][position], rigs[frame], rigs[other], position)
+        return reproject(disparities_px[frame][position], rigs[frame], rigs[other], position)
 
-    return Film(
+    return RenderedVideo(
         name="panning",
         pairs=[StereoPair(left=left.image, right=right.image) for left, _, right in shots],
         disparities_px=disparities_px,
@@ -85,7 +85,7 @@ def panning(order: RenderSpec, frames: int) -> Film:
     )
 
 
-def reprojected(
+def reproject(
     disparity_px: Float[np.ndarray, "h w"], rig: PosedRig, other: PosedRig, position: float
 ) -> Change:
     """What becomes of the points of a view at a position when the rig moves to where the other one is.
@@ -112,11 +112,11 @@ def reprojected(
     return np.stack([moved_x, moved_y], -1).astype(np.float32), change_px.astype(np.float32)
 
 
-def still(film: Film) -> Film:
+def freeze(film: RenderedVideo) -> RenderedVideo:
     """A film of the same length that shows the first frame all the time."""
     frames = len(film.pairs)
     nothing = np.zeros((*film.moving[0].shape, 3), np.float32)
-    return Film(
+    return RenderedVideo(
         name="still",
         pairs=film.pairs[:1] * frames,
         disparities_px=film.disparities_px[:1] * frames,
@@ -125,7 +125,9 @@ def still(film: Film) -> Film:
     )
 
 
-def passing(film: Film, name: str, velocity_px: tuple[float, float], nearing_px: float = 0.0) -> Film:
+def add_passing_oval(
+    film: RenderedVideo, name: str, velocity_px: tuple[float, float], nearing_px: float = 0.0
+) -> RenderedVideo:
     """A film of the same length: the first frame, and in front of it an oval picture that moves.
 
     That picture is the frame itself, upside down and of a quarter of its size.
@@ -146,7 +148,7 @@ def passing(film: Film, name: str, velocity_px: tuple[float, float], nearing_px:
         image: UInt8[np.ndarray, "h w 3"], step: int, position: float
     ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
         left = round(width * 0.375) + velocity_px[0] * step - position * ovals_px[step]
-        return _pasted(image, pair.left, left, round(height * 0.375) + velocity_px[1] * step)
+        return _paste_oval(image, pair.left, left, round(height * 0.375) + velocity_px[1] * step)
 
     shown = [
         {
@@ -162,7 +164,7 @@ def passing(film: Film, name: str, velocity_px: tuple[float, float], nearing_px:
         both = shown[frame][position][1][..., None] * of_oval.astype(np.float32)
         return both[..., :2], both[..., 2]
 
-    return Film(
+    return RenderedVideo(
         name=name,
         pairs=[StereoPair(left=views[LEFT][0], right=views[RIGHT][0]) for views in shown],
         disparities_px=[
@@ -177,10 +179,10 @@ def passing(film: Film, name: str, velocity_px: tuple[float, float], nearing_px:
     )
 
 
-def _pasted(
+def _paste_oval(
     image: UInt8[np.ndarray, "h w 3"], picture: UInt8[np.ndarray, "h w 3"], left_px: float, top_px: float
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """The image with the oval of `passing` over it, and the pixels that the oval has half of or more.
+    """The image with the oval of `add_passing_oval`, and the mask of pixels that it covers by half or more.
 
     Args:
         image: What is behind.

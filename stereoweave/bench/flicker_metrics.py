@@ -31,7 +31,7 @@ def flicker(
         before: Disparity in px [H, W], or a picture [H, W] or [H, W, C].
         after: The same of the next frame.
         motion_px: To the right and down, from where a point is in `before` to where it is in `after`.
-        visible: The points that count: such as both frames see (`seen_again`).
+        visible: The points that count: such as both frames see (`find_seen_again`).
         change: The true change of each point's value.
 
     Raises:
@@ -42,7 +42,7 @@ def flicker(
         raise StereoweaveError(
             f"flicker: expected two frames, their motion and a mask of one size, got {shapes}"
         )
-    columns, rows, inside = _places(motion_px)
+    columns, rows, inside = _target_places(motion_px)
     if (visible & ~inside).any():
         raise StereoweaveError(
             f"visible: expected points that stay in the picture, found {(visible & ~inside).sum()} "
@@ -58,7 +58,7 @@ def flicker(
     return float(error.mean()) if error.size else float("nan")
 
 
-def seen_again(
+def find_seen_again(
     before_px: Float[np.ndarray, "h w"],
     after_px: Float[np.ndarray, "h w"],
     motion_px: Float[np.ndarray, "h w 2"],
@@ -72,7 +72,7 @@ def seen_again(
         motion_px: To the right and down, from a point's place in the one to that in the other.
         change_px: The true change of each point's disparity on the way.
     """
-    columns, rows, inside = _places(motion_px)
+    columns, rows, inside = _target_places(motion_px)
     expected_px, seen = before_px + change_px, inside.copy()
     places = (np.where(inside, values, 0) for values in (rows, columns))
     around = [(np.floor(values), np.ceil(values)) for values in places]
@@ -82,7 +82,7 @@ def seen_again(
     return seen
 
 
-def _places(
+def _target_places(
     motion_px: Float[np.ndarray, "h w 2"],
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Columns and rows that points move to, and whether these are in the picture."""

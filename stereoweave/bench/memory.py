@@ -26,18 +26,18 @@ def peak_memory_mb(make: Callable[[], Callable[[Argument], object]], argument: A
     # Started afresh: a forked child would hold what its parent holds.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, context, cv2.setNumThreads, (cv2.getNumThreads(),)) as pool:
-        return pool.submit(_rise_mb, make, argument).result()
+        return pool.submit(_measure_rise_mb, make, argument).result()
 
 
-def _rise_mb(make: Callable[[], Callable[[Argument], object]], argument: Argument) -> float:
+def _measure_rise_mb(make: Callable[[], Callable[[Argument], object]], argument: Argument) -> float:
     import onnxruntime  # type: ignore[import-untyped]  # noqa: F401 - its code is no matcher's
 
-    before_mb = _peak_mb()
+    before_mb = _read_peak_mb()
     make()(argument)
-    return _peak_mb() - before_mb
+    return _read_peak_mb() - before_mb
 
 
-def _peak_mb() -> float:
+def _read_peak_mb() -> float:
     """The most that this process has had in RAM so far."""
     status = Path("/proc/self/status")
     if status.exists():

@@ -70,13 +70,13 @@ def mae(
     where: Bool[np.ndarray, "h w"] | None = None,
 ) -> float:
     """Mean absolute difference of two pictures, in grey levels of 0..255; of the pixels `where`, if given."""
-    error = np.abs(_difference(image, truth))
+    error = np.abs(_subtract(image, truth))
     return _mean(error if where is None else error[where])
 
 
 def psnr_db(image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]) -> float:
     """Peak signal-to-noise ratio of two pictures in dB; squared errors under 1e-10 count as that, 148 dB."""
-    return float(10 * np.log10(255**2 / max(_mean(_difference(image, truth) ** 2), 1e-10)))
+    return float(10 * np.log10(255**2 / max(_mean(_subtract(image, truth) ** 2), 1e-10)))
 
 
 def ssim(image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]) -> float:
@@ -86,9 +86,9 @@ def ssim(image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]) -
     """
     _check_shapes(image, truth)
     a, b = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float64) for picture in (image, truth))
-    mean_a, mean_b = _window_mean(a), _window_mean(b)
-    variance_a, variance_b = _window_mean(a * a) - mean_a**2, _window_mean(b * b) - mean_b**2
-    covariance = _window_mean(a * b) - mean_a * mean_b
+    mean_a, mean_b = _average_windows(a), _average_windows(b)
+    variance_a, variance_b = _average_windows(a * a) - mean_a**2, _average_windows(b * b) - mean_b**2
+    covariance = _average_windows(a * b) - mean_a * mean_b
     c1, c2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
     luminance = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1)
     return _mean(luminance * (2 * covariance + c2) / (variance_a + variance_b + c2))
@@ -126,10 +126,10 @@ def sparsification(error: Float[np.ndarray, " n"], confidence: Float[np.ndarray,
         confidence: Any measure that orders the pixels [N], infinite ones too; not NaN.
     """
     _check_shapes(error, confidence)
-    return Sparsification(kept=_kept_means(error, confidence), oracle=_kept_means(error, -error))
+    return Sparsification(kept=_average_kept(error, confidence), oracle=_average_kept(error, -error))
 
 
-def _kept_means(
+def _average_kept(
     error: Float[np.ndarray, " n"], confidence: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " m"]:
     """The curve itself."""
@@ -151,14 +151,14 @@ def _known_errors(
     return np.abs(estimate[known] - known_truth), known_truth
 
 
-def _difference(
+def _subtract(
     image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]
 ) -> Float[np.ndarray, "h w 3"]:
     _check_shapes(image, truth)
     return image.astype(np.float64) - truth
 
 
-def _window_mean(image: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+def _average_windows(image: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     return cv2.GaussianBlur(image, (11, 11), 1.5)
 
 

@@ -37,18 +37,18 @@ from stereoweave.matching.providers import CPU
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.system.ray_engine import Engine, stream
 
-Match = Callable[[StereoPair], Estimate | Float[np.ndarray, "h w"]]
+MatchFunction = Callable[[StereoPair], Estimate | Float[np.ndarray, "h w"]]
 """What is timed: a pair to an Estimate; or to the left disparity in px [H, W] alone, where <= 0 is a hole.
 
 The holes of such a map are then filled along rows, and its confidence is the left-right check, for which the
 mirrored pair is matched too. Neither is timed: others do it in other ways, at other costs.
 """
 
-Maker = Callable[[], Match]
+MatcherFactory = Callable[[], MatchFunction]
 
 AnyScene = TypeVar("AnyScene")
 Result = TypeVar("Result")
-Lister = Callable[[], Sequence[Callable[[], AnyScene]]]
+SceneLister = Callable[[], Sequence[Callable[[], AnyScene]]]
 """Lists what reads each scene: called where a benchmark is started, and by every worker of a cluster."""
 
 MEAN = "mean"
@@ -56,7 +56,7 @@ TURNS = 5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
+class MatcherRow:
     """How one matcher did on one scene, or on the mean of all (scene "mean").
 
     Errors are over every pixel whose truth is known, occluded ones included. A mean is over the scenes that
@@ -119,18 +119,18 @@ class Curves(NamedTuple):
     bad1_percent: Sparsification
 
 
-class Scores(NamedTuple):
+class PairScores(NamedTuple):
     """What `score_pairs` gives.
 
     Attributes:
         rows: One per scene and matcher, then a mean row per matcher.
         class_rows: One per scene, matcher and class of pixels, then one per matcher and class for the mean.
         curves: By matcher, the mean over the scenes.
-        largest: The pair with the most pixels, for `with_memory`.
+        largest: The pair with the most pixels, for `add_memory`.
         machine: What the rows were measured with, for `write_csv`.
     """
 
-    rows: list[Row]
+    rows: list[MatcherRow]
     class_rows: list[ClassRow]
     curves: dict[str, Curves]
     largest: StereoPair
@@ -138,7 +138,7 @@ class Scores(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Scored(Generic[Result]):
+class SceneResult(Generic[Result]):
     """What a scene's number gave, and the machine that it was measured on."""
 
     number: int
@@ -146,10 +146,10 @@ class Scored(Generic[Result]):
     machine: dict[str, str]
 
 
-class _Scene(NamedTuple):
+class _SceneScores(NamedTuple):
     """What `score_pairs` keeps of a scene."""
 
-    scored: list[tuple[Row, Curves]]
+    scored: list[tuple[MatcherRow, Curves]]
     class_rows: list[ClassRow]
     pixels: int
 
@@ -160,16 +160,18 @@ class _Answer(NamedTuple):
     is_probability: bool
 
 
-def network(
+def make_matcher(
     model: str | Path, threads: int | None = None, refined: bool = False, provider: str = CPU
-) -> Match:
+) -> MatchFunction:
     """What `stereoweave.estimate` does with a model, refined or not; errors as for `Matcher`."""
     matcher = Backend(model=model, threads=threads, provider=provider).matcher()
     options = MatchOptions(refined=refined)
     return lambda pair: match(matcher, pair, options)
 
 
-def score_pairs(makers: Mapping[str, Maker], scenes: Lister[Scene], engine: Engine | None = None) -> Scores:
+def score_pairs(
+    makers: Mapping[str, MatcherFactory], scenes: SceneLister[Scene], engine: Engine | None = None
+) -> PairScores:
     """The errors, times and sparsification curves of matchers on scenes; those of OpenCV join them.
 
     Args:
@@ -182,32 +184,34 @@ def score_pairs(makers: Mapping[str, Maker], scenes: Lister[Scene], engine: Engi
         StereoweaveError: A matcher bears a name that the table uses itself, or is a file of that name; there
             is no scene; or as in `engine.stream`.
     """
-    everyone = _everyone(makers)
+    everyone = _add_opencv(makers)
     found = score_all(everyone, scenes, _score_scene, engine)
     scored = [row_and_curves for scene in found for row_and_curves in scene.result.scored]
     rows = [row for row, _ in scored]
     class_rows = [row for scene in found for row in scene.result.class_rows]
     largest = max(found, key=lambda scene: scene.result.pixels)
-    return Scores(
-        rows=rows + _mean_rows(rows, everyone),
-        class_rows=class_rows + _mean_class_rows(class_rows),
-        curves={name: _mean_curves([of for row, of in scored if row.matcher == name]) for name in everyone},
+    return PairScores(
+        rows=rows + _average_rows(rows, everyone),
+        class_rows=class_rows + _average_class_rows(class_rows),
+        curves={
+            name: _average_curves([of for row, of in scored if row.matcher == name]) for name in everyone
+        },
         largest=scenes()[largest.number]().pair,
-        machine=machine_of_all(found),
+        machine=merge_machines(found),
     )
 
 
 def score_all(
     makers: Mapping[str, Callable[[], Any]],
-    scenes: Lister[AnyScene],
+    scenes: SceneLister[AnyScene],
     score: Callable[[Mapping[str, Any], AnyScene], Result],
     engine: Engine | None,
-) -> list[Scored[Result]]:
+) -> list[SceneResult[Result]]:
     """What `score` gives for all that the makers make and each scene, in the scenes' order.
 
     The rest is as for `score_pairs`.
     """
-    make_scorer = partial(_Scorer, makers, scenes, score)
+    make_scorer = partial(_SceneScorer, makers, scenes, score)
     scorer = make_scorer()  # here in any case, where it is said what is no matcher and no scene
     count = len(scorer.readers)
     if not count:
@@ -217,13 +221,15 @@ def score_all(
     return sorted(stream(partial(make_scorer, count), range(count), engine), key=attrgetter("number"))
 
 
-def machine_of_all(scored: Iterable[Scored[Any]]) -> dict[str, str]:
+def merge_machines(scored: Iterable[SceneResult[Any]]) -> dict[str, str]:
     """What the scenes were measured with; what is not the same for all of them is written side by side."""
     machines = [scene.machine for scene in scored]
     return {name: " + ".join(sorted({machine[name] for machine in machines})) for name in machines[0]}
 
 
-def with_memory(rows: Iterable[Row], makers: Mapping[str, Maker], pair: StereoPair) -> list[Row]:
+def add_memory(
+    rows: Iterable[MatcherRow], makers: Mapping[str, MatcherFactory], pair: StereoPair
+) -> list[MatcherRow]:
     """The rows, those of means with the memory that each matcher takes for a pair in a process of its own.
 
     Args:
@@ -231,7 +237,7 @@ def with_memory(rows: Iterable[Row], makers: Mapping[str, Maker], pair: StereoPa
         makers: As `score_pairs` took them; each has to be one that can be pickled.
         pair: What is matched; the largest one of all says what is enough.
     """
-    everyone = _everyone(makers)
+    everyone = _add_opencv(makers)
     return [
         replace(row, memory_mb=peak_memory_mb(everyone[row.matcher], pair)) if row.scene == MEAN else row
         for row in rows
@@ -246,19 +252,19 @@ def write_csv(path: str | Path, rows: Sequence[Any], machine: dict[str, str] | N
         rows: One or more instances of one dataclass, whose fields are the columns.
         machine: These two, and the number of cores; this one's unless given.
     """
-    machine = machine or _machine()
+    machine = machine or _describe_machine()
     columns = [field.name for field in fields(rows[0])] + list(machine)
     values = [{k: f"{v:.6g}" if isinstance(v, float) else v for k, v in asdict(row).items()} for row in rows]
     write_table(path, columns, (row | machine for row in values))
 
 
-class _Scorer:
+class _SceneScorer:
     """Scores scenes by their number, with matchers that are made once."""
 
     def __init__(
         self,
         makers: Mapping[str, Callable[[], Any]],
-        scenes: Lister[Any],
+        scenes: SceneLister[Any],
         score: Callable[[Mapping[str, Any], Any], Any],
         expected: int | None = None,
     ) -> None:
@@ -270,40 +276,42 @@ class _Scorer:
                 f"found {len(self.readers)}; put them on a disk that every node of the cluster sees"
             )
 
-    def __call__(self, number: int) -> Scored[Any]:
-        return Scored(number, self.score(self.matchers, self.readers[number]()), _machine())
+    def __call__(self, number: int) -> SceneResult[Any]:
+        return SceneResult(number, self.score(self.matchers, self.readers[number]()), _describe_machine())
 
 
-def _everyone(makers: Mapping[str, Maker]) -> dict[str, Maker]:
+def _add_opencv(makers: Mapping[str, MatcherFactory]) -> dict[str, MatcherFactory]:
     for name in makers:
         if Path(name).stem in (*OPENCV_MATCHERS, MEAN):
             raise StereoweaveError(f"{name}: expected a name that the table does not use itself; rename it")
     return {**OPENCV_MATCHERS, **makers}
 
 
-def _score_scene(matchers: Mapping[str, Match], scene: Scene) -> _Scene:
+def _score_scene(matchers: Mapping[str, MatchFunction], scene: Scene) -> _SceneScores:
     # These first calls warm the matchers up for the timing.
-    answers = {name: _answer(match, scene.pair) for name, match in matchers.items()}
+    answers = {name: _run_matcher(match, scene.pair) for name, match in matchers.items()}
     # In turns, so that a machine that slows down slows all alike.
-    turns_ms = [{name: _time_ms(match, scene.pair) for name, match in matchers.items()} for _ in range(TURNS)]
+    turns_ms = [
+        {name: _measure_time_ms(match, scene.pair) for name, match in matchers.items()} for _ in range(TURNS)
+    ]
     times_ms = {name: float(np.median([turn_ms[name] for turn_ms in turns_ms])) for name in matchers}
     scored = []
     for name, answer in answers.items():
-        curves = _curves(answer, scene.truth_px)
-        row = Row(
+        curves = _measure_curves(answer, scene.truth_px)
+        row = MatcherRow(
             matcher=name,
             scene=scene.name,
-            **_errors(answer, scene.truth_px),
+            **_measure_errors(answer, scene.truth_px),
             ause_px=curves.epe_px.ause,
             ause_bad1_percent=curves.bad1_percent.ause,
             time_ms=times_ms[name],
             time_relative=times_ms[name] / times_ms[SGBM],
         )
         scored.append((row, curves))
-    return _Scene(scored, _class_rows(answers, scene), scene.truth_px.size)
+    return _SceneScores(scored, _score_classes(answers, scene), scene.truth_px.size)
 
 
-def _class_rows(answers: Mapping[str, _Answer], scene: Scene) -> list[ClassRow]:
+def _score_classes(answers: Mapping[str, _Answer], scene: Scene) -> list[ClassRow]:
     masks = classify(scene.pair.left, scene.truth_px, scene.occluded)
     return [
         ClassRow(matcher=name, scene=scene.name, pixel_class=pixel_class, **asdict(errors))
@@ -312,7 +320,7 @@ def _class_rows(answers: Mapping[str, _Answer], scene: Scene) -> list[ClassRow]:
     ]
 
 
-def _answer(match: Match, pair: StereoPair) -> _Answer:
+def _run_matcher(match: MatchFunction, pair: StereoPair) -> _Answer:
     found = match(pair)
     if isinstance(found, Estimate):
         return _Answer(found.disparity_px, found.confidence, is_probability=True)
@@ -321,7 +329,7 @@ def _answer(match: Match, pair: StereoPair) -> _Answer:
     return _Answer(fill_rows(found), left_right_confidence(found, mirrored_px[:, ::-1]), is_probability=False)
 
 
-def _errors(answer: _Answer, truth_px: Float[np.ndarray, "h w"]) -> dict[str, float]:
+def _measure_errors(answer: _Answer, truth_px: Float[np.ndarray, "h w"]) -> dict[str, float]:
     """The columns of a row that compare with the truth pixel by pixel."""
     found_px = answer.disparity_px
     known = np.isfinite(truth_px)
@@ -340,34 +348,34 @@ def _errors(answer: _Answer, truth_px: Float[np.ndarray, "h w"]) -> dict[str, fl
     }
 
 
-def _curves(answer: _Answer, truth_px: Float[np.ndarray, "h w"]) -> Curves:
+def _measure_curves(answer: _Answer, truth_px: Float[np.ndarray, "h w"]) -> Curves:
     known = np.isfinite(truth_px)
     error_px = np.abs(answer.disparity_px[known] - truth_px[known].astype(np.float64))
     confidence = answer.confidence[known]
     return Curves(sparsification(error_px, confidence), sparsification(100.0 * (error_px > 1), confidence))
 
 
-def _time_ms(match: Match, pair: StereoPair) -> float:
+def _measure_time_ms(match: MatchFunction, pair: StereoPair) -> float:
     start_s = time.perf_counter()
     match(pair)
     return 1000 * (time.perf_counter() - start_s)
 
 
-def _mean_rows(rows: list[Row], names: Iterable[str]) -> list[Row]:
-    columns = [field.name for field in fields(Row) if field.type is float]
+def _average_rows(rows: list[MatcherRow], names: Iterable[str]) -> list[MatcherRow]:
+    columns = [field.name for field in fields(MatcherRow) if field.type is float]
     means = {
         name: {
-            column: float(_mean_known([getattr(row, column) for row in rows if row.matcher == name]))
+            column: float(_average_known([getattr(row, column) for row in rows if row.matcher == name]))
             for column in columns
         }
         for name in names
     }
     for mean in means.values():
         mean["time_relative"] = mean["time_ms"] / means[SGBM]["time_ms"]
-    return [Row(matcher=name, scene=MEAN, **mean) for name, mean in means.items()]
+    return [MatcherRow(matcher=name, scene=MEAN, **mean) for name, mean in means.items()]
 
 
-def _mean_class_rows(rows: Sequence[ClassRow]) -> list[ClassRow]:
+def _average_class_rows(rows: Sequence[ClassRow]) -> list[ClassRow]:
     """The means over the scenes, in the order of the first scene's rows."""
     by_class: defaultdict[tuple[str, str], list[ClassRow]] = defaultdict(list)
     for row in rows:
@@ -378,31 +386,31 @@ def _mean_class_rows(rows: Sequence[ClassRow]) -> list[ClassRow]:
             matcher=matcher,
             scene=MEAN,
             pixel_class=pixel_class,
-            **{column: float(_mean_known([getattr(row, column) for row in alike])) for column in columns},
+            **{column: float(_average_known([getattr(row, column) for row in alike])) for column in columns},
         )
         for (matcher, pixel_class), alike in by_class.items()
     ]
 
 
-def _mean_curves(curves: Sequence[Curves]) -> Curves:
+def _average_curves(curves: Sequence[Curves]) -> Curves:
     means = (
-        Sparsification(*(_mean_known(lines) for lines in zip(*of_scenes, strict=True)))
+        Sparsification(*(_average_known(lines) for lines in zip(*of_scenes, strict=True)))
         for of_scenes in zip(*curves, strict=True)
     )
     return Curves(*means)
 
 
-def _mean_known(values: Sequence[Any]) -> Any:
+def _average_known(values: Sequence[Any]) -> Any:
     """The mean of numbers, or of arrays of one shape, over those without NaN; NaN where there is none."""
     known = [value for value in values if not np.isnan(value).any()]
     return np.mean(known, axis=0) if known else values[0]
 
 
-def _machine() -> dict[str, str]:
-    return {"cpu": _cpu_name(), "cores": str(os.cpu_count()), "opencv": cv2.__version__}
+def _describe_machine() -> dict[str, str]:
+    return {"cpu": _find_cpu_name(), "cores": str(os.cpu_count()), "opencv": cv2.__version__}
 
 
-def _cpu_name() -> str:
+def _find_cpu_name() -> str:
     # Linux alone has this file, and there platform.processor() does not know the model.
     about = Path("/proc/cpuinfo")
     lines = about.read_text().splitlines() if about.exists() else []

@@ -14,7 +14,7 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullLocator
 from matplotlib.transforms import Bbox
 
 from stereoweave.bench.metrics import DROPPED_PERCENT, Sparsification
-from stereoweave.bench.pairs import Curves, Row
+from stereoweave.bench.pairs import Curves, MatcherRow
 from stereoweave.io.files import write_image
 from stereoweave.matching.opencv import OPENCV_MATCHERS
 
@@ -32,7 +32,7 @@ _PLACES: tuple[_Place, ...] = (
 )
 
 
-def draw_error_over_time(path: str | Path, rows: Sequence[Row]) -> None:
+def draw_error_over_time(path: str | Path, rows: Sequence[MatcherRow]) -> None:
     """Write bad-1 and EPE against the time a pair takes, side by side; lower and further left is better.
 
     Args:
@@ -40,10 +40,10 @@ def draw_error_over_time(path: str | Path, rows: Sequence[Row]) -> None:
         rows: One of each matcher: the means. Those of unknown error have no place in it.
     """
     rows = [row for row in rows if not math.isnan(row.epe_px)]
-    figure, panels = _panels()
+    figure, panels = _make_panels()
     for column, axes in panels.items():
         for row in rows:
-            axes.plot(row.time_ms, getattr(row, column), **_marker(row))
+            axes.plot(row.time_ms, getattr(row, column), **_choose_marker(row))
         highest = max((getattr(row, column) for row in rows), default=1)
         axes.set(xscale="log", xlabel="time a pair, ms", ylabel=_TITLES[column], ylim=(0, 1.15 * highest))
         axes.margins(x=0.15)
@@ -53,7 +53,7 @@ def draw_error_over_time(path: str | Path, rows: Sequence[Row]) -> None:
     # Labels make room for each other, and so have to know where the points will be.
     figure.draw_without_rendering()
     for column, axes in panels.items():
-        _label(axes, {_shown(row.matcher): (row.time_ms, getattr(row, column)) for row in rows})
+        _label(axes, {_short_name(row.matcher): (row.time_ms, getattr(row, column)) for row in rows})
     _save(figure, path)
 
 
@@ -64,12 +64,12 @@ def draw_sparsification(path: str | Path, curves: Mapping[str, Curves]) -> None:
         path: The picture's file; its ending says what is written.
         curves: By matcher, as `score_pairs` gives them.
     """
-    figure, panels = _panels()
+    figure, panels = _make_panels()
     for column, axes in panels.items():
         for index, (name, of_matcher) in enumerate(curves.items()):
             curve: Sparsification = getattr(of_matcher, column)
             colour = _COLOURS[index % len(_COLOURS)]
-            axes.plot(DROPPED_PERCENT, curve.kept, color=colour, linewidth=2, label=_legend(name))
+            axes.plot(DROPPED_PERCENT, curve.kept, color=colour, linewidth=2, label=_legend_entry(name))
             axes.plot(DROPPED_PERCENT, curve.oracle, color=colour, linewidth=1, linestyle="--")
         axes.set(xlabel="dropped, % of pixels", ylabel=_TITLES[column], xlim=(0, 95), ylim=(0, None))
     axes.plot([], [], color="0.4", linewidth=1, linestyle="--", label="by its error: the oracle")
@@ -77,7 +77,7 @@ def draw_sparsification(path: str | Path, curves: Mapping[str, Curves]) -> None:
     _save(figure, path)
 
 
-def _panels() -> tuple[Figure, dict[str, Axes]]:
+def _make_panels() -> tuple[Figure, dict[str, Axes]]:
     figure = Figure(figsize=(9, 4), layout="constrained")
     panels = dict(zip(_TITLES, figure.subplots(1, 2), strict=True))
     for axes in panels.values():
@@ -87,18 +87,18 @@ def _panels() -> tuple[Figure, dict[str, Axes]]:
     return figure, panels
 
 
-def _marker(row: Row) -> dict[str, Any]:
+def _choose_marker(row: MatcherRow) -> dict[str, Any]:
     if row.matcher in OPENCV_MATCHERS:
         return {"marker": "s", "color": "0.45", "linestyle": ""}
     return {"marker": "o", "color": _COLOURS[0], "linestyle": ""}
 
 
-def _shown(matcher: str) -> str:
+def _short_name(matcher: str) -> str:
     return Path(matcher).name
 
 
-def _legend(matcher: str) -> str:
-    return f"{matcher}, by its left-right check" if matcher in OPENCV_MATCHERS else _shown(matcher)
+def _legend_entry(matcher: str) -> str:
+    return f"{matcher}, by its left-right check" if matcher in OPENCV_MATCHERS else _short_name(matcher)
 
 
 def _label(axes: Axes, points: Mapping[str, tuple[float, float]]) -> None:
@@ -106,7 +106,7 @@ def _label(axes: Axes, points: Mapping[str, tuple[float, float]]) -> None:
     corners = [axes.transData.transform(point) for point in points.values()]
     taken = [Bbox([corner - _MARKER_PX / 2, corner + _MARKER_PX / 2]) for corner in corners]
     for name, point in points.items():
-        labels = [_written(axes, name, point, place) for place in _PLACES]
+        labels = [_draw_label(axes, name, point, place) for place in _PLACES]
         boxes = [label.get_window_extent() for label in labels]
         free = (index for index, box in enumerate(boxes) if not any(map(box.overlaps, taken)))
         chosen = next(free, 0)
@@ -115,7 +115,7 @@ def _label(axes: Axes, points: Mapping[str, tuple[float, float]]) -> None:
             label.remove()
 
 
-def _written(axes: Axes, name: str, point: tuple[float, float], place: _Place) -> Annotation:
+def _draw_label(axes: Axes, name: str, point: tuple[float, float], place: _Place) -> Annotation:
     offset, horizontal, vertical = place
     return axes.annotate(
         name, point, offset, textcoords="offset points", ha=horizontal, va=vertical, fontsize=9

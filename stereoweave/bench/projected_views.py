@@ -18,14 +18,14 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.matching.opencv import OPENCV_MATCHERS, SGBM, fill_rows
 from stereoweave.stereo import Sample, StereoPair, View
 
-Method = Callable[[Sample], Float[np.ndarray, "h w"]]
+DisparityMethod = Callable[[Sample], Float[np.ndarray, "h w"]]
 """What gives the disparity in px of a sample's left view [H, W]."""
 
 GROUND_TRUTH, NO_WARPING = "ground truth", "no warping"
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewErrors:
+class ProjectionErrors:
     """How a projected right view differs from the photograph.
 
     Attributes:
@@ -43,13 +43,13 @@ class ViewErrors:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewRow:
-    """How one method did, as means over the samples: the errors of its disparity, and `ViewErrors`.
+class ProjectionRow:
+    """How one method did, as means over the samples: the errors of its disparity, and `ProjectionErrors`.
 
     Attributes:
         epe_px: End-point error over the pixels of known truth.
         epe_cm: Mean absolute error of depth there, through each sample's camera; NaN if one has no camera.
-            Estimates are clamped as `score_views` says.
+            Estimates are clamped as `score_projections` says.
     """
 
     method: str
@@ -62,9 +62,9 @@ class ViewRow:
     ssim: float
 
 
-def score_views(
-    methods: Mapping[str, Method], samples: Iterable[Sample], max_depth_m: float | None = None
-) -> list[ViewRow]:
+def score_projections(
+    methods: Mapping[str, DisparityMethod], samples: Iterable[Sample], max_depth_m: float | None = None
+) -> list[ProjectionRow]:
     """A row per method, the means over all samples, after those of three that every table has.
 
     "ground truth" is the true disparity, which has no source to give where it is unknown; "no warping" a
@@ -79,23 +79,23 @@ def score_views(
     Raises:
         StereoweaveError: A method bears one of these three names, or there is no sample.
     """
-    everyone: dict[str, Method] = {GROUND_TRUTH: _true_px, NO_WARPING: _zero_px, SGBM: _sgbm()}
+    everyone: dict[str, DisparityMethod] = {GROUND_TRUTH: _true_px, NO_WARPING: _zero_px, SGBM: _make_sgbm()}
     if taken := everyone.keys() & methods.keys():
         raise StereoweaveError(f"{min(taken)}: expected a name that the table does not use itself; rename it")
     everyone |= methods
     scores = [
-        {name: _scores(method(sample), sample, max_depth_m) for name, method in everyone.items()}
+        {name: _score_sample(method(sample), sample, max_depth_m) for name, method in everyone.items()}
         for sample in samples
     ]
     if not scores:
         raise StereoweaveError("samples: expected at least one, found none; is the split empty?")
-    return [ViewRow(method=name, **_means([score[name] for score in scores])) for name in everyone]
+    return [ProjectionRow(method=name, **_average([score[name] for score in scores])) for name in everyone]
 
 
-def view_errors(right: UInt8[np.ndarray, "h w 3"], projected: View) -> ViewErrors:
+def measure_projection(right: UInt8[np.ndarray, "h w 3"], projected: View) -> ProjectionErrors:
     """The errors of a right view made by `project_right`, against the right photograph."""
     filled = fill_from_rows(projected)
-    return ViewErrors(
+    return ProjectionErrors(
         mae_sourced=mae(projected.image, right, projected.drawn),
         sourced_percent=100 * float(projected.drawn.mean()),
         mae_filled=mae(filled, right),
@@ -104,18 +104,20 @@ def view_errors(right: UInt8[np.ndarray, "h w 3"], projected: View) -> ViewError
     )
 
 
-def _scores(
+def _score_sample(
     disparity_px: Float[np.ndarray, "h w"], sample: Sample, max_depth_m: float | None
 ) -> dict[str, float]:
-    errors = view_errors(sample.right, project_right(sample.left, disparity_px))
+    errors = measure_projection(sample.right, project_right(sample.left, disparity_px))
     return {
         "epe_px": epe_px(disparity_px, sample.disparity_px),
-        "epe_cm": _epe_cm(disparity_px, sample, max_depth_m),
+        "epe_cm": _measure_epe_cm(disparity_px, sample, max_depth_m),
         **asdict(errors),
     }
 
 
-def _epe_cm(disparity_px: Float[np.ndarray, "h w"], sample: Sample, max_depth_m: float | None) -> float:
+def _measure_epe_cm(
+    disparity_px: Float[np.ndarray, "h w"], sample: Sample, max_depth_m: float | None
+) -> float:
     if sample.camera is None:
         return float("nan")
     truth_m = sample.camera.depth_m(sample.disparity_px)
@@ -123,7 +125,7 @@ def _epe_cm(disparity_px: Float[np.ndarray, "h w"], sample: Sample, max_depth_m:
     return 100 * depth_error_m(np.minimum(sample.camera.depth_m(disparity_px), farthest_m), truth_m)
 
 
-def _means(scores: list[dict[str, float]]) -> dict[str, float]:
+def _average(scores: list[dict[str, float]]) -> dict[str, float]:
     return {column: float(np.mean([score[column] for score in scores])) for column in scores[0]}
 
 
@@ -135,6 +137,6 @@ def _zero_px(sample: Sample) -> Float[np.ndarray, "h w"]:
     return np.zeros_like(sample.disparity_px)
 
 
-def _sgbm() -> Method:
+def _make_sgbm() -> DisparityMethod:
     match = OPENCV_MATCHERS[SGBM]()
     return lambda sample: fill_rows(match(StereoPair(left=sample.left, right=sample.right)))

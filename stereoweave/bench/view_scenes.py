@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from stereoweave.data.samples import make_sample, of_its_size
+from stereoweave.data.samples import make_sample, require_size
 from stereoweave.data.shards import Shards, list_shards
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.files import read_disparity_png, read_image, read_pair, read_pfm, read_small, reading
@@ -18,7 +18,7 @@ from stereoweave.stereo import Sample, StereoPair
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrueView:
+class ReferenceView:
     """A picture that a camera on the line through the two has taken.
 
     Attributes:
@@ -44,7 +44,7 @@ class ViewScene:
 
     name: str
     sample: Sample
-    views: tuple[TrueView, ...]
+    views: tuple[ReferenceView, ...]
 
 
 def read_view_scenes(folder: str | Path) -> Iterator[ViewScene]:
@@ -76,13 +76,15 @@ def list_view_scenes(folder: str | Path) -> list[Callable[[], ViewScene]]:
             f"{root}: expected <scene>/left.png below it, or rendered sets, found neither; "
             "render a set with further views: stereoweave synth make"
         )
-    return [partial(_rendered_scene, pairs, index, root) for pairs in sets for index in range(pairs.count)]
+    return [
+        partial(_read_rendered_scene, pairs, index, root) for pairs in sets for index in range(pairs.count)
+    ]
 
 
-def _rendered_scene(pairs: Shards, index: int, root: Path) -> ViewScene:
+def _read_rendered_scene(pairs: Shards, index: int, root: Path) -> ViewScene:
     folder = pairs.shards[0].path.parent
     name = (folder.relative_to(root) / pairs.name(index)).as_posix()
-    views = tuple(TrueView(position=at, image=image) for at, image in sorted(pairs.views(index).items()))
+    views = tuple(ReferenceView(position=at, image=image) for at, image in sorted(pairs.views(index).items()))
     if not views:
         raise FormatError(
             f"{folder}: expected pairs with further views, found {name} without; "
@@ -107,13 +109,13 @@ def _read_scene(folder: Path) -> ViewScene:
     )
 
 
-def _read_view(path: Path, pair: StereoPair, offsets_px: dict[float, tuple[float, float]]) -> TrueView:
-    position = _position(path)
-    image = of_its_size(read_image(path), path, pair)
-    return TrueView(position=position, image=image, offset_px=offsets_px.get(position, (0.0, 0.0)))
+def _read_view(path: Path, pair: StereoPair, offsets_px: dict[float, tuple[float, float]]) -> ReferenceView:
+    position = _parse_position(path)
+    image = require_size(read_image(path), path, pair)
+    return ReferenceView(position=position, image=image, offset_px=offsets_px.get(position, (0.0, 0.0)))
 
 
-def _position(path: Path) -> float:
+def _parse_position(path: Path) -> float:
     text = path.stem.removeprefix("view_")
     try:
         position = float(text)
@@ -135,7 +137,7 @@ def _read_disparity(folder: Path, name: str, *, pair: StereoPair) -> Float[np.nd
     }
     for ending, read in readers.items():
         if (path := folder / f"{name}{ending}").exists():
-            return of_its_size(read(path), path, pair)
+            return require_size(read(path), path, pair)
     return np.full(pair.left.shape[:2], np.nan, np.float32)
 
 

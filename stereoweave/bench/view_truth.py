@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from stereoweave.data.samples import hidden
+from stereoweave.data.samples import find_hidden
 from stereoweave.matching.opencv import fill_rows
 from stereoweave.stereo import Sample
 
@@ -31,7 +31,7 @@ class ViewTruth:
     none_sees: Bool[np.ndarray, "h w"]
 
 
-def view_truth(sample: Sample, position: float) -> ViewTruth:
+def find_view_truth(sample: Sample, position: float) -> ViewTruth:
     """What the view from a position shows of a pair: the nearest of what lands there from either side.
 
     Args:
@@ -39,15 +39,15 @@ def view_truth(sample: Sample, position: float) -> ViewTruth:
         position: 0 is the left camera, 1 the right one.
     """
     sides = (sample.disparity_px, 0 - position), (sample.right_disparity_px, 1 - position)
-    disparity_px = np.fmax(*(landed_px(side_px, way) for side_px, way in sides))
-    filled_px = np.fmax(*(landed_px(fill_unknown(side_px), way) for side_px, way in sides))
-    from_left, from_right = (_hidden_from(disparity_px, side_px, way) for side_px, way in sides)
+    disparity_px = np.fmax(*(land_disparities(side_px, way) for side_px, way in sides))
+    filled_px = np.fmax(*(land_disparities(fill_unknown(side_px), way) for side_px, way in sides))
+    from_left, from_right = (_find_hidden_from(disparity_px, side_px, way) for side_px, way in sides)
     return ViewTruth(
         disparity_px=disparity_px, one_sees=from_left ^ from_right, none_sees=np.isnan(filled_px)
     )
 
 
-def landed_px(disparity_px: Float[np.ndarray, "h w"], way: float) -> Float[np.ndarray, "h w"]:
+def land_disparities(disparity_px: Float[np.ndarray, "h w"], way: float) -> Float[np.ndarray, "h w"]:
     """The nearest disparity that lands on each pixel of a view [H, W]; NaN where none does.
 
     Args:
@@ -74,10 +74,10 @@ def fill_unknown(disparity_px: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h
     return fill_rows(np.nan_to_num(disparity_px + lift_px).astype(np.float32)) - lift_px
 
 
-def _hidden_from(
+def _find_hidden_from(
     disparity_px: Float[np.ndarray, "h w"], side_px: Float[np.ndarray, "h w"], way: float
 ) -> Bool[np.ndarray, "h w"]:
     """Pixels of the new view that the photograph which lands in it by `way` does not see."""
     if way < 0:  # the photograph was taken to the left: in a mirror, to the right
-        return _hidden_from(disparity_px[:, ::-1], side_px[:, ::-1], -way)[:, ::-1]
-    return hidden(way * disparity_px, way * side_px)
+        return _find_hidden_from(disparity_px[:, ::-1], side_px[:, ::-1], -way)[:, ::-1]
+    return find_hidden(way * disparity_px, way * side_px)

@@ -21,16 +21,16 @@ from jaxtyping import Bool, Float, UInt8
 
 from stereoweave.bench.edge_metrics import near_edge
 from stereoweave.bench.metrics import mae, psnr_db, ssim
-from stereoweave.bench.pairs import MEAN, TURNS, Lister, machine_of_all, score_all
-from stereoweave.bench.view_scenes import TrueView, ViewScene
-from stereoweave.bench.view_truth import fill_unknown, view_truth
-from stereoweave.data.samples import hidden
+from stereoweave.bench.pairs import MEAN, TURNS, SceneLister, merge_machines, score_all
+from stereoweave.bench.view_scenes import ReferenceView, ViewScene
+from stereoweave.bench.view_truth import fill_unknown, find_view_truth
+from stereoweave.data.samples import find_hidden
 from stereoweave.matching.opencv import OPENCV_MATCHERS, SGBM, fill_rows, left_right_confidence
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, Sample, StereoPair
 from stereoweave.system.ray_engine import Engine
 
-Match = Callable[[StereoPair], Estimate]
+Estimator = Callable[[StereoPair], Estimate]
 """A pair to the estimate that views are rendered from, such as what `benchmark.network` gives."""
 
 Viewer = Callable[[float], UInt8[np.ndarray, "h w 3"]]
@@ -41,7 +41,7 @@ NEAREST, CROSS_FADE, GROUND_TRUTH = "nearest photograph", "cross-fade", "ground 
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewScore:
+class ViewScoreRow:
     """How one method's view of a scene from a position compares with the picture taken there.
 
     In the mean row of a method (scene "mean", no position) each number is the mean over the scenes that have
@@ -74,13 +74,13 @@ class ViewScore:
 class ViewScores(NamedTuple):
     """A row per scene, position and method, then a mean row per method; and what they were measured with."""
 
-    rows: list[ViewScore]
+    rows: list[ViewScoreRow]
     machine: dict[str, str]
 
 
-def score_scenes(
-    networks: Mapping[str, Callable[[], Match]],
-    scenes: Lister[ViewScene],
+def score_view_scenes(
+    networks: Mapping[str, Callable[[], Estimator]],
+    scenes: SceneLister[ViewScene],
     threads: int | None = None,
     engine: Engine | None = None,
 ) -> ViewScores:
@@ -99,11 +99,13 @@ def score_scenes(
     found = score_all(networks, scenes, partial(_score_scene, threads), engine)
     rows = [row for scene in found for row in scene.result]
     methods = dict.fromkeys(row.method for row in rows)
-    means = [_mean_row(method, [row for row in rows if row.method == method]) for method in methods]
-    return ViewScores(rows + means, machine_of_all(found))
+    means = [_average_rows(method, [row for row in rows if row.method == method]) for method in methods]
+    return ViewScores(rows + means, merge_machines(found))
 
 
-def moved(image: UInt8[np.ndarray, "h w 3"], offset_px: tuple[float, float]) -> UInt8[np.ndarray, "h w 3"]:
+def shift_image(
+    image: UInt8[np.ndarray, "h w 3"], offset_px: tuple[float, float]
+) -> UInt8[np.ndarray, "h w 3"]:
     """The image with its content moved right and down by offset_px; as it is where that is zero."""
     if offset_px == (0, 0):
         return image
@@ -112,41 +114,45 @@ def moved(image: UInt8[np.ndarray, "h w 3"], offset_px: tuple[float, float]) -> 
     return cv2.warpAffine(image, shift, size, flags=cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
 
 
-def _score_scene(threads: int | None, networks: Mapping[str, Match], scene: ViewScene) -> list[ViewScore]:
-    viewers = _viewers(networks, scene.sample, threads)
+def _score_scene(
+    threads: int | None, networks: Mapping[str, Estimator], scene: ViewScene
+) -> list[ViewScoreRow]:
+    viewers = _make_viewers(networks, scene.sample, threads)
     rows = []
     for true in scene.views:
         # These first calls warm the renderer up for the timing.
         images = {method: viewer(true.position) for method, viewer in viewers.items()}
-        times_ms = _times_ms(viewers, true.position)
-        kinds = _kinds(scene.sample, true.position)
+        times_ms = _measure_times_ms(viewers, true.position)
+        kinds = _classify_pixels(scene.sample, true.position)
         rows += [
-            ViewScore(
+            ViewScoreRow(
                 scene=scene.name,
                 position=true.position,
                 method=method,
                 time_ms=times_ms[method],
-                **_errors(moved(image, true.offset_px), true, kinds),
+                **_measure_errors(shift_image(image, true.offset_px), true, kinds),
             )
             for method, image in images.items()
         ]
     return rows
 
 
-def _viewers(networks: Mapping[str, Match], sample: Sample, threads: int | None) -> dict[str, Viewer]:
+def _make_viewers(
+    networks: Mapping[str, Estimator], sample: Sample, threads: int | None
+) -> dict[str, Viewer]:
     pair = StereoPair(left=sample.left, right=sample.right, camera=sample.camera)
-    estimates = {SGBM: _sgbm_estimate(pair)}
-    if _truth_known(sample):
-        estimates[GROUND_TRUTH] = _true_estimate(sample)
+    estimates = {SGBM: _estimate_by_sgbm(pair)}
+    if _has_truth(sample):
+        estimates[GROUND_TRUTH] = _estimate_from_truth(sample)
     estimates |= {name: match(pair) for name, match in networks.items()}
     rendered = {
-        name: partial(_rendered, Renderer(pair, estimate, threads=threads))
+        name: partial(_render_view, Renderer(pair, estimate, threads=threads))
         for name, estimate in estimates.items()
     }
-    return {NEAREST: partial(_nearest, pair), CROSS_FADE: partial(_cross_fade, pair), **rendered}
+    return {NEAREST: partial(_pick_nearest, pair), CROSS_FADE: partial(_cross_fade, pair), **rendered}
 
 
-def _nearest(pair: StereoPair, position: float) -> UInt8[np.ndarray, "h w 3"]:
+def _pick_nearest(pair: StereoPair, position: float) -> UInt8[np.ndarray, "h w 3"]:
     return pair.left if position < 0.5 else pair.right
 
 
@@ -155,11 +161,11 @@ def _cross_fade(pair: StereoPair, position: float) -> UInt8[np.ndarray, "h w 3"]
     return np.round(pair.left * (1 - share) + pair.right * share).astype(np.uint8)
 
 
-def _rendered(renderer: Renderer, position: float) -> UInt8[np.ndarray, "h w 3"]:
+def _render_view(renderer: Renderer, position: float) -> UInt8[np.ndarray, "h w 3"]:
     return renderer.view(position).image
 
 
-def _sgbm_estimate(pair: StereoPair) -> Estimate:
+def _estimate_by_sgbm(pair: StereoPair) -> Estimate:
     """What OpenCV's users have of it: both views, each filled along rows, and the left-right check."""
     match = OPENCV_MATCHERS[SGBM]()
     left_px, mirrored_px = match(pair), match(pair.mirrored())
@@ -169,11 +175,11 @@ def _sgbm_estimate(pair: StereoPair) -> Estimate:
         right_disparity_px=right_filled_px,
         # As the matcher does for a network without a confidence of its own.
         confidence=np.exp(left_right_confidence(left_px, mirrored_px[:, ::-1])),
-        occluded=hidden(filled_px, right_filled_px),
+        occluded=find_hidden(filled_px, right_filled_px),
     )
 
 
-def _true_estimate(sample: Sample) -> Estimate:
+def _estimate_from_truth(sample: Sample) -> Estimate:
     return Estimate(
         disparity_px=fill_unknown(sample.disparity_px),
         right_disparity_px=fill_unknown(sample.right_disparity_px),
@@ -182,23 +188,23 @@ def _true_estimate(sample: Sample) -> Estimate:
     )
 
 
-def _truth_known(sample: Sample) -> bool:
+def _has_truth(sample: Sample) -> bool:
     return all(np.isfinite(side_px).any() for side_px in (sample.disparity_px, sample.right_disparity_px))
 
 
-def _kinds(sample: Sample, position: float) -> dict[str, Bool[np.ndarray, "h w"]]:
+def _classify_pixels(sample: Sample, position: float) -> dict[str, Bool[np.ndarray, "h w"]]:
     """The pixels of each kind, which begins the names of its columns; none where the truth is not known."""
-    if not _truth_known(sample):
+    if not _has_truth(sample):
         return dict.fromkeys(("smooth", "edge", "one", "neither"), np.zeros(sample.left.shape[:2], bool))
-    truth = view_truth(sample, position)
+    truth = find_view_truth(sample, position)
     known = np.isfinite(truth.disparity_px)
     # What neither shows is behind what is beside it.
     near = near_edge(np.where(truth.none_sees, _BEHIND_ALL_PX, truth.disparity_px))
     return {"smooth": known & ~near, "edge": known & near, "one": truth.one_sees, "neither": truth.none_sees}
 
 
-def _errors(
-    image: UInt8[np.ndarray, "h w 3"], true: TrueView, kinds: Mapping[str, Bool[np.ndarray, "h w"]]
+def _measure_errors(
+    image: UInt8[np.ndarray, "h w 3"], true: ReferenceView, kinds: Mapping[str, Bool[np.ndarray, "h w"]]
 ) -> dict[str, float]:
     """The columns that compare the two pictures."""
     errors = {
@@ -212,30 +218,36 @@ def _errors(
     return errors
 
 
-def _times_ms(viewers: Mapping[str, Viewer], position: float) -> dict[str, float]:
+def _measure_times_ms(viewers: Mapping[str, Viewer], position: float) -> dict[str, float]:
     # In turns, so that a machine that slows down slows all alike.
-    turns_ms = [{name: _time_ms(viewer, position) for name, viewer in viewers.items()} for _ in range(TURNS)]
+    turns_ms = [
+        {name: _measure_time_ms(viewer, position) for name, viewer in viewers.items()} for _ in range(TURNS)
+    ]
     return {name: float(np.median([turn_ms[name] for turn_ms in turns_ms])) for name in viewers}
 
 
-def _time_ms(viewer: Viewer, position: float) -> float:
+def _measure_time_ms(viewer: Viewer, position: float) -> float:
     start_s = time.perf_counter()
     viewer(position)
     return 1000 * (time.perf_counter() - start_s)
 
 
-def _mean_row(method: str, rows: Iterable[ViewScore]) -> ViewScore:
-    scenes: dict[str, list[ViewScore]] = {}
+def _average_rows(method: str, rows: Iterable[ViewScoreRow]) -> ViewScoreRow:
+    scenes: dict[str, list[ViewScoreRow]] = {}
     for row in rows:
         scenes.setdefault(row.scene, []).append(row)
-    columns = [field.name for field in fields(ViewScore) if field.type is float and field.name != "position"]
+    columns = [
+        field.name for field in fields(ViewScoreRow) if field.type is float and field.name != "position"
+    ]
     means = {
-        column: _mean_known([_mean_known([getattr(row, column) for row in of]) for of in scenes.values()])
+        column: _average_known(
+            [_average_known([getattr(row, column) for row in of]) for of in scenes.values()]
+        )
         for column in columns
     }
-    return ViewScore(scene=MEAN, position=float("nan"), method=method, **means)
+    return ViewScoreRow(scene=MEAN, position=float("nan"), method=method, **means)
 
 
-def _mean_known(values: Iterable[float]) -> float:
+def _average_known(values: Iterable[float]) -> float:
     known: Float[np.ndarray, " n"] = np.array([value for value in values if not np.isnan(value)])
     return float(known.mean()) if known.size else float("nan")

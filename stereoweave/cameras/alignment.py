@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from stereoweave.cameras.disparity_sign import depth_order, surely_negative
-from stereoweave.cameras.feature_matches import Matches, sparse_matches
+from stereoweave.cameras.disparity_sign import estimate_depth_order, find_negative_disparities
+from stereoweave.cameras.feature_matches import Matches, find_matches
 from stereoweave.errors import Note, Remedy
 
 Defect = Literal[
@@ -136,25 +136,27 @@ class Alignment:
 
 def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]) -> Alignment:
     """Defects of a pair, rectified or not; takes 0.1 to 0.2 s at 640x480."""
-    matches = sparse_matches(left, right)
+    matches = find_matches(left, right)
     scale = max(1.0, (left.shape[0] * left.shape[1] / _PIXELS_OF_TOLERANCE) ** 0.5)
     count = len(matches.left_px)
     centre_px = (np.array(right.shape[1::-1]) - 1) / 2
-    field = _fit(matches, centre_px, scale) if count >= _LEAST_MATCHES else None
+    field = _fit_vertical_error(matches, centre_px, scale) if count >= _LEAST_MATCHES else None
     if field is None:
-        return _unrelated(count)
+        return _make_unrelated(count)
     right_ones, shift_px, slope, uneven_px = field
     matches = Matches(matches.left_px[right_ones], matches.right_px[right_ones])
     # The sides of a turned picture move left and right as well.
     disparity_px = matches.disparity_px - slope * (matches.right_px[:, 1] - centre_px[1])
-    shared = _shared_by_neighbours(matches, disparity_px, scale)
+    shared = _find_supported(matches, disparity_px, scale)
     disparity_px = disparity_px[shared]
     if len(disparity_px) < _LEAST_MATCHES:
-        return _unrelated(count)
-    small = _reduced(left, scale), _levelled(_reduced(right, scale), shift_px / scale, slope)
-    negative_px = scale * surely_negative(*small, matches.left_px[shared] / scale, disparity_px / scale)
-    least_px, greatest_px = _range(disparity_px, negative_px)
-    ratio = _light_ratio(left, right, matches)
+        return _make_unrelated(count)
+    small = _shrink(left, scale), _level(_shrink(right, scale), shift_px / scale, slope)
+    negative_px = scale * find_negative_disparities(
+        *small, matches.left_px[shared] / scale, disparity_px / scale
+    )
+    least_px, greatest_px = _measure_range(disparity_px, negative_px)
+    ratio = _measure_light_ratio(left, right, matches)
     # A turn about another point than the middle of the right picture looks like a shift as well.
     tolerated_px = scale * _TOLERATED_PX + abs(slope) * float(np.median(np.abs(disparity_px)))
     amiss = {
@@ -164,7 +166,7 @@ def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3
         "exposure": abs(np.log2(ratio)) > _TOLERATED_STOPS,
     }
     if len(negative_px):
-        order = depth_order(*small, (least_px / scale, greatest_px / scale))
+        order = estimate_depth_order(*small, (least_px / scale, greatest_px / scale))
         usual = _CLEAR_VOTE * (2 * float((disparity_px < 0).mean()) - 1)
         swapped = greatest_px < -least_px and order < usual
         amiss["swapped" if swapped else "negative_disparity"] = True
@@ -181,7 +183,7 @@ def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3
     )
 
 
-def _range(
+def _measure_range(
     disparity_px: Float[np.ndarray, " n"], negative_px: Float[np.ndarray, " m"]
 ) -> tuple[float, float]:
     """The least and the greatest disparity, without the outermost 1 %; negative ones if some are sure."""
@@ -193,7 +195,7 @@ def _range(
     return float(least_px), float(greatest_px)
 
 
-def _unrelated(matches: int) -> Alignment:
+def _make_unrelated(matches: int) -> Alignment:
     nan = float("nan")
     return Alignment(
         matches=matches,
@@ -207,7 +209,7 @@ def _unrelated(matches: int) -> Alignment:
     )
 
 
-def _fit(
+def _fit_vertical_error(
     matches: Matches, centre_px: Float[np.ndarray, " 2"], scale: float
 ) -> tuple[Bool[np.ndarray, " n"], float, float, float] | None:
     """Which matches are right, the shift in px, the slope, and how far in px the rest of the field goes.
@@ -219,7 +221,7 @@ def _fit(
     x, y = ((matches.right_px - centre_px) / centre_px[0]).T
     terms = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=1)
     lower_px = matches.lower_px
-    right_ones = _agreeing(terms[:, :3], lower_px, scale * _FIRST_RIGHT_PX)
+    right_ones = _find_plane_inliers(terms[:, :3], lower_px, scale * _FIRST_RIGHT_PX)
     for _ in range(_POLISHING):
         # A tenth of a px for each unit of the terms keeps those small that few matches speak for.
         weights, ridge = terms[right_ones], 0.1 * np.eye(6)
@@ -231,7 +233,7 @@ def _fit(
     return right_ones, float(field[0]), float(field[1] / centre_px[0]), float(np.percentile(uneven_px, 95))
 
 
-def _agreeing(
+def _find_plane_inliers(
     terms: Float[np.ndarray, "n 3"], values: Float[np.ndarray, " n"], tolerated: float
 ) -> Bool[np.ndarray, " n"]:
     """Which values lie on the plane that, of many through three of them and of 0 everywhere, fits most."""
@@ -246,7 +248,7 @@ def _agreeing(
     return missed[best] < tolerated
 
 
-def _shared_by_neighbours(
+def _find_supported(
     matches: Matches, disparity_px: Float[np.ndarray, " n"], scale: float
 ) -> Bool[np.ndarray, " n"]:
     """Which matches have a disparity that some of those around them have as well."""
@@ -259,18 +261,18 @@ def _shared_by_neighbours(
     return agreeing.sum(1) - 1 >= _LEAST_AGREEING  # each agrees with itself
 
 
-def _light_ratio(
+def _measure_light_ratio(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], matches: Matches
 ) -> float:
     """The right photograph's light divided by the left one's, in the median of the matches; NaN for none."""
-    levels = _levels(left, matches.left_px), _levels(right, matches.right_px)
+    levels = _sample_levels(left, matches.left_px), _sample_levels(right, matches.right_px)
     told = np.logical_and(*((level > _BLACK_LEVEL) & (level < _WHITE_LEVEL) for level in levels))
     if told.sum() < _LEAST_MATCHES:
         return float("nan")
     return float(np.median(levels[1][told] / levels[0][told]) ** _GAMMA)
 
 
-def _levels(
+def _sample_levels(
     photo: UInt8[np.ndarray, "h w 3"], places_px: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "3 n"]:
     """Levels of the strongest channel around each place: dark, middle and bright, as one may be cut off."""
@@ -282,14 +284,14 @@ def _levels(
     return np.percentile(photo[rows, columns].max(3), [15, 50, 85], axis=(1, 2))
 
 
-def _reduced(photo: UInt8[np.ndarray, "h w 3"], scale: float) -> UInt8[np.ndarray, "h2 w2 3"]:
+def _shrink(photo: UInt8[np.ndarray, "h w 3"], scale: float) -> UInt8[np.ndarray, "h2 w2 3"]:
     if scale == 1:
         return photo
     size = max(round(photo.shape[1] / scale), 1), max(round(photo.shape[0] / scale), 1)
     return cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
 
 
-def _levelled(photo: UInt8[np.ndarray, "h w 3"], shift_px: float, slope: float) -> UInt8[np.ndarray, "h w 3"]:
+def _level(photo: UInt8[np.ndarray, "h w 3"], shift_px: float, slope: float) -> UInt8[np.ndarray, "h w 3"]:
     """The right photograph moved up and turned back."""
     height, width = photo.shape[:2]
     x, y = (width - 1) / 2, (height - 1) / 2

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from stereoweave.cameras.rig import Optics, Rig, Size, words
+from stereoweave.cameras.rig import Optics, Rig, Size, format_size
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.decoding import ENDINGS
 from stereoweave.io.files import read_image
@@ -86,7 +86,7 @@ class Board:
         return np.stack([across, down, 0 * down], axis=-1) * self.square_m
 
 
-class Seen(NamedTuple):
+class PairCorners(NamedTuple):
     """The corners that both pictures of a pair show: which of the board's, and where, x and y in px."""
 
     name: str
@@ -95,7 +95,7 @@ class Seen(NamedTuple):
     right_px: Float[np.ndarray, "n 2"]
 
 
-class _Found(NamedTuple):
+class _ViewCorners(NamedTuple):
     corners: Int[np.ndarray, " n"]
     at_px: Float[np.ndarray, "n 2"]
 
@@ -175,7 +175,7 @@ class Calibration:
         fx, fy = (self.rig.left.matrix[axis, axis] for axis in (0, 1))
         return [
             *(f"{name}: left out, {why}" for name, why in self.left_out.items()),
-            f"left camera: focal length {fx:.1f} x {fy:.1f} px, {words(self.rig.size_px)} px",
+            f"left camera: focal length {fx:.1f} x {fy:.1f} px, {format_size(self.rig.size_px)} px",
             f"baseline {1000 * self.rig.baseline_m:.2f} mm, cameras turned by "
             f"{self.rig.rotation_degrees:.2f} degrees against each other",
             f"reprojection error {self.error_px:.2f} px (left {self.left_error_px:.2f}, right "
@@ -210,8 +210,8 @@ def calibrate(
     Raises:
         StereoweaveError: No such folder, or fewer than FEWEST_PAIRS pairs that can be used.
     """
-    pairs, left_out = _pairs(Path(folder))
-    seen, size_px = _seen(pairs, board, left_out, progress)
+    pairs, left_out = _find_pairs(Path(folder))
+    seen, size_px = _find_all_corners(pairs, board, left_out, progress)
     _check_enough(len(seen), len(pairs), board, left_out)
     solve = _solve_fisheye if fisheye else _solve_pinhole
     while True:
@@ -226,7 +226,7 @@ def calibrate(
         far = worst_px > _OUTLIER * np.median(worst_px)
         if not far.any():
             rig = replace(solution.rig, name=str(folder))
-            return _judged(solution._replace(rig=rig), seen, left_out)
+            return _judge(solution._replace(rig=rig), seen, left_out)
         for index in np.flatnonzero(far):
             off = f"{worst_px[index]:.2f} px off, over {_OUTLIER:g} times as much as the other pairs"
             left_out[seen[index].name] = off
@@ -247,7 +247,7 @@ def _check_enough(count: int, total: int, board: Board, left_out: Mapping[str, s
 # Pictures and corners
 
 
-def _pairs(folder: Path) -> tuple[dict[str, tuple[Path, Path]], dict[str, str]]:
+def _find_pairs(folder: Path) -> tuple[dict[str, tuple[Path, Path]], dict[str, str]]:
     """Left and right picture by the name of their pair, and the pictures that have no partner."""
     if not folder.is_dir():
         raise StereoweaveError(f"{folder}: expected a folder with pictures of a board, found none")
@@ -272,19 +272,19 @@ def _pairs(folder: Path) -> tuple[dict[str, tuple[Path, Path]], dict[str, str]]:
     return {left.relative_to(folder).as_posix(): (left, right) for left, right in pairs.values()}, single
 
 
-def _seen(
+def _find_all_corners(
     pairs: Mapping[str, tuple[Path, Path]],
     board: Board,
     left_out: dict[str, str],
     progress: Callable[[str], None],
-) -> tuple[list[Seen], Size]:
+) -> tuple[list[PairCorners], Size]:
     """The corners of every pair that shows the board, of the size that most pictures have."""
-    seen: list[tuple[Seen, Size]] = []
+    seen: list[tuple[PairCorners, Size]] = []
     for name, paths in pairs.items():
         progress(name)
         try:
             left, right = (cv2.cvtColor(read_image(path), cv2.COLOR_RGB2GRAY) for path in paths)
-            seen.append((_seen_of_both(name, left, right, board), (left.shape[1], left.shape[0])))
+            seen.append((_find_pair_corners(name, left, right, board), (left.shape[1], left.shape[0])))
         except FormatError as error:
             left_out[name] = str(error)
     if not seen:
@@ -292,16 +292,16 @@ def _seen(
     size_px = Counter(size for _, size in seen).most_common(1)[0][0]
     for pair, found_px in seen:
         if found_px != size_px:
-            left_out[pair.name] = f"of {words(found_px)}, where most are of {words(size_px)}"
+            left_out[pair.name] = f"of {format_size(found_px)}, where most are of {format_size(size_px)}"
     return [pair for pair, found_px in seen if found_px == size_px], size_px
 
 
-def _seen_of_both(
+def _find_pair_corners(
     name: str, left: UInt8[np.ndarray, "h w"], right: UInt8[np.ndarray, "h2 w2"], board: Board
-) -> Seen:
+) -> PairCorners:
     """The corners that are in both; FormatError where they are too few."""
     if left.shape != right.shape:
-        sizes = [words(image.shape[::-1]) for image in (left, right)]
+        sizes = [format_size(image.shape[::-1]) for image in (left, right)]
         raise FormatError(f"the left picture is of {sizes[0]}, the right one of {sizes[1]}")
     find = _find_charuco if board.dictionary else _find_chessboard
     found = [find(image, board) for image in (left, right)]
@@ -311,46 +311,50 @@ def _seen_of_both(
     here, there = found
     assert here is not None and there is not None
     if not board.dictionary:
-        there = _ordered_alike(here, there, board)
+        there = _reorder(here, there, board)
     both, in_left, in_right = np.intersect1d(here.corners, there.corners, return_indices=True)
     places = board.corners_m()[both]
     if len(both) < _FEWEST_CORNERS or np.linalg.matrix_rank(places - places.mean(axis=0)) < 2:
         raise FormatError(f"only {len(both)} corners of the board are in both pictures")
-    return Seen(name, both, here.at_px[in_left], there.at_px[in_right])
+    return PairCorners(name, both, here.at_px[in_left], there.at_px[in_right])
 
 
-def _find_chessboard(image: UInt8[np.ndarray, "h w"], board: Board) -> _Found | None:
+def _find_chessboard(image: UInt8[np.ndarray, "h w"], board: Board) -> _ViewCorners | None:
     size, flags = (board.columns, board.rows), cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
     for more in (0, cv2.CALIB_CB_EXHAUSTIVE):
         found, at_px = cv2.findChessboardCornersSB(image, size, flags=flags | more)
         if found:
-            return _Found(np.arange(board.columns * board.rows), at_px.reshape(-1, 2).astype(np.float64))
+            return _ViewCorners(
+                np.arange(board.columns * board.rows), at_px.reshape(-1, 2).astype(np.float64)
+            )
     return None
 
 
-def _find_charuco(image: UInt8[np.ndarray, "h w"], board: Board) -> _Found | None:
+def _find_charuco(image: UInt8[np.ndarray, "h w"], board: Board) -> _ViewCorners | None:
     at_px, corners, _, _ = cv2.aruco.CharucoDetector(board.charuco()).detectBoard(image)
     if corners is None or not len(corners):
         return None
-    return _Found(corners.ravel().astype(int), at_px.reshape(-1, 2).astype(np.float64))
+    return _ViewCorners(corners.ravel().astype(int), at_px.reshape(-1, 2).astype(np.float64))
 
 
-def _ordered_alike(here: _Found, there: _Found, board: Board) -> _Found:
+def _reorder(here: _ViewCorners, there: _ViewCorners, board: Board) -> _ViewCorners:
     """The right corners in the order of the left ones: a chessboard does not say which way up it is."""
     grid = there.at_px.reshape(board.rows, board.columns, 2)
     turns = (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
     orders = [np.rot90(grid, turn).reshape(-1, 2) for turn in turns]
     wanted = here.at_px - here.at_px.mean(axis=0)
     unlike = [np.abs(order - order.mean(axis=0) - wanted).sum() for order in orders]
-    return _Found(here.corners, orders[int(np.argmin(unlike))])
+    return _ViewCorners(here.corners, orders[int(np.argmin(unlike))])
 
 
 # The rig
 
 
-def _solve_pinhole(corners_m: Float[np.ndarray, "m 3"], seen: Sequence[Seen], size_px: Size) -> _Solution:
+def _solve_pinhole(
+    corners_m: Float[np.ndarray, "m 3"], seen: Sequence[PairCorners], size_px: Size
+) -> _Solution:
     boards = [corners_m[pair.corners].astype(np.float32) for pair in seen]
-    left, right = ([points.astype(np.float32) for points in side] for side in _sides(seen))
+    left, right = ([points.astype(np.float32) for points in side] for side in _split_sides(seen))
     start = [
         cv2.calibrateCamera(boards, points, size_px, None, None, criteria=_ITERATIONS)[1:3]
         for points in (left, right)
@@ -360,12 +364,16 @@ def _solve_pinhole(corners_m: Float[np.ndarray, "m 3"], seen: Sequence[Seen], si
         flags=cv2.CALIB_USE_INTRINSIC_GUESS, criteria=_ITERATIONS,
     )  # fmt: skip
     lenses = [Optics(matrix=k, distortion=d.ravel()) for k, d in ((k1, d1), (k2, d2))]
-    return _solution(corners_m, seen, _rig(lenses, rotation, translation, size_px), turns, places)
+    return _measure_solution(
+        corners_m, seen, _make_rig(lenses, rotation, translation, size_px), turns, places
+    )
 
 
-def _solve_fisheye(corners_m: Float[np.ndarray, "m 3"], seen: Sequence[Seen], size_px: Size) -> _Solution:
+def _solve_fisheye(
+    corners_m: Float[np.ndarray, "m 3"], seen: Sequence[PairCorners], size_px: Size
+) -> _Solution:
     boards = [corners_m[pair.corners].reshape(1, -1, 3) for pair in seen]
-    left, right = ([points.reshape(1, -1, 2) for points in side] for side in _sides(seen))
+    left, right = ([points.reshape(1, -1, 2) for points in side] for side in _split_sides(seen))
     flags = _FISHEYE_FLAGS.CALIB_RECOMPUTE_EXTRINSIC | _FISHEYE_FLAGS.CALIB_FIX_SKEW
     start = [
         cv2.fisheye.calibrate(
@@ -384,21 +392,23 @@ def _solve_fisheye(corners_m: Float[np.ndarray, "m 3"], seen: Sequence[Seen], si
         flags=_FISHEYE_FLAGS.CALIB_FIX_SKEW | _FISHEYE_FLAGS.CALIB_USE_INTRINSIC_GUESS, criteria=_ITERATIONS,
     )  # fmt: skip
     lenses = [Optics(matrix=k, distortion=d.ravel(), fisheye=True) for k, d in ((k1, d1), (k2, d2))]
-    return _solution(corners_m, seen, _rig(lenses, rotation, translation, size_px), turns, places)
+    return _measure_solution(
+        corners_m, seen, _make_rig(lenses, rotation, translation, size_px), turns, places
+    )
 
 
-def _sides(seen: Sequence[Seen]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _split_sides(seen: Sequence[PairCorners]) -> tuple[list[np.ndarray], list[np.ndarray]]:
     return [pair.left_px for pair in seen], [pair.right_px for pair in seen]
 
 
-def _rig(lenses: Sequence[Optics], rotation: np.ndarray, translation: np.ndarray, size_px: Size) -> Rig:
+def _make_rig(lenses: Sequence[Optics], rotation: np.ndarray, translation: np.ndarray, size_px: Size) -> Rig:
     left, right = lenses
     return Rig(left=left, right=right, rotation=rotation, translation_m=translation.ravel(), size_px=size_px)
 
 
-def _solution(
+def _measure_solution(
     corners_m: Float[np.ndarray, "m 3"],
-    seen: Sequence[Seen],
+    seen: Sequence[PairCorners],
     rig: Rig,
     turns: Sequence[np.ndarray],
     places: Sequence[np.ndarray],
@@ -410,12 +420,12 @@ def _solution(
         for side, (optics, points_m, at_px) in enumerate(
             ((rig.left, for_left, pair.left_px), (rig.right, for_right, pair.right_px))
         ):
-            off_px = _projected(optics, points_m) - at_px
+            off_px = _project(optics, points_m) - at_px
             errors_px[index, side] = np.sqrt((off_px**2).sum(axis=1).mean())
     return _Solution(rig, list(turns), errors_px)
 
 
-def _projected(optics: Optics, points_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+def _project(optics: Optics, points_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     project = cv2.fisheye.projectPoints if optics.fisheye else cv2.projectPoints
     args = np.zeros(3), np.zeros(3), optics.matrix, optics.distortion
     return project(points_m.reshape(-1, 1, 3), *args)[0].reshape(-1, 2)
@@ -424,7 +434,7 @@ def _projected(optics: Optics, points_m: Float[np.ndarray, "n 3"]) -> Float[np.n
 # How well
 
 
-def _judged(solution: _Solution, seen: Sequence[Seen], left_out: Mapping[str, str]) -> Calibration:
+def _judge(solution: _Solution, seen: Sequence[PairCorners], left_out: Mapping[str, str]) -> Calibration:
     rig = solution.rig
     assert rig.size_px is not None
     counts = np.array([len(pair.corners) for pair in seen])
@@ -433,18 +443,18 @@ def _judged(solution: _Solution, seen: Sequence[Seen], left_out: Mapping[str, st
         rig=rig,
         left_error_px=float(left_px),
         right_error_px=float(right_px),
-        epipolar_error_px=_epipolar_error_px(rig, seen),
-        cover_percent=min(_cover_percent(points, rig.size_px) for points in _sides(seen)),
-        tilt_degrees=max(map(_tilt_degrees, solution.turns)),
+        epipolar_error_px=_measure_epipolar_error_px(rig, seen),
+        cover_percent=min(_measure_cover_percent(points, rig.size_px) for points in _split_sides(seen)),
+        tilt_degrees=max(map(_measure_tilt_degrees, solution.turns)),
         used=tuple(pair.name for pair in seen),
         left_out=left_out,
     )
 
 
-def _epipolar_error_px(rig: Rig, seen: Sequence[Seen]) -> float:
+def _measure_epipolar_error_px(rig: Rig, seen: Sequence[PairCorners]) -> float:
     left, right = (
-        _directions(optics, np.concatenate(points))
-        for optics, points in zip((rig.left, rig.right), _sides(seen), strict=True)
+        _undistort(optics, np.concatenate(points))
+        for optics, points in zip((rig.left, rig.right), _split_sides(seen), strict=True)
     )
     # A left direction, seen from the right camera, lies in the plane that is at a right angle to this one.
     planes = np.cross(rig.translation_m, left @ rig.rotation.T)
@@ -452,13 +462,13 @@ def _epipolar_error_px(rig: Rig, seen: Sequence[Seen]) -> float:
     return float(np.median(off) * np.diag(rig.right.matrix)[:2].mean())
 
 
-def _directions(optics: Optics, at_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+def _undistort(optics: Optics, at_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
     undistort = cv2.fisheye.undistortPoints if optics.fisheye else cv2.undistortPoints
     ideal = undistort(at_px.reshape(-1, 1, 2), optics.matrix, optics.distortion).reshape(-1, 2)
     return np.concatenate([ideal, np.ones((len(ideal), 1))], axis=1)
 
 
-def _cover_percent(views: Sequence[Float[np.ndarray, "_ 2"]], size_px: Size) -> float:
+def _measure_cover_percent(views: Sequence[Float[np.ndarray, "_ 2"]], size_px: Size) -> float:
     """The share of the picture within the outlines of the boards."""
     covered = np.zeros(size_px[::-1], np.uint8)
     for at_px in views:
@@ -467,6 +477,6 @@ def _cover_percent(views: Sequence[Float[np.ndarray, "_ 2"]], size_px: Size) -> 
     return float(100 * covered.mean())
 
 
-def _tilt_degrees(turn: Float[np.ndarray, "..."]) -> float:
+def _measure_tilt_degrees(turn: Float[np.ndarray, "..."]) -> float:
     """The angle between a board's normal and the camera's axis."""
     return float(np.degrees(np.arccos(np.clip(abs(cv2.Rodrigues(turn)[0][2, 2]), 0, 1))))

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from stereoweave.cameras.rig import Optics, Rig, Size, side_by_side, size_of
+from stereoweave.cameras.rig import Optics, Rig, Size, make_rectified_rig, pair_size_px
 from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.io.files import read_small, reading, replacing
 from stereoweave.io.structured_text import BASE64, parse_entries
@@ -56,27 +56,27 @@ def read_rig(path: str | Path, size_px: Size | None = None) -> Rig:
     """
     # What overflows or is divided by 0 on the way is refused at the end, where it is not finite.
     with reading(path, _EXPECTED), np.errstate(all="ignore"):
-        text = _text(Path(path))
+        text = _read_text(Path(path))
         if re.search(r"^(cam0|doffs|baseline)\s*=", text, re.MULTILINE):
-            rig = _middlebury(text)
+            rig = _parse_middlebury(text)
         elif re.search(r"^(P\d|P_rect_\d\d|K_\d\d):", text, re.MULTILINE):
-            rig = _kitti(text, size_px)
+            rig = _parse_kitti(text, size_px)
         elif "cam0" in (entries := parse_entries(text)):
-            rig = _kalibr(entries)
+            rig = _parse_kalibr(entries)
         else:
-            rig = _opencv(_completed(entries, Path(path)))
+            rig = _parse_opencv(_add_companion(entries, Path(path)))
         return replace(rig, name=str(path))
 
 
-def calibration_bytes(path: str | Path) -> bytes:
+def read_calibration_bytes(path: str | Path) -> bytes:
     """The content of a calibration file; FormatError where it is missing, too large or no regular file."""
     with reading(path, _EXPECTED):
         return read_small(path)
 
 
-def calibrated(pair: StereoPair, path: str | Path) -> StereoPair:
+def add_camera(pair: StereoPair, path: str | Path) -> StereoPair:
     """The pair with the camera of a calibration for rectified pictures of this size."""
-    rig = read_rig(path, size_of(pair))
+    rig = read_rig(path, pair_size_px(pair))
     rig.check_size(pair)
     return replace(pair, camera=rig.camera())
 
@@ -103,28 +103,28 @@ def write_rig(path: str | Path, rig: Rig) -> None:
         temporary.write_text(storage.releaseAndGetString())
 
 
-def _text(path: Path) -> str:
-    return calibration_bytes(path).decode("utf-8-sig", errors="replace")
+def _read_text(path: Path) -> str:
+    return read_calibration_bytes(path).decode("utf-8-sig", errors="replace")
 
 
 # OpenCV and Kalibr
 
 
-def _completed(entries: dict[str, Any], path: Path) -> dict[str, Any]:
+def _add_companion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
     """Entries, and those of the file beside it where one of OpenCV's two files was named."""
     for this, other in (("intrinsics", "extrinsics"), ("extrinsics", "intrinsics")):
         beside = path.with_name(path.name.replace(this, other))
         if this in path.name and beside.exists():
             with reading(beside, _EXPECTED):
-                return parse_entries(_text(beside)) | entries
+                return parse_entries(_read_text(beside)) | entries
     return entries
 
 
-def _opencv(entries: Mapping[str, Any]) -> Rig:
+def _parse_opencv(entries: Mapping[str, Any]) -> Rig:
     # Some write camera_matrix_left, some cameraMatrixLeft.
-    plain = {_plain_word(key): value for key, value in entries.items()}
-    parts = _opencv_parts(plain)
-    model = _model(plain)
+    plain = {_normalise_name(key): value for key, value in entries.items()}
+    parts = _parse_opencv_parts(plain)
+    model = _find_model(plain)
     left, right = (
         Optics(
             matrix=parts[f"matrix {side}"].reshape(3, 3),
@@ -134,7 +134,7 @@ def _opencv(entries: Mapping[str, Any]) -> Rig:
         for side in ("left", "right")
     )
     translation = parts["translation"].reshape(3)
-    unit, notes = _unit(translation, plain.get("translationunit"))
+    unit, notes = _find_unit(translation, plain.get("translationunit"))
     if model is None and left.distortion.size == 4:
         notes += (
             Note(
@@ -147,51 +147,51 @@ def _opencv(entries: Mapping[str, Any]) -> Rig:
         right=right,
         rotation=parts["rotation"].reshape(3, 3),
         translation_m=translation * _METRES[unit],
-        size_px=_size(plain),
+        size_px=_find_size(plain),
         notes=notes,
     )
 
 
-def _opencv_parts(plain: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def _parse_opencv_parts(plain: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """The numbers of either camera and between them, whatever they are called."""
     found = {
-        f"{what} {side}": _of_side(plain, names, sides)
+        f"{what} {side}": _find_side(plain, names, sides)
         for side, sides in (("left", ("1", "left", "l")), ("right", ("2", "right", "r")))
         for what, names in (
             ("matrix", ("m", "k", "cm", "cameramatrix", "mtx")),
             ("distortion", ("d", "dist", "distcoeffs", "distortion", "distortioncoefficients")),
         )
     }
-    found["rotation"] = _first(plain, ("r", "rotation", "rotationmatrix", "rot"))
-    found["translation"] = _first(plain, ("t", "translation", "translationvector", "trans"))
+    found["rotation"] = _find_first(plain, ("r", "rotation", "rotationmatrix", "rot"))
+    found["translation"] = _find_first(plain, ("t", "translation", "translationvector", "trans"))
     missing = [name for name, value in found.items() if value is None]
     if missing:
         raise ValueError(f"no entry for {', '.join(missing)} (M1 D1 M2 D2 R T)")
-    return {name: _numbers(value) for name, value in found.items()}
+    return {name: _parse_numbers(value) for name, value in found.items()}
 
 
-def _plain_word(word: object) -> str:
+def _normalise_name(word: object) -> str:
     return re.sub(r"[^a-z0-9]", "", str(word).lower())
 
 
-def _first(entries: Mapping[str, Any], names: Iterable[str]) -> Any:
+def _find_first(entries: Mapping[str, Any], names: Iterable[str]) -> Any:
     return next((entries[name] for name in names if name in entries), None)
 
 
-def _of_side(entries: Mapping[str, Any], names: Iterable[str], sides: Iterable[str]) -> Any:
+def _find_side(entries: Mapping[str, Any], names: Iterable[str], sides: Iterable[str]) -> Any:
     pairs = [(name, side) for name in names for side in sides]
-    return _first(entries, [name + side for name, side in pairs] + [side + name for name, side in pairs])
+    return _find_first(entries, [name + side for name, side in pairs] + [side + name for name, side in pairs])
 
 
-def _model(entries: Mapping[str, Any]) -> str | None:
+def _find_model(entries: Mapping[str, Any]) -> str | None:
     """The kind of lens that OpenCV's file names, fisheye or pinhole; None where it names none."""
-    if _is_true(_first(entries, ("fisheyemodel", "fisheye")) or "no"):
+    if _parse_bool(_find_first(entries, ("fisheyemodel", "fisheye")) or "no"):
         return "fisheye"
-    named = _first(entries, ("distortionmodel", "cameramodel", "model"))
-    return None if named is None else _known_model(named)
+    named = _find_first(entries, ("distortionmodel", "cameramodel", "model"))
+    return None if named is None else _parse_model(named)
 
 
-def _is_true(said: object) -> bool:
+def _parse_bool(said: object) -> bool:
     word = str(said).lower()
     if word in _YES or word in _NO:
         return word in _YES
@@ -201,8 +201,8 @@ def _is_true(said: object) -> bool:
     raise ValueError(f"fisheye: {reprlib.repr(said)}, not one of {', '.join(_YES + _NO)} or a number")
 
 
-def _known_model(named: object) -> str:
-    word = _plain_word(named)
+def _parse_model(named: object) -> str:
+    word = _normalise_name(named)
     if word in _FISHEYE_NAMES:
         return "fisheye"
     if word in _PINHOLE_NAMES:
@@ -212,7 +212,7 @@ def _known_model(named: object) -> str:
     )
 
 
-def _unit(translation: Float[np.ndarray, "3"], stated: object) -> tuple[str, tuple[Note, ...]]:
+def _find_unit(translation: Float[np.ndarray, "3"], stated: object) -> tuple[str, tuple[Note, ...]]:
     """The translation's unit of length, and a note if it is a guess."""
     if stated is not None:
         if str(stated) not in _METRES:
@@ -227,110 +227,114 @@ def _unit(translation: Float[np.ndarray, "3"], stated: object) -> tuple[str, tup
     return unit, (note,)
 
 
-def _size(entries: Mapping[str, Any]) -> Size | None:
-    both = _first(entries, ("imagesize", "resolution", "size"))
+def _find_size(entries: Mapping[str, Any]) -> Size | None:
+    both = _find_first(entries, ("imagesize", "resolution", "size"))
     if both is None:
         both = [entries.get("image" + side, entries.get(side)) for side in ("width", "height")]
         if None in both:
             return None
-    sides_px = _numbers(both).ravel()
+    sides_px = _parse_numbers(both).ravel()
     if sides_px.size != 2:
         raise ValueError(f"a picture's size of {reprlib.repr(both)}, not width and height")
     width, height = sides_px
     return int(width), int(height)
 
 
-def _kalibr(entries: Mapping[str, Any]) -> Rig:
+def _parse_kalibr(entries: Mapping[str, Any]) -> Rig:
     first, second = entries["cam0"], entries.get("cam1")
     if not isinstance(first, dict) or not isinstance(second, dict):
         raise ValueError("not two cameras, cam0 and cam1")
     transform = second.get("T_cn_cnm1")
     if transform is None:
         raise ValueError("no T_cn_cnm1 of cam1, the way from cam0 to it")
-    to_right = _numbers(transform).reshape(4, 4)
-    left, right = _kalibr_optics("cam0", first), _kalibr_optics("cam1", second)
+    to_right = _parse_numbers(transform).reshape(4, 4)
+    left, right = _parse_kalibr_optics("cam0", first), _parse_kalibr_optics("cam1", second)
     return Rig(
         left=left,
         right=right,
         rotation=to_right[:3, :3],
         translation_m=to_right[:3, 3],
-        size_px=_size({_plain_word(key): value for key, value in first.items()}),
+        size_px=_find_size({_normalise_name(key): value for key, value in first.items()}),
     )
 
 
-def _kalibr_optics(name: str, entries: Mapping[str, Any]) -> Optics:
+def _parse_kalibr_optics(name: str, entries: Mapping[str, Any]) -> Optics:
     missing = {"intrinsics", "distortion_coeffs"} - entries.keys()
     if missing:
         raise ValueError(f"no {' and no '.join(sorted(missing))} of {name}")
-    camera, intrinsics = entries.get("camera_model", "pinhole"), _numbers(entries["intrinsics"])
+    camera, intrinsics = entries.get("camera_model", "pinhole"), _parse_numbers(entries["intrinsics"])
     if camera != "pinhole" or intrinsics.size != 4:
         raise ValueError(
             f"the camera model {reprlib.repr(camera)} of {name}; "
             "calibrate with pinhole-radtan or pinhole-equi"
         )
-    fisheye = _known_model(entries.get("distortion_model", "radtan")) == "fisheye"
-    matrix = _camera_matrix(*intrinsics.tolist())
-    return Optics(matrix=matrix, distortion=_numbers(entries["distortion_coeffs"]).ravel(), fisheye=fisheye)
+    fisheye = _parse_model(entries.get("distortion_model", "radtan")) == "fisheye"
+    matrix = _make_camera_matrix(*intrinsics.tolist())
+    return Optics(
+        matrix=matrix, distortion=_parse_numbers(entries["distortion_coeffs"]).ravel(), fisheye=fisheye
+    )
 
 
 # KITTI and Middlebury
 
 
-def _kitti(text: str, size_px: Size | None) -> Rig:
+def _parse_kitti(text: str, size_px: Size | None) -> Rig:
     """Source: the development kits of KITTI's raw data, stereo, object and odometry benchmarks."""
     lines = (line.split(":", 1) for line in text.splitlines() if ":" in line)
     rows = {
-        key.strip(): _numbers(values.split())
+        key.strip(): _parse_numbers(values.split())
         for key, values in lines
         if re.match(r"[PKDRTS]_?(rect_)?\d", key.strip())
     }
     first, second = (2, 3) if {"P3", "P_rect_03", "K_03"} & rows.keys() else (0, 1)
     notes = (Note(f"of KITTI's cameras, {first} is taken for the left one and {second} for the right one"),)
-    raw_px = _kitti_size(rows, f"S_{first:02}")
+    raw_px = _find_kitti_size(rows, f"S_{first:02}")
     keys = (f"P_rect_{first:02}", f"P_rect_{second:02}")
     if keys[0] not in rows:
         keys = f"P{first}", f"P{second}"
     if keys[0] not in rows or (size_px is not None and size_px == raw_px):
-        return replace(_kitti_raw(rows, f"{first:02}", f"{second:02}"), size_px=raw_px, notes=notes)
-    left, right = (_kitti_row(rows, key).reshape(3, 4) for key in keys)
+        return replace(_make_kitti_raw_rig(rows, f"{first:02}", f"{second:02}"), size_px=raw_px, notes=notes)
+    left, right = (_require_kitti_row(rows, key).reshape(3, 4) for key in keys)
     return replace(
-        side_by_side(left, right, right[0, 3] / right[0, 0] - left[0, 3] / left[0, 0]),
-        size_px=_kitti_size(rows, f"S_rect_{first:02}"),
+        make_rectified_rig(left, right, right[0, 3] / right[0, 0] - left[0, 3] / left[0, 0]),
+        size_px=_find_kitti_size(rows, f"S_rect_{first:02}"),
         notes=notes,
     )
 
 
-def _kitti_raw(rows: Mapping[str, Float[np.ndarray, " _"]], first: str, second: str) -> Rig:
+def _make_kitti_raw_rig(rows: Mapping[str, Float[np.ndarray, " _"]], first: str, second: str) -> Rig:
     """The rig of the pictures before KITTI's own rectification; each camera stands relative to camera 0."""
     left, right = (
         Optics(
-            matrix=_kitti_row(rows, f"K_{number}").reshape(3, 3),
-            distortion=_kitti_row(rows, f"D_{number}"),
+            matrix=_require_kitti_row(rows, f"K_{number}").reshape(3, 3),
+            distortion=_require_kitti_row(rows, f"D_{number}"),
         )
         for number in (first, second)
     )
     left_rotation, right_rotation = (
-        _kitti_row(rows, f"R_{number}").reshape(3, 3) for number in (first, second)
+        _require_kitti_row(rows, f"R_{number}").reshape(3, 3) for number in (first, second)
     )
     rotation = right_rotation @ left_rotation.T
-    translation_m = _kitti_row(rows, f"T_{second}") - rotation @ _kitti_row(rows, f"T_{first}")
+    translation_m = _require_kitti_row(rows, f"T_{second}") - rotation @ _require_kitti_row(
+        rows, f"T_{first}"
+    )
     return Rig(left=left, right=right, rotation=rotation, translation_m=translation_m)
 
 
-def _kitti_row(rows: Mapping[str, Float[np.ndarray, " _"]], key: str) -> Float[np.ndarray, " _"]:
+def _require_kitti_row(rows: Mapping[str, Float[np.ndarray, " _"]], key: str) -> Float[np.ndarray, " _"]:
     if key not in rows:
         raise ValueError(f"no entry {key}")
     return rows[key]
 
 
-def _kitti_size(rows: Mapping[str, Float[np.ndarray, " _"]], key: str) -> Size | None:
+def _find_kitti_size(rows: Mapping[str, Float[np.ndarray, " _"]], key: str) -> Size | None:
     if key not in rows:
         return None
     width, height = rows[key].tolist()
     return int(width), int(height)
 
 
-def _middlebury(text: str) -> Rig:
+def _parse_middlebury(text: str) -> Rig:
     """Source: the Middlebury datasets of 2014, cam0=[f 0 cx; 0 f cy; 0 0 1], the baseline in millimetres."""
     lines = (line.split("=", 1) for line in text.splitlines() if "=" in line)
     entries = {key.strip(): value for key, value in lines}
@@ -338,54 +342,57 @@ def _middlebury(text: str) -> Rig:
     if missing:
         raise ValueError(f"no entry {', '.join(sorted(missing))} of a Middlebury calib.txt")
     rows = entries["cam0"].strip(" []").split(";", 3)  # a fourth row is refused, however long it is
-    left = _numbers([row.split() for row in rows]).reshape(3, 3)
+    left = _parse_numbers([row.split() for row in rows]).reshape(3, 3)
     right = left + np.array([[0, 0, float(entries["doffs"])], [0, 0, 0], [0, 0, 0]])
     baseline_m = float(entries["baseline"]) / 1000
     if not baseline_m > 0:
         raise ValueError(f"a baseline of {entries['baseline']}, which must be positive")
     size_px = int(entries["width"]), int(entries["height"])
-    return replace(side_by_side(left, right, -baseline_m), size_px=size_px)
+    return replace(make_rectified_rig(left, right, -baseline_m), size_px=size_px)
 
 
-def _camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
-    return _numbers([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+def _make_camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
+    return _parse_numbers([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
-def _numbers(values: Any) -> Float[np.ndarray, "..."]:
+def _parse_numbers(values: Any) -> Float[np.ndarray, "..."]:
     """The numbers of a value of `parse_entries`: one, a list of them, a list of rows, or OpenCV's matrix."""
     if isinstance(values, dict) and "data" in values:
-        return _matrix(values)
+        return _parse_matrix(values)
     if isinstance(values, str) and values.startswith(BASE64):
-        return _decoded(values)
+        return _decode_base64(values)
     try:
-        return np.asarray(_decimal(values), dtype=np.float64)
+        return np.asarray(_parse_hexadecimal(values), dtype=np.float64)
     except (TypeError, ValueError) as error:  # the former of a dict, for instance
         raise ValueError(f"{reprlib.repr(values)} in place of numbers") from error
 
 
-def _decimal(values: Any) -> Any:
+def _parse_hexadecimal(values: Any) -> Any:
     """The values, with numbers in place of hexadecimal words."""
     if isinstance(values, list):
-        return [_decimal(value) for value in values]
+        return [_parse_hexadecimal(value) for value in values]
     return int(values, 16) if isinstance(values, str) and _HEXADECIMAL.fullmatch(values) else values
 
 
-def _matrix(entries: Mapping[str, Any]) -> Float[np.ndarray, "..."]:
+def _parse_matrix(entries: Mapping[str, Any]) -> Float[np.ndarray, "..."]:
     """OpenCV's matrix: what cv2.FileStorage makes of it, in float64."""
     written = re.fullmatch(r"(\d*)([A-Za-z])", str(entries.get("dt", "d")))
     if written is None:
         raise ValueError(f"a matrix of the type {reprlib.repr(entries['dt'])}")
-    numbers = _numbers(entries["data"])
+    numbers = _parse_numbers(entries["data"])
     if written[2] in _ROUNDED:
         numbers = numbers.astype(_ROUNDED[written[2]]).astype(np.float64)
     sides = entries.get("sizes", [entries.get("rows", ""), entries.get("cols", "")])
-    shape = [*map(int, _numbers(sides).ravel().tolist()), int(written[1] or 1)]  # the last: its channels
+    shape = [
+        *map(int, _parse_numbers(sides).ravel().tolist()),
+        int(written[1] or 1),
+    ]  # the last: its channels
     if min(shape) < 0 or math.prod(shape) != numbers.size:
         raise ValueError(f"a matrix of {numbers.size} numbers in the shape {reprlib.repr(shape)}")
     return numbers.reshape(shape)
 
 
-def _decoded(data: str) -> Float[np.ndarray, " _"]:
+def _decode_base64(data: str) -> Float[np.ndarray, " _"]:
     """The numbers of OpenCV's base64: of a header of 24 bytes, which says their type, and their bytes."""
     content = base64.b64decode(data.removeprefix(BASE64))
     written = re.fullmatch(rb"\d*([a-z]) *", content[:24])

@@ -11,7 +11,7 @@ _CONFIDENT = 0.5
 _LEAST_CONFIDENT_PERCENT = 30.0
 
 
-def hints(pair: StereoPair, estimate: Estimate) -> list[Note]:
+def find_problems(pair: StereoPair, estimate: Estimate) -> list[Note]:
     """Notes on what is wrong with a pair; empty for a sound pair.
 
     Places that both photographs show are compared (`stereoweave check` says more of them); where there are

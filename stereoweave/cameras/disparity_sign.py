@@ -33,7 +33,7 @@ _LEAST_JUMP_PX, _LEAST_COLOUR_STEP, _BESIDE_PX = 2.0, 10.0, 3
 _VOTES_OF_DOUBT = 20
 
 
-def surely_negative(
+def find_negative_disparities(
     left: UInt8[np.ndarray, "h w 3"],
     right: UInt8[np.ndarray, "h w 3"],
     places_px: Float[np.ndarray, "n 2"],
@@ -52,29 +52,29 @@ def surely_negative(
     """
     negative = disparity_px < _NEGATIVE_PX
     greys = cv2.cvtColor(left, cv2.COLOR_RGB2GRAY), cv2.cvtColor(right, cv2.COLOR_RGB2GRAY)
-    sure_px = _sure(*greys, places_px[negative], disparity_px[negative], _RADIUS_PX)
+    sure_px = _select_certain(*greys, places_px[negative], disparity_px[negative], _RADIUS_PX)
     if len(sure_px) >= _LEAST_SURE:
         return sure_px
     factor = min(1.0, _DENSE_WIDTH_PX / left.shape[1])
-    left, right = (_shrunk(photo, factor) for photo in (left, right))
-    places_px, disparity_px = _dense_negative(left, right)
+    left, right = (_shrink(photo, factor) for photo in (left, right))
+    places_px, disparity_px = _find_dense_negative(left, right)
     greys = cv2.cvtColor(left, cv2.COLOR_RGB2GRAY), cv2.cvtColor(right, cv2.COLOR_RGB2GRAY)
-    sure_px = _sure(*greys, places_px, disparity_px, _DENSE_RADIUS_PX)
+    sure_px = _select_certain(*greys, places_px, disparity_px, _DENSE_RADIUS_PX)
     return sure_px / factor if len(sure_px) >= _LEAST_SURE else sure_px[:0]
 
 
-def _dense_negative(
+def _find_dense_negative(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
     """Places in the left picture, and their disparities, that semi-global matching takes for negative."""
-    disparity_px, seen = _matched(left, right, *_DENSE_RANGE_PX)
+    disparity_px, seen = _match_densely(left, right, *_DENSE_RANGE_PX)
     slope = cv2.Sobel(cv2.cvtColor(left, cv2.COLOR_RGB2GRAY), cv2.CV_32F, 1, 0, scale=1 / 8)
     textured = cv2.blur(np.abs(slope), (_BLOCK_PX, _BLOCK_PX)) > _LEAST_TEXTURE_LEVELS
     rows, columns = np.nonzero(seen & textured & (disparity_px < _DENSE_NEGATIVE_PX))
     return np.stack([columns, rows], axis=1).astype(float), disparity_px[rows, columns].astype(float)
 
 
-def _sure(
+def _select_certain(
     left: UInt8[np.ndarray, "h w"],
     right: UInt8[np.ndarray, "h w"],
     places_px: Float[np.ndarray, "n 2"],
@@ -92,14 +92,14 @@ def _sure(
         cv2.copyMakeBorder(grey, rim, rim, rim, rim, cv2.BORDER_REPLICATE) for grey in (left, right)
     )
     sure = [
-        _is_alone(left, right, (row, column, partner), -reach_px, radius_px)
-        and _is_alone(right, left, (row, partner, column), reach_px, radius_px)
+        _is_unambiguous(left, right, (row, column, partner), -reach_px, radius_px)
+        and _is_unambiguous(right, left, (row, partner, column), reach_px, radius_px)
         for row, column, partner in np.stack([rows, columns, partners], axis=1).tolist()
     ]
     return disparity_px[np.array(sure, bool)]
 
 
-def _is_alone(
+def _is_unambiguous(
     own: UInt8[np.ndarray, "h w"],
     other: UInt8[np.ndarray, "h w"],
     place: tuple[int, int, int],
@@ -118,24 +118,24 @@ def _is_alone(
     row, column, partner = place
     last_column = own.shape[1] - 2 * radius_px - 3
     end = min(max(column + reach_px, 0), last_column)
-    window = _strip(own, row, column, column, radius_px)[1:-1]
-    found = _strip(other, row, partner - 1, partner + 1, radius_px)
+    window = _cut_strip(own, row, column, column, radius_px)[1:-1]
+    found = _cut_strip(other, row, partner - 1, partner + 1, radius_px)
     likeness = cv2.matchTemplate(found, window, cv2.TM_CCOEFF_NORMED).max()
     if likeness < _LEAST_LIKENESS:
         return False
-    positive = _strip(other, row, min(column, end), max(column, end), radius_px)
+    positive = _cut_strip(other, row, min(column, end), max(column, end), radius_px)
     second = cv2.matchTemplate(positive, window, cv2.TM_CCOEFF_NORMED).max()
     return bool(max(1 - likeness, _ROUNDING) <= _MOST_AMBIGUOUS * (1 - second))
 
 
-def _strip(
+def _cut_strip(
     bordered: UInt8[np.ndarray, "h w"], row: int, first: int, last: int, radius_px: int
 ) -> UInt8[np.ndarray, "h2 w2"]:
     """What windows around the columns cover, and a row more above and below."""
     return bordered[row : row + 2 * radius_px + 3, first + 1 : last + 2 * radius_px + 2]
 
 
-def depth_order(
+def estimate_depth_order(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], range_px: tuple[float, float]
 ) -> float:
     """-1..1: above 0 where greater disparities hide smaller ones, below 0 where it is the other way round.
@@ -144,14 +144,16 @@ def depth_order(
     one. It belongs to what is hidden, so its colour is that of the farther side.
     """
     factor = min(1.0, _OCCLUSION_WIDTH_PX / left.shape[1])
-    small_left, small_right = (_shrunk(photo, factor) for photo in (left, right))
-    disparity_px, seen = _matched(small_left, small_right, range_px[0] * factor, range_px[1] * factor)
+    small_left, small_right = (_shrink(photo, factor) for photo in (left, right))
+    disparity_px, seen = _match_densely(small_left, small_right, range_px[0] * factor, range_px[1] * factor)
     colours = cv2.cvtColor(cv2.GaussianBlur(small_left, (0, 0), 0.7), cv2.COLOR_RGB2LAB).astype(np.float32)
-    votes = [vote for row in range(len(seen)) for vote in _votes(disparity_px[row], seen[row], colours[row])]
+    votes = [
+        vote for row in range(len(seen)) for vote in _vote_in_row(disparity_px[row], seen[row], colours[row])
+    ]
     return sum(votes) / (len(votes) + _VOTES_OF_DOUBT)
 
 
-def _votes(
+def _vote_in_row(
     disparity_px: Float32[np.ndarray, " w"], seen: Bool[np.ndarray, " w"], colours: Float32[np.ndarray, "w 3"]
 ) -> list[float]:
     """For each hidden stretch of a row, -1..1: how much more it is like its left side than its right one."""
@@ -173,7 +175,7 @@ def _votes(
     return votes
 
 
-def _matched(
+def _match_densely(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], least_px: float, greatest_px: float
 ) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Disparity of the left picture by semi-global matching, and where the right picture's agrees."""
@@ -195,6 +197,6 @@ def _matched(
     return left_px, inside & (np.abs(back_px - left_px) <= 1) & (left_px > first_px)
 
 
-def _shrunk(photo: UInt8[np.ndarray, "h w 3"], factor: float) -> UInt8[np.ndarray, "h2 w2 3"]:
+def _shrink(photo: UInt8[np.ndarray, "h w 3"], factor: float) -> UInt8[np.ndarray, "h2 w2 3"]:
     size = round(photo.shape[1] * factor), max(round(photo.shape[0] * factor), 1)
     return cv2.resize(photo, size, interpolation=cv2.INTER_AREA)

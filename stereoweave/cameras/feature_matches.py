@@ -48,7 +48,7 @@ class Matches(NamedTuple):
         return self.right_px[:, 1] - self.left_px[:, 1]
 
 
-def sparse_matches(
+def find_matches(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h2 w2 3"], *, most: int = 2000
 ) -> Matches:
     """Up to `most` places that both photographs show, to about 0.1 px; the pair need not be rectified.
@@ -56,13 +56,13 @@ def sparse_matches(
     One in five or so is wrong: the caller's geometry sorts them out.
     """
     greys = [cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY) for photo in (left, right)]
-    found = _paired(greys, most, rows_off=_MOST_ROWS_OFF * left.shape[0])
-    return _exact(greys[0], greys[1], found)
+    found = _pair_corners(greys, most, rows_off=_MOST_ROWS_OFF * left.shape[0])
+    return _refine_matches(greys[0], greys[1], found)
 
 
-def _paired(greys: list[UInt8[np.ndarray, "h w"]], most: int, rows_off: float) -> Matches:
+def _pair_corners(greys: list[UInt8[np.ndarray, "h w"]], most: int, rows_off: float) -> Matches:
     """Corners of both pictures that are each other's best, by at most so many rows apart."""
-    (left, left_windows), (right, right_windows) = (_corners(grey, most) for grey in greys)
+    (left, left_windows), (right, right_windows) = (_find_corners(grey, most) for grey in greys)
     if not (len(left) and len(right)):
         return Matches(np.zeros((0, 2)), np.zeros((0, 2)))
     alike = left_windows @ right_windows.T
@@ -78,23 +78,23 @@ def _paired(greys: list[UInt8[np.ndarray, "h w"]], most: int, rows_off: float) -
     return Matches(left[kept], right[partner[kept]])
 
 
-def _corners(
+def _find_corners(
     grey: UInt8[np.ndarray, "h w"], most: int
 ) -> tuple[Float[np.ndarray, "n 2"], Float32[np.ndarray, "n k"]]:
     """Corners in px of the full picture, and the windows around them."""
-    factor = _reduction(grey)
+    factor = _downscale_factor(grey)
     height, width = grey.shape
     if factor > 1:
         small = (max(round(width / factor), 1), max(round(height / factor), 1))
         grey = cv2.resize(grey, small, interpolation=cv2.INTER_AREA)
-    corners = _spread_corners(grey, most)
+    corners = _find_spread_corners(grey, most)
     smooth = cv2.GaussianBlur(grey, (0, 0), _WINDOW_BLUR_PX)
-    windows, _ = _normalised(_windows(smooth, corners, _WINDOW_RADIUS, _WINDOW_STEP_PX))
+    windows, _ = _normalise(_sample_windows(smooth, corners, _WINDOW_RADIUS, _WINDOW_STEP_PX))
     scale = np.array([width, height]) / grey.shape[::-1]
     return (corners + 0.5) * scale - 0.5, windows
 
 
-def _spread_corners(grey: UInt8[np.ndarray, "h w"], most: int) -> Float[np.ndarray, "n 2"]:
+def _find_spread_corners(grey: UInt8[np.ndarray, "h w"], most: int) -> Float[np.ndarray, "n 2"]:
     """The strongest corners of each tile: hazy hills have some as well, weaker than those of a near tree."""
     found = [np.zeros((0, 2))]
     for rows in np.array_split(np.arange(grey.shape[0]), _TILES):
@@ -106,7 +106,9 @@ def _spread_corners(grey: UInt8[np.ndarray, "h w"], most: int) -> Float[np.ndarr
     return np.concatenate(found)
 
 
-def _exact(left: UInt8[np.ndarray, "h w"], right: UInt8[np.ndarray, "h w"], found: Matches) -> Matches:
+def _refine_matches(
+    left: UInt8[np.ndarray, "h w"], right: UInt8[np.ndarray, "h w"], found: Matches
+) -> Matches:
     """The matches moved in the right picture to where their windows fit best; without those that do not fit.
 
     Source: the inverse compositional algorithm (Baker and Matthews 2004) for a shift alone, of windows of
@@ -115,8 +117,8 @@ def _exact(left: UInt8[np.ndarray, "h w"], right: UInt8[np.ndarray, "h w"], foun
     if not len(found.left_px):
         return found
     rim = _EXACT_RADIUS + 1
-    wide = _windows(left, found.left_px, rim, 1.0).reshape(-1, 2 * rim + 1, 2 * rim + 1)
-    window, contrast = _normalised(wide[:, 1:-1, 1:-1].reshape(len(wide), -1))
+    wide = _sample_windows(left, found.left_px, rim, 1.0).reshape(-1, 2 * rim + 1, 2 * rim + 1)
+    window, contrast = _normalise(wide[:, 1:-1, 1:-1].reshape(len(wide), -1))
     slopes = np.stack(
         [wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2], wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]], axis=1
     ).reshape(len(wide), 2, -1)
@@ -125,18 +127,18 @@ def _exact(left: UInt8[np.ndarray, "h w"], right: UInt8[np.ndarray, "h w"], foun
     normal = slopes @ slopes.transpose(0, 2, 1) + 1e-4 * np.eye(2)
     exact, step = found.right_px.copy(), np.zeros_like(found.right_px)
     for _ in range(_EXACT_STEPS):
-        seen, _ = _normalised(_windows(right, exact, _EXACT_RADIUS, 1.0))
+        seen, _ = _normalise(_sample_windows(right, exact, _EXACT_RADIUS, 1.0))
         missed = slopes @ (seen - window)[..., None]
         step = np.linalg.solve(normal, missed)[..., 0]
         exact -= np.clip(step, -1, 1)
-    seen, _ = _normalised(_windows(right, exact, _EXACT_RADIUS, 1.0))
-    reach_px = 1 + 2 * _reduction(left)
+    seen, _ = _normalise(_sample_windows(right, exact, _EXACT_RADIUS, 1.0))
+    reach_px = 1 + 2 * _downscale_factor(left)
     fits = (np.abs(step).max(1) < _CONVERGED_PX) & ((seen * window).sum(1) > _LEAST_EXACT_CORRELATION)
     fits &= np.abs(exact - found.right_px).max(1) < reach_px
     return Matches(found.left_px[fits], exact[fits])
 
 
-def _windows(
+def _sample_windows(
     grey: UInt8[np.ndarray, "h w"], centres_px: Float[np.ndarray, "n 2"], radius: int, step_px: float
 ) -> Float32[np.ndarray, "n k"]:
     """The grey levels around each centre, in rows and columns `step_px` apart; the border goes on outside."""
@@ -151,7 +153,7 @@ def _windows(
     return sampled.astype(np.float32)
 
 
-def _normalised(
+def _normalise(
     windows: Float32[np.ndarray, "n k"],
 ) -> tuple[Float32[np.ndarray, "n k"], Float32[np.ndarray, "n 1"]]:
     """The windows with mean 0 and length 1, and what they were divided by; plain ones become nearly 0."""
@@ -161,6 +163,6 @@ def _normalised(
     return centred / length, length
 
 
-def _reduction(picture: np.ndarray) -> float:
+def _downscale_factor(picture: np.ndarray) -> float:
     """By how much the picture is shrunk to have at most _PIXELS; 1 where it has."""
     return max(1.0, math.sqrt(picture.shape[0] * picture.shape[1] / _PIXELS))

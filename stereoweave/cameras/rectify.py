@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from stereoweave.cameras.rig import Optics, Rig, size_of
+from stereoweave.cameras.rig import Optics, Rig, pair_size_px
 from stereoweave.errors import Note, StereoweaveError
 from stereoweave.stereo import StereoCamera, StereoPair
 
@@ -49,15 +49,15 @@ def rectify(pair: StereoPair, rig: Rig) -> Rectified:
         return Rectified(pair=replace(pair, camera=rig.camera()), notes=(*rig.notes, note))
     # What cannot be computed is refused where it is not finite.
     with np.errstate(all="ignore"):
-        turns = _turns(rig)
-        camera = _camera(rig, turns, size_of(pair))
-    left, left_seen = _turned(pair.left, rig.left, turns[0], camera)
-    right, right_seen = _turned(pair.right, rig.right, turns[1], camera)
+        turns = _find_rotations(rig)
+        camera = _choose_camera(rig, turns, pair_size_px(pair))
+    left, left_seen = _rectify_view(pair.left, rig.left, turns[0], camera)
+    right, right_seen = _rectify_view(pair.right, rig.right, turns[1], camera)
     rectified = StereoPair(left=left, right=right, camera=camera, left_seen=left_seen, right_seen=right_seen)
     return Rectified(pair=rectified, notes=(*rig.notes, _summary(rig, turns, rectified)))
 
 
-def cropped(pair: StereoPair) -> StereoPair:
+def crop(pair: StereoPair) -> StereoPair:
     """The largest rectangle of the pair that both pictures fill, its camera's centre moved along.
 
     Raises:
@@ -68,7 +68,7 @@ def cropped(pair: StereoPair) -> StereoPair:
     full = np.ones(pair.left.shape[:2], bool)
     for seen in (pair.left_seen, pair.right_seen):
         full &= True if seen is None else seen
-    rows, columns = _largest_rectangle(full)
+    rows, columns = _find_largest_rectangle(full)
     camera = pair.camera
     if camera is not None:
         centre = camera.cx_px - columns.start, camera.cy_px - rows.start
@@ -78,7 +78,7 @@ def cropped(pair: StereoPair) -> StereoPair:
 
 
 def _check_side_by_side(rig: Rig) -> None:
-    x, y, z = _right_centre(rig)
+    x, y, z = _find_right_centre(rig)
     aside = max(
         (abs(x), "beside"), (abs(y), "below" if y > 0 else "above"), (abs(z), "in front of or behind")
     )[1]
@@ -96,14 +96,14 @@ def _check_side_by_side(rig: Rig) -> None:
         )
 
 
-def _right_centre(rig: Rig) -> Float[np.ndarray, "3"]:
+def _find_right_centre(rig: Rig) -> Float[np.ndarray, "3"]:
     """Where the right camera is for the left one, x to the right, y down, z ahead, in metres."""
     return -rig.rotation.T @ rig.translation_m
 
 
-def _turns(rig: Rig) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
+def _find_rotations(rig: Rig) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
     """The rotations of left and right directions to those of the rectified cameras."""
-    aside = _right_centre(rig) / rig.baseline_m
+    aside = _find_right_centre(rig) / rig.baseline_m
     ahead = np.array([0, 0, 1]) + rig.rotation[2]  # the left camera's direction and the right one's
     ahead -= ahead @ aside * aside
     ahead /= np.linalg.norm(ahead)
@@ -111,12 +111,14 @@ def _turns(rig: Rig) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]
     return turn, turn @ rig.rotation.T
 
 
-def _camera(rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], size_px: tuple[int, int]) -> StereoCamera:
+def _choose_camera(
+    rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], size_px: tuple[int, int]
+) -> StereoCamera:
     """The rectified camera: what the two cameras have in their middles comes, on average, to the middle."""
     lenses = rig.left, rig.right
     focal_px = float(np.mean([optics.matrix[[0, 1], [0, 1]] for optics in lenses]))
     middle_px = (np.array(size_px) - 1) / 2
-    ahead = [turn @ _direction(optics, middle_px) for optics, turn in zip(lenses, turns, strict=True)]
+    ahead = [turn @ _find_direction(optics, middle_px) for optics, turn in zip(lenses, turns, strict=True)]
     if not all(np.isfinite(direction).all() and direction[2] > 0 for direction in ahead):
         raise StereoweaveError(
             f"{rig.name}: expected two cameras that look the same way, found them turned by "
@@ -131,14 +133,14 @@ def _camera(rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], size_px: tuple[
     )
 
 
-def _direction(optics: Optics, at_px: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
+def _find_direction(optics: Optics, at_px: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
     """Where a camera sees what it shows at a pixel."""
     undistort = cv2.fisheye.undistortPoints if optics.fisheye else cv2.undistortPoints
-    (x, y), *_ = undistort(at_px.reshape(1, 1, 2), optics.matrix, _coefficients(optics)).reshape(-1, 2)
+    (x, y), *_ = undistort(at_px.reshape(1, 1, 2), optics.matrix, _opencv_distortion(optics)).reshape(-1, 2)
     return np.array([x, y, 1])
 
 
-def _turned(
+def _rectify_view(
     image: UInt8[np.ndarray, "h w 3"], optics: Optics, turn: Float[np.ndarray, "3 3"], camera: StereoCamera
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """A picture as the rectified camera would show it, and which of its pixels the picture has.
@@ -148,14 +150,16 @@ def _turned(
     height, width = image.shape[:2]
     pinhole = np.array([[camera.focal_px, 0, camera.cx_px], [0, camera.focal_px, camera.cy_px], [0, 0, 1]])
     places = cv2.fisheye.initUndistortRectifyMap if optics.fisheye else cv2.initUndistortRectifyMap
-    x_px, y_px = places(optics.matrix, _coefficients(optics), turn, pinhole, (width, height), cv2.CV_32FC1)
+    x_px, y_px = places(
+        optics.matrix, _opencv_distortion(optics), turn, pinhole, (width, height), cv2.CV_32FC1
+    )
     inside = (x_px > -0.5) & (x_px < width - 0.5) & (y_px > -0.5) & (y_px < height - 0.5)
-    inside &= _before_the_fold(optics, turn, pinhole, (height, width))
+    inside &= _find_valid_field(optics, turn, pinhole, (height, width))
     turned = cv2.remap(image, x_px, y_px, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return turned, inside
 
 
-def _before_the_fold(
+def _find_valid_field(
     optics: Optics, turn: Float[np.ndarray, "3 3"], pinhole: Float[np.ndarray, "3 3"], shape: tuple[int, int]
 ) -> Bool[np.ndarray, "h w"]:
     """Where the lens is known to see: not behind it, nor where its polynomial turns back.
@@ -168,16 +172,16 @@ def _before_the_fold(
     x, y, z = (row[0] * columns + row[1] * rows + row[2] for row in to_direction)
     radius = np.hypot(x, y)
     if optics.fisheye:
-        return np.arctan2(radius, z) < _fold(optics, np.pi)
-    return (z > 0) & (radius < _fold(optics, 10.0) * z)
+        return np.arctan2(radius, z) < _find_fold(optics, np.pi)
+    return (z > 0) & (radius < _find_fold(optics, 10.0) * z)
 
 
 @np.errstate(all="ignore")  # where it cannot be computed it does not grow either
-def _fold(optics: Optics, most: float) -> float:
+def _find_fold(optics: Optics, most: float) -> float:
     """The radius (a fisheye lens: angle) at which the distorted radius no longer grows, at most `most`."""
     radius = np.linspace(0, most, _RADIUS_STEPS)
     squares = radius**2
-    k = _coefficients(optics)
+    k = _opencv_distortion(optics)
     if optics.fisheye:
         distorted = radius * (1 + squares * (k[0] + squares * (k[1] + squares * (k[2] + squares * k[3]))))
     else:
@@ -188,7 +192,7 @@ def _fold(optics: Optics, most: float) -> float:
     return float(radius[falls[0]]) if falls.size else most
 
 
-def _coefficients(optics: Optics) -> Float[np.ndarray, " n"]:
+def _opencv_distortion(optics: Optics) -> Float[np.ndarray, " n"]:
     """The distortion as OpenCV wants it, which has no fisheye lens without any."""
     return optics.distortion if optics.distortion.size else np.zeros(4)
 
@@ -203,10 +207,12 @@ def _summary(rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], pair: StereoPa
     )
 
 
-def _largest_rectangle(full: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
+def _find_largest_rectangle(full: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
     """Rows and columns of a rectangle that is full everywhere: the largest of whole cells, then grown."""
     cell_px = max(1, min(-(-max(full.shape) // _CELLS), min(full.shape) // _LEAST_CELLS))
-    top, bottom, start, stop = (cell_px * side for side in _largest_of_cells(_full_cells(full, cell_px)))
+    top, bottom, start, stop = (
+        cell_px * side for side in _find_largest_of_cells(_find_full_cells(full, cell_px))
+    )
     bottom, stop = min(bottom, full.shape[0]), min(stop, full.shape[1])
     for _ in range(cell_px):
         top -= top > 0 and bool(full[top - 1, start:stop].all())
@@ -216,7 +222,7 @@ def _largest_rectangle(full: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
     return slice(top, bottom), slice(start, stop)
 
 
-def _full_cells(full: Bool[np.ndarray, "h w"], cell_px: int) -> Bool[np.ndarray, "rows columns"]:
+def _find_full_cells(full: Bool[np.ndarray, "h w"], cell_px: int) -> Bool[np.ndarray, "rows columns"]:
     """Which cells are full; one that the picture's end cuts counts by what it has."""
     height, width = full.shape
     padded = np.pad(full, ((0, -height % cell_px), (0, -width % cell_px)), constant_values=True)
@@ -224,7 +230,7 @@ def _full_cells(full: Bool[np.ndarray, "h w"], cell_px: int) -> Bool[np.ndarray,
     return np.asarray(cells.all(axis=(1, 3)))
 
 
-def _largest_of_cells(full: Bool[np.ndarray, "rows columns"]) -> tuple[int, int, int, int]:
+def _find_largest_of_cells(full: Bool[np.ndarray, "rows columns"]) -> tuple[int, int, int, int]:
     """Top, bottom, start and stop of the largest full rectangle: for every row the bars that stand on it."""
     best, found = 0, (0, 0, 0, 0)
     heights = np.zeros(full.shape[1], int)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from stereoweave.cameras.feature_matches import Matches, sparse_matches
+from stereoweave.cameras.feature_matches import Matches, find_matches
 from stereoweave.cameras.rectify import Rectified
 from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.stereo import StereoPair
@@ -30,7 +30,7 @@ _PIXELS_OF_RESIDUAL = 1_500_000
 _OUTER_PERCENT = 1.0
 
 
-class _Turns(NamedTuple):
+class _Homographies(NamedTuple):
     """The homographies that bring each picture to the common rows."""
 
     left: Float[np.ndarray, "3 3"]
@@ -50,14 +50,16 @@ def rectify_by_features(pair: StereoPair) -> Rectified:
         StereoweaveError: Too few places, or none that such a turn brings to equal rows.
     """
     height, width = pair.left.shape[:2]
-    matches = _right_ones(sparse_matches(pair.left, pair.right))
-    parameters = _fitted(matches, width, height)
-    turns = _turns(parameters, width, height)
-    missed_px = np.abs(_rows(turns.right, matches.right_px) - _rows(turns.left, matches.left_px))
+    matches = _select_inliers(find_matches(pair.left, pair.right))
+    parameters = _fit_rotations(matches, width, height)
+    turns = _make_homographies(parameters, width, height)
+    missed_px = np.abs(
+        _transform_rows(turns.right, matches.right_px) - _transform_rows(turns.left, matches.left_px)
+    )
     _check(parameters, float(np.median(missed_px)), width, height)
-    turns, moved_px = _side_by_side(turns, matches)
-    left, left_seen = _warped(pair.left, turns.left, pair.left_seen)
-    right, right_seen = _warped(pair.right, turns.right, pair.right_seen)
+    turns, moved_px = _align_views(turns, matches)
+    left, left_seen = _warp(pair.left, turns.left, pair.left_seen)
+    right, right_seen = _warp(pair.right, turns.right, pair.right_seen)
     before_px = np.abs(matches.lower_px)
     note = Note(
         f"rectified by {len(missed_px)} matches: their rows are {np.median(missed_px):.2f} px apart in the "
@@ -67,7 +69,7 @@ def rectify_by_features(pair: StereoPair) -> Rectified:
     return Rectified(pair=rectified, notes=(note,))
 
 
-def _right_ones(found: Matches) -> Matches:
+def _select_inliers(found: Matches) -> Matches:
     """The matches that one epipolar geometry explains."""
     count = len(found.left_px)
     right_ones = np.zeros(count, bool)
@@ -89,15 +91,15 @@ def _right_ones(found: Matches) -> Matches:
     return Matches(found.left_px[right_ones], found.right_px[right_ones])
 
 
-def _fitted(matches: Matches, width: int, height: int) -> Float[np.ndarray, " 6"]:
-    """What `_turns` takes: five angles in radians, and the logarithm of the focal length over the width.
+def _fit_rotations(matches: Matches, width: int, height: int) -> Float[np.ndarray, " 6"]:
+    """Parameters of `_make_homographies`: five angles in radians and log(focal length / width).
 
     Levenberg-Marquardt on the Sampson errors in px, with numeric slopes; large errors count for less.
     """
     likely = np.array([_LIKELY_TURN] * 5 + [_LIKELY_LOG_FOCAL])
 
     def errors(parameters: Float[np.ndarray, " 6"]) -> Float[np.ndarray, " n"]:
-        missed_px = _sampson_px(_turns(parameters, width, height), matches)
+        missed_px = _measure_sampson_px(_make_homographies(parameters, width, height), matches)
         softened = np.sign(missed_px) * _SOFT_PX * np.sqrt(np.log1p((missed_px / _SOFT_PX) ** 2))
         return np.concatenate([softened, parameters / likely])
 
@@ -115,7 +117,7 @@ def _fitted(matches: Matches, width: int, height: int) -> Float[np.ndarray, " 6"
     return parameters
 
 
-def _turns(parameters: Float[np.ndarray, " 6"], width: int, height: int) -> _Turns:
+def _make_homographies(parameters: Float[np.ndarray, " 6"], width: int, height: int) -> _Homographies:
     """The turns of the left camera by yaw and roll, and of the right one by pitch, yaw and roll.
 
     A common pitch changes no row against another, so the left camera has none.
@@ -126,10 +128,10 @@ def _turns(parameters: Float[np.ndarray, " 6"], width: int, height: int) -> _Tur
     back = np.linalg.inv(camera)
     left, _ = cv2.Rodrigues(np.array([0.0, left_yaw, left_roll]))
     right, _ = cv2.Rodrigues(np.array([right_pitch, right_yaw, right_roll]))
-    return _Turns(camera @ left @ back, camera @ right @ back)
+    return _Homographies(camera @ left @ back, camera @ right @ back)
 
 
-def _sampson_px(turns: _Turns, matches: Matches) -> Float[np.ndarray, " n"]:
+def _measure_sampson_px(turns: _Homographies, matches: Matches) -> Float[np.ndarray, " n"]:
     """How far each match is from its epipolar lines, to the first order, in px of the given pictures."""
     across = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     fundamental = turns.right.T @ across @ turns.left
@@ -152,12 +154,12 @@ def _check(parameters: Float[np.ndarray, " 6"], residual_px: float, width: int, 
         )
 
 
-def _side_by_side(turns: _Turns, matches: Matches) -> tuple[_Turns, float]:
+def _align_views(turns: _Homographies, matches: Matches) -> tuple[_Homographies, float]:
     """The turns with the left picture's middle in place, the right beside it, and by how far that moved.
 
     That is to the left where disparities would else be negative, so that they start at 0.
     """
-    left_px, right_px = _moved(turns.left, matches.left_px), _moved(turns.right, matches.right_px)
+    left_px, right_px = _transform(turns.left, matches.left_px), _transform(turns.right, matches.right_px)
     centre_px = np.median(matches.left_px, 0)
     back_px = centre_px - np.median(left_px, 0)
     least_px = np.percentile(left_px[:, 0] - right_px[:, 0] + back_px[0], _OUTER_PERCENT)
@@ -165,10 +167,10 @@ def _side_by_side(turns: _Turns, matches: Matches) -> tuple[_Turns, float]:
     left_shift, right_shift = np.eye(3), np.eye(3)
     left_shift[:2, 2] = back_px
     right_shift[:2, 2] = moved_px, back_px[1]
-    return _Turns(left_shift @ turns.left, right_shift @ turns.right), moved_px
+    return _Homographies(left_shift @ turns.left, right_shift @ turns.right), moved_px
 
 
-def _warped(
+def _warp(
     photo: UInt8[np.ndarray, "h w 3"],
     turn: Float[np.ndarray, "3 3"],
     seen: Bool[np.ndarray, "h w"] | None,
@@ -181,9 +183,13 @@ def _warped(
     return warped, shown == 255
 
 
-def _moved(turn: Float[np.ndarray, "3 3"], places_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+def _transform(
+    turn: Float[np.ndarray, "3 3"], places_px: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n 2"]:
     return cv2.perspectiveTransform(places_px[None], turn)[0]
 
 
-def _rows(turn: Float[np.ndarray, "3 3"], places_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    return _moved(turn, places_px)[:, 1]
+def _transform_rows(
+    turn: Float[np.ndarray, "3 3"], places_px: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, " n"]:
+    return _transform(turn, places_px)[:, 1]

@@ -138,26 +138,26 @@ class Rig:
 
     def check_size(self, pair: StereoPair) -> None:
         """Raise a FormatError where it is for pictures of another size than those of the pair."""
-        size_px = size_of(pair)
+        size_px = pair_size_px(pair)
         if self.size_px not in (None, size_px):
             raise FormatError(
-                f"{self.name}: expected a calibration for pictures of {words(size_px)}, found one for "
-                f"{words(self.size_px)}; focal length, centre and doffs grow with the picture: bring the "
-                "pictures to that size, or calibrate at theirs"
+                f"{self.name}: expected a calibration for pictures of {format_size(size_px)}, found one for "
+                f"{format_size(self.size_px)}; focal length, centre and doffs grow with the picture: "
+                "bring the pictures to that size, or calibrate at theirs"
             )
 
 
-def size_of(pair: StereoPair) -> Size:
+def pair_size_px(pair: StereoPair) -> Size:
     """Width and height of the pictures of a pair."""
     return pair.left.shape[1], pair.left.shape[0]
 
 
-def words(size_px: Size | None) -> str:
+def format_size(size_px: Size | None) -> str:
     """A size as people write it, 640x480."""
     return "unknown size" if size_px is None else f"{size_px[0]}x{size_px[1]}"
 
 
-def rig_of(pair: StereoPair) -> Rig:
+def rectified_rig(pair: StereoPair) -> Rig:
     """The rig of a rectified pair whose camera is known."""
     camera = pair.camera
     if camera is None:
@@ -165,10 +165,12 @@ def rig_of(pair: StereoPair) -> Rig:
     focal_px, cx_px, cy_px = camera.focal_px, camera.cx_px, camera.cy_px
     left = np.array([[focal_px, 0, cx_px], [0, focal_px, cy_px], [0, 0, 1]], np.float64)
     right = left + np.array([[0, 0, camera.doffs_px], [0, 0, 0], [0, 0, 0]])
-    return replace(side_by_side(left, right, -camera.baseline_m), size_px=size_of(pair))
+    return replace(make_rectified_rig(left, right, -camera.baseline_m), size_px=pair_size_px(pair))
 
 
-def side_by_side(left: Float[np.ndarray, "3 n"], right: Float[np.ndarray, "3 n"], aside_m: float) -> Rig:
+def make_rectified_rig(
+    left: Float[np.ndarray, "3 n"], right: Float[np.ndarray, "3 n"], aside_m: float
+) -> Rig:
     """The rig of rectified pictures; what a matrix says beyond its third column is not looked at."""
     return Rig(
         left=Optics(matrix=left[:, :3], distortion=np.zeros(0)),

@@ -78,7 +78,7 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
     """
     import cv2
 
-    from stereoweave.bench.pairs import MEAN, score_pairs, with_memory, write_csv
+    from stereoweave.bench.pairs import MEAN, add_memory, score_pairs, write_csv
     from stereoweave.data.readers import list_scenes
     from stereoweave.matching.opencv import SGBM
     from stereoweave.system.threads import thread_count
@@ -91,7 +91,7 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
     cv2.setNumThreads(thread_count(threads))
     makers = _makers(model, threads, provider)
     scores = score_pairs(makers, partial(list_scenes, folder.absolute(), dataset), engine)
-    rows = with_memory(scores.rows, makers, scores.largest)
+    rows = add_memory(scores.rows, makers, scores.largest)
     write_csv(out, rows, scores.machine)
     means = [row for row in rows if row.scene == MEAN]
     if plot or sparsification:
@@ -142,7 +142,7 @@ def views(  # noqa: PLR0913 - each is an option of the command line
 
     from stereoweave.bench.pairs import MEAN, write_csv
     from stereoweave.bench.view_scenes import list_view_scenes
-    from stereoweave.bench.views import score_scenes
+    from stereoweave.bench.views import score_view_scenes
     from stereoweave.system.threads import thread_count
 
     place_for(out)
@@ -150,7 +150,7 @@ def views(  # noqa: PLR0913 - each is an option of the command line
     threads = engine.threads_each if engine else threads
     cv2.setNumThreads(thread_count(threads))
     scenes = partial(list_view_scenes, folder.absolute())
-    scores = score_scenes(_makers(model, threads, provider), scenes, threads, engine)
+    scores = score_view_scenes(_makers(model, threads, provider), scenes, threads, engine)
     write_csv(out, scores.rows, scores.machine)
     print_means(VIEWS_TABLES, "method", [row for row in scores.rows if row.scene == MEAN])
     typer.echo(f"rows: {out}")
@@ -168,12 +168,12 @@ def flicker(  # noqa: PLR0913 - each is an option of the command line
     """Score the temporal filter on rendered noisy videos: flicker and errors with it and without."""
     place_for(out)
     with needing_the_synth_extra():
-        from stereoweave.bench.flicker import flicker_rows, means
+        from stereoweave.bench.flicker import average_rows, score_flicker
     from stereoweave.bench.pairs import write_csv
 
-    rows = list(flicker_rows(scenes, model, frames=frames, threads=threads, provider=provider))
+    rows = list(score_flicker(scenes, model, frames=frames, threads=threads, provider=provider))
     write_csv(out, rows)
-    print_means(FLICKER_TABLES, "film", means(rows))
+    print_means(FLICKER_TABLES, "film", average_rows(rows))
     typer.echo(f"rows: {out}")
 
 
@@ -238,16 +238,16 @@ def training(
 
 def _makers(models: Sequence[str] | None, threads: int | None, provider: str) -> dict[str, Callable[[], Any]]:
     """Constructors of the named networks, plain and refined; default: all shipped networks."""
-    from stereoweave.bench.pairs import network
+    from stereoweave.bench.pairs import make_matcher
     from stereoweave.matching.matcher import MODES, shipped_models
 
     makers: dict[str, Callable[[], Any]] = {}
     for name in models or shipped_models():
         # Absolute, because cluster workers have another current folder.
         model = str(Path(name).absolute()) if Path(name).is_file() else name
-        makers[name] = partial(network, model, threads, provider=provider)
+        makers[name] = partial(make_matcher, model, threads, provider=provider)
         if name not in MODES:  # modes choose refinement themselves
-            makers[name + REFINED] = partial(network, model, threads, refined=True, provider=provider)
+            makers[name + REFINED] = partial(make_matcher, model, threads, refined=True, provider=provider)
     return makers
 
 

@@ -54,8 +54,8 @@ def rectify(
     The pictures are cut to what both show. With a calibration calib.yml is the new one, of the results.
     """
     from stereoweave.cameras.calibration_files import write_rig
-    from stereoweave.cameras.rectify import cropped
-    from stereoweave.cameras.rig import rig_of, size_of, words
+    from stereoweave.cameras.rectify import crop
+    from stereoweave.cameras.rig import format_size, pair_size_px, rectified_rig
     from stereoweave.io.files import make_folder, write_image
     from stereoweave.io.output_lock import lock_output
     from stereoweave.pictures.prepare import Request, prepare
@@ -63,14 +63,14 @@ def rectify(
     _spare(pictures, calib, out)
     place_for(out / "left.png", out / "right.png", out / "calib.yml")
     prepared = prepare(pictures, Request(arrangement=arrangement, calibration=calib, rectify=True))
-    pair = cropped(prepared.pair)
+    pair = crop(prepared.pair)
     with lock_output(make_folder(out)):
         write_image(out / "left.png", pair.left)
         write_image(out / "right.png", pair.right)
         if pair.camera:
-            write_rig(out / "calib.yml", rig_of(pair))
+            write_rig(out / "calib.yml", rectified_rig(pair))
     notes = [note.worded(option_name) for note in prepared.notes]
-    typer.echo("\n".join([f"{out}: left.png and right.png, {words(size_of(pair))} px", *notes]))
+    typer.echo("\n".join([f"{out}: left.png and right.png, {format_size(pair_size_px(pair))} px", *notes]))
 
 
 def _spare(pictures: Sequence[Path], calib: Path | None, out: Path) -> None:

@@ -148,11 +148,11 @@ def _marked(out: Path, layout: str, size_px: tuple[int, int]) -> Path:
     """The name with the mark by which viewers know the layout."""
     import numpy as np
 
-    from stereoweave.rendering.layouts import Choices, marked
+    from stereoweave.rendering.layouts import LayoutOptions, add_mark
     from stereoweave.stereo import StereoPair
 
     blank = np.broadcast_to(np.uint8(0), (*reversed(size_px), 3))
-    return marked(out, layout, StereoPair(left=blank, right=blank), Choices())
+    return add_mark(out, layout, StereoPair(left=blank, right=blank), LayoutOptions())
 
 
 def _tell(out: Path, tally: "VideoTally") -> None:

@@ -24,7 +24,7 @@ from stereoweave.cli.options import (
 from stereoweave.errors import StereoweaveError
 
 if TYPE_CHECKING:
-    from stereoweave.rendering.layouts import Choices
+    from stereoweave.rendering.layouts import LayoutOptions
     from stereoweave.rendering.renderer import Renderer
     from stereoweave.stereo import View
 
@@ -94,40 +94,46 @@ def view(  # noqa: PLR0913 - each is a word of the command line
     provider: Provider = "cpu",
 ) -> None:
     """A new view of a stereo pair, or many, as 3-D viewers and displays take them."""
-    from stereoweave.cameras.diagnosis import hints
-    from stereoweave.cameras.rectify import cropped
+    from stereoweave.cameras.diagnosis import find_problems
+    from stereoweave.cameras.rectify import crop
     from stereoweave.matching.backend import Backend
     from stereoweave.matching.estimate import match
     from stereoweave.matching.options import MatchOptions
     from stereoweave.pictures.prepare import prepare
-    from stereoweave.rendering.layouts import LAYOUTS, check_reach, layout_of, marked, middle_px
+    from stereoweave.rendering.layouts import (
+        LAYOUTS,
+        add_mark,
+        check_positions,
+        choose_layout,
+        median_disparity_px,
+    )
     from stereoweave.rendering.renderer import Renderer, check_position
 
-    name = layout_of(out, layout)
+    name = choose_layout(out, layout)
     _refuse_idle(name, {"--position": position, "--up": up or None, "--forward": forward or None}, quilt)
     if name == "rgbd" and (strength != 1 or convergence is not None):
         raise StereoweaveError("--strength, --convergence: expected with several views, found with rgbd")
     check_position(_MIDDLE, up=up, forward=forward)
     choices = _choices(quilt)
     positions, converged = _needs(name, _MIDDLE if position is None else position)
-    check_reach(positions, strength)
+    check_positions(positions, strength)
     plane_px = _plane_px(("auto" if converged else "0") if convergence is None else convergence)
     options = MatchOptions(range_px=range_of(range_px), refined=True)
     prepared = prepare(pictures, request_of(arrangement, calib, rectify=rectify))
-    pair = cropped(prepared.pair)
+    pair = crop(prepared.pair)
     if name in LAYOUTS:
-        out = marked(out, name, pair, choices)
+        out = add_mark(out, name, pair, choices)
     place_for(out)
     estimate = match(Backend(model=model, threads=threads, provider=provider).matcher(), pair, options)
     if plane_px is None:
-        plane_px = middle_px(estimate)
+        plane_px = median_disparity_px(estimate)
     renderer = Renderer(pair, estimate, strength=strength, convergence_px=plane_px, threads=threads)
     if name is None:
         told = _write_view(out, renderer.view(*positions, up=up, forward=forward), *positions)
     else:
         told = _write_layout(out, name, renderer, choices)
     typer.echo(f"{out}: {told}")
-    for note in (*prepared.notes, *hints(pair, estimate)):
+    for note in (*prepared.notes, *find_problems(pair, estimate)):
         typer.echo(note.worded(option_name))
 
 
@@ -143,24 +149,24 @@ def _refuse_idle(name: str | None, of_one_view: dict[str, float | None], quilt: 
         raise StereoweaveError(f"--quilt: expected with --layout quilt, found with {name or 'a single view'}")
 
 
-def _choices(quilt: str | None) -> "Choices":
-    from stereoweave.rendering.layouts import Choices
+def _choices(quilt: str | None) -> "LayoutOptions":
+    from stereoweave.rendering.layouts import LayoutOptions
 
     if quilt is None:
-        return Choices()
+        return LayoutOptions()
     match = re.fullmatch(r"(\d+)x(\d+)", quilt)
     if match is None:
         raise StereoweaveError(f"--quilt: expected columns and rows, such as 8x6, found {quilt!r}")
-    return Choices(columns=int(match[1]), rows=int(match[2]))
+    return LayoutOptions(columns=int(match[1]), rows=int(match[2]))
 
 
 def _needs(name: str | None, position: float) -> tuple[tuple[float, ...], bool]:
     """Where the views are seen from, and whether the scene's middle should stay in place."""
-    from stereoweave.rendering.layouts import LAYOUTS, MOTIONS
+    from stereoweave.rendering.layouts import ANIMATIONS, LAYOUTS
 
     if name is None:
         return (position,), False
-    shown = LAYOUTS[name] if name in LAYOUTS else MOTIONS[name]
+    shown = LAYOUTS[name] if name in LAYOUTS else ANIMATIONS[name]
     return shown.positions, shown.converged
 
 
@@ -185,17 +191,17 @@ def _write_view(out: Path, view: "View", position: float) -> str:
     return f"view at {position:g}, {100 * (~view.drawn).mean():.1f} % of it seen by neither camera"
 
 
-def _write_layout(out: Path, name: str, renderer: "Renderer", choices: "Choices") -> str:
+def _write_layout(out: Path, name: str, renderer: "Renderer", choices: "LayoutOptions") -> str:
     """What was written into the file, in words."""
     from stereoweave.io.animation import write_animation
-    from stereoweave.rendering.layouts import LAYOUTS, MOTIONS, frames, write_picture
+    from stereoweave.rendering.layouts import ANIMATIONS, LAYOUTS, render_views, write_picture
 
     if name in LAYOUTS:
         picture = LAYOUTS[name].compose(renderer, choices)
         write_picture(out, picture)
         return f"{name}, {picture.shape[1]}x{picture.shape[0]} px"
-    motion = MOTIONS[name]
+    motion = ANIMATIONS[name]
     turns = motion.turns(out)
-    write_animation(out, frames(renderer, motion.positions * turns), motion.frame_ms)
+    write_animation(out, render_views(renderer, motion.positions * turns), motion.frame_ms)
     count = len(motion.positions) * turns
     return f"{name}, {count} frames in {count * motion.frame_ms / 1000:g} s"

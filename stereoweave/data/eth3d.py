@@ -5,26 +5,26 @@ from pathlib import Path
 
 import numpy as np
 
-from stereoweave.cameras.calibration_files import calibrated
-from stereoweave.data.frames import Frame, existing, scenes
-from stereoweave.data.samples import make_sample, of_its_size
+from stereoweave.cameras.calibration_files import add_camera
+from stereoweave.data.frames import Frame, list_scene_folders, require_folder
+from stereoweave.data.samples import make_sample, require_size
 from stereoweave.io.files import read_pair, read_pfm, read_pixels
 from stereoweave.stereo import Sample
 
 
-def eth3d(root: Path) -> list[Frame]:
+def list_eth3d(root: Path) -> list[Frame]:
     """The scenes of two_view_training with the ground truth of two_view_training_gt: delivery_area_1l."""
-    truth = existing(root / "two_view_training_gt")
+    truth = require_folder(root / "two_view_training_gt")
     return [
         Frame(name=scene.name, read=partial(_read, scene, truth / scene.name))
-        for scene in scenes(root / "two_view_training")
+        for scene in list_scene_folders(root / "two_view_training")
     ]
 
 
 def _read(scene: Path, truth: Path) -> Sample:
-    pair = calibrated(read_pair(scene / "im0.png", scene / "im1.png"), scene / "calib.txt")
+    pair = add_camera(read_pair(scene / "im0.png", scene / "im1.png"), scene / "calib.txt")
     disparity, visible = truth / "disp0GT.pfm", truth / "mask0nocc.png"
-    disparity_px = of_its_size(read_pfm(disparity), disparity, pair)
+    disparity_px = require_size(read_pfm(disparity), disparity, pair)
     # 255 is seen by both cameras; what is darker is occluded, or unknown.
-    both = of_its_size(read_pixels(visible, "L"), visible, pair) == 255
+    both = require_size(read_pixels(visible, "L"), visible, pair) == 255
     return make_sample(pair, disparity_px, occluded=np.isfinite(disparity_px) & ~both)

@@ -28,7 +28,7 @@ class Frame:
         return self.name.rpartition("/")[0]
 
 
-def matched(*folders: Path, ending: str = "") -> dict[str, list[Path]]:
+def match_files(*folders: Path, ending: str = "") -> dict[str, list[Path]]:
     """The files of each frame, one from each folder, by the name that they share there, in its order.
 
     A name is the path below the folder, without the suffix; `ending` is what it must end in to count.
@@ -37,7 +37,7 @@ def matched(*folders: Path, ending: str = "") -> dict[str, list[Path]]:
         StereoweaveError: There is no such folder.
         FormatError: A folder lacks a file that another one has.
     """
-    listings = [_files(folder, ending) for folder in folders]
+    listings = [_list_files(folder, ending) for folder in folders]
     names = sorted(set().union(*listings))
     for folder, files in zip(folders, listings, strict=True):
         missing = [name for name in names if name not in files]
@@ -50,7 +50,7 @@ def matched(*folders: Path, ending: str = "") -> dict[str, list[Path]]:
     return {name: [files[name] for files in listings] for name in names}
 
 
-def existing(folder: Path) -> Path:
+def require_folder(folder: Path) -> Path:
     """The folder itself; StereoweaveError where there is none."""
     if not folder.is_dir():
         found = "a file" if folder.exists() else "nothing of that name"
@@ -58,12 +58,14 @@ def existing(folder: Path) -> Path:
     return folder
 
 
-def scenes(root: Path) -> list[Path]:
+def list_scene_folders(root: Path) -> list[Path]:
     """The folders in `root`, by name, for datasets that keep each scene in one."""
-    return sorted(path for path in existing(root).iterdir() if path.is_dir() and path.name[0] != ".")
+    return sorted(path for path in require_folder(root).iterdir() if path.is_dir() and path.name[0] != ".")
 
 
-def _files(folder: Path, ending: str) -> dict[str, Path]:
-    paths = (path for path in existing(folder).rglob("*") if path.suffix in _SUFFIXES and path.name[0] != ".")
+def _list_files(folder: Path, ending: str) -> dict[str, Path]:
+    paths = (
+        path for path in require_folder(folder).rglob("*") if path.suffix in _SUFFIXES and path.name[0] != "."
+    )
     files = {path.relative_to(folder).with_suffix("").as_posix(): path for path in paths}
     return {name: path for name, path in files.items() if name.endswith(ending)}

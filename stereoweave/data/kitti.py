@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from stereoweave.cameras.calibration_files import calibration_bytes
-from stereoweave.data.frames import Frame, existing, matched
-from stereoweave.data.samples import make_sample, of_its_size
+from stereoweave.cameras.calibration_files import read_calibration_bytes
+from stereoweave.data.frames import Frame, match_files, require_folder
+from stereoweave.data.samples import make_sample, require_size
 from stereoweave.errors import FormatError
 from stereoweave.io.files import read_disparity_png, read_pair, reading
 from stereoweave.stereo import Sample, StereoCamera, StereoPair
 
 
-def kitti2012(root: Path) -> list[Frame]:
+def list_kitti2012(root: Path) -> list[Frame]:
     """The 194 pairs of 2012, 000000_10 and so on, in grey.
 
     The development kit gives the ground truth for the grey cameras, 0 and 1; the colour ones, 2 and 3, stand
@@ -23,25 +23,25 @@ def kitti2012(root: Path) -> list[Frame]:
     """
     training = root / "training"
     folders = [training / name for name in ("image_0", "image_1", "disp_occ", "disp_noc")]
-    return _frames(folders, training / "calib", ("P0", "P1"))
+    return _list_frames(folders, training / "calib", ("P0", "P1"))
 
 
-def kitti2015(root: Path) -> list[Frame]:
+def list_kitti2015(root: Path) -> list[Frame]:
     """The 200 pairs of 2015, 000000_10 and so on, in colour; calib_cam_to_cam is an archive of its own.
 
     disp_occ_1 is not the right view's disparity, but the next moment's, seen from the left: it is not read.
     """
     training = root / "training"
     folders = [training / name for name in ("image_2", "image_3", "disp_occ_0", "disp_noc_0")]
-    return _frames(folders, training / "calib_cam_to_cam", ("P_rect_02", "P_rect_03"))
+    return _list_frames(folders, training / "calib_cam_to_cam", ("P_rect_02", "P_rect_03"))
 
 
-def _frames(folders: list[Path], calibrations: Path, keys: tuple[str, str]) -> list[Frame]:
-    existing(calibrations)
+def _list_frames(folders: list[Path], calibrations: Path, keys: tuple[str, str]) -> list[Frame]:
+    require_folder(calibrations)
     return [
         Frame(name=name, read=partial(_read, files, calibrations / f"{name.removesuffix('_10')}.txt", keys))
         # The pictures of the next moment, _11, have no ground truth.
-        for name, files in matched(*folders, ending="_10").items()
+        for name, files in match_files(*folders, ending="_10").items()
     ]
 
 
@@ -53,14 +53,14 @@ def _read(files: list[Path], calibration: Path, keys: tuple[str, str]) -> Sample
 
 
 def _read_disparity(path: Path, pair: StereoPair) -> Float32[np.ndarray, "h w"]:
-    return of_its_size(read_disparity_png(path), path, pair)
+    return require_size(read_disparity_png(path), path, pair)
 
 
 def _read_camera(path: Path, keys: tuple[str, str]) -> StereoCamera:
     """The camera of two projections P = K [I | t]: P[0, 3] = focal_px * t, and the baseline is t0 - t1."""
     with reading(path, "a calibration of KITTI"):
         lines = (
-            line.partition(":") for line in calibration_bytes(path).decode(errors="replace").splitlines()
+            line.partition(":") for line in read_calibration_bytes(path).decode(errors="replace").splitlines()
         )
         entries = {key: numbers.split() for key, _, numbers in lines}
         missing = [key for key in keys if len(entries.get(key, [])) != 12]

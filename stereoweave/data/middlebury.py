@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from stereoweave.cameras.calibration_files import calibrated
-from stereoweave.data.frames import Frame, scenes
-from stereoweave.data.samples import make_sample, of_its_size
+from stereoweave.cameras.calibration_files import add_camera
+from stereoweave.data.frames import Frame, list_scene_folders
+from stereoweave.data.samples import make_sample, require_size
 from stereoweave.errors import FormatError
 from stereoweave.io.files import read_pair, read_pfm, read_pixels, read_small, reading
 from stereoweave.stereo import Sample, StereoCamera, StereoPair
 
 
 @dataclass(frozen=True)
-class _Views:
+class _SceneFiles:
     """What a scene calls its two views and their disparities, and by what these are multiplied."""
 
     left: str
@@ -26,11 +26,11 @@ class _Views:
     scale: int
 
 
-_2001 = {
-    "map": _Views("im0", "im1", "disp0", "disp1", 8),
-    "tsukuba": _Views("scene1.row3.col3", "scene1.row3.col4", "truedisp.row3.col3", None, 16),
+_FILES_2001 = {
+    "map": _SceneFiles("im0", "im1", "disp0", "disp1", 8),
+    "tsukuba": _SceneFiles("scene1.row3.col3", "scene1.row3.col4", "truedisp.row3.col3", None, 16),
 }
-_2001_OTHERS = _Views("im2", "im6", "disp2", "disp6", 8)
+_OTHER_FILES_2001 = _SceneFiles("im2", "im6", "disp2", "disp6", 8)
 
 # The height tells the size that was downloaded. Grey levels are pixels of the full size in every size: they
 # are divided by how much smaller the picture is.
@@ -38,82 +38,84 @@ _2003_SHRINKING = {1500: 1, 750: 2, 375: 4}
 _2006_SHRINKING = {1110: 1, 555: 2, 370: 3}
 
 # Three scenes of 2005 are published without ground truth.
-_UNTOLD_2005 = {"Computer", "Drumsticks", "Dwarves"}
+_WITHOUT_TRUTH_2005 = {"Computer", "Drumsticks", "Dwarves"}
 
 
-def middlebury2001(root: Path) -> list[Frame]:
+def list_middlebury2001(root: Path) -> list[Frame]:
     """Eight scenes of planes, from views 2 and 6 or their like; no camera is published."""
     return [
-        Frame(name=scene.name, read=partial(_read_2001, scene, _2001.get(scene.name, _2001_OTHERS)))
-        for scene in scenes(root)
+        Frame(
+            name=scene.name, read=partial(_read_2001, scene, _FILES_2001.get(scene.name, _OTHER_FILES_2001))
+        )
+        for scene in list_scene_folders(root)
     ]
 
 
-def middlebury2003(root: Path) -> list[Frame]:
+def list_middlebury2003(root: Path) -> list[Frame]:
     """Cones and teddy, views 2 and 6, in full, half or quarter size; no camera is published."""
-    return [Frame(name=scene.name, read=partial(_read_2003, scene)) for scene in scenes(root)]
+    return [Frame(name=scene.name, read=partial(_read_2003, scene)) for scene in list_scene_folders(root)]
 
 
-def middlebury2005(root: Path) -> list[Frame]:
+def list_middlebury2005(root: Path) -> list[Frame]:
     """The scenes of 2005, views 1 and 5, in full, half or third size: Art, or Art/Illum1/Exp0."""
     return [
         Frame(name=views.relative_to(root).as_posix(), read=partial(_read_2006, scene, views))
-        for scene in scenes(root)
-        if scene.name not in _UNTOLD_2005
+        for scene in list_scene_folders(root)
+        if scene.name not in _WITHOUT_TRUTH_2005
         # The archives of two views have one picture of each; those of seven have lights and exposures.
         for views in sorted(scene.glob("Illum*/Exp*")) or [scene]
     ]
 
 
-def middlebury2006(root: Path) -> list[Frame]:
+def list_middlebury2006(root: Path) -> list[Frame]:
     """The scenes of 2006, in the layout of 2005: Aloe, or Aloe/Illum1/Exp0."""
-    return middlebury2005(root)
+    return list_middlebury2005(root)
 
 
-def middlebury2014(root: Path) -> list[Frame]:
+def list_middlebury2014(root: Path) -> list[Frame]:
     """The scenes of 2014 in their default light: Adirondack-perfect, Adirondack-imperfect."""
-    return [Frame(name=scene.name, read=partial(_read_2014, scene)) for scene in scenes(root)]
+    return [Frame(name=scene.name, read=partial(_read_2014, scene)) for scene in list_scene_folders(root)]
 
 
-def middlebury2021(root: Path) -> list[Frame]:
+def list_middlebury2021(root: Path) -> list[Frame]:
     """The scenes of 2021, in the layout of 2014: artroom1."""
-    return middlebury2014(root)
+    return list_middlebury2014(root)
 
 
-def _read_2001(scene: Path, names: _Views) -> Sample:
-    pair = read_pair(_file(scene, names.left), _file(scene, names.right))
-    disparity_px = _read_levels(_file(scene, names.disparity), pair) / names.scale
+def _read_2001(scene: Path, names: _SceneFiles) -> Sample:
+    pair = read_pair(_find_picture(scene, names.left), _find_picture(scene, names.right))
+    disparity_px = _read_levels(_find_picture(scene, names.disparity), pair) / names.scale
     if names.right_disparity is None:
         return make_sample(pair, disparity_px)
     return make_sample(
-        pair, disparity_px, _read_levels(_file(scene, names.right_disparity), pair) / names.scale
+        pair, disparity_px, _read_levels(_find_picture(scene, names.right_disparity), pair) / names.scale
     )
 
 
 def _read_2003(scene: Path) -> Sample:
-    left = _file(scene, "im2")
-    pair = read_pair(left, _file(scene, "im6"))
-    shrinking = _shrinking(left, pair, _2003_SHRINKING)
-    maps = (_read_levels(_file(scene, name), pair) / shrinking for name in ("disp2", "disp6"))
+    left = _find_picture(scene, "im2")
+    pair = read_pair(left, _find_picture(scene, "im6"))
+    shrinking = _find_shrinking(left, pair, _2003_SHRINKING)
+    maps = (_read_levels(_find_picture(scene, name), pair) / shrinking for name in ("disp2", "disp6"))
     return make_sample(pair, *maps)
 
 
 def _read_2006(scene: Path, views: Path) -> Sample:
     left = views / "view1.png"
     pair = read_pair(left, views / "view5.png")
-    shrinking = _shrinking(left, pair, _2006_SHRINKING)
-    pair = replace(pair, camera=_camera_2006(scene / "dmin.txt", pair, shrinking))
+    shrinking = _find_shrinking(left, pair, _2006_SHRINKING)
+    pair = replace(pair, camera=_read_camera_2006(scene / "dmin.txt", pair, shrinking))
     maps = (_read_levels(scene / name, pair) / shrinking for name in ("disp1.png", "disp5.png"))
     return make_sample(pair, *maps)
 
 
 def _read_2014(scene: Path) -> Sample:
-    pair = calibrated(read_pair(scene / "im0.png", scene / "im1.png"), scene / "calib.txt")
-    maps = (of_its_size(read_pfm(path), path, pair) for path in (scene / "disp0.pfm", scene / "disp1.pfm"))
+    pair = add_camera(read_pair(scene / "im0.png", scene / "im1.png"), scene / "calib.txt")
+    maps = (require_size(read_pfm(path), path, pair) for path in (scene / "disp0.pfm", scene / "disp1.pfm"))
     return make_sample(pair, *maps)
 
 
-def _file(scene: Path, name: str) -> Path:
+def _find_picture(scene: Path, name: str) -> Path:
     """The picture in the format that was downloaded; .png where there is none."""
     kinds = (scene / f"{name}{suffix}" for suffix in (".ppm", ".pgm"))
     return next((path for path in kinds if path.exists()), scene / f"{name}.png")
@@ -121,11 +123,11 @@ def _file(scene: Path, name: str) -> Path:
 
 def _read_levels(path: Path, pair: StereoPair) -> Float32[np.ndarray, "h w"]:
     """The grey levels of a disparity map, whose 0, unknown, becomes NaN."""
-    levels = of_its_size(read_pixels(path, "L"), path, pair)
+    levels = require_size(read_pixels(path, "L"), path, pair)
     return np.where(levels > 0, levels, np.nan).astype(np.float32)
 
 
-def _shrinking(path: Path, pair: StereoPair, by_height_px: dict[int, int]) -> int:
+def _find_shrinking(path: Path, pair: StereoPair, by_height_px: dict[int, int]) -> int:
     height_px = pair.left.shape[0]
     if height_px not in by_height_px:
         heights = ", ".join(map(str, by_height_px))
@@ -136,7 +138,7 @@ def _shrinking(path: Path, pair: StereoPair, by_height_px: dict[int, int]) -> in
     return by_height_px[height_px]
 
 
-def _camera_2006(dmin: Path, pair: StereoPair, shrinking: int) -> StereoCamera:
+def _read_camera_2006(dmin: Path, pair: StereoPair, shrinking: int) -> StereoCamera:
     """The published camera, focal length 3740 px in full size and baseline 160 mm.
 
     dmin.txt says, in pixels of the full size whatever the size, how much cropping took from each disparity.

@@ -44,7 +44,7 @@ _WEBP = {"lossless": True, "method": 0, "quality": 0}
 _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 3, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB)
 
 
-def packed(sample: Sample, views: Mapping[float, UInt8[np.ndarray, "h w 3"]]) -> dict[str, bytes]:
+def pack(sample: Sample, views: Mapping[float, UInt8[np.ndarray, "h w 3"]]) -> dict[str, bytes]:
     """The files of a pair by the ends of their names.
 
     Args:
@@ -58,49 +58,49 @@ def packed(sample: Sample, views: Mapping[float, UInt8[np.ndarray, "h w 3"]]) ->
     pictures = {"left.webp": sample.left, "right.webp": sample.right}
     pictures |= {f"view_{position:.2f}.webp": image for position, image in views.items()}
     masks = {"occluded.png": sample.occluded, "right_occluded.png": sample.right_occluded}
-    steps_per_px = _steps_per_px(disparities_px.values())
+    steps_per_px = _choose_steps_per_px(disparities_px.values())
     facts = {"steps_per_px": steps_per_px, "camera": asdict(sample.camera) if sample.camera else None}
     return {
-        **{name: _encoded(image, "WEBP", **_WEBP) for name, image in pictures.items()},
-        **{name: _disparity_png(values, steps_per_px) for name, values in disparities_px.items()},
-        **{name: _encoded(mask, "PNG") for name, mask in masks.items()},
+        **{name: _encode(image, "WEBP", **_WEBP) for name, image in pictures.items()},
+        **{name: _encode_disparity(values, steps_per_px) for name, values in disparities_px.items()},
+        **{name: _encode(mask, "PNG") for name, mask in masks.items()},
         "camera.json": json.dumps(facts, indent=1).encode(),
     }
 
 
-def unpacked(files: Mapping[str, bytes]) -> Sample:
-    """The sample of files that `packed` made; a ValueError for any others."""
-    steps_per_px, camera = _facts(_file(files, "camera.json"))
-    left = _decoded(files, "left.webp", _RGB)
+def unpack(files: Mapping[str, bytes]) -> Sample:
+    """The sample of files that `pack` made; a ValueError for any others."""
+    steps_per_px, camera = _parse_camera(_require_file(files, "camera.json"))
+    left = _decode(files, "left.webp", _RGB)
 
-    def of_its_size(name: str, kind: _Kind) -> Shaped[np.ndarray, "h w *channels"]:
-        values = _decoded(files, name, kind)
+    def require_size(name: str, kind: _Kind) -> Shaped[np.ndarray, "h w *channels"]:
+        values = _decode(files, name, kind)
         if values.shape[:2] != left.shape[:2]:
             raise ValueError(f"{name} of {values.shape[1]}x{values.shape[0]} px")
         return values
 
     def disparity_px(name: str) -> Float[np.ndarray, "h w"]:
-        steps = of_its_size(name, _STEPS)
+        steps = require_size(name, _STEPS)
         return np.where(steps == _UNKNOWN, np.nan, steps / steps_per_px).astype(np.float32)
 
     return Sample(
         left=left,
-        right=of_its_size("right.webp", _RGB),
+        right=require_size("right.webp", _RGB),
         disparity_px=disparity_px("disparity.png"),
         right_disparity_px=disparity_px("right_disparity.png"),
-        occluded=of_its_size("occluded.png", _MASK),
-        right_occluded=of_its_size("right_occluded.png", _MASK),
+        occluded=require_size("occluded.png", _MASK),
+        right_occluded=require_size("right_occluded.png", _MASK),
         camera=camera,
     )
 
 
-def unpacked_views(files: Mapping[str, bytes]) -> dict[float, UInt8[np.ndarray, "h w 3"]]:
-    """The further pictures among files that `packed` made, by their position; a ValueError for any others."""
+def unpack_views(files: Mapping[str, bytes]) -> dict[float, UInt8[np.ndarray, "h w 3"]]:
+    """The further pictures among files that `pack` made, by their position; a ValueError for any others."""
     names = sorted(name for name in files if name.startswith("view_"))
-    return {float(name[len("view_") : -len(".webp")]): _decoded(files, name, _RGB) for name in names}
+    return {float(name[len("view_") : -len(".webp")]): _decode(files, name, _RGB) for name in names}
 
 
-def _facts(content: bytes) -> tuple[int, StereoCamera | None]:
+def _parse_camera(content: bytes) -> tuple[int, StereoCamera | None]:
     """The steps per pixel and the camera that camera.json says."""
     try:
         match json.loads(content):
@@ -113,7 +113,7 @@ def _facts(content: bytes) -> tuple[int, StereoCamera | None]:
     raise ValueError("camera.json without steps_per_px or camera")
 
 
-def _steps_per_px(disparities_px: Iterable[Float[np.ndarray, "h w"]]) -> int:
+def _choose_steps_per_px(disparities_px: Iterable[Float[np.ndarray, "h w"]]) -> int:
     """The power of two that uses most of 16 bits, so that it divides without rounding."""
     known_px = np.concatenate([values[~np.isnan(values)] for values in disparities_px])
     least_px, most_px = known_px.min(initial=0), known_px.max(initial=0)
@@ -125,28 +125,28 @@ def _steps_per_px(disparities_px: Iterable[Float[np.ndarray, "h w"]]) -> int:
     return min(_MOST_STEPS_PER_PX, 2 ** int(math.log2((_UNKNOWN - 1) / max(most_px, 1))))
 
 
-def _disparity_png(disparity_px: Float[np.ndarray, "h w"], steps_per_px: int) -> bytes:
+def _encode_disparity(disparity_px: Float[np.ndarray, "h w"], steps_per_px: int) -> bytes:
     steps = np.rint(disparity_px * steps_per_px)
     done, png = cv2.imencode(".png", np.where(np.isnan(steps), _UNKNOWN, steps).astype(np.uint16), _PNG)
     assert done
     return png.tobytes()
 
 
-def _encoded(image: UInt8[np.ndarray, "h w 3"] | Bool[np.ndarray, "h w"], kind: str, **options: Any) -> bytes:
+def _encode(image: UInt8[np.ndarray, "h w 3"] | Bool[np.ndarray, "h w"], kind: str, **options: Any) -> bytes:
     stream = io.BytesIO()
     Image.fromarray(image).save(stream, kind, **options)
     return stream.getvalue()
 
 
-def _file(files: Mapping[str, bytes], name: str) -> bytes:
+def _require_file(files: Mapping[str, bytes], name: str) -> bytes:
     if name not in files:
         raise ValueError(f"no {name}")
     return files[name]
 
 
-def _decoded(files: Mapping[str, bytes], name: str, kind: _Kind) -> Shaped[np.ndarray, "h w *channels"]:
+def _decode(files: Mapping[str, bytes], name: str, kind: _Kind) -> Shaped[np.ndarray, "h w *channels"]:
     """A picture among the files, which must be of that kind."""
-    values = unpacked_values(name, _file(files, name))
+    values = unpacked_values(name, _require_file(files, name))
     if (values.dtype.type, values.shape[2:]) != kind:
         raise ValueError(f"{name} of another kind of picture")
     return values

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
-from stereoweave.cameras.calibration_files import calibrated
-from stereoweave.data.checksums import check_sums, checksums
-from stereoweave.data.frames import Frame, matched
-from stereoweave.data.samples import make_sample, of_its_size
+from stereoweave.cameras.calibration_files import add_camera
+from stereoweave.data.checksums import make_checksums, verify_checksums
+from stereoweave.data.frames import Frame, match_files
+from stereoweave.data.samples import make_sample, require_size
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.files import read_pair, read_pixels, reading, replacing, write_image
 from stereoweave.stereo import Sample, StereoCamera
@@ -31,7 +31,7 @@ _PACKED_MAX = 2**24 - 1
 _ENDINGS = {"left": "png", "right": "png", "calib": "txt", "depth": "png"}
 
 
-def paper(root: Path) -> list[Frame]:
+def list_paper(root: Path) -> list[Frame]:
     """The frames of left, right and depth, which hold files of equal names, in subfolders or not: scene/0001.
 
     Beside the three folders lies the camera in Middlebury's format: calib.txt, which made them all, or
@@ -43,9 +43,9 @@ def paper(root: Path) -> list[Frame]:
     folders = [root / name for name in ("left", "right", "depth")]
 
     def camera_of(name: str) -> Path:
-        return camera if camera.exists() else _files(root, name)["calib"]
+        return camera if camera.exists() else _frame_files(root, name)["calib"]
 
-    frames = matched(*folders).items()
+    frames = match_files(*folders).items()
     return [Frame(name=name, read=partial(_read, files, camera_of(name))) for name, files in frames]
 
 
@@ -59,16 +59,16 @@ def write_frame(root: Path, name: str, sample: Sample) -> None:
     """
     if sample.camera is None:
         raise StereoweaveError(f"{root}: expected a sample with its camera, to write its depth, found none")
-    files = _files(root, name)
+    files = _frame_files(root, name)
     write_image(files["left"], sample.left)
     write_image(files["right"], sample.right)
-    _write_text(files["calib"], _calibration(sample.camera, sample.left.shape[:2]))
-    write_image(files["depth"], _packed(sample.camera.depth_m(sample.disparity_px)))
-    contents = {path.relative_to(root).as_posix(): _on_disk(path) for path in files.values()}
-    _write_text(_sums(root, name), checksums(contents).decode())
+    _write_text(files["calib"], _format_calibration(sample.camera, sample.left.shape[:2]))
+    write_image(files["depth"], _pack_depth(sample.camera.depth_m(sample.disparity_px)))
+    contents = {path.relative_to(root).as_posix(): _read_synced(path) for path in files.values()}
+    _write_text(_checksum_file(root, name), make_checksums(contents).decode())
 
 
-def whole_frames(root: Path) -> list[str]:
+def list_complete_frames(root: Path) -> list[str]:
     """The names of the frames that `write_frame` wrote to the end."""
     sums = root / "sums"
     return sorted(path.relative_to(sums).with_suffix("").as_posix() for path in sums.rglob("[!.]*.sha256"))
@@ -76,7 +76,7 @@ def whole_frames(root: Path) -> list[str]:
 
 def remove_unfinished(root: Path) -> None:
     """Removes all but the frames that `write_frame` wrote to the end, where nobody is writing now."""
-    whole = set(whole_frames(root))
+    whole = set(list_complete_frames(root))
     for folder in (root / name for name in _ENDINGS):
         for path in folder.rglob("*.*"):
             if path.relative_to(folder).with_suffix("").as_posix() not in whole:
@@ -85,27 +85,27 @@ def remove_unfinished(root: Path) -> None:
 
 def check_frame(root: Path, name: str) -> None:
     """FormatError, naming the file, where a file of a written frame is damaged or missing."""
-    sums = _sums(root, name)
+    sums = _checksum_file(root, name)
     with reading(sums, "the checksums of a frame"):
         expected = sums.read_bytes()
     contents = {
         path.relative_to(root).as_posix(): path.read_bytes()
-        for path in _files(root, name).values()
+        for path in _frame_files(root, name).values()
         if path.exists()
     }
     remedy = f"delete {sums}, and the same stereoweave synth make makes it again"
-    check_sums(contents, expected, root, remedy)
+    verify_checksums(contents, expected, root, remedy)
 
 
 def _read(files: list[Path], camera: Path) -> Sample:
     left, right, depth = files
-    pair = calibrated(read_pair(left, right), camera)
+    pair = add_camera(read_pair(left, right), camera)
     assert pair.camera is not None
-    depth_m = _depth_m(of_its_size(read_pixels(depth, "I;16", "RGB"), depth, pair))
+    depth_m = _unpack_depth_m(require_size(read_pixels(depth, "I;16", "RGB"), depth, pair))
     return make_sample(pair, pair.camera.disparity_px(depth_m))
 
 
-def _depth_m(stored: Shaped[np.ndarray, "h w *channels"]) -> Float[np.ndarray, "h w"]:
+def _unpack_depth_m(stored: Shaped[np.ndarray, "h w *channels"]) -> Float[np.ndarray, "h w"]:
     """Depth in metres, NaN where it is unknown."""
     if stored.ndim == 2:
         return np.where((stored > 0) & (stored <= 1000 * RANGE_M), stored / 1000, np.nan)
@@ -113,15 +113,15 @@ def _depth_m(stored: Shaped[np.ndarray, "h w *channels"]) -> Float[np.ndarray, "
     return np.where((packed > 0) & (packed < _PACKED_MAX), packed / _PACKED_MAX * RANGE_M, np.nan)
 
 
-def _packed(depth_m: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """The inverse of `_depth_m`; a known depth is 1 at least, so that it does not become an unknown one."""
+def _pack_depth(depth_m: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """The inverse of `_unpack_depth_m`. A known depth is stored as at least 1, because 0 means unknown."""
     known = (depth_m > 0) & (depth_m < RANGE_M)
     number = np.rint(np.where(known, depth_m, 0) / RANGE_M * _PACKED_MAX).clip(1, _PACKED_MAX - 1)
     number = np.where(known, number, 0).astype(np.uint32)
     return np.stack([number & 255, number >> 8 & 255, number >> 16], axis=-1).astype(np.uint8)
 
 
-def _calibration(camera: StereoCamera, shape: tuple[int, ...]) -> str:
+def _format_calibration(camera: StereoCamera, shape: tuple[int, ...]) -> str:
     focal_px, cx_px, cy_px, doffs_px = camera.focal_px, camera.cx_px, camera.cy_px, camera.doffs_px
     return (
         f"cam0=[{focal_px} 0 {cx_px}; 0 {focal_px} {cy_px}; 0 0 1]\n"
@@ -130,15 +130,15 @@ def _calibration(camera: StereoCamera, shape: tuple[int, ...]) -> str:
     )
 
 
-def _files(root: Path, name: str) -> dict[str, Path]:
+def _frame_files(root: Path, name: str) -> dict[str, Path]:
     return {folder: root / folder / f"{name}.{ending}" for folder, ending in _ENDINGS.items()}
 
 
-def _sums(root: Path, name: str) -> Path:
+def _checksum_file(root: Path, name: str) -> Path:
     return root / "sums" / f"{name}.sha256"
 
 
-def _on_disk(path: Path) -> bytes:
+def _read_synced(path: Path) -> bytes:
     """What a file holds, once that is on the disk: later than its checksums, it could be lost before them."""
     with path.open("rb") as stream:
         os.fsync(stream.fileno())

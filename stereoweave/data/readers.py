@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from stereoweave.cameras.calibration_files import calibrated
+from stereoweave.cameras.calibration_files import add_camera
 from stereoweave.data import eth3d, kitti, middlebury, paper_layout, scene_flow, shards, sintel
-from stereoweave.data.frames import Frame, existing
+from stereoweave.data.frames import Frame, require_folder
 from stereoweave.data.splits import split_frames
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.files import read_disparity_png, read_pair, read_pfm
@@ -19,21 +19,21 @@ from stereoweave.stereo import StereoPair
 __all__ = ["DATASETS", "Frame", "Scene", "list_scenes", "open_dataset", "read_scenes", "split_frames"]
 
 DATASETS: dict[str, Callable[[Path], list[Frame]]] = {
-    "sintel": sintel.sintel,
-    "flyingthings3d": scene_flow.flyingthings3d,
-    "driving": scene_flow.driving,
-    "monkaa": scene_flow.monkaa,
-    "kitti2012": kitti.kitti2012,
-    "kitti2015": kitti.kitti2015,
-    "middlebury2001": middlebury.middlebury2001,
-    "middlebury2003": middlebury.middlebury2003,
-    "middlebury2005": middlebury.middlebury2005,
-    "middlebury2006": middlebury.middlebury2006,
-    "middlebury2014": middlebury.middlebury2014,
-    "middlebury2021": middlebury.middlebury2021,
-    "eth3d": eth3d.eth3d,
-    "paper": paper_layout.paper,
-    "shards": shards.shards,
+    "sintel": sintel.list_sintel,
+    "flyingthings3d": scene_flow.list_flyingthings3d,
+    "driving": scene_flow.list_driving,
+    "monkaa": scene_flow.list_monkaa,
+    "kitti2012": kitti.list_kitti2012,
+    "kitti2015": kitti.list_kitti2015,
+    "middlebury2001": middlebury.list_middlebury2001,
+    "middlebury2003": middlebury.list_middlebury2003,
+    "middlebury2005": middlebury.list_middlebury2005,
+    "middlebury2006": middlebury.list_middlebury2006,
+    "middlebury2014": middlebury.list_middlebury2014,
+    "middlebury2021": middlebury.list_middlebury2021,
+    "eth3d": eth3d.list_eth3d,
+    "paper": paper_layout.list_paper,
+    "shards": shards.list_frames,
 }
 
 
@@ -46,7 +46,7 @@ def open_dataset(name: str, root: str | Path) -> list[Frame]:
     """
     if name not in DATASETS:
         raise StereoweaveError(f"expected one of {', '.join(DATASETS)}, found {name!r}", setting="dataset")
-    frames = DATASETS[name](existing(Path(root)))
+    frames = DATASETS[name](require_folder(Path(root)))
     if not frames:
         raise StereoweaveError(f"{root}: expected the frames of {name}, unpacked as they come, found none")
     return sorted(frames, key=lambda frame: frame.name)
@@ -90,20 +90,20 @@ def list_scenes(folder: str | Path, dataset: str | None = None) -> list[Callable
         FormatError: While a scene is read: a file is missing, damaged, or of another size than its others.
     """
     if dataset:
-        return [partial(_frame_scene, frame) for frame in open_dataset(dataset, folder)]
+        return [partial(_read_frame, frame) for frame in open_dataset(dataset, folder)]
     scenes = sorted(left.parent for left in Path(folder).glob("*/left.png"))
     if scenes:
         return [partial(_read_scene, scene) for scene in scenes]
-    frames = shards.shards(Path(folder))
+    frames = shards.list_frames(Path(folder))
     if not frames:
         raise StereoweaveError(
             f"{folder}: expected <scene>/left.png below it, found none, and no rendered set; "
             "a dataset has to be named"
         )
-    return [partial(_frame_scene, frame) for frame in frames]
+    return [partial(_read_frame, frame) for frame in frames]
 
 
-def _frame_scene(frame: Frame) -> Scene:
+def _read_frame(frame: Frame) -> Scene:
     sample = frame.read()
     pair = StereoPair(left=sample.left, right=sample.right, camera=sample.camera)
     occluded = sample.occluded if np.isfinite(sample.right_disparity_px).any() else None
@@ -114,7 +114,7 @@ def _read_scene(folder: Path) -> Scene:
     pair = read_pair(folder / "left.png", folder / "right.png")
     calibration = folder / "calib.txt"
     if calibration.exists():
-        pair = calibrated(pair, calibration)
+        pair = add_camera(pair, calibration)
     truth_px = _read_truth(folder)
     if truth_px.shape != pair.left.shape[:2]:
         raise FormatError(

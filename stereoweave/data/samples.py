@@ -12,7 +12,7 @@ from stereoweave.stereo import Sample, StereoPair
 _TOLERANCE_PX = 0.5
 
 
-def of_its_size(
+def require_size(
     values: Shaped[np.ndarray, "h w *channels"], path: Path, pair: StereoPair
 ) -> Shaped[np.ndarray, "h w *channels"]:
     """The values themselves; FormatError, naming `path`, where they are not of the size of the pair."""
@@ -39,22 +39,22 @@ def make_sample(
         right_disparity_px: Of the right view; None where the dataset has none: all of it becomes unknown.
         occluded: The dataset's own mask of the left view; None to find it from the two disparities.
     """
-    left_px = _unknown_is_nan(disparity_px)
+    left_px = _mark_unknown(disparity_px)
     right_px = (
-        np.full_like(left_px, np.nan) if right_disparity_px is None else _unknown_is_nan(right_disparity_px)
+        np.full_like(left_px, np.nan) if right_disparity_px is None else _mark_unknown(right_disparity_px)
     )
     return Sample(
         left=pair.left,
         right=pair.right,
         disparity_px=left_px,
         right_disparity_px=right_px,
-        occluded=hidden(left_px, right_px) if occluded is None else occluded,
-        right_occluded=np.ascontiguousarray(hidden(right_px[:, ::-1], left_px[:, ::-1])[:, ::-1]),
+        occluded=find_hidden(left_px, right_px) if occluded is None else occluded,
+        right_occluded=np.ascontiguousarray(find_hidden(right_px[:, ::-1], left_px[:, ::-1])[:, ::-1]),
         camera=pair.camera,
     )
 
 
-def hidden(
+def find_hidden(
     disparity_px: Float[np.ndarray, "h w"], other_px: Float[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
     """Pixels that this view alone sees: whose match is beside the other picture, or behind what it sees.
@@ -77,5 +77,5 @@ def hidden(
     return outside | (np.minimum(column_px, between_px) > disparity_px + _TOLERANCE_PX)
 
 
-def _unknown_is_nan(disparity_px: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+def _mark_unknown(disparity_px: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     return np.where(np.isfinite(disparity_px), disparity_px, np.nan).astype(np.float32)

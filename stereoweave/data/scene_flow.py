@@ -12,8 +12,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from jaxtyping import Float32
 
-from stereoweave.data.frames import Frame, existing, matched
-from stereoweave.data.samples import make_sample, of_its_size
+from stereoweave.data.frames import Frame, match_files, require_folder
+from stereoweave.data.samples import make_sample, require_size
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.files import read_pair, read_pfm
 from stereoweave.stereo import Sample, StereoCamera, StereoPair
@@ -24,22 +24,22 @@ _PASSES = {"clean": "frames_cleanpass", "final": "frames_finalpass"}
 _FOCAL_35MM_PX, _FOCAL_15MM_PX = 1050.0, 450.0
 
 
-def flyingthings3d(root: Path) -> list[Frame]:
+def list_flyingthings3d(root: Path) -> list[Frame]:
     """The full FlyingThings3D, both parts: clean/TRAIN/A/0000/0006."""
-    return _frames(root, {"TRAIN": _FOCAL_35MM_PX, "TEST": _FOCAL_35MM_PX})
+    return _list_frames(root, {"TRAIN": _FOCAL_35MM_PX, "TEST": _FOCAL_35MM_PX})
 
 
-def driving(root: Path) -> list[Frame]:
+def list_driving(root: Path) -> list[Frame]:
     """Driving: both lenses, directions and speeds: clean/15mm_focallength/scene_backwards/fast/0001."""
-    return _frames(root, {"15mm_focallength": _FOCAL_15MM_PX, "35mm_focallength": _FOCAL_35MM_PX})
+    return _list_frames(root, {"15mm_focallength": _FOCAL_15MM_PX, "35mm_focallength": _FOCAL_35MM_PX})
 
 
-def monkaa(root: Path) -> list[Frame]:
+def list_monkaa(root: Path) -> list[Frame]:
     """Monkaa: clean/a_rain_of_stones_x2/0000."""
-    return _frames(root, {".": _FOCAL_35MM_PX})
+    return _list_frames(root, {".": _FOCAL_35MM_PX})
 
 
-def _frames(root: Path, focal_px: dict[str, float]) -> list[Frame]:
+def _list_frames(root: Path, focal_px: dict[str, float]) -> list[Frame]:
     # The passes are separate downloads of tens of gigabytes: either will do.
     passes = {kind: root / folder for kind, folder in _PASSES.items() if (root / folder).is_dir()}
     if not passes:
@@ -50,17 +50,17 @@ def _frames(root: Path, focal_px: dict[str, float]) -> list[Frame]:
         Frame(name=PurePosixPath(kind, part, name).as_posix(), read=partial(_read, files, part_focal_px))
         for kind, pictures in passes.items()
         for part, part_focal_px in focal_px.items()
-        for name, files in _files(pictures / part, root / "disparity" / part)
+        for name, files in _match_files(pictures / part, root / "disparity" / part)
     ]
 
 
-def _files(pictures: Path, truth: Path) -> Iterator[tuple[str, list[Path]]]:
-    tops = existing(pictures), existing(truth)
+def _match_files(pictures: Path, truth: Path) -> Iterator[tuple[str, list[Path]]]:
+    tops = require_folder(pictures), require_folder(truth)
     sides = "left", "right"
     runs = {view.parent.relative_to(top) for top in tops for side in sides for view in top.rglob(side)}
     for run in sorted(runs):
         views = [top / run / side for top in tops for side in sides]
-        for name, files in matched(*views).items():
+        for name, files in match_files(*views).items():
             yield (run / name).as_posix(), files
 
 
@@ -77,7 +77,7 @@ def _read_disparity(path: Path, pair: StereoPair) -> Float32[np.ndarray, "h w"]:
 
     Parallel cameras leave no doubt about which is meant, unless one map has both signs: FormatError.
     """
-    values_px = of_its_size(read_pfm(path), path, pair)
+    values_px = require_size(read_pfm(path), path, pair)
     if (values_px < 0).any() and (values_px > 0).any():
         raise FormatError(
             f"{path}: expected disparities of one sign, found {np.nanmin(values_px):.3f} to "

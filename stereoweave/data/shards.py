@@ -20,9 +20,9 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from stereoweave.data.checksums import check_sums, checksums
+from stereoweave.data.checksums import make_checksums, verify_checksums
 from stereoweave.data.frames import Frame
-from stereoweave.data.packing import unpacked, unpacked_views
+from stereoweave.data.packing import unpack, unpack_views
 from stereoweave.errors import FormatError
 from stereoweave.io.files import reading, replacing
 from stereoweave.stereo import Sample
@@ -60,7 +60,7 @@ def write_shard(folder: Path, set_name: str, first: int, pairs: Sequence[Mapping
     with replacing(shard.path) as temporary, temporary.open("wb") as stream:
         with tarfile.open(fileobj=stream, mode="w", format=tarfile.USTAR_FORMAT) as tar:
             for number, pair in enumerate(pairs, first):
-                _add(tar, shard.pair_name(number), pair)
+                _add_pair(tar, shard.pair_name(number), pair)
         # Renamed before its bytes are on the disk, it could outlive them where the power fails.
         stream.flush()
         os.fsync(stream.fileno())
@@ -116,7 +116,7 @@ class Shards:
         self._contents: dict[Path, dict[str, dict[str, tuple[int, int]]]] = {}
 
     def __getitem__(self, index: int) -> Sample:
-        return self._unpacked(index, unpacked)
+        return self._unpacked(index, unpack)
 
     def name(self, index: int) -> str:
         """What the names of the pair's files begin with."""
@@ -124,7 +124,7 @@ class Shards:
 
     def views(self, index: int) -> dict[float, UInt8[np.ndarray, "h w 3"]]:
         """The further pictures of a pair, by their position between the cameras."""
-        return self._unpacked(index, unpacked_views)
+        return self._unpacked(index, unpack_views)
 
     def files(self, index: int) -> dict[str, bytes]:
         """The files of a pair by the ends of their names, checked; FormatError where one is damaged."""
@@ -133,7 +133,7 @@ class Shards:
             places = self._places(path).get(name, {})
             files = {f"{name}.{end}": _read_at(stream, *place) for end, place in places.items()}
             sums = files.pop(f"{name}.{_SUMS}", f"  {name}.{_SUMS}".encode())
-            check_sums(files, sums, path, _DELETE)
+            verify_checksums(files, sums, path, _DELETE)
         return {end.removeprefix(f"{name}."): content for end, content in files.items()}
 
     def order(self, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
@@ -160,11 +160,11 @@ class Shards:
     def _places(self, path: Path) -> dict[str, dict[str, tuple[int, int]]]:
         """Where the files of each pair begin in a shard, and their sizes; read once, as it takes a while."""
         if path not in self._contents:
-            self._contents[path] = _contents(path)
+            self._contents[path] = _list_contents(path)
         return self._contents[path]
 
 
-def shards(root: Path) -> list[Frame]:
+def list_frames(root: Path) -> list[Frame]:
     """The pairs of all sets in a folder and below it, named SUBFOLDER/ship-000057."""
     frames = []
     for folder in sorted({path.parent for path in root.rglob("[!.]*.tar") if _NAME.fullmatch(path.name)}):
@@ -179,15 +179,15 @@ def shards(root: Path) -> list[Frame]:
     return frames
 
 
-def _add(tar: tarfile.TarFile, name: str, pair: Mapping[str, bytes]) -> None:
+def _add_pair(tar: tarfile.TarFile, name: str, pair: Mapping[str, bytes]) -> None:
     files = {f"{name}.{end}": content for end, content in sorted(pair.items())}
-    for file, content in [*files.items(), (f"{name}.{_SUMS}", checksums(files))]:
+    for file, content in [*files.items(), (f"{name}.{_SUMS}", make_checksums(files))]:
         header = tarfile.TarInfo(file)  # of no owner and 1970, so that the bytes depend on the pair alone
         header.size = len(content)
         tar.addfile(header, BytesIO(content))
 
 
-def _contents(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
+def _list_contents(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
     contents: defaultdict[str, dict[str, tuple[int, int]]] = defaultdict(dict)
     try:
         with tarfile.open(path, "r:") as tar:

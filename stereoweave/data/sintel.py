@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from stereoweave.data.frames import Frame, matched
-from stereoweave.data.samples import make_sample, of_its_size
+from stereoweave.data.frames import Frame, match_files
+from stereoweave.data.samples import make_sample, require_size
 from stereoweave.errors import FormatError
 from stereoweave.io.files import read_pair, read_pixels, read_small, reading
 from stereoweave.stereo import Sample, StereoCamera
@@ -20,7 +20,7 @@ _CAM = struct.Struct("<f 9d 12d")
 _CAM_TAG = 202021.25
 
 
-def sintel(root: Path) -> list[Frame]:
+def list_sintel(root: Path) -> list[Frame]:
     """The 1,064 frames of `root`/training, each in the passes "clean" and "final": clean/alley_1/frame_0001.
 
     The camera is known where training/camdata_left, of the archive of Sintel's depth, is unpacked there too.
@@ -31,7 +31,7 @@ def sintel(root: Path) -> list[Frame]:
     return [
         Frame(name=f"{kind}/{name}", read=partial(_read, files, cameras / f"{name}.cam"))
         for kind in ("clean", "final")
-        for name, files in matched(training / f"{kind}_left", training / f"{kind}_right", *truth).items()
+        for name, files in match_files(training / f"{kind}_left", training / f"{kind}_right", *truth).items()
     ]
 
 
@@ -40,13 +40,15 @@ def _read(files: list[Path], camera: Path) -> Sample:
     pair = read_pair(left, right)
     if camera.parents[1].is_dir():
         pair = replace(pair, camera=_read_camera(camera))
-    packed = of_its_size(read_pixels(disparity, "RGB"), disparity, pair)
+    packed = require_size(read_pixels(disparity, "RGB"), disparity, pair)
     # Both masks mark what the right camera does not see: behind something nearer, or beside its picture.
-    occluded = [of_its_size(read_pixels(mask, "L", "1"), mask, pair) > 0 for mask in (occlusions, outofframe)]
-    return make_sample(pair, _unpacked_px(packed), occluded=occluded[0] | occluded[1])
+    occluded = [
+        require_size(read_pixels(mask, "L", "1"), mask, pair) > 0 for mask in (occlusions, outofframe)
+    ]
+    return make_sample(pair, _unpack_px(packed), occluded=occluded[0] | occluded[1])
 
 
-def _unpacked_px(packed: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
+def _unpack_px(packed: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
     """Disparity from its packing in RGB: R * 4 + G / 2^6 + B / 2^14.
 
     The README calls them "negative disparities", for a match lies further left; the numbers are positive.

@@ -26,7 +26,7 @@ def split_frames(frames: list[Frame], dataset: str, split: str) -> tuple[list[Fr
         StereoweaveError: An unknown dataset or split, or one of the two parts is empty.
     """
     ordered = sorted(frames, key=lambda frame: frame.name)
-    held_out = _held_out(_rule(dataset, split), ordered)
+    held_out = _choose_held_out(_read_rule(dataset, split), ordered)
     training = [frame for frame in ordered if frame.name not in held_out]
     if not (training and held_out):
         raise StereoweaveError(
@@ -36,7 +36,7 @@ def split_frames(frames: list[Frame], dataset: str, split: str) -> tuple[list[Fr
     return training, [frame for frame in ordered if frame.name in held_out]
 
 
-def _rule(dataset: str, split: str) -> dict[str, Any]:
+def _read_rule(dataset: str, split: str) -> dict[str, Any]:
     if split not in SPLITS:
         raise StereoweaveError(f"expected one of {', '.join(SPLITS)}, found {split!r}", setting="split")
     rules = tomllib.loads((files(__package__) / "split_rules" / f"{split}.toml").read_text(encoding="utf-8"))
@@ -45,7 +45,7 @@ def _rule(dataset: str, split: str) -> dict[str, Any]:
     return rules[dataset]
 
 
-def _held_out(rule: dict[str, Any], frames: list[Frame]) -> set[str]:
+def _choose_held_out(rule: dict[str, Any], frames: list[Frame]) -> set[str]:
     names = [frame.name for frame in frames]
     match rule:
         case {"random_share": share, "seed": seed}:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from rich.console import Console
 
-from stereoweave.bench.projected_views import Method, ViewRow, score_views
+from stereoweave.bench.projected_views import DisparityMethod, ProjectionRow, score_projections
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn import checkpoint
 from stereoweave.learn.checkpoint import Checkpoint
@@ -24,7 +24,7 @@ MEDIAN = "median"
 _MEDIAN_PAIRS, _MEDIAN_STRIDE = 400, 8
 
 
-def evaluate(runs: Sequence[Path], folder: Path, console: Console) -> list[ViewRow]:
+def evaluate(runs: Sequence[Path], folder: Path, console: Console) -> list[ProjectionRow]:
     """Score each run on all its held-out pairs, after ground truth, no warping, SGBM and the median.
 
     "median" predicts the median disparity of the training pairs everywhere: the score of a network that
@@ -49,10 +49,10 @@ def evaluate(runs: Sequence[Path], folder: Path, console: Console) -> list[ViewR
         **{name: make_method(one) for name, one in networks.items()},
     }
     samples = (read_known(held_out, index) for index in range(held_out.count))
-    return score_views(methods, samples, recipe.max_depth_m if recipe.target == "depth" else None)
+    return score_projections(methods, samples, recipe.max_depth_m if recipe.target == "depth" else None)
 
 
-def make_method(trained: Checkpoint) -> Method:
+def make_method(trained: Checkpoint) -> DisparityMethod:
     """Wrap a checkpoint's averaged network as a function from a sample to the left view's disparity in px."""
     network = build_network(trained.recipe)
     network.load_state_dict(trained.averaged)
@@ -71,7 +71,7 @@ def make_method(trained: Checkpoint) -> Method:
     return match
 
 
-def make_median_method(training: PairSource) -> Method:
+def make_median_method(training: PairSource) -> DisparityMethod:
     """A method that predicts the median disparity of the training pairs for every pixel."""
     some = range(0, training.count, max(1, training.count // _MEDIAN_PAIRS))
     values_px = [

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from stereoweave import __version__
-from stereoweave.cameras.calibration_files import calibration_bytes
+from stereoweave.cameras.calibration_files import read_calibration_bytes
 from stereoweave.errors import NameOf, Note, Remedy, StereoweaveError, keyword
 from stereoweave.io.colormap import colour_disparity, colour_range_px, grey_confidence
 from stereoweave.io.files import (
@@ -130,7 +130,7 @@ def job_facts(job: DepthJob) -> dict[str, Any]:
     facts = {"stereoweave": __version__, "model": model, **asdict(job.options)}
     facts |= {"files": job.files, "always": job.always, **asdict(job.request)}
     if calibration:
-        facts["calibration"] = _by_content(calibration, calibration_bytes(calibration))
+        facts["calibration"] = _by_content(calibration, read_calibration_bytes(calibration))
     return facts
 
 

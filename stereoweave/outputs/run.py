@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from stereoweave.cameras.diagnosis import hints
+from stereoweave.cameras.diagnosis import find_problems
 from stereoweave.errors import Note
 from stereoweave.matching.estimate import match_many
 from stereoweave.matching.matcher import Matcher
@@ -55,7 +55,7 @@ class Result:
 
     def warnings(self) -> list[Note]:
         """Notes on likely defects of the pair; takes about half as long as matching."""
-        return hints(self.pair, self.estimate)
+        return find_problems(self.pair, self.estimate)
 
     @cached_property
     def cloud(self) -> Cloud:

@@ -7,7 +7,7 @@ from pathlib import Path
 from stereoweave.cameras.calibration_files import read_rig
 from stereoweave.cameras.rectify import Rectified, rectify
 from stereoweave.cameras.rectify_uncalibrated import rectify_by_features
-from stereoweave.cameras.rig import size_of
+from stereoweave.cameras.rig import pair_size_px
 from stereoweave.errors import Note, Remedy, StereoweaveError
 from stereoweave.io.exif import Lens
 from stereoweave.pictures.loading import open_pictures
@@ -70,7 +70,7 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
 
 def _calibrated(pair: StereoPair, path: Path, rectified: bool) -> Rectified:
     """The pair with the camera of a calibration, rectified by it where that is asked for."""
-    rig = read_rig(path, size_of(pair))
+    rig = read_rig(path, pair_size_px(pair))
     if rectified:
         return rectify(pair, rig)
     rig.check_size(pair)

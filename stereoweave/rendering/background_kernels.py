@@ -45,20 +45,20 @@ def uncover(photo, disparity_px, nearer_px, other_px, side, hidden_px, colours, 
     origins = np.empty((2, width, 2), np.int32)  # where the colours of this row and the one above come from
     borders = np.empty(width, np.int32)  # beside which pixel of the background the foreground begins
     for y in range(first, end):
-        _bands(disparity_px[y], other_px[y], side, hidden_px[y], borders)
+        _find_hidden(disparity_px[y], other_px[y], side, hidden_px[y], borders)
         for k in range(width):
             # From the borders inwards, so that a pixel's neighbour towards the background is known.
             x = k if side < 0 else width - 1 - k
             origins[y % 2, x, 0], origins[y % 2, x, 1] = y, x
             if hidden_px[y, x] > NOTHING:
-                _take(
+                _copy_example(
                     photo, disparity_px, nearer_px, hidden_px, colours, origins, borders[x], first, y, x, side
                 )
 
 
 @compiled
 @typing.no_type_check
-def _bands(disparity_px, other_px, side, hidden_px, borders):
+def _find_hidden(disparity_px, other_px, side, hidden_px, borders):
     """Write for a row where the background goes on behind the foreground, unseen by both cameras."""
     width = disparity_px.shape[0]
     hidden_px[:] = NOTHING
@@ -84,18 +84,18 @@ def _bands(disparity_px, other_px, side, hidden_px, borders):
 
 @compiled
 @typing.no_type_check
-def _take(photo, disparity_px, nearer_px, hidden_px, colours, origins, border, first, y, x, side):
+def _copy_example(photo, disparity_px, nearer_px, hidden_px, colours, origins, border, first, y, x, side):
     """Write the colour of a hidden pixel, whose background is on that side of it: -1 left, 1 right."""
     width = disparity_px.shape[1]
     d = hidden_px[y, x]
     best, best_y, best_x = math.inf, -1, -1
-    searches = not _may_go_on(disparity_px, nearer_px, origins[y % 2, x + side], side, d)
+    searches = not _can_continue(disparity_px, nearer_px, origins[y % 2, x + side], side, d)
     compared = 7 if searches else 4
     # Fresh places to take it from: all along the row where the neighbour's does not go on, else the mirrored
     # one and one that is as good as drawn by lot.
     for k in range(4 + (_LOOK_PX if searches else 2)):
         if k < 4:  # next to where a neighbour's colour comes from
-            row, column = y - (k > 0), x + side * _along(k)
+            row, column = y - (k > 0), x + side * _neighbour_offset(k)
             if row < first or column < 0 or column >= width:
                 continue
             at_y, at_x = origins[row % 2, column, 0] + y - row, origins[row % 2, column, 1] + x - column
@@ -105,7 +105,7 @@ def _take(photo, disparity_px, nearer_px, hidden_px, colours, origins, border, f
             at_y, at_x = y - (x * 31 + y * 17) % 8, border + side * (2 + (x * 7919 + y * 104729) % _LOOK_PX)
         if (at_y == best_y and at_x == best_x) or not _is_example(disparity_px, nearer_px, at_y, at_x, d):
             continue
-        apart = _unlikeness(
+        apart = _compare_surroundings(
             photo, disparity_px, hidden_px, colours, y, x, at_y, at_x, side, compared, first, best
         )
         if apart < best:
@@ -119,7 +119,7 @@ def _take(photo, disparity_px, nearer_px, hidden_px, colours, origins, border, f
 
 @inlined
 @typing.no_type_check
-def _may_go_on(disparity_px, nearer_px, origin, side, d):
+def _can_continue(disparity_px, nearer_px, origin, side, d):
     """Whether what follows the origin of a neighbour's colour is an example for the next pixel."""
     return _is_example(disparity_px, nearer_px, origin[0], origin[1] - side, d)
 
@@ -136,12 +136,14 @@ def _is_example(disparity_px, nearer_px, y, x, d):
 
 @inlined
 @typing.no_type_check
-def _unlikeness(photo, disparity_px, hidden_px, colours, y, x, at_y, at_x, side, compared, first, enough):
+def _compare_surroundings(
+    photo, disparity_px, hidden_px, colours, y, x, at_y, at_x, side, compared, first, enough
+):
     """The mean squared difference of what is known around (y, x) and around (at_y, at_x)."""
     width = disparity_px.shape[1]
     total, count = 0.0, 0
     for k in range(compared):
-        up, along = 0 < k < 4, side * _along(k)
+        up, along = 0 < k < 4, side * _neighbour_offset(k)
         row, column, like_y, like_x = y - up, x + along, at_y - up, at_x + along
         if row < first or like_y < 0 or min(column, like_x) < 0 or max(column, like_x) >= width:
             continue
@@ -161,6 +163,6 @@ def _unlikeness(photo, disparity_px, hidden_px, colours, y, x, at_y, at_x, side,
 
 @inlined
 @typing.no_type_check
-def _along(k):
+def _neighbour_offset(k):
     """How far towards the background neighbour k is: 0 beside, 1 to 3 above, from 4 on farther beside."""
     return k - 2 if k > 3 else 1 - (k == 1) - 2 * (k == 3)

@@ -37,8 +37,8 @@ def compare_row(left, right, y, row, sums):
     width = row.front_px.shape[0]
     left_grey, left_slope, right_grey, right_slope = np.empty((4, width), np.float32)
     products = np.zeros((3, width + 2 * WINDOW_REACH_PX), np.float32)
-    _grey_in_row(left, y, row.front_px, left_grey, left_slope)
-    _grey_in_row(right, y, row.front_px, right_grey, right_slope)
+    _sample_grey_row(left, y, row.front_px, left_grey, left_slope)
+    _sample_grey_row(right, y, row.front_px, right_grey, right_slope)
     for u in range(width):
         both = min(row.in_left[u], row.in_right[u]) >= _HALF and row.back_px[u] == NOTHING
         seen = _ONE if both else np.float32(0)
@@ -73,7 +73,7 @@ def align_row(sums, row):
 
 @compiled
 @typing.no_type_check
-def _grey_in_row(side, y, front_px, grey, slope):
+def _sample_grey_row(side, y, front_px, grey, slope):
     """Write the photograph's grey level at each surface of a row, and how it rises with the disparity."""
     photo = side.grey[y]
     shift, offset_px = np.float32(side.shift), np.float32(side.offset_px)
@@ -81,7 +81,7 @@ def _grey_in_row(side, y, front_px, grey, slope):
     padded = np.empty(width + 4, np.float32)
     _pad(photo, padded)
     for u in range(width):
-        x = _inside(np.float32(u) - offset_px - shift * front_px[u], width)
+        x = _clamp_column(np.float32(u) - offset_px - shift * front_px[u], width)
         i = np.uint32(x)
         part = x - np.float32(i)
         a, b, c, d = padded[i], padded[i + _1], padded[i + _2], padded[i + _3]
@@ -102,14 +102,14 @@ def _pad(row, padded):
 
 @inlined
 @typing.no_type_check
-def _inside(x, width):
+def _clamp_column(x, width):
     """The real column, or the border's nearest to it."""
     return min(max(x, np.float32(0)), np.float32(width - 1))
 
 
 @compiled
 @typing.no_type_check
-def _colours_in_row(side, y, front_px, padded, colours):
+def _sample_colour_row(side, y, front_px, padded, colours):
     """Write the photograph's colour [3, W] at each surface of a row, by a cubic (Keys 1981, a = -1/2)."""
     shift, offset_px = np.float32(side.shift), np.float32(side.offset_px)
     width = front_px.shape[0]
@@ -117,7 +117,7 @@ def _colours_in_row(side, y, front_px, padded, colours):
         _pad(side.photo[y, :, channel], padded[channel])
     red, green, blue = padded
     for u in range(width):
-        x = _inside(np.float32(u) - offset_px - shift * front_px[u], width)
+        x = _clamp_column(np.float32(u) - offset_px - shift * front_px[u], width)
         i = np.uint32(x)
         f = x - np.float32(i)
         w0, w1, w2, w3 = _cubic_weights(f)
@@ -150,14 +150,14 @@ def paint_row(left, right, y, row, canvas):
     left_colours, right_colours = np.empty((2, 3, width), np.float32)
     of_left = np.empty(width, np.float32)
     left_share, right_share = np.float32(left.nearness), np.float32(right.nearness)
-    _colours_in_row(left, y, front_px, left_padded, left_colours)
-    _colours_in_row(right, y, front_px, right_padded, right_colours)
+    _sample_colour_row(left, y, front_px, left_padded, left_colours)
+    _sample_colour_row(right, y, front_px, right_padded, right_colours)
     for u in range(width):
         total = left_share * in_left[u] + right_share * in_right[u]
         of_left[u] = left_share * in_left[u] / max(total, _LEAST)
         pure[u] = in_left[u] + in_right[u] > RIM
         surface_px[u] = front_px[u] if in_left[u] + in_right[u] > 0 else NOTHING
-    _part_doubles(row, left_colours, right_colours, of_left)
+    _resolve_doubles(row, left_colours, right_colours, of_left)
     for channel in range(3):
         a, b = left_colours[channel], right_colours[channel]
         for u in range(width):
@@ -171,7 +171,7 @@ def paint_row(left, right, y, row, canvas):
 
 @compiled
 @typing.no_type_check
-def _part_doubles(row, left_colours, right_colours, of_left):
+def _resolve_doubles(row, left_colours, right_colours, of_left):
     """Take from one photograph alone what would be doubled: a thin thing that both disparity maps have lost.
 
     Both photographs show it, before its background and apart. So where they differ, and one of them goes with
@@ -181,7 +181,10 @@ def _part_doubles(row, left_colours, right_colours, of_left):
     agreed = np.empty(width, np.int32)  # the last pixel before each on which both agree
     last = -2 * DOUBLES_REACH_PX
     for u in range(width):
-        if _both_alone(row, u) and _apart_levels(left_colours, u, right_colours, u) <= AGREED_LEVELS:
+        if (
+            _is_shared_surface(row, u)
+            and _colour_distance_levels(left_colours, u, right_colours, u) <= AGREED_LEVELS
+        ):
             last = u
         agreed[u] = last
     after = width + 2 * DOUBLES_REACH_PX
@@ -190,28 +193,28 @@ def _part_doubles(row, left_colours, right_colours, of_left):
         before = agreed[u]
         if before == u:
             after = u
-        elif _both_alone(row, u) and max(u - before, after - u) <= DOUBLES_REACH_PX:
+        elif _is_shared_surface(row, u) and max(u - before, after - u) <= DOUBLES_REACH_PX:
             d = row.front_px[u]
             slant_px = max(abs(row.front_px[before] - d), abs(row.front_px[after] - d))
-            sides_levels = _apart_levels(left_colours, before, left_colours, after)
+            sides_levels = _colour_distance_levels(left_colours, before, left_colours, after)
             if slant_px > SAME_SURFACE_PX or sides_levels > ALIKE_LEVELS:
                 continue
-            of_one = _apart_levels(left_colours, u, left_colours, before)
-            of_other = _apart_levels(right_colours, u, left_colours, before)
+            of_one = _colour_distance_levels(left_colours, u, left_colours, before)
+            of_other = _colour_distance_levels(right_colours, u, left_colours, before)
             if min(of_one, of_other) <= ALIKE_LEVELS and max(of_one, of_other) >= UNLIKE_LEVELS:
                 of_left[u] = 1 if of_one < of_other else 0
 
 
 @inlined
 @typing.no_type_check
-def _both_alone(row, u):
+def _is_shared_surface(row, u):
     """Whether both photographs show a pixel's only surface."""
     return min(row.in_left[u], row.in_right[u]) >= _HALF and row.back_px[u] == NOTHING
 
 
 @inlined
 @typing.no_type_check
-def _apart_levels(colours, u, others, v):
+def _colour_distance_levels(colours, u, others, v):
     """How two colours of rows [3, W] differ, summed over the channels."""
     red, green, blue = (
         colours[0, u] - others[0, v],
@@ -242,7 +245,7 @@ def _paint_two(left, right, y, u, row, left_padded, right_padded, canvas):
         of_left = left.nearness * in_left
         of_left /= of_left + right.nearness * in_right
         for padded, column, weight in ((left_padded, x, of_left), (right_padded, z, 1.0 - of_left)):
-            r, g, b = _colour_at(padded, column)
+            r, g, b = _sample_colour(padded, column)
             red += part * weight * r
             green += part * weight * g
             blue += part * weight * b
@@ -256,9 +259,9 @@ def _paint_two(left, right, y, u, row, left_padded, right_padded, canvas):
 
 @inlined
 @typing.no_type_check
-def _colour_at(padded, x):
-    """The colour at the real column x of a padded row [3, W + 4], as `_colours_in_row` finds it."""
-    x = _inside(np.float32(x), padded.shape[1] - 4)
+def _sample_colour(padded, x):
+    """The colour at the real column x of a padded row [3, W + 4], as `_sample_colour_row` finds it."""
+    x = _clamp_column(np.float32(x), padded.shape[1] - 4)
     i = np.uint32(x)
     w0, w1, w2, w3 = _cubic_weights(x - np.float32(i))
     a, b, c, d = padded[:, i], padded[:, i + _1], padded[:, i + _2], padded[:, i + _3]

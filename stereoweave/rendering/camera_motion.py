@@ -12,7 +12,7 @@ from stereoweave.stereo import StereoCamera
 _MOST_APPROACH = 0.5
 
 
-def moved(canvas: Canvas, camera: StereoCamera, offset_px: float, up: float, forward: float) -> Canvas:
+def move_camera(canvas: Canvas, camera: StereoCamera, offset_px: float, up: float, forward: float) -> Canvas:
     """The view from above and before the place that the canvas was drawn for: rows first, then columns.
 
     With depth z in baselines, z = focal_px / inverse_px. Forward, everything grows about the centre by
@@ -28,22 +28,22 @@ def moved(canvas: Canvas, camera: StereoCamera, offset_px: float, up: float, for
     height, width = canvas.surface_px.shape
     inverse_px = np.maximum(canvas.surface_px + camera.doffs_px, 0)
     inverse_px = inverse_px / (1 - np.minimum(forward * inverse_px / camera.focal_px, _MOST_APPROACH))
-    columns = _grown(np.arange(width), camera.cx_px + offset_px, forward * inverse_px / camera.focal_px)
-    canvas = _moved_rows(canvas, columns, inverse_px - camera.doffs_px)
+    columns = _magnify(np.arange(width), camera.cx_px + offset_px, forward * inverse_px / camera.focal_px)
+    canvas = _move_rows(canvas, columns, inverse_px - camera.doffs_px)
     inverse_px = np.maximum(canvas.surface_px + camera.doffs_px, 0)
-    rows = _grown(np.arange(height)[:, None], camera.cy_px, forward * inverse_px / camera.focal_px)
-    turned = _turned(canvas)
-    return _turned(_moved_rows(turned, (rows + up * inverse_px).T, turned.surface_px))
+    rows = _magnify(np.arange(height)[:, None], camera.cy_px, forward * inverse_px / camera.focal_px)
+    turned = _transpose(canvas)
+    return _transpose(_move_rows(turned, (rows + up * inverse_px).T, turned.surface_px))
 
 
-def _grown(
+def _magnify(
     places: np.ndarray, centre_px: float, growth: Float[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w"]:
     """Where these rows or columns are after growing about a centre, each pixel by its own share."""
     return places + (places - centre_px) * growth
 
 
-def _moved_rows(
+def _move_rows(
     canvas: Canvas, targets: Float[np.ndarray, "h w"], disparity_px: Float[np.ndarray, "h w"]
 ) -> Canvas:
     """The view with each pixel at its target column, where it has that disparity; filled."""
@@ -54,6 +54,6 @@ def _moved_rows(
     return result
 
 
-def _turned(canvas: Canvas) -> Canvas:
+def _transpose(canvas: Canvas) -> Canvas:
     """Rows for columns."""
     return Canvas(*(np.ascontiguousarray(x.swapaxes(0, 1)) for x in canvas))

@@ -71,7 +71,7 @@ def empty_canvas(photo: np.ndarray) -> Canvas:
     )
 
 
-class Row(typing.NamedTuple):
+class SurfaceRow(typing.NamedTuple):
     """What is known about a row of the new view before it is painted; arrays are float32 [W].
 
     Attributes:

@@ -5,7 +5,7 @@ import typing
 import numpy as np
 
 from stereoweave.rendering.blend_kernels import WINDOW_REACH_PX, align_row, compare_row, paint_row
-from stereoweave.rendering.canvas_kernels import Row, splat_row
+from stereoweave.rendering.canvas_kernels import SurfaceRow, splat_row
 from stereoweave.rendering.visibility_kernels import choose_row
 from stereoweave.system.jit import compiled, kernel
 
@@ -27,7 +27,7 @@ def draw(left, right, confidence, canvas, first, end):
     landed = np.empty((2, width), np.float32)
     for y in range(first - WINDOW_REACH_PX, end + WINDOW_REACH_PX):
         if 0 <= y < height:
-            row = _row(kept, y)
+            row = _select_row(kept, y)
             splat_row(left.disparity_px[y], left.shift, left.offset_px, landed[0])
             splat_row(right.disparity_px[y], right.shift, right.offset_px, landed[1])
             choose_row(left, right, confidence, y, landed[0], landed[1], row)
@@ -36,13 +36,13 @@ def draw(left, right, confidence, canvas, first, end):
             sums[y % _RING] = 0
         behind = y - WINDOW_REACH_PX
         if behind >= first:
-            align_row(sums, _row(kept, behind))
-            paint_row(left, right, behind, _row(kept, behind), canvas)
+            align_row(sums, _select_row(kept, behind))
+            paint_row(left, right, behind, _select_row(kept, behind), canvas)
 
 
 @compiled
 @typing.no_type_check
-def _row(kept, y):
+def _select_row(kept, y):
     """The place of a row among those that are kept."""
     i = y % _RING
-    return Row(kept[0, i], kept[1, i], kept[2, i], kept[3, i], kept[4, i])
+    return SurfaceRow(kept[0, i], kept[1, i], kept[2, i], kept[3, i], kept[4, i])

@@ -13,7 +13,7 @@ NARROW_PX = 8
 @kernel
 @typing.no_type_check
 def lay(hidden_px, colours, shift, offset_px, canvas):
-    """Write the hidden background (hidden_kernels.uncover) where the canvas has no pure colour.
+    """Write the hidden background (background_kernels.uncover) where the canvas has no pure colour.
 
     A pixel on the rim of something keeps its colour if it is farther than that: a gap in a fence stays open.
     """
@@ -73,16 +73,16 @@ def fill(canvas):
             source = start - 1 if from_left else end
             mirrors = start == 0 or end == width or end - start > NARROW_PX
             if source >= 0:
-                colour = _mean_beside(canvas, y, source, -1 if from_left else 1)
+                colour = _average_beside(canvas, y, source, -1 if from_left else 1)
                 for u in range(start, end):
                     if not drawn[y, u] or surface_px[y, u] >= surface_px[y, source] - SAME_SURFACE_PX:
-                        _write(canvas, y, u, source, colour, mirrors)
+                        _fill_pixel(canvas, y, u, source, colour, mirrors)
             start = end
 
 
 @compiled
 @typing.no_type_check
-def _mean_beside(canvas, y, column, inwards):
+def _average_beside(canvas, y, column, inwards):
     """The mean colour of the surface at (y, column): two columns of three rows, its own counting twice."""
     height, width = canvas.pure.shape
     here_px = canvas.surface_px[y, column]
@@ -100,7 +100,7 @@ def _mean_beside(canvas, y, column, inwards):
 
 @compiled
 @typing.no_type_check
-def _write(canvas, y, u, source, colour, mirrors):
+def _fill_pixel(canvas, y, u, source, colour, mirrors):
     """Write a colour, or what lies as far beyond the source as u lies before it if that is of its surface."""
     width = canvas.pure.shape[1]
     mirrored = min(max(2 * source - u, 0), width - 1)

@@ -58,7 +58,7 @@ _ANAGLYPHS = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Choices:
+class LayoutOptions:
     """What can be chosen about a layout.
 
     Attributes:
@@ -95,14 +95,14 @@ class Layout:
         mark: What its viewers look for in the name of a file.
     """
 
-    compose: Callable[[Renderer, Choices], np.ndarray]
+    compose: Callable[[Renderer, LayoutOptions], np.ndarray]
     positions: tuple[float, ...] = (0.0, 1.0)
     converged: bool = False
     mark: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Motion:
+class Animation:
     """Views one after another, which begin anew where they end.
 
     Attributes:
@@ -121,44 +121,44 @@ class Motion:
         return self.mp4_turns if animation_ending(path) == ".mp4" else 1
 
 
-def frames(renderer: Renderer, positions: Iterable[float]) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+def render_views(renderer: Renderer, positions: Iterable[float]) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """The views from these positions, uint8 RGB [H, W, 3], each rendered when it is asked for."""
     return (renderer.view(position).image for position in positions)
 
 
-def side_by_side(renderer: Renderer, choices: Choices) -> UInt8[np.ndarray, "h w 3"]:
+def side_by_side(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
     """Both eyes' pictures, the left one on the left: twice the width."""
-    return np.hstack(_eyes(renderer))
+    return np.hstack(_render_eyes(renderer))
 
 
-def side_by_side_half(renderer: Renderer, choices: Choices) -> UInt8[np.ndarray, "h w 3"]:
+def side_by_side_half(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
     """As `side_by_side`, each picture at half its width; of an odd one the last column is repeated."""
-    return np.hstack([_halved(eye, axis=1) for eye in _eyes(renderer)])
+    return np.hstack([_halve(eye, axis=1) for eye in _render_eyes(renderer)])
 
 
-def crossed(renderer: Renderer, choices: Choices) -> UInt8[np.ndarray, "h w 3"]:
+def crossed(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
     """Both eyes' pictures, the right one on the left, to be seen with crossed eyes."""
-    return np.hstack(_eyes(renderer)[::-1])
+    return np.hstack(_render_eyes(renderer)[::-1])
 
 
-def top_bottom(renderer: Renderer, choices: Choices) -> UInt8[np.ndarray, "h w 3"]:
+def top_bottom(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
     """Both eyes' pictures, the left one above: twice the height."""
-    return np.vstack(_eyes(renderer))
+    return np.vstack(_render_eyes(renderer))
 
 
-def top_bottom_half(renderer: Renderer, choices: Choices) -> UInt8[np.ndarray, "h w 3"]:
+def top_bottom_half(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
     """As `top_bottom`, each picture at half its height; of an odd one the last row is repeated."""
-    return np.vstack([_halved(eye, axis=0) for eye in _eyes(renderer)])
+    return np.vstack([_halve(eye, axis=0) for eye in _render_eyes(renderer)])
 
 
-def anaglyph(kind: str) -> Callable[[Renderer, Choices], np.ndarray]:
+def make_anaglyph(kind: str) -> Callable[[Renderer, LayoutOptions], np.ndarray]:
     """A layout for glasses whose left glass is red, the right one cyan; by the name of its matrices."""
     shares = [np.array(matrix, np.float32) for matrix in _ANAGLYPHS[kind]]
 
-    def compose(renderer: Renderer, choices: Choices) -> UInt8[np.ndarray, "h w 3"]:
+    def compose(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
         left, right = (
             cv2.transform(eye.astype(np.float32), matrix)
-            for eye, matrix in zip(_eyes(renderer), shares, strict=True)
+            for eye, matrix in zip(_render_eyes(renderer), shares, strict=True)
         )
         # Rounds and cuts off the sum, as each eye's share alone must not be.
         return cv2.add(left, right, dtype=cv2.CV_8U)
@@ -166,7 +166,7 @@ def anaglyph(kind: str) -> Callable[[Renderer, Choices], np.ndarray]:
     return compose
 
 
-def rgbd(renderer: Renderer, choices: Choices) -> UInt8[np.ndarray, "h w 3"]:
+def rgbd(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
     """The left photograph, and beside it its disparity in grey, near is white: twice the width.
 
     Displays that take colour and depth make views of their own, so strength and convergence are theirs.
@@ -178,7 +178,7 @@ def rgbd(renderer: Renderer, choices: Choices) -> UInt8[np.ndarray, "h w 3"]:
     return np.hstack([renderer.pair.left, cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB)])
 
 
-def quilt(renderer: Renderer, choices: Choices) -> UInt8[np.ndarray, "h w 3"]:
+def quilt(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
     """Views from left to right in rows, the first at the bottom left, the last at the top right.
 
     Source: Looking Glass's definition of a quilt. Views are made smaller where the quilt would have a side
@@ -187,15 +187,15 @@ def quilt(renderer: Renderer, choices: Choices) -> UInt8[np.ndarray, "h w 3"]:
     height, width = renderer.pair.left.shape[:2]
     columns, rows = choices.columns, choices.rows
     smaller = max(1.0, columns * width / _QUILT_SIDE_PX, rows * height / _QUILT_SIDE_PX)
-    return _joined(_tiles(renderer, columns, rows, smaller)[::-1])
+    return _join_tiles(_render_tiles(renderer, columns, rows, smaller)[::-1])
 
 
-def contact_sheet(renderer: Renderer, choices: Choices) -> UInt8[np.ndarray, "h w 3"]:
+def contact_sheet(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
     """Nine views from -0.5 to 1.5, in the order of reading, each at a third of its size."""
-    return _joined(_tiles(renderer, _SHEET_SIDE, _SHEET_SIDE, _SHEET_SIDE))
+    return _join_tiles(_render_tiles(renderer, _SHEET_SIDE, _SHEET_SIDE, _SHEET_SIDE))
 
 
-def _there_and_back(count: int) -> tuple[float, ...]:
+def _swing(count: int) -> tuple[float, ...]:
     """Positions from 0 to 1 and back, slow at both ends, as a pendulum swings."""
     return tuple((0.5 - 0.5 * np.cos(2 * np.pi * np.arange(count) / count)).tolist())
 
@@ -208,20 +208,20 @@ LAYOUTS: dict[str, Layout] = {
     "crossed": Layout(compose=crossed, mark="_RLF_cross"),
     "top_bottom": Layout(compose=top_bottom, mark="_TBF_fulltb"),
     "top_bottom_half": Layout(compose=top_bottom_half, mark="_half_TB"),
-    "anaglyph_grey": Layout(compose=anaglyph("grey"), converged=True),
-    "anaglyph_colour": Layout(compose=anaglyph("colour"), converged=True),
-    "anaglyph_half_colour": Layout(compose=anaglyph("half_colour"), converged=True),
-    "anaglyph_dubois": Layout(compose=anaglyph("dubois"), converged=True),
+    "anaglyph_grey": Layout(compose=make_anaglyph("grey"), converged=True),
+    "anaglyph_colour": Layout(compose=make_anaglyph("colour"), converged=True),
+    "anaglyph_half_colour": Layout(compose=make_anaglyph("half_colour"), converged=True),
+    "anaglyph_dubois": Layout(compose=make_anaglyph("dubois"), converged=True),
     "rgbd": Layout(compose=rgbd, positions=(), mark="_RGBD"),
     "quilt": Layout(compose=quilt, positions=_FAN, converged=True, mark="_qs{columns}x{rows}a{aspect:g}"),
     "contact_sheet": Layout(compose=contact_sheet, positions=_FAN, converged=True),
 }
-MOTIONS: dict[str, Motion] = {
-    "sweep": Motion(positions=_there_and_back(80), frame_ms=40, mp4_turns=1),
-    "wiggle": Motion(positions=_there_and_back(12), frame_ms=60, mp4_turns=5),
+ANIMATIONS: dict[str, Animation] = {
+    "sweep": Animation(positions=_swing(80), frame_ms=40, mp4_turns=1),
+    "wiggle": Animation(positions=_swing(12), frame_ms=60, mp4_turns=5),
 }
 # What a file of such an ending holds, whether its layout is named or not.
-_HELD = {".mpo": "side_by_side", ".jps": "crossed"}
+_LAYOUT_BY_ENDING = {".mpo": "side_by_side", ".jps": "crossed"}
 # Colour at full resolution, which JPEG halves else, for what is enlarged and compared by two eyes.
 _FINE = {"quality": 95, "subsampling": 0}
 # JPEG's marker APP3 and its length; the name; the length of the four bytes that follow: separation 0, the
@@ -229,32 +229,32 @@ _FINE = {"quality": 95, "subsampling": 0}
 _JPS_SEGMENT = b"\xff\xe3\x00\x12_JPSJPS_\x00\x04\x00\x00\x02\x01\x00\x00"
 
 
-def layout_of(path: str | Path, name: str | None) -> str | None:
+def choose_layout(path: str | Path, name: str | None) -> str | None:
     """The layout for a file, by its name or by its ending; None for a single view.
 
     Raises:
         StereoweaveError: An unknown layout, or a file whose ending does not fit it.
     """
-    if name is not None and name not in LAYOUTS | MOTIONS:
+    if name is not None and name not in LAYOUTS | ANIMATIONS:
         raise StereoweaveError(
-            f"expected one of {', '.join([*LAYOUTS, *MOTIONS])}, found {name!r}", setting="layout"
+            f"expected one of {', '.join([*LAYOUTS, *ANIMATIONS])}, found {name!r}", setting="layout"
         )
     ending = Path(path).suffix.lower()
-    held = _HELD.get(ending)
+    held = _LAYOUT_BY_ENDING.get(ending)
     if held is not None:
         if name not in (None, held):
             raise StereoweaveError(
                 f"{path}: expected the layout {held} in a file of this ending, found {name}"
             )
         return held
-    if name in MOTIONS:
+    if name in ANIMATIONS:
         animation_ending(path)
     else:
         picture_kind(path)
     return name
 
 
-def check_reach(positions: Iterable[float], strength: float) -> None:
+def check_positions(positions: Iterable[float], strength: float) -> None:
     """Raise a StereoweaveError unless there can be views from all these positions at that strength."""
     for position in positions:
         seen_from = 0.5 + strength * (position - 0.5)
@@ -267,21 +267,21 @@ def check_reach(positions: Iterable[float], strength: float) -> None:
             )
 
 
-def middle_px(estimate: Estimate) -> float:
+def median_disparity_px(estimate: Estimate) -> float:
     """The disparity of the scene's middle in px: the median, each pixel weighted by its confidence."""
     # Not 0, so that a pair without any confidence has a middle too.
     weights = np.maximum(estimate.confidence, 1e-6)
     return float(np.quantile(estimate.disparity_px, 0.5, weights=weights, method="inverted_cdf"))
 
 
-def marked(path: str | Path, name: str, pair: StereoPair, choices: Choices) -> Path:
+def add_mark(path: str | Path, name: str, pair: StereoPair, choices: LayoutOptions) -> Path:
     """The path, with the mark in its name by which viewers know the layout; as it is where it has it already.
 
     A quilt's says columns, rows, and width / height of one view: view_qs8x6a0.75.png. An .mpo or .jps file is
     known by its ending.
     """
     path = Path(path)
-    if path.suffix.lower() in _HELD:
+    if path.suffix.lower() in _LAYOUT_BY_ENDING:
         return path
     height, width = pair.left.shape[:2]
     aspect = round(width / height, 3)
@@ -296,7 +296,7 @@ def write_picture(path: str | Path, picture: UInt8[np.ndarray, "h w 3"]) -> None
     first; a .jps file is a JPEG of `crossed` that says so.
     """
     ending = Path(path).suffix.lower()
-    if ending not in _HELD:
+    if ending not in _LAYOUT_BY_ENDING:
         write_image(path, picture)
         return
     with replacing(path) as temporary, held_by_its_format(path, picture.shape):
@@ -307,12 +307,12 @@ def write_picture(path: str | Path, picture: UInt8[np.ndarray, "h w 3"]) -> None
             left.save(temporary, "MPO", save_all=True, append_images=[right], **_FINE)
 
 
-def _eyes(renderer: Renderer) -> list[UInt8[np.ndarray, "h w 3"]]:
+def _render_eyes(renderer: Renderer) -> list[UInt8[np.ndarray, "h w 3"]]:
     """The left eye's picture and the right one's."""
-    return list(frames(renderer, (0.0, 1.0)))
+    return list(render_views(renderer, (0.0, 1.0)))
 
 
-def _halved(eye: UInt8[np.ndarray, "h w 3"], axis: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+def _halve(eye: UInt8[np.ndarray, "h w 3"], axis: int) -> UInt8[np.ndarray, "h2 w2 3"]:
     """Means of two neighbours along an axis; the last of an odd number is a mean with itself."""
     odd = [(0, side % 2 * (index == axis)) for index, side in enumerate(eye.shape)]
     even = np.pad(eye, odd, "edge")
@@ -321,19 +321,19 @@ def _halved(eye: UInt8[np.ndarray, "h w 3"], axis: int) -> UInt8[np.ndarray, "h2
     return cv2.resize(even, size, interpolation=cv2.INTER_AREA)
 
 
-def _tiles(
+def _render_tiles(
     renderer: Renderer, columns: int, rows: int, smaller: float
 ) -> UInt8[np.ndarray, "rows h columns w 3"]:
     """Views along the fan, so many times smaller, in the order of reading."""
     height, width = (max(1, int(side / smaller)) for side in renderer.pair.left.shape[:2])
     tiles = np.empty((rows, height, columns, width, 3), np.uint8)
-    for index, view in enumerate(frames(renderer, np.linspace(*_FAN, rows * columns).tolist())):
+    for index, view in enumerate(render_views(renderer, np.linspace(*_FAN, rows * columns).tolist())):
         row, column = divmod(index, columns)
         tiles[row, :, column] = cv2.resize(view, (width, height), interpolation=cv2.INTER_AREA)
     return tiles
 
 
-def _joined(tiles: UInt8[np.ndarray, "rows h columns w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+def _join_tiles(tiles: UInt8[np.ndarray, "rows h columns w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
     """The tiles as one picture."""
     rows, height, columns, width, _ = tiles.shape
     return tiles.reshape(rows * height, columns * width, 3)

@@ -57,9 +57,9 @@ class Renderer:
         maps_px = estimate.disparity_px, estimate.right_disparity_px
         with ThreadPoolExecutor(self._threads) as pool:
             looks = pool.submit(match_exposure, pair.left, pair.right, estimate)
-            self._sides = tuple(pool.map(_side, (pair.left, pair.right), maps_px))
+            self._sides = tuple(pool.map(_make_side, (pair.left, pair.right), maps_px))
         self._looks = looks.result()
-        self._hidden: dict[bool, Hidden] = {}
+        self._hidden: dict[bool, HiddenBackground] = {}
         self._confidence = np.require(estimate.confidence, np.float32, ["C", "W"])
 
     def view(self, position: float, *, up: float = 0.0, forward: float = 0.0) -> View:
@@ -77,16 +77,16 @@ class Renderer:
         if position in (0, 1) and not moves:
             photo = self.pair.right if position else self.pair.left
             return View(image=photo.copy(), drawn=np.ones(photo.shape[:2], bool))
-        canvas = self._drawn(float(position))
+        canvas = self._draw(float(position))
         if up or forward:
-            from stereoweave.rendering.camera_motion import moved
+            from stereoweave.rendering.camera_motion import move_camera
 
-            camera = self.pair.camera or _assumed_camera(self.estimate)
+            camera = self.pair.camera or _assume_camera(self.estimate)
             offset_px = (position - 0.5) * self.convergence_px + position * camera.doffs_px
-            canvas = moved(canvas, camera, offset_px, up, forward)
+            canvas = move_camera(canvas, camera, offset_px, up, forward)
         return View(image=canvas.image, drawn=canvas.drawn)
 
-    def _drawn(self, position: float) -> "Canvas":
+    def _draw(self, position: float) -> "Canvas":
         """The view from the line through the cameras, filled."""
         from stereoweave.rendering.canvas_kernels import empty_canvas
         from stereoweave.rendering.draw_kernels import draw  # Numba takes half a second to import
@@ -95,7 +95,7 @@ class Renderer:
         # The root, because two photographs have less noise than one: 0.03 dB on rendered views, 0.1 on Venus.
         shares = abs(1 - position) ** 0.5, abs(position) ** 0.5
         tables = self._looks.tables(position) if self._looks else (None, None)
-        photos = [_photo(side.photo, table) for side, table in zip(self._sides, tables, strict=True)]
+        photos = [_recolour(side.photo, table) for side, table in zip(self._sides, tables, strict=True)]
         left, right = (
             side._replace(
                 **photo,
@@ -111,20 +111,20 @@ class Renderer:
         in_bands(work, len(canvas.image), self._threads, self._threads)
         if not 0 <= position <= 1:
             # In between, what neither camera saw is a few pixels wide; `fill` is quicker, and does as well.
-            hidden = self._behind(right=position > 1)
+            hidden = self._find_background(right=position > 1)
             lay(*hidden, (right if position > 1 else left).shift, left.offset_px, canvas)
         fill(canvas)
         return canvas
 
-    def _behind(self, right: bool) -> "Hidden":
+    def _find_background(self, right: bool) -> "HiddenBackground":
         """What is hidden from both cameras, and seen from beyond the right one or the left one."""
         if right not in self._hidden:
-            self._hidden[right] = _uncovered(self._sides, right, self._threads)
+            self._hidden[right] = _uncover_background(self._sides, right, self._threads)
         return self._hidden[right]
 
 
-class Hidden(NamedTuple):
-    """Background that neither camera sees, in the columns of a photograph; see `hidden_kernels.uncover`."""
+class HiddenBackground(NamedTuple):
+    """Background that neither camera sees, at a photograph's pixels; see `background_kernels.uncover`."""
 
     disparity_px: np.ndarray
     colours: np.ndarray
@@ -208,7 +208,7 @@ def _check_shifts(strength: float, convergence_px: float, pair: StereoPair) -> N
         )
 
 
-def _side(photo: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarray, "h w"]) -> "Side":
+def _make_side(photo: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarray, "h w"]) -> "Side":
     """One photograph as the kernels take it, for no view yet."""
     from stereoweave.rendering.canvas_kernels import Side
 
@@ -226,7 +226,7 @@ def _side(photo: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarray, "h 
     )
 
 
-def _photo(
+def _recolour(
     photo: UInt8[np.ndarray, "h w 3"], table: Float[np.ndarray, "256 3"] | None
 ) -> dict[str, np.ndarray]:
     """A side's photograph and its grey levels in another look; nothing without a table."""
@@ -236,7 +236,7 @@ def _photo(
     return {"photo": coloured, "grey": cv2.cvtColor(coloured, cv2.COLOR_RGB2GRAY)}
 
 
-def _assumed_camera(estimate: Estimate) -> StereoCamera:
+def _assume_camera(estimate: Estimate) -> StereoCamera:
     """A camera of 53 degrees of view, whose principal point is the picture's centre.
 
     Where disparities are negative, the cameras converge: what has the least is then taken to be far away.
@@ -251,12 +251,12 @@ def _assumed_camera(estimate: Estimate) -> StereoCamera:
     )
 
 
-def _uncovered(sides: "Sequence[Side]", right: bool, threads: int) -> Hidden:
+def _uncover_background(sides: "Sequence[Side]", right: bool, threads: int) -> HiddenBackground:
     """What is behind the foreground of the right photograph, or of the left one, for views from beyond it."""
     from stereoweave.rendering.background_kernels import uncover
 
     own, other = sides[right], sides[not right]
-    hidden = Hidden(np.empty_like(own.disparity_px), np.empty_like(own.photo))
+    hidden = HiddenBackground(np.empty_like(own.disparity_px), np.empty_like(own.photo))
     # From beyond the left camera one looks behind the foreground where the background is on its left.
     outwards = 1 if right else -1
     known = own.photo, own.disparity_px, own.nearer_px, other.disparity_px, outwards

@@ -39,7 +39,7 @@ def choose_row(left, right, confidence, y, landed_left, landed_right, row):
     for u in range(width):
         if back_px[u] > NOTHING:
             a, b = landed_left[u], landed_right[u]
-            part = _share_of_left(left, right, confidence, y, u, a, b)
+            part = _find_left_share(left, right, confidence, y, u, a, b)
             front_px[u] = a if part > 0 else b
             back_px[u] = b if 0 < part < 1 else NOTHING
             row.share[u] = part if part > 0 else 1.0
@@ -49,8 +49,8 @@ def choose_row(left, right, confidence, y, landed_left, landed_right, row):
         )
         alone = back_px[u] == NOTHING and front_px[u] > NOTHING
         if alone and beside_px > front_px[u] + SAME_SURFACE_PX:
-            covered = left.nearness * _coverage(left, y, u, beside_px)
-            covered += right.nearness * _coverage(right, y, u, beside_px)
+            covered = left.nearness * _measure_coverage(left, y, u, beside_px)
+            covered += right.nearness * _measure_coverage(right, y, u, beside_px)
             if covered > 0:
                 front_px[u], back_px[u], row.share[u] = beside_px, front_px[u], covered
     support_in_row(left, y, front_px, row.in_left)
@@ -59,7 +59,7 @@ def choose_row(left, right, confidence, y, landed_left, landed_right, row):
 
 @compiled
 @typing.no_type_check
-def _coverage(side, y, u, d):
+def _measure_coverage(side, y, u, d):
     """How much of the photograph shows the surface of disparity d at (y, u), pure or not: 0..1, 0 outside."""
     last = side.disparity_px.shape[1] - 1
     x = _column(side.shift, side.offset_px, u, d)
@@ -80,10 +80,10 @@ def _column(shift, offset_px, u, d):
 
 @compiled
 @typing.no_type_check
-def _share_of_left(left, right, confidence, y, u, a, b):
+def _find_left_share(left, right, confidence, y, u, a, b):
     """The left side's part, of 1, of a pixel in which the two sides have different surfaces, a and b."""
-    gap_a_px = _gap_px(right, y, u, a)
-    gap_b_px = _gap_px(left, y, u, b)
+    gap_a_px = _find_gap_px(right, y, u, a)
+    gap_b_px = _find_gap_px(left, y, u, b)
     # The nearer surface hides the other, unless the camera that does not have it looks through it.
     if a > b and gap_a_px >= -SAME_SURFACE_PX:
         return 1.0
@@ -97,18 +97,18 @@ def _share_of_left(left, right, confidence, y, u, a, b):
         trust_b = 0.5
     elif gap_b_px < -SAME_SURFACE_PX:
         trust_b = 1.0 - trust_b
-    mismatch_a = _mismatch_levels(left, right, y, u, a)
-    mismatch_b = _mismatch_levels(left, right, y, u, b)
+    mismatch_a = _measure_mismatch(left, right, y, u, a)
+    mismatch_b = _measure_mismatch(left, right, y, u, b)
     if min(mismatch_a, mismatch_b) < 0:
         mismatch_a = mismatch_b = 0.0
-    score_a = (PRIOR + trust_a) / (NOISE_LEVELS + mismatch_a) * _weight(left, right, y, u, a)
-    score_b = (PRIOR + trust_b) / (NOISE_LEVELS + mismatch_b) * _weight(left, right, y, u, b)
+    score_a = (PRIOR + trust_a) / (NOISE_LEVELS + mismatch_a) * _sum_support(left, right, y, u, a)
+    score_b = (PRIOR + trust_b) / (NOISE_LEVELS + mismatch_b) * _sum_support(left, right, y, u, b)
     return score_a / (score_a + score_b) if score_a > 0 else 0.0
 
 
 @compiled
 @typing.no_type_check
-def _gap_px(side, y, u, d):
+def _find_gap_px(side, y, u, d):
     """How much nearer than d is what this side has there: the more similar one of two pixels; 0 outside."""
     last = side.disparity_px.shape[1] - 1
     x = _column(side.shift, side.offset_px, u, d)
@@ -122,7 +122,7 @@ def _gap_px(side, y, u, d):
 
 @compiled
 @typing.no_type_check
-def _mismatch_levels(left, right, y, u, d):
+def _measure_mismatch(left, right, y, u, d):
     """How the photographs differ over three pixels around u if d is right: the channels' sum; -1 outside."""
     left_photo, right_photo = left.photo[y], right.photo[y]
     last = left_photo.shape[0] - 1
@@ -144,7 +144,7 @@ def _mismatch_levels(left, right, y, u, d):
 
 @compiled
 @typing.no_type_check
-def _weight(left, right, y, u, d):
+def _sum_support(left, right, y, u, d):
     """How well both photographs together show the surface of disparity d at (y, u) of the new view."""
     total = 0.0
     for side in (left, right):

@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from stereoweave.cameras.rectify import cropped
+from stereoweave.cameras.rectify import crop
 from stereoweave.errors import Note, StereoweaveError
 from stereoweave.io.decoding import MOST_PIXELS, opening
 from stereoweave.io.files import RangeError, write_image
@@ -184,7 +184,7 @@ def _prepared(job: ServiceJob) -> Prepared:
     _checked_megapixels(job.pictures[0], prepared.pair.left.shape[1::-1], job.most_megapixels)
     if needs_camera(job.file):
         needed_camera(prepared.pair)
-    return replace(prepared, pair=cropped(prepared.pair)) if job.is_view else prepared
+    return replace(prepared, pair=crop(prepared.pair)) if job.is_view else prepared
 
 
 def _matched(

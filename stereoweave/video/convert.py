@@ -16,7 +16,7 @@ from rich.progress import Progress, TaskID
 
 from stereoweave import __version__
 from stereoweave.cameras.alignment import SWAPPED
-from stereoweave.cameras.diagnosis import hints
+from stereoweave.cameras.diagnosis import find_problems
 from stereoweave.errors import NameOf, Note, Remedy, StereoweaveError, keyword
 from stereoweave.io.colormap import colour_disparity, colour_range_px
 from stereoweave.io.output_lock import lock_output
@@ -25,7 +25,7 @@ from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
 from stereoweave.pictures.frame_packing import ARRANGEMENTS
-from stereoweave.rendering.layouts import LAYOUTS, Choices, check_reach, middle_px
+from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, check_positions, median_disparity_px
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.system.progress import progress
@@ -96,7 +96,7 @@ class VideoJob:
                 f"expected one of {', '.join(LAYOUTS)}, found {self.layout!r}", setting="layout"
             )
         self._check_numbers(given[0] if self.layout is None else f"layout {self.layout}")
-        check_reach(self._positions, self.strength)
+        check_positions(self._positions, self.strength)
 
     def _check_numbers(self, kind: str) -> None:
         """Raise if a number is not finite, or has no effect on this kind of video."""
@@ -132,7 +132,7 @@ class VideoJob:
         )
         if self.position is not None:
             return renderer.view(self.position).image
-        return LAYOUTS[str(self.layout)].compose(renderer, Choices(range_px=survey.range_px))
+        return LAYOUTS[str(self.layout)].compose(renderer, LayoutOptions(range_px=survey.range_px))
 
     def _plane_px(self, survey: "Survey") -> float:
         """The disparity that stays in place from view to view."""
@@ -309,9 +309,9 @@ def _look(footage: Footage, matcher: Matcher, bar: Progress) -> tuple[Survey, li
         pair = StereoPair(left=frame.left, right=frame.right)
         estimate = match(matcher, pair)
         thinned.append(estimate.disparity_px[::_SURVEYED_EVERY_PX, ::_SURVEYED_EVERY_PX])
-        middles_px.append(middle_px(estimate))
+        middles_px.append(median_disparity_px(estimate))
         if index in hinted:
-            defects.append([_at(frame.time, note, footage) for note in hints(pair, estimate)])
+            defects.append([_at(frame.time, note, footage) for note in find_problems(pair, estimate)])
         bar.advance(shown)
     all_px = np.vstack(thinned)
     survey = Survey(colour_range_px(all_px), float(np.median(middles_px)), _within_px(all_px, matcher))

@@ -16,9 +16,9 @@ from rich.console import Console
 from shard_examples import PaintedPairMaker, box_before_a_wall, contents
 
 from stereoweave.bench import pairs as benchmark
-from stereoweave.bench.pairs import network, score_pairs, write_csv
+from stereoweave.bench.pairs import make_matcher, score_pairs, write_csv
 from stereoweave.cli.root import main
-from stereoweave.data.packing import packed
+from stereoweave.data.packing import pack
 from stereoweave.data.readers import list_scenes
 from stereoweave.data.shards import write_shard
 from stereoweave.errors import StereoweaveError
@@ -81,7 +81,7 @@ def sets(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sets")
     for number, name in enumerate(("crane", "ship")):
         sample = box_before_a_wall(np.random.default_rng(number), (96, 64))
-        write_shard(folder / name, name, 0, [packed(sample, {0.5: sample.left})])
+        write_shard(folder / name, name, 0, [pack(sample, {0.5: sample.left})])
     return folder
 
 
@@ -130,7 +130,10 @@ def test_a_rendered_set_is_the_same_from_a_cluster(tmp_path, cluster, monkeypatc
 def test_a_cluster_finds_the_errors_that_one_process_finds(sets, tmp_path, cluster):
     line = f"bench pairs {sets} --model small --threads 1 -o {tmp_path}/many.csv --cluster {cluster}"
     assert main(line.split()) == 0
-    makers = {"small": partial(network, "small", 1), "small refined": partial(network, "small", 1, True)}
+    makers = {
+        "small": partial(make_matcher, "small", 1),
+        "small refined": partial(make_matcher, "small", 1, True),
+    }
     expected = score_pairs(makers, partial(list_scenes, sets))
     write_csv(tmp_path / "one.csv", expected.rows, expected.machine)
     many = _rows(tmp_path / "many.csv")
@@ -150,7 +153,7 @@ def test_a_cluster_finds_the_views_that_one_process_finds(sets, tmp_path, cluste
 
 def test_a_machine_that_sees_other_scenes_is_named(sets):
     with pytest.raises(StereoweaveError) as raised:
-        benchmark._Scorer({}, partial(list_scenes, sets), len, expected=3)
+        benchmark._SceneScorer({}, partial(list_scenes, sets), len, expected=3)
     assert str(raised.value) == (
         f"{platform.node()}: expected the 3 scenes that are where the command was started, found 2; "
         "put them on a disk that every node of the cluster sees"
@@ -159,8 +162,8 @@ def test_a_machine_that_sees_other_scenes_is_named(sets):
 
 def test_machines_that_differ_are_named_side_by_side():
     machines = [{"cpu": "B", "cores": "2"}, {"cpu": "A", "cores": "2"}, {"cpu": "B", "cores": "2"}]
-    scored = [benchmark.Scored(number, None, machine) for number, machine in enumerate(machines)]
-    assert benchmark.machine_of_all(scored) == {"cpu": "A + B", "cores": "2"}
+    scored = [benchmark.SceneResult(number, None, machine) for number, machine in enumerate(machines)]
+    assert benchmark.merge_machines(scored) == {"cpu": "A + B", "cores": "2"}
 
 
 def _rows(path):

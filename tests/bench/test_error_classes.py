@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from stereoweave.bench.error_classes import ALL, CLASSES, class_errors, classify, covered
+from stereoweave.bench.error_classes import ALL, CLASSES, class_errors, classify, find_covered
 from stereoweave.bench.metrics import bad_percent, epe_px
 
 
@@ -61,11 +61,13 @@ def test_a_rod_less_than_15_px_wide_is_thin_to_its_middle(width, is_thin):
 
 def test_what_is_over_one_px_farther_in_the_same_right_column_is_covered():
     # Matches at columns 0, 1, 1, 3: the second pixel's is covered where the third is over 1 px nearer.
-    np.testing.assert_array_equal(covered(np.array([[0.0, 0.0, 1.2, 0.0]])), [[False, True, False, False]])
-    assert not covered(np.array([[0.0, 0.0, 1.0, 0.0]])).any()
-    assert not covered(np.array([[0.0, 0.0, np.nan, 0.0]])).any()
+    np.testing.assert_array_equal(
+        find_covered(np.array([[0.0, 0.0, 1.2, 0.0]])), [[False, True, False, False]]
+    )
+    assert not find_covered(np.array([[0.0, 0.0, 1.0, 0.0]])).any()
+    assert not find_covered(np.array([[0.0, 0.0, np.nan, 0.0]])).any()
     # Both beside the picture, and so covered by nothing.
-    assert not covered(np.array([[1.0, 5.0, 0.0, 0.0]])).any()
+    assert not find_covered(np.array([[1.0, 5.0, 0.0, 0.0]])).any()
 
 
 @pytest.mark.parametrize("unknown", [np.nan, np.inf])

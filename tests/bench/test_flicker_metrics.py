@@ -3,19 +3,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereoweave.bench.flicker import FRAME_BY_FRAME, STEADY, FlickerRow, flicker_rows, means
+from stereoweave.bench.flicker import FRAME_BY_FRAME, STEADY, FlickerRow, average_rows, score_flicker
 from stereoweave.bench.flicker_films import (
     LEFT,
     MIDDLE,
     NOISE_LEVELS,
-    Film,
-    noisy,
-    panning,
-    passing,
-    reprojected,
-    still,
+    RenderedVideo,
+    add_noise,
+    add_passing_oval,
+    freeze,
+    render_panning,
+    reproject,
 )
-from stereoweave.bench.flicker_metrics import flicker, seen_again
+from stereoweave.bench.flicker_metrics import find_seen_again, flicker
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import StereoCamera, StereoPair
 from stereoweave.synth.sets.pair_rendering import RenderSpec
@@ -79,12 +79,14 @@ def test_frames_of_two_sizes_and_points_that_leave_are_refused(without_shape_che
 
 def test_a_point_is_seen_again_inside_and_where_its_own_surface_is():
     before_px, after_px = row(5, 5, 5, 5), row(5, 9, 5, 5)
-    found = seen_again(before_px, after_px, to_the_right(0, 0, 0, 1), row(0, 0, 0, 0))
+    found = find_seen_again(before_px, after_px, to_the_right(0, 0, 0, 1), row(0, 0, 0, 0))
     np.testing.assert_array_equal(found, [[True, False, True, False]])  # stays; is covered; stays; leaves
     # Between two pixels both have to show it.
-    found = seen_again(before_px, after_px, to_the_right(0.5, 1, 0.5, 0), row(0, 0, 0, 0))
+    found = find_seen_again(before_px, after_px, to_the_right(0.5, 1, 0.5, 0), row(0, 0, 0, 0))
     np.testing.assert_array_equal(found, [[False, True, True, True]])
-    assert seen_again(before_px, after_px, REST, row(4, 4, 4, 4)).tolist() == [[False, True, False, False]]
+    assert find_seen_again(before_px, after_px, REST, row(4, 4, 4, 4)).tolist() == [
+        [False, True, False, False]
+    ]
 
 
 def at(change, x, y):
@@ -97,7 +99,7 @@ def test_a_camera_that_steps_aside_moves_points_by_their_share_of_the_baseline()
     aside = replace(RIG, position_m=np.array([0.05, 0, 0]))
     disparity_px = np.full((31, 41), 8, np.float32)
     disparity_px[0, 0] = 0
-    change = reprojected(disparity_px, RIG, aside, LEFT)
+    change = reproject(disparity_px, RIG, aside, LEFT)
     np.testing.assert_allclose(at(change, 30, 20), [-4, 0, 0], atol=1e-5)
     np.testing.assert_allclose(at(change, 0, 0), [0, 0, 0], atol=1e-5)  # the sky
 
@@ -105,23 +107,23 @@ def test_a_camera_that_steps_aside_moves_points_by_their_share_of_the_baseline()
 @pytest.mark.parametrize("position", [LEFT, MIDDLE])
 def test_a_camera_that_goes_half_the_way_doubles_disparity_and_size(position):
     nearer = replace(RIG, position_m=np.array([0, 0, 0.5]))
-    change = reprojected(np.full((31, 41), 10, np.float32), RIG, nearer, position)  # 1 m away
+    change = reproject(np.full((31, 41), 10, np.float32), RIG, nearer, position)  # 1 m away
     np.testing.assert_allclose(at(change, 30, 12), [10, -3, 10], atol=1e-5)
 
 
 def test_a_camera_that_turns_moves_even_the_sky():
     right, down, forward = np.array([0.8, 0, -0.6]), np.array([0, 1, 0]), np.array([0.6, 0, 0.8])
     turned = replace(RIG, axes=np.stack([right, down, forward]))
-    change = reprojected(np.zeros((31, 41), np.float32), RIG, turned, LEFT)
+    change = reproject(np.zeros((31, 41), np.float32), RIG, turned, LEFT)
     np.testing.assert_allclose(at(change, 20, 15), [-75, 0, 0], atol=1e-4)  # tan = 0.6 / 0.8
 
 
 @pytest.fixture
 def three_frames(rng):
-    """A film of three frames of which `still` and `passing` take the first: a plane at 4 px."""
+    """A film of three frames of which `freeze` and `add_passing_oval` take the first: a plane at 4 px."""
     image = rng.integers(0, 256, (96, 128, 3), dtype=np.uint8)
     flat_px = np.full((96, 128), 4, np.float32)
-    return Film(
+    return RenderedVideo(
         name="any",
         pairs=[StereoPair(left=image, right=np.roll(image, -4, axis=1))] * 3,
         disparities_px=[{LEFT: flat_px, MIDDLE: flat_px}] * 3,
@@ -131,19 +133,19 @@ def three_frames(rng):
 
 
 def test_a_still_film_does_not_change_and_its_noise_does(three_frames):
-    film = still(three_frames)
+    film = freeze(three_frames)
     assert len(film.pairs) == 3
     motion_px, _ = film.change(0, 2, LEFT)
     assert film.seen_again(0, 2, LEFT).all()
     assert flicker(film.pairs[0].left, film.pairs[2].left, motion_px, film.seen_again(0, 2, LEFT)) == 0
     grey = StereoPair(left=np.full((96, 128, 3), 99, np.uint8), right=np.full((96, 128, 3), 99, np.uint8))
-    one, other = (noisy(grey, np.random.default_rng(seed)) for seed in (1, 2))
+    one, other = (add_noise(grey, np.random.default_rng(seed)) for seed in (1, 2))
     for a, b in ((one.left, one.right), (one.left, other.left), (one.right, other.right)):
         assert np.std(a.astype(float) - b) == pytest.approx(np.sqrt(2) * NOISE_LEVELS, rel=0.03)
 
 
 def test_what_passes_is_where_its_truth_says(three_frames):
-    film = passing(three_frames, "passing", (4.0, 2.0), nearing_px=2.0)
+    film = add_passing_oval(three_frames, "passing", (4.0, 2.0), nearing_px=2.0)
     assert not film.moving[0].all()
     for frame, near_px in enumerate((12, 14, 16)):
         oval = film.moving[frame]
@@ -161,7 +163,7 @@ def test_what_passes_is_where_its_truth_says(three_frames):
 
 
 def test_what_passes_covers_and_uncovers(three_frames):
-    film = passing(three_frames, "passing", (4.0, 0.0))
+    film = add_passing_oval(three_frames, "passing", (4.0, 0.0))
     before, after = film.moving[0], film.moving[1]
     np.testing.assert_array_equal(film.seen_again(0, 1, LEFT) | (after & ~before), np.ones_like(before))
     np.testing.assert_array_equal(film.seen_again(1, 0, LEFT), ~(before & ~after))
@@ -171,7 +173,7 @@ def test_what_passes_covers_and_uncovers(three_frames):
 
 
 def test_what_comes_nearer_moves_less_to_the_right_in_the_middle_view(three_frames):
-    film = passing(three_frames, "nearing", (3.25, 0.0), nearing_px=0.5)
+    film = add_passing_oval(three_frames, "nearing", (3.25, 0.0), nearing_px=0.5)
     motion_px, change_px = film.change(0, 1, MIDDLE)
     assert motion_px[..., 0].max() == 3.0
     assert change_px.max() == 0.5
@@ -179,7 +181,7 @@ def test_what_comes_nearer_moves_less_to_the_right_in_the_middle_view(three_fram
 
 @pytest.mark.needs_egl
 def test_a_rendered_pan_looks_the_same_along_its_true_motion():
-    film = panning(RenderSpec(scene="ship", seed=4, size_px=(160, 120), frames=12), 2)
+    film = render_panning(RenderSpec(scene="ship", seed=4, size_px=(160, 120), frames=12), 2)
     motion_px, change_px = film.change(0, 1, LEFT)
     visible = film.seen_again(0, 1, LEFT)
     assert visible.mean() > 0.8
@@ -192,7 +194,7 @@ def test_a_rendered_pan_looks_the_same_along_its_true_motion():
 
 @pytest.mark.needs_egl
 def test_the_rows_say_what_steadying_is_worth():
-    rows = list(flicker_rows(["rooms"], frames=4, size_px=(160, 120), seed=3, threads=1))
+    rows = list(score_flicker(["rooms"], frames=4, size_px=(160, 120), seed=3, threads=1))
     assert [row.film for row in rows[::2]] == ["still", "passing", "nearing", "panning"]
     assert [row.method for row in rows] == [FRAME_BY_FRAME, STEADY] * 4
     for by_frame, steady in zip(rows[::2], rows[1::2], strict=True):
@@ -206,7 +208,7 @@ def test_the_rows_say_what_steadying_is_worth():
 
 def test_a_film_of_one_frame_is_refused():
     with pytest.raises(StereoweaveError, match="frames: expected 2 or more"):
-        list(flicker_rows(["rooms"], frames=1))
+        list(score_flicker(["rooms"], frames=1))
 
 
 def test_means_are_over_the_scenes_of_a_film_and_a_method():
@@ -217,7 +219,7 @@ def test_means_are_over_the_scenes_of_a_film_and_a_method():
             noise_levels=4.0, flicker_px=value, time_ms=float("nan"), **numbers,
         )  # fmt: skip
 
-    found = means([row("a", STEADY, 1.0), row("a", FRAME_BY_FRAME, 5.0), row("b", STEADY, 2.0)])
+    found = average_rows([row("a", STEADY, 1.0), row("a", FRAME_BY_FRAME, 5.0), row("b", STEADY, 2.0)])
     assert [(mean.film, mean.scene, mean.flicker_px) for mean in found] == [
         ("still, steady", "mean", 1.5),
         ("still, frame by frame", "mean", 5.0),

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from stereoweave.bench.pairs import MEAN, TURNS, network, score_pairs, with_memory, write_csv
+from stereoweave.bench.pairs import MEAN, TURNS, add_memory, make_matcher, score_pairs, write_csv
 from stereoweave.data.readers import Scene
 from stereoweave.errors import MatcherError, StereoweaveError
 from stereoweave.matching.opencv import OPENCV_MATCHERS
@@ -197,7 +197,7 @@ def test_no_scene_is_an_error():
 
 def test_a_model_that_is_none_is_an_error_before_any_scene_is_read():
     with pytest.raises(MatcherError, match=r"none.onnx"):
-        score_pairs({"none": partial(network, "none.onnx")}, lambda: pytest.fail("was listed"))
+        score_pairs({"none": partial(make_matcher, "none.onnx")}, lambda: pytest.fail("was listed"))
 
 
 def test_memory_stands_in_the_rows_of_means_and_is_that_of_the_largest_pair(rng):
@@ -208,7 +208,7 @@ def test_memory_stands_in_the_rows_of_means_and_is_that_of_the_largest_pair(rng)
     )
     scores = scores_of({}, [small, large, small])
     assert scores.largest is large.pair
-    rows = with_memory([row for row in scores.rows if row.matcher == "sgbm"], {}, scores.largest)
+    rows = add_memory([row for row in scores.rows if row.matcher == "sgbm"], {}, scores.largest)
     assert [math.isnan(row.memory_mb) for row in rows] == [True, True, True, False]
     assert 0 < rows[-1].memory_mb < 100
 

@@ -8,7 +8,7 @@ from matplotlib.colors import to_rgba
 
 from stereoweave.bench import plots as benchmark_plots
 from stereoweave.bench.metrics import sparsification
-from stereoweave.bench.pairs import Curves, Row
+from stereoweave.bench.pairs import Curves, MatcherRow
 from stereoweave.bench.plots import draw_error_over_time, draw_sparsification
 from stereoweave.io.files import read_image
 
@@ -32,7 +32,7 @@ def row(matcher, time_ms, bad1_percent, epe_px):
     edges = dict.fromkeys(("edge_epe_px", "edge_bad1_percent", "flying_percent"), math.nan)
     areas = dict.fromkeys(("ause_px", "ause_bad1_percent"), math.nan)
     errors = {"epe_px": epe_px, "bad1_percent": bad1_percent}
-    return Row(matcher=matcher, scene="mean", time_ms=time_ms, **errors, **others, **edges, **areas)
+    return MatcherRow(matcher=matcher, scene="mean", time_ms=time_ms, **errors, **others, **edges, **areas)
 
 
 ROWS = [row("sgbm", 70, 17, 2.3), row("small", 71, 17.1, 2.29), row("a/mine.onnx", 72, 17, 2.3)]

@@ -5,7 +5,7 @@ import pytest
 from shard_examples import box_before_a_wall
 
 from stereoweave.bench.view_scenes import read_view_scenes
-from stereoweave.data.packing import packed
+from stereoweave.data.packing import pack
 from stereoweave.data.shards import write_shard
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.files import write_disparity_png, write_image, write_pfm
@@ -61,7 +61,7 @@ def test_disparity_comes_from_either_kind_of_file(scene):
 def test_the_pairs_of_rendered_sets_below_a_folder_are_scenes_with_their_views(tmp_path):
     samples = [box_before_a_wall(np.random.default_rng(number)) for number in range(3)]
     views = [{0.75: sample.right, 0.25: sample.left} for sample in samples]
-    files = [packed(sample, taken) for sample, taken in zip(samples, views, strict=True)]
+    files = [pack(sample, taken) for sample, taken in zip(samples, views, strict=True)]
     write_shard(tmp_path / "far" / "ship", "ship", 0, files[:2])
     write_shard(tmp_path / "crane", "crane", 0, files[2:])
     scenes = list(read_view_scenes(tmp_path))
@@ -82,7 +82,7 @@ def test_a_folder_without_scenes_is_told_apart(tmp_path):
 
 
 def test_a_set_without_views_is_named(tmp_path):
-    write_shard(tmp_path, "ship", 0, [packed(box_before_a_wall(np.random.default_rng(0)), {})])
+    write_shard(tmp_path, "ship", 0, [pack(box_before_a_wall(np.random.default_rng(0)), {})])
     with pytest.raises(
         FormatError, match="further views, found ship-000000 without; render a set with further"
     ):

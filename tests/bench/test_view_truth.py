@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from view_examples import BOX_PX, WALL_PX, boxes_before_a_wall
 
-from stereoweave.bench.view_truth import fill_unknown, landed_px, view_truth
+from stereoweave.bench.view_truth import fill_unknown, find_view_truth, land_disparities
 
 
 def columns(mask):
@@ -12,7 +12,7 @@ def columns(mask):
 
 
 def test_half_way_a_box_has_moved_by_half_its_disparity_and_its_flanks_are_seen_by_one():
-    truth = view_truth(boxes_before_a_wall((20, 28)), 0.5)
+    truth = find_view_truth(boxes_before_a_wall((20, 28)), 0.5)
     assert columns(truth.disparity_px == BOX_PX) == [*range(16, 24)]
     assert columns(truth.disparity_px == WALL_PX) == [*range(16), *range(24, 40)]
     # The left camera sees the wall up to the view's column 18 and from 27 on, the right one up to 12 and
@@ -24,7 +24,7 @@ def test_half_way_a_box_has_moved_by_half_its_disparity_and_its_flanks_are_seen_
 def test_a_slit_between_two_boxes_hides_what_is_behind_from_both():
     # In the view they stand at columns 6 to 11 and 14 to 19. Through the slit the left camera sees the wall
     # at 15 and 16, and the right one at 9 and 10: behind the boxes.
-    truth = view_truth(boxes_before_a_wall((10, 16), (18, 24)), 0.5)
+    truth = find_view_truth(boxes_before_a_wall((10, 16), (18, 24)), 0.5)
     assert columns(truth.none_sees) == columns(np.isnan(truth.disparity_px)) == [12, 13]
     assert columns(truth.one_sees) == [0, 3, 4, 5, 20, 21, 22, 39]
 
@@ -32,7 +32,7 @@ def test_a_slit_between_two_boxes_hides_what_is_behind_from_both():
 @pytest.mark.parametrize("position", [0, 1])
 def test_a_camera_sees_all_of_its_own_view(position):
     sample = boxes_before_a_wall((20, 28))
-    truth = view_truth(sample, position)
+    truth = find_view_truth(sample, position)
     own_px = sample.right_disparity_px if position else sample.disparity_px
     np.testing.assert_array_equal(truth.disparity_px, own_px)
     alone = sample.right_occluded if position else sample.occluded
@@ -41,7 +41,7 @@ def test_a_camera_sees_all_of_its_own_view(position):
 
 
 def test_beyond_the_left_camera_the_right_one_sees_less():
-    truth = view_truth(boxes_before_a_wall((20, 28)), -0.5)
+    truth = find_view_truth(boxes_before_a_wall((20, 28)), -0.5)
     # The box stands at columns 24 to 31. What the left camera sees of the wall before the box lands on 1 to
     # 20, what the right one sees on 3 to 14 and, from behind the box, on 23 and beyond.
     assert columns(truth.disparity_px == BOX_PX) == [*range(24, 32)]
@@ -52,7 +52,7 @@ def test_beyond_the_left_camera_the_right_one_sees_less():
 def test_what_is_unknown_is_not_taken_for_hidden():
     sample = boxes_before_a_wall((20, 28))
     sample.disparity_px[:, 4:8] = sample.right_disparity_px[:, 2:6] = np.nan
-    truth = view_truth(sample, 0.5)
+    truth = find_view_truth(sample, 0.5)
     # Of the wall there the left photograph would show columns 3 to 6, and the right one the same.
     assert columns(np.isnan(truth.disparity_px)) == [3, 4, 5, 6]
     assert columns(truth.none_sees) == []
@@ -64,12 +64,12 @@ def test_a_slant_lands_where_geometry_says_without_cracks():
     disparity_px = np.tile(1.5 * np.arange(40), (2, 1)).astype(np.float32)
     expected_px = 1.5 / 1.75 * np.arange(40)
     # The disparity is that of a place up to half a column away, where it differs by half of 1.5 / 1.75.
-    np.testing.assert_allclose(landed_px(disparity_px, 0.5), np.tile(expected_px, (2, 1)), atol=0.43)
+    np.testing.assert_allclose(land_disparities(disparity_px, 0.5), np.tile(expected_px, (2, 1)), atol=0.43)
 
 
 def test_unknown_pixels_land_nowhere():
     disparity_px = np.array([[4.0, np.nan, 4.0, 4.0, np.inf]], np.float32)
-    np.testing.assert_array_equal(landed_px(disparity_px, 0.25), [[np.nan, 4, np.nan, 4, 4]])
+    np.testing.assert_array_equal(land_disparities(disparity_px, 0.25), [[np.nan, 4, np.nan, 4, 4]])
 
 
 def test_the_unknown_is_filled_from_its_farther_side_even_where_that_is_the_sky():

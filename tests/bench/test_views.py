@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from view_examples import boxes_before_a_wall
 
-from stereoweave.bench.pairs import network
-from stereoweave.bench.view_scenes import TrueView, ViewScene, list_view_scenes
-from stereoweave.bench.views import moved, score_scenes
+from stereoweave.bench.pairs import make_matcher
+from stereoweave.bench.view_scenes import ReferenceView, ViewScene, list_view_scenes
+from stereoweave.bench.views import score_view_scenes, shift_image
 from stereoweave.data.samples import make_sample
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import Estimate, StereoPair
@@ -24,7 +24,7 @@ def scene_of(sample, *views, name="shed"):
     return ViewScene(
         name=name,
         sample=sample,
-        views=tuple(TrueView(position=position, image=image) for position, image in views),
+        views=tuple(ReferenceView(position=position, image=image) for position, image in views),
     )
 
 
@@ -39,7 +39,7 @@ def wall(rng, shift_px=4, height=32, width=64):
 
 
 def rows_of(networks, scenes):
-    return score_scenes(networks, listed(scenes)).rows
+    return score_view_scenes(networks, listed(scenes)).rows
 
 
 def by_method(rows, scene):
@@ -145,8 +145,8 @@ def test_a_mean_counts_every_scene_once_however_many_its_positions():
 
 def test_moving_a_picture_by_a_pixel_takes_each_from_its_neighbour(rng):
     image = rng.integers(0, 256, (8, 9, 3), np.uint8)
-    np.testing.assert_array_equal(moved(image, (1, 2))[2:, 1:], image[:-2, :-1])
-    assert moved(image, (0, 0)) is image
+    np.testing.assert_array_equal(shift_image(image, (1, 2))[2:, 1:], image[:-2, :-1])
+    assert shift_image(image, (0, 0)) is image
 
 
 def test_no_scene_at_all_is_an_error():
@@ -166,8 +166,8 @@ def test_the_referee_finds_the_same_for_a_photograph_beside_its_place(testdata, 
     ]
     subprocess.run(program, check=True, capture_output=True)
     referee = json.loads((tmp_path / "found.json").read_text())["cones"]
-    makers = {"base refined": partial(network, "base", refined=True)}
-    found = by_method(score_scenes(makers, partial(list_view_scenes, tmp_path)).rows, "cones")
+    makers = {"base refined": partial(make_matcher, "base", refined=True)}
+    found = by_method(score_view_scenes(makers, partial(list_view_scenes, tmp_path)).rows, "cones")
     for method, name in (("nearest photograph",) * 2, ("cross-fade",) * 2, ("base refined", "stereoweave")):
         assert found[method].psnr_db == pytest.approx(referee[name]["psnr"], abs=1e-6)
         assert found[method].ssim == pytest.approx(referee[name]["ssim"], abs=1e-6)

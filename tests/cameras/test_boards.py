@@ -158,7 +158,7 @@ def test_pairs_are_known_by_their_names(tmp_path, names):
             path.parent.mkdir(exist_ok=True)
             path.touch()
     (tmp_path / "notes.txt").touch()
-    pairs, left_out = boards._pairs(tmp_path)
+    pairs, left_out = boards._find_pairs(tmp_path)
     assert [[str(path.relative_to(tmp_path)) for path in pair] for pair in pairs.values()] == [
         [name.format(number) for name in names] for number in ("01", "02")
     ]
@@ -251,6 +251,6 @@ def test_a_chessboard_that_was_counted_from_another_corner_is_turned_back():
         numbers = np.arange(len(left_px))
         for turn in turns:
             grid = (left_px - (40, 3)).reshape(board.rows, board.columns, 2)
-            there = boards._Found(numbers, np.rot90(grid, turn).reshape(-1, 2))
-            ordered = boards._ordered_alike(boards._Found(numbers, left_px), there, board)
+            there = boards._ViewCorners(numbers, np.rot90(grid, turn).reshape(-1, 2))
+            ordered = boards._reorder(boards._ViewCorners(numbers, left_px), there, board)
             np.testing.assert_allclose(ordered.at_px, left_px - (40, 3))

@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereoweave.cameras.diagnosis import hints
+from stereoweave.cameras.diagnosis import find_problems
 from stereoweave.io.files import read_image, read_pair
 from stereoweave.matching.matcher import Matcher
 from stereoweave.stereo import Estimate, StereoPair
@@ -34,12 +34,12 @@ def plain_pair(width=200, **masks) -> StereoPair:
 
 
 def test_a_sound_pair_of_which_the_network_is_sure_gets_no_line(example):
-    assert hints(example, estimate_of(example, 0.9)) == []
+    assert find_problems(example, estimate_of(example, 0.9)) == []
 
 
 def test_swapped_sides_are_told(example):
     swapped = StereoPair(left=example.right, right=example.left)
-    assert list(map(str, hints(swapped, estimate_of(swapped, 0.9)))) == [
+    assert list(map(str, find_problems(swapped, estimate_of(swapped, 0.9)))) == [
         "left and right are swapped; give them the other way round"
     ]
 
@@ -48,28 +48,28 @@ def test_a_pair_that_needs_rectifying_is_told_once(example):
     lower = StereoPair(
         left=np.ascontiguousarray(example.left[:-2]), right=np.ascontiguousarray(example.right[2:])
     )
-    (line,) = hints(lower, estimate_of(lower, 0.1))
+    (line,) = find_problems(lower, estimate_of(lower, 0.1))
     assert str(line) == "the right picture lies 2.0 px higher; rectify the pair (rectify)"
 
 
 def test_negative_disparities_by_themselves_are_no_reason_for_a_line(example):
     left, right = (np.ascontiguousarray(x) for x in (example.left[:, 20:], example.right[:, :-20]))
     converged = StereoPair(left=left, right=right)
-    assert hints(converged, estimate_of(converged, 0.9)) == []
+    assert find_problems(converged, estimate_of(converged, 0.9)) == []
 
 
 def test_low_confidence_nearly_everywhere_is_told():
-    (line,) = hints(plain_pair(), estimate_of(plain_pair(), 0.1))
+    (line,) = find_problems(plain_pair(), estimate_of(plain_pair(), 0.1))
     assert str(line).startswith("only 0 % of the disparities are confident")
-    assert hints(plain_pair(), estimate_of(plain_pair(), 0.9)) == []
+    assert find_problems(plain_pair(), estimate_of(plain_pair(), 0.9)) == []
 
 
 def test_what_a_rectified_picture_does_not_show_needs_no_confidence():
     seen = np.zeros((40, 200), bool)
     seen[:, :50] = True
     confidence = np.where(seen, 0.9, 0)
-    assert hints(plain_pair(left_seen=seen), estimate_of(plain_pair(), confidence)) == []
-    (line,) = hints(plain_pair(), estimate_of(plain_pair(), confidence))
+    assert find_problems(plain_pair(left_seen=seen), estimate_of(plain_pair(), confidence)) == []
+    (line,) = find_problems(plain_pair(), estimate_of(plain_pair(), confidence))
     assert str(line).startswith("only 25 %")
 
 
@@ -80,4 +80,4 @@ def test_no_real_pair_gets_a_line(testdata):
     assert len(folders) == 15
     for folder in folders[::3]:
         pair = StereoPair(left=read_image(folder / "left.png"), right=read_image(folder / "right.png"))
-        assert hints(pair, matcher.estimate(pair.left, pair.right)) == [], folder
+        assert find_problems(pair, matcher.estimate(pair.left, pair.right)) == [], folder

@@ -223,7 +223,7 @@ def test_the_largest_rectangle_that_both_fill_is_kept(rng):
     left_seen[470:, 630:] = False
     right_seen[:, :31] = False
     pair = replace(noise(rng), camera=camera, left_seen=left_seen, right_seen=right_seen)
-    cropped = rectify.cropped(pair)
+    cropped = rectify.crop(pair)
     # Of the two ways around the corner the one without its 10 rows is larger: 450x609 against 460x599.
     assert 460 * 599 > 450 * 609
     np.testing.assert_array_equal(cropped.left, pair.left[20:, 31:630])
@@ -235,27 +235,27 @@ def test_the_largest_rectangle_that_both_fill_is_kept(rng):
 def test_a_low_and_wide_pair_loses_no_more_than_its_border():
     image, seen = np.zeros((150, 20_000, 3), np.uint8), np.zeros((150, 20_000), bool)
     seen[3:-4, 10:-20] = True
-    cropped = rectify.cropped(StereoPair(left=image, right=image, left_seen=seen))
+    cropped = rectify.crop(StereoPair(left=image, right=image, left_seen=seen))
     assert cropped.left.shape == (143, 19_970, 3)
 
 
 def test_a_full_pair_is_cropped_to_itself(rng):
     pair = noise(rng)
-    assert rectify.cropped(pair) is pair
+    assert rectify.crop(pair) is pair
 
 
 def test_a_pair_without_a_pixel_in_both_cannot_be_cropped(rng):
     left_seen = np.zeros((480, 640), bool)
     left_seen[:, :300] = True
     with pytest.raises(StereoweaveError, match="overlap"):
-        rectify.cropped(replace(noise(rng), left_seen=left_seen, right_seen=~left_seen))
+        rectify.crop(replace(noise(rng), left_seen=left_seen, right_seen=~left_seen))
 
 
 def test_cropping_finds_the_largest_rectangle_of_a_small_mask_by_trying_all(rng):
     for _ in range(20):
         seen = rng.random((9, 12)) < 0.8
         image = np.zeros((9, 12, 3), np.uint8)
-        cropped = rectify.cropped(StereoPair(left=image, right=image, left_seen=seen))
+        cropped = rectify.crop(StereoPair(left=image, right=image, left_seen=seen))
         sizes = [
             (bottom - top) * (stop - start)
             for top in range(9)

@@ -6,7 +6,7 @@ import pytest
 from rig_examples import fisheye, pinhole, rig_of, turned
 
 from stereoweave.cameras import rig as calibration
-from stereoweave.cameras.calibration_files import calibrated, read_rig, write_rig
+from stereoweave.cameras.calibration_files import add_camera, read_rig, write_rig
 from stereoweave.cameras.rig import Optics, Rig
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.stereo import StereoCamera, StereoPair
@@ -155,13 +155,13 @@ def test_a_middlebury_calibration_that_an_editor_has_touched_is_read_too(tmp_pat
 
 def test_a_pair_gets_the_camera_of_a_calibration_for_its_size(tmp_path):
     path = stored(tmp_path, MIDDLEBURY)
-    assert calibrated(pair_of(741, 497), path).camera == read_rig(path).camera()
+    assert add_camera(pair_of(741, 497), path).camera == read_rig(path).camera()
 
 
 def test_a_calibration_for_another_size_is_refused(tmp_path):
     path = stored(tmp_path, MIDDLEBURY)
     with pytest.raises(FormatError, match="for pictures of 370x248, found one for 741x497") as caught:
-        calibrated(pair_of(370, 248), path)
+        add_camera(pair_of(370, 248), path)
     assert str(path) in str(caught.value)
 
 
@@ -455,10 +455,10 @@ def test_only_a_rectified_rig_gives_a_camera(tmp_path):
 def test_the_rig_of_a_rectified_pair_is_written_and_gives_its_camera(tmp_path):
     camera = StereoCamera(focal_px=500, baseline_m=0.125, cx_px=310, cy_px=240, doffs_px=3)
     pair = replace(pair_of(640, 480), camera=camera)
-    write_rig(tmp_path / "rig.yml", calibration.rig_of(pair))
-    assert calibrated(pair_of(640, 480), tmp_path / "rig.yml").camera == camera
+    write_rig(tmp_path / "rig.yml", calibration.rectified_rig(pair))
+    assert add_camera(pair_of(640, 480), tmp_path / "rig.yml").camera == camera
     with pytest.raises(StereoweaveError, match="camera is known"):
-        calibration.rig_of(pair_of(640, 480))
+        calibration.rectified_rig(pair_of(640, 480))
 
 
 def test_a_rig_without_sense_is_refused():

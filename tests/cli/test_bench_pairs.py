@@ -8,7 +8,7 @@ from shard_examples import box_before_a_wall
 
 from stereoweave.bench.error_classes import CLASSES
 from stereoweave.cli.root import main
-from stereoweave.data.packing import packed
+from stereoweave.data.packing import pack
 from stereoweave.data.paper_layout import write_frame
 from stereoweave.data.readers import read_scenes
 from stereoweave.data.shards import write_shard
@@ -34,8 +34,8 @@ def pair(number):
 @pytest.fixture
 def sets(tmp_path):
     """Two rendered sets below one folder, of two pairs and of one."""
-    write_shard(tmp_path / "sets" / "ship", "ship", 0, [packed(pair(0), {}), packed(pair(1), {})])
-    write_shard(tmp_path / "sets" / "crane", "crane", 0, [packed(pair(2), {})])
+    write_shard(tmp_path / "sets" / "ship", "ship", 0, [pack(pair(0), {}), pack(pair(1), {})])
+    write_shard(tmp_path / "sets" / "crane", "crane", 0, [pack(pair(2), {})])
     return tmp_path / "sets"
 
 

@@ -5,7 +5,7 @@ import pytest
 from shard_examples import box_before_a_wall
 
 from stereoweave.cli.root import main
-from stereoweave.data.packing import packed
+from stereoweave.data.packing import pack
 from stereoweave.data.shards import write_shard
 from stereoweave.io.files import write_image
 from stereoweave.matching.matcher import shipped_models
@@ -23,7 +23,7 @@ def sets(tmp_path):
     """Two rendered sets below one folder, a pair each, with two further views and with one."""
     for name, positions in (("crane", (0.25, 0.5)), ("ship", (0.5,))):
         sample = box_before_a_wall(np.random.default_rng(0), (96, 64))
-        pair = packed(sample, {position: sample.left for position in positions})
+        pair = pack(sample, {position: sample.left for position in positions})
         write_shard(tmp_path / "sets" / name, name, 0, [pair])
     return tmp_path / "sets"
 

@@ -7,8 +7,8 @@ from error_examples import LAYOUTS, write_error_examples
 
 from stereoweave.cli.root import main
 from stereoweave.outputs.results import FILES
+from stereoweave.rendering.layouts import ANIMATIONS
 from stereoweave.rendering.layouts import LAYOUTS as VIEW_LAYOUTS
-from stereoweave.rendering.layouts import MOTIONS
 
 PAIR = "left.png right.png"
 NO_CAMERA = (
@@ -50,7 +50,7 @@ ERRORS = {
     "batch . out --gpus-each 1.5": "--gpus-each: expected 0, a part of 1 or a whole number, found 1.5",
     f"view {PAIR} --position 3 -o out.png": "--position: expected -1 to 2 (0 left camera, 1 right), got 3",
     f"view {PAIR} --layout diagonal -o out.png": "--layout: expected one of "
-    f"{', '.join([*VIEW_LAYOUTS, *MOTIONS])}, found 'diagonal'",
+    f"{', '.join([*VIEW_LAYOUTS, *ANIMATIONS])}, found 'diagonal'",
     "video plain.png -o out.mp4": "expected one kind of video to make, found none; choose one (--depth, "
     "--depth16, --position, --layout)",
     "video plain.png --depth -o out.mp4": "plain.png: expected 3-D video, two views side by side or one "

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stereoweave.cameras.alignment import check_pair
-from stereoweave.cameras.calibration_files import calibrated
+from stereoweave.cameras.calibration_files import add_camera
 from stereoweave.cli.root import main
 from stereoweave.io.files import read_image, read_pair, write_image
 from stereoweave.io.output_lock import lock_output
@@ -65,7 +65,7 @@ def test_the_new_calibration_belongs_to_the_new_pictures(tmp_path):
     out = tmp_path / "out"
     assert main(["rectify", LEFT, RIGHT, "--calib", str(EXAMPLES / "calib.txt"), "-o", str(out)]) == 0
     pair = read_pair(out / "left.png", out / "right.png")
-    assert calibrated(pair, out / "calib.yml").camera == calibrated(pair, EXAMPLES / "calib.txt").camera
+    assert add_camera(pair, out / "calib.yml").camera == add_camera(pair, EXAMPLES / "calib.txt").camera
 
 
 def test_rectification_spares_the_pictures_and_the_calibration_that_are_there(tmp_path, capsys):

@@ -11,7 +11,7 @@ from PIL import Image
 from stereoweave.cli.root import main
 from stereoweave.io.files import read_image
 from stereoweave.matching.matcher import Matcher
-from stereoweave.rendering.layouts import LAYOUTS, MOTIONS, Choices, middle_px
+from stereoweave.rendering.layouts import ANIMATIONS, LAYOUTS, LayoutOptions, median_disparity_px
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import StereoPair
 
@@ -72,16 +72,16 @@ def test_a_layout_is_made_of_one_estimate_at_its_strength_and_plane(
     assert run(f"view left.png right.png --model small --threads 1 {arguments}") == 0
     assert written(before) == Path(file)
     estimate = Matcher("small", threads=1).estimate(pair.left, pair.right, refined=True)
-    plane_px = middle_px(estimate) if convergence_px is None else convergence_px
+    plane_px = median_disparity_px(estimate) if convergence_px is None else convergence_px
     renderer = Renderer(pair, estimate, strength=strength, convergence_px=plane_px, threads=1)
-    choices = Choices(columns=3, rows=2) if "3x2" in arguments else Choices()
+    choices = LayoutOptions(columns=3, rows=2) if "3x2" in arguments else LayoutOptions()
     expected = LAYOUTS[layout].compose(renderer, choices)
     np.testing.assert_array_equal(np.asarray(Image.open(file)), expected)
 
 
 def test_the_middle_of_the_scene_is_where_it_is(pair):
     estimate = Matcher("small", threads=1).estimate(pair.left, pair.right)
-    assert middle_px(estimate) == pytest.approx(8, abs=0.5)
+    assert median_disparity_px(estimate) == pytest.approx(8, abs=0.5)
 
 
 def test_a_single_view_keeps_to_strength_and_says_what_neither_camera_saw(pair, capfd):
@@ -108,7 +108,7 @@ def test_a_wiggle_moves(pair, capfd, ending):
     # Around 0 px: the pair is one wall, which stays in place around its own disparity, as the frames do then.
     wiggle = "--layout wiggle --convergence 0 --model small --threads 1"
     assert run(f"view left.png right.png {wiggle} -o v{ending}") == 0
-    count = len(MOTIONS["wiggle"].positions)
+    count = len(ANIMATIONS["wiggle"].positions)
     if ending == ".mp4":
         with av.open("v.mp4") as film:
             assert len(list(film.decode(video=0))) == 5 * count
@@ -123,7 +123,7 @@ def test_a_wiggle_moves(pair, capfd, ending):
 @pytest.mark.parametrize(
     ("arguments", "fragments"),
     [
-        ("--layout holo -o v.png", ["layout", *LAYOUTS, *MOTIONS, "found 'holo'"]),
+        ("--layout holo -o v.png", ["layout", *LAYOUTS, *ANIMATIONS, "found 'holo'"]),
         ("--layout wiggle -o v.png", ["v.png", ".mp4, .gif, .webp", "found '.png'"]),
         ("--layout quilt -o v.mp4", ["v.mp4", ".png", "found '.mp4'"]),
         ("--layout quilt -o v.jps", ["v.jps", "crossed", "found quilt"]),
@@ -164,4 +164,4 @@ def test_a_mistake_is_told_in_one_line_before_anything_is_matched(
 def test_the_help_names_every_layout_and_motion(capfd):
     assert run("view --help") == 0
     words = set(re.findall(r"\w+", capfd.readouterr().out))
-    assert {*LAYOUTS, *MOTIONS} <= words
+    assert {*LAYOUTS, *ANIMATIONS} <= words

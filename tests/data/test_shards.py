@@ -14,7 +14,7 @@ from dataset_examples import cut, error_of
 from PIL import Image
 from shard_examples import assert_equal, box_before_a_wall, contents
 
-from stereoweave.data.packing import packed, unpacked, unpacked_views
+from stereoweave.data.packing import pack, unpack, unpack_views
 from stereoweave.data.readers import open_dataset
 from stereoweave.data.shards import Shards, list_shards, write_shard
 
@@ -27,7 +27,7 @@ def pair(number):
 def folder(tmp_path):
     """Ten pairs in three shards, the last one of two."""
     for first, count in ((0, 4), (4, 4), (8, 2)):
-        write_shard(tmp_path, "ship", first, [packed(pair(first + i), {}) for i in range(count)])
+        write_shard(tmp_path, "ship", first, [pack(pair(first + i), {}) for i in range(count)])
     return tmp_path
 
 
@@ -36,13 +36,13 @@ def folder(tmp_path):
 
 def test_a_pair_comes_back_as_it_was(rng):
     sample = pair(1)
-    assert_equal(unpacked(packed(sample, {})), sample)
+    assert_equal(unpack(pack(sample, {})), sample)
 
 
 def test_a_disparity_of_0_is_known_and_nan_is_unknown():
     sample = pair(1)
     sample.disparity_px[5, :3] = np.nan, 0, 0.25
-    found = unpacked(packed(sample, {}))
+    found = unpack(pack(sample, {}))
     np.testing.assert_array_equal(found.disparity_px[5, :3], [np.nan, 0, 0.25])
     assert (found.disparity_px[0] == 0).all()
 
@@ -53,28 +53,28 @@ def test_a_disparity_of_0_is_known_and_nan_is_unknown():
 def test_disparity_is_rounded_to_the_finest_step_that_16_bits_hold(rng, most_px, steps_per_px):
     values_px = rng.uniform(0, most_px, (32, 48)).astype(np.float32)
     values_px[3, 4] = most_px
-    files = packed(replace(pair(1), disparity_px=values_px), {})
+    files = pack(replace(pair(1), disparity_px=values_px), {})
     assert json.loads(files["camera.json"])["steps_per_px"] == steps_per_px
-    error_px = np.abs(unpacked(files).disparity_px - values_px).max()
+    error_px = np.abs(unpack(files).disparity_px - values_px).max()
     assert 0.4 / steps_per_px < error_px <= 0.5 / steps_per_px
 
 
 def test_a_set_without_any_truth_can_be_kept():
     nothing = np.full((32, 48), np.nan, np.float32)
     sample = replace(pair(1), disparity_px=nothing, right_disparity_px=nothing, camera=None)
-    assert_equal(unpacked(packed(sample, {})), sample)
+    assert_equal(unpack(pack(sample, {})), sample)
 
 
 @pytest.mark.parametrize("value_px", [-0.1, 65535.0, np.inf])
 def test_a_disparity_that_16_bits_cannot_hold_is_refused(value_px):
     sample = pair(1)
     sample.right_disparity_px[0, 0] = value_px
-    assert f"{value_px:g}" in error_of(packed, sample, {})
+    assert f"{value_px:g}" in error_of(pack, sample, {})
 
 
 def test_further_views_come_back_by_their_position():
     sample = pair(1)
-    found = unpacked_views(packed(sample, {-0.25: sample.left, 0.5: sample.right}))
+    found = unpack_views(pack(sample, {-0.25: sample.left, 0.5: sample.right}))
     assert list(found) == [-0.25, 0.5]
     np.testing.assert_array_equal(found[0.5], sample.right)
 
@@ -105,7 +105,7 @@ def test_pairs_are_read_by_index_across_shards(folder):
     ],
 )
 def test_a_damaged_file_of_a_pair_is_named_though_its_checksum_is_right(tmp_path, damage, found):
-    write_shard(tmp_path, "ship", 0, [packed(pair(1), {}) | damage])
+    write_shard(tmp_path, "ship", 0, [pack(pair(1), {}) | damage])
     message = error_of(Shards(tmp_path).__getitem__, 0)
     assert message.startswith(f"{tmp_path / 'ship-000000-000000.tar'}: expected the files of a pair")
     assert found in message
@@ -125,7 +125,7 @@ def test_shards_travel_to_other_processes(folder):
 
 def test_the_same_pairs_give_the_same_bytes(folder, tmp_path_factory):
     other = tmp_path_factory.mktemp("other")
-    write_shard(other, "ship", 4, [packed(pair(4 + i), {}) for i in range(4)])
+    write_shard(other, "ship", 4, [pack(pair(4 + i), {}) for i in range(4)])
     assert contents(other) == {"ship-000004-000007.tar": (folder / "ship-000004-000007.tar").read_bytes()}
 
 
@@ -206,7 +206,7 @@ def facts(**changes):
     ids=itertools.count(),
 )
 def test_a_pair_of_which_a_file_is_another_than_ours_is_named_with_it(tmp_path, name, content, found):
-    files = packed(pair(0), {}) | {name: content}
+    files = pack(pair(0), {}) | {name: content}
     write_shard(tmp_path, "ship", 0, [{end: made for end, made in files.items() if made is not None}])
     message = error_of(Shards(tmp_path).__getitem__, 0)
     assert message.startswith(f"{tmp_path / 'ship-000000-000000.tar'}: expected ")
@@ -215,12 +215,12 @@ def test_a_pair_of_which_a_file_is_another_than_ours_is_named_with_it(tmp_path, 
 
 
 def test_a_further_view_of_another_kind_is_named(tmp_path):
-    write_shard(tmp_path, "ship", 0, [packed(pair(0), {}) | {"view_0.50.webp": b"no picture"}])
+    write_shard(tmp_path, "ship", 0, [pack(pair(0), {}) | {"view_0.50.webp": b"no picture"}])
     assert "view_0.50.webp" in error_of(Shards(tmp_path).views, 0)
 
 
 def test_a_name_in_a_shard_that_is_no_text_is_refused(tmp_path):
-    write_shard(tmp_path, "ship", 0, [packed(pair(0), {})])
+    write_shard(tmp_path, "ship", 0, [pack(pair(0), {})])
     path = tmp_path / "ship-000000-000000.tar"
     head = bytearray(path.read_bytes()[:512])
     place = head.index(b"camera.json")
@@ -232,7 +232,7 @@ def test_a_name_in_a_shard_that_is_no_text_is_refused(tmp_path):
 
 
 def test_a_shard_with_a_file_of_a_negative_size_is_refused(tmp_path):
-    write_shard(tmp_path, "ship", 0, [packed(pair(0), {})])
+    write_shard(tmp_path, "ship", 0, [pack(pair(0), {})])
     path = tmp_path / "ship-000000-000000.tar"
     head = bytearray(path.read_bytes()[:512])
     head[124:136] = b"\xff" * 10 + b"\xfe\x00"  # -512, after which the same head comes again

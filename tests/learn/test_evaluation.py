@@ -17,7 +17,7 @@ from learn_examples import (
 from rich.console import Console
 
 from stereoweave.bench.metrics import epe_px
-from stereoweave.bench.projected_views import score_views, view_errors
+from stereoweave.bench.projected_views import measure_projection, score_projections
 from stereoweave.bench.projection import project_right
 from stereoweave.learn import checkpoint
 from stereoweave.learn.data.batches import collate
@@ -117,7 +117,7 @@ def test_a_row_has_the_means_over_the_held_out_pairs(folder, rows, name):
     found_px = [disparity_px(name, sample) for sample in samples]
     errors = [epe_px(found, sample.disparity_px) for found, sample in zip(found_px, samples, strict=True)]
     views = [
-        view_errors(sample.right, project_right(sample.left, found))
+        measure_projection(sample.right, project_right(sample.left, found))
         for found, sample in zip(found_px, samples, strict=True)
     ]
     assert rows[name].epe_px == pytest.approx(np.mean(errors), rel=1e-4)
@@ -143,7 +143,7 @@ def test_a_depth_becomes_the_disparity_of_each_pair_s_own_camera():
         np.testing.assert_allclose(match(pair), np.full(PAIR_SIZE, expected_px), rtol=1e-6)
     # The wall, 4 px, and the box, 12 px, are 6 m and 2 m away; for the other camera 12 / 5 and 12 / 13 m.
     errors_m = 2.0, 0.75 * (4 - 12 / 5) + 0.25 * (4 - 12 / 13)
-    *_, row = score_views({"half": match}, [sample, other], recipe.max_depth_m)
+    *_, row = score_projections({"half": match}, [sample, other], recipe.max_depth_m)
     assert row.epe_cm == pytest.approx(100 * np.mean(errors_m), rel=1e-5)
 
 

@@ -17,7 +17,7 @@ from stereoweave.io.exif import Lens
 from stereoweave.io.files import read_image, write_image
 from stereoweave.pictures.frame_packing import ARRANGEMENTS
 from stereoweave.pictures.loading import FORMATS, open_pictures
-from stereoweave.rendering.layouts import LAYOUTS, Choices, marked, write_picture
+from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, add_mark, write_picture
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoPair
 
@@ -430,8 +430,8 @@ def rendered(pair):
 )
 def test_what_view_writes_for_two_eyes_is_read_back(tmp_path, pair, name, size_px):
     pair = StereoPair(left=shrunk(pair.left, *size_px), right=shrunk(pair.right, *size_px))
-    path = marked(tmp_path / "view.png", name, pair, Choices())
-    write_picture(path, LAYOUTS[name].compose(rendered(pair), Choices()))
+    path = add_mark(tmp_path / "view.png", name, pair, LayoutOptions())
+    write_picture(path, LAYOUTS[name].compose(rendered(pair), LayoutOptions()))
     opened = open_pictures([path])
     assert opened.arrangement == name
     if "half" not in name:
@@ -442,13 +442,13 @@ def test_what_view_writes_for_two_eyes_is_read_back(tmp_path, pair, name, size_p
 
 def test_the_3d_files_that_view_writes_are_read_back(tmp_path, pair):
     for name, layout in (("view.mpo", "side_by_side"), ("view.jps", "crossed")):
-        write_picture(tmp_path / name, LAYOUTS[layout].compose(rendered(pair), Choices()))
+        write_picture(tmp_path / name, LAYOUTS[layout].compose(rendered(pair), LayoutOptions()))
         assert_eyes(open_pictures([tmp_path / name]), pair, tolerance=4)
 
 
 @pytest.mark.parametrize(("name", "found"), [("quilt", "a quilt"), ("rgbd", "a picture and its depth")])
 def test_what_view_writes_without_two_eyes_is_refused_by_its_name(tmp_path, pair, name, found):
-    path = marked(tmp_path / "view.png", name, pair, Choices())
+    path = add_mark(tmp_path / "view.png", name, pair, LayoutOptions())
     write_image(path, np.hstack([pair.left, pair.right]))
     assert f"found {found}" in refusal(path)
     assert open_pictures([path], "side_by_side").arrangement == "side_by_side"

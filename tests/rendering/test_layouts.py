@@ -10,14 +10,14 @@ from PIL import Image
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import read_image
 from stereoweave.rendering.layouts import (
+    ANIMATIONS,
     LAYOUTS,
-    MOTIONS,
-    Choices,
-    check_reach,
-    frames,
-    layout_of,
-    marked,
-    middle_px,
+    LayoutOptions,
+    add_mark,
+    check_positions,
+    choose_layout,
+    median_disparity_px,
+    render_views,
     write_picture,
 )
 from stereoweave.rendering.renderer import Renderer
@@ -43,7 +43,7 @@ def renderer_of(left: np.ndarray, right: np.ndarray, disparity_px: float = 0.0) 
 
 
 def composed(name: str, renderer: Renderer, **choices) -> np.ndarray:
-    return LAYOUTS[name].compose(renderer, Choices(**choices))
+    return LAYOUTS[name].compose(renderer, LayoutOptions(**choices))
 
 
 def plain(*colour: int, height: int = 2, width: int = 2) -> np.ndarray:
@@ -148,7 +148,7 @@ def test_a_quilt_is_made_smaller_where_it_would_go_beyond_8192_px():
 @pytest.mark.parametrize(("columns", "rows"), [(0, 6), (1, 1), (-2, -3), (21, 10)])
 def test_a_quilt_has_2_to_200_views(columns, rows):
     with pytest.raises(StereoweaveError, match=f"2 to 200 views, got {columns}x{rows}"):
-        Choices(columns=columns, rows=rows)
+        LayoutOptions(columns=columns, rows=rows)
 
 
 def test_a_contact_sheet_is_read_from_the_left_camera_s_side_to_the_right_one_s(wall):
@@ -174,7 +174,7 @@ def test_every_layout_takes_odd_sizes_and_leaves_the_pair_as_it_was(name, rng):
 
 
 def test_a_motion_goes_there_and_back_without_a_stop_where_it_begins_anew():
-    for motion in MOTIONS.values():
+    for motion in ANIMATIONS.values():
         positions = np.array(motion.positions)
         assert positions[0] == 0
         assert positions.max() <= 1
@@ -184,17 +184,17 @@ def test_a_motion_goes_there_and_back_without_a_stop_where_it_begins_anew():
 
 
 def test_a_wiggle_is_seen_from_both_cameras():
-    assert {0.0, 1.0} <= set(MOTIONS["wiggle"].positions)
+    assert {0.0, 1.0} <= set(ANIMATIONS["wiggle"].positions)
 
 
 def test_an_mp4_wiggles_for_a_few_seconds_and_what_repeats_itself_once():
-    wiggle = MOTIONS["wiggle"]
+    wiggle = ANIMATIONS["wiggle"]
     assert (wiggle.turns("a.gif"), wiggle.turns("a.webp")) == (1, 1)
     assert 3000 < wiggle.turns("a.MP4") * len(wiggle.positions) * wiggle.frame_ms < 5000
 
 
 def test_frames_are_rendered_when_they_are_asked_for(wall):
-    coming = frames(wall, [1.0, 7.0])
+    coming = render_views(wall, [1.0, 7.0])
     np.testing.assert_array_equal(next(coming), wall.pair.right)
     with pytest.raises(StereoweaveError, match="position"):
         next(coming)
@@ -220,13 +220,15 @@ def test_frames_are_rendered_when_they_are_asked_for(wall):
 )
 def test_a_file_has_the_mark_that_its_viewers_look_for(name, given, expected):
     picture = plain(0, 0, 0, height=8, width=6)
-    assert marked(given, name, StereoPair(left=picture, right=picture), Choices()) == Path(expected)
+    assert add_mark(given, name, StereoPair(left=picture, right=picture), LayoutOptions()) == Path(expected)
 
 
 def test_the_mark_of_a_quilt_says_what_it_has():
     picture = plain(0, 0, 0, height=9, width=16)
     pair = StereoPair(left=picture, right=picture)
-    assert marked("view.png", "quilt", pair, Choices(columns=5, rows=9)) == Path("view_qs5x9a1.778.png")
+    assert add_mark("view.png", "quilt", pair, LayoutOptions(columns=5, rows=9)) == Path(
+        "view_qs5x9a1.778.png"
+    )
 
 
 @pytest.mark.parametrize(
@@ -241,7 +243,7 @@ def test_the_mark_of_a_quilt_says_what_it_has():
     ],
 )
 def test_a_layout_is_known_by_its_name_or_by_the_ending_of_the_file(path, name, expected):
-    assert layout_of(path, name) == expected
+    assert choose_layout(path, name) == expected
 
 
 @pytest.mark.parametrize(
@@ -257,7 +259,7 @@ def test_a_layout_is_known_by_its_name_or_by_the_ending_of_the_file(path, name, 
 )
 def test_an_unknown_layout_or_an_ending_that_does_not_fit_it_is_told(path, name, expected):
     with pytest.raises(StereoweaveError, match=expected):
-        layout_of(path, name)
+        choose_layout(path, name)
 
 
 @pytest.mark.parametrize(
@@ -265,7 +267,7 @@ def test_an_unknown_layout_or_an_ending_that_does_not_fit_it_is_told(path, name,
     [((-1.0, 2.0), 1.0), ((0.0, 1.0), 3.0), ((-0.5, 1.5), 1.5), ((2.5,), 0.5), ((), 100.0)],
 )
 def test_what_a_renderer_reaches_is_accepted(positions, strength):
-    check_reach(positions, strength)
+    check_positions(positions, strength)
 
 
 @pytest.mark.parametrize(
@@ -280,14 +282,14 @@ def test_what_a_renderer_reaches_is_accepted(positions, strength):
 )
 def test_what_no_renderer_reaches_is_told(positions, strength, found):
     with pytest.raises(StereoweaveError, match=f"expected -1 to 2 .*, {found}"):
-        check_reach(positions, strength)
+        check_positions(positions, strength)
 
 
 def test_the_middle_of_a_scene_is_where_half_of_the_confidence_is_nearer():
     disparity_px, confidence = np.array([[1.0, 100, 6, 7, 5]]), np.array([[1.0, 0.1, 0.1, 0.1, 1]])
     # In order 1, 5, 6, 7, 100 px: half of the sum, 1.15, is reached at 5 px.
-    assert middle_px(estimate_of(disparity_px, confidence)) == 5
-    assert middle_px(estimate_of(disparity_px, np.zeros((1, 5)))) == 6
+    assert median_disparity_px(estimate_of(disparity_px, confidence)) == 5
+    assert median_disparity_px(estimate_of(disparity_px, np.zeros((1, 5)))) == 6
 
 
 def test_an_mpo_file_holds_two_pictures_the_left_eye_s_first(tmp_path, wall):

@@ -26,7 +26,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from service_examples import BOTH, CALIB, EXAMPLES, Sender, malformed
 
 import stereoweave as sw
-from stereoweave.cameras.calibration_files import calibrated
+from stereoweave.cameras.calibration_files import add_camera
 from stereoweave.cli.root import main
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import read_disparity_png, read_image, read_pair, read_pfm, write_image
@@ -124,7 +124,7 @@ def test_a_pair_gets_the_disparity_that_the_library_finds(service, estimate, tmp
 
 
 def test_a_pair_and_its_calibration_get_depth_in_metres(service, estimate, photos, tmp_path):
-    camera = calibrated(sw.StereoPair(left=photos[0], right=photos[1]), EXAMPLES / "calib.txt").camera
+    camera = add_camera(sw.StereoPair(left=photos[0], right=photos[1]), EXAMPLES / "calib.txt").camera
     response = post(service, "/depth", {**BOTH, "calib": CALIB}, file="npy")
     depth_m = np.load(saved(response, tmp_path / "depth.npy"), allow_pickle=False)
     np.testing.assert_allclose(depth_m, camera.depth_m(estimate.disparity_px), rtol=1e-3)

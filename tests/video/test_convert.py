@@ -19,7 +19,7 @@ from stereoweave.cli.root import main
 from stereoweave.io.colormap import colour_disparity
 from stereoweave.io.files import read_image, write_image
 from stereoweave.matching.matcher import Matcher
-from stereoweave.rendering.layouts import LAYOUTS, Choices
+from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import StereoPair
 from stereoweave.video.reader import Footage, StereoFrame, open_footage
@@ -113,7 +113,7 @@ def test_a_layout_is_what_it_is_of_a_still_and_viewers_know_it_by_its_name(tmp_p
     first = next(open_footage([film]).frames())
     pair = StereoPair(left=first.left, right=first.right)
     renderer = Renderer(pair, estimate_of(first), strength=1.5, convergence_px=12.0)
-    still = LAYOUTS[name].compose(renderer, Choices())
+    still = LAYOUTS[name].compose(renderer, LayoutOptions())
     made = tmp_path / f"out{LAYOUTS[name].mark}.mp4"
     assert np.abs(rgb_of(made)[0].astype(int) - still).mean() < 6
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["in.mp4", made.name])

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from stereoweave.data.packing import packed
+from stereoweave.data.packing import pack
 from stereoweave.data.shards import write_shard
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import SMALLEST_SIDE_PX, make_folder
@@ -45,4 +45,4 @@ def write_collages(out: Path, pairs: int, seed: int, size_px: tuple[int, int]) -
 
 def _pack_collages(seed: int, numbers: range, size_px: tuple[int, int]) -> Iterator[dict[str, bytes]]:
     for number in numbers:
-        yield packed(paint_collage(seed, 0, number, *size_px), views={})
+        yield pack(paint_collage(seed, 0, number, *size_px), views={})

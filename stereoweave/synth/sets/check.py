@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from rich.console import Console
 
-from stereoweave.data.paper_layout import check_frame, paper
+from stereoweave.data.paper_layout import check_frame, list_paper
 from stereoweave.data.shards import Shards
 from stereoweave.errors import FormatError
 from stereoweave.stereo import Sample
@@ -159,7 +159,7 @@ def _open_pairs(folder: Path, layout: str, scene: str) -> _Pairs:
 
         files = [shard.path.name for shard in shards.shards for _ in range(shard.first, shard.last + 1)]
         return _Pairs([shards.name(index) for index in range(shards.count)], files, unpack)
-    frames = paper(folder)
+    frames = list_paper(folder)
 
     def read(index: int) -> Sample:
         check_frame(folder, frames[index].name)

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from rich.console import Console
 
-from stereoweave.data.packing import packed
-from stereoweave.data.paper_layout import remove_unfinished, whole_frames, write_frame
+from stereoweave.data.packing import pack
+from stereoweave.data.paper_layout import list_complete_frames, remove_unfinished, write_frame
 from stereoweave.data.shards import list_shards, write_shard
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.files import SMALLEST_SIDE_PX, make_folder, reading, remove_leftovers, replacing
@@ -279,7 +279,7 @@ def _make_run(spec: RenderSpec, out: Path, layout: str, pair_maker: PairMaker, r
 
 
 def _write_shard(out: Path, scene: str, run: Sequence[int], pairs: Iterator[RenderedPair]) -> None:
-    packs = [packed(pair.sample, {place: shot.image for place, shot in pair.views}) for pair in pairs]
+    packs = [pack(pair.sample, {place: shot.image for place, shot in pair.views}) for pair in pairs]
     write_shard(out, scene, run[0], packs)
 
 
@@ -293,7 +293,7 @@ def _pairs_in_shards(out: Path, scene: str) -> set[int]:
 
 
 def _pairs_in_frames(out: Path, scene: str) -> set[int]:
-    names = (name.rpartition("/") for name in whole_frames(out))
+    names = (name.rpartition("/") for name in list_complete_frames(out))
     return {int(number) for folder, _, number in names if folder == scene}
 
 

@@ -13,7 +13,7 @@ from experiments.ablations import experiment as ablations
 from experiments.ablations.__main__ import main
 from experiments.ablations.experiment import BASE, VARIATIONS, fingerprint, plan, run_ablations
 from experiments.ablations.networks import VARIANTS
-from stereoweave.data.packing import packed
+from stereoweave.data.packing import pack
 from stereoweave.data.shards import write_shard
 from stereoweave.learn import checkpoint
 from stereoweave.learn.data.sources import VALIDATION_SEED
@@ -60,7 +60,7 @@ def rendered(tmp_path):
     folder = tmp_path / "rendered"
     folder.mkdir()
     sample = replace(box_before_a_wall(np.random.default_rng(0)), camera=CAMERA)
-    write_shard(folder, "rooms", 0, [packed(sample, {})])
+    write_shard(folder, "rooms", 0, [pack(sample, {})])
     return folder
 
 

@@ -7,7 +7,7 @@ from dataset_examples import shades, write_map, write_picture
 from learn_examples import CAMERA, PAIR_SIZE, RECIPE, box_before_a_wall, complaint, keep_pairs
 from rich.console import Console
 
-from stereoweave.data.packing import packed
+from stereoweave.data.packing import pack
 from stereoweave.data.shards import Shards, write_shard
 from stereoweave.learn.data import pair_cache as the_pairs
 from stereoweave.learn.data.batches import Batches
@@ -50,7 +50,7 @@ def rendered(tmp_path_factory):
     for folder, count in (("rooms", 6), ("scenes/ship", 2), ("scenes/crane", 4)):
         (root / folder).mkdir(parents=True)
         samples = (box_before_a_wall(np.random.default_rng((count, i))) for i in range(count))
-        pairs = [packed(replace(sample, camera=CAMERA), {}) for sample in samples]
+        pairs = [pack(replace(sample, camera=CAMERA), {}) for sample in samples]
         write_shard(root / folder, Path(folder).name, 0, pairs)
     return root
 

@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 from shard_examples import CAMERA, box_before_a_wall
 
-from stereoweave.data.packing import packed, unpacked
+from stereoweave.data.packing import pack, unpack
 from stereoweave.data.paper_layout import write_frame
 from stereoweave.data.samples import make_sample
 from stereoweave.data.shards import write_shard
@@ -30,7 +30,7 @@ def folder(request, tmp_path):
     (tmp_path / "set.json").write_text(FACTS.replace("LAYOUT", request.param))
     samples = [box_before_a_wall(np.random.default_rng(number)) for number in range(3)]
     if request.param == "shards":
-        write_shard(tmp_path, "pylon", 0, [packed(sample, {}) for sample in samples])
+        write_shard(tmp_path, "pylon", 0, [pack(sample, {}) for sample in samples])
     else:
         for number, sample in enumerate(samples):
             write_frame(tmp_path, f"pylon/{number:06d}", sample)
@@ -99,7 +99,7 @@ def rendered_pairs():
         renderer = shared_renderer(plain=True)
     orders = [RenderSpec(scene=scene, size_px=(160, 120)) for scene in SCENES_IN_SMALL]
     orders += [RenderSpec(scene=scene, size_px=(64, 48)) for scene in SCENES_IN_SMALL[:2]]
-    return [unpacked(packed(render_pair(renderer, spec, 0).sample, {})) for spec in orders]
+    return [unpack(pack(render_pair(renderer, spec, 0).sample, {})) for spec in orders]
 
 
 def shifted(sample, shift_px):
@@ -186,7 +186,7 @@ def test_pairs_that_are_wrong_in_themselves_are_named(tmp_path):
     (tmp_path / "set.json").write_text(FACTS.replace("LAYOUT", "shards"))
     samples = [box_before_a_wall(np.random.default_rng(number)) for number in range(3)]
     samples[1] = replace(samples[1], left=samples[0].left)
-    write_shard(tmp_path, "pylon", 0, [packed(sample, {}) for sample in samples])
+    write_shard(tmp_path, "pylon", 0, [pack(sample, {}) for sample in samples])
     (message,) = checked(tmp_path).problems
     assert message.startswith(f"{tmp_path}: pylon-000001: expected the left picture to fit")
 
