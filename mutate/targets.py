@@ -61,7 +61,7 @@ TARGETS = {
             "cameras/test_hostile_calibrations.py",
             "io/test_structured_text.py",
             "data/test_readers.py",
-            "cameras/test_boards.py",
+            "cameras/test_calibrate.py",
             "cameras/test_rectify.py",
             "cli/test_rig.py",
         ),

@@ -112,7 +112,7 @@ def calibrate(  # noqa: PLR0913 - each is a word of the command line
 ) -> None:
     """How two cameras see and stand, from pictures of a board; how well it is known, in plain words."""
     from stereoweave.cameras.boards import Board
-    from stereoweave.cameras.boards import calibrate as calibrate_by
+    from stereoweave.cameras.calibrate import calibrate as calibrate_by
     from stereoweave.cameras.calibration_files import write_rig
 
     match = re.fullmatch(r"(\d+)x(\d+)", board)

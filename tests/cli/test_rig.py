@@ -1,4 +1,4 @@
-"""The commands check and rectify; calibrate has its test in test_boards.py, where the boards are."""
+"""The commands check and rectify; calibrate has its test in test_calibrate.py, where the boards are."""
 
 import json
 from pathlib import Path

@@ -18,7 +18,8 @@ from PIL import Image
 import stereoweave
 from stereoweave.app import session as page_kept
 from stereoweave.bench.view_scenes import list_view_scenes
-from stereoweave.cameras import boards
+from stereoweave.cameras.boards import Board
+from stereoweave.cameras.calibrate import calibrate
 from stereoweave.cli.root import main
 from stereoweave.data.readers import list_scenes
 from stereoweave.errors import FormatError, StereoweaveError
@@ -136,7 +137,7 @@ def by_command(folder: Path, capsys: pytest.CaptureFixture[str]) -> str:
 
 def by_boards(folder: Path) -> str:
     with pytest.raises(StereoweaveError) as caught:
-        boards.calibrate(folder, boards.Board(columns=9, rows=6, square_m=0.025))
+        calibrate(folder, Board(columns=9, rows=6, square_m=0.025))
     return str(caught.value)
 
 

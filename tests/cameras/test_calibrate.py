@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 from rig_examples import Cameras, Plane, fisheye, pinhole, rig_of, turned
 
-from stereoweave.cameras import boards
-from stereoweave.cameras.boards import Board
+from stereoweave.cameras.boards import Board, ViewCorners, reorder_corners
+from stereoweave.cameras.calibrate import Calibration, calibrate, find_pairs
 from stereoweave.cameras.calibration_files import read_rig, write_rig
 from stereoweave.cli.root import main
 from stereoweave.errors import StereoweaveError
@@ -81,7 +81,7 @@ def copied(charucos, tmp_path):
 
 def test_the_rig_that_took_the_pictures_is_found(taken, tmp_path):
     folder, board, rig = taken
-    found = boards.calibrate(folder, board, fisheye=rig.left.fisheye)
+    found = calibrate(folder, board, fisheye=rig.left.fisheye)
     for one, other in ((found.rig.left, rig.left), (found.rig.right, rig.right)):
         np.testing.assert_allclose(np.diag(one.matrix), np.diag(other.matrix), rtol=0.005)
     assert found.rig.baseline_m == pytest.approx(rig.baseline_m, rel=0.005)
@@ -94,7 +94,7 @@ def test_the_rig_that_took_the_pictures_is_found(taken, tmp_path):
 
 
 def test_what_was_found_is_told_in_plain_words(charucos):
-    told = boards.calibrate(charucos, CHARUCO).lines()
+    told = calibrate(charucos, CHARUCO).lines()
     assert told[0].startswith("left camera: focal length 5") and told[0].endswith("640x480 px")
     assert "turned by 2.6" in told[1]
     assert "reprojection error 0." in told[2]
@@ -119,7 +119,7 @@ def test_a_bad_pair_is_named_and_the_rest_go_on(copied):
     with Image.open(copied / "right" / "04.png") as picture:
         smaller = picture.resize((320, 240))
     smaller.save(copied / "right" / "04.png")
-    found = boards.calibrate(copied, CHARUCO)
+    found = calibrate(copied, CHARUCO)
     assert set(found.left_out) == {f"left/{number}.png" for number in ("01", "02", "04", "99")}
     assert "no board was found in the right picture" in found.left_out["left/01.png"]
     assert "02.png" in found.left_out["left/02.png"]
@@ -134,7 +134,7 @@ def test_a_pair_in_motion_is_dropped(copied):
     with Image.open(copied / "right" / "05.png") as picture:
         shifted = np.roll(np.asarray(picture), 6, axis=0)
     Image.fromarray(shifted).save(copied / "right" / "05.png")
-    found = boards.calibrate(copied, CHARUCO)
+    found = calibrate(copied, CHARUCO)
     assert list(found.left_out) == ["left/05.png"]
     assert "times as much as the other pairs" in found.left_out["left/05.png"]
 
@@ -144,7 +144,7 @@ def test_pairs_of_another_size_than_most_are_left_out(copied):
         with Image.open(copied / side / "08.png") as picture:
             larger = picture.resize((1280, 960))
         larger.save(copied / side / "08.png")
-    found = boards.calibrate(copied, CHARUCO)
+    found = calibrate(copied, CHARUCO)
     assert found.left_out == {"left/08.png": "of 1280x960, where most are of 640x480"}
 
 
@@ -158,7 +158,7 @@ def test_pairs_are_known_by_their_names(tmp_path, names):
             path.parent.mkdir(exist_ok=True)
             path.touch()
     (tmp_path / "notes.txt").touch()
-    pairs, left_out = boards._find_pairs(tmp_path)
+    pairs, left_out = find_pairs(tmp_path)
     assert [[str(path.relative_to(tmp_path)) for path in pair] for pair in pairs.values()] == [
         [name.format(number) for name in names] for number in ("01", "02")
     ]
@@ -170,7 +170,7 @@ def test_another_board_than_the_one_named_is_refused(charucos):
     with pytest.raises(
         StereoweaveError, match=r"7x5 squares \(DICT_6X6_50\) .* found it in 0 of 10"
     ) as caught:
-        boards.calibrate(charucos, other)
+        calibrate(charucos, other)
     assert "\n" not in str(caught.value)
 
 
@@ -178,14 +178,14 @@ def test_too_few_pairs_are_refused(copied):
     for number in range(4, 10):
         (copied / "left" / f"{number:02}.png").unlink()
     with pytest.raises(StereoweaveError, match="at least 5 pairs, found it in 4 of 4"):
-        boards.calibrate(copied, CHARUCO)
+        calibrate(copied, CHARUCO)
 
 
 @pytest.mark.parametrize("name", ["nowhere", "empty"])
 def test_a_folder_without_pairs_is_refused(tmp_path, name):
     (tmp_path / "empty").mkdir()
     with pytest.raises(StereoweaveError, match=f"{name}: expected .*, found none"):
-        boards.calibrate(tmp_path / name, CHESSBOARD)
+        calibrate(tmp_path / name, CHESSBOARD)
 
 
 @pytest.mark.parametrize(
@@ -215,7 +215,7 @@ def judged(**change):
         "used": tuple(f"{number}.png" for number in range(18)),
         "left_out": {},
     }
-    return boards.Calibration(**(sound | change)).verdict
+    return Calibration(**(sound | change)).verdict
 
 
 def test_the_verdict_says_how_good_it_is_and_what_to_do():
@@ -240,7 +240,7 @@ def test_pictures_that_do_not_tell_how_a_lens_sees_are_refused_in_one_line(tmp_p
         write_image(tmp_path / f"left{number}.png", pair.left)
         write_image(tmp_path / f"right{number}.png", pair.right)
     with pytest.raises(StereoweaveError, match="5 pairs from which OpenCV cannot") as caught:
-        boards.calibrate(tmp_path, CHARUCO, fisheye=True)
+        calibrate(tmp_path, CHARUCO, fisheye=True)
     assert "\n" not in str(caught.value)
 
 
@@ -251,6 +251,6 @@ def test_a_chessboard_that_was_counted_from_another_corner_is_turned_back():
         numbers = np.arange(len(left_px))
         for turn in turns:
             grid = (left_px - (40, 3)).reshape(board.rows, board.columns, 2)
-            there = boards._ViewCorners(numbers, np.rot90(grid, turn).reshape(-1, 2))
-            ordered = boards._reorder(boards._ViewCorners(numbers, left_px), there, board)
+            there = ViewCorners(numbers, np.rot90(grid, turn).reshape(-1, 2))
+            ordered = reorder_corners(ViewCorners(numbers, left_px), there, board)
             np.testing.assert_allclose(ordered.at_px, left_px - (40, 3))

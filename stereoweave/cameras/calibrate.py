@@ -1,0 +1,352 @@
+"""Pictures of a chessboard or ChArUco board become the calibration of the two cameras that took them."""
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from stereoweave.cameras.boards import Board, PairCorners, find_pair_corners
+from stereoweave.cameras.rig import Optics, Rig, Size, format_size
+from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.io.decoding import ENDINGS
+from stereoweave.io.files import read_image
+
+FEWEST_PAIRS = 5
+# A pair this many times as far off as the middle one has a corner misread, or was taken in motion.
+_OUTLIER = 3.0
+_GOOD_PX, _FAIR_PX = 0.5, 1.0
+_GOOD_COVER_PERCENT, _FAIR_COVER_PERCENT = 60, 40
+_GOOD_PAIRS, _GOOD_TILT_DEGREES = 10, 15
+_SIDE = re.compile(r"(?<![a-z])(left|right|cam0|cam1|l|r)(?![a-z])", re.IGNORECASE)
+_LEFT_WORDS = {"left", "cam0", "l"}
+# OpenCV 4 has its flags for fisheye lenses apart.
+_FISHEYE_FLAGS: Any = cv2 if hasattr(cv2, "CALIB_FIX_SKEW") else cv2.fisheye
+_ITERATIONS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-7)
+
+
+class _Solution(NamedTuple):
+    """A rig, how each pair's board was turned for the left camera (rotation vectors), and the errors.
+
+    errors_px: for each pair the RMS distance of its corners from where the rig expects them, left and right.
+    """
+
+    rig: Rig
+    turns: list[np.ndarray]
+    errors_px: Float[np.ndarray, "pairs 2"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """A rig that was calibrated, and how well.
+
+    Attributes:
+        rig: The two cameras.
+        left_error_px, right_error_px: RMS distance of corners from where the rig expects them.
+        epipolar_error_px: Median distance of a right corner from the line on which its left one puts it.
+        cover_percent: The share of the picture where a board was, in the view that has less.
+        tilt_degrees: How far the most tilted board was turned away from the camera.
+        used: The pairs that it comes from.
+        left_out: The pictures and pairs that were not used, and why.
+    """
+
+    rig: Rig
+    left_error_px: float
+    right_error_px: float
+    epipolar_error_px: float
+    cover_percent: float
+    tilt_degrees: float
+    used: tuple[str, ...]
+    left_out: Mapping[str, str]
+
+    @property
+    def error_px(self) -> float:
+        """RMS distance over the corners of both views."""
+        return float(np.sqrt((self.left_error_px**2 + self.right_error_px**2) / 2))
+
+    @property
+    def verdict(self) -> str:
+        """In one line: good, fair or poor, and what to do where it is not good."""
+        faults = list(self._faults())
+        told = f"{self.error_px:.2f} px over {len(self.used)} pairs"
+        if not faults:
+            return f"good: {told}"
+        poor = any(is_poor for is_poor, _ in faults)
+        return f"{'poor' if poor else 'fair'}: {told}; " + "; ".join(fault for _, fault in faults)
+
+    def _faults(self) -> Iterator[tuple[bool, str]]:
+        """Whether it spoils the calibration, and what it is and how it is mended."""
+        if self.rig.translation_m[0] > 0:
+            yield True, "the left and the right pictures are swapped: rename them"
+        if self.error_px > _GOOD_PX:
+            yield (
+                self.error_px > _FAIR_PX,
+                "corners are far from where they should be: take sharp pictures at one moment with both "
+                "cameras, of a board that is flat",
+            )
+        if self.cover_percent < _GOOD_COVER_PERCENT:
+            yield (
+                self.cover_percent < _FAIR_COVER_PERCENT,
+                f"corners cover only {self.cover_percent:.0f} % of the picture: add pictures with the board "
+                "near the edges",
+            )
+        if self.tilt_degrees < _GOOD_TILT_DEGREES:
+            yield True, f"no board is tilted by {_GOOD_TILT_DEGREES} degrees: add pictures of a tilted board"
+        if len(self.used) < _GOOD_PAIRS:
+            yield False, f"{_GOOD_PAIRS} pairs or more make it surer"
+
+    def lines(self) -> list[str]:
+        """What a user should know of it, in plain words."""
+        fx, fy = (self.rig.left.matrix[axis, axis] for axis in (0, 1))
+        return [
+            *(f"{name}: left out, {why}" for name, why in self.left_out.items()),
+            f"left camera: focal length {fx:.1f} x {fy:.1f} px, {format_size(self.rig.size_px)} px",
+            f"baseline {1000 * self.rig.baseline_m:.2f} mm, cameras turned by "
+            f"{self.rig.rotation_degrees:.2f} degrees against each other",
+            f"reprojection error {self.error_px:.2f} px (left {self.left_error_px:.2f}, right "
+            f"{self.right_error_px:.2f}), epipolar error {self.epipolar_error_px:.2f} px (median)",
+            f"boards cover {self.cover_percent:.0f} % of the picture, tilted by up to "
+            f"{self.tilt_degrees:.0f} degrees",
+            self.verdict,
+        ]
+
+
+def calibrate(
+    folder: str | Path,
+    board: Board,
+    *,
+    fisheye: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Calibration:
+    """The rig that took the pictures of a board in a folder.
+
+    Pairs are known by their names: left and right, L and R, or cam0 and cam1, in the file's name or in its
+    folder's, the rest being alike: left/01.png and right/01.png, left01.png and right01.png, 01_L.png and
+    01_R.png. A pair without the board in both pictures, with a damaged picture, or three times as far off as
+    the others, is left out and named.
+
+    Args:
+        folder: Where the pictures are.
+        board: What is on them.
+        fisheye: Whether the lenses are fisheye ones, of Kannala and Brandt's model; else pinhole ones with
+            the distortion k1 k2 p1 p2 k3.
+        progress: Called with the name of each pair before the board is sought in it.
+
+    Raises:
+        StereoweaveError: No such folder, or fewer than FEWEST_PAIRS pairs that can be used.
+    """
+    pairs, left_out = find_pairs(Path(folder))
+    seen, size_px = _find_all_corners(pairs, board, left_out, progress)
+    _check_enough(len(seen), len(pairs), board, left_out)
+    solve = _solve_fisheye if fisheye else _solve_pinhole
+    while True:
+        try:
+            solution = solve(board.corners_m(), seen, size_px)
+        except cv2.error as error:
+            raise StereoweaveError(
+                f"{folder}: expected pictures that tell how the lenses see, found {len(seen)} pairs from "
+                f"which OpenCV cannot ({error.err}); add pictures with the board near the edges, and tilted"
+            ) from error
+        worst_px = solution.errors_px.max(axis=1)
+        far = worst_px > _OUTLIER * np.median(worst_px)
+        if not far.any():
+            rig = replace(solution.rig, name=str(folder))
+            return _judge(solution._replace(rig=rig), seen, left_out)
+        for index in np.flatnonzero(far):
+            off = f"{worst_px[index]:.2f} px off, over {_OUTLIER:g} times as much as the other pairs"
+            left_out[seen[index].name] = off
+        seen = [pair for pair, is_far in zip(seen, far, strict=True) if not is_far]
+        _check_enough(len(seen), len(pairs), board, left_out)
+
+
+def _check_enough(count: int, total: int, board: Board, left_out: Mapping[str, str]) -> None:
+    if count >= FEWEST_PAIRS:
+        return
+    example = next((f" ({name}: {why})" for name, why in left_out.items()), "")
+    raise StereoweaveError(
+        f"expected {board} in both pictures of at least {FEWEST_PAIRS} pairs, found it in {count} of {total}"
+        f"{example}; count the board anew, or take more pictures of the whole board in both views"
+    )
+
+
+def find_pairs(folder: Path) -> tuple[dict[str, tuple[Path, Path]], dict[str, str]]:
+    """Left and right picture by the name of their pair, and the pictures that have no partner."""
+    if not folder.is_dir():
+        raise StereoweaveError(f"{folder}: expected a folder with pictures of a board, found none")
+    sides: dict[str, dict[bool, Path]] = {}
+    for path in sorted(folder.rglob("*")):
+        relative = path.relative_to(folder).with_suffix("").as_posix()
+        marks = _SIDE.findall(relative)
+        if path.suffix.lower() in ENDINGS and marks:
+            sides.setdefault(_SIDE.sub("*", relative), {})[marks[-1].lower() in _LEFT_WORDS] = path
+    pairs = {str(key): (found[True], found[False]) for key, found in sides.items() if len(found) == 2}
+    single = {
+        str(path.relative_to(folder)): "its partner of the other camera is missing"
+        for found in sides.values()
+        for path in found.values()
+        if len(found) == 1
+    }
+    if not pairs:
+        raise StereoweaveError(
+            f"{folder}: expected pairs of pictures such as left/01.png and right/01.png or 01_L.png and "
+            f"01_R.png, found none among {len(list(folder.rglob('*')))} files"
+        )
+    return {left.relative_to(folder).as_posix(): (left, right) for left, right in pairs.values()}, single
+
+
+def _find_all_corners(
+    pairs: Mapping[str, tuple[Path, Path]],
+    board: Board,
+    left_out: dict[str, str],
+    progress: Callable[[str], None],
+) -> tuple[list[PairCorners], Size]:
+    """The corners of every pair that shows the board, of the size that most pictures have."""
+    seen: list[tuple[PairCorners, Size]] = []
+    for name, paths in pairs.items():
+        progress(name)
+        try:
+            left, right = (cv2.cvtColor(read_image(path), cv2.COLOR_RGB2GRAY) for path in paths)
+            seen.append((find_pair_corners(name, left, right, board), (left.shape[1], left.shape[0])))
+        except FormatError as error:
+            left_out[name] = str(error)
+    if not seen:
+        return [], (0, 0)
+    size_px = Counter(size for _, size in seen).most_common(1)[0][0]
+    for pair, found_px in seen:
+        if found_px != size_px:
+            left_out[pair.name] = f"of {format_size(found_px)}, where most are of {format_size(size_px)}"
+    return [pair for pair, found_px in seen if found_px == size_px], size_px
+
+
+def _solve_pinhole(
+    corners_m: Float[np.ndarray, "m 3"], seen: Sequence[PairCorners], size_px: Size
+) -> _Solution:
+    boards = [corners_m[pair.corners].astype(np.float32) for pair in seen]
+    left, right = ([points.astype(np.float32) for points in side] for side in _split_sides(seen))
+    start = [
+        cv2.calibrateCamera(boards, points, size_px, None, None, criteria=_ITERATIONS)[1:3]
+        for points in (left, right)
+    ]
+    _, k1, d1, k2, d2, rotation, translation, _, _, turns, places, _ = cv2.stereoCalibrateExtended(
+        boards, left, right, *start[0], *start[1], size_px, np.eye(3), np.zeros(3),
+        flags=cv2.CALIB_USE_INTRINSIC_GUESS, criteria=_ITERATIONS,
+    )  # fmt: skip
+    lenses = [Optics(matrix=k, distortion=d.ravel()) for k, d in ((k1, d1), (k2, d2))]
+    return _measure_solution(
+        corners_m, seen, _make_rig(lenses, rotation, translation, size_px), turns, places
+    )
+
+
+def _solve_fisheye(
+    corners_m: Float[np.ndarray, "m 3"], seen: Sequence[PairCorners], size_px: Size
+) -> _Solution:
+    boards = [corners_m[pair.corners].reshape(1, -1, 3) for pair in seen]
+    left, right = ([points.reshape(1, -1, 2) for points in side] for side in _split_sides(seen))
+    flags = _FISHEYE_FLAGS.CALIB_RECOMPUTE_EXTRINSIC | _FISHEYE_FLAGS.CALIB_FIX_SKEW
+    start = [
+        cv2.fisheye.calibrate(
+            boards, points, size_px, np.zeros((3, 3)), np.zeros(4), flags=flags, criteria=_ITERATIONS
+        )[1:3]
+        for points in (left, right)
+    ]
+    # OpenCV's function for both cameras wants as many corners of every pair: some are counted twice.
+    most = max(len(pair.corners) for pair in seen)
+    again = [np.arange(most) % len(pair.corners) for pair in seen]
+    boards, left, right = (
+        [points[:, some] for points, some in zip(side, again, strict=True)] for side in (boards, left, right)
+    )
+    _, k1, d1, k2, d2, rotation, translation, turns, places = cv2.fisheye.stereoCalibrate(
+        boards, left, right, *start[0], *start[1], size_px,
+        flags=_FISHEYE_FLAGS.CALIB_FIX_SKEW | _FISHEYE_FLAGS.CALIB_USE_INTRINSIC_GUESS, criteria=_ITERATIONS,
+    )  # fmt: skip
+    lenses = [Optics(matrix=k, distortion=d.ravel(), fisheye=True) for k, d in ((k1, d1), (k2, d2))]
+    return _measure_solution(
+        corners_m, seen, _make_rig(lenses, rotation, translation, size_px), turns, places
+    )
+
+
+def _split_sides(seen: Sequence[PairCorners]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    return [pair.left_px for pair in seen], [pair.right_px for pair in seen]
+
+
+def _make_rig(lenses: Sequence[Optics], rotation: np.ndarray, translation: np.ndarray, size_px: Size) -> Rig:
+    left, right = lenses
+    return Rig(left=left, right=right, rotation=rotation, translation_m=translation.ravel(), size_px=size_px)
+
+
+def _measure_solution(
+    corners_m: Float[np.ndarray, "m 3"],
+    seen: Sequence[PairCorners],
+    rig: Rig,
+    turns: Sequence[np.ndarray],
+    places: Sequence[np.ndarray],
+) -> _Solution:
+    errors_px = np.zeros((len(seen), 2))
+    for index, (pair, turn, place) in enumerate(zip(seen, turns, places, strict=True)):
+        for_left = corners_m[pair.corners] @ cv2.Rodrigues(turn)[0].T + place.ravel()
+        for_right = for_left @ rig.rotation.T + rig.translation_m
+        for side, (optics, points_m, at_px) in enumerate(
+            ((rig.left, for_left, pair.left_px), (rig.right, for_right, pair.right_px))
+        ):
+            off_px = _project(optics, points_m) - at_px
+            errors_px[index, side] = np.sqrt((off_px**2).sum(axis=1).mean())
+    return _Solution(rig, list(turns), errors_px)
+
+
+def _project(optics: Optics, points_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    project = cv2.fisheye.projectPoints if optics.fisheye else cv2.projectPoints
+    args = np.zeros(3), np.zeros(3), optics.matrix, optics.distortion
+    return project(points_m.reshape(-1, 1, 3), *args)[0].reshape(-1, 2)
+
+
+def _judge(solution: _Solution, seen: Sequence[PairCorners], left_out: Mapping[str, str]) -> Calibration:
+    rig = solution.rig
+    assert rig.size_px is not None
+    counts = np.array([len(pair.corners) for pair in seen])
+    left_px, right_px = np.sqrt((solution.errors_px**2 * counts[:, None]).sum(axis=0) / counts.sum())
+    return Calibration(
+        rig=rig,
+        left_error_px=float(left_px),
+        right_error_px=float(right_px),
+        epipolar_error_px=_measure_epipolar_error_px(rig, seen),
+        cover_percent=min(_measure_cover_percent(points, rig.size_px) for points in _split_sides(seen)),
+        tilt_degrees=max(map(_measure_tilt_degrees, solution.turns)),
+        used=tuple(pair.name for pair in seen),
+        left_out=left_out,
+    )
+
+
+def _measure_epipolar_error_px(rig: Rig, seen: Sequence[PairCorners]) -> float:
+    left, right = (
+        _undistort(optics, np.concatenate(points))
+        for optics, points in zip((rig.left, rig.right), _split_sides(seen), strict=True)
+    )
+    # A left direction, seen from the right camera, lies in the plane that is at a right angle to this one.
+    planes = np.cross(rig.translation_m, left @ rig.rotation.T)
+    off = np.abs((planes * right).sum(axis=1)) / np.linalg.norm(planes[:, :2], axis=1)
+    return float(np.median(off) * np.diag(rig.right.matrix)[:2].mean())
+
+
+def _undistort(optics: Optics, at_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    undistort = cv2.fisheye.undistortPoints if optics.fisheye else cv2.undistortPoints
+    ideal = undistort(at_px.reshape(-1, 1, 2), optics.matrix, optics.distortion).reshape(-1, 2)
+    return np.concatenate([ideal, np.ones((len(ideal), 1))], axis=1)
+
+
+def _measure_cover_percent(views: Sequence[Float[np.ndarray, "_ 2"]], size_px: Size) -> float:
+    """The share of the picture within the outlines of the boards."""
+    covered = np.zeros(size_px[::-1], np.uint8)
+    for at_px in views:
+        outline = cv2.convexHull(at_px.astype(np.float32))
+        cv2.fillConvexPoly(covered, np.rint(outline).astype(np.int32), 1)
+    return float(100 * covered.mean())
+
+
+def _measure_tilt_degrees(turn: Float[np.ndarray, "..."]) -> float:
+    """The angle between a board's normal and the camera's axis."""
+    return float(np.degrees(np.arccos(np.clip(abs(cv2.Rodrigues(turn)[0][2, 2]), 0, 1))))
