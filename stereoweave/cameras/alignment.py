@@ -1,4 +1,4 @@
-"""Whether two photographs are a rectified stereo pair: their defects, and the remedies."""
+"""Measurement of alignment defects of a stereo pair, with their remedies."""
 
 import math
 from dataclasses import dataclass
@@ -26,43 +26,43 @@ DEFECTS: tuple[Defect, ...] = get_args(Defect)
 SWAPPED = Note("left and right are swapped", Remedy("give them the other way round"))
 _RECTIFY = Remedy("rectify the pair", ("rectify",))
 
-# So far a vertical error is harmless; in pictures of more pixels it grows with their side.
+# Tolerated vertical error; it scales with the side of larger pictures.
 _TOLERATED_PX = 0.75
 _TOLERATED_DEGREES = 0.3
 _TOLERATED_STOPS = 0.58
 _PIXELS_OF_TOLERANCE = 1_500_000
 
-# Matches are right that miss the field of vertical errors by no more than this.
+# Inliers lie within this distance of the field of vertical errors.
 _RIGHT_PX = 1.5
 _FIRST_RIGHT_PX = 2.5
 _TRIALS, _POLISHING = 400, 6
 _LEAST_MATCHES, _LEAST_RIGHT_SHARE = 20, 0.2
-# A disparity counts that so many of a match's neighbours share.
+# A disparity counts if at least this many of a match's neighbours agree.
 _NEIGHBOURS, _LEAST_AGREEING = 8, 4
 _AGREE_PX, _AGREE_SHARE = 2.0, 0.05
 _OUTER_PERCENT = 1.0
 
-# Light is compared in such windows, by levels that neither photograph cuts off.
+# Exposure is compared in windows of this size, by levels that neither photograph clips.
 _LIGHT_WINDOW_PX = 7
 _BLACK_LEVEL, _WHITE_LEVEL = 8, 250
 _GAMMA = 2.2
 
-# How clearly occlusion must speak against what the signs of the disparities say by themselves.
+# Vote of the depth order needed to overrule the signs of the disparities.
 _CLEAR_VOTE = 0.15
 
 
 @dataclass(frozen=True, kw_only=True)
 class Alignment:
-    """What the places that two photographs share say about the pair.
+    """Alignment of a pair, measured at feature matches.
 
     Attributes:
-        matches: How many places were found in both.
-        vertical_error_px, vertical_error_95_px: Median and 95 % of how far apart their rows are.
-        vertical_shift_px: How much lower the right photograph lies, in its middle.
-        rotation_degrees: How far the right photograph is turned clockwise.
-        range_px: The least and the greatest disparity, without the outermost 1 %.
-        exposure_ratio: How many times as much light the right photograph got; NaN where it cannot be told.
-        defects: Names in `DEFECTS`; empty for a sound pair.
+        matches: Number of matches.
+        vertical_error_px, vertical_error_95_px: Median and 95th percentile of the vertical error.
+        vertical_shift_px: How much lower the right photograph is, at its centre.
+        rotation_degrees: Clockwise rotation of the right photograph.
+        range_px: Smallest and greatest disparity, without the outermost 1 %.
+        exposure_ratio: Exposure of the right photograph divided by the left one's; NaN if unknown.
+        defects: Defects found, names in `DEFECTS`; empty for a sound pair.
     """
 
     matches: int
@@ -135,7 +135,7 @@ class Alignment:
 
 
 def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]) -> Alignment:
-    """Defects of a pair, rectified or not; takes 0.1 to 0.2 s at 640x480."""
+    """Measure the alignment of a pair, rectified or not; takes 0.1 to 0.2 s at 640x480."""
     matches = find_matches(left, right)
     scale = max(1.0, (left.shape[0] * left.shape[1] / _PIXELS_OF_TOLERANCE) ** 0.5)
     count = len(matches.left_px)
@@ -145,7 +145,7 @@ def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3
         return _make_unrelated(count)
     right_ones, shift_px, slope, uneven_px = field
     matches = Matches(matches.left_px[right_ones], matches.right_px[right_ones])
-    # The sides of a turned picture move left and right as well.
+    # A rotation also moves the upper and lower parts of the picture sideways.
     disparity_px = matches.disparity_px - slope * (matches.right_px[:, 1] - centre_px[1])
     shared = _find_supported(matches, disparity_px, scale)
     disparity_px = disparity_px[shared]
@@ -157,7 +157,7 @@ def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3
     )
     least_px, greatest_px = _measure_range(disparity_px, negative_px)
     ratio = _measure_light_ratio(left, right, matches)
-    # A turn about another point than the middle of the right picture looks like a shift as well.
+    # A rotation about a point other than the centre of the right picture looks like a shift too.
     tolerated_px = scale * _TOLERATED_PX + abs(slope) * float(np.median(np.abs(disparity_px)))
     amiss = {
         "vertical_shift": abs(shift_px) > tolerated_px,
@@ -186,7 +186,7 @@ def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3
 def _measure_range(
     disparity_px: Float[np.ndarray, " n"], negative_px: Float[np.ndarray, " m"]
 ) -> tuple[float, float]:
-    """The least and the greatest disparity, without the outermost 1 %; negative ones if some are sure."""
+    """Smallest and greatest disparity, without the outermost 1 %; negative ones only if some are certain."""
     at_least_0 = disparity_px[disparity_px >= 0]
     counted_px = disparity_px if len(negative_px) or not len(at_least_0) else at_least_0
     least_px, greatest_px = np.percentile(counted_px, [_OUTER_PERCENT, 100 - _OUTER_PERCENT])
@@ -212,18 +212,18 @@ def _make_unrelated(matches: int) -> Alignment:
 def _fit_vertical_error(
     matches: Matches, centre_px: Float[np.ndarray, " 2"], scale: float
 ) -> tuple[Bool[np.ndarray, " n"], float, float, float] | None:
-    """Which matches are right, the shift in px, the slope, and how far in px the rest of the field goes.
+    """Fit the vertical error: returns inliers, shift in px, slope, and size of the remaining terms in px.
 
-    The vertical error is fitted as a field over the right picture: what is constant is a shift, what grows
-    along x a rotation; scale, pitch and convergence make the other terms of the second order. None where no
-    field explains enough of the matches.
+    The vertical error is a field over the right picture. Its constant term is a shift and its term in x a
+    rotation; scale, pitch and convergence give the other terms up to second order. None if no field
+    explains enough matches.
     """
     x, y = ((matches.right_px - centre_px) / centre_px[0]).T
     terms = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=1)
     lower_px = matches.lower_px
     right_ones = _find_plane_inliers(terms[:, :3], lower_px, scale * _FIRST_RIGHT_PX)
     for _ in range(_POLISHING):
-        # A tenth of a px for each unit of the terms keeps those small that few matches speak for.
+        # The ridge keeps terms small that few matches support.
         weights, ridge = terms[right_ones], 0.1 * np.eye(6)
         field = np.linalg.solve(weights.T @ weights + ridge, weights.T @ lower_px[right_ones])
         right_ones = np.abs(terms @ field - lower_px) <= scale * _RIGHT_PX
@@ -236,7 +236,7 @@ def _fit_vertical_error(
 def _find_plane_inliers(
     terms: Float[np.ndarray, "n 3"], values: Float[np.ndarray, " n"], tolerated: float
 ) -> Bool[np.ndarray, " n"]:
-    """Which values lie on the plane that, of many through three of them and of 0 everywhere, fits most."""
+    """Inliers of the best of many planes through three random values (RANSAC), or of the zero plane."""
     rng = np.random.default_rng(0)
     picked = rng.integers(0, len(values), (_TRIALS, 3))
     through = terms[picked]
@@ -251,7 +251,7 @@ def _find_plane_inliers(
 def _find_supported(
     matches: Matches, disparity_px: Float[np.ndarray, " n"], scale: float
 ) -> Bool[np.ndarray, " n"]:
-    """Which matches have a disparity that some of those around them have as well."""
+    """Matches whose disparity agrees with enough of their neighbours."""
     squared = (matches.left_px**2).sum(1)
     apart = squared[:, None] + squared - 2 * matches.left_px @ matches.left_px.T
     count = min(_NEIGHBOURS + 1, len(apart))
@@ -264,7 +264,7 @@ def _find_supported(
 def _measure_light_ratio(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], matches: Matches
 ) -> float:
-    """The right photograph's light divided by the left one's, in the median of the matches; NaN for none."""
+    """Median ratio of right to left exposure over the matches; NaN if too few are usable."""
     levels = _sample_levels(left, matches.left_px), _sample_levels(right, matches.right_px)
     told = np.logical_and(*((level > _BLACK_LEVEL) & (level < _WHITE_LEVEL) for level in levels))
     if told.sum() < _LEAST_MATCHES:
@@ -275,7 +275,7 @@ def _measure_light_ratio(
 def _sample_levels(
     photo: UInt8[np.ndarray, "h w 3"], places_px: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "3 n"]:
-    """Levels of the strongest channel around each place: dark, middle and bright, as one may be cut off."""
+    """Dark, middle and bright levels of the strongest channel around each point; some may be clipped."""
     offsets = np.arange(_LIGHT_WINDOW_PX) - _LIGHT_WINDOW_PX // 2
     height, width = photo.shape[:2]
     nearest = np.rint(places_px).astype(int)
@@ -292,7 +292,7 @@ def _shrink(photo: UInt8[np.ndarray, "h w 3"], scale: float) -> UInt8[np.ndarray
 
 
 def _level(photo: UInt8[np.ndarray, "h w 3"], shift_px: float, slope: float) -> UInt8[np.ndarray, "h w 3"]:
-    """The right photograph moved up and turned back."""
+    """Undo the vertical shift and the rotation of the right photograph."""
     height, width = photo.shape[:2]
     x, y = (width - 1) / 2, (height - 1) / 2
     source = np.array([[1, -slope, slope * y], [slope, 1, shift_px - slope * x]])

@@ -15,14 +15,14 @@ _FEWEST_CORNERS = 8
 
 @dataclass(frozen=True, kw_only=True)
 class Board:
-    """A printed board: a chessboard, or with a dictionary of markers a ChArUco board.
+    """A printed chessboard, or a ChArUco board if it has a dictionary of markers.
 
     Attributes:
-        columns, rows: Of a chessboard the inner corners, where four squares meet; of a ChArUco board the
-            squares, as OpenCV counts them.
+        columns, rows: Inner corners of a chessboard, where four squares meet; squares of a ChArUco board, as
+            OpenCV counts them.
         square_m: The side of a square.
         marker_m: The side of a ChArUco board's marker.
-        dictionary: The name of its markers, such as DICT_5X5_100.
+        dictionary: OpenCV's name of the marker dictionary, such as DICT_5X5_100.
     """
 
     columns: int
@@ -56,13 +56,13 @@ class Board:
         return f"a chessboard of {self.columns}x{self.rows} inner corners"
 
     def charuco(self) -> cv2.aruco.CharucoBoard:
-        """OpenCV's board, of one with markers."""
+        """The ChArUco board as an OpenCV object."""
         assert self.marker_m is not None
         markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, str(self.dictionary)))
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square_m, self.marker_m, markers)
 
     def corners_m(self) -> Float[np.ndarray, "n 3"]:
-        """Where every corner is on the board, row by row, in metres."""
+        """Corner positions on the board in metres, row by row."""
         if self.dictionary:
             return np.array(self.charuco().getChessboardCorners(), np.float64)
         down, across = np.mgrid[: self.rows, : self.columns].reshape(2, -1)
@@ -70,7 +70,7 @@ class Board:
 
 
 class PairCorners(NamedTuple):
-    """The corners that both pictures of a pair show: which of the board's, and where, x and y in px."""
+    """Corners visible in both pictures of a pair: their numbers on the board, and x and y in px."""
 
     name: str
     corners: Int[np.ndarray, " n"]
@@ -79,6 +79,8 @@ class PairCorners(NamedTuple):
 
 
 class ViewCorners(NamedTuple):
+    """Corners in one view: their numbers on the board, and x and y in px."""
+
     corners: Int[np.ndarray, " n"]
     at_px: Float[np.ndarray, "n 2"]
 
@@ -86,7 +88,7 @@ class ViewCorners(NamedTuple):
 def find_pair_corners(
     name: str, left: UInt8[np.ndarray, "h w"], right: UInt8[np.ndarray, "h2 w2"], board: Board
 ) -> PairCorners:
-    """The corners that are in both; FormatError where they are too few."""
+    """Find the corners visible in both pictures; raise FormatError if there are too few."""
     if left.shape != right.shape:
         sizes = [format_size(image.shape[::-1]) for image in (left, right)]
         raise FormatError(f"the left picture is of {sizes[0]}, the right one of {sizes[1]}")
@@ -123,7 +125,7 @@ def _find_charuco(image: UInt8[np.ndarray, "h w"], board: Board) -> ViewCorners 
 
 
 def reorder_corners(here: ViewCorners, there: ViewCorners, board: Board) -> ViewCorners:
-    """The right corners in the order of the left ones: a chessboard does not say which way up it is."""
+    """Bring the right corners into the order of the left ones, as a chessboard has no orientation mark."""
     grid = there.at_px.reshape(board.rows, board.columns, 2)
     turns = (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
     orders = [np.rot90(grid, turn).reshape(-1, 2) for turn in turns]

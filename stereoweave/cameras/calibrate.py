@@ -1,4 +1,4 @@
-"""Pictures of a chessboard or ChArUco board become the calibration of the two cameras that took them."""
+"""Stereo calibration from pictures of a chessboard or ChArUco board."""
 
 import re
 from collections import Counter
@@ -18,22 +18,22 @@ from stereoweave.io.decoding import ENDINGS
 from stereoweave.io.files import read_image
 
 FEWEST_PAIRS = 5
-# A pair this many times as far off as the middle one has a corner misread, or was taken in motion.
+# A pair whose error exceeds the median this many times has a misdetected corner, or was taken in motion.
 _OUTLIER = 3.0
 _GOOD_PX, _FAIR_PX = 0.5, 1.0
 _GOOD_COVER_PERCENT, _FAIR_COVER_PERCENT = 60, 40
 _GOOD_PAIRS, _GOOD_TILT_DEGREES = 10, 15
 _SIDE = re.compile(r"(?<![a-z])(left|right|cam0|cam1|l|r)(?![a-z])", re.IGNORECASE)
 _LEFT_WORDS = {"left", "cam0", "l"}
-# OpenCV 4 has its flags for fisheye lenses apart.
+# OpenCV 4 keeps the fisheye flags in cv2.fisheye.
 _FISHEYE_FLAGS: Any = cv2 if hasattr(cv2, "CALIB_FIX_SKEW") else cv2.fisheye
 _ITERATIONS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-7)
 
 
 class _Solution(NamedTuple):
-    """A rig, how each pair's board was turned for the left camera (rotation vectors), and the errors.
+    """A rig, each board's rotation vector relative to the left camera, and the errors.
 
-    errors_px: for each pair the RMS distance of its corners from where the rig expects them, left and right.
+    errors_px: RMS reprojection error of each pair, left and right.
     """
 
     rig: Rig
@@ -43,16 +43,16 @@ class _Solution(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """A rig that was calibrated, and how well.
+    """A calibrated rig and the quality of its calibration.
 
     Attributes:
         rig: The two cameras.
-        left_error_px, right_error_px: RMS distance of corners from where the rig expects them.
-        epipolar_error_px: Median distance of a right corner from the line on which its left one puts it.
-        cover_percent: The share of the picture where a board was, in the view that has less.
-        tilt_degrees: How far the most tilted board was turned away from the camera.
-        used: The pairs that it comes from.
-        left_out: The pictures and pairs that were not used, and why.
+        left_error_px, right_error_px: RMS reprojection error.
+        epipolar_error_px: Median distance of a right corner from the epipolar line of its left corner.
+        cover_percent: Share of the picture covered by boards, in the view with the smaller share.
+        tilt_degrees: Angle between the optical axis and the normal of the most tilted board.
+        used: Names of the pairs used.
+        left_out: Unused pictures and pairs with the reasons.
     """
 
     rig: Rig
@@ -66,21 +66,21 @@ class Calibration:
 
     @property
     def error_px(self) -> float:
-        """RMS distance over the corners of both views."""
+        """RMS reprojection error over both views."""
         return float(np.sqrt((self.left_error_px**2 + self.right_error_px**2) / 2))
 
     @property
     def verdict(self) -> str:
-        """In one line: good, fair or poor, and what to do where it is not good."""
+        """One line: good, fair or poor, with the remedies."""
         faults = list(self._faults())
-        told = f"{self.error_px:.2f} px over {len(self.used)} pairs"
+        summary = f"{self.error_px:.2f} px over {len(self.used)} pairs"
         if not faults:
-            return f"good: {told}"
+            return f"good: {summary}"
         poor = any(is_poor for is_poor, _ in faults)
-        return f"{'poor' if poor else 'fair'}: {told}; " + "; ".join(fault for _, fault in faults)
+        return f"{'poor' if poor else 'fair'}: {summary}; " + "; ".join(fault for _, fault in faults)
 
     def _faults(self) -> Iterator[tuple[bool, str]]:
-        """Whether it spoils the calibration, and what it is and how it is mended."""
+        """Yield each fault: whether it makes the calibration poor, and its description with the remedy."""
         if self.rig.translation_m[0] > 0:
             yield True, "the left and the right pictures are swapped: rename them"
         if self.error_px > _GOOD_PX:
@@ -101,7 +101,7 @@ class Calibration:
             yield False, f"{_GOOD_PAIRS} pairs or more make it surer"
 
     def lines(self) -> list[str]:
-        """What a user should know of it, in plain words."""
+        """The calibration's results for a user, line by line."""
         fx, fy = (self.rig.left.matrix[axis, axis] for axis in (0, 1))
         return [
             *(f"{name}: left out, {why}" for name, why in self.left_out.items()),
@@ -123,22 +123,22 @@ def calibrate(
     fisheye: bool = False,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Calibration:
-    """The rig that took the pictures of a board in a folder.
+    """Calibrate the rig from a folder of board pictures.
 
-    Pairs are known by their names: left and right, L and R, or cam0 and cam1, in the file's name or in its
-    folder's, the rest being alike: left/01.png and right/01.png, left01.png and right01.png, 01_L.png and
-    01_R.png. A pair without the board in both pictures, with a damaged picture, or three times as far off as
-    the others, is left out and named.
+    Pairs are matched by name: left and right, L and R, or cam0 and cam1, in the name of the file or of its
+    folder, with the rest equal: left/01.png and right/01.png, left01.png and right01.png, 01_L.png and
+    01_R.png. A pair is left out and reported if a picture is damaged or lacks the board, or if its error is
+    three times the median.
 
     Args:
-        folder: Where the pictures are.
-        board: What is on them.
-        fisheye: Whether the lenses are fisheye ones, of Kannala and Brandt's model; else pinhole ones with
-            the distortion k1 k2 p1 p2 k3.
-        progress: Called with the name of each pair before the board is sought in it.
+        folder: Folder of the pictures.
+        board: The printed board.
+        fisheye: Use the fisheye model of Kannala and Brandt in place of a pinhole with the distortion
+            k1 k2 p1 p2 k3.
+        progress: Called with the name of each pair before its corners are detected.
 
     Raises:
-        StereoweaveError: No such folder, or fewer than FEWEST_PAIRS pairs that can be used.
+        StereoweaveError: The folder does not exist, or has fewer than FEWEST_PAIRS usable pairs.
     """
     pairs, left_out = find_pairs(Path(folder))
     seen, size_px = _find_all_corners(pairs, board, left_out, progress)
@@ -175,7 +175,7 @@ def _check_enough(count: int, total: int, board: Board, left_out: Mapping[str, s
 
 
 def find_pairs(folder: Path) -> tuple[dict[str, tuple[Path, Path]], dict[str, str]]:
-    """Left and right picture by the name of their pair, and the pictures that have no partner."""
+    """Left and right pictures by the name of their pair, and the pictures without a partner."""
     if not folder.is_dir():
         raise StereoweaveError(f"{folder}: expected a folder with pictures of a board, found none")
     sides: dict[str, dict[bool, Path]] = {}
@@ -205,7 +205,7 @@ def _find_all_corners(
     left_out: dict[str, str],
     progress: Callable[[str], None],
 ) -> tuple[list[PairCorners], Size]:
-    """The corners of every pair that shows the board, of the size that most pictures have."""
+    """Find the corners in every pair; keep the pairs of the most common picture size."""
     seen: list[tuple[PairCorners, Size]] = []
     for name, paths in pairs.items():
         progress(name)
@@ -254,7 +254,7 @@ def _solve_fisheye(
         )[1:3]
         for points in (left, right)
     ]
-    # OpenCV's function for both cameras wants as many corners of every pair: some are counted twice.
+    # OpenCV's stereo function needs equally many corners in every pair, so some are counted twice.
     most = max(len(pair.corners) for pair in seen)
     again = [np.arange(most) % len(pair.corners) for pair in seen]
     boards, left, right = (
@@ -326,7 +326,7 @@ def _measure_epipolar_error_px(rig: Rig, seen: Sequence[PairCorners]) -> float:
         _undistort(optics, np.concatenate(points))
         for optics, points in zip((rig.left, rig.right), _split_sides(seen), strict=True)
     )
-    # A left direction, seen from the right camera, lies in the plane that is at a right angle to this one.
+    # Normal of the epipolar plane of each left direction, in the right camera's coordinates.
     planes = np.cross(rig.translation_m, left @ rig.rotation.T)
     off = np.abs((planes * right).sum(axis=1)) / np.linalg.norm(planes[:, :2], axis=1)
     return float(np.median(off) * np.diag(rig.right.matrix)[:2].mean())
@@ -339,7 +339,7 @@ def _undistort(optics: Optics, at_px: Float[np.ndarray, "n 2"]) -> Float[np.ndar
 
 
 def _measure_cover_percent(views: Sequence[Float[np.ndarray, "_ 2"]], size_px: Size) -> float:
-    """The share of the picture within the outlines of the boards."""
+    """Share of the picture inside the convex hulls of the boards."""
     covered = np.zeros(size_px[::-1], np.uint8)
     for at_px in views:
         outline = cv2.convexHull(at_px.astype(np.float32))

@@ -1,4 +1,4 @@
-"""Two cameras from the files that calibration programs write, and into one."""
+"""Readers for the calibration files of common programs, and a writer."""
 
 import base64
 import contextlib
@@ -25,7 +25,7 @@ _YES, _NO = ("true", "yes", "on", "y"), ("false", "no", "off", "n")
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _FISHEYE_NAMES = {"fisheye", "equidistant", "equi", "kannalabrandt", "kb4"}
 _PINHOLE_NAMES = {"pinhole", "radtan", "plumbbob", "rationalpolynomial", "brownconrady", "none"}
-# OpenCV's names of types: those of base64, and those whose decimal digits are rounded to them.
+# OpenCV's type names: of base64 data, and of decimal data that is rounded to the type.
 _BASE64_TYPES = {"u": "u1", "c": "i1", "w": "<u2", "s": "<i2", "i": "<i4", "f": "<f4", "d": "<f8"}
 _ROUNDED = {"h": np.float16, "f": np.float32}
 _HEXADECIMAL = re.compile(r"[-+]?0[xX][0-9a-fA-F]{1,16}")
@@ -33,28 +33,28 @@ _EXPECTED = "a calibration of two cameras: OpenCV's YAML or XML, Kalibr's camcha
 
 
 def read_rig(path: str | Path, size_px: Size | None = None) -> Rig:
-    """The two cameras of a calibration file, known by its content.
+    """Read the rig of a calibration file; the format is detected from the content.
 
     Sources:
         OpenCV's YAML, XML or JSON (cv2.FileStorage) with the names of its examples, M1 D1 M2 D2 R T, or
-        K1 .., cameraMatrix1 .., and so on, where extrinsics.yml is completed by the intrinsics.yml beside it
-        and the other way round. It does not say its unit of length: without an entry translation_unit (m, cm
-        or mm) a translation longer than 2 is taken for millimetres, else for metres. Nor does it say the
-        lens: without an entry distortion_model it is taken for a pinhole.
+        K1 .., cameraMatrix1 .., and so on. An extrinsics.yml is completed by the intrinsics.yml beside it,
+        and vice versa. The format does not state its unit of length: without an entry translation_unit (m,
+        cm or mm) a translation longer than 2 is in millimetres, otherwise in metres. Nor does it state the
+        lens model: without an entry distortion_model the lens is a pinhole.
         Kalibr's camchain.yaml, cam0 left and cam1 right. KITTI's calib.txt (P0 to P3) and
-        calib_cam_to_cam.txt, of the colour cameras 2 and 3 where they are there. Middlebury's calib.txt.
+        calib_cam_to_cam.txt, of the colour cameras 2 and 3 if present. Middlebury's calib.txt.
 
     Args:
         path: The file.
-        size_px: Width and height of the pictures: KITTI's calib_cam_to_cam.txt has a calibration for the
-            raw pictures as well, which is taken where they are of that size.
+        size_px: Width and height of the pictures. KITTI's calib_cam_to_cam.txt also has a calibration for
+            the raw pictures, which is used if the pictures have the raw size.
 
     Raises:
-        FormatError: No such file, no regular one, or one of more than 256 KB; an entry is missing, or its
-            value is nonsense; it is nested more than 20 deep, has more than 10,000 values, an anchor, an
-            alias or a DTD.
+        FormatError: The file is missing, not regular or larger than 256 KB; an entry is missing or invalid;
+            the content is nested more than 20 deep, or has more than 10,000 values, an anchor, an alias or
+            a DTD.
     """
-    # What overflows or is divided by 0 on the way is refused at the end, where it is not finite.
+    # Overflows and divisions by 0 are rejected at the end, as values that are not finite.
     with reading(path, _EXPECTED), np.errstate(all="ignore"):
         text = _read_text(Path(path))
         if re.search(r"^(cam0|doffs|baseline)\s*=", text, re.MULTILINE):
@@ -69,22 +69,22 @@ def read_rig(path: str | Path, size_px: Size | None = None) -> Rig:
 
 
 def read_calibration_bytes(path: str | Path) -> bytes:
-    """The content of a calibration file; FormatError where it is missing, too large or no regular file."""
+    """Read a calibration file; raises FormatError if it is missing, too large or not a regular file."""
     with reading(path, _EXPECTED):
         return read_small(path)
 
 
 def add_camera(pair: StereoPair, path: str | Path) -> StereoPair:
-    """The pair with the camera of a calibration for rectified pictures of this size."""
+    """Add the camera of a calibration file for rectified pictures of this size."""
     rig = read_rig(path, pair_size_px(pair))
     rig.check_size(pair)
     return replace(pair, camera=rig.camera())
 
 
 def write_rig(path: str | Path, rig: Rig) -> None:
-    """Writes OpenCV's YAML, which `read_rig` reads back exactly and cv2.FileStorage reads as well.
+    """Write OpenCV's YAML, which cv2.FileStorage reads and `read_rig` reads back exactly.
 
-    Its entries: image_width, image_height, distortion_model, M1, D1, M2, D2, R, T and translation_unit.
+    Entries: image_width, image_height, distortion_model, M1, D1, M2, D2, R, T and translation_unit.
     """
     if rig.left.fisheye != rig.right.fisheye:
         raise StereoweaveError(f"{path}: expected two lenses of one kind, found a pinhole and a fisheye one")
@@ -111,7 +111,7 @@ def _read_text(path: Path) -> str:
 
 
 def _add_companion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Entries, and those of the file beside it where one of OpenCV's two files was named."""
+    """Add the entries of the companion file if `path` is one of OpenCV's pair of files."""
     for this, other in (("intrinsics", "extrinsics"), ("extrinsics", "intrinsics")):
         beside = path.with_name(path.name.replace(this, other))
         if this in path.name and beside.exists():
@@ -121,7 +121,7 @@ def _add_companion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
 
 
 def _parse_opencv(entries: Mapping[str, Any]) -> Rig:
-    # Some write camera_matrix_left, some cameraMatrixLeft.
+    # Names vary: camera_matrix_left, cameraMatrixLeft.
     plain = {_normalise_name(key): value for key, value in entries.items()}
     parts = _parse_opencv_parts(plain)
     model = _find_model(plain)
@@ -153,7 +153,7 @@ def _parse_opencv(entries: Mapping[str, Any]) -> Rig:
 
 
 def _parse_opencv_parts(plain: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """The numbers of either camera and between them, whatever they are called."""
+    """Intrinsics and extrinsics under any of their known names."""
     found = {
         f"{what} {side}": _find_side(plain, names, sides)
         for side, sides in (("left", ("1", "left", "l")), ("right", ("2", "right", "r")))
@@ -184,7 +184,7 @@ def _find_side(entries: Mapping[str, Any], names: Iterable[str], sides: Iterable
 
 
 def _find_model(entries: Mapping[str, Any]) -> str | None:
-    """The kind of lens that OpenCV's file names, fisheye or pinhole; None where it names none."""
+    """The lens model of an OpenCV file, fisheye or pinhole; None if the file does not state it."""
     if _parse_bool(_find_first(entries, ("fisheyemodel", "fisheye")) or "no"):
         return "fisheye"
     named = _find_first(entries, ("distortionmodel", "cameramodel", "model"))
@@ -303,7 +303,7 @@ def _parse_kitti(text: str, size_px: Size | None) -> Rig:
 
 
 def _make_kitti_raw_rig(rows: Mapping[str, Float[np.ndarray, " _"]], first: str, second: str) -> Rig:
-    """The rig of the pictures before KITTI's own rectification; each camera stands relative to camera 0."""
+    """The rig of KITTI's raw pictures; poses in the file are relative to camera 0."""
     left, right = (
         Optics(
             matrix=_require_kitti_row(rows, f"K_{number}").reshape(3, 3),
@@ -341,7 +341,7 @@ def _parse_middlebury(text: str) -> Rig:
     missing = {"cam0", "doffs", "baseline", "width", "height"} - entries.keys()
     if missing:
         raise ValueError(f"no entry {', '.join(sorted(missing))} of a Middlebury calib.txt")
-    rows = entries["cam0"].strip(" []").split(";", 3)  # a fourth row is refused, however long it is
+    rows = entries["cam0"].strip(" []").split(";", 3)  # a fourth row of any length is rejected
     left = _parse_numbers([row.split() for row in rows]).reshape(3, 3)
     right = left + np.array([[0, 0, float(entries["doffs"])], [0, 0, 0], [0, 0, 0]])
     baseline_m = float(entries["baseline"]) / 1000
@@ -356,7 +356,7 @@ def _make_camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.
 
 
 def _parse_numbers(values: Any) -> Float[np.ndarray, "..."]:
-    """The numbers of a value of `parse_entries`: one, a list of them, a list of rows, or OpenCV's matrix."""
+    """Parse the numbers of an entry: one, a list, a list of rows, or OpenCV's matrix."""
     if isinstance(values, dict) and "data" in values:
         return _parse_matrix(values)
     if isinstance(values, str) and values.startswith(BASE64):
@@ -368,14 +368,14 @@ def _parse_numbers(values: Any) -> Float[np.ndarray, "..."]:
 
 
 def _parse_hexadecimal(values: Any) -> Any:
-    """The values, with numbers in place of hexadecimal words."""
+    """Replace hexadecimal strings by numbers."""
     if isinstance(values, list):
         return [_parse_hexadecimal(value) for value in values]
     return int(values, 16) if isinstance(values, str) and _HEXADECIMAL.fullmatch(values) else values
 
 
 def _parse_matrix(entries: Mapping[str, Any]) -> Float[np.ndarray, "..."]:
-    """OpenCV's matrix: what cv2.FileStorage makes of it, in float64."""
+    """Parse OpenCV's matrix to the values that cv2.FileStorage gives, in float64."""
     written = re.fullmatch(r"(\d*)([A-Za-z])", str(entries.get("dt", "d")))
     if written is None:
         raise ValueError(f"a matrix of the type {reprlib.repr(entries['dt'])}")
@@ -393,7 +393,7 @@ def _parse_matrix(entries: Mapping[str, Any]) -> Float[np.ndarray, "..."]:
 
 
 def _decode_base64(data: str) -> Float[np.ndarray, " _"]:
-    """The numbers of OpenCV's base64: of a header of 24 bytes, which says their type, and their bytes."""
+    """Decode OpenCV's base64: a header of 24 bytes that states the type, then the numbers."""
     content = base64.b64decode(data.removeprefix(BASE64))
     written = re.fullmatch(rb"\d*([a-z]) *", content[:24])
     if written is None or written[1].decode() not in _BASE64_TYPES:

@@ -7,15 +7,15 @@ from stereoweave.errors import Note, Remedy
 from stereoweave.stereo import Estimate, StereoPair
 
 _CONFIDENT = 0.5
-# Between the shares of sound pairs (at least 64 %) and of noise and plain pictures (at most 12 %).
+# Sound pairs have at least 64 % confident pixels; noise and plain pictures at most 12 %.
 _LEAST_CONFIDENT_PERCENT = 30.0
 
 
 def find_problems(pair: StereoPair, estimate: Estimate) -> list[Note]:
     """Notes on what is wrong with a pair; empty for a sound pair.
 
-    Places that both photographs show are compared (`stereoweave check` says more of them); where there are
-    too few, only the confidence of the estimate decides: a plain wall may well be matched.
+    The alignment is measured at feature matches (`stereoweave check` reports it in full). With too few
+    matches only the estimate's confidence decides, because a plain wall may be matched well.
     """
     alignment = check_pair(pair.left, pair.right)
     if "too_few_matches" not in alignment.defects:

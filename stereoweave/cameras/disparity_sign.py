@@ -1,35 +1,36 @@
-"""The signs of disparities: whether some are negative for certain, and whether near things hide far ones.
+"""The sign of disparities: detection of negative ones, and of the depth order at occlusions.
 
-Parallel cameras give disparities of 0 and more; converged ones negative ones as well, and so do a left and a
-right photograph that are swapped.
+Parallel cameras give disparities of 0 or more. Converged cameras and swapped pictures also give negative
+ones.
 """
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-# From here on a disparity is negative.
+# A disparity below this is negative.
 _NEGATIVE_PX = -1.5
-# Of so many places at most it is looked whether they are sure, and so many have to be.
+# At most this many points are tested, and at least this many must be certain.
 _MOST_TRIED, _LEAST_SURE = 150, 4
-# A place is sure whose window is so like the other picture's, and what lies at 0 or more much less so.
+# A point is certain if its window correlates this well with its match, and much less with any window at a
+# disparity of 0 or more.
 _LEAST_LIKENESS, _MOST_AMBIGUOUS = 0.9, 0.7
-# By so much equal windows differ as grey levels are rounded.
+# Difference of equal windows caused by rounded grey levels.
 _ROUNDING = 0.003
-# How far away the likest window is looked for, as a share of the width.
+# Search range for the best window, as a share of the width.
 _REACH = 0.45
 _RADIUS_PX = 7
 
-# What has no corners is matched densely in pictures so wide; farther behind there are corners, or nothing.
+# Areas without corners are matched densely at this width; beyond this range there are corners, or nothing.
 _DENSE_WIDTH_PX, _DENSE_RANGE_PX = 160, (-5.0, 53.0)
 _DENSE_NEGATIVE_PX, _DENSE_RADIUS_PX = -0.5, 4
 _LEAST_TEXTURE_LEVELS = 1.0
 
-# Occlusion is looked at in pictures so wide, by semi-global matching with OpenCV's usual penalties.
+# Occlusion is examined at this width, by semi-global matching with OpenCV's usual penalties.
 _OCCLUSION_WIDTH_PX = 320
 _BLOCK_PX, _MARGIN_PX = 5, 3
 _LEAST_JUMP_PX, _LEAST_COLOUR_STEP, _BESIDE_PX = 2.0, 10.0, 3
-# So many votes for one order of depth weigh as much as none at all.
+# Regularisation: the number of neutral votes added.
 _VOTES_OF_DOUBT = 20
 
 
@@ -39,16 +40,17 @@ def find_negative_disparities(
     places_px: Float[np.ndarray, "n 2"],
     disparity_px: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, " m"]:
-    """Negative disparities in px of which nothing makes positive ones; none where there are but a few.
+    """Find certain negative disparities in px: points without a plausible positive match; empty if few.
 
-    Where things repeat, as in a truss, matches miss by a period; but then the place at the right distance is
-    about as alike, and sound pairs are far more common than converged ones.
+    On repeated structures, such as a truss, matches can be off by a period. Then a positive candidate fits
+    about as well and is preferred, because parallel pairs are far more common than converged ones.
 
     Args:
         left: The left photograph, uint8 RGB [H, W, 3].
-        right: The right one, of which the rows match.
+        right: The right one, rectified.
         places_px: Columns and rows in the left photograph.
-        disparity_px: What was found for them. Where these are positive, plainer places are looked at as well.
+        disparity_px: Disparity at these points. If they give too few certain values, areas without corners
+            are matched densely too.
     """
     negative = disparity_px < _NEGATIVE_PX
     greys = cv2.cvtColor(left, cv2.COLOR_RGB2GRAY), cv2.cvtColor(right, cv2.COLOR_RGB2GRAY)
@@ -66,7 +68,7 @@ def find_negative_disparities(
 def _find_dense_negative(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """Places in the left picture, and their disparities, that semi-global matching takes for negative."""
+    """Points of the left picture with a negative disparity by semi-global matching."""
     disparity_px, seen = _match_densely(left, right, *_DENSE_RANGE_PX)
     slope = cv2.Sobel(cv2.cvtColor(left, cv2.COLOR_RGB2GRAY), cv2.CV_32F, 1, 0, scale=1 / 8)
     textured = cv2.blur(np.abs(slope), (_BLOCK_PX, _BLOCK_PX)) > _LEAST_TEXTURE_LEVELS
@@ -81,7 +83,7 @@ def _select_certain(
     disparity_px: Float[np.ndarray, " n"],
     radius_px: int,
 ) -> Float[np.ndarray, " m"]:
-    """Those of (some of) the negative disparities that are the only likely ones in both pictures."""
+    """Select, from a sample of the negative disparities, those that are unambiguous in both pictures."""
     step = max(1, -(-len(places_px) // _MOST_TRIED))
     disparity_px = disparity_px[::step]
     columns, rows = np.rint(places_px[::step]).astype(int).T
@@ -106,14 +108,14 @@ def _is_unambiguous(
     reach_px: int,
     radius_px: int,
 ) -> bool:
-    """Whether a window is like the other picture's at its partner, and like none at a positive disparity.
+    """Whether a window correlates with its match, and with no window at a positive disparity.
 
     Args:
         own: The picture of the window, with a border of `radius_px` + 1.
-        other: The other picture, alike.
+        other: The other picture, with the same border.
         place: Row, column and the partner's column, without that border.
         reach_px: How far positive disparities go: to the left in the right picture, to the right in the left.
-        radius_px: Of the window.
+        radius_px: Radius of the window.
     """
     row, column, partner = place
     last_column = own.shape[1] - 2 * radius_px - 3
@@ -131,17 +133,17 @@ def _is_unambiguous(
 def _cut_strip(
     bordered: UInt8[np.ndarray, "h w"], row: int, first: int, last: int, radius_px: int
 ) -> UInt8[np.ndarray, "h2 w2"]:
-    """What windows around the columns cover, and a row more above and below."""
+    """Cut the strip covered by windows around the columns, with one more row above and below."""
     return bordered[row : row + 2 * radius_px + 3, first + 1 : last + 2 * radius_px + 2]
 
 
 def estimate_depth_order(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], range_px: tuple[float, float]
 ) -> float:
-    """-1..1: above 0 where greater disparities hide smaller ones, below 0 where it is the other way round.
+    """Estimate the depth order: above 0 if greater disparities occlude smaller ones, else below 0; -1..1.
 
-    What the right camera does not see lies, in the left picture, between a smaller disparity and a greater
-    one. It belongs to what is hidden, so its colour is that of the farther side.
+    In the left picture, an area occluded in the right one lies between a smaller and a greater disparity. It
+    belongs to the occluded surface, so it has the colour of the farther side.
     """
     factor = min(1.0, _OCCLUSION_WIDTH_PX / left.shape[1])
     small_left, small_right = (_shrink(photo, factor) for photo in (left, right))
@@ -156,7 +158,7 @@ def estimate_depth_order(
 def _vote_in_row(
     disparity_px: Float32[np.ndarray, " w"], seen: Bool[np.ndarray, " w"], colours: Float32[np.ndarray, "w 3"]
 ) -> list[float]:
-    """For each hidden stretch of a row, -1..1: how much more it is like its left side than its right one."""
+    """Votes in -1..1, one per occluded run of a row: similarity to its left side minus to its right side."""
     votes = []
     changes = np.diff(seen.astype(np.int8))
     ends = np.flatnonzero(changes == 1) + 1
@@ -178,7 +180,7 @@ def _vote_in_row(
 def _match_densely(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], least_px: float, greatest_px: float
 ) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Disparity of the left picture by semi-global matching, and where the right picture's agrees."""
+    """Left disparity by semi-global matching, and the mask of the left-right consistency check."""
     first_px = int(np.floor(least_px)) - _MARGIN_PX
     count = int(np.ceil((greatest_px + _MARGIN_PX - first_px) / 16)) * 16
     penalty = _BLOCK_PX**2

@@ -1,9 +1,10 @@
-"""Single points that two photographs of one scene share, whether or not they are rectified.
+"""Sparse feature matches between two pictures of one scene, rectified or not.
 
-Corners are described by a small window of grey levels, freed of brightness and contrast, and paired where
-each is by far the other's best. That takes a twentieth of the time of SIFT (15 ms against 300 ms at 640x480),
-and about as many of the pairs are right (82 against 86 % in the median of rendered rooms). It bears a turn of
-some 10 degrees and a difference in scale of some 15 %, which is more than a rig or two hands differ by.
+A corner is described by a small window of grey levels, normalised for brightness and contrast. Two corners
+match if each is clearly the other's best candidate. This takes a twentieth of SIFT's time (15 ms against
+300 ms at 640x480) with nearly as many correct matches (82 against 86 %, median of rendered rooms). It
+tolerates a rotation of some 10 degrees and a scale difference of some 15 %, more than a rig or two hand-held
+pictures differ by.
 """
 
 import math
@@ -13,47 +14,47 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-# Corners are found and paired in copies of at most so many pixels.
+# Corners are detected and matched in copies of at most this many pixels.
 _PIXELS = 1_500_000
 _CORNER_QUALITY = 0.005
 _CORNER_DISTANCE_PX = 4
 _TILES = 4
-# A window of 11x11 samples, 2 px apart, of pictures that are smoothed to match.
+# A window of 11x11 samples, 2 px apart, in smoothed pictures.
 _WINDOW_RADIUS, _WINDOW_STEP_PX, _WINDOW_BLUR_PX = 5, 2.0, 1.0
 _LEAST_CORRELATION = 0.5
-# The distance to the best window against that to the second best.
+# Largest ratio of the distances to the best and the second-best window.
 _MOST_AMBIGUOUS = 0.85
-# Pictures that are not rectified show a thing at most this share of their height higher or lower.
+# Largest vertical offset of a match, as a share of the height.
 _MOST_ROWS_OFF = 0.25
-# Windows, in full size, by which a match becomes exact, and how many steps that takes.
+# Windows at full resolution for the refinement of matches, and the number of steps.
 _EXACT_RADIUS, _EXACT_STEPS = 6, 8
 _CONVERGED_PX, _LEAST_EXACT_CORRELATION = 0.05, 0.7
 _WEAK_CONTRAST_LEVELS = 1.0
 
 
 class Matches(NamedTuple):
-    """N places seen by both photographs: x and y in px of each, float64 [N, 2]; some are wrong."""
+    """N matches: x and y in px in each picture, float64 [N, 2]; some are wrong."""
 
     left_px: Float[np.ndarray, "n 2"]
     right_px: Float[np.ndarray, "n 2"]
 
     @property
     def disparity_px(self) -> Float[np.ndarray, " n"]:
-        """How much farther left each is in the right photograph."""
+        """How much farther left each match is in the right picture."""
         return self.left_px[:, 0] - self.right_px[:, 0]
 
     @property
     def lower_px(self) -> Float[np.ndarray, " n"]:
-        """How much lower each is in the right photograph: 0 where the pair is rectified."""
+        """How much lower each match is in the right picture; 0 in a rectified pair."""
         return self.right_px[:, 1] - self.left_px[:, 1]
 
 
 def find_matches(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h2 w2 3"], *, most: int = 2000
 ) -> Matches:
-    """Up to `most` places that both photographs show, to about 0.1 px; the pair need not be rectified.
+    """Find up to `most` matches, accurate to about 0.1 px; the pair need not be rectified.
 
-    One in five or so is wrong: the caller's geometry sorts them out.
+    About one in five is wrong; the caller rejects these by geometry.
     """
     greys = [cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY) for photo in (left, right)]
     found = _pair_corners(greys, most, rows_off=_MOST_ROWS_OFF * left.shape[0])
@@ -61,7 +62,7 @@ def find_matches(
 
 
 def _pair_corners(greys: list[UInt8[np.ndarray, "h w"]], most: int, rows_off: float) -> Matches:
-    """Corners of both pictures that are each other's best, by at most so many rows apart."""
+    """Match corners that are each other's best candidates within `rows_off` rows."""
     (left, left_windows), (right, right_windows) = (_find_corners(grey, most) for grey in greys)
     if not (len(left) and len(right)):
         return Matches(np.zeros((0, 2)), np.zeros((0, 2)))
@@ -72,7 +73,7 @@ def _pair_corners(greys: list[UInt8[np.ndarray, "h w"]], most: int, rows_off: fl
     partner, partner_of_right = alike.argmax(1), alike.argmax(0)
     best = alike[lefts, partner]
     alike[lefts, partner] = -1
-    # Of windows of length 1, the squared distance is 2 - 2 * correlation.
+    # For windows of length 1 the squared distance is 2 - 2 * correlation.
     clear = 1 - best < _MOST_AMBIGUOUS**2 * (1 - alike.max(1))
     kept = clear & (partner_of_right[partner] == lefts) & (best > _LEAST_CORRELATION)
     return Matches(left[kept], right[partner[kept]])
@@ -81,7 +82,7 @@ def _pair_corners(greys: list[UInt8[np.ndarray, "h w"]], most: int, rows_off: fl
 def _find_corners(
     grey: UInt8[np.ndarray, "h w"], most: int
 ) -> tuple[Float[np.ndarray, "n 2"], Float32[np.ndarray, "n k"]]:
-    """Corners in px of the full picture, and the windows around them."""
+    """Corners in px of the full picture, and their windows."""
     factor = _downscale_factor(grey)
     height, width = grey.shape
     if factor > 1:
@@ -95,7 +96,7 @@ def _find_corners(
 
 
 def _find_spread_corners(grey: UInt8[np.ndarray, "h w"], most: int) -> Float[np.ndarray, "n 2"]:
-    """The strongest corners of each tile: hazy hills have some as well, weaker than those of a near tree."""
+    """The strongest corners of each tile, so that low-contrast areas have some too."""
     found = [np.zeros((0, 2))]
     for rows in np.array_split(np.arange(grey.shape[0]), _TILES):
         for columns in np.array_split(np.arange(grey.shape[1]), _TILES):
@@ -109,10 +110,10 @@ def _find_spread_corners(grey: UInt8[np.ndarray, "h w"], most: int) -> Float[np.
 def _refine_matches(
     left: UInt8[np.ndarray, "h w"], right: UInt8[np.ndarray, "h w"], found: Matches
 ) -> Matches:
-    """The matches moved in the right picture to where their windows fit best; without those that do not fit.
+    """Refine the right positions to a fraction of a pixel, and drop matches that do not fit.
 
-    Source: the inverse compositional algorithm (Baker and Matthews 2004) for a shift alone, of windows of
-    equal mean and contrast, as exposures may differ.
+    Source: the inverse compositional algorithm (Baker and Matthews 2004) for a translation, on windows
+    normalised in mean and contrast, because exposures may differ.
     """
     if not len(found.left_px):
         return found
@@ -123,7 +124,7 @@ def _refine_matches(
         [wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2], wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]], axis=1
     ).reshape(len(wide), 2, -1)
     slopes = slopes / (2 * contrast[:, None])
-    # A small ridge keeps windows of one straight edge where they are along it.
+    # A small ridge prevents a window on one straight edge from sliding along it.
     normal = slopes @ slopes.transpose(0, 2, 1) + 1e-4 * np.eye(2)
     exact, step = found.right_px.copy(), np.zeros_like(found.right_px)
     for _ in range(_EXACT_STEPS):
@@ -141,7 +142,7 @@ def _refine_matches(
 def _sample_windows(
     grey: UInt8[np.ndarray, "h w"], centres_px: Float[np.ndarray, "n 2"], radius: int, step_px: float
 ) -> Float32[np.ndarray, "n k"]:
-    """The grey levels around each centre, in rows and columns `step_px` apart; the border goes on outside."""
+    """Grey levels around each centre, in rows and columns `step_px` apart; the border is repeated outside."""
     offsets = np.arange(-radius, radius + 1) * step_px
     down, along = (offset.ravel() for offset in np.meshgrid(offsets, offsets, indexing="ij"))
     columns, rows = (
@@ -156,7 +157,7 @@ def _sample_windows(
 def _normalise(
     windows: Float32[np.ndarray, "n k"],
 ) -> tuple[Float32[np.ndarray, "n k"], Float32[np.ndarray, "n 1"]]:
-    """The windows with mean 0 and length 1, and what they were divided by; plain ones become nearly 0."""
+    """Windows with mean 0 and length 1, and their divisors; plain windows become nearly 0."""
     centred = windows - windows.mean(1, keepdims=True)
     least = _WEAK_CONTRAST_LEVELS * math.sqrt(windows.shape[1])
     length = np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), least)
@@ -164,5 +165,5 @@ def _normalise(
 
 
 def _downscale_factor(picture: np.ndarray) -> float:
-    """By how much the picture is shrunk to have at most _PIXELS; 1 where it has."""
+    """Factor that shrinks the picture to at most _PIXELS; 1 if it is small enough."""
     return max(1.0, math.sqrt(picture.shape[0] * picture.shape[1] / _PIXELS))

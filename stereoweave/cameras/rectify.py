@@ -1,4 +1,4 @@
-"""A pair whose rows do not match becomes one whose rows do, by the calibration of its two cameras."""
+"""Rectification with a calibration."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,20 +11,20 @@ from stereoweave.cameras.rig import Optics, Rig, pair_size_px
 from stereoweave.errors import Note, StereoweaveError
 from stereoweave.stereo import StereoCamera, StereoPair
 
-# A picture is looked at in this many cells along its longer side when the largest rectangle is sought, and
-# in no fewer than these along its shorter one: a border spoils whole cells.
+# Cells along the longer side in the search for the largest rectangle, and the fewest along the shorter
+# side, because a border makes whole cells unusable.
 _CELLS, _LEAST_CELLS = 256, 32
-# Where a polynomial of distortion is searched for the radius at which it turns back.
+# Samples in the search for the radius at which the distortion polynomial stops growing.
 _RADIUS_STEPS = 2000
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rectified:
-    """A pair whose rows match.
+    """A rectified pair.
 
     Attributes:
-        pair: Its masks are False where a picture shows nothing, its camera is there where it is known.
-        notes: What was done.
+        pair: With masks that are False outside the source pictures, and with the camera if it is known.
+        notes: What rectification did.
     """
 
     pair: StereoPair
@@ -32,22 +32,22 @@ class Rectified:
 
 
 def rectify(pair: StereoPair, rig: Rig) -> Rectified:
-    """The pair as two pinhole cameras side by side would have taken it, of the same size, with its camera.
+    """Rectify a pair to two parallel pinhole cameras; the size stays the same, and the camera is added.
 
-    Both cameras are turned to one direction, which lies between theirs and at a right angle to the baseline.
-    The focal length is the mean of theirs, so that the middle keeps its resolution. The centre, the same in
-    both (doffs 0), is where the views are seen most. A pair of a rectified rig gets its camera, no more.
+    Both cameras are rotated to a common direction between theirs and perpendicular to the baseline. The focal
+    length is the mean of theirs, which keeps the resolution in the middle. Both views share one principal
+    point (doffs 0), chosen to keep most of the views visible. A pair of a rectified rig only gets its camera.
 
     Raises:
         FormatError: The rig is for pictures of another size.
-        StereoweaveError: The right camera is on the left, above or below, or in front.
+        StereoweaveError: The right camera is not to the right of the left one.
     """
     rig.check_size(pair)
     _check_side_by_side(rig)
     if rig.unlike_rectified() is None:
         note = Note(f"{rig.name} is for rectified pictures: they are taken as they are")
         return Rectified(pair=replace(pair, camera=rig.camera()), notes=(*rig.notes, note))
-    # What cannot be computed is refused where it is not finite.
+    # Values that cannot be computed are rejected later, as not finite.
     with np.errstate(all="ignore"):
         turns = _find_rotations(rig)
         camera = _choose_camera(rig, turns, pair_size_px(pair))
@@ -58,10 +58,10 @@ def rectify(pair: StereoPair, rig: Rig) -> Rectified:
 
 
 def crop(pair: StereoPair) -> StereoPair:
-    """The largest rectangle of the pair that both pictures fill, its camera's centre moved along.
+    """Crop a pair to the largest rectangle that is valid in both pictures, and adjust its camera.
 
     Raises:
-        StereoweaveError: No pixel is seen by both.
+        StereoweaveError: No pixel is valid in both.
     """
     if pair.left_seen is None and pair.right_seen is None:
         return pair
@@ -97,12 +97,12 @@ def _check_side_by_side(rig: Rig) -> None:
 
 
 def _find_right_centre(rig: Rig) -> Float[np.ndarray, "3"]:
-    """Where the right camera is for the left one, x to the right, y down, z ahead, in metres."""
+    """Position of the right camera relative to the left one in metres: x right, y down, z forward."""
     return -rig.rotation.T @ rig.translation_m
 
 
 def _find_rotations(rig: Rig) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
-    """The rotations of left and right directions to those of the rectified cameras."""
+    """Rotations from the left and the right camera to the rectified ones."""
     aside = _find_right_centre(rig) / rig.baseline_m
     ahead = np.array([0, 0, 1]) + rig.rotation[2]  # the left camera's direction and the right one's
     ahead -= ahead @ aside * aside
@@ -114,7 +114,7 @@ def _find_rotations(rig: Rig) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarra
 def _choose_camera(
     rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], size_px: tuple[int, int]
 ) -> StereoCamera:
-    """The rectified camera: what the two cameras have in their middles comes, on average, to the middle."""
+    """Choose the rectified camera so that the two picture centres lie, on average, in the middle."""
     lenses = rig.left, rig.right
     focal_px = float(np.mean([optics.matrix[[0, 1], [0, 1]] for optics in lenses]))
     middle_px = (np.array(size_px) - 1) / 2
@@ -134,7 +134,7 @@ def _choose_camera(
 
 
 def _find_direction(optics: Optics, at_px: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
-    """Where a camera sees what it shows at a pixel."""
+    """Viewing direction of a pixel."""
     undistort = cv2.fisheye.undistortPoints if optics.fisheye else cv2.undistortPoints
     (x, y), *_ = undistort(at_px.reshape(1, 1, 2), optics.matrix, _opencv_distortion(optics)).reshape(-1, 2)
     return np.array([x, y, 1])
@@ -143,9 +143,9 @@ def _find_direction(optics: Optics, at_px: Float[np.ndarray, "2"]) -> Float[np.n
 def _rectify_view(
     image: UInt8[np.ndarray, "h w 3"], optics: Optics, turn: Float[np.ndarray, "3 3"], camera: StereoCamera
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """A picture as the rectified camera would show it, and which of its pixels the picture has.
+    """Warp a picture to the rectified camera; returns it with the mask of its valid pixels.
 
-    Beyond the picture its border is repeated: an edge there would be matched.
+    The border is repeated outside the picture, because an edge there would be matched.
     """
     height, width = image.shape[:2]
     pinhole = np.array([[camera.focal_px, 0, camera.cx_px], [0, camera.focal_px, camera.cy_px], [0, 0, 1]])
@@ -162,10 +162,10 @@ def _rectify_view(
 def _find_valid_field(
     optics: Optics, turn: Float[np.ndarray, "3 3"], pinhole: Float[np.ndarray, "3 3"], shape: tuple[int, int]
 ) -> Bool[np.ndarray, "h w"]:
-    """Where the lens is known to see: not behind it, nor where its polynomial turns back.
+    """Pixels where the lens model is valid: in front of the camera, before the polynomial folds back.
 
-    Fitted within the picture, a polynomial falls again somewhere beyond it, and would show the picture's
-    border once more, mirrored.
+    The polynomial is fitted inside the picture. Beyond it the polynomial may decrease, which would show the
+    border again, mirrored.
     """
     rows, columns = np.indices(shape, np.float32)
     to_direction = (turn.T @ np.linalg.inv(pinhole)).astype(np.float32)
@@ -176,9 +176,9 @@ def _find_valid_field(
     return (z > 0) & (radius < _find_fold(optics, 10.0) * z)
 
 
-@np.errstate(all="ignore")  # where it cannot be computed it does not grow either
+@np.errstate(all="ignore")  # values that cannot be computed count as not growing
 def _find_fold(optics: Optics, most: float) -> float:
-    """The radius (a fisheye lens: angle) at which the distorted radius no longer grows, at most `most`."""
+    """Radius (fisheye: angle) at which the distorted radius stops growing, at most `most`."""
     radius = np.linspace(0, most, _RADIUS_STEPS)
     squares = radius**2
     k = _opencv_distortion(optics)
@@ -193,7 +193,7 @@ def _find_fold(optics: Optics, most: float) -> float:
 
 
 def _opencv_distortion(optics: Optics) -> Float[np.ndarray, " n"]:
-    """The distortion as OpenCV wants it, which has no fisheye lens without any."""
+    """Distortion for OpenCV, whose fisheye functions need four coefficients."""
     return optics.distortion if optics.distortion.size else np.zeros(4)
 
 
@@ -208,7 +208,7 @@ def _summary(rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], pair: StereoPa
 
 
 def _find_largest_rectangle(full: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
-    """Rows and columns of a rectangle that is full everywhere: the largest of whole cells, then grown."""
+    """Rows and columns of the largest full rectangle of whole cells, then grown pixel by pixel."""
     cell_px = max(1, min(-(-max(full.shape) // _CELLS), min(full.shape) // _LEAST_CELLS))
     top, bottom, start, stop = (
         cell_px * side for side in _find_largest_of_cells(_find_full_cells(full, cell_px))
@@ -223,7 +223,7 @@ def _find_largest_rectangle(full: Bool[np.ndarray, "h w"]) -> tuple[slice, slice
 
 
 def _find_full_cells(full: Bool[np.ndarray, "h w"], cell_px: int) -> Bool[np.ndarray, "rows columns"]:
-    """Which cells are full; one that the picture's end cuts counts by what it has."""
+    """Which cells are full; a cell cut by the picture's border counts by its remaining pixels."""
     height, width = full.shape
     padded = np.pad(full, ((0, -height % cell_px), (0, -width % cell_px)), constant_values=True)
     cells = padded.reshape(-1, cell_px, padded.shape[1] // cell_px, cell_px)
@@ -231,7 +231,7 @@ def _find_full_cells(full: Bool[np.ndarray, "h w"], cell_px: int) -> Bool[np.nda
 
 
 def _find_largest_of_cells(full: Bool[np.ndarray, "rows columns"]) -> tuple[int, int, int, int]:
-    """Top, bottom, start and stop of the largest full rectangle: for every row the bars that stand on it."""
+    """Top, bottom, start and stop of the largest full rectangle, by a stack of bars for each row."""
     best, found = 0, (0, 0, 0, 0)
     heights = np.zeros(full.shape[1], int)
     for row, cells in enumerate(full):

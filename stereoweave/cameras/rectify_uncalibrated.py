@@ -1,4 +1,4 @@
-"""A pair whose rows do not match becomes one whose rows do, by what both pictures show: no calibration."""
+"""Rectification without a calibration, from feature matches."""
 
 from contextlib import suppress
 from dataclasses import replace
@@ -15,39 +15,39 @@ from stereoweave.stereo import StereoPair
 
 _LEAST_MATCHES = 40
 _LEAST_RIGHT_SHARE = 0.3
-# Epipolar lines are missed by less than this where a match is right.
+# Inliers lie within this distance of their epipolar lines.
 _RIGHT_PX = 1.0
 _STEPS = 40
-# Errors beyond about this count for less and less.
+# Scale of the robust loss.
 _SOFT_PX = 0.5
-# In radians, and as the logarithm of the focal length over the width: what is thought likely beforehand. It
-# decides what the matches leave open, for the least of all turns that explain them.
+# Prior: standard deviations of the angles in radians and of log(focal length / width). Where the matches
+# leave the solution open, it selects the smallest rotations.
 _LIKELY_TURN, _LIKELY_LOG_FOCAL = 0.05, 0.3
 _MOST_TURN_DEGREES = 20.0
 _MOST_RESIDUAL_PX = 1.0
 _PIXELS_OF_RESIDUAL = 1_500_000
-# So many of the least disparities may be of wrong matches.
+# This share of the smallest disparities may come from wrong matches.
 _OUTER_PERCENT = 1.0
 
 
 class _Homographies(NamedTuple):
-    """The homographies that bring each picture to the common rows."""
+    """Homographies that map each picture to common rows."""
 
     left: Float[np.ndarray, "3 3"]
     right: Float[np.ndarray, "3 3"]
 
 
 def rectify_by_features(pair: StereoPair) -> Rectified:
-    """The pair as two cameras side by side would have seen it, as far as the places that both show tell.
+    """Rectify a pair from its feature matches.
 
-    Both pictures are turned as by a turn of their cameras, of a focal length that is found as well, by angles
-    as small as will do. Shapes stay what they are, unlike after an arbitrary homography. The result has no
-    camera: neither the focal length nor the base is known well enough for metres.
+    Both pictures are warped as by the smallest sufficient rotations of their cameras; the focal length is
+    fitted too. Unlike an arbitrary homography this preserves shapes. The result has no camera, because
+    neither focal length nor baseline is known well enough for metres.
 
     Source: "Quasi-Euclidean epipolar rectification of uncalibrated images" (Fusiello and Irsara 2011).
 
     Raises:
-        StereoweaveError: Too few places, or none that such a turn brings to equal rows.
+        StereoweaveError: Too few matches, or no such rotation aligns their rows.
     """
     height, width = pair.left.shape[:2]
     matches = _select_inliers(find_matches(pair.left, pair.right))
@@ -70,12 +70,12 @@ def rectify_by_features(pair: StereoPair) -> Rectified:
 
 
 def _select_inliers(found: Matches) -> Matches:
-    """The matches that one epipolar geometry explains."""
+    """Select the inliers of one epipolar geometry."""
     count = len(found.left_px)
     right_ones = np.zeros(count, bool)
     if count >= _LEAST_MATCHES:
         cv2.setRNGSeed(0)
-        with suppress(cv2.error):  # where no geometry at all explains any of them
+        with suppress(cv2.error):  # raised if no geometry explains any of them
             _, mask = cv2.findFundamentalMat(
                 found.left_px, found.right_px, cv2.USAC_MAGSAC, _RIGHT_PX, 0.9999, 5000
             )
@@ -118,9 +118,9 @@ def _fit_rotations(matches: Matches, width: int, height: int) -> Float[np.ndarra
 
 
 def _make_homographies(parameters: Float[np.ndarray, " 6"], width: int, height: int) -> _Homographies:
-    """The turns of the left camera by yaw and roll, and of the right one by pitch, yaw and roll.
+    """Homographies of rotations: the left camera by yaw and roll, the right one by pitch, yaw and roll.
 
-    A common pitch changes no row against another, so the left camera has none.
+    A common pitch does not change the alignment of rows, so the left camera has none.
     """
     left_yaw, left_roll, right_pitch, right_yaw, right_roll, log_focal = parameters
     focal_px = width * np.exp(log_focal)
@@ -132,7 +132,7 @@ def _make_homographies(parameters: Float[np.ndarray, " 6"], width: int, height: 
 
 
 def _measure_sampson_px(turns: _Homographies, matches: Matches) -> Float[np.ndarray, " n"]:
-    """How far each match is from its epipolar lines, to the first order, in px of the given pictures."""
+    """Sampson error: first-order distance of each match from its epipolar lines, in source px."""
     across = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     fundamental = turns.right.T @ across @ turns.left
     ones = np.ones((len(matches.left_px), 1))
@@ -155,9 +155,9 @@ def _check(parameters: Float[np.ndarray, " 6"], residual_px: float, width: int, 
 
 
 def _align_views(turns: _Homographies, matches: Matches) -> tuple[_Homographies, float]:
-    """The turns with the left picture's middle in place, the right beside it, and by how far that moved.
+    """Keep the left picture centred; shift the right one left if needed, so that disparities start at 0.
 
-    That is to the left where disparities would else be negative, so that they start at 0.
+    Returns the homographies and the sideways shift of the right picture in px.
     """
     left_px, right_px = _transform(turns.left, matches.left_px), _transform(turns.right, matches.right_px)
     centre_px = np.median(matches.left_px, 0)
@@ -175,7 +175,7 @@ def _warp(
     turn: Float[np.ndarray, "3 3"],
     seen: Bool[np.ndarray, "h w"] | None,
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """The picture after the turn, its border going on where it shows nothing, and where it shows it."""
+    """Warp a picture, repeating its border; returns it with the mask of its valid pixels."""
     size = photo.shape[1::-1]
     before = np.ones(photo.shape[:2], np.uint8) if seen is None else seen.astype(np.uint8)
     warped = cv2.warpPerspective(photo, turn, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)

@@ -1,4 +1,4 @@
-"""How two cameras see and stand; `calibration_files` reads it, and writes it."""
+"""Intrinsics and relative pose of two cameras."""
 
 from dataclasses import dataclass, replace
 
@@ -9,11 +9,11 @@ from jaxtyping import Float
 from stereoweave.errors import FormatError, Note, StereoweaveError
 from stereoweave.stereo import CAMERA_NUMBERS_BELOW, StereoCamera, StereoPair
 
-# How many coefficients OpenCV's models have; 0 is a lens without distortion.
+# Numbers of coefficients in OpenCV's models; 0 means no distortion.
 _PINHOLE_COUNTS, _FISHEYE_COUNTS = (0, 4, 5, 8, 12, 14), (0, 4)
-# Of the smallest pictures, 32 px wide, that is a view of 173 degrees.
+# In the smallest pictures, 32 px wide, this is a field of view of 173 degrees.
 _LEAST_FOCAL_PX = 1
-# Files with few decimals are let through: over a picture of 4000 px these are some hundredths of a pixel.
+# Tolerances for files with few decimals: some hundredths of a pixel in a picture of 4000 px.
 _ROTATION_OFF, _SAME_PX, _SAME_DIRECTION = 1e-5, 1e-2, 1e-3
 _ROUNDED = 1e-3
 
@@ -22,14 +22,13 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True, kw_only=True)
 class Optics:
-    """What a camera makes of a direction: a point x, y, z in front of it (right, down, forward) to a pixel.
+    """Camera intrinsics: project a point x, y, z in front of the camera (right, down, forward) to a pixel.
 
     Attributes:
-        matrix: [3, 3], focal lengths in px, and the principal point, of a picture whose pixel centres are
-            integers; without skew.
-        distortion: [N] coefficients as OpenCV orders them: k1 k2 p1 p2 k3 and so on (N of 0, 4, 5, 8, 12
-            or 14), of a fisheye lens k1 k2 k3 k4 (0 or 4).
-        fisheye: Whether the lens is Kannala and Brandt's, OpenCV's fisheye and Kalibr's `equidistant`.
+        matrix: [3, 3], focal lengths and principal point in px, without skew; pixel centres are integers.
+        distortion: [N] coefficients in OpenCV's order: k1 k2 p1 p2 k3 and so on (N is 0, 4, 5, 8, 12 or
+            14); for a fisheye lens k1 k2 k3 k4 (N is 0 or 4).
+        fisheye: Kannala and Brandt's model, which is OpenCV's fisheye and Kalibr's `equidistant`.
     """
 
     matrix: Float[np.ndarray, "3 3"]
@@ -60,13 +59,13 @@ class Rig:
     """Two cameras on one mount.
 
     Attributes:
-        left, right: What each sees.
-        rotation, translation_m: From the left camera to the right one, in OpenCV's convention: a point is at
-            rotation @ x + translation_m for the right camera that is at x for the left one; so of two cameras
-            side by side translation_m[0] is minus the baseline.
-        size_px: Width and height of the pictures that it is for; None where the file does not say.
-        name: What errors call it, such as its file.
-        notes: What the file does not state, and what was assumed.
+        left, right: The intrinsics.
+        rotation, translation_m: From left to right camera coordinates, in OpenCV's convention:
+            x_right = rotation @ x_left + translation_m. In a rectified rig translation_m[0] is minus the
+            baseline.
+        size_px: Picture width and height; None if the file does not state them.
+        name: Name in errors, such as the file.
+        notes: Assumptions made about the file.
     """
 
     left: Optics
@@ -96,16 +95,16 @@ class Rig:
 
     @property
     def baseline_m(self) -> float:
-        """How far the cameras are apart."""
+        """Distance between the cameras."""
         return float(np.linalg.norm(self.translation_m))
 
     @property
     def rotation_degrees(self) -> float:
-        """By what angle the one camera is turned against the other."""
+        """Angle between the orientations of the two cameras."""
         return float(np.degrees(np.linalg.norm(cv2.Rodrigues(self.rotation)[0])))
 
     def unlike_rectified(self) -> str | None:
-        """Why rows of its pictures do not match as they are, in a few words; None where they do."""
+        """Why the rig's pictures are not rectified, in a few words; None if they are."""
         left, right = self.left.matrix, self.right.matrix
         if any(optics.fisheye or optics.distortion.any() for optics in (self.left, self.right)):
             return "lenses that distort"
@@ -119,7 +118,7 @@ class Rig:
         return None
 
     def camera(self) -> StereoCamera:
-        """The camera of a rig whose pictures are rectified already; StereoweaveError for any other rig."""
+        """The stereo camera of a rectified rig; raises StereoweaveError for any other rig."""
         unlike = self.unlike_rectified()
         if unlike:
             raise StereoweaveError(
@@ -132,12 +131,12 @@ class Rig:
             baseline_m=self.baseline_m,
             cx_px=float(left[0, 2]),
             cy_px=float(left[1, 2]),
-            # Rounded, so that a file's 31.086 is not 31.086000000000013 for being a difference.
+            # Rounded, so that a file's 31.086 does not become 31.086000000000013 by the subtraction.
             doffs_px=round(float(right[0, 2] - left[0, 2]), 9),
         )
 
     def check_size(self, pair: StereoPair) -> None:
-        """Raise a FormatError where it is for pictures of another size than those of the pair."""
+        """Raise a FormatError if the rig is for pictures of another size."""
         size_px = pair_size_px(pair)
         if self.size_px not in (None, size_px):
             raise FormatError(
@@ -148,17 +147,17 @@ class Rig:
 
 
 def pair_size_px(pair: StereoPair) -> Size:
-    """Width and height of the pictures of a pair."""
+    """Picture width and height of a pair."""
     return pair.left.shape[1], pair.left.shape[0]
 
 
 def format_size(size_px: Size | None) -> str:
-    """A size as people write it, 640x480."""
+    """Format a size as 640x480."""
     return "unknown size" if size_px is None else f"{size_px[0]}x{size_px[1]}"
 
 
 def rectified_rig(pair: StereoPair) -> Rig:
-    """The rig of a rectified pair whose camera is known."""
+    """The rig of a rectified pair with a camera."""
     camera = pair.camera
     if camera is None:
         raise StereoweaveError("expected a pair whose camera is known, found none; give it a calibration")
@@ -171,7 +170,7 @@ def rectified_rig(pair: StereoPair) -> Rig:
 def make_rectified_rig(
     left: Float[np.ndarray, "3 n"], right: Float[np.ndarray, "3 n"], aside_m: float
 ) -> Rig:
-    """The rig of rectified pictures; what a matrix says beyond its third column is not looked at."""
+    """The rig of rectified pictures; columns beyond a matrix's third are ignored."""
     return Rig(
         left=Optics(matrix=left[:, :3], distortion=np.zeros(0)),
         right=Optics(matrix=right[:, :3], distortion=np.zeros(0)),
