@@ -1,1 +1,1 @@
-"""Real datasets as pairs with their ground truth."""
+"""Datasets: stereo pairs with ground truth."""

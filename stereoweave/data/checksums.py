@@ -1,4 +1,4 @@
-"""Checksums beside files, as the program sha256sum writes and checks them."""
+"""Checksums in the format of sha256sum."""
 
 import hashlib
 from collections.abc import Mapping
@@ -7,13 +7,13 @@ from stereoweave.errors import FormatError
 
 
 def make_checksums(files: Mapping[str, bytes]) -> bytes:
-    """A line for each file, by name: its SHA-256 and its name; `sha256sum --check` takes it."""
+    """SHA-256 and name of each file, a line each, sorted by name; for `sha256sum --check`."""
     lines = (f"{hashlib.sha256(files[name]).hexdigest()}  {name}\n" for name in sorted(files))
     return "".join(lines).encode()
 
 
 def verify_checksums(files: Mapping[str, bytes], sums: bytes, where: object, remedy: str) -> None:
-    """FormatError, naming the first file that is not the one that `sums` was made of."""
+    """Raise a FormatError that names the first file that is damaged, missing or not listed in `sums`."""
     found = set(make_checksums(files).splitlines())
     expected = sums.splitlines()
     wrong = [line for line in expected if line not in found]

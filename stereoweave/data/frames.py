@@ -1,4 +1,4 @@
-"""Frames of a dataset: their names, and the folders that their files are listed from."""
+"""Frames of a dataset, and the matching of their files by name."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,11 +12,11 @@ _SUFFIXES = {".png", ".webp", ".jpg", ".pfm"}
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """A pair of a dataset, known by name and read when it is asked for.
+    """A pair of a dataset, read on request.
 
     Attributes:
-        name: Unique and stable, parts separated by "/"; what stands before the last "/" is the sequence.
-        read: The sample, from its files; FormatError, naming the file, where one is missing or damaged.
+        name: Unique and stable, with parts separated by "/"; the part before the last "/" is the sequence.
+        read: Reads the sample; raises a FormatError that names a missing or damaged file.
     """
 
     name: str
@@ -24,18 +24,18 @@ class Frame:
 
     @property
     def sequence(self) -> str:
-        """What stands before the last "/" of the name; empty for stills."""
+        """The name's part before the last "/"; empty for stills."""
         return self.name.rpartition("/")[0]
 
 
 def match_files(*folders: Path, ending: str = "") -> dict[str, list[Path]]:
-    """The files of each frame, one from each folder, by the name that they share there, in its order.
+    """Match the files of equal names in several folders: one from each folder per frame, sorted by name.
 
-    A name is the path below the folder, without the suffix; `ending` is what it must end in to count.
+    A name is the path below the folder, without the suffix; only names with this `ending` count.
 
     Raises:
-        StereoweaveError: There is no such folder.
-        FormatError: A folder lacks a file that another one has.
+        StereoweaveError: A folder does not exist.
+        FormatError: A folder lacks a file that another folder has.
     """
     listings = [_list_files(folder, ending) for folder in folders]
     names = sorted(set().union(*listings))
@@ -51,7 +51,7 @@ def match_files(*folders: Path, ending: str = "") -> dict[str, list[Path]]:
 
 
 def require_folder(folder: Path) -> Path:
-    """The folder itself; StereoweaveError where there is none."""
+    """Return the folder; raise a StereoweaveError if it does not exist."""
     if not folder.is_dir():
         found = "a file" if folder.exists() else "nothing of that name"
         raise StereoweaveError(f"{folder}: expected a folder of the dataset, found {found}")
@@ -59,7 +59,7 @@ def require_folder(folder: Path) -> Path:
 
 
 def list_scene_folders(root: Path) -> list[Path]:
-    """The folders in `root`, by name, for datasets that keep each scene in one."""
+    """Folders in `root`, sorted by name, for datasets with one folder per scene."""
     return sorted(path for path in require_folder(root).iterdir() if path.is_dir() and path.name[0] != ".")
 
 

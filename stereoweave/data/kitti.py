@@ -1,4 +1,4 @@
-"""KITTI stereo 2012 (Geiger et al.) and 2015 (Menze and Geiger), training sets, as their archives unpack."""
+"""KITTI stereo 2012 (Geiger et al.) and 2015 (Menze and Geiger), training sets, as unpacked."""
 
 from dataclasses import replace
 from functools import partial
@@ -16,10 +16,10 @@ from stereoweave.stereo import Sample, StereoCamera, StereoPair
 
 
 def list_kitti2012(root: Path) -> list[Frame]:
-    """The 194 pairs of 2012, 000000_10 and so on, in grey.
+    """The 194 grey pairs of 2012, such as 000000_10.
 
-    The development kit gives the ground truth for the grey cameras, 0 and 1; the colour ones, 2 and 3, stand
-    6 cm beside them by the calibration.
+    The ground truth is for the grey cameras, 0 and 1; by the calibration the colour cameras, 2 and 3, are
+    6 cm beside them.
     """
     training = root / "training"
     folders = [training / name for name in ("image_0", "image_1", "disp_occ", "disp_noc")]
@@ -27,9 +27,9 @@ def list_kitti2012(root: Path) -> list[Frame]:
 
 
 def list_kitti2015(root: Path) -> list[Frame]:
-    """The 200 pairs of 2015, 000000_10 and so on, in colour; calib_cam_to_cam is an archive of its own.
+    """The 200 colour pairs of 2015, such as 000000_10; calib_cam_to_cam is a separate archive.
 
-    disp_occ_1 is not the right view's disparity, but the next moment's, seen from the left: it is not read.
+    disp_occ_1 is not read: it is the left view's disparity at the next time step, not the right view's.
     """
     training = root / "training"
     folders = [training / name for name in ("image_2", "image_3", "disp_occ_0", "disp_noc_0")]
@@ -40,7 +40,7 @@ def _list_frames(folders: list[Path], calibrations: Path, keys: tuple[str, str])
     require_folder(calibrations)
     return [
         Frame(name=name, read=partial(_read, files, calibrations / f"{name.removesuffix('_10')}.txt", keys))
-        # The pictures of the next moment, _11, have no ground truth.
+        # The pictures of the next time step, _11, have no ground truth.
         for name, files in match_files(*folders, ending="_10").items()
     ]
 
@@ -57,7 +57,7 @@ def _read_disparity(path: Path, pair: StereoPair) -> Float32[np.ndarray, "h w"]:
 
 
 def _read_camera(path: Path, keys: tuple[str, str]) -> StereoCamera:
-    """The camera of two projections P = K [I | t]: P[0, 3] = focal_px * t, and the baseline is t0 - t1."""
+    """Read the camera from two projections P = K [I | t]: P[0, 3] = focal_px * t, baseline = t0 - t1."""
     with reading(path, "a calibration of KITTI"):
         lines = (
             line.partition(":") for line in read_calibration_bytes(path).decode(errors="replace").splitlines()

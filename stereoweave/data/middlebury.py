@@ -1,4 +1,4 @@
-"""Middlebury stereo (Scharstein et al.) of 2001, 2003, 2005, 2006, 2014 and 2021: a folder for each scene."""
+"""Middlebury stereo (Scharstein et al.) of 2001, 2003, 2005, 2006, 2014 and 2021: a folder per scene."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,7 +17,7 @@ from stereoweave.stereo import Sample, StereoCamera, StereoPair
 
 @dataclass(frozen=True)
 class _SceneFiles:
-    """What a scene calls its two views and their disparities, and by what these are multiplied."""
+    """File names of a scene's views and disparities, and the factor of the stored disparities."""
 
     left: str
     right: str
@@ -32,8 +32,7 @@ _FILES_2001 = {
 }
 _OTHER_FILES_2001 = _SceneFiles("im2", "im6", "disp2", "disp6", 8)
 
-# The height tells the size that was downloaded. Grey levels are pixels of the full size in every size: they
-# are divided by how much smaller the picture is.
+# Shrinking factor by height. Grey levels are pixels of the full size, and are divided by it.
 _2003_SHRINKING = {1500: 1, 750: 2, 375: 4}
 _2006_SHRINKING = {1110: 1, 555: 2, 370: 3}
 
@@ -42,7 +41,7 @@ _WITHOUT_TRUTH_2005 = {"Computer", "Drumsticks", "Dwarves"}
 
 
 def list_middlebury2001(root: Path) -> list[Frame]:
-    """Eight scenes of planes, from views 2 and 6 or their like; no camera is published."""
+    """Eight scenes of planes, from views 2 and 6 or similar; no camera is published."""
     return [
         Frame(
             name=scene.name, read=partial(_read_2001, scene, _FILES_2001.get(scene.name, _OTHER_FILES_2001))
@@ -62,7 +61,7 @@ def list_middlebury2005(root: Path) -> list[Frame]:
         Frame(name=views.relative_to(root).as_posix(), read=partial(_read_2006, scene, views))
         for scene in list_scene_folders(root)
         if scene.name not in _WITHOUT_TRUTH_2005
-        # The archives of two views have one picture of each; those of seven have lights and exposures.
+        # Archives of two views have one picture per view; archives of seven views have lights and exposures.
         for views in sorted(scene.glob("Illum*/Exp*")) or [scene]
     ]
 
@@ -116,13 +115,13 @@ def _read_2014(scene: Path) -> Sample:
 
 
 def _find_picture(scene: Path, name: str) -> Path:
-    """The picture in the format that was downloaded; .png where there is none."""
+    """The picture's path in the downloaded format; .png if none exists."""
     kinds = (scene / f"{name}{suffix}" for suffix in (".ppm", ".pgm"))
     return next((path for path in kinds if path.exists()), scene / f"{name}.png")
 
 
 def _read_levels(path: Path, pair: StereoPair) -> Float32[np.ndarray, "h w"]:
-    """The grey levels of a disparity map, whose 0, unknown, becomes NaN."""
+    """Read a disparity map's grey levels; 0, unknown, becomes NaN."""
     levels = require_size(read_pixels(path, "L"), path, pair)
     return np.where(levels > 0, levels, np.nan).astype(np.float32)
 
@@ -141,8 +140,8 @@ def _find_shrinking(path: Path, pair: StereoPair, by_height_px: dict[int, int]) 
 def _read_camera_2006(dmin: Path, pair: StereoPair, shrinking: int) -> StereoCamera:
     """The published camera, focal length 3740 px in full size and baseline 160 mm.
 
-    dmin.txt says, in pixels of the full size whatever the size, how much cropping took from each disparity.
-    No principal point is published: it is set to the middle of the picture.
+    dmin.txt states, always in pixels of the full size, how much cropping reduced each disparity. No principal
+    point is published, so it is set to the middle of the picture.
     """
     with reading(dmin, "a number of pixels"):
         doffs_px = float(read_small(dmin).decode(errors="replace")) / shrinking

@@ -1,14 +1,14 @@
-"""A pair with its truth as the bytes of a few files, and back.
+"""Packing of a pair and its ground truth into the bytes of a few files.
 
     left.webp, right.webp, view_0.50.webp           lossless
     disparity.png, right_disparity.png              16 bits: pixels * steps_per_px; 65535 is unknown
     occluded.png, right_occluded.png                1 bit
     camera.json                                     the camera in pixels and metres, and steps_per_px
 
-Of 640x480, 17 rendered pairs of all scenes take 0.4 to 1.2 MB, 0.87 on average; packing takes 25 to 60 ms of
-a core, unpacking 22.
+17 rendered pairs of 640x480 from all scenes take 0.4 to 1.2 MB, 0.87 on average. Packing takes 25 to 60 ms on
+one core, unpacking 22.
 
-A disparity of 0, such as the sky's, is known here; so KITTI's PNG, whose 0 is unknown, would not do.
+A disparity of 0, such as the sky's, is known here, so KITTI's PNG, where 0 means unknown, is unsuitable.
 """
 
 import io
@@ -28,9 +28,9 @@ from stereoweave.io.decoding import unpacked_values
 from stereoweave.stereo import Sample, StereoCamera
 
 _UNKNOWN = 65535
-# Rounds to half of it, 0.0005 px; finer steps cost 20 kB a map and power of two.
+# The rounding error is half a step, 0.0005 px; each further power of two costs 20 kB per map.
 _MOST_STEPS_PER_PX = 1024
-# The type and the channels of a pixel.
+# Data type and channels of a pixel.
 _Kind = tuple[type[np.generic], tuple[int, ...]]
 _RGB: _Kind = np.uint8, (3,)
 _STEPS: _Kind = np.uint16, ()
@@ -45,11 +45,11 @@ _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 3, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_
 
 
 def pack(sample: Sample, views: Mapping[float, UInt8[np.ndarray, "h w 3"]]) -> dict[str, bytes]:
-    """The files of a pair by the ends of their names.
+    """Pack a pair into files, by suffix of their names.
 
     Args:
-        sample: Disparities of 0 or more; NaN is unknown.
-        views: Further pictures by their position between the cameras.
+        sample: With disparities of 0 or more; NaN means unknown.
+        views: Additional views by position.
     """
     disparities_px = {
         "disparity.png": sample.disparity_px,
@@ -69,7 +69,7 @@ def pack(sample: Sample, views: Mapping[float, UInt8[np.ndarray, "h w 3"]]) -> d
 
 
 def unpack(files: Mapping[str, bytes]) -> Sample:
-    """The sample of files that `pack` made; a ValueError for any others."""
+    """Unpack the sample from files of `pack`; raises ValueError for any others."""
     steps_per_px, camera = _parse_camera(_require_file(files, "camera.json"))
     left = _decode(files, "left.webp", _RGB)
 
@@ -95,13 +95,13 @@ def unpack(files: Mapping[str, bytes]) -> Sample:
 
 
 def unpack_views(files: Mapping[str, bytes]) -> dict[float, UInt8[np.ndarray, "h w 3"]]:
-    """The further pictures among files that `pack` made, by their position; a ValueError for any others."""
+    """Unpack the additional views from files of `pack`, by position; raises ValueError for any others."""
     names = sorted(name for name in files if name.startswith("view_"))
     return {float(name[len("view_") : -len(".webp")]): _decode(files, name, _RGB) for name in names}
 
 
 def _parse_camera(content: bytes) -> tuple[int, StereoCamera | None]:
-    """The steps per pixel and the camera that camera.json says."""
+    """Parse the steps per pixel and the camera of camera.json."""
     try:
         match json.loads(content):
             case {"steps_per_px": int(steps), "camera": None} if 0 < steps <= _MOST_STEPS_PER_PX:
@@ -114,7 +114,7 @@ def _parse_camera(content: bytes) -> tuple[int, StereoCamera | None]:
 
 
 def _choose_steps_per_px(disparities_px: Iterable[Float[np.ndarray, "h w"]]) -> int:
-    """The power of two that uses most of 16 bits, so that it divides without rounding."""
+    """Choose the largest power of two that fits 16 bits; dividing by it is exact."""
     known_px = np.concatenate([values[~np.isnan(values)] for values in disparities_px])
     least_px, most_px = known_px.min(initial=0), known_px.max(initial=0)
     if least_px < 0 or most_px >= _UNKNOWN:
@@ -145,7 +145,7 @@ def _require_file(files: Mapping[str, bytes], name: str) -> bytes:
 
 
 def _decode(files: Mapping[str, bytes], name: str, kind: _Kind) -> Shaped[np.ndarray, "h w *channels"]:
-    """A picture among the files, which must be of that kind."""
+    """Decode a picture and check its kind."""
     values = unpacked_values(name, _require_file(files, name))
     if (values.dtype.type, values.shape[2:]) != kind:
         raise ValueError(f"{name} of another kind of picture")

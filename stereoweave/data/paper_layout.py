@@ -1,14 +1,14 @@
 """The folders of "Fast Depth Estimation for View Synthesis" (section IV-A): left, right and depth.
 
-The paper says that depth, of the left view, reaches from 0 to 15 m, and not how its files hold it. Two ways
-are read:
+The paper states that the left view's depth ranges from 0 to 15 m, but not the file format. Two formats are
+read:
 
-- 16-bit grey PNG of millimetres; 0 is unknown, and so is what is beyond 15 m;
-- 8-bit RGB PNG of (R + 256 G + 65536 B) / (2^24 - 1) of 15 m, lowest byte first, as the simulator CARLA packs
-  it; 0 is unknown, and so is the greatest number, where 15 m cannot be told from what is beyond it.
+- 16-bit grey PNG of millimetres; 0 and values beyond 15 m are unknown;
+- 8-bit RGB PNG of (R + 256 G + 65536 B) / (2^24 - 1) of 15 m, as the simulator CARLA packs depth; 0 and the
+  maximum are unknown, because the maximum also stands for anything beyond 15 m.
 
 The second is written. Each written frame has its checksums in sums/NAME.sha256, for sha256sum --check in the
-root; they come last, so that a frame that has them is whole.
+root. They are written last, so a frame with checksums is complete.
 """
 
 import os
@@ -32,9 +32,9 @@ _ENDINGS = {"left": "png", "right": "png", "calib": "txt", "depth": "png"}
 
 
 def list_paper(root: Path) -> list[Frame]:
-    """The frames of left, right and depth, which hold files of equal names, in subfolders or not: scene/0001.
+    """Frames from the folders left, right and depth, with files of equal names, such as scene/0001.
 
-    Beside the three folders lies the camera in Middlebury's format: calib.txt, which made them all, or
+    The camera is in Middlebury's format: calib.txt beside the folders for all frames, or
     calib/scene/0001.txt for each.
     """
     camera = root / "calib.txt"
@@ -50,12 +50,12 @@ def list_paper(root: Path) -> list[Frame]:
 
 
 def write_frame(root: Path, name: str, sample: Sample) -> None:
-    """Writes a frame with its camera; its checksums come last, and say that it is whole.
+    """Write a frame with its camera, and its checksums last, which mark it complete.
 
-    Depth of 15 m or more becomes unknown: the paper's camera reaches no further.
+    Depth of 15 m or more becomes unknown, the limit of the paper's camera.
 
     Raises:
-        StereoweaveError: The sample has no camera, or the folder cannot be written, or is full.
+        StereoweaveError: The sample has no camera, or the folder is full or not writable.
     """
     if sample.camera is None:
         raise StereoweaveError(f"{root}: expected a sample with its camera, to write its depth, found none")
@@ -69,13 +69,13 @@ def write_frame(root: Path, name: str, sample: Sample) -> None:
 
 
 def list_complete_frames(root: Path) -> list[str]:
-    """The names of the frames that `write_frame` wrote to the end."""
+    """Names of the completely written frames."""
     sums = root / "sums"
     return sorted(path.relative_to(sums).with_suffix("").as_posix() for path in sums.rglob("[!.]*.sha256"))
 
 
 def remove_unfinished(root: Path) -> None:
-    """Removes all but the frames that `write_frame` wrote to the end, where nobody is writing now."""
+    """Remove the files of incomplete frames; no other process may be writing."""
     whole = set(list_complete_frames(root))
     for folder in (root / name for name in _ENDINGS):
         for path in folder.rglob("*.*"):
@@ -84,7 +84,7 @@ def remove_unfinished(root: Path) -> None:
 
 
 def check_frame(root: Path, name: str) -> None:
-    """FormatError, naming the file, where a file of a written frame is damaged or missing."""
+    """Raise a FormatError that names a damaged or missing file of a written frame."""
     sums = _checksum_file(root, name)
     with reading(sums, "the checksums of a frame"):
         expected = sums.read_bytes()
@@ -106,7 +106,7 @@ def _read(files: list[Path], camera: Path) -> Sample:
 
 
 def _unpack_depth_m(stored: Shaped[np.ndarray, "h w *channels"]) -> Float[np.ndarray, "h w"]:
-    """Depth in metres, NaN where it is unknown."""
+    """Depth in metres; unknown is NaN."""
     if stored.ndim == 2:
         return np.where((stored > 0) & (stored <= 1000 * RANGE_M), stored / 1000, np.nan)
     packed = stored @ np.array([1, 256, 65536])
@@ -139,7 +139,7 @@ def _checksum_file(root: Path, name: str) -> Path:
 
 
 def _read_synced(path: Path) -> bytes:
-    """What a file holds, once that is on the disk: later than its checksums, it could be lost before them."""
+    """Read a file after syncing it to disk, so that a crash cannot keep its checksums and lose the file."""
     with path.open("rb") as stream:
         os.fsync(stream.fileno())
         return stream.read()

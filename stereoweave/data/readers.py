@@ -1,4 +1,4 @@
-"""Datasets by name, as frames to train on; and scenes in the project's own layout, to score a matcher on."""
+"""Datasets by name, as frames for training, and scenes for scoring a matcher."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -38,11 +38,11 @@ DATASETS: dict[str, Callable[[Path], list[Frame]]] = {
 
 
 def open_dataset(name: str, root: str | Path) -> list[Frame]:
-    """The frames of a dataset by name, listed from the folder that its authors' archives were unpacked to.
+    """List the frames of a dataset, sorted by name, from the folder of its unpacked archives.
 
     Raises:
-        StereoweaveError: An unknown dataset, a root that lacks a folder, or no frame in it.
-        FormatError: A file is missing, where the listing shows it; a frame's `read` finds the others.
+        StereoweaveError: The dataset is unknown, a folder is missing, or there is no frame.
+        FormatError: The listing shows that a file is missing; a frame's `read` reports other missing files.
     """
     if name not in DATASETS:
         raise StereoweaveError(f"expected one of {', '.join(DATASETS)}, found {name!r}", setting="dataset")
@@ -54,13 +54,13 @@ def open_dataset(name: str, root: str | Path) -> list[Frame]:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """A pair to score a matcher on.
+    """A pair with ground truth, for scoring a matcher.
 
     Attributes:
-        name: The folder's.
-        pair: With its camera where the folder has a calib.txt.
-        truth_px: float32 [H, W], the disparity of the left view; NaN where it is unknown.
-        occluded: True occlusion of the left view; None where the truth of the right view is unknown.
+        name: Name of the folder or frame.
+        pair: With its camera if known.
+        truth_px: float32 [H, W], true disparity of the left view; unknown is NaN.
+        occluded: True occlusion of the left view; None if the right view's disparity is unknown.
     """
 
     name: str
@@ -70,24 +70,24 @@ class Scene:
 
 
 def read_scenes(folder: str | Path, dataset: str | None = None) -> Iterator[Scene]:
-    """The scenes of `folder` by name, each read when its turn comes; as for `list_scenes`."""
+    """Read the scenes of `folder` lazily, sorted by name; arguments and errors as for `list_scenes`."""
     return (read() for read in list_scenes(folder, dataset))
 
 
 def list_scenes(folder: str | Path, dataset: str | None = None) -> list[Callable[[], Scene]]:
-    """What reads each scene of `folder`, by the scenes' names.
+    """List the scenes of `folder` by name, as functions that read them.
 
-    A scene is a folder of left.png, right.png, disparity.png (16 bit, pixels * 256, 0 = unknown) or
-    disparity.pfm (NaN or infinity = unknown), and, where the camera is known, Middlebury's calib.txt. Where
-    there is none, the pairs of all rendered sets (`stereoweave synth make`) in the folder are the scenes.
+    A scene is a folder with left.png, right.png, disparity.png (16 bit, pixels * 256, 0 = unknown) or
+    disparity.pfm (NaN or infinity = unknown), and optionally Middlebury's calib.txt. Without such folders
+    the scenes are the pairs of all rendered sets (`stereoweave synth make`) in `folder`.
 
     Args:
-        folder: Of the scenes.
-        dataset: The name of a dataset in `DATASETS` whose frames are the scenes instead.
+        folder: Folder of the scenes.
+        dataset: Name in `DATASETS` of a dataset to read instead.
 
     Raises:
         StereoweaveError: No scene in the folder, or as for `open_dataset`.
-        FormatError: While a scene is read: a file is missing, damaged, or of another size than its others.
+        FormatError: On reading a scene: a file is missing, damaged or of a different size.
     """
     if dataset:
         return [partial(_read_frame, frame) for frame in open_dataset(dataset, folder)]

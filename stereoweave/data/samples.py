@@ -1,4 +1,4 @@
-"""Samples from what the files of a dataset hold: sizes compared, what is unknown or hidden marked."""
+"""Samples from a dataset's arrays: sizes checked, unknown and occluded pixels marked."""
 
 from pathlib import Path
 
@@ -8,14 +8,14 @@ from jaxtyping import Bool, Float, Shaped
 from stereoweave.errors import FormatError
 from stereoweave.stereo import Sample, StereoPair
 
-# As in the project's own collages: rounding, and surfaces that all but touch.
+# As in the project's collages: allows for rounding and nearly touching surfaces.
 _TOLERANCE_PX = 0.5
 
 
 def require_size(
     values: Shaped[np.ndarray, "h w *channels"], path: Path, pair: StereoPair
 ) -> Shaped[np.ndarray, "h w *channels"]:
-    """The values themselves; FormatError, naming `path`, where they are not of the size of the pair."""
+    """Return the values; raise a FormatError that names `path` if their size is not the pair's."""
     (height_px, width_px), expected = values.shape[:2], pair.left.shape[:2]
     if (height_px, width_px) != expected:
         raise FormatError(
@@ -31,13 +31,13 @@ def make_sample(
     right_disparity_px: Float[np.ndarray, "h w"] | None = None,
     occluded: Bool[np.ndarray, "h w"] | None = None,
 ) -> Sample:
-    """The sample of a pair and its ground truth.
+    """Make a sample from a pair and its ground truth.
 
     Args:
-        pair: With its camera where that is known.
-        disparity_px: Of the left view; NaN and infinity are unknown.
-        right_disparity_px: Of the right view; None where the dataset has none: all of it becomes unknown.
-        occluded: The dataset's own mask of the left view; None to find it from the two disparities.
+        pair: With its camera if known.
+        disparity_px: Left view's disparity; NaN and infinity mean unknown.
+        right_disparity_px: Right view's disparity; None means unknown everywhere.
+        occluded: The dataset's mask of the left view; None computes it from the two disparities.
     """
     left_px = _mark_unknown(disparity_px)
     right_px = (
@@ -57,10 +57,10 @@ def make_sample(
 def find_hidden(
     disparity_px: Float[np.ndarray, "h w"], other_px: Float[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Pixels that this view alone sees: whose match is beside the other picture, or behind what it sees.
+    """Find occluded pixels: the match lies outside the other picture or behind its visible surface.
 
-    False where a disparity that decides it is unknown. The other view lies to the right of this one; for a
-    right view, both maps are handed in mirrored.
+    False if a needed disparity is unknown. The other view is to the right of this one; mirror both maps for
+    a right view.
     """
     width_px = disparity_px.shape[1]
     match = np.arange(width_px) - disparity_px
@@ -70,8 +70,8 @@ def find_hidden(
     share = (match - before).astype(np.float32)
     after = before + (share > 0)
     before_px, after_px = (np.take_along_axis(other_px, columns, axis=1) for columns in (before, after))
-    # At a jump the nearer one of the two columns beside the match decides; on a slope that one may be nearer
-    # than the surface itself, but what lies between the two is not. Comparisons with NaN are False.
+    # At a jump the closer of the two columns beside the match decides. On a slope that column may be nearer
+    # than the surface itself, but the interpolated value is not. Comparisons with NaN are False.
     column_px = np.where(share < 0.5, before_px, after_px)
     between_px = (1 - share) * before_px + share * after_px
     return outside | (np.minimum(column_px, between_px) > disparity_px + _TOLERANCE_PX)

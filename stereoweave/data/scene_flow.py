@@ -1,7 +1,7 @@
-"""Scene Flow (Mayer et al. 2016): FlyingThings3D, Driving and Monkaa, as their archives unpack.
+"""Scene Flow (Mayer et al. 2016): FlyingThings3D, Driving and Monkaa, as unpacked.
 
-A root holds frames_cleanpass, frames_finalpass or both, and disparity; below each are the same folders, the
-last of which are left and right.
+The root contains frames_cleanpass, frames_finalpass or both, and disparity. Each has the same subfolders,
+which end in left and right.
 """
 
 from collections.abc import Iterator
@@ -40,7 +40,7 @@ def list_monkaa(root: Path) -> list[Frame]:
 
 
 def _list_frames(root: Path, focal_px: dict[str, float]) -> list[Frame]:
-    # The passes are separate downloads of tens of gigabytes: either will do.
+    # The passes are separate downloads of tens of gigabytes; one is enough.
     passes = {kind: root / folder for kind, folder in _PASSES.items() if (root / folder).is_dir()}
     if not passes:
         raise StereoweaveError(
@@ -66,16 +66,16 @@ def _match_files(pictures: Path, truth: Path) -> Iterator[tuple[str, list[Path]]
 
 def _read(files: list[Path], focal_px: float) -> Sample:
     left, right, disparity, right_disparity = files
-    # The baseline is 1 unit of Blender, which we take for 1 m. The principal point is the published one.
+    # The baseline is 1 Blender unit, taken as 1 m. The principal point is the published one.
     camera = StereoCamera(focal_px=focal_px, baseline_m=1.0, cx_px=479.5, cy_px=269.5)
     pair = replace(read_pair(left, right), camera=camera)
     return make_sample(pair, _read_disparity(disparity, pair), _read_disparity(right_disparity, pair))
 
 
 def _read_disparity(path: Path, pair: StereoPair) -> Float32[np.ndarray, "h w"]:
-    """Disparity without its sign: positive for both views here, negative for the left in the later subset.
+    """Read a disparity and drop its sign, which is negative for left views of the later subset.
 
-    Parallel cameras leave no doubt about which is meant, unless one map has both signs: FormatError.
+    With parallel cameras the sign carries no information; a map with both signs raises FormatError.
     """
     values_px = require_size(read_pfm(path), path, pair)
     if (values_px < 0).any() and (values_px > 0).any():

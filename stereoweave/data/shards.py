@@ -1,8 +1,8 @@
-"""Large sets on disk: tar files in the form of the library webdataset, read by index or nearly as a stream.
+"""Large sets as tar files in webdataset's format, read by index or nearly sequentially.
 
-A set is a folder of shards SET-FIRST-LAST.tar, named after the pairs in them: ship-000050-000099.tar. Pair 57
-in it is the files ship-000057.left.webp and so on (packing.py) and their checksums, ship-000057.sha256. The
-same pairs give the same bytes. A shard appears whole, under a name of its own, and is never changed.
+A set is a folder of shards SET-FIRST-LAST.tar, named after their first and last pair: ship-000050-000099.tar.
+Its pair 57 is the files ship-000057.left.webp and so on (packing.py) and their checksums,
+ship-000057.sha256. Equal pairs give equal bytes. A shard is written atomically and never changed.
 """
 
 import os
@@ -37,7 +37,7 @@ _WINDOW = 8
 
 
 class Shard(NamedTuple):
-    """A file of a set, and the numbers of the first and the last pair in it."""
+    """One file of a set, and the numbers of its first and last pair."""
 
     path: Path
     set_name: str
@@ -45,15 +45,15 @@ class Shard(NamedTuple):
     last: int
 
     def pair_name(self, number: int) -> str:
-        """What the names of a pair's files begin with."""
+        """Common prefix of a pair's file names."""
         return f"{self.set_name}-{number:06d}"
 
 
 def write_shard(folder: Path, set_name: str, first: int, pairs: Sequence[Mapping[str, bytes]]) -> None:
-    """Writes pairs, each as `packing.packed` gives it and numbered from `first`, as one shard.
+    """Write pairs packed by `packing.pack`, numbered from `first`, as one shard.
 
     Raises:
-        StereoweaveError: The folder cannot be written, or is full; nothing is left of the shard.
+        StereoweaveError: The folder is full or not writable; no partial shard remains.
     """
     last = first + len(pairs) - 1
     shard = Shard(folder / f"{set_name}-{first:06d}-{last:06d}.tar", set_name, first, last)
@@ -61,20 +61,20 @@ def write_shard(folder: Path, set_name: str, first: int, pairs: Sequence[Mapping
         with tarfile.open(fileobj=stream, mode="w", format=tarfile.USTAR_FORMAT) as tar:
             for number, pair in enumerate(pairs, first):
                 _add_pair(tar, shard.pair_name(number), pair)
-        # Renamed before its bytes are on the disk, it could outlive them where the power fails.
+        # Without the sync, a power failure could keep the new name and lose the bytes.
         stream.flush()
         os.fsync(stream.fileno())
 
 
 def list_shards(folder: Path, set_name: str | None = None) -> list[Shard]:
-    """The shards of one set in a folder, by their first pair.
+    """List the shards of a set, sorted by first pair.
 
     Args:
-        folder: Of a set.
-        set_name: The set's; that of the first shard if None.
+        folder: Folder of the set.
+        set_name: Name of the set; None takes it from the first shard.
 
     Raises:
-        FormatError: A shard is another set's, or has a pair that is in the one before it too.
+        FormatError: A shard belongs to another set, or overlaps the one before it.
     """
     names = ((path, _NAME.fullmatch(path.name)) for path in folder.glob("[!.]*.tar"))
     shards = [Shard(path, found[1], int(found[2]), int(found[3])) for path, found in names if found]
@@ -93,13 +93,13 @@ def list_shards(folder: Path, set_name: str | None = None) -> list[Shard]:
 
 
 class Shards:
-    """The pairs of a set by index; it may travel to other processes, and opens files only while it reads."""
+    """Pairs of a set by index; can be pickled, and keeps no file open."""
 
     def __init__(self, folder: Path, set_name: str | None = None) -> None:
-        """Lists the shards of a folder.
+        """List the shards of a folder.
 
         Raises:
-            FormatError: There is none, one is missing before another one, or as in `list_shards`.
+            FormatError: There is no shard or a gap between shards, or as in `list_shards`.
         """
         self.shards = list_shards(folder, set_name)
         if not self.shards:
@@ -119,15 +119,15 @@ class Shards:
         return self._unpacked(index, unpack)
 
     def name(self, index: int) -> str:
-        """What the names of the pair's files begin with."""
+        """Common prefix of the pair's file names."""
         return self._shard(index).pair_name(index)
 
     def views(self, index: int) -> dict[float, UInt8[np.ndarray, "h w 3"]]:
-        """The further pictures of a pair, by their position between the cameras."""
+        """Additional views of a pair, by position."""
         return self._unpacked(index, unpack_views)
 
     def files(self, index: int) -> dict[str, bytes]:
-        """The files of a pair by the ends of their names, checked; FormatError where one is damaged."""
+        """Read and verify a pair's files, by suffix; raises FormatError if one is damaged."""
         path, name = self._shard(index).path, self.name(index)
         with reading(path, "a shard"), path.open("rb") as stream:
             places = self._places(path).get(name, {})
@@ -137,7 +137,7 @@ class Shards:
         return {end.removeprefix(f"{name}."): content for end, content in files.items()}
 
     def order(self, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
-        """All indices, shuffled so that who reads them goes through a few shards at a time, each once."""
+        """Shuffle all indices so that reading them visits a few shards at a time, each once."""
         sizes = np.diff(self._starts)
         window = rng.permutation(len(sizes)) // _WINDOW
         return np.lexsort((rng.random(self.count), window.repeat(sizes)))
@@ -146,7 +146,7 @@ class Shards:
         files = self.files(index)
         try:
             return unpack(files)
-        except (ValueError, KeyError, TypeError) as error:  # checksums are no proof of who wrote the files
+        except (ValueError, KeyError, TypeError) as error:  # valid checksums do not prove who wrote the files
             raise FormatError(
                 f"{self._shard(index).path}: expected the files of a pair, found {self.name(index)} without "
                 f"or with damaged ones ({error}); {_DELETE}"
@@ -158,14 +158,14 @@ class Shards:
         return self.shards[bisect_right(self._starts, index) - 1]
 
     def _places(self, path: Path) -> dict[str, dict[str, tuple[int, int]]]:
-        """Where the files of each pair begin in a shard, and their sizes; read once, as it takes a while."""
+        """Offset and size of each pair's files in a shard; cached, because reading them is slow."""
         if path not in self._contents:
             self._contents[path] = _list_contents(path)
         return self._contents[path]
 
 
 def list_frames(root: Path) -> list[Frame]:
-    """The pairs of all sets in a folder and below it, named SUBFOLDER/ship-000057."""
+    """Pairs of all sets in a folder and its subfolders, named SUBFOLDER/ship-000057."""
     frames = []
     for folder in sorted({path.parent for path in root.rglob("[!.]*.tar") if _NAME.fullmatch(path.name)}):
         pairs = Shards(folder)
@@ -182,7 +182,9 @@ def list_frames(root: Path) -> list[Frame]:
 def _add_pair(tar: tarfile.TarFile, name: str, pair: Mapping[str, bytes]) -> None:
     files = {f"{name}.{end}": content for end, content in sorted(pair.items())}
     for file, content in [*files.items(), (f"{name}.{_SUMS}", make_checksums(files))]:
-        header = tarfile.TarInfo(file)  # of no owner and 1970, so that the bytes depend on the pair alone
+        header = tarfile.TarInfo(
+            file
+        )  # no owner and the year 1970, so that the bytes depend on the pair alone
         header.size = len(content)
         tar.addfile(header, BytesIO(content))
 
@@ -192,7 +194,7 @@ def _list_contents(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
     try:
         with tarfile.open(path, "r:") as tar:
             for member in tar:
-                if member.size < 0:  # the same head would come again without end
+                if member.size < 0:  # would read the same header forever
                     raise tarfile.ReadError(f"a size of {member.size} bytes")
                 name, _, end = member.name.partition(".")
                 contents[name][end] = member.offset_data, member.size

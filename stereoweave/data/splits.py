@@ -1,4 +1,4 @@
-"""Which frames of a dataset are trained on and which are held out, by the rules in split_rules/."""
+"""Training and held-out frames of a dataset, by the rules in split_rules/."""
 
 import tomllib
 from fnmatch import fnmatchcase
@@ -15,15 +15,15 @@ SPLITS = ("random", "disjoint")
 
 
 def split_frames(frames: list[Frame], dataset: str, split: str) -> tuple[list[Frame], list[Frame]]:
-    """The frames to train on and those held out, each by name; their order does not matter.
+    """Split frames into training and held-out ones, each sorted by name.
 
     Args:
-        frames: Of one dataset.
+        frames: Frames of one dataset, in any order.
         dataset: Its name in `DATASETS`.
-        split: "random", the paper's, or "disjoint", which holds out whole sequences or stretches of them.
+        split: "random", as in the paper, or "disjoint", which holds out whole sequences or their ends.
 
     Raises:
-        StereoweaveError: An unknown dataset or split, or one of the two parts is empty.
+        StereoweaveError: The dataset or split is unknown, or one part is empty.
     """
     ordered = sorted(frames, key=lambda frame: frame.name)
     held_out = _choose_held_out(_read_rule(dataset, split), ordered)
