@@ -9,7 +9,7 @@ from PIL import Image
 
 import stereoweave as sw
 from stereoweave.cameras.calibration_files import read_rig
-from stereoweave.io.colormap import colour_disparity, colour_range_px
+from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.io.files import write_depth_png, write_image
 
 HERE = Path(__file__).parent
@@ -24,4 +24,4 @@ print(f"sure of {100 * (estimate.confidence > 0.5).mean():.0f} % of the pixels")
 
 write_depth_png("depth.png", depth_m)  # 16 bits, millimetres
 disparity_px = estimate.disparity_px
-write_image("disparity.png", colour_disparity(disparity_px, colour_range_px(disparity_px)))
+write_image("disparity.png", colour_disparity(disparity_px, find_colour_range_px(disparity_px)))

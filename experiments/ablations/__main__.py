@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from experiments.command_line import RecipeFile, RunsFolder, Seeds, run
-from stereoweave.cli.options import needing_the_train_extra, place_for
+from stereoweave.cli.options import make_parent_folder, needing_train_extra
 
 
 def ablations(
@@ -32,8 +32,8 @@ def ablations(
     """
     from rich.console import Console
 
-    place_for(report)
-    with needing_the_train_extra():
+    make_parent_folder(report)
+    with needing_train_extra():
         from experiments.ablations.experiment import plan, run_ablations
         from stereoweave.learn.recipe import read_recipe
     run_ablations(plan(read_recipe(recipe), seeds), out, rendered, report, Console())

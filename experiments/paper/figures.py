@@ -15,7 +15,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullLocator
 
 from stereoweave.bench.projection import project_right
-from stereoweave.io.colormap import colour_disparity, colour_range_px
+from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.io.files import replacing
 from stereoweave.stereo import DepthCurve, Sample
 
@@ -84,7 +84,7 @@ def draw_iterations(path: str | Path, rows: Sequence[Estimated]) -> None:
     pictures = []
     for sample, estimates_px in rows:
         known = np.isfinite(sample.disparity_px)
-        range_px = colour_range_px(sample.disparity_px[known][None])
+        range_px = find_colour_range_px(sample.disparity_px[known][None])
         truth = colour_disparity(np.where(known, sample.disparity_px, range_px[0]), range_px)
         truth[~known] = 0
         coloured = {name: colour_disparity(found_px, range_px) for name, found_px in estimates_px.items()}

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from experiments.command_line import RecipeFile, run
-from stereoweave.cli.options import needing_the_train_extra, place_for
+from stereoweave.cli.options import make_parent_folder, needing_train_extra
 from stereoweave.cli.tables import write_and_print
 
 
@@ -19,9 +19,9 @@ def speed(
     """Time the paper's network and its rivals on a 640x480 pair, in PyTorch and in ONNX Runtime."""
     from stereoweave.learn.recipe import read_recipe
 
-    place_for(out)
+    make_parent_folder(out)
     read = read_recipe(recipe)
-    with needing_the_train_extra():
+    with needing_train_extra():
         from experiments.speed.timing import measure_run_times
     write_and_print(out, "A pair of 640x480", measure_run_times(read))
 

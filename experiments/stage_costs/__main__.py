@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from experiments.command_line import run
-from stereoweave.cli.options import needing_the_train_extra, place_for
+from stereoweave.cli.options import make_parent_folder, needing_train_extra
 
 
 def stage_costs(
@@ -22,8 +22,8 @@ def stage_costs(
     from stereoweave.bench.pairs import write_csv
 
     if out:
-        place_for(out)
-    with needing_the_train_extra():
+        make_parent_folder(out)
+    with needing_train_extra():
         from experiments.stage_costs import profiling
     rows = profiling.measure_stage_costs(runs)
     if out:

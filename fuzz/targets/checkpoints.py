@@ -7,7 +7,7 @@ import torch
 
 from fuzz.targets import Target, written
 from stereoweave.learn.checkpoint import Checkpoint, load, save
-from stereoweave.learn.recipe import recipe_from
+from stereoweave.learn.recipe import parse_recipe
 
 _RECIPE = {
     **{"name": "x", "model": "weave_small", "steps": 10, "batch": 4, "learning_rate": 1e-3},
@@ -18,7 +18,7 @@ _RECIPE = {
 def _starts() -> dict[str, bytes]:
     weights = {"layer.weight": torch.ones(2, 3), "layer.bias": torch.zeros(2, dtype=torch.float16)}
     checkpoint = Checkpoint(
-        recipe=recipe_from(_RECIPE, "a recipe"),
+        recipe=parse_recipe(_RECIPE, "a recipe"),
         step=3,
         weights=weights,
         averaged=weights,

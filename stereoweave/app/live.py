@@ -24,7 +24,7 @@ from jaxtyping import Float, UInt8
 from stereoweave.cameras.rectify import rectify
 from stereoweave.cameras.rig import Rig
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io.colormap import colour_disparity, colour_range_px
+from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
 from stereoweave.pictures.frame_packing import ARRANGEMENTS, guess_arrangement
@@ -319,7 +319,7 @@ def followed(
     range_px: tuple[float, float] | None, disparity_px: Float[np.ndarray, "h w"]
 ) -> tuple[float, float]:
     """The colour range after a frame: a step from the previous one towards the frame's own range."""
-    wanted_px = colour_range_px(disparity_px[::_RANGED_EVERY_PX, ::_RANGED_EVERY_PX])
+    wanted_px = find_colour_range_px(disparity_px[::_RANGED_EVERY_PX, ::_RANGED_EVERY_PX])
     if range_px is None:
         return wanted_px
     low_px, high_px = (old + _FOLLOWED * (new - old) for old, new in zip(range_px, wanted_px, strict=True))

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from stereoweave.errors import Note, StereoweaveError
-from stereoweave.io.colormap import colour_disparity, colour_range_px
+from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.measure import distance
@@ -108,14 +108,14 @@ def depth_picture(kept: Kept) -> UInt8[np.ndarray, "h w 3"]:
     """The disparity in colours, black where the left picture shows nothing."""
     disparity_px, seen = kept.renderer.estimate.disparity_px, kept.renderer.pair.left_seen
     if seen is None:
-        return colour_disparity(disparity_px, colour_range_px(disparity_px))
-    return colour_disparity(disparity_px, colour_range_px(disparity_px[seen][None])) * seen[..., None]
+        return colour_disparity(disparity_px, find_colour_range_px(disparity_px))
+    return colour_disparity(disparity_px, find_colour_range_px(disparity_px[seen][None])) * seen[..., None]
 
 
 def ends(result: Result) -> tuple[str, str]:
     """How far is what has the first and the last colour of the depth, in metres where they are known."""
     seen = np.s_[:] if result.pair.left_seen is None else result.pair.left_seen
-    ends_px = np.array([colour_range_px(np.atleast_2d(result.estimate.disparity_px[seen]))])
+    ends_px = np.array([find_colour_range_px(np.atleast_2d(result.estimate.disparity_px[seen]))])
     if not result.pair.camera:
         return f"{ends_px[0, 0]:.1f} px", f"{ends_px[0, 1]:.1f} px"
     far_m, near_m = result.pair.camera.depth_m(ends_px)[0]

@@ -25,7 +25,7 @@ from stereoweave.cameras.calibration_files import read_calibration_bytes
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import reading
 from stereoweave.io.output_lock import lock_output
-from stereoweave.io.run_folder import check_claim, check_unclaimed, described, description
+from stereoweave.io.run_folder import check_claim, check_unclaimed, describe_run, parse_description
 from stereoweave.io.stores import Store, store_at
 from stereoweave.matching.providers import CPU
 from stereoweave.outputs.results import DepthJob, job_facts
@@ -183,11 +183,11 @@ def _claim(destination: Store, job: DepthJob, source: Store) -> None:
     if destination.exists(BATCH_FILE):
         place = destination.at(BATCH_FILE)
         text = destination.read_bytes(BATCH_FILE).decode("utf-8", "replace")
-        check_claim(place, facts, described(place, text, "the description of a batch"))
+        check_claim(place, facts, parse_description(place, text, "the description of a batch"))
         return
     others = (file.path for file in islice(destination.files(), 1))
     check_unclaimed(destination.place, BATCH_FILE, others)
-    destination.write_bytes(BATCH_FILE, description(facts).encode())
+    destination.write_bytes(BATCH_FILE, describe_run(facts).encode())
 
 
 def _carried(job: DepthJob) -> Iterator[tuple[str, str, bytes]]:

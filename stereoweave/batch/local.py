@@ -25,7 +25,7 @@ from rich.console import Console
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import make_folder, reading, remove_leftovers, replacing
 from stereoweave.io.output_lock import lock_output
-from stereoweave.io.run_folder import check_claim, check_unclaimed, described, description
+from stereoweave.io.run_folder import check_claim, check_unclaimed, describe_run, parse_description
 from stereoweave.io.text import write_table
 from stereoweave.outputs.results import DepthJob, job_facts, make_depth
 from stereoweave.pictures.pair_finding import BATCH_FILE, SUMMARY_FILE, FoundPairs, NamedPair
@@ -271,12 +271,12 @@ def _claim(out: Path, job: DepthJob) -> None:
     if path.exists():
         expected = "the description of a batch that stereoweave depth made"
         with reading(path, expected):
-            found = described(path, path.read_text(encoding="utf-8"), expected)
+            found = parse_description(path, path.read_text(encoding="utf-8"), expected)
         check_claim(path, facts, found)
     else:
         check_unclaimed(out, BATCH_FILE, (entry.name for entry in out.iterdir() if entry.name[0] != "."))
         with replacing(path) as temporary:
-            temporary.write_text(description(facts), encoding="utf-8")
+            temporary.write_text(describe_run(facts), encoding="utf-8")
     _tidy(out)
 
 

@@ -13,10 +13,10 @@ from stereoweave.cli.options import (
     Provider,
     Threads,
     engine_of,
-    needing_the_synth_extra,
-    needing_the_train_extra,
+    make_parent_folder,
+    needing_synth_extra,
+    needing_train_extra,
     parse_size_px,
-    place_for,
 )
 from stereoweave.cli.tables import (
     FLICKER_TABLES,
@@ -84,7 +84,7 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.system.threads import thread_count
 
     for file in filter(None, (out, classes)):
-        place_for(file)
+        make_parent_folder(file)
     _check_plots(plot, sparsification)
     engine = engine_of(cluster, cpus_each=threads or 1)
     threads = engine.threads_each if engine else threads
@@ -112,7 +112,7 @@ def collages(
     size: Annotated[str, typer.Option(help="Width and height in pixels.")] = "384x256",
 ) -> None:
     """Write held-out collages, painted like the training pairs, as a set for bench pairs."""
-    with needing_the_train_extra():
+    with needing_train_extra():
         from stereoweave.learn.data.collage_set import write_collages
     width_px, height_px = parse_size_px(size)
     write_collages(out, pairs, seed, (height_px, width_px))
@@ -145,7 +145,7 @@ def views(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.bench.views import score_view_scenes
     from stereoweave.system.threads import thread_count
 
-    place_for(out)
+    make_parent_folder(out)
     engine = engine_of(cluster, cpus_each=threads or 1)
     threads = engine.threads_each if engine else threads
     cv2.setNumThreads(thread_count(threads))
@@ -166,8 +166,8 @@ def flicker(  # noqa: PLR0913 - each is an option of the command line
     provider: Provider = "cpu",
 ) -> None:
     """Score the temporal filter on rendered noisy videos: flicker and errors with it and without."""
-    place_for(out)
-    with needing_the_synth_extra():
+    make_parent_folder(out)
+    with needing_synth_extra():
         from stereoweave.bench.flicker import average_rows, score_flicker
     from stereoweave.bench.pairs import write_csv
 
@@ -195,8 +195,8 @@ def networks(
     """Score trained networks on their held-out pairs, with the errors of right views made from them."""
     from rich.console import Console
 
-    place_for(out)
-    with needing_the_train_extra():
+    make_parent_folder(out)
+    with needing_train_extra():
         from stereoweave.learn.evaluation import evaluate
     rows = evaluate(runs, pairs or runs[0].parent / "pairs", Console())
     write_and_print(out, "Means over the held-out pairs", rows)
@@ -213,8 +213,8 @@ def parity(
     """Compare every variant of shipped networks with PyTorch, on every provider available here."""
     from stereoweave.bench.pairs import write_csv
 
-    place_for(out)
-    with needing_the_train_extra():
+    make_parent_folder(out)
+    with needing_train_extra():
         from stereoweave.learn.export.parity import format_markdown
         from stereoweave.learn.export.parity import measure_parity as measured
     rows = measured(checkpoints)
@@ -229,8 +229,8 @@ def training(
     out: Annotated[Path, typer.Option("--out", "-o", help="CSV file to write; rows of other runs are kept.")],
 ) -> None:
     """Record the learning curve of a run: held-out scores by pairs seen, and the power laws that fit them."""
-    place_for(out)
-    with needing_the_train_extra():
+    make_parent_folder(out)
+    with needing_train_extra():
         from stereoweave.learn.training.curves import record_curve
     for name, law in record_curve(run, out).items():
         typer.echo(f"{name}: {law.at_10000_pairs:.4g} * (pairs / 10,000)^-{law.exponent:.3f}")
@@ -257,8 +257,8 @@ def _check_plots(*pictures: Path | None) -> None:
 
     for picture in filter(None, pictures):
         picture_kind(picture)
-        place_for(picture)
-        with needing_the_train_extra("a plot needs matplotlib"):
+        make_parent_folder(picture)
+        with needing_train_extra("a plot needs matplotlib"):
             from stereoweave.bench import plots as benchmark_plots  # noqa: F401 - checks that it can be
 
 

@@ -198,11 +198,11 @@ def parse_size_px(size: str) -> tuple[int, int]:
     return int(found[1]), int(found[2])
 
 
-def place_for(*files: Path) -> Path:
-    """As `io.place_for`, which is imported where it is needed alone."""
+def make_parent_folder(*files: Path) -> Path:
+    """As `io.make_parent_folder`, which is imported where it is needed alone."""
     from stereoweave.io import files as io
 
-    return io.place_for(*files)
+    return io.make_parent_folder(*files)
 
 
 def listening(host: str, port: int) -> socket.socket:
@@ -242,15 +242,15 @@ def _in_url(host: str) -> str:
 
 
 @contextmanager
-def needing_the_train_extra(what: str = "this command needs PyTorch and its company") -> Iterator[None]:
+def needing_train_extra(what: str = "this command needs PyTorch and its company") -> Iterator[None]:
     """Turns the lack of a library into one line that names the extra."""
     with needing_extra("train", what):
         yield
 
 
 @contextmanager
-def needing_the_synth_extra() -> Iterator[None]:
-    """As `needing_the_train_extra`."""
+def needing_synth_extra() -> Iterator[None]:
+    """As `needing_train_extra`."""
     with needing_extra("synth", "this command needs what renders"):
         import skimage  # noqa: F401 - which textures need later, in other processes too
 

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from stereoweave.cli.options import AsJson, Calib, Format, Pictures, option_name, place_for
+from stereoweave.cli.options import AsJson, Calib, Format, Pictures, make_parent_folder, option_name
 from stereoweave.errors import StereoweaveError
 
 
@@ -61,7 +61,7 @@ def rectify(
     from stereoweave.pictures.prepare import Request, prepare
 
     _spare(pictures, calib, out)
-    place_for(out / "left.png", out / "right.png", out / "calib.yml")
+    make_parent_folder(out / "left.png", out / "right.png", out / "calib.yml")
     prepared = prepare(pictures, Request(arrangement=arrangement, calibration=calib, rectify=True))
     pair = crop(prepared.pair)
     with lock_output(make_folder(out)):
@@ -125,7 +125,7 @@ def calibrate(  # noqa: PLR0913 - each is a word of the command line
         marker_m=None if marker_mm is None else marker_mm / 1000,
         dictionary=charuco,
     )
-    place_for(out)
+    make_parent_folder(out)
     found = calibrate_by(folder, expected, fisheye=fisheye)
     write_rig(out, found.rig)
     typer.echo("\n".join([f"{out}: the calibration of {found.rig.name}", *found.lines()]))

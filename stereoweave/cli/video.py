@@ -11,8 +11,8 @@ from stereoweave.cli.options import (
     Provider,
     Strength,
     Threads,
+    make_parent_folder,
     naming_video_options,
-    place_for,
     video_option_name,
 )
 from stereoweave.errors import StereoweaveError
@@ -115,7 +115,7 @@ def video(  # noqa: PLR0913 - each is a word of the command line
         footage = open_footage(films, arrangement, rate=None if rate is None else _fraction(rate))
         if layout:
             out = _marked(out, layout, footage.size_px)
-        place_for(out)
+        make_parent_folder(out)
         tally = make_film(footage, films, out, job, Console(stderr=True))
     except KeyboardInterrupt:
         folder = parts_folder(out)

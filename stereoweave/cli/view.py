@@ -16,8 +16,8 @@ from stereoweave.cli.options import (
     Rectify,
     Strength,
     Threads,
+    make_parent_folder,
     option_name,
-    place_for,
     range_of,
     request_of,
 )
@@ -123,7 +123,7 @@ def view(  # noqa: PLR0913 - each is a word of the command line
     pair = crop(prepared.pair)
     if name in LAYOUTS:
         out = add_mark(out, name, pair, choices)
-    place_for(out)
+    make_parent_folder(out)
     estimate = match(Backend(model=model, threads=threads, provider=provider).matcher(), pair, options)
     if plane_px is None:
         plane_px = median_disparity_px(estimate)

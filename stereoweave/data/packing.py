@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Shaped, UInt8
 from PIL import Image
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.decoding import unpacked_values
+from stereoweave.io.decoding import decode_packed_values
 from stereoweave.stereo import Sample, StereoCamera
 
 _UNKNOWN = 65535
@@ -146,7 +146,7 @@ def _require_file(files: Mapping[str, bytes], name: str) -> bytes:
 
 def _decode(files: Mapping[str, bytes], name: str, kind: _Kind) -> Shaped[np.ndarray, "h w *channels"]:
     """Decode a picture and check its kind."""
-    values = unpacked_values(name, _require_file(files, name))
+    values = decode_packed_values(name, _require_file(files, name))
     if (values.dtype.type, values.shape[2:]) != kind:
         raise ValueError(f"{name} of another kind of picture")
     return values

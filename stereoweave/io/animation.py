@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from stereoweave.errors import StereoweaveError, needing_extra
-from stereoweave.io.files import held_by_its_format, replacing
+from stereoweave.io.files import checking_format_size, replacing
 
 Frames = Iterator[UInt8[np.ndarray, "h w 3"]]
 
@@ -31,13 +31,13 @@ def write_animation(path: str | Path, frames: Iterable[UInt8[np.ndarray, "h w 3"
         StereoweaveError: if the ending is another, there is no frame, sizes differ, PyAV is missing, or the
             disk is full.
     """
-    write = _KINDS[animation_ending(path)]
+    write = _KINDS[check_animation_ending(path)]
     alike = _of_one_size(frames)
     with replacing(path) as temporary:
         write(temporary, alike, frame_ms)
 
 
-def animation_ending(path: str | Path) -> str:
+def check_animation_ending(path: str | Path) -> str:
     """Lower-case ending of an animation's path.
 
     Raises:
@@ -121,7 +121,7 @@ def _write_webp(path: Path, frames: Frames, frame_ms: int) -> None:
 
 def _save(path: Path, kind: str, pictures: Iterator[Image.Image], frame_ms: int, **options: int) -> None:
     first = next(pictures)
-    with held_by_its_format(path, (first.height, first.width)):
+    with checking_format_size(path, (first.height, first.width)):
         first.save(path, kind, save_all=True, append_images=pictures, duration=frame_ms, loop=0, **options)
 
 

@@ -8,7 +8,7 @@ _OUTLIERS_PERCENT = 0.5
 OCCLUDED_RGB = (217, 72, 15)
 
 
-def colour_range_px(disparity_px: Float[np.ndarray, "h w"]) -> tuple[float, float]:
+def find_colour_range_px(disparity_px: Float[np.ndarray, "h w"]) -> tuple[float, float]:
     """Disparities (px) of the first and the last colour.
 
     Half a percent at either end is ignored, so that a few outliers do not reduce the contrast.

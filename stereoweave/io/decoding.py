@@ -47,7 +47,7 @@ _PROFILED = {"RGB": "RGB", "RGBA": "RGB", "P": "RGB", "L": "L", "LA": "L", "CMYK
 logging.getLogger("PIL").addHandler(logging.NullHandler())
 
 
-class Photograph(NamedTuple):
+class DecodedPicture(NamedTuple):
     """A decoded picture in sRGB, not yet upright, with its metadata tags and a note on its colours."""
 
     image: Image.Image
@@ -57,11 +57,11 @@ class Photograph(NamedTuple):
     def upright(self, lies: int | None) -> UInt8[np.ndarray, "h w 3"]:
         """Pixels turned upright from an EXIF orientation, uint8 RGB [H, W, 3]."""
         # A copy: Pillow's read-only pixels would make Numba compile again and PyTorch warn.
-        return np.array(exif.turned(self.image, lies))
+        return np.array(exif.turn_upright(self.image, lies))
 
 
 @contextmanager
-def opening(path: Path, *, views: int = 1, expected: str = A_PICTURE) -> Iterator[Image.Image]:
+def open_picture(path: Path, *, views: int = 1, expected: str = A_PICTURE) -> Iterator[Image.Image]:
     """Open a picture of one or two views, of a supported format and size, without decoding it.
 
     Raises:
@@ -79,38 +79,38 @@ def opening(path: Path, *, views: int = 1, expected: str = A_PICTURE) -> Iterato
         yield picture
 
 
-def read_photograph(path: Path) -> Photograph:
+def read_photograph(path: Path) -> DecodedPicture:
     """Decode a file that holds one view."""
-    with opening(path) as picture:
+    with open_picture(path) as picture:
         return decode(path, picture)
 
 
-def decode(path: Path, picture: Image.Image) -> Photograph:
+def decode(path: Path, picture: Image.Image) -> DecodedPicture:
     """Decode an opened picture, or its current frame."""
     with _decoding(path):
         # Before reading the tags: loading turns a TIFF upright and updates its orientation tag.
         picture.load()
     tags = exif.read_tags(picture)
     if picture.mode.startswith(("I", "F")):
-        return Photograph(_eight_bits(path, picture), tags, None)
+        return DecodedPicture(_eight_bits(path, picture), tags, None)
     image, note = _in_srgb(picture)
     with _decoding(path):
-        return Photograph(image if image.mode == "RGB" else image.convert("RGB"), tags, note)
+        return DecodedPicture(image if image.mode == "RGB" else image.convert("RGB"), tags, note)
 
 
-def stored_values(path: str | Path, picture: Image.Image) -> Shaped[np.ndarray, "h w *channels"]:
+def decode_values(path: str | Path, picture: Image.Image) -> Shaped[np.ndarray, "h w *channels"]:
     """Decode the stored values of an opened picture, such as a measurement or a mask."""
     with _decoding(path):
         picture.load()
         return np.array(picture)
 
 
-def unpacked_values(name: str, content: bytes) -> Shaped[np.ndarray, "h w *channels"]:
+def decode_packed_values(name: str, content: bytes) -> Shaped[np.ndarray, "h w *channels"]:
     """Decode the stored values of a picture within another file; errors call it `name`."""
     with _decoding(name):
         picture = _opened(name, io.BytesIO(content), 1)
     check_size(name, picture.size)
-    return stored_values(name, picture)
+    return decode_values(name, picture)
 
 
 def check_regular(path: Path, expected: str) -> None:
@@ -249,7 +249,7 @@ def _words(text: str) -> str:
     return "".join(filter(str.isprintable, " ".join(text.split())))[:_LONGEST_WORDS]
 
 
-def view_frames(path: Path, picture: Any) -> list[int]:
+def find_view_frames(path: Path, picture: Any) -> list[int]:
     """Indices of an MPO file's two frames that are its views; none if it has one view and previews."""
     if picture.format != "MPO":
         return []
@@ -267,7 +267,7 @@ def view_frames(path: Path, picture: Any) -> list[int]:
     return []
 
 
-def read_frame(path: Path, picture: Image.Image, index: int) -> Photograph:
+def read_frame(path: Path, picture: Image.Image, index: int) -> DecodedPicture:
     """Decode a frame of an MPO file."""
     _seek(path, picture, index)
     check_size(path, picture.size)

@@ -60,24 +60,24 @@ def read_tags(picture: Image.Image) -> Tags:
         return _exif_tags(picture) | _multi_picture_tags(picture.info.get("mp", b""))
 
 
-def orientation(tags: Tags) -> int | None:
+def read_orientation(tags: Tags) -> int | None:
     """EXIF orientation, 1 (upright) to 8; None if missing or invalid."""
     value = tags.get(Base.Orientation)
     return value if value in (1, *_TURNS) else None
 
 
-def turned(picture: Image.Image, lies: int | None) -> Image.Image:
+def turn_upright(picture: Image.Image, lies: int | None) -> Image.Image:
     """Turn a picture upright from an EXIF orientation, which may be another picture's."""
     return picture.transpose(_TURNS[lies]) if lies in _TURNS else picture
 
 
-def viewpoint(tags: Tags) -> int:
+def read_viewpoint(tags: Tags) -> int:
     """Viewpoint number of an MPO file's frame, counted from the left; 0 if missing."""
     value = tags.get(_VIEWPOINT)
     return value if isinstance(value, int) else 0
 
 
-def lens_of(tags: Tags, width_px: int, height_px: int) -> Lens | None:
+def read_lens(tags: Tags, width_px: int, height_px: int) -> Lens | None:
     """Focal length and baseline for views of this size; None if the tags have neither.
 
     The views must show the camera's full image, at any scale: a crop would get a wrong focal length.

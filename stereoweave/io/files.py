@@ -15,8 +15,8 @@ from jaxtyping import Float, Float32, Shaped, UInt8, UInt16
 from PIL import Image
 
 from stereoweave.errors import FormatError, StereoweaveError, reason
-from stereoweave.io.decoding import check_regular, check_size, opening, read_photograph, stored_values
-from stereoweave.io.exif import orientation
+from stereoweave.io.decoding import check_regular, check_size, decode_values, open_picture, read_photograph
+from stereoweave.io.exif import read_orientation
 from stereoweave.stereo import StereoPair
 
 SMALLEST_SIDE_PX = 32
@@ -55,7 +55,7 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
             32 pixels wide or high, over 65 megapixels, or over 32,766 pixels wide or high.
     """
     photograph = read_photograph(Path(path))
-    image = photograph.upright(orientation(photograph.tags))
+    image = photograph.upright(read_orientation(photograph.tags))
     check_large_enough(path, image)
     return image
 
@@ -154,7 +154,7 @@ def write_pfm(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
 
 def write_float_tiff(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
     """Writes a TIFF file of one channel, float32 and uncompressed; NaN and infinity stay what they are."""
-    with replacing(path) as temporary, held_by_its_format(path, values.shape):
+    with replacing(path) as temporary, checking_format_size(path, values.shape):
         Image.fromarray(values.astype(np.float32)).save(temporary, "TIFF")
 
 
@@ -175,19 +175,19 @@ def read_pixels(path: str | Path, *modes: str) -> Shaped[np.ndarray, "h w *chann
         FormatError: No such file, a damaged one, or a picture of another kind.
     """
     expected = f"a picture of mode {' or '.join(modes)}"
-    with opening(Path(path), expected=expected) as picture:
+    with open_picture(Path(path), expected=expected) as picture:
         if picture.mode not in modes:
             raise FormatError(f"{path}: expected {expected}, found {picture.format} of mode {picture.mode}")
-        return stored_values(path, picture)
+        return decode_values(path, picture)
 
 
 def read_disparity_png(path: str | Path) -> Float32[np.ndarray, "h w"]:
     """Disparity in pixels from a 16-bit PNG of pixels * 256 (KITTI's); its 0, unknown, becomes NaN."""
     expected = "a 16-bit grey PNG of disparity * 256"
-    with opening(Path(path), expected=expected) as picture:
+    with open_picture(Path(path), expected=expected) as picture:
         if not picture.mode.startswith("I"):
             raise FormatError(f"{path}: expected {expected}, found {picture.format} of mode {picture.mode}")
-        steps = stored_values(path, picture)
+        steps = decode_values(path, picture)
     return np.where(steps > 0, steps / 256, np.nan).astype(np.float32)
 
 
@@ -245,7 +245,7 @@ def make_folder(path: str | Path) -> Path:
         ) from error
 
 
-def place_for(*files: Path) -> Path:
+def make_parent_folder(*files: Path) -> Path:
     """The nearest folder above files of one folder that is there, tried; an error if a file is a folder."""
     for file in files:
         if file.is_dir():
@@ -288,7 +288,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 @contextmanager
-def held_by_its_format(path: str | Path, shape: tuple[int, ...]) -> Iterator[None]:
+def checking_format_size(path: str | Path, shape: tuple[int, ...]) -> Iterator[None]:
     """Turns Pillow's refusal of a size that a format does not hold into one line."""
     try:
         yield
@@ -313,7 +313,7 @@ def remove_leftovers(folder: Path) -> None:
 def _save(
     path: str | Path, values: UInt8[np.ndarray, "h w *channels"] | UInt16[np.ndarray, "h w"], kind: str
 ) -> None:
-    with replacing(path) as temporary, held_by_its_format(path, values.shape):
+    with replacing(path) as temporary, checking_format_size(path, values.shape):
         # Level 3 takes a third of the time of Pillow's 6, for 5 % more bytes (a photograph of 741x500).
         Image.fromarray(values).save(temporary, kind, quality=95, compress_level=3)
 

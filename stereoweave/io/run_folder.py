@@ -11,12 +11,12 @@ from typing import Any
 from stereoweave.errors import FormatError, StereoweaveError
 
 
-def description(facts: Mapping[str, Any]) -> str:
-    """Write a run's facts as the JSON text of a description, which `described` parses."""
+def describe_run(facts: Mapping[str, Any]) -> str:
+    """Write a run's facts as the JSON text of a description, which `parse_description` parses."""
     return json.dumps(facts, indent=1, default=str) + "\n"
 
 
-def described(place: str | Path, text: str, expected: str) -> dict[str, Any]:
+def parse_description(place: str | Path, text: str, expected: str) -> dict[str, Any]:
     """Parse the facts of a description.
 
     Args:
@@ -41,13 +41,13 @@ def check_claim(place: str | Path, facts: Mapping[str, Any], found: Mapping[str,
 
     Args:
         place: Path or URL of the folder's description, for the error.
-        facts: This run's facts, as for `description`.
+        facts: This run's facts, as for `describe_run`.
         found: The facts in the folder's description.
 
     Raises:
         StereoweaveError: if a fact differs; the error names the first that does.
     """
-    expected = json.loads(description(facts))  # JSON turns tuples into lists
+    expected = json.loads(describe_run(facts))  # JSON turns tuples into lists
     for name in expected | dict(found):
         if found.get(name) != expected.get(name):
             raise StereoweaveError(

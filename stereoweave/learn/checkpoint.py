@@ -10,7 +10,7 @@ import torch
 
 from stereoweave.errors import FormatError, reason
 from stereoweave.learn.models import build_network
-from stereoweave.learn.recipe import Recipe, recipe_from
+from stereoweave.learn.recipe import Recipe, parse_recipe
 
 Weights = dict[str, torch.Tensor]
 
@@ -163,7 +163,7 @@ def load(path: Path) -> Checkpoint:
         raise FormatError(
             f"{path}: expected a checkpoint of `stereoweave train`, found something else that PyTorch saved"
         )
-    return Checkpoint(**{**values, "recipe": recipe_from(values["recipe"], str(path))})
+    return Checkpoint(**{**values, "recipe": parse_recipe(values["recipe"], str(path))})
 
 
 def find_commit() -> str:

@@ -164,10 +164,10 @@ def read_recipe(path: Path) -> Recipe:
         if len(text) > _LONGEST:
             raise ValueError(f"more than {_LONGEST} characters")
         values = tomllib.loads(text)
-    return recipe_from(values, str(path))
+    return parse_recipe(values, str(path))
 
 
-def recipe_from(values: dict[str, Any], source: str) -> Recipe:
+def parse_recipe(values: dict[str, Any], source: str) -> Recipe:
     """Make a recipe from its values.
 
     Raises:

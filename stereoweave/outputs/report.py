@@ -16,8 +16,8 @@ from stereoweave.io.colormap import (
     OCCLUDED_RGB,
     colour_confidence,
     colour_disparity,
-    colour_range_px,
     css_colour,
+    find_colour_range_px,
     legend_colours,
 )
 from stereoweave.io.text import writing_text
@@ -105,7 +105,7 @@ def _fields(pair: StereoPair, estimate: Estimate, summary: Summary, threads: int
     renderer = Renderer(small, small_estimate, threads=threads)
     views = [renderer.view(position) for position in POSITIONS]
     seen = slice(None) if pair.left_seen is None else pair.left_seen
-    range_px = colour_range_px(np.atleast_2d(estimate.disparity_px[seen]))
+    range_px = find_colour_range_px(np.atleast_2d(estimate.disparity_px[seen]))
     height, width = small.left.shape[:2]
     depth = colour_disparity(_picked(estimate.disparity_px, (width, height)), range_px)
     if small.left_seen is not None:

@@ -18,11 +18,11 @@ import numpy as np
 from stereoweave import __version__
 from stereoweave.cameras.calibration_files import read_calibration_bytes
 from stereoweave.errors import NameOf, Note, Remedy, StereoweaveError, keyword
-from stereoweave.io.colormap import colour_disparity, colour_range_px, grey_confidence
+from stereoweave.io.colormap import colour_disparity, find_colour_range_px, grey_confidence
 from stereoweave.io.files import (
     RangeError,
     make_folder,
-    place_for,
+    make_parent_folder,
     reading,
     write_depth_png,
     write_disparity_png,
@@ -50,7 +50,7 @@ from stereoweave.stereo import StereoPair
 
 def _write_preview(path: Path, result: Result) -> None:
     disparity_px = result.estimate.disparity_px
-    range_px = colour_range_px(disparity_px[result.seen][None])
+    range_px = find_colour_range_px(disparity_px[result.seen][None])
     write_image(path, colour_disparity(disparity_px, range_px) * result.seen[..., None])
 
 
@@ -169,7 +169,7 @@ def _results_in(out: Path) -> Iterator[Path]:
     Files of an earlier result that this one does not have are removed, so that all in `out` belong together.
     Where no disparity.pfm is there, which every result has and is moved first, they are the user's, and stay.
     """
-    standing = place_for(*(out / file for file in FILES))
+    standing = make_parent_folder(*(out / file for file in FILES))
     with tempfile.TemporaryDirectory(prefix=".stereoweave-", dir=standing) as name:
         yield Path(name)
         # Two commands would leave some files of each.

@@ -12,13 +12,13 @@ from PIL import Image
 from stereoweave.errors import FormatError, Note, Remedy, StereoweaveError
 from stereoweave.io import exif
 from stereoweave.io.decoding import (
-    Photograph,
+    DecodedPicture,
     check_size,
     decode,
-    opening,
+    find_view_frames,
+    open_picture,
     read_frame,
     read_photograph,
-    view_frames,
 )
 from stereoweave.io.files import check_large_enough, pair_of
 from stereoweave.pictures.frame_packing import ARRANGEMENTS, Arrangement, guess_arrangement, resemblance
@@ -93,7 +93,7 @@ def pixel_factor(path: Path, picture: Image.Image, arrangement: str | None) -> i
 
     It is 2 for MPO files, and for half views that `arrangement` or the JPS mark of the file declares.
     """
-    if arrangement in (None, "mpo") and view_frames(path, picture):
+    if arrangement in (None, "mpo") and find_view_frames(path, picture):
         return 2
     known = ARRANGEMENTS.get(_declared(path, picture, arrangement)[0] or "")
     return 2 if known is not None and known.half else 1
@@ -112,15 +112,15 @@ def _two(left: Path, right: Path) -> Opened:
 
 
 def _one(path: Path, arrangement: str | None) -> Opened:
-    with opening(path, views=2) as picture:
-        frames = view_frames(path, picture) if arrangement in (None, "mpo") else []
+    with open_picture(path, views=2) as picture:
+        frames = find_view_frames(path, picture) if arrangement in (None, "mpo") else []
         if frames:
             return _of_frames(path, picture, frames)
         if arrangement == "mpo":
             raise FormatError(f"{path}: expected an MPO file with two pictures of one size, found one")
         name, why = _declared(path, picture, arrangement)
         photograph = decode(path, picture)
-    lies = exif.orientation(photograph.tags)
+    lies = exif.read_orientation(photograph.tags)
     image = photograph.upright(lies)
     if name is None:
         name, why = _guessed(path, image), "detected from name and content"
@@ -131,16 +131,16 @@ def _one(path: Path, arrangement: str | None) -> Opened:
         pair=StereoPair(left=left, right=right),
         arrangement=name,
         notes=(*notes, *_turn_notes(lies), *_colour_notes([photograph])),
-        lens=exif.lens_of(photograph.tags, width_px, height_px),
+        lens=exif.read_lens(photograph.tags, width_px, height_px),
     )
 
 
 def _of_frames(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opened:
     """The pair of an MPO file, both turned as the first one lies: the lenses are in one body."""
     photographs = [read_frame(path, picture, index) for index in frames]
-    lies = exif.orientation(photographs[0].tags)
+    lies = exif.read_orientation(photographs[0].tags)
     # CIPA DC-007 counts viewpoints from the left; many files leave that out, and have the left one first.
-    photographs.sort(key=lambda each: exif.viewpoint(each.tags))
+    photographs.sort(key=lambda each: exif.read_viewpoint(each.tags))
     left, right = (each.upright(lies) for each in photographs)
     if left.shape != right.shape:
         sizes = " and ".join(f"{eye.shape[1]}x{eye.shape[0]}" for eye in (left, right))
@@ -158,20 +158,20 @@ def _of_frames(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opene
     )
 
 
-def _upright(left: Photograph, right: Photograph) -> tuple[tuple[int | None, int | None], list[Note]]:
+def _upright(left: DecodedPicture, right: DecodedPicture) -> tuple[tuple[int | None, int | None], list[Note]]:
     """How each of two pictures lies, and a note on it.
 
     Each as its tag says, unless that makes their sizes differ or one has no tag, which editors lose, some of
     them with the picture turned, some without: then both as the one, if their sizes fit so, and look so.
     """
-    own = exif.orientation(left.tags), exif.orientation(right.tags)
+    own = exif.read_orientation(left.tags), exif.read_orientation(right.tags)
     if own[0] == own[1] or {*own} <= {None, 1}:
         return own, _turn_notes(own[0])
     alike = (own[0] or own[1],) * 2
     fitting = [
         lies
         for lies in (own, alike)
-        if exif.turned(left.image, lies[0]).size == exif.turned(right.image, lies[1]).size
+        if exif.turn_upright(left.image, lies[0]).size == exif.turn_upright(right.image, lies[1]).size
     ]
     if len(fitting) == 2 and None not in own:
         return own, [Note("each picture turned upright as its EXIF says")]
@@ -182,7 +182,7 @@ def _upright(left: Photograph, right: Photograph) -> tuple[tuple[int | None, int
     return best, [Note("one picture turned upright as EXIF says, the other left as it is")]
 
 
-def _likeness(left: Photograph, right: Photograph, lies: tuple[int | None, int | None]) -> float:
+def _likeness(left: DecodedPicture, right: DecodedPicture, lies: tuple[int | None, int | None]) -> float:
     return resemblance(left.upright(lies[0]), right.upright(lies[1]))
 
 
@@ -232,17 +232,17 @@ def _halves(
     return left, right
 
 
-def _lens(photographs: Sequence[Photograph]) -> exif.Lens | None:
+def _lens(photographs: Sequence[DecodedPicture]) -> exif.Lens | None:
     """What the tags of either picture say of both; the first one's where both do."""
     first, second = photographs
-    return exif.lens_of({**second.tags, **first.tags}, *first.image.size)
+    return exif.read_lens({**second.tags, **first.tags}, *first.image.size)
 
 
 def _turn_notes(lies: int | None) -> list[Note]:
     return [] if lies in (None, 1) else [Note("turned upright as EXIF says")]
 
 
-def _colour_notes(photographs: Sequence[Photograph]) -> list[Note]:
+def _colour_notes(photographs: Sequence[DecodedPicture]) -> list[Note]:
     """Colour conversions, once if both pictures had the same."""
     texts = [each.note for each in photographs]
     if len(set(texts)) == 1:

@@ -16,9 +16,9 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.animation import animation_ending
-from stereoweave.io.colormap import colour_range_px
-from stereoweave.io.files import held_by_its_format, picture_kind, replacing, write_image
+from stereoweave.io.animation import check_animation_ending
+from stereoweave.io.colormap import find_colour_range_px
+from stereoweave.io.files import checking_format_size, picture_kind, replacing, write_image
 from stereoweave.rendering.renderer import FIRST_POSITION, LAST_POSITION, Renderer
 from stereoweave.stereo import Estimate, StereoPair
 
@@ -118,7 +118,7 @@ class Animation:
 
     def turns(self, path: str | Path) -> int:
         """How many turns a file of that name shows."""
-        return self.mp4_turns if animation_ending(path) == ".mp4" else 1
+        return self.mp4_turns if check_animation_ending(path) == ".mp4" else 1
 
 
 def render_views(renderer: Renderer, positions: Iterable[float]) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
@@ -172,7 +172,7 @@ def rgbd(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3
     Displays that take colour and depth make views of their own, so strength and convergence are theirs.
     """
     disparity_px = renderer.estimate.disparity_px
-    low_px, high_px = choices.range_px or colour_range_px(disparity_px)
+    low_px, high_px = choices.range_px or find_colour_range_px(disparity_px)
     share = np.clip((disparity_px - low_px) / (high_px - low_px), 0, 1)
     grey = np.rint(255 * share).astype(np.uint8)
     return np.hstack([renderer.pair.left, cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB)])
@@ -248,7 +248,7 @@ def choose_layout(path: str | Path, name: str | None) -> str | None:
             )
         return held
     if name in ANIMATIONS:
-        animation_ending(path)
+        check_animation_ending(path)
     else:
         picture_kind(path)
     return name
@@ -299,7 +299,7 @@ def write_picture(path: str | Path, picture: UInt8[np.ndarray, "h w 3"]) -> None
     if ending not in _LAYOUT_BY_ENDING:
         write_image(path, picture)
         return
-    with replacing(path) as temporary, held_by_its_format(path, picture.shape):
+    with replacing(path) as temporary, checking_format_size(path, picture.shape):
         if ending == ".jps":
             Image.fromarray(picture).save(temporary, "JPEG", extra=_JPS_SEGMENT, **_FINE)
         else:

@@ -11,7 +11,7 @@ from typing import Any
 
 from stereoweave.cameras.rectify import crop
 from stereoweave.errors import Note, StereoweaveError
-from stereoweave.io.decoding import MOST_PIXELS, opening
+from stereoweave.io.decoding import MOST_PIXELS, open_picture
 from stereoweave.io.files import RangeError, write_image
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher
@@ -113,7 +113,7 @@ def check_pixels(job: ServiceJob) -> float:
     """
     views, megapixels = 3 - len(job.pictures), 0.0
     for path in job.pictures:
-        with opening(path, views=views) as picture:
+        with open_picture(path, views=views) as picture:
             factor = pixel_factor(path, picture, job.request.arrangement) if views == 2 else 1
             megapixels += factor * _checked_megapixels(
                 path, picture.size, job.most_megapixels * views / factor

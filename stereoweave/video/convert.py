@@ -18,7 +18,7 @@ from stereoweave import __version__
 from stereoweave.cameras.alignment import SWAPPED
 from stereoweave.cameras.diagnosis import find_problems
 from stereoweave.errors import NameOf, Note, Remedy, StereoweaveError, keyword
-from stereoweave.io.colormap import colour_disparity, colour_range_px
+from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.io.output_lock import lock_output
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.estimate import match
@@ -314,7 +314,7 @@ def _look(footage: Footage, matcher: Matcher, bar: Progress) -> tuple[Survey, li
             defects.append([_at(frame.time, note, footage) for note in find_problems(pair, estimate)])
         bar.advance(shown)
     all_px = np.vstack(thinned)
-    survey = Survey(colour_range_px(all_px), float(np.median(middles_px)), _within_px(all_px, matcher))
+    survey = Survey(find_colour_range_px(all_px), float(np.median(middles_px)), _within_px(all_px, matcher))
     return survey, _usual(defects)
 
 

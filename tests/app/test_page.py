@@ -24,7 +24,7 @@ from playwright.sync_api import Browser
 from stereoweave.app.session import Uploads, matched, zipped
 from stereoweave.cli.root import main
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.colormap import colour_disparity, colour_range_px
+from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.io.files import read_image, read_pfm
 from stereoweave.matching.backend import Backend
 from stereoweave.outputs.results import FILES
@@ -176,7 +176,7 @@ def test_the_files_are_those_of_the_command(answered, tmp_path):
     assert disparity_px.shape == SIZE[::-1]
     # 600 px * 100 mm
     np.testing.assert_allclose(np.load(tmp_path / "depth.npy"), 60 / disparity_px, rtol=1e-5)
-    expected = colour_disparity(disparity_px, colour_range_px(disparity_px))
+    expected = colour_disparity(disparity_px, find_colour_range_px(disparity_px))
     answered.page.get_by_role("tab", name="View and depth").click()
     assert difference(answered.picture("depth"), expected) < 6
 

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image, ImageSequence
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.animation import animation_ending, write_animation
+from stereoweave.io.animation import check_animation_ending, write_animation
 
 ENDINGS = [".mp4", ".gif", ".webp"]
 
@@ -168,7 +168,7 @@ def test_a_disk_that_is_full_is_told_in_one_line_and_left_as_it_was(tmp_path, rn
 @pytest.mark.parametrize("path", ["a.avi", "a.png", "a"])
 def test_another_ending_is_told_with_those_there_are(path):
     with pytest.raises(StereoweaveError, match=rf"{path}: expected .* \.mp4, \.gif, \.webp, found"):
-        animation_ending(path)
+        check_animation_ending(path)
 
 
 def test_an_mp4_without_pyav_names_the_extra_before_a_frame_is_made(tmp_path, monkeypatch):
@@ -181,4 +181,4 @@ def test_an_mp4_without_pyav_names_the_extra_before_a_frame_is_made(tmp_path, mo
     with pytest.raises(StereoweaveError, match=r"an MP4 file needs PyAV, .*'stereoweave\[video\]'"):
         write_animation(tmp_path / "a.mp4", never(), 40)
     assert list(tmp_path.iterdir()) == []
-    assert animation_ending("a.gif") == ".gif"
+    assert check_animation_ending("a.gif") == ".gif"

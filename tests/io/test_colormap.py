@@ -4,7 +4,7 @@ from stereoweave.io.colormap import (
     OCCLUDED_RGB,
     colour_confidence,
     colour_disparity,
-    colour_range_px,
+    find_colour_range_px,
     legend_colours,
 )
 
@@ -12,13 +12,13 @@ from stereoweave.io.colormap import (
 def test_a_few_stray_disparities_do_not_take_the_contrast_of_all():
     disparity_px = np.linspace(10, 50, 1000, dtype=np.float32).reshape(20, 50)
     disparity_px[0, 0], disparity_px[19, 49] = -900, 900
-    low_px, high_px = colour_range_px(disparity_px)
+    low_px, high_px = find_colour_range_px(disparity_px)
     assert 10 <= low_px < 10.3
     assert 49.7 < high_px <= 50
 
 
 def test_a_flat_disparity_has_a_range_of_a_pixel():
-    assert colour_range_px(np.full((4, 4), 7, np.float32)) == (7.0, 8.0)
+    assert find_colour_range_px(np.full((4, 4), 7, np.float32)) == (7.0, 8.0)
 
 
 def test_far_is_bluer_and_near_is_redder():

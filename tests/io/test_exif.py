@@ -39,12 +39,12 @@ def multi_picture(number=None, baseline=None):
 def test_a_focal_length_on_film_is_one_of_the_same_diagonal_angle(tmp_path):
     tags = tags_of(tmp_path / "a.jpg", {FOCAL_35_MM: 26})
     # 4000x3000 has a diagonal of 5000 px, 36 mm x 24 mm one of 43.267 mm.
-    lens = exif.lens_of(tags, 4000, 3000)
+    lens = exif.read_lens(tags, 4000, 3000)
     assert lens.focal_px == pytest.approx(26 * 5000 / 43.2666, rel=1e-5)
     assert lens.baseline_m is None
     # A full-frame camera: 36 mm are 6000 px.
-    assert exif.lens_of(tags, 6000, 4000).focal_px == pytest.approx(26 * 6000 / 36, rel=1e-5)
-    assert exif.lens_of(tags, 3000, 4000) == lens
+    assert exif.read_lens(tags, 6000, 4000).focal_px == pytest.approx(26 * 6000 / 36, rel=1e-5)
+    assert exif.read_lens(tags, 3000, 4000) == lens
 
 
 def test_a_focal_length_in_mm_needs_the_density_of_the_sensor_and_grows_with_the_picture(tmp_path):
@@ -55,51 +55,51 @@ def test_a_focal_length_in_mm_needs_the_density_of_the_sensor_and_grows_with_the
         PLANE_UNIT: 3,
         WIDTH_PX: 3648,
     }
-    assert exif.lens_of(tags_of(tmp_path / "a.jpg", tags), 3648, 2736).focal_px == pytest.approx(3150)
-    assert exif.lens_of(tags_of(tmp_path / "a.jpg", tags), 1824, 1368).focal_px == pytest.approx(1575)
+    assert exif.read_lens(tags_of(tmp_path / "a.jpg", tags), 3648, 2736).focal_px == pytest.approx(3150)
+    assert exif.read_lens(tags_of(tmp_path / "a.jpg", tags), 1824, 1368).focal_px == pytest.approx(1575)
     inches = tags | {PLANE_UNIT: 2, PLANE_X: IFDRational(12700, 1)}
-    assert exif.lens_of(tags_of(tmp_path / "a.jpg", inches), 3648, 2736).focal_px == pytest.approx(3150)
+    assert exif.read_lens(tags_of(tmp_path / "a.jpg", inches), 3648, 2736).focal_px == pytest.approx(3150)
     for lacking in tags:
         some = {tag: value for tag, value in tags.items() if tag not in (lacking, PLANE_UNIT)}
         if lacking != PLANE_UNIT:
-            assert exif.lens_of(tags_of(tmp_path / "a.jpg", some), 3648, 2736) is None
+            assert exif.read_lens(tags_of(tmp_path / "a.jpg", some), 3648, 2736) is None
 
 
 def test_of_both_the_length_on_film_is_taken_which_a_rescaled_picture_keeps(tmp_path):
     tags = {FOCAL_35_MM: 36, FOCAL_MM: IFDRational(5, 1), PLANE_X: IFDRational(1, 1), WIDTH_PX: 10}
-    assert exif.lens_of(tags_of(tmp_path / "a.jpg", tags), 600, 400).focal_px == pytest.approx(600)
+    assert exif.read_lens(tags_of(tmp_path / "a.jpg", tags), 600, 400).focal_px == pytest.approx(600)
 
 
 @pytest.mark.parametrize("value", [0, 65535.5])
 def test_an_unknown_or_odd_focal_length_is_none(tmp_path, value):
-    assert exif.lens_of({FOCAL_35_MM: 0}, 40, 32) is None
-    assert exif.lens_of({FOCAL_MM: IFDRational(1, 0), PLANE_X: "text", WIDTH_PX: value}, 40, 32) is None
+    assert exif.read_lens({FOCAL_35_MM: 0}, 40, 32) is None
+    assert exif.read_lens({FOCAL_MM: IFDRational(1, 0), PLANE_X: "text", WIDTH_PX: value}, 40, 32) is None
 
 
 def test_a_focal_length_that_no_lens_has_is_none_or_that_of_the_other_tags():
     # 4000x3000 has a diagonal of 5000 px: 65535 mm on film are 7.6 million px, and 10 mm at 1 px a mm are 10.
-    assert exif.lens_of({FOCAL_35_MM: 65535}, 4000, 3000) is None
+    assert exif.read_lens({FOCAL_35_MM: 65535}, 4000, 3000) is None
     sensor = {FOCAL_MM: 10, PLANE_UNIT: 4, WIDTH_PX: 4000}
-    assert exif.lens_of(sensor | {PLANE_X: 1}, 4000, 3000) is None
+    assert exif.read_lens(sensor | {PLANE_X: 1}, 4000, 3000) is None
     both = sensor | {PLANE_X: 400, FOCAL_35_MM: 65535}
-    assert exif.lens_of(both, 4000, 3000).focal_px == pytest.approx(4000)
+    assert exif.read_lens(both, 4000, 3000).focal_px == pytest.approx(4000)
     # A round fisheye lens and a telescope.
-    assert exif.lens_of({FOCAL_35_MM: 7}, 4000, 3000).focal_px == pytest.approx(809, abs=1)
-    assert exif.lens_of({FOCAL_35_MM: 2000}, 4000, 3000).focal_px == pytest.approx(231_125, abs=1)
+    assert exif.read_lens({FOCAL_35_MM: 7}, 4000, 3000).focal_px == pytest.approx(809, abs=1)
+    assert exif.read_lens({FOCAL_35_MM: 2000}, 4000, 3000).focal_px == pytest.approx(231_125, abs=1)
 
 
 def test_the_baseline_of_an_mpo_frame_is_read_in_metres():
     picture = Image.new("RGB", (40, 32))
     picture.info["mp"] = multi_picture(2, (77, 1000))
     tags = exif.read_tags(picture)
-    assert exif.viewpoint(tags) == 2
-    assert exif.lens_of(tags, 40, 32) == exif.Lens(baseline_m=0.077)
+    assert exif.read_viewpoint(tags) == 2
+    assert exif.read_lens(tags, 40, 32) == exif.Lens(baseline_m=0.077)
 
 
 def test_an_unknown_baseline_is_none_and_not_one_metre():
     picture = Image.new("RGB", (40, 32))
     picture.info["mp"] = multi_picture(baseline=(0xFFFFFFFF, 0xFFFFFFFF))  # CIPA DC-007's way to say so
-    assert exif.lens_of(exif.read_tags(picture), 40, 32) is None
+    assert exif.read_lens(exif.read_tags(picture), 40, 32) is None
 
 
 @pytest.mark.parametrize(
@@ -108,15 +108,15 @@ def test_an_unknown_baseline_is_none_and_not_one_metre():
 )
 def test_known_cameras_that_leave_their_baseline_out_have_it(tmp_path, model, baseline_m):
     tags = tags_of(tmp_path / "a.jpg", model=model)
-    assert exif.lens_of(tags, 40, 32) == exif.Lens(baseline_m=baseline_m)
-    assert exif.lens_of(tags_of(tmp_path / "a.jpg", model="Some phone"), 40, 32) is None
+    assert exif.read_lens(tags, 40, 32) == exif.Lens(baseline_m=baseline_m)
+    assert exif.read_lens(tags_of(tmp_path / "a.jpg", model="Some phone"), 40, 32) is None
 
 
 def test_a_picture_without_tags_says_nothing():
     tags = exif.read_tags(Image.new("RGB", (40, 32)))
     assert tags == {}
-    assert exif.orientation(tags) is None
-    assert exif.lens_of(tags, 40, 32) is None
+    assert exif.read_orientation(tags) is None
+    assert exif.read_lens(tags, 40, 32) is None
 
 
 def test_damaged_tags_say_nothing_or_what_is_left_of_them(rng):
@@ -131,8 +131,8 @@ def test_damaged_tags_say_nothing_or_what_is_left_of_them(rng):
             picture = Image.new("RGB", (40, 32))
             picture.info[key] = spoiled.tobytes()[: rng.integers(1, len(spoiled) + 1)]
             tags = exif.read_tags(picture)
-            exif.lens_of(tags, 40, 32)
-            exif.orientation(tags)
+            exif.read_lens(tags, 40, 32)
+            exif.read_orientation(tags)
 
 
 @pytest.mark.parametrize(
@@ -151,14 +151,14 @@ def test_damaged_tags_say_nothing_or_what_is_left_of_them(rng):
 )
 def test_a_picture_is_turned_upright_from_each_of_the_eight_ways_to_lie(tmp_path, lies, upright):
     stored = Image.fromarray(np.array([[ord("a"), ord("b")], [ord("c"), ord("d")]], np.uint8))
-    assert exif.orientation(tags_of(tmp_path / "a.jpg", lies=lies)) == lies
-    rows = np.asarray(exif.turned(stored, lies)).tolist()
+    assert exif.read_orientation(tags_of(tmp_path / "a.jpg", lies=lies)) == lies
+    rows = np.asarray(exif.turn_upright(stored, lies)).tolist()
     assert "/".join("".join(map(chr, row)) for row in rows) == upright
 
 
 @pytest.mark.parametrize("lies", [None, 0, 9, "6", (1, 2)])
 def test_an_orientation_that_is_none_leaves_the_picture_as_it_is(lies):
-    assert exif.orientation({} if lies is None else {ORIENTATION: lies}) is None
+    assert exif.read_orientation({} if lies is None else {ORIENTATION: lies}) is None
 
 
 @pytest.mark.parametrize("nonsense", [0.0, -1.0, math.inf, math.nan])

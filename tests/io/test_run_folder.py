@@ -1,13 +1,13 @@
 import pytest
 
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io.run_folder import check_claim, check_unclaimed, described, description
+from stereoweave.io.run_folder import check_claim, check_unclaimed, describe_run, parse_description
 
 FACTS = {"model": "small", "sizes": (3, 4)}
 
 
 def test_what_was_written_down_is_the_same_claim():
-    check_claim("s3://b/batch.json", FACTS, described("", description(FACTS), "a description"))
+    check_claim("s3://b/batch.json", FACTS, parse_description("", describe_run(FACTS), "a description"))
 
 
 @pytest.mark.parametrize(
@@ -29,7 +29,7 @@ def test_another_s_claim_is_refused_by_the_first_fact_that_differs(found, words)
 )
 def test_what_is_no_description_is_refused_in_a_line(text, found):
     with pytest.raises(FormatError, match=f"^out/batch.json: expected a batch's description, found {found}"):
-        described("out/batch.json", text, "a batch's description")
+        parse_description("out/batch.json", text, "a batch's description")
 
 
 def test_a_folder_with_other_files_and_no_description_is_refused_by_the_first_of_their_names():

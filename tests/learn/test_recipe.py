@@ -6,7 +6,7 @@ import pytest
 from learn_examples import RECIPE
 
 from stereoweave.errors import FormatError
-from stereoweave.learn.recipe import Recipe, read_recipe, recipe_from
+from stereoweave.learn.recipe import Recipe, parse_recipe, read_recipe
 
 RECIPES = sorted((Path(__file__).parents[2] / "recipes").rglob("*.toml"))
 NEEDED = {
@@ -41,7 +41,7 @@ def test_a_recipe_is_read_with_its_defaults(tmp_path):
 
 
 def test_a_recipe_survives_being_a_dictionary():
-    assert recipe_from(asdict(RECIPE), "here") == RECIPE
+    assert parse_recipe(asdict(RECIPE), "here") == RECIPE
 
 
 def test_a_mix_is_a_table_of_sets_and_weights_and_survives_being_a_dictionary(tmp_path):
@@ -51,13 +51,13 @@ def test_a_mix_is_a_table_of_sets_and_weights_and_survives_being_a_dictionary(tm
     recipe = read_recipe(file)
     assert recipe == Recipe(**NEEDED, mix=(("collage", 0.5), ("runs/synth/rooms", 2)))
     assert hash(recipe) != hash(Recipe(**NEEDED))
-    assert recipe_from(asdict(recipe), "here") == recipe
+    assert parse_recipe(asdict(recipe), "here") == recipe
     # As a checkpoint's card keeps it.
-    assert recipe_from(json.loads(json.dumps(asdict(recipe))), "here") == recipe
+    assert parse_recipe(json.loads(json.dumps(asdict(recipe))), "here") == recipe
 
 
 def test_a_recipe_for_a_dataset_on_disk_is_bound_by_no_pair_size():
-    recipe = recipe_from(
+    recipe = parse_recipe(
         NEEDED | {"dataset": "sintel", "root": "datasets/sintel", "crop_size": [384, 1024]}, "here"
     )
     assert recipe.crop_size == (384, 1024)
@@ -178,7 +178,7 @@ def test_a_recipe_made_to_do_harm_is_refused_at_once(tmp_path, text, found):
 )
 def test_a_wrong_key_or_value_is_named_in_one_line(changes, message):
     with pytest.raises(FormatError) as caught:
-        recipe_from(NEEDED | changes, "my.toml")
+        parse_recipe(NEEDED | changes, "my.toml")
     assert str(caught.value).startswith(f"my.toml: {message}")
     assert "\n" not in str(caught.value)
 
@@ -187,7 +187,7 @@ def test_a_wrong_key_or_value_is_named_in_one_line(changes, message):
 def test_a_missing_key_is_named_in_one_line(missing):
     values = {name: value for name, value in NEEDED.items() if name != missing}
     with pytest.raises(FormatError) as caught:
-        recipe_from(values, "my.toml")
+        parse_recipe(values, "my.toml")
     assert str(caught.value) == f"my.toml: missing key '{missing}'; a recipe needs {', '.join(NEEDED)}"
 
 
@@ -222,9 +222,9 @@ def test_a_file_that_is_not_there_is_named(tmp_path):
 
 
 def test_a_step_has_one_micro_batch_unless_the_recipe_says_otherwise():
-    assert recipe_from(NEEDED, "here").micro_batches == 1
-    assert recipe_from(NEEDED | {"micro_batch": 4}, "here").micro_batches == 1
-    assert recipe_from(NEEDED | {"micro_batch": 1}, "here").micro_batches == 4
+    assert parse_recipe(NEEDED, "here").micro_batches == 1
+    assert parse_recipe(NEEDED | {"micro_batch": 4}, "here").micro_batches == 1
+    assert parse_recipe(NEEDED | {"micro_batch": 1}, "here").micro_batches == 4
 
 
 @pytest.mark.parametrize(
@@ -232,4 +232,4 @@ def test_a_step_has_one_micro_batch_unless_the_recipe_says_otherwise():
 )
 def test_micro_batches_that_a_batch_cannot_be_parted_into_are_refused(micro_batch, expected):
     with pytest.raises(FormatError, match=f"here: micro_batch: expected {expected}.*, found {micro_batch}"):
-        recipe_from(NEEDED | {"micro_batch": micro_batch}, "here")
+        parse_recipe(NEEDED | {"micro_batch": micro_batch}, "here")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stereoweave.errors import Remedy, StereoweaveError
-from stereoweave.io.files import place_for, replacing
+from stereoweave.io.files import make_parent_folder, replacing
 from stereoweave.learn import checkpoint
 from stereoweave.learn.export.confidence import draw_reliability
 from stereoweave.learn.export.fixed_size import check_size, fix_size
@@ -64,7 +64,7 @@ def write_matcher_files(
         reliability: For a trained network: file for a plot of the confidence's reliability.
     """
     for file in files.wanted:
-        place_for(file)
+        make_parent_folder(file)
     with tempfile.TemporaryDirectory() as folder:
         if is_matcher(source):
             made = model_file(source)
@@ -90,7 +90,7 @@ def write_weights(run: Path, out: Path) -> str:
     if out.suffix != ".pt":
         raise StereoweaveError(f"{out}: expected a name that ends in .pt, as start_from takes it")
     kept = checkpoint.load(run / "last.pt" if run.is_dir() else run)
-    place_for(out)
+    make_parent_folder(out)
     checkpoint.save(checkpoint.strip_to_average(kept), out)
     return f"{out}: averaged weights after {kept.step} steps, in 16 bits"
 

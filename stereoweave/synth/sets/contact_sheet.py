@@ -8,7 +8,7 @@ from jaxtyping import Bool, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
 
-from stereoweave.io.colormap import OCCLUDED_RGB, colour_disparity, colour_range_px
+from stereoweave.io.colormap import OCCLUDED_RGB, colour_disparity, find_colour_range_px
 from stereoweave.stereo import Sample
 from stereoweave.synth.sets.pair_rendering import RenderSpec, SceneRenderer, render_pair
 from stereoweave.system.progress import progress
@@ -55,7 +55,7 @@ def _render_samples(
 
 
 def _row_of_pictures(sample: Sample) -> list[UInt8[np.ndarray, "h w 3"]]:
-    depth = colour_disparity(sample.disparity_px, colour_range_px(sample.disparity_px))
+    depth = colour_disparity(sample.disparity_px, find_colour_range_px(sample.disparity_px))
     left, right = (
         _overlay_mask(sample.left, sample.occluded),
         _overlay_mask(sample.right, sample.right_occluded),

@@ -19,7 +19,7 @@ from stereoweave.data.shards import list_shards, write_shard
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.files import SMALLEST_SIDE_PX, make_folder, reading, remove_leftovers, replacing
 from stereoweave.io.output_lock import lock_output
-from stereoweave.io.run_folder import check_claim, check_unclaimed, description
+from stereoweave.io.run_folder import check_claim, check_unclaimed, describe_run
 from stereoweave.rendering.renderer import FIRST_POSITION, LAST_POSITION
 from stereoweave.synth.sets.pair_rendering import RenderedPair, RenderSpec, render_pair
 from stereoweave.synth.sets.renderers import shared_renderer
@@ -230,7 +230,7 @@ def _claim(out: Path, facts: dict[str, Any], pairs: int) -> None:
         check_unclaimed(out, SET_FILE, (path.name for path in out.iterdir() if path.name[0] != "."))
     LAYOUTS[facts["layout"]].remove_unfinished(out)
     with replacing(out / SET_FILE) as temporary:
-        temporary.write_text(description(facts | {"pairs": pairs}), encoding="utf-8")
+        temporary.write_text(describe_run(facts | {"pairs": pairs}), encoding="utf-8")
 
 
 def _missing_pairs(spec: RenderSpec, pairs: int, out: Path, layout: str) -> list[int]:
