@@ -16,37 +16,39 @@ from stereoweave.cli.options import (
     Raw,
     Rectify,
     Refined,
+    make_request,
     option_name,
-    range_of,
-    request_of,
+    parse_range_px,
 )
 
 Source = Annotated[
     str,
-    typer.Argument(help="Pairs and films: a folder, or s3://bucket/folder, gs://bucket/folder, az://…"),
+    typer.Argument(
+        help="Pairs and stereo videos: a folder, or s3://bucket/folder, gs://bucket/folder, az://…"
+    ),
 ]
 Destination = Annotated[
-    str, typer.Argument(help="Where the results go: a new folder or URL, or one that this was begun in.")
+    str, typer.Argument(help="Results: a new folder or URL, or that of an interrupted batch.")
 ]
 Address = Annotated[
     str | None,
     typer.Option(
-        help="The Ray cluster to work on: host:port or ray://host:port of its head, auto for one that runs "
-        "here, local for this machine's cores. RAY_ADDRESS, or else local, unless given."
+        help="Ray cluster to run on: host:port or ray://host:port of its head node, auto for one that runs "
+        "on this machine, local for this machine's cores (default: RAY_ADDRESS if set, else local)."
     ),
 ]
 Workers = Annotated[
-    int | None, typer.Option(min=1, help="At most so many; as many as find room unless given.")
+    int | None, typer.Option(min=1, help="Maximum number of workers (default: as many as the cluster holds).")
 ]
-CpusEach = Annotated[float, typer.Option(help="Processor cores for each worker.")]
-GpusEach = Annotated[float, typer.Option(help="GPUs for each worker: with 0.25 four share one.")]
+CpusEach = Annotated[float, typer.Option(help="CPU cores per worker.")]
+GpusEach = Annotated[float, typer.Option(help="GPUs per worker: with 0.25, four workers share one.")]
 Write = Annotated[
     list[str] | None,
-    typer.Option(metavar="NAME", help="A further file to write, as `stereoweave depth` knows them, or all."),
+    typer.Option(metavar="NAME", help="Additional file to write, as for depth; repeatable."),
 ]
 
 
-def batch(  # noqa: PLR0913 - each is a word of the command line
+def batch(  # noqa: PLR0913 - each is an option of the command line
     source: Source,
     destination: Destination,
     address: Address = None,
@@ -66,9 +68,10 @@ def batch(  # noqa: PLR0913 - each is a word of the command line
     provider: Provider = "cpu",
     as_json: AsJson = False,
 ) -> None:
-    """Depth of an archive of pairs and films, on one machine or a cluster, with a row for each in Parquet.
+    """Estimate depth of an archive of pairs and videos, on one machine or a cluster.
 
-    Stopped in whatever way, the same command goes on, and tries again what failed.
+    The manifest, Parquet files in the results, has a row per pair or video. Rerun the same command to resume
+    after any interruption; it also retries pairs that failed.
     """
     from stereoweave.batch.cluster import batch_on_cluster
     from stereoweave.matching.backend import Backend
@@ -77,9 +80,9 @@ def batch(  # noqa: PLR0913 - each is a word of the command line
     from stereoweave.system.ray_engine import Engine
 
     job = DepthJob(
-        request=request_of(arrangement, calib, focal_px, baseline_m, rectify),
+        request=make_request(arrangement, calib, focal_px, baseline_m, rectify),
         backend=Backend(model=model, provider=provider),
-        options=MatchOptions(range_px=range_of(range_px), refined=refined, raw=raw),
+        options=MatchOptions(range_px=parse_range_px(range_px), refined=refined, raw=raw),
         files=tuple(write or ()),
         name_of=option_name,
     )

@@ -12,7 +12,7 @@ from stereoweave.cli.options import (
     Model,
     Provider,
     Threads,
-    engine_of,
+    make_engine,
     make_parent_folder,
     needing_synth_extra,
     needing_train_extra,
@@ -34,7 +34,7 @@ Classes = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="Second CSV file to write: errors by class of pixels (outside the right picture, occluded, near "
+        help="Second CSV file to write: errors by pixel class (outside the right picture, occluded, near "
         "edges, plain, weakly textured, textured).",
     ),
 ]
@@ -58,7 +58,7 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
     out: CsvFile = Path("pairs.csv"),
     model: Models = None,
     dataset: Annotated[
-        str | None, typer.Option(help="Dataset that the folder contains, as its authors distribute it.")
+        str | None, typer.Option(help="Public dataset in the folder, unpacked as its authors distribute it.")
     ] = None,
     plot: Annotated[
         Path | None, typer.Option(help="Picture to write: errors against time. Extra 'train'.")
@@ -86,7 +86,7 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
     for file in filter(None, (out, classes)):
         make_parent_folder(file)
     _check_plots(plot, sparsification)
-    engine = engine_of(cluster, cpus_each=threads or 1)
+    engine = make_engine(cluster, cpus_each=threads or 1)
     threads = engine.threads_each if engine else threads
     cv2.setNumThreads(thread_count(threads))
     makers = _makers(model, threads, provider)
@@ -107,7 +107,7 @@ def collages(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the set, new or empty.")],
     pairs: Annotated[int, typer.Option(min=1, help="Number of pairs.")] = 16,
     seed: Annotated[
-        int, typer.Option(min=0, help="The default gives the validation pairs of trainings.")
+        int, typer.Option(min=0, help="Seed; the default gives the validation pairs of trainings.")
     ] = 1_000_003,
     size: Annotated[str, typer.Option(help="Width and height in pixels.")] = "384x256",
 ) -> None:
@@ -134,7 +134,7 @@ def views(  # noqa: PLR0913 - each is an option of the command line
     threads: Threads = None,
     provider: Provider = "cpu",
 ) -> None:
-    """Score new views against pictures taken there: all pixels, smooth regions, depth edges, hidden pixels.
+    """Score new views against pictures taken there: all pixels, smooth regions, depth edges, occluded pixels.
 
     With --cluster, one worker of --threads cores (default: 1) scores each scene.
     """
@@ -146,7 +146,7 @@ def views(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.system.threads import thread_count
 
     make_parent_folder(out)
-    engine = engine_of(cluster, cpus_each=threads or 1)
+    engine = make_engine(cluster, cpus_each=threads or 1)
     threads = engine.threads_each if engine else threads
     cv2.setNumThreads(thread_count(threads))
     scenes = partial(list_view_scenes, folder.absolute())
@@ -158,14 +158,14 @@ def views(  # noqa: PLR0913 - each is an option of the command line
 
 @bench.command()
 def flicker(  # noqa: PLR0913 - each is an option of the command line
-    scenes: Annotated[list[str], typer.Argument(metavar="SCENE...", help="As for synth make.")],
+    scenes: Annotated[list[str], typer.Argument(metavar="SCENE...", help="Scene name, as for synth make.")],
     out: CsvFile = Path("flicker.csv"),
     model: Model = "small",
     frames: Annotated[int, typer.Option(min=2, max=120, help="Frames of each video.")] = 12,
     threads: Threads = None,
     provider: Provider = "cpu",
 ) -> None:
-    """Score the temporal filter on rendered noisy videos: flicker and errors with it and without."""
+    """Score the temporal filter on rendered noisy videos: flicker and errors with and without it."""
     make_parent_folder(out)
     with needing_synth_extra():
         from stereoweave.bench.flicker import average_rows, score_flicker
@@ -259,7 +259,7 @@ def _check_plots(*pictures: Path | None) -> None:
         picture_kind(picture)
         make_parent_folder(picture)
         with needing_train_extra("a plot needs matplotlib"):
-            from stereoweave.bench import plots as benchmark_plots  # noqa: F401 - checks that it can be
+            from stereoweave.bench import plots as benchmark_plots  # noqa: F401 - checks that matplotlib is installed
 
 
 def _draw_plots(

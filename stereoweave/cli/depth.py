@@ -21,10 +21,10 @@ from stereoweave.cli.options import (
     Rectify,
     Refined,
     Threads,
+    make_request,
     option_name,
-    pixel_of,
-    range_of,
-    request_of,
+    parse_pixel,
+    parse_range_px,
 )
 
 if TYPE_CHECKING:
@@ -34,35 +34,39 @@ Write = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NAME",
-        help="A further file to write; may be repeated. disparity.npy, disparity.tiff; in metres, which "
-        "need a camera: depth.pfm, depth.npy, depth.tiff, cloud.ply, cloud.glb, mesh.ply, mesh.glb; or all.",
+        help="Additional file to write, repeatable: disparity.npy, disparity.tiff; in metres, if the camera "
+        "is known: depth.pfm, depth.npy, depth.tiff, cloud.ply, cloud.glb, mesh.ply, mesh.glb; or all.",
     ),
 ]
 PicturesOrFolder = Annotated[
     list[Path] | None,
     typer.Argument(
         metavar="PICTURE",
-        help="LEFT RIGHT of one size; or one file of both views; or a folder of many pairs, told by names "
-        "such as left/1.png, 1_L.jpg, im0.png, 1.mpo.",
+        help="LEFT RIGHT, of the same size; or one picture with both views; or a folder of pairs, detected "
+        "by names such as left/1.png, 1_L.jpg, im0.png, 1.mpo.",
     ),
 ]
 Left = Annotated[
-    str | None, typer.Option(metavar="GLOB", help="Many left pictures, such as 'left/*.png', quoted.")
+    str | None,
+    typer.Option(metavar="GLOB", help="Quoted pattern of left pictures, such as 'left/*.png'."),
 ]
-Right = Annotated[str | None, typer.Option(metavar="GLOB", help="As many right ones, in the same order.")]
+Right = Annotated[
+    str | None, typer.Option(metavar="GLOB", help="Quoted pattern of the right pictures, in the same order.")
+]
 Listed = Annotated[
     Path | None,
-    typer.Option("--list", help="A text file with a pair in each line: left, right, and a name if wanted."),
+    typer.Option("--list", help="Text file with a pair per line: left, right, optional name."),
 ]
 Jobs = Annotated[
     int | None,
-    typer.Option(min=1, help="Pairs at a time where there are many; as many as cores unless given."),
+    typer.Option(min=1, help="Number of pairs processed in parallel (default: all cores)."),
 ]
-ErrorPercent = Annotated[float, typer.Option(min=0, help="How uncertain it is, in percent of it.")]
+FocalError = Annotated[float, typer.Option(min=0, help="Uncertainty of the focal length, in percent of it.")]
+BaselineError = Annotated[float, typer.Option(min=0, help="Uncertainty of the baseline, in percent of it.")]
 
 
-def depth(  # noqa: PLR0913 - each is a word of the command line
-    out: Annotated[Path, typer.Option("--out", "-o", help="The folder to write the results into.")],
+def depth(  # noqa: PLR0913 - each is an option of the command line
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write the results to.")],
     pictures: PicturesOrFolder = None,
     left: Left = None,
     right: Right = None,
@@ -82,16 +86,16 @@ def depth(  # noqa: PLR0913 - each is a word of the command line
     provider: Provider = "cpu",
     as_json: AsJson = False,
 ) -> None:
-    """Depth of a stereo pair, or of many: maps, pictures of them, and a report to open in a browser."""
+    """Estimate depth of one or many stereo pairs: maps, previews and an HTML report."""
     from stereoweave.matching.backend import Backend
     from stereoweave.matching.options import MatchOptions
     from stereoweave.outputs.results import DepthJob, make_depth
     from stereoweave.pictures.pair_finding import find_pairs
 
     job = DepthJob(
-        request=request_of(arrangement, calib, focal_px, baseline_m, rectify),
+        request=make_request(arrangement, calib, focal_px, baseline_m, rectify),
         backend=Backend(model=model, threads=threads, provider=provider),
-        options=MatchOptions(range_px=range_of(range_px), refined=refined, raw=raw),
+        options=MatchOptions(range_px=parse_range_px(range_px), refined=refined, raw=raw),
         files=tuple(write or ()),
         name_of=option_name,
     )
@@ -101,19 +105,19 @@ def depth(  # noqa: PLR0913 - each is a word of the command line
 
         raise typer.Exit(depth_of_many(found, out, job, processes=jobs, as_json=as_json))
     summary, notes = make_depth(pictures, out, job)
-    (_tell_json if as_json else _tell)(summary, [note.worded(option_name) for note in notes], out)
+    (_print_json if as_json else _print_summary)(summary, [note.worded(option_name) for note in notes], out)
 
 
-def measure(  # noqa: PLR0913 - each is a word of the command line
+def measure(  # noqa: PLR0913 - each is an option of the command line
     pictures: Pictures,
-    first: Annotated[str, typer.Option("--from", metavar="X,Y", help="A pixel of the left picture.")],
-    second: Annotated[str, typer.Option("--to", metavar="X,Y", help="Another one.")],
+    first: Annotated[str, typer.Option("--from", metavar="X,Y", help="Pixel of the left picture.")],
+    second: Annotated[str, typer.Option("--to", metavar="X,Y", help="Another pixel.")],
     arrangement: Format = None,
     calib: Calib = None,
     focal_px: FocalPx = None,
     baseline_m: BaselineM = None,
-    focal_error_percent: ErrorPercent = 0.0,
-    baseline_error_percent: ErrorPercent = 0.0,
+    focal_error_percent: FocalError = 0.0,
+    baseline_error_percent: BaselineError = 0.0,
     rectify: Rectify = False,
     range_px: Range = None,
     refined: Refined = False,
@@ -122,9 +126,9 @@ def measure(  # noqa: PLR0913 - each is a word of the command line
     provider: Provider = "cpu",
     as_json: AsJson = False,
 ) -> None:
-    """The distance in metres between what two pixels show, and how certain it is.
+    """Measure the distance in metres between two points of the left picture, with its uncertainty.
 
-    The pixels are those of the left picture as it is matched: of the rectified one with --rectify.
+    With --rectify, the points are pixels of the rectified left picture.
     """
     from stereoweave.matching.backend import Backend
     from stereoweave.matching.estimate import match
@@ -133,9 +137,9 @@ def measure(  # noqa: PLR0913 - each is a word of the command line
     from stereoweave.outputs.point_cloud import needed_camera
     from stereoweave.pictures.prepare import prepare
 
-    places = pixel_of("--from", first), pixel_of("--to", second)
-    options = MatchOptions(range_px=range_of(range_px), refined=refined)
-    prepared = prepare(pictures, request_of(arrangement, calib, focal_px, baseline_m, rectify))
+    places = parse_pixel("--from", first), parse_pixel("--to", second)
+    options = MatchOptions(range_px=parse_range_px(range_px), refined=refined)
+    prepared = prepare(pictures, make_request(arrangement, calib, focal_px, baseline_m, rectify))
     camera = needed_camera(prepared.pair)
     matcher = Backend(model=model, threads=threads, provider=provider).matcher()
     estimate = match(matcher, prepared.pair, options)
@@ -148,14 +152,14 @@ def measure(  # noqa: PLR0913 - each is a word of the command line
         typer.echo("\n".join([str(found), *notes]))
 
 
-def _tell_json(summary: "Summary", notes: list[str], out: Path) -> None:
+def _print_json(summary: "Summary", notes: list[str], out: Path) -> None:
     from stereoweave.outputs.results import FILES
 
     files = {file: str(out / file) for file in FILES if (out / file).exists()}
     typer.echo(json.dumps(asdict(summary) | {"notes": notes, "files": files}, indent=2, allow_nan=False))
 
 
-def _tell(summary: "Summary", notes: list[str], out: Path) -> None:
+def _print_summary(summary: "Summary", notes: list[str], out: Path) -> None:
     size = f"{summary.width_px}x{summary.height_px} px"
     typer.echo(
         f"{' + '.join(summary.pictures)}: {size}, matched by {summary.model} in {summary.estimate_ms:.0f} ms"

@@ -15,29 +15,29 @@ Sources = Annotated[
     list[str],
     typer.Argument(
         metavar="SOURCE",
-        help="A camera's number, a video file, the address of a stream, or pictures as frame%03d.png, with "
-        "both views in each frame; or LEFT RIGHT.",
+        help="Camera number, video file, stream URL or picture sequence such as frame%03d.png, with both "
+        "views in each frame; or LEFT RIGHT.",
     ),
 ]
 Arrangement = Annotated[
     str | None,
     typer.Option(
-        help="How a frame holds both views, such as side_by_side or top_bottom_half; guessed from the first "
-        "one unless given. Any other word lists them all."
+        help="Frame packing, such as side_by_side or top_bottom_half (default: detected in the first "
+        "frame). An unknown one lists them all."
     ),
 ]
 Calib = Annotated[
     Path | None,
-    typer.Option(help="A calibration of both cameras: it rectifies what they see, and gives metres."),
+    typer.Option(help="Calibration file: rectifies the frames, and gives metres."),
 ]
 Port = Annotated[
-    int, typer.Option(min=0, max=65535, help="Of the page, on this machine alone; 0 takes any that is free.")
+    int, typer.Option(min=0, max=65535, help="Port of the page, on this machine only; 0 takes any free port.")
 ]
 Browser = Annotated[bool, typer.Option(help="Open the page in the browser.")]
 
 
 @naming_video_options()
-def live(  # noqa: PLR0913 - each is a word of the command line
+def live(  # noqa: PLR0913 - each is an option of the command line
     sources: Sources,
     arrangement: Arrangement = None,
     calib: Calib = None,
@@ -47,8 +47,8 @@ def live(  # noqa: PLR0913 - each is a word of the command line
     port: Port = 8123,
     browser: Browser = True,
 ) -> None:
-    """What cameras see and its depth in colours, as it comes, on a page in the browser; Ctrl-C ends it."""
-    # Else the libraries that OpenCV reads with tell the terminal in their words what the error says in ours.
+    """Show live video of cameras and its depth in colour on a page in the browser; Ctrl-C stops it."""
+    # Otherwise FFmpeg prints its own message beside our error.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     from stereoweave.app.live import Capture, LiveTally, Screen, show
     from stereoweave.cameras.calibration_files import read_rig
@@ -63,7 +63,7 @@ def live(  # noqa: PLR0913 - each is a word of the command line
     rig = read_rig(calib) if calib else None
     matcher, tally = Backend(model=model, threads=threads, provider=provider).matcher(), LiveTally()
     with Screen(port) as screen, Capture(sources) as capture:
-        typer.echo(f"{capture.name}: shown at {screen.url}; Ctrl-C ends it")
+        typer.echo(f"{capture.name}: shown at {screen.url}; Ctrl-C stops it")
         if browser:
             webbrowser.open(screen.url)
         try:

@@ -1,4 +1,4 @@
-"""What the commands share: words of the command line, and what they do before they work."""
+"""Options that several commands share, their parsing, and sockets."""
 
 import math
 import re
@@ -19,31 +19,34 @@ if TYPE_CHECKING:
 
 Pictures = Annotated[
     list[Path],
-    typer.Argument(metavar="PICTURE", help="LEFT RIGHT, of one size; or one picture with both views."),
+    typer.Argument(metavar="PICTURE", help="LEFT RIGHT, of the same size; or one picture with both views."),
 ]
 Format = Annotated[
     str | None,
     typer.Option(
         "--format",
-        help="How one picture holds both views: side_by_side, side_by_side_half, crossed, crossed_half, "
-        "top_bottom, top_bottom_half, top_bottom_right_first, top_bottom_right_first_half, mpo, jps; found "
-        "out unless given.",
+        help="Layout of a picture that holds both views: side_by_side, side_by_side_half, crossed, "
+        "crossed_half, top_bottom, top_bottom_half, top_bottom_right_first, top_bottom_right_first_half, "
+        "mpo, jps (default: detected).",
     ),
 ]
 Calib = Annotated[
     Path | None,
     typer.Option(
-        help="The cameras' calibration, for metres and --rectify: of OpenCV, Kalibr, KITTI, Middlebury."
+        help="Calibration file, for metres and --rectify: OpenCV, Kalibr, KITTI or Middlebury format."
     ),
 ]
 FocalPx = Annotated[
-    float | None, typer.Option(help="Without a calibration, for metres: the focal length in pixels.")
+    float | None, typer.Option(help="Focal length in pixels, for metres without a calibration file.")
 ]
-BaselineM = Annotated[float | None, typer.Option(help="And the distance between the two cameras in metres.")]
+BaselineM = Annotated[
+    float | None,
+    typer.Option(help="Distance between the cameras in metres, for metres without a calibration file."),
+]
 Rectify = Annotated[
     bool,
     typer.Option(
-        "--rectify", help="Bring the rows of both to match: by the calibration, or without one by features."
+        "--rectify", help="Rectify the pair: by its calibration, or without one by matched features."
     ),
 ]
 Range = Annotated[
@@ -51,60 +54,61 @@ Range = Annotated[
     typer.Option(
         "--range",
         metavar="LOW,HIGH",
-        help="The least and the greatest disparity in pixels; found out unless given.",
+        help="Least and greatest disparity in pixels (default: estimated from the pair).",
     ),
 ]
 Refined = Annotated[
     bool,
     typer.Option(
         "--refined",
-        help="Match once more, at full resolution up to 2 megapixels: thin things, sharper edges.",
+        help="Match once more at full resolution, up to 2 megapixels: thin structures, sharper edges.",
     ),
 ]
 Raw = Annotated[
     bool,
     typer.Option(
         "--raw",
-        help="The network's own disparity: occluded pixels not filled, nothing brought to a part of a pixel.",
+        help="Write the network's own disparity: occluded pixels not filled, no subpixel refinement.",
     ),
 ]
 Strength = Annotated[
-    float, typer.Option(min=0, help="Multiplies the distance of the cameras, about their middle.")
+    float, typer.Option(min=0, help="Factor on the baseline; the midpoint of the cameras stays in place.")
 ]
 Model = Annotated[
     str,
     typer.Option(
-        help="The name of a shipped network, or an .onnx file; or best, for stills: base, once more at 1.5 "
-        "times the size, and refined."
+        help="Shipped network (small or base), or an .onnx matcher file; for stills also best: base, run a "
+        "second time at 1.5 times the size, then refined."
     ),
 ]
-Threads = Annotated[int | None, typer.Option(min=1, help="Processor threads; as many as cores unless given.")]
+Threads = Annotated[int | None, typer.Option(min=1, help="CPU threads (default: all cores).")]
 Cluster = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="Work on a Ray cluster: host:port or ray://host:port of its head, auto for one that runs here, "
-        "local for this machine's cores. All its nodes have to see the folder under the same name. Extra "
-        "'cluster'.",
+        help="Run on a Ray cluster: host:port or ray://host:port of its head node, auto for one that runs "
+        "on this machine, local for this machine's cores. All nodes must see the folder under the same "
+        "path. Extra 'cluster'.",
     ),
 ]
 Provider = Annotated[
     str,
     typer.Option(
-        help="What the network is run on: cpu; cuda or tensorrt (NVIDIA's GPUs), openvino (Intel's "
-        "processors), coreml (macOS), directml (Windows). What one needs, it says where that is missing."
+        help="Hardware that runs the network: cpu; cuda or tensorrt (NVIDIA GPUs), openvino (Intel "
+        "processors), coreml (macOS), directml (Windows). If a provider's package is missing, the error "
+        "names it."
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Host = Annotated[
     str,
     typer.Option(
-        help="The address to serve. 127.0.0.1 is this computer alone; 0.0.0.0 is everyone in its networks."
+        help="Address to listen on: 127.0.0.1 accepts this computer only, 0.0.0.0 everyone in its networks."
     ),
 ]
-Port = Annotated[int, typer.Option(min=0, max=65535, help="0 takes any that is free.")]
+Port = Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes any free port.")]
 
-# Options that are not called after their setting's keyword.
+# Options whose name differs from their setting's keyword.
 _OPTIONS = {
     "arrangement": "--format",
     "calibration": "--calib",
@@ -118,12 +122,12 @@ _OPTIONS = {
 
 
 def option_name(setting: str) -> str:
-    """The option for a setting, given its Python keyword."""
+    """Return the option for a setting, given its Python keyword."""
     return _OPTIONS.get(setting, f"--{setting.replace('_', '-')}")
 
 
 def video_option_name(setting: str) -> str | None:
-    """The option of the commands for video, which cannot rectify."""
+    """Return the option of the video commands for a setting; None for rectification, which they lack."""
     if setting == "arrangement":
         return "--arrangement"
     return None if setting == "rectify" else option_name(setting)
@@ -131,21 +135,21 @@ def video_option_name(setting: str) -> str | None:
 
 @contextmanager
 def naming_video_options() -> Iterator[None]:
-    """Errors name the options of the commands for video."""
+    """Make errors name the options of the video commands."""
     try:
         yield
     except StereoweaveError as error:
         raise type(error)(error.worded(video_option_name)) from error
 
 
-def request_of(
+def make_request(
     arrangement: str | None = None,
     calib: Path | None = None,
     focal_px: float | None = None,
     baseline_m: float | None = None,
     rectify: bool = False,
 ) -> "Request":
-    """What a command was told of a pair beside its pictures."""
+    """Bundle what a command line states about a pair, apart from its pictures."""
     from stereoweave.pictures.prepare import Request
 
     return Request(
@@ -157,23 +161,23 @@ def request_of(
     )
 
 
-def range_of(text: str | None) -> tuple[float, float] | None:
-    """The least and the greatest disparity of --range, None where it is not given."""
+def parse_range_px(text: str | None) -> tuple[float, float] | None:
+    """Parse --range: least and greatest disparity in px; None if not given."""
     if text is None:
         return None
-    low_px, high_px = _two_numbers("--range", text, "the least and the greatest disparity, such as -20,150")
+    low_px, high_px = _parse_two_numbers("--range", text, "least and greatest disparity, such as -20,150")
     if low_px >= high_px:
         raise StereoweaveError(f"--range: expected the least disparity first, found {text!r}")
     return low_px, high_px
 
 
-def pixel_of(option: str, text: str) -> tuple[int, int]:
-    """Column and row that the words of an option name."""
-    column, row = _two_numbers(option, text, "column and row of a pixel, such as 320,240")
+def parse_pixel(option: str, text: str) -> tuple[int, int]:
+    """Parse an option X,Y: column and row of a pixel."""
+    column, row = _parse_two_numbers(option, text, "column and row of a pixel, such as 320,240")
     return round(column), round(row)
 
 
-def _two_numbers(option: str, text: str, expected: str) -> tuple[float, float]:
+def _parse_two_numbers(option: str, text: str, expected: str) -> tuple[float, float]:
     try:
         first, second = (float(word) for word in text.split(","))
     except ValueError:
@@ -183,15 +187,15 @@ def _two_numbers(option: str, text: str, expected: str) -> tuple[float, float]:
     return first, second
 
 
-def engine_of(cluster: str | None, workers: int | None = None, cpus_each: float = 1) -> "Engine | None":
-    """Where a command's work is done; None where it is not to be a cluster."""
+def make_engine(cluster: str | None, workers: int | None = None, cpus_each: float = 1) -> "Engine | None":
+    """Return the cluster to run on; None without --cluster."""
     from stereoweave.system.ray_engine import Engine
 
     return Engine(cluster, workers, cpus_each) if cluster else None
 
 
 def parse_size_px(size: str) -> tuple[int, int]:
-    """Width and height of --size."""
+    """Parse --size: width and height in px."""
     found = re.fullmatch("([0-9]{1,9})x([0-9]{1,9})", size)
     if found is None:
         raise StereoweaveError(f"--size: expected width x height in pixels, such as 640x480, found {size!r}")
@@ -199,59 +203,59 @@ def parse_size_px(size: str) -> tuple[int, int]:
 
 
 def make_parent_folder(*files: Path) -> Path:
-    """As `io.make_parent_folder`, which is imported where it is needed alone."""
+    """Call `io.files.make_parent_folder`, imported here only, so that --help stays fast."""
     from stereoweave.io import files as io
 
     return io.make_parent_folder(*files)
 
 
-def listening(host: str, port: int) -> socket.socket:
-    """A socket that listens there; an error in one line where that cannot be."""
+def listen(host: str, port: int) -> socket.socket:
+    """Open a listening socket; raises StereoweaveError if the address is not available."""
     try:
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         return socket.create_server(address[:2], family=family)
     except OSError as error:
         raise StereoweaveError(
-            f"--host {host} --port {port}: expected an address that is free, found {str(error).lower()}; "
-            "--port 0 takes any port that is free"
+            f"--host {host} --port {port}: expected a free address, found {str(error).lower()}; "
+            "--port 0 takes any free port"
         ) from error
 
 
-def url_at(host: str, port: int) -> str:
-    """The URL of what listens there."""
-    return f"http://{_in_url(host)}:{port}"
+def format_url(host: str, port: int) -> str:
+    """Return the URL of an HTTP server."""
+    return f"http://{_bracket_ipv6(host)}:{port}"
 
 
-def own_names(listener: socket.socket, host: str) -> tuple[str, ...] | None:
-    """The names that the header Host may have; None, for any, where other machines reach the listener.
+def find_allowed_hosts(listener: socket.socket, host: str) -> tuple[str, ...] | None:
+    """Return the names allowed in the header Host; None (any) if other machines can reach the listener.
 
-    A name that another site's DNS server gives this machine's address would open the listener to that site.
+    This stops DNS rebinding, where another site's DNS server gives its name this machine's address.
 
     Args:
-        listener: What listens.
+        listener: The listening socket.
         host: Its address as the user gave it, such as a name in /etc/hosts.
     """
     address = listener.getsockname()[0]
     if not ip_address(address).is_loopback:
         return None
-    return tuple(dict.fromkeys([_in_url(address), "localhost", _in_url(host.lower())]))
+    return tuple(dict.fromkeys([_bracket_ipv6(address), "localhost", _bracket_ipv6(host.lower())]))
 
 
-def _in_url(host: str) -> str:
+def _bracket_ipv6(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
 @contextmanager
-def needing_train_extra(what: str = "this command needs PyTorch and its company") -> Iterator[None]:
-    """Turns the lack of a library into one line that names the extra."""
+def needing_train_extra(what: str = "this command needs PyTorch and other libraries") -> Iterator[None]:
+    """Raise a one-line error that names the extra `train` if a library is missing."""
     with needing_extra("train", what):
         yield
 
 
 @contextmanager
 def needing_synth_extra() -> Iterator[None]:
-    """As `needing_train_extra`."""
-    with needing_extra("synth", "this command needs what renders"):
-        import skimage  # noqa: F401 - which textures need later, in other processes too
+    """Raise a one-line error that names the extra `synth` if a library is missing."""
+    with needing_extra("synth", "this command needs the rendering libraries"):
+        import skimage  # noqa: F401 - textures need it later, in worker processes too
 
         yield

@@ -1,4 +1,4 @@
-"""The commands about how the cameras stand: stereoweave check | rectify | calibrate."""
+"""The commands stereoweave check, rectify and calibrate."""
 
 import json
 import math
@@ -15,9 +15,9 @@ from stereoweave.errors import StereoweaveError
 
 
 def check(pictures: Pictures, arrangement: Format = None, as_json: AsJson = False) -> None:
-    """What is amiss with a pair and what to do: rows, sides, range of disparities, exposure.
+    """Check a pair for problems: rectification, swapped pictures, disparity range, exposure.
 
-    Exit code 1 where something is.
+    Every problem is reported with its remedy; the exit status is then 1.
     """
     from stereoweave.cameras.alignment import check_pair
     from stereoweave.pictures.loading import open_pictures
@@ -26,7 +26,7 @@ def check(pictures: Pictures, arrangement: Format = None, as_json: AsJson = Fals
     found = check_pair(opened.pair.left, opened.pair.right)
     notes = [note.worded(option_name) for note in (*opened.notes, *found.lines())]
     if as_json:
-        facts = {name: _known(value) for name, value in asdict(found).items()}
+        facts = {name: _replace_nan(value) for name, value in asdict(found).items()}
         typer.echo(json.dumps(facts | {"notes": notes}, indent=2, allow_nan=False))
     else:
         typer.echo("\n".join(notes))
@@ -34,24 +34,24 @@ def check(pictures: Pictures, arrangement: Format = None, as_json: AsJson = Fals
         raise typer.Exit(1)
 
 
-def _known(value: object) -> object:
-    """The value, or None, JSON's null, in place of a number that is not known."""
+def _replace_nan(value: object) -> object:
+    """Replace NaN, unknown, by None, which JSON writes as null."""
     if isinstance(value, tuple):
-        return [_known(part) for part in value]
+        return [_replace_nan(part) for part in value]
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def rectify(
     pictures: Pictures,
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="The folder to write left.png, right.png and calib.yml into.")
+        Path, typer.Option("--out", "-o", help="Folder to write left.png, right.png and calib.yml to.")
     ],
     arrangement: Format = None,
     calib: Calib = None,
 ) -> None:
-    """Bring the rows of a pair to match: by a calibration, or without one by what both pictures show.
+    """Rectify a pair, by its calibration, or without one by matched features.
 
-    The pictures are cut to what both show. With a calibration calib.yml is the new one, of the results.
+    The pictures are cropped to their common area. With --calib, calib.yml is the calibration of the results.
     """
     from stereoweave.cameras.calibration_files import write_rig
     from stereoweave.cameras.rectify import crop
@@ -60,7 +60,7 @@ def rectify(
     from stereoweave.io.output_lock import lock_output
     from stereoweave.pictures.prepare import Request, prepare
 
-    _spare(pictures, calib, out)
+    _check_output(pictures, calib, out)
     make_parent_folder(out / "left.png", out / "right.png", out / "calib.yml")
     prepared = prepare(pictures, Request(arrangement=arrangement, calibration=calib, rectify=True))
     pair = crop(prepared.pair)
@@ -73,13 +73,13 @@ def rectify(
     typer.echo("\n".join([f"{out}: left.png and right.png, {format_size(pair_size_px(pair))} px", *notes]))
 
 
-def _spare(pictures: Sequence[Path], calib: Path | None, out: Path) -> None:
-    """An error where results would take the place of what was given, or a calibration not be of theirs."""
+def _check_output(pictures: Sequence[Path], calib: Path | None, out: Path) -> None:
+    """Raise a StereoweaveError if results would replace an input, or lie beside an older calib.yml."""
     given = [file for file in (*pictures, calib) if file and file.exists()]
     for result in (out / "left.png", out / "right.png", out / "calib.yml"):
         if result.exists() and any(result.samefile(file) for file in given):
             raise StereoweaveError(
-                f"{result}: expected a place for a result, found a file that was given; choose another --out"
+                f"{result}: expected a new file, found one of the inputs; choose another --out"
             )
     if calib is None and (out / "calib.yml").exists():
         raise StereoweaveError(
@@ -88,29 +88,30 @@ def _spare(pictures: Sequence[Path], calib: Path | None, out: Path) -> None:
         )
 
 
-def calibrate(  # noqa: PLR0913 - each is a word of the command line
+def calibrate(  # noqa: PLR0913 - each is an option of the command line
     folder: Annotated[
         Path,
         typer.Argument(
-            help="Pictures of a board, at least 5 pairs: in folders left and right, or left_01, right_01."
+            help="Pictures of a board, at least 5 pairs: in folders left and right, or as left_01, right_01."
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The calibration to write, in OpenCV's YAML.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Calibration file to write, OpenCV YAML.")],
     board: Annotated[
         str,
         typer.Option(
             metavar="COLUMNSxROWS",
-            help="Inner corners of the chessboard, such as 9x6; of a ChArUco board its squares.",
+            help="Inner corners of a chessboard, such as 9x6; squares of a ChArUco board.",
         ),
     ],
-    square_mm: Annotated[float, typer.Option(help="The side of a square; measure it on the print.")],
+    square_mm: Annotated[float, typer.Option(help="Side of a square; measure it on the print.")],
     charuco: Annotated[
-        str | None, typer.Option(metavar="DICT", help="The markers of a ChArUco board: DICT_5X5_100.")
+        str | None,
+        typer.Option(metavar="DICT", help="Marker dictionary of a ChArUco board: DICT_5X5_100."),
     ] = None,
-    marker_mm: Annotated[float | None, typer.Option(help="The side of a ChArUco board's marker.")] = None,
+    marker_mm: Annotated[float | None, typer.Option(help="Side of a ChArUco board's marker.")] = None,
     fisheye: Annotated[bool, typer.Option("--fisheye", help="The lenses are fisheyes.")] = False,
 ) -> None:
-    """How two cameras see and stand, from pictures of a board; how well it is known, in plain words."""
+    """Calibrate two cameras from pictures of a board, and report how accurate the result is."""
     from stereoweave.cameras.boards import Board
     from stereoweave.cameras.calibrate import calibrate as calibrate_by
     from stereoweave.cameras.calibration_files import write_rig

@@ -1,4 +1,4 @@
-"""The commands: stereoweave depth | measure | view | video | live | app | check | rectify | train, more."""
+"""The command line `stereoweave`: its commands, its exit codes, and the one-line errors."""
 
 import io
 import re
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(commands: typer.Typer, program: str, arguments: Sequence[str] | None) -> int:
     """Run a command line. Returns 0, or 2 after a user's mistake, which is reported on stderr in one line."""
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # as stderr does, for names that are not UTF-8
+        sys.stdout.reconfigure(errors="backslashreplace")  # like stderr, for file names that are not UTF-8
     try:
         return commands(arguments, prog_name=program, standalone_mode=False) or 0
     except typer.TyperException as error:
@@ -87,7 +87,7 @@ def train(
 
 
 @app.command()
-def export(  # noqa: PLR0913 - each is a word of the command line
+def export(  # noqa: PLR0913 - each is an option of the command line
     source: Annotated[
         str,
         typer.Argument(help="Run folder, checkpoint, shipped model or .onnx matcher file."),

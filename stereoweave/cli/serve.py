@@ -10,49 +10,62 @@ from typing import Annotated
 
 import typer
 
-from stereoweave.cli.options import Host, Model, Port, Provider, Threads, listening, own_names, url_at
+from stereoweave.cli.options import (
+    Host,
+    Model,
+    Port,
+    Provider,
+    Threads,
+    find_allowed_hosts,
+    format_url,
+    listen,
+)
 from stereoweave.errors import StereoweaveError, needing_extra
 from stereoweave.system.ray_engine import set_environment
 from stereoweave.system.threads import usable_cores
 
-Replicas = Annotated[int, typer.Option(min=1, help="Processes, each with a network of its own.")]
+Replicas = Annotated[int, typer.Option(min=1, help="Number of processes; each loads the network.")]
 Address = Annotated[
     str | None,
-    typer.Option(help="A Ray cluster to serve on, as host:port; Ray is started here unless given."),
+    typer.Option(help="Ray cluster to serve on, as host:port (default: start Ray on this machine)."),
 ]
 Batch = Annotated[
     int | None,
     typer.Option(
         min=1,
-        help="Pairs that are matched together at most; 8 on a GPU unless given, and 1 on a processor, which "
-        "gains nothing by more.",
+        help="Maximum number of pairs matched together (default: 8 on a GPU, 1 on a CPU, which gains nothing "
+        "from more).",
     ),
 ]
 Waiting = Annotated[
-    int, typer.Option(min=1, help="Requests that a process accepts at a time; more are refused with 503.")
+    int,
+    typer.Option(min=1, help="Maximum number of pending requests per process; more get 503."),
 ]
-MaxMegabytes = Annotated[float, typer.Option(min=0.001, help="Of a request; larger ones get 413.")]
+MaxMegabytes = Annotated[
+    float, typer.Option(min=0.001, help="Maximum size of a request; larger ones get 413.")
+]
 MaxMegapixels = Annotated[
-    float, typer.Option(min=0.001, max=65, help="Of a view; larger ones get 413, and are not decoded.")
+    float,
+    typer.Option(min=0.001, max=65, help="Size limit of a view; larger ones get 413, not decoded."),
 ]
-TimeoutS = Annotated[float, typer.Option(min=0.001, help="For a request, in seconds; then it gets 504.")]
+TimeoutS = Annotated[float, typer.Option(min=0.001, help="Time limit of a request, in seconds; then 504.")]
 BehindProxy = Annotated[
     bool,
     typer.Option(
         "--behind-proxy",
-        help="Allow a --host that other machines reach: a proxy stands before it (deploy/nginx.conf), and "
-        "checks the header Host.",
+        help="Allow a --host that other machines can reach: a proxy in front of the service "
+        "(deploy/nginx.conf) checks the header Host.",
     ),
 ]
 TokenFile = Annotated[
     Path | None,
-    typer.Option(help="A file with a token that every request but /health has to show, as Bearer."),
+    typer.Option(help="File with a bearer token that every request except /health must send."),
 ]
-# As RFC 6750 has it.
+# The syntax of RFC 6750.
 _TOKEN = r"[A-Za-z0-9\-._~+/]+=*"
 
 
-def serve(  # noqa: PLR0913 - each is a word of the command line
+def serve(  # noqa: PLR0913 - each is an option of the command line
     host: Host = "127.0.0.1",
     port: Port = 8000,
     model: Model = "small",
@@ -68,7 +81,7 @@ def serve(  # noqa: PLR0913 - each is a word of the command line
     behind_proxy: BehindProxy = False,
     token_file: TokenFile = None,
 ) -> None:
-    """Depth and views over HTTP, for other programs; Ctrl-C ends it when what it accepted is done."""
+    """Serve depth and views over HTTP; Ctrl-C stops the service after the accepted requests."""
     set_environment(address)  # before the service imports Ray
     with needing_extra("cluster", "the service needs Ray Serve"):
         from pydantic import SecretStr
@@ -85,7 +98,7 @@ def serve(  # noqa: PLR0913 - each is a word of the command line
         if not math.isfinite(number):
             raise StereoweaveError(f"{option}: expected a finite number, found {number}")
     token = SecretStr(_read_token(token_file)) if token_file else None
-    with listening(host, port) as listener:
+    with listen(host, port) as listener:
         limits = Limits(
             megabytes=max_megabytes,
             megapixels=max_megapixels,
@@ -102,26 +115,26 @@ def serve(  # noqa: PLR0913 - each is a word of the command line
             batch=batch or (8 if provider in GPU_PROVIDERS else 1),
             limits=limits,
         )
-        url = url_at(host, listener.getsockname()[1])
+        url = format_url(host, listener.getsockname()[1])
         with serving(settings, listener, address):
-            _wait_for_signal(f"Stereoweave: {url}, described by {url}/openapi.json; Ctrl-C ends it")
+            _wait_for_signal(f"Stereoweave: {url}, described by {url}/openapi.json; Ctrl-C stops it")
 
 
 def _hosts(listener: socket.socket, host: str, behind_proxy: bool) -> tuple[str, ...] | None:
-    """The names that requests may give this machine; None where a proxy checks them."""
+    """Return the allowed Host headers; None if a proxy checks them."""
     if behind_proxy:
         return None
-    names = own_names(listener, host)
+    names = find_allowed_hosts(listener, host)
     if names is None:
         raise StereoweaveError(
-            f"--host {host}: expected an address of this machine alone, such as 127.0.0.1, found one that "
-            "others reach; put a proxy before the service (deploy/nginx.conf) and add --behind-proxy"
+            f"--host {host}: expected a loopback address, such as 127.0.0.1, found one that other machines "
+            "can reach; put a proxy in front of the service (deploy/nginx.conf) and add --behind-proxy"
         )
     return names
 
 
 def _read_token(path: Path) -> str:
-    """The token in a file, without the white space around it."""
+    """Read a token from a file, without surrounding white space."""
     try:
         token = path.read_text(encoding="ascii").strip()
     except (OSError, UnicodeDecodeError) as error:
@@ -138,10 +151,10 @@ def _read_token(path: Path) -> str:
 def _wait_for_signal(message: str) -> None:
     """Print the message and return at SIGINT or SIGTERM."""
     stopped = threading.Event()
-    # Here, because Ray brings handlers of its own.
+    # Set here, because Ray installs its own handlers at startup.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopped.set())
     typer.echo(message)
-    # Again and again: a signal that another thread receives is handled when this one is awake.
+    # Polls: Python handles a signal that another thread received only when this one wakes up.
     while not stopped.wait(timeout=1):
         pass

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from stereoweave.cli.options import Cluster, engine_of, needing_synth_extra, parse_size_px
+from stereoweave.cli.options import Cluster, make_engine, needing_synth_extra, parse_size_px
 
 synth = typer.Typer(help="Make, check and view rendered stereo pairs with exact ground truth.")
 
@@ -64,7 +64,7 @@ def make(  # noqa: PLR0913 - each is an option of the command
     spec = RenderSpec(
         scene=scene, seed=seed, size_px=parse_size_px(size), frames=frames, views=tuple(view or ()), rig=rig
     )
-    pair_maker, engine = PairRenderer(plain), engine_of(cluster, workers=jobs)
+    pair_maker, engine = PairRenderer(plain), make_engine(cluster, workers=jobs)
     made = make_set(spec, pairs, out, layout=layout, jobs=_jobs(jobs), engine=engine, pair_maker=pair_maker)
     typer.echo(f"{out}: {made} pair{'s' * (made != 1)} made, {pairs - made} already there")
 

@@ -26,56 +26,61 @@ _HIGHEST_RATE = 1000
 Films = Annotated[
     list[Path],
     typer.Argument(
-        metavar="FILM",
-        help="A 3-D film with both views in each frame; or LEFT RIGHT. Videos, folders of pictures, or "
-        "patterns such as 'left/*.png'.",
+        metavar="VIDEO",
+        help="Stereo video with both views in each frame; or LEFT RIGHT. Each is a video, a folder of "
+        "pictures, or a quoted pattern such as 'left/*.png'.",
     ),
 ]
 Out = Annotated[
     Path,
-    typer.Option("--out", "-o", help="The film to write: .mp4, .mov or .mkv. Begun once, it is continued."),
+    typer.Option(
+        "--out",
+        "-o",
+        help="Video to write: .mp4, .mov or .mkv. Rerun the command to resume an interrupted one.",
+    ),
 ]
 Depth = Annotated[
     bool,
-    typer.Option("--depth", help="Make the left view's disparity in colours, of one range throughout."),
+    typer.Option("--depth", help="Write the left view's disparity in colour, one range for the whole video."),
 ]
 Depth16 = Annotated[
-    bool, typer.Option("--depth16", help="Make it 16-bit grey, disparity in px * 256, lossless in .mkv.")
+    bool,
+    typer.Option("--depth16", help="Write the left view's disparity * 256 as 16-bit grey, lossless, .mkv."),
 ]
 Position = Annotated[
     float | None,
-    typer.Option(help="Make the view from here: 0 is the left camera, 1 the right; -1 to 2."),
+    typer.Option(help="Write the view from this position, -1 to 2: 0 is the left camera, 1 the right one."),
 ]
 Layout = Annotated[
     str | None,
-    typer.Option(help="Make a layout as `stereoweave view` knows them, such as anaglyph_dubois or quilt."),
+    typer.Option(help="Write a layout of `stereoweave view`, such as anaglyph_dubois or quilt."),
 ]
 Convergence = Annotated[
     float | None,
     typer.Option(
         metavar="PX",
-        help="The disparity that stays in place from view to view. [default: that of the film's middle "
-        "for anaglyphs, quilts and contact sheets, 0 for all others]",
+        help="Disparity that stays in place in all views (default: the video's median disparity for "
+        "anaglyphs, quilts and contact sheets, 0 for all others).",
     ),
 ]
 Arrangement = Annotated[
     str | None,
     typer.Option(
-        help="How a frame holds both views, such as side_by_side, top_bottom_half or crossed; guessed "
-        "unless given. Any other word lists them all."
+        help="Frame packing, such as side_by_side, top_bottom_half or crossed (default: detected). An "
+        "unknown one lists them all."
     ),
 ]
 Rate = Annotated[
     str | None,
     typer.Option(
         metavar="FPS",
-        help="Frames a second of a series of pictures, such as 24 or 30000/1001. [default: 25]",
+        help="Frames per second of a picture sequence, such as 24 or 30000/1001 (default: 25).",
     ),
 ]
 
 
 @naming_video_options()
-def video(  # noqa: PLR0913 - each is a word of the command line
+def video(  # noqa: PLR0913 - each is an option of the command line
     films: Films,
     out: Out,
     depth: Depth = False,
@@ -90,7 +95,7 @@ def video(  # noqa: PLR0913 - each is a word of the command line
     threads: Threads = None,
     provider: Provider = "cpu",
 ) -> None:
-    """A 3-D film's depth, a new view of it, or another layout, with its sound and its frame times."""
+    """Convert a stereo video to depth, a new view or a layout; sound and frame times are kept."""
     from rich.console import Console
 
     from stereoweave.io.animation import needing_the_video_extra
@@ -112,25 +117,25 @@ def video(  # noqa: PLR0913 - each is a word of the command line
             backend=Backend(model=model, threads=threads, provider=provider),
             name_of=video_option_name,
         )
-        footage = open_footage(films, arrangement, rate=None if rate is None else _fraction(rate))
+        footage = open_footage(films, arrangement, rate=None if rate is None else _parse_rate(rate))
         if layout:
-            out = _marked(out, layout, footage.size_px)
+            out = _add_mark(out, layout, footage.size_px)
         make_parent_folder(out)
         tally = make_film(footage, films, out, job, Console(stderr=True))
     except KeyboardInterrupt:
         folder = parts_folder(out)
-        kept = (
-            f"what is finished stays in {folder}, and the same command goes on"
+        state = (
+            f"finished parts are in {folder}; rerun the same command to resume"
             if folder.exists()
-            else "nothing stays"
+            else "no part was finished"
         )
-        typer.echo(f"stereoweave: {out}: stopped; {kept}", err=True)
+        typer.echo(f"stereoweave: {out}: stopped; {state}", err=True)
         raise typer.Exit(130) from None
-    _tell(out, tally)
+    _print_tally(out, tally)
 
 
-def _fraction(rate: str) -> Fraction:
-    """Frames a second from a word such as 24, 23.976 or 30000/1001."""
+def _parse_rate(rate: str) -> Fraction:
+    """Parse --rate: frames per second, such as 24, 23.976 or 30000/1001."""
     try:
         # FFmpeg's fractions have 32 bits.
         fraction = Fraction(rate).limit_denominator(100_000)
@@ -138,14 +143,14 @@ def _fraction(rate: str) -> Fraction:
         fraction = Fraction(0)
     if not 0 < fraction <= _HIGHEST_RATE:
         raise StereoweaveError(
-            "--rate: expected frames a second, such as 24 or 30000/1001, "
+            "--rate: expected frames per second, such as 24 or 30000/1001, "
             f"at most {_HIGHEST_RATE}, found {rate!r}"
         )
     return fraction
 
 
-def _marked(out: Path, layout: str, size_px: tuple[int, int]) -> Path:
-    """The name with the mark by which viewers know the layout."""
+def _add_mark(out: Path, layout: str, size_px: tuple[int, int]) -> Path:
+    """Return the file name with the mark by which viewers recognise the layout."""
     import numpy as np
 
     from stereoweave.rendering.layouts import LayoutOptions, add_mark
@@ -155,7 +160,7 @@ def _marked(out: Path, layout: str, size_px: tuple[int, int]) -> Path:
     return add_mark(out, layout, StereoPair(left=blank, right=blank), LayoutOptions())
 
 
-def _tell(out: Path, tally: "VideoTally") -> None:
+def _print_tally(out: Path, tally: "VideoTally") -> None:
     cuts = "1 cut" if tally.cuts == 1 else f"{tally.cuts} cuts"
     frames = "1 frame" if tally.frames == 1 else f"{tally.frames} frames"
     typer.echo(f"{out}: {frames}, {cuts}")

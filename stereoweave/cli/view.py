@@ -17,9 +17,9 @@ from stereoweave.cli.options import (
     Strength,
     Threads,
     make_parent_folder,
+    make_request,
     option_name,
-    range_of,
-    request_of,
+    parse_range_px,
 )
 from stereoweave.errors import StereoweaveError
 
@@ -36,46 +36,46 @@ Out = Annotated[
     typer.Option(
         "--out",
         "-o",
-        help="The file to write. A layout that viewers know by a mark in the name gets it: "
+        help="File to write. Viewers recognise some layouts by a mark in the file name, which is added: "
         "view.png becomes view_qs8x6a0.75.png for a quilt. .mpo and .jps are 3-D pictures.",
     ),
 ]
 Position = Annotated[
     float | None,
     typer.Option(
-        help="The viewpoint of a single view: 0 is the left camera, 1 the right; -1 to 2. [default: 0.5]"
+        help="Viewpoint of a single view, -1 to 2: 0 is the left camera, 1 the right one (default: 0.5)."
     ),
 ]
-Up = Annotated[float, typer.Option(help="Raises the viewpoint of a single view, in baselines; -1 to 1.")]
+Up = Annotated[float, typer.Option(help="Height of a single view's viewpoint, in baselines, -1 to 1.")]
 Forward = Annotated[
-    float, typer.Option(help="Moves the viewpoint of a single view forward, in baselines; -1 to 1.")
+    float, typer.Option(help="Forward shift of a single view's viewpoint, in baselines, -1 to 1.")
 ]
 Layout = Annotated[
     str | None,
     typer.Option(
-        help="Several views in one: side_by_side, side_by_side_half, crossed, top_bottom, "
+        help="Layout of several views in one picture: side_by_side, side_by_side_half, crossed, top_bottom, "
         "top_bottom_half, anaglyph_grey, anaglyph_colour, anaglyph_half_colour, anaglyph_dubois, rgbd, "
-        "quilt, contact_sheet; or moving, as .mp4 (extra 'video'), .gif or .webp: sweep, wiggle."
+        "quilt, contact_sheet; or animation as .mp4 (extra 'video'), .gif or .webp: sweep, wiggle."
     ),
 ]
 Convergence = Annotated[
     str | None,
     typer.Option(
         metavar="PX|auto",
-        help="The disparity that stays in place from view to view; auto is that of the scene's middle. "
-        "[default: 0 for a single view and where each eye has a picture of its own, auto else]",
+        help="Disparity that stays in place in all views; auto is the scene's median disparity (default: "
+        "auto for anaglyphs, quilts, contact sheets and animations, 0 for all others).",
     ),
 ]
 Quilt = Annotated[
-    str | None, typer.Option(metavar="COLUMNSxROWS", help="The views of a quilt. [default: 8x6]")
+    str | None, typer.Option(metavar="COLUMNSxROWS", help="Number of views of a quilt (default: 8x6).")
 ]
 Calib = Annotated[
     Path | None,
-    typer.Option(help="The cameras' calibration, for --rectify, and --up and --forward in true proportion."),
+    typer.Option(help="Calibration file, for --rectify, and for --up and --forward in true proportion."),
 ]
 
 
-def view(  # noqa: PLR0913 - each is a word of the command line
+def view(  # noqa: PLR0913 - each is an option of the command line
     pictures: Pictures,
     out: Out,
     position: Position = None,
@@ -93,7 +93,7 @@ def view(  # noqa: PLR0913 - each is a word of the command line
     threads: Threads = None,
     provider: Provider = "cpu",
 ) -> None:
-    """A new view of a stereo pair, or many, as 3-D viewers and displays take them."""
+    """Render a new view of a stereo pair, or several in a layout for 3-D viewers and displays."""
     from stereoweave.cameras.diagnosis import find_problems
     from stereoweave.cameras.rectify import crop
     from stereoweave.matching.backend import Backend
@@ -110,46 +110,46 @@ def view(  # noqa: PLR0913 - each is a word of the command line
     from stereoweave.rendering.renderer import Renderer, check_position
 
     name = choose_layout(out, layout)
-    _refuse_idle(name, {"--position": position, "--up": up or None, "--forward": forward or None}, quilt)
+    _check_unused(name, {"--position": position, "--up": up or None, "--forward": forward or None}, quilt)
     if name == "rgbd" and (strength != 1 or convergence is not None):
         raise StereoweaveError("--strength, --convergence: expected with several views, found with rgbd")
     check_position(_MIDDLE, up=up, forward=forward)
-    choices = _choices(quilt)
-    positions, converged = _needs(name, _MIDDLE if position is None else position)
+    layout_options = _parse_quilt(quilt)
+    positions, converged = _view_positions(name, _MIDDLE if position is None else position)
     check_positions(positions, strength)
-    plane_px = _plane_px(("auto" if converged else "0") if convergence is None else convergence)
-    options = MatchOptions(range_px=range_of(range_px), refined=True)
-    prepared = prepare(pictures, request_of(arrangement, calib, rectify=rectify))
+    plane_px = _parse_convergence_px(("auto" if converged else "0") if convergence is None else convergence)
+    options = MatchOptions(range_px=parse_range_px(range_px), refined=True)
+    prepared = prepare(pictures, make_request(arrangement, calib, rectify=rectify))
     pair = crop(prepared.pair)
     if name in LAYOUTS:
-        out = add_mark(out, name, pair, choices)
+        out = add_mark(out, name, pair, layout_options)
     make_parent_folder(out)
     estimate = match(Backend(model=model, threads=threads, provider=provider).matcher(), pair, options)
     if plane_px is None:
         plane_px = median_disparity_px(estimate)
     renderer = Renderer(pair, estimate, strength=strength, convergence_px=plane_px, threads=threads)
     if name is None:
-        told = _write_view(out, renderer.view(*positions, up=up, forward=forward), *positions)
+        written = _write_view(out, renderer.view(*positions, up=up, forward=forward), *positions)
     else:
-        told = _write_layout(out, name, renderer, choices)
-    typer.echo(f"{out}: {told}")
+        written = _write_layout(out, name, renderer, layout_options)
+    typer.echo(f"{out}: {written}")
     for note in (*prepared.notes, *find_problems(pair, estimate)):
         typer.echo(note.worded(option_name))
 
 
-def _refuse_idle(name: str | None, of_one_view: dict[str, float | None], quilt: str | None) -> None:
-    """An error for an option that the layout would not heed."""
-    given = [option for option, value in of_one_view.items() if value is not None]
+def _check_unused(name: str | None, single_view: dict[str, float | None], quilt: str | None) -> None:
+    """Raise a StereoweaveError for an option that the layout does not use."""
+    given = [option for option, value in single_view.items() if value is not None]
     if name is not None and given:
         raise StereoweaveError(
-            f"{given[0]}: expected for a single view, found with the layout {name}, which has its own; "
-            "--strength widens them"
+            f"{given[0]}: expected for a single view, found with the layout {name}, whose positions are "
+            "fixed; widen them with --strength"
         )
     if name != "quilt" and quilt is not None:
         raise StereoweaveError(f"--quilt: expected with --layout quilt, found with {name or 'a single view'}")
 
 
-def _choices(quilt: str | None) -> "LayoutOptions":
+def _parse_quilt(quilt: str | None) -> "LayoutOptions":
     from stereoweave.rendering.layouts import LayoutOptions
 
     if quilt is None:
@@ -160,8 +160,8 @@ def _choices(quilt: str | None) -> "LayoutOptions":
     return LayoutOptions(columns=int(match[1]), rows=int(match[2]))
 
 
-def _needs(name: str | None, position: float) -> tuple[tuple[float, ...], bool]:
-    """Where the views are seen from, and whether the scene's middle should stay in place."""
+def _view_positions(name: str | None, position: float) -> tuple[tuple[float, ...], bool]:
+    """Return the positions of the views, and whether --convergence is auto by default."""
     from stereoweave.rendering.layouts import ANIMATIONS, LAYOUTS
 
     if name is None:
@@ -170,8 +170,8 @@ def _needs(name: str | None, position: float) -> tuple[tuple[float, ...], bool]:
     return shown.positions, shown.converged
 
 
-def _plane_px(convergence: str) -> float | None:
-    """The disparity that stays in place; None for that of the scene's middle, which the estimate tells."""
+def _parse_convergence_px(convergence: str) -> float | None:
+    """Parse --convergence: a disparity in px; None for auto, which needs the estimate."""
     if convergence == "auto":
         return None
     try:
@@ -184,20 +184,20 @@ def _plane_px(convergence: str) -> float | None:
 
 
 def _write_view(out: Path, view: "View", position: float) -> str:
-    """What was written into the file, in words."""
+    """Write one view. Returns a description of it for the user."""
     from stereoweave.io.files import write_image
 
     write_image(out, view.image)
     return f"view at {position:g}, {100 * (~view.drawn).mean():.1f} % of it seen by neither camera"
 
 
-def _write_layout(out: Path, name: str, renderer: "Renderer", choices: "LayoutOptions") -> str:
-    """What was written into the file, in words."""
+def _write_layout(out: Path, name: str, renderer: "Renderer", layout_options: "LayoutOptions") -> str:
+    """Write several views in a layout. Returns a description of the file for the user."""
     from stereoweave.io.animation import write_animation
     from stereoweave.rendering.layouts import ANIMATIONS, LAYOUTS, render_views, write_picture
 
     if name in LAYOUTS:
-        picture = LAYOUTS[name].compose(renderer, choices)
+        picture = LAYOUTS[name].compose(renderer, layout_options)
         write_picture(out, picture)
         return f"{name}, {picture.shape[1]}x{picture.shape[0]} px"
     motion = ANIMATIONS[name]

@@ -11,7 +11,7 @@ from onnx import TensorProto, helper
 from PIL import Image
 
 import stereoweave
-from stereoweave.cli.options import listening, own_names
+from stereoweave.cli.options import find_allowed_hosts, listen
 from stereoweave.cli.root import main
 from stereoweave.io.files import read_image, read_pfm
 from stereoweave.matching.matcher import shipped_models
@@ -493,5 +493,5 @@ def test_a_link_that_leads_nowhere_is_no_place_for_output(tmp_path, capsys, line
     ],
 )
 def test_a_listener_answers_to_its_address_and_to_the_name_that_was_given(address, host, names):
-    with listening(address, 0) as listener:
-        assert own_names(listener, host) == names
+    with listen(address, 0) as listener:
+        assert find_allowed_hosts(listener, host) == names

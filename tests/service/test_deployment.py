@@ -318,7 +318,7 @@ def test_a_port_that_is_taken_is_one_line(capsys):
         port = taken.getsockname()[1]
         assert main(["serve", "--port", str(port)]) == 2
     told = capsys.readouterr().err
-    assert told.startswith(f"stereoweave: --host 127.0.0.1 --port {port}: expected an address that is free")
+    assert told.startswith(f"stereoweave: --host 127.0.0.1 --port {port}: expected a free address")
     assert told.count("\n") == 1
 
 
@@ -330,10 +330,10 @@ def test_a_port_that_is_taken_is_one_line(capsys):
         (["--provider", "abacus"], "abacus"),
         (["--address", "127.0.0.1:1"], "127.0.0.1:1: expected the head of a Ray cluster"),
         (["--replicas", "999"], "--replicas: expected at most"),
-        (["--host", "0.0.0.0"], "--host 0.0.0.0: expected an address of this machine alone"),
+        (["--host", "0.0.0.0"], "--host 0.0.0.0: expected a loopback address"),
         (
             ["--host", "0.0.0.0", "--address", "127.0.0.1:1"],
-            "put a proxy before the service (deploy/nginx.conf)",
+            "put a proxy in front of the service (deploy/nginx.conf)",
         ),
         (["--host", "0.0.0.0", "--behind-proxy", "--replicas", "999"], "--replicas: expected at most"),
         (["--token-file", "none"], "--token-file none: expected a file with a token, found"),

@@ -188,7 +188,7 @@ def test_a_film_that_was_interrupted_goes_on_to_the_same_frames(tmp_path, monkey
         assert run(film, tmp_path / "broken.mp4", *words) == 130
     [folder] = tmp_path.glob("broken*.parts")
     [line] = [line for line in capsys.readouterr().err.splitlines() if line.startswith("stereoweave")]
-    assert line.endswith(f": stopped; what is finished stays in {folder}, and the same command goes on")
+    assert line.endswith(f": stopped; finished parts are in {folder}; rerun the same command to resume")
     assert sorted(path.name for path in folder.iterdir()) == [
         "000001.nut",
         "settings.json",
@@ -292,10 +292,10 @@ def test_a_damaged_frame_is_told_with_its_time_and_is_not_the_end(tmp_path, caps
         ("out.mkv", ["--depth16", "--strength", "2"], "for it, found depth16"),
         ("out.mp4", ["--layout", "rgbd", "--convergence", "0"], "for it, found layout rgbd"),
         ("out.mp4", ["--depth", "--rate", "24"], "expected pictures for a rate, found a video"),
-        ("out.mp4", ["--depth", "--rate", "1/0"], "--rate: expected frames a second"),
-        ("out.mp4", ["--depth", "--rate", "-5"], "--rate: expected frames a second"),
+        ("out.mp4", ["--depth", "--rate", "1/0"], "--rate: expected frames per second"),
+        ("out.mp4", ["--depth", "--rate", "-5"], "--rate: expected frames per second"),
         ("out.mp4", ["--depth", "--rate", "1e300"], "at most 1000, found '1e300'"),
-        ("out.mp4", ["--depth", "--rate", ""], "--rate: expected frames a second"),
+        ("out.mp4", ["--depth", "--rate", ""], "--rate: expected frames per second"),
     ],
 )
 def test_what_cannot_be_made_is_one_line_before_any_work(tmp_path, capsys, out, words, told):
@@ -391,7 +391,7 @@ def test_a_film_stopped_while_it_is_opened_says_what_it_says_later(tmp_path, mon
     film = write_side_by_side(tmp_path / "in.mp4", example_pairs(2), codec="libx264")
     monkeypatch.setattr("stereoweave.video.reader.Footage", lambda *_: signal.raise_signal(signal.SIGINT))
     assert run(film, tmp_path / "out.mp4", "--depth") == 130
-    assert capsys.readouterr().err == f"stereoweave: {tmp_path / 'out.mp4'}: stopped; nothing stays\n"
+    assert capsys.readouterr().err == f"stereoweave: {tmp_path / 'out.mp4'}: stopped; no part was finished\n"
 
 
 def test_one_frame_is_one_frame(tmp_path, capsys):
