@@ -54,7 +54,7 @@ class Budget:
         late_s = (sum(self._accepted) + work) * median(self._latest_each_s) - left_s
         if self._accepted and late_s > 0:
             raise BusyError(
-                f"expected at most {left_s:.0f} s of work, found {late_s:.0f} s more; come again",
+                f"expected at most {left_s:.0f} s of work, found {late_s:.0f} s more; try again later",
                 retry_after_s=math.ceil(late_s),
             )
         self._accepted.append(work)

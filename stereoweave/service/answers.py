@@ -1,4 +1,4 @@
-"""What the service makes of the pictures of a request: disparity, depth or a view, as the bytes of a file."""
+"""Answers of the service: a pair's disparity, depth or view, as the bytes of a file."""
 
 import json
 import re
@@ -44,28 +44,28 @@ _FIELDS = {
     "refined": "refined",
     "strength": "strength",
 }
-# A note may quote its picture, and what carries them is the head of a response.
+# Notes may quote their picture, and are sent in a response header.
 _LONGEST_NOTE = 300
 
 
 class TooLargeError(StereoweaveError):
-    """A picture of more pixels than the service takes."""
+    """A request larger than the service accepts."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ServiceJob:
-    """What a request wants.
+    """One request to process.
 
     Attributes:
-        folder: Its own, where its pictures are.
-        pictures: Two, left first, or one that holds both views.
-        file: What it gets: a disparity or a depth in `results.FILES`, or a view, such as view.png.
-        request: What is said of the pictures.
-        options: How the pair is matched; see `match_options`.
-        position: Where a view is seen from.
-        strength: As for `rendering.Renderer`.
-        checked: Whether the notes say what is amiss with the pair, which takes half as long again.
-        most_megapixels: Of a view.
+        folder: Folder of this request's files.
+        pictures: Two pictures, left first, or one that holds both views.
+        file: File to return: a disparity or depth map of `results.FILES`, or a view, such as view.png.
+        request: Layout, camera and rectification of the pictures.
+        options: Matching options; see `match_options`.
+        position: Position of a view.
+        strength: Factor on the baseline, as for `rendering.Renderer`.
+        checked: Whether to check the pair and add notes on problems; takes 1.5 times as long.
+        most_megapixels: Greatest size of a view.
     """
 
     folder: Path
@@ -84,18 +84,18 @@ class ServiceJob:
 
     @property
     def is_view(self) -> bool:
-        """Whether a view is wanted, and not a map."""
+        """Whether the file is a view rather than a map."""
         return self.file.startswith(_VIEW)
 
     @property
     def match_options(self) -> MatchOptions:
-        """The options, refined for a view: it shows every error at an edge."""
+        """The matching options; always refined for views, which show every error at an edge."""
         return replace(self.options, refined=True) if self.is_view else self.options
 
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """The bytes of a file, and in JSON what is said of it: the numbers of its `Summary`, and notes."""
+    """The bytes of a file, and its report in JSON: the fields of `Summary`, and notes."""
 
     content: bytes
     report: str
@@ -105,23 +105,21 @@ Answering = Callable[[Sequence[ServiceJob]], list[Answer | Exception]]
 
 
 def check_pixels(job: ServiceJob) -> float:
-    """The megapixels that are matched, as the heads of the job's pictures say, before memory is spent.
+    """Return the megapixels to match, from the pictures' headers, before any is decoded.
 
     Raises:
-        TooLargeError: More than the job's views may have.
-        FormatError: No picture, or none of a kind that is read.
+        TooLargeError: A view is larger than the job allows.
+        FormatError: A file is not a picture, or of an unsupported kind.
     """
     views, megapixels = 3 - len(job.pictures), 0.0
     for path in job.pictures:
         with open_picture(path, views=views) as picture:
             factor = pixel_factor(path, picture, job.request.arrangement) if views == 2 else 1
-            megapixels += factor * _checked_megapixels(
-                path, picture.size, job.most_megapixels * views / factor
-            )
+            megapixels += factor * _check_megapixels(path, picture.size, job.most_megapixels * views / factor)
     return megapixels
 
 
-def _checked_megapixels(path: Path, size_px: tuple[int, ...], most_megapixels: float) -> float:
+def _check_megapixels(path: Path, size_px: tuple[int, ...], most_megapixels: float) -> float:
     width_px, height_px = size_px
     megapixels = width_px * height_px / 1e6
     if megapixels > most_megapixels:
@@ -132,79 +130,79 @@ def _checked_megapixels(path: Path, size_px: tuple[int, ...], most_megapixels: f
     return megapixels
 
 
-def measuring() -> Callable[[ServiceJob], float]:
-    """For a `ChildProcess`: the function that measures the pictures of a job."""
+def make_measuring() -> Callable[[ServiceJob], float]:
+    """Return the function that measures a job's pictures, for a `ChildProcess`."""
     return check_pixels
 
 
-def answering(backend: Backend) -> Answering:
-    """For a `ChildProcess`: load the network and return the function that answers jobs with it."""
+def make_answering(backend: Backend) -> Answering:
+    """Load the network and return the function that answers jobs with it, for a `ChildProcess`."""
     return partial(answer_many, backend.matcher())
 
 
 def answer_many(matcher: Matcher, jobs: Sequence[ServiceJob]) -> list[Answer | Exception]:
-    """What each job gets, or why it gets nothing; those of the same options are matched together."""
+    """Return each job's answer or error; jobs with equal options are matched together."""
     outcome: dict[int, Any] = {}
     alike: dict[MatchOptions, list[int]] = {}
     for at, job in enumerate(jobs):
-        outcome[at] = _attempt(_prepared, job)
+        outcome[at] = _attempt(_prepare, job)
         if isinstance(outcome[at], Prepared):
             alike.setdefault(job.match_options, []).append(at)
     for options, places in alike.items():
-        found = _matched(matcher, options, [outcome[at] for at in places])
+        found = _match_together(matcher, options, [outcome[at] for at in places])
         for at, result in zip(places, found, strict=True):
             failed = isinstance(result, Exception)
-            outcome[at] = result if failed else _attempt(_answered, matcher, jobs[at], result)
+            outcome[at] = result if failed else _attempt(_answer, matcher, jobs[at], result)
     return [outcome[at] for at in range(len(jobs))]
 
 
 def field_name(setting: str) -> str | None:
-    """The field of a request's form for a setting; None if a request does not have it."""
+    """Return the form field for a setting; None if the form does not have it."""
     return _FIELDS.get(setting)
 
 
-def without_paths(line: str, folder: Path) -> str:
-    """A message in one line, without the paths of this machine."""
+def strip_paths(line: str, folder: Path) -> str:
+    """Remove this machine's paths and line breaks from a message."""
     text = line.replace(f"{folder}/", "")
-    text = re.sub(r"(?<![^\s'\"(])/(?:[^\s/]+/)+", "", text)  # where a network is
+    text = re.sub(r"(?<![^\s'\"(])/(?:[^\s/]+/)+", "", text)  # path of a network
     return " ".join(text.split())
 
 
 def _attempt(work: Callable[..., Any], *given: Any, **options: Any) -> Any:
-    """What the work gives, or its error."""
+    """Return the result of the work, or its error."""
     try:
         return work(*given, **options)
-    except Exception as error:  # whatever it is: the others of the batch shall not be told it
+    except Exception as error:  # any error: it must not reach the other jobs of the batch
         return error
 
 
-def _prepared(job: ServiceJob) -> Prepared:
+def _prepare(job: ServiceJob) -> Prepared:
     prepared = prepare(job.pictures, job.request)
-    # Again: half views that are guessed are larger than the head of their picture says.
-    _checked_megapixels(job.pictures[0], prepared.pair.left.shape[1::-1], job.most_megapixels)
+    # Checked again, because detected half-size views grow beyond what the picture's header states.
+    _check_megapixels(job.pictures[0], prepared.pair.left.shape[1::-1], job.most_megapixels)
     if needs_camera(job.file):
         needed_camera(prepared.pair)
     return replace(prepared, pair=crop(prepared.pair)) if job.is_view else prepared
 
 
-def _matched(
+def _match_together(
     matcher: Matcher, options: MatchOptions, prepared: Sequence[Prepared]
 ) -> Sequence[Result | Exception]:
-    """The results of pairs that are matched together, or the error of each that cannot be matched."""
+    """Match pairs together; return the result or error of each."""
     results = _attempt(run_many, prepared, matcher, options)
     if not isinstance(results, Exception):
         return results
     if len(prepared) == 1:
         return [results]
-    # One by one, so that those that can be matched are.
-    return [found for each in prepared for found in _matched(matcher, options, [each])]
+    # One by one, so that one pair's error does not affect the others.
+    return [found for each in prepared for found in _match_together(matcher, options, [each])]
 
 
-def _answered(matcher: Matcher, job: ServiceJob, result: Result) -> Answer:
-    # The network's own name: the one that it was loaded by may be a path of this machine.
+def _answer(matcher: Matcher, job: ServiceJob, result: Result) -> Answer:
+    # The network's own name, because it may have been loaded from a path of this machine.
     summary = replace(result.summary, model=matcher.name)
     notes = [*result.notes, *(result.warnings() if job.checked else ())]
-    # Not beside its pictures: where the client went away their folder is removed, and would be made again.
+    # Not beside its pictures: their folder is removed if the client disconnects, and would be created again.
     with TemporaryDirectory(prefix="stereoweave-") as folder:
         path = Path(folder, job.file)
         if job.is_view:
@@ -227,5 +225,5 @@ def _write_map(path: Path, result: Result) -> None:
 
 
 def _report(summary: Summary, notes: Sequence[Note], folder: Path) -> str:
-    lines = [without_paths(note.worded(field_name), folder)[:_LONGEST_NOTE] for note in notes]
+    lines = [strip_paths(note.worded(field_name), folder)[:_LONGEST_NOTE] for note in notes]
     return json.dumps(asdict(summary) | {"notes": lines}, allow_nan=False)

@@ -1,4 +1,4 @@
-"""How the service speaks HTTP: what its requests say, and the guard before them, who refuses some."""
+"""HTTP interface of the service: its paths, its responses, and a guard that limits requests."""
 
 import asyncio
 import secrets
@@ -27,25 +27,25 @@ from stereoweave.service.answers import (
     ServiceJob,
     TooLargeError,
     field_name,
-    without_paths,
+    strip_paths,
 )
-from stereoweave.service.forms import MapForm, PairForm, ViewForm, stored
+from stereoweave.service.forms import MapForm, PairForm, ViewForm, store_uploads
 from stereoweave.system.child_process import ProcessDiedError
 
-# In so long some of those that wait are done.
+# Some pending requests are done by then.
 _RETRY_AFTER_S = 1
 _LATENCIES_S = [0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 60]
 _PATHS = ("/disparity", "/depth", "/view")
 _HEALTH = "/health"
-# As nginx has it: the client went away, and nobody was answered.
+# nginx's status for a client that disconnected before the response.
 _CLIENT_GONE = 499
-_DESCRIPTION = """Depth, and any view between the two cameras, of a rectified stereo pair: POST a form with
-the files `left` and `right`, or with one `picture` of both views. The header `X-Stereoweave-Report` of a
-response has numbers and notes in JSON; every error is `{"detail": "..."}`."""
+_DESCRIPTION = """Depth, and any view between the two cameras, from a stereo pair: POST a form with the files
+`left` and `right`, or with one `picture` that holds both views. The response header `X-Stereoweave-Report`
+has statistics and notes in JSON; every error is `{"detail": "..."}`."""
 
 
 class Refusal(BaseModel):
-    """What is wrong with a request, in one line."""
+    """An error response: expected, found and remedy in one line."""
 
     detail: str
 
@@ -53,16 +53,15 @@ class Refusal(BaseModel):
 _REFUSALS: dict[int | str, dict[str, Any]] = {
     status: {"model": Refusal, "description": description}
     for status, description in {
-        400: "A picture or a calibration that cannot be read, or a form that is none.",
-        401: "The service has a token, and the request has none, or another one.",
+        400: "Unreadable picture or calibration, or malformed form.",
+        401: "Missing or wrong token.",
         408: "The request did not arrive in time.",
-        413: "Too many bytes or pixels, or more work than the time limit allows.",
-        415: "No multipart/form-data.",
-        422: "A field that is unknown, missing, or says what cannot be.",
-        503: "As many requests, or as much work, wait as are accepted: the header Retry-After says when to "
-        "come again. Or the disk, the memory or what the network runs on failed, or the process that worked "
-        "on the request crashed.",
-        504: "No answer in time.",
+        413: "More bytes or pixels than accepted, or more work than the time limit allows.",
+        415: "Content type other than multipart/form-data.",
+        422: "Unknown, missing or invalid field.",
+        503: "Busy: retry after the seconds in the header Retry-After. Or disk, memory, provider or worker "
+        "process failed.",
+        504: "No response within the time limit.",
     }.items()
 }
 
@@ -72,20 +71,20 @@ _Send = Callable[[_Message], Awaitable[None]]
 _Server = Callable[[_Message, _Receive, _Send], Coroutine[Any, Any, None]]
 # Errors whose message is sent to the client. TimeoutError is an OSError.
 FAILURES = (StereoweaveError, OSError, MemoryError)
-# Of a job, and the seconds that are left for it.
+# Answers a job within the given seconds.
 Answering = Callable[[ServiceJob, float], Awaitable[Answer]]
 
 
 class Limits(BaseModel):
-    """What a replica accepts.
+    """Limits of a replica.
 
     Attributes:
-        megabytes: Of a request, all of it.
-        megapixels: Of a view.
-        timeout_s: From the head of a request to that of its response.
-        waiting: Requests that are accepted and not answered yet; more are refused.
-        hosts: The names that the header Host may have; any where None.
-        token: What a request has to show (`Authorization: Bearer`), except for /health; nothing where None.
+        megabytes: Greatest size of a whole request.
+        megapixels: Greatest size of a view.
+        timeout_s: Time from the header of a request to that of its response.
+        waiting: Greatest number of pending requests; more are refused.
+        hosts: Allowed values of the header Host; None allows any.
+        token: Bearer token that every request except /health must send; None requires none.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -105,15 +104,19 @@ _ViewForm = Annotated[ViewForm, Form(media_type="multipart/form-data")]
 def make_app(
     answering: Answering, limits: Limits, folder: Path, registry: CollectorRegistry | None = None
 ) -> FastAPI:
-    """The application: `answering` does the work, and uploads lie in the folder until it is done.
+    """Make the application.
 
-    The metrics of the registry are at /metrics; without a registry there is no such path.
+    Args:
+        answering: Answers a job.
+        limits: What it accepts.
+        folder: Holds uploads until they are processed.
+        registry: Metrics to serve at /metrics; None for no such path.
     """
     app = FastAPI(
         title="Stereoweave",
         version=__version__,
         description=_DESCRIPTION,
-        # Their pages would load scripts from elsewhere.
+        # These pages load scripts from other hosts.
         docs_url=None,
         redoc_url=None,
     )
@@ -122,35 +125,35 @@ def make_app(
 
     @app.exception_handler(RequestValidationError)
     async def _refuse(_: Request, error: RequestValidationError) -> Response:
-        return JSONResponse({"detail": _in_one_line(error)}, 422)
+        return JSONResponse({"detail": _join_errors(error)}, 422)
 
-    answered = _Answers(answering, limits.megapixels, folder)
+    respond = _Responder(answering, limits.megapixels, folder)
 
     @app.post("/disparity", responses=_responses(".png", ".pfm", ".npy", ".tiff"), response_class=Response)
     async def disparity(request: Request, form: _MapForm) -> Response:
-        """The left view's disparity in pixels."""
-        return await answered(request, form, f"disparity.{form.file}")
+        """Estimate the left view's disparity in pixels."""
+        return await respond(request, form, f"disparity.{form.file}")
 
     @app.post("/depth", responses=_responses(".png", ".pfm", ".npy", ".tiff"), response_class=Response)
     async def depth(request: Request, form: _MapForm) -> Response:
-        """Its depth along the optical axis; needs a camera: calib, focal_px and baseline_m, or EXIF."""
-        return await answered(request, form, f"depth.{form.file}")
+        """Estimate the left view's metric depth; needs a camera: calib, focal_px and baseline_m, or EXIF."""
+        return await respond(request, form, f"depth.{form.file}")
 
     @app.post("/view", responses=_responses(".png", ".jpg"), response_class=Response)
     async def view(request: Request, form: _ViewForm) -> Response:
-        """What a camera elsewhere on the line through the two would have seen."""
-        return await answered(request, form, f"view.{form.file}")
+        """Render the view from another position on the line through the two cameras."""
+        return await respond(request, form, f"view.{form.file}")
 
     @app.get(_HEALTH)
     async def health() -> dict[str, str]:
-        """That the network is loaded, and requests are taken."""
+        """Confirm that the network is loaded and requests are accepted."""
         return {"status": "ok", "version": __version__}
 
     if registry is not None:
 
         @app.get("/metrics", response_class=Response)
         async def metrics() -> Response:
-            """The counts of requests, in Prometheus' text format."""
+            """Return request metrics in Prometheus' text format."""
             return Response(generate_latest(registry), media_type="text/plain; version=0.0.4")
 
     return app
@@ -159,46 +162,46 @@ def make_app(
 def _responses(*endings: str) -> dict[int | str, dict[str, Any]]:
     files = {MEDIA_TYPES[ending]: {"schema": {"type": "string", "format": "binary"}} for ending in endings}
     report = {
-        "X-Stereoweave-Report": {"description": "Numbers and notes, in JSON.", "schema": {"type": "string"}}
+        "X-Stereoweave-Report": {"description": "Statistics and notes in JSON.", "schema": {"type": "string"}}
     }
     return {200: {"content": files, "description": "The file.", "headers": report}, **_REFUSALS}
 
 
-def _in_one_line(error: RequestValidationError) -> str:
+def _join_errors(error: RequestValidationError) -> str:
     return "; ".join(
         f"{each['loc'][-1]}: {each['msg'].removeprefix('Value error, ')}" for each in error.errors()
     )
 
 
 @dataclass(frozen=True)
-class _Answers:
-    """Makes the response to a form, whose files lie in a folder of their own until then."""
+class _Responder:
+    """Makes responses to forms; each form's files are in a folder of its own until then."""
 
     answering: Answering
     most_megapixels: float
     folder: Path
 
     async def __call__(self, request: Request, form: PairForm, file: str) -> Response:
-        with self._made() as name:
+        with self._make_folder() as name:
             try:
-                job = await asyncio.to_thread(stored, form, Path(name), file, self.most_megapixels)
+                job = await asyncio.to_thread(store_uploads, form, Path(name), file, self.most_megapixels)
                 answer = await self.answering(job, request.state.deadline_s - time.monotonic())
             except FAILURES as error:
-                raise _refusal_of(error, Path(name)) from error
-        return _file(answer, file)
+                raise _make_http_exception(error, Path(name)) from error
+        return _make_response(answer, file)
 
-    def _made(self) -> TemporaryDirectory[str]:
-        """A folder for one request."""
+    def _make_folder(self) -> TemporaryDirectory[str]:
+        """Make a folder for one request."""
         try:
-            # What cleans /tmp removes what has not been used for days.
+            # Cleaners of /tmp remove folders that were not used for days.
             self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            # Where the request is cancelled, a process may still work in it.
+            # After a request was cancelled, a process may still use the folder.
             return TemporaryDirectory(dir=self.folder, ignore_cleanup_errors=True)
         except OSError as error:
-            raise _refusal_of(error, self.folder) from error
+            raise _make_http_exception(error, self.folder) from error
 
 
-def _file(answer: Answer, name: str) -> Response:
+def _make_response(answer: Answer, name: str) -> Response:
     headers = {
         "Content-Disposition": f'attachment; filename="{name}"',
         "X-Stereoweave-Report": answer.report,
@@ -206,12 +209,12 @@ def _file(answer: Answer, name: str) -> Response:
     return Response(answer.content, media_type=MEDIA_TYPES[Path(name).suffix], headers=headers)
 
 
-def _refusal_of(error: Exception, folder: Path) -> HTTPException:
+def _make_http_exception(error: Exception, folder: Path) -> HTTPException:
     headers = {"Retry-After": str(error.retry_after_s)} if isinstance(error, BusyError) else None
-    detail = without_paths(worded(error, field_name), folder)
+    detail = strip_paths(worded(error, field_name), folder)
     if not isinstance(error, StereoweaveError | TimeoutError):
         found = detail or "too little memory"
-        detail = f"expected room for the request on the disk and in memory, found {found}; come again"
+        detail = f"expected room for the request on disk and in memory, found {found}; try again later"
     return HTTPException(_status(error), detail, headers)
 
 
@@ -231,7 +234,7 @@ def _status(error: Exception) -> int:
 
 
 class Guard:
-    """Before an application: refuses what is posted and too much, too large or no form, and counts all."""
+    """Middleware that limits POST requests (number, size, type, token, time) and counts them."""
 
     def __init__(self, app: _Server, limits: Limits, registry: CollectorRegistry | None = None) -> None:
         self._app, self._limits, self._accepted = app, limits, 0
@@ -240,7 +243,7 @@ class Guard:
         )
         self._seconds = Histogram(
             "stereoweave_request_seconds",
-            "From the head of a request to its response, of those accepted.",
+            "Time from the header of an accepted request to its response.",
             ["path"],
             buckets=_LATENCIES_S,
             registry=registry,
@@ -251,15 +254,15 @@ class Guard:
             await self._app(scope, receive, send)
         elif scope["method"] == "POST":
             await self._post(scope, receive, send)
-        elif scope["path"] == _HEALTH or self._knows(Headers(scope=scope)):
+        elif scope["path"] == _HEALTH or self._has_token(Headers(scope=scope)):
             await self._app(scope, receive, send)
         else:
-            await _stranger()(scope, receive, send)
+            await _refuse_token()(scope, receive, send)
 
     async def _post(self, scope: _Message, receive: _Receive, send: _Send) -> None:
         start_s = time.perf_counter()
         exchange = _Exchange(receive, send, self._limits)
-        # Not every path that a client may think of.
+        # Unknown paths share a label: clients must not add labels.
         path = scope["path"] if scope["path"] in _PATHS else "none"
         refusal = self._refusal(Headers(scope=scope))
         try:
@@ -273,21 +276,21 @@ class Guard:
             self._requests.labels(path, status).inc()
 
     def _refusal(self, headers: Headers) -> Response | None:
-        """The response to a request of which the head says that it is not accepted."""
-        if not self._knows(headers):
-            return _stranger()
+        """Return the error response if the header already rules the request out."""
+        if not self._has_token(headers):
+            return _refuse_token()
         if self._accepted >= self._limits.waiting:
-            detail = f"expected at most {self._limits.waiting} requests at a time, found as many; come again"
-            return _refused(503, detail, {"Retry-After": str(_RETRY_AFTER_S)})
+            detail = f"expected under {self._limits.waiting} pending requests, found as many; try again later"
+            return _make_refusal(503, detail, {"Retry-After": str(_RETRY_AFTER_S)})
         length = headers.get("content-length", "0")
         if length.isdecimal() and int(length) > self._limits.megabytes * 1e6:
-            return _refused(413, _too_large(self._limits))
+            return _make_refusal(413, _describe_size_limit(self._limits))
         if not headers.get("content-type", "").lower().startswith("multipart/form-data"):
-            return _refused(415, "expected multipart/form-data, a form with the pictures as its files")
+            return _make_refusal(415, "expected multipart/form-data, a form with the pictures as files")
         return None
 
-    def _knows(self, headers: Headers) -> bool:
-        """Whether a request shows the token, where there is one."""
+    def _has_token(self, headers: Headers) -> bool:
+        """Return whether a request has the required token, if there is one."""
         token = self._limits.token
         if token is None:
             return True
@@ -299,16 +302,16 @@ class Guard:
         scope.setdefault("state", {})["deadline_s"] = time.monotonic() + self._limits.timeout_s
         try:
             async with asyncio.timeout(self._limits.timeout_s):
-                await exchange.while_connected(self._app(scope, exchange.receive, exchange.send))
+                await exchange.run_while_connected(self._app(scope, exchange.receive, exchange.send))
         except TimeoutError:
             if exchange.status is None:
-                await exchange.late()(scope, exchange.receive, exchange.send)
+                await exchange.refuse_late()(scope, exchange.receive, exchange.send)
         finally:
             self._accepted -= 1
 
 
 class _Exchange:
-    """A request whose bytes are counted, and the status of its response, None before it."""
+    """A request, whose bytes are counted, and the status of its response; None before there is one."""
 
     def __init__(self, receive: _Receive, send: _Send, limits: Limits) -> None:
         self._receive, self._send, self._limits = receive, send, limits
@@ -319,18 +322,18 @@ class _Exchange:
         message = await self._receive()
         self._bytes += len(message.get("body", b""))
         if self._bytes > self._limits.megabytes * 1e6:
-            raise HTTPException(413, _too_large(self._limits))
+            raise HTTPException(413, _describe_size_limit(self._limits))
         if not message.get("more_body", False):
             self._arrived.set()
         return message
 
     async def send(self, message: _Message) -> None:
-        await self._send(message)  # waits for the client to read; nothing is sent if it is cancelled then
+        await self._send(message)  # waits for the client to read; if cancelled meanwhile, nothing was sent
         self.status = message.get("status", self.status)
 
-    async def while_connected(self, work: Coroutine[Any, Any, None]) -> None:
-        """Do the work, and cancel it where the client goes away."""
-        working, watching = asyncio.create_task(work), asyncio.create_task(self._gone())
+    async def run_while_connected(self, work: Coroutine[Any, Any, None]) -> None:
+        """Do the work; cancel it if the client disconnects."""
+        working, watching = asyncio.create_task(work), asyncio.create_task(self._wait_for_disconnect())
         watching.add_done_callback(lambda _: working.cancel())
         try:
             await working
@@ -340,30 +343,28 @@ class _Exchange:
         finally:
             watching.cancel()
 
-    async def _gone(self) -> None:
-        """Return when the client has gone away, after all of its request arrived."""
+    async def _wait_for_disconnect(self) -> None:
+        """Wait for the whole request, then for the client to disconnect."""
         await self._arrived.wait()
         while (await self._receive())["type"] != "http.disconnect":
             pass
 
-    def late(self) -> Response:
-        """The response to a request that takes too long: to arrive, or to be answered."""
+    def refuse_late(self) -> Response:
+        """Return the error response to a request that exceeded the time limit."""
         seconds = f"within {self._limits.timeout_s:g} s"
         if self._arrived.is_set():
-            return _refused(504, f"expected to be done {seconds}, and was not; send smaller pictures")
-        return _refused(408, f"expected the whole request {seconds}, found a part of it")
+            return _make_refusal(504, f"expected a result {seconds}, found none; send smaller pictures")
+        return _make_refusal(408, f"expected the whole request {seconds}, found part of it")
 
 
-def _refused(status: int, detail: str, headers: Mapping[str, str] | None = None) -> Response:
+def _make_refusal(status: int, detail: str, headers: Mapping[str, str] | None = None) -> Response:
     return JSONResponse({"detail": detail}, status, headers)
 
 
-def _stranger() -> Response:
-    detail = (
-        "expected the header Authorization: Bearer and the token of this service, found none or another one"
-    )
-    return _refused(401, detail, {"WWW-Authenticate": "Bearer"})
+def _refuse_token() -> Response:
+    detail = "expected the header Authorization: Bearer with this service's token, found none or another one"
+    return _make_refusal(401, detail, {"WWW-Authenticate": "Bearer"})
 
 
-def _too_large(limits: Limits) -> str:
+def _describe_size_limit(limits: Limits) -> str:
     return f"expected a request of at most {limits.megabytes:g} MB, found a larger one; send smaller pictures"

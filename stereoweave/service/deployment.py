@@ -28,7 +28,7 @@ from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher
 from stereoweave.service.admission import Budget, work_of
-from stereoweave.service.answers import Answer, ServiceJob, answering
+from stereoweave.service.answers import Answer, ServiceJob, make_answering
 from stereoweave.service.asgi import FAILURES, Guard, Limits, make_app
 from stereoweave.service.folders import own_folder
 from stereoweave.service.server import Patience, http_server
@@ -88,7 +88,7 @@ class Replica:
     def __init__(self, settings: Settings) -> None:
         self._settings, self._opened = settings, ExitStack()
         self._folder = self._opened.enter_context(own_folder())
-        make = partial(answering, settings.backend)
+        make = partial(make_answering, settings.backend)
         self._worker = Worker(make, self._folder)
         self._opened.callback(self._worker.close)
         self._budget = Budget(self._worker.warm_up())
@@ -210,7 +210,7 @@ def _at_server(settings: Settings, listener: socket.socket) -> Iterator[None]:
                 raise
             except RayActorError as error:
                 raise ProcessDiedError(
-                    "expected a replica that answers, found that it ended; come again"
+                    "expected a replica that answers, found that it ended; try again later"
                 ) from error
             if isinstance(outcome, Exception):
                 raise outcome

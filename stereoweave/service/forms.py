@@ -1,4 +1,4 @@
-"""What a request of the service says, as the fields of a form, and its files put where they are worked on."""
+"""Forms of the service's requests: their fields, their validation, and storage of their files."""
 
 import re
 import shutil
@@ -27,49 +27,48 @@ from stereoweave.service.answers import ServiceJob, TooLargeError
 _RANGE = r"^-?\d{1,6}(\.\d{1,6})?,-?\d{1,6}(\.\d{1,6})?$"
 
 
-def _checked_range(text: str | None) -> str | None:
+def _check_range(text: str | None) -> str | None:
     if text is not None and not re.fullmatch(_RANGE, text):
-        raise ValueError(
-            f"expected the least and the greatest disparity, such as -20,150, found {text[:40]!r}"
-        )
+        raise ValueError(f"expected least and greatest disparity, such as -20,150, found {text[:40]!r}")
     return text
 
 
 class PairForm(BaseModel):
-    """What every request says."""
+    """Fields of every request."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    left: Annotated[UploadFile | None, Field(description="The left picture.")] = None
-    right: Annotated[UploadFile | None, Field(description="The right one, of the same size.")] = None
-    picture: Annotated[UploadFile | None, Field(description="Instead, one that holds both views.")] = None
+    left: Annotated[UploadFile | None, Field(description="Left picture.")] = None
+    right: Annotated[UploadFile | None, Field(description="Right picture, of the same size.")] = None
+    picture: Annotated[UploadFile | None, Field(description="Instead: one picture with both views.")] = None
     format: Annotated[
         Literal[FORMATS] | None,  # type: ignore[valid-type]
-        Field(description="How that one holds both views; guessed unless given."),
+        Field(description="Layout of `picture` (default: detected)."),
     ] = None
     calib: Annotated[
         UploadFile | None,
-        Field(description="The cameras' calibration, of OpenCV, Kalibr, KITTI or Middlebury."),
+        Field(description="Calibration file: OpenCV, Kalibr, KITTI or Middlebury format."),
     ] = None
     focal_px: Annotated[
-        PositiveFloat | None, Field(description="Without a calibration, the focal length in pixels.")
+        PositiveFloat | None, Field(description="Focal length in pixels, without a calibration file.")
     ] = None
     baseline_m: Annotated[
-        PositiveFloat | None, Field(description="And the distance between the cameras in metres.")
+        PositiveFloat | None,
+        Field(description="Distance between the cameras in metres, without a calibration file."),
     ] = None
-    rectify: Annotated[bool, Field(description="Bring the rows of both to match first.")] = False
+    rectify: Annotated[bool, Field(description="Rectify the pair first.")] = False
     range: Annotated[
         str | None,
-        AfterValidator(_checked_range),
+        AfterValidator(_check_range),
         Field(
-            description="The least and the greatest disparity in pixels, such as 0,96; found unless given.",
+            description="Least and greatest disparity in pixels, such as 0,96 (default: estimated).",
             json_schema_extra={"pattern": _RANGE},
         ),
     ] = None
-    check: Annotated[bool, Field(description="Also say in the notes what is amiss with the pair.")] = False
+    check: Annotated[bool, Field(description="Check the pair and report its problems in the notes.")] = False
 
     def uploads(self) -> dict[str, datastructures.UploadFile]:
-        """The pictures by their field: left and right, or the one of both views."""
+        """Return the pictures by field: left and right, or picture."""
         given = {"left": self.left, "right": self.right, "picture": self.picture}
         pictures: dict[str, datastructures.UploadFile] = {
             field: upload for field, upload in given.items() if upload is not None
@@ -81,8 +80,8 @@ class PairForm(BaseModel):
             )
         return pictures
 
-    def said(self, calibration: Path | None) -> dict[str, Any]:
-        """What a `ServiceJob` takes of it."""
+    def job_arguments(self, calibration: Path | None) -> dict[str, Any]:
+        """Return the arguments for `ServiceJob` that the form states."""
         request = Request(
             arrangement=self.format,
             calibration=calibration,
@@ -93,7 +92,7 @@ class PairForm(BaseModel):
         return {"request": request, "options": self.options(), "checked": self.check}
 
     def options(self) -> MatchOptions:
-        """How the pair is matched."""
+        """Return the matching options."""
         return MatchOptions(range_px=self._range_px())
 
     def _range_px(self) -> tuple[float, float] | None:
@@ -104,37 +103,38 @@ class PairForm(BaseModel):
 
 
 class MapForm(PairForm):
-    """What a request for disparity or depth says."""
+    """Fields of a request for disparity or depth."""
 
-    refined: Annotated[bool, Field(description="Match once more, at full resolution.")] = False
+    refined: Annotated[bool, Field(description="Match once more at full resolution.")] = False
     file: Annotated[
         Literal["png", "pfm", "npy", "tiff"],
-        Field(description="png is of 16 bits, px * 256 or millimetres; the others are of float32."),
+        Field(description="png: 16 bits, px * 256 or millimetres; the others: float32."),
     ] = "png"
 
     def options(self) -> MatchOptions:
-        """As before, refined on request."""
+        """Return the matching options, refined on request."""
         return replace(super().options(), refined=self.refined)
 
 
 class ViewForm(PairForm):
-    """What a request for a view says."""
+    """Fields of a request for a view."""
 
     position: Annotated[
-        FiniteFloat, Field(ge=-1, le=2, description="0 is the left camera, 1 the right one.")
+        FiniteFloat, Field(ge=-1, le=2, description="Viewpoint: 0 is the left camera, 1 the right one.")
     ] = 0.5
     strength: Annotated[
-        NonNegativeFloat, Field(description="Multiplies the distance of the cameras, about their middle.")
+        NonNegativeFloat,
+        Field(description="Factor on the baseline; the midpoint of the cameras stays in place."),
     ] = 1.0
-    file: Annotated[Literal["png", "jpg"], Field(description="The kind of picture.")] = "png"
+    file: Annotated[Literal["png", "jpg"], Field(description="File format.")] = "png"
 
-    def said(self, calibration: Path | None) -> dict[str, Any]:
-        """As before, and where it is seen from."""
-        return super().said(calibration) | {"position": self.position, "strength": self.strength}
+    def job_arguments(self, calibration: Path | None) -> dict[str, Any]:
+        """Return the arguments for `ServiceJob`, with the viewpoint."""
+        return super().job_arguments(calibration) | {"position": self.position, "strength": self.strength}
 
 
-def stored(form: PairForm, folder: Path, file: str, most_megapixels: float) -> ServiceJob:
-    """The job of a form, whose files now lie in the folder, under names that the service gives them."""
+def store_uploads(form: PairForm, folder: Path, file: str, most_megapixels: float) -> ServiceJob:
+    """Store a form's files in a folder, under the service's own names, and return its job."""
     uploads = form.uploads()
     for field, upload in uploads.items():
         with (folder / field).open("wb") as out:
@@ -152,5 +152,5 @@ def stored(form: PairForm, folder: Path, file: str, most_megapixels: float) -> S
         pictures=pictures,
         file=file,
         most_megapixels=most_megapixels,
-        **form.said(calibration),
+        **form.job_arguments(calibration),
     )

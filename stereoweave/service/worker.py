@@ -7,7 +7,7 @@ from pathlib import Path
 
 from stereoweave.errors import FormatError
 from stereoweave.pictures.prepare import Request
-from stereoweave.service.answers import Answer, Answering, ServiceJob, measuring
+from stereoweave.service.answers import Answer, Answering, ServiceJob, make_measuring
 from stereoweave.system.child_process import ChildProcess, ProcessDiedError
 
 # Reading the head of a picture takes milliseconds.
@@ -33,12 +33,12 @@ class Worker:
     """Two processes: one measures pictures from their heads, the other decodes and matches them.
 
     Args:
-        make_answering: Makes the second one's function, such as `partial(answering, "small", "cpu", 1)`.
+        make_answering: Makes the second one's function, such as `partial(make_answering, "small", "cpu", 1)`.
         folder: For the temporary files of both.
     """
 
     def __init__(self, make_answering: Callable[[], Answering], folder: Path) -> None:
-        self._measuring = ChildProcess(measuring, folder / "measuring")
+        self._measuring = ChildProcess(make_measuring, folder / "measuring")
         self._answering = ChildProcess(make_answering, folder / "answering")
 
     def close(self) -> None:

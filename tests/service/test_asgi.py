@@ -69,7 +69,7 @@ def test_a_provider_that_fails_is_no_fault_of_the_request():
 def test_what_takes_too_long_is_cancelled():
     response = ask_guarded(never)
     assert response.status_code == 504
-    assert response.json()["detail"].startswith("expected to be done within 0.2 s")
+    assert response.json()["detail"].startswith("expected a result within 0.2 s")
 
 
 def test_a_request_that_does_not_arrive_is_not_waited_for():
@@ -79,7 +79,7 @@ def test_a_request_that_does_not_arrive_is_not_waited_for():
 
     response = ask_guarded(never, stalls())
     assert response.status_code == 408
-    assert "found a part of it" in response.json()["detail"]
+    assert "found part of it" in response.json()["detail"]
 
 
 def test_as_many_requests_are_accepted_at_a_time_as_may_wait_and_no_more():
@@ -238,7 +238,7 @@ def test_a_machine_without_room_is_no_fault_of_the_request(error, found):
     response = ask_guarded(fails, timeout_s=60)
     assert response.status_code == 503
     detail = response.json()["detail"]
-    assert detail.startswith("expected room for the request on the disk and in memory, found ")
+    assert detail.startswith("expected room for the request on disk and in memory, found ")
     assert found in detail
     assert "\n" not in detail
 

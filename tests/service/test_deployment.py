@@ -179,7 +179,7 @@ def test_a_service_that_is_full_refuses_and_does_what_it_accepted(service):
     assert len(done) >= WAITING
     assert len(done) + len(refused) == 16
     assert {response.headers["Retry-After"] for response in refused} == {"1"}
-    assert "come again" in refused[0].json()["detail"]
+    assert "try again later" in refused[0].json()["detail"]
 
 
 def test_hostile_requests_and_calibrations_leave_it_answering_at_once_and_small(running):
@@ -247,9 +247,7 @@ def test_temporary_folders_that_were_removed_are_made_again_and_one_that_cannot_
     measuring.touch()
     refused = post(running.client, "/disparity")
     assert refused.status_code == 503
-    assert refused.json()["detail"].startswith(
-        "expected room for the request on the disk and in memory, found "
-    )
+    assert refused.json()["detail"].startswith("expected room for the request on disk and in memory, found ")
     measuring.unlink()
     assert post(running.client, "/disparity").status_code == 200
 
