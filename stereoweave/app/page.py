@@ -1,4 +1,4 @@
-"""The web page, of Gradio: a pair becomes depth, views under a slider, a point cloud, distances and files."""
+"""The web page, in Gradio: depth of an uploaded pair, a slider of views, point cloud, distances, files."""
 
 import html
 import importlib.resources
@@ -23,17 +23,17 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from stereoweave.app.access import ContentPolicy, OwnFiles
 from stereoweave.app.session import (
-    Kept,
+    Session,
     Uploads,
-    depth_picture,
-    ends,
-    marked,
-    matched,
-    measured,
-    numbers,
+    colour_depth,
+    format_colour_range,
+    format_summary,
+    mark_clicks,
+    match_uploads,
+    measure_clicks,
     write_all,
     write_cloud,
-    zipped,
+    zip_files,
 )
 from stereoweave.errors import Note, StereoweaveError, worded
 from stereoweave.io.colormap import OCCLUDED_RGB, colour_confidence, css_colour, legend_colours
@@ -44,11 +44,11 @@ from stereoweave.pictures.prepare import Request
 
 _MOST_BYTES = 200 * 1024**2
 
-_KEPT_S = 3600
-# Each keeps its last result: 60 MB, and 19 bytes a pixel of the left picture, 0.5 GB of 24 megapixels; and
-# on disk its files, 0.9 GB of so many.
+_LIFETIME_S = 3600
+# Each keeps its last result: 60 MB and 19 bytes per pixel of the left picture (0.5 GB at 24 megapixels) in
+# memory, and its files (0.9 GB at 24 megapixels) on disk.
 _MOST_SESSIONS = 4
-_GUESSED = "guessed"
+_DETECTED = "detected"
 _MODELS = [("fast", "small"), ("fine", "base")]
 
 _HEAD = """<div class="head"><h1>Stereoweave</h1>
@@ -57,67 +57,67 @@ The pictures stay on the computer that runs this page.</p></div>"""
 _EMPTY = """<div class="empty"><ol>
 <li>Drop the left and the right picture, or one file that holds both:
 side by side, one above the other, MPO or JPS.</li>
-<li>Press <b>Find depth</b>. Pictures straight from two cameras need their rows brought to match first.</li>
-<li>Move between the cameras, turn the point cloud, measure, and take the files with you.</li>
+<li>Press <b>Find depth</b>. Pictures straight from two cameras must be rectified first: tick the box.</li>
+<li>Move between the cameras, rotate the point cloud, measure, and download the files.</li>
 </ol></div>"""
-_TO_MEASURE = "Click two points of the photograph: here stands how far each is, and how far apart they are."
+_TO_MEASURE = "Click two points of the photograph: their depths and their distance appear here."
 _WITHOUT_WEBGL = """const canvas = document.createElement("canvas");
 if (!canvas.getContext("webgl2") && !canvas.getContext("webgl")) element.innerHTML =
-  '<p class="told problem">This browser does not draw in three dimensions: switch on its hardware ' +
-  'acceleration (WebGL). Where metres are known, another program shows cloud.glb, under Files.</p>';"""
-_GONE = "This result has been put away, as after an hour. Find depth again."
+  '<p class="notice problem">This browser cannot draw in 3-D: turn on its hardware acceleration ' +
+  '(WebGL). If metres are known, open cloud.glb, under Files, in another program.</p>';"""
+_GONE = "This result has expired (results are kept for an hour). Find depth again."
 
 
 class Page:
-    """The page's parts, and what each does; `folder` takes the files to download, for an hour."""
+    """The page's components and their event handlers; `folder` keeps files to download for an hour."""
 
     def __init__(self, folder: Path, provider: str = CPU) -> None:
         self._folder, self._provider = folder, provider
         with gr.Blocks(
-            title="Stereoweave", analytics_enabled=False, delete_cache=(_KEPT_S // 4, _KEPT_S)
+            title="Stereoweave", analytics_enabled=False, delete_cache=(_LIFETIME_S // 4, _LIFETIME_S)
         ) as self.blocks:
-            self._kept = gr.State(None, time_to_live=_KEPT_S, delete_callback=_put_away)
+            self._session = gr.State(None, time_to_live=_LIFETIME_S, delete_callback=_remove_files)
             self._clicks = gr.State([])
             gr.HTML(_HEAD, padding=False)
             with gr.Row():
                 with gr.Column(scale=1, min_width=280):
-                    self._ask()
+                    self._build_form()
                 with gr.Column(scale=3, min_width=280):
                     self._status = gr.HTML(_EMPTY, elem_id="status", padding=False)
                     with gr.Column(visible=False) as self._results:
-                        self._show()
+                        self._build_results()
             self._connect()
         self.blocks.state_session_capacity = _MOST_SESSIONS
         self.blocks.queue(default_concurrency_limit=1)
 
-    def _ask(self) -> None:
-        """The part that takes pictures."""
+    def _build_form(self) -> None:
+        """Build the form for pictures and settings."""
         self._left = gr.File(label="Left picture, or one file with both views", height=160, elem_id="left")
         self._right = gr.File(label="Right picture", height=160, elem_id="right")
         self._model = gr.Radio(_MODELS, value="small", label="Network", elem_id="model")
         self._rectify = gr.Checkbox(
-            label="Bring the rows to match",
-            info="For pictures straight from two cameras. Those of a 3-D film or data set match as they are.",
+            label="Rectify the pair",
+            info="For pictures straight from two cameras. 3-D films and data sets are already rectified.",
             elem_id="rectify",
         )
         with gr.Accordion("More about the pictures", open=False):
             self._arrangement = gr.Dropdown(
-                [_GUESSED, *((name.replace("_", " "), name) for name in FORMATS)],
-                value=_GUESSED,
-                label="How one file holds both",
+                [_DETECTED, *((name.replace("_", " "), name) for name in FORMATS)],
+                value=_DETECTED,
+                label="Layout of a single file",
                 elem_id="arrangement",
             )
             self._calibration = gr.File(
                 label="Calibration file, for metres", height=140, elem_id="calibration"
             )
             with gr.Row():
-                self._focal_px = _known_number("Focal length, px", "focal")
-                self._baseline_mm = _known_number("Baseline, mm", "baseline")
+                self._focal_px = _optional_number("Focal length, px", "focal")
+                self._baseline_mm = _optional_number("Baseline, mm", "baseline")
         self._find = gr.Button("Find depth", variant="primary", elem_id="find")
         self._sample = gr.Button("Try the sample", elem_id="sample")
 
-    def _show(self) -> None:
-        """The part that shows results."""
+    def _build_results(self) -> None:
+        """Build the part that shows results."""
         with gr.Tabs() as self._tabs:
             with gr.Tab("View and depth", id="first"):
                 self._view = _picture("New view", "view")
@@ -145,7 +145,7 @@ class Page:
             with gr.Tab("Point cloud") as self._cloud_tab:
                 gr.HTML(js_on_load=_WITHOUT_WEBGL, padding=False)
                 self._cloud = gr.Model3D(
-                    label="Drag to turn, scroll to come nearer",
+                    label="Drag to rotate, scroll to zoom",
                     clear_color=(0.94, 0.95, 0.96, 1.0),
                     height=560,
                 )
@@ -154,48 +154,48 @@ class Page:
                 self._files = gr.File(label="One at a time", interactive=False, elem_id="files")
 
     def _connect(self) -> None:
-        """What happens on which event."""
+        """Connect events to their handlers."""
         asked = [self._left, self._right, self._model, self._rectify, self._arrangement, self._calibration]
         asked += [self._focal_px, self._baseline_mm]
-        seen = [self._results, self._kept, self._view, self._where, self._depth, self._ramp]
+        seen = [self._results, self._session, self._view, self._where, self._depth, self._ramp]
         seen += [self._confidence, self._photograph, self._clicks, self._measured]
         seen += [self._tabs, self._cloud]
         taken = [self._status, self._files, self._all]
-        sampled = self._sample.click(self._sampled, None, asked, api_visibility="private")
+        sampled = self._sample.click(self._fill_in_sample, None, asked, api_visibility="private")
         for begin in (self._find.click, sampled.then):
             found = begin(
-                self._found,
-                {*asked, self._position, self._kept},
+                self._find_depth,
+                {*asked, self._position, self._session},
                 [*taken, *seen],
                 show_progress_on=self._status,
                 concurrency_id="matching",
                 api_visibility="private",
             )
             found.then(
-                self._written,
-                self._kept,
+                self._write_files,
+                self._session,
                 taken,
                 show_progress_on=self._status,
                 concurrency_id="matching",
                 api_visibility="private",
             )
         self._position.input(
-            self._seen,
-            [self._kept, self._position],
+            self._render_view,
+            [self._session, self._position],
             [self._view, self._where],
             show_progress="hidden",
             trigger_mode="always_last",
             concurrency_limit=None,
             api_visibility="private",
         )
-        # When its tab is opened, and under a new name each time: Gradio's viewer stays empty where its value
-        # comes before it is shown, or comes twice.
+        # Loaded when its tab is opened, under a new name each time: Gradio's viewer stays empty if its value
+        # arrives before it is visible, or twice.
         self._cloud_tab.select(
-            self._turned, self._kept, self._cloud, concurrency_id="matching", api_visibility="private"
+            self._make_cloud, self._session, self._cloud, concurrency_id="matching", api_visibility="private"
         )
         self._photograph.select(
-            self._clicked,
-            [self._kept, self._clicks],
+            self._measure_click,
+            [self._session, self._clicks],
             [self._photograph, self._measured, self._clicks],
             show_progress="hidden",
             trigger_mode="multiple",
@@ -203,8 +203,8 @@ class Page:
             api_visibility="private",
         )
 
-    def _sampled(self) -> dict[Any, Any]:
-        """The form filled in with the pair that the package brings."""
+    def _fill_in_sample(self) -> dict[Any, Any]:
+        """Fill in the form with the sample pair of the package."""
         folder = _sample_folder()
         return {
             self._left: str(folder / "left.jpg"),
@@ -212,26 +212,27 @@ class Page:
             self._calibration: str(folder / "calib.txt"),
             self._model: "small",
             self._rectify: False,
-            self._arrangement: _GUESSED,
+            self._arrangement: _DETECTED,
             self._focal_px: 0,
             self._baseline_mm: 0,
         }
 
-    def _found(self, given: dict[Any, Any], progress: Any = gr.Progress()) -> dict[Any, Any]:  # noqa: B008
-        """What the page shows of the pictures that were given, or what is wrong with them."""
-        _put_away(given[self._kept])
+    def _find_depth(self, given: dict[Any, Any], progress: Any = gr.Progress()) -> dict[Any, Any]:  # noqa: B008
+        """Match the given pictures. Returns the page's new content: the result, or an error."""
+        _remove_files(given[self._session])
         try:
             uploads, folder = self._uploads(given), Path(tempfile.mkdtemp(dir=self._folder))
-            return self._shown(matched(uploads, folder, partial(_tell, progress)), given[self._position])
+            session = match_uploads(uploads, folder, partial(_report_progress, progress))
+            return self._show_result(session, given[self._position])
         except (StereoweaveError, OSError) as error:
             return {
-                self._status: _told([self._shown_line(worded(error, self._label_of))], problem=True),
+                self._status: self._format_error(error),
                 self._results: gr.update(visible=False),
-                self._kept: None,
+                self._session: None,
             }
 
     def _label_of(self, setting: str) -> str | None:
-        """The page's label of a setting; None if the page does not have it."""
+        """Return the page's label for a setting; None if the page does not have it."""
         components = {
             "arrangement": self._arrangement,
             "baseline_m": self._baseline_mm,
@@ -242,35 +243,38 @@ class Page:
         }
         return f"“{components[setting].label}”" if setting in components else None
 
-    def _shown_line(self, line: str) -> str:
-        """A message in one line, without this machine's folders."""
+    def _format_line(self, line: str) -> str:
+        """Put a message in one line, without this machine's folders."""
         return re.sub(rf"{re.escape(str(self._folder))}/\w+/", "", " ".join(line.splitlines()))
 
-    def _written(self, kept: Kept | None, progress: Any = gr.Progress()) -> dict[Any, Any]:  # noqa: B008
-        """The files, which take as long again as all that was shown."""
-        if kept is None:
+    def _format_error(self, error: Exception) -> str:
+        return _format_notice([self._format_line(worded(error, self._label_of))], problem=True)
+
+    def _write_files(self, session: Session | None, progress: Any = gr.Progress()) -> dict[Any, Any]:  # noqa: B008
+        """Write the files; takes as long as everything shown before."""
+        if session is None:
             return {self._files: None}
-        _tell(progress, 0.8, "writing the files")
+        _report_progress(progress, 0.8, "writing the files")
         try:
-            files, notes = write_all(kept)
-            packed = zipped(kept.folder / "stereoweave.zip", files)
+            files, notes = write_all(session)
+            packed = zip_files(session.folder / "stereoweave.zip", files)
         except (StereoweaveError, OSError) as error:
-            return {self._status: _told([self._shown_line(worded(error, self._label_of))], problem=True)}
+            return {self._status: self._format_error(error)}
         return {
-            self._status: self._summary(kept, notes),
+            self._status: self._summary(session, notes),
             self._files: [str(file) for file in files],
             self._all: gr.update(value=packed and str(packed), visible=packed is not None),
         }
 
-    def _summary(self, kept: Kept, notes: Sequence[Note] = ()) -> str:
-        lines = [self._shown_line(note.worded(self._label_of)) for note in (*kept.result.notes, *notes)]
-        return _told([numbers(kept.result.summary), *lines])
+    def _summary(self, session: Session, notes: Sequence[Note] = ()) -> str:
+        lines = [self._format_line(note.worded(self._label_of)) for note in (*session.result.notes, *notes)]
+        return _format_notice([format_summary(session.result.summary), *lines])
 
     def _uploads(self, given: dict[Any, Any]) -> Uploads:
         arrangement, calibration = given[self._arrangement], given[self._calibration]
         focal_px, baseline_mm = given[self._focal_px] or None, given[self._baseline_mm] or None
         request = Request(
-            arrangement=None if arrangement == _GUESSED else arrangement,
+            arrangement=None if arrangement == _DETECTED else arrangement,
             calibration=Path(calibration) if calibration else None,
             focal_px=focal_px,
             baseline_m=baseline_mm and baseline_mm / 1000,
@@ -280,17 +284,17 @@ class Page:
         backend = Backend(model=given[self._model], provider=self._provider)
         return Uploads(pictures=pictures, request=request, backend=backend)
 
-    def _shown(self, kept: Kept, position: float) -> dict[Any, Any]:
-        pair, estimate = kept.renderer.pair, kept.renderer.estimate
-        view, where = self._seen(kept, position)
+    def _show_result(self, session: Session, position: float) -> dict[Any, Any]:
+        pair, estimate = session.renderer.pair, session.renderer.estimate
+        view, where = self._render_view(session, position)
         return {
-            self._status: self._summary(kept),
+            self._status: self._summary(session),
             self._results: gr.update(visible=True),
-            self._kept: kept,
+            self._session: session,
             self._view: view,
             self._where: where,
-            self._depth: depth_picture(kept),
-            self._ramp: _depth_legend(kept),
+            self._depth: colour_depth(session),
+            self._ramp: _depth_legend(session),
             self._confidence: colour_confidence(estimate.confidence, estimate.occluded),
             self._photograph: pair.left,
             self._clicks: [],
@@ -301,42 +305,46 @@ class Page:
             self._all: gr.update(value=None, visible=False),
         }
 
-    def _seen(self, kept: Kept | None, position: float) -> tuple[Any, str]:
-        """The view from a position, and a line about it."""
-        if kept is None:
+    def _render_view(self, session: Session | None, position: float) -> tuple[Any, str]:
+        """Render the view from a position. Returns it with a line about it."""
+        if session is None:
             return gr.skip(), _GONE
-        view = kept.renderer.view(position)
+        view = session.renderer.view(position)
         unseen = f"{100 * (~view.drawn).mean():.1f} % of it seen by neither camera"
-        return view.image, f"{position:g}, {_place(position)}; {unseen}"
+        return view.image, f"{position:g}, {_describe_position(position)}; {unseen}"
 
-    def _turned(self, kept: Kept | None) -> str | None:
-        """The file of the point cloud."""
-        cloud = kept and write_cloud(kept.folder / f"{uuid4().hex}.glb", kept.result)
+    def _make_cloud(self, session: Session | None) -> str | None:
+        """Write the point cloud. Returns its file."""
+        cloud = session and write_cloud(session.folder / f"{uuid4().hex}.glb", session.result)
         return str(cloud) if cloud else None
 
-    def _clicked(
-        self, kept: Kept | None, clicks: list[tuple[int, int]], event: gr.SelectData
+    def _measure_click(
+        self, session: Session | None, clicks: list[tuple[int, int]], event: gr.SelectData
     ) -> tuple[Any, str, list[tuple[int, int]]]:
-        """The photograph with the points clicked so far, at most two, and what was measured there."""
-        if kept is None:
+        """Mark the clicked points, at most two, in the photograph, and measure there."""
+        if session is None:
             return gr.skip(), _paragraphs([_GONE]), []
         column, row = event.index
         clicks = [*(clicks if len(clicks) < 2 else []), (int(column), int(row))]
-        return marked(kept.renderer.pair.left, clicks), _paragraphs(measured(kept, clicks)), clicks
+        return (
+            mark_clicks(session.renderer.pair.left, clicks),
+            _paragraphs(measure_clicks(session, clicks)),
+            clicks,
+        )
 
 
-def _put_away(kept: Kept | None) -> None:
-    """Removes the files of a result that is no longer shown."""
-    if kept:
-        shutil.rmtree(kept.folder, ignore_errors=True)
+def _remove_files(session: Session | None) -> None:
+    """Remove the files of a result that is no longer shown."""
+    if session:
+        shutil.rmtree(session.folder, ignore_errors=True)
 
 
-def _tell(progress: Any, share: float, what: str) -> None:
+def _report_progress(progress: Any, share: float, what: str) -> None:
     progress(share, desc=what)
 
 
-def _known_number(label: str, name: str) -> gr.Number:
-    return gr.Number(0, label=label, info="0: not known", min_width=120, elem_id=name)
+def _optional_number(label: str, name: str) -> gr.Number:
+    return gr.Number(0, label=label, info="0: unknown", min_width=120, elem_id=name)
 
 
 def _picture(label: str, name: str) -> gr.Image:
@@ -345,9 +353,9 @@ def _picture(label: str, name: str) -> gr.Image:
     )
 
 
-def _told(lines: Sequence[str], *, problem: bool = False) -> str:
-    """Lines as the page shows them, one below the other; a problem stands out and is read out."""
-    look, role = ("told problem", "alert") if problem else ("told", "status")
+def _format_notice(lines: Sequence[str], *, problem: bool = False) -> str:
+    """Format lines as HTML, one below the other; a problem is highlighted and read out by screen readers."""
+    look, role = ("notice problem", "alert") if problem else ("notice", "status")
     return f'<div class="{look}" role="{role}">{_paragraphs(lines)}</div>'
 
 
@@ -355,14 +363,14 @@ def _paragraphs(lines: Sequence[str]) -> str:
     return "".join(f"<p>{html.escape(line)}</p>" for line in lines)
 
 
-def _depth_legend(kept: Kept) -> str:
-    far, near = ends(kept.result)
+def _depth_legend(session: Session) -> str:
+    far, near = format_colour_range(session.result)
     return _legend(f"linear-gradient(90deg,{','.join(legend_colours(24))})", f"far: {far}", f"near: {near}")
 
 
 def _confidence_legend() -> str:
-    key = f'<i class="key" style="background:{css_colour(OCCLUDED_RGB)}"></i>seen by the left camera alone'
-    return _legend("linear-gradient(90deg,#000,#fff)", "unsure", key, "sure")
+    key = f'<i class="key" style="background:{css_colour(OCCLUDED_RGB)}"></i>occluded, seen by the left only'
+    return _legend("linear-gradient(90deg,#000,#fff)", "low", key, "high")
 
 
 def _legend(colours: str, *labels: str) -> str:
@@ -370,8 +378,8 @@ def _legend(colours: str, *labels: str) -> str:
     return f'<div class="ramp" style="background:{colours}"></div><div class="ends">{spans}</div>'
 
 
-def _place(position: float) -> str:
-    """In words where a view is seen from."""
+def _describe_position(position: float) -> str:
+    """Describe in words where a view is seen from."""
     if position in (0, 1):
         return "the right picture itself" if position else "the left picture itself"
     if position < 0:
@@ -384,9 +392,12 @@ def _sample_folder() -> Path:
 
 
 def make_server(folder: Path, names: Sequence[str] | None, provider: str = CPU) -> FastAPI:
-    """The page as an ASGI application; uploads and results lie in a folder of its own.
+    """Make the page's ASGI application.
 
-    It answers to `names` alone, or to any name where that is None.
+    Args:
+        folder: Holds uploads and results.
+        names: Allowed values of the header Host; None allows any.
+        provider: Hardware that runs the network.
     """
     os.environ["GRADIO_TEMP_DIR"] = str(folder)
     server = FastAPI(openapi_url=None)
@@ -414,7 +425,7 @@ def make_server(folder: Path, names: Sequence[str] | None, provider: str = CPU) 
 
 
 def _theme() -> gr.themes.Base:
-    """Calm, and with the fonts that the visitor's computer has."""
+    """Return a plain theme with the fonts of the visitor's computer."""
     return gr.themes.Base(
         primary_hue="blue",
         neutral_hue="slate",
@@ -427,13 +438,17 @@ def _theme() -> gr.themes.Base:
 def serve(
     listener: socket.socket, names: Sequence[str] | None, *, browsed: str | None = None, provider: str = CPU
 ) -> None:
-    """Serves the page on a listening socket until a signal ends it; then what was uploaded is removed.
+    """Serve the page on a listening socket until a signal stops it; then remove all uploads.
 
-    The page answers to `names`, as of `make_server`; `browsed` is the URL that a browser opens, if any.
+    Args:
+        listener: The socket.
+        names: Allowed values of the header Host; None allows any.
+        browsed: URL to open in the browser; None opens none.
+        provider: Hardware that runs the network.
     """
-    _end_in_order()
+    _handle_signals()
     with tempfile.TemporaryDirectory(prefix="stereoweave-page-") as folder:
-        # An open page keeps a connection open, which would never end of itself.
+        # An open page keeps its connection open, so the shutdown has a time limit.
         server = make_server(Path(folder), names, provider)
         config = uvicorn.Config(server, log_level="critical", timeout_graceful_shutdown=1)
         if browsed:
@@ -441,11 +456,11 @@ def serve(
         uvicorn.Server(config).run(sockets=[listener])
 
 
-def _end_in_order() -> None:
-    """Lets SIGTERM, and the end of the terminal, end the process by an exception, as Ctrl-C does."""
+def _handle_signals() -> None:
+    """Make SIGTERM and SIGHUP end the process by an exception, as Ctrl-C does."""
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
-    hang_up = getattr(signal, "SIGHUP", None)  # Windows has none
-    # Whoever has it ignored, such as nohup, is obeyed. An exception in the midst of Uvicorn's loop may hang:
-    # SIGTERM ends the loop first.
+    hang_up = getattr(signal, "SIGHUP", None)  # missing on Windows
+    # An ignored SIGHUP, as under nohup, stays ignored. An exception inside Uvicorn's loop may hang, so SIGHUP
+    # raises SIGTERM, which ends the loop first.
     if hang_up and signal.getsignal(hang_up) is signal.SIG_DFL:
         signal.signal(hang_up, lambda *_: signal.raise_signal(signal.SIGTERM))

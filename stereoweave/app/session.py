@@ -1,4 +1,4 @@
-"""What the web page makes of a pair, without the page: a result that is kept, measured, drawn and written."""
+"""A visitor's result on the web page, independent of the page: matched, drawn, measured and written."""
 
 import zipfile
 from collections.abc import Callable, Sequence
@@ -24,21 +24,21 @@ from stereoweave.stereo import Estimate, StereoCamera
 
 _LONGER_SIDE_PX = 1280
 _MOST_POINTS = 300_000
-# What lies there twice, once by itself and once in the zip: that of about 8 megapixels.
+# Files up to this size, those of about 8 megapixels, are on disk twice: by themselves and in the zip.
 _MOST_ZIPPED_BYTES = 300 * 1024**2
-_NO_METRES = "For metres give a calibration file, or the focal length and how far apart the cameras are."
+_NO_METRES = "For metres, give a calibration file, or the focal length and the baseline."
 
 
 @dataclass(frozen=True, kw_only=True)
-class Kept:
-    """What a session keeps: its result, the renderer of its views, and the folder of its files."""
+class Session:
+    """A visitor's latest result, the renderer of its views, and the folder of its files."""
 
     result: Result
     renderer: Renderer
     folder: Path
 
     def given_px(self, shown_px: tuple[int, int]) -> tuple[int, int]:
-        """The pixel, column and row, of the pictures given that is at a pixel of the pictures shown."""
+        """Convert column and row of the shown picture to those of the given one."""
         given, shown = self.result.pair.left.shape[1::-1], self.renderer.pair.left.shape[1::-1]
         column, row = (
             round((at + 0.5) * n / m - 0.5) for at, n, m in zip(shown_px, given, shown, strict=True)
@@ -48,43 +48,45 @@ class Kept:
 
 @dataclass(frozen=True, kw_only=True)
 class Uploads:
-    """What a visitor gave: the files as they were uploaded, what was said of them, and what matches them."""
+    """A visitor's uploaded pictures and settings."""
 
     pictures: tuple[Path, ...]
     request: Request
     backend: Backend
 
 
-def matched(uploads: Uploads, folder: Path, tell: Callable[[float, str], None]) -> Kept:
-    """The result of the pictures that were given, whose files shall lie in `folder`.
+def match_uploads(uploads: Uploads, folder: Path, report_progress: Callable[[float, str], None]) -> Session:
+    """Match uploaded pictures; the session writes its files to `folder`.
 
-    `tell` hears how much is done, 0 to 1, and what is next.
+    `report_progress` gets the fraction done, 0 to 1, and the next step.
     """
     if not uploads.pictures:
-        raise StereoweaveError("expected a left and a right picture, or one file with both; found none")
+        raise StereoweaveError("expected a left and a right picture, or one file with both views, found none")
     for file in (*uploads.pictures, uploads.request.calibration):
         if file and not file.exists():
-            raise StereoweaveError(f"{file.name} has been put away, as after an hour; give it again")
-    tell(0.1, "reading")
+            raise StereoweaveError(
+                f"{file.name}: expected an upload of the last hour, found it expired; upload it again"
+            )
+    report_progress(0.1, "reading")
     prepared = prepare(uploads.pictures, uploads.request)
     height, width = prepared.pair.left.shape[:2]
-    tell(0.3, f"matching {width}×{height} px")
+    report_progress(0.3, f"matching {width}×{height} px")
     result = run(prepared, uploads.backend.matcher(), MatchOptions(refined=True))
-    tell(0.6, "showing")
+    report_progress(0.6, "showing")
     renderer = Renderer(*shrunk(result.pair, result.estimate, _LONGER_SIDE_PX))
-    return Kept(result=result, renderer=renderer, folder=folder)
+    return Session(result=result, renderer=renderer, folder=folder)
 
 
-def write_all(kept: Kept) -> tuple[list[Path], list[Note]]:
-    """The result's files in all formats, and notes on those that could not be written and on defects."""
-    result = kept.result
+def write_all(session: Session) -> tuple[list[Path], list[Note]]:
+    """Write the result's files in all formats. Returns them, with notes on missing files and on defects."""
+    result = session.result
     names = [name for name in FILES if result.pair.camera or not needs_camera(name)]
-    notes = write_files(kept.folder, names, result) + result.warnings()
-    return [file for file in map(kept.folder.joinpath, names) if file.exists()], notes
+    notes = write_files(session.folder, names, result) + result.warnings()
+    return [file for file in map(session.folder.joinpath, names) if file.exists()], notes
 
 
-def zipped(file: Path, files: Sequence[Path]) -> Path | None:
-    """One file that holds the others, which are compressed already or hardly can be; None of large ones."""
+def zip_files(file: Path, files: Sequence[Path]) -> Path | None:
+    """Put files into one zip archive without further compression; None if they are too large."""
     if sum(path.stat().st_size for path in files) > _MOST_ZIPPED_BYTES:
         return None
     with zipfile.ZipFile(file, "w") as archive:
@@ -94,9 +96,9 @@ def zipped(file: Path, files: Sequence[Path]) -> Path | None:
 
 
 def write_cloud(file: Path, result: Result) -> Path | None:
-    """The file of the cloud to be turned, seen by a likely camera if none is known; None without a point."""
+    """Write the point cloud, by an assumed camera if none is known; None if it has no points."""
     pair, estimate = result.pair, result.estimate
-    seen = pair if pair.camera else replace(pair, camera=_supposed_camera(estimate))
+    seen = pair if pair.camera else replace(pair, camera=_assume_camera(estimate))
     try:
         write_glb(file, point_cloud(seen, estimate, most_points=_MOST_POINTS))
     except EmptyError:
@@ -104,16 +106,16 @@ def write_cloud(file: Path, result: Result) -> Path | None:
     return file
 
 
-def depth_picture(kept: Kept) -> UInt8[np.ndarray, "h w 3"]:
-    """The disparity in colours, black where the left picture shows nothing."""
-    disparity_px, seen = kept.renderer.estimate.disparity_px, kept.renderer.pair.left_seen
+def colour_depth(session: Session) -> UInt8[np.ndarray, "h w 3"]:
+    """Colour the disparity; black outside the left picture's valid pixels."""
+    disparity_px, seen = session.renderer.estimate.disparity_px, session.renderer.pair.left_seen
     if seen is None:
         return colour_disparity(disparity_px, find_colour_range_px(disparity_px))
     return colour_disparity(disparity_px, find_colour_range_px(disparity_px[seen][None])) * seen[..., None]
 
 
-def ends(result: Result) -> tuple[str, str]:
-    """How far is what has the first and the last colour of the depth, in metres where they are known."""
+def format_colour_range(result: Result) -> tuple[str, str]:
+    """Format the depths of the first and the last colour, in metres if they are known, else in px."""
     seen = np.s_[:] if result.pair.left_seen is None else result.pair.left_seen
     ends_px = np.array([find_colour_range_px(np.atleast_2d(result.estimate.disparity_px[seen]))])
     if not result.pair.camera:
@@ -122,10 +124,10 @@ def ends(result: Result) -> tuple[str, str]:
     return _metres(far_m), _metres(near_m)
 
 
-def marked(
+def mark_clicks(
     photograph: UInt8[np.ndarray, "h w 3"], clicks: Sequence[tuple[int, int]]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The photograph with a ring at each click, and a line between two."""
+    """Draw a ring at each click, and a line between two."""
     picture = photograph.copy()
     for colour, width in (((0, 0, 0), 5), ((255, 255, 255), 2)):
         cv2.polylines(picture, [np.array(clicks, np.int32)], False, colour, width, cv2.LINE_AA)
@@ -134,11 +136,11 @@ def marked(
     return picture
 
 
-def measured(kept: Kept, clicks: Sequence[tuple[int, int]]) -> list[str]:
-    """What is known of each point clicked, and the distance between two."""
-    estimate, camera = kept.result.estimate, kept.result.pair.camera
-    points = [kept.given_px(click) for click in clicks]
-    lines = [_known(kept.result, point) for point in points]
+def measure_clicks(session: Session, clicks: Sequence[tuple[int, int]]) -> list[str]:
+    """Describe each clicked point, and the distance between two."""
+    estimate, camera = session.result.estimate, session.result.pair.camera
+    points = [session.given_px(click) for click in clicks]
+    lines = [_describe_pixel(session.result, point) for point in points]
     if camera is None:
         return [*lines, _NO_METRES]
     if len(points) == 2:
@@ -149,33 +151,33 @@ def measured(kept: Kept, clicks: Sequence[tuple[int, int]]) -> list[str]:
     return lines
 
 
-def numbers(summary: Summary) -> str:
-    """The line on a result: how large, how long, how near and how far, how sure."""
+def format_summary(summary: Summary) -> str:
+    """Format a result's summary: size, time, disparity, depth and confidence."""
     text = f"{summary.width_px}×{summary.height_px} px, matched in {summary.estimate_ms / 1000:.1f} s: "
     text += f"disparity {summary.disparity_min_px:.1f} to {summary.disparity_max_px:.1f} px"
     if summary.depth_min_m is not None:
         text += f", depth from {summary.depth_min_m:.2f} m, in the middle {_metres(summary.depth_median_m)}"
-    return f"{text}; sure of {summary.confident_percent:.0f} % of the picture"
+    return f"{text}; confident in {summary.confident_percent:.0f} % of the picture"
 
 
 def _metres(depth_m: float | None) -> str:
     return "infinite" if depth_m is None or not np.isfinite(depth_m) else f"{depth_m:.2f} m"
 
 
-def _known(result: Result, point: tuple[int, int]) -> str:
-    """What is known of one pixel of the left picture that was given."""
+def _describe_pixel(result: Result, point: tuple[int, int]) -> str:
+    """Describe one pixel of the given left picture."""
     column, row = point
     disparity_px = result.estimate.disparity_px[row : row + 1, column : column + 1]
     text = f"({column}, {row}): disparity {disparity_px[0, 0]:.2f} px"
     if result.pair.camera:
         text += f", depth {_metres(float(result.pair.camera.depth_m(disparity_px)[0, 0]))}"
-    return f"{text}; sure to {100 * result.estimate.confidence[row, column]:.0f} %"
+    return f"{text}; confidence {100 * result.estimate.confidence[row, column]:.0f} %"
 
 
-def _supposed_camera(estimate: Estimate) -> StereoCamera:
-    """A camera of 53 degrees of view, two of them as far apart as eyes, for a cloud of a likely shape.
+def _assume_camera(estimate: Estimate) -> StereoCamera:
+    """Assume a field of view of 53 degrees and a baseline of human eyes, for a plausible point cloud.
 
-    Where disparities are negative the cameras converge: what has the least is taken to be far away.
+    Negative disparities mean converged cameras: the least one is taken to be far away.
     """
     height, width = estimate.disparity_px.shape
     return StereoCamera(

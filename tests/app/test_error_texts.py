@@ -18,18 +18,18 @@ Say = Callable[..., list[str]]
 ERRORS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
     "left.png: expected a stereo picture, two views side by side or one above the other, found halves that "
     "do not resemble each other; give two files, left and right; or choose one of "
-    f"{LAYOUTS} (“How one file holds both”)": ({"left": "left.png"}, {}),
-    "“How one file holds both”: expected one picture that holds both views, found two, left.png and "
+    f"{LAYOUTS} (“Layout of a single file”)": ({"left": "left.png"}, {}),
+    "“Layout of a single file”: expected one picture that holds both views, found two, left.png and "
     "right.png; leave it out, and give the left one first": (PAIR, {"arrangement": "crossed"}),
     "turned.yml: expected a calibration of rectified pictures, found lenses that distort; rectify the pair "
-    "by it (“Bring the rows to match”)": ({**PAIR, "calibration": "turned.yml"}, {}),
+    "by it (“Rectify the pair”)": ({**PAIR, "calibration": "turned.yml"}, {}),
     "metres: expected a baseline beside the focal length, found none; give the baseline (“Baseline, mm”)": (
         PAIR,
         {"focal": 500},
     ),
     "metres: expected a focal length in EXIF beside the baseline, found none; give the focal length (“Focal "
     "length, px”)": (PAIR, {"baseline": 100}),
-    "“Bring the rows to match”: expected at least 40 points that both pictures show from two positions, "
+    "“Rectify the pair”: expected at least 40 points that both pictures show from two positions, "
     "found 0 of 0 matches that agree; take pictures with more texture and more overlap; or give a "
     "calibration (“Calibration file, for metres”)": (
         {"left": "plain.png", "right": "plain.png"},
@@ -37,7 +37,7 @@ ERRORS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
     ),
 }
 NOTES: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
-    "side_by_side, detected from name and content; override it if it is wrong (“How one file holds both”)": (
+    "side_by_side, detected from name and content; override it if it is wrong (“Layout of a single file”)": (
         {"left": "both.png"},
         {},
     ),
@@ -60,7 +60,7 @@ def say(tmp_path_factory) -> Iterator[Say]:
         given = {field: file_data(path) for field, path in zip(files, paths, strict=True)}
         status, said = visitor.answer(visitor.press(**given, **fields))
         assert status == 200
-        shown = next(part for part in json.loads(said)["data"] if 'class="told' in str(part))
+        shown = next(part for part in json.loads(said)["data"] if 'class="notice' in str(part))
         return [html.unescape(line) for line in re.findall(r"<p>(.*?)</p>", str(shown))]
 
     with Visitor(address) as visitor:

@@ -21,7 +21,7 @@ from page_examples import start, stop
 from PIL import Image
 from playwright.sync_api import Browser
 
-from stereoweave.app.session import Uploads, matched, zipped
+from stereoweave.app.session import Uploads, match_uploads, zip_files
 from stereoweave.cli.root import main
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
@@ -32,7 +32,7 @@ from stereoweave.pictures.prepare import Request
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SIZE = (640, 480)
-UNDRAWN = "does not draw in three dimensions"
+UNDRAWN = "cannot draw in 3-D"
 WINDOW = {"width": 1280, "height": 1000}
 # A cold computer compiles the loops over pixels first.
 PATIENCE_MS = 60_000
@@ -82,11 +82,12 @@ class Visit:
 
     def find(self) -> str:
         """What the page says after its work, which is something new, when all files are there."""
-        said = self.page.locator("#status .told")
+        said = self.page.locator("#status .notice")
         before = said.inner_text() if said.count() else ""
         self.page.click("#find")
         self.page.wait_for_function(
-            "before => (document.querySelector('#status .told')?.innerText ?? before) !== before", arg=before
+            "before => (document.querySelector('#status .notice')?.innerText ?? before) !== before",
+            arg=before,
         )
         if said.get_attribute("role") == "status":
             self.page.get_by_role("tab", name="Files").click()
@@ -269,8 +270,11 @@ def test_an_upload_that_was_put_away_is_asked_for_again(tmp_path):
     uploads = Uploads(
         pictures=(EXAMPLES / "left.png", EXAMPLES / "right.png"), request=request, backend=Backend()
     )
-    with pytest.raises(StereoweaveError, match=r"^calib.txt has been put away, .*; give it again$"):
-        matched(uploads, tmp_path, lambda share, what: None)
+    with pytest.raises(
+        StereoweaveError,
+        match=r"^calib.txt: expected an upload of the last hour, found it expired; upload it again$",
+    ):
+        match_uploads(uploads, tmp_path, lambda share, what: None)
 
 
 def test_large_files_are_not_zipped(tmp_path):
@@ -278,9 +282,9 @@ def test_large_files_are_not_zipped(tmp_path):
     for file, size in ((small, 9), (large, 301 * 1024**2)):
         with file.open("wb") as opened:
             opened.truncate(size)
-    assert zipped(tmp_path / "all.zip", [small, large]) is None
+    assert zip_files(tmp_path / "all.zip", [small, large]) is None
     assert not (tmp_path / "all.zip").exists()
-    assert zipped(tmp_path / "all.zip", [small]) == tmp_path / "all.zip"
+    assert zip_files(tmp_path / "all.zip", [small]) == tmp_path / "all.zip"
 
 
 def test_what_is_no_picture_is_told_by_its_name_alone(hasty, tmp_path):
@@ -289,11 +293,11 @@ def test_what_is_no_picture_is_told_by_its_name_alone(hasty, tmp_path):
     said = hasty.find()
     assert said.startswith("notes.txt: expected ")
     assert "/" not in said
-    assert hasty.page.locator("#status .told").get_attribute("role") == "alert"
+    assert hasty.page.locator("#status .notice").get_attribute("role") == "alert"
 
 
 def test_nothing_given_is_told(hasty):
-    assert hasty.find() == "expected a left and a right picture, or one file with both; found none"
+    assert hasty.find() == "expected a left and a right picture, or one file with both views, found none"
 
 
 def test_a_picture_of_800_megapixels_is_refused(hasty, tmp_path):

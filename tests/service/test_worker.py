@@ -8,7 +8,7 @@ import pytest
 
 from stereoweave.errors import FormatError, MatcherError
 from stereoweave.matching.backend import Backend
-from stereoweave.service.answers import Answer, Answering, ServiceJob, answering
+from stereoweave.service.answers import Answer, Answering, ServiceJob, make_answering
 from stereoweave.service.worker import Task, Worker
 
 pytestmark = pytest.mark.system
@@ -71,7 +71,7 @@ def test_what_is_late_already_is_not_begun(worker):
 
 
 def test_a_match_by_a_network_is_ended_at_its_deadline_and_the_next_one_is_answered(tmp_path):
-    worker = Worker(partial(answering, Backend(threads=1)), tmp_path / "files")
+    worker = Worker(partial(make_answering, Backend(threads=1)), tmp_path / "files")
     assert 0 < worker.warm_up() < 60
     assert names(worker.answer([task(within_s=0.01)])) == ["TimeoutError"]
     (answer,) = worker.answer([task()])
@@ -95,7 +95,7 @@ def test_a_picture_whose_head_cannot_be_read_in_time_is_refused(worker):
 
 
 def test_a_network_that_cannot_be_loaded_is_said_before_any_order(tmp_path):
-    worker = Worker(partial(answering, Backend(model="none.onnx")), tmp_path / "files")
+    worker = Worker(partial(make_answering, Backend(model="none.onnx")), tmp_path / "files")
     with pytest.raises(MatcherError, match=r"none\.onnx: expected an ONNX matcher"):
         worker.warm_up()
     worker.close()
