@@ -1,4 +1,4 @@
-"""Bytes: files, pictures, maps, stores."""
+"""Reading and writing of files: pictures, maps, stores."""
 
 from stereoweave.io.files import (
     RangeError,

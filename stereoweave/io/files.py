@@ -1,4 +1,4 @@
-"""Pictures, disparity and depth: from files, and into files that are whole or not there."""
+"""Reading and atomic writing of pictures, disparity and depth."""
 
 import math
 import os
@@ -20,7 +20,7 @@ from stereoweave.io.exif import read_orientation
 from stereoweave.stereo import StereoPair
 
 SMALLEST_SIDE_PX = 32
-# Calibrations of real rigs and training recipes have some kilobytes.
+# Real calibrations and training recipes have a few kilobytes.
 MOST_SMALL_BYTES = 256 * 1024
 _KINDS = {
     ".png": "PNG",
@@ -31,28 +31,29 @@ _KINDS = {
     ".webp": "WEBP",
     ".bmp": "BMP",
 }
-# The names that `replacing` gives while it writes.
+# Temporary names of `replacing`.
 _TEMPORARY = re.compile(r"\..*-[0-9a-f]{8}(\.\w+)?")
-# What libraries say of a damaged file; of an infinite size an OverflowError, of deep JSON a RecursionError.
+# Errors that libraries raise for damaged files: OverflowError for infinite sizes, RuntimeError (its
+# RecursionError) for deep JSON.
 _UNREADABLE = OSError, ValueError, OverflowError, SyntaxError, RuntimeError
-# Of Python's integers one of 4,301 digits cannot even be shown.
+# Digits are limited, because Python cannot print an integer of 4,301 digits.
 _PFM_HEADER = re.compile(rb"Pf\s+(\d{1,9})\s+(\d{1,9})\s+(\S{1,99})\s")
 _LONGEST_PFM_HEADER = 256
 
 
 class RangeError(StereoweaveError):
-    """A disparity map with values that a 16-bit PNG cannot hold."""
+    """Disparity outside the range of a 16-bit PNG."""
 
 
 def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture in RGB and sRGB, upright as its EXIF tag says.
+    """Read a picture as uint8 sRGB [H, W, 3], rotated by its EXIF orientation.
 
-    A colour profile is obeyed, grey is repeated, alpha dropped, 16 bits become 8. Of an MPO file it is the
-    first picture.
+    Colour profiles are applied, grey becomes RGB, alpha is dropped, and 16 bits are reduced to 8. An MPO file
+    gives its first picture.
 
     Raises:
-        FormatError: No such file, no picture of a kind that is read, a truncated one, an animation, one under
-            32 pixels wide or high, over 65 megapixels, or over 32,766 pixels wide or high.
+        FormatError: The file is missing, truncated, animated or of an unsupported kind; or the picture is
+            under 32 pixels or over 32,766 pixels wide or high, or over 65 megapixels.
     """
     photograph = read_photograph(Path(path))
     image = photograph.upright(read_orientation(photograph.tags))
@@ -61,7 +62,7 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def check_large_enough(path: str | Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Raise a FormatError where a view is under 32 pixels wide or high."""
+    """Raise a FormatError if a view is under 32 pixels wide or high."""
     if min(image.shape[:2]) < SMALLEST_SIDE_PX:
         raise FormatError(
             f"{path}: expected at least {SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX} pixels, found {_size(image)}"
@@ -69,7 +70,7 @@ def check_large_enough(path: str | Path, image: UInt8[np.ndarray, "h w 3"]) -> N
 
 
 def read_pair(left: str | Path, right: str | Path) -> StereoPair:
-    """The pair of two pictures of one size; FormatError as in `read_image`, or where the sizes differ."""
+    """Read a pair; raises FormatError as `read_image` does, or if the sizes differ."""
     return pair_of(left, read_image(left), right, read_image(right))
 
 
@@ -79,40 +80,40 @@ def pair_of(
     right: str | Path,
     right_image: UInt8[np.ndarray, "h2 w2 3"],
 ) -> StereoPair:
-    """The pair of two pictures and their names; FormatError where one is too small, or the sizes differ."""
+    """Make a pair of two named images; raises FormatError if one is too small or the sizes differ."""
     for path, image in ((left, left_image), (right, right_image)):
         check_large_enough(path, image)
     if left_image.shape != right_image.shape:
         raise FormatError(
-            f"expected left and right pictures of one size, found {left} of {_size(left_image)} "
+            f"expected left and right pictures of the same size, found {left} of {_size(left_image)} "
             f"and {right} of {_size(right_image)}; crop or rescale one of them"
         )
     return StereoPair(left=left_image, right=right_image)
 
 
 def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"]) -> None:
-    """Writes an RGB or grey picture in the format that the name's ending asks for, such as .png or .jpg."""
+    """Write an RGB or grey image; the file name's ending sets the format, such as .png or .jpg."""
     _save(path, image, picture_kind(path))
 
 
 def picture_kind(path: str | Path) -> str:
-    """Pillow's name of the format that the ending of `path` asks for; StereoweaveError for an unknown one."""
+    """Return Pillow's format name for the ending of `path`; raises StereoweaveError for an unknown one."""
     ending = Path(path).suffix
     if ending.lower() not in _KINDS:
         raise StereoweaveError(
-            f"{path}: expected the ending of a picture, {', '.join(_KINDS)}, found {ending!r}"
+            f"{path}: expected a picture file ending, {', '.join(_KINDS)}, found {ending!r}"
         )
     return _KINDS[ending.lower()]
 
 
 def read_pfm(path: str | Path) -> Float32[np.ndarray, "h w"]:
-    """The values of a PFM file of one channel, top row first, whichever its byte order.
+    """Read a single-channel PFM file of either byte order, top row first.
 
-    Source: the format as Middlebury uses it: rows from the bottom up, a negative scale for little-endian.
+    Source: Middlebury's variant of the format: rows from the bottom up, a negative scale for little-endian.
 
     Raises:
-        FormatError: No such file, another format, three channels ('PF'), no pixel or more than `read_image`
-            takes, a scale that is none, or a length unlike the header's.
+        FormatError: The file is missing or of another format, has three channels ('PF'), no pixel or more
+            than `read_image` accepts, an invalid scale, or a length that contradicts its header.
     """
     check_regular(Path(path), "a PFM file")
     with reading(path, "a PFM file"), Path(path).open("rb") as file:
@@ -129,50 +130,50 @@ def read_pfm(path: str | Path) -> Float32[np.ndarray, "h w"]:
 
 
 def _pfm_header(path: str | Path, content: bytes) -> tuple[tuple[int, int], str, int]:
-    """Width and height in pixels, the byte order as NumPy writes it, and where the values begin."""
+    """Parse a PFM header: width and height in px, NumPy's byte order, and the offset of the values."""
     header = _PFM_HEADER.match(content)
     if header is None:
         raise FormatError(
-            f"{path}: expected a PFM file of one channel, 'Pf', width, height and scale, "
+            f"{path}: expected a single-channel PFM file, 'Pf', width, height and scale, "
             f"found {content[:12]!r}"
         )
     size_px, scale = (int(header[1]), int(header[2])), float(header[3])
     check_size(path, size_px)
     if 0 in size_px or scale == 0 or not math.isfinite(scale):
         raise FormatError(
-            f"{path}: expected a PFM file of at least one pixel, and a scale other than 0, "
+            f"{path}: expected a PFM file of at least one pixel and with a scale other than 0, "
             f"found {size_px[0]}x{size_px[1]} and {scale:g}"
         )
     return size_px, "<" if scale < 0 else ">", header.end()
 
 
 def write_pfm(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
-    """Writes a PFM file of one channel, float32 and little-endian; NaN and infinity stay what they are."""
+    """Write a single-channel PFM file, float32 and little-endian; NaN and infinity are kept."""
     with replacing(path) as temporary:
         Image.fromarray(values.astype(np.float32)).save(temporary, "PPM")
 
 
 def write_float_tiff(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
-    """Writes a TIFF file of one channel, float32 and uncompressed; NaN and infinity stay what they are."""
+    """Write a single-channel TIFF file, float32 and uncompressed; NaN and infinity are kept."""
     with replacing(path) as temporary, checking_format_size(path, values.shape):
         Image.fromarray(values.astype(np.float32)).save(temporary, "TIFF")
 
 
 def write_npy(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
-    """Writes float32 as NumPy's own file; NaN and infinity stay what they are."""
+    """Write a NumPy .npy file in float32; NaN and infinity are kept."""
     with replacing(path) as temporary:
         np.save(temporary, values.astype(np.float32), allow_pickle=False)
 
 
 def read_pixels(path: str | Path, *modes: str) -> Shaped[np.ndarray, "h w *channels"]:
-    """The numbers of a picture as they are stored, for one that holds a measurement or a mask.
+    """Read a picture's stored values without conversion, for measurements and masks.
 
     Args:
         path: The picture.
-        modes: Pillow's names of the kinds that will do, such as "L", 8-bit grey, or "RGB".
+        modes: Accepted Pillow modes, such as "L", 8-bit grey, or "RGB".
 
     Raises:
-        FormatError: No such file, a damaged one, or a picture of another kind.
+        FormatError: The file is missing or damaged, or the picture has another mode.
     """
     expected = f"a picture of mode {' or '.join(modes)}"
     with open_picture(Path(path), expected=expected) as picture:
@@ -182,7 +183,7 @@ def read_pixels(path: str | Path, *modes: str) -> Shaped[np.ndarray, "h w *chann
 
 
 def read_disparity_png(path: str | Path) -> Float32[np.ndarray, "h w"]:
-    """Disparity in pixels from a 16-bit PNG of pixels * 256 (KITTI's); its 0, unknown, becomes NaN."""
+    """Read disparity in px from a 16-bit PNG of px * 256 (KITTI's format); 0, unknown, becomes NaN."""
     expected = "a 16-bit grey PNG of disparity * 256"
     with open_picture(Path(path), expected=expected) as picture:
         if not picture.mode.startswith("I"):
@@ -192,9 +193,9 @@ def read_disparity_png(path: str | Path) -> Float32[np.ndarray, "h w"]:
 
 
 def write_disparity_png(path: str | Path, disparity_px: Float[np.ndarray, "h w"]) -> None:
-    """Writes disparity as a 16-bit PNG of pixels * 256, where NaN and infinity become 0, unknown.
+    """Write disparity as a 16-bit PNG of px * 256 (KITTI's format); NaN and infinity become 0, unknown.
 
-    A known disparity is written as 1/256 px at least, so that it does not turn into an unknown one.
+    Known disparities are written as at least 1/256 px, so that none becomes unknown.
 
     Raises:
         RangeError: A known value is below 0 or above 255.99 px; nothing is written.
@@ -204,26 +205,26 @@ def write_disparity_png(path: str | Path, disparity_px: Float[np.ndarray, "h w"]
     if steps.min() < 0 or steps.max() > 65535:
         raise RangeError(
             f"{path}: not written; expected disparities of 0 to 255.99 px for a 16-bit PNG, "
-            f"found {disparity_px[known].min():.3f} to {disparity_px[known].max():.3f}; a PFM file holds them"
+            f"found {disparity_px[known].min():.3f} to {disparity_px[known].max():.3f}; use a PFM file"
         )
     _save(path, np.where(known, np.maximum(steps, 1), 0).astype(np.uint16), "PNG")
 
 
 def write_depth_png(path: str | Path, depth_m: Float[np.ndarray, "h w"]) -> None:
-    """Writes depth as a 16-bit PNG of millimetres, where unknown and beyond 65.535 m become 0."""
+    """Write depth as a 16-bit PNG of millimetres; unknown depth and depth beyond 65.535 m become 0."""
     depth_mm = np.rint(depth_m * 1000)
     _save(path, np.where((depth_mm > 0) & (depth_mm <= 65535), depth_mm, 0).astype(np.uint16), "PNG")
 
 
 def read_small(path: str | Path) -> bytes:
-    """The content of a regular file of at most 256 KB, such as a calibration.
+    """Read a regular file of at most 256 KB, such as a calibration.
 
     Raises:
-        FormatError: The file is larger, or a pipe or a device, which may be without end.
-        OSError: It cannot be read; `reading` makes a FormatError of it.
+        FormatError: The file is larger, or a pipe or a device, which may be endless.
+        OSError: The file cannot be read; `reading` turns this into a FormatError.
     """
     mode = Path(path).stat().st_mode
-    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # opening a folder says that it is one
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # opening a folder fails with its own error
         raise FormatError(f"{path}: expected a regular file, found a pipe or a device; save it to a file")
     with Path(path).open("rb") as file:
         content = file.read(MOST_SMALL_BYTES + 1)
@@ -233,7 +234,7 @@ def read_small(path: str | Path) -> bytes:
 
 
 def make_folder(path: str | Path) -> Path:
-    """The folder `path`, made where it is missing and tried, so that a long run does not fail at its end."""
+    """Make a folder and check that it is writable, so that a long run does not fail at its end."""
     folder = Path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -246,17 +247,20 @@ def make_folder(path: str | Path) -> Path:
 
 
 def make_parent_folder(*files: Path) -> Path:
-    """The nearest folder above files of one folder that is there, tried; an error if a file is a folder."""
+    """Check that files of one folder can be written; raises StereoweaveError otherwise.
+
+    Returns the nearest existing parent folder, which is checked in place of missing ones.
+    """
     for file in files:
         if file.is_dir():
             raise StereoweaveError(f"{file}: expected a file that can be written, found a folder")
-    # A link that leads nowhere is in the way of a folder.
+    # A dangling link counts as existing, because no folder can be made in its place.
     return make_folder(next(path for path in files[0].parents if path.exists() or path.is_symlink()))
 
 
 @contextmanager
 def reading(path: str | Path, expected: str) -> Iterator[None]:
-    """Turns what goes wrong while `path` is read into a FormatError: in one line, expected and found."""
+    """Turn errors of reading `path` into a one-line FormatError: expected, found."""
     try:
         yield
     except FormatError:
@@ -267,9 +271,9 @@ def reading(path: str | Path, expected: str) -> Iterator[None]:
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """A name beside `path` to write to: it takes the place of `path` at the end, or is removed on an error.
+    """Write a file atomically: yields a temporary name, which replaces `path` at the end.
 
-    The name has the ending of `path`. Missing folders are made.
+    The temporary name is beside `path`, has its ending, and is removed on an error. Missing folders are made.
 
     Raises:
         StereoweaveError: The folder or the file cannot be written.
@@ -289,23 +293,23 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def checking_format_size(path: str | Path, shape: tuple[int, ...]) -> Iterator[None]:
-    """Turns Pillow's refusal of a size that a format does not hold into one line."""
+    """Turn Pillow's error for a size that the format does not support into a StereoweaveError."""
     try:
         yield
     except ValueError as error:
         raise StereoweaveError(
-            f"{path}: expected a size that {Path(path).suffix} files hold, found {shape[1]}x{shape[0]} px "
-            f"({error}); .png holds any"
+            f"{path}: expected a size that {Path(path).suffix} supports, found {shape[1]}x{shape[0]} px "
+            f"({error}); .png supports any"
         ) from error
 
 
 def is_leftover(path: Path) -> bool:
-    """Whether a file is what `replacing` left where the program was killed."""
+    """Whether a file is a temporary one of `replacing` that a killed program left."""
     return _TEMPORARY.fullmatch(path.name) is not None
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Removes what `replacing` left in a folder and below it, where nobody is writing now."""
+    """Remove temporary files that killed programs left in a folder and below; nobody may be writing there."""
     for path in filter(is_leftover, folder.rglob(".*")):
         path.unlink(missing_ok=True)
 

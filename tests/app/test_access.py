@@ -177,7 +177,7 @@ def test_the_sample_is_read_by_who_asked_for_it_alone(visitor, resident, small_p
     left, *_ = paths_in(said)
     [right] = visitor.upload(small_pair[1])
     body = visitor.press(left=file_data(left), right=file_data(right))
-    assert "expected left and right pictures of one size" in visitor.answer(body)[1]
+    assert "expected left and right pictures of the same size" in visitor.answer(body)[1]
     assert resident[0].answer(body) == REFUSED
 
 

@@ -82,8 +82,8 @@ def test_every_matcher_has_every_number_and_both_plots_are_drawn(sets, tmp_path,
 @pytest.mark.parametrize(
     ("options", "fragments"),
     [
-        ("--plot time.words", ["time.words: expected the ending of a picture", "'.words'"]),
-        ("--sparsification words", ["words: expected the ending of a picture"]),
+        ("--plot time.words", ["time.words: expected a picture file ending", "'.words'"]),
+        ("--sparsification words", ["words: expected a picture file ending"]),
         ("--dataset words", ["dataset: expected one of", "'words'"]),
         ("--dataset kitti2015", ["expected a folder of the dataset"]),
         ("--cluster 127.0.0.1:1", ["127.0.0.1:1: expected the head of a Ray cluster that answers"]),

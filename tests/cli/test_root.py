@@ -139,7 +139,7 @@ def mistakes(pictures) -> Path:
         ("depth left.png right.png -o calib.txt/out", ["calib.txt", "expected a folder", "found a file"]),
         ("depth left.png right.png -o calib.txt", ["calib.txt", "expected a folder", "found a file"]),
         ("view left.png right.png -o calib.txt/out.png", ["calib.txt", "expected a folder", "found a file"]),
-        ("view left.png right.png -o out.words", ["out.words", "expected the ending of a picture"]),
+        ("view left.png right.png -o out.words", ["out.words", "expected a picture file ending"]),
         ("view left.png right.png -o folder", ["folder", "expected"]),
         ("view left.png right.png --position 7 -o out.png", ["position", "-1", "2", "7"]),
         ("view left.png right.png --position nan -o out.png", ["position", "-1", "2", "nan"]),

@@ -130,7 +130,7 @@ def test_the_costs_of_the_effects_are_told_in_milliseconds(monkeypatch, capsys):
         ("synth make pylon --pairs 1 -o file/set", "file/set: expected a folder that can be written"),
         ("synth costs cathedral", "scene: expected one of "),
         ("synth check set", "set/set.json: expected the description of a set"),
-        ("synth sheet -o sheet.doc", "sheet.doc: expected the ending of a picture"),
+        ("synth sheet -o sheet.doc", "sheet.doc: expected a picture file ending"),
     ],
 )
 def test_a_mistake_is_answered_in_one_line(tmp_path, monkeypatch, capsys, line, words):
