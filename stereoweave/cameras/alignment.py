@@ -33,10 +33,10 @@ _TOLERATED_STOPS = 0.58
 _PIXELS_OF_TOLERANCE = 1_500_000
 
 # Inliers lie within this distance of the field of vertical errors.
-_RIGHT_PX = 1.5
-_FIRST_RIGHT_PX = 2.5
+_INLIER_PX = 1.5
+_FIRST_INLIER_PX = 2.5
 _TRIALS, _POLISHING = 400, 6
-_LEAST_MATCHES, _LEAST_RIGHT_SHARE = 20, 0.2
+_LEAST_MATCHES, _LEAST_INLIER_SHARE = 20, 0.2
 # A disparity counts if at least this many of a match's neighbours agree.
 _NEIGHBOURS, _LEAST_AGREEING = 8, 4
 _AGREE_PX, _AGREE_SHARE = 2.0, 0.05
@@ -75,33 +75,33 @@ class Alignment:
     defects: tuple[Defect, ...]
 
     def lines(self) -> list[Note]:
-        """All findings, with the remedies of the defects."""
+        """All findings as notes, with remedies for the defects."""
         if "too_few_matches" in self.defects:
             return [self._note("too_few_matches")]
         least_px, greatest_px = self.range_px
-        light = f"the right picture got {self.exposure_ratio:.2f} times the left one's light"
+        exposure = f"the right picture has {self.exposure_ratio:.2f} times the exposure of the left one"
         if math.isnan(self.exposure_ratio):
-            light = "not compared, for where both are alike they are too dark or too bright"
+            exposure = "unknown: matching areas are too dark or too bright"
         found = [
-            f"rows: {self.matches} matches, {self.vertical_error_px:.2f} px apart in the median, "
-            f"95 % under {self.vertical_error_95_px:.2f} px",
+            f"vertical error at {self.matches} matches: median {self.vertical_error_px:.2f} px, "
+            f"95 % below {self.vertical_error_95_px:.2f} px",
             f"disparities: {least_px:.0f} to {greatest_px:.0f} px",
-            f"exposure: {light}",
+            f"exposure: {exposure}",
         ]
         defects = [self._note(defect) for defect in self.defects]
-        sound = Note("no defects: a rectified pair, left and right in their places")
+        sound = Note("no defects: the pair is rectified, and left and right are not swapped")
         return [*map(Note, found), *(defects or [sound])]
 
     def warnings(self) -> list[Note]:
-        """The notes on defects that make depth wrong or worse; disparities of either sign are matched."""
+        """Notes on defects that make depth wrong or worse; negative disparities do not."""
         return [self._note(defect) for defect in self.defects if defect != "negative_disparity"]
 
     def _note(self, defect: Defect) -> Note:
         match defect:
             case "too_few_matches":
                 return Note(
-                    f"expected two pictures of one scene, found {self.matches} points that both show: they "
-                    "are too plain, too different, or too far apart"
+                    f"expected two pictures of the same scene, found {self.matches} matching points: the "
+                    "pictures are too plain, too different or taken too far apart"
                 )
             case "swapped":
                 return SWAPPED
@@ -115,22 +115,22 @@ class Alignment:
                 )
             case "not_rectified":
                 return Note(
-                    f"the rows do not match, 95 % only to {self.vertical_error_95_px:.1f} px, and the error "
-                    "varies over the picture",
+                    f"the pair is not rectified: vertical errors reach {self.vertical_error_95_px:.1f} px "
+                    "(95 % of them are smaller) and vary over the picture",
                     _RECTIFY,
                 )
             case "exposure":
                 ratio = max(self.exposure_ratio, 1 / self.exposure_ratio)
                 which = "right" if self.exposure_ratio > 1 else "left"
                 return Note(
-                    f"the {which} picture got {ratio:.1f} times the other's light: depth is less certain "
-                    "where one is too dark or too bright",
+                    f"the {which} picture has {ratio:.1f} times the other's exposure: depth is less reliable "
+                    "where either is too dark or too bright",
                     Remedy("lock the exposure of both cameras"),
                 )
             case "negative_disparity":
                 return Note(
-                    f"disparities go down to {self.range_px[0]:.0f} px, as in 3-D films: "
-                    "they are matched as they are, but metres from focal length and baseline need doffs"
+                    f"disparities go down to {self.range_px[0]:.0f} px, as in 3-D films: matching handles "
+                    "them, but metric depth from focal length and baseline also needs doffs"
                 )
 
 
@@ -143,8 +143,8 @@ def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3
     field = _fit_vertical_error(matches, centre_px, scale) if count >= _LEAST_MATCHES else None
     if field is None:
         return _make_unrelated(count)
-    right_ones, shift_px, slope, uneven_px = field
-    matches = Matches(matches.left_px[right_ones], matches.right_px[right_ones])
+    inliers, shift_px, slope, uneven_px = field
+    matches = Matches(matches.left_px[inliers], matches.right_px[inliers])
     # A rotation also moves the upper and lower parts of the picture sideways.
     disparity_px = matches.disparity_px - slope * (matches.right_px[:, 1] - centre_px[1])
     shared = _find_supported(matches, disparity_px, scale)
@@ -159,7 +159,7 @@ def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3
     ratio = _measure_light_ratio(left, right, matches)
     # A rotation about a point other than the centre of the right picture looks like a shift too.
     tolerated_px = scale * _TOLERATED_PX + abs(slope) * float(np.median(np.abs(disparity_px)))
-    amiss = {
+    is_present = {
         "vertical_shift": abs(shift_px) > tolerated_px,
         "rotation": abs(np.degrees(slope)) > _TOLERATED_DEGREES,
         "not_rectified": uneven_px > 2 * scale * _TOLERATED_PX,
@@ -169,7 +169,7 @@ def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3
         order = estimate_depth_order(*small, (least_px / scale, greatest_px / scale))
         usual = _CLEAR_VOTE * (2 * float((disparity_px < 0).mean()) - 1)
         swapped = greatest_px < -least_px and order < usual
-        amiss["swapped" if swapped else "negative_disparity"] = True
+        is_present["swapped" if swapped else "negative_disparity"] = True
     rows_px = np.abs(matches.lower_px)
     return Alignment(
         matches=count,
@@ -179,7 +179,7 @@ def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3
         rotation_degrees=float(np.degrees(slope)),
         range_px=(least_px, greatest_px),
         exposure_ratio=ratio,
-        defects=tuple(defect for defect in DEFECTS if amiss.get(defect)),
+        defects=tuple(defect for defect in DEFECTS if is_present.get(defect)),
     )
 
 
@@ -221,16 +221,16 @@ def _fit_vertical_error(
     x, y = ((matches.right_px - centre_px) / centre_px[0]).T
     terms = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=1)
     lower_px = matches.lower_px
-    right_ones = _find_plane_inliers(terms[:, :3], lower_px, scale * _FIRST_RIGHT_PX)
+    inliers = _find_plane_inliers(terms[:, :3], lower_px, scale * _FIRST_INLIER_PX)
     for _ in range(_POLISHING):
         # The ridge keeps terms small that few matches support.
-        weights, ridge = terms[right_ones], 0.1 * np.eye(6)
-        field = np.linalg.solve(weights.T @ weights + ridge, weights.T @ lower_px[right_ones])
-        right_ones = np.abs(terms @ field - lower_px) <= scale * _RIGHT_PX
-    if right_ones.sum() < max(_LEAST_MATCHES, _LEAST_RIGHT_SHARE * len(x)):
+        weights, ridge = terms[inliers], 0.1 * np.eye(6)
+        field = np.linalg.solve(weights.T @ weights + ridge, weights.T @ lower_px[inliers])
+        inliers = np.abs(terms @ field - lower_px) <= scale * _INLIER_PX
+    if inliers.sum() < max(_LEAST_MATCHES, _LEAST_INLIER_SHARE * len(x)):
         return None
-    uneven_px = np.abs(terms[right_ones, 2:] @ field[2:])
-    return right_ones, float(field[0]), float(field[1] / centre_px[0]), float(np.percentile(uneven_px, 95))
+    uneven_px = np.abs(terms[inliers, 2:] @ field[2:])
+    return inliers, float(field[0]), float(field[1] / centre_px[0]), float(np.percentile(uneven_px, 95))
 
 
 def _find_plane_inliers(
@@ -266,10 +266,10 @@ def _measure_light_ratio(
 ) -> float:
     """Median ratio of right to left exposure over the matches; NaN if too few are usable."""
     levels = _sample_levels(left, matches.left_px), _sample_levels(right, matches.right_px)
-    told = np.logical_and(*((level > _BLACK_LEVEL) & (level < _WHITE_LEVEL) for level in levels))
-    if told.sum() < _LEAST_MATCHES:
+    usable = np.logical_and(*((level > _BLACK_LEVEL) & (level < _WHITE_LEVEL) for level in levels))
+    if usable.sum() < _LEAST_MATCHES:
         return float("nan")
-    return float(np.median(levels[1][told] / levels[0][told]) ** _GAMMA)
+    return float(np.median(levels[1][usable] / levels[0][usable]) ** _GAMMA)
 
 
 def _sample_levels(

@@ -34,11 +34,13 @@ class Board:
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3 or not self.square_m > 0:
             raise StereoweaveError(
-                "expected a board of at least 3x3 corners with squares of a length above 0, "
+                "expected a board of at least 3x3 corners and a square side above 0 mm, "
                 f"found {self.columns}x{self.rows} and {1000 * self.square_m:g} mm"
             )
         if (self.marker_m is None) != (self.dictionary is None):
-            raise StereoweaveError("expected both the dictionary and the length of a ChArUco board's markers")
+            raise StereoweaveError(
+                "expected both the dictionary and the size of a ChArUco board's markers, found one"
+            )
         if self.marker_m is not None and not 0 < self.marker_m < self.square_m:
             raise StereoweaveError(
                 f"expected markers smaller than the squares of {1000 * self.square_m:g} mm, "
@@ -46,9 +48,7 @@ class Board:
             )
         if self.dictionary is not None and not hasattr(cv2.aruco, self.dictionary):
             names = ", ".join(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
-            raise StereoweaveError(
-                f"unknown dictionary of markers {self.dictionary}; expected one of {names}"
-            )
+            raise StereoweaveError(f"unknown marker dictionary {self.dictionary}; expected one of {names}")
 
     def __str__(self) -> str:
         if self.dictionary:
@@ -91,12 +91,12 @@ def find_pair_corners(
     """Find the corners visible in both pictures; raise FormatError if there are too few."""
     if left.shape != right.shape:
         sizes = [format_size(image.shape[::-1]) for image in (left, right)]
-        raise FormatError(f"the left picture is of {sizes[0]}, the right one of {sizes[1]}")
+        raise FormatError(f"the left picture has {sizes[0]} px, the right one {sizes[1]} px")
     find = _find_charuco if board.dictionary else _find_chessboard
     found = [find(image, board) for image in (left, right)]
     nowhere = [side for side, corners in zip(("left", "right"), found, strict=True) if corners is None]
     if nowhere:
-        raise FormatError(f"no board was found in the {' and the '.join(nowhere)} picture")
+        raise FormatError(f"no board was detected in the {' and the '.join(nowhere)} picture")
     here, there = found
     assert here is not None and there is not None
     if not board.dictionary:
@@ -104,7 +104,7 @@ def find_pair_corners(
     both, in_left, in_right = np.intersect1d(here.corners, there.corners, return_indices=True)
     places = board.corners_m()[both]
     if len(both) < _FEWEST_CORNERS or np.linalg.matrix_rank(places - places.mean(axis=0)) < 2:
-        raise FormatError(f"only {len(both)} corners of the board are in both pictures")
+        raise FormatError(f"only {len(both)} corners of the board are visible in both pictures")
     return PairCorners(name, both, here.at_px[in_left], there.at_px[in_right])
 
 

@@ -86,8 +86,8 @@ class Calibration:
         if self.error_px > _GOOD_PX:
             yield (
                 self.error_px > _FAIR_PX,
-                "corners are far from where they should be: take sharp pictures at one moment with both "
-                "cameras, of a board that is flat",
+                "the reprojection error is large: take sharp pictures of a flat board with both cameras at "
+                "the same moment",
             )
         if self.cover_percent < _GOOD_COVER_PERCENT:
             yield (
@@ -98,16 +98,16 @@ class Calibration:
         if self.tilt_degrees < _GOOD_TILT_DEGREES:
             yield True, f"no board is tilted by {_GOOD_TILT_DEGREES} degrees: add pictures of a tilted board"
         if len(self.used) < _GOOD_PAIRS:
-            yield False, f"{_GOOD_PAIRS} pairs or more make it surer"
+            yield False, f"few pairs: use {_GOOD_PAIRS} or more"
 
     def lines(self) -> list[str]:
-        """The calibration's results for a user, line by line."""
+        """Results for the user, line by line."""
         fx, fy = (self.rig.left.matrix[axis, axis] for axis in (0, 1))
         return [
             *(f"{name}: left out, {why}" for name, why in self.left_out.items()),
             f"left camera: focal length {fx:.1f} x {fy:.1f} px, {format_size(self.rig.size_px)} px",
-            f"baseline {1000 * self.rig.baseline_m:.2f} mm, cameras turned by "
-            f"{self.rig.rotation_degrees:.2f} degrees against each other",
+            f"baseline {1000 * self.rig.baseline_m:.2f} mm, cameras rotated by "
+            f"{self.rig.rotation_degrees:.2f} degrees relative to each other",
             f"reprojection error {self.error_px:.2f} px (left {self.left_error_px:.2f}, right "
             f"{self.right_error_px:.2f}), epipolar error {self.epipolar_error_px:.2f} px (median)",
             f"boards cover {self.cover_percent:.0f} % of the picture, tilted by up to "
@@ -149,8 +149,8 @@ def calibrate(
             solution = solve(board.corners_m(), seen, size_px)
         except cv2.error as error:
             raise StereoweaveError(
-                f"{folder}: expected pictures that tell how the lenses see, found {len(seen)} pairs from "
-                f"which OpenCV cannot ({error.err}); add pictures with the board near the edges, and tilted"
+                f"{folder}: expected pictures that determine the lenses, found {len(seen)} pairs that OpenCV "
+                f"cannot solve ({error.err}); add pictures with the board near the edges, and tilted"
             ) from error
         worst_px = solution.errors_px.max(axis=1)
         far = worst_px > _OUTLIER * np.median(worst_px)
@@ -158,7 +158,7 @@ def calibrate(
             rig = replace(solution.rig, name=str(folder))
             return _judge(solution._replace(rig=rig), seen, left_out)
         for index in np.flatnonzero(far):
-            off = f"{worst_px[index]:.2f} px off, over {_OUTLIER:g} times as much as the other pairs"
+            off = f"error of {worst_px[index]:.2f} px, over {_OUTLIER:g} times the median of all pairs"
             left_out[seen[index].name] = off
         seen = [pair for pair, is_far in zip(seen, far, strict=True) if not is_far]
         _check_enough(len(seen), len(pairs), board, left_out)
@@ -170,12 +170,12 @@ def _check_enough(count: int, total: int, board: Board, left_out: Mapping[str, s
     example = next((f" ({name}: {why})" for name, why in left_out.items()), "")
     raise StereoweaveError(
         f"expected {board} in both pictures of at least {FEWEST_PAIRS} pairs, found it in {count} of {total}"
-        f"{example}; count the board anew, or take more pictures of the whole board in both views"
+        f"{example}; check the number of corners, or take more pictures with the whole board in both views"
     )
 
 
 def find_pairs(folder: Path) -> tuple[dict[str, tuple[Path, Path]], dict[str, str]]:
-    """Left and right pictures by the name of their pair, and the pictures without a partner."""
+    """Find left and right pictures by the name of their pair, and pictures without a partner."""
     if not folder.is_dir():
         raise StereoweaveError(f"{folder}: expected a folder with pictures of a board, found none")
     sides: dict[str, dict[bool, Path]] = {}
@@ -186,7 +186,7 @@ def find_pairs(folder: Path) -> tuple[dict[str, tuple[Path, Path]], dict[str, st
             sides.setdefault(_SIDE.sub("*", relative), {})[marks[-1].lower() in _LEFT_WORDS] = path
     pairs = {str(key): (found[True], found[False]) for key, found in sides.items() if len(found) == 2}
     single = {
-        str(path.relative_to(folder)): "its partner of the other camera is missing"
+        str(path.relative_to(folder)): "the picture of the other camera is missing"
         for found in sides.values()
         for path in found.values()
         if len(found) == 1
@@ -219,7 +219,7 @@ def _find_all_corners(
     size_px = Counter(size for _, size in seen).most_common(1)[0][0]
     for pair, found_px in seen:
         if found_px != size_px:
-            left_out[pair.name] = f"of {format_size(found_px)}, where most are of {format_size(size_px)}"
+            left_out[pair.name] = f"size {format_size(found_px)}, most pairs have {format_size(size_px)}"
     return [pair for pair, found_px in seen if found_px == size_px], size_px
 
 
@@ -348,5 +348,5 @@ def _measure_cover_percent(views: Sequence[Float[np.ndarray, "_ 2"]], size_px: S
 
 
 def _measure_tilt_degrees(turn: Float[np.ndarray, "..."]) -> float:
-    """The angle between a board's normal and the camera's axis."""
+    """Angle between a board's normal and the optical axis."""
     return float(np.degrees(np.arccos(np.clip(abs(cv2.Rodrigues(turn)[0][2, 2]), 0, 1))))

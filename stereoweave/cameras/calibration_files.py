@@ -87,7 +87,7 @@ def write_rig(path: str | Path, rig: Rig) -> None:
     Entries: image_width, image_height, distortion_model, M1, D1, M2, D2, R, T and translation_unit.
     """
     if rig.left.fisheye != rig.right.fisheye:
-        raise StereoweaveError(f"{path}: expected two lenses of one kind, found a pinhole and a fisheye one")
+        raise StereoweaveError(f"{path}: expected two lenses of the same kind, found pinhole and fisheye")
     storage = cv2.FileStorage(".yml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
     if rig.size_px is not None:
         storage.write("image_width", rig.size_px[0])
@@ -138,7 +138,7 @@ def _parse_opencv(entries: Mapping[str, Any]) -> Rig:
     if model is None and left.distortion.size == 4:
         notes += (
             Note(
-                "the calibration does not state its lens model: taken for pinhole with k1 k2 p1 p2",
+                "the calibration does not state its lens model: assumed pinhole with k1 k2 p1 p2",
                 Remedy("add the entry distortion_model: fisheye if that is wrong"),
             ),
         )
@@ -208,12 +208,12 @@ def _parse_model(named: object) -> str:
     if word in _PINHOLE_NAMES:
         return "pinhole"
     raise ValueError(
-        f"a lens {reprlib.repr(named)}; radtan (pinhole) and equidistant (fisheye) ones are known"
+        f"unknown lens model {reprlib.repr(named)}; use radtan (pinhole) or equidistant (fisheye)"
     )
 
 
 def _find_unit(translation: Float[np.ndarray, "3"], stated: object) -> tuple[str, tuple[Note, ...]]:
-    """The translation's unit of length, and a note if it is a guess."""
+    """The translation's unit of length, and a note if it is assumed."""
     if stated is not None:
         if str(stated) not in _METRES:
             raise ValueError(f"translation_unit {reprlib.repr(stated)}, not one of {', '.join(_METRES)}")
@@ -221,7 +221,7 @@ def _find_unit(translation: Float[np.ndarray, "3"], stated: object) -> tuple[str
     length = float(np.linalg.norm(translation))
     unit, word = ("mm", "millimetres") if length > _MM_ABOVE else ("m", "metres")
     note = Note(
-        f"the calibration does not state its unit of length: its baseline of {length:g} was taken for {word}",
+        f"the calibration does not state its unit of length: the baseline of {length:g} is assumed in {word}",
         Remedy("add the entry translation_unit: m, cm or mm if that is wrong"),
     )
     return unit, (note,)
@@ -235,7 +235,7 @@ def _find_size(entries: Mapping[str, Any]) -> Size | None:
             return None
     sides_px = _parse_numbers(both).ravel()
     if sides_px.size != 2:
-        raise ValueError(f"a picture's size of {reprlib.repr(both)}, not width and height")
+        raise ValueError(f"a picture size {reprlib.repr(both)}, not width and height")
     width, height = sides_px
     return int(width), int(height)
 
@@ -243,10 +243,10 @@ def _find_size(entries: Mapping[str, Any]) -> Size | None:
 def _parse_kalibr(entries: Mapping[str, Any]) -> Rig:
     first, second = entries["cam0"], entries.get("cam1")
     if not isinstance(first, dict) or not isinstance(second, dict):
-        raise ValueError("not two cameras, cam0 and cam1")
+        raise ValueError("no two cameras cam0 and cam1")
     transform = second.get("T_cn_cnm1")
     if transform is None:
-        raise ValueError("no T_cn_cnm1 of cam1, the way from cam0 to it")
+        raise ValueError("no entry T_cn_cnm1 of cam1, the transform from cam0 to cam1")
     to_right = _parse_numbers(transform).reshape(4, 4)
     left, right = _parse_kalibr_optics("cam0", first), _parse_kalibr_optics("cam1", second)
     return Rig(
@@ -287,7 +287,7 @@ def _parse_kitti(text: str, size_px: Size | None) -> Rig:
         if re.match(r"[PKDRTS]_?(rect_)?\d", key.strip())
     }
     first, second = (2, 3) if {"P3", "P_rect_03", "K_03"} & rows.keys() else (0, 1)
-    notes = (Note(f"of KITTI's cameras, {first} is taken for the left one and {second} for the right one"),)
+    notes = (Note(f"KITTI's camera {first} is used as the left one, camera {second} as the right one"),)
     raw_px = _find_kitti_size(rows, f"S_{first:02}")
     keys = (f"P_rect_{first:02}", f"P_rect_{second:02}")
     if keys[0] not in rows:
@@ -340,7 +340,7 @@ def _parse_middlebury(text: str) -> Rig:
     entries = {key.strip(): value for key, value in lines}
     missing = {"cam0", "doffs", "baseline", "width", "height"} - entries.keys()
     if missing:
-        raise ValueError(f"no entry {', '.join(sorted(missing))} of a Middlebury calib.txt")
+        raise ValueError(f"no entry {', '.join(sorted(missing))}, which a Middlebury calib.txt has")
     rows = entries["cam0"].strip(" []").split(";", 3)  # a fourth row of any length is rejected
     left = _parse_numbers([row.split() for row in rows]).reshape(3, 3)
     right = left + np.array([[0, 0, float(entries["doffs"])], [0, 0, 0], [0, 0, 0]])
@@ -363,8 +363,8 @@ def _parse_numbers(values: Any) -> Float[np.ndarray, "..."]:
         return _decode_base64(values)
     try:
         return np.asarray(_parse_hexadecimal(values), dtype=np.float64)
-    except (TypeError, ValueError) as error:  # the former of a dict, for instance
-        raise ValueError(f"{reprlib.repr(values)} in place of numbers") from error
+    except (TypeError, ValueError) as error:  # TypeError for a dict, for instance
+        raise ValueError(f"{reprlib.repr(values)} instead of numbers") from error
 
 
 def _parse_hexadecimal(values: Any) -> Any:

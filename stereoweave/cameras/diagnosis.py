@@ -12,7 +12,7 @@ _LEAST_CONFIDENT_PERCENT = 30.0
 
 
 def find_problems(pair: StereoPair, estimate: Estimate) -> list[Note]:
-    """Notes on what is wrong with a pair; empty for a sound pair.
+    """Diagnose a pair's problems; no notes for a sound pair.
 
     The alignment is measured at feature matches (`stereoweave check` reports it in full). With too few
     matches only the estimate's confidence decides, because a plain wall may be matched well.
@@ -28,7 +28,7 @@ def find_problems(pair: StereoPair, estimate: Estimate) -> list[Note]:
         return [
             Note(
                 f"only {confident_percent:.0f} % of the disparities are confident: the pictures are too "
-                "plain, do not show one scene, are swapped, or their rows do not match",
+                "plain, show different scenes, are swapped or are not rectified",
                 Remedy("rectify the pair", ("rectify",)),
             )
         ]

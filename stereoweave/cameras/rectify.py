@@ -45,7 +45,7 @@ def rectify(pair: StereoPair, rig: Rig) -> Rectified:
     rig.check_size(pair)
     _check_side_by_side(rig)
     if rig.unlike_rectified() is None:
-        note = Note(f"{rig.name} is for rectified pictures: they are taken as they are")
+        note = Note(f"{rig.name} is a calibration of rectified pictures: they are left unchanged")
         return Rectified(pair=replace(pair, camera=rig.camera()), notes=(*rig.notes, note))
     # Values that cannot be computed are rejected later, as not finite.
     with np.errstate(all="ignore"):
@@ -86,13 +86,12 @@ def _check_side_by_side(rig: Rig) -> None:
         raise StereoweaveError(
             f"{rig.name}: expected two cameras side by side, found the right one {aside} the left one "
             f"({x:.3f} m aside, {y:.3f} m down, {z:.3f} m ahead); "
-            "turn the pictures of cameras above each other by 90 degrees and calibrate with those"
+            "if one camera is above the other, rotate the pictures by 90 degrees and calibrate again"
         )
     if x < 0:
         raise StereoweaveError(
             f"{rig.name}: expected the right camera on the right, found it {-x:.3f} m to the left "
-            "of the left one: the sides are swapped; give the pictures the other way round, and a "
-            "calibration made so"
+            "of the left one: left and right are swapped; exchange the pictures and calibrate again"
         )
 
 
@@ -121,8 +120,8 @@ def _choose_camera(
     ahead = [turn @ _find_direction(optics, middle_px) for optics, turn in zip(lenses, turns, strict=True)]
     if not all(np.isfinite(direction).all() and direction[2] > 0 for direction in ahead):
         raise StereoweaveError(
-            f"{rig.name}: expected two cameras that look the same way, found them turned by "
-            f"{rig.rotation_degrees:.0f} degrees against each other; is that the rotation of this rig?"
+            f"{rig.name}: expected two cameras that face the same way, found them rotated by "
+            f"{rig.rotation_degrees:.0f} degrees relative to each other; check the rotation"
         )
     aside, down = np.mean([direction[:2] / direction[2] for direction in ahead], axis=0)
     return StereoCamera(
@@ -202,8 +201,8 @@ def _summary(rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], pair: StereoPa
     assert pair.left_seen is not None and pair.right_seen is not None
     seen_percent = 100 * (pair.left_seen & pair.right_seen).mean()
     return Note(
-        f"rectified by {rig.name}: the left picture turned by {left:.2f} degrees, the right one by "
-        f"{right:.2f}; both fill {seen_percent:.0f} % of the pixels"
+        f"rectified by {rig.name}: left picture rotated by {left:.2f} degrees, right picture by "
+        f"{right:.2f}; {seen_percent:.0f} % of the pixels are valid in both"
     )
 
 
@@ -246,6 +245,6 @@ def _find_largest_of_cells(full: Bool[np.ndarray, "rows columns"]) -> tuple[int,
             standing.append((start, height))
     if not best:
         raise StereoweaveError(
-            "expected a pair of pictures that overlap, found no pixel that both of them have"
+            "expected two pictures that overlap after rectification, found no common pixel"
         )
     return found

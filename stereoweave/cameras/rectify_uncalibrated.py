@@ -62,8 +62,8 @@ def rectify_by_features(pair: StereoPair) -> Rectified:
     right, right_seen = _warp(pair.right, turns.right, pair.right_seen)
     before_px = np.abs(matches.lower_px)
     note = Note(
-        f"rectified by {len(missed_px)} matches: their rows are {np.median(missed_px):.2f} px apart in the "
-        f"median, before {np.median(before_px):.2f} px; the right one was moved {moved_px:+.0f} px sideways"
+        f"rectified by {len(missed_px)} matches: median vertical error {np.median(missed_px):.2f} px, before "
+        f"{np.median(before_px):.2f} px; the right picture was shifted by {moved_px:+.0f} px sideways"
     )
     rectified = replace(pair, left=left, right=right, camera=None, left_seen=left_seen, right_seen=right_seen)
     return Rectified(pair=rectified, notes=(note,))
@@ -147,9 +147,9 @@ def _check(parameters: Float[np.ndarray, " 6"], residual_px: float, width: int, 
     most_px = _MOST_RESIDUAL_PX * max(1.0, (width * height / _PIXELS_OF_RESIDUAL) ** 0.5)
     if residual_px > most_px or largest_degrees > _MOST_TURN_DEGREES:
         raise StereoweaveError(
-            f"expected cameras side by side, turned by under {_MOST_TURN_DEGREES:.0f} degrees, found rows "
-            f"{residual_px:.1f} px apart after a turn of {largest_degrees:.0f} degrees; take the pictures "
-            "from two positions side by side, without moving forward",
+            f"expected cameras side by side, rotated by under {_MOST_TURN_DEGREES:.0f} degrees, found "
+            f"vertical errors of {residual_px:.1f} px after a rotation of {largest_degrees:.0f} degrees; "
+            "take the pictures from two positions side by side, without moving forward",
             setting="rectify",
         )
 

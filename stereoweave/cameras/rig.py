@@ -85,12 +85,12 @@ class Rig:
             )
         if not 0 < np.linalg.norm(self.translation_m) < CAMERA_NUMBERS_BELOW:
             raise StereoweaveError(
-                f"{self.name}: expected cameras at two places within {CAMERA_NUMBERS_BELOW:g} m, "
+                f"{self.name}: expected cameras at two positions under {CAMERA_NUMBERS_BELOW:g} m apart, "
                 f"found the translation {self.translation_m.tolist()}"
             )
         if self.size_px is not None and min(self.size_px) < 1:
             raise StereoweaveError(
-                f"{self.name}: expected a picture's width and height, found {self.size_px}"
+                f"{self.name}: expected a picture width and height of at least 1, found {self.size_px}"
             )
 
     @property
@@ -107,14 +107,14 @@ class Rig:
         """Why the rig's pictures are not rectified, in a few words; None if they are."""
         left, right = self.left.matrix, self.right.matrix
         if any(optics.fisheye or optics.distortion.any() for optics in (self.left, self.right)):
-            return "lenses that distort"
+            return "lenses with distortion"
         if np.abs(self.rotation - np.eye(3)).max() > _ROTATION_OFF:
-            return f"cameras turned by {self.rotation_degrees:.2f} degrees against each other"
+            return f"cameras rotated by {self.rotation_degrees:.2f} degrees relative to each other"
         aside = self.translation_m / self.baseline_m
         if np.abs(aside - (-1, 0, 0)).max() > _SAME_DIRECTION:
-            return "a right camera that is not straight to the right of the left one"
+            return "a right camera that is not exactly to the right of the left one"
         if np.abs((left - right)[[0, 1, 1], [0, 1, 2]]).max() > _SAME_PX:
-            return "cameras of two focal lengths or heights of the centre"
+            return "cameras with different focal lengths or rows of the principal point"
         return None
 
     def camera(self) -> StereoCamera:
@@ -141,8 +141,7 @@ class Rig:
         if self.size_px not in (None, size_px):
             raise FormatError(
                 f"{self.name}: expected a calibration for pictures of {format_size(size_px)}, found one for "
-                f"{format_size(self.size_px)}; focal length, centre and doffs grow with the picture: "
-                "bring the pictures to that size, or calibrate at theirs"
+                f"{format_size(self.size_px)}; resize the pictures to that size, or calibrate at theirs"
             )
 
 

@@ -84,7 +84,7 @@ def test_the_lines_say_what_to_do(pairs):
     assert str(check_pair(left, turned(right, -1)).lines()[-1]) == (
         "the right picture is turned 1.0 degrees anticlockwise; rectify the pair (rectify)"
     )
-    assert "2.0 times the other's light" in str(check_pair(left, brighter(right, -1)).lines()[-1])
+    assert "2.0 times the other's exposure" in str(check_pair(left, brighter(right, -1)).lines()[-1])
     assert str(check_pair(right, left).lines()[-1]).startswith("left and right are swapped")
     assert str(check_pair(left, right).lines()[-1]).startswith("no defects")
 

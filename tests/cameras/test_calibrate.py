@@ -96,7 +96,7 @@ def test_the_rig_that_took_the_pictures_is_found(taken, tmp_path):
 def test_what_was_found_is_told_in_plain_words(charucos):
     told = calibrate(charucos, CHARUCO).lines()
     assert told[0].startswith("left camera: focal length 5") and told[0].endswith("640x480 px")
-    assert "turned by 2.6" in told[1]
+    assert "rotated by 2.6" in told[1]
     assert "reprojection error 0." in told[2]
     assert told[-1].startswith("fair: 0.") and "over 10 pairs; corners cover only" in told[-1]
 
@@ -121,7 +121,7 @@ def test_a_bad_pair_is_named_and_the_rest_go_on(copied):
     smaller.save(copied / "right" / "04.png")
     found = calibrate(copied, CHARUCO)
     assert set(found.left_out) == {f"left/{number}.png" for number in ("01", "02", "04", "99")}
-    assert "no board was found in the right picture" in found.left_out["left/01.png"]
+    assert "no board was detected in the right picture" in found.left_out["left/01.png"]
     assert "02.png" in found.left_out["left/02.png"]
     assert "left picture is of 640x480, the right one of 320x240" in found.left_out["left/04.png"]
     assert "partner" in found.left_out["left/99.png"]
@@ -145,7 +145,7 @@ def test_pairs_of_another_size_than_most_are_left_out(copied):
             larger = picture.resize((1280, 960))
         larger.save(copied / side / "08.png")
     found = calibrate(copied, CHARUCO)
-    assert found.left_out == {"left/08.png": "of 1280x960, where most are of 640x480"}
+    assert found.left_out == {"left/08.png": "size 1280x960, most pairs have 640x480"}
 
 
 @pytest.mark.parametrize(

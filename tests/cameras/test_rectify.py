@@ -160,11 +160,11 @@ def test_a_rectified_rig_gives_its_camera_and_leaves_the_pictures(rng):
     assert rectified.pair.camera == StereoCamera(
         focal_px=500, baseline_m=0.1, cx_px=310, cy_px=240, doffs_px=12
     )
-    assert "taken as they are" in rectified.notes[-1].text
+    assert "left unchanged" in rectified.notes[-1].text
 
 
 def test_what_was_assumed_and_done_is_said(wall, rig, rng):
-    assert "turned by" in wall.notes[-1].text
+    assert "rotated by" in wall.notes[-1].text
     assumed = Note("metres were assumed")
     notes = rectify.rectify(noise(rng), replace(rig, name="rig.yml", notes=(assumed,))).notes
     assert notes[0] == assumed and "rectified by rig.yml" in notes[1].text
@@ -190,7 +190,7 @@ def test_cameras_that_are_not_side_by_side_are_refused(rng, translation_m, said)
 def test_cameras_that_look_different_ways_are_refused(rng, degrees):
     rotation = turned(0, degrees, 0)
     rig = replace(flat_rig(), rotation=rotation, translation_m=-rotation @ [0.1, 0, 0])
-    with pytest.raises(StereoweaveError, match="expected two cameras that look the same way") as caught:
+    with pytest.raises(StereoweaveError, match="expected two cameras that face the same way") as caught:
         rectify.rectify(noise(rng, 64, 48), replace(rig, size_px=None))
     assert "\n" not in str(caught.value)
 

@@ -72,7 +72,7 @@ def test_a_mended_pair_is_sound_and_of_the_same_size(example, mended):
     assert mended.pair.left.shape == example.left.shape
     assert check_pair(mended.pair.left, mended.pair.right).defects == ()
     assert mended.pair.camera is None
-    assert "matches: their rows are 0." in mended.notes[0].text
+    assert "matches: median vertical error 0." in mended.notes[0].text
 
 
 def test_what_no_picture_shows_is_masked_and_goes_on_from_the_border(mended):

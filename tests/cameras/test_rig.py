@@ -189,7 +189,7 @@ def test_kittis_colour_cameras_are_read_from_calib_txt(tmp_path):
     assert (camera.focal_px, camera.cx_px, camera.cy_px, camera.doffs_px) == (700, 600, 170, 0)
     assert camera.baseline_m == pytest.approx((35 + 336) / 700)
     assert rig.size_px is None
-    assert "2 is taken for the left one" in rig.notes[0].text
+    assert "camera 2 is used as the left one" in rig.notes[0].text
 
 
 def test_kittis_grey_cameras_are_read_where_the_colour_ones_are_missing(tmp_path):
@@ -262,7 +262,7 @@ def test_kalibrs_radtan_is_a_pinhole(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "found"),
     [
-        ("cam1", "cam2", "not two cameras"),
+        ("cam1", "cam2", "no two cameras"),
         ("T_cn_cnm1", "T_cam_imu", "no T_cn_cnm1"),
         ("camera_model: pinhole", "camera_model: omni", "omni"),
         ("distortion_model: equidistant", "distortion_model: fov", "fov"),
@@ -285,13 +285,13 @@ def test_opencvs_yaml_in_millimetres_is_read_in_metres_and_says_so(tmp_path):
     np.testing.assert_array_equal(rig.left.distortion, [-0.28, 0.09, 0, 0, 0])
     np.testing.assert_array_equal(rig.right.matrix, [[552, 0, 321], [0, 553, 241], [0, 0, 1]])
     assert rig.size_px == (640, 480)
-    assert len(rig.notes) == 1 and "taken for millimetres" in rig.notes[0].text
+    assert len(rig.notes) == 1 and "is assumed in millimetres" in rig.notes[0].text
 
 
 def test_a_short_baseline_without_unit_is_taken_for_metres(tmp_path):
     rig = read_rig(stored(tmp_path, OPENCV.replace("-120., 0., 1.", "-0.12, 0., 0.001")))
     np.testing.assert_allclose(rig.translation_m, [-0.12, 0, 0.001])
-    assert "taken for metres" in rig.notes[0].text
+    assert "is assumed in metres" in rig.notes[0].text
 
 
 def test_a_unit_and_a_lens_that_are_stated_need_no_guess(tmp_path):
@@ -309,7 +309,7 @@ def test_four_coefficients_are_a_pinholes_unless_the_file_says_fisheye(tmp_path)
         "550., 0., 320., 0., 551., 240., 0., 0. ]", "550., 0., 320., 0., 551., 240., 0., 0., 1. ]"
     )
     guessed = read_rig(stored(tmp_path, four))
-    assert not guessed.left.fisheye and "taken for pinhole" in guessed.notes[-1].text
+    assert not guessed.left.fisheye and "assumed pinhole" in guessed.notes[-1].text
     for said in ("distortion_model: fisheye", "fisheye_model: 1", "camera_model: Kannala-Brandt"):
         assert read_rig(stored(tmp_path, f"{four}{said}\n")).left.fisheye
 
@@ -371,9 +371,9 @@ def test_extrinsics_are_completed_by_the_intrinsics_beside_them(tmp_path):
 @pytest.mark.parametrize(
     ("more", "found"),
     [
-        ("image_size: 640", "a picture's size of '640', not width and height"),
+        ("image_size: 640", "a picture size '640', not width and height"),
         ("image_size: [640, 480, 3]", "not width and height"),
-        ("M1: {rows: 3}", "{'rows': '3'} in place of numbers"),
+        ("M1: {rows: 3}", "{'rows': '3'} instead of numbers"),
         ("fisheye: maybe", "fisheye: 'maybe', not one of true, yes, on, y, false, no, off, n or a number"),
         ("fisheye: [1]", "fisheye: ['1'], not one of"),
         ("fisheye: .nan", "fisheye: '.nan', not one of"),
@@ -442,10 +442,10 @@ def test_only_a_rectified_rig_gives_a_camera(tmp_path):
         )
     ]
     for unlike, reason in (
-        (replace(flat, left=pinhole()), "lenses that distort"),
-        (replace(flat, rotation=turned(0, 1, 0)), "turned by 1.00 degrees"),
-        (replace(flat, translation_m=np.array([-0.1, 0.01, 0])), "not straight to the right"),
-        (replace(flat, translation_m=np.array([0.1, 0, 0])), "not straight to the right"),
+        (replace(flat, left=pinhole()), "lenses with distortion"),
+        (replace(flat, rotation=turned(0, 1, 0)), "rotated by 1.00 degrees"),
+        (replace(flat, translation_m=np.array([-0.1, 0.01, 0])), "not exactly to the right"),
+        (replace(flat, translation_m=np.array([0.1, 0, 0])), "not exactly to the right"),
         *((replace(flat, right=each), "focal lengths or heights of the centre") for each in other),
     ):
         with pytest.raises(StereoweaveError, match=reason):
