@@ -28,7 +28,7 @@ from stereoweave.matching.backend import Backend
 from stereoweave.pictures.loading import open_pictures
 from stereoweave.pictures.prepare import Request, prepare
 from stereoweave.service.answers import check_pixels
-from stereoweave.service.forms import MapForm, stored
+from stereoweave.service.forms import MapForm, store_uploads
 from stereoweave.stereo import StereoPair
 from stereoweave.video.reader import open_footage
 
@@ -64,7 +64,7 @@ def by_service(folder: Path):
     contents = {side: io.BytesIO((folder / f"{side}.png").read_bytes()) for side in ("left", "right")}
     uploads = {side: UploadFile(content) for side, content in contents.items()}
     (folder / "request").mkdir(exist_ok=True)
-    order = stored(MapForm(**uploads), folder / "request", "disparity.png", 65)
+    order = store_uploads(MapForm(**uploads), folder / "request", "disparity.png", 65)
     check_pixels(order)
     return prepare(order.pictures, order.request).pair
 
@@ -72,7 +72,7 @@ def by_service(folder: Path):
 def by_page(folder: Path):
     pictures = folder / "left.png", folder / "right.png"
     uploads = page_kept.Uploads(pictures=pictures, request=Request(), backend=Backend())
-    return page_kept.matched(uploads, folder / "kept", lambda *_: None).result.pair
+    return page_kept.match_uploads(uploads, folder / "kept", lambda *_: None).result.pair
 
 
 def by_footage(folder: Path):
