@@ -27,7 +27,7 @@ Format = Annotated[
         "--format",
         help="Layout of a picture that holds both views: side_by_side, side_by_side_half, crossed, "
         "crossed_half, top_bottom, top_bottom_half, top_bottom_right_first, top_bottom_right_first_half, "
-        "mpo, jps (default: detected).",
+        "mpo, jps; default: detected.",
     ),
 ]
 Calib = Annotated[
