@@ -104,7 +104,7 @@ def test_pictures_of_two_scenes_and_plain_ones_have_too_few_matches(pairs):
         found = check_pair(left, right)
         assert found.defects == ("too_few_matches",)
         assert found.lines() == found.warnings()
-        assert str(found.lines()[0]).startswith("expected two pictures of one scene, found ")
+        assert str(found.lines()[0]).startswith("expected two pictures of the same scene, found ")
 
 
 def test_each_defect_has_its_words(pairs):

@@ -446,7 +446,7 @@ def test_only_a_rectified_rig_gives_a_camera(tmp_path):
         (replace(flat, rotation=turned(0, 1, 0)), "rotated by 1.00 degrees"),
         (replace(flat, translation_m=np.array([-0.1, 0.01, 0])), "not exactly to the right"),
         (replace(flat, translation_m=np.array([0.1, 0, 0])), "not exactly to the right"),
-        *((replace(flat, right=each), "focal lengths or heights of the centre") for each in other),
+        *((replace(flat, right=each), "focal lengths or rows of the principal point") for each in other),
     ):
         with pytest.raises(StereoweaveError, match=reason):
             unlike.camera()
