@@ -173,7 +173,7 @@ def test_what_was_assumed_and_done_is_said(wall, rig, rng):
 @pytest.mark.parametrize(
     ("translation_m", "said"),
     [
-        ((0.1, 0, 0), "the sides are swapped"),
+        ((0.1, 0, 0), "left and right are swapped"),
         ((0, -0.1, 0), "below the left one"),
         ((0, 0.1, 0), "above the left one"),
         ((0.01, 0, 0.1), "in front of or behind"),
