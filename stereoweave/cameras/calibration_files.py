@@ -246,7 +246,7 @@ def _parse_kalibr(entries: Mapping[str, Any]) -> Rig:
         raise ValueError("no two cameras cam0 and cam1")
     transform = second.get("T_cn_cnm1")
     if transform is None:
-        raise ValueError("no entry T_cn_cnm1 of cam1, the transform from cam0 to cam1")
+        raise ValueError("no T_cn_cnm1 of cam1, the transform from cam0 to cam1")
     to_right = _parse_numbers(transform).reshape(4, 4)
     left, right = _parse_kalibr_optics("cam0", first), _parse_kalibr_optics("cam1", second)
     return Rig(
