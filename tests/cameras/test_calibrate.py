@@ -124,7 +124,7 @@ def test_a_bad_pair_is_named_and_the_rest_go_on(copied):
     assert "no board was detected in the right picture" in found.left_out["left/01.png"]
     assert "02.png" in found.left_out["left/02.png"]
     assert "left picture has 640x480 px, the right one 320x240 px" in found.left_out["left/04.png"]
-    assert "partner" in found.left_out["left/99.png"]
+    assert "the picture of the other camera is missing" in found.left_out["left/99.png"]
     assert len(found.used) == 7
     assert found.rig.baseline_m == pytest.approx(0.1, rel=0.02)
     assert "left/01.png: left out, no board" in "\n".join(found.lines())
