@@ -1,4 +1,4 @@
-"""Stereoweave: a stereo pair in; depth, and any view between the two cameras, out."""
+"""Depth and new views from a stereo pair."""
 
 import importlib
 from typing import TYPE_CHECKING, Any
@@ -52,12 +52,12 @@ __all__ = [
 ]
 
 
-# Every import of a module of the package, in any process, runs this first.
+# Runs before any other module of the package is imported, in every process.
 disable_telemetry()
 
 
 def __getattr__(name: str) -> Any:
-    """The public name, imported when it is first asked for (PEP 562): the package itself loads at once."""
+    """Import a public name on first access (PEP 562), so that importing the package is fast."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)

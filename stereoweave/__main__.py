@@ -1,4 +1,4 @@
-"""`python -m stereoweave`, which is how torchrun starts a training: the commands."""
+"""Entry point of `python -m stereoweave`; torchrun starts a training this way."""
 
 import sys
 

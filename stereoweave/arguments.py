@@ -1,6 +1,6 @@
-"""Arguments of the Python interface that are of a wrong kind: each is one line of a StereoweaveError.
+"""Type checks for arguments of the Python interface; each raises a one-line StereoweaveError.
 
-NumPy is imported inside the functions: the command line's help counts threads, and must not wait for it.
+The functions import NumPy only when called: the command line's help uses these checks and must be fast.
 """
 
 import reprlib
@@ -17,19 +17,19 @@ _DTYPES = {"f": "floats", "u": "uint8", "b": "booleans"}
 
 
 def check_number(name: str, value: object) -> None:
-    """Refuse anything but a number that a float holds, NaN and infinity among them."""
+    """Require a real number within the range of a float; NaN and infinity are allowed."""
     if not isinstance(value, Real) or isinstance(value, bool) or not _is_held_by_float(value):
         raise StereoweaveError(f"{name}: expected a number, got {shown(value)}")
 
 
 def check_whole_number(name: str, value: object) -> None:
-    """Refuse anything but a whole number that a float holds."""
+    """Require an integer within the range of a float."""
     if not isinstance(value, Integral) or isinstance(value, bool) or not _is_held_by_float(value):
         raise StereoweaveError(f"{name}: expected a whole number, got {shown(value)}")
 
 
 def check_flag(name: str, value: object) -> None:
-    """Refuse anything but True and False."""
+    """Require True or False."""
     import numpy as np
 
     if not isinstance(value, bool | np.bool_):
@@ -37,17 +37,14 @@ def check_flag(name: str, value: object) -> None:
 
 
 def check_kind(name: str, value: object, *kinds: type) -> None:
-    """Refuse anything but an instance of these types."""
+    """Require an instance of one of `kinds`."""
     if not isinstance(value, kinds):
         expected = " or ".join(kind.__name__ for kind in kinds)
         raise StereoweaveError(f"{name}: expected {expected}, got {shown(value)}")
 
 
 def check_array(name: str, value: object, kind: str, dimensions: int) -> None:
-    """Refuse anything but an array of a kind of numbers, "f", "u" or "b", of `dimensions` axes.
-
-    A matrix and a masked array are none: they compute otherwise, or leave out what is masked.
-    """
+    """Require a plain array with `dimensions` axes and dtype kind "f", "u" or "b"."""
     if not is_plain_array(value) or value.dtype.kind != kind or value.ndim != dimensions:
         raise StereoweaveError(
             f"{name}: expected an array of {_DTYPES[kind]} with {dimensions} axes, got {shown(value)}"
@@ -55,7 +52,7 @@ def check_array(name: str, value: object, kind: str, dimensions: int) -> None:
 
 
 def check_numbers(name: str, value: object) -> None:
-    """Refuse what is neither a number nor an array of numbers."""
+    """Require a real number or an array of real numbers."""
     import numpy as np
 
     if not isinstance(value, Real | np.ndarray) or np.asarray(value).dtype.kind not in "fiu":
@@ -63,7 +60,7 @@ def check_numbers(name: str, value: object) -> None:
 
 
 def is_plain_array(value: object) -> TypeGuard["np.ndarray"]:
-    """Whether it is an array that computes as arrays do."""
+    """Whether a value is an ndarray, but not a matrix or masked array, whose arithmetic differs."""
     import numpy as np
 
     return isinstance(value, np.ndarray) and not isinstance(value, np.matrix | np.ma.MaskedArray)
@@ -78,7 +75,7 @@ def _is_held_by_float(value: Real) -> bool:
 
 
 def shown(value: object) -> str:
-    """A value in a few words; of an array its type, dtype and shape."""
+    """Describe a value briefly for an error message; an array by type, dtype and shape."""
     import numpy as np
 
     if isinstance(value, np.ndarray):

@@ -1,7 +1,7 @@
-"""Errors that callers may want to catch, and notes on results; both carry their remedy.
+"""Errors and notes, each with its remedy.
 
-A remedy names settings by their Python keyword. Each front end shows its own name for them: an option, a
-field of a form, a label.
+A remedy names settings by their Python keyword. Each front end translates them to its own names: options,
+form fields or labels.
 """
 
 import textwrap
@@ -10,12 +10,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-# A front end's name for a setting, given its Python keyword; None if the front end does not have it.
+# Maps a setting's Python keyword to a front end's name for it; None if the front end lacks the setting.
 NameOf = Callable[[str], str | None]
 
 
 def keyword(setting: str) -> str:
-    """Python's name for a setting."""
+    """Return the setting unchanged: the `NameOf` of the Python interface."""
     return setting
 
 
@@ -24,15 +24,15 @@ class Remedy:
     """What to do about an error or a note.
 
     Attributes:
-        text: Such as "rectify the pair".
-        settings: The settings that do it, by their Python keyword.
+        text: An instruction, such as "rectify the pair".
+        settings: Python keywords of the settings to change.
     """
 
     text: str
     settings: tuple[str, ...] = ()
 
     def worded(self, name_of: NameOf) -> str:
-        """The text and the front end's names; empty if the front end has none of the settings."""
+        """Format with the front end's names for settings; empty if it has none of them."""
         names = [name for name in map(name_of, self.settings) if name]
         if not self.settings:
             return self.text
@@ -41,7 +41,7 @@ class Remedy:
 
 @dataclass(frozen=True)
 class Note:
-    """A line for the user about a pair or its results, with the remedy if there is one."""
+    """One line for the user about a pair or its results."""
 
     text: str
     remedy: Remedy | None = None
@@ -50,17 +50,16 @@ class Note:
         return self.worded(keyword)
 
     def worded(self, name_of: NameOf) -> str:
-        """The line with a front end's names for settings."""
+        """Format with the front end's names for settings."""
         return _with_remedy(self.text, self.remedy, name_of)
 
 
 class StereoweaveError(ValueError):
-    """Invalid input; the base class of all errors of this package.
+    """Invalid input; base class of all errors of this package.
 
     Args:
-        message: What was expected, and what was found.
-        setting: The setting that is wrong, by its Python keyword.
-        remedy: What to do about it.
+        message: What was expected and what was found.
+        setting: Python keyword of the invalid setting.
     """
 
     def __init__(self, message: str, *, setting: str | None = None, remedy: Remedy | None = None) -> None:
@@ -71,17 +70,17 @@ class StereoweaveError(ValueError):
         return self.worded(keyword)
 
     def worded(self, name_of: NameOf) -> str:
-        """The error in one line with a front end's names for settings."""
+        """Format as one line with the front end's names for settings."""
         prefix = f"{name_of(self.setting) or self.setting}: " if self.setting else ""
         return prefix + _with_remedy(self.message, self.remedy, name_of)
 
     def extended(self, text: str) -> "StereoweaveError":
-        """The error with more text before its remedy."""
+        """Return a copy with text inserted before the remedy."""
         return StereoweaveError(f"{self.message}; {text}", setting=self.setting, remedy=self.remedy)
 
 
 class FormatError(StereoweaveError):
-    """Invalid file: its name, what was expected, what was found."""
+    """Invalid or missing file."""
 
 
 class MatcherError(StereoweaveError):
@@ -89,15 +88,15 @@ class MatcherError(StereoweaveError):
 
 
 class ProviderError(MatcherError):
-    """A provider failed while it ran a network, for example out of memory; the same call may work later."""
+    """A provider failed during inference, for example out of memory; a retry may succeed."""
 
 
 class OutputInUseError(StereoweaveError):
-    """Another process writes to the same output."""
+    """Another process is writing to the same output."""
 
 
 def worded(error: Exception, name_of: NameOf) -> str:
-    """An error's message, with a front end's names for settings if it is one of this package."""
+    """Format any exception; a StereoweaveError with the front end's names for settings."""
     return error.worded(name_of) if isinstance(error, StereoweaveError) else str(error)
 
 
@@ -108,7 +107,7 @@ def _with_remedy(text: str, remedy: Remedy | None, name_of: NameOf) -> str:
 
 @contextmanager
 def needing_extra(extra: str, what: str) -> Iterator[None]:
-    """Raise a StereoweaveError that names the extra to install if a library is missing."""
+    """Turn a missing library into a StereoweaveError that names the extra to install."""
     try:
         yield
     except ModuleNotFoundError as missing:
@@ -119,7 +118,7 @@ def needing_extra(extra: str, what: str) -> Iterator[None]:
 
 
 def reason(error: Exception) -> str:
-    """What was found instead of a usable file, as the end of an error message."""
+    """Describe what was found instead of a usable file, to complete "expected ..., found ..."."""
     match error:
         case FileNotFoundError():
             return "no such file"
@@ -135,6 +134,6 @@ def reason(error: Exception) -> str:
             return "one that ends too early"
         case MemoryError():
             return "one that takes more memory than there is"
-    # Libraries quote what they found, which may be all of a file, and in many lines.
+    # Library messages may quote a whole file, over many lines.
     words = textwrap.shorten(str(error)[:1000], 200, placeholder=" ...") or type(error).__name__
     return f"one that cannot be read ({words})"

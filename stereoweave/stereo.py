@@ -1,4 +1,4 @@
-"""The values that travel through Stereoweave, and the geometry between them.
+"""Data types passed between the parts of Stereoweave, and their geometry.
 
 Conventions (docs/conventions.md): pixel centres are integers; column x of the left image is at
 x - disparity in the right one; column x of the right image is at x + right disparity in the left.
@@ -21,22 +21,22 @@ from stereoweave.arguments import (
 )
 from stereoweave.errors import StereoweaveError
 
-# What OpenCV's remapping takes: it counts pixels in 16 bits.
+# Limit of cv2.remap, which indexes pixels with 16 bits.
 LONGEST_SIDE_PX = 32_766
 
-# The two share the operators that are used here, but no base class; PyTorch is not imported outside learn.
+# NumPy arrays and PyTorch tensors have no common base class, and only `learn` imports PyTorch.
 ArrayOrTensor = TypeVar("ArrayOrTensor", bound=Any)
 
-# Pixels, metres and coefficients beyond it are no camera's, and their products would leave float32.
+# No real camera has larger parameters (px, m or coefficients); their products would overflow float32.
 CAMERA_NUMBERS_BELOW = 1e9
-# A code, not what it encodes: so the slope of `DepthCurve.decode` is bounded for any exponent.
+# In units of the code, which bounds the slope of `DepthCurve.decode` for any exponent.
 _STRAIGHT_BELOW = 1e-5
 _LARGEST_FITTED_EXPONENT = 8.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class StereoCamera:
-    """Two rectified cameras: the left one's intrinsics, the baseline, and how far apart their centres lie.
+    """Rectified stereo camera: intrinsics of the left camera, baseline and principal-point offset.
 
     doffs_px is the right camera's cx minus the left's (Middlebury's definition).
     """
@@ -50,7 +50,7 @@ class StereoCamera:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             check_number(name, value)
-        # What is smaller still is 0 in float32, and no depth.
+        # Smaller values underflow to 0 in float32 and give no depth.
         if not (self.focal_px > 1 / CAMERA_NUMBERS_BELOW and self.baseline_m > 1 / CAMERA_NUMBERS_BELOW):
             raise StereoweaveError(
                 f"focal_px and baseline_m must be above {1 / CAMERA_NUMBERS_BELOW:g}, "
@@ -65,7 +65,7 @@ class StereoCamera:
     def centred(
         cls, image: UInt8[np.ndarray, "h w 3"], *, focal_px: float, baseline_m: float
     ) -> "StereoCamera":
-        """The camera of an image [H, W, 3] of which no more is known: its axis meets the image's middle."""
+        """Create a camera whose optical axis passes through the centre of the image [H, W, 3]."""
         check_array("image", image, "u", 3)
         height, width = image.shape[:2]
         return cls(focal_px=focal_px, baseline_m=baseline_m, cx_px=(width - 1) / 2, cy_px=(height - 1) / 2)
@@ -78,7 +78,7 @@ class StereoCamera:
             return self.focal_px * self.baseline_m / shifted_px
 
     def disparity_px(self, depth_m: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-        """Disparity in pixels of a depth in metres: the inverse of `depth_m`."""
+        """Disparity in pixels from depth in metres: the inverse of `depth_m`."""
         check_numbers("depth_m", depth_m)
         with np.errstate(divide="ignore"):
             return self.focal_px * self.baseline_m / depth_m - self.doffs_px
@@ -86,10 +86,10 @@ class StereoCamera:
 
 @dataclass(frozen=True, kw_only=True)
 class StereoPair:
-    """Two rectified photographs of one moment, uint8 RGB of one size, and their camera where it is known.
+    """Rectified left and right images, uint8 RGB of equal size, and their camera if known.
 
-    left_seen and right_seen, bool [H, W], are False where a picture shows nothing, as at the borders that
-    rectification leaves; None where it is full.
+    left_seen and right_seen, bool [H, W], are False at pixels without content, such as the borders left by
+    rectification; None if every pixel has content.
     """
 
     left: UInt8[np.ndarray, "h w 3"]
@@ -123,7 +123,7 @@ class StereoPair:
                 )
 
     def mirrored(self) -> "StereoPair":
-        """The pair as a mirror shows it, without its camera: what was the right view is now the left one."""
+        """Return the pair flipped horizontally, with its views swapped and without its camera."""
         return StereoPair(
             left=np.ascontiguousarray(self.right[:, ::-1]),
             right=np.ascontiguousarray(self.left[:, ::-1]),
@@ -134,13 +134,13 @@ class StereoPair:
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """What a matcher found in a pair; every array is [H, W] and finite.
+    """Matching result for a pair; every array is [H, W] and finite.
 
     Attributes:
         disparity_px: float32, for the left view: column x is at x - disparity_px in the right image.
         right_disparity_px: float32, for the right view: column x is at x + right_disparity_px in the left.
         confidence: float32 in 0..1, the estimated probability that disparity_px is within 1 px.
-        occluded: pixels that the left camera alone sees.
+        occluded: pixels that only the left camera sees.
     """
 
     disparity_px: Float[np.ndarray, "h w"]
@@ -171,7 +171,7 @@ class Estimate:
 
 
 def check_fits(estimate: Estimate, pair: StereoPair) -> None:
-    """Raise a StereoweaveError unless the estimate is of the size of the pair."""
+    """Require an estimate of the same size as the pair."""
     check_kind("estimate", estimate, Estimate)
     check_kind("pair", pair, StereoPair)
     found, expected = estimate.disparity_px.shape, pair.left.shape[:2]
@@ -184,7 +184,7 @@ def check_fits(estimate: Estimate, pair: StereoPair) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """A synthesized photograph: image uint8 RGB [H, W, 3], and which of its pixels a camera really saw."""
+    """Synthesized image, uint8 RGB [H, W, 3]; `drawn` marks the pixels that a camera saw."""
 
     image: UInt8[np.ndarray, "h w 3"]
     drawn: Bool[np.ndarray, "h w"]
@@ -192,13 +192,13 @@ class View:
 
 @dataclass(frozen=True, kw_only=True)
 class Sample:
-    """A pair with exact ground truth, for training and scoring; unknown disparity is NaN.
+    """Stereo pair with exact ground truth for training and evaluation; unknown disparity is NaN.
 
     Attributes:
         left, right: uint8 RGB [H, W, 3].
         disparity_px, right_disparity_px: float32 [H, W], signs as in `Estimate`.
-        occluded, right_occluded: bool [H, W], seen by this camera alone.
-        camera: the camera, where it is known.
+        occluded, right_occluded: bool [H, W], pixels that only this view's camera sees.
+        camera: the camera, if known.
     """
 
     left: UInt8[np.ndarray, "h w 3"]
@@ -212,14 +212,15 @@ class Sample:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthCurve:
-    """The depth adjustment of "Fast Depth Estimation for View Synthesis": disparity or depth <-> code.
+    """Depth adjustment of "Fast Depth Estimation for View Synthesis": disparity or depth <-> code.
 
-    The code is u^p (equation 3), where u is d / d_max or 1 - z / z_max: 0 is far and 1 is near, and p >= 1
-    gives the near more of the range. Exactly one of the two maxima is given, and says which of the two it is.
+    The code is u^p (equation 3), where u is d / d_max or 1 - z / z_max: 0 is far, 1 is near, and p >= 1
+    gives near surfaces more of the range. Set max_disparity_px to encode disparity or max_depth_m to encode
+    depth, not both.
 
-    One deviation: below a code of 1e-5 the curve is the straight line to 0. The slope of the paper's
-    x^(1/p) (equation 4) is infinite at 0; this one's is at most 1e5 for any p, and 46 for p = 1.5. The code
-    differs by less than 1e-5 (1.5e-6 for p = 1.5), and `encode` and `decode` stay exact inverses.
+    One deviation: below a code of 1e-5 the curve is a straight line to 0. The slope of the paper's x^(1/p)
+    (equation 4) is infinite at 0; here it is at most 1e5 for any p, and 46 for p = 1.5. The code differs by
+    less than 1e-5 (1.5e-6 for p = 1.5), and `encode` and `decode` stay exact inverses.
     """
 
     exponent: float = 1.5
@@ -244,11 +245,14 @@ class DepthCurve:
             raise StereoweaveError(f"exponent must be finite and at least 1, got {self.exponent}")
 
     def encode(self, values: ArrayOrTensor) -> ArrayOrTensor:
-        """The code in 0..1 of disparity in px or depth in m, of the same shape and kind; NaN stays NaN.
+        """Encode disparity in px or depth in m as a code in 0..1 of the same shape; NaN stays NaN.
 
         Args:
-            values: Array or tensor of any shape: disparity in 0..max_disparity_px, or depth above 0 and up
-                to max_depth_m; NaN where unknown. Anything else is a StereoweaveError.
+            values: Array or tensor of any shape: disparity in 0..max_disparity_px, or depth above 0 and at
+                most max_depth_m; NaN where unknown.
+
+        Raises:
+            StereoweaveError: A value is outside the range.
         """
         if self.max_disparity_px is not None:
             outside = values[(values < 0) | (values > self.max_disparity_px)]
@@ -259,7 +263,7 @@ class DepthCurve:
         return self.encode_estimate(values)
 
     def encode_estimate(self, values: ArrayOrTensor) -> ArrayOrTensor:
-        """As `encode`, of an estimate, which may lie outside of the range: the curve goes on there."""
+        """Encode estimated values, extrapolating the curve outside the range instead of raising."""
         if self.max_disparity_px is not None:
             straight = values / self.max_disparity_px
         else:
@@ -267,9 +271,9 @@ class DepthCurve:
         return straight * straight.clip(min=_STRAIGHT_BELOW ** (1 / self.exponent)) ** (self.exponent - 1)
 
     def decode(self, code: ArrayOrTensor) -> ArrayOrTensor:
-        """Disparity in px or depth in m of a code in 0..1: the inverse of `encode`.
+        """Disparity in px or depth in m from a code in 0..1: the inverse of `encode`.
 
-        Value and gradient are finite on all of [0, 1]: 0 is far (disparity 0, or max_depth_m), 1 is near.
+        Value and gradient are finite on all of [0, 1]. 0 is far (disparity 0 or max_depth_m), 1 is near.
         """
         straight = code * code.clip(min=_STRAIGHT_BELOW) ** (1 / self.exponent - 1)
         if self.max_disparity_px is not None:
@@ -278,16 +282,15 @@ class DepthCurve:
 
 
 def fit_exponent(histogram: Real[np.ndarray, " n"]) -> float:
-    """The exponent p of a `DepthCurve`, 1 to 8, that suits a training set.
+    """Fit the exponent p of a `DepthCurve`, 1 to 8, to a training set.
 
-    The paper starts p by "curve fitting to the histogram of the training ground truth" and does not say
-    which. This is the p whose u^p is nearest, in least squares at the edges of the bins, to the cumulative
-    histogram, which is the curve that equalises: the codes then spread as evenly over 0..1 as u^p can make
-    them, and each part of the output serves as many pixels. A set that is mostly far asks for p < 1 and
-    gets 1, the paper's lower bound.
+    The paper initialises p by "curve fitting to the histogram of the training ground truth" and gives no
+    details. Here u^p is fitted by least squares, at the bin edges, to the cumulative histogram, which is the
+    equalising curve: codes then spread over 0..1 as evenly as u^p allows. A set of mostly far pixels would
+    need p < 1 and gets 1, the paper's lower bound.
 
     Args:
-        histogram: Counts [N], N >= 2, of the known truth in equal bins over 0..1, before the exponent:
+        histogram: Counts [N], N >= 2, of known ground truth in equal bins over u in 0..1, where u is
             d / d_max or 1 - z / z_max.
     """
     if histogram.size < 2 or not (histogram >= 0).all() or not 0 < histogram.sum() < math.inf:
@@ -298,7 +301,7 @@ def fit_exponent(histogram: Real[np.ndarray, " n"]) -> float:
     edges = np.arange(1, histogram.size) / histogram.size
     cumulative = histogram.cumsum()[:-1] / histogram.sum()
     low, high = 1.0, _LARGEST_FITTED_EXPONENT
-    for _ in range(4):  # each search leaves 2 of 50 steps to the next
+    for _ in range(4):  # each pass narrows the interval to 2 of its 50 steps
         exponents = np.linspace(low, high, 51)
         best = ((edges ** exponents[:, None] - cumulative) ** 2).sum(1).argmin()
         low, high = exponents[max(best - 1, 0)], exponents[min(best + 1, 50)]

@@ -69,8 +69,8 @@ ERRORS = {
     "provider: expected one of cpu, cuda, tensorrt, openvino, coreml, directml, found 'gpu'": (
         lambda: sw.Matcher(provider="gpu")
     ),
-    "range_px: expected disparities of -64 to 64 px, the width of the pictures, got 70 and 80; leave it out "
-    "to have it found": lambda: sw.estimate(BLACK, BLACK, range_px=(70, 80)),
+    "range_px: expected disparities of -64 to 64 px, the width of the pictures, got 70 and 80; omit it for "
+    "automatic detection": lambda: sw.estimate(BLACK, BLACK, range_px=(70, 80)),
     "threads: expected 1 or more, got 0; 1024 at most": lambda: sw.Matcher(threads=0),
     "position: expected -1.0 to 2.0 (0 left camera, 1 right), got 3": (
         lambda: sw.synthesize(BLACK, BLACK, 3, threads=1)

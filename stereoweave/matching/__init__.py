@@ -1,1 +1,1 @@
-"""From a pair to an estimate."""
+"""Stereo matching: from a pair to an estimate."""

@@ -1,4 +1,4 @@
-"""What pairs are matched with: a network, its threads and its provider."""
+"""Network, threads and provider used for matching."""
 
 import functools
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from stereoweave.system.threads import thread_count
 
 @dataclass(frozen=True, kw_only=True)
 class Backend:
-    """A network and what runs it; a process loads each once.
+    """A network and how it runs; each process loads it once.
 
     Attributes:
         model: Name of a shipped network, `best`, or path of an .onnx matcher.
-        threads: Threads that a call may use; default: all cores.
-        provider: What the network runs on, a name in `providers.PROVIDERS`.
+        threads: Maximum number of threads per call; default: all cores.
+        provider: Execution provider, a name in `providers.PROVIDERS`.
     """
 
     model: str | Path = "small"
@@ -24,7 +24,7 @@ class Backend:
     provider: str = CPU
 
     def matcher(self) -> Matcher:
-        """The loaded network; it is loaded again if its file has changed.
+        """Load the network, or return the cached one if its file is unchanged.
 
         Raises:
             StereoweaveError: The number of threads is invalid.
@@ -38,5 +38,5 @@ class Backend:
 
 @functools.lru_cache(maxsize=4)
 def _load(backend: Backend, path: Path, modified_ns: int) -> Matcher:
-    # The last two are part of the key alone: a relative path may have become another file's.
+    # path and modified_ns only serve as cache key: a relative path may now name another file.
     return Matcher(backend.model, threads=backend.threads, provider=backend.provider)

@@ -137,7 +137,7 @@ def _within_width(range_px: tuple[float, float], width_px: int) -> tuple[float, 
     if low_px >= width_px or high_px <= -width_px:
         raise StereoweaveError(
             f"expected disparities of {-width_px} to {width_px} px, the width of the pictures, "
-            f"got {low_px:g} and {high_px:g}; leave it out to have it found",
+            f"got {low_px:g} and {high_px:g}; omit it for automatic detection",
             setting="range_px",
         )
     return max(low_px, -width_px), min(high_px, width_px)

@@ -1,19 +1,19 @@
-"""Left-right consistency check: what each view finds at the other view's match."""
+"""Left-right consistency check of the two views' disparities."""
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 OCCLUSION_STEP_PX = 1.0
-"""A nearer surface this much in front of a pixel's match hides it; less is the two views' disagreement."""
-# Rows checked at once: a picture of 50 megapixels would need another gigabyte.
+"""A surface at the match that is nearer by more than this occludes the pixel; less is matching error."""
+# Rows checked at once; checking 50 megapixels at once would take another gigabyte.
 _BAND_ROWS = 256
 
 
 def find_occluded(
     disparity_px: Float[np.ndarray, "h w"], right_disparity_px: Float[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Left pixels whose match is outside the right picture, or hidden there by a nearer surface."""
+    """Mask of left pixels whose match is outside the right image or behind a nearer surface."""
     occluded = np.empty(disparity_px.shape, bool)
     for top in range(0, len(occluded), _BAND_ROWS):
         rows = slice(top, top + _BAND_ROWS)
@@ -24,7 +24,7 @@ def find_occluded(
 def measure_disagreement(
     disparity_px: Float[np.ndarray, "h w"], right_disparity_px: Float[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Right disparity at each left pixel's match less its own, in px, and where the match is inside."""
+    """Right disparity at each left pixel's match minus its own, in px; mask of matches inside the image."""
     seen_px, inside = at_match(right_disparity_px, disparity_px, -1)
     return seen_px - disparity_px, inside
 
@@ -32,20 +32,20 @@ def measure_disagreement(
 def is_occluded(
     disagreement_px: Float[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Where a disagreement of the two views means that only the left camera sees the pixel."""
+    """Mask of pixels that, by the two views' disagreement, only the left camera sees."""
     return ~inside | (disagreement_px > OCCLUSION_STEP_PX)
 
 
 def at_match(
     values: Shaped[np.ndarray, "h w"], disparity_px: Float[np.ndarray, "h w"], direction: int
 ) -> tuple[Shaped[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """The other view's values at each pixel's match, and where the match is inside its picture.
+    """Sample the other view's values at each pixel's match; mask of matches inside that image.
 
-    Beyond a border its last column is taken.
+    Matches outside take the border column's value.
 
     Args:
-        values: Of the other view, float32 or uint8.
-        disparity_px: Of this view.
+        values: Values of the other view, float32 or uint8.
+        disparity_px: Disparity of this view.
         direction: -1 for the left view's disparity, whose matches are to the left; 1 for the right view's.
     """
     height, width = disparity_px.shape

@@ -1,4 +1,4 @@
-"""An estimate whose occluded pixels take the disparity of the background beside them."""
+"""Fill occluded pixels with the disparity of the background beside them."""
 
 from dataclasses import replace
 
@@ -8,29 +8,28 @@ from jaxtyping import Bool, Float32, Int
 
 from stereoweave.stereo import Estimate
 
-# The median of so many visible pixels stands for an end of a run: the first is often a mix of two surfaces.
+# Visible pixels whose median represents one end of a run: the first alone often mixes two surfaces.
 _END_PX = 7
 _MEDIAN_PX = 5
-# The network's own disparity stays where it is this far from the filled one, and between the disparities of
-# the visible pixels around: there the fill is the worse of two guesses. Around are 11x11 places of a grid
-# that has every fourth pixel of every fourth row.
+# The network's disparity is kept where it differs from the fill by more than this and lies between the
+# disparities of the surrounding visible pixels: there the fill is less accurate. The surroundings are 11x11
+# points of a grid with a spacing of 4 px.
 _FAR_OFF_PX = 10.0
 _SPACING_PX, _AROUND = 4, 11
-# The share of the confidence beside a run in that of a pixel filled from there; its own claim has the rest.
-# Fitted on collages and rendered pairs: the claim alone is 0.02 to 0.12 too low there, this is off by 0.02 to
-# 0.06.
+# Weight of the background's confidence in a filled pixel; the network's own has the rest. Fitted on collages
+# and rendered pairs: the network's alone is 0.02 to 0.12 too low, the mixture is off by 0.02 to 0.06.
 _SHARE_BESIDE = np.float32(0.4)
 
 
 def fill_occluded(estimate: Estimate, left_seen: Bool[np.ndarray, "h w"] | None = None) -> Estimate:
-    """The estimate with its occluded pixels filled from the farther visible surface in their row.
+    """Fill occluded pixels from the farther visible surface in their row.
 
-    Visible pixels stay as they are, and so does `occluded`. The confidence of a filled pixel is brought
-    nearer to that of the surface it is filled from; where it is 0 it stays.
+    Visible pixels and the `occluded` mask do not change. A filled pixel's confidence moves towards that of
+    the surface that fills it; a confidence of 0 stays 0.
 
     Args:
-        estimate: Its disparities go on where it is occluded.
-        left_seen: Where the left picture shows something that they can go on from; everywhere if left out.
+        estimate: The estimate to fill.
+        left_seen: Mask of left pixels with content, which the fill may come from; default: all.
     """
     occluded = estimate.occluded
     visible = ~occluded if left_seen is None else ~occluded & left_seen
@@ -52,9 +51,10 @@ def fill_occluded(estimate: Estimate, left_seen: Bool[np.ndarray, "h w"] | None 
 def _background(
     estimate: Estimate, visible: Bool[np.ndarray, "h w"]
 ) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
-    """Disparity and confidence at the farther end of the run of each pixel that is not visible, row by row.
+    """Disparity and confidence of the background for each invisible pixel, in row-major order.
 
-    They are the pixel's own in a row without a visible one.
+    The background is the farther of the two ends of the pixel's run of invisible pixels. In a row without
+    visible pixels the pixel keeps its own values.
     """
     hidden = np.pad(~visible, ((0, 0), (1, 1)))
     changes = np.flatnonzero(hidden.ravel()[1:] != hidden.ravel()[:-1])
@@ -82,7 +82,7 @@ def _medians(
     rows: Int[np.ndarray, "n 1"],
     columns: Int[np.ndarray, "n k"],
 ) -> Float32[np.ndarray, " n"]:
-    """The median of the visible pixels among some of a row, the lesser of two; NaN without any."""
+    """Lower median of the visible pixels among the given columns of each row; NaN if there are none."""
     last = values.shape[1] - 1
     at = rows, columns.clip(0, last)
     known = (columns >= 0) & (columns <= last) & visible[at]
@@ -97,7 +97,7 @@ def _within_surroundings(
     rows: Int[np.ndarray, " n"],
     columns: Int[np.ndarray, " n"],
 ) -> Bool[np.ndarray, " n"]:
-    """Whether the disparity at each of these pixels is between those of the visible pixels around it."""
+    """Whether each pixel's disparity lies within the range of the visible pixels around it."""
     some = np.s_[::_SPACING_PX, ::_SPACING_PX]
     known, some_px = visible[some], disparity_px[some]
     window = np.ones((_AROUND, _AROUND), np.uint8)

@@ -1,4 +1,4 @@
-"""OpenCV's matchers, set as its sample sets them, and their maps filled and checked as their users do."""
+"""OpenCV's matchers with the settings of its sample, hole filling and left-right confidence."""
 
 from collections.abc import Callable
 from functools import partial
@@ -10,17 +10,17 @@ from jaxtyping import Bool, Float32, UInt8
 from stereoweave.stereo import StereoPair
 
 MapMatch = Callable[[StereoPair], Float32[np.ndarray, "h w"]]
-"""A pair to the disparity in px of its left view [H, W]; values <= 0 are holes."""
+"""Computes the left view's disparity in px [H, W] of a pair; values <= 0 are holes."""
 
 SGBM = "sgbm"
 DISPARITIES = 192
 
 
 def _sgbm(mode: int) -> MapMatch:
-    """The semi-global matcher over 192 disparities.
+    """Create a semi-global block matcher over 192 disparities.
 
-    Source of the settings: OpenCV's sample stereo_match.cpp at a block size of 5 (P1 = 8*3*5*5,
-    P2 = 32*3*5*5), with the speckle range of 2 that StereoSGBM's documentation recommends; the sample has 32.
+    Settings: OpenCV's sample stereo_match.cpp at a block size of 5 (P1 = 8*3*5*5, P2 = 32*3*5*5), except
+    that the speckle range is 2, as StereoSGBM's documentation recommends, and not the sample's 32.
     """
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,
@@ -39,7 +39,7 @@ def _sgbm(mode: int) -> MapMatch:
 
 
 def _bm() -> MapMatch:
-    """The block matcher over 192 disparities, set as in the same sample, with the same speckle range."""
+    """Create a block matcher over 192 disparities: the same sample's settings, speckle range 2."""
     matcher = cv2.StereoBM.create(numDisparities=DISPARITIES, blockSize=9)
     matcher.setPreFilterCap(31)
     matcher.setTextureThreshold(10)
@@ -58,13 +58,13 @@ OPENCV_MATCHERS: dict[str, Callable[[], MapMatch]] = {
     "sgbm_3_way": partial(_sgbm, cv2.STEREO_SGBM_MODE_SGBM_3WAY),
     "bm": _bm,
 }
-"""What makes each of them."""
+"""Matcher name to factory."""
 
 
 def fill_rows(disparity_px: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """The map with each hole (<= 0) filled from the farther of its known neighbours along the row.
+    """Fill each hole (<= 0) with the farther of the nearest known values to its left and right.
 
-    A row without any takes the one above; above the first row that has some, holes stay.
+    A row without known values copies the row above; holes above the first row with known values remain.
     """
     known = disparity_px > 0
     occupied = known.max(axis=1)
@@ -78,10 +78,9 @@ def fill_rows(disparity_px: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "
 def left_right_confidence(
     disparity_px: Float32[np.ndarray, "h w"], right_disparity_px: Float32[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"]:
-    """How little the two views' disparities disagree at a pixel and its match: 0 px at best, else negative.
+    """Negated left-right disagreement in px: 0 at best; a ranking, not a probability.
 
-    It orders pixels, and is no probability. Minus infinity where either is a hole (<= 0), or the match lies
-    outside of the right view.
+    Minus infinity where either disparity is a hole (<= 0) or the match lies outside the right view.
     """
     width = disparity_px.shape[1]
     matches = np.rint(np.arange(width) - disparity_px).astype(int)
@@ -93,7 +92,7 @@ def left_right_confidence(
 def _with_room(
     matcher: cv2.StereoMatcher, left: UInt8[np.ndarray, "h w *c"], right: UInt8[np.ndarray, "h w *c"]
 ) -> Float32[np.ndarray, "h w"]:
-    # OpenCV gives no answer in the first 192 columns: a border gives them that room.
+    # OpenCV leaves the first 192 columns empty, so pad the left border by as many.
     left, right = (
         cv2.copyMakeBorder(image, 0, 0, DISPARITIES, 0, cv2.BORDER_REPLICATE) for image in (left, right)
     )
@@ -103,7 +102,7 @@ def _with_room(
 def _last_known(
     values: Float32[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"]:
-    """At each pixel the nearest known value at or before it in the row; infinity where there is none."""
+    """Nearest known value at or before each pixel in its row; infinity if there is none."""
     columns = np.maximum.accumulate(np.where(known, np.arange(values.shape[1]), -1), axis=1)
     last = np.take_along_axis(values, np.maximum(columns, 0), axis=1)
     return np.where(columns >= 0, last, np.float32(np.inf))

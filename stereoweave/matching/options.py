@@ -1,4 +1,4 @@
-"""How a pair is matched: the options that every way to an estimate takes."""
+"""Matching options shared by all interfaces."""
 
 import math
 from collections.abc import Sequence
@@ -12,14 +12,14 @@ from stereoweave.errors import Remedy, StereoweaveError
 
 @dataclass(frozen=True, kw_only=True)
 class MatchOptions:
-    """How a pair is matched; invalid options are refused before any work.
+    """Matching options, validated on construction.
 
     Attributes:
-        range_px: Least and greatest disparity of the left view in px; what is found outside is clipped, with
-            confidence 0. Default: found from the pair where the network, within its own range, is uncertain.
-        refined: Match once more at full resolution, with the network's disparity as prior: thin things and
-            sharper edges, in more time.
-        raw: Return the network's own disparity: occluded pixels not filled, no subpixel refinement.
+        range_px: Least and greatest disparity of the left view in px; values outside are clipped and get
+            confidence 0. Default: the network's range, extended where the pair shows that it is too small.
+        refined: Match once more at full resolution with the network's disparity as prior: slower, with thin
+            structures and sharper edges.
+        raw: Return the network's disparity without subpixel refinement and occlusion filling.
 
     Raises:
         StereoweaveError: `range_px` is not two finite numbers in ascending order, or both `refined` and `raw`
@@ -51,7 +51,7 @@ def _checked_range(range_px: tuple[float, float]) -> tuple[float, float]:
     if not is_row or len(range_px) != 2:
         raise StereoweaveError(
             "expected the least and the greatest disparity in px, such as (-20, 150); "
-            "leave it out to have it found",
+            "omit it for automatic detection",
             setting="range_px",
         )
     for value in range_px:
@@ -60,7 +60,7 @@ def _checked_range(range_px: tuple[float, float]) -> tuple[float, float]:
     if not (math.isfinite(low_px) and math.isfinite(high_px) and low_px < high_px):
         raise StereoweaveError(
             f"expected the least and the greatest disparity in px, got {low_px:g} and {high_px:g}; "
-            "leave it out to have it found",
+            "omit it for automatic detection",
             setting="range_px",
         )
     return low_px, high_px

@@ -39,7 +39,7 @@ ERRORS = {
     f"depth {PAIR} --raw --refined -o out": "--raw: expected without refined: it is the network's own "
     "disparity; leave one of them out (--raw, --refined)",
     f"depth {PAIR} --range 700,800 -o out": "--range: expected disparities of -640 to 640 px, the width of "
-    "the pictures, got 700 and 800; leave it out to have it found",
+    "the pictures, got 700 and 800; omit it for automatic detection",
     f"depth {PAIR} --provider gpu -o out": "--provider: expected one of cpu, cuda, tensorrt, openvino, "
     "coreml, directml, found 'gpu'",
     f"depth {PAIR} --list list.txt -o out": "expected pictures or a folder, patterns of left and right "

@@ -44,8 +44,8 @@ ERRORS: dict[str, tuple[str, dict[str, str], dict[str, Any]]] = {
     ),
     "expected a camera, for metres, found none; give a calibration, or the focal length and baseline of a "
     "rectified pair (calib, focal_px, baseline_m)": ("/depth", PAIR, {}),
-    "range: expected disparities of -640 to 640 px, the width of the pictures, got 700 and 800; leave it out "
-    "to have it found": ("/disparity", PAIR, {"range": "700,800"}),
+    "range: expected disparities of -640 to 640 px, the width of the pictures, got 700 and 800; omit it for "
+    "automatic detection": ("/disparity", PAIR, {"range": "700,800"}),
     "position: expected -1.0 to 2.0 (0 left camera, 1 right), got 3.5": (
         "/view",
         PAIR,
