@@ -1,7 +1,7 @@
-"""The range of disparities of a pair, whatever it is: from sparse matches along the rows.
+"""Disparity range of a pair from sparse matches, without limits on the disparity.
 
-Both photographs are made small, and on some of their rows what stands out in the left one is looked for along
-the whole row of the right one, in either direction.
+In some rows of the downsampled pair, high-contrast pixels of the left image are searched along the whole row
+of the right one.
 """
 
 from typing import NamedTuple
@@ -14,34 +14,33 @@ from stereoweave.stereo import StereoPair
 
 _WIDTH_PX = 384
 _ROWS = 32
-# What is compared: so many rows by so many columns.
+# Size of the windows that are compared.
 _WINDOW_ROWS, _WINDOW_COLUMNS = 7, 11
-# At most one place in so many columns is looked for, where grey levels vary by so much.
+# At most one pixel per this many columns is searched, and only if its window has this contrast.
 _SPACING_PX = 6
 _LEAST_CONTRAST_LEVELS = 3.0
-# A match is so like (1 is equal), and what else is like it in the row is less so.
+# Least correlation of a match (1 is equal), and the ratio test against the second-best peak in the row.
 _LEAST_LIKENESS = 0.8
 _MOST_AMBIGUOUS = 0.7
 _PEAK_PX = 2
-# A match counts if so many are near it, in the cells of a grid in columns, rows and disparity and next to it.
+# A match counts if this many lie in its cell or the adjacent ones of a grid over column, row and disparity.
 _SUPPORT = 4
 _CELL_PX = (32, 32, 3)
 _LEAST_MATCHES = 30
 _ENDS_PERCENT = 0.5
-# What the matches did not meet is nearer by so much of their range, and so many px of the small ones.
+# Margin for nearer surfaces without matches: a share of the range plus px of the downsampled pair.
 _MARGIN_SHARE, _MARGIN_PX = 0.06, 2.0
-# Of the matches in a part of the picture, so many and such a share have to lie beyond a range.
+# A region exceeds a range if at least this number and share of its matches do.
 _LEAST_BEYOND, _LEAST_SHARE_BEYOND = 6, 0.1
 _SLACK_PX = 0.6
 
 
 class _Texture(NamedTuple):
-    """The windows of a small grey picture, freed of brightness.
+    """Windows of a small grey image, with the local mean removed.
 
     Attributes:
-        windows: Grey levels less their mean around, in the window that has a pixel of column x in its middle;
-            by its first row and x.
-        scale: What makes the window around a pixel one of length 1; 0 where it is plain, and matches nothing.
+        windows: Grey levels minus their local mean, in windows [first row, centre column, rows, columns].
+        scale: Factor that normalises the window around a pixel to length 1; 0 if it is plain, to exclude it.
     """
 
     windows: Float32[np.ndarray, "h2 w r c"]
@@ -49,13 +48,13 @@ class _Texture(NamedTuple):
 
 
 def find_range(pair: StereoPair) -> tuple[float, float] | None:
-    """The least and the greatest disparity of the left view in px, negative ones included.
+    """Find the least and greatest disparity of the left view in px, which may be negative.
 
-    The greatest has a margin, for what the matches did not meet. The least has none: a network takes a plain
-    sky for what is at the lower end of its range (5 px lower doubles the wrong pixels of a rendered ship).
+    The greatest has a margin for nearer surfaces without matches. The least has none, because a network puts
+    a plain sky at the lower end of its range (5 px lower doubles the wrong pixels of a rendered ship).
 
-    None where too little of one picture is found in the other, as in plain pictures, or in two that are no
-    pair. What the pictures do not show is not looked at.
+    Pixels without content are ignored. Returns None if there are too few matches, as in plain images or
+    images of different scenes.
     """
     disparity_px = _disparities(pair, None)
     if len(disparity_px) < _LEAST_MATCHES:
@@ -66,7 +65,7 @@ def find_range(pair: StereoPair) -> tuple[float, float] | None:
 
 
 def goes_beyond(pair: StereoPair, where: Bool[np.ndarray, "h w"], range_px: tuple[float, float]) -> bool:
-    """Whether something in a part of the left picture has a disparity outside of a range."""
+    """Whether a region of the left image contains disparities outside a range."""
     slack_px = _SLACK_PX * _scale(pair.left)
     disparity_px = _disparities(pair, where)
     beyond = (disparity_px < range_px[0] - slack_px) | (disparity_px > range_px[1] + slack_px)
@@ -74,13 +73,13 @@ def goes_beyond(pair: StereoPair, where: Bool[np.ndarray, "h w"], range_px: tupl
 
 
 def _scale(photo: UInt8[np.ndarray, "h w 3"]) -> float:
-    """How many times smaller the picture is made."""
+    """Factor by which the image is downsampled."""
     width = photo.shape[1]
     return width / min(width, _WIDTH_PX)
 
 
 def _disparities(pair: StereoPair, where: Bool[np.ndarray, "h w"] | None) -> Float[np.ndarray, " n"]:
-    """The disparities in px of places that stand out, `where` that is wished if given."""
+    """Disparities in px of the matched pixels, only those in the mask `where` if given."""
     left, right = _small_grey(pair.left), _small_grey(pair.right)
     wanted = _inner(pair.left_seen, left)
     if where is not None:
@@ -105,7 +104,7 @@ def _small_mask(
 def _inner(
     seen: Bool[np.ndarray, "h w"] | None, small: Float32[np.ndarray, "h2 w2"]
 ) -> Bool[np.ndarray, "h2 w2"]:
-    """Where a small picture shows something in all of the window: what begins beside it is no texture."""
+    """Mask of pixels whose whole window has content, since the border of the content is not texture."""
     if seen is None:
         return np.ones(small.shape, bool)
     window = np.ones((_WINDOW_ROWS + 2, _WINDOW_COLUMNS + 2), np.uint8)
@@ -118,13 +117,13 @@ def _row_matches(
     wanted: Bool[np.ndarray, "h w"],
     seen: Bool[np.ndarray, "h w"],
 ) -> Float[np.ndarray, "n 3"]:
-    """Column, row and disparity in px of what both grey pictures show on a row, and nothing else is like.
+    """Column, row and disparity in px of unambiguous matches that agree in both directions.
 
     Args:
-        left: The left picture, in grey levels.
-        right: The right one.
-        wanted: Where the left one is looked at.
-        seen: Where the right one is.
+        left: Left image, grey levels.
+        right: Right image, grey levels.
+        wanted: Mask of left pixels to match.
+        seen: Mask of right pixels that may match.
     """
     height = left.shape[0]
     rows = np.linspace(_WINDOW_ROWS // 2, height - 1 - _WINDOW_ROWS // 2, min(_ROWS, height // 4))
@@ -142,9 +141,9 @@ def _row_matches(
 def _peaks(
     likeness: Float32[np.ndarray, "n w"],
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """The column that is most like, how far from it the peak is, and whether it is like and nothing else is.
+    """Best column in each row of `likeness`, the subpixel offset of its peak, and whether it is unambiguous.
 
-    What is near a peak is overwritten.
+    Overwrites the values near the peaks.
     """
     width = likeness.shape[1]
     each, best = np.arange(len(likeness)), likeness.argmax(1)
@@ -152,7 +151,7 @@ def _peaks(
     near = np.clip(best[:, None] + np.arange(-_PEAK_PX, _PEAK_PX + 1), 0, width - 1)
     np.put_along_axis(likeness, near, -1, 1)
     sure = (highest >= _LEAST_LIKENESS) & (1 - highest <= _MOST_AMBIGUOUS * (1 - likeness.max(1)))
-    # The top of the parabola through the highest likeness and those beside it.
+    # Vertex of the parabola through the maximum and its neighbours.
     bend = np.maximum(2 * highest - before - behind, 1e-6)
     return best, np.clip((behind - before) / (2 * bend), -0.5, 0.5), sure
 
@@ -160,7 +159,7 @@ def _peaks(
 def _outstanding(
     grey: Float32[np.ndarray, "h w"], rows: Int[np.ndarray, " r"], wanted: Bool[np.ndarray, "h w"]
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """Rows and columns of the places of most contrast in every _SPACING_PX of the rows, where wanted."""
+    """Rows and columns of the highest gradient in every _SPACING_PX columns, where wanted."""
     steps = np.abs(cv2.Sobel(grey, cv2.CV_32F, 1, 0))[rows]
     count = grey.shape[1] // _SPACING_PX
     cells = steps[:, : count * _SPACING_PX].reshape(len(rows), count, _SPACING_PX)
@@ -173,7 +172,7 @@ def _outstanding(
 def _texture(grey: Float32[np.ndarray, "h w"]) -> _Texture:
     size = (_WINDOW_COLUMNS, _WINDOW_ROWS)
     uneven = grey - cv2.blur(grey, size)
-    # Its running sums may end a little below 0.
+    # Rounding in cv2.blur may give values slightly below 0.
     contrast = np.sqrt(np.maximum(cv2.blur(uneven * uneven, size), 0))
     length = np.sqrt(np.float32(_WINDOW_ROWS * _WINDOW_COLUMNS)) * contrast
     scale = np.zeros_like(length)
@@ -186,21 +185,21 @@ def _texture(grey: Float32[np.ndarray, "h w"]) -> _Texture:
 def _likeness(
     own: _Texture, rows: Int[np.ndarray, " n"], columns: Int[np.ndarray, " n"], other: _Texture
 ) -> Float32[np.ndarray, "n w"]:
-    """How like the window around each of these places is to each of the other picture's on its row."""
+    """Correlation of the window around each pixel with all windows in the other image's row."""
     width, pixels = other.scale.shape[1], _WINDOW_ROWS * _WINDOW_COLUMNS
     likeness = np.empty((len(rows), width), np.float32)
-    # A row at a time: its windows, a matrix [77, W], stay in the processor's cache.
+    # Row by row, so that its windows, a matrix [77, W], stay in the CPU's cache.
     for row in np.unique(rows):
         here, first = rows == row, row - _WINDOW_ROWS // 2
         within = own.windows[first, columns[here]].reshape(-1, pixels)
         along = other.windows[first].transpose(1, 2, 0).reshape(pixels, width)
-        # Not a product of matrices: NumPy would use all cores, which may be more than the caller allows.
+        # Not a matrix product, for which NumPy would use all cores regardless of the caller's limit.
         likeness[here] = np.einsum("nk,kw->nw", within, along)
     return likeness * own.scale[rows, columns, None] * other.scale[rows]
 
 
 def _supported(matches: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """The matches that enough others beside them have a like disparity."""
+    """Keep the matches with enough neighbours of similar disparity."""
     if not len(matches):
         return matches
     cells = (matches // _CELL_PX).astype(int)

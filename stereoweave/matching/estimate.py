@@ -1,8 +1,8 @@
-"""A pair of any size, with disparities in any range, becomes an Estimate: what `stereoweave.estimate` does.
+"""`stereoweave.estimate`: matching of pairs of any size and disparity range.
 
-A network compares disparities of 0 to so many px, in a picture of so many pixels. What lies elsewhere is
-brought there: the right picture is moved along the rows, or both are made smaller. A disparity found in
-smaller pictures is brought to the full size by `enlarging`.
+A network covers disparities from 0 to its maximum, in images up to a certain size. To cover other disparities
+the right image is shifted along its rows; to cover wider ranges and larger images both are scaled down, and
+`upsample` brings the estimate back to full size.
 """
 
 import math
@@ -31,36 +31,36 @@ from stereoweave.matching.refine import right_confidence
 from stereoweave.matching.upsample import enlarge
 from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
 
-# A network that is shown what is beyond its range often believes in the end of it, but not quite.
+# Beyond its range a network often predicts the end of the range, with a confidence between these two.
 _CONFIDENT, _CONFIDENT_AT_END = 0.5, 0.9
-# A range is looked for unless all of the picture but so much is certain.
+# The disparity range is searched if at least this percentage of the pixels is doubtful.
 _DOUBTFUL_PERCENT = 1.0
-# A network is less exact near the ends of its range.
+# A network is less accurate near the ends of its range.
 _MARGIN_PX = 4
-# Disparities this far outside of a range that was given are no rounding, but wrong.
+# Disparities farther than this outside a given range are wrong, not just rounded.
 _OUTSIDE_PX = 1
-# Of the pixel pairs that are matched at once: rows are counted in multiples.
+# Usable share of PIXEL_PAIRS_AT_ONCE, because the number of rows is rounded to a multiple.
 _FILLED = 0.95
-# How much a width and a move, both rounded, may be too large together.
+# Maximum combined rounding error of width and shift.
 _ROUNDED_PX = 2
-# A closer look at less than this magnification is not worth its time; the range that it has to see is that of
-# all but so much of some pixels.
+# A second, magnified run below this magnification is not worth its time. Its range is that of a grid of
+# pixels, without this percentage at both ends.
 _LEAST_MAGNIFICATION = 1.1
 _ENDS_PERCENT, _STEP_PX = 0.5, 4
-# Disparities of the larger picture that differ by more are of two surfaces.
+# Disparities of the magnified pair that differ by more belong to different surfaces.
 _OTHER_SURFACE_PX = 3.0
-# The median window of a larger estimate, of which one pixel is taken for each of the pair's.
+# Median window applied to a magnified estimate before it is sampled at the pair's size.
 _MEDIAN_PX = 3
 
 
 class _Shown(NamedTuple):
-    """What a network is shown of a pair: it made small, and by how much its right picture is moved, if so."""
+    """Network input for a pair: the scaled pair, and the shift of its right image in px, if any."""
 
     small: StereoPair
     least_px: int | None = None
 
 
-def estimate(  # noqa: PLR0913 - each has a name, and all but the pictures can be left out
+def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optional
     left: object,
     right: object,
     *,
@@ -74,16 +74,16 @@ def estimate(  # noqa: PLR0913 - each has a name, and all but the pictures can b
     """Disparity of both views, confidence and occlusion of a rectified pair.
 
     Args:
-        left: The left photograph, at least 32x32: uint8 RGB [H, W, 3], or what else `arrays.as_rgb` takes,
+        left: Left image, at least 32x32: uint8 RGB [H, W, 3], or another type that `arrays.as_rgb` accepts,
             such as a PIL image or a PyTorch tensor.
-        right: The right one, of the same size.
-        model: A shipped name, `best` (the network base, once more at 1.5 times the size, and refined), or the
-            path of an .onnx matcher; loaded at the first call, and kept.
-        threads: How many threads may be used; all cores if left out.
-        provider: What the network is run on: cpu, cuda, tensorrt, openvino, coreml or directml.
-        refined: As in `MatchOptions`.
-        raw: As in `MatchOptions`.
-        range_px: As in `MatchOptions`.
+        right: Right image of the same size.
+        model: Name of a shipped network, `best` (network base, run again at 1.5 times the size and refined),
+            or path of an .onnx matcher; loaded on the first call and cached.
+        threads: Maximum number of threads; default: all cores.
+        provider: Execution provider: cpu, cuda, tensorrt, openvino, coreml or directml.
+        refined: See `MatchOptions`.
+        raw: See `MatchOptions`.
+        range_px: See `MatchOptions`.
 
     Raises:
         ValueError: MatcherError for an unknown model or an unavailable provider, ProviderError for one that
@@ -96,18 +96,17 @@ def estimate(  # noqa: PLR0913 - each has a name, and all but the pictures can b
 
 
 def match(matcher: Matcher, pair: StereoPair, options: MatchOptions = DEFAULT_OPTIONS) -> Estimate:
-    """The estimate of a pair of any size; equals `matcher.estimate` where the network sees all of it at once.
+    """Match a pair of any size; equals `matcher.estimate` if the network takes the whole pair in one run.
 
     Args:
         matcher: The network.
-        pair: The photographs, rectified. Where the left one shows nothing the confidence is 0, and what has
-            its match where the right one shows nothing is occluded.
-        options: How it is matched; `refined` and `raw` apply at the size that the network sees. A larger
-            pair's disparities are upsampled even if `raw`.
+        pair: The rectified pair. Left pixels without content get confidence 0; pixels whose match has no
+            content in the right image are marked occluded.
+        options: Matching options; `refined` and `raw` apply at the network's input size. The disparities of
+            larger pairs are upsampled even if `raw`.
 
     Raises:
-        StereoweaveError: The range is outside the pictures' width, or a picture is under 32 px in a
-            direction.
+        StereoweaveError: The range is outside the images' width, or a side is shorter than 32 px.
     """
     (found,) = match_many(matcher, [pair], options)
     return found
@@ -116,7 +115,7 @@ def match(matcher: Matcher, pair: StereoPair, options: MatchOptions = DEFAULT_OP
 def match_many(
     matcher: Matcher, pairs: Sequence[StereoPair], options: MatchOptions = DEFAULT_OPTIONS
 ) -> list[Estimate]:
-    """Estimates of pairs of any sizes, as by `match`; those of one size for the network share a batch."""
+    """Match pairs of any sizes as `match` does, batching those with the same network input size."""
     every_shown = [_shown_first(matcher, pair, options.range_px) for pair in pairs]
     moved = [_moved(shown) for shown in every_shown]
     of_size: dict[tuple[int, ...], list[int]] = {}
@@ -132,7 +131,7 @@ def match_many(
 
 
 def _within_width(range_px: tuple[float, float], width_px: int) -> tuple[float, float]:
-    """The part of a range that pictures of this width can have."""
+    """Clip a disparity range to the disparities that images of this width can have."""
     low_px, high_px = range_px
     if low_px >= width_px or high_px <= -width_px:
         raise StereoweaveError(
@@ -144,7 +143,7 @@ def _within_width(range_px: tuple[float, float], width_px: int) -> tuple[float, 
 
 
 def _shown_first(matcher: Matcher, pair: StereoPair, range_px: tuple[float, float] | None) -> _Shown:
-    """What the network is shown before anything is known of the pair but the range, if that is given."""
+    """Prepare the network's first input: the whole pair, or one that covers the given range."""
     seen = _seen_whole(matcher, pair)
     if range_px is None:
         return _Shown(seen)
@@ -156,7 +155,7 @@ def _shown_first(matcher: Matcher, pair: StereoPair, range_px: tuple[float, floa
 def _finished(
     matcher: Matcher, pair: StereoPair, shown: _Shown, found: Estimate, options: MatchOptions
 ) -> Estimate:
-    """The estimate of a pair from the network's own of what it was shown first; shown again if need be."""
+    """Turn the network's output for its first input into the pair's estimate, with further runs if needed."""
     found = _unmoved(shown, found)
     if options.range_px is None:
         beyond_px = _range_beyond(shown.small, found, matcher.max_disparity_px)
@@ -179,7 +178,7 @@ def _finished(
 
 
 def _seen_whole(matcher: Matcher, pair: StereoPair) -> StereoPair:
-    """The pair, smaller where the network would else see it in strips, whose seams would show."""
+    """Scale the pair down if the network would otherwise need strips, whose seams would be visible."""
     height, width = pair.left.shape[:2]
     return _resized(pair, _times_smaller(matcher, width, height))
 
@@ -187,10 +186,10 @@ def _seen_whole(matcher: Matcher, pair: StereoPair) -> StereoPair:
 def _times_smaller(
     matcher: Matcher, width: int, height: int, moved_px: int = 0, largest: float = 1.0
 ) -> float:
-    """By how much the network has to be shown less, to see a picture of this size whole.
+    """Factor by which to scale down an image of this size so that the network takes it in one run.
 
-    It sees one `largest` times larger, 1 / largest, if it can. The picture is wider by what the other one is
-    moved by.
+    Below 1, magnify: 1 / largest, if the network can take an image `largest` times as large. A shift of
+    moved_px widens the image.
     """
     width += moved_px
     if matcher.sees_whole(round(width * largest), round(height * largest)):
@@ -203,7 +202,7 @@ def _times_smaller(
 
 
 def _resized(pair: StereoPair, scale: float) -> StereoPair:
-    """The photographs so many times smaller, or the pair itself where that is as large."""
+    """Scale the pair down by a factor; return it unchanged if its size stays the same."""
     height, width = pair.left.shape[:2]
     size = max(round(width / scale), SMALLEST_SIDE_PX), max(round(height / scale), SMALLEST_SIDE_PX)
     if size == (width, height) or min(width, height) < SMALLEST_SIDE_PX:
@@ -220,16 +219,19 @@ def _resized(pair: StereoPair, scale: float) -> StereoPair:
 def _look_closer(
     matcher: Matcher, pair: StereoPair, small: StereoPair, found: Estimate
 ) -> tuple[StereoPair, Estimate]:
-    """A pair as it is shown for a matcher's magnification, and the network's own estimate of that.
+    """Run the network again on the pair magnified by `matcher.magnification`; merge both estimates.
 
-    It is enlarged by less where the range or the memory allow no more. Where the estimate at hand is surer
-    and says something else, that counts: beyond the network's range, and on plain surfaces.
+    Disparity range or memory may limit the magnification. The first estimate wins where it differs and is
+    more confident: beyond the network's range and on textureless surfaces.
 
     Args:
-        matcher: Its network looks closer.
-        pair: At its own size.
-        small: As it was shown before.
-        found: What was found then.
+        matcher: The matcher, with a magnification above 1.
+        pair: The pair at its own size.
+        small: The pair at the size of the first run.
+        found: The first run's estimate.
+
+    Returns:
+        The magnified pair and its merged estimate; `small` and `found` if magnification is not worthwhile.
     """
     height, width = pair.left.shape[:2]
     seen = _resized(pair, _times_smaller(matcher, width, height, largest=matcher.magnification))
@@ -243,7 +245,7 @@ def _look_closer(
 
 
 def _surer(closer: Estimate, found: Estimate) -> Estimate:
-    """The closer look, but what was found at a smaller size where that is another surface, and surer."""
+    """Merge: `closer`, but `found` where it shows another surface with higher confidence."""
     size = closer.disparity_px.shape[::-1]
     scale = np.float32(size[0] / found.disparity_px.shape[1])
     found_px, right_found_px, confidence, right_trust = (
@@ -271,12 +273,12 @@ def _surer(closer: Estimate, found: Estimate) -> Estimate:
 def _is_other(
     one_px: Float[np.ndarray, "h w"], other_px: Float[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Where two disparities are not of one surface."""
+    """Mask of pixels where two disparities belong to different surfaces."""
     return np.abs(one_px - other_px) > _OTHER_SURFACE_PX
 
 
 def _shrunk(found: Estimate, pair: StereoPair) -> Estimate:
-    """The estimate of a larger copy of a pair, at its size; no pixel is a mix of two surfaces."""
+    """Scale a magnified estimate down to the pair's size without mixing surfaces in a pixel."""
     size = pair.left.shape[1::-1]
     scale = np.float32(size[0] / found.disparity_px.shape[1])
     disparity_px, right_disparity_px = (
@@ -296,7 +298,7 @@ def _nearest(values: Shaped[np.ndarray, "h w"], size: tuple[int, int]) -> Shaped
 
 
 def _range_beyond(pair: StereoPair, found: Estimate, max_disparity_px: float) -> tuple[float, float] | None:
-    """The range of a pair where it goes beyond the network's, within which the estimate was found."""
+    """Find the pair's disparity range if it exceeds the network's, in which `found` was estimated."""
     doubtful = _doubtful(found, max_disparity_px)
     if 100 * doubtful.mean() < _DOUBTFUL_PERCENT or not goes_beyond(pair, doubtful, (0, max_disparity_px)):
         return None
@@ -304,11 +306,11 @@ def _range_beyond(pair: StereoPair, found: Estimate, max_disparity_px: float) ->
 
 
 def _doubtful(found: Estimate, max_disparity_px: float) -> Bool[np.ndarray, "h w"]:
-    """Where the network is not certain, and what it finds may be beyond its range."""
+    """Mask of uncertain pixels whose disparity may be outside the network's range."""
     near_end = np.abs(found.disparity_px - max_disparity_px / 2) > max_disparity_px / 2 - _MARGIN_PX
     doubtful = (found.confidence < _CONFIDENT) & ~found.occluded
     doubtful |= (near_end & (found.confidence < _CONFIDENT_AT_END)) | (found.disparity_px <= 0)
-    # Only what is of some size: a network is unsure of every edge.
+    # Keep larger areas only: a network is uncertain at every edge.
     small = cv2.resize(doubtful.astype(np.float32), None, fx=1 / 8, fy=1 / 8, interpolation=cv2.INTER_AREA)
     return cv2.resize(small, doubtful.shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5
 
@@ -316,9 +318,9 @@ def _doubtful(found: Estimate, max_disparity_px: float) -> Bool[np.ndarray, "h w
 def _shown_within(
     matcher: Matcher, pair: StereoPair, seen: StereoPair, range_px: tuple[float, float]
 ) -> _Shown:
-    """A smaller pair, if need be, in which the range fits into the network's, and how it is moved to fit.
+    """Prepare a network input that covers a disparity range, by scaling and shifting the pair.
 
-    `seen` is what the network can see at once of the pair, and the range is in its pixels.
+    `seen` is the pair scaled so that the network takes it in one run; the range is in its pixels.
     """
     low_px, high_px = range_px
     most_px = matcher.max_disparity_px
@@ -328,7 +330,7 @@ def _shown_within(
     small = seen
     if scale > 1:
         small = _resized(pair, scale * pair.left.shape[1] / seen.left.shape[1])
-    # Not farther than the least: a network takes a plain sky for what is at the lower end of its range.
+    # Shift by exactly the least disparity: a network puts a plain sky at the lower end of its range.
     least_px = math.floor(low_px * small.left.shape[1] / seen.left.shape[1])
     height, width = small.left.shape[:2]
     smaller = _times_smaller(matcher, width, height, abs(least_px))
@@ -339,7 +341,7 @@ def _shown_within(
 
 
 def _moved(shown: _Shown) -> StereoPair:
-    """The pair as the network gets it: both pictures wider, so that the right one can be moved."""
+    """Shift the right image by padding both images; the pair as the network receives it."""
     if shown.least_px is None:
         return shown.small
     (left_at, right_at), more = _places(shown.least_px), abs(shown.least_px)
@@ -350,7 +352,7 @@ def _moved(shown: _Shown) -> StereoPair:
 
 
 def _unmoved(shown: _Shown, found: Estimate) -> Estimate:
-    """The estimate of a pair from that of its pictures as the network got them."""
+    """Undo the shift and padding of the network's input in its estimate."""
     if shown.least_px is None:
         return found
     width, least_px = shown.small.left.shape[1], np.float32(shown.least_px)
@@ -366,7 +368,7 @@ def _unmoved(shown: _Shown, found: Estimate) -> Estimate:
 
 
 def _places(least_px: int) -> tuple[int, int]:
-    """The columns of the wider pictures at which the left and the right one begin."""
+    """First columns of the left and right image within their padded versions."""
     return (-least_px, 0) if least_px < 0 else (0, least_px)
 
 
@@ -375,7 +377,7 @@ def _widened(photo: np.ndarray, before: int, behind: int) -> np.ndarray:
 
 
 def _clipped(found: Estimate, low_px: float, high_px: float) -> Estimate:
-    """The estimate within a range; what was found outside is not believed."""
+    """Clip the disparities to a range; those outside get confidence 0."""
     outside_px = np.maximum(low_px - found.disparity_px, found.disparity_px - high_px)
     return replace(
         found,
@@ -386,7 +388,7 @@ def _clipped(found: Estimate, low_px: float, high_px: float) -> Estimate:
 
 
 def _as_seen(found: Estimate, pair: StereoPair) -> Estimate:
-    """The estimate with what the pair's masks say."""
+    """Apply the pair's content masks to confidence and occlusion."""
     confidence, occluded = found.confidence, found.occluded
     if pair.left_seen is not None:
         confidence = np.where(pair.left_seen, confidence, np.float32(0))

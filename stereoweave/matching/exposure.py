@@ -1,7 +1,7 @@
-"""Two photographs that differ in exposure or colour are brought to one look.
+"""Equalise exposure and colour of the two images of a pair.
 
-What shows the same place in both says which level of one corresponds to which level of the other, channel by
-channel. Where the photographs agree up to noise, there is nothing to bring together.
+Matched pixels give the correspondence between the levels of both images, channel by channel. Images that
+agree up to noise are left unchanged.
 """
 
 from dataclasses import dataclass
@@ -13,28 +13,28 @@ from jaxtyping import Bool, Float, Float32, Shaped, UInt8
 
 from stereoweave.stereo import Estimate
 
-# Both photographs are shrunk to about so many pixels: enough for a curve, and their noise averages out.
+# Both images are downsampled to about this many pixels: enough to fit a curve, and noise averages out.
 _PIXELS = 20_000
 _LEAST_CONFIDENCE = 0.5
-# A match may be a little off where its neighbours, in the shrunk photographs, differ by no more than this.
+# Small matching errors do not matter where neighbours in the downsampled images differ by at most this.
 _CALM_PX = 1.0
 _CALM_LEVELS = 32
-# A level this near to 0 or 255 may stand for darker or brighter ones that were cut off.
+# A level this close to 0 or 255 may be clipped.
 _END_LEVELS = 4
-# So many pixels that agree are added to those seen at an end: black stays black, and white white, unless the
-# photographs say otherwise.
+# Number of pixels without difference added to those at each end: black stays black and white stays white
+# without evidence against it.
 _END_PRIOR = 3
-# Wrong matches are those that miss what is usual among equal levels, in such bins, by more than so many times
-# the median, and so many levels.
+# A match is an outlier if its difference deviates from the median of its bin of levels by more than this many
+# median deviations and more than this many levels.
 _BIN_LEVELS = 16
 _OUTLIER_MEDIANS, _OUTLIER_LEVELS = 6, 8
 _KNOT_LEVELS = 5
-# The price of bending, beside that of missing the pixels. The errors are alike from 0.03 to 1.
+# Weight of the smoothness term. Errors are much the same from 0.03 to 1.
 _STIFFNESS = 0.1
-# So little that it decides only what pixels and smoothness leave open.
+# Small enough to decide only what data and smoothness leave undetermined.
 _PULL_TO_AGREEMENT = 1e-7
-# From the first to the second the correction sets in, by the mean difference and by the number of matches: a
-# film that hovers about there must not flicker.
+# The correction fades in between these mean differences and numbers of matches, so that a video near the
+# threshold does not flicker.
 _DIFFERENCE_LEVELS = 0.5, 1.5
 _MATCHES = 50, 200
 
@@ -43,7 +43,7 @@ _WHITE = (255, 255, 255)
 _ENDS = np.full(256, 255, np.uint8)
 _ENDS[_END_LEVELS : 256 - _END_LEVELS] = 0
 _IDENTITY = np.repeat(np.arange(256, dtype=np.float32)[:, None], 3, axis=1)
-# Means of two levels go in halves.
+# The means of two levels are multiples of 1/2.
 _MEANS = np.arange(511) / 2
 _KNOTS = np.arange(0, 256, _KNOT_LEVELS)
 _HATS = np.maximum(1 - np.abs(_MEANS[:, None] - _KNOTS) / _KNOT_LEVELS, 0)
@@ -52,11 +52,11 @@ _PRICES = _STIFFNESS * _BENDS.T @ _BENDS + _PULL_TO_AGREEMENT * np.eye(len(_KNOT
 
 
 class _Channel(NamedTuple):
-    """One channel of N matched places: what each photograph shows there, as a mean over a small window.
+    """One channel of N matched pixels.
 
     Attributes:
-        left, right: uint8 [N].
-        cut_off: bool [N], whether a level in either window is so near to 0 or 255 that it may be cut off.
+        left, right: uint8 [N], mean level over a small window.
+        cut_off: bool [N], whether any level in either window may be clipped.
     """
 
     left: UInt8[np.ndarray, " n"]
@@ -64,29 +64,29 @@ class _Channel(NamedTuple):
     cut_off: Bool[np.ndarray, " n"]
 
     def swapped(self) -> "_Channel":
-        """The same with the sides exchanged."""
+        """Return a copy with left and right exchanged."""
         return _Channel(self.right, self.left, self.cut_off)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Looks:
-    """How the levels of two photographs of one scene correspond, channel by channel.
+    """Correspondence between the levels of two images of one scene, channel by channel.
 
     Attributes:
-        right_of_left: float32 [256, 3], 0..255 and never falling: the right photograph's level for each level
-            of the left one.
-        left_of_right: The same the other way round.
+        right_of_left: float32 [256, 3], 0..255 and non-decreasing: the right image's level for each level of
+            the left one.
+        left_of_right: The left image's level for each level of the right one.
     """
 
     right_of_left: Float32[np.ndarray, "256 3"]
     left_of_right: Float32[np.ndarray, "256 3"]
 
     def tables(self, position: float) -> tuple[Float32[np.ndarray, "256 3"], Float32[np.ndarray, "256 3"]]:
-        """What becomes of each level of the left and of the right photograph for one look, [256, 3] each.
+        """Lookup tables [256, 3] that bring the left and the right image to a common look.
 
         Args:
-            position: At 0 the look is the left photograph's, whose table then changes nothing; at 1 it is the
-                right one's. In between it changes in a straight line; beyond, it stays the nearer one's.
+            position: 0 for the left image's look, whose table is then the identity; 1 for the right image's.
+                Interpolated linearly between, clamped outside 0..1.
         """
         share = np.float32(np.clip(position, 0, 1))
         return (
@@ -98,23 +98,23 @@ class Looks:
 def recoloured(
     photo: UInt8[np.ndarray, "h w 3"], table: Float32[np.ndarray, "256 3"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The photograph with each level replaced by the table's for it, rounded; the table is within 0..255."""
+    """Apply a lookup table with values in 0..255, rounded."""
     return cv2.LUT(photo, np.rint(table).astype(np.uint8)[None])
 
 
 def match_exposure(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], estimate: Estimate
 ) -> Looks | None:
-    """How the looks of two photographs correspond; None where they agree, or too little of them is matched.
+    """Fit the level correspondence of two images; None if they agree or too few pixels match.
 
-    Smooth curves make the histograms of reliably matched pixels equal: small errors of disparity mix up
-    neighbouring pixels, and leave histograms as they are. The correction fades to none as the mean difference
-    falls to what noise and lenses make of equal looks.
+    Smooth curves equalise the histograms of reliably matched pixels, because small disparity errors swap
+    neighbouring pixels but hardly change histograms. The correction fades out as the mean difference
+    approaches that caused by noise and lenses alone.
 
     Args:
-        left: The left photograph, uint8 RGB [H, W, 3].
-        right: The right one, of the same size.
-        estimate: Of these two photographs.
+        left: Left image, uint8 RGB [H, W, 3].
+        right: Right image of the same size.
+        estimate: The pair's estimate.
     """
     channels = _matched_channels(left, right, estimate)
     differences = [_difference(channel) for channel in channels]
@@ -135,7 +135,7 @@ def match_exposure(
 def _matched_channels(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], estimate: Estimate
 ) -> list[_Channel]:
-    """The three channels of the places that both photographs show for sure."""
+    """Collect the three channels of reliably matched pixels."""
     step = max(round((left.shape[0] * left.shape[1] / _PIXELS) ** 0.5), 1)
     disparity_px = _sampled(estimate.disparity_px, step) / step
     rows, columns = np.indices(disparity_px.shape, np.float32)
@@ -146,7 +146,7 @@ def _matched_channels(
 
     photos = of_both(_shrunk(left, step), _shrunk(right, step))
     certain = _sampled(estimate.confidence, step) >= _LEAST_CONFIDENCE
-    # A sky that is cut off to white is plain, and of no confidence; but nor is a match needed that is exact.
+    # A clipped white sky is plain and has confidence 0, but its match need not be exact.
     certain |= cv2.inRange(cv2.max(*photos), _WHITE, _WHITE) > 0
     certain &= ~_sampled(estimate.occluded, step)
     certain &= (columns >= 0) & (columns <= columns.shape[1] - 1)
@@ -161,27 +161,27 @@ def _matched_channels(
 
 
 def _shrunk(values: Shaped[np.ndarray, "h w *c"], step: int) -> Shaped[np.ndarray, "h2 w2 *c"]:
-    """Means over squares of `step` pixels; what is left over at the right and at the bottom is left out."""
+    """Average over squares of `step` pixels, cropping the remainder at the right and bottom."""
     height, width = (side // step for side in values.shape[:2])
     whole = values[: height * step, : width * step]
     return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
 
 
 def _sampled(values: Shaped[np.ndarray, "h w *c"], step: int) -> Shaped[np.ndarray, "h2 w2 *c"]:
-    """The values in the middle of these squares."""
+    """Take the values at the centres of the squares of `step` pixels."""
     height, width = (side // step for side in values.shape[:2])
     return np.ascontiguousarray(values[step // 2 :: step, step // 2 :: step][:height, :width])
 
 
 def _range(values: Shaped[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]:
-    """The largest less the smallest value around each pixel."""
+    """Maximum minus minimum in the window around each pixel."""
     return cv2.morphologyEx(values, cv2.MORPH_GRADIENT, _WINDOW)
 
 
 def _difference(channel: _Channel) -> Float[np.ndarray, " 511"]:
-    """The right level less the left one, by the mean of the two in halves: so both sides count alike.
+    """Right level minus left level as a function of their mean, which treats both sides alike.
 
-    Of too few places, it fades to none.
+    Fades to 0 if there are too few pixels.
     """
     kept = ~channel.cut_off
     known = _ramp(int(kept.sum()), *_MATCHES)
@@ -194,7 +194,7 @@ def _difference(channel: _Channel) -> Float[np.ndarray, " 511"]:
 
 
 def _missed(left: UInt8[np.ndarray, " n"], right: UInt8[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """How far each difference of levels is from the median of those with nearly the same left level."""
+    """Deviation of each level difference from the median of its bin of left levels."""
     differences = right.astype(int) - left
     bins = left // _BIN_LEVELS
     medians = [
@@ -204,18 +204,18 @@ def _missed(left: UInt8[np.ndarray, " n"], right: UInt8[np.ndarray, " n"]) -> Fl
 
 
 def _fitted(left: UInt8[np.ndarray, " n"], right: UInt8[np.ndarray, " n"]) -> Float[np.ndarray, " 511"]:
-    """The difference as a smooth curve, of levels at N >= 1 places.
+    """Fit the level difference of N >= 1 pixels by a smooth curve over the mean level.
 
-    The darkest left one corresponds to the darkest right one, and so on. Near these points goes a curve that
-    is straight between knots, and whose bends have their price (Eilers and Marx 1996, P-splines); where no
-    point is, it goes on straight. Neither level leaves 0..255.
+    Sorted left and right levels correspond in order, as in histogram matching. The curve is linear between
+    knots with a penalty on bends (Eilers and Marx 1996, P-splines) and extrapolates linearly. Both levels
+    stay in 0..255.
     """
-    # Stable, because NumPy then sorts bytes 40 times as fast, by counting them.
+    # NumPy's stable sort of bytes is a counting sort, 40 times as fast as its default.
     left, right = (np.sort(side, kind="stable").astype(int) for side in (left, right))
     weights = np.bincount(left + right, minlength=511) / len(left)
     sums = np.bincount(left + right, right - left, minlength=511) / len(left)
-    # Sums and OpenCV's solver, because the threads of NumPy's library go on waiting busily after a matrix
-    # product, on a core that the renderer needs.
+    # No NumPy matrix products or solver: the threads of its BLAS keep spinning afterwards, on cores that the
+    # renderer needs.
     weighted = weights[:, None] * _HATS
     beside = np.diag((weighted[:, 1:] * _HATS[:, :-1]).sum(0), 1)
     normal = np.diag((weighted * _HATS).sum(0)) + beside + beside.T + _PRICES
@@ -226,7 +226,7 @@ def _fitted(left: UInt8[np.ndarray, " n"], right: UInt8[np.ndarray, " n"]) -> Fl
 
 
 def _mean_size(difference: Float[np.ndarray, " 511"], channel: _Channel) -> float:
-    """Mean absolute difference over the matched places; 0 of none."""
+    """Mean absolute difference over the matched pixels; 0 if there are none."""
     means = channel.left.astype(int) + channel.right
     return float(np.abs(difference[means]).sum()) / max(len(means), 1)
 
@@ -234,7 +234,7 @@ def _mean_size(difference: Float[np.ndarray, " 511"], channel: _Channel) -> floa
 def _tables(
     differences: list[Float[np.ndarray, " 511"]], channels: list[_Channel], strength: float
 ) -> Float32[np.ndarray, "256 3"]:
-    """The right photograph's level for each of the left one's, of the three channels."""
+    """Tabulate the right level for each left level in the three channels."""
     tables = [
         _with_ends(_table(difference), channel, strength)
         for difference, channel in zip(differences, channels, strict=True)
@@ -243,7 +243,7 @@ def _tables(
 
 
 def _table(difference: Float[np.ndarray, " 511"]) -> Float[np.ndarray, " 256"]:
-    """The right level for each left one, of a curve of their difference by their mean."""
+    """Tabulate the right level for each left level from the curve of their difference over their mean."""
     left, right = (np.maximum.accumulate(_MEANS + sign * difference / 2) for sign in (-1, 1))
     return np.interp(np.arange(256), left, right)
 
@@ -251,10 +251,10 @@ def _table(difference: Float[np.ndarray, " 511"]) -> Float[np.ndarray, " 256"]:
 def _with_ends(
     table: Float[np.ndarray, " 256"], channel: _Channel, strength: float
 ) -> Float[np.ndarray, " 256"]:
-    """The table with new ends: what was cut off becomes the mean of what the other photograph shows of it.
+    """Replace both ends of the table: clipped levels map to the mean level that the other image shows there.
 
-    The curve cannot tell, because many levels of one correspond to one of the other there. From the last
-    level that surely was not cut off, the table goes straight to its end.
+    The curve cannot represent clipping, where many levels of one image correspond to one of the other. The
+    table is linear from the last level that is surely not clipped to the end.
     """
     differences = channel.right.astype(int) - channel.left
 
@@ -269,5 +269,5 @@ def _with_ends(
 
 
 def _ramp(value: float, low: float, high: float) -> float:
-    """0 up to low, 1 from high on, and a straight line in between."""
+    """Linear ramp: 0 up to low, 1 from high on."""
     return float(np.clip((value - low) / (high - low), 0, 1))

@@ -1,7 +1,7 @@
-"""A pair becomes an Estimate: the shipped network, or any matcher file, under ONNX Runtime.
+"""Matching with a shipped network or any matcher file under ONNX Runtime.
 
-A matcher file (docs/architecture.md) takes `left` and `right`, float32 [B, 3, H, W] in 0..1, and gives
-`disparity_px`, and, where the network can, `right_disparity_px` and `confidence_logit`.
+A matcher file (docs/architecture.md) has inputs `left` and `right`, float32 [B, 3, H, W] in 0..1, output
+`disparity_px`, and optional outputs `right_disparity_px` and `confidence_logit`.
 """
 
 import math
@@ -28,27 +28,26 @@ from stereoweave.system.threads import thread_count
 
 _FLOAT32 = "tensor(float)"
 PIXEL_PAIRS_AT_ONCE = 1920 * 1920 * 1088
-"""A network compares every column of a row with every other: this many pairs of columns take about 1 GB."""
-# After more of them the memory is given back: what enlarges their disparities needs as much.
+"""Limit for one run: comparing all pairs of columns in each row, this many in all, takes about 1 GB."""
+# After larger runs the memory is released, because upsampling their disparities needs as much.
 _KEPT_PIXEL_PAIRS = 1280 * 1280 * 960
-# What a strip sees beyond its own rows; about 1 % of the pixels then differ by over 1 px from the whole.
+# Overlap of strips on each side; about 1 % of the pixels then differ by over 1 px from a run on the whole.
 _STRIP_OVERLAP_PX = 64
-# Pictures are padded up to it.
+# Images are padded to a multiple of this at most.
 _MOST_MULTIPLE_OF = 1024
-# Within such a square a picture whose means over 9x9 px vary by no more than this says nothing about
-# disparity: noise of 3 grey levels alone does so much. Of painted pairs it takes 1 pixel in 5,000, and of
-# these 1 in 3 is right.
+# A square is plain if its means over 9x9 px vary by no more than this, as noise of 3 grey levels alone does.
+# In collages 1 pixel in 5,000 is plain, and 1 in 3 of these has the right disparity.
 _PLAIN_WINDOW_PX = 65
 _PLAIN_MEAN_PX = 9
 _PLAIN_GREY_LEVELS = 2
 
 
 class Mode(NamedTuple):
-    """A way to match that has a name as networks have.
+    """A named preset, used like the name of a network.
 
     Attributes:
-        network: The shipped network.
-        magnification: How many times larger than it is a pair is shown to it at most.
+        network: Name of the shipped network.
+        magnification: Greatest factor by which pairs are magnified for the network.
         refined: Whether every estimate is refined.
     """
 
@@ -58,11 +57,11 @@ class Mode(NamedTuple):
 
 
 MODES = {"best": Mode(network="base", magnification=1.5, refined=True)}
-"""For stills: thin things and edges, in several times the time."""
+"""`best` is for stills: better thin structures and edges, several times slower."""
 
 
 class Maps(NamedTuple):
-    """What a graph gives for a pair, each float32 [H, W]; None where it has no such output."""
+    """Network outputs for a pair, each float32 [H, W]; None if the graph lacks the output."""
 
     disparity_px: np.ndarray
     right_disparity_px: np.ndarray | None = None
@@ -70,21 +69,21 @@ class Maps(NamedTuple):
 
 
 class Matcher:
-    """A matcher file, loaded once and kept between calls.
+    """A loaded matcher file.
 
     Args:
-        model: A shipped name (see `shipped_models`), a name in `MODES`, or the path of an .onnx file.
-        threads: How many threads a call may use; all cores that the process may use if left out.
-        provider: What the network is run on, a name in `providers.PROVIDERS`.
+        model: Name of a shipped network (`shipped_models`), name in `MODES`, or path of an .onnx file.
+        threads: Maximum number of threads per call; default: all cores available to the process.
+        provider: Execution provider, a name in `providers.PROVIDERS`.
 
     Attributes:
-        model: The name or the path that it was loaded by.
-        fixed_size: Height and width of the only pictures that the network takes; None where any will do.
-        magnification: How many times larger than it is `matching.match` shows a pair to the network at most;
-            `estimate` shows it as it is.
+        model: The name or path given.
+        fixed_size: Height and width of a network with fixed input size; None if any size works.
+        magnification: Greatest factor by which `match` magnifies pairs for the network; `estimate` ignores
+            it.
 
     Raises:
-        MatcherError: If there is no such model, the file is not a matcher, or the provider is not there.
+        MatcherError: Unknown model, invalid matcher file or unavailable provider.
     """
 
     def __init__(
@@ -99,7 +98,7 @@ class Matcher:
         try:
             self._outputs = self._checked_outputs()
             self.name, self.multiple_of, self.max_disparity_px = self._checked_properties()
-            # A side that may be any has a name; a file need not say how many sides there are.
+            # Free dimensions have names, and a file may omit the shape altogether.
             shape: list[Any] = [*self._session.get_inputs()[0].shape, *["any"] * 4]
         except UnicodeDecodeError as error:
             raise MatcherError(f"{self._path}: expected metadata in UTF-8, found {error}") from error
@@ -116,21 +115,21 @@ class Matcher:
         refined: bool = False,
         raw: bool = False,
     ) -> Estimate:
-        """Disparity of both views, confidence and occlusion of a rectified pair, uint8 RGB of one size.
+        """Disparity of both views, confidence and occlusion of a rectified pair, uint8 RGB of equal size.
 
-        The left view's disparity is brought to a part of a pixel (`subpixel.to_subpixel`), and where it is
-        occluded it continues the background (`occluded_fill.fill_occluded`).
+        The left view's disparity is refined to a fraction of a pixel (`subpixel.to_subpixel`) and filled with
+        the background where occluded (`occlusion_fill.fill_occluded`).
 
         Args:
-            left: The left photograph [H, W, 3].
-            right: The right one.
-            refined: Whether the estimate is brought to fit the photographs (`refining.refine`): it sees thin
-                things, has sharper edges, and takes longer.
-            raw: Return the network's own disparities instead, without any of these steps.
+            left: Left image [H, W, 3].
+            right: Right image [H, W, 3].
+            refined: Match once more at full resolution (`refine.refine`): slower, with thin structures and
+                sharper edges.
+            raw: Return the network's own disparities without any of these steps.
 
         Raises:
-            ValueError: If the images are not that, under 32 px in a direction, or larger than `fixed_size`;
-                or if the estimate is to be both refined and raw.
+            StereoweaveError: The images are invalid, shorter than 32 px on a side or larger than
+                `fixed_size`; or both `refined` and `raw` are set.
         """
         (found,) = self.estimate_many([StereoPair(left=left, right=right)], refined=refined, raw=raw)
         return found
@@ -138,12 +137,12 @@ class Matcher:
     def estimate_many(
         self, pairs: Sequence[StereoPair], *, refined: bool = False, raw: bool = False
     ) -> list[Estimate]:
-        """As `estimate` of each, of pairs of one size; in one run where the file can and the provider gains.
+        """Match pairs of equal size as `estimate` does, batched if the file and the provider support it.
 
         Raises:
-            ValueError: As for `estimate`, or if the pairs are not all of one size.
+            StereoweaveError: As for `estimate`, or the pairs differ in size.
         """
-        MatchOptions(refined=refined, raw=raw)  # refuses both at once
+        MatchOptions(refined=refined, raw=raw)  # raises if both are set
         check_kind("pairs", pairs, Sequence)
         for pair in pairs:
             check_kind("pairs", pair, StereoPair)
@@ -161,7 +160,7 @@ class Matcher:
         return [self.finish(pair, own, refined=refined) for pair, own in zip(pairs, found, strict=True)]
 
     def finish(self, pair: StereoPair, found: Estimate, *, refined: bool = False) -> Estimate:
-        """The network's own estimate of a pair to a part of a pixel, refined on request, and filled."""
+        """Post-process the network's estimate: subpixel step, `refine` on request, occlusion filling."""
         found = to_subpixel(pair.left, pair.right, found, self.threads)
         if refined or self._refines:
             from stereoweave.matching.refine import refine  # Numba takes half a second to import
@@ -190,7 +189,7 @@ class Matcher:
                 )
 
     def sees_whole(self, width: int, height: int) -> bool:
-        """Whether a picture of that size is matched at once, not in strips of rows, and can be matched."""
+        """Whether an image of this size is matched in one run, without strips of rows."""
         if self.fixed_size is not None:
             return height <= self.fixed_size[0] and width <= self.fixed_size[1]
         if max(height, width) > LONGEST_SIDE_PX:
@@ -198,7 +197,7 @@ class Matcher:
         return height <= self._strip_rows(width) and width * width * height <= PIXEL_PAIRS_AT_ONCE
 
     def _maps(self, pairs: Sequence[StereoPair]) -> list[Maps]:
-        """The graph's outputs for pairs of one size, as many at once as may be."""
+        """Run the network on pairs of equal size, in batches as large as memory allows."""
         if not pairs:
             return []
         height, width = pairs[0].left.shape[:2]
@@ -213,7 +212,7 @@ class Matcher:
         ]
 
     def _in_strips(self, pair: StereoPair) -> Maps:
-        """The graph's outputs for a large pair: in strips of rows, blended where they overlap."""
+        """Run the network on a large pair in strips of rows, blended where they overlap."""
         height, width = pair.left.shape[:2]
         totals: dict[str, np.ndarray] = {}
         weights = np.zeros((height, 1), np.float32)
@@ -234,7 +233,7 @@ class Matcher:
         return maps
 
     def _run_together(self, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Maps]:
-        """The graph's outputs for left and right pictures of one size, in one run."""
+        """Run the network once on a batch of (left, right) images of equal size."""
         height, width = pairs[0][0].shape[:2]
         (above, _), (before, _) = self._borders_px(height, width)
         inputs = {"left": self._tensor([x for x, _ in pairs]), "right": self._tensor([x for _, x in pairs])}
@@ -265,7 +264,7 @@ class Matcher:
                 )
 
     def _run_options(self, pixel_pairs: int) -> Any:
-        """How a picture is run: what it took in memory is kept for the next one, unless that is very much."""
+        """Run options: keep the memory arena for the next run, but release a very large one."""
         import onnxruntime  # type: ignore[import-untyped]
 
         options = onnxruntime.RunOptions()
@@ -274,31 +273,31 @@ class Matcher:
         return options
 
     def _run_size(self, height: int, width: int) -> tuple[int, int]:
-        """The size, in rows and columns, at which the network is shown a picture."""
+        """Height and width of the network's input for an image of this size."""
         if self.fixed_size is not None:
             return self.fixed_size
         return height + -height % self.multiple_of, width + -width % self.multiple_of
 
     def _borders_px(self, height: int, width: int) -> list[tuple[int, int]]:
-        """What is added before and behind the rows and the columns, up to a size that the network takes.
+        """Padding (above, below) and (left, right) up to the network's input size.
 
-        Half on each side: what lies beyond a view's left border hurts that view alone, and so both alike.
+        Half on each side: padding at one border harms one view only, so both views are treated alike.
         """
         rows, columns = self._run_size(height, width)
         return [(px // 2, px - px // 2) for px in (rows - height, columns - width)]
 
     def _tensor(self, images: Sequence[UInt8[np.ndarray, "h w 3"]]) -> Float[np.ndarray, "b 3 h2 w2"]:
-        """The images as the network takes them, their borders repeated around them."""
+        """Convert images to the network's input, padded by repeating their borders."""
         (above, below), (before, behind) = self._borders_px(*images[0].shape[:2])
         padded = [
             cv2.copyMakeBorder(image, above, below, before, behind, cv2.BORDER_REPLICATE) for image in images
         ]
-        # Half the time of cv2.dnn.blobFromImage, and the same numbers.
+        # Same result as cv2.dnn.blobFromImage in half the time.
         planes = np.stack([plane for image in padded for plane in cv2.split(image)])
         return planes.reshape(len(images), 3, *padded[0].shape[:2]) * np.float32(1 / 255)
 
     def _checked_outputs(self) -> list[str]:
-        """The outputs that `Maps` has a place for."""
+        """Validate the graph's inputs and outputs; return the names of the outputs in `Maps`."""
         inputs = {value.name: value.type for value in self._session.get_inputs()}
         outputs = {value.name: value.type for value in self._session.get_outputs()}
         used = [name for name in Maps._fields if name in outputs]
@@ -311,7 +310,7 @@ class Matcher:
         return used
 
     def _checked_properties(self) -> tuple[str, int, float]:
-        """Name, multiple_of and max_disparity_px from the file's metadata."""
+        """Read name, multiple_of and max_disparity_px from the file's metadata."""
         metadata = self._session.get_modelmeta().custom_metadata_map
         keys = [f"stereoweave.{key}" for key in ("name", "multiple_of", "max_disparity_px")]
         try:
@@ -329,7 +328,7 @@ class Matcher:
 
 
 def shipped_models() -> list[str]:
-    """The names of the networks inside the package."""
+    """Return the names of the networks in the package."""
     return sorted(Path(file.name).stem for file in _weights_folder().iterdir() if file.name.endswith(".onnx"))
 
 
@@ -342,7 +341,7 @@ def _weights_folder() -> Path:
 
 
 def model_file(model: str | Path) -> Path:
-    """The file of a shipped name or a mode, or the .onnx file itself; MatcherError where there is none."""
+    """Return the .onnx file of a shipped network, mode or path; raise MatcherError if there is none."""
     check_kind("model", model, str, Path)
     if str(model).endswith(".onnx"):
         path = Path(model)
@@ -359,7 +358,7 @@ def model_file(model: str | Path) -> Path:
 
 
 def _strips(height: int, rows: int) -> Iterator[slice]:
-    """Row ranges of at most `rows` that cover `height` and overlap their neighbours, equal but for a row."""
+    """Overlapping row ranges of at most `rows` rows that cover `height`; lengths differ by at most one."""
     if height <= rows:
         yield slice(0, height)
         return
@@ -370,17 +369,17 @@ def _strips(height: int, rows: int) -> Iterator[slice]:
 
 
 def _strip_weights(rows: slice, height: int) -> Float[np.ndarray, "h 1"]:
-    """How much a strip counts at each of its rows: less towards an end that another strip sees better."""
+    """Blending weight of each row of a strip, which decreases towards ends that overlap other strips."""
     places = np.arange(rows.start, rows.stop, dtype=np.float32)[:, None] + 0.5
     from_top = places - rows.start if rows.start > 0 else np.full_like(places, np.inf)
     from_bottom = rows.stop - places if rows.stop < height else np.full_like(places, np.inf)
-    # Nothing from the outermost quarter of the overlap, where the strip's own border shows.
+    # Almost no weight for the outermost quarter of the overlap, which suffers from the strip's border.
     inset = np.minimum(from_top, from_bottom) - _STRIP_OVERLAP_PX / 2
     return np.clip(inset / _STRIP_OVERLAP_PX, 1e-6, 1).astype(np.float32)
 
 
 def _estimate(left: UInt8[np.ndarray, "h w 3"], maps: Maps) -> Estimate:
-    """The network's own estimate from the maps of both views."""
+    """Build the network's estimate from the maps of both views."""
     right_px = maps.right_disparity_px
     assert right_px is not None
     disagreement_px, inside = measure_disagreement(maps.disparity_px, right_px)
@@ -398,23 +397,23 @@ def _confidence(
     inside: Bool[np.ndarray, "h w"],
     plain: Bool[np.ndarray, "h w"],
 ) -> Float[np.ndarray, "h w"]:
-    """The network's own probability, or what the two views' disagreement suggests; mended where it cannot be.
+    """Confidence from the network's log odds, or from the left-right disagreement if it has none.
 
-    Of what both cameras could see, each sees the nearest: where the right view finds something farther at a
-    match, one of the two is wrong, and which is not known. So the probability halves (on painted and on real
-    pairs about a quarter of such pixels are right, of which the network claims 0.4 to 0.5). It is 0 where the
-    left picture is plain.
+    A pixel's match cannot be farther than the pixel itself, because both cameras see the nearest surface.
+    Where the right view's disparity is farther nevertheless, one of the two views is wrong, and the
+    network's probability is halved (on collages and real pairs about a quarter of such pixels are right,
+    where the network claims 0.4 to 0.5). It is 0 where the left image is plain.
 
     Args:
-        logit: The network's log odds, None where it gives none.
-        disagreement_px: The right view's disparity at the match, less the left one's.
-        inside: Where the match is in the right picture.
-        plain: Where the left picture has nothing to match by.
+        logit: The network's log odds; None if it has no such output.
+        disagreement_px: The right view's disparity at the match minus the left view's.
+        inside: Mask of matches inside the right image.
+        plain: Mask of left pixels without texture to match.
     """
     if logit is None:
         probability = np.exp(-np.abs(disagreement_px))
     else:
-        # The logistic function, in a form that cannot overflow.
+        # The logistic function in a form that does not overflow.
         probability = 0.5 * (1 + np.tanh(logit / 2))
         contradicted = inside & (disagreement_px < -OCCLUSION_STEP_PX)
         np.multiply(probability, 0.5, out=probability, where=contradicted)
@@ -423,7 +422,7 @@ def _confidence(
 
 
 def _plain(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
-    """Where no mean over _PLAIN_MEAN_PX within _PLAIN_WINDOW_PX differs by more than _PLAIN_GREY_LEVELS."""
+    """Mask of pixels in whose _PLAIN_WINDOW_PX window local means vary by at most _PLAIN_GREY_LEVELS."""
     window = np.ones((_PLAIN_WINDOW_PX, _PLAIN_WINDOW_PX), np.uint8)
     means = cv2.blur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (_PLAIN_MEAN_PX, _PLAIN_MEAN_PX))
     contrast = cv2.morphologyEx(means, cv2.MORPH_GRADIENT, window)

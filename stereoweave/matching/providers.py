@@ -1,8 +1,8 @@
-"""What a matcher file is run on: ONNX Runtime's providers, by name, and one line where one is missing.
+"""ONNX Runtime execution providers.
 
-Where a provider cannot be had, ONNX Runtime logs that and goes on with the processor. Here it is an error:
-who asks for a GPU is never served by the processor unknowingly. Only operations that a provider does not have
-are left to the next one, which is CUDA for TensorRT's, and the processor in the end.
+If a provider is unavailable, ONNX Runtime logs a message and falls back to the CPU. Here that is an error: a
+request for a GPU never runs on the CPU unnoticed. Only operations that a provider lacks run on the next one:
+CUDA after TensorRT, and finally the CPU.
 """
 
 import contextlib
@@ -24,15 +24,15 @@ _USE_CPU = Remedy(f"or run it on {CPU}", ("provider",))
 
 @dataclass(frozen=True, kw_only=True)
 class Provider:
-    """How ONNX Runtime is asked for a provider.
+    """Settings of an execution provider.
 
     Attributes:
-        name: ONNX Runtime's name of it.
-        needs: What a machine must have, and how to install it.
-        options: ONNX Runtime's options for it, by the number of threads.
-        then: Who has the operations that it does not have, by the name in `PROVIDERS`.
-        batches: Whether it is given several pairs at once, as a GPU is. A processor is slower with them, for
-            their maps leave its caches (measured: 53 ms a pair of 320x240 in a batch of 8, 35 ms alone).
+        name: ONNX Runtime's name for it.
+        needs: Requirements, and how to install them.
+        options: Returns ONNX Runtime's provider options for a number of threads.
+        then: Provider, a name in `PROVIDERS`, that runs the operations this one lacks.
+        batches: Whether batches of pairs are faster, as on a GPU. On a CPU they are slower because their maps
+            do not fit its caches (measured: 53 ms a pair of 320x240 in a batch of 8, 35 ms alone).
     """
 
     name: str
@@ -44,17 +44,17 @@ class Provider:
 
 def _cuda_options(threads: int) -> dict[str, str]:
     return {
-        # Not the exhaustive search, which tries all ways of each convolution anew for every size of picture.
+        # The exhaustive search would try every convolution algorithm again for each new image size.
         "cudnn_conv_algo_search": "HEURISTIC",
-        # By default each enlargement doubles the memory, of which other processes may need some.
+        # By default the arena doubles whenever it grows, and takes memory that other processes may need.
         "arena_extend_strategy": "kSameAsRequested",
-        # Products of numbers with 10 bits would not be the processor's to a part of a pixel.
+        # TF32 has 10 mantissa bits: too few to match the CPU's disparities to a fraction of a pixel.
         "use_tf32": "0",
     }
 
 
 def _tensorrt_options(threads: int) -> dict[str, str]:
-    """An engine takes minutes to build: it is kept in the user's place for caches, if that can be written."""
+    """Cache engines, which take minutes to build, in the user's cache folder if it is writable."""
     from stereoweave.system.jit import cache_folder  # imports Numba
 
     folder = cache_folder().with_name("tensorrt")
@@ -65,18 +65,18 @@ def _tensorrt_options(threads: int) -> dict[str, str]:
     return {
         f"trt_{kind}_cache_{key}": value
         for kind in ("engine", "timing")
-        # In Python's words: a 1, which CUDA's options may have, TensorRT's refuse.
+        # TensorRT's options, unlike CUDA's, accept "True" but not "1".
         for key, value in (("enable", "True"), ("path", str(folder)))
     }
 
 
 def _openvino_options(threads: int) -> dict[str, str]:
-    # Not AUTO: with it ONNX Runtime 1.24 leaves every operation to its own provider.
+    # With AUTO, ONNX Runtime 1.24 assigns every operation to its own CPU provider.
     return {"device_type": "CPU", "precision": "FP32", "num_of_threads": str(threads)}
 
 
 def _instead(package: str) -> str:
-    """How to change packages: they overwrite one another's files, so that both together are one of them."""
+    """How to switch packages; they overwrite each other's files and cannot be installed side by side."""
     return (
         f"{package} instead of onnxruntime: pip uninstall onnxruntime {package}, then pip install {package}"
     )
@@ -117,7 +117,7 @@ PROVIDERS: dict[str, Provider] = {
 
 
 def check_provider(provider: str) -> None:
-    """MatcherError for a name that is none, or a provider that the installed ONNX Runtime does not have."""
+    """Raise MatcherError if the provider is unknown or the installed ONNX Runtime lacks it."""
     import onnxruntime  # type: ignore[import-untyped]
 
     check_kind("provider", provider, str)
@@ -132,10 +132,10 @@ def check_provider(provider: str) -> None:
 
 
 def open_session(path: Path, provider: str, threads: int) -> Any:
-    """ONNX Runtime's session of a matcher file on a provider, with so many threads on the processor.
+    """Open an ONNX Runtime session for a matcher file; `threads` applies to the CPU.
 
     Raises:
-        MatcherError: The provider is unknown, missing or cannot begin, or ONNX Runtime refuses the file.
+        MatcherError: Unknown provider, provider that is unavailable or fails to start, or invalid file.
     """
     check_provider(provider)
     if provider == CPU:
@@ -145,7 +145,7 @@ def open_session(path: Path, provider: str, threads: int) -> Any:
         try:
             session = _opened(path, provider, threads)
         except MatcherError as error:
-            _opened(path, CPU, threads)  # a file that is refused here too is at fault, and not the provider
+            _opened(path, CPU, threads)  # if this fails too, the file is invalid, not the provider
             raise _cannot_begin(provider, _line(error.__cause__)) from error
     if PROVIDERS[provider].name not in session.get_providers():
         raise _cannot_begin(provider, "a library or a device that is missing")
@@ -160,10 +160,10 @@ def open_session(path: Path, provider: str, threads: int) -> Any:
 
 @contextmanager
 def running(provider: str, path: Path) -> Iterator[None]:
-    """Turns what goes wrong in a run into one line: of the provider that failed, or of the matcher file."""
+    """Turn exceptions of a run into one-line errors that blame the provider or the matcher file."""
     try:
         yield
-    except Exception as error:  # ONNX Runtime's have no common base class
+    except Exception as error:  # ONNX Runtime's exceptions have no common base class
         out_of_memory = isinstance(error, MemoryError) or "alloc" in str(error).lower()
         unfit = type(error).__name__ == "InvalidArgument"
         if unfit or (provider == CPU and not out_of_memory):
@@ -179,27 +179,27 @@ def _opened(path: Path, provider: str, threads: int) -> Any:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
-    # Not ONNX Runtime's own choice: on a virtual machine it counts two cores as one with two threads.
+    # ONNX Runtime's default takes two cores of a virtual machine for one with two hardware threads.
     options.intra_op_num_threads = threads
-    # Else its threads go on waiting busily after a run, and slow down what runs next on these cores.
+    # By default its threads keep spinning after a run and slow down other work on these cores.
     options.add_session_config_entry("session.force_spinning_stop", "1")
-    options.log_severity_level = 4  # what is wrong with a file is said once, by the error below
+    options.log_severity_level = 4  # the error below reports problems with the file
     if provider != CPU:
         options.add_session_config_entry("session.record_ep_graph_assignment_info", "1")
-        options.enable_mem_pattern = provider != "directml"  # which cannot work with it
+        options.enable_mem_pattern = provider != "directml"  # which does not support it
     names = [provider]
     while names[-1] != CPU:
         names.append(PROVIDERS[names[-1]].then)
     providers = [(PROVIDERS[name].name, PROVIDERS[name].options(threads)) for name in names]
     try:
-        # Without its fallback, which would go on with the processor when the provider fails.
+        # Disable the fallback to the CPU when the provider fails.
         return onnxruntime.InferenceSession(str(path), options, providers=providers, enable_fallback=0)
-    except Exception as error:  # they have no common base class
+    except Exception as error:  # no common base class, as above
         raise _refused(path, error) from error
 
 
 def _load_libraries(provider: str) -> None:
-    """Loads what pip has installed of CUDA and TensorRT, which is not where a system's libraries are."""
+    """Load the CUDA and TensorRT libraries installed by pip, which are outside the system's library path."""
     import onnxruntime
 
     if provider in ("cuda", "tensorrt") and hasattr(onnxruntime, "preload_dlls"):
@@ -212,18 +212,18 @@ def _load_libraries(provider: str) -> None:
 
 @contextmanager
 def _without_log() -> Iterator[None]:
-    """Meanwhile ONNX Runtime logs nothing: what it has to say becomes an error."""
+    """Silence ONNX Runtime's log; its messages are raised as errors instead."""
     import onnxruntime
 
     onnxruntime.set_default_logger_severity(4)
     try:
         yield
     finally:
-        onnxruntime.set_default_logger_severity(2)  # as it is by default
+        onnxruntime.set_default_logger_severity(2)  # the default
 
 
 def _takes_nothing(session: Any, name: str) -> bool:
-    """Whether all of a graph is left to others; only ONNX Runtime 1.24 and later tell."""
+    """Whether the provider runs no operation of the graph; known with ONNX Runtime 1.24 or later."""
     if not hasattr(session, "get_provider_graph_assignment_info"):
         return False
     return all(part.ep_name != name for part in session.get_provider_graph_assignment_info())
@@ -242,6 +242,6 @@ def _refused(path: Path, error: Exception) -> MatcherError:
 
 
 def _line(error: BaseException | None) -> str:
-    """What ONNX Runtime says first, without the place in its sources."""
+    """First line of ONNX Runtime's message, without its source location."""
     line = (str(error).splitlines() or [type(error).__name__])[0]
     return re.sub(r"/\S+:\d+ [^(]*\(.*?\) ", "", line)

@@ -1,9 +1,9 @@
-"""An estimate brought to fit the photographs: matched once more at full resolution, the network's as prior.
+"""Refine an estimate: match once more at full resolution with the network's disparity as prior.
 
 Semi-global matching (Hirschmueller 2008) over the disparities between the network's least and greatest. A
-candidate costs what the photographs differ by there, in colour and in which neighbours are darker, and how
-far it is from the network's disparity, by how confident that is. What both views find alike takes the place
-of what the network said: thin things that its coarse steps cannot see, and edges.
+candidate's cost is the colour and census difference plus its distance to the network's disparity, weighted by
+confidence. Disparities on which both views agree replace the network's: thin structures below its resolution,
+and edges.
 """
 
 import math
@@ -21,16 +21,16 @@ from stereoweave.system.threads import in_bands, thread_count
 if TYPE_CHECKING:
     from stereoweave.matching.refine_kernels import Cues
 
-# Candidates go this far beyond the network's least and greatest disparity, and are as many as fill vectors.
+# Candidates extend this far beyond the network's range; their number is a multiple of the vector length.
 _MARGIN_PX = 4
 _CANDIDATES_MULTIPLE = 16
-# They take 3 bytes each; so larger pictures are refined in strips, which see this many rows beyond their own.
+# Each takes 3 bytes, so larger images are refined in strips that overlap by this many rows on each side.
 _CANDIDATES_AT_ONCE = 100_000_000
 _OVERLAP_PX = 24
-# A jump between two pixels costs most where they are equally bright, half of it at this difference.
+# Penalty of a large disparity step: greatest between equal grey levels, halved at this difference.
 _LARGEST_STEP, _LEAST_LARGE_STEP = 125, 30
 _HALVING_LEVELS = 30
-# What is left of a pixel's confidence where the other view's network says something else.
+# Factor on a pixel's confidence where the network's disparity of the other view disagrees.
 _DOUBTED = 0.2
 _SAME_PX = 1.0
 _MOST_THREADS = 4
@@ -42,17 +42,17 @@ def refine(
     estimate: Estimate,
     threads: int | None = None,
 ) -> Estimate:
-    """The estimate with the disparities of both views changed where the photographs say otherwise.
+    """Correct the disparities of both views by semi-global matching at full resolution.
 
-    Where the two agree to 1.5 px the estimate's own stays, which is the more precise, and so it does where it
-    is certain, or where the two views find different things. The confidence stays as it is. Photographs of
-    different exposure are brought to one look before they are compared.
+    The network's disparity is kept where matching confirms it to 1.5 px (it is the more precise), where its
+    confidence is high, and where the two views disagree. The confidence does not change. Different exposures
+    are equalised first.
 
     Args:
-        left: The left photograph, uint8 RGB [H, W, 3].
-        right: The right one, of the same size.
-        estimate: Of these two photographs (`stereoweave.estimate`).
-        threads: How many threads may be used, of which four at most are; all cores if left out.
+        left: Left image, uint8 RGB [H, W, 3].
+        right: Right image of the same size.
+        estimate: The pair's estimate (`stereoweave.estimate`).
+        threads: Maximum number of threads, of which at most four are used; default: all cores.
     """
     pair = StereoPair(left=left, right=right)
     check_fits(estimate, pair)
@@ -78,7 +78,7 @@ def _settled(
     trust: Float32[np.ndarray, "h w"],
     towards: int,
 ) -> Float32[np.ndarray, "h w"]:
-    """A view's disparity with what was found in its place, where both views found it."""
+    """Replace a view's disparity where both views found another one and agree."""
     from stereoweave.matching import refine_kernels as kernels  # Numba takes half a second to import
 
     settled_px = np.array(disparity_px, np.float32, order="C")
@@ -91,7 +91,7 @@ def _settled(
 def _matched(
     pair: StereoPair, estimate: Estimate, threads: int
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """The disparities of least cost of both views."""
+    """Match both views; their disparities of least cost."""
     first_px, count = _candidates(estimate)
     left = _cues(pair.left, estimate.disparity_px - first_px, estimate.confidence)
     right = _cues(pair.right, estimate.right_disparity_px - first_px, right_confidence(estimate))
@@ -111,9 +111,9 @@ def _matched(
 def _strip(
     views: list[tuple["Cues", "Cues"]], first_px: int, count: int, threads: int
 ) -> Float32[np.ndarray, "2 h w"]:
-    """The disparities of least cost of some rows, of both views, each as the left one of its pair."""
+    """Match a strip of rows of both views, each as the left view of its pair."""
     size = (*views[0][0].grey.shape, count)
-    # Memory that is new takes as long to get as a path: both views work in the same.
+    # Both views share the buffers: allocating new memory takes as long as aggregating one path.
     costs, sums = np.empty(size, np.uint8), np.empty(size, np.uint16)
     return np.stack([_found(own, other, (costs, sums), first_px, threads) for own, other in views])
 
@@ -125,7 +125,7 @@ def _found(
     first_px: int,
     threads: int,
 ) -> Float32[np.ndarray, "h w"]:
-    """The disparities of least cost of a left view; its costs and their sums are written into `volumes`."""
+    """Match a left view; `volumes` are buffers for its costs and their sums over all paths."""
     from stereoweave.matching import refine_kernels as kernels
 
     height, width = own.grey.shape
@@ -151,10 +151,10 @@ def _found(
 
 
 def _candidates(estimate: Estimate) -> tuple[int, int]:
-    """The first disparity in px that is looked at, and how many are."""
+    """First candidate disparity in px and number of candidates."""
     both = estimate.disparity_px, estimate.right_disparity_px
     least_px = math.floor(min(view.min() for view in both))
-    # Parallel cameras give none below 0: a plain sky would take them.
+    # Parallel cameras have none below 0; as candidates, a plain sky would take them.
     first_px = least_px - _MARGIN_PX if least_px < 0 else max(least_px - _MARGIN_PX, 0)
     last_px = math.ceil(max(view.max() for view in both)) + _MARGIN_PX
     count = last_px - first_px + 1
@@ -182,19 +182,19 @@ def _cues(photo: UInt8[np.ndarray, "h w 3"], above_first_px: np.ndarray, trust: 
 
 
 def _backwards(cues: "Cues", first_px: int, count: int) -> "Cues":
-    """The other photograph's columns as the kernels take them; beyond its borders these go on."""
+    """Reverse the other image's columns for the kernels and pad them by repeating the borders."""
     width = cues.grey.shape[1]
     columns = np.clip(width - 1 - first_px - np.arange(width + count - 1), 0, width - 1)
     return type(cues)(*(cue.take(columns, -1) for cue in cues))
 
 
 def _part(cues: "Cues", index: Any) -> "Cues":
-    """Rows or columns of all cues."""
+    """Index all cues alike."""
     return type(cues)(*(np.ascontiguousarray(cue[index]) for cue in cues))
 
 
 def right_confidence(estimate: Estimate) -> Float32[np.ndarray, "h w"]:
-    """The confidence of the right view's disparities, for which the left one's speaks at their matches."""
+    """Confidence of the right view's disparities, taken from the left view at their matches."""
     seen_px, inside = at_match(estimate.disparity_px, estimate.right_disparity_px, 1)
     confidence, _ = at_match(np.asarray(estimate.confidence, np.float32), estimate.right_disparity_px, 1)
     agreed = inside & (np.abs(seen_px - estimate.right_disparity_px) <= _SAME_PX)
@@ -202,7 +202,7 @@ def right_confidence(estimate: Estimate) -> Float32[np.ndarray, "h w"]:
 
 
 def _large_steps(grey: UInt8[np.ndarray, "h w"], axis: int) -> UInt16[np.ndarray, "h w"]:
-    """What a jump between a pixel and the one before it costs: less where their grey values differ more."""
+    """Penalty of a large step between a pixel and the one before it, lower at strong grey edges."""
     before = grey.take([0, *range(grey.shape[axis] - 1)], axis)
     costs = _LARGEST_STEP / (1 + cv2.absdiff(grey, before).astype(np.float32) / _HALVING_LEVELS)
     return np.maximum(costs, _LEAST_LARGE_STEP).astype(np.uint16)

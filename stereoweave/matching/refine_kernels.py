@@ -1,9 +1,9 @@
-"""The refinement's loops over pixels and disparities, compiled by Numba; `refine` calls them in this order.
+"""Numba kernels of `refine`, in the order of their calls.
 
-A plain version of all this is in tests/plain_refining.py, and has to agree. All is for a left view: the right
-one is the left one of the mirrored pair. Volumes are [H, W, D]: candidate i is the disparity first_px + i,
-and the match of column x is then column W - 1 - x + i of the other photograph's `Cues`, whose columns run
-backwards, so that candidates lie side by side in memory.
+Their plain reference is tests/helpers/plain_refining.py. All kernels treat a left view; the right view is
+the left one of the mirrored pair. Volumes are [H, W, D]. Candidate i is the disparity first_px + i. The
+columns of the other image's `Cues` are reversed, so that the candidates of column x, W - 1 - x + i, are
+contiguous in memory.
 """
 
 import typing
@@ -13,44 +13,44 @@ import numpy as np
 from stereoweave.system.jit import inlined, kernel
 
 SUBSTEPS = 8
-"""A network's disparity is compared with candidates in steps of 1/8 px."""
+"""The network's disparity is compared with candidates in steps of 1/8 px."""
 DOUBTLESS, FARTHEST = np.uint16(SUBSTEPS), np.uint16(8 * SUBSTEPS)
-"""A candidate so near to it costs nothing by that, and one so much farther away the most."""
+"""Distances to the network's disparity: up to the first cost nothing; beyond it by the second cost most."""
 MOST_TRUST = 12
-"""What the most is, for a disparity of full confidence."""
+"""The greatest cost of that distance, for a disparity of confidence 1."""
 MOST_DIFFERENCE = np.uint8(40)
-"""Levels of a channel that differ by more belong to different surfaces, however much more that is."""
+"""Truncation of a channel's difference: greater ones all mean a different surface."""
 SMALL_STEP = 20
-"""What a change by one candidate between two pixels of a path costs."""
+"""Penalty of a disparity step of one candidate between two pixels of a path."""
 PRECISE_PX = 1.5
-"""So near to a whole candidate the network is the more precise of the two."""
+"""Within this distance of the result the network's disparity is the more precise one."""
 CERTAIN = 0.85
-"""Of a network's disparities of this confidence more would be spoilt than mended."""
+"""Above this confidence, replacing the network's disparities does more harm than good."""
 AGREED_PX = 1.0
-"""The most by which two views' disparities of one point differ."""
+"""Greatest difference between two views' disparities of one point."""
 RELIABLE_RUN = 8
 SLACK_PX = 2
 LARGEST_MOVE_PX = 24
-"""A network that is off by more than this beside the border sees something else there than the surface."""
+"""Beyond this distance, the network's disparity at the border belongs to another surface."""
 _CENSUS_RADIUS = 2
 _NEVER = np.uint16(30000)
 _SIX = np.uint16(6)
-# Numba makes 64 bits of every sum unless both its parts are narrow: half as many in a vector.
+# Numba widens sums to 64 bits unless both operands are narrow, which halves the vector's elements.
 _ONE, _TWO, _FOUR, _TOP = (np.uint32(bits) for bits in (1, 2, 4, 24))
 _PAIRS, _FOURS, _EIGHTS, _SUM = (np.uint32(mask) for mask in (0x55555555, 0x33333333, 0x0F0F0F0F, 0x01010101))
 
 
 class Cues(typing.NamedTuple):
-    """What the cost of a match is made of, for each pixel of a photograph; arrays [H, W], C-contiguous.
+    """Inputs of the matching cost for each pixel of an image; C-contiguous arrays [H, W].
 
     Attributes:
-        grey: uint8; where it changes little, neighbours are on one surface.
-        census: uint32, which of the 24 pixels around are darker.
+        grey: uint8, determines the penalty of large disparity steps.
+        census: uint32, one bit for each of the 24 pixels around: whether it is darker.
         colour: uint8 [H, 3, W].
-        darkest: uint8 [H, 3, W], of the levels up to half a pixel to either side.
-        brightest: uint8 [H, 3, W], likewise.
-        prior: uint16, the network's disparity less first_px, in 1/SUBSTEPS px: up to 8191 px.
-        trust: uint16, 0..MOST_TRUST, its weight.
+        darkest: uint8 [H, 3, W], least level within half a pixel to either side.
+        brightest: uint8 [H, 3, W], greatest level within half a pixel to either side.
+        prior: uint16, the network's disparity minus first_px in 1/SUBSTEPS px, up to 8191 px.
+        trust: uint16, weight of the prior, 0..MOST_TRUST.
     """
 
     grey: np.ndarray
@@ -65,7 +65,7 @@ class Cues(typing.NamedTuple):
 @kernel
 @typing.no_type_check
 def census(grey, codes):
-    """Write into codes one bit for each of the 24 pixels around: whether it is darker."""
+    """Write the 5x5 census code of each pixel into codes: one bit per neighbour, set if it is darker."""
     height, width = grey.shape
     for y in range(height):
         for x in range(width):
@@ -82,7 +82,7 @@ def census(grey, codes):
 @inlined
 @typing.no_type_check
 def bits(code):
-    """How many of 32 bits are set."""
+    """Number of set bits in 32."""
     pairs = np.uint32(code - ((code >> _ONE) & _PAIRS))
     fours = np.uint32((pairs & _FOURS) + ((pairs >> _TWO) & _FOURS))
     return np.int32(np.uint32(((fours + (fours >> _FOUR)) & _EIGHTS) * _SUM) >> _TOP)
@@ -91,14 +91,14 @@ def bits(code):
 @inlined
 @typing.no_type_check
 def _outside(level, dark, bright):
-    """How far a level is outside of dark..bright."""
+    """Distance of a level to the interval dark..bright."""
     return max(np.uint8(max(level, bright) - bright), np.uint8(dark - min(level, dark)))
 
 
 @inlined
 @typing.no_type_check
 def _difference(level, dark, bright, there, dark_there, bright_there):
-    """How much a channel differs, half a pixel to either side of one allowed (Birchfield and Tomasi 1998)."""
+    """Sampling-insensitive difference of a channel (Birchfield and Tomasi 1998), truncated."""
     nearest = min(_outside(level, dark_there, bright_there), _outside(there, dark, bright))
     return min(nearest, MOST_DIFFERENCE)
 
@@ -106,7 +106,7 @@ def _difference(level, dark, bright, there, dark_there, bright_there):
 @inlined
 @typing.no_type_check
 def _differences(level, dark, bright, levels, darks, brights, costs):
-    """Write half of how much the candidates' colours differ; each argument is three channels'."""
+    """Write half the colour difference of each candidate; arguments are tuples of three channels."""
     for i in range(costs.shape[0]):
         red = _difference(level[0], dark[0], bright[0], levels[0][i], darks[0][i], brights[0][i])
         green = _difference(level[1], dark[1], bright[1], levels[1][i], darks[1][i], brights[1][i])
@@ -117,21 +117,21 @@ def _differences(level, dark, bright, levels, darks, brights, costs):
 @inlined
 @typing.no_type_check
 def _at(channels, y, x):
-    """A pixel's three levels; `channels` is [H, 3, W]."""
+    """The three levels of a pixel; `channels` is [H, 3, W]."""
     return channels[y, 0, x], channels[y, 1, x], channels[y, 2, x]
 
 
 @inlined
 @typing.no_type_check
 def _along(channels, y, start, end):
-    """The three channels of some columns of a row."""
+    """The three channels of columns start..end of a row."""
     return channels[y, 0, start:end], channels[y, 1, start:end], channels[y, 2, start:end]
 
 
 @inlined
 @typing.no_type_check
 def _add_census(code, codes, costs):
-    """Add how many bits of the census differ, twice."""
+    """Add twice the Hamming distance of the census codes."""
     for i in range(costs.shape[0]):
         costs[i] = np.uint8(costs[i] + 2 * bits(code ^ codes[i]))
 
@@ -139,7 +139,7 @@ def _add_census(code, codes, costs):
 @inlined
 @typing.no_type_check
 def _pull(prior, trust, candidate):
-    """What a candidate costs by its distance to the network's disparity, beyond 1 px and up to 9."""
+    """Cost of a candidate's distance to the network's disparity: rises from 1 px to 9 px."""
     away = np.uint16(max(prior, candidate) - min(prior, candidate))
     beyond = np.uint16(max(away, DOUBTLESS) - DOUBTLESS)
     return np.uint16(np.uint16(min(beyond, FARTHEST) * trust) >> _SIX)
@@ -148,7 +148,7 @@ def _pull(prior, trust, candidate):
 @inlined
 @typing.no_type_check
 def _add_pulls(prior, trust, priors, trusts, costs):
-    """Add the pull of both views' networks."""
+    """Add the pulls towards the network's disparities of both views."""
     for i in range(costs.shape[0]):
         candidate = np.uint16(SUBSTEPS * i)
         pulls = _pull(prior, trust, candidate) + _pull(priors[i], trusts[i], candidate)
@@ -158,7 +158,7 @@ def _add_pulls(prior, trust, priors, trusts, costs):
 @kernel
 @typing.no_type_check
 def match(own, other, first, last, costs):
-    """Write into rows first..last of costs, uint8, what each candidate costs."""
+    """Write the matching cost of each candidate into rows first..last of costs, uint8."""
     _, width, count = costs.shape
     for y in range(first, last):
         for x in range(width):
@@ -182,7 +182,7 @@ def match(own, other, first, last, costs):
 @inlined
 @typing.no_type_check
 def _step(before, least, costs, large_step, after, sums):
-    """One step of a path: writes its costs into after and adds them to sums; the least of them."""
+    """Advance a path by one pixel: write its costs into after, add them to sums and return the least."""
     limit = np.uint16(least + large_step)
     lowest = _NEVER
     for i in range(costs.shape[0]):
@@ -197,9 +197,9 @@ def _step(before, least, costs, large_step, after, sums):
 @kernel
 @typing.no_type_check
 def along_rows(costs, large_step, first, last, sums):
-    """Write into rows first..last of sums the costs of the paths from the left and from the right.
+    """Write the summed costs of the paths from left and right into rows first..last of sums.
 
-    large_step [H, W] is what a jump between a pixel and the one before it costs.
+    large_step [H, W] is the penalty of a large step between a pixel and the one before it.
     """
     _, width, count = costs.shape
     paths = np.empty((2, count + 2), np.uint16)
@@ -218,7 +218,7 @@ def along_rows(costs, large_step, first, last, sums):
 @kernel
 @typing.no_type_check
 def along_columns(costs, large_step, first, last, sums):
-    """Add to columns first..last of sums the costs of the paths from above and from below."""
+    """Add the costs of the paths from above and below to columns first..last of sums."""
     height, _, count = costs.shape
     width = last - first
     paths = np.empty((2, width, count + 2), np.uint16)
@@ -239,7 +239,7 @@ def along_columns(costs, large_step, first, last, sums):
 @inlined
 @typing.no_type_check
 def _between(before, here, after):
-    """Where between the candidates, -0.5..0.5, two lines of opposite slope meet through three costs."""
+    """Subpixel offset, -0.5..0.5: intersection of two lines of opposite slope through three costs."""
     rise = max(np.int32(before), np.int32(after)) - np.int32(here)
     return 0.5 * (np.int32(before) - np.int32(after)) / rise if rise > 0 else 0.0
 
@@ -247,7 +247,7 @@ def _between(before, here, after):
 @kernel
 @typing.no_type_check
 def pick(sums, first_px, first, last, found_px):
-    """Write into rows first..last of found_px the disparities of least cost."""
+    """Write the disparities of least cost into rows first..last of found_px."""
     _, width, count = sums.shape
     for y in range(first, last):
         for x in range(width):
@@ -266,10 +266,10 @@ def pick(sums, first_px, first, last, found_px):
 @kernel
 @typing.no_type_check
 def settle(found_px, other_px, trust, towards, disparity_px, agreed):
-    """Put what both views found alike into disparity_px, which holds the network's, and mark it in agreed.
+    """Mark in agreed where both views agree; there replace the network's disparity in disparity_px.
 
-    A disparity that is certain, or off by no more than PRECISE_PX, stays: `trust` is its confidence. towards
-    is -1 if the match of column x is at x - disparity, 1 if it is at x + disparity.
+    Disparities of confidence `trust` >= CERTAIN, or off by no more than PRECISE_PX, are kept. towards is -1
+    if the match of column x is at x - disparity, 1 if it is at x + disparity.
     """
     height, width = found_px.shape
     for y in range(height):
@@ -285,10 +285,11 @@ def settle(found_px, other_px, trust, towards, disparity_px, agreed):
 @kernel
 @typing.no_type_check
 def extend(agreed, trust, towards, disparity_px):
-    """Continue the first surface of each row to the border that the other picture does not reach.
+    """Extend the first surface of each row to the border that is outside the other image.
 
-    A surface is RELIABLE_RUN agreed pixels; it is continued where all between it and the border lies beyond
-    the other picture. What is certain stays, and what is farther from it than LARGEST_MOVE_PX.
+    A surface is a run of RELIABLE_RUN agreed pixels. It is extended if all pixels between it and the border
+    have their matches outside the other image. Certain disparities, and those farther from the surface than
+    LARGEST_MOVE_PX, are kept.
     """
     height, width = agreed.shape
     for y in range(height):

@@ -1,4 +1,4 @@
-"""The shipped network behind the call of OpenCV's stereo matchers, for programs written for StereoSGBM."""
+"""Drop-in replacement for OpenCV's StereoSGBM that runs the shipped networks."""
 
 from pathlib import Path
 
@@ -19,23 +19,23 @@ _LARGEST_PX = 2047
 
 
 class StereoMatcher:
-    """Takes the place of cv2.StereoSGBM: `compute` gives int16 disparity * 16, as its users expect it.
+    """Replacement for cv2.StereoSGBM: `compute` returns int16 disparity * 16.
 
-    The two parameters have OpenCV's names and meaning. Those that steer OpenCV's way of matching (blockSize,
-    P1, P2, disp12MaxDiff, preFilterCap, uniquenessRatio, speckleWindowSize, speckleRange, mode) mean nothing
-    to a network: handed in, they are a TypeError.
+    minDisparity and numDisparities have OpenCV's names and meaning. Parameters of OpenCV's algorithm
+    (blockSize, P1, P2, disp12MaxDiff, preFilterCap, uniquenessRatio, speckleWindowSize, speckleRange, mode)
+    do not apply to a network and raise a TypeError.
 
     Args:
-        minDisparity: The least disparity that is looked for, in px; below 0 for converged cameras.
-        numDisparities: How many are, from minDisparity on; any number, where OpenCV demands a multiple of 16.
-        model: A shipped name or the path of an .onnx matcher.
-        threads: How many threads a call may use; all cores if left out.
-        provider: As for `stereoweave.estimate`.
-        refined: As for `stereoweave.estimate`.
-        min_confidence: Pixels whose disparity is less likely than this to be within 1 px are invalid.
+        minDisparity: Least disparity in px; below 0 for converged cameras.
+        numDisparities: Number of disparities from minDisparity; need not be a multiple of 16 as in OpenCV.
+        model: Name of a shipped network or path of an .onnx matcher.
+        threads: Maximum number of threads per call; default: all cores.
+        provider: See `stereoweave.estimate`.
+        refined: See `stereoweave.estimate`.
+        min_confidence: Pixels with a lower confidence are invalid.
     """
 
-    def __init__(  # noqa: PLR0913 - OpenCV's two, and what makes a matcher
+    def __init__(  # noqa: PLR0913 - OpenCV's two and those of a matcher
         self,
         minDisparity: int = 0,
         numDisparities: int = 192,
@@ -58,14 +58,14 @@ class StereoMatcher:
     def compute(
         self, left: UInt8[np.ndarray, "h w *channels"], right: UInt8[np.ndarray, "h w *channels"]
     ) -> Int16[np.ndarray, "h w"]:
-        """Disparity of the left picture in px * 16, and (minDisparity - 1) * 16 where it is not known.
+        """Disparity of the left image in px * 16; invalid pixels are (minDisparity - 1) * 16.
 
-        It is not known where the left camera alone sees, where the confidence is below min_confidence, and
-        where the disparity is outside of minDisparity to minDisparity + numDisparities.
+        Invalid are occluded pixels, those with a confidence below min_confidence, and disparities outside
+        minDisparity to minDisparity + numDisparities.
 
         Args:
-            left: The left picture of a rectified pair as cv2.imread gives it: BGR or grey, uint8.
-            right: The right one, of the same size.
+            left: Left image of a rectified pair as returned by cv2.imread: BGR or grey, uint8.
+            right: Right image of the same size.
         """
         pair = StereoPair(left=_rgb_of_bgr(left, "left picture"), right=_rgb_of_bgr(right, "right picture"))
         least_px, most_px = self._least_px, self._least_px + self._count
@@ -94,7 +94,7 @@ class StereoMatcher:
         check_whole_number("minDisparity", self._least_px)
         check_whole_number("numDisparities", self._count)
         least_px, most_px = self._least_px, self._least_px + self._count
-        # One more at the low end, for what is invalid.
+        # The value below minDisparity marks invalid pixels.
         if self._count < 1 or least_px - 1 < -_LARGEST_PX or most_px > _LARGEST_PX:
             raise StereoweaveError(
                 f"expected numDisparities of 1 or more, and disparities of {1 - _LARGEST_PX} to "
@@ -104,7 +104,7 @@ class StereoMatcher:
 
 
 def _rgb_of_bgr(picture: UInt8[np.ndarray, "h w *channels"], name: str) -> UInt8[np.ndarray, "h w 3"]:
-    # Else a PIL image or a tensor, which are RGB, would be taken for BGR.
+    # PIL images and tensors are RGB and would be misread as BGR.
     if not isinstance(picture, np.ndarray) or picture.dtype != np.uint8:
         raise StereoweaveError(
             f"{name}: expected uint8, BGR [H, W, 3] or grey [H, W], as cv2.imread gives it, "

@@ -1,4 +1,4 @@
-"""An estimate that is right to about a pixel becomes one that is right to a small part of one."""
+"""Subpixel refinement of an estimate that is accurate to about a pixel."""
 
 from dataclasses import replace
 
@@ -10,19 +10,19 @@ from stereoweave.stereo import Estimate
 from stereoweave.system.threads import in_bands, thread_count
 
 _LARGEST_CHANGE_PX = 1.0
-# Neighbours whose disparities differ by more than about this are of two surfaces.
+# Neighbours whose disparities differ by more than about this belong to different surfaces.
 _SAME_PX = 0.6
-# The variance of a slope that noise of 3 grey levels alone gives: plain places stay as they are.
+# Gradient variance caused by noise of 3 grey levels alone; keeps disparity unchanged in plain areas.
 _PLAIN = 4.0
-# The slope of a picture along its rows, without the blur of a Sobel filter.
+# Horizontal derivative without the blur of a Sobel filter.
 _SLOPE = np.array([[1, -8, 0, 8, -1]], np.float32) / 12
-# Widths on the grid of half as many rows and columns, where everything that is smooth is worked out: before
-# the photographs are compared, the window they are compared in, and after.
+# Widths on the half-resolution grid, on which all smooth quantities are computed: smoothing before matching,
+# matching window, smoothing after matching.
 _SMOOTH_SIGMA, _WINDOW_SIGMA, _FOUND_SIGMA = 2.0, 0.8, 3.0
-# A depth edge is where the disparity differs by this from its mean over so many places of that grid.
+# A depth edge is where the disparity differs by this from its mean over a window of that grid.
 _EDGE_PX, _EDGE_PLACES = 0.5, 5
-# How far below and above the rows of a band what it finds there depends on; the least rows worth a thread,
-# and the most pixels at once, which take 40 bytes each.
+# Bands of rows: overlap on each side that the result depends on; least number of rows worth a thread; most
+# pixels at once, at 40 bytes each.
 _REACH_PX = 32
 _LEAST_BAND_PX = 64
 _BAND_PIXELS = 2_000_000
@@ -35,28 +35,30 @@ def to_subpixel(
     estimate: Estimate,
     threads: int | None = None,
 ) -> Estimate:
-    """The estimate with the left view's disparity moved by at most 1 px, to where the photographs agree best.
+    """Refine the left view's disparity by at most 1 px, to best agreement of the images.
 
     Source: B. Lucas and T. Kanade, "An iterative image registration technique with an application to stereo
-    vision", 1981: around each pixel least squares between the left view and the right one shifted by the
-    disparity, after which the slopes say how much is missing. Three deviations: contrast is made alike and
-    means within the window are taken off, so that a difference in exposure does not shift anything; before
-    and after the one step the disparity is smoothed, not across edges, for neighbours that err to either
-    side hold each other (median error of depth of walls 0.9 -> 0.5 %); and near depth edges, where a window
-    sees two surfaces, nothing is added (bad-1 there 31.3 -> 30.1 %). What the right camera does not see
-    stays.
+    vision", 1981: in a window around each pixel, one least-squares step aligns the right image, warped by the
+    disparity, with the left one. Three deviations:
+
+    - Contrast is equalised and window means are subtracted, so that different exposures cause no shift.
+    - Disparity is smoothed before and after the step, but not across edges, so that errors of opposite sign
+      cancel out (median depth error of walls 0.9 -> 0.5 %).
+    - Near depth edges, where a window covers two surfaces, no step is made (bad-1 there 31.3 -> 30.1 %).
+
+    Occluded pixels do not change.
 
     Args:
-        left: The left photograph, uint8 RGB [H, W, 3].
-        right: The right one, of the same size.
-        estimate: Of these two photographs.
-        threads: How many threads may be used; all cores if left out.
+        left: Left image, uint8 RGB [H, W, 3].
+        right: Right image of the same size.
+        estimate: The pair's estimate.
+        threads: Maximum number of threads; default: all cores.
     """
     here, there = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right))
     gain = _gain(here, there, estimate)
     here, there = _even(here), _even(there)
     given_px = _even(estimate.disparity_px.astype(np.float32))
-    # Parallel cameras give none below 0, and a sky must not either.
+    # Parallel cameras have no disparities below 0; keep a sky from getting any.
     least_px = min(float(given_px.min()), 0.0)
     found_px = np.empty_like(given_px)
 
@@ -68,9 +70,9 @@ def to_subpixel(
 
     count = thread_count(threads)
     bands = max(1, min(max(count, here.size // _BAND_PIXELS), len(here) // _LEAST_BAND_PX))
-    # By pairs of rows, so that no place of the coarse grid is in two bands.
+    # Bands of row pairs, so that none splits a row of the coarse grid.
     if bands == 1:
-        move(0, len(here) // 2)  # a thread of its own would take a fifth longer, in getting memory
+        move(0, len(here) // 2)  # in another thread, memory allocation would take a fifth longer
     else:
         in_bands(move, len(here) // 2, bands, count)
     height, width = estimate.disparity_px.shape
@@ -79,20 +81,20 @@ def to_subpixel(
 
 
 def _even(values: np.ndarray) -> np.ndarray:
-    """The map with its last row and column twice where they are odd in number."""
+    """Repeat the last row and column if needed to make both sides even."""
     height, width = values.shape
     return cv2.copyMakeBorder(values, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
 
 
 def _gain(here: UInt8[np.ndarray, "h w"], there: UInt8[np.ndarray, "h w"], estimate: Estimate) -> float:
-    """The left view's contrast by the right one's, as standard deviations of some of what both see."""
+    """Ratio of left to right contrast: standard deviations over a sample of the visible pixels."""
     some = np.s_[::_GAIN_STEP_PX, ::_GAIN_STEP_PX]
     rows, columns = _GAIN_STEP_PX * np.argwhere(~estimate.occluded[some]).T
     if not rows.size:
         return 1.0
     matches = np.rint(columns - estimate.disparity_px[rows, columns]).astype(int)
     seen = here[rows, columns], there[rows, matches.clip(0, there.shape[1] - 1)]
-    # 1 at least, for a picture without any.
+    # At least 1, for images without contrast.
     own, other = (max(float(values.std()), 1.0) for values in seen)
     return own / other
 
@@ -103,7 +105,7 @@ def _moved(
     given_px: Float32[np.ndarray, "h w"],
     gain: float,
 ) -> Float32[np.ndarray, "h w"]:
-    """The disparity of rows of the left view, of even size."""
+    """Refine the disparity of a band of rows of the left view; both sides are even."""
     coarse_px = _halved(given_px)
     smooth_px = _doubled(_smoothed(coarse_px, _SMOOTH_SIGMA))
     start_px = np.where(cv2.absdiff(smooth_px, given_px) < _SAME_PX, smooth_px, given_px)
@@ -120,7 +122,7 @@ def _missing_px(
     disparity_px: Float32[np.ndarray, "h w"],
     gain: float,
 ) -> Float32[np.ndarray, "h2 w2"]:
-    """What least squares adds to a disparity, on the coarse grid."""
+    """Least-squares correction of the disparity on the coarse grid."""
     height, width = disparity_px.shape
     columns = np.arange(width, dtype=np.float32) - disparity_px
     rows = np.broadcast_to(np.arange(height, dtype=np.float32)[:, None], columns.shape)
@@ -133,19 +135,19 @@ def _missing_px(
 
 
 def _near_edge(coarse_px: Float32[np.ndarray, "h2 w2"]) -> Bool[np.ndarray, "h2 w2"]:
-    """Where a surface ends, and around it; a slanted one, whose mean is its middle, has none inside."""
+    """Mask of pixels near depth edges; a slanted plane, equal to its local mean, has none."""
     around = (_EDGE_PLACES, _EDGE_PLACES)
     off_px = cv2.absdiff(coarse_px, cv2.blur(coarse_px, around))
     return cv2.dilate(off_px, np.ones(around, np.uint8)) > _EDGE_PX
 
 
 def _smoothed(coarse_px: Float32[np.ndarray, "h2 w2"], sigma: float) -> Float32[np.ndarray, "h2 w2"]:
-    """The disparity smoothed, but not across steps."""
+    """Smooth the disparity, but not across depth edges."""
     return cv2.bilateralFilter(coarse_px, -1, _SAME_PX, sigma)
 
 
 def _window(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h2 w2"]:
-    """Means around each place of the coarse grid."""
+    """Window means on the coarse grid."""
     return cv2.GaussianBlur(_halved(values), (0, 0), _WINDOW_SIGMA)
 
 

@@ -1,9 +1,9 @@
-"""An estimate of smaller photographs, brought to the full size of the photographs and to their edges.
+"""Upsample the estimate of a downscaled pair to full size, with edges aligned to the full-size images.
 
-Each level is at most twice as large as the one before, whose disparities are its prior. Semi-global matching
-(Hirschmueller 2008), with candidates only near the prior's surfaces (as Rothermel et al. 2012), finds where
-these meet, and where they are to a fraction of a pixel. It works on strips of rows: what its paths know is
-handed from strip to strip, so that the strips' height changes nothing.
+Each level is at most twice as large as the previous one, whose disparities are its prior. Semi-global
+matching (Hirschmueller 2008) with candidates near the prior's surfaces only (as in Rothermel et al. 2012)
+locates their edges and refines their disparity to a fraction of a pixel. Images are processed in strips of
+rows; the vertical paths' state passes from strip to strip, so that the strips' height does not matter.
 """
 
 from collections.abc import Callable
@@ -18,42 +18,42 @@ from stereoweave.matching.left_right_check import find_occluded
 from stereoweave.stereo import Estimate
 from stereoweave.system.threads import in_bands, thread_count
 
-# What the candidates of a strip and their costs may take.
+# Memory limit for the cost volumes of a strip.
 _STRIP_BYTES = 150_000_000
 _LEAST_ROWS = 32
 _CENSUS_PX = 2
-# A pixel may be of any surface that the smaller pictures show within a window of so many of their pixels.
+# A pixel may belong to any surface within a window of this size in the smaller images.
 _SURFACES_PX = 5
-# Where these surfaces are so many of their pixels apart, there is an edge.
+# There is an edge where these surfaces differ by this much, in pixels of the smaller images.
 _EDGE_PX = 1.5
-# What a candidate costs by each px that it is away from its surface, beyond the first of these and up to
-# the second: the smaller pictures show disparity to about half a pixel of theirs.
+# Cost per px of a candidate's distance to its surface, counted from _FREE_PX to _FARTHEST_PX: disparities of
+# the smaller images are accurate to about half of their pixels.
 _PULL, _FREE_PX, _FARTHEST_PX = 2, 1, 8
-# A jump between two pixels costs most where they are equally bright, half of it at this difference.
+# Penalty of a large disparity step: greatest between equal grey levels, halved at this difference.
 _LARGEST_STEP, _LEAST_LARGE_STEP = 125, 30
 _HALVING_LEVELS = 30
-# Where the prior is off by no more, it is moved by what is found in such a window on average.
+# Where the prior is off by at most this, it is corrected by the mean difference in a window of this size.
 _FOLLOWED_PX = 2.0
 _MEAN_PX = 9
 _LEAST_SHARE, _LEAST_SHARE_AROUND = 0.3, 0.02
 _SETTLED_ROWS = 256
-# What is left of the prior's confidence, and the most that it can be. On painted pairs what follows the prior
-# is right as often as that claimed, what the views see not alike 85 % as often, and what is changed every
-# other time.
+# Factor on the prior's confidence, and its upper limit. On collages, disparities that follow the prior are
+# right as often as it claimed, those on which the views disagree 85 % as often, and changed ones half the
+# time.
 _FOLLOWS, _UNSEEN, _CHANGED = 0, 1, 2
 _LEFT_OF_CONFIDENCE = np.array([1, 0.85, 1], np.float32)
 _MOST_CONFIDENCE = np.array([1, 1, 0.5], np.float32)
 
 
 class _Cues(NamedTuple):
-    """What the costs of a strip are made of: census codes and grey levels, uint32 and uint8 [H, W]."""
+    """Inputs of a strip's matching cost: census codes, uint32, and grey levels, uint8, [H, W]."""
 
     codes: UInt32[np.ndarray, "h w"]
     levels: UInt8[np.ndarray, "h w"]
 
 
 class _Paths(NamedTuple):
-    """What vertical paths know at a row, as `enlarging_kernels.along_columns` takes it."""
+    """State of the vertical paths at a row, for `upsample_kernels.along_columns`."""
 
     costs: UInt16[np.ndarray, "w path"]
     least: UInt16[np.ndarray, " w"]
@@ -61,12 +61,12 @@ class _Paths(NamedTuple):
 
 
 class _View:
-    """A left picture, the right one and the prior: what is seen of it in strips of rows.
+    """A left view with its prior, read in strips of rows.
 
     Args:
-        grey: The left picture.
-        other: The right one.
-        smaller_px: The left one's disparities in a smaller copy, in pixels of that.
+        grey: Left image.
+        other: Right image.
+        smaller_px: The left view's disparities at the smaller size, in pixels of that size.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class _View:
         )
 
     def prior_px(self, rows: slice) -> Float32[np.ndarray, "h w"]:
-        """The disparity of the smaller copy at each pixel of some rows."""
+        """Interpolate the smaller images' disparity at each pixel of the rows."""
         height, smaller = len(self.grey), len(self._columns_px)
         places = np.clip((np.arange(height)[rows] + 0.5) * smaller / height - 0.5, 0, smaller - 1)
         above = np.minimum(places.astype(int), smaller - 2)
@@ -94,11 +94,11 @@ class _View:
         return (1 - share) * self._columns_px[above] + share * self._columns_px[above + 1]
 
     def surfaces_px(self, rows: slice) -> list[Float32[np.ndarray, "h w"]]:
-        """The farthest and the nearest surface around each pixel of some rows."""
+        """Disparities of the farthest and nearest surface around each pixel of the rows."""
         return [surface[self._rows[rows]][:, self._columns] for surface in self._surfaces_px]
 
     def cues(self, rows: slice, threads: int) -> tuple[_Cues, _Cues]:
-        """Those of both pictures as `enlarging_kernels.match` takes them."""
+        """Cues of both images for `upsample_kernels.match`."""
         from stereoweave.matching import upsample_kernels as kernels  # Numba takes half a second to import
 
         with ThreadPoolExecutor(threads) as pool:
@@ -107,7 +107,7 @@ class _View:
         return own, _Cues(*(np.pad(cue[:, ::-1], more, mode="edge") for cue in other))
 
     def first_candidates(self, rows: slice) -> Int16[np.ndarray, "h w 2"]:
-        """The least disparity of each band."""
+        """Least disparity of each band of candidates."""
         from stereoweave.matching import upsample_kernels as kernels
 
         farthest_px, nearest_px = self.surfaces_px(rows)
@@ -119,16 +119,16 @@ class _View:
     def at_edge(
         self, farthest_px: Float32[np.ndarray, "h w"], nearest_px: Float32[np.ndarray, "h w"]
     ) -> Bool[np.ndarray, "h w"]:
-        """Where the surfaces around a pixel are not one."""
+        """Mask of pixels with more than one surface around them."""
         return nearest_px - farthest_px > _EDGE_PX * self._scale
 
     def steps_along(self, rows: slice) -> UInt16[np.ndarray, "h w1"]:
-        """What a jump between a column and the one before it costs."""
+        """Penalty of a large step between each column and the one before it."""
         grey = self.grey[rows]
         return np.pad(_large_steps(grey[:, 1:], grey[:, :-1]), ((0, 0), (1, 1)))
 
     def steps_down(self, rows: slice) -> UInt16[np.ndarray, "h1 w"]:
-        """What a jump between a row and the one before it costs, that behind the last row included."""
+        """Penalty of a large step between each row and the one before it, and after the last row."""
         grey = self.grey[max(rows.start - 1, 0) : rows.stop + 1]
         ends = rows.start == 0, rows.stop == len(self.grey)
         return np.pad(_large_steps(grey[1:], grey[:-1]), (ends, (0, 0)))
@@ -140,16 +140,16 @@ def enlarge(
     estimate: Estimate,
     threads: int | None = None,
 ) -> Estimate:
-    """The estimate of smaller copies of two photographs, at the size of these.
+    """Upsample the estimate of a downscaled pair to full size.
 
-    Disparities are px of the full size. Confidence is lowered where the photographs do not bear out what the
-    smaller ones showed; what is occluded is found anew.
+    Disparities are in px of the full size. Confidence is lowered where the full-size images contradict the
+    smaller ones; occlusion is computed again.
 
     Args:
-        left: The left photograph, uint8 RGB [H, W, 3].
-        right: The right one, of the same size.
-        estimate: Of these two made smaller, alike in both directions.
-        threads: How many threads may be used; all cores if left out.
+        left: Left image, uint8 RGB [H, W, 3].
+        right: Right image of the same size.
+        estimate: Estimate of the pair, downscaled by the same factor in both directions.
+        threads: Maximum number of threads; default: all cores.
     """
     height, width = left.shape[:2]
     for divisor in _divisors(width, estimate.disparity_px.shape[1]):
@@ -159,7 +159,7 @@ def enlarge(
 
 
 def _divisors(width: int, smaller: int) -> list[int]:
-    """How many times smaller than the full size the levels are: the last one is of the full size."""
+    """Downscaling factors of the levels; the last is 1."""
     divisor = 1
     while width / (2 * divisor) > smaller:
         divisor *= 2
@@ -167,7 +167,7 @@ def _divisors(width: int, smaller: int) -> list[int]:
 
 
 def _grey(photo: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "h2 w2"]:
-    """The photograph's grey levels at a size."""
+    """Convert to grey and resize."""
     grey = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
     return cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
 
@@ -175,7 +175,7 @@ def _grey(photo: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[np.
 def _level(
     left: UInt8[np.ndarray, "h w"], right: UInt8[np.ndarray, "h w"], smaller: Estimate, threads: int
 ) -> Estimate:
-    """The estimate at the size of these grey pictures."""
+    """Upsample an estimate to the size of these grey images."""
     view = _View(left, right, smaller.disparity_px)
     right_view = _View(_mirrored(right), _mirrored(left), _mirrored(smaller.right_disparity_px))
     found_px, right_found_px = _found(view, threads), _found(right_view, threads)
@@ -191,13 +191,13 @@ def _level(
 
 
 def _found(view: _View, threads: int) -> Float32[np.ndarray, "h w"]:
-    """The disparities of least cost of a left view."""
+    """Match a left view strip by strip; its disparities of least cost."""
     from stereoweave.matching import upsample_kernels as kernels
 
     height, width = view.grey.shape
     count = 2 * kernels.BAND
     strips = _strips(height, max(_STRIP_BYTES // (3 * width * count), _LEAST_ROWS))
-    # Memory that is new takes as long to get as a path: all strips work in the same.
+    # All strips share the buffers: allocating new memory takes as long as aggregating one path.
     volumes = (np.empty((strips[0].stop, width, count), dtype) for dtype in (np.uint8, np.uint16))
     costs, sums = volumes
     found_px = np.empty((height, width), np.float32)
@@ -217,7 +217,7 @@ def _found(view: _View, threads: int) -> Float32[np.ndarray, "h w"]:
 
 
 class _Strip:
-    """Some rows of a left view, whose candidates' costs are written into `costs`."""
+    """A strip of rows of a left view, with buffers for its costs and their sums."""
 
     def __init__(
         self,
@@ -238,13 +238,13 @@ class _Strip:
         self._in_bands(lambda *band: kernels.match(own, other, self._first, pull, band, self._costs), 0)
 
     def run_along(self) -> None:
-        """Write the sums of the paths along the rows."""
+        """Write the summed costs of both horizontal paths."""
         self._in_bands(
             lambda *band: self._kernels.along_rows(self._costs, self._first, self._along, band, self._sums), 0
         )
 
     def run_down(self, paths: _Paths, backwards: int) -> None:
-        """Add the path from above, or below; `paths` are those of the strip there, and become this one's."""
+        """Add the costs of the path from above, or below; update `paths` for the next strip."""
         volumes = self._costs, self._first, self._down
         self._in_bands(
             lambda *band: self._kernels.along_columns(*volumes, backwards, band, *paths, self._sums), 1
@@ -264,7 +264,7 @@ def _settled(
     other_px: Float32[np.ndarray, "h w"],
     threads: int,
 ) -> tuple[Float32[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]]:
-    """A left view's disparity, from both views' and the prior; its doubt: _FOLLOWS, _UNSEEN or _CHANGED."""
+    """Combine both views' disparities and the prior; doubt is _FOLLOWS, _UNSEEN or _CHANGED."""
     settled_px, doubt = np.empty(found_px.shape, np.float32), np.empty(found_px.shape, np.uint8)
     halo = _MEAN_PX // 2
 
@@ -277,7 +277,7 @@ def _settled(
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(settle, _strips(len(found_px), _SETTLED_ROWS)))
     if view.parallel:
-        # Parallel cameras give none below 0: a plain sky would take them.
+        # Parallel cameras have no disparities below 0; keep a plain sky from getting any.
         np.maximum(settled_px, 0, out=settled_px)
     return settled_px, doubt
 
@@ -312,7 +312,7 @@ def _settled_strip(
 def _confidence(
     smaller: Float[np.ndarray, "h2 w2"], doubt: UInt8[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"]:
-    """What is left of the smaller copy's confidence."""
+    """Resize the smaller pair's confidence and reduce it by doubt."""
     confidence = _resized(smaller, doubt.shape)
     for rows in _strips(len(doubt), _SETTLED_ROWS):
         kept = confidence[rows] * _LEFT_OF_CONFIDENCE[doubt[rows]]
@@ -321,7 +321,7 @@ def _confidence(
 
 
 def _no_paths(width: int) -> _Paths:
-    """Those before the first row."""
+    """Initial state of the vertical paths."""
     from stereoweave.matching import upsample_kernels as kernels
 
     return _Paths(
@@ -336,7 +336,7 @@ def _strips(height: int, rows: int) -> list[slice]:
 
 
 def _cues(grey: UInt8[np.ndarray, "h w"], rows: slice) -> _Cues:
-    """Those of some rows, with what their neighbours beyond the rows say."""
+    """Cues of a strip of rows; census codes use the rows beyond it."""
     from stereoweave.matching import refine_kernels as kernels
 
     above = min(_CENSUS_PX, rows.start)
@@ -347,7 +347,7 @@ def _cues(grey: UInt8[np.ndarray, "h w"], rows: slice) -> _Cues:
 
 
 def _pull() -> UInt8[np.ndarray, " d"]:
-    """What a candidate costs by its place in a band."""
+    """Cost of each candidate by its position in the band."""
     from stereoweave.matching import upsample_kernels as kernels
 
     away_px = np.abs(np.arange(kernels.BAND) - kernels.MIDDLE)
@@ -355,14 +355,14 @@ def _pull() -> UInt8[np.ndarray, " d"]:
 
 
 def _places(size: int, smaller: int) -> Int[np.ndarray, " n"]:
-    """The pixel of a smaller copy that shows each of `size` pixels."""
+    """Index of the smaller image's pixel that covers each of `size` pixels."""
     return np.minimum(((np.arange(size) + 0.5) * smaller / size).astype(int), smaller - 1)
 
 
 def _large_steps(
     grey: UInt8[np.ndarray, "h w"], before: UInt8[np.ndarray, "h w"]
 ) -> UInt16[np.ndarray, "h w"]:
-    """What a jump between two pixels costs: less where their grey levels differ more."""
+    """Penalty of a large step between two pixels, lower at strong grey edges."""
     costs = _LARGEST_STEP / (1 + cv2.absdiff(grey, before).astype(np.float32) / _HALVING_LEVELS)
     return np.maximum(costs, _LEAST_LARGE_STEP).astype(np.uint16)
 

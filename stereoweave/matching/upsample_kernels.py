@@ -1,9 +1,9 @@
-"""The loops of `enlarging` over pixels and candidates, compiled by Numba; `enlarge` calls them in this order.
+"""Numba kernels of `upsample.enlarge`, in the order of their calls.
 
-A plain version of all this is in tests/plain_enlarging.py, and has to agree. All is for a left view: the
-right one is the left one of the mirrored pair. A pixel has two bands of BAND candidates, one for the farthest
-surface that the smaller pictures show around it and one for the nearest: candidate i of band b is the
-disparity first_candidate[y, x, b] + i. Volumes are [H, W, 2 * BAND]. Rows are a strip of the picture's.
+Their plain reference is tests/helpers/plain_enlarging.py. All kernels treat a left view; the right view is
+the left one of the mirrored pair. A pixel has two bands of BAND candidates, around the farthest and the
+nearest surface nearby in the smaller images: candidate i of band b is the disparity
+first_candidate[y, x, b] + i. Volumes are [H, W, 2 * BAND]. H is the height of a strip.
 """
 
 import typing
@@ -15,27 +15,27 @@ from stereoweave.system.jit import inlined, kernel
 
 BAND = 16
 MIDDLE = 8
-"""The candidate of a band that is its surface's disparity."""
+"""Index of the candidate at the surface's disparity."""
 SMALL_STEP = 12
-"""What a change by one candidate between two pixels of a path costs."""
+"""Penalty of a disparity step of one candidate between two pixels of a path."""
 MOST_DIFFERENCE = np.uint8(40)
-"""Grey levels that differ by more belong to different surfaces, however much more that is."""
+"""Truncation of the grey difference: greater ones all mean a different surface."""
 AGREED_PX = 1.0
-"""The most by which two views' disparities of one point differ."""
+"""Greatest difference between two views' disparities of one point."""
 FILL_PX = 8.0
-"""What fills a gap is at most so far before or behind the surfaces around it."""
-# A band of the pixel before may begin so many candidates before or behind this one's: these cost the most.
+"""A gap is filled only with disparities within this distance of the surfaces around it."""
+# Padding of a path: the previous pixel's band may start this many candidates off; the padding costs most.
 _BESIDE = BAND + 2
 _ROOM = BAND + 2 * _BESIDE
 PATH = 2 * _ROOM
-"""The costs that a path carries from pixel to pixel."""
+"""Number of costs that a path carries from pixel to pixel."""
 NEVER = np.uint16(30000)
 
 
 @inlined
 @typing.no_type_check
 def _compare(code, level, codes, levels, pull, costs):
-    """Write what the candidates of a band cost, by their neighbours, their grey levels and their place."""
+    """Write the costs of a band's candidates from census codes, grey levels and position in the band."""
     for i in range(BAND):
         apart = np.uint8(max(level, levels[i]) - min(level, levels[i]))
         apart = np.uint8(min(apart, MOST_DIFFERENCE) >> np.uint8(1))
@@ -45,10 +45,10 @@ def _compare(code, level, codes, levels, pull, costs):
 @kernel
 @typing.no_type_check
 def match(own, other, first_candidate, pull, rows, costs):
-    """Write into some rows of costs, uint8, what each candidate costs.
+    """Write the matching cost of each candidate into some rows of costs, uint8.
 
-    own and other are the census codes and the grey levels of both pictures; the columns of the other one run
-    backwards, with BAND more of them at both ends. pull [BAND] is what a place in a band costs.
+    own and other are the census codes and grey levels of both images; the columns of `other` are reversed and
+    padded by BAND at both ends. pull [BAND] is the cost of each position in a band.
     """
     codes, levels = own
     other_codes, other_levels = other
@@ -66,9 +66,9 @@ def match(own, other, first_candidate, pull, rows, costs):
 @inlined
 @typing.no_type_check
 def _step(before, least, moved, costs, large_step, after, sums):
-    """One step of a band's path: writes its costs into after and adds them to sums; the least of them.
+    """Advance a band's path by one pixel: write its costs into after, add them to sums, return the least.
 
-    moved is by how many candidates this pixel's band begins behind that of the pixel before.
+    moved is the first candidate of this pixel's band minus that of the previous pixel.
     """
     limit = np.uint16(least + large_step)
     at = _BESIDE + min(max(moved, -BAND - 1), BAND + 1)
@@ -87,7 +87,7 @@ def _step(before, least, moved, costs, large_step, after, sums):
 @inlined
 @typing.no_type_check
 def _step_both(before, least, first, first_before, costs, large_step, after, sums):
-    """One step of both bands' path; the least of its costs."""
+    """Advance the path of both bands by one pixel; return its least cost."""
     lowest = NEVER
     for band in range(2):
         room = slice(band * _ROOM, (band + 1) * _ROOM)
@@ -101,9 +101,10 @@ def _step_both(before, least, first, first_before, costs, large_step, after, sum
 @kernel
 @typing.no_type_check
 def along_rows(costs, first_candidate, large_step, rows, sums):
-    """Write into some rows of sums the costs of the paths from the left and from the right.
+    """Write the summed costs of the paths from left and right into some rows of sums.
 
-    large_step [H, W + 1] is what a jump between a column and the one before it costs, 0 at both ends.
+    large_step [H, W + 1] is the penalty of a large step between a column and the one before it, 0 at both
+    ends.
     """
     _, width, _ = costs.shape
     paths = np.full((2, PATH), NEVER, np.uint16)
@@ -124,11 +125,11 @@ def along_rows(costs, first_candidate, large_step, rows, sums):
 @kernel
 @typing.no_type_check
 def along_columns(costs, first_candidate, large_step, backwards, columns, paths, least, first_before, sums):
-    """Add to some columns of sums the costs of the paths from above, or from below if backwards is 1.
+    """Add the costs of the path from above, or below if backwards is 1, to some columns of sums.
 
-    large_step [H + 1, W] is what a jump between a row and the one before it costs, 0 at both ends of the
-    picture. paths [W, PATH], least [W] and first_before [W, 2] are what the paths bring along from the strip
-    that they come from, and are made what they take to the next one.
+    large_step [H + 1, W] is the penalty of a large step between a row and the one before it, 0 at both ends
+    of the image. paths [W, PATH], least [W] and first_before [W, 2] are the paths' state after the previous
+    strip and are updated for the next one.
     """
     height, _, _ = costs.shape
     before = np.empty(PATH, np.uint16)
@@ -147,7 +148,7 @@ def along_columns(costs, first_candidate, large_step, backwards, columns, paths,
 @kernel
 @typing.no_type_check
 def pick(sums, first_candidate, rows, found_px):
-    """Write into some rows of found_px the disparities of least cost, where two alike slopes would meet."""
+    """Write the subpixel disparities of least cost into some rows of found_px (equiangular line fit)."""
     _, width, _ = sums.shape
     for y in range(rows[0], rows[1]):
         for x in range(width):
@@ -170,7 +171,7 @@ def pick(sums, first_candidate, rows, found_px):
 @kernel
 @typing.no_type_check
 def agree(found_px, other_px, agreed):
-    """Write into agreed whether the other view found the same at each pixel's match."""
+    """Write into agreed whether the other view's disparity at each pixel's match is the same."""
     height, width = found_px.shape
     for y in range(height):
         for x in range(width):
@@ -182,10 +183,10 @@ def agree(found_px, other_px, agreed):
 @kernel
 @typing.no_type_check
 def fill(known, gap, farthest_px, nearest_px, disparity_px):
-    """Fill gaps from the farther of the known pixels to their left and right in the row.
+    """Fill gaps with the farther of the known disparities to their left and right in the row.
 
-    What is in a gap one camera alone sees, for a nearer surface hides it from the other. It is filled if that
-    fits the surfaces around it, which are farthest_px to nearest_px.
+    Only one camera sees a gap; a nearer surface hides it from the other one. A pixel is filled only if the
+    disparity fits the surfaces around it, farthest_px to nearest_px.
     """
     height, width = known.shape
     for y in range(height):
