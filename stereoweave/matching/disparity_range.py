@@ -56,7 +56,7 @@ def find_range(pair: StereoPair) -> tuple[float, float] | None:
     Pixels without content are ignored. Returns None if there are too few matches, as in plain images or
     images of different scenes.
     """
-    disparity_px = _disparities(pair, None)
+    disparity_px = _find_disparities(pair, None)
     if len(disparity_px) < _LEAST_MATCHES:
         return None
     low_px, high_px = np.percentile(disparity_px, [_ENDS_PERCENT, 100 - _ENDS_PERCENT])
@@ -67,7 +67,7 @@ def find_range(pair: StereoPair) -> tuple[float, float] | None:
 def goes_beyond(pair: StereoPair, where: Bool[np.ndarray, "h w"], range_px: tuple[float, float]) -> bool:
     """Whether a region of the left image contains disparities outside a range."""
     slack_px = _SLACK_PX * _scale(pair.left)
-    disparity_px = _disparities(pair, where)
+    disparity_px = _find_disparities(pair, where)
     beyond = (disparity_px < range_px[0] - slack_px) | (disparity_px > range_px[1] + slack_px)
     return bool(beyond.sum() >= max(_LEAST_BEYOND, _LEAST_SHARE_BEYOND * len(beyond)))
 
@@ -78,13 +78,13 @@ def _scale(photo: UInt8[np.ndarray, "h w 3"]) -> float:
     return width / min(width, _WIDTH_PX)
 
 
-def _disparities(pair: StereoPair, where: Bool[np.ndarray, "h w"] | None) -> Float[np.ndarray, " n"]:
+def _find_disparities(pair: StereoPair, where: Bool[np.ndarray, "h w"] | None) -> Float[np.ndarray, " n"]:
     """Disparities in px of the matched pixels, only those in the mask `where` if given."""
     left, right = _small_grey(pair.left), _small_grey(pair.right)
-    wanted = _inner(pair.left_seen, left)
+    wanted = _find_inner(pair.left_seen, left)
     if where is not None:
         wanted &= _small_mask(where, left)
-    matches = _supported(_row_matches(left, right, wanted, _inner(pair.right_seen, right)))
+    matches = _keep_supported(_match_rows(left, right, wanted, _find_inner(pair.right_seen, right)))
     return matches[:, 2] * _scale(pair.left)
 
 
@@ -101,7 +101,7 @@ def _small_mask(
     return cv2.resize(mask.astype(np.uint8), small.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
 
 
-def _inner(
+def _find_inner(
     seen: Bool[np.ndarray, "h w"] | None, small: Float32[np.ndarray, "h2 w2"]
 ) -> Bool[np.ndarray, "h2 w2"]:
     """Mask of pixels whose whole window has content, since the border of the content is not texture."""
@@ -111,7 +111,7 @@ def _inner(
     return cv2.erode(_small_mask(seen, small).astype(np.uint8), window) > 0
 
 
-def _row_matches(
+def _match_rows(
     left: Float32[np.ndarray, "h w"],
     right: Float32[np.ndarray, "h w"],
     wanted: Bool[np.ndarray, "h w"],
@@ -130,7 +130,7 @@ def _row_matches(
     rows = rows.round().astype(int)
     own, other = _texture(left), _texture(right)
     other.scale[~seen] = 0
-    rows, columns = _outstanding(left, rows, wanted & (own.scale > 0))
+    rows, columns = _find_salient(left, rows, wanted & (own.scale > 0))
     likeness = _likeness(own, rows, columns, other)
     best, offsets_px, sure = _peaks(likeness)
     back = _likeness(other, rows[sure], best[sure], own).argmax(1)
@@ -156,7 +156,7 @@ def _peaks(
     return best, np.clip((behind - before) / (2 * bend), -0.5, 0.5), sure
 
 
-def _outstanding(
+def _find_salient(
     grey: Float32[np.ndarray, "h w"], rows: Int[np.ndarray, " r"], wanted: Bool[np.ndarray, "h w"]
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
     """Rows and columns of the highest gradient in every _SPACING_PX columns, where wanted."""
@@ -198,7 +198,7 @@ def _likeness(
     return likeness * own.scale[rows, columns, None] * other.scale[rows]
 
 
-def _supported(matches: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+def _keep_supported(matches: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
     """Keep the matches with enough neighbours of similar disparity."""
     if not len(matches):
         return matches

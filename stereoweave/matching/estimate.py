@@ -53,7 +53,7 @@ _OTHER_SURFACE_PX = 3.0
 _MEDIAN_PX = 3
 
 
-class _Shown(NamedTuple):
+class _NetworkInput(NamedTuple):
     """Network input for a pair: the scaled pair, and the shift of its right image in px, if any."""
 
     small: StereoPair
@@ -116,8 +116,8 @@ def match_many(
     matcher: Matcher, pairs: Sequence[StereoPair], options: MatchOptions = DEFAULT_OPTIONS
 ) -> list[Estimate]:
     """Match pairs of any sizes as `match` does, batching those with the same network input size."""
-    every_shown = [_shown_first(matcher, pair, options.range_px) for pair in pairs]
-    moved = [_moved(shown) for shown in every_shown]
+    every_shown = [_prepare_first_input(matcher, pair, options.range_px) for pair in pairs]
+    moved = [_shift(shown) for shown in every_shown]
     of_size: dict[tuple[int, ...], list[int]] = {}
     for i, pair in enumerate(moved):
         of_size.setdefault(pair.left.shape, []).append(i)
@@ -125,12 +125,12 @@ def match_many(
     for alike in of_size.values():
         found |= zip(alike, matcher.estimate_many([moved[i] for i in alike], raw=True), strict=True)
     return [
-        _finished(matcher, pair, shown, found[i], options)
+        _finish(matcher, pair, shown, found[i], options)
         for i, (pair, shown) in enumerate(zip(pairs, every_shown, strict=True))
     ]
 
 
-def _within_width(range_px: tuple[float, float], width_px: int) -> tuple[float, float]:
+def _clip_to_width(range_px: tuple[float, float], width_px: int) -> tuple[float, float]:
     """Clip a disparity range to the disparities that images of this width can have."""
     low_px, high_px = range_px
     if low_px >= width_px or high_px <= -width_px:
@@ -142,48 +142,50 @@ def _within_width(range_px: tuple[float, float], width_px: int) -> tuple[float, 
     return max(low_px, -width_px), min(high_px, width_px)
 
 
-def _shown_first(matcher: Matcher, pair: StereoPair, range_px: tuple[float, float] | None) -> _Shown:
+def _prepare_first_input(
+    matcher: Matcher, pair: StereoPair, range_px: tuple[float, float] | None
+) -> _NetworkInput:
     """Prepare the network's first input: the whole pair, or one that covers the given range."""
-    seen = _seen_whole(matcher, pair)
+    seen = _fit_network(matcher, pair)
     if range_px is None:
-        return _Shown(seen)
+        return _NetworkInput(seen)
     width = pair.left.shape[1]
-    low_px, high_px = (px * seen.left.shape[1] / width for px in _within_width(range_px, width))
-    return _shown_within(matcher, pair, seen, (low_px, high_px))
+    low_px, high_px = (px * seen.left.shape[1] / width for px in _clip_to_width(range_px, width))
+    return _prepare_for_range(matcher, pair, seen, (low_px, high_px))
 
 
-def _finished(
-    matcher: Matcher, pair: StereoPair, shown: _Shown, found: Estimate, options: MatchOptions
+def _finish(
+    matcher: Matcher, pair: StereoPair, shown: _NetworkInput, found: Estimate, options: MatchOptions
 ) -> Estimate:
     """Turn the network's output for its first input into the pair's estimate, with further runs if needed."""
-    found = _unmoved(shown, found)
+    found = _undo_shift(shown, found)
     if options.range_px is None:
-        beyond_px = _range_beyond(shown.small, found, matcher.max_disparity_px)
+        beyond_px = _find_wider_range(shown.small, found, matcher.max_disparity_px)
         if beyond_px is not None:
-            shown = _shown_within(matcher, pair, shown.small, beyond_px)
-            (found,) = matcher.estimate_many([_moved(shown)], raw=True)
-            found = _unmoved(shown, found)
+            shown = _prepare_for_range(matcher, pair, shown.small, beyond_px)
+            (found,) = matcher.estimate_many([_shift(shown)], raw=True)
+            found = _undo_shift(shown, found)
     small = shown.small
     if matcher.magnification > 1:
-        small, found = _look_closer(matcher, pair, small, found)
+        small, found = _match_magnified(matcher, pair, small, found)
     if not options.raw:
-        found = matcher.finish(small, _as_seen(found, small), refined=options.refined)
+        found = matcher.finish(small, _apply_masks(found, small), refined=options.refined)
     if small.left.shape[1] > pair.left.shape[1]:
-        found = _shrunk(found, pair)
+        found = _downsample(found, pair)
     elif small.left.shape != pair.left.shape:
         found = enlarge(pair.left, pair.right, found, matcher.threads)
     if options.range_px is not None:
-        found = _clipped(found, *options.range_px)
-    return _as_seen(found, pair)
+        found = _clip(found, *options.range_px)
+    return _apply_masks(found, pair)
 
 
-def _seen_whole(matcher: Matcher, pair: StereoPair) -> StereoPair:
+def _fit_network(matcher: Matcher, pair: StereoPair) -> StereoPair:
     """Scale the pair down if the network would otherwise need strips, whose seams would be visible."""
     height, width = pair.left.shape[:2]
-    return _resized(pair, _times_smaller(matcher, width, height))
+    return _resize(pair, _find_downscale(matcher, width, height))
 
 
-def _times_smaller(
+def _find_downscale(
     matcher: Matcher, width: int, height: int, moved_px: int = 0, largest: float = 1.0
 ) -> float:
     """Factor by which to scale down an image of this size so that the network takes it in one run.
@@ -201,7 +203,7 @@ def _times_smaller(
     return max(too_many, height / LONGEST_SIDE_PX, width / LONGEST_SIDE_PX)
 
 
-def _resized(pair: StereoPair, scale: float) -> StereoPair:
+def _resize(pair: StereoPair, scale: float) -> StereoPair:
     """Scale the pair down by a factor; return it unchanged if its size stays the same."""
     height, width = pair.left.shape[:2]
     size = max(round(width / scale), SMALLEST_SIDE_PX), max(round(height / scale), SMALLEST_SIDE_PX)
@@ -216,7 +218,7 @@ def _resized(pair: StereoPair, scale: float) -> StereoPair:
     return StereoPair(left=left, right=right, left_seen=left_seen, right_seen=right_seen)
 
 
-def _look_closer(
+def _match_magnified(
     matcher: Matcher, pair: StereoPair, small: StereoPair, found: Estimate
 ) -> tuple[StereoPair, Estimate]:
     """Run the network again on the pair magnified by `matcher.magnification`; merge both estimates.
@@ -234,22 +236,22 @@ def _look_closer(
         The magnified pair and its merged estimate; `small` and `found` if magnification is not worthwhile.
     """
     height, width = pair.left.shape[:2]
-    seen = _resized(pair, _times_smaller(matcher, width, height, largest=matcher.magnification))
+    seen = _resize(pair, _find_downscale(matcher, width, height, largest=matcher.magnification))
     range_px = np.percentile(found.disparity_px[::_STEP_PX, ::_STEP_PX], [_ENDS_PERCENT, 100 - _ENDS_PERCENT])
     low_px, high_px = range_px * seen.left.shape[1] / small.left.shape[1]
-    shown = _shown_within(matcher, pair, seen, (float(low_px), float(high_px)))
+    shown = _prepare_for_range(matcher, pair, seen, (float(low_px), float(high_px)))
     if shown.small.left.shape[1] < _LEAST_MAGNIFICATION * small.left.shape[1]:
         return small, found
-    (closer,) = matcher.estimate_many([_moved(shown)], raw=True)
-    return shown.small, _surer(_unmoved(shown, closer), found)
+    (closer,) = matcher.estimate_many([_shift(shown)], raw=True)
+    return shown.small, _merge(_undo_shift(shown, closer), found)
 
 
-def _surer(closer: Estimate, found: Estimate) -> Estimate:
+def _merge(closer: Estimate, found: Estimate) -> Estimate:
     """Merge: `closer`, but `found` where it shows another surface with higher confidence."""
     size = closer.disparity_px.shape[::-1]
     scale = np.float32(size[0] / found.disparity_px.shape[1])
     found_px, right_found_px, confidence, right_trust = (
-        _nearest(values, size)
+        _resize_nearest(values, size)
         for values in (
             scale * found.disparity_px,
             scale * found.right_disparity_px,
@@ -277,35 +279,37 @@ def _is_other(
     return np.abs(one_px - other_px) > _OTHER_SURFACE_PX
 
 
-def _shrunk(found: Estimate, pair: StereoPair) -> Estimate:
+def _downsample(found: Estimate, pair: StereoPair) -> Estimate:
     """Scale a magnified estimate down to the pair's size without mixing surfaces in a pixel."""
     size = pair.left.shape[1::-1]
     scale = np.float32(size[0] / found.disparity_px.shape[1])
     disparity_px, right_disparity_px = (
-        scale * _nearest(cv2.medianBlur(view, _MEDIAN_PX), size)
+        scale * _resize_nearest(cv2.medianBlur(view, _MEDIAN_PX), size)
         for view in (found.disparity_px, found.right_disparity_px)
     )
     return Estimate(
         disparity_px=disparity_px,
         right_disparity_px=right_disparity_px,
-        confidence=_nearest(found.confidence, size),
-        occluded=_nearest(found.occluded.astype(np.uint8), size) > 0,
+        confidence=_resize_nearest(found.confidence, size),
+        occluded=_resize_nearest(found.occluded.astype(np.uint8), size) > 0,
     )
 
 
-def _nearest(values: Shaped[np.ndarray, "h w"], size: tuple[int, int]) -> Shaped[np.ndarray, "h2 w2"]:
+def _resize_nearest(values: Shaped[np.ndarray, "h w"], size: tuple[int, int]) -> Shaped[np.ndarray, "h2 w2"]:
     return cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT)
 
 
-def _range_beyond(pair: StereoPair, found: Estimate, max_disparity_px: float) -> tuple[float, float] | None:
+def _find_wider_range(
+    pair: StereoPair, found: Estimate, max_disparity_px: float
+) -> tuple[float, float] | None:
     """Find the pair's disparity range if it exceeds the network's, in which `found` was estimated."""
-    doubtful = _doubtful(found, max_disparity_px)
+    doubtful = _find_doubtful(found, max_disparity_px)
     if 100 * doubtful.mean() < _DOUBTFUL_PERCENT or not goes_beyond(pair, doubtful, (0, max_disparity_px)):
         return None
     return find_range(pair)
 
 
-def _doubtful(found: Estimate, max_disparity_px: float) -> Bool[np.ndarray, "h w"]:
+def _find_doubtful(found: Estimate, max_disparity_px: float) -> Bool[np.ndarray, "h w"]:
     """Mask of uncertain pixels whose disparity may be outside the network's range."""
     near_end = np.abs(found.disparity_px - max_disparity_px / 2) > max_disparity_px / 2 - _MARGIN_PX
     doubtful = (found.confidence < _CONFIDENT) & ~found.occluded
@@ -315,9 +319,9 @@ def _doubtful(found: Estimate, max_disparity_px: float) -> Bool[np.ndarray, "h w
     return cv2.resize(small, doubtful.shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5
 
 
-def _shown_within(
+def _prepare_for_range(
     matcher: Matcher, pair: StereoPair, seen: StereoPair, range_px: tuple[float, float]
-) -> _Shown:
+) -> _NetworkInput:
     """Prepare a network input that covers a disparity range, by scaling and shifting the pair.
 
     `seen` is the pair scaled so that the network takes it in one run; the range is in its pixels.
@@ -325,38 +329,38 @@ def _shown_within(
     low_px, high_px = range_px
     most_px = matcher.max_disparity_px
     if low_px >= 0 and high_px <= most_px:
-        return _Shown(seen)
+        return _NetworkInput(seen)
     scale = max((high_px - low_px) / (most_px - _MARGIN_PX), 1.0)
     small = seen
     if scale > 1:
-        small = _resized(pair, scale * pair.left.shape[1] / seen.left.shape[1])
+        small = _resize(pair, scale * pair.left.shape[1] / seen.left.shape[1])
     # Shift by exactly the least disparity: a network puts a plain sky at the lower end of its range.
     least_px = math.floor(low_px * small.left.shape[1] / seen.left.shape[1])
     height, width = small.left.shape[:2]
-    smaller = _times_smaller(matcher, width, height, abs(least_px))
+    smaller = _find_downscale(matcher, width, height, abs(least_px))
     if smaller > 1:
-        small = _resized(pair, smaller * pair.left.shape[1] / width)
+        small = _resize(pair, smaller * pair.left.shape[1] / width)
         least_px = math.floor(low_px * small.left.shape[1] / seen.left.shape[1])
-    return _Shown(small, least_px)
+    return _NetworkInput(small, least_px)
 
 
-def _moved(shown: _Shown) -> StereoPair:
+def _shift(shown: _NetworkInput) -> StereoPair:
     """Shift the right image by padding both images; the pair as the network receives it."""
     if shown.least_px is None:
         return shown.small
-    (left_at, right_at), more = _places(shown.least_px), abs(shown.least_px)
+    (left_at, right_at), more = _start_columns(shown.least_px), abs(shown.least_px)
     return StereoPair(
-        left=_widened(shown.small.left, left_at, more - left_at),
-        right=_widened(shown.small.right, right_at, more - right_at),
+        left=_pad_columns(shown.small.left, left_at, more - left_at),
+        right=_pad_columns(shown.small.right, right_at, more - right_at),
     )
 
 
-def _unmoved(shown: _Shown, found: Estimate) -> Estimate:
+def _undo_shift(shown: _NetworkInput, found: Estimate) -> Estimate:
     """Undo the shift and padding of the network's input in its estimate."""
     if shown.least_px is None:
         return found
     width, least_px = shown.small.left.shape[1], np.float32(shown.least_px)
-    left, right = (np.s_[:, at : at + width] for at in _places(shown.least_px))
+    left, right = (np.s_[:, at : at + width] for at in _start_columns(shown.least_px))
     disparity_px = np.ascontiguousarray(found.disparity_px[left]) + least_px
     right_disparity_px = np.ascontiguousarray(found.right_disparity_px[right]) + least_px
     return Estimate(
@@ -367,16 +371,16 @@ def _unmoved(shown: _Shown, found: Estimate) -> Estimate:
     )
 
 
-def _places(least_px: int) -> tuple[int, int]:
+def _start_columns(least_px: int) -> tuple[int, int]:
     """First columns of the left and right image within their padded versions."""
     return (-least_px, 0) if least_px < 0 else (0, least_px)
 
 
-def _widened(photo: np.ndarray, before: int, behind: int) -> np.ndarray:
+def _pad_columns(photo: np.ndarray, before: int, behind: int) -> np.ndarray:
     return cv2.copyMakeBorder(photo, 0, 0, before, behind, cv2.BORDER_REPLICATE)
 
 
-def _clipped(found: Estimate, low_px: float, high_px: float) -> Estimate:
+def _clip(found: Estimate, low_px: float, high_px: float) -> Estimate:
     """Clip the disparities to a range; those outside get confidence 0."""
     outside_px = np.maximum(low_px - found.disparity_px, found.disparity_px - high_px)
     return replace(
@@ -387,7 +391,7 @@ def _clipped(found: Estimate, low_px: float, high_px: float) -> Estimate:
     )
 
 
-def _as_seen(found: Estimate, pair: StereoPair) -> Estimate:
+def _apply_masks(found: Estimate, pair: StereoPair) -> Estimate:
     """Apply the pair's content masks to confidence and occlusion."""
     confidence, occluded = found.confidence, found.occluded
     if pair.left_seen is not None:

@@ -63,7 +63,7 @@ class _Channel(NamedTuple):
     right: UInt8[np.ndarray, " n"]
     cut_off: Bool[np.ndarray, " n"]
 
-    def swapped(self) -> "_Channel":
+    def swap(self) -> "_Channel":
         """Return a copy with left and right exchanged."""
         return _Channel(self.right, self.left, self.cut_off)
 
@@ -95,7 +95,7 @@ class Looks:
         )
 
 
-def recoloured(
+def recolour(
     photo: UInt8[np.ndarray, "h w 3"], table: Float32[np.ndarray, "256 3"]
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Apply a lookup table with values in 0..255, rounded."""
@@ -116,7 +116,7 @@ def match_exposure(
         right: Right image of the same size.
         estimate: The pair's estimate.
     """
-    channels = _matched_channels(left, right, estimate)
+    channels = _collect_channels(left, right, estimate)
     differences = [_difference(channel) for channel in channels]
     largest = max(_mean_size(*both) for both in zip(differences, channels, strict=True))
     strength = _ramp(largest, *_DIFFERENCE_LEVELS)
@@ -126,48 +126,48 @@ def match_exposure(
         right_of_left=_tables([strength * values for values in differences], channels, strength),
         left_of_right=_tables(
             [-strength * values for values in differences],
-            [channel.swapped() for channel in channels],
+            [channel.swap() for channel in channels],
             strength,
         ),
     )
 
 
-def _matched_channels(
+def _collect_channels(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], estimate: Estimate
 ) -> list[_Channel]:
     """Collect the three channels of reliably matched pixels."""
     step = max(round((left.shape[0] * left.shape[1] / _PIXELS) ** 0.5), 1)
-    disparity_px = _sampled(estimate.disparity_px, step) / step
+    disparity_px = _subsample(estimate.disparity_px, step) / step
     rows, columns = np.indices(disparity_px.shape, np.float32)
     columns -= disparity_px
 
     def of_both(left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return left, cv2.remap(right, columns, rows, cv2.INTER_LINEAR)
 
-    photos = of_both(_shrunk(left, step), _shrunk(right, step))
-    certain = _sampled(estimate.confidence, step) >= _LEAST_CONFIDENCE
+    photos = of_both(_downsample(left, step), _downsample(right, step))
+    certain = _subsample(estimate.confidence, step) >= _LEAST_CONFIDENCE
     # A clipped white sky is plain and has confidence 0, but its match need not be exact.
     certain |= cv2.inRange(cv2.max(*photos), _WHITE, _WHITE) > 0
-    certain &= ~_sampled(estimate.occluded, step)
+    certain &= ~_subsample(estimate.occluded, step)
     certain &= (columns >= 0) & (columns <= columns.shape[1] - 1)
     certain = cv2.erode(certain.astype(np.uint8), _WINDOW) > 0
     certain &= _range(disparity_px) <= _CALM_PX
     for photo in photos:
         certain &= _range(cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)) <= _CALM_LEVELS
-    ends = of_both(*(cv2.LUT(_sampled(photo, step), _ENDS) for photo in (left, right)))
+    ends = of_both(*(cv2.LUT(_subsample(photo, step), _ENDS) for photo in (left, right)))
     cut_off = cv2.dilate(cv2.max(*ends), _WINDOW) > 0
     values = [image[certain].T.copy() for image in (*(cv2.blur(photo, (3, 3)) for photo in photos), cut_off)]
     return [_Channel(*channel) for channel in zip(*values, strict=True)]
 
 
-def _shrunk(values: Shaped[np.ndarray, "h w *c"], step: int) -> Shaped[np.ndarray, "h2 w2 *c"]:
+def _downsample(values: Shaped[np.ndarray, "h w *c"], step: int) -> Shaped[np.ndarray, "h2 w2 *c"]:
     """Average over squares of `step` pixels, cropping the remainder at the right and bottom."""
     height, width = (side // step for side in values.shape[:2])
     whole = values[: height * step, : width * step]
     return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
 
 
-def _sampled(values: Shaped[np.ndarray, "h w *c"], step: int) -> Shaped[np.ndarray, "h2 w2 *c"]:
+def _subsample(values: Shaped[np.ndarray, "h w *c"], step: int) -> Shaped[np.ndarray, "h2 w2 *c"]:
     """Take the values at the centres of the squares of `step` pixels."""
     height, width = (side // step for side in values.shape[:2])
     return np.ascontiguousarray(values[step // 2 :: step, step // 2 :: step][:height, :width])
@@ -188,12 +188,14 @@ def _difference(channel: _Channel) -> Float[np.ndarray, " 511"]:
     if known == 0:
         return np.zeros(len(_MEANS))
     left, right = channel.left[kept], channel.right[kept]
-    missed = _missed(left, right)
-    kept = missed <= max(_OUTLIER_MEDIANS * float(np.median(missed)), _OUTLIER_LEVELS)
-    return known * _fitted(left[kept], right[kept])
+    deviations = _measure_deviation(left, right)
+    kept = deviations <= max(_OUTLIER_MEDIANS * float(np.median(deviations)), _OUTLIER_LEVELS)
+    return known * _fit_curve(left[kept], right[kept])
 
 
-def _missed(left: UInt8[np.ndarray, " n"], right: UInt8[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def _measure_deviation(
+    left: UInt8[np.ndarray, " n"], right: UInt8[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
     """Deviation of each level difference from the median of its bin of left levels."""
     differences = right.astype(int) - left
     bins = left // _BIN_LEVELS
@@ -203,7 +205,7 @@ def _missed(left: UInt8[np.ndarray, " n"], right: UInt8[np.ndarray, " n"]) -> Fl
     return np.abs(differences - np.asarray(medians)[bins])
 
 
-def _fitted(left: UInt8[np.ndarray, " n"], right: UInt8[np.ndarray, " n"]) -> Float[np.ndarray, " 511"]:
+def _fit_curve(left: UInt8[np.ndarray, " n"], right: UInt8[np.ndarray, " n"]) -> Float[np.ndarray, " 511"]:
     """Fit the level difference of N >= 1 pixels by a smooth curve over the mean level.
 
     Sorted left and right levels correspond in order, as in histogram matching. The curve is linear between
@@ -236,7 +238,7 @@ def _tables(
 ) -> Float32[np.ndarray, "256 3"]:
     """Tabulate the right level for each left level in the three channels."""
     tables = [
-        _with_ends(_table(difference), channel, strength)
+        _replace_ends(_table(difference), channel, strength)
         for difference, channel in zip(differences, channels, strict=True)
     ]
     return np.stack(tables, axis=1).astype(np.float32)
@@ -248,7 +250,7 @@ def _table(difference: Float[np.ndarray, " 511"]) -> Float[np.ndarray, " 256"]:
     return np.interp(np.arange(256), left, right)
 
 
-def _with_ends(
+def _replace_ends(
     table: Float[np.ndarray, " 256"], channel: _Channel, strength: float
 ) -> Float[np.ndarray, " 256"]:
     """Replace both ends of the table: clipped levels map to the mean level that the other image shows there.
@@ -258,13 +260,13 @@ def _with_ends(
     """
     differences = channel.right.astype(int) - channel.left
 
-    def shown(end: int) -> float:
+    def find_end(end: int) -> float:
         seen = differences[np.abs(channel.left.astype(int) - end) <= _END_LEVELS]
         return end + strength * float(seen.sum()) / (len(seen) + _END_PRIOR)
 
     sure = np.arange(_END_LEVELS, 256 - _END_LEVELS)
-    black = np.clip(shown(0), 0, table[sure[0]])
-    white = np.clip(shown(255), table[sure[-1]], 255)
+    black = np.clip(find_end(0), 0, table[sure[0]])
+    white = np.clip(find_end(255), table[sure[-1]], 255)
     return np.interp(np.arange(256), [0, *sure, 255], [black, *table[sure], white])
 
 

@@ -21,7 +21,7 @@ from stereoweave.io.files import SMALLEST_SIDE_PX
 from stereoweave.matching.left_right_check import OCCLUSION_STEP_PX, is_occluded, measure_disagreement
 from stereoweave.matching.occlusion_fill import fill_occluded
 from stereoweave.matching.options import MatchOptions
-from stereoweave.matching.providers import CPU, PROVIDERS, open_session, running
+from stereoweave.matching.providers import CPU, PROVIDERS, explain_failure, open_session
 from stereoweave.matching.subpixel import to_subpixel
 from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
 from stereoweave.system.threads import thread_count
@@ -96,8 +96,8 @@ class Matcher:
         self._refines = mode is not None and mode.refined
         self._session = open_session(self._path, provider, thread_count(threads))
         try:
-            self._outputs = self._checked_outputs()
-            self.name, self.multiple_of, self.max_disparity_px = self._checked_properties()
+            self._outputs = self._read_outputs()
+            self.name, self.multiple_of, self.max_disparity_px = self._read_properties()
             # Free dimensions have names, and a file may omit the shape altogether.
             shape: list[Any] = [*self._session.get_inputs()[0].shape, *["any"] * 4]
         except UnicodeDecodeError as error:
@@ -202,16 +202,16 @@ class Matcher:
             return []
         height, width = pairs[0].left.shape[:2]
         if self.fixed_size is None and height > self._strip_rows(width):
-            return [self._in_strips(pair) for pair in pairs]
+            return [self._run_in_strips(pair) for pair in pairs]
         rows, columns = self._run_size(height, width)
         at_once = max(PIXEL_PAIRS_AT_ONCE // (rows * columns**2), 1) if self._takes_batches else 1
         return [
             maps
             for first in range(0, len(pairs), at_once)
-            for maps in self._run_together([(x.left, x.right) for x in pairs[first : first + at_once]])
+            for maps in self._run_batch([(x.left, x.right) for x in pairs[first : first + at_once]])
         ]
 
-    def _in_strips(self, pair: StereoPair) -> Maps:
+    def _run_in_strips(self, pair: StereoPair) -> Maps:
         """Run the network on a large pair in strips of rows, blended where they overlap."""
         height, width = pair.left.shape[:2]
         totals: dict[str, np.ndarray] = {}
@@ -229,16 +229,16 @@ class Matcher:
         return max(rows // self.multiple_of * self.multiple_of, 4 * _STRIP_OVERLAP_PX)
 
     def _run(self, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]) -> Maps:
-        (maps,) = self._run_together([(left, right)])
+        (maps,) = self._run_batch([(left, right)])
         return maps
 
-    def _run_together(self, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Maps]:
+    def _run_batch(self, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Maps]:
         """Run the network once on a batch of (left, right) images of equal size."""
         height, width = pairs[0][0].shape[:2]
         (above, _), (before, _) = self._borders_px(height, width)
         inputs = {"left": self._tensor([x for x, _ in pairs]), "right": self._tensor([x for _, x in pairs])}
         pixel_pairs = len(pairs) * height * width * width
-        with running(self.provider, self._path):
+        with explain_failure(self.provider, self._path):
             values = self._session.run(self._outputs, inputs, self._run_options(pixel_pairs))
         outputs = dict(zip(self._outputs, values, strict=True))
         self._check_outputs(outputs, [len(pairs), 1, *inputs["left"].shape[2:]])
@@ -296,7 +296,7 @@ class Matcher:
         planes = np.stack([plane for image in padded for plane in cv2.split(image)])
         return planes.reshape(len(images), 3, *padded[0].shape[:2]) * np.float32(1 / 255)
 
-    def _checked_outputs(self) -> list[str]:
+    def _read_outputs(self) -> list[str]:
         """Validate the graph's inputs and outputs; return the names of the outputs in `Maps`."""
         inputs = {value.name: value.type for value in self._session.get_inputs()}
         outputs = {value.name: value.type for value in self._session.get_outputs()}
@@ -305,11 +305,11 @@ class Matcher:
         if inputs != {"left": _FLOAT32, "right": _FLOAT32} or "disparity_px" not in used or not all_float32:
             raise MatcherError(
                 f"{self._path}: expected a matcher, inputs left and right and an output disparity_px, "
-                f"all {_FLOAT32}, found inputs {_listed(inputs)} and outputs {_listed(outputs)}"
+                f"all {_FLOAT32}, found inputs {_format_types(inputs)} and outputs {_format_types(outputs)}"
             )
         return used
 
-    def _checked_properties(self) -> tuple[str, int, float]:
+    def _read_properties(self) -> tuple[str, int, float]:
         """Read name, multiple_of and max_disparity_px from the file's metadata."""
         metadata = self._session.get_modelmeta().custom_metadata_map
         keys = [f"stereoweave.{key}" for key in ("name", "multiple_of", "max_disparity_px")]
@@ -332,7 +332,7 @@ def shipped_models() -> list[str]:
     return sorted(Path(file.name).stem for file in _weights_folder().iterdir() if file.name.endswith(".onnx"))
 
 
-def _listed(types: dict[str, str]) -> str:
+def _format_types(types: dict[str, str]) -> str:
     return ", ".join(f"{name} {kind}" for name, kind in types.items())
 
 
@@ -386,7 +386,7 @@ def _estimate(left: UInt8[np.ndarray, "h w 3"], maps: Maps) -> Estimate:
     return Estimate(
         disparity_px=maps.disparity_px,
         right_disparity_px=right_px,
-        confidence=_confidence(maps.confidence_logit, disagreement_px, inside, _plain(left)),
+        confidence=_confidence(maps.confidence_logit, disagreement_px, inside, _find_plain(left)),
         occluded=is_occluded(disagreement_px, inside),
     )
 
@@ -421,7 +421,7 @@ def _confidence(
     return probability
 
 
-def _plain(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
+def _find_plain(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
     """Mask of pixels in whose _PLAIN_WINDOW_PX window local means vary by at most _PLAIN_GREY_LEVELS."""
     window = np.ones((_PLAIN_WINDOW_PX, _PLAIN_WINDOW_PX), np.uint8)
     means = cv2.blur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (_PLAIN_MEAN_PX, _PLAIN_MEAN_PX))

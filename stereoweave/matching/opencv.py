@@ -35,7 +35,7 @@ def _sgbm(mode: int) -> MapMatch:
         speckleRange=2,
         mode=mode,
     )
-    return lambda pair: _with_room(matcher, pair.left, pair.right)
+    return lambda pair: _compute_padded(matcher, pair.left, pair.right)
 
 
 def _bm() -> MapMatch:
@@ -47,7 +47,7 @@ def _bm() -> MapMatch:
     matcher.setDisp12MaxDiff(1)
     matcher.setSpeckleWindowSize(100)
     matcher.setSpeckleRange(2)
-    return lambda pair: _with_room(
+    return lambda pair: _compute_padded(
         matcher, *(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (pair.left, pair.right))
     )
 
@@ -69,7 +69,8 @@ def fill_rows(disparity_px: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "
     known = disparity_px > 0
     occupied = known.max(axis=1)
     farther_px = np.minimum(
-        _last_known(disparity_px, known), _last_known(disparity_px[:, ::-1], known[:, ::-1])[:, ::-1]
+        _find_last_known(disparity_px, known),
+        _find_last_known(disparity_px[:, ::-1], known[:, ::-1])[:, ::-1],
     )
     filled_px = np.where(known | ~occupied[:, None], disparity_px, farther_px)
     return filled_px[np.maximum.accumulate(np.where(occupied, np.arange(len(known)), 0))]
@@ -89,7 +90,7 @@ def left_right_confidence(
     return np.where(known, -np.abs(disparity_px - seen_px), np.float32(-np.inf))
 
 
-def _with_room(
+def _compute_padded(
     matcher: cv2.StereoMatcher, left: UInt8[np.ndarray, "h w *c"], right: UInt8[np.ndarray, "h w *c"]
 ) -> Float32[np.ndarray, "h w"]:
     # OpenCV leaves the first 192 columns empty, so pad the left border by as many.
@@ -99,7 +100,7 @@ def _with_room(
     return matcher.compute(left, right)[:, DISPARITIES:].astype(np.float32) / 16
 
 
-def _last_known(
+def _find_last_known(
     values: Float32[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"]:
     """Nearest known value at or before each pixel in its row; infinity if there is none."""

@@ -40,13 +40,13 @@ class MatchOptions:
                 remedy=Remedy("leave one of them out", ("raw", "refined")),
             )
         if self.range_px is not None:
-            object.__setattr__(self, "range_px", _checked_range(self.range_px))
+            object.__setattr__(self, "range_px", _parse_range(self.range_px))
 
 
 DEFAULT_OPTIONS = MatchOptions()
 
 
-def _checked_range(range_px: tuple[float, float]) -> tuple[float, float]:
+def _parse_range(range_px: tuple[float, float]) -> tuple[float, float]:
     is_row = isinstance(range_px, Sequence) or (isinstance(range_px, np.ndarray) and range_px.ndim == 1)
     if not is_row or len(range_px) != 2:
         raise StereoweaveError(

@@ -75,14 +75,14 @@ def _openvino_options(threads: int) -> dict[str, str]:
     return {"device_type": "CPU", "precision": "FP32", "num_of_threads": str(threads)}
 
 
-def _instead(package: str) -> str:
+def _explain_replacement(package: str) -> str:
     """How to switch packages; they overwrite each other's files and cannot be installed side by side."""
     return (
         f"{package} instead of onnxruntime: pip uninstall onnxruntime {package}, then pip install {package}"
     )
 
 
-_NVIDIA = f"an NVIDIA GPU with its driver, and {_instead('onnxruntime-gpu')}[cuda,cudnn]"
+_NVIDIA = f"an NVIDIA GPU with its driver, and {_explain_replacement('onnxruntime-gpu')}[cuda,cudnn]"
 PROVIDERS: dict[str, Provider] = {
     CPU: Provider(name="CPUExecutionProvider", needs="onnxruntime"),
     "cuda": Provider(
@@ -100,7 +100,7 @@ PROVIDERS: dict[str, Provider] = {
     ),
     "openvino": Provider(
         name="OpenVINOExecutionProvider",
-        needs=_instead("onnxruntime-openvino"),
+        needs=_explain_replacement("onnxruntime-openvino"),
         options=_openvino_options,
     ),
     "coreml": Provider(
@@ -110,7 +110,7 @@ PROVIDERS: dict[str, Provider] = {
     ),
     "directml": Provider(
         name="DmlExecutionProvider",
-        needs=f"Windows with DirectX 12, and {_instead('onnxruntime-directml')}",
+        needs=f"Windows with DirectX 12, and {_explain_replacement('onnxruntime-directml')}",
         batches=True,
     ),
 }
@@ -139,17 +139,17 @@ def open_session(path: Path, provider: str, threads: int) -> Any:
     """
     check_provider(provider)
     if provider == CPU:
-        return _opened(path, CPU, threads)
-    with _without_log():
+        return _create_session(path, CPU, threads)
+    with _silence_log():
         _load_libraries(provider)
         try:
-            session = _opened(path, provider, threads)
+            session = _create_session(path, provider, threads)
         except MatcherError as error:
-            _opened(path, CPU, threads)  # if this fails too, the file is invalid, not the provider
-            raise _cannot_begin(provider, _line(error.__cause__)) from error
+            _create_session(path, CPU, threads)  # if this fails too, the file is invalid, not the provider
+            raise _start_error(provider, _first_line(error.__cause__)) from error
     if PROVIDERS[provider].name not in session.get_providers():
-        raise _cannot_begin(provider, "a library or a device that is missing")
-    if _takes_nothing(session, PROVIDERS[provider].name):
+        raise _start_error(provider, "a library or a device that is missing")
+    if _runs_nothing(session, PROVIDERS[provider].name):
         raise MatcherError(
             f"{path}: expected a matcher with operations that provider {provider} has, found none; export it "
             "for a fixed size with `stereoweave export`",
@@ -159,7 +159,7 @@ def open_session(path: Path, provider: str, threads: int) -> Any:
 
 
 @contextmanager
-def running(provider: str, path: Path) -> Iterator[None]:
+def explain_failure(provider: str, path: Path) -> Iterator[None]:
     """Turn exceptions of a run into one-line errors that blame the provider or the matcher file."""
     try:
         yield
@@ -167,15 +167,15 @@ def running(provider: str, path: Path) -> Iterator[None]:
         out_of_memory = isinstance(error, MemoryError) or "alloc" in str(error).lower()
         unfit = type(error).__name__ == "InvalidArgument"
         if unfit or (provider == CPU and not out_of_memory):
-            raise _refused(path, error) from error
+            raise _file_error(path, error) from error
         raise ProviderError(
-            f"provider {provider}: expected to run {path.name}, found that it failed: {_line(error)}; "
+            f"provider {provider}: expected to run {path.name}, found that it failed: {_first_line(error)}; "
             "use smaller pictures, or fewer processes at a time on the device",
             remedy=None if provider == CPU else _USE_CPU,
         ) from error
 
 
-def _opened(path: Path, provider: str, threads: int) -> Any:
+def _create_session(path: Path, provider: str, threads: int) -> Any:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -195,7 +195,7 @@ def _opened(path: Path, provider: str, threads: int) -> Any:
         # Disable the fallback to the CPU when the provider fails.
         return onnxruntime.InferenceSession(str(path), options, providers=providers, enable_fallback=0)
     except Exception as error:  # no common base class, as above
-        raise _refused(path, error) from error
+        raise _file_error(path, error) from error
 
 
 def _load_libraries(provider: str) -> None:
@@ -211,7 +211,7 @@ def _load_libraries(provider: str) -> None:
 
 
 @contextmanager
-def _without_log() -> Iterator[None]:
+def _silence_log() -> Iterator[None]:
     """Silence ONNX Runtime's log; its messages are raised as errors instead."""
     import onnxruntime
 
@@ -222,26 +222,26 @@ def _without_log() -> Iterator[None]:
         onnxruntime.set_default_logger_severity(2)  # the default
 
 
-def _takes_nothing(session: Any, name: str) -> bool:
+def _runs_nothing(session: Any, name: str) -> bool:
     """Whether the provider runs no operation of the graph; known with ONNX Runtime 1.24 or later."""
     if not hasattr(session, "get_provider_graph_assignment_info"):
         return False
     return all(part.ep_name != name for part in session.get_provider_graph_assignment_info())
 
 
-def _cannot_begin(provider: str, found: str) -> MatcherError:
+def _start_error(provider: str, found: str) -> MatcherError:
     return MatcherError(
         f"provider {provider}: expected to begin, found {found}; it needs {PROVIDERS[provider].needs}"
     )
 
 
-def _refused(path: Path, error: Exception) -> MatcherError:
+def _file_error(path: Path, error: Exception) -> MatcherError:
     return MatcherError(
-        f"{path}: expected an ONNX matcher, found a file ONNX Runtime refuses: {_line(error)}"
+        f"{path}: expected an ONNX matcher, found a file ONNX Runtime refuses: {_first_line(error)}"
     )
 
 
-def _line(error: BaseException | None) -> str:
+def _first_line(error: BaseException | None) -> str:
     """First line of ONNX Runtime's message, without its source location."""
     line = (str(error).splitlines() or [type(error).__name__])[0]
     return re.sub(r"/\S+:\d+ [^(]*\(.*?\) ", "", line)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8, UInt16
 
-from stereoweave.matching.exposure import match_exposure, recoloured
+from stereoweave.matching.exposure import match_exposure, recolour
 from stereoweave.matching.left_right_check import at_match, find_occluded
 from stereoweave.stereo import Estimate, StereoPair, check_fits
 from stereoweave.system.threads import in_bands, thread_count
@@ -58,11 +58,11 @@ def refine(
     check_fits(estimate, pair)
     looks = match_exposure(left, right, estimate)
     if looks is not None:
-        pair = StereoPair(left=left, right=recoloured(right, looks.tables(0)[1]))
-    found_px, right_found_px = _matched(pair, estimate, min(_MOST_THREADS, thread_count(threads)))
+        pair = StereoPair(left=left, right=recolour(right, looks.tables(0)[1]))
+    found_px, right_found_px = _match_views(pair, estimate, min(_MOST_THREADS, thread_count(threads)))
     trust, right_trust = np.asarray(estimate.confidence, np.float32, order="C"), right_confidence(estimate)
-    disparity_px = _settled(estimate.disparity_px, found_px, right_found_px, trust, -1)
-    right_disparity_px = _settled(estimate.right_disparity_px, right_found_px, found_px, right_trust, 1)
+    disparity_px = _settle(estimate.disparity_px, found_px, right_found_px, trust, -1)
+    right_disparity_px = _settle(estimate.right_disparity_px, right_found_px, found_px, right_trust, 1)
     return Estimate(
         disparity_px=disparity_px,
         right_disparity_px=right_disparity_px,
@@ -71,7 +71,7 @@ def refine(
     )
 
 
-def _settled(
+def _settle(
     disparity_px: Float[np.ndarray, "h w"],
     found_px: Float32[np.ndarray, "h w"],
     other_px: Float32[np.ndarray, "h w"],
@@ -88,37 +88,37 @@ def _settled(
     return settled_px
 
 
-def _matched(
+def _match_views(
     pair: StereoPair, estimate: Estimate, threads: int
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """Match both views; their disparities of least cost."""
     first_px, count = _candidates(estimate)
     left = _cues(pair.left, estimate.disparity_px - first_px, estimate.confidence)
     right = _cues(pair.right, estimate.right_disparity_px - first_px, right_confidence(estimate))
-    mirrored = _part(right, np.s_[..., ::-1]), _part(left, np.s_[..., ::-1])
-    views = [(own, _backwards(other, first_px, count)) for own, other in ((left, right), mirrored)]
+    mirrored = _index_cues(right, np.s_[..., ::-1]), _index_cues(left, np.s_[..., ::-1])
+    views = [(own, _reverse_columns(other, first_px, count)) for own, other in ((left, right), mirrored)]
     height, width = left.grey.shape
     found_px = np.empty((2, height, width), np.float32)
     step = max(_CANDIDATES_AT_ONCE // (width * count), 4 * _OVERLAP_PX) - 2 * _OVERLAP_PX
     for top in range(0, height, step):
         rows = slice(max(top - _OVERLAP_PX, 0), min(top + step + _OVERLAP_PX, height))
-        strip = [(_part(own, rows), _part(other, rows)) for own, other in views]
-        strip_px = _strip(strip, first_px, count, threads)
+        strip = [(_index_cues(own, rows), _index_cues(other, rows)) for own, other in views]
+        strip_px = _match_strip(strip, first_px, count, threads)
         found_px[:, top : top + step] = strip_px[:, top - rows.start :][:, :step]
     return found_px[0], np.ascontiguousarray(found_px[1, :, ::-1])
 
 
-def _strip(
+def _match_strip(
     views: list[tuple["Cues", "Cues"]], first_px: int, count: int, threads: int
 ) -> Float32[np.ndarray, "2 h w"]:
     """Match a strip of rows of both views, each as the left view of its pair."""
     size = (*views[0][0].grey.shape, count)
     # Both views share the buffers: allocating new memory takes as long as aggregating one path.
     costs, sums = np.empty(size, np.uint8), np.empty(size, np.uint16)
-    return np.stack([_found(own, other, (costs, sums), first_px, threads) for own, other in views])
+    return np.stack([_match_view(own, other, (costs, sums), first_px, threads) for own, other in views])
 
 
-def _found(
+def _match_view(
     own: "Cues",
     other: "Cues",
     volumes: tuple[UInt8[np.ndarray, "h w d"], UInt16[np.ndarray, "h w d"]],
@@ -181,14 +181,14 @@ def _cues(photo: UInt8[np.ndarray, "h w 3"], above_first_px: np.ndarray, trust: 
     )
 
 
-def _backwards(cues: "Cues", first_px: int, count: int) -> "Cues":
+def _reverse_columns(cues: "Cues", first_px: int, count: int) -> "Cues":
     """Reverse the other image's columns for the kernels and pad them by repeating the borders."""
     width = cues.grey.shape[1]
     columns = np.clip(width - 1 - first_px - np.arange(width + count - 1), 0, width - 1)
     return type(cues)(*(cue.take(columns, -1) for cue in cues))
 
 
-def _part(cues: "Cues", index: Any) -> "Cues":
+def _index_cues(cues: "Cues", index: Any) -> "Cues":
     """Index all cues alike."""
     return type(cues)(*(np.ascontiguousarray(cue[index]) for cue in cues))
 

@@ -56,8 +56,8 @@ def to_subpixel(
     """
     here, there = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right))
     gain = _gain(here, there, estimate)
-    here, there = _even(here), _even(there)
-    given_px = _even(estimate.disparity_px.astype(np.float32))
+    here, there = _pad_to_even(here), _pad_to_even(there)
+    given_px = _pad_to_even(estimate.disparity_px.astype(np.float32))
     # Parallel cameras have no disparities below 0; keep a sky from getting any.
     least_px = min(float(given_px.min()), 0.0)
     found_px = np.empty_like(given_px)
@@ -65,7 +65,7 @@ def to_subpixel(
     def move(first: int, last: int) -> None:
         top = max(2 * first - _REACH_PX, 0)
         seen = slice(top, 2 * last + _REACH_PX)
-        moved_px = _moved(here[seen], there[seen], given_px[seen], gain)
+        moved_px = _refine_band(here[seen], there[seen], given_px[seen], gain)
         np.maximum(moved_px[2 * first - top : 2 * last - top], least_px, out=found_px[2 * first : 2 * last])
 
     count = thread_count(threads)
@@ -80,7 +80,7 @@ def to_subpixel(
     return replace(estimate, disparity_px=kept_px)
 
 
-def _even(values: np.ndarray) -> np.ndarray:
+def _pad_to_even(values: np.ndarray) -> np.ndarray:
     """Repeat the last row and column if needed to make both sides even."""
     height, width = values.shape
     return cv2.copyMakeBorder(values, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
@@ -99,20 +99,20 @@ def _gain(here: UInt8[np.ndarray, "h w"], there: UInt8[np.ndarray, "h w"], estim
     return own / other
 
 
-def _moved(
+def _refine_band(
     here: UInt8[np.ndarray, "h w"],
     there: UInt8[np.ndarray, "h w"],
     given_px: Float32[np.ndarray, "h w"],
     gain: float,
 ) -> Float32[np.ndarray, "h w"]:
     """Refine the disparity of a band of rows of the left view; both sides are even."""
-    coarse_px = _halved(given_px)
-    smooth_px = _doubled(_smoothed(coarse_px, _SMOOTH_SIGMA))
+    coarse_px = _halve(given_px)
+    smooth_px = _double(_smooth(coarse_px, _SMOOTH_SIGMA))
     start_px = np.where(cv2.absdiff(smooth_px, given_px) < _SAME_PX, smooth_px, given_px)
     missing_px = _missing_px(here, there, start_px, gain)
     missing_px[_near_edge(coarse_px)] = 0
-    coarse_px = _halved(start_px)
-    found_px = start_px + _doubled(_smoothed(coarse_px + missing_px, _FOUND_SIGMA) - coarse_px)
+    coarse_px = _halve(start_px)
+    found_px = start_px + _double(_smooth(coarse_px + missing_px, _FOUND_SIGMA) - coarse_px)
     return given_px + np.clip(found_px - given_px, -_LARGEST_CHANGE_PX, _LARGEST_CHANGE_PX)
 
 
@@ -141,19 +141,19 @@ def _near_edge(coarse_px: Float32[np.ndarray, "h2 w2"]) -> Bool[np.ndarray, "h2 
     return cv2.dilate(off_px, np.ones(around, np.uint8)) > _EDGE_PX
 
 
-def _smoothed(coarse_px: Float32[np.ndarray, "h2 w2"], sigma: float) -> Float32[np.ndarray, "h2 w2"]:
+def _smooth(coarse_px: Float32[np.ndarray, "h2 w2"], sigma: float) -> Float32[np.ndarray, "h2 w2"]:
     """Smooth the disparity, but not across depth edges."""
     return cv2.bilateralFilter(coarse_px, -1, _SAME_PX, sigma)
 
 
 def _window(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h2 w2"]:
     """Window means on the coarse grid."""
-    return cv2.GaussianBlur(_halved(values), (0, 0), _WINDOW_SIGMA)
+    return cv2.GaussianBlur(_halve(values), (0, 0), _WINDOW_SIGMA)
 
 
-def _halved(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h2 w2"]:
+def _halve(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h2 w2"]:
     return cv2.resize(values, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
 
 
-def _doubled(values: Float[np.ndarray, "h2 w2"]) -> Float32[np.ndarray, "h w"]:
+def _double(values: Float[np.ndarray, "h2 w2"]) -> Float32[np.ndarray, "h w"]:
     return cv2.resize(values, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)

@@ -77,7 +77,7 @@ class _View:
     ) -> None:
         self.grey, self.other = grey, other
         self._scale = scale = np.float32(grey.shape[1] / smaller_px.shape[1])
-        self._columns_px = _resized(smaller_px, (len(smaller_px), grey.shape[1])) * scale
+        self._columns_px = _resize(smaller_px, (len(smaller_px), grey.shape[1])) * scale
         window = np.ones((_SURFACES_PX, _SURFACES_PX), np.uint8)
         self._surfaces_px = cv2.erode(smaller_px, window) * scale, cv2.dilate(smaller_px, window) * scale
         self.parallel = smaller_px.min() >= 0
@@ -154,7 +154,7 @@ def enlarge(
     height, width = left.shape[:2]
     for divisor in _divisors(width, estimate.disparity_px.shape[1]):
         size = round(width / divisor), round(height / divisor)
-        estimate = _level(_grey(left, size), _grey(right, size), estimate, thread_count(threads))
+        estimate = _upsample_level(_grey(left, size), _grey(right, size), estimate, thread_count(threads))
     return estimate
 
 
@@ -172,15 +172,15 @@ def _grey(photo: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[np.
     return cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
 
 
-def _level(
+def _upsample_level(
     left: UInt8[np.ndarray, "h w"], right: UInt8[np.ndarray, "h w"], smaller: Estimate, threads: int
 ) -> Estimate:
     """Upsample an estimate to the size of these grey images."""
     view = _View(left, right, smaller.disparity_px)
-    right_view = _View(_mirrored(right), _mirrored(left), _mirrored(smaller.right_disparity_px))
-    found_px, right_found_px = _found(view, threads), _found(right_view, threads)
-    disparity_px, doubt = _settled(view, found_px, _mirrored(right_found_px), threads)
-    right_disparity_px = _mirrored(_settled(right_view, right_found_px, _mirrored(found_px), threads)[0])
+    right_view = _View(_mirror(right), _mirror(left), _mirror(smaller.right_disparity_px))
+    found_px, right_found_px = _match_view(view, threads), _match_view(right_view, threads)
+    disparity_px, doubt = _settle(view, found_px, _mirror(right_found_px), threads)
+    right_disparity_px = _mirror(_settle(right_view, right_found_px, _mirror(found_px), threads)[0])
     del view, right_view, found_px, right_found_px  # as large as the result: 1 GB of 50 megapixels
     return Estimate(
         disparity_px=disparity_px,
@@ -190,7 +190,7 @@ def _level(
     )
 
 
-def _found(view: _View, threads: int) -> Float32[np.ndarray, "h w"]:
+def _match_view(view: _View, threads: int) -> Float32[np.ndarray, "h w"]:
     """Match a left view strip by strip; its disparities of least cost."""
     from stereoweave.matching import upsample_kernels as kernels
 
@@ -258,7 +258,7 @@ class _Strip:
         in_bands(work, self._costs.shape[axis], self._threads, self._threads)
 
 
-def _settled(
+def _settle(
     view: _View,
     found_px: Float32[np.ndarray, "h w"],
     other_px: Float32[np.ndarray, "h w"],
@@ -270,7 +270,7 @@ def _settled(
 
     def settle(rows: slice) -> None:
         around = slice(max(rows.start - halo, 0), rows.stop + halo)
-        strip = _settled_strip(view, around, found_px[around], other_px[around])
+        strip = _settle_strip(view, around, found_px[around], other_px[around])
         inner = slice(rows.start - around.start, rows.stop - around.start)
         settled_px[rows], doubt[rows] = (values[inner] for values in strip)
 
@@ -282,7 +282,7 @@ def _settled(
     return settled_px, doubt
 
 
-def _settled_strip(
+def _settle_strip(
     view: _View,
     rows: slice,
     found_px: Float32[np.ndarray, "h w"],
@@ -313,7 +313,7 @@ def _confidence(
     smaller: Float[np.ndarray, "h2 w2"], doubt: UInt8[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"]:
     """Resize the smaller pair's confidence and reduce it by doubt."""
-    confidence = _resized(smaller, doubt.shape)
+    confidence = _resize(smaller, doubt.shape)
     for rows in _strips(len(doubt), _SETTLED_ROWS):
         kept = confidence[rows] * _LEFT_OF_CONFIDENCE[doubt[rows]]
         np.minimum(kept, _MOST_CONFIDENCE[doubt[rows]], out=confidence[rows])
@@ -367,9 +367,9 @@ def _large_steps(
     return np.maximum(costs, _LEAST_LARGE_STEP).astype(np.uint16)
 
 
-def _resized(values: Float[np.ndarray, "h w"], shape: tuple[int, int]) -> Float32[np.ndarray, "h2 w2"]:
+def _resize(values: Float[np.ndarray, "h w"], shape: tuple[int, int]) -> Float32[np.ndarray, "h2 w2"]:
     return cv2.resize(values.astype(np.float32), shape[::-1], interpolation=cv2.INTER_LINEAR)
 
 
-def _mirrored(values: Shaped[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]:
+def _mirror(values: Shaped[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]:
     return np.ascontiguousarray(values[:, ::-1])

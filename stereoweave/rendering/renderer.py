@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 
 from stereoweave.arguments import check_number
 from stereoweave.errors import StereoweaveError
-from stereoweave.matching.exposure import match_exposure, recoloured
+from stereoweave.matching.exposure import match_exposure, recolour
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair, View, check_fits
 from stereoweave.system.threads import in_bands, thread_count
 
@@ -232,7 +232,7 @@ def _recolour(
     """A side's photograph and its grey levels in another look; nothing without a table."""
     if table is None:
         return {}
-    coloured = recoloured(photo, table)
+    coloured = recolour(photo, table)
     return {"photo": coloured, "grey": cv2.cvtColor(coloured, cv2.COLOR_RGB2GRAY)}
 
 

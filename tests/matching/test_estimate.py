@@ -131,7 +131,7 @@ def test_a_pair_larger_than_what_is_seen_at_once_is_matched_smaller(matcher, rng
     pair = flat(rng, 37, size=(320, 480))
     for module in (matching, matcher_module):
         monkeypatch.setattr(module, "PIXEL_PAIRS_AT_ONCE", 400 * 400 * 266)
-    small = matching._seen_whole(matcher, pair)
+    small = matching._fit_network(matcher, pair)
     assert matcher.sees_whole(small.left.shape[1], small.left.shape[0])
     assert 385 < small.left.shape[1] < 400
     found_px = match(matcher, pair).disparity_px
@@ -141,7 +141,7 @@ def test_a_pair_larger_than_what_is_seen_at_once_is_matched_smaller(matcher, rng
 @pytest.mark.parametrize("size", [(1500, 2000), (4000, 6000), (5774, 8660), (1000, 5000), (9000, 2000)])
 def test_what_is_matched_smaller_is_seen_whole_so_that_no_seam_can_show(matcher, size):
     photo = np.broadcast_to(np.zeros((1, 1, 3), np.uint8), (*size, 3))
-    seen = matching._seen_whole(matcher, sw.StereoPair(left=photo, right=photo)).left
+    seen = matching._fit_network(matcher, sw.StereoPair(left=photo, right=photo)).left
     assert matcher.sees_whole(seen.shape[1], seen.shape[0])
     assert seen.shape[1] ** 2 * seen.shape[0] > 0.85 * matching.PIXEL_PAIRS_AT_ONCE
     assert abs(seen.shape[1] / seen.shape[0] - size[1] / size[0]) < 0.01 * size[1] / size[0]
@@ -199,7 +199,7 @@ def test_the_best_estimate_mixes_no_surfaces():
         occluded=stripes_px > 10,
     )
     grey = np.zeros((60, 24, 3), np.uint8)
-    shrunk = matching._shrunk(found, sw.StereoPair(left=grey, right=grey))
+    shrunk = matching._downsample(found, sw.StereoPair(left=grey, right=grey))
     np.testing.assert_allclose(np.unique(shrunk.disparity_px), [4, 40])
     np.testing.assert_array_equal(shrunk.occluded, shrunk.disparity_px > 10)
 
@@ -248,7 +248,7 @@ def test_a_smaller_look_counts_where_it_is_surer_of_another_surface():
     closer.confidence[:, 40:] = 0.4
     found.disparity_px[:12], found.right_disparity_px[:12] = 16, 16  # 24 px of the larger picture
     found.disparity_px[12:], found.right_disparity_px[12:] = 7, 7  # 10.5 px
-    merged = matching._surer(closer, found)
+    merged = matching._merge(closer, found)
     expected_px = np.full((36, 48), 9)
     expected_px[:18, 40:] = 24
     np.testing.assert_allclose(merged.disparity_px, expected_px)
@@ -261,7 +261,7 @@ def test_masks_are_made_smaller_with_the_pictures(rng):
     pair = flat(rng, 37)
     seen = np.ones(pair.left.shape[:2], bool)
     seen[:, :120] = False
-    small = matching._resized(replace(pair, left_seen=seen), 2)
+    small = matching._resize(replace(pair, left_seen=seen), 2)
     assert small.right_seen is None
     np.testing.assert_array_equal(small.left_seen[:, [59, 60]], np.tile([False, True], (80, 1)))
 
@@ -411,8 +411,8 @@ def test_a_pair_larger_than_the_only_size_of_a_matcher_file_is_matched_smaller(t
 def test_whatever_is_shown_to_a_file_for_one_size_fits_it(tmp_path, size, least_px):
     fixed = Matcher(of_fixed_size("small", tmp_path / "fixed.onnx", 160, 320))
     blank = np.zeros((*size, 3), np.uint8)
-    shown = matching._shown_first(fixed, sw.StereoPair(left=blank, right=blank), (least_px, 60))
-    height, width = matching._moved(shown).left.shape[:2]
+    shown = matching._prepare_first_input(fixed, sw.StereoPair(left=blank, right=blank), (least_px, 60))
+    height, width = matching._shift(shown).left.shape[:2]
     assert fixed.sees_whole(width, height)
     # No smaller than it has to be.
     assert max(height / 160, width / 320) > 0.97 or size[0] < 160

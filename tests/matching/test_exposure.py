@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stereoweave.io.files import read_image
-from stereoweave.matching.exposure import Looks, match_exposure, recoloured
+from stereoweave.matching.exposure import Looks, match_exposure, recolour
 from stereoweave.matching.matcher import Matcher
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.synth.rendering.effects import PLAIN
@@ -72,8 +72,8 @@ def occurring(photo):
 def assert_recovered(looks, left, distortion, within):
     errors = np.abs(looks.right_of_left - distortion)
     assert errors[occurring(left)].max() < within
-    back = recoloured(recoloured(left, distortion.astype(np.float32)), looks.left_of_right)
-    lost = recoloured(left, distortion.astype(np.float32)) > 250
+    back = recolour(recolour(left, distortion.astype(np.float32)), looks.left_of_right)
+    lost = recolour(left, distortion.astype(np.float32)) > 250
     assert np.abs(back.astype(int) - left)[occurring_pixels(left) & ~lost].max() < 2 * within
 
 
@@ -84,14 +84,14 @@ def occurring_pixels(photo):
 
 @pytest.mark.parametrize("name", DISTORTIONS)
 def test_what_was_done_to_the_right_photograph_is_found_within_2_levels(name, examples, matcher):
-    right = recoloured(examples.right, DISTORTIONS[name].astype(np.float32))
+    right = recolour(examples.right, DISTORTIONS[name].astype(np.float32))
     looks = match_exposure(examples.left, right, matcher.estimate(examples.left, right))
     assert_recovered(looks, examples.left, DISTORTIONS[name], within=2)
 
 
 def test_in_a_rendered_pair_too(matcher):
     sample = render_pair(Raycaster(PLAIN), RenderSpec(scene="bridge", seed=3, size_px=(320, 240)), 1).sample
-    right = recoloured(sample.right, DISTORTIONS["gain"].astype(np.float32))
+    right = recolour(sample.right, DISTORTIONS["gain"].astype(np.float32))
     looks = match_exposure(sample.left, right, matcher.estimate(sample.left, right))
     assert_recovered(looks, sample.left, DISTORTIONS["gain"], within=2)
 
@@ -99,7 +99,7 @@ def test_in_a_rendered_pair_too(matcher):
 @pytest.mark.parametrize("name", DISTORTIONS)
 def test_with_exact_matches_within_1_level(name, wall):
     pair, estimate = wall
-    looks = match_exposure(pair.left, recoloured(pair.right, DISTORTIONS[name].astype(np.float32)), estimate)
+    looks = match_exposure(pair.left, recolour(pair.right, DISTORTIONS[name].astype(np.float32)), estimate)
     assert_recovered(looks, pair.left, DISTORTIONS[name], within=1.5)
 
 
@@ -142,7 +142,7 @@ def test_as_the_difference_grows_the_correction_sets_in_without_a_jump(wall, rng
 
 def test_as_more_becomes_certain_the_correction_sets_in_without_a_jump(wall):
     pair, estimate = wall
-    right = recoloured(pair.right, DISTORTIONS["darker"].astype(np.float32))
+    right = recolour(pair.right, DISTORTIONS["darker"].astype(np.float32))
     changes = []
     for rows in range(0, 30):
         estimate.confidence[:] = np.where(np.arange(120)[:, None] < rows, 1, 0)
@@ -156,7 +156,7 @@ def test_as_more_becomes_certain_the_correction_sets_in_without_a_jump(wall):
 @pytest.mark.parametrize("unknown", ["occluded", "confidence"])
 def test_what_is_no_sure_match_does_not_matter(unknown, wall, rng):
     pair, estimate = wall
-    right = recoloured(pair.right, DISTORTIONS["gain"].astype(np.float32))
+    right = recolour(pair.right, DISTORTIONS["gain"].astype(np.float32))
     values = getattr(estimate, unknown).copy()
     values[40:90, 50:120] = unknown == "occluded"
     estimate = replace(estimate, **{unknown: values})
@@ -170,7 +170,7 @@ def test_what_is_no_sure_match_does_not_matter(unknown, wall, rng):
 def test_matches_are_not_believed_where_disparities_are_torn(wall, rng):
     pair, estimate = wall
     estimate.disparity_px[:, 40:] = rng.integers(0, 40, (120, 120))
-    right = recoloured(pair.right, DISTORTIONS["cast"].astype(np.float32))
+    right = recolour(pair.right, DISTORTIONS["cast"].astype(np.float32))
     looks = match_exposure(pair.left, right, estimate)
     assert_recovered(looks, pair.left, DISTORTIONS["cast"], within=2)
 
@@ -179,7 +179,7 @@ def test_a_part_of_wrong_matches_does_no_harm(wall, rng):
     pair, estimate = wall
     squares = rng.integers(0, 60, (12, 6)) * (rng.random((12, 1)) < 0.5)
     estimate.disparity_px[:, 100:] += np.kron(squares, np.ones((10, 10)))
-    right = recoloured(pair.right, DISTORTIONS["cast"].astype(np.float32))
+    right = recolour(pair.right, DISTORTIONS["cast"].astype(np.float32))
     looks = match_exposure(pair.left, right, estimate)
     assert_recovered(looks, pair.left, DISTORTIONS["cast"], within=2)
 
@@ -194,14 +194,14 @@ def test_a_part_of_wrong_matches_does_no_harm(wall, rng):
 )
 def test_without_sure_matches_there_is_no_correction(nothing, wall):
     pair, estimate = wall
-    right = recoloured(pair.right, DISTORTIONS["gain"].astype(np.float32))
+    right = recolour(pair.right, DISTORTIONS["gain"].astype(np.float32))
     assert match_exposure(pair.left, right, estimate) is not None
     assert match_exposure(pair.left, right, replace(estimate, **nothing)) is None
 
 
 def test_a_mirror_exchanges_the_looks(wall):
     pair, estimate = wall
-    pair = replace(pair, right=recoloured(pair.right, DISTORTIONS["cast"].astype(np.float32)))
+    pair = replace(pair, right=recolour(pair.right, DISTORTIONS["cast"].astype(np.float32)))
     mirrored = pair.mirrored()
     looks = match_exposure(pair.left, pair.right, estimate)
     exchanged = match_exposure(mirrored.left, mirrored.right, estimate)
@@ -211,7 +211,7 @@ def test_a_mirror_exchanges_the_looks(wall):
 
 def test_a_plain_sky_that_is_white_in_both_photographs_stays_white_in_both_looks(wall):
     pair, estimate = wall
-    right = recoloured(pair.right, DISTORTIONS["darker"].astype(np.float32))
+    right = recolour(pair.right, DISTORTIONS["darker"].astype(np.float32))
     confidence = estimate.confidence.copy()
     left = pair.left.copy()
     left[:40], right[:40], confidence[:40] = 255, 255, 0
@@ -223,7 +223,7 @@ def test_a_plain_sky_that_is_white_in_both_photographs_stays_white_in_both_looks
 def test_what_is_cut_off_to_white_becomes_the_mean_of_what_the_other_photograph_shows_of_it(wall):
     pair, estimate = wall
     left, right = (np.repeat(photo[..., :1], 3, axis=2) for photo in (pair.left, pair.right))
-    right = recoloured(right, DISTORTIONS["gain"].astype(np.float32))
+    right = recolour(right, DISTORTIONS["gain"].astype(np.float32))
     # A matcher has no confidence where a photograph is plain.
     estimate.confidence[np.roll(right[..., 0] == 255, SHIFT_PX, axis=1)] = 0
     looks = match_exposure(left, right, estimate)
@@ -258,7 +258,7 @@ def test_the_look_changes_in_a_straight_line_from_one_photograph_to_the_other():
 
 def test_levels_are_rounded_and_the_photographs_own_look_changes_nothing(examples):
     table = IDENTITY.astype(np.float32)
-    np.testing.assert_array_equal(recoloured(examples.left, table), examples.left)
+    np.testing.assert_array_equal(recolour(examples.left, table), examples.left)
     table[[7, 8, 255]] = [[1.4, 1.6, 2.0], [3.4, 3.6, 4.0], [254.4, 254.6, 255.0]]
     photo = np.array([[[7, 7, 7], [8, 8, 8], [255, 255, 255]]], np.uint8)
-    assert recoloured(photo, table).tolist() == [[[1, 2, 2], [3, 4, 4], [254, 255, 255]]]
+    assert recolour(photo, table).tolist() == [[[1, 2, 2], [3, 4, 4], [254, 255, 255]]]

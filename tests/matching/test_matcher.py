@@ -145,7 +145,7 @@ def test_plain_is_what_has_nothing_to_match_by_within_32_px():
     # The last mean of 90 is at column 95, the first of 93 at 103: 8 of its 9 columns are the board's.
     expected[:, : 103 - 32] = True
     expected[:, 95 + 32 + 1 :] = True
-    np.testing.assert_array_equal(matcher._plain(image), expected)
+    np.testing.assert_array_equal(matcher._find_plain(image), expected)
 
 
 def test_strips_put_together_are_the_whole(tmp_path, rng, monkeypatch):

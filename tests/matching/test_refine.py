@@ -141,16 +141,16 @@ def test_the_kernels_equal_the_plain_ones(rng):
     for view in (own, other):
         np.testing.assert_array_equal(view.census, plain_census(view.grey))
     costs = np.empty((24, 50, count), np.uint8)
-    kernels.match(own, refining._backwards(other, first_px, count), 0, 24, costs)
+    kernels.match(own, refining._reverse_columns(other, first_px, count), 0, 24, costs)
     np.testing.assert_array_equal(costs, plain_costs(own, other, first_px, count))
-    found_px = refining._matched(StereoPair(left=left, right=right), given, 1)
+    found_px = refining._match_views(StereoPair(left=left, right=right), given, 1)
     expected_px = plain_pick(plain_sums(costs.astype(int), own.grey), first_px)
     np.testing.assert_allclose(found_px[0], expected_px, atol=1e-5)
 
 
 def test_both_views_settle_as_the_plain_ones(rng):
     left, right, given = random_pair(rng)
-    found_px = refining._matched(StereoPair(left=left, right=right), given, 1)
+    found_px = refining._match_views(StereoPair(left=left, right=right), given, 1)
     refined = refine(left, right, given)
     expected = plain_settled(given.disparity_px, *found_px, given.confidence, -1)
     np.testing.assert_array_equal(refined.disparity_px, expected)
@@ -162,8 +162,8 @@ def test_both_views_settle_as_the_plain_ones(rng):
 def test_a_right_view_is_matched_as_the_left_one_of_the_mirrored_pair(scene):
     left, right, _, right_px = scene
     pair, given = StereoPair(left=left, right=right), estimate_of(right_px, right_px, confidence=0)
-    found_px, right_found_px = refining._matched(pair, given, 1)
-    mirrored_px, right_mirrored_px = refining._matched(pair.mirrored(), given, 1)
+    found_px, right_found_px = refining._match_views(pair, given, 1)
+    mirrored_px, right_mirrored_px = refining._match_views(pair.mirrored(), given, 1)
     np.testing.assert_array_equal(mirrored_px[:, ::-1], right_found_px)
     np.testing.assert_array_equal(right_mirrored_px[:, ::-1], found_px)
     assert (abs(right_found_px - right_px) < 1).mean() > 0.9
@@ -185,10 +185,10 @@ def test_a_right_view_settles_as_a_mirrored_left_one(rng):
     found_px, other_px, disparity_px = rng.integers(2, 5, (3, 30, 40)).astype(np.float32)
     disparity_px += 30 * (rng.random((30, 40)) < 0.2)
     trust = rng.random((30, 40), np.float32)
-    right_px = refining._settled(disparity_px, found_px, other_px, trust, 1)
+    right_px = refining._settle(disparity_px, found_px, other_px, trust, 1)
     np.testing.assert_array_equal(right_px, plain_settled(disparity_px, found_px, other_px, trust, 1))
     mirrored = (np.ascontiguousarray(values[:, ::-1]) for values in (disparity_px, found_px, other_px, trust))
-    np.testing.assert_array_equal(refining._settled(*mirrored, -1)[:, ::-1], right_px)
+    np.testing.assert_array_equal(refining._settle(*mirrored, -1)[:, ::-1], right_px)
 
 
 def test_the_number_of_threads_changes_nothing(scene):
