@@ -19,13 +19,13 @@ _DTYPES = {"f": "floats", "u": "uint8", "b": "booleans"}
 def check_number(name: str, value: object) -> None:
     """Require a real number within the range of a float; NaN and infinity are allowed."""
     if not isinstance(value, Real) or isinstance(value, bool) or not _is_held_by_float(value):
-        raise StereoweaveError(f"{name}: expected a number, got {shown(value)}")
+        raise StereoweaveError(f"{name}: expected a number, got {describe(value)}")
 
 
 def check_whole_number(name: str, value: object) -> None:
     """Require an integer within the range of a float."""
     if not isinstance(value, Integral) or isinstance(value, bool) or not _is_held_by_float(value):
-        raise StereoweaveError(f"{name}: expected a whole number, got {shown(value)}")
+        raise StereoweaveError(f"{name}: expected a whole number, got {describe(value)}")
 
 
 def check_flag(name: str, value: object) -> None:
@@ -33,21 +33,21 @@ def check_flag(name: str, value: object) -> None:
     import numpy as np
 
     if not isinstance(value, bool | np.bool_):
-        raise StereoweaveError(f"{name}: expected True or False, got {shown(value)}")
+        raise StereoweaveError(f"{name}: expected True or False, got {describe(value)}")
 
 
 def check_kind(name: str, value: object, *kinds: type) -> None:
     """Require an instance of one of `kinds`."""
     if not isinstance(value, kinds):
         expected = " or ".join(kind.__name__ for kind in kinds)
-        raise StereoweaveError(f"{name}: expected {expected}, got {shown(value)}")
+        raise StereoweaveError(f"{name}: expected {expected}, got {describe(value)}")
 
 
 def check_array(name: str, value: object, kind: str, dimensions: int) -> None:
     """Require a plain array with `dimensions` axes and dtype kind "f", "u" or "b"."""
     if not is_plain_array(value) or value.dtype.kind != kind or value.ndim != dimensions:
         raise StereoweaveError(
-            f"{name}: expected an array of {_DTYPES[kind]} with {dimensions} axes, got {shown(value)}"
+            f"{name}: expected an array of {_DTYPES[kind]} with {dimensions} axes, got {describe(value)}"
         )
 
 
@@ -56,7 +56,7 @@ def check_numbers(name: str, value: object) -> None:
     import numpy as np
 
     if not isinstance(value, Real | np.ndarray) or np.asarray(value).dtype.kind not in "fiu":
-        raise StereoweaveError(f"{name}: expected an array of numbers, got {shown(value)}")
+        raise StereoweaveError(f"{name}: expected an array of numbers, got {describe(value)}")
 
 
 def is_plain_array(value: object) -> TypeGuard["np.ndarray"]:
@@ -74,7 +74,7 @@ def _is_held_by_float(value: Real) -> bool:
     return True
 
 
-def shown(value: object) -> str:
+def describe(value: object) -> str:
     """Describe a value briefly for an error message; an array by type, dtype and shape."""
     import numpy as np
 

@@ -31,7 +31,7 @@ class Remedy:
     text: str
     settings: tuple[str, ...] = ()
 
-    def worded(self, name_of: NameOf) -> str:
+    def format(self, name_of: NameOf) -> str:
         """Format with the front end's names for settings; empty if it has none of them."""
         names = [name for name in map(name_of, self.settings) if name]
         if not self.settings:
@@ -47,9 +47,9 @@ class Note:
     remedy: Remedy | None = None
 
     def __str__(self) -> str:
-        return self.worded(keyword)
+        return self.format(keyword)
 
-    def worded(self, name_of: NameOf) -> str:
+    def format(self, name_of: NameOf) -> str:
         """Format with the front end's names for settings."""
         return _with_remedy(self.text, self.remedy, name_of)
 
@@ -67,14 +67,14 @@ class StereoweaveError(ValueError):
         self.message, self.setting, self.remedy = message, setting, remedy
 
     def __str__(self) -> str:
-        return self.worded(keyword)
+        return self.format(keyword)
 
-    def worded(self, name_of: NameOf) -> str:
+    def format(self, name_of: NameOf) -> str:
         """Format as one line with the front end's names for settings."""
         prefix = f"{name_of(self.setting) or self.setting}: " if self.setting else ""
         return prefix + _with_remedy(self.message, self.remedy, name_of)
 
-    def extended(self, text: str) -> "StereoweaveError":
+    def with_detail(self, text: str) -> "StereoweaveError":
         """Return a copy with text inserted before the remedy."""
         return StereoweaveError(f"{self.message}; {text}", setting=self.setting, remedy=self.remedy)
 
@@ -95,18 +95,18 @@ class OutputInUseError(StereoweaveError):
     """Another process is writing to the same output."""
 
 
-def worded(error: Exception, name_of: NameOf) -> str:
+def format_error(error: Exception, name_of: NameOf) -> str:
     """Format any exception; a StereoweaveError with the front end's names for settings."""
-    return error.worded(name_of) if isinstance(error, StereoweaveError) else str(error)
+    return error.format(name_of) if isinstance(error, StereoweaveError) else str(error)
 
 
 def _with_remedy(text: str, remedy: Remedy | None, name_of: NameOf) -> str:
-    advice = remedy.worded(name_of) if remedy else ""
+    advice = remedy.format(name_of) if remedy else ""
     return f"{text}; {advice}" if advice else text
 
 
 @contextmanager
-def needing_extra(extra: str, what: str) -> Iterator[None]:
+def require_extra(extra: str, what: str) -> Iterator[None]:
     """Turn a missing library into a StereoweaveError that names the extra to install."""
     try:
         yield

@@ -16,8 +16,8 @@ from stereoweave.arguments import (
     check_kind,
     check_number,
     check_numbers,
+    describe,
     is_plain_array,
-    shown,
 )
 from stereoweave.errors import StereoweaveError
 
@@ -101,7 +101,7 @@ class StereoPair:
     def __post_init__(self) -> None:
         for side, image in (("left", self.left), ("right", self.right)):
             if not is_plain_array(image) or image.dtype != np.uint8 or image.shape[2:] != (3,):
-                raise StereoweaveError(f"{side} image: expected uint8 RGB [H, W, 3], got {shown(image)}")
+                raise StereoweaveError(f"{side} image: expected uint8 RGB [H, W, 3], got {describe(image)}")
             if max(image.shape) > LONGEST_SIDE_PX:
                 raise StereoweaveError(
                     f"{side} image: expected at most {LONGEST_SIDE_PX} pixels a side, got {_size(image)}; "
@@ -122,7 +122,7 @@ class StereoPair:
                     f"{side}_seen: expected the shape of the images {self.left.shape[:2]}, got {seen.shape}"
                 )
 
-    def mirrored(self) -> "StereoPair":
+    def mirror(self) -> "StereoPair":
         """Return the pair flipped horizontally, with its views swapped and without its camera."""
         return StereoPair(
             left=np.ascontiguousarray(self.right[:, ::-1]),

@@ -116,12 +116,12 @@ def test_a_note_names_settings_by_their_keyword(folder):
 )
 def test_a_remedy_that_a_front_end_does_not_have_is_left_out(remedy, text):
     names = {"rectify": "R", "calibration": "C"}
-    assert Note("two cameras", remedy).worded(names.get) == text
-    assert sw.StereoweaveError("two cameras", remedy=remedy).worded(names.get) == text
+    assert Note("two cameras", remedy).format(names.get) == text
+    assert sw.StereoweaveError("two cameras", remedy=remedy).format(names.get) == text
     assert (
-        sw.StereoweaveError("two cameras", setting="rectify", remedy=remedy).worded(names.get) == f"R: {text}"
+        sw.StereoweaveError("two cameras", setting="rectify", remedy=remedy).format(names.get) == f"R: {text}"
     )
-    assert sw.StereoweaveError("two", setting="provider").worded(names.get) == "provider: two"
+    assert sw.StereoweaveError("two", setting="provider").format(names.get) == "provider: two"
 
 
 @pytest.mark.parametrize(

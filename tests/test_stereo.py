@@ -76,7 +76,7 @@ def test_a_pair_refuses_what_is_not_rgb_of_8_bits(image):
 def test_the_mirrored_pair_keeps_its_disparities(rng):
     left = rng.integers(0, 256, (32, 40, 3), dtype=np.uint8)
     right = np.roll(left, -5, axis=1)
-    mirrored = StereoPair(left=left, right=right).mirrored()
+    mirrored = StereoPair(left=left, right=right).mirror()
     np.testing.assert_array_equal(mirrored.right, np.roll(mirrored.left, -5, axis=1))
     np.testing.assert_array_equal(mirrored.left, right[:, ::-1])
 

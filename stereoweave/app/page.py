@@ -35,7 +35,7 @@ from stereoweave.app.session import (
     write_cloud,
     zip_files,
 )
-from stereoweave.errors import Note, StereoweaveError, worded
+from stereoweave.errors import Note, StereoweaveError, format_error
 from stereoweave.io.colormap import OCCLUDED_RGB, colour_confidence, css_colour, legend_colours
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.providers import CPU
@@ -248,7 +248,7 @@ class Page:
         return re.sub(rf"{re.escape(str(self._folder))}/\w+/", "", " ".join(line.splitlines()))
 
     def _format_error(self, error: Exception) -> str:
-        return _format_notice([self._format_line(worded(error, self._label_of))], problem=True)
+        return _format_notice([self._format_line(format_error(error, self._label_of))], problem=True)
 
     def _write_files(self, session: Session | None, progress: Any = gr.Progress()) -> dict[Any, Any]:  # noqa: B008
         """Write the files; takes as long as everything shown before."""
@@ -267,7 +267,7 @@ class Page:
         }
 
     def _summary(self, session: Session, notes: Sequence[Note] = ()) -> str:
-        lines = [self._format_line(note.worded(self._label_of)) for note in (*session.result.notes, *notes)]
+        lines = [self._format_line(note.format(self._label_of)) for note in (*session.result.notes, *notes)]
         return _format_notice([format_summary(session.result.summary), *lines])
 
     def _uploads(self, given: dict[Any, Any]) -> Uploads:

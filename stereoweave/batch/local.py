@@ -227,12 +227,12 @@ def _make(out: Path, job: DepthJob, pair: NamedPair) -> str | None:
         summary, notes = make_depth(pair.pictures, folder, job)
         seconds = round(time.perf_counter() - start_s, 3)
         files = sorted(path.name for path in folder.iterdir() if path.name[0] != ".")
-        lines = [note.worded(job.name_of) for note in notes]
+        lines = [note.format(job.name_of) for note in notes]
         facts = {"sources": sources, "files": files, "seconds": seconds, "notes": lines}
         with replacing(folder / DONE_FILE) as temporary:
             temporary.write_text(json.dumps(facts | {"summary": asdict(summary)}), encoding="utf-8")
     except StereoweaveError as error:
-        return " ".join(error.worded(job.name_of).split())
+        return " ".join(error.format(job.name_of).split())
     except Exception as error:  # whatever a library makes of a bad picture, the other pairs go on
         return " ".join(f"{type(error).__name__}: {error}".split())
     return None

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from stereoweave.batch.manifest import Planned, read_chunk, read_rows, write_rows
-from stereoweave.errors import OutputInUseError, ProviderError, StereoweaveError, worded
+from stereoweave.errors import OutputInUseError, ProviderError, StereoweaveError, format_error
 from stereoweave.io.files import SMALLEST_SIDE_PX, is_leftover
 from stereoweave.io.stores import Store
 from stereoweave.matching.matcher import Matcher
@@ -164,7 +164,7 @@ class Worker:
                 if any(isinstance(cause, ProviderError) for cause in _causes(error)):
                     _check_runs(matcher)
                 kind = "" if isinstance(error, StereoweaveError) else f"{type(error).__name__}: "
-                line = kind + worded(error, job.name_of).replace(f"{name}/pictures", self.source.place)
+                line = kind + format_error(error, job.name_of).replace(f"{name}/pictures", self.source.place)
                 row["error"] = " ".join(line.split())
         return row | {"seconds": round(time.perf_counter() - start_s, 3)}
 
@@ -197,7 +197,7 @@ class Worker:
             "confident_percent": summary.confident_percent,
             "width_px": summary.width_px,
             "height_px": summary.height_px,
-            "checks": [note.worded(job.name_of) for note in notes],
+            "checks": [note.format(job.name_of) for note in notes],
             "files": _names(out),
         }
 

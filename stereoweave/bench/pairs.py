@@ -324,7 +324,7 @@ def _run_matcher(match: MatchFunction, pair: StereoPair) -> _Answer:
     found = match(pair)
     if isinstance(found, Estimate):
         return _Answer(found.disparity_px, found.confidence, is_probability=True)
-    mirrored_px = match(pair.mirrored())
+    mirrored_px = match(pair.mirror())
     assert not isinstance(mirrored_px, Estimate)
     return _Answer(fill_rows(found), left_right_confidence(found, mirrored_px[:, ::-1]), is_probability=False)
 

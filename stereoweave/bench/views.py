@@ -168,7 +168,7 @@ def _render_view(renderer: Renderer, position: float) -> UInt8[np.ndarray, "h w 
 def _estimate_by_sgbm(pair: StereoPair) -> Estimate:
     """What OpenCV's users have of it: both views, each filled along rows, and the left-right check."""
     match = OPENCV_MATCHERS[SGBM]()
-    left_px, mirrored_px = match(pair), match(pair.mirrored())
+    left_px, mirrored_px = match(pair), match(pair.mirror())
     filled_px, right_filled_px = fill_rows(left_px), fill_rows(mirrored_px)[:, ::-1]
     return Estimate(
         disparity_px=filled_px,

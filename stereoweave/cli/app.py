@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stereoweave.cli.options import Host, Port, Provider, find_allowed_hosts, format_url, listen
-from stereoweave.errors import needing_extra
+from stereoweave.errors import require_extra
 
 OpenBrowser = Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")]
 
@@ -18,7 +18,7 @@ def app(
 
     check_provider(provider)
     with listen(host, port) as listener:
-        with needing_extra("app", "the page needs Gradio"):
+        with require_extra("app", "the page needs Gradio"):
             from stereoweave.app.page import serve
         url = format_url(host, listener.getsockname()[1])
         typer.echo(f"Stereoweave: {url} (Ctrl-C stops it)")

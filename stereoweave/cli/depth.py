@@ -105,7 +105,7 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
 
         raise typer.Exit(depth_of_many(found, out, job, processes=jobs, as_json=as_json))
     summary, notes = make_depth(pictures, out, job)
-    (_print_json if as_json else _print_summary)(summary, [note.worded(option_name) for note in notes], out)
+    (_print_json if as_json else _print_summary)(summary, [note.format(option_name) for note in notes], out)
 
 
 def measure(  # noqa: PLR0913 - each is an option of the command line
@@ -145,7 +145,7 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
     estimate = match(matcher, prepared.pair, options)
     error = CameraError(focal=focal_error_percent / 100, baseline=baseline_error_percent / 100)
     found = distance(estimate, camera, *places, camera_error=error)
-    notes = [note.worded(option_name) for note in prepared.notes]
+    notes = [note.format(option_name) for note in prepared.notes]
     if as_json:
         typer.echo(json.dumps(asdict(found) | {"notes": notes}, indent=2, allow_nan=False))
     else:

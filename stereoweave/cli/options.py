@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoweave.errors import StereoweaveError, needing_extra
+from stereoweave.errors import StereoweaveError, require_extra
 
 if TYPE_CHECKING:
     from stereoweave.pictures.prepare import Request
@@ -139,7 +139,7 @@ def naming_video_options() -> Iterator[None]:
     try:
         yield
     except StereoweaveError as error:
-        raise type(error)(error.worded(video_option_name)) from error
+        raise type(error)(error.format(video_option_name)) from error
 
 
 def make_request(
@@ -248,14 +248,14 @@ def _bracket_ipv6(host: str) -> str:
 @contextmanager
 def needing_train_extra(what: str = "this command needs PyTorch and other libraries") -> Iterator[None]:
     """Raise a one-line error that names the extra `train` if a library is missing."""
-    with needing_extra("train", what):
+    with require_extra("train", what):
         yield
 
 
 @contextmanager
 def needing_synth_extra() -> Iterator[None]:
     """Raise a one-line error that names the extra `synth` if a library is missing."""
-    with needing_extra("synth", "this command needs the rendering libraries"):
+    with require_extra("synth", "this command needs the rendering libraries"):
         import skimage  # noqa: F401 - textures need it later, in worker processes too
 
         yield

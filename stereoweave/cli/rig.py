@@ -24,7 +24,7 @@ def check(pictures: Pictures, arrangement: Format = None, as_json: AsJson = Fals
 
     opened = open_pictures(pictures, arrangement)
     found = check_pair(opened.pair.left, opened.pair.right)
-    notes = [note.worded(option_name) for note in (*opened.notes, *found.lines())]
+    notes = [note.format(option_name) for note in (*opened.notes, *found.lines())]
     if as_json:
         facts = {name: _replace_nan(value) for name, value in asdict(found).items()}
         typer.echo(json.dumps(facts | {"notes": notes}, indent=2, allow_nan=False))
@@ -69,7 +69,7 @@ def rectify(
         write_image(out / "right.png", pair.right)
         if pair.camera:
             write_rig(out / "calib.yml", rectified_rig(pair))
-    notes = [note.worded(option_name) for note in prepared.notes]
+    notes = [note.format(option_name) for note in prepared.notes]
     typer.echo("\n".join([f"{out}: left.png and right.png, {format_size(pair_size_px(pair))} px", *notes]))
 
 

@@ -21,7 +21,7 @@ from stereoweave.cli.serve import serve
 from stereoweave.cli.synth import synth
 from stereoweave.cli.video import video
 from stereoweave.cli.view import view
-from stereoweave.errors import StereoweaveError, worded
+from stereoweave.errors import StereoweaveError, format_error
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 app.add_typer(bench, name="bench")
@@ -42,7 +42,7 @@ def run(commands: typer.Typer, program: str, arguments: Sequence[str] | None) ->
     except typer.TyperException as error:
         message = error.format_message().rstrip(".") + f"; see {program} --help"
     except (StereoweaveError, OSError) as error:
-        message = worded(error, option_name)
+        message = format_error(error, option_name)
     typer.echo(f"{program}: " + " ".join(message.splitlines()), err=True)
     return 2
 

@@ -20,7 +20,7 @@ from stereoweave.cli.options import (
     format_url,
     listen,
 )
-from stereoweave.errors import StereoweaveError, needing_extra
+from stereoweave.errors import StereoweaveError, require_extra
 from stereoweave.system.ray_engine import set_environment
 from stereoweave.system.threads import usable_cores
 
@@ -83,7 +83,7 @@ def serve(  # noqa: PLR0913 - each is an option of the command line
 ) -> None:
     """Serve depth and views over HTTP; Ctrl-C stops the service after the accepted requests."""
     set_environment(address)  # before the service imports Ray
-    with needing_extra("cluster", "the service needs Ray Serve"):
+    with require_extra("cluster", "the service needs Ray Serve"):
         from pydantic import SecretStr
 
         from stereoweave.service.asgi import Limits

@@ -134,7 +134,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
         written = _write_layout(out, name, renderer, layout_options)
     typer.echo(f"{out}: {written}")
     for note in (*prepared.notes, *find_problems(pair, estimate)):
-        typer.echo(note.worded(option_name))
+        typer.echo(note.format(option_name))
 
 
 def _check_unused(name: str | None, single_view: dict[str, float | None], quilt: str | None) -> None:

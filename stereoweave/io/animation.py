@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from stereoweave.errors import StereoweaveError, needing_extra
+from stereoweave.errors import StereoweaveError, require_extra
 from stereoweave.io.files import checking_format_size, replacing
 
 Frames = Iterator[UInt8[np.ndarray, "h w 3"]]
@@ -57,7 +57,7 @@ def check_animation_ending(path: str | Path) -> str:
 @contextmanager
 def needing_the_video_extra(what: str) -> Iterator[None]:
     """Turn a missing PyAV into an error that names the extra."""
-    with needing_extra("video", f"{what} needs PyAV"):
+    with require_extra("video", f"{what} needs PyAV"):
         yield
 
 

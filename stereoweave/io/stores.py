@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
-from stereoweave.errors import StereoweaveError, needing_extra
+from stereoweave.errors import StereoweaveError, require_extra
 from stereoweave.io.files import make_folder, reading, replacing
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ def store_at(place: str | Path) -> Store:
     if not path.strip("/") or path.startswith("/"):
         raise StereoweaveError(f"{place}: expected {protocol}://bucket/folder, found no bucket")
     library = _KINDS[protocol].library
-    with needing_extra("cluster", f"{place}: expected the library {library}"):
+    with require_extra("cluster", f"{place}: expected the library {library}"):
         importlib.import_module(library)
     return ObjectStore(f"{protocol}://{path.rstrip('/')}")
 

@@ -149,7 +149,7 @@ class Matcher:
         self._check_sizes(pairs)
         every_maps = self._maps(pairs)
         if any(maps.right_disparity_px is None for maps in every_maps):
-            mirrored = self._maps([pair.mirrored() for pair in pairs])
+            mirrored = self._maps([pair.mirror() for pair in pairs])
             every_maps = [
                 maps._replace(right_disparity_px=np.ascontiguousarray(other.disparity_px[:, ::-1]))
                 for maps, other in zip(every_maps, mirrored, strict=True)

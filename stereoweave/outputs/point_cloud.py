@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 
-from stereoweave.errors import Note, Remedy, StereoweaveError, needing_extra
+from stereoweave.errors import Note, Remedy, StereoweaveError, require_extra
 from stereoweave.io.files import replacing
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair, check_fits
 
@@ -222,7 +222,7 @@ def _shape(cloud: Cloud) -> Any:
 
 
 def _trimesh() -> Any:
-    with needing_extra("mesh", "point clouds and meshes need trimesh"):
+    with require_extra("mesh", "point clouds and meshes need trimesh"):
         import trimesh
     return trimesh
 

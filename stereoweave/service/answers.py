@@ -225,5 +225,5 @@ def _write_map(path: Path, result: Result) -> None:
 
 
 def _report(summary: Summary, notes: Sequence[Note], folder: Path) -> str:
-    lines = [strip_paths(note.worded(field_name), folder)[:_LONGEST_NOTE] for note in notes]
+    lines = [strip_paths(note.format(field_name), folder)[:_LONGEST_NOTE] for note in notes]
     return json.dumps(asdict(summary) | {"notes": lines}, allow_nan=False)

@@ -18,7 +18,7 @@ from starlette.datastructures import Headers
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from stereoweave import __version__
-from stereoweave.errors import FormatError, MatcherError, StereoweaveError, worded
+from stereoweave.errors import FormatError, MatcherError, StereoweaveError, format_error
 from stereoweave.service.admission import BusyError
 from stereoweave.service.answers import (
     MEDIA_TYPES,
@@ -211,7 +211,7 @@ def _make_response(answer: Answer, name: str) -> Response:
 
 def _make_http_exception(error: Exception, folder: Path) -> HTTPException:
     headers = {"Retry-After": str(error.retry_after_s)} if isinstance(error, BusyError) else None
-    detail = strip_paths(worded(error, field_name), folder)
+    detail = strip_paths(format_error(error, field_name), folder)
     if not isinstance(error, StereoweaveError | TimeoutError):
         found = detail or "too little memory"
         detail = f"expected room for the request on disk and in memory, found {found}; try again later"

@@ -17,7 +17,7 @@ from functools import partial
 from importlib.metadata import distribution
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from stereoweave.errors import Remedy, StereoweaveError, needing_extra
+from stereoweave.errors import Remedy, StereoweaveError, require_extra
 from stereoweave.system.threads import usable_cores
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def connect(engine: Engine) -> Iterator[None]:
         StereoweaveError: If Ray is not installed, or no head answers at the address.
     """
     address = set_environment(engine.address)
-    with needing_extra("cluster", "this needs Ray"):
+    with require_extra("cluster", "this needs Ray"):
         already = "ray" in sys.modules and sys.modules["ray"].is_initialized()
         if address and not already:
             distribution("ray")  # raises ModuleNotFoundError, without the import

@@ -237,7 +237,7 @@ def make_film(
             survey, notes = _look(footage, matcher, bar)
             maker = _Maker(job, matcher, survey)
             for note in [*notes, *job.loses(survey)]:
-                line = note.worded(job.name_of)
+                line = note.format(job.name_of)
                 console.print(line, markup=False, highlight=False, soft_wrap=True)
         done, total = maker.tally.frames, footage.frame_count
         shown = bar.add_task(out.name, total=total, completed=done, loss="", rate="")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
-from stereoweave.errors import FormatError, StereoweaveError, needing_extra
+from stereoweave.errors import FormatError, StereoweaveError, require_extra
 from stereoweave.io.decoding import ENDINGS
 from stereoweave.io.files import read_image
 
@@ -230,7 +230,7 @@ def picture_files(path: Path) -> list[Path] | None:
 
 @contextmanager
 def _reading(path: Path) -> Iterator[tuple["av.container.InputContainer", "av.VideoStream"]]:
-    with needing_extra("video", f"{path}: reading video needs PyAV"):
+    with require_extra("video", f"{path}: reading video needs PyAV"):
         import av
     try:
         container = av.open(str(path), metadata_errors="replace")

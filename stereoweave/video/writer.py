@@ -255,7 +255,7 @@ def growing(film: Path, settings: Mapping[str, object]) -> Iterator[Parts]:
             _clear(folder)
         elif isinstance(error, OSError | FFmpegError | StereoweaveError):
             ours = error if isinstance(error, StereoweaveError) else StereoweaveError(str(error))
-            raise ours.extended(
+            raise ours.with_detail(
                 f"what is finished stays in {folder}, and the same command goes on from there"
             ) from error
         raise

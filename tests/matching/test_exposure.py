@@ -202,7 +202,7 @@ def test_without_sure_matches_there_is_no_correction(nothing, wall):
 def test_a_mirror_exchanges_the_looks(wall):
     pair, estimate = wall
     pair = replace(pair, right=recolour(pair.right, DISTORTIONS["cast"].astype(np.float32)))
-    mirrored = pair.mirrored()
+    mirrored = pair.mirror()
     looks = match_exposure(pair.left, pair.right, estimate)
     exchanged = match_exposure(mirrored.left, mirrored.right, estimate)
     np.testing.assert_allclose(exchanged.right_of_left[10:246], looks.left_of_right[10:246], atol=0.5)

@@ -163,7 +163,7 @@ def test_a_right_view_is_matched_as_the_left_one_of_the_mirrored_pair(scene):
     left, right, _, right_px = scene
     pair, given = StereoPair(left=left, right=right), estimate_of(right_px, right_px, confidence=0)
     found_px, right_found_px = refining._match_views(pair, given, 1)
-    mirrored_px, right_mirrored_px = refining._match_views(pair.mirrored(), given, 1)
+    mirrored_px, right_mirrored_px = refining._match_views(pair.mirror(), given, 1)
     np.testing.assert_array_equal(mirrored_px[:, ::-1], right_found_px)
     np.testing.assert_array_equal(right_mirrored_px[:, ::-1], found_px)
     assert (abs(right_found_px - right_px) < 1).mean() > 0.9

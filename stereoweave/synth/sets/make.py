@@ -133,7 +133,7 @@ def make(  # noqa: PLR0913 - mirrors the command's options
                 )
                 _check_shared(out, _missing_pairs(spec, pairs, out, layout))
         except StereoweaveError as error:
-            raise error.extended(
+            raise error.with_detail(
                 "all finished pairs are complete: rerun the same command to resume"
             ) from error
         finally:

@@ -85,7 +85,7 @@ def test_the_matcher_file_answers_as_pytorch_does_and_nothing_is_written_otherwi
     assert written["parameters"] == sum(p.numel() for p in overfitted().network.parameters())
 
     matcher = Matcher(out, threads=1)
-    mirrored = pair.mirrored()
+    mirrored = pair.mirror()
     for found, alone in zip(matcher.estimate_many([pair, mirrored]), (pair, mirrored), strict=True):
         expected = matcher.estimate(alone.left, alone.right)
         np.testing.assert_allclose(found.disparity_px, expected.disparity_px, atol=1e-3)
@@ -133,7 +133,7 @@ def test_the_papers_network_becomes_a_matcher_that_finds_the_right_view_by_the_m
     network = export.load_matcher_network(checkpoint.load(paper_run / "last.pt"))
     for values, view in (
         (found.disparity_px, pair),
-        (found.right_disparity_px[:, ::-1], pair.mirrored()),
+        (found.right_disparity_px[:, ::-1], pair.mirror()),
     ):
         tensors = [torch.from_numpy(image).permute(2, 0, 1)[None] / 255 for image in (view.left, view.right)]
         with torch.no_grad():
