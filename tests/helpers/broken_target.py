@@ -1,4 +1,4 @@
-"""A target that does what its files say: for the tests of the fuzzer."""
+"""Fuzzing target that fails as its files command, for the tests of the fuzzer."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""The browser of the tests: the Chromium of this machine, driven by Playwright."""
+"""The installed Chromium, driven by Playwright."""
 
 import shutil
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ FLAGS = (
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """Chromium without a window, for as long as the block lasts."""
+    """Run headless Chromium during the block."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
         yield browser

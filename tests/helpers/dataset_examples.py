@@ -1,4 +1,4 @@
-"""What the tests of the datasets share: small files in the datasets' own encodings, and their errors."""
+"""Shared by the tests of datasets: small files in the datasets' encodings, and their errors."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,19 +16,19 @@ SHAPE = 32, 40
 
 
 def write_pixels(path: Path, values: np.ndarray) -> None:
-    """Numbers as they are, in the mode of their type and in the format of the name."""
+    """Write pixel values unchanged; dtype and file name determine mode and format."""
     path.parent.mkdir(parents=True, exist_ok=True)
     options = {"lossless": True} if path.suffix == ".webp" else {}
     Image.fromarray(values).save(path, **options)
 
 
 def write_picture(path: Path, shade: int, shape: tuple[int, int] = SHAPE) -> None:
-    """A picture of one grey, by which a test tells left from right."""
+    """Write a picture of uniform grey, by which tests distinguish left and right."""
     write_pixels(path, np.full((*shape, 3), shade, np.uint8))
 
 
 def write_map(path: Path, start: list, rest: float, kind: type, shape: tuple[int, int] = SHAPE) -> None:
-    """A map in which the first row begins with `start`; a PFM or a picture, by the name."""
+    """Write a map whose first row begins with `start`, as PFM or picture by the file name."""
     values = np.full((*shape, *np.shape(rest)), rest, kind)
     if start:
         values[0, : len(start)] = start
@@ -48,18 +48,18 @@ def names(dataset: str, root: Path) -> list[str]:
 
 
 def shades(sample: Sample) -> tuple[int, int]:
-    """The greys of the left and of the right picture of a sample."""
+    """Return the greys of the left and right image of a sample."""
     return int(sample.left[0, 0, 0]), int(sample.right[0, 0, 0])
 
 
 def cut(path: Path) -> None:
-    """Leaves the first half of a file."""
+    """Truncate a file to its first half."""
     content = path.read_bytes()
     path.write_bytes(content[: len(content) // 2])
 
 
 def error_of(call: Callable, *arguments: object) -> str:
-    """The one line of the error in which the call must end."""
+    """Return the one-line error that the call must raise."""
     with pytest.raises(StereoweaveError) as caught:
         call(*arguments)
     message = str(caught.value)
@@ -70,7 +70,7 @@ def error_of(call: Callable, *arguments: object) -> str:
 
 
 def error_naming(path: Path, dataset: str, root: Path) -> str:
-    """The error of opening the dataset and reading all of it, which must name the file or folder."""
+    """Return the error of reading the whole dataset, which must name the file or folder."""
     message = error_of(lambda: [frame.read() for frame in open_dataset(dataset, root)])
     assert str(path) in message
     return message

@@ -1,4 +1,4 @@
-"""Files that front ends refuse or remark on, each with a remedy that names a setting."""
+"""Files that cause errors and notes whose remedies name settings."""
 
 import shutil
 from pathlib import Path
@@ -17,7 +17,7 @@ LAYOUTS = (
 
 
 def write_error_examples(folder: Path) -> None:
-    """A pair, the same with the right picture 2 px lower, plain pictures, and a calibration to rectify by."""
+    """Write a pair, the same with the right picture 2 px lower, plain pictures, and a calibration."""
     for name in ("left.png", "right.png"):
         shutil.copy(EXAMPLES / name, folder)
     left, right = (read_image(EXAMPLES / name) for name in ("left.png", "right.png"))

@@ -1,4 +1,4 @@
-"""What the tests of video share: small real films made with PyAV, their sound, and ways of damaging them."""
+"""Shared by the tests of video: small real films made with PyAV, their sound, and ways to damage them."""
 
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
@@ -18,7 +18,7 @@ Pair = tuple[np.ndarray, np.ndarray]
 
 
 def example_pairs(count: int, *, width: int = 160, height: int = 96, step_px: int = 2) -> list[Pair]:
-    """Windows of the example pair that wander to the right: a film of a camera that moves sideways."""
+    """Windows of the example pair moving to the right, like a film of a camera that moves sideways."""
     left, right = (read_image(EXAMPLES / f"{eye}.png") for eye in ("left", "right"))
     top_px, first_px = 200, 180
     return [
@@ -31,7 +31,7 @@ def example_pairs(count: int, *, width: int = 160, height: int = 96, step_px: in
 
 
 def flat_pairs(count: int, *, width: int = 64, height: int = 48) -> list[Pair]:
-    """Pairs of one colour each, by which a test tells eyes and frames apart: the right eye is bluer."""
+    """Pairs of uniform colour by which tests distinguish eyes and frames; the right eye is bluer."""
     return [
         tuple(np.full((height, width, 3), (20 + 8 * index, 100, blue), np.uint8) for blue in (60, 180))
         for index in range(count)
@@ -39,7 +39,7 @@ def flat_pairs(count: int, *, width: int = 64, height: int = 48) -> list[Pair]:
 
 
 def packed(left: np.ndarray, right: np.ndarray, arrangement: str = "side_by_side") -> np.ndarray:
-    """One picture of both eyes."""
+    """Pack both eyes into one image."""
     height_px, width_px = left.shape[:2]
     match arrangement:
         case "side_by_side":
@@ -73,7 +73,7 @@ def write_side_by_side(
     codec: str = "mpeg4",
     **more: object,
 ) -> Path:
-    """A video of pairs in one picture each; `more` goes to `write_video`."""
+    """Write a video of packed pairs; `more` is passed to `write_video`."""
     frames = [packed(left, right, arrangement) for left, right in pairs]
     return write_video(path, frames, times_ms=times_ms, sound=sound, codec=codec, **more)
 
@@ -92,20 +92,20 @@ def write_video(
     rotation: int = 0,
     options: dict[str, str] | None = None,
 ) -> Path:
-    """A video of RGB frames, 25 a second unless `times_ms` says when each is shown; with sound, a sine.
+    """Write a video of RGB frames, optionally with sound.
 
     Args:
-        path: Where; the ending chooses the container.
-        frames: uint8 RGB [H, W, 3], each of one size.
-        times_ms: When each frame is shown, rising.
-        sound: Whether there is a sine of 440 Hz, AAC, as long as the frames.
+        path: Output file; the extension determines the container.
+        frames: uint8 RGB [H, W, 3], all of equal size.
+        times_ms: Presentation times in ascending order; default: 25 frames a second.
+        sound: Add a sine of 440 Hz, AAC, as long as the frames.
         codec: FFmpeg's name of an encoder: mpeg4, libx264, libx264rgb, ffv1, mjpeg, ...
-        pix_fmt: The layout of pixels; what the encoder likes best unless given.
-        colorspace: FFmpeg's AVCOL_SPC_*: 2 is none said, 1 BT.709, 5 and 6 BT.601.
-        color_range: 0 none said, 1 limited, 2 full.
-        stereo_mode: What Matroska says of the arrangement, such as "left_right".
-        rotation: What a player has to turn the picture by, anticlockwise, in degrees.
-        options: More for the encoder, such as {"g": "12"}, a key frame every 12.
+        pix_fmt: Pixel format; default: the encoder's preferred one.
+        colorspace: FFmpeg's AVCOL_SPC_*: 2 is unspecified, 1 BT.709, 5 and 6 BT.601.
+        color_range: 0 unspecified, 1 limited, 2 full.
+        stereo_mode: Matroska's frame packing tag, such as "left_right".
+        rotation: Anticlockwise rotation in degrees that players must apply.
+        options: Encoder options, such as {"g": "12"}, a key frame every 12.
     """
     times_ms = times_ms if times_ms is not None else [FRAME_MS * index for index in range(len(frames))]
     with av.open(str(path), "w") as container:
@@ -138,7 +138,7 @@ def write_video(
 
 
 def packets(path: Path, kind: str) -> list[tuple[int, bytes]]:
-    """Time, in steps of its stream, and content of each packet of a kind, "video" or "audio"."""
+    """Return time stamp and content of each packet of a kind, "video" or "audio"."""
     with av.open(str(path)) as container:
         return [
             (packet.pts, bytes(packet)) for packet in container.demux(**{kind: 0}) if packet.pts is not None
@@ -146,7 +146,7 @@ def packets(path: Path, kind: str) -> list[tuple[int, bytes]]:
 
 
 def damage(path: Path, *frames: int, length: int = 60) -> Path:
-    """Overwrites bytes in the middle of the packets of some frames, counted in the order of the file."""
+    """Overwrite bytes in the middle of the packets of some frames, numbered in file order."""
     content = bytearray(path.read_bytes())
     bodies = [body for _, body in packets(path, "video")]
     for frame in frames:
@@ -160,7 +160,7 @@ def damage(path: Path, *frames: int, length: int = 60) -> Path:
 
 
 def truncate(path: Path, share: float) -> Path:
-    """Leaves the first part of a file, as a broken download does."""
+    """Truncate a file, like an interrupted download."""
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
     return path

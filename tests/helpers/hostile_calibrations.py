@@ -1,4 +1,4 @@
-"""Calibrations made to do harm, by rule: HOSTILE must be refused, each quickly; HARMLESS must be read."""
+"""Systematically generated malicious calibrations: HOSTILE must be refused quickly, HARMLESS read."""
 
 import base64
 import gzip
@@ -7,7 +7,7 @@ import struct
 from fuzz.targets.calibrations import KALIBR, MIDDLEBURY
 
 MATRIX = [500, 0, 320, 0, 500, 240, 0, 0, 1]
-# What a calibration says, flat: a list is a matrix of three columns, or of one row.
+# Flat content of a calibration: a list is a matrix of three columns, or of one row.
 RIG = {
     "M1": MATRIX,
     "D1": [0.1, -0.2, 0.001, 0.002, 0.03],

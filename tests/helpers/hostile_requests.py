@@ -1,4 +1,4 @@
-"""Requests that are made to do harm, byte by byte: to what parses HTTP, and to what waits for it."""
+"""Malicious raw HTTP requests that attack parsing and time limits."""
 
 import socket
 import struct
@@ -10,7 +10,7 @@ from itertools import chain, repeat
 import httpx
 
 Sender = Callable[[httpx.Client], tuple[int, str]]
-# Enough for a server that keeps all of it to be seen.
+# Enough to notice a server that keeps all of it in memory.
 _ENDLESS = 64_000_000
 _POST = b"POST /disparity HTTP/1.1\r\nHost: localhost\r\n"
 _FORM = b"Content-Type: multipart/form-data; boundary=b\r\n"
@@ -19,7 +19,7 @@ _PART = b'--b\r\nContent-Disposition: form-data; name="left"; filename="l"\r\n\r
 
 
 def hostile() -> dict[str, Sender]:
-    """Requests by what each does. The status of one whose connection is closed without a word is 0."""
+    """Requests by what each does; the status is 0 if the connection is closed without a response."""
     once = _heads() | _methods() | _hosts() | _lengths() | _bodies() | _other_protocols()
     return {
         **{name: partial(_speak, [request]) for name, request in once.items()},
@@ -195,13 +195,13 @@ def _leave(start: bytes, reset: bool, client: httpx.Client) -> tuple[int, str]:
 
 
 def _speak(parts: Iterable[bytes], client: httpx.Client) -> tuple[int, str]:
-    """The status that is answered to bytes, as many of them as are taken."""
+    """Send bytes, as many as are accepted; return the status of the response."""
     with _connection(client) as connection:
         try:
             for part in parts:
                 connection.sendall(part)
         except OSError:
-            pass  # the connection was closed in the middle of it
+            pass  # the connection was closed while sending
         return _status(connection)
 
 

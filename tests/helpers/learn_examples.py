@@ -1,4 +1,4 @@
-"""What the tests of training share: a pair whose truth is known by construction, a network trained on it."""
+"""Shared by the tests of training: a pair with truth by construction, and a network trained on it."""
 
 import functools
 import json
@@ -18,7 +18,7 @@ from stereoweave.learn.recipe import Recipe
 from stereoweave.learn.training.losses import weave_losses
 from stereoweave.stereo import Sample, StereoCamera
 
-# Pictures this small cost more to share among threads than to compute.
+# For images this small, sharing the work among threads costs more than computing.
 torch.set_num_threads(1)
 
 PAIR_SIZE = (64, 96)
@@ -41,9 +41,9 @@ CAMERA = StereoCamera(focal_px=120.0, baseline_m=0.2, cx_px=47.5, cy_px=31.5)
 
 
 def recipe_of(model, **changes):
-    """RECIPE with another model: its loss changes with it, and PSMNet has a few candidates alone.
+    """RECIPE with another model and its loss; PSMNet gets only 48 candidates.
 
-    48 of them, because with 32 a volume is 2 levels deep, for which oneDNN's bfloat16 gradient is garbage.
+    Not 32, for which a volume is 2 levels deep and oneDNN's bfloat16 gradient is wrong.
     """
     loss = "weave" if model.startswith("weave") else "l2"
     return replace(RECIPE, **{"model": model, "loss": loss, "max_disparity_px": 48.0, **changes})
@@ -55,7 +55,7 @@ def texture(rng, height, width):
 
 
 def box_before_a_wall(rng, size=PAIR_SIZE, wall_px=4, box_px=12):
-    """A sample of two flat surfaces: the box covers the middle half of the left view's rows and columns."""
+    """Sample of two flat surfaces; the box covers the middle half of the left view's rows and columns."""
     height, width = size
     wall, box = texture(rng, height, width + wall_px), texture(rng, height // 2, width // 2)
     rows, start = slice(height // 4, height // 4 + height // 2), width // 4
@@ -79,7 +79,7 @@ def box_before_a_wall(rng, size=PAIR_SIZE, wall_px=4, box_px=12):
 
 
 def keep_pairs(folder, seed, count, size=PAIR_SIZE):
-    """Pairs of this file in place of the collages that training would make."""
+    """Fill the pair cache of a training with pairs of this file instead of collages."""
     pairs = CachedPairs(folder, seed, count, size)
     pairs.folder.mkdir(parents=True, exist_ok=True)
     for index in range(count):
@@ -88,7 +88,7 @@ def keep_pairs(folder, seed, count, size=PAIR_SIZE):
 
 
 def make_batches_in_place(patch):
-    """Have a training's batches come in its own process: another one takes seconds to load PyTorch."""
+    """Make batches in the training process itself: another one takes seconds to load PyTorch."""
     patch.setattr(
         "stereoweave.learn.training.loop._load_batches",
         lambda batches, first: ((step, batches[step]) for step in range(first, batches.recipe.steps)),
@@ -116,7 +116,7 @@ def checkpoint_of(network, recipe=RECIPE):
 
 
 def complaint(call, *arguments) -> str:
-    """The one line of the error in which the call must end."""
+    """Return the one-line error that the call must raise."""
     with pytest.raises(StereoweaveError) as caught:
         call(*arguments)
     assert "\n" not in str(caught.value)
@@ -125,7 +125,7 @@ def complaint(call, *arguments) -> str:
 
 @dataclass(frozen=True)
 class Listed:
-    """Samples in memory as a source."""
+    """Source of samples in memory."""
 
     samples: list[Sample]
 
@@ -150,7 +150,7 @@ class Overfitted:
 
 @functools.cache
 def overfitted(name="weave_small", steps=45) -> Overfitted:
-    """A network that has seen one pair again and again, and its mean error on that pair before and after."""
+    """Overfit a network to one pair; also return its mean error on that pair before and after."""
     network, sample = untrained(name), box_before_a_wall(np.random.default_rng(0))
     batch = collate([sample])
     before_px = mean_error_px(network, batch)
@@ -175,14 +175,14 @@ def mean_error_px(network, batch) -> float:
 
 
 def write(recipe, file):
-    """The file, which holds the recipe now."""
+    """Write the recipe to the file; return the path."""
     lines = (f"{name} = {json.dumps(value)}" for name, value in asdict(recipe).items())
     file.write_text("\n".join(lines) + "\n")
     return file
 
 
 def assert_same(one, other):
-    """Equal to the last bit, through dictionaries and lists."""
+    """Assert that two values are bitwise equal, recursively through dictionaries and lists."""
     if isinstance(one, torch.Tensor):
         assert torch.equal(one, other)
     elif isinstance(one, dict):

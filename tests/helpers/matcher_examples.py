@@ -1,4 +1,4 @@
-"""Matcher files whose graphs are written by hand, and the pictures that they read."""
+"""Matcher files with handwritten graphs, and images for them."""
 
 from pathlib import Path
 
@@ -15,9 +15,9 @@ PROPERTIES = {"name": "by_hand", "multiple_of": 16, "max_disparity_px": 255}
 def matcher_file(
     path: Path, nodes, outputs, properties=PROPERTIES, inputs=("left", "right"), size=ANY_SIZE
 ) -> Path:
-    """A matcher file whose graph is written by hand; the constants below are there to use.
+    """Write a matcher file from graph nodes, which may use the constants below.
 
-    `size`: how many pictures it takes at once, of what height and width; numbers, or names where any will do.
+    `size`: batch, height and width of its inputs; numbers, or names for free dimensions.
     """
     batch, height, width = size
     graph = helper.make_graph(
@@ -44,7 +44,7 @@ def matcher_file(
 
 
 def red_of(image: str, output: str):
-    """Nodes that give the red channel of an image in 0..255: a disparity that the test paints."""
+    """Nodes that output the red channel of an image in 0..255, in which tests encode disparity."""
     return [
         helper.make_node("Gather", [image, "red"], [f"{output}_red"], axis=1),
         helper.make_node("Mul", [f"{output}_red", "scale"], [output]),
@@ -52,7 +52,7 @@ def red_of(image: str, output: str):
 
 
 def of_fixed_size(model: str, path: Path, height: int, width: int) -> Path:
-    """A shipped network as a matcher file for pictures of one size."""
+    """Write a shipped network as a matcher file of fixed input size."""
     graph = onnx.load(model_file(model))
     for value in (*graph.graph.input, *graph.graph.output):
         dims = value.type.tensor_type.shape.dim

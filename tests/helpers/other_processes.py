@@ -1,4 +1,4 @@
-"""What tests do with other processes and with ports."""
+"""Helpers for processes and ports."""
 
 import signal
 import socket
@@ -13,7 +13,7 @@ import psutil
 
 @contextmanager
 def halted(process: subprocess.Popen[Any] | psutil.Process) -> Iterator[None]:
-    """A process stands still during the block, and keeps what it holds."""
+    """Stop a process during the block; it keeps its resources."""
     process.send_signal(signal.SIGSTOP)
     try:
         yield
@@ -22,7 +22,7 @@ def halted(process: subprocess.Popen[Any] | psutil.Process) -> Iterator[None]:
 
 
 def processes_of(process: int) -> list[int]:
-    """The process, and all that it has started and that these have."""
+    """Return the process and all its descendants."""
     parents = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError):
@@ -34,7 +34,7 @@ def processes_of(process: int) -> list[int]:
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports of this machine that nobody listens at."""
+    """Return unused ports of this machine."""
     with ExitStack() as stack:
         sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
         for taken in sockets:

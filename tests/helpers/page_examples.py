@@ -1,4 +1,4 @@
-"""The page as its command serves it, and a visitor without a browser."""
+"""The page, served by its command, and a client without a browser."""
 
 import json
 import os
@@ -21,8 +21,8 @@ SERVER = [
 
 
 def start(folder: Path, *words: str) -> tuple[subprocess.Popen[str], str]:
-    """A server of its own, whose temporary files are in `folder`, and its address."""
-    # Where a shell or nohup starts the tests in the background, both are ignored, and processes inherit that.
+    """Start a separate server with its temporary files in `folder`; return it and its address."""
+    # If a shell or nohup runs the tests in the background, both are ignored, which processes inherit.
     before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGINT, signal.SIGHUP)}
     server = subprocess.Popen(
         [*SERVER, "--port", "0", *words],
@@ -38,7 +38,7 @@ def start(folder: Path, *words: str) -> tuple[subprocess.Popen[str], str]:
 
 
 def stop(server: subprocess.Popen[str], number: signal.Signals = signal.SIGINT) -> str:
-    """What the server said to the end, after a signal."""
+    """Stop the server by a signal; return its output."""
     server.send_signal(number)
     try:
         said = "".join(server.communicate(timeout=30))
@@ -49,12 +49,12 @@ def stop(server: subprocess.Popen[str], number: signal.Signals = signal.SIGINT) 
 
 
 def file_data(path: Any, **more: Any) -> dict[str, Any]:
-    """A file as Gradio's client names it."""
+    """Reference to a file in the format of Gradio's client."""
     return {"path": path, "meta": {"_type": "gradio.FileData"}, **more}
 
 
 class Visitor:
-    """A client of the page that sends what the page's form sends, or anything else."""
+    """Client of the page that sends form requests or arbitrary ones."""
 
     def __init__(self, address: str) -> None:
         self.http = httpx.Client(base_url=address, timeout=60)
@@ -67,7 +67,7 @@ class Visitor:
         }
 
     def upload(self, *files: Path) -> list[str]:
-        """The paths that the page gives to uploaded files."""
+        """Upload files; return the page's paths for them."""
         answer = self.http.post(
             "/gradio_api/upload", files=[("files", (file.name, file.read_bytes())) for file in files]
         )
@@ -75,14 +75,14 @@ class Visitor:
         return answer.json()
 
     def press(self, button: str = "find", **given: Any) -> dict[str, Any]:
-        """The body of a request that presses a button of the form, with some fields filled in."""
+        """Request body for a button of the form, with some fields filled in."""
         number, inputs = self._inputs[button]
         form = {"model": "small", "rectify": False, "arrangement": "detected", "position": 0.5} | given
         data = [form.get(self._fields[part]) for part in inputs]
         return {"data": data, "fn_index": number, "session_hash": uuid4().hex}
 
     def answer(self, body: dict[str, Any]) -> tuple[int, str]:
-        """Status and words of the answer to a request; where the page begins to work, those of its work."""
+        """Status and text of the response; if the page starts a job, those of the job."""
         joined = self.http.post("/gradio_api/queue/join", json=body)
         if joined.status_code != 200:
             return joined.status_code, joined.text

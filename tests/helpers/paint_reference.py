@@ -1,4 +1,4 @@
-"""The painter once more, in plain NumPy, layer by layer over whole views."""
+"""Plain NumPy reference of the collage painter, layer by layer over whole views."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ def rectangle(left, top, right, bottom, canvas):
 
 
 def sampled(image, shift_px):
-    """The image [H, W, C] at column x + shift_px, linearly; the borders go on."""
+    """Image [H, W, C] shifted to x + shift_px by linear interpolation; the borders repeat."""
     height, width = shift_px.shape
     column = np.clip(np.arange(width) + shift_px, 0, width - 1)
     before = np.minimum(column.astype(int), width - 2)
@@ -22,7 +22,7 @@ def sampled(image, shift_px):
 
 
 def plain_view(scene, side):
-    """Image and disparity of a view: side 0 the left one, 1 the right one."""
+    """Image and disparity of a view; side 0 is left, 1 right."""
     layers = [plain_layer(scene, layer, side) for layer in scene.layers]
     nearest = np.max([np.where(field >= 0, d, -1) for field, d in layers], axis=0)
     opaque = np.max([np.where(field >= 0.5, d, -1) for field, d in layers], axis=0)
@@ -69,7 +69,7 @@ def mapped(mapping, x, y):
 
 
 def mirrored(image, u, v):
-    """Bilinear, the image repeated forth and back."""
+    """Sample bilinearly; the image is continued by reflection."""
     there_and_back = [np.r_[0:n, n - 2 : 0 : -1] for n in image.shape[:2]]
     result = 0
     for dv in (0, 1):

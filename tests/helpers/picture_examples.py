@@ -1,4 +1,4 @@
-"""What the tests of pictures share: colour profiles, and files whose heads say what is not there."""
+"""Shared by the tests of pictures: colour profiles, and files with false headers."""
 
 import io
 import struct
@@ -8,7 +8,7 @@ from PIL import Image
 
 
 def profile(name, red, green, blue):
-    """An ICC profile, version 4, of these primaries as XYZ under D50, with the curve of sRGB."""
+    """ICC profile, version 4, of these primaries as XYZ under D50, with the curve of sRGB."""
 
     def fixed(*values):
         return b"".join(struct.pack(">i", round(value * 65536)) for value in values)
@@ -40,7 +40,7 @@ DISPLAY_P3 = (0.5151, 0.2412, -0.0011), (0.2920, 0.6922, 0.0419), (0.1571, 0.066
 
 
 def png_of(width_px, height_px):
-    """A PNG that says it is of this size, with hardly any content."""
+    """PNG whose header claims this size, with hardly any content."""
     content = io.BytesIO()
     Image.new("L", (1, 1)).save(content, "PNG")
     head = b"IHDR" + struct.pack(">LL", width_px, height_px) + content.getvalue()[24:29]

@@ -1,4 +1,4 @@
-"""Views moved along their rows, and the hidden background laid, once more in plain NumPy."""
+"""Plain NumPy reference of `camera_motion_kernels` and `hole_filling_kernels.lay`."""
 
 import numpy as np
 from plain_rendering import SAME_SURFACE_PX, cubic, linear, tap
@@ -7,7 +7,7 @@ from stereoweave.rendering.canvas_kernels import NOTHING
 
 
 def plain_move(view, targets, disparity_px, before):
-    """The canvas of `moving_kernels.move`, where `before` is what it was; all of them are `Canvas`."""
+    """Canvas after `camera_motion_kernels.move`, given the canvas before."""
     lines = zip(view.surface_px, targets, disparity_px, strict=True)
     landed_px, source = np.swapaxes([plain_landing(*line) for line in lines], 0, 1)
     pure = np.isfinite(landed_px)
@@ -25,7 +25,7 @@ def plain_move(view, targets, disparity_px, before):
 
 
 def plain_landing(surface_px, targets, disparity_px):
-    """For each column of a row, the nearest disparity that lands there (NaN: none), and its real source."""
+    """Nearest disparity that lands on each column of a row (NaN: none), and its fractional source column."""
     columns = np.arange(len(targets))
     joined = np.abs(np.diff(surface_px)) <= SAME_SURFACE_PX
     landed_px, source = np.full(len(targets), np.nan), np.zeros(len(targets))
@@ -46,7 +46,7 @@ def plain_landing(surface_px, targets, disparity_px):
 
 
 def plain_lay(hidden_px, colours, shift, offset_px, canvas):
-    """The canvas after `filling_kernels.lay`: of what may be seen at a pixel, the nearest background."""
+    """Canvas after `hole_filling_kernels.lay`: the nearest visible background at each pixel."""
     result = type(canvas)(*(values.copy() for values in canvas))
     height, width = hidden_px.shape
     at = np.arange(width) + shift * hidden_px.astype(float) + offset_px
@@ -63,7 +63,7 @@ def plain_lay(hidden_px, colours, shift, offset_px, canvas):
 
 
 def plain_mix(hidden_px, colours, x, beyond):
-    """The colour so many columns from the hidden pixel x, towards its neighbour if that is of its surface."""
+    """Colour at an offset from the hidden pixel x, interpolated towards its neighbour on the same surface."""
     beside = x + (1 if beyond > 0 else -1)
     if not (0 <= beside < len(hidden_px) and abs(hidden_px[beside] - hidden_px[x]) <= SAME_SURFACE_PX):
         return colours[x]

@@ -1,4 +1,4 @@
-"""The refinement once more, in plain NumPy: one candidate, one direction and one row after another."""
+"""Plain NumPy reference of `refine_kernels`: one candidate, direction and row at a time."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ OUTSIDE = 65535
 
 
 def plain_costs(own, other, first_px, count):
-    """What each candidate costs [H, W, D]; both are `Cues`."""
+    """Matching cost of each candidate [H, W, D]; own and other are `Cues`."""
     height, width = own.grey.shape
     volume = np.empty((height, width, count), int)
     here = type(own)(*(cue.astype(int) for cue in own))
@@ -23,7 +23,7 @@ def plain_costs(own, other, first_px, count):
 
 
 def plain_census(grey):
-    """One bit for each of the 24 pixels around: whether it is darker."""
+    """Census code of each pixel: one bit for each of its 24 neighbours, set if it is darker."""
     around = np.pad(grey, 2, mode="edge")
     height, width = grey.shape
     codes = np.zeros(grey.shape, int)
@@ -35,7 +35,7 @@ def plain_census(grey):
 
 
 def plain_sums(costs, grey):
-    """The sum over paths from the left, the right, above and below, of the cheapest way to each candidate."""
+    """Aggregated costs of each candidate: the sum over paths from left, right, above and below."""
     total = np.zeros(costs.shape, int)
     for axis in (0, 1):
         for backwards in (False, True):
@@ -47,7 +47,7 @@ def plain_sums(costs, grey):
 
 
 def _add_path(costs, grey, total):
-    """One path down the first axis, for all columns at once."""
+    """Add the path down the first axis, all columns at once."""
     path = costs[0].copy()
     total[0] += path
     for y in range(1, len(costs)):
@@ -65,7 +65,7 @@ def _add_path(costs, grey, total):
 
 
 def plain_pick(sums, first_px):
-    """The disparities of least cost."""
+    """Disparities of least cost."""
     count = sums.shape[2]
     best = sums.argmin(2)
     inner = np.clip(best, 1, count - 2)
@@ -78,7 +78,7 @@ def plain_pick(sums, first_px):
 
 
 def plain_settled(disparity_px, found_px, other_px, trust, towards):
-    """One view's disparity with what both views found, continued to the border."""
+    """Settle one view's disparity where both views agree, and extend it to the border."""
     width = disparity_px.shape[1]
     match = np.rint(np.arange(width) + towards * found_px).astype(int)
     there_px = np.take_along_axis(other_px, np.clip(match, 0, width - 1), axis=1)

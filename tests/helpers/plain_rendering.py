@@ -1,4 +1,4 @@
-"""The renderer once more, in plain NumPy: whole views at once, pixel by pixel only where pixels land."""
+"""Plain NumPy reference of the renderer: whole views at once, only splatting pixel by pixel."""
 
 from typing import NamedTuple
 
@@ -15,14 +15,15 @@ class PlainSide(NamedTuple):
     offset_px: float
 
     def column(self, d):
-        """Where in the photograph each pixel of the new view is, if its disparity is d."""
+        """Column in the image of each pixel of the new view, at disparity d."""
         return np.arange(d.shape[1]) - self.offset_px - self.shift * d
 
 
 def plain_rendering(left, right, estimate, position, convergence_px=0.0):
-    """Image and drawn of `stereoweave.render`, and where colours are pure, for positions other than 0 and 1.
+    """Image and mask of `stereoweave.render`, and where colours are pure, for positions other than 0 and 1.
 
-    Beyond the cameras, pixels that are not pure are left to others: this fills them as in between.
+    Outside the baseline the renderer fills impure pixels differently; here they are filled as between the
+    cameras.
     """
     near, far = abs(1 - position) ** 0.5, abs(position) ** 0.5
     offset_px = (position - 0.5) * convergence_px
@@ -49,7 +50,7 @@ def plain_rendering(left, right, estimate, position, convergence_px=0.0):
 
 
 def plain_splat(disparity_px, shift, offset_px=0.0):
-    """The nearest disparity on each pixel of the new view, NaN where there is none."""
+    """Nearest disparity on each pixel of the new view; NaN if there is none."""
     landed = np.full(disparity_px.shape, np.nan)
     columns = np.arange(disparity_px.shape[1])
     for line, row in zip(landed, disparity_px, strict=True):
@@ -71,7 +72,7 @@ def plain_splat(disparity_px, shift, offset_px=0.0):
 
 
 def tap(values, column):
-    """values [H, W, ...] at whole columns [H, W]; the border goes on."""
+    """values [H, W, ...] at integer columns [H, W]; the border repeats."""
     return values[np.arange(len(values))[:, None], np.clip(column, 0, values.shape[1] - 1)]
 
 
@@ -82,7 +83,7 @@ def linear(values, column):
 
 
 def cubic(values, column):
-    """Catmull and Rom's spline through the four neighbours, in its textbook form; the border's beyond it."""
+    """Catmull-Rom spline through the four neighbours in its textbook form; the border repeats."""
     column = np.clip(column, 0, values.shape[1] - 1)
     whole = np.floor(column).astype(int)
     t = (column - whole)[..., None]
@@ -102,7 +103,7 @@ def purity(side):
 
 
 def support(side, d, weight):
-    """How much of the photograph shows each pixel's surface d; weight [H, W] is that of its pixels."""
+    """Support of each pixel's surface d in the image; weight [H, W] is per pixel of the image."""
     column = side.column(d)
     whole = np.floor(column).astype(int)
     parts = [
@@ -123,7 +124,7 @@ def gap(side, d):
 
 
 def mismatch(sides, d):
-    """The photographs' difference over three columns that all have disparity d; NaN if none is in both."""
+    """Difference of both images over three columns of disparity d; NaN if none is inside both."""
     total, count = np.zeros(d.shape), np.zeros(d.shape)
     for k in (-1, 0, 1):
         left, right = (side.column(d) + k for side in sides)
@@ -135,7 +136,7 @@ def mismatch(sides, d):
 
 
 def share_of_left(sides, confidence, a, b):
-    """The part of a, where a and b are two surfaces; both are finite."""
+    """Share of surface a where a and b are two surfaces; both are finite."""
     left, right = sides
     gap_a, gap_b = gap(right, a), gap(left, b)
     trust_a, trust_b = linear(confidence, left.column(a)), linear(confidence, left.column(b))
@@ -151,7 +152,7 @@ def share_of_left(sides, confidence, a, b):
 
 
 def plain_surfaces(sides, confidence):
-    """Front and back disparity of the new view's pixels, NaN where there is none, and the front's share."""
+    """Front and back disparity of the new view's pixels (NaN: none), and the front's share."""
     a, b = (plain_splat(side.disparity_px, side.shift, side.offset_px) for side in sides)
     both = np.isfinite(a) & np.isfinite(b)
     same = both & (np.abs(a - b) <= SAME_SURFACE_PX)
@@ -174,7 +175,7 @@ def plain_surfaces(sides, confidence):
 
 
 def aligned(sides, front, back):
-    """front, moved by one step of least squares over 5 x 5 windows."""
+    """front after one least-squares step over 5 x 5 windows."""
     d = np.nan_to_num(front)
     greys = [grey(side.photo) for side in sides]
     seen = np.min([support(side, d, purity(side)) for side in sides], axis=0) >= 0.5
@@ -194,7 +195,7 @@ def aligned(sides, front, back):
 
 
 def grey(photo):
-    """ITU-R BT.601 luma in whole levels, by OpenCV's fixed-point weights."""
+    """ITU-R BT.601 luma as integers, with OpenCV's fixed-point weights."""
     return (photo.astype(int) @ [9798, 19235, 3735] + 2**14) >> 15
 
 
@@ -204,7 +205,7 @@ def windows(values):
 
 
 def plain_colours(sides, front, back, share, front_supports):
-    """Colours, the disparity that has most of each pixel (NaN: none), and where the colours are pure."""
+    """Colours, disparity of the surface with the greatest share (NaN: none), and where colours are pure."""
     colours, known, seen_by = [], [], []
     back_supports = [support(side, np.nan_to_num(back), purity(side)) for side in sides]
     layers = (front, share, front_supports), (back, 1 - share, back_supports)
@@ -230,7 +231,7 @@ def plain_colours(sides, front, back, share, front_supports):
 
 
 def part_doubles(of_left, left, right, d, both):
-    """The left photograph's part, 0 or 1 where one of the two shows a thin thing that the maps have lost."""
+    """Share of the left image; 0 or 1 where one image shows a thin structure missing from the maps."""
     of_left = of_left.copy()
     agreed = both & (np.abs(left - right).sum(2) <= 30)
     for y, x in np.argwhere(both & ~agreed):

@@ -1,4 +1,4 @@
-"""Photographs of known scenes by known cameras, cast ray by ray: what rectification is tested against."""
+"""Ray-cast images of known scenes by known cameras, to test rectification."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ KANNALA_BRANDT = np.array([-0.02, 0.006, -0.003, 0.0005])
 
 @dataclass(frozen=True)
 class Sphere:
-    """The inside of a sphere around the left camera: as far away in every direction."""
+    """Inside of a sphere around the left camera: equally distant in all directions."""
 
     radius_m: float
 
@@ -30,7 +30,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane through a point, spanned by two directions of length 1 at a right angle."""
+    """Plane through a point, spanned by two orthonormal directions."""
 
     point_m: np.ndarray
     across: np.ndarray
@@ -48,7 +48,7 @@ class Plane:
 
 
 def turned(*degrees):
-    """A rotation by an angle about x, then y, then z."""
+    """Rotation about x, then y, then z."""
     x, y, z = (
         cv2.Rodrigues(angle * axis)[0] for angle, axis in zip(np.radians(degrees), np.eye(3), strict=True)
     )
@@ -69,7 +69,7 @@ def _matrix(offset_px):
 
 
 def rig_of(lens, degrees=(1.2, -1.5, 1.8), centre_m=(0.1, 0.003, -0.002)):
-    """Two cameras of one kind with errors: turned against each other, and not at one height."""
+    """Two cameras of one kind, rotated relative to each other and at different heights."""
     rotation = turned(*degrees)
     return Rig(
         left=lens(offset_px=(4.0, -6.0)),
@@ -81,7 +81,7 @@ def rig_of(lens, degrees=(1.2, -1.5, 1.8), centre_m=(0.1, 0.003, -0.002)):
 
 
 class Cameras:
-    """The two cameras of a rig; every pixel is the mean of samples x samples rays, found once."""
+    """The two cameras of a rig; each pixel averages samples x samples rays, which are computed once."""
 
     def __init__(self, rig, samples=2):
         steps = (np.arange(samples) + 0.5) / samples - 0.5
@@ -98,7 +98,7 @@ class Cameras:
         self._centres_m = np.zeros(3), -rig.rotation.T @ rig.translation_m
 
     def photograph(self, surfaces, texture, texel_m):
-        """The pair that they take of surfaces, which stand in the left camera's coordinates."""
+        """Render a pair of surfaces given in the left camera's coordinates."""
         left, right = (
             np.mean([_colours(centre_m, ray, surfaces, texture, texel_m) for ray in rays], axis=0)
             for centre_m, rays in zip(self._centres_m, self._rays, strict=True)
@@ -117,7 +117,7 @@ def _colours(start_m, direction, surfaces, texture, texel_m):
 
 
 def directions(optics, at_px):
-    """Directions of length 1 that a camera sees at places x, y: its model inverted by Newton's method."""
+    """Unit viewing directions at pixels x, y: the camera model inverted by Newton's method."""
     (fx, _, cx), (_, fy, cy), _ = optics.matrix
     distorted = (at_px - (cx, cy)) / (fx, fy)
     guess = distorted.copy()
@@ -164,7 +164,7 @@ def project(optics, points_m):
 
 
 def speckle(rng, size_px=1024):
-    """A texture, uint8 RGB, of noise at all scales from 2 texels on, as photographs have."""
+    """Texture, uint8 RGB, of noise at all scales from 2 texels up, as in photographs."""
     total = np.zeros((size_px, size_px, 3))
     for octave in range(1, 7):
         noise = rng.standard_normal((size_px >> octave, size_px >> octave, 3)).astype(np.float32)

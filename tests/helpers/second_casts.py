@@ -1,4 +1,4 @@
-"""What one eye sees of the other's points, by a second cast of rays: exact, between pixels too."""
+"""Exact visibility of one eye's points from the other eye, by a second cast of rays."""
 
 import numpy as np
 
@@ -11,10 +11,10 @@ from stereoweave.synth.world import World
 def from_the_other_eye(
     world: World, rig: PosedRig, disparity_px: np.ndarray, position: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """For each pixel of the eye at `position`, towards the point of its disparity from the other eye:
+    """Cast rays from the other eye to the point at the disparity of each pixel of the eye at `position`.
 
-    the disparity of what that one meets first (NaN if that is beside its picture), and whether it is the
-    triangle that the first eye meets.
+    Returns the disparity of the surface that the ray meets first (NaN if outside the other eye's image), and
+    whether that is the triangle that the first eye sees.
     """
     camera, caster = rig.camera, Raycaster()
     away = 1 - 2 * position  # to the right for the left eye

@@ -1,4 +1,4 @@
-"""Requests that are malformed, each in a way of its own."""
+"""Requests that are each malformed in a different way."""
 
 import io
 import socket
@@ -16,7 +16,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 LEFT, RIGHT, CALIB = ((EXAMPLES / name).read_bytes() for name in ("left.png", "right.png", "calib.txt"))
 BOTH = {"left": LEFT, "right": RIGHT}
 
-# Sends it to the service; the status and the text of the response.
+# Sends a request to the service; returns status and text of the response.
 Sender = Callable[[httpx.Client], tuple[int, str]]
 
 
@@ -42,7 +42,7 @@ def _post(path: str, files: Any, client: httpx.Client, **options: Any) -> tuple[
 
 
 def _cut_off() -> dict[str, bytes]:
-    """Pictures of which a part is missing, or changed."""
+    """Truncated and modified pictures."""
     found = {}
     with Image.open(io.BytesIO(LEFT)) as picture:
         for kind in ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000"):
@@ -91,7 +91,7 @@ def _no_pictures() -> dict[str, bytes]:
 
 
 def _wrong_sizes() -> dict[str, bytes]:
-    """Pictures too large, too small, unlike the right one, or whose heads say what is not there."""
+    """Pictures that are too large, too small, unlike the right one, or have false headers."""
     sizes = {(100_000, 100_000), (2**31 - 1, 2**31 - 1), (0, 0), (0, 64), (20_000, 3_000), (4_000_000_000, 1)}
     heads = {f"PNG that says it has {w}x{h} px": _png_head(w, h) for w, h in sorted(sizes)}
     small = {
@@ -128,7 +128,7 @@ def _with_chunk(name: bytes, content: bytes) -> bytes:
 
 
 def _wrong_options() -> dict[str, Sender]:
-    """Fields that say what cannot be."""
+    """Invalid field values."""
     numbers = ("nan", "inf", "-1", "0", "1e400", "x", "1,5")
     of_maps = {
         "range": (
@@ -168,14 +168,14 @@ def _wrong_options() -> dict[str, Sender]:
 
 
 def _with_camera(field: str, value: str) -> dict[str, str]:
-    """The field, and others by which the rest of the request is sound."""
+    """The field, plus others that make the rest of the request valid."""
     camera = {"focal_px": "600", "baseline_m": "0.1"}
     position = {"position": "0.9"} if field == "strength" else {}
     return {**camera, **position, field: value}
 
 
 def _wrong_fields() -> dict[str, Sender]:
-    """Files that are missing, or too many, or by other names."""
+    """Missing, surplus and misnamed files."""
     files = {
         "no file": {"other": b"x"},
         "no right picture": {"left": LEFT},
@@ -229,7 +229,7 @@ def _wrong_calibrations() -> dict[str, Sender]:
 
 
 def _wrong_http(most_megabytes: float) -> dict[str, Sender]:
-    """Requests of which the head, or the order of the body, is wrong."""
+    """Requests with invalid headers or an invalid order of the body."""
     form = "multipart/form-data; boundary=b"
     part = b'--b\r\nContent-Disposition: form-data; name="left"; filename="l"\r\n\r\n'
     bodies = {
@@ -282,7 +282,7 @@ def _send(method: str, path: str, client: httpx.Client, **options: Any) -> tuple
 
 
 def _speak(request: bytes, client: httpx.Client) -> tuple[int, str]:
-    """What is answered to bytes."""
+    """Send bytes; return the response."""
     with socket.create_connection((client.base_url.host, client.base_url.port), timeout=60) as connection:
         connection.sendall(request)
         answer = connection.makefile("rb").readline().split()

@@ -1,4 +1,4 @@
-"""What the tests of sets on disk share: pairs whose truth is known by construction, made in no time."""
+"""Shared by the tests of sets on disk: quickly made pairs whose truth is known by construction."""
 
 import os
 import signal
@@ -19,7 +19,7 @@ WALL_PX, BOX_PX = 3, 10
 
 
 def box_before_a_wall(rng: np.random.Generator, size_px: tuple[int, int] = (48, 32)) -> Sample:
-    """A wall below a sky, and a box before it in the middle third of the left view's columns and rows."""
+    """Wall below a sky, with a box in front in the middle third of the left view's columns and rows."""
     width, height = size_px
     left_px, right_px = (np.full((height, width), WALL_PX, np.float32) for _ in range(2))
     rows, start, end = slice(height // 3, 2 * height // 3), width // 3, 2 * width // 3
@@ -37,7 +37,7 @@ def box_before_a_wall(rng: np.random.Generator, size_px: tuple[int, int] = (48, 
 
 @dataclass(frozen=True)
 class PaintedPairMaker:
-    """Makes pairs without rendering; at a pair it kills its process, or halts the one that started it."""
+    """Make pairs without rendering; at a given pair, kill this process or halt its parent."""
 
     dies_at: int | None = None
     halts_at: int | None = None
@@ -58,7 +58,7 @@ class PaintedPairMaker:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """All files in a folder and below it."""
+    """Read all files in a folder and its subfolders."""
     return {
         path.relative_to(folder).as_posix(): path.read_bytes()
         for path in sorted(folder.rglob("*"))

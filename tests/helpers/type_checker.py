@@ -1,4 +1,4 @@
-"""Type checker for jaxtyping's import hook, whose pytest option takes such a call for one package only."""
+"""Type checker for jaxtyping's import hook, whose pytest option accepts such a call for one package only."""
 
 from beartype import BeartypeConf, beartype
 

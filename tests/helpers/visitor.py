@@ -1,4 +1,4 @@
-"""Drives the page over HTTP as its own script does in a browser, which would make look-ups of its own."""
+"""Drive the page over HTTP like its script, without a browser, which would make network look-ups itself."""
 
 from pathlib import Path
 from typing import Any
@@ -7,7 +7,7 @@ import httpx
 
 
 class Visitor:
-    """One visitor of the page that a client is connected to."""
+    """A visitor of the page, connected by a client."""
 
     def __init__(self, client: httpx.Client) -> None:
         self._client = client
@@ -17,7 +17,7 @@ class Visitor:
         self._events = config["dependencies"]
 
     def press(self, button: str, **files: Path) -> str:
-        """What the page answers when files were put into the fields of these names."""
+        """Press a button with files in the named fields; return the page's answer."""
         (event, *_) = [each for each in self._events if button in map(self._name_of, each["targets"])]
         given = {field: self._uploaded(path) for field, path in files.items()}
         parts = [self._parts[part] for part in event["inputs"]]

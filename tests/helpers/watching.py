@@ -1,7 +1,7 @@
-"""A process beside the tests: it asks a service for its health, and measures its memory, until it is to end.
+"""Monitor a service's response time and memory in a separate process until stopped.
 
-python watching.py URL PID writes in JSON how long each answer took, and the megabytes of all processes of the
-service. It is a process of its own, because the tests themselves keep a Python interpreter busy.
+`python watching.py URL PID` writes as JSON how long each health check took, and the memory in MB of all
+processes of the service. It is a separate process because the tests keep their own interpreter busy.
 """
 
 import json
@@ -15,14 +15,14 @@ import httpx
 
 
 def children(pid: int) -> list[int]:
-    """The processes that a process has started, and those that these have."""
+    """Return all descendants of a process."""
     tasks = Path(f"/proc/{pid}/task").glob("*/children")
     direct = [int(child) for task in tasks for child in task.read_text().split()]
     return direct + [child for each in direct for child in children(each)]
 
 
 def proportional_megabytes(pid: int) -> float:
-    """The memory of a process, in which what it shares with others counts in part; 0 where it has ended."""
+    """Memory of a process, with its proportional share of shared memory; 0 if it has ended."""
     try:
         smaps = Path(f"/proc/{pid}/smaps_rollup").read_text()
     except OSError:
