@@ -125,15 +125,15 @@ def reason(error: Exception) -> str:
         case IsADirectoryError():
             return "a folder"
         case FileExistsError(filename=str(name)) if Path(name).is_symlink() and not Path(name).exists():
-            return "a link that leads nowhere"
+            return "a broken link"
         case FileExistsError():
             return "a file"
         case OSError(strerror=str(text)):
             return text.lower()
         case EOFError():
-            return "one that ends too early"
+            return "a truncated file"
         case MemoryError():
-            return "one that takes more memory than there is"
+            return "a file too large for the available memory"
     # Library messages may quote a whole file, over many lines.
     words = textwrap.shorten(str(error)[:1000], 200, placeholder=" ...") or type(error).__name__
     return f"one that cannot be read ({words})"

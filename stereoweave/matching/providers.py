@@ -148,7 +148,7 @@ def open_session(path: Path, provider: str, threads: int) -> Any:
             _create_session(path, CPU, threads)  # if this fails too, the file is invalid, not the provider
             raise _start_error(provider, _first_line(error.__cause__)) from error
     if PROVIDERS[provider].name not in session.get_providers():
-        raise _start_error(provider, "a library or a device that is missing")
+        raise _start_error(provider, "a missing library or device")
     if _runs_nothing(session, PROVIDERS[provider].name):
         raise MatcherError(
             f"{path}: expected a matcher with operations that provider {provider} has, found none; export it "
@@ -231,7 +231,7 @@ def _runs_nothing(session: Any, name: str) -> bool:
 
 def _start_error(provider: str, found: str) -> MatcherError:
     return MatcherError(
-        f"provider {provider}: expected to begin, found {found}; it needs {PROVIDERS[provider].needs}"
+        f"provider {provider}: expected to start, found {found}; it needs {PROVIDERS[provider].needs}"
     )
 
 

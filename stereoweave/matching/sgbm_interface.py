@@ -98,8 +98,8 @@ class StereoMatcher:
         if self._count < 1 or least_px - 1 < -_LARGEST_PX or most_px > _LARGEST_PX:
             raise StereoweaveError(
                 f"expected numDisparities of 1 or more, and disparities of {1 - _LARGEST_PX} to "
-                f"{_LARGEST_PX} px, which int16 holds times 16, found minDisparity {least_px} and "
-                f"numDisparities {self._count}; stereoweave.estimate gives any as floats"
+                f"{_LARGEST_PX} px, the range of int16 / 16, found minDisparity {least_px} and "
+                f"numDisparities {self._count}; use stereoweave.estimate, which returns floats"
             )
 
 

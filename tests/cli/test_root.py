@@ -478,7 +478,7 @@ def test_a_link_that_leads_nowhere_is_no_place_for_output(tmp_path, capsys, line
     places = {"left": EXAMPLES / "left.png", "right": EXAMPLES / "right.png", "folder": EXAMPLES}
     assert run(line.format(**places, link=link)) == 2
     told = capsys.readouterr().err.splitlines()
-    expected = "expected a folder that can be written, found a link that leads nowhere"
+    expected = "expected a folder that can be written, found a broken link"
     assert told[-1] == f"stereoweave: {link}: {expected}"
     assert not (tmp_path / "nowhere").exists()
 
