@@ -381,7 +381,7 @@ def _pad_columns(photo: np.ndarray, before: int, behind: int) -> np.ndarray:
 
 
 def _clip(found: Estimate, low_px: float, high_px: float) -> Estimate:
-    """Clip the disparities to a range; those outside get confidence 0."""
+    """Clip disparities to a range; those more than _OUTSIDE_PX outside get confidence 0."""
     outside_px = np.maximum(low_px - found.disparity_px, found.disparity_px - high_px)
     return replace(
         found,
