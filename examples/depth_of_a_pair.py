@@ -1,4 +1,4 @@
-"""Depth in metres of a rectified pair: prints what is in the middle, and writes depth.png and disparity.png.
+"""Depth in metres of a rectified pair: prints it for the middle, and writes depth.png and disparity.png.
 
 Run: python examples/depth_of_a_pair.py
 """

@@ -1,7 +1,7 @@
 """Depth of each frame of a side-by-side video or camera, in a loop of your own: writes depth.mp4.
 
-Run: python examples/depth_of_a_video.py FILM.mp4 (or a camera's number; Ctrl-C ends it). To watch instead,
-`stereoweave live FILM.mp4`; for films, steady over time and with their sound, `stereoweave video`.
+Run: python examples/depth_of_a_video.py FILM.mp4 (or a camera's number; Ctrl-C ends it). To watch depth
+live, use `stereoweave live FILM.mp4`; for videos with a temporal filter and sound, `stereoweave video`.
 """
 
 import sys
@@ -18,7 +18,7 @@ matcher = sw.Matcher("small")  # loaded once
 film, frames = None, 0
 try:
     while (frame := capture.read()[1]) is not None:
-        rgb = cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)  # OpenCV's pictures are BGR, ours RGB
+        rgb = cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)  # OpenCV uses BGR, Stereoweave RGB
         left, right = (np.ascontiguousarray(half) for half in np.split(rgb, 2, axis=1))
         colours = colour_disparity(matcher.estimate(left, right).disparity_px, (0, 40))
         if film is None:

@@ -1,4 +1,4 @@
-"""The distance between what two pixels show, in metres, with its uncertainty.
+"""Distance in metres between the points that two pixels show, with its uncertainty.
 
 Run: python examples/measure.py
 or, with column and row of two pixels: python examples/measure.py 80 400 560 400
@@ -22,7 +22,7 @@ found = distance(
     pair.camera,
     (column, row),
     (other_column, other_row),
-    # A baseline that was measured to half a percent.
+    # The baseline is known to half a percent.
     camera_error=CameraError(baseline=0.005),
 )
 print(f"from ({column}, {row}) to ({other_column}, {other_row}): {found}")

@@ -19,7 +19,7 @@ middle = sw.synthesize(pair.left, pair.right, position=0.5)
 write_image("middle.png", middle.image)
 print(f"seen by a camera: {100 * middle.drawn.mean():.1f} % of the middle view, the rest is filled in")
 
-# Of one pair, many views: matched once, drawn as often as you like.
+# Many views of one pair: match once, render any number of times.
 estimate = sw.estimate(pair.left, pair.right, refined=True)
 renderer = Renderer(pair, estimate)
 write_image("wider.png", renderer.view(1.3).image)

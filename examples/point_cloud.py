@@ -1,4 +1,4 @@
-"""Coloured points and a surface in metres: writes points.ply and surface.glb; needs the extra 'mesh'.
+"""Coloured point cloud and mesh in metres: writes points.ply and surface.glb; needs the extra 'mesh'.
 
 Run: python examples/point_cloud.py
 """
@@ -15,7 +15,7 @@ HERE = Path(__file__).parent
 pair = add_camera(read_pair(HERE / "left.png", HERE / "right.png"), HERE / "calib.txt")
 estimate = sw.estimate(pair.left, pair.right)
 
-# Pixels of doubtful depth, and those that would fly between two surfaces, give no point.
+# Uncertain pixels, and flying pixels between two surfaces, give no point.
 cloud = point_cloud(pair, estimate, least_confidence=0.7)
 near_m, far_m = cloud.points_m[:, 2].min(), cloud.points_m[:, 2].max()
 print(f"{len(cloud.points_m)} points, {near_m:.2f} to {far_m:.2f} m away")

@@ -1,4 +1,4 @@
-"""A program for OpenCV's StereoSGBM with its matcher exchanged: writes points.npy, [N, 3] in metres.
+"""A program for OpenCV's StereoSGBM with the matcher replaced: writes points.npy, [N, 3] in metres.
 
 Run: python examples/replace_sgbm.py
 """

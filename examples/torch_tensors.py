@@ -1,4 +1,4 @@
-"""Tensors in, tensors out: depth beside a network of your own; writes features.pt. Needs PyTorch.
+"""Tensors in, tensors out: disparity as an input of your own network; writes features.pt. Needs PyTorch.
 
 Run: python examples/torch_tensors.py
 """
@@ -13,7 +13,7 @@ import stereoweave as sw
 
 HERE = Path(__file__).parent
 
-# As data loaders give them: float in 0..1, channels first, with a batch of one.
+# The form that data loaders return: float in 0..1, channels first, with a batch of one.
 left, right = (
     torch.from_numpy(np.array(Image.open(HERE / name))).permute(2, 0, 1)[None] / 255
     for name in ("left.png", "right.png")

@@ -23,22 +23,22 @@ CORPUS = Path(__file__).parent.parent / "tests" / "corpus"
 
 
 def main(
-    seconds: Annotated[float, typer.Option(help="How long, shared evenly among the targets.")] = 60.0,
-    seed: Annotated[int | None, typer.Option(help="Of all draws; a new one each time unless given.")] = None,
+    seconds: Annotated[float, typer.Option(help="Total time, shared evenly among the targets.")] = 60.0,
+    seed: Annotated[int | None, typer.Option(help="Random seed; default: a new one each time.")] = None,
     target: Annotated[
-        list[str] | None, typer.Option(help=f"One of {', '.join(NAMES)}; all by default.")
+        list[str] | None, typer.Option(help=f"One of {', '.join(NAMES)}; default: all.")
     ] = None,
-    corpus: Annotated[Path, typer.Option(help="Where findings are kept, in a folder each target.")] = CORPUS,
-    out: Annotated[Path | None, typer.Option(help="A CSV file that gets a row for each target.")] = None,
+    corpus: Annotated[Path, typer.Option(help="Folder for findings; each target has a subfolder.")] = CORPUS,
+    out: Annotated[Path | None, typer.Option(help="CSV file to which a row per target is added.")] = None,
 ) -> None:
-    """Read damaged files of every kind; exit with 1 where one is answered by anything but an own error."""
+    """Read damaged files of every kind; exit with 1 if there are findings."""
     seed = SystemRandom().randrange(10**6) if seed is None else seed
     targets, jobs = target or list(NAMES), usable_cores()
     typer.echo(f"seed {seed}")
     outcomes = []
     with ThreadPoolExecutor(min(jobs, len(targets))) as pool:
         share_s = seconds * min(jobs, len(targets)) / len(targets)
-        for outcome in pool.map(partial(_fuzzed, seed=seed, seconds=share_s, corpus=corpus), targets):
+        for outcome in pool.map(partial(_fuzz_target, seed=seed, seconds=share_s, corpus=corpus), targets):
             typer.echo("\n".join(_lines(outcome, corpus)))
             outcomes.append(outcome)
     if out:
@@ -46,12 +46,12 @@ def main(
     sys.exit(any(outcome.findings for outcome in outcomes))
 
 
-def _fuzzed(target: str, seed: int, seconds: float, corpus: Path) -> Outcome:
+def _fuzz_target(target: str, seed: int, seconds: float, corpus: Path) -> Outcome:
     return fuzz(target, seed, seconds, corpus / target)
 
 
 def _lines(outcome: Outcome, corpus: Path) -> Iterator[str]:
-    """One for the target, and one for each finding, which is kept."""
+    """Yield a line for the target, then one per finding; store the findings."""
     per_s = outcome.cases / outcome.seconds
     yield f"{outcome.target:<13} {outcome.cases:>9,} cases, {per_s:7,.0f}/s, {len(outcome.findings)} findings"
     for finding in outcome.findings.values():

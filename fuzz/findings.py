@@ -1,4 +1,4 @@
-"""What was found: told apart by where it happened, made small, and kept as files."""
+"""Findings of the fuzzer: identified by their place, reduced to small files, and stored."""
 
 import hashlib
 import re
@@ -8,20 +8,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 
-# Not the thread by which a worker ends with its parent.
+# Excludes the thread that ends a worker together with its parent.
 _OWN_FRAME = re.compile(r'/(stereoweave/(?!system/processes)[\w/]+\.py)", line \d+,? in (\w+)')
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """A case that was answered by anything but an error of the package's own.
+    """A case that caused anything but one of the package's own errors.
 
     Attributes:
-        what: The class of the exception, the signal, or how else the process ended.
-        place: The innermost function of the package that was at work.
-        detail: What was said, in one line.
-        name: The file's name.
-        content: Its bytes.
+        what: Class of the exception, or the signal or other reason that ended the process.
+        place: Innermost function of the package on the stack.
+        detail: The exception's message, in one line.
+        name: Name of the file.
+        content: Bytes of the file.
     """
 
     what: str
@@ -32,31 +32,31 @@ class Finding:
 
     @property
     def key(self) -> str:
-        """The same for all cases of one fault."""
+        """Identity of the fault, the same for all its cases."""
         return f"{self.what} in {self.place}"
 
     @classmethod
-    def of_error(cls, error: BaseException, name: str, content: bytes) -> "Finding":
-        """The finding that an exception is."""
+    def from_error(cls, error: BaseException, name: str, content: bytes) -> "Finding":
+        """Make a finding of an exception."""
         frames = "".join(reversed(traceback.format_tb(error.__traceback__)))
         line = (str(error).strip().splitlines() or [""])[0][:200]
-        detail = line.encode("ascii", "backslashreplace").decode()  # it may quote anything
+        detail = line.encode("ascii", "backslashreplace").decode()  # the message may quote any bytes
         return cls(what=type(error).__name__, place=_place(frames), detail=detail, name=name, content=content)
 
     @classmethod
-    def of_death(cls, what: str, log: str, name: str, content: bytes) -> "Finding":
-        """The finding that the end of a process is, by what `faulthandler` wrote of it."""
+    def from_death(cls, what: str, log: str, name: str, content: bytes) -> "Finding":
+        """Make a finding of the end of a process, from the output of `faulthandler`."""
         return cls(what=what, place=_place(log), detail="", name=name, content=content)
 
 
 def _place(frames: str) -> str:
-    """The first function of the package in printed frames, the innermost one first."""
+    """Find the first function of the package in printed frames, innermost first."""
     found = _OWN_FRAME.search(frames)
     return f"{found[1]}:{found[2]}" if found else "its target"
 
 
-def shrunk(content: bytes, fails_alike: Callable[[bytes], bool], seconds: float) -> bytes:
-    """Less of the content, which still fails alike: parts are left out, large ones first."""
+def shrink(content: bytes, fails_alike: Callable[[bytes], bool], seconds: float) -> bytes:
+    """Remove parts of the content, large ones first, as long as the rest fails alike."""
     end_s, step = monotonic() + seconds, len(content) // 2
     while step:
         start = 0
@@ -71,13 +71,13 @@ def shrunk(content: bytes, fails_alike: Callable[[bytes], bool], seconds: float)
 
 
 def keep(finding: Finding, folder: Path) -> Path:
-    """Writes a finding as the file HASH-NAME."""
+    """Write a finding to the file HASH-NAME."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{hashlib.sha256(finding.content).hexdigest()[:8]}-{finding.name}"
     path.write_bytes(finding.content)
     return path
 
 
-def kept(folder: Path) -> dict[Path, str]:
-    """The findings in a folder, each with the name that its file had."""
+def list_findings(folder: Path) -> dict[Path, str]:
+    """Map the files of a folder's findings to the names that they had in their cases."""
     return {path: path.name.partition("-")[2] for path in sorted(folder.glob("*-*"))}

@@ -1,4 +1,4 @@
-"""Checksums that fit a damaged file again: without them most damage ends at the first check."""
+"""Repair of checksums in damaged files; otherwise the first check would reject most of them."""
 
 import io
 import struct
@@ -12,7 +12,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def repair_png(content: bytes) -> bytes:
-    """The file with the right checksum behind each of its chunks, where it is a PNG."""
+    """Correct the checksum of each chunk if the file is a PNG."""
     if not content.startswith(_PNG):
         return content
     repaired, place = bytearray(content), len(_PNG)
@@ -27,7 +27,7 @@ def repair_png(content: bytes) -> bytes:
 
 
 def repair_shard(content: bytes) -> bytes:
-    """The shard with the right checksums of its members' heads and of the files of its pairs."""
+    """Correct the checksums of a shard's member headers and of its pairs' files."""
     files = _files_in(_with_right_heads(content))
     stream = io.BytesIO()
     with tarfile.open(fileobj=stream, mode="w", encoding="latin-1") as tar:
@@ -42,22 +42,22 @@ def repair_shard(content: bytes) -> bytes:
 
 
 def _files_in(content: bytes) -> dict[str, bytes]:
-    """The files of a tar file by name, up to where it cannot be read."""
+    """Read the files of a tar file, up to the first unreadable one."""
     files: dict[str, bytes] = {}
     with (
         suppress(tarfile.TarError, ValueError, OverflowError),
         tarfile.open(fileobj=io.BytesIO(content), mode="r:", encoding="latin-1") as tar,
     ):
         for member in tar:
-            if member.size < 0:  # the same head would come again without end
+            if member.size < 0:  # the same header would be read again forever
                 break
-            if member.name.isprintable():  # halves of characters would not be written again
+            if member.name.isprintable():  # lone surrogates cannot be written again
                 files[member.name] = content[member.offset_data :][: member.size]
     return files
 
 
 def _with_right_heads(content: bytes) -> bytes:
-    """The tar file with the right checksum in every block that looks like the head of a member."""
+    """Correct the checksum in every block of a tar file that looks like a member's header."""
     repaired = bytearray(content)
     for start in range(0, len(content) - 511, 512):
         head = repaired[start : start + 512]

@@ -1,4 +1,4 @@
-"""A file that holds an HTTP request, sent to an ASGI application as a server would."""
+"""HTTP requests in files, passed to an ASGI application as a server would pass them."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, MutableMapping
@@ -15,11 +15,11 @@ Application = Callable[
 
 
 class ServerError(Exception):
-    """A response by which a server says that the fault is its own."""
+    """A response that reports an internal error of the server, or a missing response."""
 
 
 def request_bytes(method: str, path: str, **form: Any) -> bytes:
-    """A request as it goes over the wire; `form` is as httpx takes it."""
+    """Serialise a request to the bytes sent over the network; `form` is passed to httpx."""
     request = httpx.Request(method, f"http://127.0.0.1{path}", **form)
     body = request.read()
     headers = [name + b": " + value for name, value in request.headers.raw]
@@ -28,30 +28,30 @@ def request_bytes(method: str, path: str, **form: Any) -> bytes:
 
 
 def repair_length(content: bytes) -> bytes:
-    """The request with a Content-Length that is its body's."""
+    """Set the Content-Length of a request to its body's length."""
     head, blank, body = content.partition(b"\r\n\r\n")
     lines = [line for line in head.split(b"\r\n") if not line.lower().startswith(b"content-length")]
     return b"\r\n".join([*lines, b"Content-Length: %d" % len(body)]) + blank + body
 
 
 def send(application: Application, content: bytes) -> int | None:
-    """The status of the response to a request; None where it is no request, and no server passes it on.
+    """Return the status of the response, or None if the content is not an HTTP request.
 
     Raises:
         ServerError: The status is 500.
-        Exception: Whatever the application raises.
+        Exception: Any error of the application.
     """
-    events = _parsed(content)
+    events = _parse(content)
     if not events or not isinstance(events[0], h11.Request):
         return None
     return asyncio.run(_exchange(application, events[0], events[1:]))
 
 
-def _parsed(content: bytes) -> list[Any]:
-    """What a server reads of it: the head, parts of the body, its end where it is whole."""
+def _parse(content: bytes) -> list[Any]:
+    """Parse a request to h11's events: the head, parts of the body, and its end if it is complete."""
     connection, events = h11.Connection(h11.SERVER), []
     try:
-        connection.receive_data(content or b"\r\n")  # no bytes would be the end of the connection
+        connection.receive_data(content or b"\r\n")  # empty data would close the connection
         while (event := connection.next_event()) not in (h11.NEED_DATA, h11.PAUSED):
             events.append(event)
     except h11.RemoteProtocolError:
@@ -75,7 +75,7 @@ async def _exchange(application: Application, head: h11.Request, body: list[Any]
             return messages.pop(0)
         if is_whole:
             await asyncio.Event().wait()  # the client waits for the response
-        return {"type": "http.disconnect"}  # it is gone before it has sent all
+        return {"type": "http.disconnect"}  # the client left before the body was complete
 
     async def respond(message: _Message) -> None:
         if message["type"] == "http.response.start":

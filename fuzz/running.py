@@ -1,4 +1,4 @@
-"""Fuzzing of one target: workers are watched, and replaced where they die."""
+"""Fuzzing of one target by worker processes, which are replaced when they die."""
 
 import multiprocessing
 import signal
@@ -14,13 +14,13 @@ from fuzz.worker import CASE, DONE, LOG, Task, work
 
 @dataclass(kw_only=True)
 class Outcome:
-    """What came of fuzzing a target.
+    """Result of fuzzing a target.
 
     Attributes:
-        target: Its name.
-        cases: How many files were read.
-        seconds: For how long, without what its processes took to start.
-        findings: By their keys.
+        target: Name of the target.
+        cases: Number of files read.
+        seconds: Time spent, without the start of processes.
+        findings: Findings by their keys.
     """
 
     target: str
@@ -29,15 +29,15 @@ class Outcome:
     findings: dict[str, Finding] = field(default_factory=dict)
 
     def add(self, finding: Finding) -> None:
-        """Keeps the first finding of each fault."""
+        """Add a finding unless its fault is known."""
         self.findings.setdefault(finding.key, finding)
 
 
 def fuzz(target: str, seed: int, seconds: float, corpus: Path, case_s: float = 10.0) -> Outcome:
-    """Reads damaged files of a target for some seconds.
+    """Read damaged files of a target for a number of seconds.
 
     Raises:
-        RuntimeError: The fuzzer itself failed: what it said.
+        RuntimeError: The fuzzer itself failed; the message contains its log.
     """
     outcome = Outcome(target=target)
     with TemporaryDirectory(prefix="fuzz-") as folder:
@@ -50,7 +50,7 @@ def fuzz(target: str, seed: int, seconds: float, corpus: Path, case_s: float = 1
 
 
 def _run(task: Task, outcome: Outcome) -> None:
-    """Lets one worker go on with the cases, until it is done or dies, and adds what came of it."""
+    """Run one worker until it is done or dies, and add its cases and findings to the outcome."""
     context = multiprocessing.get_context("spawn")  # a fork would share this process's threads
     messages, sender = context.Pipe(duplex=False)
     worker = context.Process(
@@ -66,11 +66,11 @@ def _run(task: Task, outcome: Outcome) -> None:
     log, code = (task.folder / LOG).read_text(errors="replace"), worker.exitcode or 0
     if outcome.cases == before or (code >= 0 and "Timeout (" not in log):
         raise RuntimeError(f"{task.target}: the fuzzer itself failed:\n{log}")
-    outcome.add(_finding_of_death(code, log, task.folder / CASE))
+    outcome.add(_make_finding_of_death(code, log, task.folder / CASE))
 
 
 def _listen(messages: Connection, outcome: Outcome) -> bool:
-    """Adds what a worker sends; whether it was done before its end."""
+    """Add a worker's messages to the outcome. Return whether it finished before it ended."""
     start_s = monotonic()
     try:
         while (message := messages.recv()) != DONE:
@@ -79,7 +79,7 @@ def _listen(messages: Connection, outcome: Outcome) -> bool:
                     outcome.add(message)
                 case int():
                     outcome.cases += 1
-                case _:  # READY: what is loaded before the first case does not count
+                case _:  # READY: the time to load does not count
                     start_s = monotonic()
     except EOFError:
         return False
@@ -88,8 +88,8 @@ def _listen(messages: Connection, outcome: Outcome) -> bool:
     return True
 
 
-def _finding_of_death(code: int, log: str, folder: Path) -> Finding:
-    """The finding that the end of a worker is: by a signal, or by its own watch over a case's time."""
+def _make_finding_of_death(code: int, log: str, folder: Path) -> Finding:
+    """Make a finding of a worker's end, by a signal or by its own time limit for a case."""
     what = signal.Signals(-code).name if code < 0 else "hang"
     (case,) = folder.iterdir()
-    return Finding.of_death(what, log, case.name, case.read_bytes())
+    return Finding.from_death(what, log, case.name, case.read_bytes())

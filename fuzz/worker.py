@@ -1,4 +1,4 @@
-"""A process that reads damaged files of one target, until its time is over or it dies."""
+"""Worker process that reads damaged files of one target until its time is up or it dies."""
 
 import faulthandler
 import os
@@ -12,7 +12,7 @@ from pathlib import Path
 from random import Random
 from time import monotonic
 
-from fuzz.findings import Finding, kept, shrunk
+from fuzz.findings import Finding, list_findings, shrink
 from fuzz.mutations import mutate
 from fuzz.targets import load
 from stereoweave.errors import StereoweaveError
@@ -27,15 +27,15 @@ _MORE_BYTES = 2 * 10**9
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """What a worker does.
+    """Task of a worker.
 
     Attributes:
-        target: As `targets.load` takes it.
-        seed: Of all draws.
-        seconds: How long, from its first case on.
-        case_s: How long a case may take.
-        corpus: The folder of the target's earlier findings.
-        folder: Its own: the file at hand, and what is written as it dies.
+        target: Name of the target, for `targets.load`.
+        seed: Random seed.
+        seconds: Working time, from the first case on.
+        case_s: Time limit of a case.
+        corpus: Folder of the target's earlier findings.
+        folder: The worker's own folder, for the current file and the log of a crash.
     """
 
     target: str
@@ -47,9 +47,9 @@ class Task:
 
 
 def work(task: Task, first: int, known: Sequence[str], messages: Connection) -> None:
-    """Reads cases from number `first` on.
+    """Read cases from number `first` on.
 
-    Sends READY, the number of each case before it is read, each Finding whose key is not known, and DONE.
+    Sends READY, the number of each case before it is read, each Finding with a new key, and DONE.
     """
     begin_work(threads=1)
     with (task.folder / LOG).open("ab") as log, Path(os.devnull).open("wb") as nowhere:
@@ -58,7 +58,7 @@ def work(task: Task, first: int, known: Sequence[str], messages: Connection) -> 
         faulthandler.enable(log)
         faulthandler.dump_traceback_later(_STARTING_S, exit=True, file=log)
         cases = Cases(task)
-        cases.read_valid()  # loads and compiles what is used later
+        cases.read_valid()  # loads libraries and compiles kernels
         _limit_memory()
         messages.send(READY)
         end_s, found = monotonic() + task.seconds, set(known)
@@ -66,11 +66,11 @@ def work(task: Task, first: int, known: Sequence[str], messages: Connection) -> 
             os.ftruncate(log.fileno(), 0)
             faulthandler.dump_traceback_later(task.case_s, exit=True, file=log)
             messages.send(number)
-            finding = cases.fault(*cases.make(number))
+            finding = cases.find_fault(*cases.make(number))
             if finding and finding.key not in found:
                 found.add(finding.key)
                 faulthandler.dump_traceback_later(task.case_s + _SHRINKING_S, exit=True, file=log)
-                messages.send(cases.smallest(finding))
+                messages.send(cases.shrink(finding))
             if monotonic() > end_s:
                 break
         faulthandler.cancel_dump_traceback_later()
@@ -78,20 +78,22 @@ def work(task: Task, first: int, known: Sequence[str], messages: Connection) -> 
 
 
 class Cases:
-    """The cases of a task by number: the start files as they are, earlier findings, and then damaged ones."""
+    """Cases of a task by number: the valid files, the earlier findings, then damaged files."""
 
     def __init__(self, task: Task) -> None:
         self._task, self._target = task, load(task.target)
         self._valid = list(self._target.starts().items())
-        self._starts = self._valid + [(name, path.read_bytes()) for path, name in kept(task.corpus).items()]
+        self._starts = self._valid + [
+            (name, path.read_bytes()) for path, name in list_findings(task.corpus).items()
+        ]
 
     def read_valid(self) -> None:
-        """Reads each file that was made by rule."""
+        """Read each valid file once."""
         for name, content in self._valid:
-            self.fault(name, content)
+            self.find_fault(name, content)
 
     def make(self, number: int) -> tuple[str, bytes]:
-        """The name and the bytes of a case; they depend on its number, the seed and the corpus alone."""
+        """Make the name and bytes of a case; they depend only on its number, the seed and the corpus."""
         if number < len(self._starts):
             return self._starts[number]
         rng = Random(f"{self._task.seed} {self._task.target} {number}")
@@ -99,8 +101,8 @@ class Cases:
         content = mutate(content, [other for _, other in self._starts], self._target.tokens, rng)
         return name, self._target.repair(content) if rng.random() < 0.5 else content
 
-    def fault(self, name: str, content: bytes) -> Finding | None:
-        """What is wrong with how a file is read; None where nothing is."""
+    def find_fault(self, name: str, content: bytes) -> Finding | None:
+        """Read a file. Return the finding, or None if it is read or refused as it should be."""
         path = self._task.folder / CASE / name
         path.parent.mkdir(exist_ok=True)
         for other in path.parent.iterdir():
@@ -111,22 +113,22 @@ class Cases:
                 self._target.read(path)
         except StereoweaveError:
             return None
-        except BaseException as error:  # whatever it is
-            return Finding.of_error(error, name, content)
+        except BaseException as error:  # any error at all
+            return Finding.from_error(error, name, content)
         return None
 
-    def smallest(self, finding: Finding) -> Finding:
-        """The finding with as little content as could be found in two seconds."""
+    def shrink(self, finding: Finding) -> Finding:
+        """Reduce the finding's content as far as possible in two seconds."""
 
         def fails_alike(content: bytes) -> bool:
-            fault = self.fault(finding.name, content)
+            fault = self.find_fault(finding.name, content)
             return fault is not None and fault.key == finding.key
 
-        return replace(finding, content=shrunk(finding.content, fails_alike, _SHRINKING_S))
+        return replace(finding, content=shrink(finding.content, fails_alike, _SHRINKING_S))
 
 
 def _limit_memory() -> None:
-    """From now on what takes 2 GB more than this process has fails; and a crash writes no core."""
+    """Limit this process to 2 GB more than it has now, and write no core dump."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     most = pages * resource.getpagesize() + _MORE_BYTES

@@ -15,7 +15,7 @@ from random import Random
 
 import pytest
 
-from fuzz.findings import kept
+from fuzz.findings import list_findings
 from fuzz.mutations import MOST_BYTES, mutate
 from fuzz.repairs import repair_png, repair_shard
 from fuzz.requests import ServerError, request_bytes, send
@@ -25,7 +25,7 @@ from stereoweave.errors import StereoweaveError
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 CORPUS = REPOSITORY / "tests" / "corpus"
-FOUND = [path for name in NAMES for path in kept(CORPUS / name)]
+FOUND = [path for name in NAMES for path in list_findings(CORPUS / name)]
 
 # Of Ray's own code, as it is imported.
 pytestmark = pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`:DeprecationWarning")

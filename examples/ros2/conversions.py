@@ -1,4 +1,4 @@
-"""Between ROS 2 messages and Stereoweave's arrays; needs no ROS, for it only reads and fills their fields."""
+"""Conversion between ROS 2 messages and Stereoweave's arrays; only accesses fields, and needs no ROS."""
 
 from array import array
 from typing import Any
@@ -7,7 +7,7 @@ import numpy as np
 
 from stereoweave.stereo import Estimate, StereoCamera
 
-# Encodings of sensor_msgs/Image: how many channels, and which of them are red, green and blue.
+# Encodings of sensor_msgs/Image: number of channels, and the indices of red, green and blue.
 _ENCODINGS = {
     "rgb8": (3, [0, 1, 2]),
     "bgr8": (3, [2, 1, 0]),
@@ -20,7 +20,7 @@ _POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
 
 
 def rgb_of(image: Any) -> np.ndarray:
-    """The picture of a sensor_msgs/Image, uint8 RGB [H, W, 3]; rows may end in padding."""
+    """Convert a sensor_msgs/Image to uint8 RGB [H, W, 3]; its rows may end in padding."""
     if image.encoding not in _ENCODINGS:
         raise ValueError(f"expected an image of {', '.join(_ENCODINGS)}, found {image.encoding!r}")
     channels, colours = _ENCODINGS[image.encoding]
@@ -30,7 +30,7 @@ def rgb_of(image: Any) -> np.ndarray:
 
 
 def camera_of(left_info: Any, right_info: Any) -> StereoCamera:
-    """The camera of two sensor_msgs/CameraInfo: P is fx 0 cx Tx, 0 fy cy 0, 0 0 1 0, right Tx = -fx B."""
+    """Convert two sensor_msgs/CameraInfo: P is fx 0 cx Tx, 0 fy cy 0, 0 0 1 0; on the right, Tx = -fx B."""
     left, right = left_info.p, right_info.p
     if not (left[0] > 0 and right[3] < 0):
         raise ValueError(
@@ -47,17 +47,17 @@ def camera_of(left_info: Any, right_info: Any) -> StereoCamera:
 
 
 def known_of(estimate: Estimate, least_confidence: float) -> np.ndarray:
-    """Which pixels of the left picture have a disparity to rely on, bool [H, W]."""
+    """Mask of the left image's pixels with a reliable disparity, bool [H, W]."""
     return (estimate.confidence >= least_confidence) & ~estimate.occluded
 
 
 def depth_of(estimate: Estimate, camera: StereoCamera, known: np.ndarray) -> np.ndarray:
-    """Depth in metres, float32 [H, W], as REP 118 has it: NaN where unknown, +inf where too far to tell."""
+    """Compute depth in metres, float32 [H, W], after REP 118: NaN where unknown, +inf where too far away."""
     return np.where(known, camera.depth_m(estimate.disparity_px), np.nan).astype(np.float32)
 
 
 def fill_image(message: Any, header: Any, values: np.ndarray) -> None:
-    """Makes a sensor_msgs/Image of encoding 32FC1 of float32 [H, W]."""
+    """Fill a sensor_msgs/Image of encoding 32FC1 from float32 [H, W]."""
     message.header = header
     message.height, message.width = values.shape
     message.encoding, message.is_bigendian, message.step = "32FC1", 0, 4 * values.shape[1]
@@ -72,10 +72,9 @@ def fill_disparity(  # noqa: PLR0913 - what a message needs
     known: np.ndarray,
     range_px: tuple[float, float],
 ) -> None:
-    """Makes a stereo_msgs/DisparityImage of an estimate whose disparities are in range_px.
+    """Fill a stereo_msgs/DisparityImage from an estimate with disparities in range_px.
 
-    The message has disparities d of which the depth is f T / d: ours and doffs. What is unknown is below its
-    min_disparity.
+    The message's disparities d include doffs, so that depth is f T / d. Unknown ones are below min_disparity.
     """
     least_px, most_px = (float(end_px + camera.doffs_px) for end_px in range_px)
     shifted_px = estimate.disparity_px + camera.doffs_px
@@ -93,9 +92,9 @@ def fill_disparity(  # noqa: PLR0913 - what a message needs
 def fill_cloud(  # noqa: PLR0913 - what a message needs
     message: Any, new_field: Any, header: Any, rgb: np.ndarray, depth_m: np.ndarray, camera: StereoCamera
 ) -> None:
-    """Makes a sensor_msgs/PointCloud2 of the picture's rows and columns: x right, y down, z forward, and rgb.
+    """Fill a sensor_msgs/PointCloud2 with the image's rows and columns: x right, y down, z forward, and rgb.
 
-    A point without a finite depth is NaN. `new_field` makes an empty sensor_msgs/PointField.
+    A point without a finite depth is NaN. `new_field` creates an empty sensor_msgs/PointField.
     """
     height, width = depth_m.shape
     rows, columns = np.indices(depth_m.shape, np.float32)
@@ -104,7 +103,7 @@ def fill_cloud(  # noqa: PLR0913 - what a message needs
     points["x"] = (columns - camera.cx_px) / camera.focal_px * points["z"]
     points["y"] = (rows - camera.cy_px) / camera.focal_px * points["z"]
     red, green, blue = np.moveaxis(rgb.astype(np.uint32), 2, 0)
-    points["rgb"] = red << 16 | green << 8 | blue  # read as a float32 by name, as PCL packs it
+    points["rgb"] = red << 16 | green << 8 | blue  # PCL's packing: readers take it as float32
     message.header = header
     message.height, message.width = height, width
     message.fields = [_field(new_field(), name, 4 * at) for at, name in enumerate(_POINT.names or ())]
@@ -119,5 +118,5 @@ def _field(field: Any, name: str, offset: int) -> Any:
 
 
 def _bytes(values: np.ndarray) -> array:
-    # rclpy looks at each number of bytes or a list; an array it takes as it is.
+    # rclpy checks every element of bytes or a list, but takes an array unchecked.
     return array("B", values.tobytes())

@@ -1,11 +1,11 @@
-"""A ROS 2 node: rectified stereo pictures in; disparity, depth and a point cloud out.
+"""A ROS 2 node: rectified stereo images in; disparity, depth and a point cloud out.
 
 Run, after sourcing ROS 2 (with stereo_msgs and message_filters):
     python3 examples/ros2/stereoweave_node.py --ros-args -r __ns:=/stereo -p min_confidence:=0.7
 
 Subscribes to left/image_rect_color, right/image_rect_color, left/camera_info, right/camera_info.
 Publishes disparity (stereo_msgs/DisparityImage), depth (sensor_msgs/Image, 32FC1, metres, REP 118) and
-points2 (sensor_msgs/PointCloud2), all of the left camera's optical frame and time.
+points2 (sensor_msgs/PointCloud2), all in the left camera's optical frame, with its time stamp.
 """
 
 import message_filters
@@ -23,7 +23,7 @@ from stereoweave.stereo import StereoPair
 
 
 class StereoweaveNode(Node):
-    """Matches each pair that comes while no other is being matched."""
+    """Match each pair that arrives while no other pair is being matched."""
 
     def __init__(self) -> None:
         super().__init__("stereoweave")
@@ -46,11 +46,11 @@ class StereoweaveNode(Node):
             message_filters.Subscriber(self, kind, topic, qos_profile=qos_profile_sensor_data)
             for topic, kind in topics.items()
         ]
-        # A queue of 2, so that what comes during a match is dropped and not made up for.
+        # A queue of 2, so that pairs that arrive during a match are dropped and not queued up.
         self._together = message_filters.ApproximateTimeSynchronizer(subscribers, queue_size=2, slop=0.01)
-        self._together.registerCallback(self._matched)
+        self._together.registerCallback(self._publish)
 
-    def _matched(self, left: Image, right: Image, left_info: CameraInfo, right_info: CameraInfo) -> None:
+    def _publish(self, left: Image, right: Image, left_info: CameraInfo, right_info: CameraInfo) -> None:
         try:
             camera = camera_of(left_info, right_info)
             pair = StereoPair(left=rgb_of(left), right=rgb_of(right))
@@ -70,7 +70,7 @@ class StereoweaveNode(Node):
 
 
 def main() -> None:
-    """Runs the node until it is interrupted."""
+    """Run the node until it is interrupted."""
     rclpy.init()
     node = StereoweaveNode()
     try:

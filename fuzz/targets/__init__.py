@@ -1,4 +1,4 @@
-"""What is fuzzed, a module each: valid files made by rule, and what reads them."""
+"""Fuzzing targets, one per module: generated valid files, and the function that reads them."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -16,13 +16,13 @@ NAMES = (
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
-    """A way in.
+    """An entrance for untrusted data.
 
     Attributes:
-        starts: Makes valid files, by their names.
-        read: Reads a file as the package does; a StereoweaveError is an answer, anything else a finding.
-        tokens: Words that mean something in such files.
-        repair: Makes checksums and the like fit again, so that damage gets past them.
+        starts: Makes valid files, by name.
+        read: Reads a file as the package does; it may raise StereoweaveError, any other error is a finding.
+        tokens: Words with a meaning in such files.
+        repair: Corrects checksums and the like, so that damage gets past them.
     """
 
     starts: Callable[[], Mapping[str, bytes]]
@@ -32,13 +32,13 @@ class Target:
 
 
 def load(name: str) -> Target:
-    """The target of a module in this package, or of any other module that has a TARGET."""
+    """Load the target of a module of this package, or of any other module with a TARGET."""
     target: Target = import_module(f"{__name__}.{name}" if name in NAMES else name).TARGET
     return target
 
 
 def read_every_way(*ways: Callable[[], object]) -> None:
-    """Reads a file in several ways; the first one's StereoweaveError where all have one."""
+    """Read a file in several ways; raise the first StereoweaveError if all fail."""
     errors = []
     for read in ways:
         try:
@@ -49,8 +49,8 @@ def read_every_way(*ways: Callable[[], object]) -> None:
         raise errors[0]
 
 
-def written(name: str, write: Callable[[Path], object]) -> bytes:
-    """The bytes of the file that `write` writes, which has that name."""
+def write_to_bytes(name: str, write: Callable[[Path], object]) -> bytes:
+    """Return the bytes of a file of that name, written by `write`."""
     with TemporaryDirectory() as folder:
         path = Path(folder, name)
         write(path)

@@ -1,11 +1,11 @@
-"""Calibrations of every program whose files are read, and pictures rectified by them."""
+"""Calibrations in every supported format, and pictures rectified with them."""
 
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from fuzz.targets import Target, written
+from fuzz.targets import Target, write_to_bytes
 from fuzz.targets.pictures import eyes
 from stereoweave.cameras.calibration_files import read_rig, write_rig
 from stereoweave.cameras.rectify import rectify
@@ -59,7 +59,7 @@ T_03: -0.5 0 0
 S_rect_03: 70 46
 P_rect_03: 70 0 36 -35 0 70 24 0 0 0 1 0
 """
-# Each list is nine of the one before it.
+# Each list contains the previous one nine times.
 _LAUGHS = b"\nx0: &x0 [1]\n" + b"\n".join(
     b"x%d: &x%d [%s]" % (level, level, b", ".join([b"*x%d" % (level - 1)] * 9)) for level in range(1, 10)
 )
@@ -72,7 +72,7 @@ def _starts() -> dict[str, bytes]:
         "P.txt": _KITTI,
         "cam_to_cam.txt": _KITTI_RAW,
     }
-    written_by_us = written("rig.yml", lambda path: write_rig(path, _rig()))
+    written_by_us = write_to_bytes("rig.yml", lambda path: write_rig(path, _rig()))
     by_opencv = {f"rig{ending}": _written_by_opencv(ending) for ending in (".yml", ".xml", ".json")}
     return {name: text.encode() for name, text in texts.items()} | by_opencv | {"ours.yml": written_by_us}
 

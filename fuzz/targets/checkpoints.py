@@ -1,11 +1,11 @@
-"""Checkpoints of trainings."""
+"""Training checkpoints."""
 
 from functools import partial
 from pathlib import Path
 
 import torch
 
-from fuzz.targets import Target, written
+from fuzz.targets import Target, write_to_bytes
 from stereoweave.learn.checkpoint import Checkpoint, load, save
 from stereoweave.learn.recipe import parse_recipe
 
@@ -28,7 +28,7 @@ def _starts() -> dict[str, bytes]:
         commit="0123456",
         hours=0.5,
     )
-    return {"last.pt": written("last.pt", partial(save, checkpoint))}
+    return {"last.pt": write_to_bytes("last.pt", partial(save, checkpoint))}
 
 
 def _read(path: Path) -> None:

@@ -18,26 +18,26 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.service.server import Patience, http_server
 
 ANSWERED_S = 3.0
-# The client keeps the connection open for as long as answers come, so that later requests are answered too.
-# Short, since a case may get no answer; on a busy machine a valid request needs longer.
+# The client closes after this time without data, so that later requests on the connection are answered too.
+# Short, because a case may get no answer; on a busy machine a valid request needs longer.
 QUIET_S = 0.004
 _WORK_S = 0.001
-# Sent after each case: its response comes after the end of whatever the application still does.
+# Sent after each case: its response comes after the application's remaining work.
 _PLAIN = b"GET /later HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n"
 _STATUS = re.compile(rb"HTTP/1\.1 (\d{3}) ")
-# Here uvicorn and asyncio report the exceptions that they catch.
+# Loggers to which uvicorn and asyncio report the exceptions that they catch.
 _LOGGERS = [logging.getLogger(name) for name in ("uvicorn.error", "asyncio")]
 
 
 def talk(app: ASGIApp, content: bytes) -> list[int]:
-    """The statuses of the responses to the bytes of a connection.
+    """Send bytes over a connection and return the statuses of the responses.
 
     Raises:
         ServerError: A status is 500, or the server does not answer a plain request afterwards.
-        BaseException: What the server or the application raised, if it was logged.
+        BaseException: An error of the server or the application that was logged.
     """
     address = _address(app)
-    with _logged() as errors:
+    with _collect_errors() as errors:
         statuses = _statuses(address, content, QUIET_S)
         after = _statuses(address, _PLAIN, ANSWERED_S)
     if errors:
@@ -48,7 +48,7 @@ def talk(app: ASGIApp, content: bytes) -> list[int]:
 
 
 def _statuses(address: tuple[str, int], content: bytes, quiet_s: float) -> list[int]:
-    """Those of all responses; the client sends no more once the server is quiet for that long."""
+    """Return the statuses of all responses; close for sending after `quiet_s` without data."""
     received = bytearray()
     try:
         with socket.create_connection(address, timeout=ANSWERED_S) as connection:
@@ -72,8 +72,8 @@ def _receive(connection: socket.socket, received: bytearray) -> None:
 
 
 @contextmanager
-def _logged() -> Iterator[list[BaseException]]:
-    """What is logged as an error meanwhile; it goes nowhere else."""
+def _collect_errors() -> Iterator[list[BaseException]]:
+    """Collect the errors that are logged within the block, instead of printing them."""
     errors: list[BaseException] = []
 
     def collect(record: logging.LogRecord) -> bool:
@@ -96,12 +96,12 @@ def _logged() -> Iterator[list[BaseException]]:
 
 @cache
 def _address(app: ASGIApp) -> tuple[str, int]:
-    """The address of a server that ends with this process."""
+    """Start a server that ends with this process, and return its address."""
     listener = socket.create_server(("127.0.0.1", 0))
-    # The server's own thread is a daemon as this one is, and so does not keep the process.
+    # The server's own thread inherits `daemon`, so that it does not keep the process alive.
     threading.Thread(target=_serve, args=(app, listener), daemon=True).start()
     host, port = listener.getsockname()
-    # When this is answered, uvicorn has set the levels of its loggers.
+    # After this response, uvicorn has set the levels of its loggers.
     _statuses((host, port), _PLAIN, ANSWERED_S)
     return host, port
 
@@ -112,7 +112,7 @@ def _serve(app: ASGIApp, listener: socket.socket) -> None:
 
 
 async def answer_length(scope: Scope, receive: Receive, send: Send) -> None:
-    """Answers with the length of the body; the path says whether before it is read, later, or in parts."""
+    """Respond with the body's length; the path selects whether before reading it, later, or in parts."""
     if scope["type"] != "http":
         return
     path = scope["path"]

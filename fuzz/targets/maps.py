@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from fuzz.repairs import repair_png
-from fuzz.targets import Target, read_every_way, written
-from fuzz.targets.pictures import encoded
+from fuzz.targets import Target, read_every_way, write_to_bytes
+from fuzz.targets.pictures import encode_picture
 from stereoweave.io.files import read_disparity_png, read_pfm, read_pixels, write_disparity_png, write_pfm
 
 
@@ -16,12 +16,12 @@ def _starts() -> dict[str, bytes]:
     values[3, 4:6] = np.nan, np.inf
     steps = np.arange(12 * 16, dtype=np.uint16).reshape(12, 16)
     return {
-        "map.pfm": written("map.pfm", partial(write_pfm, values=values)),
+        "map.pfm": write_to_bytes("map.pfm", partial(write_pfm, values=values)),
         "big_endian.pfm": b"Pf\n16 12\n1.0\n" + values.astype(">f4").tobytes(),
-        "map.png": written("map.png", partial(write_disparity_png, disparity_px=values)),
-        "mask.png": encoded(steps.astype(np.uint8), "PNG"),
-        "float.tiff": encoded(np.nan_to_num(values, posinf=1), "TIFF"),
-        "deep.tiff": encoded(steps, "TIFF"),
+        "map.png": write_to_bytes("map.png", partial(write_disparity_png, disparity_px=values)),
+        "mask.png": encode_picture(steps.astype(np.uint8), "PNG"),
+        "float.tiff": encode_picture(np.nan_to_num(values, posinf=1), "TIFF"),
+        "deep.tiff": encode_picture(steps, "TIFF"),
     }
 
 

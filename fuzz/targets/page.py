@@ -1,4 +1,4 @@
-"""Requests to the page's gate, in front of an application that takes whatever passes it."""
+"""Requests to the page's access control, in front of an application that accepts everything."""
 
 import json
 from collections.abc import Callable
@@ -22,15 +22,15 @@ _UPLOAD, _JOIN, _FILE = "/gradio_api/upload", "/gradio_api/queue/join", "/gradio
 
 
 class LeakError(Exception):
-    """A file got through that the page has not named to the visitor."""
+    """A visitor got access to a file that the page had not named to them."""
 
 
 class _Page:
-    """An application in Gradio's place: names files in its answers, and keeps those that requests name.
+    """Stand-in for Gradio: names files in its responses, and records those that requests name.
 
     Attributes:
-        named: The files in its answers.
-        asked: Those in requests.
+        named: Files that responses name.
+        asked: Files that requests have named.
     """
 
     def __init__(self) -> None:
@@ -49,22 +49,22 @@ class _Page:
     async def _read(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["method"] not in ("GET", "HEAD") and scope["path"] != _UPLOAD:
             body = await Request(scope, receive).body()
-            with suppress(ValueError, RecursionError):  # Gradio would refuse it
+            with suppress(ValueError, RecursionError):  # Gradio would refuse such a body
                 json.loads(body, object_pairs_hook=self._keep)
         await JSONResponse(self.named)(scope, receive, send)
 
     def _keep(self, entries: list[tuple[str, Any]]) -> dict[str, Any]:
-        """Keeps all paths of an object, which may have several."""
+        """Record all paths of a JSON object, even repeated keys."""
         self.asked += [value for key, value in entries if key == "path"]
         return dict(entries)
 
 
 def visit(content: bytes, gate: Callable[[ASGIApp], ASGIApp] = OwnFiles) -> int | None:
-    """The status of the response to a request, after a visitor and another were given a file each.
+    """Give a file each to two visitors, send a request, and return the response's status.
 
     Raises:
-        LeakError: The page was asked for a file that was not given to whoever sent the request.
-        Exception: Whatever the gate raises.
+        LeakError: The request reached the page with a file that its sender had not been given.
+        Exception: Any error of the gate.
     """
     page = _Page()
     server = ContentPolicy(gate(page))

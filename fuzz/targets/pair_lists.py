@@ -1,4 +1,4 @@
-"""Lists of pairs, as `depth --list` takes them."""
+"""Lists of pairs for `depth --list`."""
 
 from pathlib import Path
 

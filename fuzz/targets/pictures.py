@@ -1,4 +1,4 @@
-"""Pictures of one view or two, in every kind that is read, with tags, profiles and markers."""
+"""Pictures of one view or two, in every supported format, with tags, profiles and markers."""
 
 import io
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image, ImageCms, features
 
 from fuzz.repairs import repair_png
-from fuzz.targets import Target, read_every_way, written
+from fuzz.targets import Target, read_every_way, write_to_bytes
 from stereoweave.io.files import read_image
 from stereoweave.pictures.loading import open_pictures
 from stereoweave.rendering.layouts import write_picture
@@ -20,15 +20,15 @@ _SIZE_PX = 48, 72
 
 
 def eyes(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """A small pair, uint8 RGB [48, 72, 3]: one texture, seen 4 px apart."""
+    """Make a small pair, uint8 RGB [48, 72, 3]: one texture with a disparity of 4 px."""
     rng = np.random.default_rng(seed)
     noise = rng.integers(0, 256, (_SIZE_PX[0], _SIZE_PX[1] + 4, 3), np.uint8)
     texture = cv2.GaussianBlur(noise, (0, 0), 1)
     return texture[:, 4:].copy(), texture[:, :-4].copy()
 
 
-def encoded(image: np.ndarray, kind: str, **options: Any) -> bytes:
-    """The picture as a file that Pillow writes."""
+def encode_picture(image: np.ndarray, kind: str, **options: Any) -> bytes:
+    """Encode a picture with Pillow."""
     stream = io.BytesIO()
     Image.fromarray(image).save(stream, kind, **options)
     return stream.getvalue()
@@ -41,9 +41,9 @@ def _starts() -> dict[str, bytes]:
     return {
         **dict(_plain(both, grey)),
         **dict(_with_tags(both)),
-        "eyes.mpo": written("eyes.mpo", lambda path: write_picture(path, both)),
-        "eyes.jps": written("eyes.jps", lambda path: write_picture(path, both)),
-        "above_TB.png": encoded(np.vstack([left, right]), "PNG"),
+        "eyes.mpo": write_to_bytes("eyes.mpo", lambda path: write_picture(path, both)),
+        "eyes.jps": write_to_bytes("eyes.jps", lambda path: write_picture(path, both)),
+        "above_TB.png": encode_picture(np.vstack([left, right]), "PNG"),
     }
 
 
@@ -51,14 +51,14 @@ def _plain(both: np.ndarray, grey: np.ndarray) -> Iterator[tuple[str, bytes]]:
     kinds = {"png": "PNG", "jpg": "JPEG", "tif": "TIFF", "webp": "WEBP", "bmp": "BMP", "gif": "GIF"}
     kinds |= {"ppm": "PPM", "jp2": "JPEG2000"} | ({"avif": "AVIF"} if features.check("avif") else {})
     for ending, kind in kinds.items():
-        yield f"colour.{ending}", encoded(both, kind)
+        yield f"colour.{ending}", encode_picture(both, kind)
     for ending in ("png", "tif", "pgm"):
-        yield f"deep.{ending}", encoded(grey.astype(np.uint16) << 8, kinds.get(ending, "PPM"))
-    yield "lzw.tif", encoded(both, "TIFF", compression="tiff_lzw")
-    yield "jpeg.tif", encoded(both, "TIFF", compression="jpeg")
-    yield "lossless.webp", encoded(both, "WEBP", lossless=True)
-    yield "alpha.png", encoded(np.dstack([both, grey]), "PNG")
-    yield "progressive.jpg", encoded(grey, "JPEG", progressive=True)
+        yield f"deep.{ending}", encode_picture(grey.astype(np.uint16) << 8, kinds.get(ending, "PPM"))
+    yield "lzw.tif", encode_picture(both, "TIFF", compression="tiff_lzw")
+    yield "jpeg.tif", encode_picture(both, "TIFF", compression="jpeg")
+    yield "lossless.webp", encode_picture(both, "WEBP", lossless=True)
+    yield "alpha.png", encode_picture(np.dstack([both, grey]), "PNG")
+    yield "progressive.jpg", encode_picture(grey, "JPEG", progressive=True)
 
 
 def _with_tags(both: np.ndarray) -> Iterator[tuple[str, bytes]]:
@@ -70,8 +70,8 @@ def _with_tags(both: np.ndarray) -> Iterator[tuple[str, bytes]]:
     srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     xmp = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><GPano:Pose>0</GPano:Pose></x:xmpmeta>'
     for ending, kind in {"jpg": "JPEG", "png": "PNG", "webp": "WEBP", "tif": "TIFF"}.items():
-        yield f"tags.{ending}", encoded(both, kind, exif=exif, icc_profile=srgb)
-    yield "profile.jpg", encoded(both, "JPEG", exif=exif, icc_profile=profile, xmp=xmp)
+        yield f"tags.{ending}", encode_picture(both, kind, exif=exif, icc_profile=srgb)
+    yield "profile.jpg", encode_picture(both, "JPEG", exif=exif, icc_profile=profile, xmp=xmp)
 
 
 def _read(path: Path) -> None:

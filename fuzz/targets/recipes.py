@@ -1,4 +1,4 @@
-"""Recipes of trainings."""
+"""Training recipes."""
 
 from pathlib import Path
 

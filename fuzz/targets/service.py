@@ -9,7 +9,7 @@ from prometheus_client import CollectorRegistry
 
 from fuzz.requests import Application, repair_length, request_bytes, send
 from fuzz.targets import Target, calibrations
-from fuzz.targets.pictures import encoded, eyes
+from fuzz.targets.pictures import encode_picture, eyes
 from stereoweave.errors import StereoweaveError
 from stereoweave.matching.matcher import Matcher
 from stereoweave.service.answers import Answer, ServiceJob, answer_many, check_pixels
@@ -20,7 +20,7 @@ _LIMITS = Limits(megapixels=0.05, megabytes=0.5, timeout_s=600)
 
 
 def _starts() -> dict[str, bytes]:
-    left, right = (encoded(eye, "JPEG") for eye in eyes())
+    left, right = (encode_picture(eye, "JPEG") for eye in eyes())
     files = {"left": ("left.jpg", left), "right": ("right.jpg", right)}
     calib = calibrations.TARGET.starts()["calib.txt"]
     camera = {"focal_px": "60", "baseline_m": "0.1"}

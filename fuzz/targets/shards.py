@@ -1,11 +1,11 @@
-"""Shards of rendered pairs, with checksums that fit or not."""
+"""Shards of rendered pairs, with correct or wrong checksums."""
 
 from pathlib import Path
 
 import numpy as np
 
 from fuzz.repairs import repair_shard
-from fuzz.targets import Target, written
+from fuzz.targets import Target, write_to_bytes
 from fuzz.targets.pictures import eyes
 from stereoweave.data.packing import pack
 from stereoweave.data.samples import make_sample
@@ -22,7 +22,7 @@ def _starts() -> dict[str, bytes]:
         StereoPair(left=left, right=right, camera=camera), *np.full((2, *left.shape[:2]), 4, np.float32)
     )
     pair = pack(sample, {0.5: left})
-    return {_NAME: written(_NAME, lambda path: write_shard(path.parent, "box", 0, [pair]))}
+    return {_NAME: write_to_bytes(_NAME, lambda path: write_shard(path.parent, "box", 0, [pair]))}
 
 
 def _read(path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Videos of both eyes, in several containers and codecs."""
+"""Stereo videos in several containers and codecs."""
 
 from fractions import Fraction
 from functools import partial
@@ -8,7 +8,7 @@ from pathlib import Path
 import av
 import numpy as np
 
-from fuzz.targets import Target, written
+from fuzz.targets import Target, write_to_bytes
 from fuzz.targets.pictures import eyes
 from stereoweave.video.reader import open_footage
 from stereoweave.video.tracks import open_track
@@ -24,7 +24,7 @@ _PIXELS = {"ffv1": "bgr0", "mjpeg": "yuvj420p"}
 
 
 def _starts() -> dict[str, bytes]:
-    return {name: written(name, partial(_write, codec=codec)) for name, codec in _KINDS.items()}
+    return {name: write_to_bytes(name, partial(_write, codec=codec)) for name, codec in _KINDS.items()}
 
 
 def _write(path: Path, codec: str) -> None:
@@ -42,7 +42,7 @@ def _write(path: Path, codec: str) -> None:
 
 
 def _read(path: Path) -> None:
-    # Not guessed, which would take most of the time; of pictures it is.
+    # Detection would take most of the time; the target for pictures covers it.
     footage = open_footage([path], "side_by_side")
     for _ in islice(footage.frames(), 2 * _FRAMES):
         pass
