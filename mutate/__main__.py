@@ -1,4 +1,4 @@
-"""python -m mutate: which of a draw of mutants the tests notice."""
+"""python -m mutate: draws mutants and reports which of them the tests notice."""
 
 import argparse
 import csv
@@ -21,9 +21,9 @@ _COLUMNS = ("commit", "seed", "module", "drawn", "killed", "survived", "timeouts
 def main() -> int:
     """Try the mutants; 1 if fewer than 85 % of them are killed."""
     parser = argparse.ArgumentParser(prog="python -m mutate", description=__doc__)
-    parser.add_argument("--count", type=_positive, default=400, help="how many mutants are drawn")
-    parser.add_argument("--seed", type=int, default=1, help="of the draw")
-    parser.add_argument("--jobs", type=_positive, default=2, help="how many are tried at a time")
+    parser.add_argument("--count", type=_positive, default=400, help="number of mutants")
+    parser.add_argument("--seed", type=int, default=1, help="random seed of the draw")
+    parser.add_argument("--jobs", type=_positive, default=2, help="mutants tried at a time")
     options = parser.parse_args()
     root = Path.cwd()
     trials = _try_all(Session(root, root / _RUNS, options.jobs), options.count, options.seed)
@@ -63,7 +63,7 @@ def _try_all(session: Session, count: int, seed: int) -> list[Trial]:
 
 
 def _rows(trials: Sequence[Trial], seed: int) -> list[dict[str, Any]]:
-    """A row for each part of the package, and one for all."""
+    """Make a row per part of the package, and one for all."""
     git = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]
     commit = subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
     rows: list[dict[str, Any]] = []

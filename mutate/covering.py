@@ -1,4 +1,4 @@
-"""Which tests cover a line, and which of them are asked about a mutant there."""
+"""Coverage of lines by tests, and the choice of tests for a mutant."""
 
 import ast
 import json
@@ -15,21 +15,22 @@ from coverage import CoverageData
 from mutate.drawing import Mutant
 from mutate.targets import TARGETS
 
-# What a mutant's tests may take together, the quicker ones first, without what they share: that is often
-# worth its time.
+# Total time of a mutant's tests, fastest first. Shared fixtures are not counted: they are often worth their
+# time.
 _MOST_S = 60
-# Tests of one such class of time run file by file, because leaving a file ends what its tests share.
+# Upper limits of classes by time. Within a class tests run file by file, because leaving a file ends its
+# shared fixtures.
 _CLASSES_S = [1, 5]
 
 
 @dataclass(frozen=True)
 class Covered:
-    """What was measured of the unchanged sources.
+    """Measurements of the unchanged sources.
 
     Attributes:
-        taken_s: The seconds that each test takes, without what it shares with others; of those that passed.
-        shared_s: The seconds that each fixture takes that a test shares with others, by test.
-        tests: The tests that run a line, by source and line.
+        taken_s: Seconds of each passed test, without shared fixtures.
+        shared_s: Seconds of each shared fixture of a test, by test.
+        tests: Tests that run a line, by source and line.
         failed: Tests that failed without any change.
     """
 
@@ -39,7 +40,7 @@ class Covered:
     failed: list[str]
 
     def choose(self, mutant: Mutant, root: Path) -> list[str]:
-        """The tests that are asked about a mutant, in order: the quick ones first, about a minute of them."""
+        """Choose up to a minute of tests for a mutant, fast ones first."""
         found = self._covering(mutant)
         target = TARGETS[mutant.target]
         if target.elsewhere or not found:
@@ -51,7 +52,7 @@ class Covered:
         return sorted(chosen or quickest[:1], key=self._turn)
 
     def seconds(self, tests: Sequence[str]) -> float:
-        """How long tests take together."""
+        """Total seconds of tests, with each shared fixture counted once."""
         shared_s = {name: seconds for test in tests for name, seconds in self.shared_s[test].items()}
         return sum(shared_s.values()) + sum(self.taken_s[test] for test in tests)
 
@@ -65,12 +66,12 @@ class Covered:
 
 
 def _lines_of_statement(tree: ast.Module, line: int) -> Iterable[int]:
-    """The lines of the statement that has this line, or of its head; none outside of functions.
+    """Find the lines of the statement, or statement header, that contains a line; none outside of functions.
 
-    What is run by an import counts as covered by all tests of the source.
+    Code that an import runs counts as covered by all tests of the source.
     """
     inside, lines = False, range(0)
-    for node in ast.walk(tree):  # from the outside to the inside
+    for node in ast.walk(tree):  # outer statements first
         if isinstance(node, ast.stmt) and node.lineno <= line <= (node.end_lineno or 0):
             body = getattr(node, "body", None)
             end = body[0].lineno if body else (node.end_lineno or 0) + 1
@@ -80,7 +81,7 @@ def _lines_of_statement(tree: ast.Module, line: int) -> Iterable[int]:
 
 
 def lines_run(folder: Path, tree: Path) -> dict[str, dict[int, list[str]]]:
-    """The tests that ran a line, by source and line, from the data of coverage that all processes left."""
+    """Read which tests ran each line, by source and line, from the coverage data of all processes."""
     found: dict[str, dict[int, set[str]]] = defaultdict(lambda: defaultdict(set))
     for path in folder.glob(".coverage.*"):
         data = CoverageData(str(path))
@@ -93,12 +94,12 @@ def lines_run(folder: Path, tree: Path) -> dict[str, dict[int, list[str]]]:
 
 
 def _test(context: str) -> str:
-    # A process that a test started has "tests/test_x.py::test_y (call)", as pytest writes it there.
+    # In a process that a test started, the context is pytest's "tests/test_x.py::test_y (call)".
     return context.rpartition(" (")[0] if context.endswith(("(setup)", "(call)", "(teardown)")) else context
 
 
 def read_covered(paths: Iterable[Path]) -> Covered:
-    """What was measured of all test files, from a JSON file of each."""
+    """Combine the measurements of all test files, from one JSON file each."""
     covered = Covered({}, {}, defaultdict(lambda: defaultdict(set)), [])
     for path in paths:
         measured: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))

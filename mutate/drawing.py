@@ -1,4 +1,4 @@
-"""The seeded draw of mutants."""
+"""Random choice of mutants from a seed."""
 
 import ast
 import random
@@ -24,12 +24,12 @@ class Mutant:
     """A source with one change.
 
     Attributes:
-        target: The part of the package, a key of TARGETS.
-        path: The source, relative to the repository's root.
-        line: Where it is changed, from 1.
-        operator: The name of the operator that changes it.
+        target: Part of the package, a key of TARGETS.
+        path: Source file, relative to the repository's root.
+        line: Line of the change, from 1.
+        operator: Name of the operator that made the change.
         before: The whole source.
-        after: The whole source, changed.
+        after: The whole source with the change.
     """
 
     target: str
@@ -40,15 +40,15 @@ class Mutant:
     after: str
 
     def diff(self) -> str:
-        """What is changed, as a patch."""
+        """Return the change as a patch."""
         before, after = (text.splitlines(keepends=True) for text in (self.before, self.after))
         return "".join(unified_diff(before, after, f"a/{self.path}", f"b/{self.path}", n=2))
 
 
 def draw(root: Path, count: int, seed: int) -> list[Mutant]:
-    """Mutants at places that are drawn evenly from all sources; those of a lower count come first.
+    """Draw mutants at places spread evenly over all sources; a higher count extends the list of a lower one.
 
-    At each place one change is drawn from those that the operators offer there.
+    At each place one of the operators' possible changes is drawn.
     """
     available = [
         (target, path, place, changes)
@@ -73,25 +73,25 @@ def draw(root: Path, count: int, seed: int) -> list[Mutant]:
 
 
 def places(path: Path) -> dict[Place, list[tuple[str, Operator, int]]]:
-    """Where a source can be changed (line, column), and by which occurrence of which operators."""
+    """Find the places (line, column) where a source can be changed, with their operators and occurrences."""
     source = path.read_text(encoding="utf-8")
-    left_out = list(_left_out(ast.parse(source)))
+    left_out = list(_find_left_out(ast.parse(source)))
     nodes = list(ast_nodes(get_ast(source)))
     found = defaultdict(list)
     for name, operator in operators().items():
         starts = ((node, start) for node in nodes for start, _ in operator.mutation_positions(node))
         for occurrence, (node, place) in enumerate(starts):
-            # The `*` before parameters that have names looks like a product.
+            # The `*` before keyword-only parameters looks like a product.
             is_mark = node.parent is not None and node.parent.type == "parameters"
             if not is_mark and not any(first <= place < last for first, last in left_out):
                 found[place].append((name, operator, occurrence))
     return dict(found)
 
 
-def _left_out(tree: ast.Module) -> Iterator[tuple[Place, Place]]:
-    """What no test can or should notice, and `/` between paths, which no other operator could replace."""
+def _find_left_out(tree: ast.Module) -> Iterator[tuple[Place, Place]]:
+    """Find code whose change no test should notice, and `/` between paths, which has no alternative."""
     for node in ast.walk(tree):
-        # `strict` of zip is an assertion.
+        # zip's `strict` is an assertion.
         is_assertion = isinstance(node, ast.keyword) and node.arg == "strict"
         is_for_types = isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
         if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div) and _is_path(node.left):
@@ -111,7 +111,7 @@ def _is_path(node: ast.expr) -> bool:
 
 
 def _differs(before: str, after: str) -> bool:
-    """Whether the changed source is still Python, and another program."""
+    """Whether the changed source is valid Python and a different program."""
     try:
         return ast.dump(ast.parse(before)) != ast.dump(ast.parse(after))
     except SyntaxError:

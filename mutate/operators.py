@@ -1,4 +1,4 @@
-"""The changes that are made: some of Cosmic Ray's operators, and a few of our own for what these lack.
+"""Mutation operators: some of Cosmic Ray's, and our own for changes that it lacks.
 
 Cosmic Ray can replace each binary operator by each of eleven others. Every test would notice most of these
 (`<<` of two floats), so only plausible ones are used. No test can notice that a cache is gone, so decorators
@@ -34,32 +34,32 @@ _OF_COSMIC_RAY = (
 
 
 class _LeafOperator(Operator):
-    """An operator that changes single leaves of the syntax tree."""
+    """Operator on single leaves of the syntax tree."""
 
     def mutation_positions(self, node: NodeOrLeaf) -> Iterator[Position]:
         if self.applies(node):
             yield node.start_pos, node.end_pos
 
     def mutate(self, node: Any, index: int) -> Any:
-        node.value = self.changed(node.value)
+        node.value = self.replacement(node.value)
         return node
 
     @abstractmethod
     def applies(self, node: NodeOrLeaf) -> bool:
-        """Whether the leaf is one that this operator changes."""
+        """Whether this operator changes the leaf."""
 
     @abstractmethod
-    def changed(self, value: str) -> str:
-        """The text in place of the leaf's."""
+    def replacement(self, value: str) -> str:
+        """Return the replacement of the leaf's text."""
 
 
 class ChangeNumber(_LeafOperator):
-    """A small number becomes one more, a large one a thousand times as large."""
+    """Adds 1 to a small number, multiplies a large one by 1,000."""
 
     def applies(self, node: NodeOrLeaf) -> bool:
         return isinstance(node, Number)
 
-    def changed(self, value: str) -> str:
+    def replacement(self, value: str) -> str:
         number = ast.literal_eval(value)
         return repr(number + 1 if abs(number) < _LARGE else number * _FACTOR)
 
@@ -69,9 +69,9 @@ class ChangeNumber(_LeafOperator):
 
 
 class LowerNumber(ChangeNumber):
-    """A small number becomes one less, a large one a thousandth of it."""
+    """Subtracts 1 from a small number, divides a large one by 1,000."""
 
-    def changed(self, value: str) -> str:
+    def replacement(self, value: str) -> str:
         number = ast.literal_eval(value)
         if abs(number) < _LARGE:
             return f"({number - 1!r})"
@@ -83,7 +83,7 @@ class LowerNumber(ChangeNumber):
 
 
 class SwapFunction(_LeafOperator):
-    """A function is called in the place of its opposite."""
+    """Calls a function's opposite."""
 
     PAIRS = (("min", "max"), ("minimum", "maximum"), ("any", "all"), ("floor", "ceil"), ("ones", "zeros"))
     OPPOSITES = dict(PAIRS) | {second: first for first, second in PAIRS}
@@ -94,7 +94,7 @@ class SwapFunction(_LeafOperator):
         following = node.get_next_leaf()
         return following is not None and following.value == "("
 
-    def changed(self, value: str) -> str:
+    def replacement(self, value: str) -> str:
         return self.OPPOSITES[value]
 
     @classmethod
@@ -103,13 +103,13 @@ class SwapFunction(_LeafOperator):
 
 
 class ReplaceIn(_LeafOperator):
-    """`in` becomes `not in`."""
+    """Replaces `in` by `not in`."""
 
     def applies(self, node: NodeOrLeaf) -> bool:
         in_comparison = node.parent is not None and node.parent.type == "comparison"
         return in_comparison and isinstance(node, Keyword) and node.value == "in"
 
-    def changed(self, value: str) -> str:
+    def replacement(self, value: str) -> str:
         return "not in"
 
     @classmethod
@@ -118,7 +118,7 @@ class ReplaceIn(_LeafOperator):
 
 
 class ReplaceNotIn(Operator):
-    """`not in` becomes `in`."""
+    """Replaces `not in` by `in`."""
 
     def mutation_positions(self, node: NodeOrLeaf) -> Iterator[Position]:
         if node.type == "comp_op" and node.get_code().split() == ["not", "in"]:
@@ -133,7 +133,7 @@ class ReplaceNotIn(Operator):
 
 
 class RemoveCall(Operator):
-    """A call whose result is not used is left out."""
+    """Removes a call whose result is not used."""
 
     def mutation_positions(self, node: NodeOrLeaf) -> Iterator[Position]:
         if node.type == "simple_stmt" and isinstance(node, PythonNode):
@@ -152,7 +152,7 @@ class RemoveCall(Operator):
 
 
 class CatchNothing(Operator):
-    """No exception is caught."""
+    """Catches no exception."""
 
     def mutation_positions(self, node: NodeOrLeaf) -> Iterator[Position]:
         if node.type == "except_clause":
@@ -172,7 +172,7 @@ class CatchNothing(Operator):
 
 
 class RemoveTranspose(Operator):
-    """A matrix in the place of its transpose."""
+    """Replaces a transpose by the matrix itself."""
 
     def mutation_positions(self, node: NodeOrLeaf) -> Iterator[Position]:
         if node.type == "trailer" and node.get_code() == ".T":
@@ -193,6 +193,6 @@ OUR_OWN: tuple[type[Operator], ...] = (
 
 
 def operators() -> dict[str, Operator]:
-    """All operators by name."""
+    """Return all operators by name."""
     theirs = {name: get_operator(f"core/{name}")() for name in _OF_COSMIC_RAY}
     return theirs | {operator.__name__: operator() for operator in OUR_OWN}

@@ -1,4 +1,4 @@
-"""A run over mutants that can be stopped and continued."""
+"""A resumable run over mutants."""
 
 import hashlib
 import json
@@ -21,21 +21,21 @@ from mutate.trees import Tree, repository_files
 KILLED, SURVIVED, TIMEOUT = "killed", "survived", "timeout"
 
 _MEASURED_WITHIN_S = 900
-# A loaded machine takes longer than it did when the tests were measured.
+# A busy machine takes longer than when the tests were measured.
 _TIMES_AS_LONG, _START_S = 4, 60
 # Tests that call nearly all kernels of Numba.
 _COMPILING = ("tests/rendering/test_camera_motion.py", "tests/rendering/test_synthesize.py")
-# Pytest's exit code where no test was found.
+# Pytest's exit code if it finds no test.
 _NO_TESTS = 5
-# Nothing else can change what a test finds.
+# Only these files can change a test's result.
 _PARTS = ("stereoweave/", "tests/", "examples/", "mutate/", "pyproject.toml")
 
-Telling = Callable[[str], None]
+Report = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What came of a mutant: killed, survived or timeout; how long it took, and how many tests were asked."""
+    """Result of a mutant: killed, survived or timeout; with the time taken and the number of tests chosen."""
 
     mutant: Mutant
     outcome: str
@@ -44,7 +44,7 @@ class Trial:
 
 
 class Session:
-    """A run on this state of sources and tests: what was measured, and the outcomes, are kept in a folder."""
+    """Run on one state of sources and tests; a folder stores its measurements and outcomes."""
 
     def __init__(self, root: Path, runs: Path, jobs: int) -> None:
         self.root = root
@@ -55,26 +55,26 @@ class Session:
         for tree in self._trees:
             self._free.put(tree)
 
-    def measure(self, told: Telling) -> Covered:
-        """Which tests cover which lines, as far as that was not measured before."""
+    def measure(self, report: Report) -> Covered:
+        """Return which tests cover which lines; measure the test files that are not measured yet."""
         files = sorted({file for target in TARGETS.values() for file in target.test_files(self.root)})
-        with self._at_once() as pool:
-            if any(not self._kept(file).exists() for file in files):
-                told("compiling")
+        with self._open_pool() as pool:
+            if any(not self._measurements_path(file).exists() for file in files):
+                report("compiling")
                 list(pool.map(self._compile, self._trees))
-            return read_covered(pool.map(lambda file: self._measured(file, told), files))
+            return read_covered(pool.map(lambda file: self._measure_file(file, report), files))
 
     def try_all(self, mutants: Sequence[Mutant], covered: Covered, seed: int) -> Iterator[Trial]:
-        """The outcomes as they come; those of an earlier run of this session first."""
+        """Yield the outcomes as they arrive, after those of an earlier run of this session."""
         kept = self.folder / f"outcomes-{seed}.jsonl"
-        known = _outcomes(kept)
+        known = _read_outcomes(kept)
         waiting = []
         for turn, mutant in enumerate(mutants):
             if turn in known:
                 yield Trial(mutant, **known[turn])
             else:
                 waiting.append((turn, mutant))
-        with self._at_once() as pool, kept.open("a", encoding="utf-8") as out:
+        with self._open_pool() as pool, kept.open("a", encoding="utf-8") as out:
             trials = {pool.submit(self._try, mutant, covered, turn): turn for turn, mutant in waiting}
             for future in as_completed(trials):
                 trial = future.result()
@@ -84,8 +84,8 @@ class Session:
                 yield trial
 
     @contextmanager
-    def _at_once(self) -> Iterator[ThreadPoolExecutor]:
-        """As many threads as there are trees; the tests are ended when something goes wrong here."""
+    def _open_pool(self) -> Iterator[ThreadPoolExecutor]:
+        """Open a pool with one thread per tree; on an error, end the running tests."""
         pool = ThreadPoolExecutor(len(self._trees))
         try:
             yield pool
@@ -96,7 +96,7 @@ class Session:
             pool.shutdown()
 
     @contextmanager
-    def _a_tree(self) -> Iterator[Tree]:
+    def _borrow_tree(self) -> Iterator[Tree]:
         tree = self._free.get()
         try:
             yield tree
@@ -104,22 +104,22 @@ class Session:
             self._free.put(tree)
 
     def _compile(self, tree: Tree) -> None:
-        """Compile the kernels for a copy, so that the first test to call them is not taken for slow."""
+        """Compile the kernels for a copy, so that the first test to call them is not measured as slow."""
         words = [file for file in _COMPILING if (tree.folder / file).exists()]
         if words:
             tree.pytest(words, self.folder / f"log-{tree.folder.name}.txt", _MEASURED_WITHIN_S)
 
-    def _kept(self, file: str) -> Path:
-        return self.folder / "covered" / f"{_flat(file)}.json"
+    def _measurements_path(self, file: str) -> Path:
+        return self.folder / "covered" / f"{_flatten(file)}.json"
 
-    def _measured(self, file: str, told: Telling) -> Path:
-        """The JSON file of what was measured of a test file."""
-        kept = self._kept(file)
+    def _measure_file(self, file: str, report: Report) -> Path:
+        """Return the JSON file with a test file's measurements; measure it if there is none."""
+        kept = self._measurements_path(file)
         if not kept.exists():
-            with self._a_tree() as tree, tempfile.TemporaryDirectory(dir=self.folder) as folder:
-                told(f"measuring {file}")
+            with self._borrow_tree() as tree, tempfile.TemporaryDirectory(dir=self.folder) as folder:
+                report(f"measuring {file}")
                 measured = _measure(tree, file, Path(folder))
-                # Whole or not at all.
+                # Written completely or not at all.
                 partial = Path(folder, "measured.json")
                 partial.write_text(json.dumps(measured), encoding="utf-8")
                 partial.replace(kept)
@@ -131,7 +131,7 @@ class Session:
         limit_s = _START_S + _TIMES_AS_LONG * covered.seconds(tests)
         asked, log = self.folder / f"tests-{turn}.txt", self.folder / f"log-{turn}.txt"
         asked.write_text("\n".join(tests), encoding="utf-8")
-        with self._a_tree() as tree, tree.changed(mutant.path, mutant.after, turn):
+        with self._borrow_tree() as tree, tree.replace_source(mutant.path, mutant.after, turn):
             code = tree.pytest(["-x", f"@{asked}"], log, limit_s)
         if code == _NO_TESTS:
             raise RuntimeError(f"{log}: expected tests that cover {mutant.path}:{mutant.line}, found none")
@@ -140,7 +140,7 @@ class Session:
 
 
 def _measure(tree: Tree, file: str, folder: Path) -> dict[str, Any]:
-    """What each test of a file takes, and the lines that it runs."""
+    """Measure the time and the lines of each test of a file."""
     sources = [tree.folder / path for target in TARGETS.values() for path in target.source_files(tree.folder)]
     settings, times = folder / "coveragerc", folder / "times.json"
     settings.write_text(
@@ -149,20 +149,20 @@ def _measure(tree: Tree, file: str, folder: Path) -> dict[str, Any]:
         encoding="utf-8",
     )
     variables = {"COVERAGE_PROCESS_START": str(settings), TIMES_FILE: str(times)}
-    log = folder.parent / f"log-{_flat(file)}.txt"
+    log = folder.parent / f"log-{_flatten(file)}.txt"
     tree.pytest(["-p", "mutate.measuring", file], log, _MEASURED_WITHIN_S, **variables)
     if not times.exists():
         raise RuntimeError(f"{log}: expected tests that end, found that they were stopped")
     return json.loads(times.read_text(encoding="utf-8")) | {"lines": lines_run(folder, tree.folder)}
 
 
-def _flat(file: str) -> str:
-    """A path as the name of a file."""
+def _flatten(file: str) -> str:
+    """Convert a path to a file name."""
     return file.removesuffix(".py").replace("/", "-")
 
 
-def _outcomes(path: Path) -> dict[int, dict[str, Any]]:
-    """The outcomes of an earlier run, by the mutants' turns."""
+def _read_outcomes(path: Path) -> dict[int, dict[str, Any]]:
+    """Read the outcomes of an earlier run, by the mutants' turns."""
     if not path.exists():
         return {}
     lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
@@ -170,7 +170,7 @@ def _outcomes(path: Path) -> dict[int, dict[str, Any]]:
 
 
 def _digest(root: Path) -> str:
-    """What sources and tests are, in 12 digits."""
+    """Hash of sources and tests, 12 hexadecimal digits."""
     digest = hashlib.sha256()
     for name in repository_files(root):
         if name.startswith(_PARTS):

@@ -1,4 +1,4 @@
-"""Which sources are mutated, and which test files may cover them."""
+"""Parts of the package to mutate, and the test files that may cover them."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -9,8 +9,8 @@ class Target(NamedTuple):
 
     Attributes:
         sources: Files below stereoweave/.
-        tests: Test files below tests/. What each test covers is measured.
-        elsewhere: Whether some of it runs in processes that are killed before their coverage is written, as
+        tests: Test files below tests/. The coverage of each test is measured.
+        elsewhere: Whether some code runs in processes that are killed before they write their coverage, as
             Ray's are. Then all tests of the first pattern count as covering each line.
     """
 
@@ -19,15 +19,15 @@ class Target(NamedTuple):
     elsewhere: bool = False
 
     def source_files(self, root: Path) -> list[str]:
-        """The sources, relative to the repository's root."""
+        """Find the sources, relative to the repository's root."""
         return _found(root, "stereoweave", self.sources)
 
     def test_files(self, root: Path) -> list[str]:
-        """The test files, relative to the repository's root."""
+        """Find the test files, relative to the repository's root."""
         return _found(root, "tests", self.tests)
 
     def own_test_files(self, root: Path) -> list[str]:
-        """The test files of the first pattern."""
+        """Find the test files of the first pattern."""
         return _found(root, "tests", self.tests[:1])
 
 

@@ -1,4 +1,4 @@
-"""Copies of the repository, in which sources are changed and tests are run."""
+"""Copies of the repository in which mutants are tested."""
 
 import os
 import shutil
@@ -12,10 +12,10 @@ from pathlib import Path
 
 
 class Tree:
-    """A copy of the repository, on disk, because some tests start processes of their own.
+    """A copy of the repository on disk, because some tests start processes.
 
     Attributes:
-        folder: Where it is; the same from run to run, so that Numba finds what it has compiled for it.
+        folder: Folder of the copy; the same in each run, so that Numba finds its compiled kernels.
     """
 
     def __init__(self, root: Path, folder: Path) -> None:
@@ -29,7 +29,7 @@ class Tree:
             shutil.copy2(root / name, copy)
 
     def pytest(self, words: Sequence[str], log: Path, limit_s: float, **variables: str) -> int | None:
-        """The exit code of pytest on the copy; None if it did not end in time."""
+        """Run pytest on the copy. Returns its exit code, or None if it did not end in time."""
         environment = os.environ | {
             "PYTHONPATH": str(self.folder),
             "STEREOWEAVE_TESTDATA": self._testdata,
@@ -37,7 +37,7 @@ class Tree:
             **variables,
         }
         pytest = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "mutate.limits"]
-        # A short name, because the names of sockets have at most 107 bytes.
+        # A short name, because socket names have at most 107 bytes.
         with (
             tempfile.TemporaryDirectory(prefix="swm-", ignore_cleanup_errors=True) as temporary,
             log.open("wb") as out,
@@ -58,18 +58,18 @@ class Tree:
                 self.stop()
 
     def stop(self) -> None:
-        """End the tests that run, and what they have started."""
+        """End the running tests and their processes."""
         if self._running:
             with suppress(ProcessLookupError):
                 os.killpg(self._running.pid, signal.SIGKILL)
             self._running.wait()
 
     @contextmanager
-    def changed(self, path: str, source: str, turn: int) -> Iterator[None]:
-        """Within the block a source is another one, with a time of change of its own.
+    def replace_source(self, path: str, source: str, turn: int) -> Iterator[None]:
+        """Replace a source within the block, with a modification time of its own.
 
-        Python and Numba take what they compiled before as long as a source has the same size and time, in
-        whole seconds.
+        Python and Numba reuse compiled code as long as a source has the same size and the same time in whole
+        seconds.
         """
         file = self.folder / path
         original, status = file.read_bytes(), file.stat()
@@ -84,7 +84,7 @@ class Tree:
 
 
 def repository_files(root: Path) -> list[str]:
-    """The files of the repository as they are, committed or not."""
+    """List the files of the repository, committed or not."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     listed = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True).stdout
     return sorted(name for name in listed.split("\0") if name and (root / name).is_file())

@@ -1,1 +1,1 @@
-"""The check of a release: what is in its files, and whether they install and run."""
+"""Check of a release: the contents of its files, and whether they install and run."""

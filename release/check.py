@@ -1,7 +1,7 @@
 """Check a release: python -m release.check WHEEL SDIST.
 
-Compares the files of both with those that git tracks, then installs each in an empty environment of every
-Python that is here, and runs it on the example pair.
+Compares the contents of both with the files that git tracks, then installs each in an empty environment of
+every Python on this machine, and runs it on the example pair.
 """
 
 import os
@@ -16,39 +16,39 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = "stereoweave"
-# The oldest that pyproject.toml allows has to be here; of the later ones those that are.
+# The first, the oldest that pyproject.toml allows, is required; later ones are tried if they are installed.
 VERSIONS = ("3.11", "3.12", "3.13", "3.14")
-# What setuptools adds to a source distribution.
+# Files that setuptools adds to a source distribution.
 _GENERATED = ("PKG-INFO", "setup.cfg", f"{PACKAGE}.egg-info/")
 
 
 def tracked_files(root: Path) -> set[str]:
-    """The files that git tracks, relative to the root."""
+    """List the files that git tracks, relative to the root."""
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=root, capture_output=True, text=True, check=True)
     return set(filter(None, listed.stdout.split("\0")))
 
 
 def wheel_files(wheel: Path) -> set[str]:
-    """The files that a wheel installs, without its metadata."""
+    """List the files that a wheel installs, without its metadata."""
     with zipfile.ZipFile(wheel) as archive:
         return {name for name in archive.namelist() if ".dist-info/" not in name}
 
 
 def sdist_files(sdist: Path) -> set[str]:
-    """The files of a source distribution, without those that setuptools adds."""
+    """List the files of a source distribution, without those that setuptools adds."""
     with tarfile.open(sdist) as archive:
         names = {member.name.partition("/")[2] for member in archive if member.isfile()}
     return {name for name in names if not name.startswith(_GENERATED)}
 
 
 def differences(file: Path, expected: set[str], found: set[str]) -> list[str]:
-    """A line for each path that a release file lacks, or has beyond what git tracks."""
+    """Make a line for each path that a release file lacks, or that git does not track."""
     missing = [f"{file.name}: {name} is missing" for name in sorted(expected - found)]
     return missing + [f"{file.name}: {name} is not tracked by git" for name in sorted(found - expected)]
 
 
 def content_differences(wheel: Path, sdist: Path) -> list[str]:
-    """The differences of both files from the repository."""
+    """Compare both files with the repository; one line per difference."""
     tracked = tracked_files(ROOT)
     package = {name for name in tracked if name.startswith(f"{PACKAGE}/")}
     return [
@@ -58,7 +58,7 @@ def content_differences(wheel: Path, sdist: Path) -> list[str]:
 
 
 def python_here(version: str) -> Path | None:
-    """The interpreter of a version: on the PATH, or one of pyenv, whose shims answer for chosen ones only."""
+    """Find the interpreter of a version, on the PATH or in pyenv, whose shims run only activated versions."""
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
     on_path = shutil.which(f"python{version}")
     candidates = [Path(on_path)] if on_path else []
@@ -73,10 +73,10 @@ def _answers(python: Path, version: str) -> bool:
 
 
 def run(command: Iterable[str | Path], folder: Path) -> str:
-    """What a command prints, run in a folder without the repository on Python's path.
+    """Run a command in a folder, without the repository on Python's path. Returns its output.
 
     Raises:
-        SystemExit: It failed; its output is shown.
+        SystemExit: The command failed; the message contains its output.
     """
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     environment["NUMBA_CACHE_DIR"] = str(folder / "kernels")
@@ -88,10 +88,10 @@ def run(command: Iterable[str | Path], folder: Path) -> str:
 
 
 def try_out(file: Path, python: Path, folder: Path) -> None:
-    """Install a file of the release in an empty environment, and make depth and a view of the example pair.
+    """Install a release file in an empty environment, and compute depth and a view of the example pair.
 
     Raises:
-        SystemExit: A step failed, or something else than the installed package answered.
+        SystemExit: A step failed, or another package than the installed one was imported.
     """
     environment = folder / "env"
     run([python, "-m", "venv", environment], folder)
@@ -113,7 +113,7 @@ def main(wheel: Path, sdist: Path) -> None:
     """Check both files.
 
     Raises:
-        SystemExit: One has other files than the repository, does not install or does not run.
+        SystemExit: A file differs from the repository, does not install or does not run.
     """
     if different := content_differences(wheel, sdist):
         raise SystemExit("\n".join(different))

@@ -1,4 +1,4 @@
-"""Draws docstrings and error messages of the package at random, for a reader who judges their English.
+"""Random sample of the package's docstrings and error messages, for a reader who judges their English.
 
 python -m release.words --seed 1
 """
@@ -23,7 +23,7 @@ def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 
 def error_messages(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Yield line and source of each raised error that is built from a text."""
+    """Yield line and source of each raised error with a message."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
             texts = (part for part in ast.walk(node.exc) if isinstance(part, ast.Constant))
@@ -32,7 +32,7 @@ def error_messages(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 
 def draw(seed: int, count: int, kind: str) -> list[str]:
-    """A random sample of a kind of texts, each with its place, in the order of the files."""
+    """Draw a random sample of docstrings or errors, each with its place, in the order of the files."""
     find = {"docstrings": docstrings, "errors": error_messages}[kind]
     found = [
         f"{path.relative_to(ROOT)}:{line}: {text}"
@@ -43,7 +43,7 @@ def draw(seed: int, count: int, kind: str) -> list[str]:
 
 
 def main(
-    seed: Annotated[int, typer.Option(help="The draw depends on it and on the sources alone.")] = 1,
+    seed: Annotated[int, typer.Option(help="Random seed; only it and the sources decide.")] = 1,
     docstring_count: int = 100,
     error_count: int = 40,
 ) -> None:
