@@ -1,1 +1,1 @@
-"""From an estimate to a view."""
+"""View synthesis from an estimate."""

@@ -1,9 +1,10 @@
-"""What a photograph's background may look like where its foreground hides it: continued with its texture.
+"""Kernels that continue an image's background behind its foreground, with texture.
 
-It is found once for a photograph, not for each view of it, so that it stays the same from view to view. From
-every border of something nearer, the surface behind goes on as far as a camera within one baseline may look
-behind it. It takes each pixel's colour from the place of that surface whose surroundings are most alike, out
-of those next to where its neighbours took theirs from (Ashikhmin 2001, "Synthesizing natural textures").
+The hidden background is synthesised once per image rather than once per view, so that it is consistent
+between views. From every depth edge, the farther surface continues as far as a camera within one baseline can
+look behind the edge. Each hidden pixel copies the pixel of that surface with the most similar neighbourhood;
+the candidates are next to the sources of its neighbours' colours (Ashikhmin 2001, "Synthesizing natural
+textures").
 """
 
 import math
@@ -15,39 +16,39 @@ from stereoweave.rendering.canvas_kernels import NOTHING, SAME_SURFACE_PX
 from stereoweave.system.jit import compiled, inlined, kernel
 
 RIM_PX = 1
-"""So far from a border the background's pixels may carry the foreground's colour."""
+"""Within this distance of a depth edge, background pixels may carry the foreground's colour."""
 _PURE_PX = np.float32(1)
-"""A pixel whose neighbours are nearer than it by more than this is no example for others."""
+"""A pixel with a neighbour nearer by more than this is not copied."""
 _ALIKE_PX = 2 * SAME_SURFACE_PX
-"""What differs in disparity by no more than this from a surface may be an example for it."""
+"""Largest disparity difference between a surface and the pixels copied to it."""
 _LOOK_PX = 16
-"""A fresh place to take colours from lies within so many pixels."""
+"""Largest distance of a new candidate, not derived from a neighbour's source."""
 
 
 @kernel
 @typing.no_type_check
 def uncover(photo, disparity_px, nearer_px, other_px, side, hidden_px, colours, first, end):
-    """Write the background's disparity where neither camera sees it, else NOTHING, and its colours there.
+    """Write the disparity and colour of the background where neither camera sees it, elsewhere NOTHING.
 
     Args:
-        photo: uint8 RGB [H, W, 3].
-        disparity_px: float32 [H, W], of the photograph.
-        nearer_px: float32 [H, W], how much nearer the nearest of a pixel and its eight neighbours is.
-        other_px: float32 [H, W], the disparity of the other photograph.
-        side: -1 for the left photograph, whose background is uncovered to the left of the foreground, and
-            which shows at column x what is at x - disparity in the other; 1 for the right one.
-        hidden_px: float32 [H, W] to write.
-        colours: uint8 RGB [H, W, 3], of which the hidden pixels are written.
-        first: the first row, which does not follow the one above.
-        end: the row to end before.
+        photo: uint8 RGB [H, W, 3], the image.
+        disparity_px: float32 [H, W], its disparity.
+        nearer_px: float32 [H, W], largest disparity in the 3x3 window minus the pixel's own.
+        other_px: float32 [H, W], the other image's disparity.
+        side: -1 for the left image, whose background is uncovered to the left of the foreground and whose
+            column x corresponds to x - disparity in the other image; 1 for the right image.
+        hidden_px: float32 [H, W], output: disparity or NOTHING.
+        colours: uint8 RGB [H, W, 3], output: written at hidden pixels only.
+        first: First row of the band; it does not use the row above.
+        end: Row after the last.
     """
     width = disparity_px.shape[1]
-    origins = np.empty((2, width, 2), np.int32)  # where the colours of this row and the one above come from
-    borders = np.empty(width, np.int32)  # beside which pixel of the background the foreground begins
+    origins = np.empty((2, width, 2), np.int32)  # source pixels of the colours in this row and the one above
+    borders = np.empty(width, np.int32)  # column of the last visible background pixel before the foreground
     for y in range(first, end):
         _find_hidden(disparity_px[y], other_px[y], side, hidden_px[y], borders)
         for k in range(width):
-            # From the borders inwards, so that a pixel's neighbour towards the background is known.
+            # From the edges inwards, so that the neighbour towards the background is already written.
             x = k if side < 0 else width - 1 - k
             origins[y % 2, x, 0], origins[y % 2, x, 1] = y, x
             if hidden_px[y, x] > NOTHING:
@@ -59,7 +60,7 @@ def uncover(photo, disparity_px, nearer_px, other_px, side, hidden_px, colours, 
 @compiled
 @typing.no_type_check
 def _find_hidden(disparity_px, other_px, side, hidden_px, borders):
-    """Write for a row where the background goes on behind the foreground, unseen by both cameras."""
+    """Write where a row's background continues behind the foreground, unseen by both cameras."""
     width = disparity_px.shape[0]
     hidden_px[:] = NOTHING
     for seen in range(width):
@@ -77,7 +78,7 @@ def _find_hidden(disparity_px, other_px, side, hidden_px, borders):
             there = round(at + side * behind_px)
             if 0 <= there < width and abs(other_px[there] - behind_px) <= SAME_SURFACE_PX:
                 continue
-            # Of two borders the closer one decides.
+            # The closer of two edges decides.
             if hidden_px[at] == NOTHING or abs(at - borders[at]) > abs(k):
                 hidden_px[at], borders[at] = behind_px, seen
 
@@ -85,16 +86,16 @@ def _find_hidden(disparity_px, other_px, side, hidden_px, borders):
 @compiled
 @typing.no_type_check
 def _copy_example(photo, disparity_px, nearer_px, hidden_px, colours, origins, border, first, y, x, side):
-    """Write the colour of a hidden pixel, whose background is on that side of it: -1 left, 1 right."""
+    """Write the colour of a hidden pixel; `side` is the direction of its visible background, -1 or 1."""
     width = disparity_px.shape[1]
     d = hidden_px[y, x]
     best, best_y, best_x = math.inf, -1, -1
     searches = not _can_continue(disparity_px, nearer_px, origins[y % 2, x + side], side, d)
     compared = 7 if searches else 4
-    # Fresh places to take it from: all along the row where the neighbour's does not go on, else the mirrored
-    # one and one that is as good as drawn by lot.
+    # New candidates: a stretch of the row if the neighbour's source cannot continue, else the mirrored pixel
+    # and a pseudo-random one.
     for k in range(4 + (_LOOK_PX if searches else 2)):
-        if k < 4:  # next to where a neighbour's colour comes from
+        if k < 4:  # next to the source of a neighbour's colour
             row, column = y - (k > 0), x + side * _neighbour_offset(k)
             if row < first or column < 0 or column >= width:
                 continue
@@ -120,14 +121,14 @@ def _copy_example(photo, disparity_px, nearer_px, hidden_px, colours, origins, b
 @inlined
 @typing.no_type_check
 def _can_continue(disparity_px, nearer_px, origin, side, d):
-    """Whether what follows the origin of a neighbour's colour is an example for the next pixel."""
+    """Whether the pixel after the source of a neighbour's colour can be copied to the next pixel."""
     return _is_example(disparity_px, nearer_px, origin[0], origin[1] - side, d)
 
 
 @inlined
 @typing.no_type_check
 def _is_example(disparity_px, nearer_px, y, x, d):
-    """Whether that is a pixel of the surface of disparity d, with none of a nearer one's colour."""
+    """Whether the pixel is on the surface of disparity d and free of a nearer surface's colour."""
     height, width = disparity_px.shape
     if y < 0 or y >= height or x < 0 or x >= width:
         return False
@@ -139,7 +140,7 @@ def _is_example(disparity_px, nearer_px, y, x, d):
 def _compare_surroundings(
     photo, disparity_px, hidden_px, colours, y, x, at_y, at_x, side, compared, first, enough
 ):
-    """The mean squared difference of what is known around (y, x) and around (at_y, at_x)."""
+    """Mean squared colour difference between the known neighbours of (y, x) and those of (at_y, at_x)."""
     width = disparity_px.shape[1]
     total, count = 0.0, 0
     for k in range(compared):
@@ -148,7 +149,7 @@ def _compare_surroundings(
         if row < first or like_y < 0 or min(column, like_x) < 0 or max(column, like_x) >= width:
             continue
         seen = hidden_px[row, column] == NOTHING
-        # What is neither hidden nor of this surface is the foreground.
+        # Neither hidden nor on this surface: foreground.
         if seen and abs(disparity_px[row, column] - hidden_px[y, x]) > _ALIKE_PX:
             continue
         count += 1
@@ -164,5 +165,5 @@ def _compare_surroundings(
 @inlined
 @typing.no_type_check
 def _neighbour_offset(k):
-    """How far towards the background neighbour k is: 0 beside, 1 to 3 above, from 4 on farther beside."""
+    """Column offset of neighbour k towards the background: 0 beside, 1 to 3 above, from 4 farther beside."""
     return k - 2 if k > 3 else 1 - (k == 1) - 2 * (k == 3)

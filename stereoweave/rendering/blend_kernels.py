@@ -1,4 +1,4 @@
-"""What colour a pixel of the new view has, from both photographs, where one of them shows its surface."""
+"""Kernels that blend both images into the new view, where at least one shows a pixel's surface."""
 
 import typing
 
@@ -8,20 +8,20 @@ from stereoweave.rendering.canvas_kernels import NOTHING, SAME_SURFACE_PX, suppo
 from stereoweave.system.jit import compiled, inlined
 
 RIM = 0.15
-"""A surface with no more support than this is seen by one photograph alone, and through impure pixels."""
+"""Largest support of a surface that is seen in one image only, and there in impure pixels."""
 
 WINDOW_REACH_PX = 2
-"""The photographs are aligned over windows of 5x5 pixels."""
+"""Half size of the alignment window, 5x5 pixels."""
 LARGEST_STEP_PX = np.float32(1)
-"""A disparity is moved by this at most."""
+"""Largest change of a disparity by the alignment."""
 FLAT_LEVELS2 = np.float32(30)
-"""Where the squared slope of the grey values is less than this, on average, there is nothing to align."""
+"""Regularisation: mean squared grey-level slope below which a window is too flat to align."""
 DOUBLES_REACH_PX = 12
-"""What is doubled is thin: on both sides, pixels that are not lie within so many."""
+"""A doubled object is thin: pixels that are not doubled lie within this distance on both sides."""
 AGREED_LEVELS = 30
-"""Photographs that differ by no more than this, summed over the channels, show the same."""
+"""Images agree where they differ by at most this, summed over the channels."""
 ALIKE_LEVELS, UNLIKE_LEVELS = 20, 60
-"""What differs by less than the first goes with its surroundings, by more than the second it does not."""
+"""A colour belongs to its surroundings if it differs by at most the first, not if by at least the second."""
 _HALF, _ONE, _LARGEST = np.float32(0.5), np.float32(1), np.float32(255)
 _LEAST = np.float32(1e-9)
 _1, _2, _3 = np.uint32(1), np.uint32(2), np.uint32(3)
@@ -30,9 +30,9 @@ _1, _2, _3 = np.uint32(1), np.uint32(2), np.uint32(3)
 @compiled
 @typing.no_type_check
 def compare_row(left, right, y, row, sums):
-    """Write how the photographs differ where both show a pixel's only surface: sums [3, W] over 5 columns.
+    """Write the terms of the alignment, sums [3, W] over 5 columns, where both images show the only surface.
 
-    Summed are the difference of the grey levels times its slope by disparity, that slope squared, and 1.
+    The terms are the grey-level difference times its derivative by disparity, that derivative squared, and 1.
     """
     width = row.front_px.shape[0]
     left_grey, left_slope, right_grey, right_slope = np.empty((4, width), np.float32)
@@ -55,10 +55,10 @@ def compare_row(left, right, y, row, sums):
 @compiled
 @typing.no_type_check
 def align_row(sums, row):
-    """Move a row's disparities so that the photographs match there; sums [5, 3, W].
+    """Refine a row's disparities so that the images align; sums [5, 3, W].
 
-    It is one step of Lucas and Kanade. A matcher's noise would show as blur otherwise: each photograph would
-    be sampled beside the right place.
+    One Lucas-Kanade step. Without it, matching noise shows as blur, because each image is sampled slightly
+    off the surface.
     """
     width = row.front_px.shape[0]
     for u in range(width):
@@ -74,7 +74,7 @@ def align_row(sums, row):
 @compiled
 @typing.no_type_check
 def _sample_grey_row(side, y, front_px, grey, slope):
-    """Write the photograph's grey level at each surface of a row, and how it rises with the disparity."""
+    """Write an image's grey level at each surface of a row, and its derivative by disparity."""
     photo = side.grey[y]
     shift, offset_px = np.float32(side.shift), np.float32(side.offset_px)
     width = front_px.shape[0]
@@ -92,7 +92,7 @@ def _sample_grey_row(side, y, front_px, grey, slope):
 @inlined
 @typing.no_type_check
 def _pad(row, padded):
-    """Write a row as float32 with one more pixel before and three behind it."""
+    """Write a row as float32, padded by one pixel before and three after it."""
     width = row.shape[0]
     for x in range(width):
         padded[x + 1] = row[x]
@@ -103,14 +103,14 @@ def _pad(row, padded):
 @inlined
 @typing.no_type_check
 def _clamp_column(x, width):
-    """The real column, or the border's nearest to it."""
+    """Clamp a fractional column to the image."""
     return min(max(x, np.float32(0)), np.float32(width - 1))
 
 
 @compiled
 @typing.no_type_check
 def _sample_colour_row(side, y, front_px, padded, colours):
-    """Write the photograph's colour [3, W] at each surface of a row, by a cubic (Keys 1981, a = -1/2)."""
+    """Write an image's colours [3, W] at a row's surfaces, by cubic convolution (Keys 1981, a = -1/2)."""
     shift, offset_px = np.float32(side.shift), np.float32(side.offset_px)
     width = front_px.shape[0]
     for channel in range(3):
@@ -129,7 +129,7 @@ def _sample_colour_row(side, y, front_px, padded, colours):
 @inlined
 @typing.no_type_check
 def _cubic_weights(f):
-    """What the pixels at -1, 0, 1 and 2 weigh at f in 0..1; float32."""
+    """Weights of the pixels at -1, 0, 1 and 2 for a sample at f in 0..1; float32."""
     w0 = ((-_HALF * f + _ONE) * f - _HALF) * f
     w1 = (np.float32(1.5) * f - np.float32(2.5)) * f * f + _ONE
     w3 = (_HALF * f - _HALF) * f * f
@@ -139,9 +139,9 @@ def _cubic_weights(f):
 @compiled
 @typing.no_type_check
 def paint_row(left, right, y, row, canvas):
-    """Write a row's colours into image, into pure whether they come from pure pixels, and surface_px.
+    """Write a row's image, pure and surface_px on the canvas.
 
-    Where no photograph shows the surface, the image stays as it is.
+    The image is unchanged where neither input image shows the surface.
     """
     front_px, in_left, in_right = row.front_px, row.in_left, row.in_right
     surface_px, image, pure = canvas.surface_px[y], canvas.image[y], canvas.pure[y]
@@ -172,13 +172,14 @@ def paint_row(left, right, y, row, canvas):
 @compiled
 @typing.no_type_check
 def _resolve_doubles(row, left_colours, right_colours, of_left):
-    """Take from one photograph alone what would be doubled: a thin thing that both disparity maps have lost.
+    """Avoid doubling thin objects that both disparity maps have missed: use the image that shows background.
 
-    Both photographs show it, before its background and apart. So where they differ, and one of them goes with
-    the pixels of that surface on both sides, on which they agree, the other one shows such a thing.
+    Both images show such an object, but at different places before the background. It is recognised where the
+    images differ, although they agree on the same surface on both sides, and one of them continues its
+    colour; the other image shows the object.
     """
     width = of_left.shape[0]
-    agreed = np.empty(width, np.int32)  # the last pixel before each on which both agree
+    agreed = np.empty(width, np.int32)  # the last column, up to each, in which both images agree
     last = -2 * DOUBLES_REACH_PX
     for u in range(width):
         if (
@@ -208,14 +209,14 @@ def _resolve_doubles(row, left_colours, right_colours, of_left):
 @inlined
 @typing.no_type_check
 def _is_shared_surface(row, u):
-    """Whether both photographs show a pixel's only surface."""
+    """Whether both images show a pixel's only surface."""
     return min(row.in_left[u], row.in_right[u]) >= _HALF and row.back_px[u] == NOTHING
 
 
 @inlined
 @typing.no_type_check
 def _colour_distance_levels(colours, u, others, v):
-    """How two colours of rows [3, W] differ, summed over the channels."""
+    """Absolute difference of two colours of rows [3, W], summed over the channels."""
     red, green, blue = (
         colours[0, u] - others[0, v],
         colours[1, u] - others[1, v],
@@ -227,7 +228,7 @@ def _colour_distance_levels(colours, u, others, v):
 @compiled
 @typing.no_type_check
 def _paint_two(left, right, y, u, row, left_padded, right_padded, canvas):
-    """Write the colour of a pixel that two surfaces share."""
+    """Paint a pixel that two surfaces share."""
     red = green = blue = known = most = support = 0.0
     seen_px = NOTHING
     for layer in range(2):
@@ -260,7 +261,7 @@ def _paint_two(left, right, y, u, row, left_padded, right_padded, canvas):
 @inlined
 @typing.no_type_check
 def _sample_colour(padded, x):
-    """The colour at the real column x of a padded row [3, W + 4], as `_sample_colour_row` finds it."""
+    """Sample a padded row [3, W + 4] at the fractional column x, as `_sample_colour_row` does."""
     x = _clamp_column(np.float32(x), padded.shape[1] - 4)
     i = np.uint32(x)
     w0, w1, w2, w3 = _cubic_weights(x - np.float32(i))

@@ -1,4 +1,4 @@
-"""A drawn view as a camera sees it that is moved up and forward too."""
+"""Warp of a rendered view to a camera that is also moved up and forward."""
 
 import numpy as np
 from jaxtyping import Float
@@ -8,20 +8,21 @@ from stereoweave.rendering.canvas_kernels import Canvas, empty_canvas
 from stereoweave.rendering.hole_filling_kernels import fill
 from stereoweave.stereo import StereoCamera
 
-# A camera that goes forward by more than this share of a point's depth has it all over the picture.
+# Limit of the forward motion as a share of a point's depth; closer, the point would fill the image.
 _MOST_APPROACH = 0.5
 
 
 def move_camera(canvas: Canvas, camera: StereoCamera, offset_px: float, up: float, forward: float) -> Canvas:
-    """The view from above and before the place that the canvas was drawn for: rows first, then columns.
+    """Warp a view to a camera moved up and forward, along the rows first, then along the columns.
 
-    With depth z in baselines, z = focal_px / inverse_px. Forward, everything grows about the centre by
-    z / (z - forward), which is 1 + forward * inverse_px / focal_px with inverse_px after the move.
+    The depth in baselines is z = focal_px / inverse_px. Forward motion magnifies each point about the
+    principal point by z / (z - forward) = 1 + forward * inverse_px / focal_px, with inverse_px after the
+    motion.
 
     Args:
-        canvas: A view from the line through the cameras, filled.
-        camera: Of the left photograph.
-        offset_px: How far the view's principal point lies to the right of that one's.
+        canvas: A view from the line through the cameras, holes filled.
+        camera: The left camera.
+        offset_px: The view's principal point relative to the left camera's, to the right.
         up: In baselines.
         forward: In baselines.
     """
@@ -39,14 +40,14 @@ def move_camera(canvas: Canvas, camera: StereoCamera, offset_px: float, up: floa
 def _magnify(
     places: np.ndarray, centre_px: float, growth: Float[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w"]:
-    """Where these rows or columns are after growing about a centre, each pixel by its own share."""
+    """Positions of rows or columns after magnification about a centre by 1 + growth per pixel."""
     return places + (places - centre_px) * growth
 
 
 def _move_rows(
     canvas: Canvas, targets: Float[np.ndarray, "h w"], disparity_px: Float[np.ndarray, "h w"]
 ) -> Canvas:
-    """The view with each pixel at its target column, where it has that disparity; filled."""
+    """Move each pixel to its target column, with its new disparity, and fill the holes."""
     result = empty_canvas(canvas.image)
     ends = (np.ascontiguousarray(x, np.float32) for x in (targets, disparity_px))
     move(canvas.image, canvas.surface_px, canvas.drawn, *ends, result)
@@ -55,5 +56,5 @@ def _move_rows(
 
 
 def _transpose(canvas: Canvas) -> Canvas:
-    """Rows for columns."""
+    """Swap rows and columns."""
     return Canvas(*(np.ascontiguousarray(x.swapaxes(0, 1)) for x in canvas))

@@ -1,4 +1,4 @@
-"""A finished view moved along its rows, each pixel by a way of its own; transposed, along its columns."""
+"""Kernel that warps a view along its rows by a shift per pixel; along its columns, if transposed."""
 
 import math
 import typing
@@ -12,18 +12,18 @@ from stereoweave.system.jit import compiled, kernel
 @kernel
 @typing.no_type_check
 def move(image, surface_px, drawn, targets, disparity_px, canvas):
-    """Write the view whose pixel (y, x) goes to the real column targets[y, x] of the canvas; near wins.
+    """Move each pixel (y, x) to the fractional column targets[y, x] of the canvas; the nearer one wins.
 
-    Neighbours on one surface are joined, so that nothing cracks where it grows. Where nothing comes to lie,
-    the canvas is not pure.
+    Colours are interpolated between neighbours on one surface, so that magnified surfaces have no cracks.
+    Pixels on which nothing lands stay impure.
 
     Args:
         image: uint8 RGB [H, W, 3].
-        surface_px: float32 [H, W], what tells surfaces apart.
+        surface_px: float32 [H, W], disparity before the motion; it separates surfaces.
         drawn: bool [H, W].
         targets: float32 [H, W].
-        disparity_px: float32 [H, W], after the move.
-        canvas: An empty one.
+        disparity_px: float32 [H, W], after the motion.
+        canvas: Empty canvas, output.
     """
     for y in range(image.shape[0]):
         _move_row(image[y], surface_px[y], drawn[y], targets[y], disparity_px[y], y, canvas)
@@ -39,7 +39,7 @@ def _move_row(image, surface_px, drawn, targets, disparity_px, y, canvas):
         after = min(x + 1, width - 1)
         right_end = x == width - 1 or abs(surface_px[after] - surface_px[x]) > SAME_SURFACE_PX
         begin = targets[x] - 0.5 if left_end else targets[x]
-        # A pixel that has no neighbour on its surface reaches half a pixel to either side.
+        # A pixel without a neighbour on its surface reaches half a pixel to either side.
         end = targets[x] + 0.5 if right_end else targets[after]
         stretch = 1.0 if right_end else targets[after] - targets[x]
         if stretch <= 0:
@@ -56,7 +56,7 @@ def _move_row(image, surface_px, drawn, targets, disparity_px, y, canvas):
 @compiled
 @typing.no_type_check
 def _copy(image, surface_px, x, part, colour):
-    """Write the colour between pixel x and the next; by a cubic where all four are of one surface."""
+    """Write the colour between pixel x and the next: cubic if all four are on one surface, else linear."""
     width = image.shape[0]
     a, b, c, d = max(x - 1, 0), x, min(x + 1, width - 1), min(x + 2, width - 1)
     w0, w1, w2, w3 = 0.0, 1.0 - part, part, 0.0

@@ -1,6 +1,6 @@
-"""What the renderer's loops over pixels have in common: photographs and canvas, splatting, support.
+"""Types and kernels shared by the renderer: input images, canvas, splatting, support.
 
-A plain version of all this is in tests/plain_rendering.py, and has to agree.
+Reference implementation, which tests compare: tests/helpers/plain_rendering.py.
 """
 
 import math
@@ -11,28 +11,28 @@ import numpy as np
 from stereoweave.system.jit import compiled, inlined, kernel
 
 NOTHING = np.float32(-1e9)
-"""The disparity of a pixel that nothing lands on: behind everything, yet finite."""
+"""Disparity of a pixel on which nothing lands: behind everything, but finite."""
 SAME_SURFACE_PX = np.float32(3)
-"""Disparities at most this far apart are taken for one surface: a matcher's noise, or a slant."""
+"""Largest disparity difference within one surface, from matching noise or slant."""
 FADE_PX = np.float32(2)
-"""Over this further difference, a photograph's claim to show the surface fades to none."""
+"""Further difference over which an image's support for a surface falls to 0."""
 IMPURE = np.float32(0.1)
-"""What a pixel that may carry the colour of a nearer neighbour weighs beside a pure one."""
+"""Weight, relative to a pure pixel, of one that may carry a nearer neighbour's colour."""
 PARTED_PX = np.float32(1)
-"""A nearer neighbour's colour is out of place once the new view parts the two by more than this."""
+"""Parallax in the new view above which a nearer neighbour's colour is out of place."""
 
 
 class Side(typing.NamedTuple):
-    """One photograph and what is known about it; arrays are [H, W], and C-contiguous.
+    """One input image and its maps; arrays are C-contiguous [H, W] unless stated.
 
     Attributes:
         photo: uint8 RGB [H, W, 3].
         grey: uint8.
         disparity_px: float32; column x lands at x + shift * disparity_px + offset_px in the new view.
-        nearer_px: float32, how much nearer the nearest of a pixel and its eight neighbours is.
-        shift: -position for the left side, 1 - position for the right one.
-        offset_px: by which the whole view is moved.
-        nearness: the photograph's weight by its camera's distance to the new one; the two add up to 1.
+        nearer_px: float32; largest disparity in the 3x3 window minus the pixel's own.
+        shift: -position for the left image, 1 - position for the right one.
+        offset_px: Shift of the whole view to the right.
+        nearness: Weight from the distance between its camera and the new one; both images' weights sum to 1.
     """
 
     photo: np.ndarray
@@ -45,13 +45,13 @@ class Side(typing.NamedTuple):
 
 
 class Canvas(typing.NamedTuple):
-    """The new view; arrays are [H, W], and C-contiguous.
+    """The new view; arrays are C-contiguous [H, W] unless stated.
 
     Attributes:
-        surface_px: float32, the disparity of the surface that has most of a pixel, or NOTHING.
+        surface_px: float32; disparity of the surface that covers most of a pixel, or NOTHING.
         image: uint8 RGB [H, W, 3].
-        pure: bool, whether the colour comes from more than the rim of something nearer.
-        drawn: bool, whether the colour comes from a photograph at all.
+        pure: bool; whether the colour is free of a nearer surface's colour.
+        drawn: bool; whether the colour comes from an input image.
     """
 
     surface_px: np.ndarray
@@ -61,7 +61,7 @@ class Canvas(typing.NamedTuple):
 
 
 def empty_canvas(photo: np.ndarray) -> Canvas:
-    """A canvas that shows a photograph, uint8 RGB [H, W, 3], until it is drawn on; some rows never are."""
+    """Create a canvas that shows an image, uint8 RGB [H, W, 3], in rows that are never drawn."""
     size = photo.shape[:2]
     return Canvas(
         surface_px=np.full(size, NOTHING, np.float32),
@@ -72,13 +72,13 @@ def empty_canvas(photo: np.ndarray) -> Canvas:
 
 
 class SurfaceRow(typing.NamedTuple):
-    """What is known about a row of the new view before it is painted; arrays are float32 [W].
+    """Surfaces in a row of the new view, before it is painted; arrays are float32 [W].
 
     Attributes:
-        front_px: the disparity that a pixel shows, or NOTHING.
-        back_px: that of a second surface in the pixel, or NOTHING.
-        share: the front's part of the pixel, 0..1; the rest is the back's.
-        in_left, in_right: how much of the photographs' pixels there shows the front: 0..1.
+        front_px: Disparity of the visible surface, or NOTHING.
+        back_px: Disparity of a second surface in the pixel, or NOTHING.
+        share: Part of the pixel that the front covers, 0..1; the back covers the rest.
+        in_left, in_right: Support of the front in each input image, 0..1.
     """
 
     front_px: np.ndarray
@@ -94,10 +94,10 @@ _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 @compiled
 @typing.no_type_check
 def splat_row(disparity_px, shift, offset_px, landed_px):
-    """Write into landed_px [W] the nearest disparity that lands on each pixel of the new view, or NOTHING.
+    """Write to landed_px [W] the nearest disparity that lands on each pixel of the new view, or NOTHING.
 
-    Neighbours on one surface are joined by a straight line, so that slants and magnified surfaces have no
-    cracks; the pixels at a surface's border reach half a pixel further.
+    Disparity is interpolated linearly between neighbours on one surface, so that slanted and magnified
+    surfaces have no cracks. The pixels at a surface's edge reach half a pixel further.
     """
     width = disparity_px.shape[0]
     landed_px[:] = NOTHING
@@ -112,7 +112,7 @@ def splat_row(disparity_px, shift, offset_px, landed_px):
         last = math.ceil(u + 0.5) - 1 if right_end else math.floor(u)
         for column in range(max(first, 0), min(last, width - 1) + 1):
             landed_px[column] = max(landed_px[column], d)
-        # Where stretch <= 0, the surface turns its back on the new view.
+        # Where stretch <= 0, the surface faces away from the new view.
         stretch = 1.0 + shift * rise
         if not right_end and stretch > 0:
             slope = rise / stretch
@@ -123,15 +123,15 @@ def splat_row(disparity_px, shift, offset_px, landed_px):
 @kernel
 @typing.no_type_check
 def splat(disparity_px, shift, offset_px, landed_px):
-    """`splat_row` for all rows of landed_px [H, W]."""
+    """Splat all rows into landed_px [H, W]; see `splat_row`."""
     for y in range(disparity_px.shape[0]):
         splat_row(disparity_px[y], shift, offset_px, landed_px[y])
 
 
 @inlined
 @typing.no_type_check
-def linear(row, x):
-    """`row` [W] at the real column x; the border goes on."""
+def sample_linear(row, x):
+    """Sample `row` [W] linearly at the fractional column x, clamped to the border."""
     last = row.shape[0] - 1
     i = math.floor(x)
     # As floats, because the difference of two uint8 wraps around.
@@ -143,16 +143,16 @@ def linear(row, x):
 @inlined
 @typing.no_type_check
 def lies_on(apart_px):
-    """1 for what is at most SAME_SURFACE_PX from a surface, falling to 0 over FADE_PX; float32."""
+    """1 up to SAME_SURFACE_PX from a surface, falling to 0 over FADE_PX; float32."""
     return min(_ONE, max(_ZERO, _ONE + (SAME_SURFACE_PX - abs(apart_px)) / FADE_PX))
 
 
 @inlined
 @typing.no_type_check
 def purity(shift, nearer_px):
-    """1, falling to IMPURE where a nearer neighbour's colour may be in a pixel, and is out of place; float32.
+    """1, falling to IMPURE where a pixel may carry a nearer neighbour's colour; float32.
 
-    It is once the new view parts the two by more than PARTED_PX.
+    That colour counts once the parallax between the two in the new view exceeds PARTED_PX.
     """
     return min(_ONE, max(IMPURE, _ONE + PARTED_PX - abs(shift) * nearer_px))
 
@@ -160,9 +160,9 @@ def purity(shift, nearer_px):
 @compiled
 @typing.no_type_check
 def support_in_row(side, y, front_px, support):
-    """Write how much of the photograph shows each front_px [W] of a row: 0..1, float32.
+    """Write an image's support for each surface front_px [W] of a row: 0..1, float32.
 
-    Two pixels of the photograph show it, as far as each lies on that surface, and pure ones more than others.
+    The support is interpolated between two pixels, each weighted by `lies_on` and `purity`.
     """
     disparity_px, nearer_px = side.disparity_px[y], side.nearer_px[y]
     shift, offset_px = np.float32(side.shift), np.float32(side.offset_px)
@@ -183,7 +183,7 @@ def support_in_row(side, y, front_px, support):
 @inlined
 @typing.no_type_check
 def support_at(disparity_px, nearer_px, shift, x, d):
-    """As `support_in_row`, for the surface of disparity d at the real column x of the photograph's row."""
+    """Support for the surface of disparity d at an image row's fractional column x; see `support_in_row`."""
     last = disparity_px.shape[0] - 1
     if x < -0.5 or x > last + 0.5:
         return 0.0

@@ -1,4 +1,4 @@
-"""A band of rows of the new view, from both photographs."""
+"""Kernel that renders a band of rows of the new view from both input images."""
 
 import typing
 
@@ -15,11 +15,11 @@ _RING = 2 * WINDOW_REACH_PX + 1
 @kernel
 @typing.no_type_check
 def draw(left, right, confidence, canvas, first, end):
-    """Write the rows from `first` to before `end` of the canvas.
+    """Render the canvas rows from `first` up to but not including `end`.
 
-    In rectified photographs everything moves along the rows, so each is placed by itself; but it is aligned
-    by those within WINDOW_REACH_PX. So painting follows that many rows behind, and the few rows that are kept
-    stay in the fastest memory: three times as quick as whole pictures, step by step.
+    In a rectified pair all motion is along rows, so surfaces are chosen row by row. Alignment needs the rows
+    within WINDOW_REACH_PX, so painting follows that many rows behind. The few rows in the ring buffer stay in
+    the cache: three times as fast as running each step over the whole image.
     """
     height, width = canvas.surface_px.shape
     kept = np.empty((5, _RING, width), np.float32)
@@ -43,6 +43,6 @@ def draw(left, right, confidence, canvas, first, end):
 @compiled
 @typing.no_type_check
 def _select_row(kept, y):
-    """The place of a row among those that are kept."""
+    """Slot of a row in the ring buffer."""
     i = y % _RING
     return SurfaceRow(kept[0, i], kept[1, i], kept[2, i], kept[3, i], kept[4, i])

@@ -1,4 +1,4 @@
-"""What colour a pixel of the new view has that no photograph shows: the background's, continued."""
+"""Hole filling: background colours for the pixels of the new view that neither image shows."""
 
 import math
 import typing
@@ -7,20 +7,20 @@ from stereoweave.rendering.canvas_kernels import NOTHING, SAME_SURFACE_PX
 from stereoweave.system.jit import compiled, kernel
 
 NARROW_PX = 8
-"""A hole of at most so many pixels needs no texture."""
+"""Widest hole that is filled with one colour, without texture."""
 
 
 @kernel
 @typing.no_type_check
-def lay(hidden_px, colours, shift, offset_px, canvas):
-    """Write the hidden background (background_kernels.uncover) where the canvas has no pure colour.
+def paint_background(hidden_px, colours, shift, offset_px, canvas):
+    """Paint the hidden background (`background_kernels.uncover`) where the canvas has no pure colour.
 
-    A pixel on the rim of something keeps its colour if it is farther than that: a gap in a fence stays open.
+    Impure pixels farther than that background keep their colour, so that a gap in a fence stays open.
     """
     height, width = hidden_px.shape
     for y in range(height):
         for k in range(width):
-            # What lands on one pixel comes nearest first, so that nothing is laid twice.
+            # Visit the nearest first among those that land on one pixel, so that each is painted once.
             x = k if shift > 0 else width - 1 - k
             d = hidden_px[y, x]
             if d == NOTHING:
@@ -38,7 +38,7 @@ def lay(hidden_px, colours, shift, offset_px, canvas):
 @compiled
 @typing.no_type_check
 def _mix(hidden_px, colours, x, beyond, colour):
-    """Write the colour between the hidden pixel x and its neighbour, `beyond` pixels from it."""
+    """Write the colour interpolated `beyond` pixels from the hidden pixel x, towards its neighbour there."""
     beside = x + (1 if beyond > 0 else -1)
     part = abs(beyond)
     if beside < 0 or beside >= hidden_px.shape[0] or abs(hidden_px[beside] - hidden_px[x]) > SAME_SURFACE_PX:
@@ -51,11 +51,11 @@ def _mix(hidden_px, colours, x, beyond, colour):
 @kernel
 @typing.no_type_check
 def fill(canvas):
-    """Give every run of pixels that are still not pure what is seen beside its farther end.
+    """Fill every run of pixels that are still impure from the surface beside its farther end.
 
-    That is one mean colour for a narrow run, which errs least. A wide one shows texture, mirrored at that
-    end, and so does one at the picture's border, which has one end only. As in `lay`, a farther pixel on the
-    rim keeps its colour.
+    A narrow run gets one mean colour, which has the least error. A wide run gets the texture mirrored at that
+    end, as does a run at the image border, which has one end only. As in `paint_background`, impure pixels
+    farther than that surface keep their colour.
     """
     surface_px, pure, drawn = canvas.surface_px, canvas.pure, canvas.drawn
     height, width = pure.shape
@@ -83,7 +83,7 @@ def fill(canvas):
 @compiled
 @typing.no_type_check
 def _average_beside(canvas, y, column, inwards):
-    """The mean colour of the surface at (y, column): two columns of three rows, its own counting twice."""
+    """Mean colour of the surface at (y, column) over two columns and three rows; its own row counts twice."""
     height, width = canvas.pure.shape
     here_px = canvas.surface_px[y, column]
     red = green = blue = total = 0.0
@@ -101,7 +101,7 @@ def _average_beside(canvas, y, column, inwards):
 @compiled
 @typing.no_type_check
 def _fill_pixel(canvas, y, u, source, colour, mirrors):
-    """Write a colour, or what lies as far beyond the source as u lies before it if that is of its surface."""
+    """Write the pixel mirrored at the source if it is on the source's surface, else a plain colour."""
     width = canvas.pure.shape[1]
     mirrored = min(max(2 * source - u, 0), width - 1)
     apart_px = abs(canvas.surface_px[y, mirrored] - canvas.surface_px[y, source])

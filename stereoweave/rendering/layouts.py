@@ -1,8 +1,8 @@
-"""Layouts: views of a pair as 3-D viewers and displays take them, and as pictures that move.
+"""Output layouts for 3-D viewers and displays, and animations.
 
-A layout makes one picture, uint8 RGB, of a `Renderer`, so that a film can do the same for each of its frames;
-a motion is a row of views. The two eyes are the positions 0 and 1 of the renderer, whose strength and
-convergence they keep to.
+A layout composes one image, uint8 RGB, from the views of a `Renderer`; a video applies it to every frame. An
+animation is a sequence of views. The left and right eye are the renderer's positions 0 and 1, with its
+strength and convergence.
 """
 
 import math
@@ -22,26 +22,26 @@ from stereoweave.io.files import checking_format_size, picture_kind, replacing, 
 from stereoweave.rendering.renderer import FIRST_POSITION, LAST_POSITION, Renderer
 from stereoweave.stereo import Estimate, StereoPair
 
-# A quilt's viewers move their heads much farther than a pair's cameras are apart, so they ask for a wide fan
-# of views; the outer ones, which are seen least, may be the ones that were mostly invented.
+# Viewers of a quilt move their heads much farther than the cameras are apart, so a quilt needs a wide range
+# of positions. The outer views may consist mostly of filled holes, but are seen least.
 _FAN = (-0.5, 1.5)
-# The largest quilt that the maker of the displays asks for (its 32 inch and 65 inch ones).
+# The largest quilt that Looking Glass recommends (for its 32 inch and 65 inch displays).
 _QUILT_SIDE_PX = 8192
 _MOST_VIEWS = 200
 _SHEET_SIDE = 3
 
-# Rec. 601's luma, as JPEG and OpenCV count it.
+# Luma of Rec. 601, as in JPEG and OpenCV.
 _GREY = (0.299, 0.587, 0.114)
 _RED, _GREEN, _BLUE = np.eye(3)
 _NOTHING = (0.0, 0.0, 0.0)
-# Red, green and blue of a red-cyan anaglyph, each as shares of the left picture's three and the right one's.
+# Red-cyan anaglyphs: 3x3 RGB matrices of the left and the right view, whose products are added.
 _ANAGLYPHS = {
     "grey": ([_GREY, _NOTHING, _NOTHING], [_NOTHING, _GREY, _GREY]),
     "colour": ([_RED, _NOTHING, _NOTHING], [_NOTHING, _GREEN, _BLUE]),
     "half_colour": ([_GREY, _NOTHING, _NOTHING], [_NOTHING, _GREEN, _BLUE]),
-    # E. Dubois, "Conversion of a Stereo Pair to Anaglyph with the Least-Squares Projection Method", 2009; the
-    # method: ICASSP 2001. It is one for linear light; like most programs, and like his own recipe for
-    # Photoshop, this applies the matrices to the stored values.
+    # E. Dubois, "Conversion of a Stereo Pair to Anaglyph with the Least-Squares Projection Method", 2009;
+    # method in ICASSP 2001. It is derived for linear light; like most programs and his own Photoshop recipe,
+    # this applies the matrices to the stored values.
     "dubois": (
         [
             (0.456100, 0.500484, 0.176381),
@@ -59,12 +59,12 @@ _ANAGLYPHS = {
 
 @dataclass(frozen=True, kw_only=True)
 class LayoutOptions:
-    """What can be chosen about a layout.
+    """Options of a layout.
 
     Attributes:
-        columns, rows: How many views a quilt has in a row, and in a column.
-        range_px: The disparities that rgbd shows as black and as white; a picture's own unless given.
-            A film has one for all its frames, so that it does not flicker.
+        columns, rows: Number of views in a row and in a column of a quilt.
+        range_px: Disparities of black and white in rgbd; default: the image's own range. A video uses one
+            range for all frames, to avoid flicker.
     """
 
     columns: int = 8
@@ -75,7 +75,7 @@ class LayoutOptions:
         if min(self.columns, self.rows) < 1 or not 2 <= self.columns * self.rows <= _MOST_VIEWS:
             raise StereoweaveError(
                 f"quilt: expected columns and rows of 2 to {_MOST_VIEWS} views, "
-                f"got {self.columns}x{self.rows}; the displays' are 5x9, 8x6, 7x7 and 11x6"
+                f"got {self.columns}x{self.rows}; displays take 5x9, 8x6, 7x7 and 11x6"
             )
         if self.range_px is not None and not -math.inf < self.range_px[0] < self.range_px[1] < math.inf:
             raise StereoweaveError(
@@ -86,13 +86,13 @@ class LayoutOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """A way to make one picture of several views.
+    """A way to compose one image from several views.
 
     Attributes:
-        compose: The picture, uint8 RGB.
-        positions: The ends of what it takes its views from.
-        converged: Whether the views lie upon one another, so that the scene's middle should stay in place.
-        mark: What its viewers look for in the name of a file.
+        compose: Function that returns the image, uint8 RGB.
+        positions: The outermost positions of its views.
+        converged: Whether views are overlaid or compared in place, so that mid-scene should have no parallax.
+        mark: File name suffix by which viewers detect the layout.
     """
 
     compose: Callable[[Renderer, LayoutOptions], np.ndarray]
@@ -103,12 +103,12 @@ class Layout:
 
 @dataclass(frozen=True, kw_only=True)
 class Animation:
-    """Views one after another, which begin anew where they end.
+    """A loop of views.
 
     Attributes:
-        positions: Of each frame of one turn.
-        frame_ms: How long each is shown; a multiple of 10, in which GIF counts.
-        mp4_turns: How often an MP4 shows them, which players do not repeat by themselves.
+        positions: Position of each frame of one turn.
+        frame_ms: Duration of a frame; a multiple of 10, the unit of GIF.
+        mp4_turns: Number of turns in an MP4 file, since players do not loop it.
     """
 
     positions: tuple[float, ...]
@@ -117,42 +117,42 @@ class Animation:
     converged: bool = True
 
     def turns(self, path: str | Path) -> int:
-        """How many turns a file of that name shows."""
+        """Number of turns in a file of this format."""
         return self.mp4_turns if check_animation_ending(path) == ".mp4" else 1
 
 
 def render_views(renderer: Renderer, positions: Iterable[float]) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """The views from these positions, uint8 RGB [H, W, 3], each rendered when it is asked for."""
+    """Render the views from these positions lazily, uint8 RGB [H, W, 3]."""
     return (renderer.view(position).image for position in positions)
 
 
 def side_by_side(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """Both eyes' pictures, the left one on the left: twice the width."""
+    """Both eyes' views, the left eye's on the left: twice the width."""
     return np.hstack(_render_eyes(renderer))
 
 
 def side_by_side_half(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """As `side_by_side`, each picture at half its width; of an odd one the last column is repeated."""
+    """Both eyes' views side by side, each at half its width; an odd width repeats the last column."""
     return np.hstack([_halve(eye, axis=1) for eye in _render_eyes(renderer)])
 
 
 def crossed(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """Both eyes' pictures, the right one on the left, to be seen with crossed eyes."""
+    """Both eyes' views, the right eye's on the left, for cross-eyed viewing."""
     return np.hstack(_render_eyes(renderer)[::-1])
 
 
 def top_bottom(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """Both eyes' pictures, the left one above: twice the height."""
+    """Both eyes' views, the left eye's on top: twice the height."""
     return np.vstack(_render_eyes(renderer))
 
 
 def top_bottom_half(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """As `top_bottom`, each picture at half its height; of an odd one the last row is repeated."""
+    """Both eyes' views, the left eye's on top, each at half height; an odd height repeats its last row."""
     return np.vstack([_halve(eye, axis=0) for eye in _render_eyes(renderer)])
 
 
 def make_anaglyph(kind: str) -> Callable[[Renderer, LayoutOptions], np.ndarray]:
-    """A layout for glasses whose left glass is red, the right one cyan; by the name of its matrices."""
+    """Return the `compose` function of a red-cyan anaglyph, red for the left eye; `kind` in `_ANAGLYPHS`."""
     shares = [np.array(matrix, np.float32) for matrix in _ANAGLYPHS[kind]]
 
     def compose(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
@@ -160,16 +160,16 @@ def make_anaglyph(kind: str) -> Callable[[Renderer, LayoutOptions], np.ndarray]:
             cv2.transform(eye.astype(np.float32), matrix)
             for eye, matrix in zip(_render_eyes(renderer), shares, strict=True)
         )
-        # Rounds and cuts off the sum, as each eye's share alone must not be.
+        # Round and clip the sum; neither eye's part may be clipped alone.
         return cv2.add(left, right, dtype=cv2.CV_8U)
 
     return compose
 
 
 def rgbd(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """The left photograph, and beside it its disparity in grey, near is white: twice the width.
+    """The left image beside its disparity in grey, near is white: twice the width.
 
-    Displays that take colour and depth make views of their own, so strength and convergence are theirs.
+    Strength and convergence have no effect: RGB-D displays render views themselves.
     """
     disparity_px = renderer.estimate.disparity_px
     low_px, high_px = choices.range_px or find_colour_range_px(disparity_px)
@@ -179,10 +179,10 @@ def rgbd(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3
 
 
 def quilt(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """Views from left to right in rows, the first at the bottom left, the last at the top right.
+    """Views in rows from left to right, the first at the bottom left, the last at the top right.
 
-    Source: Looking Glass's definition of a quilt. Views are made smaller where the quilt would have a side
-    above 8192 px.
+    Views are scaled down if a side of the quilt would exceed 8192 px. Source: Looking Glass's quilt
+    definition.
     """
     height, width = renderer.pair.left.shape[:2]
     columns, rows = choices.columns, choices.rows
@@ -191,17 +191,17 @@ def quilt(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 
 
 
 def contact_sheet(renderer: Renderer, choices: LayoutOptions) -> UInt8[np.ndarray, "h w 3"]:
-    """Nine views from -0.5 to 1.5, in the order of reading, each at a third of its size."""
+    """Nine views from -0.5 to 1.5 in reading order, each at a third of its size."""
     return _join_tiles(_render_tiles(renderer, _SHEET_SIDE, _SHEET_SIDE, _SHEET_SIDE))
 
 
-def _swing(count: int) -> tuple[float, ...]:
-    """Positions from 0 to 1 and back, slow at both ends, as a pendulum swings."""
+def _swing_positions(count: int) -> tuple[float, ...]:
+    """Positions from 0 to 1 and back along a cosine, slow at both ends."""
     return tuple((0.5 - 0.5 * np.cos(2 * np.pi * np.arange(count) / count)).tolist())
 
 
-# The marks are those that VR players look for (LR, TB, half), in the words of iw3, the most used conversion
-# tool, where they are full or crossed; of a quilt Looking Glass's.
+# VR players detect LR, TB and half in file names. The marks of full and crossed layouts follow iw3, the most
+# used conversion tool; a quilt's follows Looking Glass.
 LAYOUTS: dict[str, Layout] = {
     "side_by_side": Layout(compose=side_by_side, mark="_LRF_Full_SBS"),
     "side_by_side_half": Layout(compose=side_by_side_half, mark="_half_LR"),
@@ -217,23 +217,23 @@ LAYOUTS: dict[str, Layout] = {
     "contact_sheet": Layout(compose=contact_sheet, positions=_FAN, converged=True),
 }
 ANIMATIONS: dict[str, Animation] = {
-    "sweep": Animation(positions=_swing(80), frame_ms=40, mp4_turns=1),
-    "wiggle": Animation(positions=_swing(12), frame_ms=60, mp4_turns=5),
+    "sweep": Animation(positions=_swing_positions(80), frame_ms=40, mp4_turns=1),
+    "wiggle": Animation(positions=_swing_positions(12), frame_ms=60, mp4_turns=5),
 }
-# What a file of such an ending holds, whether its layout is named or not.
+# Layouts that a file's ending determines.
 _LAYOUT_BY_ENDING = {".mpo": "side_by_side", ".jps": "crossed"}
-# Colour at full resolution, which JPEG halves else, for what is enlarged and compared by two eyes.
+# No chroma subsampling, because stereo pictures are magnified and compared by two eyes.
 _FINE = {"quality": 95, "subsampling": 0}
-# JPEG's marker APP3 and its length; the name; the length of the four bytes that follow: separation 0, the
-# right eye's picture first, side by side, stereo; no comment. Source: ExifTool's table of JPS tags.
+# JPEG marker APP3 and its length; the identifier; the length of the next four bytes: separation 0, right eye
+# first, side by side, stereo; no comment. Source: ExifTool's table of JPS tags.
 _JPS_SEGMENT = b"\xff\xe3\x00\x12_JPSJPS_\x00\x04\x00\x00\x02\x01\x00\x00"
 
 
 def choose_layout(path: str | Path, name: str | None) -> str | None:
-    """The layout for a file, by its name or by its ending; None for a single view.
+    """Return the layout of an output file, given by name or by the file's ending; None for a single view.
 
     Raises:
-        StereoweaveError: An unknown layout, or a file whose ending does not fit it.
+        StereoweaveError: Unknown layout, or one that does not fit the file's ending.
     """
     if name is not None and name not in LAYOUTS | ANIMATIONS:
         raise StereoweaveError(
@@ -243,9 +243,7 @@ def choose_layout(path: str | Path, name: str | None) -> str | None:
     held = _LAYOUT_BY_ENDING.get(ending)
     if held is not None:
         if name not in (None, held):
-            raise StereoweaveError(
-                f"{path}: expected the layout {held} in a file of this ending, found {name}"
-            )
+            raise StereoweaveError(f"{path}: expected the layout {held} for this file ending, found {name}")
         return held
     if name in ANIMATIONS:
         check_animation_ending(path)
@@ -255,11 +253,11 @@ def choose_layout(path: str | Path, name: str | None) -> str | None:
 
 
 def check_positions(positions: Iterable[float], strength: float) -> None:
-    """Raise a StereoweaveError unless there can be views from all these positions at that strength."""
+    """Raise a StereoweaveError if one of these positions cannot be rendered at this strength."""
     for position in positions:
         seen_from = 0.5 + strength * (position - 0.5)
         if not FIRST_POSITION <= seen_from <= LAST_POSITION:
-            by_strength = "" if strength == 1 else f", where strength {strength:g} takes {position:g}"
+            by_strength = "" if strength == 1 else f", position {position:g} at strength {strength:g}"
             raise StereoweaveError(
                 f"expected {FIRST_POSITION:g} to {LAST_POSITION:g} (0 left camera, 1 right), "
                 f"got {seen_from:g}{by_strength}",
@@ -268,17 +266,17 @@ def check_positions(positions: Iterable[float], strength: float) -> None:
 
 
 def median_disparity_px(estimate: Estimate) -> float:
-    """The disparity of the scene's middle in px: the median, each pixel weighted by its confidence."""
-    # Not 0, so that a pair without any confidence has a middle too.
+    """Median disparity in px, weighted by confidence: the middle of the scene."""
+    # Not 0, so that a pair without any confidence has a median too.
     weights = np.maximum(estimate.confidence, 1e-6)
     return float(np.quantile(estimate.disparity_px, 0.5, weights=weights, method="inverted_cdf"))
 
 
 def add_mark(path: str | Path, name: str, pair: StereoPair, choices: LayoutOptions) -> Path:
-    """The path, with the mark in its name by which viewers know the layout; as it is where it has it already.
+    """Append the suffix by which viewers detect the layout to the file name, unless it is already there.
 
-    A quilt's says columns, rows, and width / height of one view: view_qs8x6a0.75.png. An .mpo or .jps file is
-    known by its ending.
+    A quilt's suffix gives columns, rows, and the aspect ratio of one view: view_qs8x6a0.75.png. An .mpo or
+    .jps file needs none.
     """
     path = Path(path)
     if path.suffix.lower() in _LAYOUT_BY_ENDING:
@@ -290,10 +288,10 @@ def add_mark(path: str | Path, name: str, pair: StereoPair, choices: LayoutOptio
 
 
 def write_picture(path: str | Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Writes a layout's picture as the name's ending asks for.
+    """Write a layout's image in the format of the path's ending.
 
-    In an .mpo file, which 3-D cameras write, the halves of `side_by_side` become two pictures, the left eye's
-    first; a .jps file is a JPEG of `crossed` that says so.
+    An .mpo file, the format of 3-D cameras, stores the halves of `side_by_side` as two pictures, the left
+    eye's first. A .jps file is a JPEG of `crossed` with a JPS header.
     """
     ending = Path(path).suffix.lower()
     if ending not in _LAYOUT_BY_ENDING:
@@ -308,12 +306,12 @@ def write_picture(path: str | Path, picture: UInt8[np.ndarray, "h w 3"]) -> None
 
 
 def _render_eyes(renderer: Renderer) -> list[UInt8[np.ndarray, "h w 3"]]:
-    """The left eye's picture and the right one's."""
+    """Render the left eye's view and the right eye's."""
     return list(render_views(renderer, (0.0, 1.0)))
 
 
 def _halve(eye: UInt8[np.ndarray, "h w 3"], axis: int) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Means of two neighbours along an axis; the last of an odd number is a mean with itself."""
+    """Halve one side by averaging neighbours; an odd side is padded with a copy of its last row or column."""
     odd = [(0, side % 2 * (index == axis)) for index, side in enumerate(eye.shape)]
     even = np.pad(eye, odd, "edge")
     height, width = even.shape[:2]
@@ -324,7 +322,7 @@ def _halve(eye: UInt8[np.ndarray, "h w 3"], axis: int) -> UInt8[np.ndarray, "h2 
 def _render_tiles(
     renderer: Renderer, columns: int, rows: int, smaller: float
 ) -> UInt8[np.ndarray, "rows h columns w 3"]:
-    """Views along the fan, so many times smaller, in the order of reading."""
+    """Render views across the whole range of positions, reduced by the factor `smaller`, in reading order."""
     height, width = (max(1, int(side / smaller)) for side in renderer.pair.left.shape[:2])
     tiles = np.empty((rows, height, columns, width, 3), np.uint8)
     for index, view in enumerate(render_views(renderer, np.linspace(*_FAN, rows * columns).tolist())):
@@ -334,6 +332,6 @@ def _render_tiles(
 
 
 def _join_tiles(tiles: UInt8[np.ndarray, "rows h columns w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """The tiles as one picture."""
+    """Join the tiles into one image."""
     rows, height, columns, width, _ = tiles.shape
     return tiles.reshape(rows * height, columns * width, 3)

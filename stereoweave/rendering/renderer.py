@@ -1,4 +1,4 @@
-"""New views from an estimate: what a camera elsewhere on the line through the two would have seen."""
+"""View synthesis: images from virtual cameras on the line through the two real ones, or beside it."""
 
 import math
 from collections.abc import Sequence
@@ -22,22 +22,21 @@ if TYPE_CHECKING:
 FIRST_POSITION, LAST_POSITION = -1.0, 2.0
 _MOST_THREADS = 4
 _LEAST_NEARNESS = 1e-3
-# What is hidden is found in bands of about this many rows, however many threads there are.
+# Rows per band when background is uncovered, independent of the number of threads.
 _BAND_ROWS = 60
 _FARTHEST_MOVE = 1.0
-# So few pixels may be farther than what is taken to be far away: a matcher's errors.
+# Percentile of disparity taken as infinity; matching errors lie below it.
 _FAR_PERCENT = 1
 
 
 class Renderer:
-    """Views of one pair from one estimate, as many as wanted: what they share is made once.
+    """Renderer of any number of views from one pair and its estimate; shared data is computed once.
 
     Attributes:
-        pair: The two photographs, with their camera where it is known.
-        estimate: Of these two photographs.
-        strength: Multiplies the baseline about the middle: p is seen from 0.5 + strength * (p - 0.5).
-        convergence_px: The disparity of the plane that stays in place from view to view; at most the
-            picture's width, of either sign.
+        pair: The two images, and their camera if known.
+        estimate: The pair's estimate.
+        strength: Factor on the baseline about its middle: position p is seen from 0.5 + strength * (p - 0.5).
+        convergence_px: Disparity of the plane that stays in place in all views; from -width to width.
     """
 
     def __init__(
@@ -63,12 +62,12 @@ class Renderer:
         self._confidence = np.require(estimate.confidence, np.float32, ["C", "W"])
 
     def view(self, position: float, *, up: float = 0.0, forward: float = 0.0) -> View:
-        """The view from a position: 0 is the left camera, 1 the right one; see `render`.
+        """Render the view from a position: 0 is the left camera, 1 the right one; see `render`.
 
         Args:
-            position: -1 to 2 after `strength`.
-            up: How far above the line through the cameras, in baselines; -1 to 1.
-            forward: How far before it, in baselines; -1 to 1.
+            position: -1 to 2 after `strength` is applied.
+            up: Distance above the line through the cameras, in baselines; -1 to 1.
+            forward: Distance in front of it, towards the scene, in baselines; -1 to 1.
         """
         check_number("position", position)
         position = 0.5 + self.strength * (position - 0.5)
@@ -87,12 +86,12 @@ class Renderer:
         return View(image=canvas.image, drawn=canvas.drawn)
 
     def _draw(self, position: float) -> "Canvas":
-        """The view from the line through the cameras, filled."""
+        """Render the view from a position on the line through the cameras, holes filled."""
         from stereoweave.rendering.canvas_kernels import empty_canvas
         from stereoweave.rendering.draw_kernels import draw  # Numba takes half a second to import
-        from stereoweave.rendering.hole_filling_kernels import fill, lay
+        from stereoweave.rendering.hole_filling_kernels import fill, paint_background
 
-        # The root, because two photographs have less noise than one: 0.03 dB on rendered views, 0.1 on Venus.
+        # The square root averages more, for less noise: +0.03 dB on rendered views, +0.1 dB on Venus.
         shares = abs(1 - position) ** 0.5, abs(position) ** 0.5
         tables = self._looks.tables(position) if self._looks else (None, None)
         photos = [_recolour(side.photo, table) for side, table in zip(self._sides, tables, strict=True)]
@@ -101,7 +100,7 @@ class Renderer:
                 **photo,
                 shift=end - position,
                 offset_px=(position - 0.5) * self.convergence_px,
-                # Not 0, because the other camera alone sees some things.
+                # Not 0: some surfaces are seen by the other camera only.
                 nearness=max(share / sum(shares), _LEAST_NEARNESS),
             )
             for side, photo, end, share in zip(self._sides, photos, (0, 1), shares, strict=True)
@@ -110,27 +109,27 @@ class Renderer:
         work = partial(draw, left, right, self._confidence, canvas)
         in_bands(work, len(canvas.image), self._threads, self._threads)
         if not 0 <= position <= 1:
-            # In between, what neither camera saw is a few pixels wide; `fill` is quicker, and does as well.
+            # Holes of views between the cameras are a few pixels wide: `fill` alone is faster and as good.
             hidden = self._find_background(right=position > 1)
-            lay(*hidden, (right if position > 1 else left).shift, left.offset_px, canvas)
+            paint_background(*hidden, (right if position > 1 else left).shift, left.offset_px, canvas)
         fill(canvas)
         return canvas
 
     def _find_background(self, right: bool) -> "HiddenBackground":
-        """What is hidden from both cameras, and seen from beyond the right one or the left one."""
+        """Background seen by neither camera but visible from beyond one of them; cached."""
         if right not in self._hidden:
             self._hidden[right] = _uncover_background(self._sides, right, self._threads)
         return self._hidden[right]
 
 
 class HiddenBackground(NamedTuple):
-    """Background that neither camera sees, at a photograph's pixels; see `background_kernels.uncover`."""
+    """Background that neither camera sees, at an input image's pixels; see `background_kernels.uncover`."""
 
     disparity_px: np.ndarray
     colours: np.ndarray
 
 
-def render(  # noqa: PLR0913 - each is a choice of the caller's
+def render(  # noqa: PLR0913 - the options of one view
     left: UInt8[np.ndarray, "h w 3"],
     right: UInt8[np.ndarray, "h w 3"],
     estimate: Estimate,
@@ -143,36 +142,35 @@ def render(  # noqa: PLR0913 - each is a choice of the caller's
     forward: float = 0.0,
     camera: StereoCamera | None = None,
 ) -> View:
-    """The view from a position on the line through the two cameras, or beside it, made of both photographs.
+    """Render the view from a position on the line through the two cameras, or beside it, from both images.
 
-    Both disparity maps are splatted to the new view, where the nearer surface wins. Each pixel takes its
-    colour from the place of its surface in both photographs, weighted by how near their cameras are, and by
-    whether their own disparity agrees: it does not where the camera's sight is blocked. Where the two maps
-    contradict each other, confidence and the photographs' agreement decide. What neither camera saw goes on
-    from the farther side of the gap. Photographs that differ in exposure or colour are brought to one look:
-    that of the left one at 0, that of the right one at 1, and in between on the way.
+    Both disparity maps are splatted to the new view; the nearer surface wins. Each pixel samples both images
+    at its surface. The weights depend on the distance to each camera and on whether the image's own disparity
+    agrees; where the camera's line of sight is blocked, it does not. Where the two maps contradict each
+    other, their confidence and the similarity of the images decide. Holes, seen by neither camera, continue
+    the farther side. Differences in exposure and colour are removed: the view has the colours of the left
+    image at position 0, those of the right image at 1, and a blend in between.
 
-    For many views of one pair make a `Renderer`.
+    To render many views of one pair, use `Renderer`.
 
     Args:
-        left: The left photograph, uint8 RGB [H, W, 3].
-        right: The right one, of the same size.
-        estimate: Of these two photographs (`stereoweave.estimate`).
+        left: Left image, uint8 RGB [H, W, 3].
+        right: Right image, of the same size.
+        estimate: The pair's estimate (`stereoweave.estimate`).
         position: 0 is the left camera, 1 the right one; -1 to 2.
-        threads: How many threads may be used, of which four at most are; all cores if left out.
-        strength: Multiplies the baseline about the middle, as for `Renderer`.
-        convergence_px: The disparity of the plane that stays in place from view to view.
-        up: How far above the line through the cameras, in baselines; -1 to 1.
-        forward: How far before it, in baselines; -1 to 1.
-        camera: For `forward` and `up`, which take its focal length, centre and doffs; without one, the focal
-            length is taken to be the picture's width.
+        threads: Number of threads; at most four are used. Default: all cores.
+        strength: Factor on the baseline about its middle, as in `Renderer`.
+        convergence_px: Disparity of the plane that stays in place in all views.
+        up: Distance above the line through the cameras, in baselines; -1 to 1.
+        forward: Distance in front of it, towards the scene, in baselines; -1 to 1.
+        camera: Focal length, principal point and doffs for `up` and `forward`. Default: a focal length equal
+            to the image width.
 
     Returns:
-        The view, of the photographs' size; `drawn` is False where the colour was invented. At 0 and 1 it is
-        the photograph itself.
+        The view, of the images' size; `drawn` is False in filled holes. At 0 and 1 it is the image itself.
 
     Raises:
-        ValueError: If the sizes differ, or a number is out of its range.
+        ValueError: The sizes differ, or a number is out of range.
     """
     pair = StereoPair(left=left, right=right, camera=camera)
     renderer = Renderer(pair, estimate, strength=strength, convergence_px=convergence_px, threads=threads)
@@ -180,7 +178,7 @@ def render(  # noqa: PLR0913 - each is a choice of the caller's
 
 
 def check_position(position: float, *, up: float = 0.0, forward: float = 0.0) -> None:
-    """Raise a ValueError unless views can be rendered from there."""
+    """Raise a ValueError if no view can be rendered from this position."""
     for name, value in (("position", position), ("up", up), ("forward", forward)):
         check_number(name, value)
     if not FIRST_POSITION <= position <= LAST_POSITION:
@@ -209,10 +207,10 @@ def _check_shifts(strength: float, convergence_px: float, pair: StereoPair) -> N
 
 
 def _make_side(photo: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarray, "h w"]) -> "Side":
-    """One photograph as the kernels take it, for no view yet."""
+    """Pack an input image and its maps for the kernels, before a view is chosen."""
     from stereoweave.rendering.canvas_kernels import Side
 
-    # Numba would compile every kernel once more for arrays that are read-only or have gaps.
+    # Numba compiles a second version of every kernel for read-only or non-contiguous arrays.
     photo = np.require(photo, np.uint8, ["C", "W"])
     disparity_px = np.require(disparity_px, np.float32, ["C", "W"])
     return Side(
@@ -229,7 +227,7 @@ def _make_side(photo: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarray
 def _recolour(
     photo: UInt8[np.ndarray, "h w 3"], table: Float[np.ndarray, "256 3"] | None
 ) -> dict[str, np.ndarray]:
-    """A side's photograph and its grey levels in another look; nothing without a table."""
+    """Apply a colour table to a side's image and grey levels; return no change without a table."""
     if table is None:
         return {}
     coloured = recolour(photo, table)
@@ -237,9 +235,9 @@ def _recolour(
 
 
 def _assume_camera(estimate: Estimate) -> StereoCamera:
-    """A camera of 53 degrees of view, whose principal point is the picture's centre.
+    """Camera with a horizontal field of view of 53 degrees and a centred principal point.
 
-    Where disparities are negative, the cameras converge: what has the least is then taken to be far away.
+    Negative disparities mean converged cameras; the least disparity is then taken as infinitely far.
     """
     height, width = estimate.disparity_px.shape
     return StereoCamera(
@@ -252,12 +250,12 @@ def _assume_camera(estimate: Estimate) -> StereoCamera:
 
 
 def _uncover_background(sides: "Sequence[Side]", right: bool, threads: int) -> HiddenBackground:
-    """What is behind the foreground of the right photograph, or of the left one, for views from beyond it."""
+    """Reconstruct the background behind the foreground of one image, for views from beyond its camera."""
     from stereoweave.rendering.background_kernels import uncover
 
     own, other = sides[right], sides[not right]
     hidden = HiddenBackground(np.empty_like(own.disparity_px), np.empty_like(own.photo))
-    # From beyond the left camera one looks behind the foreground where the background is on its left.
+    # Views from beyond the left camera uncover background to the left of the foreground.
     outwards = 1 if right else -1
     known = own.photo, own.disparity_px, own.nearer_px, other.disparity_px, outwards
     height = len(own.photo)

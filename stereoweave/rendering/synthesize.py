@@ -1,4 +1,4 @@
-"""A pair becomes a new view in one call."""
+"""View synthesis from a pair in one call."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from stereoweave.rendering.renderer import check_position, render
 from stereoweave.stereo import View
 
 
-def synthesize(  # noqa: PLR0913 - all but the first three can be left out
+def synthesize(  # noqa: PLR0913 - all but the first three are optional
     left: UInt8[np.ndarray, "h w 3"],
     right: UInt8[np.ndarray, "h w 3"],
     position: float,
@@ -20,21 +20,21 @@ def synthesize(  # noqa: PLR0913 - all but the first three can be left out
     *,
     provider: str = CPU,
 ) -> View:
-    """The view from a position on the line through two cameras: `estimate`, refined, then `render`.
+    """Estimate the disparity of a rectified pair, refined, and render the view from a position.
 
     Args:
-        left: The left photograph, uint8 RGB [H, W, 3], rectified.
-        right: The right one, of the same size.
+        left: Left image, uint8 RGB [H, W, 3].
+        right: Right image, of the same size.
         position: 0 is the left camera, 1 the right one; -1 to 2.
-        model: As for `estimate`; by default the exact one, because a new view shows every error at an edge.
-        threads: How many threads may be used; all cores if left out.
-        provider: As for `estimate`.
+        model: See `estimate`. The default is the accurate model: a new view shows every error at an edge.
+        threads: Number of threads; default: all cores.
+        provider: See `estimate`.
 
     Returns:
-        The view, of the photographs' size; `drawn` is False where the colour was invented.
+        The view, of the images' size; `drawn` is False in filled holes.
 
     Raises:
-        ValueError: As `estimate` and `render`; a position out of its range before anything is matched.
+        ValueError: See `estimate` and `render`. The position is checked before matching.
     """
     check_position(position)
     found = estimate(left, right, model=model, threads=threads, provider=provider, refined=True)

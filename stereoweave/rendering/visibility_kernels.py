@@ -1,4 +1,4 @@
-"""Which surface a pixel of the new view shows: where the photographs' sides agree, and where they do not."""
+"""Kernels that choose the visible surface of each pixel of the new view from both disparity maps."""
 
 import math
 import typing
@@ -9,24 +9,24 @@ from stereoweave.rendering.canvas_kernels import (
     NOTHING,
     SAME_SURFACE_PX,
     lies_on,
-    linear,
+    sample_linear,
     support_at,
     support_in_row,
 )
 from stereoweave.system.jit import compiled, inlined
 
 NOISE_LEVELS = 10.0
-"""Differences below this, summed over the channels, say little about which of two surfaces is right."""
+"""Noise of the difference between the images, summed over the channels, when two surfaces are compared."""
 PRIOR = 0.3
-"""What a disparity of no confidence is granted: a certain one outweighs it about four times."""
+"""Weight of a disparity with confidence 0; one with confidence 1 weighs about four times as much."""
 
 
 @compiled
 @typing.no_type_check
 def choose_row(left, right, confidence, y, landed_left, landed_right, row):
-    """Write the surface of every pixel of a row, and where there is a second one, that and the shares.
+    """Write the surface of every pixel in a row, and a second surface with its share where there are two.
 
-    There are two where the sides contradict each other, and where a nearer surface ends within the pixel.
+    There are two where the maps contradict each other, and where a nearer surface ends within the pixel.
     """
     front_px, back_px = row.front_px, row.back_px
     width = front_px.shape[0]
@@ -60,7 +60,7 @@ def choose_row(left, right, confidence, y, landed_left, landed_right, row):
 @compiled
 @typing.no_type_check
 def _measure_coverage(side, y, u, d):
-    """How much of the photograph shows the surface of disparity d at (y, u), pure or not: 0..1, 0 outside."""
+    """Support of an image for the surface of disparity d at (y, u), pure or not: 0..1, 0 outside."""
     last = side.disparity_px.shape[1] - 1
     x = _column(side.shift, side.offset_px, u, d)
     if x < -0.5 or x > last + 0.5:
@@ -74,25 +74,25 @@ def _measure_coverage(side, y, u, d):
 @inlined
 @typing.no_type_check
 def _column(shift, offset_px, u, d):
-    """The real column of the photograph that shows disparity d at column u of the new view."""
+    """Fractional column of an image that shows disparity d at column u of the new view."""
     return u - offset_px - shift * d
 
 
 @compiled
 @typing.no_type_check
 def _find_left_share(left, right, confidence, y, u, a, b):
-    """The left side's part, of 1, of a pixel in which the two sides have different surfaces, a and b."""
+    """Share, 0..1, of the left map's surface a where the maps disagree; the rest is b, the right map's."""
     gap_a_px = _find_gap_px(right, y, u, a)
     gap_b_px = _find_gap_px(left, y, u, b)
-    # The nearer surface hides the other, unless the camera that does not have it looks through it.
+    # The nearer surface occludes the other one, unless the other camera looks through it.
     if a > b and gap_a_px >= -SAME_SURFACE_PX:
         return 1.0
     if b > a and gap_b_px >= -SAME_SURFACE_PX:
         return 0.0
-    trust_a = linear(confidence[y], _column(left.shift, left.offset_px, u, a))
-    trust_b = linear(confidence[y], _column(left.shift, left.offset_px, u, b))
-    # The confidence is about the left map, which may have something else at b's place: nearer, so that it
-    # knows nothing of b, or farther, so that it denies b.
+    trust_a = sample_linear(confidence[y], _column(left.shift, left.offset_px, u, a))
+    trust_b = sample_linear(confidence[y], _column(left.shift, left.offset_px, u, b))
+    # Confidence refers to the left map, which may differ at b: a nearer surface there says nothing about b, a
+    # farther one contradicts it.
     if gap_b_px > SAME_SURFACE_PX:
         trust_b = 0.5
     elif gap_b_px < -SAME_SURFACE_PX:
@@ -109,7 +109,7 @@ def _find_left_share(left, right, confidence, y, u, a, b):
 @compiled
 @typing.no_type_check
 def _find_gap_px(side, y, u, d):
-    """How much nearer than d is what this side has there: the more similar one of two pixels; 0 outside."""
+    """Disparity of this image's surface there minus d, at the more similar of two pixels; 0 outside."""
     last = side.disparity_px.shape[1] - 1
     x = _column(side.shift, side.offset_px, u, d)
     if x < 0 or x > last:
@@ -123,7 +123,7 @@ def _find_gap_px(side, y, u, d):
 @compiled
 @typing.no_type_check
 def _measure_mismatch(left, right, y, u, d):
-    """How the photographs differ over three pixels around u if d is right: the channels' sum; -1 outside."""
+    """Images' mean difference over three pixels around u at disparity d, channels summed; -1 outside."""
     left_photo, right_photo = left.photo[y], right.photo[y]
     last = left_photo.shape[0] - 1
     total, count = 0.0, 0
@@ -145,7 +145,7 @@ def _measure_mismatch(left, right, y, u, d):
 @compiled
 @typing.no_type_check
 def _sum_support(left, right, y, u, d):
-    """How well both photographs together show the surface of disparity d at (y, u) of the new view."""
+    """Weighted support of both images for the surface of disparity d at (y, u) of the new view."""
     total = 0.0
     for side in (left, right):
         x = _column(side.shift, side.offset_px, u, d)

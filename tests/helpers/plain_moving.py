@@ -46,7 +46,7 @@ def plain_landing(surface_px, targets, disparity_px):
 
 
 def plain_lay(hidden_px, colours, shift, offset_px, canvas):
-    """Canvas after `hole_filling_kernels.lay`: the nearest visible background at each pixel."""
+    """The canvas after `hole_filling_kernels.paint_background`: each pixel shows the nearest background."""
     result = type(canvas)(*(values.copy() for values in canvas))
     height, width = hidden_px.shape
     at = np.arange(width) + shift * hidden_px.astype(float) + offset_px

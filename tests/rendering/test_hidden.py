@@ -4,7 +4,7 @@ from plain_moving import plain_lay
 
 from stereoweave.rendering.background_kernels import uncover
 from stereoweave.rendering.canvas_kernels import NOTHING, Canvas, empty_canvas
-from stereoweave.rendering.hole_filling_kernels import lay
+from stereoweave.rendering.hole_filling_kernels import paint_background
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoPair
 
@@ -149,7 +149,7 @@ def random_hidden(rng, height=40, width=50):
 def test_the_fast_laying_equals_the_plain_one(rng, shift, offset_px):
     hidden_px, colours, canvas = random_hidden(rng)
     expected = plain_lay(hidden_px, colours, shift, offset_px, canvas)
-    lay(hidden_px, colours, shift, offset_px, canvas)
+    paint_background(hidden_px, colours, shift, offset_px, canvas)
     np.testing.assert_array_equal(canvas.surface_px, expected.surface_px)
     np.testing.assert_array_equal(canvas.pure, expected.pure)
     np.testing.assert_array_equal(canvas.drawn, expected.drawn)
@@ -163,7 +163,7 @@ def test_hidden_background_is_laid_only_where_none_is_nearer(shift, near_at, far
     hidden_px[0, near_at], hidden_px[0, far_at] = 10, 2
     colours[0, near_at], colours[0, far_at] = 200, 100
     canvas = empty_canvas(np.zeros((1, 40, 3), np.uint8))
-    lay(hidden_px, colours, shift, 0.0, canvas)
+    paint_background(hidden_px, colours, shift, 0.0, canvas)
     (column,) = np.flatnonzero(canvas.pure[0])
     assert (canvas.surface_px[0, column], canvas.drawn[0, column]) == (10, False)
     assert (canvas.image[0, column] == 200).all()

@@ -275,8 +275,8 @@ def test_what_a_renderer_reaches_is_accepted(positions, strength):
     [
         ((7.0,), 1.0, "got 7"),
         ((float("nan"),), 1.0, "got nan"),
-        ((0.0, 1.0), 4.0, "got -1.5, where strength 4 takes 0"),
-        ((0.5, 1.5), 2.0, "got 2.5, where strength 2 takes 1.5"),
+        ((0.0, 1.0), 4.0, "got -1.5, position 0 at strength 4"),
+        ((0.5, 1.5), 2.0, "got 2.5, position 1.5 at strength 2"),
         ((0.5,), float("nan"), "got nan"),
     ],
 )
