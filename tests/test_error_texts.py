@@ -15,7 +15,7 @@ from stereoweave.cameras.alignment import check_pair
 from stereoweave.errors import Note, Remedy
 from stereoweave.io.files import RangeError, read_image
 from stereoweave.matching.options import MatchOptions
-from stereoweave.outputs.point_cloud import EmptyError, needed_camera
+from stereoweave.outputs.point_cloud import EmptyError, require_camera
 from stereoweave.pictures.loading import open_pictures
 from stereoweave.pictures.pair_finding import find_pairs
 from stereoweave.pictures.prepare import Request, prepare
@@ -58,9 +58,9 @@ ERRORS = {
     "that agree; take pictures with more texture and more overlap; or give a calibration (calibration)": (
         lambda: prepare(PLAIN, Request(rectify=True))
     ),
-    "expected a camera, for metres, found none; give a calibration, or the focal length and baseline of a "
+    "expected a camera for depth, found none; give a calibration, or the focal length and baseline of a "
     "rectified pair (calibration, focal_px, baseline_m)": (
-        lambda: needed_camera(sw.StereoPair(left=BLACK, right=BLACK))
+        lambda: require_camera(sw.StereoPair(left=BLACK, right=BLACK))
     ),
     "raw: expected without refined: it is the network's own disparity; leave one of them out "
     "(raw, refined)": (lambda: MatchOptions(raw=True, refined=True)),

@@ -15,7 +15,7 @@ from stereoweave.matching.backend import Backend
 from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.measure import distance
 from stereoweave.outputs.point_cloud import EmptyError, point_cloud, write_glb
-from stereoweave.outputs.report import Summary, shrunk
+from stereoweave.outputs.report import Summary, downscale
 from stereoweave.outputs.results import FILES, needs_camera, write_files
 from stereoweave.outputs.run import Result, run
 from stereoweave.pictures.prepare import Request, prepare
@@ -73,7 +73,7 @@ def match_uploads(uploads: Uploads, folder: Path, report_progress: Callable[[flo
     report_progress(0.3, f"matching {width}×{height} px")
     result = run(prepared, uploads.backend.matcher(), MatchOptions(refined=True))
     report_progress(0.6, "showing")
-    renderer = Renderer(*shrunk(result.pair, result.estimate, _LONGER_SIDE_PX))
+    renderer = Renderer(*downscale(result.pair, result.estimate, _LONGER_SIDE_PX))
     return Session(result=result, renderer=renderer, folder=folder)
 
 

@@ -134,13 +134,13 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.matching.estimate import match
     from stereoweave.matching.options import MatchOptions
     from stereoweave.outputs.measure import CameraError, distance
-    from stereoweave.outputs.point_cloud import needed_camera
+    from stereoweave.outputs.point_cloud import require_camera
     from stereoweave.pictures.prepare import prepare
 
     places = parse_pixel("--from", first), parse_pixel("--to", second)
     options = MatchOptions(range_px=parse_range_px(range_px), refined=refined)
     prepared = prepare(pictures, make_request(arrangement, calib, focal_px, baseline_m, rectify))
-    camera = needed_camera(prepared.pair)
+    camera = require_camera(prepared.pair)
     matcher = Backend(model=model, threads=threads, provider=provider).matcher()
     estimate = match(matcher, prepared.pair, options)
     error = CameraError(focal=focal_error_percent / 100, baseline=baseline_error_percent / 100)

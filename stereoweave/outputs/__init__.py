@@ -1,1 +1,1 @@
-"""What is made of an estimate: maps, reports, point clouds, measurements."""
+"""Outputs of an estimate: maps, reports, point clouds, meshes and measurements."""

@@ -1,4 +1,4 @@
-"""One self-contained HTML page to look at a result: pictures, numbers, and the new view under a slider."""
+"""Self-contained HTML report of a result: images, summary, and new views with a slider."""
 
 import base64
 import html
@@ -33,10 +33,11 @@ _JPEG_QUALITY = 88
 
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """What a result is in numbers; depths are None without a camera, and where they are infinite.
+    """Summary of a result. Depths are None if infinite or without a camera.
 
-    confident_percent counts the pixels whose confidence is at least 0.5, occluded_percent those that the left
-    camera alone sees.
+    Attributes:
+        occluded_percent: Pixels that only the left camera sees.
+        confident_percent: Pixels with a confidence of at least 0.5.
     """
 
     pictures: tuple[str, ...]
@@ -58,9 +59,14 @@ class Summary:
 def summarize(
     pair: StereoPair, estimate: Estimate, *, pictures: tuple[str, ...], model: str, estimate_ms: float
 ) -> Summary:
-    """The numbers of an estimate that `model` made of `pictures` (their file names) in `estimate_ms`.
+    """Summarise an estimate over the pixels that the left image covers (`StereoPair.left_seen`).
 
-    What the left picture does not show counts in none of them but the size.
+    Args:
+        pair: The pair.
+        estimate: Its estimate.
+        pictures: File names of the pair.
+        model: Name of the matcher.
+        estimate_ms: Duration of the matching.
     """
     height_px, width_px = estimate.disparity_px.shape
     seen = slice(None) if pair.left_seen is None else pair.left_seen
@@ -71,14 +77,14 @@ def summarize(
         width_px=width_px,
         height_px=height_px,
         estimate_ms=round(estimate_ms, 1),
-        disparity_min_px=_rounded(low_px),
-        disparity_median_px=_rounded(median_px),
-        disparity_max_px=_rounded(high_px),
+        disparity_min_px=_round(low_px),
+        disparity_median_px=_round(median_px),
+        disparity_max_px=_round(high_px),
         depth_min_m=_depth_m(pair.camera, high_px),
         depth_median_m=_depth_m(pair.camera, median_px),
         depth_max_m=_depth_m(pair.camera, low_px),
-        occluded_percent=_rounded(100 * estimate.occluded[seen].mean()),
-        confident_percent=_rounded(100 * (estimate.confidence[seen] >= 0.5).mean()),
+        occluded_percent=_round(100 * estimate.occluded[seen].mean()),
+        confident_percent=_round(100 * (estimate.confidence[seen] >= 0.5).mean()),
         camera=pair.camera,
     )
 
@@ -86,28 +92,30 @@ def summarize(
 def write_report(
     path: Path, pair: StereoPair, estimate: Estimate, summary: Summary, threads: int | None = None
 ) -> None:
-    """Write the page: a single HTML file that asks the network for nothing.
+    """Write the report as a single HTML file without external resources.
 
-    It shows the left image, depth (disparity without a camera), confidence, the numbers of `summary`, and the
-    views from POSITIONS under a slider. Pictures are at most 1000 px on their longer side;
-    `threads` is as for `render`.
+    It shows the left image, the depth (the disparity without a camera), the confidence, the summary, and the
+    views from POSITIONS with a slider. The longer side of an image is at most 1000 px. `threads` is the
+    number of threads for `render`.
     """
     source = importlib.resources.files("stereoweave.outputs") / "report.html"
     template = source.read_text(encoding="utf-8")
-    page = string.Template(template).substitute(_fields(pair, estimate, summary, threads))
+    page = string.Template(template).substitute(_collect_fields(pair, estimate, summary, threads))
     with writing_text(path) as file:
         file.write(page)
 
 
-def _fields(pair: StereoPair, estimate: Estimate, summary: Summary, threads: int | None) -> dict[str, object]:
-    """Everything that the template asks for, by name."""
-    small, small_estimate = shrunk(pair, estimate, _LONGER_SIDE_PX)
+def _collect_fields(
+    pair: StereoPair, estimate: Estimate, summary: Summary, threads: int | None
+) -> dict[str, object]:
+    """Return the values of the template's fields by name."""
+    small, small_estimate = downscale(pair, estimate, _LONGER_SIDE_PX)
     renderer = Renderer(small, small_estimate, threads=threads)
     views = [renderer.view(position) for position in POSITIONS]
     seen = slice(None) if pair.left_seen is None else pair.left_seen
     range_px = find_colour_range_px(np.atleast_2d(estimate.disparity_px[seen]))
     height, width = small.left.shape[:2]
-    depth = colour_disparity(_picked(estimate.disparity_px, (width, height)), range_px)
+    depth = colour_disparity(_resize_nearest(estimate.disparity_px, (width, height)), range_px)
     if small.left_seen is not None:
         depth[~small.left_seen] = 0
     data = {
@@ -115,7 +123,7 @@ def _fields(pair: StereoPair, estimate: Estimate, summary: Summary, threads: int
         "height_px": summary.height_px,
         "camera": asdict(pair.camera) if pair.camera else None,
         "invented_percent": [round(100 * float((~view.drawn).mean()), 2) for view in views],
-        "map": _levels(estimate),
+        "map": _encode_disparity(estimate),
     }
     title = " + ".join(summary.pictures)
     size = f"{summary.width_px} × {summary.height_px} px"
@@ -130,49 +138,49 @@ def _fields(pair: StereoPair, estimate: Estimate, summary: Summary, threads: int
         "step": POSITIONS[1] - POSITIONS[0],
         "left_end": _along_slider(0),
         "right_end": _along_slider(1),
-        "numbers": "\n".join(_number_tag(name, value) for name, value in _numbers(summary)),
+        "numbers": "\n".join(_number_tag(name, value) for name, value in _list_numbers(summary)),
         "left": _data_uri(small.left),
         "depth_name": "Depth" if pair.camera else "Disparity",
         "depth": _data_uri(depth),
         "confidence": _data_uri(colour_confidence(small_estimate.confidence, small_estimate.occluded)),
         "ramp": ",".join(legend_colours(24)),
-        "ticks": "".join(f"<span>{tick}</span>" for tick in _ticks(range_px, pair.camera)),
+        "ticks": "".join(f"<span>{tick}</span>" for tick in _label_ticks(range_px, pair.camera)),
         "occluded_colour": css_colour(OCCLUDED_RGB),
-        # "</" would end the script element that the data lies in.
+        # "</" would end the script element that contains the data.
         "data": json.dumps(data).replace("</", "<\\/"),
     }
 
 
-def shrunk(pair: StereoPair, estimate: Estimate, longer_side_px: int) -> tuple[StereoPair, Estimate]:
-    """Both for showing, at most `longer_side_px` long, disparities in its pixels; no camera."""
+def downscale(pair: StereoPair, estimate: Estimate, longer_side_px: int) -> tuple[StereoPair, Estimate]:
+    """Downscale both for display to at most `longer_side_px`, disparities included; the camera is dropped."""
     height, width = estimate.disparity_px.shape
     scale = min(1.0, longer_side_px / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     scale_x = np.float32(size[0] / width)
     left, right = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (pair.left, pair.right))
     left_seen, right_seen = (
-        None if seen is None else _picked(seen, size) for seen in (pair.left_seen, pair.right_seen)
+        None if seen is None else _resize_nearest(seen, size) for seen in (pair.left_seen, pair.right_seen)
     )
     return StereoPair(left=left, right=right, left_seen=left_seen, right_seen=right_seen), Estimate(
-        disparity_px=_picked(estimate.disparity_px, size) * scale_x,
-        right_disparity_px=_picked(estimate.right_disparity_px, size) * scale_x,
-        confidence=_picked(estimate.confidence, size),
-        occluded=_picked(estimate.occluded, size),
+        disparity_px=_resize_nearest(estimate.disparity_px, size) * scale_x,
+        right_disparity_px=_resize_nearest(estimate.right_disparity_px, size) * scale_x,
+        confidence=_resize_nearest(estimate.confidence, size),
+        occluded=_resize_nearest(estimate.occluded, size),
     )
 
 
-def _picked(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """The map at another size (width, height), each value one it had: a mean over an edge lies nowhere."""
+def _resize_nearest(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Resize a map to (width, height) by nearest neighbour: a mean across a depth edge lies on no surface."""
     numbers = values.view(np.uint8) if values.dtype == bool else values
     return cv2.resize(numbers, size, interpolation=cv2.INTER_NEAREST_EXACT).view(values.dtype)
 
 
-def _levels(estimate: Estimate) -> dict[str, object]:
-    """The disparity to read under the pointer, low_px + step_px * level, the levels as 16 bits in base64."""
+def _encode_disparity(estimate: Estimate) -> dict[str, object]:
+    """Encode the disparity shown at the pointer: low_px + step_px * level, with 16-bit levels in base64."""
     height, width = estimate.disparity_px.shape
     scale = min(1.0, _LONGER_SIDE_OF_MAP_PX / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    picked_px = _picked(estimate.disparity_px, size)
+    picked_px = _resize_nearest(estimate.disparity_px, size)
     low_px = float(picked_px.min())
     step_px = max(float(picked_px.max()) - low_px, 1e-6) / 65535
     levels = np.round((picked_px - low_px) / step_px).astype("<u2")
@@ -185,8 +193,8 @@ def _levels(estimate: Estimate) -> dict[str, object]:
     }
 
 
-def _numbers(summary: Summary) -> list[tuple[str, str]]:
-    """The rows of the table: name and value with its unit."""
+def _list_numbers(summary: Summary) -> list[tuple[str, str]]:
+    """Return the rows of the summary table: name, and value with unit."""
     rows = [
         ("Size", f"{summary.width_px} × {summary.height_px} px"),
         ("Model", summary.model),
@@ -196,43 +204,43 @@ def _numbers(summary: Summary) -> list[tuple[str, str]]:
     ]
     if summary.camera:
         rows += [
-            ("Depth", f"{_metres(summary.depth_min_m)} to {_metres(summary.depth_max_m)}"),
-            ("Median depth", _metres(summary.depth_median_m)),
+            ("Depth", f"{_format_metres(summary.depth_min_m)} to {_format_metres(summary.depth_max_m)}"),
+            ("Median depth", _format_metres(summary.depth_median_m)),
             ("Focal length", f"{summary.camera.focal_px:.1f} px"),
             ("Baseline", f"{summary.camera.baseline_m * 1000:.1f} mm"),
-            ("Left centre", f"{summary.camera.cx_px:.1f}, {summary.camera.cy_px:.1f} px"),
-            ("Offset of the right", f"{summary.camera.doffs_px:.2f} px"),
+            ("Left principal point", f"{summary.camera.cx_px:.1f}, {summary.camera.cy_px:.1f} px"),
+            ("Principal point offset (doffs)", f"{summary.camera.doffs_px:.2f} px"),
         ]
     return [
         *rows,
         ("Confident (at least 50 %)", f"{summary.confident_percent:.1f} %"),
-        ("Seen by the left alone", f"{summary.occluded_percent:.1f} %"),
+        ("Occluded", f"{summary.occluded_percent:.1f} %"),
     ]
 
 
-def _ticks(range_px: tuple[float, float], camera: StereoCamera | None) -> list[str]:
-    """Five labels along the colours, evenly spaced in disparity: metres with a camera, pixels without."""
+def _label_ticks(range_px: tuple[float, float], camera: StereoCamera | None) -> list[str]:
+    """Return five labels of the colour bar, evenly spaced in disparity: metres with a camera, else pixels."""
     values_px = np.linspace(*range_px, 5)
     if camera is None:
         return [f"{value_px:.1f} px" for value_px in values_px]
-    return [_metres(_depth_m(camera, value_px)) for value_px in values_px]
+    return [_format_metres(_depth_m(camera, value_px)) for value_px in values_px]
 
 
 def _depth_m(camera: StereoCamera | None, disparity_px: float) -> float | None:
-    """The depth of one disparity, None where it is infinite or there is no camera."""
+    """Depth of one disparity; None if infinite or without a camera."""
     if camera is None:
         return None
     depth_m = float(camera.depth_m(np.array([[disparity_px]], np.float64))[0, 0])
-    return _rounded(depth_m) if np.isfinite(depth_m) else None
+    return _round(depth_m) if np.isfinite(depth_m) else None
 
 
-def _metres(depth_m: float | None) -> str:
+def _format_metres(depth_m: float | None) -> str:
     if depth_m is None:
         return "∞"
     return f"{depth_m:#.3g} m" if depth_m < 99.95 else f"{depth_m:.0f} m"
 
 
-def _rounded(value: float) -> float:
+def _round(value: float) -> float:
     return round(float(value), 4)
 
 
@@ -245,13 +253,13 @@ def _number_tag(name: str, value: str) -> str:
 
 
 def _view_tag(position: float, image: UInt8[np.ndarray, "h w 3"]) -> str:
-    # The middle view is there even where scripts are switched off.
+    # The middle view is visible even with scripts disabled.
     shown = ' class="shown"' if position == 0.5 else ""
     return f'<img{shown} src="{_data_uri(image)}" alt="View at position {position}">'
 
 
 def _data_uri(image: UInt8[np.ndarray, "h w 3"]) -> str:
-    """The picture inside its own address, as JPEG."""
+    """Encode an image as a JPEG data URI."""
     encoded, jpeg = cv2.imencode(
         ".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
     )

@@ -1,8 +1,7 @@
-"""What `depth` writes of a pair: maps, masks, pictures of them, points and surfaces, and the report.
+"""Output files of the `depth` command: maps, masks, previews, point clouds, meshes and the report.
 
-Where the left picture shows nothing (`StereoPair.left_seen`) disparity and depth are unknown: infinite in a
-PFM file, which is Middlebury's way, NaN in NPY and TIFF files, and 0 in a PNG. What is infinitely far is
-infinite in all files of depth but the PNG, where it is 0 too.
+Disparity and depth are unknown outside the left image's content (`StereoPair.left_seen`): infinity in PFM, as
+in Middlebury, NaN in NPY and TIFF, 0 in PNG. Infinite depth is infinity in PFM, NPY and TIFF, and 0 in PNG.
 """
 
 import hashlib
@@ -38,7 +37,7 @@ from stereoweave.outputs.point_cloud import (
     MOST_POINTS,
     NO_CAMERA,
     EmptyError,
-    needing_the_mesh_extra,
+    require_mesh_extra,
     write_glb,
     write_ply,
 )
@@ -54,7 +53,7 @@ def _write_preview(path: Path, result: Result) -> None:
     write_image(path, colour_disparity(disparity_px, range_px) * result.seen[..., None])
 
 
-# Every file that `depth` can write.
+# All output files of `depth`.
 FILES: dict[str, Callable[[Path, Result], None]] = {
     "disparity.pfm": lambda path, result: write_pfm(path, result.disparity_px(np.inf)),
     "disparity.png": lambda path, result: write_disparity_png(path, result.disparity_px()),
@@ -81,15 +80,16 @@ ALL = "all"
 
 @dataclass(frozen=True, kw_only=True)
 class DepthJob:
-    """What is to be made of every pair: what is said of the pictures, with which network and how.
+    """Settings of `depth` for every pair.
 
     Attributes:
-        request: What is said of the pictures.
-        backend: What matches them.
-        options: How the pair is matched.
-        files: What is written beside `always`, names in FILES, or "all"; depth.png is with any camera.
-        always: What is written of every pair.
-        name_of: The front end's names for settings, in the notes and failures that a batch writes down.
+        request: How the pictures are opened and rectified.
+        backend: The matcher.
+        options: Settings of the matching.
+        files: Output files besides `always`, names in FILES or "all"; depth.png is added if there is a
+            camera.
+        always: Output files of every pair.
+        name_of: The front end's names of settings, for the notes and failures that a batch records.
     """
 
     request: Request = Request()
@@ -111,68 +111,69 @@ def make_depth(pictures: Sequence[Path], out: Path, job: DepthJob) -> tuple[Summ
     """Write all results of a pair to `out` atomically. Returns the summary and user-facing notes."""
     matcher = job.backend.matcher()
     prepared = prepare(pictures, job.request)
-    files, left_out = _files_of(job, prepared.pair)
-    with _results_in(out) as folder:
+    files, left_out = _choose_files(job, prepared.pair)
+    with _write_together(out) as folder:
         result = run(prepared, matcher, job.options)
         notes = [*result.notes, *left_out, *write_files(folder, files, result), *result.warnings()]
     return result.summary, notes
 
 
 def job_facts(job: DepthJob) -> dict[str, Any]:
-    """All that decides the results of a pair beside its pictures, files by what is in them.
+    """Return everything that determines a pair's results besides its pictures; files are named by their hash.
 
-    What it is computed with does not: a batch whose GPU fails can be finished on the processor.
+    The provider and the threads are not included: a batch whose GPU fails can be finished on the CPU.
     """
     model, calibration = str(job.backend.model), job.request.calibration
     if model.endswith(".onnx"):
         with reading(model, "a model"):
-            model = _by_content(model, Path(model).read_bytes())
+            model = _hash_content(model, Path(model).read_bytes())
     facts = {"stereoweave": __version__, "model": model, **asdict(job.options)}
     facts |= {"files": job.files, "always": job.always, **asdict(job.request)}
     if calibration:
-        facts["calibration"] = _by_content(calibration, read_calibration_bytes(calibration))
+        facts["calibration"] = _hash_content(calibration, read_calibration_bytes(calibration))
     return facts
 
 
-def _by_content(path: str | Path, content: bytes) -> str:
+def _hash_content(path: str | Path, content: bytes) -> str:
     return f"{Path(path).name} {hashlib.sha256(content).hexdigest()[:12]}"
 
 
 def needs_camera(file: str) -> bool:
-    """Whether a file in FILES is in metres."""
+    """Whether an output file is in metres."""
     return file.startswith(("depth.", "cloud.", "mesh."))
 
 
-def _files_of(job: DepthJob, pair: StereoPair) -> tuple[list[str], list[Note]]:
-    """The files to write of a pair, and notes; raises StereoweaveError if they need a camera without one."""
+def _choose_files(job: DepthJob, pair: StereoPair) -> tuple[list[str], list[Note]]:
+    """Return a pair's output files, and notes; raise a StereoweaveError if one needs a missing camera."""
     wanted, notes = {*job.always, *job.files}, list[Note]()
     if pair.camera:
         wanted.add("depth.png")
     if ALL in wanted:
         wanted |= {file for file in FILES if pair.camera or not needs_camera(file)}
         if not pair.camera:
-            text = f"no depth, points or surface in metres: {NO_CAMERA.text}"
+            text = f"no depth, point cloud or mesh: {NO_CAMERA.text}"
             notes.append(replace(NO_CAMERA, text=text))
     files = [file for file in FILES if file in wanted]
     in_metres = [file for file in files if needs_camera(file)]
     if in_metres and not pair.camera:
         raise StereoweaveError(f"{in_metres[0]}: {NO_CAMERA.text}", remedy=NO_CAMERA.remedy)
     if any(file.endswith((".ply", ".glb")) for file in files):
-        needing_the_mesh_extra()
+        require_mesh_extra()
     return files, notes
 
 
 @contextmanager
-def _results_in(out: Path) -> Iterator[Path]:
-    """A temporary folder, whose files move into `out` in the end; after an error nothing of either is left.
+def _write_together(out: Path) -> Iterator[Path]:
+    """Yield a temporary folder whose files move to `out` at the end; an error leaves `out` unchanged.
 
-    Files of an earlier result that this one does not have are removed, so that all in `out` belong together.
-    Where no disparity.pfm is there, which every result has and is moved first, they are the user's, and stay.
+    Files of an earlier result that the new one lacks are removed, so that all of `out` belongs to one result.
+    An earlier result is recognised by disparity.pfm, which every result has and which is moved first; without
+    it, files of these names are the user's and stay.
     """
     standing = make_parent_folder(*(out / file for file in FILES))
     with tempfile.TemporaryDirectory(prefix=".stereoweave-", dir=standing) as name:
         yield Path(name)
-        # Two commands would leave some files of each.
+        # Without the lock, two commands could leave a mixture of their files.
         with lock_output(make_folder(out)):
             is_earlier_result = (out / "disparity.pfm").exists()
             for file in FILES:
@@ -184,12 +185,12 @@ def _results_in(out: Path) -> Iterator[Path]:
 
 
 def write_files(folder: Path, files: Sequence[str], result: Result) -> list[Note]:
-    """Write the files. Returns notes on those that could not be written or hold less, and why."""
+    """Write the files. Returns a note with the reason for each one that is skipped or thinned."""
     notes = []
     for file in files:
         try:
             FILES[file](folder / file, result)
-            notes += _thinned(file, result)
+            notes += _note_thinning(file, result)
         except RangeError:
             text = (
                 "no disparity.png: it holds 0 to 255.99 px, found "
@@ -201,8 +202,8 @@ def write_files(folder: Path, files: Sequence[str], result: Result) -> list[Note
     return notes
 
 
-def _thinned(file: str, result: Result) -> list[Note]:
-    """A note if points or a surface leave out pixels of a large picture."""
+def _note_thinning(file: str, result: Result) -> list[Note]:
+    """Return a note if a large picture's point cloud or mesh is thinned."""
     match file.split("."):
         case ["cloud", _]:
             step_px = result.cloud.step_px
@@ -212,4 +213,4 @@ def _thinned(file: str, result: Result) -> list[Note]:
             step_px = 1
     if step_px == 1:
         return []
-    return [Note(f"{file}: one of every {step_px}x{step_px} pixels, for at most {MOST_POINTS:,} points")]
+    return [Note(f"{file}: thinned to one of {step_px}x{step_px} pixels, for at most {MOST_POINTS:,} points")]

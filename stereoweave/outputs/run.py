@@ -1,4 +1,4 @@
-"""From a prepared pair to a result: one way for commands, batches, the page and the service."""
+"""Matching of prepared pairs, shared by commands, batches, the page and the service."""
 
 import time
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from stereoweave.matching.estimate import match_many
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU
-from stereoweave.outputs.point_cloud import Cloud, Surface, needed_camera, point_cloud, surface
+from stereoweave.outputs.point_cloud import Cloud, Surface, point_cloud, require_camera, surface
 from stereoweave.outputs.report import Summary, summarize
 from stereoweave.pictures.prepare import Prepared
 from stereoweave.stereo import Estimate, StereoPair
@@ -25,11 +25,11 @@ class Result:
     """A matched pair and its numbers.
 
     Attributes:
-        pair: The pair, with its camera where that is known.
-        estimate: Its estimate.
-        summary: The numbers of both.
+        pair: The pair, with its camera if known.
+        estimate: The pair's estimate.
+        summary: Summary of the pair and its estimate.
         notes: What was detected or changed while the pictures were read.
-        threads: Threads that may be used to render it; default: all cores.
+        threads: Number of threads for rendering; default: all cores.
     """
 
     pair: StereoPair
@@ -40,7 +40,7 @@ class Result:
 
     @property
     def seen(self) -> Bool[np.ndarray, "h w"]:
-        """Where the left picture shows something."""
+        """Mask of the pixels that the left image covers."""
         seen = self.pair.left_seen
         return np.ones(self.estimate.disparity_px.shape, bool) if seen is None else seen
 
@@ -50,7 +50,7 @@ class Result:
 
     def depth_m(self, unknown: float = np.nan) -> Float[np.ndarray, "h w"]:
         """The left view's depth in metres, with `unknown` where there is none."""
-        depth_m = needed_camera(self.pair).depth_m(self.estimate.disparity_px)
+        depth_m = require_camera(self.pair).depth_m(self.estimate.disparity_px)
         return np.where(self.seen, depth_m, np.float32(unknown))
 
     def warnings(self) -> list[Note]:
@@ -73,7 +73,7 @@ def run(prepared: Prepared, matcher: Matcher, options: MatchOptions) -> Result:
 
 
 def run_many(prepared: Sequence[Prepared], matcher: Matcher, options: MatchOptions) -> list[Result]:
-    """Match prepared pairs together and summarise each, with an equal share of the time."""
+    """Match prepared pairs together and summarise each; the time is divided equally."""
     start_s = time.perf_counter()
     estimates = match_many(matcher, [each.pair for each in prepared], options)
     total_ms = 1000 * (time.perf_counter() - start_s)

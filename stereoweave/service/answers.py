@@ -16,7 +16,7 @@ from stereoweave.io.files import RangeError, write_image
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
-from stereoweave.outputs.point_cloud import needed_camera
+from stereoweave.outputs.point_cloud import require_camera
 from stereoweave.outputs.report import Summary
 from stereoweave.outputs.results import FILES, needs_camera
 from stereoweave.outputs.run import Result, run_many
@@ -181,7 +181,7 @@ def _prepare(job: ServiceJob) -> Prepared:
     # Checked again, because detected half-size views grow beyond what the picture's header states.
     _check_megapixels(job.pictures[0], prepared.pair.left.shape[1::-1], job.most_megapixels)
     if needs_camera(job.file):
-        needed_camera(prepared.pair)
+        require_camera(prepared.pair)
     return replace(prepared, pair=crop(prepared.pair)) if job.is_view else prepared
 
 

@@ -12,7 +12,7 @@ from stereoweave.rendering.layouts import LAYOUTS as VIEW_LAYOUTS
 
 PAIR = "left.png right.png"
 NO_CAMERA = (
-    "expected a camera, for metres, found none; give a calibration, or the focal length and baseline of a "
+    "expected a camera for depth, found none; give a calibration, or the focal length and baseline of a "
     "rectified pair (--calib, --focal-px, --baseline-m)"
 )
 ERRORS = {
@@ -71,7 +71,7 @@ NOTES = {
     "check right.png left.png": "left and right are swapped; give them the other way round",
     f"depth {PAIR} --focal-px 600 --baseline-m 0.1 --rectify -o out": "no metres after rectification by "
     "features; give a calibration (--calib)",
-    f"depth {PAIR} --write all -o out": f"no depth, points or surface in metres: {NO_CAMERA}",
+    f"depth {PAIR} --write all -o out": f"no depth, point cloud or mesh: {NO_CAMERA}",
     "view upper.png lower.png --model small -o out.png": "the right picture lies 2.0 px lower; rectify the "
     "pair (--rectify)",
 }

@@ -135,10 +135,10 @@ def test_a_disparity_is_the_median_of_its_surface():
 @pytest.mark.parametrize(
     ("first_px", "second_px", "message"),
     [
-        ((20, 20), (60, 20), "pixel 60,20: .* 0,0 to 59,39, found one outside"),
+        ((20, 20), (60, 20), "pixel 60,20: .* from 0,0 to 59,39, found one outside"),
         ((20, -1), (30, 20), "pixel 20,-1: .* outside"),
-        ((20, 20), (20, 20), "two pixels, found one, 20,20, twice"),
-        ((5, 5), (20, 20), "pixel 5,5: .* the left alone sees"),
+        ((20, 20), (20, 20), "two different pixels, found 20,20 twice"),
+        ((5, 5), (20, 20), "pixel 5,5: .* only the left camera sees"),
         ((20, 20), (6, 6), "pixel 6,6: .* at least 50 %, found 49 %"),
         ((20, 20), (7, 30), "pixel 7,30: .* at infinity"),
     ],

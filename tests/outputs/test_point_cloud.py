@@ -11,8 +11,8 @@ from stereoweave.outputs.point_cloud import (
     Cloud,
     EmptyError,
     Surface,
+    find_reliable,
     point_cloud,
-    solid,
     surface,
     write_glb,
     write_ply,
@@ -75,13 +75,13 @@ def test_no_point_flies_between_two_planes(blur_px, turned_degrees):
 
 
 def test_a_sharp_edge_loses_no_point():
-    assert solid(pair_of((40, 60)), estimate_of(two_planes())).all()
+    assert find_reliable(pair_of((40, 60)), estimate_of(two_planes())).all()
 
 
 def test_a_thin_rod_and_a_slanted_surface_keep_all_their_points():
     slanted_px = np.broadcast_to(np.linspace(2, 26, 61)[:60], (40, 60)).copy()  # 0.4 px a px
     slanted_px[:, 30] = 60
-    assert solid(pair_of((40, 60)), estimate_of(slanted_px)).all()
+    assert find_reliable(pair_of((40, 60)), estimate_of(slanted_px)).all()
 
 
 def test_what_is_not_known_gives_no_point():
@@ -96,9 +96,9 @@ def test_what_is_not_known_gives_no_point():
     estimate = estimate_of(disparity_px, confidence=confidence, occluded=occluded)
     expected = np.ones((40, 60), bool)
     expected[:2] = False
-    np.testing.assert_array_equal(solid(pair, estimate), expected)
+    np.testing.assert_array_equal(find_reliable(pair, estimate), expected)
     assert len(point_cloud(pair, estimate).points_m) == 38 * 60
-    assert not solid(pair, estimate, least_confidence=0.6).any()
+    assert not find_reliable(pair, estimate, least_confidence=0.6).any()
 
 
 def test_a_wall_is_a_surface_of_two_triangles_a_square_that_face_the_camera():

@@ -11,7 +11,7 @@ from browsers import chromium
 from PIL import Image
 from playwright.sync_api import Browser, Page
 
-from stereoweave.outputs.report import POSITIONS, Summary, shrunk, summarize, write_report
+from stereoweave.outputs.report import POSITIONS, Summary, downscale, summarize, write_report
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
 CAMERA = StereoCamera(focal_px=400, baseline_m=0.04, cx_px=160, cy_px=60, doffs_px=0)
@@ -94,7 +94,7 @@ def test_a_long_picture_is_shrunk_and_its_disparity_with_it(rng, tmp_path):
     write_report(tmp_path / "report.html", pair, estimate, summary_of(pair, estimate, "a.png"))
     pictures = pictures_in((tmp_path / "report.html").read_text(encoding="utf-8"))
     halfway = np.asarray(Image.fromarray(photograph[:, 40:2040]).resize((1000, 80)))
-    assert pictures["The left photograph"].shape == (80, 1000, 3)
+    assert pictures["Left image"].shape == (80, 1000, 3)
     assert difference(pictures["View at position 0.5"], halfway) < 5
 
 
@@ -107,7 +107,7 @@ def test_what_the_left_picture_does_not_show_has_no_colour_of_depth(rng, tmp_pat
     depth = pictures_in((tmp_path / "report.html").read_text(encoding="utf-8"))["Depth in colour"]
     assert depth[:, :72].max() < 8
     assert depth[:, 88:].max(axis=2).min() > 40
-    shown, _ = shrunk(pair, estimate, 160)
+    shown, _ = downscale(pair, estimate, 160)
     assert (shown.left_seen == seen[::2, ::2]).all()
 
 

@@ -42,7 +42,7 @@ ERRORS: dict[str, tuple[str, dict[str, str], dict[str, Any]]] = {
         {"left": "plain.png", "right": "plain.png"},
         {"rectify": True},
     ),
-    "expected a camera, for metres, found none; give a calibration, or the focal length and baseline of a "
+    "expected a camera for depth, found none; give a calibration, or the focal length and baseline of a "
     "rectified pair (calib, focal_px, baseline_m)": ("/depth", PAIR, {}),
     "range: expected disparities of -640 to 640 px, the width of the pictures, got 700 and 800; omit it for "
     "automatic detection": ("/disparity", PAIR, {"range": "700,800"}),
