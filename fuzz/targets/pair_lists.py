@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from fuzz.targets import Target
-from stereoweave.pictures.pair_finding import pairs_in_list
+from stereoweave.pictures.pair_finding import read_pair_list
 
 _STARTS = {
     "spaces.txt": b"left/a.png right/a.png\n# a comment\n\nleft/b.png right/b.png second\n",
@@ -14,7 +14,7 @@ _STARTS = {
 
 
 def _read(path: Path) -> None:
-    pairs_in_list(path)
+    read_pair_list(path)
 
 
 TARGET = Target(

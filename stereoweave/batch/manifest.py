@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.stores import Store, store_at
-from stereoweave.pictures.pair_finding import ListedPair, left_out_note, pairs_among
+from stereoweave.pictures.pair_finding import ListedPair, find_pairs_among, note_left_out
 
 if TYPE_CHECKING:
     import pyarrow
@@ -71,7 +71,7 @@ def extend_plan(source: Store, destination: Store, workers: int) -> ChunkPlan:
     """
     _read_plan.cache_clear()
     versions = {file.path: f"{file.size_bytes} {file.version}" for file in source.files()}
-    listed = pairs_among(source.place, versions)
+    listed = find_pairs_among(source.place, versions)
     found = {planned.name: planned for planned in _all_planned(listed.pairs, listed.films, versions)}
     parts = _parts(destination, PLAN)
     counts = {part: _updated(destination, part, found) for part in parts}  # which takes the known ones out
@@ -87,7 +87,7 @@ def extend_plan(source: Store, destination: Store, workers: int) -> ChunkPlan:
     # Of a plan that was lost, or that two runs extended at the same time.
     for stray in set(_parts(destination, MANIFEST)).difference(numbers):
         destination.remove(_part(MANIFEST, stray))
-    return ChunkPlan(numbers, sum(map(sum, counts.values())), left_out_note(source.place, listed.left_out))
+    return ChunkPlan(numbers, sum(map(sum, counts.values())), note_left_out(source.place, listed.left_out))
 
 
 def read_chunk(destination: Store, chunk: int) -> list[Planned]:

@@ -1,1 +1,1 @@
-"""From files to a pair."""
+"""Opening of pictures: layouts, pairs in folders, and rectification."""

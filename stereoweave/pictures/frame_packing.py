@@ -1,4 +1,4 @@
-"""How one picture, or a frame of video, holds two eyes: the arrangements, and a guess where none is named."""
+"""Layouts of two views in one picture or video frame, and their detection."""
 
 import re
 from collections.abc import Sequence
@@ -17,14 +17,14 @@ Frame = UInt8[np.ndarray, "rows columns 3"]
 
 
 class Arrangement(NamedTuple):
-    """How one frame holds two eyes."""
+    """Layout of two views in one frame; by default side by side, full size, left view first."""
 
     beside: bool = True
     half: bool = False
     right_first: bool = False
 
     def eye_size_px(self, width_px: int, height_px: int) -> tuple[int, int]:
-        """Width and height of one eye at its full size; FormatError where the frame cannot be halved."""
+        """Width and height of one view at full size; raises FormatError if the frame cannot be halved."""
         side, extent_px = ("width", width_px) if self.beside else ("height", height_px)
         if extent_px % 2 or extent_px < 2 * SMALLEST_SIDE_PX:
             raise FormatError(
@@ -36,7 +36,7 @@ class Arrangement(NamedTuple):
         return (width_px // 2, height_px) if self.beside else (width_px, height_px // 2)
 
     def eyes(self, frame: Frame) -> tuple[Picture, Picture]:
-        """Left and right eye of one frame, each at its full size."""
+        """Left and right view of one frame, each at full size."""
         first, second = np.split(frame, 2, axis=1 if self.beside else 0)
         if self.half:
             size_px = frame.shape[1], frame.shape[0]
@@ -66,22 +66,21 @@ _WORDS_IN_NAMES = {
 _HALF = {"half", "hsbs", "halfsbs", "htb", "htab", "hou", "halfou"}
 _FULL = {"full", "lrf", "rlf", "tbf", "fsbs", "fullsbs", "fulltb", "fullou"}
 
-# Width to height of one eye. Screens and cameras are 4:3 to 2.4:1; below and above, the eyes were squeezed to
-# half. The aspect alone does not tell an upright film, 9:16, which is taken for a squeezed one.
+# Aspect ratios of one view. Screens and cameras have 4:3 to 2.4:1; views outside of that are half size. An
+# upright video, 9:16, cannot be distinguished by its aspect ratio and is taken for half size.
 _NARROWEST_EYE, _WIDEST_EYE = 1.2, 2.5
-# Photographs are upright, square or wide. Where their aspect may be that of a full eye as well as that of a
-# squeezed one, the contrast of neighbours beside each other tells, divided by that of those above each other:
-# in the median of painted pictures it is 0.96 of full eyes, 1.58 where the width was squeezed to half, 0.57
-# where the height was.
+# Photographs are upright, square or wide. If the aspect ratio fits full and half size, the ratio of
+# horizontal to vertical contrast between neighbouring pixels decides. Its median over painted pictures is
+# 0.96 for full views, 1.58 for half width and 0.57 for half height.
 _UPRIGHT_EYE, _LOW_EYE, _LOWEST_EYE, _SQUEEZED_CONTRAST = 0.5, 2.0, 3.0, 1.25
 _SCREEN, _SCREEN_TOLERANCE = 16 / 9, 0.01
 _DETAIL_PX = 480
-# Width to height of a whole frame: two upright telephones beside each other are at least as wide, and the
-# widest film in two squeezed halves, one above the other, is at most as wide.
+# Limits of a whole frame's aspect ratio: two upright phone pictures side by side are at least as wide as the
+# first; two half-height views of the widest film, one above the other, are at most as wide as the second.
 _NARROWEST_BESIDE, _WIDEST_ABOVE = 1.05, 2.45
 
-# 95 in 100 painted or rendered pairs, of which many have disparities far above those of films, resemble each
-# other by 0.34 or more; the halves of single pictures by 0.13 at most, of blurred enlargements by 0.23.
+# The resemblance is 0.34 or more for 95 % of painted or rendered pairs, many with disparities far above those
+# of films. It is at most 0.13 for the halves of single pictures and 0.23 for those of blurred enlargements.
 _ALIKE = 0.3
 _SMALL_PX = 160, 120
 _WINDOW_PX, _STEP_PX, _SHIFT_PX, _OFF_PX = 20, 10, 32, 2
@@ -95,20 +94,21 @@ def guess_arrangement(
     *,
     photograph: bool = False,
 ) -> str:
-    """The name in `ARRANGEMENTS` that a film has: as its container declares, as its name says, as it looks.
+    """Detect a video's layout, a name in `ARRANGEMENTS`, from its container, its name or its frames.
 
-    What the name says must be borne out by the look, unless the frames are too plain to tell: "LR" has
-    other meanings too. Which eye comes first cannot be seen: the left one, unless declaration or name differ.
+    The frames must confirm a layout in the name, unless they are too plain: "LR" has other meanings too. The
+    frames do not show which view comes first; it is the left one, unless the container or the name differs.
 
     Args:
-        name: The file; words of its name, without its folders', may say it: film_SBS, film-half-OU.
-        frames: Some frames of the film, far from each other.
-        declared: What the container says, a name in `ARRANGEMENTS` of full size, which half ones may be.
-        photograph: Whether it is no film but one photograph, which may be upright.
+        name: Path of the file; its name, without folders, may contain a layout: film_SBS, film-half-OU.
+        frames: Some frames of the video, far apart in time.
+        declared: Layout in the container, a full-size name in `ARRANGEMENTS`; the views may still be half
+            size.
+        photograph: Whether it is a photograph, which may be upright, rather than a video.
 
     Raises:
-        FormatError: The two halves of the frames do not resemble each other, whichever way they are split;
-            or an arrangement is declared that is none of `ARRANGEMENTS`.
+        FormatError: The halves of the frames resemble each other in neither split, or the declared layout is
+            not in `ARRANGEMENTS`.
     """
     if declared not in (None, *ARRANGEMENTS):
         raise FormatError(
@@ -118,24 +118,24 @@ def guess_arrangement(
         )
     words = set(re.split(r"[^a-z0-9]+", Path(name).name.lower()))
     named = next((kind for kind, marks in _WORDS_IN_NAMES.items() if marks & words), None)
-    kind = declared or _confirmed(named, frames) or _seen(name, frames, photograph)
+    kind = declared or _confirm(named, frames) or _detect_layout(name, frames, photograph)
     looks_squeezed = _looks_squeezed_photograph if photograph else _looks_squeezed
     squeezed = bool(words & _HALF) or (not words & _FULL and looks_squeezed(kind, frames[0]))
     return f"{kind}_half" if squeezed else kind
 
 
-def resemblance(first: Picture, second: Picture) -> float:
-    """How far two pictures show one scene from two places, 0 to 1; NaN where they are too plain to tell.
+def measure_resemblance(first: Picture, second: Picture) -> float:
+    """Score from 0 to 1 of whether two images show one scene from two places; NaN if they are too plain.
 
-    Windows of the one are sought in the other, up to a fifth of the width aside. The median of their best
-    correlations, times the share of neighbouring windows that are found displaced alike: repeated patterns
-    correlate as well, but here and there. Both pictures are brought to one small size and freed of shades
-    wider than a window, for skies and floors are alike everywhere.
+    Windows of the first image are matched in the second, up to a fifth of the width away. The score is the
+    median of their best correlations, times the share of neighbouring windows with similar shifts: repeated
+    patterns also correlate, but with scattered shifts. Both images are first reduced to one small size and
+    high-pass filtered, because skies and floors look alike everywhere.
     """
-    here, there = _details(first), _details(second)
+    here, there = _extract_detail(first), _extract_detail(second)
     rows = range(_OFF_PX, _SMALL_PX[1] - _WINDOW_PX - _OFF_PX + 1, _STEP_PX)
     columns = range(0, _SMALL_PX[0] - _WINDOW_PX + 1, _STEP_PX)
-    found = np.array([[_sought(here, there, top, left) for left in columns] for top in rows])
+    found = np.array([[_match_window(here, there, top, left) for left in columns] for top in rows])
     correlation, shift_px = found[..., 0], found[..., 1]
     steps_px = np.concatenate([np.diff(shift_px, axis=axis).ravel() for axis in (0, 1)])
     steps_px = np.abs(steps_px[~np.isnan(steps_px)])
@@ -144,10 +144,10 @@ def resemblance(first: Picture, second: Picture) -> float:
     return float(max(np.nanmedian(correlation), 0) * np.mean(steps_px <= _AGREE_PX))
 
 
-def _sought(
+def _match_window(
     here: Float32[np.ndarray, "h w"], there: Float32[np.ndarray, "h w"], top: int, left: int
 ) -> tuple[float, float]:
-    """Best correlation of a window, and the shift in pixels where it is; NaN for a plain window."""
+    """Return the best correlation of a window and its shift in pixels; NaN for a plain window."""
     window = here[top : top + _WINDOW_PX, left : left + _WINDOW_PX]
     if window.std() < _PLAIN:
         return np.nan, np.nan
@@ -157,37 +157,37 @@ def _sought(
     return best, start + column - left
 
 
-def _details(picture: Picture) -> Float32[np.ndarray, "120 160"]:
+def _extract_detail(picture: Picture) -> Float32[np.ndarray, "120 160"]:
     grey = cv2.cvtColor(cv2.resize(picture, _SMALL_PX, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
     shades = grey.astype(np.float32)
     return shades - cv2.GaussianBlur(shades, (0, 0), _WINDOW_PX / 5)
 
 
-def _alike(kind: str, frames: Sequence[Frame]) -> float:
-    """The median resemblance of the two halves, NaN where no frame tells."""
-    scores = [resemblance(*_halves(kind, frame)) for frame in frames]
-    told = [score for score in scores if not np.isnan(score)]
-    return float(np.median(told)) if told else np.nan
+def _score_halves(kind: str, frames: Sequence[Frame]) -> float:
+    """Median resemblance of the frames' halves; NaN if all frames are too plain."""
+    scores = [measure_resemblance(*_split_halves(kind, frame)) for frame in frames]
+    known = [score for score in scores if not np.isnan(score)]
+    return float(np.median(known)) if known else np.nan
 
 
-def _halves(kind: str, frame: Frame) -> tuple[Picture, Picture]:
+def _split_halves(kind: str, frame: Frame) -> tuple[Picture, Picture]:
     height_px, width_px = frame.shape[0] // 2, frame.shape[1] // 2
     if ARRANGEMENTS[kind].beside:
         return frame[:, :width_px], frame[:, -width_px:]
     return frame[:height_px], frame[-height_px:]
 
 
-def _confirmed(named: str | None, frames: Sequence[Frame]) -> str | None:
-    return None if named is None or _alike(named, frames) < _ALIKE else named
+def _confirm(named: str | None, frames: Sequence[Frame]) -> str | None:
+    return None if named is None or _score_halves(named, frames) < _ALIKE else named
 
 
-def _seen(name: str, frames: Sequence[Frame], photograph: bool) -> str:
+def _detect_layout(name: str, frames: Sequence[Frame], photograph: bool) -> str:
     height_px, width_px = frames[0].shape[:2]
-    thinkable = {
+    plausible = {
         "side_by_side": width_px >= _NARROWEST_BESIDE * height_px,
         "top_bottom": width_px <= _WIDEST_ABOVE * height_px,
     }
-    alike = {kind: _alike(kind, frames) for kind, may_be in thinkable.items() if may_be}
+    alike = {kind: _score_halves(kind, frames) for kind, may_be in plausible.items() if may_be}
     best = max(alike, key=lambda kind: np.nan_to_num(alike[kind], nan=-1))
     if alike[best] >= _ALIKE:
         return best
@@ -213,26 +213,26 @@ def _looks_squeezed_photograph(kind: str, frame: Frame) -> bool:
     height_px, width_px = frame.shape[:2]
     if ARRANGEMENTS[kind].beside:
         aspect = width_px / 2 / height_px
-        # Both in one picture of a screen's aspect are made for a screen.
+        # A picture with the aspect ratio of a screen is made for a 3-D screen, which stretches half views.
         if abs(width_px / height_px / _SCREEN - 1) < _SCREEN_TOLERANCE:
             return True
         if _UPRIGHT_EYE <= aspect < _NARROWEST_EYE:
-            return _contrast_beside(kind, frame) > _SQUEEZED_CONTRAST
+            return _measure_contrast_ratio(kind, frame) > _SQUEEZED_CONTRAST
         return aspect < _UPRIGHT_EYE
     aspect = 2 * width_px / height_px
     if _LOW_EYE < aspect < _LOWEST_EYE:
-        return _contrast_beside(kind, frame) < 1 / _SQUEEZED_CONTRAST
+        return _measure_contrast_ratio(kind, frame) < 1 / _SQUEEZED_CONTRAST
     return aspect >= _LOWEST_EYE
 
 
-def _contrast_beside(kind: str, frame: Frame) -> float:
-    """The contrast of neighbours beside each other, divided by that of those above each other."""
+def _measure_contrast_ratio(kind: str, frame: Frame) -> float:
+    """Ratio of horizontal to vertical contrast between neighbouring pixels."""
     beside, above = 0.0, 0.0
-    for eye in _halves(kind, frame):
+    for eye in _split_halves(kind, frame):
         smaller = min(1.0, _DETAIL_PX / max(eye.shape[:2]))
         size_px = max(round(eye.shape[1] * smaller), 1), max(round(eye.shape[0] * smaller), 1)
         small = cv2.resize(eye, size_px, interpolation=cv2.INTER_AREA)
-        # So that the grain of the sensor, alike along both, does not count.
+        # Suppress sensor noise, which is equal along both axes.
         shades = cv2.GaussianBlur(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1)
         beside += float(np.abs(np.diff(shades, axis=1)).mean())
         above += float(np.abs(np.diff(shades, axis=0)).mean())

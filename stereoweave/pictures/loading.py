@@ -1,4 +1,4 @@
-"""Stereo pictures as people own them: two files, or one that holds both views in whatever way."""
+"""Opening of stereo pictures: two files, or one file with both views in any layout."""
 
 import re
 from collections.abc import Sequence
@@ -21,15 +21,21 @@ from stereoweave.io.decoding import (
     read_photograph,
 )
 from stereoweave.io.files import check_large_enough, pair_of
-from stereoweave.pictures.frame_packing import ARRANGEMENTS, Arrangement, guess_arrangement, resemblance
+from stereoweave.pictures.frame_packing import (
+    ARRANGEMENTS,
+    Arrangement,
+    guess_arrangement,
+    measure_resemblance,
+)
 from stereoweave.stereo import StereoPair
 
-# Layouts of one file that holds both views: how one picture holds them, or the kind of file.
+# Layouts of one file with both views: the layout of one picture, or a file format with two pictures.
 FORMATS = (*ARRANGEMENTS, "mpo", "jps")
 TWO_PICTURES = "two_pictures"
 _OVERRIDE = Remedy("override it if it is wrong", ("arrangement",))
 
-# What `layouts` writes that holds no two eyes, and whose halves may yet resemble each other.
+# Output layouts of `rendering.layouts` other than two views, whose halves may nevertheless resemble each
+# other.
 _OTHER_LAYOUTS = {"a quilt of many views": r"_qs\d+x\d+a[\d.]+$", "a picture and its depth": r"_RGBD$"}
 
 _JPS_MARK, _JPS_STEREO, _JPS_BESIDE, _JPS_ABOVE = b"_JPSJPS_", 1, 2, 3
@@ -39,13 +45,13 @@ _CROSSED_ENDINGS = (".jps", ".pns")
 
 @dataclass(frozen=True, kw_only=True)
 class Opened:
-    """A pair as it was taken, not rectified.
+    """A pair as taken, before rectification.
 
     Attributes:
         pair: Both views, upright, in sRGB.
-        arrangement: How the files held them: a name in `ARRANGEMENTS`, "mpo" or "two_pictures".
+        arrangement: Layout of the files: a name in `ARRANGEMENTS`, "mpo" or "two_pictures".
         notes: What was detected or changed.
-        lens: What the tags of the files say of the cameras, in pixels of the pair; None for nothing.
+        lens: The cameras according to EXIF, in pixels of the pair; None if EXIF has nothing.
     """
 
     pair: StereoPair
@@ -55,17 +61,17 @@ class Opened:
 
 
 def open_pictures(paths: Sequence[Path], arrangement: str | None = None) -> Opened:
-    """The pair of two pictures, left first, or of one file that holds both views.
+    """Open the pair in two pictures, left first, or in one file with both views.
 
     Args:
         paths: One or two files.
-        arrangement: How one file holds both views, a name in `FORMATS`; guessed unless given: as the file's
-            kind says, as its name says, as it looks.
+        arrangement: Layout of one file with both views, a name in `FORMATS`. Default: detected from the file
+            format, the file's name, then its content.
 
     Raises:
-        FormatError: A file that cannot be read, holds no two views, is too large, or is of a kind that is not
-            read, which the error names; or two pictures of different sizes.
-        StereoweaveError: An unknown arrangement, one beside two files, or not one or two files.
+        FormatError: A file is unreadable, too large, in an unsupported format (named in the error) or without
+            two views; or the two pictures differ in size.
+        StereoweaveError: Unknown layout, a layout given for two files, or neither one nor two files.
     """
     if arrangement not in (None, *FORMATS):
         raise StereoweaveError(
@@ -79,9 +85,9 @@ def open_pictures(paths: Sequence[Path], arrangement: str | None = None) -> Open
                     "leave it out, and give the left one first",
                     setting="arrangement",
                 )
-            return _two(left, right)
+            return _open_two(left, right)
         case [both]:
-            return _one(both, arrangement)
+            return _open_one(both, arrangement)
     names = " ".join(map(str, paths))
     raise StereoweaveError(
         f"expected LEFT RIGHT or SIDE_BY_SIDE, one or two pictures, found {len(paths)}: {names}"
@@ -89,42 +95,42 @@ def open_pictures(paths: Sequence[Path], arrangement: str | None = None) -> Open
 
 
 def pixel_factor(path: Path, picture: Image.Image, arrangement: str | None) -> int:
-    """The pixels of both views divided by those that the head of their common file states: 1 or 2.
+    """Pixels of both views divided by the pixels in the header of their common file: 1 or 2.
 
-    It is 2 for MPO files, and for half views that `arrangement` or the JPS mark of the file declares.
+    It is 2 for MPO files, and for half-size views declared by `arrangement` or by the file's JPS header.
     """
     if arrangement in (None, "mpo") and find_view_frames(path, picture):
         return 2
-    known = ARRANGEMENTS.get(_declared(path, picture, arrangement)[0] or "")
+    known = ARRANGEMENTS.get(_read_declared(path, picture, arrangement)[0] or "")
     return 2 if known is not None and known.half else 1
 
 
-def _two(left: Path, right: Path) -> Opened:
+def _open_two(left: Path, right: Path) -> Opened:
     photographs = [read_photograph(path) for path in (left, right)]
-    lies, notes = _upright(*photographs)
+    lies, notes = _choose_orientations(*photographs)
     eyes = [each.upright(lie) for each, lie in zip(photographs, lies, strict=True)]
     return Opened(
         pair=pair_of(left, eyes[0], right, eyes[1]),
         arrangement=TWO_PICTURES,
         notes=(*notes, *_colour_notes(photographs)),
-        lens=_lens(photographs),
+        lens=_read_lens(photographs),
     )
 
 
-def _one(path: Path, arrangement: str | None) -> Opened:
+def _open_one(path: Path, arrangement: str | None) -> Opened:
     with open_picture(path, views=2) as picture:
         frames = find_view_frames(path, picture) if arrangement in (None, "mpo") else []
         if frames:
-            return _of_frames(path, picture, frames)
+            return _open_mpo(path, picture, frames)
         if arrangement == "mpo":
             raise FormatError(f"{path}: expected an MPO file with two pictures of one size, found one")
-        name, why = _declared(path, picture, arrangement)
+        name, why = _read_declared(path, picture, arrangement)
         photograph = decode(path, picture)
     lies = exif.read_orientation(photograph.tags)
     image = photograph.upright(lies)
     if name is None:
-        name, why = _guessed(path, image), "detected from name and content"
-    left, right = _halves(path, image, ARRANGEMENTS[name])
+        name, why = _detect_layout(path, image), "detected from name and content"
+    left, right = _split_views(path, image, ARRANGEMENTS[name])
     height_px, width_px = left.shape[:2]
     notes = [Note(f"{name}, {why}", _OVERRIDE)] if why else []
     return Opened(
@@ -135,11 +141,11 @@ def _one(path: Path, arrangement: str | None) -> Opened:
     )
 
 
-def _of_frames(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opened:
-    """The pair of an MPO file, both turned as the first one lies: the lenses are in one body."""
+def _open_mpo(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opened:
+    """Open the pair in an MPO file; both views share the first one's orientation, as one camera took them."""
     photographs = [read_frame(path, picture, index) for index in frames]
     lies = exif.read_orientation(photographs[0].tags)
-    # CIPA DC-007 counts viewpoints from the left; many files leave that out, and have the left one first.
+    # CIPA DC-007 numbers viewpoints from the left; many files omit the number and store the left view first.
     photographs.sort(key=lambda each: exif.read_viewpoint(each.tags))
     left, right = (each.upright(lies) for each in photographs)
     if left.shape != right.shape:
@@ -150,19 +156,22 @@ def _of_frames(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opene
         pair=StereoPair(left=left, right=right),
         arrangement="mpo",
         notes=(
-            Note("mpo, the two pictures of the file", _OVERRIDE),
+            Note("mpo, two pictures in one file", _OVERRIDE),
             *_turn_notes(lies),
             *_colour_notes(photographs),
         ),
-        lens=_lens(photographs),
+        lens=_read_lens(photographs),
     )
 
 
-def _upright(left: DecodedPicture, right: DecodedPicture) -> tuple[tuple[int | None, int | None], list[Note]]:
-    """How each of two pictures lies, and a note on it.
+def _choose_orientations(
+    left: DecodedPicture, right: DecodedPicture
+) -> tuple[tuple[int | None, int | None], list[Note]]:
+    """Return the EXIF orientation to use for each of two pictures, and notes.
 
-    Each as its tag says, unless that makes their sizes differ or one has no tag, which editors lose, some of
-    them with the picture turned, some without: then both as the one, if their sizes fit so, and look so.
+    Each picture uses its own tag, unless their sizes then differ or one tag is missing. Editors drop the tag,
+    some after rotating the picture, some without. In these cases both use one tag if it makes the sizes equal
+    and the pictures more similar.
     """
     own = exif.read_orientation(left.tags), exif.read_orientation(right.tags)
     if own[0] == own[1] or {*own} <= {None, 1}:
@@ -174,22 +183,28 @@ def _upright(left: DecodedPicture, right: DecodedPicture) -> tuple[tuple[int | N
         if exif.turn_upright(left.image, lies[0]).size == exif.turn_upright(right.image, lies[1]).size
     ]
     if len(fitting) == 2 and None not in own:
-        return own, [Note("each picture turned upright as its EXIF says")]
-    best = max(fitting or [own], key=lambda lies: np.nan_to_num(_likeness(left, right, lies), nan=-1))
+        return own, [Note("each picture turned upright by its own EXIF orientation")]
+    best = max(fitting or [own], key=lambda lies: np.nan_to_num(_compare(left, right, lies), nan=-1))
     if best == alike:
-        which = "the other says" if None in own else "the left one says, though the right one differs"
-        return best, [Note(f"both pictures turned upright as EXIF of {which}")]
-    return best, [Note("one picture turned upright as EXIF says, the other left as it is")]
+        which = (
+            "the only EXIF orientation"
+            if None in own
+            else "the left EXIF orientation, though the right one differs"
+        )
+        return best, [Note(f"both pictures turned upright by {which}")]
+    return best, [Note("one picture turned upright by its EXIF orientation, the other unchanged")]
 
 
-def _likeness(left: DecodedPicture, right: DecodedPicture, lies: tuple[int | None, int | None]) -> float:
-    return resemblance(left.upright(lies[0]), right.upright(lies[1]))
+def _compare(left: DecodedPicture, right: DecodedPicture, lies: tuple[int | None, int | None]) -> float:
+    return measure_resemblance(left.upright(lies[0]), right.upright(lies[1]))
 
 
-def _declared(path: Path, picture: Image.Image, arrangement: str | None) -> tuple[str | None, str | None]:
-    """The name in `ARRANGEMENTS` that the user or a JPS file gives, and why where it is the file; else None.
+def _read_declared(
+    path: Path, picture: Image.Image, arrangement: str | None
+) -> tuple[str | None, str | None]:
+    """Return the layout that the user or a JPS file declares, and the reason if it is the file; else None.
 
-    Source: VRex's JPS, the four bytes after its mark and their count: separation, flags, layout, type.
+    Source: VRex's JPS format; after identifier and length, four bytes: separation, flags, layout, type.
     """
     if arrangement not in (None, "jps"):
         return arrangement, None
@@ -197,30 +212,32 @@ def _declared(path: Path, picture: Image.Image, arrangement: str | None) -> tupl
     mark = next((content for content in segments if content.startswith(_JPS_MARK)), b"")
     if len(mark) < 14 or mark[13] != _JPS_STEREO:
         is_jps = arrangement == "jps" or path.suffix.lower() in _CROSSED_ENDINGS
-        return ("crossed", "as is usual of .jps files") if is_jps else (None, None)
+        return ("crossed", "the default of .jps files") if is_jps else (None, None)
     flags, layout = mark[11], mark[12]
     if layout not in (_JPS_BESIDE, _JPS_ABOVE):
         raise FormatError(
-            f"{path}: expected two views side by side or one above the other, found JPS that is interleaved "
-            "or an anaglyph, which is not read; save it side by side"
+            f"{path}: expected two views side by side or one above the other, found a JPS file that is "
+            "interleaved or an anaglyph; save it side by side"
         )
     beside = layout == _JPS_BESIDE
     half = bool(flags & (_JPS_HALF_WIDTH if beside else _JPS_HALF_HEIGHT))
     known = Arrangement(beside=beside, half=half, right_first=not flags & _JPS_LEFT_FIRST)
-    return next(name for name, each in ARRANGEMENTS.items() if each == known), "as its JPS mark says"
+    return next(name for name, each in ARRANGEMENTS.items() if each == known), "from its JPS header"
 
 
-def _guessed(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> str:
+def _detect_layout(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> str:
     for kind, mark in _OTHER_LAYOUTS.items():
         if re.search(mark, path.stem):
-            raise FormatError(f"{path}: expected two views, found {kind}, by its name", remedy=_OVERRIDE)
+            raise FormatError(
+                f"{path}: expected two views, found {kind}, according to its name", remedy=_OVERRIDE
+            )
     return guess_arrangement(str(path), [image], photograph=True)
 
 
-def _halves(
+def _split_views(
     path: Path, image: UInt8[np.ndarray, "h w 3"], arrangement: Arrangement
 ) -> tuple[UInt8[np.ndarray, "h2 w2 3"], UInt8[np.ndarray, "h2 w2 3"]]:
-    """Left and right view at their full size."""
+    """Split an image into the left and the right view, at full size."""
     height_px, width_px = image.shape[:2]
     try:
         view_px = arrangement.eye_size_px(width_px, height_px)
@@ -232,18 +249,18 @@ def _halves(
     return left, right
 
 
-def _lens(photographs: Sequence[DecodedPicture]) -> exif.Lens | None:
-    """What the tags of either picture say of both; the first one's where both do."""
+def _read_lens(photographs: Sequence[DecodedPicture]) -> exif.Lens | None:
+    """Read the cameras from the tags of both pictures; the first picture's take precedence."""
     first, second = photographs
     return exif.read_lens({**second.tags, **first.tags}, *first.image.size)
 
 
 def _turn_notes(lies: int | None) -> list[Note]:
-    return [] if lies in (None, 1) else [Note("turned upright as EXIF says")]
+    return [] if lies in (None, 1) else [Note("turned upright by its EXIF orientation")]
 
 
 def _colour_notes(photographs: Sequence[DecodedPicture]) -> list[Note]:
-    """Colour conversions, once if both pictures had the same."""
+    """Return notes on colour conversions, one if both pictures had the same."""
     texts = [each.note for each in photographs]
     if len(set(texts)) == 1:
         return [Note(text) for text in texts[:1] if text]

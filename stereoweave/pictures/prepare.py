@@ -1,4 +1,4 @@
-"""Pictures as they were given become a pair that can be matched: opened, rectified, with its camera."""
+"""Preparation of pictures for matching: open, rectify, find the camera."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,13 +16,13 @@ from stereoweave.stereo import StereoCamera, StereoPair
 
 @dataclass(frozen=True, kw_only=True)
 class Request:
-    """What a user says about a pair beside its pictures.
+    """User settings for opening and rectifying a pair.
 
     Attributes:
-        arrangement: How one picture holds both views, a name in `pictures.FORMATS`; guessed where None.
-        calibration: A calibration file of the two cameras (`calibration_files.read_rig`).
-        focal_px, baseline_m: Without one, what is known of the cameras; else EXIF may say it.
-        rectify: Whether the rows are brought to match: by the calibration, or by features without one.
+        arrangement: Layout of one picture with both views, a name in `loading.FORMATS`; default: detected.
+        calibration: Calibration file of the two cameras (`calibration_files.read_rig`).
+        focal_px, baseline_m: The camera, without a calibration; default: from EXIF.
+        rectify: Whether to rectify the pair, by the calibration or, without one, by features.
     """
 
     arrangement: str | None = None
@@ -34,13 +34,13 @@ class Request:
     def __post_init__(self) -> None:
         if self.calibration and not (self.focal_px is None and self.baseline_m is None):
             raise StereoweaveError(
-                f"{self.calibration}: expected a calibration, or focal length and baseline given, found both"
+                f"{self.calibration}: expected a calibration, or focal length and baseline, found both"
             )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Prepared:
-    """A pair that can be matched, the files it was read from, and notes on what was detected or changed."""
+    """A pair ready for matching, its files, and notes on what was detected or changed."""
 
     pair: StereoPair
     pictures: tuple[Path, ...]
@@ -48,28 +48,28 @@ class Prepared:
 
 
 def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
-    """The pair of two pictures, left first, or of one that holds both views.
+    """Open and rectify the pair in two pictures, left first, or in one picture with both views.
 
-    Its camera comes from the calibration, from what is known by hand, or from EXIF; where none of them says
-    both focal length and baseline, or features alone rectified the pair, it has none.
+    The camera comes from the calibration, from the request, or from EXIF. The pair has none if focal length
+    or baseline is missing, or if it was rectified by features.
 
     Raises:
-        StereoweaveError: As `open_pictures`, `read_rig`, `rectify` and `rectify_by_features`; or only one of
-            focal length and baseline is known though the other one was given.
+        StereoweaveError: See `open_pictures`, `read_rig`, `rectify` and `rectify_by_features`; or the request
+            has one of focal length and baseline and the other is unknown.
     """
     opened = open_pictures(pictures, request.arrangement)
     if request.calibration:
-        ready = _calibrated(opened.pair, request.calibration, request.rectify)
+        ready = _apply_calibration(opened.pair, request.calibration, request.rectify)
     else:
-        camera, notes = _camera(opened.pair, opened.lens or Lens(), request)
+        camera, notes = _find_camera(opened.pair, opened.lens or Lens(), request)
         ready = Rectified(pair=replace(opened.pair, camera=camera), notes=notes)
         if request.rectify:
-            ready = _by_features(ready)
+            ready = _rectify_by_features(ready)
     return Prepared(pair=ready.pair, pictures=tuple(pictures), notes=(*opened.notes, *ready.notes))
 
 
-def _calibrated(pair: StereoPair, path: Path, rectified: bool) -> Rectified:
-    """The pair with the camera of a calibration, rectified by it where that is asked for."""
+def _apply_calibration(pair: StereoPair, path: Path, rectified: bool) -> Rectified:
+    """Add the calibration's camera to the pair, and rectify the pair by it if requested."""
     rig = read_rig(path, pair_size_px(pair))
     if rectified:
         return rectify(pair, rig)
@@ -83,8 +83,10 @@ def _calibrated(pair: StereoPair, path: Path, rectified: bool) -> Rectified:
     return Rectified(pair=replace(pair, camera=rig.camera()), notes=rig.notes)
 
 
-def _camera(pair: StereoPair, lens: Lens, request: Request) -> tuple[StereoCamera | None, tuple[Note, ...]]:
-    """The camera of the request, completed from EXIF; and a note on what came from EXIF."""
+def _find_camera(
+    pair: StereoPair, lens: Lens, request: Request
+) -> tuple[StereoCamera | None, tuple[Note, ...]]:
+    """Return the request's camera, completed from EXIF, and a note on the values from EXIF."""
     focal_px = lens.focal_px if request.focal_px is None else request.focal_px
     baseline_m = lens.baseline_m if request.baseline_m is None else request.baseline_m
     if focal_px is not None and baseline_m is not None:
@@ -105,8 +107,8 @@ def _camera(pair: StereoPair, lens: Lens, request: Request) -> tuple[StereoCamer
     return None, ()
 
 
-def _by_features(ready: Rectified) -> Rectified:
-    """The pair rectified by what it shows, without its camera: the turn put in is known but for infinity."""
+def _rectify_by_features(ready: Rectified) -> Rectified:
+    """Rectify the pair by its features and drop its camera: the disparity at infinity is then unknown."""
     rectified = rectify_by_features(ready.pair)
     if ready.pair.camera is None:
         return rectified

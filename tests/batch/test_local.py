@@ -22,7 +22,7 @@ from stereoweave.errors import OutputInUseError, StereoweaveError
 from stereoweave.io.files import read_image, read_pixels, write_image
 from stereoweave.matching.backend import Backend
 from stereoweave.outputs.results import DepthJob, make_depth
-from stereoweave.pictures.pair_finding import FoundPairs, NamedPair, pairs_in
+from stereoweave.pictures.pair_finding import FoundPairs, NamedPair, find_pairs_in
 from stereoweave.pictures.prepare import Request
 from stereoweave.system.threads import usable_cores
 
@@ -35,12 +35,12 @@ import sys
 from pathlib import Path
 from stereoweave.batch.local import depth_of_many
 from stereoweave.matching.backend import Backend
-from stereoweave.pictures.pair_finding import pairs_in
+from stereoweave.pictures.pair_finding import find_pairs_in
 from stereoweave.outputs.results import DepthJob
 
 if __name__ == "__main__":
     job = DepthJob(backend=Backend(threads=1), always=("disparity.pfm", "preview.png", "confidence.png"))
-    sys.exit(depth_of_many(pairs_in(Path(sys.argv[1])), Path(sys.argv[2]), job, processes=2))
+    sys.exit(depth_of_many(find_pairs_in(Path(sys.argv[1])), Path(sys.argv[2]), job, processes=2))
 """
 
 
@@ -85,7 +85,7 @@ def write_pairs(folder: Path, count: int, size_px=(96, 64)) -> Path:
 def batch(folder: Path, out: Path, job: DepthJob = JOB, **options) -> tuple[LocalTally, str]:
     """The tally, and what was shown meanwhile."""
     shown = io.StringIO()
-    options.setdefault("pairs", pairs_in(folder).pairs)
+    options.setdefault("pairs", find_pairs_in(folder).pairs)
     return run_batch(out=out, job=job, console=Console(file=shown), **options), shown.getvalue()
 
 
@@ -146,7 +146,7 @@ def test_a_bad_pair_is_told_and_the_others_are_as_they_are_alone_and_the_next_ru
 def test_a_pair_that_fails_when_it_is_made_again_is_finished_no_more(tmp_path):
     folder, out = write_pairs(tmp_path / "pairs", 2), tmp_path / "out"
     assert batch(folder, out, processes=1)[0].done == 2
-    first, second = pairs_in(folder).pairs
+    first, second = find_pairs_in(folder).pairs
     second.pictures[1].write_bytes(b"no picture")
     tally, _ = batch(folder, out, processes=1)
     assert [name for name, _ in tally.failed] == ["01"]
@@ -159,7 +159,7 @@ def test_a_pair_is_there_only_with_its_pictures_and_its_mark_unharmed(tmp_path, 
     folder, out = write_pairs(tmp_path / "pairs", 3), tmp_path / "out"
     out.mkdir()
     (out / ".DS_Store").touch()  # a folder of which only this is in it is a new one
-    pairs = pairs_in(folder).pairs
+    pairs = find_pairs_in(folder).pairs
     assert batch(folder, out, processes=1)[0].done == 3
     (out / "00" / DONE_FILE).write_text("{")
     pairs[1].pictures[0].unlink()
@@ -177,7 +177,7 @@ def test_several_processes_have_a_thread_each_and_a_single_one_has_all_cores(
 ):
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
     folder = write_pairs(tmp_path / "pairs", 2)
-    pairs = [Noting(pair.name, pair.pictures) for pair in pairs_in(folder).pairs]
+    pairs = [Noting(pair.name, pair.pictures) for pair in find_pairs_in(folder).pairs]
     job = DepthJob(always=("disparity.pfm",))
     assert batch(folder, tmp_path / "out", job, pairs=pairs, processes=processes)[0].done == 2
     notes = [pair.pictures[0].with_suffix(".txt").read_text() for pair in pairs]
@@ -217,7 +217,7 @@ def test_a_killed_batch_goes_on_and_so_does_an_interrupted_one_but_none_beside_a
     assert "Traceback" not in errors
     assert not list(out.glob(".*"))
 
-    assert depth_of_many(pairs_in(folder), out, JOB, processes=2) == 0
+    assert depth_of_many(find_pairs_in(folder), out, JOB, processes=2) == 0
     assert capsys.readouterr().out.splitlines() == [
         f"{out}: 24 pairs: {24 - len(before)} made, {len(before)} were there",
         f"table: {out / 'summary.csv'}",
@@ -231,7 +231,7 @@ def test_a_killed_batch_goes_on_and_so_does_an_interrupted_one_but_none_beside_a
 
 def test_a_pair_that_kills_its_process_is_named_and_costs_no_other(tmp_path, capsys):
     folder, out = write_pairs(tmp_path / "pairs", 3), tmp_path / "out"
-    first, second, third = pairs_in(folder).pairs
+    first, second, third = find_pairs_in(folder).pairs
     pairs = [first, Deadly(second.name, second.pictures), third]
     assert depth_of_many(FoundPairs(pairs), out, JOB, processes=2, as_json=True) == 1
     told = capsys.readouterr()

@@ -147,7 +147,7 @@ def test_two_files_are_turned_upright_each_as_its_tag_says(tmp_path, pair, lies)
     stored = [np.rot90(eye, quarter_turns) for eye in (pair.left, pair.right)]
     opened = open_pictures(write_two(tmp_path, *stored, tagged(lies), tagged(lies)))
     assert_eyes(opened, pair)
-    assert list(map(str, opened.notes)) == ["turned upright as EXIF says"]
+    assert list(map(str, opened.notes)) == ["turned upright by its EXIF orientation"]
 
 
 @pytest.mark.parametrize("lost", ["left", "right"])
@@ -157,7 +157,7 @@ def test_a_tag_that_one_of_two_files_has_lost_goes_for_both(tmp_path, pair, lost
     tags = [None if lost == side else tagged(lies) for side in ("left", "right")]
     opened = open_pictures(write_two(tmp_path, *stored, *tags))
     assert_eyes(opened, pair)
-    assert list(map(str, opened.notes)) == ["both pictures turned upright as EXIF of the other says"]
+    assert list(map(str, opened.notes)) == ["both pictures turned upright by the only EXIF orientation"]
 
 
 @pytest.mark.parametrize("lies", [3, 6])
@@ -166,7 +166,7 @@ def test_a_file_that_was_turned_when_it_lost_its_tag_is_left_as_it_is(tmp_path, 
     opened = open_pictures(write_two(tmp_path, stored, pair.right, tagged(lies)))
     assert_eyes(opened, pair)
     assert list(map(str, opened.notes)) == [
-        "one picture turned upright as EXIF says, the other left as it is"
+        "one picture turned upright by its EXIF orientation, the other unchanged"
     ]
 
 
@@ -188,7 +188,7 @@ def test_a_side_by_side_picture_is_turned_as_a_whole(tmp_path, pair):
     Image.fromarray(whole).save(tmp_path / "both.png", exif=tagged(3))
     opened = open_pictures([tmp_path / "both.png"])
     assert_eyes(opened, pair)
-    assert "turned upright as EXIF says" in [note.text for note in opened.notes]
+    assert "turned upright by its EXIF orientation" in [note.text for note in opened.notes]
 
 
 def test_the_first_picture_of_an_mpo_file_says_how_both_lie(tmp_path, pair):
@@ -216,7 +216,7 @@ def test_an_mpo_file_holds_the_left_picture_and_then_the_right_one(tmp_path, pai
     assert_eyes(opened, pair, tolerance=3)
     assert opened.arrangement == "mpo"
     assert list(map(str, opened.notes)) == [
-        "mpo, the two pictures of the file; override it if it is wrong (arrangement)"
+        "mpo, two pictures in one file; override it if it is wrong (arrangement)"
     ]
 
 
@@ -315,7 +315,7 @@ def test_a_jps_file_says_how_it_holds_its_views(tmp_path, pair, flags, layout, a
         opened = open_pictures([write_jps(tmp_path / name, image, flags, layout)])
         assert opened.arrangement == arrangement
         assert list(map(str, opened.notes)) == [
-            f"{arrangement}, as its JPS mark says; override it if it is wrong (arrangement)"
+            f"{arrangement}, from its JPS header; override it if it is wrong (arrangement)"
         ]
         assert_eyes(opened, pair, tolerance=12)
 
@@ -333,7 +333,7 @@ def test_a_jps_file_that_says_nothing_is_crossed(tmp_path, pair):
     opened = open_pictures([tmp_path / "a.jps"])
     assert_eyes(opened, pair, tolerance=3)
     assert list(map(str, opened.notes)) == [
-        "crossed, as is usual of .jps files; override it if it is wrong (arrangement)"
+        "crossed, the default of .jps files; override it if it is wrong (arrangement)"
     ]
     image.save(tmp_path / "b.jpg", "JPEG", **FINE)
     assert open_pictures([tmp_path / "b.jpg"], "jps").arrangement == "crossed"

@@ -8,10 +8,10 @@ from stereoweave.pictures.pair_finding import (
     ListedPair,
     NamedPair,
     find_pairs,
-    pairs_among,
-    pairs_by_globs,
-    pairs_in,
-    pairs_in_list,
+    find_pairs_among,
+    find_pairs_by_globs,
+    find_pairs_in,
+    read_pair_list,
 )
 
 
@@ -47,76 +47,79 @@ def test_a_folders_pairs_are_found_by_the_marks_of_their_sides(tmp_path, name, l
     folder = put(tmp_path, left, right)
     if name.startswith("img"):
         name = "img_img_7"
-    assert listed(folder, pairs_in(folder).pairs) == {name: (left, right)}
+    assert listed(folder, find_pairs_in(folder).pairs) == {name: (left, right)}
 
 
 def test_a_pair_right_in_the_folder_has_the_folders_name(tmp_path):
     folder = put(tmp_path / "castle", "left.png", "right.png")
-    assert listed(folder, pairs_in(folder).pairs) == {"castle": ("left.png", "right.png")}
+    assert listed(folder, find_pairs_in(folder).pairs) == {"castle": ("left.png", "right.png")}
 
 
 def test_words_that_only_begin_like_a_mark_are_none(tmp_path):
     folder = put(tmp_path, "leftover.png", "lake.png", "Room.png", "im0001.png", "ball.png")
     expected = {Path(name).stem: (name,) for name in ("leftover.png", "lake.png", "Room.png", "im0001.png")}
-    assert listed(folder, pairs_in(folder).pairs) == expected | {"ball": ("ball.png",)}
+    assert listed(folder, find_pairs_in(folder).pairs) == expected | {"ball": ("ball.png",)}
 
 
 def test_half_a_pair_is_a_pair_whose_other_picture_is_missing(tmp_path):
     folder = put(tmp_path, "left/1.png", "right/1.png", "left/2.png", "right/3.png")
-    assert listed(folder, pairs_in(folder).pairs) == {
+    assert listed(folder, find_pairs_in(folder).pairs) == {
         name: (f"left/{name}.png", f"right/{name}.png") for name in ("1", "2", "3")
     }
 
 
 def test_marks_mean_nothing_where_not_one_pair_is_whole(tmp_path):
     folder = put(tmp_path, "turn_left.jpg", "sea.jpg")
-    assert listed(folder, pairs_in(folder).pairs) == {"sea": ("sea.jpg",), "turn_left": ("turn_left.jpg",)}
+    assert listed(folder, find_pairs_in(folder).pairs) == {
+        "sea": ("sea.jpg",),
+        "turn_left": ("turn_left.jpg",),
+    }
 
 
 def test_files_of_both_views_are_pairs_and_the_camera_s_copy_beside_them_is_left_out(tmp_path):
     folder = put(tmp_path, "DSCF1.MPO", "DSCF1.JPG", "tree.jps", "notes.txt")
-    found = pairs_in(folder)
+    found = find_pairs_in(folder)
     assert listed(folder, found.pairs) == {"DSCF1": ("DSCF1.MPO",), "tree": ("tree.jps",)}
-    assert found.notes == (f"{folder}: 1 picture left out, whose names do not say left or right: DSCF1.JPG",)
+    assert found.notes == (f"{folder}: 1 picture skipped, no left or right in the name: DSCF1.JPG",)
 
 
 def test_a_scene_folder_brings_its_calibration_and_not_its_ground_truth(tmp_path):
     names = ["left.png", "right.png", "disparity.png"]
     folder = put(tmp_path, *(f"{scene}/{name}" for scene in ("a", "b") for name in names), "b/calib.txt")
-    found = pairs_in(folder)
+    found = find_pairs_in(folder)
     assert [(pair.name, pair.calibration) for pair in found.pairs] == [
         ("a", None),
         ("b", folder / "b" / "calib.txt"),
     ]
-    assert "2 pictures left out" in found.notes[0]
+    assert "2 pictures skipped" in found.notes[0]
 
 
 def test_hidden_files_and_results_of_a_batch_are_no_pictures(tmp_path):
     folder = put(tmp_path, "a_l.png", "a_r.png", "._a_l.png", ".trash/b_l.png")
     put(folder, "out/batch.json", "out/a/preview.png", "out/a/left.png", "out/a/right.png")
-    assert listed(folder, pairs_in(folder).pairs) == {"a": ("a_l.png", "a_r.png")}
+    assert listed(folder, find_pairs_in(folder).pairs) == {"a": ("a_l.png", "a_r.png")}
 
 
 def test_two_pairs_of_one_name_are_refused_before_the_start_even_if_capitals_alone_differ(tmp_path):
     folder = put(tmp_path, "a_L.png", "a_R.png", "A_L.jpg", "A_R.jpg")
     with pytest.raises(
-        StereoweaveError, match="pairs of different names, found a for .*A_L.jpg and for .*a_L.png"
+        StereoweaveError, match="pairs with different names, found a for .*A_L.jpg and for .*a_L.png"
     ):
-        pairs_in(folder)
+        find_pairs_in(folder)
 
 
 def test_a_folder_without_pictures_is_told_in_one_line(tmp_path):
     with pytest.raises(StereoweaveError, match="expected pictures in it, .* found none"):
-        pairs_in(put(tmp_path, "film.mp4"))
+        find_pairs_in(put(tmp_path, "film.mp4"))
     with pytest.raises(StereoweaveError, match="expected a folder of pictures, found no such folder"):
-        pairs_in(tmp_path / "none")
+        find_pairs_in(tmp_path / "none")
 
 
 def test_pairs_among_the_files_of_a_store_are_those_of_a_folder_with_the_same_files(tmp_path):
     names = ["a/left.png", "a/right.png", "a/calib.txt", "b_l.png", "b_r.png", "c/1.jps", "d.png", "left.png"]
     names += ["out/batch.json", "out/e/left.png", "out/e/right.png", "right.png", "calib.txt", "c/calib.txt"]
     folder = put(tmp_path / "castle", *names)
-    among = pairs_among("s3://bucket/castle", iter(names))
+    among = find_pairs_among("s3://bucket/castle", iter(names))
     assert among.pairs == [
         ListedPair("c_1", ("c/1.jps",)),
         ListedPair("a", ("a/left.png", "a/right.png"), "a/calib.txt"),
@@ -124,7 +127,7 @@ def test_pairs_among_the_files_of_a_store_are_those_of_a_folder_with_the_same_fi
         ListedPair("castle", ("left.png", "right.png"), "calib.txt"),
     ]
     assert among.left_out == ["d.png"]
-    pairs = pairs_in(folder).pairs
+    pairs = find_pairs_in(folder).pairs
     assert listed(folder, pairs) == {pair.name: pair.files for pair in among.pairs}
     assert [pair.calibration for pair in pairs] == [
         folder / pair.calibration if pair.calibration else None for pair in among.pairs
@@ -133,7 +136,7 @@ def test_pairs_among_the_files_of_a_store_are_those_of_a_folder_with_the_same_fi
 
 def test_films_have_their_endings_in_their_names_and_are_no_pictures():
     files = ["a_l.png", "a_r.png", "a.mp4", "trip/a.MKV", "a.webm", "old/batch.json", "old/made.mov", "a.txt"]
-    among = pairs_among("pairs", files)
+    among = find_pairs_among("pairs", files)
     assert [pair.name for pair in among.pairs] == ["a"]
     assert among.films == [
         ListedPair("a.mp4", ("a.mp4",)),
@@ -145,20 +148,20 @@ def test_films_have_their_endings_in_their_names_and_are_no_pictures():
 
 def test_two_films_of_one_name_are_refused():
     with pytest.raises(StereoweaveError, match="found a_b.mp4 for a/b.mp4 and for a_b.mp4"):
-        pairs_among("pairs", ["a/b.mp4", "a_b.mp4"])
+        find_pairs_among("pairs", ["a/b.mp4", "a_b.mp4"])
 
 
 def test_a_file_named_like_a_kind_of_file_is_nothing():
-    assert pairs_among("pairs", ["picture", "film", "both views"]) == ([], [], [])
+    assert find_pairs_among("pairs", ["picture", "film", "both views"]) == ([], [], [])
 
 
 def test_nothing_is_found_in_the_folder_that_a_batch_was_written_to():
-    assert pairs_among("out", ["batch.json", "a/left.png", "a/right.png"]) == ([], [], [])
+    assert find_pairs_among("out", ["batch.json", "a/left.png", "a/right.png"]) == ([], [], [])
 
 
 def test_a_side_may_be_told_by_folder_and_name_or_by_the_name_alone():
     files = ["left/a_l.png", "right/a_r.png", "left_run/b_l.png", "left_run/b_r.png"]
-    assert [pair.files for pair in pairs_among("x", files).pairs] == [
+    assert [pair.files for pair in find_pairs_among("x", files).pairs] == [
         ("left/a_l.png", "right/a_r.png"),
         ("left_run/b_l.png", "left_run/b_r.png"),
     ]
@@ -166,13 +169,13 @@ def test_a_side_may_be_told_by_folder_and_name_or_by_the_name_alone():
 
 def test_globs_are_paired_in_the_order_of_their_names(tmp_path):
     folder = put(tmp_path, "l/2.png", "l/1.png", "r/c.png", "r/b.png", "l/3.txt")
-    pairs = pairs_by_globs(f"{folder}/l/*.png", f"{folder}/r/*.png")
+    pairs = find_pairs_by_globs(f"{folder}/l/*.png", f"{folder}/r/*.png")
     assert listed(folder, pairs) == {"1": ("l/1.png", "r/b.png"), "2": ("l/2.png", "r/c.png")}
 
 
 def test_names_from_globs_tell_folders_apart(tmp_path):
     folder = put(tmp_path, "a/left.png", "a/right.png", "b/c/left.png", "b/c/right.png")
-    pairs = pairs_by_globs(f"{folder}/**/left.png", f"{folder}/**/right.png")
+    pairs = find_pairs_by_globs(f"{folder}/**/left.png", f"{folder}/**/right.png")
     assert listed(folder, pairs) == {
         "a": ("a/left.png", "a/right.png"),
         "b_c": ("b/c/left.png", "b/c/right.png"),
@@ -181,16 +184,16 @@ def test_names_from_globs_tell_folders_apart(tmp_path):
 
 def test_a_file_whose_name_has_brackets_is_no_pattern(tmp_path):
     folder = put(tmp_path, "sea [1].png", "sea [2].png")
-    pairs = pairs_by_globs(f"{folder}/sea [1].png", f"{folder}/sea [2].png")
+    pairs = find_pairs_by_globs(f"{folder}/sea [1].png", f"{folder}/sea [2].png")
     assert listed(folder, pairs) == {"sea [1]": ("sea [1].png", "sea [2].png")}
 
 
 def test_unequal_counts_are_refused_with_both(tmp_path):
     folder = put(tmp_path, "l/1.png", "l/2.png", "r/1.png")
     with pytest.raises(StereoweaveError, match=r"found 2 for .*/l/\* and 1 for .*/r/\*"):
-        pairs_by_globs(f"{folder}/l/*", f"{folder}/r/*")
+        find_pairs_by_globs(f"{folder}/l/*", f"{folder}/r/*")
     with pytest.raises(StereoweaveError, match=r"^right: expected pictures that match .*/x/\*, found none"):
-        pairs_by_globs(f"{folder}/l/*", f"{folder}/x/*")
+        find_pairs_by_globs(f"{folder}/l/*", f"{folder}/x/*")
 
 
 @pytest.mark.parametrize(
@@ -214,26 +217,26 @@ def test_unequal_counts_are_refused_with_both(tmp_path):
 )
 def test_a_line_of_a_list_is_a_pair(tmp_path, line, name, pictures):
     (tmp_path / "list.txt").write_text(f"# left right\n\n{line}\n", encoding="utf-8-sig")
-    assert listed(tmp_path, pairs_in_list(tmp_path / "list.txt")) == {name: pictures}
+    assert listed(tmp_path, read_pair_list(tmp_path / "list.txt")) == {name: pictures}
 
 
 def test_a_pair_named_like_a_folder_of_a_batch_is_renamed_and_may_not_take_another_s_name(tmp_path):
     folder = put(
         tmp_path, *(f"{name}/{side}.png" for name in ("begun", "manifest") for side in ("left", "right"))
     )
-    assert [pair.name for pair in pairs_in(folder).pairs] == ["begun_", "manifest_"]
+    assert [pair.name for pair in find_pairs_in(folder).pairs] == ["begun_", "manifest_"]
     put(tmp_path, "manifest_/left.png", "manifest_/right.png")
     with pytest.raises(
         StereoweaveError, match="different names, found manifest_ for manifest.*and for manifest_"
     ):
-        pairs_in(folder)
+        find_pairs_in(folder)
 
 
 def test_paths_of_a_list_are_relative_to_its_folder_and_those_elsewhere_keep_their_names_apart(tmp_path):
     (tmp_path / "lists").mkdir()
     path = tmp_path / "lists" / "list.txt"
     path.write_text(f"../a/l.png ../a/r.png\n{tmp_path}/b/l.png {tmp_path}/b/r.png\n")
-    first, second = pairs_in_list(path)
+    first, second = read_pair_list(path)
     assert first.pictures == (path.parent / "../a/l.png", path.parent / "../a/r.png")
     stem = "_".join(tmp_path.parts[1:])
     assert [first.name, second.name] == [f"{stem}_a", f"{stem}_b"]
@@ -242,7 +245,7 @@ def test_paths_of_a_list_are_relative_to_its_folder_and_those_elsewhere_keep_the
 def test_what_cannot_be_a_picture_is_noticed_only_when_it_is_read(tmp_path):
     long = "a" * 300  # no file system has such names
     (tmp_path / "list.txt").write_text(f"/ right.png\n{long}/left.png {long}/right.png\n")
-    assert [pair.pictures for pair in pairs_in_list(tmp_path / "list.txt")] == [
+    assert [pair.pictures for pair in read_pair_list(tmp_path / "list.txt")] == [
         (Path("/"), tmp_path / "right.png"),
         (tmp_path / long / "left.png", tmp_path / long / "right.png"),
     ]
@@ -252,15 +255,15 @@ def test_a_bad_line_is_told_by_its_number(tmp_path):
     path = tmp_path / "list.txt"
     path.write_text("a.png b.png\na b c d\n")
     with pytest.raises(StereoweaveError, match=r"list.txt, line 2: .*found 4 columns: a b c d"):
-        pairs_in_list(path)
+        read_pair_list(path)
     path.write_text(f"a.png {'b' * 140_000}\n")
     with pytest.raises(StereoweaveError, match=r"list.txt, line 1: expected .*field larger than"):
-        pairs_in_list(path)
+        read_pair_list(path)
     path.write_text("# nothing\n")
-    with pytest.raises(StereoweaveError, match="expected a pair in each line, found none"):
-        pairs_in_list(path)
+    with pytest.raises(StereoweaveError, match="expected one pair per line, found none"):
+        read_pair_list(path)
     with pytest.raises(StereoweaveError, match="expected a list of pairs, found no such file"):
-        pairs_in_list(tmp_path / "none.txt")
+        read_pair_list(tmp_path / "none.txt")
 
 
 def test_the_words_of_the_command_line_name_one_source(tmp_path):
@@ -275,7 +278,7 @@ def test_the_words_of_the_command_line_name_one_source(tmp_path):
     for words, found in {
         ((), None, None, None): "none",
         ((folder,), left, right, None): "pictures with patterns",
-        ((), left, None, None): "one of the two patterns",
+        ((), left, None, None): "only one of the two patterns",
     }.items():
         with pytest.raises(
             StereoweaveError, match=f"or a list of pairs, found {found}; .*(left, right, listed)"

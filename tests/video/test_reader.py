@@ -21,7 +21,7 @@ from film_examples import (
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import write_image
-from stereoweave.pictures.frame_packing import guess_arrangement, resemblance
+from stereoweave.pictures.frame_packing import guess_arrangement, measure_resemblance
 from stereoweave.video.reader import ARRANGEMENTS, open_footage
 from stereoweave.video.tracks import _by_rank, _filled, _separated
 
@@ -148,11 +148,11 @@ def test_a_plain_video_is_called_plain(tmp_path):
 
 def test_two_views_resemble_each_other_and_other_pictures_do_not():
     ((left, right),) = example_pairs(1, width=320, height=240)
-    assert resemblance(left, left) == pytest.approx(1, abs=0.001)
-    assert resemblance(left, right) > 0.6
-    assert resemblance(left, left[::-1].copy()) < 0.3
-    assert resemblance(left, left * 0) < 0.1
-    assert np.isnan(resemblance(left * 0, left))
+    assert measure_resemblance(left, left) == pytest.approx(1, abs=0.001)
+    assert measure_resemblance(left, right) > 0.6
+    assert measure_resemblance(left, left[::-1].copy()) < 0.3
+    assert measure_resemblance(left, left * 0) < 0.1
+    assert np.isnan(measure_resemblance(left * 0, left))
 
 
 def test_an_odd_width_is_refused_side_by_side_and_taken_top_to_bottom(tmp_path):
