@@ -1,1 +1,1 @@
-"""Scores: of disparity, of views, of flicker, against ground truth."""
+"""Scores of disparity, new views and flicker against ground truth."""

@@ -1,9 +1,9 @@
-"""How an estimate does at depth edges, where new views tear and smear: errors near them, and flying pixels.
+"""Disparity errors and flying pixels near depth edges, where new views tear and smear.
 
-An edge runs between two neighbours, in a row or a column, whose known true disparities differ by over 2 px: a
-surface that both cameras see well changes by less than 1 px from pixel to pixel. A known pixel is near an
-edge if it is one of the three on either side. Where a sparse truth, as a laser gives it, has no neighbours,
-there is no edge, and without any edge each number is NaN.
+An edge lies between two neighbours, in a row or a column, whose known true disparities differ by more than
+2 px; a surface that both cameras see well changes by less than 1 px from pixel to pixel. A known pixel is
+near an edge if it is one of the three on either side. Sparse ground truth, such as a laser's, has no edge
+where it has no neighbouring pixels. Without any edge every metric is NaN.
 """
 
 import cv2
@@ -18,11 +18,11 @@ FLYING_PX = 2.0
 
 
 def near_edge(truth_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Known pixels among the three on either side of an edge, in rows, in columns and around its corners."""
+    """Mask of the known pixels within three pixels of an edge, in rows, in columns and around its corners."""
     known_px = np.where(np.isfinite(truth_px), truth_px, np.nan).astype(np.float64)
     at_edge = np.zeros(truth_px.shape, np.uint8)
     for axis in (0, 1):
-        # Unknown is NaN, which is no step.
+        # Unknown pixels are NaN, and NaN never counts as a step.
         step = np.abs(np.diff(known_px, axis=axis)) > EDGE_STEP_PX
         before, after = ([(0, 0), (0, 0)] for _ in range(2))
         before[axis], after[axis] = (0, 1), (1, 0)
@@ -33,26 +33,27 @@ def near_edge(truth_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 def edge_epe_px(estimate_px: Float[np.ndarray, "h w"], truth_px: Float[np.ndarray, "h w"]) -> float:
-    """Mean absolute error of disparity in pixels, of the known pixels near an edge."""
+    """Mean absolute disparity error, in pixels, over the known pixels near an edge."""
     return epe_px(estimate_px, _truth_near_edges(truth_px))
 
 
 def edge_bad_percent(
     estimate_px: Float[np.ndarray, "h w"], truth_px: Float[np.ndarray, "h w"], threshold_px: float
 ) -> float:
-    """Percent of the known pixels near an edge whose disparity is off by more than threshold_px."""
+    """Percent of known pixels near an edge whose disparity is off by more than threshold_px."""
     return bad_percent(estimate_px, _truth_near_edges(truth_px), threshold_px)
 
 
 def flying_percent(estimate_px: Float[np.ndarray, "h w"], truth_px: Float[np.ndarray, "h w"]) -> float:
-    """Percent of the known pixels near an edge whose estimate lies on none of the surfaces there.
+    """Percent of known pixels near an edge whose estimate lies on neither surface.
 
-    It lies on none when it is over 2 px away from every known true disparity in the 7x7 pixels around it,
-    which reach over the edge: between the two sides, before both or behind both. A slanted side does no harm,
-    and an edge that is moved by up to 3 px has errors and no flying pixels.
+    A pixel is flying if it differs by more than 2 px from every known true disparity in its 7x7
+    neighbourhood, which reaches across the edge: it lies between the two surfaces, in front of both or behind
+    both. Slanted surfaces do not count as flying. An edge that is displaced by up to 3 px causes errors but
+    no flying pixels.
     """
     near = near_edge(truth_px)
-    # Within 2 px of its own truth a pixel is on a surface; only the few others have to be looked at.
+    # A pixel within 2 px of its own truth is on a surface; only the few others need the search.
     rows, columns = np.nonzero(near & ~(np.abs(estimate_px - truth_px.astype(np.float64)) <= FLYING_PX))
     around_px = np.pad(truth_px.astype(np.float64), NEAR_PX, constant_values=np.nan)
     windows_px = np.lib.stride_tricks.sliding_window_view(around_px, (2 * NEAR_PX + 1, 2 * NEAR_PX + 1))
@@ -62,5 +63,5 @@ def flying_percent(estimate_px: Float[np.ndarray, "h w"], truth_px: Float[np.nda
 
 
 def _truth_near_edges(truth_px: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """The truth where it is near an edge, and elsewhere NaN, which is unknown."""
+    """Return the truth near edges, and NaN (unknown) elsewhere."""
     return np.where(near_edge(truth_px), truth_px, np.nan)

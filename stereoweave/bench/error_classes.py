@@ -1,14 +1,14 @@
-"""Errors by class: which known pixels are hidden, near depth edges, plain or textured, and how wrong each is.
+"""Disparity errors by class of pixel: occluded, near depth edges, plain or textured.
 
-The classes come from the truth and the left picture alone, so that two matchers are compared on the same
-pixels. Every known pixel is in exactly one class, the first that it fits:
+The classes depend only on the ground truth and the left image, so that all matchers are compared on the same
+pixels. Every known pixel belongs to exactly one class, the first that applies:
 
-    outside        its match lies left of the right picture
-    occluded       in the right picture a nearer surface covers it
-    thin_or_edge   within 3 px of a depth edge (edges.py), or on something less than 15 px wide
-    plain          the grey levels change by less than 1 a pixel
-    weak_texture   by less than 2
-    textured       by 2 or more
+    outside        its match lies beyond the right image's left border
+    occluded       a nearer surface covers it in the right image
+    thin_or_edge   within 3 px of a depth edge (edge_metrics.py), or on an object less than 15 px wide
+    plain          gradient below 1 grey level per pixel
+    weak_texture   gradient below 2
+    textured       gradient of 2 or more
 """
 
 from dataclasses import dataclass
@@ -25,22 +25,22 @@ ALL = "all"
 THIN_PX = 15
 PLAIN_LEVELS_PER_PX = 1.0
 WEAK_LEVELS_PER_PX = 2.0
-# With it, plain noise of 3 levels stays under 1 level a pixel in 93 % of the pixels: it is no texture.
+# After this smoothing, noise of 3 levels stays below 1 level per pixel in 93 % of pixels: not texture.
 _SMOOTHING_PX = 1.0
-# A slanted surface covers itself by less than this; a nearer one by more.
+# A slanted surface occludes itself by less than this, a nearer surface by more.
 _COVERED_STEP_PX = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClassErrors:
-    """Errors of an estimate in one class of pixels; NaN where the class is empty.
+    """An estimate's errors in one class of pixels; NaN if the class is empty.
 
     Attributes:
-        share_percent: Known pixels that are in the class.
-        bad1_percent, bad2_percent: Known pixels that are in the class and off by over 1 or 2 px. Those of all
-            classes add up to the estimate's bad-1 and bad-2; 0 in an empty class.
-        bad1_within_percent, bad2_within_percent: Pixels of the class that are off by over 1 or 2 px.
-        epe_px: Mean absolute error in the class.
+        share_percent: Share of known pixels that are in the class.
+        bad1_percent, bad2_percent: Share of known pixels that are in the class and off by more than 1 or
+            2 px. The classes add up to the estimate's bad-1 and bad-2; an empty class has 0.
+        bad1_within_percent, bad2_within_percent: Share of the class that is off by more than 1 or 2 px.
+        epe_px: Mean absolute error within the class.
     """
 
     share_percent: float
@@ -56,13 +56,13 @@ def classify(
     truth_px: Float[np.ndarray, "h w"],
     occluded: Bool[np.ndarray, "h w"] | None = None,
 ) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """Masks of the classes by name, in their order; each known pixel is in exactly one.
+    """Return a mask per class, in the order of `CLASSES`; each known pixel is in exactly one.
 
     Args:
         left: RGB.
-        truth_px: True disparity of the left view; NaN and infinity are unknown.
-        occluded: True occlusion of the left view, with or without the pixels outside the right picture; found
-            from truth_px unless given, where an occluder of unknown disparity hides nothing.
+        truth_px: True disparity of the left view; NaN and infinity mean unknown.
+        occluded: True occlusion of the left view, with or without the pixels outside the right image.
+            Default: computed from truth_px, where surfaces of unknown disparity occlude nothing.
     """
     known = np.isfinite(truth_px)
     known_px = np.where(known, truth_px, np.nan)
@@ -87,11 +87,11 @@ def class_errors(
     truth_px: Float[np.ndarray, "h w"],
     masks: dict[str, Bool[np.ndarray, "h w"]],
 ) -> dict[str, ClassErrors]:
-    """Errors of an estimate in each class and, last, in `ALL` known pixels.
+    """Return an estimate's errors in each class and, last, over `ALL` known pixels.
 
     Args:
-        estimate_px: Disparity of the left view; NaN is bad.
-        truth_px: As for `classify`.
+        estimate_px: Disparity of the left view; NaN counts as bad.
+        truth_px: See `classify`.
         masks: From `classify`.
     """
     known = np.isfinite(truth_px)
@@ -102,10 +102,10 @@ def class_errors(
 
 
 def find_covered(truth_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Known pixels whose column in the right picture shows a surface over 1 px nearer.
+    """Return a mask of the known pixels that a surface more than 1 px nearer covers in the right image.
 
-    Found from the left truth alone: every known pixel is moved to the closest column of the right picture,
-    where the nearest surface stays.
+    Uses the left truth alone: projects every known pixel to the nearest column of the right image and keeps
+    the nearest surface there.
     """
     width = truth_px.shape[1]
     target = np.rint(np.arange(width) - truth_px)
@@ -120,8 +120,8 @@ def find_covered(truth_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 def _find_thin(known_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels over an edge's step nearer than both their sides, which are less than THIN_PX apart."""
-    # Unknown pixels are taken as near, so that they bound nothing.
+    """Find objects narrower than THIN_PX: nearer than both sides by more than EDGE_STEP_PX."""
+    # Unknown pixels count as near, so that they bound no object.
     surface_px = np.where(np.isnan(known_px), np.inf, known_px).astype(np.float32)
     behind_px = np.full_like(surface_px, np.inf)
     for window in ((1, THIN_PX), (THIN_PX, 1)):
@@ -131,10 +131,10 @@ def _find_thin(known_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 def _measure_gradient(left: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
-    """Gradient magnitude of the smoothed grey picture, in levels of 0..255 a pixel."""
+    """Gradient magnitude of the smoothed grey image, in levels of 0..255 per pixel."""
     grey = cv2.cvtColor(left, cv2.COLOR_RGB2GRAY).astype(np.float32)
     smooth = cv2.GaussianBlur(grey, (0, 0), _SMOOTHING_PX)
-    # Sobel's weights sum to 8 over a difference of two pixels' distance.
+    # Sobel's kernel amplifies by 8: weights of 1, 2, 1 on a difference over two pixels.
     along_x, along_y = (cv2.Sobel(smooth, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
     return np.hypot(along_x, along_y)
 

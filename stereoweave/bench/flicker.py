@@ -1,4 +1,4 @@
-"""What steadying is worth: flicker and errors, frame by frame and steady, on rendered films with noise."""
+"""Benchmark of the temporal filter: flicker and errors with and without it, on rendered noisy videos."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -30,23 +30,24 @@ from stereoweave.video.temporal_filter import Steadier
 
 MEAN = "mean"
 FRAME_BY_FRAME, STEADY = "frame by frame", "steady"
-# Five seconds of a camera on its way.
+# Length of the camera path: five seconds.
 _PATH_FRAMES = 120
 
 
 @dataclass(frozen=True, kw_only=True)
 class FlickerRow:
-    """How one method did on one film. Errors are means over all such pixels from the second frame on.
+    """Scores of one method on one video. Errors are means over all such pixels from the second frame on.
 
     Attributes:
-        noise_levels: The noise's standard deviation, 0 to 255.
-        flicker_px: Of the left view's disparity (flicker.py).
-        view_flicker_levels: Of the view half-way, 0 to 255, painted from the pictures without their noise, so
-            that disparity alone makes it flicker.
+        film: The video's name.
+        noise_levels: Standard deviation of the noise, 0 to 255.
+        flicker_px: Flicker of the left view's disparity (flicker_metrics.py).
+        view_flicker_levels: Flicker of the middle view, 0 to 255, rendered from the noise-free images, so
+            that only disparity makes it flicker.
         epe_px: End-point error of the left view.
-        moving_epe_px: On the pixels of the thing that moves; NaN without one.
-        uncovered_epe_px: On the pixels that show what the frame before did not; NaN without such.
-        time_ms: Of steadying a frame, the median; NaN without.
+        moving_epe_px: End-point error on the moving object; NaN without one.
+        uncovered_epe_px: End-point error on pixels that the previous frame did not show; NaN without any.
+        time_ms: Median time of the temporal filter per frame; NaN without it.
     """
 
     film: str
@@ -66,7 +67,7 @@ class FlickerRow:
 
 
 class _Result(NamedTuple):
-    """What a method made of a film."""
+    """A method's output for one video."""
 
     disparities_px: list[Float[np.ndarray, "h w"]]
     views: list[UInt8[np.ndarray, "h w 3"]]
@@ -83,22 +84,22 @@ def score_flicker(  # noqa: PLR0913 - each is a word of the command line
     threads: int | None = None,
     provider: str = CPU,
 ) -> Iterator[FlickerRow]:
-    """Two rows, frame by frame and steady, of each of four films of each scene.
+    """Yield two rows, frame by frame and steady, for each of four videos per scene.
 
     Args:
-        scenes: Names as `stereoweave synth make` takes them.
-        model: As for `Matcher`, and so is `threads`.
-        frames: Of each film, 2 or more.
+        scenes: Scene names of `stereoweave synth make`.
+        model: See `Matcher`.
+        frames: Frames per video, at least 2.
         size_px: Width and height.
-        seed: Of the scenes and of the noise.
-        threads: How many may be used; all cores if left out.
-        provider: As for `Matcher`.
+        seed: Seed of the scenes and the noise.
+        threads: Default: all cores.
+        provider: See `Matcher`.
 
     Raises:
-        StereoweaveError: A scene or the model is unknown, or there are too few frames.
+        StereoweaveError: Unknown scene or model, or too few frames.
     """
     if frames < 2:
-        raise StereoweaveError(f"frames: expected 2 or more, for flicker is between two; got {frames}")
+        raise StereoweaveError(f"frames: expected 2 or more, because flicker compares two; got {frames}")
     orders = [RenderSpec(scene=scene, seed=seed, size_px=size_px, frames=_PATH_FRAMES) for scene in scenes]
     matcher = Backend(model=model, threads=threads, provider=provider).matcher()
     for order in orders:
@@ -124,7 +125,7 @@ def score_flicker(  # noqa: PLR0913 - each is a word of the command line
 
 
 def average_rows(rows: Sequence[FlickerRow]) -> list[FlickerRow]:
-    """The mean over the scenes of each film and method, the two in one name."""
+    """Average over the scenes for each video and method; the new `film` joins both names."""
     groups: dict[tuple[str, str], list[FlickerRow]] = {}
     for row in rows:
         groups.setdefault((row.film, row.method), []).append(row)
@@ -162,7 +163,7 @@ def _run_methods(
 def _render_middle(
     film: RenderedVideo, estimates: list[Estimate], threads: int | None
 ) -> tuple[list[Float[np.ndarray, "h w"]], list[UInt8[np.ndarray, "h w 3"]]]:
-    """The disparities of the left view, and the views half-way: of the film itself, without the noise."""
+    """Return the left view's disparities, and the middle views rendered from the noise-free video."""
     renderers = (
         Renderer(pair, estimate, threads=threads)
         for pair, estimate in zip(film.pairs, estimates, strict=True)
@@ -172,7 +173,7 @@ def _render_middle(
 
 
 def _measure_errors(film: RenderedVideo, taken: _Result) -> dict[str, float]:
-    """The columns of a row that are errors."""
+    """Compute the error columns of a row."""
     later = range(1, len(film.pairs))
 
     def mean_flicker(shown: list[np.ndarray], position: float, with_change: bool) -> float:

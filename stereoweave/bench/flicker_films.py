@@ -1,4 +1,4 @@
-"""Rendered films whose motion is known: one that stands still, a thing that passes, a camera that moves."""
+"""Rendered videos with known motion: a still scene, a passing object and a moving camera."""
 
 import math
 from collections.abc import Callable
@@ -16,26 +16,26 @@ from stereoweave.synth.viewpoints import PosedRig
 
 LEFT, MIDDLE, RIGHT = 0.0, 0.5, 1.0
 NOISE_LEVELS = 4.0
-# A thing that passes is painted from so many pixels a pixel and direction: it moves in quarters of a pixel.
+# Supersampling per axis of a passing object, so that it can move by quarters of a pixel.
 _FINE = 4
-# How far it is in front of everything else, at least.
+# Least disparity of the object in front of everything else.
 _IN_FRONT_PX = 8
 
 Change = tuple[Float[np.ndarray, "h w 2"], Float[np.ndarray, "h w"]]
-"""What becomes of a frame's points on the way to another one, as a view sees it: their motion to the right
-and down in px, and the change of their disparity in px."""
+"""Change of a frame's points on the way to another frame, seen from one view: motion right and down in px,
+and change of disparity in px."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RenderedVideo:
-    """A film with its truth.
+    """A video with its ground truth.
 
     Attributes:
         name: What happens in it.
-        pairs: Its frames, without noise.
-        disparities_px: What each frame truly shows [H, W], at the pixels of the views at LEFT and MIDDLE.
-        moving: Where the left view of each frame shows a thing that moves by itself.
-        change: Of one frame's points on the way to another frame, seen from a position.
+        pairs: The frames, without noise.
+        disparities_px: True disparity [H, W] of each frame in the views at LEFT and MIDDLE.
+        moving: Mask of the moving object in the left view of each frame.
+        change: `Change` of the points from one frame to another, seen from a position.
     """
 
     name: str
@@ -45,13 +45,13 @@ class RenderedVideo:
     change: Callable[[int, int, float], Change]
 
     def seen_again(self, frame: int, other: int, position: float) -> Bool[np.ndarray, "h w"]:
-        """The points of one frame that another one shows too, seen from a position."""
+        """Mask of a frame's points that are also visible in another frame, seen from a position."""
         before_px, after_px = (self.disparities_px[number][position] for number in (frame, other))
         return find_seen_again(before_px, after_px, *self.change(frame, other, position))
 
 
 def add_noise(pair: StereoPair, rng: np.random.Generator) -> StereoPair:
-    """The pair with a sensor's noise: normal, of NOISE_LEVELS, of each eye, pixel and channel by itself."""
+    """Add sensor noise: normal, NOISE_LEVELS strong, independent for each eye, pixel and channel."""
 
     def with_noise(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
         return np.rint(image + rng.normal(0, NOISE_LEVELS, image.shape)).clip(0, 255).astype(np.uint8)
@@ -60,7 +60,7 @@ def add_noise(pair: StereoPair, rng: np.random.Generator) -> StereoPair:
 
 
 def render_panning(order: RenderSpec, frames: int) -> RenderedVideo:
-    """A film of a camera that moves: so many frames from the middle of the order's, where it is fastest."""
+    """Render `frames` frames from the middle of the camera path, where the camera is fastest."""
     first = (order.frames - frames) // 2
     stages = [draw_stage_and_rig(shared_renderer(), order, 0, first + number) for number in range(frames)]
     rigs = [rig for _, rig in stages]
@@ -88,13 +88,13 @@ def render_panning(order: RenderSpec, frames: int) -> RenderedVideo:
 def reproject(
     disparity_px: Float[np.ndarray, "h w"], rig: PosedRig, other: PosedRig, position: float
 ) -> Change:
-    """What becomes of the points of a view at a position when the rig moves to where the other one is.
+    """Compute the change of a view's points when the rig moves to the pose of `other`.
 
     Args:
-        disparity_px: Of the points at the view's pixels; 0 for the sky.
-        rig: Which saw them.
-        other: With the same camera, elsewhere.
-        position: Of the view in both rigs.
+        disparity_px: Disparity of the view's pixels; 0 for the sky.
+        rig: The rig of the view.
+        other: The same camera at another pose.
+        position: Position of the view in both rigs.
     """
     lens, turn = rig.camera, other.axes @ rig.axes.T
     shift = other.axes @ (rig.eye_m(position) - other.eye_m(position))
@@ -102,7 +102,7 @@ def reproject(
     ray = np.stack(
         [(columns - lens.cx_px) / lens.focal_px, (rows - lens.cy_px) / lens.focal_px, 1 + 0 * rows]
     )
-    # All by the depth that the point has in the first view, so that the sky's may be infinite.
+    # Everything is divided by the point's depth in the first view, so that the sky may be infinitely far.
     point = np.tensordot(turn, ray, 1) + shift[:, None, None] * disparity_px / (
         lens.focal_px * lens.baseline_m
     )
@@ -113,7 +113,7 @@ def reproject(
 
 
 def freeze(film: RenderedVideo) -> RenderedVideo:
-    """A film of the same length that shows the first frame all the time."""
+    """Return a video of the same length that repeats the first frame."""
     frames = len(film.pairs)
     nothing = np.zeros((*film.moving[0].shape, 3), np.float32)
     return RenderedVideo(
@@ -128,15 +128,15 @@ def freeze(film: RenderedVideo) -> RenderedVideo:
 def add_passing_oval(
     film: RenderedVideo, name: str, velocity_px: tuple[float, float], nearing_px: float = 0.0
 ) -> RenderedVideo:
-    """A film of the same length: the first frame, and in front of it an oval picture that moves.
+    """Return a video of the same length: the first frame, and an oval that moves in front of it.
 
-    That picture is the frame itself, upside down and of a quarter of its size.
+    The oval shows the frame itself, upside down and at a quarter of its size.
 
     Args:
-        film: Whose first frame is taken.
-        name: Of the new film.
-        velocity_px: Of the oval in the left view, to the right and down, a frame; multiples of 0.25.
-        nearing_px: By how much its disparity grows, a frame; a multiple of 0.5.
+        film: The video whose first frame is used.
+        name: The new video's name.
+        velocity_px: Motion of the oval in the left view, right and down per frame; multiples of 0.25.
+        nearing_px: Growth of its disparity per frame; a multiple of 0.5.
     """
     pair, truth_px = film.pairs[0], film.disparities_px[0]
     height, width = film.moving[0].shape
@@ -182,13 +182,13 @@ def add_passing_oval(
 def _paste_oval(
     image: UInt8[np.ndarray, "h w 3"], picture: UInt8[np.ndarray, "h w 3"], left_px: float, top_px: float
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """The image with the oval of `add_passing_oval`, and the mask of pixels that it covers by half or more.
+    """Return the image with the oval of `add_passing_oval`, and the mask of pixels at least half covered.
 
     Args:
-        image: What is behind.
-        picture: What is painted, upside down and four times smaller.
-        left_px: Of the oval's frame; a multiple of 0.25, as is the next.
-        top_px: Likewise.
+        image: The background.
+        picture: Content of the oval, painted upside down and four times smaller.
+        left_px: Left edge of the oval's bounding box; a multiple of 0.25.
+        top_px: Top edge; a multiple of 0.25.
     """
     height, width = picture.shape[:2]
     oval = np.zeros((height, width, 1), np.uint8)

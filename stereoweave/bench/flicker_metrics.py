@@ -1,4 +1,4 @@
-"""How much a film flickers: what differs from frame to frame once the true motion is taken out."""
+"""Flicker of a video: the difference between frames after compensation of the true motion."""
 
 from itertools import product
 
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Shaped
 
 from stereoweave.errors import StereoweaveError
 
-# What two frames' truth says of one point differs by interpolation and slant; two surfaces are further apart.
+# Two frames' truths of one point differ by interpolation and slant; two surfaces differ by more than this.
 _SAME_SURFACE_PX = 1.0
 
 
@@ -19,23 +19,23 @@ def flicker(
     visible: Bool[np.ndarray, "h w"],
     change: Float[np.ndarray, "h w"] | float = 0.0,
 ) -> float:
-    """Mean error of how a point's value changes from one frame to the next, in its unit; NaN without a point.
+    """Mean error of a point's change from one frame to the next, in the values' unit; NaN without points.
 
-    For a point at x it is |after(x + motion(x)) - before(x) - change(x)|, with `after` interpolated linearly:
-    an error that stays is no flicker. Of disparity it is the temporal end-point error (TEPE) of Li et al.
-    2023, "Temporally Consistent Online Depth Estimation in Dynamic Scenes"; of pictures, whose true change is
-    0, the warping error of Lai et al. 2018, "Learning Blind Video Temporal Consistency", by the true motion
-    and not squared.
+    The error at x is |after(x + motion(x)) - before(x) - change(x)|, with `after` interpolated linearly; a
+    constant error is not flicker. For disparity this is the temporal end-point error (TEPE) of Li et al.
+    2023, "Temporally Consistent Online Depth Estimation in Dynamic Scenes". For images, whose true change is
+    0, it is the warping error of Lai et al. 2018, "Learning Blind Video Temporal Consistency", but with the
+    true motion and not squared.
 
     Args:
-        before: Disparity in px [H, W], or a picture [H, W] or [H, W, C].
-        after: The same of the next frame.
-        motion_px: To the right and down, from where a point is in `before` to where it is in `after`.
-        visible: The points that count: such as both frames see (`find_seen_again`).
-        change: The true change of each point's value.
+        before: Disparity in px [H, W], or an image [H, W] or [H, W, C].
+        after: The same for the next frame.
+        motion_px: Motion right and down, from a point's place in `before` to its place in `after`.
+        visible: The points that count, such as those that both frames show (`find_seen_again`).
+        change: True change of each point's value.
 
     Raises:
-        StereoweaveError: The sizes differ, or a point that counts leaves the picture.
+        StereoweaveError: The sizes differ, or a visible point leaves the image.
     """
     shapes = [list(values.shape[:2]) for values in (before, after, motion_px, visible)]
     if any(shape != shapes[0] for shape in shapes):
@@ -45,11 +45,11 @@ def flicker(
     columns, rows, inside = _target_places(motion_px)
     if (visible & ~inside).any():
         raise StereoweaveError(
-            f"visible: expected points that stay in the picture, found {(visible & ~inside).sum()} "
-            "that leave it; take seen_again"
+            f"visible: expected points that stay in the image, found {(visible & ~inside).sum()} "
+            "that leave it; use find_seen_again"
         )
     found = cv2.remap(after.astype(np.float32), columns, rows, cv2.INTER_LINEAR)
-    # The channels of a picture come last, and its change is one for all of them.
+    # An image's channels come last and share one change.
     error = np.abs(
         found[visible].T.astype(np.float64)
         - before[visible].T
@@ -64,13 +64,13 @@ def find_seen_again(
     motion_px: Float[np.ndarray, "h w 2"],
     change_px: Float[np.ndarray, "h w"],
 ) -> Bool[np.ndarray, "h w"]:
-    """Where a point of one frame is seen in the other: all four pixels at its place there show its surface.
+    """Return a mask of the points visible in both frames: all four pixels at the target show the surface.
 
     Args:
-        before_px: The true disparity of the one frame.
-        after_px: That of the other.
-        motion_px: To the right and down, from a point's place in the one to that in the other.
-        change_px: The true change of each point's disparity on the way.
+        before_px: True disparity of the first frame.
+        after_px: True disparity of the second frame.
+        motion_px: Motion right and down, from a point's place in the first frame to that in the second.
+        change_px: True change of each point's disparity.
     """
     columns, rows, inside = _target_places(motion_px)
     expected_px, seen = before_px + change_px, inside.copy()
@@ -85,7 +85,7 @@ def find_seen_again(
 def _target_places(
     motion_px: Float[np.ndarray, "h w 2"],
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Columns and rows that points move to, and whether these are in the picture."""
+    """Return the columns and rows that points move to, and a mask of those inside the image."""
     height, width = motion_px.shape[:2]
     rows, columns = np.indices((height, width), np.float32)
     columns, rows = columns + motion_px[..., 0], rows + motion_px[..., 1]

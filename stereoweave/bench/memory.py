@@ -1,4 +1,4 @@
-"""The memory that a function needs, measured in a process of its own."""
+"""Peak memory of a function, measured in a separate process."""
 
 import multiprocessing
 import sys
@@ -11,26 +11,26 @@ Argument = TypeVar("Argument")
 
 
 def peak_memory_mb(make: Callable[[], Callable[[Argument], object]], argument: Argument) -> float:
-    """How far resident memory rises, in 10^6 bytes, while a function is made and called once.
+    """Rise of peak resident memory, in 10^6 bytes, while a function is made and called once.
 
-    Counted is what a fresh process holds in RAM at its peak: what making the function loads, such as a
-    network, and what the first call takes, its result included. Not counted is what was there before: Python,
-    NumPy, OpenCV, ONNX Runtime and the argument. NaN where the system does not tell (Windows).
+    Measured in a fresh process. Includes what making the function loads, such as a network, and what the
+    first call needs, its result included. Excludes what is loaded before: Python, NumPy, OpenCV, ONNX Runtime
+    and the argument. NaN where the system does not report it (Windows).
 
     Args:
-        make: Makes the function; it is pickled, so a function of a module, or a partial of one.
-        argument: What that function is called with.
+        make: Makes the function. It is pickled: use a module-level function or a partial of one.
+        argument: The function's argument.
     """
     import cv2
 
-    # Started afresh: a forked child would hold what its parent holds.
+    # Spawned, because a forked child would inherit its parent's memory.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, context, cv2.setNumThreads, (cv2.getNumThreads(),)) as pool:
         return pool.submit(_measure_rise_mb, make, argument).result()
 
 
 def _measure_rise_mb(make: Callable[[], Callable[[Argument], object]], argument: Argument) -> float:
-    import onnxruntime  # type: ignore[import-untyped]  # noqa: F401 - its code is no matcher's
+    import onnxruntime  # type: ignore[import-untyped]  # noqa: F401 - not counted
 
     before_mb = _read_peak_mb()
     make()(argument)
@@ -38,16 +38,16 @@ def _measure_rise_mb(make: Callable[[], Callable[[Argument], object]], argument:
 
 
 def _read_peak_mb() -> float:
-    """The most that this process has had in RAM so far."""
+    """Return this process's peak resident memory so far."""
     status = Path("/proc/self/status")
     if status.exists():
-        # Not getrusage, which on Linux starts a child at its parent's peak.
+        # Not getrusage: on Linux a child starts at its parent's peak there.
         (line,) = (line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
         return int(line.split()[1]) * 1024 / 1e6
     if sys.platform == "win32":
         return float("nan")
     import resource
 
-    # Bytes on macOS, KiB on the other systems that have no /proc.
+    # Bytes on macOS, KiB on other systems without /proc.
     unit_bytes = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit_bytes / 1e6

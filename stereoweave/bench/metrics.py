@@ -1,7 +1,7 @@
-"""How far an estimate is from the truth: the one implementation, in double precision.
+"""Error metrics, in double precision; the package's only implementation.
 
 In ground truth NaN and infinity mean unknown, and unknown pixels do not count. A pixel whose estimate is NaN
-is a bad one. A mean over no pixel is NaN.
+is bad. A mean over no pixel is NaN.
 """
 
 from typing import NamedTuple
@@ -12,18 +12,18 @@ from jaxtyping import Bool, Float, UInt8
 
 from stereoweave.errors import StereoweaveError
 
-# As many as Guo et al. 2017 take.
+# As in Guo et al. 2017.
 _BINS = 15
 DROPPED_PERCENT = np.arange(96)
-"""How many of the pixels `sparsification` drops."""
+"""Shares of the pixels that `sparsification` drops."""
 
 
 class Sparsification(NamedTuple):
-    """Mean error of what is kept after 0, 1, ... 95 % of the pixels were dropped, [96], in the error's unit.
+    """Mean error of the remaining pixels after 0, 1, ... 95 % are dropped, [96], in the error's unit.
 
     Attributes:
-        kept: The least confident were dropped.
-        oracle: Those of the largest error were, which no confidence can better.
+        kept: Drops the least confident pixels first.
+        oracle: Drops the pixels of largest error first; no confidence can do better.
     """
 
     kept: Float[np.ndarray, " n"]
@@ -31,9 +31,9 @@ class Sparsification(NamedTuple):
 
     @property
     def ause(self) -> float:
-        """Area under the sparsification error, the gap between the two, over the share dropped; 0 is best.
+        """Area between the two curves over the share dropped (AUSE); 0 is best.
 
-        Source: Ilg et al. 2018, who divide errors by the mean of all pixels; these keep their unit.
+        Source: Ilg et al. 2018, who divide errors by the mean over all pixels; here they keep their unit.
         """
         return float(np.trapezoid(self.kept - self.oracle, DROPPED_PERCENT / 100))
 
@@ -69,20 +69,20 @@ def mae(
     truth: UInt8[np.ndarray, "h w 3"],
     where: Bool[np.ndarray, "h w"] | None = None,
 ) -> float:
-    """Mean absolute difference of two pictures, in grey levels of 0..255; of the pixels `where`, if given."""
+    """Mean absolute difference of two images, in grey levels of 0..255, over the pixels `where`."""
     error = np.abs(_subtract(image, truth))
     return _mean(error if where is None else error[where])
 
 
 def psnr_db(image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]) -> float:
-    """Peak signal-to-noise ratio of two pictures in dB; squared errors under 1e-10 count as that, 148 dB."""
+    """Peak signal-to-noise ratio of two images in dB; at most 148 dB, a mean squared error of 1e-10."""
     return float(10 * np.log10(255**2 / max(_mean(_subtract(image, truth) ** 2), 1e-10)))
 
 
 def ssim(image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]) -> float:
-    """Mean structural similarity of two pictures' luminance, rounded to 8 bits; 1 where they are equal.
+    """Mean structural similarity of two images' luminance, rounded to 8 bits; 1 if they are equal.
 
-    Source: Wang et al. 2004: 11x11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03; borders are mirrored.
+    Source: Wang et al. 2004: 11x11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03. Borders are mirrored.
     """
     _check_shapes(image, truth)
     a, b = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float64) for picture in (image, truth))
@@ -95,9 +95,9 @@ def ssim(image: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]) -
 
 
 def calibration_error(probability: Float[np.ndarray, "..."], happened: Bool[np.ndarray, "..."]) -> float:
-    """Expected calibration error: the mean gap between what was claimed and what happened, over equal bins.
+    """Expected calibration error: the mean gap between predicted probability and observed frequency.
 
-    Source: Guo et al. 2017; a bin weighs as many as fall into it.
+    Source: Guo et al. 2017: equal bins, weighted by their number of values.
     """
     if not probability.size:
         return float("nan")
@@ -108,7 +108,7 @@ def calibration_error(probability: Float[np.ndarray, "..."], happened: Bool[np.n
 def calibration_bins(
     probability: Float[np.ndarray, "..."], happened: Bool[np.ndarray, "..."]
 ) -> Float[np.ndarray, "3 n"]:
-    """Mean claim, how much of it came true, and share of all, in each of 15 equal bins that is not empty."""
+    """Mean probability, observed frequency and share of all values in each non-empty one of 15 equal bins."""
     where = np.minimum((probability * _BINS).astype(int), _BINS - 1).ravel()
     counts = np.bincount(where, minlength=_BINS)
     used = counts > 0
@@ -117,13 +117,13 @@ def calibration_bins(
 
 
 def sparsification(error: Float[np.ndarray, " n"], confidence: Float[np.ndarray, " n"]) -> Sparsification:
-    """How the mean error falls as the least confident pixels are dropped, beside the best that could be.
+    """Compute the sparsification curve of a confidence, and the oracle's.
 
-    Source: Ilg et al. 2018. Pixels of equal confidence are dropped in any order: the mean over all is given.
+    Source: Ilg et al. 2018. Ties in confidence are averaged over all orders.
 
     Args:
-        error: Of each pixel [N], such as absolute errors in px, or 100 for a bad pixel and 0 for a good one.
-        confidence: Any measure that orders the pixels [N], infinite ones too; not NaN.
+        error: Error of each pixel [N], such as its absolute error in px, or 100 if bad and 0 if good.
+        confidence: Any value that ranks the pixels [N]; may be infinite, not NaN.
     """
     _check_shapes(error, confidence)
     return Sparsification(kept=_average_kept(error, confidence), oracle=_average_kept(error, -error))
@@ -132,7 +132,7 @@ def sparsification(error: Float[np.ndarray, " n"], confidence: Float[np.ndarray,
 def _average_kept(
     error: Float[np.ndarray, " n"], confidence: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " m"]:
-    """The curve itself."""
+    """Mean error of the pixels that remain at each share of `DROPPED_PERCENT`."""
     if not error.size:
         return np.full(len(DROPPED_PERCENT), np.nan)
     _, group, counts = np.unique(-confidence, return_inverse=True, return_counts=True)
@@ -144,7 +144,7 @@ def _average_kept(
 def _known_errors(
     estimate: Float[np.ndarray, "h w"], truth: Float[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """The absolute errors at the pixels whose truth is known, and the truth there."""
+    """Return the absolute errors at the pixels of known truth, and the truth there."""
     _check_shapes(estimate, truth)
     known = np.isfinite(truth)
     known_truth = truth[known].astype(np.float64)
@@ -167,7 +167,7 @@ def _mean(values: Float[np.ndarray, "..."] | Bool[np.ndarray, "..."]) -> float:
 
 
 def _check_shapes(estimate: np.ndarray, truth: np.ndarray) -> None:
-    # NumPy would stretch one to the other where it can, and the score would mean nothing.
+    # NumPy would broadcast where it can, and the score would be meaningless.
     if estimate.shape != truth.shape:
         raise StereoweaveError(
             f"expected an estimate of the truth's shape {truth.shape}, found {estimate.shape}"

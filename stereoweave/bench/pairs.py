@@ -1,4 +1,4 @@
-"""Matchers side by side on pairs of known disparity: accuracy, edges, confidence, time and memory."""
+"""Benchmark of matchers on pairs of known disparity: accuracy, edges, confidence, time and memory."""
 
 import os
 import platform
@@ -38,10 +38,10 @@ from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.system.ray_engine import Engine, stream
 
 MatchFunction = Callable[[StereoPair], Estimate | Float[np.ndarray, "h w"]]
-"""What is timed: a pair to an Estimate; or to the left disparity in px [H, W] alone, where <= 0 is a hole.
+"""The timed function: a pair to an Estimate, or to the left disparity alone, in px [H, W], <= 0 in holes.
 
-The holes of such a map are then filled along rows, and its confidence is the left-right check, for which the
-mirrored pair is matched too. Neither is timed: others do it in other ways, at other costs.
+Holes of such a map are then filled along rows, and its confidence comes from the left-right check, for which
+the mirrored pair is matched too. Neither step is timed, because users choose other methods at other costs.
 """
 
 MatcherFactory = Callable[[], MatchFunction]
@@ -49,7 +49,7 @@ MatcherFactory = Callable[[], MatchFunction]
 AnyScene = TypeVar("AnyScene")
 Result = TypeVar("Result")
 SceneLister = Callable[[], Sequence[Callable[[], AnyScene]]]
-"""Lists what reads each scene: called where a benchmark is started, and by every worker of a cluster."""
+"""Returns a reader for each scene; called by the process that starts a benchmark and by every worker."""
 
 MEAN = "mean"
 TURNS = 5
@@ -57,20 +57,21 @@ TURNS = 5
 
 @dataclass(frozen=True, kw_only=True)
 class MatcherRow:
-    """How one matcher did on one scene, or on the mean of all (scene "mean").
+    """Scores of one matcher on one scene, or averaged over all scenes (scene "mean").
 
-    Errors are over every pixel whose truth is known, occluded ones included. A mean is over the scenes that
-    have the number: a scene without a depth edge has no error near one.
+    Errors cover every pixel of known truth, occluded ones included. A mean is over the scenes that have the
+    number; a scene without a depth edge has no edge errors, for example.
 
     Attributes:
-        edge_epe_px, edge_bad1_percent, flying_percent: Near depth edges (edges.py).
-        ause_px, ause_bad1_percent: How far the confidence is from an order of pixels by their error, or from
-            bad ones before good ones: the area between its sparsification curve and the oracle's.
-        calibration_error: Of a confidence that is a probability, and NaN for the left-right check. Each scene
-            counts by itself: claims too high in one do not make up for claims too low in another.
-        time_ms: Median of the warm calls; in the mean row, the mean of these over the scenes.
-        time_relative: time_ms as a multiple of SGBM's in the same row.
-        memory_mb: In the mean row alone, where it was measured: of the largest pair (memory.py).
+        edge_epe_px, edge_bad1_percent, flying_percent: Errors near depth edges (edge_metrics.py).
+        ause_px, ause_bad1_percent: Area between the confidence's sparsification curve and the oracle's, for
+            the absolute error and for bad pixels.
+        calibration_error: Expected calibration error; NaN for the left-right check, which gives no
+            probability. It is computed per scene, so that overconfidence in one scene does not cancel
+            underconfidence in another.
+        time_ms: Median of the warm calls; in the mean row, the mean of these medians.
+        time_relative: time_ms as a multiple of SGBM's in the same scene.
+        memory_mb: Peak memory for the largest pair (memory.py); only in the mean row, and if measured.
     """
 
     matcher: str
@@ -92,13 +93,13 @@ class MatcherRow:
 
 @dataclass(frozen=True, kw_only=True)
 class ClassRow:
-    """Errors of one matcher on one scene, or on the mean of all, in one class of pixels.
+    """Errors of one matcher in one class of pixels, on one scene or averaged over all scenes.
 
     Attributes:
         pixel_class: A name in `error_classes.CLASSES`, or `error_classes.ALL`.
 
-    The others are those of `ClassErrors`. A mean is over the scenes that have the number: a scene without a
-    plain pixel has no error within the class.
+    The other columns are those of `ClassErrors`. A mean is over the scenes that have the number; a scene
+    without plain pixels has no error within that class, for example.
     """
 
     matcher: str
@@ -113,21 +114,21 @@ class ClassRow:
 
 
 class Curves(NamedTuple):
-    """How a matcher's mean error in px, and its percent of bad pixels (over 1 px), fall by its confidence."""
+    """A matcher's sparsification curves: of the mean error in px, and of bad-1 in percent."""
 
     epe_px: Sparsification
     bad1_percent: Sparsification
 
 
 class PairScores(NamedTuple):
-    """What `score_pairs` gives.
+    """Result of `score_pairs`.
 
     Attributes:
-        rows: One per scene and matcher, then a mean row per matcher.
-        class_rows: One per scene, matcher and class of pixels, then one per matcher and class for the mean.
-        curves: By matcher, the mean over the scenes.
+        rows: A row per scene and matcher, then a mean row per matcher.
+        class_rows: A row per scene, matcher and class of pixels, then a mean row per matcher and class.
+        curves: Mean curves over the scenes, by matcher.
         largest: The pair with the most pixels, for `add_memory`.
-        machine: What the rows were measured with, for `write_csv`.
+        machine: Description of the machine, for `write_csv`.
     """
 
     rows: list[MatcherRow]
@@ -139,7 +140,7 @@ class PairScores(NamedTuple):
 
 @dataclass(frozen=True)
 class SceneResult(Generic[Result]):
-    """What a scene's number gave, and the machine that it was measured on."""
+    """A scene's number and result, and the machine that measured it."""
 
     number: int
     result: Result
@@ -147,7 +148,7 @@ class SceneResult(Generic[Result]):
 
 
 class _SceneScores(NamedTuple):
-    """What `score_pairs` keeps of a scene."""
+    """One scene's part of `PairScores`."""
 
     scored: list[tuple[MatcherRow, Curves]]
     class_rows: list[ClassRow]
@@ -163,7 +164,7 @@ class _Answer(NamedTuple):
 def make_matcher(
     model: str | Path, threads: int | None = None, refined: bool = False, provider: str = CPU
 ) -> MatchFunction:
-    """What `stereoweave.estimate` does with a model, refined or not; errors as for `Matcher`."""
+    """Return `stereoweave.estimate` with these settings; raises as `Matcher` does."""
     matcher = Backend(model=model, threads=threads, provider=provider).matcher()
     options = MatchOptions(refined=refined)
     return lambda pair: match(matcher, pair, options)
@@ -172,17 +173,17 @@ def make_matcher(
 def score_pairs(
     makers: Mapping[str, MatcherFactory], scenes: SceneLister[Scene], engine: Engine | None = None
 ) -> PairScores:
-    """The errors, times and sparsification curves of matchers on scenes; those of OpenCV join them.
+    """Measure errors, times and sparsification curves of the given matchers and OpenCV's on scenes.
 
     Args:
-        makers: What makes each matcher, by its name.
-        scenes: Lists at least one.
-        engine: Where each scene is scored by one worker, so that times are compared on one machine; in this
-            process unless given. The makers and `scenes` are sent to it.
+        makers: Makes each matcher, by name.
+        scenes: Must list at least one scene.
+        engine: Scores each scene on one worker, so that times are compared on one machine; the makers and
+            `scenes` are pickled for it. Default: this process.
 
     Raises:
-        StereoweaveError: A matcher bears a name that the table uses itself, or is a file of that name; there
-            is no scene; or as in `engine.stream`.
+        StereoweaveError: A matcher's name, or its file's stem, is reserved by the table; no scenes; or any
+            error of `engine.stream`.
     """
     everyone = _add_opencv(makers)
     found = score_all(everyone, scenes, _score_scene, engine)
@@ -207,12 +208,12 @@ def score_all(
     score: Callable[[Mapping[str, Any], AnyScene], Result],
     engine: Engine | None,
 ) -> list[SceneResult[Result]]:
-    """What `score` gives for all that the makers make and each scene, in the scenes' order.
+    """Apply `score` to the made matchers and each scene; results are in the scenes' order.
 
-    The rest is as for `score_pairs`.
+    For arguments and errors see `score_pairs`.
     """
     make_scorer = partial(_SceneScorer, makers, scenes, score)
-    scorer = make_scorer()  # here in any case, where it is said what is no matcher and no scene
+    scorer = make_scorer()  # always made here too, so that unknown matchers and scenes raise here
     count = len(scorer.readers)
     if not count:
         raise StereoweaveError("scenes: expected at least one, found none")
@@ -222,7 +223,7 @@ def score_all(
 
 
 def merge_machines(scored: Iterable[SceneResult[Any]]) -> dict[str, str]:
-    """What the scenes were measured with; what is not the same for all of them is written side by side."""
+    """Merge the machines' descriptions; values that differ are joined by " + "."""
     machines = [scene.machine for scene in scored]
     return {name: " + ".join(sorted({machine[name] for machine in machines})) for name in machines[0]}
 
@@ -230,12 +231,12 @@ def merge_machines(scored: Iterable[SceneResult[Any]]) -> dict[str, str]:
 def add_memory(
     rows: Iterable[MatcherRow], makers: Mapping[str, MatcherFactory], pair: StereoPair
 ) -> list[MatcherRow]:
-    """The rows, those of means with the memory that each matcher takes for a pair in a process of its own.
+    """Add each matcher's peak memory for a pair to the mean rows, measured in a separate process.
 
     Args:
-        rows: As `score_pairs` gives them.
-        makers: As `score_pairs` took them; each has to be one that can be pickled.
-        pair: What is matched; the largest one of all says what is enough.
+        rows: Rows of `score_pairs`.
+        makers: The makers given to `score_pairs`; each must be picklable.
+        pair: The pair to match; use the largest.
     """
     everyone = _add_opencv(makers)
     return [
@@ -245,12 +246,12 @@ def add_memory(
 
 
 def write_csv(path: str | Path, rows: Sequence[Any], machine: dict[str, str] | None = None) -> None:
-    """Writes the rows with a header, each beside the processor and the OpenCV that it was measured with.
+    """Write the rows as CSV with a header and the machine's columns.
 
     Args:
-        path: Where to; the folder is made.
-        rows: One or more instances of one dataclass, whose fields are the columns.
-        machine: These two, and the number of cores; this one's unless given.
+        path: The CSV file; its folder is created.
+        rows: At least one instance of one dataclass, whose fields are the columns.
+        machine: Processor, number of cores and OpenCV's version. Default: this machine's.
     """
     machine = machine or _describe_machine()
     columns = [field.name for field in fields(rows[0])] + list(machine)
@@ -259,7 +260,7 @@ def write_csv(path: str | Path, rows: Sequence[Any], machine: dict[str, str] | N
 
 
 class _SceneScorer:
-    """Scores scenes by their number, with matchers that are made once."""
+    """Scores scenes by number; makes the matchers once."""
 
     def __init__(
         self,
@@ -272,7 +273,7 @@ class _SceneScorer:
         self.readers, self.score = scenes(), score
         if expected not in (None, len(self.readers)):
             raise StereoweaveError(
-                f"{platform.node()}: expected the {expected} scenes that are where the command was started, "
+                f"{platform.node()}: expected the same {expected} scenes as where the command was started, "
                 f"found {len(self.readers)}; put them on a disk that every node of the cluster sees"
             )
 
@@ -288,9 +289,9 @@ def _add_opencv(makers: Mapping[str, MatcherFactory]) -> dict[str, MatcherFactor
 
 
 def _score_scene(matchers: Mapping[str, MatchFunction], scene: Scene) -> _SceneScores:
-    # These first calls warm the matchers up for the timing.
+    # These first calls warm up the matchers before timing.
     answers = {name: _run_matcher(match, scene.pair) for name, match in matchers.items()}
-    # In turns, so that a machine that slows down slows all alike.
+    # Take turns, so that a slowdown of the machine affects all alike.
     turns_ms = [
         {name: _measure_time_ms(match, scene.pair) for name, match in matchers.items()} for _ in range(TURNS)
     ]
@@ -330,7 +331,7 @@ def _run_matcher(match: MatchFunction, pair: StereoPair) -> _Answer:
 
 
 def _measure_errors(answer: _Answer, truth_px: Float[np.ndarray, "h w"]) -> dict[str, float]:
-    """The columns of a row that compare with the truth pixel by pixel."""
+    """Compute the columns that compare with the truth pixel by pixel."""
     found_px = answer.disparity_px
     known = np.isfinite(truth_px)
     hits = np.abs(found_px - truth_px)[known] <= 1
@@ -376,7 +377,7 @@ def _average_rows(rows: list[MatcherRow], names: Iterable[str]) -> list[MatcherR
 
 
 def _average_class_rows(rows: Sequence[ClassRow]) -> list[ClassRow]:
-    """The means over the scenes, in the order of the first scene's rows."""
+    """Average over the scenes, in the order of the first scene's rows."""
     by_class: defaultdict[tuple[str, str], list[ClassRow]] = defaultdict(list)
     for row in rows:
         by_class[row.matcher, row.pixel_class].append(row)
@@ -401,7 +402,7 @@ def _average_curves(curves: Sequence[Curves]) -> Curves:
 
 
 def _average_known(values: Sequence[Any]) -> Any:
-    """The mean of numbers, or of arrays of one shape, over those without NaN; NaN where there is none."""
+    """Mean of the numbers or equal-shaped arrays without NaN; NaN if there are none."""
     known = [value for value in values if not np.isnan(value).any()]
     return np.mean(known, axis=0) if known else values[0]
 
@@ -411,7 +412,7 @@ def _describe_machine() -> dict[str, str]:
 
 
 def _find_cpu_name() -> str:
-    # Linux alone has this file, and there platform.processor() does not know the model.
+    # Only Linux has this file, and there platform.processor() does not return the model.
     about = Path("/proc/cpuinfo")
     lines = about.read_text().splitlines() if about.exists() else []
     models = [line.split(": ", 1)[1] for line in lines if line.startswith("model name")]

@@ -1,4 +1,4 @@
-"""Plots of `stereoweave bench pairs`: errors against time, and what a confidence is worth."""
+"""Plots of `stereoweave bench pairs`: errors against time, and sparsification curves."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -18,12 +18,12 @@ from stereoweave.bench.pairs import Curves, MatcherRow
 from stereoweave.io.files import write_image
 from stereoweave.matching.opencv import OPENCV_MATCHERS
 
-# Okabe and Ito's colours, which colour-blind readers tell apart.
+# Okabe and Ito's colours, which colour-blind readers can distinguish.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _TITLES = {"bad1_percent": "bad-1: off by over 1 px, % of pixels", "epe_px": "EPE: mean error, px"}
 _MARKER_PX = 8
 _Place = tuple[tuple[float, float], Literal["left", "center", "right"], Literal["top", "center", "bottom"]]
-# Where a label may stand beside its point, the best place first: offset in points, and how it is aligned.
+# Places of a label beside its point, the best first: offset in points, and alignment.
 _PLACES: tuple[_Place, ...] = (
     ((0, 6), "center", "bottom"),
     ((0, -6), "center", "top"),
@@ -33,11 +33,11 @@ _PLACES: tuple[_Place, ...] = (
 
 
 def draw_error_over_time(path: str | Path, rows: Sequence[MatcherRow]) -> None:
-    """Write bad-1 and EPE against the time a pair takes, side by side; lower and further left is better.
+    """Write plots of bad-1 and EPE against the time per pair, side by side; lower and further left is better.
 
     Args:
-        path: The picture's file; its ending says what is written.
-        rows: One of each matcher: the means. Those of unknown error have no place in it.
+        path: The picture to write; its ending chooses the format.
+        rows: The mean row of each matcher. Rows whose error is NaN are left out.
     """
     rows = [row for row in rows if not math.isnan(row.epe_px)]
     figure, panels = _make_panels()
@@ -50,7 +50,7 @@ def draw_error_over_time(path: str | Path, rows: Sequence[MatcherRow]) -> None:
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
         axes.xaxis.set_minor_locator(NullLocator())
-    # Labels make room for each other, and so have to know where the points will be.
+    # Placing the labels needs the final positions of the points.
     figure.draw_without_rendering()
     for column, axes in panels.items():
         _label(axes, {_short_name(row.matcher): (row.time_ms, getattr(row, column)) for row in rows})
@@ -58,11 +58,11 @@ def draw_error_over_time(path: str | Path, rows: Sequence[MatcherRow]) -> None:
 
 
 def draw_sparsification(path: str | Path, curves: Mapping[str, Curves]) -> None:
-    """Write how bad-1 and EPE fall as the least confident pixels are dropped; a dashed line is the oracle's.
+    """Write plots of bad-1 and EPE against the share of pixels dropped by confidence; dashed: the oracle's.
 
     Args:
-        path: The picture's file; its ending says what is written.
-        curves: By matcher, as `score_pairs` gives them.
+        path: The picture to write; its ending chooses the format.
+        curves: Curves of `score_pairs`, by matcher.
     """
     figure, panels = _make_panels()
     for column, axes in panels.items():
@@ -102,7 +102,7 @@ def _legend_entry(matcher: str) -> str:
 
 
 def _label(axes: Axes, points: Mapping[str, tuple[float, float]]) -> None:
-    """Write each name beside its point, where no point and no other name is, if there is such a place."""
+    """Write each name beside its point, in the first place free of points and other names, if any."""
     corners = [axes.transData.transform(point) for point in points.values()]
     taken = [Bbox([corner - _MARKER_PX / 2, corner + _MARKER_PX / 2]) for corner in corners]
     for name, point in points.items():

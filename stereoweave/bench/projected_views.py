@@ -1,9 +1,9 @@
-"""Methods side by side on one dataset: errors of depth, and of the right view made with it.
+"""Comparison of methods on one dataset: errors of depth, and of the right view projected with it.
 
-The columns of Table I of "Fast Depth Estimation for View Synthesis". The paper does not say how its view
-error treats pixels without a source, which a bad disparity can make many of. So it is given twice: over the
-pixels that have one, with their share, and over all pixels after one row fill for all methods. The second one
-ranks.
+These are the columns of Table I of "Fast Depth Estimation for View Synthesis". The paper does not say how its
+view error treats pixels without a source, and a bad disparity can leave many of them. So the error is given
+twice: over the pixels that have a source, with their share, and over all pixels after the same row fill for
+all methods. The second one ranks the methods.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -19,20 +19,20 @@ from stereoweave.matching.opencv import OPENCV_MATCHERS, SGBM, fill_rows
 from stereoweave.stereo import Sample, StereoPair, View
 
 DisparityMethod = Callable[[Sample], Float[np.ndarray, "h w"]]
-"""What gives the disparity in px of a sample's left view [H, W]."""
+"""A sample to its left view's disparity in px [H, W]."""
 
 GROUND_TRUTH, NO_WARPING = "ground truth", "no warping"
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProjectionErrors:
-    """How a projected right view differs from the photograph.
+    """Errors of a projected right view against the right image.
 
     Attributes:
-        mae_sourced: Mean absolute error, 0 to 255, of the pixels that received a source.
-        sourced_percent: Their share.
-        mae_filled: Mean absolute error, 0 to 255, of all pixels after `fill_from_rows`; the one to rank by.
-        psnr_db, ssim: Of the filled view.
+        mae_sourced: Mean absolute error, 0 to 255, over the pixels that have a source.
+        sourced_percent: Share of these pixels.
+        mae_filled: Mean absolute error, 0 to 255, over all pixels after `fill_from_rows`; rank by this one.
+        psnr_db, ssim: Scores of the filled view.
     """
 
     mae_sourced: float
@@ -44,12 +44,12 @@ class ProjectionErrors:
 
 @dataclass(frozen=True, kw_only=True)
 class ProjectionRow:
-    """How one method did, as means over the samples: the errors of its disparity, and `ProjectionErrors`.
+    """One method's errors of disparity and its `ProjectionErrors`, averaged over the samples.
 
     Attributes:
         epe_px: End-point error over the pixels of known truth.
-        epe_cm: Mean absolute error of depth there, through each sample's camera; NaN if one has no camera.
-            Estimates are clamped as `score_projections` says.
+        epe_cm: Mean absolute depth error over the same pixels; NaN if a sample has no camera. Estimates are
+            clamped (see `score_projections`).
     """
 
     method: str
@@ -65,19 +65,20 @@ class ProjectionRow:
 def score_projections(
     methods: Mapping[str, DisparityMethod], samples: Iterable[Sample], max_depth_m: float | None = None
 ) -> list[ProjectionRow]:
-    """A row per method, the means over all samples, after those of three that every table has.
+    """Return a mean row for each of three baselines, then for each given method.
 
-    "ground truth" is the true disparity, which has no source to give where it is unknown; "no warping" a
-    disparity of 0, whose right view is the left image; "sgbm" OpenCV's matcher, its holes filled along rows.
+    The baselines: "ground truth" uses the true disparity and leaves pixels without a source where that is
+    unknown; "no warping" has disparity 0, so its right view is the left image; "sgbm" is OpenCV's matcher
+    with holes filled along rows.
 
     Args:
-        methods: What gives the disparity of each further row, by its name.
+        methods: Further methods, by name.
         samples: Pairs of known disparity.
-        max_depth_m: What an estimated depth is clamped to before it is compared, since one pixel at infinity
-            would make the mean infinite. None: the greatest true depth of each sample.
+        max_depth_m: Estimated depth is clamped to this before comparison, because one pixel at infinity would
+            make the mean infinite. Default: each sample's greatest true depth.
 
     Raises:
-        StereoweaveError: A method bears one of these three names, or there is no sample.
+        StereoweaveError: A method has a baseline's name, or there are no samples.
     """
     everyone: dict[str, DisparityMethod] = {GROUND_TRUTH: _true_px, NO_WARPING: _zero_px, SGBM: _make_sgbm()}
     if taken := everyone.keys() & methods.keys():
@@ -93,7 +94,7 @@ def score_projections(
 
 
 def measure_projection(right: UInt8[np.ndarray, "h w 3"], projected: View) -> ProjectionErrors:
-    """The errors of a right view made by `project_right`, against the right photograph."""
+    """Compare a right view made by `project_right` with the right image."""
     filled = fill_from_rows(projected)
     return ProjectionErrors(
         mae_sourced=mae(projected.image, right, projected.drawn),

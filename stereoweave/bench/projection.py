@@ -1,7 +1,8 @@
-"""The right view made of the left image, as in Table I of "Fast Depth Estimation for View Synthesis".
+"""Projection of the left image to the right view.
 
-`rendering` makes better views, of both photographs. This is a yardstick: nothing is blended or refined, so
-that what differs between the views of two methods is their disparity alone.
+Used for Table I of "Fast Depth Estimation for View Synthesis". `rendering` makes better views, from both
+images. This projection only compares methods: it neither blends nor refines, so that two methods' views
+differ by their disparity alone.
 """
 
 import numpy as np
@@ -12,36 +13,35 @@ from stereoweave.stereo import View
 
 
 def project_right(left: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarray, "h w"]) -> View:
-    """The right view, made of the left image by forward projection; black and not `drawn` without a source.
+    """Project the left image to the right view; pixels without a source are black and not `drawn`.
 
-    Column x of the left image goes to the column of the right one that is nearest to x - disparity_px. Where
-    several land, the nearer surface stays. The paper says no more than "projected from the left images".
+    Column x of the left image goes to the right image's column nearest to x - disparity_px. Where several
+    pixels land on one, the nearest surface wins. The paper only says "projected from the left images".
 
     Args:
         left: uint8 RGB [H, W, 3].
-        disparity_px: [H, W], of the left view; a pixel whose disparity is NaN or infinite goes nowhere.
+        disparity_px: Left disparity [H, W]; pixels with NaN or infinity are not projected.
     """
     if disparity_px.shape != left.shape[:2]:
         raise StereoweaveError(
             f"disparity_px: expected the left image's shape {left.shape[:2]}, found {disparity_px.shape}"
         )
-    # np.rint sends halves to even columns: a surface at 0.5 px would lose every second one.
+    # Not np.rint, which rounds halves to even: a surface at 0.5 px would miss every second column.
     landed = np.floor(np.arange(left.shape[1]) - disparity_px + 0.5)
     inside = (landed >= 0) & (landed < left.shape[1])
     target = np.nonzero(inside)[0], landed[inside].astype(np.intp)
     image, drawn = np.zeros_like(left), np.zeros(disparity_px.shape, bool)
-    # Of two pixels that land together the nearer came from farther right: from left to right, it stays.
+    # Of two pixels that land together, the nearer came from farther right; written last, it stays.
     image[target], drawn[target] = left[inside], True
     return View(image=image, drawn=drawn)
 
 
 def fill_from_rows(view: View) -> UInt8[np.ndarray, "h w 3"]:
-    """The view's image with each pixel that was not drawn taken from the next drawn one to its right.
+    """Fill each pixel that was not drawn with the next drawn pixel to its right, else the last to its left.
 
-    Without one it takes the last to its left. In a right view made of the left image a nearer surface moves
-    farther to the left, so that what it uncovers has the background on its right: this needs no disparity,
-    and treats all methods alike. A row without any drawn pixel takes the one above; above the first row that
-    has some, all is black.
+    In a right view projected from the left image, nearer surfaces move farther left, so the area that they
+    uncover has background on its right. The fill therefore needs no disparity and treats all methods alike. A
+    row without any drawn pixel copies the row above; rows above the first drawn one stay black.
     """
     height, width = view.drawn.shape
     after = np.where(view.drawn, np.arange(width), width)

@@ -1,4 +1,4 @@
-"""Pairs with pictures from between (or beyond) the two cameras, real or rendered, to score new views on."""
+"""Pairs with reference pictures from between or beyond the cameras, real or rendered, to score new views."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -19,12 +19,12 @@ from stereoweave.stereo import Sample, StereoPair
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceView:
-    """A picture that a camera on the line through the two has taken.
+    """An image taken by a further camera on the line through the two.
 
     Attributes:
-        position: Where it stood: 0 is the left camera, 1 the right one.
+        position: 0 is the left camera, 1 the right one.
         image: uint8 RGB [H, W, 3].
-        offset_px: How far its content lies right of and below the nominal place.
+        offset_px: Offset of its content right of and below the nominal place.
     """
 
     position: float
@@ -34,12 +34,12 @@ class ReferenceView:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewScene:
-    """A pair, and pictures to score new views of it against.
+    """A pair with reference views.
 
     Attributes:
-        name: The folder's, or SUBFOLDER/ship-000057 in a rendered set.
-        sample: The pair; its disparities are NaN where the scene has none.
-        views: At least one, by position, each of the pair's size.
+        name: The folder's name, or SUBFOLDER/ship-000057 in a rendered set.
+        sample: The pair; its disparities are NaN if the scene has none.
+        views: At least one, sorted by position, each of the pair's size.
     """
 
     name: str
@@ -48,23 +48,23 @@ class ViewScene:
 
 
 def read_view_scenes(folder: str | Path) -> Iterator[ViewScene]:
-    """The scenes of `folder` by name, each read when its turn comes; as for `list_view_scenes`."""
+    """Iterate over the scenes of `folder` by name and read each lazily; see `list_view_scenes`."""
     return (read() for read in list_view_scenes(folder))
 
 
 def list_view_scenes(folder: str | Path) -> list[Callable[[], ViewScene]]:
-    """What reads each scene of `folder`, by the scenes' names.
+    """Return a reader for each scene of `folder`, sorted by the scenes' names.
 
-    A scene is a folder of left.png, right.png, and view_<position>.png for each further photograph. It may
-    have disparity.png (16 bit, pixels * 256, 0 = unknown) or disparity.pfm (NaN or infinity = unknown), the
-    same as right_disparity, and scene.json, whose "offset_px" {position: [right, down]} says how far a
-    photograph lies beside its nominal place. Where there is no such folder, the pairs of all rendered sets
-    with further views (`stereoweave synth make`) in `folder` and below it are the scenes.
+    A scene is a folder of left.png, right.png and view_<position>.png for each further picture. It may have
+    disparity.png (16 bit, pixels * 256, 0 = unknown) or disparity.pfm (NaN or infinity = unknown), the same
+    for right_disparity, and scene.json, whose "offset_px" {position: [right, down]} gives each picture's
+    offset from its nominal place. Without such folders, the scenes are the pairs with further views of all
+    rendered sets (`stereoweave synth make`) in and below `folder`.
 
     Raises:
         StereoweaveError: No scene in the folder.
-        FormatError: While a scene is read: a file is missing, damaged, or of another size than its
-            neighbours; a position is no number that a view can be rendered at; there is no further picture.
+        FormatError: Raised by a reader if a file is missing, damaged or of a different size, a position is
+            not a number or out of range, or there is no further picture.
     """
     root = Path(folder)
     if scenes := sorted(left.parent for left in root.glob("*/left.png")):
@@ -130,7 +130,7 @@ def _parse_position(path: Path) -> float:
 
 
 def _read_disparity(folder: Path, name: str, *, pair: StereoPair) -> Float[np.ndarray, "h w"]:
-    """The named disparity, of which one file or none is there; all of it NaN, unknown, if none is."""
+    """Read the named disparity, PFM or else PNG; NaN (unknown) everywhere without a file."""
     readers: dict[str, Callable[[Path], Float[np.ndarray, "h w"]]] = {
         ".pfm": read_pfm,
         ".png": read_disparity_png,

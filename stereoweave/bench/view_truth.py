@@ -1,4 +1,4 @@
-"""What a camera beside those of a known pair would see: true disparity, and who else sees it."""
+"""Ground truth of a new view of a known pair: its disparity, and which pixels the two cameras see."""
 
 from dataclasses import dataclass
 
@@ -9,21 +9,21 @@ from stereoweave.data.samples import find_hidden
 from stereoweave.matching.opencv import fill_rows
 from stereoweave.stereo import Sample
 
-# Neighbours up to this far apart are one surface. A larger step is an edge, as in edges.py.
+# Neighbours up to this far apart are one surface. A larger step is an edge, as in edge_metrics.py.
 _JOINED_PX = 2.0
-# Of one surface, so that it has no cracks where the view magnifies it: by 3 at most between the cameras.
+# Sampling of one surface, so that the view's magnification, at most 3 between the cameras, leaves no cracks.
 _SAMPLES_A_PIXEL = 4
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewTruth:
-    """What a new view shows; arrays are [H, W].
+    """Ground truth of a new view; arrays are [H, W].
 
     Attributes:
-        disparity_px: Of the surface in each pixel, in pixels between the left and the right photograph; NaN
-            where no pixel of known disparity shows it.
-        one_sees: Of known disparity, and hidden from one of the two photographs.
-        none_sees: Shown by no pixel of either, those of unknown disparity taken as by `fill_unknown`.
+        disparity_px: Disparity between the left and the right image of the surface in each pixel; NaN where
+            no pixel of known disparity lands.
+        one_sees: Mask of pixels of known disparity that only one of the two images shows.
+        none_sees: Mask of pixels that neither image shows, unknown disparity filled by `fill_unknown`.
     """
 
     disparity_px: Float[np.ndarray, "h w"]
@@ -32,10 +32,10 @@ class ViewTruth:
 
 
 def find_view_truth(sample: Sample, position: float) -> ViewTruth:
-    """What the view from a position shows of a pair: the nearest of what lands there from either side.
+    """Compute a view's ground truth: the nearest surface that lands on each pixel from either image.
 
     Args:
-        sample: With both disparities; where one is unknown nothing is said to be hidden.
+        sample: Needs both disparities; pixels of unknown disparity never count as occluded.
         position: 0 is the left camera, 1 the right one.
     """
     sides = (sample.disparity_px, 0 - position), (sample.right_disparity_px, 1 - position)
@@ -48,11 +48,11 @@ def find_view_truth(sample: Sample, position: float) -> ViewTruth:
 
 
 def land_disparities(disparity_px: Float[np.ndarray, "h w"], way: float) -> Float[np.ndarray, "h w"]:
-    """The nearest disparity that lands on each pixel of a view [H, W]; NaN where none does.
+    """Return the nearest surface's disparity on each pixel of a view [H, W]; NaN where nothing lands.
 
     Args:
-        disparity_px: Of a photograph; NaN where it is unknown.
-        way: Column x lands at x + way * disparity_px, on the pixel that is nearest.
+        disparity_px: Disparity of an input image; NaN is unknown.
+        way: Column x lands on the pixel nearest to x + way * disparity_px.
     """
     height, width = disparity_px.shape
     landed = np.full((height, width), -np.inf, np.float32)
@@ -68,8 +68,8 @@ def land_disparities(disparity_px: Float[np.ndarray, "h w"], way: float) -> Floa
 
 
 def fill_unknown(disparity_px: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """The map with NaN filled from the farther of its known neighbours along the row, as by `fill_rows`."""
-    # To that function 0 is unknown, which is the sky's true disparity.
+    """Fill NaN with the farther of the known neighbours along the row, as `fill_rows` does."""
+    # `fill_rows` takes 0 for unknown, but 0 is the sky's true disparity.
     lift_px = 1 - np.min(disparity_px, where=np.isfinite(disparity_px), initial=0)
     return fill_rows(np.nan_to_num(disparity_px + lift_px).astype(np.float32)) - lift_px
 
@@ -77,7 +77,7 @@ def fill_unknown(disparity_px: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h
 def _find_hidden_from(
     disparity_px: Float[np.ndarray, "h w"], side_px: Float[np.ndarray, "h w"], way: float
 ) -> Bool[np.ndarray, "h w"]:
-    """Pixels of the new view that the photograph which lands in it by `way` does not see."""
-    if way < 0:  # the photograph was taken to the left: in a mirror, to the right
+    """Find the new view's pixels that are occluded in the side image; for `way` see `land_disparities`."""
+    if way < 0:  # the image was taken to the left; mirrored, to the right
         return _find_hidden_from(disparity_px[:, ::-1], side_px[:, ::-1], -way)[:, ::-1]
     return find_hidden(way * disparity_px, way * side_px)

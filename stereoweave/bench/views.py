@@ -1,12 +1,12 @@
-"""New views side by side with pictures that a camera has taken there, by method and by kind of pixel.
+"""Scores of new views against reference images from the same position, by method and by kind of pixel.
 
-The methods are shown the two photographs alone. Where both true disparities are known, pixels are told apart
-by what the new view truly shows (data/view_truth.py), at the nominal place of a picture taken beside it:
+The methods only see the two input images. If both true disparities are known, the pixels at the reference's
+nominal position are classified by the new view's ground truth (view_truth.py):
 
-    smooth    of known disparity there, farther than three pixels from a depth edge
-    edge      the three on either side of one (edges.py)
-    one       of these two, seen by one of the photographs
-    neither   seen by none, and of no known disparity
+    smooth    known disparity, more than three pixels from a depth edge
+    edge      known disparity, within three pixels of one (edge_metrics.py)
+    one       smooth or edge, and seen by only one of the two cameras
+    neither   seen by neither camera, so of unknown disparity
 """
 
 import time
@@ -31,10 +31,10 @@ from stereoweave.stereo import Estimate, Sample, StereoPair
 from stereoweave.system.ray_engine import Engine
 
 Estimator = Callable[[StereoPair], Estimate]
-"""A pair to the estimate that views are rendered from, such as what `benchmark.network` gives."""
+"""A pair to the estimate that views are rendered from."""
 
 Viewer = Callable[[float], UInt8[np.ndarray, "h w 3"]]
-"""A position to one method's view of one scene."""
+"""A position to the view of one scene by one method."""
 
 _BEHIND_ALL_PX = -1e9
 NEAREST, CROSS_FADE, GROUND_TRUTH = "nearest photograph", "cross-fade", "ground truth"
@@ -42,16 +42,17 @@ NEAREST, CROSS_FADE, GROUND_TRUTH = "nearest photograph", "cross-fade", "ground 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewScoreRow:
-    """How one method's view of a scene from a position compares with the picture taken there.
+    """Scores of one method's view of a scene from one position against the reference image.
 
-    In the mean row of a method (scene "mean", no position) each number is the mean over the scenes that have
-    it, of the mean over a scene's positions that have it.
+    In a method's mean row (scene "mean", no position) each number is averaged over a scene's positions that
+    have it, then over the scenes that have it.
 
     Attributes:
         psnr_db, ssim, mae: Over all pixels; errors are in grey levels of 0..255.
-        smooth_psnr_db: Over the pixels of a kind (see above), from their mean squared error; NaN where there
-            is none, or the truth is not known. The others likewise.
-        time_ms: Median for a view once the pair is matched.
+        smooth_psnr_db, edge_psnr_db, one_psnr_db, neither_psnr_db: PSNR over the pixels of one kind (see the
+            module); NaN if there are none or the truth is unknown.
+        smooth_mae, edge_mae, one_mae, neither_mae: Mean absolute error over the same pixels.
+        time_ms: Median time per view once the pair is matched.
     """
 
     scene: str
@@ -72,7 +73,7 @@ class ViewScoreRow:
 
 
 class ViewScores(NamedTuple):
-    """A row per scene, position and method, then a mean row per method; and what they were measured with."""
+    """A row per scene, position and method, then a mean row per method; and the machine's description."""
 
     rows: list[ViewScoreRow]
     machine: dict[str, str]
@@ -84,17 +85,17 @@ def score_view_scenes(
     threads: int | None = None,
     engine: Engine | None = None,
 ) -> ViewScores:
-    """How the views of several methods compare with the pictures taken there.
+    """Score the views of several methods against reference images.
 
-    Four methods are in every table. "nearest photograph" and "cross-fade", the two photographs' weighted
-    mean, need no disparity. "sgbm" is OpenCV's matcher, and "ground truth" the true disparity of both views:
-    the ceiling, where it is known. These two are filled along rows, and rendered as the networks' are.
+    Every table has four baselines. "nearest photograph" and "cross-fade", the weighted mean of both images,
+    need no disparity. "sgbm" is OpenCV's matcher. "ground truth" is the true disparity of both views, where
+    known: the upper bound. Both are filled along rows and rendered like the networks' estimates.
 
     Args:
-        networks: What makes each further method, by its name.
-        scenes: Lists at least one.
-        threads: For rendering; all cores if left out.
-        engine: As for `benchmark.score_pairs`, which says what is raised, too.
+        networks: Makes each further method, by name.
+        scenes: Must list at least one scene.
+        threads: Threads for rendering; default: all cores.
+        engine: See `score_pairs`, for errors too.
     """
     found = score_all(networks, scenes, partial(_score_scene, threads), engine)
     rows = [row for scene in found for row in scene.result]
@@ -106,7 +107,7 @@ def score_view_scenes(
 def shift_image(
     image: UInt8[np.ndarray, "h w 3"], offset_px: tuple[float, float]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The image with its content moved right and down by offset_px; as it is where that is zero."""
+    """Shift the image's content right and down by offset_px; unchanged if that is zero."""
     if offset_px == (0, 0):
         return image
     shift = np.array([[1, 0, offset_px[0]], [0, 1, offset_px[1]]], np.float32)
@@ -120,7 +121,7 @@ def _score_scene(
     viewers = _make_viewers(networks, scene.sample, threads)
     rows = []
     for true in scene.views:
-        # These first calls warm the renderer up for the timing.
+        # These first calls warm up the renderer before timing.
         images = {method: viewer(true.position) for method, viewer in viewers.items()}
         times_ms = _measure_times_ms(viewers, true.position)
         kinds = _classify_pixels(scene.sample, true.position)
@@ -166,14 +167,14 @@ def _render_view(renderer: Renderer, position: float) -> UInt8[np.ndarray, "h w 
 
 
 def _estimate_by_sgbm(pair: StereoPair) -> Estimate:
-    """What OpenCV's users have of it: both views, each filled along rows, and the left-right check."""
+    """Match both views with SGBM and fill each along rows; the confidence is the left-right check's."""
     match = OPENCV_MATCHERS[SGBM]()
     left_px, mirrored_px = match(pair), match(pair.mirror())
     filled_px, right_filled_px = fill_rows(left_px), fill_rows(mirrored_px)[:, ::-1]
     return Estimate(
         disparity_px=filled_px,
         right_disparity_px=right_filled_px,
-        # As the matcher does for a network without a confidence of its own.
+        # As `Matcher` does for a network without a confidence output.
         confidence=np.exp(left_right_confidence(left_px, mirrored_px[:, ::-1])),
         occluded=find_hidden(filled_px, right_filled_px),
     )
@@ -193,12 +194,12 @@ def _has_truth(sample: Sample) -> bool:
 
 
 def _classify_pixels(sample: Sample, position: float) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """The pixels of each kind, which begins the names of its columns; none where the truth is not known."""
+    """Return a mask per kind of pixel, by the prefix of its columns; empty if the truth is unknown."""
     if not _has_truth(sample):
         return dict.fromkeys(("smooth", "edge", "one", "neither"), np.zeros(sample.left.shape[:2], bool))
     truth = find_view_truth(sample, position)
     known = np.isfinite(truth.disparity_px)
-    # What neither shows is behind what is beside it.
+    # Areas that neither camera sees lie behind their surroundings.
     near = near_edge(np.where(truth.none_sees, _BEHIND_ALL_PX, truth.disparity_px))
     return {"smooth": known & ~near, "edge": known & near, "one": truth.one_sees, "neither": truth.none_sees}
 
@@ -206,7 +207,7 @@ def _classify_pixels(sample: Sample, position: float) -> dict[str, Bool[np.ndarr
 def _measure_errors(
     image: UInt8[np.ndarray, "h w 3"], true: ReferenceView, kinds: Mapping[str, Bool[np.ndarray, "h w"]]
 ) -> dict[str, float]:
-    """The columns that compare the two pictures."""
+    """Compute the columns that compare the two images."""
     errors = {
         "psnr_db": psnr_db(image, true.image),
         "ssim": ssim(image, true.image),
@@ -219,7 +220,7 @@ def _measure_errors(
 
 
 def _measure_times_ms(viewers: Mapping[str, Viewer], position: float) -> dict[str, float]:
-    # In turns, so that a machine that slows down slows all alike.
+    # Take turns, so that a slowdown of the machine affects all alike.
     turns_ms = [
         {name: _measure_time_ms(viewer, position) for name, viewer in viewers.items()} for _ in range(TURNS)
     ]

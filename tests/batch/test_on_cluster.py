@@ -155,7 +155,7 @@ def test_a_machine_that_sees_other_scenes_is_named(sets):
     with pytest.raises(StereoweaveError) as raised:
         benchmark._SceneScorer({}, partial(list_scenes, sets), len, expected=3)
     assert str(raised.value) == (
-        f"{platform.node()}: expected the 3 scenes that are where the command was started, found 2; "
+        f"{platform.node()}: expected the same 3 scenes as where the command was started, found 2; "
         "put them on a disk that every node of the cluster sees"
     )
 
