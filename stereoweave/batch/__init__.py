@@ -1,1 +1,1 @@
-"""Many pairs: on this machine, or on a cluster with Ray."""
+"""Depth of many pairs and videos, on this machine or on a Ray cluster."""

@@ -1,9 +1,9 @@
-"""Depth of very many pairs and films, by workers on one machine or many, in folders or object stores.
+"""Depth of very many pairs and videos, by workers on one or many machines, in folders or object stores.
 
-What is to be made and what came of it is in Parquet files by chunks (`manifest`); here are their numbers.
-A run that was stopped in whatever way goes on with the same command: chunks whose rows are written are looked
-through, and all others made. On a disk a second run is refused while one goes on; in an object store two at
-once do everything twice, and harm nothing.
+Parquet files store the plan and the results by chunk (`manifest`); this module distributes the chunks'
+numbers. Rerun the same command to resume after any interruption: chunks whose rows are written are only
+checked, all others are processed. On a disk a second concurrent run is refused; in an object store two
+concurrent runs do all work twice but damage nothing.
 """
 
 import json
@@ -33,20 +33,20 @@ from stereoweave.pictures.pair_finding import BATCH_FILE
 from stereoweave.system.progress import progress
 from stereoweave.system.ray_engine import Engine, connect, room, stream
 
-# Ray Data remembers something of each task; chunks beyond so many share one.
+# Ray Data keeps state per task. Above this number of chunks, several share a task.
 _MOST_TASKS = 2000
 
 
 @dataclass(frozen=True)
 class ClusterTally:
-    """How a batch ended.
+    """Counts of a batch.
 
     Attributes:
-        made: How many pairs and films were made.
-        there: How many were there before.
-        failed: How many failed.
-        named: Names and reasons of the first failed ones.
-        manifest: Path or URL of the folder of Parquet files that has a row for each.
+        made: Number of pairs and videos processed.
+        there: Number finished before.
+        failed: Number that failed.
+        named: Names and errors of the first failures.
+        manifest: Path or URL of the folder of Parquet files with a row for each.
     """
 
     made: int
@@ -64,28 +64,28 @@ def run_cluster(
     *,
     console: Console | None = None,
 ) -> ClusterTally:
-    """Makes the results of every pair and film in the source that are not there yet, and a row for each.
+    """Process every pair and video in the source that has no results yet, and write a row for each.
 
-    Of a pair it makes what `depth` makes of many, of a film depth.mkv, its disparity in 16-bit grey; each in
-    destination/name. On a cluster both places have to be seen by all machines, under the same names.
+    Results are in destination/name: for a pair the files of `depth` for many pairs, for a video depth.mkv,
+    its disparity in 16-bit grey. All machines of a cluster must see both places under the same names.
 
     Args:
-        source: A folder, or the URL of one in an object store.
-        destination: A new one, or one that the same job was begun in.
-        job: What is made of each pair.
-        engine: Where.
-        console: Where progress is shown; nowhere unless given.
+        source: A folder, or its URL in an object store.
+        destination: A new folder or URL, or that of an interrupted batch with the same job.
+        job: Settings for each pair.
+        engine: Where to run; default: this machine.
+        console: Shows progress; default: hidden.
 
     Raises:
-        StereoweaveError: A place, the cluster, the network or the provider cannot be used, or not any more,
-            or another run writes to the destination. What is made stays, and the same call goes on.
+        StereoweaveError: A place, the cluster, the model or the provider is or becomes unusable, or another
+            run writes to the destination. Results are kept, and the same call resumes.
     """
     engine = engine or Engine()
     job = _for_many(job or DepthJob(), engine)
     console = console or Console(quiet=True)
     read_from, write_to = _store(source), _store(destination)
     if job.backend.provider == CPU:
-        replace(job.backend, threads=1).matcher()  # an unknown network is one error, not one for each pair
+        replace(job.backend, threads=1).matcher()  # raise once for an unknown model, not for each pair
     read_from.check_source()
     write_to.check_destination()
     with _alone(write_to), connect(engine):
@@ -103,11 +103,11 @@ def run_cluster(
 def batch_on_cluster(
     source: str, destination: str, job: DepthJob, engine: Engine, *, as_json: bool = False
 ) -> int:
-    """Makes a batch and tells how it went; the exit code: 1 if a pair failed, 130 if Ctrl-C ended it."""
+    """Run a batch and print its counts. Returns the exit code: 1 if a pair failed, 130 after Ctrl-C."""
     try:
         tally = run_cluster(source, destination, job, engine, console=Console(stderr=True))
     except KeyboardInterrupt:
-        kept = "what is finished stays, and the same command goes on"
+        kept = "finished results are kept; rerun the same command to resume"
         typer.echo(f"stereoweave: {destination}: stopped; {kept}", err=True)
         return 130
     if as_json:
@@ -119,7 +119,7 @@ def batch_on_cluster(
 
 def _tell(tally: ClusterTally, destination: str) -> None:
     count = tally.made + tally.there + tally.failed
-    there = f", {tally.there} were there" if tally.there else ""
+    there = f", {tally.there} already there" if tally.there else ""
     failed = f", {tally.failed} failed" if tally.failed else ""
     typer.echo(
         f"{destination}: {count} {'pair' if count == 1 else 'pairs'}: {tally.made} made{there}{failed}"
@@ -132,7 +132,7 @@ def _tell(tally: ClusterTally, destination: str) -> None:
 
 
 def _run(worker: Worker, plan: ChunkPlan, engine: Engine, console: Console) -> Counts:
-    """Makes all chunks of a plan."""
+    """Process all chunks of a plan."""
     counts, start_s = Counts(), time.perf_counter()
     of_each = -(-len(plan.chunks) // _MOST_TASKS)
     tasks = [plan.chunks[first : first + of_each] for first in range(0, len(plan.chunks), of_each)]
@@ -147,38 +147,38 @@ def _run(worker: Worker, plan: ChunkPlan, engine: Engine, console: Console) -> C
 
 
 def _ready(worker: Worker) -> Worker:
-    """The worker, on a machine that sees both places."""
+    """Return the worker if this machine sees both places; raises otherwise."""
     try:
         for store in (worker.source, worker.destination):
             if store.folder is not None:
                 store.check_source()
     except StereoweaveError as error:
         raise StereoweaveError(
-            f"{platform.node()}: {error}; all machines of a cluster need it on a disk that they share, "
-            "or take an object store"
+            f"{platform.node()}: {error}; all machines of a cluster need it on a shared disk, "
+            "or use an object store"
         ) from error
     return worker
 
 
 def _for_many(job: DepthJob, engine: Engine) -> DepthJob:
-    """The job without reports, unless they are asked for, with the threads that a worker has to itself."""
+    """Return the job without default reports, and with the threads of one worker."""
     always = tuple(file for file in job.always if file != "report.html")
     return replace(job, always=always, backend=replace(job.backend, threads=engine.threads_each))
 
 
 def _store(place: str | Path) -> Store:
-    """The store of a place; workers have other working folders, so a path is made absolute."""
+    """Open a place as a store; makes paths absolute because workers have other working folders."""
     store = store_at(place)
     return store if store.folder is None else store_at(store.folder.absolute())
 
 
 def _alone(destination: Store) -> AbstractContextManager[None]:
-    """Keeps a second run out of a folder on a disk; an object store has no locks."""
+    """Lock a folder on a disk against a second run; object stores have no locks."""
     return lock_output(destination.folder) if destination.folder else nullcontext()
 
 
 def _claim(destination: Store, job: DepthJob, source: Store) -> None:
-    """Writes down whose folder this is, or refuses one that is another's."""
+    """Record the batch's settings in the destination; raises if it belongs to something else."""
     facts = {"made by": "stereoweave batch", "source": source.place, **job_facts(job)}
     if destination.exists(BATCH_FILE):
         place = destination.at(BATCH_FILE)
@@ -191,9 +191,9 @@ def _claim(destination: Store, job: DepthJob, source: Store) -> None:
 
 
 def _carried(job: DepthJob) -> Iterator[tuple[str, str, bytes]]:
-    """The job's own files, which workers on other machines cannot read: kind, name and content."""
+    """Yield kind, name and content of the job's files that workers on other machines may not see."""
     model, calibration = Path(job.backend.model), job.request.calibration
-    if str(model).endswith(".onnx") and model.is_file():  # else a name that they all know
+    if str(model).endswith(".onnx") and model.is_file():  # otherwise a shipped model
         with reading(model, "a model"):
             yield "model", model.name, model.read_bytes()
     if calibration and calibration.is_file():

@@ -1,7 +1,7 @@
-"""Depth of many pairs, by several processes; a batch that was stopped goes on where it was.
+"""Depth of many pairs by several processes; an interrupted batch resumes.
 
-A pair is finished when its folder has the file `done.json`, which is written last, says of which pictures the
-results are, and how they came out. What was made how, `batch.json` says for the whole folder.
+A pair is finished once its folder has `done.json`, which is written last and records the pictures and a
+summary. `batch.json` records the settings of the whole folder.
 """
 
 import functools
@@ -39,13 +39,13 @@ _NUMBERS = ("disparity_min_px", "disparity_median_px", "disparity_max_px", "conf
 _COLUMNS = ("name", "pictures", "seconds", *_NUMBERS, "notes", "error")
 
 Work = Callable[[NamedPair], str | None]
-# A pair, and what went wrong with it, None where nothing did.
+# A pair and its error, None on success.
 Outcome = tuple[NamedPair, str | None]
 
 
 @dataclass(frozen=True)
 class LocalTally:
-    """How a batch ended: how many pairs were made, how many were there, and name and reason of the others."""
+    """Counts of a batch: pairs processed, pairs finished before, and name and error of each failed pair."""
 
     done: int
     skipped: int
@@ -60,27 +60,27 @@ def run_batch(
     processes: int | None = None,
     console: Console,
 ) -> LocalTally:
-    """Makes the results of every pair in `out`/name, but for those that are there, and a table of all.
+    """Process every unfinished pair, with results in `out`/name, and write summary.csv.
 
-    A pair that cannot be made is told at once, and the others go on; so it is with a pair whose process
-    is killed. summary.csv has a row for each pair in the folder, earlier runs' and failed ones included.
+    A pair that fails, or whose process is killed, is reported at once; the others continue. summary.csv has a
+    row for each pair in the folder, including failed pairs and those of earlier runs.
 
     Args:
         pairs: The pairs.
-        out: A new folder, or one that a batch with the same job was begun in.
-        job: What is made of each pair.
-        processes: How many at a time, as many as cores unless given; more than one have a thread each, unless
-            the job says otherwise.
-        console: Where progress and failures are shown.
+        out: A new folder, or that of an interrupted batch with the same job.
+        job: Settings for each pair.
+        processes: Number of processes; default: all cores. If more than one, each uses one thread unless the
+            job sets the number.
+        console: Shows progress and failures.
 
     Raises:
-        StereoweaveError: `out` has something else in it, is in use or cannot be written, or there is no such
-            matcher.
+        StereoweaveError: `out` belongs to something else, is in use or cannot be written, or the matcher is
+            unknown.
     """
     processes = min(processes or usable_cores(), max(len(pairs), 1))
     if processes > 1 and job.backend.threads is None:
         job = replace(job, backend=replace(job.backend, threads=1))
-    # An unknown network or unavailable provider is one error here, not one for each pair.
+    # Raise once for an unknown model or unavailable provider, not for each pair.
     replace(job.backend, threads=1).matcher()
     threads = job.backend.threads
     make_folder(out)
@@ -98,9 +98,9 @@ def run_batch(
 def depth_of_many(
     found: FoundPairs, out: Path, job: DepthJob, *, processes: int | None = None, as_json: bool = False
 ) -> int:
-    """Makes a batch and tells how it went; the exit code: 1 if a pair failed, 130 if Ctrl-C ended it.
+    """Run a batch and print its counts. Returns the exit code: 1 if a pair failed, 130 after Ctrl-C.
 
-    Reports are made only where the job's files name report.html or all: each takes as long as all else.
+    Writes reports only if the job's files name report.html or all: a report takes as long as everything else.
     """
     job = replace(job, always=tuple(file for file in job.always if file != "report.html"))
     for note in found.notes:
@@ -108,7 +108,7 @@ def depth_of_many(
     try:
         tally = run_batch(found.pairs, out, job, processes=processes, console=Console(stderr=True))
     except KeyboardInterrupt:
-        kept = "what is finished stays, and the same command goes on"
+        kept = "finished results are kept; rerun the same command to resume"
         typer.echo(f"stereoweave: {out}: stopped; {kept}", err=True)
         return 130
     if as_json:
@@ -121,7 +121,7 @@ def depth_of_many(
 
 def _tell(tally: LocalTally, out: Path) -> None:
     count = tally.done + tally.skipped + len(tally.failed)
-    there = f", {tally.skipped} were there" if tally.skipped else ""
+    there = f", {tally.skipped} already there" if tally.skipped else ""
     failed = f", {len(tally.failed)} failed" if tally.failed else ""
     typer.echo(f"{out}: {count} {'pair' if count == 1 else 'pairs'}: {tally.done} made{there}{failed}")
     for name, error in tally.failed:
@@ -132,7 +132,7 @@ def _tell(tally: LocalTally, out: Path) -> None:
 def _run(
     work: Work, pairs: Sequence[NamedPair], processes: int, threads: int | None, console: Console
 ) -> list[tuple[str, str]]:
-    """Does the work on all pairs; names and reasons of those that failed, which are shown at once as well."""
+    """Process all pairs. Shows failures at once, and returns their names and errors."""
     failed: list[tuple[str, str]] = []
     start_s = time.perf_counter()
     with closing(_outcomes(work, pairs, processes, threads)) as outcomes, progress(console) as bar:
@@ -150,7 +150,7 @@ def _run(
 def _outcomes(
     work: Work, pairs: Sequence[NamedPair], processes: int, threads: int | None
 ) -> Generator[Outcome, None, None]:
-    """The outcomes as they come. When a process is killed, its pair is found by making each suspect alone."""
+    """Yield outcomes as they come. If a process is killed, rerun each suspect alone to find its pair."""
     waiting = deque(pairs)
     while waiting:
         for pair in (yield from _until_one_is_killed(work, waiting, processes, threads)):
@@ -161,12 +161,12 @@ def _outcomes(
 def _until_one_is_killed(
     work: Work, waiting: deque[NamedPair], processes: int, threads: int | None
 ) -> Generator[Outcome, None, list[NamedPair]]:
-    """Outcomes of the pairs that wait; returns those that were being made when a process was killed."""
+    """Yield outcomes of the waiting pairs; returns the pairs in progress when a process was killed."""
     pending: dict[Future[str | None], NamedPair] = {}
     with _pool(processes, threads or usable_cores()) as pool:
         try:
             while waiting or pending:
-                # No more than can be worked on, so that few are suspected.
+                # Submit one pair per process, so that few are suspects.
                 while waiting and len(pending) < processes:
                     pending[pool.submit(work, waiting[0])] = waiting[0]
                     waiting.popleft()
@@ -181,9 +181,9 @@ def _until_one_is_killed(
 
 @contextmanager
 def _pool(processes: int, threads: int) -> Iterator[ProcessPoolExecutor]:
-    """Processes to work in, which are ended when something goes wrong here."""
+    """Start a pool of processes; terminates them on an error."""
     others = multiprocessing.active_children()
-    # Started afresh, because a forked child inherits OpenCV's and ONNX Runtime's threads in an unknown state.
+    # Spawned, because a forked child inherits OpenCV's and ONNX Runtime's threads in an unknown state.
     context = multiprocessing.get_context("spawn")
     with (
         _few_blas_threads(threads),
@@ -202,9 +202,9 @@ def _pool(processes: int, threads: int) -> Iterator[ProcessPoolExecutor]:
 
 @contextmanager
 def _few_blas_threads(threads: int) -> Iterator[None]:
-    """Processes that are started meanwhile have so many threads in OpenBLAS, NumPy's matrix library.
+    """Limit the threads of OpenBLAS, NumPy's matrix library, in processes started meanwhile.
 
-    It reads the environment once, while it is loaded; its threads go on waiting busily after each product.
+    OpenBLAS reads the environment once, when it is loaded; its threads busy-wait after each product.
     """
     before = os.environ.get(_BLAS_THREADS)
     os.environ[_BLAS_THREADS] = str(threads)
@@ -217,7 +217,7 @@ def _few_blas_threads(threads: int) -> Iterator[None]:
 
 
 def _make(out: Path, job: DepthJob, pair: NamedPair) -> str | None:
-    """Makes the results of a pair and marks them as finished; what went wrong in one line, or None."""
+    """Write a pair's results and mark it as finished. Returns the error in one line, or None."""
     try:
         folder, sources = out / pair.name, _sources(pair)
         (folder / DONE_FILE).unlink(missing_ok=True)
@@ -233,13 +233,13 @@ def _make(out: Path, job: DepthJob, pair: NamedPair) -> str | None:
             temporary.write_text(json.dumps(facts | {"summary": asdict(summary)}), encoding="utf-8")
     except StereoweaveError as error:
         return " ".join(error.format(job.name_of).split())
-    except Exception as error:  # whatever a library makes of a bad picture, the other pairs go on
+    except Exception as error:  # a library may raise anything on a bad picture; the other pairs continue
         return " ".join(f"{type(error).__name__}: {error}".split())
     return None
 
 
 def _sources(pair: NamedPair) -> list[list[Any]]:
-    """What tells whether a pair's files are still the same: name, bytes and time of change of each."""
+    """Return name, size and modification time of each of a pair's files, to detect changes."""
     sources = []
     for path in (*pair.pictures, *([pair.calibration] if pair.calibration else [])):
         with reading(path, "a picture"):
@@ -257,7 +257,7 @@ def _is_finished(folder: Path, pair: NamedPair) -> bool:
 
 
 def _finished(folder: Path) -> dict[str, Any]:
-    """What is written about a finished pair; nothing where it is not, or files are missing by now."""
+    """Read `done.json` of a pair; empty if it is not finished or files are missing."""
     try:
         facts = json.loads((folder / DONE_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -266,7 +266,7 @@ def _finished(folder: Path) -> dict[str, Any]:
 
 
 def _claim(out: Path, job: DepthJob) -> None:
-    """Writes down whose folder this is, or refuses one that is another's."""
+    """Record the batch's settings in the folder; raises if it belongs to something else."""
     facts, path = job_facts(job), out / BATCH_FILE
     if path.exists():
         expected = "the description of a batch that stereoweave depth made"
@@ -281,7 +281,7 @@ def _claim(out: Path, job: DepthJob) -> None:
 
 
 def _tidy(out: Path) -> None:
-    """Removes what a killed process was about to write, where nobody is writing now."""
+    """Remove temporary files of killed processes; call only while nothing is being written."""
     for folder in out.glob(".stereoweave-*"):
         shutil.rmtree(folder, ignore_errors=True)
     remove_leftovers(out)
@@ -298,7 +298,7 @@ def _write_summary(out: Path, pairs: Sequence[NamedPair], failed: dict[str, str]
 
 
 def _row(folder: Path) -> dict[str, Any]:
-    """The row of a finished pair; nothing where it is not finished."""
+    """Return the summary row of a pair; empty if it is not finished."""
     if not (facts := _finished(folder)):
         return {}
     row = {name: facts["summary"][name] for name in _NUMBERS}

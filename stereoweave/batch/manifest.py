@@ -1,7 +1,7 @@
-"""What a large batch has to make, and what came of it: Parquet files by chunks, so that nobody reads all.
+"""Plan and results of a large batch: Parquet files by chunk, so that no process has to read all of them.
 
-`plan/part-*.parquet` lists what was found, each with the chunk that it belongs to; it is extended, never
-rearranged. `manifest/part-*.parquet` has the rows of a chunk each, written when all of the chunk is made.
+`plan/part-*.parquet` lists the pairs and videos found, with their chunks; it is extended, never rearranged.
+Each `manifest/part-*.parquet` has the rows of one chunk and is written once the whole chunk is processed.
 """
 
 import io
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 MANIFEST, PLAN = "manifest", "plan"
 MOST_IN_A_CHUNK = 32
-"""Pairs: what a dead worker has to do again at most."""
+"""Most pairs in a chunk, and so the most that are repeated after a worker dies."""
 _CHUNKS_OF_A_WORKER = 8
 _CHUNKS_IN_A_FILE = 64
 _PART = re.compile(r"part-(\d{8})\.parquet")
@@ -29,14 +29,14 @@ _PART = re.compile(r"part-(\d{8})\.parquet")
 
 @dataclass(frozen=True)
 class Planned:
-    """A pair, or a film, that is to be made.
+    """A planned pair or video.
 
     Attributes:
         name: The folder of its results.
-        files: Paths in the source of left and right, of one picture of both views, or of a film.
-        versions: What changes when one of the files, or the calibration, does.
-        calibration: The path of its own calibration.
-        is_film: Whether it is a film.
+        files: Paths in the source: left and right, one picture of both views, or a video.
+        versions: Change if one of the files or the calibration changes.
+        calibration: Path of its own calibration, if any.
+        is_film: True for a video.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Planned:
 
 @dataclass(frozen=True)
 class ChunkPlan:
-    """The numbers of all chunks, how many pairs and films are in them, and lines to tell."""
+    """The numbers of all chunks, the number of pairs and videos in them, and notes for the user."""
 
     chunks: tuple[int, ...]
     count: int
@@ -56,27 +56,26 @@ class ChunkPlan:
 
 
 def extend_plan(source: Store, destination: Store, workers: int) -> ChunkPlan:
-    """The plan in the destination, brought up to what is in the source now.
+    """Update the plan in the destination to the source's current files.
 
-    What is new in the source gets chunks of its own, and what has changed there its new versions. What is no
-    longer there stays as it is.
+    New files get chunks of their own, changed files their new versions. Entries of removed files stay.
 
     Args:
-        source: Where the pairs and films are.
-        destination: Where the plan is.
-        workers: How many are to share the new chunks.
+        source: The pairs and videos.
+        destination: Holds the plan.
+        workers: Number of workers that share the new chunks.
 
     Raises:
-        StereoweaveError: Nothing to make was found, or one of both cannot be used.
+        StereoweaveError: No pairs or videos found, or a store cannot be used.
     """
     _read_plan.cache_clear()
     versions = {file.path: f"{file.size_bytes} {file.version}" for file in source.files()}
     listed = find_pairs_among(source.place, versions)
     found = {planned.name: planned for planned in _all_planned(listed.pairs, listed.films, versions)}
     parts = _parts(destination, PLAN)
-    counts = {part: _updated(destination, part, found) for part in parts}  # which takes the known ones out
+    counts = {part: _updated(destination, part, found) for part in parts}  # shrinks `found` to the new ones
     if not (found or counts):
-        raise StereoweaveError(f"{source.place}: expected pairs of pictures or films in it, found none")
+        raise StereoweaveError(f"{source.place}: expected pairs of pictures or videos in it, found none")
     size = max(1, min(MOST_IN_A_CHUNK, len(found) // (_CHUNKS_OF_A_WORKER * workers)))
     chunks = list(_in_chunks(found.values(), size))
     for part, first in enumerate(range(0, len(chunks), _CHUNKS_IN_A_FILE), max(parts, default=-1) + 1):
@@ -84,20 +83,20 @@ def extend_plan(source: Store, destination: Store, workers: int) -> ChunkPlan:
     numbers = tuple(
         part * _CHUNKS_IN_A_FILE + chunk for part, of_each in counts.items() for chunk in range(len(of_each))
     )
-    # Of a plan that was lost, or that two runs extended at the same time.
+    # Rows of a lost plan, or of one that two runs extended at the same time.
     for stray in set(_parts(destination, MANIFEST)).difference(numbers):
         destination.remove(_part(MANIFEST, stray))
     return ChunkPlan(numbers, sum(map(sum, counts.values())), note_left_out(source.place, listed.left_out))
 
 
 def read_chunk(destination: Store, chunk: int) -> list[Planned]:
-    """What is to be made in a chunk."""
+    """Read the planned entries of a chunk."""
     part, number = divmod(chunk, _CHUNKS_IN_A_FILE)
     return _read_plan(destination.place, part)[number]
 
 
 def read_rows(destination: Store, chunk: int) -> dict[str, dict[str, Any]]:
-    """The rows of a chunk by the names of their pairs; none where they are not written yet."""
+    """Read the rows of a chunk, by pair; empty if not written yet."""
     path = _part(MANIFEST, chunk)
     if not destination.exists(path):
         return {}
@@ -105,7 +104,7 @@ def read_rows(destination: Store, chunk: int) -> dict[str, dict[str, Any]]:
 
 
 def write_rows(destination: Store, chunk: int, rows: Sequence[dict[str, Any]]) -> None:
-    """Writes the rows of a chunk: all, or nothing."""
+    """Write the rows of a chunk atomically."""
     _write(destination, _part(MANIFEST, chunk), rows, _rows_schema())
 
 
@@ -159,7 +158,7 @@ def _all_planned(
 
 
 def _in_chunks(planned: Collection[Planned], size: int) -> Iterator[list[Planned]]:
-    """Pairs so many together; a film, which takes as long as many pairs, alone."""
+    """Split into chunks of `size` pairs; a video, as slow as many pairs, gets its own chunk."""
     pairs = (one for one in planned if not one.is_film)
     while chunk := list(islice(pairs, size)):
         yield chunk
@@ -167,7 +166,7 @@ def _in_chunks(planned: Collection[Planned], size: int) -> Iterator[list[Planned
 
 
 def _updated(destination: Store, part: int, found: dict[str, Planned]) -> list[int]:
-    """How many are in each chunk of a file of the plan; those that were found have their versions of now."""
+    """Update a plan file from `found`, which loses these entries. Returns the chunks' sizes."""
     chunks = _read_plan(destination.place, part)
     now = [[found.pop(one.name, one) for one in chunk] for chunk in chunks]
     if now != chunks:
@@ -176,16 +175,16 @@ def _updated(destination: Store, part: int, found: dict[str, Planned]) -> list[i
 
 
 def _write_plan(destination: Store, part: int, chunks: Sequence[Sequence[Planned]]) -> list[int]:
-    """Writes a file of the plan; how many are in each chunk."""
+    """Write a plan file. Returns the chunks' sizes."""
     rows = [{"chunk": number, **asdict(one)} for number, chunk in enumerate(chunks) for one in chunk]
     _write(destination, _part(PLAN, part), rows, _plan_schema())
     return [len(chunk) for chunk in chunks]
 
 
-# A worker's chunks mostly follow one another.
+# Caches one file, because a worker's chunks are mostly consecutive.
 @lru_cache(maxsize=1)
 def _read_plan(destination: str, part: int) -> list[list[Planned]]:
-    """What is planned in one file, by chunk."""
+    """Read a plan file: the entries of each chunk."""
     chunks: list[list[Planned]] = []
     for row in _read(store_at(destination), _part(PLAN, part)):
         number = row.pop("chunk")
@@ -214,7 +213,7 @@ def _read(destination: Store, path: str) -> list[dict[str, Any]]:
     except (pyarrow.ArrowException, ValueError) as error:
         raise FormatError(
             f"{destination.at(path)}: expected a Parquet file of a batch, found one that cannot be read "
-            f"({error}); remove it, and the same command writes it anew"
+            f"({error}); remove it and rerun the same command, which writes it again"
         ) from error
 
 

@@ -1,7 +1,8 @@
-"""One worker of a large batch: makes the pairs of a chunk, and writes their rows when all are made.
+"""One worker of a large batch: processes the pairs of a chunk, then writes their rows.
 
-A chunk is marked as begun meanwhile. One that is found so was left by a worker that was killed, perhaps by
-one of its pairs: they are then made in a process of their own, which may be killed in the worker's stead.
+A chunk is marked as begun in the meantime. A mark found at the start was left by a killed worker, and one of
+its pairs may be the cause. The chunk's pairs are then processed in a child process, which may be killed in
+the worker's place.
 """
 
 import errno
@@ -36,19 +37,19 @@ ManifestRow = dict[str, Any]
 BEGUN = "begun"
 FILM = "depth.mkv"
 _NAMED_FAILURES = 5
-# A process may also be killed for others' need of memory.
+# A process may also be killed because others need memory.
 _MOST_TRIES = 3
-# Processes that are killed while they start, one after another: more are no accident.
+# Consecutive processes that may be killed during startup before it is an error.
 _MOST_FALSE_STARTS = 10
 _KILLED = "its process was killed every time; is the memory full?"
-# What is younger may be a living worker's.
+# Younger files may belong to a running worker.
 _LEFT_BEHIND_S = 600
 _FULL_OR_GONE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.ESTALE}
 
 
 @dataclass(frozen=True)
 class Counts:
-    """How many pairs and films were made, how many were there, how many failed; some of the failed."""
+    """Numbers of pairs and videos processed, finished before and failed; `named` has the first failures."""
 
     made: int = 0
     there: int = 0
@@ -61,20 +62,20 @@ class Counts:
 
     @property
     def all(self) -> int:
-        """Of all three kinds."""
+        """Sum of all three."""
         return self.made + self.there + self.failed
 
 
 @dataclass(frozen=True)
 class Worker:
-    """Makes what is planned.
+    """Processes planned pairs and videos.
 
     Attributes:
-        source: Where the pictures and films are.
-        destination: Where plan, rows and results are.
-        job: What is made of each pair.
-        carried: The job's own files, which the driver alone may have: their contents by `model` and
-            `calibration`.
+        source: The pictures and videos.
+        destination: Holds plan, rows and results.
+        job: Settings for each pair.
+        carried: The job's files that only the driver may have: kind (`model` or `calibration`), name and
+            content.
     """
 
     source: Store
@@ -83,11 +84,11 @@ class Worker:
     carried: tuple[tuple[str, str, bytes], ...] = ()
 
     def __call__(self, chunks: Sequence[int]) -> Counts:
-        """Makes what is missing in the chunks."""
+        """Process the missing pairs of several chunks."""
         return sum(map(self.make_chunk, chunks), Counts())
 
     def make_chunk(self, chunk: int) -> Counts:
-        """Makes what is missing in a chunk, failed before or changed since, and writes its rows."""
+        """Process a chunk's missing, failed and changed pairs, and write its rows."""
         planned, rows = read_chunk(self.destination, chunk), read_rows(self.destination, chunk)
         missing = [one for one in planned if not self._is_made(one, rows.get(one.name))]
         mark = f"{BEGUN}/{chunk:08d}.json"
@@ -103,7 +104,7 @@ class Worker:
         return row is not None and not row["error"] and self._holds(planned, row)
 
     def _holds(self, planned: Planned, row: ManifestRow) -> bool:
-        """Whether a row is of these very files, and its results are there."""
+        """Test whether a row matches the current files and its results exist."""
         if tuple(row["versions"]) != planned.versions:
             return False
         folder = planned.name
@@ -119,7 +120,7 @@ class Worker:
         return [self.row(planned) for planned in missing]
 
     def _rows_apart(self, missing: Sequence[Planned], mark: str) -> list[ManifestRow]:
-        """The rows, each made in another process; what it was killed by is noted, and not tried for ever."""
+        """Make the rows in a child process; records the tries of each pair and limits them."""
         notes = self._notes(mark)
         tries, rows = notes.get("tries", {}), {row["pair"]: row for row in notes.get("rows", [])}
         with _Apart(self) as apart:
@@ -139,14 +140,14 @@ class Worker:
     def _notes(self, mark: str) -> dict[str, Any]:
         try:
             return json.loads(self.destination.read_bytes(mark))
-        except ValueError:  # another run has just made the chunk, or the file was lost with a machine's power
+        except ValueError:  # another run has just finished the chunk, or a power failure lost the file
             return {}
 
     def row(self, planned: Planned) -> ManifestRow:
-        """The row of a pair or a film that is made now.
+        """Process a pair or video and return its row; the pair's own errors go into the row.
 
         Raises:
-            StereoweaveError: Not because of the pair: the source, the destination or the provider fails.
+            StereoweaveError: The source, the destination or the provider fails.
         """
         start_s = time.perf_counter()
         row, job = self._empty_row(planned), self._local_job()
@@ -159,7 +160,7 @@ class Worker:
                     row |= self._pair(planned, Path(name), job)
             except _StoreError:
                 raise
-            except Exception as error:  # whatever a library makes of a bad picture, the others go on
+            except Exception as error:  # a library may raise anything on a bad picture; the others continue
                 self._check_disk(error)
                 if any(isinstance(cause, ProviderError) for cause in _causes(error)):
                     _check_runs(matcher)
@@ -206,7 +207,7 @@ class Worker:
 
         from stereoweave.io.animation import needing_the_video_extra
 
-        with needing_the_video_extra("a film"):
+        with needing_the_video_extra("a video"):
             from stereoweave.video.convert import VideoJob, make_film
             from stereoweave.video.reader import open_footage
             from stereoweave.video.writer import parts_folder
@@ -225,25 +226,25 @@ class Worker:
                 kept = ProviderError | OutputInUseError
                 if not was_begun or any(isinstance(cause, kept) for cause in _causes(error)):
                     raise
-                # A killed worker's parts, of other files or damaged.
+                # Parts of a killed worker, damaged or from other files.
                 shutil.rmtree(begun, ignore_errors=True)
                 tally = make()
         width, height = footage.size_px
         return {"width_px": width, "height_px": height, "checks": tally.named, "files": _names(out)}
 
     def _fetched(self, planned: Planned, into: Path) -> tuple[tuple[Path, ...], Path | None]:
-        """The files on a disk of this machine, and the calibration."""
+        """Copy the files and the calibration to this machine."""
         try:
             files = tuple(self.source.fetch(file, into) for file in planned.files)
             return files, self.source.fetch(planned.calibration, into) if planned.calibration else None
         except StereoweaveError:
             with _of_the_store():
                 self.source.check_source()
-            raise  # the store is well, and the file is not
+            raise  # the store works, so the file is at fault
 
     @contextmanager
     def _results(self, planned: Planned, scratch: Path) -> Iterator[Path]:
-        """A folder to make the results in, which are then in the destination."""
+        """Give a folder for the results, and upload them to the destination if that is not a folder."""
         if self.destination.folder is not None:
             folder = self.destination.folder / planned.name
             remove_left_behind(folder)
@@ -261,12 +262,12 @@ class Worker:
                 self.destination.remove(stale)
 
     def _check_disk(self, error: Exception) -> None:
-        """Raises where a disk is full or gone: so it would be with the pairs to come."""
+        """Raise if a disk is full or gone, because all further pairs would fail too."""
         if any(isinstance(cause, OSError) and cause.errno in _FULL_OR_GONE for cause in _causes(error)):
             raise _StoreError(f"{self.destination.place}: {' '.join(str(error).split())}") from error
 
     def _local_job(self) -> DepthJob:
-        """The job with the files that were carried here."""
+        """Return the job with its carried files on this machine."""
         job = self.job
         for kind, name, content in self.carried:
             path = _carried(name, content)
@@ -278,7 +279,7 @@ class Worker:
 
 
 class _StoreError(StereoweaveError):
-    """What a source or a destination fails with as a whole."""
+    """Failure of the source or destination as a whole."""
 
 
 @contextmanager
@@ -290,7 +291,7 @@ def _of_the_store() -> Iterator[None]:
 
 
 class _Apart:
-    """A process of its own that makes rows; another one where it was killed."""
+    """A child process that makes rows; restarted after it is killed."""
 
     def __init__(self, worker: Worker) -> None:
         self._worker = worker
@@ -304,7 +305,7 @@ class _Apart:
             self._pool.shutdown()
 
     def begin(self) -> None:
-        """Waits for the process, if there is none."""
+        """Start the process unless it runs, and wait for it."""
         false_starts = 0
         while self._pool is None:
             threads = self._worker.job.backend.threads or 1
@@ -324,7 +325,7 @@ class _Apart:
                     pool.shutdown()
 
     def row(self, planned: Planned) -> ManifestRow | None:
-        """The row; None where the process was killed."""
+        """Process a pair or video in the child process; None if that was killed."""
         assert self._pool is not None
         try:
             return self._pool.submit(self._worker.row, planned).result()
@@ -335,13 +336,13 @@ class _Apart:
 
 
 def _warm(worker: Worker) -> None:
-    """Loads what a row takes, so that a try counts only while a pair is made."""
+    """Load the network, so that startup does not count as a try of a pair."""
     worker._local_job().backend.matcher()
 
 
 @functools.cache
 def _carried(name: str, content: bytes) -> Path:
-    """A file of the driver's, on a disk of this machine for as long as the process lives."""
+    """Write a file of the driver to this machine's disk, for the lifetime of the process."""
     path = Path(_scratch().name, name)
     path.write_bytes(content)
     return path
@@ -353,7 +354,7 @@ def _scratch() -> "tempfile.TemporaryDirectory[str]":
 
 
 def remove_left_behind(folder: Path) -> None:
-    """Removes what killed workers have left half-written in a folder, a while ago."""
+    """Remove old temporary files of killed workers from a folder."""
     for path in folder.glob(".*"):
         with suppress(FileNotFoundError):
             if time.time() - path.stat().st_mtime < _LEFT_BEHIND_S:
@@ -365,13 +366,13 @@ def remove_left_behind(folder: Path) -> None:
 
 
 def _check_runs(matcher: Matcher) -> None:
-    """Raises where a provider fails with the smallest pair as well: then the last one was not too large."""
+    """Raise if the provider fails even on the smallest pair: then the last pair was not too large."""
     plain = np.zeros((SMALLEST_SIDE_PX, SMALLEST_SIDE_PX, 3), np.uint8)
     matcher.estimate(plain, plain)
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """An error, what it came of, and so on."""
+    """Yield an error and the chain of its causes."""
     while error is not None:
         yield error
         error = error.__cause__

@@ -352,7 +352,7 @@ def test_another_runs_destination_is_refused_and_so_is_a_source_with_nothing_in_
     with pytest.raises(StereoweaveError, match="none: expected a folder, found no such folder"):
         run_cluster(tmp_path / "none", tmp_path / "new", JOB, engine)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(StereoweaveError, match="expected pairs of pictures or films in it, found none"):
+    with pytest.raises(StereoweaveError, match="expected pairs of pictures or videos in it, found none"):
         run_cluster(tmp_path / "empty", tmp_path / "new", JOB, engine)
 
 

@@ -167,7 +167,7 @@ def test_a_pair_is_there_only_with_its_pictures_and_its_mark_unharmed(tmp_path, 
     assert (tally.done, tally.skipped, [name for name, _ in tally.failed]) == (1, 1, ["01"])
     assert depth_of_many(FoundPairs(pairs[:1], ("a note",)), out, JOB) == 0
     told = capsys.readouterr()
-    assert told.out.splitlines()[0] == f"{out}: 1 pair: 0 made, 1 were there"
+    assert told.out.splitlines()[0] == f"{out}: 1 pair: 0 made, 1 already there"
     assert told.err.splitlines()[0] == "a note"
 
 
@@ -212,14 +212,14 @@ def test_a_killed_batch_goes_on_and_so_does_an_interrupted_one_but_none_beside_a
     assert process.returncode == 130
     assert told == ""
     assert errors.splitlines()[-1] == (
-        f"stereoweave: {out}: stopped; what is finished stays, and the same command goes on"
+        f"stereoweave: {out}: stopped; finished results are kept; rerun the same command to resume"
     )
     assert "Traceback" not in errors
     assert not list(out.glob(".*"))
 
     assert depth_of_many(find_pairs_in(folder), out, JOB, processes=2) == 0
     assert capsys.readouterr().out.splitlines() == [
-        f"{out}: 24 pairs: {24 - len(before)} made, {len(before)} were there",
+        f"{out}: 24 pairs: {24 - len(before)} made, {len(before)} already there",
         f"table: {out / 'summary.csv'}",
     ]
     assert made_at_ns(out).items() >= before.items()
