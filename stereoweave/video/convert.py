@@ -1,4 +1,4 @@
-"""A 3-D film made into another, frame by frame: matched, held steady, and shown as depth, view or layout."""
+"""Conversion of a stereo video, frame by frame: match, filter over time, show as depth, view or layout."""
 
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
@@ -35,11 +35,11 @@ from stereoweave.video.temporal_filter import Steadier
 from stereoweave.video.tracks import picture_files
 from stereoweave.video.writer import GREY16, H264, Packing, Picture, Recorder, check_film, growing
 
-# A part is lost when a run is interrupted; each begins with a key frame.
+# Length of a part. An interrupted run loses the unfinished one; each begins with a key frame.
 _PART_S = 10
 _SURVEYED_FRAMES, _HINTED_FRAMES = 24, 3
 _SURVEYED_EVERY_PX = 4
-# Single wrong pixels do not widen the range of a film, and what moves may come nearer between those frames.
+# Outliers do not widen the range; the margin allows for objects that come nearer between the surveyed frames.
 _OUTER_PERCENT, _MARGIN_PX = 0.5, 8.0
 _NAMED_PROBLEMS = 3
 _STEPS_PER_PX, _MOST_GREY16_PX = 256, 255.99
@@ -55,18 +55,18 @@ PACKINGS = {
 
 @dataclass(frozen=True, kw_only=True)
 class VideoJob:
-    """What a film is made into: one of depth, depth16, position and layout.
+    """Settings of a conversion; exactly one of depth, depth16, position and layout is set.
 
     Attributes:
-        depth: The left view's disparity in colours, one range for the whole film.
-        depth16: The same as 16-bit grey, px * 256 as in disparity.png; clipped to 1/256 to 255.99 px.
-        position: A view: 0 is the left camera, 1 the right one.
+        depth: Left disparity in colours, with one range for the whole video.
+        depth16: Left disparity as 16-bit grey, px * 256 as in disparity.png; clipped to 1/256 to 255.99 px.
+        position: View from this position: 0 is the left camera, 1 the right one.
         layout: A name in `LAYOUTS`.
         strength: Multiplies the baseline.
-        convergence_px: The disparity that stays in place from view to view. None is that of the film's middle
-            for layouts whose views lie upon one another, and 0 for all else.
-        backend: What matches its frames.
-        name_of: The front end's names for settings, in notes.
+        convergence_px: Disparity that stays in place from view to view. Default: the scene's median disparity
+            for layouts that overlay their views, else 0.
+        backend: Matches the frames.
+        name_of: The front end's names for settings, used in notes.
     """
 
     depth: bool = False
@@ -118,7 +118,7 @@ class VideoJob:
         return () if self.position is None else (self.position,)
 
     def picture(self, pair: StereoPair, estimate: Estimate, survey: "Survey") -> Picture:
-        """What is shown of one frame."""
+        """Make the output image of one frame."""
         if self.depth:
             return colour_disparity(estimate.disparity_px, survey.range_px)
         if self.depth16:
@@ -135,13 +135,13 @@ class VideoJob:
         return LAYOUTS[str(self.layout)].compose(renderer, LayoutOptions(range_px=survey.range_px))
 
     def _plane_px(self, survey: "Survey") -> float:
-        """The disparity that stays in place from view to view."""
+        """Return the disparity that stays in place from view to view."""
         if self.convergence_px is not None:
             return self.convergence_px
         return survey.middle_px if self.layout and LAYOUTS[self.layout].converged else 0.0
 
     def loses(self, survey: "Survey") -> list[Note]:
-        """A note if the file cannot hold all disparities of the film."""
+        """Return a note if the file cannot hold all of the video's disparities."""
         low_px, high_px = survey.range_px
         if not self.depth16 or (low_px >= 0 and high_px <= _MOST_GREY16_PX):
             return []
@@ -152,7 +152,7 @@ class VideoJob:
         return [Note(text, Remedy("show all of them in colours", ("depth",)))]
 
     def says(self, survey: "Survey") -> dict[str, str]:
-        """What the file says about itself: how to get back from its pictures to disparities."""
+        """Return the file's metadata: how to convert its pictures back to disparities."""
         low_px, high_px = survey.range_px
         if self.depth16:
             return {"comment": f"16-bit grey: disparity of the left view in pixels = value / {_STEPS_PER_PX}"}
@@ -166,12 +166,12 @@ class VideoJob:
 
 
 class Survey(NamedTuple):
-    """What was found in frames from all over the film.
+    """Disparities measured in frames from all over the video.
 
     Attributes:
-        range_px: The disparities that colours are spread over.
-        middle_px: That of the middle of the scene.
-        within_px: The range that is matched; None where the network's own has all of it, as far as is known.
+        range_px: Disparity range of the colours.
+        middle_px: Median disparity of the scene.
+        within_px: Disparity range to match; None if the network's own range covers the surveyed frames.
     """
 
     range_px: tuple[float, float]
@@ -181,7 +181,7 @@ class Survey(NamedTuple):
 
 @dataclass
 class VideoTally:
-    """What was met on the way: frames, cuts, and frames with a problem, of which the first ones are named."""
+    """Counts of frames, cuts and frames with a problem; `named` describes the first problems."""
 
     frames: int = 0
     cuts: int = 0
@@ -189,7 +189,7 @@ class VideoTally:
     named: list[str] = field(default_factory=list)
 
     def note(self, frame: StereoFrame) -> None:
-        """Counts a frame."""
+        """Count a frame."""
         self.frames += 1
         if frame.problem is not None:
             self.problems += 1
@@ -200,21 +200,21 @@ class VideoTally:
 def make_film(
     footage: Footage, sources: Sequence[Path], out: Path, job: VideoJob, console: Console
 ) -> VideoTally:
-    """Writes the film that was ordered; one that was begun and interrupted goes on after its last part.
+    """Convert a video and write it; an interrupted conversion resumes after its last finished part.
 
     Args:
-        footage: The film to make it from.
-        sources: What the footage was opened from, to go on only while it is the same.
+        footage: The input video.
+        sources: The input's files; a conversion resumes only if they are unchanged.
         out: The file to write; its ending chooses the container.
-        job: What it is made into.
-        console: Where progress is told, and before it what seems amiss with the film.
+        job: Settings of the conversion.
+        console: Shows notes on the video, then progress.
 
     Returns:
-        What was met on the way, in all runs together.
+        Counts over all runs of this conversion.
 
     Raises:
-        StereoweaveError: `out` cannot be such a film, is in use, or cannot be written, for instance on a full
-            disk.
+        StereoweaveError: `out` has an unsuitable ending, is in use, or cannot be written, for instance on a
+            full disk.
     """
     _check_out(out, job, footage, sources)
     matcher = job.backend.matcher()
@@ -251,7 +251,7 @@ def make_film(
 
 
 class _Maker:
-    """Makes a picture of each frame, and can go on where it was left."""
+    """Makes the output image of each frame; its state can be saved and restored."""
 
     def __init__(self, job: VideoJob, matcher: Matcher, survey: Survey) -> None:
         self.survey, self.tally = survey, VideoTally()
@@ -260,7 +260,7 @@ class _Maker:
 
     @classmethod
     def from_state(cls, job: VideoJob, matcher: Matcher, state: dict[str, np.ndarray]) -> "_Maker":
-        """One that goes on as the one whose `state` this was would have."""
+        """Restore a maker from its `state`; it continues exactly as the original would have."""
         low_px, high_px, middle_px, *within_px = state.pop("survey_px").tolist()
         survey = Survey((low_px, high_px), middle_px, (within_px[0], within_px[1]) if within_px else None)
         maker = cls(job, matcher, survey)
@@ -270,7 +270,7 @@ class _Maker:
         return maker
 
     def state(self) -> dict[str, np.ndarray]:
-        """All that the next frame's picture depends on."""
+        """Return everything that the next frame's output depends on, as arrays."""
         tally = self.tally
         return {
             "survey_px": np.array(
@@ -284,7 +284,7 @@ class _Maker:
     def pictures(
         self, frames: Iterable[StereoFrame], bar: Progress, shown: TaskID
     ) -> Iterator[tuple[Fraction, Picture]]:
-        """What is shown of each frame, with its time; the bar follows."""
+        """Yield each frame's time and output image; updates the progress bar."""
         for frame in frames:
             pair = StereoPair(left=frame.left, right=frame.right)
             estimate = match(self._matcher, pair, self._options)
@@ -296,13 +296,13 @@ class _Maker:
 
 
 def _look(footage: Footage, matcher: Matcher, bar: Progress) -> tuple[Survey, list[Note]]:
-    """Range and middle of the disparities all over the film; and notes on defects.
+    """Survey the disparities of frames spread over the whole video, and find defects.
 
-    All over: titles, with which a film may begin, say nothing about its range.
+    The frames are spread because the first ones may be titles, which have another range.
     """
     picked = _spread(footage.frame_count, _SURVEYED_FRAMES)
     hinted = set(picked[len(picked) // 6 :: -(-len(picked) // _HINTED_FRAMES)])
-    shown = bar.add_task("looking at its depth", total=len(picked), loss="", rate="")
+    shown = bar.add_task("surveying depth", total=len(picked), loss="", rate="")
     thinned, middles_px, defects = [], [], []
     frames = islice(footage.frames(), picked.start, picked.stop, picked.step)
     for index, frame in zip(picked, frames, strict=True):
@@ -319,22 +319,22 @@ def _look(footage: Footage, matcher: Matcher, bar: Progress) -> tuple[Survey, li
 
 
 def _within_px(disparity_px: Float[np.ndarray, "h w"], matcher: Matcher) -> tuple[float, float] | None:
-    """The range of a film that goes beyond the network's own, by disparities from all over it."""
+    """Return the disparity range of surveyed disparities; None if the network's own range covers it."""
     low_px, high_px = np.percentile(disparity_px, [_OUTER_PERCENT, 100 - _OUTER_PERCENT]).tolist()
     if low_px >= 0 and high_px <= matcher.max_disparity_px:
         return None
-    # A plain sky is taken for what is at the lower end of a range: that of parallel cameras stays at 0.
+    # A plain sky is matched at the lower end of the range: for parallel cameras that stays at 0.
     return min(low_px, max(low_px - _MARGIN_PX, 0.0)), high_px + _MARGIN_PX
 
 
 def _spread(count: int, wanted: int) -> range:
-    """So many frames of the first `count`, evenly spread, or all if there are fewer."""
+    """Return the numbers of at most `wanted` frames, evenly spread over `count`."""
     step = -(-count // wanted)
     return range(step // 2, count, step)
 
 
 def _at(time: Fraction, note: Note, footage: Footage) -> Note:
-    """A note on the frame at that time; the remedy for swapped views of one file is another arrangement."""
+    """Add the time to a note; for swapped views in one file, the remedy becomes the opposite arrangement."""
     other = _other_way_round(footage.arrangement)
     if note == SWAPPED and other:
         note = replace(note, remedy=Remedy(f"choose {other}", ("arrangement",)))
@@ -342,13 +342,13 @@ def _at(time: Fraction, note: Note, footage: Footage) -> Note:
 
 
 def _usual(defects: Sequence[list[Note]]) -> list[Note]:
-    """The notes on the last frame with any, if most have some: a film may begin with a black picture."""
+    """Return the notes on the last frame that has any, if at least half do: a video may begin black."""
     some = [notes for notes in defects if notes]
     return some[-1] if 2 * len(some) > len(defects) else []
 
 
 def _other_way_round(arrangement: str | None) -> str | None:
-    """The arrangement that differs only in which eye comes first, if it has a name."""
+    """Return the named arrangement with the eyes swapped, if any."""
     if arrangement is None:
         return None
     split = ARRANGEMENTS[arrangement]
@@ -357,7 +357,7 @@ def _other_way_round(arrangement: str | None) -> str | None:
 
 
 def _grey16(disparity_px: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
-    # 0 would mean that it is unknown, as in disparity.png.
+    # 0 would mean unknown, as in disparity.png.
     return np.clip(np.rint(_STEPS_PER_PX * disparity_px), 1, 65535).astype(np.uint16)
 
 
@@ -366,12 +366,12 @@ def _check_out(out: Path, job: VideoJob, footage: Footage, sources: Sequence[Pat
         raise StereoweaveError(f"{out}: expected the ending .mkv for depth in 16 bits, found {out.suffix!r}")
     for source in sources:
         if source.exists() and out.exists() and out.samefile(source):
-            raise StereoweaveError(f"{out}: expected another file than the film it is made from")
+            raise StereoweaveError(f"{out}: expected another file than the input video")
     check_film(out, footage.sound)
 
 
 def _settings(job: VideoJob, footage: Footage, sources: Sequence[Path]) -> dict[str, object]:
-    """All that the film depends on but for what computes it, by setting, as JSON values."""
+    """Return everything that determines the video except the machine, by setting, as JSON values."""
     model = Path(job.backend.model)
     return {
         "depth": job.depth,
@@ -389,7 +389,7 @@ def _settings(job: VideoJob, footage: Footage, sources: Sequence[Path]) -> dict[
 
 
 def _known_by(path: Path) -> list[object]:
-    """A name, and a digest of the names, sizes and times of the files that it stands for."""
+    """Return a path's name, and a digest of its files' names, sizes and modification times."""
     files = picture_files(path)
     digest = hashlib.sha256()
     for file in [path] if files is None else files:
@@ -399,6 +399,6 @@ def _known_by(path: Path) -> list[object]:
 
 
 def _clock(time_s: Fraction) -> str:
-    """0:01:02.345 for 62.345 s."""
+    """Format a time: 0:01:02.345 for 62.345 s."""
     minutes, seconds = divmod(float(time_s), 60)
     return f"{int(minutes) // 60}:{int(minutes) % 60:02}:{seconds:06.3f}"

@@ -1,4 +1,4 @@
-"""3-D video from files: pairs of frames with their times, whatever the arrangement of the two eyes."""
+"""Reading of stereo video: pairs of frames with their times, for any arrangement of the two eyes."""
 
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
@@ -12,18 +12,18 @@ from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.pictures.frame_packing import ARRANGEMENTS, guess_arrangement
 from stereoweave.video.tracks import Shot, Track, open_track
 
-_BEFORE, _AFTER = "damaged: the frame before it stands in", "damaged: the one after it stands in"
-_SPOILT = "made from a damaged frame before it"
-_MOVED = "its time stamp was missing or another frame's: it is shown a little later"
+_BEFORE, _AFTER = "damaged: replaced by the frame before it", "damaged: replaced by the frame after it"
+_SPOILT = "decoded from a damaged frame before it"
+_MOVED = "its time stamp was missing or a duplicate: it is shown slightly later"
 
 
 class StereoFrame(NamedTuple):
-    """One moment of a film.
+    """One pair of frames of a video.
 
     Attributes:
         left, right: uint8 RGB [H, W, 3].
-        time: Seconds from the start of the footage, exact.
-        problem: Why this frame is not the one that was filmed, or why it is the last; None if all is well.
+        time: Exact time in seconds from the start of the video.
+        problem: Why this frame is not the original one, or why the video ends early; None if intact.
     """
 
     left: UInt8[np.ndarray, "h w 3"]
@@ -33,20 +33,20 @@ class StereoFrame(NamedTuple):
 
 
 class Footage:
-    """Pairs of frames with their times; made by `open_footage`.
+    """A stereo video: pairs of frames with their times; opened by `open_footage`.
 
     Attributes:
         name: The files, as the caller gave them.
-        arrangement: How a frame holds both eyes, a name in `ARRANGEMENTS`; None of two files.
-        size_px: Width and height of one eye at its full size.
-        frame_count: How many frames `frames` gives: one for each in the file, damaged or not.
-        rate: Average frames a second.
-        time_base: In seconds; all times are multiples of it.
-        sound: The file whose sound belongs to it, if any.
+        arrangement: How a frame holds both eyes, a name in `ARRANGEMENTS`; None for two files.
+        size_px: Width and height of one eye at full size.
+        frame_count: Number of frames that `frames` yields: one for each in the file, damaged or not.
+        rate: Average frames per second.
+        time_base: Unit of all times, in seconds; every time is a multiple of it.
+        sound: The file that has the video's sound, if any.
     """
 
     def __init__(self, tracks: Sequence[Track], arrangement: str | None) -> None:
-        """Footage of two tracks, or of one with both eyes in the given arrangement."""
+        """Combine two tracks, or split one that has both eyes in the given arrangement."""
         self._tracks = tracks
         self._split = ARRANGEMENTS[arrangement] if arrangement else None
         first = tracks[0]
@@ -58,10 +58,10 @@ class Footage:
         self.sound = next((track.sound for track in tracks if track.sound), None)
 
     def frames(self, start: int = 0) -> Iterator[StereoFrame]:
-        """The frames from number `start` on, those that a run from 0 gives; opens and closes the files.
+        """Yield the frames from number `start` on, identical to those of a run from 0.
 
-        A frame that cannot be decoded is replaced by the last one that can; what was decoded from a damaged
-        one, up to the next frame that stands for itself, is given as it is. Either says so in `problem`.
+        A frame that cannot be decoded is replaced by the last decoded one. Frames decoded from a damaged one,
+        up to the next key frame, are yielded unchanged. `problem` reports both.
         """
         steps = self._tracks[0].steps
         every_track = zip(*(_bridged(track, start) for track in self._tracks), strict=False)
@@ -86,24 +86,24 @@ class Footage:
     def _ending(self, track: Track) -> str | None:
         more = len(track.steps) - self.frame_count
         frames = "1 frame" if more == 1 else f"{more} frames"
-        return f"{track.name} goes on for {frames} after the other's end" if more else track.broken_off
+        return f"{track.name} has {frames} more than the other video" if more else track.broken_off
 
 
 def open_footage(
     paths: Sequence[Path], arrangement: str | None = None, *, rate: Fraction | None = None
 ) -> Footage:
-    """The footage in one video of both eyes, in two, left and right, or in series of pictures likewise.
+    """Open a stereo video: one file with both eyes, or two, left and right.
 
-    Reads through the files to know every frame's time, and decodes some frames where it has to guess.
+    Reads the files once for every frame's time, and decodes some frames to detect the arrangement.
 
     Args:
-        paths: One or two: videos, folders of pictures, or glob patterns of pictures.
-        arrangement: How one frame holds both eyes, a name in `ARRANGEMENTS`; guessed unless given.
-        rate: Frames a second, for pictures, 25 unless given.
+        paths: One or two videos, folders of pictures, or glob patterns of pictures.
+        arrangement: How one frame holds both eyes, a name in `ARRANGEMENTS`. Default: detected.
+        rate: Frames per second of pictures; default: 25.
 
     Raises:
-        FormatError: A file that cannot be read or halved, is not 3-D, or does not go with the other one.
-        StereoweaveError: An unknown arrangement, not one or two paths, a video's rate, or PyAV is missing.
+        FormatError: A file cannot be read or halved, is not 3-D, or does not match the other one.
+        StereoweaveError: Unknown arrangement, not one or two paths, a rate for a video, or PyAV is missing.
     """
     if arrangement not in (None, *ARRANGEMENTS):
         raise StereoweaveError(
@@ -127,7 +127,7 @@ def open_footage(
 
 
 def _check_company(left: Track, right: Track) -> None:
-    """Refuses two films of different sizes, or whose frames drift apart by more than half of one's time."""
+    """Raise unless both videos have one size and their frames stay within half a frame of each other."""
     if left.size_px != right.size_px:
         sizes = ["{}x{}".format(*track.size_px) for track in (left, right)]
         raise FormatError(
@@ -145,7 +145,7 @@ def _check_company(left: Track, right: Track) -> None:
 
 
 def _bridged(track: Track, start: int) -> Iterator[tuple[Shot, str | None]]:
-    """What is shown as each frame of a track from number `start` on, and its problem."""
+    """Yield a shot and its problem for each frame from number `start` on; replaces missing frames."""
     upcoming, last, spoilt = 0, None, False
     for shot in track.shots(start):
         index = shot.number

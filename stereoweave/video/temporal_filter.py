@@ -1,10 +1,10 @@
-"""Disparity that holds still from frame to frame of a film: filtered along its motion, anew after each cut.
+"""Temporal filter: averages a video's disparity along its motion, and restarts at each cut.
 
-Each view is filtered by itself. What was found before is brought along the motion of the picture, and what a
-surface's neighbourhood then says in common is taken for a true change of its distance. What is left is noise:
-a pixel becomes the mean over the frames that saw its point. It starts anew where the picture before does not
-explain it, and where the disparity contradicts what was found: at once beside anything that moves in either
-view, by vote where all is at rest. So nothing trails behind what moves.
+Each view is filtered separately. The previous estimate is warped along the optical flow. A change that a
+surface's neighbourhood shares is taken for a true change of its distance, and the rest for noise: each pixel
+becomes the mean over the frames that saw its point. A pixel restarts where the previous frame does not
+explain the image, and where the new disparity contradicts the old one: at once near anything that moves in
+either view, by vote where everything is at rest. So nothing trails behind moving objects.
 """
 
 import typing
@@ -21,45 +21,45 @@ from stereoweave.system.jit import kernel
 from stereoweave.system.threads import thread_count
 
 MOST_FRAMES = 12.0
-"""A mean stands for no more frames than this, so that what changes slowly is not held back for long."""
+"""Most frames that count in a mean, so that slow changes are followed soon."""
 SAME_PX, SAME_SHARE = 1.0, 0.02
-"""Two frames see one surface where their disparities differ by no more than this, and this share of it."""
+"""Two frames see the same surface if their disparities differ by at most this, plus this share of them."""
 NEIGHBOUR_PX = 3.0
-"""Pixels around that differ by less than this in disparity tell of the same surface's change."""
+"""Neighbours whose disparities differ by less than this belong to the same surface."""
 STEP_PX, STEPS = 8, 2
-"""Those that are asked lie on a grid of this step, so many to each side."""
+"""Grid of the sampled neighbours: its step, and the number of steps to each side."""
 
-# Of half the size, where noise is half as strong, and motion takes a quarter of the time.
+# At half the size, where noise is half as strong and optical flow takes a quarter of the time.
 _WINDOW_PX = 5
-# A window is explained if its mean difference is below this multiple of what is usual in the picture, which
-# is its noise; something is added for clean pictures, and more than so much is no noise.
+# A window is explained if its mean difference is below this multiple of the image's median difference, its
+# noise, plus an offset for clean images. Noise is at most the third number.
 _UNUSUAL, _LEAST_LEVELS, _NOISIEST_LEVELS = 1.5, 0.5, 6.0
-# Motion always explains a little more than rest, for it also fits the noise.
+# Motion always explains a little more than rest, because it also fits the noise.
 _REST, _REST_LEVELS = 1.1, 0.25
-# At rest is what has nothing that moves within half of this.
+# A pixel is calm if nothing moves in the window of this size around it.
 _CALM_PX = 9
-# What a plane has none of; normal noise of one level makes it 6 levels, half of it below 0.674 times that.
+# Zero on a plane. Normal noise of one level gives a deviation of 6 levels, and a median of 0.674 times that.
 _ROUGHNESS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 _MEDIAN_ROUGHNESS = 6 * 0.674
-# Contrast is a standard deviation above this multiple of the noise's, and a level.
+# A window has contrast if its standard deviation exceeds this multiple of the noise's, plus a level.
 _CONTRAST, _CONTRAST_LEVELS = 2.0, 1.0
-# What differs by more than this share of its contrast is something else, however faint both are.
+# A window that differs by more than this share of its contrast shows something else, however faint.
 _DIFFERENT_SHARE = 0.6
-# Rendered films explain more than 0.4 of their contrast from the frame before; pairs of scenes less than 0.1.
+# In rendered videos the previous frame explains over 0.4 of the contrast; across scenes, less than 0.1.
 _CUT_SHARE = 0.2
-# Contrast in less than this share of a picture is a thing in it, which may come and go without a cut.
+# Contrast in less than this share of an image is a single object, which may appear without a cut.
 _LEAST_CONTRAST_SHARE = 0.05
-# Where so much of the picture is at rest, most of it is not contradicted by chance.
+# With this share of the image at rest, a majority of contradictions is not chance.
 _LEAST_ASKED_SHARE = 0.25
 
 
 class Track(typing.NamedTuple):
-    """What is known about one view; arrays are float32 [H, W].
+    """Filtered state of one view; arrays are float32 [H, W].
 
     Attributes:
-        disparity_px: The mean of what the frames said.
-        confidence: The mean of what they claimed, 0 where one said otherwise.
-        frames: How many stand behind the mean, less those that contradicted it since; 0 for none.
+        disparity_px: Mean disparity over the frames.
+        confidence: Mean confidence; a frame that contradicts the mean counts as 0.
+        frames: Number of frames in the mean, less those that have contradicted it since; 0 if unknown.
     """
 
     disparity_px: np.ndarray
@@ -68,13 +68,14 @@ class Track(typing.NamedTuple):
 
 
 class Motion(typing.NamedTuple):
-    """How a picture follows from the one before; arrays are of half its size, rounded up.
+    """Motion from an image back to the previous one; arrays have half its size, rounded up.
 
     Attributes:
-        to_before_px: float32 [H2, W2, 2], from a pixel to its point in the picture before, full-size pixels.
-        explained: bool, whether the picture before looks the same there.
-        calm: bool, whether nothing moves around.
-        explained_share: Of what has contrast; 1 where next to nothing has.
+        to_before_px: float32 [H2, W2, 2], from a pixel to its point in the previous image, in full-size
+            pixels.
+        explained: bool, true where the previous image looks the same at that point.
+        calm: bool, true where nothing moves nearby.
+        explained_share: Explained share of the windows with contrast; 1 if next to nothing has contrast.
     """
 
     to_before_px: np.ndarray
@@ -84,12 +85,12 @@ class Motion(typing.NamedTuple):
 
 
 class Expectation(typing.NamedTuple):
-    """What a view is to show, from what was found before; the last two arrays are of half its size.
+    """Prediction of a view from the previous frames; the last two arrays have half its size.
 
     Attributes:
-        carried: What is known about the point that each pixel shows now.
-        calm: bool, whether nothing moves around, nor around the place it matches in the other view.
-        drift_px: float32, how the surface changes in disparity.
+        carried: The track warped to the new frame.
+        calm: bool, true where nothing moves near the pixel or near its match in the other view.
+        drift_px: float32, change of the surface's disparity.
     """
 
     carried: Track
@@ -98,13 +99,13 @@ class Expectation(typing.NamedTuple):
 
 
 class Steadier:
-    """Takes the estimates of a film, frame by frame, and gives each filtered with those before it.
+    """Filters a video's estimates, frame by frame, with those before.
 
     Args:
-        threads: How many may be used, of which two views need two; all cores if left out.
+        threads: Default: all cores; uses at most two, one per view.
 
     Attributes:
-        cuts: How many cuts there were so far.
+        cuts: Number of cuts so far.
 
     Raises:
         StereoweaveError: `threads` is below 1.
@@ -119,15 +120,15 @@ class Steadier:
     def __call__(
         self, left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], estimate: Estimate
     ) -> Estimate:
-        """The estimate of this frame, filtered along the motion of both pictures; itself after a cut.
+        """Filter the estimate of the next frame; unchanged after a cut.
 
         Args:
-            left: The frame's left picture, uint8 RGB [H, W, 3].
-            right: The right one, of the same size.
-            estimate: Of these two.
+            left: uint8 RGB [H, W, 3].
+            right: The same size as the left image.
+            estimate: The pair's estimate.
 
         Returns:
-            Both disparities and the confidence are filtered; `occluded` is the frame's own.
+            The estimate with both disparities and the confidence filtered; `occluded` is not.
         """
         if left.shape != right.shape or left.shape[:2] != estimate.disparity_px.shape:
             raise StereoweaveError(
@@ -135,7 +136,7 @@ class Steadier:
                 f"{list(left.shape[:2])} and {list(right.shape[:2])}; estimate these two"
             )
         before, self._greys = self._greys, [_grey(left), _grey(right)]
-        # The right view makes no claim; what stands for it is not given out.
+        # The right view has no confidence; the placeholder is not returned.
         claims = (estimate.confidence, np.ones_like(estimate.confidence))
         disparities_px = (estimate.disparity_px, estimate.right_disparity_px)
         news = [Track(*maps, np.ones_like(maps[0])) for maps in zip(disparities_px, claims, strict=True)]
@@ -152,7 +153,7 @@ class Steadier:
         )
 
     def state(self) -> dict[str, np.ndarray]:
-        """All that is needed to go on exactly, as arrays that `np.savez` keeps."""
+        """Return everything needed to continue exactly, as arrays for `np.savez`."""
         kept = {"cuts": np.array(self.cuts)}
         for side, grey, track in zip(("left", "right"), self._greys, self._tracks, strict=False):
             kept[f"{side}_grey"] = grey
@@ -161,7 +162,7 @@ class Steadier:
 
     @classmethod
     def from_state(cls, state: Mapping[str, np.ndarray], threads: int | None = None) -> "Steadier":
-        """One that goes on where the one that gave this `state` was."""
+        """Restore a filter from its `state`."""
         steadier = cls(threads)
         steadier.cuts = int(state["cuts"])
         for side in ("left", "right") if "left_grey" in state else ():
@@ -170,14 +171,14 @@ class Steadier:
         return steadier
 
     def _continued(self, before: list[np.ndarray], news: list[Track]) -> list[Track] | None:
-        """The tracks filtered with those before; None after a cut."""
+        """Filter the new tracks with the previous ones; None after a cut."""
         if news[0].frames.shape != self._tracks[0].frames.shape:
             return None
         with ThreadPoolExecutor(self._threads) as pool:
             motions = list(pool.map(_motion, before, self._greys))
             if np.mean([motion.explained_share for motion in motions]) < _CUT_SHARE:
                 return None
-            # A match lies to the left in the right view, and to the right in the left one.
+            # A left pixel's match in the right view is to the left, a right pixel's to the right.
             expected = list(pool.map(_expected, self._tracks, news, motions, motions[::-1], (-1, 1)))
             if _mostly_contradicted(news, expected):
                 return None
@@ -185,14 +186,14 @@ class Steadier:
 
 
 def _grey(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2"]:
-    """Grey levels at half the size, rounded up."""
+    """Convert to grey at half the size, rounded up."""
     height, width = image.shape[:2]
     half = ((width + 1) // 2, (height + 1) // 2)
     return cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), half, interpolation=cv2.INTER_AREA)
 
 
 def _motion(before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "h2 w2"]) -> Motion:
-    """How a picture follows from the one before; both are of half the size."""
+    """Measure the motion between two grey images of half the size."""
     before = _as_bright(before, grey)
     rest = np.zeros((*grey.shape, 2), np.float32)
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(grey, before, rest)
@@ -213,7 +214,7 @@ def _explained_share(
     least_levels: Float[np.ndarray, "h2 w2"],
     explained: Bool[np.ndarray, "h2 w2"],
 ) -> float:
-    """The share explained of what has contrast; 1 where next to nothing has."""
+    """Return the explained share of the windows with contrast; 1 if next to nothing has contrast."""
     window = (_WINDOW_PX, _WINDOW_PX)
     squares = cv2.sqrBoxFilter(grey, cv2.CV_32F, window)
     variance = squares - cv2.boxFilter(grey, cv2.CV_32F, window) ** 2
@@ -226,7 +227,7 @@ def _explained_share(
 
 
 def _noise_levels(grey: UInt8[np.ndarray, "h2 w2"]) -> float:
-    """The noise's standard deviation, from the median size of what a smooth picture has none of."""
+    """Estimate the noise's standard deviation from the median roughness."""
     roughness = cv2.filter2D(grey, cv2.CV_32F, _ROUGHNESS)
     return float(np.median(np.abs(roughness[::4, ::4]))) / _MEDIAN_ROUGHNESS
 
@@ -234,7 +235,7 @@ def _noise_levels(grey: UInt8[np.ndarray, "h2 w2"]) -> float:
 def _as_bright(
     before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "h2 w2"]
 ) -> UInt8[np.ndarray, "h2 w2"]:
-    """The picture before with the mean and the contrast of this one, so that a fade is no change."""
+    """Give the previous image this one's mean and contrast, so that a fade does not count as change."""
     (old_mean, old_contrast), (mean, contrast) = (
         [float(value[0, 0]) for value in cv2.meanStdDev(picture)] for picture in (before, grey)
     )
@@ -254,12 +255,12 @@ def _warped(
 def _difference_levels(
     a: UInt8[np.ndarray, "h2 w2"], b: UInt8[np.ndarray, "h2 w2"]
 ) -> Float[np.ndarray, "h2 w2"]:
-    """The mean absolute difference over a window around each pixel."""
+    """Mean absolute difference over a window around each pixel."""
     return cv2.boxFilter(cv2.absdiff(a, b), cv2.CV_32F, (_WINDOW_PX, _WINDOW_PX))
 
 
 def _expected(track: Track, new: Track, motion: Motion, other: Motion, towards: int) -> Expectation:
-    """What the new frame is to show; a match lies towards (-1 left, 1 right) its place in the other view."""
+    """Predict the new frame; `towards` is the direction to the match in the other view (-1 left, 1 right)."""
     carried = Track(*(np.empty_like(values) for values in track))
     carry(new.disparity_px, track, motion, carried)
     drift_px = np.empty(motion.calm.shape, np.float32)
@@ -271,7 +272,7 @@ def _expected(track: Track, new: Track, motion: Motion, other: Motion, towards: 
 def _matched(
     other_calm: Bool[np.ndarray, "h2 w2"], disparity_px: Float[np.ndarray, "h2 w2"], towards: int
 ) -> Bool[np.ndarray, "h2 w2"]:
-    """Whether the other view is calm where each pixel has its match; at its edge for one outside it."""
+    """Look up whether the other view is calm at each pixel's match, or at its border for a match outside."""
     height, width = other_calm.shape
     rows, columns = np.indices((height, width), np.float32)
     there = columns + np.float32(towards / 2) * disparity_px
@@ -280,7 +281,7 @@ def _matched(
 
 
 def _mostly_contradicted(news: list[Track], expected: list[Expectation]) -> bool:
-    """Whether most of what is known and at rest has another disparity now, by every fourth pixel."""
+    """Whether most known pixels at rest have a new disparity; tests every fourth pixel."""
     asked, contradicted = [], []
     for new, (carried, calm, drift_px) in zip(news, expected, strict=True):
         new_px, old_px, frames = (
@@ -294,7 +295,7 @@ def _mostly_contradicted(news: list[Track], expected: list[Expectation]) -> bool
 
 
 def _filtered(new: Track, expected: Expectation) -> Track:
-    """The track as it is after a further frame."""
+    """Return the track updated by a new frame."""
     mean = Track(*(np.empty_like(values) for values in new))
     blend(new, expected.carried, expected.calm, expected.drift_px, mean)
     return mean
@@ -303,10 +304,10 @@ def _filtered(new: Track, expected: Expectation) -> Track:
 @kernel
 @typing.no_type_check
 def carry(new_px, track, motion, carried):
-    """Write into carried what track knows about the point that each pixel shows now; 0 frames for nothing.
+    """Warp `track` to the new frame and write it into `carried`; 0 frames where nothing is known.
 
-    Motion is not exact to the pixel: where not all is calm, one of the nine pixels around the place before is
-    taken that has the surface which new_px [H, W] has now, if there is one.
+    Motion is not exact to the pixel. So outside calm areas, of the nine pixels around the previous place,
+    take the one whose disparity is closest to new_px [H, W].
     """
     old_px, old_confidence, old_frames = track.disparity_px, track.confidence, track.frames
     disparity_px, confidence, frames = carried.disparity_px, carried.confidence, carried.frames
@@ -322,7 +323,7 @@ def carry(new_px, track, motion, carried):
                 continue
             if not calm[i, j]:
                 middle_row, middle_column = row, column
-                # The middle one has to be clearly worse, so that noise does not shift the map to and fro.
+                # The centre must be clearly worse, so that noise does not shift the map to and fro.
                 least_px = abs(old_px[row, column] - new_px[y, x]) - 0.5
                 for near_row in range(max(middle_row - 1, 0), min(middle_row + 2, height)):
                     for near_column in range(max(middle_column - 1, 0), min(middle_column + 2, width)):
@@ -338,10 +339,10 @@ def carry(new_px, track, motion, carried):
 @kernel
 @typing.no_type_check
 def measure_drift(new_px, carried, drift_px):
-    """Write into drift_px [H2, W2] how the surface around every second pixel changes in disparity.
+    """Write the change of disparity of the surface around every second pixel into drift_px [H2, W2].
 
-    That is the mean change there, as far as it is more than chance: James and Stein's estimate, which takes
-    the square of the standard error off that of the mean, and gives 0 where less than nothing is left.
+    This is the neighbourhood's mean change, shrunk by James and Stein's estimator: it subtracts the squared
+    standard error from the squared mean, and gives 0 if the result is negative.
     """
     old_px, frames = carried.disparity_px, carried.frames
     height, width = new_px.shape
@@ -369,7 +370,7 @@ def measure_drift(new_px, carried, drift_px):
 @kernel
 @typing.no_type_check
 def blend(new, carried, calm, drift_px, mean):
-    """Write into mean what is known after the new frame."""
+    """Write the track updated by the new frame into `mean`."""
     new_px, new_confidence = new.disparity_px, new.confidence
     old_px, old_confidence, old_frames = carried.disparity_px, carried.confidence, carried.frames
     disparity_px, confidence, frames = mean.disparity_px, mean.confidence, mean.frames

@@ -1,4 +1,4 @@
-"""One video file, or one series of pictures: when each frame is shown, and those that can be decoded."""
+"""One video file or series of pictures: the time of each frame, and the frames that can be decoded."""
 
 import re
 from array import array
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 
 _SAMPLES = 0.1, 0.3, 0.5, 0.7, 0.9
 
-# What players take for the matrix of untagged colours, as mpv does: BT.709 from this width or height on.
+# Untagged colours are BT.709 from this width or height on, below it BT.601: the rule of players such as mpv.
 _HD_WIDTH_PX, _HD_HEIGHT_PX = 1280, 577
 _BT709, _BT601, _FULL_RANGE = 1, 5, 2  # av.video.reformatter's Colorspace and ColorRange
-_UNTAGGED = 0, 2  # AVCOL_SPC_RGB, which some write where they know nothing, and AVCOL_SPC_UNSPECIFIED
+_UNTAGGED = 0, 2  # AVCOL_SPC_RGB, which some encoders write for unknown, and AVCOL_SPC_UNSPECIFIED
 
-# AVStereo3D begins with its type, one of these but for 0, not stereo, and 8, unknown; and with its flags, the
-# lowest of which says that the right eye comes first.
+# AVStereo3D begins with its type, one of these, 0 (not stereo) or 8 (unknown), and its flags. The lowest flag
+# means that the right eye comes first.
 _STEREO_3D = {
     1: "side_by_side",
     2: "top_bottom",
@@ -40,10 +40,10 @@ _STEREO_3D = {
     7: "columns",
 }
 
-# What an MP4 or MOV file begins with, after four bytes of length.
+# The first box of an MP4 or MOV file, after four bytes of length.
 _MP4_BOXES = b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot"
 
-# How much earlier than it claims a file may end before it counts as cut off.
+# A file that ends earlier than its declared duration by more than this counts as cut off.
 _CUT_OFF_S = Fraction(1, 5)
 
 
@@ -51,9 +51,9 @@ class Shot(NamedTuple):
     """A frame that could be decoded.
 
     Attributes:
-        number: Which frame of the track it is.
-        picture: Makes its picture, uint8 RGB [H, W, 3]; where it is not called, nothing is converted.
-        fresh: Whether it is made without any frame before it.
+        number: The frame's number in the track.
+        picture: Converts the frame to uint8 RGB [H, W, 3]; frames that are not needed are not converted.
+        fresh: Whether it is decoded without any earlier frame (a key frame).
     """
 
     number: int
@@ -66,18 +66,18 @@ class VideoTrack:
 
     Attributes:
         name: As the caller gave it.
-        steps: When each frame is shown, rising, in steps of `time_base`: one for each frame in the file.
-        moved: Frames whose time stamp was missing or another's, and which got one after it.
+        steps: Display time of each frame in the file, increasing, in steps of `time_base`.
+        moved: Frames whose time stamp was missing or a duplicate, and which got a later one.
         time_base: Seconds.
-        rate: Average frames a second.
-        size_px: Width and height of a whole frame, turned as a player would.
-        declared: The arrangement of the two eyes that the file declares, if any: one of full size, or
-            another word than `ARRANGEMENTS` has.
+        rate: Average frames per second.
+        size_px: Width and height of a whole frame, rotated as a player would.
+        declared: The arrangement that the file declares, if any: a full-size one of `ARRANGEMENTS`, or an
+            unsupported one.
         sound: The file, if it has sound.
-        broken_off: What is wrong with the file's end, if anything.
+        broken_off: Describes a file that ends early; None for a complete one.
 
     Raises:
-        FormatError: No such file, no video, or one without a frame that can be decoded.
+        FormatError: No such file, not a video, or no frame can be decoded.
     """
 
     def __init__(self, path: Path) -> None:
@@ -95,10 +95,10 @@ class VideoTrack:
             self.declared = _declared(first)
 
     def shots(self, start: int) -> Iterator[Shot]:
-        """The frames that can be decoded, as they are shown, from the first one on whatever `start` is.
+        """Yield the frames that can be decoded, in display order; always from the first one on.
 
-        Only so are they the same frames every time: what a damaged frame leaves behind in those after it
-        depends on all before it.
+        Ignoring `start` makes every run yield the same frames: what a damaged frame leaves in later ones
+        depends on all frames before it.
         """
         with _reading(self._path) as (container, stream):
             frames = _decoded(container, stream)
@@ -108,7 +108,7 @@ class VideoTrack:
                     yield Shot(index, partial(_rgb, frame), frame.key_frame)
 
     def samples(self) -> list[UInt8[np.ndarray, "h w 3"]]:
-        """Some pictures from all over the film, at least one."""
+        """Return images from all over the video, at least one."""
         import av
 
         pictures: list[UInt8[np.ndarray, "h w 3"]] = []
@@ -129,7 +129,7 @@ class VideoTrack:
         self.steps: Sequence[int] = range(len(stamps))
         self.time_base = 1 / rate
         self._stamps: Sequence[int] | None = None
-        # Bare streams, and some AVI, have no times to go by: there the order decides.
+        # Raw streams and some AVI files have no time stamps: use the order.
         if 2 * len(set(stamps) - {None}) > len(stamps):
             self.time_base = Fraction(stream.time_base or 1)
             self._stamps = array("q", sorted(_filled(stamps)))
@@ -142,10 +142,10 @@ class VideoTrack:
 
 
 class PictureTrack:
-    """The frames of a series of pictures, one after the other; attributes as in `VideoTrack`.
+    """The frames of a series of pictures; for attributes see `VideoTrack`.
 
     Raises:
-        FormatError: No picture among `files` can be read.
+        FormatError: None of `files` can be read.
     """
 
     declared: str | None = None
@@ -162,17 +162,17 @@ class PictureTrack:
         self.size_px = first.shape[1], first.shape[0]
 
     def shots(self, start: int) -> Iterator[Shot]:
-        """The pictures that can be read, from the last one at or before `start` on."""
+        """Yield the pictures that can be read, from the last one at or before `start` on."""
         before = next((index for index in range(start, 0, -1) if self._shot(index)), 0)
         yield from filter(None, map(self._shot, self.steps[before:]))
 
     def samples(self) -> list[UInt8[np.ndarray, "h w 3"]]:
-        """Some pictures from all over the series, at least one."""
+        """Return images from all over the series, at least one."""
         starts = [int(share * len(self._files)) for share in (0.0, *_SAMPLES)]
         return [shot.picture() for start in starts for shot in islice(self.shots(start), 1)]
 
     def _first(self) -> UInt8[np.ndarray, "h w 3"]:
-        """The first picture that can be read."""
+        """Read the first picture that can be read."""
         problem: FormatError | None = None
         for file in self._files:
             try:
@@ -197,20 +197,20 @@ Track = VideoTrack | PictureTrack
 
 
 def open_track(path: Path, rate: Fraction | None) -> Track:
-    """The frames of a video file, of a folder of pictures, or of the pictures that a glob pattern finds.
+    """Open a video file, a folder of pictures, or the pictures that match a glob pattern.
 
     Args:
         path: The file, the folder, or the pattern, such as frames/left_*.png; 2 comes before 10.
-        rate: Frames a second, for pictures, 25 unless given.
+        rate: Frames per second of pictures; default: 25.
 
     Raises:
         FormatError: No such file, folder or picture, or nothing in it can be read.
-        StereoweaveError: A rate for a video.
+        StereoweaveError: `rate` is given for a video.
     """
     files = picture_files(path)
     if files is None:
         if rate is not None:
-            raise StereoweaveError(f"{path}: expected pictures for a rate, found a video, which has its own")
+            raise StereoweaveError(f"{path}: expected pictures for a rate, found a video; leave the rate out")
         return VideoTrack(path)
     if not files:
         raise FormatError(f"{path}: expected a video or pictures, found no picture there")
@@ -218,7 +218,7 @@ def open_track(path: Path, rate: Fraction | None) -> Track:
 
 
 def picture_files(path: Path) -> list[Path] | None:
-    """The pictures in a folder, or that a glob pattern finds, in counting order; None for any other path."""
+    """List the pictures in a folder or matching a glob pattern, in natural order; None for any other path."""
     if path.is_dir():
         found = path.iterdir()
     elif not path.exists() and re.search(r"[*?\[]", path.name):
@@ -240,17 +240,17 @@ def _reading(path: Path) -> Iterator[tuple["av.container.InputContainer", "av.Vi
         stream = container.streams.best("video")
         if not isinstance(stream, av.VideoStream) or stream.codec_context is None:
             raise FormatError(f"{path}: expected a video, found no picture track that can be decoded")
-        # With more threads FFmpeg mends damaged H.264 badly or not at all, and not always alike.
+        # With more threads FFmpeg conceals damage in H.264 badly or not at all, and not reproducibly.
         stream.codec_context.thread_count = 1
-        stream.codec_context.copy_opaque = True  # the packet's rank, to the frame
+        stream.codec_context.copy_opaque = True  # passes the packet's rank on to the frame
         if stream.codec_context.name == "mjpeg":
-            # Unasked, it hands out pictures whose lower part is grey and calls them sound.
+            # By default it returns truncated pictures, grey at the bottom, as intact.
             stream.codec_context.options = {"err_detect": "explode"}
         yield container, stream
 
 
 def _decoded(container: "av.container.InputContainer", stream: "av.VideoStream") -> Iterator["av.VideoFrame"]:
-    """What the decoder makes of every packet up to where the file ends or breaks off, in order of display."""
+    """Decode every packet up to the end or damage of the file; frames come in display order."""
     import av
 
     ranks = count()
@@ -260,7 +260,7 @@ def _decoded(container: "av.container.InputContainer", stream: "av.VideoStream")
                 packet.opaque = next(ranks)
             with suppress(av.error.FFmpegError):
                 yield from stream.decode(packet)
-    # Where the file could be read to its end the decoder is empty already, and says so.
+    # If the file was read to its end, the decoder is already flushed and raises.
     with suppress(av.error.FFmpegError):
         yield from stream.decode(None)
 
@@ -268,7 +268,7 @@ def _decoded(container: "av.container.InputContainer", stream: "av.VideoStream")
 def _stamps(
     container: "av.container.InputContainer", stream: "av.VideoStream"
 ) -> tuple[list[int | None], Fraction, str | None]:
-    """The time stamp of every frame in the file; when all tracks end; why it cannot be read on, if so."""
+    """Return every frame's time stamp, the end of all tracks, and why reading stopped early, if it did."""
     import av
 
     stamps: list[int | None] = []
@@ -289,17 +289,20 @@ def _is_frame(packet: "av.Packet[Any]") -> bool:
 
 
 def _filled(stamps: Sequence[int | None]) -> list[int]:
-    """Time stamps, with that of the frame before it in the file for one that is missing."""
+    """Replace missing time stamps by that of the previous frame in the file."""
     known = next(stamp for stamp in stamps if stamp is not None)
     return [known := known if stamp is None else stamp for stamp in stamps]
 
 
 def _separated(stamps: Sequence[int], usual: int) -> tuple["array[int]", list[int]]:
-    """Rising times from sorted stamps, and the numbers of those moved: one frame on, or halfway to the next.
+    """Make sorted time stamps strictly increasing: move duplicates by one frame, or halfway to the next.
 
     Args:
         stamps: In steps of a time base.
-        usual: From frame to frame, in the same steps.
+        usual: Usual distance between frames, in the same steps.
+
+    Returns:
+        The times, and the numbers of the moved frames.
     """
     steps, moved = array("q", stamps[:1]), []
     later = [b for a, b in pairwise(stamps) if b > a]
@@ -318,7 +321,7 @@ def _separated(stamps: Sequence[int], usual: int) -> tuple["array[int]", list[in
 def _by_stamp(
     frames: Iterator["av.VideoFrame"], stamps: Sequence[int]
 ) -> Iterator[tuple[int, "av.VideoFrame"]]:
-    """Frames with their numbers, as their time stamps tell; those of one stamp in the order they come."""
+    """Number frames by their time stamps; frames with equal stamps keep their order."""
     last = -1
     for frame in frames:
         stamp = stamps[max(last, 0)] if frame.pts is None else frame.pts
@@ -331,10 +334,10 @@ def _by_stamp(
 def _by_rank(
     frames: Iterator["av.VideoFrame"], stream: "av.VideoStream"
 ) -> Iterator[tuple[int, "av.VideoFrame"]]:
-    """Frames with their numbers, as the ranks of their packets in the file tell.
+    """Number frames by the ranks of their packets in the file.
 
-    No frame is shown before its rank, but for those that are coded out of turn: among these, what was lost is
-    noticed at the next key frame.
+    Without B-frames, no frame is shown before its rank. With B-frames, lost frames are noticed only at the
+    next key frame.
     """
     index = -1
     for frame in frames:
@@ -349,7 +352,7 @@ def _intact(frames: Iterator["av.VideoFrame"]) -> Iterator["av.VideoFrame"]:
 
 
 def _unopened(path: Path, error: "av.error.FFmpegError") -> str:
-    """What was found instead of a video."""
+    """Describe what was found instead of a video."""
     beginning = b""
     with suppress(OSError), path.open("rb") as file:
         beginning = file.read(8)
@@ -357,7 +360,7 @@ def _unopened(path: Path, error: "av.error.FFmpegError") -> str:
             return "an empty file"
     found = f"one that cannot be opened ({_words(error)})"
     if beginning[4:] in _MP4_BOXES:
-        found += "; a file of this kind that was cut off has lost its index: record or fetch it again"
+        found += "; if it was cut off, it lost its index: record or download it again"
     return found
 
 
@@ -373,7 +376,7 @@ def _rgb(frame: "av.VideoFrame") -> UInt8[np.ndarray, "h w 3"]:
         format="rgb24",
         src_colorspace=(_BT709 if large else _BT601) if frame.colorspace in _UNTAGGED else None,
         dst_color_range=_FULL_RANGE,
-        # Without the last two, FFmpeg's quick way from 4:2:0 darkens by more than one level of 255.
+        # Without the last two flags, FFmpeg's fast path from 4:2:0 darkens by more than one level of 255.
         interpolation=Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT,
         threads=1,
     )
@@ -383,7 +386,7 @@ def _rgb(frame: "av.VideoFrame") -> UInt8[np.ndarray, "h w 3"]:
 def _declared(frame: "av.VideoFrame") -> str | None:
     from av.sidedata.sidedata import Type
 
-    # PyAV's types know of fewer kinds of side data than it has.
+    # PyAV's type stubs lack some kinds of side data.
     side_data: Any = frame.side_data
     if Type.STEREO3D not in side_data:
         return None
@@ -394,7 +397,7 @@ def _declared(frame: "av.VideoFrame") -> str | None:
 
 
 def _rate(steps: Sequence[int], time_base: Fraction, average: Fraction) -> Fraction:
-    """Frames a second: what the container says, unless the frames' times tell otherwise by more than 1 %."""
+    """Return the container's frame rate, or the measured one if they differ by more than 1 %."""
     if len(steps) < 2:
         return average
     measured = Fraction(len(steps) - 1) / ((steps[-1] - steps[0]) * time_base)

@@ -1,6 +1,6 @@
-"""Films written in parts, so that one that was interrupted goes on, and joined with the sound they came with.
+"""Writing of video in parts, so that an interrupted conversion resumes, and joining them with the sound.
 
-A part is a NUT file, which holds frame times of any time base exactly. Parts are joined packet by packet:
+A part is a NUT file, which stores frame times of any time base exactly. Parts are joined packet by packet:
 nothing is encoded twice, and sound is copied bit for bit.
 """
 
@@ -39,20 +39,20 @@ else:
     from av.packet import Packet as AnyPacket
 
 CONTAINERS = {".mp4": "mp4", ".mkv": "matroska", ".mov": "mov"}
-# Sound begins before 0 by what its decoder throws away: the muxer would rather make the whole film late.
+# Sound starts before 0 by its decoder's priming samples; by default the muxer would delay the whole video.
 _EXACT_TIMES = {"avoid_negative_ts": "disabled"}
-# When streams begin is told in these; a whole number for 90 kHz, 48 kHz, and rates such as 30000/1001.
+# Time unit of stream starts: a multiple of 90 kHz, 48 kHz and the numerators of rates such as 30000/1001.
 _EXACT_STARTS = {"movie_timescale": "720000"}
-# Enough for the first ones of all streams of sound.
+# Enough to include the first packet of every audio stream.
 _TRIED_PACKETS = 64
-# swscale's plain conversion takes a level or two from everything.
+# swscale's default conversion darkens everything by a level or two.
 _EXACT_COLOURS = Interpolation.BICUBIC | Interpolation.ACCURATE_RND
 
 Picture = UInt8[np.ndarray, "h w 3"] | UInt16[np.ndarray, "h w"]
 
 
 class Encoding(NamedTuple):
-    """How pictures become packets, in FFmpeg's words."""
+    """Settings of the encoder, in FFmpeg's terms."""
 
     codec: str
     pixel_format: str
@@ -60,18 +60,18 @@ class Encoding(NamedTuple):
     options: Mapping[str, str]
 
 
-# What every player takes, hard to tell from what went in. Without frames that are coded out of turn (bf),
-# parts can be joined whatever their times. With x264's plans by blocks (mbtree), one part in 500 came out
-# otherwise from the very same frames, on one thread too (x264 165); without, none of 4,447 did.
+# Plays everywhere and looks like the input. Without B-frames (bf), parts can be joined at any times. With
+# macroblock-tree rate control (mbtree), 1 part in 500 differed between runs on the same frames, even with one
+# thread (x264 165); without it, 0 of 4,447.
 H264 = Encoding(
     "libx264", "yuv420p", ColorRange.MPEG, {"crf": "17", "preset": "fast", "bf": "0", "mbtree": "0"}
 )
-# Loses nothing; as archives have it, each frame a key frame with a checksum.
+# Lossless; as archives do, every frame is a key frame with checksums.
 GREY16 = Encoding("ffv1", "gray16le", ColorRange.JPEG, {"level": "3", "g": "1", "slicecrc": "1"})
 
 
 class Packing(NamedTuple):
-    """How two views share a picture: Matroska's word, and H.264's number, None where that would swap eyes."""
+    """Frame packing: Matroska's stereo mode, and H.264's number, None where that would swap the eyes."""
 
     stereo_mode: str
     frame_packing: int | None
@@ -79,14 +79,14 @@ class Packing(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Recorder:
-    """Writes a film: its parts, and the whole of them.
+    """Writes the parts of a video and joins them.
 
     Attributes:
-        encoding: H264, or GREY16 for pictures of 16-bit grey.
-        time_base: The seconds that all frame times are multiples of.
-        rate: Frames a second; it says how long the last one is shown.
-        packing: How two views share each picture, if they do.
-        threads: How many threads may be used.
+        encoding: H264, or GREY16 for 16-bit grey.
+        time_base: Unit of all frame times, in seconds.
+        rate: Frames per second; sets the duration of the last frame.
+        packing: Frame packing of two views, if any.
+        threads: Number of threads.
     """
 
     encoding: Encoding
@@ -96,9 +96,9 @@ class Recorder:
     threads: int = 1
 
     def write_part(self, path: Path, pictures: Iterable[tuple[Fraction, Picture]]) -> None:
-        """Writes pictures of one size, each with its time in seconds, as a NUT file.
+        """Write images of one size, each with its time in seconds, as a NUT file.
 
-        H.264 halves the colours' resolution: an odd picture gets its last row or column once more.
+        H.264 halves the resolution of colour, so an odd size is padded by repeating the last row or column.
         """
         with av.open(str(path), "w", format="nut") as part:
             stream = None
@@ -113,15 +113,15 @@ class Recorder:
     def join(
         self, parts: Sequence[Path], sound: Path | None, film: Path, metadata: Mapping[str, str]
     ) -> None:
-        """Writes the film of all parts, with all sound of the file `sound`, copying every packet as it is.
+        """Join all parts with all sound of the file `sound`; copies every packet unchanged.
 
-        MP4 and MOV keep all times exactly; Matroska counts in whole milliseconds.
+        MP4 and MOV store all times exactly; Matroska rounds to milliseconds.
 
         Args:
-            parts: What `write_part` wrote, in their order.
-            sound: The film whose sound is copied, and which the new one begins as late as; None for silence.
-            film: The file to write, of an ending in `CONTAINERS`.
-            metadata: What the file says about itself.
+            parts: Files of `write_part`, in order.
+            sound: The video whose sound and start time are copied; None for a silent video.
+            film: The file to write; its ending must be in `CONTAINERS`.
+            metadata: The file's metadata.
         """
         with ExitStack() as stack:
             temporary = stack.enter_context(replacing(film))
@@ -137,12 +137,12 @@ class Recorder:
                 source = stack.enter_context(av.open(str(sound)))
                 start_s = _start_s(source.streams.best("video"))
                 flows = [_sound(source, _copied(source, container))]
-            # In the order of their times: the muxer holds whatever comes ahead of the other flow.
+            # In order of time, because the muxer buffers packets that are ahead of the other streams.
             for packet in merge(self._pictures(parts, stream, start_s), *flows, key=_time_s):
                 container.mux(packet)
 
     def _stream(self, part: OutputContainer, frame: VideoFrame) -> VideoStream:
-        """A stream for frames like this one, whose colours are those of HD video (BT.709)."""
+        """Add a stream for frames like this one, with the colours of HD video (BT.709)."""
         options = dict(self.encoding.options)
         if self.packing and self.packing.frame_packing is not None:
             options["x264-params"] = f"frame-packing={self.packing.frame_packing}"
@@ -155,51 +155,51 @@ class Recorder:
         return stream
 
     def _pictures(self, parts: Sequence[Path], stream: VideoStream, start_s: Fraction) -> Iterator[AnyPacket]:
-        """The packets of all parts, for one stream, later by `start_s`."""
+        """Yield the packets of all parts for one stream, delayed by `start_s`."""
         for path in parts:
             with av.open(str(path)) as part:
                 for packet in _filled(part.demux(video=0)):
                     packet.stream = stream
-                    # Without frames coded out of turn, they are decoded when they are shown.
+                    # Without B-frames, decoding order is display order.
                     packet.pts = packet.dts = (packet.pts or 0) + round(start_s / packet.time_base)
                     packet.duration = round(1 / self.rate / packet.time_base)
                     yield packet
 
 
 def check_film(path: Path, sound: Path | None) -> None:
-    """A StereoweaveError unless `path` has the ending of a film that can hold the sound of that file."""
+    """Raise StereoweaveError unless `path` has the ending of a container that can hold the file's sound."""
     if path.suffix.lower() not in CONTAINERS:
         raise StereoweaveError(
-            f"{path}: expected the ending of a film, {', '.join(CONTAINERS)}, found {path.suffix!r}"
+            f"{path}: expected the ending of a video, {', '.join(CONTAINERS)}, found {path.suffix!r}"
         )
     if sound is None or _holds(path.suffix, sound):
         return
     with av.open(str(sound)) as source:
         codecs = ", ".join(sorted({stream.codec_context.name for stream in source.streams.audio}))
     others = [ending for ending in CONTAINERS if _holds(ending, sound)]
-    remedy = f"{others[0]} holds it" if others else "convert it first, to FLAC for instance"
+    remedy = f"{others[0]} holds it" if others else "convert the sound first, to FLAC for instance"
     raise StereoweaveError(
         f"{path}: expected sound that {path.suffix} can hold, found {codecs} in {sound}; {remedy}"
     )
 
 
 class Parts:
-    """The finished parts of a film, each with the state in which its maker went on.
+    """The finished parts of a video, and the state after the last one.
 
     Attributes:
-        folder: Where the parts are.
-        files: The finished ones, in their order.
+        folder: The folder of the parts.
+        files: The finished parts, in order.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.files = sorted(folder.glob("[0-9]*.nut"))
-        if not self._state_file(len(self.files)).exists():  # a removal that was interrupted began with it
+        if not self._state_file(len(self.files)).exists():  # an interrupted removal deletes the state first
             self.files = []
 
     @contextmanager
     def next(self, state: Callable[[], Mapping[str, np.ndarray]]) -> Iterator[Path]:
-        """The name to write the next part to, which is finished once the state after it is kept too."""
+        """Give a path for the next part; the part is finished once the state after it is saved too."""
         number = len(self.files) + 1
         part = self.folder / f"{number:06}.nut"
         with replacing(part) as temporary:
@@ -210,7 +210,7 @@ class Parts:
         self._state_file(number - 1).unlink(missing_ok=True)
 
     def state(self) -> dict[str, np.ndarray]:
-        """The state after the last finished part."""
+        """Load the state after the last finished part."""
         file = self._state_file(len(self.files))
         with _undamaged(file), file.open("rb") as opened, np.load(opened) as arrays:
             return dict(arrays)
@@ -220,21 +220,21 @@ class Parts:
 
 
 def parts_folder(film: Path) -> Path:
-    """The folder in which a film grows."""
+    """Return the folder of a video's unfinished parts."""
     return film.with_name(f"{film.name}.parts")
 
 
 @contextmanager
 def growing(film: Path, settings: Mapping[str, object]) -> Iterator[Parts]:
-    """The parts of a film, to add to: removed when all went well; after an error the finished ones stay.
+    """Open the parts of a video, to add more; removes them on success and keeps finished ones after an error.
 
     Args:
-        film: What the parts will become.
-        settings: What it is made of, and how, in words that JSON has.
+        film: The video that the parts will become.
+        settings: Its input and settings, as JSON values.
 
     Raises:
-        StereoweaveError: There are parts that were made with other settings, or are damaged; or what went
-            wrong, with a word about what stays.
+        StereoweaveError: The folder has parts with other settings or damaged ones; or an error of the body,
+            with a note that finished parts are kept.
     """
     folder = parts_folder(film)
     parts = Parts(folder)
@@ -256,7 +256,7 @@ def growing(film: Path, settings: Mapping[str, object]) -> Iterator[Parts]:
         elif isinstance(error, OSError | FFmpegError | StereoweaveError):
             ours = error if isinstance(error, StereoweaveError) else StereoweaveError(str(error))
             raise ours.with_detail(
-                f"what is finished stays in {folder}, and the same command goes on from there"
+                f"finished parts are in {folder}; rerun the same command to resume"
             ) from error
         raise
     _clear(folder)
@@ -267,7 +267,7 @@ def _settings_file(folder: Path) -> Path:
 
 
 def _clear(folder: Path) -> None:
-    """Removes what was written into a folder, and itself, if somebody else has nothing in it."""
+    """Remove the parts from a folder, and the folder if nothing else is in it."""
     for file in chain(folder.glob("*.npz"), folder.glob("*.nut"), [_settings_file(folder)]):
         file.unlink(missing_ok=True)
     with suppress(OSError):
@@ -301,13 +301,13 @@ def _begun_with(name: str, value: object) -> str:
 
 @contextmanager
 def _undamaged(file: Path) -> Iterator[None]:
-    """Turns what can be wrong with a file of a film's parts into one line."""
+    """Turn any error of reading a file of the parts into one line."""
     try:
         yield
     except (OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
         raise StereoweaveError(
-            f"{file}: expected what an interrupted film goes on from, found none that can be read; "
-            f"remove that folder: {file.parent}"
+            f"{file}: expected the saved state of an interrupted video, found none that can be read; "
+            f"remove the folder {file.parent}"
         ) from error
 
 
@@ -326,18 +326,18 @@ def _frame(picture: Picture) -> VideoFrame:
 
 
 def _holds(ending: str, sound: Path) -> bool:
-    """Whether a film of this ending can hold the sound of a file; the beginning of it is tried."""
+    """Test whether a container with this ending can hold a file's sound, by muxing its beginning."""
     container = CONTAINERS[ending.lower()]
     try:
         with av.open(str(sound)) as source, av.open(BytesIO(), "w", format=container) as film:
             film.mux(list(islice(_sound(source, _copied(source, film)), _TRIED_PACKETS)))
-    except ValueError:  # what both PyAV and FFmpeg say of sound that a container has no place for
+    except ValueError:  # raised by both PyAV and FFmpeg for sound that the container cannot hold
         return False
     return True
 
 
 def _copied(source: InputContainer, film: OutputContainer) -> dict[int, AudioStream]:
-    """New streams of a film for the sound of a source, by their indices there."""
+    """Add a stream to a video for each audio stream of the source; by the source's indices."""
     streams = {}
     for stream in source.streams.audio:
         streams[stream.index] = copy = film.add_stream_from_template(stream, opaque=True)
@@ -347,20 +347,20 @@ def _copied(source: InputContainer, film: OutputContainer) -> dict[int, AudioStr
 
 
 def _sound(source: InputContainer, streams: Mapping[int, AudioStream]) -> Iterator[AnyPacket]:
-    """The packets of sound of a source, for the streams that a film has for them."""
-    with suppress(FFmpegError):  # where the file breaks off, of which `Footage` tells
+    """Yield the audio packets of a source for the new streams."""
+    with suppress(FFmpegError):  # the file breaks off, which `Footage` reports
         for packet in _filled(source.demux(*source.streams.audio)):
             packet.stream = streams[packet.stream_index]
             yield packet
 
 
 def _start_s(stream: Stream | None) -> Fraction:
-    """When the first picture is shown, in seconds of its file's clock."""
+    """Return the time of the first frame, in seconds of its file's clock."""
     return (stream.start_time or 0) * (stream.time_base or Fraction(0)) if stream else Fraction(0)
 
 
 def _filled(packets: Iterable[AnyPacket]) -> Iterator[AnyPacket]:
-    """Without the empty packets with which a demuxer ends."""
+    """Drop the empty packets at the end of a demuxer."""
     return (packet for packet in packets if packet.size)
 
 

@@ -250,7 +250,7 @@ def test_where_the_disk_fills_up_one_line_says_what_stays_and_how_to_go_on(tmp_p
     folder = tmp_path / "out.mkv.parts"
     assert done.stderr.splitlines()[-1] == (
         f"stereoweave: {tmp_path / 'out.mkv'}: expected a file that can be written, found file too large; "
-        f"what is finished stays in {folder}, and the same command goes on from there"
+        f"finished parts are in {folder}; rerun the same command to resume"
     )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.mp4", "out.mkv.parts", "whole.mkv"]
     assert len(list(folder.glob("*.nut"))) == 9
@@ -264,7 +264,7 @@ def test_a_damaged_frame_is_told_with_its_time_and_is_not_the_end(tmp_path, caps
     assert run(film, tmp_path / "out.mkv", "--position", "0.5") == 0
     told = capsys.readouterr().out.splitlines()
     assert told[0].endswith("12 frames, 0 cuts")
-    assert told[1] == "problems in 1 of 12 frames: 0:00:00.200 damaged: the frame before it stands in"
+    assert told[1] == "problems in 1 of 12 frames: 0:00:00.200 damaged: replaced by the frame before it"
     assert times_of(tmp_path / "out.mkv") == times_of(film)
 
 
@@ -279,10 +279,10 @@ def test_a_damaged_frame_is_told_with_its_time_and_is_not_the_end(tmp_path, caps
         ),
         ("out.mp4", ["--layout", "wiggle"], "--layout: expected one of side_by_side, "),
         ("out.mp4", ["--position", "2.5"], "--position: expected -1 to 2"),
-        ("out.mp4", ["--position", "1", "--strength", "4"], "position 1 at strength 4"),
-        ("out.gif", ["--depth"], "expected the ending of a film, .mp4, .mkv, .mov, found '.gif'"),
+        ("out.mp4", ["--position", "1", "--strength", "4"], "where strength 4 takes 1"),
+        ("out.gif", ["--depth"], "expected the ending of a video, .mp4, .mkv, .mov, found '.gif'"),
         ("out.mp4", ["--depth16"], "expected the ending .mkv for depth in 16 bits, found '.mp4'"),
-        ("in.mp4", ["--depth"], "expected another file than the film it is made from"),
+        ("in.mp4", ["--depth"], "expected another file than the input video"),
         ("out.mp4", ["--depth", "--model", "huge"], "unknown model 'huge'"),
         ("out.mp4", ["--depth", "--arrangement", "diagonal"], "--arrangement: expected one of side_by_side"),
         ("out.mp4", ["--position", "0", "--convergence", "nan"], "--convergence: expected a finite number"),

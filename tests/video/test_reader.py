@@ -25,8 +25,8 @@ from stereoweave.pictures.frame_packing import guess_arrangement, measure_resemb
 from stereoweave.video.reader import ARRANGEMENTS, open_footage
 from stereoweave.video.tracks import _by_rank, _filled, _separated
 
-BEFORE = "damaged: the frame before it stands in"
-SPOILT = "made from a damaged frame before it"
+BEFORE = "damaged: replaced by the frame before it"
+SPOILT = "decoded from a damaged frame before it"
 
 
 def assert_eyes(frames, pairs, tolerance=0.0):
@@ -220,7 +220,7 @@ def test_for_a_damaged_first_frame_the_one_after_it_stands_in(tmp_path):
     path = damage(write_side_by_side(tmp_path / "film.mkv", example_pairs(5), codec="mjpeg"), 0)
     footage = open_footage([path])
     frames = list(footage.frames())
-    assert frames[0].problem == "damaged: the one after it stands in"
+    assert frames[0].problem == "damaged: replaced by the frame after it"
     assert_eyes([frames[0]], [frames[1][:2]])
     assert_same(footage.frames(1), frames[1:])
 
@@ -236,7 +236,7 @@ def test_a_film_that_breaks_off_is_read_so_far_and_says_so(tmp_path):
 
 def test_an_mp4_that_was_cut_off_cannot_be_opened_and_says_why(tmp_path):
     path = truncate(write_side_by_side(tmp_path / "film.mp4", example_pairs(10)), 0.6)
-    assert "lost its index" in refusal(path)
+    assert "it lost its index" in refusal(path)
 
 
 def test_only_what_begins_as_an_mp4_has_lost_its_index(tmp_path):
@@ -265,7 +265,7 @@ def test_frames_without_times_of_their_own_follow_each_other_at_the_films_rate(t
         assert [frame.time for frame in frames] == [Fraction(index, 25) for index in range(9)]
 
 
-MOVED = "its time stamp was missing or another frame's: it is shown a little later"
+MOVED = "its time stamp was missing or a duplicate: it is shown slightly later"
 
 
 def restamped(path, stamps_ms):
@@ -353,7 +353,7 @@ def test_a_damaged_picture_is_bridged(tmp_path):
     for number in (8, 11, 12):
         truncate(tmp_path / f"f{number}.png", 0.5)
     footage = open_footage([tmp_path])
-    after = "damaged: the one after it stands in"
+    after = "damaged: replaced by the frame after it"
     assert problems(footage) == {0: after, 3: BEFORE, 4: BEFORE}
     for start in range(7):
         assert_same(footage.frames(start), list(footage.frames())[start:])
@@ -374,7 +374,7 @@ def test_the_shorter_of_two_videos_ends_both_and_it_is_said(tmp_path):
     right = write_video(tmp_path / "right.mkv", [right for _, right in pairs[:4]])
     footage = open_footage([left, right])
     assert footage.frame_count == 4
-    assert problems(footage) == {3: f"{left} goes on for 2 frames after the other's end"}
+    assert problems(footage) == {3: f"{left} has 2 frames more than the other video"}
 
 
 def test_a_damaged_frame_of_one_eye_is_told_from_the_other(tmp_path):

@@ -219,7 +219,7 @@ def test_sound_that_a_container_cannot_hold_is_refused_with_one_that_can(tmp_pat
 
 def test_a_name_that_is_no_films_is_refused():
     with pytest.raises(
-        StereoweaveError, match=r"film\.gif: expected the ending of a film, .*, found '\.gif'"
+        StereoweaveError, match=r"film\.gif: expected the ending of a video, .*, found '\.gif'"
     ):
         check_film(Path("film.gif"), None)
 
@@ -250,9 +250,7 @@ def test_an_error_before_the_first_part_leaves_nothing(tmp_path):
 
 def test_after_an_error_the_finished_parts_and_the_last_ones_state_stay(tmp_path):
     film = tmp_path / "film.mp4"
-    told = (
-        r"^no picture; what is finished stays in .*film\.mp4\.parts, and the same command goes on from there$"
-    )
+    told = r"^no picture; finished parts are in .*film\.mp4\.parts; rerun the same command to resume$"
     with pytest.raises(StereoweaveError, match=told), growing(film, {"position": 0.5}) as parts:
         add(parts, b"first", 1)
         add(parts, b"second", 2)
@@ -346,7 +344,7 @@ def assert_to_be_removed(film: Path, name: str) -> None:
         pass
     folder = parts_folder(film)
     assert str(caught.value).startswith(f"{folder / name}: expected")
-    assert str(caught.value).endswith(f"remove that folder: {folder}")
+    assert str(caught.value).endswith(f"remove the folder {folder}")
     assert (folder / "000001.nut").exists()
 
 
