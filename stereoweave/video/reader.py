@@ -64,7 +64,7 @@ class Footage:
         up to the next key frame, are yielded unchanged. `problem` reports both.
         """
         steps = self._tracks[0].steps
-        every_track = zip(*(_bridged(track, start) for track in self._tracks), strict=False)
+        every_track = zip(*(_bridge_gaps(track, start) for track in self._tracks), strict=False)
         for index, seen in zip(range(start, self.frame_count), every_track, strict=False):
             pictures = [shot.picture() for shot, _ in seen]
             left, right = self._split.eyes(*pictures) if self._split else pictures
@@ -144,7 +144,7 @@ def _check_company(left: Track, right: Track) -> None:
         )
 
 
-def _bridged(track: Track, start: int) -> Iterator[tuple[Shot, str | None]]:
+def _bridge_gaps(track: Track, start: int) -> Iterator[tuple[Shot, str | None]]:
     """Yield a shot and its problem for each frame from number `start` on; replaces missing frames."""
     upcoming, last, spoilt = 0, None, False
     for shot in track.shots(start):

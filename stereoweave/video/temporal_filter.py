@@ -140,7 +140,7 @@ class Steadier:
         claims = (estimate.confidence, np.ones_like(estimate.confidence))
         disparities_px = (estimate.disparity_px, estimate.right_disparity_px)
         news = [Track(*maps, np.ones_like(maps[0])) for maps in zip(disparities_px, claims, strict=True)]
-        continued = self._continued(before, news) if before else None
+        continued = self._filter_tracks(before, news) if before else None
         if before and continued is None:
             self.cuts += 1
         self._tracks = continued or news
@@ -170,7 +170,7 @@ class Steadier:
             steadier._tracks.append(Track(*(state[f"{side}_{name}"] for name in Track._fields)))
         return steadier
 
-    def _continued(self, before: list[np.ndarray], news: list[Track]) -> list[Track] | None:
+    def _filter_tracks(self, before: list[np.ndarray], news: list[Track]) -> list[Track] | None:
         """Filter the new tracks with the previous ones; None after a cut."""
         if news[0].frames.shape != self._tracks[0].frames.shape:
             return None
@@ -179,10 +179,10 @@ class Steadier:
             if np.mean([motion.explained_share for motion in motions]) < _CUT_SHARE:
                 return None
             # A left pixel's match in the right view is to the left, a right pixel's to the right.
-            expected = list(pool.map(_expected, self._tracks, news, motions, motions[::-1], (-1, 1)))
-            if _mostly_contradicted(news, expected):
+            expected = list(pool.map(_predict, self._tracks, news, motions, motions[::-1], (-1, 1)))
+            if _is_contradicted(news, expected):
                 return None
-            return list(pool.map(_filtered, news, expected))
+            return list(pool.map(_update, news, expected))
 
 
 def _grey(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2"]:
@@ -194,10 +194,10 @@ def _grey(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2"]:
 
 def _motion(before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "h2 w2"]) -> Motion:
     """Measure the motion between two grey images of half the size."""
-    before = _as_bright(before, grey)
+    before = _match_brightness(before, grey)
     rest = np.zeros((*grey.shape, 2), np.float32)
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(grey, before, rest)
-    moved_levels = _difference_levels(grey, _warped(before, flow))
+    moved_levels = _difference_levels(grey, _warp(before, flow))
     rest_levels = _difference_levels(grey, before)
     least_levels = np.minimum(moved_levels, rest_levels)
     usual_levels = min(float(np.median(least_levels[::4, ::4])), _NOISIEST_LEVELS)
@@ -232,7 +232,7 @@ def _noise_levels(grey: UInt8[np.ndarray, "h2 w2"]) -> float:
     return float(np.median(np.abs(roughness[::4, ::4]))) / _MEDIAN_ROUGHNESS
 
 
-def _as_bright(
+def _match_brightness(
     before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "h2 w2"]
 ) -> UInt8[np.ndarray, "h2 w2"]:
     """Give the previous image this one's mean and contrast, so that a fade does not count as change."""
@@ -243,7 +243,7 @@ def _as_bright(
     return cv2.addWeighted(before, gain, before, 0, mean - gain * old_mean)
 
 
-def _warped(
+def _warp(
     before: UInt8[np.ndarray, "h2 w2"], flow: Float[np.ndarray, "h2 w2 2"]
 ) -> UInt8[np.ndarray, "h2 w2"]:
     height, width = before.shape
@@ -259,17 +259,17 @@ def _difference_levels(
     return cv2.boxFilter(cv2.absdiff(a, b), cv2.CV_32F, (_WINDOW_PX, _WINDOW_PX))
 
 
-def _expected(track: Track, new: Track, motion: Motion, other: Motion, towards: int) -> Expectation:
+def _predict(track: Track, new: Track, motion: Motion, other: Motion, towards: int) -> Expectation:
     """Predict the new frame; `towards` is the direction to the match in the other view (-1 left, 1 right)."""
     carried = Track(*(np.empty_like(values) for values in track))
     carry(new.disparity_px, track, motion, carried)
     drift_px = np.empty(motion.calm.shape, np.float32)
     measure_drift(new.disparity_px, carried, drift_px)
-    calm = motion.calm & _matched(other.calm, carried.disparity_px[::2, ::2], towards)
+    calm = motion.calm & _find_calm_matches(other.calm, carried.disparity_px[::2, ::2], towards)
     return Expectation(carried, calm, drift_px)
 
 
-def _matched(
+def _find_calm_matches(
     other_calm: Bool[np.ndarray, "h2 w2"], disparity_px: Float[np.ndarray, "h2 w2"], towards: int
 ) -> Bool[np.ndarray, "h2 w2"]:
     """Look up whether the other view is calm at each pixel's match, or at its border for a match outside."""
@@ -280,7 +280,7 @@ def _matched(
     return cv2.remap(calm, there, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE) > 0
 
 
-def _mostly_contradicted(news: list[Track], expected: list[Expectation]) -> bool:
+def _is_contradicted(news: list[Track], expected: list[Expectation]) -> bool:
     """Whether most known pixels at rest have a new disparity; tests every fourth pixel."""
     asked, contradicted = [], []
     for new, (carried, calm, drift_px) in zip(news, expected, strict=True):
@@ -294,7 +294,7 @@ def _mostly_contradicted(news: list[Track], expected: list[Expectation]) -> bool
     return bool(asked_share >= _LEAST_ASKED_SHARE and np.mean(contradicted) > 0.5 * asked_share)
 
 
-def _filtered(new: Track, expected: Expectation) -> Track:
+def _update(new: Track, expected: Expectation) -> Track:
     """Return the track updated by a new frame."""
     mean = Track(*(np.empty_like(values) for values in new))
     blend(new, expected.carried, expected.calm, expected.drift_px, mean)

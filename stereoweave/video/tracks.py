@@ -87,7 +87,7 @@ class VideoTrack:
             self.sound = path if container.streams.audio else None
             self._read_times(container, stream)
         with _reading(path) as (container, stream):
-            first = next(_intact(_decoded(container, stream)), None)
+            first = next(_intact(_decode(container, stream)), None)
             if first is None:
                 raise FormatError(f"{path}: expected a video, found no frame in it that can be decoded")
             self._frame_size_px = first.width, first.height
@@ -101,7 +101,7 @@ class VideoTrack:
         depends on all frames before it.
         """
         with _reading(self._path) as (container, stream):
-            frames = _decoded(container, stream)
+            frames = _decode(container, stream)
             placed = _by_rank(frames, stream) if self._stamps is None else _by_stamp(frames, self._stamps)
             for index, frame in placed:
                 if not frame.is_corrupt and (frame.width, frame.height) == self._frame_size_px:
@@ -113,11 +113,11 @@ class VideoTrack:
 
         pictures: list[UInt8[np.ndarray, "h w 3"]] = []
         with _reading(self._path) as (container, stream):
-            pictures += map(_rgb, islice(_intact(_decoded(container, stream)), 1))
+            pictures += map(_rgb, islice(_intact(_decode(container, stream)), 1))
             for share in _SAMPLES:
                 with suppress(av.error.FFmpegError):
                     container.seek(int(share * (container.duration or 0)))
-                    pictures += map(_rgb, islice(_intact(_decoded(container, stream)), 1))
+                    pictures += map(_rgb, islice(_intact(_decode(container, stream)), 1))
         return pictures
 
     def _read_times(self, container: "av.container.InputContainer", stream: "av.VideoStream") -> None:
@@ -132,8 +132,8 @@ class VideoTrack:
         # Raw streams and some AVI files have no time stamps: use the order.
         if 2 * len(set(stamps) - {None}) > len(stamps):
             self.time_base = Fraction(stream.time_base or 1)
-            self._stamps = array("q", sorted(_filled(stamps)))
-            self.steps, self.moved = _separated(self._stamps, round(1 / rate / self.time_base))
+            self._stamps = array("q", sorted(_fill_missing(stamps)))
+            self.steps, self.moved = _separate(self._stamps, round(1 / rate / self.time_base))
         self.rate = _rate(self.steps, self.time_base, rate)
         claimed_s = Fraction(container.duration or 0, av.time_base)
         if reason is None and claimed_s > end_s + _CUT_OFF_S:
@@ -235,7 +235,7 @@ def _reading(path: Path) -> Iterator[tuple["av.container.InputContainer", "av.Vi
     try:
         container = av.open(str(path), metadata_errors="replace")
     except av.error.FFmpegError as error:
-        raise FormatError(f"{path}: expected a video, found {_unopened(path, error)}") from error
+        raise FormatError(f"{path}: expected a video, found {_describe_unopened(path, error)}") from error
     with container:
         stream = container.streams.best("video")
         if not isinstance(stream, av.VideoStream) or stream.codec_context is None:
@@ -249,7 +249,7 @@ def _reading(path: Path) -> Iterator[tuple["av.container.InputContainer", "av.Vi
         yield container, stream
 
 
-def _decoded(container: "av.container.InputContainer", stream: "av.VideoStream") -> Iterator["av.VideoFrame"]:
+def _decode(container: "av.container.InputContainer", stream: "av.VideoStream") -> Iterator["av.VideoFrame"]:
     """Decode every packet up to the end or damage of the file; frames come in display order."""
     import av
 
@@ -288,13 +288,13 @@ def _is_frame(packet: "av.Packet[Any]") -> bool:
     return bool(packet.size) and not packet.is_discard
 
 
-def _filled(stamps: Sequence[int | None]) -> list[int]:
+def _fill_missing(stamps: Sequence[int | None]) -> list[int]:
     """Replace missing time stamps by that of the previous frame in the file."""
     known = next(stamp for stamp in stamps if stamp is not None)
     return [known := known if stamp is None else stamp for stamp in stamps]
 
 
-def _separated(stamps: Sequence[int], usual: int) -> tuple["array[int]", list[int]]:
+def _separate(stamps: Sequence[int], usual: int) -> tuple["array[int]", list[int]]:
     """Make sorted time stamps strictly increasing: move duplicates by one frame, or halfway to the next.
 
     Args:
@@ -351,7 +351,7 @@ def _intact(frames: Iterator["av.VideoFrame"]) -> Iterator["av.VideoFrame"]:
     return (frame for frame in frames if not frame.is_corrupt)
 
 
-def _unopened(path: Path, error: "av.error.FFmpegError") -> str:
+def _describe_unopened(path: Path, error: "av.error.FFmpegError") -> str:
     """Describe what was found instead of a video."""
     beginning = b""
     with suppress(OSError), path.open("rb") as file:

@@ -158,7 +158,7 @@ class Recorder:
         """Yield the packets of all parts for one stream, delayed by `start_s`."""
         for path in parts:
             with av.open(str(path)) as part:
-                for packet in _filled(part.demux(video=0)):
+                for packet in _drop_empty(part.demux(video=0)):
                     packet.stream = stream
                     # Without B-frames, decoding order is display order.
                     packet.pts = packet.dts = (packet.pts or 0) + round(start_s / packet.time_base)
@@ -349,7 +349,7 @@ def _copied(source: InputContainer, film: OutputContainer) -> dict[int, AudioStr
 def _sound(source: InputContainer, streams: Mapping[int, AudioStream]) -> Iterator[AnyPacket]:
     """Yield the audio packets of a source for the new streams."""
     with suppress(FFmpegError):  # the file breaks off, which `Footage` reports
-        for packet in _filled(source.demux(*source.streams.audio)):
+        for packet in _drop_empty(source.demux(*source.streams.audio)):
             packet.stream = streams[packet.stream_index]
             yield packet
 
@@ -359,7 +359,7 @@ def _start_s(stream: Stream | None) -> Fraction:
     return (stream.start_time or 0) * (stream.time_base or Fraction(0)) if stream else Fraction(0)
 
 
-def _filled(packets: Iterable[AnyPacket]) -> Iterator[AnyPacket]:
+def _drop_empty(packets: Iterable[AnyPacket]) -> Iterator[AnyPacket]:
     """Drop the empty packets at the end of a demuxer."""
     return (packet for packet in packets if packet.size)
 

@@ -23,7 +23,7 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import write_image
 from stereoweave.pictures.frame_packing import guess_arrangement, measure_resemblance
 from stereoweave.video.reader import ARRANGEMENTS, open_footage
-from stereoweave.video.tracks import _by_rank, _filled, _separated
+from stereoweave.video.tracks import _by_rank, _fill_missing, _separate
 
 BEFORE = "damaged: replaced by the frame before it"
 SPOILT = "decoded from a damaged frame before it"
@@ -292,17 +292,17 @@ def test_a_repeated_time_stamp_moves_its_frame_alone(tmp_path):
 
 
 def test_a_repeat_goes_one_frame_on_where_there_is_room():
-    assert _separated([0, 40, 40, 200, 200], usual=40) == (array("q", [0, 40, 80, 200, 240]), [2, 4])
+    assert _separate([0, 40, 40, 200, 200], usual=40) == (array("q", [0, 40, 80, 200, 240]), [2, 4])
 
 
 def test_steps_rise_where_there_is_no_room_between_repeated_stamps():
-    steps, moved = _separated([0, 5, 5, 5, 6, 9], usual=4)
+    steps, moved = _separate([0, 5, 5, 5, 6, 9], usual=4)
     assert list(steps) == [0, 5, 6, 7, 8, 9]
     assert moved == [2, 3]
 
 
 def test_a_missing_time_stamp_is_taken_for_that_of_the_frame_before():
-    assert _filled([None, 40, None, 120]) == [40, 40, 40, 120]
+    assert _fill_missing([None, 40, None, 120]) == [40, 40, 40, 120]
 
 
 @pytest.mark.parametrize(("key_every", "spoilt"), [("1", []), ("5", [4])])
