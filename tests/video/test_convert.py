@@ -279,7 +279,7 @@ def test_a_damaged_frame_is_told_with_its_time_and_is_not_the_end(tmp_path, caps
         ),
         ("out.mp4", ["--layout", "wiggle"], "--layout: expected one of side_by_side, "),
         ("out.mp4", ["--position", "2.5"], "--position: expected -1 to 2"),
-        ("out.mp4", ["--position", "1", "--strength", "4"], "where strength 4 takes 1"),
+        ("out.mp4", ["--position", "1", "--strength", "4"], "position 1 at strength 4"),
         ("out.gif", ["--depth"], "expected the ending of a video, .mp4, .mkv, .mov, found '.gif'"),
         ("out.mp4", ["--depth16"], "expected the ending .mkv for depth in 16 bits, found '.mp4'"),
         ("in.mp4", ["--depth"], "expected another file than the input video"),
