@@ -26,12 +26,12 @@ from stereoweave.bench.metrics import (
     epe_px,
     sparsification,
 )
+from stereoweave.bench.opencv_matchers import OPENCV_MATCHERS, SGBM, fill_rows, left_right_confidence
 from stereoweave.data.readers import Scene
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.text import write_table
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.estimate import match
-from stereoweave.matching.opencv import OPENCV_MATCHERS, SGBM, fill_rows, left_right_confidence
 from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU
 from stereoweave.stereo import Estimate, StereoPair

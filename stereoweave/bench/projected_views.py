@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from stereoweave.bench.metrics import depth_error_m, epe_px, mae, psnr_db, ssim
+from stereoweave.bench.opencv_matchers import OPENCV_MATCHERS, SGBM, fill_rows
 from stereoweave.bench.projection import fill_from_rows, project_right
 from stereoweave.errors import StereoweaveError
-from stereoweave.matching.opencv import OPENCV_MATCHERS, SGBM, fill_rows
 from stereoweave.stereo import Sample, StereoPair, View
 
 DisparityMethod = Callable[[Sample], Float[np.ndarray, "h w"]]

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from stereoweave.bench.opencv_matchers import fill_rows
 from stereoweave.data.samples import find_hidden
-from stereoweave.matching.opencv import fill_rows
 from stereoweave.stereo import Sample
 
 # Neighbours up to this far apart are one surface. A larger step is an edge, as in edge_metrics.py.

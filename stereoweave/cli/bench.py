@@ -78,9 +78,9 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
     """
     import cv2
 
+    from stereoweave.bench.opencv_matchers import SGBM
     from stereoweave.bench.pairs import MEAN, add_memory, score_pairs, write_csv
     from stereoweave.data.readers import list_scenes
-    from stereoweave.matching.opencv import SGBM
     from stereoweave.system.threads import thread_count
 
     for file in filter(None, (out, classes)):

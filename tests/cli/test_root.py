@@ -11,11 +11,11 @@ from onnx import TensorProto, helper
 from PIL import Image
 
 import stereoweave
+from stereoweave.bench.opencv_matchers import OPENCV_MATCHERS
 from stereoweave.cli.options import find_allowed_hosts, listen
 from stereoweave.cli.root import main
 from stereoweave.io.files import read_image, read_pfm
 from stereoweave.matching.matcher import shipped_models
-from stereoweave.matching.opencv import OPENCV_MATCHERS
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 EXAMPLES = REPOSITORY / "examples"

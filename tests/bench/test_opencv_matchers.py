@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
+from stereoweave.bench.opencv_matchers import OPENCV_MATCHERS, fill_rows, left_right_confidence
 from stereoweave.data.readers import read_scenes
-from stereoweave.matching.opencv import OPENCV_MATCHERS, fill_rows, left_right_confidence
 from stereoweave.stereo import StereoPair
 
 MODES = {
