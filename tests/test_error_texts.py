@@ -48,7 +48,7 @@ ERRORS = {
     "arrangement: expected one picture that holds both views, found two, left.png and right.png; leave it "
     "out, and give the left one first": lambda: open_pictures(PAIR, "crossed"),
     "turned.yml: expected a calibration of rectified pictures, found lenses with distortion; rectify "
-    "the pair by it (rectify)": lambda: prepare(PAIR, Request(calibration=Path("turned.yml"))),
+    "the pair with it (rectify)": lambda: prepare(PAIR, Request(calibration=Path("turned.yml"))),
     "metres: expected a baseline beside the focal length, found none; give the baseline (baseline_m)": (
         lambda: prepare(PAIR, Request(focal_px=500))
     ),

@@ -336,7 +336,7 @@ class _Apart:
 
 
 def _warm(worker: Worker) -> None:
-    """Load the network, so that startup does not count as a try of a pair."""
+    """Load the network, so that startup time does not count towards the first pair's attempt."""
     worker._local_job().backend.matcher()
 
 

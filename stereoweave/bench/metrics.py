@@ -108,7 +108,7 @@ def calibration_error(probability: Float[np.ndarray, "..."], happened: Bool[np.n
 def calibration_bins(
     probability: Float[np.ndarray, "..."], happened: Bool[np.ndarray, "..."]
 ) -> Float[np.ndarray, "3 n"]:
-    """Mean probability, observed frequency and share of all values in each non-empty one of 15 equal bins."""
+    """Mean probability, observed frequency and fraction of the values, for each non-empty bin of 15."""
     where = np.minimum((probability * _BINS).astype(int), _BINS - 1).ravel()
     counts = np.bincount(where, minlength=_BINS)
     used = counts > 0

@@ -284,7 +284,7 @@ class _SceneScorer:
 def _add_opencv(makers: Mapping[str, MatcherFactory]) -> dict[str, MatcherFactory]:
     for name in makers:
         if Path(name).stem in (*OPENCV_MATCHERS, MEAN):
-            raise StereoweaveError(f"{name}: expected a name that the table does not use itself; rename it")
+            raise StereoweaveError(f"{name}: expected a name that no other row of the table has; rename it")
     return {**OPENCV_MATCHERS, **makers}
 
 

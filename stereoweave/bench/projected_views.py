@@ -82,7 +82,7 @@ def score_projections(
     """
     everyone: dict[str, DisparityMethod] = {GROUND_TRUTH: _true_px, NO_WARPING: _zero_px, SGBM: _make_sgbm()}
     if taken := everyone.keys() & methods.keys():
-        raise StereoweaveError(f"{min(taken)}: expected a name that the table does not use itself; rename it")
+        raise StereoweaveError(f"{min(taken)}: expected a name that no other row of the table has; rename it")
     everyone |= methods
     scores = [
         {name: _score_sample(method(sample), sample, max_depth_m) for name, method in everyone.items()}

@@ -48,7 +48,7 @@ class ViewScene:
 
 
 def read_view_scenes(folder: str | Path) -> Iterator[ViewScene]:
-    """Iterate over the scenes of `folder` by name and read each lazily; see `list_view_scenes`."""
+    """Iterate over the scenes of `folder` in order of name, reading each lazily; see `list_view_scenes`."""
     return (read() for read in list_view_scenes(folder))
 
 
@@ -100,7 +100,7 @@ def _read_scene(folder: Path) -> ViewScene:
     views = [_read_view(path, pair, offsets_px) for path in folder.glob("view_*.png")]
     if not views:
         raise FormatError(
-            f"{folder}: expected a photograph from between, such as view_0.5.png, found no view_*.png"
+            f"{folder}: expected an image from between the cameras, such as view_0.5.png, found no view_*.png"
         )
     return ViewScene(
         name=folder.name,

@@ -186,7 +186,7 @@ def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3
 def _measure_range(
     disparity_px: Float[np.ndarray, " n"], negative_px: Float[np.ndarray, " m"]
 ) -> tuple[float, float]:
-    """Smallest and greatest disparity, without the outermost 1 %; negative ones only if some are certain."""
+    """Disparity range without the outermost 1 %; negative ones count only if some are reliable."""
     at_least_0 = disparity_px[disparity_px >= 0]
     counted_px = disparity_px if len(negative_px) or not len(at_least_0) else at_least_0
     least_px, greatest_px = np.percentile(counted_px, [_OUTER_PERCENT, 100 - _OUTER_PERCENT])

@@ -158,7 +158,7 @@ def estimate_depth_order(
 def _vote_in_row(
     disparity_px: Float32[np.ndarray, " w"], seen: Bool[np.ndarray, " w"], colours: Float32[np.ndarray, "w 3"]
 ) -> list[float]:
-    """Votes in -1..1, one per occluded run of a row: similarity to its left side minus to its right side."""
+    """Votes in -1..1, one per occluded run of a row: likeness to the pixels on its left minus its right."""
     votes = []
     changes = np.diff(seen.astype(np.int8))
     ends = np.flatnonzero(changes == 1) + 1

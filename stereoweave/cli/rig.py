@@ -83,8 +83,8 @@ def _check_output(pictures: Sequence[Path], calib: Path | None, out: Path) -> No
             )
     if calib is None and (out / "calib.yml").exists():
         raise StereoweaveError(
-            f"{out / 'calib.yml'}: expected no calibration beside pictures rectified without one, found one; "
-            "choose another --out"
+            f"{out / 'calib.yml'}: expected no calibration, since these pictures are rectified without one, "
+            "found an older one; choose another --out"
         )
 
 

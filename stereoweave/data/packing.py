@@ -5,8 +5,8 @@
     occluded.png, right_occluded.png                1 bit
     camera.json                                     the camera in pixels and metres, and steps_per_px
 
-17 rendered pairs of 640x480 from all scenes take 0.4 to 1.2 MB, 0.87 on average. Packing takes 25 to 60 ms on
-one core, unpacking 22.
+A rendered pair of 640x480 takes 0.4 to 1.2 MB, 0.87 on average (17 pairs from all scenes). Packing takes 25
+to 60 ms on one core, unpacking 22.
 
 A disparity of 0, such as the sky's, is known here, so KITTI's PNG, where 0 means unknown, is unsuitable.
 """

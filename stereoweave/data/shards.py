@@ -109,7 +109,7 @@ class Shards:
             if shard.first != self._starts[-1]:
                 raise FormatError(
                     f"{folder}: expected pair {self._starts[-1]} in the next shard, found {shard.path.name}; "
-                    "start the same stereoweave synth make again"
+                    "rerun the same `stereoweave synth make` command"
                 )
             self._starts.append(shard.last + 1)
         self.count = self._starts[-1]

@@ -193,8 +193,8 @@ def _refuse_by_content(path: Path, picture: Any) -> None:
     words = description if isinstance(description, bytes) else str(description).encode(errors="replace")
     if b"GImage:" in words or b"equirectangular" in words.lower():
         raise FormatError(
-            f"{path}: expected a photograph, found VR180 or a panorama of 360 degrees, by its XMP, "
-            "which is unsupported; export two plain views from it"
+            f"{path}: expected a plain photograph, found a VR180 picture or a 360-degree panorama "
+            "(from its XMP metadata); export two plain views from it"
         )
     if picture.format in ("GIF", "PNG", "WEBP", "AVIF"):
         with _decoding(path):

@@ -40,7 +40,7 @@ def lock_output(output: Path, before_waiting: Callable[[], None] | None = None) 
         _acquire(lock, before_waiting)
     except Timeout as error:
         raise OutputInUseError(
-            f"{output}: expected an output that nobody writes to, found one that is in use; "
+            f"{output}: expected an output that no other command writes to, found one that is in use; "
             "wait for the other command to end, or choose another output"
         ) from error
     except OSError as error:

@@ -190,8 +190,8 @@ def _find_downscale(
 ) -> float:
     """Factor by which to scale down an image of this size so that the network takes it in one run.
 
-    Below 1, magnify: 1 / largest, if the network can take an image `largest` times as large. A shift of
-    moved_px widens the image.
+    A factor below 1 magnifies: it is 1 / largest if the network can take an image `largest` times as large.
+    A shift of moved_px widens the image.
     """
     width += moved_px
     if matcher.sees_whole(round(width * largest), round(height * largest)):

@@ -82,7 +82,7 @@ def census(grey, codes):
 @inlined
 @typing.no_type_check
 def bits(code):
-    """Number of set bits in 32."""
+    """Number of set bits in a 32-bit code."""
     pairs = np.uint32(code - ((code >> _ONE) & _PAIRS))
     fours = np.uint32((pairs & _FOURS) + ((pairs >> _TWO) & _FOURS))
     return np.int32(np.uint32(((fours + (fours >> _FOUR)) & _EIGHTS) * _SUM) >> _TOP)

@@ -27,7 +27,7 @@ class StereoMatcher:
 
     Args:
         minDisparity: Least disparity in px; below 0 for converged cameras.
-        numDisparities: Number of disparities from minDisparity; need not be a multiple of 16 as in OpenCV.
+        numDisparities: Number of disparities from minDisparity; unlike in OpenCV, any number.
         model: Name of a shipped network or path of an .onnx matcher.
         threads: Maximum number of threads per call; default: all cores.
         provider: See `stereoweave.estimate`.

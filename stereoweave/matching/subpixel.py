@@ -105,7 +105,7 @@ def _refine_band(
     given_px: Float32[np.ndarray, "h w"],
     gain: float,
 ) -> Float32[np.ndarray, "h w"]:
-    """Refine the disparity of a band of rows of the left view; both sides are even."""
+    """Refine the disparity of a band of rows of the left view; height and width are even."""
     coarse_px = _halve(given_px)
     smooth_px = _double(_smooth(coarse_px, _SMOOTH_SIGMA))
     start_px = np.where(cv2.absdiff(smooth_px, given_px) < _SAME_PX, smooth_px, given_px)

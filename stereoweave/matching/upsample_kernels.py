@@ -1,9 +1,9 @@
 """Numba kernels of `upsample.enlarge`, in the order of their calls.
 
-Their plain reference is tests/helpers/plain_enlarging.py. All kernels treat a left view; the right view is
-the left one of the mirrored pair. A pixel has two bands of BAND candidates, around the farthest and the
-nearest surface nearby in the smaller images: candidate i of band b is the disparity
-first_candidate[y, x, b] + i. Volumes are [H, W, 2 * BAND]. H is the height of a strip.
+The plain reference implementation is tests/helpers/plain_enlarging.py. All kernels process a left view; the
+right view is processed as the left view of the mirrored pair. A pixel has two bands of BAND candidates,
+around the farthest and the nearest surface nearby in the smaller images: candidate i of band b is the
+disparity first_candidate[y, x, b] + i. Volumes are [H, W, 2 * BAND]. H is the height of a strip.
 """
 
 import typing

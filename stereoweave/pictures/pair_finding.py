@@ -126,7 +126,7 @@ def find_pairs_in(folder: Path) -> FoundPairs:
         raise StereoweaveError(f"{folder}: expected a folder of pictures, found {_describe_found(folder)}")
     listed = find_pairs_among(folder, (file.path for file in store_at(folder).files()))
     if not listed.pairs:
-        raise StereoweaveError(f"{folder}: expected pictures in it, {_list_endings()}, found none")
+        raise StereoweaveError(f"{folder}: expected pictures in it ({_list_endings()}), found none")
     pairs = [
         NamedPair(
             pair.name,
@@ -264,7 +264,7 @@ def _list_parents(path: str) -> list[str]:
 
 
 def _pair_by_marks(paths: Sequence[str]) -> list[tuple[str, str]]:
-    """Pair every path with a mark as (left, right); return nothing if no pair is complete."""
+    """Pair up the paths that contain a mark, as (left, right); return nothing if no pair is complete."""
     there, pairs, settled = set(paths), set(), set()
     for path in paths:
         if path not in settled and (marked := _swap_sides(path)):

@@ -78,7 +78,7 @@ def _apply_calibration(pair: StereoPair, path: Path, rectified: bool) -> Rectifi
     if unlike:
         raise StereoweaveError(
             f"{path}: expected a calibration of rectified pictures, found {unlike}",
-            remedy=Remedy("rectify the pair by it", ("rectify",)),
+            remedy=Remedy("rectify the pair with it", ("rectify",)),
         )
     return Rectified(pair=replace(pair, camera=rig.camera()), notes=rig.notes)
 

@@ -110,7 +110,7 @@ def _clamp_column(x, width):
 @compiled
 @typing.no_type_check
 def _sample_colour_row(side, y, front_px, padded, colours):
-    """Write an image's colours [3, W] at a row's surfaces, by cubic convolution (Keys 1981, a = -1/2)."""
+    """Sample an image at a row's surfaces into colours [3, W], by cubic convolution (Keys 1981, a = -1/2)."""
     shift, offset_px = np.float32(side.shift), np.float32(side.offset_px)
     width = front_px.shape[0]
     for channel in range(3):

@@ -41,9 +41,9 @@ class Patience:
 
 
 class _Connection(H11Protocol, asyncio.BufferedProtocol):
-    """A connection that closes if a head or a reader is late.
+    """A connection that closes if a request head is late, or the client reads a response too slowly.
 
-    If there are too many connections, the one that has waited longest for a head is closed.
+    If there are too many connections, the one that has waited longest for a request head is closed.
     """
 
     def __init__(self, patience: Patience, *args: Any, **options: Any) -> None:

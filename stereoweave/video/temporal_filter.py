@@ -339,10 +339,10 @@ def carry(new_px, track, motion, carried):
 @kernel
 @typing.no_type_check
 def measure_drift(new_px, carried, drift_px):
-    """Write the change of disparity of the surface around every second pixel into drift_px [H2, W2].
+    """Write the surface's disparity change around every second pixel into drift_px [H2, W2].
 
-    This is the neighbourhood's mean change, shrunk by James and Stein's estimator: it subtracts the squared
-    standard error from the squared mean, and gives 0 if the result is negative.
+    This is the neighbourhood's mean change, shrunk by the James-Stein estimator, which subtracts the squared
+    standard error from the squared mean, and returns 0 if the result is negative.
     """
     old_px, frames = carried.disparity_px, carried.frames
     height, width = new_px.shape

@@ -22,7 +22,7 @@ ERRORS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
     "“Layout of a single file”: expected one picture that holds both views, found two, left.png and "
     "right.png; leave it out, and give the left one first": (PAIR, {"arrangement": "crossed"}),
     "turned.yml: expected a calibration of rectified pictures, found lenses with distortion; rectify the "
-    "pair by it (“Rectify the pair”)": ({**PAIR, "calibration": "turned.yml"}, {}),
+    "pair with it (“Rectify the pair”)": ({**PAIR, "calibration": "turned.yml"}, {}),
     "metres: expected a baseline beside the focal length, found none; give the baseline (“Baseline, mm”)": (
         PAIR,
         {"focal": 500},

@@ -65,7 +65,10 @@ def test_models_can_be_chosen(sets, tmp_path):
     ("pictures", "fragment"),
     [
         ((), "expected <scene>/left.png below it, or rendered sets, found neither"),
-        (("left", "right"), "expected a photograph from between, such as view_0.5.png, found no view_*.png"),
+        (
+            ("left", "right"),
+            "expected an image from between the cameras, such as view_0.5.png, found no view_*.png",
+        ),
         (("left", "right", "view_half"), "a position of -1 to 2 (0 left camera, 1 right), found 'half'"),
     ],
 )

@@ -24,7 +24,7 @@ ERRORS = {
     "view both.png --format diagonal -o out.png": f"--format: expected one of {LAYOUTS}, mpo, jps, found "
     "'diagonal'",
     f"depth {PAIR} --calib turned.yml -o out": "turned.yml: expected a calibration of rectified pictures, "
-    "found lenses with distortion; rectify the pair by it (--rectify)",
+    "found lenses with distortion; rectify the pair with it (--rectify)",
     f"depth {PAIR} --focal-px 500 -o out": "metres: expected a baseline beside the focal length, found none; "
     "give the baseline (--baseline-m)",
     f"depth {PAIR} --baseline-m 0.1 -o out": "metres: expected a focal length in EXIF beside the baseline, "

@@ -38,7 +38,7 @@ def assert_in_use(output: Path) -> None:
     with pytest.raises(OutputInUseError) as caught, lock_output(output):
         pass
     assert str(caught.value) == (
-        f"{output}: expected an output that nobody writes to, found one that is in use; "
+        f"{output}: expected an output that no other command writes to, found one that is in use; "
         "wait for the other command to end, or choose another output"
     )
 

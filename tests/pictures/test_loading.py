@@ -600,8 +600,8 @@ def test_what_is_not_read_is_refused_by_its_name(tmp_path, name, content, found)
 def test_vr180_is_refused_by_its_name(tmp_path, pair, xmp):
     path = tmp_path / "a.vr.jpg"
     Image.fromarray(np.hstack([pair.left, pair.right])).save(path, xmp=xmp)
-    assert "found VR180 or a panorama" in refusal(path)
-    assert "found VR180 or a panorama" in refusal(path, path)
+    assert "found a VR180 picture or a 360-degree panorama" in refusal(path)
+    assert "found a VR180 picture or a 360-degree panorama" in refusal(path, path)
 
 
 @pytest.mark.parametrize("ending", ["gif", "webp", "png"])

@@ -109,7 +109,7 @@ def test_two_pairs_of_one_name_are_refused_before_the_start_even_if_capitals_alo
 
 
 def test_a_folder_without_pictures_is_told_in_one_line(tmp_path):
-    with pytest.raises(StereoweaveError, match="expected pictures in it, .* found none"):
+    with pytest.raises(StereoweaveError, match=r"expected pictures in it \(.*\), found none"):
         find_pairs_in(put(tmp_path, "film.mp4"))
     with pytest.raises(StereoweaveError, match="expected a folder of pictures, found no such folder"):
         find_pairs_in(tmp_path / "none")

@@ -212,8 +212,8 @@ def test_a_film_that_is_being_made_is_refused_until_its_process_is_killed(tmp_pa
         assert run(film, tmp_path / "link" / "out.mp4", "--depth") == 2
         first.kill()
     assert capsys.readouterr().err == (
-        f"stereoweave: {tmp_path / 'link' / 'out.mp4'}: expected an output that nobody writes to, found one "
-        "that is in use; wait for the other command to end, or choose another output\n"
+        f"stereoweave: {tmp_path / 'link' / 'out.mp4'}: expected an output that no other command writes to, "
+        "found one that is in use; wait for the other command to end, or choose another output\n"
     )
     assert first.wait() == -signal.SIGKILL
     assert run(film, out, "--depth") == 0

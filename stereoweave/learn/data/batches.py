@@ -39,8 +39,9 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
     def key(self, step: int, part: int) -> tuple[int, ...]:
         """Seed of a micro-batch's draws.
 
-        Trailing zeros do not change a seed: the first micro-batch has the draws of (seed, step), as before
-        steps had micro-batches. The last number is even because odd ones seed the orders of pairs and sets.
+        Trailing zeros do not change a seed: the first micro-batch has the draws of (seed, step), as a step
+        had before it was split into micro-batches. The last number is even because odd ones seed the orders
+        of pairs and sets.
         """
         return self.recipe.seed, step, 0, 2 * part
 

@@ -88,7 +88,7 @@ def draw_paint(rng: np.random.Generator, place: Placement) -> Paint:
 def draw_plain_paint(
     rng: np.random.Generator, place: Placement, colour: Float[np.ndarray, "3"] | None = None
 ) -> Paint:
-    """Draw a colour with at most 3 % of a texture's contrast, under nearly even light."""
+    """Draw a nearly plain paint: a colour, at most 3 % of a texture's contrast, nearly even light."""
     paint = draw_paint(rng, place)
     contrast = rng.uniform(0, 0.03) if rng.random() < 0.7 else 0.0
     light = 1 + rng.uniform(0, 0.35) * (paint.light - 1)

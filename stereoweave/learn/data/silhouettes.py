@@ -114,7 +114,7 @@ def draw_polygon(corners: Points, place: Placement) -> Patch:
 
 
 def soften(patch: Patch) -> Patch:
-    """Soften the patch's edges to 4 px, as out of focus; its interior stays opaque."""
+    """Soften the patch's edges to a width of 4 px, as if out of focus; its interior stays opaque."""
     return Patch(patch.field * np.float32(0.5 / REACH_PX), patch.left, patch.top)
 
 

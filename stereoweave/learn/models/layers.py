@@ -275,9 +275,9 @@ def upsample_to_a_side(
     """Like `upsample_convex`, but a mixture of two surfaces snaps to the one with the larger share.
 
     The neighbours are split at the mixture; they are two surfaces if their means are more than `step` apart.
-    The mean of two surfaces lies on neither and would be a flying pixel. All decisions are blended, so that
-    rounding decides nothing: a share of three quarters snaps fully. Not for training: the losing side gets
-    hardly any gradient.
+    The mean of two surfaces lies on neither and would be a flying pixel. All thresholds are soft, so that
+    rounding errors cannot flip the result: a share of three quarters snaps fully. Not for training: the
+    losing side gets hardly any gradient.
     """
     neighbours, logits = _neighbours(x, weights)
     # Written out: ONNX Runtime's sigmoid has an error of 1e-7, too much where all neighbours are rejected.
@@ -372,7 +372,7 @@ class PooledMatching(nn.Module):
 
 
 class CodeHead(nn.Module):
-    """The last layers of DenseMapNet and the paper: a code in 0..1 from decoded maps and the left channel."""
+    """Head of DenseMapNet and the paper's network: a code in 0..1 from decoded maps and the left channel."""
 
     def __init__(self, inputs: int) -> None:
         super().__init__()

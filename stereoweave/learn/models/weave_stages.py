@@ -1,4 +1,4 @@
-"""Optional stages that a trained WeaveNet can grow by; they add nothing until trained."""
+"""Optional stages to add to a trained WeaveNet; they change nothing until they are trained."""
 
 import torch
 import torch.nn.functional as F

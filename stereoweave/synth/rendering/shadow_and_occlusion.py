@@ -113,7 +113,7 @@ def count_occlusion(corners_m: Corners, target_m: Corners) -> OcclusionGrid:
 
 
 def _hidden_share(surface: Float[np.ndarray, "z y x"]) -> UInt8[np.ndarray, "z y x"]:
-    """Share of the sky hidden by surface in the cell itself and, with less weight, in the cube around it.
+    """Share of the sky hidden by surfaces in the cell itself and, with less weight, in the cube around it.
 
     A plane hides no sky from points on it, so its area is subtracted from the cube's.
     """

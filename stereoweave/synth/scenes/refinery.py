@@ -138,7 +138,7 @@ def _units(rng: np.random.Generator, materials: RefineryMaterials, lines: tuple[
 def _route(
     rng: np.random.Generator, start_m: Float[np.ndarray, "3"], plot_m: tuple[float, float]
 ) -> Float[np.ndarray, "_ 3"]:
-    """Route of a pipe from a nozzle to a lane between the plots, along it at some height, into the rack."""
+    """Route of a pipe from a nozzle to a lane between the plots, along the lane, and into the rack."""
     x, y, z = start_m
     lane_x, side = plot_m[0] + rng.choice([-1, 1]) * rng.uniform(0.7, 0.88), np.sign(plot_m[1])
     high_m, into_m = float(rng.choice([0.17, 0.51, 0.63])), float(rng.choice([0.8, 1.16]))

@@ -48,7 +48,7 @@ def measure_effect_costs(
 
 
 def _ms_a_pair(effects: Effects, views: list[tuple[World, PosedRig]]) -> float:
-    """Mean over the views of the faster of two runs, each with a world new to the renderer."""
+    """Time in ms: the faster of two runs per view, averaged. Each run's world is new to the renderer."""
     renderer = OpenGLRenderer(effects)
     renderer.render_views(*views[0], (0.0, 1.0))
     total_s = 0.0

@@ -128,7 +128,9 @@ def test_no_other_process_goes_on_before_one_is_killed_with_its_workers(finished
     first = start(tmp_path, out, pair_maker="PaintedPairMaker(halts_at=6)")
     try:
         os.waitpid(first.pid, os.WUNTRACED)
-        assert "expected an output that nobody writes to, found one that is in use" in error_of(made, out)
+        assert "expected an output that no other command writes to, found one that is in use" in error_of(
+            made, out
+        )
     finally:
         first.kill()
         first.communicate()  # which returns when its workers have ended too
