@@ -1,14 +1,14 @@
-# make demo    depth, a new view and a report, of the example or of LEFT=… RIGHT=… (needs Python 3.11 or newer)
-# make test    the tests, JOBS=3 files at a time
-# make coverage the tests, and which lines of the package they do not run
-# make check   style, types, imports between rooms, and the tests
-# make mutate which of COUNT=400 changes of the sources, drawn by SEED, the tests notice; a stopped run goes on
-# make fuzz    damaged files and requests for SECONDS=60, each answered by our own errors or kept in tests/corpus
-# make bench   accuracy and time on the real pairs in STEREOWEAVE_TESTDATA
-# make audit   licences of all that is installed, and known vulnerabilities where their service is reached
-# make release the wheel and the source distribution, tried in empty environments, and the lists of what they need (SBOM), in dist
-# make gallery the pictures of the README and docs/views.md, from pairs rendered for them
-# Each first sets up the virtual environment that it needs, once.
+# make demo      depth, a new view and a report of the example, or of LEFT=… RIGHT=… (needs Python 3.11 or newer)
+# make test      run the tests, JOBS=3 files at a time
+# make coverage  run the tests, and report which lines of the package they do not run
+# make check     check style, types and imports between rooms, and run the tests
+# make mutate    count how many of COUNT=400 changes of the sources, drawn by SEED, the tests notice; resumes
+# make fuzz      read damaged files and requests for SECONDS=60; findings are kept in tests/corpus
+# make bench     measure accuracy and time on the real pairs in STEREOWEAVE_TESTDATA
+# make audit     check the licences of everything installed, and known vulnerabilities if the service answers
+# make release   build the wheel and the source distribution in dist, list their dependencies (SBOM), and try both
+# make gallery   render the pictures of the README and docs/views.md
+# Each target creates the virtual environment that it needs, once.
 
 PYTHON ?= python3
 STEREOWEAVE_TESTDATA ?= ../shared
@@ -94,7 +94,7 @@ release: $(CORE)/installed $(DEV)/installed $(AUDIT)/installed
 	$(SBOM) --output-file dist/stereoweave-$(VERSION)-all-extras.cdx.json $(DEV)
 	$(AUDIT)/bin/python -m release.check dist/stereoweave-$(VERSION)-py3-none-any.whl dist/stereoweave-$(VERSION).tar.gz
 
-# The wiggle's frames are smaller, because it is as large as all other pictures together else.
+# The wiggle gets smaller frames: at full size it would be as large as all other pictures together.
 gallery: $(DEV)/installed
 	$(RENDER) --size 640x480 -o runs/gallery/pair
 	$(RENDER) --size 400x300 -o runs/gallery/smaller
