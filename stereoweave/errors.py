@@ -4,6 +4,7 @@ A remedy names settings by their Python keyword. Each front end translates them 
 form fields or labels.
 """
 
+import copy
 import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -75,8 +76,11 @@ class StereoweaveError(ValueError):
         return prefix + _with_remedy(self.message, self.remedy, name_of)
 
     def with_detail(self, text: str) -> "StereoweaveError":
-        """Return a copy with text inserted before the remedy."""
-        return StereoweaveError(f"{self.message}; {text}", setting=self.setting, remedy=self.remedy)
+        """Return a copy, of the same class, with text inserted before the remedy."""
+        detailed = copy.copy(self)
+        detailed.message = f"{self.message}; {text}"
+        detailed.args = (detailed.message,)
+        return detailed
 
 
 class FormatError(StereoweaveError):

@@ -148,6 +148,14 @@ def test_errors_cross_processes_with_setting_and_remedy(kind):
     assert vars(there) == vars(error)
 
 
+def test_a_detail_stands_before_the_remedy_and_keeps_the_class():
+    error = errors.ProviderError("expected 1, found 2", remedy=Remedy("wait", ("threads",)))
+    detailed = error.with_detail("parts are kept")
+    assert type(detailed) is errors.ProviderError
+    assert str(detailed) == "expected 1, found 2; parts are kept; wait (threads)"
+    assert str(error) == "expected 1, found 2; wait (threads)"
+
+
 def test_no_module_outside_the_command_line_spells_an_option():
     found = {}
     for path in sorted(PACKAGE.rglob("*.py")):

@@ -25,6 +25,7 @@ NEEDS = (
     ("jaxtyping", ("jaxtyping",), (0, 2)),
     ("PIL", ("pillow",), (9, 0)),
     ("yaml", ("pyyaml",), (5, 0)),
+    ("pydantic", ("pydantic",), (2, 10)),
     ("rich", ("rich",), (13, 0)),
     ("skimage", ("scikit-image",), (0, 22)),
     ("torch", ("torch",), (2, 4)),

@@ -1,6 +1,7 @@
 """Network, threads and provider used for matching."""
 
 import functools
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,7 +34,12 @@ class Backend:
         check_provider(self.provider)
         thread_count(self.threads)
         path = model_file(self.model).absolute()
-        return _load(self, path, path.stat().st_mtime_ns)
+        with _LOADING:
+            return _load(self, path, path.stat().st_mtime_ns)
+
+
+# lru_cache does not wait for a call that computes the same value: threads would load a network each.
+_LOADING = threading.Lock()
 
 
 @functools.lru_cache(maxsize=4)

@@ -33,7 +33,7 @@ class Worker:
     """Two processes: one measures pictures from their heads, the other decodes and matches them.
 
     Args:
-        make_answering: Makes the second one's function, such as `partial(make_answering, "small", "cpu", 1)`.
+        make_answering: Makes the second one's function, such as `partial(make_answering, Backend())`.
         folder: For the temporary files of both.
     """
 

@@ -355,7 +355,8 @@ def _check_status(address: str) -> None:
         os.environ["RAY_AUTH_MODE"] = "token"
         status = _status(address)
     if status.returncode:
-        raise _not_joined(address, status.stderr.strip().splitlines()[-1].rstrip(".;"))
+        lines = status.stderr.strip().splitlines() or [f"exit status {status.returncode}"]
+        raise _not_joined(address, lines[-1].rstrip(".;"))
 
 
 def _status(address: str) -> subprocess.CompletedProcess[str]:

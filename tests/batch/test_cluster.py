@@ -84,7 +84,7 @@ def test_bad_pairs_become_rows_and_the_next_run_makes_what_is_missing_changed_or
     rows = manifest(out)
     assert list(sorted(rows)) == [*numbered(8), "alone"]
     assert str(bad) in rows["01"]["error"]
-    assert "of one size, found" in rows["02"]["error"]
+    assert "of the same size, found" in rows["02"]["error"]
     assert rows["alone"]["error"].endswith(
         "alone.png: expected a picture (PNG, JPEG, TIFF or the like), found no such file"
     )

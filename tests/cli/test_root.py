@@ -125,7 +125,7 @@ def mistakes(pictures) -> Path:
         ("depth words.png right.png -o out", ["words.png", "expected a picture"]),
         ("depth half.png right.png -o out", ["half.png", "expected a picture", "truncated"]),
         ("depth left.png half.jpg -o out", ["half.jpg", "expected a picture", "truncated"]),
-        ("depth left.png narrow.png -o out", ["left.png of 96x64", "narrow.png of 80x64", "one size"]),
+        ("depth left.png narrow.png -o out", ["left.png of 96x64", "narrow.png of 80x64", "the same size"]),
         ("depth tiny.png tiny.png -o out", ["tiny.png", "at least 32x32", "found 31x64"]),
         ("depth odd.png --format side_by_side -o out", ["odd.png", "an even width", "found 95x64"]),
         ("depth left.png right.png both.png -o out", ["LEFT RIGHT or SIDE_BY_SIDE", "found 3", "both.png"]),

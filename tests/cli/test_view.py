@@ -128,7 +128,10 @@ def test_a_wiggle_moves(pair, capfd, ending):
         ("--layout quilt -o v.mp4", ["v.mp4", ".png", "found '.mp4'"]),
         ("--layout quilt -o v.jps", ["v.jps", "crossed", "found quilt"]),
         ("--layout side_by_side --strength 4 -o v.png", ["position", "-1 to 2", "-1.5", "strength 4"]),
-        ("--layout quilt --strength 2 -o v.png", ["position", "-1 to 2", "-1.5", "takes -0.5"]),
+        (
+            "--layout quilt --strength 2 -o v.png",
+            ["position", "-1 to 2", "-1.5", "-0.5 at strength 2"],
+        ),
         ("--layout sweep --strength 3.5 -o v.gif", ["position", "-1 to 2", "strength 3.5"]),
         ("--position 2 --strength 1.5 -o v.png", ["position", "-1 to 2", "2.75"]),
         ("--strength nan -o v.png", ["--strength", "greater than or equal to 0"]),

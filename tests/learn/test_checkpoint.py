@@ -195,8 +195,16 @@ def test_averaged_weights_alone_are_small_and_a_run_can_start_from_them(tmp_path
         torch.testing.assert_close(start.weights[name], value, rtol=1e-3, atol=1e-6)
 
 
-@pytest.mark.parametrize("content", [b"", b"no checkpoint", b"\x80", b"PK\x03\x04"])
-def test_what_is_no_checkpoint_is_refused_with_a_reason(tmp_path, content):
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        (b"", "a truncated file"),
+        (b"no checkpoint", r"one that \S.+"),
+        (b"\x80", r"one that \S.+"),
+        (b"PK\x03\x04", r"one that \S.+"),
+    ],
+)
+def test_what_is_no_checkpoint_is_refused_with_a_reason(tmp_path, content, found):
     path = tmp_path / "last.pt"
     path.write_bytes(content)
     for load, expected in (
@@ -206,6 +214,4 @@ def test_what_is_no_checkpoint_is_refused_with_a_reason(tmp_path, content):
         with pytest.raises(FormatError) as raised:
             load(path)
         told = str(raised.value)
-        assert re.fullmatch(rf"{re.escape(str(path))}: expected {expected}.*, found one that \S.+", told), (
-            told
-        )
+        assert re.fullmatch(rf"{re.escape(str(path))}: expected {expected}.*, found {found}", told), told

@@ -1,4 +1,5 @@
 import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,6 +34,14 @@ def test_a_model_is_loaded_once_and_kept(tmp_path, rng, monkeypatch):
         sw.estimate(left, right, model=file)
         sw.StereoMatcher(model=file).compute(left, right)
     assert len(opened) == 1
+
+
+def test_threads_that_ask_at_once_share_one_network(tmp_path):
+    file = tmp_path / "matcher.onnx"
+    matcher_file(file, red_of("left", "disparity_px"), ["disparity_px"])
+    with ThreadPoolExecutor(6) as pool:
+        matchers = list(pool.map(lambda _: Backend(model=file, threads=1).matcher(), range(6)))
+    assert len(set(map(id, matchers))) == 1
 
 
 def test_the_network_is_loaded_as_the_backend_says():
