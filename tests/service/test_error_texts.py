@@ -30,7 +30,7 @@ ERRORS: dict[str, tuple[str, dict[str, str], dict[str, Any]]] = {
     "format: expected one picture that holds both views, found two, left and right; leave it out, and give "
     "the left one first": ("/disparity", PAIR, {"format": "crossed"}),
     "calib: expected a calibration of rectified pictures, found lenses with distortion; rectify the pair "
-    "by it (rectify)": ("/disparity", {**PAIR, "calib": "turned.yml"}, {}),
+    "with it (rectify)": ("/disparity", {**PAIR, "calib": "turned.yml"}, {}),
     "metres: expected a baseline beside the focal length, found none; give the baseline (baseline_m)": (
         "/depth",
         PAIR,
