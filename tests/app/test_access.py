@@ -256,6 +256,7 @@ def test_a_body_is_checked_whatever_the_method_is(page, method):
     assert (answer.status_code, answer.text) == REFUSED
 
 
+@pytest.mark.no_cover  # which takes time
 def test_a_long_cookie_of_another_server_does_not_hold_the_page_up(page):
     other = (
         'other="' + r"\a" * 30_000 + '"'

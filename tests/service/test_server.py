@@ -66,6 +66,7 @@ def test_a_head_without_end_is_refused_before_it_fills_memory(address, connectio
         assert read_to_end(other).startswith(b"HTTP/1.1 200")
 
 
+@pytest.mark.no_cover  # which takes time
 @pytest.mark.parametrize("begun", [b"", HEAD + b"X: "])
 def test_a_head_that_does_not_arrive_in_time_closes_the_connection(connection, begun):
     start_s = time.monotonic()
@@ -139,6 +140,7 @@ def test_what_was_accepted_is_answered_before_the_server_ends():
             assert read_to_end(connection).endswith(b"later")
 
 
+@pytest.mark.no_cover  # which takes time
 def test_a_body_of_tiny_chunks_does_not_hold_others_up(address, connection):
     connection.sendall(b"POST /5 HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n")
     threading.Thread(target=connection.sendall, args=(b"1\r\na\r\n" * 150_000,), daemon=True).start()
