@@ -24,6 +24,8 @@ from stereoweave.stereo import Estimate, StereoCamera
 
 _LONGER_SIDE_PX = 1280
 _MOST_POINTS = 300_000
+# Times the median depth. The viewer fits all points: a few of a far horizon would shrink the rest to a dot.
+_FARTHEST = 4.0
 # Files up to this size, those of about 8 megapixels, are on disk twice: by themselves and in the zip.
 _MOST_ZIPPED_BYTES = 300 * 1024**2
 _NO_METRES = "For metres, give a calibration file, or the focal length and the baseline."
@@ -96,13 +98,19 @@ def zip_files(file: Path, files: Sequence[Path]) -> Path | None:
 
 
 def write_cloud(file: Path, result: Result) -> Path | None:
-    """Write the point cloud, by an assumed camera if none is known; None if it has no points."""
+    """Write the point cloud for the viewer, without its farthest points; return None if it has no points.
+
+    A camera is assumed if none is known. `cloud.glb` among the files has all points.
+    """
     pair, estimate = result.pair, result.estimate
     seen = pair if pair.camera else replace(pair, camera=_assume_camera(estimate))
     try:
-        write_glb(file, point_cloud(seen, estimate, most_points=_MOST_POINTS))
+        cloud = point_cloud(seen, estimate, most_points=_MOST_POINTS)
     except EmptyError:
         return None
+    depth_m = cloud.points_m[:, 2]
+    near = depth_m <= _FARTHEST * np.median(depth_m)
+    write_glb(file, replace(cloud, points_m=cloud.points_m[near], colours=cloud.colours[near]))
     return file
 
 
