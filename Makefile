@@ -39,7 +39,6 @@ SBOM = $(AUDIT)/bin/cyclonedx-py environment --pyproject pyproject.toml --output
 VERSION = $(shell sed -n 's/^__version__ = "\(.*\)"/\1/p' stereoweave/__init__.py)
 RENDER = $(DEV)/bin/stereoweave synth make refinery --pairs 1 --seed 4000 --layout paper
 RENDERED = $(foreach side,left right,runs/gallery/$(1)/$(side)/refinery/000000.png)
-SHIP = $(foreach side,left right,runs/gallery/ship/$(side)/ship/000002.png)
 VIEW = $(DEV)/bin/stereoweave view
 # Three files at a time on two cores, because the system tests mostly wait for other programs.
 PYTEST = $(DEV)/bin/pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder
@@ -107,11 +106,9 @@ gallery: $(DEV)/installed
 	$(VIEW) $(call RENDERED,pair) --position 1.5 -o docs/gallery/beyond_right.jpg
 	$(VIEW) $(call RENDERED,pair) --layout anaglyph_dubois -o docs/gallery/anaglyph.jpg
 	$(VIEW) $(call RENDERED,smaller) --layout wiggle -o docs/gallery/wiggle.webp
-	$(DEV)/bin/stereoweave synth make ship --pairs 3 --seed 11 --size 640x480 --layout paper -o runs/gallery/ship
-	$(DEV)/bin/stereoweave depth $(SHIP) --model best -o runs/gallery/ship_depth
+	$(DEV)/bin/stereoweave depth $(EXAMPLE) --model best -o runs/gallery/ship_depth
 	cp runs/gallery/ship_depth/preview.png docs/gallery/ship_depth.png
-	cp $(firstword $(SHIP)) docs/gallery/ship.png
-	$(VIEW) $(SHIP) --position 0.5 -o docs/gallery/ship_between.jpg
+	$(VIEW) $(EXAMPLE) --position 0.5 -o docs/gallery/ship_between.jpg
 
 $(CORE)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(CORE)

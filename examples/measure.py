@@ -1,7 +1,7 @@
 """Distance in metres between the points that two pixels show, with its uncertainty.
 
 Run: python examples/measure.py
-or, with column and row of two pixels: python examples/measure.py 80 400 560 400
+or, with column and row of two pixels: python examples/measure.py 130 380 440 225
 """
 
 import sys
@@ -14,7 +14,7 @@ from stereoweave.outputs.measure import CameraError, distance
 
 HERE = Path(__file__).parent
 
-column, row, other_column, other_row = map(int, sys.argv[1:] or (80, 440, 560, 440))
+column, row, other_column, other_row = map(int, sys.argv[1:] or (262, 225, 390, 215))
 pair = add_camera(read_pair(HERE / "left.png", HERE / "right.png"), HERE / "calib.txt")
 assert pair.camera is not None
 found = distance(

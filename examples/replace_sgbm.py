@@ -19,7 +19,7 @@ matcher = StereoMatcher(minDisparity=0, numDisparities=64)
 
 disparity_px = matcher.compute(left, right).astype(np.float32) / 16.0
 known = disparity_px > matcher.getMinDisparity()
-focal_px, baseline_m = 600.0, 0.1
+focal_px, baseline_m = 480.0, 0.406
 to_points = np.array(
     [[1, 0, 0, -319.5], [0, 1, 0, -239.5], [0, 0, 0, focal_px], [0, 0, 1 / baseline_m, 0]], np.float32
 )

@@ -8,7 +8,7 @@ from PIL import Image
 
 import stereoweave as sw
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.files import read_pair
+from stereoweave.learn.data.collage import paint_collage
 from stereoweave.matching import estimate as matching
 from stereoweave.matching import matcher as matcher_module
 from stereoweave.matching.estimate import match, match_many
@@ -25,8 +25,9 @@ def matcher():
 
 
 @pytest.fixture(scope="module")
-def examples():
-    return read_pair("examples/left.png", "examples/right.png")
+def textured():
+    painted = paint_collage(4_000_037, 0, 157, 480, 640)
+    return sw.StereoPair(left=painted.left, right=painted.right)
 
 
 def same(one, other):
@@ -46,29 +47,29 @@ def sure(estimate, confidence=0.9):
 
 
 @pytest.mark.parametrize("refined", [False, True])
-def test_a_pair_that_the_network_sees_all_of_is_what_the_matcher_estimates(matcher, examples, refined):
-    found = sw.estimate(examples.left, examples.right, refined=refined)
-    same(found, matcher.estimate(examples.left, examples.right, refined=refined))
+def test_a_pair_that_the_network_sees_all_of_is_what_the_matcher_estimates(matcher, textured, refined):
+    found = sw.estimate(textured.left, textured.right, refined=refined)
+    same(found, matcher.estimate(textured.left, textured.right, refined=refined))
 
 
-def test_raw_is_the_networks_own_disparity_alone_and_among_others(matcher, examples):
-    alone = matcher.estimate(examples.left, examples.right, raw=True)
-    same(sw.estimate(examples.left, examples.right, raw=True), alone)
-    same(match_many(matcher, [examples], MatchOptions(raw=True))[0], alone)
-    filled = matcher.estimate(examples.left, examples.right)
+def test_raw_is_the_networks_own_disparity_alone_and_among_others(matcher, textured):
+    alone = matcher.estimate(textured.left, textured.right, raw=True)
+    same(sw.estimate(textured.left, textured.right, raw=True), alone)
+    same(match_many(matcher, [textured], MatchOptions(raw=True))[0], alone)
+    filled = matcher.estimate(textured.left, textured.right)
     assert (np.abs(filled.disparity_px - alone.disparity_px)[alone.occluded] > 1).mean() > 0.1
     assert np.abs(filled.disparity_px - alone.disparity_px)[~alone.occluded].max() < 1.001
 
 
-def test_a_pair_of_pillow_is_what_its_pixels_are(examples):
-    pictures = (Image.fromarray(photo) for photo in (examples.left, examples.right))
-    same(sw.estimate(*pictures), sw.estimate(examples.left, examples.right))
+def test_a_pair_of_pillow_is_what_its_pixels_are(textured):
+    pictures = (Image.fromarray(photo) for photo in (textured.left, textured.right))
+    same(sw.estimate(*pictures), sw.estimate(textured.left, textured.right))
 
 
 @pytest.mark.parametrize("by_px", [60, 100])
-def test_a_pair_with_columns_cut_off_has_so_much_less_disparity_negative_ones_too(matcher, examples, by_px):
-    whole = matcher.estimate(examples.left, examples.right)
-    found = match(matcher, moved(examples, by_px))
+def test_a_pair_with_columns_cut_off_has_so_much_less_disparity_negative_ones_too(matcher, textured, by_px):
+    whole = matcher.estimate(textured.left, textured.right)
+    found = match(matcher, moved(textured, by_px))
     clear = sure(whole)[:, by_px:] & sure(found)
     assert clear.mean() > 0.3
     off_px = found.disparity_px - (whole.disparity_px[:, by_px:] - by_px)
@@ -77,20 +78,20 @@ def test_a_pair_with_columns_cut_off_has_so_much_less_disparity_negative_ones_to
     assert abs(np.median(off_px[clear])) < 0.1
 
 
-def test_what_is_given_as_the_range_counts_and_not_what_is_found(matcher, examples):
-    whole = matcher.estimate(examples.left, examples.right)
-    same(match(matcher, examples, MatchOptions(range_px=(0, 192))), whole)
-    found = match(matcher, examples, MatchOptions(range_px=(-20, 120)))
+def test_what_is_given_as_the_range_counts_and_not_what_is_found(matcher, textured):
+    whole = matcher.estimate(textured.left, textured.right)
+    same(match(matcher, textured, MatchOptions(range_px=(0, 192))), whole)
+    found = match(matcher, textured, MatchOptions(range_px=(-20, 120)))
     clear = sure(whole) & sure(found)
     assert np.mean(np.abs(found.disparity_px - whole.disparity_px)[clear] > 1) < 0.03
 
 
-def test_a_picture_twice_as_large_has_twice_the_disparity_even_if_it_is_matched_smaller(matcher, examples):
+def test_a_picture_twice_as_large_has_twice_the_disparity_even_if_it_is_matched_smaller(matcher, textured):
     twice = sw.StereoPair(
-        left=cv2.resize(examples.left, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC),
-        right=cv2.resize(examples.right, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC),
+        left=cv2.resize(textured.left, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC),
+        right=cv2.resize(textured.right, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC),
     )
-    whole = matcher.estimate(examples.left, examples.right)
+    whole = matcher.estimate(textured.left, textured.right)
     found = match(matcher, twice, MatchOptions(range_px=(0, 440)))
     expected_px = 2 * cv2.resize(whole.disparity_px, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
     clear = cv2.resize(sure(whole).astype(np.uint8), None, fx=2, fy=2) > 0
@@ -168,9 +169,9 @@ def best():
 
 
 @pytest.fixture(scope="module")
-def part(examples):
+def part(textured):
     """160x96 px of the example."""
-    left, right = (np.ascontiguousarray(x[200:296, 240:400]) for x in (examples.left, examples.right))
+    left, right = (np.ascontiguousarray(x[200:296, 240:400]) for x in (textured.left, textured.right))
     return sw.StereoPair(left=left, right=right)
 
 
@@ -326,9 +327,9 @@ def test_a_range_beyond_the_pictures_width_is_as_good_as_the_width(matcher, rng)
 
 
 @pytest.mark.parametrize("range_px", [(10, 10), (50, 0), (0, float("nan")), (float("-inf"), 10)])
-def test_a_range_that_is_none_is_refused_in_one_line(matcher, examples, range_px):
+def test_a_range_that_is_none_is_refused_in_one_line(matcher, textured, range_px):
     with pytest.raises(StereoweaveError, match="range_px: expected the least and the greatest") as caught:
-        match(matcher, examples, MatchOptions(range_px=range_px))
+        match(matcher, textured, MatchOptions(range_px=range_px))
     assert "\n" not in str(caught.value)
 
 
