@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from release import check, words
+from release import check, compare_tests, words
 
 ROOT = Path(__file__).resolve().parent.parent
 THIS_VERSION = "{}.{}".format(*sys.version_info)
@@ -126,3 +126,11 @@ def test_a_draw_of_texts_has_all_kinds_and_depends_on_its_seed_alone():
     )
     assert list(words.docstrings(tree)) == [(1, "A module."), (3, "A function.")]
     assert list(words.error_messages(tree)) == [(4, "ValueError(f'too {long}')")]
+
+
+def test_tests_and_asserts_are_counted_by_name_methods_too():
+    source = (
+        "def test_a():\n    assert 1\nclass TestB:\n    def test_a(self):\n        assert 1\n        assert 2"
+    )
+    names, asserts = compare_tests.count_tests([source, "async def test_c(): ..."])
+    assert (dict(names), asserts) == ({"test_a": 2, "test_c": 1}, 3)
