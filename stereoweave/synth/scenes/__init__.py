@@ -1,4 +1,4 @@
-"""Registry of scenes; each draws a stage from a random generator."""
+"""Registry of scenes, each of which builds a random stage."""
 
 from collections.abc import Callable
 

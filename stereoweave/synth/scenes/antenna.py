@@ -1,4 +1,4 @@
-"""Scene `antenna`: a radio mast with panels and drums, roof antennas, or a large dish."""
+"""Scene `antenna`: a radio mast with panel and drum antennas, roof antennas, or a large dish."""
 
 from dataclasses import dataclass
 
@@ -45,9 +45,9 @@ class MastPlan:
 
     Attributes:
         corners: number of legs, 3 or 4.
-        widths_m: side lengths at foot and top.
-        guyed: slim and held by wires, or free-standing.
-        banded: painted in red and white bands.
+        widths_m: side lengths at the foot and at the top.
+        guyed: whether the mast is slim and held by guy wires; it is free-standing otherwise.
+        banded: whether the mast is painted in red and white bands.
     """
 
     height_m: float
@@ -69,7 +69,7 @@ class MastMaterials:
 
 
 def antenna(rng: np.random.Generator) -> Stage:
-    """A mast of 6.5 m, roof antennas of 3 m, or a dish of 4 m."""
+    """Build a stage with a mast of 6.5 m, roof antennas of 3 m, or a dish of 4 m."""
     kind = str(rng.choice(["mast", "roof", "dish"], p=[0.5, 0.25, 0.25]))
     return {"mast": _mast_site, "roof": roof_antennas, "dish": radio_dish}[kind](rng)
 
@@ -128,14 +128,14 @@ def _width(plan: MastPlan, z_m: float) -> float:
 
 
 def _mast(rng: np.random.Generator, plan: MastPlan, materials: MastMaterials) -> Mesh:
-    """The lattice with ladder, cables, and landings or guy wires."""
+    """Build the lattice mast with a ladder, cables, and landings or guy wires."""
     joints = mast_rings(*mast_levels((0.0, plan.height_m), plan.widths_m, 1.0), corners=plan.corners)
     thick = 1.0 if plan.guyed else 1.35
     bracing: Bracing = "zigzag" if plan.guyed or rng.random() < 0.5 else "cross"
     lattice = truss(joints, bracing).banded_mesh(
         0.017 * thick, 0.009 * thick, materials.bands, (np.inf, plan.height_m / 7)
     )
-    # Inside, near the middle of the first face.
+    # The ladder is inside the mast, near the middle of its first face.
     foot, head = (joints[k, :2].mean(0) * [0.8, 0.8, 1] for k in (0, -1))
     sideways = joints[0, 1] - joints[0, 0]
     trunk = foot * [0.4, 0.4, 1] + np.linspace(-0.05, 0.05, 6)[:, None] * sideways / np.linalg.norm(sideways)
@@ -167,7 +167,7 @@ def _landing(plan: MastPlan, z_m: float, materials: MastMaterials) -> Mesh:
 
 
 def _guys(plan: MastPlan, materials: MastMaterials) -> Mesh:
-    """Guy wires from three heights to three anchors, with strainers near the ground."""
+    """Build guy wires from three heights to three anchors, with tensioners near the ground."""
     angle = np.radians([60, 180, 300])
     around = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
     radius = plan.widths_m[0] / np.sqrt(3)
@@ -181,7 +181,7 @@ def _guys(plan: MastPlan, materials: MastMaterials) -> Mesh:
 
 
 def _sectors(rng: np.random.Generator, plan: MastPlan, materials: MastMaterials) -> Mesh:
-    """One or two rings of sector panels around the mast."""
+    """Build one or two rings of sector antennas around the mast."""
     heights = [0.93] if rng.random() < 0.5 else [0.93, 0.78]
     turned = rng.uniform(0, 120)
     crowns = []
@@ -194,7 +194,7 @@ def _sectors(rng: np.random.Generator, plan: MastPlan, materials: MastMaterials)
 
 
 def _crown(plan: MastPlan, z_m: float, side_m: float, panel_m: float, materials: MastMaterials) -> Mesh:
-    """A ring of three frames with two panels each."""
+    """Build a ring of three frames with two panel antennas each."""
     out = 0.42 * side_m + 0.5 * _width(plan, z_m)
     half = side_m / 2
     rails = np.array([[(out, -half, z), (out, half, z)] for z in (-0.2, 0.2)])
@@ -210,7 +210,7 @@ def _crown(plan: MastPlan, z_m: float, side_m: float, panel_m: float, materials:
 
 
 def _links(rng: np.random.Generator, plan: MastPlan, materials: MastMaterials) -> Mesh:
-    """Drums, yagis and dipoles at the mast's sides."""
+    """Build drum, Yagi and dipole antennas on the sides of the mast."""
     parts = []
     for share in rng.uniform(0.35, 0.68, int(rng.integers(2, 5))):
         radius = rng.uniform(0.14, 0.32)
@@ -227,7 +227,7 @@ def _links(rng: np.random.Generator, plan: MastPlan, materials: MastMaterials) -
 def _on_arm(
     rng: np.random.Generator, plan: MastPlan, share: float, mesh: Mesh, materials: MastMaterials
 ) -> Mesh:
-    """Mount a mesh on an arm at a share of the mast's height, in a random direction."""
+    """Mount a mesh on an arm at a fraction of the mast's height, in a random direction."""
     z = share * plan.height_m
     out = 0.55 * _width(plan, z) + 0.16
     arm = bars(
@@ -240,7 +240,7 @@ def _on_arm(
 
 
 def _top(rng: np.random.Generator, plan: MastPlan, materials: MastMaterials) -> Mesh:
-    """Whip antennas, lightning rod, lamp."""
+    """Build the whip antennas and the lamp on top of the mast."""
     z = plan.height_m
     around = 0.5 * plan.widths_m[1] * np.array([(1, 1), (-1, 1), (0, -1.2)])
     rods = [
@@ -251,7 +251,7 @@ def _top(rng: np.random.Generator, plan: MastPlan, materials: MastMaterials) -> 
 
 
 def _site(rng: np.random.Generator, palette: Palette, materials: MastMaterials) -> Mesh:
-    """Equipment cabin, cable bridge to it, and fence."""
+    """Build the equipment cabin, the cable bridge to it, and the fence."""
     wall = palette.add(
         painted_steel(rng, ((0.45, 0.5, 0.44), (0.7, 0.68, 0.62))[int(rng.integers(2))], roughness=0.8)
     )
@@ -284,7 +284,7 @@ def _site(rng: np.random.Generator, palette: Palette, materials: MastMaterials) 
 
 
 def _land(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """A hilltop or the edge of a village."""
+    """Build a hilltop or the edge of a village."""
     small: Float[np.ndarray, "4 4"] = np.diag([0.4, 0.4, 0.4, 1.0])
     village = draw_spots(rng, int(rng.integers(0, 9)), 16 / 0.4, 50 / 0.4)
     parts = [

@@ -40,7 +40,7 @@ KINDS: dict[str, Callable[[np.random.Generator, Palette, BridgePlan], Mesh]] = {
 
 
 def bridge(rng: np.random.Generator) -> Stage:
-    """A bridge of one of five kinds, seen from the water or from a bank."""
+    """Build a stage with a bridge of one of five kinds, seen from the water or from a bank."""
     palette = Palette()
     plan = draw_bridge_plan(rng, palette)
     kind = str(rng.choice(list(KINDS)))
@@ -60,7 +60,7 @@ def bridge(rng: np.random.Generator) -> Stage:
 
 
 def _orbit(rng: np.random.Generator, plan: BridgePlan) -> Orbit:
-    """Viewpoints on a boat in the middle of the river, or higher at an angle from a bank."""
+    """Return viewpoints from a boat in mid-river, or higher, oblique ones from a bank."""
     side_deg = 90.0 if rng.random() < 0.5 else 270.0
     centre_m = (0.0, 0.0, plan.level_m + 0.3)
     if rng.random() < 0.4:
@@ -88,7 +88,7 @@ def _street_lamps(rng: np.random.Generator, palette: Palette, plan: BridgePlan) 
 
 
 def _traffic(rng: np.random.Generator, palette: Palette, plan: BridgePlan, fifths: Sequence[int]) -> Mesh:
-    """Two or more vehicles in two lanes, driving on the right, on some fifths of the road."""
+    """Build two or more vehicles in two lanes, driving on the right, on the given fifths of the road."""
     kinds = [vehicle.transform(np.diag([SCALE, SCALE, SCALE, 1.0])) for vehicle in fleet(rng, palette)]
     slots = rng.permutation([(fifth, lane) for fifth in fifths for lane in (0, 1)])
     placed = []
@@ -103,7 +103,7 @@ def _traffic(rng: np.random.Generator, palette: Palette, plan: BridgePlan, fifth
 
 
 def _banks(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> list[Mesh]:
-    """Ground on both sides at road level, slopes to the water, and vegetation."""
+    """Build ground and roads at road level on both banks, slopes to the water, vegetation and houses."""
     grass = palette.add(
         Material(
             texture=str(rng.choice(["grass", "grass", "soil"])),
@@ -132,7 +132,7 @@ def _banks(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> list
 
 
 def _bank(rng: np.random.Generator, plan: BridgePlan, side: int, grass: int, slope: int) -> Mesh:
-    """The slope from below the water to road level, and the land behind."""
+    """Build a bank's slope from below the water to road level, and the land behind it."""
     y = 9 * np.sinh(np.linspace(-3.0, 3.0, 61))
     edge = (
         plan.half_m
@@ -156,7 +156,7 @@ def _bank(rng: np.random.Generator, plan: BridgePlan, side: int, grass: int, slo
         for a, b in ((3, 4), (6, -5), (11, 9))
     )
     land = np.stack([x, np.broadcast_to(y, x.shape), plan.level_m - 0.05 + level * bumps], -1)
-    # The sheet must face up on both sides, so one of them reverses its columns.
+    # The sheet must face up on both banks, so one of them reverses its columns.
     order = slice(None, None, -1)
     return join_meshes(
         sheet((points if side < 0 else points[:, order]) * [side, 1, 1], material)
@@ -165,7 +165,7 @@ def _bank(rng: np.random.Generator, plan: BridgePlan, side: int, grass: int, slo
 
 
 def _growth(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> list[Mesh]:
-    """Trees, bushes, boulders and houses on the banks, in the bridge's scale, away from the road."""
+    """Build trees, bushes, boulders and houses on the banks, at the bridge's scale and away from the road."""
 
     def spots(count: int, nearest_m: float, farthest_m: float) -> np.ndarray:
         around = draw_spots(rng, count, nearest_m, farthest_m)

@@ -1,4 +1,4 @@
-"""Scene `crane`: a tower crane over a building site, or a container crane at a quay."""
+"""Scene `crane`: a tower crane over a building site, or a container crane on a quay."""
 
 from dataclasses import dataclass
 
@@ -42,9 +42,9 @@ class TowerCranePlan:
 
     Attributes:
         ring_m: height of the slewing ring on top of the mast.
-        head_m: height of the head above the ring; 0 without head.
-        trolley_m: x of the trolley.
-        rope_m: from the jib to the hook.
+        head_m: height of the tower head above `deck_m`; 0 if there is no head.
+        trolley_m: x coordinate of the trolley.
+        rope_m: length of the rope from the jib to the hook.
     """
 
     ring_m: float
@@ -58,7 +58,7 @@ class TowerCranePlan:
 
     @property
     def deck_m(self) -> float:
-        """Height of the jib's lower chords and the counter-jib."""
+        """Height of the jib's lower chords and of the counter-jib."""
         return self.ring_m + 0.22
 
 
@@ -77,13 +77,13 @@ class TowerCraneMaterials:
 
 
 def crane(rng: np.random.Generator) -> Stage:
-    """A tower crane of 5.5 to 6.5 m, or a container crane of about 6 m."""
+    """Build a stage with a tower crane of 5.5 to 6.5 m or a container crane of about 6 m."""
     return _tower_crane(rng) if rng.random() < 0.68 else quay_crane(rng)
 
 
 def _tower_crane(rng: np.random.Generator) -> Stage:
     palette, plan = Palette(), _draw_plan(rng)
-    # Turned away from the shell at negative y, so that the load does not intersect it.
+    # Turn the crane away from the building shell at negative y, so that the load does not intersect it.
     target = _crane(rng, palette, plan).transform(rotation((0, 0, 1), rng.uniform(-8, 30)))
     site = building_site(rng, palette)
     light = daylight(rng)
@@ -151,7 +151,7 @@ def _crane(rng: np.random.Generator, palette: Palette, plan: TowerCranePlan) -> 
 
 
 def _mast(plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
-    """Mast with ladder and landings, on a slab with four anchors."""
+    """Build the mast with its ladder and landings, on a slab with four anchors."""
     joints = mast_rings(*mast_levels((0.3, plan.ring_m - 0.1), (plan.side_m, plan.side_m), 0.95))
     lattice = truss(joints, "zigzag").banded_mesh(0.024, 0.012, materials.mast, (np.inf, 0.8))
     landings = np.arange(1.0, plan.ring_m - 0.4, 0.9)[:, None] * [0, 0, 1]
@@ -176,7 +176,7 @@ def _mast(plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
 
 
 def _slewing(plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
-    """Slewing ring, platform with railing, cab, and head if any."""
+    """Build the slewing ring, the platform with its railing, the cab, and the tower head if there is one."""
     z, half = plan.ring_m, plan.side_m / 2
     ring = lathe(
         [(0, -0.06), (half, -0.06), (half + 0.02, 0.0), (half, 0.03), (0, 0.03)], materials.steel, 28
@@ -206,7 +206,7 @@ def _slewing(plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
 
 
 def _jib(plan: TowerCranePlan) -> Float[np.ndarray, "k 3 3"]:
-    """Joints of the jib: two lower chords and one upper chord, tapering towards the tip."""
+    """Return the joints of the jib's two lower chords and upper chord, which taper towards the tip."""
     count = max(round((plan.jib_m - 0.2) / 0.3), 2)
     x = np.linspace(0.2, plan.jib_m, count + 1)
     share = (x - 0.2) / (plan.jib_m - 0.2)
@@ -231,7 +231,7 @@ def _jib_mesh(plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
 
 
 def _counter_jib(rng: np.random.Generator, plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
-    """Two beams with deck and railings, counterweights, winch, cabinet, signs."""
+    """Build the counter-jib: beams with a deck, railings, counterweights, a winch, a cabinet and signs."""
     end, half, z = -plan.counter_m, 0.42 * plan.side_m, plan.deck_m
     beams = [(0.5 * end, side * half, z) for side in (1, -1)]
     count = int(rng.integers(3, 6))
@@ -268,7 +268,7 @@ def _counter_jib(rng: np.random.Generator, plan: TowerCranePlan, materials: Towe
 
 
 def _pendants(plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
-    """Ties from the head to both jibs; without head, struts to the jib's upper chord."""
+    """Build ties from the tower head to both jibs or, without a head, struts to the jib's upper chord."""
     joints = _jib(plan)
     half = 0.42 * plan.side_m
     sides = np.array([[1, half, 1], [1, -half, 1]])
@@ -284,7 +284,7 @@ def _pendants(plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
 
 
 def _hook(plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
-    """Trolley, ropes, hook block and hook."""
+    """Build the trolley, ropes, hook block and hook."""
     x, z = plan.trolley_m, plan.deck_m
     low = z - plan.rope_m
     half = 0.4 * plan.side_m
@@ -316,7 +316,7 @@ def _hook(plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
 
 
 def _load(rng: np.random.Generator, plan: TowerCranePlan, materials: TowerCraneMaterials) -> Mesh:
-    """The load: a concrete panel or a bundle of bars in slings, or a bucket."""
+    """Build the load: a concrete panel or a bundle of bars in slings, or a bucket."""
     at = np.array([plan.trolley_m, 0, plan.deck_m - plan.rope_m - 0.19])
     kind = str(rng.choice(["panel", "bars", "bucket"]))
     if kind == "bucket":

@@ -22,12 +22,12 @@ from stereoweave.synth.stage import Palette, Stage
 from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Colour, Mesh, Sky, World, join_meshes
 
-# Figures close to the cameras with a distant background.
+# The figures are close to the cameras and the background is distant.
 _NEAREST_PX = (55.0, 175.0)
 
 
 def figures(rng: np.random.Generator) -> Stage:
-    """Three to seven rounded figures with plain surfaces, the nearest about 1 to 2 m from the cameras."""
+    """Build a stage with three to seven plain, rounded figures, the nearest 1 to 2 m from the cameras."""
     distance_m, lowest_deg = rng.uniform((3.0, -4.0), (5.0, 12.0)).tolist()
     orbit = Orbit(
         centre_m=(0.0, 0.0, rng.uniform(0.9, 1.4)),
@@ -44,7 +44,7 @@ def figures(rng: np.random.Generator) -> Stage:
 
 
 def _cast(rng: np.random.Generator, palette: Palette, distance_m: float) -> Mesh:
-    """Figures from close to the cameras, which are at x = distance_m, to behind the centre."""
+    """Build figures from close to the cameras, which are at x = distance_m, to behind the centre."""
     clothes = [draw_clothes(rng, palette) for _ in range(3)]
     kinds = [animal(rng, palette) for _ in range(2)]
     depths_m = np.geomspace(rng.uniform(0.95, 1.8), distance_m + 4, int(rng.integers(3, 8)))
@@ -53,7 +53,7 @@ def _cast(rng: np.random.Generator, palette: Palette, distance_m: float) -> Mesh
         if rng.random() < 0.6:
             figure, size = person(rng, clothes[int(rng.integers(3))]), rng.uniform(0.7, 1.1)
         else:
-            # Limits the size so that the nose stays clear of the cameras.
+            # Limit the size, so that the nose stays clear of the cameras.
             figure, size = kinds[int(rng.integers(2))], min(rng.uniform(0.7, 1.6), 0.65 * depth_m)
         pose = rotation((0, 0, 1), rng.uniform(-100, 100)) @ np.diag([size, size, size, 1.0])
         cast.append(
@@ -63,7 +63,7 @@ def _cast(rng: np.random.Generator, palette: Palette, distance_m: float) -> Mesh
 
 
 def _hall(rng: np.random.Generator, palette: Palette, orbit: Orbit, cast: Mesh) -> World:
-    """A large room with lamps, and some clutter."""
+    """Build a large room with the figures, lamps and some clutter."""
     size_m = 2 * orbit.distance_m[1] + rng.uniform(1.5, 8.0, 3)
     size_m[2] = rng.uniform(2.8, 5.0)
     space = ClutterSpace(
@@ -88,7 +88,7 @@ def _hall(rng: np.random.Generator, palette: Palette, orbit: Orbit, cast: Mesh) 
 
 
 def _open_air(rng: np.random.Generator, palette: Palette, orbit: Orbit, cast: Mesh) -> World:
-    """Open ground with distant trees, rocks, houses and hills, often in soft light."""
+    """Build open ground with the figures and distant trees, rocks, houses and hills, often in soft light."""
     family = str(rng.choice(["grass", "soil", "gravel", "concrete", "plain"], p=[0.2, 0.15, 0.15, 0.1, 0.4]))
     parts = [
         cast,
@@ -109,7 +109,7 @@ def _open_air(rng: np.random.Generator, palette: Palette, orbit: Orbit, cast: Me
 
 
 def _soften(rng: np.random.Generator, sky: Sky) -> Sky:
-    """Dim the sun; in half of the draws it keeps its full strength."""
+    """Dim the sun in half of the draws."""
     share = rng.choice([1.0, rng.uniform(0.1, 0.6)])
 
     def dim(colour: Colour) -> Colour:

@@ -1,7 +1,7 @@
-"""Scene `boards`: near plain boards, tables and walls, with textured things on, beside and behind them.
+"""Scene `boards`: plain boards, tables and walls near the cameras, among textured objects.
 
 The interior of a plain surface cannot be matched, so its disparity follows from its outlines alone. Real
-rooms are full of such surfaces, near the cameras and larger than training crops.
+rooms are full of such surfaces, which are often near the cameras and larger than training crops.
 """
 
 from collections.abc import Sequence
@@ -21,30 +21,31 @@ from stereoweave.synth.world import Colour, Lamp, Material, Mesh, Sky, World, jo
 
 # The cameras look along y, so that the foreground can be placed in front of them.
 _AHEAD_DEG, _SWING_DEG = 270.0, 6.0
-# Half of the view's width at 1 m for the longest focal length of `viewpoints.draw_focal_px`.
+# Half the width of the view at a distance of 1 m, for the longest focal length of
+# `viewpoints.draw_focal_px`.
 _HALF_VIEW = 0.38
-# Gives most plain surfaces 20 to 120 px.
+# Gives most plain surfaces a disparity of 20 to 120 px.
 _NEAREST_PX = (32.0, 130.0)
 _BAR_M = 0.015
-# A texel of the faint noise is then larger than the visible surface.
+# Texture period at which a texel of the faint noise is larger than the visible surface.
 _EVEN_SPAN_M = 200.0
 # Without sensor noise the slightest shading would be matchable, unlike in photographs.
 _NOISE_LEVELS = (0.5, 1.5)
-# Materials of things; with those of the room they stay within a renderer's 64.
+# Number of materials of the objects; with the room's materials, they stay within a renderer's limit of 64.
 _SURFACES = 16
-# Chairs and the like would look like toys on a table.
+# Objects for table tops; furniture such as chairs would look like toys on a table.
 _SMALL = (*SOLIDS, book_stack, picture, plant)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Foreground:
-    """The foreground.
+    """Plain surfaces near the cameras, with places for objects on them.
 
     Attributes:
-        plain: the near plain surfaces.
+        plain: mesh of the plain surfaces.
         orbit: viewpoints around a point on the z axis.
-        spots_m: [N, 4], spots of small things on them: x, y, z and size.
-        end_m: y at which the foreground ends; the room continues behind.
+        spots_m: [N, 4], places for small objects: x, y, z and size.
+        end_m: y at which the foreground ends; the room continues behind it.
     """
 
     plain: Mesh
@@ -54,7 +55,7 @@ class _Foreground:
 
 
 def plain_boards(rng: np.random.Generator) -> Stage:
-    """A room behind standing boards, a table top or a wall, all close to the cameras."""
+    """Build a room behind standing boards, a table top or a wall, all of them close to the cameras."""
     palette = Palette()
     foreground = (_standing_boards, _table_top, _wall)[rng.integers(3)](rng, palette)
     width_m, depth_m, height_m = rng.uniform([3.5, 1.5, 2.5], [6.5, 3.5, 3.4]).tolist()
@@ -78,14 +79,14 @@ def plain_boards(rng: np.random.Generator) -> Stage:
 
 
 def _standing_boards(rng: np.random.Generator, palette: Palette) -> _Foreground:
-    """One to three boards, partitions or cupboards, each with a vertical edge in the picture."""
+    """Build one to three boards, partitions or cupboards, each with a vertical edge in the picture."""
     distance_m, eye_m = rng.uniform(1.2, 1.9), rng.uniform(0.9, 1.4)
     away_m = [rng.uniform(0.65, 1.0), *rng.uniform(1.0, 1.8, rng.integers(0, 3)).tolist()]
     side = rng.choice([-1, 1])
     parts = []
     for k, away in enumerate(away_m):
         width_m = away * rng.uniform(0.7, 1.4)
-        # Boards behind leave a gap beside the first: otherwise no outline would be visible.
+        # The boards behind leave a gap beside the first one, because no outline would be visible otherwise.
         edge_m = rng.uniform(*((-0.6, 0.4) if k == 0 else (0.65, 0.85))) * away * _HALF_VIEW
         top_m = eye_m + away * rng.uniform(0.05, 0.5)
         pose = rotation((0, 0, 1), rng.normal(0, 15))
@@ -101,7 +102,7 @@ def _standing_boards(rng: np.random.Generator, palette: Palette) -> _Foreground:
 
 
 def _table_top(rng: np.random.Generator, palette: Palette) -> _Foreground:
-    """A table larger than the picture, with things on it, and at times a board at its end."""
+    """Build a table larger than the picture, with places for objects and sometimes a board at its end."""
     distance_m, table_m, end_m = rng.uniform(0.8, 1.3), rng.uniform(0.65, 0.85), rng.uniform(0.15, 0.7)
     width_m, length_m = rng.uniform(1.6, 3.0), distance_m + end_m + 0.4
     top = boxes([[0, 0, -0.02]], [[width_m, length_m, 0.04]], palette.add(_plain(rng)))
@@ -122,7 +123,7 @@ def _table_top(rng: np.random.Generator, palette: Palette) -> _Foreground:
 
 
 def _wall(rng: np.random.Generator, palette: Palette) -> _Foreground:
-    """A wall, seen frontally or obliquely, with a sideboard and things on it."""
+    """Build a wall, seen frontally or obliquely, and a sideboard with places for objects."""
     distance_m, eye_m = rng.uniform(1.1, 1.7), rng.uniform(0.95, 1.3)
     turned_deg = rng.choice([-1, 1]) * rng.uniform(0, 60)
     length_m, end_m = rng.uniform(0.9, 1.6) * distance_m, rng.uniform(-0.1, 0.3)
@@ -146,7 +147,7 @@ def _wall(rng: np.random.Generator, palette: Palette) -> _Foreground:
 
 
 def _board(rng: np.random.Generator, palette: Palette, width_m: float, top_m: float) -> Mesh:
-    """A board, partition or cupboard with its front at y = 0, up to top_m, on the floor or on feet."""
+    """Build a board, partition or cupboard of height top_m, with its front at y = 0, perhaps on feet."""
     low_m = 0.0 if rng.random() < 0.6 else rng.uniform(0.05, 0.3) * top_m
     depth_m, tall_m = rng.choice([rng.uniform(0.01, 0.04), rng.uniform(0.15, 0.5)]), top_m - low_m
     middle_m, trim = low_m + tall_m / 2, palette.add(_trim(rng))
@@ -165,7 +166,7 @@ def _board(rng: np.random.Generator, palette: Palette, width_m: float, top_m: fl
 
 
 def _orbit(rng: np.random.Generator, distance_m: float, aim_m: float, elevation_deg: float) -> Orbit:
-    """A small arc of viewpoints around the point at height aim_m on the z axis."""
+    """Return a small arc of viewpoints around the point at height aim_m on the z axis."""
     turned_deg = _AHEAD_DEG + rng.normal(0, 4)
     return Orbit(
         centre_m=(0.0, 0.0, aim_m),
@@ -178,7 +179,7 @@ def _orbit(rng: np.random.Generator, distance_m: float, aim_m: float, elevation_
 
 
 def _plain(rng: np.random.Generator) -> Material:
-    """Draw a material of one muted colour; 30 % have faint noise, 25 % are glossy."""
+    """Draw a material of one muted colour; 30 % of the draws have faint noise and 25 % are glossy."""
     even = rng.random() < 0.7
     return Material(
         texture="plain",
@@ -201,7 +202,7 @@ def _spots(
     level_m: float,
     sizes: tuple[float, float],
 ) -> Float[np.ndarray, "n 4"]:
-    """Spots at each y, across the picture's width; sizes are shares of the distance to the cameras."""
+    """Draw a spot at each y, across the view's width; sizes are fractions of the distance to the cameras."""
     away_m = along_m + distance_m
     x = rng.permutation(np.linspace(-1.3, 1.3, len(along_m))) * _HALF_VIEW * away_m
     sizes_m = rng.uniform(*sizes, len(along_m)) * away_m
@@ -211,13 +212,13 @@ def _spots(
 def _floor_spots(
     rng: np.random.Generator, foreground: _Foreground, depth_m: float
 ) -> Float[np.ndarray, "n 4"]:
-    """Spots of 8 to 16 things behind the foreground."""
+    """Draw places for 8 to 16 objects on the floor behind the foreground."""
     along_m = foreground.end_m + np.linspace(0.35, depth_m - 0.4, int(rng.integers(8, 17)))
     return _spots(rng, along_m, foreground.orbit.distance_m[0], 0.0, (0.25, 0.6))
 
 
 def _thing(rng: np.random.Generator, skins: Sequence[int], spot_m: Float[np.ndarray, "4"]) -> Mesh:
-    """A solid or a piece of furniture at a spot."""
+    """Build a solid or a piece of furniture at a spot."""
     kinds = FURNITURE if spot_m[2] == 0 and rng.random() < 0.6 else _SMALL
     main, other = (skins[k] for k in rng.integers(len(skins), size=2))
     mesh = kinds[rng.integers(len(kinds))](rng, PropStyle(main=main, other=other, bar_m=_BAR_M))
@@ -230,7 +231,7 @@ def _thing(rng: np.random.Generator, skins: Sequence[int], spot_m: Float[np.ndar
 
 
 def _light(rng: np.random.Generator, lamps: Sequence[Lamp]) -> tuple[Sky, float]:
-    """Ambient light from walls and ceiling, without sun, and the exposure for it and the lamps."""
+    """Draw ambient light from walls and ceiling, without sun; return it with a suitable exposure."""
     ambient = rng.uniform(0.25, 0.6)
     tint = np.array([1.0, 0.97, 0.92]) * rng.uniform(0.96, 1.04, 3)
 

@@ -15,7 +15,7 @@ from stereoweave.synth.stage import Palette, Stage
 from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Colour, Lamp, Material, Mesh, Sky, World, join_meshes
 
-# Finishes of propellers: texture and variants, colour, roughness, metal.
+# Finishes of propellers: texture, its variants, colour, roughness and metal.
 _FINISHES: tuple[tuple[str, tuple[int, ...], Colour, float, float], ...] = (
     ("steel", (0, 2), (1.6, 1.15, 0.6), 0.3, 0.9),  # polished bronze
     ("steel", (1, 2), (1.1, 0.8, 0.45), 0.45, 0.7),  # worn bronze
@@ -27,7 +27,7 @@ _FINISHES: tuple[tuple[str, tuple[int, ...], Colour, float, float], ...] = (
 
 @dataclass(frozen=True, kw_only=True)
 class _Surroundings:
-    """Surroundings of a propeller: mesh, height of the floor, and lamps."""
+    """Surroundings of a propeller: their mesh, the height of their floor, and their lamps."""
 
     mesh: Mesh
     floor_m: float
@@ -35,7 +35,7 @@ class _Surroundings:
 
 
 def propeller(rng: np.random.Generator) -> Stage:
-    """A propeller of 4.6 to 5.6 m, seen from aft."""
+    """Build a stage with a propeller of 4.6 to 5.6 m, seen from aft."""
     palette, propeller = Palette(), draw_propeller(rng)
     bolt = palette.add(Material(texture="steel", tint=(0.5, 0.5, 0.5), roughness=0.5, metal=0.7))
     bronze = palette.add(_draw_finish(rng))
@@ -92,7 +92,7 @@ def _turn_sun_aft(rng: np.random.Generator, sky: Sky) -> Sky:
 def _shipyard(
     rng: np.random.Generator, palette: Palette, propeller: Propeller, docked: bool
 ) -> _Surroundings:
-    """The ship's stern on blocks above the propeller, with equipment of the yard."""
+    """Build the ship's stern on blocks above the propeller, among shipyard equipment."""
     ship = stern(rng, palette, propeller)
     floor_m, half_m = ship.keel_m - rng.uniform(0.9, 1.3), rng.uniform(8.0, 9.5)
     light, shining = work_lamps(rng, palette, floor_m)
@@ -110,7 +110,7 @@ def _shipyard(
 
 
 def _park(rng: np.random.Generator, palette: Palette, propeller: Propeller) -> _Surroundings:
-    """A plinth with the propeller on a short shaft, among paths, benches, trees and houses."""
+    """Build a plinth that carries the propeller on a short shaft, among paths, benches, trees and houses."""
     floor_m = -propeller.radius_m - rng.uniform(0.7, 1.1)
     angle = np.radians(np.arange(95, 266, 5.5)) + rng.normal(0, 0.01, 32)
     close = draw_spots(rng, 22, 9.5, 14)
@@ -131,7 +131,7 @@ def _park(rng: np.random.Generator, palette: Palette, propeller: Propeller) -> _
 
 
 def _plinth(rng: np.random.Generator, palette: Palette, propeller: Propeller, floor_m: float) -> Mesh:
-    """Two steps, a tapering pier behind the hub, and a plaque."""
+    """Build two steps, a tapering pier behind the hub, a plaque, and a chain around them."""
     texture = str(rng.choice(["stone", "concrete", "brick"]))
     stone = palette.add(
         Material(texture=texture, variant=int(rng.integers(64)), tint=vary_colour(rng, (0.8, 0.78, 0.74)))
@@ -159,7 +159,7 @@ def _plinth(rng: np.random.Generator, palette: Palette, propeller: Propeller, fl
 
 
 def _path(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """A paved circle around the plinth, and a path to it."""
+    """Build a paved circle around the plinth and a path to it."""
     paving = palette.add(
         Material(
             texture=str(rng.choice(["gravel", "stone", "concrete"])),

@@ -1,4 +1,4 @@
-"""Scene `pylon`: a high-voltage line over fields, with one lattice tower close and others far away."""
+"""Scene `pylon`: a high-voltage line over fields, with one lattice tower close by and others far away."""
 
 from dataclasses import dataclass, replace
 
@@ -26,7 +26,7 @@ from stereoweave.synth.stage import Palette, Stage, outdoor_stage
 from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Material, Mesh, join_meshes
 
-# Per arm: height and reach as shares of the tower's height, and conductors on each side.
+# For each arm: height and reach as fractions of the tower's height, and number of conductors on each side.
 KINDS: dict[str, tuple[tuple[float, float, int], ...]] = {
     "single level": ((0.76, 0.33, 3),),
     "danube": ((0.64, 0.30, 2), (0.80, 0.19, 1)),
@@ -34,7 +34,7 @@ KINDS: dict[str, tuple[tuple[float, float, int], ...]] = {
     "fir tree": ((0.55, 0.24, 1), (0.70, 0.19, 1), (0.85, 0.14, 1)),
 }
 ARM_PANELS = 6
-REACH_M = 4.4  # lines within this distance belong to the target
+REACH_M = 4.4  # lines within this distance of the tower's middle belong to the target
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,10 +42,10 @@ class PylonPlan:
     """Dimensions of a tower; the line runs along y, the arms along x.
 
     Attributes:
-        arms: height_m, reach_m and conductors on each side, from the lowest up.
-        widths_m: width of the body at the ground, at the lowest and at the highest arm.
+        arms: height_m, reach_m and number of conductors on each side for each arm, from the lowest up.
+        widths_m: widths of the body at the ground, at the lowest arm and at the highest arm.
         span_m: distance to the next tower.
-        strained: tension insulators along the line instead of suspension insulators.
+        strained: whether tension insulators along the line replace suspension insulators.
         bundle_m: distance between the wires of a twin bundle; 0 for single wires.
     """
 
@@ -62,7 +62,7 @@ class PylonPlan:
 
 
 def pylon(rng: np.random.Generator) -> Stage:
-    """A tower of 6.5 to 7.5 m."""
+    """Build a stage with a tower of 6.5 to 7.5 m."""
     palette, plan = Palette(), _draw_plan(rng)
     tower, steel = _tower(rng, palette, plan)
     lines, wire = _lines(rng, palette, plan)
@@ -92,7 +92,7 @@ def _draw_plan(rng: np.random.Generator) -> PylonPlan:
 
 
 def _orbit(rng: np.random.Generator, plan: PylonPlan) -> Orbit:
-    """Low viewpoints, or beside the line at any height, so that no wire is right in front of the cameras."""
+    """Return viewpoints that are low or beside the line, so that no wire is right in front of the cameras."""
     beside = bool(rng.random() < 0.6)
     middle = float(rng.choice([90, 270]))
     if beside:
@@ -111,7 +111,7 @@ def _orbit(rng: np.random.Generator, plan: PylonPlan) -> Orbit:
 
 
 def _trusses(plan: PylonPlan) -> list[Truss]:
-    """Trusses of the body below and above the lowest arm, and of the arms on both sides."""
+    """Return the trusses of the body below and above the lowest arm, and of the arms on both sides."""
     foot, waist, neck = plan.widths_m
     lowest, highest = plan.arms[0][0], plan.arms[-1][0] + plan.depth_m
     below = mast_levels((0.0, lowest), (foot, waist), 0.95)
@@ -128,7 +128,7 @@ def _trusses(plan: PylonPlan) -> list[Truss]:
 
 
 def _arm(plan: PylonPlan, height_m: float, reach_m: float) -> Float[np.ndarray, "k 4 3"]:
-    """Joints of an arm from body to tip; the first two of each ring are the lower ones."""
+    """Return the joints of an arm from body to tip; the first two of each ring are the lower ones."""
     low, high = (_width(plan, z) / 2 for z in (height_m, height_m + plan.depth_m))
     top = height_m + plan.depth_m
     root = np.array([[low, -low, height_m], [low, low, height_m], [high, high, top], [high, -high, top]])
@@ -148,7 +148,7 @@ def _mirror(arm: Truss) -> Truss:
 
 
 def _hooks(plan: PylonPlan) -> Points:
-    """Attachment points of the insulator strings below the arms."""
+    """Return the attachment points of the insulator strings below the arms."""
     inner = []
     for height, reach, count in plan.arms:
         low = _width(plan, height) / 2
@@ -159,7 +159,7 @@ def _hooks(plan: PylonPlan) -> Points:
 
 
 def _tower(rng: np.random.Generator, palette: Palette, plan: PylonPlan) -> tuple[Mesh, int]:
-    """The tower with fittings, and the index of its steel."""
+    """Build the tower with its fittings; return its mesh and the material index of its steel."""
     steel = palette.add(_steel(rng))
     leg, brace = 0.028 * plan.bar_m, 0.013 * plan.bar_m
     trusses = _trusses(plan)
@@ -181,7 +181,7 @@ def _steel(rng: np.random.Generator) -> Material:
 def _fittings(
     rng: np.random.Generator, palette: Palette, plan: PylonPlan, body: Truss, steel: int
 ) -> list[Mesh]:
-    """Footings, gusset plates, step bolts, anti-climbing guard, sign."""
+    """Build the footings, gusset plates, step bolts, anti-climbing guard and sign."""
     concrete = palette.add(Material(texture="concrete", variant=int(rng.integers(8)), span_m=1.0))
     yellow = palette.add(
         Material(texture="sign", variant=int(rng.integers(8)), tint=(0.9, 0.7, 0.1), span_m=0.3)
@@ -210,7 +210,7 @@ def _body_width(plan: PylonPlan, z_m: float) -> float:
 
 
 def _steps(plan: PylonPlan) -> Segments:
-    """Step bolts on the first leg, on alternating sides."""
+    """Return the step bolts of the first leg, which stick out on alternating sides."""
     heights = np.arange(0.2 * plan.height_m, plan.arms[0][0], 0.075)
     half = np.interp(heights, (0, plan.arms[0][0]), plan.widths_m[:2]) / 2
     at = np.column_stack([half, half, heights])
@@ -219,7 +219,7 @@ def _steps(plan: PylonPlan) -> Segments:
 
 
 def _lines(rng: np.random.Generator, palette: Palette, plan: PylonPlan) -> tuple[Mesh, int]:
-    """Insulator strings, conductors both ways and earth wire; and the index of the wires' material."""
+    """Build the insulators, conductors and earth wire; return their mesh and the wires' material index."""
     tints = ((0.32, 0.16, 0.1), (0.55, 0.62, 0.6), (0.2, 0.22, 0.24))
     glass = palette.add(
         Material(texture="plain", tint=tints[int(rng.integers(3))], roughness=0.2, span_m=0.5)
@@ -244,7 +244,7 @@ def _lines(rng: np.random.Generator, palette: Palette, plan: PylonPlan) -> tuple
 
 
 def _wires(plan: PylonPlan, starts_m: Points, way: int, wire: int) -> Mesh:
-    """Conductors over two spans, single or as twin bundles with spacers."""
+    """Build conductors over two spans, single or in twin bundles with spacers."""
     aside = np.array([plan.bundle_m / 2, 0, 0])
     along = np.array([0, way * plan.span_m, 0])
     parts = []
@@ -261,13 +261,13 @@ def _wires(plan: PylonPlan, starts_m: Points, way: int, wire: int) -> Mesh:
 
 
 def _mark_near(lines: Mesh, plan: PylonPlan) -> Mesh:
-    """Mark the lines close to the tower as target."""
+    """Mark the lines close to the tower as part of the target."""
     away = lines.corners_m - np.array([0, 0, 0.52 * plan.height_m], np.float32)
     return replace(lines, target=(np.linalg.norm(away, axis=2) < REACH_M).all(1))
 
 
 def _far_towers(plan: PylonPlan, steel: int, wire: int) -> Mesh:
-    """Simpler copies of the tower along the line."""
+    """Build simplified copies of the tower along the line."""
     hooks = _hooks(plan)
     tower = [part.mesh(0.03, 0.015, steel, sides=3) for part in _trusses(plan)]
     strings = [] if plan.strained else [cables(hooks, hooks - [0, 0, plan.string_m], 0.03, wire, count=1)]
@@ -276,7 +276,7 @@ def _far_towers(plan: PylonPlan, steel: int, wire: int) -> Mesh:
 
 
 def _land(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """Fields or meadows, trees beside the line, hills behind."""
+    """Build fields or meadows with trees beside the line and hills behind them."""
     small = np.diag([0.4, 0.4, 0.4, 1.0])
     family = str(rng.choice(["grass", "grass", "grass", "soil"]))
     spots = draw_spots(rng, int(rng.integers(16, 34)), 11, 60)

@@ -1,4 +1,4 @@
-"""Container cranes on a quay: portal on rails, boom over the sea, stays, trolley, containers, a ship."""
+"""A container crane on a quay: its portal, boom, stays and trolley, with containers and often a ship."""
 
 from dataclasses import dataclass, replace
 
@@ -28,10 +28,10 @@ BOXES: tuple[Colour, ...] = (
     (0.45, 0.12, 0.08), (0.1, 0.2, 0.38), (0.5, 0.5, 0.48), (0.6, 0.32, 0.08), (0.14, 0.3, 0.2)
 )  # fmt: skip
 CONTAINER_M = np.array([1.1, 0.28, 0.3])
-GAUGE_M, BASE_M = 1.15, 0.95  # half the distances between legs along x and y
+GAUGE_M, BASE_M = 1.15, 0.95  # half the distances between the legs along x and y
 GIRDER_M = 3.7  # height of the boom
 BACK_M, TIP_M = -2.3, 4.0
-EDGE_M = 1.9  # x of the quay's edge
+EDGE_M = 1.9  # x coordinate of the quay's edge
 WATER_M = -0.55
 
 
@@ -48,7 +48,7 @@ class QuayCraneMaterials:
 
 
 def quay_crane(rng: np.random.Generator) -> Stage:
-    """A container crane with its boom along x, on a quay along y."""
+    """Build a stage with a container crane on a quay along y, its boom along x."""
     palette = Palette()
     materials = _draw_materials(rng, palette)
     colours = [palette.add(painted_steel(rng, colour, roughness=0.6)) for colour in BOXES]
@@ -56,7 +56,7 @@ def quay_crane(rng: np.random.Generator) -> Stage:
         [_portal(materials), _boom(materials), _stays(materials), _trolley(rng, materials, colours)]
     )
     mesh = join_meshes([crane.as_target(), _quay(rng, palette, colours)])
-    # Viewpoints on one side, where boom and portal are seen from the side; mirroring adds the other.
+    # The viewpoints are on one side, which shows boom and portal in profile; mirroring adds the other side.
     mirrored = rng.random() < 0.5
     light = daylight(rng)
     mesh = _mirror(mesh) if mirrored else mesh
@@ -87,7 +87,7 @@ def _draw_materials(rng: np.random.Generator, palette: Palette) -> QuayCraneMate
 
 
 def _portal(materials: QuayCraneMaterials) -> Mesh:
-    """Legs, beams, braces, bogies on rails, a lift, ladders with landings."""
+    """Build the portal: legs, beams, braces, bogies on rails, a lift, and ladders with landings."""
     corner = np.array([(a, b, 0) for a in (GAUGE_M, -GAUGE_M) for b in (BASE_M, -BASE_M)])
     sides = np.array([[1, BASE_M, 1], [1, -BASE_M, 1]])
     wheels = (corner[:, None] + [[0, d, 0.08] for d in (-0.24, -0.08, 0.08, 0.24)]).reshape(-1, 3)
@@ -115,7 +115,7 @@ def _portal(materials: QuayCraneMaterials) -> Mesh:
 
 
 def _climb(materials: QuayCraneMaterials) -> Mesh:
-    """Caged ladders between landings on the landward leg."""
+    """Build caged ladders between landings on a landward leg."""
     y = BASE_M + 0.12
     landings = np.array([1.5, 2.6, GIRDER_M - 0.02])
     parts = [boxes([(-GAUGE_M, y + 0.02, z) for z in landings], (0.5, 0.26, 0.015), materials.steel)]
@@ -130,7 +130,7 @@ def _climb(materials: QuayCraneMaterials) -> Mesh:
 
 
 def _boom(materials: QuayCraneMaterials) -> Mesh:
-    """Two lattice girders with walkways and cross beams; machinery house at the back."""
+    """Build two lattice girders with walkways and cross beams, and the machinery house at their back."""
     x = np.linspace(BACK_M, TIP_M, 22)
     square = np.array([[-0.06, -0.0], [0.06, -0.0], [0.06, 0.26], [-0.06, 0.26]])
     parts = []
@@ -162,7 +162,7 @@ def _boom(materials: QuayCraneMaterials) -> Mesh:
 
 
 def _stays(materials: QuayCraneMaterials) -> Mesh:
-    """The A-frame above the portal, and the stays to the boom."""
+    """Build the A-frame above the portal and the stays from it to the boom."""
     sides = np.array([[1, 1.0, 1], [1, -1.0, 1]])
     apex = sides * [GAUGE_M + 0.1, 0.2, GIRDER_M + 1.95]
     front, back = sides * [GAUGE_M, BASE_M, GIRDER_M], sides * [-GAUGE_M, 0.28, GIRDER_M + 0.26]
@@ -183,7 +183,7 @@ def _stays(materials: QuayCraneMaterials) -> Mesh:
 
 
 def _trolley(rng: np.random.Generator, materials: QuayCraneMaterials, colours: list[int]) -> Mesh:
-    """Trolley, cab, ropes, spreader, and at times a container."""
+    """Build the trolley, its cab, ropes and spreader, and often a container."""
     x, low = rng.uniform(-0.4, 3.4), rng.uniform(1.2, 2.6)
     z = GIRDER_M - 0.08
     corners = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]])
@@ -207,7 +207,7 @@ def _trolley(rng: np.random.Generator, materials: QuayCraneMaterials, colours: l
 
 
 def _container(colour: int, dark: int) -> Mesh:
-    """A container on z = 0 along x: ribbed sides, posts, locking bars on the doors."""
+    """Build a container along x on z = 0, with ribbed sides, posts, and locking bars on its doors."""
     length, width, height = CONTAINER_M
     x = np.linspace(-0.42, 0.42, 7) * length
     ribs = np.array([(a, b * (width / 2 - 0.004), height / 2) for a in x for b in (1, -1)])
@@ -224,7 +224,7 @@ def _container(colour: int, dark: int) -> Mesh:
 
 
 def _quay(rng: np.random.Generator, palette: Palette, colours: list[int]) -> Mesh:
-    """The quay with rails, fenders, bollards and container stacks, the sea, a distant shore."""
+    """Build the quay with its rails, fenders, bollards and containers, the sea, and a distant shore."""
     concrete = palette.add(
         Material(
             texture="concrete", variant=int(rng.integers(8)), tint=(0.78, 0.77, 0.74), span_m=3.5, relief=0.4
@@ -252,7 +252,7 @@ def _quay(rng: np.random.Generator, palette: Palette, colours: list[int]) -> Mes
 
 
 def _ship(rng: np.random.Generator, palette: Palette, colours: list[int], dark: int) -> Mesh:
-    """A container ship alongside, its bow beyond the crane, bridge and containers astern."""
+    """Build a container ship alongside: its bow is beyond the crane, its bridge and containers are astern."""
     hull = palette.add(
         painted_steel(rng, ((0.08, 0.12, 0.2), (0.3, 0.06, 0.05), (0.07, 0.2, 0.15))[int(rng.integers(3))])
     )
@@ -274,13 +274,13 @@ def _ship(rng: np.random.Generator, palette: Palette, colours: list[int], dark: 
 
 
 def _yard(rng: np.random.Generator, colours: list[int], dark: int) -> Mesh:
-    """Container stacks on the landward side."""
+    """Build container stacks on the landward side."""
     x, y = (values.ravel() for values in np.meshgrid(-3.2 - 0.31 * np.arange(4), -1.2 - 1.35 * np.arange(8)))
     return _stacks(rng, colours, dark, np.stack([x, y, 0 * x], -1))
 
 
 def _stacks(rng: np.random.Generator, colours: list[int], dark: int, feet_m: np.ndarray) -> Mesh:
-    """Containers along y, in stacks of zero to four at each foot."""
+    """Build a stack of zero to four containers along y at each point of `feet_m`."""
     high = rng.integers(0, 5, len(feet_m))
     level = np.concatenate([np.arange(count) for count in high])
     at = np.repeat(feet_m, high, axis=0) + level[:, None] * [0, 0, CONTAINER_M[2]]

@@ -1,4 +1,4 @@
-"""Large dishes: reflector on a lattice of ribs, feed on struts, yoke, pedestal or alidade."""
+"""Large radio dishes: a reflector on a lattice of ribs, a feed on struts, and a mount."""
 
 import numpy as np
 from jaxtyping import Float
@@ -24,7 +24,7 @@ RIBS = 16
 
 
 def radio_dish(rng: np.random.Generator) -> Stage:
-    """A dish of 3.6 to 4.4 m facing +x, with more of its kind behind."""
+    """Build a stage with a dish of 3.6 to 4.4 m that faces +x, and similar dishes in the distance."""
     palette = Palette()
     white, steel = palette.add(composite_skin(rng)), palette.add(galvanised_steel(rng))
     back = white if rng.random() < 0.5 else steel
@@ -55,7 +55,7 @@ def radio_dish(rng: np.random.Generator) -> Stage:
 
 
 def _far(rng: np.random.Generator, white: int, measures: tuple[float, float, float]) -> Mesh:
-    """Simpler distant dishes of the same dimensions (radius, axis height, elevation)."""
+    """Build simplified, distant dishes of the same dimensions (radius, axis height, elevation)."""
     radius, axis, upwards_deg = measures
     reflector = paraboloid(radius, 0.8 * radius, white, white, 20)
     dish = [
@@ -68,7 +68,7 @@ def _far(rng: np.random.Generator, white: int, measures: tuple[float, float, flo
 
 
 def _reflector(rng: np.random.Generator, radius_m: float, skins: tuple[int, int, int, int]) -> Mesh:
-    """Paraboloid around z with ribs behind, struts and receiver in front."""
+    """Build a paraboloid around z with ribs behind it and with struts and a receiver in front."""
     white, back, steel, dark = skins
     focal = rng.uniform(0.7, 0.85) * radius_m
     count = int(rng.choice([3, 4]))
@@ -116,7 +116,7 @@ def _reflector(rng: np.random.Generator, radius_m: float, skins: tuple[int, int,
 
 
 def _seams(radius_m: float, focal_m: float) -> Float[np.ndarray, "n 2 3"]:
-    """Seams between the reflector's panels: radial and circular lines on its front."""
+    """Return the seams between the reflector's panels: radial and circular lines on its front."""
     radius, angle = np.meshgrid(
         np.linspace(0.2, 0.97, 9) * radius_m, np.linspace(0, 2 * np.pi, 4 * RIBS + 1), indexing="ij"
     )
@@ -125,7 +125,7 @@ def _seams(radius_m: float, focal_m: float) -> Float[np.ndarray, "n 2 3"]:
 
 
 def _ribs(radius_m: float, focal_m: float) -> Float[np.ndarray, "n 2 3"]:
-    """The lattice behind the reflector: radial ribs with chords, posts and braces, and rings."""
+    """Return the bars behind the reflector: radial ribs of chords, posts and braces, and rings."""
     radius = np.linspace(0.18, 0.98, 6) * radius_m
     angle = np.arange(RIBS) * 2 * np.pi / RIBS
     across = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
@@ -146,7 +146,7 @@ def _ribs(radius_m: float, focal_m: float) -> Float[np.ndarray, "n 2 3"]:
 
 
 def _yoke(axis_m: float, foot_m: float, skins: tuple[int, int, int, int]) -> Mesh:
-    """Two arms up to the elevation axis, drives, and a counterweight."""
+    """Build two arms up to the elevation axis, drives, and a counterweight."""
     white, steel, _, dark = skins
     height = axis_m - foot_m
     arms = [boxes((-0.05, y, foot_m + height / 2), (0.34, 0.12, height + 0.24), white) for y in (0.46, -0.46)]
@@ -163,7 +163,7 @@ def _yoke(axis_m: float, foot_m: float, skins: tuple[int, int, int, int]) -> Mes
 
 
 def _pedestal(axis_m: float, skins: tuple[int, int, int, int]) -> Mesh:
-    """A steel cone on concrete with door, platform, railing and caged ladder."""
+    """Build a steel cone on concrete with a door, a platform with a railing, and a caged ladder."""
     white, steel, concrete, dark = skins
     top = axis_m - 0.75
     angle = np.linspace(0, 2 * np.pi, 21)
@@ -183,7 +183,7 @@ def _pedestal(axis_m: float, skins: tuple[int, int, int, int]) -> Mesh:
 
 
 def _alidade(axis_m: float, skins: tuple[int, int, int, int]) -> Mesh:
-    """A lattice on wheels and a circular rail, with a ladder."""
+    """Build a lattice that turns on wheels on a circular rail, with a ladder."""
     white, steel, concrete, dark = skins
     top, wide = axis_m - 0.75, 1.05
     corner = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]])
@@ -221,7 +221,7 @@ def _alidade(axis_m: float, skins: tuple[int, int, int, int]) -> Mesh:
 
 
 def _land(rng: np.random.Generator, palette: Palette, concrete: int) -> Mesh:
-    """Open ground with a path, distant buildings, trees, hills."""
+    """Build open ground with a path, distant buildings, trees and hills."""
     small = np.diag([0.4, 0.4, 0.4, 1.0])
     family = str(rng.choice(["grass", "grass", "gravel", "soil"]))
     path = boxes((1.0, 8.0, 0.0), (0.9, 17.0, 0.02), concrete).transform(

@@ -40,7 +40,7 @@ UNITS: dict[str, Callable[[np.random.Generator, RefineryMaterials], RefineryUnit
     "chimney": chimney,
     "flare": flare,
 }
-# Number of each, minimum and maximum: enough for people to recognise a refinery.
+# Least and greatest number of each unit, enough for people to recognise a refinery.
 _COUNTS = {
     "column": (3, 3),
     "ball tank": (1, 2),
@@ -52,13 +52,13 @@ _COUNTS = {
 _PLOTS_X_M = (-2.7, -0.9, 0.9, 2.7)
 _PLOTS_Y_M = (-2.75, -1.4, 1.4, 2.75)
 _HALF_RACK_M = 3.3
-_YARD_M = 13.5  # half a side
-# Surroundings have their real size.
+_YARD_M = 13.5  # half of the yard's side
+# Props of the surroundings are built at real size; this shrinks them to the refinery's scale.
 _SMALL = np.diag([0.3, 0.3, 0.3, 1.0])
 
 
 def refinery(rng: np.random.Generator) -> Stage:
-    """A refinery of 10 to 12 units, seen from any side."""
+    """Build a stage with a refinery of 10 to 12 units, seen from any side."""
     palette = Palette()
     materials = _draw_materials(rng, palette)
     rusty = Material(texture="rust", variant=int(rng.integers(64)), span_m=0.8)
@@ -116,13 +116,13 @@ def _draw_materials(rng: np.random.Generator, palette: Palette) -> RefineryMater
 
 
 def _units(rng: np.random.Generator, materials: RefineryMaterials, lines: tuple[int, ...]) -> list[Mesh]:
-    """The units on their plots, and pipes from their nozzles to the rack."""
+    """Build the units on their plots, and pipes from their nozzles to the rack."""
     plots = iter(np.array([(x, y) for x in _PLOTS_X_M for y in _PLOTS_Y_M])[rng.permutation(16)])
     meshes: list[Mesh] = []
     routes: dict[int, list[Float[np.ndarray, "_ 3"]]] = {}
     for name, counts in _COUNTS.items():
         count = int(rng.integers(counts[0], counts[1] + 1))
-        # Two may be identical, because building them takes most of the time.
+        # Two units may be identical, because building units takes most of the time.
         kinds = [UNITS[name](rng, materials) for _ in range((count + 1) // 2)]
         for k in range(count):
             x, y = next(plots)
@@ -138,7 +138,7 @@ def _units(rng: np.random.Generator, materials: RefineryMaterials, lines: tuple[
 def _route(
     rng: np.random.Generator, start_m: Float[np.ndarray, "3"], plot_m: tuple[float, float]
 ) -> Float[np.ndarray, "_ 3"]:
-    """Route of a pipe from a nozzle to a lane between the plots, along the lane, and into the rack."""
+    """Return a pipe's route from a nozzle to a lane between the plots, along the lane, and into the rack."""
     x, y, z = start_m
     lane_x, side = plot_m[0] + rng.choice([-1, 1]) * rng.uniform(0.7, 0.88), np.sign(plot_m[1])
     high_m, into_m = float(rng.choice([0.17, 0.51, 0.63])), float(rng.choice([0.8, 1.16]))
@@ -155,7 +155,7 @@ def _rack(rng: np.random.Generator, materials: RefineryMaterials, lines: tuple[i
 
 
 def _yard(rng: np.random.Generator, palette: Palette, materials: RefineryMaterials) -> list[Mesh]:
-    """The yard: a slab under the plant, signs, drums, pallets."""
+    """Build the yard: a slab under the plant, signs, drums and pallets."""
     slab = boxes([[0, 0, 0.0]], [[8.4, 8.0, 0.03]], materials.concrete)
     spots = np.column_stack(
         [rng.uniform(-3.6, 3.6, 6), rng.choice([-1, 1], 6) * rng.uniform(3.5, 3.9, 6), np.zeros(6)]
@@ -168,7 +168,7 @@ def _yard(rng: np.random.Generator, palette: Palette, materials: RefineryMateria
 
 
 def _ground(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """A paved yard in open land."""
+    """Build a paved yard in open land."""
     family = str(rng.choice(["concrete", "asphalt", "gravel"]))
     paving = Material(
         texture=family, variant=int(rng.integers(64)), tint=(0.9, 0.88, 0.85), span_m=1.6, roughness=0.95
@@ -181,7 +181,7 @@ def _ground(rng: np.random.Generator, palette: Palette) -> Mesh:
 
 
 def _tank_farm(rng: np.random.Generator, materials: RefineryMaterials) -> Mesh:
-    """Large distant tanks on one side."""
+    """Build large, distant tanks on one side."""
     spots = draw_spots(rng, 24, 18.0, 42.0)
     spots = spots[np.argsort(-spots @ [np.cos(way := rng.uniform(0, 6)), np.sin(way), 0])[:7]]
     profile = np.array(

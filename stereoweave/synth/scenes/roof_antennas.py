@@ -1,4 +1,4 @@
-"""Roof antennas: masts with yagis, dishes and whips among chimneys on a flat roof in a town."""
+"""Roof antennas: masts with Yagi antennas, dishes and whips among the chimneys of a flat roof in a town."""
 
 import numpy as np
 
@@ -10,12 +10,12 @@ from stereoweave.synth.stage import Palette, Stage, outdoor_stage
 from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Material, Mesh, join_meshes
 
-STREET_M = -8.0  # the roof is at 0
+STREET_M = -8.0  # height of the street; the roof is at 0
 SPOTS_M = np.array([(0.1, 0.2, 0), (0.7, -1.5, 0), (0.5, 1.7, 0), (-1.1, -0.8, 0), (-1.2, 1.0, 0)])
 
 
 def roof_antennas(rng: np.random.Generator) -> Stage:
-    """Five masts of 1.9 to 3.3 m."""
+    """Build a stage with five antenna masts of 1.9 to 3.3 m."""
     palette = Palette()
     steel, other = palette.add(galvanised_steel(rng)), palette.add(galvanised_steel(rng))
     grey = rng.uniform(0.5, 0.8)
@@ -42,7 +42,7 @@ def roof_antennas(rng: np.random.Generator) -> Stage:
 
 
 def _mast(rng: np.random.Generator, height_m: float, skins: tuple[int, int, int], steel: int) -> Mesh:
-    """A pole on a tripod or with guys, with antennas one below another, and a cable."""
+    """Build a pole on a tripod or with guy wires, carrying a cable and a column of antennas."""
     mast, cover, dark = skins
     parts = [
         tubes((0, 0, 0), (0, 0, height_m), 0.022, mast, 10),
@@ -62,13 +62,13 @@ def _mast(rng: np.random.Generator, height_m: float, skins: tuple[int, int, int]
 
 
 def _draw_antenna(rng: np.random.Generator, skins: tuple[int, int, int]) -> tuple[Mesh, float]:
-    """Draw an antenna. Returns its mesh and the length of mast it occupies."""
+    """Draw an antenna; return its mesh and the length of mast that it occupies, in metres."""
     steel, cover, dark = skins
     kind = str(rng.choice(["yagi", "wide", "dish", "dipoles", "panel"], p=[0.4, 0.2, 0.24, 0.1, 0.06]))
     if kind == "yagi":
         return yagi(rng.uniform(0.8, 1.3), int(rng.integers(9, 16)), steel, dark), 0.5
     if kind == "wide":
-        # For long waves: a few long rods, as wide as the boom is long.
+        # An antenna for long waves: it has a few rods, as long as its boom.
         broad = yagi(0.45, 4, steel, dark)
         return broad.transform(np.diag([2.2, 2.2, 2.2, 1.0])), 0.85
     if kind == "dish":
@@ -92,7 +92,7 @@ def _tripod(steel: int) -> Mesh:
 
 
 def _roof(rng: np.random.Generator, palette: Palette, feet: np.ndarray, dark: int) -> Mesh:
-    """The building with parapet, chimneys, vents, stair shed, coolers and cables."""
+    """Build the building with its parapet, chimneys, vents, stair shed, cooling units and cables."""
     gravel = palette.add(
         Material(
             texture=str(rng.choice(["gravel", "asphalt", "concrete"])),
@@ -129,7 +129,7 @@ def _roof(rng: np.random.Generator, palette: Palette, feet: np.ndarray, dark: in
 
 
 def _windows(half_m: np.ndarray, dark: int, white: int) -> Mesh:
-    """Rows of windows on the street walls."""
+    """Build rows of windows in the street walls."""
     y, z = (values.ravel() for values in np.meshgrid(np.linspace(-2.8, 2.8, 5), [-1.7, -4.2, -6.7]))
     x = np.full_like(y, half_m[0])
     front = np.stack([x, y, z], -1)
@@ -145,7 +145,7 @@ def _windows(half_m: np.ndarray, dark: int, white: int) -> Mesh:
 
 
 def _chimneys(rng: np.random.Generator, wall: int, dark: int, zinc: int) -> Mesh:
-    """A chimney stack with pots, and ventilators."""
+    """Build a chimney stack with pots, and three ventilators."""
     x, y = -2.2, rng.uniform(-0.4, 0.4)
     pots = np.array([(x, y + d, 1.28) for d in (-0.3, 0.0, 0.3)])
     vent = lathe([(0.07, 0), (0.07, 0.35), (0.13, 0.36), (0.15, 0.42), (0.1, 0.52), (0, 0.54)], zinc, 20)
@@ -160,7 +160,7 @@ def _chimneys(rng: np.random.Generator, wall: int, dark: int, zinc: int) -> Mesh
 
 
 def _cooler(white: int, dark: int) -> Mesh:
-    """A cooling unit on feet with its fan in front."""
+    """Build a cooling unit on feet, with its fan in front."""
     fan = lathe([(0.2, 0), (0.2, 0.03), (0.17, 0.035), (0, 0.02)], dark, 20)
     return join_meshes(
         [
@@ -172,7 +172,7 @@ def _cooler(white: int, dark: int) -> Mesh:
 
 
 def _run(foot_m: np.ndarray, dark: int) -> Mesh:
-    """A cable on the roof from a mast to the shed."""
+    """Build a cable on the roof from a mast to the stair shed."""
     share = np.linspace(0, 1, 14)[:, None]
     path = foot_m + share * (np.array([-2.36, 1.1, 0.02]) - foot_m) + [0, 0, 0.012]
     path[:, 1] += 0.25 * np.sin(share[:, 0] * 2 * np.pi)
@@ -180,7 +180,7 @@ def _run(foot_m: np.ndarray, dark: int) -> Mesh:
 
 
 def _town(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """Houses and trees at street level."""
+    """Build houses and trees at street level, with hills behind them."""
     street = np.array([0, 0, STREET_M])
     return join_meshes(
         [

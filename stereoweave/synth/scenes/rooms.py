@@ -1,4 +1,4 @@
-"""Scene `rooms`, for training: table tops, rooms and open ground with things of all shapes and materials."""
+"""Scene `rooms`, for training: table tops, rooms and open ground with objects of all shapes and materials."""
 
 from collections.abc import Sequence
 
@@ -24,22 +24,23 @@ from stereoweave.synth.stage import Palette, Stage
 from stereoweave.synth.viewpoints import Orbit
 from stereoweave.synth.world import Mesh, World, join_meshes
 
-# A narrow arc, so that things can be placed in view of all viewpoints.
+# The arc is narrow, so that objects can be placed in view of all viewpoints.
 _SWING_DEG = 12.0
 # Probabilities of table tops, rooms and open ground.
 _SHARES = (0.64, 0.24, 0.12)
-# Larger than in other scenes: in real indoor pairs 6 to 8 % of the left picture is outside the right one.
+# Larger than in other scenes, because 6 to 8 % of the left image lies outside the right one in real indoor
+# pairs.
 _NEAREST_PX = (60.0, 170.0)
 
 
 def rooms(rng: np.random.Generator) -> Stage:
-    """A table top, a room or open ground with 9 to 40 things, seen from an arc around its centre."""
+    """Build a table top, a room or open ground with 9 to 40 objects, seen from an arc around its centre."""
     kinds = (_table_top, _room, _ground)
     return kinds[rng.choice(len(kinds), p=_SHARES)](rng)
 
 
 def _table_top(rng: np.random.Generator) -> Stage:
-    """A table close to the cameras in a closed room, with boards on it and a wall behind it."""
+    """Build a closed room with a table close to the cameras, boards on the table and a wall behind it."""
     palette = Palette()
     sizes, size_m = draw_table_top(rng), rng.uniform([6.5, 6.5, 2.5], [9.0, 9.0, 3.5])
     azimuth_deg, lowest_deg = rng.uniform((0, 6), (360, 28)).tolist()
@@ -139,7 +140,7 @@ def _ground(rng: np.random.Generator) -> Stage:
 
 
 def _far_off(rng: np.random.Generator, palette: Palette) -> Sequence[Mesh]:
-    """A random choice of hills, houses and rocks."""
+    """Build a random choice of distant hills, houses and rocks."""
     far = []
     if rng.random() < 0.6:
         far.append(hills(rng, palette, distance_m=rng.uniform(70, 130)))
@@ -151,7 +152,7 @@ def _far_off(rng: np.random.Generator, palette: Palette) -> Sequence[Mesh]:
 
 
 def _walls(rng: np.random.Generator, palette: Palette, cameras_deg: float, away_m: float) -> Mesh:
-    """One to four free-standing walls beyond the centre, opposite the cameras."""
+    """Build one to four free-standing walls beyond the centre, opposite the cameras."""
     walls = []
     for _ in range(int(rng.integers(1, 5))):
         material = palette.add(
@@ -167,7 +168,7 @@ def _walls(rng: np.random.Generator, palette: Palette, cameras_deg: float, away_
 
 
 def _orbit_inside(rng: np.random.Generator, size_m: Float[np.ndarray, "3"]) -> Orbit:
-    """An arc around the room's centre, as wide as the walls allow, at eye level."""
+    """Return an arc around the room's centre, at eye level and as far from it as the walls allow."""
     azimuth_deg = rng.uniform(0, 360)
     angle = np.radians(np.linspace(azimuth_deg, azimuth_deg + _SWING_DEG, 9))
     to_wall_m = np.minimum(size_m[0] / 2 / abs(np.cos(angle)), size_m[1] / 2 / abs(np.sin(angle))).min()

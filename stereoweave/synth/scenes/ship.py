@@ -27,7 +27,7 @@ from stereoweave.synth.world import Colour, Material, Mesh, join_meshes
 
 
 def ship(rng: np.random.Generator) -> Stage:
-    """A ship of 7 to 8.5 m, mostly or entirely in the picture."""
+    """Build a stage with a ship of 7 to 8.5 m, most or all of which is in the picture."""
     palette = Palette()
     plan = TRADES[str(rng.choice(list(TRADES)))](rng)
     heel = rotation((1, 0, 0), rng.normal(0, 0.8)) @ rotation((0, 1, 0), rng.normal(0, 0.6))
@@ -47,7 +47,7 @@ def ship(rng: np.random.Generator) -> Stage:
     return outdoor_stage(mesh, palette, light, orbit)
 
 
-# Colours of hull, stripe, bottom, house and trim, as used by fleets.
+# Colours of hull, stripe, bottom, house and trim, as real fleets use them.
 _LIVERIES: tuple[tuple[Colour, Colour, Colour, Colour, Colour], ...] = (
     ((0.05, 0.06, 0.07), (0.9, 0.9, 0.87), (0.42, 0.1, 0.07), (0.9, 0.88, 0.82), (0.6, 0.3, 0.08)),
     ((0.06, 0.13, 0.28), (0.9, 0.9, 0.87), (0.4, 0.11, 0.08), (0.95, 0.95, 0.93), (0.62, 0.12, 0.08)),
@@ -60,7 +60,7 @@ _LIVERIES: tuple[tuple[Colour, Colour, Colour, Colour, Colour], ...] = (
 
 
 def _build_ship(rng: np.random.Generator, palette: Palette, plan: ShipPlan) -> Mesh:
-    """Build the ship afloat."""
+    """Build the ship with its waterline at z = 0."""
     side, stripe, bottom, walls, trim = _LIVERIES[rng.integers(len(_LIVERIES))]
     coats = [
         palette.add(replace(painted_steel(rng, colour), span_m=rng.uniform(3, 5)))
@@ -116,7 +116,7 @@ def _draw_materials(rng: np.random.Generator, palette: Palette, walls: Colour, t
 
 
 def _houses(rng: np.random.Generator, plan: ShipPlan, materials: ShipMaterials) -> Mesh:
-    """Deckhouse and bridge with their fittings."""
+    """Build the deckhouse and the bridge with their fittings."""
     house, bridge = plan.house, plan.bridge
     starboard, front, port, back = house.walls_m()
     pieces = [house.mesh(materials.house, materials.roof), bridge.mesh(materials.house, materials.roof, 0.09)]
@@ -150,7 +150,7 @@ def _houses(rng: np.random.Generator, plan: ShipPlan, materials: ShipMaterials) 
 
 
 def _rigging(plan: ShipPlan, foot: Point, materials: ShipMaterials) -> Mesh:
-    """Stays from the mast to bow and stern, and a searchlight on the bridge."""
+    """Build stays from the mast to bow and stern, and a searchlight on the bridge."""
     top = foot + [-0.05 * plan.mast_m[1], 0, 0.92 * plan.mast_m[1]]
     bow, aft = plan.hull.length_m / 2, -plan.hull.length_m / 2
     ends = np.array(
@@ -165,7 +165,7 @@ def _rigging(plan: ShipPlan, foot: Point, materials: ShipMaterials) -> Mesh:
 
 
 def _roof_rails(plan: ShipPlan, materials: ShipMaterials) -> Mesh:
-    """A railing around the after part of the deckhouse's roof, and a ladder to the bridge's roof."""
+    """Build a railing around the after part of the deckhouse roof, and a ladder to the bridge roof."""
     _, top = plan.house.corners_m(-0.05)
     top = top + [0, 0, 0.05]
     ahead = (plan.bridge.x_m[0] - plan.house.x_m[0]) / (plan.house.x_m[1] - plan.house.x_m[0])
@@ -182,7 +182,7 @@ def _roof_rails(plan: ShipPlan, materials: ShipMaterials) -> Mesh:
 
 
 def _forward(plan: ShipPlan, materials: ShipMaterials) -> Mesh:
-    """Windlass, bitts, vents and anchors on the forecastle."""
+    """Build the windlass, bitts, vents and anchors of the forecastle."""
     hull = plan.hull
     bow = hull.length_m / 2
     ends = np.array([[0.14], [0.76]])
@@ -205,7 +205,7 @@ def _forward(plan: ShipPlan, materials: ShipMaterials) -> Mesh:
 
 
 def _name(hull: Hull, sign: int) -> Mesh:
-    """Name plates on both bows and on the stern."""
+    """Build name plates on both sides of the bow and on the stern."""
     plates = []
     for side in (1, -1):
         plates.append(hull.patch((48, 54), (3, 5), side, sign))
@@ -216,7 +216,7 @@ def _name(hull: Hull, sign: int) -> Mesh:
 
 
 def _fenders(hull: Hull, materials: ShipMaterials) -> Mesh:
-    """Tyres along both sides."""
+    """Build tyre fenders along both sides."""
     share = np.linspace(0.06, 0.76, 9)
     hung = []
     for side in (1, -1):
@@ -226,7 +226,7 @@ def _fenders(hull: Hull, materials: ShipMaterials) -> Mesh:
 
 
 def _rails(hull: Hull, materials: ShipMaterials) -> Mesh:
-    """Railings along both sides and the stern."""
+    """Build railings along both sides and the stern."""
     share = np.linspace(0.985, 0.0, 14)
     port, starboard = (hull.side_m(share, hull.edge_m(share), side) * [1, 0.97, 1] for side in (1, -1))
     return railing(np.concatenate([port, starboard[::-1]]), 0.36, 0.6, 0.011, materials.white, 3)

@@ -20,7 +20,7 @@ _NEAREST_PX = (25.0, 130.0)
 
 
 def street(rng: np.random.Generator) -> Stage:
-    """A street along x with house fronts, vehicles, people and posts, seen from 1.2 to 2 m above a lane."""
+    """Build a street along x with houses, vehicles, people and posts, seen from 1.2 to 2 m above a lane."""
     palette, plan = Palette(), draw_street_plan(rng)
     target = join_meshes([traffic(rng, palette, plan), walkers(rng, palette, plan)]).as_target()
     parts = [

@@ -1,4 +1,4 @@
-"""Scene `wind_turbine`: a wind turbine on a tube or lattice tower, at sea, or a wind pump."""
+"""Scene `wind_turbine`: a wind turbine on land or at sea, or a wind pump."""
 
 from dataclasses import dataclass
 
@@ -51,9 +51,9 @@ class TurbinePlan:
     """Dimensions of a wind turbine.
 
     Attributes:
-        foot_m: height of the tower's foot: the ground, or the platform at sea.
+        foot_m: height of the tower's foot, which is on the ground or, at sea, on a platform.
         hub_m: height of the tower's top.
-        radii_m: radius of the tower at foot and top; half the width of a lattice tower.
+        radii_m: radii of the tower at its foot and top; half the widths of a lattice tower.
     """
 
     kind: str
@@ -64,7 +64,7 @@ class TurbinePlan:
 
 
 def wind_turbine(rng: np.random.Generator) -> Stage:
-    """A turbine about 6.5 m high to the blade tips, its rotor facing +x; or a wind pump of 5 m."""
+    """Build a stage with a turbine, about 6.5 m high and with its rotor facing +x, or a wind pump of 5 m."""
     kind = str(rng.choice(list(KINDS), p=list(KINDS.values())))
     return _wind_pump(rng) if kind == "pump" else _turbine(rng, kind)
 
@@ -104,7 +104,7 @@ def _turbine(rng: np.random.Generator, kind: str) -> Stage:
     land = (_sea if kind == "sea" else _fields)(rng, palette, plan, materials)
     mesh = join_meshes([join_meshes(parts).as_target(), land])
     top_m = plan.hub_m + plan.rotor.radius_m
-    # From the front or from behind: from the side a rotor is a line.
+    # Seen from the front or from behind, because a rotor is only a line when seen from the side.
     front = float(rng.choice([0, 180], p=[0.7, 0.3]))
     orbit = Orbit(
         centre_m=(0.0, 0.0, 0.5 * top_m),
@@ -149,7 +149,7 @@ def _draw_materials(rng: np.random.Generator, palette: Palette) -> TurbineMateri
 
 
 def _tube(rng: np.random.Generator, palette: Palette, plan: TurbinePlan, materials: TurbineMaterials) -> Mesh:
-    """A tapering tower with flanges, at times with a green foot or a red band."""
+    """Build a tapering tower with flanges, sometimes with a green foot or a red band."""
     low, high = plan.foot_m, plan.hub_m
     z = np.linspace(low, high, 21)
     radius = np.interp(z, (low, high), plan.radii_m)
@@ -175,7 +175,7 @@ def _tube(rng: np.random.Generator, palette: Palette, plan: TurbinePlan, materia
 def _entrance(
     rng: np.random.Generator, palette: Palette, plan: TurbinePlan, materials: TurbineMaterials
 ) -> Mesh:
-    """Foundation, door with stairs and railings, transformer kiosk."""
+    """Build the foundation, the door with stairs and railings, and the transformer kiosk."""
     concrete = palette.add(Material(texture="concrete", variant=int(rng.integers(8)), span_m=1.2))
     kiosk = palette.add(painted_steel(rng, (0.25, 0.33, 0.26)))
     foot = plan.radii_m[0]
@@ -209,7 +209,7 @@ def _entrance(
 
 
 def _mast(rng: np.random.Generator, plan: TurbinePlan, materials: TurbineMaterials) -> Mesh:
-    """A guyed lattice met mast with cup anemometers and vanes on booms."""
+    """Build a guyed lattice mast with anemometers and wind vanes on booms."""
     top = rng.uniform(0.75, 0.92) * plan.hub_m
     lattice = truss(mast_rings(*mast_levels((0.0, top), (0.11, 0.11), 1.3), corners=3)).mesh(
         0.011, 0.006, materials.steel
@@ -240,7 +240,7 @@ def _mast(rng: np.random.Generator, plan: TurbinePlan, materials: TurbineMateria
 
 
 def _lattice(plan: TurbinePlan, materials: TurbineMaterials) -> Mesh:
-    """Four legs with cross bracing, ladder, platform below the nacelle, footings."""
+    """Build the lattice tower with cross bracing, a ladder, a platform below the nacelle, and footings."""
     wide = 2 * np.array(plan.radii_m)
     joints = mast_rings(*mast_levels((0.0, plan.hub_m - 0.1), tuple(wide), 0.95))
     top = plan.hub_m - 0.45
@@ -260,7 +260,7 @@ def _lattice(plan: TurbinePlan, materials: TurbineMaterials) -> Mesh:
 def _foundation(
     rng: np.random.Generator, palette: Palette, plan: TurbinePlan, materials: TurbineMaterials
 ) -> Mesh:
-    """Yellow offshore foundation: monopile or lattice, platform with railing, boat landing, crane."""
+    """Build an offshore foundation: a monopile or lattice, a platform, a boat landing and a crane."""
     yellow = palette.add(painted_steel(rng, (0.75, 0.5, 0.04)))
     weathered = palette.add(
         Material(texture="rust", variant=int(rng.integers(8)), tint=(0.6, 0.5, 0.35), span_m=0.8)
@@ -297,7 +297,7 @@ def _foundation(
 
 
 def _davit(top_m: float, yellow: int, materials: TurbineMaterials) -> Mesh:
-    """The platform's small crane."""
+    """Build the platform's small crane."""
     mast = np.array(
         [
             [(-0.1, 0.4, top_m), (-0.1, 0.4, top_m + 0.38)],
@@ -311,7 +311,7 @@ def _davit(top_m: float, yellow: int, materials: TurbineMaterials) -> Mesh:
 
 
 def _far(rng: np.random.Generator, plan: TurbinePlan, materials: TurbineMaterials, base: int) -> Mesh:
-    """Simpler distant turbines of the wind farm, facing the same way."""
+    """Build simplified, distant turbines of the wind farm, facing the same way."""
     tower = lathe([(1.1 * plan.radii_m[0], -0.3), (1.1 * plan.radii_m[0], plan.foot_m + 0.1)], base, 12)
     tube = lathe([(plan.radii_m[0], plan.foot_m), (plan.radii_m[1], plan.hub_m)], materials.white, 12)
     at = draw_spots(rng, int(rng.integers(3, 7)), 16, 75)
@@ -339,7 +339,7 @@ def _sea(rng: np.random.Generator, palette: Palette, plan: TurbinePlan, material
 def _fields(
     rng: np.random.Generator, palette: Palette, plan: TurbinePlan, materials: TurbineMaterials
 ) -> Mesh:
-    """Fields with a track, trees, houses, hills, and the other turbines of the wind farm."""
+    """Build fields with a track, trees, houses, hills, and the other turbines of the wind farm."""
     family = str(rng.choice(["grass", "grass", "grass", "soil"]))
     small = np.diag([0.4, 0.4, 0.4, 1.0])
     corners = np.array([(9.0, -30, 0), (9.5, -8, 0), (-9, -10, 0), (-30, -13, 0)]) * [
@@ -362,7 +362,7 @@ def _fields(
 
 
 def _track(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """A gravel track past the tower, and a crane pad."""
+    """Build a gravel track past the tower, and a crane pad."""
     tint: Colour = (0.9, 0.87, 0.82)
     gravel = palette.add(
         Material(texture="gravel", variant=int(rng.integers(8)), tint=tint, span_m=2.0, relief=0.6)
@@ -376,7 +376,7 @@ def _track(rng: np.random.Generator, palette: Palette) -> Mesh:
 
 
 def _dry_land(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """Dry ground with scrub, stones, a few trees, a fence, hills."""
+    """Build dry ground with scrub, stones, a few trees, a fence and hills."""
     small = np.diag([0.5, 0.5, 0.5, 1.0])
     corners = np.array([(-40, 14, 0), (-6, 11, 0), (18, 12, 0), (50, 18, 0)]) * [1, rng.choice([-1, 1]), 1]
     return join_meshes(

@@ -30,7 +30,7 @@ def test_every_kind_spans_the_river_within_its_bounds(kind):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_target_is_about_ten_metres_wide_and_the_cameras_stand_clear_of_everything(seed):
+def test_the_target_is_about_ten_metres_wide_and_the_cameras_are_clear_of_everything(seed):
     rng, stage = np.random.default_rng(seed), draw_stage_and_rig(seed)
     mesh = stage.world.mesh
     target_m = mesh.corners_m[mesh.target].reshape(-1, 3)
@@ -44,7 +44,7 @@ def test_the_target_is_about_ten_metres_wide_and_the_cameras_stand_clear_of_ever
         assert (below_m[:, 2] < eye_m[2]).all()
 
 
-def test_a_beam_lies_where_it_is_told():
+def test_a_beam_lies_between_its_given_ends():
     beam = beams([[1.0, 0, 2]], [[4.0, 0, 2]], (0.2, 0.4), 7)
     np.testing.assert_allclose(beam.corners_m.min((0, 1)), [1, -0.1, 1.8], atol=1e-6)
     np.testing.assert_allclose(beam.corners_m.max((0, 1)), [4, 0.1, 2.2], atol=1e-6)

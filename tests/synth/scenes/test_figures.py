@@ -10,14 +10,14 @@ SEEDS = range(8)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_an_animal_has_about_a_metre_and_stands_on_the_ground(seed):
+def test_an_animal_is_about_a_metre_long_and_stands_on_the_ground(seed):
     corners_m = animal(np.random.default_rng(seed), Palette()).corners_m.reshape(-1, 3)
     assert 0.9 < np.ptp(corners_m[:, 0]) < 2.2
     assert corners_m[:, 2].min() == pytest.approx(0.03, abs=0.08)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_the_nearest_figure_is_close_but_never_at_the_lens(seed):
+def test_the_nearest_figure_is_close_to_the_cameras_but_never_touches_them(seed):
     rng = np.random.default_rng(seed)
     stage = figures(rng)
     corners_m = stage.world.mesh.corners_m[stage.world.mesh.target].reshape(-1, 3)
@@ -34,6 +34,6 @@ def test_the_nearest_figure_is_close_but_never_at_the_lens(seed):
     assert 0.25 < min(nearest_m) < 2.5
 
 
-def test_half_of_the_scenes_are_in_halls():
+def test_half_of_the_scenes_are_indoors():
     halls = [bool(figures(np.random.default_rng(seed)).world.lamps) for seed in range(40)]
     assert 12 <= sum(halls) <= 28

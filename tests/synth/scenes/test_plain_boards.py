@@ -10,7 +10,7 @@ from stereoweave.synth.sets.pair_rendering import RenderSpec, draw_stage_and_rig
 
 SPEC = RenderSpec(scene="boards", seed=77, size_px=(160, 120))
 PAIRS = range(12)
-# A training's crop of 384x256, as a share of a picture of 640x480.
+# A training crop of 384x256, as a fraction of an image of 640x480.
 CROP = 0.32
 
 
@@ -21,7 +21,7 @@ def camera():
 
 @pytest.fixture(scope="module")
 def left_views(camera):
-    """Depth, disparity at 640 px width, and where the near plain surfaces are seen, of each pair."""
+    """Return each pair's depth, its disparity at a width of 640 px, and the mask of near plain surfaces."""
     views = []
     for index in PAIRS:
         stage, rig = draw_stage_and_rig(camera, SPEC, index)
@@ -34,7 +34,7 @@ def test_near_plain_surfaces_are_larger_than_a_training_crop_in_most_pairs(left_
     shares = [plain.mean() for _, _, plain in left_views]
     assert np.median(shares) > 0.5
     assert sum(share > CROP for share in shares) >= 0.8 * len(shares)
-    assert max(shares) < 0.99  # never without an outline
+    assert max(shares) < 0.99  # an outline is always visible
 
 
 def test_near_plain_surfaces_have_20_to_120_px_of_disparity(left_views):
@@ -49,7 +49,7 @@ def test_nothing_touches_the_cameras_and_the_room_is_closed(left_views):
     assert max(depth_m.max() for depth_m, _, _ in left_views) < 12
 
 
-def test_the_target_is_plain_and_the_rest_mostly_is_not():
+def test_the_target_is_plain_and_most_of_the_rest_is_not():
     plain_families, other_families = [], []
     for seed in range(6):
         world = plain_boards(np.random.default_rng(seed)).world
@@ -64,7 +64,7 @@ def test_the_target_is_plain_and_the_rest_mostly_is_not():
     assert np.mean(other_families) < 0.5
 
 
-def test_both_cameras_have_noise_of_their_own_and_the_truth_has_none(camera):
+def test_both_cameras_have_independent_noise_and_the_ground_truth_has_none(camera):
     stage, rig = draw_stage_and_rig(camera, SPEC, 0)
     ideal = [shot.image.astype(float) for shot in camera.render_views(stage.world, rig, (0.0, 1.0))]
     sample = render_pair(camera, SPEC, 0).sample

@@ -3,7 +3,7 @@ import pytest
 
 from stereoweave.synth.scenes.propeller import propeller
 
-SEEDS = (0, 1, 3, 4)  # five, four, three and six blades; the last in a park
+SEEDS = (0, 1, 3, 4)  # propellers with five, four, three and six blades; the last one is in a park
 
 
 @pytest.fixture(scope="module")
@@ -11,7 +11,7 @@ def stages():
     return [propeller(np.random.default_rng(seed)) for seed in SEEDS]
 
 
-def test_the_target_is_the_screw_alone_within_its_circle(stages):
+def test_the_target_is_only_the_propeller_within_its_circle(stages):
     for stage in stages:
         mesh = stage.world.mesh
         screw = mesh.corners_m[mesh.target]
@@ -20,7 +20,7 @@ def test_the_target_is_the_screw_alone_within_its_circle(stages):
         assert np.abs(screw[..., 0]).max() < 2.0
 
 
-def test_the_cameras_stay_abaft_the_screw_above_the_floor_and_clear_of_everything(stages):
+def test_the_cameras_stay_aft_of_the_propeller_above_the_floor_and_clear_of_everything(stages):
     for stage in stages:
         orbit, corners_m = stage.orbit, stage.world.mesh.corners_m.reshape(-1, 3)
         for azimuth_deg in np.linspace(*orbit.azimuth_deg, 5):
@@ -38,7 +38,7 @@ def test_the_cameras_stay_abaft_the_screw_above_the_floor_and_clear_of_everythin
                     assert np.linalg.norm(corners_m - eye_m, axis=1).min() > 0.4
 
 
-def test_screws_differ_in_blades_and_places(stages):
+def test_propellers_differ_in_blades_and_surroundings(stages):
     assert len({int(stage.world.mesh.target.sum()) for stage in stages}) == 4
     lit = {bool(stage.world.lamps) for stage in stages}
     grown = {any(material.texture == "grass" for material in stage.world.materials) for stage in stages}

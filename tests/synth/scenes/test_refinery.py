@@ -16,7 +16,7 @@ def draw_stage_and_rig(seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_target_is_the_plant_that_all_cameras_stand_outside_of(seed):
+def test_the_target_is_the_plant_and_all_cameras_are_outside_it(seed):
     stage = draw_stage_and_rig(seed)
     mesh = stage.world.mesh
     target_m = mesh.corners_m[mesh.target].reshape(-1, 3)
@@ -26,7 +26,7 @@ def test_the_target_is_the_plant_that_all_cameras_stand_outside_of(seed):
 
 
 @pytest.mark.parametrize("name", UNITS)
-def test_every_unit_keeps_to_its_plot_and_its_pipes_begin_there(name):
+def test_every_unit_and_its_nozzles_stay_within_its_plot(name):
     for seed in range(4):
         unit = UNITS[name](np.random.default_rng(seed), COATS)
         reach_m = np.linalg.norm(unit.mesh.corners_m[..., :2], axis=-1).max()
@@ -39,7 +39,7 @@ def test_every_unit_keeps_to_its_plot_and_its_pipes_begin_there(name):
 def test_pipes_follow_their_paths():
     path_m = np.array([[0.0, 0, 0], [0, 0, 1], [2, 0, 1]])
     mesh = pipes([path_m], [0.05], 3)
-    # The flanges stand out by 1.6 radii, the elbow by 0.15 of one.
+    # The flanges have 1.6 times the pipe's radius, and the elbow has 1.15 times the radius.
     np.testing.assert_allclose(mesh.corners_m.min((0, 1)), [-0.08, -0.08, 0], atol=0.002)
     np.testing.assert_allclose(mesh.corners_m.max((0, 1)), [2, 0.08, 1.08], atol=0.002)
     assert set(mesh.material) == {3}

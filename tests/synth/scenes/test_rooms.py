@@ -30,7 +30,7 @@ def draw_stage_and_rig(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_15_to_40_things_fill_the_room_and_keep_away_from_the_cameras(seed):
+def test_15_to_40_objects_fill_the_room_and_keep_away_from_the_cameras(seed):
     palette = Palette()
     things = clutter(np.random.default_rng(seed), palette, SPACE)
     assert COUNT[0] == 15
@@ -44,7 +44,7 @@ def test_15_to_40_things_fill_the_room_and_keep_away_from_the_cameras(seed):
     assert np.linalg.norm(corners_m - eyes_m.mean(0), axis=1).max() < 9
 
 
-def test_cameras_are_where_their_orbit_says():
+def test_cameras_are_within_the_ranges_of_their_orbit():
     eyes_m = SPACE.eyes_m() - [0, 0, 1]
     distances_m = np.linalg.norm(eyes_m, axis=1)
     assert distances_m.min() == pytest.approx(2)
@@ -54,7 +54,7 @@ def test_cameras_are_where_their_orbit_says():
     assert azimuths_deg.max() == pytest.approx(55)
 
 
-def test_only_the_things_are_the_target():
+def test_only_the_objects_are_the_target():
     for seed in range(4):
         stage = draw_stage_and_rig(seed)
         mesh = stage.world.mesh
@@ -64,7 +64,7 @@ def test_only_the_things_are_the_target():
         assert target_m[..., 2].min() > -0.8
 
 
-def test_a_fifth_of_the_surfaces_is_nearly_plain_and_a_third_shows_photographs(rng):
+def test_a_fifth_of_the_surfaces_are_nearly_plain_and_a_third_show_photographs(rng):
     families = [draw_material(rng, 3.0).texture for _ in range(4000)]
     assert 0.15 < families.count("plain") / 4000 < 0.25
     assert 0.30 < families.count("photograph") / 4000 < 0.40
@@ -81,7 +81,7 @@ def test_two_thirds_of_the_walls_floors_and_tables_are_plain_and_flat(rng):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_a_table_reaches_from_before_the_middle_to_the_wall_behind_it(seed):
+def test_a_table_reaches_from_the_front_of_its_centre_to_the_wall_behind_it(seed):
     rng = np.random.default_rng(seed)
     sizes = draw_table_top(rng)
     corners_m = table_top(rng, Palette(), sizes).corners_m
@@ -92,7 +92,7 @@ def test_a_table_reaches_from_before_the_middle_to_the_wall_behind_it(seed):
     assert np.ptp(surface_m[..., 1]) == pytest.approx(sizes.width_m)
 
 
-def test_boards_and_walls_of_a_table_keep_a_quarter_of_the_distance_away_from_the_cameras():
+def test_boards_and_walls_of_a_table_keep_a_quarter_of_the_distance_from_the_cameras():
     for seed in range(40):
         rng = np.random.default_rng(seed)
         sizes = draw_table_top(rng)
@@ -102,7 +102,7 @@ def test_boards_and_walls_of_a_table_keep_a_quarter_of_the_distance_away_from_th
         assert away_m.min() > 0.25 * sizes.distance_m
 
 
-def test_a_fifth_of_the_surfaces_shines(rng):
+def test_a_fifth_of_the_surfaces_are_glossy(rng):
     materials = [draw_material(rng, 3.0) for _ in range(4000)]
     glossy = [material for material in materials if material.roughness <= 0.4]
     assert 0.17 < len(glossy) / 4000 < 0.23
@@ -112,12 +112,12 @@ def test_a_fifth_of_the_surfaces_shines(rng):
 def test_textures_are_as_fine_as_pixels_at_any_distance(rng):
     for distance_m in (1.0, 4.0, 10.0):
         spans_px = [draw_material(rng, distance_m).span_m / distance_m * 600 for _ in range(300)]
-        assert min(spans_px) >= 169.9  # at 600 px focal length
+        assert min(spans_px) >= 169.9  # at a focal length of 600 px
         assert max(spans_px) <= 800.1
 
 
 @pytest.mark.parametrize("name", THINGS)
-def test_every_thing_has_about_a_metre_and_faces_outwards(name):
+def test_every_object_is_about_a_metre_in_size_and_faces_outwards(name):
     skin = PropStyle(main=3, other=5, bar_m=0.01)
     for seed in range(3):
         mesh = THINGS[name](np.random.default_rng(seed), skin)

@@ -1,4 +1,4 @@
-"""What holds for every scene: enough of everything, sound meshes, of their seed alone."""
+"""Tests of every scene: enough parts, valid meshes, and stages that depend only on their seed."""
 
 from dataclasses import fields
 
@@ -9,7 +9,7 @@ from stereoweave.synth.scenes import SCENES
 from stereoweave.synth.textures.bank import FAMILIES
 from stereoweave.synth.world import Mesh
 
-# Between them most kinds of each scene.
+# Together, these seeds give most kinds of each scene.
 SEEDS = range(5)
 
 
@@ -18,7 +18,7 @@ def stages(request):
     return [SCENES[request.param](np.random.default_rng(seed)) for seed in SEEDS]
 
 
-def test_there_are_triangles_materials_and_lamps_enough_and_no_more_than_a_renderer_takes(stages):
+def test_there_are_enough_triangles_and_materials_but_no_more_than_a_renderer_accepts(stages):
     for stage in stages:
         assert 20_000 <= len(stage.world.mesh.material) <= 90_000
         assert 0 < stage.world.mesh.target.sum() < len(stage.world.mesh.material)
@@ -27,7 +27,7 @@ def test_there_are_triangles_materials_and_lamps_enough_and_no_more_than_a_rende
         assert len(stage.world.lamps) <= 4
 
 
-def test_every_material_is_known_and_its_texture_in_the_bank(stages):
+def test_every_material_exists_and_its_texture_is_in_the_bank(stages):
     for stage in stages:
         assert set(np.unique(stage.world.mesh.material)) <= set(range(len(stage.world.materials)))
         assert {material.texture for material in stage.world.materials} <= set(FAMILIES)
@@ -40,7 +40,7 @@ def test_all_corners_are_finite_and_all_normals_unit_vectors(stages):
         np.testing.assert_allclose(np.linalg.norm(stage.world.mesh.normals, axis=-1), 1, atol=1e-4)
 
 
-def test_faces_look_outwards(stages):
+def test_faces_and_their_normals_point_to_the_same_side(stages):
     for stage in stages:
         a, b, c = stage.world.mesh.corners_m.astype(float).swapaxes(0, 1)
         agree = (np.cross(b - a, c - a)[:, None] * stage.world.mesh.normals).sum(-1) > 0
@@ -48,7 +48,7 @@ def test_faces_look_outwards(stages):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_a_seed_gives_the_same_stage_and_another_another(name):
+def test_a_seed_always_gives_the_same_stage_and_another_seed_a_different_one(name):
     first, again, other = (SCENES[name](np.random.default_rng(seed)) for seed in (1, 1, 2))
     for field in fields(Mesh):
         np.testing.assert_array_equal(

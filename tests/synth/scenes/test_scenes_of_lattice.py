@@ -1,4 +1,4 @@
-"""Antenna, pylon, crane and wind turbine: in place, out of the cameras' way, and thin."""
+"""The targets of the lattice scenes are in view, clear of the cameras, and have thin parts."""
 
 from collections.abc import Iterator
 
@@ -13,7 +13,8 @@ from stereoweave.synth.scenes import SCENES
 from stereoweave.synth.viewpoints import PosedRig, draw_viewpoint, place_rig
 
 NAMES = ("antenna", "pylon", "crane", "wind_turbine")
-# Between them every kind of each scene: roof, mast, dish; tower and quay; sea, tube, lattice, pump.
+# Together, these seeds give every kind of each scene: roof, mast and dish; tower and quay crane; turbines at
+# sea, on a tube and on a lattice, and a pump.
 SEEDS = {"antenna": (0, 2, 4), "pylon": (0, 1), "crane": (0, 3, 4), "wind_turbine": (0, 2, 5, 4)}
 FARTHEST_M = 4.6
 
@@ -24,7 +25,7 @@ def stages():
 
 
 def eyes(stage, count: int) -> Iterator[PosedRig]:
-    """Rigs that may be drawn for a stage."""
+    """Yield rigs at viewpoints drawn from a stage's orbit."""
     rng = np.random.default_rng(1)
     camera = StereoCamera(focal_px=580.0, baseline_m=0.2, cx_px=319.5, cy_px=239.5)
     for _ in range(count):
@@ -41,7 +42,7 @@ def test_the_target_is_where_the_cameras_look(stages, name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_nothing_stands_where_a_camera_may(stages, name):
+def test_nothing_stands_where_a_camera_may_be(stages, name):
     for stage in stages[name]:
         corners_m = stage.world.mesh.corners_m.reshape(-1, 3)
         for rig in eyes(stage, 8):
@@ -49,13 +50,13 @@ def test_nothing_stands_where_a_camera_may(stages, name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_three_in_a_hundred_of_the_targets_pixels_are_on_parts_under_six_pixels_wide(stages, name):
+def test_three_percent_of_the_target_s_pixels_are_on_parts_less_than_six_pixels_wide(stages, name):
     masks = [target_mask(stage, next(eyes(stage, 1))) for stage in stages[name]]
     assert all(mask.mean() > 0.01 for mask in masks)
     assert np.mean([thin_share(mask) for mask in masks]) >= 0.03
 
 
-def test_the_thin_share_counts_what_no_square_of_six_fits_into():
+def test_the_thin_share_counts_parts_into_which_no_square_of_six_pixels_fits():
     mask = np.zeros((40, 60), bool)
     mask[10:20, 10:20] = True  # 100 pixels, thick
     mask[30:35, 5:25] = True  # 100 pixels, five wide
@@ -63,7 +64,7 @@ def test_the_thin_share_counts_what_no_square_of_six_fits_into():
 
 
 def target_mask(stage, rig: PosedRig) -> np.ndarray:
-    """Pixels whose ray meets the target first, by a ray cast."""
+    """Return the mask of pixels whose ray hits the target first, found by ray casting."""
     mesh = stage.world.mesh
     corners_m = mesh.corners_m.astype(np.float64)
     surface = trimesh.Trimesh(
@@ -75,8 +76,8 @@ def target_mask(stage, rig: PosedRig) -> np.ndarray:
 
 
 def thin_share(mask: np.ndarray) -> float:
-    """The share of a mask's pixels that an opening by 6x6 removes."""
+    """Return the fraction of a mask's pixels that a morphological opening by 6x6 removes."""
     square = np.ones((6, 6), np.uint8)
-    # An even square is off its centre; dilation takes the mirrored one, so that nothing shifts.
+    # A square of even size has no centre pixel; the mirrored anchor for dilation cancels the shift.
     opened = cv2.dilate(cv2.erode(mask.astype(np.uint8), square), square, anchor=(2, 2))
     return float(1 - opened.sum() / mask.sum())

@@ -3,7 +3,7 @@ import pytest
 
 from stereoweave.synth.scenes.ship import ship
 
-SEEDS = (0, 1, 4, 7, 11)  # a tug, a trawler, a coaster, two patrol boats; three of them at a quay
+SEEDS = (0, 1, 4, 7, 11)  # a tug, a trawler, a coaster and two patrol boats; three of them are at a quay
 
 
 @pytest.fixture(scope="module")
@@ -11,7 +11,7 @@ def stages():
     return [ship(np.random.default_rng(seed)) for seed in SEEDS]
 
 
-def test_the_target_is_the_ship_within_a_sphere_about_the_orbits_centre(stages):
+def test_the_target_is_the_ship_within_a_sphere_around_the_orbit_s_centre(stages):
     for stage in stages:
         mesh = stage.world.mesh
         vessel = mesh.corners_m[mesh.target]
@@ -20,7 +20,7 @@ def test_the_target_is_the_ship_within_a_sphere_about_the_orbits_centre(stages):
         assert 15_000 < mesh.target.sum() < 35_000
 
 
-def test_it_floats(stages):
+def test_the_ship_floats(stages):
     for stage in stages:
         mesh = stage.world.mesh
         z = mesh.corners_m[mesh.target][..., 2]
@@ -31,11 +31,11 @@ def test_it_floats(stages):
         assert abs(mesh.corners_m[mesh.material == water[0]][..., 2].mean()) < 0.05
 
 
-def test_nothing_of_a_ship_is_below_the_hull(stages):
+def test_no_part_of_a_ship_is_below_the_hull(stages):
     for stage in stages:
         mesh = stage.world.mesh
         vessel = mesh.corners_m[mesh.target]
-        bottom = mesh.material[mesh.target] == 0  # the antifouling is the first paint
+        bottom = mesh.material[mesh.target] == 0  # the first material is the paint below the waterline
         deepest_m = vessel[bottom][..., 2].min()
         assert vessel[~bottom][..., 2].min() > deepest_m + 0.3
 
@@ -56,5 +56,5 @@ def test_the_cameras_are_clear_of_everything_and_never_on_the_quay(stages):
                 assert np.linalg.norm(corners_m - eye_m, axis=1).min() > 0.7
 
 
-def test_ships_lie_at_quays_and_on_open_water(stages):
+def test_ships_are_at_quays_and_on_open_water(stages):
     assert {stage.orbit.azimuth_deg for stage in stages} == {(0.0, 360.0), (22.0, 158.0)}

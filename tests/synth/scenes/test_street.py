@@ -24,10 +24,10 @@ def test_the_carriageway_is_level_at_z_0_between_its_kerbs(rng):
     np.testing.assert_allclose(pavement_m[..., 2], 0.12, atol=1e-6)
 
 
-def test_house_fronts_keep_off_the_pavements(rng):
+def test_house_fronts_stay_off_the_pavements(rng):
     house_m = fronts(rng, Palette(), PLAN).corners_m
     low_m = house_m[(house_m[..., 2] < 2.0).all(1)]
-    # A window's bars and frames stand out from the wall by 10 cm, bushes over the fence by more.
+    # Window bars and frames protrude from the wall by 10 cm, and bushes protrude over the fence by more.
     assert abs(low_m[..., 1]).min() > PLAN.half_m + 0.5 * PLAN.pavement_m
 
 
@@ -42,7 +42,7 @@ def test_traffic_keeps_to_one_side_of_the_middle_with_room_for_a_parked_car(rng)
     assert abs(plan.lane_m) + 2.1 < plan.half_m
 
 
-def test_people_are_as_tall_as_people_and_stand_on_the_ground(rng):
+def test_people_have_realistic_heights_and_stand_on_the_ground(rng):
     clothes = draw_clothes(rng, Palette())
     corners_m = person(rng, clothes).corners_m
     assert corners_m[..., 2].min() == pytest.approx(0, abs=0.03)
