@@ -1,1 +1,1 @@
-"""Synthetic stereo with exact ground truth: scenes, textures, renderers, and sets of pairs."""
+"""Synthetic stereo pairs with exact ground truth: scenes, textures, renderers and sets."""

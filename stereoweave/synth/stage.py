@@ -1,4 +1,4 @@
-"""Stages, which scenes return: a world and the viewpoints on it."""
+"""Stages: worlds with the viewpoints from which they are rendered."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -9,13 +9,13 @@ from stereoweave.synth.world import Fog, Material, Mesh, Sky, World
 
 @dataclass(frozen=True, kw_only=True)
 class Stage:
-    """A world and the viewpoints on it.
+    """A world with the viewpoints from which it is rendered.
 
     Attributes:
-        world: what the cameras see.
-        orbit: the viewpoints.
-        nearest_px: range of the nearest surface's disparity in a picture 640 px wide.
-        noise_levels: standard deviation of the sensor noise on white, in grey levels of 0..255.
+        world: everything that the cameras see.
+        orbit: range of the viewpoints.
+        nearest_px: range of the nearest surface's disparity in an image 640 px wide.
+        noise_levels: standard deviation of sensor noise on white, in grey levels (0..255).
     """
 
     world: World
@@ -31,13 +31,13 @@ class Palette:
     materials: list[Material] = field(default_factory=list)
 
     def add(self, material: Material) -> int:
-        """Add a material. Returns its index, which meshes refer to."""
+        """Add a material and return the index by which meshes refer to it."""
         self.materials.append(material)
         return len(self.materials) - 1
 
 
 class Daylight(NamedTuple):
-    """Outdoor light: sky with sun, fog (or None), and the exposure for them."""
+    """Outdoor light: the sky with its sun, optional fog, and a suitable exposure."""
 
     sky: Sky
     fog: Fog | None
@@ -51,7 +51,7 @@ def outdoor_stage(
     orbit: Orbit,
     nearest_px: tuple[float, float] = NEAREST_PX,
 ) -> Stage:
-    """Build an outdoor stage with the materials of a palette."""
+    """Build an outdoor stage from a mesh, the palette of its materials, daylight and viewpoints."""
     world = World(
         mesh=mesh,
         materials=tuple(palette.materials),

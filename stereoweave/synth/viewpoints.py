@@ -1,4 +1,4 @@
-"""Viewpoints around a target, and stereo rigs placed there."""
+"""Viewpoints around a target, and stereo rigs placed at them."""
 
 from dataclasses import dataclass
 
@@ -7,18 +7,18 @@ from jaxtyping import Float
 
 from stereoweave.stereo import StereoCamera
 
-# For a picture 640 px wide; default of the scenes.
+# Default range of the nearest surface's disparity, for images 640 px wide.
 NEAREST_PX = (18.0, 160.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class PosedRig:
-    """A rectified stereo camera with its pose in the world.
+    """A rectified rig with its pose in the world.
 
     Attributes:
         camera: intrinsics and baseline; doffs_px is 0.
         size_px: width and height of the images.
-        position_m: the left camera's centre [3].
+        position_m: the left camera's centre [3] in the world.
         axes: rotation [3, 3]; its rows are the camera's right, down and forward axes in the world.
     """
 
@@ -28,21 +28,21 @@ class PosedRig:
     axes: Float[np.ndarray, "3 3"]
 
     def eye_m(self, position: float) -> Float[np.ndarray, "3"]:
-        """Camera centre at `position`: 0 is the left camera, 1 the right one."""
+        """Return the camera centre at `position`, where 0 is the left camera and 1 the right one."""
         return self.position_m + position * self.camera.baseline_m * self.axes[0]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Orbit:
-    """The viewpoints of a scene: ranges of spherical coordinates around a point.
+    """Range of a scene's viewpoints, in spherical coordinates around a point.
 
     Attributes:
-        centre_m: the point that the cameras look at, up to aim_m.
-        distance_m: from the centre, minimum and maximum.
-        azimuth_deg: around z, from x towards y, minimum and maximum.
-        elevation_deg: above the horizon, minimum and maximum.
-        aim_m: the largest distance between the centre and the point looked at.
-        floor_m: the cameras stay above this z.
+        centre_m: centre of the orbit; the cameras look at a point near it.
+        distance_m: least and greatest distance from the centre.
+        azimuth_deg: least and greatest azimuth around z, measured from x towards y.
+        elevation_deg: least and greatest elevation above the horizon.
+        aim_m: greatest distance from the centre to the point that the cameras look at.
+        floor_m: least z of the point midway between the cameras.
     """
 
     centre_m: tuple[float, float, float]
@@ -55,7 +55,7 @@ class Orbit:
 
 @dataclass(frozen=True, kw_only=True)
 class Viewpoint:
-    """One viewpoint on an orbit."""
+    """A viewpoint on an orbit."""
 
     distance_m: float
     azimuth_deg: float
@@ -65,7 +65,7 @@ class Viewpoint:
 
 
 def draw_viewpoint(rng: np.random.Generator, orbit: Orbit) -> Viewpoint:
-    """Draw a viewpoint anywhere on the orbit, with the cameras nearly level."""
+    """Draw a random viewpoint on the orbit, with the cameras nearly level."""
     aim_m = np.array(orbit.centre_m) + orbit.aim_m * rng.uniform(-1, 1, 3) / np.sqrt(3)
     return Viewpoint(
         distance_m=float(np.exp(rng.uniform(*np.log(orbit.distance_m)))),
@@ -77,23 +77,23 @@ def draw_viewpoint(rng: np.random.Generator, orbit: Orbit) -> Viewpoint:
 
 
 def draw_focal_px(rng: np.random.Generator, width_px: int) -> float:
-    """Draw a focal length in pixels, for a field of view of 42 to 72 degrees."""
+    """Draw a focal length in pixels that gives a horizontal field of view of 42 to 72 degrees."""
     return float(width_px / 2 / np.tan(np.radians(rng.uniform(42, 72)) / 2))
 
 
 def draw_nearest_px(
     rng: np.random.Generator, width_px: int, range_px: tuple[float, float] = NEAREST_PX
 ) -> float:
-    """Draw the nearest surface's disparity, log-uniform in a range given for a width of 640 px.
+    """Draw the nearest surface's disparity, log-uniform in a range given for images 640 px wide.
 
-    The baseline follows from it: for training, the distribution of disparities matters more than that of
-    baselines.
+    The baseline is derived from this disparity, because training depends more on the distribution of
+    disparities than on the distribution of baselines.
     """
     return float(np.exp(rng.uniform(*np.log(range_px))) * width_px / 640)
 
 
 def place_rig(orbit: Orbit, viewpoint: Viewpoint, camera: StereoCamera, size_px: tuple[int, int]) -> PosedRig:
-    """Place the rig at a viewpoint, looking at its aim; the midpoint of both cameras is on the orbit."""
+    """Place the rig at a viewpoint, facing its aim; the midpoint between the cameras lies on the orbit."""
     azimuth, elevation = np.radians([viewpoint.azimuth_deg, viewpoint.elevation_deg])
     outwards = np.array(
         [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
@@ -117,7 +117,7 @@ def place_rig(orbit: Orbit, viewpoint: Viewpoint, camera: StereoCamera, size_px:
 
 
 def interpolate_viewpoints(start: Viewpoint, end: Viewpoint, share: float) -> Viewpoint:
-    """Interpolate two viewpoints at a share 0..1 of the way, with a smooth start and stop."""
+    """Interpolate between two viewpoints at a fraction (0..1) of the way, with a smooth start and stop."""
     eased = share * share * (3 - 2 * share)
 
     def mix(name: str) -> float:

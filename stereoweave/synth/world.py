@@ -1,4 +1,4 @@
-"""Scene description: triangles, materials, sky, lamps and fog. Metres; z is up."""
+"""Scene description: triangles, materials, sky, lamps and fog. Lengths are in metres; z points up."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -6,15 +6,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-Colour = tuple[float, float, float]  # linear RGB; 1 is a white sheet in the sun
+Colour = tuple[float, float, float]  # linear RGB; 1 is a white surface in sunlight
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mesh:
-    """Triangles with unshared vertices, so that neighbours may differ in normals and texture coordinates.
+    """Triangles that share no vertices, so neighbours may differ in normals and texture coordinates.
 
     Attributes:
-        corners_m: float32 [N, 3, 3]: triangle, corner, x y z; counter-clockwise seen from outside.
+        corners_m: float32 [N, 3, 3]: triangle, corner, (x, y, z); counter-clockwise when seen from outside.
         normals: float32 [N, 3, 3], outward unit vectors.
         uv_m: float32 [N, 3, 2], texture coordinates in metres along the surface.
         material: int32 [N], index into the world's materials.
@@ -28,8 +28,8 @@ class Mesh:
     target: Bool[np.ndarray, " n"]
 
     def transform(self, pose: Float[np.ndarray, "4 4"]) -> "Mesh":
-        """The mesh under an affine pose; texture coordinates stay unchanged."""
-        # One large product: NumPy is slow at many small ones.
+        """Return the mesh transformed by an affine pose; its texture coordinates stay unchanged."""
+        # One large product, because NumPy is slow at many small ones.
         corners_m = self.corners_m.reshape(-1, 3) @ pose[:3, :3].T.astype(np.float32)
         normals = self.normals.reshape(-1, 3) @ np.linalg.inv(pose[:3, :3]).astype(np.float32)
         normals /= np.sqrt(np.einsum("ij,ij->i", normals, normals))[:, None]
@@ -40,11 +40,11 @@ class Mesh:
         )
 
     def translate(self, x: float = 0, y: float = 0, z: float = 0) -> "Mesh":
-        """The mesh, translated in metres."""
+        """Return the mesh translated by x, y and z in metres."""
         return replace(self, corners_m=self.corners_m + np.array([x, y, z], np.float32))
 
     def as_target(self) -> "Mesh":
-        """The mesh, marked as the scene's subject."""
+        """Return the mesh with all its triangles marked as the scene's subject."""
         return replace(self, target=np.ones_like(self.target))
 
 
@@ -61,10 +61,10 @@ class Material:
 
     Attributes:
         texture: a family of the texture bank (textures.bank.FAMILIES), such as "rust".
-        variant: number of the texture in its family, modulo the family's size.
-        tint: multiplies the texture's colour.
+        variant: index of the texture in its family, taken modulo the family's size.
+        tint: factor that multiplies the texture's colour.
         span_m: period of the texture in metres.
-        roughness: 0 is a mirror, 1 is chalk.
+        roughness: 0 (like a mirror) to 1 (like chalk).
         metal: 0 for paint, stone and cloth, 1 for bare metal.
         relief: strength of the bump map, 0 to 1.
         glow: emitted light, as a multiple of the colour.
@@ -82,14 +82,14 @@ class Material:
 
 @dataclass(frozen=True, kw_only=True)
 class Sky:
-    """Sky and sun, and their light.
+    """The sky, the sun and their light.
 
     Attributes:
         sun: unit vector towards the sun.
         sun_light: the sun's colour and strength; (0, 0, 0) indoors.
-        zenith, horizon, ground: colours of the gradient, visible and as ambient light from above, from the
-            side and from below.
-        cloud_variant: number of the cloud texture in the family "sky".
+        zenith, horizon, ground: colours of the sky's gradient, which is visible and lights surfaces from
+            above, from the side and from below.
+        cloud_variant: index of the cloud texture in the family "sky".
         clouds: cloud cover, 0 (clear) to 1 (overcast).
     """
 
@@ -104,10 +104,10 @@ class Sky:
 
 @dataclass(frozen=True, kw_only=True)
 class Lamp:
-    """A point light without shadow; its light falls with the square of the distance.
+    """A point light that casts no shadows; its light falls off with the square of the distance.
 
     Attributes:
-        position_m: in the world.
+        position_m: position in the world.
         light: colour and strength at 1 m.
     """
 
@@ -117,7 +117,7 @@ class Lamp:
 
 @dataclass(frozen=True, kw_only=True)
 class Fog:
-    """Haze: a surface at distance d keeps the share exp(-density_per_m * d) of its colour."""
+    """Haze: at distance d, a surface keeps the fraction exp(-density_per_m * d) of its colour."""
 
     colour: Colour
     density_per_m: float
@@ -125,13 +125,13 @@ class Fog:
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """All that a renderer needs, except the camera.
+    """Everything that a renderer needs except the camera.
 
     Attributes:
         mesh: all triangles.
         materials: at most 64; `mesh.material` is an index into them.
         lamps: at most 4.
-        exposure: multiplies colours before tone mapping.
+        exposure: factor that multiplies colours before tone mapping.
     """
 
     mesh: Mesh
@@ -148,8 +148,8 @@ class RenderedView:
 
     Attributes:
         image: uint8 RGB [H, W, 3].
-        depth_m: float32 [H, W], along the optical axis at the pixels' centres; infinite for the sky.
-        target: bool [H, W], whether the pixel's centre shows the scene's subject.
+        depth_m: depth along the optical axis at pixel centres, float32 [H, W]; infinite for the sky.
+        target: bool [H, W], whether the pixel centre shows the scene's subject.
     """
 
     image: UInt8[np.ndarray, "h w 3"]

@@ -173,7 +173,7 @@ def test_costs_of_an_unknown_scene_are_refused_before_a_renderer_starts(monkeypa
 def test_what_opengl_has_no_room_for_is_told_in_a_line():
     gl = moderngl.create_context(standalone=True, backend="egl")
     message = error_of(FrameBuffers, gl, (100_000, 32), 2)
-    assert message.startswith("pictures of 100000x32 px: expected OpenGL to have enough memory, found ")
+    assert message.startswith("pictures of 100000x32 px: expected enough OpenGL memory, found too little (")
     gl.release()
 
 

@@ -43,7 +43,7 @@ def test_the_right_camera_is_a_baseline_to_the_right_of_the_left_one():
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_axes_are_at_right_angles_and_right_handed_and_the_aim_is_straight_ahead(seed):
+def test_axes_are_orthonormal_and_right_handed_and_the_aim_is_straight_ahead(seed):
     drawn = draw_viewpoint(np.random.default_rng(seed), ORBIT)
     made = place_rig(ORBIT, drawn, CAMERA, (640, 480))
     np.testing.assert_allclose(made.axes @ made.axes.T, np.eye(3), atol=1e-12)
@@ -74,12 +74,12 @@ def test_viewpoints_are_within_the_ranges_of_their_orbit():
         assert np.linalg.norm(drawn.aim_m - [0, 0, 1]) <= 0.5
 
 
-def test_a_moving_camera_starts_and_stops_gently_and_is_half_way_at_half_time():
+def test_a_moving_camera_starts_and_stops_gently_and_is_halfway_at_half_time():
     start, end = viewpoint(), viewpoint(distance_m=7.0, azimuth_deg=40.0)
     assert interpolate_viewpoints(start, end, 0.0).azimuth_deg == 0
     assert interpolate_viewpoints(start, end, 0.5).azimuth_deg == 20
     assert interpolate_viewpoints(start, end, 1.0).distance_m == 7
-    # Near its ends it moves by 3 t^2 of the way.
+    # At time t near the start, the camera has covered 3 t^2 of the way.
     assert interpolate_viewpoints(start, end, 0.01).azimuth_deg == pytest.approx(40 * 3e-4, rel=0.01)
 
 

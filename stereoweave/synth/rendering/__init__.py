@@ -1,1 +1,1 @@
-"""Rendering of worlds: images and depth."""
+"""Rendering of worlds to images and depth maps."""

@@ -7,15 +7,15 @@ from stereoweave.errors import StereoweaveError
 
 @dataclass(frozen=True, kw_only=True)
 class Effects:
-    """Switches of the effects; `synth costs` measures the time of each.
+    """Switches for the rendering effects; `synth costs` measures the time that each one takes.
 
     Attributes:
-        shadows: of the sun.
-        ambient_occlusion: less light from the sky in corners and narrow places.
-        gloss: highlights of sun and lamps, reflections of the sky.
-        fog: haze.
-        relief: bump mapping by the texture's height.
-        samples: 2 for 2x2 samples per pixel, 1 for the centre only.
+        shadows: shadows cast by the sun.
+        ambient_occlusion: weaker skylight in corners and narrow places.
+        gloss: highlights from the sun and lamps, and reflections of the sky.
+        fog: haze that grows with distance.
+        relief: bump mapping from the texture's height map.
+        samples: 2 for 2x2 samples per pixel, 1 for a single sample at its centre.
     """
 
     shadows: bool = True

@@ -1,4 +1,4 @@
-"""Projection matrices, rays and frustum culling of a rig's cameras."""
+"""Projection matrices, rays and frustum culling for a rig's cameras."""
 
 from collections.abc import Sequence
 
@@ -7,15 +7,15 @@ from jaxtyping import Float, Int
 
 from stereoweave.synth.viewpoints import PosedRig
 
-# Near plane. The depth buffer's 24 bits cover the range from here to infinity.
+# Distance of the near plane; the 24-bit depth buffer covers the range from it to infinity.
 NEAR_M = 0.1
 
 
 def projection(rig: PosedRig) -> Float[np.ndarray, "4 4"]:
-    """Matrix from camera coordinates (right, down, forward, 1) to OpenGL's clip space.
+    """Return the matrix from camera coordinates (right, down, forward, 1) to OpenGL's clip space.
 
-    Rows of the frame buffer run downwards like those of the image, so reading needs no flip. Pixel centres
-    are at integers for the rig and at halves for OpenGL.
+    Frame buffer rows run downwards like image rows, so reading them needs no flip. The rig's pixel centres
+    are at integers, OpenGL's at half-integers.
     """
     width_px, height_px = rig.size_px
     camera = rig.camera
@@ -32,10 +32,10 @@ def projection(rig: PosedRig) -> Float[np.ndarray, "4 4"]:
 def triangles_in_view(
     corners_m: Float[np.ndarray, "3 3 n"], rig: PosedRig, positions: Sequence[float]
 ) -> Int[np.ndarray, " k"]:
-    """Indices of the triangles in any position's view, roughly from near to far.
+    """Return the indices of the triangles in view from any of the positions, roughly from near to far.
 
-    Near triangles first, because the depth test then skips the shading of hidden ones. corners_m is
-    `Mesh.corners_m.T`, contiguous: axis, corner, triangle.
+    Near triangles come first, because the depth test then skips the shading of triangles behind them.
+    `corners_m` is a contiguous `Mesh.corners_m.T`: axis, corner, triangle.
     """
     away_m = corners_m.reshape(3, -1) - rig.position_m.astype(np.float32)[:, None]
     right, down, forward = (rig.axes.astype(np.float32) @ away_m).reshape(corners_m.shape)
@@ -49,21 +49,24 @@ def triangles_in_view(
         | (down > lower_edge * forward).all(0)
     )
     seen = np.flatnonzero(~outside)
-    # Sorted by the farthest corner, so that large ground triangles follow the objects on them. Positive
-    # floats sort like their bits, and 16 bits sort fast.
+    # Sort by the farthest corner, so that large ground triangles follow the objects on them. Positive floats
+    # sort like their bits, and sorting 16 bits is fast.
     farthest_m = forward.max(0)[seen]
     return seen[np.argsort((farthest_m.view(np.uint32) >> 16).astype(np.uint16), kind="stable")]
 
 
 def _image_edges(rig: PosedRig) -> Float[np.ndarray, "2 2"]:
-    """The image's borders at depth 1: left and right, upper and lower."""
+    """Return the image's borders at depth 1: left and right, upper and lower."""
     camera, (width_px, height_px) = rig.camera, rig.size_px
     borders_px = np.array([[-0.5, width_px - 0.5], [-0.5, height_px - 0.5]])
     return (borders_px - [[camera.cx_px], [camera.cy_px]]) / camera.focal_px
 
 
 def direction_matrix(rig: PosedRig, samples: int) -> Float[np.ndarray, "3 3"]:
-    """Matrix from OpenGL's (column, row, 1), samples x samples per pixel, to world directions of depth 1."""
+    """Return the matrix from OpenGL's (column, row, 1) to world directions whose depth is 1.
+
+    Columns and rows count samples, of which each pixel has `samples` x `samples`.
+    """
     camera = rig.camera
     to_camera = np.array(
         [
@@ -76,7 +79,10 @@ def direction_matrix(rig: PosedRig, samples: int) -> Float[np.ndarray, "3 3"]:
 
 
 def rays(rig: PosedRig, samples: int = 1) -> Float[np.ndarray, "h w 3"]:
-    """World directions of depth 1 through the pixels' centres, or samples x samples per pixel."""
+    """Return the world directions, scaled to depth 1, of `samples` x `samples` rays through each pixel.
+
+    A single ray goes through the pixel's centre.
+    """
     width, height = (side * samples for side in rig.size_px)
     column, row = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return np.stack([column, row, np.ones_like(row)], -1) @ direction_matrix(rig, samples).T

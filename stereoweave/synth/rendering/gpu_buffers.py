@@ -1,4 +1,4 @@
-"""GPU memory: a world's triangles and materials, the textures, and frame buffers."""
+"""GPU memory for a world's triangles and materials, for textures, and for frame buffers."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,18 +13,18 @@ from stereoweave.synth.rendering.shader_programs import MOST_LAMPS, MOST_MATERIA
 from stereoweave.synth.textures.bank import TextureBank, srgb_to_linear
 from stereoweave.synth.world import World
 
-# Height of a texture at full relief, as a share of its period.
+# Relief height of a texture at full strength, as a fraction of its period.
 _RELIEF_SHARE = 0.018
-_FLOATS = 12  # of a material in std140: three vectors of four
+_FLOATS = 12  # floats of a material in std140 layout: three vectors of four
 
 
 class Geometry:
-    """A world's triangles in GPU memory; `release` frees it.
+    """A world's triangles in GPU memory; `release` frees the memory.
 
     Attributes:
-        world: the triangles' world.
-        corners_m: float32 [3, 3, N]: axis, corner, triangle.
-        target_m: the target's triangles, or all if the world has no target.
+        world: the world that the triangles belong to.
+        corners_m: corners of the triangles, float32 [3, 3, N]: axis, corner, triangle.
+        target_m: corners of the target's triangles, or of all triangles if the world has no target.
     """
 
     def __init__(self, gl: moderngl.Context, world: World) -> None:
@@ -55,7 +55,7 @@ class Geometry:
         corners.release()
 
     def release(self) -> None:
-        """Gives the memory back."""
+        """Free the GPU memory."""
         for buffer, _ in self._attributes.values():
             buffer.release()
 
@@ -69,25 +69,25 @@ def _reporting_lack_of_memory(what: str) -> Iterator[None]:
         yield
     except moderngl.Error as error:
         raise StereoweaveError(
-            f"{what}: expected OpenGL to have enough memory, found {error}; request fewer or smaller ones"
+            f"{what}: expected enough OpenGL memory, found too little ({error}); request smaller pictures"
         ) from error
 
 
 def _check_limits(world: World) -> None:
     for name, most, remedy in (
         ("materials", MOST_MATERIALS, "share materials between parts"),
-        ("lamps", MOST_LAMPS, "omit the faintest"),
+        ("lamps", MOST_LAMPS, "omit the faintest ones"),
     ):
         count = len(getattr(world, name))
         if count > most:
-            raise StereoweaveError(f"{name} of a world: expected at most {most}, found {count}; {remedy}")
+            raise StereoweaveError(f"world: expected at most {most} {name}, found {count}; {remedy}")
 
 
 class MaterialBlock:
-    """Uniform block `Materials` of the shaders."""
+    """The shaders' uniform block `Materials`."""
 
     def __init__(self, gl: moderngl.Context) -> None:
-        # Binding 0, because it is the program's only block.
+        # Binding 0, because this is the program's only block.
         self._buffer = gl.buffer(reserve=4 * _FLOATS * MOST_MATERIALS)
         self._buffer.bind_to_uniform_block(0)
 
@@ -112,7 +112,7 @@ def upload_textures(
 ) -> moderngl.TextureArray:
     """Upload all textures with mipmaps; colours are stored as square roots of linear light.
 
-    llvmpipe filters bytes fastest, and one multiplication in the shader undoes the root.
+    llvmpipe filters bytes fastest, and one multiplication in the shader restores linear light.
     """
     layers, height, width, channels = pixels.shape
     array = gl.texture_array((width, height, layers), channels)
@@ -146,7 +146,7 @@ class FrameBuffers:
             self.pixels = gl.framebuffer([shown])
 
     def release(self) -> None:
-        """Gives the memory back."""
+        """Free the GPU memory."""
         for frame in (self.depth, self.samples, self.pixels):
             frame.release()
         for buffer in self._renderbuffers:

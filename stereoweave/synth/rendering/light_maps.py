@@ -1,4 +1,4 @@
-"""Light textures of a world: the sun's shadow map and the ambient occlusion grid."""
+"""Textures for a world's lighting: the sun's shadow map and the ambient occlusion grid."""
 
 from typing import Any
 
@@ -11,15 +11,15 @@ from stereoweave.synth.rendering.shader_programs import Programs
 from stereoweave.synth.rendering.shadow_and_occlusion import CELLS, SunView, count_occlusion, fit_sun_view
 from stereoweave.synth.world import Sky
 
-# Two cascades side by side in one shadow map: the square around the target and a wide one. At 640x480 their
-# texels are as small as samples already.
+# The shadow map holds two cascades side by side: a square around the target and a wider one. At 640x480 their
+# texels are already as small as the samples.
 _INNER_PX, _WIDE_PX = 1536, 1024
 _REACH_M = 40.0
 _SHADOW_MAP, _OCCLUSION = 2, 3  # texture units
 
 
 class LightMaps:
-    """The textures, rewritten for each world, and the uniforms for reading them."""
+    """Light textures, rewritten for each world, and the uniforms that shaders need to read them."""
 
     def __init__(self, gl: moderngl.Context, programs: Programs) -> None:
         self._gl = gl
@@ -36,13 +36,13 @@ class LightMaps:
         programs.bind_textures(shadow_map=_SHADOW_MAP, occlusion=_OCCLUSION)
 
     def render_shadow_map(self, geometry: Geometry, sky: Sky) -> dict[str, Any]:
-        """Render the sun's shadow map. Returns its uniforms."""
+        """Render the sun's shadow map and return its uniforms, or none if the sun gives no light."""
         self._frame.use()
         self._frame.clear()
         if not any(sky.sun_light):
             return {}
         view = fit_sun_view(geometry.corners_m, geometry.target_m, sky.sun, _REACH_M)
-        # Depth bias away from the sun against self-shadowing.
+        # Shift depth away from the sun to prevent self-shadowing.
         self._gl.polygon_offset = 2.0, 4.0
         for left_px, side_px, to_unit, triangles in (
             (0, _INNER_PX, view.to_unit, view.inside),
@@ -67,7 +67,7 @@ class LightMaps:
         }
 
     def write_occlusion(self, geometry: Geometry) -> dict[str, Any]:
-        """Write the ambient occlusion grid. Returns its uniforms."""
+        """Write the ambient occlusion grid and return its uniforms."""
         counted = count_occlusion(geometry.corners_m, geometry.target_m)
         self._occlusion.write(counted.share)
         side_m = counted.cell_m * CELLS
@@ -75,7 +75,7 @@ class LightMaps:
 
 
 def _widen(view: SunView) -> Float[np.ndarray, "3 4"]:
-    """Matrix from (x, y, z, 1) to 0..1 across and down the wide square."""
+    """Return the counterpart of `view.to_unit` for the wide square."""
     scale = np.diag([1 / view.wide, 1 / view.wide, 1])
     middle = np.array([0.5, 0.5, 0])
     wide = scale @ view.to_unit

@@ -1,4 +1,4 @@
-"""Off-screen OpenGL renderer: images and exact depth; Mesa needs no graphics card."""
+"""Off-screen OpenGL renderer of images and exact depth; with Mesa it needs no graphics card."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -21,12 +21,12 @@ _TEXTURES, _SAMPLES = 0, 1  # texture units
 
 
 class OpenGLRenderer:
-    """Renders worlds with OpenGL; a `pair_rendering.SceneRenderer`.
+    """OpenGL renderer of worlds; implements `pair_rendering.SceneRenderer`.
 
-    World and rig determine the bytes, whatever was rendered before. Depth is rasterised separately, through
-    the pixels' centres. The image takes 2x2 samples per pixel, centred on the pixel, and shades each of
-    them: with llvmpipe that takes little more than half the time of multisampling, which also shades hidden
-    surfaces, and it smooths highlights and edges of shadows as well.
+    The bytes depend on the world and the rig alone, not on earlier renderings. Depth is rasterised
+    separately, at pixel centres. By default the image takes 2x2 samples per pixel, centred on the pixel, and
+    shades each of them. With llvmpipe this takes little more than half the time of multisampling, which also
+    shades surfaces that are covered later. It also smooths highlights and shadow edges.
     """
 
     def __init__(self, effects: Effects = Effects()) -> None:  # noqa: B008, frozen
@@ -49,11 +49,11 @@ class OpenGLRenderer:
 
     @property
     def name(self) -> str:
-        """OpenGL's driver and version."""
+        """Name of the OpenGL driver, and the OpenGL version."""
         return f"{self._gl.info['GL_RENDERER']}, OpenGL {self._gl.info['GL_VERSION']}"
 
     def depth_m(self, world: World, rig: PosedRig, position: float) -> Float[np.ndarray, "h w"]:
-        """Depth in metres along the optical axis, float32 [H, W]; infinite for the sky."""
+        """Return the depth in metres along the optical axis, float32 [H, W]; infinite for the sky."""
         with self._gl:
             geometry = self._upload(world)
             triangles = triangles_in_view(geometry.corners_m, rig, (position,))
@@ -82,7 +82,7 @@ class OpenGLRenderer:
     def _render_depth(
         self, geometry: Geometry, triangles: Int[np.ndarray, " k"], rig: PosedRig, position: float
     ) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-        """Depth and target mask."""
+        """Render the depth in metres and the mask of the target."""
         frame = self._frame_buffers(rig).depth
         frame.use()
         frame.clear(red=np.inf)
@@ -101,7 +101,7 @@ class OpenGLRenderer:
         name = surface_program(len(geometry.world.lamps), any(geometry.world.sky.sun_light))
         self._set_view(name, rig, position)
         geometry.draw(self._programs[name], triangles)
-        # The sky lies at the far plane, the depth buffer's clear value.
+        # The sky lies at the far plane, whose depth equals the depth buffer's clear value.
         self._gl.depth_func = "<="
         self._programs.set_uniforms("sky", direction_matrix=direction_matrix(rig, self.effects.samples).T)
         self._full_screen["sky"].render(vertices=3)
@@ -118,7 +118,7 @@ class OpenGLRenderer:
         )
 
     def _frame_buffers(self, rig: PosedRig) -> FrameBuffers:
-        """Frame buffers of the rig's size; the last size is cached."""
+        """Return frame buffers for the rig's image size; those of the last size are cached."""
         if self._last_frame_buffers is None or self._last_frame_buffers.size_px != rig.size_px:
             if self._last_frame_buffers is not None:
                 self._last_frame_buffers.release()
@@ -126,7 +126,7 @@ class OpenGLRenderer:
         return self._last_frame_buffers
 
     def _upload(self, world: World) -> Geometry:
-        """Upload the world's triangles; the last world is cached."""
+        """Return the world's triangles in GPU memory; those of the last world are cached."""
         if self._geometry is None or self._geometry.world is not world:
             fresh = Geometry(self._gl, world)
             if self._geometry is not None:
@@ -135,7 +135,7 @@ class OpenGLRenderer:
         return self._geometry
 
     def _set_light(self, world: World, geometry: Geometry) -> None:
-        """Set materials and light, which all images of one world share."""
+        """Set the materials and the light, which all images of a world share."""
         if world is self._lit_world:
             return
         self._materials.write(world, self._bank)
@@ -158,11 +158,11 @@ class OpenGLRenderer:
 
 
 def _create_context() -> moderngl.Context:
-    # The stub of create_context mistypes its keywords.
+    # The type stub of create_context declares its keywords wrongly.
     options: dict[str, Any] = {"standalone": True, "backend": "egl"}
     try:
         return moderngl.create_context(**options)
     except Exception as error:  # glcontext and moderngl have no exception class for this
         raise StereoweaveError(
-            f"OpenGL: expected EGL to start, found {error}; on Debian: apt install libegl1 libgl1-mesa-dri"
+            f"OpenGL: EGL did not start ({error}); on Debian: apt install libegl1 libgl1-mesa-dri"
         ) from error

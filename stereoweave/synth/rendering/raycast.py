@@ -1,6 +1,6 @@
-"""Ray caster (embree): images and exact depth, slower and plainer than `opengl`.
+"""Embree ray caster for images and exact depth, slower and plainer than `opengl`.
 
-It is the fallback without OpenGL, and the tests' independent reference for the OpenGL renderer.
+It is the fallback where OpenGL does not start, and the tests' independent reference for the OpenGL renderer.
 """
 
 import functools
@@ -21,15 +21,15 @@ from stereoweave.synth.world import Mesh, RenderedView, Sky, World
 
 Vectors = Float[np.ndarray, "p 3"]
 
-# Offset of shadow rays from the surface, against self-shadowing by rounding.
+# Offset of shadow rays from the surface; prevents self-shadowing by rounding errors.
 _OFF_M = 2e-3
 
 
 class Raycaster:
-    """Renders worlds by ray casting; a `pair_rendering.SceneRenderer`.
+    """Ray-casting renderer of worlds; implements `pair_rendering.SceneRenderer`.
 
-    Supported effects: shadows (with hard edges), fog and samples. Surfaces are diffuse; clouds and lamps are
-    ignored.
+    It supports shadows with hard edges, fog, and several samples per pixel. Surfaces are diffuse, and clouds
+    and lamps are ignored.
     """
 
     def __init__(self, effects: Effects = Effects()) -> None:  # noqa: B008, frozen
@@ -39,19 +39,19 @@ class Raycaster:
 
     @property
     def name(self) -> str:
-        """Embree and its version."""
+        """Name and version of embree."""
         return f"embree {version('embreex')}"
 
     def depth_m(self, world: World, rig: PosedRig, position: float) -> Float[np.ndarray, "h w"]:
-        """Depth in metres along the optical axis, float32 [H, W]; infinite for the sky."""
+        """Return the depth in metres along the optical axis, float32 [H, W]; infinite for the sky."""
         return self.cast_rays(world, rig.eye_m(position), rays(rig))[0].astype(np.float32)
 
     def cast_rays(
         self, world: World, eye_m: Float[np.ndarray, "3"], directions: Float[np.ndarray, "h w 3"]
     ) -> tuple[Float[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
-        """Cast rays from one point. Returns distances, in lengths of the directions, and triangle indices.
+        """Cast rays from one point; return the distances and triangle indices of their hits.
 
-        Infinity and -1 where a ray hits nothing.
+        Distances are multiples of the directions' lengths. A ray that hits nothing gets infinity and -1.
         """
         hits = self._cast(world, eye_m, directions.reshape(-1, 3))
         shape = directions.shape[:2]
@@ -95,7 +95,7 @@ class Raycaster:
         hits: "_Hits",
         ray_width: float,
     ) -> Vectors:
-        """Light from each direction; ray_width is a ray's width at depth 1."""
+        """Return the light from each direction; `ray_width` is the width of a ray at depth 1."""
         light = _sky_radiance(world.sky, directions)
         met = hits.triangle >= 0
         surface = hits.select(met)
@@ -114,7 +114,7 @@ class Raycaster:
         return light
 
     def _sun_visibility(self, world: World, places_m: Vectors) -> Float[np.ndarray, " p"]:
-        """1 where nothing occludes the sun, otherwise 0."""
+        """Return 1 where nothing blocks the sun, otherwise 0."""
         assert self._scene is not None
         towards = np.broadcast_to(np.array(world.sky.sun, np.float32), places_m.shape)
         met = self._scene.run(places_m.astype(np.float32), np.ascontiguousarray(towards))
@@ -123,7 +123,13 @@ class Raycaster:
 
 @dataclass(frozen=True, kw_only=True)
 class _Hits:
-    """Hits of rays: triangle (-1 for none), distance in lengths of the ray (inf), barycentric coordinates."""
+    """The first hit of each ray.
+
+    Attributes:
+        triangle: index of the triangle; -1 if the ray hits nothing.
+        distance: multiple of the direction's length; infinite if the ray hits nothing.
+        shares: barycentric coordinates of the hit.
+    """
 
     triangle: Int[np.ndarray, " p"]
     distance: Float[np.ndarray, " p"]
@@ -138,7 +144,7 @@ class _Hits:
 def _intersect_planes(
     mesh: Mesh, eye_m: np.ndarray, directions: Vectors, triangle: Int[np.ndarray, " p"]
 ) -> _Hits:
-    """Intersect rays and their triangles' planes in double precision; embree only finds the triangle."""
+    """Intersect each ray with its triangle's plane in double precision; embree only finds the triangle."""
     met = triangle >= 0
     first, second, third = mesh.corners_m[triangle[met]].astype(np.float64).transpose(1, 0, 2)
     edge, other, from_first = second - first, third - first, eye_m - first
@@ -153,7 +159,7 @@ def _intersect_planes(
 
 
 def _interpolate_normals(mesh: Mesh, hits: _Hits, directions: Vectors) -> Vectors:
-    """Interpolated unit normals, on the side facing the ray."""
+    """Return the interpolated unit normals on the side that faces the ray."""
     first, second, third = mesh.corners_m[hits.triangle].transpose(1, 0, 2)
     face = np.cross(second - first, third - first)
     normal = np.einsum("pc,pcx->px", hits.shares, mesh.normals[hits.triangle])
@@ -163,7 +169,7 @@ def _interpolate_normals(mesh: Mesh, hits: _Hits, directions: Vectors) -> Vector
 
 
 def _look_up_colours(world: World, hits: _Hits, ray_m: Float[np.ndarray, " p"]) -> Vectors:
-    """Albedo at the hits; ray_m is the rays' width there."""
+    """Return the albedo at each hit; `ray_m` is the width of the ray at the hit."""
     material = world.mesh.material[hits.triangle]
     uv_m = np.einsum("pc,pcx->px", hits.shares, world.mesh.uv_m[hits.triangle])
     colours = np.empty((len(material), 3))
@@ -186,7 +192,7 @@ def _look_up_colours(world: World, hits: _Hits, ray_m: Float[np.ndarray, " p"]) 
 
 @functools.lru_cache(maxsize=24)
 def _mipmaps(layer: int) -> list[Float[np.ndarray, "side side 3"]]:
-    """Mipmaps of a texture in linear light."""
+    """Return a texture's mipmaps in linear light, from fine to coarse."""
     levels = [srgb_to_linear(texture_bank().pixels[layer, ..., :3].astype(np.float32))]
     while len(levels[-1]) > 1:
         half = len(levels[-1]) // 2
@@ -195,7 +201,7 @@ def _mipmaps(layer: int) -> list[Float[np.ndarray, "side side 3"]]:
 
 
 def _sky_radiance(sky: Sky, directions: Vectors) -> Vectors:
-    """The sky's radiance in directions; shaders/light.glsl in NumPy."""
+    """Return the sky's radiance from the given directions, as in shaders/light.glsl."""
     height = (directions[:, 2] / np.linalg.norm(directions, axis=1))[:, None]
     zenith, horizon, ground = (np.array(colour) for colour in (sky.zenith, sky.horizon, sky.ground))
     up = np.maximum(height, 0)
@@ -205,7 +211,7 @@ def _sky_radiance(sky: Sky, directions: Vectors) -> Vectors:
 
 
 def _sky_irradiance(sky: Sky, normals: Vectors) -> Vectors:
-    """The sky's irradiance on surfaces with these normals; shaders/light.glsl in NumPy."""
+    """Return the sky's irradiance on surfaces with the given normals, as in shaders/light.glsl."""
     zenith, horizon, ground = (np.array(colour) for colour in (sky.zenith, sky.horizon, sky.ground))
     up = 0.5 + 0.5 * normals[:, 2:]
     upper = horizon + 0.7 * up * (zenith - horizon)

@@ -12,7 +12,7 @@ from stereoweave.synth.rendering.shadow_and_occlusion import CELLS
 MOST_MATERIALS = 64
 MOST_LAMPS = 4
 
-# Vertex shader, then the parts of the fragment shader.
+# The vertex shader of each program, followed by the parts of its fragment shader.
 _PARTS = {
     "depth": ("depth.vert", "depth.frag"),
     "sun": ("sun.vert", "sun.frag"),
@@ -23,11 +23,11 @@ _SURFACE = ("surface.vert", "light.glsl", "surface.frag")
 
 
 class Programs:
-    """All programs by name, compiled for the active effects.
+    """Shader programs by name, compiled for the active effects.
 
-    The surface program exists for each number of lamps, because llvmpipe takes a quarter longer for a loop
-    whose count is a uniform, even if that is 0. Each exists with and without a sun, because closed rooms
-    need none of its shadows and gloss.
+    Each number of lamps has its own surface program, because llvmpipe takes a quarter longer for a loop whose
+    count is a uniform, even if the count is 0. Each of these programs has a variant without the sun, because
+    closed rooms need neither sun shadows nor highlights from the sun.
     """
 
     def __init__(self, gl: moderngl.Context, effects: Effects) -> None:
@@ -47,14 +47,14 @@ class Programs:
         return self._programs[name]
 
     def bind_textures(self, **units: int) -> None:
-        """Set the texture units of all programs' samplers."""
+        """Assign texture units to the samplers of all programs."""
         for program in self._programs.values():
             for key, unit in units.items():
                 if key in program:
                     program[key] = unit
 
     def set_uniforms(self, name: str, **values: Any) -> None:
-        """Set a program's uniforms, matrices column by column; unused ones are ignored."""
+        """Set a program's uniforms, with matrices column by column; unused uniforms are ignored."""
         program = self._programs[name]
         for key, value in values.items():
             uniform = program.get(key, None)
@@ -63,7 +63,7 @@ class Programs:
 
 
 def surface_program(lamps: int, sun: bool) -> str:
-    """Name of the surface program for a number of lamps, with or without sun."""
+    """Return the name of the surface program for a number of lamps, with or without the sun."""
     return f"surface, {lamps} lamps{', sun' * sun}"
 
 

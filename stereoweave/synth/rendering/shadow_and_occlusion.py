@@ -1,6 +1,6 @@
-"""Geometry of shadows and ambient occlusion: the sun's view, and a grid of nearby surface.
+"""Geometry for shadows and ambient occlusion: the sun's view, and a grid of surface areas.
 
-Triangles are `Mesh.corners_m.T`, contiguous: axis, corner, triangle.
+Triangles are passed as a contiguous `Mesh.corners_m.T`: axis, corner, triangle.
 """
 
 from dataclasses import dataclass
@@ -11,26 +11,28 @@ from jaxtyping import Float, Int, UInt8
 
 Corners = Float[np.ndarray, "3 3 _"]
 
-# Grid cells along each axis; 17 cm each around a target of 8 m.
+# Number of grid cells along each axis; a cell is 18 cm wide if the target is 8 m long.
 CELLS = 64
-# Margin between the target and the grid's border.
+# Margin between the target and the grid's border, in cells.
 _SPARE_CELLS = 8
-# A triangle of a larger area, in faces of a cell, is subdivided.
+# Triangles larger than this, in areas of a cell's face, are subdivided.
 _LARGE_CELLS = 64
-# Side of the cube whose surface occludes its centre: 1.5 m around a target of 8 m.
+# Side, in cells, of the cube whose surfaces occlude its centre: 1.65 m if the target is 8 m long.
 _WIDE_CELLS = 9
 
 
 @dataclass(frozen=True, kw_only=True)
 class SunView:
-    """The sun's orthographic view: an inner square around the target, and a concentric wide one.
+    """The sun's orthographic view: an inner square around the target and a wider concentric one.
 
     Attributes:
-        to_unit: [3, 4], from (x, y, z, 1) to 0..1 across and down the inner square, and away from the sun.
+        to_unit: matrix [3, 4] from (x, y, z, 1) to 0..1 across and down the inner square, and away from the
+            sun.
         inner_m: side of the inner square.
-        wide: side of the wide square over that of the inner one.
+        wide: ratio of the wide square's side to the inner square's side.
         inside: indices of the triangles that cast shadows into the inner square.
-        beyond: indices of those that cast shadows into the wide square and are not entirely in the inner one.
+        beyond: indices of the triangles that cast shadows into the wide square and are not entirely in the
+            inner one.
     """
 
     to_unit: Float[np.ndarray, "3 4"]
@@ -43,7 +45,10 @@ class SunView:
 def fit_sun_view(
     corners_m: Corners, target_m: Corners, sun: tuple[float, float, float], reach_m: float
 ) -> SunView:
-    """Fit the sun's view to the target; along the sun's rays, target and shadow cover the same square."""
+    """Fit the sun's view to the target.
+
+    Seen along the sun's rays, a target covers its own shadow, so one square contains both.
+    """
     axes = _sun_axes(np.array(sun))
     low, high = _extent(_rotate(target_m, axes))
     middle = (low + high) / 2
@@ -68,7 +73,7 @@ def fit_sun_view(
 
 
 def _sun_axes(sun: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Rotation [3, 3]: two axes across the sun's rays, and their direction."""
+    """Return the rotation [3, 3] whose rows are two axes across the sun's rays and the rays' direction."""
     across = np.cross([0, 1, 0] if abs(sun[2]) > 0.9 else [0, 0, 1], sun)
     across = across / np.linalg.norm(across)
     return np.stack([across, np.cross(sun, across), -sun])
@@ -87,8 +92,8 @@ class OcclusionGrid:
     """Ambient occlusion around the target.
 
     Attributes:
-        share: uint8 [CELLS, CELLS, CELLS], z y x: hidden share of the sky, 255 is all of it.
-        low_m: lower corner of the grid.
+        share: blocked fraction of the sky, uint8 [CELLS, CELLS, CELLS] indexed z, y, x; 255 is all of it.
+        low_m: corner of the grid with the least coordinates.
         cell_m: side of a cell.
     """
 
@@ -98,7 +103,7 @@ class OcclusionGrid:
 
 
 def count_occlusion(corners_m: Corners, target_m: Corners) -> OcclusionGrid:
-    """Estimate occlusion from the surface area in each cell, sampled at points on the triangles."""
+    """Estimate ambient occlusion from each cell's surface area, sampled at points on the triangles."""
     low, high = _extent(target_m)
     cell_m = 1.1 * float((high - low).max()) / (CELLS - 2 * _SPARE_CELLS)
     low_m = (low + high) / 2 - np.float32(cell_m * CELLS / 2)
@@ -113,9 +118,10 @@ def count_occlusion(corners_m: Corners, target_m: Corners) -> OcclusionGrid:
 
 
 def _hidden_share(surface: Float[np.ndarray, "z y x"]) -> UInt8[np.ndarray, "z y x"]:
-    """Share of the sky hidden by surfaces in the cell itself and, with less weight, in the cube around it.
+    """Return the fraction of the sky that nearby surfaces block from each cell.
 
-    A plane hides no sky from points on it, so its area is subtracted from the cube's.
+    Surfaces in the cell itself count most, those in the cube around it less. A plane blocks no sky from
+    points on it, so its area is subtracted from the cube's.
     """
     around = surface
     for axis in range(3):
@@ -123,14 +129,14 @@ def _hidden_share(surface: Float[np.ndarray, "z y x"]) -> UInt8[np.ndarray, "z y
         blurred = cv2.blur(layers.reshape(CELLS, -1), (1, _WIDE_CELLS), borderType=cv2.BORDER_CONSTANT)
         around = np.moveaxis(blurred.reshape(layers.shape), 0, axis)
     hidden = 0.35 * surface + 5 * np.maximum(around - 1.2 / _WIDE_CELLS, 0)
-    # Lookups outside the grid return its border.
+    # The border stays 0, because a lookup outside the grid returns the value at the border.
     inner = np.zeros_like(hidden)
     inner[1:-1, 1:-1, 1:-1] = hidden[1:-1, 1:-1, 1:-1]
     return (255 * np.minimum(inner, 0.85)).astype(np.uint8)
 
 
 def _cut_large(corners_m: Corners, low_m: Float[np.ndarray, "3"], cell_m: float) -> Corners:
-    """Triangles that touch the grid; large ones are subdivided, so that few sample points miss it."""
+    """Return the triangles that touch the grid, with large ones subdivided so that few samples miss it."""
     done = []
     rest = _select_near(corners_m, low_m, cell_m * CELLS)
     while rest.size:
@@ -163,7 +169,7 @@ def _areas(corners_m: Corners) -> Float[np.ndarray, " p"]:
 def _sample_points(
     corners_m: Corners, cell_m: float
 ) -> tuple[Float[np.ndarray, "3 p"], Float[np.ndarray, " p"]]:
-    """Sample points on the triangles, about two per cell, and the area that each represents."""
+    """Return sample points on the triangles, about two per cell, and the area that each point represents."""
     first = corners_m[:, 0]
     edge, other = corners_m[:, 1] - first, corners_m[:, 2] - first
     areas = _areas(corners_m)

@@ -1,4 +1,4 @@
-"""The renderer against geometry worked out by hand, against ray casting, and against itself."""
+"""Tests of the OpenGL renderer against hand-computed geometry, ray casting and itself."""
 
 import functools
 from collections.abc import Callable, Iterator
@@ -74,7 +74,7 @@ def make() -> Iterator[Callable[[Effects], OpenGLRenderer]]:
 def ahead(
     size_px: tuple[int, int] = (160, 120), focal_px: float = 100.0, baseline_m: float = 0.2
 ) -> PosedRig:
-    """At the origin, looking along y, z up."""
+    """Return a rig at the origin that looks along y, with z upwards."""
     width_px, height_px = size_px
     camera = StereoCamera(
         focal_px=focal_px, baseline_m=baseline_m, cx_px=(width_px - 1) / 2, cy_px=(height_px - 1) / 2
@@ -96,7 +96,7 @@ def orbiting(size_px: tuple[int, int] = (320, 240)) -> PosedRig:
 def wall(
     distance_m: float, left_m: float = -20, right_m: float = 20, material: int = 0, steps: int = 2
 ) -> Mesh:
-    """Upright across the view of `ahead`, its front to the camera."""
+    """Return an upright wall across the view of `ahead` that faces the camera."""
     x, z = np.meshgrid(np.linspace(left_m, right_m, steps), np.linspace(-20, 20, steps))
     return sheet(np.stack([x, np.full_like(x, distance_m), z], -1), material)
 
@@ -128,7 +128,7 @@ def cluttered(rng: np.random.Generator) -> World:
 
 
 def level(light: float) -> float:
-    """What a screen shows of light at exposure 1: the tone curve, then sRGB."""
+    """Return the sRGB level of light at exposure 1: the tone curve, then the sRGB transfer function."""
     shown = light**1.5 / (light**1.5 + 0.25)
     return 255 * (1.055 * shown ** (1 / 2.4) - 0.055)
 
@@ -138,15 +138,15 @@ def light_of(image: np.ndarray) -> np.ndarray:
     return (0.25 * shown / (1 - shown)) ** (2 / 3)
 
 
-def test_a_wall_at_4_m_is_4_m_deep_everywhere(plain):
+def test_a_wall_at_4_m_has_a_depth_of_4_m_everywhere(plain):
     rig = ahead(focal_px=100.0, baseline_m=0.2)
     depth_m = plain.depth_m(world_of(wall(4.0)), rig, 0.0)
     np.testing.assert_allclose(depth_m, 4.0, atol=2e-6)
     np.testing.assert_allclose(rig.camera.disparity_px(depth_m), 5.0, atol=2e-5)  # 100 px * 0.2 m / 4 m
 
 
-def test_a_box_hides_the_wall_where_it_stands(plain):
-    # Its front is at 2 m, so 1 cm is half a pixel: 20.5 px to each side of the middle, 41 of 161 columns.
+def test_a_box_hides_the_wall_behind_it(plain):
+    # The box's front is at 2 m, where 1 cm is half a pixel: 20.5 px to each side of the middle.
     box = boxes(np.array([[0, 2.2, 0]]), np.array([[0.82, 0.4, 0.42]]), 0).as_target()
     left, right = plain.render_views(
         world_of(join_meshes([wall(4.0), box])), ahead(size_px=(161, 121)), (0.0, 1.0)
@@ -159,8 +159,8 @@ def test_a_box_hides_the_wall_where_it_stands(plain):
     np.testing.assert_array_equal(right.target, np.roll(expected, -10, axis=1))
 
 
-def test_a_pixel_sees_what_its_centre_sees(plain):
-    # From x = -0.495 to 0.205 m at 1 m: from column 79.5 - 49.5 = 30 on, a hair before it, up to 100 at most.
+def test_a_pixel_shows_the_surface_at_its_centre(plain):
+    # The wall's edges, 1 m away, are just left of columns 79.5 - 49.5 = 30 and 79.5 + 20.5 = 100.
     columns = plain.depth_m(world_of(wall(1.0, -0.4951, 0.2049)), ahead(), 0.0)[60] == 1.0
     np.testing.assert_array_equal(np.flatnonzero(columns), np.arange(30, 100))
 
@@ -170,7 +170,7 @@ def test_the_sky_is_infinitely_far(plain):
     assert np.isinf(depth_m).all() and (depth_m > 0).all()
 
 
-def test_a_world_without_a_sun_looks_like_one_whose_sun_gives_no_light_to_speak_of(renderer, rng):
+def test_a_world_without_a_sun_looks_like_one_with_a_very_faint_sun(renderer, rng):
     world, rig = cluttered(rng), orbiting()
     without, faint = (
         renderer.render_views(replace(world, sky=replace(world.sky, sun_light=3 * (light,))), rig, (0.0,))[
@@ -193,7 +193,7 @@ def test_positions_lie_on_the_baseline(plain):
 
 @pytest.mark.parametrize("position", [0, 1])
 @pytest.mark.parametrize("name", ["clutter", *SCENES])
-def test_depth_is_that_of_ray_casting(plain, small_scene, rng, name, position):
+def test_depth_equals_the_depth_from_ray_casting(plain, small_scene, rng, name, position):
     world, rig = (cluttered(rng), orbiting()) if name == "clutter" else small_scene(name)
     disparity_px, expected_px = (
         rig.camera.disparity_px(camera.depth_m(world, rig, position)) for camera in (plain, Raycaster())
@@ -205,8 +205,8 @@ def test_depth_is_that_of_ray_casting(plain, small_scene, rng, name, position):
 
 @pytest.mark.parametrize("position", [0, 1])
 @pytest.mark.parametrize("name", SCENES)
-def test_the_two_disparities_agree_where_both_cameras_see(plain, small_scene, name, position):
-    """What one eye renders has this disparity for the other one, wherever it meets the same triangle."""
+def test_the_two_disparities_agree_where_both_cameras_see_a_surface(plain, small_scene, name, position):
+    """One camera's disparity equals the other's wherever both see the same triangle."""
     world, rig = small_scene(name)
     disparity_px = rig.camera.disparity_px(plain.depth_m(world, rig, position))
     there_px, same = from_the_other_eye(world, rig, disparity_px, position)
@@ -215,8 +215,8 @@ def test_the_two_disparities_agree_where_both_cameras_see(plain, small_scene, na
 
 
 @pytest.mark.parametrize("samples", [1, 2])
-def test_diffuse_images_are_not_shifted_against_their_truth(make, samples):
-    """The right picture, warped to the left by the disparity: what is left to shift, by least squares."""
+def test_diffuse_images_are_not_shifted_against_their_ground_truth(make, samples):
+    """After warping the right image by the disparity, a least-squares fit finds no remaining shift."""
     diffuse = make(Effects(gloss=False, fog=False, samples=samples))
     x, z = np.meshgrid(np.linspace(-6, 6, 9), np.linspace(-4, 4, 9))
     slanted = sheet(np.stack([x, 5 + 0.35 * x + 0.1 * np.sin(3 * z), z], -1), 0)
@@ -226,7 +226,7 @@ def test_diffuse_images_are_not_shifted_against_their_truth(make, samples):
     disparity_px = rig.camera.disparity_px(left.depth_m)
     columns = np.arange(640)
     seen, other = (shot.image.mean(2) for shot in (left, right))
-    # Not cv2.remap, which shifts by 1/64 px on average.
+    # cv2.remap is not used, because it shifts images by 1/64 px on average.
     warped = np.stack(
         [np.interp(columns - d, columns, row) for d, row in zip(disparity_px, other, strict=True)]
     )
@@ -236,8 +236,8 @@ def test_diffuse_images_are_not_shifted_against_their_truth(make, samples):
         assert abs((slope * (seen - warped)[inside]).sum() / (slope**2).sum()) < 0.01
 
 
-def test_a_shadow_falls_where_geometry_says(plain, make):
-    """The sun stands 45 degrees high towards +x: what floats at 2 m throws its shadow 2 m towards -x."""
+def test_a_shadow_falls_where_geometry_predicts(plain, make):
+    """The sun is 45 degrees high towards +x, so a slab at a height of 2 m casts its shadow 2 m towards -x."""
     sky = replace(SKY, sun=(np.sqrt(0.5), 0.0, np.sqrt(0.5)))
     x, y = np.meshgrid([-9.0, 9.0], [-9.0, 9.0])
     ground = sheet(np.stack([x, y, 0 * x], -1), 0)
@@ -262,8 +262,8 @@ def test_a_shadow_falls_where_geometry_says(plain, make):
     assert (lit - shadowed)[76:85, 56:65].min() > 20
 
 
-def test_crowded_places_get_less_light_from_the_sky(plain, make):
-    """A floor under a table is darker than the open floor, and as bright where the effect is off."""
+def test_enclosed_places_get_less_light_from_the_sky(plain, make):
+    """The effect darkens the floor under a table and leaves the open floor as it is."""
     x, y = np.meshgrid([-9.0, 9.0], [-9.0, 9.0])
     floor = sheet(np.stack([x, y, 0 * x], -1), 0)
     table = boxes(np.array([[0, 4.0, 0.45]]), np.array([[3.0, 3.0, 0.1]]), 0).as_target()
@@ -279,21 +279,21 @@ def test_crowded_places_get_less_light_from_the_sky(plain, make):
     np.testing.assert_allclose(crowded[beside].mean(), open_to_the_sky[beside].mean(), rtol=0.03)
 
 
-def test_gloss_alone_differs_between_the_eyes(plain, make):
-    """A wall moved along with the eye looks the same to both, but for highlights and reflections."""
+def test_only_gloss_differs_between_the_cameras(plain, make):
+    """Both cameras see the same colours on a wall, except for highlights and reflections."""
     rig = ahead(baseline_m=1.0)
     paint = Material(texture="paint", roughness=0.3, relief=0.0)
     lamps = (Lamp(position_m=(0.5, 1.0, 0.0), light=(3.0, 3.0, 3.0)),)
     for camera, gloss in ((plain, False), (make(replace(PLAIN, gloss=True)), True)):
-        # 100 px * 1 m / 5 m: whole pixels, so that samples fall on the same places of the wall.
+        # The disparity, 100 px * 1 m / 5 m, is whole, so samples fall on the same places of the wall.
         shots = camera.render_views(world_of(wall(5.0), paint, lamps=lamps), rig, (0.0, 1.0))
         left, right = (shot.image.astype(int) for shot in shots)
         differs = np.abs(left[:, 20:] - right[:, :-20]).max() > 3
         assert differs == gloss
 
 
-def test_fog_mixes_its_colour_in_by_distance(plain, make):
-    """exp(-0.1 / m * 5 m) = 0.6065 of black, the rest of fog 0.5: light 0.1967."""
+def test_fog_adds_its_colour_with_distance(plain, make):
+    """At 5 m, exp(-0.1 * 5) = 0.6065 of the black wall and 0.3935 of the fog's 0.5 give 0.1967."""
     world = world_of(
         wall(5.0),
         Material(texture="plain", tint=BLACK),
@@ -305,8 +305,8 @@ def test_fog_mixes_its_colour_in_by_distance(plain, make):
 
 
 @pytest.mark.parametrize("span_m", [0.5, 4.0])
-def test_a_textures_mean_colour_survives(plain, span_m):
-    """Under a white sky a wall gives off what its texture is, tint times mean, from near and from afar."""
+def test_a_texture_keeps_its_mean_colour(plain, span_m):
+    """Under a white sky a wall has its tint times its texture's mean, for coarse and fine textures."""
     even = replace(SKY, sun_light=BLACK, zenith=WHITE, horizon=WHITE)
     world = world_of(wall(5.0), Material(texture="concrete", tint=(0.9, 0.7, 0.5), span_m=span_m), sky=even)
     image = plain.render_views(world, ahead(size_px=(160, 160)), (0.0,))[0].image
@@ -315,8 +315,8 @@ def test_a_textures_mean_colour_survives(plain, span_m):
     np.testing.assert_allclose(light_of(image).mean((0, 1)), expected, rtol=0.04)
 
 
-def test_plain_is_what_ray_casting_shows(plain):
-    """Diffuse colours in sun and sky without shadows, by two ways; texels differ by their filter."""
+def test_a_plain_rendering_equals_ray_casting(plain):
+    """Diffuse colours in sun and sky without shadows agree, but texels are filtered differently."""
     world = replace(cluttered(np.random.default_rng(3)), lamps=())
     world = replace(world, sky=replace(SKY, clouds=0.0))
     shot, expected = (
@@ -327,7 +327,7 @@ def test_plain_is_what_ray_casting_shows(plain):
     assert np.median(np.abs(difference)) < 8
 
 
-def test_the_same_bytes_whatever_was_rendered_before(renderer, plain, make):
+def test_the_bytes_do_not_depend_on_earlier_renderings(renderer, plain, make):
     worlds = [cluttered(np.random.default_rng(seed)) for seed in range(2)]
     rig = orbiting((160, 120))
     first = renderer.render_views(worlds[0], rig, (0.0, 1.0))
@@ -342,7 +342,7 @@ def test_the_same_bytes_whatever_was_rendered_before(renderer, plain, make):
                 np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
-def test_a_shot_does_not_depend_on_the_others(renderer, rng):
+def test_a_view_does_not_depend_on_the_other_views(renderer, rng):
     world, rig = cluttered(rng), orbiting((160, 120))
     alone = renderer.render_views(world, rig, (1.0,))[0]
     np.testing.assert_array_equal(alone.image, renderer.render_views(world, rig, (0.0, 1.0))[1].image)
@@ -353,25 +353,25 @@ def test_a_shot_does_not_depend_on_the_others(renderer, rng):
     [
         (
             {"materials": 65 * (Material(texture="rust"),)},
-            "materials of a world: expected at most 64, found 65",
+            "world: expected at most 64 materials, found 65",
         ),
         (
             {"lamps": 5 * (Lamp(position_m=(0, 0, 1), light=WHITE),)},
-            "lamps of a world: expected at most 4, found 5",
+            "world: expected at most 4 lamps, found 5",
         ),
     ],
 )
-def test_more_than_a_world_may_have_is_an_error(plain, others, message):
+def test_more_materials_or_lamps_than_a_world_may_have_are_an_error(plain, others, message):
     with pytest.raises(StereoweaveError, match=message):
         plain.render_views(replace(world_of(wall(4.0)), **others), ahead(), (0.0,))
 
 
-def test_a_pixel_takes_one_sample_or_2x2():
+def test_a_pixel_has_one_sample_or_2x2():
     with pytest.raises(StereoweaveError, match="samples: expected 1 or 2, found 3"):
         Effects(samples=3)
 
 
 def _beside_edges(disparity_px: np.ndarray) -> np.ndarray:
-    """Where a neighbour differs from another by more than half a pixel."""
+    """Return the mask of pixels whose neighbourhood spans more than half a pixel of disparity."""
     values, window = disparity_px.astype(np.float32), np.ones((3, 3))
     return cv2.dilate(values, window) - cv2.erode(values, window) > 0.5

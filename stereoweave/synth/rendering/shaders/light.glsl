@@ -1,6 +1,6 @@
 // Sky light and tone mapping.
 
-uniform vec3 sun;  // direction towards it
+uniform vec3 sun;  // unit vector towards the sun
 uniform vec3 sun_light;
 uniform vec3 zenith;
 uniform vec3 horizon;

@@ -1,4 +1,4 @@
-// Pixel from its samples: mean of the tone-mapped light, then sRGB.
+// Averages the tone-mapped samples of a pixel and encodes the mean as sRGB.
 
 uniform sampler2D samples;
 

@@ -12,7 +12,7 @@ void main() {
     vec3 direction = normalize(direction_matrix * vec3(gl_FragCoord.xy, 1));
     vec3 seen = sky_radiance(direction);
     float up = max(direction.z, 0);
-    // The texture is the cloud density; clouds lie on a plane overhead.
+    // The texture holds the cloud density; the clouds lie on a plane overhead.
     vec2 overhead = direction.xy / (up + 0.15);
     float cloud = texture(textures, vec3(0.2 * overhead, cloud_layer)).r;
     float cover = smoothstep(0.7 - 0.7 * clouds, 1.2 - 0.6 * clouds, cloud) * smoothstep(0.0, 0.15, up);

@@ -32,12 +32,12 @@ out vec4 colour;
 #ifdef SHADOWS
 uniform sampler2DShadow shadow_map;
 uniform mat4x3 to_unit;  // to the inner square of the sun's view
-uniform float wide;      // side of the wide square over that of the inner one
-uniform vec4 squares;    // each square's share of the map's width and height
-uniform vec2 texels;     // texel of each, as a share of the inner square's side
+uniform float wide;      // ratio of the wide square's side to the inner square's side
+uniform vec4 squares;    // each square's fraction of the map's width and height
+uniform vec2 texels;     // texel size of each square, as a fraction of the inner square's side
 uniform float inner_m;
 
-// Visible share of the sun. Offset from the surface by two texels, because the filter is three texels wide.
+// Visible fraction of the sun, sampled two texels off the surface: the filter is three texels wide.
 float sun_visibility(vec3 normal) {
     vec3 unit = to_unit * vec4(place_m, 1);
     vec3 off = mat3(to_unit) * normal * (2 * inner_m);
@@ -60,7 +60,7 @@ float sun_visibility(vec3 normal) {
 uniform sampler3D occlusion;
 uniform vec4 occlusion_frame;  // the lower corner, and 1 / side
 
-// Visible share of the sky, sampled two cells off the surface to exclude the surface itself.
+// Visible fraction of the sky, sampled two cells off the surface to exclude the surface itself.
 float sky_visibility(vec3 normal) {
     vec3 at = (place_m - occlusion_frame.xyz) * occlusion_frame.w + normal * (2.0 / CELLS);
     return 1 - texture(occlusion, at).r;
@@ -78,7 +78,7 @@ vec3 bumped(vec3 normal, vec3 across, vec3 down, float height_m) {
 }
 #endif
 
-// Reflected share of light from a direction, relative to a white diffuse surface facing it.
+// Reflected fraction of the light from a direction, relative to a white diffuse surface facing it.
 vec3 reflected_share(vec3 light, vec3 normal, vec3 viewer, vec3 diffuse, vec3 mirror, float roughness) {
     float facing = max(dot(normal, light), 0);
 #ifdef GLOSS
@@ -102,7 +102,7 @@ void main() {
     vec4 texel = texture(textures, vec3(uv_at_m * made.repeats_per_m, made.layer));
     vec3 own = made.tint * texel.rgb * texel.rgb;
 
-    // Normals face the viewer, because sheets are two-sided.
+    // Turn normals towards the viewer, because sheets are two-sided.
     vec3 across = dFdx(place_m), down = dFdy(place_m);
     vec3 face = cross(across, down);
     vec3 away_m = place_m - eye_m;
