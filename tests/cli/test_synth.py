@@ -52,7 +52,7 @@ def test_a_set_is_found_in_order_and_a_damaged_one_ends_with_1(words, capsys):
     assert run(f"synth check {out} --jobs 1") == 0
     told = capsys.readouterr().out
     assert "disparity, px" in told
-    assert told.endswith("\nin order\n")
+    assert told.endswith("\nno problems\n")
     shard = out / "pylon-000000-000001.tar"
     content = shard.read_bytes()
     shard.write_bytes(content[:2000] + b"?" + content[2001:])
@@ -119,11 +119,11 @@ def test_the_costs_of_the_effects_are_told_in_milliseconds(monkeypatch, capsys):
         ("synth make pylon --pairs 1 --size 640 -o set", "--size: expected width x height"),
         (
             "synth make pylon --pairs 1 --size 640x10 -o set",
-            "--size: expected 32 to 4096 px a side, found 640x10",
+            "--size: expected 32 to 4096 px per side, found 640x10",
         ),
-        ("synth make pylon --pairs 1 --size 99999x32 -o set", "--size: expected 32 to 4096 px a side"),
+        ("synth make pylon --pairs 1 --size 99999x32 -o set", "--size: expected 32 to 4096 px per side"),
         ("synth make pylon --pairs 1 --size ６４x４８ -o set", "--size: expected width x height"),
-        ("synth make pylon --pairs 1 --view 2.1 -o set", "--view: expected positions of -1.0 "),
+        ("synth make pylon --pairs 1 --view 2.1 -o set", "--view: expected positions from -1.0 to 2.0 "),
         ("synth make pylon --pairs 1 --view 0.5 --view 0.5 -o set", "--view: expected positions that differ"),
         ("synth make pylon --pairs 1 --rig 0 0.2 -o set", "focal_px and baseline_m must be above"),
         ("synth make pylon --pairs 1 --layout zip -o set", "--layout: expected one of shards, paper"),

@@ -1,1 +1,1 @@
-"""Sets of rendered pairs: making, checking, contact sheets."""
+"""Sets of rendered pairs: making and checking them, and contact sheets."""

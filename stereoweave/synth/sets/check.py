@@ -1,4 +1,4 @@
-"""Verification of sets: checksums, disparities against the images and against each other."""
+"""Verification of sets: checksums, and disparities against the images and each other."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -23,37 +23,38 @@ _DISPARITY_EDGES_PX = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 _DEPTH_EDGES_M = (0.0, 1.0, 2.0, 3.0, 5.0, 7.5, 10.0, 15.0, 25.0, 50.0, 100.0)
 _WIDEST_BAR = 40
 _PAIRS_A_TASK = 20
-# Rounding on disk contributes at most 0.002 px.
+# Rounding of the stored disparities contributes at most 0.002 px.
 _AGREE_PX = 0.05
-# Rendered pairs of all scenes agree at 98 % of the pixels or more at 64x48, 99.1 % at 160x120 and 99.9 % at
-# 640x480; with one of the two maps 0.1 px off, at 29 % at most.
+# Measured on all scenes: correct pairs agree at 98 % of the pixels or more at 64x48, 99.1 % at 160x120 and
+# 99.9 % at 640x480. If one of the two maps is off by 0.1 px, they agree at 29 % or less.
 _LEAST_AGREEING = 0.95
-# Difference at the disparity over that one pixel beside it: at these sizes at most 0.90, 0.76 and 0.66 for
-# correct pairs, at least 1.1 for disparities 1 px off, and at least 0.99 for swapped sides.
+# Ratio of the image difference at the disparity to the difference 1 px beside it. At these sizes it is at
+# most 0.90, 0.76 and 0.66 for correct pairs, at least 1.1 if the disparity is off by 1 px, and at least 0.99
+# if the sides are swapped.
 _LARGEST_RATIO = 0.97
 # Means over fewer pixels are too noisy.
 _FEWEST_PIXELS = 200
-# Farther surfaces, above all the sky, look the same in both images even with swapped sides.
+# Farther surfaces, above all the sky, look the same in both images even if the sides are swapped.
 _NEAR_PX = 1.0
 _JUMP_PX = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
 class Findings:
-    """Statistics and problems of checked pairs; findings add up.
+    """Statistics and problems of checked pairs; instances can be added.
 
     Attributes:
         pairs: number of pairs.
         disparity: histogram [10] of the left views' known disparities.
-        depth: histogram [11] of their depths; the last bin includes the sky.
+        depth: histogram [11] of the depths at the same pixels; the last bin includes the sky.
         unknown: number of pixels without ground truth.
         occluded: number of pixels that only the left camera sees.
-        grey_levels: [3], sums over the compared pairs of the mean difference between the left image and the
-            right one warped by the disparity - 1 px, + 0 px and + 1 px.
-        compared: number of compared pairs: those with near surfaces in both views.
-        agreeing: sum over the matched pairs of the share of pixels whose two disparities agree.
-        matched: number of matched pairs: those with both disparities.
-        problems: one line each.
+        grey_levels: sums [3] over the compared pairs of the mean grey-level difference between the left image
+            and the right one warped by the disparity minus 1 px, plus 0 px and plus 1 px.
+        compared: number of pairs whose images were compared; the others have too few near surfaces.
+        agreeing: fraction of the pixels at which both disparities agree, summed over the matched pairs.
+        matched: number of pairs whose two disparities could be compared.
+        problems: one line per problem.
     """
 
     pairs: int
@@ -72,7 +73,10 @@ class Findings:
 
 
 class _Pairs(NamedTuple):
-    """Names and files of the pairs, and the function that reads one; in folders each frame is a file."""
+    """Names and files of the pairs, and a function that reads a pair.
+
+    In the paper's layout, each frame counts as one file.
+    """
 
     names: list[str]
     files: list[str]
@@ -87,10 +91,10 @@ class _Pairs(NamedTuple):
 
 
 def check_set(folder: Path, jobs: int = 1, console: Console | None = None) -> Findings:
-    """Check all pairs of a set; `problems` is empty if the set is in order.
+    """Check all pairs of a set; the findings have no `problems` if the set is intact.
 
     Raises:
-        FormatError: The folder holds no set, or files are missing between others.
+        FormatError: The folder holds no set, or the sequence of its files has a gap.
     """
     facts = read_set(folder)
     pairs = _open_pairs(folder, facts["layout"], facts["scene"])
@@ -100,35 +104,35 @@ def check_set(folder: Path, jobs: int = 1, console: Console | None = None) -> Fi
     for part in run_in_workers(look, pairs.runs(), jobs, console or Console(), "checking pairs", count):
         found += part
     if count < facts["pairs"]:
-        lacking = f"{folder}: expected {facts['pairs']} pairs, as requested, found {count}"
-        found += _no_findings(f"{lacking}; rerun the same stereoweave synth make to resume")
+        lacking = f"{folder}: expected the {facts['pairs']} pairs requested, found {count}"
+        found += _no_findings(f"{lacking}; rerun the same `stereoweave synth make` command to resume")
     return found
 
 
 def report_lines(found: Findings) -> Iterator[str]:
-    """Yield the report: statistics, histograms of disparity and depth, then the problems and their number."""
+    """Yield the report's lines: statistics, histograms of disparity and depth, problems, and their number."""
     if found.pairs:
         yield from _statistics(found)
     yield from found.problems
     count = len(found.problems)
-    yield f"{count} problem{'s' * (count > 1)}" if count else "in order"
+    yield f"{count} problem{'s' * (count > 1)}" if count else "no problems"
 
 
 def find_problem(sample: Sample) -> str | None:
-    """The first inconsistency between a pair's disparities and images, or None."""
+    """Return the first inconsistency between a pair's disparities and images, or None."""
     if not np.isfinite(sample.disparity_px).any():
-        return "expected a disparity, found every pixel unknown"
+        return "expected known disparities, found every pixel unknown"
     before, at, after = _grey_level_differences(sample)
     if at > _LARGEST_RATIO * min(before, after):
         return (
-            "expected the left picture to fit the right one best at the disparity, found differences of "
-            f"{at:.2f} grey levels there, {before:.2f} at 1 px less and {after:.2f} at 1 px more"
+            "expected both images to differ least at the disparity, found differences of "
+            f"{at:.2f} grey levels at the disparity, {before:.2f} at 1 px less and {after:.2f} at 1 px more"
         )
     agreeing = _agreeing_share(sample)
     if agreeing < _LEAST_AGREEING:
         return (
-            f"expected both disparities to agree at {_LEAST_AGREEING:.0%} of the pixels that both see, "
-            f"found {agreeing:.1%}"
+            f"expected both disparities to agree at {_LEAST_AGREEING:.0%} of the pixels that both cameras "
+            f"see, found {agreeing:.1%}"
         )
     return None
 
@@ -203,15 +207,15 @@ def _measure(sample: Sample, problem: str | None) -> Findings:
 
 
 def _grey_level_differences(sample: Sample) -> Float[np.ndarray, "3"]:
-    """Mean difference of both images on near surfaces seen by both, at the disparity - 1, + 0 and + 1 px.
+    """Return the images' mean differences at the disparity minus 1 px, plus 0 px and plus 1 px.
 
-    NaN if too few pixels are near.
+    Only near surfaces seen by both cameras count; NaN if they cover too few pixels.
     """
     left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (sample.left, sample.right))
     columns = _matching_columns(sample)
     rows = np.broadcast_to(np.arange(len(columns), dtype=np.float32)[:, None], columns.shape).copy()
     last = columns.shape[1] - 1
-    # Also false where the disparity is unknown.
+    # Comparisons with NaN are false, so this also excludes unknown disparities.
     seen = ~sample.occluded & (columns >= 1) & (columns <= last - 1) & (sample.disparity_px >= _NEAR_PX)
     if seen.sum() < _FEWEST_PIXELS:
         return np.full(3, np.nan)
@@ -223,10 +227,11 @@ def _grey_level_differences(sample: Sample) -> Float[np.ndarray, "3"]:
 
 
 def _agreeing_share(sample: Sample) -> float:
-    """Share of the pixels seen by both views whose disparities agree, excluding jumps; NaN if too few.
+    """Return the fraction of pixels, among those seen by both cameras, at which both disparities agree.
 
-    A disparity agrees if it lies between the values at the two columns next to its match. This tolerates a
-    crease between them, where no interpolation would be right.
+    Pixels at disparity jumps are excluded; NaN if too few pixels remain. A disparity agrees if it lies
+    between the right view's values at the two columns next to its match. This tolerates a crease between
+    these columns, where no interpolation would be right.
     """
     columns = _matching_columns(sample)
     inside = (columns >= 0) & (columns <= columns.shape[1] - 1)
@@ -236,7 +241,7 @@ def _agreeing_share(sample: Sample) -> float:
         for rounded in (np.floor, np.ceil)
     ]
     low_px, high_px = np.minimum(*beside), np.maximum(*beside)
-    # A wire narrower than a pixel may show in one view and fall between the columns of the other.
+    # A wire narrower than a pixel may appear in one view and fall between two columns of the other.
     level = _find_level(sample.disparity_px) & (high_px - low_px <= _JUMP_PX)
     seen = inside & level & ~sample.occluded
     if seen.sum() < _FEWEST_PIXELS:
@@ -246,12 +251,12 @@ def _agreeing_share(sample: Sample) -> float:
 
 
 def _matching_columns(sample: Sample) -> Float[np.ndarray, "h w"]:
-    """Column in the right image that each left pixel matches."""
+    """Return the column of the right image that each left pixel matches."""
     return np.arange(sample.disparity_px.shape[1], dtype=np.float32) - sample.disparity_px
 
 
 def _find_level(disparity_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels without a disparity jump or unknown disparity in the column before or after them."""
+    """Return the mask of pixels without a disparity jump or an unknown disparity at an adjacent column."""
     padded_px = np.pad(disparity_px, ((0, 0), (1, 1)), mode="edge")
     level = np.abs(np.diff(padded_px, axis=1)) <= _JUMP_PX
     return level[:, 1:] & level[:, :-1]
@@ -265,16 +270,16 @@ def _count(values: Float[np.ndarray, "*n"], edges: tuple[float, ...]) -> Int[np.
 def _statistics(found: Findings) -> Iterator[str]:
     pixels = found.disparity.sum() + found.unknown
     yield f"{found.pairs} pair{'s' * (found.pairs > 1)}"
-    yield f"occluded {found.occluded / pixels:.1%}, unknown {found.unknown / pixels:.1%} of the left views"
+    yield f"occluded {found.occluded / pixels:.1%}, unknown {found.unknown / pixels:.1%} of left view pixels"
     if found.compared:
         before, at, after = found.grey_levels / found.compared
         yield (
-            f"left pictures differ from right ones by {at:.2f} grey levels at the disparity, "
+            f"images differ by {at:.2f} grey levels at the disparity, "
             f"{before:.2f} at 1 px less, {after:.2f} at 1 px more"
         )
     if found.matched:
         share = found.agreeing / found.matched
-        yield f"both disparities agree within {_AGREE_PX} px at {share:.3%} of shared pixels, edges excluded"
+        yield f"disparities agree within {_AGREE_PX} px at {share:.3%} of shared pixels, edges excluded"
     yield from _histogram("disparity", "px", _DISPARITY_EDGES_PX, found.disparity)
     yield from _histogram("depth", "m", _DEPTH_EDGES_M, found.depth)
 

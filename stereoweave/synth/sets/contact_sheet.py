@@ -1,4 +1,4 @@
-"""Contact sheets: one row per scene, or unlabelled pictures as a quiz."""
+"""Contact sheets: one row per scene, or unlabelled images as a quiz."""
 
 from collections.abc import Iterator, Sequence
 
@@ -13,7 +13,7 @@ from stereoweave.stereo import Sample
 from stereoweave.synth.sets.pair_rendering import RenderSpec, SceneRenderer, render_pair
 from stereoweave.system.progress import progress
 
-COLUMNS = ("left", "right", "depth", "seen by this camera alone: left", "right")
+COLUMNS = ("left", "right", "depth", "occluded, left", "occluded, right")
 _TILE_PX = 320, 240
 _LABEL_PX = 20
 
@@ -21,7 +21,7 @@ _LABEL_PX = 20
 def contact_sheet(
     renderer: SceneRenderer, scenes: Sequence[str], seed: int, index: int = 0
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """One row per scene for pair `index`: left, right, coloured depth (red is near), both occlusion masks."""
+    """Render pair `index` of each scene into one row: images, depth (red is near) and occlusion masks."""
     rows = [np.hstack([_draw_label(text) for text in COLUMNS])]
     for scene, sample in _render_samples(renderer, [(scene, index) for scene in scenes], seed):
         tiles = [_shrink(picture) for picture in _row_of_pictures(sample)]
@@ -32,7 +32,7 @@ def contact_sheet(
 def quiz_sheet(
     renderer: SceneRenderer, scenes: Sequence[str], seed: int, pictures: int = 16
 ) -> tuple[UInt8[np.ndarray, "h w 3"], list[str]]:
-    """Unlabelled left images in four columns in random order. Returns the sheet and its scenes by row."""
+    """Render unlabelled left images in random order, four per row; return the sheet and its scenes by row."""
     order = np.random.default_rng(seed).permutation(
         [scenes[place % len(scenes)] for place in range(pictures)]
     )
@@ -46,7 +46,7 @@ def quiz_sheet(
 def _render_samples(
     renderer: SceneRenderer, pairs: Sequence[tuple[str, int]], seed: int
 ) -> Iterator[tuple[str, Sample]]:
-    """Yield scene and sample of each pair, with a progress bar."""
+    """Yield the scene and sample of each pair while showing a progress bar."""
     with progress(Console()) as bar:
         shown = bar.add_task("rendering pairs", total=len(pairs), loss="", rate="")
         for scene, index in pairs:
@@ -66,7 +66,7 @@ def _row_of_pictures(sample: Sample) -> list[UInt8[np.ndarray, "h w 3"]]:
 def _overlay_mask(
     image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The image in dark grey with the mask in orange."""
+    """Return the image in dark grey with the mask in orange."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) // 2
     return np.where(mask[..., None], np.array(OCCLUDED_RGB, np.uint8), grey[..., None])
 

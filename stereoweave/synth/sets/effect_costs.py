@@ -1,4 +1,4 @@
-"""Time that each rendering effect costs."""
+"""Measurement of the time that each rendering effect takes."""
 
 import time
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ _OFF = {
 
 @dataclass(frozen=True, kw_only=True)
 class Cost:
-    """Time per pair on one core in milliseconds: an effect's share, or the total."""
+    """Rendering time of a pair on one core, in milliseconds: an effect's share or a total."""
 
     effect: str
     ms_a_pair: float
@@ -30,7 +30,10 @@ class Cost:
 def measure_effect_costs(
     scene: str = "propeller", pairs: int = 3, size_px: tuple[int, int] = (640, 480)
 ) -> list[Cost]:
-    """Measure all effects together, each one's share, and no effects; building the scene is excluded."""
+    """Measure the time with all effects, the share of each effect, and the time without any.
+
+    The time for building the scene is excluded.
+    """
     spec = RenderSpec(scene=scene, size_px=size_px)
     renderer = OpenGLRenderer(PLAIN)
     stages = [draw_stage_and_rig(renderer, spec, index) for index in range(pairs)]
@@ -48,7 +51,10 @@ def measure_effect_costs(
 
 
 def _ms_a_pair(effects: Effects, views: list[tuple[World, PosedRig]]) -> float:
-    """Time in ms: the faster of two runs per view, averaged. Each run's world is new to the renderer."""
+    """Return the time of a pair in ms: the mean, over the pairs, of the faster of two runs.
+
+    Each run renders a world that is new to the renderer, so nothing is cached.
+    """
     renderer = OpenGLRenderer(effects)
     renderer.render_views(*views[0], (0.0, 1.0))
     total_s = 0.0

@@ -1,4 +1,4 @@
-"""Resumable making of sets of rendered pairs in several processes."""
+"""Resumable rendering of sets of pairs in several processes."""
 
 import hashlib
 import json
@@ -28,11 +28,11 @@ from stereoweave.system.ray_engine import Engine
 
 SET_FILE = "set.json"
 FORMAT = 1
-# 50 MB at 640x480: large enough to read at the disk's full speed; half a minute of work at stake.
+# At 640x480 a shard has 50 MB, enough for reading at full disk speed, and takes half a minute to make.
 PAIRS_A_SHARD = 50
-# Each frame has its own files, so runs may be short and keep every worker busy.
+# Each frame has its own files, so runs can be short, which keeps every worker busy.
 _FRAMES_A_RUN = 4
-# The sample buffers of such a picture take half a gigabyte.
+# The sample buffers of an image of this size take half a gigabyte.
 _LARGEST_SIDE_PX = 4096
 _EXCLUDED_SOURCES = {"make.py", "workers.py", "check.py", "contact_sheet.py", "effect_costs.py"}
 _ADDED_SOURCES = ("stereo.py", "data/samples.py", "data/packing.py", "data/paper_layout.py")
@@ -42,10 +42,10 @@ _PACKAGES = ("moderngl", "numpy", "opencv-python-headless", "pillow", "scikit-im
 
 @runtime_checkable
 class PairMaker(Protocol):
-    """Makes pairs; it is pickled and sent to worker processes."""
+    """A maker of pairs, which is pickled and sent to worker processes."""
 
     def renderer(self) -> str:
-        """Name of the renderer: with the spec and the generator's version it determines a pair's bytes."""
+        """Return the renderer's name; name, spec and generator version determine the bytes of a pair."""
         ...
 
     def __call__(self, spec: RenderSpec, index: int) -> RenderedPair: ...
@@ -53,12 +53,12 @@ class PairMaker(Protocol):
 
 @dataclass(frozen=True)
 class PairRenderer:
-    """Makes pairs with the best renderer of this machine; `plain` turns all effects off."""
+    """A maker of pairs that uses this machine's best renderer; `plain` turns all effects off."""
 
     plain: bool = False
 
     def renderer(self) -> str:
-        # In a short-lived process, because a renderer takes much memory.
+        # In a short-lived process, because a renderer needs a lot of memory.
         (name,) = run_in_workers(
             _renderer_name, [self.plain], 1, Console(quiet=True), "starting the renderer", 1
         )
@@ -72,10 +72,10 @@ class Layout(NamedTuple):
     """A storage layout of pairs in a folder.
 
     Attributes:
-        whole_pairs: lists the numbers of a scene's complete pairs.
-        write: writes a run of pairs as they arrive.
-        remove_unfinished: deletes partly written files.
-        pairs_a_run: pairs that a worker makes in one task; no run crosses a multiple of it.
+        whole_pairs: function that returns the numbers of a scene's complete pairs.
+        write: function that writes a run of pairs as they arrive.
+        remove_unfinished: function that deletes partly written files.
+        pairs_a_run: most pairs that a worker makes in one task; no run crosses a multiple of this number.
     """
 
     whole_pairs: Callable[[Path, str], set[int]]
@@ -95,23 +95,23 @@ def make(  # noqa: PLR0913 - mirrors the command's options
     pair_maker: PairMaker = PairRenderer(),
     console: Console | None = None,
 ) -> int:
-    """Make the missing ones of the first `pairs` pairs of a set. Returns the number of pairs made.
+    """Make the missing pairs of a set of `pairs` pairs, and return how many were made.
 
     Args:
-        spec: Scene, seed, size and so on.
-        pairs: Size of the finished set.
-        out: The set's folder, new or to be resumed.
+        spec: Specification of the pairs.
+        pairs: Number of pairs in the finished set.
+        out: Folder of a new set, or of one to resume.
         layout: A name in LAYOUTS.
-        jobs: Number of worker processes; the bytes do not depend on it.
-        engine: Cluster to use instead of local processes; all its machines must see `out`. The bytes do not
-            depend on it. The tasks of killed workers are repeated.
-        pair_maker: Makes the pairs.
-        console: Shows the progress.
+        jobs: Number of worker processes; it does not affect the bytes written.
+        engine: Cluster to use instead of local processes; all its machines must see `out`. It does not
+            affect the bytes written. The tasks of killed workers are repeated.
+        pair_maker: Maker of the pairs.
+        console: Console that shows the progress.
 
     Raises:
         StereoweaveError: An argument is invalid; `out` holds another set, is in use or cannot be written; the
-            disk is full; a worker was killed; or a machine does not see `out` or would make other pairs. All
-            finished pairs are then complete, and the same call resumes.
+            disk is full; a worker was killed; or a machine does not see `out` or would make different pairs.
+            All finished pairs are complete even then, and the same call resumes.
     """
     _check(spec, pairs, layout)
     make_folder(out)
@@ -127,7 +127,7 @@ def make(  # noqa: PLR0913 - mirrors the command's options
                 ):
                     pass
             else:
-                # Absolute, because the workers have another working directory.
+                # An absolute path, because the workers have a different working directory.
                 run_in_engine(
                     partial(_prepare_node, spec, out.absolute(), layout, pair_maker), runs, engine, *progress
                 )
@@ -145,7 +145,7 @@ def read_set(folder: Path) -> dict[str, Any]:
     """Read a set's description: spec, layout, generator, renderer and number of pairs.
 
     Raises:
-        FormatError: The folder holds no set, one of another format version, or a damaged description.
+        FormatError: The folder holds no set, a set of another format version, or a damaged description.
     """
     path = folder / SET_FILE
     with reading(path, "the description of a set made by stereoweave synth make"):
@@ -160,7 +160,7 @@ def read_set(folder: Path) -> dict[str, Any]:
 
 
 def generator_version() -> str:
-    """Hash (8 hexadecimal digits) of the sources that make pairs and of their packages' versions."""
+    """Return a hash (8 hexadecimal digits) of the sources that make pairs and of their packages' versions."""
     folder = Path(__file__).parents[1]
     sources = sorted(path for path in folder.rglob("*.*") if path.suffix != ".pyc" and path.is_file())
     sources = [path for path in sources if path.name not in _EXCLUDED_SOURCES]
@@ -177,7 +177,7 @@ def _check_facts(path: Path, facts: dict[str, Any]) -> None:
         wrong = ["layout"]
     if wrong:
         raise FormatError(
-            f"{path}: expected layout ({' or '.join(LAYOUTS)}), scene and number of pairs as written, "
+            f"{path}: expected a layout ({' or '.join(LAYOUTS)}), a scene and a number of pairs, "
             f"found {wrong[0]} = {json.dumps(facts.get(wrong[0]))}; restore the file, or make the set again"
         )
 
@@ -192,25 +192,25 @@ def _check(spec: RenderSpec, pairs: int, layout: str) -> None:
     width_px, height_px = spec.size_px
     if min(spec.size_px) < SMALLEST_SIDE_PX or max(spec.size_px) > _LARGEST_SIDE_PX:
         raise StereoweaveError(
-            f"expected {SMALLEST_SIDE_PX} to {_LARGEST_SIDE_PX} px a side, found {width_px}x{height_px}",
+            f"expected {SMALLEST_SIDE_PX} to {_LARGEST_SIDE_PX} px per side, found {width_px}x{height_px}",
             setting="size_px",
         )
     for position in spec.views:
         if not FIRST_POSITION <= position <= LAST_POSITION:
             raise StereoweaveError(
-                f"expected positions of {FIRST_POSITION} (0 is the left camera, 1 the right one) "
-                f"to {LAST_POSITION}, found {position}",
+                f"expected positions from {FIRST_POSITION} to {LAST_POSITION} (0 is the left camera, "
+                f"1 the right one), found {position}",
                 setting="views",
             )
     names = {f"{position:.2f}" for position in spec.views}
     if len(names) < len(spec.views):
         raise StereoweaveError(
-            f"expected positions that differ in their first two decimals, found {spec.views}",
+            f"expected positions that differ when rounded to two decimals, found {spec.views}",
             setting="views",
         )
     if layout == "paper" and spec.views:
         raise StereoweaveError(
-            f"expected none in the paper's layout, found {spec.views}; use the layout shards",
+            f"expected no additional views in the paper's layout, found {spec.views}; use the layout shards",
             setting="views",
         )
 
@@ -221,7 +221,11 @@ def _set_facts(spec: RenderSpec, layout: str, pair_maker: PairMaker) -> dict[str
 
 
 def _claim(out: Path, facts: dict[str, Any], pairs: int) -> None:
-    """Write the set's description; raises StereoweaveError if the folder holds another set."""
+    """Write the set's description to claim the folder.
+
+    Raises:
+        StereoweaveError: The folder holds another set.
+    """
     if (out / SET_FILE).exists():
         found = read_set(out)
         pairs = max(pairs, found.pop("pairs"))
@@ -240,14 +244,14 @@ def _missing_pairs(spec: RenderSpec, pairs: int, out: Path, layout: str) -> list
 def _prepare_node(
     spec: RenderSpec, out: Path, layout: str, pair_maker: PairMaker
 ) -> Callable[[Sequence[int]], int]:
-    """Check that this node sees the set and makes the same pairs. Returns the function that makes runs."""
+    """Check that this node sees the set and would make the same pairs. Returns a function that makes runs."""
     try:
         found = read_set(out)
         del found["pairs"]
         check_claim(out / SET_FILE, _set_facts(spec, layout, pair_maker), found)
     except StereoweaveError as error:
         raise StereoweaveError(
-            f"{platform.node()}: {error}; all nodes of a cluster need the folder on a shared disk "
+            f"{platform.node()}: {error}; all nodes of the cluster need the folder on a shared disk "
             "and the same versions of all packages"
         ) from error
     return partial(_make_run, spec, out, layout, pair_maker)
@@ -257,12 +261,12 @@ def _check_shared(out: Path, lacking: Sequence[int]) -> None:
     if lacking:
         raise StereoweaveError(
             f"{out}: expected all pairs that the cluster made, found {len(lacking)} of them missing; "
-            "check that all its nodes share the disk"
+            "check that all nodes share the disk"
         )
 
 
 def _split_into_runs(numbers: Sequence[int], most: int) -> list[list[int]]:
-    """Split sorted numbers into runs of consecutive ones; no run crosses a multiple of `most`."""
+    """Split sorted numbers into runs of consecutive numbers; no run crosses a multiple of `most`."""
     places = enumerate(numbers)
     groups = groupby(places, key=lambda item: (item[1] - item[0], item[1] // most))
     return [[number for _, number in group] for _, group in groups]

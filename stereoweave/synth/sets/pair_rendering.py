@@ -23,17 +23,18 @@ from stereoweave.synth.viewpoints import (
 )
 from stereoweave.synth.world import RenderedView, World
 
-# This quantile of depth decides the baseline: a single blade of grass does not count.
+# This quantile of depth determines the baseline, so a single blade of grass does not count.
 _NEAREST_SHARE = 0.01
-# Right in front of either camera even a wire counts, if its disparity exceeds the drawn one by this factor.
+# Seen from either camera, even a wire (this quantile of depth) counts if its disparity exceeds the drawn one
+# by this factor.
 _WIRE_SHARE, _EXCESS = 0.002, 1.25
-# A small picture suffices to find the nearest surface.
+# A small image suffices to find the nearest surface.
 _LOOK_WIDTH_PX = 160
 
 
 @runtime_checkable
 class SceneRenderer(Protocol):
-    """Renders worlds: `OpenGLRenderer`, or `Raycaster`, which is slower and plainer."""
+    """A renderer of worlds: `OpenGLRenderer`, or `Raycaster`, which is slower and plainer."""
 
     @property
     def name(self) -> str: ...
@@ -49,11 +50,11 @@ class RenderSpec:
 
     Attributes:
         scene: a name in SCENES.
-        seed: determines all random draws, together with the scene's name and the pair's index.
+        seed: seed of all random draws, together with the scene's name and the pair's index.
         size_px: width and height.
-        frames: consecutive pairs that form a video of one world by a moving camera; 1 for stills.
-        views: positions of additional views between (or beyond) the two cameras, such as 0.5.
-        rig: focal length in px and baseline in m of all pairs; None draws them for each world.
+        frames: number of consecutive pairs that form a video of one world from a moving camera; 1 for stills.
+        views: positions of additional views between or beyond the two cameras, such as 0.5.
+        rig: focal length in pixels and baseline in metres of all pairs; None draws both for each world.
     """
 
     scene: str
@@ -72,11 +73,11 @@ class RenderSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderedPair:
-    """A pair with its ground truth.
+    """A rendered pair with its ground truth.
 
     Attributes:
         sample: the pair, its disparities (0 for the sky), occlusion masks and camera.
-        views: position and image of each additional view.
+        views: position and rendering of each additional view.
     """
 
     sample: Sample
@@ -101,13 +102,13 @@ def render_pair(renderer: SceneRenderer, spec: RenderSpec, index: int) -> Render
 def draw_stage_and_rig(
     renderer: SceneRenderer, spec: RenderSpec, sequence: int, frame: int = 0
 ) -> tuple[Stage, PosedRig]:
-    """Draw stage and rig of a frame; all but its viewpoint depend on (seed, scene, sequence) only."""
+    """Draw the stage and rig of a frame; only the viewpoint differs between the frames of a sequence."""
     rng = np.random.default_rng(_seed(spec, sequence))
     stage = SCENES[spec.scene](rng)
     focal_px = draw_focal_px(rng, spec.size_px[0])
     nearest_px = draw_nearest_px(rng, spec.size_px[0], stage.nearest_px)
     start = draw_viewpoint(rng, stage.orbit)
-    # A video covers a part of the orbit.
+    # A video covers only a part of the orbit.
     end = interpolate_viewpoints(start, draw_viewpoint(rng, stage.orbit), rng.uniform(0.15, 0.4))
     ends = (start,) if spec.frames == 1 else (start, end)
     if spec.rig is not None:
@@ -133,7 +134,7 @@ def _seed(spec: RenderSpec, sequence: int) -> tuple[int, int, int]:
 def _add_noise(
     rng: np.random.Generator, image: UInt8[np.ndarray, "h w 3"], levels: float
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Add sensor noise; like shot noise it grows with the root of the brightness."""
+    """Add sensor noise that grows with the square root of brightness, like shot noise."""
     if not levels:
         return image
     deviation = levels * np.sqrt((0.25 + image / 255) / 1.25)
@@ -143,16 +144,17 @@ def _add_noise(
 def _choose_baseline_m(
     renderer: SceneRenderer, world: World, rigs: Callable[[float], Sequence[PosedRig]], metres_px: float
 ) -> float:
-    """Baseline in metres that gives the nearest surface, seen from the rig's centre, the wanted disparity.
+    """Return the baseline in metres that gives the nearest surface the wanted disparity.
 
-    From the cameras' actual centres something else may be nearer. If its disparity exceeds the wanted one by
-    more than a quarter, the baseline is shortened to that limit.
+    The nearest surface is the one seen from the rig's centre. Seen from the cameras, another surface may be
+    nearer. If its disparity exceeds the wanted one by more than a quarter, the baseline is shortened to that
+    limit.
 
     Args:
-        renderer: Renders depth.
+        renderer: Renderer that measures depth.
         world: The world to look at.
-        rigs: Returns the rigs for a baseline in metres.
-        metres_px: Wanted disparity over focal length: metres of baseline per metre of depth.
+        rigs: Function that returns the rigs for a baseline in metres.
+        metres_px: Wanted disparity divided by focal length, which is the baseline per metre of depth.
     """
 
     def nearest_m(baseline_m: float, positions: Sequence[float], share: float) -> float:

@@ -1,4 +1,4 @@
-"""Choice of the renderer: OpenGL where it works, otherwise ray casting."""
+"""Choice of a renderer: OpenGL where it works, otherwise ray casting."""
 
 import warnings
 from functools import cache
@@ -12,12 +12,12 @@ _PACKAGES = "on Debian: apt install libegl1 libgl1-mesa-dri"
 
 @cache
 def shared_renderer(plain: bool = False) -> SceneRenderer:
-    """The best renderer of this machine, one per process; `plain` turns all effects off."""
+    """Return this process's renderer, the best one that starts; `plain` turns all effects off."""
     return choose_renderer(PLAIN if plain else Effects())
 
 
 def choose_renderer(effects: Effects) -> SceneRenderer:
-    """An `OpenGLRenderer`; where OpenGL does not start, a `Raycaster` and a warning."""
+    """Return an `OpenGLRenderer`, or warn and return a `Raycaster` if OpenGL does not start."""
     try:
         from stereoweave.synth.rendering.opengl import OpenGLRenderer
 
@@ -29,7 +29,7 @@ def choose_renderer(effects: Effects) -> SceneRenderer:
     except ImportError as error:
         raise StereoweaveError(
             f"rendering: expected OpenGL (EGL) or embree, found neither ({without_opengl}; {error}); "
-            f"pip install 'stereoweave[synth]', and {_PACKAGES}"
+            f"run pip install 'stereoweave[synth]', and {_PACKAGES}"
         ) from error
     warnings.warn(
         f"rendering with embree, which is slower and plainer, because OpenGL did not start: {without_opengl}",

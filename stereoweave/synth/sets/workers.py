@@ -19,7 +19,7 @@ from stereoweave.system.ray_engine import Engine, connect, stream
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-# In a local worker: the number of steps done by all of them.
+# In a local worker: the number of steps that all workers together have done.
 _done: "Synchronized[int] | None" = None
 
 
@@ -34,17 +34,18 @@ def run_in_workers(  # noqa: PLR0913 - work, workers, and progress
     """Yield the results of `work` in order of completion.
 
     Args:
-        work: A picklable function; it calls `count_step` after each step.
-        tasks: Its arguments.
+        work: Picklable function that does a task and calls `count_step` after each step.
+        tasks: Arguments of `work`, one for each call.
         jobs: Number of processes.
-        console: Shows the progress.
+        console: Console that shows the progress.
         description: Label of the progress bar.
         steps: Total number of steps.
 
     Raises:
         StereoweaveError: A worker was killed.
     """
-    # Spawned: a forked child would inherit the threads of OpenGL and OpenCV in an unknown state.
+    # Spawned, because a forked child would inherit OpenGL's and OpenCV's locks without the threads that hold
+    # them.
     context = multiprocessing.get_context("spawn")
     done = context.Value("L", 0)
     others = multiprocessing.active_children()
@@ -55,7 +56,7 @@ def run_in_workers(  # noqa: PLR0913 - work, workers, and progress
                 pending = {pool.submit(work, task) for task in tasks}
                 while pending:
                     finished, pending = wait(pending, timeout=0.5, return_when=FIRST_COMPLETED)
-                    # Without the lock, because a killed worker may hold it forever.
+                    # Read without the lock, because a killed worker may hold it forever.
                     bar.update(shown, completed=done.get_obj().value)
                     yield from (future.result() for future in finished)
         except BaseException as error:
@@ -65,7 +66,7 @@ def run_in_workers(  # noqa: PLR0913 - work, workers, and progress
                     child.terminate()
             if isinstance(error, BrokenProcessPool):
                 raise StereoweaveError(
-                    f"{description}: expected every worker to survive, found one killed; is memory full?"
+                    f"{description}: expected every worker to finish, found one killed; is the memory full?"
                 ) from error
             raise
 
@@ -78,14 +79,14 @@ def run_in_engine(  # noqa: PLR0913 - see `run_in_workers`
     description: str,
     steps: int,
 ) -> None:
-    """Do all tasks on a cluster; the tasks of killed workers are repeated.
+    """Do all tasks on a cluster and repeat the tasks of killed workers.
 
     Args:
-        make_work: Called once in each worker. Returns the function that does a task and returns its number
-            of steps.
-        tasks: The function's arguments.
-        engine: The cluster.
-        console: Shows the progress.
+        make_work: Function called once in each worker. It returns the function that does a task and
+            returns the task's number of steps.
+        tasks: Arguments of that function, one for each call.
+        engine: Cluster that runs the workers.
+        console: Console that shows the progress.
         description: Label of the progress bar.
         steps: Total number of steps.
 
@@ -118,5 +119,5 @@ def _begin_in_engine(make_work: Callable[[], Callable[[Task], int]]) -> Callable
 
 
 def _draw_with_one_thread() -> None:
-    # Mesa reads it when it creates the first context; more threads than cores would slow down all of them.
+    # Mesa reads this variable when it creates its first context. More threads than cores would slow all down.
     os.environ["LP_NUM_THREADS"] = "1"

@@ -26,7 +26,7 @@ def sample(rng):
 
 @pytest.fixture(params=["shards", "paper"])
 def folder(request, tmp_path):
-    """A set of three pairs in either layout."""
+    """Return the folder of a set of three pairs, in each layout."""
     (tmp_path / "set.json").write_text(FACTS.replace("LAYOUT", request.param))
     samples = [box_before_a_wall(np.random.default_rng(number)) for number in range(3)]
     if request.param == "shards":
@@ -44,21 +44,23 @@ def checked(folder):
 # One pair
 
 
-def test_a_true_pair_has_no_problem(sample):
+def test_a_correct_pair_has_no_problem(sample):
     assert find_problem(sample) is None
 
 
 @pytest.mark.parametrize("shift_px", [-1, 1, 5])
-def test_a_disparity_that_is_off_by_a_pixel_is_noticed(sample, shift_px):
+def test_a_disparity_that_is_off_by_a_pixel_is_a_problem(sample, shift_px):
     shifted = {name: getattr(sample, name) + shift_px for name in ("disparity_px", "right_disparity_px")}
-    assert "expected the left picture to fit the right one" in find_problem(replace(sample, **shifted))
+    assert "expected both images to differ least at the disparity" in find_problem(replace(sample, **shifted))
 
 
-def test_pictures_that_changed_sides_are_noticed(sample):
-    assert "expected the left picture" in find_problem(replace(sample, left=sample.right, right=sample.left))
+def test_swapped_images_are_a_problem(sample):
+    assert "expected both images to differ least" in find_problem(
+        replace(sample, left=sample.right, right=sample.left)
+    )
 
 
-def test_disparities_that_disagree_are_noticed(sample):
+def test_disparities_that_disagree_are_a_problem(sample):
     wrong_px = np.where(sample.right_disparity_px > 0, sample.right_disparity_px + 0.1, 0).astype(np.float32)
     message = find_problem(replace(sample, right_disparity_px=wrong_px))
     assert message.startswith("expected both disparities to agree at 95%")
@@ -69,13 +71,13 @@ def test_a_pair_without_truth_is_a_problem(sample):
     assert "found every pixel unknown" in find_problem(replace(sample, disparity_px=nothing))
 
 
-def test_a_pair_with_nothing_near_is_not_wrong(sample):
+def test_a_pair_without_near_surfaces_has_no_problem(sample):
     far_px = np.full_like(sample.disparity_px, 0.5)
     assert find_problem(replace(sample, disparity_px=far_px, right_disparity_px=far_px)) is None
 
 
-def test_a_slope_with_a_crease_agrees_with_itself_and_not_with_one_that_is_off():
-    # Between two columns of the other view the disparity of a crease is in neither of them.
+def test_a_slope_with_a_crease_agrees_with_itself_but_not_with_a_wrong_disparity():
+    # The crease lies between two columns of the other view, so neither column has its disparity.
     width = 48
     left_px = np.broadcast_to(4 + 0.1 * np.abs(np.arange(width) - 24.5), (32, width)).astype(np.float32)
     places = np.arange(width) - left_px[0]
@@ -88,12 +90,12 @@ def test_a_slope_with_a_crease_agrees_with_itself_and_not_with_one_that_is_off()
     assert "both disparities to agree" in find_problem(off)
 
 
-# Rendered pairs, in small
+# Small rendered pairs
 
 
 @pytest.fixture(scope="module")
 def rendered_pairs():
-    """Five scenes at 160x120, two of which at 64x48 too, as they come from the disk."""
+    """Return pairs of five scenes at 160x120 and of two of them at 64x48, as read from the disk."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LP_NUM_THREADS", "1")
         renderer = shared_renderer(plain=True)
@@ -108,7 +110,7 @@ def shifted(sample, shift_px):
 
 
 @pytest.mark.needs_egl
-def test_rendered_pairs_of_all_sizes_are_in_order(rendered_pairs):
+def test_rendered_pairs_of_all_sizes_have_no_problem(rendered_pairs):
     assert [find_problem(sample) for sample in rendered_pairs] == [None] * len(rendered_pairs)
 
 
@@ -125,37 +127,38 @@ def test_rendered_pairs_of_all_sizes_are_in_order(rendered_pairs):
     ],
     ids=["sides", "a pixel more", "a pixel less", "scale", "sign", "a tenth of a pixel"],
 )
-def test_rendered_pairs_that_were_spoiled_are_found(rendered_pairs, spoil):
+def test_spoiled_rendered_pairs_have_a_problem(rendered_pairs, spoil):
     assert all(find_problem(spoil(sample)) for sample in rendered_pairs)
 
 
 # A set
 
 
-def test_a_set_in_order_has_statistics_and_no_problem(folder):
+def test_an_intact_set_has_statistics_and_no_problem(folder):
     found = checked(folder)
     assert found.problems == ()
     assert found.pairs == 3
-    # A box of 11 x 16 of 32 x 48 pixels at 10 px, a sky of 8 rows at 0, a wall at 3 px; f B = 12 px m.
+    # Of 32 x 48 pixels, a box of 11 x 16 is at 10 px, a sky of 8 rows at 0 px, and a wall at 3 px. Focal
+    # length times baseline is 12 px m.
     box, sky = 3 * 11 * 16, 3 * 8 * 48
     wall = 3 * 32 * 48 - box - sky
     known_sky = sky - found.unknown
     assert found.unknown in (0, sky)
     assert found.disparity.tolist() == [known_sky, 0, 0, wall, 0, box, 0, 0, 0, 0]
-    # 1.2 m, 4 m, and 100 m and more.
+    # The box is at 1.2 m, the wall at 4 m, and the sky at 100 m or more.
     assert found.depth.tolist() == [0, box, 0, wall, 0, 0, 0, 0, 0, 0, known_sky]
-    # Without a disparity of the right view what the box hides there counts as well.
+    # Without the right view's disparity, pixels that the box hides from the right camera count as well.
     assert found.compared == 3
     assert found.matched == (3 if known_sky else 0)
     assert found.grey_levels[1] <= (0 if known_sky else 0.2 * found.grey_levels[0])
 
 
-def test_the_statistics_are_told_with_histograms(folder):
+def test_the_report_has_statistics_with_histograms(folder):
     told = "\n".join(report_lines(checked(folder)))
-    assert told.endswith("\nin order")
+    assert told.endswith("\nno problems")
     assert "3 pairs" in told
     assert "8 to 16  " in told
-    # The wall is most of the picture, and has the longest bar.
+    # The wall covers most of the picture, so it has the longest bar.
     assert ("█" * 40) in next(line for line in told.splitlines() if line.strip().startswith("2 to 4"))
 
 
@@ -172,7 +175,7 @@ def test_a_damaged_file_is_named_and_the_other_pairs_are_checked(folder):
     assert list(report_lines(found))[-2:] == [message, "1 problem"]
 
 
-def test_a_damaged_shard_is_told_once_however_many_of_its_pairs_are_lost(folder):
+def test_a_damaged_shard_is_reported_once_for_all_of_its_pairs(folder):
     for path in (*folder.glob("*.tar"), *folder.glob("depth/pylon/*.png")):
         path.write_bytes(b"nothing")
     found = checked(folder)
@@ -182,22 +185,22 @@ def test_a_damaged_shard_is_told_once_however_many_of_its_pairs_are_lost(folder)
     assert list(report_lines(found))[-1] == f"{count} problem{'s' * (count > 1)}"
 
 
-def test_pairs_that_are_wrong_in_themselves_are_named(tmp_path):
+def test_inconsistent_pairs_are_named(tmp_path):
     (tmp_path / "set.json").write_text(FACTS.replace("LAYOUT", "shards"))
     samples = [box_before_a_wall(np.random.default_rng(number)) for number in range(3)]
     samples[1] = replace(samples[1], left=samples[0].left)
     write_shard(tmp_path, "pylon", 0, [pack(sample, {}) for sample in samples])
     (message,) = checked(tmp_path).problems
-    assert message.startswith(f"{tmp_path}: pylon-000001: expected the left picture to fit")
+    assert message.startswith(f"{tmp_path}: pylon-000001: expected both images to differ least")
 
 
-def test_a_set_that_was_not_finished_is_a_problem(folder):
+def test_an_unfinished_set_is_a_problem(folder):
     text = (folder / "set.json").read_text().replace("3}", "5}")
     (folder / "set.json").write_text(text)
     (message,) = checked(folder).problems
-    assert message.startswith(f"{folder}: expected 5 pairs, as requested, found 3")
+    assert message.startswith(f"{folder}: expected the 5 pairs requested, found 3")
 
 
-def test_several_processes_find_what_one_finds(folder):
+def test_several_processes_report_the_same_as_one(folder):
     one, several = checked(folder), check_set(folder, jobs=2, console=Console(file=io.StringIO()))
     assert list(report_lines(one)) == list(report_lines(several))

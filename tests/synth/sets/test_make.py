@@ -25,7 +25,7 @@ from stereoweave.synth.sets.pair_rendering import RenderSpec
 
 SPEC = RenderSpec(scene="pylon", seed=3, size_px=(48, 32), views=(0.5,))
 PAIR_MAKER = PaintedPairMaker()
-# What a killed process would have run.
+# Program of the process that is killed.
 PROGRAM = """
 import resource
 from pathlib import Path
@@ -42,7 +42,7 @@ if __name__ == "__main__":
 
 
 def prepare(patch):
-    """Small shards, and a version that stays what it is while somebody works on a scene."""
+    """Make small shards, and fix the generator's version so that edits to a scene do not change it."""
     patch.setitem(making.LAYOUTS, "shards", making.LAYOUTS["shards"]._replace(pairs_a_run=4))
     patch.setattr(making, "generator_version", lambda: "01234567")
 
@@ -57,7 +57,7 @@ def made(out, pairs=10, spec=SPEC, pair_maker=PAIR_MAKER, **options):
 
 
 def start(folder, out, pair_maker="PaintedPairMaker()", first=""):
-    """The same in a process of its own."""
+    """Start `made` in a separate process."""
     program = folder / "program.py"
     program.write_text(PROGRAM.format(out=str(out), pair_maker=pair_maker, first=first))
     root = Path(__file__).parents[3]
@@ -68,7 +68,7 @@ def start(folder, out, pair_maker="PaintedPairMaker()", first=""):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """A set that two workers made without a break."""
+    """Return the folder of a set that two workers made without interruption."""
     out = tmp_path_factory.mktemp("finished")
     with pytest.MonkeyPatch.context() as patch:
         prepare(patch)
@@ -82,10 +82,10 @@ def copied(finished, out):
     return out
 
 
-# Making and going on
+# Making and resuming
 
 
-def test_a_set_has_the_pairs_of_its_order_by_number(finished):
+def test_a_set_has_the_pairs_of_its_spec_by_number(finished):
     assert list(contents(finished)) == [
         "pylon-000000-000003.tar",
         "pylon-000004-000007.tar",
@@ -97,7 +97,7 @@ def test_a_set_has_the_pairs_of_its_order_by_number(finished):
         assert_equal(pairs[number], PAIR_MAKER(SPEC, number).sample)
 
 
-def test_a_set_says_what_it_is(finished):
+def test_a_set_describes_itself(finished):
     assert read_set(finished) == {
         "format": 1,
         "layout": "shards",
@@ -113,17 +113,17 @@ def test_a_set_says_what_it_is(finished):
     }
 
 
-def test_a_killed_worker_is_told_in_a_line_and_the_same_call_goes_on_to_the_same_bytes(finished, tmp_path):
+def test_a_killed_worker_is_a_one_line_error_and_the_same_call_resumes_to_the_same_bytes(finished, tmp_path):
     message = error_of(made, tmp_path, 10, SPEC, PaintedPairMaker(dies_at=6))
     assert "found one killed" in message
     assert message.endswith("all finished pairs are complete: rerun the same command to resume")
     assert sorted(contents(tmp_path)) == ["pylon-000000-000003.tar", "set.json"]
-    # One worker now, and two for the set that it is compared with.
+    # One worker makes this set; two made the set that it is compared with.
     assert made(tmp_path) == 6
     assert contents(tmp_path) == contents(finished)
 
 
-def test_no_other_process_goes_on_before_one_is_killed_with_its_workers(finished, tmp_path):
+def test_no_other_process_resumes_until_a_killed_one_and_its_workers_have_ended(finished, tmp_path):
     out = tmp_path / "set"
     first = start(tmp_path, out, pair_maker="PaintedPairMaker(halts_at=6)")
     try:
@@ -133,16 +133,16 @@ def test_no_other_process_goes_on_before_one_is_killed_with_its_workers(finished
         )
     finally:
         first.kill()
-        first.communicate()  # which returns when its workers have ended too
+        first.communicate()  # returns once its workers have ended too
     assert sorted(contents(out)) == [".lock", "pylon-000000-000003.tar", "set.json"]
     (out / ".pylon-000004-000007-0123abcd.tar").write_bytes(b"half a shard")
     assert made(out) == 6
     assert contents(out) == contents(finished)
 
 
-def test_a_full_disk_is_told_in_a_line_and_leaves_nothing_half_written(tmp_path):
+def test_a_full_disk_is_a_one_line_error_and_leaves_no_partial_file(tmp_path):
     out = tmp_path / "set"
-    # Room for set.json, and not for a shard: the same OSError on the same way as from a full disk.
+    # There is room for set.json but not for a shard, which raises the same OSError as a full disk does.
     full = start(tmp_path, out, first="resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))")
     message = full.communicate()[1].splitlines()[-1]
     assert "pylon-000000-000003.tar: expected a file that can be written, found file too large" in message
@@ -150,7 +150,7 @@ def test_a_full_disk_is_told_in_a_line_and_leaves_nothing_half_written(tmp_path)
     assert sorted(contents(out)) == ["set.json"]
 
 
-def test_more_pairs_later_leave_the_first_ones_as_they_are(finished, tmp_path):
+def test_adding_pairs_later_leaves_the_first_ones_unchanged(finished, tmp_path):
     copied(finished, tmp_path)
     assert made(tmp_path, 13) == 3
     after, before = contents(tmp_path), contents(finished)
@@ -160,7 +160,7 @@ def test_more_pairs_later_leave_the_first_ones_as_they_are(finished, tmp_path):
         assert_equal(Shards(tmp_path)[number], PAIR_MAKER(SPEC, number).sample)
 
 
-def test_fewer_pairs_are_there_already(finished, tmp_path):
+def test_asking_for_fewer_pairs_changes_nothing(finished, tmp_path):
     copied(finished, tmp_path)
     assert made(tmp_path, 3) == 0
     assert contents(tmp_path) == contents(finished)
@@ -181,7 +181,7 @@ def test_a_damaged_shard_is_made_again_once_it_is_deleted(finished, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["pylon-000003-000005.tar", "crane-000000-000003.tar"])
-def test_a_shard_too_many_is_named_alike_by_making_and_checking(finished, tmp_path, name):
+def test_making_and_checking_report_a_surplus_shard_with_the_same_error(finished, tmp_path, name):
     copied(finished, tmp_path)
     (tmp_path / name).touch()
     messages = [error_of(made, tmp_path), error_of(check_set, tmp_path)]
@@ -191,7 +191,7 @@ def test_a_shard_too_many_is_named_alike_by_making_and_checking(finished, tmp_pa
     assert made(tmp_path) == 0
 
 
-def test_further_views_are_kept(finished):
+def test_additional_views_are_kept(finished):
     ((position, image),) = Shards(finished).views(7).items()
     assert position == 0.5
     np.testing.assert_array_equal(image, PAIR_MAKER(SPEC, 7).sample.right)
@@ -200,7 +200,7 @@ def test_further_views_are_kept(finished):
 # The paper's folders
 
 
-def test_each_of_the_jobs_has_work_in_a_small_set_of_frames(tmp_path):
+def test_each_job_has_work_in_a_small_set_of_frames(tmp_path):
     spec = replace(SPEC, views=())
     made(tmp_path / "one", 6, spec, layout="paper")
     runs = making._split_into_runs(range(6), making.LAYOUTS["paper"].pairs_a_run)
@@ -209,12 +209,12 @@ def test_each_of_the_jobs_has_work_in_a_small_set_of_frames(tmp_path):
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
 
 
-def test_the_paper_s_folders_go_on_after_a_kill_to_the_same_bytes(tmp_path):
+def test_making_the_paper_s_folders_resumes_after_a_kill_to_the_same_bytes(tmp_path):
     out, whole = tmp_path / "set", tmp_path / "whole"
     spec = replace(SPEC, views=())
     error_of(lambda: made(out, 6, spec, PaintedPairMaker(dies_at=5), layout="paper"))
     assert [frame.name for frame in open_dataset("paper", out)] == [f"pylon/{i:06d}" for i in range(5)]
-    (out / "sums" / "pylon" / "000002.sha256").unlink()  # as if all were killed just before
+    (out / "sums" / "pylon" / "000002.sha256").unlink()  # as if killed just before writing it
     (out / "depth" / "pylon" / "000002.png").unlink()
     (out / "left" / "pylon" / ".000005-0123abcd.png").touch()
     assert made(out, 6, spec, layout="paper") == 2
@@ -232,16 +232,16 @@ def frame(tmp_path):
     return tmp_path, sample
 
 
-def test_a_frame_in_the_paper_s_folders_comes_back_but_for_what_is_beyond_15_m(frame):
+def test_a_frame_in_the_paper_s_folders_is_read_back_except_for_depths_beyond_15_m(frame):
     root, sample = frame
     found = read_frame("paper", root, "pylon/000000")
-    expected = np.where(sample.disparity_px > 0, sample.disparity_px, np.nan)  # 3 px are 4 m, 0 px is the sky
+    expected = np.where(sample.disparity_px > 0, sample.disparity_px, np.nan)  # 3 px is 4 m, 0 px is the sky
     np.testing.assert_allclose(found.disparity_px, expected, rtol=1e-6)
     assert found.camera == sample.camera
     np.testing.assert_array_equal(found.right, sample.right)
 
 
-def test_every_frame_may_have_a_camera_of_its_own(frame):
+def test_every_frame_may_have_its_own_camera(frame):
     root, sample = frame
     other = replace(sample.camera, focal_px=61.7, doffs_px=0.1)
     write_frame(root, "pylon/000001", replace(sample, camera=other))
@@ -266,12 +266,12 @@ def test_a_damaged_or_missing_file_of_a_frame_is_named(frame, folder):
     assert f"{folder}/pylon/000000" in error_of(check_frame, root, "pylon/000000")
 
 
-def test_a_sample_without_a_camera_has_no_place_in_the_paper_s_folders(frame):
+def test_the_paper_s_folders_refuse_a_sample_without_a_camera(frame):
     root, sample = frame
     assert "camera" in error_of(write_frame, root, "pylon/000001", replace(sample, camera=None))
 
 
-# What is refused
+# Refused arguments and folders
 
 
 @pytest.mark.parametrize(
@@ -285,7 +285,7 @@ def test_a_sample_without_a_camera_has_no_place_in_the_paper_s_folders(frame):
         ({"spec": replace(SPEC, views=()), "layout": "paper"}, 'expected layout = "paper"'),
     ],
 )
-def test_another_set_in_the_folder_is_refused_and_kept(finished, changes, words):
+def test_a_folder_with_another_set_is_refused_and_left_unchanged(finished, changes, words):
     before = contents(finished)
     message = error_of(lambda: made(finished, **changes))
     assert words in message
@@ -311,15 +311,15 @@ def test_a_description_of_another_format_is_refused(tmp_path, text):
     ("name", "value"),
     [("pairs", "3"), ("pairs", True), ("pairs", None), ("layout", []), ("layout", "zip"), ("scene", 7)],
 )
-def test_a_damaged_description_is_refused_in_a_line(finished, tmp_path, name, value):
+def test_a_damaged_description_is_a_one_line_error(finished, tmp_path, name, value):
     facts = json.loads((finished / "set.json").read_text()) | {name: value}
     (tmp_path / "set.json").write_text(json.dumps(facts))
     message = error_of(read_set, tmp_path)
-    assert message.startswith(f"{tmp_path / 'set.json'}: expected layout (shards or paper), scene and number")
+    assert message.startswith(f"{tmp_path / 'set.json'}: expected a layout (shards or paper), a scene")
     assert f"found {name} = {json.dumps(value)}; " in message
 
 
-def test_a_folder_with_something_else_in_it_is_refused_and_kept(tmp_path):
+def test_a_folder_with_other_files_is_refused_and_left_unchanged(tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
     (tmp_path / ".set-0123abcd.json").touch()
     assert "found thesis.tex" in error_of(made, tmp_path)
@@ -342,32 +342,32 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
         (
             1,
             {"spec": replace(SPEC, size_px=(640, 0))},
-            "size_px: expected 32 to 4096 px a side, found 640x0",
+            "size_px: expected 32 to 4096 px per side, found 640x0",
         ),
-        (1, {"spec": replace(SPEC, size_px=(4097, 32))}, "size_px: expected 32 to 4096 px a side"),
+        (1, {"spec": replace(SPEC, size_px=(4097, 32))}, "size_px: expected 32 to 4096 px per side"),
         (1, {"spec": replace(SPEC, views=(0.5, 0.501))}, "views: expected positions that differ"),
-        (1, {"spec": replace(SPEC, views=(float("nan"),))}, "views: expected positions of -1.0 "),
-        (1, {"spec": replace(SPEC, views=(0.5, 2.1))}, "views: expected positions of -1.0 "),
-        (1, {"layout": "paper"}, "views: expected none"),
+        (1, {"spec": replace(SPEC, views=(float("nan"),))}, "views: expected positions from -1.0 "),
+        (1, {"spec": replace(SPEC, views=(0.5, 2.1))}, "views: expected positions from -1.0 "),
+        (1, {"layout": "paper"}, "views: expected no additional views"),
         (1, {"layout": "zip"}, "layout: expected one of shards, paper, found 'zip'"),
     ],
 )
-def test_nonsense_is_refused_before_a_folder_is_made(tmp_path, pairs, changes, words):
+def test_invalid_arguments_are_refused_before_the_folder_is_created(tmp_path, pairs, changes, words):
     assert error_of(lambda: made(tmp_path / "set", pairs, **changes)).startswith(words)
     assert not (tmp_path / "set").exists()
 
 
-def test_a_set_without_a_description_is_none(tmp_path):
+def test_a_folder_without_a_description_is_not_a_set(tmp_path):
     with pytest.raises(
         FormatError, match=r"set.json: expected the description of a set .* found no such file"
     ):
         read_set(tmp_path)
 
 
-# The version of what makes pairs
+# The generator's version
 
 
-def test_the_version_changes_with_what_makes_pairs_and_not_with_what_comes_after(tmp_path, monkeypatch):
+def test_the_version_depends_on_the_sources_that_make_pairs_and_on_no_others(tmp_path, monkeypatch):
     monkeypatch.undo()
     drawn = ("synth/scenes/ship.py", "synth/rendering/shaders/shade.frag")
     changed = (*drawn, "data/packing.py", "data/samples.py", "stereo.py")
@@ -389,7 +389,7 @@ def test_the_version_changes_with_what_makes_pairs_and_not_with_what_comes_after
 
 
 @pytest.mark.needs_egl
-def test_a_set_names_the_opengl_that_draws(monkeypatch):
+def test_the_renderer_s_name_contains_the_opengl_driver(monkeypatch):
     monkeypatch.setenv("LP_NUM_THREADS", "1")
     renderer = OpenGLRenderer(PLAIN)
     name = renderer.name

@@ -32,7 +32,7 @@ def small_scene(monkeypatch):
 
 
 class Wall:
-    """A camera that sees a wall 4 m away, wherever it stands."""
+    """A renderer that shows a wall 4 m away from any position."""
 
     name = "wall"
 
@@ -44,7 +44,7 @@ class Wall:
 
 
 @pytest.mark.parametrize("index", [0, 1])
-def test_a_given_rig_takes_every_pair_from_where_any_rig_stands(index):
+def test_a_given_rig_stands_where_a_drawn_one_would(index):
     _, fixed = draw_stage_and_rig(Wall(), replace(SPEC, rig=(260.0, 0.5)), index)
     _, drawn = draw_stage_and_rig(Wall(), SPEC, index)
     assert fixed.camera == StereoCamera(focal_px=260.0, baseline_m=0.5, cx_px=159.5, cy_px=119.5)
@@ -53,7 +53,7 @@ def test_a_given_rig_takes_every_pair_from_where_any_rig_stands(index):
     np.testing.assert_array_equal(fixed.axes, drawn.axes)
 
 
-def test_a_drawn_rig_has_its_nearest_disparity_between_18_and_160_px_of_640():
+def test_a_drawn_rig_has_a_nearest_disparity_of_18_to_160_px_per_640_px_of_width():
     nearest_px = [
         draw_stage_and_rig(Wall(), SPEC, index)[1].camera.disparity_px(np.array([[4.0]]))
         for index in range(4)
@@ -61,14 +61,14 @@ def test_a_drawn_rig_has_its_nearest_disparity_between_18_and_160_px_of_640():
     assert all(9 <= px <= 80 for px in np.ravel(nearest_px))
 
 
-def test_a_scene_may_have_a_range_of_its_own_for_the_nearest_disparity(monkeypatch):
+def test_a_scene_may_set_its_own_range_of_the_nearest_disparity(monkeypatch):
     monkeypatch.setitem(SCENES, "propeller", lambda rng: replace(STAGE, nearest_px=(100.0, 100.0)))
     _, rig = draw_stage_and_rig(Wall(), SPEC, 0)
-    np.testing.assert_allclose(rig.camera.disparity_px(np.array([[4.0]])), 50.0)  # of 320 px width
+    np.testing.assert_allclose(rig.camera.disparity_px(np.array([[4.0]])), 50.0)  # at a width of 320 px
 
 
 class Grey(Wall):
-    """A camera that takes even pictures, white on the left and black on the right."""
+    """A renderer whose left view is plain white and whose right view is plain black."""
 
     def render_views(self, world, rig, positions):
         levels = [np.full((*rig.size_px[::-1], 3), 255 * (position == 0), np.uint8) for position in positions]
@@ -78,11 +78,11 @@ class Grey(Wall):
         ]
 
 
-def test_noise_grows_with_the_root_of_brightness_and_comes_from_the_seed(monkeypatch):
+def test_noise_grows_with_the_root_of_brightness_and_depends_on_the_seed(monkeypatch):
     assert render_pair(Grey(), SPEC, 0).sample.left.min() == 255
     monkeypatch.setitem(SCENES, "propeller", lambda rng: replace(STAGE, noise_levels=4.0))
     sample = render_pair(Grey(), SPEC, 0).sample
-    # Half of the values are cut off at white and at black: of a normal one, 0.399 of its deviation is left.
+    # White and black clip half of the noise, which leaves a mean of 0.399 standard deviations.
     assert (255 - sample.left).mean() == pytest.approx(0.399 * 4, rel=0.05)
     assert sample.right.mean() == pytest.approx(0.399 * 4 * 0.2**0.5, rel=0.05)
     np.testing.assert_array_equal(render_pair(Grey(), SPEC, 0).sample.left, sample.left)
@@ -90,7 +90,7 @@ def test_noise_grows_with_the_root_of_brightness_and_comes_from_the_seed(monkeyp
 
 
 class Wire(Wall):
-    """A wall 4 m away, and a wire at a share of that before an eye that stands beside the middle."""
+    """A wall 4 m away, in front of which the right camera sees a wire at a fraction of that depth."""
 
     def __init__(self, share):
         self.share = share
@@ -98,17 +98,17 @@ class Wire(Wall):
     def depth_m(self, world, rig, position):
         depth_m = super().depth_m(world, rig, position)
         if rig.camera.baseline_m > 1e-3 and position == 1.0:
-            depth_m[:, :2] *= self.share  # 0.6 % of the picture
+            depth_m[:, :2] *= self.share  # 0.6 % of the image
         return depth_m
 
 
 @pytest.mark.parametrize(("share", "shrunk"), [(1.0, 1.0), (0.9, 1.0), (0.5, 0.5 * 1.25), (0.1, 0.1 * 1.25)])
-def test_a_wire_close_to_one_eye_shrinks_the_baseline_to_a_quarter_above_the_drawn_disparity(share, shrunk):
+def test_a_wire_close_to_one_camera_limits_its_disparity_to_a_quarter_above_the_drawn_one(share, shrunk):
     (_, wired), (_, clear) = (draw_stage_and_rig(camera, SPEC, 0) for camera in (Wire(share), Wall()))
     assert wired.camera.baseline_m == pytest.approx(shrunk * clear.camera.baseline_m)
     assert wired.camera.focal_px == clear.camera.focal_px
 
 
 @pytest.mark.parametrize("rig", [(0.0, 0.5), (260.0, -0.5), (float("inf"), 0.5)])
-def test_a_rig_that_cannot_be_is_refused(rig):
+def test_an_invalid_rig_is_refused(rig):
     assert "must be" in complaint(lambda: replace(SPEC, rig=rig))

@@ -24,7 +24,7 @@ def with_a_view(camera):
     return render_pair(camera, replace(SPEC, views=(0.5,)), 1)
 
 
-def test_a_pair_depends_on_its_seed_scene_and_index_alone(camera, with_a_view):
+def test_a_pair_depends_only_on_its_seed_scene_and_index(camera, with_a_view):
     again = render_pair(camera, SPEC, 1).sample
     for name in ("left", "right", "disparity_px", "right_disparity_px", "occluded", "right_occluded"):
         np.testing.assert_array_equal(getattr(again, name), getattr(with_a_view.sample, name), err_msg=name)
@@ -33,7 +33,7 @@ def test_a_pair_depends_on_its_seed_scene_and_index_alone(camera, with_a_view):
     assert len({again.camera, *(other.sample.camera for other in others)}) == 3
 
 
-def test_disparity_is_that_of_the_cameras_depth_and_zero_in_the_sky(camera, with_a_view):
+def test_disparity_follows_from_the_rendered_depth_and_is_zero_in_the_sky(camera, with_a_view):
     stage, rig = draw_stage_and_rig(camera, SPEC, 1)
     for position, disparity_px in enumerate(
         (with_a_view.sample.disparity_px, with_a_view.sample.right_disparity_px)
@@ -46,8 +46,8 @@ def test_disparity_is_that_of_the_cameras_depth_and_zero_in_the_sky(camera, with
 
 
 @pytest.mark.parametrize("scene", ["refinery", "antenna", "pylon", "rooms"])
-def test_masks_are_what_a_cast_from_the_other_eye_finds_hidden(camera, scene):
-    """Pixels know the other view at its columns alone: 1 % of them or fewer may be missed, as many extra."""
+def test_occlusion_masks_agree_with_rays_cast_from_the_other_camera(camera, scene):
+    """Masks compare disparities only at whole columns, so up to 1 % of the pixels may be missed or extra."""
     spec = RenderSpec(scene=scene, size_px=(320, 240))
     stage, rig = draw_stage_and_rig(camera, spec, 0)
     left_px, right_px = (
@@ -76,7 +76,7 @@ def test_a_view_half_way_sees_each_visible_pixel_half_its_disparity_to_the_left(
     low = np.floor(matches).astype(int)
     around_m = np.stack([view.depth_m[rows, low], view.depth_m[rows, np.minimum(low + 1, 159)]])
     depth_m = with_a_view.sample.camera.depth_m(with_a_view.sample.disparity_px)[rows, columns]
-    # Smooth ground is between its neighbours; what else there is hides it.
+    # Smooth ground lies between the depths of its neighbours; anything else covers it.
     known = np.isfinite(around_m).all(0)
     agree = np.abs(around_m.mean(0) - depth_m)[known] < 0.03 * depth_m[known]
     nearer = around_m.min(0)[known] < depth_m[known]
@@ -84,7 +84,7 @@ def test_a_view_half_way_sees_each_visible_pixel_half_its_disparity_to_the_left(
     assert (agree | nearer).mean() > 0.97
 
 
-def test_a_film_shows_one_world_through_one_camera_that_moves_a_little_from_frame_to_frame(camera):
+def test_a_video_shows_one_world_through_one_camera_that_moves_a_little_between_frames(camera):
     film = replace(SPEC, frames=8)
     stages, rigs = zip(*(draw_stage_and_rig(camera, film, 2, frame) for frame in range(8)), strict=True)
     np.testing.assert_array_equal(stages[0].world.mesh.corners_m, stages[7].world.mesh.corners_m)
