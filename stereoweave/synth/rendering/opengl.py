@@ -164,5 +164,5 @@ def _create_context() -> moderngl.Context:
         return moderngl.create_context(**options)
     except Exception as error:  # glcontext and moderngl have no exception class for this
         raise StereoweaveError(
-            f"OpenGL: EGL did not start ({error}); on Debian: apt install libegl1 libgl1-mesa-dri"
+            f"OpenGL: EGL did not start ({error}); on Debian, run apt install libegl1 libgl1-mesa-dri"
         ) from error

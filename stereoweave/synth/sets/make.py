@@ -210,7 +210,7 @@ def _check(spec: RenderSpec, pairs: int, layout: str) -> None:
         )
     if layout == "paper" and spec.views:
         raise StereoweaveError(
-            f"expected no additional views in the paper's layout, found {spec.views}; use the layout shards",
+            f"expected no additional views in the paper's layout, found {spec.views}; use the shards layout",
             setting="views",
         )
 

@@ -7,7 +7,7 @@ from stereoweave.errors import StereoweaveError
 from stereoweave.synth.rendering.effects import PLAIN, Effects
 from stereoweave.synth.sets.pair_rendering import SceneRenderer
 
-_PACKAGES = "on Debian: apt install libegl1 libgl1-mesa-dri"
+_PACKAGES = "on Debian, apt install libegl1 libgl1-mesa-dri"
 
 
 @cache

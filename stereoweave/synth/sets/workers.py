@@ -66,7 +66,7 @@ def run_in_workers(  # noqa: PLR0913 - work, workers, and progress
                     child.terminate()
             if isinstance(error, BrokenProcessPool):
                 raise StereoweaveError(
-                    f"{description}: expected every worker to finish, found one killed; is the memory full?"
+                    f"{description}: expected all workers to finish, found one killed; memory may be full"
                 ) from error
             raise
 
