@@ -10,7 +10,7 @@ import numpy as np
 
 from fuzz.targets import Target, write_to_bytes
 from fuzz.targets.pictures import eyes
-from stereoweave.video.reader import open_footage
+from stereoweave.video.reader import open_video
 from stereoweave.video.tracks import open_track
 
 _FRAMES = 5
@@ -43,8 +43,8 @@ def _write(path: Path, codec: str) -> None:
 
 def _read(path: Path) -> None:
     # Detection would take most of the time; the target for pictures covers it.
-    footage = open_footage([path], "side_by_side")
-    for _ in islice(footage.frames(), 2 * _FRAMES):
+    video = open_video([path], "side_by_side")
+    for _ in islice(video.frames(), 2 * _FRAMES):
         pass
     open_track(path, None).samples()
 

@@ -208,15 +208,15 @@ class Worker:
         from stereoweave.io.animation import needing_the_video_extra
 
         with needing_the_video_extra("a video"):
-            from stereoweave.video.convert import VideoJob, make_film
-            from stereoweave.video.reader import open_footage
+            from stereoweave.video.convert import VideoJob, convert_video
+            from stereoweave.video.reader import open_video
             from stereoweave.video.writer import parts_folder
 
         films, _ = self._fetched(planned, scratch / "pictures")
         film_job = VideoJob(depth16=True, backend=job.backend, name_of=job.name_of)
-        footage = open_footage(films, job.request.arrangement)
+        video = open_video(films, job.request.arrangement)
         with self._results(planned, scratch) as out:
-            make = partial(make_film, footage, films, out / FILM, film_job, Console(quiet=True))
+            make = partial(convert_video, video, films, out / FILM, film_job, Console(quiet=True))
             begun = parts_folder(out / FILM)
             was_begun = begun.exists()
             try:
@@ -229,7 +229,7 @@ class Worker:
                 # Parts of a killed worker, damaged or from other files.
                 shutil.rmtree(begun, ignore_errors=True)
                 tally = make()
-        width, height = footage.size_px
+        width, height = video.size_px
         return {"width_px": width, "height_px": height, "checks": tally.named, "files": _names(out)}
 
     def _fetched(self, planned: Planned, into: Path) -> tuple[tuple[Path, ...], Path | None]:

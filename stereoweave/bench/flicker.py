@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from stereoweave.bench.flicker_films import (
+from stereoweave.bench.flicker_metrics import flicker
+from stereoweave.bench.flicker_videos import (
     LEFT,
     MIDDLE,
     NOISE_LEVELS,
@@ -19,14 +20,13 @@ from stereoweave.bench.flicker_films import (
     freeze,
     render_panning,
 )
-from stereoweave.bench.flicker_metrics import flicker
 from stereoweave.errors import StereoweaveError
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.providers import CPU
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.synth.sets.pair_rendering import RenderSpec
-from stereoweave.video.temporal_filter import Steadier
+from stereoweave.video.temporal_filter import TemporalFilter
 
 MEAN = "mean"
 FRAME_BY_FRAME, STEADY = "frame by frame", "steady"
@@ -100,19 +100,19 @@ def score_flicker(  # noqa: PLR0913 - each is a word of the command line
     """
     if frames < 2:
         raise StereoweaveError(f"frames: expected 2 or more, because flicker compares two; got {frames}")
-    orders = [RenderSpec(scene=scene, seed=seed, size_px=size_px, frames=_PATH_FRAMES) for scene in scenes]
+    specs = [RenderSpec(scene=scene, seed=seed, size_px=size_px, frames=_PATH_FRAMES) for scene in scenes]
     matcher = Backend(model=model, threads=threads, provider=provider).matcher()
-    for order in orders:
-        for film in _render_videos(order, frames):
+    for spec in specs:
+        for video in _render_videos(spec, frames):
             pairs = [
                 add_noise(pair, np.random.default_rng((seed, number)))
-                for number, pair in enumerate(film.pairs)
+                for number, pair in enumerate(video.pairs)
             ]
             estimates = [matcher.estimate(pair.left, pair.right) for pair in pairs]
-            for method, taken in _run_methods(film, pairs, estimates, threads).items():
+            for method, taken in _run_methods(video, pairs, estimates, threads).items():
                 yield FlickerRow(
-                    film=film.name,
-                    scene=order.scene,
+                    film=video.name,
+                    scene=spec.scene,
                     model=str(model),
                     method=method,
                     width_px=size_px[0],
@@ -120,7 +120,7 @@ def score_flicker(  # noqa: PLR0913 - each is a word of the command line
                     frames=frames,
                     noise_levels=NOISE_LEVELS,
                     time_ms=taken.time_ms,
-                    **_measure_errors(film, taken),
+                    **_measure_errors(video, taken),
                 )
 
 
@@ -138,8 +138,8 @@ def _average_group(name: str, rows: Sequence[FlickerRow]) -> FlickerRow:
     return replace(rows[0], film=name, scene=MEAN, **values)
 
 
-def _render_videos(order: RenderSpec, frames: int) -> Iterator[RenderedVideo]:
-    pan = render_panning(order, frames)
+def _render_videos(spec: RenderSpec, frames: int) -> Iterator[RenderedVideo]:
+    pan = render_panning(spec, frames)
     yield freeze(pan)
     yield add_passing_oval(pan, "passing", (3.25, 0.75))
     yield add_passing_oval(pan, "nearing", (0.25, 0.0), nearing_px=0.5)
@@ -147,51 +147,51 @@ def _render_videos(order: RenderSpec, frames: int) -> Iterator[RenderedVideo]:
 
 
 def _run_methods(
-    film: RenderedVideo, pairs: list[StereoPair], estimates: list[Estimate], threads: int | None
+    video: RenderedVideo, pairs: list[StereoPair], estimates: list[Estimate], threads: int | None
 ) -> dict[str, _Result]:
-    steadier, steady, times_ms = Steadier(threads), [], []
+    temporal_filter, steady, times_ms = TemporalFilter(threads), [], []
     for pair, estimate in zip(pairs, estimates, strict=True):
         start_s = time.perf_counter()
-        steady.append(steadier(pair.left, pair.right, estimate))
+        steady.append(temporal_filter(pair.left, pair.right, estimate))
         times_ms.append(1000 * (time.perf_counter() - start_s))
     return {
-        FRAME_BY_FRAME: _Result(*_render_middle(film, estimates, threads), float("nan")),
-        STEADY: _Result(*_render_middle(film, steady, threads), float(np.median(times_ms[1:]))),
+        FRAME_BY_FRAME: _Result(*_render_middle(video, estimates, threads), float("nan")),
+        STEADY: _Result(*_render_middle(video, steady, threads), float(np.median(times_ms[1:]))),
     }
 
 
 def _render_middle(
-    film: RenderedVideo, estimates: list[Estimate], threads: int | None
+    video: RenderedVideo, estimates: list[Estimate], threads: int | None
 ) -> tuple[list[Float[np.ndarray, "h w"]], list[UInt8[np.ndarray, "h w 3"]]]:
     """Return the left view's disparities, and the middle views rendered from the noise-free video."""
     renderers = (
         Renderer(pair, estimate, threads=threads)
-        for pair, estimate in zip(film.pairs, estimates, strict=True)
+        for pair, estimate in zip(video.pairs, estimates, strict=True)
     )
     views = [renderer.view(MIDDLE).image for renderer in renderers]
     return [estimate.disparity_px for estimate in estimates], views
 
 
-def _measure_errors(film: RenderedVideo, taken: _Result) -> dict[str, float]:
+def _measure_errors(video: RenderedVideo, taken: _Result) -> dict[str, float]:
     """Compute the error columns of a row."""
-    later = range(1, len(film.pairs))
+    later = range(1, len(video.pairs))
 
     def mean_flicker(shown: list[np.ndarray], position: float, with_change: bool) -> float:
         of_frames = []
         for frame in later:
-            motion_px, change_px = film.change(frame - 1, frame, position)
-            visible = film.seen_again(frame - 1, frame, position)
+            motion_px, change_px = video.change(frame - 1, frame, position)
+            visible = video.seen_again(frame - 1, frame, position)
             true_change = change_px if with_change else 0.0
             of_frames.append(flicker(shown[frame - 1], shown[frame], motion_px, visible, true_change))
         return float(np.mean(of_frames))
 
-    errors_px = np.abs([taken.disparities_px[frame] - film.disparities_px[frame][LEFT] for frame in later])
-    uncovered = ~np.array([film.seen_again(frame, frame - 1, LEFT) for frame in later])
+    errors_px = np.abs([taken.disparities_px[frame] - video.disparities_px[frame][LEFT] for frame in later])
+    uncovered = ~np.array([video.seen_again(frame, frame - 1, LEFT) for frame in later])
     return {
         "flicker_px": mean_flicker(taken.disparities_px, LEFT, with_change=True),
         "view_flicker_levels": mean_flicker(taken.views, MIDDLE, with_change=False),
         "epe_px": float(errors_px.mean()),
-        "moving_epe_px": _mean(errors_px, np.array(film.moving[1:])),
+        "moving_epe_px": _mean(errors_px, np.array(video.moving[1:])),
         "uncovered_epe_px": _mean(errors_px, uncovered),
     }
 

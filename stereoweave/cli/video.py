@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _HIGHEST_RATE = 1000
 
 
-Films = Annotated[
+Videos = Annotated[
     list[Path],
     typer.Argument(
         metavar="VIDEO",
@@ -81,7 +81,7 @@ Rate = Annotated[
 
 @naming_video_options()
 def video(  # noqa: PLR0913 - each is an option of the command line
-    films: Films,
+    videos: Videos,
     out: Out,
     depth: Depth = False,
     depth16: Depth16 = False,
@@ -100,10 +100,10 @@ def video(  # noqa: PLR0913 - each is an option of the command line
 
     from stereoweave.io.animation import needing_the_video_extra
     from stereoweave.matching.backend import Backend
-    from stereoweave.video.reader import open_footage
+    from stereoweave.video.reader import open_video
 
-    with needing_the_video_extra("a film"):
-        from stereoweave.video.convert import VideoJob, make_film
+    with needing_the_video_extra("a video"):
+        from stereoweave.video.convert import VideoJob, convert_video
         from stereoweave.video.writer import parts_folder
 
     try:
@@ -117,11 +117,11 @@ def video(  # noqa: PLR0913 - each is an option of the command line
             backend=Backend(model=model, threads=threads, provider=provider),
             name_of=video_option_name,
         )
-        footage = open_footage(films, arrangement, rate=None if rate is None else _parse_rate(rate))
+        source = open_video(videos, arrangement, rate=None if rate is None else _parse_rate(rate))
         if layout:
-            out = _add_mark(out, layout, footage.size_px)
+            out = _add_mark(out, layout, source.size_px)
         make_parent_folder(out)
-        tally = make_film(footage, films, out, job, Console(stderr=True))
+        tally = convert_video(source, videos, out, job, Console(stderr=True))
     except KeyboardInterrupt:
         folder = parts_folder(out)
         state = (

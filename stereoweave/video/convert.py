@@ -30,10 +30,10 @@ from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoPair
 from stereoweave.system.progress import progress
 from stereoweave.system.threads import thread_count
-from stereoweave.video.reader import Footage, StereoFrame
-from stereoweave.video.temporal_filter import Steadier
+from stereoweave.video.reader import StereoFrame, StereoVideo
+from stereoweave.video.temporal_filter import TemporalFilter
 from stereoweave.video.tracks import picture_files
-from stereoweave.video.writer import GREY16, H264, Packing, Picture, Recorder, check_film, growing
+from stereoweave.video.writer import GREY16, H264, Packing, Picture, Recorder, check_container, growing
 
 # Length of a part. An interrupted run loses the unfinished one; each begins with a key frame.
 _PART_S = 10
@@ -197,13 +197,13 @@ class VideoTally:
                 self.named.append(f"{_clock(frame.time)} {frame.problem}")
 
 
-def make_film(
-    footage: Footage, sources: Sequence[Path], out: Path, job: VideoJob, console: Console
+def convert_video(
+    video: StereoVideo, sources: Sequence[Path], out: Path, job: VideoJob, console: Console
 ) -> VideoTally:
     """Convert a video and write it; an interrupted conversion resumes after its last finished part.
 
     Args:
-        footage: The input video.
+        video: The input video.
         sources: The input's files; a conversion resumes only if they are unchanged.
         out: The file to write; its ending chooses the container.
         job: Settings of the conversion.
@@ -216,58 +216,58 @@ def make_film(
         StereoweaveError: `out` has an unsuitable ending, is in use, or cannot be written, for instance on a
             full disk.
     """
-    _check_out(out, job, footage, sources)
+    _check_out(out, job, video, sources)
     matcher = job.backend.matcher()
     recorder = Recorder(
         encoding=GREY16 if job.depth16 else H264,
-        time_base=footage.time_base,
+        time_base=video.time_base,
         # FFmpeg's fractions have 32 bits.
-        rate=footage.rate.limit_denominator(100_000),
+        rate=video.rate.limit_denominator(100_000),
         packing=PACKINGS.get(job.layout or ""),
         threads=thread_count(job.backend.threads),
     )
     with (
         lock_output(out),
-        growing(out, _settings(job, footage, sources)) as parts,
+        growing(out, _settings(job, video, sources)) as parts,
         progress(console) as bar,
     ):
         if parts.files:
-            maker = _Maker.from_state(job, matcher, parts.state())
+            converter = _FrameConverter.from_state(job, matcher, parts.state())
         else:
-            survey, notes = _look(footage, matcher, bar)
-            maker = _Maker(job, matcher, survey)
+            survey, notes = _look(video, matcher, bar)
+            converter = _FrameConverter(job, matcher, survey)
             for note in [*notes, *job.loses(survey)]:
                 line = note.format(job.name_of)
                 console.print(line, markup=False, highlight=False, soft_wrap=True)
-        done, total = maker.tally.frames, footage.frame_count
+        done, total = converter.tally.frames, video.frame_count
         shown = bar.add_task(out.name, total=total, completed=done, loss="", rate="")
-        frames = footage.frames(done)
+        frames = video.frames(done)
         for first in frames:
-            part = islice(chain([first], frames), round(_PART_S * footage.rate) or 1)
-            with parts.next(maker.state) as path:
-                recorder.write_part(path, maker.pictures(part, bar, shown))
-        recorder.join(parts.files, footage.sound, out, job.says(maker.survey))
-    return maker.tally
+            part = islice(chain([first], frames), round(_PART_S * video.rate) or 1)
+            with parts.next(converter.state) as path:
+                recorder.write_part(path, converter.pictures(part, bar, shown))
+        recorder.join(parts.files, video.sound, out, job.says(converter.survey))
+    return converter.tally
 
 
-class _Maker:
+class _FrameConverter:
     """Makes the output image of each frame; its state can be saved and restored."""
 
     def __init__(self, job: VideoJob, matcher: Matcher, survey: Survey) -> None:
         self.survey, self.tally = survey, VideoTally()
         self._options = MatchOptions(range_px=survey.within_px)
-        self._job, self._matcher, self._steadier = job, matcher, Steadier(job.backend.threads)
+        self._job, self._matcher, self._filter = job, matcher, TemporalFilter(job.backend.threads)
 
     @classmethod
-    def from_state(cls, job: VideoJob, matcher: Matcher, state: dict[str, np.ndarray]) -> "_Maker":
-        """Restore a maker from its `state`; it continues exactly as the original would have."""
+    def from_state(cls, job: VideoJob, matcher: Matcher, state: dict[str, np.ndarray]) -> "_FrameConverter":
+        """Restore a converter from its `state`; it continues exactly as the original would have."""
         low_px, high_px, middle_px, *within_px = state.pop("survey_px").tolist()
         survey = Survey((low_px, high_px), middle_px, (within_px[0], within_px[1]) if within_px else None)
-        maker = cls(job, matcher, survey)
+        converter = cls(job, matcher, survey)
         frames, cuts, problems = state.pop("tally").tolist()
-        maker.tally = VideoTally(frames, cuts, problems, state.pop("named").tolist())
-        maker._steadier = Steadier.from_state(state, job.backend.threads)
-        return maker
+        converter.tally = VideoTally(frames, cuts, problems, state.pop("named").tolist())
+        converter._filter = TemporalFilter.from_state(state, job.backend.threads)
+        return converter
 
     def state(self) -> dict[str, np.ndarray]:
         """Return everything that the next frame's output depends on, as arrays."""
@@ -278,7 +278,7 @@ class _Maker:
             ),
             "tally": np.array([tally.frames, tally.cuts, tally.problems]),
             "named": np.array(tally.named, dtype=np.str_),
-            **self._steadier.state(),
+            **self._filter.state(),
         }
 
     def pictures(
@@ -288,30 +288,30 @@ class _Maker:
         for frame in frames:
             pair = StereoPair(left=frame.left, right=frame.right)
             estimate = match(self._matcher, pair, self._options)
-            estimate = self._steadier(frame.left, frame.right, estimate)
+            estimate = self._filter(frame.left, frame.right, estimate)
             self.tally.note(frame)
-            self.tally.cuts = self._steadier.cuts
+            self.tally.cuts = self._filter.cuts
             bar.update(shown, completed=self.tally.frames)
             yield frame.time, self._job.picture(pair, estimate, self.survey)
 
 
-def _look(footage: Footage, matcher: Matcher, bar: Progress) -> tuple[Survey, list[Note]]:
+def _look(video: StereoVideo, matcher: Matcher, bar: Progress) -> tuple[Survey, list[Note]]:
     """Survey the disparities of frames spread over the whole video, and find defects.
 
     The frames are spread because the first ones may be titles, which have another range.
     """
-    picked = _spread(footage.frame_count, _SURVEYED_FRAMES)
+    picked = _spread(video.frame_count, _SURVEYED_FRAMES)
     hinted = set(picked[len(picked) // 6 :: -(-len(picked) // _HINTED_FRAMES)])
     shown = bar.add_task("surveying depth", total=len(picked), loss="", rate="")
     thinned, middles_px, defects = [], [], []
-    frames = islice(footage.frames(), picked.start, picked.stop, picked.step)
+    frames = islice(video.frames(), picked.start, picked.stop, picked.step)
     for index, frame in zip(picked, frames, strict=True):
         pair = StereoPair(left=frame.left, right=frame.right)
         estimate = match(matcher, pair)
         thinned.append(estimate.disparity_px[::_SURVEYED_EVERY_PX, ::_SURVEYED_EVERY_PX])
         middles_px.append(median_disparity_px(estimate))
         if index in hinted:
-            defects.append([_at(frame.time, note, footage) for note in find_problems(pair, estimate)])
+            defects.append([_at(frame.time, note, video) for note in find_problems(pair, estimate)])
         bar.advance(shown)
     all_px = np.vstack(thinned)
     survey = Survey(find_colour_range_px(all_px), float(np.median(middles_px)), _within_px(all_px, matcher))
@@ -333,9 +333,9 @@ def _spread(count: int, wanted: int) -> range:
     return range(step // 2, count, step)
 
 
-def _at(time: Fraction, note: Note, footage: Footage) -> Note:
+def _at(time: Fraction, note: Note, video: StereoVideo) -> Note:
     """Add the time to a note; for swapped views in one file, the remedy becomes the opposite arrangement."""
-    other = _other_way_round(footage.arrangement)
+    other = _other_way_round(video.arrangement)
     if note == SWAPPED and other:
         note = replace(note, remedy=Remedy(f"choose {other}", ("arrangement",)))
     return replace(note, text=f"{_clock(time)} {note.text}")
@@ -361,16 +361,16 @@ def _grey16(disparity_px: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]
     return np.clip(np.rint(_STEPS_PER_PX * disparity_px), 1, 65535).astype(np.uint16)
 
 
-def _check_out(out: Path, job: VideoJob, footage: Footage, sources: Sequence[Path]) -> None:
+def _check_out(out: Path, job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -> None:
     if job.depth16 and out.suffix.lower() != ".mkv":
         raise StereoweaveError(f"{out}: expected the ending .mkv for depth in 16 bits, found {out.suffix!r}")
     for source in sources:
         if source.exists() and out.exists() and out.samefile(source):
             raise StereoweaveError(f"{out}: expected another file than the input video")
-    check_film(out, footage.sound)
+    check_container(out, video.sound)
 
 
-def _settings(job: VideoJob, footage: Footage, sources: Sequence[Path]) -> dict[str, object]:
+def _settings(job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -> dict[str, object]:
     """Return everything that determines the video except the machine, by setting, as JSON values."""
     model = Path(job.backend.model)
     return {
@@ -380,8 +380,8 @@ def _settings(job: VideoJob, footage: Footage, sources: Sequence[Path]) -> dict[
         "layout": job.layout,
         "strength": job.strength,
         "convergence_px": job.convergence_px,
-        "arrangement": footage.arrangement,
-        "rate": str(footage.rate),
+        "arrangement": video.arrangement,
+        "rate": str(video.rate),
         "model": _known_by(model) if model.exists() else str(job.backend.model),
         "film": [_known_by(source) for source in sources],
         "stereoweave": __version__,

@@ -32,8 +32,8 @@ class StereoFrame(NamedTuple):
     problem: str | None
 
 
-class Footage:
-    """A stereo video: pairs of frames with their times; opened by `open_footage`.
+class StereoVideo:
+    """A stereo video: pairs of frames with their times; opened by `open_video`.
 
     Attributes:
         name: The files, as the caller gave them.
@@ -89,9 +89,9 @@ class Footage:
         return f"{track.name} has {frames} more than the other video" if more else track.broken_off
 
 
-def open_footage(
+def open_video(
     paths: Sequence[Path], arrangement: str | None = None, *, rate: Fraction | None = None
-) -> Footage:
+) -> StereoVideo:
     """Open a stereo video: one file with both eyes, or two, left and right.
 
     Reads the files once for every frame's time, and decodes some frames to detect the arrangement.
@@ -117,11 +117,11 @@ def open_footage(
     tracks = [open_track(path, rate) for path in paths]
     if len(tracks) == 2:
         _check_company(*tracks)
-        return Footage(tracks, None)
+        return StereoVideo(tracks, None)
     [track] = tracks
     name = arrangement or guess_arrangement(track.name, track.samples(), track.declared)
     try:
-        return Footage(tracks, name)
+        return StereoVideo(tracks, name)
     except FormatError as error:
         raise FormatError(f"{track.name}: {error}") from error
 

@@ -98,7 +98,7 @@ class Expectation(typing.NamedTuple):
     drift_px: np.ndarray
 
 
-class Steadier:
+class TemporalFilter:
     """Filters a video's estimates, frame by frame, with those before.
 
     Args:
@@ -161,14 +161,14 @@ class Steadier:
         return kept
 
     @classmethod
-    def from_state(cls, state: Mapping[str, np.ndarray], threads: int | None = None) -> "Steadier":
+    def from_state(cls, state: Mapping[str, np.ndarray], threads: int | None = None) -> "TemporalFilter":
         """Restore a filter from its `state`."""
-        steadier = cls(threads)
-        steadier.cuts = int(state["cuts"])
+        temporal_filter = cls(threads)
+        temporal_filter.cuts = int(state["cuts"])
         for side in ("left", "right") if "left_grey" in state else ():
-            steadier._greys.append(state[f"{side}_grey"])
-            steadier._tracks.append(Track(*(state[f"{side}_{name}"] for name in Track._fields)))
-        return steadier
+            temporal_filter._greys.append(state[f"{side}_grey"])
+            temporal_filter._tracks.append(Track(*(state[f"{side}_{name}"] for name in Track._fields)))
+        return temporal_filter
 
     def _filter_tracks(self, before: list[np.ndarray], news: list[Track]) -> list[Track] | None:
         """Filter the new tracks with the previous ones; None after a cut."""

@@ -110,9 +110,7 @@ class Recorder:
             if stream:
                 part.mux(stream.encode())
 
-    def join(
-        self, parts: Sequence[Path], sound: Path | None, film: Path, metadata: Mapping[str, str]
-    ) -> None:
+    def join(self, parts: Sequence[Path], sound: Path | None, out: Path, metadata: Mapping[str, str]) -> None:
         """Join all parts with all sound of the file `sound`; copies every packet unchanged.
 
         MP4 and MOV store all times exactly; Matroska rounds to milliseconds.
@@ -120,12 +118,12 @@ class Recorder:
         Args:
             parts: Files of `write_part`, in order.
             sound: The video whose sound and start time are copied; None for a silent video.
-            film: The file to write; its ending must be in `CONTAINERS`.
+            out: The file to write; its ending must be in `CONTAINERS`.
             metadata: The file's metadata.
         """
         with ExitStack() as stack:
-            temporary = stack.enter_context(replacing(film))
-            options = _EXACT_TIMES | (_EXACT_STARTS if film.suffix.lower() in (".mp4", ".mov") else {})
+            temporary = stack.enter_context(replacing(out))
+            options = _EXACT_TIMES | (_EXACT_STARTS if out.suffix.lower() in (".mp4", ".mov") else {})
             container = stack.enter_context(av.open(str(temporary), "w", options=options))
             container.metadata.update(metadata)
             first = stack.enter_context(av.open(str(parts[0])))
@@ -166,7 +164,7 @@ class Recorder:
                     yield packet
 
 
-def check_film(path: Path, sound: Path | None) -> None:
+def check_container(path: Path, sound: Path | None) -> None:
     """Raise StereoweaveError unless `path` has the ending of a container that can hold the file's sound."""
     if path.suffix.lower() not in CONTAINERS:
         raise StereoweaveError(
@@ -219,24 +217,24 @@ class Parts:
         return self.folder / f"state-{number:06}.npz"
 
 
-def parts_folder(film: Path) -> Path:
+def parts_folder(out: Path) -> Path:
     """Return the folder of a video's unfinished parts."""
-    return film.with_name(f"{film.name}.parts")
+    return out.with_name(f"{out.name}.parts")
 
 
 @contextmanager
-def growing(film: Path, settings: Mapping[str, object]) -> Iterator[Parts]:
+def growing(out: Path, settings: Mapping[str, object]) -> Iterator[Parts]:
     """Open the parts of a video, to add more; removes them on success and keeps finished ones after an error.
 
     Args:
-        film: The video that the parts will become.
+        out: The video that the parts will become.
         settings: Its input and settings, as JSON values.
 
     Raises:
         StereoweaveError: The folder has parts with other settings or damaged ones; or an error of the body,
             with a note that finished parts are kept.
     """
-    folder = parts_folder(film)
+    folder = parts_folder(out)
     parts = Parts(folder)
     if parts.files:
         _check_settings(folder, settings)
@@ -329,18 +327,18 @@ def _holds(ending: str, sound: Path) -> bool:
     """Test whether a container with this ending can hold a file's sound, by muxing its beginning."""
     container = CONTAINERS[ending.lower()]
     try:
-        with av.open(str(sound)) as source, av.open(BytesIO(), "w", format=container) as film:
-            film.mux(list(islice(_sound(source, _copied(source, film)), _TRIED_PACKETS)))
+        with av.open(str(sound)) as source, av.open(BytesIO(), "w", format=container) as output:
+            output.mux(list(islice(_sound(source, _copied(source, output)), _TRIED_PACKETS)))
     except ValueError:  # raised by both PyAV and FFmpeg for sound that the container cannot hold
         return False
     return True
 
 
-def _copied(source: InputContainer, film: OutputContainer) -> dict[int, AudioStream]:
+def _copied(source: InputContainer, output: OutputContainer) -> dict[int, AudioStream]:
     """Add a stream to a video for each audio stream of the source; by the source's indices."""
     streams = {}
     for stream in source.streams.audio:
-        streams[stream.index] = copy = film.add_stream_from_template(stream, opaque=True)
+        streams[stream.index] = copy = output.add_stream_from_template(stream, opaque=True)
         copy.metadata.update(stream.metadata)
         copy.disposition = stream.disposition
     return streams
@@ -348,7 +346,7 @@ def _copied(source: InputContainer, film: OutputContainer) -> dict[int, AudioStr
 
 def _sound(source: InputContainer, streams: Mapping[int, AudioStream]) -> Iterator[AnyPacket]:
     """Yield the audio packets of a source for the new streams."""
-    with suppress(FFmpegError):  # the file breaks off, which `Footage` reports
+    with suppress(FFmpegError):  # the file breaks off, which `StereoVideo` reports
         for packet in _drop_empty(source.demux(*source.streams.audio)):
             packet.stream = streams[packet.stream_index]
             yield packet

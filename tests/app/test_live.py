@@ -25,8 +25,8 @@ COMMAND = [sys.executable, "-c", "import typer; from stereoweave.cli.live import
 _STEP = 20
 
 
-def write_film(path: Path, frames: Sequence[np.ndarray], rate: float = 25) -> str:
-    """A film of these RGB pictures; motion JPEG, of which each frame stands for itself."""
+def write_video(path: Path, frames: Sequence[np.ndarray], rate: float = 25) -> str:
+    """A video of these RGB pictures; motion JPEG, of which each frame stands for itself."""
     size_px = frames[0].shape[1], frames[0].shape[0]
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), rate, size_px)
     assert writer.isOpened()
@@ -83,9 +83,9 @@ def begun(process: subprocess.Popen[str]) -> str:
     return found[0]
 
 
-def test_a_film_gives_its_frames_in_order_up_to_the_last_one_and_ends(tmp_path):
+def test_a_video_gives_its_frames_in_order_up_to_the_last_one_and_ends(tmp_path):
     last = -1
-    with Capture([write_film(tmp_path / "film.avi", greys(8))]) as capture:
+    with Capture([write_video(tmp_path / "video.avi", greys(8))]) as capture:
         while moment := capture.newest(last):
             assert moment.number > last
             assert number_of(moment.pictures[0]) == moment.number
@@ -94,17 +94,17 @@ def test_a_film_gives_its_frames_in_order_up_to_the_last_one_and_ends(tmp_path):
 
 
 def test_who_comes_late_gets_the_newest_frame_and_not_those_before_it(tmp_path):
-    with Capture([write_film(tmp_path / "film.avi", greys(8), rate=50)]) as capture:
+    with Capture([write_video(tmp_path / "video.avi", greys(8), rate=50)]) as capture:
         assert capture.newest(6) is not None  # waits for the last one
         late = capture.newest(-1)
         assert late is not None
         assert (late.number, number_of(late.pictures[0])) == (7, 7)
 
 
-def test_two_films_are_read_in_step_until_the_shorter_one_ends(tmp_path):
+def test_two_videos_are_read_in_step_until_the_shorter_one_ends(tmp_path):
     sources = [
-        write_film(tmp_path / "left.avi", greys(5)),
-        write_film(tmp_path / "right.avi", [255 - grey for grey in greys(9)]),
+        write_video(tmp_path / "left.avi", greys(5)),
+        write_video(tmp_path / "right.avi", [255 - grey for grey in greys(9)]),
     ]
     last = -1
     with Capture(sources) as capture:
@@ -115,7 +115,7 @@ def test_two_films_are_read_in_step_until_the_shorter_one_ends(tmp_path):
     assert last == 4
 
 
-def test_a_series_of_pictures_is_a_film(tmp_path):
+def test_a_series_of_pictures_is_a_video(tmp_path):
     for number, picture in enumerate(greys(3)):
         cv2.imwrite(str(tmp_path / f"frame{number:03}.png"), picture)
     with Capture([str(tmp_path / "frame%03d.png")]) as capture:
@@ -144,7 +144,7 @@ def test_more_than_two_sources_are_refused():
         Capture(["0", "1", "2"])
 
 
-def test_a_picture_and_a_stream_in_a_file_are_films_that_end(tmp_path):
+def test_a_picture_and_a_stream_in_a_file_are_videos_that_end(tmp_path):
     cv2.imwrite(str(tmp_path / "one.png"), greys(3)[2])
     jpegs = [cv2.imencode(".jpg", grey)[1].tobytes() for grey in greys(3)]
     (tmp_path / "camera.mjpeg").write_bytes(b"".join(jpegs))
@@ -154,7 +154,7 @@ def test_a_picture_and_a_stream_in_a_file_are_films_that_end(tmp_path):
             assert capture.newest(last) is None
 
 
-def test_a_stream_that_stops_is_told_and_is_no_end_of_a_film():
+def test_a_stream_that_stops_is_told_and_is_no_end_of_a_video():
     grey = greys(6)[5]
     with Screen(0) as screen:
         screen.show(grey)
@@ -238,7 +238,7 @@ def test_with_a_camera_the_colours_stand_for_metres():
 
 
 def test_a_tally_counts_frames_their_rate_and_how_long_they_took(tmp_path):
-    with Capture([write_film(tmp_path / "film.avi", greys(1))]) as capture:
+    with Capture([write_video(tmp_path / "video.avi", greys(1))]) as capture:
         moment = capture.newest(-1)
     assert moment is not None
     tally = LiveTally()
@@ -249,9 +249,9 @@ def test_a_tally_counts_frames_their_rate_and_how_long_they_took(tmp_path):
     assert tally.line() == "3 frames shown of 5, 1.0 a second, 333 ms after they came"
 
 
-def test_what_is_shown_of_two_films_is_their_left_picture_and_its_disparity(tmp_path):
+def test_what_is_shown_of_two_videos_is_their_left_picture_and_its_disparity(tmp_path):
     left, right = np.split(cv2.resize(example_frame(), (640, 240)), 2, axis=1)
-    sources = [write_film(tmp_path / "left.avi", [left]), write_film(tmp_path / "right.avi", [right])]
+    sources = [write_video(tmp_path / "left.avi", [left]), write_video(tmp_path / "right.avi", [right])]
     # calib.txt, for pictures of half its size.
     calibration = "cam0=[300 0 159.5; 0 300 119.5; 0 0 1]\ncam1=[300 0 159.5; 0 300 119.5; 0 0 1]\n"
     (tmp_path / "calib.txt").write_text(f"{calibration}doffs=0\nbaseline=100\nwidth=320\nheight=240\n")
@@ -268,10 +268,10 @@ def test_what_is_shown_of_two_films_is_their_left_picture_and_its_disparity(tmp_
     assert bottom[0] > bottom[2]
 
 
-def test_the_command_shows_a_film_and_sums_it_up_at_its_end(tmp_path):
-    film = write_film(tmp_path / "film.avi", 30 * [example_frame()], rate=10)
+def test_the_command_shows_a_video_and_sums_it_up_at_its_end(tmp_path):
+    video = write_video(tmp_path / "video.avi", 30 * [example_frame()], rate=10)
     with subprocess.Popen(
-        [*COMMAND, film, "--port", "0", "--no-browser"], stdout=subprocess.PIPE, text=True
+        [*COMMAND, video, "--port", "0", "--no-browser"], stdout=subprocess.PIPE, text=True
     ) as process:
         stream = parts(asked(begun(process), "/stream"))
         for picture in (next(stream), next(stream)):
@@ -279,16 +279,16 @@ def test_the_command_shows_a_film_and_sums_it_up_at_its_end(tmp_path):
         rest, _ = process.communicate(timeout=60)
     assert process.returncode == 0
     counted = re.fullmatch(
-        rf"{re.escape(film)}: (\d+) frames shown of 30, [\d.]+ a second, \d+ ms .*\n", rest
+        rf"{re.escape(video)}: (\d+) frames shown of 30, [\d.]+ a second, \d+ ms .*\n", rest
     )
     assert counted is not None
     assert 2 <= int(counted[1]) <= 30
 
 
 def test_an_interrupt_ends_the_command_in_order(tmp_path):
-    film = write_film(tmp_path / "film.avi", 20 * [example_frame()], rate=0.2)
+    video = write_video(tmp_path / "video.avi", 20 * [example_frame()], rate=0.2)
     process = subprocess.Popen(
-        [*COMMAND, film, "--port", "0", "--no-browser"],
+        [*COMMAND, video, "--port", "0", "--no-browser"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

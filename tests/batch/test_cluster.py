@@ -14,8 +14,8 @@ import fsspec
 import numpy as np
 import pyarrow.dataset
 import pytest
-from film_examples import example_pairs, packets, write_side_by_side
 from other_processes import halted, processes_of
+from video_examples import example_pairs, packets, write_side_by_side
 
 from stereoweave.batch import worker as cluster_worker
 from stereoweave.batch.cluster import _carried, _ready, run_cluster

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from stereoweave.bench.flicker import FRAME_BY_FRAME, STEADY, FlickerRow, average_rows, score_flicker
-from stereoweave.bench.flicker_films import (
+from stereoweave.bench.flicker_metrics import find_seen_again, flicker
+from stereoweave.bench.flicker_videos import (
     LEFT,
     MIDDLE,
     NOISE_LEVELS,
@@ -15,7 +16,6 @@ from stereoweave.bench.flicker_films import (
     render_panning,
     reproject,
 )
-from stereoweave.bench.flicker_metrics import find_seen_again, flicker
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import StereoCamera, StereoPair
 from stereoweave.synth.sets.pair_rendering import RenderSpec
@@ -120,7 +120,7 @@ def test_a_camera_that_turns_moves_even_the_sky():
 
 @pytest.fixture
 def three_frames(rng):
-    """A film of three frames of which `freeze` and `add_passing_oval` take the first: a plane at 4 px."""
+    """A video of three frames of which `freeze` and `add_passing_oval` take the first: a plane at 4 px."""
     image = rng.integers(0, 256, (96, 128, 3), dtype=np.uint8)
     flat_px = np.full((96, 128), 4, np.float32)
     return RenderedVideo(
@@ -132,12 +132,12 @@ def three_frames(rng):
     )
 
 
-def test_a_still_film_does_not_change_and_its_noise_does(three_frames):
-    film = freeze(three_frames)
-    assert len(film.pairs) == 3
-    motion_px, _ = film.change(0, 2, LEFT)
-    assert film.seen_again(0, 2, LEFT).all()
-    assert flicker(film.pairs[0].left, film.pairs[2].left, motion_px, film.seen_again(0, 2, LEFT)) == 0
+def test_a_still_video_does_not_change_and_its_noise_does(three_frames):
+    video = freeze(three_frames)
+    assert len(video.pairs) == 3
+    motion_px, _ = video.change(0, 2, LEFT)
+    assert video.seen_again(0, 2, LEFT).all()
+    assert flicker(video.pairs[0].left, video.pairs[2].left, motion_px, video.seen_again(0, 2, LEFT)) == 0
     grey = StereoPair(left=np.full((96, 128, 3), 99, np.uint8), right=np.full((96, 128, 3), 99, np.uint8))
     one, other = (add_noise(grey, np.random.default_rng(seed)) for seed in (1, 2))
     for a, b in ((one.left, one.right), (one.left, other.left), (one.right, other.right)):
@@ -145,50 +145,50 @@ def test_a_still_film_does_not_change_and_its_noise_does(three_frames):
 
 
 def test_what_passes_is_where_its_truth_says(three_frames):
-    film = add_passing_oval(three_frames, "passing", (4.0, 2.0), nearing_px=2.0)
-    assert not film.moving[0].all()
+    video = add_passing_oval(three_frames, "passing", (4.0, 2.0), nearing_px=2.0)
+    assert not video.moving[0].all()
     for frame, near_px in enumerate((12, 14, 16)):
-        oval = film.moving[frame]
-        np.testing.assert_array_equal(film.disparities_px[frame][LEFT], np.where(oval, near_px, 4))
+        oval = video.moving[frame]
+        np.testing.assert_array_equal(video.disparities_px[frame][LEFT], np.where(oval, near_px, 4))
         rows, columns = np.nonzero(oval)
         # An oval of 32 x 24 px, whose rim it shares with what is behind.
         assert len(rows) == pytest.approx(np.pi / 4 * 32 * 24, rel=0.1)
         middle = (np.abs(rows - rows.mean()) < 6) & (np.abs(columns - columns.mean()) < 8)
         rows, columns = rows[middle], columns[middle]
-        pair = film.pairs[frame]
+        pair = video.pairs[frame]
         np.testing.assert_array_equal(pair.left[rows, columns], pair.right[rows, columns - near_px])
         if frame:
-            earlier = film.pairs[frame - 1].left
+            earlier = video.pairs[frame - 1].left
             np.testing.assert_array_equal(pair.left[rows, columns], earlier[rows - 2, columns - 4])
 
 
 def test_what_passes_covers_and_uncovers(three_frames):
-    film = add_passing_oval(three_frames, "passing", (4.0, 0.0))
-    before, after = film.moving[0], film.moving[1]
-    np.testing.assert_array_equal(film.seen_again(0, 1, LEFT) | (after & ~before), np.ones_like(before))
-    np.testing.assert_array_equal(film.seen_again(1, 0, LEFT), ~(before & ~after))
-    motion_px, change_px = film.change(0, 2, LEFT)
+    video = add_passing_oval(three_frames, "passing", (4.0, 0.0))
+    before, after = video.moving[0], video.moving[1]
+    np.testing.assert_array_equal(video.seen_again(0, 1, LEFT) | (after & ~before), np.ones_like(before))
+    np.testing.assert_array_equal(video.seen_again(1, 0, LEFT), ~(before & ~after))
+    motion_px, change_px = video.change(0, 2, LEFT)
     np.testing.assert_array_equal(motion_px[before], np.tile([8, 0], (before.sum(), 1)))
     assert not motion_px[~before].any() and not change_px.any()
 
 
 def test_what_comes_nearer_moves_less_to_the_right_in_the_middle_view(three_frames):
-    film = add_passing_oval(three_frames, "nearing", (3.25, 0.0), nearing_px=0.5)
-    motion_px, change_px = film.change(0, 1, MIDDLE)
+    video = add_passing_oval(three_frames, "nearing", (3.25, 0.0), nearing_px=0.5)
+    motion_px, change_px = video.change(0, 1, MIDDLE)
     assert motion_px[..., 0].max() == 3.0
     assert change_px.max() == 0.5
 
 
 @pytest.mark.needs_egl
 def test_a_rendered_pan_looks_the_same_along_its_true_motion():
-    film = render_panning(RenderSpec(scene="ship", seed=4, size_px=(160, 120), frames=12), 2)
-    motion_px, change_px = film.change(0, 1, LEFT)
-    visible = film.seen_again(0, 1, LEFT)
+    video = render_panning(RenderSpec(scene="ship", seed=4, size_px=(160, 120), frames=12), 2)
+    motion_px, change_px = video.change(0, 1, LEFT)
+    visible = video.seen_again(0, 1, LEFT)
     assert visible.mean() > 0.8
-    before_px, after_px = (maps[LEFT] for maps in film.disparities_px)
+    before_px, after_px = (maps[LEFT] for maps in video.disparities_px)
     at_rest_px = flicker(before_px, after_px, 0 * motion_px, visible)
     assert flicker(before_px, after_px, motion_px, visible, change_px) < 0.05 * at_rest_px
-    before, after = (pair.left for pair in film.pairs)
+    before, after = (pair.left for pair in video.pairs)
     assert flicker(before, after, motion_px, visible) < 0.5 * flicker(before, after, 0 * motion_px, visible)
 
 
@@ -206,12 +206,12 @@ def test_the_rows_say_what_steadying_is_worth():
     assert np.isnan(rows[0].moving_epe_px) and np.isnan(rows[0].uncovered_epe_px)
 
 
-def test_a_film_of_one_frame_is_refused():
+def test_a_video_of_one_frame_is_refused():
     with pytest.raises(StereoweaveError, match="frames: expected 2 or more"):
         list(score_flicker(["rooms"], frames=1))
 
 
-def test_means_are_over_the_scenes_of_a_film_and_a_method():
+def test_means_are_over_the_scenes_of_a_video_and_a_method():
     def row(scene, method, value):
         numbers = dict.fromkeys(("view_flicker_levels", "epe_px", "moving_epe_px", "uncovered_epe_px"), value)
         return FlickerRow(

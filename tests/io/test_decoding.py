@@ -30,7 +30,7 @@ from stereoweave.pictures.prepare import Request, prepare
 from stereoweave.service.answers import check_pixels
 from stereoweave.service.forms import MapForm, store_uploads
 from stereoweave.stereo import StereoPair
-from stereoweave.video.reader import open_footage
+from stereoweave.video.reader import open_video
 
 ORIENTATION = 0x0112
 
@@ -75,9 +75,9 @@ def by_page(folder: Path):
     return page_kept.match_uploads(uploads, folder / "kept", lambda *_: None).result.pair
 
 
-def by_footage(folder: Path):
-    footage = open_footage([folder / "frames" / f"{side}_*.png" for side in ("left", "right")])
-    frame = next(iter(footage.frames()))
+def by_video(folder: Path):
+    video = open_video([folder / "frames" / f"{side}_*.png" for side in ("left", "right")])
+    frame = next(iter(video.frames()))
     return StereoPair(left=frame.left, right=frame.right)
 
 
@@ -88,7 +88,7 @@ WAYS: dict[str, Callable[[Path], StereoPair]] = {
     ),
     "read_pair": lambda folder: read_pair(folder / "left.png", folder / "right.png"),
     "commands": lambda folder: open_pictures([folder / "left.png", folder / "right.png"]).pair,
-    "footage": by_footage,
+    "video": by_video,
     "bench pairs": lambda folder: list_scenes(folder.parent)[0]().pair,
     "bench views": lambda folder: list_view_scenes(folder.parent)[0]().sample,
     "service": by_service,

@@ -6,10 +6,10 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from film_examples import packed, shrunk
 from picture_examples import DISPLAY_P3, SRGB, png_of, profile
 from PIL import Image, ImageCms
 from skimage import data
+from video_examples import packed, shrunk
 
 from stereoweave.cli.options import Format
 from stereoweave.errors import FormatError, StereoweaveError

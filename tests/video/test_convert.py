@@ -1,4 +1,4 @@
-"""A film through the command: its frames, times and sound, and what becomes of one that is interrupted."""
+"""A video through the command: its frames, times and sound, and what becomes of one that is interrupted."""
 
 import os
 import signal
@@ -12,8 +12,8 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from film_examples import EXAMPLES, damage, example_pairs, packets, write_side_by_side, write_video
 from other_processes import halted
+from video_examples import EXAMPLES, damage, example_pairs, packets, write_side_by_side, write_video
 
 from stereoweave.cli.root import main
 from stereoweave.io.colormap import colour_disparity
@@ -22,13 +22,13 @@ from stereoweave.matching.matcher import Matcher
 from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import StereoPair
-from stereoweave.video.reader import Footage, StereoFrame, open_footage
+from stereoweave.video.reader import StereoFrame, StereoVideo, open_video
 
 # So that a part, 10 s, is 5 frames.
 SLOW_MS = 2000
 
 
-def slow_film(path: Path, count: int = 13) -> Path:
+def slow_video(path: Path, count: int = 13) -> Path:
     return write_side_by_side(
         path, example_pairs(count), times_ms=range(0, count * SLOW_MS, SLOW_MS), codec="libx264"
     )
@@ -42,22 +42,22 @@ def heeded_interrupts():
     signal.signal(signal.SIGINT, before)
 
 
-def run(film: Path, out: Path, *words: str) -> int:
+def run(video: Path, out: Path, *words: str) -> int:
     # Of two threads the second would wait as busily as the first one works, while other tests have its core.
-    return main(["video", str(film), "-o", str(out), "--threads", "1", *words])
+    return main(["video", str(video), "-o", str(out), "--threads", "1", *words])
 
 
-def frames_of(film: Path) -> list[np.ndarray]:
-    with av.open(str(film)) as container:
+def frames_of(video: Path) -> list[np.ndarray]:
+    with av.open(str(video)) as container:
         return [frame.to_ndarray() for frame in container.decode(video=0)]
 
 
-def rgb_of(film: Path) -> list[np.ndarray]:
-    return [frame.left for frame in open_footage([film, film]).frames()]
+def rgb_of(video: Path) -> list[np.ndarray]:
+    return [frame.left for frame in open_video([video, video]).frames()]
 
 
-def times_of(film: Path) -> list[Fraction]:
-    with av.open(str(film)) as container:
+def times_of(video: Path) -> list[Fraction]:
+    with av.open(str(video)) as container:
         return [frame.pts * frame.time_base for frame in container.decode(video=0)]
 
 
@@ -67,20 +67,20 @@ def estimate_of(frame: StereoFrame):
 
 def test_as_many_frames_at_their_uneven_times_and_the_same_sound(tmp_path, capsys):
     times_ms = [0, 40, 90, 130, 170, 300, 330, 370]
-    film = write_side_by_side(
+    video = write_side_by_side(
         tmp_path / "in.mp4", example_pairs(8), times_ms=times_ms, sound=True, codec="libx264"
     )
-    assert run(film, tmp_path / "out.mp4", "--position", "0.5", "--threads", "2") == 0
+    assert run(video, tmp_path / "out.mp4", "--position", "0.5", "--threads", "2") == 0
     assert capsys.readouterr().out == f"{tmp_path / 'out.mp4'}: 8 frames, 0 cuts\n"
     assert times_of(tmp_path / "out.mp4") == [Fraction(ms, 1000) for ms in times_ms]
-    assert packets(tmp_path / "out.mp4", "audio") == packets(film, "audio")
+    assert packets(tmp_path / "out.mp4", "audio") == packets(video, "audio")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.mp4", "out.mp4"]
 
 
 def test_depth_in_16_bits_is_disparity_times_256(tmp_path):
-    film = write_side_by_side(tmp_path / "in.mp4", example_pairs(2), codec="libx264")
-    assert run(film, tmp_path / "out.mkv", "--depth16") == 0
-    first = next(open_footage([film]).frames())
+    video = write_side_by_side(tmp_path / "in.mp4", example_pairs(2), codec="libx264")
+    assert run(video, tmp_path / "out.mkv", "--depth16") == 0
+    first = next(open_video([video]).frames())
     with av.open(str(tmp_path / "out.mkv")) as container:
         assert (
             container.metadata["COMMENT"] == "16-bit grey: disparity of the left view in pixels = value / 256"
@@ -90,16 +90,16 @@ def test_depth_in_16_bits_is_disparity_times_256(tmp_path):
     np.testing.assert_array_equal(grey, np.rint(256 * estimate_of(first).disparity_px))
 
 
-def test_colours_of_depth_mean_the_same_in_all_of_the_film(tmp_path, capsys):
+def test_colours_of_depth_mean_the_same_in_all_of_the_video(tmp_path, capsys):
     near = example_pairs(1)[0]
     far = (255 - near[0][::-1],) * 2
-    film = write_side_by_side(tmp_path / "in.mp4", [near, near, far, far], codec="libx264")
-    assert run(film, tmp_path / "out.mp4", "--depth", "--arrangement", "side_by_side") == 0
+    video = write_side_by_side(tmp_path / "in.mp4", [near, near, far, far], codec="libx264")
+    assert run(video, tmp_path / "out.mp4", "--depth", "--arrangement", "side_by_side") == 0
     assert capsys.readouterr().out.endswith("4 frames, 1 cut\n")
     with av.open(str(tmp_path / "out.mp4")) as container:
         comment = container.metadata["comment"]
     low_px, high_px = (float(word) for word in comment.replace(" px", "").split() if word[0].isdigit())
-    frames = list(open_footage([film], "side_by_side").frames())
+    frames = list(open_video([video], "side_by_side").frames())
     shown = rgb_of(tmp_path / "out.mp4")
     for index in (0, 2):  # the first frame, and the first one after the cut
         expected = colour_disparity(estimate_of(frames[index]).disparity_px, (low_px, high_px))
@@ -108,9 +108,9 @@ def test_colours_of_depth_mean_the_same_in_all_of_the_film(tmp_path, capsys):
 
 @pytest.mark.parametrize("name", ["side_by_side", "anaglyph_dubois"])
 def test_a_layout_is_what_it_is_of_a_still_and_viewers_know_it_by_its_name(tmp_path, name):
-    film = write_side_by_side(tmp_path / "in.mp4", example_pairs(2), codec="libx264")
-    assert run(film, tmp_path / "out.mp4", "--layout", name, "--strength", "1.5", "--convergence", "12") == 0
-    first = next(open_footage([film]).frames())
+    video = write_side_by_side(tmp_path / "in.mp4", example_pairs(2), codec="libx264")
+    assert run(video, tmp_path / "out.mp4", "--layout", name, "--strength", "1.5", "--convergence", "12") == 0
+    first = next(open_video([video]).frames())
     pair = StereoPair(left=first.left, right=first.right)
     renderer = Renderer(pair, estimate_of(first), strength=1.5, convergence_px=12.0)
     still = LAYOUTS[name].compose(renderer, LayoutOptions())
@@ -119,10 +119,10 @@ def test_a_layout_is_what_it_is_of_a_still_and_viewers_know_it_by_its_name(tmp_p
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["in.mp4", made.name])
 
 
-def test_what_lies_upon_one_another_keeps_the_films_middle_in_place(tmp_path):
-    film = write_side_by_side(tmp_path / "in.mp4", example_pairs(3), codec="libx264")
+def test_what_lies_upon_one_another_keeps_the_videos_middle_in_place(tmp_path):
+    video = write_side_by_side(tmp_path / "in.mp4", example_pairs(3), codec="libx264")
     for name, words in {"auto": (), "none": ("--convergence", "0")}.items():
-        assert run(film, tmp_path / f"{name}.mp4", "--layout", "anaglyph_grey", *words) == 0
+        assert run(video, tmp_path / f"{name}.mp4", "--layout", "anaglyph_grey", *words) == 0
     # The eyes' pictures, red and green, lie apart by the disparity where nothing is kept in place.
     apart = {name: _red_from_green(rgb_of(tmp_path / f"{name}.mp4")[1]) for name in ("auto", "none")}
     assert apart["auto"] < apart["none"] / 2
@@ -135,13 +135,13 @@ def converged_pairs(moved_px: list[int]) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(left[rows, 180:436], right[rows, 180 - by_px : 436 - by_px]) for by_px in moved_px]
 
 
-def test_disparities_behind_the_screen_are_found_however_late_in_a_film(tmp_path, capsys):
+def test_disparities_behind_the_screen_are_found_however_late_in_a_video(tmp_path, capsys):
     # 11 to 21 px without the move; the last of these frames begins after a minute.
     pairs = converged_pairs([22] * 6 + [62] * 2)
     times_ms = range(0, 8 * 12_000, 12_000)
-    film = write_side_by_side(tmp_path / "in.mp4", pairs, times_ms=times_ms, codec="libx264")
+    video = write_side_by_side(tmp_path / "in.mp4", pairs, times_ms=times_ms, codec="libx264")
     words = ["--arrangement", "side_by_side"]
-    assert run(film, tmp_path / "depth.mkv", "--depth", *words) == 0
+    assert run(video, tmp_path / "depth.mkv", "--depth", *words) == 0
     with av.open(str(tmp_path / "depth.mkv")) as container:
         comment = container.metadata["COMMENT"]
     low_px, high_px = (
@@ -150,7 +150,7 @@ def test_disparities_behind_the_screen_are_found_however_late_in_a_film(tmp_path
     assert -62 + 10 < low_px < -62 + 16
     assert -22 + 16 < high_px < -22 + 22
     # A point at disparity d is at x - d / 2 in the view halfway: the move brings it 31 columns to the right.
-    assert run(film, tmp_path / "view.mp4", "--position", "0.5", *words) == 0
+    assert run(video, tmp_path / "view.mp4", "--position", "0.5", *words) == 0
     still = write_side_by_side(tmp_path / "still.mp4", converged_pairs([0]), codec="libx264")
     assert run(still, tmp_path / "unmoved.mp4", "--position", "0.5", *words) == 0
     moved, unmoved = (rgb_of(tmp_path / name)[-1].astype(int) for name in ("view.mp4", "unmoved.mp4"))
@@ -158,8 +158,8 @@ def test_disparities_behind_the_screen_are_found_however_late_in_a_film(tmp_path
 
 
 def test_depth_in_16_bits_says_what_it_cannot_hold(tmp_path, capsys):
-    film = write_side_by_side(tmp_path / "in.mp4", converged_pairs([40, 40]), codec="libx264")
-    assert run(film, tmp_path / "out.mkv", "--depth16", "--arrangement", "side_by_side") == 0
+    video = write_side_by_side(tmp_path / "in.mp4", converged_pairs([40, 40]), codec="libx264")
+    assert run(video, tmp_path / "out.mkv", "--depth16", "--arrangement", "side_by_side") == 0
     [line] = [line for line in capsys.readouterr().err.splitlines() if "16-bit" in line]
     assert line.startswith("16-bit grey holds 0 to 255.99 px: this video's disparities, -2")
     assert line.endswith("are clipped; show all of them in colours (--depth)")
@@ -169,8 +169,8 @@ def _red_from_green(anaglyph: np.ndarray) -> float:
     return np.abs(anaglyph[..., 0].astype(int) - anaglyph[..., 1]).mean()
 
 
-class Interrupted(Footage):
-    """Footage whose reader gets the signal of Ctrl-C at frame 8, once a part is finished."""
+class Interrupted(StereoVideo):
+    """A video whose reader gets the signal of Ctrl-C at frame 8, once a part is finished."""
 
     def frames(self, start: int = 0) -> Iterator[StereoFrame]:
         for index, frame in enumerate(super().frames(start), start):
@@ -180,12 +180,12 @@ class Interrupted(Footage):
 
 
 @pytest.mark.parametrize("words", [("--position", "0.4"), ("--layout", "rgbd")])
-def test_a_film_that_was_interrupted_goes_on_to_the_same_frames(tmp_path, monkeypatch, capsys, words):
-    film = slow_film(tmp_path / "in.mp4")
-    assert run(film, tmp_path / "whole.mp4", *words) == 0
+def test_a_video_that_was_interrupted_goes_on_to_the_same_frames(tmp_path, monkeypatch, capsys, words):
+    video = slow_video(tmp_path / "in.mp4")
+    assert run(video, tmp_path / "whole.mp4", *words) == 0
     with monkeypatch.context() as patch:
-        patch.setattr("stereoweave.video.reader.Footage", Interrupted)
-        assert run(film, tmp_path / "broken.mp4", *words) == 130
+        patch.setattr("stereoweave.video.reader.StereoVideo", Interrupted)
+        assert run(video, tmp_path / "broken.mp4", *words) == 130
     [folder] = tmp_path.glob("broken*.parts")
     [line] = [line for line in capsys.readouterr().err.splitlines() if line.startswith("stereoweave")]
     assert line.endswith(f": stopped; finished parts are in {folder}; rerun the same command to resume")
@@ -194,40 +194,40 @@ def test_a_film_that_was_interrupted_goes_on_to_the_same_frames(tmp_path, monkey
         "settings.json",
         "state-000001.npz",
     ]
-    assert run(film, tmp_path / "broken.mp4", *words) == 0
+    assert run(video, tmp_path / "broken.mp4", *words) == 0
     [whole], [broken] = tmp_path.glob("whole*"), tmp_path.glob("broken*")
     np.testing.assert_array_equal(frames_of(broken), frames_of(whole))
-    assert times_of(broken) == times_of(film)
+    assert times_of(broken) == times_of(video)
 
 
-def test_a_film_that_is_being_made_is_refused_until_its_process_is_killed(tmp_path, capsys):
-    film, out = slow_film(tmp_path / "in.mp4"), tmp_path / "out.mp4"
+def test_a_video_that_is_being_made_is_refused_until_its_process_is_killed(tmp_path, capsys):
+    video, out = slow_video(tmp_path / "in.mp4"), tmp_path / "out.mp4"
     program = "import sys; from stereoweave.cli.root import main; sys.exit(main())"
-    words = ["video", film, "-o", out, "--depth", "--threads", "1"]
+    words = ["video", video, "-o", out, "--depth", "--threads", "1"]
     first = subprocess.Popen([sys.executable, "-c", program, *words], stderr=subprocess.DEVNULL)
     while not any(tmp_path.glob("*.parts/*.nut")) and first.poll() is None:
         time.sleep(0.002)
     (tmp_path / "link").symlink_to(tmp_path)
     with halted(first):
-        assert run(film, tmp_path / "link" / "out.mp4", "--depth") == 2
+        assert run(video, tmp_path / "link" / "out.mp4", "--depth") == 2
         first.kill()
     assert capsys.readouterr().err == (
         f"stereoweave: {tmp_path / 'link' / 'out.mp4'}: expected an output that no other command writes to, "
         "found one that is in use; wait for the other command to end, or choose another output\n"
     )
     assert first.wait() == -signal.SIGKILL
-    assert run(film, out, "--depth") == 0
+    assert run(video, out, "--depth") == 0
     assert len(frames_of(out)) == 13
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.mp4", "link", "out.mp4"]
 
 
 def test_another_order_does_not_go_on_with_what_was_begun(tmp_path, monkeypatch, capsys):
-    film = slow_film(tmp_path / "in.mp4", 10)
+    video = slow_video(tmp_path / "in.mp4", 10)
     with monkeypatch.context() as patch:
-        patch.setattr("stereoweave.video.reader.Footage", Interrupted)
-        assert run(film, tmp_path / "out.mp4", "--position", "0.4") == 130
+        patch.setattr("stereoweave.video.reader.StereoVideo", Interrupted)
+        assert run(video, tmp_path / "out.mp4", "--position", "0.4") == 130
     capsys.readouterr()
-    assert run(film, tmp_path / "out.mp4", "--position", "0.6") == 2
+    assert run(video, tmp_path / "out.mp4", "--position", "0.6") == 2
     folder = tmp_path / "out.mp4.parts"
     assert capsys.readouterr().err == (
         f"stereoweave: {folder}: expected parts of the same video, found parts begun with position 0.4; "
@@ -236,11 +236,11 @@ def test_another_order_does_not_go_on_with_what_was_begun(tmp_path, monkeypatch,
 
 
 def test_where_the_disk_fills_up_one_line_says_what_stays_and_how_to_go_on(tmp_path):
-    film = slow_film(tmp_path / "in.mp4", 45)
-    assert run(film, tmp_path / "whole.mkv", "--depth16") == 0
+    video = slow_video(tmp_path / "in.mp4", 45)
+    assert run(video, tmp_path / "whole.mkv", "--depth16") == 0
     # Each part finds room, and so does the state after it (0.4 MB); all of them joined do not.
     room_bytes = int(0.8 * (tmp_path / "whole.mkv").stat().st_size)
-    words = ["video", str(film), "-o", str(tmp_path / "out.mkv"), "--depth16"]
+    words = ["video", str(video), "-o", str(tmp_path / "out.mkv"), "--depth16"]
     program = (
         "import resource, sys; from stereoweave.cli.root import main; "
         f"resource.setrlimit(resource.RLIMIT_FSIZE, ({room_bytes}, {room_bytes})); sys.exit(main({words}))"
@@ -254,18 +254,18 @@ def test_where_the_disk_fills_up_one_line_says_what_stays_and_how_to_go_on(tmp_p
     )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.mp4", "out.mkv.parts", "whole.mkv"]
     assert len(list(folder.glob("*.nut"))) == 9
-    assert run(film, tmp_path / "out.mkv", "--depth16") == 0
+    assert run(video, tmp_path / "out.mkv", "--depth16") == 0
     np.testing.assert_array_equal(frames_of(tmp_path / "out.mkv"), frames_of(tmp_path / "whole.mkv"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.mp4", "out.mkv", "whole.mkv"]
 
 
 def test_a_damaged_frame_is_told_with_its_time_and_is_not_the_end(tmp_path, capsys):
-    film = damage(write_side_by_side(tmp_path / "in.mkv", example_pairs(12), codec="mjpeg"), 5)
-    assert run(film, tmp_path / "out.mkv", "--position", "0.5") == 0
+    video = damage(write_side_by_side(tmp_path / "in.mkv", example_pairs(12), codec="mjpeg"), 5)
+    assert run(video, tmp_path / "out.mkv", "--position", "0.5") == 0
     told = capsys.readouterr().out.splitlines()
     assert told[0].endswith("12 frames, 0 cuts")
     assert told[1] == "problems in 1 of 12 frames: 0:00:00.200 damaged: replaced by the frame before it"
-    assert times_of(tmp_path / "out.mkv") == times_of(film)
+    assert times_of(tmp_path / "out.mkv") == times_of(video)
 
 
 @pytest.mark.parametrize(
@@ -299,22 +299,22 @@ def test_a_damaged_frame_is_told_with_its_time_and_is_not_the_end(tmp_path, caps
     ],
 )
 def test_what_cannot_be_made_is_one_line_before_any_work(tmp_path, capsys, out, words, told):
-    film = write_side_by_side(tmp_path / "in.mp4", example_pairs(2), codec="libx264")
-    before = film.read_bytes()
-    assert run(film, tmp_path / out, *words) == 2
+    video = write_side_by_side(tmp_path / "in.mp4", example_pairs(2), codec="libx264")
+    before = video.read_bytes()
+    assert run(video, tmp_path / out, *words) == 2
     [line] = capsys.readouterr().err.splitlines()
     assert told in line
     assert [path.name for path in tmp_path.iterdir()] == ["in.mp4"]
-    assert film.read_bytes() == before
+    assert video.read_bytes() == before
 
 
-def test_what_is_no_3d_film_is_one_line(tmp_path, capsys):
+def test_what_is_no_3d_video_is_one_line(tmp_path, capsys):
     wide = [np.hstack([left, np.flip(left)]) for left, _ in example_pairs(2)]
     flat = write_video(tmp_path / "flat.mp4", wide, codec="libx264")
     broken = tmp_path / "broken.mp4"
     broken.write_bytes(flat.read_bytes()[:400])
-    for film, told in ((flat, "expected 3-D video"), (broken, "expected a video")):
-        assert run(film, tmp_path / "out.mp4", "--depth") == 2
+    for video, told in ((flat, "expected 3-D video"), (broken, "expected a video")):
+        assert run(video, tmp_path / "out.mp4", "--depth") == 2
         [line] = capsys.readouterr().err.splitlines()
         assert told in line
     assert sorted(path.name for path in tmp_path.iterdir()) == ["broken.mp4", "flat.mp4"]
@@ -330,17 +330,17 @@ def test_swapped_sides_are_told_with_the_arrangement_that_mends_them(tmp_path, c
     assert "swapped" not in capsys.readouterr().err
 
 
-def test_a_film_is_looked_at_beyond_its_first_minute(tmp_path, capsys):
+def test_a_video_is_looked_at_beyond_its_first_minute(tmp_path, capsys):
     # At 6 frames a minute, so that two of the three that are looked at, number 1, 4 and 7, are swapped.
     pairs = example_pairs(8, width=320, height=192)
     pairs = [pair if index < 3 else pair[::-1] for index, pair in enumerate(pairs)]
     times_ms = range(0, 8 * 10_000, 10_000)
-    film = write_side_by_side(tmp_path / "in.mp4", pairs, times_ms=times_ms, codec="libx264")
-    assert run(film, tmp_path / "out.mp4", "--position", "0", "--arrangement", "side_by_side") == 0
+    video = write_side_by_side(tmp_path / "in.mp4", pairs, times_ms=times_ms, codec="libx264")
+    assert run(video, tmp_path / "out.mp4", "--position", "0", "--arrangement", "side_by_side") == 0
     assert capsys.readouterr().err.count("0:01:10.000 ") == 1
 
 
-def test_swapped_films_are_told_without_an_arrangement(tmp_path, capsys):
+def test_swapped_videos_are_told_without_an_arrangement(tmp_path, capsys):
     pairs = example_pairs(2, width=320, height=192)
     left, right = (write_video(tmp_path / f"{eye}.mp4", [pair[eye] for pair in pairs]) for eye in (0, 1))
     words = ["video", str(right), str(left), "-o", str(tmp_path / "out.mp4"), "--position", "0"]
@@ -368,7 +368,7 @@ def test_a_series_of_which_one_picture_changed_is_not_gone_on_with(tmp_path, mon
     out = (folder / pattern).with_name("out.mp4")
     words = ["--position", "0.5", "--rate", "0.5"]
     with monkeypatch.context() as patch:
-        patch.setattr("stereoweave.video.reader.Footage", Interrupted)
+        patch.setattr("stereoweave.video.reader.StereoVideo", Interrupted)
         assert run(folder / pattern, out, *words) == 130
     status = (folder / "006.png").stat()
     os.utime(folder / "006.png", ns=(status.st_atime_ns, status.st_mtime_ns + 1_000_000))
@@ -377,24 +377,24 @@ def test_a_series_of_which_one_picture_changed_is_not_gone_on_with(tmp_path, mon
     assert "found parts begun with another film;" in capsys.readouterr().err
 
 
-def test_a_film_taken_apart_otherwise_is_not_gone_on_with(tmp_path, monkeypatch, capsys):
-    film = slow_film(tmp_path / "in.mp4", 10)
+def test_a_video_taken_apart_otherwise_is_not_gone_on_with(tmp_path, monkeypatch, capsys):
+    video = slow_video(tmp_path / "in.mp4", 10)
     with monkeypatch.context() as patch:
-        patch.setattr("stereoweave.video.reader.Footage", Interrupted)
-        assert run(film, tmp_path / "out.mp4", "--position", "0.5") == 130
+        patch.setattr("stereoweave.video.reader.StereoVideo", Interrupted)
+        assert run(video, tmp_path / "out.mp4", "--position", "0.5") == 130
     capsys.readouterr()
-    assert run(film, tmp_path / "out.mp4", "--position", "0.5", "--arrangement", "crossed") == 2
+    assert run(video, tmp_path / "out.mp4", "--position", "0.5", "--arrangement", "crossed") == 2
     assert "found parts begun with arrangement side_by_side;" in capsys.readouterr().err
 
 
-def test_a_film_stopped_while_it_is_opened_says_what_it_says_later(tmp_path, monkeypatch, capsys):
-    film = write_side_by_side(tmp_path / "in.mp4", example_pairs(2), codec="libx264")
-    monkeypatch.setattr("stereoweave.video.reader.Footage", lambda *_: signal.raise_signal(signal.SIGINT))
-    assert run(film, tmp_path / "out.mp4", "--depth") == 130
+def test_a_video_stopped_while_it_is_opened_says_what_it_says_later(tmp_path, monkeypatch, capsys):
+    video = write_side_by_side(tmp_path / "in.mp4", example_pairs(2), codec="libx264")
+    monkeypatch.setattr("stereoweave.video.reader.StereoVideo", lambda *_: signal.raise_signal(signal.SIGINT))
+    assert run(video, tmp_path / "out.mp4", "--depth") == 130
     assert capsys.readouterr().err == f"stereoweave: {tmp_path / 'out.mp4'}: stopped; no part was finished\n"
 
 
 def test_one_frame_is_one_frame(tmp_path, capsys):
-    film = write_side_by_side(tmp_path / "in.mp4", example_pairs(1), codec="libx264")
-    assert run(film, tmp_path / "out.mp4", "--position", "0.5") == 0
+    video = write_side_by_side(tmp_path / "in.mp4", example_pairs(1), codec="libx264")
+    assert run(video, tmp_path / "out.mp4", "--position", "0.5") == 0
     assert capsys.readouterr().out == f"{tmp_path / 'out.mp4'}: 1 frame, 0 cuts\n"

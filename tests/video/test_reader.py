@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import av
 import numpy as np
 import pytest
-from film_examples import (
+from video_examples import (
     FRAME_MS,
     damage,
     example_pairs,
@@ -22,7 +22,7 @@ from film_examples import (
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import write_image
 from stereoweave.pictures.frame_packing import guess_arrangement, measure_resemblance
-from stereoweave.video.reader import ARRANGEMENTS, open_footage
+from stereoweave.video.reader import ARRANGEMENTS, open_video
 from stereoweave.video.tracks import _by_rank, _fill_missing, _separate
 
 BEFORE = "damaged: replaced by the frame before it"
@@ -30,11 +30,11 @@ SPOILT = "decoded from a damaged frame before it"
 
 
 def assert_eyes(frames, pairs, tolerance=0.0):
-    """Every eye is the one that was filmed, or on the mean of its values at most `tolerance` levels away."""
+    """Every eye is the expected one, or on the mean of its values at most `tolerance` levels away."""
     frames = list(frames)
     assert len(frames) == len(pairs)
-    for frame, filmed in zip(frames, pairs, strict=True):
-        for eye, image in zip(frame[:2], filmed, strict=True):
+    for frame, expected in zip(frames, pairs, strict=True):
+        for eye, image in zip(frame[:2], expected, strict=True):
             assert eye.shape == image.shape
             assert np.abs(eye.astype(int) - image).mean() <= tolerance
 
@@ -48,14 +48,14 @@ def assert_same(frames, others):
 
 def refusal(*paths, **options):
     with pytest.raises(StereoweaveError) as caught:
-        open_footage(paths, **options)
+        open_video(paths, **options)
     message = str(caught.value)
     assert "\n" not in message
     return message
 
 
-def problems(footage):
-    return {index: frame.problem for index, frame in enumerate(footage.frames()) if frame.problem}
+def problems(video):
+    return {index: frame.problem for index, frame in enumerate(video.frames()) if frame.problem}
 
 
 def write_pictures(folder, pattern, images):
@@ -66,11 +66,11 @@ def write_pictures(folder, pattern, images):
 @pytest.mark.parametrize("arrangement", ARRANGEMENTS)
 def test_each_arrangement_gives_both_eyes_at_full_size(tmp_path, arrangement):
     pairs = flat_pairs(3, height=72)
-    path = write_side_by_side(tmp_path / "film.mkv", pairs, arrangement=arrangement, codec="ffv1")
-    footage = open_footage([path], arrangement)
-    assert footage.size_px == (64, 72)
-    assert (footage.frame_count, footage.rate, footage.sound) == (3, 25, None)
-    assert_eyes(footage.frames(), pairs)
+    path = write_side_by_side(tmp_path / "video.mkv", pairs, arrangement=arrangement, codec="ffv1")
+    video = open_video([path], arrangement)
+    assert video.size_px == (64, 72)
+    assert (video.frame_count, video.rate, video.sound) == (3, 25, None)
+    assert_eyes(video.frames(), pairs)
 
 
 @pytest.mark.parametrize(
@@ -78,24 +78,24 @@ def test_each_arrangement_gives_both_eyes_at_full_size(tmp_path, arrangement):
 )
 def test_an_arrangement_that_nobody_names_is_seen(tmp_path, arrangement):
     pairs = example_pairs(5)
-    path = write_side_by_side(tmp_path / "film.mkv", pairs, arrangement=arrangement, codec="ffv1")
+    path = write_side_by_side(tmp_path / "video.mkv", pairs, arrangement=arrangement, codec="ffv1")
     lost_in_half = 3.0 if arrangement.endswith("half") else 0.0
-    assert_eyes(open_footage([path]).frames(), pairs, lost_in_half)
+    assert_eyes(open_video([path]).frames(), pairs, lost_in_half)
 
 
 @pytest.mark.parametrize(
     ("name", "width", "height", "arrangement"),
     [
-        ("film_RL.mkv", 1280, 480, "crossed"),
-        ("film_RL.mkv", 640, 480, "crossed_half"),
-        ("my-film.sbs.mkv", 1280, 480, "side_by_side"),
-        ("my-film.sbs.mkv", 640, 480, "side_by_side_half"),
-        ("film [half-SBS].mkv", 1280, 480, "side_by_side_half"),
-        ("film_full_SBS.mkv", 640, 480, "side_by_side"),
-        ("film_TB.mkv", 640, 960, "top_bottom"),
-        ("film_TB.mkv", 640, 480, "top_bottom_half"),
-        ("film.HOU.mkv", 640, 960, "top_bottom_half"),
-        ("sbs/film_TB.mkv", 640, 960, "top_bottom"),
+        ("video_RL.mkv", 1280, 480, "crossed"),
+        ("video_RL.mkv", 640, 480, "crossed_half"),
+        ("my-video.sbs.mkv", 1280, 480, "side_by_side"),
+        ("my-video.sbs.mkv", 640, 480, "side_by_side_half"),
+        ("video [half-SBS].mkv", 1280, 480, "side_by_side_half"),
+        ("video_full_SBS.mkv", 640, 480, "side_by_side"),
+        ("video_TB.mkv", 640, 960, "top_bottom"),
+        ("video_TB.mkv", 640, 480, "top_bottom_half"),
+        ("video.HOU.mkv", 640, 960, "top_bottom_half"),
+        ("sbs/video_TB.mkv", 640, 960, "top_bottom"),
     ],
 )
 def test_the_name_says_what_cannot_be_seen(name, width, height, arrangement):
@@ -103,7 +103,7 @@ def test_the_name_says_what_cannot_be_seen(name, width, height, arrangement):
 
 
 def test_a_name_that_means_something_else_is_not_believed(tmp_path):
-    path = write_video(tmp_path / "film_LR.mkv", [left for left, _ in example_pairs(3)])
+    path = write_video(tmp_path / "video_LR.mkv", [left for left, _ in example_pairs(3)])
     assert "do not resemble each other" in refusal(path)
 
 
@@ -112,37 +112,37 @@ def test_what_the_container_declares_is_believed(tmp_path):
     for mode, arrangement in (("right_left", "crossed"), ("left_right", "side_by_side"), ("top_bottom",) * 2):
         path = tmp_path / f"{mode}.mkv"
         write_side_by_side(path, pairs, arrangement=arrangement, stereo_mode=mode, codec="ffv1")
-        assert_eyes(open_footage([path]).frames(), pairs)
+        assert_eyes(open_video([path]).frames(), pairs)
 
 
 def test_what_the_frames_of_h264_declare_is_believed(tmp_path):
     pairs = flat_pairs(3)
-    path = tmp_path / "film.mp4"
+    path = tmp_path / "video.mp4"
     options = {"x264-params": "frame-packing=3"}
     write_side_by_side(path, pairs, codec="libx264", options=options)
-    assert_eyes(open_footage([path]).frames(), pairs, tolerance=1.5)
+    assert_eyes(open_video([path]).frames(), pairs, tolerance=1.5)
 
 
 def test_a_declared_arrangement_that_is_not_read_is_named(tmp_path):
     path = write_side_by_side(
-        tmp_path / "film.mkv", flat_pairs(2), stereo_mode="row_interleaved_lr", codec="ffv1"
+        tmp_path / "video.mkv", flat_pairs(2), stereo_mode="row_interleaved_lr", codec="ffv1"
     )
-    assert "film.mkv: " in refusal(path)
+    assert "video.mkv: " in refusal(path)
     assert "declares lines" in refusal(path)
-    assert open_footage([path], "side_by_side").frame_count == 2
+    assert open_video([path], "side_by_side").frame_count == 2
 
 
 def test_a_video_that_is_not_3d_is_refused_with_what_to_do(tmp_path):
-    path = write_video(tmp_path / "film.mkv", [left for left, _ in example_pairs(5)])
+    path = write_video(tmp_path / "video.mkv", [left for left, _ in example_pairs(5)])
     message = refusal(path)
     assert message.startswith(f"{path}: expected 3-D video")
     assert "(arrangement)" in message
     assert "two files" in message
-    assert open_footage([path], "side_by_side_half").size_px == (160, 96)
+    assert open_video([path], "side_by_side_half").size_px == (160, 96)
 
 
 def test_a_plain_video_is_called_plain(tmp_path):
-    path = write_side_by_side(tmp_path / "film.mkv", flat_pairs(2))
+    path = write_side_by_side(tmp_path / "video.mkv", flat_pairs(2))
     assert "too plain" in refusal(path)
 
 
@@ -156,13 +156,13 @@ def test_two_views_resemble_each_other_and_other_pictures_do_not():
 
 
 def test_an_odd_width_is_refused_side_by_side_and_taken_top_to_bottom(tmp_path):
-    path = write_video(tmp_path / "film.mkv", [np.zeros((96, 161, 3), np.uint8)], codec="ffv1")
+    path = write_video(tmp_path / "video.mkv", [np.zeros((96, 161, 3), np.uint8)], codec="ffv1")
     for arrangement in ("side_by_side", "side_by_side_half", "crossed"):
         message = refusal(path, arrangement=arrangement)
         assert message.startswith(f"{path}: ")
         assert "even width" in message
         assert "161x96" in message
-    assert open_footage([path], "top_bottom").size_px == (161, 48)
+    assert open_video([path], "top_bottom").size_px == (161, 48)
     assert "even height" in refusal(
         write_video(tmp_path / "b.mkv", [np.zeros((97, 160, 3), np.uint8)], codec="ffv1"),
         arrangement="top_bottom",
@@ -171,71 +171,71 @@ def test_an_odd_width_is_refused_side_by_side_and_taken_top_to_bottom(tmp_path):
 
 def test_frame_times_are_the_files_own_counted_from_its_first_frame(tmp_path):
     times_ms = [2000, 2040, 2107, 2140, 2900]
-    for name in ("film.mkv", "film.mp4"):
+    for name in ("video.mkv", "video.mp4"):
         path = write_side_by_side(
             tmp_path / name, flat_pairs(5), times_ms=times_ms, arrangement="top_bottom", codec="libx264"
         )
-        footage = open_footage([path], "top_bottom")
-        times = [frame.time for frame in footage.frames()]
+        video = open_video([path], "top_bottom")
+        times = [frame.time for frame in video.frames()]
         assert times == [Fraction(time_ms - 2000, 1000) for time_ms in times_ms]
-        assert all((time / footage.time_base).denominator == 1 for time in times)
-        assert footage.rate == Fraction(4000, 900)
+        assert all((time / video.time_base).denominator == 1 for time in times)
+        assert video.rate == Fraction(4000, 900)
 
 
 def test_a_damaged_frame_is_bridged_and_those_made_from_it_are_marked(tmp_path):
-    path = write_side_by_side(tmp_path / "film.mkv", example_pairs(30))
-    whole = list(open_footage([path]).frames())
+    path = write_side_by_side(tmp_path / "video.mkv", example_pairs(30))
+    whole = list(open_video([path]).frames())
     assert not any(frame.problem for frame in whole)
-    footage = open_footage([damage(path, 14)])
-    frames = list(footage.frames())
+    video = open_video([damage(path, 14)])
+    frames = list(video.frames())
     # Every twelfth frame of MPEG-4 stands for itself, unless told otherwise.
-    assert problems(footage) == {14: BEFORE} | dict.fromkeys(range(15, 24), SPOILT)
+    assert problems(video) == {14: BEFORE} | dict.fromkeys(range(15, 24), SPOILT)
     assert_eyes([frames[14]], [whole[13][:2]])
     assert [frame.time for frame in frames] == [frame.time for frame in whole]
     assert_same(frames[:14] + frames[24:], whole[:14] + whole[24:])
-    assert footage.frame_count == len(packets(path, "video")) == 30
+    assert video.frame_count == len(packets(path, "video")) == 30
 
 
 @pytest.mark.parametrize("codec", ["libx264", "mpeg4", "mjpeg"])
 def test_a_run_from_the_middle_gives_the_frames_of_a_full_run(tmp_path, codec):
     options = {} if codec == "mjpeg" else {"g": "8"}
     path = damage(
-        write_side_by_side(tmp_path / "film.mkv", example_pairs(20), codec=codec, options=options), 8, 11, 12
+        write_side_by_side(tmp_path / "video.mkv", example_pairs(20), codec=codec, options=options), 8, 11, 12
     )
-    footage = open_footage([path], "side_by_side")
-    frames = list(footage.frames())
+    video = open_video([path], "side_by_side")
+    frames = list(video.frames())
     assert len(frames) == 20
     assert any(frame.problem == BEFORE for frame in frames)
     for start in (1, 8, 9, 11, 12, 13, 17, 19):
-        assert_same(footage.frames(start), frames[start:])
-    assert list(footage.frames(20)) == []
+        assert_same(video.frames(start), frames[start:])
+    assert list(video.frames(20)) == []
 
 
 def test_where_every_frame_stands_for_itself_only_the_damaged_one_is_replaced(tmp_path):
-    path = write_side_by_side(tmp_path / "film.mkv", example_pairs(8), codec="mjpeg")
-    assert problems(open_footage([damage(path, 3, 4)])) == {3: BEFORE, 4: BEFORE}
+    path = write_side_by_side(tmp_path / "video.mkv", example_pairs(8), codec="mjpeg")
+    assert problems(open_video([damage(path, 3, 4)])) == {3: BEFORE, 4: BEFORE}
 
 
 def test_for_a_damaged_first_frame_the_one_after_it_stands_in(tmp_path):
-    path = damage(write_side_by_side(tmp_path / "film.mkv", example_pairs(5), codec="mjpeg"), 0)
-    footage = open_footage([path])
-    frames = list(footage.frames())
+    path = damage(write_side_by_side(tmp_path / "video.mkv", example_pairs(5), codec="mjpeg"), 0)
+    video = open_video([path])
+    frames = list(video.frames())
     assert frames[0].problem == "damaged: replaced by the frame after it"
     assert_eyes([frames[0]], [frames[1][:2]])
-    assert_same(footage.frames(1), frames[1:])
+    assert_same(video.frames(1), frames[1:])
 
 
-def test_a_film_that_breaks_off_is_read_so_far_and_says_so(tmp_path):
-    path = truncate(write_side_by_side(tmp_path / "film.mkv", example_pairs(30), codec="ffv1"), 0.5)
-    footage = open_footage([path])
-    assert 10 < footage.frame_count < 20
-    [(last, problem)] = problems(footage).items()
-    assert last == footage.frame_count - 1
+def test_a_video_that_breaks_off_is_read_so_far_and_says_so(tmp_path):
+    path = truncate(write_side_by_side(tmp_path / "video.mkv", example_pairs(30), codec="ffv1"), 0.5)
+    video = open_video([path])
+    assert 10 < video.frame_count < 20
+    [(last, problem)] = problems(video).items()
+    assert last == video.frame_count - 1
     assert problem == f"{path} breaks off after this frame (it claims to last 1.2 s)"
 
 
 def test_an_mp4_that_was_cut_off_cannot_be_opened_and_says_why(tmp_path):
-    path = truncate(write_side_by_side(tmp_path / "film.mp4", example_pairs(10)), 0.6)
+    path = truncate(write_side_by_side(tmp_path / "video.mp4", example_pairs(10)), 0.6)
     assert "it lost its index" in refusal(path)
 
 
@@ -255,12 +255,12 @@ def test_what_is_no_video_is_named_in_one_line(tmp_path):
     assert "index" not in refusal(tmp_path / "missing.mp4")
 
 
-def test_frames_without_times_of_their_own_follow_each_other_at_the_films_rate(tmp_path):
+def test_frames_without_times_of_their_own_follow_each_other_at_the_videos_rate(tmp_path):
     pairs = example_pairs(9)
-    for name, options in (("film.avi", {"bf": "2"}), ("film.m4v", {}), ("film.h264", {})):
+    for name, options in (("video.avi", {"bf": "2"}), ("video.m4v", {}), ("video.h264", {})):
         codec = "libx264" if name.endswith("h264") else "mpeg4"
-        footage = open_footage([write_side_by_side(tmp_path / name, pairs, codec=codec, options=options)])
-        frames = list(footage.frames())
+        video = open_video([write_side_by_side(tmp_path / name, pairs, codec=codec, options=options)])
+        frames = list(video.frames())
         assert_eyes(frames, pairs, tolerance=3.0)
         assert [frame.time for frame in frames] == [Fraction(index, 25) for index in range(9)]
 
@@ -269,7 +269,7 @@ MOVED = "its time stamp was missing or a duplicate: it is shown slightly later"
 
 
 def restamped(path, stamps_ms):
-    """A film with these time stamps, in a container that holds equal ones too."""
+    """A video with these time stamps, in a container that holds equal ones too."""
     source = write_side_by_side(path.with_name("source.mkv"), example_pairs(len(stamps_ms)), codec="mjpeg")
     with av.open(str(source)) as old, av.open(str(path), "w") as new:
         stream = new.add_stream_from_template(old.streams.video[0], opaque=True)
@@ -283,12 +283,12 @@ def restamped(path, stamps_ms):
 
 
 def test_a_repeated_time_stamp_moves_its_frame_alone(tmp_path):
-    footage = open_footage([restamped(tmp_path / "film.mkv", [0, 70, 70, 90, 240])])
-    times_ms = [1000 * frame.time for frame in footage.frames()]
+    video = open_video([restamped(tmp_path / "video.mkv", [0, 70, 70, 90, 240])])
+    times_ms = [1000 * frame.time for frame in video.frames()]
     assert times_ms == [0, 70, 80, 90, 240]  # halfway to 90
-    assert problems(footage) == {2: MOVED}
-    assert_eyes(footage.frames(), example_pairs(5), tolerance=6.0)
-    assert_same(footage.frames(2), list(footage.frames())[2:])
+    assert problems(video) == {2: MOVED}
+    assert_eyes(video.frames(), example_pairs(5), tolerance=6.0)
+    assert_same(video.frames(2), list(video.frames())[2:])
 
 
 def test_a_repeat_goes_one_frame_on_where_there_is_room():
@@ -309,16 +309,16 @@ def test_a_missing_time_stamp_is_taken_for_that_of_the_frame_before():
 def test_a_frame_lost_where_there_are_no_times_is_the_one_that_is_bridged(tmp_path, key_every, spoilt):
     options = {"bf": "0", "g": key_every}
     path = write_side_by_side(tmp_path / "a.h264", example_pairs(9), codec="libx264", options=options)
-    whole = list(open_footage([path]).frames())
+    whole = list(open_video([path]).frames())
     with av.open(str(path)) as container:
         bodies = [bytes(packet) for packet in container.demux(video=0)]
     # The parameter sets and the first byte of the slice stay, so that it still counts as a frame.
     sliced = bodies[3].rindex(b"\0\0\1") + 4
     spoiled = bodies[3][:sliced] + b"\xff" * (len(bodies[3]) - sliced)
     path.write_bytes(path.read_bytes().replace(bodies[3], spoiled))
-    footage = open_footage([path])
-    assert problems(footage) == {3: BEFORE} | dict.fromkeys(spoilt, SPOILT)
-    assert_same(list(footage.frames())[5:], whole[5:])
+    video = open_video([path])
+    assert problems(video) == {3: BEFORE} | dict.fromkeys(spoilt, SPOILT)
+    assert_same(list(video.frames())[5:], whole[5:])
 
 
 def test_a_frame_lost_among_those_coded_out_of_turn_is_noticed_at_the_next_key_frame():
@@ -328,53 +328,53 @@ def test_a_frame_lost_among_those_coded_out_of_turn_is_noticed_at_the_next_key_f
     assert [number for number, _ in _by_rank(iter(shown), decoder)] == [0, 1, 2, 3, 5, 6]
 
 
-def test_a_folder_of_pictures_is_a_film_in_counting_order(tmp_path):
+def test_a_folder_of_pictures_is_a_video_in_counting_order(tmp_path):
     pairs = example_pairs(5)  # numbers 8 to 12: in the order of letters 10 would come first
     write_pictures(tmp_path / "frames", "f{}.png", [packed(*pair) for pair in pairs])
     (tmp_path / "frames" / "notes.txt").write_text("no picture")
     for path in (tmp_path / "frames", tmp_path / "frames" / "f*.png"):
-        footage = open_footage([path], rate=Fraction(30_000, 1001))
-        assert footage.rate == Fraction(30_000, 1001)
-        assert_eyes(footage.frames(), pairs)
-        assert [frame.time for frame in footage.frames(3)] == [Fraction(3003, 30_000), Fraction(4004, 30_000)]
+        video = open_video([path], rate=Fraction(30_000, 1001))
+        assert video.rate == Fraction(30_000, 1001)
+        assert_eyes(video.frames(), pairs)
+        assert [frame.time for frame in video.frames(3)] == [Fraction(3003, 30_000), Fraction(4004, 30_000)]
 
 
 def test_two_patterns_are_the_two_eyes(tmp_path):
     pairs = example_pairs(3)
     write_pictures(tmp_path, "left_{}.png", [left for left, _ in pairs])
     write_pictures(tmp_path, "right_{}.png", [right for _, right in pairs])
-    footage = open_footage([tmp_path / "left_*.png", tmp_path / "right_*.png"])
-    assert (footage.size_px, footage.rate, footage.sound) == ((160, 96), 25, None)
-    assert_eyes(footage.frames(), pairs)
+    video = open_video([tmp_path / "left_*.png", tmp_path / "right_*.png"])
+    assert (video.size_px, video.rate, video.sound) == ((160, 96), 25, None)
+    assert_eyes(video.frames(), pairs)
 
 
 def test_a_damaged_picture_is_bridged(tmp_path):
     write_pictures(tmp_path, "f{}.png", [packed(*pair) for pair in example_pairs(6)])
     for number in (8, 11, 12):
         truncate(tmp_path / f"f{number}.png", 0.5)
-    footage = open_footage([tmp_path])
+    video = open_video([tmp_path])
     after = "damaged: replaced by the frame after it"
-    assert problems(footage) == {0: after, 3: BEFORE, 4: BEFORE}
+    assert problems(video) == {0: after, 3: BEFORE, 4: BEFORE}
     for start in range(7):
-        assert_same(footage.frames(start), list(footage.frames())[start:])
+        assert_same(video.frames(start), list(video.frames())[start:])
 
 
 def test_two_videos_are_the_two_eyes_with_the_sound_of_the_one_that_has_it(tmp_path):
     pairs = example_pairs(4)
     left = write_video(tmp_path / "left.mkv", [left for left, _ in pairs], codec="ffv1")
     right = write_video(tmp_path / "right.mkv", [right for _, right in pairs], codec="ffv1", sound=True)
-    footage = open_footage([left, right])
-    assert footage.sound == right
-    assert_eyes(footage.frames(), pairs)
+    video = open_video([left, right])
+    assert video.sound == right
+    assert_eyes(video.frames(), pairs)
 
 
 def test_the_shorter_of_two_videos_ends_both_and_it_is_said(tmp_path):
     pairs = example_pairs(6)
     left = write_video(tmp_path / "left.mkv", [left for left, _ in pairs])
     right = write_video(tmp_path / "right.mkv", [right for _, right in pairs[:4]])
-    footage = open_footage([left, right])
-    assert footage.frame_count == 4
-    assert problems(footage) == {3: f"{left} has 2 frames more than the other video"}
+    video = open_video([left, right])
+    assert video.frame_count == 4
+    assert problems(video) == {3: f"{left} has 2 frames more than the other video"}
 
 
 def test_a_damaged_frame_of_one_eye_is_told_from_the_other(tmp_path):
@@ -382,7 +382,7 @@ def test_a_damaged_frame_of_one_eye_is_told_from_the_other(tmp_path):
     left = write_video(tmp_path / "left.mkv", [left for left, _ in pairs], codec="mjpeg")
     right = write_video(tmp_path / "right.mkv", [right for _, right in pairs], codec="mjpeg")
     damage(right, 2)
-    assert problems(open_footage([left, right])) == {2: f"{right}: {BEFORE}"}
+    assert problems(open_video([left, right])) == {2: f"{right}: {BEFORE}"}
 
 
 def test_two_videos_that_do_not_go_together_are_refused(tmp_path):
@@ -400,10 +400,10 @@ def test_two_videos_that_do_not_go_together_are_refused(tmp_path):
 def test_colours_come_out_as_they_went_in(tmp_path, colorspace, color_range):
     pairs = flat_pairs(2)
     path = write_side_by_side(
-        tmp_path / "film.mkv", pairs, codec="libx264", colorspace=colorspace, color_range=color_range
+        tmp_path / "video.mkv", pairs, codec="libx264", colorspace=colorspace, color_range=color_range
     )
-    for frame, filmed in zip(open_footage([path], "side_by_side").frames(), pairs, strict=True):
-        for eye, image in zip(frame[:2], filmed, strict=True):
+    for frame, expected in zip(open_video([path], "side_by_side").frames(), pairs, strict=True):
+        for eye, image in zip(frame[:2], expected, strict=True):
             # Where the eyes meet, their colours mix in the video, which has one sample for four pixels.
             np.testing.assert_allclose(eye[8:-8, 8:-8], image[8:-8, 8:-8], atol=2)
 
@@ -413,43 +413,43 @@ def test_untagged_colours_of_a_large_picture_are_taken_for_those_of_bt709(tmp_pa
     # - 0.533 * -94 = 216 instead of 255.
     green = np.zeros((64, 1280, 3), np.uint8)
     green[..., 1] = 255
-    untagged = write_video(tmp_path / "film.mkv", [green], codec="libx264")
-    [frame] = open_footage([untagged], "side_by_side").frames()
+    untagged = write_video(tmp_path / "video.mkv", [green], codec="libx264")
+    [frame] = open_video([untagged], "side_by_side").frames()
     assert frame.left[..., 1].mean() == pytest.approx(216, abs=2)
 
 
 def test_colours_are_not_darkened_on_the_way_from_fewer_colour_samples(tmp_path):
     pairs = example_pairs(2)
-    path = write_side_by_side(tmp_path / "film.mkv", pairs, codec="libx264", options={"crf": "1"})
-    frame = next(open_footage([path]).frames())
+    path = write_side_by_side(tmp_path / "video.mkv", pairs, codec="libx264", options={"crf": "1"})
+    frame = next(open_video([path]).frames())
     # FFmpeg's quick conversion loses 1.1 to 1.5 levels here.
     assert np.abs((frame.left.astype(float) - pairs[0][0]).mean(axis=(0, 1))).max() < 0.5
 
 
-def test_a_film_that_lies_on_its_side_is_turned_upright(tmp_path):
+def test_a_video_that_lies_on_its_side_is_turned_upright(tmp_path):
     pairs = flat_pairs(2)
     lying = [np.ascontiguousarray(np.rot90(packed(*pair), k=-1)) for pair in pairs]
-    path = write_video(tmp_path / "film.mp4", lying, codec="libx264", rotation=90)
-    footage = open_footage([path], "side_by_side")
-    assert footage.size_px == (64, 48)
-    assert_eyes(footage.frames(), pairs, tolerance=1.5)
+    path = write_video(tmp_path / "video.mp4", lying, codec="libx264", rotation=90)
+    video = open_video([path], "side_by_side")
+    assert video.size_px == (64, 48)
+    assert_eyes(video.frames(), pairs, tolerance=1.5)
 
 
 def test_a_name_with_brackets_is_a_file_where_there_is_one(tmp_path):
-    path = write_side_by_side(tmp_path / "film [3D].mkv", example_pairs(2))
-    assert open_footage([path]).frame_count == 2
+    path = write_side_by_side(tmp_path / "video [3D].mkv", example_pairs(2))
+    assert open_video([path]).frame_count == 2
 
 
 def test_without_pyav_the_extra_is_named_and_pictures_still_work(tmp_path, monkeypatch):
-    path = write_side_by_side(tmp_path / "film.mkv", flat_pairs(1))
+    path = write_side_by_side(tmp_path / "video.mkv", flat_pairs(1))
     write_pictures(tmp_path / "frames", "{}.png", [packed(*pair) for pair in flat_pairs(2)])
     monkeypatch.setitem(sys.modules, "av", None)
     assert "stereoweave[video]" in refusal(path)
-    assert_eyes(open_footage([tmp_path / "frames"], "side_by_side").frames(), flat_pairs(2))
+    assert_eyes(open_video([tmp_path / "frames"], "side_by_side").frames(), flat_pairs(2))
 
 
 def test_what_cannot_be_meant_is_refused(tmp_path):
-    path = write_side_by_side(tmp_path / "film.mkv", flat_pairs(1))
+    path = write_side_by_side(tmp_path / "video.mkv", flat_pairs(1))
     assert "'sideways'" in refusal(path, arrangement="sideways")
     assert "found 3" in refusal(path, path, path)
     assert "found 0" in refusal()
@@ -457,8 +457,8 @@ def test_what_cannot_be_meant_is_refused(tmp_path):
 
 
 def test_frames_are_read_one_after_the_other_and_files_closed(tmp_path):
-    path = write_side_by_side(tmp_path / "film.mkv", flat_pairs(4))
-    footage = open_footage([path], "side_by_side")
-    first, second = footage.frames(), footage.frames()
+    path = write_side_by_side(tmp_path / "video.mkv", flat_pairs(4))
+    video = open_video([path], "side_by_side")
+    first, second = video.frames(), video.frames()
     assert_same([next(first), next(first)], [next(second), next(second)])
-    assert all(b.time - a.time == Fraction(FRAME_MS, 1000) for a, b in pairwise(footage.frames()))
+    assert all(b.time - a.time == Fraction(FRAME_MS, 1000) for a, b in pairwise(video.frames()))

@@ -1,4 +1,4 @@
-"""Each film is a list of (left, right, estimate); pictures are random textures, and noise has a seed."""
+"""Each video is a list of (left, right, estimate); pictures are random textures, and noise has a seed."""
 
 import threading
 
@@ -16,7 +16,7 @@ from stereoweave.video.temporal_filter import (
     STEP_PX,
     STEPS,
     Motion,
-    Steadier,
+    TemporalFilter,
     Track,
     blend,
     carry,
@@ -50,9 +50,9 @@ def plain(value_px, at_pixel_px=None):
     return estimate(disparity_px)
 
 
-def steadied(film):
-    steadier = Steadier()
-    return [steadier(*frame) for frame in film], steadier
+def filter_all(video):
+    temporal_filter = TemporalFilter()
+    return [temporal_filter(*frame) for frame in video], temporal_filter
 
 
 def disparities(estimates):
@@ -64,10 +64,10 @@ def at_rest(rng, estimates):
     return [(left, right, each) for each in estimates]
 
 
-def square_film(rng, frames, velocity_px, nearing_px=0.0):
+def square_video(rng, frames, velocity_px, nearing_px=0.0):
     """A textured square of 48 px with a disparity of 30 px at first, over a plane of 10 px; and the truth."""
     back, front = texture(rng), texture(rng, 48, 48)
-    film, truths_px, masks = [], [], []
+    video, truths_px, masks = [], [], []
     for number in range(frames):
         near_px = 30 + nearing_px * number
         images, maps, squares = [], [], []
@@ -80,69 +80,69 @@ def square_film(rng, frames, velocity_px, nearing_px=0.0):
             images.append(np.clip(image + rng.normal(0, 3, image.shape), 0, 255).astype(np.uint8))
             maps.append(np.where(square, near_px, 10.0) + noise_px)
             squares.append(square)
-        film.append((*images, estimate(*maps)))
+        video.append((*images, estimate(*maps)))
         truths_px.append(np.where(squares[0], near_px, 10.0))
         masks.append(squares[0])
-    return film, np.stack(truths_px), np.stack(masks)
+    return video, np.stack(truths_px), np.stack(masks)
 
 
 def test_the_first_frame_is_its_own_estimate(rng):
     only = estimate(rng.uniform(0, 40, (HEIGHT, WIDTH)))
-    (first,), steadier = steadied(at_rest(rng, [only]))
+    (first,), temporal_filter = filter_all(at_rest(rng, [only]))
     np.testing.assert_array_equal(first.disparity_px, only.disparity_px)
     np.testing.assert_array_equal(first.confidence, only.confidence)
-    assert steadier.cuts == 0
+    assert temporal_filter.cuts == 0
 
 
 def test_a_pixel_at_rest_becomes_the_mean_of_its_frames(rng):
-    film = at_rest(rng, [plain(10, 10.0), plain(10, 10.6), plain(10, 10.0), plain(10, 9.8)])
-    found = disparities(steadied(film)[0])
+    video = at_rest(rng, [plain(10, 10.0), plain(10, 10.6), plain(10, 10.0), plain(10, 9.8)])
+    found = disparities(filter_all(video)[0])
     np.testing.assert_allclose(found[:, *PIXEL], [10.0, 10.3, 10.2, 10.1], atol=1e-5)
     assert (np.delete(found.reshape(4, -1), PIXEL[0] * WIDTH + PIXEL[1], axis=1) == 10).all()
 
 
 def test_what_a_surface_changes_in_common_is_followed_without_lag(rng):
-    found = disparities(steadied(at_rest(rng, [plain(10 + 0.5 * t) for t in range(8)]))[0])
+    found = disparities(filter_all(at_rest(rng, [plain(10 + 0.5 * t) for t in range(8)]))[0])
     np.testing.assert_allclose(found[:, 50, 60], 10 + 0.5 * np.arange(8), atol=1e-5)
 
 
 def test_at_rest_a_contradiction_is_outvoted_until_it_has_lasted_as_long(rng):
-    film = at_rest(rng, [plain(10), plain(10), *[plain(10, 40)] * 4])
-    found = disparities(steadied(film)[0])
+    video = at_rest(rng, [plain(10), plain(10), *[plain(10, 40)] * 4])
+    found = disparities(filter_all(video)[0])
     np.testing.assert_allclose(found[:, *PIXEL], [10, 10, 10, 10, 40, 40], atol=1e-5)
 
 
 def test_what_a_frame_contradicts_is_less_certain(rng):
-    film = at_rest(rng, [plain(10), plain(10, 40), plain(10)])
-    found = [each.confidence[PIXEL] for each in steadied(film)[0]]
+    video = at_rest(rng, [plain(10), plain(10, 40), plain(10)])
+    found = [each.confidence[PIXEL] for each in filter_all(video)[0]]
     # One claim of 0.8, then one of nothing; by then the two have cancelled each other.
     np.testing.assert_allclose(found, [0.8, 0.4, 0.8], atol=1e-6)
 
 
-def test_flicker_of_a_still_film_at_least_halves_in_both_views(rng):
+def test_flicker_of_a_still_video_at_least_halves_in_both_views(rng):
     left, right = texture(rng), texture(rng)
-    film = []
+    video = []
     for _ in range(12):
         noisy = (
             np.clip(image + rng.normal(0, 4, image.shape), 0, 255).astype(np.uint8) for image in (left, right)
         )
-        film.append((*noisy, estimate(*(10 + rng.normal(0, 0.3, (2, HEIGHT, WIDTH))))))
-    found, steadier = steadied(film)
+        video.append((*noisy, estimate(*(10 + rng.normal(0, 0.3, (2, HEIGHT, WIDTH))))))
+    found, temporal_filter = filter_all(video)
     for name in ("disparity_px", "right_disparity_px"):
         before, after = (
             np.abs(np.diff([getattr(each, name) for each in maps], axis=0)).mean()
-            for maps in ([each for *_, each in film], found)
+            for maps in ([each for *_, each in video], found)
         )
         assert after < 0.5 * before
-    assert steadier.cuts == 0
+    assert temporal_filter.cuts == 0
 
 
 @pytest.mark.parametrize(("velocity_px", "nearing_px"), [(4, 0), (-3, 0), (1, 0), (2, 1)])
 def test_nothing_trails_behind_what_moves(rng, velocity_px, nearing_px):
-    film, truth_px, moving = square_film(rng, 10, velocity_px, nearing_px)
-    found = disparities(steadied(film)[0])
+    video, truth_px, moving = square_video(rng, 10, velocity_px, nearing_px)
+    found = disparities(filter_all(video)[0])
     error_px = np.abs(found - truth_px)[1:]
-    error_by_frame_px = np.abs(disparities([each for *_, each in film]) - truth_px)[1:]
+    error_by_frame_px = np.abs(disparities([each for *_, each in video]) - truth_px)[1:]
     uncovered = moving[:-1] & ~moving[1:]
     assert error_px[moving[1:]].mean() <= error_by_frame_px[moving[1:]].mean()
     assert error_px[uncovered].mean() <= 1.02 * error_by_frame_px[uncovered].mean()
@@ -150,8 +150,8 @@ def test_nothing_trails_behind_what_moves(rng, velocity_px, nearing_px):
 
 
 def test_what_comes_nearer_is_followed_without_lag(rng):
-    film, truth_px, moving = square_film(rng, 12, 0, nearing_px=0.5)
-    found = disparities(steadied(film)[0])
+    video, truth_px, moving = square_video(rng, 12, 0, nearing_px=0.5)
+    found = disparities(filter_all(video)[0])
     inside = cv2.erode(moving[0].astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     lag_px = (truth_px - found)[1:, inside].mean(axis=1)
     assert np.abs(lag_px).max() < 0.1
@@ -161,39 +161,39 @@ def test_a_pan_is_filtered_along_its_motion(rng):
     wide = texture(rng, HEIGHT, WIDTH + 60)
     # Stairs, which are elsewhere in every frame.
     wide_px = 10.0 + 6 * (np.arange(WIDTH + 60) // 12 % 2)[None].repeat(HEIGHT, 0)
-    film, truths_px = [], []
+    video, truths_px = [], []
     for number in range(10):
         seen = slice(6 * number, 6 * number + WIDTH)
         truths_px.append(wide_px[:, seen])
-        film.append(
+        video.append(
             (
                 wide[:, seen].copy(),
                 wide[:, seen].copy(),
                 estimate(truths_px[-1] + rng.normal(0, 0.3, (HEIGHT, WIDTH))),
             )
         )
-    found = disparities(steadied(film)[0])
+    found = disparities(filter_all(video)[0])
     inner = np.s_[4:, 16:-16, 16:-16]
     error_px = np.abs(found - truths_px)[inner].mean()
-    assert error_px < 0.6 * np.abs(disparities([each for *_, each in film]) - truths_px)[inner].mean()
+    assert error_px < 0.6 * np.abs(disparities([each for *_, each in video]) - truths_px)[inner].mean()
 
 
 def test_a_cut_starts_anew_and_is_counted(rng):
     before = at_rest(rng, [plain(10)] * 3)
     after = at_rest(rng, [plain(10, 10.5), plain(10, 10.5)])
-    found, steadier = steadied(before + after)
+    found, temporal_filter = filter_all(before + after)
     np.testing.assert_array_equal(found[3].disparity_px, after[0][2].disparity_px)
     np.testing.assert_array_equal(found[3].right_disparity_px, after[0][2].right_disparity_px)
     np.testing.assert_array_equal(found[3].confidence, after[0][2].confidence)
-    assert steadier.cuts == 1
+    assert temporal_filter.cuts == 1
 
 
 def test_a_frame_of_another_size_is_a_cut(rng):
-    film = at_rest(rng, [plain(10)])
-    film.append((texture(rng, 90, 91), texture(rng, 90, 91), estimate(np.full((90, 91), 7.0))))
-    found, steadier = steadied(film)
+    video = at_rest(rng, [plain(10)])
+    video.append((texture(rng, 90, 91), texture(rng, 90, 91), estimate(np.full((90, 91), 7.0))))
+    found, temporal_filter = filter_all(video)
     assert (found[1].disparity_px == 7).all()
-    assert steadier.cuts == 1
+    assert temporal_filter.cuts == 1
 
 
 def plain_with_patch(rng, row, column, disparity_px):
@@ -206,14 +206,14 @@ def plain_with_patch(rng, row, column, disparity_px):
 
 def test_a_cut_between_plain_scenes_shows_in_their_disparity(rng):
     before, after = plain_with_patch(rng, 20, 40, 10), plain_with_patch(rng, 70, 120, 30)
-    found, steadier = steadied([before] * 3 + [after] * 2)
+    found, temporal_filter = filter_all([before] * 3 + [after] * 2)
     assert (disparities(found)[3:] == 30).all()
-    assert steadier.cuts == 1
+    assert temporal_filter.cuts == 1
 
 
 def test_a_thing_that_comes_and_goes_over_plain_ground_is_no_cut(rng):
-    film = [plain_with_patch(rng, row, column, 10) for row, column in [(20, 40), (70, 120), (20, 100)]]
-    assert steadied(film)[1].cuts == 0
+    video = [plain_with_patch(rng, row, column, 10) for row, column in [(20, 40), (70, 120), (20, 100)]]
+    assert filter_all(video)[1].cuts == 0
 
 
 @pytest.mark.parametrize("contrast", [0.25, 0.1])
@@ -223,9 +223,9 @@ def test_a_cut_between_faint_scenes_is_one(rng, contrast):
         return *images, plain(disparity_px)
 
     before, after = faint(10), faint(10.5)
-    found, steadier = steadied([before, before, after, after])
+    found, temporal_filter = filter_all([before, before, after, after])
     assert (found[2].disparity_px == 10.5).all()
-    assert steadier.cuts == 1
+    assert temporal_filter.cuts == 1
 
 
 @pytest.mark.parametrize("jump_px", [3, 6, -6])
@@ -233,23 +233,23 @@ def test_what_moves_in_the_right_view_alone_is_not_outvoted(rng, jump_px):
     left, wide = texture(rng), texture(rng, HEIGHT, WIDTH + 20)
     near_px = np.array([20, 20, 20, 20 + jump_px])
     rights = [wide[:, 10 + shift_px : 10 + shift_px + WIDTH].copy() for shift_px in near_px - 20]
-    film = [(left, right, plain(px)) for right, px in zip(rights, near_px, strict=True)]
-    found, steadier = steadied(film)
+    video = [(left, right, plain(px)) for right, px in zip(rights, near_px, strict=True)]
+    found, temporal_filter = filter_all(video)
     assert np.abs(found[-1].disparity_px - near_px[-1]).mean() < 0.1
-    assert steadier.cuts == 0
+    assert temporal_filter.cuts == 0
 
 
 def test_a_small_thing_that_moves_in_the_right_view_alone_is_not_outvoted(rng):
     ground, thing = texture(rng), texture(rng, 12, 12)
-    film, square = [], np.s_[60:72, 100:112]
+    video, square = [], np.s_[60:72, 100:112]
     for near_px in range(12, 33, 3):
         left, right = ground.copy(), ground.copy()
         column = 100 - near_px
         left[square] = right[60:72, column : column + 12] = thing
         disparity_px = np.zeros((HEIGHT, WIDTH))
         disparity_px[square] = near_px
-        film.append((left, right, estimate(disparity_px)))
-    found = disparities(steadied(film)[0])
+        video.append((left, right, estimate(disparity_px)))
+    found = disparities(filter_all(video)[0])
     np.testing.assert_allclose(found[:, *square].mean(axis=(1, 2)), range(12, 33, 3), atol=0.2)
 
 
@@ -257,59 +257,59 @@ def test_a_small_thing_that_moves_in_the_right_view_alone_is_not_outvoted(rng):
 def test_a_fade_is_no_cut_and_keeps_what_was_found(rng, gain, offset_levels):
     left, right = (cv2.convertScaleAbs(texture(rng), alpha=0.6, beta=40) for _ in range(2))
     faded = [np.clip(gain * image + offset_levels, 0, 255).astype(np.uint8) for image in (left, right)]
-    found, steadier = steadied([(left, right, plain(10, 10.0)), (*faded, plain(10, 10.6))])
-    assert steadier.cuts == 0
+    found, temporal_filter = filter_all([(left, right, plain(10, 10.0)), (*faded, plain(10, 10.6))])
+    assert temporal_filter.cuts == 0
     np.testing.assert_allclose(found[1].disparity_px[PIXEL], 10.3, atol=1e-5)
 
 
 def test_a_state_goes_on_bit_for_bit(rng, tmp_path):
-    film, _, _ = square_film(rng, 6, 3, 1)
-    found, steadier = steadied(film[:3])
-    np.savez(tmp_path / "state.npz", **steadier.state())
+    video, _, _ = square_video(rng, 6, 3, 1)
+    found, temporal_filter = filter_all(video[:3])
+    np.savez(tmp_path / "state.npz", **temporal_filter.state())
     with np.load(tmp_path / "state.npz") as state:
-        again = Steadier.from_state(state)
-    assert again.cuts == steadier.cuts
-    for frame in film[3:]:
-        one, other = steadier(*frame), again(*frame)
+        again = TemporalFilter.from_state(state)
+    assert again.cuts == temporal_filter.cuts
+    for frame in video[3:]:
+        one, other = temporal_filter(*frame), again(*frame)
         for name in ("disparity_px", "right_disparity_px", "confidence", "occluded"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
 @pytest.mark.parametrize(
-    "start", [Steadier, lambda threads: Steadier.from_state(Steadier().state(), threads)]
+    "start", [TemporalFilter, lambda threads: TemporalFilter.from_state(TemporalFilter().state(), threads)]
 )
 @pytest.mark.parametrize("threads", [1, 2])
 def test_no_more_threads_work_than_asked_for(rng, start, threads):
     workers = set()
-    steadier = start(threads)
+    temporal_filter = start(threads)
     threading.setprofile(lambda *_: workers.add(threading.get_ident()))
     try:
         for frame in at_rest(rng, [plain(10)] * 2):
-            steadier(*frame)
+            temporal_filter(*frame)
     finally:
         threading.setprofile(None)
     assert len(workers) <= threads
 
 
 def test_the_number_of_threads_changes_nothing(rng):
-    film, _, _ = square_film(rng, 3, 3, 1)
-    one, two = Steadier(1), Steadier(2)
-    for frame in film:
+    video, _, _ = square_video(rng, 3, 3, 1)
+    one, two = TemporalFilter(1), TemporalFilter(2)
+    for frame in video:
         found, expected = one(*frame), two(*frame)
         np.testing.assert_array_equal(found.disparity_px, expected.disparity_px)
         np.testing.assert_array_equal(found.right_disparity_px, expected.right_disparity_px)
 
 
 def test_the_state_before_the_first_frame_and_the_cuts_are_kept(rng):
-    assert Steadier.from_state(Steadier().state()).state() == {"cuts": 0}
-    _, steadier = steadied(at_rest(rng, [plain(10)]) + at_rest(rng, [plain(10)]))
-    assert Steadier.from_state(steadier.state()).cuts == 1
+    assert TemporalFilter.from_state(TemporalFilter().state()).state() == {"cuts": 0}
+    _, temporal_filter = filter_all(at_rest(rng, [plain(10)]) + at_rest(rng, [plain(10)]))
+    assert TemporalFilter.from_state(temporal_filter.state()).cuts == 1
 
 
-def test_the_state_does_not_grow_with_the_film(rng):
+def test_the_state_does_not_grow_with_the_video(rng):
     def state_bytes(frames):
         return sum(
-            values.nbytes for values in steadied(at_rest(rng, [plain(10)] * frames))[1].state().values()
+            values.nbytes for values in filter_all(at_rest(rng, [plain(10)] * frames))[1].state().values()
         )
 
     assert state_bytes(2) == state_bytes(9)
@@ -319,14 +319,14 @@ def test_the_state_does_not_grow_with_the_film(rng):
 def test_odd_sizes(rng, height, width):
     left, right = texture(rng, height, width), texture(rng, height, width)
     maps_px = 10 + rng.normal(0, 0.2, (6, height, width))
-    found = disparities(steadied([(left, right, estimate(each)) for each in maps_px])[0])
+    found = disparities(filter_all([(left, right, estimate(each)) for each in maps_px])[0])
     assert found.shape == (6, height, width)
     assert np.abs(found[-1] - 10).mean() < 0.6 * np.abs(maps_px - 10).mean()
 
 
 def test_an_estimate_of_another_size_is_refused(rng, without_shape_checks):
     with pytest.raises(StereoweaveError, match="estimate: expected the size of both pictures, got .90, 91."):
-        Steadier()(texture(rng), texture(rng), estimate(np.ones((90, 91))))
+        TemporalFilter()(texture(rng), texture(rng), estimate(np.ones((90, 91))))
 
 
 def random_track(rng, shape):

@@ -1,4 +1,4 @@
-"""Films in parts and whole: times, sound, colours and marks come out as they went in."""
+"""Videos in parts and whole: times, sound, colours and marks come out as they went in."""
 
 import json
 import resource
@@ -11,10 +11,19 @@ import numpy as np
 import pytest
 from av.sidedata.sidedata import Type
 from av.video.reformatter import Interpolation
-from film_examples import example_pairs, write_side_by_side
+from video_examples import example_pairs, write_side_by_side
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.video.writer import GREY16, H264, Packing, Parts, Recorder, check_film, growing, parts_folder
+from stereoweave.video.writer import (
+    GREY16,
+    H264,
+    Packing,
+    Parts,
+    Recorder,
+    check_container,
+    growing,
+    parts_folder,
+)
 
 # What FFmpeg needs to give back colours to the level.
 EXACT = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
@@ -27,19 +36,19 @@ def pictures(count: int) -> list[np.ndarray]:
 
 
 def make(
-    film: Path,
+    video: Path,
     shown: Sequence[tuple[Fraction, np.ndarray]],
     recorder: Recorder,
     *,
     sound: Path | None = None,
     parts: int = 2,
 ) -> Path:
-    """The film of these pictures, written in so many parts."""
-    files = [film.with_name(f"{number}.nut") for number in range(parts)]
+    """The video of these pictures, written in so many parts."""
+    files = [video.with_name(f"{number}.nut") for number in range(parts)]
     for file, chosen in zip(files, np.array_split(np.arange(len(shown)), parts), strict=True):
         recorder.write_part(file, [shown[index] for index in chosen])
-    recorder.join(files, sound, film, {})
-    return film
+    recorder.join(files, sound, video, {})
+    return video
 
 
 def even_times(count: int, rate: Fraction = NTSC) -> list[Fraction]:
@@ -50,19 +59,19 @@ def recorder(**changes: object) -> Recorder:
     return Recorder(**{"encoding": H264, "time_base": 1 / NTSC, "rate": NTSC, **changes})
 
 
-def shown_at(film: Path) -> list[Fraction]:
-    with av.open(str(film)) as container:
+def shown_at(video: Path) -> list[Fraction]:
+    with av.open(str(video)) as container:
         return [frame.pts * frame.time_base for frame in container.decode(video=0)]
 
 
-def first_frame(film: Path) -> av.VideoFrame:
-    with av.open(str(film)) as container:
+def first_frame(video: Path) -> av.VideoFrame:
+    with av.open(str(video)) as container:
         return next(container.decode(video=0))
 
 
-def sound_of(film: Path) -> list[list[tuple[Fraction, bytes]]]:
+def sound_of(video: Path) -> list[list[tuple[Fraction, bytes]]]:
     """Time and content of each packet, for each stream of sound."""
-    with av.open(str(film)) as container:
+    with av.open(str(video)) as container:
         found: dict[int, list[tuple[Fraction, bytes]]] = {
             stream.index: [] for stream in container.streams.audio
         }
@@ -78,18 +87,18 @@ def test_frames_are_shown_at_their_very_times_even_where_parts_meet(tmp_path, en
     steps = [0, 1, 3, 4, 9, 10, 11, 12, 20, 21]
     times_s = [step * time_base for step in steps]
     writing = recorder(time_base=time_base, rate=len(steps) / times_s[-1])
-    film = make(tmp_path / f"film{ending}", list(zip(times_s, pictures(10), strict=True)), writing, parts=3)
-    assert shown_at(film) == times_s
+    video = make(tmp_path / f"video{ending}", list(zip(times_s, pictures(10), strict=True)), writing, parts=3)
+    assert shown_at(video) == times_s
 
 
 def test_matroska_rounds_times_to_the_millisecond(tmp_path):
-    film = make(tmp_path / "film.mkv", list(zip(even_times(6), pictures(6), strict=True)), recorder())
-    assert shown_at(film) == [Fraction(ms, 1000) for ms in (0, 33, 67, 100, 133, 167)]
+    video = make(tmp_path / "video.mkv", list(zip(even_times(6), pictures(6), strict=True)), recorder())
+    assert shown_at(video) == [Fraction(ms, 1000) for ms in (0, 33, 67, 100, 133, 167)]
 
 
 def test_the_last_frame_is_shown_as_long_as_the_others(tmp_path):
-    film = make(tmp_path / "film.mp4", list(zip(even_times(6), pictures(6), strict=True)), recorder())
-    with av.open(str(film)) as container:
+    video = make(tmp_path / "video.mp4", list(zip(even_times(6), pictures(6), strict=True)), recorder())
+    with av.open(str(video)) as container:
         stream = container.streams.video[0]
         assert stream.duration * stream.time_base == 6 / NTSC
 
@@ -97,8 +106,8 @@ def test_the_last_frame_is_shown_as_long_as_the_others(tmp_path):
 def test_an_odd_picture_gets_its_last_row_and_column_once_more(tmp_path):
     picture = np.full((35, 37, 3), 40, np.uint8)
     picture[-1], picture[:, -1] = 200, 200
-    film = make(tmp_path / "film.mp4", [(Fraction(0), picture)], recorder(), parts=1)
-    levels = first_frame(film).to_ndarray(format="gray").astype(int)
+    video = make(tmp_path / "video.mp4", [(Fraction(0), picture)], recorder(), parts=1)
+    levels = first_frame(video).to_ndarray(format="gray").astype(int)
     assert levels.shape == (36, 38)
     np.testing.assert_allclose(levels[-2:, 5:30], 200, atol=12)
     np.testing.assert_allclose(levels[5:30, -2:], 200, atol=12)
@@ -107,8 +116,8 @@ def test_an_odd_picture_gets_its_last_row_and_column_once_more(tmp_path):
 
 def test_colours_come_back_within_two_levels_and_are_said_to_be_those_of_hd_video(tmp_path):
     picture = np.repeat(np.array(FLAT_RGB, np.uint8)[None], 64, 0).repeat(32, 1)
-    film = make(tmp_path / "film.mp4", [(Fraction(0), picture)], recorder(), parts=1)
-    frame = first_frame(film)
+    video = make(tmp_path / "video.mp4", [(Fraction(0), picture)], recorder(), parts=1)
+    frame = first_frame(video)
     # ITU-T H.273: 1 is BT.709 as a matrix, as primaries and as a curve; FFmpeg's 1 is the limited range.
     assert (frame.colorspace, frame.color_primaries, frame.color_trc, frame.color_range) == (1, 1, 1, 1)
     seen = frame.to_ndarray(format="rgb24", interpolation=EXACT).astype(int)
@@ -119,10 +128,13 @@ def test_colours_come_back_within_two_levels_and_are_said_to_be_those_of_hd_vide
 
 def test_16_bit_grey_comes_back_exactly(tmp_path, rng):
     grey = rng.integers(0, 65536, (3, 33, 45), dtype=np.uint16)
-    film = make(
-        tmp_path / "film.mkv", list(zip(even_times(3), grey, strict=True)), recorder(encoding=GREY16), parts=2
+    video = make(
+        tmp_path / "video.mkv",
+        list(zip(even_times(3), grey, strict=True)),
+        recorder(encoding=GREY16),
+        parts=2,
     )
-    with av.open(str(film)) as container:
+    with av.open(str(video)) as container:
         frames = list(container.decode(video=0))
     assert frames[0].format.name == "gray16le"
     np.testing.assert_array_equal([frame.to_ndarray() for frame in frames], grey)
@@ -132,23 +144,23 @@ def test_16_bit_grey_comes_back_exactly(tmp_path, rng):
 @pytest.mark.parametrize(("number", "kind"), [(3, 1), (4, 2)])  # AVStereo3D: 1 side by side, 2 top and bottom
 def test_players_are_told_how_two_views_share_a_picture(tmp_path, ending, number, kind):
     word = {3: "left_right", 4: "top_bottom"}[number]
-    film = make(
-        tmp_path / f"film{ending}",
+    video = make(
+        tmp_path / f"video{ending}",
         list(zip(even_times(2), pictures(2), strict=True)),
         recorder(packing=Packing(word, number)),
     )
-    told = np.frombuffer(bytes(first_frame(film).side_data[Type.STEREO3D]), np.int32)
+    told = np.frombuffer(bytes(first_frame(video).side_data[Type.STEREO3D]), np.int32)
     assert told[0] == kind
-    with av.open(str(film)) as container:
+    with av.open(str(video)) as container:
         assert container.streams.video[0].metadata.get("stereo_mode") == (word if ending == ".mkv" else None)
 
 
 def test_crossed_views_are_marked_where_that_can_be_said(tmp_path):
     shown = list(zip(even_times(2), pictures(2), strict=True))
     writing = recorder(packing=Packing("right_left", None))
-    assert Type.STEREO3D not in first_frame(make(tmp_path / "film.mp4", shown, writing)).side_data
-    film = make(tmp_path / "film.mkv", shown, writing)
-    with av.open(str(film)) as container:
+    assert Type.STEREO3D not in first_frame(make(tmp_path / "video.mp4", shown, writing)).side_data
+    video = make(tmp_path / "video.mkv", shown, writing)
+    with av.open(str(video)) as container:
         assert container.streams.video[0].metadata["stereo_mode"] == "right_left"
 
 
@@ -158,31 +170,31 @@ def test_crossed_views_are_marked_where_that_can_be_said(tmp_path):
 )
 def test_sound_is_copied_bit_for_bit_at_its_times(tmp_path, source, target, off_s):
     original = write_side_by_side(tmp_path / f"in{source}", example_pairs(10), sound=True)
-    film = make(
+    video = make(
         tmp_path / f"out{target}",
         list(zip(even_times(10, Fraction(25)), pictures(10), strict=True)),
         recorder(time_base=Fraction(1, 25), rate=Fraction(25)),
         sound=original,
     )
-    [before], [after] = sound_of(original), sound_of(film)
+    [before], [after] = sound_of(original), sound_of(video)
     assert len(before) > 15
     assert [content for _, content in after] == [content for _, content in before]
     # The encoder's run-up lies before 0; nothing is shifted for it.
     assert before[0][0] < 0
     assert max(abs(then - now) for (then, _), (now, _) in zip(before, after, strict=True)) <= off_s
-    assert shown_at(film)[0] == 0
+    assert shown_at(video)[0] == 0
 
 
 def test_all_streams_of_sound_are_kept_with_their_languages(tmp_path):
     original = two_languages(tmp_path / "in.mkv")
-    film = make(
+    video = make(
         tmp_path / "out.mkv",
         list(zip(even_times(4), pictures(4), strict=True)),
         recorder(),
         sound=original,
     )
-    assert sound_of(film) == sound_of(original)
-    with av.open(str(film)) as container:
+    assert sound_of(video) == sound_of(original)
+    with av.open(str(video)) as container:
         assert [stream.metadata["language"] for stream in container.streams.audio] == ["deu", "fra"]
         assert [stream.codec_context.name for stream in container.streams.audio] == ["opus", "flac"]
 
@@ -190,11 +202,11 @@ def test_all_streams_of_sound_are_kept_with_their_languages(tmp_path):
 def test_pictures_and_sound_stay_in_step_where_the_pictures_begin_late(tmp_path):
     original = write_side_by_side(tmp_path / "in.mp4", example_pairs(3), times_ms=[400, 440, 480], sound=True)
     shown = list(zip(even_times(3, Fraction(25)), pictures(3), strict=True))
-    film = make(
+    video = make(
         tmp_path / "out.mp4", shown, recorder(time_base=Fraction(1, 1000), rate=Fraction(25)), sound=original
     )
-    assert shown_at(film) == shown_at(original) == [Fraction(ms, 1000) for ms in (400, 440, 480)]
-    assert sound_of(film) == sound_of(original)
+    assert shown_at(video) == shown_at(original) == [Fraction(ms, 1000) for ms in (400, 440, 480)]
+    assert sound_of(video) == sound_of(original)
 
 
 @pytest.mark.parametrize("ending", [".mp4", ".mov"])
@@ -202,8 +214,8 @@ def test_a_late_start_is_kept_exactly(tmp_path, ending):
     ninety_kilohertz = Fraction(1, 90_000)
     late = [(36_001 + index * 3600) * ninety_kilohertz for index in range(3)]
     writing = recorder(time_base=ninety_kilohertz, rate=Fraction(25))
-    film = make(tmp_path / f"film{ending}", list(zip(late, pictures(3), strict=True)), writing)
-    assert shown_at(film) == late
+    video = make(tmp_path / f"video{ending}", list(zip(late, pictures(3), strict=True)), writing)
+    assert shown_at(video) == late
 
 
 def test_sound_that_a_container_cannot_hold_is_refused_with_one_that_can(tmp_path):
@@ -212,50 +224,50 @@ def test_sound_that_a_container_cannot_hold_is_refused_with_one_that_can(tmp_pat
         StereoweaveError,
         match=r"out\.mov: expected sound that \.mov can hold, found flac, opus in .*in\.mkv; \.mp4 holds it",
     ):
-        check_film(tmp_path / "out.mov", original)
-    check_film(tmp_path / "out.mkv", original)
+        check_container(tmp_path / "out.mov", original)
+    check_container(tmp_path / "out.mkv", original)
     assert [path.name for path in tmp_path.iterdir()] == ["in.mkv"]
 
 
-def test_a_name_that_is_no_films_is_refused():
+def test_a_name_that_is_no_videos_is_refused():
     with pytest.raises(
-        StereoweaveError, match=r"film\.gif: expected the ending of a video, .*, found '\.gif'"
+        StereoweaveError, match=r"video\.gif: expected the ending of a video, .*, found '\.gif'"
     ):
-        check_film(Path("film.gif"), None)
+        check_container(Path("video.gif"), None)
 
 
-def test_a_films_parts_go_when_it_is_done(tmp_path):
-    film = tmp_path / "film.mp4"
-    with growing(film, {"position": 0.5}) as parts:
+def test_a_videos_parts_go_when_it_is_done(tmp_path):
+    video = tmp_path / "video.mp4"
+    with growing(video, {"position": 0.5}) as parts:
         add(parts, b"first", 1)
-        assert parts_folder(film) == tmp_path / "film.mp4.parts"
-        assert parts_folder(film).is_dir()
+        assert parts_folder(video) == tmp_path / "video.mp4.parts"
+        assert parts_folder(video).is_dir()
     assert list(tmp_path.iterdir()) == []
 
 
 def test_what_others_keep_in_that_folder_stays(tmp_path):
-    film = tmp_path / "film.mp4"
-    parts_folder(film).mkdir()
-    (parts_folder(film) / "notes.txt").write_text("mine")
-    with growing(film, {}) as parts:
+    video = tmp_path / "video.mp4"
+    parts_folder(video).mkdir()
+    (parts_folder(video) / "notes.txt").write_text("mine")
+    with growing(video, {}) as parts:
         add(parts, b"first", 1)
-    assert [path.name for path in parts_folder(film).iterdir()] == ["notes.txt"]
+    assert [path.name for path in parts_folder(video).iterdir()] == ["notes.txt"]
 
 
 def test_an_error_before_the_first_part_leaves_nothing(tmp_path):
-    with pytest.raises(ZeroDivisionError), growing(tmp_path / "film.mp4", {}) as parts:
+    with pytest.raises(ZeroDivisionError), growing(tmp_path / "video.mp4", {}) as parts:
         break_off(parts, ZeroDivisionError())
     assert list(tmp_path.iterdir()) == []
 
 
 def test_after_an_error_the_finished_parts_and_the_last_ones_state_stay(tmp_path):
-    film = tmp_path / "film.mp4"
-    told = r"^no picture; finished parts are in .*film\.mp4\.parts; rerun the same command to resume$"
-    with pytest.raises(StereoweaveError, match=told), growing(film, {"position": 0.5}) as parts:
+    video = tmp_path / "video.mp4"
+    told = r"^no picture; finished parts are in .*video\.mp4\.parts; rerun the same command to resume$"
+    with pytest.raises(StereoweaveError, match=told), growing(video, {"position": 0.5}) as parts:
         add(parts, b"first", 1)
         add(parts, b"second", 2)
         break_off(parts, StereoweaveError("no picture"))
-    with growing(film, {"position": 0.5}) as parts:
+    with growing(video, {"position": 0.5}) as parts:
         assert [file.read_bytes() for file in parts.files] == [b"first", b"second"]
         assert parts.state() == {"frames": 2}
         assert sorted(path.name for path in parts.folder.iterdir()) == [
@@ -267,44 +279,44 @@ def test_after_an_error_the_finished_parts_and_the_last_ones_state_stay(tmp_path
 
 
 def test_parts_without_their_state_count_for_nothing(tmp_path):
-    film = tmp_path / "film.mp4"
-    with pytest.raises(KeyboardInterrupt), growing(film, {}) as parts:
+    video = tmp_path / "video.mp4"
+    with pytest.raises(KeyboardInterrupt), growing(video, {}) as parts:
         add(parts, b"first", 1)
         add(parts, b"second", 2)
         raise KeyboardInterrupt
-    (parts_folder(film) / "state-000002.npz").unlink()
-    with growing(film, {}) as parts:
+    (parts_folder(video) / "state-000002.npz").unlink()
+    with growing(video, {}) as parts:
         assert parts.files == []
         assert [path.name for path in parts.folder.iterdir()] == ["settings.json"]
 
 
-def test_parts_of_another_film_are_not_continued(tmp_path):
-    film = tmp_path / "film.mp4"
-    with pytest.raises(KeyboardInterrupt), growing(film, {"position": 0.5, "model": "small"}) as parts:
+def test_parts_of_another_video_are_not_continued(tmp_path):
+    video = tmp_path / "video.mp4"
+    with pytest.raises(KeyboardInterrupt), growing(video, {"position": 0.5, "model": "small"}) as parts:
         add(parts, b"first", 1)
         raise KeyboardInterrupt
     with (
         pytest.raises(
             StereoweaveError, match=r"found parts begun with position 0\.5; remove that folder, or give"
         ),
-        growing(film, {"position": 0.25, "model": "small"}),
+        growing(video, {"position": 0.25, "model": "small"}),
     ):
         pass
-    assert json.loads((tmp_path / "film.mp4.parts" / "settings.json").read_text())["position"] == 0.5
+    assert json.loads((tmp_path / "video.mp4.parts" / "settings.json").read_text())["position"] == 0.5
 
 
 @pytest.mark.parametrize("name", ["settings.json", "state-000001.npz"])
 @pytest.mark.parametrize("content", [b"", b"[1, 2", b"PK\x03\x04 no archive"])
 def test_a_damaged_parts_folder_is_to_be_removed(tmp_path, name, content):
-    folder = begin(tmp_path / "film.mp4")
+    folder = begin(tmp_path / "video.mp4")
     (folder / name).write_bytes(content)
-    assert_to_be_removed(tmp_path / "film.mp4", name)
+    assert_to_be_removed(tmp_path / "video.mp4", name)
 
 
 def test_parts_without_their_settings_are_to_be_removed(tmp_path):
-    folder = begin(tmp_path / "film.mp4")
+    folder = begin(tmp_path / "video.mp4")
     (folder / "settings.json").unlink()
-    assert_to_be_removed(tmp_path / "film.mp4", "settings.json")
+    assert_to_be_removed(tmp_path / "video.mp4", "settings.json")
 
 
 def test_a_disk_that_is_full_from_the_start_is_one_line_with_the_file(tmp_path):
@@ -313,7 +325,7 @@ def test_a_disk_that_is_full_from_the_start_is_one_line_with_the_file(tmp_path):
     with pytest.raises(StereoweaveError, match=told):
         resource.setrlimit(resource.RLIMIT_FSIZE, (1, hard))
         try:
-            with growing(tmp_path / "film.mp4", {"position": 0.5}):
+            with growing(tmp_path / "video.mp4", {"position": 0.5}):
                 pass
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -324,25 +336,25 @@ def test_a_disk_that_is_full_from_the_start_is_one_line_with_the_file(tmp_path):
     ("value", "told"),
     [(True, "with x"), (False, "without x"), (None, "without x"), (0.5, "with x 0.5")],
 )
-def test_what_a_film_was_begun_with_is_told_as_users_write_it(tmp_path, value, told):
-    film = tmp_path / "film.mp4"
-    begin(film, {"x": value})
-    with pytest.raises(StereoweaveError, match=f"found parts begun {told}; "), growing(film, {"x": "else"}):
+def test_what_a_video_was_begun_with_is_told_as_users_write_it(tmp_path, value, told):
+    video = tmp_path / "video.mp4"
+    begin(video, {"x": value})
+    with pytest.raises(StereoweaveError, match=f"found parts begun {told}; "), growing(video, {"x": "else"}):
         pass
 
 
-def begin(film: Path, settings: dict[str, object] | None = None) -> Path:
-    """The folder of a film that was interrupted after one part."""
-    with pytest.raises(KeyboardInterrupt), growing(film, settings or {}) as parts:
+def begin(video: Path, settings: dict[str, object] | None = None) -> Path:
+    """The folder of a video that was interrupted after one part."""
+    with pytest.raises(KeyboardInterrupt), growing(video, settings or {}) as parts:
         add(parts, b"first", 1)
         raise KeyboardInterrupt
-    return parts_folder(film)
+    return parts_folder(video)
 
 
-def assert_to_be_removed(film: Path, name: str) -> None:
-    with pytest.raises(StereoweaveError) as caught, growing(film, {}):
+def assert_to_be_removed(video: Path, name: str) -> None:
+    with pytest.raises(StereoweaveError) as caught, growing(video, {}):
         pass
-    folder = parts_folder(film)
+    folder = parts_folder(video)
     assert str(caught.value).startswith(f"{folder / name}: expected")
     assert str(caught.value).endswith(f"remove the folder {folder}")
     assert (folder / "000001.nut").exists()

@@ -59,10 +59,10 @@ def add_noise(pair: StereoPair, rng: np.random.Generator) -> StereoPair:
     return StereoPair(left=with_noise(pair.left), right=with_noise(pair.right))
 
 
-def render_panning(order: RenderSpec, frames: int) -> RenderedVideo:
+def render_panning(spec: RenderSpec, frames: int) -> RenderedVideo:
     """Render `frames` frames from the middle of the camera path, where the camera is fastest."""
-    first = (order.frames - frames) // 2
-    stages = [draw_stage_and_rig(shared_renderer(), order, 0, first + number) for number in range(frames)]
+    first = (spec.frames - frames) // 2
+    stages = [draw_stage_and_rig(shared_renderer(), spec, 0, first + number) for number in range(frames)]
     rigs = [rig for _, rig in stages]
     shots = [shared_renderer().render_views(stage.world, rig, (LEFT, MIDDLE, RIGHT)) for stage, rig in stages]
     disparities_px = [
@@ -112,35 +112,35 @@ def reproject(
     return np.stack([moved_x, moved_y], -1).astype(np.float32), change_px.astype(np.float32)
 
 
-def freeze(film: RenderedVideo) -> RenderedVideo:
+def freeze(video: RenderedVideo) -> RenderedVideo:
     """Return a video of the same length that repeats the first frame."""
-    frames = len(film.pairs)
-    nothing = np.zeros((*film.moving[0].shape, 3), np.float32)
+    frames = len(video.pairs)
+    nothing = np.zeros((*video.moving[0].shape, 3), np.float32)
     return RenderedVideo(
         name="still",
-        pairs=film.pairs[:1] * frames,
-        disparities_px=film.disparities_px[:1] * frames,
-        moving=film.moving[:1] * frames,
+        pairs=video.pairs[:1] * frames,
+        disparities_px=video.disparities_px[:1] * frames,
+        moving=video.moving[:1] * frames,
         change=lambda frame, other, position: (nothing[..., :2], nothing[..., 2]),
     )
 
 
 def add_passing_oval(
-    film: RenderedVideo, name: str, velocity_px: tuple[float, float], nearing_px: float = 0.0
+    video: RenderedVideo, name: str, velocity_px: tuple[float, float], nearing_px: float = 0.0
 ) -> RenderedVideo:
     """Return a video of the same length: the first frame, and an oval that moves in front of it.
 
     The oval shows the frame itself, upside down and at a quarter of its size.
 
     Args:
-        film: The video whose first frame is used.
+        video: The video whose first frame is used.
         name: The new video's name.
         velocity_px: Motion of the oval in the left view, right and down per frame; multiples of 0.25.
         nearing_px: Growth of its disparity per frame; a multiple of 0.5.
     """
-    pair, truth_px = film.pairs[0], film.disparities_px[0]
-    height, width = film.moving[0].shape
-    steps = range(len(film.pairs))
+    pair, truth_px = video.pairs[0], video.disparities_px[0]
+    height, width = video.moving[0].shape
+    steps = range(len(video.pairs))
     nearest_px = max(math.ceil(values.max()) for values in truth_px.values()) + _IN_FRONT_PX
     ovals_px = [nearest_px + nearing_px * step for step in steps]
 

@@ -1,4 +1,4 @@
-"""Shared by the tests of video: small real films made with PyAV, their sound, and ways to damage them."""
+"""Shared by the tests of video: small real videos made with PyAV, their sound, and ways to damage them."""
 
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
@@ -18,7 +18,7 @@ Pair = tuple[np.ndarray, np.ndarray]
 
 
 def example_pairs(count: int, *, width: int = 160, height: int = 96, step_px: int = 2) -> list[Pair]:
-    """Windows of the example pair moving to the right, like a film of a camera that moves sideways."""
+    """Windows of the example pair moving to the right, like a video of a camera that moves sideways."""
     left, right = (read_image(EXAMPLES / f"{eye}.png") for eye in ("left", "right"))
     top_px, first_px = 200, 180
     return [
