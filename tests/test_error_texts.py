@@ -41,11 +41,11 @@ OTHERS = {
 ERRORS = {
     "left.png: expected a stereo picture, two views side by side or one above the other, found halves that "
     "do not resemble each other; give two files, left and right; or choose one of "
-    f"{LAYOUTS} (arrangement)": lambda: open_pictures(PAIR[:1]),
-    f"arrangement: expected one of {LAYOUTS}, mpo, jps, found 'diagonal'": lambda: open_pictures(
+    f"{LAYOUTS} (format)": lambda: open_pictures(PAIR[:1]),
+    f"format: expected one of {LAYOUTS}, mpo, jps, found 'diagonal'": lambda: open_pictures(
         PAIR[:1], "diagonal"
     ),
-    "arrangement: expected one picture that holds both views, found two, left.png and right.png; leave it "
+    "format: expected one picture that holds both views, found two, left.png and right.png; leave it "
     "out, and give the left one first": lambda: open_pictures(PAIR, "crossed"),
     "turned.yml: expected a calibration of rectified pictures, found lenses with distortion; rectify "
     "the pair with it (rectify)": lambda: prepare(PAIR, Request(calibration=Path("turned.yml"))),
@@ -100,7 +100,7 @@ def test_a_note_names_settings_by_their_keyword(folder):
         "the right picture lies 2.0 px lower; rectify the pair (rectify)"
     ]
     assert list(map(str, open_pictures([Path("both.png")]).notes)) == [
-        "side_by_side, detected from name and content; override it if it is wrong (arrangement)"
+        "side_by_side, detected from name and content; override it if it is wrong (format)"
     ]
 
 

@@ -27,7 +27,7 @@ from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
-from stereoweave.pictures.frame_packing import ARRANGEMENTS, guess_arrangement
+from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, detect_layout
 from stereoweave.stereo import StereoCamera, StereoPair
 
 Picture = UInt8[np.ndarray, "h w 3"]
@@ -289,7 +289,7 @@ def show(  # noqa: PLR0913 - source, output and settings
     matcher: Matcher,
     tally: LiveTally,
     *,
-    arrangement: str | None = None,
+    format: str | None = None,
     rig: Rig | None = None,
 ) -> None:
     """Show captured images and their disparity until the sources end.
@@ -299,14 +299,14 @@ def show(  # noqa: PLR0913 - source, output and settings
         screen: The page to show them on.
         matcher: The matcher for the disparity.
         tally: Updated with each frame, so that it is valid even after an error.
-        arrangement: The frame packing of a single source, a name in `ARRANGEMENTS`. Default: detected.
+        format: The frame packing of a single source, a name in `PAIR_LAYOUTS`. Default: detected.
         rig: The calibration to rectify the images with. Default: they are rectified already.
     """
     range_px: tuple[float, float] | None = None
     while moment := capture.newest(tally.last):
-        if capture.count == 1 and arrangement is None:
-            arrangement = guess_arrangement(capture.name, moment.pictures)
-        pair = _pair(moment.pictures, arrangement)
+        if capture.count == 1 and format is None:
+            format = detect_layout(capture.name, moment.pictures)
+        pair = _pair(moment.pictures, format)
         pair = rectify(pair, rig).pair if rig else pair
         disparity_px = match(matcher, pair).disparity_px
         range_px = followed(range_px, disparity_px)
@@ -349,13 +349,13 @@ def range_words(camera: StereoCamera | None, range_px: tuple[float, float]) -> s
     return f"depth {far_m:.2f} m (blue) to {near_m:.2f} m (red)"
 
 
-def _pair(pictures: Sequence[Picture], arrangement: str | None) -> StereoPair:
-    if arrangement is None:
+def _pair(pictures: Sequence[Picture], format: str | None) -> StereoPair:
+    if format is None:
         left, right = pictures
     else:
         [both] = pictures
-        ARRANGEMENTS[arrangement].eye_size_px(both.shape[1], both.shape[0])  # raises if it cannot be halved
-        left, right = ARRANGEMENTS[arrangement].eyes(both)
+        PAIR_LAYOUTS[format].eye_size_px(both.shape[1], both.shape[0])  # raises if it cannot be halved
+        left, right = PAIR_LAYOUTS[format].eyes(both)
     return StereoPair(left=left, right=right)
 
 

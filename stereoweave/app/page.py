@@ -101,11 +101,11 @@ class Page:
             elem_id="rectify",
         )
         with gr.Accordion("More about the pictures", open=False):
-            self._arrangement = gr.Dropdown(
+            self._layout = gr.Dropdown(
                 [_DETECTED, *((name.replace("_", " "), name) for name in FORMATS)],
                 value=_DETECTED,
                 label="Layout of a single file",
-                elem_id="arrangement",
+                elem_id="layout",
             )
             self._calibration = gr.File(
                 label="Calibration file, for metres", height=140, elem_id="calibration"
@@ -155,7 +155,7 @@ class Page:
 
     def _connect(self) -> None:
         """Connect events to their handlers."""
-        asked = [self._left, self._right, self._model, self._rectify, self._arrangement, self._calibration]
+        asked = [self._left, self._right, self._model, self._rectify, self._layout, self._calibration]
         asked += [self._focal_px, self._baseline_mm]
         seen = [self._results, self._session, self._view, self._where, self._depth, self._ramp]
         seen += [self._confidence, self._photograph, self._clicks, self._measured]
@@ -212,7 +212,7 @@ class Page:
             self._calibration: str(folder / "calib.txt"),
             self._model: "small",
             self._rectify: False,
-            self._arrangement: _DETECTED,
+            self._layout: _DETECTED,
             self._focal_px: 0,
             self._baseline_mm: 0,
         }
@@ -234,7 +234,7 @@ class Page:
     def _label_of(self, setting: str) -> str | None:
         """Return the page's label for a setting; None if the page does not have it."""
         components = {
-            "arrangement": self._arrangement,
+            "format": self._layout,
             "baseline_m": self._baseline_mm,
             "calibration": self._calibration,
             "focal_px": self._focal_px,
@@ -271,10 +271,10 @@ class Page:
         return _format_notice([format_summary(session.result.summary), *lines])
 
     def _uploads(self, given: dict[Any, Any]) -> Uploads:
-        arrangement, calibration = given[self._arrangement], given[self._calibration]
+        layout, calibration = given[self._layout], given[self._calibration]
         focal_px, baseline_mm = given[self._focal_px] or None, given[self._baseline_mm] or None
         request = Request(
-            arrangement=None if arrangement == _DETECTED else arrangement,
+            format=None if layout == _DETECTED else layout,
             calibration=Path(calibration) if calibration else None,
             focal_px=focal_px,
             baseline_m=baseline_mm and baseline_mm / 1000,

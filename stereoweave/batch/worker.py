@@ -214,7 +214,7 @@ class Worker:
 
         films, _ = self._fetched(planned, scratch / "pictures")
         film_job = VideoJob(depth16=True, backend=job.backend, name_of=job.name_of)
-        video = open_video(films, job.request.arrangement)
+        video = open_video(films, job.request.format)
         with self._results(planned, scratch) as out:
             make = partial(convert_video, video, films, out / FILM, film_job, Console(quiet=True))
             begun = parts_folder(out / FILM)

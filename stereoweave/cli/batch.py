@@ -55,7 +55,7 @@ def batch(  # noqa: PLR0913 - each is an option of the command line
     workers: Workers = None,
     cpus_each: CpusEach = 1.0,
     gpus_each: GpusEach = 0.0,
-    arrangement: Format = None,
+    format: Format = None,
     calib: Calib = None,
     focal_px: FocalPx = None,
     baseline_m: BaselineM = None,
@@ -80,7 +80,7 @@ def batch(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.system.ray_engine import Engine
 
     job = DepthJob(
-        request=make_request(arrangement, calib, focal_px, baseline_m, rectify),
+        request=make_request(format, calib, focal_px, baseline_m, rectify),
         backend=Backend(model=model, provider=provider),
         options=MatchOptions(range_px=parse_range_px(range_px), refined=refined, raw=raw),
         files=tuple(write or ()),

@@ -72,7 +72,7 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
     right: Right = None,
     listed: Listed = None,
     jobs: Jobs = None,
-    arrangement: Format = None,
+    format: Format = None,
     calib: Calib = None,
     focal_px: FocalPx = None,
     baseline_m: BaselineM = None,
@@ -93,7 +93,7 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.pictures.pair_finding import find_pairs
 
     job = DepthJob(
-        request=make_request(arrangement, calib, focal_px, baseline_m, rectify),
+        request=make_request(format, calib, focal_px, baseline_m, rectify),
         backend=Backend(model=model, threads=threads, provider=provider),
         options=MatchOptions(range_px=parse_range_px(range_px), refined=refined, raw=raw),
         files=tuple(write or ()),
@@ -112,7 +112,7 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
     pictures: Pictures,
     first: Annotated[str, typer.Option("--from", metavar="X,Y", help="Pixel of the left picture.")],
     second: Annotated[str, typer.Option("--to", metavar="X,Y", help="Another pixel.")],
-    arrangement: Format = None,
+    format: Format = None,
     calib: Calib = None,
     focal_px: FocalPx = None,
     baseline_m: BaselineM = None,
@@ -139,7 +139,7 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
 
     places = parse_pixel("--from", first), parse_pixel("--to", second)
     options = MatchOptions(range_px=parse_range_px(range_px), refined=refined)
-    prepared = prepare(pictures, make_request(arrangement, calib, focal_px, baseline_m, rectify))
+    prepared = prepare(pictures, make_request(format, calib, focal_px, baseline_m, rectify))
     camera = require_camera(prepared.pair)
     matcher = Backend(model=model, threads=threads, provider=provider).matcher()
     estimate = match(matcher, prepared.pair, options)

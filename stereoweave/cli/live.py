@@ -8,7 +8,14 @@ from typing import Annotated
 
 import typer
 
-from stereoweave.cli.options import Model, Provider, Threads, naming_video_options
+from stereoweave.cli.options import (
+    Model,
+    OldFormat,
+    Provider,
+    Threads,
+    naming_video_options,
+    replace_old_option,
+)
 from stereoweave.errors import StereoweaveError
 
 Sources = Annotated[
@@ -19,11 +26,12 @@ Sources = Annotated[
         "views in each frame; or LEFT RIGHT.",
     ),
 ]
-Arrangement = Annotated[
+Format = Annotated[
     str | None,
     typer.Option(
+        "--format",
         help="Frame packing, such as side_by_side or top_bottom_half (default: detected in the first "
-        "frame). An unknown one lists them all."
+        "frame). An unknown one lists them all.",
     ),
 ]
 Calib = Annotated[
@@ -39,13 +47,14 @@ Browser = Annotated[bool, typer.Option(help="Open the page in the browser.")]
 @naming_video_options()
 def live(  # noqa: PLR0913 - each is an option of the command line
     sources: Sources,
-    arrangement: Arrangement = None,
+    format: Format = None,
     calib: Calib = None,
     model: Model = "small",
     threads: Threads = None,
     provider: Provider = "cpu",
     port: Port = 8123,
     browser: Browser = True,
+    arrangement: OldFormat = None,
 ) -> None:
     """Show live video of cameras and its depth in colour on a page in the browser; Ctrl-C stops it."""
     # Otherwise FFmpeg prints its own message beside our error.
@@ -53,12 +62,14 @@ def live(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.app.live import Capture, LiveTally, Screen, show
     from stereoweave.cameras.calibration_files import read_rig
     from stereoweave.matching.backend import Backend
-    from stereoweave.pictures.frame_packing import ARRANGEMENTS
+    from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS
 
-    if arrangement not in (None, *ARRANGEMENTS) or (arrangement and len(sources) > 1):
+    format = replace_old_option(("--arrangement", arrangement), ("--format", format))
+    if format not in (None, *PAIR_LAYOUTS) or (format and len(sources) > 1):
         raise StereoweaveError(
-            f"--arrangement: expected {', '.join(ARRANGEMENTS)}, of one source with both views, found "
-            f"{arrangement} of {' '.join(sources)}"
+            f"expected {', '.join(PAIR_LAYOUTS)}, of one source with both views, found {format} of "
+            f"{' '.join(sources)}",
+            setting="format",
         )
     rig = read_rig(calib) if calib else None
     matcher, tally = Backend(model=model, threads=threads, provider=provider).matcher(), LiveTally()
@@ -68,6 +79,6 @@ def live(  # noqa: PLR0913 - each is an option of the command line
             webbrowser.open(screen.url)
         try:
             with suppress(KeyboardInterrupt):
-                show(capture, screen, matcher, tally, arrangement=arrangement, rig=rig)
+                show(capture, screen, matcher, tally, format=format, rig=rig)
         finally:
             typer.echo(f"{capture.name}: {tally.line()}")

@@ -30,6 +30,7 @@ Format = Annotated[
         "mpo, jps; default: detected.",
     ),
 ]
+OldFormat = Annotated[str | None, typer.Option("--arrangement", hidden=True, help="Old name of --format.")]
 Calib = Annotated[
     Path | None,
     typer.Option(
@@ -110,7 +111,6 @@ Port = Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 
 
 # Options whose name differs from their setting's keyword.
 _OPTIONS = {
-    "arrangement": "--format",
     "calibration": "--calib",
     "convergence_px": "--convergence",
     "files": "--write",
@@ -128,8 +128,6 @@ def option_name(setting: str) -> str:
 
 def video_option_name(setting: str) -> str | None:
     """Return the option of the video commands for a setting; None for rectification, which they lack."""
-    if setting == "arrangement":
-        return "--arrangement"
     return None if setting == "rectify" else option_name(setting)
 
 
@@ -142,8 +140,27 @@ def naming_video_options() -> Iterator[None]:
         raise type(error)(error.format(video_option_name)) from error
 
 
+def replace_old_option(old: tuple[str, str | None], new: tuple[str, str | None]) -> str | None:
+    """Return the value of a renamed option, given under its old or its new name; warns about the old name.
+
+    Args:
+        old: The old name and the value given with it, if any.
+        new: The same for the new name.
+
+    Raises:
+        StereoweaveError: Both are given.
+    """
+    (old_name, old_value), (new_name, new_value) = old, new
+    if old_value is None:
+        return new_value
+    if new_value is not None:
+        raise StereoweaveError(f"{old_name}: expected {new_name} alone, its new name, found both")
+    typer.echo(f"stereoweave: warning: {old_name} is deprecated; use {new_name}", err=True)
+    return old_value
+
+
 def make_request(
-    arrangement: str | None = None,
+    format: str | None = None,
     calib: Path | None = None,
     focal_px: float | None = None,
     baseline_m: float | None = None,
@@ -153,7 +170,7 @@ def make_request(
     from stereoweave.pictures.prepare import Request
 
     return Request(
-        arrangement=arrangement,
+        format=format,
         calibration=calib,
         focal_px=focal_px,
         baseline_m=baseline_m,

@@ -14,7 +14,7 @@ from stereoweave.cli.options import AsJson, Calib, Format, Pictures, make_parent
 from stereoweave.errors import StereoweaveError
 
 
-def check(pictures: Pictures, arrangement: Format = None, as_json: AsJson = False) -> None:
+def check(pictures: Pictures, format: Format = None, as_json: AsJson = False) -> None:
     """Check a pair for problems: rectification, swapped pictures, disparity range, exposure.
 
     Every problem is reported with its remedy; the exit status is then 1.
@@ -22,7 +22,7 @@ def check(pictures: Pictures, arrangement: Format = None, as_json: AsJson = Fals
     from stereoweave.cameras.alignment import check_pair
     from stereoweave.pictures.loading import open_pictures
 
-    opened = open_pictures(pictures, arrangement)
+    opened = open_pictures(pictures, format)
     found = check_pair(opened.pair.left, opened.pair.right)
     notes = [note.format(option_name) for note in (*opened.notes, *found.lines())]
     if as_json:
@@ -46,7 +46,7 @@ def rectify(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Folder to write left.png, right.png and calib.yml to.")
     ],
-    arrangement: Format = None,
+    format: Format = None,
     calib: Calib = None,
 ) -> None:
     """Rectify a pair, by its calibration, or without one by matched features.
@@ -62,7 +62,7 @@ def rectify(
 
     _check_output(pictures, calib, out)
     make_parent_folder(out / "left.png", out / "right.png", out / "calib.yml")
-    prepared = prepare(pictures, Request(arrangement=arrangement, calibration=calib, rectify=True))
+    prepared = prepare(pictures, Request(format=format, calibration=calib, rectify=True))
     pair = crop(prepared.pair)
     with lock_output(make_folder(out)):
         write_image(out / "left.png", pair.left)

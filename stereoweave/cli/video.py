@@ -8,11 +8,13 @@ import typer
 
 from stereoweave.cli.options import (
     Model,
+    OldFormat,
     Provider,
     Strength,
     Threads,
     make_parent_folder,
     naming_video_options,
+    replace_old_option,
     video_option_name,
 )
 from stereoweave.errors import StereoweaveError
@@ -63,11 +65,12 @@ Convergence = Annotated[
         "anaglyphs, quilts and contact sheets, 0 for all others).",
     ),
 ]
-Arrangement = Annotated[
+Format = Annotated[
     str | None,
     typer.Option(
+        "--format",
         help="Frame packing, such as side_by_side, top_bottom_half or crossed (default: detected). An "
-        "unknown one lists them all."
+        "unknown one lists them all.",
     ),
 ]
 Rate = Annotated[
@@ -89,11 +92,12 @@ def video(  # noqa: PLR0913 - each is an option of the command line
     layout: Layout = None,
     strength: Strength = 1.0,
     convergence: Convergence = None,
-    arrangement: Arrangement = None,
+    format: Format = None,
     rate: Rate = None,
     model: Model = "small",
     threads: Threads = None,
     provider: Provider = "cpu",
+    arrangement: OldFormat = None,
 ) -> None:
     """Convert a stereo video to depth, a new view or a layout; sound and frame times are kept."""
     from rich.console import Console
@@ -106,6 +110,7 @@ def video(  # noqa: PLR0913 - each is an option of the command line
         from stereoweave.video.convert import VideoJob, convert_video
         from stereoweave.video.writer import parts_folder
 
+    format = replace_old_option(("--arrangement", arrangement), ("--format", format))
     try:
         job = VideoJob(
             depth=depth,
@@ -117,7 +122,7 @@ def video(  # noqa: PLR0913 - each is an option of the command line
             backend=Backend(model=model, threads=threads, provider=provider),
             name_of=video_option_name,
         )
-        source = open_video(videos, arrangement, rate=None if rate is None else _parse_rate(rate))
+        source = open_video(videos, format, rate=None if rate is None else _parse_rate(rate))
         if layout:
             out = _add_mark(out, layout, source.size_px)
         make_parent_folder(out)

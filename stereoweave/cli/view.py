@@ -85,7 +85,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     strength: Strength = 1.0,
     convergence: Convergence = None,
     quilt: Quilt = None,
-    arrangement: Format = None,
+    format: Format = None,
     calib: Calib = None,
     rectify: Rectify = False,
     range_px: Range = None,
@@ -119,7 +119,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
     check_positions(positions, strength)
     plane_px = _parse_convergence_px(("auto" if converged else "0") if convergence is None else convergence)
     options = MatchOptions(range_px=parse_range_px(range_px), refined=True)
-    prepared = prepare(pictures, make_request(arrangement, calib, rectify=rectify))
+    prepared = prepare(pictures, make_request(format, calib, rectify=rectify))
     pair = crop(prepared.pair)
     if name in LAYOUTS:
         out = add_mark(out, name, pair, layout_options)

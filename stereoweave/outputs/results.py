@@ -128,7 +128,9 @@ def job_facts(job: DepthJob) -> dict[str, Any]:
         with reading(model, "a model"):
             model = _hash_content(model, Path(model).read_bytes())
     facts = {"stereoweave": __version__, "model": model, **asdict(job.options)}
-    facts |= {"files": job.files, "always": job.always, **asdict(job.request)}
+    request = asdict(job.request)
+    # "arrangement" is the name in the files of begun batches.
+    facts |= {"files": job.files, "always": job.always, "arrangement": request.pop("format"), **request}
     if calibration:
         facts["calibration"] = _hash_content(calibration, read_calibration_bytes(calibration))
     return facts

@@ -21,18 +21,18 @@ from stereoweave.io.decoding import (
     read_photograph,
 )
 from stereoweave.io.files import check_large_enough, pair_of
-from stereoweave.pictures.frame_packing import (
-    ARRANGEMENTS,
-    Arrangement,
-    guess_arrangement,
+from stereoweave.pictures.pair_layouts import (
+    PAIR_LAYOUTS,
+    PairLayout,
+    detect_layout,
     measure_resemblance,
 )
 from stereoweave.stereo import StereoPair
 
 # Layouts of one file with both views: the layout of one picture, or a file format with two pictures.
-FORMATS = (*ARRANGEMENTS, "mpo", "jps")
+FORMATS = (*PAIR_LAYOUTS, "mpo", "jps")
 TWO_PICTURES = "two_pictures"
-_OVERRIDE = Remedy("override it if it is wrong", ("arrangement",))
+_OVERRIDE = Remedy("override it if it is wrong", ("format",))
 
 # Output layouts of `rendering.layouts` other than two views, whose halves may nevertheless resemble each
 # other.
@@ -49,23 +49,23 @@ class Opened:
 
     Attributes:
         pair: Both views, upright, in sRGB.
-        arrangement: Layout of the files: a name in `ARRANGEMENTS`, "mpo" or "two_pictures".
+        layout: Layout of the files: a name in `PAIR_LAYOUTS`, "mpo" or "two_pictures".
         notes: What was detected or changed.
         lens: The cameras according to EXIF, in pixels of the pair; None if EXIF has nothing.
     """
 
     pair: StereoPair
-    arrangement: str
+    layout: str
     notes: tuple[Note, ...] = ()
     lens: exif.Lens | None = None
 
 
-def open_pictures(paths: Sequence[Path], arrangement: str | None = None) -> Opened:
+def open_pictures(paths: Sequence[Path], format: str | None = None) -> Opened:
     """Open the pair in two pictures, left first, or in one file with both views.
 
     Args:
         paths: One or two files.
-        arrangement: Layout of one file with both views, a name in `FORMATS`. Default: detected from the file
+        format: Layout of one file with both views, a name in `FORMATS`. Default: detected from the file
             format, the file's name, then its content.
 
     Raises:
@@ -73,35 +73,33 @@ def open_pictures(paths: Sequence[Path], arrangement: str | None = None) -> Open
             two views; or the two pictures differ in size.
         StereoweaveError: Unknown layout, a layout given for two files, or neither one nor two files.
     """
-    if arrangement not in (None, *FORMATS):
-        raise StereoweaveError(
-            f"expected one of {', '.join(FORMATS)}, found {arrangement!r}", setting="arrangement"
-        )
+    if format not in (None, *FORMATS):
+        raise StereoweaveError(f"expected one of {', '.join(FORMATS)}, found {format!r}", setting="format")
     match paths:
         case [left, right]:
-            if arrangement is not None:
+            if format is not None:
                 raise StereoweaveError(
                     f"expected one picture that holds both views, found two, {left} and {right}; "
                     "leave it out, and give the left one first",
-                    setting="arrangement",
+                    setting="format",
                 )
             return _open_two(left, right)
         case [both]:
-            return _open_one(both, arrangement)
+            return _open_one(both, format)
     names = " ".join(map(str, paths))
     raise StereoweaveError(
         f"expected LEFT RIGHT or SIDE_BY_SIDE, one or two pictures, found {len(paths)}: {names}"
     )
 
 
-def pixel_factor(path: Path, picture: Image.Image, arrangement: str | None) -> int:
+def pixel_factor(path: Path, picture: Image.Image, format: str | None) -> int:
     """Pixels of both views divided by the pixels in the header of their common file: 1 or 2.
 
-    It is 2 for MPO files, and for half-size views declared by `arrangement` or by the file's JPS header.
+    It is 2 for MPO files, and for half-size views declared by `format` or by the file's JPS header.
     """
-    if arrangement in (None, "mpo") and find_view_frames(path, picture):
+    if format in (None, "mpo") and find_view_frames(path, picture):
         return 2
-    known = ARRANGEMENTS.get(_read_declared(path, picture, arrangement)[0] or "")
+    known = PAIR_LAYOUTS.get(_read_declared(path, picture, format)[0] or "")
     return 2 if known is not None and known.half else 1
 
 
@@ -111,31 +109,31 @@ def _open_two(left: Path, right: Path) -> Opened:
     eyes = [each.upright(lie) for each, lie in zip(photographs, lies, strict=True)]
     return Opened(
         pair=pair_of(left, eyes[0], right, eyes[1]),
-        arrangement=TWO_PICTURES,
+        layout=TWO_PICTURES,
         notes=(*notes, *_colour_notes(photographs)),
         lens=_read_lens(photographs),
     )
 
 
-def _open_one(path: Path, arrangement: str | None) -> Opened:
+def _open_one(path: Path, format: str | None) -> Opened:
     with open_picture(path, views=2) as picture:
-        frames = find_view_frames(path, picture) if arrangement in (None, "mpo") else []
+        frames = find_view_frames(path, picture) if format in (None, "mpo") else []
         if frames:
             return _open_mpo(path, picture, frames)
-        if arrangement == "mpo":
+        if format == "mpo":
             raise FormatError(f"{path}: expected an MPO file with two pictures of one size, found one")
-        name, why = _read_declared(path, picture, arrangement)
+        name, why = _read_declared(path, picture, format)
         photograph = decode(path, picture)
     lies = exif.read_orientation(photograph.tags)
     image = photograph.upright(lies)
     if name is None:
-        name, why = _detect_layout(path, image), "detected from name and content"
-    left, right = _split_views(path, image, ARRANGEMENTS[name])
+        name, why = _detect_picture_layout(path, image), "detected from name and content"
+    left, right = _split_views(path, image, PAIR_LAYOUTS[name])
     height_px, width_px = left.shape[:2]
     notes = [Note(f"{name}, {why}", _OVERRIDE)] if why else []
     return Opened(
         pair=StereoPair(left=left, right=right),
-        arrangement=name,
+        layout=name,
         notes=(*notes, *_turn_notes(lies), *_colour_notes([photograph])),
         lens=exif.read_lens(photograph.tags, width_px, height_px),
     )
@@ -154,7 +152,7 @@ def _open_mpo(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opened
     check_large_enough(path, left)
     return Opened(
         pair=StereoPair(left=left, right=right),
-        arrangement="mpo",
+        layout="mpo",
         notes=(
             Note("mpo, two pictures in one file", _OVERRIDE),
             *_turn_notes(lies),
@@ -199,19 +197,17 @@ def _compare(left: DecodedPicture, right: DecodedPicture, lies: tuple[int | None
     return measure_resemblance(left.upright(lies[0]), right.upright(lies[1]))
 
 
-def _read_declared(
-    path: Path, picture: Image.Image, arrangement: str | None
-) -> tuple[str | None, str | None]:
+def _read_declared(path: Path, picture: Image.Image, format: str | None) -> tuple[str | None, str | None]:
     """Return the layout that the user or a JPS file declares, and the reason if it is the file; else None.
 
     Source: VRex's JPS format; after identifier and length, four bytes: separation, flags, layout, type.
     """
-    if arrangement not in (None, "jps"):
-        return arrangement, None
+    if format not in (None, "jps"):
+        return format, None
     segments = [content for _, content in getattr(picture, "applist", [])]
     mark = next((content for content in segments if content.startswith(_JPS_MARK)), b"")
     if len(mark) < 14 or mark[13] != _JPS_STEREO:
-        is_jps = arrangement == "jps" or path.suffix.lower() in _CROSSED_ENDINGS
+        is_jps = format == "jps" or path.suffix.lower() in _CROSSED_ENDINGS
         return ("crossed", "the default of .jps files") if is_jps else (None, None)
     flags, layout = mark[11], mark[12]
     if layout not in (_JPS_BESIDE, _JPS_ABOVE):
@@ -221,30 +217,30 @@ def _read_declared(
         )
     beside = layout == _JPS_BESIDE
     half = bool(flags & (_JPS_HALF_WIDTH if beside else _JPS_HALF_HEIGHT))
-    known = Arrangement(beside=beside, half=half, right_first=not flags & _JPS_LEFT_FIRST)
-    return next(name for name, each in ARRANGEMENTS.items() if each == known), "from its JPS header"
+    known = PairLayout(beside=beside, half=half, right_first=not flags & _JPS_LEFT_FIRST)
+    return next(name for name, each in PAIR_LAYOUTS.items() if each == known), "from its JPS header"
 
 
-def _detect_layout(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> str:
+def _detect_picture_layout(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> str:
     for kind, mark in _OTHER_LAYOUTS.items():
         if re.search(mark, path.stem):
             raise FormatError(
                 f"{path}: expected two views, found {kind}, according to its name", remedy=_OVERRIDE
             )
-    return guess_arrangement(str(path), [image], photograph=True)
+    return detect_layout(str(path), [image], photograph=True)
 
 
 def _split_views(
-    path: Path, image: UInt8[np.ndarray, "h w 3"], arrangement: Arrangement
+    path: Path, image: UInt8[np.ndarray, "h w 3"], layout: PairLayout
 ) -> tuple[UInt8[np.ndarray, "h2 w2 3"], UInt8[np.ndarray, "h2 w2 3"]]:
     """Split an image into the left and the right view, at full size."""
     height_px, width_px = image.shape[:2]
     try:
-        view_px = arrangement.eye_size_px(width_px, height_px)
+        view_px = layout.eye_size_px(width_px, height_px)
     except FormatError as error:
         raise FormatError(f"{path}: {error}") from error
     check_size(path, view_px)
-    left, right = arrangement.eyes(image)
+    left, right = layout.eyes(image)
     check_large_enough(path, left)
     return left, right
 

@@ -19,13 +19,13 @@ class Request:
     """User settings for opening and rectifying a pair.
 
     Attributes:
-        arrangement: Layout of one picture with both views, a name in `loading.FORMATS`; default: detected.
+        format: Layout of one picture with both views, a name in `loading.FORMATS`; default: detected.
         calibration: Calibration file of the two cameras (`calibration_files.read_rig`).
         focal_px, baseline_m: The camera, without a calibration; default: from EXIF.
         rectify: Whether to rectify the pair, by the calibration or, without one, by features.
     """
 
-    arrangement: str | None = None
+    format: str | None = None
     calibration: Path | None = None
     focal_px: float | None = None
     baseline_m: float | None = None
@@ -57,7 +57,7 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
         StereoweaveError: See `open_pictures`, `read_rig`, `rectify` and `rectify_by_features`; or the request
             has one of focal length and baseline and the other is unknown.
     """
-    opened = open_pictures(pictures, request.arrangement)
+    opened = open_pictures(pictures, request.format)
     if request.calibration:
         ready = _apply_calibration(opened.pair, request.calibration, request.rectify)
     else:

@@ -34,7 +34,7 @@ MEDIA_TYPES = {
 }
 _VIEW = "view"
 _FIELDS = {
-    "arrangement": "format",
+    "format": "format",
     "baseline_m": "baseline_m",
     "calibration": "calib",
     "focal_px": "focal_px",
@@ -114,7 +114,7 @@ def check_pixels(job: ServiceJob) -> float:
     views, megapixels = 3 - len(job.pictures), 0.0
     for path in job.pictures:
         with open_picture(path, views=views) as picture:
-            factor = pixel_factor(path, picture, job.request.arrangement) if views == 2 else 1
+            factor = pixel_factor(path, picture, job.request.format) if views == 2 else 1
             megapixels += factor * _check_megapixels(path, picture.size, job.most_megapixels * views / factor)
     return megapixels
 

@@ -83,7 +83,7 @@ class PairForm(BaseModel):
     def job_arguments(self, calibration: Path | None) -> dict[str, Any]:
         """Return the arguments for `ServiceJob` that the form states."""
         request = Request(
-            arrangement=self.format,
+            format=self.format,
             calibration=calibration,
             focal_px=self.focal_px,
             baseline_m=self.baseline_m,

@@ -24,7 +24,7 @@ from stereoweave.matching.backend import Backend
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
-from stereoweave.pictures.frame_packing import ARRANGEMENTS
+from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS
 from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, check_positions, median_disparity_px
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoPair
@@ -334,10 +334,10 @@ def _spread(count: int, wanted: int) -> range:
 
 
 def _at(time: Fraction, note: Note, video: StereoVideo) -> Note:
-    """Add the time to a note; for swapped views in one file, the remedy becomes the opposite arrangement."""
-    other = _other_way_round(video.arrangement)
+    """Add the time to a note; for swapped views in one file, the remedy becomes the other frame packing."""
+    other = _other_way_round(video.frame_packing)
     if note == SWAPPED and other:
-        note = replace(note, remedy=Remedy(f"choose {other}", ("arrangement",)))
+        note = replace(note, remedy=Remedy(f"choose {other}", ("format",)))
     return replace(note, text=f"{_clock(time)} {note.text}")
 
 
@@ -347,13 +347,13 @@ def _usual(defects: Sequence[list[Note]]) -> list[Note]:
     return some[-1] if 2 * len(some) > len(defects) else []
 
 
-def _other_way_round(arrangement: str | None) -> str | None:
-    """Return the named arrangement with the eyes swapped, if any."""
-    if arrangement is None:
+def _other_way_round(frame_packing: str | None) -> str | None:
+    """Return the named frame packing with the eyes swapped, if any."""
+    if frame_packing is None:
         return None
-    split = ARRANGEMENTS[arrangement]
+    split = PAIR_LAYOUTS[frame_packing]
     other = split._replace(right_first=not split.right_first)
-    return next((name for name, known in ARRANGEMENTS.items() if known == other), None)
+    return next((name for name, known in PAIR_LAYOUTS.items() if known == other), None)
 
 
 def _grey16(disparity_px: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
@@ -380,7 +380,7 @@ def _settings(job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -> dic
         "layout": job.layout,
         "strength": job.strength,
         "convergence_px": job.convergence_px,
-        "arrangement": video.arrangement,
+        "arrangement": video.frame_packing,
         "rate": str(video.rate),
         "model": _known_by(model) if model.exists() else str(job.backend.model),
         "film": [_known_by(source) for source in sources],

@@ -1,4 +1,4 @@
-"""Reading of stereo video: pairs of frames with their times, for any arrangement of the two eyes."""
+"""Reading of stereo video: pairs of frames with their times, for any frame packing."""
 
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.pictures.frame_packing import ARRANGEMENTS, guess_arrangement
+from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, detect_layout
 from stereoweave.video.tracks import Shot, Track, open_track
 
 _BEFORE, _AFTER = "damaged: replaced by the frame before it", "damaged: replaced by the frame after it"
@@ -37,7 +37,7 @@ class StereoVideo:
 
     Attributes:
         name: The files, as the caller gave them.
-        arrangement: How a frame holds both eyes, a name in `ARRANGEMENTS`; None for two files.
+        frame_packing: How a frame holds both eyes, a name in `PAIR_LAYOUTS`; None for two files.
         size_px: Width and height of one eye at full size.
         frame_count: Number of frames that `frames` yields: one for each in the file, damaged or not.
         rate: Average frames per second.
@@ -45,13 +45,13 @@ class StereoVideo:
         sound: The file that has the video's sound, if any.
     """
 
-    def __init__(self, tracks: Sequence[Track], arrangement: str | None) -> None:
-        """Combine two tracks, or split one that has both eyes in the given arrangement."""
+    def __init__(self, tracks: Sequence[Track], frame_packing: str | None) -> None:
+        """Combine two tracks, or split one that has both eyes in each frame."""
         self._tracks = tracks
-        self._split = ARRANGEMENTS[arrangement] if arrangement else None
+        self._split = PAIR_LAYOUTS[frame_packing] if frame_packing else None
         first = tracks[0]
         self.name = ", ".join(track.name for track in tracks)
-        self.arrangement = arrangement
+        self.frame_packing = frame_packing
         self.size_px = self._split.eye_size_px(*first.size_px) if self._split else first.size_px
         self.frame_count = min(len(track.steps) for track in tracks)
         self.rate, self.time_base = first.rate, first.time_base
@@ -90,28 +90,28 @@ class StereoVideo:
 
 
 def open_video(
-    paths: Sequence[Path], arrangement: str | None = None, *, rate: Fraction | None = None
+    paths: Sequence[Path], format: str | None = None, *, rate: Fraction | None = None
 ) -> StereoVideo:
     """Open a stereo video: one file with both eyes, or two, left and right.
 
-    Reads the files once for every frame's time, and decodes some frames to detect the arrangement.
+    Reads the files once for every frame's time, and decodes some frames to detect the frame packing.
 
     Args:
         paths: One or two videos, folders of pictures, or glob patterns of pictures.
-        arrangement: How one frame holds both eyes, a name in `ARRANGEMENTS`. Default: detected.
+        format: How one frame holds both eyes, a name in `PAIR_LAYOUTS`. Default: detected.
         rate: Frames per second of pictures; default: 25.
 
     Raises:
         FormatError: A file cannot be read or halved, is not 3-D, or does not match the other one.
-        StereoweaveError: Unknown arrangement, not one or two paths, a rate for a video, or PyAV is missing.
+        StereoweaveError: Unknown frame packing, not one or two paths, a rate for a video, or PyAV is missing.
     """
-    if arrangement not in (None, *ARRANGEMENTS):
+    if format not in (None, *PAIR_LAYOUTS):
         raise StereoweaveError(
-            f"expected one of {', '.join(ARRANGEMENTS)}, found {arrangement!r}", setting="arrangement"
+            f"expected one of {', '.join(PAIR_LAYOUTS)}, found {format!r}", setting="format"
         )
-    if not 1 <= len(paths) <= 2 or (len(paths) == 2 and arrangement):
+    if not 1 <= len(paths) <= 2 or (len(paths) == 2 and format):
         raise StereoweaveError(
-            "expected one video with both eyes, or two, left and right, without an arrangement, "
+            "expected one video with both eyes, or two, left and right, without a frame packing, "
             f"found {len(paths)}: {' '.join(map(str, paths))}"
         )
     tracks = [open_track(path, rate) for path in paths]
@@ -119,7 +119,7 @@ def open_video(
         _check_company(*tracks)
         return StereoVideo(tracks, None)
     [track] = tracks
-    name = arrangement or guess_arrangement(track.name, track.samples(), track.declared)
+    name = format or detect_layout(track.name, track.samples(), track.declared)
     try:
         return StereoVideo(tracks, name)
     except FormatError as error:

@@ -71,7 +71,7 @@ class VideoTrack:
         time_base: Seconds.
         rate: Average frames per second.
         size_px: Width and height of a whole frame, rotated as a player would.
-        declared: The arrangement that the file declares, if any: a full-size one of `ARRANGEMENTS`, or an
+        declared: The frame packing that the file declares, if any: a full-size one of `PAIR_LAYOUTS`, or an
             unsupported one.
         sound: The file, if it has sound.
         broken_off: Describes a file that ends early; None for a complete one.

@@ -20,7 +20,7 @@ ERRORS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
     "do not resemble each other; give two files, left and right; or choose one of "
     f"{LAYOUTS} (“Layout of a single file”)": ({"left": "left.png"}, {}),
     "“Layout of a single file”: expected one picture that holds both views, found two, left.png and "
-    "right.png; leave it out, and give the left one first": (PAIR, {"arrangement": "crossed"}),
+    "right.png; leave it out, and give the left one first": (PAIR, {"layout": "crossed"}),
     "turned.yml: expected a calibration of rectified pictures, found lenses with distortion; rectify the "
     "pair with it (“Rectify the pair”)": ({**PAIR, "calibration": "turned.yml"}, {}),
     "metres: expected a baseline beside the focal length, found none; give the baseline (“Baseline, mm”)": (

@@ -303,14 +303,14 @@ def test_an_interrupt_ends_the_command_in_order(tmp_path):
     assert "1 frames shown of 1" in said
 
 
-def test_an_arrangement_that_is_none_is_refused_before_anything_is_opened():
+def test_a_frame_packing_that_is_none_is_refused_before_anything_is_opened():
     with pytest.raises(StereoweaveError, match=r"side_by_side, .* found beside of nowhere.mp4"):
-        live(["nowhere.mp4"], arrangement="beside")
+        live(["nowhere.mp4"], format="beside")
     with pytest.raises(StereoweaveError, match=r"of one source .* found crossed of 0 1"):
-        live(["0", "1"], arrangement="crossed")
+        live(["0", "1"], format="crossed")
 
 
 def test_a_frame_that_cannot_be_halved_is_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "frame000.png"), np.zeros((64, 95, 3), np.uint8))
     with pytest.raises(FormatError, match="found 95x64"):
-        live([str(tmp_path / "frame%03d.png")], arrangement="side_by_side", port=0, browser=False)
+        live([str(tmp_path / "frame%03d.png")], format="side_by_side", port=0, browser=False)

@@ -55,8 +55,8 @@ ERRORS = {
     "--depth16, --position, --layout)",
     "video plain.png --depth -o out.mp4": "plain.png: expected 3-D video, two views side by side or one "
     "above the other, found too plain a picture to tell; give two files, left and right; or choose one of "
-    f"{LAYOUTS} (--arrangement)",
-    "video plain.png --depth --arrangement diagonal -o out.mp4": f"--arrangement: expected one of {LAYOUTS}, "
+    f"{LAYOUTS} (--format)",
+    "video plain.png --depth --format diagonal -o out.mp4": f"--format: expected one of {LAYOUTS}, "
     "found 'diagonal'",
     "synth make pylon --pairs 1 --size 8x8 -o set": "--size: expected 32 to 4096 px per side, found 8x8",
     "synth make pylon --pairs 1 --view 3 -o set": "--view: expected positions from -1.0 to 2.0 (0 is the "

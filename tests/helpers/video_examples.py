@@ -38,10 +38,10 @@ def flat_pairs(count: int, *, width: int = 64, height: int = 48) -> list[Pair]:
     ]
 
 
-def packed(left: np.ndarray, right: np.ndarray, arrangement: str = "side_by_side") -> np.ndarray:
+def packed(left: np.ndarray, right: np.ndarray, layout: str = "side_by_side") -> np.ndarray:
     """Pack both eyes into one image."""
     height_px, width_px = left.shape[:2]
-    match arrangement:
+    match layout:
         case "side_by_side":
             return np.hstack([left, right])
         case "crossed":
@@ -55,8 +55,8 @@ def packed(left: np.ndarray, right: np.ndarray, arrangement: str = "side_by_side
         case "top_bottom_half":
             return np.vstack([shrunk(eye, width_px, height_px // 2) for eye in (left, right)])
         case "crossed_half" | "top_bottom_right_first_half":
-            return packed(right, left, "side_by_side_half" if "crossed" in arrangement else "top_bottom_half")
-    raise ValueError(arrangement)
+            return packed(right, left, "side_by_side_half" if "crossed" in layout else "top_bottom_half")
+    raise ValueError(layout)
 
 
 def shrunk(image: np.ndarray, width_px: int, height_px: int) -> np.ndarray:
@@ -69,12 +69,12 @@ def write_side_by_side(
     *,
     times_ms: Sequence[int] | None = None,
     sound: bool = False,
-    arrangement: str = "side_by_side",
+    layout: str = "side_by_side",
     codec: str = "mpeg4",
     **more: object,
 ) -> Path:
     """Write a video of packed pairs; `more` is passed to `write_video`."""
-    frames = [packed(left, right, arrangement) for left, right in pairs]
+    frames = [packed(left, right, layout) for left, right in pairs]
     return write_video(path, frames, times_ms=times_ms, sound=sound, codec=codec, **more)
 
 

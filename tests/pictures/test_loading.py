@@ -15,8 +15,8 @@ from stereoweave.cli.options import Format
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.exif import Lens
 from stereoweave.io.files import read_image, write_image
-from stereoweave.pictures.frame_packing import ARRANGEMENTS
 from stereoweave.pictures.loading import FORMATS, open_pictures
+from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS
 from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, add_mark, write_picture
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoPair
@@ -39,9 +39,9 @@ def assert_eyes(opened, pair, tolerance=0.0):
         assert np.abs(found.astype(int) - taken).mean() <= tolerance
 
 
-def refusal(*paths, arrangement=None, kind=FormatError):
+def refusal(*paths, format=None, kind=FormatError):
     with pytest.raises(kind) as caught:
-        open_pictures(list(paths), arrangement)
+        open_pictures(list(paths), format)
     message = str(caught.value)
     assert "\n" not in message
     return message
@@ -84,7 +84,7 @@ def write_jps(path, image, flags, layout=2, kind=1):
 def test_two_files_are_the_left_and_the_right_view(tmp_path, pair):
     opened = open_pictures(write_two(tmp_path, pair.left, pair.right))
     assert_eyes(opened, pair)
-    assert (opened.arrangement, opened.notes, opened.lens) == ("two_pictures", (), None)
+    assert (opened.layout, opened.notes, opened.lens) == ("two_pictures", (), None)
     assert opened.pair.left.flags.writeable
 
 
@@ -126,11 +126,11 @@ def test_one_or_two_files_are_expected(tmp_path, count):
     assert f"one or two pictures, found {count}" in message
 
 
-def test_an_arrangement_is_for_one_file_and_one_of_the_formats(tmp_path):
+def test_a_format_is_for_one_file_and_one_of_the_formats(tmp_path):
     two = [tmp_path / "a.png", tmp_path / "b.png"]
-    assert "found two" in refusal(*two, arrangement="crossed", kind=StereoweaveError)
-    message = refusal(two[0], arrangement="sideways", kind=StereoweaveError)
-    assert message == f"arrangement: expected one of {', '.join(FORMATS)}, found 'sideways'"
+    assert "found two" in refusal(*two, format="crossed", kind=StereoweaveError)
+    message = refusal(two[0], format="sideways", kind=StereoweaveError)
+    assert message == f"format: expected one of {', '.join(FORMATS)}, found 'sideways'"
 
 
 def test_the_help_of_format_names_all_of_them():
@@ -210,13 +210,13 @@ def test_a_tiff_is_turned_once(tmp_path, pair, lies):
 
 
 @pytest.mark.parametrize("name", ["a.mpo", "a.jpg"])
-@pytest.mark.parametrize("arrangement", [None, "mpo"])
-def test_an_mpo_file_holds_the_left_picture_and_then_the_right_one(tmp_path, pair, name, arrangement):
-    opened = open_pictures([write_mpo(tmp_path / name, pair.left, pair.right)], arrangement)
+@pytest.mark.parametrize("format", [None, "mpo"])
+def test_an_mpo_file_holds_the_left_picture_and_then_the_right_one(tmp_path, pair, name, format):
+    opened = open_pictures([write_mpo(tmp_path / name, pair.left, pair.right)], format)
     assert_eyes(opened, pair, tolerance=3)
-    assert opened.arrangement == "mpo"
+    assert opened.layout == "mpo"
     assert list(map(str, opened.notes)) == [
-        "mpo, two pictures in one file; override it if it is wrong (arrangement)"
+        "mpo, two pictures in one file; override it if it is wrong (format)"
     ]
 
 
@@ -263,9 +263,9 @@ def test_an_mpo_file_whose_second_picture_is_a_preview_is_one_picture(tmp_path, 
     both = np.hstack([pair.left, pair.right])
     path = write_mpo(tmp_path / "a.jpg", both, pair.left)
     opened = open_pictures([path])
-    assert opened.arrangement == "side_by_side"
+    assert opened.layout == "side_by_side"
     assert_eyes(opened, pair, tolerance=3)
-    assert "found one" in refusal(path, arrangement="mpo")
+    assert "found one" in refusal(path, format="mpo")
 
 
 def test_the_first_picture_of_an_mpo_file_may_be_asked_for(tmp_path, pair):
@@ -298,7 +298,7 @@ def test_two_mpo_files_are_two_pictures(tmp_path, pair):
 
 
 @pytest.mark.parametrize(
-    ("flags", "layout", "arrangement"),
+    ("flags", "layout", "format"),
     [
         (0, 2, "crossed"),
         (4, 2, "side_by_side"),
@@ -309,13 +309,13 @@ def test_two_mpo_files_are_two_pictures(tmp_path, pair):
         (0, 3, "top_bottom_right_first"),
     ],
 )
-def test_a_jps_file_says_how_it_holds_its_views(tmp_path, pair, flags, layout, arrangement):
-    image = packed(pair.left, pair.right, arrangement)
+def test_a_jps_file_says_how_it_holds_its_views(tmp_path, pair, flags, layout, format):
+    image = packed(pair.left, pair.right, format)
     for name in ("a.jps", "a.jpg"):
         opened = open_pictures([write_jps(tmp_path / name, image, flags, layout)])
-        assert opened.arrangement == arrangement
+        assert opened.layout == format
         assert list(map(str, opened.notes)) == [
-            f"{arrangement}, from its JPS header; override it if it is wrong (arrangement)"
+            f"{format}, from its JPS header; override it if it is wrong (format)"
         ]
         assert_eyes(opened, pair, tolerance=12)
 
@@ -333,10 +333,10 @@ def test_a_jps_file_that_says_nothing_is_crossed(tmp_path, pair):
     opened = open_pictures([tmp_path / "a.jps"])
     assert_eyes(opened, pair, tolerance=3)
     assert list(map(str, opened.notes)) == [
-        "crossed, the default of .jps files; override it if it is wrong (arrangement)"
+        "crossed, the default of .jps files; override it if it is wrong (format)"
     ]
     image.save(tmp_path / "b.jpg", "JPEG", **FINE)
-    assert open_pictures([tmp_path / "b.jpg"], "jps").arrangement == "crossed"
+    assert open_pictures([tmp_path / "b.jpg"], "jps").layout == "crossed"
 
 
 @pytest.mark.parametrize("layout", [1, 4])
@@ -351,7 +351,7 @@ def test_a_jps_file_that_is_interleaved_or_an_anaglyph_is_refused(tmp_path, pair
 def seen(pair, name, folder):
     write_image(folder / "view.png", packed(pair.left, pair.right, name))
     try:
-        return open_pictures([folder / "view.png"]).arrangement
+        return open_pictures([folder / "view.png"]).layout
     except FormatError:
         return "refused"
 
@@ -380,20 +380,20 @@ def test_a_guess_is_told_and_how_to_overrule_it(tmp_path, pair):
     write_image(tmp_path / "view.png", np.hstack([pair.left, pair.right]))
     opened = open_pictures([tmp_path / "view.png"])
     assert list(map(str, opened.notes)) == [
-        "side_by_side, detected from name and content; override it if it is wrong (arrangement)"
+        "side_by_side, detected from name and content; override it if it is wrong (format)"
     ]
     assert_eyes(opened, pair)
     assert open_pictures([tmp_path / "view.png"], "side_by_side").notes == ()
 
 
-@pytest.mark.parametrize("arrangement", ARRANGEMENTS)
-def test_a_named_arrangement_is_taken_without_a_look(tmp_path, rng, arrangement):
+@pytest.mark.parametrize("format", PAIR_LAYOUTS)
+def test_a_named_format_is_taken_without_a_look(tmp_path, rng, format):
     noise = rng.integers(0, 256, (80, 100, 3), dtype=np.uint8)
     write_image(tmp_path / "view.png", noise)
-    opened = open_pictures([tmp_path / "view.png"], arrangement)
-    first, second = np.split(noise, 2, axis=1 if ARRANGEMENTS[arrangement].beside else 0)
-    if "half" not in arrangement:
-        expected = (second, first) if ARRANGEMENTS[arrangement].right_first else (first, second)
+    opened = open_pictures([tmp_path / "view.png"], format)
+    first, second = np.split(noise, 2, axis=1 if PAIR_LAYOUTS[format].beside else 0)
+    if "half" not in format:
+        expected = (second, first) if PAIR_LAYOUTS[format].right_first else (first, second)
         np.testing.assert_array_equal(opened.pair.left, expected[0])
         np.testing.assert_array_equal(opened.pair.right, expected[1])
     else:
@@ -409,7 +409,7 @@ def test_an_ordinary_photograph_is_refused_with_what_to_do(tmp_path, photograph)
         f"{path}: expected a stereo picture, two views side by side or one above the other"
     )
     assert "; give two files, left and right; or choose one of side_by_side, " in message
-    assert message.endswith(" (arrangement)")
+    assert message.endswith(" (format)")
 
 
 def rendered(pair):
@@ -433,7 +433,7 @@ def test_what_view_writes_for_two_eyes_is_read_back(tmp_path, pair, name, size_p
     path = add_mark(tmp_path / "view.png", name, pair, LayoutOptions())
     write_picture(path, LAYOUTS[name].compose(rendered(pair), LayoutOptions()))
     opened = open_pictures([path])
-    assert opened.arrangement == name
+    assert opened.layout == name
     if "half" not in name:
         assert_eyes(opened, pair)
     elif size_px[0] % 2 == 0:
@@ -451,11 +451,11 @@ def test_what_view_writes_without_two_eyes_is_refused_by_its_name(tmp_path, pair
     path = add_mark(tmp_path / "view.png", name, pair, LayoutOptions())
     write_image(path, np.hstack([pair.left, pair.right]))
     assert f"found {found}" in refusal(path)
-    assert open_pictures([path], "side_by_side").arrangement == "side_by_side"
+    assert open_pictures([path], "side_by_side").layout == "side_by_side"
 
 
 @pytest.mark.parametrize(
-    ("size", "arrangement", "found"),
+    ("size", "format", "found"),
     [
         ((97, 64), "side_by_side", "even width of at least 64 pixels for two views, found 97x64"),
         ((62, 64), "crossed", "found 62x64"),
@@ -463,10 +463,10 @@ def test_what_view_writes_without_two_eyes_is_refused_by_its_name(tmp_path, pair
         ((96, 20), "side_by_side", "expected at least 32x32 pixels, found 48x20"),
     ],
 )
-def test_what_cannot_be_halved_is_refused(tmp_path, size, arrangement, found):
+def test_what_cannot_be_halved_is_refused(tmp_path, size, format, found):
     path = tmp_path / "view.png"
     Image.new("RGB", size).save(path)
-    message = refusal(path, arrangement=arrangement)
+    message = refusal(path, format=format)
     assert message.startswith(f"{path}: ")
     assert found in message
 
@@ -612,7 +612,7 @@ def test_an_animation_is_refused_with_the_number_of_its_pictures(tmp_path, pair,
 
 
 @pytest.mark.parametrize(
-    ("size_px", "views", "arrangement", "found"),
+    ("size_px", "views", "format", "found"),
     [
         ((40_000, 20_000), 1, None, "at most 130 megapixels, found more"),
         ((40_000, 20_000), 2, None, "at most 65 megapixels, found more"),
@@ -620,10 +620,10 @@ def test_an_animation_is_refused_with_the_number_of_its_pictures(tmp_path, pair,
         ((10_000, 7_000), 2, None, "at most 65 megapixels, found 10000x7000"),
     ],
 )
-def test_too_large_a_picture_is_refused_before_it_is_decoded(tmp_path, size_px, views, arrangement, found):
+def test_too_large_a_picture_is_refused_before_it_is_decoded(tmp_path, size_px, views, format, found):
     path = tmp_path / "bomb.png"
     path.write_bytes(png_of(*size_px))
-    message = refusal(*[path] * views, arrangement=arrangement)
+    message = refusal(*[path] * views, format=format)
     assert found in message
     assert "scale it down" in message
 
@@ -631,4 +631,4 @@ def test_too_large_a_picture_is_refused_before_it_is_decoded(tmp_path, size_px, 
 def test_a_picture_within_the_limit_that_is_not_whole_is_refused(tmp_path):
     path = tmp_path / "cut.png"
     path.write_bytes(png_of(400, 300))
-    assert re.search(r"cut\.png: expected a picture .* found", refusal(path, arrangement="side_by_side"))
+    assert re.search(r"cut\.png: expected a picture .* found", refusal(path, format="side_by_side"))

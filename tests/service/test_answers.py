@@ -83,7 +83,7 @@ def jps_of(picture: Image.Image, flags: int) -> bytes:
 
 
 def test_half_views_that_are_named_are_measured_by_the_head_of_their_picture(halves):
-    named = replace(halves, request=Request(arrangement="side_by_side_half"))
+    named = replace(halves, request=Request(format="side_by_side_half"))
     assert check_pixels(named) == 2 * 1280 * 480 / 1e6
     assert check_pixels(replace(named, most_megapixels=0.62)) == 2 * 1280 * 480 / 1e6
     with pytest.raises(TooLargeError, match=r"expected at most 0\.6 megapixels, found 1280x480"):

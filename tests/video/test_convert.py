@@ -94,7 +94,7 @@ def test_colours_of_depth_mean_the_same_in_all_of_the_video(tmp_path, capsys):
     near = example_pairs(1)[0]
     far = (255 - near[0][::-1],) * 2
     video = write_side_by_side(tmp_path / "in.mp4", [near, near, far, far], codec="libx264")
-    assert run(video, tmp_path / "out.mp4", "--depth", "--arrangement", "side_by_side") == 0
+    assert run(video, tmp_path / "out.mp4", "--depth", "--format", "side_by_side") == 0
     assert capsys.readouterr().out.endswith("4 frames, 1 cut\n")
     with av.open(str(tmp_path / "out.mp4")) as container:
         comment = container.metadata["comment"]
@@ -140,7 +140,7 @@ def test_disparities_behind_the_screen_are_found_however_late_in_a_video(tmp_pat
     pairs = converged_pairs([22] * 6 + [62] * 2)
     times_ms = range(0, 8 * 12_000, 12_000)
     video = write_side_by_side(tmp_path / "in.mp4", pairs, times_ms=times_ms, codec="libx264")
-    words = ["--arrangement", "side_by_side"]
+    words = ["--format", "side_by_side"]
     assert run(video, tmp_path / "depth.mkv", "--depth", *words) == 0
     with av.open(str(tmp_path / "depth.mkv")) as container:
         comment = container.metadata["COMMENT"]
@@ -159,7 +159,7 @@ def test_disparities_behind_the_screen_are_found_however_late_in_a_video(tmp_pat
 
 def test_depth_in_16_bits_says_what_it_cannot_hold(tmp_path, capsys):
     video = write_side_by_side(tmp_path / "in.mp4", converged_pairs([40, 40]), codec="libx264")
-    assert run(video, tmp_path / "out.mkv", "--depth16", "--arrangement", "side_by_side") == 0
+    assert run(video, tmp_path / "out.mkv", "--depth16", "--format", "side_by_side") == 0
     [line] = [line for line in capsys.readouterr().err.splitlines() if "16-bit" in line]
     assert line.startswith("16-bit grey holds 0 to 255.99 px: this video's disparities, -2")
     assert line.endswith("are clipped; show all of them in colours (--depth)")
@@ -284,7 +284,7 @@ def test_a_damaged_frame_is_told_with_its_time_and_is_not_the_end(tmp_path, caps
         ("out.mp4", ["--depth16"], "expected the ending .mkv for depth in 16 bits, found '.mp4'"),
         ("in.mp4", ["--depth"], "expected another file than the input video"),
         ("out.mp4", ["--depth", "--model", "huge"], "unknown model 'huge'"),
-        ("out.mp4", ["--depth", "--arrangement", "diagonal"], "--arrangement: expected one of side_by_side"),
+        ("out.mp4", ["--depth", "--format", "diagonal"], "--format: expected one of side_by_side"),
         ("out.mp4", ["--position", "0", "--convergence", "nan"], "--convergence: expected a finite number"),
         ("out.mp4", ["--layout", "quilt", "--convergence", "-inf"], "expected a finite number, found -inf"),
         ("out.mp4", ["--position", "0.5", "--strength", "inf"], "--strength: expected a finite number"),
@@ -308,6 +308,22 @@ def test_what_cannot_be_made_is_one_line_before_any_work(tmp_path, capsys, out, 
     assert video.read_bytes() == before
 
 
+@pytest.mark.parametrize("command", ["video -o out.mp4 --depth", "live --no-browser"])
+def test_the_old_name_of_format_is_accepted_with_a_warning(capsys, command):
+    assert main([*command.split(), "none.mp4", "--arrangement", "diagonal"]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(
+        "stereoweave: warning: --arrangement is deprecated; use --format\nstereoweave: --format: expected "
+    )
+    assert "diagonal" in told
+    assert main([*command.split(), "none.mp4", "--arrangement", "crossed", "--format", "crossed"]) == 2
+    assert capsys.readouterr().err == (
+        "stereoweave: --arrangement: expected --format alone, its new name, found both\n"
+    )
+    assert main([command.split()[0], "--help"]) == 0
+    assert "--arrangement" not in capsys.readouterr().out
+
+
 def test_what_is_no_3d_video_is_one_line(tmp_path, capsys):
     wide = [np.hstack([left, np.flip(left)]) for left, _ in example_pairs(2)]
     flat = write_video(tmp_path / "flat.mp4", wide, codec="libx264")
@@ -320,13 +336,13 @@ def test_what_is_no_3d_video_is_one_line(tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["broken.mp4", "flat.mp4"]
 
 
-def test_swapped_sides_are_told_with_the_arrangement_that_mends_them(tmp_path, capsys):
+def test_swapped_sides_are_told_with_the_frame_packing_that_mends_them(tmp_path, capsys):
     pairs = example_pairs(2, width=320, height=192)
-    crossed = write_side_by_side(tmp_path / "in.mp4", pairs, arrangement="crossed", codec="libx264")
-    assert run(crossed, tmp_path / "a.mp4", "--depth", "--arrangement", "side_by_side") == 0
+    crossed = write_side_by_side(tmp_path / "in.mp4", pairs, layout="crossed", codec="libx264")
+    assert run(crossed, tmp_path / "a.mp4", "--depth", "--format", "side_by_side") == 0
     told = capsys.readouterr().err
-    assert told.count("swapped; choose crossed (--arrangement)") == 1
-    assert run(crossed, tmp_path / "b.mp4", "--depth", "--arrangement", "crossed") == 0
+    assert told.count("swapped; choose crossed (--format)") == 1
+    assert run(crossed, tmp_path / "b.mp4", "--depth", "--format", "crossed") == 0
     assert "swapped" not in capsys.readouterr().err
 
 
@@ -336,18 +352,18 @@ def test_a_video_is_looked_at_beyond_its_first_minute(tmp_path, capsys):
     pairs = [pair if index < 3 else pair[::-1] for index, pair in enumerate(pairs)]
     times_ms = range(0, 8 * 10_000, 10_000)
     video = write_side_by_side(tmp_path / "in.mp4", pairs, times_ms=times_ms, codec="libx264")
-    assert run(video, tmp_path / "out.mp4", "--position", "0", "--arrangement", "side_by_side") == 0
+    assert run(video, tmp_path / "out.mp4", "--position", "0", "--format", "side_by_side") == 0
     assert capsys.readouterr().err.count("0:01:10.000 ") == 1
 
 
-def test_swapped_videos_are_told_without_an_arrangement(tmp_path, capsys):
+def test_swapped_videos_are_told_without_a_frame_packing(tmp_path, capsys):
     pairs = example_pairs(2, width=320, height=192)
     left, right = (write_video(tmp_path / f"{eye}.mp4", [pair[eye] for pair in pairs]) for eye in (0, 1))
     words = ["video", str(right), str(left), "-o", str(tmp_path / "out.mp4"), "--position", "0"]
     assert main(words) == 0
     told = capsys.readouterr().err
     assert "swapped" in told
-    assert "--arrangement" not in told
+    assert "--format" not in told
 
 
 def write_pictures(folder: Path, count: int) -> Path:
@@ -383,7 +399,7 @@ def test_a_video_taken_apart_otherwise_is_not_gone_on_with(tmp_path, monkeypatch
         patch.setattr("stereoweave.video.reader.StereoVideo", Interrupted)
         assert run(video, tmp_path / "out.mp4", "--position", "0.5") == 130
     capsys.readouterr()
-    assert run(video, tmp_path / "out.mp4", "--position", "0.5", "--arrangement", "crossed") == 2
+    assert run(video, tmp_path / "out.mp4", "--position", "0.5", "--format", "crossed") == 2
     assert "found parts begun with arrangement side_by_side;" in capsys.readouterr().err
 
 

@@ -21,8 +21,8 @@ from video_examples import (
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import write_image
-from stereoweave.pictures.frame_packing import guess_arrangement, measure_resemblance
-from stereoweave.video.reader import ARRANGEMENTS, open_video
+from stereoweave.pictures.pair_layouts import detect_layout, measure_resemblance
+from stereoweave.video.reader import PAIR_LAYOUTS, open_video
 from stereoweave.video.tracks import _by_rank, _fill_missing, _separate
 
 BEFORE = "damaged: replaced by the frame before it"
@@ -63,28 +63,26 @@ def write_pictures(folder, pattern, images):
         write_image(folder / pattern.format(index), image)
 
 
-@pytest.mark.parametrize("arrangement", ARRANGEMENTS)
-def test_each_arrangement_gives_both_eyes_at_full_size(tmp_path, arrangement):
+@pytest.mark.parametrize("format", PAIR_LAYOUTS)
+def test_each_frame_packing_gives_both_eyes_at_full_size(tmp_path, format):
     pairs = flat_pairs(3, height=72)
-    path = write_side_by_side(tmp_path / "video.mkv", pairs, arrangement=arrangement, codec="ffv1")
-    video = open_video([path], arrangement)
+    path = write_side_by_side(tmp_path / "video.mkv", pairs, layout=format, codec="ffv1")
+    video = open_video([path], format)
     assert video.size_px == (64, 72)
     assert (video.frame_count, video.rate, video.sound) == (3, 25, None)
     assert_eyes(video.frames(), pairs)
 
 
-@pytest.mark.parametrize(
-    "arrangement", ["side_by_side", "side_by_side_half", "top_bottom", "top_bottom_half"]
-)
-def test_an_arrangement_that_nobody_names_is_seen(tmp_path, arrangement):
+@pytest.mark.parametrize("format", ["side_by_side", "side_by_side_half", "top_bottom", "top_bottom_half"])
+def test_a_frame_packing_that_nobody_names_is_seen(tmp_path, format):
     pairs = example_pairs(5)
-    path = write_side_by_side(tmp_path / "video.mkv", pairs, arrangement=arrangement, codec="ffv1")
-    lost_in_half = 3.0 if arrangement.endswith("half") else 0.0
+    path = write_side_by_side(tmp_path / "video.mkv", pairs, layout=format, codec="ffv1")
+    lost_in_half = 3.0 if format.endswith("half") else 0.0
     assert_eyes(open_video([path]).frames(), pairs, lost_in_half)
 
 
 @pytest.mark.parametrize(
-    ("name", "width", "height", "arrangement"),
+    ("name", "width", "height", "format"),
     [
         ("video_RL.mkv", 1280, 480, "crossed"),
         ("video_RL.mkv", 640, 480, "crossed_half"),
@@ -98,8 +96,8 @@ def test_an_arrangement_that_nobody_names_is_seen(tmp_path, arrangement):
         ("sbs/video_TB.mkv", 640, 960, "top_bottom"),
     ],
 )
-def test_the_name_says_what_cannot_be_seen(name, width, height, arrangement):
-    assert guess_arrangement(name, [np.full((height, width, 3), 90, np.uint8)]) == arrangement
+def test_the_name_says_what_cannot_be_seen(name, width, height, format):
+    assert detect_layout(name, [np.full((height, width, 3), 90, np.uint8)]) == format
 
 
 def test_a_name_that_means_something_else_is_not_believed(tmp_path):
@@ -109,9 +107,9 @@ def test_a_name_that_means_something_else_is_not_believed(tmp_path):
 
 def test_what_the_container_declares_is_believed(tmp_path):
     pairs = flat_pairs(3)
-    for mode, arrangement in (("right_left", "crossed"), ("left_right", "side_by_side"), ("top_bottom",) * 2):
+    for mode, format in (("right_left", "crossed"), ("left_right", "side_by_side"), ("top_bottom",) * 2):
         path = tmp_path / f"{mode}.mkv"
-        write_side_by_side(path, pairs, arrangement=arrangement, stereo_mode=mode, codec="ffv1")
+        write_side_by_side(path, pairs, layout=format, stereo_mode=mode, codec="ffv1")
         assert_eyes(open_video([path]).frames(), pairs)
 
 
@@ -123,7 +121,7 @@ def test_what_the_frames_of_h264_declare_is_believed(tmp_path):
     assert_eyes(open_video([path]).frames(), pairs, tolerance=1.5)
 
 
-def test_a_declared_arrangement_that_is_not_read_is_named(tmp_path):
+def test_a_declared_frame_packing_that_is_not_read_is_named(tmp_path):
     path = write_side_by_side(
         tmp_path / "video.mkv", flat_pairs(2), stereo_mode="row_interleaved_lr", codec="ffv1"
     )
@@ -136,7 +134,7 @@ def test_a_video_that_is_not_3d_is_refused_with_what_to_do(tmp_path):
     path = write_video(tmp_path / "video.mkv", [left for left, _ in example_pairs(5)])
     message = refusal(path)
     assert message.startswith(f"{path}: expected 3-D video")
-    assert "(arrangement)" in message
+    assert "(format)" in message
     assert "two files" in message
     assert open_video([path], "side_by_side_half").size_px == (160, 96)
 
@@ -157,15 +155,15 @@ def test_two_views_resemble_each_other_and_other_pictures_do_not():
 
 def test_an_odd_width_is_refused_side_by_side_and_taken_top_to_bottom(tmp_path):
     path = write_video(tmp_path / "video.mkv", [np.zeros((96, 161, 3), np.uint8)], codec="ffv1")
-    for arrangement in ("side_by_side", "side_by_side_half", "crossed"):
-        message = refusal(path, arrangement=arrangement)
+    for format in ("side_by_side", "side_by_side_half", "crossed"):
+        message = refusal(path, format=format)
         assert message.startswith(f"{path}: ")
         assert "even width" in message
         assert "161x96" in message
     assert open_video([path], "top_bottom").size_px == (161, 48)
     assert "even height" in refusal(
         write_video(tmp_path / "b.mkv", [np.zeros((97, 160, 3), np.uint8)], codec="ffv1"),
-        arrangement="top_bottom",
+        format="top_bottom",
     )
 
 
@@ -173,7 +171,7 @@ def test_frame_times_are_the_files_own_counted_from_its_first_frame(tmp_path):
     times_ms = [2000, 2040, 2107, 2140, 2900]
     for name in ("video.mkv", "video.mp4"):
         path = write_side_by_side(
-            tmp_path / name, flat_pairs(5), times_ms=times_ms, arrangement="top_bottom", codec="libx264"
+            tmp_path / name, flat_pairs(5), times_ms=times_ms, layout="top_bottom", codec="libx264"
         )
         video = open_video([path], "top_bottom")
         times = [frame.time for frame in video.frames()]
@@ -450,10 +448,10 @@ def test_without_pyav_the_extra_is_named_and_pictures_still_work(tmp_path, monke
 
 def test_what_cannot_be_meant_is_refused(tmp_path):
     path = write_side_by_side(tmp_path / "video.mkv", flat_pairs(1))
-    assert "'sideways'" in refusal(path, arrangement="sideways")
+    assert "'sideways'" in refusal(path, format="sideways")
     assert "found 3" in refusal(path, path, path)
     assert "found 0" in refusal()
-    assert "without an arrangement" in refusal(path, path, arrangement="top_bottom")
+    assert "without a frame packing" in refusal(path, path, format="top_bottom")
 
 
 def test_frames_are_read_one_after_the_other_and_files_closed(tmp_path):

@@ -16,7 +16,7 @@ Picture = UInt8[np.ndarray, "h w 3"]
 Frame = UInt8[np.ndarray, "rows columns 3"]
 
 
-class Arrangement(NamedTuple):
+class PairLayout(NamedTuple):
     """Layout of two views in one frame; by default side by side, full size, left view first."""
 
     beside: bool = True
@@ -47,15 +47,15 @@ class Arrangement(NamedTuple):
         return np.ascontiguousarray(left), np.ascontiguousarray(right)
 
 
-ARRANGEMENTS = {
-    "side_by_side": Arrangement(),
-    "side_by_side_half": Arrangement(half=True),
-    "top_bottom": Arrangement(beside=False),
-    "top_bottom_half": Arrangement(beside=False, half=True),
-    "crossed": Arrangement(right_first=True),
-    "crossed_half": Arrangement(half=True, right_first=True),
-    "top_bottom_right_first": Arrangement(beside=False, right_first=True),
-    "top_bottom_right_first_half": Arrangement(beside=False, half=True, right_first=True),
+PAIR_LAYOUTS = {
+    "side_by_side": PairLayout(),
+    "side_by_side_half": PairLayout(half=True),
+    "top_bottom": PairLayout(beside=False),
+    "top_bottom_half": PairLayout(beside=False, half=True),
+    "crossed": PairLayout(right_first=True),
+    "crossed_half": PairLayout(half=True, right_first=True),
+    "top_bottom_right_first": PairLayout(beside=False, right_first=True),
+    "top_bottom_right_first_half": PairLayout(beside=False, half=True, right_first=True),
 }
 
 _WORDS_IN_NAMES = {
@@ -87,14 +87,14 @@ _WINDOW_PX, _STEP_PX, _SHIFT_PX, _OFF_PX = 20, 10, 32, 2
 _PLAIN, _FEW_WINDOWS, _AGREE_PX = 3.0, 6, 3
 
 
-def guess_arrangement(
+def detect_layout(
     name: str,
     frames: Sequence[Frame],
     declared: str | None = None,
     *,
     photograph: bool = False,
 ) -> str:
-    """Detect a video's layout, a name in `ARRANGEMENTS`, from its container, its name or its frames.
+    """Detect a video's layout, a name in `PAIR_LAYOUTS`, from its container, its name or its frames.
 
     The frames must confirm a layout in the name, unless they are too plain: "LR" has other meanings too. The
     frames do not show which view comes first; it is the left one, unless the container or the name differs.
@@ -102,23 +102,23 @@ def guess_arrangement(
     Args:
         name: Path of the file; its name, without folders, may contain a layout: film_SBS, film-half-OU.
         frames: Some frames of the video, far apart in time.
-        declared: Layout in the container, a full-size name in `ARRANGEMENTS`; the views may still be half
+        declared: Layout in the container, a full-size name in `PAIR_LAYOUTS`; the views may still be half
             size.
         photograph: Whether it is a photograph, which may be upright, rather than a video.
 
     Raises:
         FormatError: The halves of the frames resemble each other in neither split, or the declared layout is
-            not in `ARRANGEMENTS`.
+            not in `PAIR_LAYOUTS`.
     """
-    if declared not in (None, *ARRANGEMENTS):
+    if declared not in (None, *PAIR_LAYOUTS):
         raise FormatError(
             f"{name}: expected two views side by side, or the left one above the right one, found a video "
             f"that declares {declared}",
-            remedy=Remedy(f"if that is wrong, choose one of {', '.join(ARRANGEMENTS)}", ("arrangement",)),
+            remedy=Remedy(f"if that is wrong, choose one of {', '.join(PAIR_LAYOUTS)}", ("format",)),
         )
     words = set(re.split(r"[^a-z0-9]+", Path(name).name.lower()))
     named = next((kind for kind, marks in _WORDS_IN_NAMES.items() if marks & words), None)
-    kind = declared or _confirm(named, frames) or _detect_layout(name, frames, photograph)
+    kind = declared or _confirm(named, frames) or _detect_by_content(name, frames, photograph)
     looks_squeezed = _looks_squeezed_photograph if photograph else _looks_squeezed
     squeezed = bool(words & _HALF) or (not words & _FULL and looks_squeezed(kind, frames[0]))
     return f"{kind}_half" if squeezed else kind
@@ -172,7 +172,7 @@ def _score_halves(kind: str, frames: Sequence[Frame]) -> float:
 
 def _split_halves(kind: str, frame: Frame) -> tuple[Picture, Picture]:
     height_px, width_px = frame.shape[0] // 2, frame.shape[1] // 2
-    if ARRANGEMENTS[kind].beside:
+    if PAIR_LAYOUTS[kind].beside:
         return frame[:, :width_px], frame[:, -width_px:]
     return frame[:height_px], frame[-height_px:]
 
@@ -181,7 +181,7 @@ def _confirm(named: str | None, frames: Sequence[Frame]) -> str | None:
     return None if named is None or _score_halves(named, frames) < _ALIKE else named
 
 
-def _detect_layout(name: str, frames: Sequence[Frame], photograph: bool) -> str:
+def _detect_by_content(name: str, frames: Sequence[Frame], photograph: bool) -> str:
     height_px, width_px = frames[0].shape[:2]
     plausible = {
         "side_by_side": width_px >= _NARROWEST_BESIDE * height_px,
@@ -198,20 +198,20 @@ def _detect_layout(name: str, frames: Sequence[Frame], photograph: bool) -> str:
     raise FormatError(
         f"{name}: expected {expected}, two views side by side or one above the other, found {found}; "
         "give two files, left and right",
-        remedy=Remedy(f"or choose one of {', '.join(ARRANGEMENTS)}", ("arrangement",)),
+        remedy=Remedy(f"or choose one of {', '.join(PAIR_LAYOUTS)}", ("format",)),
     )
 
 
 def _looks_squeezed(kind: str, frame: Frame) -> bool:
     height_px, width_px = frame.shape[:2]
-    if ARRANGEMENTS[kind].beside:
+    if PAIR_LAYOUTS[kind].beside:
         return width_px / 2 < _NARROWEST_EYE * height_px
     return width_px > _WIDEST_EYE * height_px / 2
 
 
 def _looks_squeezed_photograph(kind: str, frame: Frame) -> bool:
     height_px, width_px = frame.shape[:2]
-    if ARRANGEMENTS[kind].beside:
+    if PAIR_LAYOUTS[kind].beside:
         aspect = width_px / 2 / height_px
         # A picture with the aspect ratio of a screen is made for a 3-D screen, which stretches half views.
         if abs(width_px / height_px / _SCREEN - 1) < _SCREEN_TOLERANCE:
