@@ -44,6 +44,9 @@ _OUTER_PERCENT, _MARGIN_PX = 0.5, 8.0
 _NAMED_PROBLEMS = 3
 _STEPS_PER_PX, _MOST_GREY16_PX = 256, 255.99
 
+# Keys of the saved settings that are not settings, and their names in errors.
+_SAVED_FACTS = {"film": "video", "stereoweave": "stereoweave"}
+
 PACKINGS = {
     "side_by_side": Packing("left_right", 3),
     "side_by_side_half": Packing("left_right", 3),
@@ -140,6 +143,13 @@ class VideoJob:
             return self.convergence_px
         return survey.middle_px if self.layout and LAYOUTS[self.layout].converged else 0.0
 
+    def name_of_saved(self, key: str) -> str:
+        """Return the front end's name for a key of the saved settings."""
+        if key in _SAVED_FACTS:
+            return _SAVED_FACTS[key]
+        setting = "format" if key == "arrangement" else key
+        return self.name_of(setting) or setting
+
     def loses(self, survey: "Survey") -> list[Note]:
         """Return a note if the file cannot hold all of the video's disparities."""
         low_px, high_px = survey.range_px
@@ -228,7 +238,7 @@ def convert_video(
     )
     with (
         lock_output(out),
-        growing(out, _settings(job, video, sources)) as parts,
+        growing(out, _settings(job, video, sources), job.name_of_saved) as parts,
         progress(console) as bar,
     ):
         if parts.files:

@@ -28,7 +28,7 @@ from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTr
 from av.video.stream import VideoStream
 from jaxtyping import UInt8, UInt16
 
-from stereoweave.errors import StereoweaveError
+from stereoweave.errors import NameOf, StereoweaveError, keyword
 from stereoweave.io.files import make_folder, remove_leftovers, replacing
 
 if TYPE_CHECKING:  # PyAV's types have parameters that its classes lack
@@ -223,12 +223,13 @@ def parts_folder(out: Path) -> Path:
 
 
 @contextmanager
-def growing(out: Path, settings: Mapping[str, object]) -> Iterator[Parts]:
+def growing(out: Path, settings: Mapping[str, object], name_of: NameOf = keyword) -> Iterator[Parts]:
     """Open the parts of a video, to add more; removes them on success and keeps finished ones after an error.
 
     Args:
         out: The video that the parts will become.
         settings: Its input and settings, as JSON values.
+        name_of: The front end's names for these settings, used in errors.
 
     Raises:
         StereoweaveError: The folder has parts with other settings or damaged ones; or an error of the body,
@@ -237,7 +238,7 @@ def growing(out: Path, settings: Mapping[str, object]) -> Iterator[Parts]:
     folder = parts_folder(out)
     parts = Parts(folder)
     if parts.files:
-        _check_settings(folder, settings)
+        _check_settings(folder, settings, name_of)
         parts.state()
         remove_leftovers(folder)
     else:
@@ -272,20 +273,20 @@ def _clear(folder: Path) -> None:
         folder.rmdir()
 
 
-def _check_settings(folder: Path, settings: Mapping[str, object]) -> None:
+def _check_settings(folder: Path, settings: Mapping[str, object], name_of: NameOf) -> None:
     file = _settings_file(folder)
     with _undamaged(file):
         found = dict(json.loads(file.read_text()))
     other = [name for name, value in json.loads(json.dumps(settings)).items() if value != found.get(name)]
     if other:
-        begun = ", ".join(_begun_with(name, found.get(name)) for name in other)
+        begun = ", ".join(_format_setting(name_of(name) or name, found.get(name)) for name in other)
         raise StereoweaveError(
             f"{folder}: expected parts of the same video, found parts begun {begun}; "
             "remove that folder, or give the same settings again"
         )
 
 
-def _begun_with(name: str, value: object) -> str:
+def _format_setting(name: str, value: object) -> str:
     match value:
         case None | False:
             return f"without {name}"

@@ -225,13 +225,13 @@ def test_another_order_does_not_go_on_with_what_was_begun(tmp_path, monkeypatch,
     video = slow_video(tmp_path / "in.mp4", 10)
     with monkeypatch.context() as patch:
         patch.setattr("stereoweave.video.reader.StereoVideo", Interrupted)
-        assert run(video, tmp_path / "out.mp4", "--position", "0.4") == 130
+        assert run(video, tmp_path / "out.mp4", "--position", "0.4", "--convergence", "3") == 130
     capsys.readouterr()
     assert run(video, tmp_path / "out.mp4", "--position", "0.6") == 2
     folder = tmp_path / "out.mp4.parts"
     assert capsys.readouterr().err == (
-        f"stereoweave: {folder}: expected parts of the same video, found parts begun with position 0.4; "
-        "remove that folder, or give the same settings again\n"
+        f"stereoweave: {folder}: expected parts of the same video, found parts begun with --position 0.4, "
+        "with --convergence 3.0; remove that folder, or give the same settings again\n"
     )
 
 
@@ -390,7 +390,7 @@ def test_a_series_of_which_one_picture_changed_is_not_gone_on_with(tmp_path, mon
     os.utime(folder / "006.png", ns=(status.st_atime_ns, status.st_mtime_ns + 1_000_000))
     capsys.readouterr()
     assert run(folder / pattern, out, *words) == 2
-    assert "found parts begun with another film;" in capsys.readouterr().err
+    assert "found parts begun with another video;" in capsys.readouterr().err
 
 
 def test_a_video_taken_apart_otherwise_is_not_gone_on_with(tmp_path, monkeypatch, capsys):
@@ -400,7 +400,7 @@ def test_a_video_taken_apart_otherwise_is_not_gone_on_with(tmp_path, monkeypatch
         assert run(video, tmp_path / "out.mp4", "--position", "0.5") == 130
     capsys.readouterr()
     assert run(video, tmp_path / "out.mp4", "--position", "0.5", "--format", "crossed") == 2
-    assert "found parts begun with arrangement side_by_side;" in capsys.readouterr().err
+    assert "found parts begun with --format side_by_side;" in capsys.readouterr().err
 
 
 def test_a_video_stopped_while_it_is_opened_says_what_it_says_later(tmp_path, monkeypatch, capsys):
