@@ -35,7 +35,7 @@ Frame = UInt8[np.ndarray, "rows columns 3"]
 
 _ADDRESS = "127.0.0.1"
 # Other names are refused: another site could point its own name at this address (DNS rebinding).
-_OWN_NAMES = (_ADDRESS, "localhost")
+_HOST_NAMES = (_ADDRESS, "localhost")
 # Not "picture": FFmpeg, a possible client, mistakes its first letters for the start of a QuickTime file.
 _BOUNDARY = "frame"
 _PAGE = b"""<!doctype html>
@@ -49,13 +49,13 @@ _PAGE = b"""<!doctype html>
 <img src="/stream" alt="The left picture, and its disparity in colours beside it">
 </html>
 """
-_USUAL_RATE = 25.0
+_DEFAULT_RATE = 25.0
 # A network stream may be slow; a camera without a frame for this long is disconnected.
-_SILENT_S = 10.0
+_TIMEOUT_S = 10.0
 # The share by which the colour range follows that of a new frame; at 1 the colours would flicker.
-_FOLLOWED = 0.1
-_RANGED_EVERY_PX = 4
-_RATED_FRAMES = 30
+_RANGE_SHARE = 0.1
+_RANGE_STEP_PX = 4
+_RATE_FRAMES = 30
 _STRIP_PX, _FONT, _FONT_SCALE = 32, cv2.FONT_HERSHEY_SIMPLEX, 0.6
 _JPEG_QUALITY = 85
 
@@ -89,16 +89,16 @@ class Capture:
                 f"{' '.join(sources)}"
             )
         self.name, self.count = " and ".join(sources), len(sources)
-        self._captures = [_opened(source) for source in sources]
+        self._captures = [_open_source(source) for source in sources]
         first = self._captures[0]
         # A picture or a recorded stream has no frame count.
-        self._is_film = first.get(cv2.CAP_PROP_FRAME_COUNT) > 0 or Path(sources[0]).is_file()
+        self._is_recording = first.get(cv2.CAP_PROP_FRAME_COUNT) > 0 or Path(sources[0]).is_file()
         rate = first.get(cv2.CAP_PROP_FPS)
-        self._step_s = 1 / (rate if rate > 0 else _USUAL_RATE)
+        self._step_s = 1 / (rate if rate > 0 else _DEFAULT_RATE)
         self._newest: Moment | None = None
         self._ended = False
         self._changed, self._stopped = threading.Condition(), threading.Event()
-        self._thread = threading.Thread(target=self._read_on, daemon=True)
+        self._thread = threading.Thread(target=self._keep_reading, daemon=True)
 
     def __enter__(self) -> "Capture":
         self._thread.start()
@@ -117,25 +117,25 @@ class Capture:
             StereoweaveError: If a camera or stream stops, or a video has no frame.
         """
         with self._changed:
-            came = self._changed.wait_for(lambda: self._ended or self._has(after), _SILENT_S)
-            if self._has(after):
+            came = self._changed.wait_for(lambda: self._ended or self._has_newer(after), _TIMEOUT_S)
+            if self._has_newer(after):
                 return self._newest
-        if came and self._is_film and after >= 0:
+        if came and self._is_recording and after >= 0:
             return None
-        found = "the end of what it gives" if came else f"nothing for {_SILENT_S:g} s"
+        found = "the end of what it gives" if came else f"nothing for {_TIMEOUT_S:g} s"
         raise StereoweaveError(
             f"{self.name}: expected frames, found {found} after {after + 1}; is it still connected?"
         )
 
-    def _has(self, after: int) -> bool:
+    def _has_newer(self, after: int) -> bool:
         return self._newest is not None and self._newest.number > after
 
-    def _read_on(self) -> None:
+    def _keep_reading(self) -> None:
         begin_s = time.monotonic()
         try:
             for number in count():
                 pictures = self._read()
-                early_s = begin_s + number * self._step_s - time.monotonic() if self._is_film else 0
+                early_s = begin_s + number * self._step_s - time.monotonic() if self._is_recording else 0
                 if pictures is None or self._stopped.wait(max(early_s, 0)):
                     return
                 with self._changed:
@@ -219,10 +219,10 @@ class Screen(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
-        if urlsplit(f"//{self.headers.get('Host', '')}").hostname not in _OWN_NAMES:
+        if urlsplit(f"//{self.headers.get('Host', '')}").hostname not in _HOST_NAMES:
             self.send_error(403, "only for this machine")
         elif self.path == "/":
-            self._begin("text/html; charset=utf-8")
+            self._send_headers("text/html; charset=utf-8")
             self.wfile.write(_PAGE)
         elif self.path == "/stream":
             with suppress(ConnectionError):  # the visitor has left
@@ -233,7 +233,7 @@ class _Handler(BaseHTTPRequestHandler):
     def log_message(self, format: str, *values: object) -> None:
         """Log nothing: each request would print a line on the terminal."""
 
-    def _begin(self, kind: str) -> None:
+    def _send_headers(self, kind: str) -> None:
         self.send_response(200)
         self.send_header("Content-Type", kind)
         self.send_header("Cache-Control", "no-store")
@@ -242,7 +242,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _stream(self) -> None:
         boundary = f"\r\n--{_BOUNDARY}\r\n".encode()
-        self._begin(f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
+        self._send_headers(f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
         self.wfile.write(boundary)
         for jpeg in cast(Screen, self.server).pictures():
             header = f"Content-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n".encode()
@@ -258,7 +258,7 @@ class LiveTally:
     last: int = -1
     waited_s: float = 0.0
     first_s: float = 0.0
-    last_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RATED_FRAMES))
+    last_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RATE_FRAMES))
 
     def add(self, moment: Moment, now_s: float) -> None:
         """Count a moment that is shown now."""
@@ -270,13 +270,13 @@ class LiveTally:
     @property
     def rate(self) -> float:
         """Frames per second over the last frames; 0 for a single one."""
-        return _rate(len(self.last_s), self.last_s[-1] - self.last_s[0])
+        return _measure_rate(len(self.last_s), self.last_s[-1] - self.last_s[0])
 
-    def line(self) -> str:
-        """The statistics in one line."""
+    def describe(self) -> str:
+        """Describe the statistics in one line."""
         if not self.shown:
             return "nothing was shown"
-        rate = _rate(self.shown, self.last_s[-1] - self.first_s)
+        rate = _measure_rate(self.shown, self.last_s[-1] - self.first_s)
         return (
             f"{self.shown} frames shown of {self.last + 1}, {rate:.1f} a second, "
             f"{1000 * self.waited_s / self.shown:.0f} ms after they came"
@@ -306,50 +306,50 @@ def show(  # noqa: PLR0913 - source, output and settings
     while moment := capture.newest(tally.last):
         if capture.count == 1 and format is None:
             format = detect_layout(capture.name, moment.pictures)
-        pair = _pair(moment.pictures, format)
+        pair = _split_pair(moment.pictures, format)
         pair = rectify(pair, rig).pair if rig else pair
         disparity_px = match(matcher, pair).disparity_px
-        range_px = followed(range_px, disparity_px)
+        range_px = follow_range(range_px, disparity_px)
         tally.add(moment, time.monotonic())
-        words = f"{tally.rate:.1f} frames/s, {1000 * (tally.last_s[-1] - moment.taken_s):.0f} ms"
-        screen.show(composed(pair, disparity_px, range_px, words))
+        status = f"{tally.rate:.1f} frames/s, {1000 * (tally.last_s[-1] - moment.taken_s):.0f} ms"
+        screen.show(compose(pair, disparity_px, range_px, status))
 
 
-def followed(
+def follow_range(
     range_px: tuple[float, float] | None, disparity_px: Float[np.ndarray, "h w"]
 ) -> tuple[float, float]:
-    """The colour range after a frame: a step from the previous one towards the frame's own range."""
-    wanted_px = find_colour_range_px(disparity_px[::_RANGED_EVERY_PX, ::_RANGED_EVERY_PX])
+    """Return the colour range after a frame: a step from the previous one towards the frame's own range."""
+    wanted_px = find_colour_range_px(disparity_px[::_RANGE_STEP_PX, ::_RANGE_STEP_PX])
     if range_px is None:
         return wanted_px
-    low_px, high_px = (old + _FOLLOWED * (new - old) for old, new in zip(range_px, wanted_px, strict=True))
+    low_px, high_px = (old + _RANGE_SHARE * (new - old) for old, new in zip(range_px, wanted_px, strict=True))
     return low_px, high_px
 
 
-def composed(
-    pair: StereoPair, disparity_px: Float[np.ndarray, "h w"], range_px: tuple[float, float], words: str
+def compose(
+    pair: StereoPair, disparity_px: Float[np.ndarray, "h w"], range_px: tuple[float, float], status: str
 ) -> Frame:
-    """The left image, its disparity beside it, and a line of text above both."""
+    """Draw the left image, its disparity beside it, and a line of text above both."""
     colours = colour_disparity(disparity_px, range_px)
     if pair.left_seen is not None:
         colours[~pair.left_seen] = 0
     both = np.hstack([pair.left, colours])
-    text = f"{words}; {range_words(pair.camera, range_px)}"
+    text = f"{status}; {describe_range(pair.camera, range_px)}"
     (width_px, _), _ = cv2.getTextSize(text, _FONT, _FONT_SCALE, 1)
     scale = _FONT_SCALE * min(1.0, both.shape[1] / (width_px + _STRIP_PX))
     picture = cv2.copyMakeBorder(both, _STRIP_PX, 0, 0, 0, cv2.BORDER_CONSTANT)
     return cv2.putText(picture, text, (8, 22), _FONT, scale, (255, 255, 255), 1, cv2.LINE_AA)
 
 
-def range_words(camera: StereoCamera | None, range_px: tuple[float, float]) -> str:
-    """The meaning of the first and the last colour, in metres if the camera is known, else in pixels."""
+def describe_range(camera: StereoCamera | None, range_px: tuple[float, float]) -> str:
+    """Describe the first and the last colour, in metres if the camera is known, else in pixels."""
     if camera is None:
         return "disparity {:.1f} px (blue) to {:.1f} px (red)".format(*range_px)
     far_m, near_m = camera.depth_m(np.array([range_px]))[0]
     return f"depth {far_m:.2f} m (blue) to {near_m:.2f} m (red)"
 
 
-def _pair(pictures: Sequence[Picture], format: str | None) -> StereoPair:
+def _split_pair(pictures: Sequence[Picture], format: str | None) -> StereoPair:
     if format is None:
         left, right = pictures
     else:
@@ -359,7 +359,7 @@ def _pair(pictures: Sequence[Picture], format: str | None) -> StereoPair:
     return StereoPair(left=left, right=right)
 
 
-def _opened(source: str) -> cv2.VideoCapture:
+def _open_source(source: str) -> cv2.VideoCapture:
     level = cv2.utils.logging.getLogLevel()
     # The error below reports a failure; OpenCV would print it too.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -379,5 +379,5 @@ def _opened(source: str) -> cv2.VideoCapture:
     )
 
 
-def _rate(frames: int, seconds: float) -> float:
+def _measure_rate(frames: int, seconds: float) -> float:
     return (frames - 1) / seconds if seconds > 0 else 0.0

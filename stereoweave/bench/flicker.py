@@ -109,7 +109,7 @@ def score_flicker(  # noqa: PLR0913 - each is a word of the command line
                 for number, pair in enumerate(video.pairs)
             ]
             estimates = [matcher.estimate(pair.left, pair.right) for pair in pairs]
-            for method, taken in _run_methods(video, pairs, estimates, threads).items():
+            for method, result in _run_methods(video, pairs, estimates, threads).items():
                 yield FlickerRow(
                     film=video.name,
                     scene=spec.scene,
@@ -119,8 +119,8 @@ def score_flicker(  # noqa: PLR0913 - each is a word of the command line
                     height_px=size_px[1],
                     frames=frames,
                     noise_levels=NOISE_LEVELS,
-                    time_ms=taken.time_ms,
-                    **_measure_errors(video, taken),
+                    time_ms=result.time_ms,
+                    **_measure_errors(video, result),
                 )
 
 
@@ -172,24 +172,24 @@ def _render_middle(
     return [estimate.disparity_px for estimate in estimates], views
 
 
-def _measure_errors(video: RenderedVideo, taken: _Result) -> dict[str, float]:
+def _measure_errors(video: RenderedVideo, result: _Result) -> dict[str, float]:
     """Compute the error columns of a row."""
     later = range(1, len(video.pairs))
 
     def mean_flicker(shown: list[np.ndarray], position: float, with_change: bool) -> float:
-        of_frames = []
+        per_frame = []
         for frame in later:
             motion_px, change_px = video.change(frame - 1, frame, position)
-            visible = video.seen_again(frame - 1, frame, position)
+            visible = video.find_seen_again(frame - 1, frame, position)
             true_change = change_px if with_change else 0.0
-            of_frames.append(flicker(shown[frame - 1], shown[frame], motion_px, visible, true_change))
-        return float(np.mean(of_frames))
+            per_frame.append(flicker(shown[frame - 1], shown[frame], motion_px, visible, true_change))
+        return float(np.mean(per_frame))
 
-    errors_px = np.abs([taken.disparities_px[frame] - video.disparities_px[frame][LEFT] for frame in later])
-    uncovered = ~np.array([video.seen_again(frame, frame - 1, LEFT) for frame in later])
+    errors_px = np.abs([result.disparities_px[frame] - video.disparities_px[frame][LEFT] for frame in later])
+    uncovered = ~np.array([video.find_seen_again(frame, frame - 1, LEFT) for frame in later])
     return {
-        "flicker_px": mean_flicker(taken.disparities_px, LEFT, with_change=True),
-        "view_flicker_levels": mean_flicker(taken.views, MIDDLE, with_change=False),
+        "flicker_px": mean_flicker(result.disparities_px, LEFT, with_change=True),
+        "view_flicker_levels": mean_flicker(result.views, MIDDLE, with_change=False),
         "epe_px": float(errors_px.mean()),
         "moving_epe_px": _mean(errors_px, np.array(video.moving[1:])),
         "uncovered_epe_px": _mean(errors_px, uncovered),

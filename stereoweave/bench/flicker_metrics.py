@@ -42,7 +42,7 @@ def flicker(
         raise StereoweaveError(
             f"flicker: expected two frames, their motion and a mask of one size, got {shapes}"
         )
-    columns, rows, inside = _target_places(motion_px)
+    columns, rows, inside = _find_targets(motion_px)
     if (visible & ~inside).any():
         raise StereoweaveError(
             f"visible: expected points that stay in the image, found {(visible & ~inside).sum()} "
@@ -72,7 +72,7 @@ def find_seen_again(
         motion_px: Motion right and down, from a point's place in the first frame to that in the second.
         change_px: True change of each point's disparity.
     """
-    columns, rows, inside = _target_places(motion_px)
+    columns, rows, inside = _find_targets(motion_px)
     expected_px, seen = before_px + change_px, inside.copy()
     places = (np.where(inside, values, 0) for values in (rows, columns))
     around = [(np.floor(values), np.ceil(values)) for values in places]
@@ -82,7 +82,7 @@ def find_seen_again(
     return seen
 
 
-def _target_places(
+def _find_targets(
     motion_px: Float[np.ndarray, "h w 2"],
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Return the columns and rows that points move to, and a mask of those inside the image."""

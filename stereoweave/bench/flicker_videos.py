@@ -44,8 +44,8 @@ class RenderedVideo:
     moving: list[Bool[np.ndarray, "h w"]]
     change: Callable[[int, int, float], Change]
 
-    def seen_again(self, frame: int, other: int, position: float) -> Bool[np.ndarray, "h w"]:
-        """Mask of a frame's points that are also visible in another frame, seen from a position."""
+    def find_seen_again(self, frame: int, other: int, position: float) -> Bool[np.ndarray, "h w"]:
+        """Return a mask of a frame's points that are also visible in another frame, seen from a position."""
         before_px, after_px = (self.disparities_px[number][position] for number in (frame, other))
         return find_seen_again(before_px, after_px, *self.change(frame, other, position))
 
@@ -53,10 +53,10 @@ class RenderedVideo:
 def add_noise(pair: StereoPair, rng: np.random.Generator) -> StereoPair:
     """Add sensor noise: normal, NOISE_LEVELS strong, independent for each eye, pixel and channel."""
 
-    def with_noise(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    def add(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
         return np.rint(image + rng.normal(0, NOISE_LEVELS, image.shape)).clip(0, 255).astype(np.uint8)
 
-    return StereoPair(left=with_noise(pair.left), right=with_noise(pair.right))
+    return StereoPair(left=add(pair.left), right=add(pair.right))
 
 
 def render_panning(spec: RenderSpec, frames: int) -> RenderedVideo:
@@ -64,13 +64,15 @@ def render_panning(spec: RenderSpec, frames: int) -> RenderedVideo:
     first = (spec.frames - frames) // 2
     stages = [draw_stage_and_rig(shared_renderer(), spec, 0, first + number) for number in range(frames)]
     rigs = [rig for _, rig in stages]
-    shots = [shared_renderer().render_views(stage.world, rig, (LEFT, MIDDLE, RIGHT)) for stage, rig in stages]
+    renders = [
+        shared_renderer().render_views(stage.world, rig, (LEFT, MIDDLE, RIGHT)) for stage, rig in stages
+    ]
     disparities_px = [
         {
             position: rig.camera.disparity_px(shot.depth_m).astype(np.float32)
             for position, shot in zip((LEFT, MIDDLE), seen, strict=False)
         }
-        for rig, seen in zip(rigs, shots, strict=True)
+        for rig, seen in zip(rigs, renders, strict=True)
     ]
 
     def change(frame: int, other: int, position: float) -> Change:
@@ -78,9 +80,9 @@ def render_panning(spec: RenderSpec, frames: int) -> RenderedVideo:
 
     return RenderedVideo(
         name="panning",
-        pairs=[StereoPair(left=left.image, right=right.image) for left, _, right in shots],
+        pairs=[StereoPair(left=left.image, right=right.image) for left, _, right in renders],
         disparities_px=disparities_px,
-        moving=[np.zeros(left.depth_m.shape, bool) for left, _, _ in shots],
+        moving=[np.zeros(left.depth_m.shape, bool) for left, _, _ in renders],
         change=change,
     )
 
@@ -144,7 +146,7 @@ def add_passing_oval(
     nearest_px = max(math.ceil(values.max()) for values in truth_px.values()) + _IN_FRONT_PX
     ovals_px = [nearest_px + nearing_px * step for step in steps]
 
-    def pasted(
+    def paste(
         image: UInt8[np.ndarray, "h w 3"], step: int, position: float
     ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
         left = round(width * 0.375) + velocity_px[0] * step - position * ovals_px[step]
@@ -152,7 +154,7 @@ def add_passing_oval(
 
     shown = [
         {
-            place: pasted(pair.right if place == RIGHT else pair.left, step, place)
+            place: paste(pair.right if place == RIGHT else pair.left, step, place)
             for place in (LEFT, MIDDLE, RIGHT)
         }
         for step in steps

@@ -81,4 +81,4 @@ def live(  # noqa: PLR0913 - each is an option of the command line
             with suppress(KeyboardInterrupt):
                 show(capture, screen, matcher, tally, format=format, rig=rig)
         finally:
-            typer.echo(f"{capture.name}: {tally.line()}")
+            typer.echo(f"{capture.name}: {tally.describe()}")

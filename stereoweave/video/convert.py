@@ -32,13 +32,13 @@ from stereoweave.system.progress import progress
 from stereoweave.system.threads import thread_count
 from stereoweave.video.reader import StereoFrame, StereoVideo
 from stereoweave.video.temporal_filter import TemporalFilter
-from stereoweave.video.tracks import picture_files
-from stereoweave.video.writer import GREY16, H264, Packing, Picture, Recorder, check_container, growing
+from stereoweave.video.tracks import list_picture_files
+from stereoweave.video.writer import GREY16, H264, Packing, Picture, Recorder, check_container, open_parts
 
 # Length of a part. An interrupted run loses the unfinished one; each begins with a key frame.
 _PART_S = 10
-_SURVEYED_FRAMES, _HINTED_FRAMES = 24, 3
-_SURVEYED_EVERY_PX = 4
+_SURVEYED_FRAMES, _CHECKED_FRAMES = 24, 3
+_SURVEY_STEP_PX = 4
 # Outliers do not widen the range; the margin allows for objects that come nearer between the surveyed frames.
 _OUTER_PERCENT, _MARGIN_PX = 0.5, 8.0
 _NAMED_PROBLEMS = 3
@@ -120,24 +120,24 @@ class VideoJob:
             return LAYOUTS[self.layout].positions
         return () if self.position is None else (self.position,)
 
-    def picture(self, pair: StereoPair, estimate: Estimate, survey: "Survey") -> Picture:
+    def render_frame(self, pair: StereoPair, estimate: Estimate, survey: "Survey") -> Picture:
         """Make the output image of one frame."""
         if self.depth:
             return colour_disparity(estimate.disparity_px, survey.range_px)
         if self.depth16:
-            return _grey16(estimate.disparity_px)
+            return _encode_grey16(estimate.disparity_px)
         renderer = Renderer(
             pair,
             estimate,
             strength=self.strength,
-            convergence_px=self._plane_px(survey),
+            convergence_px=self._find_plane_px(survey),
             threads=self.backend.threads,
         )
         if self.position is not None:
             return renderer.view(self.position).image
         return LAYOUTS[str(self.layout)].compose(renderer, LayoutOptions(range_px=survey.range_px))
 
-    def _plane_px(self, survey: "Survey") -> float:
+    def _find_plane_px(self, survey: "Survey") -> float:
         """Return the disparity that stays in place from view to view."""
         if self.convergence_px is not None:
             return self.convergence_px
@@ -150,7 +150,7 @@ class VideoJob:
         setting = "format" if key == "arrangement" else key
         return self.name_of(setting) or setting
 
-    def loses(self, survey: "Survey") -> list[Note]:
+    def find_losses(self, survey: "Survey") -> list[Note]:
         """Return a note if the file cannot hold all of the video's disparities."""
         low_px, high_px = survey.range_px
         if not self.depth16 or (low_px >= 0 and high_px <= _MOST_GREY16_PX):
@@ -161,7 +161,7 @@ class VideoJob:
         )
         return [Note(text, Remedy("show all of them in colours", ("depth",)))]
 
-    def says(self, survey: "Survey") -> dict[str, str]:
+    def describe_values(self, survey: "Survey") -> dict[str, str]:
         """Return the file's metadata: how to convert its pictures back to disparities."""
         low_px, high_px = survey.range_px
         if self.depth16:
@@ -181,12 +181,12 @@ class Survey(NamedTuple):
     Attributes:
         range_px: Disparity range of the colours.
         middle_px: Median disparity of the scene.
-        within_px: Disparity range to match; None if the network's own range covers the surveyed frames.
+        match_range_px: Disparity range to match; None if the network's own range covers the surveyed frames.
     """
 
     range_px: tuple[float, float]
     middle_px: float
-    within_px: tuple[float, float] | None
+    match_range_px: tuple[float, float] | None
 
 
 @dataclass
@@ -198,13 +198,13 @@ class VideoTally:
     problems: int = 0
     named: list[str] = field(default_factory=list)
 
-    def note(self, frame: StereoFrame) -> None:
+    def add(self, frame: StereoFrame) -> None:
         """Count a frame."""
         self.frames += 1
         if frame.problem is not None:
             self.problems += 1
             if len(self.named) < _NAMED_PROBLEMS:
-                self.named.append(f"{_clock(frame.time)} {frame.problem}")
+                self.named.append(f"{_format_time(frame.time)} {frame.problem}")
 
 
 def convert_video(
@@ -226,7 +226,7 @@ def convert_video(
         StereoweaveError: `out` has an unsuitable ending, is in use, or cannot be written, for instance on a
             full disk.
     """
-    _check_out(out, job, video, sources)
+    _check_output(out, job, video, sources)
     matcher = job.backend.matcher()
     recorder = Recorder(
         encoding=GREY16 if job.depth16 else H264,
@@ -238,15 +238,15 @@ def convert_video(
     )
     with (
         lock_output(out),
-        growing(out, _settings(job, video, sources), job.name_of_saved) as parts,
+        open_parts(out, _list_settings(job, video, sources), job.name_of_saved) as parts,
         progress(console) as bar,
     ):
         if parts.files:
             converter = _FrameConverter.from_state(job, matcher, parts.state())
         else:
-            survey, notes = _look(video, matcher, bar)
+            survey, notes = _survey_video(video, matcher, bar)
             converter = _FrameConverter(job, matcher, survey)
-            for note in [*notes, *job.loses(survey)]:
+            for note in [*notes, *job.find_losses(survey)]:
                 line = note.format(job.name_of)
                 console.print(line, markup=False, highlight=False, soft_wrap=True)
         done, total = converter.tally.frames, video.frame_count
@@ -255,8 +255,8 @@ def convert_video(
         for first in frames:
             part = islice(chain([first], frames), round(_PART_S * video.rate) or 1)
             with parts.next(converter.state) as path:
-                recorder.write_part(path, converter.pictures(part, bar, shown))
-        recorder.join(parts.files, video.sound, out, job.says(converter.survey))
+                recorder.write_part(path, converter.convert(part, bar, shown))
+        recorder.join(parts.files, video.sound, out, job.describe_values(converter.survey))
     return converter.tally
 
 
@@ -265,14 +265,16 @@ class _FrameConverter:
 
     def __init__(self, job: VideoJob, matcher: Matcher, survey: Survey) -> None:
         self.survey, self.tally = survey, VideoTally()
-        self._options = MatchOptions(range_px=survey.within_px)
+        self._options = MatchOptions(range_px=survey.match_range_px)
         self._job, self._matcher, self._filter = job, matcher, TemporalFilter(job.backend.threads)
 
     @classmethod
     def from_state(cls, job: VideoJob, matcher: Matcher, state: dict[str, np.ndarray]) -> "_FrameConverter":
         """Restore a converter from its `state`; it continues exactly as the original would have."""
-        low_px, high_px, middle_px, *within_px = state.pop("survey_px").tolist()
-        survey = Survey((low_px, high_px), middle_px, (within_px[0], within_px[1]) if within_px else None)
+        low_px, high_px, middle_px, *match_range_px = state.pop("survey_px").tolist()
+        survey = Survey(
+            (low_px, high_px), middle_px, (match_range_px[0], match_range_px[1]) if match_range_px else None
+        )
         converter = cls(job, matcher, survey)
         frames, cuts, problems = state.pop("tally").tolist()
         converter.tally = VideoTally(frames, cuts, problems, state.pop("named").tolist())
@@ -284,14 +286,14 @@ class _FrameConverter:
         tally = self.tally
         return {
             "survey_px": np.array(
-                [*self.survey.range_px, self.survey.middle_px, *(self.survey.within_px or ())]
+                [*self.survey.range_px, self.survey.middle_px, *(self.survey.match_range_px or ())]
             ),
             "tally": np.array([tally.frames, tally.cuts, tally.problems]),
             "named": np.array(tally.named, dtype=np.str_),
             **self._filter.state(),
         }
 
-    def pictures(
+    def convert(
         self, frames: Iterable[StereoFrame], bar: Progress, shown: TaskID
     ) -> Iterator[tuple[Fraction, Picture]]:
         """Yield each frame's time and output image; updates the progress bar."""
@@ -299,36 +301,40 @@ class _FrameConverter:
             pair = StereoPair(left=frame.left, right=frame.right)
             estimate = match(self._matcher, pair, self._options)
             estimate = self._filter(frame.left, frame.right, estimate)
-            self.tally.note(frame)
+            self.tally.add(frame)
             self.tally.cuts = self._filter.cuts
             bar.update(shown, completed=self.tally.frames)
-            yield frame.time, self._job.picture(pair, estimate, self.survey)
+            yield frame.time, self._job.render_frame(pair, estimate, self.survey)
 
 
-def _look(video: StereoVideo, matcher: Matcher, bar: Progress) -> tuple[Survey, list[Note]]:
+def _survey_video(video: StereoVideo, matcher: Matcher, bar: Progress) -> tuple[Survey, list[Note]]:
     """Survey the disparities of frames spread over the whole video, and find defects.
 
     The frames are spread because the first ones may be titles, which have another range.
     """
-    picked = _spread(video.frame_count, _SURVEYED_FRAMES)
-    hinted = set(picked[len(picked) // 6 :: -(-len(picked) // _HINTED_FRAMES)])
+    picked = _spread_evenly(video.frame_count, _SURVEYED_FRAMES)
+    checked = set(picked[len(picked) // 6 :: -(-len(picked) // _CHECKED_FRAMES)])
     shown = bar.add_task("surveying depth", total=len(picked), loss="", rate="")
     thinned, middles_px, defects = [], [], []
     frames = islice(video.frames(), picked.start, picked.stop, picked.step)
     for index, frame in zip(picked, frames, strict=True):
         pair = StereoPair(left=frame.left, right=frame.right)
         estimate = match(matcher, pair)
-        thinned.append(estimate.disparity_px[::_SURVEYED_EVERY_PX, ::_SURVEYED_EVERY_PX])
+        thinned.append(estimate.disparity_px[::_SURVEY_STEP_PX, ::_SURVEY_STEP_PX])
         middles_px.append(median_disparity_px(estimate))
-        if index in hinted:
-            defects.append([_at(frame.time, note, video) for note in find_problems(pair, estimate)])
+        if index in checked:
+            defects.append([_add_time(frame.time, note, video) for note in find_problems(pair, estimate)])
         bar.advance(shown)
     all_px = np.vstack(thinned)
-    survey = Survey(find_colour_range_px(all_px), float(np.median(middles_px)), _within_px(all_px, matcher))
-    return survey, _usual(defects)
+    survey = Survey(
+        find_colour_range_px(all_px), float(np.median(middles_px)), _find_match_range_px(all_px, matcher)
+    )
+    return survey, _select_common_notes(defects)
 
 
-def _within_px(disparity_px: Float[np.ndarray, "h w"], matcher: Matcher) -> tuple[float, float] | None:
+def _find_match_range_px(
+    disparity_px: Float[np.ndarray, "h w"], matcher: Matcher
+) -> tuple[float, float] | None:
     """Return the disparity range of surveyed disparities; None if the network's own range covers it."""
     low_px, high_px = np.percentile(disparity_px, [_OUTER_PERCENT, 100 - _OUTER_PERCENT]).tolist()
     if low_px >= 0 and high_px <= matcher.max_disparity_px:
@@ -337,27 +343,27 @@ def _within_px(disparity_px: Float[np.ndarray, "h w"], matcher: Matcher) -> tupl
     return min(low_px, max(low_px - _MARGIN_PX, 0.0)), high_px + _MARGIN_PX
 
 
-def _spread(count: int, wanted: int) -> range:
+def _spread_evenly(count: int, wanted: int) -> range:
     """Return the numbers of at most `wanted` frames, evenly spread over `count`."""
     step = -(-count // wanted)
     return range(step // 2, count, step)
 
 
-def _at(time: Fraction, note: Note, video: StereoVideo) -> Note:
+def _add_time(time: Fraction, note: Note, video: StereoVideo) -> Note:
     """Add the time to a note; for swapped views in one file, the remedy becomes the other frame packing."""
-    other = _other_way_round(video.frame_packing)
+    other = _find_swapped_packing(video.frame_packing)
     if note == SWAPPED and other:
         note = replace(note, remedy=Remedy(f"choose {other}", ("format",)))
-    return replace(note, text=f"{_clock(time)} {note.text}")
+    return replace(note, text=f"{_format_time(time)} {note.text}")
 
 
-def _usual(defects: Sequence[list[Note]]) -> list[Note]:
+def _select_common_notes(defects: Sequence[list[Note]]) -> list[Note]:
     """Return the notes on the last frame that has any, if at least half do: a video may begin black."""
     some = [notes for notes in defects if notes]
     return some[-1] if 2 * len(some) > len(defects) else []
 
 
-def _other_way_round(frame_packing: str | None) -> str | None:
+def _find_swapped_packing(frame_packing: str | None) -> str | None:
     """Return the named frame packing with the eyes swapped, if any."""
     if frame_packing is None:
         return None
@@ -366,12 +372,12 @@ def _other_way_round(frame_packing: str | None) -> str | None:
     return next((name for name, known in PAIR_LAYOUTS.items() if known == other), None)
 
 
-def _grey16(disparity_px: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
+def _encode_grey16(disparity_px: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
     # 0 would mean unknown, as in disparity.png.
     return np.clip(np.rint(_STEPS_PER_PX * disparity_px), 1, 65535).astype(np.uint16)
 
 
-def _check_out(out: Path, job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -> None:
+def _check_output(out: Path, job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -> None:
     if job.depth16 and out.suffix.lower() != ".mkv":
         raise StereoweaveError(f"{out}: expected the ending .mkv for depth in 16 bits, found {out.suffix!r}")
     for source in sources:
@@ -380,7 +386,7 @@ def _check_out(out: Path, job: VideoJob, video: StereoVideo, sources: Sequence[P
     check_container(out, video.sound)
 
 
-def _settings(job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -> dict[str, object]:
+def _list_settings(job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -> dict[str, object]:
     """Return everything that determines the video except the machine, by setting, as JSON values."""
     model = Path(job.backend.model)
     return {
@@ -392,15 +398,15 @@ def _settings(job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -> dic
         "convergence_px": job.convergence_px,
         "arrangement": video.frame_packing,
         "rate": str(video.rate),
-        "model": _known_by(model) if model.exists() else str(job.backend.model),
-        "film": [_known_by(source) for source in sources],
+        "model": _identify_source(model) if model.exists() else str(job.backend.model),
+        "film": [_identify_source(source) for source in sources],
         "stereoweave": __version__,
     }
 
 
-def _known_by(path: Path) -> list[object]:
+def _identify_source(path: Path) -> list[object]:
     """Return a path's name, and a digest of its files' names, sizes and modification times."""
-    files = picture_files(path)
+    files = list_picture_files(path)
     digest = hashlib.sha256()
     for file in [path] if files is None else files:
         status = file.stat()
@@ -408,7 +414,7 @@ def _known_by(path: Path) -> list[object]:
     return [str(path), digest.hexdigest()]
 
 
-def _clock(time_s: Fraction) -> str:
+def _format_time(time_s: Fraction) -> str:
     """Format a time: 0:01:02.345 for 62.345 s."""
     minutes, seconds = divmod(float(time_s), 60)
     return f"{int(minutes) // 60}:{int(minutes) % 60:02}:{seconds:06.3f}"

@@ -12,9 +12,12 @@ from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, detect_layout
 from stereoweave.video.tracks import Shot, Track, open_track
 
-_BEFORE, _AFTER = "damaged: replaced by the frame before it", "damaged: replaced by the frame after it"
-_SPOILT = "decoded from a damaged frame before it"
-_MOVED = "its time stamp was missing or a duplicate: it is shown slightly later"
+_REPEATED_LAST, _REPEATED_NEXT = (
+    "damaged: replaced by the frame before it",
+    "damaged: replaced by the frame after it",
+)
+_AFTER_DAMAGE = "decoded from a damaged frame before it"
+_RETIMED = "its time stamp was missing or a duplicate: it is shown slightly later"
 
 
 class StereoFrame(NamedTuple):
@@ -69,24 +72,26 @@ class StereoVideo:
             pictures = [shot.picture() for shot, _ in seen]
             left, right = self._split.eyes(*pictures) if self._split else pictures
             time = (steps[index] - steps[0]) * self.time_base
-            yield StereoFrame(left, right, time, self._problem(index, [problem for _, problem in seen]))
+            yield StereoFrame(
+                left, right, time, self._describe_problem(index, [problem for _, problem in seen])
+            )
 
-    def _problem(self, index: int, problems: Sequence[str | None]) -> str | None:
+    def _describe_problem(self, index: int, problems: Sequence[str | None]) -> str | None:
         of_two = len(self._tracks) == 2
         found = [
             f"{track.name}: {problem}" if of_two else problem
             for track, problem in zip(self._tracks, problems, strict=True)
             if problem
         ]
-        found += [_MOVED] if index in self._tracks[0].moved else []
+        found += [_RETIMED] if index in self._tracks[0].retimed else []
         if index == self.frame_count - 1:
-            found += [ending for track in self._tracks if (ending := self._ending(track))]
+            found += [ending for track in self._tracks if (ending := self._describe_ending(track))]
         return "; ".join(found) or None
 
-    def _ending(self, track: Track) -> str | None:
+    def _describe_ending(self, track: Track) -> str | None:
         more = len(track.steps) - self.frame_count
         frames = "1 frame" if more == 1 else f"{more} frames"
-        return f"{track.name} has {frames} more than the other video" if more else track.broken_off
+        return f"{track.name} has {frames} more than the other video" if more else track.truncation
 
 
 def open_video(
@@ -116,17 +121,17 @@ def open_video(
         )
     tracks = [open_track(path, rate) for path in paths]
     if len(tracks) == 2:
-        _check_company(*tracks)
+        _check_alike(*tracks)
         return StereoVideo(tracks, None)
     [track] = tracks
-    name = format or detect_layout(track.name, track.samples(), track.declared)
+    name = format or detect_layout(track.name, track.samples(), track.declared_packing)
     try:
         return StereoVideo(tracks, name)
     except FormatError as error:
         raise FormatError(f"{track.name}: {error}") from error
 
 
-def _check_company(left: Track, right: Track) -> None:
+def _check_alike(left: Track, right: Track) -> None:
     """Raise unless both videos have one size and their frames stay within half a frame of each other."""
     if left.size_px != right.size_px:
         sizes = ["{}x{}".format(*track.size_px) for track in (left, right)]
@@ -146,16 +151,20 @@ def _check_company(left: Track, right: Track) -> None:
 
 def _bridge_gaps(track: Track, start: int) -> Iterator[tuple[Shot, str | None]]:
     """Yield a shot and its problem for each frame from number `start` on; replaces missing frames."""
-    upcoming, last, spoilt = 0, None, False
+    upcoming, last, after_damage = 0, None, False
     for shot in track.shots(start):
         index = shot.number
         if not upcoming <= index < len(track.steps):
             continue
         missing = range(upcoming, index)
-        yield from ((last or shot, _BEFORE if last else _AFTER) for number in missing if number >= start)
-        spoilt = not shot.fresh and (spoilt or bool(missing))
+        yield from (
+            (last or shot, _REPEATED_LAST if last else _REPEATED_NEXT)
+            for number in missing
+            if number >= start
+        )
+        after_damage = not shot.is_key_frame and (after_damage or bool(missing))
         if index >= start:
-            yield shot, _SPOILT if spoilt else None
+            yield shot, _AFTER_DAMAGE if after_damage else None
         upcoming, last = index + 1, shot
     if last:
-        yield from ((last, _BEFORE) for number in range(upcoming, len(track.steps)) if number >= start)
+        yield from ((last, _REPEATED_LAST) for number in range(upcoming, len(track.steps)) if number >= start)

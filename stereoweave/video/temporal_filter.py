@@ -33,7 +33,7 @@ STEP_PX, STEPS = 8, 2
 _WINDOW_PX = 5
 # A window is explained if its mean difference is below this multiple of the image's median difference, its
 # noise, plus an offset for clean images. Noise is at most the third number.
-_UNUSUAL, _LEAST_LEVELS, _NOISIEST_LEVELS = 1.5, 0.5, 6.0
+_EXPLAINED, _LEAST_LEVELS, _NOISIEST_LEVELS = 1.5, 0.5, 6.0
 # Motion always explains a little more than rest, because it also fits the noise.
 _REST, _REST_LEVELS = 1.1, 0.25
 # A pixel is calm if nothing moves in the window of this size around it.
@@ -135,15 +135,17 @@ class TemporalFilter:
                 f"estimate: expected the size of both pictures, got {list(estimate.disparity_px.shape)} for "
                 f"{list(left.shape[:2])} and {list(right.shape[:2])}; estimate these two"
             )
-        before, self._greys = self._greys, [_grey(left), _grey(right)]
+        before, self._greys = self._greys, [_convert_to_grey(left), _convert_to_grey(right)]
         # The right view has no confidence; the placeholder is not returned.
-        claims = (estimate.confidence, np.ones_like(estimate.confidence))
+        confidences = (estimate.confidence, np.ones_like(estimate.confidence))
         disparities_px = (estimate.disparity_px, estimate.right_disparity_px)
-        news = [Track(*maps, np.ones_like(maps[0])) for maps in zip(disparities_px, claims, strict=True)]
-        continued = self._filter_tracks(before, news) if before else None
+        new_tracks = [
+            Track(*maps, np.ones_like(maps[0])) for maps in zip(disparities_px, confidences, strict=True)
+        ]
+        continued = self._filter_tracks(before, new_tracks) if before else None
         if before and continued is None:
             self.cuts += 1
-        self._tracks = continued or news
+        self._tracks = continued or new_tracks
         filtered, filtered_right = self._tracks
         return Estimate(
             disparity_px=filtered.disparity_px,
@@ -170,46 +172,46 @@ class TemporalFilter:
             temporal_filter._tracks.append(Track(*(state[f"{side}_{name}"] for name in Track._fields)))
         return temporal_filter
 
-    def _filter_tracks(self, before: list[np.ndarray], news: list[Track]) -> list[Track] | None:
+    def _filter_tracks(self, before: list[np.ndarray], new_tracks: list[Track]) -> list[Track] | None:
         """Filter the new tracks with the previous ones; None after a cut."""
-        if news[0].frames.shape != self._tracks[0].frames.shape:
+        if new_tracks[0].frames.shape != self._tracks[0].frames.shape:
             return None
         with ThreadPoolExecutor(self._threads) as pool:
-            motions = list(pool.map(_motion, before, self._greys))
+            motions = list(pool.map(_measure_motion, before, self._greys))
             if np.mean([motion.explained_share for motion in motions]) < _CUT_SHARE:
                 return None
             # A left pixel's match in the right view is to the left, a right pixel's to the right.
-            expected = list(pool.map(_predict, self._tracks, news, motions, motions[::-1], (-1, 1)))
-            if _is_contradicted(news, expected):
+            expected = list(pool.map(_predict, self._tracks, new_tracks, motions, motions[::-1], (-1, 1)))
+            if _is_contradicted(new_tracks, expected):
                 return None
-            return list(pool.map(_update, news, expected))
+            return list(pool.map(_update, new_tracks, expected))
 
 
-def _grey(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2"]:
+def _convert_to_grey(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2"]:
     """Convert to grey at half the size, rounded up."""
     height, width = image.shape[:2]
     half = ((width + 1) // 2, (height + 1) // 2)
     return cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), half, interpolation=cv2.INTER_AREA)
 
 
-def _motion(before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "h2 w2"]) -> Motion:
+def _measure_motion(before: UInt8[np.ndarray, "h2 w2"], grey: UInt8[np.ndarray, "h2 w2"]) -> Motion:
     """Measure the motion between two grey images of half the size."""
     before = _match_brightness(before, grey)
     rest = np.zeros((*grey.shape, 2), np.float32)
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(grey, before, rest)
-    moved_levels = _difference_levels(grey, _warp(before, flow))
-    rest_levels = _difference_levels(grey, before)
+    moved_levels = _measure_difference_levels(grey, _warp(before, flow))
+    rest_levels = _measure_difference_levels(grey, before)
     least_levels = np.minimum(moved_levels, rest_levels)
-    usual_levels = min(float(np.median(least_levels[::4, ::4])), _NOISIEST_LEVELS)
-    explained = least_levels <= _UNUSUAL * usual_levels + _LEAST_LEVELS
+    median_levels = min(float(np.median(least_levels[::4, ::4])), _NOISIEST_LEVELS)
+    explained = least_levels <= _EXPLAINED * median_levels + _LEAST_LEVELS
     rests = rest_levels <= _REST * moved_levels + _REST_LEVELS
     flow[rests] = 0
     around = np.ones((_CALM_PX, _CALM_PX), np.uint8)
     calm = cv2.erode((rests & explained).astype(np.uint8), around).astype(bool)
-    return Motion(2 * flow, explained, calm, _explained_share(grey, least_levels, explained))
+    return Motion(2 * flow, explained, calm, _measure_explained_share(grey, least_levels, explained))
 
 
-def _explained_share(
+def _measure_explained_share(
     grey: UInt8[np.ndarray, "h2 w2"],
     least_levels: Float[np.ndarray, "h2 w2"],
     explained: Bool[np.ndarray, "h2 w2"],
@@ -219,14 +221,14 @@ def _explained_share(
     squares = cv2.sqrBoxFilter(grey, cv2.CV_32F, window)
     variance = squares - cv2.boxFilter(grey, cv2.CV_32F, window) ** 2
     contrast_levels = np.sqrt(np.maximum(variance, 0))
-    has_contrast = contrast_levels > _CONTRAST * _noise_levels(grey) + _CONTRAST_LEVELS
+    has_contrast = contrast_levels > _CONTRAST * _estimate_noise_levels(grey) + _CONTRAST_LEVELS
     if has_contrast.mean() < _LEAST_CONTRAST_SHARE:
         return 1.0
     alike = explained & (least_levels < _DIFFERENT_SHARE * contrast_levels)
     return float(alike[has_contrast].mean())
 
 
-def _noise_levels(grey: UInt8[np.ndarray, "h2 w2"]) -> float:
+def _estimate_noise_levels(grey: UInt8[np.ndarray, "h2 w2"]) -> float:
     """Estimate the noise's standard deviation from the median roughness."""
     roughness = cv2.filter2D(grey, cv2.CV_32F, _ROUGHNESS)
     return float(np.median(np.abs(roughness[::4, ::4]))) / _MEDIAN_ROUGHNESS
@@ -252,7 +254,7 @@ def _warp(
     return cv2.remap(before, *source, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
-def _difference_levels(
+def _measure_difference_levels(
     a: UInt8[np.ndarray, "h2 w2"], b: UInt8[np.ndarray, "h2 w2"]
 ) -> Float[np.ndarray, "h2 w2"]:
     """Mean absolute difference over a window around each pixel."""
@@ -280,10 +282,10 @@ def _find_calm_matches(
     return cv2.remap(calm, there, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE) > 0
 
 
-def _is_contradicted(news: list[Track], expected: list[Expectation]) -> bool:
+def _is_contradicted(new_tracks: list[Track], expected: list[Expectation]) -> bool:
     """Whether most known pixels at rest have a new disparity; tests every fourth pixel."""
     asked, contradicted = [], []
-    for new, (carried, calm, drift_px) in zip(news, expected, strict=True):
+    for new, (carried, calm, drift_px) in zip(new_tracks, expected, strict=True):
         new_px, old_px, frames = (
             values[::4, ::4] for values in (new.disparity_px, carried.disparity_px, carried.frames)
         )

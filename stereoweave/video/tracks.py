@@ -53,12 +53,12 @@ class Shot(NamedTuple):
     Attributes:
         number: The frame's number in the track.
         picture: Converts the frame to uint8 RGB [H, W, 3]; frames that are not needed are not converted.
-        fresh: Whether it is decoded without any earlier frame (a key frame).
+        is_key_frame: Whether it is decoded without any earlier frame (a key frame).
     """
 
     number: int
     picture: Callable[[], UInt8[np.ndarray, "h w 3"]]
-    fresh: bool
+    is_key_frame: bool
 
 
 class VideoTrack:
@@ -67,14 +67,14 @@ class VideoTrack:
     Attributes:
         name: As the caller gave it.
         steps: Display time of each frame in the file, increasing, in steps of `time_base`.
-        moved: Frames whose time stamp was missing or a duplicate, and which got a later one.
+        retimed: Frames whose time stamp was missing or a duplicate, and which got a later one.
         time_base: Seconds.
         rate: Average frames per second.
         size_px: Width and height of a whole frame, rotated as a player would.
-        declared: The frame packing that the file declares, if any: a full-size one of `PAIR_LAYOUTS`, or an
-            unsupported one.
+        declared_packing: The frame packing that the file declares, if any: a full-size one of
+            `PAIR_LAYOUTS`, or an unsupported one.
         sound: The file, if it has sound.
-        broken_off: Describes a file that ends early; None for a complete one.
+        truncation: Describes a file that ends early; None for a complete one.
 
     Raises:
         FormatError: No such file, not a video, or no frame can be decoded.
@@ -83,16 +83,16 @@ class VideoTrack:
     def __init__(self, path: Path) -> None:
         self.name = str(path)
         self._path = path
-        with _reading(path) as (container, stream):
+        with _opening(path) as (container, stream):
             self.sound = path if container.streams.audio else None
             self._read_times(container, stream)
-        with _reading(path) as (container, stream):
-            first = next(_intact(_decode(container, stream)), None)
+        with _opening(path) as (container, stream):
+            first = next(_drop_corrupt(_decode(container, stream)), None)
             if first is None:
                 raise FormatError(f"{path}: expected a video, found no frame in it that can be decoded")
             self._frame_size_px = first.width, first.height
             self.size_px = self._frame_size_px if first.rotation % 180 == 0 else self._frame_size_px[::-1]
-            self.declared = _declared(first)
+            self.declared_packing = _read_declared_packing(first)
 
     def shots(self, start: int) -> Iterator[Shot]:
         """Yield the frames that can be decoded, in display order; always from the first one on.
@@ -100,24 +100,28 @@ class VideoTrack:
         Ignoring `start` makes every run yield the same frames: what a damaged frame leaves in later ones
         depends on all frames before it.
         """
-        with _reading(self._path) as (container, stream):
+        with _opening(self._path) as (container, stream):
             frames = _decode(container, stream)
-            placed = _by_rank(frames, stream) if self._stamps is None else _by_stamp(frames, self._stamps)
+            placed = (
+                _number_by_rank(frames, stream)
+                if self._stamps is None
+                else _number_by_stamp(frames, self._stamps)
+            )
             for index, frame in placed:
                 if not frame.is_corrupt and (frame.width, frame.height) == self._frame_size_px:
-                    yield Shot(index, partial(_rgb, frame), frame.key_frame)
+                    yield Shot(index, partial(_convert_to_rgb, frame), frame.key_frame)
 
     def samples(self) -> list[UInt8[np.ndarray, "h w 3"]]:
         """Return images from all over the video, at least one."""
         import av
 
         pictures: list[UInt8[np.ndarray, "h w 3"]] = []
-        with _reading(self._path) as (container, stream):
-            pictures += map(_rgb, islice(_intact(_decode(container, stream)), 1))
+        with _opening(self._path) as (container, stream):
+            pictures += map(_convert_to_rgb, islice(_drop_corrupt(_decode(container, stream)), 1))
             for share in _SAMPLES:
                 with suppress(av.error.FFmpegError):
                     container.seek(int(share * (container.duration or 0)))
-                    pictures += map(_rgb, islice(_intact(_decode(container, stream)), 1))
+                    pictures += map(_convert_to_rgb, islice(_drop_corrupt(_decode(container, stream)), 1))
         return pictures
 
     def _read_times(self, container: "av.container.InputContainer", stream: "av.VideoStream") -> None:
@@ -125,7 +129,7 @@ class VideoTrack:
 
         stamps, end_s, reason = _stamps(container, stream)
         rate = stream.guessed_rate or Fraction(25)
-        self.moved: Collection[int] = ()
+        self.retimed: Collection[int] = ()
         self.steps: Sequence[int] = range(len(stamps))
         self.time_base = 1 / rate
         self._stamps: Sequence[int] | None = None
@@ -133,12 +137,12 @@ class VideoTrack:
         if 2 * len(set(stamps) - {None}) > len(stamps):
             self.time_base = Fraction(stream.time_base or 1)
             self._stamps = array("q", sorted(_fill_missing(stamps)))
-            self.steps, self.moved = _separate(self._stamps, round(1 / rate / self.time_base))
-        self.rate = _rate(self.steps, self.time_base, rate)
+            self.steps, self.retimed = _separate_duplicates(self._stamps, round(1 / rate / self.time_base))
+        self.rate = _choose_rate(self.steps, self.time_base, rate)
         claimed_s = Fraction(container.duration or 0, av.time_base)
         if reason is None and claimed_s > end_s + _CUT_OFF_S:
             reason = f"it claims to last {float(claimed_s):.1f} s"
-        self.broken_off = f"{self.name} breaks off after this frame ({reason})" if reason else None
+        self.truncation = f"{self.name} breaks off after this frame ({reason})" if reason else None
 
 
 class PictureTrack:
@@ -148,30 +152,30 @@ class PictureTrack:
         FormatError: None of `files` can be read.
     """
 
-    declared: str | None = None
-    moved: Collection[int] = ()
+    declared_packing: str | None = None
+    retimed: Collection[int] = ()
     sound: Path | None = None
-    broken_off: str | None = None
+    truncation: str | None = None
 
     def __init__(self, name: str, files: Sequence[Path], rate: Fraction) -> None:
         self.name = name
         self._files = files
         self.steps: Sequence[int] = range(len(files))
         self.rate, self.time_base = rate, 1 / rate
-        first = self._first()
+        first = self._read_first()
         self.size_px = first.shape[1], first.shape[0]
 
     def shots(self, start: int) -> Iterator[Shot]:
         """Yield the pictures that can be read, from the last one at or before `start` on."""
-        before = next((index for index in range(start, 0, -1) if self._shot(index)), 0)
-        yield from filter(None, map(self._shot, self.steps[before:]))
+        before = next((index for index in range(start, 0, -1) if self._read_shot(index)), 0)
+        yield from filter(None, map(self._read_shot, self.steps[before:]))
 
     def samples(self) -> list[UInt8[np.ndarray, "h w 3"]]:
         """Return images from all over the series, at least one."""
         starts = [int(share * len(self._files)) for share in (0.0, *_SAMPLES)]
         return [shot.picture() for start in starts for shot in islice(self.shots(start), 1)]
 
-    def _first(self) -> UInt8[np.ndarray, "h w 3"]:
+    def _read_first(self) -> UInt8[np.ndarray, "h w 3"]:
         """Read the first picture that can be read."""
         problem: FormatError | None = None
         for file in self._files:
@@ -181,11 +185,11 @@ class PictureTrack:
                 problem = problem or error
         raise FormatError(f"{self.name}: expected pictures, found none that can be read: {problem}")
 
-    def _shot(self, index: int) -> Shot | None:
-        picture = self._read(index)
-        return None if picture is None else Shot(index, lambda: picture, fresh=True)
+    def _read_shot(self, index: int) -> Shot | None:
+        picture = self._read_picture(index)
+        return None if picture is None else Shot(index, lambda: picture, is_key_frame=True)
 
-    def _read(self, index: int) -> UInt8[np.ndarray, "h w 3"] | None:
+    def _read_picture(self, index: int) -> UInt8[np.ndarray, "h w 3"] | None:
         with suppress(FormatError):
             picture = read_image(self._files[index])
             if self.size_px == (picture.shape[1], picture.shape[0]):
@@ -207,7 +211,7 @@ def open_track(path: Path, rate: Fraction | None) -> Track:
         FormatError: No such file, folder or picture, or nothing in it can be read.
         StereoweaveError: `rate` is given for a video.
     """
-    files = picture_files(path)
+    files = list_picture_files(path)
     if files is None:
         if rate is not None:
             raise StereoweaveError(f"{path}: expected pictures for a rate, found a video; leave the rate out")
@@ -217,7 +221,7 @@ def open_track(path: Path, rate: Fraction | None) -> Track:
     return PictureTrack(str(path), files, rate or Fraction(25))
 
 
-def picture_files(path: Path) -> list[Path] | None:
+def list_picture_files(path: Path) -> list[Path] | None:
     """List the pictures in a folder or matching a glob pattern, in natural order; None for any other path."""
     if path.is_dir():
         found = path.iterdir()
@@ -225,11 +229,11 @@ def picture_files(path: Path) -> list[Path] | None:
         found = path.parent.glob(path.name)
     else:
         return None
-    return sorted(filter(_is_picture, found), key=_in_counting_order)
+    return sorted(filter(_is_picture, found), key=_natural_key)
 
 
 @contextmanager
-def _reading(path: Path) -> Iterator[tuple["av.container.InputContainer", "av.VideoStream"]]:
+def _opening(path: Path) -> Iterator[tuple["av.container.InputContainer", "av.VideoStream"]]:
     with require_extra("video", f"{path}: reading video needs PyAV"):
         import av
     try:
@@ -280,7 +284,7 @@ def _stamps(
             if packet.pts is not None and packet.time_base:
                 end_s = max(end_s, (packet.pts + (packet.duration or 0)) * packet.time_base)
     except av.error.FFmpegError as error:
-        return stamps, end_s, _words(error)
+        return stamps, end_s, _describe_error(error)
     return stamps, end_s, None
 
 
@@ -294,17 +298,17 @@ def _fill_missing(stamps: Sequence[int | None]) -> list[int]:
     return [known := known if stamp is None else stamp for stamp in stamps]
 
 
-def _separate(stamps: Sequence[int], usual: int) -> tuple["array[int]", list[int]]:
+def _separate_duplicates(stamps: Sequence[int], frame_steps: int) -> tuple["array[int]", list[int]]:
     """Make sorted time stamps strictly increasing: move duplicates by one frame, or halfway to the next.
 
     Args:
         stamps: In steps of a time base.
-        usual: Usual distance between frames, in the same steps.
+        frame_steps: Usual distance between frames, in the same steps.
 
     Returns:
-        The times, and the numbers of the moved frames.
+        The times, and the numbers of the retimed frames.
     """
-    steps, moved = array("q", stamps[:1]), []
+    steps, retimed = array("q", stamps[:1]), []
     later = [b for a, b in pairwise(stamps) if b > a]
     after = 0
     for index in range(1, len(stamps)):
@@ -312,13 +316,13 @@ def _separate(stamps: Sequence[int], usual: int) -> tuple["array[int]", list[int
             after += 1
             steps.append(max(stamps[index], steps[-1] + 1))
             continue
-        room = (later[after] - steps[-1]) // 2 if after < len(later) else usual
-        steps.append(steps[-1] + max(min(usual, room), 1))
-        moved.append(index)
-    return steps, moved
+        room = (later[after] - steps[-1]) // 2 if after < len(later) else frame_steps
+        steps.append(steps[-1] + max(min(frame_steps, room), 1))
+        retimed.append(index)
+    return steps, retimed
 
 
-def _by_stamp(
+def _number_by_stamp(
     frames: Iterator["av.VideoFrame"], stamps: Sequence[int]
 ) -> Iterator[tuple[int, "av.VideoFrame"]]:
     """Number frames by their time stamps; frames with equal stamps keep their order."""
@@ -331,7 +335,7 @@ def _by_stamp(
             last = index
 
 
-def _by_rank(
+def _number_by_rank(
     frames: Iterator["av.VideoFrame"], stream: "av.VideoStream"
 ) -> Iterator[tuple[int, "av.VideoFrame"]]:
     """Number frames by the ranks of their packets in the file.
@@ -347,7 +351,7 @@ def _by_rank(
         yield index, frame
 
 
-def _intact(frames: Iterator["av.VideoFrame"]) -> Iterator["av.VideoFrame"]:
+def _drop_corrupt(frames: Iterator["av.VideoFrame"]) -> Iterator["av.VideoFrame"]:
     return (frame for frame in frames if not frame.is_corrupt)
 
 
@@ -358,17 +362,17 @@ def _describe_unopened(path: Path, error: "av.error.FFmpegError") -> str:
         beginning = file.read(8)
         if not beginning:
             return "an empty file"
-    found = f"one that cannot be opened ({_words(error)})"
+    found = f"one that cannot be opened ({_describe_error(error)})"
     if beginning[4:] in _MP4_BOXES:
         found += "; if it was cut off, it lost its index: record or download it again"
     return found
 
 
-def _words(error: "av.error.FFmpegError") -> str:
+def _describe_error(error: "av.error.FFmpegError") -> str:
     return (error.strerror or "error in FFmpeg").lower()
 
 
-def _rgb(frame: "av.VideoFrame") -> UInt8[np.ndarray, "h w 3"]:
+def _convert_to_rgb(frame: "av.VideoFrame") -> UInt8[np.ndarray, "h w 3"]:
     from av.video.reformatter import Interpolation
 
     large = frame.width >= _HD_WIDTH_PX or frame.height >= _HD_HEIGHT_PX
@@ -383,7 +387,7 @@ def _rgb(frame: "av.VideoFrame") -> UInt8[np.ndarray, "h w 3"]:
     return np.ascontiguousarray(np.rot90(picture, frame.rotation // 90))
 
 
-def _declared(frame: "av.VideoFrame") -> str | None:
+def _read_declared_packing(frame: "av.VideoFrame") -> str | None:
     from av.sidedata.sidedata import Type
 
     # PyAV's type stubs lack some kinds of side data.
@@ -396,7 +400,7 @@ def _declared(frame: "av.VideoFrame") -> str | None:
     return right_first.get(name, f"{name}_right_first") if flags & 1 else name
 
 
-def _rate(steps: Sequence[int], time_base: Fraction, average: Fraction) -> Fraction:
+def _choose_rate(steps: Sequence[int], time_base: Fraction, average: Fraction) -> Fraction:
     """Return the container's frame rate, or the measured one if they differ by more than 1 %."""
     if len(steps) < 2:
         return average
@@ -408,6 +412,6 @@ def _is_picture(file: Path) -> bool:
     return file.suffix.lower() in ENDINGS and not file.name.startswith(".")
 
 
-def _in_counting_order(file: Path) -> list[tuple[int, str]]:
+def _natural_key(file: Path) -> list[tuple[int, str]]:
     parts = re.split(r"(\d+)", file.name)
     return [(int(part), part) if part.isdigit() else (0, part) for part in parts]

@@ -103,9 +103,9 @@ class Recorder:
         with av.open(str(path), "w", format="nut") as part:
             stream = None
             for time_s, picture in pictures:
-                frame = _frame(picture)
+                frame = _make_frame(picture)
                 frame.pts, frame.time_base = round(time_s / self.time_base), self.time_base
-                stream = stream or self._stream(part, frame)
+                stream = stream or self._add_stream(part, frame)
                 part.mux(stream.encode(frame))
             if stream:
                 part.mux(stream.encode())
@@ -130,16 +130,18 @@ class Recorder:
             stream = container.add_stream_from_template(first.streams.video[0], opaque=True)
             if self.packing:
                 stream.metadata["stereo_mode"] = self.packing.stereo_mode
-            start_s, flows = Fraction(0), []
+            start_s, sound_packets = Fraction(0), []
             if sound:
                 source = stack.enter_context(av.open(str(sound)))
-                start_s = _start_s(source.streams.best("video"))
-                flows = [_sound(source, _copied(source, container))]
+                start_s = _find_start_s(source.streams.best("video"))
+                sound_packets = [_read_sound(source, _copy_sound_streams(source, container))]
             # In order of time, because the muxer buffers packets that are ahead of the other streams.
-            for packet in merge(self._pictures(parts, stream, start_s), *flows, key=_time_s):
+            for packet in merge(
+                self._read_packets(parts, stream, start_s), *sound_packets, key=_decoding_time_s
+            ):
                 container.mux(packet)
 
-    def _stream(self, part: OutputContainer, frame: VideoFrame) -> VideoStream:
+    def _add_stream(self, part: OutputContainer, frame: VideoFrame) -> VideoStream:
         """Add a stream for frames like this one, with the colours of HD video (BT.709)."""
         options = dict(self.encoding.options)
         if self.packing and self.packing.frame_packing is not None:
@@ -152,7 +154,9 @@ class Recorder:
         stream.color_primaries, stream.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
         return stream
 
-    def _pictures(self, parts: Sequence[Path], stream: VideoStream, start_s: Fraction) -> Iterator[AnyPacket]:
+    def _read_packets(
+        self, parts: Sequence[Path], stream: VideoStream, start_s: Fraction
+    ) -> Iterator[AnyPacket]:
         """Yield the packets of all parts for one stream, delayed by `start_s`."""
         for path in parts:
             with av.open(str(path)) as part:
@@ -170,11 +174,11 @@ def check_container(path: Path, sound: Path | None) -> None:
         raise StereoweaveError(
             f"{path}: expected the ending of a video, {', '.join(CONTAINERS)}, found {path.suffix!r}"
         )
-    if sound is None or _holds(path.suffix, sound):
+    if sound is None or _can_hold(path.suffix, sound):
         return
     with av.open(str(sound)) as source:
         codecs = ", ".join(sorted({stream.codec_context.name for stream in source.streams.audio}))
-    others = [ending for ending in CONTAINERS if _holds(ending, sound)]
+    others = [ending for ending in CONTAINERS if _can_hold(ending, sound)]
     remedy = f"{others[0]} holds it" if others else "convert the sound first, to FLAC for instance"
     raise StereoweaveError(
         f"{path}: expected sound that {path.suffix} can hold, found {codecs} in {sound}; {remedy}"
@@ -210,7 +214,7 @@ class Parts:
     def state(self) -> dict[str, np.ndarray]:
         """Load the state after the last finished part."""
         file = self._state_file(len(self.files))
-        with _undamaged(file), file.open("rb") as opened, np.load(opened) as arrays:
+        with _reporting_damage(file), file.open("rb") as opened, np.load(opened) as arrays:
             return dict(arrays)
 
     def _state_file(self, number: int) -> Path:
@@ -223,7 +227,7 @@ def parts_folder(out: Path) -> Path:
 
 
 @contextmanager
-def growing(out: Path, settings: Mapping[str, object], name_of: NameOf = keyword) -> Iterator[Parts]:
+def open_parts(out: Path, settings: Mapping[str, object], name_of: NameOf = keyword) -> Iterator[Parts]:
     """Open the parts of a video, to add more; removes them on success and keeps finished ones after an error.
 
     Args:
@@ -275,7 +279,7 @@ def _clear(folder: Path) -> None:
 
 def _check_settings(folder: Path, settings: Mapping[str, object], name_of: NameOf) -> None:
     file = _settings_file(folder)
-    with _undamaged(file):
+    with _reporting_damage(file):
         found = dict(json.loads(file.read_text()))
     other = [name for name, value in json.loads(json.dumps(settings)).items() if value != found.get(name)]
     if other:
@@ -299,7 +303,7 @@ def _format_setting(name: str, value: object) -> str:
 
 
 @contextmanager
-def _undamaged(file: Path) -> Iterator[None]:
+def _reporting_damage(file: Path) -> Iterator[None]:
     """Turn any error of reading a file of the parts into one line."""
     try:
         yield
@@ -310,7 +314,7 @@ def _undamaged(file: Path) -> Iterator[None]:
         ) from error
 
 
-def _frame(picture: Picture) -> VideoFrame:
+def _make_frame(picture: Picture) -> VideoFrame:
     if picture.ndim == 2:
         return VideoFrame.from_ndarray(picture.astype(np.uint16, copy=False), "gray16le")
     height, width = picture.shape[:2]
@@ -324,18 +328,18 @@ def _frame(picture: Picture) -> VideoFrame:
     )
 
 
-def _holds(ending: str, sound: Path) -> bool:
+def _can_hold(ending: str, sound: Path) -> bool:
     """Test whether a container with this ending can hold a file's sound, by muxing its beginning."""
     container = CONTAINERS[ending.lower()]
     try:
         with av.open(str(sound)) as source, av.open(BytesIO(), "w", format=container) as output:
-            output.mux(list(islice(_sound(source, _copied(source, output)), _TRIED_PACKETS)))
+            output.mux(list(islice(_read_sound(source, _copy_sound_streams(source, output)), _TRIED_PACKETS)))
     except ValueError:  # raised by both PyAV and FFmpeg for sound that the container cannot hold
         return False
     return True
 
 
-def _copied(source: InputContainer, output: OutputContainer) -> dict[int, AudioStream]:
+def _copy_sound_streams(source: InputContainer, output: OutputContainer) -> dict[int, AudioStream]:
     """Add a stream to a video for each audio stream of the source; by the source's indices."""
     streams = {}
     for stream in source.streams.audio:
@@ -345,7 +349,7 @@ def _copied(source: InputContainer, output: OutputContainer) -> dict[int, AudioS
     return streams
 
 
-def _sound(source: InputContainer, streams: Mapping[int, AudioStream]) -> Iterator[AnyPacket]:
+def _read_sound(source: InputContainer, streams: Mapping[int, AudioStream]) -> Iterator[AnyPacket]:
     """Yield the audio packets of a source for the new streams."""
     with suppress(FFmpegError):  # the file breaks off, which `StereoVideo` reports
         for packet in _drop_empty(source.demux(*source.streams.audio)):
@@ -353,7 +357,7 @@ def _sound(source: InputContainer, streams: Mapping[int, AudioStream]) -> Iterat
             yield packet
 
 
-def _start_s(stream: Stream | None) -> Fraction:
+def _find_start_s(stream: Stream | None) -> Fraction:
     """Return the time of the first frame, in seconds of its file's clock."""
     return (stream.start_time or 0) * (stream.time_base or Fraction(0)) if stream else Fraction(0)
 
@@ -363,5 +367,5 @@ def _drop_empty(packets: Iterable[AnyPacket]) -> Iterator[AnyPacket]:
     return (packet for packet in packets if packet.size)
 
 
-def _time_s(packet: AnyPacket) -> Fraction:
+def _decoding_time_s(packet: AnyPacket) -> Fraction:
     return packet.time_base * (packet.dts or 0)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stereoweave.app.live import Capture, LiveTally, Screen, composed, followed, range_words, show
+from stereoweave.app.live import Capture, LiveTally, Screen, compose, describe_range, follow_range, show
 from stereoweave.cameras.calibration_files import read_rig
 from stereoweave.cli.live import live
 from stereoweave.errors import FormatError, StereoweaveError
@@ -52,7 +52,7 @@ def example_frame() -> np.ndarray:
     return cv2.cvtColor(both, cv2.COLOR_BGR2RGB)
 
 
-def parts(response: http.client.HTTPResponse) -> Iterator[np.ndarray]:
+def read_pictures(response: http.client.HTTPResponse) -> Iterator[np.ndarray]:
     """The pictures of a stream in RGB, read as the format says: boundary, header, as many bytes."""
     boundary = response.headers.get_boundary()
     assert response.headers.get_content_type() == "multipart/x-mixed-replace"
@@ -69,13 +69,13 @@ def parts(response: http.client.HTTPResponse) -> Iterator[np.ndarray]:
         yield cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
 
 
-def asked(url: str, path: str = "/", **headers: str) -> http.client.HTTPResponse:
+def request(url: str, path: str = "/", **headers: str) -> http.client.HTTPResponse:
     connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=20)
     connection.request("GET", path, headers=headers)
     return connection.getresponse()
 
 
-def begun(process: subprocess.Popen[str]) -> str:
+def read_page_url(process: subprocess.Popen[str]) -> str:
     """The address of the page, which the command says first."""
     assert process.stdout is not None
     found = re.search(r"http://127\.0\.0\.1:\d+/", process.stdout.readline())
@@ -181,12 +181,12 @@ def keep_showing(screen: Screen, picture: np.ndarray, ended: threading.Event) ->
 def test_the_page_has_the_stream_and_the_stream_the_newest_pictures():
     first, second = greys(8)[3], greys(8)[7]
     with Screen(0) as screen:
-        page = asked(screen.url)
+        page = request(screen.url)
         assert page.status == 200
         assert b'<img src="/stream"' in page.read()
         screen.show(first)
         screen.show(second)
-        stream = parts(asked(screen.url, "/stream"))
+        stream = read_pictures(request(screen.url, "/stream"))
         assert number_of(next(stream)) == 7
         screen.show(first)
         assert number_of(next(stream)) == 3
@@ -196,11 +196,11 @@ def test_the_page_has_the_stream_and_the_stream_the_newest_pictures():
 
 def test_the_page_is_for_this_machine_alone():
     with Screen(0) as screen:
-        assert asked(screen.url, Host="somewhere.example:80").status == 403
-        assert asked(screen.url, Host=f"localhost:{screen.server_port}").status == 200
-        assert asked(screen.url, Host="localhost").status == 200  # as browsers write port 80
-        assert asked(screen.url, "/other").status == 404
-        assert asked(screen.url).headers["Cross-Origin-Resource-Policy"] == "same-origin"
+        assert request(screen.url, Host="somewhere.example:80").status == 403
+        assert request(screen.url, Host=f"localhost:{screen.server_port}").status == 200
+        assert request(screen.url, Host="localhost").status == 200  # as browsers write port 80
+        assert request(screen.url, "/other").status == 404
+        assert request(screen.url).headers["Cross-Origin-Resource-Policy"] == "same-origin"
 
 
 def test_a_port_that_is_taken_is_named():
@@ -213,8 +213,8 @@ def test_a_port_that_is_taken_is_named():
 
 def test_the_colours_follow_a_new_range_by_a_tenth():
     near_px = np.full((40, 40), 50, np.float32)
-    assert followed(None, near_px) == (50, 51)  # at least a pixel
-    assert followed((0.0, 20.0), near_px) == pytest.approx((5, 23.1))
+    assert follow_range(None, near_px) == (50, 51)  # at least a pixel
+    assert follow_range((0.0, 20.0), near_px) == pytest.approx((5, 23.1))
 
 
 def test_the_disparity_is_beside_the_left_picture_and_black_where_nothing_is_seen(rng):
@@ -223,7 +223,7 @@ def test_the_disparity_is_beside_the_left_picture_and_black_where_nothing_is_see
     seen[:, :7] = False
     disparity_px = rng.uniform(0, 9, (40, 60)).astype(np.float32)
     pair = StereoPair(left=left, right=left, left_seen=seen)
-    picture = composed(pair, disparity_px, (0, 9), "12.0 frames/s")
+    picture = compose(pair, disparity_px, (0, 9), "12.0 frames/s")
     strip, below = picture[:-40], picture[-40:]
     assert strip.max() > 0
     np.testing.assert_array_equal(below[:, :60], left)
@@ -233,8 +233,8 @@ def test_the_disparity_is_beside_the_left_picture_and_black_where_nothing_is_see
 
 def test_with_a_camera_the_colours_stand_for_metres():
     camera = StereoCamera(focal_px=600, baseline_m=0.1, cx_px=320, cy_px=240)
-    assert range_words(camera, (6.0, 40.0)) == "depth 10.00 m (blue) to 1.50 m (red)"
-    assert range_words(None, (6.0, 40.0)) == "disparity 6.0 px (blue) to 40.0 px (red)"
+    assert describe_range(camera, (6.0, 40.0)) == "depth 10.00 m (blue) to 1.50 m (red)"
+    assert describe_range(None, (6.0, 40.0)) == "disparity 6.0 px (blue) to 40.0 px (red)"
 
 
 def test_a_tally_counts_frames_their_rate_and_how_long_they_took(tmp_path):
@@ -242,11 +242,11 @@ def test_a_tally_counts_frames_their_rate_and_how_long_they_took(tmp_path):
         moment = capture.newest(-1)
     assert moment is not None
     tally = LiveTally()
-    assert tally.line() == "nothing was shown"
+    assert tally.describe() == "nothing was shown"
     for number, (taken_s, now_s) in enumerate([(0.0, 0.5), (0.75, 1.0), (2.25, 2.5)]):
         tally.add(moment._replace(number=2 * number, taken_s=taken_s), now_s)
     assert tally.rate == 1.0
-    assert tally.line() == "3 frames shown of 5, 1.0 a second, 333 ms after they came"
+    assert tally.describe() == "3 frames shown of 5, 1.0 a second, 333 ms after they came"
 
 
 def test_what_is_shown_of_two_videos_is_their_left_picture_and_its_disparity(tmp_path):
@@ -258,7 +258,7 @@ def test_what_is_shown_of_two_videos_is_their_left_picture_and_its_disparity(tmp
     tally = LiveTally()
     with Screen(0) as screen, Capture(sources) as capture:
         show(capture, screen, Matcher(), tally, rig=read_rig(tmp_path / "calib.txt"))
-        picture = next(parts(asked(screen.url, "/stream")))
+        picture = next(read_pictures(request(screen.url, "/stream")))
     assert (tally.shown, tally.last) == (1, 0)
     assert picture.shape == (240 + 32, 640, 3)
     assert np.abs(picture[32:, :320].astype(int) - left).mean() < 8
@@ -273,7 +273,7 @@ def test_the_command_shows_a_video_and_sums_it_up_at_its_end(tmp_path):
     with subprocess.Popen(
         [*COMMAND, video, "--port", "0", "--no-browser"], stdout=subprocess.PIPE, text=True
     ) as process:
-        stream = parts(asked(begun(process), "/stream"))
+        stream = read_pictures(request(read_page_url(process), "/stream"))
         for picture in (next(stream), next(stream)):
             assert picture.shape == (120 + 32, 320, 3)
         rest, _ = process.communicate(timeout=60)
@@ -296,7 +296,7 @@ def test_an_interrupt_ends_the_command_in_order(tmp_path):
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     with process:
-        next(parts(asked(begun(process), "/stream")))
+        next(read_pictures(request(read_page_url(process), "/stream")))
         process.send_signal(signal.SIGINT)
         said, complaint = process.communicate(timeout=60)
     assert (process.returncode, complaint) == (0, "")

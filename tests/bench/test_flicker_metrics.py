@@ -136,8 +136,10 @@ def test_a_still_video_does_not_change_and_its_noise_does(three_frames):
     video = freeze(three_frames)
     assert len(video.pairs) == 3
     motion_px, _ = video.change(0, 2, LEFT)
-    assert video.seen_again(0, 2, LEFT).all()
-    assert flicker(video.pairs[0].left, video.pairs[2].left, motion_px, video.seen_again(0, 2, LEFT)) == 0
+    assert video.find_seen_again(0, 2, LEFT).all()
+    assert (
+        flicker(video.pairs[0].left, video.pairs[2].left, motion_px, video.find_seen_again(0, 2, LEFT)) == 0
+    )
     grey = StereoPair(left=np.full((96, 128, 3), 99, np.uint8), right=np.full((96, 128, 3), 99, np.uint8))
     one, other = (add_noise(grey, np.random.default_rng(seed)) for seed in (1, 2))
     for a, b in ((one.left, one.right), (one.left, other.left), (one.right, other.right)):
@@ -165,8 +167,8 @@ def test_what_passes_is_where_its_truth_says(three_frames):
 def test_what_passes_covers_and_uncovers(three_frames):
     video = add_passing_oval(three_frames, "passing", (4.0, 0.0))
     before, after = video.moving[0], video.moving[1]
-    np.testing.assert_array_equal(video.seen_again(0, 1, LEFT) | (after & ~before), np.ones_like(before))
-    np.testing.assert_array_equal(video.seen_again(1, 0, LEFT), ~(before & ~after))
+    np.testing.assert_array_equal(video.find_seen_again(0, 1, LEFT) | (after & ~before), np.ones_like(before))
+    np.testing.assert_array_equal(video.find_seen_again(1, 0, LEFT), ~(before & ~after))
     motion_px, change_px = video.change(0, 2, LEFT)
     np.testing.assert_array_equal(motion_px[before], np.tile([8, 0], (before.sum(), 1)))
     assert not motion_px[~before].any() and not change_px.any()
@@ -183,7 +185,7 @@ def test_what_comes_nearer_moves_less_to_the_right_in_the_middle_view(three_fram
 def test_a_rendered_pan_looks_the_same_along_its_true_motion():
     video = render_panning(RenderSpec(scene="ship", seed=4, size_px=(160, 120), frames=12), 2)
     motion_px, change_px = video.change(0, 1, LEFT)
-    visible = video.seen_again(0, 1, LEFT)
+    visible = video.find_seen_again(0, 1, LEFT)
     assert visible.mean() > 0.8
     before_px, after_px = (maps[LEFT] for maps in video.disparities_px)
     at_rest_px = flicker(before_px, after_px, 0 * motion_px, visible)

@@ -35,7 +35,7 @@ def slow_video(path: Path, count: int = 13) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def heeded_interrupts():
+def default_interrupts():
     """Where a shell starts the tests in the background, Python leaves Ctrl-C ignored."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield

@@ -21,9 +21,9 @@ from video_examples import (
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import write_image
-from stereoweave.pictures.pair_layouts import detect_layout, measure_resemblance
-from stereoweave.video.reader import PAIR_LAYOUTS, open_video
-from stereoweave.video.tracks import _by_rank, _fill_missing, _separate
+from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, detect_layout, measure_resemblance
+from stereoweave.video.reader import open_video
+from stereoweave.video.tracks import _fill_missing, _number_by_rank, _separate_duplicates
 
 BEFORE = "damaged: replaced by the frame before it"
 SPOILT = "decoded from a damaged frame before it"
@@ -290,11 +290,14 @@ def test_a_repeated_time_stamp_moves_its_frame_alone(tmp_path):
 
 
 def test_a_repeat_goes_one_frame_on_where_there_is_room():
-    assert _separate([0, 40, 40, 200, 200], usual=40) == (array("q", [0, 40, 80, 200, 240]), [2, 4])
+    assert _separate_duplicates([0, 40, 40, 200, 200], frame_steps=40) == (
+        array("q", [0, 40, 80, 200, 240]),
+        [2, 4],
+    )
 
 
 def test_steps_rise_where_there_is_no_room_between_repeated_stamps():
-    steps, moved = _separate([0, 5, 5, 5, 6, 9], usual=4)
+    steps, moved = _separate_duplicates([0, 5, 5, 5, 6, 9], frame_steps=4)
     assert list(steps) == [0, 5, 6, 7, 8, 9]
     assert moved == [2, 3]
 
@@ -323,7 +326,7 @@ def test_a_frame_lost_among_those_coded_out_of_turn_is_noticed_at_the_next_key_f
     # In the file I0 P1 B2 B3 P4 I5 P6, of which B3 is lost.
     shown = [SimpleNamespace(opaque=rank, key_frame=rank in (0, 5)) for rank in (0, 2, 1, 4, 5, 6)]
     decoder = SimpleNamespace(codec_context=SimpleNamespace(has_b_frames=True))
-    assert [number for number, _ in _by_rank(iter(shown), decoder)] == [0, 1, 2, 3, 5, 6]
+    assert [number for number, _ in _number_by_rank(iter(shown), decoder)] == [0, 1, 2, 3, 5, 6]
 
 
 def test_a_folder_of_pictures_is_a_video_in_counting_order(tmp_path):

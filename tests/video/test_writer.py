@@ -21,7 +21,7 @@ from stereoweave.video.writer import (
     Parts,
     Recorder,
     check_container,
-    growing,
+    open_parts,
     parts_folder,
 )
 
@@ -59,7 +59,7 @@ def recorder(**changes: object) -> Recorder:
     return Recorder(**{"encoding": H264, "time_base": 1 / NTSC, "rate": NTSC, **changes})
 
 
-def shown_at(video: Path) -> list[Fraction]:
+def frame_times(video: Path) -> list[Fraction]:
     with av.open(str(video)) as container:
         return [frame.pts * frame.time_base for frame in container.decode(video=0)]
 
@@ -88,12 +88,12 @@ def test_frames_are_shown_at_their_very_times_even_where_parts_meet(tmp_path, en
     times_s = [step * time_base for step in steps]
     writing = recorder(time_base=time_base, rate=len(steps) / times_s[-1])
     video = make(tmp_path / f"video{ending}", list(zip(times_s, pictures(10), strict=True)), writing, parts=3)
-    assert shown_at(video) == times_s
+    assert frame_times(video) == times_s
 
 
 def test_matroska_rounds_times_to_the_millisecond(tmp_path):
     video = make(tmp_path / "video.mkv", list(zip(even_times(6), pictures(6), strict=True)), recorder())
-    assert shown_at(video) == [Fraction(ms, 1000) for ms in (0, 33, 67, 100, 133, 167)]
+    assert frame_times(video) == [Fraction(ms, 1000) for ms in (0, 33, 67, 100, 133, 167)]
 
 
 def test_the_last_frame_is_shown_as_long_as_the_others(tmp_path):
@@ -182,7 +182,7 @@ def test_sound_is_copied_bit_for_bit_at_its_times(tmp_path, source, target, off_
     # The encoder's run-up lies before 0; nothing is shifted for it.
     assert before[0][0] < 0
     assert max(abs(then - now) for (then, _), (now, _) in zip(before, after, strict=True)) <= off_s
-    assert shown_at(video)[0] == 0
+    assert frame_times(video)[0] == 0
 
 
 def test_all_streams_of_sound_are_kept_with_their_languages(tmp_path):
@@ -205,7 +205,7 @@ def test_pictures_and_sound_stay_in_step_where_the_pictures_begin_late(tmp_path)
     video = make(
         tmp_path / "out.mp4", shown, recorder(time_base=Fraction(1, 1000), rate=Fraction(25)), sound=original
     )
-    assert shown_at(video) == shown_at(original) == [Fraction(ms, 1000) for ms in (400, 440, 480)]
+    assert frame_times(video) == frame_times(original) == [Fraction(ms, 1000) for ms in (400, 440, 480)]
     assert sound_of(video) == sound_of(original)
 
 
@@ -215,7 +215,7 @@ def test_a_late_start_is_kept_exactly(tmp_path, ending):
     late = [(36_001 + index * 3600) * ninety_kilohertz for index in range(3)]
     writing = recorder(time_base=ninety_kilohertz, rate=Fraction(25))
     video = make(tmp_path / f"video{ending}", list(zip(late, pictures(3), strict=True)), writing)
-    assert shown_at(video) == late
+    assert frame_times(video) == late
 
 
 def test_sound_that_a_container_cannot_hold_is_refused_with_one_that_can(tmp_path):
@@ -238,7 +238,7 @@ def test_a_name_that_is_no_videos_is_refused():
 
 def test_a_videos_parts_go_when_it_is_done(tmp_path):
     video = tmp_path / "video.mp4"
-    with growing(video, {"position": 0.5}) as parts:
+    with open_parts(video, {"position": 0.5}) as parts:
         add(parts, b"first", 1)
         assert parts_folder(video) == tmp_path / "video.mp4.parts"
         assert parts_folder(video).is_dir()
@@ -249,13 +249,13 @@ def test_what_others_keep_in_that_folder_stays(tmp_path):
     video = tmp_path / "video.mp4"
     parts_folder(video).mkdir()
     (parts_folder(video) / "notes.txt").write_text("mine")
-    with growing(video, {}) as parts:
+    with open_parts(video, {}) as parts:
         add(parts, b"first", 1)
     assert [path.name for path in parts_folder(video).iterdir()] == ["notes.txt"]
 
 
 def test_an_error_before_the_first_part_leaves_nothing(tmp_path):
-    with pytest.raises(ZeroDivisionError), growing(tmp_path / "video.mp4", {}) as parts:
+    with pytest.raises(ZeroDivisionError), open_parts(tmp_path / "video.mp4", {}) as parts:
         break_off(parts, ZeroDivisionError())
     assert list(tmp_path.iterdir()) == []
 
@@ -263,11 +263,11 @@ def test_an_error_before_the_first_part_leaves_nothing(tmp_path):
 def test_after_an_error_the_finished_parts_and_the_last_ones_state_stay(tmp_path):
     video = tmp_path / "video.mp4"
     told = r"^no picture; finished parts are in .*video\.mp4\.parts; rerun the same command to resume$"
-    with pytest.raises(StereoweaveError, match=told), growing(video, {"position": 0.5}) as parts:
+    with pytest.raises(StereoweaveError, match=told), open_parts(video, {"position": 0.5}) as parts:
         add(parts, b"first", 1)
         add(parts, b"second", 2)
         break_off(parts, StereoweaveError("no picture"))
-    with growing(video, {"position": 0.5}) as parts:
+    with open_parts(video, {"position": 0.5}) as parts:
         assert [file.read_bytes() for file in parts.files] == [b"first", b"second"]
         assert parts.state() == {"frames": 2}
         assert sorted(path.name for path in parts.folder.iterdir()) == [
@@ -280,26 +280,26 @@ def test_after_an_error_the_finished_parts_and_the_last_ones_state_stay(tmp_path
 
 def test_parts_without_their_state_count_for_nothing(tmp_path):
     video = tmp_path / "video.mp4"
-    with pytest.raises(KeyboardInterrupt), growing(video, {}) as parts:
+    with pytest.raises(KeyboardInterrupt), open_parts(video, {}) as parts:
         add(parts, b"first", 1)
         add(parts, b"second", 2)
         raise KeyboardInterrupt
     (parts_folder(video) / "state-000002.npz").unlink()
-    with growing(video, {}) as parts:
+    with open_parts(video, {}) as parts:
         assert parts.files == []
         assert [path.name for path in parts.folder.iterdir()] == ["settings.json"]
 
 
 def test_parts_of_another_video_are_not_continued(tmp_path):
     video = tmp_path / "video.mp4"
-    with pytest.raises(KeyboardInterrupt), growing(video, {"position": 0.5, "model": "small"}) as parts:
+    with pytest.raises(KeyboardInterrupt), open_parts(video, {"position": 0.5, "model": "small"}) as parts:
         add(parts, b"first", 1)
         raise KeyboardInterrupt
     with (
         pytest.raises(
             StereoweaveError, match=r"found parts begun with position 0\.5; remove that folder, or give"
         ),
-        growing(video, {"position": 0.25, "model": "small"}),
+        open_parts(video, {"position": 0.25, "model": "small"}),
     ):
         pass
     assert json.loads((tmp_path / "video.mp4.parts" / "settings.json").read_text())["position"] == 0.5
@@ -325,7 +325,7 @@ def test_a_disk_that_is_full_from_the_start_is_one_line_with_the_file(tmp_path):
     with pytest.raises(StereoweaveError, match=told):
         resource.setrlimit(resource.RLIMIT_FSIZE, (1, hard))
         try:
-            with growing(tmp_path / "video.mp4", {"position": 0.5}):
+            with open_parts(tmp_path / "video.mp4", {"position": 0.5}):
                 pass
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -339,20 +339,23 @@ def test_a_disk_that_is_full_from_the_start_is_one_line_with_the_file(tmp_path):
 def test_what_a_video_was_begun_with_is_told_as_users_write_it(tmp_path, value, told):
     video = tmp_path / "video.mp4"
     begin(video, {"x": value})
-    with pytest.raises(StereoweaveError, match=f"found parts begun {told}; "), growing(video, {"x": "else"}):
+    with (
+        pytest.raises(StereoweaveError, match=f"found parts begun {told}; "),
+        open_parts(video, {"x": "else"}),
+    ):
         pass
 
 
 def begin(video: Path, settings: dict[str, object] | None = None) -> Path:
     """The folder of a video that was interrupted after one part."""
-    with pytest.raises(KeyboardInterrupt), growing(video, settings or {}) as parts:
+    with pytest.raises(KeyboardInterrupt), open_parts(video, settings or {}) as parts:
         add(parts, b"first", 1)
         raise KeyboardInterrupt
     return parts_folder(video)
 
 
 def assert_to_be_removed(video: Path, name: str) -> None:
-    with pytest.raises(StereoweaveError) as caught, growing(video, {}):
+    with pytest.raises(StereoweaveError) as caught, open_parts(video, {}):
         pass
     folder = parts_folder(video)
     assert str(caught.value).startswith(f"{folder / name}: expected")
