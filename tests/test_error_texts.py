@@ -23,7 +23,7 @@ from stereoweave.service.admission import BusyError
 from stereoweave.service.answers import TooLargeError
 from stereoweave.system.child_process import ProcessDiedError
 from stereoweave.system.ray_engine import Engine
-from stereoweave.video.convert import VideoJob
+from stereoweave.video.job import VideoJob
 
 PACKAGE = Path(sw.__file__).parent
 PAIR = Path("left.png"), Path("right.png")

@@ -208,9 +208,10 @@ class Worker:
         from stereoweave.io.animation import needing_the_video_extra
 
         with needing_the_video_extra("a video"):
-            from stereoweave.video.convert import VideoJob, convert_video
+            from stereoweave.video.convert import convert_video
+            from stereoweave.video.job import VideoJob
+            from stereoweave.video.parts import parts_folder
             from stereoweave.video.reader import open_video
-            from stereoweave.video.writer import parts_folder
 
         films, _ = self._fetched(planned, scratch / "pictures")
         film_job = VideoJob(depth16=True, backend=job.backend, name_of=job.name_of)

@@ -107,8 +107,9 @@ def video(  # noqa: PLR0913 - each is an option of the command line
     from stereoweave.video.reader import open_video
 
     with needing_the_video_extra("a video"):
-        from stereoweave.video.convert import VideoJob, convert_video
-        from stereoweave.video.writer import parts_folder
+        from stereoweave.video.convert import convert_video
+        from stereoweave.video.job import VideoJob
+        from stereoweave.video.parts import parts_folder
 
     format = replace_old_option(("--arrangement", arrangement), ("--format", format))
     try:

@@ -2,50 +2,35 @@
 
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from fractions import Fraction
 from itertools import chain, islice
-from math import isfinite
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, UInt16
 from rich.console import Console
 from rich.progress import Progress, TaskID
 
 from stereoweave import __version__
-from stereoweave.cameras.alignment import SWAPPED
-from stereoweave.cameras.diagnosis import find_problems
-from stereoweave.errors import NameOf, Note, Remedy, StereoweaveError, keyword
-from stereoweave.io.colormap import colour_disparity, find_colour_range_px
+from stereoweave.errors import StereoweaveError
 from stereoweave.io.output_lock import lock_output
-from stereoweave.matching.backend import Backend
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
-from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS
-from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, check_positions, median_disparity_px
-from stereoweave.rendering.renderer import Renderer
-from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.stereo import StereoPair
 from stereoweave.system.progress import progress
 from stereoweave.system.threads import thread_count
-from stereoweave.video.reader import StereoFrame, StereoVideo
+from stereoweave.video.job import VideoJob
+from stereoweave.video.parts import open_parts
+from stereoweave.video.reader import StereoFrame, StereoVideo, format_time
+from stereoweave.video.survey import Survey, survey_video
 from stereoweave.video.temporal_filter import TemporalFilter
 from stereoweave.video.tracks import list_picture_files
-from stereoweave.video.writer import GREY16, H264, Packing, Picture, Recorder, check_container, open_parts
+from stereoweave.video.writer import GREY16, H264, Packing, Picture, Recorder, check_container
 
 # Length of a part. An interrupted run loses the unfinished one; each begins with a key frame.
 _PART_S = 10
-_SURVEYED_FRAMES, _CHECKED_FRAMES = 24, 3
-_SURVEY_STEP_PX = 4
-# Outliers do not widen the range; the margin allows for objects that come nearer between the surveyed frames.
-_OUTER_PERCENT, _MARGIN_PX = 0.5, 8.0
 _NAMED_PROBLEMS = 3
-_STEPS_PER_PX, _MOST_GREY16_PX = 256, 255.99
-
-# Keys of the saved settings that are not settings, and their names in errors.
-_SAVED_FACTS = {"film": "video", "stereoweave": "stereoweave"}
 
 PACKINGS = {
     "side_by_side": Packing("left_right", 3),
@@ -54,139 +39,6 @@ PACKINGS = {
     "top_bottom": Packing("top_bottom", 4),
     "top_bottom_half": Packing("top_bottom", 4),
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class VideoJob:
-    """Settings of a conversion; exactly one of depth, depth16, position and layout is set.
-
-    Attributes:
-        depth: Left disparity in colours, with one range for the whole video.
-        depth16: Left disparity as 16-bit grey, px * 256 as in disparity.png; clipped to 1/256 to 255.99 px.
-        position: View from this position: 0 is the left camera, 1 the right one.
-        layout: A name in `LAYOUTS`.
-        strength: Multiplies the baseline.
-        convergence_px: Disparity that stays in place from view to view. Default: the scene's median disparity
-            for layouts that overlay their views, else 0.
-        backend: Matches the frames.
-        name_of: The front end's names for settings, used in notes.
-    """
-
-    depth: bool = False
-    depth16: bool = False
-    position: float | None = None
-    layout: str | None = None
-    strength: float = 1.0
-    convergence_px: float | None = None
-    backend: Backend = Backend()
-    name_of: NameOf = keyword
-
-    def __post_init__(self) -> None:
-        kinds = {
-            "depth": self.depth,
-            "depth16": self.depth16,
-            "position": self.position is not None,
-            "layout": self.layout is not None,
-        }
-        given = [kind for kind, is_given in kinds.items() if is_given]
-        if len(given) != 1:
-            raise StereoweaveError(
-                f"expected one kind of video to make, found {' and '.join(given) or 'none'}",
-                remedy=Remedy("choose one", tuple(kinds)),
-            )
-        if self.layout not in (None, *LAYOUTS):
-            raise StereoweaveError(
-                f"expected one of {', '.join(LAYOUTS)}, found {self.layout!r}", setting="layout"
-            )
-        self._check_numbers(given[0] if self.layout is None else f"layout {self.layout}")
-        check_positions(self._positions, self.strength)
-
-    def _check_numbers(self, kind: str) -> None:
-        """Raise if a number is not finite, or has no effect on this kind of video."""
-        numbers = {"strength": (self.strength, 1.0), "convergence_px": (self.convergence_px, None)}
-        for setting, (value, unset) in numbers.items():
-            if value == unset or value is None:
-                continue
-            if not isfinite(value):
-                raise StereoweaveError(f"expected a finite number, found {value}", setting=setting)
-            if not self._positions:
-                raise StereoweaveError(
-                    f"expected a view or a layout of views for it, found {kind}", setting=setting
-                )
-
-    @property
-    def _positions(self) -> tuple[float, ...]:
-        if self.layout:
-            return LAYOUTS[self.layout].positions
-        return () if self.position is None else (self.position,)
-
-    def render_frame(self, pair: StereoPair, estimate: Estimate, survey: "Survey") -> Picture:
-        """Make the output image of one frame."""
-        if self.depth:
-            return colour_disparity(estimate.disparity_px, survey.range_px)
-        if self.depth16:
-            return _encode_grey16(estimate.disparity_px)
-        renderer = Renderer(
-            pair,
-            estimate,
-            strength=self.strength,
-            convergence_px=self._find_plane_px(survey),
-            threads=self.backend.threads,
-        )
-        if self.position is not None:
-            return renderer.view(self.position).image
-        return LAYOUTS[str(self.layout)].compose(renderer, LayoutOptions(range_px=survey.range_px))
-
-    def _find_plane_px(self, survey: "Survey") -> float:
-        """Return the disparity that stays in place from view to view."""
-        if self.convergence_px is not None:
-            return self.convergence_px
-        return survey.middle_px if self.layout and LAYOUTS[self.layout].converged else 0.0
-
-    def name_of_saved(self, key: str) -> str:
-        """Return the front end's name for a key of the saved settings."""
-        if key in _SAVED_FACTS:
-            return _SAVED_FACTS[key]
-        setting = "format" if key == "arrangement" else key
-        return self.name_of(setting) or setting
-
-    def find_losses(self, survey: "Survey") -> list[Note]:
-        """Return a note if the file cannot hold all of the video's disparities."""
-        low_px, high_px = survey.range_px
-        if not self.depth16 or (low_px >= 0 and high_px <= _MOST_GREY16_PX):
-            return []
-        text = (
-            f"16-bit grey holds 0 to {_MOST_GREY16_PX} px: this video's disparities, {low_px:.1f} to "
-            f"{high_px:.1f} px, are clipped"
-        )
-        return [Note(text, Remedy("show all of them in colours", ("depth",)))]
-
-    def describe_values(self, survey: "Survey") -> dict[str, str]:
-        """Return the file's metadata: how to convert its pictures back to disparities."""
-        low_px, high_px = survey.range_px
-        if self.depth16:
-            return {"comment": f"16-bit grey: disparity of the left view in pixels = value / {_STEPS_PER_PX}"}
-        if self.depth:
-            return {
-                "comment": f"disparity of the left view: {low_px:.2f} px is blue, {high_px:.2f} px is red"
-            }
-        if self.layout == "rgbd":
-            return {"comment": f"disparity in grey: {low_px:.2f} px is black, {high_px:.2f} px is white"}
-        return {}
-
-
-class Survey(NamedTuple):
-    """Disparities measured in frames from all over the video.
-
-    Attributes:
-        range_px: Disparity range of the colours.
-        middle_px: Median disparity of the scene.
-        match_range_px: Disparity range to match; None if the network's own range covers the surveyed frames.
-    """
-
-    range_px: tuple[float, float]
-    middle_px: float
-    match_range_px: tuple[float, float] | None
 
 
 @dataclass
@@ -204,7 +56,7 @@ class VideoTally:
         if frame.problem is not None:
             self.problems += 1
             if len(self.named) < _NAMED_PROBLEMS:
-                self.named.append(f"{_format_time(frame.time)} {frame.problem}")
+                self.named.append(f"{format_time(frame.time)} {frame.problem}")
 
 
 def convert_video(
@@ -244,7 +96,7 @@ def convert_video(
         if parts.files:
             converter = _FrameConverter.from_state(job, matcher, parts.state())
         else:
-            survey, notes = _survey_video(video, matcher, bar)
+            survey, notes = survey_video(video, matcher, bar)
             converter = _FrameConverter(job, matcher, survey)
             for note in [*notes, *job.find_losses(survey)]:
                 line = note.format(job.name_of)
@@ -307,76 +159,6 @@ class _FrameConverter:
             yield frame.time, self._job.render_frame(pair, estimate, self.survey)
 
 
-def _survey_video(video: StereoVideo, matcher: Matcher, bar: Progress) -> tuple[Survey, list[Note]]:
-    """Survey the disparities of frames spread over the whole video, and find defects.
-
-    The frames are spread because the first ones may be titles, which have another range.
-    """
-    picked = _spread_evenly(video.frame_count, _SURVEYED_FRAMES)
-    checked = set(picked[len(picked) // 6 :: -(-len(picked) // _CHECKED_FRAMES)])
-    shown = bar.add_task("surveying depth", total=len(picked), loss="", rate="")
-    thinned, middles_px, defects = [], [], []
-    frames = islice(video.frames(), picked.start, picked.stop, picked.step)
-    for index, frame in zip(picked, frames, strict=True):
-        pair = StereoPair(left=frame.left, right=frame.right)
-        estimate = match(matcher, pair)
-        thinned.append(estimate.disparity_px[::_SURVEY_STEP_PX, ::_SURVEY_STEP_PX])
-        middles_px.append(median_disparity_px(estimate))
-        if index in checked:
-            defects.append([_add_time(frame.time, note, video) for note in find_problems(pair, estimate)])
-        bar.advance(shown)
-    all_px = np.vstack(thinned)
-    survey = Survey(
-        find_colour_range_px(all_px), float(np.median(middles_px)), _find_match_range_px(all_px, matcher)
-    )
-    return survey, _select_common_notes(defects)
-
-
-def _find_match_range_px(
-    disparity_px: Float[np.ndarray, "h w"], matcher: Matcher
-) -> tuple[float, float] | None:
-    """Return the disparity range of surveyed disparities; None if the network's own range covers it."""
-    low_px, high_px = np.percentile(disparity_px, [_OUTER_PERCENT, 100 - _OUTER_PERCENT]).tolist()
-    if low_px >= 0 and high_px <= matcher.max_disparity_px:
-        return None
-    # A plain sky is matched at the lower end of the range: for parallel cameras that stays at 0.
-    return min(low_px, max(low_px - _MARGIN_PX, 0.0)), high_px + _MARGIN_PX
-
-
-def _spread_evenly(count: int, wanted: int) -> range:
-    """Return the numbers of at most `wanted` frames, evenly spread over `count`."""
-    step = -(-count // wanted)
-    return range(step // 2, count, step)
-
-
-def _add_time(time: Fraction, note: Note, video: StereoVideo) -> Note:
-    """Add the time to a note; for swapped views in one file, the remedy becomes the other frame packing."""
-    other = _find_swapped_packing(video.frame_packing)
-    if note == SWAPPED and other:
-        note = replace(note, remedy=Remedy(f"choose {other}", ("format",)))
-    return replace(note, text=f"{_format_time(time)} {note.text}")
-
-
-def _select_common_notes(defects: Sequence[list[Note]]) -> list[Note]:
-    """Return the notes on the last frame that has any, if at least half do: a video may begin black."""
-    some = [notes for notes in defects if notes]
-    return some[-1] if 2 * len(some) > len(defects) else []
-
-
-def _find_swapped_packing(frame_packing: str | None) -> str | None:
-    """Return the named frame packing with the eyes swapped, if any."""
-    if frame_packing is None:
-        return None
-    split = PAIR_LAYOUTS[frame_packing]
-    other = split._replace(right_first=not split.right_first)
-    return next((name for name, known in PAIR_LAYOUTS.items() if known == other), None)
-
-
-def _encode_grey16(disparity_px: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
-    # 0 would mean unknown, as in disparity.png.
-    return np.clip(np.rint(_STEPS_PER_PX * disparity_px), 1, 65535).astype(np.uint16)
-
-
 def _check_output(out: Path, job: VideoJob, video: StereoVideo, sources: Sequence[Path]) -> None:
     if job.depth16 and out.suffix.lower() != ".mkv":
         raise StereoweaveError(f"{out}: expected the ending .mkv for depth in 16 bits, found {out.suffix!r}")
@@ -412,9 +194,3 @@ def _identify_source(path: Path) -> list[object]:
         status = file.stat()
         digest.update(f"{file.name} {status.st_size} {status.st_mtime_ns}\n".encode(errors="surrogateescape"))
     return [str(path), digest.hexdigest()]
-
-
-def _format_time(time_s: Fraction) -> str:
-    """Format a time: 0:01:02.345 for 62.345 s."""
-    minutes, seconds = divmod(float(time_s), 60)
-    return f"{int(minutes) // 60}:{int(minutes) % 60:02}:{seconds:06.3f}"

@@ -168,3 +168,9 @@ def _bridge_gaps(track: Track, start: int) -> Iterator[tuple[Shot, str | None]]:
         upcoming, last = index + 1, shot
     if last:
         yield from ((last, _REPEATED_LAST) for number in range(upcoming, len(track.steps)) if number >= start)
+
+
+def format_time(time_s: Fraction) -> str:
+    """Format a time: 0:01:02.345 for 62.345 s."""
+    minutes, seconds = divmod(float(time_s), 60)
+    return f"{int(minutes) // 60}:{int(minutes) % 60:02}:{seconds:06.3f}"

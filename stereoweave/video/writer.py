@@ -1,20 +1,18 @@
-"""Writing of video in parts, so that an interrupted conversion resumes, and joining them with the sound.
+"""Writing of the parts of a video, and joining them with the sound.
 
 A part is a NUT file, which stores frame times of any time base exactly. Parts are joined packet by packet:
 nothing is encoded twice, and sound is copied bit for bit.
 """
 
-import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from heapq import merge
 from io import BytesIO
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
-from zipfile import BadZipFile
 
 import av
 import cv2
@@ -28,8 +26,8 @@ from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTr
 from av.video.stream import VideoStream
 from jaxtyping import UInt8, UInt16
 
-from stereoweave.errors import NameOf, StereoweaveError, keyword
-from stereoweave.io.files import make_folder, remove_leftovers, replacing
+from stereoweave.errors import StereoweaveError
+from stereoweave.io.files import replacing
 
 if TYPE_CHECKING:  # PyAV's types have parameters that its classes lack
     from av.packet import Packet
@@ -183,135 +181,6 @@ def check_container(path: Path, sound: Path | None) -> None:
     raise StereoweaveError(
         f"{path}: expected sound that {path.suffix} can hold, found {codecs} in {sound}; {remedy}"
     )
-
-
-class Parts:
-    """The finished parts of a video, and the state after the last one.
-
-    Attributes:
-        folder: The folder of the parts.
-        files: The finished parts, in order.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.files = sorted(folder.glob("[0-9]*.nut"))
-        if not self._state_file(len(self.files)).exists():  # an interrupted removal deletes the state first
-            self.files = []
-
-    @contextmanager
-    def next(self, state: Callable[[], Mapping[str, np.ndarray]]) -> Iterator[Path]:
-        """Give a path for the next part; the part is finished once the state after it is saved too."""
-        number = len(self.files) + 1
-        part = self.folder / f"{number:06}.nut"
-        with replacing(part) as temporary:
-            yield temporary
-            with replacing(self._state_file(number)) as state_file:
-                np.savez(state_file, allow_pickle=False, **state())
-        self.files.append(part)
-        self._state_file(number - 1).unlink(missing_ok=True)
-
-    def state(self) -> dict[str, np.ndarray]:
-        """Load the state after the last finished part."""
-        file = self._state_file(len(self.files))
-        with _reporting_damage(file), file.open("rb") as opened, np.load(opened) as arrays:
-            return dict(arrays)
-
-    def _state_file(self, number: int) -> Path:
-        return self.folder / f"state-{number:06}.npz"
-
-
-def parts_folder(out: Path) -> Path:
-    """Return the folder of a video's unfinished parts."""
-    return out.with_name(f"{out.name}.parts")
-
-
-@contextmanager
-def open_parts(out: Path, settings: Mapping[str, object], name_of: NameOf = keyword) -> Iterator[Parts]:
-    """Open the parts of a video, to add more; removes them on success and keeps finished ones after an error.
-
-    Args:
-        out: The video that the parts will become.
-        settings: Its input and settings, as JSON values.
-        name_of: The front end's names for these settings, used in errors.
-
-    Raises:
-        StereoweaveError: The folder has parts with other settings or damaged ones; or an error of the body,
-            with a note that finished parts are kept.
-    """
-    folder = parts_folder(out)
-    parts = Parts(folder)
-    if parts.files:
-        _check_settings(folder, settings, name_of)
-        parts.state()
-        remove_leftovers(folder)
-    else:
-        _clear(folder)
-    make_folder(folder)
-    try:
-        if not parts.files:
-            with replacing(_settings_file(folder)) as file:
-                file.write_text(json.dumps(settings, indent=2))
-        yield parts
-    except BaseException as error:
-        if not parts.files:
-            _clear(folder)
-        elif isinstance(error, OSError | FFmpegError | StereoweaveError):
-            ours = error if isinstance(error, StereoweaveError) else StereoweaveError(str(error))
-            raise ours.with_detail(
-                f"finished parts are in {folder}; rerun the same command to resume"
-            ) from error
-        raise
-    _clear(folder)
-
-
-def _settings_file(folder: Path) -> Path:
-    return folder / "settings.json"
-
-
-def _clear(folder: Path) -> None:
-    """Remove the parts from a folder, and the folder if nothing else is in it."""
-    for file in chain(folder.glob("*.npz"), folder.glob("*.nut"), [_settings_file(folder)]):
-        file.unlink(missing_ok=True)
-    with suppress(OSError):
-        folder.rmdir()
-
-
-def _check_settings(folder: Path, settings: Mapping[str, object], name_of: NameOf) -> None:
-    file = _settings_file(folder)
-    with _reporting_damage(file):
-        found = dict(json.loads(file.read_text()))
-    other = [name for name, value in json.loads(json.dumps(settings)).items() if value != found.get(name)]
-    if other:
-        begun = ", ".join(_format_setting(name_of(name) or name, found.get(name)) for name in other)
-        raise StereoweaveError(
-            f"{folder}: expected parts of the same video, found parts begun {begun}; "
-            "remove that folder, or give the same settings again"
-        )
-
-
-def _format_setting(name: str, value: object) -> str:
-    match value:
-        case None | False:
-            return f"without {name}"
-        case True:
-            return f"with {name}"
-        case str() | int() | float():
-            return f"with {name} {value}"
-        case _:
-            return f"with another {name}"
-
-
-@contextmanager
-def _reporting_damage(file: Path) -> Iterator[None]:
-    """Turn any error of reading a file of the parts into one line."""
-    try:
-        yield
-    except (OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
-        raise StereoweaveError(
-            f"{file}: expected the saved state of an interrupted video, found none that can be read; "
-            f"remove the folder {file.parent}"
-        ) from error
 
 
 def _make_frame(picture: Picture) -> VideoFrame:

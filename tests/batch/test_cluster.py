@@ -30,7 +30,7 @@ from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher
 from stereoweave.outputs.results import DepthJob, make_depth
 from stereoweave.system.ray_engine import Engine, connect
-from stereoweave.video.writer import parts_folder
+from stereoweave.video.parts import parts_folder
 
 pytestmark = pytest.mark.system
 

@@ -1,0 +1,145 @@
+"""Settings of a conversion: what is made of each frame, and what the file then holds."""
+
+from dataclasses import dataclass
+from math import isfinite
+
+import numpy as np
+from jaxtyping import Float, UInt16
+
+from stereoweave.errors import NameOf, Note, Remedy, StereoweaveError, keyword
+from stereoweave.io.colormap import colour_disparity
+from stereoweave.matching.backend import Backend
+from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, check_positions
+from stereoweave.rendering.renderer import Renderer
+from stereoweave.stereo import Estimate, StereoPair
+from stereoweave.video.survey import Survey
+from stereoweave.video.writer import Picture
+
+_STEPS_PER_PX, _MOST_GREY16_PX = 256, 255.99
+
+# Keys of the saved settings that are not settings, and their names in errors.
+_SAVED_FACTS = {"film": "video", "stereoweave": "stereoweave"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoJob:
+    """Settings of a conversion; exactly one of depth, depth16, position and layout is set.
+
+    Attributes:
+        depth: Left disparity in colours, with one range for the whole video.
+        depth16: Left disparity as 16-bit grey, px * 256 as in disparity.png; clipped to 1/256 to 255.99 px.
+        position: View from this position: 0 is the left camera, 1 the right one.
+        layout: A name in `LAYOUTS`.
+        strength: Multiplies the baseline.
+        convergence_px: Disparity that stays in place from view to view. Default: the scene's median disparity
+            for layouts that overlay their views, else 0.
+        backend: Matches the frames.
+        name_of: The front end's names for settings, used in notes.
+    """
+
+    depth: bool = False
+    depth16: bool = False
+    position: float | None = None
+    layout: str | None = None
+    strength: float = 1.0
+    convergence_px: float | None = None
+    backend: Backend = Backend()
+    name_of: NameOf = keyword
+
+    def __post_init__(self) -> None:
+        kinds = {
+            "depth": self.depth,
+            "depth16": self.depth16,
+            "position": self.position is not None,
+            "layout": self.layout is not None,
+        }
+        given = [kind for kind, is_given in kinds.items() if is_given]
+        if len(given) != 1:
+            raise StereoweaveError(
+                f"expected one kind of video to make, found {' and '.join(given) or 'none'}",
+                remedy=Remedy("choose one", tuple(kinds)),
+            )
+        if self.layout not in (None, *LAYOUTS):
+            raise StereoweaveError(
+                f"expected one of {', '.join(LAYOUTS)}, found {self.layout!r}", setting="layout"
+            )
+        self._check_numbers(given[0] if self.layout is None else f"layout {self.layout}")
+        check_positions(self._positions, self.strength)
+
+    def _check_numbers(self, kind: str) -> None:
+        """Raise if a number is not finite, or has no effect on this kind of video."""
+        numbers = {"strength": (self.strength, 1.0), "convergence_px": (self.convergence_px, None)}
+        for setting, (value, unset) in numbers.items():
+            if value == unset or value is None:
+                continue
+            if not isfinite(value):
+                raise StereoweaveError(f"expected a finite number, found {value}", setting=setting)
+            if not self._positions:
+                raise StereoweaveError(
+                    f"expected a view or a layout of views for it, found {kind}", setting=setting
+                )
+
+    @property
+    def _positions(self) -> tuple[float, ...]:
+        if self.layout:
+            return LAYOUTS[self.layout].positions
+        return () if self.position is None else (self.position,)
+
+    def render_frame(self, pair: StereoPair, estimate: Estimate, survey: Survey) -> Picture:
+        """Make the output image of one frame."""
+        if self.depth:
+            return colour_disparity(estimate.disparity_px, survey.range_px)
+        if self.depth16:
+            return _encode_grey16(estimate.disparity_px)
+        renderer = Renderer(
+            pair,
+            estimate,
+            strength=self.strength,
+            convergence_px=self._find_plane_px(survey),
+            threads=self.backend.threads,
+        )
+        if self.position is not None:
+            return renderer.view(self.position).image
+        return LAYOUTS[str(self.layout)].compose(renderer, LayoutOptions(range_px=survey.range_px))
+
+    def _find_plane_px(self, survey: Survey) -> float:
+        """Return the disparity that stays in place from view to view."""
+        if self.convergence_px is not None:
+            return self.convergence_px
+        return survey.middle_px if self.layout and LAYOUTS[self.layout].converged else 0.0
+
+    def name_of_saved(self, key: str) -> str:
+        """Return the front end's name for a key of the saved settings."""
+        if key in _SAVED_FACTS:
+            return _SAVED_FACTS[key]
+        setting = "format" if key == "arrangement" else key
+        return self.name_of(setting) or setting
+
+    def find_losses(self, survey: Survey) -> list[Note]:
+        """Return a note if the file cannot hold all of the video's disparities."""
+        low_px, high_px = survey.range_px
+        if not self.depth16 or (low_px >= 0 and high_px <= _MOST_GREY16_PX):
+            return []
+        text = (
+            f"16-bit grey holds 0 to {_MOST_GREY16_PX} px: this video's disparities, {low_px:.1f} to "
+            f"{high_px:.1f} px, are clipped"
+        )
+        return [Note(text, Remedy("show all of them in colours", ("depth",)))]
+
+    def describe_values(self, survey: Survey) -> dict[str, str]:
+        """Return the file's metadata: how to convert its pictures back to disparities."""
+        low_px, high_px = survey.range_px
+        if self.depth16:
+            return {"comment": f"16-bit grey: disparity of the left view in pixels = value / {_STEPS_PER_PX}"}
+        if self.depth:
+            return {
+                "comment": f"disparity of the left view: {low_px:.2f} px is blue, {high_px:.2f} px is red"
+            }
+        if self.layout == "rgbd":
+            return {"comment": f"disparity in grey: {low_px:.2f} px is black, {high_px:.2f} px is white"}
+        return {}
+
+
+def _encode_grey16(disparity_px: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
+    # 0 would mean unknown, as in disparity.png.
+    return np.clip(np.rint(_STEPS_PER_PX * disparity_px), 1, 65535).astype(np.uint16)

@@ -1,0 +1,106 @@
+"""Survey of a video before its conversion: disparities and defects of frames spread over all of it."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from fractions import Fraction
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from rich.progress import Progress
+
+from stereoweave.cameras.alignment import SWAPPED
+from stereoweave.cameras.diagnosis import find_problems
+from stereoweave.errors import Note, Remedy
+from stereoweave.io.colormap import find_colour_range_px
+from stereoweave.matching.estimate import match
+from stereoweave.matching.matcher import Matcher
+from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS
+from stereoweave.rendering.layouts import median_disparity_px
+from stereoweave.stereo import StereoPair
+from stereoweave.video.reader import StereoVideo, format_time
+
+_SURVEYED_FRAMES, _CHECKED_FRAMES = 24, 3
+_SURVEY_STEP_PX = 4
+# Outliers do not widen the range; the margin allows for objects that come nearer between the surveyed frames.
+_OUTER_PERCENT, _MARGIN_PX = 0.5, 8.0
+
+
+class Survey(NamedTuple):
+    """Disparities measured in frames from all over the video.
+
+    Attributes:
+        range_px: Disparity range of the colours.
+        middle_px: Median disparity of the scene.
+        match_range_px: Disparity range to match; None if the network's own range covers the surveyed frames.
+    """
+
+    range_px: tuple[float, float]
+    middle_px: float
+    match_range_px: tuple[float, float] | None
+
+
+def survey_video(video: StereoVideo, matcher: Matcher, bar: Progress) -> tuple[Survey, list[Note]]:
+    """Survey the disparities of frames spread over the whole video, and find defects.
+
+    The frames are spread because the first ones may be titles, which have another range.
+    """
+    picked = _spread_evenly(video.frame_count, _SURVEYED_FRAMES)
+    checked = set(picked[len(picked) // 6 :: -(-len(picked) // _CHECKED_FRAMES)])
+    shown = bar.add_task("surveying depth", total=len(picked), loss="", rate="")
+    thinned, middles_px, defects = [], [], []
+    frames = islice(video.frames(), picked.start, picked.stop, picked.step)
+    for index, frame in zip(picked, frames, strict=True):
+        pair = StereoPair(left=frame.left, right=frame.right)
+        estimate = match(matcher, pair)
+        thinned.append(estimate.disparity_px[::_SURVEY_STEP_PX, ::_SURVEY_STEP_PX])
+        middles_px.append(median_disparity_px(estimate))
+        if index in checked:
+            defects.append([_add_time(frame.time, note, video) for note in find_problems(pair, estimate)])
+        bar.advance(shown)
+    all_px = np.vstack(thinned)
+    survey = Survey(
+        find_colour_range_px(all_px), float(np.median(middles_px)), _find_match_range_px(all_px, matcher)
+    )
+    return survey, _select_common_notes(defects)
+
+
+def _find_match_range_px(
+    disparity_px: Float[np.ndarray, "h w"], matcher: Matcher
+) -> tuple[float, float] | None:
+    """Return the disparity range of surveyed disparities; None if the network's own range covers it."""
+    low_px, high_px = np.percentile(disparity_px, [_OUTER_PERCENT, 100 - _OUTER_PERCENT]).tolist()
+    if low_px >= 0 and high_px <= matcher.max_disparity_px:
+        return None
+    # A plain sky is matched at the lower end of the range: for parallel cameras that stays at 0.
+    return min(low_px, max(low_px - _MARGIN_PX, 0.0)), high_px + _MARGIN_PX
+
+
+def _spread_evenly(count: int, wanted: int) -> range:
+    """Return the numbers of at most `wanted` frames, evenly spread over `count`."""
+    step = -(-count // wanted)
+    return range(step // 2, count, step)
+
+
+def _add_time(time: Fraction, note: Note, video: StereoVideo) -> Note:
+    """Add the time to a note; for swapped views in one file, the remedy becomes the other frame packing."""
+    other = _find_swapped_packing(video.frame_packing)
+    if note == SWAPPED and other:
+        note = replace(note, remedy=Remedy(f"choose {other}", ("format",)))
+    return replace(note, text=f"{format_time(time)} {note.text}")
+
+
+def _select_common_notes(defects: Sequence[list[Note]]) -> list[Note]:
+    """Return the notes on the last frame that has any, if at least half do: a video may begin black."""
+    some = [notes for notes in defects if notes]
+    return some[-1] if 2 * len(some) > len(defects) else []
+
+
+def _find_swapped_packing(frame_packing: str | None) -> str | None:
+    """Return the named frame packing with the eyes swapped, if any."""
+    if frame_packing is None:
+        return None
+    split = PAIR_LAYOUTS[frame_packing]
+    other = split._replace(right_first=not split.right_first)
+    return next((name for name, known in PAIR_LAYOUTS.items() if known == other), None)

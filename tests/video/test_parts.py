@@ -1,0 +1,149 @@
+"""Parts of an unfinished video: kept after an error, continued with the same settings, then removed."""
+
+import json
+import resource
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.video.parts import Parts, open_parts, parts_folder
+
+
+def test_a_videos_parts_go_when_it_is_done(tmp_path):
+    video = tmp_path / "video.mp4"
+    with open_parts(video, {"position": 0.5}) as parts:
+        add(parts, b"first", 1)
+        assert parts_folder(video) == tmp_path / "video.mp4.parts"
+        assert parts_folder(video).is_dir()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_others_keep_in_that_folder_stays(tmp_path):
+    video = tmp_path / "video.mp4"
+    parts_folder(video).mkdir()
+    (parts_folder(video) / "notes.txt").write_text("mine")
+    with open_parts(video, {}) as parts:
+        add(parts, b"first", 1)
+    assert [path.name for path in parts_folder(video).iterdir()] == ["notes.txt"]
+
+
+def test_an_error_before_the_first_part_leaves_nothing(tmp_path):
+    with pytest.raises(ZeroDivisionError), open_parts(tmp_path / "video.mp4", {}) as parts:
+        break_off(parts, ZeroDivisionError())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_after_an_error_the_finished_parts_and_the_last_ones_state_stay(tmp_path):
+    video = tmp_path / "video.mp4"
+    told = r"^no picture; finished parts are in .*video\.mp4\.parts; rerun the same command to resume$"
+    with pytest.raises(StereoweaveError, match=told), open_parts(video, {"position": 0.5}) as parts:
+        add(parts, b"first", 1)
+        add(parts, b"second", 2)
+        break_off(parts, StereoweaveError("no picture"))
+    with open_parts(video, {"position": 0.5}) as parts:
+        assert [file.read_bytes() for file in parts.files] == [b"first", b"second"]
+        assert parts.state() == {"frames": 2}
+        assert sorted(path.name for path in parts.folder.iterdir()) == [
+            "000001.nut",
+            "000002.nut",
+            "settings.json",
+            "state-000002.npz",
+        ]
+
+
+def test_parts_without_their_state_count_for_nothing(tmp_path):
+    video = tmp_path / "video.mp4"
+    with pytest.raises(KeyboardInterrupt), open_parts(video, {}) as parts:
+        add(parts, b"first", 1)
+        add(parts, b"second", 2)
+        raise KeyboardInterrupt
+    (parts_folder(video) / "state-000002.npz").unlink()
+    with open_parts(video, {}) as parts:
+        assert parts.files == []
+        assert [path.name for path in parts.folder.iterdir()] == ["settings.json"]
+
+
+def test_parts_of_another_video_are_not_continued(tmp_path):
+    video = tmp_path / "video.mp4"
+    with pytest.raises(KeyboardInterrupt), open_parts(video, {"position": 0.5, "model": "small"}) as parts:
+        add(parts, b"first", 1)
+        raise KeyboardInterrupt
+    with (
+        pytest.raises(
+            StereoweaveError, match=r"found parts begun with position 0\.5; remove that folder, or give"
+        ),
+        open_parts(video, {"position": 0.25, "model": "small"}),
+    ):
+        pass
+    assert json.loads((tmp_path / "video.mp4.parts" / "settings.json").read_text())["position"] == 0.5
+
+
+@pytest.mark.parametrize("name", ["settings.json", "state-000001.npz"])
+@pytest.mark.parametrize("content", [b"", b"[1, 2", b"PK\x03\x04 no archive"])
+def test_a_damaged_parts_folder_is_to_be_removed(tmp_path, name, content):
+    folder = begin(tmp_path / "video.mp4")
+    (folder / name).write_bytes(content)
+    assert_to_be_removed(tmp_path / "video.mp4", name)
+
+
+def test_parts_without_their_settings_are_to_be_removed(tmp_path):
+    folder = begin(tmp_path / "video.mp4")
+    (folder / "settings.json").unlink()
+    assert_to_be_removed(tmp_path / "video.mp4", "settings.json")
+
+
+def test_a_disk_that_is_full_from_the_start_is_one_line_with_the_file(tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    told = r"settings\.json: expected a file that can be written, found file too large$"
+    with pytest.raises(StereoweaveError, match=told):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1, hard))
+        try:
+            with open_parts(tmp_path / "video.mp4", {"position": 0.5}):
+                pass
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [(True, "with x"), (False, "without x"), (None, "without x"), (0.5, "with x 0.5")],
+)
+def test_what_a_video_was_begun_with_is_told_as_users_write_it(tmp_path, value, told):
+    video = tmp_path / "video.mp4"
+    begin(video, {"x": value})
+    with (
+        pytest.raises(StereoweaveError, match=f"found parts begun {told}; "),
+        open_parts(video, {"x": "else"}),
+    ):
+        pass
+
+
+def begin(video: Path, settings: dict[str, object] | None = None) -> Path:
+    """The folder of a video that was interrupted after one part."""
+    with pytest.raises(KeyboardInterrupt), open_parts(video, settings or {}) as parts:
+        add(parts, b"first", 1)
+        raise KeyboardInterrupt
+    return parts_folder(video)
+
+
+def assert_to_be_removed(video: Path, name: str) -> None:
+    with pytest.raises(StereoweaveError) as caught, open_parts(video, {}):
+        pass
+    folder = parts_folder(video)
+    assert str(caught.value).startswith(f"{folder / name}: expected")
+    assert str(caught.value).endswith(f"remove the folder {folder}")
+    assert (folder / "000001.nut").exists()
+
+
+def add(parts: Parts, content: bytes, frames: int) -> None:
+    with parts.next(lambda: {"frames": np.array(frames)}) as path:
+        path.write_bytes(content)
+
+
+def break_off(parts: Parts, error: Exception) -> None:
+    with parts.next(dict) as path:
+        path.write_bytes(b"half")
+        raise error
