@@ -59,7 +59,9 @@ def live(  # noqa: PLR0913 - each is an option of the command line
     """Show live video of cameras and its depth in colour on a page in the browser; Ctrl-C stops it."""
     # Otherwise FFmpeg prints its own message beside our error.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    from stereoweave.app.live import Capture, LiveTally, Screen, show
+    from stereoweave.app.capture import Capture
+    from stereoweave.app.live import LiveTally, show
+    from stereoweave.app.screen import Screen
     from stereoweave.cameras.calibration_files import read_rig
     from stereoweave.matching.backend import Backend
     from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS

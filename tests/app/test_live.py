@@ -12,7 +12,9 @@ import cv2
 import numpy as np
 import pytest
 
-from stereoweave.app.live import Capture, LiveTally, Screen, compose, describe_range, follow_range, show
+from stereoweave.app.capture import Capture
+from stereoweave.app.live import LiveTally, compose, describe_range, follow_range, show
+from stereoweave.app.screen import Screen
 from stereoweave.cameras.calibration_files import read_rig
 from stereoweave.cli.live import live
 from stereoweave.errors import FormatError, StereoweaveError

@@ -1,0 +1,136 @@
+"""Sources of live video: cameras, files and streams, read in step by a thread."""
+
+import threading
+import time
+from collections.abc import Sequence
+from itertools import count
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple
+
+import cv2
+
+from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.pictures.pair_layouts import Picture
+
+_DEFAULT_RATE = 25.0
+# A network stream may be slow; a camera without a frame for this long is disconnected.
+_TIMEOUT_S = 10.0
+
+
+class Moment(NamedTuple):
+    """Simultaneous RGB images of all sources, their number from 0, and their time (time.monotonic)."""
+
+    number: int
+    pictures: tuple[Picture, ...]
+    taken_s: float
+
+
+class Capture:
+    """One or two sources, read in step by a thread that keeps only the newest moment.
+
+    A video is read at its own frame rate, like a camera.
+
+    Args:
+        sources: A source with both views, or two, the left one first. Each is a camera's number, a video
+            file, a stream's address, or a series of pictures such as frame%03d.png.
+
+    Raises:
+        FormatError: If a source cannot be opened.
+        StereoweaveError: If there are more than two.
+    """
+
+    def __init__(self, sources: Sequence[str]) -> None:
+        if len(sources) > 2:
+            raise StereoweaveError(
+                f"expected one SOURCE with both views, or LEFT RIGHT, found {len(sources)}: "
+                f"{' '.join(sources)}"
+            )
+        self.name, self.count = " and ".join(sources), len(sources)
+        self._captures = [_open_source(source) for source in sources]
+        first = self._captures[0]
+        # A picture or a recorded stream has no frame count.
+        self._is_recording = first.get(cv2.CAP_PROP_FRAME_COUNT) > 0 or Path(sources[0]).is_file()
+        rate = first.get(cv2.CAP_PROP_FPS)
+        self._step_s = 1 / (rate if rate > 0 else _DEFAULT_RATE)
+        self._newest: Moment | None = None
+        self._ended = False
+        self._changed, self._stopped = threading.Condition(), threading.Event()
+        self._thread = threading.Thread(target=self._keep_reading, daemon=True)
+
+    def __enter__(self) -> "Capture":
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stopped.set()
+        self._thread.join(timeout=1)  # a camera that hangs ends with the process
+
+    def newest(self, after: int) -> Moment | None:
+        """Wait for the newest moment with a number above `after`; None at the end of a video.
+
+        Raises:
+            StereoweaveError: If a camera or stream stops, or a video has no frame.
+        """
+        with self._changed:
+            came = self._changed.wait_for(lambda: self._ended or self._has_newer(after), _TIMEOUT_S)
+            if self._has_newer(after):
+                return self._newest
+        if came and self._is_recording and after >= 0:
+            return None
+        found = "the end of what it gives" if came else f"nothing for {_TIMEOUT_S:g} s"
+        raise StereoweaveError(
+            f"{self.name}: expected frames, found {found} after {after + 1}; is it still connected?"
+        )
+
+    def _has_newer(self, after: int) -> bool:
+        return self._newest is not None and self._newest.number > after
+
+    def _keep_reading(self) -> None:
+        begin_s = time.monotonic()
+        try:
+            for number in count():
+                pictures = self._read()
+                early_s = begin_s + number * self._step_s - time.monotonic() if self._is_recording else 0
+                if pictures is None or self._stopped.wait(max(early_s, 0)):
+                    return
+                with self._changed:
+                    self._newest = Moment(number, pictures, time.monotonic())
+                    self._changed.notify_all()
+        finally:
+            for capture in self._captures:
+                capture.release()
+            with self._changed:
+                self._ended = True
+                self._changed.notify_all()
+
+    def _read(self) -> tuple[Picture, ...] | None:
+        # Grab all before decoding any, so that two cameras are as close in time as possible.
+        if not all([capture.grab() for capture in self._captures]):
+            return None
+        frames = [capture.retrieve() for capture in self._captures]
+        if not all(well for well, _ in frames):
+            return None
+        return tuple(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB) for _, frame in frames)
+
+
+def _open_source(source: str) -> cv2.VideoCapture:
+    level = cv2.utils.logging.getLogLevel()
+    # The error below reports a failure; OpenCV would print it too.
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
+    cv2.utils.logging.setLogLevel(level)
+    if capture.isOpened():
+        return capture
+    if source.isdigit():
+        found = "no camera of that number that is free"
+    elif "://" in source:
+        found = "no stream at that address"
+    else:
+        found = "something else" if Path(source).exists() else "no such file"
+    raise FormatError(
+        f"{source}: expected a camera's number, a video file, the address of a stream, or pictures as "
+        f"frame%03d.png, found {found}"
+    )
