@@ -204,12 +204,12 @@ def test_pictures_of_ones_own_go_through_the_commands_for_them(tmp_path):
         assert (tmp_path / folder / "summary.csv").read_text().count("\n") == 2
 
 
-def test_films_are_made_by_the_commands_for_them(pictures):
+def test_videos_are_made_by_the_commands_for_them(pictures):
     frame = read_image(pictures / "side_by_side.png")
-    write_animation(pictures / "film_LR.mp4", [frame] * 3, frame_ms=40)
+    write_animation(pictures / "video_LR.mp4", [frame] * 3, frame_ms=40)
     run(["bash", "-ec", VIDEO], pictures, PATH=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
-    films = sorted(path.name for path in pictures.glob("*.m[pk][4v]"))
-    assert films == ["anaglyph.mp4", "between.mp4", "depth.mkv", "depth.mp4", "film_LR.mp4"]
+    videos = sorted(path.name for path in pictures.glob("*.m[pk][4v]"))
+    assert videos == ["anaglyph.mp4", "between.mp4", "depth.mkv", "depth.mp4", "video_LR.mp4"]
 
 
 def test_an_archive_is_worked_through_by_the_command_for_it(pictures):
