@@ -1,4 +1,4 @@
-"""The bank of tileable textures, colour and height, for all scenes.
+"""Bank of all tileable textures, with colour and height.
 
 Some are cut from scikit-image's photographs; docs/training-data.md lists their licences.
 """
@@ -37,7 +37,7 @@ _KEPT_DAYS = 30
 Procedure = Callable[[np.random.Generator], Texture]
 Pixels = UInt8[np.ndarray, "layers side side 4"]
 
-# The photographs that could be a surface, a print or a poster.
+# Photographs that can pass for a surface, a print or a poster.
 _PHOTOGRAPHS = (
     "brick", "grass", "gravel", "coins", "coffee", "cat", "astronaut", "camera",
     "text", "rocket", "immunohistochemistry", "coffee", "grass", "camera", "astronaut", "cat",
@@ -46,11 +46,12 @@ _PHOTOGRAPHS = (
 
 @dataclass(frozen=True, kw_only=True)
 class TextureFamily:
-    """Textures of one kind.
+    """Family of similar textures.
 
     Attributes:
         variants: one procedure per texture.
-        albedo: range of the mean colour in linear light, 0 (black) to 1 (white). None keeps it as drawn.
+        albedo: range of the mean colour in linear light, from 0 (black) to 1 (white); None keeps the colours
+            as drawn.
     """
 
     variants: tuple[Procedure, ...]
@@ -116,12 +117,16 @@ FAMILIES = {
 
 @dataclass(frozen=True)
 class TextureBank:
-    """All textures: `pixels` uint8 [L, 512, 512, 4], sRGB and height (128 is the mean level)."""
+    """All textures.
+
+    Attributes:
+        pixels: uint8 [L, 512, 512, 4], sRGB colour and height; a height of 128 is level with the surface.
+    """
 
     pixels: Pixels
 
     def layer(self, family: str, variant: int) -> int:
-        """Index of a texture in `pixels`; variant is taken modulo the family's size."""
+        """Return the index of a texture in `pixels`; `variant` is taken modulo the family's size."""
         if family not in FAMILIES:
             raise StereoweaveError(f"texture: expected one of {', '.join(FAMILIES)}, found {family!r}")
         counts = {name: len(each.variants) for name, each in FAMILIES.items()}
@@ -131,7 +136,10 @@ class TextureBank:
 
 @functools.cache
 def texture_bank() -> TextureBank:
-    """The bank, identical in every process; drawn once per machine and cached in the user's cache folder."""
+    """Return the bank, which is identical in every process.
+
+    It is drawn once per machine and cached in the user's cache folder.
+    """
     file = cache_folder().with_name("textures") / f"{_source_version()}.rgba"
     pixels = _read_cache(file)
     if pixels is None:
@@ -146,7 +154,7 @@ def _draw_all() -> Pixels:
 
 
 def draw_texture(family: str, variant: int) -> UInt8[np.ndarray, "side side 4"]:
-    """Draw one texture."""
+    """Draw one texture of a family."""
     rng = np.random.default_rng((BANK_SEED, zlib.crc32(family.encode()), variant))
     levels = FAMILIES[family].variants[variant](rng)
     albedo = FAMILIES[family].albedo
@@ -156,28 +164,28 @@ def draw_texture(family: str, variant: int) -> UInt8[np.ndarray, "side side 4"]:
 
 
 def srgb_to_linear(levels: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Linear light 0..1 from sRGB levels 0..255."""
+    """Convert sRGB levels in 0..255 to linear light in 0..1."""
     values = levels / 255
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
 def _scale_to_albedo(colours: Colours, albedo: float) -> Colours:
-    """Scale the colours until their linear mean is the albedo."""
+    """Scale sRGB colours until their mean in linear light equals the albedo."""
     few, gain = colours[::4, ::4], 1.0
-    # Light is about the 2.2nd power of the levels; clipping makes some iterations necessary.
+    # Linear light is about the 2.2nd power of the levels, but levels are clipped, hence the iterations.
     for _ in range(6):
         gain *= float(albedo / srgb_to_linear(np.clip(few * gain, 0, 255)).mean()) ** (1 / 2.2)
     return colours * gain
 
 
 def _source_version() -> str:
-    """Hash of the sources of all textures."""
+    """Return a hash of the source code of all textures."""
     files = sorted(Path(__file__).parent.glob("*.py"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
 
 
 def _read_cache(file: Path) -> Pixels | None:
-    """The cached textures, or None if they are missing or damaged."""
+    """Return the cached textures, or None if the file is missing or damaged."""
     try:
         kept = np.fromfile(file, np.uint8)
     except OSError:
@@ -198,12 +206,12 @@ def _write_cache(file: Path, pixels: Pixels) -> None:
                 stream.write(pixels.data)
                 stream.write(_checksum(pixels))
             whole.replace(file)
-        # Not at once: two versions in alternating use would delete each other's.
+        # Other versions are kept for a while: two in alternating use would delete each other's cache.
         for other in file.parent.glob(f"*{file.suffix}"):
             if time.time() - other.stat().st_mtime > _KEPT_DAYS * 86_400:
                 other.unlink()
     except OSError:
-        # Without a cache each process draws the bank itself.
+        # The cache is optional: without it, each process draws the bank itself.
         return
 
 

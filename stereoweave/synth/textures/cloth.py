@@ -1,4 +1,4 @@
-"""Cloth: woven, twilled, knitted, checked."""
+"""Textures of woven, twilled, knitted and checked cloth."""
 
 from collections.abc import Callable
 
@@ -8,11 +8,11 @@ from jaxtyping import Bool
 from stereoweave.synth.textures.tiling import SIDE, Colour, Map, Texture, noise, stack_texture, texel_grid
 
 _Choice = Bool[np.ndarray, "side side"]
-_Rule = Callable[[Map, Map], _Choice]  # from a thread's row and column
+_Rule = Callable[[Map, Map], _Choice]  # whether the warp is on top, by row and column of threads
 
 
 def woven_cloth(rng: np.random.Generator) -> Texture:
-    """Plain weave, canvas or linen: threads of uneven thickness."""
+    """Draw plain-woven cloth, such as canvas or linen, with threads of uneven thickness."""
     colour = _draw_cloth_colour(rng)
     lift, over = _weave(rng, 64, lambda row, column: (row + column) % 2 > 0)
     thread = np.where(over, noise(rng, 0.8, 4, stretch=(30, 1)), noise(rng, 0.8, 4, stretch=(1, 30)))
@@ -22,7 +22,7 @@ def woven_cloth(rng: np.random.Generator) -> Texture:
 
 
 def twill(rng: np.random.Generator) -> Texture:
-    """Twill of two yarns, as in jeans or a herringbone."""
+    """Draw twill of two yarns in a herringbone pattern."""
     colour = np.array(_draw_cloth_colour(rng), np.float32)
     lift, over = _weave(rng, 96, lambda row, column: (np.where(row % 32 < 16, row, -row) + column) % 4 < 2)
     yarn = np.where(over[..., None], colour, 0.55 * colour + 70)
@@ -31,7 +31,7 @@ def twill(rng: np.random.Generator) -> Texture:
 
 
 def knitted_cloth(rng: np.random.Generator) -> Texture:
-    """Knitting: columns of V-shaped stitches."""
+    """Draw knitted cloth with columns of V-shaped stitches."""
     y, x = texel_grid()
     y, x = y + 1.5 * noise(rng, 1.6, 4), x + 1.5 * noise(rng, 1.6, 4)
     wide, high = SIDE / 24, SIDE / 32
@@ -47,7 +47,7 @@ def knitted_cloth(rng: np.random.Generator) -> Texture:
 
 
 def tartan(rng: np.random.Generator) -> Texture:
-    """A tartan: bands of several colours both ways, woven as twill."""
+    """Draw a tartan with bands of several colours in both directions, woven as twill."""
     bands = [np.array(_draw_cloth_colour(rng), np.float32) for _ in range(4)]
     widths = rng.integers(2, 14, 10)
     order = np.repeat(rng.integers(0, 4, 10), widths)
@@ -69,7 +69,7 @@ def _draw_cloth_colour(rng: np.random.Generator) -> Colour:
 
 
 def _weave(rng: np.random.Generator, threads: int, warp_on_top: _Rule) -> tuple[Map, _Choice]:
-    """Height 0..1 of a weave, and mask of the warp (along y) on top."""
+    """Return the height of a weave in 0..1 and the mask of texels where the warp (along y) is on top."""
     y, x = texel_grid()
     pitch = SIDE / threads
     y, x = y + 0.8 * noise(rng, 1.5, 6), x + 0.8 * noise(rng, 1.5, 6)

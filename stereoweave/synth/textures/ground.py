@@ -1,4 +1,4 @@
-"""Earth, mud, gravel and roads."""
+"""Textures of soil, mud, gravel and asphalt."""
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from stereoweave.synth.textures.wear import crack_map
 
 
 def soil(rng: np.random.Generator) -> Texture:
-    """Earth: clods, small stones, bits of straw."""
+    """Draw soil with clods, small stones and bits of straw."""
     clods = voronoi_cells(rng, 36, 36, 0.5, rough=5)
     size = clods.per_texel(rng.uniform(0.3, 1, clods.number))
     lump = size * np.clip((clods.rim + noise(rng, 0.9, 10)) / 6, 0, 1)
@@ -41,7 +41,7 @@ def soil(rng: np.random.Generator) -> Texture:
 
 
 def dried_mud(rng: np.random.Generator) -> Texture:
-    """Dried mud, cracked into plates."""
+    """Draw dried mud that has cracked into plates."""
     plates, parts = voronoi_cells(rng, 9, 9, 0.5, rough=5), voronoi_cells(rng, 22, 22, 0.5, rough=3)
     edge = plates.rim + 0.6 * noise(rng, 0.9, 20)
     gap = smoothstep(3.2, 1.2, edge)
@@ -61,7 +61,7 @@ _PEBBLES = (
 
 
 def gravel(rng: np.random.Generator) -> Texture:
-    """Overlapping pebbles of several sizes."""
+    """Draw gravel of overlapping pebbles in several sizes."""
     canvas = np.full((SIDE, SIDE, 4), (58, 54, 48, 20), np.uint8)
     palette = _PEBBLES[rng.integers(len(_PEBBLES))]
     size = rng.uniform(5, 12)
@@ -73,7 +73,7 @@ def gravel(rng: np.random.Generator) -> Texture:
 
 
 def asphalt(rng: np.random.Generator) -> Texture:
-    """Asphalt: stones in bitumen, cracks, sealed cracks, patches, oil."""
+    """Draw asphalt with visible stones, open and sealed cracks, patches and oil stains."""
     stones = blur(noise(rng, 0.0), 0.8)
     stones = stones / stones.std()
     broad = noise(rng, 1.4, 2)

@@ -1,4 +1,4 @@
-"""Lettering: sign plates, stencilled numbers, posters."""
+"""Textures with lettering: sign plates, stencilled numbers and posters."""
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -35,7 +35,7 @@ _WORDS = (
 
 
 def notice_board(rng: np.random.Generator) -> Texture:
-    """A board covered with sign plates."""
+    """Draw a board covered with sign plates."""
     page = Image.new("RGB", (SIDE, SIDE), (118, 112, 102))
     mask = Image.new("L", (SIDE, SIDE), 0)
     tall = SIDE // int(rng.choice([4, 5, 6]))
@@ -49,7 +49,7 @@ def notice_board(rng: np.random.Generator) -> Texture:
 
 
 def stencilled_numbers(rng: np.random.Generator) -> Texture:
-    """Large stencilled letters and numbers on a plain ground, as on containers and hulls."""
+    """Draw large stencilled letters and numbers on a plain ground, as on containers and hulls."""
     ground, ink = _SIGN_COLOURS[rng.integers(len(_SIGN_COLOURS))]
     page = Image.new("RGB", (SIDE, SIDE), _integer_colour(ground))
     pen = ImageDraw.Draw(page)
@@ -64,7 +64,7 @@ def stencilled_numbers(rng: np.random.Generator) -> Texture:
 
 
 def posters(rng: np.random.Generator) -> Texture:
-    """Posters side by side: headlines, columns of small type."""
+    """Draw four posters side by side, each with a headline above small print."""
     page = Image.new("RGB", (SIDE, SIDE), (150, 140, 124))
     pen = ImageDraw.Draw(page)
     for left in (0, SIDE // 2):
@@ -80,7 +80,7 @@ def _integer_colour(colour: Colour) -> tuple[int, int, int]:
 
 
 def _write_text(pen: ImageDraw.ImageDraw, box: Box, text: str, ink: Colour) -> None:
-    """Write text centred in a box, as large as it fits."""
+    """Write text centred in a box, in the largest size that fits."""
     wide, high = box[2] - box[0], box[3] - box[1]
     font = ImageFont.load_default(100)
     left, top, right, bottom = font.getbbox(text)
@@ -123,7 +123,7 @@ def _paint_bill(rng: np.random.Generator, pen: ImageDraw.ImageDraw, box: Box) ->
 
 
 def _weather_print(rng: np.random.Generator, page: Image.Image, height: Map) -> Texture:
-    """Fade and scuff a printed page."""
+    """Fade and scuff a printed page, and return it as a texture."""
     colours = np.asarray(page, np.float32)
     faded = 0.12 * smoothstep(-1, 2, noise(rng, 1.6, 2))
     colours = mix(colours, (176, 170, 160), faded)

@@ -1,4 +1,4 @@
-"""Bare, rusty and painted metal."""
+"""Textures of bare, rusty and painted metal."""
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from stereoweave.synth.textures.wear import dirt_map
 
 
 def rust(rng: np.random.Generator) -> Texture:
-    """Rusty steel: brown and orange patches, dark pits, streaks from rain."""
+    """Draw rusty steel with brown and orange patches, dark pits and streaks from rain."""
     broad, fine = noise(rng, 1.3, 3), noise(rng, 0.8, 8)
     tone = 0.5 + 0.17 * broad + 0.12 * fine
     colours = ramp(tone, (56, 43, 38), (86, 59, 47), (116, 76, 54), (142, 100, 72), (132, 108, 88))
@@ -34,7 +34,7 @@ def rust(rng: np.random.Generator) -> Texture:
 
 
 def paint(rng: np.random.Generator) -> Texture:
-    """Old, nearly white paint: chips with rusty rims and streaks, dirt."""
+    """Draw old, nearly white paint with dirt and with chips whose rims and streaks are rusty."""
     broad, edge = noise(rng, 1.5, 3), noise(rng, 1.0, 14)
     damage = noise(rng, 1.6, 5) + 0.45 * edge
     limit = rng.uniform(2.2, 3.1)
@@ -50,7 +50,7 @@ def paint(rng: np.random.Generator) -> Texture:
 
 
 def brushed_steel(rng: np.random.Generator) -> Texture:
-    """Steel brushed along x."""
+    """Draw steel brushed along x."""
     lines = noise(rng, 0.7, 4, stretch=(1, 60))
     broad = noise(rng, 1.5, 2)
     colours = tint_grey(164 + 14 * lines + 9 * broad - 18 * dirt_map(rng), 0.99, 1.01)
@@ -58,7 +58,7 @@ def brushed_steel(rng: np.random.Generator) -> Texture:
 
 
 def spangled_steel(rng: np.random.Generator) -> Texture:
-    """Galvanised steel: zinc crystals, each in its own grey."""
+    """Draw galvanised steel with zinc crystals, each in its own shade of grey."""
     large = voronoi_cells(rng, 22, 22, 0.5, rough=2)
     small = voronoi_cells(rng, 64, 64, 0.5)
     feathers = noise(rng, 0.8, 20, stretch=(1, 3))
@@ -74,7 +74,7 @@ def spangled_steel(rng: np.random.Generator) -> Texture:
 
 
 def scratched_steel(rng: np.random.Generator) -> Texture:
-    """Worn bare steel: scratches of all lengths, smears."""
+    """Draw worn bare steel with smears and with scratches of all lengths."""
     canvas = np.full((SIDE, SIDE, 4), 128, np.uint8)
     count = 900
     turn, length = rng.normal(0.3, 0.7, count), np.exp(rng.normal(3.2, 0.8, count))
@@ -90,7 +90,7 @@ def scratched_steel(rng: np.random.Generator) -> Texture:
 
 
 def tread_plate(rng: np.random.Generator) -> Texture:
-    """Chequer plate: raised bars in alternating directions, worn bright on top."""
+    """Draw chequer plate with raised bars in alternating directions, worn bright on top."""
     y, x = texel_grid()
     pitch = SIDE / 16
     row, column = y // pitch, x // pitch

@@ -8,12 +8,12 @@ from jaxtyping import Float, UInt8
 
 from stereoweave.synth.textures.tiling import SIDE, Texture, blur, stack_texture
 
-# A crop exceeds its texture by this margin, which is blended with the opposite side.
+# A crop is larger than its texture by this margin, which is blended into the opposite side.
 _OVERLAP = SIDE // 4
 
 
 def photograph_crop(name: str, rng: np.random.Generator) -> Texture:
-    """A random crop of one of scikit-image's photographs; brighter texels are slightly higher."""
+    """Draw a random crop of one of scikit-image's photographs; brighter texels are slightly higher."""
     part = _mute(rng, _draw_crop(rng, _load_photograph(name)))
     rows = _blend_ends(part)
     colours = _blend_ends(rows.transpose(1, 0, 2)).transpose(1, 0, 2)
@@ -42,14 +42,17 @@ def _draw_crop(
 
 
 def _mute(rng: np.random.Generator, part: Float[np.ndarray, "_ _ 3"]) -> Float[np.ndarray, "_ _ 3"]:
-    """Reduce saturation, like faded print, and add a slight tint."""
+    """Reduce the saturation, as in a faded print, and add a slight tint."""
     grey = part.mean(-1, keepdims=True)
     warm = rng.normal(0, 0.03)
     return (grey + rng.uniform(0.3, 0.5) * (part - grey)) * np.array([1 + warm, 1, 1 - warm], np.float32)
 
 
 def _blend_ends(part: Float[np.ndarray, "_ _ 3"]) -> Float[np.ndarray, "_ _ 3"]:
-    """The first SIDE rows; the rows after them are blended into the beginning, so that the rows tile."""
+    """Return the first SIDE rows, made tileable.
+
+    The rows that follow them are blended into the first ones.
+    """
     share = np.linspace(0, 1, _OVERLAP, dtype=np.float32)[:, None, None]
     share = share * share * (3 - 2 * share)
     rows = part[:SIDE].copy()

@@ -1,4 +1,4 @@
-"""Roofs of tiles and slates."""
+"""Textures of tiled and slated roofs."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from stereoweave.synth.textures.wear import dirt_map
 
 
 def pantiles(rng: np.random.Generator) -> Texture:
-    """Pantiles: waves across, overlapping rows."""
+    """Draw overlapping rows of pantiles, wavy across the roof."""
     y, x = texel_grid()
     wave = 0.5 + 0.5 * np.sin(2 * np.pi * x / (SIDE / 12) + 0.1 * noise(rng, 1.2, 4))
     row_high = SIDE / 10
@@ -35,17 +35,17 @@ def pantiles(rng: np.random.Generator) -> Texture:
 
 
 def plain_tiles(rng: np.random.Generator) -> Texture:
-    """Flat clay tiles with rounded ends."""
+    """Draw flat clay tiles with rounded ends."""
     return _shingles(rng, rows=20, columns=16, rounded=0.35, fire=True)
 
 
 def slates(rng: np.random.Generator) -> Texture:
-    """Slates."""
+    """Draw roof slates."""
     return _shingles(rng, rows=14, columns=10, rounded=0.0, fire=False)
 
 
 def _fired_clay(rng: np.random.Generator, number: np.ndarray, count: int) -> Colours:
-    """Fired clay: one colour per tile, lichen and soot."""
+    """Return the colours of fired clay, one shade per tile, with lichen and soot."""
     palette = np.array([(124, 72, 54), (142, 86, 64), (108, 66, 54), (156, 104, 78), (118, 88, 72)])
     shades = palette[rng.integers(0, 5, count)] * np.exp(rng.normal(0, 0.08, (count, 1)))
     colours = shades.astype(np.float32)[number] * (1 + 0.07 * noise(rng, 0.9, 6))[..., None]
@@ -54,14 +54,14 @@ def _fired_clay(rng: np.random.Generator, number: np.ndarray, count: int) -> Col
 
 
 def _shingles(rng: np.random.Generator, rows: int, columns: int, rounded: float, fire: bool) -> Texture:
-    """Overlapping rows of flat tiles, every other row shifted by half a tile."""
+    """Draw overlapping rows of flat tiles, with every other row shifted by half a tile."""
     y, x = texel_grid()
     y = y + 0.8 * noise(rng, 1.4, 6)
     high, wide = SIDE / rows, SIDE / columns
     row = np.floor(y / high)
     shifted = x + wide * np.where(row % 2 > 0, 0.5, 0)
     aside = np.abs(shifted / wide % 1 - 0.5) * 2
-    # Rounded ends hang lower in the middle; the row below shows at their sides.
+    # A rounded end hangs lowest in its middle; the row below shows on both sides of it.
     fall = (y / high) % 1 + rounded * aside**2
     below = fall > 1
     row, fall = row + below, np.where(below, fall - 1, fall)

@@ -1,4 +1,4 @@
-"""Stone walls."""
+"""Textures of stone walls."""
 
 import numpy as np
 
@@ -23,7 +23,7 @@ _ROCKS = (
 
 
 def rubble_wall(rng: np.random.Generator) -> Texture:
-    """Field stones in mortar."""
+    """Draw a wall of field stones in mortar."""
     rows = int(rng.choice([9, 12]))
     stones = voronoi_cells(rng, rows, int(rows * 0.65), 0.42, rough=7)
     edge = stones.rim + 0.7 * noise(rng, 1.0, 16)
@@ -32,14 +32,14 @@ def rubble_wall(rng: np.random.Generator) -> Texture:
 
 
 def coursed_wall(rng: np.random.Generator) -> Texture:
-    """Hewn blocks of varying length in courses."""
+    """Draw a wall of hewn blocks of varying length, laid in courses."""
     label, edge, count = _lay_courses(rng)
     edge = edge + 0.8 * noise(rng, 1.0, 16)
     return _masonry(rng, label, count, edge, smoothstep(3.4, 1.4, edge))
 
 
 def _lay_courses(rng: np.random.Generator) -> tuple[np.ndarray, Map, int]:
-    """Labels, distance to the next joint in texels, and number of blocks."""
+    """Return the blocks' labels, the distance to the nearest joint in texels, and the number of blocks."""
     heights = rng.choice([2, 3, 4], 12)
     edges = np.round(np.concatenate([[0], np.cumsum(heights)]) * SIDE / heights.sum()).astype(int)
     label = np.zeros((SIDE, SIDE), int)
@@ -59,7 +59,7 @@ def _lay_courses(rng: np.random.Generator) -> tuple[np.ndarray, Map, int]:
 
 
 def _masonry(rng: np.random.Generator, label: np.ndarray, count: int, edge: Map, mortar: Map) -> Texture:
-    """Colour stones, each in its own shade, rounded towards the mortar."""
+    """Draw stones in mortar, each in its own shade and rounded towards its rim."""
     palette = np.array(_ROCKS[rng.integers(len(_ROCKS))])
     shades = palette[rng.integers(0, 4, count)] * np.exp(rng.normal(0, 0.08, (count, 1)))
     grain, veins = noise(rng, 0.8, 8), noise(rng, 1.4, 8)

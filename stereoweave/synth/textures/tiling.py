@@ -1,7 +1,7 @@
 """Building blocks of tileable textures: noise, Voronoi cells, and drawing with wraparound.
 
-All maps are SIDE x SIDE texels and periodic. Colours are sRGB levels 0..255, and heights are levels
-0..255 around 128.
+All maps are periodic and have SIDE x SIDE texels. Colours are sRGB levels in 0..255. Heights are levels in
+0..255, centred on 128.
 """
 
 from typing import NamedTuple
@@ -20,10 +20,10 @@ Colour = tuple[float, float, float]
 
 
 class Cells(NamedTuple):
-    """The Voronoi cells of scattered sites.
+    """Voronoi cells of scattered sites.
 
     Attributes:
-        label: int [SIDE, SIDE], each texel's cell.
+        label: int [SIDE, SIDE], index of each texel's cell.
         rim: float32 [SIDE, SIDE], approximate distance to the cell's border in texels.
         number: number of cells.
     """
@@ -33,7 +33,7 @@ class Cells(NamedTuple):
     number: int
 
     def per_texel(self, values: np.ndarray) -> np.ndarray:
-        """Look up values [N] or [N, C] of the cells for each texel."""
+        """Return each texel's value, given one value per cell ([N] or [N, C])."""
         return values.astype(np.float32)[self.label]
 
 
@@ -43,18 +43,21 @@ def noise(
     cycles: float = 2.0,
     stretch: tuple[float, float] = (1.0, 1.0),
 ) -> Map:
-    """Periodic noise with amplitude ~ frequency**-exponent (1 in photographs), mean 0, deviation 1.
+    """Return periodic noise with mean 0 and standard deviation 1.
+
+    Its amplitude is proportional to frequency**-exponent; photographs have an exponent of about 1.
 
     Args:
         rng: Source of the noise.
         exponent: Smoothness of the noise.
-        cycles: The spectrum is flat below this many periods per side, so that no blot marks every tile.
+        cycles: The spectrum is flat below this many periods per side, so that no large blot gives the tiling
+            away.
         stretch: Elongation of structures along y and along x.
     """
     along_y, along_x = stretch[0] * np.fft.fftfreq(SIDE), stretch[1] * np.fft.rfftfreq(SIDE)
     squared = np.add.outer((along_y**2).astype(np.float32), (along_x**2).astype(np.float32))
     strength = np.maximum(squared, (cycles / SIDE) ** 2) ** (-exponent / 2)
-    # The sum of many waves is normally distributed anyway; uniform amplitudes are drawn fastest.
+    # A sum of many waves is nearly normal for any amplitudes, so draw uniform ones, which is fastest.
     waves = rng.random((SIDE, SIDE // 2 + 1, 2), np.float32).view(np.complex64)[..., 0] - (0.5 + 0.5j)
     spectrum = waves.astype(np.complex64) * strength
     spectrum[0, 0] = 0
@@ -63,7 +66,7 @@ def noise(
 
 
 def texel_grid() -> tuple[Map, Map]:
-    """The texels' coordinates y and x."""
+    """Return the y and x coordinates of the texels."""
     y, x = np.mgrid[:SIDE, :SIDE].astype(np.float32)
     return y, x
 
@@ -71,7 +74,10 @@ def texel_grid() -> tuple[Map, Map]:
 def voronoi_cells(
     rng: np.random.Generator, rows: int, columns: int, jitter: float = 0.45, rough: float = 0.0
 ) -> Cells:
-    """Voronoi cells of a jittered grid of rows x columns sites; borders wander by about `rough` texels."""
+    """Return the Voronoi cells of a jittered grid of rows x columns sites.
+
+    The cells' borders wander by about `rough` texels.
+    """
     home = np.indices((rows, columns)).reshape(2, -1).T + 0.5
     sites = home + jitter * rng.uniform(-1, 1, home.shape)
     y, x = (sites * [SIDE / rows, SIDE / columns]).astype(int).T % SIDE
@@ -96,25 +102,25 @@ def _rim(label: Map) -> Map:
     edge = (label != np.roll(label, 1, 0)) | (label != np.roll(label, 1, 1))
     wide = cv2.copyMakeBorder((~edge).astype(np.uint8), 64, 64, 64, 64, cv2.BORDER_WRAP)
     distance = cv2.distanceTransform(wide, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[64:-64, 64:-64]
-    # Whole-texel distances would make jagged joints.
+    # Distances in whole texels would make joints jagged.
     return blur(distance, 0.7)
 
 
 def warp(image: np.ndarray, down: Map, right: Map, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
-    """Warp an image: look it up displaced by `down` and `right` texels."""
+    """Warp an image by sampling each texel from `down` texels below and `right` texels to the right."""
     y, x = texel_grid()
     return cv2.remap(image, x + right, y + down, interpolation, borderMode=cv2.BORDER_WRAP)
 
 
 def blur(image: np.ndarray, sigma: float) -> np.ndarray:
-    """Gaussian blur with wraparound; sigma in texels."""
+    """Blur an image with a Gaussian of `sigma` texels and wraparound."""
     margin = int(4 * sigma) + 1
     padded = cv2.copyMakeBorder(image, margin, margin, margin, margin, cv2.BORDER_WRAP)
     return cv2.GaussianBlur(padded, (0, 0), sigma)[margin:-margin, margin:-margin]
 
 
 def smear_down(source: Map, length: float) -> Map:
-    """Smear a source down, fading over `length` texels, like streaks of rust and dirt."""
+    """Smear a map downwards, fading over `length` texels, as rust and dirt run down a wall."""
     tail = np.exp(-np.arange(SIDE, dtype=np.float32) / length)
     spectrum = np.fft.rfft(source, axis=0) * np.fft.rfft(tail / tail.sum())[:, None]
     return np.fft.irfft(spectrum, SIDE, axis=0).astype(np.float32)
@@ -129,7 +135,7 @@ def paint_polygons(
     low, high = polygons.min(1), polygons.max(1)
     shifts = SIDE * (np.indices((3, 3)).reshape(2, 9).T - 1)
     seen = ((high[:, None] + shifts > -1) & (low[:, None] + shifts < SIDE)).all(-1)
-    # OpenCV antialiases less well along the image's border.
+    # OpenCV antialiases poorly at an image's border, so the canvas is padded.
     margin = 4
     wide = cv2.copyMakeBorder(canvas, margin, margin, margin, margin, cv2.BORDER_WRAP)
     corners = np.round((polygons + margin) * 16).astype(np.int32)
@@ -145,7 +151,7 @@ def blade_outlines(
     length: Float[np.ndarray, " n"],
     wide: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, "n 8 2"]:
-    """Outlines of tapering blades of grass or straw.
+    """Return the outlines of tapering blades of grass or straw.
 
     turns: direction at the root and at the tip, in radians.
     """
@@ -158,34 +164,37 @@ def blade_outlines(
 
 
 def distance_to_lines(position: np.ndarray, first: float, period: float) -> Map:
-    """Distance to the nearest line of those at first, first + period, ..."""
+    """Return the distance to the nearest of the lines at `first`, `first + period`, ..."""
     return np.abs((position - first + period / 2) % period - period / 2).astype(np.float32)
 
 
 def smoothstep(low: float, high: float, values: Map) -> Map:
-    """Smoothstep: 0 below low, 1 above high; reversed if low > high."""
+    """Return a smooth step from 0 at `low` to 1 at `high`; it falls instead of rising if low > high."""
     share = np.clip((values - low) / (high - low), 0, 1)
     return share * share * (3 - 2 * share)
 
 
 def mix(first: np.ndarray | Colour, second: np.ndarray | Colour, share: Map) -> Colours:
-    """Linear blend, (1 - share) of the first and share of the second; each is an image or one colour."""
+    """Blend two images or colours linearly.
+
+    The result is (1 - share) of the first plus share of the second.
+    """
     first, second = np.asarray(first, np.float32), np.asarray(second, np.float32)
     return first + share[..., None] * (second - first)
 
 
 def ramp(values: Map, *colours: Colour) -> Colours:
-    """Map values 0..1 to a ramp of evenly spaced colours."""
+    """Map values in 0..1 to a ramp of evenly spaced colours."""
     at, stops = np.linspace(0, len(colours) - 1, 1024), range(len(colours))
     table = np.stack([np.interp(at, stops, channel) for channel in np.transpose(colours)], -1)
     return table.astype(np.float32)[np.clip(values * 1023, 0, 1023).astype(np.int32)]
 
 
 def tint_grey(levels: Map, red: float, blue: float) -> Colours:
-    """RGB from grey levels, with factors for red and blue."""
+    """Convert grey levels to RGB, scaling red and blue by one factor each."""
     return np.dstack([levels * red, levels, levels * blue]).astype(np.float32)
 
 
 def stack_texture(colours: Colours, height: Map) -> Texture:
-    """Stack colours and a height of -1..1, clipped, into a texture."""
+    """Stack colours and a height map, clipped to -1..1, into a texture."""
     return np.dstack([colours, 128 + 127 * np.clip(height, -1, 1)]).astype(np.float32)

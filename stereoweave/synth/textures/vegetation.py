@@ -1,4 +1,4 @@
-"""Bark, boards, leaves and grass."""
+"""Textures of bark, boards, leaves and grass."""
 
 import numpy as np
 from jaxtyping import Float
@@ -24,7 +24,7 @@ from stereoweave.synth.textures.wear import dirt_map
 
 
 def furrowed_bark(rng: np.random.Generator) -> Texture:
-    """Oak bark: ridges along y that split and join, with dark furrows."""
+    """Draw oak bark with dark furrows between ridges that run along y, split and join."""
     wander = 5 * noise(rng, 1.6, 5)
     fibres = warp(noise(rng, 0.9, 8, stretch=(6, 1)), wander, wander)
     furrows = np.abs(warp(noise(rng, 1.9, 9, stretch=(4.5, 1)), wander, wander))
@@ -38,7 +38,7 @@ def furrowed_bark(rng: np.random.Generator) -> Texture:
 
 
 def plated_bark(rng: np.random.Generator) -> Texture:
-    """Pine bark: scaly, reddish, flaking plates."""
+    """Draw pine bark of reddish, flaking plates."""
     plates, flakes = voronoi_cells(rng, 8, 13, 0.5, rough=9), voronoi_cells(rng, 24, 30, 0.5, rough=5)
     depth = np.clip((plates.rim + 0.9 * noise(rng, 1.1, 12)) / 8, 0, 1)
     leaf = flakes.per_texel(rng.normal(0, 1, flakes.number)) - 0.8 * smoothstep(2.0, 0.5, flakes.rim)
@@ -48,7 +48,7 @@ def plated_bark(rng: np.random.Generator) -> Texture:
 
 
 def smooth_bark(rng: np.random.Generator) -> Texture:
-    """Beech or birch bark: grey, with lens-shaped marks, scars, lichen."""
+    """Draw grey beech or birch bark with lens-shaped marks, scars and lichen."""
     lens = noise(rng, 1.1, 12, stretch=(1, 6))
     marks, lips = smoothstep(1.5, 1.9, lens), smoothstep(1.0, 1.5, lens)
     wrinkles = warp(noise(rng, 1.1, 6, stretch=(1, 5)), 8 * noise(rng, 1.8, 3), 8 * noise(rng, 1.8, 3))
@@ -62,7 +62,7 @@ def smooth_bark(rng: np.random.Generator) -> Texture:
 
 
 def planks(rng: np.random.Generator) -> Texture:
-    """Boards along y with growth rings, knots, gaps and nails."""
+    """Draw boards along y with growth rings, knots, splits and gaps."""
     y, x = texel_grid()
     count = int(rng.choice([4, 6, 8]))
     width = SIDE / count
@@ -92,7 +92,7 @@ _FOLIAGE: tuple[tuple[Colour, ...], ...] = (
 
 
 def foliage(rng: np.random.Generator) -> Texture:
-    """Foliage seen from some metres: overlapping leaves with dark gaps."""
+    """Draw foliage as seen from a few metres, with overlapping leaves and dark gaps."""
     palette = np.array(_FOLIAGE[rng.integers(len(_FOLIAGE))])
     size, slim = rng.uniform(9, 17), rng.uniform(0.28, 0.5)
     canvas = np.full((SIDE, SIDE, 4), (20, 24, 16, 10), np.uint8)
@@ -115,7 +115,7 @@ def foliage(rng: np.random.Generator) -> Texture:
 
 
 def grass(rng: np.random.Generator) -> Texture:
-    """Grass from above: blades in all directions, some dry, with earth between them."""
+    """Draw grass seen from above, with blades in all directions, some of them dry, and soil between them."""
     fresh = np.array(((64, 78, 40), (78, 92, 50), (94, 106, 60), (86, 94, 62)))
     dry = np.array(((136, 126, 92), (122, 112, 84)))
     dryness, count = rng.uniform(0.02, 0.25), 8500
@@ -149,7 +149,7 @@ def _knots(rng: np.random.Generator, boards: int) -> Map:
 
 
 def _shift_boards(values: Map, shift: np.ndarray, board: np.ndarray) -> Map:
-    """Shift the values along y by a separate amount per board."""
+    """Shift each board's values along y by an amount of its own."""
     rows = (np.arange(SIDE)[:, None] + shift[board]) % SIDE
     return np.take_along_axis(values, rows, 0)
 
@@ -160,7 +160,7 @@ def _leaf_halves(
     length: Float[np.ndarray, " n"],
     slim: float,
 ) -> Float[np.ndarray, "n 2 6 2"]:
-    """Outlines of both halves of pointed leaves around `at`; `length` is half a leaf's length."""
+    """Return the outlines of both halves of pointed leaves at `at`; `length` is half a leaf's length."""
     along = np.linspace(-1, 1, 6)
     bow = slim * (1 - np.abs(along) ** 1.7)
     halves = np.stack([np.stack([along, side * bow], -1) for side in (1, -1)])

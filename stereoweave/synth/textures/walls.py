@@ -1,4 +1,4 @@
-"""Walls and floors: concrete, plaster, brick, and a nearly plain surface."""
+"""Textures of walls and floors: concrete, plaster, brick, and a nearly plain surface."""
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from stereoweave.synth.textures.wear import crack_map, dirt_map
 
 
 def cast_concrete(rng: np.random.Generator) -> Texture:
-    """Cast concrete: joints of the formwork, tie holes, air bubbles."""
+    """Draw cast concrete with formwork joints, tie holes and air bubbles."""
     colours, height = _concrete(rng)
     y, x = texel_grid()
     joint = np.minimum(distance_to_lines(y, 0, SIDE / 2), distance_to_lines(x, 0, SIDE / 2))
@@ -38,7 +38,7 @@ def cast_concrete(rng: np.random.Generator) -> Texture:
 
 
 def cracked_concrete(rng: np.random.Generator) -> Texture:
-    """Concrete with cracks and repaired patches."""
+    """Draw concrete with cracks and repaired patches."""
     colours, height = _concrete(rng)
     cracks = crack_map(rng, 4, 0.0)
     patch = smoothstep(1.35, 1.45, noise(rng, 2.0, 2))
@@ -47,7 +47,7 @@ def cracked_concrete(rng: np.random.Generator) -> Texture:
 
 
 def stained_concrete(rng: np.random.Generator) -> Texture:
-    """Stained concrete: black and pale streaks from water, moss."""
+    """Draw stained concrete with moss and with black and pale streaks left by water."""
     colours, height = _concrete(rng)
     soot = smear_down(smoothstep(1.0, 2.2, noise(rng, 0.9, 6, stretch=(1, 0.4))), 150)
     lime = smear_down(smoothstep(1.6, 2.4, noise(rng, 0.9, 8)), 70)
@@ -58,7 +58,7 @@ def stained_concrete(rng: np.random.Generator) -> Texture:
 
 
 def paving_slabs(rng: np.random.Generator) -> Texture:
-    """Square paving slabs, each differently weathered."""
+    """Draw square paving slabs, each with its own degree of weathering."""
     colours, height = _concrete(rng)
     y, x = texel_grid()
     pitch = SIDE / 4
@@ -73,7 +73,7 @@ def paving_slabs(rng: np.random.Generator) -> Texture:
 
 
 def trowelled_plaster(rng: np.random.Generator) -> Texture:
-    """Hand-trowelled plaster: strokes, hairline cracks, damp."""
+    """Draw hand-trowelled plaster with visible strokes, hairline cracks and damp patches."""
     strokes = warp(noise(rng, 1.2, 5, stretch=(1, 3)), 22 * noise(rng, 1.8, 2), 22 * noise(rng, 1.8, 2))
     broad = noise(rng, 1.6, 2)
     colours = ramp(0.5 + 0.2 * broad, (188, 178, 160), (206, 198, 182), (218, 212, 200))
@@ -85,7 +85,7 @@ def trowelled_plaster(rng: np.random.Generator) -> Texture:
 
 
 def roughcast_plaster(rng: np.random.Generator) -> Texture:
-    """Roughcast plaster: gritty grains with small shadows, and bare patches."""
+    """Draw roughcast plaster with gritty grains, small shadows and bare patches."""
     grain = blur(noise(rng, 0.0), 1.2)
     grain = grain / grain.std() + 0.4 * noise(rng, 1.0, 10)
     broad = noise(rng, 1.5, 2)
@@ -105,7 +105,7 @@ _BRICKS = (
 
 
 def brickwork(rng: np.random.Generator) -> Texture:
-    """Brickwork in stretcher bond: each brick in its own shade, recessed mortar."""
+    """Draw brickwork in stretcher bond, with recessed mortar and each brick in its own shade."""
     y, x = texel_grid()
     wander = noise(rng, 1.4, 8)
     y, x = y + 0.8 * wander, x + 0.8 * noise(rng, 1.4, 8)
@@ -130,7 +130,7 @@ def brickwork(rng: np.random.Generator) -> Texture:
 
 
 def near_plain(rng: np.random.Generator) -> Texture:
-    """Nearly white and even: almost no texture to match."""
+    """Draw a nearly white, even surface with almost no texture to match."""
     broad, fine = noise(rng, 1.5, 1), noise(rng, 0.8, 6)
     share = rng.uniform(0.008, 0.02)
     grey = 226 * (1 + share * (0.8 * broad + 0.6 * fine))
@@ -138,7 +138,7 @@ def near_plain(rng: np.random.Generator) -> Texture:
 
 
 def _concrete(rng: np.random.Generator) -> tuple[Colours, Map]:
-    """Colour and height of clean concrete."""
+    """Return the colour and height of clean concrete."""
     broad, fine = noise(rng, 1.5, 2), noise(rng, 0.7, 10)
     colours = ramp(0.5 + 0.16 * broad + 0.06 * fine, (128, 124, 116), (158, 154, 146), (184, 181, 173))
     colours = colours + (3.5 * fine)[..., None]

@@ -1,4 +1,4 @@
-"""Water and clouds."""
+"""Textures of water and clouds."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from stereoweave.synth.textures.tiling import Map, Texture, mix, noise, ramp, sm
 
 
 def water(rng: np.random.Generator) -> Texture:
-    """Ripples with a main direction: rounded troughs, sharp crests."""
+    """Draw ripples in a main direction, with rounded troughs and sharp crests."""
     turn = 5 * noise(rng, 2.0, 4), 5 * noise(rng, 2.0, 4)
     length = rng.uniform(1.5, 3)
     waves = [warp(noise(rng, 2.0, cycles, stretch=(1, length)), *turn) for cycles in (7, 16, 36)]
@@ -21,7 +21,7 @@ def water(rng: np.random.Generator) -> Texture:
 
 
 def cumulus(rng: np.random.Generator) -> Texture:
-    """Density of cumulus clouds: 0 is clear, 255 dense."""
+    """Draw the density of cumulus clouds, from 0 (clear) to 255 (dense)."""
     shape = noise(rng, 1.9, 2) + 0.45 * noise(rng, 1.2, 8)
     cover = rng.uniform(-0.5, 0.3)
     heaps = smoothstep(cover, cover + 1.9, shape) ** 0.8
@@ -29,7 +29,7 @@ def cumulus(rng: np.random.Generator) -> Texture:
 
 
 def cirrus(rng: np.random.Generator) -> Texture:
-    """Density of windswept cirrus clouds."""
+    """Draw the density of windswept cirrus clouds."""
     turn = 24 * noise(rng, 3.0, 2), 10 * noise(rng, 3.0, 2)
     veil = warp(noise(rng, 1.1, 5, stretch=(1, 9)), *turn)
     patches = smoothstep(-1.2, 1.6, noise(rng, 1.7, 2))
@@ -37,7 +37,7 @@ def cirrus(rng: np.random.Generator) -> Texture:
 
 
 def overcast(rng: np.random.Generator) -> Texture:
-    """Density of an overcast sky with folds and thin places."""
+    """Draw the density of an overcast sky with folds and thin places."""
     folds = warp(noise(rng, 1.6, 3, stretch=(1, 2)), 25 * noise(rng, 1.9, 2), 25 * noise(rng, 1.9, 2))
     return _density(np.clip(0.72 + 0.13 * folds + 0.03 * noise(rng, 1.1, 8), 0, 1))
 
