@@ -1,1 +1,1 @@
-"""The things of which scenes are made."""
+"""Objects that scenes are composed of."""

@@ -1,4 +1,4 @@
-"""Antennas: panels, drums, dishes, yagis, whips; each points along +x, mounted at the origin."""
+"""Antennas of several kinds, mounted at the origin. Directional ones point along +x."""
 
 import numpy as np
 
@@ -6,11 +6,11 @@ from stereoweave.synth.props.lattice import bars, chain_segments
 from stereoweave.synth.props.primitives import boxes, lathe, rotation, spheres, tubes
 from stereoweave.synth.world import Mesh, join_meshes
 
-FORWARD = rotation((0, 1, 0), 90)  # from z to x
+FORWARD = rotation((0, 1, 0), 90)  # rotates z onto x
 
 
 def panel(height_m: float, cover: int, steel: int) -> Mesh:
-    """A sector panel in front of its pole, with brackets, radio unit and cables."""
+    """Build a sector panel in front of its pole, with brackets, radio unit and cables."""
     half = height_m / 2
     brackets = np.array([[(-0.08, 0, z), (0.03, 0, z)] for z in (-0.7 * half, 0.7 * half)])
     leads = np.array(
@@ -34,7 +34,7 @@ def panel(height_m: float, cover: int, steel: int) -> Mesh:
 
 
 def drum(radius_m: float, cover: int, steel: int) -> Mesh:
-    """A shrouded microwave dish with a bulging cover, on a bracket."""
+    """Build a shrouded microwave dish with a bulging cover, on a bracket."""
     r, depth = radius_m, 0.75 * radius_m
     profile = np.array(
         [
@@ -64,7 +64,7 @@ def drum(radius_m: float, cover: int, steel: int) -> Mesh:
 
 
 def paraboloid(radius_m: float, focal_m: float, skin: int, back: int, sections: int = 32) -> Mesh:
-    """A paraboloid around z, its vertex at the origin and its focus at z = focal_m."""
+    """Build a paraboloid around z, with its vertex at the origin and its focus at z = focal_m."""
     radius = np.linspace(0, radius_m, 9)
     front = np.column_stack([radius, radius**2 / (4 * focal_m)])
     thick = 0.018 * radius_m + 0.004
@@ -75,7 +75,7 @@ def paraboloid(radius_m: float, focal_m: float, skin: int, back: int, sections: 
 
 
 def satellite_dish(radius_m: float, cover: int, steel: int) -> Mesh:
-    """A television dish, tilted up by 30 degrees, with its receiver on an arm."""
+    """Build a satellite television dish, tilted up by 30 degrees, with its receiver on an arm."""
     focal = 1.25 * radius_m
     rim = radius_m**2 / (4 * focal)
     arm = np.array(
@@ -96,7 +96,10 @@ def satellite_dish(radius_m: float, cover: int, steel: int) -> Mesh:
 
 
 def yagi(length_m: float, count: int, steel: int, end: int) -> Mesh:
-    """A yagi antenna: directors shorter towards the front, a loop as dipole, rods as reflector."""
+    """Build a Yagi antenna with a loop dipole and a reflector of rods.
+
+    The directors get shorter towards the front.
+    """
     x = np.linspace(0.12, 1, count) * length_m - 0.3 * length_m
     half = np.linspace(0.5, 0.36, count) * 0.32
     rods = np.stack([np.stack([x, side * half, 0 * x + 0.012], -1) for side in (-1, 1)], 1)
@@ -121,7 +124,7 @@ def yagi(length_m: float, count: int, steel: int, end: int) -> Mesh:
 
 
 def whip(height_m: float, cover: int, steel: int) -> Mesh:
-    """An upright rod beside its bracket."""
+    """Build a whip antenna, an upright rod, on a short mount."""
     return join_meshes(
         [
             tubes((0, 0, 0), (0, 0, height_m), np.array([[0.014, 0.007]]), cover, 8),
@@ -132,7 +135,7 @@ def whip(height_m: float, cover: int, steel: int) -> Mesh:
 
 
 def dipoles(count: int, steel: int) -> Mesh:
-    """A column of loop dipoles on a pole."""
+    """Build a column of loop dipoles on a pole."""
     angle = np.linspace(0, 2 * np.pi, 13)
     loop = np.column_stack([0.14 + 0.03 * np.cos(angle), 0 * angle, 0.15 * np.sin(angle)])
     z = (np.arange(count) * 0.42)[:, None, None] * [0.0, 0, 1]

@@ -20,7 +20,7 @@ from stereoweave.synth.props.primitives import (
 from stereoweave.synth.stage import Palette
 from stereoweave.synth.world import Colour, Material, Mesh, join_meshes
 
-# Relative to real bridges.
+# Size relative to real bridges.
 SCALE = 0.1
 _STEEL_PAINTS: tuple[Colour, ...] = (
     (0.2, 0.28, 0.24),
@@ -34,13 +34,13 @@ _STEEL_PAINTS: tuple[Colour, ...] = (
 
 @dataclass(frozen=True, kw_only=True)
 class BridgePlan:
-    """Common dimensions of a bridge's parts, and its materials.
+    """Dimensions and materials common to all parts of a bridge.
 
     Attributes:
         level_m: height of the road above the water.
-        half_m: half of the road's length between the banks.
+        half_m: half the length of the road between the banks.
         width_m: width of the road.
-        steel, masonry, dressed, asphalt, rail: materials; dressed stone lines edges.
+        steel, masonry, dressed, asphalt, rail: materials; dressed stone lines the edges.
     """
 
     level_m: float
@@ -59,7 +59,7 @@ class BridgePlan:
 
 
 def draw_bridge_plan(rng: np.random.Generator, palette: Palette) -> BridgePlan:
-    """Draw a plan and add its materials to the palette."""
+    """Draw a bridge plan and add its materials to the palette."""
     paint = _STEEL_PAINTS[rng.integers(len(_STEEL_PAINTS))]
     masonry = Material(
         texture=str(rng.choice(["stone", "brick", "concrete"], p=[0.5, 0.15, 0.35])),
@@ -91,7 +91,10 @@ def draw_bridge_plan(rng: np.random.Generator, palette: Palette) -> BridgePlan:
 
 
 def beams(starts_m: Numbers, ends_m: Numbers, size_m: tuple[float, float], material: int) -> Mesh:
-    """Rectangular bars [N] from start to end; size_m: horizontal and vertical size, for lying bars."""
+    """Build rectangular bars [N] from start to end.
+
+    size_m: horizontal and vertical size of a horizontal bar's cross-section.
+    """
     starts, ends = np.broadcast_arrays(np.atleast_2d(starts_m), np.atleast_2d(ends_m))
     along = ends - starts
     length = np.linalg.norm(along, axis=1, keepdims=True)
@@ -102,7 +105,7 @@ def beams(starts_m: Numbers, ends_m: Numbers, size_m: tuple[float, float], mater
 
 
 def roadway(plan: BridgePlan, start_m: float, end_m: float, *, deep_m: float = 0.1) -> Mesh:
-    """Slab, asphalt, kerbs and railings from x = start_m to end_m at z = 0."""
+    """Build slab, asphalt, kerbs and railings from x = start_m to x = end_m, with the road at z = 0."""
     middle_m, length_m = (start_m + end_m) / 2, end_m - start_m
     slab = boxes([[middle_m, 0, -deep_m / 2 - 0.01]], [[length_m, plan.width_m, deep_m]], plan.masonry)
     asphalt = boxes([[middle_m, 0, -0.005]], [[length_m, 0.74 * plan.width_m, 0.03]], plan.asphalt)
@@ -118,7 +121,7 @@ def roadway(plan: BridgePlan, start_m: float, end_m: float, *, deep_m: float = 0
 
 
 def street_lamps(plan: BridgePlan, start_m: float, end_m: float, material: int, glass: int) -> Mesh:
-    """Street lamps on both sides, with arms over the road, at z = 0."""
+    """Build street lamps on both sides of a road at z = 0, with arms over the road."""
     angle = np.linspace(0, np.pi / 2, 6)
     bow = np.stack([0 * angle, 0.12 - 0.12 * np.cos(angle), 0.6 + 0.12 * np.sin(angle)], -1)
     mast = sweep(np.concatenate([[[0, 0, 0.02]], bow, [[0, 0.2, 0.72]]]), 0.011, material, 6)
@@ -132,7 +135,7 @@ def street_lamps(plan: BridgePlan, start_m: float, end_m: float, material: int, 
 
 
 def pier(plan: BridgePlan, at_m: float, top_m: float, *, thick_m: float = 0.32, wide_m: float = 0.3) -> Mesh:
-    """A pier in the river, pointed upstream, wide_m wider than the road."""
+    """Build a river pier with pointed ends, wide_m wider than the road and topped at z = top_m."""
     y = plan.width_m / 2 + wide_m / 2
     outline = np.array([(0.5, -y), (0.5, y), (0, y + 0.2), (-0.5, y), (-0.5, -y), (0, -y - 0.2)]) * [
         thick_m,
@@ -145,7 +148,7 @@ def pier(plan: BridgePlan, at_m: float, top_m: float, *, thick_m: float = 0.32, 
 
 
 def abutments(plan: BridgePlan) -> Mesh:
-    """Abutments at both ends, between bridge and banks."""
+    """Build the abutments between bridge and banks at both ends."""
     size_m = [0.9, plan.width_m + 0.24, plan.level_m + 0.88]
     x = (plan.half_m + 0.42) * np.array([-1.0, 1.0])
     walls = boxes([[at, 0, (plan.level_m - 1.12) / 2] for at in x], [size_m], plan.masonry)
@@ -162,7 +165,7 @@ def abutments(plan: BridgePlan) -> Mesh:
 
 
 def stone_arch_bridge(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
-    """Two to five arches with voussoirs, pointed piers and a parapet."""
+    """Build a bridge of two to five arches with voussoirs, pointed piers and parapets."""
     count = int(rng.integers(2, 6))
     wide_m = 2 * plan.half_m / count
     pier_m = min(0.16 * wide_m, 0.4)
@@ -184,7 +187,7 @@ def stone_arch_bridge(rng: np.random.Generator, palette: Palette, plan: BridgePl
 
 
 def _arch(plan: BridgePlan, arch_m: Float[np.ndarray, "k 2"], reach_m: float) -> Mesh:
-    """One arch with the wall above it: faces on both sides, vault, and voussoirs."""
+    """Build one arch and the wall above it: faces on both sides, vault and voussoirs."""
     y, top_m = plan.width_m / 2, plan.level_m
     below = np.concatenate(
         [[[-reach_m, -0.7], [arch_m[0, 0], -0.7]], arch_m, [[arch_m[-1, 0], -0.7], [reach_m, -0.7]]]

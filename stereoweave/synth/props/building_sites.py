@@ -1,4 +1,4 @@
-"""The building site below a tower crane: concrete shell, scaffolding, site offices, hoarding, town."""
+"""Building site around a tower crane: concrete shell, scaffolding, site offices, hoarding and a town."""
 
 import numpy as np
 
@@ -8,12 +8,12 @@ from stereoweave.synth.props.surroundings import draw_spots, hills, houses, pall
 from stereoweave.synth.stage import Palette
 from stereoweave.synth.world import Colour, Material, Mesh, join_meshes
 
-SCALE = 0.4  # of the surroundings; the crane is smaller than a real one
+SCALE = 0.4  # scale of the surroundings, because the crane is smaller than a real one
 BAY_M, STOREY_M = 0.95, 0.52
 
 
 def building_site(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """A site with its shell at negative y, behind the crane seen from positive y."""
+    """Build a site whose shell is at negative y, behind a crane that is seen from positive y."""
     small = np.diag([SCALE, SCALE, SCALE, 1.0])
     town = draw_spots(rng, 20, 17 / SCALE, 60 / SCALE)
     stacks = draw_spots(rng, 7, 2 / SCALE, 5 / SCALE)
@@ -34,14 +34,17 @@ def building_site(rng: np.random.Generator, palette: Palette) -> Mesh:
 
 
 def _yard(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """The bare ground of the site."""
+    """Build the bare ground of the site."""
     family = str(rng.choice(["soil", "gravel", "gravel"]))
     ground = palette.add(Material(texture=family, variant=int(rng.integers(64)), span_m=2.5, relief=0.6))
     return boxes((0, 2, 0.0), (19, 17, 0.03), ground)
 
 
 def _shell(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """Slabs on columns around a core, starter bars on top, props, railings, scaffolding."""
+    """Build a concrete shell under construction.
+
+    Its slabs stand on columns around a core, with starter bars, props, railings and scaffolding.
+    """
     concrete = palette.add(
         Material(texture="concrete", variant=int(rng.integers(8)), span_m=1.6, roughness=0.9)
     )
@@ -74,20 +77,20 @@ def _shell(rng: np.random.Generator, palette: Palette) -> Mesh:
 
 
 def _starters(tops: np.ndarray) -> np.ndarray:
-    """Starter bars on the columns' heads."""
+    """Return segments [N, 2, 3] of the starter bars on top of the columns."""
     around = np.array([(a, b, 0.0) for a in (-0.035, 0.0, 0.035) for b in (-0.035, 0.035)])
     feet = (tops[:, None] + around).reshape(-1, 3)
     return np.stack([feet, feet + [0, 0, 0.36]], 1)
 
 
 def _props(rng: np.random.Generator, x: np.ndarray, y: np.ndarray, floor_m: float) -> np.ndarray:
-    """Props below the highest slab."""
+    """Return segments [N, 2, 3] of the props below the highest slab."""
     at = rng.uniform((x[0], y[0], 0), (x[-1], y[-1], 0), (40, 3)) + [0, 0, floor_m]
     return np.stack([at, at + [0, 0, STOREY_M - 0.07]], 1)
 
 
 def _scaffolding(size_m: np.ndarray, floors: int, tube: int, board: int) -> Mesh:
-    """Standards, ledgers, braces and planks in front of the visible side."""
+    """Build standards, ledgers, braces and planks in front of the visible side."""
     x = np.linspace(-size_m[0] / 2, 0.1 * size_m[0], 6)
     y = size_m[1] / 2 + np.array([0.06, 0.3])
     z = np.arange(0, floors + 1) * STOREY_M
@@ -107,7 +110,7 @@ def _scaffolding(size_m: np.ndarray, floors: int, tube: int, board: int) -> Mesh
 
 
 def _huts(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """Site offices in two storeys, with windows and doors."""
+    """Build two storeys of site offices with windows."""
     tints: tuple[Colour, ...] = ((0.75, 0.75, 0.72), (0.2, 0.32, 0.45), (0.62, 0.5, 0.2))
     wall = palette.add(painted_steel(rng, tints[int(rng.integers(3))], roughness=0.7))
     glass = palette.add(Material(texture="plain", tint=(0.06, 0.08, 0.1), roughness=0.15))
@@ -120,7 +123,7 @@ def _huts(rng: np.random.Generator, palette: Palette) -> Mesh:
 
 
 def _hoarding(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """Boards behind the site, slightly out of line."""
+    """Build a hoarding of slightly uneven boards behind the site."""
     wood = palette.add(
         Material(texture="wood", variant=int(rng.integers(8)), tint=(0.75, 0.72, 0.66), span_m=1.5)
     )
@@ -132,7 +135,7 @@ def _hoarding(rng: np.random.Generator, palette: Palette) -> Mesh:
 
 
 def _heaps(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """Heaps of sand and gravel."""
+    """Build heaps of sand."""
     sand = palette.add(
         Material(texture="soil", variant=int(rng.integers(8)), tint=(1.0, 0.9, 0.7), span_m=0.7, relief=0.6)
     )

@@ -17,24 +17,24 @@ from stereoweave.synth.world import Mesh
 COUNT = (15, 40)
 _SIZES_M = (0.05, 1.5)
 _NEAREST_M = 0.75
-# Size as a share of distance, so that things fill the picture at all depths.
+# Object size as a share of distance, so that objects look equally large at all depths.
 _SIZE_PER_DISTANCE = (0.05, 0.55)
 _TYPICAL_FOCAL_PX = 600
 _THIN_PX = (1.0, 6.0)
 _CANDIDATES = 24
-_CLEAR_M = 0.6  # between a camera and the nearest thing
+_CLEAR_M = 0.6  # least gap between a camera and an object
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClutterSpace:
-    """The space for clutter.
+    """Space that clutter fills.
 
     Attributes:
-        orbit: the viewpoints; things keep clear of all of them.
-        low_m, high_m: [3], corners of the box that things stay in; the floor is at low_m[2].
-        far_m: largest distance between cameras and things.
-        count: number of things, minimum and maximum.
-        standing: share of things that stand on the floor.
+        orbit: the viewpoints; objects keep clear of all of them.
+        low_m, high_m: [3], corners of the box that contains the objects; the floor is at low_m[2].
+        far_m: largest distance between cameras and objects.
+        count: minimum and maximum number of objects.
+        standing: share of objects that stand on the floor.
     """
 
     orbit: Orbit
@@ -45,7 +45,7 @@ class ClutterSpace:
     standing: float = 0.4
 
     def eyes_m(self) -> Float[np.ndarray, "n 3"]:
-        """Sampled camera positions all over the orbit."""
+        """Return camera positions [N, 3] sampled all over the orbit."""
         orbit = self.orbit
         ranges = (orbit.distance_m, orbit.azimuth_deg, orbit.elevation_deg)
         grids = np.meshgrid(*(np.linspace(start, end, 3) for start, end in ranges))
@@ -60,7 +60,14 @@ class ClutterSpace:
 
 @dataclass(frozen=True, kw_only=True)
 class _Placement:
-    """Position and size of a thing; distance_m is from the nearest camera."""
+    """Position and size of an object.
+
+    Attributes:
+        middle_m: [3], centre of the object.
+        distance_m: distance from the nearest camera.
+        size_m: longest side of the object.
+        standing: whether the object stands on the floor.
+    """
 
     middle_m: Float[np.ndarray, "3"]
     distance_m: float
@@ -69,7 +76,7 @@ class _Placement:
 
 
 def clutter(rng: np.random.Generator, palette: Palette, space: ClutterSpace) -> list[Mesh]:
-    """Draw things of 5 cm to 1.5 m; in half of the draws many of them are 1 to 6 px thin."""
+    """Draw objects of 5 cm to 1.5 m; in half of the draws, many of them are only 1 to 6 px thick."""
     count = int(rng.integers(space.count[0], space.count[1] + 1))
     thin_share = rng.uniform(0.25, 0.5) if rng.random() < 0.5 else 0.0
     bars_px = _log_uniform(rng, *_THIN_PX, (count,))
@@ -88,17 +95,17 @@ def _log_uniform(rng: np.random.Generator, low: float, high: float, shape: tuple
 
 
 def _draw_kind(rng: np.random.Generator, thin_share: float) -> PropBuilder:
-    """Draw a kind of thing; thin_share is the probability of a thin one."""
+    """Draw a kind of object, which is thin with probability `thin_share`."""
     others = SOLIDS if rng.random() < 0.65 else FURNITURE
     kinds = THIN if rng.random() < thin_share else others
     return kinds[rng.integers(len(kinds))]
 
 
 def _draw_placements(rng: np.random.Generator, space: ClutterSpace, count: int) -> list[_Placement]:
-    """Place things in order of decreasing apparent size, while there is room.
+    """Place objects in order of decreasing apparent size.
 
-    Each takes the best of several candidates: clearance from all cameras is required, from other things only
-    preferred.
+    Each object takes the best of several candidate positions. Clearance from all cameras comes before
+    clearance from other objects, and objects too close to a camera are shrunk.
     """
     eyes_m = space.eyes_m()
     shape = (count, _CANDIDATES)
@@ -135,12 +142,12 @@ def _points_in_view(
     eyes_m: Float[np.ndarray, "n k 3"],
     depths_m: Float[np.ndarray, "n k"],
 ) -> Float[np.ndarray, "n k 3"]:
-    """Draw points in the field of view of cameras that look at the orbit's centre."""
+    """Draw points [N, K, 3] in the field of view of cameras that look at the orbit's centre."""
     forward = np.array(space.orbit.centre_m) - eyes_m
     forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
     right = np.cross(forward, [0, 0, 1])
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    # Focal lengths are drawn later, so points spread from the narrowest to the widest field of view.
+    # Focal lengths are drawn later, so the points cover narrow and wide fields of view alike.
     reach = rng.uniform(0.25, 0.6, depths_m.shape)
     x, y = reach * rng.uniform(-1, 1, depths_m.shape), 0.75 * reach * rng.uniform(-1, 1, depths_m.shape)
     seen = forward + x[..., None] * right + y[..., None] * np.cross(right, forward)
@@ -148,7 +155,7 @@ def _points_in_view(
 
 
 def _place_mesh(rng: np.random.Generator, mesh: Mesh, place: _Placement, floor_m: float) -> Mesh:
-    """Rotate and scale a mesh with its texture, and put it at its position or on the floor below."""
+    """Rotate and scale a mesh and its texture, then move it to its position or onto the floor below."""
     low, high = mesh.corners_m.min((0, 1)), mesh.corners_m.max((0, 1))
     scale = place.size_m / float((high - low).max())
     axis = np.array([0, 0, 1]) if place.standing else rng.normal(size=3)

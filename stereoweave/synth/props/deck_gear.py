@@ -1,6 +1,6 @@
-"""Deck gear of ships: winches, nets, derricks, containers, boats, rafts, vents, flags. Bow at +x.
+"""Deck gear of ships, such as winches, nets, derricks, containers and boats. The bow is at +x.
 
-Each stands on deck at `at_m`.
+`at_m` is the position of the gear on deck.
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ from stereoweave.synth.world import Mesh, join_meshes
 
 
 def winch(at_m: Point, width_m: float, materials: ShipMaterials, load: int) -> Mesh:
-    """A transverse drum, full of rope or net, between cheeks on a bed."""
+    """Build a transverse drum, full of rope or net, between cheeks on a bed."""
     half = width_m / 2
     turns = np.linspace(-0.82 * half, 0.82 * half, 24)
     bulge = 0.19 + 0.05 * np.cos(turns / half * 1.4) + 0.012 * np.sin(np.arange(24) * 2.1)
@@ -43,7 +43,7 @@ def winch(at_m: Point, width_m: float, materials: ShipMaterials, load: int) -> M
 
 
 def gantry(at_m: Point, width_m: float, height_m: float, materials: ShipMaterials) -> Mesh:
-    """A portal over the stern, leaning aft, with hanging blocks."""
+    """Build a portal that stands over the stern, leans aft and carries hanging blocks."""
     half, lean = width_m / 2, -0.25 * height_m
     frame = [(0, -half, 0), (lean, -0.85 * half, height_m), (lean, 0.85 * half, height_m), (0, half, 0)]
     portal = polyline_tubes(frame, 0.06, materials.trim, sides=12)
@@ -63,7 +63,7 @@ def gantry(at_m: Point, width_m: float, height_m: float, materials: ShipMaterial
 
 
 def derrick(foot_m: Point, tip_m: Point, top_m: Point, materials: ShipMaterials) -> Mesh:
-    """A boom from foot to tip, held by wires from top_m, with a hook."""
+    """Build a boom with a hook from foot to tip, held by wires from top_m."""
     middle = (foot_m + tip_m) / 2
     boom = tubes(
         [foot_m, middle], [middle, tip_m], np.array([[0.03, 0.05], [0.05, 0.025]]), materials.trim, sides=12
@@ -93,7 +93,10 @@ def derrick(foot_m: Point, tip_m: Point, top_m: Point, materials: ShipMaterials)
 def nets(
     rng: np.random.Generator, at_m: Point, size_m: tuple[float, float], materials: ShipMaterials
 ) -> Mesh:
-    """A heap of nets with floats; size_m: along and across the ship."""
+    """Build a heap of nets with floats.
+
+    size_m: length along the ship and width across it.
+    """
     x, y = np.meshgrid(np.linspace(-1, 1, 22), np.linspace(-1, 1, 20))
     mound = np.clip(1 - x**4, 0, 1) * np.clip(1 - y**4, 0, 1)
     rough = sum(
@@ -110,7 +113,10 @@ def nets(
 
 
 def containers(at_m: Points, colours: tuple[int, ...]) -> Mesh:
-    """Ribbed containers [N] of 1.5 m in alternating colours; at_m is the centre of each floor."""
+    """Build ribbed containers [N], 1.5 m long, in alternating colours.
+
+    at_m: centre of each container's floor.
+    """
     ribs = np.linspace(-0.68, 0.68, 18)
     meshes = []
     for k, material in enumerate(colours):
@@ -131,7 +137,7 @@ def containers(at_m: Points, colours: tuple[int, ...]) -> Mesh:
 
 
 def hatches(x_m: tuple[float, float], width_m: float, z_m: float, materials: ShipMaterials) -> Mesh:
-    """A hatch coaming with ribbed covers."""
+    """Build a hatch coaming with ribbed covers."""
     length, middle = x_m[1] - x_m[0], sum(x_m) / 2
     coaming = boxes((middle, 0, z_m + 0.1), (length, width_m, 0.3), materials.trim)
     count = max(int(length / 0.55), 2)
@@ -143,7 +149,7 @@ def hatches(x_m: tuple[float, float], width_m: float, z_m: float, materials: Shi
 
 
 def boat(at_m: Point, length_m: float, materials: ShipMaterials) -> Mesh:
-    """An inflatable boat on a cradle, bow forward."""
+    """Build an inflatable boat on a cradle, with its bow forward."""
     half, wide = length_m / 2, 0.2 * length_m
     share = np.linspace(-1, 1, 31)
     x = half * (1 - 1.75 * np.abs(share) ** 2.2)
@@ -169,7 +175,7 @@ def boat(at_m: Point, length_m: float, materials: ShipMaterials) -> Mesh:
 
 
 def rafts(at_m: Points, materials: ShipMaterials) -> Mesh:
-    """Life rafts [N] in white canisters on cradles, along the ship."""
+    """Build life rafts [N] in white canisters that lie lengthwise on cradles."""
     barrel = [(0, -0.27), (0.1, -0.26), (0.14, -0.22), (0.145, 0.0), (0.14, 0.22), (0.1, 0.26), (0, 0.27)]
     bands = [lathe([(0.147, z), (0.147, z + 0.025)], materials.dark, 20) for z in (-0.15, -0.01, 0.12)]
     lying = (
@@ -182,13 +188,13 @@ def rafts(at_m: Points, materials: ShipMaterials) -> Mesh:
 
 
 def vents(at_m: Points, materials: ShipMaterials) -> Mesh:
-    """Mushroom-shaped vents [N]."""
+    """Build mushroom-shaped vents [N]."""
     profile = [(0.06, 0), (0.06, 0.24), (0.11, 0.23), (0.12, 0.28), (0.08, 0.33), (0, 0.345)]
     return copies(lathe(profile, materials.white, 14), np.stack([translation(*spot) for spot in at_m]))
 
 
 def bitts(at_m: Points, materials: ShipMaterials) -> Mesh:
-    """Pairs of posts [N] along the ship, with a belayed rope on each."""
+    """Build bitts [N], each a pair of posts in line with the ship, with a rope belayed around them."""
     post = [(0.045, 0), (0.045, 0.17), (0.06, 0.18), (0.06, 0.21), (0, 0.22)]
     pair = [lathe(post, materials.dark, 12).translate(x=x) for x in (-0.1, 0.1)]
     angle = np.linspace(0, 6 * np.pi, 49)
@@ -198,7 +204,7 @@ def bitts(at_m: Points, materials: ShipMaterials) -> Mesh:
 
 
 def coil(at_m: Point, materials: ShipMaterials) -> Mesh:
-    """A coil of rope."""
+    """Build a coil of rope."""
     angle = np.linspace(0, 12 * np.pi, 110)
     radius = 0.2 - 0.05 * (angle / (12 * np.pi)) + 0.03 * np.sin(angle * 0.51)
     path = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.02 + angle * 0.0035], -1)
@@ -208,7 +214,7 @@ def coil(at_m: Point, materials: ShipMaterials) -> Mesh:
 def flag(
     rng: np.random.Generator, foot_m: Point, height_m: float, materials: ShipMaterials, cloth: int
 ) -> Mesh:
-    """A flag blowing aft from a staff."""
+    """Build a staff with a flag that blows aft."""
     top = foot_m + [-0.1, 0, height_m]
     staff = tubes(foot_m, top, 0.011, materials.white)
     x, z = np.meshgrid(np.linspace(0, 0.5, 20), np.linspace(-0.3, 0, 8))
@@ -218,7 +224,7 @@ def flag(
 
 
 def anchor(at_m: Point, side: float, materials: ShipMaterials) -> Mesh:
-    """An anchor at the bow, its shank in the hawsepipe."""
+    """Build an anchor at the bow, with its shank in the hawsepipe."""
     out = np.array([0.1, side, 0])
     shank = tubes(at_m + 0.03 * out, at_m + 0.05 * out + [0, 0, -0.26], 0.022, materials.dark, 8)
     crown = at_m + 0.06 * out + [0, 0, -0.27]

@@ -1,4 +1,4 @@
-"""Superstructures: deckhouses with windows, funnels, masts, lifebuoys, fenders. Bow at +x."""
+"""Superstructures of ships: deckhouses, funnels, masts, lifebuoys and fenders. The bow is at +x."""
 
 from dataclasses import dataclass, replace
 
@@ -22,7 +22,7 @@ from stereoweave.synth.world import Mesh, join_meshes
 
 Quads = Float[np.ndarray, "n 4 3"]
 
-# Offsets from the wall, far enough apart to keep their depth order at any distance.
+# Offsets from the wall, large enough to keep wall, frame and glass in depth order at any distance.
 _FRAME_M, _GLASS_M = 0.006, 0.012
 
 
@@ -31,12 +31,12 @@ class ShipMaterials:
     """Materials of a ship.
 
     Attributes:
-        house: walls of the houses.
+        house: walls of the deckhouses.
         roof: roofs and decks.
-        trim: second colour, for funnels, cranes and rails.
-        white: light paint of masts and rails.
-        dark: black paint, rubber.
-        glass: panes.
+        trim: second colour, for funnels, cranes and doors.
+        white: light paint of masts and canisters.
+        dark: black paint and rubber.
+        glass: window panes.
         steel: bare or galvanised metal.
         orange: lifesaving gear.
         rope: ropes and nets.
@@ -55,13 +55,13 @@ class ShipMaterials:
 
 @dataclass(frozen=True, kw_only=True)
 class House:
-    """A block with sloping walls on a deck.
+    """Block with sloping walls on a deck.
 
     Attributes:
-        x_m: after and forward end at the foot.
-        width_m: at the foot.
-        z_m: foot and top.
-        lean_m: inward lean of the after, forward and side walls at the top; negative leans outwards.
+        x_m: aft and forward ends of the foot.
+        width_m: width of the foot.
+        z_m: heights of foot and top.
+        lean_m: inward lean of the aft, forward and side walls at the top; negative values lean outwards.
     """
 
     x_m: tuple[float, float]
@@ -70,7 +70,10 @@ class House:
     lean_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def corners_m(self, spare_m: float = 0.0) -> tuple[Points, Points]:
-        """Corners of foot and top: after starboard, forward starboard, forward port, after port."""
+        """Return the corners of foot and top, each [4, 3] and moved outwards by spare_m.
+
+        Their order is aft starboard, forward starboard, forward port, aft port.
+        """
         aft, forward, side = self.lean_m
         half = self.width_m / 2 + spare_m
         low = [(self.x_m[0] - spare_m, -half), (self.x_m[1] + spare_m, -half)]
@@ -82,18 +85,21 @@ class House:
         return foot, top
 
     def walls_m(self) -> Quads:
-        """Starboard, forward, port and after wall, each from its lower left corner, seen from outside."""
+        """Return the starboard, forward, port and aft walls.
+
+        Each wall starts at its lower left corner, as seen from outside.
+        """
         foot, top = self.corners_m()
         return np.stack([foot, np.roll(foot, -1, 0), np.roll(top, -1, 0), top], 1)
 
     def mesh(self, walls: int, roof: int, eaves_m: float = 0.05) -> Mesh:
-        """Walls and an overhanging roof."""
+        """Build the walls and an overhanging roof."""
         _, top = self.corners_m(eaves_m)
         return join_meshes([_quads(self.walls_m(), walls), slab(top, top + [0, 0, 0.05], roof)])
 
 
 def slab(low_m: Points, high_m: Points, material: int) -> Mesh:
-    """Solid between two quads, both counter-clockwise seen from above."""
+    """Build a solid between two quads, both counter-clockwise when seen from above."""
     sides = np.stack([low_m, np.roll(low_m, -1, 0), np.roll(high_m, -1, 0), high_m], 1)
     return _quads(np.concatenate([sides, high_m[None], low_m[None, ::-1]]), material)
 
@@ -105,7 +111,10 @@ def windows(
     materials: ShipMaterials,
     gap: float = 0.25,
 ) -> Mesh:
-    """A row of framed panes on a wall; band: lower and upper edge as shares of its height."""
+    """Build a row of framed panes on a wall.
+
+    band: lower and upper edge of the panes as shares of the wall's height.
+    """
     edges = np.linspace(0.06, 0.94, count + 1)
     half = gap / 2 * (edges[1] - edges[0])
     left, right = edges[:-1] + half, edges[1:] - half
@@ -119,7 +128,7 @@ def windows(
 
 
 def door(wall_m: Float[np.ndarray, "4 3"], at: float, materials: ShipMaterials) -> Mesh:
-    """A door with a small window; `at` is its position as a share of the wall's length."""
+    """Build a door with a small window; `at` is its position as a share of the wall's length."""
     length, height = (float(np.linalg.norm(wall_m[k] - wall_m[0])) for k in (1, 3))
     half = 0.3 * min(height, 1.0) / length
     leaf = _quads_on_wall(wall_m, (np.array([at - half]), np.array([at + half])), (0.06, 0.82), _FRAME_M)
@@ -130,7 +139,10 @@ def door(wall_m: Float[np.ndarray, "4 3"], at: float, materials: ShipMaterials) 
 
 
 def funnel(foot_m: Point, size_m: tuple[float, float, float], materials: ShipMaterials) -> Mesh:
-    """An oval funnel, leaning aft, with a band and a dark top; size_m: length, width, height."""
+    """Build an oval funnel that leans aft, with a band and a dark top.
+
+    size_m: length, width and height.
+    """
     length, width, height = size_m
     angle = np.linspace(0, 2 * np.pi, 28, endpoint=False)
     oval = np.stack([length / 2 * np.cos(angle), width / 2 * np.sin(angle), 0 * angle], -1)
@@ -152,7 +164,7 @@ def funnel(foot_m: Point, size_m: tuple[float, float, float], materials: ShipMat
 
 
 def ship_mast(rng: np.random.Generator, foot_m: Point, height_m: float, materials: ShipMaterials) -> Mesh:
-    """A mast with crosstrees, radars, lights and aerials."""
+    """Build a mast with crosstrees, a radar, lights and aerials."""
     top = foot_m + [-0.06 * height_m, 0, height_m]
     pole = tubes(foot_m, top, np.array([[0.06, 0.03]]), materials.white, sides=14)
     legs = tubes(
@@ -177,7 +189,7 @@ def ship_mast(rng: np.random.Generator, foot_m: Point, height_m: float, material
 
 
 def _radar(rng: np.random.Generator, at_m: Point, materials: ShipMaterials) -> Mesh:
-    """A radar scanner on a pedestal, on a bracket in front of the mast."""
+    """Build a radar scanner on a pedestal, on a bracket in front of the mast."""
     spin = rotation((0, 0, 1), rng.uniform(0, 180))[None, :3, :3]
     bar = boxes(at_m + [0, 0, 0.14], (0.07, 0.75, 0.07), materials.white, spin)
     bracket = boxes(at_m + [-0.06, 0, -0.02], (0.24, 0.1, 0.03), materials.white)
@@ -187,12 +199,12 @@ def _radar(rng: np.random.Generator, at_m: Point, materials: ShipMaterials) -> M
 
 
 def stays(tops_m: Points, feet_m: Points, materials: ShipMaterials) -> Mesh:
-    """Wires between pairs of points."""
+    """Build wires between pairs of points."""
     return tubes(tops_m, feet_m, 0.006, materials.steel, sides=4)
 
 
 def lifebuoys(at_m: Points, outwards: Points, materials: ShipMaterials) -> Mesh:
-    """Lifebuoys of four orange and four white pieces, facing `outwards`."""
+    """Build lifebuoys of four orange and four white segments, facing `outwards`."""
     angle = np.linspace(0, 2 * np.pi, 9)
     ring = lathe(
         np.stack([0.15 + 0.04 * np.cos(angle), 0.04 * np.sin(angle)], -1), materials.orange, sections=24
@@ -204,7 +216,7 @@ def lifebuoys(at_m: Points, outwards: Points, materials: ShipMaterials) -> Mesh:
 
 
 def tyres(at_m: Points, along: Points, materials: ShipMaterials) -> Mesh:
-    """Car tyres flat against the hull; along: direction of the hull."""
+    """Build car tyres that lie flat against a hull; `along` is the direction of the hull."""
     angle = np.linspace(0, 2 * np.pi, 9)
     profile = np.stack([0.17 + 0.055 * np.cos(angle), 0.06 * np.sin(angle)], -1)
     tyre = lathe(profile, materials.dark, sections=18)
@@ -217,7 +229,7 @@ def _quads_on_wall(
     up: tuple[float, float],
     off_m: float,
 ) -> Quads:
-    """Quads on a wall between shares of its length and height, off_m in front of it."""
+    """Return quads that cover shares of a wall's length and height, off_m in front of the wall."""
     a, b, c, d = wall_m
     out = np.cross(b - a, d - a)
     out = off_m * out / np.linalg.norm(out)

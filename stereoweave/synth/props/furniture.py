@@ -1,4 +1,4 @@
-"""Random furniture and garden objects of about one metre."""
+"""Random furniture, plants and household objects of about one metre."""
 
 import numpy as np
 from jaxtyping import Float
@@ -18,7 +18,7 @@ from stereoweave.synth.world import Mesh, join_meshes
 
 
 def chair(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A chair of bars with a seat, and slats or a board as back."""
+    """Build a chair of bars with a seat and a back of slats or uprights."""
     width_m, seat_m = rng.uniform(0.4, 0.5), rng.uniform(0.42, 0.5)
     leg_m, half_m = rng.uniform(0.012, 0.025), width_m / 2
     feet = np.array([[x, y, 0.0] for y in (-half_m, half_m) for x in (-half_m, half_m)])
@@ -43,7 +43,7 @@ def chair(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def table(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A table, round on one foot or with four legs, with a bowl and cups on it."""
+    """Build a table with cups on it; the top is round on one foot, or rectangular on four legs."""
     height_m = rng.uniform(0.45, 0.75)
     if rng.random() < 0.4:
         rim = np.array([[0, 0.96], [0.5, 0.96], [0.5, 1.0], [0.0, 1.0]]) * [1, height_m]
@@ -61,7 +61,7 @@ def table(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def leaning_ladder(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A leaning ladder."""
+    """Build a leaning ladder."""
     count, width_m, lean_m = int(rng.integers(5, 11)), rng.uniform(0.12, 0.2), rng.uniform(0.0, 0.3)
     sides = np.array([[-width_m, 0, 0], [width_m, 0, 0]])
     share = (np.arange(count) + 0.5)[:, None] / count
@@ -71,7 +71,7 @@ def leaning_ladder(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def shelf(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Boards between two sides, full of books."""
+    """Build a bookcase with boards between two sides, full of books."""
     count, depth_m = int(rng.integers(2, 6)), rng.uniform(0.16, 0.28)
     levels = np.linspace(0.03, 1.0, count + 1)
     boards = boxes([[0, 0, z] for z in levels], [0.7, depth_m, 0.02], style.main)
@@ -84,7 +84,7 @@ def shelf(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def book_stack(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A skewed stack of books, with pages in another material."""
+    """Build a skewed stack of books, with pages in another material."""
     count = int(rng.integers(4, 14))
     thick_m = rng.uniform(0.03, 0.1, count)
     middles_m = np.cumsum(thick_m) - thick_m / 2
@@ -105,7 +105,7 @@ def book_stack(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def picture(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A picture in a frame of four bars."""
+    """Build a picture in a frame of four bars."""
     width_m, height_m, bar_m = rng.uniform(0.5, 1.0), rng.uniform(0.5, 1.0), rng.uniform(0.02, 0.06)
     x, z = np.array([-width_m, width_m]) / 2, np.array([-height_m, height_m]) / 2
     level = boxes([[0, 0, at] for at in z], [width_m + bar_m, 0.04, bar_m], style.main)
@@ -114,7 +114,7 @@ def picture(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def plant(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A pot with long bent leaves."""
+    """Build a potted plant with long bent leaves."""
     count, pot_m = int(rng.integers(20, 70)), rng.uniform(0.12, 0.2)
     pot = (
         np.array([[0, 0], [0.7, 0], [1, 1.4], [1.1, 1.4], [1.1, 1.6], [0.9, 1.6], [0.85, 1.3], [0, 1.3]])
@@ -135,7 +135,7 @@ def plant(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def bush(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Leaves on a ball around a stem."""
+    """Build a ball of leaves around a stem."""
     count = int(rng.integers(150, 400))
     directions = rng.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -149,7 +149,7 @@ def bush(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def bench(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A bench of slats."""
+    """Build a bench of slats."""
     count, y = int(rng.integers(3, 6)), np.linspace(-0.15, 0.15, 5)
     slats = boxes(
         [[0, at, 0.42] for at in np.linspace(-0.16, 0.16, count)], [1.0, 0.22 / count, 0.03], style.main
@@ -161,7 +161,7 @@ def bench(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def stool(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A round seat on three or four splayed legs, with a cushion or a ball on it."""
+    """Build a stool with three or four splayed legs, a round seat and a cushion."""
     legs, height_m = int(rng.integers(3, 5)), rng.uniform(0.5, 0.9)
     angle = np.arange(legs) * 2 * np.pi / legs
     out = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
@@ -181,7 +181,7 @@ def stool(rng: np.random.Generator, style: PropStyle) -> Mesh:
 def _standing_books(
     rng: np.random.Generator, style: PropStyle, width_m: float, height_m: float, depth_m: float
 ) -> Mesh:
-    """Books side by side on z = 0, in alternating materials."""
+    """Build books that stand side by side on z = 0, in alternating materials."""
     thick_m = rng.uniform(0.012, 0.05, 40)
     ends_m = np.cumsum(thick_m)
     used = ends_m < width_m * rng.uniform(0.6, 1)
@@ -196,7 +196,7 @@ def _standing_books(
 
 
 def _blade(rng: np.random.Generator, material: int) -> Mesh:
-    """A leaf from the origin that bends over towards x."""
+    """Build a leaf that rises from the origin and bends over towards x."""
     share = np.linspace(0, 1, 9)[:, None]
     bend = rng.uniform(0.6, 2.2) * share
     x, z = np.cumsum(np.sin(bend), 0) / 11, np.cumsum(np.cos(bend), 0) / 11
@@ -211,7 +211,7 @@ def _leaves(
     across: Float[np.ndarray, "n 3"],
     material: int,
 ) -> Mesh:
-    """Flat leaves, each a rhombus."""
+    """Build flat leaves, each a rhombus."""
     outwards = np.cross(along, across)
     outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
     ring = np.stack([centres_m - along, centres_m + across, centres_m + along, centres_m - across], 1)

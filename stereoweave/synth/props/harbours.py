@@ -1,4 +1,4 @@
-"""Surroundings of ships: a harbour's quay, or open sea with a coast."""
+"""Surroundings of ships: a harbour quay, or open sea with a coast."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ _BOLLARDS_M = np.array([-5.2, -1.0, 1.2, 6.0, -14.0, 14.0])
 
 
 def open_water(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """Sea with buoys, and a distant wooded coast with a few houses."""
+    """Build a sea with buoys and a distant ring of wooded hills."""
     pieces = [
         surroundings.sea(rng, palette),
         surroundings.hills(rng, palette, distance_m=rng.uniform(110, 170)),
@@ -24,7 +24,7 @@ def open_water(rng: np.random.Generator, palette: Palette) -> Mesh:
 
 
 def _buoys(rng: np.random.Generator, palette: Palette, spots: Points) -> Mesh:
-    """Red and green buoys, leaning in the current."""
+    """Build red and green buoys that lean in the current."""
     kinds = []
     for colour in ((0.5, 0.08, 0.06), (0.08, 0.3, 0.14)):
         paint = palette.add(painted_steel(rng, colour))
@@ -40,7 +40,7 @@ def _buoys(rng: np.random.Generator, palette: Palette, spots: Points) -> Mesh:
 
 
 def harbour(rng: np.random.Generator, palette: Palette, hull: Hull) -> Mesh:
-    """A quay along the ship's starboard side, with mooring ropes, goods and buildings."""
+    """Build a quay along the ship's starboard side, with mooring ropes, goods and buildings."""
     edge_m, top_m = -hull.beam_m / 2 - rng.uniform(0.3, 0.45), rng.uniform(0.7, 1.1)
     paving = palette.add(
         Material(
@@ -91,7 +91,7 @@ def harbour(rng: np.random.Generator, palette: Palette, hull: Hull) -> Mesh:
 
 
 def _moorings(hull: Hull, edge_m: float, top_m: float, rope: int) -> Mesh:
-    """Mooring ropes from bow and stern to the quay's bollards."""
+    """Build mooring ropes from the bow and stern to the bollards on the quay."""
     share = np.array([0.08, 0.12, 0.85, 0.9])
     starts = hull.side_m(share, hull.edge_m(share) - 0.05, -1)
     x = _BOLLARDS_M[[0, 1, 2, 3]]
@@ -100,7 +100,7 @@ def _moorings(hull: Hull, edge_m: float, top_m: float, rope: int) -> Mesh:
 
 
 def _on_quay(rng: np.random.Generator, palette: Palette, edge_m: float) -> Mesh:
-    """Bollards, stacked goods, lamp posts, warehouses, trees and hills."""
+    """Build bollards, stacked goods, lamp posts, warehouses, trees and hills."""
     beside = np.stack([_BOLLARDS_M, np.full(6, edge_m - 0.7), np.zeros(6)], -1)
     spots = np.stack([rng.uniform(-12, 12, 36), edge_m - rng.uniform(1.8, 8, 36), np.zeros(36)], -1)
     kinds = (surroundings.crates, surroundings.barrels, surroundings.pallets, surroundings.cones)

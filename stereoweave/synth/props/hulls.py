@@ -1,4 +1,4 @@
-"""Hulls of ships: painted skin, deck, and points on both for fittings."""
+"""Ship hulls with painted skin and deck, and points on both for fittings."""
 
 from dataclasses import dataclass, replace
 
@@ -13,14 +13,14 @@ Values = float | np.ndarray
 
 @dataclass(frozen=True, kw_only=True)
 class Hull:
-    """A hull with its bow at +x and its waterline at z = 0.
+    """Hull with its bow at +x and its waterline at z = 0.
 
     Attributes:
-        length_m: at the waterline, from -length_m / 2 to length_m / 2.
+        length_m: length at the waterline, which reaches from -length_m / 2 to length_m / 2.
         beam_m: greatest breadth of the deck.
         draft_m: depth of the keel.
         freeboard_m: height of the bulwark's edge amidships.
-        sheer_m: additional height of that edge at the stern and at the bow.
+        sheer_m: additional height of the bulwark's edge at the stern and at the bow.
         stern: breadth of the transom as a share of the beam.
         rise: rise of the keel at the stern as a share of the draft.
         rise_to: share of the length over which the keel rises.
@@ -40,34 +40,37 @@ class Hull:
     bulwark_m: float = 0.25
 
     def edge_m(self, share: Values) -> Values:
-        """Height of the bulwark's edge at a share of the length, 0 at the stern to 1 at the bow."""
+        """Return the height of the bulwark's edge at a share of the length, from 0 (stern) to 1 (bow)."""
         aft, forward = np.clip((0.4 - share) / 0.4, 0, 1), np.clip((share - 0.4) / 0.6, 0, 1)
         return self.freeboard_m + self.sheer_m[0] * aft**2 + self.sheer_m[1] * forward**2
 
     def deck_m(self, x: float) -> float:
-        """Height of the deck at x."""
+        """Return the height of the deck at x."""
         return float(self.edge_m(x / self.length_m + 0.5)) - self.bulwark_m
 
     def keel_m(self, share: Values) -> Values:
-        """Height of the keel, negative."""
+        """Return the height of the keel, which is negative, at a share of the length."""
         aft = np.clip(1.35 - 1.35 * share / self.rise_to, 0, 1)
         return -self.draft_m * (1 - self.rise * aft * aft * (3 - 2 * aft))
 
     def side_m(self, share: Values, z: Values, side: Values) -> Float[np.ndarray, "... 3"]:
-        """Points on the skin at a share of the length and a height; side: 1 is port (+y), -1 starboard."""
+        """Return points on the skin at a share of the length and a height.
+
+        side: 1 for port (+y), -1 for starboard.
+        """
         share, z, side = np.broadcast_arrays(share, z, side)
         keel = self.keel_m(share)
         level = np.clip((z - keel) / (self.edge_m(share) - keel), 0, 1.2)
         aft, forward = np.clip((0.4 - share) / 0.4, 0, 1), np.clip((share - 0.45) / 0.55, 0, 1)
         plan = (1 - (1 - self.stern) * aft**2) * np.maximum(1 - forward**2.4, 0) ** 0.8
-        # U-shaped amidships, V-shaped with flare at the bow.
+        # Sections are U-shaped amidships, and V-shaped with flare at the bow.
         y = (self.beam_m / 2 * plan) * level ** (0.2 + 0.25 * aft + 0.75 * forward**1.5) + 0.02
         x = self.length_m * (share - 0.5) + self.rake_m * level**1.3 * forward**2
         x = x - 0.35 * self.rake_m * level * aft**3
         return np.stack([x, side * y, z], -1)
 
     def skin(self, bottom: int, stripe: int, topside: int, stripe_m: float = 0.12) -> Mesh:
-        """The outside, with a stripe of paint above the waterline, and the transom."""
+        """Build the outside of the hull, with a stripe of paint above the waterline, and the transom."""
         share, dry = self._topside(stripe_m)
         wet = self.keel_m(share) * (1 - np.linspace(0, 1, 10) ** 3)
         z = np.concatenate([wet, dry], 1)
@@ -81,7 +84,7 @@ class Hull:
         return join_meshes([replace(skin, material=material.astype(np.int32)), self._transom(z[0], paint)])
 
     def deck(self, planks: int, inside: int, rail: int) -> Mesh:
-        """The deck, the bulwark's inside and the rail on its edge."""
+        """Build the deck, the inside of the bulwark and the rail on its edge."""
         share = np.linspace(0, 0.985, 41)
         edge = self.edge_m(share)
         port, starboard = (self.side_m(share, edge - self.bulwark_m, side) for side in (1, -1))
@@ -97,18 +100,25 @@ class Hull:
         return join_meshes([floor, *walls, *rails])
 
     def patch(self, stations: tuple[int, int], levels: tuple[int, int], side: int, material: int) -> Mesh:
-        """A plate on the skin, over ranges of its 60 cells along and 7 cells above the stripe."""
+        """Build a plate on the skin above the stripe.
+
+        The skin has 60 cells along the hull and 7 upwards there; `stations` and `levels` are ranges of them.
+        """
         share, z = self._topside(0.12)
         cells = np.s_[stations[0] : stations[1] + 1, levels[0] : levels[1] + 1]
         points = self.side_m(np.broadcast_to(share, z.shape)[cells], z[cells], side)
-        # On the skin's own triangles, so that it never sinks below them.
+        # The plate uses the skin's own vertices, so it never sinks below the skin.
         plate = sheet(points[:, ::side], material)
         uv = side * np.stack([-plate.uv_m[..., 1], plate.uv_m[..., 0]], -1)
         outside = plate.corners_m + np.float32(0.012) * plate.normals
         return replace(plate, corners_m=outside, uv_m=uv - uv.min((0, 1)))
 
     def _topside(self, stripe_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """Shares of the length [61, 1], and heights [61, 8] from the stripe's edge to the bulwark's."""
+        """Return the grid of the skin above the stripe.
+
+        It consists of shares of the length [61, 1], and of heights [61, 8] from the stripe to the bulwark's
+        edge.
+        """
         share = np.linspace(0, 1, 61)[:, None]
         return share, stripe_m + (self.edge_m(share) - stripe_m) * np.linspace(0, 1, 8)
 

@@ -33,9 +33,9 @@ def shell(
     open_roof: bool,
     open_side: int | None,
 ) -> Mesh:
-    """Floor at z = 0, up to four walls with objects on them, and a ceiling, around the z axis.
+    """Build a room around the z axis, with its floor at z = 0 and objects on its walls.
 
-    open_side: the missing wall, counted counter-clockwise from the one at the largest x.
+    open_side: the missing wall, counted counter-clockwise from the wall at the largest x.
     """
     x, y, height_m = (float(v) for v in size_m)
     distance_m = 0.6 * max(x, y)
@@ -61,7 +61,7 @@ def shell(
 def pendants(
     rng: np.random.Generator, palette: Palette, spots_m: Float[np.ndarray, "n 3"], ceiling_m: float
 ) -> Mesh:
-    """Lampshades with glowing bulbs at the spots, on cords from the ceiling."""
+    """Build lampshades with glowing bulbs at the spots, on cords from the ceiling."""
     shade = palette.add(Material(texture="plain", tint=draw_muted_colour(rng, 0.4), roughness=0.5))
     bulb = palette.add(Material(texture="plain", tint=(1.0, 0.95, 0.85), glow=4.0))
     wide_m, high_m = rng.uniform(0.1, 0.25), rng.uniform(0.1, 0.25)
@@ -72,7 +72,7 @@ def pendants(
 
 
 def draw_lamps(rng: np.random.Generator, spots_m: Float[np.ndarray, "n 3"]) -> tuple[Lamp, ...]:
-    """Draw a room's lamps, warm or cold; one of them is often the strongest."""
+    """Draw a room's lamps, which share one warm or cold colour and differ in strength."""
     warm = rng.uniform(0, 1)
     colour = np.array([1.0, 0.95 - 0.2 * warm, 0.92 - 0.5 * warm])
     strengths = np.exp(rng.normal(0, 0.6, len(spots_m)))
@@ -86,7 +86,7 @@ def draw_lamps(rng: np.random.Generator, spots_m: Float[np.ndarray, "n 3"]) -> t
 def draw_lamp_spots(
     rng: np.random.Generator, size_m: Float[np.ndarray, "3"], eyes_m: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Draw positions of one to four lamps in a room's upper part, away from the cameras."""
+    """Draw positions of one to four lamps in the upper part of a room, away from the cameras."""
     low_m, high_m = size_m * [-0.4, -0.4, 0.68], size_m * [0.4, 0.4, 0.85]
     spots_m = rng.uniform(low_m, high_m, (40, 3))
     clear_m = np.linalg.norm(spots_m[:, None] - eyes_m, axis=2).min(1)
@@ -94,7 +94,7 @@ def draw_lamp_spots(
 
 
 def indoor_light(rng: np.random.Generator, sky: Sky, lamps: Sequence[Lamp]) -> tuple[Sky, float]:
-    """Ambient light of a room, as a sky without sun, and the exposure."""
+    """Draw a room's ambient light, as a sky without sun, and the exposure of its images."""
     ambient = rng.uniform(0.15, 0.6)
     warm = np.array([1.0, 0.95, 0.87])
 
@@ -114,7 +114,10 @@ def indoor_light(rng: np.random.Generator, sky: Sky, lamps: Sequence[Lamp]) -> t
 
 
 def _panel(rng: np.random.Generator, origin: Corner, along: Corner, up: Corner, material: int) -> Mesh:
-    """A slightly uneven surface facing along x up; it overlaps its corners to close them."""
+    """Build a slightly uneven surface whose normal is `along` x `up`.
+
+    It extends slightly beyond its corners, so that adjacent surfaces leave no gap.
+    """
     share = np.linspace(-0.01, 1.01, 29)
     u, v = np.meshgrid(share, share)
     normal = np.cross(along, up) / np.linalg.norm(np.cross(along, up))
@@ -126,7 +129,7 @@ def _panel(rng: np.random.Generator, origin: Corner, along: Corner, up: Corner, 
 
 
 def _wall_pose(side: int, away_m: float) -> Float[np.ndarray, "4 4"]:
-    """Pose of a wall: from x along it, y into the room and z up to the room's coordinates."""
+    """Return a wall's pose in the room; the wall's x runs along it, y into the room and z up."""
     angle = side * np.pi / 2
     inwards = -np.array([np.cos(angle), np.sin(angle), 0])
     pose = np.eye(4)
@@ -138,7 +141,7 @@ def _wall_pose(side: int, away_m: float) -> Float[np.ndarray, "4 4"]:
 def _hang_on_wall(
     rng: np.random.Generator, palette: Palette, length_m: float, height_m: float, trim: int
 ) -> list[Mesh]:
-    """Objects on one wall, each in its own section."""
+    """Build objects on one wall, each in its own section."""
     count = int(rng.integers(1, min(int(length_m / 1.4), 3) + 1))
     stretch_m = length_m / count
     kinds: list[Hanging] = [_window, _door, _poster, _shelves, _radiator, _curtain]
@@ -151,7 +154,7 @@ def _hang_on_wall(
 
 
 def _frame(width_m: float, low_m: float, high_m: float, bar_m: float, trim: int) -> Mesh:
-    """Four bars around an opening."""
+    """Build four bars around an opening."""
     middle_m, tall_m = (low_m + high_m) / 2, high_m - low_m
     level = boxes([[0, 0.02, z] for z in (low_m, high_m)], [width_m + bar_m, 0.08, bar_m], trim)
     upright = boxes(
@@ -161,7 +164,7 @@ def _frame(width_m: float, low_m: float, high_m: float, bar_m: float, trim: int)
 
 
 def _window(rng: np.random.Generator, palette: Palette, width_m: float, height_m: float, trim: int) -> Mesh:
-    """A window with daylight behind its panes, glazing bars, a sill."""
+    """Build a window with daylight behind its panes, glazing bars and a sill."""
     low_m, high_m = 0.85, min(height_m - 0.25, 2.2)
     outside = Material(
         texture=str(rng.choice(["photograph", "sky", "leaves"])),
@@ -184,7 +187,7 @@ def _window(rng: np.random.Generator, palette: Palette, width_m: float, height_m
 
 
 def _door(rng: np.random.Generator, palette: Palette, width_m: float, height_m: float, trim: int) -> Mesh:
-    """A panelled door with a handle."""
+    """Build a panelled door with a handle."""
     width_m, high_m = min(width_m, 0.95), min(height_m - 0.15, 2.05)
     leaf = palette.add(draw_material_from(rng, ("wood", "paint", "plain"), 4.0))
     panels = boxes([[0, 0.04, z * high_m] for z in (0.27, 0.72)], [0.7 * width_m, 0.03, 0.36 * high_m], leaf)
@@ -200,7 +203,7 @@ def _door(rng: np.random.Generator, palette: Palette, width_m: float, height_m: 
 
 
 def _poster(rng: np.random.Generator, palette: Palette, width_m: float, height_m: float, trim: int) -> Mesh:
-    """A poster or a framed picture at eye level."""
+    """Build a framed poster or picture at eye level."""
     width_m, tall_m = width_m * rng.uniform(0.4, 0.9), rng.uniform(0.4, 1.2)
     low_m = min(1.55, 0.55 * height_m) - tall_m / 2
     face = palette.add(draw_material_from(rng, ("photograph", "photograph", "sign", "cloth"), tall_m * 3))
@@ -209,14 +212,14 @@ def _poster(rng: np.random.Generator, palette: Palette, width_m: float, height_m
 
 
 def _shelves(rng: np.random.Generator, palette: Palette, width_m: float, height_m: float, trim: int) -> Mesh:
-    """A bookcase at the wall."""
+    """Build a bookcase against the wall."""
     skin = PropStyle(main=trim, other=palette.add(draw_material(rng, 4.0)), bar_m=0.01)
     pose = np.diag([width_m / 0.75, 1.2, min(0.8 * height_m, rng.uniform(0.8, 2.2)), 1.0])
     return shelf(rng, skin).transform(pose).translate(y=0.2)
 
 
 def _radiator(rng: np.random.Generator, palette: Palette, width_m: float, height_m: float, trim: int) -> Mesh:
-    """Vertical ribs between two pipes."""
+    """Build a radiator of vertical ribs between two pipes."""
     x = np.linspace(-0.45, 0.45, int(rng.integers(8, 24))) * width_m
     ribs = tubes(
         [[at, 0.09, 0.16] for at in x], [[at, 0.09, 0.75] for at in x], 0.35 * (x[1] - x[0]), trim, 10
@@ -228,7 +231,7 @@ def _radiator(rng: np.random.Generator, palette: Palette, width_m: float, height
 
 
 def _curtain(rng: np.random.Generator, palette: Palette, width_m: float, height_m: float, trim: int) -> Mesh:
-    """Folded cloth on a rod."""
+    """Build a folded curtain on a rod."""
     cloth = palette.add(draw_material_from(rng, ("cloth", "plain", "photograph"), 4.0))
     high_m = min(height_m - 0.1, 2.4)
     x, z = np.meshgrid(np.linspace(-0.5, 0.5, 60) * width_m, np.linspace(0.05, high_m, 14))

@@ -1,7 +1,7 @@
-"""Lattice structures: masts, jibs, cables, ladders, railings, insulator strings.
+"""Lattice structures and related parts: masts, cables, ladders, railings, insulator strings.
 
 A lattice is built as segments from joint to joint, so that its members meet exactly, and converted to tubes
-at the end. Metres; z is up.
+at the end. Lengths are in metres, and z is up.
 """
 
 from collections.abc import Sequence
@@ -20,12 +20,12 @@ Bracing = Literal["cross", "zigzag", "single"]
 
 @dataclass(frozen=True, kw_only=True)
 class Truss:
-    """The members of a lattice, segments from joint to joint in metres.
+    """Members of a lattice, as segments [N, 2, 3] from joint to joint in metres.
 
     Attributes:
-        legs: along the lattice, [N, 2, 3].
-        struts: around each ring of joints.
-        braces: diagonals within its faces.
+        legs: members along the lattice.
+        struts: members around each ring of joints.
+        braces: diagonals within the faces.
     """
 
     legs: Segments
@@ -33,7 +33,7 @@ class Truss:
     braces: Segments
 
     def mesh(self, leg_radius_m: float, brace_radius_m: float, material: int, sides: int = 5) -> Mesh:
-        """The members as round bars."""
+        """Build the members as round bars."""
         others = np.concatenate([self.struts, self.braces])
         return join_meshes(
             [
@@ -49,7 +49,10 @@ class Truss:
         materials: Sequence[int],
         bands_m: tuple[float, float],
     ) -> Mesh:
-        """The members as round bars, painted in bands by their midpoints; bands_m: band length in x and z."""
+        """Build the members as round bars, painted in bands by their midpoints.
+
+        bands_m: length of a band in x and in z.
+        """
         return join_meshes(
             self._within(band, len(materials), bands_m).mesh(leg_radius_m, brace_radius_m, material)
             for band, material in enumerate(materials)
@@ -65,14 +68,14 @@ class Truss:
 def mast_levels(
     stations_m: Sequence[float], widths_m: Sequence[float], ratio: float
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Heights of a tapering mast's joints, and its widths there.
+    """Return the heights of a tapering mast's joints and its widths at those heights.
 
-    Every station is a joint; the panels between are about `ratio` times as high as wide.
+    Every station is a joint; the panels between stations are about `ratio` times as high as they are wide.
     """
     heights = [np.array(stations_m[:1], float)]
     for low, high, width, top in zip(stations_m, stations_m[1:], widths_m, widths_m[1:], strict=False):
         count = max(round((high - low) / (ratio * np.sqrt(width * top))), 1)
-        # Panels of constant proportions shrink by a constant factor.
+        # Panels of equal proportions shrink by a constant factor.
         sizes = (top / width) ** (np.arange(count) / count)
         heights.append(low + (high - low) * np.cumsum(sizes) / sizes.sum())
     joints = np.concatenate(heights)
@@ -82,9 +85,9 @@ def mast_levels(
 def mast_rings(
     heights_m: Float[np.ndarray, " k"], widths_m: float | Float[np.ndarray, " k"], corners: int = 4
 ) -> Float[np.ndarray, "k m 3"]:
-    """Joints of an upright mast: a square along x and y, or another polygon, at each height.
+    """Return the joints of an upright mast: one regular polygon per height.
 
-    widths_m: side length.
+    A square has its sides along x and y. widths_m: side length at each height.
     """
     angle = (np.arange(corners) + 0.5) * 2 * np.pi / corners
     radius = np.broadcast_to(widths_m, heights_m.shape) / (2 * np.sin(np.pi / corners))
@@ -93,7 +96,7 @@ def mast_rings(
 
 
 def truss(rings_m: Float[np.ndarray, "k m 3"], bracing: Bracing = "zigzag") -> Truss:
-    """The lattice through rings of joints.
+    """Return the lattice through rings of joints.
 
     Each face between two rings is braced by both diagonals ("cross"), by diagonals of alternating direction
     ("zigzag"), or by diagonals of one direction ("single").
@@ -115,19 +118,19 @@ def truss(rings_m: Float[np.ndarray, "k m 3"], bracing: Bracing = "zigzag") -> T
 def bars(
     segments_m: Segments, radius_m: float | np.ndarray, material: int, sides: int = 5, capped: bool = True
 ) -> Mesh:
-    """Round bars along segments; capped=False if joints hide their ends."""
+    """Build round bars along segments; set capped=False if joints hide the ends."""
     return tubes(segments_m[:, 0], segments_m[:, 1], radius_m, material, sides, capped)
 
 
 def chain_segments(points_m: Float[np.ndarray, "n k 3"]) -> Segments:
-    """Segments of N polylines."""
+    """Return the segments of N polylines, as one array."""
     return _segments(points_m[:, :-1], points_m[:, 1:])
 
 
 def sagging_points(
     starts_m: Numbers, ends_m: Numbers, sag_m: float | Float[np.ndarray, " n"], count: int = 12
 ) -> Float[np.ndarray, "n k 3"]:
-    """Points [N, count + 1, 3] on parabolic cables that sag by sag_m in the middle."""
+    """Return points [N, count + 1, 3] on parabolic cables that sag by sag_m in the middle."""
     starts, ends = np.broadcast_arrays(np.atleast_2d(starts_m), np.atleast_2d(ends_m))
     share = np.linspace(0, 1, count + 1)
     points = starts[:, None] + share[:, None] * (ends - starts)[:, None]
@@ -135,7 +138,7 @@ def sagging_points(
     return points
 
 
-def cables(  # noqa: PLR0913, cables differ in so much
+def cables(  # noqa: PLR0913 - dimensions
     starts_m: Numbers,
     ends_m: Numbers,
     radius_m: float,
@@ -144,7 +147,7 @@ def cables(  # noqa: PLR0913, cables differ in so much
     sag_m: float | Float[np.ndarray, " n"] = 0.0,
     count: int = 12,
 ) -> Mesh:
-    """Sagging cables [N] between pairs of points."""
+    """Build sagging cables [N] between pairs of points."""
     path = sagging_points(starts_m, ends_m, sag_m, count)
     return bars(chain_segments(path), radius_m, material, sides=5, capped=False)
 
@@ -156,7 +159,7 @@ def ladder(
     width_m: float,
     material: int,
 ) -> Mesh:
-    """A ladder with rungs along `sideways`, spaced by 3/4 of its width."""
+    """Build a ladder with rungs along `sideways`, spaced by 3/4 of its width."""
     foot, head = np.array(foot_m), np.array(head_m)
     half = width_m / 2 * np.array(sideways) / np.linalg.norm(sideways)
     count = max(round(np.linalg.norm(head - foot) / (0.75 * width_m)), 2)
@@ -178,7 +181,7 @@ def cage(
     width_m: float,
     material: int,
 ) -> Mesh:
-    """Safety cage (hoops and strips) of an upright ladder."""
+    """Build the safety cage (hoops and strips) of an upright ladder."""
     foot, head = np.array(foot_m), np.array(head_m)
     out = np.array(outwards) / np.linalg.norm(outwards)
     side = np.cross(out, [0.0, 0.0, 1.0])
@@ -191,10 +194,13 @@ def cage(
     return bars(members, 0.045 * width_m, material, sides=4, capped=False)
 
 
-def railing(  # noqa: PLR0913, railings differ in so much
+def railing(  # noqa: PLR0913 - dimensions
     path_m: Points, height_m: float, spacing_m: float, radius_m: float, material: int, rails: int = 2
 ) -> Mesh:
-    """Posts along a path, at its corners and at most spacing_m apart, with rails between corners."""
+    """Build a railing of posts and rails along a path.
+
+    Posts stand at the path's corners and at most spacing_m apart.
+    """
     lengths = np.linalg.norm(np.diff(path_m, axis=0), axis=1)
     counts = np.maximum(np.ceil(lengths / spacing_m), 1).astype(int)
     feet = np.concatenate(
@@ -215,7 +221,7 @@ def railing(  # noqa: PLR0913, railings differ in so much
 
 
 def poses_towards(at_m: Numbers, directions: Numbers) -> Float[np.ndarray, "n 4 4"]:
-    """Poses [N] at points, with z along a direction and x horizontal."""
+    """Return poses [N, 4, 4] at the given points, with z along the directions and x horizontal."""
     at, along = np.broadcast_arrays(np.atleast_2d(at_m), np.atleast_2d(directions))
     z = along / np.linalg.norm(along, axis=1, keepdims=True)
     poses = np.tile(np.eye(4), (len(z), 1, 1))
@@ -225,7 +231,7 @@ def poses_towards(at_m: Numbers, directions: Numbers) -> Float[np.ndarray, "n 4 
 
 
 def insulators(starts_m: Points, ends_m: Points, radius_m: float, discs: int, material: int) -> Mesh:
-    """Insulator strings of bell-shaped discs that open towards each string's end."""
+    """Build insulator strings of bell-shaped discs that open towards each string's end."""
     starts_m, ends_m = np.broadcast_arrays(np.atleast_2d(starts_m), np.atleast_2d(ends_m))
     pitch = float(np.linalg.norm(ends_m - starts_m, axis=1).mean()) / discs
     bell = np.array([[0.0, 0.15], [0.95, 0.15], [1.0, 0.3], [0.35, 0.75], [0.3, 1.0]]) * (radius_m, pitch)
@@ -237,7 +243,7 @@ def insulators(starts_m: Points, ends_m: Points, radius_m: float, discs: int, ma
 
 
 def galvanised_steel(rng: np.random.Generator) -> Material:
-    """Galvanised steel, from bright to dull and dark."""
+    """Draw a material of galvanised steel, from bright to dull and dark."""
     grey = rng.uniform(0.35, 0.85)
     return Material(
         texture="steel",
@@ -251,7 +257,7 @@ def galvanised_steel(rng: np.random.Generator) -> Material:
 
 
 def painted_steel(rng: np.random.Generator, tint: Colour, roughness: float = 0.55) -> Material:
-    """Painted steel with a slight variation of the given colour."""
+    """Draw a material of painted steel in a slight variation of the given colour."""
     shade = rng.uniform(0.85, 1.1)
     red, green, blue = (float(np.clip(shade * part, 0, 1)) for part in tint)
     return Material(
@@ -265,7 +271,7 @@ def painted_steel(rng: np.random.Generator, tint: Colour, roughness: float = 0.5
 
 
 def aviation_paints(rng: np.random.Generator) -> tuple[Material, Material]:
-    """Red and white paint of aviation obstacles."""
+    """Draw the red and white paints that mark obstacles to aviation."""
     return painted_steel(rng, (0.55, 0.07, 0.04)), painted_steel(rng, (0.8, 0.8, 0.77))
 
 

@@ -1,4 +1,4 @@
-"""Pipework of a refinery: pipe rack, and pipes to it."""
+"""Pipework of a refinery: pipes, valves and pipe racks."""
 
 from collections.abc import Sequence
 
@@ -15,14 +15,14 @@ Path = Float[np.ndarray, "_ 3"]
 
 
 def pipes(paths_m: Sequence[Path], radii_m: Sequence[float], material: int) -> Mesh:
-    """Pipes with elbows at corners and a pair of flanges on each long section."""
+    """Build pipes with elbows at corners and a pair of flanges on each long section."""
     counts = [len(path) - 1 for path in paths_m]
     starts, ends = (
         np.concatenate([path[part] for path in paths_m]) for part in (slice(None, -1), slice(1, None))
     )
     radii, length = np.repeat(radii_m, counts), np.linalg.norm(ends - starts, axis=1)
     elbows = np.concatenate([path[1:-1] for path in paths_m])
-    # Wider than the pipes, so that a ball of 20 faces closes the gap between their ends.
+    # Wider than the pipes, so that a sphere of 20 faces closes the gap between their ends.
     bent = spheres(elbows, 1.15 * np.repeat(radii_m, np.array(counts) - 1), material, subdivisions=0)
     long = length > 0.5
     along = (ends - starts)[long] / length[long, None]
@@ -32,7 +32,7 @@ def pipes(paths_m: Sequence[Path], radii_m: Sequence[float], material: int) -> M
 
 
 def valves(at_m: Path, axes: Path, radius_m: float, body: int, wheel: int) -> Mesh:
-    """Valves on pipes along x, with handwheels on spindles along `axes`."""
+    """Build valves on pipes along x, with handwheels on spindles along `axes`."""
     parts = [
         spheres(at_m, 1.6 * radius_m, body, subdivisions=1),
         tubes(at_m, at_m + 4 * radius_m * axes, 0.3 * radius_m, body, 6),
@@ -54,7 +54,10 @@ def rack(
     lines: Sequence[int],
     materials: RefineryMaterials,
 ) -> Mesh:
-    """A steel rack along x with layers of parallel pipes of the materials `lines`; some form loops."""
+    """Build a steel rack along x with layers of parallel pipes, some of which have expansion loops.
+
+    lines: materials to choose from for the pipes.
+    """
     by_coat: dict[int, list[tuple[Path, float]]] = {}
     for level_m in levels_m:
         y = -0.37
@@ -76,7 +79,7 @@ def rack(
 
 
 def _frame(half_m: float, levels_m: Sequence[float], steel: int) -> Mesh:
-    """Posts, ties, rails and braces of the rack."""
+    """Build the posts, ties, rails and braces of the rack."""
     x, half_y = np.linspace(-half_m + 0.15, half_m - 0.15, 9), 0.42
     feet = np.array([[at, y, 0.0] for at in x for y in (-half_y, half_y)])
     across = np.array([[at, -half_y, z - 0.03] for at in x for z in levels_m])
@@ -92,7 +95,10 @@ def _frame(half_m: float, levels_m: Sequence[float], steel: int) -> Mesh:
 
 
 def _line_on_rack(rng: np.random.Generator, half_m: float, y: float, z: float) -> Path:
-    """A pipe up from the ground, along the rack and down again, at times with an expansion loop."""
+    """Draw the path of a pipe up from the ground, along the rack and down again.
+
+    Some paths have an expansion loop.
+    """
     first, last = -half_m - rng.uniform(0, 0.3), half_m + rng.uniform(0, 0.3)
     line = [[first, y, 0.0], [first, y, z]]
     if rng.random() < 0.25 and z > 0.9:

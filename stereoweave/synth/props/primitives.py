@@ -1,7 +1,8 @@
 """Geometric primitives: tubes, boxes, solids of revolution, lofts, sheets, spheres.
 
-Vectorised over arrays of pieces, because a lattice mast has a thousand struts. Metres; z is up. Points and
-sizes are [N, 3], or one [3] for all. Texture coordinates are metres along the surface.
+Tubes, boxes and spheres are vectorised over arrays of pieces, because a lattice mast has a thousand struts.
+Lengths are in metres, and z is up. Points and sizes are [N, 3], or one [3] for all pieces. Texture
+coordinates are metres along the surface.
 """
 
 import functools
@@ -20,13 +21,13 @@ Point = Float[np.ndarray, "3"]
 Points = Float[np.ndarray, "_ 3"]
 Numbers = np.ndarray | Sequence[Any] | float  # an array, or nested sequences
 
-# Two triangles per side, counter-clockwise from outside. Corner 4 x + 2 y + z has the coordinates x, y, z in
-# {0, 1}.
+# Two triangles per side, counter-clockwise when seen from outside. Corner 4 x + 2 y + z has the coordinates
+# x, y and z, each 0 or 1.
 _CUBE_FACES = (
     *((1, 3, 0), (4, 1, 0), (0, 3, 2), (2, 4, 0), (1, 7, 3), (5, 1, 4)),
     *((5, 7, 1), (3, 7, 2), (6, 4, 2), (2, 7, 6), (6, 5, 4), (7, 5, 6)),
 )
-# Corner indices: those of three golden rectangles in order.
+# Indices into the corners of three golden rectangles, taken in order.
 _ICOSAHEDRON_FACES = (
     *((0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2)),
     *((10, 7, 6), (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5)),
@@ -42,9 +43,9 @@ def tubes(  # noqa: PLR0913 - dimensions and options
     sides: int = 6,
     capped: bool = True,
 ) -> Mesh:
-    """Straight round bars [N] from start to end; `capped` closes both ends by flat caps.
+    """Build straight round bars [N] from start to end; `capped` closes both ends with flat caps.
 
-    radii_m: one for all, [N], or [N, 2] for start and end.
+    radii_m: one radius for all bars, [N], or [N, 2] for start and end.
     """
     starts, ends = np.broadcast_arrays(np.atleast_2d(starts_m), np.atleast_2d(ends_m))
     count = len(starts)
@@ -79,7 +80,7 @@ def tubes(  # noqa: PLR0913 - dimensions and options
 def boxes(
     centres_m: Numbers, sizes_m: Numbers, material: int, turns: Float[np.ndarray, "_ 3 3"] | None = None
 ) -> Mesh:
-    """Boxes [N]; `turns` rotates each about its centre."""
+    """Build boxes [N]; `turns` rotates each about its centre."""
     centres, sizes = np.broadcast_arrays(np.atleast_2d(centres_m), np.atleast_2d(sizes_m))
     cube, face_normals = _cube()
     corners = cube[None] * (sizes / 2)[:, None, None]
@@ -92,16 +93,18 @@ def boxes(
 
 
 def lathe(profile_m: Numbers, material: int, sections: int = 32, crease_deg: float = 35) -> Mesh:
-    """Solid of revolution around z; profile_m [K, 2]: radius and height, outside from bottom to top.
+    """Build a solid of revolution around z.
 
     Profile edges sharper than `crease_deg` stay sharp.
+
+    profile_m: [K, 2], radius and height of points along the outside from bottom to top.
     """
     profile = np.asarray(profile_m, np.float64)
     angle = np.arange(sections + 1) * 2 * np.pi / sections
     circle = np.stack([np.cos(angle), np.sin(angle)], -1)
     step = np.diff(profile, axis=0)
     slope = step / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
-    flat = np.stack([slope[:, 1], -slope[:, 0]], -1)  # outwards for an outside that rises
+    flat = np.stack([slope[:, 1], -slope[:, 0]], -1)  # outwards, because the profile rises along the outside
     below, above = flat.copy(), flat.copy()
     smooth = (flat[:-1] * flat[1:]).sum(1) > np.cos(np.radians(crease_deg))
     mean = flat[:-1] + flat[1:]
@@ -116,10 +119,10 @@ def lathe(profile_m: Numbers, material: int, sections: int = 32, crease_deg: flo
 
 
 def loft(rings_m: Float[np.ndarray, "k m 3"], material: int, capped: bool = True) -> Mesh:
-    """Smooth closed surface through rings of points, such as a hull, a blade or a bent pipe.
+    """Build a smooth closed surface through rings of points, such as a hull, a blade or a bent pipe.
 
-    Rings run counter-clockwise, seen from the last ring towards the first, without a repeated point. `capped`
-    closes the first and the last ring by triangle fans.
+    Rings run counter-clockwise as seen from the last ring towards the first, and do not repeat their first
+    point. `capped` closes the first and the last ring with triangle fans.
     """
     rings = np.asarray(rings_m, np.float64)
     rings = np.concatenate([rings, rings[:, :1]], axis=1)
@@ -130,7 +133,10 @@ def loft(rings_m: Float[np.ndarray, "k m 3"], material: int, capped: bool = True
 
 
 def sweep(path_m: Numbers, radius_m: Numbers, material: int, sides: int = 8) -> Mesh:
-    """Round pipe or cable along a path [K, 3]; radius_m: one, or one per point."""
+    """Build a round pipe or cable along a path [K, 3].
+
+    radius_m: one radius, or one per point.
+    """
     path = np.asarray(path_m, np.float64)
     along = np.gradient(path, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -142,9 +148,9 @@ def sweep(path_m: Numbers, radius_m: Numbers, material: int, sides: int = 8) -> 
 
 
 def sheet(points_m: Float[np.ndarray, "r c 3"], material: int, closed: bool = False) -> Mesh:
-    """Smooth surface through a grid of points; its normal is columns x rows.
+    """Build a smooth surface through a grid of points; its normal is columns x rows.
 
-    With x along columns and y along rows it faces up. `closed`: the last column repeats the first.
+    A sheet with x along columns and y along rows faces up. `closed`: the last column repeats the first.
     """
     points = np.asarray(points_m, np.float64)
     if closed:
@@ -160,7 +166,10 @@ def sheet(points_m: Float[np.ndarray, "r c 3"], material: int, closed: bool = Fa
 
 
 def spheres(centres_m: Numbers, radii_m: Numbers, material: int, subdivisions: int = 2) -> Mesh:
-    """Spheres [N]; radii_m: one for all, [N], or [N, 3] for ellipsoids along the axes."""
+    """Build spheres [N].
+
+    radii_m: one radius for all spheres, [N], or [N, 3] for ellipsoids along the axes.
+    """
     centres = np.atleast_2d(np.asarray(centres_m, np.float64))
     radii = np.asarray(radii_m, np.float64)
     radii = np.broadcast_to(radii[:, None] if radii.ndim == 1 else radii, (len(centres), 3))
@@ -175,7 +184,7 @@ def spheres(centres_m: Numbers, radii_m: Numbers, material: int, subdivisions: i
 
 
 def facets(triangles_m: Numbers, material: int) -> Mesh:
-    """Flat triangles [N, 3, 3], counter-clockwise seen from outside."""
+    """Build flat triangles [N, 3, 3], counter-clockwise when seen from outside."""
     triangles = np.asarray(triangles_m, np.float64)
     across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
@@ -184,7 +193,10 @@ def facets(triangles_m: Numbers, material: int) -> Mesh:
 
 
 def prism(outline_m: Numbers, depth_m: float, material: int) -> Mesh:
-    """Convex outline [K, 2], counter-clockwise from above, extruded from z = 0 to depth_m."""
+    """Extrude a convex outline from z = 0 to z = depth_m.
+
+    outline_m: [K, 2], counter-clockwise when seen from above.
+    """
     floor = np.pad(np.asarray(outline_m, np.float64), ((0, 0), (0, 1)))
     roof = floor + [0, 0, depth_m]
     after, above = np.roll(floor, -1, axis=0), np.roll(roof, -1, axis=0)
@@ -197,7 +209,7 @@ def prism(outline_m: Numbers, depth_m: float, material: int) -> Mesh:
 
 
 def copies(mesh: Mesh, poses: Float[np.ndarray, "n 4 4"]) -> Mesh:
-    """One copy of the mesh per pose [N, 4, 4]; poses may scale uniformly."""
+    """Return one copy of the mesh per pose [N, 4, 4]; poses may scale uniformly."""
     turns = poses[:, :3, :3].swapaxes(1, 2)
     scales = np.cbrt(np.abs(np.linalg.det(turns)))[:, None, None]
     corners = mesh.corners_m.reshape(-1, 3) @ turns.astype(np.float32)
@@ -215,23 +227,26 @@ def copies(mesh: Mesh, poses: Float[np.ndarray, "n 4 4"]) -> Mesh:
 
 
 def rotation(axis: tuple[float, float, float], angle_deg: float) -> Float[np.ndarray, "4 4"]:
-    """Pose [4, 4] that rotates about an axis through the origin, counter-clockwise seen from its tip."""
+    """Return the pose [4, 4] of a rotation about an axis through the origin.
+
+    The rotation is counter-clockwise when seen from the tip of the axis.
+    """
     pose = np.eye(4)
     pose[:3, :3] = cv2.Rodrigues(np.radians(angle_deg) * np.array(axis) / np.linalg.norm(axis))[0]
     return pose
 
 
 def translation(x: float = 0, y: float = 0, z: float = 0) -> Float[np.ndarray, "4 4"]:
-    """Pose [4, 4] that translates by metres."""
+    """Return the pose [4, 4] of a translation in metres."""
     pose = np.eye(4)
     pose[:3, 3] = x, y, z
     return pose
 
 
 def orthogonal_frames(along: Points) -> tuple[Points, Points]:
-    """Two unit vectors across each unit direction [N], forming right-handed frames; the first is horizontal.
+    """Return two unit vectors [N, 3] that form right-handed frames with the unit directions [N, 3].
 
-    For directions within 2.5 degrees of vertical the first is along -y.
+    The first is horizontal; for directions within 2.5 degrees of vertical it is nearly parallel to y.
     """
     helper = np.where(np.abs(along[:, 2:]) < 0.999, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     across = np.cross(helper, along)
@@ -240,7 +255,7 @@ def orthogonal_frames(along: Points) -> tuple[Points, Points]:
 
 
 def polyline_tubes(points_m: Numbers, radius_m: float, material: int, sides: int = 6) -> Mesh:
-    """Tubes along a polyline: railings, frames, cables with corners."""
+    """Build tubes along a polyline, as in railings, frames and cables with corners."""
     points = np.asarray(points_m)
     return tubes(points[:-1], points[1:], radius_m, material, sides)
 
@@ -251,7 +266,7 @@ def _mesh_grids(
     uv: Float[np.ndarray, "n r c 2"],
     material: int,
 ) -> Mesh:
-    """Two triangles per cell of each grid."""
+    """Return a mesh with two triangles per cell of each grid."""
 
     def cells(values: np.ndarray) -> np.ndarray:
         a, b, c, d = values[:, :-1, :-1], values[:, :-1, 1:], values[:, 1:, 1:], values[:, 1:, :-1]
@@ -307,10 +322,13 @@ def _make_mesh(corners: np.ndarray, normals: np.ndarray, uv: np.ndarray, materia
 
 
 def _transport_frames(along: Points) -> tuple[Points, Points]:
-    """Frames along a path by parallel transport, so that a pipe does not twist."""
+    """Return two unit vectors [N, 3] across each point of a path.
+
+    They are carried along by parallel transport, so that a pipe does not twist.
+    """
     across = orthogonal_frames(along[:1])[0][0]
     carried = []
-    # Plain floats, because arrays of three are slow.
+    # Plain floats are faster than arrays of three.
     u, v, w = across.tolist()
     for x, y, z in along.tolist():
         off = u * x + v * y + w * z
@@ -323,21 +341,24 @@ def _transport_frames(along: Points) -> tuple[Points, Points]:
 
 
 def _revolve(circle: Float[np.ndarray, "s 2"], radius_and_height: np.ndarray) -> np.ndarray:
-    """Rings [..., S, 3] from radii and heights [..., 2]."""
+    """Return rings [..., S, 3] of the given radii and heights [..., 2]."""
     radius, height = radius_and_height[..., None, :1], radius_and_height[..., None, 1:]
     level = radius * circle
     return np.concatenate([level, np.broadcast_to(height, (*level.shape[:-1], 1))], -1)
 
 
 def _arc_lengths_m(points: Float[np.ndarray, "r c 3"], axis: int) -> Float[np.ndarray, "r c"]:
-    """Arc length from the first point along one axis of the grid."""
+    """Return the arc length from the first point along one axis of the grid."""
     step = np.linalg.norm(np.diff(points, axis=axis), axis=-1)
     start = np.zeros_like(np.take(step, [0], axis=axis))
     return np.concatenate([start, np.cumsum(step, axis=axis)], axis=axis)
 
 
 def _box_uv(corners: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Texture coordinates by box projection: the two axes across the normal's dominant one."""
+    """Return texture coordinates by box projection.
+
+    They are the coordinates along the two axes other than the normal's dominant one.
+    """
     axis = np.abs(normals[..., :1, :]).argmax(-1)[..., None]
     x, y, z = corners[..., 0], corners[..., 1], corners[..., 2]
     axis = axis[..., 0] * np.ones(x.shape, int)
@@ -349,8 +370,9 @@ def _box_uv(corners: np.ndarray, normals: np.ndarray) -> np.ndarray:
 class _TubeTopology(NamedTuple):
     """Topology of a tube: indices [T, 3] into its points, normals and texture coordinates.
 
-    Points: the start's ring [S + 1], the end's ring, both centres. Normals: a ring [S + 1], back, ahead.
-    Texture coordinates: both rings for the sides, then the points for the ends.
+    The points are the ring [S + 1] at the start, the ring at the end, and both centres. The normals are those
+    of a ring [S + 1], then backwards and forwards along the tube. The texture coordinates are both rings for
+    the sides, then all points for the ends.
     """
 
     circle: Float[np.ndarray, "s 2"]
@@ -378,7 +400,7 @@ def _tube_topology(sides: int, capped: bool) -> _TubeTopology:
 
 @functools.cache
 def _cube() -> tuple[Float[np.ndarray, "12 3 3"], Float[np.ndarray, "12 3 3"]]:
-    """Triangles and normals of a cube of side 2 around the origin."""
+    """Return the triangles and normals of a cube of side 2 around the origin."""
     corners = np.array(list(product((-1.0, 1.0), repeat=3)))
     triangles = corners[np.array(_CUBE_FACES)]
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]) / 4
@@ -387,7 +409,10 @@ def _cube() -> tuple[Float[np.ndarray, "12 3 3"], Float[np.ndarray, "12 3 3"]]:
 
 @functools.cache
 def _ball(subdivisions: int) -> Float[np.ndarray, "n 3 3"]:
-    """Triangles of a unit sphere: an icosahedron, each triangle split into four per subdivision."""
+    """Return the triangles of a unit sphere.
+
+    It is an icosahedron whose triangles are split into four once per subdivision.
+    """
     golden_ratio = (1 + math.sqrt(5)) / 2
     rectangle = np.array([(y, x * golden_ratio, 0) for x, y in product((1, -1), (-1, 1))])
     corners = np.concatenate([np.roll(rectangle, turn, axis=1) for turn in range(3)])

@@ -1,4 +1,4 @@
-"""Random ship propellers: pitched, skewed blades with round outlines on a hub."""
+"""Random ship propellers, with pitched and skewed blades of round outline on a hub."""
 
 from dataclasses import dataclass, replace
 
@@ -11,18 +11,18 @@ from stereoweave.synth.world import Mesh, join_meshes
 
 @dataclass(frozen=True, kw_only=True)
 class Propeller:
-    """A ship's propeller around the x axis; aft is +x.
+    """Ship propeller around the x axis; aft is +x.
 
     Attributes:
-        radius_m: from the axis to the tips.
+        radius_m: distance from the axis to the tips.
         blades: number of blades.
         hub_share: radius of the hub as a share of radius_m.
         pitch_share: pitch as a share of the diameter.
         skew_deg: sweep of the tips.
         rake_m: aft lean of the tips.
         chord_m: greatest width of a blade.
-        tip: 3 for slender tips to 9 for blunt ones.
-        hand: 1 or -1, the direction of rotation.
+        tip: bluntness of the tips, from 3 (slender) to 9 (blunt).
+        hand: direction of rotation, 1 or -1.
     """
 
     radius_m: float
@@ -42,18 +42,21 @@ class Propeller:
 
     @property
     def hub_half_m(self) -> float:
-        """Half the length of the hub, which covers the blades' roots."""
+        """Half the length of the hub, which covers the roots of the blades."""
         return 0.5 * 0.5 * self.chord_m * float(np.sin(self._pitch(self.hub_m))) + 0.08
 
     def sections_m(self, spans: int = 40, points: int = 32) -> Float[np.ndarray, "k m 3"]:
-        """Sections of one blade from inside the hub up to the tip: rings for a loft."""
+        """Return sections [K, M, 3] of one blade from inside the hub to the tip.
+
+        They are rings of points for `loft`.
+        """
         # Sections are denser at the tip, because the outline is round there.
         span = np.sin(np.linspace(0, 0.992 * np.pi / 2, spans))[:, None]
         inner_m = 0.85 * self.hub_m
         radius = inner_m + (self.radius_m - inner_m) * span
         chord = self.chord_m * (0.5 + 0.5 * np.sin(np.pi / 2 * np.minimum(span / 0.65, 1)))
         chord = chord * np.sqrt(1 - span**self.tip)
-        # Thickest at the root, where it swells into the hub.
+        # The blade is thickest at the root, where it swells into the hub.
         thick = self.radius_m * (0.065 * (1 - span) + 0.007) * (1 + 0.9 * np.exp(-span / 0.07))
         thick = np.minimum(thick, 0.6 * chord)
         angle = np.linspace(0, 2 * np.pi, points, endpoint=False)
@@ -67,7 +70,7 @@ class Propeller:
         return rings[:, :: self.hand]
 
     def _pitch(self, radius_m: float | np.ndarray) -> float | np.ndarray:
-        """Pitch angle of the blade in radians."""
+        """Return the pitch angle of a blade at a radius, in radians."""
         return np.arctan(self.pitch_share * 2 * self.radius_m / (2 * np.pi * radius_m))
 
 
@@ -89,7 +92,7 @@ def draw_propeller(rng: np.random.Generator) -> Propeller:
 
 
 def propeller_mesh(propeller: Propeller, bronze: int, hub: int, bolt: int) -> Mesh:
-    """Mesh of blades, hub, cap and bolts around the origin; one blade points up."""
+    """Build the blades, hub, cap and bolts around the origin; one blade points up."""
     blade = loft(propeller.sections_m(), bronze)
     # Planar texture coordinates, so that the texture is not squeezed at the tip.
     blade = replace(blade, uv_m=blade.corners_m[..., 1:].copy())
@@ -98,7 +101,7 @@ def propeller_mesh(propeller: Propeller, bronze: int, hub: int, bolt: int) -> Me
 
 
 def turn_aft(mesh: Mesh) -> Mesh:
-    """Rotate the mesh from z to x (aft)."""
+    """Rotate a mesh so that its z axis points along x (aft)."""
     return mesh.transform(rotation((0, 1, 0), 90))
 
 
@@ -119,7 +122,7 @@ def _hub(propeller: Propeller, material: int) -> Mesh:
 
 
 def _bolts(propeller: Propeller, material: int) -> Mesh:
-    """Hexagon bolts around the cap's flange and the hub's front."""
+    """Build hexagonal bolts around the flange of the cap."""
     angle = np.arange(12) * np.pi / 6
     circle = np.stack([0 * angle, np.cos(angle), np.sin(angle)], -1)
     size = 0.055 * propeller.hub_m / 0.5

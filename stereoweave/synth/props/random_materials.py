@@ -1,4 +1,4 @@
-"""Random materials for training: natural, nearly plain or periodic textures, a fifth of them glossy."""
+"""Random materials for training, with natural, nearly plain or periodic textures; a fifth are glossy."""
 
 import colorsys
 
@@ -6,9 +6,11 @@ import numpy as np
 
 from stereoweave.synth.world import Colour, Material
 
-# Natural image statistics transfer to photographs; plain and periodic surfaces make real rooms hard.
+# Shares of texture kinds. Training on natural image statistics transfers to photographs; real rooms are hard
+# because of their plain and periodic surfaces.
 _PHOTOGRAPHS, _PLAIN, _PERIODIC = 0.35, 0.20, 0.12
-# Share of plain walls, floors and tables, whose middle is farther from any texture than a matcher sees.
+# Share of plain surfaces among walls, floors and tables; their middle is farther from texture than a matcher
+# sees.
 _BROAD_PLAIN = 0.65
 PERIODIC = ("brick", "tiles", "cloth")
 NATURAL = (
@@ -19,7 +21,7 @@ _TYPICAL_FOCAL_PX = 600
 
 
 def draw_material(rng: np.random.Generator, distance_m: float) -> Material:
-    """Draw any material, its texels as fine as pixels seen from distance_m."""
+    """Draw a material of any kind, with texels about as fine as pixels when seen from distance_m."""
     family = _draw_family(rng)
     glossy = rng.random() < 0.2
     return Material(
@@ -34,7 +36,10 @@ def draw_material(rng: np.random.Generator, distance_m: float) -> Material:
 
 
 def draw_material_from(rng: np.random.Generator, families: tuple[str, ...], distance_m: float) -> Material:
-    """Draw a dull material of one of the families, its texels as fine as pixels seen from distance_m."""
+    """Draw a dull material from one of the texture families.
+
+    Its texels are about as fine as pixels when seen from distance_m.
+    """
     family = families[rng.integers(len(families))]
     return Material(
         texture=family,
@@ -49,14 +54,14 @@ def draw_material_from(rng: np.random.Generator, families: tuple[str, ...], dist
 
 
 def draw_broad_material(rng: np.random.Generator, families: tuple[str, ...], distance_m: float) -> Material:
-    """Draw a material for a wall, floor or table: mostly plain, otherwise of one of the families."""
+    """Draw a material for a wall, floor or table: mostly plain, otherwise from one of the families."""
     if rng.random() >= _BROAD_PLAIN:
         return draw_material_from(rng, families, distance_m)
     return Material(
         texture="plain",
         variant=int(rng.integers(1000)),
         tint=draw_muted_colour(rng, 0.3),
-        # Up to six times coarser than pixels, so that little of the texture's contrast remains.
+        # The texture is enlarged up to six times, so that little of its contrast remains.
         span_m=draw_fine_span_m(rng, distance_m) * rng.uniform(1, 6),
         roughness=rng.uniform(0.35, 1.0),
         relief=rng.uniform(0.0, 0.1),
@@ -64,20 +69,23 @@ def draw_broad_material(rng: np.random.Generator, families: tuple[str, ...], dis
 
 
 def draw_fine_span_m(rng: np.random.Generator, distance_m: float) -> float:
-    """Draw a texture's span in metres such that 1 to 3 of its 512 texels, at times fewer, fall on a pixel."""
+    """Draw the span of a texture in metres.
+
+    Seen from distance_m, 0.6 to 3 of the texture's 512 texels fall on a pixel.
+    """
     across_px = np.exp(rng.uniform(np.log(170), np.log(800)))
     return float(distance_m * across_px / _TYPICAL_FOCAL_PX)
 
 
 def draw_muted_colour(rng: np.random.Generator, saturation: float) -> Colour:
-    """Draw a greyish colour of walls and objects, from dark to almost white."""
+    """Draw a greyish colour for walls and objects, from dark to almost white."""
     hue = rng.choice([rng.uniform(0.02, 0.16), rng.uniform()], p=[0.6, 0.4])
     red, green, blue = colorsys.hsv_to_rgb(hue, rng.uniform(0, saturation), rng.uniform(0.15, 0.9))
     return red, green, blue
 
 
 def draw_natural_tint(rng: np.random.Generator) -> Colour:
-    """Draw a tint that changes brightness but hardly the colour."""
+    """Draw a tint that changes the brightness of a texture but hardly its colour."""
     red, green, blue = rng.uniform(0.55, 1.0) * rng.uniform(0.88, 1.0, 3)
     return float(red), float(green), float(blue)
 

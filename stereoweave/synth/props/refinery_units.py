@@ -1,6 +1,6 @@
 """Units of a refinery at a tenth of their real size: columns, tanks, pressure vessels, stacks.
 
-Each stands on z = 0 around the z axis and lists its nozzles.
+Each unit stands on z = 0 around the z axis and lists its nozzles.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from stereoweave.synth.world import Mesh, join_meshes
 
 @dataclass(frozen=True, kw_only=True)
 class RefineryMaterials:
-    """Materials of a refinery: painted and bare shells, structure, railings, and so on."""
+    """Materials of a refinery; `shells` are the alternatives for the walls of vessels."""
 
     shells: tuple[int, ...]
     steel: int
@@ -36,20 +36,23 @@ class RefineryMaterials:
     flame: int
 
     def shell(self, rng: np.random.Generator) -> int:
-        """Draw a shell's material."""
+        """Draw the material of a shell."""
         return self.shells[rng.integers(len(self.shells))]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RefineryUnit:
-    """A unit and the positions [N, 3] of its nozzles."""
+    """Mesh of a unit, and the positions [N, 3] of its nozzles."""
 
     mesh: Mesh
     nozzles_m: Float[np.ndarray, "n 3"]
 
 
 def column(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUnit:
-    """A distillation column: skirt, shell of one or two widths, platforms with railings, caged ladders."""
+    """Build a distillation column.
+
+    Its skirt carries a shell of one or two widths, with railed platforms and caged ladders.
+    """
     high_m, radius_m = rng.uniform(2.8, 4.4), rng.uniform(0.16, 0.26)
     upper_m = radius_m * (rng.uniform(0.78, 0.9) if rng.random() < 0.5 else 1.0)
     neck_m = rng.uniform(0.55, 0.75) * high_m
@@ -65,7 +68,7 @@ def column(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUn
     climb = _caged_ladder(radius_m + 0.1, floors_m[0] + 0.1, materials)
     turns = np.stack([rotation((0, 0, 1), 150.0 * k) for k in range(len(floors_m))])
     parts.append(copies(climb, _poses_at_heights(floors_m - floors_m[0]) @ turns))
-    # The vapour pipe runs down along the shell from the top.
+    # The vapour pipe runs from the top down the shell.
     line = np.array(
         [[0, 0, high_m], [0, 0, high_m + 0.3], [radius_m + 0.12, 0, high_m + 0.3], [radius_m + 0.12, 0, 0.5]]
     )
@@ -78,7 +81,7 @@ def column(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUn
 
 
 def ball_tank(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUnit:
-    """A spherical tank on braced legs, with a winding stair and a platform on top."""
+    """Build a spherical tank on braced legs, with winding stairs and a platform on top."""
     radius_m = rng.uniform(0.5, 0.6)
     middle_m, legs = radius_m + 0.28, 9
     angle = np.arange(legs) * 2 * np.pi / legs
@@ -121,7 +124,7 @@ def ball_tank(rng: np.random.Generator, materials: RefineryMaterials) -> Refiner
 
 
 def drum_tank(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUnit:
-    """A storage tank with a low conical roof, a winding stair, a railing, and its number."""
+    """Build a storage tank with a low conical roof, winding stairs, a railing and a number plate."""
     radius_m, high_m = rng.uniform(0.5, 0.62), rng.uniform(0.6, 1.1)
     seams_m = np.linspace(0, high_m, 5)[1:-1]
     shell = lathe(
@@ -159,7 +162,10 @@ def drum_tank(rng: np.random.Generator, materials: RefineryMaterials) -> Refiner
 
 
 def pressure_vessels(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUnit:
-    """One to three horizontal vessels with round ends on saddles, some stacked, with platform and ladder."""
+    """Build two to four horizontal pressure vessels with round ends on saddles.
+
+    Some are stacked. They have a platform and a ladder.
+    """
     radius_m, long_m = rng.uniform(0.14, 0.2), rng.uniform(0.55, 0.7)
     bend = np.linspace(0, np.pi / 2, 6)[:-1]
     cap = np.column_stack([radius_m * np.sin(bend), -0.5 * radius_m * np.cos(bend)])
@@ -200,7 +206,7 @@ def pressure_vessels(rng: np.random.Generator, materials: RefineryMaterials) -> 
 
 
 def chimney(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUnit:
-    """A chimney with red and white bands, a platform and a ladder."""
+    """Build a chimney with red and white bands, a platform and a ladder."""
     high_m, foot_m, top_m = rng.uniform(3.8, 5.2), rng.uniform(0.2, 0.28), rng.uniform(0.11, 0.15)
     edges_m = np.concatenate([[0, 0.45 * high_m], np.linspace(0.45, 1, 7)[1:] * high_m])
     widths_m = np.interp(edges_m, [0, high_m], [foot_m, top_m])
@@ -229,7 +235,7 @@ def chimney(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryU
 
 
 def flare(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUnit:
-    """A slender flare stack with guy wires at two heights, mostly with a flame."""
+    """Build a slender flare stack with guy wires at two heights and, in most draws, a flame."""
     high_m = rng.uniform(4.4, 5.4)
     stack = lathe(
         [
@@ -267,7 +273,7 @@ def flare(rng: np.random.Generator, materials: RefineryMaterials) -> RefineryUni
 
 
 def _flame(rng: np.random.Generator, materials: RefineryMaterials) -> Mesh:
-    """A flame leaning with the wind."""
+    """Build a flame that leans with the wind."""
     share = np.linspace(0, 1, 12)
     width_m = 0.11 * np.sin(np.pi * (0.15 + 0.85 * share)) ** 0.8 * rng.uniform(0.8, 1.2, 12)
     flame = lathe(np.column_stack([np.append(width_m[:-1], 0.0), 0.55 * share]), materials.flame, 18)
@@ -277,7 +283,7 @@ def _flame(rng: np.random.Generator, materials: RefineryMaterials) -> Mesh:
 
 
 def _deck(inner_m: float, wide_m: float, materials: RefineryMaterials) -> Mesh:
-    """A round platform with railing and brackets."""
+    """Build a round platform with railing and brackets."""
     outer_m = inner_m + wide_m
     plate = lathe(
         [[inner_m, -0.02], [outer_m, -0.02], [outer_m, 0.0], [inner_m, 0.0]],
@@ -294,14 +300,14 @@ def _deck(inner_m: float, wide_m: float, materials: RefineryMaterials) -> Mesh:
 
 
 def _railing(path_m: Float[np.ndarray, "n 3"], materials: RefineryMaterials) -> Mesh:
-    """A railing with posts at the points of a path, and two rails."""
+    """Build a railing with two rails and a post at each point of a path."""
     rails = [np.stack([path_m[:-1], path_m[1:]], 1) + [0, 0, z] for z in (0.055, 0.11)]
     posts = np.stack([path_m, path_m + [0, 0, 0.11]], 1)
     return bars(np.concatenate([*rails, posts]), 0.0065, materials.rail, 3, capped=False)
 
 
 def _caged_ladder(at_m: float, high_m: float, materials: RefineryMaterials) -> Mesh:
-    """A caged ladder at distance at_m from the axis."""
+    """Build a caged ladder at a distance of at_m from the axis."""
     angle = np.radians(np.linspace(-90, 90, 5))
     bow = np.stack([at_m + 0.12 * np.cos(angle), 0.07 * np.sin(angle), 0 * angle], -1)
     hoops = bow + np.arange(0.24, high_m, 0.2)[:, None, None] * [0, 0, 1]
@@ -313,14 +319,14 @@ def _caged_ladder(at_m: float, high_m: float, materials: RefineryMaterials) -> M
 
 
 def _poses_at_heights(heights_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
-    """Poses at heights on the z axis."""
+    """Return poses [N, 4, 4] at heights on the z axis."""
     poses = np.tile(np.eye(4), (len(heights_m), 1, 1))
     poses[:, 2, 3] = heights_m
     return poses
 
 
 def _stair(path_m: Float[np.ndarray, "n 3"], materials: RefineryMaterials) -> Mesh:
-    """Steps along a path around the z axis, with handrails."""
+    """Build steps along a path around the z axis, with handrails."""
     angle = np.arctan2(path_m[:, 1], path_m[:, 0])
     out = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
     turns = np.stack(

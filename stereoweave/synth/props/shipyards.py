@@ -1,6 +1,6 @@
 """Dry docks and shipyards: blocks and shores under the hull, scaffolds, work lamps.
 
-Aft is +x; the propeller is at the origin.
+Aft is +x, and the propeller is at the origin.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ _STEP_M = 0.6
 
 
 def dock(rng: np.random.Generator, palette: Palette, floor_m: float, half_m: float) -> Mesh:
-    """A dry dock, 2 half_m wide, with stepped walls, stairs, and buildings above."""
+    """Build a dry dock, 2 half_m wide, with stepped walls and stairs, and with buildings around it."""
     wall, bed, land = (_concrete(rng, palette, tone) for tone in (0.75, 0.65, 0.7))
     rise_m = rng.uniform(1.4, 1.9)
     top_m = floor_m + 4 * rise_m
@@ -47,7 +47,7 @@ def dock(rng: np.random.Generator, palette: Palette, floor_m: float, half_m: flo
 
 
 def yard(rng: np.random.Generator, palette: Palette, floor_m: float) -> Mesh:
-    """Open ground of a shipyard with sheds, a fence, trees and hills."""
+    """Build the open ground of a shipyard with sheds, a fence, trees and hills."""
     ground = str(rng.choice(["concrete", "asphalt", "gravel"]))
     base = surroundings.terrain(rng, palette, ground, bumps_m=0.1, flat_radius_m=25)
     sheds = surroundings.draw_spots(rng, 14, 20, 60)
@@ -65,7 +65,7 @@ def yard(rng: np.random.Generator, palette: Palette, floor_m: float) -> Mesh:
 
 
 def blocks(rng: np.random.Generator, palette: Palette, stern: Stern, floor_m: float) -> Mesh:
-    """Keel blocks, and timber shores of the hull."""
+    """Build keel blocks, and timber shores that support the hull."""
     concrete = _concrete(rng, palette, 0.6)
     timber = palette.add(
         Material(
@@ -86,7 +86,7 @@ def blocks(rng: np.random.Generator, palette: Palette, stern: Stern, floor_m: fl
 
 
 def scaffold(rng: np.random.Generator, palette: Palette, floor_m: float, high_m: float) -> Mesh:
-    """Scaffolds on both sides in front of the propeller, with planks, ladders, and some netting."""
+    """Build scaffolds with planks and ladders on both sides, forward of the propeller; some have netting."""
     steel = palette.add(galvanised_steel(rng))
     planks = palette.add(
         Material(
@@ -121,7 +121,7 @@ def scaffold(rng: np.random.Generator, palette: Palette, floor_m: float, high_m:
 
 
 def litter(rng: np.random.Generator, palette: Palette, floor_m: float, half_m: float) -> Mesh:
-    """Drums, crates, pallets, cones, hoses and ladders on the ground, away from the cameras."""
+    """Build drums, crates, pallets, cones and hoses that lie on the ground, away from the cameras."""
     kinds: tuple[Clutter, ...] = (
         surroundings.barrels,
         surroundings.crates,
@@ -141,7 +141,7 @@ def litter(rng: np.random.Generator, palette: Palette, floor_m: float, half_m: f
 
 
 def work_lamps(rng: np.random.Generator, palette: Palette, floor_m: float) -> tuple[Mesh, tuple[Lamp, ...]]:
-    """Two work lamps on tripods beside the propeller, and their light."""
+    """Build two work lamps on tripods beside the propeller, and return them with their light."""
     steel = palette.add(Material(texture="paint", tint=vary_colour(rng, (0.22, 0.2, 0.16)), roughness=0.5))
     glass = palette.add(Material(texture="plain", tint=(1.0, 0.97, 0.9), glow=2.5))
     strength = rng.uniform(2, 7)
@@ -153,14 +153,14 @@ def work_lamps(rng: np.random.Generator, palette: Palette, floor_m: float) -> tu
         pieces.append(tubes(np.concatenate([foot + legs, [head - [0, 0, 0.4]]]), head, 0.014, steel))
         pieces.append(boxes(head + [0, 0, 0.12], (0.1, 0.26, 0.18), steel))
         pieces.append(boxes(head + [-0.03, 0, 0.12], (0.06, 0.22, 0.14), glass))
-        # The light source is in front of its lamp, which would otherwise be the brightest surface.
+        # The light source is in front of its lamp; otherwise the lamp would be the brightest surface.
         light = head + [-0.4, -side * 0.4, 0.4]
         lights.append(Lamp(position_m=_triple(light), light=(strength, 0.93 * strength, 0.8 * strength)))
     return join_meshes(pieces), tuple(lights)
 
 
 def _land(floor_m: float, top_m: float, half_m: float, stern_m: float, material: int) -> Mesh:
-    """The ground around the dock: four blocks as deep as the dock."""
+    """Build the ground around the dock from four blocks as deep as the dock."""
     low_m, middle_m = floor_m - 1, (top_m + floor_m - 1) / 2
     deep_m, far_m = top_m - low_m, 110.0
     wide_m = far_m - half_m
@@ -172,7 +172,7 @@ def _land(floor_m: float, top_m: float, half_m: float, stern_m: float, material:
 
 
 def _above(rng: np.random.Generator, palette: Palette, half_m: float) -> Mesh:
-    """Surroundings of a dock: sheds, bollards, trees, hills."""
+    """Build the surroundings of a dock: sheds, bollards, trees and hills."""
     far = _keep_clear_of_ship(surroundings.draw_spots(rng, 14, 22, 60), half_m + 9)
     x = np.arange(-28, 13, 8.0)
     beside = np.concatenate([np.stack([x, 0 * x + side * (half_m + 3.4), 0 * x], -1) for side in (1, -1)])
@@ -194,7 +194,7 @@ def _edge(top_m: float, half_m: float, steel: int) -> Mesh:
 
 
 def _stairs(floor_m: float, top_m: float, wall_m: float, steel: int, concrete: int) -> Mesh:
-    """A flight of solid steps along the dock's wall at y = wall_m, with a handrail."""
+    """Build a flight of solid steps along the dock's wall at y = wall_m, with a handrail."""
     count = int((top_m - floor_m) / 0.24)
     step = np.arange(count)
     heights = (top_m - floor_m) * (step + 1) / count
@@ -207,7 +207,10 @@ def _stairs(floor_m: float, top_m: float, wall_m: float, steel: int, concrete: i
 
 
 def _tower(rng: np.random.Generator, high_m: float, steel: int, planks: int) -> Mesh:
-    """Three bays of 1.5 m along y, 0.9 m deep: standards, ledgers, braces, planks, a ladder."""
+    """Build a scaffold of three bays of 1.5 m along y, 0.9 m deep.
+
+    It has standards, ledgers, braces, planks and a ladder.
+    """
     y, x = np.linspace(-2.25, 2.25, 4), np.array([-0.45, 0.45])
     levels = np.arange(0.3, high_m, 1.9)
     gx, gy = (v.ravel() for v in np.meshgrid(x, y))
@@ -233,14 +236,14 @@ def _tower(rng: np.random.Generator, high_m: float, steel: int, planks: int) -> 
 
 
 def _netting(rng: np.random.Generator, high_m: float, cloth: int) -> Mesh:
-    """A folded sheet on the front of a scaffold."""
+    """Build a folded sheet on the front of a scaffold."""
     y, z = np.meshgrid(np.linspace(-2.3, 2.3, 28), np.linspace(rng.uniform(0.3, 1.2), high_m - 0.1, 14))
     folds = 0.05 * np.sin(y * rng.uniform(4, 7) + rng.uniform(0, 6)) * np.sin(z * 1.7 + rng.uniform(0, 6))
     return sheet(np.stack([0.53 + abs(folds), y, z], -1), cloth)
 
 
 def _hose_path(rng: np.random.Generator, half_m: float) -> Points:
-    """Path of a hose on the floor."""
+    """Draw the path [40, 3] of a hose on the floor."""
     share = np.linspace(0, 1, 40)
     sway = sum(rng.normal(0, 0.6) / k * np.sin(k * np.pi * share + rng.uniform(0, 6)) for k in (2, 3, 5))
     ends = rng.uniform(-half_m + 1, half_m - 1, 2)
@@ -249,7 +252,7 @@ def _hose_path(rng: np.random.Generator, half_m: float) -> Points:
 
 
 def _keep_clear_of_ship(spots: Points, half_m: float) -> Points:
-    """Select the spots at least half_m away from the ship's centre line."""
+    """Select the spots more than half_m away from the ship's centre line."""
     return spots[np.abs(spots[:, 1]) > half_m]
 
 

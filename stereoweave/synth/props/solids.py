@@ -28,7 +28,7 @@ PropBuilder = Callable[[np.random.Generator, PropStyle], Mesh]
 
 
 def box(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A box, flat or tall, at times with a lid or a band."""
+    """Build a box, flat or tall, with a protruding band at a random height."""
     size_m = rng.uniform(0.2, 1.0, 3)
     block = boxes(np.zeros(3), size_m, style.main)
     band_m = size_m * np.array([1.03, 1.03, rng.uniform(0.08, 0.3)])
@@ -37,17 +37,17 @@ def box(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def ball(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A ball."""
+    """Build a ball."""
     return spheres(np.zeros(3), 0.5, style.main, subdivisions=3)
 
 
 def ellipsoid(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A ball scaled along its axes."""
+    """Build an ellipsoid."""
     return spheres(np.zeros(3), rng.uniform(0.15, 0.5, (1, 3)), style.main, subdivisions=3)
 
 
 def cylinder(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A cylinder with a bevelled rim and a band."""
+    """Build a cylinder with bevelled rims and a band."""
     radius_m, height_m, bevel_m = rng.uniform(0.15, 0.5), rng.uniform(0.2, 1.0), rng.uniform(0.01, 0.04)
     rim = np.array([[radius_m - bevel_m, 0], [radius_m, bevel_m]])
     top = np.array([[radius_m, height_m - bevel_m], [radius_m - bevel_m, height_m], [0, height_m]])
@@ -60,7 +60,7 @@ def cylinder(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def cone(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A cone, at times truncated."""
+    """Build a truncated cone."""
     radius_m, height_m, tip_m = rng.uniform(0.2, 0.5), rng.uniform(0.4, 1.0), rng.uniform(0, 0.15)
     share = np.linspace(0, 1, 9)[:, None]
     side_m = (1 - share) * [[radius_m, 0]] + share * [[tip_m, height_m]]
@@ -68,7 +68,7 @@ def cone(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def torus(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A ring, thin or thick."""
+    """Build a torus, thin or thick."""
     tube_m = rng.uniform(0.04, 0.17)
     angle = np.linspace(0, 2 * np.pi, 17)
     circle_m = tube_m * np.stack([np.cos(angle), np.sin(angle)], -1)
@@ -76,7 +76,7 @@ def torus(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def vase(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A vase or turned post with a smooth wavy profile."""
+    """Build a vase or turned post with a smooth wavy profile."""
     share = np.linspace(0, 1, 18)
     waves = sum(rng.uniform(-1, 1) / k * np.cos(np.pi * k * share + rng.uniform(0, 6)) for k in range(1, 6))
     radii_m = rng.uniform(0.12, 0.3) * np.exp(0.45 * waves)
@@ -87,7 +87,7 @@ def vase(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def bottle(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A bottle with a label and a cap."""
+    """Build a bottle with a label and a cap."""
     radius_m, neck_m, shoulder = rng.uniform(0.12, 0.22), rng.uniform(0.03, 0.06), rng.uniform(0.5, 0.75)
     share = np.linspace(0, 1, 8)
     bend_m = neck_m + (radius_m - neck_m) * (1 + np.cos(np.pi * share)) / 2
@@ -102,7 +102,7 @@ def bottle(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def lamp(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A floor lamp: foot, rod, shade."""
+    """Build a floor lamp with foot, rod and shade."""
     foot_m, rod_m, low_m = rng.uniform(0.12, 0.22), rng.uniform(0.012, 0.03), rng.uniform(0.55, 0.7)
     stand = np.array([[0, 0], [foot_m, 0], [foot_m, 0.03], [rod_m, 0.06], [rod_m, 0.9], [0.0, 0.9]])
     wide_m, narrow_m = rng.uniform(0.2, 0.32), rng.uniform(0.08, 0.2)
@@ -111,7 +111,7 @@ def lamp(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def twisted_prism(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A twisted, tapering prism of three to six sides."""
+    """Build a twisted, tapering prism of three to six sides."""
     corners, steps = int(rng.integers(3, 7)), 5
     angle = np.arange(corners * steps) / steps
     part = (angle % 1)[:, None]
@@ -126,13 +126,13 @@ def twisted_prism(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def bent_pipe(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A pipe along a random curve, of varying thickness."""
+    """Build a pipe of varying thickness along a random curve."""
     path_m = wander_m(rng, 26)
     return sweep(path_m, rng.uniform(0.02, 0.12) * (1 + 0.3 * np.sin(np.linspace(0, 9, 26))), style.main, 14)
 
 
 def blob(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A boulder: a sphere with smooth bumps."""
+    """Build a boulder, a sphere with smooth bumps."""
     polar, around = np.linspace(3.12, 0.02, 24)[:, None], np.arange(36) * 2 * np.pi / 36
     radius_m = 0.4 + np.sum(
         [
@@ -147,12 +147,12 @@ def blob(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def plate(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A thin flat board."""
+    """Build a thin flat board."""
     return boxes(np.zeros(3), np.array([rng.uniform(0.4, 1.0), rng.uniform(0.01, 0.04), 1.0]), style.main)
 
 
 def bowl(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """An open bowl, deep or flat."""
+    """Build an open bowl, deep or shallow."""
     depth_m, angle = rng.uniform(0.12, 0.4), np.linspace(0.05, np.pi / 2, 10)
     outside = np.stack([0.5 * np.sin(angle), depth_m * (1 - np.cos(angle))], -1)
     inside = outside[::-1] * [0.94, 0.94] + [0, 0.06 * depth_m]
@@ -160,7 +160,7 @@ def bowl(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def dumbbell(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Two or three balls on a rod."""
+    """Build two or three balls on a rod."""
     count = int(rng.integers(2, 4))
     centres_m = np.stack([np.zeros(count), np.zeros(count), np.linspace(-0.4, 0.4, count)], -1)
     balls = spheres(centres_m, rng.uniform(0.06, 0.5 / count, count), style.main, subdivisions=3)
@@ -170,7 +170,7 @@ def dumbbell(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def cloth(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A wavy sheet, hanging or flying."""
+    """Build a wavy sheet of cloth, hanging or flying."""
     x, z = np.meshgrid(np.linspace(-0.5, 0.5, 36), np.linspace(0, rng.uniform(0.6, 1.1), 26))
     y = sum(
         rng.uniform(0.01, 0.12) / np.sqrt(k) * np.sin(k * rng.uniform(2, 6) * x + rng.normal(0, 3) * z)
@@ -180,7 +180,7 @@ def cloth(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def arch(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A half ring on two posts."""
+    """Build an arch, half a ring on two posts."""
     angle, radius_m, leg_m = np.linspace(0, np.pi, 24), rng.uniform(0.25, 0.45), rng.uniform(0.1, 0.5)
     bend = np.stack([radius_m * np.cos(angle), 0 * angle, leg_m + radius_m * np.sin(angle)], -1)
     path_m = np.concatenate([[[radius_m, 0, 0]], bend, [[-radius_m, 0, 0]]])
@@ -188,7 +188,7 @@ def arch(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def stairs(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Stairs of stacked blocks."""
+    """Build stairs of stacked blocks."""
     count = int(rng.integers(4, 9))
     step_m, wide_m = 1.0 / count, rng.uniform(0.3, 0.8)
     k = np.arange(count)
@@ -201,7 +201,7 @@ def stairs(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def tower_of_blocks(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A tower of slightly rotated blocks."""
+    """Build a tower of rotated blocks."""
     count = int(rng.integers(3, 7))
     sizes_m = np.stack([*rng.uniform(0.2, 0.45, (2, count)), rng.uniform(0.6, 1.0, count) / count], -1)
     tops_m = np.cumsum(sizes_m[:, 2])

@@ -1,4 +1,4 @@
-"""The stern of a large ship above its propeller: hull, skeg or bracket, shaft, rudder. Aft is +x."""
+"""Stern of a large ship above its propeller: hull, skeg or bracket, shaft, rudder. Aft is +x."""
 
 from dataclasses import dataclass
 
@@ -18,13 +18,13 @@ _LENGTH_M = 34.0
 
 @dataclass(frozen=True, kw_only=True)
 class Stern:
-    """A ship's stern, with the propeller at the origin.
+    """Stern of a ship with its propeller at the origin.
 
     Attributes:
         mesh: hull with fittings, without the propeller.
         keel_m: height of the keel.
-        hull: the hull in its own coordinates: bow at +x, waterline at z = 0.
-        end_m: x of the hull's after end.
+        hull: the hull in its own coordinates, with the bow at +x and the waterline at z = 0.
+        end_m: x of the hull's aft end.
         water_m: height of the waterline.
     """
 
@@ -35,14 +35,17 @@ class Stern:
     water_m: float
 
     def side_m(self, x: np.ndarray, z: np.ndarray, side: float) -> Points:
-        """Points on the hull's skin near x and z."""
+        """Return points on the hull's skin near x and z.
+
+        side: 1 for the side at +y, -1 for the one at -y.
+        """
         share = (self.end_m - x) / _LENGTH_M
         at = self.hull.side_m(share, z - self.water_m, -side)
         return np.stack([self.end_m - _LENGTH_M / 2 - at[:, 0], -at[:, 1], z], -1)
 
 
 def stern(rng: np.random.Generator, palette: Palette, propeller: Propeller) -> Stern:
-    """A hull above the propeller, with a skeg or a bracket and, at times, a rudder."""
+    """Build a hull above the propeller, with a skeg or a bracket and, at times, a rudder."""
     bottom = palette.add(_coat(rng, _BOTTOMS))
     stripe = palette.add(_coat(rng, ((0.75, 0.75, 0.72), (0.6, 0.5, 0.15))))
     topside = palette.add(_coat(rng, _SIDES))
@@ -93,7 +96,7 @@ def _shaft(rng: np.random.Generator) -> Material:
 
 
 def _skeg(sole: Stern, propeller: Propeller, material: int) -> Mesh:
-    """The skeg below the hull, with the boss of the shaft."""
+    """Build the skeg below the hull, with the boss of the shaft."""
     after_m = -propeller.hub_half_m - 0.25
     away = np.linspace(0, 1, 30)[::-1, None] ** 1.5
     x = after_m - 13 * away
@@ -109,7 +112,7 @@ def _skeg(sole: Stern, propeller: Propeller, material: int) -> Mesh:
 
 
 def _bracket(propeller: Propeller, clear_m: float, material: int, steel: int) -> Mesh:
-    """A shaft bracket of two struts, and the exposed shaft."""
+    """Build a shaft bracket of two struts, and the exposed shaft."""
     r, front_m = propeller.hub_m, -propeller.hub_half_m - 0.05
     profile = [
         (0, -1.5),
@@ -132,14 +135,14 @@ def _bracket(propeller: Propeller, clear_m: float, material: int, steel: int) ->
 
 
 def _collar(propeller: Propeller, material: int) -> Mesh:
-    """The rope guard between hub and bearing."""
+    """Build the rope guard between hub and bearing."""
     r = 0.95 * propeller.hub_m
     ring = [(0.5 * r, 0), (1.05 * r, 0), (1.05 * r, 0.3), (0.9 * r, 0.33), (0.5 * r, 0.33)]
     return turn_aft(lathe(ring, material, 40)).translate(x=-propeller.hub_half_m - 0.35)
 
 
 def _rudder(rng: np.random.Generator, propeller: Propeller, clear_m: float, material: int, zinc: int) -> Mesh:
-    """A rudder with its stock, turned to one side."""
+    """Build a rudder with its stock, turned by a random angle."""
     chord_m = rng.uniform(0.95, 1.3)
     foot_m, head_m = -rng.uniform(0.45, 0.75) * propeller.radius_m, clear_m - 0.25
     angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
@@ -161,7 +164,7 @@ def _rudder(rng: np.random.Generator, propeller: Propeller, clear_m: float, mate
 
 
 def _anodes(sole: Stern, zinc: int) -> Mesh:
-    """Zinc anodes in rows on both sides, slightly above the propeller."""
+    """Build a row of zinc anodes on each side, slightly above the propeller."""
     x = np.linspace(-8, 1, 5)
     level = np.full(5, sole.water_m - 0.28)
     at = np.concatenate([sole.side_m(x, level, side) for side in (1, -1)])

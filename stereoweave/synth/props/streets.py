@@ -24,7 +24,7 @@ class StreetPlan:
     """Dimensions of a street.
 
     Attributes:
-        half_m: half of the carriageway's width.
+        half_m: half the width of the carriageway.
         pavement_m: width of each pavement.
         lane_m: y of the cameras' lane.
     """
@@ -47,7 +47,7 @@ def draw_street_plan(rng: np.random.Generator) -> StreetPlan:
 
 
 def carriageway(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mesh:
-    """Asphalt with markings, kerbs and pavements; the carriageway is at z = 0."""
+    """Build the carriageway at z = 0, with markings and raised pavements."""
     asphalt = palette.add(
         _ground(rng, str(rng.choice(["asphalt", "plain", "concrete"], p=[0.6, 0.25, 0.15])), 6.0)
     )
@@ -72,7 +72,10 @@ def carriageway(rng: np.random.Generator, palette: Palette, plan: StreetPlan) ->
 
 
 def fronts(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mesh:
-    """Two rows of houses with some gaps; at times one side is a fence with bushes and trees instead."""
+    """Build two rows of houses with some gaps.
+
+    In some draws, a fence with bushes and trees takes the place of one row.
+    """
     walls = [palette.add(draw_material_from(rng, _FRONTS, 12.0)) for _ in range(6)]
     glass = palette.add(Material(texture="plain", tint=(0.07, 0.09, 0.11), roughness=0.08))
     trim = palette.add(Material(texture="plain", tint=draw_muted_colour(rng, 0.2), roughness=0.7, relief=0.1))
@@ -96,7 +99,10 @@ def fronts(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mesh
 
 
 def traffic(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mesh:
-    """Vehicles: parked along both kerbs, at most one ahead in the lane, and up to two oncoming."""
+    """Build parked and moving vehicles.
+
+    Parked ones stand along both kerbs. At most one drives ahead of the cameras, and up to two are oncoming.
+    """
     kinds = [*fleet(rng, palette), *fleet(rng, palette)[:2]]
     cars = [kinds[k] for k in (0, 1, 4, 5)]
     poses = []
@@ -120,7 +126,7 @@ def traffic(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mes
 
 
 def walkers(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mesh:
-    """Two to ten people on the pavements, at times one crossing."""
+    """Build two to ten people, most of them on the pavements and a few crossing the street."""
     clothes = [draw_clothes(rng, palette) for _ in range(3)]
     people = []
     for _ in range(int(rng.integers(2, 11))):
@@ -134,7 +140,7 @@ def walkers(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mes
 
 
 def street_furniture(rng: np.random.Generator, palette: Palette, plan: StreetPlan) -> Mesh:
-    """Lamp posts, signs, bollards and trees on the pavements, in half of the draws overhead wires."""
+    """Build lamp posts and signs on the pavements and, in some draws, bollards, trees and wires."""
     steel = palette.add(galvanised_steel(rng))
     signs = [palette.add(draw_material_from(rng, ("sign", "paint", "plain"), 6.0)) for _ in range(2)]
     at_m = np.arange(rng.uniform(-8, 4), 80, rng.uniform(12, 26))
@@ -173,7 +179,10 @@ def _on_pavement(rng: np.random.Generator, plan: StreetPlan) -> float:
 def _house(
     rng: np.random.Generator, size_m: Float[np.ndarray, "3"], wall: int, glass: int, trim: int
 ) -> Mesh:
-    """A house from the origin along x and y, its front at y = 0: windows above doors or shops."""
+    """Build a house that extends from the origin along x and y, with its front at y = 0.
+
+    The front has windows above doors or shops.
+    """
     length_m, deep_m, high_m = (float(v) for v in size_m)
     block = boxes([[length_m / 2, deep_m / 2, high_m / 2 - 0.3]], [[length_m, deep_m, high_m + 0.6]], wall)
     cornice = boxes([[length_m / 2, 0, high_m - 0.15]], [[length_m, 0.5, 0.3]], trim)
@@ -194,7 +203,7 @@ def _house(
 
 
 def _panes(spots_m: list[tuple[float, float]], width_m: float, high_m: float, glass: int, trim: int) -> Mesh:
-    """Windows at (x, z) of a front; frames protrude from the wall, panes from the frames."""
+    """Build windows at (x, z) of a front; frames protrude from the wall, and panes from the frames."""
     centres = np.array([[x, 0, z] for x, z in spots_m])
     frames = boxes(centres, [width_m + 0.2, 0.1, high_m + 0.2], trim)
     panes = boxes(centres, [width_m, 0.16, high_m], glass)
@@ -203,7 +212,7 @@ def _panes(spots_m: list[tuple[float, float]], width_m: float, high_m: float, gl
 
 
 def _ridge(size_m: Float[np.ndarray, "3"], material: int) -> Mesh:
-    """A roof over a house, its ridge along x."""
+    """Build a roof over a house, with its ridge along x."""
     length_m, deep_m, high_m = (float(v) for v in size_m)
     outline = [(-0.3, high_m), (deep_m + 0.3, high_m), (deep_m / 2, high_m + 0.35 * deep_m)]
     upright = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -211,7 +220,7 @@ def _ridge(size_m: Float[np.ndarray, "3"], material: int) -> Mesh:
 
 
 def _green(rng: np.random.Generator, palette: Palette, plan: StreetPlan, side: int) -> Mesh:
-    """A fence along the pavement, with bushes and trees behind it."""
+    """Build a fence along the pavement, with bushes and trees behind it."""
     y = side * (plan.fronts_m + 0.3)
     line = np.array([[x, y, 0.0] for x in (_START_M / 2, 70.0)])
     x = np.arange(-10, 60, 3.0)
@@ -223,14 +232,14 @@ def _green(rng: np.random.Generator, palette: Palette, plan: StreetPlan, side: i
 
 
 def _lamp_post(x: float, y: float, inwards: float, steel: int) -> Mesh:
-    """A post with an arm over the carriageway."""
+    """Build a lamp post with an arm over the carriageway."""
     top, arm = [x, y, 6.2], [x, y + 1.3 * inwards, 6.5]
     post = tubes([[x, y, 0], top], [top, arm], [[0.09, 0.06], [0.05, 0.04]], steel, 10)
     return join_meshes([post, spheres([arm], [[0.12, 0.35, 0.08]], steel)])
 
 
 def _wires(rng: np.random.Generator, at_m: Float[np.ndarray, " n"], y: float, steel: int) -> Mesh:
-    """One to four wires sagging from post to post."""
+    """Build one to four wires that sag from post to post."""
     share = np.linspace(0, 1, 9)
     sag_m = rng.uniform(0.2, 0.6)
     wires = []
@@ -243,13 +252,13 @@ def _wires(rng: np.random.Generator, at_m: Float[np.ndarray, " n"], y: float, st
 
 
 def _sign(rng: np.random.Generator, steel: int, faces: list[int]) -> Mesh:
-    """A round, square or triangular sign on a post, facing the traffic."""
+    """Build a round, square or triangular sign on a post, facing the traffic."""
     high_m, half_m = rng.uniform(2.0, 2.8), rng.uniform(0.25, 0.45)
     corners = int(rng.choice([3, 4, 24]))
     angle = np.arange(corners) * 2 * np.pi / corners + np.pi / 2
     outline = half_m * np.stack([np.cos(angle), np.sin(angle)], -1)
     plate = prism(outline, 0.02, faces[int(rng.integers(len(faces)))])
-    # Maps the outline's x, y, z to across the street, up, and towards the traffic.
+    # Map the outline's x, y and z to across the street, up, and towards the traffic.
     facing = np.array([[0.0, 0, -1, -0.06], [-1, 0, 0, 0], [0, 1, 0, high_m - half_m], [0, 0, 0, 1]])
     post = tubes([[0, 0, 0]], [[0, 0, high_m]], 0.035, steel, 8)
     return join_meshes([post, plate.transform(rotation((0, 0, 1), rng.normal(0, 8)) @ facing)])

@@ -1,7 +1,7 @@
 """Surroundings of the targets: daylight, ground, water, trees, houses, and goods of yards and quays.
 
-Each function adds its materials to the palette. Objects stand at their spots, usually at z = 0, and extend
-slightly below, so that uneven ground hides their feet.
+Each function adds its materials to the palette. Objects stand at their spots, usually at z = 0, and most
+extend slightly below, so that uneven ground hides their feet.
 """
 
 from collections.abc import Sequence
@@ -74,7 +74,7 @@ def terrain(  # noqa: PLR0913 - family and dimensions
     bumps_m: float = 0.3,
     flat_radius_m: float = 5.0,
 ) -> Mesh:
-    """Ground that extends extent_m to each side, flat around the origin, with bumps of bumps_m beyond.
+    """Build ground that extends extent_m to each side, flat around the origin and bumpy farther out.
 
     family: texture family, one of "grass", "soil", "gravel", "asphalt", "concrete", or "plain" for sand and
     snow.
@@ -103,7 +103,7 @@ def terrain(  # noqa: PLR0913 - family and dimensions
 
 
 def sea(rng: np.random.Generator, palette: Palette, *, extent_m: float = 200.0, level_m: float = 0.0) -> Mesh:
-    """Water that extends extent_m to each side, with the highest waves near the origin."""
+    """Build water that extends extent_m to each side, with the highest waves near the origin."""
     tint: Colour = [(0.7, 0.75, 0.75), (0.8, 0.8, 0.65), (0.9, 0.8, 0.75)][int(rng.integers(3))]
     material = palette.add(
         Material(
@@ -128,7 +128,7 @@ def sea(rng: np.random.Generator, palette: Palette, *, extent_m: float = 200.0, 
 
 
 def hills(rng: np.random.Generator, palette: Palette, *, distance_m: float = 140.0) -> Mesh:
-    """A distant ring of wooded hills, 5 to 25 m high."""
+    """Build a distant ring of wooded hills with a crest up to about 16 m high."""
     material = palette.add(
         Material(
             texture="leaves",
@@ -156,8 +156,8 @@ def hills(rng: np.random.Generator, palette: Palette, *, distance_m: float = 140
 
 
 def draw_spots(rng: np.random.Generator, count: int, nearest_m: float, farthest_m: float) -> Spots:
-    """Draw spots [count, 3] at z = 0 in a ring around the origin, evenly spread and apart."""
-    # A jittered sunflower pattern: every spot has the same area.
+    """Draw spots [count, 3] at z = 0 that are spread evenly over a ring around the origin."""
+    # A jittered sunflower pattern gives every spot the same area.
     order = np.arange(count)
     ring = farthest_m**2 - nearest_m**2
     radius = np.sqrt(nearest_m**2 + ring * (order + rng.uniform(0.2, 0.8, count)) / max(count, 1))
@@ -171,7 +171,10 @@ def draw_spots(rng: np.random.Generator, count: int, nearest_m: float, farthest_
 def trees(
     rng: np.random.Generator, palette: Palette, spots: Spots, height_m: tuple[float, float] = (4, 9)
 ) -> Mesh:
-    """Broad and slender trees at the spots; height_m: minimum and maximum."""
+    """Build broad and slender trees at the spots.
+
+    height_m: minimum and maximum height.
+    """
     bark = palette.add(Material(texture="bark", variant=int(rng.integers(64)), span_m=1.5, relief=0.8))
     leaves = [_add_foliage(rng, palette) for _ in range(2)]
     kinds = [_tree(rng, bark, leaves[0], 0.42), _tree(rng, bark, leaves[1], 0.36), _fir(rng, bark, leaves[0])]
@@ -179,7 +182,7 @@ def trees(
 
 
 def bushes(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
-    """Bushes at the spots, 0.6 to 1.8 m high."""
+    """Build bushes at the spots, about 0.5 to 2 m high."""
     leaves = _add_foliage(rng, palette)
     middles = rng.uniform((-0.35, -0.35, 0.2), (0.35, 0.35, 0.6), (2, 3, 3))
     shapes = [_lumps(rng, places, (0.42, 0.42, 0.38), leaves) for places in middles]
@@ -188,27 +191,27 @@ def bushes(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
 
 
 def rocks(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
-    """Boulders at the spots, 0.3 to 1.5 m across, half sunk."""
+    """Build boulders at the spots, about 0.3 to 1.5 m across and half sunk."""
     stone = palette.add(Material(texture="stone", variant=int(rng.integers(64)), relief=0.7, roughness=0.9))
     kinds = [_lumps(rng, np.zeros((1, 3)), rng.uniform(0.3, 0.55, 3), stone) for _ in range(3)]
     return _scatter(rng, kinds, spots, rng.uniform(0.4, 1.5, len(spots)))
 
 
 def houses(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
-    """Houses of two kinds at the spots, 6 to 9 m high, with gable roofs, windows, doors and chimneys."""
+    """Build houses of two kinds at the spots, with gable roofs, windows, doors and chimneys."""
     kinds = [_house(rng, palette) for _ in range(2)]
     return _scatter(rng, kinds, spots, rng.uniform(0.9, 1.25, len(spots)))
 
 
 def posts(rng: np.random.Generator, palette: Palette, spots: Spots, height_m: float = 1.2) -> Mesh:
-    """Wooden posts at the spots."""
+    """Build wooden posts at the spots."""
     wood = palette.add(Material(texture="wood", variant=int(rng.integers(64)), tint=(1.0, 0.95, 0.9)))
     tops = spots + np.array([0, 0, height_m]) + rng.normal(0, 0.03, (len(spots), 3))
     return tubes(spots - [0, 0, 0.5], tops, rng.uniform(0.06, 0.1, len(spots)), wood, sides=8)
 
 
 def fence(rng: np.random.Generator, palette: Palette, corners_m: Spots) -> Mesh:
-    """A fence of posts and rails along corners [N, 3], with a post about every 2 m."""
+    """Build a fence of posts and rails along corners [N, 3], with a post about every 2 m."""
     steps = [
         np.linspace(a, b, max(int(np.linalg.norm(b - a) / 2), 1), endpoint=False)
         for a, b in zip(corners_m[:-1], corners_m[1:], strict=True)
@@ -224,7 +227,7 @@ def fence(rng: np.random.Generator, palette: Palette, corners_m: Spots) -> Mesh:
 
 
 def crates(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
-    """Wooden crates at the spots, some in stacks of two."""
+    """Build wooden crates at the spots, some in stacks of two."""
     wood = palette.add(Material(texture="wood", variant=int(rng.integers(64)), tint=(1.1, 1.02, 0.9)))
     frame = palette.add(Material(texture="wood", variant=int(rng.integers(64)), tint=(0.8, 0.7, 0.6)))
     lower = _crate(wood, frame)
@@ -235,7 +238,7 @@ def crates(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
 
 
 def pallets(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
-    """Stacks of one to four pallets at the spots."""
+    """Build single pallets and stacks of four at the spots."""
     wood = palette.add(Material(texture="wood", variant=int(rng.integers(64)), tint=(1.1, 1.0, 0.88)))
     boards = boxes([[0, y, 0.13] for y in np.linspace(-0.35, 0.35, 6)], (1.2, 0.1, 0.022), wood)
     beams = boxes([[x, 0, 0.06] for x in (-0.55, 0, 0.55)], (0.1, 0.8, 0.12), wood)
@@ -245,7 +248,7 @@ def pallets(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
 
 
 def barrels(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
-    """Steel drums at the spots, of two colours, 0.9 m high."""
+    """Build steel drums at the spots, painted or rusty and 0.9 m high."""
     profile = [(0, 0), (0.29, 0), (0.29, 0.3), (0.305, 0.31), (0.29, 0.32), (0.29, 0.58), (0.305, 0.59)]
     profile += [(0.29, 0.6), (0.29, 0.88), (0.27, 0.88), (0.27, 0.86), (0, 0.86)]
     kinds = [
@@ -256,7 +259,7 @@ def barrels(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
 
 
 def bollards(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
-    """Iron mooring bollards at the spots, 0.55 m high."""
+    """Build iron mooring bollards at the spots, 0.55 m high."""
     iron = palette.add(Material(texture="rust", variant=int(rng.integers(64)), tint=(0.75, 0.72, 0.7)))
     profile = [
         (0, 0),
@@ -272,7 +275,7 @@ def bollards(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
 
 
 def cones(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
-    """Traffic cones at the spots, with a white band, 0.55 m high."""
+    """Build traffic cones with a white band at the spots, 0.55 m high."""
     orange = palette.add(Material(texture="plain", tint=(0.8, 0.2, 0.06), roughness=0.6))
     white = palette.add(Material(texture="plain", tint=(0.85, 0.85, 0.85), roughness=0.5))
     below = lathe([(0.14, 0.03), (0.1, 0.2)], orange, 16)
@@ -285,7 +288,7 @@ def cones(rng: np.random.Generator, palette: Palette, spots: Spots) -> Mesh:
 def _scatter(
     rng: np.random.Generator, kinds: Sequence[Mesh], spots: Spots, scales: Float[np.ndarray, " n"]
 ) -> Mesh:
-    """Put one of the kinds at each spot, randomly rotated about z, and scaled."""
+    """Put one of the kinds at each spot, scaled and randomly rotated about z."""
     which = rng.integers(len(kinds), size=len(spots))
     angle = rng.uniform(0, 2 * np.pi, len(spots))
     poses = np.tile(np.eye(4), (len(spots), 1, 1))
@@ -298,7 +301,10 @@ def _scatter(
 
 
 def _widening_grid(extent_m: float, near_m: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates x and y [steps + 1, steps + 1] of a grid, fine within near_m and coarser outwards."""
+    """Return the x and y coordinates of a grid, each [steps + 1, steps + 1].
+
+    The grid is fine within near_m of the origin and coarser outwards.
+    """
     end = np.arcsinh(extent_m / near_m)
     axis = near_m * np.sinh(np.linspace(-end, end, steps + 1))
     x, y = np.meshgrid(axis, axis)
@@ -325,7 +331,7 @@ def _add_foliage(rng: np.random.Generator, palette: Palette) -> int:
 
 
 def _tree(rng: np.random.Generator, bark: int, leaves: int, spread: float) -> Mesh:
-    """A broad tree of height 1: a forked trunk, and lumps of foliage."""
+    """Build a broad tree of height 1, with a forked trunk and lumps of foliage."""
     fork = np.array([0, 0, 0.35])
     tips = rng.uniform((-0.2, -0.2, 0.6), (0.2, 0.2, 0.8), (4, 3))
     trunk = tubes([0, 0, -0.1], fork, [[0.04, 0.028]], bark, 7, capped=False)
@@ -336,7 +342,7 @@ def _tree(rng: np.random.Generator, bark: int, leaves: int, spread: float) -> Me
 
 
 def _fir(rng: np.random.Generator, bark: int, leaves: int) -> Mesh:
-    """A fir of height 1: stacked skirts of needles."""
+    """Build a fir of height 1, with stacked skirts of needles."""
     trunk = tubes([[0, 0, -0.1]], [[0, 0, 0.9]], np.array([[0.022, 0.005]]), bark, 6)
     skirts = []
     for z in np.linspace(0.15, 0.8, 6):
@@ -351,13 +357,13 @@ def _fir(rng: np.random.Generator, bark: int, leaves: int) -> Mesh:
 def _lumps(
     rng: np.random.Generator, centres_m: Spots, radii_m: Sequence[float] | np.ndarray, material: int
 ) -> Mesh:
-    """Uneven balls of foliage or stone."""
+    """Build uneven balls of foliage or stone."""
     radii = np.asarray(radii_m) * rng.uniform(0.8, 1.2, (len(centres_m), 1))
     return _perturb(rng, spheres(centres_m, radii, material, 1), 0.22)
 
 
 def _tufts(rng: np.random.Generator, crown: Mesh, count: int, size_m: float) -> Mesh:
-    """Twigs, one triangle each, that roughen the outline of a crown."""
+    """Build twigs, one triangle each, that roughen the outline of a crown."""
     pick = rng.integers(len(crown.material), size=count)
     normals = crown.normals[pick].mean(1, keepdims=True)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
@@ -384,7 +390,7 @@ def _perturb(rng: np.random.Generator, mesh: Mesh, share: float) -> Mesh:
 
 
 def _house(rng: np.random.Generator, palette: Palette) -> Mesh:
-    """A house about 8 m long, its ridge along x."""
+    """Build a house, 6 to 11 m long, with its ridge along x."""
     family = str(rng.choice(["brick", "plaster", "wood"]))
     tint = vary_colour(rng, (1.1, 1.04, 0.95) if family == "plaster" else (1.0, 0.96, 0.92))
     walls = palette.add(Material(texture=family, variant=int(rng.integers(64)), tint=tint, span_m=2.5))
@@ -418,7 +424,7 @@ def _gabled_walls(length: float, width: float, eaves: float, rise: float, materi
 
 
 def _roof(length: float, width: float, eaves: float, rise: float, material: int) -> Mesh:
-    """Two slabs that overhang the walls by 0.4 m."""
+    """Build two slabs that overhang the walls by 0.4 m."""
     slope = np.arctan2(rise, width / 2)
     across = width / 2 / np.cos(slope) + 0.4
     turns = np.stack([rotation((1, 0, 0), side * np.degrees(slope))[:3, :3] for side in (1, -1)])
@@ -427,7 +433,10 @@ def _roof(length: float, width: float, eaves: float, rise: float, material: int)
 
 
 def _openings(size_m: tuple[float, float, float], columns: int, glass: int, frame: int) -> Mesh:
-    """Rows of windows on long walls and gables, and a door; size_m: length, width, height of the eaves."""
+    """Build rows of windows on the long walls and the gables, and a door.
+
+    size_m: length, width, and height of the eaves.
+    """
     length, width, eaves = size_m
     floors = np.arange(1.5, eaves - 0.6, 2.6)
     along = np.linspace(-length / 2 + 1.2, length / 2 - 1.2, columns)
@@ -437,7 +446,7 @@ def _openings(size_m: tuple[float, float, float], columns: int, glass: int, fram
         [np.stack([x, side * width / 2, z], -1), np.stack([end * length / 2, y, z2], -1)]
     )
     thin = np.concatenate([np.tile([1.0, 0.1, 1.2], (len(x), 1)), np.tile([0.1, 1.0, 1.2], (len(y), 1))])
-    # Frames protrude less than panes, and these less than their bars, against z-fighting.
+    # Panes protrude more than frames, and glazing bars more than panes, which avoids z-fighting.
     frames = boxes(centres, thin + np.where(thin < 0.5, 0.0, 0.2), frame)
     panes = boxes(centres, np.where(thin < 0.5, 0.16, thin), glass)
     bars = boxes(centres, np.where(thin < 0.5, 0.22, [0.06, 0.06, 1.2]), frame)
@@ -446,7 +455,7 @@ def _openings(size_m: tuple[float, float, float], columns: int, glass: int, fram
 
 
 def _crate(wood: int, frame: int) -> Mesh:
-    """A crate of 1 m with battens along its edges."""
+    """Build a crate of 1 m with battens along its edges."""
     ends = np.array([(a, b) for a in (-0.47, 0.47) for b in (0.03, 0.97)])
     along_x = boxes(np.insert(ends, 0, 0, axis=1), (1.02, 0.1, 0.1), frame)
     along_y = boxes(np.insert(ends, 1, 0, axis=1), (0.1, 1.02, 0.1), frame)
@@ -471,6 +480,6 @@ def _scale_colour(colour: Colour, factor: float) -> Colour:
 
 
 def vary_colour(rng: np.random.Generator, colour: Colour) -> Colour:
-    """Vary a colour slightly in brightness and temperature."""
+    """Vary the brightness and temperature of a colour slightly."""
     red, green, blue = np.array(colour) * rng.uniform(0.85, 1.1) * rng.uniform(0.96, 1.04, 3)
     return float(red), float(green), float(blue)

@@ -1,6 +1,6 @@
 """Tables close to the cameras, with upright boards and a wall close behind.
 
-The cameras are towards x, the centre of their view is above the origin, and the floor is at z = 0.
+The cameras are towards +x, the centre of their view is above the origin, and the floor is at z = 0.
 """
 
 from dataclasses import dataclass
@@ -23,11 +23,11 @@ class TableTop:
     """Dimensions of a table.
 
     Attributes:
-        distance_m: from the cameras to the centre.
+        distance_m: distance from the cameras to the centre.
         height_m: height of the table's surface.
-        behind_m: from the centre to the wall behind, where the table ends.
-        before_m: from the centre to the front edge.
-        width_m: across the view.
+        behind_m: distance from the centre to the wall behind, where the table ends.
+        before_m: distance from the centre to the front edge.
+        width_m: width of the table across the view.
     """
 
     distance_m: float
@@ -38,7 +38,7 @@ class TableTop:
 
 
 def draw_table_top(rng: np.random.Generator) -> TableTop:
-    """Draw the dimensions of a table; most fill the picture's width."""
+    """Draw the dimensions of a table, which in most draws fills the image's width."""
     distance_m = rng.uniform(1.5, 2.3)
     return TableTop(
         distance_m=distance_m,
@@ -58,7 +58,7 @@ def table_top(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> Me
 
 
 def _table(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> Mesh:
-    """A slab on a narrower plinth."""
+    """Build a slab on a narrower plinth."""
     material = palette.add(draw_broad_material(rng, _TOPS, sizes.distance_m))
     length_m = sizes.behind_m + sizes.before_m
     x = (sizes.before_m - sizes.behind_m) / 2
@@ -69,7 +69,7 @@ def _table(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> Mesh:
 
 
 def _boards(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> list[Mesh]:
-    """Slightly leaning boards of at most two materials."""
+    """Build up to three slightly leaning boards of at most two materials."""
     materials = [palette.add(draw_broad_material(rng, _BOARDS, sizes.distance_m)) for _ in range(2)]
     boards = []
     for _ in range(int(rng.integers(0, 4))):
@@ -83,13 +83,13 @@ def _boards(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> list
 
 
 def _backdrop(rng: np.random.Generator, palette: Palette, sizes: TableTop) -> Mesh:
-    """A wall across the view, or two walls with a corner."""
+    """Build a wall across the view and, in some draws, a side wall at right angles to it."""
     material = palette.add(draw_broad_material(rng, _BACKDROPS, sizes.distance_m + sizes.behind_m))
     wide_m, high_m = sizes.distance_m * rng.uniform(1.4, 3.0), rng.uniform(1.3, 2.4)
     wall = boxes([[-0.03, 0, high_m / 2]], [[0.06, wide_m, high_m]], material)
     if rng.random() < 0.3:
         other = palette.add(draw_broad_material(rng, _BACKDROPS, sizes.distance_m + sizes.behind_m))
-        # It ends well in front of the cameras.
+        # The side wall ends before it reaches the cameras.
         deep_m = min(wide_m * rng.uniform(0.3, 0.6), sizes.behind_m + 0.35 * sizes.distance_m)
         side = boxes([[deep_m / 2, 0.0, high_m / 2]], [[deep_m, 0.06, high_m]], other)
         wall = join_meshes([wall, side.translate(y=rng.choice([-1, 1]) * rng.uniform(0.2, 0.45) * wide_m)])

@@ -11,14 +11,14 @@ from stereoweave.synth.world import Mesh, join_meshes
 
 
 def rods(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A few bars in random directions."""
+    """Build a few bars in random directions."""
     count = int(rng.integers(2, 8))
     ends_m = rng.uniform(-0.5, 0.5, (2, count, 3))
     return tubes(ends_m[0], ends_m[1], style.bar_m * rng.uniform(0.6, 1.8, count), style.main, 8)
 
 
 def bundle(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A bundle of slightly spreading bars, like reeds or a broom."""
+    """Build a bundle of slightly spreading bars, like reeds or a broom."""
     count = int(rng.integers(10, 40))
     feet_m = np.column_stack([rng.normal(0, 0.1, (count, 2)), np.zeros(count)])
     spread = np.column_stack([rng.normal(0, 0.15, (count, 2)), rng.uniform(0.6, 1.0, count)])
@@ -26,7 +26,7 @@ def bundle(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def wire_frame(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """The edges of a box, with balls at its corners and at times diagonals."""
+    """Build the edges and some face diagonals of a box, with balls at its corners."""
     corners = np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * rng.uniform(0.4, 1.0, 3)
     apart = [(a, b) for a in range(8) for b in range(a) if (a ^ b).bit_count() <= rng.integers(1, 3)]
     pairs = np.array(apart)
@@ -35,7 +35,7 @@ def wire_frame(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def bar_grid(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A 3-D grid of bars along three axes."""
+    """Build a three-dimensional grid of bars."""
     counts = rng.integers(2, 5, 3)
     size_m = rng.uniform(0.4, 1.0, 3)
     sets = []
@@ -48,7 +48,7 @@ def bar_grid(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def thin_fence(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A fence of pickets, or of wire mesh in a frame."""
+    """Build a framed fence of pickets and rails, coarse or as fine as wire mesh."""
     height_m = rng.uniform(0.5, 1.0)
     x, z = np.linspace(-0.5, 0.5, rng.integers(6, 24)), np.linspace(0, height_m, rng.integers(2, 12))
     upright = tubes(_points(x, 0 * x), _points(x, 0 * x + height_m), style.bar_m, style.main, 5)
@@ -58,7 +58,7 @@ def thin_fence(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def wheel(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A rim with a hub and spokes."""
+    """Build a rim with a hub and spokes."""
     angle = np.linspace(0, 2 * np.pi, 37)
     rim_m = 0.48 * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], -1)
     spokes = rim_m[: -1 : int(rng.choice([1, 2, 3, 6]))]
@@ -72,7 +72,7 @@ def wheel(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def spring(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A coil spring."""
+    """Build a coil spring."""
     share = np.linspace(0, 1, 120)
     angle = 2 * np.pi * rng.uniform(3, 8) * share
     radius_m = rng.uniform(0.1, 0.35) * (1 + rng.uniform(-0.6, 0.4) * share)
@@ -81,7 +81,7 @@ def spring(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def branch(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A bare branch that forks four times."""
+    """Build a bare branch that forks four times."""
     starts, directions = np.zeros((1, 3)), np.array([[0.0, 0.0, 0.32]])
     levels = []
     for level in range(5):
@@ -95,14 +95,14 @@ def branch(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def loose_wires(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Wires along similar random curves."""
+    """Build wires along similar random curves."""
     main_m = wander_m(rng, 20)
     aside_m = rng.normal(0, 0.08, (int(rng.integers(2, 5)), 1, 3)) * np.linspace(0.2, 1, 20)[:, None]
     return join_meshes(sweep(main_m + aside, style.bar_m, style.main, 6) for aside in aside_m)
 
 
 def mobile(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """Balls on threads from a bar."""
+    """Build a bar from which balls hang on threads."""
     count = int(rng.integers(3, 9))
     x, drop_m = np.linspace(-0.45, 0.45, count), rng.uniform(0.15, 0.9, count)
     lower = _points(x, -drop_m)
@@ -116,7 +116,7 @@ def mobile(rng: np.random.Generator, style: PropStyle) -> Mesh:
 
 
 def lattice_mast(rng: np.random.Generator, style: PropStyle) -> Mesh:
-    """A slender lattice mast of three legs with zigzag bracing."""
+    """Build a slender lattice mast with three legs and a diagonal in each panel."""
     angle, z = np.arange(3) * 2 * np.pi / 3, np.linspace(0, 1, int(rng.integers(5, 12)))
     feet = np.stack([np.cos(angle), np.sin(angle)], -1) * rng.uniform(0.06, 0.16)
     rings = np.concatenate(

@@ -1,4 +1,4 @@
-"""Steel truss bridges: fixed girders, and lift bridges. The road runs along x."""
+"""Steel truss bridges, fixed or lifting. The road runs along x."""
 
 import numpy as np
 from jaxtyping import Float
@@ -11,11 +11,11 @@ from stereoweave.synth.world import Material, Mesh, join_meshes
 
 Joints = Float[np.ndarray, "_ 3"]
 
-_TOWER_M = 0.5  # along the road
+_TOWER_M = 0.5  # length of a tower along the road
 
 
 def truss_bridge(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
-    """One or two spans between piers, with straight or curved upper chords."""
+    """Build a bridge of one or two truss spans with straight or curved upper chords."""
     count = int(rng.integers(1, 3))
     length_m = 2 * plan.half_m / count
     panels = 2 * int(rng.integers(4, 7)) if count == 1 else 2 * int(rng.integers(3, 5))
@@ -29,7 +29,10 @@ def truss_bridge(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -
 
 
 def lift_bridge(rng: np.random.Generator, palette: Palette, plan: BridgePlan) -> Mesh:
-    """A truss span between two lattice towers, at times raised, with counterweights, ropes and sheaves."""
+    """Build a lift bridge: a truss span between two lattice towers, raised in some draws.
+
+    The towers have counterweights, ropes and sheaves.
+    """
     gap_m, height_m = rng.uniform(1.5, 1.8), rng.uniform(2.3, 2.8)
     raised_m = rng.uniform(0.3, 1.1) * float(rng.random() < 0.6)
     lifted = join_meshes(
@@ -52,7 +55,7 @@ def lift_bridge(rng: np.random.Generator, palette: Palette, plan: BridgePlan) ->
 def _span(  # noqa: PLR0913 - dimensions
     rng: np.random.Generator, plan: BridgePlan, length_m: float, panels: int, height_m: float, crown: float
 ) -> Mesh:
-    """Two trusses, bracing over the road and beams under it, around x = 0; the road is at z = 0.
+    """Build two trusses, bracing over the road and beams under it, around x = 0; the road is at z = 0.
 
     crown: additional height in the middle, as a share of the height.
     """
@@ -77,7 +80,7 @@ def _span(  # noqa: PLR0913 - dimensions
 
 
 def _plane(plan: BridgePlan, low: Joints, top: Joints, braced: str) -> Mesh:
-    """One truss: chords, end posts, verticals, diagonals, gusset plates."""
+    """Build one truss: chords, end posts, verticals, diagonals and gusset plates."""
     count = len(top)
     chords = beams(
         np.concatenate([low[:-1], top[:-1]]), np.concatenate([low[1:], top[1:]]), (0.07, 0.085), plan.steel
@@ -100,11 +103,14 @@ def _plane(plan: BridgePlan, low: Joints, top: Joints, braced: str) -> Mesh:
 
 
 def _lift_tower(plan: BridgePlan, height_m: float, raised_m: float, concrete: int) -> Mesh:
-    """A tower around the road, with the span at smaller x; its counterweight is down when the span is up."""
+    """Build a tower around the road, next to a lift span at smaller x.
+
+    Its counterweight is down when the span is up.
+    """
     z = np.linspace(-0.12, height_m, 9)
     frame = truss(mast_rings(z, _TOWER_M, 4) * [1, 2 * plan.side_m / _TOWER_M, 1], "cross")
     others = np.concatenate([frame.struts, frame.braces])
-    # The two faces across the road stay open.
+    # The two faces that the road passes through stay open.
     along_road, overhead = abs(np.diff(others[..., 1], axis=1))[:, 0] < 1e-6, others[..., 2].min(1) > 0.5
     steel = [
         beams(frame.legs[:, 0], frame.legs[:, 1], (0.07, 0.07), plan.steel),
@@ -117,7 +123,7 @@ def _lift_tower(plan: BridgePlan, height_m: float, raised_m: float, concrete: in
 
 
 def _hoist(plan: BridgePlan, height_m: float, raised_m: float, weight_m: float) -> Mesh:
-    """Two sheaves on top of a tower, with ropes from the span to the counterweight."""
+    """Build two sheaves on top of a tower, with ropes from the span to the counterweight."""
     groove = [(0.03, -0.03), (0.24, -0.03), (0.22, 0), (0.24, 0.03), (0.03, 0.03)]
     wheel = lathe(groove, plan.steel, 28).transform(rotation((1, 0, 0), 90))
     y, top_m = np.array([-0.6, 0.6]) * plan.side_m, height_m + 0.3
@@ -134,7 +140,7 @@ def _hoist(plan: BridgePlan, height_m: float, raised_m: float, weight_m: float) 
 
 
 def _cabin(plan: BridgePlan, glass: int) -> Mesh:
-    """The operator's cabin at the side of a tower."""
+    """Build the operator's cabin at the side of a tower."""
     at_y = -plan.side_m - 0.2
     return join_meshes(
         [

@@ -1,4 +1,4 @@
-"""Cars, lorries and buses in real size, along x on z = 0."""
+"""Cars, lorries and buses at real size, pointing along x and standing on z = 0."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ _PAINTS: tuple[Colour, ...] = (
 
 
 def fleet(rng: np.random.Generator, palette: Palette) -> list[Mesh]:
-    """Two cars, a lorry and a bus in random colours."""
+    """Build two cars, a lorry and a bus in random colours."""
     glass = palette.add(Material(texture="plain", tint=(0.06, 0.08, 0.1), roughness=0.1))
     tyre = palette.add(Material(texture="plain", tint=(0.04, 0.04, 0.045), roughness=0.9))
     first, second, third = (

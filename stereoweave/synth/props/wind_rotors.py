@@ -9,7 +9,7 @@ from stereoweave.synth.props.lattice import bars, railing
 from stereoweave.synth.props.primitives import boxes, copies, lathe, loft, rotation, spheres
 from stereoweave.synth.world import Material, Mesh, join_meshes
 
-STATIONS = 22  # along a blade
+STATIONS = 22  # cross-sections along a blade
 OVERHANG_M = 0.34  # from the tower's axis to the rotor's plane
 
 
@@ -18,7 +18,7 @@ class Rotor:
     """Dimensions of a rotor around x; upwind is +x.
 
     Attributes:
-        radius_m: from the axis to the tips.
+        radius_m: distance from the axis to the tips.
         chord_m: greatest width of a blade.
         pitch_deg: angle between blades and rotor plane; 90 is feathered.
         angle_deg: angle of the first blade from vertical.
@@ -34,7 +34,10 @@ class Rotor:
 
 @dataclass(frozen=True, kw_only=True)
 class TurbineMaterials:
-    """Materials of a wind turbine; `tip` marks bands near the tips and may equal `white`."""
+    """Materials of a wind turbine.
+
+    `tip` colours the bands near the blade tips and may equal `white`.
+    """
 
     white: int
     tip: int
@@ -44,7 +47,7 @@ class TurbineMaterials:
 
 
 def composite_skin(rng: np.random.Generator) -> Material:
-    """White or light grey skin of blades and towers, slightly dirty."""
+    """Draw the white or light grey skin of blades and towers, slightly dirty."""
     grey = rng.uniform(0.68, 0.85)
     return Material(
         texture="plain",
@@ -57,7 +60,10 @@ def composite_skin(rng: np.random.Generator) -> Material:
 
 
 def turbine_head(rotor: Rotor, materials: TurbineMaterials, around: int = 18) -> Mesh:
-    """Nacelle, hub and blades above the tower's top at the origin; `around`: points per blade section."""
+    """Build nacelle, hub and blades above the top of the tower, which is at the origin.
+
+    around: points per blade section.
+    """
     blades = copies(_blade(rotor, materials, around), _turns(rotor.angle_deg, 3))
     turning = join_meshes([blades, _hub(rotor, materials)]).translate(OVERHANG_M)
     return (
@@ -72,7 +78,10 @@ def _turns(angle_deg: float, count: int) -> Float[np.ndarray, "n 4 4"]:
 
 
 def _blade(rotor: Rotor, materials: TurbineMaterials, around: int) -> Mesh:
-    """A blade along z: round root, widest at a fifth of its length, twisted, bent upwind."""
+    """Build a twisted blade along z that bends upwind.
+
+    It has a round root and is widest at a fifth of its length.
+    """
     share = np.linspace(0, 1, STATIONS)
     radius = 0.05 * rotor.radius_m + 0.95 * rotor.radius_m * share
     root = 0.3 * rotor.chord_m
@@ -82,7 +91,7 @@ def _blade(rotor: Rotor, materials: TurbineMaterials, around: int) -> Mesh:
     chord = root + grown * (taper - root)
     thickness = root + grown * (np.interp(share, (0, 0.2, 0.5, 1), (1, 0.3, 0.2, 0.14)) * taper - root)
     angle = np.arange(around) * 2 * np.pi / around
-    # A circle at the root; farther out each section thins from its thickest point to the trailing edge.
+    # Sections are circles at the root; farther out they thin from the thickest point to the trailing edge.
     belly = 1 - grown[:, None] * 0.45 * (1 - np.cos(angle))
     along = chord[:, None] * (np.cos(angle) / 2 - 0.2 * grown[:, None])
     across = thickness[:, None] * np.sin(angle) / 2 * belly
@@ -98,7 +107,7 @@ def _blade(rotor: Rotor, materials: TurbineMaterials, around: int) -> Mesh:
 
 
 def _hub(rotor: Rotor, materials: TurbineMaterials) -> Mesh:
-    """Spinner, pointing upwind, and collars around the blades' roots."""
+    """Build a spinner that points upwind, and collars around the roots of the blades."""
     size = max(0.06 * rotor.radius_m, 0.12)
     profile = np.array(
         [(0, -1.0), (0.95, -1.0), (1.0, -0.5), (1.0, 0.3), (0.86, 0.85), (0.55, 1.25), (0.2, 1.42), (0, 1.45)]
@@ -117,7 +126,7 @@ def _hub(rotor: Rotor, materials: TurbineMaterials) -> Mesh:
 
 
 def _nacelle(materials: TurbineMaterials) -> Mesh:
-    """A rounded nacelle with cooler, railing, wind vanes, lightning rod and lamps."""
+    """Build a rounded nacelle with cooler, railing, wind vanes, lightning rod and lamps."""
     x = np.array([0.24, 0.21, 0.1, -0.25, -0.5, -0.62, -0.65])
     half = np.array([0.1, 0.135, 0.15, 0.155, 0.145, 0.12, 0.08])
     angle = np.arange(24) * 2 * np.pi / 24
