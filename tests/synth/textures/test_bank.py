@@ -23,7 +23,7 @@ from stereoweave.synth.textures.tiling import (
     voronoi_cells,
 )
 
-# As surfaces outdoors have it: linear mean colour, black 0 and white 1.
+# Mean colour of outdoor surfaces in linear light, from 0 (black) to 1 (white).
 ALBEDO = {
     "asphalt": (0.05, 0.12),
     "bark": (0.07, 0.15),
@@ -39,7 +39,7 @@ ALBEDO = {
     "stone": (0.14, 0.32),
     "water": (0.01, 0.05),
 }
-# The greatest median of HSV saturation, 0..1; a fire engine has 0.9, a ripe lemon 0.8.
+# Upper limits of the median HSV saturation, 0..1. A fire engine has 0.9, and a ripe lemon 0.8.
 SATURATION = {"asphalt": 0.1, "concrete": 0.12, "paint": 0.1, "plain": 0.05, "sky": 0.01, "steel": 0.1}
 MUTED = 0.6
 
@@ -52,7 +52,7 @@ def layers(*left_out):
 
 
 def slope(grey):
-    """By which power of the frequency the amplitude falls, between 4 and 128 waves a side."""
+    """Return the exponent with which amplitude falls with frequency, from 4 to 128 waves per side."""
     amplitude = np.abs(np.fft.fft2(grey - grey.mean()))
     frequency = np.hypot(np.fft.fftfreq(SIDE)[:, None], np.fft.fftfreq(SIDE)) * SIDE
     edges = np.geomspace(4, 128, 11)
@@ -62,7 +62,7 @@ def slope(grey):
 
 
 def greatest_seam(pixels):
-    """The mean step across a border, over the largest mean step from one line to the next inside."""
+    """Return the mean step across a border, relative to the largest mean step between lines inside."""
     image = pixels.astype(np.float32)
     seams = []
     for axis in (0, 1):
@@ -72,14 +72,14 @@ def greatest_seam(pixels):
     return max(seams)
 
 
-def test_every_layer_is_a_texture_of_its_own():
+def test_every_layer_is_a_different_texture():
     count = sum(len(family.variants) for family in FAMILIES.values())
     assert texture_bank().pixels.shape == (count, 512, 512, 4)
     assert texture_bank().pixels.dtype == np.uint8
     assert len({pixels.tobytes() for _, pixels in layers()}) == count
 
 
-def test_layers_are_found_by_family_and_variant_counted_on_past_the_last():
+def test_layers_are_found_by_family_and_by_variant_modulo_the_familys_size():
     np.testing.assert_array_equal(
         texture_bank().pixels[texture_bank().layer("brick", 1)], draw_texture("brick", 1)
     )
@@ -92,22 +92,22 @@ def test_layers_are_found_by_family_and_variant_counted_on_past_the_last():
     assert places == list(range(len(texture_bank().pixels)))
 
 
-def test_an_unknown_family_is_named_with_those_there_are():
+def test_an_unknown_family_is_an_error_that_lists_the_known_ones():
     with pytest.raises(StereoweaveError, match="texture: expected one of rust, paint, .*, found 'marmalade'"):
         texture_bank().layer("marmalade", 0)
 
 
-def test_every_texture_goes_on_at_its_other_side():
+def test_every_texture_tiles():
     seams = {name: greatest_seam(pixels) for name, pixels in layers()}
     assert {name: seam for name, seam in seams.items() if seam > 1.1} == {}
 
 
 @pytest.mark.parametrize("family", ["rust", "leaves", "stone", "water", "photograph"])
-def test_a_part_of_a_texture_does_not_go_on_at_its_other_side(family):
+def test_a_part_of_a_texture_does_not_tile(family):
     assert greatest_seam(texture_bank().pixels[texture_bank().layer(family, 0), :400, :400]) > 1.3
 
 
-def test_there_is_structure_at_every_scale_as_in_photographs():
+def test_textures_have_structure_at_every_scale_as_photographs_do():
     slopes = {name: slope(pixels[..., :3].mean(-1)) for name, pixels in layers("photograph")}
     assert {name: found for name, found in slopes.items() if not 0.5 < found < 1.6} == {}
 
@@ -127,7 +127,7 @@ def test_surfaces_are_as_light_and_dark_as_in_nature():
         assert low < light.mean() < high, name
 
 
-def test_surfaces_lose_next_to_nothing_in_black_and_white():
+def test_few_texels_of_surfaces_are_clipped_to_black_or_white():
     for name, pixels in layers("sky", "sign", "photograph"):
         grey = pixels[..., :3].mean(-1)
         assert ((grey < 1) | (grey > 254)).mean() < 0.04, name
@@ -141,14 +141,14 @@ def test_the_sky_is_grey_and_has_no_height():
 
 
 def test_mortar_lies_lower_than_bricks():
-    # 20 courses: a joint at each multiple of 25.6 rows, the middle of a brick 12.8 below.
+    # With 20 courses, joints are at multiples of 25.6 rows, and the middles of bricks 12.8 rows below them.
     for variant in range(4):
         height = texture_bank().pixels[texture_bank().layer("brick", variant), ..., 3].mean(axis=1)
         joints = np.round(np.arange(20) * 25.6).astype(int)
         assert height[joints].mean() < height[joints + 13].mean() - 40
 
 
-def test_where_paint_came_off_it_is_darker_and_lower():
+def test_chips_in_paint_are_darker_and_lower_than_the_paint():
     for variant in range(4):
         pixels = texture_bank().pixels[texture_bank().layer("paint", variant)]
         chips = pixels[..., 3] < 90
@@ -166,7 +166,7 @@ def test_another_process_draws_the_same_bytes(family, variant):
     assert there.strip() == hashlib.sha256(draw_texture(family, variant).tobytes()).hexdigest()
 
 
-def test_only_photographs_of_known_licence_are_used():
+def test_all_photographs_have_a_known_licence():
     used = {procedure.args[0] for procedure in FAMILIES["photograph"].variants}
     assert used <= set(PHOTOGRAPHS)
 
@@ -178,7 +178,7 @@ def test_importing_the_textures_does_not_import_scikit_image():
 
 @pytest.fixture
 def small_bank(tmp_path, monkeypatch):
-    """The cache folder of a bank of one texture, and a list that grows each time it is drawn."""
+    """Return the cache folder of a bank of one texture, and a list that grows with each drawing."""
     drawn, (plain, *_) = [], FAMILIES["plain"].variants
 
     def once(rng):
@@ -191,11 +191,11 @@ def small_bank(tmp_path, monkeypatch):
 
 
 def fresh_bank():
-    """The bank of a new process."""
+    """Return the bank as a new process would see it."""
     return texture_bank.__wrapped__().pixels
 
 
-def test_a_kept_bank_is_read_and_not_drawn_again(small_bank):
+def test_a_cached_bank_is_read_and_not_drawn_again(small_bank):
     folder, drawn = small_bank
     first = fresh_bank()
     assert [file.suffix for file in folder.iterdir()] == [".rgba"]
@@ -214,7 +214,7 @@ def test_a_kept_bank_is_read_and_not_drawn_again(small_bank):
     ],
     ids=["empty", "four zeros", "cut", "grown", "one bit"],
 )
-def test_a_damaged_file_is_made_anew(small_bank, damage):
+def test_a_damaged_file_is_replaced(small_bank, damage):
     folder, drawn = small_bank
     first = fresh_bank()
     (file,) = folder.iterdir()
@@ -225,7 +225,7 @@ def test_a_damaged_file_is_made_anew(small_bank, damage):
     assert file.read_bytes() == whole
 
 
-def test_a_bank_of_other_code_is_drawn_anew_and_banks_of_last_month_are_removed(small_bank, monkeypatch):
+def test_changed_code_draws_a_new_bank_and_removes_banks_older_than_a_month(small_bank, monkeypatch):
     folder, drawn = small_bank
     month_s = 31 * 24 * 60 * 60
     for version, age_s in [("oldest", 2 * month_s), ("old", 0), ("new", 0)]:
@@ -237,7 +237,7 @@ def test_a_bank_of_other_code_is_drawn_anew_and_banks_of_last_month_are_removed(
     assert sorted(file.name for file in folder.iterdir()) == ["new.rgba", "old.rgba"]
 
 
-def test_where_nothing_can_be_kept_the_bank_is_there_all_the_same(small_bank):
+def test_the_bank_is_drawn_if_it_cannot_be_cached(small_bank):
     folder, drawn = small_bank
     folder.write_text("a file where the folder should be")
     np.testing.assert_array_equal(fresh_bank(), fresh_bank())
@@ -245,7 +245,7 @@ def test_where_nothing_can_be_kept_the_bank_is_there_all_the_same(small_bank):
 
 
 @pytest.mark.parametrize("exponent", [0.5, 1.0, 1.5])
-def test_noise_has_the_spectrum_that_was_asked_for(rng, exponent):
+def test_noise_has_the_requested_spectrum(rng, exponent):
     values = noise(rng, exponent)
     assert abs(slope(values) - exponent) < 0.1
     assert abs(values.mean()) < 1e-4
@@ -257,8 +257,8 @@ def test_stretched_noise_is_longer_than_wide(rng):
     assert np.abs(np.diff(values, axis=0)).mean() < 0.5 * np.abs(np.diff(values, axis=1)).mean()
 
 
-def test_cells_are_those_of_the_nearest_site(rng):
-    # Without jitter the cells are squares of 64 texels; their rims are 32 from their middles.
+def test_each_texel_belongs_to_the_cell_of_its_nearest_site(rng):
+    # Without jitter, the cells are squares of 64 texels, so their middles are 32 texels from the border.
     found = voronoi_cells(rng, 8, 8, jitter=0)
     assert found.number == 64
     assert (found.label[1:63, 1:63] == found.label[32, 32]).all()
@@ -267,7 +267,7 @@ def test_cells_are_those_of_the_nearest_site(rng):
     np.testing.assert_array_equal(found.per_texel(np.arange(64)), found.label)
 
 
-def test_what_is_painted_over_a_border_comes_out_at_the_other_side():
+def test_polygons_across_a_border_continue_at_the_opposite_one():
     canvas = np.zeros((SIDE, SIDE, 4), np.uint8)
     square = np.array([[[-10.0, 100.0], [10.0, 100.0], [10.0, 120.0], [-10.0, 120.0]]])
     paint_polygons(canvas, square, np.array([[200.0, 150.0, 100.0, 50.0]]))
@@ -276,12 +276,12 @@ def test_what_is_painted_over_a_border_comes_out_at_the_other_side():
     assert not canvas[110, 20 : SIDE - 20].any()
 
 
-def test_what_runs_down_keeps_its_amount_and_goes_on_at_the_top():
+def test_smearing_keeps_the_sum_and_continues_at_the_top():
     source = np.zeros((SIDE, SIDE), np.float32)
     source[SIDE - 1, 7] = 1
     run = smear_down(source, 30)
     assert abs(run.sum() - 1) < 1e-4
-    # After 30 texels 1 / e is left.
+    # After 30 texels, 1 / e of the strength is left.
     assert abs(run[29, 7] / run[SIDE - 1, 7] - np.exp(-1)) < 1e-3
 
 
@@ -293,7 +293,7 @@ def test_blur_keeps_the_mean_and_crosses_the_border():
     assert abs(soft[-1, -1] - soft[1, 1]) < 1e-7
 
 
-def test_steps_lines_and_mixtures():
+def test_smoothsteps_line_distances_and_mixtures_have_known_values():
     values = np.array([[0.0, 1.5], [2.0, 9.0]], np.float32)
     np.testing.assert_allclose(smoothstep(1, 2, values), [[0, 0.5], [1, 1]])
     np.testing.assert_allclose(smoothstep(2, 1, values), [[1, 0.5], [0, 0]])
