@@ -23,7 +23,7 @@ def test_a_house_encloses_its_frustum_and_its_roof():
     assert mesh.corners_m[..., 2].max() == pytest.approx(1.05)
 
 
-def test_panes_are_12_mm_before_the_wall_and_their_frames_6_mm():
+def test_panes_are_12_mm_in_front_of_the_wall_and_their_frames_6_mm():
     wall = np.array([(0.0, 0, 0), (4, 0, 0), (4, 0, 2), (0, 0, 2)])  # seen from -y
     row = windows(wall, 3, (0.4, 0.8), PAINTS)
     panes, frames = (row.corners_m[row.material == paint] for paint in (PAINTS.glass, PAINTS.dark))

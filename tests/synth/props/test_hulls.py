@@ -14,7 +14,7 @@ def test_the_keel_is_a_draft_below_the_water_and_rises_at_the_stern():
     np.testing.assert_allclose(HULL.keel_m(np.array([0.0, 0.5, 1.0])), [-0.45, -0.9, -0.9])
 
 
-def test_amidships_the_edge_is_half_a_beam_away():
+def test_the_edge_amidships_is_half_a_beam_from_the_centre_line():
     np.testing.assert_allclose(HULL.side_m(0.42, 0.7, 1), (-0.64, 1.22, 0.7), atol=0.002)
 
 
@@ -42,7 +42,7 @@ def test_paints_meet_at_the_waterline_and_at_the_stripes_edge():
     ]
 
 
-def test_the_skin_looks_outwards_and_holds_the_water_off():
+def test_the_skins_normals_and_triangles_face_outwards():
     skin = HULL.skin(0, 1, 2)
     middles = skin.corners_m.mean(1)
     side = np.abs(skin.normals[..., 1].mean(1)) > 0.3
@@ -52,7 +52,7 @@ def test_the_skin_looks_outwards_and_holds_the_water_off():
     assert agree.mean() > 0.99
 
 
-def test_the_deck_is_as_much_below_the_edge_as_the_bulwark_is_high():
+def test_the_deck_is_below_the_edge_by_the_height_of_the_bulwark():
     deck = HULL.deck(0, 1, 2)
     floor = deck.corners_m[deck.material == 0].reshape(-1, 3)
     middle = floor[np.abs(floor[:, 0] + 0.64) < 0.2]
@@ -62,13 +62,13 @@ def test_the_deck_is_as_much_below_the_edge_as_the_bulwark_is_high():
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_a_plate_lies_on_the_skin_12_mm_before_it_and_reads_from_the_left(side):
+def test_a_plate_is_12_mm_in_front_of_the_skin_and_reads_from_the_left(side):
     plate = HULL.patch((48, 54), (3, 5), side, 7)
     skin = HULL.skin(0, 1, 2).corners_m.reshape(-1, 3)
     gaps = np.linalg.norm(plate.corners_m.reshape(-1, 1, 3) - skin[None], axis=-1).min(1)
     np.testing.assert_allclose(gaps, 0.012, atol=1e-4)
     assert (plate.normals[..., 1] * side > 0).all()
-    # Seen from outside, letters go to the bow on starboard and to the stern on port, and stand upright.
+    # Letters run towards the bow on starboard and towards the stern on port, and stand upright.
     x, z = plate.corners_m[..., 0].ravel(), plate.corners_m[..., 2].ravel()
     u, v = plate.uv_m[..., 0].ravel(), plate.uv_m[..., 1].ravel()
     assert np.corrcoef(u, -side * x)[0, 1] > 0.99

@@ -28,7 +28,7 @@ SQUARE = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 
 
 def volume(mesh: Mesh) -> float:
-    """Of a closed surface whose corners are counter-clockwise from outside; negative if inside out."""
+    """Return the volume of a closed surface, which is negative if the surface is inside out."""
     a, b, c = mesh.corners_m.astype(float).swapaxes(0, 1)
     return float((a * np.cross(b, c)).sum() / 6)
 
@@ -62,27 +62,27 @@ PIECES = {
 
 
 @pytest.mark.parametrize("name", PIECES)
-def test_it_encloses_the_volume_of_the_formula(name):
+def test_a_piece_encloses_the_volume_that_the_formula_gives(name):
     mesh, expected = PIECES[name]
     assert volume(mesh) == pytest.approx(expected, rel=0.005)
 
 
 @pytest.mark.parametrize("name", PIECES)
-def test_its_normals_are_unit_vectors_that_point_outwards(name):
+def test_normals_are_unit_vectors_that_point_outwards(name):
     mesh, _ = PIECES[name]
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=-1), 1, atol=1e-6)
     assert (faces(mesh)[:, None] * mesh.normals).sum(-1).min() > 0
 
 
 @pytest.mark.parametrize("name", PIECES)
-def test_it_comes_as_float32_of_its_material_and_not_yet_a_target(name):
+def test_a_piece_is_float32_has_its_material_and_is_not_a_target(name):
     mesh, _ = PIECES[name]
     assert {mesh.corners_m.dtype, mesh.normals.dtype, mesh.uv_m.dtype} == {np.dtype(np.float32)}
     assert not mesh.material.any()
     assert not mesh.target.any()
 
 
-def test_a_tube_without_caps_is_its_wall_alone():
+def test_a_tube_without_caps_is_only_its_wall():
     wall = tubes([0, 0, 0], [0, 0, 2], 0.5, 0, sides=128, capped=False)
     assert area(wall) == pytest.approx(2 * np.pi, rel=0.001)
 
@@ -92,12 +92,12 @@ def test_the_caps_of_a_tube_are_two_discs():
     assert whole == pytest.approx(2 * np.pi + 2 * np.pi * 0.25, rel=0.001)
 
 
-def test_the_texture_goes_along_a_tube_in_metres():
+def test_texture_coordinates_of_a_tube_are_in_metres():
     wall = tubes([0, 0, 0], [0, 0, 2.5], 0.5, 0, sides=128, capped=False)
     np.testing.assert_allclose(np.ptp(wall.uv_m.reshape(-1, 2), axis=0), (np.pi, 2.5), rtol=1e-5)
 
 
-def test_a_box_turned_by_a_quarter_swaps_length_and_breadth():
+def test_a_box_rotated_by_90_degrees_swaps_length_and_breadth():
     box = boxes([1, 0, 0], [4, 2, 1], 0, rotation((0, 0, 1), 90)[None, :3, :3])
     corners = box.corners_m.reshape(-1, 3)
     np.testing.assert_allclose((corners.min(0), corners.max(0)), [(0, -2, -0.5), (2, 2, 0.5)], atol=1e-6)
@@ -125,7 +125,7 @@ def test_an_open_loft_lacks_its_two_ends():
     assert area(loft(rings, 0)) - area(loft(rings, 0, capped=False)) == pytest.approx(2 * np.pi, rel=0.002)
 
 
-def test_a_sheet_with_x_along_columns_and_y_along_rows_looks_up():
+def test_a_sheet_with_x_along_columns_and_y_along_rows_faces_up():
     x, y = np.meshgrid(np.arange(5.0), np.arange(4.0))
     flat = sheet(np.stack([x, y, 0 * x], -1), 3)
     assert (flat.normals == (0, 0, 1)).all()
@@ -145,7 +145,7 @@ def test_facets_are_flat():
     np.testing.assert_allclose(slope.normals[0], [(0, -(0.5**0.5), 0.5**0.5)] * 3, atol=1e-6)
 
 
-def test_copies_are_what_placing_one_by_one_gives():
+def test_copies_equal_meshes_that_are_placed_one_by_one():
     piece = join_meshes([boxes([1, 2, 3], [1, 2, 3], 0), tubes([0, 0, 0], [1, 1, 1], 0.2, 5).as_target()])
     poses = np.stack(
         [rotation((1, 2, 3), 50) @ translation(3, 4, 5), translation(z=2) @ np.diag([2.0, 2, 2, 1])]
@@ -161,7 +161,7 @@ def test_a_quarter_turn_about_z_takes_x_to_y():
     np.testing.assert_allclose(rotation((0, 0, 1), 90) @ (1, 0, 0, 1), (0, 1, 0, 1), atol=1e-12)
 
 
-def test_a_shift_moves_by_its_metres():
+def test_a_translation_moves_points_by_its_metres():
     np.testing.assert_allclose(translation(1, 2, 3) @ (10, 20, 30, 1), (11, 22, 33, 1))
 
 
@@ -181,13 +181,13 @@ def test_a_ball_of_twenty_faces_is_a_regular_icosahedron():
     np.testing.assert_allclose(edges, np.full((20, 3), 1 / np.sin(2 * np.pi / 5)), rtol=1e-6)
 
 
-def test_each_division_of_a_ball_makes_four_faces_of_one_on_the_sphere():
+def test_each_subdivision_of_a_ball_splits_every_face_into_four_on_the_sphere():
     ball = spheres([1, 2, 3], 0.5, 0, subdivisions=2)
     assert len(ball.corners_m) == 20 * 4**2
     np.testing.assert_allclose(np.linalg.norm(ball.corners_m - [1, 2, 3], axis=-1), 0.5, rtol=1e-6)
 
 
-def test_nothing_that_starts_slowly_is_imported_to_make_or_check_a_set():
+def test_making_and_checking_sets_does_not_import_slow_modules():
     slow = ["scipy", "networkx", "trimesh", "numba", "skimage"]
     program = (
         "import sys, stereoweave.synth.sets.check, stereoweave.synth.sets.make\n"

@@ -27,7 +27,7 @@ def volume(sections_m: np.ndarray) -> float:
 
 @pytest.mark.parametrize("hand", [1, -1])
 def test_a_blades_edges_lie_on_the_helix_of_its_pitch(hand):
-    """Between its edges a section rises by pitch * turns: 4 m a turn for a diameter of 4 m."""
+    """From edge to edge, a section advances by 4 m per turn: its pitch equals the diameter of 4 m."""
     sections_m = propeller(hand=hand, rake_m=0.0).sections_m()[5:30]
     chords = sections_m[:, 0] - sections_m[:, 16]
     if hand == -1:
@@ -43,7 +43,7 @@ def test_a_left_handed_blade_is_the_mirror_image():
 
 
 @pytest.mark.parametrize("hand", [1, -1])
-def test_a_blade_is_solid_and_not_inside_out(hand):
+def test_a_blade_has_a_plausible_volume_and_is_not_inside_out(hand):
     thick_m, area_m2 = 0.08, 1.2
     assert volume(propeller(hand=hand).sections_m()) == pytest.approx(thick_m * area_m2, rel=0.6)
 
@@ -54,7 +54,7 @@ def test_the_blades_reach_the_radius_and_no_further():
     assert reach_m.max() == pytest.approx(2.0, abs=0.01)
 
 
-def test_a_screw_looks_the_same_after_a_blades_share_of_a_turn():
+def test_a_propeller_is_unchanged_by_rotation_from_blade_to_blade():
     blades = propeller_mesh(propeller(blades=5), 0, 1, 2).corners_m[: 5 * 2560].reshape(5, -1, 3)
     angle = 2 * np.pi / 5
     turned = blades @ np.array(

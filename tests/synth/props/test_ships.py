@@ -27,7 +27,7 @@ def test_the_bridge_stands_on_the_house(trade):
 
 
 @pytest.mark.parametrize("trade", TRADES)
-def test_its_gear_stands_above_its_deck_and_uses_its_paints(trade):
+def test_the_gear_stands_above_the_deck_and_uses_the_given_materials(trade):
     for seed in range(4):
         rng = np.random.default_rng(seed)
         plan = TRADES[trade](rng)

@@ -28,55 +28,55 @@ def built(name: str, seed: int = 0) -> tuple[Mesh, Palette]:
 
 
 def facing(mesh: Mesh) -> np.ndarray:
-    """How well normals agree with the side that the corners' order calls outside: 1 to -1."""
+    """Return the cosine between each normal and the outward direction that the corner order defines."""
     a, b, c = mesh.corners_m.astype(float).swapaxes(0, 1)
     across = np.cross(b - a, c - a)
     return (across[:, None] * mesh.normals).sum(-1) / np.linalg.norm(across, axis=1, keepdims=True)
 
 
 @pytest.mark.parametrize("name", STANDING)
-def test_each_spot_gets_one_thing_and_nothing_stands_elsewhere(name):
+def test_objects_stand_at_each_spot_and_nowhere_else(name):
     mesh, _ = built(name)
     centres = mesh.corners_m.mean(1)[:, :2]
     distance_m = np.linalg.norm(centres[:, None] - SPOTS[None, :, :2], axis=-1)
-    assert distance_m.min(1).max() < 9  # half a house's length and its eaves
+    assert distance_m.min(1).max() < 9  # half the length of a house, plus its eaves
     assert (np.bincount(distance_m.argmin(1), minlength=len(SPOTS)) > 0).all()
 
 
 @pytest.mark.parametrize("name", STANDING)
-def test_its_feet_are_on_the_ground_or_a_little_below(name):
+def test_feet_are_on_the_ground_or_slightly_below(name):
     mesh, _ = built(name)
     assert -1.5 < mesh.corners_m[..., 2].min() < 0.03
 
 
 @pytest.mark.parametrize("name", STANDING)
-def test_its_normals_are_unit_vectors_that_point_outwards(name):
+def test_normals_are_unit_vectors_that_point_outwards(name):
     mesh, _ = built(name)
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=-1), 1, atol=1e-5)
     assert np.mean(facing(mesh) > 0) > 0.995
 
 
 @pytest.mark.parametrize("name", STANDING)
-def test_its_materials_are_the_palettes_and_their_textures_in_the_bank(name):
+def test_materials_are_in_the_palette_and_their_textures_in_the_bank(name):
     mesh, palette = built(name)
     assert set(np.unique(mesh.material)) == set(range(len(palette.materials)))
     assert {material.texture for material in palette.materials} <= set(FAMILIES)
 
 
 @pytest.mark.parametrize("name", STANDING)
-def test_the_seed_decides_everything(name):
+def test_the_mesh_depends_on_the_seed_alone(name):
     (first, _), (again, _), (other, _) = built(name, 1), built(name, 1), built(name, 2)
     np.testing.assert_array_equal(first.corners_m, again.corners_m)
     assert first.corners_m.shape != other.corners_m.shape or (first.corners_m != other.corners_m).any()
 
 
 @pytest.mark.parametrize("name", STANDING)
-def test_no_spots_give_no_triangles(name):
+def test_an_empty_list_of_spots_gives_an_empty_mesh(name):
     nothing = getattr(surroundings, name)(np.random.default_rng(0), Palette(), np.zeros((0, 3)))
     assert len(nothing.material) == 0
 
 
-def test_trees_are_as_high_as_asked_for():
+def test_trees_have_the_requested_height():
     mesh = trees(np.random.default_rng(3), Palette(), SPOTS, (5, 6))
     nearest = np.linalg.norm(mesh.corners_m.mean(1)[:, None, :2] - SPOTS[None, :, :2], axis=-1).argmin(1)
     tops_m = [mesh.corners_m[nearest == k, :, 2].max() for k in range(len(SPOTS))]
@@ -84,28 +84,28 @@ def test_trees_are_as_high_as_asked_for():
     assert max(tops_m) < 6.6
 
 
-def test_places_share_a_ring_evenly():
+def test_spots_are_spread_evenly_over_a_ring():
     spots = draw_spots(np.random.default_rng(0), 400, 10, 50)
     radius_m = np.linalg.norm(spots[:, :2], axis=1)
     assert not spots[:, 2].any()
     assert radius_m.min() >= 10
     assert radius_m.max() <= 50
-    # Half of the area of the ring from 10 to 50 m is within sqrt((100 + 2500) / 2) = 36.06 m.
+    # Half the area of the ring from 10 to 50 m lies within sqrt((100 + 2500) / 2) = 36.06 m.
     assert np.mean(radius_m < 36.06) == pytest.approx(0.5, abs=0.01)
     quarters = np.bincount(np.digitize(np.arctan2(spots[:, 1], spots[:, 0]), [-np.pi / 2, 0, np.pi / 2]))
     assert quarters.min() > 85
 
 
-def test_places_keep_apart_and_come_in_no_order():
+def test_spots_keep_apart_and_are_not_sorted_by_distance():
     spots = draw_spots(np.random.default_rng(0), 400, 10, 50)
     apart = np.linalg.norm(spots[:, None] - spots[None], axis=-1) + 1e9 * np.eye(400)
-    # Each has pi (2500 - 100) / 400 = 18.8 m^2, a square of 4.3 m, to itself.
+    # Each spot has pi (2500 - 100) / 400 = 18.8 m^2 to itself, as much as a square of 4.3 m.
     assert apart.min() > 1.2
     radius_m = np.linalg.norm(spots, axis=1)
     assert abs(np.corrcoef(radius_m, np.arange(400))[0, 1]) < 0.15
 
 
-def test_daylight_has_a_sun_at_15_to_65_degrees_and_light_of_a_natural_strength():
+def test_daylight_has_a_sun_at_15_to_65_degrees_and_a_plausible_strength():
     skies = [daylight(np.random.default_rng(seed)) for seed in range(200)]
     suns = np.array([sky.sun for sky, _, _ in skies])
     np.testing.assert_allclose(np.linalg.norm(suns, axis=1), 1)
@@ -120,11 +120,11 @@ def test_daylight_has_a_sun_at_15_to_65_degrees_and_light_of_a_natural_strength(
         assert 0.5 < exposure < 1.5
         assert fog is None or fog.density_per_m < 0.01
     assert {fog is None for _, fog, _ in skies} == {True, False}
-    assert min(max(sky.sun_light) for sky, _, _ in skies) < 0.5  # an overcast day among them
+    assert min(max(sky.sun_light) for sky, _, _ in skies) < 0.5  # some days are overcast
 
 
 @pytest.mark.parametrize("family", ["grass", "soil", "gravel", "asphalt", "concrete"])
-def test_terrain_is_flat_about_the_origin_and_reaches_as_far_as_asked(family):
+def test_terrain_is_flat_around_the_origin_and_has_the_requested_extent(family):
     palette = Palette()
     ground = terrain(
         np.random.default_rng(0), palette, family, extent_m=80, level_m=-2, bumps_m=0.5, flat_radius_m=6
@@ -148,7 +148,7 @@ def test_terrain_and_sea_are_finer_near_the_origin():
         assert sides_m[away_m < 5].mean() < 0.2 * sides_m[away_m > 60].mean()
 
 
-def test_the_sea_waves_about_its_level():
+def test_waves_are_small_and_centred_on_the_level_of_the_sea():
     water = sea(np.random.default_rng(0), Palette(), level_m=3.0)
     z = water.corners_m[..., 2]
     assert z.mean() == pytest.approx(3, abs=0.05)

@@ -1,4 +1,4 @@
-"""Three equal blades as long as asked, in a plane that the tilt and the pitch decide."""
+"""A turbine head has three blades of the requested length and pitch, with marked tips."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ FINISH = TurbineMaterials(white=0, tip=1, steel=2, dark=3, lamp=4)
 
 
 def blades_m(**changes):
-    """Corners beyond the nacelle's width around the axis, of a rotor whose axis is level."""
+    """Return the corners more than 0.7 m from the axis, which are the blades', for a level axis."""
     measures = {
         "radius_m": 2.0,
         "chord_m": 0.24,
@@ -41,7 +41,7 @@ def test_the_three_blades_are_a_third_of_a_turn_apart():
     assert around.max() < 22
 
 
-def test_feathered_blades_are_flat_seen_from_before_and_others_seen_from_the_side():
+def test_feathered_blades_are_narrow_from_the_front_and_others_from_the_side():
     upright = [corners[corners[:, 2] > 1.2] for corners in (blades_m(), blades_m(pitch_deg=90.0))]
     (across, along), (across_feathered, along_feathered) = (
         (np.ptp(blade[:, 1]), np.ptp(blade[:, 0])) for blade in upright
@@ -52,13 +52,13 @@ def test_feathered_blades_are_flat_seen_from_before_and_others_seen_from_the_sid
 
 def test_marked_tips_are_bands_of_whole_rings():
     mesh = turbine_head(Rotor(radius_m=2.0, chord_m=0.24, pitch_deg=0, angle_deg=0, tilt_deg=0), FINISH)
-    # Twenty-two stations from 0.1 to 2 m: the bands are between the 15th and the 19th, and beyond the 21st.
+    # The 22 stations are from 0.1 to 2 m; bands lie between the 15th and the 19th, and beyond the 21st.
     station_m = np.linspace(0.1, 2.0, 22)
     marked = mesh.corners_m[mesh.material == 1] - np.array([OVERHANG_M, 0, 0.17])
     height_m = marked[marked[..., 2].min(1) > 1.0][..., 2]  # of the upright blade
     np.testing.assert_allclose(np.unique(height_m.round(4)), station_m[[14, 15, 16, 17, 18, 20, 21]].round(4))
 
 
-def test_composite_is_a_light_grey(rng):
+def test_composite_skin_is_light_grey(rng):
     tint = composite_skin(rng).tint
     assert 0.6 < min(tint) <= max(tint) < 0.9
