@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from stereoweave.cli import root
+from stereoweave.cli.commands import Commands
 
 RecipeFile = Annotated[
     Path, typer.Argument(metavar="RECIPE", help="TOML file of the base recipe, in recipes/.")
@@ -17,6 +18,6 @@ Seeds = Annotated[int, typer.Option(min=1, help="Repetitions of each training, w
 
 def run(command: Callable[..., None], module: str, arguments: Sequence[str] | None) -> int:
     """Run an experiment's only command, as `python -m MODULE`. Returns its exit code, as `root.run` does."""
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+    app = Commands()
     app.command()(command)
     return root.run(app, f"python -m {module}", arguments)

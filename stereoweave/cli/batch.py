@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from stereoweave.cli.commands import running_options
 from stereoweave.cli.options import (
     AsJson,
     BaselineM,
@@ -17,7 +18,6 @@ from stereoweave.cli.options import (
     Rectify,
     Refined,
     make_request,
-    option_name,
     parse_range_px,
 )
 
@@ -84,7 +84,7 @@ def batch(  # noqa: PLR0913 - each is an option of the command line
         backend=Backend(model=model, provider=provider),
         options=MatchOptions(range_px=parse_range_px(range_px), refined=refined, raw=raw),
         files=tuple(write or ()),
-        name_of=option_name,
+        name_of=running_options(),
     )
     engine = Engine(address, workers, cpus_each, gpus_each)
     raise typer.Exit(batch_on_cluster(source, destination, job, engine, as_json=as_json))

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from stereoweave.cli.commands import Commands
 from stereoweave.cli.options import (
     Cluster,
     Model,
@@ -44,7 +45,7 @@ Models = Annotated[
     typer.Option(help="As for depth; repeat for several (default: all shipped networks)."),
 ]
 
-bench = typer.Typer(help="Score matchers, views, videos and trained networks.")
+bench = Commands("Score matchers, views, videos and trained networks.")
 
 
 @bench.command()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stereoweave.cli.commands import running_options
 from stereoweave.cli.options import (
     AsJson,
     BaselineM,
@@ -22,7 +23,6 @@ from stereoweave.cli.options import (
     Refined,
     Threads,
     make_request,
-    option_name,
     parse_pixel,
     parse_range_px,
 )
@@ -97,7 +97,7 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
         backend=Backend(model=model, threads=threads, provider=provider),
         options=MatchOptions(range_px=parse_range_px(range_px), refined=refined, raw=raw),
         files=tuple(write or ()),
-        name_of=option_name,
+        name_of=running_options(),
     )
     pictures = pictures or []
     if found := find_pairs(pictures, left, right, listed):
@@ -105,7 +105,8 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
 
         raise typer.Exit(depth_of_many(found, out, job, processes=jobs, as_json=as_json))
     summary, notes = make_depth(pictures, out, job)
-    (_print_json if as_json else _print_summary)(summary, [note.format(option_name) for note in notes], out)
+    lines = [note.format(job.name_of) for note in notes]
+    (_print_json if as_json else _print_summary)(summary, lines, out)
 
 
 def measure(  # noqa: PLR0913 - each is an option of the command line
@@ -145,7 +146,7 @@ def measure(  # noqa: PLR0913 - each is an option of the command line
     estimate = match(matcher, prepared.pair, options)
     error = CameraError(focal=focal_error_percent / 100, baseline=baseline_error_percent / 100)
     found = distance(estimate, camera, *places, camera_error=error)
-    notes = [note.format(option_name) for note in prepared.notes]
+    notes = [note.format(running_options()) for note in prepared.notes]
     if as_json:
         typer.echo(json.dumps(asdict(found) | {"notes": notes}, indent=2, allow_nan=False))
     else:

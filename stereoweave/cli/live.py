@@ -8,14 +8,7 @@ from typing import Annotated
 
 import typer
 
-from stereoweave.cli.options import (
-    Model,
-    OldFormat,
-    Provider,
-    Threads,
-    naming_video_options,
-    replace_old_option,
-)
+from stereoweave.cli.options import Model, OldFormat, Provider, Threads, replace_old_option
 from stereoweave.errors import StereoweaveError
 
 Sources = Annotated[
@@ -44,7 +37,6 @@ Port = Annotated[
 Browser = Annotated[bool, typer.Option(help="Open the page in the browser.")]
 
 
-@naming_video_options()
 def live(  # noqa: PLR0913 - each is an option of the command line
     sources: Sources,
     format: Format = None,

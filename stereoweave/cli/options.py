@@ -109,36 +109,6 @@ Host = Annotated[
 ]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes any free port.")]
 
-# Options whose name differs from their setting's keyword.
-_OPTIONS = {
-    "calibration": "--calib",
-    "convergence_px": "--convergence",
-    "files": "--write",
-    "listed": "--list",
-    "range_px": "--range",
-    "size_px": "--size",
-    "views": "--view",
-}
-
-
-def option_name(setting: str) -> str:
-    """Return the option for a setting, given its Python keyword."""
-    return _OPTIONS.get(setting, f"--{setting.replace('_', '-')}")
-
-
-def video_option_name(setting: str) -> str | None:
-    """Return the option of the video commands for a setting; None for rectification, which they lack."""
-    return None if setting == "rectify" else option_name(setting)
-
-
-@contextmanager
-def naming_video_options() -> Iterator[None]:
-    """Make errors name the options of the video commands."""
-    try:
-        yield
-    except StereoweaveError as error:
-        raise type(error)(error.format(video_option_name)) from error
-
 
 def replace_old_option(old: tuple[str, str | None], new: tuple[str, str | None]) -> str | None:
     """Return the value of a renamed option, given under its old or its new name; warns about the old name.

@@ -10,7 +10,8 @@ from typing import Annotated
 
 import typer
 
-from stereoweave.cli.options import AsJson, Calib, Format, Pictures, make_parent_folder, option_name
+from stereoweave.cli.commands import running_options
+from stereoweave.cli.options import AsJson, Calib, Format, Pictures, make_parent_folder
 from stereoweave.errors import StereoweaveError
 
 
@@ -24,7 +25,7 @@ def check(pictures: Pictures, format: Format = None, as_json: AsJson = False) ->
 
     opened = open_pictures(pictures, format)
     found = check_pair(opened.pair.left, opened.pair.right)
-    notes = [note.format(option_name) for note in (*opened.notes, *found.lines())]
+    notes = [note.format(_name_remedy) for note in (*opened.notes, *found.lines())]
     if as_json:
         facts = {name: _replace_nan(value) for name, value in asdict(found).items()}
         typer.echo(json.dumps(facts | {"notes": notes}, indent=2, allow_nan=False))
@@ -32,6 +33,11 @@ def check(pictures: Pictures, format: Format = None, as_json: AsJson = False) ->
         typer.echo("\n".join(notes))
     if found.defects:
         raise typer.Exit(1)
+
+
+def _name_remedy(setting: str) -> str | None:
+    """Return the option of `check` for a setting; for rectification, which it lacks, the command."""
+    return "stereoweave rectify" if setting == "rectify" else running_options()(setting)
 
 
 def _replace_nan(value: object) -> object:
@@ -69,7 +75,7 @@ def rectify(
         write_image(out / "right.png", pair.right)
         if pair.camera:
             write_rig(out / "calib.yml", rectified_rig(pair))
-    notes = [note.format(option_name) for note in prepared.notes]
+    notes = [note.format(running_options()) for note in prepared.notes]
     typer.echo("\n".join([f"{out}: left.png and right.png, {format_size(pair_size_px(pair))} px", *notes]))
 
 

@@ -13,17 +13,18 @@ from stereoweave import __version__
 from stereoweave.cli.app import app as page
 from stereoweave.cli.batch import batch
 from stereoweave.cli.bench import bench
+from stereoweave.cli.commands import Commands
 from stereoweave.cli.depth import depth, measure
 from stereoweave.cli.live import live
-from stereoweave.cli.options import needing_train_extra, option_name
+from stereoweave.cli.options import needing_train_extra
 from stereoweave.cli.rig import calibrate, check, rectify
 from stereoweave.cli.serve import serve
 from stereoweave.cli.synth import synth
 from stereoweave.cli.video import video
 from stereoweave.cli.view import view
-from stereoweave.errors import StereoweaveError, format_error
+from stereoweave.errors import StereoweaveError
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app = Commands()
 app.add_typer(bench, name="bench")
 app.add_typer(synth, name="synth")
 
@@ -33,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run(app, "stereoweave", arguments)
 
 
-def run(commands: typer.Typer, program: str, arguments: Sequence[str] | None) -> int:
+def run(commands: Commands, program: str, arguments: Sequence[str] | None) -> int:
     """Run a command line. Returns 0, or 2 after a user's mistake, which is reported on stderr in one line."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # like stderr, for file names that are not UTF-8
@@ -42,7 +43,7 @@ def run(commands: typer.Typer, program: str, arguments: Sequence[str] | None) ->
     except typer.TyperException as error:
         message = error.format_message().rstrip(".") + f"; see {program} --help"
     except (StereoweaveError, OSError) as error:
-        message = format_error(error, option_name)
+        message = str(error)
     typer.echo(f"{program}: " + " ".join(message.splitlines()), err=True)
     return 2
 

@@ -6,9 +6,10 @@ from typing import Annotated
 
 import typer
 
+from stereoweave.cli.commands import Commands
 from stereoweave.cli.options import Cluster, make_engine, needing_synth_extra, parse_size_px
 
-synth = typer.Typer(help="Make, check and view rendered stereo pairs with exact ground truth.")
+synth = Commands("Make, check and view rendered stereo pairs with exact ground truth.")
 
 # Listed here so that --help imports nothing heavy.
 SCENE_NAMES = (

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stereoweave.cli.commands import running_options
 from stereoweave.cli.options import (
     Model,
     OldFormat,
@@ -13,9 +14,7 @@ from stereoweave.cli.options import (
     Strength,
     Threads,
     make_parent_folder,
-    naming_video_options,
     replace_old_option,
-    video_option_name,
 )
 from stereoweave.errors import StereoweaveError
 
@@ -82,7 +81,6 @@ Rate = Annotated[
 ]
 
 
-@naming_video_options()
 def video(  # noqa: PLR0913 - each is an option of the command line
     videos: Videos,
     out: Out,
@@ -121,7 +119,7 @@ def video(  # noqa: PLR0913 - each is an option of the command line
             strength=strength,
             convergence_px=convergence,
             backend=Backend(model=model, threads=threads, provider=provider),
-            name_of=video_option_name,
+            name_of=running_options(),
         )
         source = open_video(videos, format, rate=None if rate is None else _parse_rate(rate))
         if layout:

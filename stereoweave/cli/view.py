@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stereoweave.cli.commands import running_options
 from stereoweave.cli.options import (
     Format,
     Model,
@@ -18,7 +19,6 @@ from stereoweave.cli.options import (
     Threads,
     make_parent_folder,
     make_request,
-    option_name,
     parse_range_px,
 )
 from stereoweave.errors import StereoweaveError
@@ -134,7 +134,7 @@ def view(  # noqa: PLR0913 - each is an option of the command line
         written = _write_layout(out, name, renderer, layout_options)
     typer.echo(f"{out}: {written}")
     for note in (*prepared.notes, *find_problems(pair, estimate)):
-        typer.echo(note.format(option_name))
+        typer.echo(note.format(running_options()))
 
 
 def _check_unused(name: str | None, single_view: dict[str, float | None], quilt: str | None) -> None:

@@ -32,6 +32,11 @@ ERRORS = {
     "view plain.png plain.png --rectify -o out.png": "--rectify: expected at least 40 points that both "
     "pictures show from two positions, found 0 of 0 matches that agree; take pictures with more texture and "
     "more overlap; or give a calibration (--calib)",
+    "rectify plain.png plain.png -o out": "rectify: expected at least 40 points that both pictures show from "
+    "two positions, found 0 of 0 matches that agree; take pictures with more texture and more overlap; or "
+    "give a calibration (--calib)",
+    "rectify both.png --format diagonal -o out": f"--format: expected one of {LAYOUTS}, mpo, jps, found "
+    "'diagonal'",
     f"depth {PAIR} --write depth.npy -o out": f"depth.npy: {NO_CAMERA}",
     f"depth {PAIR} --write x.obj -o out": "--write: expected all or one of "
     f"{', '.join(FILES)}, found 'x.obj'",
@@ -66,7 +71,8 @@ ERRORS = {
     "bench collages -o set --pairs 2 --size 64x16": "--size: expected at least 32x32 pixels, found 64x16",
 }
 NOTES = {
-    "check upper.png lower.png": "the right picture lies 2.0 px lower; rectify the pair (--rectify)",
+    "check upper.png lower.png": "the right picture lies 2.0 px lower; rectify the pair (stereoweave "
+    "rectify)",
     "check both.png": "side_by_side, detected from name and content; override it if it is wrong (--format)",
     "check right.png left.png": "left and right are swapped; give them the other way round",
     f"depth {PAIR} --focal-px 600 --baseline-m 0.1 --rectify -o out": "no metres after rectification by "
@@ -102,10 +108,21 @@ def test_many_pairs_have_the_same_texts(capsys):
     told = capsys.readouterr().err
     assert f"left: {ERRORS['depth left.png -o out']}\n" in told
     low = next(line for line in Path("out/summary.csv").read_text().splitlines() if line.startswith("low,"))
-    assert NOTES["check upper.png lower.png"] in low
+    assert NOTES["view upper.png lower.png --model small -o out.png"] in low
 
 
 def test_a_video_cannot_be_rectified_so_that_its_notes_do_not_say_it(capsys):
     assert main(["video", "upper.png", "lower.png", "--depth", "-o", "out.mkv", "--threads", "1"]) == 0
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "px lower" in line]
     assert line == "0:00:00.000 the right picture lies 2.0 px lower"
+
+
+def test_a_folder_with_two_pairs_of_one_name_advises_a_list(capsys):
+    Path("same").mkdir()
+    for name in ("a.mpo", "a.jps"):
+        (Path("same") / name).write_bytes(b"")
+    assert main(["depth", "same", "-o", "out"]) == 2
+    assert capsys.readouterr().err == (
+        "stereoweave: expected pairs with different names, found a for a.jps and for a.mpo; rename one; or "
+        "name them in the third column of a list (--list)\n"
+    )

@@ -1,0 +1,79 @@
+"""The options of the running command, by which its errors and notes name settings."""
+
+from collections.abc import Callable
+from contextvars import ContextVar
+from dataclasses import dataclass
+from typing import Any
+
+import typer
+from typer.core import TyperCommand
+
+from stereoweave.errors import NameOf, StereoweaveError, keyword
+
+# Parameters of commands that set a setting of another name.
+_PARAMETERS = {
+    "calibration": "calib",
+    "convergence_px": "convergence",
+    "cpus_each": "threads",
+    "files": "write",
+    "size_px": "size",
+    "views": "view",
+    "workers": "jobs",
+}
+
+
+@dataclass(frozen=True)
+class OptionNames:
+    """The `NameOf` of one command; it can be sent to other processes.
+
+    Attributes:
+        options: The command's options by parameter.
+    """
+
+    options: dict[str, str]
+
+    def __call__(self, setting: str) -> str | None:
+        """Return the option for a setting; None if the command has none."""
+        return self.options.get(setting) or self.options.get(_PARAMETERS.get(setting, ""))
+
+
+def option_names(command: TyperCommand) -> OptionNames:
+    """Return the names of a command's options."""
+    options = [parameter for parameter in command.params if parameter.param_type_name == "option"]
+    return OptionNames({str(option.name): option.opts[0] for option in options})
+
+
+_running: ContextVar[NameOf] = ContextVar("names of the running command's options", default=keyword)
+
+
+def running_options() -> NameOf:
+    """Return the names of the running command's options; keywords if none runs."""
+    return _running.get()
+
+
+class Command(TyperCommand):
+    """A command whose errors name settings by its own options."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command."""
+        names = option_names(self)
+        token = _running.set(names)
+        try:
+            return super().invoke(ctx)
+        except StereoweaveError as error:
+            raise StereoweaveError(error.format(names)) from error
+        finally:
+            _running.reset(token)
+
+
+class Commands(typer.Typer):
+    """A command line, or a group of commands, all of the class `Command`."""
+
+    def __init__(self, help: str | None = None) -> None:
+        super().__init__(
+            help=help, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
+        )
+
+    def command(self, *given: Any, **options: Any) -> Callable[..., Any]:
+        """Register a command."""
+        return super().command(*given, **options, cls=Command)
