@@ -11,7 +11,7 @@ from error_examples import LAYOUTS, write_error_examples
 
 import stereoweave as sw
 from stereoweave import errors
-from stereoweave.cameras.alignment import check_pair
+from stereoweave.cameras.alignment import Alignment, check_pair
 from stereoweave.errors import Note, Remedy
 from stereoweave.io.files import RangeError, read_image
 from stereoweave.matching.options import MatchOptions
@@ -101,6 +101,23 @@ def test_a_note_names_settings_by_their_keyword(folder):
     ]
     assert list(map(str, open_pictures([Path("both.png")]).notes)) == [
         "side_by_side, detected from name and content; override it if it is wrong (format)"
+    ]
+
+
+def test_a_pair_of_unlike_exposures_advises_to_lock_them():
+    brighter = Alignment(
+        matches=500,
+        vertical_error_px=0.1,
+        vertical_error_95_px=0.3,
+        vertical_shift_px=0.0,
+        rotation_degrees=0.0,
+        range_px=(5.0, 60.0),
+        exposure_ratio=2.0,
+        defects=("exposure",),
+    )
+    assert list(map(str, brighter.warnings())) == [
+        "the right picture has 2.0 times the other's exposure: depth is less reliable where either is too "
+        "dark or too bright; lock the exposure of both cameras"
     ]
 
 

@@ -51,6 +51,16 @@ _MOST_SESSIONS = 4
 _DETECTED = "detected"
 _MODELS = [("fast", "small"), ("fine", "base")]
 
+# Labels of the form's fields, by setting.
+_LABELS = {
+    "format": "Layout of a single file",
+    "baseline_m": "Baseline, mm",
+    "calibration": "Calibration file, for metres",
+    "focal_px": "Focal length, px",
+    "model": "Network",
+    "rectify": "Rectify the pair",
+}
+
 _HEAD = """<div class="head"><h1>Stereoweave</h1>
 <p>Two photographs of one scene become depth, and the view from anywhere between the two cameras.
 The pictures stay on the computer that runs this page.</p></div>"""
@@ -66,6 +76,11 @@ if (!canvas.getContext("webgl2") && !canvas.getContext("webgl")) element.innerHT
   '<p class="notice problem">This browser cannot draw in 3-D: turn on its hardware acceleration ' +
   '(WebGL). If metres are known, open cloud.glb, under Files, in another program.</p>';"""
 _GONE = "This result has expired (results are kept for an hour). Find depth again."
+
+
+def label_of(setting: str) -> str | None:
+    """Return the page's label for a setting; None if the page does not have it."""
+    return f"“{_LABELS[setting]}”" if setting in _LABELS else None
 
 
 class Page:
@@ -94,9 +109,9 @@ class Page:
         """Build the form for pictures and settings."""
         self._left = gr.File(label="Left picture, or one file with both views", height=160, elem_id="left")
         self._right = gr.File(label="Right picture", height=160, elem_id="right")
-        self._model = gr.Radio(_MODELS, value="small", label="Network", elem_id="model")
+        self._model = gr.Radio(_MODELS, value="small", label=_LABELS["model"], elem_id="model")
         self._rectify = gr.Checkbox(
-            label="Rectify the pair",
+            label=_LABELS["rectify"],
             info="For pictures straight from two cameras. 3-D films and data sets are already rectified.",
             elem_id="rectify",
         )
@@ -104,15 +119,13 @@ class Page:
             self._layout = gr.Dropdown(
                 [_DETECTED, *((name.replace("_", " "), name) for name in FORMATS)],
                 value=_DETECTED,
-                label="Layout of a single file",
+                label=_LABELS["format"],
                 elem_id="layout",
             )
-            self._calibration = gr.File(
-                label="Calibration file, for metres", height=140, elem_id="calibration"
-            )
+            self._calibration = gr.File(label=_LABELS["calibration"], height=140, elem_id="calibration")
             with gr.Row():
-                self._focal_px = _optional_number("Focal length, px", "focal")
-                self._baseline_mm = _optional_number("Baseline, mm", "baseline")
+                self._focal_px = _optional_number(_LABELS["focal_px"], "focal")
+                self._baseline_mm = _optional_number(_LABELS["baseline_m"], "baseline")
         self._find = gr.Button("Find depth", variant="primary", elem_id="find")
         self._sample = gr.Button("Try the sample", elem_id="sample")
 
@@ -231,24 +244,12 @@ class Page:
                 self._session: None,
             }
 
-    def _label_of(self, setting: str) -> str | None:
-        """Return the page's label for a setting; None if the page does not have it."""
-        components = {
-            "format": self._layout,
-            "baseline_m": self._baseline_mm,
-            "calibration": self._calibration,
-            "focal_px": self._focal_px,
-            "model": self._model,
-            "rectify": self._rectify,
-        }
-        return f"“{components[setting].label}”" if setting in components else None
-
     def _format_line(self, line: str) -> str:
         """Put a message in one line, without this machine's folders."""
         return re.sub(rf"{re.escape(str(self._folder))}/\w+/", "", " ".join(line.splitlines()))
 
     def _format_error(self, error: Exception) -> str:
-        return _format_notice([self._format_line(format_error(error, self._label_of))], problem=True)
+        return _format_notice([self._format_line(format_error(error, label_of))], problem=True)
 
     def _write_files(self, session: Session | None, progress: Any = gr.Progress()) -> dict[Any, Any]:  # noqa: B008
         """Write the files; takes as long as everything shown before."""
@@ -267,7 +268,7 @@ class Page:
         }
 
     def _summary(self, session: Session, notes: Sequence[Note] = ()) -> str:
-        lines = [self._format_line(note.format(self._label_of)) for note in (*session.result.notes, *notes)]
+        lines = [self._format_line(note.format(label_of)) for note in (*session.result.notes, *notes)]
         return _format_notice([format_summary(session.result.summary), *lines])
 
     def _uploads(self, given: dict[Any, Any]) -> Uploads:

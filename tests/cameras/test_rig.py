@@ -291,7 +291,9 @@ def test_opencvs_yaml_in_millimetres_is_read_in_metres_and_says_so(tmp_path):
 def test_a_short_baseline_without_unit_is_taken_for_metres(tmp_path):
     rig = read_rig(stored(tmp_path, OPENCV.replace("-120., 0., 1.", "-0.12, 0., 0.001")))
     np.testing.assert_allclose(rig.translation_m, [-0.12, 0, 0.001])
-    assert "is assumed in metres" in rig.notes[0].text
+    assert str(rig.notes[0]).endswith(
+        "is assumed in metres; add the entry translation_unit: m, cm or mm if that is wrong"
+    )
 
 
 def test_a_unit_and_a_lens_that_are_stated_need_no_guess(tmp_path):
@@ -309,7 +311,11 @@ def test_four_coefficients_are_a_pinholes_unless_the_file_says_fisheye(tmp_path)
         "550., 0., 320., 0., 551., 240., 0., 0. ]", "550., 0., 320., 0., 551., 240., 0., 0., 1. ]"
     )
     guessed = read_rig(stored(tmp_path, four))
-    assert not guessed.left.fisheye and "assumed pinhole" in guessed.notes[-1].text
+    assert not guessed.left.fisheye
+    assert str(guessed.notes[-1]) == (
+        "the calibration does not state its lens model: assumed pinhole with k1 k2 p1 p2; add the entry "
+        "distortion_model: fisheye if that is wrong"
+    )
     for said in ("distortion_model: fisheye", "fisheye_model: 1", "camera_model: Kannala-Brandt"):
         assert read_rig(stored(tmp_path, f"{four}{said}\n")).left.fisheye
 

@@ -294,7 +294,8 @@ def test_a_disparity_that_a_png_cannot_hold_gets_none_and_a_line(pictures, capfd
     save_matcher(Path("far.onnx"), disparity_px)
     assert run("depth left.png right.png --model far.onnx -o out") == 0
     printed, _ = capfd.readouterr()
-    assert "no disparity.png: it holds 0 to 255.99 px" in printed
+    (note,) = [line for line in printed.splitlines() if "no disparity.png: it holds 0 to 255.99 px" in line]
+    assert note.endswith(" px; use disparity.pfm")
     assert not Path("out/disparity.png").exists()
     # No disparity that the photographs bear out, which moves it by at most 1 px.
     np.testing.assert_allclose(read_pfm("out/disparity.pfm"), disparity_px, atol=1.001)

@@ -13,7 +13,7 @@ from stereoweave.errors import MatcherError, ProviderError
 from stereoweave.io.files import read_pair, write_image
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher
-from stereoweave.matching.providers import PROVIDERS
+from stereoweave.matching.providers import PROVIDERS, explain_failure
 from stereoweave.outputs.results import DepthJob, job_facts, make_depth
 from stereoweave.system import jit as compiling
 
@@ -131,6 +131,15 @@ def test_out_of_memory_is_no_fault_of_the_file(tmp_path):
     assert "use smaller pictures, or fewer processes" in line
     assert "run it on cpu" not in line
     assert "\n" not in line
+
+
+def test_a_failure_of_another_provider_advises_the_cpu():
+    with pytest.raises(ProviderError) as caught, explain_failure("cuda", Path("a.onnx")):
+        raise RuntimeError("out of memory")
+    assert str(caught.value) == (
+        "provider cuda: expected to run a.onnx, found that it failed: out of memory; use smaller pictures, "
+        "or fewer processes at a time on the device; or run it on cpu (provider)"
+    )
 
 
 def test_a_graph_that_cannot_take_the_picture_is_the_files_fault(tmp_path):

@@ -137,7 +137,11 @@ def test_a_worker_that_fits_no_machine_is_refused_and_parts_of_a_core_are_counte
     assert room(Engine(cpus_each=0.1)) == 20
     with pytest.raises(StereoweaveError, match=r"a machine with 3 cores and 0 GPUs .* found 2 and 0"):
         list(stream(make_reporter, [1], Engine(cpus_each=3)))
-    with pytest.raises(StereoweaveError, match=r"a machine with 1 cores and 0.5 GPUs .* found 2 and 0"):
+    with pytest.raises(
+        StereoweaveError,
+        match=r"a machine with 1 cores and 0.5 GPUs .* found 2 and 0 .*; or ask for less "
+        r"\(cpus_each, gpus_each\)$",
+    ):
         room(Engine(gpus_each=0.5))
     nan, inf = float("nan"), float("inf")
     shares = ({"cpus_each": cpus} for cpus in (0, 1e-5, nan, inf))

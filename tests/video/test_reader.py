@@ -126,7 +126,7 @@ def test_a_declared_frame_packing_that_is_not_read_is_named(tmp_path):
         tmp_path / "video.mkv", flat_pairs(2), stereo_mode="row_interleaved_lr", codec="ffv1"
     )
     assert "video.mkv: " in refusal(path)
-    assert "declares lines" in refusal(path)
+    assert "declares lines; if that is wrong, choose one of side_by_side, " in refusal(path)
     assert open_video([path], "side_by_side").frame_count == 2
 
 
