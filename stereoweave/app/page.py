@@ -2,14 +2,9 @@
 
 import html
 import importlib.resources
-import os
 import re
 import shutil
-import signal
-import socket
-import sys
 import tempfile
-import webbrowser
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -17,11 +12,7 @@ from typing import Any
 from uuid import uuid4
 
 import gradio as gr
-import uvicorn
-from fastapi import FastAPI
-from starlette.middleware.trustedhost import TrustedHostMiddleware
 
-from stereoweave.app.access import ContentPolicy, OwnFiles
 from stereoweave.app.session import (
     Session,
     Uploads,
@@ -41,8 +32,6 @@ from stereoweave.matching.backend import Backend
 from stereoweave.matching.providers import CPU
 from stereoweave.pictures.loading import FORMATS
 from stereoweave.pictures.prepare import Request
-
-_MOST_BYTES = 200 * 1024**2
 
 _LIFETIME_S = 3600
 # Each keeps its last result: 60 MB and 19 bytes per pixel of the left picture (0.5 GB at 24 megapixels) in
@@ -218,7 +207,7 @@ class Page:
 
     def _fill_in_sample(self) -> dict[Any, Any]:
         """Fill in the form with the sample pair of the package."""
-        folder = _sample_folder()
+        folder = sample_folder()
         return {
             self._left: str(folder / "left.jpg"),
             self._right: str(folder / "right.jpg"),
@@ -388,80 +377,6 @@ def _describe_position(position: float) -> str:
     return "right of the right camera" if position > 1 else "between the cameras"
 
 
-def _sample_folder() -> Path:
+def sample_folder() -> Path:
+    """Return the folder of the sample pair."""
     return Path(str(importlib.resources.files("stereoweave"))) / "sample"
-
-
-def make_server(folder: Path, names: Sequence[str] | None, provider: str = CPU) -> FastAPI:
-    """Make the page's ASGI application.
-
-    Args:
-        folder: Holds uploads and results.
-        names: Allowed values of the header Host; None allows any.
-        provider: Hardware that runs the network.
-    """
-    os.environ["GRADIO_TEMP_DIR"] = str(folder)
-    server = FastAPI(openapi_url=None)
-    css = importlib.resources.files("stereoweave.app").joinpath("page.css").read_text(encoding="utf-8")
-    gr.mount_gradio_app(
-        server,
-        Page(folder, provider).blocks,
-        path="/",
-        footer_links=[],
-        run_history=False,
-        allowed_paths=[str(_sample_folder())],
-        max_file_size=_MOST_BYTES,
-        show_error=False,
-        ssr_mode=False,
-        pwa=False,
-        mcp_server=False,
-        theme=_theme(),
-        css=css,
-    )
-    server.add_middleware(OwnFiles)
-    if names is not None:
-        server.add_middleware(TrustedHostMiddleware, allowed_hosts=names, www_redirect=False)
-    server.add_middleware(ContentPolicy)
-    return server
-
-
-def _theme() -> gr.themes.Base:
-    """Return a plain theme with the fonts of the visitor's computer."""
-    return gr.themes.Base(
-        primary_hue="blue",
-        neutral_hue="slate",
-        radius_size="lg",
-        font=["system-ui", "Segoe UI", "Roboto", "Helvetica Neue", "Arial", "sans-serif"],
-        font_mono=["ui-monospace", "Consolas", "monospace"],
-    ).set(body_text_color_subdued="*neutral_600", body_text_color_subdued_dark="*neutral_300")
-
-
-def serve(
-    listener: socket.socket, names: Sequence[str] | None, *, browsed: str | None = None, provider: str = CPU
-) -> None:
-    """Serve the page on a listening socket until a signal stops it; then remove all uploads.
-
-    Args:
-        listener: The socket.
-        names: Allowed values of the header Host; None allows any.
-        browsed: URL to open in the browser; None opens none.
-        provider: Hardware that runs the network.
-    """
-    _handle_signals()
-    with tempfile.TemporaryDirectory(prefix="stereoweave-page-") as folder:
-        # An open page keeps its connection open, so the shutdown has a time limit.
-        server = make_server(Path(folder), names, provider)
-        config = uvicorn.Config(server, log_level="critical", timeout_graceful_shutdown=1)
-        if browsed:
-            webbrowser.open(browsed)
-        uvicorn.Server(config).run(sockets=[listener])
-
-
-def _handle_signals() -> None:
-    """Make SIGTERM and SIGHUP end the process by an exception, as Ctrl-C does."""
-    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
-    hang_up = getattr(signal, "SIGHUP", None)  # missing on Windows
-    # An ignored SIGHUP, as under nohup, stays ignored. An exception inside Uvicorn's loop may hang, so SIGHUP
-    # raises SIGTERM, which ends the loop first.
-    if hang_up and signal.getsignal(hang_up) is signal.SIG_DFL:
-        signal.signal(hang_up, lambda *_: signal.raise_signal(signal.SIGTERM))

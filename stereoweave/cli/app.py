@@ -19,7 +19,7 @@ def app(
     check_provider(provider)
     with listen(host, port) as listener:
         with require_extra("app", "the page needs Gradio"):
-            from stereoweave.app.page import serve
+            from stereoweave.app.server import serve
         url = format_url(host, listener.getsockname()[1])
         typer.echo(f"Stereoweave: {url} (Ctrl-C stops it)")
         try:
