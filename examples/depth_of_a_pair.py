@@ -10,7 +10,8 @@ from PIL import Image
 import stereoweave as sw
 from stereoweave.cameras.calibration_files import read_rig
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
-from stereoweave.io.files import write_depth_png, write_image
+from stereoweave.io.images import write_image
+from stereoweave.io.maps import write_depth_png
 
 HERE = Path(__file__).parent
 

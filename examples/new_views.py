@@ -9,7 +9,7 @@ import numpy as np
 
 import stereoweave as sw
 from stereoweave.io.animation import write_animation
-from stereoweave.io.files import read_pair, write_image
+from stereoweave.io.images import read_pair, write_image
 from stereoweave.rendering.renderer import Renderer
 
 HERE = Path(__file__).parent

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import stereoweave as sw
 from stereoweave.cameras.calibration_files import add_camera
-from stereoweave.io.files import read_pair
+from stereoweave.io.images import read_pair
 from stereoweave.outputs.point_cloud import point_cloud, surface, write_glb, write_ply
 
 HERE = Path(__file__).parent

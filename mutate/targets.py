@@ -33,9 +33,11 @@ class Target(NamedTuple):
 
 TARGETS = {
     "io": Target(
-        ("io/files.py", "io/decoding.py"),
+        ("io/files.py", "io/images.py", "io/maps.py", "io/decoding.py"),
         (
             "io/test_files.py",
+            "io/test_images.py",
+            "io/test_maps.py",
             "io/test_decoding.py",
             "cli/test_bad_input.py",
             "pictures/test_loading.py",

@@ -13,7 +13,8 @@ import stereoweave as sw
 from stereoweave import errors
 from stereoweave.cameras.alignment import Alignment, check_pair
 from stereoweave.errors import Note, Remedy
-from stereoweave.io.files import RangeError, read_image
+from stereoweave.io.images import read_image
+from stereoweave.io.maps import RangeError
 from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.point_cloud import EmptyError, require_camera
 from stereoweave.pictures.loading import open_pictures

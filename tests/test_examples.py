@@ -18,7 +18,8 @@ import torch
 import trimesh
 from PIL import Image
 
-from stereoweave.io.files import read_image, read_pixels
+from stereoweave.io.images import read_image
+from stereoweave.io.maps import read_pixels
 from stereoweave.stereo import Estimate, StereoCamera
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"

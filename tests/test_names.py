@@ -13,7 +13,7 @@ import pytest
 
 from stereoweave.bench.pairs import write_csv
 from stereoweave.cli.root import main
-from stereoweave.io.files import read_image, write_image
+from stereoweave.io.images import read_image, write_image
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 # Names as a disk of another country's has them, in Latin-1: "grün", "grûn".

@@ -19,7 +19,7 @@ import pytest
 from other_processes import halted
 from visitor import Visitor
 
-from stereoweave.io.files import read_image, write_image
+from stereoweave.io.images import read_image, write_image
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 PAIR = {side: EXAMPLES / f"{side}.png" for side in ("left", "right")}
@@ -30,7 +30,7 @@ STEREOWEAVE = [sys.executable, "-m", "stereoweave"]
 ESTIMATING = """
 import time
 import stereoweave as sw
-from stereoweave.io.files import read_image
+from stereoweave.io.images import read_image
 left, right = (read_image(f"{folder}/{side}.png")[:96, 200:328] for side in ("left", "right"))
 sw.estimate(left, right)
 print("ready", flush=True)

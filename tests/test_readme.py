@@ -14,7 +14,7 @@ from PIL import Image, ImageSequence
 from pyarrow import parquet
 
 from stereoweave.io.animation import write_animation
-from stereoweave.io.files import read_image
+from stereoweave.io.images import read_image
 from stereoweave.rendering.layouts import ANIMATIONS
 
 pytestmark = pytest.mark.system

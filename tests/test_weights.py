@@ -15,7 +15,7 @@ import stereoweave as sw
 from stereoweave.bench import metrics
 from stereoweave.bench.edge_metrics import flying_percent
 from stereoweave.data.readers import read_scenes
-from stereoweave.io.files import read_image
+from stereoweave.io.images import read_image
 from stereoweave.learn import checkpoint
 from stereoweave.learn.data.collage import paint_collage
 from stereoweave.learn.export.from_checkpoint import compare_runtimes

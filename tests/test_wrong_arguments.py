@@ -12,7 +12,7 @@ import pytest
 import stereoweave as sw
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.arrays import as_rgb
-from stereoweave.io.files import read_image
+from stereoweave.io.images import read_image
 from stereoweave.rendering.renderer import Renderer
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"

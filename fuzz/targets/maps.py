@@ -8,7 +8,7 @@ import numpy as np
 from fuzz.repairs import repair_png
 from fuzz.targets import Target, read_every_way, write_to_bytes
 from fuzz.targets.pictures import encode_picture
-from stereoweave.io.files import read_disparity_png, read_pfm, read_pixels, write_disparity_png, write_pfm
+from stereoweave.io.maps import read_disparity_png, read_pfm, read_pixels, write_disparity_png, write_pfm
 
 
 def _starts() -> dict[str, bytes]:

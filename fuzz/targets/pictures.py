@@ -12,7 +12,7 @@ from PIL import Image, ImageCms, features
 
 from fuzz.repairs import repair_png
 from fuzz.targets import Target, read_every_way, write_to_bytes
-from stereoweave.io.files import read_image
+from stereoweave.io.images import read_image
 from stereoweave.pictures.loading import open_pictures
 from stereoweave.rendering.layouts import write_picture
 

@@ -26,7 +26,8 @@ import numpy as np
 
 from stereoweave.batch.manifest import Planned, read_chunk, read_rows, write_rows
 from stereoweave.errors import OutputInUseError, ProviderError, StereoweaveError, format_error
-from stereoweave.io.files import SMALLEST_SIDE_PX, is_leftover
+from stereoweave.io.files import is_leftover
+from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.io.stores import Store
 from stereoweave.matching.matcher import Matcher
 from stereoweave.outputs.results import DepthJob, make_depth

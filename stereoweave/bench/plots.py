@@ -16,7 +16,7 @@ from matplotlib.transforms import Bbox
 from stereoweave.bench.metrics import DROPPED_PERCENT, Sparsification
 from stereoweave.bench.opencv_matchers import OPENCV_MATCHERS
 from stereoweave.bench.pairs import Curves, MatcherRow
-from stereoweave.io.files import write_image
+from stereoweave.io.images import write_image
 
 # Okabe and Ito's colours, which colour-blind readers can distinguish.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")

@@ -12,7 +12,9 @@ from jaxtyping import Float, UInt8
 from stereoweave.data.samples import make_sample, require_size
 from stereoweave.data.shards import Shards, list_shards
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io.files import read_disparity_png, read_image, read_pair, read_pfm, read_small, reading
+from stereoweave.io.files import read_small, reading
+from stereoweave.io.images import read_image, read_pair
+from stereoweave.io.maps import read_disparity_png, read_pfm
 from stereoweave.rendering.renderer import FIRST_POSITION, LAST_POSITION
 from stereoweave.stereo import Sample, StereoPair
 

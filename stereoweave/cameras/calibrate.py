@@ -15,7 +15,7 @@ from stereoweave.cameras.boards import Board, PairCorners, find_pair_corners
 from stereoweave.cameras.rig import Optics, Rig, Size, format_size
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.decoding import ENDINGS
-from stereoweave.io.files import read_image
+from stereoweave.io.images import read_image
 
 FEWEST_PAIRS = 5
 # A pair whose error exceeds the median this many times has a misdetected corner, or was taken in motion.

@@ -254,7 +254,7 @@ def _makers(models: Sequence[str] | None, threads: int | None, provider: str) ->
 
 def _check_plots(*pictures: Path | None) -> None:
     """Fail before scoring starts if a plot cannot be drawn or written."""
-    from stereoweave.io.files import picture_kind
+    from stereoweave.io.images import picture_kind
 
     for picture in filter(None, pictures):
         picture_kind(picture)

@@ -62,7 +62,8 @@ def rectify(
     from stereoweave.cameras.calibration_files import write_rig
     from stereoweave.cameras.rectify import crop
     from stereoweave.cameras.rig import format_size, pair_size_px, rectified_rig
-    from stereoweave.io.files import make_folder, write_image
+    from stereoweave.io.files import make_folder
+    from stereoweave.io.images import write_image
     from stereoweave.io.output_lock import lock_output
     from stereoweave.pictures.prepare import Request, prepare
 

@@ -92,7 +92,7 @@ def sheet(
     ] = False,
 ) -> None:
     """Write a contact sheet with a row per scene: left, right, depth, and occlusion masks."""
-    from stereoweave.io.files import picture_kind, write_image
+    from stereoweave.io.images import picture_kind, write_image
 
     picture_kind(out)
     with needing_synth_extra():

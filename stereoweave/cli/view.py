@@ -185,7 +185,7 @@ def _parse_convergence_px(convergence: str) -> float | None:
 
 def _write_view(out: Path, view: "View", position: float) -> str:
     """Write one view. Returns a description of it for the user."""
-    from stereoweave.io.files import write_image
+    from stereoweave.io.images import write_image
 
     write_image(out, view.image)
     return f"view at {position:g}, {100 * (~view.drawn).mean():.1f} % of it seen by neither camera"

@@ -8,7 +8,8 @@ import numpy as np
 from stereoweave.cameras.calibration_files import add_camera
 from stereoweave.data.frames import Frame, list_scene_folders, require_folder
 from stereoweave.data.samples import make_sample, require_size
-from stereoweave.io.files import read_pair, read_pfm, read_pixels
+from stereoweave.io.images import read_pair
+from stereoweave.io.maps import read_pfm, read_pixels
 from stereoweave.stereo import Sample
 
 

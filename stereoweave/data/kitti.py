@@ -11,7 +11,9 @@ from stereoweave.cameras.calibration_files import read_calibration_bytes
 from stereoweave.data.frames import Frame, match_files, require_folder
 from stereoweave.data.samples import make_sample, require_size
 from stereoweave.errors import FormatError
-from stereoweave.io.files import read_disparity_png, read_pair, reading
+from stereoweave.io.files import reading
+from stereoweave.io.images import read_pair
+from stereoweave.io.maps import read_disparity_png
 from stereoweave.stereo import Sample, StereoCamera, StereoPair
 
 

@@ -11,7 +11,9 @@ from stereoweave.cameras.calibration_files import add_camera
 from stereoweave.data.frames import Frame, list_scene_folders
 from stereoweave.data.samples import make_sample, require_size
 from stereoweave.errors import FormatError
-from stereoweave.io.files import read_pair, read_pfm, read_pixels, read_small, reading
+from stereoweave.io.files import read_small, reading
+from stereoweave.io.images import read_pair
+from stereoweave.io.maps import read_pfm, read_pixels
 from stereoweave.stereo import Sample, StereoCamera, StereoPair
 
 

@@ -23,7 +23,9 @@ from stereoweave.data.checksums import make_checksums, verify_checksums
 from stereoweave.data.frames import Frame, match_files
 from stereoweave.data.samples import make_sample, require_size
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io.files import read_pair, read_pixels, reading, replacing, write_image
+from stereoweave.io.files import reading, replacing
+from stereoweave.io.images import read_pair, write_image
+from stereoweave.io.maps import read_pixels
 from stereoweave.stereo import Sample, StereoCamera
 
 RANGE_M = 15.0

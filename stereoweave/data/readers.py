@@ -13,7 +13,8 @@ from stereoweave.data import eth3d, kitti, middlebury, paper_layout, scene_flow,
 from stereoweave.data.frames import Frame, require_folder
 from stereoweave.data.splits import split_frames
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io.files import read_disparity_png, read_pair, read_pfm
+from stereoweave.io.images import read_pair
+from stereoweave.io.maps import read_disparity_png, read_pfm
 from stereoweave.stereo import StereoPair
 
 __all__ = ["DATASETS", "Frame", "Scene", "list_scenes", "open_dataset", "read_scenes", "split_frames"]

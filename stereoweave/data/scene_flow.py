@@ -15,7 +15,8 @@ from jaxtyping import Float32
 from stereoweave.data.frames import Frame, match_files, require_folder
 from stereoweave.data.samples import make_sample, require_size
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io.files import read_pair, read_pfm
+from stereoweave.io.images import read_pair
+from stereoweave.io.maps import read_pfm
 from stereoweave.stereo import Sample, StereoCamera, StereoPair
 
 _PASSES = {"clean": "frames_cleanpass", "final": "frames_finalpass"}

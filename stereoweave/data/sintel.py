@@ -11,7 +11,9 @@ from jaxtyping import Float32, UInt8
 from stereoweave.data.frames import Frame, match_files
 from stereoweave.data.samples import make_sample, require_size
 from stereoweave.errors import FormatError
-from stereoweave.io.files import read_pair, read_pixels, read_small, reading
+from stereoweave.io.files import read_small, reading
+from stereoweave.io.images import read_pair
+from stereoweave.io.maps import read_pixels
 from stereoweave.stereo import Sample, StereoCamera
 
 # "Rendered from two cameras with a baseline of 10 cm apart": the dataset's README.

@@ -1,15 +1,13 @@
 """Reading and writing of files: pictures, maps, stores."""
 
-from stereoweave.io.files import (
+from stereoweave.io.images import read_image, read_pair, write_image
+from stereoweave.io.maps import (
     RangeError,
     read_disparity_png,
-    read_image,
-    read_pair,
     read_pfm,
     write_depth_png,
     write_disparity_png,
     write_float_tiff,
-    write_image,
     write_npy,
     write_pfm,
 )

@@ -11,7 +11,8 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from stereoweave.errors import StereoweaveError, require_extra
-from stereoweave.io.files import checking_format_size, replacing
+from stereoweave.io.files import replacing
+from stereoweave.io.images import checking_format_size
 
 Frames = Iterator[UInt8[np.ndarray, "h w 3"]]
 

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Shaped
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.arrays import as_rgb
-from stereoweave.io.files import SMALLEST_SIDE_PX
+from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.disparity_range import find_range, goes_beyond
 from stereoweave.matching.left_right_check import at_match, find_occluded

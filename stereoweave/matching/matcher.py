@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from stereoweave.arguments import check_kind
 from stereoweave.errors import MatcherError, StereoweaveError
-from stereoweave.io.files import SMALLEST_SIDE_PX
+from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.matching.left_right_check import OCCLUSION_STEP_PX, is_occluded, measure_disagreement
 from stereoweave.matching.occlusion_fill import fill_occluded
 from stereoweave.matching.options import MatchOptions

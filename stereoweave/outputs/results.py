@@ -18,15 +18,13 @@ from stereoweave import __version__
 from stereoweave.cameras.calibration_files import read_calibration_bytes
 from stereoweave.errors import NameOf, Note, Remedy, StereoweaveError, keyword
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px, grey_confidence
-from stereoweave.io.files import (
+from stereoweave.io.files import make_folder, make_parent_folder, reading
+from stereoweave.io.images import write_image
+from stereoweave.io.maps import (
     RangeError,
-    make_folder,
-    make_parent_folder,
-    reading,
     write_depth_png,
     write_disparity_png,
     write_float_tiff,
-    write_image,
     write_npy,
     write_pfm,
 )

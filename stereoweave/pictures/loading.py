@@ -20,7 +20,7 @@ from stereoweave.io.decoding import (
     read_frame,
     read_photograph,
 )
-from stereoweave.io.files import check_large_enough, pair_of
+from stereoweave.io.images import check_large_enough, pair_of
 from stereoweave.pictures.pair_layouts import (
     PAIR_LAYOUTS,
     PairLayout,

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from stereoweave.errors import FormatError, Remedy
-from stereoweave.io.files import SMALLEST_SIDE_PX
+from stereoweave.io.images import SMALLEST_SIDE_PX
 
 Picture = UInt8[np.ndarray, "h w 3"]
 Frame = UInt8[np.ndarray, "rows columns 3"]

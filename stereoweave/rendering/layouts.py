@@ -18,7 +18,8 @@ from PIL import Image
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.animation import check_animation_ending
 from stereoweave.io.colormap import find_colour_range_px
-from stereoweave.io.files import checking_format_size, picture_kind, replacing, write_image
+from stereoweave.io.files import replacing
+from stereoweave.io.images import checking_format_size, picture_kind, write_image
 from stereoweave.rendering.renderer import FIRST_POSITION, LAST_POSITION, Renderer
 from stereoweave.stereo import Estimate, StereoPair
 

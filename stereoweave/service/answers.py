@@ -12,7 +12,8 @@ from typing import Any
 from stereoweave.cameras.rectify import crop
 from stereoweave.errors import Note, StereoweaveError
 from stereoweave.io.decoding import MOST_PIXELS, open_picture
-from stereoweave.io.files import RangeError, write_image
+from stereoweave.io.images import write_image
+from stereoweave.io.maps import RangeError
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions

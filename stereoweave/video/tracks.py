@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 
 from stereoweave.errors import FormatError, StereoweaveError, require_extra
 from stereoweave.io.decoding import ENDINGS
-from stereoweave.io.files import read_image
+from stereoweave.io.images import read_image
 
 if TYPE_CHECKING:
     import av

@@ -19,7 +19,7 @@ from starlette.routing import Route
 from starlette.testclient import TestClient
 
 from stereoweave.app.access import OwnFiles
-from stereoweave.io.files import read_image, write_image
+from stereoweave.io.images import read_image, write_image
 
 pytestmark = pytest.mark.system
 

@@ -21,7 +21,8 @@ from playwright.sync_api import Browser
 from stereoweave.app.session import Uploads, match_uploads, write_cloud, zip_files
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.colormap import colour_disparity, find_colour_range_px
-from stereoweave.io.files import read_image, read_pfm
+from stereoweave.io.images import read_image
+from stereoweave.io.maps import read_pfm
 from stereoweave.matching.backend import Backend
 from stereoweave.outputs.point_cloud import point_cloud
 from stereoweave.outputs.results import FILES

@@ -23,7 +23,8 @@ from stereoweave.batch.manifest import extend_plan, read_chunk, read_rows
 from stereoweave.batch.worker import FILM, Worker, remove_left_behind
 from stereoweave.cli.root import main
 from stereoweave.errors import MatcherError, OutputInUseError, ProviderError, StereoweaveError
-from stereoweave.io.files import read_image, read_pfm, write_image
+from stereoweave.io.images import read_image, write_image
+from stereoweave.io.maps import read_pfm
 from stereoweave.io.output_lock import lock_output
 from stereoweave.io.stores import store_at
 from stereoweave.matching.backend import Backend

@@ -19,7 +19,8 @@ from rich.console import Console
 from stereoweave.batch.local import DONE_FILE, LocalTally, depth_of_many, run_batch
 from stereoweave.cli.root import main
 from stereoweave.errors import OutputInUseError, StereoweaveError
-from stereoweave.io.files import read_image, read_pixels, write_image
+from stereoweave.io.images import read_image, write_image
+from stereoweave.io.maps import read_pixels
 from stereoweave.matching.backend import Backend
 from stereoweave.outputs.results import DepthJob, make_depth
 from stereoweave.pictures.pair_finding import FoundPairs, NamedPair, find_pairs_in

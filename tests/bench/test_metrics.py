@@ -6,7 +6,7 @@ import pytest
 
 from stereoweave.bench import metrics
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.files import read_image
+from stereoweave.io.images import read_image
 
 TRUTH_PX = np.array([[10.0, 20.0, 100.0, 100.0], [np.nan, np.inf, 40.0, 40.0]])
 ESTIMATE_PX = TRUTH_PX + np.array([[0.5, -1.0, 4.0, -6.0], [7.0, 7.0, 2.0, -2.5]])

@@ -10,7 +10,7 @@ from stereoweave.bench import plots as benchmark_plots
 from stereoweave.bench.metrics import sparsification
 from stereoweave.bench.pairs import Curves, MatcherRow
 from stereoweave.bench.plots import draw_error_over_time, draw_sparsification
-from stereoweave.io.files import read_image
+from stereoweave.io.images import read_image
 
 
 @pytest.fixture

@@ -8,7 +8,8 @@ from stereoweave.bench.view_scenes import read_view_scenes
 from stereoweave.data.packing import pack
 from stereoweave.data.shards import write_shard
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io.files import write_disparity_png, write_image, write_pfm
+from stereoweave.io.images import write_image
+from stereoweave.io.maps import write_disparity_png, write_pfm
 
 SIZE = (48, 64, 3)
 

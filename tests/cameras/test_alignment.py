@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from stereoweave.cameras.alignment import DEFECTS, check_pair
-from stereoweave.io.files import read_image, read_pair
+from stereoweave.io.images import read_image, read_pair
 from stereoweave.learn.data.collage import paint_collage
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"

@@ -12,7 +12,7 @@ from stereoweave.cameras.calibrate import Calibration, calibrate, find_pairs
 from stereoweave.cameras.calibration_files import read_rig, write_rig
 from stereoweave.cli.root import main
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.files import write_image
+from stereoweave.io.images import write_image
 
 CHESSBOARD = Board(columns=9, rows=6, square_m=0.025)
 CHARUCO = Board(columns=7, rows=5, square_m=0.04, marker_m=0.03, dictionary="DICT_4X4_50")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stereoweave.cameras.diagnosis import find_problems
-from stereoweave.io.files import read_image, read_pair
+from stereoweave.io.images import read_image, read_pair
 from stereoweave.matching.matcher import Matcher
 from stereoweave.stereo import Estimate, StereoPair
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from stereoweave.cameras.feature_matches import find_matches
-from stereoweave.io.files import read_image
+from stereoweave.io.images import read_image
 
 LEFT = Path(__file__).resolve().parents[2] / "examples/left.png"
 

@@ -7,7 +7,7 @@ import pytest
 from stereoweave.cameras.alignment import check_pair
 from stereoweave.cameras.rectify_uncalibrated import rectify_by_features
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.files import read_pair
+from stereoweave.io.images import read_pair
 from stereoweave.learn.data.collage import paint_collage
 from stereoweave.stereo import StereoPair
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import stereoweave as sw
-from stereoweave.io.files import read_image
+from stereoweave.io.images import read_image
 from stereoweave.learn.data.collage import paint_collage
 
 SIZE = (192, 320)

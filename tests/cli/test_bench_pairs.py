@@ -13,7 +13,8 @@ from stereoweave.data.paper_layout import write_frame
 from stereoweave.data.readers import read_scenes
 from stereoweave.data.shards import write_shard
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.files import write_image, write_pfm
+from stereoweave.io.images import write_image
+from stereoweave.io.maps import write_pfm
 from stereoweave.io.output_lock import lock_output
 from stereoweave.learn.data import collage
 from stereoweave.learn.data.sources import VALIDATION_SEED

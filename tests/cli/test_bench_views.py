@@ -7,7 +7,7 @@ from shard_examples import box_before_a_wall
 from stereoweave.cli.root import main
 from stereoweave.data.packing import pack
 from stereoweave.data.shards import write_shard
-from stereoweave.io.files import write_image
+from stereoweave.io.images import write_image
 from stereoweave.matching.matcher import shipped_models
 
 NETWORKS = [name + how for name in shipped_models() for how in ("", " refined")]

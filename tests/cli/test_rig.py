@@ -10,7 +10,7 @@ import pytest
 from stereoweave.cameras.alignment import check_pair
 from stereoweave.cameras.calibration_files import add_camera
 from stereoweave.cli.root import main
-from stereoweave.io.files import read_image, read_pair, write_image
+from stereoweave.io.images import read_image, read_pair, write_image
 from stereoweave.io.output_lock import lock_output
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"

@@ -14,7 +14,8 @@ import stereoweave
 from stereoweave.bench.opencv_matchers import OPENCV_MATCHERS
 from stereoweave.cli.options import find_allowed_hosts, listen
 from stereoweave.cli.root import main
-from stereoweave.io.files import read_image, read_pfm
+from stereoweave.io.images import read_image
+from stereoweave.io.maps import read_pfm
 from stereoweave.matching.matcher import shipped_models
 
 REPOSITORY = Path(__file__).resolve().parents[2]

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from stereoweave.cli.root import main
-from stereoweave.io.files import read_image
+from stereoweave.io.images import read_image
 from stereoweave.matching.matcher import Matcher
 from stereoweave.rendering.layouts import ANIMATIONS, LAYOUTS, LayoutOptions, median_disparity_px
 from stereoweave.rendering.renderer import Renderer

@@ -4,7 +4,7 @@ import pytest
 from stereoweave.cameras.calibration_files import read_rig
 from stereoweave.data.readers import read_scenes
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io import files as io
+from stereoweave.io import images, maps
 
 CALIBRATION = "cam0=[100 0 20; 0 100 16; 0 0 1]\ndoffs=0\nbaseline=50\nwidth=40\nheight=32\n"
 
@@ -14,37 +14,37 @@ def scene(tmp_path, rng):
     """A scene's folder, still without ground truth."""
     folder = tmp_path / "scenes" / "motorcycle"
     for side in ("left", "right"):
-        io.write_image(folder / f"{side}.png", rng.integers(0, 256, (32, 40, 3), dtype=np.uint8))
+        images.write_image(folder / f"{side}.png", rng.integers(0, 256, (32, 40, 3), dtype=np.uint8))
     return folder
 
 
 def test_a_scene_has_its_name_its_pair_and_nan_where_the_truth_is_unknown(scene):
     truth_px = np.full((32, 40), 7.5, np.float32)
     truth_px[3, 4] = np.nan
-    io.write_disparity_png(scene / "disparity.png", truth_px)
+    maps.write_disparity_png(scene / "disparity.png", truth_px)
     (read,) = read_scenes(scene.parent)
     assert read.name == "motorcycle"
-    np.testing.assert_array_equal(read.pair.left, io.read_image(scene / "left.png"))
-    np.testing.assert_array_equal(read.pair.right, io.read_image(scene / "right.png"))
+    np.testing.assert_array_equal(read.pair.left, images.read_image(scene / "left.png"))
+    np.testing.assert_array_equal(read.pair.right, images.read_image(scene / "right.png"))
     np.testing.assert_array_equal(read.truth_px, truth_px)
     assert read.pair.camera is None
 
 
 def test_infinity_in_a_pfm_is_unknown(scene):
-    io.write_pfm(scene / "disparity.pfm", np.full((32, 40), np.inf))
+    maps.write_pfm(scene / "disparity.pfm", np.full((32, 40), np.inf))
     (read,) = read_scenes(scene.parent)
     assert np.isnan(read.truth_px).all()
 
 
 def test_a_calibration_beside_the_pictures_gives_the_camera(scene):
-    io.write_pfm(scene / "disparity.pfm", np.ones((32, 40)))
+    maps.write_pfm(scene / "disparity.pfm", np.ones((32, 40)))
     (scene / "calib.txt").write_text(CALIBRATION)
     (read,) = read_scenes(scene.parent)
     assert read.pair.camera == read_rig(scene / "calib.txt").camera()
 
 
 def test_scenes_come_by_name_and_other_folders_are_passed_over(scene):
-    io.write_pfm(scene / "disparity.pfm", np.ones((32, 40)))
+    maps.write_pfm(scene / "disparity.pfm", np.ones((32, 40)))
     (scene.parent / "notes").mkdir()
     for name in ("adirondack", "pipes"):
         (scene.parent / name).symlink_to(scene)
@@ -63,7 +63,7 @@ def test_a_scene_without_ground_truth_is_an_error(scene):
 
 
 def test_ground_truth_of_another_size_is_an_error(scene):
-    io.write_pfm(scene / "disparity.pfm", np.ones((32, 41)))
+    maps.write_pfm(scene / "disparity.pfm", np.ones((32, 41)))
     with pytest.raises(FormatError, match=r"expected ground truth of shape \(32, 40\).*found \(32, 41\)"):
         list(read_scenes(scene.parent))
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from dataset_examples import SHAPE, cut, error_naming, names, read_frame, shades, write_map, write_picture
 
-from stereoweave.io import files as io
+from stereoweave.io import maps
 from stereoweave.stereo import StereoCamera
 
 PASSES = {"frames_cleanpass": 10, "frames_finalpass": 30}
@@ -82,7 +82,7 @@ def test_both_disparities_are_read_and_tell_what_is_hidden(monkaa):
 def test_disparity_is_positive_whatever_sign_a_release_gives_it(monkaa, sides):
     for side in sides:
         path = monkaa / "disparity" / "treeflight_x2" / side / "0006.pfm"
-        io.write_pfm(path, -io.read_pfm(path))
+        maps.write_pfm(path, -maps.read_pfm(path))
     sample = read_frame("monkaa", monkaa, "clean/treeflight_x2/0006")
     assert sample.disparity_px[0, 0] == 7.25
     assert sample.right_disparity_px[0, 0] == 2.5

@@ -9,7 +9,7 @@ from PIL import Image
 
 from stereoweave.data.readers import open_dataset
 from stereoweave.errors import StereoweaveError
-from stereoweave.io import files as io
+from stereoweave.io import maps
 from stereoweave.stereo import Sample
 
 SHAPE = 32, 40
@@ -33,7 +33,7 @@ def write_map(path: Path, start: list, rest: float, kind: type, shape: tuple[int
     if start:
         values[0, : len(start)] = start
     if path.suffix == ".pfm":
-        io.write_pfm(path, values)
+        maps.write_pfm(path, values)
     else:
         write_pixels(path, values)
 

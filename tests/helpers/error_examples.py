@@ -7,7 +7,7 @@ import numpy as np
 from rig_examples import pinhole, rig_of
 
 from stereoweave.cameras.calibration_files import write_rig
-from stereoweave.io.files import read_image, write_image
+from stereoweave.io.images import read_image, write_image
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 LAYOUTS = (

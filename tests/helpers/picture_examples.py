@@ -4,7 +4,10 @@ import io
 import struct
 import zlib
 
+import pytest
 from PIL import Image
+
+from stereoweave.errors import FormatError
 
 
 def profile(name, red, green, blue):
@@ -46,3 +49,14 @@ def png_of(width_px, height_px):
     head = b"IHDR" + struct.pack(">LL", width_px, height_px) + content.getvalue()[24:29]
     whole = content.getvalue()
     return whole[:12] + head + struct.pack(">L", zlib.crc32(head)) + whole[33:]
+
+
+def refusal_of(function, *arguments, kind=FormatError):
+    """The message of the error that the call must end in, which names the file in one line."""
+    with pytest.raises(kind) as caught:
+        function(*arguments)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert str(arguments[0]) in message
+    assert "expected" in message
+    return message

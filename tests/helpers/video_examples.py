@@ -8,7 +8,7 @@ import av
 import cv2
 import numpy as np
 
-from stereoweave.io.files import read_image
+from stereoweave.io.images import read_image
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 FRAME_MS = 40  # 25 frames a second

@@ -8,7 +8,7 @@ from PIL import Image
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.arrays import as_rgb
-from stereoweave.io.files import read_image
+from stereoweave.io.images import read_image
 
 # Neighbouring values differ everywhere, so that no mix-up of axes or channels stays unseen.
 COLOURS = np.arange(40 * 50 * 3).reshape(40, 50, 3).astype(np.uint8)

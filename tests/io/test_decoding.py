@@ -23,7 +23,8 @@ from stereoweave.cameras.calibrate import calibrate
 from stereoweave.cli.root import main
 from stereoweave.data.readers import list_scenes
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io.files import read_disparity_png, read_image, read_pair, read_pfm, read_pixels, write_image
+from stereoweave.io.images import read_image, read_pair, write_image
+from stereoweave.io.maps import read_disparity_png, read_pfm, read_pixels
 from stereoweave.matching.backend import Backend
 from stereoweave.pictures.loading import open_pictures
 from stereoweave.pictures.prepare import Request, prepare
@@ -240,7 +241,8 @@ def test_one_picture_may_hold_two_views_of_the_greatest_length(tmp_path):
 PROGRAM = """
 import sys
 from stereoweave.cli.root import main
-from stereoweave.io.files import read_disparity_png, read_image, read_pfm
+from stereoweave.io.images import read_image
+from stereoweave.io.maps import read_disparity_png, read_pfm
 for path in (*sys.argv[1:], "a\\0b.png"):
     for read in (read_image, read_disparity_png, read_pfm):
         try:

@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stereoweave.io.files import read_image
+from stereoweave.io.images import read_image
 from stereoweave.matching.exposure import Looks, match_exposure, recolour
 from stereoweave.matching.matcher import Matcher
 from stereoweave.stereo import Estimate, StereoPair

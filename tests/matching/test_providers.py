@@ -10,7 +10,7 @@ from onnx import TensorProto, helper
 import stereoweave as sw
 from stereoweave.cli.root import main
 from stereoweave.errors import MatcherError, ProviderError
-from stereoweave.io.files import read_pair, write_image
+from stereoweave.io.images import read_pair, write_image
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.providers import PROVIDERS, explain_failure

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.files import read_pair
+from stereoweave.io.images import read_pair
 from stereoweave.matching.estimate import match
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions

@@ -9,7 +9,8 @@ from PIL import Image
 
 from stereoweave.cli.depth import depth
 from stereoweave.errors import OutputInUseError, StereoweaveError
-from stereoweave.io.files import read_disparity_png, read_image, read_pfm, read_pixels, write_image
+from stereoweave.io.images import read_image, write_image
+from stereoweave.io.maps import read_disparity_png, read_pfm, read_pixels
 from stereoweave.io.output_lock import lock_output
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher

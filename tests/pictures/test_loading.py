@@ -14,7 +14,7 @@ from video_examples import packed, shrunk
 from stereoweave.cli.options import Format
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.exif import Lens
-from stereoweave.io.files import read_image, write_image
+from stereoweave.io.images import read_image, write_image
 from stereoweave.pictures.loading import FORMATS, open_pictures
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS
 from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, add_mark, write_picture

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.files import read_image
+from stereoweave.io.images import read_image
 from stereoweave.rendering.layouts import (
     ANIMATIONS,
     LAYOUTS,

@@ -4,7 +4,7 @@ import pytest
 import stereoweave as sw
 from stereoweave.bench.metrics import psnr_db
 from stereoweave.errors import MatcherError
-from stereoweave.io.files import read_image
+from stereoweave.io.images import read_image
 from stereoweave.matching.estimate import estimate
 from stereoweave.rendering.renderer import render
 from stereoweave.rendering.synthesize import synthesize

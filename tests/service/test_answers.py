@@ -11,7 +11,7 @@ from PIL import Image
 from service_examples import BOTH, EXAMPLES
 
 import stereoweave as sw
-from stereoweave.io.files import read_pair, write_image
+from stereoweave.io.images import read_pair, write_image
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
 from stereoweave.pictures.prepare import Request

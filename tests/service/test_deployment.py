@@ -29,7 +29,8 @@ import stereoweave as sw
 from stereoweave.cameras.calibration_files import add_camera
 from stereoweave.cli.root import main
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.files import read_disparity_png, read_image, read_pair, read_pfm, write_image
+from stereoweave.io.images import read_image, read_pair, write_image
+from stereoweave.io.maps import read_disparity_png, read_pfm
 
 WAITING, MEGABYTES = 3, 4
 

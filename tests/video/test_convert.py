@@ -17,7 +17,7 @@ from video_examples import EXAMPLES, damage, example_pairs, packets, write_side_
 
 from stereoweave.cli.root import main
 from stereoweave.io.colormap import colour_disparity
-from stereoweave.io.files import read_image, write_image
+from stereoweave.io.images import read_image, write_image
 from stereoweave.matching.matcher import Matcher
 from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions
 from stereoweave.rendering.renderer import Renderer

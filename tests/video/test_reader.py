@@ -20,7 +20,7 @@ from video_examples import (
 )
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.files import write_image
+from stereoweave.io.images import write_image
 from stereoweave.pictures.pair_layouts import PAIR_LAYOUTS, detect_layout, measure_resemblance
 from stereoweave.video.reader import open_video
 from stereoweave.video.tracks import _fill_missing, _number_by_rank, _separate_duplicates

@@ -6,7 +6,8 @@ from pathlib import Path
 from stereoweave.data.packing import pack
 from stereoweave.data.shards import write_shard
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.files import SMALLEST_SIDE_PX, make_folder
+from stereoweave.io.files import make_folder
+from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.io.output_lock import lock_output
 from stereoweave.learn.data.collage import paint_collage
 

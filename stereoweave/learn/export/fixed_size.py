@@ -8,7 +8,8 @@ import onnx
 from onnxscript import optimizer
 
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.files import SMALLEST_SIDE_PX, make_folder, replacing
+from stereoweave.io.files import make_folder, replacing
+from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.learn.export.graph import write_card
 from stereoweave.matching.matcher import Matcher
 

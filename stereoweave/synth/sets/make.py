@@ -17,7 +17,8 @@ from stereoweave.data.packing import pack
 from stereoweave.data.paper_layout import list_complete_frames, remove_unfinished, write_frame
 from stereoweave.data.shards import list_shards, write_shard
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io.files import SMALLEST_SIDE_PX, make_folder, reading, remove_leftovers, replacing
+from stereoweave.io.files import make_folder, reading, remove_leftovers, replacing
+from stereoweave.io.images import SMALLEST_SIDE_PX
 from stereoweave.io.output_lock import lock_output
 from stereoweave.io.run_folder import check_claim, check_unclaimed, describe_run
 from stereoweave.rendering.renderer import FIRST_POSITION, LAST_POSITION

@@ -35,7 +35,7 @@ from experiments.paper.trials import (
 )
 from experiments.trial import Trial
 from stereoweave.data.paper_layout import write_frame
-from stereoweave.io.files import read_image
+from stereoweave.io.images import read_image
 from stereoweave.learn import checkpoint
 from stereoweave.learn.data.pair_cache import CachedPairs
 from stereoweave.learn.data.sources import VALIDATION_SEED

@@ -5,7 +5,7 @@ from learn_examples import box_before_a_wall
 from matplotlib.colors import to_rgb
 
 from experiments.paper import figures
-from stereoweave.io.files import read_image
+from stereoweave.io.images import read_image
 
 LARGEST_BYTES = 300_000
 CURVES = {

@@ -5,7 +5,7 @@ import pytest
 import torch
 from learn_examples import PAIR_SIZE, box_before_a_wall, overfitted, untrained
 
-from stereoweave.io.files import read_image
+from stereoweave.io.images import read_image
 from stereoweave.learn.data.batches import collate
 from stereoweave.learn.export import confidence as calibrate
 

@@ -7,7 +7,8 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from stereoweave.errors import FormatError
-from stereoweave.io.files import read_disparity_png, read_pair
+from stereoweave.io.images import read_pair
+from stereoweave.io.maps import read_disparity_png
 from stereoweave.learn.models.densemapnet import DenseMapNet, load_keras
 
 # Kernels in Keras's order: rows, columns, inputs, outputs; the transposed convolution's last two exchanged.

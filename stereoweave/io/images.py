@@ -1,0 +1,112 @@
+"""Reading and writing of pictures."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8, UInt16
+from PIL import Image
+
+from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.io.decoding import read_photograph
+from stereoweave.io.exif import read_orientation
+from stereoweave.io.files import replacing
+from stereoweave.stereo import StereoPair
+
+SMALLEST_SIDE_PX = 32
+_KINDS = {
+    ".png": "PNG",
+    ".jpg": "JPEG",
+    ".jpeg": "JPEG",
+    ".tif": "TIFF",
+    ".tiff": "TIFF",
+    ".webp": "WEBP",
+    ".bmp": "BMP",
+}
+
+
+def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
+    """Read a picture as uint8 sRGB [H, W, 3], rotated by its EXIF orientation.
+
+    Colour profiles are applied, grey becomes RGB, alpha is dropped, and 16 bits are reduced to 8. An MPO file
+    gives its first picture.
+
+    Raises:
+        FormatError: The file is missing, truncated, animated or of an unsupported kind; or the picture is
+            under 32 pixels or over 32,766 pixels wide or high, or over 65 megapixels.
+    """
+    photograph = read_photograph(Path(path))
+    image = photograph.upright(read_orientation(photograph.tags))
+    check_large_enough(path, image)
+    return image
+
+
+def check_large_enough(path: str | Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
+    """Raise a FormatError if a view is under 32 pixels wide or high."""
+    if min(image.shape[:2]) < SMALLEST_SIDE_PX:
+        raise FormatError(
+            f"{path}: expected at least {SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX} pixels, found {_size(image)}"
+        )
+
+
+def read_pair(left: str | Path, right: str | Path) -> StereoPair:
+    """Read a pair; raises FormatError as `read_image` does, or if the sizes differ."""
+    return pair_of(left, read_image(left), right, read_image(right))
+
+
+def pair_of(
+    left: str | Path,
+    left_image: UInt8[np.ndarray, "h w 3"],
+    right: str | Path,
+    right_image: UInt8[np.ndarray, "h2 w2 3"],
+) -> StereoPair:
+    """Make a pair of two named images; raises FormatError if one is too small or the sizes differ."""
+    for path, image in ((left, left_image), (right, right_image)):
+        check_large_enough(path, image)
+    if left_image.shape != right_image.shape:
+        raise FormatError(
+            f"expected left and right pictures of the same size, found {left} of {_size(left_image)} "
+            f"and {right} of {_size(right_image)}; crop or rescale one of them"
+        )
+    return StereoPair(left=left_image, right=right_image)
+
+
+def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"]) -> None:
+    """Write an RGB or grey image; the file name's ending sets the format, such as .png or .jpg."""
+    save_picture(path, image, picture_kind(path))
+
+
+def picture_kind(path: str | Path) -> str:
+    """Return Pillow's format name for the ending of `path`; raises StereoweaveError for an unknown one."""
+    ending = Path(path).suffix
+    if ending.lower() not in _KINDS:
+        raise StereoweaveError(
+            f"{path}: expected a picture file ending, {', '.join(_KINDS)}, found {ending!r}"
+        )
+    return _KINDS[ending.lower()]
+
+
+def save_picture(
+    path: str | Path, values: UInt8[np.ndarray, "h w *channels"] | UInt16[np.ndarray, "h w"], kind: str
+) -> None:
+    """Write values as a picture of one of Pillow's formats."""
+    with replacing(path) as temporary, checking_format_size(path, values.shape):
+        # Level 3 takes a third of the time of Pillow's 6, for 5 % more bytes (a photograph of 741x500).
+        Image.fromarray(values).save(temporary, kind, quality=95, compress_level=3)
+
+
+@contextmanager
+def checking_format_size(path: str | Path, shape: tuple[int, ...]) -> Iterator[None]:
+    """Turn Pillow's error for a size that the format does not support into a StereoweaveError."""
+    try:
+        yield
+    except ValueError as error:
+        raise StereoweaveError(
+            f"{path}: expected a size that {Path(path).suffix} supports, found {shape[1]}x{shape[0]} px "
+            f"({error}); .png supports any"
+        ) from error
+
+
+def _size(image: UInt8[np.ndarray, "h w 3"]) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"

@@ -1,0 +1,133 @@
+"""Reading and writing of disparity, depth and other maps."""
+
+import math
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32, Shaped
+from PIL import Image
+
+from stereoweave.errors import FormatError, StereoweaveError
+from stereoweave.io.decoding import check_regular, check_size, decode_values, open_picture
+from stereoweave.io.files import reading, replacing
+from stereoweave.io.images import checking_format_size, save_picture
+
+# Digits are limited, because Python cannot print an integer of 4,301 digits.
+_PFM_HEADER = re.compile(rb"Pf\s+(\d{1,9})\s+(\d{1,9})\s+(\S{1,99})\s")
+_LONGEST_PFM_HEADER = 256
+
+
+class RangeError(StereoweaveError):
+    """Disparity outside the range of a 16-bit PNG."""
+
+
+def read_pfm(path: str | Path) -> Float32[np.ndarray, "h w"]:
+    """Read a single-channel PFM file of either byte order, top row first.
+
+    Source: Middlebury's variant of the format: rows from the bottom up, a negative scale for little-endian.
+
+    Raises:
+        FormatError: The file is missing or of another format, has three channels ('PF'), no pixel or more
+            than `read_image` accepts, an invalid scale, or a length that contradicts its header.
+    """
+    check_regular(Path(path), "a PFM file")
+    with reading(path, "a PFM file"), Path(path).open("rb") as file:
+        (width_px, height_px), order, start = _pfm_header(path, file.read(_LONGEST_PFM_HEADER))
+        expected, found = 4 * width_px * height_px, file.seek(0, os.SEEK_END) - start
+        if found != expected:
+            raise FormatError(
+                f"{path}: expected {expected} bytes for {width_px}x{height_px} values, found {found}; "
+                "is the file truncated?"
+            )
+        file.seek(start)
+        values = np.frombuffer(file.read(), f"{order}f4")
+    return values.reshape(height_px, width_px)[::-1].astype(np.float32, order="C")
+
+
+def _pfm_header(path: str | Path, content: bytes) -> tuple[tuple[int, int], str, int]:
+    """Parse a PFM header: width and height in px, NumPy's byte order, and the offset of the values."""
+    header = _PFM_HEADER.match(content)
+    if header is None:
+        raise FormatError(
+            f"{path}: expected a single-channel PFM file, 'Pf', width, height and scale, "
+            f"found {content[:12]!r}"
+        )
+    size_px, scale = (int(header[1]), int(header[2])), float(header[3])
+    check_size(path, size_px)
+    if 0 in size_px or scale == 0 or not math.isfinite(scale):
+        raise FormatError(
+            f"{path}: expected a PFM file of at least one pixel and with a scale other than 0, "
+            f"found {size_px[0]}x{size_px[1]} and {scale:g}"
+        )
+    return size_px, "<" if scale < 0 else ">", header.end()
+
+
+def write_pfm(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
+    """Write a single-channel PFM file, float32 and little-endian; NaN and infinity are kept."""
+    with replacing(path) as temporary:
+        Image.fromarray(values.astype(np.float32)).save(temporary, "PPM")
+
+
+def write_float_tiff(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
+    """Write a single-channel TIFF file, float32 and uncompressed; NaN and infinity are kept."""
+    with replacing(path) as temporary, checking_format_size(path, values.shape):
+        Image.fromarray(values.astype(np.float32)).save(temporary, "TIFF")
+
+
+def write_npy(path: str | Path, values: Float[np.ndarray, "h w"]) -> None:
+    """Write a NumPy .npy file in float32; NaN and infinity are kept."""
+    with replacing(path) as temporary:
+        np.save(temporary, values.astype(np.float32), allow_pickle=False)
+
+
+def read_pixels(path: str | Path, *modes: str) -> Shaped[np.ndarray, "h w *channels"]:
+    """Read a picture's stored values without conversion, for measurements and masks.
+
+    Args:
+        path: The picture.
+        modes: Accepted Pillow modes, such as "L", 8-bit grey, or "RGB".
+
+    Raises:
+        FormatError: The file is missing or damaged, or the picture has another mode.
+    """
+    expected = f"a picture of mode {' or '.join(modes)}"
+    with open_picture(Path(path), expected=expected) as picture:
+        if picture.mode not in modes:
+            raise FormatError(f"{path}: expected {expected}, found {picture.format} of mode {picture.mode}")
+        return decode_values(path, picture)
+
+
+def read_disparity_png(path: str | Path) -> Float32[np.ndarray, "h w"]:
+    """Read disparity in px from a 16-bit PNG of px * 256 (KITTI's format); 0, unknown, becomes NaN."""
+    expected = "a 16-bit grey PNG of disparity * 256"
+    with open_picture(Path(path), expected=expected) as picture:
+        if not picture.mode.startswith("I"):
+            raise FormatError(f"{path}: expected {expected}, found {picture.format} of mode {picture.mode}")
+        steps = decode_values(path, picture)
+    return np.where(steps > 0, steps / 256, np.nan).astype(np.float32)
+
+
+def write_disparity_png(path: str | Path, disparity_px: Float[np.ndarray, "h w"]) -> None:
+    """Write disparity as a 16-bit PNG of px * 256 (KITTI's format); NaN and infinity become 0, unknown.
+
+    Known disparities are written as at least 1/256 px, so that none becomes unknown.
+
+    Raises:
+        RangeError: A known value is below 0 or above 255.99 px; nothing is written.
+    """
+    known = np.isfinite(disparity_px)
+    steps = np.rint(np.where(known, disparity_px, 0) * 256)
+    if steps.min() < 0 or steps.max() > 65535:
+        raise RangeError(
+            f"{path}: not written; expected disparities of 0 to 255.99 px for a 16-bit PNG, "
+            f"found {disparity_px[known].min():.3f} to {disparity_px[known].max():.3f}; use a PFM file"
+        )
+    save_picture(path, np.where(known, np.maximum(steps, 1), 0).astype(np.uint16), "PNG")
+
+
+def write_depth_png(path: str | Path, depth_m: Float[np.ndarray, "h w"]) -> None:
+    """Write depth as a 16-bit PNG of millimetres; unknown depth and depth beyond 65.535 m become 0."""
+    depth_mm = np.rint(depth_m * 1000)
+    save_picture(path, np.where((depth_mm > 0) & (depth_mm <= 65535), depth_mm, 0).astype(np.uint16), "PNG")

@@ -1,0 +1,149 @@
+import struct
+
+import cv2
+import numpy as np
+import pytest
+from picture_examples import refusal_of
+from PIL import Image
+
+from stereoweave.io import images, maps
+
+
+@pytest.fixture
+def picture():
+    """Smooth, so that JPEG keeps it, and different in every channel and direction."""
+    y, x = np.mgrid[:40, :48]
+    return np.stack([5 * x, 6 * y, 255 - 2 * x - 2 * y], axis=-1).astype(np.uint8)
+
+
+# PFM
+
+
+@pytest.mark.parametrize(("scale", "order"), [("-1.0", "<"), ("1", ">"), ("-0.003922", "<")])
+def test_a_pfm_file_has_its_bottom_row_first_in_either_byte_order(tmp_path, scale, order):
+    values = struct.pack(f"{order}6f", 4, 5, 6.5, 1, 2, float("inf"))
+    (tmp_path / "map.pfm").write_bytes(f"Pf\n3 2\n{scale}\n".encode() + values)
+    found = maps.read_pfm(tmp_path / "map.pfm")
+    np.testing.assert_array_equal(found, [[1, 2, np.inf], [4, 5, 6.5]])
+    assert found.dtype == np.dtype("=f4")
+
+
+def test_a_pfm_file_is_written_byte_for_byte(tmp_path):
+    maps.write_pfm(tmp_path / "map.pfm", np.array([[1.0, 2.0], [3.0, -4.5]]))
+    expected = b"Pf\n2 2\n-1.0\n" + struct.pack("<4f", 3, -4.5, 1, 2)
+    assert (tmp_path / "map.pfm").read_bytes() == expected
+
+
+def test_a_pfm_file_keeps_every_bit(tmp_path, rng):
+    values = rng.normal(size=(7, 5)).astype(np.float32)
+    values[0, 0], values[1, 1] = np.nan, -np.inf
+    maps.write_pfm(tmp_path / "map.pfm", values)
+    np.testing.assert_array_equal(maps.read_pfm(tmp_path / "map.pfm"), values)
+
+
+def test_opencv_reads_the_same_pfm(tmp_path, rng):
+    values = rng.normal(size=(7, 5)).astype(np.float32)
+    maps.write_pfm(tmp_path / "map.pfm", values)
+    read = cv2.imread(str(tmp_path / "map.pfm"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(read, values)
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        (b"PF\n1 1\n-1.0\n" + bytes(12), "found b'PF"),
+        (b"\x89PNG\r\n\x1a\n", "found b'"),
+        (b"", "found b''"),
+        (b"Pf\n2 2\n-1.0\n" + bytes(15), "expected 16 bytes for 2x2 values, found 15"),
+        (b"Pf\n2 2\n-1.0\n" + bytes(17), "expected 16 bytes for 2x2 values, found 17"),
+        (b"Pf\n2 2\nx\n" + bytes(16), "could not convert"),
+    ],
+)
+def test_what_is_no_pfm_is_refused(tmp_path, content, found):
+    (tmp_path / "map.pfm").write_bytes(content)
+    assert found in refusal_of(maps.read_pfm, tmp_path / "map.pfm")
+
+
+def test_a_missing_pfm_names_itself(tmp_path):
+    assert refusal_of(maps.read_pfm, tmp_path / "map.pfm").endswith("found no such file")
+
+
+# Disparity and depth in PNG
+
+
+def stored(path):
+    return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+
+
+def test_a_disparity_png_holds_pixels_times_256_and_unknown_as_0(tmp_path):
+    disparity_px = np.array([[1.0, 0.5, 255.99], [100.25, np.nan, np.inf]], np.float32)
+    maps.write_disparity_png(tmp_path / "disparity.png", disparity_px)
+    steps = stored(tmp_path / "disparity.png")
+    assert steps.dtype == np.uint16
+    np.testing.assert_array_equal(steps, [[256, 128, 65533], [25664, 0, 0]])
+
+
+def test_a_disparity_of_zero_does_not_become_unknown(tmp_path):
+    maps.write_disparity_png(tmp_path / "disparity.png", np.array([[0.0, 0.001, -0.001]]))
+    np.testing.assert_array_equal(stored(tmp_path / "disparity.png"), [[1, 1, 1]])
+
+
+def test_a_disparity_png_comes_back_within_half_a_step(tmp_path, rng):
+    disparity_px = rng.uniform(0.01, 255.99, (30, 40)).astype(np.float32)
+    disparity_px[3, 4] = np.nan
+    maps.write_disparity_png(tmp_path / "disparity.png", disparity_px)
+    read = maps.read_disparity_png(tmp_path / "disparity.png")
+    np.testing.assert_allclose(read, disparity_px, atol=0.5 / 256)
+    assert read.dtype == np.float32
+
+
+def test_a_map_without_a_known_pixel_is_written_as_unknown(tmp_path):
+    maps.write_disparity_png(tmp_path / "disparity.png", np.full((2, 3), np.nan))
+    assert np.isnan(maps.read_disparity_png(tmp_path / "disparity.png")).all()
+
+
+@pytest.mark.parametrize(("wrong_px", "found"), [(-0.5, "-0.500 to 9.000"), (256.0, "9.000 to 256.000")])
+def test_a_disparity_that_a_png_cannot_hold_leaves_none(tmp_path, wrong_px, found):
+    disparity_px = np.array([[wrong_px, 9.0, np.nan]])
+    path = tmp_path / "disparity.png"
+    assert f"found {found}" in refusal_of(maps.write_disparity_png, path, disparity_px, kind=maps.RangeError)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disparity_png_of_8_bits_is_refused(tmp_path, picture):
+    images.write_image(tmp_path / "disparity.png", picture[..., 0])
+    assert "found PNG of mode L" in refusal_of(maps.read_disparity_png, tmp_path / "disparity.png")
+
+
+def test_a_depth_png_holds_millimetres_and_unknown_as_0(tmp_path):
+    depth_m = np.array([[1.0, 2.3456, 65.535], [65.536, np.inf, np.nan]])
+    maps.write_depth_png(tmp_path / "depth.png", depth_m)
+    np.testing.assert_array_equal(stored(tmp_path / "depth.png"), [[1000, 2346, 65535], [0, 0, 0]])
+
+
+# Numbers in pictures
+
+
+@pytest.mark.parametrize(
+    ("mode", "values"),
+    [
+        ("L", np.arange(12, dtype=np.uint8).reshape(3, 4)),
+        ("1", np.eye(4, dtype=np.bool_)),
+        ("I;16", np.array([[0, 1, 65535]], np.uint16)),
+        ("RGB", np.array([[[1, 2, 3], [255, 0, 128]]], np.uint8)),
+    ],
+)
+def test_numbers_come_back_as_they_are_stored(tmp_path, mode, values):
+    path = tmp_path / "numbers.png"
+    Image.fromarray(values).save(path)
+    read = maps.read_pixels(path, "other", mode)
+    assert read.dtype == values.dtype
+    np.testing.assert_array_equal(read, values)
+
+
+def test_numbers_in_a_picture_of_another_kind_are_refused(tmp_path, picture):
+    images.write_image(tmp_path / "colour.png", picture)
+    assert "mode L or 1, found PNG of mode RGB" in refusal_of(
+        maps.read_pixels, tmp_path / "colour.png", "L", "1"
+    )
+    refusal_of(maps.read_pixels, tmp_path / "nowhere.png", "L")
