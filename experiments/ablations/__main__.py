@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from experiments.command_line import RecipeFile, RunsFolder, Seeds, run
-from stereoweave.cli.options import make_parent_folder, needing_train_extra
+from stereoweave.cli.options import make_parent_folder, require_train_extra
 
 
 def ablations(
@@ -33,7 +33,7 @@ def ablations(
     from rich.console import Console
 
     make_parent_folder(report)
-    with needing_train_extra():
+    with require_train_extra():
         from experiments.ablations.experiment import plan, run_ablations
         from stereoweave.learn.recipe import read_recipe
     run_ablations(plan(read_recipe(recipe), seeds), out, rendered, report, Console())

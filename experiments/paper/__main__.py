@@ -9,7 +9,7 @@ import typer
 
 from experiments.command_line import RecipeFile, RunsFolder, Seeds, run
 from experiments.paper.trials import ADJUSTMENT, CLAIMS
-from stereoweave.cli.options import needing_train_extra
+from stereoweave.cli.options import require_train_extra
 
 
 def paper(  # noqa: PLR0913 - each is an option of the command line
@@ -29,7 +29,7 @@ def paper(  # noqa: PLR0913 - each is an option of the command line
     from rich.console import Console
 
     console = Console()
-    with needing_train_extra():
+    with require_train_extra():
         from experiments.paper.experiment import plan, run_trials
         from experiments.paper.report import write_report
         from stereoweave.learn.recipe import read_recipe

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from experiments.command_line import RecipeFile, run
-from stereoweave.cli.options import make_parent_folder, needing_train_extra
+from stereoweave.cli.options import make_parent_folder, require_train_extra
 from stereoweave.cli.tables import write_and_print
 
 
@@ -21,7 +21,7 @@ def speed(
 
     make_parent_folder(out)
     read = read_recipe(recipe)
-    with needing_train_extra():
+    with require_train_extra():
         from experiments.speed.timing import measure_run_times
     write_and_print(out, "A pair of 640x480", measure_run_times(read))
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from experiments.command_line import run
-from stereoweave.cli.options import make_parent_folder, needing_train_extra
+from stereoweave.cli.options import make_parent_folder, require_train_extra
 
 
 def stage_costs(
@@ -23,7 +23,7 @@ def stage_costs(
 
     if out:
         make_parent_folder(out)
-    with needing_train_extra():
+    with require_train_extra():
         from experiments.stage_costs import profiling
     rows = profiling.measure_stage_costs(runs)
     if out:

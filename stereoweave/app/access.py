@@ -41,7 +41,7 @@ class ContentPolicy:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        await self._app(scope, receive, _with_header(send, "content-security-policy", _POLICY))
+        await self._app(scope, receive, _add_header(send, "content-security-policy", _POLICY))
 
 
 class OwnFiles:
@@ -60,7 +60,7 @@ class OwnFiles:
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
-        visitor = _visitor(scope)
+        visitor = _find_visitor(scope)
         try:
             receive = await self._checked(scope, receive, visitor)
         except PermissionError:
@@ -68,10 +68,10 @@ class OwnFiles:
             return
         if scope["path"] == "/" and not visitor:
             cookie = f"{_COOKIE}={token_urlsafe(32)}; HttpOnly; SameSite=Lax; Path=/"
-            send = _with_header(send, "set-cookie", cookie)
+            send = _add_header(send, "set-cookie", cookie)
         elif scope["path"] in _NAMING and visitor:
-            send = self._remembering(send, visitor)
-        await self._app(_without_cookies(scope), receive, send)
+            send = self._watch_response(send, visitor)
+        await self._app(_remove_cookies(scope), receive, send)
 
     async def _checked(self, scope: Scope, receive: Receive, visitor: str) -> Receive:
         """The channel to read the request from; raises PermissionError if it names a file of someone else."""
@@ -81,8 +81,8 @@ class OwnFiles:
         if path.startswith(_FILE):
             self._check([path.removeprefix(_FILE)], visitor)
         elif method not in ("GET", "HEAD") and path != f"{_API}/upload":
-            value, text = await _json(Request(scope, receive))
-            self._check(list(_paths(value)), visitor)
+            value, text = await _read_json(Request(scope, receive))
+            self._check(list(_find_paths(value)), visitor)
             return _replay(text, receive)
         return receive
 
@@ -90,7 +90,7 @@ class OwnFiles:
         if not all(isinstance(path, str) and self._named.knows(visitor, path) for path in paths):
             raise PermissionError
 
-    def _remembering(self, send: Send, visitor: str) -> Send:
+    def _watch_response(self, send: Send, visitor: str) -> Send:
         """Remember the files that a response names: a list of uploads, or one event a line."""
         kept = b""
 
@@ -101,18 +101,18 @@ class OwnFiles:
                 if not message.get("more_body"):
                     whole.append(kept)
                 for line in whole:
-                    self._remember(line.removeprefix(b"data: "), visitor)
+                    self._remember_line(line.removeprefix(b"data: "), visitor)
             await send(message)
 
         return send_and_remember
 
-    def _remember(self, line: bytes, visitor: str) -> None:
+    def _remember_line(self, line: bytes, visitor: str) -> None:
         try:
             value = json.loads(line)
         except ValueError:
             return
         uploads = value if isinstance(value, list) else []
-        for path in (*uploads, *_paths(value)):
+        for path in (*uploads, *_find_paths(value)):
             self._named.add(visitor, path)
 
 
@@ -142,7 +142,7 @@ def _use(entries: OrderedDict[str, Any], key: str, most: int) -> None:
         entries.popitem(last=False)
 
 
-def _visitor(scope: Scope) -> str:
+def _find_visitor(scope: Scope) -> str:
     """The visitor's cookie; empty if there is none."""
     # In some versions of Python the time to unquote a cookie grows with the square of its length.
     for header in Headers(scope=scope).getlist("cookie"):
@@ -153,12 +153,12 @@ def _visitor(scope: Scope) -> str:
     return ""
 
 
-def _without_cookies(scope: Scope) -> Scope:
+def _remove_cookies(scope: Scope) -> Scope:
     """The request without cookies: Gradio would unquote those of other servers too."""
     return {**scope, "headers": [(name, value) for name, value in scope["headers"] if name != b"cookie"]}
 
 
-def _with_header(send: Send, name: str, value: str) -> Send:
+def _add_header(send: Send, name: str, value: str) -> Send:
     async def send_with_header(message: Message) -> None:
         if message["type"] == "http.response.start":
             MutableHeaders(scope=message).append(name, value)
@@ -167,7 +167,7 @@ def _with_header(send: Send, name: str, value: str) -> Send:
     return send_with_header
 
 
-async def _json(request: Request) -> tuple[Any, bytes]:
+async def _read_json(request: Request) -> tuple[Any, bytes]:
     """The value of a request's JSON body, and the body encoded again, so that Gradio reads what is checked.
 
     Raises:
@@ -185,7 +185,7 @@ async def _json(request: Request) -> tuple[Any, bytes]:
         raise PermissionError from error
 
 
-def _paths(value: Any) -> Iterator[Any]:
+def _find_paths(value: Any) -> Iterator[Any]:
     """Yield every `path` in a value: Gradio treats any mapping with this key as a file."""
     waiting = [value]
     while waiting:

@@ -206,9 +206,9 @@ class Worker:
     def _film(self, planned: Planned, scratch: Path, job: DepthJob) -> ManifestRow:
         from rich.console import Console
 
-        from stereoweave.io.animation import needing_the_video_extra
+        from stereoweave.io.animation import require_video_extra
 
-        with needing_the_video_extra("a video"):
+        with require_video_extra("a video"):
             from stereoweave.video.convert import convert_video
             from stereoweave.video.job import VideoJob
             from stereoweave.video.parts import parts_folder

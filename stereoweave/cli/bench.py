@@ -15,9 +15,9 @@ from stereoweave.cli.options import (
     Threads,
     make_engine,
     make_parent_folder,
-    needing_synth_extra,
-    needing_train_extra,
     parse_size_px,
+    require_synth_extra,
+    require_train_extra,
 )
 from stereoweave.cli.tables import (
     FLICKER_TABLES,
@@ -113,7 +113,7 @@ def collages(
     size: Annotated[str, typer.Option(help="Width and height in pixels.")] = "384x256",
 ) -> None:
     """Write held-out collages, painted like the training pairs, as a set for bench pairs."""
-    with needing_train_extra():
+    with require_train_extra():
         from stereoweave.learn.data.collage_set import write_collages
     width_px, height_px = parse_size_px(size)
     write_collages(out, pairs, seed, (height_px, width_px))
@@ -168,7 +168,7 @@ def flicker(  # noqa: PLR0913 - each is an option of the command line
 ) -> None:
     """Score the temporal filter on rendered noisy videos: flicker and errors with and without it."""
     make_parent_folder(out)
-    with needing_synth_extra():
+    with require_synth_extra():
         from stereoweave.bench.flicker import average_rows, score_flicker
     from stereoweave.bench.pairs import write_csv
 
@@ -197,7 +197,7 @@ def networks(
     from rich.console import Console
 
     make_parent_folder(out)
-    with needing_train_extra():
+    with require_train_extra():
         from stereoweave.learn.evaluation import evaluate
     rows = evaluate(runs, pairs or runs[0].parent / "pairs", Console())
     write_and_print(out, "Means over the held-out pairs", rows)
@@ -215,7 +215,7 @@ def parity(
     from stereoweave.bench.pairs import write_csv
 
     make_parent_folder(out)
-    with needing_train_extra():
+    with require_train_extra():
         from stereoweave.learn.export.parity import format_markdown
         from stereoweave.learn.export.parity import measure_parity as measured
     rows = measured(checkpoints)
@@ -231,7 +231,7 @@ def training(
 ) -> None:
     """Record the learning curve of a run: held-out scores by pairs seen, and the power laws that fit them."""
     make_parent_folder(out)
-    with needing_train_extra():
+    with require_train_extra():
         from stereoweave.learn.training.curves import record_curve
     for name, law in record_curve(run, out).items():
         typer.echo(f"{name}: {law.at_10000_pairs:.4g} * (pairs / 10,000)^-{law.exponent:.3f}")
@@ -259,7 +259,7 @@ def _check_plots(*pictures: Path | None) -> None:
     for picture in filter(None, pictures):
         picture_kind(picture)
         make_parent_folder(picture)
-        with needing_train_extra("a plot needs matplotlib"):
+        with require_train_extra("a plot needs matplotlib"):
             from stereoweave.bench import plots as benchmark_plots  # noqa: F401 - checks that matplotlib is installed
 
 

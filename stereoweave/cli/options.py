@@ -233,14 +233,14 @@ def _bracket_ipv6(host: str) -> str:
 
 
 @contextmanager
-def needing_train_extra(what: str = "this command needs PyTorch and other libraries") -> Iterator[None]:
+def require_train_extra(what: str = "this command needs PyTorch and other libraries") -> Iterator[None]:
     """Raise a one-line error that names the `train` extra if a library is missing."""
     with require_extra("train", what):
         yield
 
 
 @contextmanager
-def needing_synth_extra() -> Iterator[None]:
+def require_synth_extra() -> Iterator[None]:
     """Raise a one-line error that names the `synth` extra if a library is missing."""
     with require_extra("synth", "this command needs the rendering libraries"):
         import skimage  # noqa: F401 - textures need it later, in worker processes too

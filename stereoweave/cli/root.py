@@ -16,7 +16,7 @@ from stereoweave.cli.bench import bench
 from stereoweave.cli.commands import Commands
 from stereoweave.cli.depth import depth, measure
 from stereoweave.cli.live import live
-from stereoweave.cli.options import needing_train_extra
+from stereoweave.cli.options import require_train_extra
 from stereoweave.cli.rig import calibrate, check, rectify
 from stereoweave.cli.serve import serve
 from stereoweave.cli.synth import synth
@@ -78,11 +78,11 @@ def train(
     """Train the network of a recipe, or resume an interrupted run."""
     from stereoweave.learn.distributed import report_once
 
-    with report_once(), needing_train_extra():
+    with report_once(), require_train_extra():
         from stereoweave.learn.recipe import read_recipe
 
         read_recipe(recipe)  # reports errors before PyTorch, which takes seconds to load
-    with needing_train_extra():
+    with require_train_extra():
         from stereoweave.learn.training.loop import train as train_recipe
     train_recipe(recipe, out)
 
@@ -130,7 +130,7 @@ def export(  # noqa: PLR0913 - each is an option of the command line
 
     size_px = _size_px(size) if size else None
     pairs = [scene.pair for scene in read_scenes(scenes)] if scenes else []
-    with needing_train_extra():
+    with require_train_extra():
         from stereoweave.learn.export.files import MatcherFiles, write_matcher_files, write_weights
     if weights:
         typer.echo(write_weights(Path(source), weights))

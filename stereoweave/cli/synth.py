@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from stereoweave.cli.commands import Commands
-from stereoweave.cli.options import Cluster, make_engine, needing_synth_extra, parse_size_px
+from stereoweave.cli.options import Cluster, make_engine, parse_size_px, require_synth_extra
 
 synth = Commands("Make, check and view rendered stereo pairs with exact ground truth.")
 
@@ -58,7 +58,7 @@ def make(  # noqa: PLR0913 - each is an option of the command
     cluster: Cluster = None,
 ) -> None:
     """Make a set of rendered pairs, or resume or extend one."""
-    with needing_synth_extra():
+    with require_synth_extra():
         from stereoweave.synth.sets.make import PairRenderer
         from stereoweave.synth.sets.make import make as make_set
         from stereoweave.synth.sets.pair_rendering import RenderSpec
@@ -95,7 +95,7 @@ def sheet(
     from stereoweave.io.images import picture_kind, write_image
 
     picture_kind(out)
-    with needing_synth_extra():
+    with require_synth_extra():
         from stereoweave.synth.scenes import SCENES
         from stereoweave.synth.sets.contact_sheet import contact_sheet, quiz_sheet
         from stereoweave.synth.sets.renderers import shared_renderer
@@ -118,7 +118,7 @@ def costs(
     """Measure the time of each rendering effect: milliseconds per 640x480 pair on one core."""
     # One thread, see synth make; Mesa reads it when the renderer starts.
     os.environ["LP_NUM_THREADS"] = "1"
-    with needing_synth_extra():
+    with require_synth_extra():
         from stereoweave.synth.sets.effect_costs import measure_effect_costs
     for cost in measure_effect_costs(scene, pairs):
         typer.echo(f"{cost.ms_a_pair:6.0f} ms  {cost.effect}")

@@ -100,11 +100,11 @@ def video(  # noqa: PLR0913 - each is an option of the command line
     """Convert a stereo video to depth, a new view or a layout; sound and frame times are kept."""
     from rich.console import Console
 
-    from stereoweave.io.animation import needing_the_video_extra
+    from stereoweave.io.animation import require_video_extra
     from stereoweave.matching.backend import Backend
     from stereoweave.video.reader import open_video
 
-    with needing_the_video_extra("a video"):
+    with require_video_extra("a video"):
         from stereoweave.video.convert import convert_video
         from stereoweave.video.job import VideoJob
         from stereoweave.video.parts import parts_folder

@@ -33,7 +33,7 @@ def write_animation(path: str | Path, frames: Iterable[UInt8[np.ndarray, "h w 3"
             disk is full.
     """
     write = _KINDS[check_animation_ending(path)]
-    alike = _of_one_size(frames)
+    alike = _check_sizes(frames)
     with replacing(path) as temporary:
         write(temporary, alike, frame_ms)
 
@@ -50,28 +50,28 @@ def check_animation_ending(path: str | Path) -> str:
             f"{path}: expected the ending of an animation, {', '.join(_KINDS)}, found {Path(path).suffix!r}"
         )
     if ending == ".mp4":
-        with needing_the_video_extra("an MP4 file"):
+        with require_video_extra("an MP4 file"):
             import av  # noqa: F401 - fail before the frames are rendered, which takes longer
     return ending
 
 
 @contextmanager
-def needing_the_video_extra(what: str) -> Iterator[None]:
+def require_video_extra(what: str) -> Iterator[None]:
     """Turn a missing PyAV into an error that names the extra."""
     with require_extra("video", f"{what} needs PyAV"):
         yield
 
 
-def _of_one_size(frames: Iterable[UInt8[np.ndarray, "h w 3"]]) -> Frames:
+def _check_sizes(frames: Iterable[UInt8[np.ndarray, "h w 3"]]) -> Frames:
     """Check that frames have one size; render the first now, so that it fails before a file is created."""
     coming = iter(frames)
     first = next(coming, None)
     if first is None:
         raise StereoweaveError("frames: expected one or more, found none")
-    return chain([first], (_sized_as(first, frame) for frame in coming))
+    return chain([first], (_check_size(first, frame) for frame in coming))
 
 
-def _sized_as(first: UInt8[np.ndarray, "h w 3"], frame: UInt8[np.ndarray, "h2 w2 3"]) -> np.ndarray:
+def _check_size(first: UInt8[np.ndarray, "h w 3"], frame: UInt8[np.ndarray, "h2 w2 3"]) -> np.ndarray:
     if frame.shape != first.shape:
         raise StereoweaveError(
             f"frames: expected all of one size, found {first.shape[1]}x{first.shape[0]} "
@@ -84,7 +84,7 @@ def _write_mp4(path: Path, frames: Frames, frame_ms: int) -> None:
     import av
     from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
-    first = _with_even_sides(next(frames))
+    first = _pad_to_even(next(frames))
     with av.open(path, "w", options={"movflags": "faststart"}) as film:
         stream = film.add_stream("libx264", rate=Fraction(1000, frame_ms), options={"crf": "18"})
         context = stream.codec_context
@@ -93,7 +93,7 @@ def _write_mp4(path: Path, frames: Frames, frame_ms: int) -> None:
         # Stored in the file: players would guess from the size instead, and shift the colours.
         context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
         context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
-        for frame in chain([first], map(_with_even_sides, frames)):
+        for frame in chain([first], map(_pad_to_even, frames)):
             picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
             in_yuv = picture.reformat(
                 format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
@@ -102,7 +102,7 @@ def _write_mp4(path: Path, frames: Frames, frame_ms: int) -> None:
         film.mux(stream.encode())
 
 
-def _with_even_sides(frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+def _pad_to_even(frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
     height, width = frame.shape[:2]
     return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), "edge")
 

@@ -32,7 +32,7 @@ def as_rgb(image: object, name: str = "image") -> UInt8[np.ndarray, "h w 3"]:
         StereoweaveError: if type, shape or dtype is unsupported, or a float is outside of 0..1.
     """
     if isinstance(image, Image.Image):
-        image = _of_pil(image)
+        image = _convert_pil(image)
     elif hasattr(image, "detach"):  # a tensor, detected without importing PyTorch
         tensor = image.detach().cpu()
         # NumPy has no bfloat16.
@@ -44,7 +44,7 @@ def as_rgb(image: object, name: str = "image") -> UInt8[np.ndarray, "h w 3"]:
             f"{name}: expected a NumPy array, a PIL image or a torch tensor, got {type(image).__name__}; "
             "PIL.Image.open reads a file"
         )
-    levels = _channels_last(_eight_bits(image, name), name)
+    levels = _move_channels_last(_to_eight_bits(image, name), name)
     match levels.shape[2]:
         case 1:
             return np.repeat(levels, 3, axis=2)
@@ -53,7 +53,7 @@ def as_rgb(image: object, name: str = "image") -> UInt8[np.ndarray, "h w 3"]:
     return np.ascontiguousarray(levels)
 
 
-def _of_pil(picture: Image.Image) -> Shaped[np.ndarray, "h w *channels"]:
+def _convert_pil(picture: Image.Image) -> Shaped[np.ndarray, "h w *channels"]:
     if not picture.mode.startswith(("I", "F")):
         direct = picture.convert(_BETWEEN[picture.mode]) if picture.mode in _BETWEEN else picture
         # A copy: Pillow's read-only pixels would make Numba compile again and PyTorch warn.
@@ -65,7 +65,7 @@ def _of_pil(picture: Image.Image) -> Shaped[np.ndarray, "h w *channels"]:
     return values
 
 
-def _eight_bits(values: Shaped[np.ndarray, "..."], name: str) -> UInt8[np.ndarray, "..."]:
+def _to_eight_bits(values: Shaped[np.ndarray, "..."], name: str) -> UInt8[np.ndarray, "..."]:
     if values.dtype == np.uint8:
         return values
     if values.dtype.kind == "u" and values.dtype.itemsize == 2:
@@ -84,7 +84,7 @@ def _eight_bits(values: Shaped[np.ndarray, "..."], name: str) -> UInt8[np.ndarra
     return np.rint(values * 255.0).astype(np.uint8)
 
 
-def _channels_last(levels: UInt8[np.ndarray, "..."], name: str) -> UInt8[np.ndarray, "h w channels"]:
+def _move_channels_last(levels: UInt8[np.ndarray, "..."], name: str) -> UInt8[np.ndarray, "h w channels"]:
     picture = levels[0] if levels.ndim == 4 and len(levels) == 1 else levels
     if picture.ndim == 2:
         return picture[..., None]

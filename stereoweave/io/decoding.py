@@ -72,14 +72,14 @@ def open_picture(path: Path, *, views: int = 1, expected: str = A_PICTURE) -> It
         head = file.read(64)
     _refuse_by_name(path, head)
     with _decoding(path, expected):
-        picture = _opened(path, path, views)
+        picture = _open(path, path, views)
     with picture:
         check_size(path, picture.size, views=views)
         _refuse_by_content(path, picture)
         yield picture
 
 
-def read_photograph(path: Path) -> DecodedPicture:
+def read_picture(path: Path) -> DecodedPicture:
     """Decode a file that holds one view."""
     with open_picture(path) as picture:
         return decode(path, picture)
@@ -92,8 +92,8 @@ def decode(path: Path, picture: Image.Image) -> DecodedPicture:
         picture.load()
     tags = exif.read_tags(picture)
     if picture.mode.startswith(("I", "F")):
-        return DecodedPicture(_eight_bits(path, picture), tags, None)
-    image, note = _in_srgb(picture)
+        return DecodedPicture(_to_eight_bits(path, picture), tags, None)
+    image, note = _convert_to_srgb(picture)
     with _decoding(path):
         return DecodedPicture(image if image.mode == "RGB" else image.convert("RGB"), tags, note)
 
@@ -108,7 +108,7 @@ def decode_values(path: str | Path, picture: Image.Image) -> Shaped[np.ndarray, 
 def decode_packed_values(name: str, content: bytes) -> Shaped[np.ndarray, "h w *channels"]:
     """Decode the stored values of a picture within another file; errors call it `name`."""
     with _decoding(name):
-        picture = _opened(name, io.BytesIO(content), 1)
+        picture = _open(name, io.BytesIO(content), 1)
     check_size(name, picture.size)
     return decode_values(name, picture)
 
@@ -128,7 +128,9 @@ def check_size(path: str | Path, size_px: tuple[int, int], *, views: int = 1) ->
     """Raise a FormatError if width, height or the number of pixels exceeds the limit."""
     width_px, height_px = size_px
     if width_px * height_px > views * MOST_PIXELS:
-        raise FormatError(f"{path}: expected {_most(views)}, found {width_px}x{height_px}; scale it down")
+        raise FormatError(
+            f"{path}: expected {_format_limit(views)}, found {width_px}x{height_px}; scale it down"
+        )
     if max(size_px) > views * LONGEST_SIDE_PX:
         raise FormatError(
             f"{path}: expected at most {views * LONGEST_SIDE_PX} pixels a side, "
@@ -156,14 +158,16 @@ def _decoding(path: str | Path, expected: str = A_PICTURE) -> Iterator[None]:
         raise FormatError(f"{path}: expected {expected}, found {reason(error)}") from error
 
 
-def _opened(path: str | Path, source: Path | io.BytesIO, views: int) -> Image.Image:
+def _open(path: str | Path, source: Path | io.BytesIO, views: int) -> Image.Image:
     try:
         return Image.open(source, formats=_KINDS)
     except Image.DecompressionBombError as error:
-        raise FormatError(f"{path}: expected {_most(views)}, found more ({error}); scale it down") from error
+        raise FormatError(
+            f"{path}: expected {_format_limit(views)}, found more ({error}); scale it down"
+        ) from error
 
 
-def _most(views: int) -> str:
+def _format_limit(views: int) -> str:
     return f"at most {views * MOST_PIXELS // 1_000_000} megapixels"
 
 
@@ -205,7 +209,7 @@ def _refuse_by_content(path: Path, picture: Any) -> None:
             )
 
 
-def _eight_bits(path: Path, picture: Image.Image) -> Image.Image:
+def _to_eight_bits(path: Path, picture: Image.Image) -> Image.Image:
     """Convert a loaded 16-bit grey picture, or a 32-bit one with 16-bit values, to 8-bit RGB."""
     with _decoding(path):
         values = np.asarray(picture)
@@ -219,7 +223,7 @@ def _eight_bits(path: Path, picture: Image.Image) -> Image.Image:
     return Image.fromarray((values >> bits).astype(np.uint8)).convert("RGB")
 
 
-def _in_srgb(picture: Image.Image) -> tuple[Image.Image, str | None]:
+def _convert_to_srgb(picture: Image.Image) -> tuple[Image.Image, str | None]:
     """Convert a picture to sRGB; also returns a note if it has another colour profile, or a damaged one."""
     profile, mode = picture.info.get("icc_profile"), _PROFILED.get(picture.mode)
     if not profile or mode is None:
@@ -228,7 +232,7 @@ def _in_srgb(picture: Image.Image) -> tuple[Image.Image, str | None]:
 
     try:
         stored = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-        name = _words(ImageCms.getProfileDescription(stored)) or "a profile without a name"
+        name = _clean_text(ImageCms.getProfileDescription(stored)) or "a profile without a name"
         if "srgb" in name.lower():
             return picture, None
         converted = ImageCms.profileToProfile(
@@ -240,11 +244,14 @@ def _in_srgb(picture: Image.Image) -> tuple[Image.Image, str | None]:
             flags=ImageCms.Flags.BLACKPOINTCOMPENSATION,
         )
     except Exception as error:  # of any type for a damaged profile, as in `_decoding`
-        return picture, f"the colour profile cannot be used, colours are taken as sRGB ({_words(str(error))})"
+        return (
+            picture,
+            f"the colour profile cannot be used, colours are taken as sRGB ({_clean_text(str(error))})",
+        )
     return converted or picture, f"colours converted from {name}"
 
 
-def _words(text: str) -> str:
+def _clean_text(text: str) -> str:
     """Text from a file, safe to show within a line."""
     return "".join(filter(str.isprintable, " ".join(text.split())))[:_LONGEST_WORDS]
 
@@ -288,5 +295,5 @@ def _seek(path: Path, picture: Image.Image, index: int) -> None:
     except Exception as error:  # of any type for a damaged file, as in `_decoding`
         raise FormatError(
             f"{path}: expected an undamaged MPO file, found picture {index + 1} truncated or damaged "
-            f"({_words(str(error))})"
+            f"({_clean_text(str(error))})"
         ) from error

@@ -9,7 +9,7 @@ from jaxtyping import UInt8, UInt16
 from PIL import Image
 
 from stereoweave.errors import FormatError, StereoweaveError
-from stereoweave.io.decoding import read_photograph
+from stereoweave.io.decoding import read_picture
 from stereoweave.io.exif import read_orientation
 from stereoweave.io.files import replacing
 from stereoweave.stereo import StereoPair
@@ -36,7 +36,7 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
         FormatError: The file is missing, truncated, animated or of an unsupported kind; or the picture is
             under 32 pixels or over 32,766 pixels wide or high, or over 65 megapixels.
     """
-    photograph = read_photograph(Path(path))
+    photograph = read_picture(Path(path))
     image = photograph.upright(read_orientation(photograph.tags))
     check_large_enough(path, image)
     return image
@@ -52,10 +52,10 @@ def check_large_enough(path: str | Path, image: UInt8[np.ndarray, "h w 3"]) -> N
 
 def read_pair(left: str | Path, right: str | Path) -> StereoPair:
     """Read a pair; raises FormatError as `read_image` does, or if the sizes differ."""
-    return pair_of(left, read_image(left), right, read_image(right))
+    return make_pair(left, read_image(left), right, read_image(right))
 
 
-def pair_of(
+def make_pair(
     left: str | Path,
     left_image: UInt8[np.ndarray, "h w 3"],
     right: str | Path,

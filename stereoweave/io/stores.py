@@ -182,10 +182,10 @@ class DiskStore:
         waiting = [below]
         while waiting:
             within = waiting.pop()
-            entries = _entries(self.folder / within)
+            entries = _list_entries(self.folder / within)
             paths = [f"{within}/{entry.name}" if within else entry.name for entry in entries]
             for entry, path in zip(entries, paths, strict=True):
-                if status := _status(entry):
+                if status := _read_status(entry):
                     yield StoredFile(path, status.st_size, str(status.st_mtime_ns))
             folders = zip(entries, paths, strict=True)
             # Links are not followed: they may form a cycle.
@@ -239,7 +239,7 @@ class ObjectStore:
     def files(self, below: str = "") -> Iterator[StoredFile]:
         with self._library(below, "a folder that can be listed") as (library, folder):
             start = len(folder) - len(below) + (not below)
-            for file in (_listed_in_s3 if self._is_s3() else _listed)(library, folder):
+            for file in (_list_s3 if self._is_s3() else _list_files)(library, folder):
                 path = file.path[start:]
                 # Some programs mark a folder by an empty object whose name ends in "/".
                 if path and "/." not in f"/{path}" and not path.endswith("/"):
@@ -292,7 +292,7 @@ class ObjectStore:
             try:
                 if self._is_s3():
                     # `info` would begin with a HEAD request, whose error has no reason but "Forbidden".
-                    return bool(_page(library, folder, MaxKeys=1, timeout=_ANSWER_S).get("Contents"))
+                    return bool(_fetch_page(library, folder, MaxKeys=1, timeout=_ANSWER_S).get("Contents"))
                 with suppress(FileNotFoundError):
                     library.info(folder, timeout=_ANSWER_S)
                     return True
@@ -318,51 +318,51 @@ class ObjectStore:
             raise
         except Exception as error:  # the libraries' exceptions have no common base
             raise StereoweaveError(
-                f"{self.at(path)}: expected {expected}, found {_found(error, self._kind())}"
+                f"{self.at(path)}: expected {expected}, found {_describe_error(error, self._kind())}"
             ) from error
 
     def _kind(self) -> _Kind:
         return _KINDS[self.place.partition("://")[0]]
 
 
-def _entries(folder: Path) -> list[os.DirEntry[str]]:
+def _list_entries(folder: Path) -> list[os.DirEntry[str]]:
     """Entries of a folder by name, without hidden ones; none if the folder is missing or unreadable."""
     with suppress(FileNotFoundError, PermissionError), os.scandir(folder) as entries:
         return sorted((entry for entry in entries if entry.name[0] != "."), key=lambda entry: entry.name)
     return []
 
 
-def _status(entry: os.DirEntry[str]) -> os.stat_result | None:
+def _read_status(entry: os.DirEntry[str]) -> os.stat_result | None:
     """Status of a file; None for anything else, and for a file that was just removed."""
     with suppress(FileNotFoundError):
         return entry.stat() if entry.is_file() else None
     return None
 
 
-def _listed_in_s3(library: "AsyncFileSystem", folder: str) -> Iterator[StoredFile]:
+def _list_s3(library: "AsyncFileSystem", folder: str) -> Iterator[StoredFile]:
     """List the files below a folder by their full names, lazily, in pages of a thousand."""
     bucket = folder.partition("/")[0]
     more: dict[str, Any] | None = {}
     while more is not None:
-        page = _page(library, folder, **more)
+        page = _fetch_page(library, folder, **more)
         for entry in page.get("Contents", ()):
             yield StoredFile(f"{bucket}/{entry['Key']}", entry["Size"], entry["ETag"])
         more = {"ContinuationToken": page["NextContinuationToken"]} if page["IsTruncated"] else None
 
 
-def _listed(library: "AsyncFileSystem", folder: str) -> Iterator[StoredFile]:
+def _list_files(library: "AsyncFileSystem", folder: str) -> Iterator[StoredFile]:
     for name, info in library.find(folder, detail=True).items():
         version = next((str(info[key]) for key in _VERSIONS if info.get(key)), "")
         yield StoredFile(name, info["size"], version)
 
 
-def _page(library: "AsyncFileSystem", folder: str, **more: Any) -> dict[str, Any]:
+def _fetch_page(library: "AsyncFileSystem", folder: str, **more: Any) -> dict[str, Any]:
     bucket, _, path = folder.partition("/")
     prefix = f"{path}/" if path else ""
     return library.call_s3("list_objects_v2", Bucket=bucket, Prefix=prefix, **more, **library.req_kw)
 
 
-def _found(error: Exception, kind: _Kind) -> str:
+def _describe_error(error: Exception, kind: _Kind) -> str:
     names = {name.__name__ for name in type(error).__mro__}
     text = " ".join(str(error).split()) or "timeout"
     # Azure's library raises a plain ValueError.

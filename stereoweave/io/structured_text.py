@@ -95,11 +95,11 @@ def _is_null(node: yaml.Node) -> bool:
     )
 
 
-def _marked(loader: _Loader, node: yaml.ScalarNode) -> str:
+def _mark_binary(loader: _Loader, node: yaml.ScalarNode) -> str:
     return BASE64 + str(loader.construct_scalar(node))
 
 
-_Loader.add_constructor("tag:yaml.org,2002:binary", _marked)
+_Loader.add_constructor("tag:yaml.org,2002:binary", _mark_binary)
 
 
 def _parse_yaml(text: str) -> Any:

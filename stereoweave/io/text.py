@@ -37,10 +37,10 @@ def write_table(path: str | Path, columns: Sequence[str], rows: Iterable[Mapping
     with writing_text(path) as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
-        writer.writerows({column: _inert(value) for column, value in row.items()} for row in rows)
+        writer.writerows({column: _escape_formulas(value) for column, value in row.items()} for row in rows)
 
 
-def _inert(value: Any) -> Any:
+def _escape_formulas(value: Any) -> Any:
     if not isinstance(value, str) or _NUMBER.fullmatch(value):
         return value
     return "".join(f"'{cell}" if _is_computed(cell) else cell for cell in _CELL_STARTS.split(value))

@@ -18,9 +18,9 @@ from stereoweave.io.decoding import (
     find_view_frames,
     open_picture,
     read_frame,
-    read_photograph,
+    read_picture,
 )
-from stereoweave.io.images import check_large_enough, pair_of
+from stereoweave.io.images import check_large_enough, make_pair
 from stereoweave.pictures.pair_layouts import (
     PAIR_LAYOUTS,
     PairLayout,
@@ -104,11 +104,11 @@ def pixel_factor(path: Path, picture: Image.Image, format: str | None) -> int:
 
 
 def _open_two(left: Path, right: Path) -> Opened:
-    photographs = [read_photograph(path) for path in (left, right)]
+    photographs = [read_picture(path) for path in (left, right)]
     lies, notes = _choose_orientations(*photographs)
     eyes = [each.upright(lie) for each, lie in zip(photographs, lies, strict=True)]
     return Opened(
-        pair=pair_of(left, eyes[0], right, eyes[1]),
+        pair=make_pair(left, eyes[0], right, eyes[1]),
         layout=TWO_PICTURES,
         notes=(*notes, *_colour_notes(photographs)),
         lens=_read_lens(photographs),
