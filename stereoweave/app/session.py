@@ -14,7 +14,7 @@ from stereoweave.io.colormap import colour_disparity, find_colour_range_px
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.measure import distance
-from stereoweave.outputs.point_cloud import EmptyError, point_cloud, write_glb
+from stereoweave.outputs.point_cloud import EmptyError, make_point_cloud, write_glb
 from stereoweave.outputs.report import Summary, downscale
 from stereoweave.outputs.results import FILES, needs_camera, write_files
 from stereoweave.outputs.run import Result, run
@@ -105,7 +105,7 @@ def write_cloud(file: Path, result: Result) -> Path | None:
     pair, estimate = result.pair, result.estimate
     seen = pair if pair.camera else replace(pair, camera=_assume_camera(estimate))
     try:
-        cloud = point_cloud(seen, estimate, most_points=_MOST_POINTS)
+        cloud = make_point_cloud(seen, estimate, most_points=_MOST_POINTS)
     except EmptyError:
         return None
     depth_m = cloud.points_m[:, 2]

@@ -40,7 +40,7 @@ class EmptyError(StereoweaveError):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cloud:
+class PointCloud:
     """Coloured point cloud.
 
     Attributes:
@@ -55,15 +55,15 @@ class Cloud:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Surface(Cloud):
+class Mesh(PointCloud):
     """Triangle mesh; `faces`, int32 [M, 3], are vertex indices, with front sides towards the camera."""
 
     faces: Int32[np.ndarray, "m 3"]
 
 
-def point_cloud(
+def make_point_cloud(
     pair: StereoPair, estimate: Estimate, *, least_confidence: float = 0.5, most_points: int = MOST_POINTS
-) -> Cloud:
+) -> PointCloud:
     """Return the point cloud of the left image's pixels of known depth (`find_reliable`).
 
     Args:
@@ -78,13 +78,13 @@ def point_cloud(
     """
     camera = require_camera(pair)
     known, step_px = _thin(find_reliable(pair, estimate, least_confidence), most_points)
-    return _make_cloud(pair, estimate, camera, np.argwhere(known) * step_px, step_px)
+    return _place_points(pair, estimate, camera, np.argwhere(known) * step_px, step_px)
 
 
-def surface(
+def make_mesh(
     pair: StereoPair, estimate: Estimate, *, least_confidence: float = 0.5, most_points: int = MOST_POINTS
-) -> Surface:
-    """Return the mesh through the points of `point_cloud`, open at depth edges; same arguments.
+) -> Mesh:
+    """Return the mesh through the points of `make_point_cloud`, open at depth edges; same arguments.
 
     Neighbouring pixels are joined unless their disparities differ by more than 1 px per pixel. Points that no
     triangle uses are removed.
@@ -96,8 +96,8 @@ def surface(
         raise EmptyError("expected neighbouring pixels of known depth on one surface, found none")
     used = np.zeros(np.count_nonzero(known), bool)
     used[faces] = True
-    cloud = _make_cloud(pair, estimate, camera, np.argwhere(known)[used] * step_px, step_px)
-    return Surface(
+    cloud = _place_points(pair, estimate, camera, np.argwhere(known)[used] * step_px, step_px)
+    return Mesh(
         points_m=cloud.points_m,
         colours=cloud.colours,
         step_px=step_px,
@@ -136,14 +136,14 @@ def require_mesh_extra() -> None:
     _import_trimesh()
 
 
-def write_ply(path: str | Path, cloud: Cloud) -> None:
+def write_ply(path: str | Path, cloud: PointCloud) -> None:
     """Write a point cloud or mesh as a binary PLY file, in the axes of 3-D viewers."""
     content = _convert_to_trimesh(cloud).export(file_type="ply")
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 
 
-def write_glb(path: str | Path, cloud: Cloud) -> None:
+def write_glb(path: str | Path, cloud: PointCloud) -> None:
     """Write a point cloud or mesh as a GLB file (binary glTF 2.0) with an unlit material."""
     linear = _linearize(cloud.colours)
 
@@ -184,19 +184,19 @@ def _thin(known: Bool[np.ndarray, "h w"], most_points: int) -> tuple[Bool[np.nda
     return thinned, step_px
 
 
-def _make_cloud(
+def _place_points(
     pair: StereoPair,
     estimate: Estimate,
     camera: StereoCamera,
     places: Int[np.ndarray, "n 2"],
     step_px: int,
-) -> Cloud:
+) -> PointCloud:
     """Return the points of pixels given by row and column."""
     rows, columns = places.T
     depth_m = camera.depth_m(estimate.disparity_px[rows, columns][None])[0]
     x, y = (columns - camera.cx_px) / camera.focal_px, (rows - camera.cy_px) / camera.focal_px
     points_m = np.stack([x * depth_m, y * depth_m, depth_m], axis=1).astype(np.float32)
-    return Cloud(points_m=points_m, colours=pair.left[rows, columns], step_px=step_px)
+    return PointCloud(points_m=points_m, colours=pair.left[rows, columns], step_px=step_px)
 
 
 def _triangulate(
@@ -216,11 +216,11 @@ def _triangulate(
     return np.concatenate(faces)
 
 
-def _convert_to_trimesh(cloud: Cloud) -> Any:
+def _convert_to_trimesh(cloud: PointCloud) -> Any:
     """Convert to a trimesh object in the axes of 3-D viewers."""
     trimesh = _import_trimesh()
     points_m = cloud.points_m * _VIEWER_AXES
-    if isinstance(cloud, Surface):
+    if isinstance(cloud, Mesh):
         return trimesh.Trimesh(points_m, cloud.faces, vertex_colors=cloud.colours, process=False)
     return trimesh.PointCloud(points_m, colors=cloud.colours)
 

@@ -64,10 +64,10 @@ FILES: dict[str, Callable[[Path, Result], None]] = {
     "preview.png": _write_preview,
     "confidence.png": lambda path, result: write_image(path, grey_confidence(result.estimate.confidence)),
     "occluded.png": lambda path, result: write_image(path, np.uint8(255) * result.estimate.occluded),
-    "cloud.ply": lambda path, result: write_ply(path, result.cloud),
-    "cloud.glb": lambda path, result: write_glb(path, result.cloud),
-    "mesh.ply": lambda path, result: write_ply(path, result.surface),
-    "mesh.glb": lambda path, result: write_glb(path, result.surface),
+    "cloud.ply": lambda path, result: write_ply(path, result.point_cloud),
+    "cloud.glb": lambda path, result: write_glb(path, result.point_cloud),
+    "mesh.ply": lambda path, result: write_ply(path, result.mesh),
+    "mesh.glb": lambda path, result: write_glb(path, result.mesh),
     "report.html": lambda path, result: write_report(
         path, result.pair, result.estimate, result.summary, result.threads
     ),
@@ -206,9 +206,9 @@ def _note_thinning(file: str, result: Result) -> list[Note]:
     """Return a note if a large picture's point cloud or mesh is thinned."""
     match file.split("."):
         case ["cloud", _]:
-            step_px = result.cloud.step_px
+            step_px = result.point_cloud.step_px
         case ["mesh", _]:
-            step_px = result.surface.step_px
+            step_px = result.mesh.step_px
         case _:
             step_px = 1
     if step_px == 1:

@@ -14,7 +14,7 @@ from stereoweave.matching.estimate import match_many
 from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.providers import CPU
-from stereoweave.outputs.point_cloud import Cloud, Surface, point_cloud, require_camera, surface
+from stereoweave.outputs.point_cloud import Mesh, PointCloud, make_mesh, make_point_cloud, require_camera
 from stereoweave.outputs.report import Summary, summarize
 from stereoweave.pictures.prepare import Prepared
 from stereoweave.stereo import Estimate, StereoPair
@@ -58,12 +58,12 @@ class Result:
         return find_problems(self.pair, self.estimate)
 
     @cached_property
-    def cloud(self) -> Cloud:
-        return point_cloud(self.pair, self.estimate)
+    def point_cloud(self) -> PointCloud:
+        return make_point_cloud(self.pair, self.estimate)
 
     @cached_property
-    def surface(self) -> Surface:
-        return surface(self.pair, self.estimate)
+    def mesh(self) -> Mesh:
+        return make_mesh(self.pair, self.estimate)
 
 
 def run(prepared: Prepared, matcher: Matcher, options: MatchOptions) -> Result:

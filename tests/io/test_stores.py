@@ -152,11 +152,11 @@ def test_links_to_files_are_followed_and_links_to_folders_are_not(tmp_path):
 
 def test_a_file_that_is_removed_while_it_is_listed_is_left_out(tmp_path):
     (tmp_path / "a").write_bytes(b"1")
-    [entry] = stores._entries(tmp_path)
-    assert stores._status(entry).st_size == 1
-    [entry] = stores._entries(tmp_path)
+    [entry] = stores._list_entries(tmp_path)
+    assert stores._read_status(entry).st_size == 1
+    [entry] = stores._list_entries(tmp_path)
     (tmp_path / "a").unlink()
-    assert stores._status(entry) is None
+    assert stores._read_status(entry) is None
 
 
 def test_a_path_needs_none_of_the_libraries_of_stores(tmp_path):

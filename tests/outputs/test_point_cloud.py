@@ -8,12 +8,12 @@ import trimesh
 
 from stereoweave.errors import StereoweaveError
 from stereoweave.outputs.point_cloud import (
-    Cloud,
     EmptyError,
-    Surface,
+    Mesh,
+    PointCloud,
     find_reliable,
-    point_cloud,
-    surface,
+    make_mesh,
+    make_point_cloud,
     write_glb,
     write_ply,
 )
@@ -50,7 +50,7 @@ def two_planes(height=40, width=60) -> np.ndarray:
 def test_a_pixel_becomes_the_point_that_it_shows(doffs_px):
     camera = StereoCamera(focal_px=100.0, baseline_m=0.1, cx_px=30.0, cy_px=20.0, doffs_px=doffs_px)
     pair = pair_of((40, 60), camera=camera)
-    cloud = point_cloud(pair, estimate_of(np.full((40, 60), FAR_PX - doffs_px)))
+    cloud = make_point_cloud(pair, estimate_of(np.full((40, 60), FAR_PX - doffs_px)))
     assert cloud.points_m.shape == (2400, 3)
     # 10 px right of the middle and 8 above it, at 2 m: 10 / 100 * 2 and -8 / 100 * 2
     np.testing.assert_allclose(cloud.points_m[12 * 60 + 40], [0.2, -0.16, 2.0], rtol=1e-6)
@@ -68,7 +68,10 @@ def test_no_point_flies_between_two_planes(blur_px, turned_degrees):
     flying = (blurred_px > FAR_PX + 1.5) & (blurred_px < NEAR_PX - 1.5)
     assert flying.any() == (blur_px > 1)
     pair, estimate = pair_of((40, 60)), estimate_of(blurred_px)
-    for depth_m in (point_cloud(pair, estimate).points_m[:, 2], surface(pair, estimate).points_m[:, 2]):
+    for depth_m in (
+        make_point_cloud(pair, estimate).points_m[:, 2],
+        make_mesh(pair, estimate).points_m[:, 2],
+    ):
         # On a plane to 1.5 px: 10 / 18.5, 10 / 6.5 m
         assert ((depth_m < 0.541) | (depth_m > 1.538)).all()
         assert depth_m.min() < 0.51 and depth_m.max() > 1.99
@@ -97,12 +100,12 @@ def test_what_is_not_known_gives_no_point():
     expected = np.ones((40, 60), bool)
     expected[:2] = False
     np.testing.assert_array_equal(find_reliable(pair, estimate), expected)
-    assert len(point_cloud(pair, estimate).points_m) == 38 * 60
+    assert len(make_point_cloud(pair, estimate).points_m) == 38 * 60
     assert not find_reliable(pair, estimate, least_confidence=0.6).any()
 
 
 def test_a_wall_is_a_surface_of_two_triangles_a_square_that_face_the_camera():
-    wall = surface(pair_of((40, 60)), estimate_of(np.full((40, 60), FAR_PX)))
+    wall = make_mesh(pair_of((40, 60)), estimate_of(np.full((40, 60), FAR_PX)))
     assert (len(wall.points_m), len(wall.faces)) == (40 * 60, 2 * 39 * 59)
     corners_m = wall.points_m[wall.faces]
     normals = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
@@ -111,7 +114,7 @@ def test_a_wall_is_a_surface_of_two_triangles_a_square_that_face_the_camera():
 
 
 def test_no_triangle_crosses_a_jump_of_depth():
-    found = surface(pair_of((40, 60)), estimate_of(two_planes()))
+    found = make_mesh(pair_of((40, 60)), estimate_of(two_planes()))
     depths_m = found.points_m[found.faces][..., 2]
     assert np.ptp(depths_m, axis=1).max() == 0
     # The square of 20x20 pixels; and the wall without the 21x21 squares that touch it.
@@ -123,26 +126,26 @@ def test_no_triangle_crosses_a_jump_of_depth():
 def test_a_point_without_a_neighbour_is_no_part_of_a_surface():
     confidence = np.zeros((40, 60), np.float32)
     confidence[5, 5] = confidence[20:22, 20:22] = 1
-    found = surface(pair_of((40, 60)), estimate_of(np.full((40, 60), FAR_PX), confidence=confidence))
+    found = make_mesh(pair_of((40, 60)), estimate_of(np.full((40, 60), FAR_PX), confidence=confidence))
     assert (len(found.points_m), len(found.faces)) == (4, 2)
     assert set(found.faces.ravel()) == {0, 1, 2, 3}
 
 
 def test_of_a_large_picture_every_so_manieth_pixel_counts():
     pair, estimate = pair_of((40, 60)), estimate_of(two_planes())
-    cloud = point_cloud(pair, estimate, most_points=300)
+    cloud = make_point_cloud(pair, estimate, most_points=300)
     # Every second of rows and columns would be 20 * 30 = 600, every third is 14 * 20 = 280.
     assert (cloud.step_px, len(cloud.points_m)) == (3, 280)
-    whole = point_cloud(pair, estimate)
+    whole = make_point_cloud(pair, estimate)
     picked = np.arange(2400).reshape(40, 60)[::3, ::3].ravel()
     np.testing.assert_array_equal(cloud.points_m, whole.points_m[picked])
     np.testing.assert_array_equal(cloud.colours, whole.colours[picked])
-    wall = surface(pair, estimate_of(np.full((40, 60), FAR_PX)), most_points=300)
+    wall = make_mesh(pair, estimate_of(np.full((40, 60), FAR_PX)), most_points=300)
     assert (wall.step_px, len(wall.faces)) == (3, 2 * 13 * 19)
 
 
 def test_a_ply_file_holds_points_in_metres_upright_for_viewers_and_the_photographs_colours(tmp_path):
-    cloud = point_cloud(pair_of((40, 60)), estimate_of(two_planes()))
+    cloud = make_point_cloud(pair_of((40, 60)), estimate_of(two_planes()))
     write_ply(tmp_path / "cloud.ply", cloud)
     found = trimesh.load(tmp_path / "cloud.ply")
     x, y, z = cloud.points_m.T
@@ -154,7 +157,7 @@ def test_a_ply_file_holds_points_in_metres_upright_for_viewers_and_the_photograp
 
 
 def test_a_ply_file_holds_a_surface(tmp_path):
-    made = surface(pair_of((40, 60)), estimate_of(two_planes()))
+    made = make_mesh(pair_of((40, 60)), estimate_of(two_planes()))
     write_ply(tmp_path / "mesh.ply", made)
     found = trimesh.load(tmp_path / "mesh.ply", process=False)
     np.testing.assert_array_equal(found.faces, made.faces)
@@ -166,15 +169,15 @@ def test_a_ply_file_holds_a_surface(tmp_path):
 GREYS = {0: 0.0, 10: 10 / 255 / 12.92, 11: 11 / 255 / 12.92, 188: 0.50289, 255: 1.0}
 
 
-@pytest.mark.parametrize("kind", [Cloud, Surface])
+@pytest.mark.parametrize("kind", [PointCloud, Mesh])
 def test_a_glb_file_holds_the_same_with_its_own_light(tmp_path, kind):
     colours = np.repeat(np.array(list(GREYS), np.uint8)[:, None], 3, axis=1)
     points_m = np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1], [2, 3, 4]], np.float32)
-    faces = {"faces": np.array([[0, 2, 1], [1, 2, 3], [3, 2, 4]], np.int32)} if kind is Surface else {}
+    faces = {"faces": np.array([[0, 2, 1], [1, 2, 3], [3, 2, 4]], np.int32)} if kind is Mesh else {}
     write_glb(tmp_path / "it.glb", kind(points_m=points_m, colours=colours, **faces))
     (found,) = trimesh.load(tmp_path / "it.glb", process=False).geometry.values()
     np.testing.assert_array_equal(found.vertices, points_m * [1, -1, -1])
-    if kind is Surface:
+    if kind is Mesh:
         np.testing.assert_array_equal(found.faces, faces["faces"])
     tree, data = chunks(tmp_path / "it.glb")
     (primitive,) = tree["meshes"][0]["primitives"]
@@ -183,7 +186,7 @@ def test_a_glb_file_holds_the_same_with_its_own_light(tmp_path, kind):
     np.testing.assert_allclose(
         light, np.repeat(np.array(list(GREYS.values()))[:, None], 3, axis=1), atol=1e-5
     )
-    assert primitive["mode"] == (4 if kind is Surface else 0)
+    assert primitive["mode"] == (4 if kind is Mesh else 0)
     # The photograph has its light in it: no lamp of the viewer's may add to it.
     assert tree["extensionsUsed"] == ["KHR_materials_unlit"]
     assert "KHR_materials_unlit" in tree["materials"][primitive["material"]]["extensions"]
@@ -208,7 +211,7 @@ def values(tree: dict, data: bytes, accessor_at: int) -> np.ndarray:
 
 def test_metres_need_a_camera(tmp_path):
     pair = pair_of((40, 60), camera=None)
-    for make in (point_cloud, surface):
+    for make in (make_point_cloud, make_mesh):
         with pytest.raises(StereoweaveError, match=r"calibration.*\(calibration, focal_px, baseline_m\)"):
             make(pair, estimate_of(two_planes()))
 
@@ -216,15 +219,15 @@ def test_metres_need_a_camera(tmp_path):
 def test_nothing_known_is_an_error():
     nothing = estimate_of(two_planes(), confidence=np.zeros((40, 60), np.float32))
     with pytest.raises(EmptyError, match="known depth, found none"):
-        point_cloud(pair_of((40, 60)), nothing)
+        make_point_cloud(pair_of((40, 60)), nothing)
     speckled = (np.indices((40, 60)).sum(axis=0) % 2).astype(np.float32)
     with pytest.raises(EmptyError, match="on one surface, found none"):
-        surface(pair_of((40, 60)), estimate_of(two_planes(), confidence=speckled))
+        make_mesh(pair_of((40, 60)), estimate_of(two_planes(), confidence=speckled))
 
 
 def test_without_trimesh_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
-    cloud = Cloud(points_m=np.zeros((1, 3), np.float32), colours=np.zeros((1, 3), np.uint8))
+    cloud = PointCloud(points_m=np.zeros((1, 3), np.float32), colours=np.zeros((1, 3), np.uint8))
     with pytest.raises(StereoweaveError, match=r"stereoweave\[mesh\]"):
         write_ply(tmp_path / "cloud.ply", cloud)
     assert list(tmp_path.iterdir()) == []
