@@ -51,7 +51,7 @@ _LABELS = {
 }
 
 _HEAD = """<div class="head"><h1>Stereoweave</h1>
-<p>Two photographs of one scene become depth, and the view from anywhere between the two cameras.
+<p>Two pictures of one scene become depth, and the view from anywhere between the two cameras.
 The pictures stay on the computer that runs this page.</p></div>"""
 _EMPTY = """<div class="empty"><ol>
 <li>Drop the left and the right picture, or one file that holds both:
@@ -59,7 +59,7 @@ side by side, one above the other, MPO or JPS.</li>
 <li>Press <b>Find depth</b>. Pictures straight from two cameras must be rectified first: tick the box.</li>
 <li>Move between the cameras, rotate the point cloud, measure, and download the files.</li>
 </ol></div>"""
-_TO_MEASURE = "Click two points of the photograph: their depths and their distance appear here."
+_TO_MEASURE = "Click two points of the left picture: their depths and their distance appear here."
 _WITHOUT_WEBGL = """const canvas = document.createElement("canvas");
 if (!canvas.getContext("webgl2") && !canvas.getContext("webgl")) element.innerHTML =
   '<p class="notice problem">This browser cannot draw in 3-D: turn on its hardware acceleration ' +
@@ -143,7 +143,7 @@ class Page:
                         gr.HTML(_confidence_legend())
             with gr.Tab("Measure"):
                 self._measured = gr.HTML(elem_id="measured")
-                self._photograph = _picture("Left photograph", "photograph")
+                self._clickable = _picture("Left picture", "clickable")
             with gr.Tab("Point cloud") as self._cloud_tab:
                 gr.HTML(js_on_load=_WITHOUT_WEBGL, padding=False)
                 self._cloud = gr.Model3D(
@@ -160,7 +160,7 @@ class Page:
         asked = [self._left, self._right, self._model, self._rectify, self._layout, self._calibration]
         asked += [self._focal_px, self._baseline_mm]
         seen = [self._results, self._session, self._view, self._where, self._depth, self._ramp]
-        seen += [self._confidence, self._photograph, self._clicks, self._measured]
+        seen += [self._confidence, self._clickable, self._clicks, self._measured]
         seen += [self._tabs, self._cloud]
         taken = [self._status, self._files, self._all]
         sampled = self._sample.click(self._fill_in_sample, None, asked, api_visibility="private")
@@ -195,10 +195,10 @@ class Page:
         self._cloud_tab.select(
             self._make_cloud, self._session, self._cloud, concurrency_id="matching", api_visibility="private"
         )
-        self._photograph.select(
+        self._clickable.select(
             self._measure_click,
             [self._session, self._clicks],
-            [self._photograph, self._measured, self._clicks],
+            [self._clickable, self._measured, self._clicks],
             show_progress="hidden",
             trigger_mode="multiple",
             concurrency_limit=None,
@@ -286,7 +286,7 @@ class Page:
             self._depth: colour_depth(session),
             self._ramp: _depth_legend(session),
             self._confidence: colour_confidence(estimate.confidence, estimate.occluded),
-            self._photograph: pair.left,
+            self._clickable: pair.left,
             self._clicks: [],
             self._tabs: gr.update(selected="first"),
             self._measured: _paragraphs([_TO_MEASURE]),
@@ -311,7 +311,7 @@ class Page:
     def _measure_click(
         self, session: Session | None, clicks: list[tuple[int, int]], event: gr.SelectData
     ) -> tuple[Any, str, list[tuple[int, int]]]:
-        """Mark the clicked points, at most two, in the photograph, and measure there."""
+        """Mark the clicked points, at most two, in the left image, and measure there."""
         if session is None:
             return gr.skip(), _paragraphs([_GONE]), []
         column, row = event.index

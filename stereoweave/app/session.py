@@ -133,15 +133,15 @@ def format_colour_range(result: Result) -> tuple[str, str]:
 
 
 def mark_clicks(
-    photograph: UInt8[np.ndarray, "h w 3"], clicks: Sequence[tuple[int, int]]
+    image: UInt8[np.ndarray, "h w 3"], clicks: Sequence[tuple[int, int]]
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Draw a ring at each click, and a line between two."""
-    picture = photograph.copy()
+    marked = image.copy()
     for colour, width in (((0, 0, 0), 5), ((255, 255, 255), 2)):
-        cv2.polylines(picture, [np.array(clicks, np.int32)], False, colour, width, cv2.LINE_AA)
+        cv2.polylines(marked, [np.array(clicks, np.int32)], False, colour, width, cv2.LINE_AA)
         for click in clicks:
-            cv2.circle(picture, click, 7, colour, width, cv2.LINE_AA)
-    return picture
+            cv2.circle(marked, click, 7, colour, width, cv2.LINE_AA)
+    return marked
 
 
 def measure_clicks(session: Session, clicks: Sequence[tuple[int, int]]) -> list[str]:

@@ -42,7 +42,7 @@ _NEIGHBOURS, _LEAST_AGREEING = 8, 4
 _AGREE_PX, _AGREE_SHARE = 2.0, 0.05
 _OUTER_PERCENT = 1.0
 
-# Exposure is compared in windows of this size, by levels that neither photograph clips.
+# Exposure is compared in windows of this size, by levels that neither image clips.
 _LIGHT_WINDOW_PX = 7
 _BLACK_LEVEL, _WHITE_LEVEL = 8, 250
 _GAMMA = 2.2
@@ -58,10 +58,10 @@ class Alignment:
     Attributes:
         matches: Number of matches.
         vertical_error_px, vertical_error_95_px: Median and 95th percentile of the vertical error.
-        vertical_shift_px: How much lower the right photograph is, at its centre.
-        rotation_degrees: Clockwise rotation of the right photograph.
+        vertical_shift_px: How much lower the right image is, at its centre.
+        rotation_degrees: Clockwise rotation of the right image.
         range_px: Smallest and greatest disparity, without the outermost 1 %.
-        exposure_ratio: Exposure of the right photograph divided by the left one's; NaN if unknown.
+        exposure_ratio: Exposure of the right image divided by the left one's; NaN if unknown.
         defects: Defects found, names in `DEFECTS`; empty for a sound pair.
     """
 
@@ -273,28 +273,28 @@ def _measure_light_ratio(
 
 
 def _sample_levels(
-    photo: UInt8[np.ndarray, "h w 3"], places_px: Float[np.ndarray, "n 2"]
+    image: UInt8[np.ndarray, "h w 3"], places_px: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "3 n"]:
     """Dark, middle and bright levels of the strongest channel around each point; some may be clipped."""
     offsets = np.arange(_LIGHT_WINDOW_PX) - _LIGHT_WINDOW_PX // 2
-    height, width = photo.shape[:2]
+    height, width = image.shape[:2]
     nearest = np.rint(places_px).astype(int)
     columns = np.clip(nearest[:, 0, None, None] + offsets, 0, width - 1)
     rows = np.clip(nearest[:, 1, None, None] + offsets[:, None], 0, height - 1)
-    return np.percentile(photo[rows, columns].max(3), [15, 50, 85], axis=(1, 2))
+    return np.percentile(image[rows, columns].max(3), [15, 50, 85], axis=(1, 2))
 
 
-def _shrink(photo: UInt8[np.ndarray, "h w 3"], scale: float) -> UInt8[np.ndarray, "h2 w2 3"]:
+def _shrink(image: UInt8[np.ndarray, "h w 3"], scale: float) -> UInt8[np.ndarray, "h2 w2 3"]:
     if scale == 1:
-        return photo
-    size = max(round(photo.shape[1] / scale), 1), max(round(photo.shape[0] / scale), 1)
-    return cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
+        return image
+    size = max(round(image.shape[1] / scale), 1), max(round(image.shape[0] / scale), 1)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
-def _level(photo: UInt8[np.ndarray, "h w 3"], shift_px: float, slope: float) -> UInt8[np.ndarray, "h w 3"]:
-    """Undo the vertical shift and the rotation of the right photograph."""
-    height, width = photo.shape[:2]
+def _level(image: UInt8[np.ndarray, "h w 3"], shift_px: float, slope: float) -> UInt8[np.ndarray, "h w 3"]:
+    """Undo the vertical shift and the rotation of the right image."""
+    height, width = image.shape[:2]
     x, y = (width - 1) / 2, (height - 1) / 2
     source = np.array([[1, -slope, slope * y], [slope, 1, shift_px - slope * x]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return cv2.warpAffine(photo, source, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return cv2.warpAffine(image, source, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)

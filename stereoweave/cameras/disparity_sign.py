@@ -46,9 +46,9 @@ def find_negative_disparities(
     about as well and is preferred, because parallel pairs are far more common than converged ones.
 
     Args:
-        left: The left photograph, uint8 RGB [H, W, 3].
+        left: The left image, uint8 RGB [H, W, 3].
         right: The right one, rectified.
-        places_px: Columns and rows in the left photograph.
+        places_px: Columns and rows in the left image.
         disparity_px: Disparity at these points. If they give too few certain values, areas without corners
             are matched densely too.
     """
@@ -58,7 +58,7 @@ def find_negative_disparities(
     if len(sure_px) >= _LEAST_SURE:
         return sure_px
     factor = min(1.0, _DENSE_WIDTH_PX / left.shape[1])
-    left, right = (_shrink(photo, factor) for photo in (left, right))
+    left, right = (_shrink(image, factor) for image in (left, right))
     places_px, disparity_px = _find_dense_negative(left, right)
     greys = cv2.cvtColor(left, cv2.COLOR_RGB2GRAY), cv2.cvtColor(right, cv2.COLOR_RGB2GRAY)
     sure_px = _select_certain(*greys, places_px, disparity_px, _DENSE_RADIUS_PX)
@@ -146,7 +146,7 @@ def estimate_depth_order(
     belongs to the occluded surface, so it has the colour of the farther side.
     """
     factor = min(1.0, _OCCLUSION_WIDTH_PX / left.shape[1])
-    small_left, small_right = (_shrink(photo, factor) for photo in (left, right))
+    small_left, small_right = (_shrink(image, factor) for image in (left, right))
     disparity_px, seen = _match_densely(small_left, small_right, range_px[0] * factor, range_px[1] * factor)
     colours = cv2.cvtColor(cv2.GaussianBlur(small_left, (0, 0), 0.7), cv2.COLOR_RGB2LAB).astype(np.float32)
     votes = [
@@ -168,11 +168,11 @@ def _vote_in_row(
             continue
         jump_px = disparity_px[end + 1] - disparity_px[start - 2]
         before, after = colours[start - _BESIDE_PX : start], colours[end : end + _BESIDE_PX]
-        hidden, before, after = (part.mean(0) for part in (colours[start:end], before, after))
+        occluded, before, after = (part.mean(0) for part in (colours[start:end], before, after))
         plain = np.linalg.norm(before - after) < _LEAST_COLOUR_STEP
         if plain or jump_px < _LEAST_JUMP_PX or abs(end - start - jump_px) > 0.5 * jump_px + 1:
             continue
-        unlike_before, unlike_after = np.linalg.norm(hidden - before), np.linalg.norm(hidden - after)
+        unlike_before, unlike_after = np.linalg.norm(occluded - before), np.linalg.norm(occluded - after)
         votes.append(float((unlike_after - unlike_before) / (unlike_after + unlike_before)))
     return votes
 
@@ -199,6 +199,6 @@ def _match_densely(
     return left_px, inside & (np.abs(back_px - left_px) <= 1) & (left_px > first_px)
 
 
-def _shrink(photo: UInt8[np.ndarray, "h w 3"], factor: float) -> UInt8[np.ndarray, "h2 w2 3"]:
-    size = round(photo.shape[1] * factor), max(round(photo.shape[0] * factor), 1)
-    return cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
+def _shrink(image: UInt8[np.ndarray, "h w 3"], factor: float) -> UInt8[np.ndarray, "h2 w2 3"]:
+    size = round(image.shape[1] * factor), max(round(image.shape[0] * factor), 1)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)

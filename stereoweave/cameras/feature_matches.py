@@ -56,7 +56,7 @@ def find_matches(
 
     About one in five is wrong; the caller rejects these by geometry.
     """
-    greys = [cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY) for photo in (left, right)]
+    greys = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right)]
     found = _pair_corners(greys, most, rows_off=_MOST_ROWS_OFF * left.shape[0])
     return _refine_matches(greys[0], greys[1], found)
 

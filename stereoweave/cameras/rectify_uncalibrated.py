@@ -171,14 +171,14 @@ def _align_views(turns: _Homographies, matches: Matches) -> tuple[_Homographies,
 
 
 def _warp(
-    photo: UInt8[np.ndarray, "h w 3"],
+    image: UInt8[np.ndarray, "h w 3"],
     turn: Float[np.ndarray, "3 3"],
     seen: Bool[np.ndarray, "h w"] | None,
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """Warp a picture, repeating its border; returns it with the mask of its valid pixels."""
-    size = photo.shape[1::-1]
-    before = np.ones(photo.shape[:2], np.uint8) if seen is None else seen.astype(np.uint8)
-    warped = cv2.warpPerspective(photo, turn, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    size = image.shape[1::-1]
+    before = np.ones(image.shape[:2], np.uint8) if seen is None else seen.astype(np.uint8)
+    warped = cv2.warpPerspective(image, turn, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     shown = cv2.warpPerspective(255 * before, turn, size, flags=cv2.INTER_LINEAR)
     return warped, shown == 255
 

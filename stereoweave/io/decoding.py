@@ -278,9 +278,9 @@ def read_frame(path: Path, picture: Image.Image, index: int) -> DecodedPicture:
     """Decode a frame of an MPO file."""
     _seek(path, picture, index)
     check_size(path, picture.size)
-    photograph = decode(path, picture)
+    decoded = decode(path, picture)
     # A copy: Pillow reuses the memory for the next frame.
-    return photograph._replace(image=photograph.image.copy())
+    return decoded._replace(image=decoded.image.copy())
 
 
 def _seek(path: Path, picture: Image.Image, index: int) -> None:

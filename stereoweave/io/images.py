@@ -36,8 +36,8 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
         FormatError: The file is missing, truncated, animated or of an unsupported kind; or the picture is
             under 32 pixels or over 32,766 pixels wide or high, or over 65 megapixels.
     """
-    photograph = read_picture(Path(path))
-    image = photograph.upright(read_orientation(photograph.tags))
+    decoded = read_picture(Path(path))
+    image = decoded.upright(read_orientation(decoded.tags))
     check_large_enough(path, image)
     return image
 
@@ -92,7 +92,7 @@ def save_picture(
 ) -> None:
     """Write values as a picture of one of Pillow's formats."""
     with replacing(path) as temporary, checking_format_size(path, values.shape):
-        # Level 3 takes a third of the time of Pillow's 6, for 5 % more bytes (a photograph of 741x500).
+        # Level 3 takes a third of the time of Pillow's 6, for 5 % more bytes (a picture of 741x500).
         Image.fromarray(values).save(temporary, kind, quality=95, compress_level=3)
 
 

@@ -72,9 +72,9 @@ def goes_beyond(pair: StereoPair, where: Bool[np.ndarray, "h w"], range_px: tupl
     return bool(beyond.sum() >= max(_LEAST_BEYOND, _LEAST_SHARE_BEYOND * len(beyond)))
 
 
-def _scale(photo: UInt8[np.ndarray, "h w 3"]) -> float:
+def _scale(image: UInt8[np.ndarray, "h w 3"]) -> float:
     """Factor by which the image is downsampled."""
-    width = photo.shape[1]
+    width = image.shape[1]
     return width / min(width, _WIDTH_PX)
 
 
@@ -88,10 +88,10 @@ def _find_disparities(pair: StereoPair, where: Bool[np.ndarray, "h w"] | None) -
     return matches[:, 2] * _scale(pair.left)
 
 
-def _small_grey(photo: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h2 w2"]:
-    height, width = photo.shape[:2]
-    size = min(width, _WIDTH_PX), max(round(height / _scale(photo)), 2 * _WINDOW_ROWS)
-    grey = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
+def _small_grey(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h2 w2"]:
+    height, width = image.shape[:2]
+    size = min(width, _WIDTH_PX), max(round(height / _scale(image)), 2 * _WINDOW_ROWS)
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     return cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 

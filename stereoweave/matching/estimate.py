@@ -210,7 +210,7 @@ def _resize(pair: StereoPair, scale: float) -> StereoPair:
     if size == (width, height) or min(width, height) < SMALLEST_SIDE_PX:
         return pair
     way = cv2.INTER_AREA if scale > 1 else cv2.INTER_CUBIC
-    left, right = (cv2.resize(photo, size, interpolation=way) for photo in (pair.left, pair.right))
+    left, right = (cv2.resize(image, size, interpolation=way) for image in (pair.left, pair.right))
     left_seen, right_seen = (
         None if seen is None else cv2.resize(seen.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
         for seen in (pair.left_seen, pair.right_seen)
@@ -376,8 +376,8 @@ def _start_columns(least_px: int) -> tuple[int, int]:
     return (-least_px, 0) if least_px < 0 else (0, least_px)
 
 
-def _pad_columns(photo: np.ndarray, before: int, behind: int) -> np.ndarray:
-    return cv2.copyMakeBorder(photo, 0, 0, before, behind, cv2.BORDER_REPLICATE)
+def _pad_columns(image: np.ndarray, before: int, behind: int) -> np.ndarray:
+    return cv2.copyMakeBorder(image, 0, 0, before, behind, cv2.BORDER_REPLICATE)
 
 
 def _clip(found: Estimate, low_px: float, high_px: float) -> Estimate:

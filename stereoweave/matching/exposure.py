@@ -96,10 +96,10 @@ class Looks:
 
 
 def recolour(
-    photo: UInt8[np.ndarray, "h w 3"], table: Float32[np.ndarray, "256 3"]
+    image: UInt8[np.ndarray, "h w 3"], table: Float32[np.ndarray, "256 3"]
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Apply a lookup table with values in 0..255, rounded."""
-    return cv2.LUT(photo, np.rint(table).astype(np.uint8)[None])
+    return cv2.LUT(image, np.rint(table).astype(np.uint8)[None])
 
 
 def match_exposure(
@@ -144,19 +144,21 @@ def _collect_channels(
     def of_both(left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return left, cv2.remap(right, columns, rows, cv2.INTER_LINEAR)
 
-    photos = of_both(_downsample(left, step), _downsample(right, step))
+    images = of_both(_downsample(left, step), _downsample(right, step))
     certain = _subsample(estimate.confidence, step) >= _LEAST_CONFIDENCE
     # A clipped white sky is plain and has confidence 0, but its match need not be exact.
-    certain |= cv2.inRange(cv2.max(*photos), _WHITE, _WHITE) > 0
+    certain |= cv2.inRange(cv2.max(*images), _WHITE, _WHITE) > 0
     certain &= ~_subsample(estimate.occluded, step)
     certain &= (columns >= 0) & (columns <= columns.shape[1] - 1)
     certain = cv2.erode(certain.astype(np.uint8), _WINDOW) > 0
     certain &= _range(disparity_px) <= _CALM_PX
-    for photo in photos:
-        certain &= _range(cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)) <= _CALM_LEVELS
-    ends = of_both(*(cv2.LUT(_subsample(photo, step), _ENDS) for photo in (left, right)))
+    for image in images:
+        certain &= _range(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) <= _CALM_LEVELS
+    ends = of_both(*(cv2.LUT(_subsample(image, step), _ENDS) for image in (left, right)))
     cut_off = cv2.dilate(cv2.max(*ends), _WINDOW) > 0
-    values = [image[certain].T.copy() for image in (*(cv2.blur(photo, (3, 3)) for photo in photos), cut_off)]
+    values = [
+        levels[certain].T.copy() for levels in (*(cv2.blur(image, (3, 3)) for image in images), cut_off)
+    ]
     return [_Channel(*channel) for channel in zip(*values, strict=True)]
 
 

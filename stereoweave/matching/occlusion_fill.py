@@ -56,9 +56,9 @@ def _background(
     The background is the farther of the two ends of the pixel's run of invisible pixels. In a row without
     visible pixels the pixel keeps its own values.
     """
-    hidden = np.pad(~visible, ((0, 0), (1, 1)))
-    changes = np.flatnonzero(hidden.ravel()[1:] != hidden.ravel()[:-1])
-    rows, columns = np.divmod(changes.reshape(-1, 2), hidden.shape[1])
+    occluded = np.pad(~visible, ((0, 0), (1, 1)))
+    changes = np.flatnonzero(occluded.ravel()[1:] != occluded.ravel()[:-1])
+    rows, columns = np.divmod(changes.reshape(-1, 2), occluded.shape[1])
     steps = np.arange(_END_PX)
     left, right = (rows[:, :1], columns[:, :1] - 1 - steps), (rows[:, 1:], columns[:, 1:] + steps)
     left_px, right_px = (_medians(estimate.disparity_px, visible, *end) for end in (left, right))

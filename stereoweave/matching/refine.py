@@ -161,13 +161,13 @@ def _candidates(estimate: Estimate) -> tuple[int, int]:
     return first_px, count + -count % _CANDIDATES_MULTIPLE
 
 
-def _cues(photo: UInt8[np.ndarray, "h w 3"], above_first_px: np.ndarray, trust: np.ndarray) -> "Cues":
+def _cues(image: UInt8[np.ndarray, "h w 3"], above_first_px: np.ndarray, trust: np.ndarray) -> "Cues":
     from stereoweave.matching import refine_kernels as kernels
 
-    grey = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     codes = np.empty(grey.shape, np.uint32)
     kernels.census(grey, codes)
-    colour = np.ascontiguousarray(photo.transpose(0, 2, 1))
+    colour = np.ascontiguousarray(image.transpose(0, 2, 1))
     around = np.pad(colour, ((0, 0), (0, 0), (1, 1)), mode="edge").astype(np.uint16)
     halfway = ((around[..., 1:] + around[..., :-1]) // 2).astype(np.uint8)
     return kernels.Cues(

@@ -297,11 +297,11 @@ def extend(agreed, trust, towards, disparity_px):
         while i < width and run < RELIABLE_RUN:
             run = run + 1 if agreed[y, i if towards < 0 else width - 1 - i] else 0
             i += 1
-        hidden = i - RELIABLE_RUN
+        margin = i - RELIABLE_RUN
         if run == RELIABLE_RUN:
-            surface_px = disparity_px[y, hidden if towards < 0 else width - 1 - hidden]
-            if hidden <= surface_px + SLACK_PX:
-                for i in range(hidden):
+            surface_px = disparity_px[y, margin if towards < 0 else width - 1 - margin]
+            if margin <= surface_px + SLACK_PX:
+                for i in range(margin):
                     x = i if towards < 0 else width - 1 - i
                     if trust[y, x] < CERTAIN and abs(surface_px - disparity_px[y, x]) <= LARGEST_MOVE_PX:
                         disparity_px[y, x] = surface_px

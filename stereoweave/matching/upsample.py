@@ -166,9 +166,9 @@ def _divisors(width: int, smaller: int) -> list[int]:
     return [divisor // 2**level for level in range(divisor.bit_length())]
 
 
-def _grey(photo: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "h2 w2"]:
+def _grey(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "h2 w2"]:
     """Convert to grey and resize."""
-    grey = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     return cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
 
 

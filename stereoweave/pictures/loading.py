@@ -104,14 +104,14 @@ def pixel_factor(path: Path, picture: Image.Image, format: str | None) -> int:
 
 
 def _open_two(left: Path, right: Path) -> Opened:
-    photographs = [read_picture(path) for path in (left, right)]
-    lies, notes = _choose_orientations(*photographs)
-    eyes = [each.upright(lie) for each, lie in zip(photographs, lies, strict=True)]
+    decoded = [read_picture(path) for path in (left, right)]
+    lies, notes = _choose_orientations(*decoded)
+    eyes = [each.upright(lie) for each, lie in zip(decoded, lies, strict=True)]
     return Opened(
         pair=make_pair(left, eyes[0], right, eyes[1]),
         layout=TWO_PICTURES,
-        notes=(*notes, *_colour_notes(photographs)),
-        lens=_read_lens(photographs),
+        notes=(*notes, *_colour_notes(decoded)),
+        lens=_read_lens(decoded),
     )
 
 
@@ -123,9 +123,9 @@ def _open_one(path: Path, format: str | None) -> Opened:
         if format == "mpo":
             raise FormatError(f"{path}: expected an MPO file with two pictures of one size, found one")
         name, why = _read_declared(path, picture, format)
-        photograph = decode(path, picture)
-    lies = exif.read_orientation(photograph.tags)
-    image = photograph.upright(lies)
+        decoded = decode(path, picture)
+    lies = exif.read_orientation(decoded.tags)
+    image = decoded.upright(lies)
     if name is None:
         name, why = _detect_picture_layout(path, image), "detected from name and content"
     left, right = _split_views(path, image, PAIR_LAYOUTS[name])
@@ -134,18 +134,18 @@ def _open_one(path: Path, format: str | None) -> Opened:
     return Opened(
         pair=StereoPair(left=left, right=right),
         layout=name,
-        notes=(*notes, *_turn_notes(lies), *_colour_notes([photograph])),
-        lens=exif.read_lens(photograph.tags, width_px, height_px),
+        notes=(*notes, *_turn_notes(lies), *_colour_notes([decoded])),
+        lens=exif.read_lens(decoded.tags, width_px, height_px),
     )
 
 
 def _open_mpo(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opened:
     """Open the pair in an MPO file; both views share the first one's orientation, as one camera took them."""
-    photographs = [read_frame(path, picture, index) for index in frames]
-    lies = exif.read_orientation(photographs[0].tags)
+    decoded = [read_frame(path, picture, index) for index in frames]
+    lies = exif.read_orientation(decoded[0].tags)
     # CIPA DC-007 numbers viewpoints from the left; many files omit the number and store the left view first.
-    photographs.sort(key=lambda each: exif.read_viewpoint(each.tags))
-    left, right = (each.upright(lies) for each in photographs)
+    decoded.sort(key=lambda each: exif.read_viewpoint(each.tags))
+    left, right = (each.upright(lies) for each in decoded)
     if left.shape != right.shape:
         sizes = " and ".join(f"{eye.shape[1]}x{eye.shape[0]}" for eye in (left, right))
         raise FormatError(f"{path}: expected an MPO file with two pictures of one size, found {sizes}")
@@ -156,9 +156,9 @@ def _open_mpo(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opened
         notes=(
             Note("mpo, two pictures in one file", _OVERRIDE),
             *_turn_notes(lies),
-            *_colour_notes(photographs),
+            *_colour_notes(decoded),
         ),
-        lens=_read_lens(photographs),
+        lens=_read_lens(decoded),
     )
 
 
@@ -227,7 +227,7 @@ def _detect_picture_layout(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> str
             raise FormatError(
                 f"{path}: expected two views, found {kind}, according to its name", remedy=_OVERRIDE
             )
-    return detect_layout(str(path), [image], photograph=True)
+    return detect_layout(str(path), [image], decoded=True)
 
 
 def _split_views(
@@ -245,9 +245,9 @@ def _split_views(
     return left, right
 
 
-def _read_lens(photographs: Sequence[DecodedPicture]) -> exif.Lens | None:
+def _read_lens(decoded: Sequence[DecodedPicture]) -> exif.Lens | None:
     """Read the cameras from the tags of both pictures; the first picture's take precedence."""
-    first, second = photographs
+    first, second = decoded
     return exif.read_lens({**second.tags, **first.tags}, *first.image.size)
 
 
@@ -255,9 +255,9 @@ def _turn_notes(lies: int | None) -> list[Note]:
     return [] if lies in (None, 1) else [Note("turned upright by its EXIF orientation")]
 
 
-def _colour_notes(photographs: Sequence[DecodedPicture]) -> list[Note]:
+def _colour_notes(decoded: Sequence[DecodedPicture]) -> list[Note]:
     """Return notes on colour conversions, one if both pictures had the same."""
-    texts = [each.note for each in photographs]
+    texts = [each.note for each in decoded]
     if len(set(texts)) == 1:
         return [Note(text) for text in texts[:1] if text]
     sides = zip(("left", "right"), texts, strict=True)

@@ -27,11 +27,11 @@ _LOOK_PX = 16
 
 @kernel
 @typing.no_type_check
-def uncover(photo, disparity_px, nearer_px, other_px, side, hidden_px, colours, first, end):
+def uncover(image, disparity_px, nearer_px, other_px, side, hidden_px, colours, first, end):
     """Write the disparity and colour of the background where neither camera sees it, elsewhere NOTHING.
 
     Args:
-        photo: uint8 RGB [H, W, 3], the image.
+        image: uint8 RGB [H, W, 3].
         disparity_px: float32 [H, W], its disparity.
         nearer_px: float32 [H, W], largest disparity in the 3x3 window minus the pixel's own.
         other_px: float32 [H, W], the other image's disparity.
@@ -53,7 +53,7 @@ def uncover(photo, disparity_px, nearer_px, other_px, side, hidden_px, colours, 
             origins[y % 2, x, 0], origins[y % 2, x, 1] = y, x
             if hidden_px[y, x] > NOTHING:
                 _copy_example(
-                    photo, disparity_px, nearer_px, hidden_px, colours, origins, borders[x], first, y, x, side
+                    image, disparity_px, nearer_px, hidden_px, colours, origins, borders[x], first, y, x, side
                 )
 
 
@@ -85,7 +85,7 @@ def _find_hidden(disparity_px, other_px, side, hidden_px, borders):
 
 @compiled
 @typing.no_type_check
-def _copy_example(photo, disparity_px, nearer_px, hidden_px, colours, origins, border, first, y, x, side):
+def _copy_example(image, disparity_px, nearer_px, hidden_px, colours, origins, border, first, y, x, side):
     """Write the colour of a hidden pixel; `side` is the direction of its visible background, -1 or 1."""
     width = disparity_px.shape[1]
     d = hidden_px[y, x]
@@ -107,7 +107,7 @@ def _copy_example(photo, disparity_px, nearer_px, hidden_px, colours, origins, b
         if (at_y == best_y and at_x == best_x) or not _is_example(disparity_px, nearer_px, at_y, at_x, d):
             continue
         apart = _compare_surroundings(
-            photo, disparity_px, hidden_px, colours, y, x, at_y, at_x, side, compared, first, best
+            image, disparity_px, hidden_px, colours, y, x, at_y, at_x, side, compared, first, best
         )
         if apart < best:
             best, best_y, best_x = apart, at_y, at_x
@@ -115,7 +115,7 @@ def _copy_example(photo, disparity_px, nearer_px, hidden_px, colours, origins, b
         best_y, best_x = y, min(max(border + side * RIM_PX, 0), width - 1)
     origins[y % 2, x, 0], origins[y % 2, x, 1] = best_y, best_x
     for channel in range(3):
-        colours[y, x, channel] = photo[best_y, best_x, channel]
+        colours[y, x, channel] = image[best_y, best_x, channel]
 
 
 @inlined
@@ -138,7 +138,7 @@ def _is_example(disparity_px, nearer_px, y, x, d):
 @inlined
 @typing.no_type_check
 def _compare_surroundings(
-    photo, disparity_px, hidden_px, colours, y, x, at_y, at_x, side, compared, first, enough
+    image, disparity_px, hidden_px, colours, y, x, at_y, at_x, side, compared, first, enough
 ):
     """Mean squared colour difference between the known neighbours of (y, x) and those of (at_y, at_x)."""
     width = disparity_px.shape[1]
@@ -154,8 +154,8 @@ def _compare_surroundings(
             continue
         count += 1
         for channel in range(3):
-            level = photo[row, column, channel] if seen else colours[row, column, channel]
-            apart = np.int32(level) - np.int32(photo[like_y, like_x, channel])
+            level = image[row, column, channel] if seen else colours[row, column, channel]
+            apart = np.int32(level) - np.int32(image[like_y, like_x, channel])
             total += apart * apart
         if total >= compared * enough:
             return total

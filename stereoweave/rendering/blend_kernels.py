@@ -75,11 +75,11 @@ def align_row(sums, row):
 @typing.no_type_check
 def _sample_grey_row(side, y, front_px, grey, slope):
     """Write an image's grey level at each surface of a row, and its derivative by disparity."""
-    photo = side.grey[y]
+    levels = side.grey[y]
     shift, offset_px = np.float32(side.shift), np.float32(side.offset_px)
     width = front_px.shape[0]
     padded = np.empty(width + 4, np.float32)
-    _pad(photo, padded)
+    _pad(levels, padded)
     for u in range(width):
         x = _clamp_column(np.float32(u) - offset_px - shift * front_px[u], width)
         i = np.uint32(x)
@@ -114,7 +114,7 @@ def _sample_colour_row(side, y, front_px, padded, colours):
     shift, offset_px = np.float32(side.shift), np.float32(side.offset_px)
     width = front_px.shape[0]
     for channel in range(3):
-        _pad(side.photo[y, :, channel], padded[channel])
+        _pad(side.image[y, :, channel], padded[channel])
     red, green, blue = padded
     for u in range(width):
         x = _clamp_column(np.float32(u) - offset_px - shift * front_px[u], width)

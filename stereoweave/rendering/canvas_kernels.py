@@ -26,7 +26,7 @@ class Side(typing.NamedTuple):
     """One input image and its maps; arrays are C-contiguous [H, W] unless stated.
 
     Attributes:
-        photo: uint8 RGB [H, W, 3].
+        image: uint8 RGB [H, W, 3].
         grey: uint8.
         disparity_px: float32; column x lands at x + shift * disparity_px + offset_px in the new view.
         nearer_px: float32; largest disparity in the 3x3 window minus the pixel's own.
@@ -35,7 +35,7 @@ class Side(typing.NamedTuple):
         nearness: Weight from the distance between its camera and the new one; both images' weights sum to 1.
     """
 
-    photo: np.ndarray
+    image: np.ndarray
     grey: np.ndarray
     disparity_px: np.ndarray
     nearer_px: np.ndarray
@@ -60,12 +60,12 @@ class Canvas(typing.NamedTuple):
     drawn: np.ndarray
 
 
-def empty_canvas(photo: np.ndarray) -> Canvas:
+def empty_canvas(image: np.ndarray) -> Canvas:
     """Create a canvas that shows an image, uint8 RGB [H, W, 3], in rows that are never drawn."""
-    size = photo.shape[:2]
+    size = image.shape[:2]
     return Canvas(
         surface_px=np.full(size, NOTHING, np.float32),
-        image=photo.copy(),
+        image=image.copy(),
         pure=np.zeros(size, bool),
         drawn=np.ones(size, bool),
     )

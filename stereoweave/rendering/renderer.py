@@ -74,8 +74,8 @@ class Renderer:
         check_position(position, up=up, forward=forward)
         moves = bool(self.convergence_px or up or forward)
         if position in (0, 1) and not moves:
-            photo = self.pair.right if position else self.pair.left
-            return View(image=photo.copy(), drawn=np.ones(photo.shape[:2], bool))
+            image = self.pair.right if position else self.pair.left
+            return View(image=image.copy(), drawn=np.ones(image.shape[:2], bool))
         canvas = self._draw(float(position))
         if up or forward:
             from stereoweave.rendering.camera_motion import move_camera
@@ -94,18 +94,18 @@ class Renderer:
         # The square root averages more, for less noise: +0.03 dB on rendered views, +0.1 dB on Venus.
         shares = abs(1 - position) ** 0.5, abs(position) ** 0.5
         tables = self._looks.tables(position) if self._looks else (None, None)
-        photos = [_recolour(side.photo, table) for side, table in zip(self._sides, tables, strict=True)]
+        colours = [_recolour(side.image, table) for side, table in zip(self._sides, tables, strict=True)]
         left, right = (
             side._replace(
-                **photo,
+                **colour,
                 shift=end - position,
                 offset_px=(position - 0.5) * self.convergence_px,
                 # Not 0: some surfaces are seen by the other camera only.
                 nearness=max(share / sum(shares), _LEAST_NEARNESS),
             )
-            for side, photo, end, share in zip(self._sides, photos, (0, 1), shares, strict=True)
+            for side, colour, end, share in zip(self._sides, colours, (0, 1), shares, strict=True)
         )
-        canvas = empty_canvas((left if position < 0.5 else right).photo)
+        canvas = empty_canvas((left if position < 0.5 else right).image)
         work = partial(draw, left, right, self._confidence, canvas)
         in_bands(work, len(canvas.image), self._threads, self._threads)
         if not 0 <= position <= 1:
@@ -206,16 +206,16 @@ def _check_shifts(strength: float, convergence_px: float, pair: StereoPair) -> N
         )
 
 
-def _make_side(photo: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarray, "h w"]) -> "Side":
+def _make_side(image: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarray, "h w"]) -> "Side":
     """Pack an input image and its maps for the kernels, before a view is chosen."""
     from stereoweave.rendering.canvas_kernels import Side
 
     # Numba compiles a second version of every kernel for read-only or non-contiguous arrays.
-    photo = np.require(photo, np.uint8, ["C", "W"])
+    image = np.require(image, np.uint8, ["C", "W"])
     disparity_px = np.require(disparity_px, np.float32, ["C", "W"])
     return Side(
-        photo=photo,
-        grey=cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY),
+        image=image,
+        grey=cv2.cvtColor(image, cv2.COLOR_RGB2GRAY),
         disparity_px=disparity_px,
         nearer_px=cv2.dilate(disparity_px, np.ones((3, 3), np.uint8)) - disparity_px,
         shift=0.0,
@@ -225,13 +225,13 @@ def _make_side(photo: UInt8[np.ndarray, "h w 3"], disparity_px: Float[np.ndarray
 
 
 def _recolour(
-    photo: UInt8[np.ndarray, "h w 3"], table: Float[np.ndarray, "256 3"] | None
+    image: UInt8[np.ndarray, "h w 3"], table: Float[np.ndarray, "256 3"] | None
 ) -> dict[str, np.ndarray]:
     """Apply a colour table to a side's image and grey levels; return no change without a table."""
     if table is None:
         return {}
-    coloured = recolour(photo, table)
-    return {"photo": coloured, "grey": cv2.cvtColor(coloured, cv2.COLOR_RGB2GRAY)}
+    coloured = recolour(image, table)
+    return {"image": coloured, "grey": cv2.cvtColor(coloured, cv2.COLOR_RGB2GRAY)}
 
 
 def _assume_camera(estimate: Estimate) -> StereoCamera:
@@ -254,10 +254,10 @@ def _uncover_background(sides: "Sequence[Side]", right: bool, threads: int) -> H
     from stereoweave.rendering.background_kernels import uncover
 
     own, other = sides[right], sides[not right]
-    hidden = HiddenBackground(np.empty_like(own.disparity_px), np.empty_like(own.photo))
+    hidden = HiddenBackground(np.empty_like(own.disparity_px), np.empty_like(own.image))
     # Views from beyond the left camera uncover background to the left of the foreground.
     outwards = 1 if right else -1
-    known = own.photo, own.disparity_px, own.nearer_px, other.disparity_px, outwards
-    height = len(own.photo)
+    known = own.image, own.disparity_px, own.nearer_px, other.disparity_px, outwards
+    height = len(own.image)
     in_bands(partial(uncover, *known, *hidden), height, -(-height // _BAND_ROWS), threads)
     return hidden

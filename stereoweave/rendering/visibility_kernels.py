@@ -124,8 +124,8 @@ def _find_gap_px(side, y, u, d):
 @typing.no_type_check
 def _measure_mismatch(left, right, y, u, d):
     """Images' mean difference over three pixels around u at disparity d, channels summed; -1 outside."""
-    left_photo, right_photo = left.photo[y], right.photo[y]
-    last = left_photo.shape[0] - 1
+    left_image, right_image = left.image[y], right.image[y]
+    last = left_image.shape[0] - 1
     total, count = 0.0, 0
     for column in range(u - 1, u + 2):
         x = _column(left.shift, left.offset_px, column, d)
@@ -136,8 +136,8 @@ def _measure_mismatch(left, right, y, u, d):
         j, m = min(i + 1, last), min(k + 1, last)
         count += 1
         for channel in range(3):
-            here = (1 - x + i) * left_photo[i, channel] + (x - i) * left_photo[j, channel]
-            there = (1 - z + k) * right_photo[k, channel] + (z - k) * right_photo[m, channel]
+            here = (1 - x + i) * left_image[i, channel] + (x - i) * left_image[j, channel]
+            there = (1 - z + k) * right_image[k, channel] + (z - k) * right_image[m, channel]
             total += abs(here - there)
     return total / count if count else -1.0
 

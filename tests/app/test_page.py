@@ -185,11 +185,11 @@ def test_the_files_are_those_of_the_command(answered, tmp_path):
 
 def test_two_clicks_measure_a_distance(answered):
     answered.page.get_by_role("tab", name="Measure").click()
-    box = answered.page.locator("#photograph img").bounding_box()
+    box = answered.page.locator("#clickable img").bounding_box()
     for count, (across, down) in enumerate(((0.3, 0.45), (0.7, 0.6)), start=1):
         answered.page.mouse.click(box["x"] + across * box["width"], box["y"] + down * box["height"])
         answered.page.locator("#measured p").get_by_text("disparity").nth(count - 1).wait_for()
-        answered.page.wait_for_function("document.querySelector('#photograph img').complete")
+        answered.page.wait_for_function("document.querySelector('#clickable img').complete")
     said = answered.page.locator("#measured").inner_text()
     answered.page.get_by_role("tab", name="View and depth").click()
     points = []

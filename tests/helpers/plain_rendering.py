@@ -8,7 +8,7 @@ SAME_SURFACE_PX = 3.0
 
 
 class PlainSide(NamedTuple):
-    photo: np.ndarray
+    image: np.ndarray
     disparity_px: np.ndarray
     shift: float
     nearness: float
@@ -129,7 +129,7 @@ def mismatch(sides, d):
     for k in (-1, 0, 1):
         left, right = (side.column(d) + k for side in sides)
         both = inside(sides[0], left) & inside(sides[1], right)
-        apart = np.abs(linear(sides[0].photo, left) - linear(sides[1].photo, right)).sum(2)
+        apart = np.abs(linear(sides[0].image, left) - linear(sides[1].image, right)).sum(2)
         total += np.where(both, apart, 0)
         count += both
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
@@ -177,7 +177,7 @@ def plain_surfaces(sides, confidence):
 def aligned(sides, front, back):
     """front after one least-squares step over 5 x 5 windows."""
     d = np.nan_to_num(front)
-    greys = [grey(side.photo) for side in sides]
+    greys = [grey(side.image) for side in sides]
     seen = np.min([support(side, d, purity(side)) for side in sides], axis=0) >= 0.5
     seen &= np.isfinite(front) & np.isnan(back)
     left, right = (side.column(d) for side in sides)
@@ -194,9 +194,9 @@ def aligned(sides, front, back):
     return np.where(seen, front + step, front)
 
 
-def grey(photo):
+def grey(image):
     """ITU-R BT.601 luma as integers, with OpenCV's fixed-point weights."""
-    return (photo.astype(int) @ [9798, 19235, 3735] + 2**14) >> 15
+    return (image.astype(int) @ [9798, 19235, 3735] + 2**14) >> 15
 
 
 def windows(values):
@@ -214,7 +214,7 @@ def plain_colours(sides, front, back, share, front_supports):
         supports = [exists * of_side for of_side in found]
         weights = [side.nearness * s for side, s in zip(sides, supports, strict=True)]
         of_left = weights[0] / np.maximum(sum(weights), 1e-300)
-        seen_in = [cubic(side.photo, side.column(d)) for side in sides]
+        seen_in = [cubic(side.image, side.column(d)) for side in sides]
         if layer == 0:
             both = (np.minimum(*supports) >= 0.5) & np.isnan(back)
             of_left = part_doubles(of_left, *seen_in, d, both)
