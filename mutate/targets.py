@@ -85,7 +85,7 @@ TARGETS = {
         ("rendering/renderer.py",),
         (
             "rendering/test_renderer.py",
-            "rendering/test_hidden.py",
+            "rendering/test_background_kernels.py",
             "rendering/test_camera_motion.py",
             "rendering/test_synthesize.py",
             "rendering/test_layouts.py",
