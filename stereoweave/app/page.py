@@ -113,8 +113,8 @@ class Page:
             )
             self._calibration = gr.File(label=_LABELS["calibration"], height=140, elem_id="calibration")
             with gr.Row():
-                self._focal_px = _optional_number(_LABELS["focal_px"], "focal")
-                self._baseline_mm = _optional_number(_LABELS["baseline_m"], "baseline")
+                self._focal_px = _make_optional_number(_LABELS["focal_px"], "focal")
+                self._baseline_mm = _make_optional_number(_LABELS["baseline_m"], "baseline")
         self._find = gr.Button("Find depth", variant="primary", elem_id="find")
         self._sample = gr.Button("Try the sample", elem_id="sample")
 
@@ -122,7 +122,7 @@ class Page:
         """Build the part that shows results."""
         with gr.Tabs() as self._tabs:
             with gr.Tab("View and depth", id="first"):
-                self._view = _picture("New view", "view")
+                self._view = _make_picture("New view", "view")
                 self._position = gr.Slider(
                     -0.5,
                     1.5,
@@ -136,14 +136,14 @@ class Page:
                 self._where = gr.HTML(elem_id="where")
                 with gr.Row():
                     with gr.Column(min_width=280):
-                        self._depth = _picture("Depth", "depth")
+                        self._depth = _make_picture("Depth", "depth")
                         self._ramp = gr.HTML()
                     with gr.Column(min_width=280):
-                        self._confidence = _picture("Confidence", "confidence")
-                        gr.HTML(_confidence_legend())
+                        self._confidence = _make_picture("Confidence", "confidence")
+                        gr.HTML(_format_confidence_legend())
             with gr.Tab("Measure"):
                 self._measured = gr.HTML(elem_id="measured")
-                self._clickable = _picture("Left picture", "clickable")
+                self._clickable = _make_picture("Left picture", "clickable")
             with gr.Tab("Point cloud") as self._cloud_tab:
                 gr.HTML(js_on_load=_WITHOUT_WEBGL, padding=False)
                 self._cloud = gr.Model3D(
@@ -223,7 +223,7 @@ class Page:
         """Match the given pictures. Returns the page's new content: the result, or an error."""
         _remove_files(given[self._session])
         try:
-            uploads, folder = self._uploads(given), Path(tempfile.mkdtemp(dir=self._folder))
+            uploads, folder = self._make_uploads(given), Path(tempfile.mkdtemp(dir=self._folder))
             session = match_uploads(uploads, folder, partial(_report_progress, progress))
             return self._show_result(session, given[self._position])
         except (StereoweaveError, OSError) as error:
@@ -251,16 +251,16 @@ class Page:
         except (StereoweaveError, OSError) as error:
             return {self._status: self._format_error(error)}
         return {
-            self._status: self._summary(session, notes),
+            self._status: self._format_summary(session, notes),
             self._files: [str(file) for file in files],
             self._all: gr.update(value=packed and str(packed), visible=packed is not None),
         }
 
-    def _summary(self, session: Session, notes: Sequence[Note] = ()) -> str:
+    def _format_summary(self, session: Session, notes: Sequence[Note] = ()) -> str:
         lines = [self._format_line(note.format(label_of)) for note in (*session.result.notes, *notes)]
         return _format_notice([format_summary(session.result.summary), *lines])
 
-    def _uploads(self, given: dict[Any, Any]) -> Uploads:
+    def _make_uploads(self, given: dict[Any, Any]) -> Uploads:
         layout, calibration = given[self._layout], given[self._calibration]
         focal_px, baseline_mm = given[self._focal_px] or None, given[self._baseline_mm] or None
         request = Request(
@@ -278,18 +278,18 @@ class Page:
         pair, estimate = session.renderer.pair, session.renderer.estimate
         view, where = self._render_view(session, position)
         return {
-            self._status: self._summary(session),
+            self._status: self._format_summary(session),
             self._results: gr.update(visible=True),
             self._session: session,
             self._view: view,
             self._where: where,
             self._depth: colour_depth(session),
-            self._ramp: _depth_legend(session),
+            self._ramp: _format_depth_legend(session),
             self._confidence: colour_confidence(estimate.confidence, estimate.occluded),
             self._clickable: pair.left,
             self._clicks: [],
             self._tabs: gr.update(selected="first"),
-            self._measured: _paragraphs([_TO_MEASURE]),
+            self._measured: _format_paragraphs([_TO_MEASURE]),
             self._cloud: None,
             self._files: None,
             self._all: gr.update(value=None, visible=False),
@@ -313,12 +313,12 @@ class Page:
     ) -> tuple[Any, str, list[tuple[int, int]]]:
         """Mark the clicked points, at most two, in the left image, and measure there."""
         if session is None:
-            return gr.skip(), _paragraphs([_GONE]), []
+            return gr.skip(), _format_paragraphs([_GONE]), []
         column, row = event.index
         clicks = [*(clicks if len(clicks) < 2 else []), (int(column), int(row))]
         return (
             mark_clicks(session.renderer.pair.left, clicks),
-            _paragraphs(measure_clicks(session, clicks)),
+            _format_paragraphs(measure_clicks(session, clicks)),
             clicks,
         )
 
@@ -333,11 +333,11 @@ def _report_progress(progress: Any, share: float, what: str) -> None:
     progress(share, desc=what)
 
 
-def _optional_number(label: str, name: str) -> gr.Number:
+def _make_optional_number(label: str, name: str) -> gr.Number:
     return gr.Number(0, label=label, info="0: unknown", min_width=120, elem_id=name)
 
 
-def _picture(label: str, name: str) -> gr.Image:
+def _make_picture(label: str, name: str) -> gr.Image:
     return gr.Image(
         label=label, format="jpeg", interactive=False, buttons=["fullscreen"], elem_id=name, alt_text=label
     )
@@ -346,24 +346,26 @@ def _picture(label: str, name: str) -> gr.Image:
 def _format_notice(lines: Sequence[str], *, problem: bool = False) -> str:
     """Format lines as HTML, one below the other; a problem is highlighted and read out by screen readers."""
     look, role = ("notice problem", "alert") if problem else ("notice", "status")
-    return f'<div class="{look}" role="{role}">{_paragraphs(lines)}</div>'
+    return f'<div class="{look}" role="{role}">{_format_paragraphs(lines)}</div>'
 
 
-def _paragraphs(lines: Sequence[str]) -> str:
+def _format_paragraphs(lines: Sequence[str]) -> str:
     return "".join(f"<p>{html.escape(line)}</p>" for line in lines)
 
 
-def _depth_legend(session: Session) -> str:
+def _format_depth_legend(session: Session) -> str:
     far, near = format_colour_range(session.result)
-    return _legend(f"linear-gradient(90deg,{','.join(legend_colours(24))})", f"far: {far}", f"near: {near}")
+    return _format_legend(
+        f"linear-gradient(90deg,{','.join(legend_colours(24))})", f"far: {far}", f"near: {near}"
+    )
 
 
-def _confidence_legend() -> str:
+def _format_confidence_legend() -> str:
     key = f'<i class="key" style="background:{css_colour(OCCLUDED_RGB)}"></i>occluded, seen by the left only'
-    return _legend("linear-gradient(90deg,#000,#fff)", "low", key, "high")
+    return _format_legend("linear-gradient(90deg,#000,#fff)", "low", key, "high")
 
 
-def _legend(colours: str, *labels: str) -> str:
+def _format_legend(colours: str, *labels: str) -> str:
     spans = "".join(f"<span>{label}</span>" for label in labels)
     return f'<div class="ramp" style="background:{colours}"></div><div class="ends">{spans}</div>'
 

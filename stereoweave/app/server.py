@@ -45,7 +45,7 @@ def make_server(folder: Path, names: Sequence[str] | None, provider: str = CPU) 
         ssr_mode=False,
         pwa=False,
         mcp_server=False,
-        theme=_theme(),
+        theme=_make_theme(),
         css=css,
     )
     server.add_middleware(OwnFiles)
@@ -55,7 +55,7 @@ def make_server(folder: Path, names: Sequence[str] | None, provider: str = CPU) 
     return server
 
 
-def _theme() -> gr.themes.Base:
+def _make_theme() -> gr.themes.Base:
     """Return a plain theme with the fonts of the visitor's computer."""
     return gr.themes.Base(
         primary_hue="blue",

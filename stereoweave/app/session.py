@@ -129,7 +129,7 @@ def format_colour_range(result: Result) -> tuple[str, str]:
     if not result.pair.camera:
         return f"{ends_px[0, 0]:.1f} px", f"{ends_px[0, 1]:.1f} px"
     far_m, near_m = result.pair.camera.depth_m(ends_px)[0]
-    return _metres(far_m), _metres(near_m)
+    return _format_metres(far_m), _format_metres(near_m)
 
 
 def mark_clicks(
@@ -164,11 +164,12 @@ def format_summary(summary: Summary) -> str:
     text = f"{summary.width_px}×{summary.height_px} px, matched in {summary.estimate_ms / 1000:.1f} s: "
     text += f"disparity {summary.disparity_min_px:.1f} to {summary.disparity_max_px:.1f} px"
     if summary.depth_min_m is not None:
-        text += f", depth from {summary.depth_min_m:.2f} m, in the middle {_metres(summary.depth_median_m)}"
+        middle = _format_metres(summary.depth_median_m)
+        text += f", depth from {summary.depth_min_m:.2f} m, in the middle {middle}"
     return f"{text}; confident in {summary.confident_percent:.0f} % of the picture"
 
 
-def _metres(depth_m: float | None) -> str:
+def _format_metres(depth_m: float | None) -> str:
     return "infinite" if depth_m is None or not np.isfinite(depth_m) else f"{depth_m:.2f} m"
 
 
@@ -178,7 +179,7 @@ def _describe_pixel(result: Result, point: tuple[int, int]) -> str:
     disparity_px = result.estimate.disparity_px[row : row + 1, column : column + 1]
     text = f"({column}, {row}): disparity {disparity_px[0, 0]:.2f} px"
     if result.pair.camera:
-        text += f", depth {_metres(float(result.pair.camera.depth_m(disparity_px)[0, 0]))}"
+        text += f", depth {_format_metres(float(result.pair.camera.depth_m(disparity_px)[0, 0]))}"
     return f"{text}; confidence {100 * result.estimate.confidence[row, column]:.0f} %"
 
 

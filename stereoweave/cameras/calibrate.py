@@ -72,14 +72,14 @@ class Calibration:
     @property
     def verdict(self) -> str:
         """One line: good, fair or poor, with the remedies."""
-        faults = list(self._faults())
+        faults = list(self._find_faults())
         summary = f"{self.error_px:.2f} px over {len(self.used)} pairs"
         if not faults:
             return f"good: {summary}"
         poor = any(is_poor for is_poor, _ in faults)
         return f"{'poor' if poor else 'fair'}: {summary}; " + "; ".join(fault for _, fault in faults)
 
-    def _faults(self) -> Iterator[tuple[bool, str]]:
+    def _find_faults(self) -> Iterator[tuple[bool, str]]:
         """Yield each fault: whether it makes the calibration poor, and its description with the remedy."""
         if self.rig.translation_m[0] > 0:
             yield True, "the left and the right pictures are swapped: rename them"

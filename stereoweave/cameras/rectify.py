@@ -54,7 +54,7 @@ def rectify(pair: StereoPair, rig: Rig) -> Rectified:
     left, left_seen = _rectify_view(pair.left, rig.left, turns[0], camera)
     right, right_seen = _rectify_view(pair.right, rig.right, turns[1], camera)
     rectified = StereoPair(left=left, right=right, camera=camera, left_seen=left_seen, right_seen=right_seen)
-    return Rectified(pair=rectified, notes=(*rig.notes, _summary(rig, turns, rectified)))
+    return Rectified(pair=rectified, notes=(*rig.notes, _summarize(rig, turns, rectified)))
 
 
 def crop(pair: StereoPair) -> StereoPair:
@@ -135,7 +135,7 @@ def _choose_camera(
 def _find_direction(optics: Optics, at_px: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
     """Viewing direction of a pixel."""
     undistort = cv2.fisheye.undistortPoints if optics.fisheye else cv2.undistortPoints
-    (x, y), *_ = undistort(at_px.reshape(1, 1, 2), optics.matrix, _opencv_distortion(optics)).reshape(-1, 2)
+    (x, y), *_ = undistort(at_px.reshape(1, 1, 2), optics.matrix, _pad_distortion(optics)).reshape(-1, 2)
     return np.array([x, y, 1])
 
 
@@ -149,9 +149,7 @@ def _rectify_view(
     height, width = image.shape[:2]
     pinhole = np.array([[camera.focal_px, 0, camera.cx_px], [0, camera.focal_px, camera.cy_px], [0, 0, 1]])
     places = cv2.fisheye.initUndistortRectifyMap if optics.fisheye else cv2.initUndistortRectifyMap
-    x_px, y_px = places(
-        optics.matrix, _opencv_distortion(optics), turn, pinhole, (width, height), cv2.CV_32FC1
-    )
+    x_px, y_px = places(optics.matrix, _pad_distortion(optics), turn, pinhole, (width, height), cv2.CV_32FC1)
     inside = (x_px > -0.5) & (x_px < width - 0.5) & (y_px > -0.5) & (y_px < height - 0.5)
     inside &= _find_valid_field(optics, turn, pinhole, (height, width))
     turned = cv2.remap(image, x_px, y_px, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
@@ -180,7 +178,7 @@ def _find_fold(optics: Optics, most: float) -> float:
     """Radius (fisheye: angle) at which the distorted radius stops growing, at most `most`."""
     radius = np.linspace(0, most, _RADIUS_STEPS)
     squares = radius**2
-    k = _opencv_distortion(optics)
+    k = _pad_distortion(optics)
     if optics.fisheye:
         distorted = radius * (1 + squares * (k[0] + squares * (k[1] + squares * (k[2] + squares * k[3]))))
     else:
@@ -191,12 +189,12 @@ def _find_fold(optics: Optics, most: float) -> float:
     return float(radius[falls[0]]) if falls.size else most
 
 
-def _opencv_distortion(optics: Optics) -> Float[np.ndarray, " n"]:
+def _pad_distortion(optics: Optics) -> Float[np.ndarray, " n"]:
     """Distortion for OpenCV, whose fisheye functions need four coefficients."""
     return optics.distortion if optics.distortion.size else np.zeros(4)
 
 
-def _summary(rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], pair: StereoPair) -> Note:
+def _summarize(rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], pair: StereoPair) -> Note:
     left, right = (np.degrees(np.linalg.norm(cv2.Rodrigues(turn)[0])) for turn in turns)
     assert pair.left_seen is not None and pair.right_seen is not None
     seen_percent = 100 * (pair.left_seen & pair.right_seen).mean()

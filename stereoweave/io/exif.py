@@ -57,7 +57,7 @@ def read_tags(picture: Image.Image) -> Tags:
     """Read the tags of an opened picture, or of an MPO file's current frame, without damaged ones."""
     # Pillow warns about each damaged tag.
     with warnings.catch_warnings(action="ignore"):
-        return _exif_tags(picture) | _multi_picture_tags(picture.info.get("mp", b""))
+        return _read_exif_tags(picture) | _read_multi_picture_tags(picture.info.get("mp", b""))
 
 
 def read_orientation(tags: Tags) -> int | None:
@@ -82,11 +82,11 @@ def read_lens(tags: Tags, width_px: int, height_px: int) -> Lens | None:
 
     The views must show the camera's full image, at any scale: a crop would get a wrong focal length.
     """
-    lens = Lens(focal_px=_focal_px(tags, width_px, height_px), baseline_m=_baseline_m(tags))
+    lens = Lens(focal_px=_find_focal_px(tags, width_px, height_px), baseline_m=_find_baseline_m(tags))
     return None if lens == Lens() else lens
 
 
-def _exif_tags(picture: Image.Image) -> dict[int, Any]:
+def _read_exif_tags(picture: Image.Image) -> dict[int, Any]:
     try:
         tags = picture.getexif()
         return dict(tags) | dict(tags.get_ifd(IFD.Exif))
@@ -94,7 +94,7 @@ def _exif_tags(picture: Image.Image) -> dict[int, Any]:
         return {}
 
 
-def _multi_picture_tags(content: bytes) -> dict[int, Any]:
+def _read_multi_picture_tags(content: bytes) -> dict[int, Any]:
     """Tags of an MPO file's frame: its own, and for the first frame the file's."""
     tags: dict[int, Any] = {}
     try:
@@ -112,35 +112,38 @@ def _multi_picture_tags(content: bytes) -> dict[int, Any]:
     return tags
 
 
-def _focal_px(tags: Tags, width_px: int, height_px: int) -> float | None:
+def _find_focal_px(tags: Tags, width_px: int, height_px: int) -> float | None:
     diagonal_px = math.hypot(width_px, height_px)
     lengths_px = (
-        _focal_on_film_px(tags, diagonal_px),
-        _focal_on_sensor_px(tags, width_px),
+        _find_focal_on_film_px(tags, diagonal_px),
+        _find_focal_on_sensor_px(tags, width_px),
     )
     return next((px for px in lengths_px if px and _SHORTEST < px / diagonal_px < _LONGEST), None)
 
 
-def _focal_on_film_px(tags: Tags, diagonal_px: float) -> float | None:
-    of_film_mm = _positive(tags.get(Base.FocalLengthIn35mmFilm))
+def _find_focal_on_film_px(tags: Tags, diagonal_px: float) -> float | None:
+    of_film_mm = _parse_positive(tags.get(Base.FocalLengthIn35mmFilm))
     return of_film_mm / _FILM_DIAGONAL_MM * diagonal_px if of_film_mm else None
 
 
-def _focal_on_sensor_px(tags: Tags, width_px: int) -> float | None:
-    focal_mm, density = _positive(tags.get(Base.FocalLength)), _positive(tags.get(Base.FocalPlaneXResolution))
-    taken_px = _positive(tags.get(Base.ExifImageWidth))
+def _find_focal_on_sensor_px(tags: Tags, width_px: int) -> float | None:
+    focal_mm, density = (
+        _parse_positive(tags.get(Base.FocalLength)),
+        _parse_positive(tags.get(Base.FocalPlaneXResolution)),
+    )
+    taken_px = _parse_positive(tags.get(Base.ExifImageWidth))
     unit_mm = _UNIT_MM.get(tags.get(Base.FocalPlaneResolutionUnit, 2))
     if focal_mm and density and taken_px and unit_mm:
         return focal_mm * density / unit_mm * width_px / taken_px
     return None
 
 
-def _baseline_m(tags: Tags) -> float | None:
+def _find_baseline_m(tags: Tags) -> float | None:
     model = str(tags.get(Base.Model, "")).strip("\0 ")
-    return _positive(tags.get(_BASELINE)) or _BASELINES_M.get(model)
+    return _parse_positive(tags.get(_BASELINE)) or _BASELINES_M.get(model)
 
 
-def _positive(value: Any) -> float | None:
+def _parse_positive(value: Any) -> float | None:
     """Positive number of a tag; None for 0, which means unknown, and for an invalid value."""
     try:
         number = float(value)

@@ -46,7 +46,8 @@ def check_large_enough(path: str | Path, image: UInt8[np.ndarray, "h w 3"]) -> N
     """Raise a FormatError if a view is under 32 pixels wide or high."""
     if min(image.shape[:2]) < SMALLEST_SIDE_PX:
         raise FormatError(
-            f"{path}: expected at least {SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX} pixels, found {_size(image)}"
+            f"{path}: expected at least {SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX} pixels, "
+            f"found {_format_size(image)}"
         )
 
 
@@ -66,8 +67,8 @@ def make_pair(
         check_large_enough(path, image)
     if left_image.shape != right_image.shape:
         raise FormatError(
-            f"expected left and right pictures of the same size, found {left} of {_size(left_image)} "
-            f"and {right} of {_size(right_image)}; crop or rescale one of them"
+            f"expected left and right pictures of the same size, found {left} of {_format_size(left_image)} "
+            f"and {right} of {_format_size(right_image)}; crop or rescale one of them"
         )
     return StereoPair(left=left_image, right=right_image)
 
@@ -108,5 +109,5 @@ def checking_format_size(path: str | Path, shape: tuple[int, ...]) -> Iterator[N
         ) from error
 
 
-def _size(image: UInt8[np.ndarray, "h w 3"]) -> str:
+def _format_size(image: UInt8[np.ndarray, "h w 3"]) -> str:
     return f"{image.shape[1]}x{image.shape[0]}"

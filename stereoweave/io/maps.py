@@ -34,7 +34,7 @@ def read_pfm(path: str | Path) -> Float32[np.ndarray, "h w"]:
     """
     check_regular(Path(path), "a PFM file")
     with reading(path, "a PFM file"), Path(path).open("rb") as file:
-        (width_px, height_px), order, start = _pfm_header(path, file.read(_LONGEST_PFM_HEADER))
+        (width_px, height_px), order, start = _parse_pfm_header(path, file.read(_LONGEST_PFM_HEADER))
         expected, found = 4 * width_px * height_px, file.seek(0, os.SEEK_END) - start
         if found != expected:
             raise FormatError(
@@ -46,7 +46,7 @@ def read_pfm(path: str | Path) -> Float32[np.ndarray, "h w"]:
     return values.reshape(height_px, width_px)[::-1].astype(np.float32, order="C")
 
 
-def _pfm_header(path: str | Path, content: bytes) -> tuple[tuple[int, int], str, int]:
+def _parse_pfm_header(path: str | Path, content: bytes) -> tuple[tuple[int, int], str, int]:
     """Parse a PFM header: width and height in px, NumPy's byte order, and the offset of the values."""
     header = _PFM_HEADER.match(content)
     if header is None:

@@ -110,7 +110,7 @@ def _open_two(left: Path, right: Path) -> Opened:
     return Opened(
         pair=make_pair(left, eyes[0], right, eyes[1]),
         layout=TWO_PICTURES,
-        notes=(*notes, *_colour_notes(decoded)),
+        notes=(*notes, *_note_colours(decoded)),
         lens=_read_lens(decoded),
     )
 
@@ -134,7 +134,7 @@ def _open_one(path: Path, format: str | None) -> Opened:
     return Opened(
         pair=StereoPair(left=left, right=right),
         layout=name,
-        notes=(*notes, *_turn_notes(lies), *_colour_notes([decoded])),
+        notes=(*notes, *_note_turns(lies), *_note_colours([decoded])),
         lens=exif.read_lens(decoded.tags, width_px, height_px),
     )
 
@@ -155,8 +155,8 @@ def _open_mpo(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opened
         layout="mpo",
         notes=(
             Note("mpo, two pictures in one file", _OVERRIDE),
-            *_turn_notes(lies),
-            *_colour_notes(decoded),
+            *_note_turns(lies),
+            *_note_colours(decoded),
         ),
         lens=_read_lens(decoded),
     )
@@ -173,7 +173,7 @@ def _choose_orientations(
     """
     own = exif.read_orientation(left.tags), exif.read_orientation(right.tags)
     if own[0] == own[1] or {*own} <= {None, 1}:
-        return own, _turn_notes(own[0])
+        return own, _note_turns(own[0])
     alike = (own[0] or own[1],) * 2
     fitting = [
         lies
@@ -251,11 +251,11 @@ def _read_lens(decoded: Sequence[DecodedPicture]) -> exif.Lens | None:
     return exif.read_lens({**second.tags, **first.tags}, *first.image.size)
 
 
-def _turn_notes(lies: int | None) -> list[Note]:
+def _note_turns(lies: int | None) -> list[Note]:
     return [] if lies in (None, 1) else [Note("turned upright by its EXIF orientation")]
 
 
-def _colour_notes(decoded: Sequence[DecodedPicture]) -> list[Note]:
+def _note_colours(decoded: Sequence[DecodedPicture]) -> list[Note]:
     """Return notes on colour conversions, one if both pictures had the same."""
     texts = [each.note for each in decoded]
     if len(set(texts)) == 1:
