@@ -24,8 +24,8 @@ VARIABLE = {
     ("pictures/pair_finding.py", "side"): {"left", "right"},
     ("rendering/renderer.py", "name"): {"up", "forward"},
     ("synth/sets/make.py", "name"): {"pairs", "seed", "frames"},
-    ("video/convert.py", "setting"): {"strength", "convergence_px"},
-    ("video/convert.py", "tuple(kinds)"): {"depth", "depth16", "position", "layout"},
+    ("video/job.py", "setting"): {"strength", "convergence_px"},
+    ("video/job.py", "tuple(kinds)"): {"depth", "depth16", "position", "layout"},
 }
 # Rooms whose errors reach the page and the service.
 SHARED = {"cameras", "matching", "outputs", "pictures", "rendering"}

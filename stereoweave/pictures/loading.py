@@ -227,7 +227,7 @@ def _detect_picture_layout(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> str
             raise FormatError(
                 f"{path}: expected two views, found {kind}, according to its name", remedy=_OVERRIDE
             )
-    return detect_layout(str(path), [image], decoded=True)
+    return detect_layout(str(path), [image], photograph=True)
 
 
 def _split_views(
