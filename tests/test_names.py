@@ -15,7 +15,7 @@ from stereoweave.bench.pairs import write_csv
 from stereoweave.cli.root import main
 from stereoweave.io.images import read_image, write_image
 
-EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+TEXTURED = Path(__file__).resolve().parent / "textured_pair"
 # Names as a disk of another country's has them, in Latin-1: "grün", "grûn".
 GREEN, GREENISH = os.fsdecode(b"gr\xfcn"), os.fsdecode(b"gr\xfbn")
 SHOWN, SHOWN_TOO = r"gr\udcfcn", r"gr\udcfbn"
@@ -31,7 +31,7 @@ def write_pair(folder: Path, name: str) -> list[str]:
     folder.mkdir(exist_ok=True)
     files = [folder / f"{name}_{side}.png" for side in ("left", "right")]
     for file in files:
-        small = read_image(EXAMPLES / f"{file.stem.rpartition('_')[2]}.png")[200:264, 200:296]
+        small = read_image(TEXTURED / f"{file.stem.rpartition('_')[2]}.png")[200:264, 200:296]
         write_image(file.with_name("new.png"), small)
         file.with_name("new.png").rename(file)
     return [str(file) for file in files]

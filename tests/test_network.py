@@ -21,8 +21,8 @@ from visitor import Visitor
 
 from stereoweave.io.images import read_image, write_image
 
-EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
-PAIR = {side: EXAMPLES / f"{side}.png" for side in ("left", "right")}
+TEXTURED = Path(__file__).resolve().parent / "textured_pair"
+PAIR = {side: TEXTURED / f"{side}.png" for side in ("left", "right")}
 # ONNX Runtime looks up where its reports go after some ten seconds.
 ALIVE_S = 20
 STRACE = ["strace", "-D", "-f", "-qq", "--seccomp-bpf", "-e", "trace=connect,sendto,sendmsg,sendmmsg"]
@@ -37,7 +37,7 @@ print("ready", flush=True)
 while True:
     sw.estimate(left, right)
     time.sleep(0.5)
-""".replace("{folder}", str(EXAMPLES))
+""".replace("{folder}", str(TEXTURED))
 LOOKING_UP = "import socket; socket.getaddrinfo('stereoweave.invalid', 443)"
 CALLING_ITSELF = """
 import socket

@@ -15,9 +15,9 @@ from stereoweave.io.arrays import as_rgb
 from stereoweave.io.images import read_image
 from stereoweave.rendering.renderer import Renderer
 
-EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+TEXTURED = Path(__file__).resolve().parent / "textured_pair"
 LEFT, RIGHT = (
-    np.ascontiguousarray(read_image(EXAMPLES / f"{side}.png")[200:264, 200:296]) for side in ("left", "right")
+    np.ascontiguousarray(read_image(TEXTURED / f"{side}.png")[200:264, 200:296]) for side in ("left", "right")
 )
 FLAT = np.full((64, 96), 3.0, np.float32)
 FOUND = sw.Estimate(

@@ -22,7 +22,7 @@ from stereoweave.io.colormap import colour_disparity
 from stereoweave.matching.matcher import Matcher
 from stereoweave.stereo import StereoCamera, StereoPair
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 COMMAND = [sys.executable, "-c", "import typer; from stereoweave.cli.live import live; typer.run(live)"]
 _STEP = 20
 
@@ -49,7 +49,7 @@ def number_of(picture: np.ndarray) -> int:
 
 def example_frame() -> np.ndarray:
     """The example pair in one frame, at a quarter of its size."""
-    left, right = (cv2.imread(str(EXAMPLES / name)) for name in ("left.png", "right.png"))
+    left, right = (cv2.imread(str(TEXTURED / name)) for name in ("left.png", "right.png"))
     both = cv2.resize(np.hstack([left, right]), (320, 120), interpolation=cv2.INTER_AREA)
     return cv2.cvtColor(both, cv2.COLOR_BGR2RGB)
 
@@ -131,7 +131,7 @@ def test_a_series_of_pictures_is_a_video(tmp_path):
     ("source", "found"),
     [
         ("nowhere.mp4", "no such file"),
-        (str(EXAMPLES / "calib.txt"), "something else"),
+        (str(TEXTURED / "calib.txt"), "something else"),
         ("999", "no camera of that number"),
         ("http://127.0.0.1:1/stream", "no stream at that address"),
     ],

@@ -35,7 +35,7 @@ from stereoweave.video.parts import parts_folder
 
 pytestmark = pytest.mark.system
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
+TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 JOB = DepthJob(always=("disparity.pfm", "confidence.png"))
 
 
@@ -50,7 +50,7 @@ def write_pairs(folder: Path, names, size_px=(64, 48)) -> Path:
     """Small pairs, each another part of the example."""
     width, height = size_px
     for side in ("left", "right"):
-        image = read_image(EXAMPLES / f"{side}.png")
+        image = read_image(TEXTURED / f"{side}.png")
         for index, name in enumerate(names):
             crop = image[3 * index :][:height, 200 : 200 + width]
             write_image(folder / side / f"{name}.png", crop)
@@ -366,7 +366,7 @@ def test_pairs_go_from_a_bucket_to_a_bucket_with_a_calibration_and_a_bad_one_is_
     for path in local.rglob("*.png"):
         store.put(path, path.relative_to(local).as_posix())
     for name in ("left.png", "right.png", "calib.txt"):
-        store.put(EXAMPLES / name, f"room/{name}")
+        store.put(TEXTURED / name, f"room/{name}")
     tally = run_cluster(f"{bucket}/in", f"{bucket}/out", JOB, engine)
     assert (tally.made, tally.failed, tally.manifest) == (3, 1, f"{bucket}/out/manifest")
     rows = manifest(f"{bucket}/out")

@@ -29,7 +29,7 @@ from stereoweave.system.threads import usable_cores
 
 pytestmark = pytest.mark.system
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
+TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 JOB = DepthJob(backend=Backend(threads=1), always=("disparity.pfm", "preview.png", "confidence.png"))
 PROGRAM = """
 import sys
@@ -77,7 +77,7 @@ def write_pairs(folder: Path, count: int, size_px=(96, 64)) -> Path:
     width, height = size_px
     for side in ("left", "right"):
         (folder / side).mkdir(parents=True)
-        image = read_image(EXAMPLES / f"{side}.png")
+        image = read_image(TEXTURED / f"{side}.png")
         for index in range(count):
             write_image(folder / side / f"{index:02d}.png", image[4 * index :][:height, 200 : 200 + width])
     return folder
@@ -272,13 +272,13 @@ def test_a_scenes_own_calibration_gives_its_depth_in_metres_unless_one_is_named_
     folder, out = tmp_path / "scenes", tmp_path / "out"
     (folder / "room").mkdir(parents=True)
     for name in ("left.png", "right.png", "calib.txt"):
-        (folder / "room" / name).write_bytes((EXAMPLES / name).read_bytes())
+        (folder / "room" / name).write_bytes((TEXTURED / name).read_bytes())
     tally, _ = batch(folder, out, processes=1)
     assert tally == LocalTally(done=1, skipped=0, failed=())
     own_mm = read_pixels(out / "room" / "depth.png", "I;16")
 
     calibration = tmp_path / "twice.txt"
-    words = (EXAMPLES / "calib.txt").read_text().replace("baseline=100", "baseline=200")
+    words = (TEXTURED / "calib.txt").read_text().replace("baseline=100", "baseline=200")
     calibration.write_text(words)
     job = DepthJob(request=Request(calibration=calibration))
     batch(folder, tmp_path / "other", job, processes=1)

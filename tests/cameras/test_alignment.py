@@ -8,7 +8,7 @@ from stereoweave.cameras.alignment import DEFECTS, check_pair
 from stereoweave.io.images import read_image, read_pair
 from stereoweave.learn.data.collage import paint_collage
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 SEED = 77
 # Painted pairs whose two exposures are alike.
 ALIKE = 2, 6
@@ -40,7 +40,7 @@ ONE_DEFECT = {
 @pytest.fixture(scope="module")
 def pairs():
     """The example, then painted ones."""
-    example = read_pair(EXAMPLES / "left.png", EXAMPLES / "right.png")
+    example = read_pair(TEXTURED / "left.png", TEXTURED / "right.png")
     painted = [paint_collage(SEED, 0, index, 480, 640) for index in ALIKE]
     return [(pair.left, pair.right) for pair in (example, *painted)]
 

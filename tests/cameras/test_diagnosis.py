@@ -8,12 +8,12 @@ from stereoweave.io.images import read_image, read_pair
 from stereoweave.matching.matcher import Matcher
 from stereoweave.stereo import Estimate, StereoPair
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 
 
 @pytest.fixture(scope="module")
 def example():
-    return read_pair(EXAMPLES / "left.png", EXAMPLES / "right.png")
+    return read_pair(TEXTURED / "left.png", TEXTURED / "right.png")
 
 
 def estimate_of(pair, confidence) -> Estimate:

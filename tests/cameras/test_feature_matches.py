@@ -7,7 +7,7 @@ import pytest
 from stereoweave.cameras.feature_matches import find_matches
 from stereoweave.io.images import read_image
 
-LEFT = Path(__file__).resolve().parents[2] / "examples/left.png"
+LEFT = Path(__file__).resolve().parents[1] / "textured_pair/left.png"
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from stereoweave.io.images import read_pair
 from stereoweave.learn.data.collage import paint_collage
 from stereoweave.stereo import StereoPair
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 
 
 def homography(size, degrees):
@@ -47,7 +47,7 @@ def sift_matches(left, right):
 
 @pytest.fixture(scope="module")
 def example():
-    return read_pair(EXAMPLES / "left.png", EXAMPLES / "right.png")
+    return read_pair(TEXTURED / "left.png", TEXTURED / "right.png")
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from stereoweave.io.images import read_image
 from stereoweave.learn.data.collage import paint_collage
 
 SIZE = (192, 320)
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 UNSEEN_SEED = 4_000_037
 
 
@@ -31,7 +31,7 @@ def test_plain_pictures_give_finite_maps_without_any_confidence(left, right):
 
 
 def test_a_photograph_beside_a_black_picture_is_not_trusted():
-    left = read_image(EXAMPLES / "left.png")
+    left = read_image(TEXTURED / "left.png")
     for pictures in ((left, np.zeros_like(left)), (np.zeros_like(left), left)):
         assert estimate(*pictures).confidence.mean() < 0.1
 
@@ -48,7 +48,7 @@ def test_noise_is_not_trusted(rng, spread):
 
 
 def test_identical_pictures_are_at_disparity_0():
-    left = read_image(EXAMPLES / "left.png")
+    left = read_image(TEXTURED / "left.png")
     found = estimate(left, left)
     assert np.percentile(found.disparity_px, 99) < 1
     assert np.percentile(found.right_disparity_px, 99) < 1

@@ -13,8 +13,8 @@ from stereoweave.cli.root import main
 from stereoweave.io.images import read_image, read_pair, write_image
 from stereoweave.io.output_lock import lock_output
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
-LEFT, RIGHT = str(EXAMPLES / "left.png"), str(EXAMPLES / "right.png")
+TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
+LEFT, RIGHT = str(TEXTURED / "left.png"), str(TEXTURED / "right.png")
 
 
 @pytest.fixture
@@ -63,14 +63,14 @@ def test_a_pair_is_rectified_by_what_it_shows_into_files_that_fit(turned, tmp_pa
 
 def test_the_new_calibration_belongs_to_the_new_pictures(tmp_path):
     out = tmp_path / "out"
-    assert main(["rectify", LEFT, RIGHT, "--calib", str(EXAMPLES / "calib.txt"), "-o", str(out)]) == 0
+    assert main(["rectify", LEFT, RIGHT, "--calib", str(TEXTURED / "calib.txt"), "-o", str(out)]) == 0
     pair = read_pair(out / "left.png", out / "right.png")
-    assert add_camera(pair, out / "calib.yml").camera == add_camera(pair, EXAMPLES / "calib.txt").camera
+    assert add_camera(pair, out / "calib.yml").camera == add_camera(pair, TEXTURED / "calib.txt").camera
 
 
 def test_rectification_spares_the_pictures_and_the_calibration_that_are_there(tmp_path, capsys):
     files = {name: tmp_path / name for name in ("left.png", "right.png", "calib.yml")}
-    for path, source in zip(files.values(), (LEFT, RIGHT, EXAMPLES / "calib.txt"), strict=True):
+    for path, source in zip(files.values(), (LEFT, RIGHT, TEXTURED / "calib.txt"), strict=True):
         path.write_bytes(Path(source).read_bytes())
     before = {name: path.read_bytes() for name, path in files.items()}
     pictures = [str(files["left.png"]), str(files["right.png"])]

@@ -19,7 +19,7 @@ from stereoweave.io.maps import read_pfm
 from stereoweave.matching.matcher import shipped_models
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-EXAMPLES = REPOSITORY / "examples"
+TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 RECIPE = REPOSITORY / "recipes" / "weave_small.toml"
 CALIBRATION = "cam0=[100 0 48; 0 100 32; 0 0 1]\ndoffs=0\nbaseline=80\nwidth=96\nheight=64\n"
 
@@ -349,7 +349,7 @@ def test_bench_takes_every_shipped_network_and_says_where_the_rows_are(mistakes,
 
 def test_depth_of_a_large_picture_takes_less_than_a_gigabyte_and_a_half(tmp_path):
     for side in ("left.png", "right.png"):
-        Image.open(EXAMPLES / side).resize((1920, 1080)).save(tmp_path / side)
+        Image.open(TEXTURED / side).resize((1920, 1080)).save(tmp_path / side)
     # In a process of its own, whose only child is the command: Linux counts a parent's memory as its child's.
     program = (
         "import resource, subprocess, sys; subprocess.run(sys.argv[1:], check=True); "
@@ -477,7 +477,7 @@ def test_a_mistake_with_a_benchmark_of_networks_is_told_in_one_line(mistakes, ca
 def test_a_link_that_leads_nowhere_is_no_place_for_output(tmp_path, capsys, line):
     link = tmp_path / "link"
     link.symlink_to(tmp_path / "nowhere")
-    places = {"left": EXAMPLES / "left.png", "right": EXAMPLES / "right.png", "folder": EXAMPLES}
+    places = {"left": TEXTURED / "left.png", "right": TEXTURED / "right.png", "folder": TEXTURED}
     assert run(line.format(**places, link=link)) == 2
     told = capsys.readouterr().err.splitlines()
     expected = "expected a folder that can be written, found a broken link"

@@ -9,7 +9,7 @@ from rig_examples import pinhole, rig_of
 from stereoweave.cameras.calibration_files import write_rig
 from stereoweave.io.images import read_image, write_image
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
+TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 LAYOUTS = (
     "side_by_side, side_by_side_half, top_bottom, top_bottom_half, crossed, crossed_half, "
     "top_bottom_right_first, top_bottom_right_first_half"
@@ -19,8 +19,8 @@ LAYOUTS = (
 def write_error_examples(folder: Path) -> None:
     """Write a pair, the same with the right picture 2 px lower, plain pictures, and a calibration."""
     for name in ("left.png", "right.png"):
-        shutil.copy(EXAMPLES / name, folder)
-    left, right = (read_image(EXAMPLES / name) for name in ("left.png", "right.png"))
+        shutil.copy(TEXTURED / name, folder)
+    left, right = (read_image(TEXTURED / name) for name in ("left.png", "right.png"))
     write_image(folder / "upper.png", left[2:])
     write_image(folder / "lower.png", right[:-2])
     write_image(folder / "both.png", np.hstack([left, right]))

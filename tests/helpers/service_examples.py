@@ -12,8 +12,8 @@ from typing import Any
 import httpx
 from PIL import Image
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
-LEFT, RIGHT, CALIB = ((EXAMPLES / name).read_bytes() for name in ("left.png", "right.png", "calib.txt"))
+TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
+LEFT, RIGHT, CALIB = ((TEXTURED / name).read_bytes() for name in ("left.png", "right.png", "calib.txt"))
 BOTH = {"left": LEFT, "right": RIGHT}
 
 # Sends a request to the service; returns status and text of the response.

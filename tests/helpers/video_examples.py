@@ -10,7 +10,7 @@ import numpy as np
 
 from stereoweave.io.images import read_image
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 FRAME_MS = 40  # 25 frames a second
 SOUND_RATE = 48_000
 
@@ -19,7 +19,7 @@ Pair = tuple[np.ndarray, np.ndarray]
 
 def example_pairs(count: int, *, width: int = 160, height: int = 96, step_px: int = 2) -> list[Pair]:
     """Windows of the example pair moving to the right, like a video of a camera that moves sideways."""
-    left, right = (read_image(EXAMPLES / f"{eye}.png") for eye in ("left", "right"))
+    left, right = (read_image(TEXTURED / f"{eye}.png") for eye in ("left", "right"))
     top_px, first_px = 200, 180
     return [
         tuple(

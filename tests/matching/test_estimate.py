@@ -8,7 +8,7 @@ from PIL import Image
 
 import stereoweave as sw
 from stereoweave.errors import StereoweaveError
-from stereoweave.learn.data.collage import paint_collage
+from stereoweave.io.images import read_pair
 from stereoweave.matching import estimate as matching
 from stereoweave.matching import matcher as matcher_module
 from stereoweave.matching.estimate import match, match_many
@@ -26,8 +26,7 @@ def matcher():
 
 @pytest.fixture(scope="module")
 def textured():
-    painted = paint_collage(4_000_037, 0, 157, 480, 640)
-    return sw.StereoPair(left=painted.left, right=painted.right)
+    return read_pair("tests/textured_pair/left.png", "tests/textured_pair/right.png")
 
 
 def same(one, other):

@@ -13,7 +13,7 @@ from stereoweave.synth.rendering.effects import PLAIN
 from stereoweave.synth.rendering.raycast import Raycaster
 from stereoweave.synth.sets.pair_rendering import RenderSpec, render_pair
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 LEVELS = np.arange(256)
 IDENTITY = np.repeat(LEVELS[:, None], 3, axis=1)
 SHIFT_PX = 8
@@ -60,7 +60,7 @@ def matcher():
 
 @pytest.fixture(scope="module")
 def examples():
-    return StereoPair(left=read_image(EXAMPLES / "left.png"), right=read_image(EXAMPLES / "right.png"))
+    return StereoPair(left=read_image(TEXTURED / "left.png"), right=read_image(TEXTURED / "right.png"))
 
 
 def occurring(photo):

@@ -6,7 +6,7 @@ from matcher_examples import ANY_SIZE, PROPERTIES, matcher_file, of_fixed_size, 
 from onnx import TensorProto, helper
 
 import stereoweave as sw
-from stereoweave.learn.data.collage import paint_collage
+from stereoweave.io.images import read_pair
 from stereoweave.matching import matcher
 from stereoweave.matching.estimate import match, match_many
 from stereoweave.matching.matcher import Matcher
@@ -347,7 +347,7 @@ def test_a_file_for_one_size_takes_smaller_pictures_and_refuses_larger_ones_in_o
 
 
 def test_what_a_picture_is_padded_with_up_to_a_fixed_size_changes_little(tmp_path):
-    pair = paint_collage(4_000_037, 0, 157, 480, 640)
+    pair = read_pair("tests/textured_pair/left.png", "tests/textured_pair/right.png")
     left, right = (np.ascontiguousarray(x[120:280, 200:424]) for x in (pair.left, pair.right))
     fixed = Matcher(of_fixed_size("small", tmp_path / "fixed.onnx", 240, 320))
     alone, found = Matcher().estimate(left, right), fixed.estimate(left, right)

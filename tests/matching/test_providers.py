@@ -30,7 +30,7 @@ def red(tmp_path):
 
 @pytest.fixture
 def pictures(tmp_path):
-    pair = read_pair("examples/left.png", "examples/right.png")
+    pair = read_pair("tests/textured_pair/left.png", "tests/textured_pair/right.png")
     paths = tmp_path / "left.png", tmp_path / "right.png"
     for path, picture in zip(paths, (pair.left, pair.right), strict=True):
         write_image(path, picture[200:296, 200:328])
@@ -47,7 +47,7 @@ def test_what_is_here_runs_a_matcher_file(red, rng, provider):
 
 @pytest.mark.parametrize("provider", HERE)
 def test_what_is_here_runs_the_shipped_network_as_the_processor_does(provider):
-    pair = read_pair("examples/left.png", "examples/right.png")
+    pair = read_pair("tests/textured_pair/left.png", "tests/textured_pair/right.png")
     left, right = pair.left[200:296, 200:328], pair.right[200:296, 200:328]
     expected = sw.estimate(left, right)
     found = sw.estimate(left, right, provider=provider)

@@ -12,14 +12,14 @@ from stereoweave.matching.matcher import Matcher
 from stereoweave.matching.options import MatchOptions
 from stereoweave.matching.sgbm_interface import StereoMatcher
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 # calib.txt beside it: 600 px, centre 319.5, 239.5, baseline 0.1 m.
 Q = np.array([[1, 0, 0, -319.5], [0, 1, 0, -239.5], [0, 0, 0, 600], [0, 0, 10, 0]], np.float32)
 
 
 def photographs() -> tuple[np.ndarray, np.ndarray]:
     """The example pair as users of OpenCV have it, in BGR."""
-    left, right = (cv2.imread(str(EXAMPLES / name)) for name in ("left.png", "right.png"))
+    left, right = (cv2.imread(str(TEXTURED / name)) for name in ("left.png", "right.png"))
     assert left is not None
     assert right is not None
     return left, right
@@ -68,7 +68,7 @@ def test_a_program_for_sgbm_finds_the_same_points_through_it():
 
 def test_what_is_known_is_the_estimate_times_16_and_the_rest_says_so():
     left, right = photographs()
-    pair = read_pair(EXAMPLES / "left.png", EXAMPLES / "right.png")
+    pair = read_pair(TEXTURED / "left.png", TEXTURED / "right.png")
     estimate = match(Matcher(), pair, MatchOptions(range_px=(0, 64)))
     disparity = StereoMatcher(0, 64, min_confidence=0.25).compute(left, right)
     known = ~estimate.occluded & (estimate.confidence >= 0.25)

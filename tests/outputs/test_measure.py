@@ -12,7 +12,7 @@ from stereoweave.matching.matcher import Matcher
 from stereoweave.outputs.measure import CameraError, Measurement, disparity_error_px, distance
 from stereoweave.stereo import Estimate, StereoCamera
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 CAMERA = StereoCamera(focal_px=100.0, baseline_m=0.1, cx_px=30.0, cy_px=20.0)
 
 
@@ -176,7 +176,7 @@ def test_a_measurement_is_told_as_exactly_as_it_is(distance_m, uncertainty_m, wo
 
 
 def test_the_command_measures_between_two_pixels(capfd):
-    pictures, calib = [EXAMPLES / "left.png", EXAMPLES / "right.png"], EXAMPLES / "calib.txt"
+    pictures, calib = [TEXTURED / "left.png", TEXTURED / "right.png"], TEXTURED / "calib.txt"
     measure(pictures, "320,240", "420,300", calib=calib, model="small")
     line, *_ = capfd.readouterr().out.splitlines()
     measure(pictures, "320,240", "420,300", calib=calib, model="small", as_json=True)
@@ -195,17 +195,17 @@ def test_the_command_measures_between_two_pixels(capfd):
     [
         (
             "320",
-            {"calib": EXAMPLES / "calib.txt"},
+            {"calib": TEXTURED / "calib.txt"},
             "--from: expected column and row of a pixel.* found '320'",
         ),
-        ("1,2,3", {"calib": EXAMPLES / "calib.txt"}, "--from: .* found '1,2,3'"),
-        ("a,b", {"calib": EXAMPLES / "calib.txt"}, "--from: .* found 'a,b'"),
+        ("1,2,3", {"calib": TEXTURED / "calib.txt"}, "--from: .* found '1,2,3'"),
+        ("a,b", {"calib": TEXTURED / "calib.txt"}, "--from: .* found 'a,b'"),
         ("320,240", {}, r"give a calibration.*\(calibration, focal_px, baseline_m\)"),
         ("320,240", {"range_px": "9,3"}, "--range: .* found '9,3'"),
         ("320,240", {"range_px": "nan,3"}, "--range: .* found 'nan,3'"),
     ],
 )
 def test_a_mistake_with_measuring_is_told_before_anything_is_matched(first, options, message):
-    pictures = [EXAMPLES / "left.png", EXAMPLES / "right.png"]
+    pictures = [TEXTURED / "left.png", TEXTURED / "right.png"]
     with pytest.raises(StereoweaveError, match=message):
         measure(pictures, first, "420,300", model="none.onnx", **options)

@@ -21,7 +21,7 @@ from stereoweave.outputs.run import Result
 from stereoweave.pictures.prepare import Request
 from stereoweave.stereo import Estimate, StereoCamera, StereoPair
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 CALIBRATION = "cam0=[100 0 48; 0 100 32; 0 0 1]\ndoffs=0\nbaseline=80\nwidth=96\nheight=64\n"
 CAMERA = StereoCamera(focal_px=100.0, baseline_m=0.08, cx_px=48.0, cy_px=32.0)
 PICTURES = [Path("left.png"), Path("right.png")]
@@ -39,7 +39,7 @@ def folder(tmp_path, monkeypatch) -> Path:
     """The folder that the test runs in: a piece of the example, 96x64, and its calibration."""
     monkeypatch.chdir(tmp_path)
     for name in ("left.png", "right.png"):
-        write_image(name, np.ascontiguousarray(read_image(EXAMPLES / name)[200:264, 300:396]))
+        write_image(name, np.ascontiguousarray(read_image(TEXTURED / name)[200:264, 300:396]))
     Path("calib.txt").write_text(CALIBRATION)
     return tmp_path
 

@@ -9,8 +9,8 @@ from stereoweave.matching.options import MatchOptions
 from stereoweave.outputs.run import run, run_many
 from stereoweave.pictures.prepare import Prepared, Request, prepare
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
-PICTURES = (EXAMPLES / "left.png", EXAMPLES / "right.png")
+TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
+PICTURES = (TEXTURED / "left.png", TEXTURED / "right.png")
 
 
 @pytest.fixture(scope="module")

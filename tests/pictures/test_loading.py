@@ -21,14 +21,14 @@ from stereoweave.rendering.layouts import LAYOUTS, LayoutOptions, add_mark, writ
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, StereoPair
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
+TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 ORIENTATION, EXIF, FOCAL_35_MM, MODEL = 0x0112, 0x8769, 0xA405, 0x0110
 FINE = {"quality": 97, "subsampling": 0}
 
 
 @pytest.fixture(scope="module")
 def pair():
-    left, right = (shrunk(read_image(EXAMPLES / f"{eye}.png"), 240, 160) for eye in ("left", "right"))
+    left, right = (shrunk(read_image(TEXTURED / f"{eye}.png"), 240, 160) for eye in ("left", "right"))
     return StereoPair(left=left, right=right)
 
 
@@ -358,7 +358,7 @@ def seen(pair, name, folder):
 
 def windows(width_px, height_px):
     """Nine parts of the example pair."""
-    left, right = (read_image(EXAMPLES / f"{eye}.png") for eye in ("left", "right"))
+    left, right = (read_image(TEXTURED / f"{eye}.png") for eye in ("left", "right"))
     tops, starts = np.linspace(0, 480 - height_px, 3, dtype=int), np.linspace(0, 640 - width_px, 3, dtype=int)
     parts = [np.s_[top : top + height_px, start : start + width_px] for top in tops for start in starts]
     return [StereoPair(left=left[part].copy(), right=right[part].copy()) for part in parts]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from service_examples import BOTH, EXAMPLES
+from service_examples import BOTH, TEXTURED
 
 import stereoweave as sw
 from stereoweave.io.images import read_pair, write_image
@@ -20,7 +20,7 @@ from stereoweave.service.answers import ServiceJob, TooLargeError, answer_many, 
 
 @pytest.fixture(scope="module")
 def photos() -> tuple[np.ndarray, np.ndarray]:
-    pair = read_pair(EXAMPLES / "left.png", EXAMPLES / "right.png")
+    pair = read_pair(TEXTURED / "left.png", TEXTURED / "right.png")
     return pair.left, pair.right
 
 

@@ -23,7 +23,7 @@ from hostile_calibrations import HOSTILE
 from hostile_requests import hostile
 from prometheus_client import Metric
 from prometheus_client.parser import text_string_to_metric_families
-from service_examples import BOTH, CALIB, EXAMPLES, Sender, malformed
+from service_examples import BOTH, CALIB, TEXTURED, Sender, malformed
 
 import stereoweave as sw
 from stereoweave.cameras.calibration_files import add_camera
@@ -108,7 +108,7 @@ def saved(response: httpx.Response, path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def photos() -> tuple[np.ndarray, np.ndarray]:
-    pair = read_pair(EXAMPLES / "left.png", EXAMPLES / "right.png")
+    pair = read_pair(TEXTURED / "left.png", TEXTURED / "right.png")
     return pair.left, pair.right
 
 
@@ -125,7 +125,7 @@ def test_a_pair_gets_the_disparity_that_the_library_finds(service, estimate, tmp
 
 
 def test_a_pair_and_its_calibration_get_depth_in_metres(service, estimate, photos, tmp_path):
-    camera = add_camera(sw.StereoPair(left=photos[0], right=photos[1]), EXAMPLES / "calib.txt").camera
+    camera = add_camera(sw.StereoPair(left=photos[0], right=photos[1]), TEXTURED / "calib.txt").camera
     response = post(service, "/depth", {**BOTH, "calib": CALIB}, file="npy")
     depth_m = np.load(saved(response, tmp_path / "depth.npy"), allow_pickle=False)
     np.testing.assert_allclose(depth_m, camera.depth_m(estimate.disparity_px), rtol=1e-3)
@@ -337,9 +337,9 @@ def test_a_port_that_is_taken_is_one_line(capsys):
         (["--host", "0.0.0.0", "--behind-proxy", "--replicas", "999"], "--replicas: expected at most"),
         (["--token-file", "none"], "--token-file none: expected a file with a token, found"),
         (["--token-file", os.devnull], "expected a token of letters, digits and -._~+/=, found nothing"),
-        (["--token-file", str(EXAMPLES / "left.png")], "left.png: expected a file with a token, found"),
+        (["--token-file", str(TEXTURED / "left.png")], "left.png: expected a file with a token, found"),
         (
-            ["--token-file", str(EXAMPLES / "calib.txt")],
+            ["--token-file", str(TEXTURED / "calib.txt")],
             "found other characters; make one with",
         ),
     ],

@@ -13,12 +13,12 @@ from stereoweave.service.worker import Task, Worker
 
 pytestmark = pytest.mark.system
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
-PICTURES = (EXAMPLES / "left.png", EXAMPLES / "right.png")
+TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
+PICTURES = (TEXTURED / "left.png", TEXTURED / "right.png")
 
 
 def task(file: str = "disparity.png", within_s: float = 60) -> Task:
-    job = ServiceJob(folder=EXAMPLES, pictures=PICTURES, file=file)
+    job = ServiceJob(folder=TEXTURED, pictures=PICTURES, file=file)
     return Task(job, megapixels=0.6, deadline_s=time.monotonic() + within_s)
 
 

@@ -13,7 +13,7 @@ import av
 import numpy as np
 import pytest
 from other_processes import halted
-from video_examples import EXAMPLES, damage, example_pairs, packets, write_side_by_side, write_video
+from video_examples import TEXTURED, damage, example_pairs, packets, write_side_by_side, write_video
 
 from stereoweave.cli.root import main
 from stereoweave.io.colormap import colour_disparity
@@ -130,7 +130,7 @@ def test_what_lies_upon_one_another_keeps_the_videos_middle_in_place(tmp_path):
 
 def converged_pairs(moved_px: list[int]) -> list[tuple[np.ndarray, np.ndarray]]:
     """The same window of the example pair, its disparities lower by each of these."""
-    left, right = (read_image(EXAMPLES / f"{eye}.png") for eye in ("left", "right"))
+    left, right = (read_image(TEXTURED / f"{eye}.png") for eye in ("left", "right"))
     rows = slice(200, 296)
     return [(left[rows, 180:436], right[rows, 180 - by_px : 436 - by_px]) for by_px in moved_px]
 
