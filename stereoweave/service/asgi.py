@@ -233,21 +233,31 @@ def _status(error: Exception) -> int:
     return 422
 
 
-class Guard:
-    """Middleware that limits POST requests (number, size, type, token, time) and counts them."""
+class _Metrics:
+    """Metrics of the requests, in a registry."""
 
-    def __init__(self, app: _Server, limits: Limits, registry: CollectorRegistry | None = None) -> None:
-        self._app, self._limits, self._accepted = app, limits, 0
-        self._requests = Counter(
+    def __init__(self, registry: CollectorRegistry) -> None:
+        self.requests = Counter(
             "stereoweave_requests", "Requests by path and status.", ["path", "status"], registry=registry
         )
-        self._seconds = Histogram(
+        self.seconds = Histogram(
             "stereoweave_request_seconds",
             "Time from the header of an accepted request to its response.",
             ["path"],
             buckets=_LATENCIES_S,
             registry=registry,
         )
+
+
+class Guard:
+    """Middleware that limits POST requests (number, size, type, token, time).
+
+    It counts and times them if there is a registry for the metrics.
+    """
+
+    def __init__(self, app: _Server, limits: Limits, registry: CollectorRegistry | None = None) -> None:
+        self._app, self._limits, self._accepted = app, limits, 0
+        self._metrics = _Metrics(registry) if registry is not None else None
 
     async def __call__(self, scope: _Message, receive: _Receive, send: _Send) -> None:
         if scope["type"] != "http":
@@ -268,12 +278,13 @@ class Guard:
         try:
             if refusal is None:
                 await self._accept(scope, exchange)
-                self._seconds.labels(path).observe(time.perf_counter() - start_s)
+                if self._metrics:
+                    self._metrics.seconds.labels(path).observe(time.perf_counter() - start_s)
             else:
                 await refusal(scope, receive, exchange.send)
         finally:
-            status = str(exchange.status or _CLIENT_GONE)
-            self._requests.labels(path, status).inc()
+            if self._metrics:
+                self._metrics.requests.labels(path, str(exchange.status or _CLIENT_GONE)).inc()
 
     def _refusal(self, headers: Headers) -> Response | None:
         """Return the error response if the header already rules the request out."""

@@ -257,11 +257,14 @@ def test_a_flood_of_requests_for_metrics_holds_no_other_up():
     assert 'stereoweave_request_seconds_count{path="/disparity"} 1.0\n' in text
 
 
-def test_without_a_registry_there_are_no_metrics():
+def test_without_a_registry_there_are_no_metrics(monkeypatch):
     async def get() -> httpx.Response:
         async with guarded(at_once) as client:
+            assert (await client.post("/disparity", files=BOTH)).status_code == 200
             return await client.get("/metrics")
 
+    monkeypatch.delattr("stereoweave.service.asgi.Counter")
+    monkeypatch.delattr("stereoweave.service.asgi.Histogram")
     assert asyncio.run(get()).status_code == 404
 
 
