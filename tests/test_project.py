@@ -1,7 +1,10 @@
 """The project's metadata: files at the root that repeat what the package and pyproject.toml say."""
 
+import ast
 import re
+import sys
 import tomllib
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -28,6 +31,35 @@ def test_the_citation_refers_to_the_paper():
     assert f'# "{paper["title"]}"' in (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
     names = [author["family-names"] for author in paper["authors"]]
     assert names == ["Anantrasirichai", "Geravand", "Braendler", "Bull"]
+
+
+def imported_packages():
+    modules = set()
+    for path in (ROOT / "stereoweave").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                modules |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                modules.add(node.module.partition(".")[0])
+    return modules - sys.stdlib_module_names - {"stereoweave"}
+
+
+def normalise(distribution):
+    return re.sub(r"[-_.]+", "-", distribution).lower()
+
+
+def test_every_imported_package_is_declared():
+    # Of ray[serve], which the service runs on, and of the file systems for object stores.
+    required_by_declared = {"fastapi", "starlette", "uvicorn", "fsspec"}
+    lines = [*PROJECT["dependencies"], *sum(PROJECT["optional-dependencies"].values(), [])]
+    declared = {normalise(re.match(r"[\w.-]+", line)[0]) for line in lines} | required_by_declared
+    distributions = packages_distributions()
+    missing = {
+        module
+        for module in imported_packages()
+        if not declared.intersection(map(normalise, distributions.get(module, [])))
+    }
+    assert missing == set()
 
 
 def hooks():
