@@ -85,7 +85,7 @@ def run_cluster(
     console = console or Console(quiet=True)
     read_from, write_to = _store(source), _store(destination)
     if job.backend.provider == CPU:
-        replace(job.backend, threads=1).matcher()  # raise once for an unknown model, not for each pair
+        replace(job.backend, threads=1).check()  # raise once for an unknown model, not for each pair
     read_from.check_source()
     write_to.check_destination()
     with _alone(write_to), connect(engine):

@@ -27,6 +27,7 @@ from stereoweave.io.files import make_folder, reading, remove_leftovers, replaci
 from stereoweave.io.output_lock import lock_output
 from stereoweave.io.run_folder import check_claim, check_unclaimed, describe_run, parse_description
 from stereoweave.io.text import write_table
+from stereoweave.matching.backend import Backend, PinnedBackend
 from stereoweave.outputs.results import DepthJob, job_facts, make_depth
 from stereoweave.pictures.pair_finding import BATCH_FILE, SUMMARY_FILE, FoundPairs, NamedPair
 from stereoweave.system.processes import begin_work
@@ -81,7 +82,7 @@ def run_batch(
     if processes > 1 and job.backend.threads is None:
         job = replace(job, backend=replace(job.backend, threads=1))
     # Raise once for an unknown model or unavailable provider, not for each pair.
-    replace(job.backend, threads=1).matcher()
+    replace(job.backend, threads=1).check()
     threads = job.backend.threads
     make_folder(out)
     with lock_output(out):
@@ -220,6 +221,7 @@ def _make(out: Path, job: DepthJob, pair: NamedPair) -> str | None:
     """Write a pair's results and mark it as finished. Returns the error in one line, or None."""
     try:
         folder, sources = out / pair.name, _sources(pair)
+        job = replace(job, backend=_pin(job.backend))
         (folder / DONE_FILE).unlink(missing_ok=True)
         if pair.calibration and not job.request.calibration:
             job = replace(job, request=replace(job.request, calibration=pair.calibration))
@@ -236,6 +238,12 @@ def _make(out: Path, job: DepthJob, pair: NamedPair) -> str | None:
     except Exception as error:  # a library may raise anything on a bad picture; the other pairs continue
         return " ".join(f"{type(error).__name__}: {error}".split())
     return None
+
+
+@functools.lru_cache(maxsize=1)
+def _pin(backend: Backend) -> PinnedBackend:
+    """Load the network once in this process of the batch, even if its file is replaced meanwhile."""
+    return backend.pin()
 
 
 def _sources(pair: NamedPair) -> list[list[Any]]:

@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -151,8 +151,7 @@ class Worker:
             StereoweaveError: The source, the destination or the provider fails.
         """
         start_s = time.perf_counter()
-        row, job = self._empty_row(planned), self._local_job()
-        matcher = job.backend.matcher()
+        row, job = self._empty_row(planned), self._loaded_job
         with tempfile.TemporaryDirectory(prefix="stereoweave-") as name:
             try:
                 if planned.is_film:
@@ -164,7 +163,7 @@ class Worker:
             except Exception as error:  # a library may raise anything on a bad picture; the others continue
                 self._check_disk(error)
                 if any(isinstance(cause, ProviderError) for cause in _causes(error)):
-                    _check_runs(matcher)
+                    _check_runs(job.backend.matcher())
                 kind = "" if isinstance(error, StereoweaveError) else f"{type(error).__name__}: "
                 line = kind + format_error(error, job.name_of).replace(f"{name}/pictures", self.source.place)
                 row["error"] = " ".join(line.split())
@@ -268,8 +267,9 @@ class Worker:
         if any(isinstance(cause, OSError) and cause.errno in _FULL_OR_GONE for cause in _causes(error)):
             raise _StoreError(f"{self.destination.place}: {' '.join(str(error).split())}") from error
 
-    def _local_job(self) -> DepthJob:
-        """Return the job with its carried files on this machine."""
+    @functools.cached_property
+    def _loaded_job(self) -> DepthJob:
+        """The job with its carried files on this machine, and its network even if its file is replaced."""
         job = self.job
         for kind, name, content in self.carried:
             path = _carried(name, content)
@@ -277,7 +277,11 @@ class Worker:
                 job = replace(job, backend=replace(job.backend, model=str(path)))
             else:
                 job = replace(job, request=replace(job.request, calibration=path))
-        return job
+        return replace(job, backend=job.backend.pin())
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the loaded job: networks cannot be pickled."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 class _StoreError(StereoweaveError):
@@ -313,7 +317,7 @@ class _Apart:
             threads = self._worker.job.backend.threads or 1
             pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), begin_work, (threads,))
             try:
-                pool.submit(_warm, self._worker).result()
+                pool.submit(_keep_worker, self._worker).result()
                 self._pool = pool
             except BrokenProcessPool as error:
                 false_starts += 1
@@ -330,16 +334,28 @@ class _Apart:
         """Process a pair or video in the child process; None if that was killed."""
         assert self._pool is not None
         try:
-            return self._pool.submit(self._worker.row, planned).result()
+            return self._pool.submit(_make_row, planned).result()
         except BrokenProcessPool:
             self._pool.shutdown()
             self._pool = None
             return None
 
 
-def _warm(worker: Worker) -> None:
-    """Load the network, so that startup time does not count towards the first pair's attempt."""
-    worker._local_job().backend.matcher()
+# The worker of a child process.
+_kept_worker: Worker | None = None
+
+
+def _keep_worker(worker: Worker) -> None:
+    """Keep a worker in this child process, and load its network before the first pair's attempt."""
+    global _kept_worker
+    _kept_worker = worker
+    worker._loaded_job  # noqa: B018 - loads it
+
+
+def _make_row(planned: Planned) -> ManifestRow:
+    """Process a pair or video with the worker of this child process."""
+    assert _kept_worker is not None
+    return _kept_worker.row(planned)
 
 
 @functools.cache

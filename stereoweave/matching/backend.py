@@ -31,11 +31,36 @@ class Backend:
             StereoweaveError: The number of threads is invalid.
             MatcherError: The model is unknown or invalid, or the provider is unavailable.
         """
-        check_provider(self.provider)
-        thread_count(self.threads)
+        self._check_settings()
         path = model_file(self.model).absolute()
         with _LOADING:
             return _load(self, path, path.stat().st_mtime_ns)
+
+    def check(self) -> None:
+        """Load the network without keeping it in memory; raises like `matcher`."""
+        self._check_settings()
+        Matcher(self.model, threads=self.threads, provider=self.provider)
+
+    def pin(self) -> "PinnedBackend":
+        """Load the network, and ignore later changes of its file; raises like `matcher`."""
+        return PinnedBackend(
+            model=self.model, threads=self.threads, provider=self.provider, pinned=self.matcher()
+        )
+
+    def _check_settings(self) -> None:
+        check_provider(self.provider)
+        thread_count(self.threads)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PinnedBackend(Backend):
+    """A backend that keeps the network it has loaded; see `Backend.pin`."""
+
+    pinned: Matcher
+
+    def matcher(self) -> Matcher:
+        """Return the pinned network."""
+        return self.pinned
 
 
 # lru_cache does not wait for a call that computes the same value: threads would load a network each.

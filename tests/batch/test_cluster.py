@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import shutil
 import signal
 import subprocess
 import sys
@@ -27,8 +28,8 @@ from stereoweave.io.images import read_image, write_image
 from stereoweave.io.maps import read_pfm
 from stereoweave.io.output_lock import lock_output
 from stereoweave.io.stores import store_at
-from stereoweave.matching.backend import Backend
-from stereoweave.matching.matcher import Matcher
+from stereoweave.matching.backend import Backend, _load
+from stereoweave.matching.matcher import Matcher, model_file
 from stereoweave.outputs.results import DepthJob, make_depth
 from stereoweave.system.ray_engine import Engine, connect
 from stereoweave.video.parts import parts_folder
@@ -195,7 +196,8 @@ def test_a_pair_that_kills_its_process_becomes_a_row_and_costs_no_other(tmp_path
 class Stillborn(Worker):
     """A worker of which every further process is killed while it starts."""
 
-    def _local_job(self):
+    @property
+    def _loaded_job(self):
         os.kill(os.getpid(), signal.SIGKILL)
 
 
@@ -269,6 +271,32 @@ def test_a_provider_that_a_workers_machine_has_not_ends_the_run_and_is_no_row(pl
     with pytest.raises(MatcherError, match="provider directml: expected an ONNX Runtime that has it"):
         Worker(source, out, replace(JOB, backend=Backend(provider="directml")))([chunk])
     assert read_rows(out, chunk) == {}
+
+
+class ModelRemover(Worker):
+    """A worker whose model file is replaced by an invalid one after each pair."""
+
+    def _pair(self, planned, *more):
+        row = super()._pair(planned, *more)
+        self.job.backend.model.write_bytes(b"no network")
+        return row
+
+
+@pytest.mark.parametrize("in_child_process", [False, True])
+def test_a_model_that_is_replaced_during_a_batch_is_not_taken_up(places, tmp_path, in_child_process):
+    source, out, chunk = places
+    model = Path(shutil.copy(model_file("small"), tmp_path / "model.onnx"))
+    if in_child_process:
+        out.write_bytes(f"begun/{chunk:08d}.json", b"{}")
+    counts = ModelRemover(source, out, replace(JOB, backend=Backend(model=model)))([chunk])
+    assert (counts.made, counts.failed) == (3, 0)
+
+
+def test_the_driver_keeps_no_network(tmp_path):
+    _load.cache_clear()
+    with pytest.raises(StereoweaveError, match="none: expected a folder"):
+        run_cluster(tmp_path / "none", tmp_path / "out", JOB)
+    assert _load.cache_info().currsize == 0
 
 
 def test_a_machine_that_does_not_see_a_folder_is_named(places, tmp_path):

@@ -4,10 +4,12 @@ import csv
 import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -21,7 +23,8 @@ from stereoweave.cli.root import main
 from stereoweave.errors import OutputInUseError, StereoweaveError
 from stereoweave.io.images import read_image, write_image
 from stereoweave.io.maps import read_pixels
-from stereoweave.matching.backend import Backend
+from stereoweave.matching.backend import Backend, _load
+from stereoweave.matching.matcher import model_file
 from stereoweave.outputs.results import DepthJob, make_depth
 from stereoweave.pictures.pair_finding import FoundPairs, NamedPair, find_pairs_in
 from stereoweave.pictures.prepare import Request
@@ -35,7 +38,8 @@ PROGRAM = """
 import sys
 from pathlib import Path
 from stereoweave.batch.local import depth_of_many
-from stereoweave.matching.backend import Backend
+from stereoweave.matching.backend import Backend, _load
+from stereoweave.matching.matcher import model_file
 from stereoweave.pictures.pair_finding import find_pairs_in
 from stereoweave.outputs.results import DepthJob
 
@@ -62,6 +66,18 @@ class Noting(NamedPair):
 def noted_pair(name: str, pictures: tuple[Path, ...]) -> NamedPair:
     threads = cv2.getNumThreads(), os.environ["OPENBLAS_NUM_THREADS"]
     pictures[0].with_suffix(".txt").write_text("{} {}".format(*threads))
+    return NamedPair(name, pictures)
+
+
+class ModelRemover(NamedPair):
+    """A pair that replaces the model file in the process it is sent to by an invalid one."""
+
+    def __reduce__(self):
+        return remove_model, (self.name, self.pictures)
+
+
+def remove_model(name: str, pictures: tuple[Path, ...]) -> NamedPair:
+    (pictures[0].parents[1] / "model.onnx").write_bytes(b"no network")
     return NamedPair(name, pictures)
 
 
@@ -244,6 +260,18 @@ def test_a_pair_that_kills_its_process_is_named_and_costs_no_other(tmp_path, cap
     }
     assert "01: its process was killed" in told.err
     assert sorted(made_at_ns(out)) == ["00", "02"]
+
+
+def test_a_model_that_is_replaced_during_a_batch_is_not_taken_up(tmp_path):
+    folder, out = write_pairs(tmp_path / "pairs", 2), tmp_path / "out"
+    model = Path(shutil.copy(model_file("small"), folder / "model.onnx"))
+    first, second = find_pairs_in(folder).pairs
+    pairs = [first, ModelRemover(second.name, second.pictures)]
+    job = replace(JOB, backend=Backend(model=model, threads=1))
+    _load.cache_clear()
+    assert batch(folder, out, job, pairs=pairs, processes=1)[0] == LocalTally(2, 0, ())
+    assert model.read_bytes() == b"no network"
+    assert _load.cache_info().currsize == 0  # in this process, which matches nothing
 
 
 def test_another_order_or_another_folder_is_refused_before_anything_starts(tmp_path):

@@ -10,7 +10,7 @@ from matcher_examples import matcher_file, painted, red_of
 import stereoweave as sw
 from stereoweave.errors import MatcherError, StereoweaveError
 from stereoweave.matching import matcher as matcher_module
-from stereoweave.matching.backend import Backend
+from stereoweave.matching.backend import Backend, _load
 
 
 def test_equal_backends_share_one_loaded_network_and_unlike_ones_do_not():
@@ -34,6 +34,27 @@ def test_a_model_is_loaded_once_and_kept(tmp_path, rng, monkeypatch):
         sw.estimate(left, right, model=file)
         sw.StereoMatcher(model=file).compute(left, right)
     assert len(opened) == 1
+
+
+def test_a_checked_network_is_not_kept(tmp_path):
+    file = tmp_path / "matcher.onnx"
+    matcher_file(file, red_of("left", "disparity_px"), ["disparity_px"])
+    before = _load.cache_info().misses
+    Backend(model=file).check()
+    assert _load.cache_info().misses == before
+    file.write_bytes(b"no network")
+    with pytest.raises(MatcherError, match=r"matcher\.onnx: expected an ONNX matcher"):
+        Backend(model=file).check()
+
+
+def test_a_pinned_network_stays_though_its_file_changes(tmp_path):
+    file = tmp_path / "matcher.onnx"
+    matcher_file(file, red_of("left", "disparity_px"), ["disparity_px"])
+    pinned = Backend(model=file, threads=1).pin()
+    matcher = pinned.matcher()
+    file.write_bytes(b"no network")
+    assert pinned.matcher() is matcher
+    assert (pinned.model, pinned.threads, pinned.provider) == (file, 1, "cpu")
 
 
 def test_threads_that_ask_at_once_share_one_network(tmp_path):
