@@ -75,12 +75,25 @@ class StereoweaveError(ValueError):
         prefix = f"{name_of(self.setting) or self.setting}: " if self.setting else ""
         return prefix + _with_remedy(self.message, self.remedy, name_of)
 
+    @classmethod
+    def from_error(cls, error: Exception) -> "StereoweaveError":
+        """Return an error of this class with another one's message, setting and remedy."""
+        if isinstance(error, StereoweaveError):
+            return cls(error.message, setting=error.setting, remedy=error.remedy)
+        return cls(" ".join(str(error).split()))
+
+    def with_prefix(self, text: str) -> "StereoweaveError":
+        """Return a copy, of the same class, whose message starts with text."""
+        return self._with_message(text + self.message)
+
     def with_detail(self, text: str) -> "StereoweaveError":
         """Return a copy, of the same class, with text inserted before the remedy."""
-        detailed = copy.copy(self)
-        detailed.message = f"{self.message}; {text}"
-        detailed.args = (detailed.message,)
-        return detailed
+        return self._with_message(f"{self.message}; {text}")
+
+    def _with_message(self, message: str) -> "StereoweaveError":
+        changed = copy.copy(self)
+        changed.message, changed.args = message, (message,)
+        return changed
 
 
 class FormatError(StereoweaveError):

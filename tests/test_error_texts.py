@@ -174,6 +174,17 @@ def test_a_detail_stands_before_the_remedy_and_keeps_the_class():
     assert str(error) == "expected 1, found 2; wait (threads)"
 
 
+def test_a_prefix_and_another_class_keep_the_setting_and_the_remedy():
+    error = errors.StereoweaveError(
+        "expected 1, found 2", setting="depth", remedy=Remedy("wait", ("threads",))
+    )
+    prefixed = errors.ProviderError.from_error(error).with_prefix("here: ")
+    assert type(prefixed) is errors.ProviderError
+    assert str(prefixed) == "depth: here: expected 1, found 2; wait (threads)"
+    assert str(error) == "depth: expected 1, found 2; wait (threads)"
+    assert str(errors.ProviderError.from_error(OSError("two\nlines"))) == "two lines"
+
+
 def test_no_module_outside_the_command_line_spells_an_option():
     found = {}
     for path in sorted(PACKAGE.rglob("*.py")):

@@ -153,10 +153,10 @@ def _ready(worker: Worker) -> Worker:
             if store.folder is not None:
                 store.check_source()
     except StereoweaveError as error:
-        raise StereoweaveError(
-            f"{platform.node()}: {error}; all machines of a cluster need it on a shared disk, "
-            "or use an object store"
-        ) from error
+        detailed = error.with_detail(
+            "all machines of a cluster need it on a shared disk, or use an object store"
+        )
+        raise detailed.with_prefix(f"{platform.node()}: ") from error
     return worker
 
 

@@ -265,7 +265,7 @@ class Worker:
     def _check_disk(self, error: Exception) -> None:
         """Raise if a disk is full or gone, because all further pairs would fail too."""
         if any(isinstance(cause, OSError) and cause.errno in _FULL_OR_GONE for cause in _causes(error)):
-            raise _StoreError(f"{self.destination.place}: {' '.join(str(error).split())}") from error
+            raise _StoreError.from_error(error).with_prefix(f"{self.destination.place}: ") from error
 
     @functools.cached_property
     def _loaded_job(self) -> DepthJob:
@@ -293,7 +293,7 @@ def _of_the_store() -> Iterator[None]:
     try:
         yield
     except StereoweaveError as error:
-        raise _StoreError(str(error)) from error
+        raise _StoreError.from_error(error) from error
 
 
 class _Apart:

@@ -8,13 +8,13 @@ import asyncio
 import logging
 import math
 import os
-import re
 import socket
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Any
 
 from prometheus_client import CollectorRegistry
@@ -34,7 +34,7 @@ from stereoweave.service.folders import own_folder
 from stereoweave.service.server import Patience, http_server
 from stereoweave.service.worker import Task, Worker
 from stereoweave.system.child_process import ProcessDiedError
-from stereoweave.system.ray_engine import Engine, connect, room
+from stereoweave.system.ray_engine import Engine, call_on_each_machine, connect, room
 from stereoweave.system.threads import usable_cores
 
 NAME = "stereoweave"
@@ -45,6 +45,8 @@ _GATHERED_WITHIN_S = 0.005
 _MEGAPIXELS_AT_ONCE = 32
 # In addition to waiting requests: these are refused, or ask for its health.
 _MOST_AT_DOOR = 200
+# A replica starts in seconds; the first on a machine also compiles the kernels.
+_TRIAL_WITHIN_S = 120
 _QUIET = LoggingConfig(log_level="ERROR", enable_access_log=False)
 
 
@@ -88,8 +90,7 @@ class Replica:
     def __init__(self, settings: Settings) -> None:
         self._settings, self._opened = settings, ExitStack()
         self._folder = self._opened.enter_context(own_folder())
-        make = partial(make_answering, settings.backend)
-        self._worker = Worker(make, self._folder)
+        self._worker = _make_worker(settings, self._folder)
         self._opened.callback(self._worker.close)
         self._budget = Budget(self._worker.warm_up())
         # One thread for each process of the worker: calls that wait for it are not sent yet, and can be
@@ -252,12 +253,31 @@ def _run(settings: Settings) -> DeploymentHandle[Any]:
     try:
         return serve.run(application(settings), name=NAME, route_prefix="/")
     except RuntimeError as error:
-        told = "\n".join(each.message for each in serve.status().applications[NAME].deployments.values())
-        ours = re.findall(r"^stereoweave\.errors\.\w+: (.+)", told, re.MULTILINE)
-        raise StereoweaveError(
-            f"expected a network that loads where the service runs, found {(ours or [error])[-1]}; "
-            "is the model there too?"
-        ) from error
+        cause = StereoweaveError.from_error(_find_start_error(settings) or error)
+        cause = cause.with_prefix("expected a network that loads where the service runs, found ")
+        raise cause.with_detail("is the model there too?") from error
+
+
+def _find_start_error(settings: Settings) -> StereoweaveError | None:
+    """Return why replicas did not start, from a trial on each machine: Ray Serve reports it only as text."""
+    _end()  # replicas that did start may leave no room
+    engine = Engine(cpus_each=settings.threads, gpus_each=settings.gpus_each)
+    errors = call_on_each_machine(_try_start, settings, engine, _TRIAL_WITHIN_S)
+    return next(filter(None, errors), None)
+
+
+def _try_start(settings: Settings) -> StereoweaveError | None:
+    """Do what a replica does to start; return the error, if any."""
+    try:
+        with own_folder() as folder, closing(_make_worker(settings, folder)) as worker:
+            worker.warm_up()
+    except StereoweaveError as error:
+        return error
+    return None
+
+
+def _make_worker(settings: Settings, folder: Path) -> Worker:
+    return Worker(partial(make_answering, settings.backend), folder)
 
 
 def _end() -> None:

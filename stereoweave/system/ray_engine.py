@@ -11,7 +11,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import distribution
@@ -151,6 +151,33 @@ def stream(
                 continue
 
 
+def call_on_each_machine(
+    function: Callable[[Task], Result], argument: Task, engine: Engine, timeout_s: float
+) -> list[Result]:
+    """Call a function once on each machine that has room for a worker, with a worker's resources.
+
+    This process must be a driver of the cluster; see `connect`.
+
+    Returns:
+        The results, without those of machines that fail or do not answer in time.
+    """
+    import ray
+    from ray.exceptions import RayError
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    remote: Any = ray.remote(num_cpus=engine.cpus_each, num_gpus=engine.gpus_each, max_retries=0)(function)
+    calls = [
+        remote.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False)).remote(argument)
+        for node, has in _machines_by_id().items()
+        if _places(has, engine)
+    ]
+    results = []
+    for call in ray.wait(calls, num_returns=len(calls), timeout=timeout_s)[0] if calls else []:
+        with suppress(RayError):
+            results.append(ray.get(call))
+    return results
+
+
 class _LostMachineError(Exception):
     """Workers wait for a machine that does not return."""
 
@@ -263,10 +290,14 @@ def _rooms(engine: Engine) -> int:
 
 def _machines() -> list[dict[str, float]]:
     """The resources of each live machine of the cluster."""
+    return list(_machines_by_id().values())
+
+
+def _machines_by_id() -> dict[str, dict[str, float]]:
     import ray
 
     nodes: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
-    return [node["Resources"] for node in nodes if node["Alive"]]
+    return {node["NodeID"]: node["Resources"] for node in nodes if node["Alive"]}
 
 
 def _places(has: dict[str, float], engine: Engine) -> int:

@@ -1,5 +1,6 @@
 """Large batches on a real Ray: what is made, what a bad pair or a killed process costs, and going on."""
 
+import errno
 import json
 import os
 import platform
@@ -23,7 +24,7 @@ from stereoweave.batch.cluster import _carried, _ready, run_cluster
 from stereoweave.batch.manifest import extend_plan, read_chunk, read_rows
 from stereoweave.batch.worker import FILM, Worker, remove_left_behind
 from stereoweave.cli.root import main
-from stereoweave.errors import MatcherError, OutputInUseError, ProviderError, StereoweaveError
+from stereoweave.errors import MatcherError, OutputInUseError, ProviderError, Remedy, StereoweaveError
 from stereoweave.io.images import read_image, write_image
 from stereoweave.io.maps import read_pfm
 from stereoweave.io.output_lock import lock_output
@@ -309,6 +310,43 @@ def test_a_machine_that_does_not_see_a_folder_is_named(places, tmp_path):
         ) as told:
             _ready(Worker(*places_there, JOB))
         assert str(told.value).startswith(f"{platform.node()}: ")
+
+
+GONE = StereoweaveError(
+    "expected a store, found none", setting="source", remedy=Remedy("mount it", ("workers",))
+)
+
+
+def raise_gone(*_: object) -> None:
+    raise GONE
+
+
+def test_an_error_of_a_whole_store_keeps_its_setting_and_remedy(places, monkeypatch):
+    source, out, chunk = places
+    monkeypatch.setattr(type(source), "fetch", raise_gone)
+    monkeypatch.setattr(type(source), "check_source", raise_gone)
+    with pytest.raises(StereoweaveError) as caught:
+        Worker(source, out, JOB)([chunk])
+    assert caught.value.format(str.upper) == "SOURCE: expected a store, found none; mount it (WORKERS)"
+    with pytest.raises(StereoweaveError) as caught:
+        _ready(Worker(source, out, JOB))
+    assert caught.value.format(str.upper) == (
+        f"SOURCE: {platform.node()}: expected a store, found none; all machines of a cluster need it on a "
+        "shared disk, or use an object store; mount it (WORKERS)"
+    )
+
+
+def test_an_error_of_a_full_disk_keeps_its_setting_and_remedy(places):
+    source, out, _ = places
+    full = StereoweaveError(GONE.message, setting=GONE.setting, remedy=GONE.remedy)
+    full.__cause__ = OSError(errno.ENOSPC, "full")
+    with pytest.raises(StereoweaveError) as caught:
+        Worker(source, out, JOB)._check_disk(full)
+    assert caught.value.format(str.upper) == (
+        f"SOURCE: {out.place}: expected a store, found none; mount it (WORKERS)"
+    )
+    with pytest.raises(StereoweaveError, match=f"^{out.place}: .Errno {errno.ENOSPC}. full$"):
+        Worker(source, out, JOB)._check_disk(OSError(errno.ENOSPC, "full"))
 
 
 def test_a_film_goes_on_without_the_parts_of_another(tmp_path):

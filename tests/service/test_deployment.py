@@ -368,6 +368,14 @@ def test_a_network_that_the_cluster_does_not_have_is_named(ray_address, capsys):
     assert told.count("\n") == 1
 
 
+def test_an_error_of_a_replica_names_its_setting_as_an_option(ray_address, capsys):
+    words = ["--address", ray_address, "--threads", "1", "--provider", "abacus"]
+    assert main(["serve", "--port", "0", *words]) == 2
+    assert capsys.readouterr().err.startswith(
+        "stereoweave: --provider: expected a network that loads where the service runs, found expected one"
+    )
+
+
 def test_what_the_command_says_of_hosts_and_the_token_holds_for_the_service(tmp_path, monkeypatch):
     kept = []
 

@@ -16,7 +16,7 @@ from ray.data import DataContext
 
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.system import ray_engine as engine_module
-from stereoweave.system.ray_engine import Engine, connect, room, stream
+from stereoweave.system.ray_engine import Engine, call_on_each_machine, connect, room, stream
 
 pytestmark = pytest.mark.system
 
@@ -149,6 +149,21 @@ def test_a_worker_that_fits_no_machine_is_refused_and_parts_of_a_core_are_counte
     for wrong in ({"workers": 0}, *shares, *gpus):
         with pytest.raises(StereoweaveError, match="expected"):
             Engine(**wrong)
+
+
+def name_of_positive(task: int) -> str:
+    if task < 0:
+        raise ValueError("negative")
+    return f"{task} in {os.getpid()}"
+
+
+def test_a_function_is_called_on_each_machine_that_has_room_and_an_error_is_no_result(engine):
+    (result,) = call_on_each_machine(name_of_positive, 7, Engine(), timeout_s=60)
+    assert result.startswith("7 in ")
+    assert result != name_of_positive(7)
+    assert call_on_each_machine(name_of_positive, -7, Engine(), timeout_s=60) == []
+    assert call_on_each_machine(name_of_positive, 7, Engine(cpus_each=3), timeout_s=60) == []
+    assert call_on_each_machine(name_of_positive, 7, Engine(), timeout_s=0) == []
 
 
 def test_a_wrong_address_is_told_in_one_line(engine, monkeypatch):
