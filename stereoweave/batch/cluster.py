@@ -20,7 +20,7 @@ import typer
 from rich.console import Console
 
 from stereoweave.batch.manifest import MANIFEST, PLAN, ChunkPlan, extend_plan
-from stereoweave.batch.worker import BEGUN, Counts, Worker, remove_left_behind
+from stereoweave.batch.worker import BEGUN, ChunkWorker, Counts, remove_abandoned
 from stereoweave.cameras.calibration_files import read_calibration_bytes
 from stereoweave.errors import StereoweaveError
 from stereoweave.io.files import reading
@@ -81,26 +81,28 @@ def run_cluster(
             run writes to the destination. Results are kept, and the same call resumes.
     """
     engine = engine or Engine()
-    job = _for_many(job or DepthJob(), engine)
+    job = _adapt_job(job or DepthJob(), engine)
     console = console or Console(quiet=True)
-    read_from, write_to = _store(source), _store(destination)
+    source_store, destination_store = _open_store(source), _open_store(destination)
     if job.backend.provider == CPU:
         replace(job.backend, threads=1).check()  # raise once for an unknown model, not for each pair
-    read_from.check_source()
-    write_to.check_destination()
-    with _alone(write_to), connect(engine):
+    source_store.check_source()
+    destination_store.check_destination()
+    with _lock_folder(destination_store), connect(engine):
         workers = room(engine)
-        _claim(write_to, job, read_from)
-        plan = extend_plan(read_from, write_to, min(workers, engine.workers or workers))
+        _claim(destination_store, job, source_store)
+        plan = extend_plan(source_store, destination_store, min(workers, engine.workers or workers))
         for note in plan.notes:
             console.print(note, markup=False, highlight=False, soft_wrap=True)
-        worker = Worker(read_from, write_to, job, tuple(_carried(job)))
-        counts = _run(worker, plan, engine, console)
-        _tidy(write_to)
-    return ClusterTally(counts.made, counts.there, counts.failed, counts.named, write_to.at(MANIFEST))
+        worker = ChunkWorker(source_store, destination_store, job, tuple(_read_job_files(job)))
+        counts = _process_chunks(worker, plan, engine, console)
+        _remove_abandoned_files(destination_store)
+    return ClusterTally(
+        counts.made, counts.there, counts.failed, counts.named, destination_store.at(MANIFEST)
+    )
 
 
-def batch_on_cluster(
+def run_cluster_command(
     source: str, destination: str, job: DepthJob, engine: Engine, *, as_json: bool = False
 ) -> int:
     """Run a batch and print its counts. Returns the exit code: 1 if a pair failed, 130 after Ctrl-C."""
@@ -113,11 +115,11 @@ def batch_on_cluster(
     if as_json:
         typer.echo(json.dumps({**asdict(tally), "named": dict(tally.named)}, indent=2))
     else:
-        _tell(tally, destination)
+        _print_counts(tally, destination)
     return 1 if tally.failed else 0
 
 
-def _tell(tally: ClusterTally, destination: str) -> None:
+def _print_counts(tally: ClusterTally, destination: str) -> None:
     count = tally.made + tally.there + tally.failed
     there = f", {tally.there} already there" if tally.there else ""
     failed = f", {tally.failed} failed" if tally.failed else ""
@@ -131,12 +133,12 @@ def _tell(tally: ClusterTally, destination: str) -> None:
     typer.echo(f"manifest: {tally.manifest}")
 
 
-def _run(worker: Worker, plan: ChunkPlan, engine: Engine, console: Console) -> Counts:
+def _process_chunks(worker: ChunkWorker, plan: ChunkPlan, engine: Engine, console: Console) -> Counts:
     """Process all chunks of a plan."""
     counts, start_s = Counts(), time.perf_counter()
-    of_each = -(-len(plan.chunks) // _MOST_TASKS)
-    tasks = [plan.chunks[first : first + of_each] for first in range(0, len(plan.chunks), of_each)]
-    with closing(stream(partial(_ready, worker), tasks, engine)) as results, progress(console) as bar:
+    per_task = -(-len(plan.chunks) // _MOST_TASKS)
+    tasks = [plan.chunks[first : first + per_task] for first in range(0, len(plan.chunks), per_task)]
+    with closing(stream(partial(_check_folders, worker), tasks, engine)) as results, progress(console) as bar:
         shown = bar.add_task("depth", total=plan.count, loss="", rate="")
         for result in results:
             counts += result
@@ -146,7 +148,7 @@ def _run(worker: Worker, plan: ChunkPlan, engine: Engine, console: Console) -> C
     return counts
 
 
-def _ready(worker: Worker) -> Worker:
+def _check_folders(worker: ChunkWorker) -> ChunkWorker:
     """Return the worker if this machine sees both places; raises otherwise."""
     try:
         for store in (worker.source, worker.destination):
@@ -160,19 +162,19 @@ def _ready(worker: Worker) -> Worker:
     return worker
 
 
-def _for_many(job: DepthJob, engine: Engine) -> DepthJob:
+def _adapt_job(job: DepthJob, engine: Engine) -> DepthJob:
     """Return the job without default reports, and with the threads of one worker."""
     always = tuple(file for file in job.always if file != "report.html")
     return replace(job, always=always, backend=replace(job.backend, threads=engine.threads_each))
 
 
-def _store(place: str | Path) -> Store:
+def _open_store(place: str | Path) -> Store:
     """Open a place as a store; makes paths absolute because workers have other working folders."""
     store = store_at(place)
     return store if store.folder is None else store_at(store.folder.absolute())
 
 
-def _alone(destination: Store) -> AbstractContextManager[None]:
+def _lock_folder(destination: Store) -> AbstractContextManager[None]:
     """Lock a folder on a disk against a second run; object stores have no locks."""
     return lock_output(destination.folder) if destination.folder else nullcontext()
 
@@ -190,7 +192,7 @@ def _claim(destination: Store, job: DepthJob, source: Store) -> None:
     destination.write_bytes(BATCH_FILE, describe_run(facts).encode())
 
 
-def _carried(job: DepthJob) -> Iterator[tuple[str, str, bytes]]:
+def _read_job_files(job: DepthJob) -> Iterator[tuple[str, str, bytes]]:
     """Yield kind, name and content of the job's files that workers on other machines may not see."""
     model, calibration = Path(job.backend.model), job.request.calibration
     if str(model).endswith(".onnx") and model.is_file():  # otherwise a shipped model
@@ -200,7 +202,7 @@ def _carried(job: DepthJob) -> Iterator[tuple[str, str, bytes]]:
         yield "calibration", calibration.name, read_calibration_bytes(calibration)
 
 
-def _tidy(destination: Store) -> None:
+def _remove_abandoned_files(destination: Store) -> None:
     if destination.folder is not None:
         for below in ("", MANIFEST, PLAN, BEGUN):
-            remove_left_behind(destination.folder / below)
+            remove_abandoned(destination.folder / below)

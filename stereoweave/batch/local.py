@@ -89,14 +89,16 @@ def run_batch(
         _claim(out, job)
         missing = [pair for pair in pairs if not _is_finished(out / pair.name, pair)]
         try:
-            failed = _run(functools.partial(_make, out, job), missing, processes, threads, console)
+            failed = _process_pairs(
+                functools.partial(_process_pair, out, job), missing, processes, threads, console
+            )
         finally:
-            _tidy(out)
+            _remove_abandoned_files(out)
         _write_summary(out, pairs, dict(failed))
     return LocalTally(len(missing) - len(failed), len(pairs) - len(missing), tuple(failed))
 
 
-def depth_of_many(
+def run_batch_command(
     found: FoundPairs, out: Path, job: DepthJob, *, processes: int | None = None, as_json: bool = False
 ) -> int:
     """Run a batch and print its counts. Returns the exit code: 1 if a pair failed, 130 after Ctrl-C.
@@ -116,11 +118,11 @@ def depth_of_many(
         facts = {**asdict(tally), "failed": dict(tally.failed), "summary": str(out / SUMMARY_FILE)}
         typer.echo(json.dumps(facts, indent=2))
     else:
-        _tell(tally, out)
+        _print_counts(tally, out)
     return 1 if tally.failed else 0
 
 
-def _tell(tally: LocalTally, out: Path) -> None:
+def _print_counts(tally: LocalTally, out: Path) -> None:
     count = tally.done + tally.skipped + len(tally.failed)
     there = f", {tally.skipped} already there" if tally.skipped else ""
     failed = f", {len(tally.failed)} failed" if tally.failed else ""
@@ -130,13 +132,13 @@ def _tell(tally: LocalTally, out: Path) -> None:
     typer.echo(f"table: {out / SUMMARY_FILE}")
 
 
-def _run(
+def _process_pairs(
     work: Work, pairs: Sequence[NamedPair], processes: int, threads: int | None, console: Console
 ) -> list[tuple[str, str]]:
     """Process all pairs. Shows failures at once, and returns their names and errors."""
     failed: list[tuple[str, str]] = []
     start_s = time.perf_counter()
-    with closing(_outcomes(work, pairs, processes, threads)) as outcomes, progress(console) as bar:
+    with closing(_collect_outcomes(work, pairs, processes, threads)) as outcomes, progress(console) as bar:
         shown = bar.add_task("depth", total=len(pairs), loss="", rate="")
         for made, (pair, error) in enumerate(outcomes, 1):
             if error:
@@ -148,23 +150,23 @@ def _run(
     return failed
 
 
-def _outcomes(
+def _collect_outcomes(
     work: Work, pairs: Sequence[NamedPair], processes: int, threads: int | None
 ) -> Generator[Outcome, None, None]:
     """Yield outcomes as they come. If a process is killed, rerun each suspect alone to find its pair."""
     waiting = deque(pairs)
     while waiting:
-        for pair in (yield from _until_one_is_killed(work, waiting, processes, threads)):
-            if (yield from _until_one_is_killed(work, deque([pair]), 1, threads)):
+        for pair in (yield from _process_until_killed(work, waiting, processes, threads)):
+            if (yield from _process_until_killed(work, deque([pair]), 1, threads)):
                 yield pair, "its process was killed; is the memory full?"
 
 
-def _until_one_is_killed(
+def _process_until_killed(
     work: Work, waiting: deque[NamedPair], processes: int, threads: int | None
 ) -> Generator[Outcome, None, list[NamedPair]]:
     """Yield outcomes of the waiting pairs; returns the pairs in progress when a process was killed."""
     pending: dict[Future[str | None], NamedPair] = {}
-    with _pool(processes, threads or usable_cores()) as pool:
+    with _start_pool(processes, threads or usable_cores()) as pool:
         try:
             while waiting or pending:
                 # Submit one pair per process, so that few are suspects.
@@ -181,13 +183,13 @@ def _until_one_is_killed(
 
 
 @contextmanager
-def _pool(processes: int, threads: int) -> Iterator[ProcessPoolExecutor]:
+def _start_pool(processes: int, threads: int) -> Iterator[ProcessPoolExecutor]:
     """Start a pool of processes; terminates them on an error."""
     others = multiprocessing.active_children()
     # Spawned, because a forked child inherits OpenCV's and ONNX Runtime's threads in an unknown state.
     context = multiprocessing.get_context("spawn")
     with (
-        _few_blas_threads(threads),
+        _limit_blas_threads(threads),
         ProcessPoolExecutor(processes, context, begin_work, (threads,)) as pool,
     ):
         try:
@@ -202,7 +204,7 @@ def _pool(processes: int, threads: int) -> Iterator[ProcessPoolExecutor]:
 
 
 @contextmanager
-def _few_blas_threads(threads: int) -> Iterator[None]:
+def _limit_blas_threads(threads: int) -> Iterator[None]:
     """Limit the threads of OpenBLAS, NumPy's matrix library, in processes started meanwhile.
 
     OpenBLAS reads the environment once, when it is loaded; its threads busy-wait after each product.
@@ -217,10 +219,10 @@ def _few_blas_threads(threads: int) -> Iterator[None]:
             os.environ[_BLAS_THREADS] = before
 
 
-def _make(out: Path, job: DepthJob, pair: NamedPair) -> str | None:
+def _process_pair(out: Path, job: DepthJob, pair: NamedPair) -> str | None:
     """Write a pair's results and mark it as finished. Returns the error in one line, or None."""
     try:
-        folder, sources = out / pair.name, _sources(pair)
+        folder, sources = out / pair.name, _describe_sources(pair)
         job = replace(job, backend=_pin(job.backend))
         (folder / DONE_FILE).unlink(missing_ok=True)
         if pair.calibration and not job.request.calibration:
@@ -246,7 +248,7 @@ def _pin(backend: Backend) -> PinnedBackend:
     return backend.pin()
 
 
-def _sources(pair: NamedPair) -> list[list[Any]]:
+def _describe_sources(pair: NamedPair) -> list[list[Any]]:
     """Return name, size and modification time of each of a pair's files, to detect changes."""
     sources = []
     for path in (*pair.pictures, *([pair.calibration] if pair.calibration else [])):
@@ -257,14 +259,14 @@ def _sources(pair: NamedPair) -> list[list[Any]]:
 
 
 def _is_finished(folder: Path, pair: NamedPair) -> bool:
-    facts = _finished(folder)
+    facts = _read_done(folder)
     try:
-        return bool(facts) and facts["sources"] == _sources(pair)
+        return bool(facts) and facts["sources"] == _describe_sources(pair)
     except StereoweaveError:
         return False
 
 
-def _finished(folder: Path) -> dict[str, Any]:
+def _read_done(folder: Path) -> dict[str, Any]:
     """Read `done.json` of a pair; empty if it is not finished or files are missing."""
     try:
         facts = json.loads((folder / DONE_FILE).read_text(encoding="utf-8"))
@@ -285,10 +287,10 @@ def _claim(out: Path, job: DepthJob) -> None:
         check_unclaimed(out, BATCH_FILE, (entry.name for entry in out.iterdir() if entry.name[0] != "."))
         with replacing(path) as temporary:
             temporary.write_text(describe_run(facts), encoding="utf-8")
-    _tidy(out)
+    _remove_abandoned_files(out)
 
 
-def _tidy(out: Path) -> None:
+def _remove_abandoned_files(out: Path) -> None:
     """Remove temporary files of killed processes; call only while nothing is being written."""
     for folder in out.glob(".stereoweave-*"):
         shutil.rmtree(folder, ignore_errors=True)
@@ -297,7 +299,7 @@ def _tidy(out: Path) -> None:
 
 def _write_summary(out: Path, pairs: Sequence[NamedPair], failed: dict[str, str]) -> None:
     pictures = {pair.name: pair.pictures for pair in pairs}
-    rows = {folder.parent.name: _row(folder.parent) for folder in out.glob(f"*/{DONE_FILE}")}
+    rows = {folder.parent.name: _read_row(folder.parent) for folder in out.glob(f"*/{DONE_FILE}")}
     rows |= {
         name: {"name": name, "pictures": " + ".join(path.name for path in pictures[name]), "error": error}
         for name, error in failed.items()
@@ -305,9 +307,9 @@ def _write_summary(out: Path, pairs: Sequence[NamedPair], failed: dict[str, str]
     write_table(out / SUMMARY_FILE, _COLUMNS, (rows[name] for name in sorted(rows) if rows[name]))
 
 
-def _row(folder: Path) -> dict[str, Any]:
+def _read_row(folder: Path) -> dict[str, Any]:
     """Return the summary row of a pair; empty if it is not finished."""
-    if not (facts := _finished(folder)):
+    if not (facts := _read_done(folder)):
         return {}
     row = {name: facts["summary"][name] for name in _NUMBERS}
     row |= {"name": folder.name, "pictures": " + ".join(facts["summary"]["pictures"])}

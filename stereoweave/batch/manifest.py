@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 MANIFEST, PLAN = "manifest", "plan"
 MOST_IN_A_CHUNK = 32
 """Most pairs in a chunk, and so the most that are repeated after a worker dies."""
-_CHUNKS_OF_A_WORKER = 8
-_CHUNKS_IN_A_FILE = 64
+_CHUNKS_PER_WORKER = 8
+_CHUNKS_PER_FILE = 64
 _PART = re.compile(r"part-(\d{8})\.parquet")
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlanEntry:
     """A planned pair or video.
 
     Attributes:
@@ -71,44 +71,45 @@ def extend_plan(source: Store, destination: Store, workers: int) -> ChunkPlan:
     _read_plan.cache_clear()
     versions = {file.path: f"{file.size_bytes} {file.version}" for file in source.files()}
     listed = find_pairs_among(source.place, versions)
-    found = {planned.name: planned for planned in _all_planned(listed.pairs, listed.films, versions)}
-    parts = _parts(destination, PLAN)
-    counts = {part: _updated(destination, part, found) for part in parts}  # shrinks `found` to the new ones
+    found = {entry.name: entry for entry in _make_entries(listed.pairs, listed.films, versions)}
+    parts = _list_parts(destination, PLAN)
+    # Shrinks `found` to the new ones.
+    counts = {part: _update_part(destination, part, found) for part in parts}
     if not (found or counts):
         raise StereoweaveError(f"{source.place}: expected pairs of pictures or videos in it, found none")
-    size = max(1, min(MOST_IN_A_CHUNK, len(found) // (_CHUNKS_OF_A_WORKER * workers)))
-    chunks = list(_in_chunks(found.values(), size))
-    for part, first in enumerate(range(0, len(chunks), _CHUNKS_IN_A_FILE), max(parts, default=-1) + 1):
-        counts[part] = _write_plan(destination, part, chunks[first : first + _CHUNKS_IN_A_FILE])
+    size = max(1, min(MOST_IN_A_CHUNK, len(found) // (_CHUNKS_PER_WORKER * workers)))
+    chunks = list(_split_into_chunks(found.values(), size))
+    for part, first in enumerate(range(0, len(chunks), _CHUNKS_PER_FILE), max(parts, default=-1) + 1):
+        counts[part] = _write_plan(destination, part, chunks[first : first + _CHUNKS_PER_FILE])
     numbers = tuple(
-        part * _CHUNKS_IN_A_FILE + chunk for part, of_each in counts.items() for chunk in range(len(of_each))
+        part * _CHUNKS_PER_FILE + chunk for part, sizes in counts.items() for chunk in range(len(sizes))
     )
     # Rows of a lost plan, or of one that two runs extended at the same time.
-    for stray in set(_parts(destination, MANIFEST)).difference(numbers):
-        destination.remove(_part(MANIFEST, stray))
+    for stray in set(_list_parts(destination, MANIFEST)).difference(numbers):
+        destination.remove(_part_path(MANIFEST, stray))
     return ChunkPlan(numbers, sum(map(sum, counts.values())), note_left_out(source.place, listed.left_out))
 
 
-def read_chunk(destination: Store, chunk: int) -> list[Planned]:
-    """Read the planned entries of a chunk."""
-    part, number = divmod(chunk, _CHUNKS_IN_A_FILE)
+def read_chunk(destination: Store, chunk: int) -> list[PlanEntry]:
+    """Read the entries of a chunk."""
+    part, number = divmod(chunk, _CHUNKS_PER_FILE)
     return _read_plan(destination.place, part)[number]
 
 
 def read_rows(destination: Store, chunk: int) -> dict[str, dict[str, Any]]:
     """Read the rows of a chunk, by pair; empty if not written yet."""
-    path = _part(MANIFEST, chunk)
+    path = _part_path(MANIFEST, chunk)
     if not destination.exists(path):
         return {}
-    return {row["pair"]: row for row in _read(destination, path)}
+    return {row["pair"]: row for row in _read_table(destination, path)}
 
 
 def write_rows(destination: Store, chunk: int, rows: Sequence[dict[str, Any]]) -> None:
     """Write the rows of a chunk atomically."""
-    _write(destination, _part(MANIFEST, chunk), rows, _rows_schema())
+    _write_table(destination, _part_path(MANIFEST, chunk), rows, _make_rows_schema())
 
 
-def _rows_schema() -> "pyarrow.Schema":
+def _make_rows_schema() -> "pyarrow.Schema":
     import pyarrow
 
     names = pyarrow.list_(pyarrow.string())
@@ -131,7 +132,7 @@ def _rows_schema() -> "pyarrow.Schema":
     )
 
 
-def _plan_schema() -> "pyarrow.Schema":
+def _make_plan_schema() -> "pyarrow.Schema":
     import pyarrow
 
     names = pyarrow.list_(pyarrow.string())
@@ -147,63 +148,63 @@ def _plan_schema() -> "pyarrow.Schema":
     )
 
 
-def _all_planned(
+def _make_entries(
     pairs: Iterable[ListedPair], films: Iterable[ListedPair], versions: dict[str, str]
-) -> Iterator[Planned]:
+) -> Iterator[PlanEntry]:
     for listed, is_film in [(pairs, False), (films, True)]:
         for name, files, calibration in listed:
-            every = (*files, calibration) if calibration else files
-            found = tuple(versions.get(path, "") for path in every)  # one of a pair may be missing
-            yield Planned(name, files, found, calibration, is_film)
+            paths = (*files, calibration) if calibration else files
+            file_versions = tuple(versions.get(path, "") for path in paths)  # one of a pair may be missing
+            yield PlanEntry(name, files, file_versions, calibration, is_film)
 
 
-def _in_chunks(planned: Collection[Planned], size: int) -> Iterator[list[Planned]]:
+def _split_into_chunks(entries: Collection[PlanEntry], size: int) -> Iterator[list[PlanEntry]]:
     """Split into chunks of `size` pairs; a video, as slow as many pairs, gets its own chunk."""
-    pairs = (one for one in planned if not one.is_film)
+    pairs = (entry for entry in entries if not entry.is_film)
     while chunk := list(islice(pairs, size)):
         yield chunk
-    yield from ([one] for one in planned if one.is_film)
+    yield from ([entry] for entry in entries if entry.is_film)
 
 
-def _updated(destination: Store, part: int, found: dict[str, Planned]) -> list[int]:
+def _update_part(destination: Store, part: int, found: dict[str, PlanEntry]) -> list[int]:
     """Update a plan file from `found`, which loses these entries. Returns the chunks' sizes."""
     chunks = _read_plan(destination.place, part)
-    now = [[found.pop(one.name, one) for one in chunk] for chunk in chunks]
-    if now != chunks:
-        _write_plan(destination, part, now)
-    return [len(chunk) for chunk in now]
+    updated = [[found.pop(entry.name, entry) for entry in chunk] for chunk in chunks]
+    if updated != chunks:
+        _write_plan(destination, part, updated)
+    return [len(chunk) for chunk in updated]
 
 
-def _write_plan(destination: Store, part: int, chunks: Sequence[Sequence[Planned]]) -> list[int]:
+def _write_plan(destination: Store, part: int, chunks: Sequence[Sequence[PlanEntry]]) -> list[int]:
     """Write a plan file. Returns the chunks' sizes."""
-    rows = [{"chunk": number, **asdict(one)} for number, chunk in enumerate(chunks) for one in chunk]
-    _write(destination, _part(PLAN, part), rows, _plan_schema())
+    rows = [{"chunk": number, **asdict(entry)} for number, chunk in enumerate(chunks) for entry in chunk]
+    _write_table(destination, _part_path(PLAN, part), rows, _make_plan_schema())
     return [len(chunk) for chunk in chunks]
 
 
 # Caches one file, because a worker's chunks are mostly consecutive.
 @lru_cache(maxsize=1)
-def _read_plan(destination: str, part: int) -> list[list[Planned]]:
+def _read_plan(destination: str, part: int) -> list[list[PlanEntry]]:
     """Read a plan file: the entries of each chunk."""
-    chunks: list[list[Planned]] = []
-    for row in _read(store_at(destination), _part(PLAN, part)):
+    chunks: list[list[PlanEntry]] = []
+    for row in _read_table(store_at(destination), _part_path(PLAN, part)):
         number = row.pop("chunk")
         chunks += [[] for _ in range(number + 1 - len(chunks))]
         row |= {name: tuple(row[name]) for name in ("files", "versions")}
-        chunks[number].append(Planned(**row))
+        chunks[number].append(PlanEntry(**row))
     return chunks
 
 
-def _part(folder: str, number: int) -> str:
+def _part_path(folder: str, number: int) -> str:
     return f"{folder}/part-{number:08d}.parquet"
 
 
-def _parts(destination: Store, folder: str) -> list[int]:
+def _list_parts(destination: Store, folder: str) -> list[int]:
     names = (file.path.rpartition("/")[2] for file in destination.files(folder))
     return sorted(int(match[1]) for name in names if (match := _PART.fullmatch(name)))
 
 
-def _read(destination: Store, path: str) -> list[dict[str, Any]]:
+def _read_table(destination: Store, path: str) -> list[dict[str, Any]]:
     import pyarrow
     from pyarrow import parquet
 
@@ -217,7 +218,9 @@ def _read(destination: Store, path: str) -> list[dict[str, Any]]:
         ) from error
 
 
-def _write(destination: Store, path: str, rows: Sequence[dict[str, Any]], schema: "pyarrow.Schema") -> None:
+def _write_table(
+    destination: Store, path: str, rows: Sequence[dict[str, Any]], schema: "pyarrow.Schema"
+) -> None:
     import pyarrow
     from pyarrow import parquet
 

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from stereoweave.batch.manifest import Planned, read_chunk, read_rows, write_rows
+from stereoweave.batch.manifest import PlanEntry, read_chunk, read_rows, write_rows
 from stereoweave.errors import OutputInUseError, ProviderError, StereoweaveError, format_error
 from stereoweave.io.files import is_leftover
 from stereoweave.io.images import SMALLEST_SIDE_PX
@@ -42,10 +42,10 @@ _NAMED_FAILURES = 5
 _MOST_TRIES = 3
 # Consecutive processes that may be killed during startup before it is an error.
 _MOST_FALSE_STARTS = 10
-_KILLED = "its process was killed every time; is the memory full?"
+_KILLED_ERROR = "its process was killed every time; is the memory full?"
 # Younger files may belong to a running worker.
-_LEFT_BEHIND_S = 600
-_FULL_OR_GONE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.ESTALE}
+_ABANDONED_AFTER_S = 600
+_DISK_ERRNOS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.ESTALE}
 
 
 @dataclass(frozen=True)
@@ -68,21 +68,21 @@ class Counts:
 
 
 @dataclass(frozen=True)
-class Worker:
+class ChunkWorker:
     """Processes planned pairs and videos.
 
     Attributes:
         source: The pictures and videos.
         destination: Holds plan, rows and results.
         job: Settings for each pair.
-        carried: The job's files that only the driver may have: kind (`model` or `calibration`), name and
+        job_files: The job's files that only the driver may have: kind (`model` or `calibration`), name and
             content.
     """
 
     source: Store
     destination: Store
     job: DepthJob
-    carried: tuple[tuple[str, str, bytes], ...] = ()
+    job_files: tuple[tuple[str, str, bytes], ...] = ()
 
     def __call__(self, chunks: Sequence[int]) -> Counts:
         """Process the missing pairs of several chunks."""
@@ -90,91 +90,93 @@ class Worker:
 
     def make_chunk(self, chunk: int) -> Counts:
         """Process a chunk's missing, failed and changed pairs, and write its rows."""
-        planned, rows = read_chunk(self.destination, chunk), read_rows(self.destination, chunk)
-        missing = [one for one in planned if not self._is_made(one, rows.get(one.name))]
+        entries, rows = read_chunk(self.destination, chunk), read_rows(self.destination, chunk)
+        missing = [entry for entry in entries if not self._is_done(entry, rows.get(entry.name))]
         mark = f"{BEGUN}/{chunk:08d}.json"
-        rows |= {row["pair"]: row for row in self._rows(missing, mark)}
-        if missing or rows.keys() != {one.name for one in planned}:
-            write_rows(self.destination, chunk, [rows[one.name] for one in planned])
+        rows |= {row["pair"]: row for row in self._make_rows(missing, mark)}
+        if missing or rows.keys() != {entry.name for entry in entries}:
+            write_rows(self.destination, chunk, [rows[entry.name] for entry in entries])
             self.destination.remove(mark)
-        failed = tuple((one.name, rows[one.name]["error"]) for one in missing if rows[one.name]["error"])
-        there = len(planned) - len(missing)
+        errors = ((entry.name, rows[entry.name]["error"]) for entry in missing)
+        failed = tuple((name, error) for name, error in errors if error)
+        there = len(entries) - len(missing)
         return Counts(len(missing) - len(failed), there, len(failed), failed[:_NAMED_FAILURES])
 
-    def _is_made(self, planned: Planned, row: ManifestRow | None) -> bool:
-        return row is not None and not row["error"] and self._holds(planned, row)
+    def _is_done(self, entry: PlanEntry, row: ManifestRow | None) -> bool:
+        return row is not None and not row["error"] and self._is_current(entry, row)
 
-    def _holds(self, planned: Planned, row: ManifestRow) -> bool:
+    def _is_current(self, entry: PlanEntry, row: ManifestRow) -> bool:
         """Test whether a row matches the current files and its results exist."""
-        if tuple(row["versions"]) != planned.versions:
+        if tuple(row["versions"]) != entry.versions:
             return False
-        folder = planned.name
+        folder = entry.name
         there = {file.path.removeprefix(f"{folder}/") for file in self.destination.files(folder)}
         return there.issuperset(row["files"])
 
-    def _rows(self, missing: Sequence[Planned], mark: str) -> list[ManifestRow]:
+    def _make_rows(self, missing: Sequence[PlanEntry], mark: str) -> list[ManifestRow]:
+        """Make the rows, in a child process if a worker was killed before."""
         if not missing:
             return []
         if self.destination.exists(mark):
-            return self._rows_apart(missing, mark)
+            return self._make_rows_in_child(missing, mark)
         self.destination.write_bytes(mark, b"{}")
-        return [self.row(planned) for planned in missing]
+        return [self.make_row(entry) for entry in missing]
 
-    def _rows_apart(self, missing: Sequence[Planned], mark: str) -> list[ManifestRow]:
+    def _make_rows_in_child(self, missing: Sequence[PlanEntry], mark: str) -> list[ManifestRow]:
         """Make the rows in a child process; records the tries of each pair and limits them."""
-        notes = self._notes(mark)
-        tries, rows = notes.get("tries", {}), {row["pair"]: row for row in notes.get("rows", [])}
-        with _Apart(self) as apart:
-            for planned in missing:
-                if planned.name in rows and self._holds(planned, rows[planned.name]):
+        marked = self._read_mark(mark)
+        tries, rows = marked.get("tries", {}), {row["pair"]: row for row in marked.get("rows", [])}
+        with _RowProcess(self) as child:
+            for entry in missing:
+                if entry.name in rows and self._is_current(entry, rows[entry.name]):
                     continue
                 row = None
-                while row is None and tries.get(planned.name, 0) < _MOST_TRIES:
-                    apart.begin()
-                    tries[planned.name] = tries.get(planned.name, 0) + 1
-                    noted = json.dumps({"tries": tries, "rows": list(rows.values())})
-                    self.destination.write_bytes(mark, noted.encode())
-                    row = apart.row(planned)
-                rows[planned.name] = row or self._empty_row(planned) | {"error": _KILLED}
+                while row is None and tries.get(entry.name, 0) < _MOST_TRIES:
+                    child.start()
+                    tries[entry.name] = tries.get(entry.name, 0) + 1
+                    marked = {"tries": tries, "rows": list(rows.values())}
+                    self.destination.write_bytes(mark, json.dumps(marked).encode())
+                    row = child.make_row(entry)
+                rows[entry.name] = row or self._make_empty_row(entry) | {"error": _KILLED_ERROR}
         return list(rows.values())
 
-    def _notes(self, mark: str) -> dict[str, Any]:
+    def _read_mark(self, mark: str) -> dict[str, Any]:
         try:
             return json.loads(self.destination.read_bytes(mark))
         except ValueError:  # another run has just finished the chunk, or a power failure lost the file
             return {}
 
-    def row(self, planned: Planned) -> ManifestRow:
+    def make_row(self, entry: PlanEntry) -> ManifestRow:
         """Process a pair or video and return its row; the pair's own errors go into the row.
 
         Raises:
             StereoweaveError: The source, the destination or the provider fails.
         """
         start_s = time.perf_counter()
-        row, job = self._empty_row(planned), self._loaded_job
+        row, job = self._make_empty_row(entry), self._loaded_job
         with tempfile.TemporaryDirectory(prefix="stereoweave-") as name:
             try:
-                if planned.is_film:
-                    row |= self._film(planned, Path(name), job)
+                if entry.is_film:
+                    row |= self._process_video(entry, Path(name), job)
                 else:
-                    row |= self._pair(planned, Path(name), job)
+                    row |= self._process_pair(entry, Path(name), job)
             except _StoreError:
                 raise
             except Exception as error:  # a library may raise anything on a bad picture; the others continue
                 self._check_disk(error)
-                if any(isinstance(cause, ProviderError) for cause in _causes(error)):
-                    _check_runs(job.backend.matcher())
+                if any(isinstance(cause, ProviderError) for cause in _list_causes(error)):
+                    _check_provider(job.backend.matcher())
                 kind = "" if isinstance(error, StereoweaveError) else f"{type(error).__name__}: "
                 line = kind + format_error(error, job.name_of).replace(f"{name}/pictures", self.source.place)
                 row["error"] = " ".join(line.split())
         return row | {"seconds": round(time.perf_counter() - start_s, 3)}
 
-    def _empty_row(self, planned: Planned) -> ManifestRow:
+    def _make_empty_row(self, entry: PlanEntry) -> ManifestRow:
         empty = dict.fromkeys(
             ("disparity_min_px", "disparity_median_px", "disparity_max_px", "confident_percent")
         )
-        names = [file.rpartition("/")[2] for file in planned.files]
-        row = {"pair": planned.name, "pictures": names, "versions": list(planned.versions)}
+        names = [file.rpartition("/")[2] for file in entry.files]
+        row = {"pair": entry.name, "pictures": names, "versions": list(entry.versions)}
         return (
             row
             | empty
@@ -185,11 +187,11 @@ class Worker:
             }
         )
 
-    def _pair(self, planned: Planned, scratch: Path, job: DepthJob) -> ManifestRow:
-        pictures, calibration = self._fetched(planned, scratch / "pictures")
+    def _process_pair(self, entry: PlanEntry, scratch: Path, job: DepthJob) -> ManifestRow:
+        pictures, calibration = self._fetch(entry, scratch / "pictures")
         if calibration and not job.request.calibration:
             job = replace(job, request=replace(job.request, calibration=calibration))
-        with self._results(planned, scratch) as out:
+        with self._open_results(entry, scratch) as out:
             summary, notes = make_depth(pictures, out, job)
         return {
             "disparity_min_px": summary.disparity_min_px,
@@ -199,10 +201,10 @@ class Worker:
             "width_px": summary.width_px,
             "height_px": summary.height_px,
             "checks": [note.format(job.name_of) for note in notes],
-            "files": _names(out),
+            "files": _list_names(out),
         }
 
-    def _film(self, planned: Planned, scratch: Path, job: DepthJob) -> ManifestRow:
+    def _process_video(self, entry: PlanEntry, scratch: Path, job: DepthJob) -> ManifestRow:
         from rich.console import Console
 
         from stereoweave.io.animation import require_video_extra
@@ -213,10 +215,10 @@ class Worker:
             from stereoweave.video.parts import parts_folder
             from stereoweave.video.reader import open_video
 
-        films, _ = self._fetched(planned, scratch / "pictures")
+        films, _ = self._fetch(entry, scratch / "pictures")
         film_job = VideoJob(depth16=True, backend=job.backend, name_of=job.name_of)
         video = open_video(films, job.request.format)
-        with self._results(planned, scratch) as out:
+        with self._open_results(entry, scratch) as out:
             make = partial(convert_video, video, films, out / FILM, film_job, Console(quiet=True))
             begun = parts_folder(out / FILM)
             was_begun = begun.exists()
@@ -225,38 +227,38 @@ class Worker:
             except StereoweaveError as error:
                 self._check_disk(error)
                 kept = ProviderError | OutputInUseError
-                if not was_begun or any(isinstance(cause, kept) for cause in _causes(error)):
+                if not was_begun or any(isinstance(cause, kept) for cause in _list_causes(error)):
                     raise
                 # Parts of a killed worker, damaged or from other files.
                 shutil.rmtree(begun, ignore_errors=True)
                 tally = make()
         width, height = video.size_px
-        return {"width_px": width, "height_px": height, "checks": tally.named, "files": _names(out)}
+        return {"width_px": width, "height_px": height, "checks": tally.named, "files": _list_names(out)}
 
-    def _fetched(self, planned: Planned, into: Path) -> tuple[tuple[Path, ...], Path | None]:
+    def _fetch(self, entry: PlanEntry, into: Path) -> tuple[tuple[Path, ...], Path | None]:
         """Copy the files and the calibration to this machine."""
         try:
-            files = tuple(self.source.fetch(file, into) for file in planned.files)
-            return files, self.source.fetch(planned.calibration, into) if planned.calibration else None
+            files = tuple(self.source.fetch(file, into) for file in entry.files)
+            return files, self.source.fetch(entry.calibration, into) if entry.calibration else None
         except StereoweaveError:
-            with _of_the_store():
+            with _convert_store_errors():
                 self.source.check_source()
             raise  # the store works, so the file is at fault
 
     @contextmanager
-    def _results(self, planned: Planned, scratch: Path) -> Iterator[Path]:
+    def _open_results(self, entry: PlanEntry, scratch: Path) -> Iterator[Path]:
         """Give a folder for the results, and upload them to the destination if that is not a folder."""
         if self.destination.folder is not None:
-            folder = self.destination.folder / planned.name
-            remove_left_behind(folder)
+            folder = self.destination.folder / entry.name
+            remove_abandoned(folder)
             yield folder
             return
         folder = scratch / "results"
         folder.mkdir()
         yield folder
-        with _of_the_store():
-            stored = {file.path for file in self.destination.files(planned.name)}
-            fresh = {f"{planned.name}/{name}": folder / name for name in _names(folder)}
+        with _convert_store_errors():
+            stored = {file.path for file in self.destination.files(entry.name)}
+            fresh = {f"{entry.name}/{name}": folder / name for name in _list_names(folder)}
             for path, file in fresh.items():
                 self.destination.put(file, path)
             for stale in stored - fresh.keys():
@@ -264,15 +266,15 @@ class Worker:
 
     def _check_disk(self, error: Exception) -> None:
         """Raise if a disk is full or gone, because all further pairs would fail too."""
-        if any(isinstance(cause, OSError) and cause.errno in _FULL_OR_GONE for cause in _causes(error)):
+        if any(isinstance(cause, OSError) and cause.errno in _DISK_ERRNOS for cause in _list_causes(error)):
             raise _StoreError.from_error(error).with_prefix(f"{self.destination.place}: ") from error
 
     @functools.cached_property
     def _loaded_job(self) -> DepthJob:
-        """The job with its carried files on this machine, and its network even if its file is replaced."""
+        """The job with its files and its network on this machine, even if the network's file is replaced."""
         job = self.job
-        for kind, name, content in self.carried:
-            path = _carried(name, content)
+        for kind, name, content in self.job_files:
+            path = _write_job_file(name, content)
             if kind == "model":
                 job = replace(job, backend=replace(job.backend, model=str(path)))
             else:
@@ -289,35 +291,35 @@ class _StoreError(StereoweaveError):
 
 
 @contextmanager
-def _of_the_store() -> Iterator[None]:
+def _convert_store_errors() -> Iterator[None]:
     try:
         yield
     except StereoweaveError as error:
         raise _StoreError.from_error(error) from error
 
 
-class _Apart:
+class _RowProcess:
     """A child process that makes rows; restarted after it is killed."""
 
-    def __init__(self, worker: Worker) -> None:
+    def __init__(self, worker: ChunkWorker) -> None:
         self._worker = worker
         self._pool: ProcessPoolExecutor | None = None
 
-    def __enter__(self) -> "_Apart":
+    def __enter__(self) -> "_RowProcess":
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._pool:
             self._pool.shutdown()
 
-    def begin(self) -> None:
+    def start(self) -> None:
         """Start the process unless it runs, and wait for it."""
         false_starts = 0
         while self._pool is None:
             threads = self._worker.job.backend.threads or 1
             pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), begin_work, (threads,))
             try:
-                pool.submit(_keep_worker, self._worker).result()
+                pool.submit(_load_worker, self._worker).result()
                 self._pool = pool
             except BrokenProcessPool as error:
                 false_starts += 1
@@ -330,11 +332,11 @@ class _Apart:
                 if self._pool is None:
                     pool.shutdown()
 
-    def row(self, planned: Planned) -> ManifestRow | None:
+    def make_row(self, entry: PlanEntry) -> ManifestRow | None:
         """Process a pair or video in the child process; None if that was killed."""
         assert self._pool is not None
         try:
-            return self._pool.submit(_make_row, planned).result()
+            return self._pool.submit(_make_row_in_child, entry).result()
         except BrokenProcessPool:
             self._pool.shutdown()
             self._pool = None
@@ -342,40 +344,40 @@ class _Apart:
 
 
 # The worker of a child process.
-_kept_worker: Worker | None = None
+_child_worker: ChunkWorker | None = None
 
 
-def _keep_worker(worker: Worker) -> None:
+def _load_worker(worker: ChunkWorker) -> None:
     """Keep a worker in this child process, and load its network before the first pair's attempt."""
-    global _kept_worker
-    _kept_worker = worker
+    global _child_worker
+    _child_worker = worker
     worker._loaded_job  # noqa: B018 - loads it
 
 
-def _make_row(planned: Planned) -> ManifestRow:
+def _make_row_in_child(entry: PlanEntry) -> ManifestRow:
     """Process a pair or video with the worker of this child process."""
-    assert _kept_worker is not None
-    return _kept_worker.row(planned)
+    assert _child_worker is not None
+    return _child_worker.make_row(entry)
 
 
 @functools.cache
-def _carried(name: str, content: bytes) -> Path:
+def _write_job_file(name: str, content: bytes) -> Path:
     """Write a file of the driver to this machine's disk, for the lifetime of the process."""
-    path = Path(_scratch().name, name)
+    path = Path(_make_scratch_folder().name, name)
     path.write_bytes(content)
     return path
 
 
 @functools.cache
-def _scratch() -> "tempfile.TemporaryDirectory[str]":
+def _make_scratch_folder() -> "tempfile.TemporaryDirectory[str]":
     return tempfile.TemporaryDirectory(prefix="stereoweave-")
 
 
-def remove_left_behind(folder: Path) -> None:
+def remove_abandoned(folder: Path) -> None:
     """Remove old temporary files of killed workers from a folder."""
     for path in folder.glob(".*"):
         with suppress(FileNotFoundError):
-            if time.time() - path.stat().st_mtime < _LEFT_BEHIND_S:
+            if time.time() - path.stat().st_mtime < _ABANDONED_AFTER_S:
                 continue
             if path.name.startswith(".stereoweave-"):
                 shutil.rmtree(path, ignore_errors=True)
@@ -383,18 +385,18 @@ def remove_left_behind(folder: Path) -> None:
                 path.unlink()
 
 
-def _check_runs(matcher: Matcher) -> None:
+def _check_provider(matcher: Matcher) -> None:
     """Raise if the provider fails even on the smallest pair: then the last pair was not too large."""
     plain = np.zeros((SMALLEST_SIDE_PX, SMALLEST_SIDE_PX, 3), np.uint8)
     matcher.estimate(plain, plain)
 
 
-def _causes(error: BaseException | None) -> Iterator[BaseException]:
+def _list_causes(error: BaseException | None) -> Iterator[BaseException]:
     """Yield an error and the chain of its causes."""
     while error is not None:
         yield error
         error = error.__cause__
 
 
-def _names(folder: Path) -> list[str]:
+def _list_names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir() if path.name[0] != "." and path.is_file())

@@ -73,7 +73,7 @@ def batch(  # noqa: PLR0913 - each is an option of the command line
     The manifest, Parquet files in the results, has a row per pair or video. Rerun the same command to resume
     after any interruption; it also retries pairs that failed.
     """
-    from stereoweave.batch.cluster import batch_on_cluster
+    from stereoweave.batch.cluster import run_cluster_command
     from stereoweave.matching.backend import Backend
     from stereoweave.matching.options import MatchOptions
     from stereoweave.outputs.results import DepthJob
@@ -87,4 +87,4 @@ def batch(  # noqa: PLR0913 - each is an option of the command line
         name_of=running_options(),
     )
     engine = Engine(address, workers, cpus_each, gpus_each)
-    raise typer.Exit(batch_on_cluster(source, destination, job, engine, as_json=as_json))
+    raise typer.Exit(run_cluster_command(source, destination, job, engine, as_json=as_json))

@@ -101,9 +101,9 @@ def depth(  # noqa: PLR0913 - each is an option of the command line
     )
     pictures = pictures or []
     if found := find_pairs(pictures, left, right, listed):
-        from stereoweave.batch.local import depth_of_many
+        from stereoweave.batch.local import run_batch_command
 
-        raise typer.Exit(depth_of_many(found, out, job, processes=jobs, as_json=as_json))
+        raise typer.Exit(run_batch_command(found, out, job, processes=jobs, as_json=as_json))
     summary, notes = make_depth(pictures, out, job)
     lines = [note.format(job.name_of) for note in notes]
     (_print_json if as_json else _print_summary)(summary, lines, out)

@@ -20,9 +20,9 @@ from other_processes import halted, processes_of
 from video_examples import example_pairs, packets, write_side_by_side
 
 from stereoweave.batch import worker as cluster_worker
-from stereoweave.batch.cluster import _carried, _ready, run_cluster
+from stereoweave.batch.cluster import _check_folders, _read_job_files, run_cluster
 from stereoweave.batch.manifest import extend_plan, read_chunk, read_rows
-from stereoweave.batch.worker import FILM, Worker, remove_left_behind
+from stereoweave.batch.worker import FILM, ChunkWorker, remove_abandoned
 from stereoweave.cli.root import main
 from stereoweave.errors import MatcherError, OutputInUseError, ProviderError, Remedy, StereoweaveError
 from stereoweave.io.images import read_image, write_image
@@ -59,11 +59,11 @@ def write_pairs(folder: Path, names, size_px=(64, 48)) -> Path:
     return folder
 
 
-def numbered(count: int) -> list[str]:
+def number_names(count: int) -> list[str]:
     return [f"{index:02d}" for index in range(count)]
 
 
-def manifest(out: str | Path) -> dict[str, dict]:
+def read_manifest(out: str | Path) -> dict[str, dict]:
     """The rows of all parts, read as others would, each pair once."""
     files, path = fsspec.url_to_fs(str(out))
     rows = pyarrow.dataset.dataset(f"{path}/manifest", filesystem=files).to_table().to_pylist()
@@ -71,12 +71,12 @@ def manifest(out: str | Path) -> dict[str, dict]:
     return {row["pair"]: row for row in rows}
 
 
-def made_at_ns(out: Path) -> dict[str, int]:
+def read_write_times_ns(out: Path) -> dict[str, int]:
     return {path.parent.name: path.stat().st_mtime_ns for path in out.glob("*/disparity.pfm")}
 
 
 def test_bad_pairs_become_rows_and_the_next_run_makes_what_is_missing_changed_or_new(engine, tmp_path):
-    source, out = write_pairs(tmp_path / "pairs", numbered(8)), tmp_path / "out"
+    source, out = write_pairs(tmp_path / "pairs", number_names(8)), tmp_path / "out"
     write_image(source / "left" / "alone.png", read_image(source / "left" / "00.png"))
     bad, odd = source / "right" / "01.png", source / "right" / "02.png"
     whole = {path: path.read_bytes() for path in (bad, odd)}
@@ -84,8 +84,8 @@ def test_bad_pairs_become_rows_and_the_next_run_makes_what_is_missing_changed_or
     write_image(odd, read_image(odd)[:-4])
     tally = run_cluster(source, out, JOB, engine)
     assert (tally.made, tally.there, tally.failed, tally.manifest) == (6, 0, 3, str(out / "manifest"))
-    rows = manifest(out)
-    assert list(sorted(rows)) == [*numbered(8), "alone"]
+    rows = read_manifest(out)
+    assert list(sorted(rows)) == [*number_names(8), "alone"]
     assert str(bad) in rows["01"]["error"]
     assert "of the same size, found" in rows["02"]["error"]
     assert rows["alone"]["error"].endswith(
@@ -103,7 +103,7 @@ def test_bad_pairs_become_rows_and_the_next_run_makes_what_is_missing_changed_or
     assert row["confident_percent"] == pytest.approx(summary.confident_percent)
     assert (row["pictures"], row["checks"]) == (["03.png", "03.png"], notes)
 
-    before = made_at_ns(out)
+    before = read_write_times_ns(out)
     for path, content in whole.items():
         path.write_bytes(content)
     (source / "left" / "alone.png").unlink()
@@ -112,16 +112,16 @@ def test_bad_pairs_become_rows_and_the_next_run_makes_what_is_missing_changed_or
     write_pairs(source, ["new"])
     tally = run_cluster(source, out, JOB, engine)
     assert (tally.made, tally.there, tally.failed) == (5, 4, 1)  # 01, 02, 04, 06, new; alone is still missing
-    after = made_at_ns(out)
+    after = read_write_times_ns(out)
     assert {name for name in after if after[name] != before.get(name)} == {"01", "02", "04", "06", "new"}
-    rows = manifest(out)
+    rows = read_manifest(out)
     assert {name for name, row in rows.items() if row["error"]} == {"alone"}
-    assert set(rows) == {*numbered(8), "alone", "new"}
+    assert set(rows) == {*number_names(8), "alone", "new"}
     assert not list((out / "begun").iterdir())
 
 
 def test_killed_workers_and_a_killed_driver_lose_nothing_and_double_nothing(ray_address, engine, tmp_path):
-    names = numbered(40)
+    names = number_names(40)
     source, out = write_pairs(tmp_path / "pairs", names, (256, 192)), tmp_path / "out"
     program = "import sys; from stereoweave.cli.root import main; sys.exit(main())"
     words = ["batch", str(source), str(out), "--address", ray_address, "--workers", "2"]
@@ -135,7 +135,7 @@ def test_killed_workers_and_a_killed_driver_lose_nothing_and_double_nothing(ray_
             time.sleep(0.01)
 
     wait_for(2)
-    workers = [process for process in processes_of(os.getpid()) if b"MapWorker" in command_of(process)]
+    workers = [process for process in processes_of(os.getpid()) if b"MapWorker" in read_command(process)]
     os.kill(workers[0], signal.SIGKILL)
     wait_for(6)
     with halted(driver):
@@ -144,46 +144,46 @@ def test_killed_workers_and_a_killed_driver_lose_nothing_and_double_nothing(ray_
         driver.kill()
     assert driver.wait() == -signal.SIGKILL
     assert 6 <= parts() < 20
-    kept = made_at_ns(out)
-    complete = set(manifest(out))
+    kept = read_write_times_ns(out)
+    complete = set(read_manifest(out))
 
     job = DepthJob()
     tally = run_cluster(source, out, job, engine)
     assert (tally.made + tally.there, tally.failed) == (40, 0)
     assert tally.there >= len(complete) > 0
-    rows = manifest(out)
+    rows = read_manifest(out)
     assert sorted(rows) == names
     assert not any(row["error"] for row in rows.values())
-    now = made_at_ns(out)
+    now = read_write_times_ns(out)
     assert {name: now[name] for name in complete} == {name: kept[name] for name in complete}
     for name in names:
         assert read_pfm(out / name / "disparity.pfm").shape == (192, 256)
         assert read_image(out / name / "preview.png").shape == (192, 256, 3)
 
 
-def command_of(process: int) -> bytes:
+def read_command(process: int) -> bytes:
     try:
         return Path(f"/proc/{process}/cmdline").read_bytes()
     except OSError:
         return b""
 
 
-class Deadly(Worker):
+class KilledByPair(ChunkWorker):
     """A worker whose process is killed by the pair 01."""
 
-    def row(self, planned):
-        if planned.name == "01":
+    def make_row(self, entry):
+        if entry.name == "01":
             os.kill(os.getpid(), signal.SIGKILL)
-        return super().row(planned)
+        return super().make_row(entry)
 
 
 def test_a_pair_that_kills_its_process_becomes_a_row_and_costs_no_other(tmp_path, monkeypatch):
     monkeypatch.setattr(cluster_worker, "_MOST_TRIES", 2)
-    source, out = store_at(write_pairs(tmp_path / "pairs", numbered(3))), store_at(tmp_path / "out")
-    monkeypatch.setattr("stereoweave.batch.manifest._CHUNKS_OF_A_WORKER", 1)
+    source, out = store_at(write_pairs(tmp_path / "pairs", number_names(3))), store_at(tmp_path / "out")
+    monkeypatch.setattr("stereoweave.batch.manifest._CHUNKS_PER_WORKER", 1)
     [first] = extend_plan(source, out, workers=1).chunks
     out.write_bytes(f"begun/{first:08d}.json", b"{}")  # as the worker leaves it that is killed with the pair
-    counts = Deadly(source, out, JOB)([first])
+    counts = KilledByPair(source, out, JOB)([first])
     assert (counts.made, counts.failed) == (2, 1)
     rows = read_rows(out, first)
     assert [row["error"] for row in rows.values()] == [
@@ -194,7 +194,7 @@ def test_a_pair_that_kills_its_process_becomes_a_row_and_costs_no_other(tmp_path
     assert not out.exists(f"begun/{first:08d}.json")
 
 
-class Stillborn(Worker):
+class KilledAtStart(ChunkWorker):
     """A worker of which every further process is killed while it starts."""
 
     @property
@@ -202,90 +202,92 @@ class Stillborn(Worker):
         os.kill(os.getpid(), signal.SIGKILL)
 
 
-class Overtaxed(Worker):
+class OutOfMemory(ChunkWorker):
     """A worker whose provider has no memory for the pair 01."""
 
-    def _pair(self, planned, *more):
-        if planned.name == "01":
+    def _process_pair(self, entry, *more):
+        if entry.name == "01":
             raise ProviderError("provider cpu: expected to run small.onnx, found that it failed: alloc")
-        return super()._pair(planned, *more)
+        return super()._process_pair(entry, *more)
 
 
 @pytest.fixture
-def places(tmp_path, monkeypatch):
+def stores_and_chunk(tmp_path, monkeypatch):
     """Source and destination of a chunk of three pairs, and its number."""
-    monkeypatch.setattr("stereoweave.batch.manifest._CHUNKS_OF_A_WORKER", 1)
-    source, out = store_at(write_pairs(tmp_path / "pairs", numbered(3))), store_at(tmp_path / "out")
+    monkeypatch.setattr("stereoweave.batch.manifest._CHUNKS_PER_WORKER", 1)
+    source, out = store_at(write_pairs(tmp_path / "pairs", number_names(3))), store_at(tmp_path / "out")
     [chunk] = extend_plan(source, out, workers=1).chunks
     return source, out, chunk
 
 
-def test_rows_that_a_killed_worker_noted_count_while_their_results_are_there(places):
-    source, out, chunk = places
-    worker = Worker(source, out, JOB)
-    planned = read_chunk(out, chunk)
-    rows = [worker._empty_row(one) | {"checks": ["noted"]} for one in planned[:2]]
+def test_rows_that_a_killed_worker_noted_count_while_their_results_are_there(stores_and_chunk):
+    source, out, chunk = stores_and_chunk
+    worker = ChunkWorker(source, out, JOB)
+    entry = read_chunk(out, chunk)
+    rows = [worker._make_empty_row(one) | {"checks": ["noted"]} for one in entry[:2]]
     rows[0]["files"] = ["disparity.pfm"]  # which is not there
     mark = f"begun/{chunk:08d}.json"
     out.write_bytes(mark, json.dumps({"rows": rows}).encode())
     assert worker([chunk]).made == 3
     assert [row["checks"] == ["noted"] for row in read_rows(out, chunk).values()] == [False, True, False]
     out.write_bytes(mark, b"")  # lost with a machine's power
-    assert worker._notes(mark) == {}
+    assert worker._read_mark(mark) == {}
     out.remove(mark)  # by another run, which has just made the chunk
-    assert worker._notes(mark) == {}
+    assert worker._read_mark(mark) == {}
 
 
-def test_processes_that_are_killed_while_they_start_end_the_run(places, monkeypatch):
+def test_processes_that_are_killed_while_they_start_end_the_run(stores_and_chunk, monkeypatch):
     monkeypatch.setattr(cluster_worker, "_MOST_FALSE_STARTS", 2)
-    source, out, chunk = places
+    source, out, chunk = stores_and_chunk
     out.write_bytes(f"begun/{chunk:08d}.json", b"{}")
     with pytest.raises(
         StereoweaveError, match="loads the network, found it killed 2 times in a row; is the mem"
     ):
-        Stillborn(source, out, JOB)([chunk])
+        KilledAtStart(source, out, JOB)([chunk])
 
 
 def test_a_pair_that_is_too_much_for_the_provider_is_a_row_and_one_that_fails_always_ends_the_run(
-    places, monkeypatch
+    stores_and_chunk, monkeypatch
 ):
-    source, out, chunk = places
+    source, out, chunk = stores_and_chunk
     with monkeypatch.context() as patch:
-        patch.setattr(Matcher, "estimate_many", fails)
+        patch.setattr(Matcher, "estimate_many", raise_provider_error)
         with pytest.raises(ProviderError, match=r"^provider cpu: .* it failed: lost$"):
-            Overtaxed(source, out, JOB)([chunk])
+            OutOfMemory(source, out, JOB)([chunk])
     assert read_rows(out, chunk) == {}
     out.remove(f"begun/{chunk:08d}.json")
-    counts = Overtaxed(source, out, JOB)([chunk])
+    counts = OutOfMemory(source, out, JOB)([chunk])
     assert (counts.made, counts.failed) == (2, 1)
     assert read_rows(out, chunk)["01"]["error"].endswith("found that it failed: alloc")
-    counts = Worker(source, out, JOB)([chunk])
+    counts = ChunkWorker(source, out, JOB)([chunk])
     assert (counts.made, counts.there) == (1, 2)
 
 
-def fails(*_: object, **__: object) -> None:
+def raise_provider_error(*_: object, **__: object) -> None:
     raise ProviderError("provider cpu: expected to run small.onnx, found that it failed: lost")
 
 
-def test_a_provider_that_a_workers_machine_has_not_ends_the_run_and_is_no_row(places):
-    source, out, chunk = places
+def test_a_provider_that_a_workers_machine_has_not_ends_the_run_and_is_no_row(stores_and_chunk):
+    source, out, chunk = stores_and_chunk
     with pytest.raises(MatcherError, match="provider directml: expected an ONNX Runtime that has it"):
-        Worker(source, out, replace(JOB, backend=Backend(provider="directml")))([chunk])
+        ChunkWorker(source, out, replace(JOB, backend=Backend(provider="directml")))([chunk])
     assert read_rows(out, chunk) == {}
 
 
-class ModelRemover(Worker):
+class ModelRemover(ChunkWorker):
     """A worker whose model file is replaced by an invalid one after each pair."""
 
-    def _pair(self, planned, *more):
-        row = super()._pair(planned, *more)
+    def _process_pair(self, entry, *more):
+        row = super()._process_pair(entry, *more)
         self.job.backend.model.write_bytes(b"no network")
         return row
 
 
 @pytest.mark.parametrize("in_child_process", [False, True])
-def test_a_model_that_is_replaced_during_a_batch_is_not_taken_up(places, tmp_path, in_child_process):
-    source, out, chunk = places
+def test_a_model_that_is_replaced_during_a_batch_is_not_taken_up(
+    stores_and_chunk, tmp_path, in_child_process
+):
+    source, out, chunk = stores_and_chunk
     model = Path(shutil.copy(model_file("small"), tmp_path / "model.onnx"))
     if in_child_process:
         out.write_bytes(f"begun/{chunk:08d}.json", b"{}")
@@ -300,16 +302,16 @@ def test_the_driver_keeps_no_network(tmp_path):
     assert _load.cache_info().currsize == 0
 
 
-def test_a_machine_that_does_not_see_a_folder_is_named(places, tmp_path):
-    source, out, _ = places
-    worker = Worker(source, out, JOB)
-    assert _ready(worker) is worker
+def test_a_machine_that_does_not_see_a_folder_is_named(stores_and_chunk, tmp_path):
+    source, out, _ = stores_and_chunk
+    worker = ChunkWorker(source, out, JOB)
+    assert _check_folders(worker) is worker
     for places_there in ((store_at(tmp_path / "none"), out), (source, store_at(tmp_path / "none"))):
         with pytest.raises(
             StereoweaveError, match="none: expected a folder, found no such folder; all"
-        ) as told:
-            _ready(Worker(*places_there, JOB))
-        assert str(told.value).startswith(f"{platform.node()}: ")
+        ) as caught:
+            _check_folders(ChunkWorker(*places_there, JOB))
+        assert str(caught.value).startswith(f"{platform.node()}: ")
 
 
 GONE = StereoweaveError(
@@ -321,32 +323,32 @@ def raise_gone(*_: object) -> None:
     raise GONE
 
 
-def test_an_error_of_a_whole_store_keeps_its_setting_and_remedy(places, monkeypatch):
-    source, out, chunk = places
+def test_an_error_of_a_whole_store_keeps_its_setting_and_remedy(stores_and_chunk, monkeypatch):
+    source, out, chunk = stores_and_chunk
     monkeypatch.setattr(type(source), "fetch", raise_gone)
     monkeypatch.setattr(type(source), "check_source", raise_gone)
     with pytest.raises(StereoweaveError) as caught:
-        Worker(source, out, JOB)([chunk])
+        ChunkWorker(source, out, JOB)([chunk])
     assert caught.value.format(str.upper) == "SOURCE: expected a store, found none; mount it (WORKERS)"
     with pytest.raises(StereoweaveError) as caught:
-        _ready(Worker(source, out, JOB))
+        _check_folders(ChunkWorker(source, out, JOB))
     assert caught.value.format(str.upper) == (
         f"SOURCE: {platform.node()}: expected a store, found none; all machines of a cluster need it on a "
         "shared disk, or use an object store; mount it (WORKERS)"
     )
 
 
-def test_an_error_of_a_full_disk_keeps_its_setting_and_remedy(places):
-    source, out, _ = places
+def test_an_error_of_a_full_disk_keeps_its_setting_and_remedy(stores_and_chunk):
+    source, out, _ = stores_and_chunk
     full = StereoweaveError(GONE.message, setting=GONE.setting, remedy=GONE.remedy)
     full.__cause__ = OSError(errno.ENOSPC, "full")
     with pytest.raises(StereoweaveError) as caught:
-        Worker(source, out, JOB)._check_disk(full)
+        ChunkWorker(source, out, JOB)._check_disk(full)
     assert caught.value.format(str.upper) == (
         f"SOURCE: {out.place}: expected a store, found none; mount it (WORKERS)"
     )
     with pytest.raises(StereoweaveError, match=f"^{out.place}: .Errno {errno.ENOSPC}. full$"):
-        Worker(source, out, JOB)._check_disk(OSError(errno.ENOSPC, "full"))
+        ChunkWorker(source, out, JOB)._check_disk(OSError(errno.ENOSPC, "full"))
 
 
 def test_a_film_goes_on_without_the_parts_of_another(tmp_path):
@@ -359,7 +361,7 @@ def test_a_film_goes_on_without_the_parts_of_another(tmp_path):
     np.savez(parts / "state-000001.npz")
     (parts / "settings.json").write_text("{}")
     [chunk] = extend_plan(source, out, workers=1).chunks
-    assert Worker(source, out, JOB)([chunk]).made == 1
+    assert ChunkWorker(source, out, JOB)([chunk]).made == 1
     [row] = read_rows(out, chunk).values()
     assert (row["files"], row["error"], row["width_px"]) == ([FILM], None, 160)
     assert len(packets(tmp_path / "out" / "sea.mkv" / FILM, "video")) == 3
@@ -375,7 +377,7 @@ def test_a_film_that_another_process_makes_is_a_row_with_an_error_and_keeps_its_
     (parts_folder(film) / "000001.nut").touch()
     [chunk] = extend_plan(source, out, workers=1).chunks
     with lock_output(film):
-        assert Worker(source, out, JOB)([chunk]).failed == 1
+        assert ChunkWorker(source, out, JOB)([chunk]).failed == 1
     [row] = read_rows(out, chunk).values()
     assert "found one that is in use" in row["error"]
     assert [path.name for path in parts_folder(film).iterdir()] == ["000001.nut"]
@@ -387,7 +389,7 @@ def test_what_killed_workers_left_is_removed_after_a_while(tmp_path):
             path = tmp_path / name
             path.mkdir() if "weave" in name else path.touch()
             os.utime(path, (time.time() - age_s,) * 2)
-    remove_left_behind(tmp_path)
+    remove_abandoned(tmp_path)
     left = {path.name for path in tmp_path.iterdir()}
     assert left == {".stereoweave-00000000", ".part-00000000.parquet", ".mine-0", ".mine-3600"}
 
@@ -395,10 +397,10 @@ def test_what_killed_workers_left_is_removed_after_a_while(tmp_path):
 def test_a_file_beside_that_is_called_like_a_network_is_none(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("small").write_bytes(b"something else")
-    assert list(_carried(DepthJob())) == []
+    assert list(_read_job_files(DepthJob())) == []
 
 
-def test_a_name_that_is_no_text_is_told(tmp_path):
+def test_a_name_that_is_not_utf8_is_refused(tmp_path):
     for side in ("left", "right"):
         (tmp_path / side).mkdir()
         Path(os.fsdecode(os.fsencode(tmp_path / side) + b"/\xff.png")).touch()
@@ -423,10 +425,10 @@ def test_another_runs_destination_is_refused_and_so_is_a_source_with_nothing_in_
         run_cluster(tmp_path / "empty", tmp_path / "new", JOB, engine)
 
 
-def test_pairs_go_from_a_bucket_to_a_bucket_with_a_calibration_and_a_bad_one_is_told_by_its_url(
+def test_pairs_go_from_a_bucket_to_a_bucket_with_a_calibration_and_a_bad_one_is_named_by_its_url(
     engine, bucket, tmp_path
 ):
-    local = write_pairs(tmp_path / "pairs", numbered(3))
+    local = write_pairs(tmp_path / "pairs", number_names(3))
     (local / "right" / "02.png").write_bytes(b"none")
     store = store_at(f"{bucket}/in")
     for path in local.rglob("*.png"):
@@ -435,7 +437,7 @@ def test_pairs_go_from_a_bucket_to_a_bucket_with_a_calibration_and_a_bad_one_is_
         store.put(TEXTURED / name, f"room/{name}")
     tally = run_cluster(f"{bucket}/in", f"{bucket}/out", JOB, engine)
     assert (tally.made, tally.failed, tally.manifest) == (3, 1, f"{bucket}/out/manifest")
-    rows = manifest(f"{bucket}/out")
+    rows = read_manifest(f"{bucket}/out")
     assert rows["02"]["error"].startswith(f"{bucket}/in/right/02.png: expected a picture")
     assert "depth.png" in rows["room"]["files"]
     out = store_at(f"{bucket}/out")
@@ -450,13 +452,13 @@ def test_pairs_go_from_a_bucket_to_a_bucket_with_a_calibration_and_a_bad_one_is_
 
 
 def test_the_command_tells_how_it_went(engine, tmp_path, capsys):
-    source, out = write_pairs(tmp_path / "pairs", numbered(2)), tmp_path / "out"
+    source, out = write_pairs(tmp_path / "pairs", number_names(2)), tmp_path / "out"
     (source / "left" / "01.png").write_bytes(b"none")
     assert main(["batch", str(source), str(out), "--workers", "1"]) == 1
-    told = capsys.readouterr()
-    assert told.out.splitlines()[0] == f"{out}: 2 pairs: 1 made, 1 failed"
-    assert told.out.splitlines()[1].startswith(f"failed: 01: {source}/left/01.png: expected a picture")
-    assert told.out.splitlines()[2] == f"manifest: {out / 'manifest'}"
+    printed = capsys.readouterr()
+    assert printed.out.splitlines()[0] == f"{out}: 2 pairs: 1 made, 1 failed"
+    assert printed.out.splitlines()[1].startswith(f"failed: 01: {source}/left/01.png: expected a picture")
+    assert printed.out.splitlines()[2] == f"manifest: {out / 'manifest'}"
     assert main(["batch", str(source), str(out), "--json"]) == 1
     facts = json.loads(capsys.readouterr().out)
     assert (facts["made"], facts["there"], facts["failed"], list(facts["named"])) == (0, 1, 1, ["01"])

@@ -12,7 +12,7 @@ import ray
 import typer
 import yaml
 
-from stereoweave.batch.manifest import MOST_IN_A_CHUNK, _rows_schema
+from stereoweave.batch.manifest import MOST_IN_A_CHUNK, _make_rows_schema
 from stereoweave.cli.root import app
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -174,7 +174,7 @@ def test_one_version_of_ray_is_named_everywhere():
 def test_the_columns_that_the_page_names_are_the_manifest_s():
     (table,) = re.findall(r"\| column \|.*?\n\n", PAGE, re.DOTALL)
     names = re.findall(r"`(\w+)`", "".join(line.split("|")[1] for line in table.split("\n") if line))
-    assert names == _rows_schema().names
+    assert names == _make_rows_schema().names
 
 
 def test_links_lead_somewhere():

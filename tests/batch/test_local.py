@@ -18,7 +18,7 @@ import pytest
 from other_processes import halted
 from rich.console import Console
 
-from stereoweave.batch.local import DONE_FILE, LocalTally, depth_of_many, run_batch
+from stereoweave.batch.local import DONE_FILE, LocalTally, run_batch, run_batch_command
 from stereoweave.cli.root import main
 from stereoweave.errors import OutputInUseError, StereoweaveError
 from stereoweave.io.images import read_image, write_image
@@ -37,33 +37,32 @@ JOB = DepthJob(backend=Backend(threads=1), always=("disparity.pfm", "preview.png
 PROGRAM = """
 import sys
 from pathlib import Path
-from stereoweave.batch.local import depth_of_many
-from stereoweave.matching.backend import Backend, _load
-from stereoweave.matching.matcher import model_file
+from stereoweave.batch.local import run_batch_command
+from stereoweave.matching.backend import Backend
 from stereoweave.pictures.pair_finding import find_pairs_in
 from stereoweave.outputs.results import DepthJob
 
 if __name__ == "__main__":
     job = DepthJob(backend=Backend(threads=1), always=("disparity.pfm", "preview.png", "confidence.png"))
-    sys.exit(depth_of_many(find_pairs_in(Path(sys.argv[1])), Path(sys.argv[2]), job, processes=2))
+    sys.exit(run_batch_command(find_pairs_in(Path(sys.argv[1])), Path(sys.argv[2]), job, processes=2))
 """
 
 
-class Deadly(NamedPair):
+class KillingPair(NamedPair):
     """A pair that kills the process it is sent to."""
 
     def __reduce__(self):
-        return os.kill, (_own_id(), signal.SIGKILL)
+        return os.kill, (_OwnPid(), signal.SIGKILL)
 
 
-class Noting(NamedPair):
-    """A pair that notes beside its left picture how many threads the process has that it is sent to."""
+class ThreadRecordingPair(NamedPair):
+    """A pair that records the threads of the process it is sent to, in a file beside its left picture."""
 
     def __reduce__(self):
-        return noted_pair, (self.name, self.pictures)
+        return record_threads, (self.name, self.pictures)
 
 
-def noted_pair(name: str, pictures: tuple[Path, ...]) -> NamedPair:
+def record_threads(name: str, pictures: tuple[Path, ...]) -> NamedPair:
     threads = cv2.getNumThreads(), os.environ["OPENBLAS_NUM_THREADS"]
     pictures[0].with_suffix(".txt").write_text("{} {}".format(*threads))
     return NamedPair(name, pictures)
@@ -81,7 +80,7 @@ def remove_model(name: str, pictures: tuple[Path, ...]) -> NamedPair:
     return NamedPair(name, pictures)
 
 
-class _own_id:
+class _OwnPid:
     """The id of whichever process unpickles it."""
 
     def __reduce__(self):
@@ -99,25 +98,25 @@ def write_pairs(folder: Path, count: int, size_px=(96, 64)) -> Path:
     return folder
 
 
-def batch(folder: Path, out: Path, job: DepthJob = JOB, **options) -> tuple[LocalTally, str]:
+def run_quietly(folder: Path, out: Path, job: DepthJob = JOB, **options) -> tuple[LocalTally, str]:
     """The tally, and what was shown meanwhile."""
     shown = io.StringIO()
     options.setdefault("pairs", find_pairs_in(folder).pairs)
     return run_batch(out=out, job=job, console=Console(file=shown), **options), shown.getvalue()
 
 
-def made_at_ns(out: Path) -> dict[str, int]:
+def read_write_times_ns(out: Path) -> dict[str, int]:
     return {path.parent.name: path.stat().st_mtime_ns for path in out.glob(f"*/{DONE_FILE}")}
 
 
-def table(out: Path) -> dict[str, dict[str, str]]:
+def read_summary(out: Path) -> dict[str, dict[str, str]]:
     with (out / "summary.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len({row["name"] for row in rows}) == len(rows)
     return {row["name"]: row for row in rows}
 
 
-def test_a_bad_pair_is_told_and_the_others_are_as_they_are_alone_and_the_next_run_does_what_is_missing(
+def test_a_bad_pair_is_reported_and_the_others_are_as_they_are_alone_and_the_next_run_does_what_is_missing(
     tmp_path,
 ):
     folder, out = write_pairs(tmp_path / "pairs", 4), tmp_path / "out"
@@ -125,7 +124,7 @@ def test_a_bad_pair_is_told_and_the_others_are_as_they_are_alone_and_the_next_ru
     whole = bad.read_bytes()
     bad.write_bytes(whole[:3000])
     start_s = time.perf_counter()
-    tally, shown = batch(folder, out, processes=2)
+    tally, shown = run_quietly(folder, out, processes=2)
     elapsed_s = time.perf_counter() - start_s
     [(name, reason)] = tally.failed
     assert (tally.done, tally.skipped, name) == (3, 0, "01")
@@ -135,21 +134,21 @@ def test_a_bad_pair_is_told_and_the_others_are_as_they_are_alone_and_the_next_ru
     make_depth((folder / "left" / "02.png", folder / "right" / "02.png"), tmp_path / "alone", JOB)
     for file in ("disparity.pfm", "preview.png", "confidence.png"):
         assert (out / "02" / file).read_bytes() == (tmp_path / "alone" / file).read_bytes()
-    rows = table(out)
+    rows = read_summary(out)
     assert list(rows) == ["00", "01", "02", "03"]
     assert rows["01"]["error"] == reason
     assert rows["02"]["pictures"] == "02.png + 02.png"
     assert 0 < float(rows["02"]["seconds"]) < elapsed_s
 
-    before = made_at_ns(out)
+    before = read_write_times_ns(out)
     bad.write_bytes(whole)
     write_image(folder / "left" / "03.png", read_image(folder / "left" / "03.png")[::-1])
     (out / "00" / "disparity.pfm").unlink()
-    tally, shown = batch(folder, out, processes=1)
+    tally, shown = run_quietly(folder, out, processes=1)
     assert tally == LocalTally(done=3, skipped=1, failed=())
-    after = made_at_ns(out)
+    after = read_write_times_ns(out)
     assert {name for name in after if after[name] != before.get(name)} == {"00", "01", "03"}
-    assert [row["error"] for row in table(out).values()] == [""] * 4
+    assert [row["error"] for row in read_summary(out).values()] == [""] * 4
     assert sorted(path.name for path in out.iterdir()) == [
         "00",
         "01",
@@ -162,14 +161,14 @@ def test_a_bad_pair_is_told_and_the_others_are_as_they_are_alone_and_the_next_ru
 
 def test_a_pair_that_fails_when_it_is_made_again_is_finished_no_more(tmp_path):
     folder, out = write_pairs(tmp_path / "pairs", 2), tmp_path / "out"
-    assert batch(folder, out, processes=1)[0].done == 2
+    assert run_quietly(folder, out, processes=1)[0].done == 2
     first, second = find_pairs_in(folder).pairs
     second.pictures[1].write_bytes(b"no picture")
-    tally, _ = batch(folder, out, processes=1)
+    tally, _ = run_quietly(folder, out, processes=1)
     assert [name for name, _ in tally.failed] == ["01"]
-    assert list(made_at_ns(out)) == ["00"]
-    batch(folder, out, pairs=[first], processes=1)
-    assert list(table(out)) == ["00"]
+    assert list(read_write_times_ns(out)) == ["00"]
+    run_quietly(folder, out, pairs=[first], processes=1)
+    assert list(read_summary(out)) == ["00"]
 
 
 def test_a_pair_is_there_only_with_its_pictures_and_its_mark_unharmed(tmp_path, capsys):
@@ -177,15 +176,15 @@ def test_a_pair_is_there_only_with_its_pictures_and_its_mark_unharmed(tmp_path, 
     out.mkdir()
     (out / ".DS_Store").touch()  # a folder of which only this is in it is a new one
     pairs = find_pairs_in(folder).pairs
-    assert batch(folder, out, processes=1)[0].done == 3
+    assert run_quietly(folder, out, processes=1)[0].done == 3
     (out / "00" / DONE_FILE).write_text("{")
     pairs[1].pictures[0].unlink()
-    tally, _ = batch(folder, out, pairs=pairs, processes=1)
+    tally, _ = run_quietly(folder, out, pairs=pairs, processes=1)
     assert (tally.done, tally.skipped, [name for name, _ in tally.failed]) == (1, 1, ["01"])
-    assert depth_of_many(FoundPairs(pairs[:1], ("a note",)), out, JOB) == 0
-    told = capsys.readouterr()
-    assert told.out.splitlines()[0] == f"{out}: 1 pair: 0 made, 1 already there"
-    assert told.err.splitlines()[0] == "a note"
+    assert run_batch_command(FoundPairs(pairs[:1], ("a note",)), out, JOB) == 0
+    printed = capsys.readouterr()
+    assert printed.out.splitlines()[0] == f"{out}: 1 pair: 0 made, 1 already there"
+    assert printed.err.splitlines()[0] == "a note"
 
 
 @pytest.mark.parametrize(("processes", "threads"), [(2, 1), (1, usable_cores())])
@@ -194,9 +193,9 @@ def test_several_processes_have_a_thread_each_and_a_single_one_has_all_cores(
 ):
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
     folder = write_pairs(tmp_path / "pairs", 2)
-    pairs = [Noting(pair.name, pair.pictures) for pair in find_pairs_in(folder).pairs]
+    pairs = [ThreadRecordingPair(pair.name, pair.pictures) for pair in find_pairs_in(folder).pairs]
     job = DepthJob(always=("disparity.pfm",))
-    assert batch(folder, tmp_path / "out", job, pairs=pairs, processes=processes)[0].done == 2
+    assert run_quietly(folder, tmp_path / "out", job, pairs=pairs, processes=processes)[0].done == 2
     notes = [pair.pictures[0].with_suffix(".txt").read_text() for pair in pairs]
     assert notes == [f"{threads} {threads}"] * 2
     assert os.environ["OPENBLAS_NUM_THREADS"] == "7"
@@ -215,51 +214,51 @@ def test_a_killed_batch_goes_on_and_so_does_an_interrupted_one_but_none_beside_a
             # Where a shell starts the tests in the background, Ctrl-C is ignored by all that they start.
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
         )
-        while len(made_at_ns(out)) < goal and process.poll() is None:
+        while len(read_write_times_ns(out)) < goal and process.poll() is None:
             time.sleep(0.002)
         with halted(process):
             with pytest.raises(OutputInUseError, match=f"{out}: .* found one that is in use"):
-                batch(folder, out)
+                run_quietly(folder, out)
             os.killpg(process.pid, end)
-        told, errors = process.communicate()
-        made = made_at_ns(out)
+        output, errors = process.communicate()
+        made = read_write_times_ns(out)
         assert goal <= len(made) < 24
         assert made.items() >= before.items()
         before = made
     assert process.returncode == 130
-    assert told == ""
+    assert output == ""
     assert errors.splitlines()[-1] == (
         f"stereoweave: {out}: stopped; finished results are kept; rerun the same command to resume"
     )
     assert "Traceback" not in errors
     assert not list(out.glob(".*"))
 
-    assert depth_of_many(find_pairs_in(folder), out, JOB, processes=2) == 0
+    assert run_batch_command(find_pairs_in(folder), out, JOB, processes=2) == 0
     assert capsys.readouterr().out.splitlines() == [
         f"{out}: 24 pairs: {24 - len(before)} made, {len(before)} already there",
         f"table: {out / 'summary.csv'}",
     ]
-    assert made_at_ns(out).items() >= before.items()
+    assert read_write_times_ns(out).items() >= before.items()
     names = [f"{index:02d}" for index in range(24)]
-    assert sorted(made_at_ns(out)) == names
-    assert list(table(out)) == names
+    assert sorted(read_write_times_ns(out)) == names
+    assert list(read_summary(out)) == names
     assert not list(out.rglob(".*"))
 
 
 def test_a_pair_that_kills_its_process_is_named_and_costs_no_other(tmp_path, capsys):
     folder, out = write_pairs(tmp_path / "pairs", 3), tmp_path / "out"
     first, second, third = find_pairs_in(folder).pairs
-    pairs = [first, Deadly(second.name, second.pictures), third]
-    assert depth_of_many(FoundPairs(pairs), out, JOB, processes=2, as_json=True) == 1
-    told = capsys.readouterr()
-    assert json.loads(told.out) == {
+    pairs = [first, KillingPair(second.name, second.pictures), third]
+    assert run_batch_command(FoundPairs(pairs), out, JOB, processes=2, as_json=True) == 1
+    printed = capsys.readouterr()
+    assert json.loads(printed.out) == {
         "done": 2,
         "skipped": 0,
         "failed": {"01": "its process was killed; is the memory full?"},
         "summary": str(out / "summary.csv"),
     }
-    assert "01: its process was killed" in told.err
-    assert sorted(made_at_ns(out)) == ["00", "02"]
+    assert "01: its process was killed" in printed.err
+    assert sorted(read_write_times_ns(out)) == ["00", "02"]
 
 
 def test_a_model_that_is_replaced_during_a_batch_is_not_taken_up(tmp_path):
@@ -269,7 +268,7 @@ def test_a_model_that_is_replaced_during_a_batch_is_not_taken_up(tmp_path):
     pairs = [first, ModelRemover(second.name, second.pictures)]
     job = replace(JOB, backend=Backend(model=model, threads=1))
     _load.cache_clear()
-    assert batch(folder, out, job, pairs=pairs, processes=1)[0] == LocalTally(2, 0, ())
+    assert run_quietly(folder, out, job, pairs=pairs, processes=1)[0] == LocalTally(2, 0, ())
     assert model.read_bytes() == b"no network"
     assert _load.cache_info().currsize == 0  # in this process, which matches nothing
 
@@ -279,20 +278,22 @@ def test_another_order_or_another_folder_is_refused_before_anything_starts(tmp_p
     calibration = tmp_path / "calib.txt"
     calibration.write_text("first")
     job = DepthJob(request=Request(calibration=calibration))
-    assert batch(folder, out, job, pairs=[])[0] == LocalTally(done=0, skipped=0, failed=())
+    assert run_quietly(folder, out, job, pairs=[])[0] == LocalTally(done=0, skipped=0, failed=())
     with pytest.raises(StereoweaveError, match='batch.json: expected model = "base", .* found "small"'):
-        batch(folder, out, DepthJob(request=Request(calibration=calibration), backend=Backend(model="base")))
+        run_quietly(
+            folder, out, DepthJob(request=Request(calibration=calibration), backend=Backend(model="base"))
+        )
     calibration.write_text("second")
     with pytest.raises(
         StereoweaveError, match=r"expected calibration = .calib.txt \w{12}., .* another folder"
     ):
-        batch(folder, out, job)
+        run_quietly(folder, out, job)
     with pytest.raises(
         StereoweaveError, match="expected a new folder, or one with a batch.json, found left in"
     ):
-        batch(folder, folder)
+        run_quietly(folder, folder)
     with pytest.raises(StereoweaveError, match="nonsense"):
-        batch(folder, tmp_path / "new", DepthJob(backend=Backend(model="nonsense")))
+        run_quietly(folder, tmp_path / "new", DepthJob(backend=Backend(model="nonsense")))
     assert not (tmp_path / "new").exists()
 
 
@@ -301,7 +302,7 @@ def test_a_scenes_own_calibration_gives_its_depth_in_metres_unless_one_is_named_
     (folder / "room").mkdir(parents=True)
     for name in ("left.png", "right.png", "calib.txt"):
         (folder / "room" / name).write_bytes((TEXTURED / name).read_bytes())
-    tally, _ = batch(folder, out, processes=1)
+    tally, _ = run_quietly(folder, out, processes=1)
     assert tally == LocalTally(done=1, skipped=0, failed=())
     own_mm = read_pixels(out / "room" / "depth.png", "I;16")
 
@@ -309,7 +310,7 @@ def test_a_scenes_own_calibration_gives_its_depth_in_metres_unless_one_is_named_
     words = (TEXTURED / "calib.txt").read_text().replace("baseline=100", "baseline=200")
     calibration.write_text(words)
     job = DepthJob(request=Request(calibration=calibration))
-    batch(folder, tmp_path / "other", job, processes=1)
+    run_quietly(folder, tmp_path / "other", job, processes=1)
     other_mm = read_pixels(tmp_path / "other" / "room" / "depth.png", "I;16")
     assert np.median(other_mm / own_mm) == pytest.approx(2, rel=1e-3)
 
@@ -319,14 +320,14 @@ def test_the_command_takes_a_list_and_makes_no_reports_unless_they_are_asked_for
     (folder / "list.txt").write_text("left/00.png right/00.png quay\nleft/01.png right/none.png\n")
     words = ["depth", "--list", str(folder / "list.txt"), "--jobs", "1", "--threads", "1", "-o"]
     assert main([*words, str(out)]) == 1
-    told = capsys.readouterr()
+    printed = capsys.readouterr()
     reason = f"01: {folder / 'right' / 'none.png'}: expected a picture, found no such file"
-    assert told.out.splitlines() == [
+    assert printed.out.splitlines() == [
         f"{out}: 2 pairs: 1 made, 1 failed",
         f"failed: {reason}",
         f"table: {out / 'summary.csv'}",
     ]
-    assert reason in told.err
+    assert reason in printed.err
     assert (out / "quay" / "disparity.pfm").exists()
     assert not (out / "quay" / "report.html").exists()
     assert main([*words, str(tmp_path / "reports"), "--write", "report.html"]) == 1
