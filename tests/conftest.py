@@ -22,7 +22,7 @@ from uuid import uuid4
 import jaxtyping
 import numpy as np
 import pytest
-from other_processes import free_ports, processes_of
+from other_processes import find_free_ports, list_processes
 from xdist.workermanage import WorkerController
 
 TESTDATA = Path(
@@ -149,7 +149,7 @@ def guarded_ray_address() -> Iterator[str]:
 @contextmanager
 def ray_head(cpus: int, **variables: str) -> Iterator[str]:
     """Ray, started by its own command and on ports of its own, for as long as the block lasts."""
-    port, client_port = free_ports(2)
+    port, client_port = find_free_ports(2)
     # Directly below /tmp: the names of Unix sockets have at most 107 bytes.
     with tempfile.TemporaryDirectory(prefix="sw-", dir="/tmp", ignore_cleanup_errors=True) as folder:
         options = {
@@ -186,7 +186,7 @@ def ray_head(cpus: int, **variables: str) -> Iterator[str]:
             yield f"127.0.0.1:{port}"
         finally:
             # Ended politely it would wait for half a minute; all its processes end with those of the node.
-            for process in processes_of(head.pid):
+            for process in list_processes(head.pid):
                 with suppress(ProcessLookupError):
                     os.kill(process, signal.SIGKILL)
             head.wait()

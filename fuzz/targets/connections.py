@@ -15,7 +15,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from fuzz.requests import ServerError, request_bytes
 from fuzz.targets import Target
 from stereoweave.errors import StereoweaveError
-from stereoweave.service.server import Patience, http_server
+from stereoweave.service.server import ClientTimeouts, run_http_server
 
 ANSWERED_S = 3.0
 # The client closes after this time without data, so that later requests on the connection are answered too.
@@ -107,7 +107,7 @@ def _address(app: ASGIApp) -> tuple[str, int]:
 
 
 def _serve(app: ASGIApp, listener: socket.socket) -> None:
-    with http_server(app, listener, Patience(head_s=1, reader_s=1, end_s=1)):
+    with run_http_server(app, listener, ClientTimeouts(head_s=1, reader_s=1, end_s=1)):
         threading.Event().wait()
 
 

@@ -12,7 +12,7 @@ from fuzz.targets import Target, calibrations
 from fuzz.targets.pictures import encode_picture, eyes
 from stereoweave.errors import StereoweaveError
 from stereoweave.matching.matcher import Matcher
-from stereoweave.service.answers import Answer, ServiceJob, answer_many, check_pixels
+from stereoweave.service.answers import ServiceAnswer, ServiceJob, answer_many, check_pixels
 from stereoweave.service.asgi import Guard, Limits, make_app
 
 # A first view compiles its kernels.
@@ -43,7 +43,7 @@ def _starts() -> dict[str, bytes]:
 def _application() -> Application:
     matcher = Matcher("small", threads=1)
 
-    async def answering(job: ServiceJob, left_s: float) -> Answer:
+    async def answering(job: ServiceJob, left_s: float) -> ServiceAnswer:
         check_pixels(job)
         (answer,) = await asyncio.to_thread(answer_many, matcher, [job])
         if isinstance(answer, Exception):

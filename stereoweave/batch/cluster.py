@@ -31,7 +31,7 @@ from stereoweave.matching.providers import CPU
 from stereoweave.outputs.results import DepthJob, job_facts
 from stereoweave.pictures.pair_finding import BATCH_FILE
 from stereoweave.system.progress import progress
-from stereoweave.system.ray_engine import Engine, connect, room, stream
+from stereoweave.system.ray_engine import Engine, connect, count_slots, stream
 
 # Ray Data keeps state per task. Above this number of chunks, several share a task.
 _MOST_TASKS = 2000
@@ -89,7 +89,7 @@ def run_cluster(
     source_store.check_source()
     destination_store.check_destination()
     with _lock_folder(destination_store), connect(engine):
-        workers = room(engine)
+        workers = count_slots(engine)
         _claim(destination_store, job, source_store)
         plan = extend_plan(source_store, destination_store, min(workers, engine.workers or workers))
         for note in plan.notes:

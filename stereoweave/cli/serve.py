@@ -87,7 +87,7 @@ def serve(  # noqa: PLR0913 - each is an option of the command line
         from pydantic import SecretStr
 
         from stereoweave.service.asgi import Limits
-        from stereoweave.service.deployment import GPU_PROVIDERS, Settings, serving
+        from stereoweave.service.deployment import GPU_PROVIDERS, Settings, run_service
 
     numbers = {
         "--max-megabytes": max_megabytes,
@@ -116,7 +116,7 @@ def serve(  # noqa: PLR0913 - each is an option of the command line
             limits=limits,
         )
         url = format_url(host, listener.getsockname()[1])
-        with serving(settings, listener, address):
+        with run_service(settings, listener, address):
             _wait_for_signal(f"Stereoweave: {url}, described by {url}/openapi.json; Ctrl-C stops it")
 
 

@@ -25,7 +25,7 @@ class BusyError(StereoweaveError):
 
 
 class Budget:
-    """The accepted work of one process, and its time per unit of `work_of`.
+    """The accepted work of one process, and its time per unit of `estimate_work`.
 
     A request is refused permanently if it could not finish in time at the best speed so far. It is refused
     temporarily if it would be late after the accepted ones at the usual speed, the median of the last few.
@@ -44,7 +44,7 @@ class Budget:
             TooLargeError: If the job alone takes longer than `left_s`.
             BusyError: If it takes longer than that after the accepted ones.
         """
-        work = work_of(job, megapixels)
+        work = estimate_work(job, megapixels)
         least_s = work * self._best_each_s
         if least_s > left_s:
             raise TooLargeError(
@@ -73,7 +73,7 @@ class Budget:
         self._latest_each_s.append(each_s)
 
 
-def work_of(job: ServiceJob, megapixels: float) -> float:
+def estimate_work(job: ServiceJob, megapixels: float) -> float:
     """The work of a job, in megapixels of unrefined disparity of small pictures that take as long."""
     large = _LARGE if megapixels > _LARGE_FROM_MEGAPIXELS else 1
     refined = _REFINED if job.match_options.refined else 1

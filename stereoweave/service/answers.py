@@ -95,14 +95,14 @@ class ServiceJob:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Answer:
+class ServiceAnswer:
     """The bytes of a file, and its report in JSON: the fields of `Summary`, and notes."""
 
     content: bytes
     report: str
 
 
-Answering = Callable[[Sequence[ServiceJob]], list[Answer | Exception]]
+BatchAnswerer = Callable[[Sequence[ServiceJob]], list[ServiceAnswer | Exception]]
 
 
 def check_pixels(job: ServiceJob) -> float:
@@ -131,30 +131,30 @@ def _check_megapixels(path: Path, size_px: tuple[int, ...], most_megapixels: flo
     return megapixels
 
 
-def make_measuring() -> Callable[[ServiceJob], float]:
+def load_measurer() -> Callable[[ServiceJob], float]:
     """Return the function that measures a job's pictures, for a `ChildProcess`."""
     return check_pixels
 
 
-def make_answering(backend: Backend) -> Answering:
+def load_answerer(backend: Backend) -> BatchAnswerer:
     """Load the network and return the function that answers jobs with it, for a `ChildProcess`."""
     return partial(answer_many, backend.matcher())
 
 
-def answer_many(matcher: Matcher, jobs: Sequence[ServiceJob]) -> list[Answer | Exception]:
+def answer_many(matcher: Matcher, jobs: Sequence[ServiceJob]) -> list[ServiceAnswer | Exception]:
     """Return each job's answer or error; jobs with equal options are matched together."""
-    outcome: dict[int, Any] = {}
-    alike: dict[MatchOptions, list[int]] = {}
+    outcomes: dict[int, Any] = {}
+    by_options: dict[MatchOptions, list[int]] = {}
     for at, job in enumerate(jobs):
-        outcome[at] = _attempt(_prepare, job)
-        if isinstance(outcome[at], Prepared):
-            alike.setdefault(job.match_options, []).append(at)
-    for options, places in alike.items():
-        found = _match_together(matcher, options, [outcome[at] for at in places])
-        for at, result in zip(places, found, strict=True):
+        outcomes[at] = _attempt(_prepare, job)
+        if isinstance(outcomes[at], Prepared):
+            by_options.setdefault(job.match_options, []).append(at)
+    for options, indices in by_options.items():
+        found = _match_together(matcher, options, [outcomes[at] for at in indices])
+        for at, result in zip(indices, found, strict=True):
             failed = isinstance(result, Exception)
-            outcome[at] = result if failed else _attempt(_answer, matcher, jobs[at], result)
-    return [outcome[at] for at in range(len(jobs))]
+            outcomes[at] = result if failed else _attempt(_answer, matcher, jobs[at], result)
+    return [outcomes[at] for at in range(len(jobs))]
 
 
 def field_name(setting: str) -> str | None:
@@ -199,7 +199,7 @@ def _match_together(
     return [found for each in prepared for found in _match_together(matcher, options, [each])]
 
 
-def _answer(matcher: Matcher, job: ServiceJob, result: Result) -> Answer:
+def _answer(matcher: Matcher, job: ServiceJob, result: Result) -> ServiceAnswer:
     # The network's own name, because it may have been loaded from a path of this machine.
     summary = replace(result.summary, model=matcher.name)
     notes = [*result.notes, *(result.warnings() if job.checked else ())]
@@ -211,7 +211,7 @@ def _answer(matcher: Matcher, job: ServiceJob, result: Result) -> Answer:
             write_image(path, renderer.view(job.position).image)
         else:
             _write_map(path, result)
-        return Answer(content=path.read_bytes(), report=_report(summary, notes, job.folder))
+        return ServiceAnswer(content=path.read_bytes(), report=_make_report(summary, notes, job.folder))
 
 
 def _write_map(path: Path, result: Result) -> None:
@@ -225,6 +225,6 @@ def _write_map(path: Path, result: Result) -> None:
         ) from error
 
 
-def _report(summary: Summary, notes: Sequence[Note], folder: Path) -> str:
+def _make_report(summary: Summary, notes: Sequence[Note], folder: Path) -> str:
     lines = [strip_paths(note.format(field_name), folder)[:_LONGEST_NOTE] for note in notes]
     return json.dumps(asdict(summary) | {"notes": lines}, allow_nan=False)

@@ -23,7 +23,7 @@ from stereoweave.service.admission import BusyError
 from stereoweave.service.answers import (
     MEDIA_TYPES,
     MOST_MEGAPIXELS,
-    Answer,
+    ServiceAnswer,
     ServiceJob,
     TooLargeError,
     field_name,
@@ -72,7 +72,7 @@ _Server = Callable[[_Message, _Receive, _Send], Coroutine[Any, Any, None]]
 # Errors whose message is sent to the client. TimeoutError is an OSError.
 FAILURES = (StereoweaveError, OSError, MemoryError)
 # Answers a job within the given seconds.
-Answering = Callable[[ServiceJob, float], Awaitable[Answer]]
+JobAnswerer = Callable[[ServiceJob, float], Awaitable[ServiceAnswer]]
 
 
 class Limits(BaseModel):
@@ -102,12 +102,12 @@ _ViewForm = Annotated[ViewForm, Form(media_type="multipart/form-data")]
 
 
 def make_app(
-    answering: Answering, limits: Limits, folder: Path, registry: CollectorRegistry | None = None
+    answer_job: JobAnswerer, limits: Limits, folder: Path, registry: CollectorRegistry | None = None
 ) -> FastAPI:
     """Make the application.
 
     Args:
-        answering: Answers a job.
+        answer_job: Answers a job.
         limits: What it accepts.
         folder: Holds uploads until they are processed.
         registry: Metrics to serve at /metrics; None for no such path.
@@ -127,19 +127,21 @@ def make_app(
     async def _refuse(_: Request, error: RequestValidationError) -> Response:
         return JSONResponse({"detail": _join_errors(error)}, 422)
 
-    respond = _Responder(answering, limits.megapixels, folder)
+    respond = _Responder(answer_job, limits.megapixels, folder)
 
-    @app.post("/disparity", responses=_responses(".png", ".pfm", ".npy", ".tiff"), response_class=Response)
+    @app.post(
+        "/disparity", responses=_list_responses(".png", ".pfm", ".npy", ".tiff"), response_class=Response
+    )
     async def disparity(request: Request, form: _MapForm) -> Response:
         """Estimate the left view's disparity in pixels."""
         return await respond(request, form, f"disparity.{form.file}")
 
-    @app.post("/depth", responses=_responses(".png", ".pfm", ".npy", ".tiff"), response_class=Response)
+    @app.post("/depth", responses=_list_responses(".png", ".pfm", ".npy", ".tiff"), response_class=Response)
     async def depth(request: Request, form: _MapForm) -> Response:
         """Estimate the left view's metric depth; needs a camera: calib, focal_px and baseline_m, or EXIF."""
         return await respond(request, form, f"depth.{form.file}")
 
-    @app.post("/view", responses=_responses(".png", ".jpg"), response_class=Response)
+    @app.post("/view", responses=_list_responses(".png", ".jpg"), response_class=Response)
     async def view(request: Request, form: _ViewForm) -> Response:
         """Render the view from another position on the line through the two cameras."""
         return await respond(request, form, f"view.{form.file}")
@@ -159,7 +161,7 @@ def make_app(
     return app
 
 
-def _responses(*endings: str) -> dict[int | str, dict[str, Any]]:
+def _list_responses(*endings: str) -> dict[int | str, dict[str, Any]]:
     files = {MEDIA_TYPES[ending]: {"schema": {"type": "string", "format": "binary"}} for ending in endings}
     report = {
         "X-Stereoweave-Report": {"description": "Statistics and notes in JSON.", "schema": {"type": "string"}}
@@ -177,7 +179,7 @@ def _join_errors(error: RequestValidationError) -> str:
 class _Responder:
     """Makes responses to forms; each form's files are in a folder of its own until then."""
 
-    answering: Answering
+    answer_job: JobAnswerer
     most_megapixels: float
     folder: Path
 
@@ -185,7 +187,7 @@ class _Responder:
         with self._make_folder() as name:
             try:
                 job = await asyncio.to_thread(store_uploads, form, Path(name), file, self.most_megapixels)
-                answer = await self.answering(job, request.state.deadline_s - time.monotonic())
+                answer = await self.answer_job(job, request.state.deadline_s - time.monotonic())
             except FAILURES as error:
                 raise _make_http_exception(error, Path(name)) from error
         return _make_response(answer, file)
@@ -201,7 +203,7 @@ class _Responder:
             raise _make_http_exception(error, self.folder) from error
 
 
-def _make_response(answer: Answer, name: str) -> Response:
+def _make_response(answer: ServiceAnswer, name: str) -> Response:
     headers = {
         "Content-Disposition": f'attachment; filename="{name}"',
         "X-Stereoweave-Report": answer.report,
@@ -215,10 +217,10 @@ def _make_http_exception(error: Exception, folder: Path) -> HTTPException:
     if not isinstance(error, StereoweaveError | TimeoutError):
         found = detail or "too little memory"
         detail = f"expected room for the request on disk and in memory, found {found}; try again later"
-    return HTTPException(_status(error), detail, headers)
+    return HTTPException(_find_status(error), detail, headers)
 
 
-def _status(error: Exception) -> int:
+def _find_status(error: Exception) -> int:
     match error:
         case TooLargeError():
             return 413
@@ -274,7 +276,7 @@ class Guard:
         exchange = _Exchange(receive, send, self._limits)
         # Unknown paths share a label: clients must not add labels.
         path = scope["path"] if scope["path"] in _PATHS else "none"
-        refusal = self._refusal(Headers(scope=scope))
+        refusal = self._find_refusal(Headers(scope=scope))
         try:
             if refusal is None:
                 await self._accept(scope, exchange)
@@ -286,7 +288,7 @@ class Guard:
             if self._metrics:
                 self._metrics.requests.labels(path, str(exchange.status or _CLIENT_GONE)).inc()
 
-    def _refusal(self, headers: Headers) -> Response | None:
+    def _find_refusal(self, headers: Headers) -> Response | None:
         """Return the error response if the header already rules the request out."""
         if not self._has_token(headers):
             return _refuse_token()

@@ -27,27 +27,27 @@ from ray.serve.schema import LoggingConfig
 from stereoweave.errors import Remedy, StereoweaveError
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.matcher import Matcher
-from stereoweave.service.admission import Budget, work_of
-from stereoweave.service.answers import Answer, ServiceJob, make_answering
+from stereoweave.service.admission import Budget, estimate_work
+from stereoweave.service.answers import ServiceAnswer, ServiceJob, load_answerer
 from stereoweave.service.asgi import FAILURES, Guard, Limits, make_app
-from stereoweave.service.folders import own_folder
-from stereoweave.service.server import Patience, http_server
-from stereoweave.service.worker import Task, Worker
+from stereoweave.service.folders import make_own_folder
+from stereoweave.service.replica_processes import ReplicaProcesses, TimedJob
+from stereoweave.service.server import ClientTimeouts, run_http_server
 from stereoweave.system.child_process import ProcessDiedError
-from stereoweave.system.ray_engine import Engine, call_on_each_machine, connect, room
+from stereoweave.system.ray_engine import Engine, call_on_each_machine, connect, count_slots
 from stereoweave.system.threads import usable_cores
 
 NAME = "stereoweave"
 GPU_PROVIDERS = ("cuda", "tensorrt")
 # Requests that wake up together arrive within this time.
-_GATHERED_WITHIN_S = 0.005
+_GATHERING_S = 0.005
 # All pairs of a batch are in memory at once, so a batch holds fewer large ones.
 _MEGAPIXELS_AT_ONCE = 32
 # In addition to waiting requests: these are refused, or ask for its health.
-_MOST_AT_DOOR = 200
+_MOST_QUEUED = 200
 # A replica starts in seconds; the first on a machine also compiles the kernels.
-_TRIAL_WITHIN_S = 120
-_QUIET = LoggingConfig(log_level="ERROR", enable_access_log=False)
+_TRIAL_LIMIT_S = 120
+_LOGGING = LoggingConfig(log_level="ERROR", enable_access_log=False)
 
 
 class Settings(BaseModel):
@@ -88,65 +88,66 @@ class Replica:
     """A process of the service that answers jobs; on a cluster also HTTP requests."""
 
     def __init__(self, settings: Settings) -> None:
-        self._settings, self._opened = settings, ExitStack()
-        self._folder = self._opened.enter_context(own_folder())
-        self._worker = _make_worker(settings, self._folder)
-        self._opened.callback(self._worker.close)
-        self._budget = Budget(self._worker.warm_up())
-        # One thread for each process of the worker: calls that wait for it are not sent yet, and can be
-        # cancelled.
-        self._measuring, self._answering = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
-        self._free = asyncio.Event()
-        self._free.set()
-        self._together = serve.batch(
-            max_batch_size=settings.batch, batch_wait_timeout_s=_GATHERED_WITHIN_S, batch_size_fn=self._size
-        )(self._answered)
+        self._settings, self._resources = settings, ExitStack()
+        self._folder = self._resources.enter_context(make_own_folder())
+        self._processes = _make_processes(settings, self._folder)
+        self._resources.callback(self._processes.close)
+        self._budget = Budget(self._processes.warm_up())
+        # One thread for each process: calls that wait for it are not sent yet, and can be cancelled.
+        self._measuring_thread, self._answering_thread = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
+        self._idle = asyncio.Event()
+        self._idle.set()
+        self._answer_in_batch = serve.batch(
+            max_batch_size=settings.batch, batch_wait_timeout_s=_GATHERING_S, batch_size_fn=self._count_share
+        )(self._answer_batch)
 
     def __del__(self) -> None:  # Ray Serve calls it to end a replica
-        self._opened.close()
+        self._resources.close()
 
     def __serve_build_asgi_app__(self) -> Guard:
         limits = self._settings.limits
         return Guard(make_app(self._answer, limits, self._folder), limits)
 
-    async def outcome(self, job: ServiceJob, left_s: float) -> Answer | Exception:
+    async def try_answer(self, job: ServiceJob, left_s: float) -> ServiceAnswer | Exception:
         """The answer to a job within the seconds that are left for it, or the error."""
         try:
             return await self._answer(job, left_s)
         except FAILURES as error:
             return error
 
-    async def _answer(self, job: ServiceJob, left_s: float) -> Answer:
+    async def _answer(self, job: ServiceJob, left_s: float) -> ServiceAnswer:
         """The answer to a job. A job that is cancelled while it waits never starts."""
         deadline_s = time.monotonic() + left_s
         loop = asyncio.get_running_loop()
-        megapixels = await loop.run_in_executor(self._measuring, self._worker.measure, job, left_s)
+        megapixels = await loop.run_in_executor(self._measuring_thread, self._processes.measure, job, left_s)
         with self._budget.admit(job, megapixels, deadline_s - time.monotonic()):
             # Otherwise each job that arrives during a match would become a batch of its own.
-            await self._free.wait()
-            answer = await self._together(Task(job, megapixels, deadline_s))
+            await self._idle.wait()
+            answer = await self._answer_in_batch(TimedJob(job, megapixels, deadline_s))
         if isinstance(answer, Exception):
             raise answer
         return answer
 
-    async def _answered(self, tasks: list[Task]) -> list[Answer | Exception]:
-        self._free.clear()
+    async def _answer_batch(self, timed_jobs: list[TimedJob]) -> list[ServiceAnswer | Exception]:
+        self._idle.clear()
         start_s = time.perf_counter()
         try:
             loop = asyncio.get_running_loop()
-            answers = await loop.run_in_executor(self._answering, self._worker.answer, tasks)
+            answers = await loop.run_in_executor(self._answering_thread, self._processes.answer, timed_jobs)
         finally:
-            self._free.set()
-        if all(isinstance(answer, Answer | TimeoutError) for answer in answers):
-            work = sum(work_of(task.job, task.megapixels) for task in tasks)
-            finished = all(isinstance(answer, Answer) for answer in answers)
+            self._idle.set()
+        if all(isinstance(answer, ServiceAnswer | TimeoutError) for answer in answers):
+            work = sum(estimate_work(timed.job, timed.megapixels) for timed in timed_jobs)
+            finished = all(isinstance(answer, ServiceAnswer) for answer in answers)
             self._budget.learn(work, time.perf_counter() - start_s, finished=finished)
         return answers
 
-    def _size(self, tasks: Sequence[Task]) -> int:
-        """The share of a batch that tasks fill, in pairs."""
+    def _count_share(self, timed_jobs: Sequence[TimedJob]) -> int:
+        """Return the share of a batch that jobs fill, in pairs."""
         most = self._settings.batch
-        return sum(min(math.ceil(task.megapixels * most / _MEGAPIXELS_AT_ONCE), most) for task in tasks)
+        return sum(
+            min(math.ceil(timed.megapixels * most / _MEGAPIXELS_AT_ONCE), most) for timed in timed_jobs
+        )
 
 
 def application(settings: Settings) -> serve.Application:
@@ -155,18 +156,18 @@ def application(settings: Settings) -> serve.Application:
         name=NAME,
         num_replicas=settings.replicas,
         ray_actor_options={"num_cpus": settings.threads, "num_gpus": settings.gpus_each},
-        max_ongoing_requests=settings.limits.waiting + _MOST_AT_DOOR,
-        max_queued_requests=_MOST_AT_DOOR,
+        max_ongoing_requests=settings.limits.waiting + _MOST_QUEUED,
+        max_queued_requests=_MOST_QUEUED,
         graceful_shutdown_timeout_s=settings.limits.timeout_s,
         # If a network fails to load, further tries fail too.
         max_constructor_retry_count=2,
-        logging_config=_QUIET,
+        logging_config=_LOGGING,
     )
     return deployed(Replica).bind(settings)
 
 
 @contextmanager
-def serving(settings: Settings, listener: socket.socket, address: str | None = None) -> Iterator[None]:
+def run_service(settings: Settings, listener: socket.socket, address: str | None = None) -> Iterator[None]:
     """Run the service within the block; at its end finish the accepted requests.
 
     Args:
@@ -181,29 +182,29 @@ def serving(settings: Settings, listener: socket.socket, address: str | None = N
     address = address or os.environ.get("RAY_ADDRESS")
     engine = Engine(address, cpus_each=settings.threads, gpus_each=settings.gpus_each)
     if address is None:
-        _check_room(settings, usable_cores() // settings.threads)
+        _check_slots(settings, usable_cores() // settings.threads)
         # Report its errors before Ray starts, which takes seconds.
         Matcher(settings.model, provider=settings.provider)
     logging.getLogger("ray.serve").setLevel(logging.CRITICAL)
     with connect(engine):
         _check_free(address)
-        _check_room(settings, _room(engine))
-        with (_at_proxies if address else _at_server)(settings, listener):
+        _check_slots(settings, _count_replica_slots(engine))
+        with (_serve_at_proxies if address else _serve_at_server)(settings, listener):
             yield
 
 
 @contextmanager
-def _at_server(settings: Settings, listener: socket.socket) -> Iterator[None]:
+def _serve_at_server(settings: Settings, listener: socket.socket) -> Iterator[None]:
     """Serve from an HTTP server in this process that passes jobs to the replicas."""
     limits = settings.limits
     limits = limits.model_copy(update={"waiting": limits.waiting * settings.replicas})
-    serve.start(proxy_location="Disabled", logging_config=_QUIET)
+    serve.start(proxy_location="Disabled", logging_config=_LOGGING)
     with ExitStack() as ending:
-        ending.callback(_end)
-        handle = _run(settings)
+        ending.callback(_stop_replicas)
+        handle = _start_replicas(settings)
 
-        async def answer(job: ServiceJob, left_s: float) -> Answer:
-            response = handle.outcome.remote(job, left_s)
+        async def answer(job: ServiceJob, left_s: float) -> ServiceAnswer:
+            response = handle.try_answer.remote(job, left_s)
             try:
                 outcome = await response
             except asyncio.CancelledError:
@@ -217,24 +218,24 @@ def _at_server(settings: Settings, listener: socket.socket) -> Iterator[None]:
                 raise outcome
             return outcome
 
-        folder = ending.enter_context(own_folder())
+        folder = ending.enter_context(make_own_folder())
         registry = CollectorRegistry()
         app = Guard(make_app(answer, limits, folder, registry), limits, registry)
-        ending.enter_context(http_server(app, listener, Patience(end_s=limits.timeout_s)))
+        ending.enter_context(run_http_server(app, listener, ClientTimeouts(end_s=limits.timeout_s)))
         yield
 
 
 @contextmanager
-def _at_proxies(settings: Settings, listener: socket.socket) -> Iterator[None]:
+def _serve_at_proxies(settings: Settings, listener: socket.socket) -> Iterator[None]:
     """Serve from the HTTP proxies of Ray Serve, one on each machine."""
     host, port = listener.getsockname()[:2]
     listener.close()
-    serve.start(http_options={"host": host, "port": port}, logging_config=_QUIET)
+    serve.start(http_options={"host": host, "port": port}, logging_config=_LOGGING)
     try:
-        _run(settings)
+        _start_replicas(settings)
         yield
     finally:
-        _end()
+        _stop_replicas()
         serve.shutdown()  # type: ignore[no-untyped-call]
 
 
@@ -248,7 +249,7 @@ def _check_free(address: str | None) -> None:
         )
 
 
-def _run(settings: Settings) -> DeploymentHandle[Any]:
+def _start_replicas(settings: Settings) -> DeploymentHandle[Any]:
     """Start the replicas and wait until their networks are loaded."""
     try:
         return serve.run(application(settings), name=NAME, route_prefix="/")
@@ -260,34 +261,34 @@ def _run(settings: Settings) -> DeploymentHandle[Any]:
 
 def _find_start_error(settings: Settings) -> StereoweaveError | None:
     """Return why replicas did not start, from a trial on each machine: Ray Serve reports it only as text."""
-    _end()  # replicas that did start may leave no room
+    _stop_replicas()  # replicas that did start may leave no room
     engine = Engine(cpus_each=settings.threads, gpus_each=settings.gpus_each)
-    errors = call_on_each_machine(_try_start, settings, engine, _TRIAL_WITHIN_S)
+    errors = call_on_each_machine(_try_start, settings, engine, _TRIAL_LIMIT_S)
     return next(filter(None, errors), None)
 
 
 def _try_start(settings: Settings) -> StereoweaveError | None:
     """Do what a replica does to start; return the error, if any."""
     try:
-        with own_folder() as folder, closing(_make_worker(settings, folder)) as worker:
-            worker.warm_up()
+        with make_own_folder() as folder, closing(_make_processes(settings, folder)) as processes:
+            processes.warm_up()
     except StereoweaveError as error:
         return error
     return None
 
 
-def _make_worker(settings: Settings, folder: Path) -> Worker:
-    return Worker(partial(make_answering, settings.backend), folder)
+def _make_processes(settings: Settings, folder: Path) -> ReplicaProcesses:
+    return ReplicaProcesses(partial(load_answerer, settings.backend), folder)
 
 
-def _end() -> None:
+def _stop_replicas() -> None:
     """End the replicas, each after its accepted requests."""
     while NAME in serve.status().applications:
         with suppress(TimeoutError):  # raised after a minute; a request may take longer
             serve.delete(NAME)
 
 
-def _check_room(settings: Settings, found: int) -> None:
+def _check_slots(settings: Settings, found: int) -> None:
     """Raise an error if the replicas do not fit: Ray would wait for more room without a message."""
     if settings.replicas > found:
         gpu = " and a GPU" if settings.gpus_each else ""
@@ -299,9 +300,9 @@ def _check_room(settings: Settings, found: int) -> None:
         )
 
 
-def _room(engine: Engine) -> int:
+def _count_replica_slots(engine: Engine) -> int:
     """The number of replicas that fit on the cluster."""
     try:
-        return room(engine)
+        return count_slots(engine)
     except StereoweaveError:  # none fits; the error names settings of another command
         return 0

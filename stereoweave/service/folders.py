@@ -13,7 +13,7 @@ _PREFIX, _LOCK = "stereoweave-service-", ".lock"
 
 
 @contextmanager
-def own_folder() -> Iterator[Path]:
+def make_own_folder() -> Iterator[Path]:
     """Make a temporary folder for the block, readable by this user only.
 
     A lock file beside it marks it as in use. The system releases the lock when the process ends in any way.

@@ -26,7 +26,7 @@ _MOST_CONNECTIONS, _WAITING_CONNECTIONS = 500, 100
 
 
 @dataclass(frozen=True)
-class Patience:
+class ClientTimeouts:
     """How long a server waits for its clients.
 
     Attributes:
@@ -46,9 +46,9 @@ class _Connection(H11Protocol, asyncio.BufferedProtocol):
     If there are too many connections, the one that has waited longest for a request head is closed.
     """
 
-    def __init__(self, patience: Patience, *args: Any, **options: Any) -> None:
+    def __init__(self, timeouts: ClientTimeouts, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
-        self._patience = patience
+        self._timeouts = timeouts
         self._buffer = bytearray(_PARSED_BYTES)
         self._deadline: asyncio.TimerHandle | None = None
 
@@ -90,7 +90,7 @@ class _Connection(H11Protocol, asyncio.BufferedProtocol):
 
     def pause_writing(self) -> None:
         super().pause_writing()
-        self._close_within(self._patience.reader_s)
+        self._close_within(self._timeouts.reader_s)
 
     def resume_writing(self) -> None:
         super().resume_writing()
@@ -116,7 +116,7 @@ class _Connection(H11Protocol, asyncio.BufferedProtocol):
     def _expect_head(self) -> None:
         """Start to wait for the next head, unless it has arrived or the client is still reading."""
         if self._is_idle():
-            self._close_within(self._patience.head_s)
+            self._close_within(self._timeouts.head_s)
 
     def _close_within(self, seconds: float | None) -> None:
         if self._deadline is not None:
@@ -125,11 +125,11 @@ class _Connection(H11Protocol, asyncio.BufferedProtocol):
 
 
 @contextmanager
-def http_server(app: Any, listener: socket.socket, patience: Patience) -> Iterator[None]:
+def run_http_server(app: Any, listener: socket.socket, timeouts: ClientTimeouts) -> Iterator[None]:
     """Serve an ASGI application at a socket within the block, in a thread."""
     config = uvicorn.Config(
         app,
-        http=partial(_Connection, patience),  # type: ignore[arg-type]
+        http=partial(_Connection, timeouts),  # type: ignore[arg-type]
         h11_max_incomplete_event_size=_MOST_HEAD_BYTES,
         ws="none",
         loop="asyncio",  # uvloop fails at its end if a connection was aborted
@@ -139,8 +139,8 @@ def http_server(app: Any, listener: socket.socket, patience: Patience) -> Iterat
         log_config=None,
         log_level="critical",
         backlog=_WAITING_CONNECTIONS,
-        timeout_keep_alive=math.ceil(patience.head_s),
-        timeout_graceful_shutdown=math.ceil(patience.end_s),
+        timeout_keep_alive=math.ceil(timeouts.head_s),
+        timeout_graceful_shutdown=math.ceil(timeouts.end_s),
     )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=partial(server.run, sockets=[listener]))

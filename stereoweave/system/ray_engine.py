@@ -23,18 +23,19 @@ from stereoweave.system.threads import usable_cores
 if TYPE_CHECKING:
     from ray.data import DataContext, Dataset
 
-Task = TypeVar("Task")
-Result = TypeVar("Result")
+TaskT = TypeVar("TaskT")
+ResultT = TypeVar("ResultT")
 
-_CONNECTS_WITHIN_S, _ANSWERS_WITHIN_S = 10, 20
+_CONNECT_TIMEOUT_S, _STATUS_TIMEOUT_S = 10, 20
 # It carries only tasks and results.
 _OBJECT_STORE_BYTES = 200_000_000
-_LOOKED_AT_EVERY_S, _BACK_WITHIN_S = 2, 10
+# Seconds between two looks at a cluster's machines, and for a lost machine to return.
+_CHECKED_EVERY_S, _RETURNS_WITHIN_S = 2, 10
 # The resolution of Ray's counts of cores and GPUs.
 _LEAST_SHARE = 0.0001
 # Consecutive workers that die while starting, before the run fails.
 _MOST_FALSE_STARTS = 20
-_SILENCE = {
+_QUIET_ENVIRONMENT = {
     # Hide deprecation warnings, and errors of Ray's C++ parts: those that matter are raised as well.
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "RAY_BACKEND_LOG_LEVEL": "fatal",
@@ -90,7 +91,7 @@ def set_environment(address: str | None) -> str | None:
     Returns:
         The address of the cluster to join; None to start Ray on this machine, listening on loopback only.
     """
-    for name, value in _SILENCE.items():
+    for name, value in _QUIET_ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     address = address or os.environ.get("RAY_ADDRESS")
     if address and address != "local":
@@ -124,8 +125,8 @@ def connect(engine: Engine) -> Iterator[None]:
 
 
 def stream(
-    make_worker: Callable[[], Callable[[Task], Result]], tasks: Sequence[Task], engine: Engine
-) -> Generator[Result, None, None]:
+    make_worker: Callable[[], Callable[[TaskT], ResultT]], tasks: Sequence[TaskT], engine: Engine
+) -> Generator[ResultT, None, None]:
     """Yield the tasks' results as they arrive, in any order.
 
     If a worker or a machine dies, its tasks run again: a task may run twice, but its result is yielded once.
@@ -144,7 +145,7 @@ def stream(
         waiting = dict(enumerate(tasks))
         while waiting:
             try:
-                for index, result in _run(make_worker, waiting, engine):
+                for index, result in _run_tasks(make_worker, waiting, engine):
                     del waiting[index]
                     yield result
             except _LostMachineError:
@@ -152,8 +153,8 @@ def stream(
 
 
 def call_on_each_machine(
-    function: Callable[[Task], Result], argument: Task, engine: Engine, timeout_s: float
-) -> list[Result]:
+    function: Callable[[TaskT], ResultT], argument: TaskT, engine: Engine, timeout_s: float
+) -> list[ResultT]:
     """Call a function once on each machine that has room for a worker, with a worker's resources.
 
     This process must be a driver of the cluster; see `connect`.
@@ -168,8 +169,8 @@ def call_on_each_machine(
     remote: Any = ray.remote(num_cpus=engine.cpus_each, num_gpus=engine.gpus_each, max_retries=0)(function)
     calls = [
         remote.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False)).remote(argument)
-        for node, has in _machines_by_id().items()
-        if _places(has, engine)
+        for node, resources in _list_machines().items()
+        if _count_machine_slots(resources, engine)
     ]
     results = []
     for call in ray.wait(calls, num_returns=len(calls), timeout=timeout_s)[0] if calls else []:
@@ -182,13 +183,13 @@ class _LostMachineError(Exception):
     """Workers wait for a machine that does not return."""
 
 
-def _run(
-    make_worker: Callable[[], Callable[[Task], Result]], tasks: dict[int, Task], engine: Engine
-) -> Iterator[tuple[int, Result]]:
+def _run_tasks(
+    make_worker: Callable[[], Callable[[TaskT], ResultT]], tasks: dict[int, TaskT], engine: Engine
+) -> Iterator[tuple[int, ResultT]]:
     """Yield each task's number and result until all are done; raises _LostMachineError."""
     from ray.exceptions import RayError
 
-    batches = _dataset(make_worker, tasks, engine).iter_batches(batch_size=None, prefetch_batches=0)
+    batches = _make_dataset(make_worker, tasks, engine).iter_batches(batch_size=None, prefetch_batches=0)
     try:
         for batch in batches:
             for index, content in zip(batch[_INDEX], batch[_CONTENT], strict=True):
@@ -203,19 +204,19 @@ def _run(
         ) from error
 
 
-def _dataset(
-    make_worker: Callable[[], Callable[[Task], Result]], tasks: dict[int, Task], engine: Engine
+def _make_dataset(
+    make_worker: Callable[[], Callable[[TaskT], ResultT]], tasks: dict[int, TaskT], engine: Engine
 ) -> "Dataset":
     """A lazy data set of the results: tasks run while it is read."""
     from ray.data import ActorPoolStrategy, DataContext, from_items
 
     logging.getLogger("ray.data").setLevel(logging.CRITICAL)
     most = min(engine.workers or len(tasks), len(tasks))
-    pool = ActorPoolStrategy(min_size=1, initial_size=min(room(engine), most), max_size=most)
+    pool = ActorPoolStrategy(min_size=1, initial_size=min(count_slots(engine), most), max_size=most)
     rows = [{_INDEX: index, _CONTENT: pickle.dumps(task)} for index, task in tasks.items()]
-    with DataContext.current(_context(engine)):
+    with DataContext.current(_make_context(engine)):
         return from_items(rows, override_num_blocks=len(rows)).map_batches(
-            _Worker,
+            _TaskRunner,
             fn_constructor_args=(make_worker, engine.threads_each),
             batch_size=None,
             compute=pool,
@@ -224,7 +225,7 @@ def _dataset(
         )
 
 
-def _context(engine: Engine) -> "DataContext":
+def _make_context(engine: Engine) -> "DataContext":
     """Settings of Ray Data: no output, and a watch over the machines."""
     from ray.data import DataContext
 
@@ -248,21 +249,21 @@ class _Watch:
     """
 
     def __init__(self, engine: Engine) -> None:
-        self._engine, self._most = engine, 0
-        self._looked_s = self._enough_s = -math.inf
+        self._engine, self._most_slots = engine, 0
+        self._checked_s = self._complete_s = -math.inf
 
     def before_execution_starts(self, _: object) -> None:
-        self._enough_s = time.monotonic()
+        self._complete_s = time.monotonic()
 
     def on_execution_step(self, _: object) -> None:
         now_s = time.monotonic()
-        if now_s < self._looked_s + _LOOKED_AT_EVERY_S:
+        if now_s < self._checked_s + _CHECKED_EVERY_S:
             return
-        self._looked_s, room = now_s, _rooms(self._engine)
-        self._most = max(self._most, min(room, self._engine.workers or room))
-        if room >= self._most:
-            self._enough_s = now_s
-        elif room and now_s > self._enough_s + _BACK_WITHIN_S:
+        self._checked_s, slots = now_s, _count_slots(self._engine)
+        self._most_slots = max(self._most_slots, min(slots, self._engine.workers or slots))
+        if slots >= self._most_slots:
+            self._complete_s = now_s
+        elif slots and now_s > self._complete_s + _RETURNS_WITHIN_S:
             raise _LostMachineError
 
     def after_execution_succeeds(self, _: object) -> None:
@@ -272,11 +273,11 @@ class _Watch:
         pass
 
 
-def room(engine: Engine) -> int:
-    """The number of workers that fit on the cluster; raises StereoweaveError if none does."""
-    if found := _rooms(engine):
-        return found
-    largest = max(_machines(), key=lambda has: has.get("CPU", 0))
+def count_slots(engine: Engine) -> int:
+    """Return the number of workers that fit on the cluster; raise StereoweaveError if none does."""
+    if slots := _count_slots(engine):
+        return slots
+    largest = max(_list_machines().values(), key=lambda resources: resources.get("CPU", 0))
     raise StereoweaveError(
         f"expected a machine with {engine.cpus_each:g} cores and {engine.gpus_each:g} GPUs for a worker, "
         f"found {largest.get('CPU', 0):g} and {largest.get('GPU', 0):g} in the largest; join such a machine",
@@ -284,28 +285,24 @@ def room(engine: Engine) -> int:
     )
 
 
-def _rooms(engine: Engine) -> int:
-    return sum(_places(has, engine) for has in _machines())
+def _count_slots(engine: Engine) -> int:
+    return sum(_count_machine_slots(resources, engine) for resources in _list_machines().values())
 
 
-def _machines() -> list[dict[str, float]]:
-    """The resources of each live machine of the cluster."""
-    return list(_machines_by_id().values())
-
-
-def _machines_by_id() -> dict[str, dict[str, float]]:
+def _list_machines() -> dict[str, dict[str, float]]:
+    """Return the resources of each live machine of the cluster, by its id."""
     import ray
 
     nodes: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
     return {node["NodeID"]: node["Resources"] for node in nodes if node["Alive"]}
 
 
-def _places(has: dict[str, float], engine: Engine) -> int:
-    """The number of workers that fit on a machine."""
-    places = has.get("CPU", 0) / engine.cpus_each
+def _count_machine_slots(resources: dict[str, float], engine: Engine) -> int:
+    """Return the number of workers that fit on a machine."""
+    slots = resources.get("CPU", 0) / engine.cpus_each
     if engine.gpus_each:
-        places = min(places, has.get("GPU", 0) / engine.gpus_each)
-    return int(places + 1e-6)  # ten tenths make one
+        slots = min(slots, resources.get("GPU", 0) / engine.gpus_each)
+    return int(slots + 1e-6)  # ten tenths make one
 
 
 def _start() -> None:
@@ -314,12 +311,12 @@ def _start() -> None:
 
     # Ray always starts a dashboard process, which queries the metadata services of three clouds even if usage
     # reports are off (2.60). If the port of that process is in use, Ray continues without it.
-    with _muted_stderr(), socket.create_server(("127.0.0.1", 0)) as taken:
+    with _mute_stderr(), socket.create_server(("127.0.0.1", 0)) as occupied:
         ray.init(
             address="local",
             num_cpus=usable_cores(),
             include_dashboard=False,
-            dashboard_port=taken.getsockname()[1],
+            dashboard_port=occupied.getsockname()[1],
             object_store_memory=_OBJECT_STORE_BYTES,
             log_to_driver=False,
             logging_level=logging.ERROR,
@@ -331,13 +328,13 @@ def _join(address: str) -> None:
     import ray
 
     try:
-        with _muted_stderr():
+        with _mute_stderr():
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except Exception as error:  # Ray's own, gRPC's and Python's, which have no common base class
-        raise _not_joined(address, _first_line(error)) from error
+        raise _make_join_error(address, _first_line(error)) from error
 
 
-def _not_joined(address: str, found: str) -> StereoweaveError:
+def _make_join_error(address: str, found: str) -> StereoweaveError:
     return StereoweaveError(
         f"{address}: expected the head of a Ray cluster, found {found}; "
         "see that Ray and Python are of the cluster's versions, and that its token is here"
@@ -369,7 +366,7 @@ def _check_port(address: str) -> None:
         raise StereoweaveError(
             f"a cluster's address: expected host:port, ray://host:port, auto or local, found {address!r}"
         )
-    socket.create_connection((host, int(port)), _CONNECTS_WITHIN_S).close()
+    socket.create_connection((host, int(port)), _CONNECT_TIMEOUT_S).close()
 
 
 def _check_status(address: str) -> None:
@@ -381,24 +378,24 @@ def _check_status(address: str) -> None:
         StereoweaveError: The head refused: wrong version, wrong token.
         subprocess.TimeoutExpired: Nothing that understands Ray answers.
     """
-    status = _status(address)
+    status = _run_status_command(address)
     if "AuthenticationError" in status.stderr and "RAY_AUTH_MODE" not in os.environ:
         os.environ["RAY_AUTH_MODE"] = "token"
-        status = _status(address)
+        status = _run_status_command(address)
     if status.returncode:
         lines = status.stderr.strip().splitlines() or [f"exit status {status.returncode}"]
-        raise _not_joined(address, lines[-1].rstrip(".;"))
+        raise _make_join_error(address, lines[-1].rstrip(".;"))
 
 
-def _status(address: str) -> subprocess.CompletedProcess[str]:
+def _run_status_command(address: str) -> subprocess.CompletedProcess[str]:
     """The outcome of the command `ray status`, in a process of its own."""
     # -P: else a file in the current folder may have the name of a library.
     command = [sys.executable, "-P", "-m", "ray.scripts.scripts", "status", "--address", address]
-    return subprocess.run(command, capture_output=True, text=True, timeout=_ANSWERS_WITHIN_S, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=_STATUS_TIMEOUT_S, check=False)
 
 
 @contextmanager
-def _muted_stderr() -> Iterator[None]:
+def _mute_stderr() -> Iterator[None]:
     """Discard what Ray writes to the standard error: a line of C++ that it has read RAY_BACKEND_LOG_LEVEL."""
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
@@ -421,7 +418,7 @@ def _last_line(error: Exception) -> str:
     return str(error).strip().splitlines()[-1].rstrip(".;")
 
 
-class _Worker:
+class _TaskRunner:
     """Callable of a worker's process for Ray Data: made once, called with a row for each task."""
 
     def __init__(self, make_worker: Callable[[], Callable[[Any], Any]], threads: int) -> None:
@@ -432,9 +429,9 @@ class _Worker:
         self._worker: Callable[[Any], Any] | None = None
 
     def __call__(self, batch: dict[str, Any]) -> dict[str, Any]:
-        return {_INDEX: batch[_INDEX], _CONTENT: [self._outcome(content) for content in batch[_CONTENT]]}
+        return {_INDEX: batch[_INDEX], _CONTENT: [self._run_task(content) for content in batch[_CONTENT]]}
 
-    def _outcome(self, content: bytes) -> bytes:
+    def _run_task(self, content: bytes) -> bytes:
         """A task's pickled result, or its error for the driver to raise: Ray's own report has many lines."""
         try:
             if self._worker is None:

@@ -16,7 +16,7 @@ import fsspec
 import numpy as np
 import pyarrow.dataset
 import pytest
-from other_processes import halted, processes_of
+from other_processes import halted, list_processes
 from video_examples import example_pairs, packets, write_side_by_side
 
 from stereoweave.batch import worker as cluster_worker
@@ -135,7 +135,7 @@ def test_killed_workers_and_a_killed_driver_lose_nothing_and_double_nothing(ray_
             time.sleep(0.01)
 
     wait_for(2)
-    workers = [process for process in processes_of(os.getpid()) if b"MapWorker" in read_command(process)]
+    workers = [process for process in list_processes(os.getpid()) if b"MapWorker" in read_command(process)]
     os.kill(workers[0], signal.SIGKILL)
     wait_for(6)
     with halted(driver):

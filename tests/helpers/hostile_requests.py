@@ -18,18 +18,19 @@ _CHUNKED = _POST + _FORM + b"Transfer-Encoding: chunked\r\n\r\n"
 _PART = b'--b\r\nContent-Disposition: form-data; name="left"; filename="l"\r\n\r\n'
 
 
-def hostile() -> dict[str, Sender]:
+def make_hostile_requests() -> dict[str, Sender]:
     """Requests by what each does; the status is 0 if the connection is closed without a response."""
-    once = _heads() | _methods() | _hosts() | _lengths() | _bodies() | _other_protocols()
+    once = _make_heads() | _make_methods() | _make_hosts() | _make_lengths() | _make_bodies()
+    once |= _make_other_protocols()
     return {
-        **{name: partial(_speak, [request]) for name, request in once.items()},
-        **{name: partial(_speak, parts) for name, parts in _endless().items()},
-        **_slow(),
-        **_cut_off(),
+        **{name: partial(_send_parts, [request]) for name, request in once.items()},
+        **{name: partial(_send_parts, parts) for name, parts in _make_endless().items()},
+        **_make_slow(),
+        **_make_cut_off(),
     }
 
 
-def _heads() -> dict[str, bytes]:
+def _make_heads() -> dict[str, bytes]:
     get = b"GET /health HTTP/1.1\r\nHost: localhost\r\n"
     return {
         "a header without a colon": get + b"X\r\n\r\n",
@@ -49,7 +50,7 @@ def _heads() -> dict[str, bytes]:
     }
 
 
-def _methods() -> dict[str, bytes]:
+def _make_methods() -> dict[str, bytes]:
     methods = (b"BREW", b"post", b"CONNECT", b"TRACE", b"OPTIONS", b"DELETE", b"A" * 9000, b"\x01", b"P OST")
     return {
         f"method {method[:8]!r}": method + b" /view HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
@@ -57,7 +58,7 @@ def _methods() -> dict[str, bytes]:
     }
 
 
-def _hosts() -> dict[str, bytes]:
+def _make_hosts() -> dict[str, bytes]:
     hosts = (
         b"evil.example",
         b"127.0.0.1.evil.example",
@@ -75,7 +76,7 @@ def _hosts() -> dict[str, bytes]:
     }
 
 
-def _lengths() -> dict[str, bytes]:
+def _make_lengths() -> dict[str, bytes]:
     lengths = (b"+5", b"0x10", b"1e3", b"5, 6", b"9" * 30, b" ", b"\xd9\xa3")
     heads = {f"length {length[:8]!r}": b"Content-Length: " + length for length in lengths}
     heads |= {
@@ -86,7 +87,7 @@ def _lengths() -> dict[str, bytes]:
     return {name: _POST + _FORM + head + b"\r\n\r\nhello" for name, head in heads.items()}
 
 
-def _bodies() -> dict[str, bytes]:
+def _make_bodies() -> dict[str, bytes]:
     chunks = {
         "a chunk without an end": b"FFFFFFFFFFFFFFFF\r\n" + _PART,
         "a chunk of a negative length": b"-1\r\n" + _PART,
@@ -103,16 +104,16 @@ def _bodies() -> dict[str, bytes]:
         "a form in the form": _PART + _PART * 1000 + b"--b--\r\n",
         "a compressed body": b"\x1f\x8b\x08" + bytes(1000),
     }
-    framed = {name: _form(body) for name, body in bodies.items()}
-    many = {"a hundred forms in one piece": _form(_PART + b"x\r\n--b--\r\n") * 100}
+    framed = {name: _make_form(body) for name, body in bodies.items()}
+    many = {"a hundred forms in one piece": _make_form(_PART + b"x\r\n--b--\r\n") * 100}
     return {name: _CHUNKED + body for name, body in chunks.items()} | framed | many
 
 
-def _form(body: bytes) -> bytes:
+def _make_form(body: bytes) -> bytes:
     return _POST + _FORM + b"Content-Length: %d\r\n\r\n" % len(body) + body
 
 
-def _other_protocols() -> dict[str, bytes]:
+def _make_other_protocols() -> dict[str, bytes]:
     get = b"GET /health HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: "
     key = b"\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
     return {
@@ -125,7 +126,7 @@ def _other_protocols() -> dict[str, bytes]:
     }
 
 
-def _endless() -> dict[str, Iterable[bytes]]:
+def _make_endless() -> dict[str, Iterable[bytes]]:
     get = b"GET /health HTTP/1.1\r\nHost: localhost\r\n"
     begun = {
         "an endless header": (get + b"X: ", b"a"),
@@ -141,15 +142,15 @@ def _endless() -> dict[str, Iterable[bytes]]:
         "an endless field": (_CHUNKED + b"FFFFFFF\r\n" + _PART, b"a"),
         "an endless head of a part": (_CHUNKED + b"FFFFFFF\r\n--b\r\nX: ", b"a"),
     }
-    return {name: list(_repeated(start, unit)) for name, (start, unit) in begun.items()}
+    return {name: list(_repeat(start, unit)) for name, (start, unit) in begun.items()}
 
 
-def _repeated(start: bytes, unit: bytes) -> Iterator[bytes]:
+def _repeat(start: bytes, unit: bytes) -> Iterator[bytes]:
     block = unit * (64_000 // len(unit))
     return chain([start], repeat(block, _ENDLESS // len(block)))
 
 
-def _slow() -> dict[str, Sender]:
+def _make_slow() -> dict[str, Sender]:
     head = b"GET /health HTTP/1.1\r\nHost: localhost\r\nX: "
     body = _POST + _FORM + b"Content-Length: 1000000\r\n\r\n" + _PART
     starts = {"head": head, "body": body, "chunk": _CHUNKED + b"FFFF\r\n"}
@@ -158,23 +159,23 @@ def _slow() -> dict[str, Sender]:
 
 
 def _drip(start: bytes, client: httpx.Client) -> tuple[int, str]:
-    return _speak(chain([start], _drops()), client)
+    return _send_parts(chain([start], _make_drops()), client)
 
 
-def _drops() -> Iterator[bytes]:
+def _make_drops() -> Iterator[bytes]:
     while True:
         time.sleep(0.5)
         yield b"a"
 
 
 def _never_read(client: httpx.Client) -> tuple[int, str]:
-    with _connection(client) as connection:
+    with _connect(client) as connection:
         connection.sendall(b"GET /openapi.json HTTP/1.1\r\nHost: localhost\r\n\r\n" * 100)
         time.sleep(3)
     return 0, ""
 
 
-def _cut_off() -> dict[str, Sender]:
+def _make_cut_off() -> dict[str, Sender]:
     body = _POST + _FORM + b"Content-Length: 1000\r\n\r\n" + _PART
     starts = {"the head": _POST[:40], "the body": body, "a chunk": _CHUNKED + b"FF\r\nabc"}
     return {
@@ -185,31 +186,31 @@ def _cut_off() -> dict[str, Sender]:
 
 
 def _leave(start: bytes, reset: bool, client: httpx.Client) -> tuple[int, str]:
-    with _connection(client) as connection:
+    with _connect(client) as connection:
         connection.sendall(start)
         if not reset:
             connection.shutdown(socket.SHUT_WR)
-            return _status(connection)
+            return _read_status(connection)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
     return 0, ""
 
 
-def _speak(parts: Iterable[bytes], client: httpx.Client) -> tuple[int, str]:
+def _send_parts(parts: Iterable[bytes], client: httpx.Client) -> tuple[int, str]:
     """Send bytes, as many as are accepted; return the status of the response."""
-    with _connection(client) as connection:
+    with _connect(client) as connection:
         try:
             for part in parts:
                 connection.sendall(part)
         except OSError:
             pass  # the connection was closed while sending
-        return _status(connection)
+        return _read_status(connection)
 
 
-def _connection(client: httpx.Client) -> socket.socket:
+def _connect(client: httpx.Client) -> socket.socket:
     return socket.create_connection((client.base_url.host, client.base_url.port), timeout=60)
 
 
-def _status(connection: socket.socket) -> tuple[int, str]:
+def _read_status(connection: socket.socket) -> tuple[int, str]:
     try:
         words = connection.makefile("rb").readline().split()
     except OSError:

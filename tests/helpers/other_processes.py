@@ -21,7 +21,7 @@ def halted(process: subprocess.Popen[Any] | psutil.Process) -> Iterator[None]:
         process.send_signal(signal.SIGCONT)
 
 
-def processes_of(process: int) -> list[int]:
+def list_processes(process: int) -> list[int]:
     """Return the process and all its descendants."""
     parents = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
@@ -33,7 +33,7 @@ def processes_of(process: int) -> list[int]:
     return found
 
 
-def free_ports(count: int) -> list[int]:
+def find_free_ports(count: int) -> list[int]:
     """Return unused ports of this machine."""
     with ExitStack() as stack:
         sockets = [stack.enter_context(socket.socket()) for _ in range(count)]

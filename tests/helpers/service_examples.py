@@ -20,19 +20,19 @@ BOTH = {"left": LEFT, "right": RIGHT}
 Sender = Callable[[httpx.Client], tuple[int, str]]
 
 
-def malformed(most_megabytes: float) -> dict[str, Sender]:
+def make_malformed_requests(most_megabytes: float) -> dict[str, Sender]:
     """Requests by what is wrong with each."""
-    files = {**_cut_off(), **_no_pictures(), **_wrong_sizes()}
+    files = {**_cut_pictures_off(), **_make_other_files(), **_make_wrong_sizes()}
     pictures = {
         f"left is {what}": partial(_post, "/disparity", {"left": content, "right": RIGHT})
         for what, content in files.items()
     }
     return {
         **pictures,
-        **_wrong_options(),
-        **_wrong_fields(),
-        **_wrong_calibrations(),
-        **_wrong_http(most_megabytes),
+        **_make_wrong_options(),
+        **_make_wrong_fields(),
+        **_make_wrong_calibrations(),
+        **_make_wrong_http(most_megabytes),
     }
 
 
@@ -41,12 +41,12 @@ def _post(path: str, files: Any, client: httpx.Client, **options: Any) -> tuple[
     return response.status_code, response.text
 
 
-def _cut_off() -> dict[str, bytes]:
+def _cut_pictures_off() -> dict[str, bytes]:
     """Truncated and modified pictures."""
     found = {}
     with Image.open(io.BytesIO(LEFT)) as picture:
         for kind in ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000"):
-            content = _encoded(picture.convert("RGB"), kind)
+            content = _encode(picture.convert("RGB"), kind)
             for percent in (1, 60):
                 found[f"{kind} cut off at {percent} %"] = content[: len(content) * percent // 100]
             found[f"{kind} cut off after 9 bytes"] = content[:9]
@@ -57,13 +57,13 @@ def _cut_off() -> dict[str, bytes]:
     return found
 
 
-def _encoded(picture: Image.Image, kind: str) -> bytes:
+def _encode(picture: Image.Image, kind: str) -> bytes:
     out = io.BytesIO()
     picture.save(out, kind)
     return out.getvalue()
 
 
-def _no_pictures() -> dict[str, bytes]:
+def _make_other_files() -> dict[str, bytes]:
     frames = [Image.new("L", (64, 64), grey) for grey in (0, 99, 200)]
     out = io.BytesIO()
     frames[0].save(out, "GIF", save_all=True, append_images=frames[1:])
@@ -90,20 +90,22 @@ def _no_pictures() -> dict[str, bytes]:
     return heads | {"a GIF that moves": out.getvalue()}
 
 
-def _wrong_sizes() -> dict[str, bytes]:
+def _make_wrong_sizes() -> dict[str, bytes]:
     """Pictures that are too large, too small, unlike the right one, or have false headers."""
     sizes = {(100_000, 100_000), (2**31 - 1, 2**31 - 1), (0, 0), (0, 64), (20_000, 3_000), (4_000_000_000, 1)}
-    heads = {f"PNG that says it has {w}x{h} px": _png_head(w, h) for w, h in sorted(sizes)}
+    heads = {f"PNG that says it has {w}x{h} px": _make_png_head(w, h) for w, h in sorted(sizes)}
     small = {
-        f"PNG of {w}x{h} px": _encoded(Image.new("L", (w, h)), "PNG")
+        f"PNG of {w}x{h} px": _encode(Image.new("L", (w, h)), "PNG")
         for w, h in [(1, 1), (31, 480), (640, 31), (64, 64), (641, 480), (480, 640)]
     }
     return {
         **heads,
         **small,
-        "a bomb of 900 megapixels": _encoded(Image.new("1", (30_000, 30_000)), "PNG"),
-        "more pixels than are taken": _encoded(Image.new("L", (1200, 900)), "PNG"),
-        "a bomb in a text chunk": _with_chunk(b"zTXt", b"Comment\0\0" + zlib.compress(bytes(200_000_000), 9)),
+        "a bomb of 900 megapixels": _encode(Image.new("1", (30_000, 30_000)), "PNG"),
+        "more pixels than are taken": _encode(Image.new("L", (1200, 900)), "PNG"),
+        "a bomb in a text chunk": _insert_chunk(
+            b"zTXt", b"Comment\0\0" + zlib.compress(bytes(200_000_000), 9)
+        ),
         "PPM that says it is huge": b"P6 999999999 999999999 255\n" + bytes(1000),
         "PPM of a negative size": b"P6 -640 480 255\n" + bytes(1000),
         "BMP of a negative size": b"BM"
@@ -114,20 +116,20 @@ def _wrong_sizes() -> dict[str, bytes]:
     }
 
 
-def _png_head(width: int, height: int) -> bytes:
+def _make_png_head(width: int, height: int) -> bytes:
     head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + _chunk(b"IHDR", head) + _chunk(b"IDAT", zlib.compress(bytes(100)))
+    return b"\x89PNG\r\n\x1a\n" + _make_chunk(b"IHDR", head) + _make_chunk(b"IDAT", zlib.compress(bytes(100)))
 
 
-def _chunk(name: bytes, content: bytes) -> bytes:
+def _make_chunk(name: bytes, content: bytes) -> bytes:
     return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
 
 
-def _with_chunk(name: bytes, content: bytes) -> bytes:
-    return LEFT[:33] + _chunk(name, content) + LEFT[33:]
+def _insert_chunk(name: bytes, content: bytes) -> bytes:
+    return LEFT[:33] + _make_chunk(name, content) + LEFT[33:]
 
 
-def _wrong_options() -> dict[str, Sender]:
+def _make_wrong_options() -> dict[str, Sender]:
     """Invalid field values."""
     numbers = ("nan", "inf", "-1", "0", "1e400", "x", "1,5")
     of_maps = {
@@ -160,21 +162,21 @@ def _wrong_options() -> dict[str, Sender]:
         "refined": ("true",),
     }
     return {
-        f"{path} with {field} {value[:20]!r}": partial(_post, path, BOTH, data=_with_camera(field, value))
+        f"{path} with {field} {value[:20]!r}": partial(_post, path, BOTH, data=_add_camera(field, value))
         for path, fields in {"/depth": of_maps, "/view": of_views}.items()
         for field, values in fields.items()
         for value in values
     }
 
 
-def _with_camera(field: str, value: str) -> dict[str, str]:
+def _add_camera(field: str, value: str) -> dict[str, str]:
     """The field, plus others that make the rest of the request valid."""
     camera = {"focal_px": "600", "baseline_m": "0.1"}
     position = {"position": "0.9"} if field == "strength" else {}
     return {**camera, **position, field: value}
 
 
-def _wrong_fields() -> dict[str, Sender]:
+def _make_wrong_fields() -> dict[str, Sender]:
     """Missing, surplus and misnamed files."""
     files = {
         "no file": {"other": b"x"},
@@ -185,7 +187,7 @@ def _wrong_fields() -> dict[str, Sender]:
         "other names": {"Left": LEFT, "Right": RIGHT},
         "a field too many": {**BOTH, "depth": LEFT},
         "names of paths": {"../left": LEFT, "right": RIGHT},
-        "one view as picture of both": {"picture": _encoded(Image.new("L", (33, 33)), "PNG")},
+        "one view as picture of both": {"picture": _encode(Image.new("L", (33, 33)), "PNG")},
         "file names that are paths": {
             "left": ("../../../etc/passwd", b"x"),
             "right": ("\x01ü\u202e.png", RIGHT),
@@ -203,7 +205,7 @@ def _wrong_fields() -> dict[str, Sender]:
     }
 
 
-def _wrong_calibrations() -> dict[str, Sender]:
+def _make_wrong_calibrations() -> dict[str, Sender]:
     laughs = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
         f"{b}: &{b} [{','.join([f'*{a}'] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
     )
@@ -228,7 +230,7 @@ def _wrong_calibrations() -> dict[str, Sender]:
     }
 
 
-def _wrong_http(most_megabytes: float) -> dict[str, Sender]:
+def _make_wrong_http(most_megabytes: float) -> dict[str, Sender]:
     """Requests with invalid headers or an invalid order of the body."""
     form = "multipart/form-data; boundary=b"
     part = b'--b\r\nContent-Disposition: form-data; name="left"; filename="l"\r\n\r\n'
@@ -266,12 +268,13 @@ def _wrong_http(most_megabytes: float) -> dict[str, Sender]:
         "another method": partial(_send, "PUT", "/disparity"),
         "no post": partial(_send, "GET", "/view"),
         "another path": partial(_send, "POST", "/%2e%2e/etc/passwd", headers={"Content-Type": form}),
-        "a head that is none": partial(_speak, b"HELLO\r\n\r\n"),
+        "a head that is none": partial(_send_bytes, b"HELLO\r\n\r\n"),
         "a length that is none": partial(
-            _speak, b"POST /view HTTP/1.1\r\nHost: x\r\nContent-Length: -5\r\n\r\n"
+            _send_bytes, b"POST /view HTTP/1.1\r\nHost: x\r\nContent-Length: -5\r\n\r\n"
         ),
         "two lengths": partial(
-            _speak, b"POST /view HTTP/1.1\r\nHost: x\r\nContent-Length: 5\r\nContent-Length: 6\r\n\r\nhello"
+            _send_bytes,
+            b"POST /view HTTP/1.1\r\nHost: x\r\nContent-Length: 5\r\nContent-Length: 6\r\n\r\nhello",
         ),
     }
 
@@ -281,7 +284,7 @@ def _send(method: str, path: str, client: httpx.Client, **options: Any) -> tuple
     return response.status_code, response.text
 
 
-def _speak(request: bytes, client: httpx.Client) -> tuple[int, str]:
+def _send_bytes(request: bytes, client: httpx.Client) -> tuple[int, str]:
     """Send bytes; return the response."""
     with socket.create_connection((client.base_url.host, client.base_url.port), timeout=60) as connection:
         connection.sendall(request)

@@ -14,14 +14,14 @@ from pathlib import Path
 import httpx
 
 
-def children(pid: int) -> list[int]:
+def list_descendants(pid: int) -> list[int]:
     """Return all descendants of a process."""
     tasks = Path(f"/proc/{pid}/task").glob("*/children")
     direct = [int(child) for task in tasks for child in task.read_text().split()]
-    return direct + [child for each in direct for child in children(each)]
+    return direct + [child for each in direct for child in list_descendants(each)]
 
 
-def proportional_megabytes(pid: int) -> float:
+def measure_megabytes(pid: int) -> float:
     """Memory of a process, with its proportional share of shared memory; 0 if it has ended."""
     try:
         smaps = Path(f"/proc/{pid}/smaps_rollup").read_text()
@@ -36,7 +36,7 @@ def watch(url: str, pid: int) -> dict[str, list[float]]:
 
     def measure() -> None:
         while not ended.wait(1):
-            megabytes.append(sum(map(proportional_megabytes, [pid, *children(pid)])))
+            megabytes.append(sum(map(measure_megabytes, [pid, *list_descendants(pid)])))
 
     def ask() -> None:
         alone = httpx.Limits(max_keepalive_connections=0)

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from stereoweave.matching.options import MatchOptions
-from stereoweave.service.admission import Budget, BusyError, work_of
+from stereoweave.service.admission import Budget, BusyError, estimate_work
 from stereoweave.service.answers import ServiceJob, TooLargeError
 
 
@@ -67,6 +67,7 @@ def test_what_was_stopped_unfinished_makes_the_usual_speed_slower_and_the_best_n
 
 
 def test_large_pictures_and_full_resolution_are_more_work():
-    assert work_of(job(), 0.6) == 0.6
-    assert work_of(job(), 50) == 125
-    assert work_of(job(options=MatchOptions(refined=True)), 1) == work_of(job(file="view.png"), 1) == 1.3
+    assert estimate_work(job(), 0.6) == 0.6
+    assert estimate_work(job(), 50) == 125
+    assert estimate_work(job(options=MatchOptions(refined=True)), 1) == 1.3
+    assert estimate_work(job(file="view.png"), 1) == 1.3

@@ -13,21 +13,21 @@ from service_examples import BOTH
 
 from stereoweave.errors import ProviderError
 from stereoweave.service.admission import BusyError
-from stereoweave.service.answers import Answer, ServiceJob, TooLargeError
+from stereoweave.service.answers import ServiceAnswer, ServiceJob, TooLargeError
 from stereoweave.system.child_process import ProcessDiedError
 
 # What Ray Serve is warned of by Pydantic when it is imported.
 pytestmark = pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`:DeprecationWarning")
 
 
-def guarded(
-    answering: Any, registry: CollectorRegistry | None = None, folder: Path | None = None, **limits: Any
+def make_client(
+    answer_job: Any, registry: CollectorRegistry | None = None, folder: Path | None = None, **limits: Any
 ) -> httpx.AsyncClient:
     """A client of the service without a server, whose work is done by a function."""
     from stereoweave.service.asgi import Guard, Limits, make_app
 
     allowed = Limits(**limits)
-    app = make_app(answering, allowed, folder or Path(tempfile.gettempdir()), registry)
+    app = make_app(answer_job, allowed, folder or Path(tempfile.gettempdir()), registry)
     app = Guard(app, allowed, registry)
     return httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://service")
 
@@ -35,13 +35,13 @@ def guarded(
 FORM = {"Content-Type": "multipart/form-data; boundary=b"}
 
 
-def ask_guarded(
-    answering: Any, content: AsyncIterator[bytes] | bytes | None = None, **limits: Any
+def ask_guard(
+    answer_job: Any, content: AsyncIterator[bytes] | bytes | None = None, **limits: Any
 ) -> httpx.Response:
     """The response of a guard that allows a fifth of a second, unless told otherwise."""
 
     async def ask() -> httpx.Response:
-        async with guarded(answering, **{"timeout_s": 0.2, **limits}) as client:
+        async with make_client(answer_job, **{"timeout_s": 0.2, **limits}) as client:
             if content is None:
                 return await client.post("/disparity", files=BOTH)
             return await client.post("/disparity", content=content, headers=FORM)
@@ -49,17 +49,17 @@ def ask_guarded(
     return asyncio.run(ask())
 
 
-async def never(job: ServiceJob, left_s: float) -> Answer:
+async def wait_forever(job: ServiceJob, left_s: float) -> ServiceAnswer:
     await asyncio.Event().wait()
 
 
 def test_a_provider_that_fails_is_no_fault_of_the_request():
-    async def fails(job: ServiceJob, left_s: float) -> Answer:
+    async def fails(job: ServiceJob, left_s: float) -> ServiceAnswer:
         raise ProviderError(
             "provider cuda: expected to run /srv/net.onnx, found that it failed: out of memory"
         )
 
-    response = ask_guarded(fails)
+    response = ask_guard(fails)
     assert response.status_code == 503
     assert response.json()["detail"] == (
         "provider cuda: expected to run net.onnx, found that it failed: out of memory"
@@ -67,7 +67,7 @@ def test_a_provider_that_fails_is_no_fault_of_the_request():
 
 
 def test_what_takes_too_long_is_cancelled():
-    response = ask_guarded(never)
+    response = ask_guard(wait_forever)
     assert response.status_code == 504
     assert response.json()["detail"].startswith("expected a result within 0.2 s")
 
@@ -77,7 +77,7 @@ def test_a_request_that_does_not_arrive_is_not_waited_for():
         yield b"--b\r\n"
         await asyncio.Event().wait()
 
-    response = ask_guarded(never, stalls())
+    response = ask_guard(wait_forever, stalls())
     assert response.status_code == 408
     assert "found part of it" in response.json()["detail"]
 
@@ -86,12 +86,12 @@ def test_as_many_requests_are_accepted_at_a_time_as_may_wait_and_no_more():
     async def ask() -> list[int]:
         done, accepted = asyncio.Event(), []
 
-        async def waits(job: ServiceJob, left_s: float) -> Answer:
+        async def waits(job: ServiceJob, left_s: float) -> ServiceAnswer:
             accepted.append(job)
             await done.wait()
-            return Answer(content=b"", report="{}")
+            return ServiceAnswer(content=b"", report="{}")
 
-        async with guarded(waits, waiting=2, timeout_s=20) as client:
+        async with make_client(waits, waiting=2, timeout_s=20) as client:
             first = [asyncio.create_task(client.post("/disparity", files=BOTH)) for _ in range(2)]
             while len(accepted) < 2:
                 await asyncio.sleep(0)
@@ -113,7 +113,7 @@ def test_a_request_without_a_length_is_refused_once_more_bytes_arrive_than_are_t
             sent.append(100_000)
             yield bytes(100_000)
 
-    response = ask_guarded(never, streams(), megabytes=1, timeout_s=60)
+    response = ask_guard(wait_forever, streams(), megabytes=1, timeout_s=60)
     assert response.status_code == 413
     assert "expected a request of at most 1 MB" in response.json()["detail"]
     assert sum(sent) == 1_000_000  # with the head of the part more than 1 MB
@@ -135,7 +135,7 @@ def test_a_request_without_a_length_is_refused_once_more_bytes_arrive_than_are_t
 )
 def test_where_there_is_a_token_all_but_health_need_it(headers, path, status):
     async def get() -> httpx.Response:
-        async with guarded(never, token="secret-1") as client:
+        async with make_client(wait_forever, token="secret-1") as client:
             return await client.get(path, headers={k: v.encode("latin-1") for k, v in headers.items()})
 
     response = asyncio.run(get())
@@ -151,7 +151,7 @@ def test_without_the_token_not_even_the_body_of_a_form_is_read():
         await asyncio.Event().wait()
         yield b""
 
-    assert ask_guarded(never, never_sent(), token="secret").status_code == 401
+    assert ask_guard(wait_forever, never_sent(), token="secret").status_code == 401
 
 
 def test_work_for_a_client_that_goes_away_is_cancelled():
@@ -160,7 +160,7 @@ def test_work_for_a_client_that_goes_away_is_cancelled():
     async def leave() -> bool:
         begun, cancelled = asyncio.Event(), asyncio.Event()
 
-        async def waits(job: ServiceJob, left_s: float) -> Answer:
+        async def waits(job: ServiceJob, left_s: float) -> ServiceAnswer:
             begun.set()
             try:
                 await asyncio.Event().wait()
@@ -203,22 +203,22 @@ def test_work_for_a_client_that_goes_away_is_cancelled():
     ],
 )
 def test_what_the_work_came_to_is_told_by_the_status(error, status, header):
-    async def fails(job: ServiceJob, left_s: float) -> Answer:
+    async def fails(job: ServiceJob, left_s: float) -> ServiceAnswer:
         raise error
 
-    response = ask_guarded(fails, timeout_s=60)
+    response = ask_guard(fails, timeout_s=60)
     assert response.status_code == status
     assert response.json() == {"detail": str(error)}
     assert response.headers.get("Retry-After") == header
 
 
-async def at_once(job: ServiceJob, left_s: float) -> Answer:
-    return Answer(content=job.pictures[0].read_bytes(), report="{}")
+async def answer_at_once(job: ServiceJob, left_s: float) -> ServiceAnswer:
+    return ServiceAnswer(content=job.pictures[0].read_bytes(), report="{}")
 
 
 def test_a_folder_that_was_removed_meanwhile_is_made_again(tmp_path):
     folder = tmp_path / "emptied" / "own"
-    response = ask_guarded(at_once, folder=folder, timeout_s=60)
+    response = ask_guard(answer_at_once, folder=folder, timeout_s=60)
     assert (response.status_code, response.content) == (200, BOTH["left"])
     assert folder.stat().st_mode & 0o777 == 0o700
 
@@ -232,10 +232,10 @@ def test_a_folder_that_was_removed_meanwhile_is_made_again(tmp_path):
     ],
 )
 def test_a_machine_without_room_is_no_fault_of_the_request(error, found):
-    async def fails(job: ServiceJob, left_s: float) -> Answer:
+    async def fails(job: ServiceJob, left_s: float) -> ServiceAnswer:
         raise error
 
-    response = ask_guarded(fails, timeout_s=60)
+    response = ask_guard(fails, timeout_s=60)
     assert response.status_code == 503
     detail = response.json()["detail"]
     assert detail.startswith("expected room for the request on disk and in memory, found ")
@@ -245,7 +245,7 @@ def test_a_machine_without_room_is_no_fault_of_the_request(error, found):
 
 def test_a_flood_of_requests_for_metrics_holds_no_other_up():
     async def flood() -> tuple[int, set[int], str]:
-        async with guarded(at_once, CollectorRegistry(), timeout_s=3) as client:
+        async with make_client(answer_at_once, CollectorRegistry(), timeout_s=3) as client:
             asked = [asyncio.create_task(client.get("/metrics")) for _ in range(50)]
             posted = await client.post("/disparity", files=BOTH)
             statuses = {each.status_code for each in await asyncio.gather(*asked)}
@@ -259,7 +259,7 @@ def test_a_flood_of_requests_for_metrics_holds_no_other_up():
 
 def test_without_a_registry_there_are_no_metrics(monkeypatch):
     async def get() -> httpx.Response:
-        async with guarded(at_once) as client:
+        async with make_client(answer_at_once) as client:
             assert (await client.post("/disparity", files=BOTH)).status_code == 200
             return await client.get("/metrics")
 
@@ -271,8 +271,8 @@ def test_without_a_registry_there_are_no_metrics(monkeypatch):
 def test_a_response_that_could_not_be_begun_in_time_becomes_one_that_says_so():
     from stereoweave.service.asgi import Guard, Limits, make_app
 
-    async def answers(job: ServiceJob, left_s: float) -> Answer:
-        return Answer(content=b"done", report="{}")
+    async def answers(job: ServiceJob, left_s: float) -> ServiceAnswer:
+        return ServiceAnswer(content=b"done", report="{}")
 
     async def ask() -> httpx.Response:
         limits, unread = Limits(timeout_s=0.2), [asyncio.Event()]

@@ -20,10 +20,10 @@ import psutil
 import pytest
 import watching
 from hostile_calibrations import HOSTILE
-from hostile_requests import hostile
+from hostile_requests import make_hostile_requests
 from prometheus_client import Metric
 from prometheus_client.parser import text_string_to_metric_families
-from service_examples import BOTH, CALIB, TEXTURED, Sender, malformed
+from service_examples import BOTH, CALIB, TEXTURED, Sender, make_malformed_requests
 
 import stereoweave as sw
 from stereoweave.cameras.calibration_files import add_camera
@@ -55,12 +55,12 @@ def service(running) -> httpx.Client:
 @pytest.fixture(scope="module")
 def running(tmp_path_factory) -> Iterator[Running]:
     limits = ["--waiting", WAITING, "--max-megabytes", MEGABYTES, "--max-megapixels", 1, "--timeout-s", 20]
-    with served(tmp_path_factory.mktemp("uploads"), "--batch", 2, *limits) as running:
+    with run_serve_command(tmp_path_factory.mktemp("uploads"), "--batch", 2, *limits) as running:
         yield running
 
 
 @contextmanager
-def served(uploads: Path, *words: object) -> Iterator[Running]:
+def run_serve_command(uploads: Path, *words: object) -> Iterator[Running]:
     """The command, in a process of its own, which has to end by itself, and all that it started with it."""
     # Metrics each second, and not each ten. The names of the sockets of Ray may not be long.
     ray = {"RAY_metrics_report_interval_ms": "1000", "RAY_TMPDIR": "/tmp"}
@@ -73,22 +73,22 @@ def served(uploads: Path, *words: object) -> Iterator[Running]:
     try:
         with process.stdout:
             url = re.search(r"http://[\d.:]+", process.stdout.readline())[0]
-            started = set(watching.children(process.pid))
+            started = set(watching.list_descendants(process.pid))
             # Each request has a connection of its own, as those of many clients.
             alone = httpx.Limits(max_keepalive_connections=0)
             with httpx.Client(base_url=url, timeout=60, limits=alone) as client:
                 yield Running(client, process.pid, uploads)
-            started |= set(watching.children(process.pid))
+            started |= set(watching.list_descendants(process.pid))
             process.send_signal(signal.SIGTERM)
             assert process.wait(30) == 0
-            assert not still_running(started, within_s=10)
+            assert not wait_for_end(started, within_s=10)
             assert not list(uploads.glob("stereoweave-*"))
     finally:
         process.kill()
         process.wait()
 
 
-def still_running(pids: set[int], within_s: float) -> list[int]:
+def wait_for_end(pids: set[int], within_s: float) -> list[int]:
     """The processes that have not ended by then."""
     deadline_s = time.monotonic() + within_s
     while (left := [pid for pid in pids if Path(f"/proc/{pid}").exists()]) and time.monotonic() < deadline_s:
@@ -100,7 +100,7 @@ def post(service: httpx.Client, path: str, files: Any = BOTH, **data: Any) -> ht
     return service.post(path, files=files, data=data)
 
 
-def saved(response: httpx.Response, path: Path) -> Path:
+def save_content(response: httpx.Response, path: Path) -> Path:
     assert response.status_code == 200, response.text
     path.write_bytes(response.content)
     return path
@@ -118,16 +118,16 @@ def estimate(photos) -> sw.Estimate:
 
 
 def test_a_pair_gets_the_disparity_that_the_library_finds(service, estimate, tmp_path):
-    pfm = saved(post(service, "/disparity", file="pfm"), tmp_path / "disparity.pfm")
+    pfm = save_content(post(service, "/disparity", file="pfm"), tmp_path / "disparity.pfm")
     np.testing.assert_allclose(read_pfm(pfm), estimate.disparity_px, atol=1e-3)
-    png = saved(post(service, "/disparity"), tmp_path / "disparity.png")
+    png = save_content(post(service, "/disparity"), tmp_path / "disparity.png")
     np.testing.assert_allclose(read_disparity_png(png), estimate.disparity_px, atol=1 / 256)
 
 
 def test_a_pair_and_its_calibration_get_depth_in_metres(service, estimate, photos, tmp_path):
     camera = add_camera(sw.StereoPair(left=photos[0], right=photos[1]), TEXTURED / "calib.txt").camera
     response = post(service, "/depth", {**BOTH, "calib": CALIB}, file="npy")
-    depth_m = np.load(saved(response, tmp_path / "depth.npy"), allow_pickle=False)
+    depth_m = np.load(save_content(response, tmp_path / "depth.npy"), allow_pickle=False)
     np.testing.assert_allclose(depth_m, camera.depth_m(estimate.disparity_px), rtol=1e-3)
     report = json.loads(response.headers["X-Stereoweave-Report"])
     assert report["width_px"] == 640
@@ -135,7 +135,7 @@ def test_a_pair_and_its_calibration_get_depth_in_metres(service, estimate, photo
 
 
 def test_a_view_is_the_one_of_the_library(service, photos, tmp_path):
-    view = saved(post(service, "/view", position=0.3), tmp_path / "view.png")
+    view = save_content(post(service, "/view", position=0.3), tmp_path / "view.png")
     expected = sw.synthesize(*photos, 0.3, model="small").image.astype(int)
     assert np.abs(read_image(view) - expected).mean() < 0.01
 
@@ -149,13 +149,13 @@ def test_one_picture_of_both_views_is_as_good_as_two(service, photos, tmp_path):
 
 
 def test_a_range_that_is_given_is_kept(service, tmp_path):
-    pfm = saved(post(service, "/disparity", range="8,16", file="pfm"), tmp_path / "disparity.pfm")
+    pfm = save_content(post(service, "/disparity", range="8,16", file="pfm"), tmp_path / "disparity.pfm")
     assert read_pfm(pfm).min() == 8
     assert read_pfm(pfm).max() == 16
 
 
 def test_no_malformed_request_is_answered_with_a_server_error(service):
-    requests = malformed(MEGABYTES)
+    requests = make_malformed_requests(MEGABYTES)
     assert len(requests) >= 100
     with ThreadPoolExecutor(WAITING - 1) as pool:
         answers = dict(zip(requests, pool.map(lambda send: send(service), requests.values()), strict=True))
@@ -186,7 +186,7 @@ def test_a_service_that_is_full_refuses_and_does_what_it_accepted(service):
 def test_hostile_requests_and_calibrations_leave_it_answering_at_once_and_small(running):
     calibrations = dict(list(HOSTILE.items())[:: max(1, len(HOSTILE) // 60)])
     requests = {name: partial(post_calibration, content) for name, content in calibrations.items()}
-    requests |= hostile() | malformed(MEGABYTES)
+    requests |= make_hostile_requests() | make_malformed_requests(MEGABYTES)
     assert len(calibrations) >= 60
     assert len(requests) >= 260
     watcher = [sys.executable, watching.__file__, str(running.client.base_url), str(running.pid)]
@@ -194,7 +194,9 @@ def test_hostile_requests_and_calibrations_leave_it_answering_at_once_and_small(
         subprocess.Popen(watcher, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as watch,
         ThreadPoolExecutor(12) as pool,
     ):
-        sent = {name: pool.submit(send_until_taken, send, running.client) for name, send in requests.items()}
+        sent = {
+            name: pool.submit(send_until_accepted, send, running.client) for name, send in requests.items()
+        }
         statuses = {name: status.result() for name, status in sent.items()}
         seen = json.loads(watch.communicate()[0])
     assert not {name: status for name, status in statuses.items() if status >= 500}
@@ -213,7 +215,7 @@ def post_calibration(content: bytes, client: httpx.Client) -> tuple[int, str]:
     return response.status_code, response.text
 
 
-def send_until_taken(send: Sender, client: httpx.Client) -> int:
+def send_until_accepted(send: Sender, client: httpx.Client) -> int:
     """The status that is answered once others have made room; 503 where they do not within five minutes.
 
     The slow ones among the others take all the time that the service allows, one after another.
@@ -272,7 +274,7 @@ def test_its_description_names_every_path_and_field(service):
     assert {"left", "right", "picture", "position", "file", "range", "calib"} <= set(fields)
 
 
-def families_of(text: str) -> dict[str, Metric]:
+def parse_metrics(text: str) -> dict[str, Metric]:
     return {family.name: family for family in text_string_to_metric_families(text)}
 
 
@@ -283,7 +285,7 @@ def test_its_metrics_count_requests_by_status(service):
     expected = {("/depth", "422"), ("/view", "499"), ("/disparity", "200"), ("/disparity", "503")}
     deadline_s = time.monotonic() + 30
     while time.monotonic() < deadline_s:
-        families = families_of(service.get("/metrics").text)
+        families = parse_metrics(service.get("/metrics").text)
         seen = {(s.labels["path"], s.labels["status"]) for s in families["stereoweave_requests"].samples}
         if expected <= seen:
             break
@@ -294,13 +296,13 @@ def test_its_metrics_count_requests_by_status(service):
 
 def test_ray_s_own_exporter_has_what_replicas_count(running):
     deadline_s = time.monotonic() + 30
-    while not (families := exported_by_ray(running.pid)) and time.monotonic() < deadline_s:
+    while not (families := read_ray_metrics(running.pid)) and time.monotonic() < deadline_s:
         time.sleep(0.2)
     batches = {s.labels.get("le"): s.value for s in families["ray_serve_actual_batch_size"].samples}
     assert batches["+Inf"] > batches["1.0"]  # some were of two
 
 
-def exported_by_ray(pid: int) -> dict[str, Metric]:
+def read_ray_metrics(pid: int) -> dict[str, Metric]:
     """The metrics at the port of Ray's exporter, which is one of the ports that the service opens."""
     for process in psutil.Process(pid).children(recursive=True):
         for connection in process.net_connections("tcp"):
@@ -308,7 +310,7 @@ def exported_by_ray(pid: int) -> dict[str, Metric]:
                 with suppress(httpx.HTTPError):
                     text = httpx.get(f"http://127.0.0.1:{connection.laddr.port}/metrics", timeout=2).text
                     if "ray_serve_actual_batch_size" in text:
-                        return families_of(text)
+                        return parse_metrics(text)
     return {}
 
 
@@ -379,11 +381,11 @@ def test_an_error_of_a_replica_names_its_setting_as_an_option(ray_address, capsy
 def test_what_the_command_says_of_hosts_and_the_token_holds_for_the_service(tmp_path, monkeypatch):
     kept = []
 
-    def serving(settings: Any, listener: socket.socket, address: str | None) -> None:
+    def run_service(settings: Any, listener: socket.socket, address: str | None) -> None:
         kept.append(settings.limits)
         raise StereoweaveError("not now")
 
-    monkeypatch.setattr("stereoweave.service.deployment.serving", serving)
+    monkeypatch.setattr("stereoweave.service.deployment.run_service", run_service)
     (tmp_path / "token").write_text(" se-cret\n")
     hosts = {
         (): ("127.0.0.1", "localhost"),
@@ -400,7 +402,7 @@ def test_what_the_command_says_of_hosts_and_the_token_holds_for_the_service(tmp_
 
 
 def test_on_a_cluster_the_proxies_of_ray_serve_the_same(ray_address, tmp_path):
-    with served(tmp_path, "--address", ray_address, "--threads", 1) as running:
+    with run_serve_command(tmp_path, "--address", ray_address, "--threads", 1) as running:
         assert post(running.client, "/disparity").status_code == 200
         assert running.client.get("/health", headers={"Host": "evil.example"}).status_code == 400
         assert running.client.get("/health").status_code == 200

@@ -11,7 +11,7 @@ import pytest
 from error_examples import LAYOUTS, write_error_examples
 
 from stereoweave.matching.matcher import Matcher
-from stereoweave.service.answers import Answer, ServiceJob, answer_many
+from stereoweave.service.answers import ServiceAnswer, ServiceJob, answer_many
 
 # What Ray Serve is warned of by Pydantic when it is imported.
 pytestmark = pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`:DeprecationWarning")
@@ -74,7 +74,7 @@ def ask(tmp_path_factory) -> Ask:
     write_error_examples(folder)
     matcher = Matcher("small", threads=1)
 
-    async def answer(job: ServiceJob, left_s: float) -> Answer:
+    async def answer(job: ServiceJob, left_s: float) -> ServiceAnswer:
         (outcome,) = answer_many(matcher, [job])
         if isinstance(outcome, Exception):
             raise outcome

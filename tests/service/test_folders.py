@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from stereoweave.service.folders import own_folder
+from stereoweave.service.folders import make_own_folder
 
 PROGRAM = """
-from stereoweave.service.folders import own_folder
-with own_folder() as folder:
+from stereoweave.service.folders import make_own_folder
+with make_own_folder() as folder:
     (folder / "upload").write_bytes(b"x")
     print(folder, flush=True)
     input()
@@ -33,14 +33,14 @@ def test_uploads_of_a_killed_process_are_removed_at_the_next_start_and_those_of_
         killed.kill()
         killed.wait()
         assert (left_behind / "upload").exists()
-        with own_folder():
+        with make_own_folder():
             assert not left_behind.exists()
             assert (in_use / "upload").exists()
         running.communicate("\n")
 
 
 def test_nothing_is_left_of_a_folder_after_its_block(temporary):
-    with own_folder() as folder:
+    with make_own_folder() as folder:
         (folder / "upload").write_bytes(b"x")
         assert folder.stat().st_mode & 0o777 == 0o700
     assert not list(temporary.iterdir())
@@ -52,11 +52,11 @@ def test_a_folder_that_a_link_of_that_name_leads_to_is_not_emptied(temporary):
     (other / "file").write_bytes(b"x")
     (temporary / "stereoweave-service-0").symlink_to(other)
     (temporary / "stereoweave-service-0.lock").touch()
-    with own_folder():
+    with make_own_folder():
         assert (other / "file").exists()
 
 
 def test_a_lock_file_that_was_removed_meanwhile_is_not_missed(temporary):
-    with own_folder() as folder:
+    with make_own_folder() as folder:
         folder.with_name(f"{folder.name}.lock").unlink()
     assert not list(temporary.iterdir())

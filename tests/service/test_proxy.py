@@ -11,9 +11,9 @@ from pathlib import Path
 
 import httpx
 import pytest
-from other_processes import free_ports
+from other_processes import find_free_ports
 
-from stereoweave.service.server import Patience, http_server
+from stereoweave.service.server import ClientTimeouts, run_http_server
 
 pytestmark = [pytest.mark.system, pytest.mark.needs_nginx]
 
@@ -58,8 +58,8 @@ def certificate(tmp_path_factory) -> Path:
 def port(tmp_path_factory, certificate) -> Iterator[int]:
     """The port of nginx, whose configuration is changed in places, ports and seconds alone."""
     folder = tmp_path_factory.mktemp("nginx")
-    with socket.create_server(("127.0.0.1", 0)) as listener, http_server(app, listener, Patience()):
-        (port,) = free_ports(1)
+    with socket.create_server(("127.0.0.1", 0)) as listener, run_http_server(app, listener, ClientTimeouts()):
+        (port,) = find_free_ports(1)
         places = {
             "listen 443": f"listen 127.0.0.1:{port}",
             "127.0.0.1:8000": f"127.0.0.1:{listener.getsockname()[1]}",

@@ -10,9 +10,9 @@ from http.client import HTTPResponse
 
 import pytest
 
-from stereoweave.service.server import Patience, http_server
+from stereoweave.service.server import ClientTimeouts, run_http_server
 
-PATIENCE = Patience(head_s=0.5, reader_s=0.5, end_s=10)
+TIMEOUTS = ClientTimeouts(head_s=0.5, reader_s=0.5, end_s=10)
 HEAD = b"GET /5 HTTP/1.1\r\nHost: x\r\n"
 ARRIVED, ALLOWED = threading.Event(), threading.Event()
 
@@ -33,7 +33,7 @@ async def app(scope, receive, send) -> None:
 def address() -> Iterator[tuple[str, int]]:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         address = listener.getsockname()
-        with http_server(app, listener, PATIENCE):
+        with run_http_server(app, listener, TIMEOUTS):
             yield address
 
 
@@ -109,21 +109,21 @@ def test_a_request_for_a_head_that_goes_on_as_no_http_is_closed_without_an_error
 def test_a_request_that_takes_longer_than_a_head_may_take_is_answered(connection):
     ALLOWED.clear()
     connection.sendall(b"GET /later HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
-    threading.Timer(2 * PATIENCE.head_s, ALLOWED.set).start()
+    threading.Timer(2 * TIMEOUTS.head_s, ALLOWED.set).start()
     assert read_to_end(connection).endswith(b"later")
 
 
 def test_a_response_that_is_not_read_in_time_is_given_up(connection):
     connection.sendall(b"GET /50000000 HTTP/1.1\r\nHost: x\r\n\r\n")
     connection.recv(1)
-    time.sleep(4 * PATIENCE.reader_s)
+    time.sleep(4 * TIMEOUTS.reader_s)
     assert len(read_to_end(connection)) < 49_000_000
 
 
 def test_a_response_that_is_not_read_is_given_up_though_another_request_waits_behind_it(connection):
     connection.sendall(b"GET /50000000 HTTP/1.1\r\nHost: x\r\n\r\n" * 2)
     connection.recv(1)
-    time.sleep(4 * PATIENCE.reader_s)
+    time.sleep(4 * TIMEOUTS.reader_s)
     assert len(read_to_end(connection)) < 49_000_000
 
 
@@ -131,7 +131,7 @@ def test_what_was_accepted_is_answered_before_the_server_ends():
     ARRIVED.clear()
     ALLOWED.clear()
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        with http_server(app, listener, PATIENCE):
+        with run_http_server(app, listener, TIMEOUTS):
             connection = socket.create_connection(listener.getsockname(), timeout=10)
             connection.sendall(b"GET /later HTTP/1.1\r\nHost: x\r\n\r\n")
             assert ARRIVED.wait(10)
@@ -156,7 +156,7 @@ def test_a_body_of_tiny_chunks_does_not_hold_others_up(address, connection):
 def test_beyond_the_limit_the_connection_that_waited_longest_is_closed_and_the_others_are_answered():
     with ExitStack() as opened:
         listener = opened.enter_context(socket.create_server(("127.0.0.1", 0)))
-        opened.enter_context(http_server(app, listener, Patience(head_s=60)))
+        opened.enter_context(run_http_server(app, listener, ClientTimeouts(head_s=60)))
         several = []
         for count in range(1, 502):
             connection = socket.create_connection(listener.getsockname(), timeout=10)

@@ -16,7 +16,7 @@ from ray.data import DataContext
 
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.system import ray_engine as engine_module
-from stereoweave.system.ray_engine import Engine, call_on_each_machine, connect, room, stream
+from stereoweave.system.ray_engine import Engine, call_on_each_machine, connect, count_slots, stream
 
 pytestmark = pytest.mark.system
 
@@ -133,8 +133,8 @@ time.sleep(3)  # until Ray has reported
 
 
 def test_a_worker_that_fits_no_machine_is_refused_and_parts_of_a_core_are_counted(engine):
-    assert room(engine) == 2
-    assert room(Engine(cpus_each=0.1)) == 20
+    assert count_slots(engine) == 2
+    assert count_slots(Engine(cpus_each=0.1)) == 20
     with pytest.raises(StereoweaveError, match=r"a machine with 3 cores and 0 GPUs .* found 2 and 0"):
         list(stream(make_reporter, [1], Engine(cpus_each=3)))
     with pytest.raises(
@@ -142,7 +142,7 @@ def test_a_worker_that_fits_no_machine_is_refused_and_parts_of_a_core_are_counte
         match=r"a machine with 1 cores and 0.5 GPUs .* found 2 and 0 .*; or ask for less "
         r"\(cpus_each, gpus_each\)$",
     ):
-        room(Engine(gpus_each=0.5))
+        count_slots(Engine(gpus_each=0.5))
     nan, inf = float("nan"), float("inf")
     shares = ({"cpus_each": cpus} for cpus in (0, 1e-5, nan, inf))
     gpus = ({"gpus_each": gpus} for gpus in (-1, 1e-5, 1.5, nan, inf))
@@ -168,7 +168,7 @@ def test_a_function_is_called_on_each_machine_that_has_room_and_an_error_is_no_r
 
 def test_a_wrong_address_is_told_in_one_line(engine, monkeypatch):
     ray.shutdown()  # where there is a connection already, the address is not asked for
-    monkeypatch.setattr(engine_module, "_ANSWERS_WITHIN_S", 1)
+    monkeypatch.setattr(engine_module, "_STATUS_TIMEOUT_S", 1)
     with socket.create_server(("127.0.0.1", 0)) as deaf:
         addresses = {
             "127.0.0.1:1": "expected the head of a Ray cluster that answers, found .*refused",
@@ -188,12 +188,12 @@ def test_the_token_is_shown_to_a_head_that_requires_it_and_a_wrong_one_is_told_i
     program = """
 import sys
 from stereoweave.errors import StereoweaveError
-from stereoweave.system.ray_engine import Engine, connect, room
+from stereoweave.system.ray_engine import Engine, connect, count_slots
 
 engine = Engine(sys.argv[1])
 try:
     with connect(engine):
-        print(room(engine), "worker")
+        print(count_slots(engine), "worker")
 except StereoweaveError as error:
     print(error)
 """

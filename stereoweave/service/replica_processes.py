@@ -1,4 +1,4 @@
-"""Child processes that read and match for the service; replaced when they overrun or crash."""
+"""A replica's child processes, which read and match; replaced when they overrun or crash."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -7,16 +7,16 @@ from pathlib import Path
 
 from stereoweave.errors import FormatError
 from stereoweave.pictures.prepare import Request
-from stereoweave.service.answers import Answer, Answering, ServiceJob, make_measuring
+from stereoweave.service.answers import BatchAnswerer, ServiceAnswer, ServiceJob, load_measurer
 from stereoweave.system.child_process import ChildProcess, ProcessDiedError
 
 # Reading the head of a picture takes milliseconds.
-_MEASURED_WITHIN_S = 10
+_MEASURING_LIMIT_S = 10
 _SAMPLE = Path(__file__).parents[1] / "sample"
 
 
 @dataclass(frozen=True)
-class Task:
+class TimedJob:
     """A job, its megapixels, and its deadline as a value of `time.monotonic`."""
 
     job: ServiceJob
@@ -29,22 +29,22 @@ class Task:
         return max(0.0, self.deadline_s - time.monotonic())
 
 
-class Worker:
+class ReplicaProcesses:
     """Two processes: one measures pictures from their heads, the other decodes and matches them.
 
     Args:
-        make_answering: Makes the second one's function, such as `partial(make_answering, Backend())`.
+        load_answerer: Makes the second one's function, such as `partial(load_answerer, Backend())`.
         folder: For the temporary files of both.
     """
 
-    def __init__(self, make_answering: Callable[[], Answering], folder: Path) -> None:
-        self._measuring = ChildProcess(make_measuring, folder / "measuring")
-        self._answering = ChildProcess(make_answering, folder / "answering")
+    def __init__(self, load_answerer: Callable[[], BatchAnswerer], folder: Path) -> None:
+        self._measurer = ChildProcess(load_measurer, folder / "measuring")
+        self._answerer = ChildProcess(load_answerer, folder / "answering")
 
     def close(self) -> None:
         """End the processes."""
-        self._measuring.close()
-        self._answering.close()
+        self._measurer.close()
+        self._answerer.close()
 
     def warm_up(self) -> float:
         """Compile all kernels, then measure the seconds per megapixel of an unrefined disparity.
@@ -57,11 +57,11 @@ class Worker:
         every_option = replace(plain, file="view.png", request=Request(rectify=True), checked=True)
         for job in (every_option, plain):
             start_s = time.perf_counter()
-            (answer,) = self._answering([job], timeout_s=None)
+            (answer,) = self._answerer([job], timeout_s=None)
             took_s = time.perf_counter() - start_s
             if isinstance(answer, Exception):
                 raise answer
-        return took_s / self._measuring(plain, timeout_s=None)
+        return took_s / self._measurer(plain, timeout_s=None)
 
     def measure(self, job: ServiceJob, left_s: float) -> float:
         """The megapixels of a job's pictures, from their heads.
@@ -71,24 +71,25 @@ class Worker:
             TimeoutError: If it takes longer than `left_s`.
         """
         try:
-            return self._measuring(job, min(left_s, _MEASURED_WITHIN_S))
+            return self._measurer(job, min(left_s, _MEASURING_LIMIT_S))
         except TimeoutError as error:
-            if left_s < _MEASURED_WITHIN_S:
+            if left_s < _MEASURING_LIMIT_S:
                 raise
             raise FormatError(
-                f"expected pictures whose sizes are known within {_MEASURED_WITHIN_S} s, found that it takes "
+                f"expected pictures whose sizes are known within {_MEASURING_LIMIT_S} s, found that it takes "
                 "longer; save them again"
             ) from error
 
-    def answer(self, tasks: Sequence[Task]) -> list[Answer | Exception]:
-        """The answer to each task, or its error.
+    def answer(self, timed_jobs: Sequence[TimedJob]) -> list[ServiceAnswer | Exception]:
+        """The answer to each job, or its error.
 
-        At the first deadline, or if the process crashes, it is replaced, and the other tasks start again, one
+        At the first deadline, or if the process crashes, it is replaced, and the other jobs start again, one
         by one.
         """
         try:
-            return self._answering([task.job for task in tasks], min(task.left_s for task in tasks))
+            jobs = [timed.job for timed in timed_jobs]
+            return self._answerer(jobs, min(timed.left_s for timed in timed_jobs))
         except (TimeoutError, ProcessDiedError) as error:
-            if len(tasks) == 1:
+            if len(timed_jobs) == 1:
                 return [error]
-        return [outcome for task in tasks for outcome in self.answer([task])]
+        return [outcome for timed in timed_jobs for outcome in self.answer([timed])]

@@ -1,0 +1,101 @@
+import signal
+import time
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from stereoweave.errors import FormatError, MatcherError
+from stereoweave.matching.backend import Backend
+from stereoweave.service.answers import BatchAnswerer, ServiceAnswer, ServiceJob, load_answerer
+from stereoweave.service.replica_processes import ReplicaProcesses, TimedJob
+
+pytestmark = pytest.mark.system
+
+TEXTURED = Path(__file__).parents[1] / "textured_pair"
+PICTURES = (TEXTURED / "left.png", TEXTURED / "right.png")
+
+
+def make_job(file: str = "disparity.png", within_s: float = 60) -> TimedJob:
+    job = ServiceJob(folder=TEXTURED, pictures=PICTURES, file=file)
+    return TimedJob(job, megapixels=0.6, deadline_s=time.monotonic() + within_s)
+
+
+def load_named_answerer() -> BatchAnswerer:
+    """Instead of a network: jobs named so sleep or crash, others get their name."""
+
+    def answer(jobs: Sequence[ServiceJob]) -> list[ServiceAnswer | Exception]:
+        for job in jobs:
+            if job.file == "sleep":
+                time.sleep(60)
+            if job.file == "crash":
+                signal.raise_signal(signal.SIGSEGV)
+        return [ServiceAnswer(content=job.file.encode(), report="{}") for job in jobs]
+
+    return answer
+
+
+@pytest.fixture(scope="module")
+def processes(tmp_path_factory) -> Iterator[ReplicaProcesses]:
+    processes = ReplicaProcesses(load_named_answerer, tmp_path_factory.mktemp("files"))
+    processes.answer([make_job()])  # it has started: what comes now takes its own time alone
+    yield processes
+    processes.close()
+
+
+def list_names(outcomes: Sequence[ServiceAnswer | Exception]) -> list[str]:
+    return [
+        outcome.content.decode() if isinstance(outcome, ServiceAnswer) else type(outcome).__name__
+        for outcome in outcomes
+    ]
+
+
+def test_what_overruns_is_ended_and_what_waited_with_it_is_answered(processes):
+    start_s = time.monotonic()
+    outcomes = processes.answer([make_job("first"), make_job("sleep", within_s=0.3), make_job("second")])
+    assert list_names(outcomes) == ["first", "TimeoutError", "second"]
+    assert time.monotonic() - start_s < 20
+    assert str(outcomes[1]).startswith("expected to be done within")
+
+
+def test_what_crashes_is_one_line_and_what_waited_with_it_is_answered(processes):
+    outcomes = processes.answer([make_job("first"), make_job("crash"), make_job("second")])
+    assert list_names(outcomes) == ["first", "ProcessDiedError", "second"]
+    assert "SIGSEGV" in str(outcomes[1])
+
+
+def test_what_is_late_already_is_not_begun(processes):
+    assert list_names(processes.answer([make_job("first", within_s=-1)])) == ["TimeoutError"]
+    assert list_names(processes.answer([make_job("second")])) == ["second"]
+
+
+def test_a_match_by_a_network_is_ended_at_its_deadline_and_the_next_one_is_answered(tmp_path):
+    processes = ReplicaProcesses(partial(load_answerer, Backend(threads=1)), tmp_path / "files")
+    assert 0 < processes.warm_up() < 60
+    assert list_names(processes.answer([make_job(within_s=0.01)])) == ["TimeoutError"]
+    (answer,) = processes.answer([make_job()])
+    assert answer.content.startswith(b"\x89PNG")
+    processes.close()
+
+
+def test_pictures_are_measured_by_their_heads(processes, tmp_path):
+    job = make_job().job
+    assert processes.measure(job, left_s=10) == pytest.approx(2 * 640 * 480 / 1e6)
+    (tmp_path / "text").write_text("no picture")
+    with pytest.raises(FormatError, match="expected a picture"):
+        processes.measure(
+            ServiceJob(folder=tmp_path, pictures=(tmp_path / "text",), file="disparity.png"), left_s=10
+        )
+
+
+def test_a_picture_whose_head_cannot_be_read_in_time_is_refused(processes):
+    with pytest.raises(TimeoutError):
+        processes.measure(make_job().job, left_s=0)
+
+
+def test_a_network_that_cannot_be_loaded_is_said_before_any_order(tmp_path):
+    processes = ReplicaProcesses(partial(load_answerer, Backend(model="none.onnx")), tmp_path / "files")
+    with pytest.raises(MatcherError, match=r"none\.onnx: expected an ONNX matcher"):
+        processes.warm_up()
+    processes.close()
