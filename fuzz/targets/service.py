@@ -43,7 +43,7 @@ def _starts() -> dict[str, bytes]:
 def _application() -> Application:
     matcher = Matcher("small", threads=1)
 
-    async def answering(job: ServiceJob, left_s: float) -> ServiceAnswer:
+    async def answer_job(job: ServiceJob, left_s: float) -> ServiceAnswer:
         check_pixels(job)
         (answer,) = await asyncio.to_thread(answer_many, matcher, [job])
         if isinstance(answer, Exception):
@@ -51,7 +51,7 @@ def _application() -> Application:
         return answer
 
     registry = CollectorRegistry()
-    app = make_app(answering, _LIMITS, Path(tempfile.gettempdir()), registry)
+    app = make_app(answer_job, _LIMITS, Path(tempfile.gettempdir()), registry)
     return Guard(app, _LIMITS, registry)
 
 

@@ -318,9 +318,9 @@ def test_a_port_that_is_taken_is_one_line(capsys):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         assert main(["serve", "--port", str(port)]) == 2
-    told = capsys.readouterr().err
-    assert told.startswith(f"stereoweave: --host 127.0.0.1 --port {port}: expected a free address")
-    assert told.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert printed.startswith(f"stereoweave: --host 127.0.0.1 --port {port}: expected a free address")
+    assert printed.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -348,15 +348,15 @@ def test_a_port_that_is_taken_is_one_line(capsys):
 )
 def test_what_cannot_be_served_is_said_before_ray_starts(words, expected, capsys):
     assert main(["serve", "--port", "0", *words]) == 2
-    told = capsys.readouterr().err
-    assert expected in told
-    assert told.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert expected in printed
+    assert printed.count("\n") == 1
 
 
 def test_a_cluster_without_room_is_said_and_not_waited_for(ray_address, capsys):
     assert main(["serve", "--port", "0", "--address", ray_address, "--threads", "3"]) == 2
-    told = capsys.readouterr().err
-    assert told == (
+    printed = capsys.readouterr().err
+    assert printed == (
         "stereoweave: --replicas: expected at most 0, for which there is room, found 1; each takes 3 cores; "
         "ask for less (--replicas, --threads)\n"
     )
@@ -365,9 +365,9 @@ def test_a_cluster_without_room_is_said_and_not_waited_for(ray_address, capsys):
 def test_a_network_that_the_cluster_does_not_have_is_named(ray_address, capsys):
     words = ["--address", ray_address, "--threads", "1", "--model", "none.onnx"]
     assert main(["serve", "--port", "0", *words]) == 2
-    told = capsys.readouterr().err
-    assert "found none.onnx: expected an ONNX matcher, found no such file; is the model there too?" in told
-    assert told.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert "found none.onnx: expected an ONNX matcher, found no such file; is the model there too?" in printed
+    assert printed.count("\n") == 1
 
 
 def test_an_error_of_a_replica_names_its_setting_as_an_option(ray_address, capsys):

@@ -93,7 +93,7 @@ def test_what_a_worker_raises_is_raised_here_as_it_was(engine):
     assert "in work" in caught.value.__notes__[0]
 
 
-def test_workers_that_lack_a_module_are_told_in_a_line(engine, tmp_path, monkeypatch, capfd):
+def test_workers_that_lack_a_module_are_reported_in_a_line(engine, tmp_path, monkeypatch, capfd):
     (tmp_path / "only_here.py").write_text("def make():\n    return str\n")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(engine_module, "_MOST_FALSE_STARTS", 0)
@@ -166,7 +166,7 @@ def test_a_function_is_called_on_each_machine_that_has_room_and_an_error_is_no_r
     assert call_on_each_machine(name_of_positive, 7, Engine(), timeout_s=0) == []
 
 
-def test_a_wrong_address_is_told_in_one_line(engine, monkeypatch):
+def test_a_wrong_address_is_reported_in_one_line(engine, monkeypatch):
     ray.shutdown()  # where there is a connection already, the address is not asked for
     monkeypatch.setattr(engine_module, "_STATUS_TIMEOUT_S", 1)
     with socket.create_server(("127.0.0.1", 0)) as deaf:
@@ -176,13 +176,13 @@ def test_a_wrong_address_is_told_in_one_line(engine, monkeypatch):
             f"127.0.0.1:{deaf.getsockname()[1]}": "found something else that listens there",
             "nonsense": "expected host:port, ray://host:port, auto or local, found 'nonsense'",
         }
-        for address, told in addresses.items():
-            with pytest.raises(StereoweaveError, match=told) as caught, connect(Engine(address)):
+        for address, expected in addresses.items():
+            with pytest.raises(StereoweaveError, match=expected) as caught, connect(Engine(address)):
                 pass
             assert "\n" not in str(caught.value)
 
 
-def test_the_token_is_shown_to_a_head_that_requires_it_and_a_wrong_one_is_told_in_one_line(
+def test_the_token_is_shown_to_a_head_that_requires_it_and_a_wrong_one_is_reported_in_one_line(
     guarded_ray_address,
 ):
     program = """
