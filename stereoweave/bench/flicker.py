@@ -66,7 +66,7 @@ class FlickerRow:
     time_ms: float
 
 
-class _Result(NamedTuple):
+class _MethodOutput(NamedTuple):
     """A method's output for one video."""
 
     disparities_px: list[Float[np.ndarray, "h w"]]
@@ -148,15 +148,15 @@ def _render_videos(spec: RenderSpec, frames: int) -> Iterator[RenderedVideo]:
 
 def _run_methods(
     video: RenderedVideo, pairs: list[StereoPair], estimates: list[Estimate], threads: int | None
-) -> dict[str, _Result]:
+) -> dict[str, _MethodOutput]:
     temporal_filter, steady, times_ms = TemporalFilter(threads), [], []
     for pair, estimate in zip(pairs, estimates, strict=True):
         start_s = time.perf_counter()
         steady.append(temporal_filter(pair.left, pair.right, estimate))
         times_ms.append(1000 * (time.perf_counter() - start_s))
     return {
-        FRAME_BY_FRAME: _Result(*_render_middle(video, estimates, threads), float("nan")),
-        STEADY: _Result(*_render_middle(video, steady, threads), float(np.median(times_ms[1:]))),
+        FRAME_BY_FRAME: _MethodOutput(*_render_middle(video, estimates, threads), float("nan")),
+        STEADY: _MethodOutput(*_render_middle(video, steady, threads), float(np.median(times_ms[1:]))),
     }
 
 
@@ -172,7 +172,7 @@ def _render_middle(
     return [estimate.disparity_px for estimate in estimates], views
 
 
-def _measure_errors(video: RenderedVideo, result: _Result) -> dict[str, float]:
+def _measure_errors(video: RenderedVideo, result: _MethodOutput) -> dict[str, float]:
     """Compute the error columns of a row."""
     later = range(1, len(video.pairs))
 

@@ -47,7 +47,7 @@ the mirrored pair is matched too. Neither step is timed, because users choose ot
 MatcherFactory = Callable[[], MatchFunction]
 
 AnyScene = TypeVar("AnyScene")
-Result = TypeVar("Result")
+AnyResult = TypeVar("AnyResult")
 SceneLister = Callable[[], Sequence[Callable[[], AnyScene]]]
 """Returns a reader for each scene; called by the process that starts a benchmark and by every worker."""
 
@@ -139,11 +139,11 @@ class PairScores(NamedTuple):
 
 
 @dataclass(frozen=True)
-class SceneResult(Generic[Result]):
+class SceneResult(Generic[AnyResult]):
     """A scene's number and result, and the machine that measured it."""
 
     number: int
-    result: Result
+    result: AnyResult
     machine: dict[str, str]
 
 
@@ -155,7 +155,7 @@ class _SceneScores(NamedTuple):
     pixels: int
 
 
-class _Answer(NamedTuple):
+class _MatcherOutput(NamedTuple):
     disparity_px: Float[np.ndarray, "h w"]
     confidence: Float[np.ndarray, "h w"]
     is_probability: bool
@@ -205,9 +205,9 @@ def score_pairs(
 def score_all(
     makers: Mapping[str, Callable[[], Any]],
     scenes: SceneLister[AnyScene],
-    score: Callable[[Mapping[str, Any], AnyScene], Result],
+    score: Callable[[Mapping[str, Any], AnyScene], AnyResult],
     engine: Engine | None,
-) -> list[SceneResult[Result]]:
+) -> list[SceneResult[AnyResult]]:
     """Apply `score` to the made matchers and each scene; results are in the scenes' order.
 
     For arguments and errors see `score_pairs`.
@@ -312,7 +312,7 @@ def _score_scene(matchers: Mapping[str, MatchFunction], scene: Scene) -> _SceneS
     return _SceneScores(scored, _score_classes(answers, scene), scene.truth_px.size)
 
 
-def _score_classes(answers: Mapping[str, _Answer], scene: Scene) -> list[ClassRow]:
+def _score_classes(answers: Mapping[str, _MatcherOutput], scene: Scene) -> list[ClassRow]:
     masks = classify(scene.pair.left, scene.truth_px, scene.occluded)
     return [
         ClassRow(matcher=name, scene=scene.name, pixel_class=pixel_class, **asdict(errors))
@@ -321,16 +321,18 @@ def _score_classes(answers: Mapping[str, _Answer], scene: Scene) -> list[ClassRo
     ]
 
 
-def _run_matcher(match: MatchFunction, pair: StereoPair) -> _Answer:
+def _run_matcher(match: MatchFunction, pair: StereoPair) -> _MatcherOutput:
     found = match(pair)
     if isinstance(found, Estimate):
-        return _Answer(found.disparity_px, found.confidence, is_probability=True)
+        return _MatcherOutput(found.disparity_px, found.confidence, is_probability=True)
     mirrored_px = match(pair.mirror())
     assert not isinstance(mirrored_px, Estimate)
-    return _Answer(fill_rows(found), left_right_confidence(found, mirrored_px[:, ::-1]), is_probability=False)
+    return _MatcherOutput(
+        fill_rows(found), left_right_confidence(found, mirrored_px[:, ::-1]), is_probability=False
+    )
 
 
-def _measure_errors(answer: _Answer, truth_px: Float[np.ndarray, "h w"]) -> dict[str, float]:
+def _measure_errors(answer: _MatcherOutput, truth_px: Float[np.ndarray, "h w"]) -> dict[str, float]:
     """Compute the columns that compare with the truth pixel by pixel."""
     found_px = answer.disparity_px
     known = np.isfinite(truth_px)
@@ -349,7 +351,7 @@ def _measure_errors(answer: _Answer, truth_px: Float[np.ndarray, "h w"]) -> dict
     }
 
 
-def _measure_curves(answer: _Answer, truth_px: Float[np.ndarray, "h w"]) -> Curves:
+def _measure_curves(answer: _MatcherOutput, truth_px: Float[np.ndarray, "h w"]) -> Curves:
     known = np.isfinite(truth_px)
     error_px = np.abs(answer.disparity_px[known] - truth_px[known].astype(np.float64))
     confidence = answer.confidence[known]

@@ -45,7 +45,7 @@ _LEFT_OF_CONFIDENCE = np.array([1, 0.85, 1], np.float32)
 _MOST_CONFIDENCE = np.array([1, 1, 0.5], np.float32)
 
 
-class _Cues(NamedTuple):
+class _StripCues(NamedTuple):
     """Inputs of a strip's matching cost: census codes, uint32, and grey levels, uint8, [H, W]."""
 
     codes: UInt32[np.ndarray, "h w"]
@@ -60,7 +60,7 @@ class _Paths(NamedTuple):
     first: Int16[np.ndarray, "w 2"]
 
 
-class _View:
+class _StripView:
     """A left view with its prior, read in strips of rows.
 
     Args:
@@ -97,14 +97,14 @@ class _View:
         """Disparities of the farthest and nearest surface around each pixel of the rows."""
         return [surface[self._rows[rows]][:, self._columns] for surface in self._surfaces_px]
 
-    def cues(self, rows: slice, threads: int) -> tuple[_Cues, _Cues]:
+    def cues(self, rows: slice, threads: int) -> tuple[_StripCues, _StripCues]:
         """Cues of both images for `upsample_kernels.match`."""
         from stereoweave.matching import upsample_kernels as kernels  # Numba takes half a second to import
 
         with ThreadPoolExecutor(threads) as pool:
             own, other = pool.map(lambda grey: _cues(grey, rows), (self.grey, self.other))
         more = ((0, 0), (kernels.BAND, kernels.BAND))
-        return own, _Cues(*(np.pad(cue[:, ::-1], more, mode="edge") for cue in other))
+        return own, _StripCues(*(np.pad(cue[:, ::-1], more, mode="edge") for cue in other))
 
     def first_candidates(self, rows: slice) -> Int16[np.ndarray, "h w 2"]:
         """Least disparity of each band of candidates."""
@@ -176,8 +176,8 @@ def _upsample_level(
     left: UInt8[np.ndarray, "h w"], right: UInt8[np.ndarray, "h w"], smaller: Estimate, threads: int
 ) -> Estimate:
     """Upsample an estimate to the size of these grey images."""
-    view = _View(left, right, smaller.disparity_px)
-    right_view = _View(_mirror(right), _mirror(left), _mirror(smaller.right_disparity_px))
+    view = _StripView(left, right, smaller.disparity_px)
+    right_view = _StripView(_mirror(right), _mirror(left), _mirror(smaller.right_disparity_px))
     found_px, right_found_px = _match_view(view, threads), _match_view(right_view, threads)
     disparity_px, doubt = _settle(view, found_px, _mirror(right_found_px), threads)
     right_disparity_px = _mirror(_settle(right_view, right_found_px, _mirror(found_px), threads)[0])
@@ -190,7 +190,7 @@ def _upsample_level(
     )
 
 
-def _match_view(view: _View, threads: int) -> Float32[np.ndarray, "h w"]:
+def _match_view(view: _StripView, threads: int) -> Float32[np.ndarray, "h w"]:
     """Match a left view strip by strip; its disparities of least cost."""
     from stereoweave.matching import upsample_kernels as kernels
 
@@ -221,7 +221,7 @@ class _Strip:
 
     def __init__(
         self,
-        view: _View,
+        view: _StripView,
         rows: slice,
         costs: UInt8[np.ndarray, "h w d"],
         sums: UInt16[np.ndarray, "h w d"],
@@ -259,7 +259,7 @@ class _Strip:
 
 
 def _settle(
-    view: _View,
+    view: _StripView,
     found_px: Float32[np.ndarray, "h w"],
     other_px: Float32[np.ndarray, "h w"],
     threads: int,
@@ -283,7 +283,7 @@ def _settle(
 
 
 def _settle_strip(
-    view: _View,
+    view: _StripView,
     rows: slice,
     found_px: Float32[np.ndarray, "h w"],
     other_px: Float32[np.ndarray, "h w"],
@@ -335,7 +335,7 @@ def _strips(height: int, rows: int) -> list[slice]:
     return [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
 
 
-def _cues(grey: UInt8[np.ndarray, "h w"], rows: slice) -> _Cues:
+def _cues(grey: UInt8[np.ndarray, "h w"], rows: slice) -> _StripCues:
     """Cues of a strip of rows; census codes use the rows beyond it."""
     from stereoweave.matching import refine_kernels as kernels
 
@@ -343,7 +343,7 @@ def _cues(grey: UInt8[np.ndarray, "h w"], rows: slice) -> _Cues:
     around = grey[rows.start - above : rows.stop + _CENSUS_PX]
     codes = np.empty(around.shape, np.uint32)
     kernels.census(around, codes)
-    return _Cues(codes[above:][: rows.stop - rows.start], grey[rows])
+    return _StripCues(codes[above:][: rows.stop - rows.start], grey[rows])
 
 
 def _pull() -> UInt8[np.ndarray, " d"]:

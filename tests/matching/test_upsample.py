@@ -145,7 +145,7 @@ def test_the_kernels_find_what_the_plain_loops_find(rng):
     smaller_px = np.full(small, 4.0, np.float32)
     smaller_px[5:15, 10:20] = 21.3
     smaller_px[8:12, 20:26] = -3.2
-    view = enlarging._View(grey, other, smaller_px)
+    view = enlarging._StripView(grey, other, smaller_px)
     first = view.first_candidates(slice(0, shape[0]))
     assert first.min() < -12 and first.max() > 30
     costs = plain_costs(plain_census(grey), grey, plain_census(other), other, first)
@@ -157,7 +157,7 @@ def test_bands_are_around_the_surfaces_that_the_smaller_copy_shows_near_a_pixel(
     smaller_px = np.full((20, 30), 4.0, np.float32)
     smaller_px[:, 15:] = 20
     grey = np.zeros((40, 60), np.uint8)
-    first = enlarging._View(grey, grey, smaller_px).first_candidates(slice(10, 11))[0]
+    first = enlarging._StripView(grey, grey, smaller_px).first_candidates(slice(10, 11))[0]
     # Within two of its pixels of the edge between columns 14 and 15, which are 28..29 and 30..31, both count.
     np.testing.assert_array_equal(first[:26], [[0, 0]] * 26)
     np.testing.assert_array_equal(first[26:34], [[0, 32]] * 8)

@@ -59,7 +59,7 @@ class ClutterSpace:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Placement:
+class _ClutterPlacement:
     """Position and size of an object.
 
     Attributes:
@@ -101,7 +101,7 @@ def _draw_kind(rng: np.random.Generator, thin_share: float) -> PropBuilder:
     return kinds[rng.integers(len(kinds))]
 
 
-def _draw_placements(rng: np.random.Generator, space: ClutterSpace, count: int) -> list[_Placement]:
+def _draw_placements(rng: np.random.Generator, space: ClutterSpace, count: int) -> list[_ClutterPlacement]:
     """Place objects in order of decreasing apparent size.
 
     Each object takes the best of several candidate positions. Clearance from all cameras comes before
@@ -126,7 +126,7 @@ def _draw_placements(rng: np.random.Generator, space: ClutterSpace, count: int) 
         size_m = min(sizes_m[k, best], max(clear_m[k, best] - _CLEAR_M, 0.03) / 0.55)
         taken[k], radii_m[k] = spots[k, best], 0.4 * size_m
         places.append(
-            _Placement(
+            _ClutterPlacement(
                 middle_m=spots[k, best],
                 distance_m=float(clear_m[k, best]),
                 size_m=float(size_m),
@@ -154,7 +154,7 @@ def _points_in_view(
     return eyes_m + depths_m[..., None] * seen
 
 
-def _place_mesh(rng: np.random.Generator, mesh: Mesh, place: _Placement, floor_m: float) -> Mesh:
+def _place_mesh(rng: np.random.Generator, mesh: Mesh, place: _ClutterPlacement, floor_m: float) -> Mesh:
     """Rotate and scale a mesh and its texture, then move it to its position or onto the floor below."""
     low, high = mesh.corners_m.min((0, 1)), mesh.corners_m.max((0, 1))
     scale = place.size_m / float((high - low).max())

@@ -69,7 +69,7 @@ class PairRenderer:
         return render_pair(shared_renderer(self.plain), spec, index)
 
 
-class Layout(NamedTuple):
+class StorageFormat(NamedTuple):
     """A storage layout of pairs in a folder.
 
     Attributes:
@@ -312,6 +312,6 @@ def _renderer_name(plain: bool) -> str:
 
 
 LAYOUTS = {
-    "shards": Layout(_pairs_in_shards, _write_shard, remove_leftovers, PAIRS_A_SHARD),
-    "paper": Layout(_pairs_in_frames, _write_frames, _tidy_frames, _FRAMES_A_RUN),
+    "shards": StorageFormat(_pairs_in_shards, _write_shard, remove_leftovers, PAIRS_A_SHARD),
+    "paper": StorageFormat(_pairs_in_frames, _write_frames, _tidy_frames, _FRAMES_A_RUN),
 }
