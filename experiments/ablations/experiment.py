@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from experiments.ablations.networks import VARIANTS
+from experiments.ablations.networks import register_variants
 from experiments.trial import Trial
 from stereoweave.bench.edge_metrics import edge_bad_percent, edge_epe_px, flying_percent
 from stereoweave.bench.projected_views import DisparityMethod
@@ -24,7 +24,7 @@ from stereoweave.learn.checkpoint import Checkpoint
 from stereoweave.learn.data.sources import PairSource, PhotographedSet, cache_pairs, open_sources
 from stereoweave.learn.evaluation import make_method
 from stereoweave.learn.export.from_checkpoint import count_multiply_adds
-from stereoweave.learn.models import MODELS, build_network
+from stereoweave.learn.models import build_network
 from stereoweave.learn.recipe import COLLAGE, Recipe
 from stereoweave.learn.training.loop import train_recipe
 from stereoweave.learn.training.scores import validate
@@ -90,7 +90,7 @@ def run_ablations(
     Raises:
         StereoweaveError: If training or held-out pairs are missing; raised before the first training.
     """
-    MODELS.update(VARIANTS)  # so that recipes can name them
+    register_variants()
     rendered_pairs = PhotographedSet(Shards(rendered))
     for trial in planned:
         for pairs in open_sources(trial.recipe, runs / "pairs"):

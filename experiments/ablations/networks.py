@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from stereoweave.learn.models import MODELS
 from stereoweave.learn.models.layers import (
     ConvBlock,
     correlation_volume,
@@ -143,3 +144,8 @@ VARIANTS: dict[str, Callable[[], WeaveNet]] = {
     "weave_small_nine_neighbours": partial(WeaveNet, replace(SMALL, neighbours=9)),
     "weave_small_looked_up": partial(WeaveNet, replace(SMALL, warps=False, compared=16, handed=8)),
 }
+
+
+def register_variants() -> None:
+    """Add the variants to MODELS, so that recipes and checkpoints can name them."""
+    MODELS.update(VARIANTS)

@@ -15,6 +15,7 @@ import onnx
 import onnxruntime  # type: ignore[import-untyped]
 from onnx import TensorProto, helper
 
+from experiments.ablations.networks import register_variants
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn import checkpoint
 from stereoweave.learn.export.from_checkpoint import export_annotated_graph, load_matcher_network
@@ -102,12 +103,13 @@ def measure_stage_costs(runs: Sequence[Path], turns: int = TURNS) -> list[StageC
     """Measure a large matrix product, then each network's stages in the order of execution and their total.
 
     Args:
-        runs: Checkpoints of WeaveNets, or folders of runs for their last checkpoints.
+        runs: Checkpoints of WeaveNets or of their ablations, or folders of runs for their last checkpoints.
         turns: Repetitions of each measurement.
 
     Raises:
         StereoweaveError: If a network is not a WeaveNet.
     """
+    register_variants()
     networks = [_load_weave_net(run) for run in runs]
     peak = measure(_matrix_product(PRODUCT_SIDE), {}, turns)[TOTAL]
     rows = [_row("", PRODUCT, peak, peak)]

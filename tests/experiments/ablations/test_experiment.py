@@ -12,7 +12,7 @@ from rich.console import Console
 from experiments.ablations import experiment as ablations
 from experiments.ablations.__main__ import main
 from experiments.ablations.experiment import BASE, VARIATIONS, fingerprint, plan, run_ablations
-from experiments.ablations.networks import VARIANTS
+from experiments.ablations.networks import register_variants
 from stereoweave.data.packing import pack
 from stereoweave.data.shards import write_shard
 from stereoweave.learn import checkpoint
@@ -122,7 +122,7 @@ def test_every_variation_is_planned_with_the_first_seed_before_any_with_the_next
 
 
 def test_every_variation_has_a_network_and_a_loss():
-    MODELS.update(VARIANTS)
+    register_variants()
     for recipe in {replace(trial.recipe, name="", seed=0) for trial in plan(RECIPE, 1)}:
         build_objective(recipe, build_network(recipe))
 

@@ -1,16 +1,19 @@
 import csv
 import json
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 import torch
 from learn_examples import RECIPE, checkpoint_of, complaint, recipe_of, untrained
 from onnx import TensorProto, helper
 
+from experiments.ablations.networks import VARIANTS
 from experiments.stage_costs import profiling as costs
 from experiments.stage_costs.__main__ import main
 from stereoweave.learn import checkpoint
 from stereoweave.learn.export.from_checkpoint import count_multiply_adds
+from stereoweave.learn.models import MODELS
 
 HEIGHT, WIDTH = 32, 64
 
@@ -31,17 +34,22 @@ def graph_of(nodes, shapes, given, constants=()):
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=9)
 
 
+def measure_small_pairs(run):
+    """Rows of a run for pairs of WIDTH x HEIGHT; MODELS stays as it was."""
+    with pytest.MonkeyPatch.context() as monkeypatch, patch.dict(MODELS):
+        monkeypatch.setattr(costs, "HEIGHT_PX", HEIGHT)
+        monkeypatch.setattr(costs, "WIDTH_PX", WIDTH)
+        monkeypatch.setattr(costs, "PRODUCT_SIDE", 64)
+        return costs.measure_stage_costs([run], turns=2)
+
+
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory):
-    """Rows of a small run: its file, and the network."""
+    """The network of a small run, and the run's rows."""
     file = tmp_path_factory.mktemp("run") / "last.pt"
     network = untrained()
     checkpoint.save(checkpoint_of(network), file)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(costs, "HEIGHT_PX", HEIGHT)
-        patch.setattr(costs, "WIDTH_PX", WIDTH)
-        patch.setattr(costs, "PRODUCT_SIDE", 64)
-        return network, costs.measure_stage_costs([file.parent], turns=2)
+    return network, measure_small_pairs(file.parent)
 
 
 def test_an_operation_belongs_to_the_stage_of_its_module_or_of_what_ran_before_it():
@@ -187,10 +195,22 @@ def test_the_table_has_a_line_for_each_row(rows):
     assert lines[2].endswith("| 100 % |")
 
 
+def test_an_ablations_checkpoint_is_measured_too(rows, tmp_path):
+    name = "weave_small_without_context"
+    assert name not in MODELS
+    checkpoint.save(checkpoint_of(VARIANTS[name](), recipe_of(name)), tmp_path / "last.pt")
+    counts, of_small = (
+        {row.stage: row.multiply_adds for row in found} for found in (measure_small_pairs(tmp_path), rows[1])
+    )
+    assert counts.keys() == of_small.keys()
+    assert {stage for stage in counts if counts[stage] < of_small[stage]} == {"aggregation", costs.TOTAL}
+
+
 def test_another_network_is_one_line_that_says_where_it_is_timed(tmp_path):
     recipe = recipe_of("fast_depth", target="disparity")
     checkpoint.save(checkpoint_of(untrained("fast_depth"), recipe), tmp_path / "last.pt")
-    assert "expected a WeaveNet" in complaint(costs.measure_stage_costs, [tmp_path / "last.pt"])
+    with patch.dict(MODELS):
+        assert "expected a WeaveNet" in complaint(costs.measure_stage_costs, [tmp_path / "last.pt"])
 
 
 def test_the_command_prints_the_table_and_writes_the_rows(rows, monkeypatch, tmp_path, capsys):
