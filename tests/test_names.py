@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from stereoweave.bench.pairs import write_csv
+from stereoweave.bench.tables import write_csv
 from stereoweave.cli.root import main
 from stereoweave.io.images import read_image, write_image
 

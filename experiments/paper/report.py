@@ -28,8 +28,8 @@ from experiments.paper.trials import (
     TUNED,
 )
 from experiments.trial import Trial
-from stereoweave.bench.pairs import write_csv
 from stereoweave.bench.projected_views import DisparityMethod, ProjectionRow
+from stereoweave.bench.tables import write_csv
 from stereoweave.errors import FormatError, StereoweaveError
 from stereoweave.io.files import make_folder, replacing
 from stereoweave.learn import checkpoint

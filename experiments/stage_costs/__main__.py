@@ -19,7 +19,7 @@ def stage_costs(
 
     The "of the peak" columns compare a stage's speed with that of a large matrix product in the same run.
     """
-    from stereoweave.bench.pairs import write_csv
+    from stereoweave.bench.tables import write_csv
 
     if out:
         make_parent_folder(out)

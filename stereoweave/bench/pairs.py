@@ -1,25 +1,21 @@
 """Benchmark of matchers on pairs of known disparity: accuracy, edges, confidence, time and memory."""
 
-import os
 import platform
 import time
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 
 from stereoweave.bench.edge_metrics import edge_bad_percent, edge_epe_px, flying_percent
-from stereoweave.bench.error_classes import ClassErrors, class_errors, classify
+from stereoweave.bench.error_classes import class_errors, classify
 from stereoweave.bench.memory import peak_memory_mb
 from stereoweave.bench.metrics import (
-    Sparsification,
     bad_percent,
     calibration_error,
     d1_percent,
@@ -27,9 +23,18 @@ from stereoweave.bench.metrics import (
     sparsification,
 )
 from stereoweave.bench.opencv_matchers import OPENCV_MATCHERS, SGBM, fill_rows, left_right_confidence
+from stereoweave.bench.tables import (
+    MEAN,
+    ClassRow,
+    Curves,
+    MatcherRow,
+    average_class_rows,
+    average_curves,
+    average_rows,
+    describe_machine,
+)
 from stereoweave.data.readers import Scene
 from stereoweave.errors import StereoweaveError
-from stereoweave.io.text import write_table
 from stereoweave.matching.backend import Backend
 from stereoweave.matching.estimate import match
 from stereoweave.matching.options import MatchOptions
@@ -51,73 +56,7 @@ AnyResult = TypeVar("AnyResult")
 SceneLister = Callable[[], Sequence[Callable[[], AnyScene]]]
 """Returns a reader for each scene; called by the process that starts a benchmark and by every worker."""
 
-MEAN = "mean"
 TURNS = 5
-
-
-@dataclass(frozen=True, kw_only=True)
-class MatcherRow:
-    """Scores of one matcher on one scene, or averaged over all scenes (scene "mean").
-
-    Errors cover every pixel of known truth, occluded ones included. A mean is over the scenes that have the
-    number; a scene without a depth edge has no edge errors, for example.
-
-    Attributes:
-        edge_epe_px, edge_bad1_percent, flying_percent: Errors near depth edges (edge_metrics.py).
-        ause_px, ause_bad1_percent: Area between the confidence's sparsification curve and the oracle's, for
-            the absolute error and for bad pixels.
-        calibration_error: Expected calibration error; NaN for the left-right check, which gives no
-            probability. It is computed per scene, so that overconfidence in one scene does not cancel
-            underconfidence in another.
-        time_ms: Median of the warm calls; in the mean row, the mean of these medians.
-        time_relative: time_ms as a multiple of SGBM's in the same scene.
-        memory_mb: Peak memory for the largest pair (memory.py); only in the mean row, and if measured.
-    """
-
-    matcher: str
-    scene: str
-    epe_px: float
-    bad1_percent: float
-    bad2_percent: float
-    d1_percent: float
-    edge_epe_px: float
-    edge_bad1_percent: float
-    flying_percent: float
-    ause_px: float
-    ause_bad1_percent: float
-    calibration_error: float
-    time_ms: float
-    time_relative: float
-    memory_mb: float = float("nan")
-
-
-@dataclass(frozen=True, kw_only=True)
-class ClassRow:
-    """Errors of one matcher in one class of pixels, on one scene or averaged over all scenes.
-
-    Attributes:
-        pixel_class: A name in `error_classes.CLASSES`, or `error_classes.ALL`.
-
-    The other columns are those of `ClassErrors`. A mean is over the scenes that have the number; a scene
-    without plain pixels has no error within that class, for example.
-    """
-
-    matcher: str
-    scene: str
-    pixel_class: str
-    share_percent: float
-    bad1_percent: float
-    bad2_percent: float
-    bad1_within_percent: float
-    bad2_within_percent: float
-    epe_px: float
-
-
-class Curves(NamedTuple):
-    """A matcher's sparsification curves: of the mean error in px, and of bad-1 in percent."""
-
-    epe_px: Sparsification
-    bad1_percent: Sparsification
 
 
 class PairScores(NamedTuple):
@@ -192,11 +131,9 @@ def score_pairs(
     class_rows = [row for scene in found for row in scene.result.class_rows]
     largest = max(found, key=lambda scene: scene.result.pixels)
     return PairScores(
-        rows=rows + _average_rows(rows, everyone),
-        class_rows=class_rows + _average_class_rows(class_rows),
-        curves={
-            name: _average_curves([of for row, of in scored if row.matcher == name]) for name in everyone
-        },
+        rows=rows + average_rows(rows, everyone),
+        class_rows=class_rows + average_class_rows(class_rows),
+        curves={name: average_curves([of for row, of in scored if row.matcher == name]) for name in everyone},
         largest=scenes()[largest.number]().pair,
         machine=merge_machines(found),
     )
@@ -245,20 +182,6 @@ def add_memory(
     ]
 
 
-def write_csv(path: str | Path, rows: Sequence[Any], machine: dict[str, str] | None = None) -> None:
-    """Write the rows as CSV with a header and the machine's columns.
-
-    Args:
-        path: The CSV file; its folder is created.
-        rows: At least one instance of one dataclass, whose fields are the columns.
-        machine: Processor, number of cores and OpenCV's version. Default: this machine's.
-    """
-    machine = machine or _describe_machine()
-    columns = [field.name for field in fields(rows[0])] + list(machine)
-    values = [{k: f"{v:.6g}" if isinstance(v, float) else v for k, v in asdict(row).items()} for row in rows]
-    write_table(path, columns, (row | machine for row in values))
-
-
 class _SceneScorer:
     """Scores scenes by number; makes the matchers once."""
 
@@ -278,7 +201,7 @@ class _SceneScorer:
             )
 
     def __call__(self, number: int) -> SceneResult[Any]:
-        return SceneResult(number, self.score(self.matchers, self.readers[number]()), _describe_machine())
+        return SceneResult(number, self.score(self.matchers, self.readers[number]()), describe_machine())
 
 
 def _add_opencv(makers: Mapping[str, MatcherFactory]) -> dict[str, MatcherFactory]:
@@ -362,60 +285,3 @@ def _measure_time_ms(match: MatchFunction, pair: StereoPair) -> float:
     start_s = time.perf_counter()
     match(pair)
     return 1000 * (time.perf_counter() - start_s)
-
-
-def _average_rows(rows: list[MatcherRow], names: Iterable[str]) -> list[MatcherRow]:
-    columns = [field.name for field in fields(MatcherRow) if field.type is float]
-    means = {
-        name: {
-            column: float(_average_known([getattr(row, column) for row in rows if row.matcher == name]))
-            for column in columns
-        }
-        for name in names
-    }
-    for mean in means.values():
-        mean["time_relative"] = mean["time_ms"] / means[SGBM]["time_ms"]
-    return [MatcherRow(matcher=name, scene=MEAN, **mean) for name, mean in means.items()]
-
-
-def _average_class_rows(rows: Sequence[ClassRow]) -> list[ClassRow]:
-    """Average over the scenes, in the order of the first scene's rows."""
-    by_class: defaultdict[tuple[str, str], list[ClassRow]] = defaultdict(list)
-    for row in rows:
-        by_class[row.matcher, row.pixel_class].append(row)
-    columns = [field.name for field in fields(ClassErrors)]
-    return [
-        ClassRow(
-            matcher=matcher,
-            scene=MEAN,
-            pixel_class=pixel_class,
-            **{column: float(_average_known([getattr(row, column) for row in alike])) for column in columns},
-        )
-        for (matcher, pixel_class), alike in by_class.items()
-    ]
-
-
-def _average_curves(curves: Sequence[Curves]) -> Curves:
-    means = (
-        Sparsification(*(_average_known(lines) for lines in zip(*of_scenes, strict=True)))
-        for of_scenes in zip(*curves, strict=True)
-    )
-    return Curves(*means)
-
-
-def _average_known(values: Sequence[Any]) -> Any:
-    """Mean of the numbers or equal-shaped arrays without NaN; NaN if there are none."""
-    known = [value for value in values if not np.isnan(value).any()]
-    return np.mean(known, axis=0) if known else values[0]
-
-
-def _describe_machine() -> dict[str, str]:
-    return {"cpu": _find_cpu_name(), "cores": str(os.cpu_count()), "opencv": cv2.__version__}
-
-
-def _find_cpu_name() -> str:
-    # Only Linux has this file, and there platform.processor() does not return the model.
-    about = Path("/proc/cpuinfo")
-    lines = about.read_text().splitlines() if about.exists() else []
-    models = [line.split(": ", 1)[1] for line in lines if line.startswith("model name")]
-    return models[0] if models else platform.processor()

@@ -15,7 +15,7 @@ from matplotlib.transforms import Bbox
 
 from stereoweave.bench.metrics import DROPPED_PERCENT, Sparsification
 from stereoweave.bench.opencv_matchers import OPENCV_MATCHERS
-from stereoweave.bench.pairs import Curves, MatcherRow
+from stereoweave.bench.tables import Curves, MatcherRow
 from stereoweave.io.images import write_image
 
 # Okabe and Ito's colours, which colour-blind readers can distinguish.

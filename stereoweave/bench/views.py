@@ -22,7 +22,8 @@ from jaxtyping import Bool, Float, UInt8
 from stereoweave.bench.edge_metrics import near_edge
 from stereoweave.bench.metrics import mae, psnr_db, ssim
 from stereoweave.bench.opencv_matchers import OPENCV_MATCHERS, SGBM, fill_rows, left_right_confidence
-from stereoweave.bench.pairs import MEAN, TURNS, SceneLister, merge_machines, score_all
+from stereoweave.bench.pairs import TURNS, SceneLister, merge_machines, score_all
+from stereoweave.bench.tables import MEAN
 from stereoweave.bench.view_scenes import ReferenceView, ViewScene
 from stereoweave.bench.view_truth import fill_unknown, find_view_truth
 from stereoweave.data.samples import find_hidden

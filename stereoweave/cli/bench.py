@@ -80,7 +80,8 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
     import cv2
 
     from stereoweave.bench.opencv_matchers import SGBM
-    from stereoweave.bench.pairs import MEAN, add_memory, score_pairs, write_csv
+    from stereoweave.bench.pairs import add_memory, score_pairs
+    from stereoweave.bench.tables import MEAN, write_csv
     from stereoweave.data.readers import list_scenes
     from stereoweave.system.threads import thread_count
 
@@ -141,7 +142,7 @@ def views(  # noqa: PLR0913 - each is an option of the command line
     """
     import cv2
 
-    from stereoweave.bench.pairs import MEAN, write_csv
+    from stereoweave.bench.tables import MEAN, write_csv
     from stereoweave.bench.view_scenes import list_view_scenes
     from stereoweave.bench.views import score_view_scenes
     from stereoweave.system.threads import thread_count
@@ -170,7 +171,7 @@ def flicker(  # noqa: PLR0913 - each is an option of the command line
     make_parent_folder(out)
     with require_synth_extra():
         from stereoweave.bench.flicker import average_rows, score_flicker
-    from stereoweave.bench.pairs import write_csv
+    from stereoweave.bench.tables import write_csv
 
     rows = list(score_flicker(scenes, model, frames=frames, threads=threads, provider=provider))
     write_csv(out, rows)
@@ -212,7 +213,7 @@ def parity(
     out: CsvFile = Path("parity.csv"),
 ) -> None:
     """Compare every variant of shipped networks with PyTorch, on every provider available here."""
-    from stereoweave.bench.pairs import write_csv
+    from stereoweave.bench.tables import write_csv
 
     make_parent_folder(out)
     with require_train_extra():
@@ -276,7 +277,7 @@ def _draw_plots(
 
 def _write_classes(file: Path, scores: Any) -> None:
     """Write errors by class, and print their means."""
-    from stereoweave.bench.pairs import MEAN, write_csv
+    from stereoweave.bench.tables import MEAN, write_csv
 
     write_csv(file, scores.class_rows, scores.machine)
     print_classes([row for row in scores.class_rows if row.scene == MEAN])

@@ -115,7 +115,7 @@ def _cell(number: float) -> str:
 
 def write_and_print(out: Path, title: str, rows: Sequence[Any]) -> None:
     """Write dataclass rows as CSV, and print them as a table, followed by the file's name."""
-    from stereoweave.bench.pairs import write_csv
+    from stereoweave.bench.tables import write_csv
 
     write_csv(out, rows)
     _print_rows(title, rows)

@@ -16,7 +16,8 @@ from rich.console import Console
 from shard_examples import PaintedPairMaker, box_before_a_wall, contents
 
 from stereoweave.bench import pairs as benchmark
-from stereoweave.bench.pairs import make_matcher, score_pairs, write_csv
+from stereoweave.bench.pairs import make_matcher, score_pairs
+from stereoweave.bench.tables import write_csv
 from stereoweave.cli.root import main
 from stereoweave.data.packing import pack
 from stereoweave.data.readers import list_scenes

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from stereoweave.bench.opencv_matchers import OPENCV_MATCHERS
-from stereoweave.bench.pairs import MEAN, TURNS, add_memory, make_matcher, score_pairs, write_csv
+from stereoweave.bench.pairs import TURNS, add_memory, make_matcher, score_pairs
+from stereoweave.bench.tables import MEAN, write_csv
 from stereoweave.data.readers import Scene
 from stereoweave.errors import MatcherError, StereoweaveError
 from stereoweave.stereo import Estimate, StereoPair

@@ -8,8 +8,8 @@ from matplotlib.colors import to_rgba
 
 from stereoweave.bench import plots as benchmark_plots
 from stereoweave.bench.metrics import sparsification
-from stereoweave.bench.pairs import Curves, MatcherRow
 from stereoweave.bench.plots import draw_error_over_time, draw_sparsification
+from stereoweave.bench.tables import Curves, MatcherRow
 from stereoweave.io.images import read_image
 
 

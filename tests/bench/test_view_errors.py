@@ -6,9 +6,9 @@ import pytest
 from learn_examples import box_before_a_wall
 
 from stereoweave.bench.metrics import psnr_db, ssim
-from stereoweave.bench.pairs import write_csv
 from stereoweave.bench.projected_views import measure_projection, score_projections
 from stereoweave.bench.projection import project_right
+from stereoweave.bench.tables import write_csv
 from stereoweave.errors import StereoweaveError
 from stereoweave.stereo import Sample, StereoCamera, View
 
