@@ -35,6 +35,7 @@ OTHERS = {
     "data/checksums.py": {"--check"},
     "data/paper_layout.py": {"--check"},
     "learn/checkpoint.py": {"--git-dir", "--always", "--dirty", "--exclude"},
+    "learn/training/fabric.py": {"--nproc-per-node"},
     "learn/training/loop.py": {"--nproc-per-node"},
     "system/ray_engine.py": {"--address"},
 }

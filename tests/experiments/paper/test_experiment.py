@@ -39,7 +39,8 @@ from stereoweave.io.images import read_image
 from stereoweave.learn import checkpoint
 from stereoweave.learn.data.pair_cache import CachedPairs
 from stereoweave.learn.data.sources import VALIDATION_SEED
-from stereoweave.learn.training.loop import SCORES_FILE, TrainingRun, read_scores
+from stereoweave.learn.training.loop import SCORES_FILE, read_scores
+from stereoweave.learn.training.run import TrainingRun
 from stereoweave.stereo import fit_exponent
 
 QUIET = Console(quiet=True)

@@ -42,8 +42,11 @@ from stereoweave.learn.data.pair_cache import CachedPairs
 from stereoweave.learn.data.sources import VALIDATION_SEED
 from stereoweave.learn.models import MODELS
 from stereoweave.learn.recipe import read_recipe
+from stereoweave.learn.training import fabric
 from stereoweave.learn.training import loop as training
-from stereoweave.learn.training.loop import TrainingRun, train
+from stereoweave.learn.training.fabric import make_fabric
+from stereoweave.learn.training.loop import train
+from stereoweave.learn.training.run import TrainingRun, load_start
 
 RECIPES = sorted((Path(__file__).parents[3] / "recipes").rglob("*.toml"))
 QUIET = Console(quiet=True)
@@ -163,14 +166,14 @@ def test_a_run_goes_on_with_another_end_and_other_data(folder, finished):
     recipe = replace(
         RECIPE, steps=RECIPE.steps + 2, cool_down_steps=1, mix=(("collage", 1.0),), crop_size=(32, 64)
     )
-    start = training._load_start(recipe, finished)
+    start = load_start(recipe, finished)
     assert (start.step, start.recipe) == (RECIPE.steps, recipe)
     assert_same(start.optimiser, checkpoint.load(finished).optimiser)
 
 
 def test_a_run_is_kept_every_ten_minutes(folder, recipe_file, tmp_path, logger, monkeypatch):
     last = tmp_path / "last.pt"
-    run = TrainingRun(RECIPE, training._load_start(RECIPE, last), training._make_fabric(logger))
+    run = TrainingRun(RECIPE, load_start(RECIPE, last), make_fabric(logger))
     run.save_periodically(3, last)
     assert not last.exists()
     now = time.monotonic()
@@ -194,7 +197,7 @@ def test_a_run_is_scored_by_class_on_the_held_out_sets_of_its_recipe(folder, in_
 
 def test_a_run_starts_from_the_averaged_weights_of_another(folder, finished):
     recipe = replace(RECIPE, name="second", start_from=str(finished))
-    start = training._load_start(recipe, folder / "second" / "last.pt")
+    start = load_start(recipe, folder / "second" / "last.pt")
     first = checkpoint.load(finished)
     assert start.step == 0
     assert start.hours == first.hours
@@ -243,9 +246,7 @@ def test_a_pair_that_cannot_be_trained_on_is_named_in_one_line(tmp_path):
 
 def test_a_truth_out_of_range_is_named_with_the_pairs_of_its_step(tmp_path, logger):
     recipe = recipe_of("fast_depth", target="depth", max_depth_m=1.0)
-    run = TrainingRun(
-        recipe, training._load_start(recipe, tmp_path / "last.pt"), training._make_fabric(logger)
-    )
+    run = TrainingRun(recipe, load_start(recipe, tmp_path / "last.pt"), make_fabric(logger))
     batches = Batches(recipe, CAMERA_PAIRS)
     message = complaint(run.step, 0, batches[0], batches)
     assert message.startswith(f"step 0: one of {', '.join(batches.names(0))}: depth: expected more than 0")
@@ -253,7 +254,7 @@ def test_a_truth_out_of_range_is_named_with_the_pairs_of_its_step(tmp_path, logg
 
 def test_weights_of_another_network_are_refused_as_a_start(finished, tmp_path):
     recipe = recipe_of("fast_depth", start_from=str(finished))
-    assert complaint(training._load_start, recipe, tmp_path / "last.pt") == (
+    assert complaint(load_start, recipe, tmp_path / "last.pt") == (
         f"tiny: start_from = {str(finished)!r}, expected a checkpoint that shares weights with fast_depth, "
         "found one of weave_small"
     )
@@ -261,9 +262,7 @@ def test_weights_of_another_network_are_refused_as_a_start(finished, tmp_path):
 
 def test_a_gradient_that_is_not_finite_never_reaches_the_weights_and_twice_stops(tmp_path, logger, caplog):
     recipe = recipe_of("fast_depth")
-    run = TrainingRun(
-        recipe, training._load_start(recipe, tmp_path / "last.pt"), training._make_fabric(logger)
-    )
+    run = TrainingRun(recipe, load_start(recipe, tmp_path / "last.pt"), make_fabric(logger))
     network = run.network
     before = {name: value.clone() for name, value in network.state_dict().items()}
     # A product with infinity makes the gradient infinite and leaves the loss as it was.
@@ -305,7 +304,7 @@ def test_a_run_into_a_file_fails_before_any_pair_is_made(recipe_file, tmp_path):
 
 def step_of(recipe, folder, logger, steps=1):
     """The first steps of a recipe on pairs in memory: the run after them, and every parameter before."""
-    run = TrainingRun(recipe, training._load_start(recipe, folder / "last.pt"), training._make_fabric(logger))
+    run = TrainingRun(recipe, load_start(recipe, folder / "last.pt"), make_fabric(logger))
     before = {name: value.clone() for name, value in run.network.named_parameters()}
     batches = Batches(recipe, CAMERA_PAIRS)
     for step in range(steps):
@@ -380,10 +379,8 @@ def test_a_record_that_is_written_again_replaces_what_came_later(tmp_path):
 def test_a_step_computes_in_bfloat16_where_the_device_does(
     folder, tmp_path, monkeypatch, logger, precision, dtype
 ):
-    monkeypatch.setattr(training, "_choose_precision", lambda: precision)
-    run = TrainingRun(
-        RECIPE, training._load_start(RECIPE, tmp_path / "last.pt"), training._make_fabric(logger)
-    )
+    monkeypatch.setattr(fabric, "_choose_precision", lambda: precision)
+    run = TrainingRun(RECIPE, load_start(RECIPE, tmp_path / "last.pt"), make_fabric(logger))
     seen = []
     run.network.to_match.register_forward_hook(lambda _layer, _inputs, output: seen.append(output.dtype))
     batches = Batches(RECIPE, CachedPairs(folder / "pairs", RECIPE.seed, RECIPE.pairs, PAIR_SIZE))

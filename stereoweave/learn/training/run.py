@@ -1,0 +1,155 @@
+"""The state of a run of `train`: where it starts or resumes, its steps, and its checkpoints."""
+
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from lightning_fabric import Fabric
+from torch import nn
+
+from stereoweave.errors import StereoweaveError
+from stereoweave.learn import checkpoint
+from stereoweave.learn.checkpoint import Checkpoint
+from stereoweave.learn.data.batches import Batches, split_batch
+from stereoweave.learn.data.sources import open_held_out_sets
+from stereoweave.learn.recipe import Recipe
+from stereoweave.learn.training.accumulation import StepSums
+from stereoweave.learn.training.model_state import STEPS_BETWEEN_SKIPS, ModelState
+from stereoweave.learn.training.objective import name_in_errors
+
+# Longest time between two checkpoints: a killed run loses no more.
+_SAVE_EVERY_S = 600
+# Recipe keys that may change when a run resumes.
+_RESUMABLE = ("steps", "cool_down_steps", "mix", "pair_size", "crop_size", "validate_every", "held_out")
+
+_LOGGER = logging.getLogger(__name__)
+
+
+class TrainingRun(ModelState):
+    """The state of a run of `train`, and the device and ranks that train it."""
+
+    def __init__(self, recipe: Recipe, start: Checkpoint, fabric: Fabric) -> None:
+        self.recipe, self.fabric, self.by_class = recipe, fabric, open_held_out_sets(recipe)
+        update_average = partial(_update_average, recipe.averaged_steps)
+        super().__init__(start, fabric.device, update_average, start.optimiser)
+        self.averaged.n_averaged.fill_(start.step)
+        if self.fabric.world_size > 1 and self.fabric.device.type == "cuda":
+            nn.SyncBatchNorm.convert_sync_batchnorm(self.network)  # type: ignore[no-untyped-call]
+        torch.set_rng_state(start.random_state)
+        self.began_s = self.saved_s = time.monotonic()
+        self.scores = start.scores
+        self.skipped: list[int] = []
+
+    def step(self, step: int, batch: dict[str, torch.Tensor], batches: Batches) -> float:
+        """Take one optimiser step. Returns the loss.
+
+        A step whose loss or gradient is not finite changes nothing; it is counted and logged.
+
+        Raises:
+            StereoweaveError: Two such steps are less than 500 steps apart.
+        """
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.recipe.learning_rate_at(step)
+        self.network.train()
+        sums = StepSums(self.network)
+        terms = self._gradient(step, self.fabric.to_device(batch), batches, sums)
+        value = terms.pop("loss")
+        norm = self.clip_gradient()
+        if not (np.isfinite(value) and norm.isfinite()):
+            sums.undo()
+            found = f"the loss is {value}"
+            if np.isfinite(value):
+                found = f"the norm of the gradient is {norm}"
+            self._skip(step, found, batches)
+            return value
+        self.optimiser.step()
+        self.averaged.update_parameters(self.network)
+        if step % 20 == 0:
+            self.fabric.log_dict({"loss": value, **{f"loss/{k}": term for k, term in terms.items()}}, step)
+        return value
+
+    def _gradient(
+        self, step: int, batch: dict[str, torch.Tensor], batches: Batches, sums: StepSums
+    ) -> dict[str, float]:
+        """Set the gradient of a step, summed over all ranks. Returns the loss and its terms."""
+        what = f"step {step}: one of {', '.join(batches.names(step))}"
+        for part, values in zip(batches.parts, split_batch(batch, len(batches.parts)), strict=True):
+            if self.recipe.micro_batches > 1:
+                # Dropout depends on the micro-batch, not on the rank.
+                torch.manual_seed(int(np.random.SeedSequence(batches.key(step, part)).generate_state(1)[0]))
+            with self.fabric.autocast():
+                predicted = self.objective.predict(self.network, values)
+            with name_in_errors(what):
+                terms = self.objective.losses(predicted, values)
+            loss = torch.stack(list(terms.values())).sum()
+            self.optimiser.zero_grad()
+            self.fabric.backward(loss)
+            sums.add([loss, *terms.values()])
+        means = sums.finish(self.fabric, self.recipe.micro_batches)
+        return dict(zip(["loss", *terms], means, strict=True))
+
+    def _skip(self, step: int, found: str, batches: Batches) -> None:
+        found = f"step {step}: {found}; its pairs are {', '.join(batches.names(step))}"
+        if self.skipped and step - self.skipped[-1] < STEPS_BETWEEN_SKIPS:
+            raise StereoweaveError(f"{found}; step {self.skipped[-1]} was skipped for the same reason")
+        self.skipped.append(step)
+        self.fabric.log_dict({"skipped_steps": float(len(self.skipped))}, step)
+        _LOGGER.warning("%s; skipped", found)
+
+    def save_periodically(self, step: int, path: Path) -> None:
+        """Save a checkpoint after `step` steps if the last one is ten minutes old."""
+        if self.fabric.is_global_zero and time.monotonic() - self.saved_s > _SAVE_EVERY_S:
+            self._write(step, self.scores, path)
+
+    def save(self, step: int, scores: dict[str, float], path: Path) -> None:
+        """Save a checkpoint after `step` steps and log its scores."""
+        self.fabric.log_dict({f"validation/{name}": score for name, score in scores.items()}, step)
+        self._write(step, scores, path)
+
+    def _write(self, step: int, scores: dict[str, float], path: Path) -> None:
+        self.saved_s, self.scores = time.monotonic(), scores
+        state = replace(
+            self.start,
+            step=step,
+            weights=self.network.state_dict(),
+            averaged=self.averaged.module.state_dict(),
+            optimiser=self.optimiser.state_dict(),
+            random_state=torch.get_rng_state(),
+            scores=scores,
+            hours=self.start.hours + (time.monotonic() - self.began_s) / 3600,
+        )
+        checkpoint.save(state, path)
+
+
+def load_start(recipe: Recipe, last: Path) -> Checkpoint:
+    """Load the state to start from: the run's last checkpoint, else `start_from` or random weights."""
+    if last.exists():
+        found = checkpoint.load(last)
+        if replace(found.recipe, **{name: getattr(recipe, name) for name in _RESUMABLE}) != recipe:
+            raise StereoweaveError(
+                f"{last}: expected a run of this recipe, found one of another ({found.recipe.name}); "
+                "train into a new folder, or remove the file"
+            )
+        return replace(found, recipe=recipe, commit=checkpoint.find_commit())
+    return checkpoint.make_initial(recipe, checkpoint.find_commit())
+
+
+@torch.no_grad()
+def _update_average(
+    averaged_steps: int,
+    averaged: Sequence[torch.Tensor],
+    current: Sequence[torch.Tensor],
+    steps: torch.Tensor | int,
+) -> None:
+    """Move the average towards the current weights: fast at first, so that random ones are soon forgotten."""
+    share = max(1 / averaged_steps, 9 / (9 + float(steps)))
+    for average, value in zip(averaged, current, strict=True):
+        if average.is_floating_point():
+            average.lerp_(value.to(average), share)
+        else:
+            average.copy_(value)
