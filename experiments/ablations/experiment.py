@@ -21,7 +21,7 @@ from stereoweave.data.shards import Shards
 from stereoweave.io.files import make_folder, replacing
 from stereoweave.learn import checkpoint
 from stereoweave.learn.checkpoint import Checkpoint
-from stereoweave.learn.data.sources import PairSource, PhotographedSet, cache_pairs, open_sources
+from stereoweave.learn.data.sources import PairSource, RenderedSet, cache_pairs, open_sources
 from stereoweave.learn.evaluation import make_method
 from stereoweave.learn.export.from_checkpoint import count_multiply_adds
 from stereoweave.learn.models import build_network
@@ -91,7 +91,7 @@ def run_ablations(
         StereoweaveError: If training or held-out pairs are missing; raised before the first training.
     """
     register_variants()
-    rendered_pairs = PhotographedSet(Shards(rendered))
+    rendered_pairs = RenderedSet(Shards(rendered))
     for trial in planned:
         for pairs in open_sources(trial.recipe, runs / "pairs"):
             cache_pairs(pairs, console)

@@ -176,13 +176,13 @@ def parse_recipe(values: dict[str, Any], source: str) -> Recipe:
     try:
         recipe = _RECIPES.validate_python(values)
     except ValidationError as error:
-        raise FormatError(f"{source}: {_first_mistake(error, values)}") from error
-    if contradiction := _contradiction(recipe):
+        raise FormatError(f"{source}: {_describe_mistake(error, values)}") from error
+    if contradiction := _find_contradiction(recipe):
         raise FormatError(f"{source}: {contradiction}")
     return recipe
 
 
-def _first_mistake(error: ValidationError, values: dict[str, Any]) -> str:
+def _describe_mistake(error: ValidationError, values: dict[str, Any]) -> str:
     """Describe one mistake in a line: an unknown key, else an invalid value, else a missing key."""
     known: dict[str, Any] = {field.name: field.type for field in fields(Recipe)}
     if unknown := sorted(values.keys() - known.keys()):
@@ -193,10 +193,10 @@ def _first_mistake(error: ValidationError, values: dict[str, Any]) -> str:
         needed = [field.name for field in fields(Recipe) if field.default is MISSING]
         return f"missing key {name!r}; a recipe needs {', '.join(needed)}"
     expected = known[name].__metadata__[-1].description
-    return f"{name}: expected {expected}, found {_written(values[name])}"
+    return f"{name}: expected {expected}, found {_shorten(values[name])}"
 
 
-def _contradiction(recipe: Recipe) -> str | None:
+def _find_contradiction(recipe: Recipe) -> str | None:
     """Describe the first two settings that exclude each other, in one line; None if none do."""
     collage = recipe.dataset == COLLAGE
     if recipe.batch % (recipe.micro_batch or recipe.batch):
@@ -212,7 +212,7 @@ def _contradiction(recipe: Recipe) -> str | None:
     return None
 
 
-def _written(value: object) -> str:
+def _shorten(value: object) -> str:
     """Shortened repr of a value."""
     try:
         text = repr(value)

@@ -26,7 +26,7 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
         self._draw(0)
 
     def __getitem__(self, step: int) -> dict[str, torch.Tensor]:
-        chosen = self.chosen(step)
+        chosen = self.list_pairs(step)
         size = len(chosen) // self.recipe.micro_batches
         return collate(
             [
@@ -45,7 +45,7 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
         """
         return self.recipe.seed, step, 0, 2 * part
 
-    def chosen(self, step: int) -> list[int]:
+    def list_pairs(self, step: int) -> list[int]:
         """Indices of a step's pairs. Every pair of a set comes once before any comes again."""
         first, end = step * self.recipe.batch, (step + 1) * self.recipe.batch
         while len(self._drawn) < end:
@@ -54,7 +54,7 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
 
     def names(self, step: int) -> list[str]:
         """Names of a step's pairs for error messages."""
-        return [self.pairs.name(index) for index in self.chosen(step)]
+        return [self.pairs.name(index) for index in self.list_pairs(step)]
 
     def _draw(self, places: int) -> None:
         """Draw the set of each of the first `places` pairs, and count its earlier draws."""

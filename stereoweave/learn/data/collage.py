@@ -43,7 +43,7 @@ def paint_collage(seed: int, epoch: int, index: int, height: int = 256, width: i
     builds the textures, which takes some seconds.
     """
     rng = np.random.default_rng((seed, epoch, index))
-    return _photograph_views(rng, *_paint_matchable(rng, draw_scene, height, width))
+    return _make_sample(rng, *_paint_matchable(rng, draw_scene, height, width))
 
 
 def paint_training_collage(seed: int, epoch: int, index: int, height: int = 256, width: int = 384) -> Sample:
@@ -59,8 +59,8 @@ def paint_training_collage(seed: int, epoch: int, index: int, height: int = 256,
         return _paint_plain_noise(rng, height, width)
     if kind < NOISE_SHARE + SHIFTED_APART_SHARE:
         views = _paint_matchable(rng, draw_training_scene, height, width + width // 4)
-        return _photograph_views(rng, *_crop_apart(rng, *views, width))
-    return _photograph_views(rng, *_paint_matchable(rng, draw_training_scene, height, width))
+        return _make_sample(rng, *_crop_apart(rng, *views, width))
+    return _make_sample(rng, *_paint_matchable(rng, draw_training_scene, height, width))
 
 
 def _paint_matchable(
@@ -86,9 +86,9 @@ def _find_occlusions(
     )
 
 
-def _photograph_views(rng: np.random.Generator, left: PaintedView, right: PaintedView) -> Sample:
+def _make_sample(rng: np.random.Generator, left: PaintedView, right: PaintedView) -> Sample:
     occluded, right_occluded = _find_occlusions(left, right)
-    left_image, right_image = photograph(rng, left.image, right.image)
+    left_image, right_image = simulate_cameras(rng, left.image, right.image)
     return Sample(
         left=left_image,
         right=right_image,
@@ -155,7 +155,7 @@ def _paint_view(scene: CollageScene, sheets: list[Sheet], side: int) -> PaintedV
     return PaintedView(image=image, disparity_px=nearest)
 
 
-def photograph(
+def simulate_cameras(
     rng: np.random.Generator, left: Float[np.ndarray, "h w 3"], right: Float[np.ndarray, "h w 3"]
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
     """Simulate two real cameras: slight differences in height, sharpness, tone and noise."""

@@ -103,7 +103,7 @@ class Painters:
     Attributes:
         cuts: How often each new pair is cropped; 1 while painting keeps up with training.
         taken: Batches taken.
-        starved: Batches that were not ready when requested.
+        late: Batches that were not ready when requested.
         failures: Tracebacks of failed batches.
     """
 
@@ -111,7 +111,7 @@ class Painters:
         self, recipes: Sequence[Recipe], folder: Path, processes: int, first: int = 0, pinned: bool = False
     ) -> None:
         self.recipes, self.pinned, self.number, self.recipe = tuple(recipes), pinned, first, 0
-        self.cuts, self.taken, self.starved = 1.0, 0, 0
+        self.cuts, self.taken, self.late = 1.0, 0, 0
         self.failures: list[str] = []
         self._ready: deque[tuple[Connection, PaintedBatch]] = deque()
         self._memory: dict[Connection, Any] = {}
@@ -132,7 +132,7 @@ class Painters:
             self._memory[here] = memory
         for slot in range(_SLOTS):
             for here in self._memory:
-                self._order(here, slot)
+                self._request(here, slot)
 
     def __enter__(self) -> "Painters":
         return self
@@ -149,11 +149,11 @@ class Painters:
         """Request batches of another recipe from now on; pending ones come first."""
         self.recipe = recipe
 
-    def adapt(self, starved_share: float) -> None:
+    def adapt(self, late_share: float) -> None:
         """Crop each pair more often if batches came late, less often if none did."""
-        if starved_share > 0.1:
+        if late_share > 0.1:
             self.cuts = min(self.cuts * 1.5, _MOST_CUTS)
-        elif starved_share == 0:
+        elif late_share == 0:
             self.cuts = max(self.cuts / 1.2, 1.0)
 
     def take(self) -> dict[str, torch.Tensor]:
@@ -162,11 +162,11 @@ class Painters:
         Raises:
             StereoweaveError: All processes have ended, most batches fail, or none arrives for minutes.
         """
-        self._listen(0)
-        self.starved += not self._ready
+        self._collect(0)
+        self.late += not self._ready
         while True:
             while not self._ready:
-                self._listen(_PATIENCE_S)
+                self._collect(_PATIENCE_S)
             here, done = self._ready.popleft()
             if not done.problem:
                 break
@@ -175,7 +175,7 @@ class Painters:
             name: torch.empty(view.shape, dtype=view.dtype, pin_memory=self.pinned).copy_(view)
             for name, view in self._views(here, done.request).items()
         }
-        self._order(here, done.request.slot)
+        self._request(here, done.request.slot)
         self.taken += 1
         return batch
 
@@ -186,9 +186,9 @@ class Painters:
                 f"{len(self.failures)} of {len(self.failures) + self.taken} batches failed; "
                 f"the last: {done.problem}"
             )
-        self._order(here, done.request.slot)
+        self._request(here, done.request.slot)
 
-    def _listen(self, patience_s: float) -> None:
+    def _collect(self, patience_s: float) -> None:
         """Collect finished batches; drop processes that have ended."""
         heard = wait(list(self._memory), patience_s)
         if patience_s and not heard:
@@ -198,19 +198,19 @@ class Painters:
             try:
                 self._ready.append((here, here.recv()))
             except (EOFError, OSError):
-                self._lose(here)
+                self._drop(here)
 
-    def _lose(self, here: Connection) -> None:
+    def _drop(self, here: Connection) -> None:
         del self._memory[here]
         self._ready = deque(entry for entry in self._ready if entry[0] is not here)
         if not self._memory:
             raise StereoweaveError("every process that makes batches has ended; is there enough memory?")
 
-    def _order(self, here: Connection, slot: int) -> None:
+    def _request(self, here: Connection, slot: int) -> None:
         try:
             here.send(BatchRequest(slot, self.number, self.recipe, self.cuts))
         except OSError:
-            return  # the process has ended, as the next `_listen` will notice
+            return  # the process has ended, as the next `_collect` will notice
         self.number += 1
 
     def _views(self, here: Connection, request: BatchRequest) -> dict[str, torch.Tensor]:

@@ -56,12 +56,12 @@ class MixedSource:
         return sum(one.count for one in self.sets)
 
     def __getitem__(self, index: int) -> Sample:
-        source, own = self._own(index)
-        return source[own]
+        source, place = self._locate(index)
+        return source[place]
 
     def name(self, index: int) -> str:
-        source, own = self._own(index)
-        return source.name(own)
+        source, place = self._locate(index)
+        return source.name(place)
 
     def first_index(self, which: int) -> int:
         """Index of the first pair of a set."""
@@ -72,7 +72,7 @@ class MixedSource:
         bounds = np.cumsum(self.weights) / np.sum(self.weights)
         return np.searchsorted(bounds[:-1], rng.random(places), side="right")
 
-    def _own(self, index: int) -> tuple[PairSource, int]:
+    def _locate(self, index: int) -> tuple[PairSource, int]:
         for one in self.sets:
             if index < one.count:
                 return one, index
@@ -100,7 +100,7 @@ class FreshCollages:
 
 
 @dataclass(frozen=True)
-class PhotographedSet:
+class RenderedSet:
     """A rendered set with simulated camera imperfections, the same for every read of a pair."""
 
     shards: Shards
@@ -112,7 +112,7 @@ class PhotographedSet:
     def __getitem__(self, index: int) -> Sample:
         sample = self.shards[index]
         # As for collages: without noise, blur and tone differences, matching is too easy.
-        left, right = collage.photograph(
+        left, right = collage.simulate_cameras(
             np.random.default_rng(index), sample.left.astype(np.float32), sample.right.astype(np.float32)
         )
         return replace(sample, left=left, right=right)
@@ -185,7 +185,7 @@ def open_held_out_sets(recipe: Recipe) -> dict[str, PairSource]:
     sets: dict[str, PairSource] = {}
     for name, folder in recipe.held_out:
         found = tuple(
-            PhotographedSet(Shards(path)) for path in _find_set_folders(recipe, "held_out", Path(folder))
+            RenderedSet(Shards(path)) for path in _find_set_folders(recipe, "held_out", Path(folder))
         )
         sets[name] = MixedSource(found, (1.0,) * len(found))
     return sets
@@ -205,7 +205,7 @@ def _find_set_folders(recipe: Recipe, key: str, folder: Path) -> list[Path]:
 def _open_rendered_sets(recipe: Recipe, folder: Path) -> list[PairSource]:
     """Open the set in a folder, or all sets in it. FormatError if there are none or one is too small."""
     folders = _find_set_folders(recipe, "mix", folder)
-    sets: list[PairSource] = [PhotographedSet(Shards(path)) for path in folders]
+    sets: list[PairSource] = [RenderedSet(Shards(path)) for path in folders]
     for path, one in zip(folders, sets, strict=True):
         rows, columns = one[0].disparity_px.shape
         if recipe.crop_size[0] > rows or recipe.crop_size[1] > columns:

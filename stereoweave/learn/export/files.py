@@ -36,19 +36,19 @@ class MatcherFiles:
     size: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
-        if not self.wanted:
+        if not self.paths:
             raise StereoweaveError(
                 "export: expected an output file, found none",
                 remedy=Remedy("give at least one", ("out", "half", "eight_bits")),
             )
-        for file in self.wanted:
+        for file in self.paths:
             if file.suffix != ".onnx":
                 raise StereoweaveError(f"{file}: expected a name that ends in .onnx")
-        if len(set(self.wanted)) < len(self.wanted):
-            raise StereoweaveError(f"{self.wanted[0]}: expected a different file for each variant")
+        if len(set(self.paths)) < len(self.paths):
+            raise StereoweaveError(f"{self.paths[0]}: expected a different file for each variant")
 
     @property
-    def wanted(self) -> list[Path]:
+    def paths(self) -> list[Path]:
         return [file for file in (self.out, self.half, self.eight_bits) if file]
 
 
@@ -63,7 +63,7 @@ def write_matcher_files(
         pairs: For a trained network: pairs on which ONNX Runtime and PyTorch must agree.
         reliability: For a trained network: file for a plot of the confidence's reliability.
     """
-    for file in files.wanted:
+    for file in files.paths:
         make_parent_folder(file)
     with tempfile.TemporaryDirectory() as folder:
         if is_matcher(source):
@@ -122,13 +122,13 @@ def _write_variants(made: Path, files: MatcherFiles) -> Iterator[str]:
         lost_px = card["epe_px"] - card["epe_px_of_32_bits"]
         yield f"{files.eight_bits}: 8 bits change the mean error by {lost_px:+.3f} px"
     if files.size:
-        for file in files.wanted:
+        for file in files.paths:
             fix_size(file, file, *files.size)
             yield f"{file}: only for pairs of {files.size[0]}x{files.size[1]}"
 
 
 def _check_apart(source: Path, files: MatcherFiles) -> None:
-    for file in files.wanted:
+    for file in files.paths:
         if file.resolve() == source.resolve():
             raise StereoweaveError(f"{file}: expected an output file other than the source")
 

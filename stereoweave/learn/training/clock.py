@@ -24,17 +24,17 @@ class RunClock:
     minutes: float
     total_minutes: float
 
-    def used_at(self, now_s: float) -> float:
+    def elapsed_s(self, now_s: float) -> float:
         """Seconds of the run used so far."""
         return self.used_s + now_s - self.began_s
 
-    def share_at(self, now_s: float) -> float:
+    def elapsed_share(self, now_s: float) -> float:
         """Share of the run's time used so far, 0 to 1; at 1 the last command stops training."""
-        return min(self.used_at(now_s) / (60 * self.total_minutes - RESERVE_S), 1.0)
+        return min(self.elapsed_s(now_s) / (60 * self.total_minutes - RESERVE_S), 1.0)
 
-    def left_at(self, now_s: float) -> float:
+    def remaining_s(self, now_s: float) -> float:
         """Seconds left to train in this command; negative when overdue."""
-        of_run = 60 * self.total_minutes - self.used_at(now_s)
+        of_run = 60 * self.total_minutes - self.elapsed_s(now_s)
         of_command = 60 * self.minutes - (now_s - self.began_s)
         return min(of_run, of_command) - RESERVE_S
 

@@ -165,7 +165,7 @@ class CodeObjective:
         rows = []
         for index in range(pairs.count):
             with name_in_errors(pairs.name(index)):
-                rows.append(self._scores_of(network, read_known(pairs, index), device))
+                rows.append(self._score_sample(network, read_known(pairs, index), device))
         return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
     def _terms(self, output: Map, code_truth: Map, batch: Batch) -> dict[str, Tensor]:
@@ -186,7 +186,7 @@ class CodeObjective:
         beyond = (1 - shifted_px / least_px).clamp(min=0)
         return focal_baseline / shifted_px.clamp(min=least_px) + beyond * self.recipe.max_depth_m
 
-    def _scores_of(self, network: CodeNetwork, sample: Sample, device: torch.device) -> dict[str, float]:
+    def _score_sample(self, network: CodeNetwork, sample: Sample, device: torch.device) -> dict[str, float]:
         batch = {name: values.to(device) for name, values in collate([sample]).items()}
         output, truth = network(batch["left"], batch["right"]), compute_target(self.recipe, batch)
         terms = self._terms(output, self.curve.encode(truth), batch)

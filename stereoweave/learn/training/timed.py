@@ -88,7 +88,7 @@ def train_by_clock(recipe: Recipe, command: TimedCommand, report: Report) -> Run
         minutes=command.minutes,
         total_minutes=command.total_minutes,
     )
-    if clock.left_at(time.monotonic()) <= 0:
+    if clock.remaining_s(time.monotonic()) <= 0:
         report(f"the {command.total_minutes:g} minutes are used up; {command.out} is not changed")
         return start.progress
     recipes = [
@@ -119,9 +119,9 @@ class _TimedLoop:
         """Train until the command's time is over, with periodic reports and checkpoints."""
         self.progress = progress
         batch = self._smoke_test()
-        self.reported = self._mark()
-        while self.clock.left_at(time.monotonic()) > 0:
-            share = self.clock.share_at(time.monotonic())
+        self.reported = self._take_snapshot()
+        while self.clock.remaining_s(time.monotonic()) > 0:
+            share = self.clock.elapsed_share(time.monotonic())
             rate = learning_rate_at(self.recipe, self.progress.optimiser_steps, share)
             if is_cooling_down(self.recipe, share):
                 self.painters.switch(len(self.painters.recipes) - 1)
@@ -136,7 +136,7 @@ class _TimedLoop:
 
     def finish(self, held_out: PairSource) -> None:
         """Save the run with its scores, and report them."""
-        too_late = self.clock.left_at(time.monotonic()) < -RESERVE_S
+        too_late = self.clock.remaining_s(time.monotonic()) < -RESERVE_S
         if too_late or (isinstance(held_out, CachedPairs) and held_out.missing()):
             self.report("not scored: out of time" if too_late else "not scored: no held-out pairs")
             return self._save({})
@@ -145,7 +145,7 @@ class _TimedLoop:
         self.report("held-out pairs: " + "  ".join(f"{name} {score:.4g}" for name, score in scores.items()))
         for file in sorted(self.out.iterdir()):
             self.report(f"{file}  {file.stat().st_size / 2**20:.1f} MiB")
-        seconds, progress = self.clock.used_at(time.monotonic()), self.progress
+        seconds, progress = self.clock.elapsed_s(time.monotonic()), self.progress
         self.report(
             f"{seconds / 60:.1f} of {self.clock.total_minutes:g} minutes used up: {progress.steps} steps, "
             f"{progress.pairs} pairs, {progress.skipped} steps skipped"
@@ -159,22 +159,22 @@ class _TimedLoop:
         """
         batch = self.run.move_to_device(self.painters.take())
         plain = self.run.loss(batch, bfloat16=False)
-        self.report(f"{self._used()}  first batch ready; its loss is {plain:.4g}")
+        self.report(f"{self._format_elapsed()}  first batch ready; its loss is {plain:.4g}")
         if self.run.bfloat16:
             rounded = self.run.loss(batch, bfloat16=True)
             self.run.bfloat16 = abs(rounded - plain) < _BFLOAT16_SHARE * abs(plain)
             taken = "bfloat16" if self.run.bfloat16 else "float32"
             self.report(f"in bfloat16 the loss is {rounded:.4g}; training in {taken}")
-        pairs_per_s = len(batch["left"]) / self._seconds_a_step(batch)
+        pairs_per_s = len(batch["left"]) / self._measure_step_s(batch)
         self._save({})
         checkpoint.load(self.out / NETWORK_FILE)
         self.report(
-            f"{self._used()}  smoke test passed: files can be written and read, and the network alone takes "
-            f"{pairs_per_s:.1f} pairs/s"
+            f"{self._format_elapsed()}  smoke test passed: files can be written and read, and the network "
+            f"alone takes {pairs_per_s:.1f} pairs/s"
         )
         return batch
 
-    def _seconds_a_step(self, batch: dict[str, torch.Tensor]) -> float:
+    def _measure_step_s(self, batch: dict[str, torch.Tensor]) -> float:
         """Mean time of a few steps at a learning rate of 0, after one warm-up step."""
         for step in range(1 + _TRIED_STEPS):
             if step == 1:
@@ -210,13 +210,13 @@ class _TimedLoop:
         self.progress = replace(self.progress, skipped=before.skipped + 1, last_skipped=before.steps)
 
     def _report(self, rate: float) -> None:
-        before, self.reported = self.reported, self._mark()
+        before, self.reported = self.reported, self._take_snapshot()
         late = (self.reported.late - before.late) / max(self.reported.taken - before.taken, 1)
         speed = (self.reported.pairs - before.pairs) / (self.reported.at_s - before.at_s)
-        left_s = 60 * self.clock.total_minutes - self.clock.used_at(self.reported.at_s)
+        left_s = 60 * self.clock.total_minutes - self.clock.elapsed_s(self.reported.at_s)
         self.report(
-            f"{self._used()}  step {self.progress.steps}  loss {np.mean(self.losses):.4g}  rate {rate:.3g}  "
-            f"{speed:.1f} pairs/s  late {100 * late:.0f} %  cuts {self.painters.cuts:.1f}  "
+            f"{self._format_elapsed()}  step {self.progress.steps}  loss {np.mean(self.losses):.4g}  "
+            f"rate {rate:.3g}  {speed:.1f} pairs/s  late {100 * late:.0f} %  cuts {self.painters.cuts:.1f}  "
             f"{self.progress.pairs + speed * left_s:.3g} pairs in the end"
         )
         self.painters.adapt(late)
@@ -225,13 +225,13 @@ class _TimedLoop:
     def _save(self, scores: dict[str, float]) -> None:
         self.saved_s = time.monotonic()
         self.progress = replace(
-            self.progress, seconds=self.clock.used_at(self.saved_s), batches=self.painters.number
+            self.progress, seconds=self.clock.elapsed_s(self.saved_s), batches=self.painters.number
         )
         hours = self.run.start.hours + (self.saved_s - self.clock.began_s) / 3600
         self.run.save(self.out, self.progress, hours, scores)
 
-    def _mark(self) -> _Snapshot:
-        return _Snapshot(time.monotonic(), self.progress.pairs, self.painters.taken, self.painters.starved)
+    def _take_snapshot(self) -> _Snapshot:
+        return _Snapshot(time.monotonic(), self.progress.pairs, self.painters.taken, self.painters.late)
 
-    def _used(self) -> str:
-        return f"{self.clock.used_at(time.monotonic()):5.0f} s"
+    def _format_elapsed(self) -> str:
+        return f"{self.clock.elapsed_s(time.monotonic()):5.0f} s"

@@ -36,13 +36,13 @@ def mix_of(*counts, weights):
 
 def chosen_of(mix, steps, **changes):
     batches = Batches(replace(RECIPE, **changes), mix)
-    return [index for step in range(steps) for index in batches.chosen(step)]
+    return [index for step in range(steps) for index in batches.list_pairs(step)]
 
 
 def test_every_pair_comes_once_before_any_comes_again():
     recipe = replace(RECIPE, pairs=7, batch=3)
     batches = Batches(recipe, CachedPairs(Path("unused"), 0, recipe.pairs, PAIR_SIZE))
-    chosen = [index for step in range(7) for index in batches.chosen(step)]
+    chosen = [index for step in range(7) for index in batches.list_pairs(step)]
     epochs = [chosen[:7], chosen[7:14], chosen[14:]]
     assert all(sorted(epoch) == list(range(7)) for epoch in epochs)
     assert epochs[0] != epochs[1]
@@ -52,7 +52,8 @@ def test_the_pairs_of_a_step_come_in_the_order_of_their_seed_and_epoch():
     """As they did before sets were mixed: runs of old are resumed and compared with."""
     batches = Batches(replace(RECIPE, batch=3, seed=5), Listed(samples(1) * 7))
     orders = [np.random.default_rng((5, epoch, 1)).permutation(7) for epoch in range(3)]
-    assert [index for step in range(7) for index in batches.chosen(step)] == np.concatenate(orders).tolist()
+    chosen = [index for step in range(7) for index in batches.list_pairs(step)]
+    assert chosen == np.concatenate(orders).tolist()
 
 
 def test_of_each_set_of_a_mix_every_pair_comes_once_before_any_comes_again():
@@ -74,7 +75,7 @@ def test_the_sets_of_a_mix_are_drawn_by_weight():
 def test_a_step_of_a_mix_depends_on_the_seed_and_the_step_alone():
     mix = mix_of(5, 3, weights=(1.0, 1.0))
     whole = chosen_of(mix, 20, batch=4)
-    assert Batches(replace(RECIPE, batch=4), mix).chosen(13) == whole[52:56]
+    assert Batches(replace(RECIPE, batch=4), mix).list_pairs(13) == whole[52:56]
     assert chosen_of(mix, 20, batch=4, seed=1) != whole
 
 
@@ -88,7 +89,7 @@ def test_a_batch_of_a_mix_has_the_pairs_of_its_sets_and_names_them(pairs):
     cameras = Listed(samples(3, camera=CAMERA))
     mix = MixedSource((pairs, cameras), (1.0, 1.0))
     batches = Batches(replace(RECIPE, augment=False, crop_size=PAIR_SIZE, batch=8), mix)
-    chosen, batch = batches.chosen(0), batches[0]
+    chosen, batch = batches.list_pairs(0), batches[0]
     assert min(chosen) < 4 <= max(chosen)
     own = [(pairs, index) if index < 4 else (cameras, index - 4) for index in chosen]
     for place, (source, index) in enumerate(own):
@@ -112,7 +113,7 @@ def test_a_batch_depends_on_the_seed_and_the_step_alone(pairs):
 def test_a_batch_without_augmentation_holds_cuts_of_the_pairs_as_they_are(pairs):
     batches = Batches(replace(RECIPE, augment=False, crop_size=PAIR_SIZE), pairs)
     batch = batches[0]
-    for place, index in enumerate(batches.chosen(0)):
+    for place, index in enumerate(batches.list_pairs(0)):
         np.testing.assert_array_equal(batch["disparity_px"][place, 0], pairs[index].disparity_px)
         found = (255 * batch["right"][place]).round().byte().permute(1, 2, 0)
         np.testing.assert_array_equal(found, pairs[index].right)

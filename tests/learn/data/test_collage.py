@@ -14,7 +14,7 @@ from stereoweave.learn.data.collage import (
     paint_collage,
     paint_scene,
     paint_training_collage,
-    photograph,
+    simulate_cameras,
 )
 from stereoweave.learn.data.collage_kinds import draw_scene, draw_training_scene
 from stereoweave.learn.data.collage_scene import CollageLayer, CollageScene, CollageSurface
@@ -239,7 +239,7 @@ def test_in_some_pairs_the_right_view_is_a_row_or_two_lower_or_higher():
     step[24:] = 200
     rows = []
     for index in range(3000):
-        _, right = photograph(np.random.default_rng((8, index)), step, step)
+        _, right = simulate_cameras(np.random.default_rng((8, index)), step, step)
         levels = right[20:28].mean(axis=(1, 2))
         # How many of the eight rows are bright, parts of rows included; four where nothing moved.
         rows.append(((levels - levels.min()) / (levels.max() - levels.min())).sum())

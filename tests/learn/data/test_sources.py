@@ -192,7 +192,7 @@ def test_fresh_collages_are_those_of_the_seed_and_none_is_kept(tmp_path):
     np.testing.assert_array_equal(training[5].left, expected.left)
     np.testing.assert_array_equal(training[5].disparity_px, expected.disparity_px)
     assert training.name(5) == f"collage 5 of seed {recipe.seed}"
-    assert [Batches(recipe, training).chosen(step) for step in (0, 7)] == [[0, 1], [14, 15]]
+    assert [Batches(recipe, training).list_pairs(step) for step in (0, 7)] == [[0, 1], [14, 15]]
     assert held_out.folder.name.startswith(f"seed{VALIDATION_SEED}-")
     assert list(tmp_path.iterdir()) == []
 

@@ -212,7 +212,7 @@ def test_a_loss_that_is_not_finite_twice_stops_and_names_the_pairs(folder, in_pl
     recipe = replace(RECIPE, name="broken", start_from=str(tmp_path / "broken.pt"))
     file = write(recipe, tmp_path / "broken.toml")
     pairs = CachedPairs(folder / "pairs", recipe.seed, recipe.pairs, PAIR_SIZE)
-    names = ", ".join(pairs.name(index) for index in Batches(recipe, pairs).chosen(1))
+    names = ", ".join(pairs.name(index) for index in Batches(recipe, pairs).list_pairs(1))
     with pytest.raises(StereoweaveError) as caught:
         train(file, folder / "broken", QUIET)
     assert str(caught.value) == (

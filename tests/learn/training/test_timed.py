@@ -88,12 +88,12 @@ def test_crops_change_where_the_rate_begins_to_fall():
 
 def test_a_clock_counts_the_commands_before_and_ends_a_command_in_time():
     clock = RunClock(began_s=1000.0, used_s=500.0, minutes=9, total_minutes=26)
-    assert clock.used_at(1010) == 510
-    assert clock.share_at(1270) == 770 / (26 * 60 - RESERVE_S)
-    assert clock.left_at(1010) == 9 * 60 - 10 - RESERVE_S
+    assert clock.elapsed_s(1010) == 510
+    assert clock.elapsed_share(1270) == 770 / (26 * 60 - RESERVE_S)
+    assert clock.remaining_s(1010) == 9 * 60 - 10 - RESERVE_S
     late = replace(clock, used_s=1400.0)
-    assert late.left_at(1010) == 26 * 60 - 1410 - RESERVE_S  # the run's end comes before the command's
-    assert late.share_at(2000) == 1
+    assert late.remaining_s(1010) == 26 * 60 - 1410 - RESERVE_S  # the run's end comes before the command's
+    assert late.elapsed_share(2000) == 1
 
 
 def test_a_pair_comes_as_often_as_it_is_to_be_cut():
