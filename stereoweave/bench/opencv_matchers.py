@@ -16,7 +16,7 @@ SGBM = "sgbm"
 DISPARITIES = 192
 
 
-def _sgbm(mode: int) -> MapMatch:
+def _make_sgbm(mode: int) -> MapMatch:
     """Create a semi-global block matcher over 192 disparities.
 
     Settings: OpenCV's sample stereo_match.cpp at a block size of 5 (P1 = 8*3*5*5, P2 = 32*3*5*5), except
@@ -38,7 +38,7 @@ def _sgbm(mode: int) -> MapMatch:
     return lambda pair: _compute_padded(matcher, pair.left, pair.right)
 
 
-def _bm() -> MapMatch:
+def _make_bm() -> MapMatch:
     """Create a block matcher over 192 disparities: the same sample's settings, speckle range 2."""
     matcher = cv2.StereoBM.create(numDisparities=DISPARITIES, blockSize=9)
     matcher.setPreFilterCap(31)
@@ -53,10 +53,10 @@ def _bm() -> MapMatch:
 
 
 OPENCV_MATCHERS: dict[str, Callable[[], MapMatch]] = {
-    SGBM: partial(_sgbm, cv2.STEREO_SGBM_MODE_SGBM),
-    "sgbm_8_paths": partial(_sgbm, cv2.STEREO_SGBM_MODE_HH),
-    "sgbm_3_way": partial(_sgbm, cv2.STEREO_SGBM_MODE_SGBM_3WAY),
-    "bm": _bm,
+    SGBM: partial(_make_sgbm, cv2.STEREO_SGBM_MODE_SGBM),
+    "sgbm_8_paths": partial(_make_sgbm, cv2.STEREO_SGBM_MODE_HH),
+    "sgbm_3_way": partial(_make_sgbm, cv2.STEREO_SGBM_MODE_SGBM_3WAY),
+    "bm": _make_bm,
 }
 """Matcher name to factory."""
 

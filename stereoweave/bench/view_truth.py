@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from stereoweave.bench.opencv_matchers import fill_rows
-from stereoweave.data.samples import find_hidden
+from stereoweave.data.samples import find_occluded
 from stereoweave.stereo import Sample
 
 # Neighbours up to this far apart are one surface. A larger step is an edge, as in edge_metrics.py.
@@ -41,7 +41,7 @@ def find_view_truth(sample: Sample, position: float) -> ViewTruth:
     sides = (sample.disparity_px, 0 - position), (sample.right_disparity_px, 1 - position)
     disparity_px = np.fmax(*(land_disparities(side_px, way) for side_px, way in sides))
     filled_px = np.fmax(*(land_disparities(fill_unknown(side_px), way) for side_px, way in sides))
-    from_left, from_right = (_find_hidden_from(disparity_px, side_px, way) for side_px, way in sides)
+    from_left, from_right = (_find_occluded_from(disparity_px, side_px, way) for side_px, way in sides)
     return ViewTruth(
         disparity_px=disparity_px, one_sees=from_left ^ from_right, none_sees=np.isnan(filled_px)
     )
@@ -74,10 +74,10 @@ def fill_unknown(disparity_px: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h
     return fill_rows(np.nan_to_num(disparity_px + lift_px).astype(np.float32)) - lift_px
 
 
-def _find_hidden_from(
+def _find_occluded_from(
     disparity_px: Float[np.ndarray, "h w"], side_px: Float[np.ndarray, "h w"], way: float
 ) -> Bool[np.ndarray, "h w"]:
     """Find the new view's pixels that are occluded in the side image; for `way` see `land_disparities`."""
     if way < 0:  # the image was taken to the left; mirrored, to the right
-        return _find_hidden_from(disparity_px[:, ::-1], side_px[:, ::-1], -way)[:, ::-1]
-    return find_hidden(way * disparity_px, way * side_px)
+        return _find_occluded_from(disparity_px[:, ::-1], side_px[:, ::-1], -way)[:, ::-1]
+    return find_occluded(way * disparity_px, way * side_px)

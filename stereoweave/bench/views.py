@@ -26,7 +26,7 @@ from stereoweave.bench.pairs import TURNS, SceneLister, merge_machines, score_al
 from stereoweave.bench.tables import MEAN
 from stereoweave.bench.view_scenes import ReferenceView, ViewScene
 from stereoweave.bench.view_truth import fill_unknown, find_view_truth
-from stereoweave.data.samples import find_hidden
+from stereoweave.data.samples import find_occluded
 from stereoweave.rendering.renderer import Renderer
 from stereoweave.stereo import Estimate, Sample, StereoPair
 from stereoweave.system.ray_engine import Engine
@@ -177,7 +177,7 @@ def _estimate_by_sgbm(pair: StereoPair) -> Estimate:
         right_disparity_px=right_filled_px,
         # As `Matcher` does for a network without a confidence output.
         confidence=np.exp(left_right_confidence(left_px, mirrored_px[:, ::-1])),
-        occluded=find_hidden(filled_px, right_filled_px),
+        occluded=find_occluded(filled_px, right_filled_px),
     )
 
 

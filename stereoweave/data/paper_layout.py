@@ -44,11 +44,11 @@ def list_paper(root: Path) -> list[Frame]:
         raise FormatError(f"{camera}: expected the camera in Middlebury's format, found no such file")
     folders = [root / name for name in ("left", "right", "depth")]
 
-    def camera_of(name: str) -> Path:
+    def find_camera(name: str) -> Path:
         return camera if camera.exists() else _frame_files(root, name)["calib"]
 
     frames = match_files(*folders).items()
-    return [Frame(name=name, read=partial(_read, files, camera_of(name))) for name, files in frames]
+    return [Frame(name=name, read=partial(_read, files, find_camera(name))) for name, files in frames]
 
 
 def write_frame(root: Path, name: str, sample: Sample) -> None:

@@ -48,13 +48,13 @@ def make_sample(
         right=pair.right,
         disparity_px=left_px,
         right_disparity_px=right_px,
-        occluded=find_hidden(left_px, right_px) if occluded is None else occluded,
-        right_occluded=np.ascontiguousarray(find_hidden(right_px[:, ::-1], left_px[:, ::-1])[:, ::-1]),
+        occluded=find_occluded(left_px, right_px) if occluded is None else occluded,
+        right_occluded=np.ascontiguousarray(find_occluded(right_px[:, ::-1], left_px[:, ::-1])[:, ::-1]),
         camera=pair.camera,
     )
 
 
-def find_hidden(
+def find_occluded(
     disparity_px: Float[np.ndarray, "h w"], other_px: Float[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
     """Find occluded pixels: the match lies outside the other picture or behind its visible surface.

@@ -116,21 +116,21 @@ class Shards:
         self._contents: dict[Path, dict[str, dict[str, tuple[int, int]]]] = {}
 
     def __getitem__(self, index: int) -> Sample:
-        return self._unpacked(index, unpack)
+        return self._unpack_pair(index, unpack)
 
     def name(self, index: int) -> str:
         """Common prefix of the pair's file names."""
-        return self._shard(index).pair_name(index)
+        return self._find_shard(index).pair_name(index)
 
     def views(self, index: int) -> dict[float, UInt8[np.ndarray, "h w 3"]]:
         """Additional views of a pair, by position."""
-        return self._unpacked(index, unpack_views)
+        return self._unpack_pair(index, unpack_views)
 
     def files(self, index: int) -> dict[str, bytes]:
         """Read and verify a pair's files, by suffix; raises FormatError if one is damaged."""
-        path, name = self._shard(index).path, self.name(index)
+        path, name = self._find_shard(index).path, self.name(index)
         with reading(path, "a shard"), path.open("rb") as stream:
-            places = self._places(path).get(name, {})
+            places = self._locate_files(path).get(name, {})
             files = {f"{name}.{end}": _read_at(stream, *place) for end, place in places.items()}
             sums = files.pop(f"{name}.{_SUMS}", f"  {name}.{_SUMS}".encode())
             verify_checksums(files, sums, path, _DELETE)
@@ -142,22 +142,22 @@ class Shards:
         window = rng.permutation(len(sizes)) // _WINDOW
         return np.lexsort((rng.random(self.count), window.repeat(sizes)))
 
-    def _unpacked(self, index: int, unpack: Callable[[Mapping[str, bytes]], Unpacked]) -> Unpacked:
+    def _unpack_pair(self, index: int, unpack: Callable[[Mapping[str, bytes]], Unpacked]) -> Unpacked:
         files = self.files(index)
         try:
             return unpack(files)
         except (ValueError, KeyError, TypeError) as error:  # valid checksums do not prove who wrote the files
             raise FormatError(
-                f"{self._shard(index).path}: expected the files of a pair, found {self.name(index)} without "
-                f"or with damaged ones ({error}); {_DELETE}"
+                f"{self._find_shard(index).path}: expected the files of a pair, found {self.name(index)} "
+                f"without or with damaged ones ({error}); {_DELETE}"
             ) from error
 
-    def _shard(self, index: int) -> Shard:
+    def _find_shard(self, index: int) -> Shard:
         if not 0 <= index < self.count:
             raise IndexError(f"pair {index} of {self.count}")
         return self.shards[bisect_right(self._starts, index) - 1]
 
-    def _places(self, path: Path) -> dict[str, dict[str, tuple[int, int]]]:
+    def _locate_files(self, path: Path) -> dict[str, dict[str, tuple[int, int]]]:
         """Offset and size of each pair's files in a shard; cached, because reading them is slow."""
         if path not in self._contents:
             self._contents[path] = _list_contents(path)

@@ -7,7 +7,7 @@ from dataset_examples import error_of, read_frame, write_map, write_picture
 
 from stereoweave.data.frames import Frame, match_files
 from stereoweave.data.readers import DATASETS, open_dataset
-from stereoweave.data.samples import find_hidden, make_sample
+from stereoweave.data.samples import find_occluded, make_sample
 from stereoweave.stereo import StereoPair
 
 CALIBRATION = "cam0=[300 0 19.5; 0 300 15.5; 0 0 1]\ndoffs=0\nbaseline=100\nwidth=40\nheight=32\n"
@@ -113,16 +113,16 @@ def row(*values_px):
 
 def test_a_match_beside_the_other_picture_is_hidden():
     # The columns 0 to 3 land on -2, -1, 0 and 1.
-    assert find_hidden(row(2, 2, 2, 2), row(2, 2, 2, 2)).tolist() == [[True, True, False, False]]
+    assert find_occluded(row(2, 2, 2, 2), row(2, 2, 2, 2)).tolist() == [[True, True, False, False]]
     # Behind the plane of convergence they land further right.
-    assert find_hidden(row(-1, -1, -1, -1), row(-1, -1, -1, -1)).tolist() == [[False, False, False, True]]
+    assert find_occluded(row(-1, -1, -1, -1), row(-1, -1, -1, -1)).tolist() == [[False, False, False, True]]
 
 
 def test_a_match_behind_something_nearer_is_hidden():
     # A block at 3 px over a ground at 1 px. It is in the columns 4 and 5 here, in 1 and 2 there, where it
     # hides the ground that here is in the columns 2 and 3.
     disparity_px, other_px = row(1, 1, 1, 1, 3, 3, 1, 1), row(1, 3, 3, 1, 1, 1, 1, 1)
-    assert find_hidden(disparity_px, other_px).tolist() == [
+    assert find_occluded(disparity_px, other_px).tolist() == [
         [True, False, True, True, False, False, False, False]
     ]
 
@@ -132,23 +132,23 @@ def test_at_a_jump_the_column_nearer_to_the_match_decides(match, behind):
     # The ground that is in column 4 here; there a block of 8 px ends after column 2.
     ground_px = 4 - match
     disparity_px, other_px = row(*5 * [ground_px]), row(8, 8, 8, ground_px, ground_px)
-    assert find_hidden(disparity_px, other_px)[0, 4] == behind
+    assert find_occluded(disparity_px, other_px)[0, 4] == behind
 
 
 def test_a_slope_does_not_hide_itself():
     # d = 2 x / 3 here, so that column x is column x / 3 there, and the disparity there is twice the column.
     columns = np.arange(16, dtype=np.float32)[None]
-    assert not find_hidden(2 * columns / 3, 2 * columns).any()
+    assert not find_occluded(2 * columns / 3, 2 * columns).any()
 
 
 def test_surfaces_that_all_but_touch_do_not_hide_each_other():
-    assert find_hidden(row(0, 0, 0), row(0.5, 0.625, -9)).tolist() == [[False, True, False]]
+    assert find_occluded(row(0, 0, 0), row(0.5, 0.625, -9)).tolist() == [[False, True, False]]
 
 
 def test_what_is_unknown_is_not_hidden():
     nan = np.nan
-    assert not find_hidden(row(nan, nan, 0, 1), row(9, 9, nan, nan)).any()
-    assert find_hidden(row(1, nan, nan, nan), row(nan, nan, nan, nan)).tolist() == [
+    assert not find_occluded(row(nan, nan, 0, 1), row(9, 9, nan, nan)).any()
+    assert find_occluded(row(1, nan, nan, nan), row(nan, nan, nan, nan)).tolist() == [
         [True, False, False, False]
     ]
 
