@@ -95,7 +95,7 @@ def run_ablations(
     for trial in planned:
         for pairs in open_sources(trial.recipe, runs / "pairs"):
             cache_pairs(pairs, console)
-    before = {row.get("fingerprint"): row for row in _read(report)}
+    before = {row.get("fingerprint"): row for row in _read_report(report)}
     rows = {i: row for i, trial in enumerate(planned) if (row := before.get(fingerprint(trial.recipe)))}
     for i, trial in enumerate(planned):
         if i in rows:
@@ -103,8 +103,8 @@ def run_ablations(
         trained = checkpoint.load(train_recipe(trial.recipe, runs / trial.recipe.name, console))
         _, collages = open_sources(trial.recipe, runs / "pairs")
         held_out = {"collage": collages, "rendered": rendered_pairs}
-        rows[i] = {key: _text(value) for key, value in _row(trial, trained, held_out).items()}
-        _write(report, [rows[j] for j in sorted(rows)])
+        rows[i] = {key: _format_value(value) for key, value in _make_row(trial, trained, held_out).items()}
+        _write_report(report, [rows[j] for j in sorted(rows)])
         console.print(f"{trial.recipe.name}: {len(rows)} of {len(planned)}")
 
 
@@ -113,7 +113,7 @@ def fingerprint(recipe: Recipe) -> str:
     return hashlib.sha256(repr(replace(recipe, name="")).encode()).hexdigest()[:8]
 
 
-def _row(trial: Trial, trained: Checkpoint, held_out: dict[str, PairSource]) -> dict[str, object]:
+def _make_row(trial: Trial, trained: Checkpoint, held_out: dict[str, PairSource]) -> dict[str, object]:
     network = build_network(trained.recipe)
     network.load_state_dict(trained.averaged)
     network.eval()
@@ -122,7 +122,7 @@ def _row(trial: Trial, trained: Checkpoint, held_out: dict[str, PairSource]) -> 
         f"{pairs}_{name}": value
         for pairs, source in held_out.items()
         for name, value in (
-            validate(network, source, _CPU) | _near_edges(make_method(trained), source)
+            validate(network, source, _CPU) | _measure_near_edges(make_method(trained), source)
         ).items()
     }
     return {
@@ -142,7 +142,7 @@ def _row(trial: Trial, trained: Checkpoint, held_out: dict[str, PairSource]) -> 
     }
 
 
-def _near_edges(match: DisparityMethod, pairs: PairSource) -> dict[str, float]:
+def _measure_near_edges(match: DisparityMethod, pairs: PairSource) -> dict[str, float]:
     """Mean errors near depth edges, over the pairs that have edges."""
     rows = []
     for index in range(pairs.count):
@@ -158,18 +158,18 @@ def _near_edges(match: DisparityMethod, pairs: PairSource) -> dict[str, float]:
     return {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}
 
 
-def _text(value: object) -> str:
+def _format_value(value: object) -> str:
     return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
-def _read(report: Path) -> list[dict[str, str]]:
+def _read_report(report: Path) -> list[dict[str, str]]:
     if not report.exists():
         return []
     with report.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
-def _write(report: Path, rows: Sequence[dict[str, str]]) -> None:
+def _write_report(report: Path, rows: Sequence[dict[str, str]]) -> None:
     make_folder(report.parent)
     with replacing(report) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[-1]))

@@ -122,7 +122,7 @@ def _gather(base: Recipe, planned: Sequence[Trial], runs: Path) -> Report:
         missing=sorted(files.keys() - names),
         kept={name: kept[name] for name in names},
         curves={name: read_scores(runs / name / SCORES_FILE) for name in names},
-        rows=[_row(trial, kept[trial.recipe.name], scores[trial.recipe.name]) for trial in trained],
+        rows=[_make_row(trial, kept[trial.recipe.name], scores[trial.recipe.name]) for trial in trained],
         common=common,
     )
 
@@ -147,7 +147,7 @@ def _score(recipes: Sequence[Recipe], runs: Path) -> tuple[dict[str, ProjectionR
     return scores, common
 
 
-def _row(trial: Trial, kept: Checkpoint, score: ProjectionRow) -> PaperRow:
+def _make_row(trial: Trial, kept: Checkpoint, score: ProjectionRow) -> PaperRow:
     recipe = kept.recipe
     return PaperRow(
         claim=trial.claim,
@@ -188,7 +188,7 @@ def _format_report(report: Report, run_time: str) -> str:
         parts += [f"## {claim.capitalize()}", settings_table(report.rows, claim, report.depth)]
         if claim == ADJUSTMENT and (fitted := _describe_fit(report.planned)):
             parts.append(fitted)
-    parts += ["## What needs no training", _common_table(report.common, report.depth)]
+    parts += ["## What needs no training", _format_common_table(report.common, report.depth)]
     if reached := _describe_transfer(report):
         parts += ["## Transfer: steps to one validation loss", reached]
     if run_time:
@@ -259,7 +259,7 @@ def _read_run_times(path: Path) -> str:
     return f"A pair of 640x480, all cores of a processor; the paper's are of GPUs.\n\n{table}"
 
 
-def _common_table(rows: Sequence[ProjectionRow], depth: bool) -> str:
+def _format_common_table(rows: Sequence[ProjectionRow], depth: bool) -> str:
     columns = ["method", *(["EPE cm"] if depth else []), "EPE px", "MAE", "MAE of sourced", "sourced %"]
     lines = [f"| {' | '.join((*columns, 'PSNR dB', 'SSIM'))} |", "|---" * (len(columns) + 2) + "|"]
     for row in rows:

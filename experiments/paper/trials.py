@@ -21,7 +21,7 @@ PAPER = "the paper's recipe"
 FITTED = "(fitted)"
 SCRATCH, TUNED = "from scratch", "from the synthetic checkpoint"
 # The rivals train with the losses of their own papers, without this paper's two contributions.
-OWN: dict[str, dict[str, Any]] = {
+RIVAL_SETTINGS: dict[str, dict[str, Any]] = {
     "densemapnet": {"exponent": 1.0, "alpha_p": 0.0},
     "dispnet": {"exponent": 1.0, "alpha_p": 0.0, "loss": "l1", "learning_rate": 1e-4},
     "psmnet": {"exponent": 1.0, "alpha_p": 0.0, "loss": "smooth_l1"},
@@ -49,7 +49,7 @@ def list_trials(base: Recipe, seeds: int, fitted_exponent: float) -> list[Trial]
     """
     # Otherwise training would replace every p by the fitted one.
     base = replace(base, fit_exponent=False)
-    rivals = {rival: _rival_changes(rival) for rival in OWN}
+    rivals = {rival: _rival_changes(rival) for rival in RIVAL_SETTINGS}
     every = {"psmnet": rivals["psmnet"], "fast_depth": {}, **rivals}
     return [
         *_repeat(seeds, base, PROJECTION, {PAPER: {}, "without": {"alpha_p": 0.0}}),
@@ -89,7 +89,7 @@ def _list_transfer(base: Recipe) -> Iterator[Trial]:
 
 
 def _rival_changes(model: str) -> dict[str, Any]:
-    return {"model": model, **OWN[model]}
+    return {"model": model, **RIVAL_SETTINGS[model]}
 
 
 def _other_losses(base: Recipe) -> tuple[str, ...]:

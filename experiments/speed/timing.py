@@ -59,7 +59,10 @@ def measure_run_times(
     }
     with tempfile.TemporaryDirectory() as folder:
         calls = {
-            name: (_eager(network, pair), _onnx(network, pair, Path(folder) / f"{name}.onnx"))
+            name: (
+                _make_eager_call(network, pair),
+                _make_onnx_call(network, pair, Path(folder) / f"{name}.onnx"),
+            )
             for name, network in built.items()
         }
         times_ms = _measure_ms(calls, turns)
@@ -77,7 +80,7 @@ def measure_run_times(
     ]
 
 
-def _eager(network: DisparityNetwork, pair: torch.Tensor) -> Callable[[], object]:
+def _make_eager_call(network: DisparityNetwork, pair: torch.Tensor) -> Callable[[], object]:
     def call() -> object:
         with torch.inference_mode():
             return network(*pair)
@@ -85,7 +88,7 @@ def _eager(network: DisparityNetwork, pair: torch.Tensor) -> Callable[[], object
     return call
 
 
-def _onnx(network: DisparityNetwork, pair: torch.Tensor, file: Path) -> Callable[[], object]:
+def _make_onnx_call(network: DisparityNetwork, pair: torch.Tensor, file: Path) -> Callable[[], object]:
     onnx.save(export_fixed_graph(network, HEIGHT_PX, WIDTH_PX), file)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = thread_count(None)

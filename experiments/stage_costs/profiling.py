@@ -111,12 +111,12 @@ def measure_stage_costs(runs: Sequence[Path], turns: int = TURNS) -> list[StageC
     """
     register_variants()
     networks = [_load_weave_net(run) for run in runs]
-    peak = measure(_matrix_product(PRODUCT_SIDE), {}, turns)[TOTAL]
-    rows = [_row("", PRODUCT, peak, peak)]
+    peak = measure(_make_matrix_product(PRODUCT_SIDE), {}, turns)[TOTAL]
+    rows = [_make_row("", PRODUCT, peak, peak)]
     for name, network in networks:
         graph = trace(network)
         found = measure(graph, find_stages(graph), turns)
-        rows += [_row(name, stage, cost, peak) for stage, cost in found.items()]
+        rows += [_make_row(name, stage, cost, peak) for stage, cost in found.items()]
     return rows
 
 
@@ -274,7 +274,7 @@ def _load_weave_net(run: Path) -> tuple[str, WeaveNet]:
     return kept.recipe.name, network
 
 
-def _matrix_product(side: int) -> onnx.ModelProto:
+def _make_matrix_product(side: int) -> onnx.ModelProto:
     """Graph of the product of two square float32 matrices."""
     first, second, result = (
         helper.make_tensor_value_info(name, TensorProto.FLOAT, [side, side])
@@ -289,7 +289,7 @@ def _matrix_product(side: int) -> onnx.ModelProto:
     )
 
 
-def _row(network: str, stage: str, cost: StageMeasurement, peak: StageMeasurement) -> StageCost:
+def _make_row(network: str, stage: str, cost: StageMeasurement, peak: StageMeasurement) -> StageCost:
     one_ms, two_ms = cost.times_ms
     shares = [
         100 * cost.multiply_adds / peak.multiply_adds * at_peak_ms / ms if ms else 0.0

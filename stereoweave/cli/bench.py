@@ -91,7 +91,7 @@ def pairs(  # noqa: PLR0913 - each is an option of the command line
     engine = make_engine(cluster, cpus_each=threads or 1)
     threads = engine.threads_each if engine else threads
     cv2.setNumThreads(thread_count(threads))
-    makers = _makers(model, threads, provider)
+    makers = _list_makers(model, threads, provider)
     scores = score_pairs(makers, partial(list_scenes, folder.absolute(), dataset), engine)
     rows = add_memory(scores.rows, makers, scores.largest)
     write_csv(out, rows, scores.machine)
@@ -152,7 +152,7 @@ def views(  # noqa: PLR0913 - each is an option of the command line
     threads = engine.threads_each if engine else threads
     cv2.setNumThreads(thread_count(threads))
     scenes = partial(list_view_scenes, folder.absolute())
-    scores = score_view_scenes(_makers(model, threads, provider), scenes, threads, engine)
+    scores = score_view_scenes(_list_makers(model, threads, provider), scenes, threads, engine)
     write_csv(out, scores.rows, scores.machine)
     print_means(VIEWS_TABLES, "method", [row for row in scores.rows if row.scene == MEAN])
     typer.echo(f"rows: {out}")
@@ -217,9 +217,8 @@ def parity(
 
     make_parent_folder(out)
     with require_train_extra():
-        from stereoweave.learn.export.parity import format_markdown
-        from stereoweave.learn.export.parity import measure_parity as measured
-    rows = measured(checkpoints)
+        from stereoweave.learn.export.parity import format_markdown, measure_parity
+    rows = measure_parity(checkpoints)
     write_csv(out, rows)
     typer.echo(format_markdown(rows))
     typer.echo(f"rows: {out}")
@@ -238,7 +237,9 @@ def training(
         typer.echo(f"{name}: {law.at_10000_pairs:.4g} * (pairs / 10,000)^-{law.exponent:.3f}")
 
 
-def _makers(models: Sequence[str] | None, threads: int | None, provider: str) -> dict[str, Callable[[], Any]]:
+def _list_makers(
+    models: Sequence[str] | None, threads: int | None, provider: str
+) -> dict[str, Callable[[], Any]]:
     """Constructors of the named networks, plain and refined; default: all shipped networks."""
     from stereoweave.bench.pairs import make_matcher
     from stereoweave.matching.matcher import MODES, shipped_models

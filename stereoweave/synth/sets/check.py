@@ -122,13 +122,13 @@ def find_problem(sample: Sample) -> str | None:
     """Return the first inconsistency between a pair's disparities and images, or None."""
     if not np.isfinite(sample.disparity_px).any():
         return "expected known disparities, found every pixel unknown"
-    before, at, after = _grey_level_differences(sample)
+    before, at, after = _measure_differences(sample)
     if at > _LARGEST_RATIO * min(before, after):
         return (
             "expected both images to differ least at the disparity, found differences of "
             f"{at:.2f} grey levels at the disparity, {before:.2f} at 1 px less and {after:.2f} at 1 px more"
         )
-    agreeing = _agreeing_share(sample)
+    agreeing = _measure_agreement(sample)
     if agreeing < _LEAST_AGREEING:
         return (
             f"expected both disparities to agree at {_LEAST_AGREEING:.0%} of the pixels that both cameras "
@@ -191,7 +191,7 @@ def _no_findings(*problems: str) -> Findings:
 def _measure(sample: Sample, problem: str | None) -> Findings:
     known_px = sample.disparity_px[np.isfinite(sample.disparity_px)]
     assert sample.camera is not None
-    grey_levels, agreeing = _grey_level_differences(sample), _agreeing_share(sample)
+    grey_levels, agreeing = _measure_differences(sample), _measure_agreement(sample)
     return Findings(
         pairs=1,
         disparity=_count(known_px, _DISPARITY_EDGES_PX),
@@ -206,13 +206,13 @@ def _measure(sample: Sample, problem: str | None) -> Findings:
     )
 
 
-def _grey_level_differences(sample: Sample) -> Float[np.ndarray, "3"]:
+def _measure_differences(sample: Sample) -> Float[np.ndarray, "3"]:
     """Return the images' mean differences at the disparity minus 1 px, plus 0 px and plus 1 px.
 
     Only near surfaces seen by both cameras count; NaN if they cover too few pixels.
     """
     left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (sample.left, sample.right))
-    columns = _matching_columns(sample)
+    columns = _find_matches(sample)
     rows = np.broadcast_to(np.arange(len(columns), dtype=np.float32)[:, None], columns.shape).copy()
     last = columns.shape[1] - 1
     # Comparisons with NaN are false, so this also excludes unknown disparities.
@@ -226,14 +226,14 @@ def _grey_level_differences(sample: Sample) -> Float[np.ndarray, "3"]:
     return np.array([np.abs(difference[seen]).mean() for difference in differences])
 
 
-def _agreeing_share(sample: Sample) -> float:
+def _measure_agreement(sample: Sample) -> float:
     """Return the fraction of pixels, among those seen by both cameras, at which both disparities agree.
 
     Pixels at disparity jumps are excluded; NaN if too few pixels remain. A disparity agrees if it lies
     between the right view's values at the two columns next to its match. This tolerates a crease between
     these columns, where no interpolation would be right.
     """
-    columns = _matching_columns(sample)
+    columns = _find_matches(sample)
     inside = (columns >= 0) & (columns <= columns.shape[1] - 1)
     columns = np.where(inside, columns, 0)
     beside = [
@@ -250,7 +250,7 @@ def _agreeing_share(sample: Sample) -> float:
     return float((outside_px[seen] <= _AGREE_PX).mean())
 
 
-def _matching_columns(sample: Sample) -> Float[np.ndarray, "h w"]:
+def _find_matches(sample: Sample) -> Float[np.ndarray, "h w"]:
     """Return the column of the right image that each left pixel matches."""
     return np.arange(sample.disparity_px.shape[1], dtype=np.float32) - sample.disparity_px
 

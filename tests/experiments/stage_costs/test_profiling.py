@@ -118,7 +118,7 @@ def test_multiply_adds_are_of_convolutions_products_and_sums_of_products():
 
 
 def test_a_product_of_matrices_moves_both_and_the_result_and_runs_every_turn():
-    found = costs.profile(costs._matrix_product(16), threads=1, turns=3)
+    found = costs.profile(costs._make_matrix_product(16), threads=1, turns=3)
     assert found.moved == {"product": 3 * 16 * 16 * 4}
     assert len(found.kernels_ms["product"]) == len(found.total_ms) == 3
     for kernel_ms, total_ms in zip(found.kernels_ms["product"], found.total_ms, strict=True):
@@ -127,7 +127,7 @@ def test_a_product_of_matrices_moves_both_and_the_result_and_runs_every_turn():
 
 def test_the_least_time_of_a_stage_is_that_of_its_kernels_in_one_turn():
     profiled = costs.Profile(
-        costs._matrix_product(2), {}, {"a": [1.0, 5.0], "b": [4.0, 1.0], "c": [9.0, 9.0]}, [14.0, 15.0]
+        costs._make_matrix_product(2), {}, {"a": [1.0, 5.0], "b": [4.0, 1.0], "c": [9.0, 9.0]}, [14.0, 15.0]
     )
     stages = {"a": "encoder", "b": "encoder", "c": "refinement"}
     assert costs._min_ms(profiled, stages, "encoder") == 5
@@ -141,7 +141,7 @@ def test_the_first_turn_warms_up_and_views_move_nothing():
         for dur in (9000, 1000, 2000)
         for name, operation in (("a_kernel_time", "Conv"), ("b_kernel_time", "Reshape"), ("model_run", ""))
     ]
-    found = costs._parse_profile(costs._matrix_product(2), json.loads(json.dumps(events)))
+    found = costs._parse_profile(costs._make_matrix_product(2), json.loads(json.dumps(events)))
     assert found.moved == {"a": 14, "b": 0}
     assert found.kernels_ms == {"a": [1, 2], "b": [1, 2]}
     assert found.total_ms == [1, 2]
