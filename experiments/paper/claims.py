@@ -95,7 +95,7 @@ _VIEW: _Measure = ("mae_filled", "MAE of the right view", "-", None)
 _ADJUSTMENT: tuple[_Measure, ...] = (
     (
         "prediction",
-        "validation loss, each in its own code, smaller by construction",
+        "validation loss, each in its own code (smaller by construction)",
         "about 15 %",
         15.0,
     ),
@@ -183,7 +183,7 @@ def claims_table(rows: Sequence[PaperRow], depth: bool = False) -> str:
     With `depth` as the target, end-point errors are in cm, and Table I is compared by its Propeller column.
     """
     lines = [
-        "| claim: percent less | paper | here (95 % interval) | difference (points) | verdict |",
+        "| claim: reduction in percent | paper | here (95 % interval) | difference (points) | verdict |",
         "|---|---|---|---|---|",
     ]
     for comparison in list_comparisons(depth):

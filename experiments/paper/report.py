@@ -22,6 +22,7 @@ from experiments.paper.trials import (
     ITERATIONS,
     NETWORKS,
     NETWORKS_SHORT,
+    OTHER_SEED,
     PROJECTION,
     SCRATCH,
     TRANSFER,
@@ -177,7 +178,7 @@ def _make_row(trial: Trial, kept: Checkpoint, score: ProjectionRow) -> PaperRow:
 def _format_report(report: Report, run_time: str) -> str:
     """The whole report: setup, tables, and trials that were not run."""
     parts = [
-        "# The paper's experiment: what was measured",
+        "# The paper's experiment: results",
         *_describe_setup(report),
         "## The claims",
         claims_table(report.rows, report.depth),
@@ -188,9 +189,9 @@ def _format_report(report: Report, run_time: str) -> str:
         parts += [f"## {claim.capitalize()}", settings_table(report.rows, claim, report.depth)]
         if claim == ADJUSTMENT and (fitted := _describe_fit(report.planned)):
             parts.append(fitted)
-    parts += ["## What needs no training", _format_common_table(report.common, report.depth)]
+    parts += ["## Methods without training", _format_common_table(report.common, report.depth)]
     if reached := _describe_transfer(report):
-        parts += ["## Transfer: steps to one validation loss", reached]
+        parts += ["## Transfer: steps to the same validation loss", reached]
     if run_time:
         parts += ["## Run time", run_time]
     if report.missing:
@@ -201,22 +202,27 @@ def _format_report(report: Report, run_time: str) -> str:
 def _describe_setup(report: Report) -> list[str]:
     """Settings that all trainings share, deviations from the paper, and how to read the tables."""
     base = report.base
-    another_set = " (in the transfer, of another set)" if base.dataset == COLLAGE else ""
+    transfer_seed = f" (the transfer: seed {OTHER_SEED})" if base.dataset == COLLAGE else ""
     unknown = (
-        f" Beyond {base.max_depth_m:g} m ground truth is unknown and gives no source." if report.depth else ""
+        f" Ground truth beyond {base.max_depth_m:g} m is unknown; the row ground truth does not project it."
+        if report.depth
+        else ""
     )
     return [
-        f"Written by `python -m experiments.paper`. {_describe_pairs(report)}, batch {base.batch}, "
-        f"{base.steps} steps unless a table says otherwise, Adam at {base.learning_rate:g}; scores over "
-        f"{report.held_out.count} held-out pairs. Right view: made from the left image by forward "
-        "projection; MAE, 0 to 255, over all pixels after one row fill, then over the pixels that received a "
-        f"source, and their share.{unknown}",
-        f"Not the paper's: what is scored are weights averaged over about {base.averaged_steps} steps; "
-        "gradients are clipped at norm 5; precision is bf16-mixed where the processor has it, else float32; "
-        f"PyTorch is {torch.__version__}. The rivals train with the losses of their own papers (DispNet with "
-        "its learning rate too), without this paper's depth adjustment and projection loss.",
-        f"± is the standard deviation over the seeds. A row of one seed is of seed {base.seed} alone"
-        f"{another_set}; it comes after the means over several and is not ranked against them.",
+        f"Written by `python -m experiments.paper`. Training: {_describe_pairs(report)}, batch {base.batch}, "
+        f"{base.steps} steps unless a table states another number, Adam at a learning rate of "
+        f"{base.learning_rate:g}. Scores are means over {report.held_out.count} held-out pairs. The right "
+        "view is the left image projected with the estimated disparity. MAE is its mean absolute error, 0 to "
+        "255, after pixels without a source are filled along their rows. MAE of sourced is the error over "
+        f"the pixels that have a source, and sourced % is their share.{unknown}",
+        "Differences from the paper: the scores are those of weights averaged over about "
+        f"{base.averaged_steps} steps, gradients are clipped to a norm of 5, the precision is bf16-mixed "
+        "where the processor supports it and float32 elsewhere, and the framework is PyTorch "
+        f"{torch.__version__}. The rivals train with the losses of their own papers (DispNet also with its "
+        "learning rate), without this paper's depth adjustment and projection loss.",
+        "± is the standard deviation over the seeds. Rows with one seed used seed "
+        f"{base.seed}{transfer_seed}. They come after the means over several seeds and are not ranked "
+        "against them.",
     ]
 
 
@@ -225,11 +231,11 @@ def _describe_pairs(report: Report) -> str:
     base = report.base
     size = f"{base.crop_size[1]}x{base.crop_size[0]}"
     if base.dataset == COLLAGE:
-        return f"{base.pairs} collage pairs of {size} a seed"
+        return f"{base.pairs} collage pairs of {size} per seed"
     target = f"depth up to {base.max_depth_m:g} m" if report.depth else "disparity"
     return (
-        f"{report.training.count} pairs of {base.root}, the same for every seed, in cuts of {size}; split "
-        f"{base.split}, target {target}"
+        f"{report.training.count} pairs of {base.root}, the same for every seed, cropped to {size}, "
+        f"split {base.split}, target {target}"
     )
 
 
@@ -239,8 +245,11 @@ def _describe_fit(planned: Sequence[Trial]) -> str:
     for setting, recipe in settings.items():
         if setting.endswith(FITTED):
             same = [name for name in settings if name != setting and settings[name].name == recipe.name]
-            also = f", which is {same[0]}: both rows are the same trainings" if same else ""
-            return f"Fitted to the histogram of the training truth, p is {recipe.exponent:.4g}{also}."
+            also = f", the same as {same[0]}: both rows show the same trainings" if same else ""
+            return (
+                "The exponent fitted to the histogram of the training pairs' ground truth is "
+                f"{recipe.exponent:.4g}{also}."
+            )
     return ""
 
 
@@ -256,7 +265,7 @@ def _read_run_times(path: Path) -> str:
             f"{path}: expected the rows of `python -m experiments.speed`, found {error}; "
             "write it again or remove it"
         ) from error
-    return f"A pair of 640x480, all cores of a processor; the paper's are of GPUs.\n\n{table}"
+    return f"One pair of 640x480 on all cores of a CPU; the paper's times are from GPUs.\n\n{table}"
 
 
 def _format_common_table(rows: Sequence[ProjectionRow], depth: bool) -> str:
@@ -281,14 +290,14 @@ def _describe_transfer(report: Report) -> str:
     best = min(curves[SCRATCH], key=lambda point: point["loss"])
     reached = [point["step"] for point in curves[TUNED] if point["loss"] <= best["loss"]]
     tuned = (
-        f"is reached after {reached[0]:.0f} steps"
+        f"reaches it after {reached[0]:.0f} steps"
         if reached
-        else f"is never reached: the run ended at {curves[TUNED][-1]['step']:.0f} steps"
+        else f"had not reached it at its end, after {curves[TUNED][-1]['step']:.0f} steps"
     )
     return (
-        f"The reference is the best validation loss {SCRATCH}: {best['loss']:.5f}, after {best['step']:.0f} "
-        f"steps. {TUNED.capitalize()} it {tuned}. One seed; scores are {report.base.validate_every} steps "
-        "apart."
+        f"The best validation loss of the training {SCRATCH} is {best['loss']:.5f}, after {best['step']:.0f} "
+        f"steps. The training {TUNED} {tuned}. Both used one seed, and were validated every "
+        f"{report.base.validate_every} steps."
     )
 
 

@@ -124,7 +124,7 @@ def test_losses_in_codes_of_two_exponents_decide_nothing():
         for seed in range(3)
     ]
     text = (
-        "depth adjustment, p = 1.5 against 1: validation loss, each in its own code, smaller by construction"
+        "depth adjustment, p = 1.5 against 1: validation loss, each in its own code (smaller by construction)"
     )
     assert line_of(claims_table(rows), text) == ["about 15 %", "50 (50 to 50)", "+35", "not a fair test"]
 

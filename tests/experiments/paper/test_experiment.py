@@ -311,22 +311,23 @@ def test_transfer_counts_the_steps_to_the_best_loss_from_scratch():
     scratch = [(2.0, 0.5), (4.0, 0.25), (6.0, 0.375)]
     found, alone = transfer_of(scratch, [(2.0, 0.25), (4.0, 0.125), (6.0, 0.125)])
     assert found == (
-        "The reference is the best validation loss from scratch: 0.25000, after 4 steps. "
-        "From the synthetic checkpoint it is reached after 2 steps. One seed; scores are 2 steps apart."
+        "The best validation loss of the training from scratch is 0.25000, after 4 steps. The training from "
+        "the synthetic checkpoint reaches it after 2 steps. Both used one seed, and were validated every 2 "
+        "steps."
     )
     assert alone == ""
     never, _ = transfer_of(scratch, [(2.0, 0.5), (4.0, 0.5), (6.0, 0.5)])
-    assert "it is never reached: the run ended at 6 steps. " in never
+    assert "had not reached it at its end, after 6 steps. " in never
 
 
 def test_a_fitted_exponent_that_was_planned_anyway_is_named_and_drawn_once():
     planned = [trial for trial in list_trials(BASE, 2, 1.5) if trial.claim == ADJUSTMENT]
     assert paper_report._describe_fit(planned) == (
-        "Fitted to the histogram of the training truth, p is 1.5, which is p = 1.5: "
-        "both rows are the same trainings."
+        "The exponent fitted to the histogram of the training pairs' ground truth is 1.5, the same as "
+        "p = 1.5: both rows show the same trainings."
     )
     assert paper_report._describe_fit(list_trials(BASE, 1, 1.3742)) == (
-        "Fitted to the histogram of the training truth, p is 1.374."
+        "The exponent fitted to the histogram of the training pairs' ground truth is 1.374."
     )
     curves = {trial.recipe.name: [{"step": 2.0, "squared_error": 0.5}] for trial in planned}
     drawn = paper_report._curves_by_setting(report_of(planned, curves), ADJUSTMENT)
@@ -377,9 +378,9 @@ def test_depth_of_pairs_on_disk_is_scored_in_cm(on_disk):
 def test_the_tables_of_depth_stand_beside_the_papers_propeller(on_disk):
     text = (on_disk.out / "paper.md").read_text()
     assert "9 pairs of " in text.split("## The claims")[0]
-    assert "cuts of 64x64; split disjoint, target depth up to 8 m" in text
-    assert "scores over 1 held-out pairs" in text
-    assert "Beyond 8 m ground truth is unknown" in text
+    assert "cropped to 64x64, split disjoint, target depth up to 8 m" in text
+    assert "means over 1 held-out pairs" in text
+    assert "Ground truth beyond 8 m is unknown" in text
     assert "transfer" not in text.lower()
     table = text.split("## Table I, Propeller\n\n")[1].split("\n\n")[0].splitlines()[2:]
     assert [line.split(" | ")[:3] for line in table] == [
@@ -426,5 +427,5 @@ def test_a_report_of_nothing_is_refused(tmp_path):
 
 def test_the_head_says_what_is_not_the_papers(experiment):
     text = (experiment.out / "paper.md").read_text().split("## The claims")[0]
-    for words in ("averaged over about 1 steps", "clipped at norm 5", torch.__version__, "± is the standard"):
+    for words in ("averaged over about 1 steps", "to a norm of 5", torch.__version__, "± is the standard"):
         assert words in text
