@@ -1,4 +1,4 @@
-"""Entry point of `python -m stereoweave`; torchrun starts a training this way."""
+"""Entry point of `python -m stereoweave`, through which torchrun starts a training."""
 
 import sys
 

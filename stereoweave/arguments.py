@@ -1,6 +1,6 @@
-"""Type checks for arguments of the Python interface; each raises a one-line StereoweaveError.
+"""Type checks for arguments of the Python interface; each check raises a one-line StereoweaveError.
 
-The functions import NumPy only when called: the command line's help uses these checks and must be fast.
+The functions import NumPy only when called, because the command line's help uses them and must be fast.
 """
 
 import reprlib
@@ -17,13 +17,13 @@ _DTYPES = {"f": "floats", "u": "uint8", "b": "booleans"}
 
 
 def check_number(name: str, value: object) -> None:
-    """Require a real number within the range of a float; NaN and infinity are allowed."""
+    """Require a real number that a float can represent; NaN and infinity are allowed."""
     if not isinstance(value, Real) or isinstance(value, bool) or not _is_held_by_float(value):
         raise StereoweaveError(f"{name}: expected a number, got {describe(value)}")
 
 
 def check_whole_number(name: str, value: object) -> None:
-    """Require an integer within the range of a float."""
+    """Require an integer that does not exceed the range of a float."""
     if not isinstance(value, Integral) or isinstance(value, bool) or not _is_held_by_float(value):
         raise StereoweaveError(f"{name}: expected a whole number, got {describe(value)}")
 
@@ -60,7 +60,7 @@ def check_numbers(name: str, value: object) -> None:
 
 
 def is_plain_array(value: object) -> TypeGuard["np.ndarray"]:
-    """Whether a value is an ndarray, but not a matrix or masked array, whose arithmetic differs."""
+    """Return whether a value is an ndarray, but not a matrix or masked array, whose arithmetic differs."""
     import numpy as np
 
     return isinstance(value, np.ndarray) and not isinstance(value, np.matrix | np.ma.MaskedArray)
@@ -75,7 +75,7 @@ def _is_held_by_float(value: Real) -> bool:
 
 
 def describe(value: object) -> str:
-    """Describe a value briefly for an error message; an array by type, dtype and shape."""
+    """Describe a value briefly for an error message; describe an array by its type, dtype and shape."""
     import numpy as np
 
     if isinstance(value, np.ndarray):

@@ -1,6 +1,6 @@
-"""Errors and notes, each with its remedy.
+"""Errors and notes, and the remedies for them.
 
-A remedy names settings by their Python keyword. Each front end translates them to its own names: options,
+A remedy names settings by their Python keywords, which each front end translates to its own names: options,
 form fields or labels.
 """
 
@@ -11,21 +11,21 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-# Maps a setting's Python keyword to a front end's name for it; None if the front end lacks the setting.
+# Maps the Python keyword of a setting to the front end's name for it; None if the front end lacks it.
 NameOf = Callable[[str], str | None]
 
 
 def keyword(setting: str) -> str:
-    """Return the setting unchanged: the `NameOf` of the Python interface."""
+    """Return the setting unchanged; this is the `NameOf` of the Python interface."""
     return setting
 
 
 @dataclass(frozen=True)
 class Remedy:
-    """What to do about an error or a note.
+    """Advice to the user about an error or a note.
 
     Attributes:
-        text: An instruction, such as "rectify the pair".
+        text: Instruction, such as "rectify the pair".
         settings: Python keywords of the settings to change.
     """
 
@@ -33,7 +33,7 @@ class Remedy:
     settings: tuple[str, ...] = ()
 
     def format(self, name_of: NameOf) -> str:
-        """Format with the front end's names for settings; empty if it has none of them."""
+        """Format with the front end's names for settings; return "" if it lacks all of them."""
         names = [name for name in map(name_of, self.settings) if name]
         if not self.settings:
             return self.text
@@ -42,7 +42,7 @@ class Remedy:
 
 @dataclass(frozen=True)
 class Note:
-    """One line for the user about a pair or its results."""
+    """One-line message to the user about a pair or its results."""
 
     text: str
     remedy: Remedy | None = None
@@ -59,8 +59,9 @@ class StereoweaveError(ValueError):
     """Invalid input; base class of all errors of this package.
 
     Args:
-        message: What was expected and what was found.
-        setting: Python keyword of the invalid setting.
+        message: Text that says what was expected and what was found.
+        setting: Python keyword of the invalid setting, which starts the error's line.
+        remedy: Advice, which ends the error's line.
     """
 
     def __init__(self, message: str, *, setting: str | None = None, remedy: Remedy | None = None) -> None:
@@ -87,7 +88,7 @@ class StereoweaveError(ValueError):
         return self._with_message(text + self.message)
 
     def with_detail(self, text: str) -> "StereoweaveError":
-        """Return a copy, of the same class, with text inserted before the remedy."""
+        """Return a copy of the same class, with text inserted before the remedy."""
         return self._with_message(f"{self.message}; {text}")
 
     def _with_message(self, message: str) -> "StereoweaveError":
@@ -97,23 +98,23 @@ class StereoweaveError(ValueError):
 
 
 class FormatError(StereoweaveError):
-    """Invalid or missing file."""
+    """Error for an invalid or missing file."""
 
 
 class MatcherError(StereoweaveError):
-    """Unknown matcher, invalid ONNX file or unavailable provider."""
+    """Error for an unknown matcher, an invalid ONNX file or an unavailable provider."""
 
 
 class ProviderError(MatcherError):
-    """A provider failed during inference, for example out of memory; a retry may succeed."""
+    """Error for a provider that fails during inference, such as out of memory; a retry may succeed."""
 
 
 class OutputInUseError(StereoweaveError):
-    """Another process is writing to the same output."""
+    """Error for an output to which another process is writing."""
 
 
 def format_error(error: Exception, name_of: NameOf) -> str:
-    """Format any exception; a StereoweaveError with the front end's names for settings."""
+    """Format any exception in one line, a StereoweaveError with the front end's names for settings."""
     return error.format(name_of) if isinstance(error, StereoweaveError) else str(error)
 
 
@@ -124,18 +125,21 @@ def _with_remedy(text: str, remedy: Remedy | None, name_of: NameOf) -> str:
 
 @contextmanager
 def require_extra(extra: str, what: str) -> Iterator[None]:
-    """Turn a missing library into a StereoweaveError that names the extra to install."""
+    """Turn a missing library into a StereoweaveError that names the extra to install.
+
+    `what` says what was expected, such as "a plot needs matplotlib".
+    """
     try:
         yield
     except ModuleNotFoundError as missing:
         raise StereoweaveError(
             f"{what}, found no module {missing.name}; install the extra '{extra}': "
-            f"pip install 'stereoweave[{extra}]', from the wheel or the copy you have"
+            f"pip install 'stereoweave[{extra}]', from your wheel or your copy of the source"
         ) from missing
 
 
 def reason(error: Exception) -> str:
-    """Describe what was found instead of a usable file, to complete "expected ..., found ..."."""
+    """Describe what was found instead of a usable file, as the end of "expected ..., found ..."."""
     match error:
         case FileNotFoundError():
             return "no such file"
@@ -151,6 +155,6 @@ def reason(error: Exception) -> str:
             return "a truncated file"
         case MemoryError():
             return "a file too large for the available memory"
-    # Library messages may quote a whole file, over many lines.
+    # A library's message may quote an entire file, over many lines.
     words = textwrap.shorten(str(error)[:1000], 200, placeholder=" ...") or type(error).__name__
     return f"one that cannot be read ({words})"

@@ -1,4 +1,4 @@
-"""Data types passed between the parts of Stereoweave, and their geometry.
+"""Data types that the parts of Stereoweave exchange, and their geometry.
 
 Conventions (docs/conventions.md): pixel centres are integers; column x of the left image is at
 x - disparity in the right one; column x of the right image is at x + right disparity in the left.
@@ -27,9 +27,9 @@ LONGEST_SIDE_PX = 32_766
 # NumPy arrays and PyTorch tensors have no common base class, and only `learn` imports PyTorch.
 ArrayOrTensor = TypeVar("ArrayOrTensor", bound=Any)
 
-# No real camera has larger parameters (px, m or coefficients); their products would overflow float32.
+# No real camera has larger parameters (px, m or coefficients), and their products would overflow float32.
 CAMERA_NUMBERS_BELOW = 1e9
-# In units of the code, which bounds the slope of `DepthCurve.decode` for any exponent.
+# Code below which the curve is a straight line, which bounds the slope of `DepthCurve.decode`.
 _STRAIGHT_BELOW = 1e-5
 _LARGEST_FITTED_EXPONENT = 8.0
 
@@ -38,7 +38,7 @@ _LARGEST_FITTED_EXPONENT = 8.0
 class StereoCamera:
     """Rectified stereo camera: intrinsics of the left camera, baseline and principal-point offset.
 
-    doffs_px is the right camera's cx minus the left's (Middlebury's definition).
+    doffs_px is the right camera's cx minus the left camera's cx (Middlebury's definition).
     """
 
     focal_px: float
@@ -71,14 +71,14 @@ class StereoCamera:
         return cls(focal_px=focal_px, baseline_m=baseline_m, cx_px=(width - 1) / 2, cy_px=(height - 1) / 2)
 
     def depth_m(self, disparity_px: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-        """Depth along the optical axis in metres; infinite where disparity_px + doffs_px <= 0."""
+        """Return the depth along the optical axis in metres; infinite where disparity_px + doffs_px <= 0."""
         check_numbers("disparity_px", disparity_px)
         shifted_px = np.maximum(disparity_px + self.doffs_px, 0)
         with np.errstate(divide="ignore"):
             return self.focal_px * self.baseline_m / shifted_px
 
     def disparity_px(self, depth_m: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-        """Disparity in pixels from depth in metres: the inverse of `depth_m`."""
+        """Return the disparity in pixels, given the depth in metres: the inverse of `depth_m`."""
         check_numbers("depth_m", depth_m)
         with np.errstate(divide="ignore"):
             return self.focal_px * self.baseline_m / depth_m - self.doffs_px
@@ -88,8 +88,8 @@ class StereoCamera:
 class StereoPair:
     """Rectified left and right images, uint8 RGB of equal size, and their camera if known.
 
-    left_seen and right_seen, bool [H, W], are False at pixels without content, such as the borders left by
-    rectification; None if every pixel has content.
+    left_seen and right_seen, bool [H, W], are False at pixels without content, such as the borders that
+    rectification leaves; None if every pixel has content.
     """
 
     left: UInt8[np.ndarray, "h w 3"]
@@ -105,11 +105,11 @@ class StereoPair:
             if max(image.shape) > LONGEST_SIDE_PX:
                 raise StereoweaveError(
                     f"{side} image: expected at most {LONGEST_SIDE_PX} pixels a side, got {_size(image)}; "
-                    "scale it down or cut it"
+                    "scale it down or crop it"
                 )
         if self.left.shape != self.right.shape:
             raise StereoweaveError(
-                "left and right images must be of one size, "
+                "left and right images must have the same size, "
                 f"got {_size(self.left)} and {_size(self.right)}; crop or rescale one of them"
             )
         if self.camera is not None:
@@ -137,10 +137,11 @@ class Estimate:
     """Matching result for a pair; every array is [H, W] and finite.
 
     Attributes:
-        disparity_px: float32, for the left view: column x is at x - disparity_px in the right image.
-        right_disparity_px: float32, for the right view: column x is at x + right_disparity_px in the left.
-        confidence: float32 in 0..1, the estimated probability that disparity_px is within 1 px.
-        occluded: pixels that only the left camera sees.
+        disparity_px: float32, of the left view: column x is at x - disparity_px in the right image.
+        right_disparity_px: float32, of the right view: column x is at x + right_disparity_px in the left
+            image.
+        confidence: float32 in 0..1, the estimated probability that disparity_px is within 1 px of the truth.
+        occluded: bool, pixels that only the left camera sees.
     """
 
     disparity_px: Float[np.ndarray, "h w"]
@@ -161,7 +162,7 @@ class Estimate:
             if not np.isfinite(value).all():
                 count = int((~np.isfinite(value)).sum())
                 raise StereoweaveError(
-                    f"{name}: expected finite values, got {count} NaN or infinite ones; fill them first"
+                    f"{name}: expected finite values, got {count} that are NaN or infinite; fill them first"
                 )
         if self.confidence.size and not 0 <= self.confidence.min() <= self.confidence.max() <= 1:
             raise StereoweaveError(
@@ -171,20 +172,20 @@ class Estimate:
 
 
 def check_fits(estimate: Estimate, pair: StereoPair) -> None:
-    """Require an estimate of the same size as the pair."""
+    """Require an estimate whose size is that of the pair."""
     check_kind("estimate", estimate, Estimate)
     check_kind("pair", pair, StereoPair)
     found, expected = estimate.disparity_px.shape, pair.left.shape[:2]
     if found != expected:
         raise StereoweaveError(
-            f"estimate: expected the photographs' size {expected[1]}x{expected[0]}, "
-            f"got {found[1]}x{found[0]}; make it from these photographs"
+            f"estimate: expected the size of the images, {expected[1]}x{expected[0]}, "
+            f"got {found[1]}x{found[0]}; estimate it from these images"
         )
 
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """Synthesized image, uint8 RGB [H, W, 3]; `drawn` marks the pixels that a camera saw."""
+    """Synthesized image, uint8 RGB [H, W, 3]; `drawn`, bool [H, W], marks the pixels that a camera saw."""
 
     image: UInt8[np.ndarray, "h w 3"]
     drawn: Bool[np.ndarray, "h w"]
@@ -195,10 +196,10 @@ class Sample:
     """Stereo pair with exact ground truth for training and evaluation; unknown disparity is NaN.
 
     Attributes:
-        left, right: uint8 RGB [H, W, 3].
-        disparity_px, right_disparity_px: float32 [H, W], signs as in `Estimate`.
-        occluded, right_occluded: bool [H, W], pixels that only this view's camera sees.
-        camera: the camera, if known.
+        left, right: Images, uint8 RGB [H, W, 3].
+        disparity_px, right_disparity_px: True disparities, float32 [H, W], with the signs of `Estimate`.
+        occluded, right_occluded: bool [H, W], pixels that only the camera of that view sees.
+        camera: The camera, if known.
     """
 
     left: UInt8[np.ndarray, "h w 3"]
@@ -212,15 +213,15 @@ class Sample:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthCurve:
-    """Depth adjustment of "Fast Depth Estimation for View Synthesis": disparity or depth <-> code.
+    """Depth adjustment of "Fast Depth Estimation for View Synthesis": maps disparity or depth to a code.
 
-    The code is u^p (equation 3), where u is d / d_max or 1 - z / z_max: 0 is far, 1 is near, and p >= 1
-    gives near surfaces more of the range. Set max_disparity_px to encode disparity or max_depth_m to encode
-    depth, not both.
+    The code is u^p (equation 3), where u is d / d_max or 1 - z / z_max: 0 is far, 1 is near, and p >= 1 gives
+    near surfaces more of the range. Set max_disparity_px to encode disparity, or max_depth_m to encode depth,
+    but not both.
 
-    One deviation: below a code of 1e-5 the curve is a straight line to 0. The slope of the paper's x^(1/p)
-    (equation 4) is infinite at 0; here it is at most 1e5 for any p, and 46 for p = 1.5. The code differs by
-    less than 1e-5 (1.5e-6 for p = 1.5), and `encode` and `decode` stay exact inverses.
+    There is one deviation: below a code of 1e-5, the curve is a straight line to 0. The slope of the paper's
+    x^(1/p) (equation 4) is infinite at 0; here it is at most 1e5 for any p, and 46 for p = 1.5. The code
+    differs by less than 1e-5 (1.5e-6 for p = 1.5), and `encode` and `decode` remain exact inverses.
     """
 
     exponent: float = 1.5
@@ -245,7 +246,7 @@ class DepthCurve:
             raise StereoweaveError(f"exponent must be finite and at least 1, got {self.exponent}")
 
     def encode(self, values: ArrayOrTensor) -> ArrayOrTensor:
-        """Encode disparity in px or depth in m as a code in 0..1 of the same shape; NaN stays NaN.
+        """Encode disparity in px or depth in m as a code in 0..1, of the same shape; NaN stays NaN.
 
         Args:
             values: Array or tensor of any shape: disparity in 0..max_disparity_px, or depth above 0 and at
@@ -263,7 +264,7 @@ class DepthCurve:
         return self.encode_estimate(values)
 
     def encode_estimate(self, values: ArrayOrTensor) -> ArrayOrTensor:
-        """Encode estimated values, extrapolating the curve outside the range instead of raising."""
+        """Encode estimated values; outside the range, extrapolate the curve instead of raising an error."""
         if self.max_disparity_px is not None:
             straight = values / self.max_disparity_px
         else:
@@ -271,7 +272,7 @@ class DepthCurve:
         return straight * straight.clip(min=_STRAIGHT_BELOW ** (1 / self.exponent)) ** (self.exponent - 1)
 
     def decode(self, code: ArrayOrTensor) -> ArrayOrTensor:
-        """Disparity in px or depth in m from a code in 0..1: the inverse of `encode`.
+        """Decode a code in 0..1 to disparity in px or depth in m: the inverse of `encode`.
 
         Value and gradient are finite on all of [0, 1]. 0 is far (disparity 0 or max_depth_m), 1 is near.
         """
@@ -285,9 +286,9 @@ def fit_exponent(histogram: Real[np.ndarray, " n"]) -> float:
     """Fit the exponent p of a `DepthCurve`, 1 to 8, to a training set.
 
     The paper initialises p by "curve fitting to the histogram of the training ground truth" and gives no
-    details. Here u^p is fitted by least squares, at the bin edges, to the cumulative histogram, which is the
-    equalising curve: codes then spread over 0..1 as evenly as u^p allows. A set of mostly far pixels would
-    need p < 1 and gets 1, the paper's lower bound.
+    details. Here u^p is fitted to the cumulative histogram by least squares at the bin edges. The cumulative
+    histogram is the equalising curve, so the codes spread over 0..1 as evenly as u^p allows. A set of mostly
+    far pixels would need p < 1; it gets 1, the paper's lower bound.
 
     Args:
         histogram: Counts [N], N >= 2, of known ground truth in equal bins over u in 0..1, where u is
@@ -295,7 +296,7 @@ def fit_exponent(histogram: Real[np.ndarray, " n"]) -> float:
     """
     if histogram.size < 2 or not (histogram >= 0).all() or not 0 < histogram.sum() < math.inf:
         raise StereoweaveError(
-            "histogram: expected 2 or more finite counts, none negative and not all 0, "
+            "histogram: expected 2 or more finite counts, none of them negative and not all of them 0, "
             f"got {histogram.size}, {(histogram < 0).sum()} of them negative, with the sum {histogram.sum()}"
         )
     edges = np.arange(1, histogram.size) / histogram.size

@@ -1,1 +1,1 @@
-"""Calibration, rectification and their checks."""
+"""Calibration and rectification of stereo cameras, and checks of a pair's alignment."""

@@ -1,4 +1,4 @@
-"""Measurement of alignment defects of a stereo pair, with their remedies."""
+"""Measurement of a stereo pair's alignment, with remedies for its defects."""
 
 import math
 from dataclasses import dataclass
@@ -26,18 +26,18 @@ DEFECTS: tuple[Defect, ...] = get_args(Defect)
 SWAPPED = Note("left and right are swapped", Remedy("give them the other way round"))
 _RECTIFY = Remedy("rectify the pair", ("rectify",))
 
-# Tolerated vertical error; it scales with the side of larger pictures.
+# Tolerated vertical error; in larger pictures it grows with their side.
 _TOLERATED_PX = 0.75
 _TOLERATED_DEGREES = 0.3
 _TOLERATED_STOPS = 0.58
 _PIXELS_OF_TOLERANCE = 1_500_000
 
-# Inliers lie within this distance of the field of vertical errors.
+# Inliers lie within this distance of the fitted field of vertical errors.
 _INLIER_PX = 1.5
 _FIRST_INLIER_PX = 2.5
 _TRIALS, _POLISHING = 400, 6
 _LEAST_MATCHES, _LEAST_INLIER_SHARE = 20, 0.2
-# A disparity counts if at least this many of a match's neighbours agree.
+# A disparity counts if it agrees with at least this many of the match's neighbours.
 _NEIGHBOURS, _LEAST_AGREEING = 8, 4
 _AGREE_PX, _AGREE_SHARE = 2.0, 0.05
 _OUTER_PERCENT = 1.0
@@ -47,7 +47,7 @@ _LIGHT_WINDOW_PX = 7
 _BLACK_LEVEL, _WHITE_LEVEL = 8, 250
 _GAMMA = 2.2
 
-# Vote of the depth order needed to overrule the signs of the disparities.
+# The vote of the depth order must be this clear to overrule the signs of the disparities.
 _CLEAR_VOTE = 0.15
 
 
@@ -60,7 +60,7 @@ class Alignment:
         vertical_error_px, vertical_error_95_px: Median and 95th percentile of the vertical error.
         vertical_shift_px: How much lower the right image is, at its centre.
         rotation_degrees: Clockwise rotation of the right image.
-        range_px: Smallest and greatest disparity, without the outermost 1 %.
+        range_px: Least and greatest disparity, without the outermost 1 %.
         exposure_ratio: Exposure of the right image divided by the left one's; NaN if unknown.
         defects: Defects found, names in `DEFECTS`; empty for a sound pair.
     """
@@ -75,7 +75,7 @@ class Alignment:
     defects: tuple[Defect, ...]
 
     def lines(self) -> list[Note]:
-        """All findings as notes, with remedies for the defects."""
+        """Return all findings as notes, with remedies for the defects."""
         if "too_few_matches" in self.defects:
             return [self._note("too_few_matches")]
         least_px, greatest_px = self.range_px
@@ -93,7 +93,7 @@ class Alignment:
         return [*map(Note, found), *(defects or [sound])]
 
     def warnings(self) -> list[Note]:
-        """Notes on defects that make depth wrong or worse; negative disparities do not."""
+        """Return notes on the defects that impair depth, which excludes negative disparities."""
         return [self._note(defect) for defect in self.defects if defect != "negative_disparity"]
 
     def _note(self, defect: Defect) -> Note:
@@ -135,7 +135,7 @@ class Alignment:
 
 
 def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]) -> Alignment:
-    """Measure the alignment of a pair, rectified or not; takes 0.1 to 0.2 s at 640x480."""
+    """Measure the alignment of a pair, rectified or not, in 0.1 to 0.2 s at 640x480."""
     matches = find_matches(left, right)
     scale = max(1.0, (left.shape[0] * left.shape[1] / _PIXELS_OF_TOLERANCE) ** 0.5)
     count = len(matches.left_px)
@@ -157,7 +157,7 @@ def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3
     )
     least_px, greatest_px = _measure_range(disparity_px, negative_px)
     ratio = _measure_light_ratio(left, right, matches)
-    # A rotation about a point other than the centre of the right picture looks like a shift too.
+    # A rotation about a point other than the centre of the right picture also looks like a shift.
     tolerated_px = scale * _TOLERATED_PX + abs(slope) * float(np.median(np.abs(disparity_px)))
     is_present = {
         "vertical_shift": abs(shift_px) > tolerated_px,
@@ -186,7 +186,7 @@ def check_pair(left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3
 def _measure_range(
     disparity_px: Float[np.ndarray, " n"], negative_px: Float[np.ndarray, " m"]
 ) -> tuple[float, float]:
-    """Disparity range without the outermost 1 %; negative ones count only if some are reliable."""
+    """Return the disparity range without the outermost 1 %; ignore negative values if none is reliable."""
     at_least_0 = disparity_px[disparity_px >= 0]
     counted_px = disparity_px if len(negative_px) or not len(at_least_0) else at_least_0
     least_px, greatest_px = np.percentile(counted_px, [_OUTER_PERCENT, 100 - _OUTER_PERCENT])
@@ -212,10 +212,10 @@ def _make_unrelated(matches: int) -> Alignment:
 def _fit_vertical_error(
     matches: Matches, centre_px: Float[np.ndarray, " 2"], scale: float
 ) -> tuple[Bool[np.ndarray, " n"], float, float, float] | None:
-    """Fit the vertical error: returns inliers, shift in px, slope, and size of the remaining terms in px.
+    """Fit the vertical error; return inliers, shift in px, slope, and size of the remaining terms in px.
 
-    The vertical error is a field over the right picture. Its constant term is a shift and its term in x a
-    rotation; scale, pitch and convergence give the other terms up to second order. None if no field
+    The vertical error is a field over the right picture. Its constant term is a shift, and its term in x is a
+    rotation. Scale, pitch and convergence cause the other terms up to second order. Returns None if no field
     explains enough matches.
     """
     x, y = ((matches.right_px - centre_px) / centre_px[0]).T
@@ -223,7 +223,7 @@ def _fit_vertical_error(
     lower_px = matches.lower_px
     inliers = _find_plane_inliers(terms[:, :3], lower_px, scale * _FIRST_INLIER_PX)
     for _ in range(_POLISHING):
-        # The ridge keeps terms small that few matches support.
+        # The ridge keeps terms that few matches support small.
         weights, ridge = terms[inliers], 0.1 * np.eye(6)
         field = np.linalg.solve(weights.T @ weights + ridge, weights.T @ lower_px[inliers])
         inliers = np.abs(terms @ field - lower_px) <= scale * _INLIER_PX
@@ -236,7 +236,7 @@ def _fit_vertical_error(
 def _find_plane_inliers(
     terms: Float[np.ndarray, "n 3"], values: Float[np.ndarray, " n"], tolerated: float
 ) -> Bool[np.ndarray, " n"]:
-    """Inliers of the best of many planes through three random values (RANSAC), or of the zero plane."""
+    """Return the inliers of the best plane among zero and many through three random values (RANSAC)."""
     rng = np.random.default_rng(0)
     picked = rng.integers(0, len(values), (_TRIALS, 3))
     through = terms[picked]
@@ -251,7 +251,7 @@ def _find_plane_inliers(
 def _find_supported(
     matches: Matches, disparity_px: Float[np.ndarray, " n"], scale: float
 ) -> Bool[np.ndarray, " n"]:
-    """Matches whose disparity agrees with enough of their neighbours."""
+    """Return the mask of matches whose disparity agrees with enough of their neighbours."""
     squared = (matches.left_px**2).sum(1)
     apart = squared[:, None] + squared - 2 * matches.left_px @ matches.left_px.T
     count = min(_NEIGHBOURS + 1, len(apart))
@@ -264,7 +264,7 @@ def _find_supported(
 def _measure_light_ratio(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], matches: Matches
 ) -> float:
-    """Median ratio of right to left exposure over the matches; NaN if too few are usable."""
+    """Return the median ratio of right to left exposure over the matches; NaN if too few are usable."""
     levels = _sample_levels(left, matches.left_px), _sample_levels(right, matches.right_px)
     usable = np.logical_and(*((level > _BLACK_LEVEL) & (level < _WHITE_LEVEL) for level in levels))
     if usable.sum() < _LEAST_MATCHES:
@@ -275,7 +275,7 @@ def _measure_light_ratio(
 def _sample_levels(
     image: UInt8[np.ndarray, "h w 3"], places_px: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "3 n"]:
-    """Dark, middle and bright levels of the strongest channel around each point; some may be clipped."""
+    """Return the dark, middle and bright level of the strongest channel around each point, clipped or not."""
     offsets = np.arange(_LIGHT_WINDOW_PX) - _LIGHT_WINDOW_PX // 2
     height, width = image.shape[:2]
     nearest = np.rint(places_px).astype(int)

@@ -18,10 +18,10 @@ class Board:
     """A printed chessboard, or a ChArUco board if it has a dictionary of markers.
 
     Attributes:
-        columns, rows: Inner corners of a chessboard, where four squares meet; squares of a ChArUco board, as
-            OpenCV counts them.
-        square_m: The side of a square.
-        marker_m: The side of a ChArUco board's marker.
+        columns, rows: Number of inner corners of a chessboard, where four squares meet, or number of squares
+            of a ChArUco board, as in OpenCV.
+        square_m: Side of a square.
+        marker_m: Side of a marker of a ChArUco board.
         dictionary: OpenCV's name of the marker dictionary, such as DICT_5X5_100.
     """
 
@@ -34,12 +34,12 @@ class Board:
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3 or not self.square_m > 0:
             raise StereoweaveError(
-                "expected a board of at least 3x3 corners and a square side above 0 mm, "
+                "expected a board of at least 3x3 corners and squares with a side above 0 mm, "
                 f"found {self.columns}x{self.rows} and {1000 * self.square_m:g} mm"
             )
         if (self.marker_m is None) != (self.dictionary is None):
             raise StereoweaveError(
-                "expected both the dictionary and the size of a ChArUco board's markers, found one"
+                "expected both the dictionary and the size of a ChArUco board's markers, found only one"
             )
         if self.marker_m is not None and not 0 < self.marker_m < self.square_m:
             raise StereoweaveError(
@@ -56,13 +56,13 @@ class Board:
         return f"a chessboard of {self.columns}x{self.rows} inner corners"
 
     def charuco(self) -> cv2.aruco.CharucoBoard:
-        """The ChArUco board as an OpenCV object."""
+        """Return the ChArUco board as an OpenCV object."""
         assert self.marker_m is not None
         markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, str(self.dictionary)))
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square_m, self.marker_m, markers)
 
     def corners_m(self) -> Float[np.ndarray, "n 3"]:
-        """Corner positions on the board in metres, row by row."""
+        """Return the corner positions on the board in metres, row by row."""
         if self.dictionary:
             return np.array(self.charuco().getChessboardCorners(), np.float64)
         down, across = np.mgrid[: self.rows, : self.columns].reshape(2, -1)
@@ -88,10 +88,14 @@ class ViewCorners(NamedTuple):
 def find_pair_corners(
     name: str, left: UInt8[np.ndarray, "h w"], right: UInt8[np.ndarray, "h2 w2"], board: Board
 ) -> PairCorners:
-    """Find the corners visible in both pictures; raise FormatError if there are too few."""
+    """Find the corners visible in both pictures.
+
+    Raises:
+        FormatError: The pictures differ in size, or too few corners are visible in both.
+    """
     if left.shape != right.shape:
         sizes = [format_size(image.shape[::-1]) for image in (left, right)]
-        raise FormatError(f"the left picture has {sizes[0]} px, the right one {sizes[1]} px")
+        raise FormatError(f"the left picture has {sizes[0]} pixels, the right one {sizes[1]}")
     find = _find_charuco if board.dictionary else _find_chessboard
     found = [find(image, board) for image in (left, right)]
     nowhere = [side for side, corners in zip(("left", "right"), found, strict=True) if corners is None]
@@ -125,7 +129,7 @@ def _find_charuco(image: UInt8[np.ndarray, "h w"], board: Board) -> ViewCorners 
 
 
 def reorder_corners(here: ViewCorners, there: ViewCorners, board: Board) -> ViewCorners:
-    """Bring the right corners into the order of the left ones, as a chessboard has no orientation mark."""
+    """Put the right corners in the same order as the left ones: a chessboard has no orientation mark."""
     grid = there.at_px.reshape(board.rows, board.columns, 2)
     turns = (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
     orders = [np.rot90(grid, turn).reshape(-1, 2) for turn in turns]

@@ -18,7 +18,8 @@ from stereoweave.io.decoding import ENDINGS
 from stereoweave.io.images import read_image
 
 FEWEST_PAIRS = 5
-# A pair whose error exceeds the median this many times has a misdetected corner, or was taken in motion.
+# A pair with an error of more than this many times the median has a misdetected corner, or was taken in
+# motion.
 _OUTLIER = 3.0
 _GOOD_PX, _FAIR_PX = 0.5, 1.0
 _GOOD_COVER_PERCENT, _FAIR_COVER_PERCENT = 60, 40
@@ -31,9 +32,12 @@ _ITERATIONS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-7)
 
 
 class _Solution(NamedTuple):
-    """A rig, each board's rotation vector relative to the left camera, and the errors.
+    """Result of a calibration.
 
-    errors_px: RMS reprojection error of each pair, left and right.
+    Attributes:
+        rig: The two cameras.
+        turns: Rotation vector of the board in each pair, relative to the left camera.
+        errors_px: RMS reprojection error of each pair, left and right.
     """
 
     rig: Rig
@@ -49,10 +53,10 @@ class Calibration:
         rig: The two cameras.
         left_error_px, right_error_px: RMS reprojection error.
         epipolar_error_px: Median distance of a right corner from the epipolar line of its left corner.
-        cover_percent: Share of the picture covered by boards, in the view with the smaller share.
+        cover_percent: Share of the picture that the boards cover, in the view in which it is smaller.
         tilt_degrees: Angle between the optical axis and the normal of the most tilted board.
         used: Names of the pairs used.
-        left_out: Unused pictures and pairs with the reasons.
+        left_out: Reason for each picture or pair left out, by name.
     """
 
     rig: Rig
@@ -66,12 +70,12 @@ class Calibration:
 
     @property
     def error_px(self) -> float:
-        """RMS reprojection error over both views."""
+        """RMS reprojection error over both views, in px."""
         return float(np.sqrt((self.left_error_px**2 + self.right_error_px**2) / 2))
 
     @property
     def verdict(self) -> str:
-        """One line: good, fair or poor, with the remedies."""
+        """Quality in one line: good, fair or poor, with remedies for the faults."""
         faults = list(self._find_faults())
         summary = f"{self.error_px:.2f} px over {len(self.used)} pairs"
         if not faults:
@@ -80,9 +84,9 @@ class Calibration:
         return f"{'poor' if poor else 'fair'}: {summary}; " + "; ".join(fault for _, fault in faults)
 
     def _find_faults(self) -> Iterator[tuple[bool, str]]:
-        """Yield each fault: whether it makes the calibration poor, and its description with the remedy."""
+        """Yield for each fault whether it makes the calibration poor, and its description with a remedy."""
         if self.rig.translation_m[0] > 0:
-            yield True, "the left and the right pictures are swapped: rename them"
+            yield True, "left and right pictures are swapped: rename them"
         if self.error_px > _GOOD_PX:
             yield (
                 self.error_px > _FAIR_PX,
@@ -101,7 +105,7 @@ class Calibration:
             yield False, f"few pairs: use {_GOOD_PAIRS} or more"
 
     def lines(self) -> list[str]:
-        """Results for the user, line by line."""
+        """Return the results as lines for the user."""
         fx, fy = (self.rig.left.matrix[axis, axis] for axis in (0, 1))
         return [
             *(f"{name}: left out, {why}" for name, why in self.left_out.items()),
@@ -125,20 +129,19 @@ def calibrate(
 ) -> Calibration:
     """Calibrate the rig from a folder of board pictures.
 
-    Pairs are matched by name: left and right, L and R, or cam0 and cam1, in the name of the file or of its
-    folder, with the rest equal: left/01.png and right/01.png, left01.png and right01.png, 01_L.png and
-    01_R.png. A pair is left out and reported if a picture is damaged or lacks the board, or if its error is
-    three times the median.
+    Two pictures are a pair if their paths differ only in left and right, L and R, or cam0 and cam1:
+    left/01.png and right/01.png, left01.png and right01.png, 01_L.png and 01_R.png. A pair is left out and
+    reported if a picture is damaged or lacks the board, or if its error exceeds three times the median.
 
     Args:
         folder: Folder of the pictures.
         board: The printed board.
-        fisheye: Use the fisheye model of Kannala and Brandt in place of a pinhole with the distortion
+        fisheye: Use the fisheye model of Kannala and Brandt instead of a pinhole with distortion
             k1 k2 p1 p2 k3.
         progress: Called with the name of each pair before its corners are detected.
 
     Raises:
-        StereoweaveError: The folder does not exist, or has fewer than FEWEST_PAIRS usable pairs.
+        StereoweaveError: The folder does not exist, or it has fewer than FEWEST_PAIRS usable pairs.
     """
     pairs, left_out = find_pairs(Path(folder))
     seen, size_px = _find_all_corners(pairs, board, left_out, progress)
@@ -149,8 +152,8 @@ def calibrate(
             solution = solve(board.corners_m(), seen, size_px)
         except cv2.error as error:
             raise StereoweaveError(
-                f"{folder}: expected pictures that determine the lenses, found {len(seen)} pairs that OpenCV "
-                f"cannot solve ({error.err}); add pictures with the board near the edges, and tilted"
+                f"{folder}: expected pictures sufficient for calibration, found {len(seen)} pairs for which "
+                f"OpenCV fails ({error.err}); add pictures with the board tilted and near the edges"
             ) from error
         worst_px = solution.errors_px.max(axis=1)
         far = worst_px > _OUTLIER * np.median(worst_px)
@@ -158,7 +161,7 @@ def calibrate(
             rig = replace(solution.rig, name=str(folder))
             return _judge(solution._replace(rig=rig), seen, left_out)
         for index in np.flatnonzero(far):
-            off = f"error of {worst_px[index]:.2f} px, over {_OUTLIER:g} times the median of all pairs"
+            off = f"error of {worst_px[index]:.2f} px, more than {_OUTLIER:g} times the median of all pairs"
             left_out[seen[index].name] = off
         seen = [pair for pair, is_far in zip(seen, far, strict=True) if not is_far]
         _check_enough(len(seen), len(pairs), board, left_out)
@@ -175,7 +178,7 @@ def _check_enough(count: int, total: int, board: Board, left_out: Mapping[str, s
 
 
 def find_pairs(folder: Path) -> tuple[dict[str, tuple[Path, Path]], dict[str, str]]:
-    """Find left and right pictures by the name of their pair, and pictures without a partner."""
+    """Return the left and right picture of each pair, by name, and the reason for each picture left out."""
     if not folder.is_dir():
         raise StereoweaveError(f"{folder}: expected a folder with pictures of a board, found none")
     sides: dict[str, dict[bool, Path]] = {}
@@ -193,7 +196,7 @@ def find_pairs(folder: Path) -> tuple[dict[str, tuple[Path, Path]], dict[str, st
     }
     if not pairs:
         raise StereoweaveError(
-            f"{folder}: expected pairs of pictures such as left/01.png and right/01.png or 01_L.png and "
+            f"{folder}: expected pairs of pictures, such as left/01.png and right/01.png or 01_L.png and "
             f"01_R.png, found none among {len(list(folder.rglob('*')))} files"
         )
     return {left.relative_to(folder).as_posix(): (left, right) for left, right in pairs.values()}, single
@@ -205,7 +208,7 @@ def _find_all_corners(
     left_out: dict[str, str],
     progress: Callable[[str], None],
 ) -> tuple[list[PairCorners], Size]:
-    """Find the corners in every pair; keep the pairs of the most common picture size."""
+    """Find the corners in every pair; return the pairs of the most common picture size, and that size."""
     seen: list[tuple[PairCorners, Size]] = []
     for name, paths in pairs.items():
         progress(name)
@@ -219,7 +222,9 @@ def _find_all_corners(
     size_px = Counter(size for _, size in seen).most_common(1)[0][0]
     for pair, found_px in seen:
         if found_px != size_px:
-            left_out[pair.name] = f"size {format_size(found_px)}, most pairs have {format_size(size_px)}"
+            left_out[pair.name] = (
+                f"size {format_size(found_px)}, while most pairs have {format_size(size_px)}"
+            )
     return [pair for pair, found_px in seen if found_px == size_px], size_px
 
 
@@ -254,7 +259,7 @@ def _solve_fisheye(
         )[1:3]
         for points in (left, right)
     ]
-    # OpenCV's stereo function needs equally many corners in every pair, so some are counted twice.
+    # OpenCV's stereo function needs the same number of corners in every pair, so some are repeated.
     most = max(len(pair.corners) for pair in seen)
     again = [np.arange(most) % len(pair.corners) for pair in seen]
     boards, left, right = (
@@ -326,7 +331,7 @@ def _measure_epipolar_error_px(rig: Rig, seen: Sequence[PairCorners]) -> float:
         _undistort(optics, np.concatenate(points))
         for optics, points in zip((rig.left, rig.right), _split_sides(seen), strict=True)
     )
-    # Normal of the epipolar plane of each left direction, in the right camera's coordinates.
+    # Normal of the epipolar plane through each left direction, in the right camera's coordinates.
     planes = np.cross(rig.translation_m, left @ rig.rotation.T)
     off = np.abs((planes * right).sum(axis=1)) / np.linalg.norm(planes[:, :2], axis=1)
     return float(np.median(off) * np.diag(rig.right.matrix)[:2].mean())
@@ -339,7 +344,7 @@ def _undistort(optics: Optics, at_px: Float[np.ndarray, "n 2"]) -> Float[np.ndar
 
 
 def _measure_cover_percent(views: Sequence[Float[np.ndarray, "_ 2"]], size_px: Size) -> float:
-    """Share of the picture inside the convex hulls of the boards."""
+    """Return the share of the picture that lies inside the boards' convex hulls."""
     covered = np.zeros(size_px[::-1], np.uint8)
     for at_px in views:
         outline = cv2.convexHull(at_px.astype(np.float32))
@@ -348,5 +353,5 @@ def _measure_cover_percent(views: Sequence[Float[np.ndarray, "_ 2"]], size_px: S
 
 
 def _measure_tilt_degrees(turn: Float[np.ndarray, "..."]) -> float:
-    """Angle between a board's normal and the optical axis."""
+    """Return the angle between a board's normal and the optical axis, given the board's rotation vector."""
     return float(np.degrees(np.arccos(np.clip(abs(cv2.Rodrigues(turn)[0][2, 2]), 0, 1))))

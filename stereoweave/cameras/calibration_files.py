@@ -1,4 +1,4 @@
-"""Readers for the calibration files of common programs, and a writer."""
+"""Reading of calibration files from common programs, and writing of OpenCV's."""
 
 import base64
 import contextlib
@@ -25,36 +25,38 @@ _YES, _NO = ("true", "yes", "on", "y"), ("false", "no", "off", "n")
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _FISHEYE_NAMES = {"fisheye", "equidistant", "equi", "kannalabrandt", "kb4"}
 _PINHOLE_NAMES = {"pinhole", "radtan", "plumbbob", "rationalpolynomial", "brownconrady", "none"}
-# OpenCV's type names: of base64 data, and of decimal data that is rounded to the type.
+# NumPy types by OpenCV's type names: for base64 data, and for decimal data that OpenCV rounds to the type.
 _BASE64_TYPES = {"u": "u1", "c": "i1", "w": "<u2", "s": "<i2", "i": "<i4", "f": "<f4", "d": "<f8"}
 _ROUNDED = {"h": np.float16, "f": np.float32}
 _HEXADECIMAL = re.compile(r"[-+]?0[xX][0-9a-fA-F]{1,16}")
-_EXPECTED = "a calibration of two cameras: OpenCV's YAML or XML, Kalibr's camchain, KITTI's or Middlebury's"
+_EXPECTED = "a calibration of two cameras (OpenCV's YAML or XML, Kalibr's camchain, KITTI's or Middlebury's)"
 
 
 def read_rig(path: str | Path, size_px: Size | None = None) -> Rig:
     """Read the rig of a calibration file; the format is detected from the content.
 
-    Sources:
-        OpenCV's YAML, XML or JSON (cv2.FileStorage) with the names of its examples, M1 D1 M2 D2 R T, or
-        K1 .., cameraMatrix1 .., and so on. An extrinsics.yml is completed by the intrinsics.yml beside it,
-        and vice versa. The format does not state its unit of length: without an entry translation_unit (m,
-        cm or mm) a translation longer than 2 is in millimetres, otherwise in metres. Nor does it state the
-        lens model: without an entry distortion_model the lens is a pinhole.
-        Kalibr's camchain.yaml, cam0 left and cam1 right. KITTI's calib.txt (P0 to P3) and
-        calib_cam_to_cam.txt, of the colour cameras 2 and 3 if present. Middlebury's calib.txt.
+    Formats:
+        OpenCV's YAML, XML or JSON (cv2.FileStorage), with the names of its examples (M1 D1 M2 D2 R T) or
+        common variants such as K1 or cameraMatrix1. An extrinsics.yml is completed by the intrinsics.yml
+        beside it, and vice versa. The format does not state its unit of length: without an entry
+        translation_unit (m, cm or mm), a translation longer than 2 is taken to be in millimetres, a shorter
+        one in metres. Nor does it state the lens model: without an entry distortion_model, the lens is taken
+        to be a pinhole.
+        Kalibr's camchain.yaml, with cam0 as the left camera and cam1 as the right one.
+        KITTI's calib.txt (P0 to P3) and calib_cam_to_cam.txt; the colour cameras 2 and 3 are used if present.
+        Middlebury's calib.txt.
 
     Args:
         path: The file.
-        size_px: Width and height of the pictures. KITTI's calib_cam_to_cam.txt also has a calibration for
-            the raw pictures, which is used if the pictures have the raw size.
+        size_px: Width and height of the pictures. KITTI's calib_cam_to_cam.txt also has a calibration of the
+            raw pictures, which is used if the pictures have the raw size.
 
     Raises:
         FormatError: The file is missing, not regular or larger than 256 KB; an entry is missing or invalid;
             the content is nested more than 20 deep, or has more than 10,000 values, an anchor, an alias or
             a DTD.
     """
-    # Overflows and divisions by 0 are rejected at the end, as values that are not finite.
+    # Overflows and divisions by 0 give values that are not finite, which are rejected at the end.
     with reading(path, _EXPECTED), np.errstate(all="ignore"):
         text = _read_text(Path(path))
         if re.search(r"^(cam0|doffs|baseline)\s*=", text, re.MULTILINE):
@@ -69,25 +71,29 @@ def read_rig(path: str | Path, size_px: Size | None = None) -> Rig:
 
 
 def read_calibration_bytes(path: str | Path) -> bytes:
-    """Read a calibration file; raises FormatError if it is missing, too large or not a regular file."""
+    """Return the content of a calibration file.
+
+    Raises:
+        FormatError: The file is missing, too large or not a regular file.
+    """
     with reading(path, _EXPECTED):
         return read_small(path)
 
 
 def add_camera(pair: StereoPair, path: str | Path) -> StereoPair:
-    """Add the camera of a calibration file for rectified pictures of this size."""
+    """Return the rectified pair with the camera of a calibration file, which must be for its size."""
     rig = read_rig(path, pair_size_px(pair))
     rig.check_size(pair)
     return replace(pair, camera=rig.camera())
 
 
 def write_rig(path: str | Path, rig: Rig) -> None:
-    """Write OpenCV's YAML, which cv2.FileStorage reads and `read_rig` reads back exactly.
+    """Write a rig as OpenCV's YAML, which cv2.FileStorage reads and `read_rig` restores exactly.
 
-    Entries: image_width, image_height, distortion_model, M1, D1, M2, D2, R, T and translation_unit.
+    The entries are image_width, image_height, distortion_model, M1, D1, M2, D2, R, T and translation_unit.
     """
     if rig.left.fisheye != rig.right.fisheye:
-        raise StereoweaveError(f"{path}: expected two lenses of the same kind, found pinhole and fisheye")
+        raise StereoweaveError(f"{path}: expected two lenses of the same model, found pinhole and fisheye")
     storage = cv2.FileStorage(".yml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
     if rig.size_px is not None:
         storage.write("image_width", rig.size_px[0])
@@ -111,7 +117,7 @@ def _read_text(path: Path) -> str:
 
 
 def _add_companion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Add the entries of the companion file if `path` is one of OpenCV's pair of files."""
+    """Add the entries of the companion file if `path` is an intrinsics or extrinsics file that has one."""
     for this, other in (("intrinsics", "extrinsics"), ("extrinsics", "intrinsics")):
         beside = path.with_name(path.name.replace(this, other))
         if this in path.name and beside.exists():
@@ -121,7 +127,7 @@ def _add_companion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
 
 
 def _parse_opencv(entries: Mapping[str, Any]) -> Rig:
-    # Names vary: camera_matrix_left, cameraMatrixLeft.
+    # Names vary in case and separators: camera_matrix_left, cameraMatrixLeft.
     plain = {_normalise_name(key): value for key, value in entries.items()}
     parts = _parse_opencv_parts(plain)
     model = _find_model(plain)
@@ -138,7 +144,7 @@ def _parse_opencv(entries: Mapping[str, Any]) -> Rig:
     if model is None and left.distortion.size == 4:
         notes += (
             Note(
-                "the calibration does not state its lens model: assumed pinhole with k1 k2 p1 p2",
+                "the calibration does not state its lens model: a pinhole with k1 k2 p1 p2 is assumed",
                 Remedy("add the entry distortion_model: fisheye if that is wrong"),
             ),
         )
@@ -153,7 +159,7 @@ def _parse_opencv(entries: Mapping[str, Any]) -> Rig:
 
 
 def _parse_opencv_parts(plain: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Intrinsics and extrinsics under any of their known names."""
+    """Return intrinsics and extrinsics, stored under any of their known names."""
     found = {
         f"{what} {side}": _find_side(plain, names, sides)
         for side, sides in (("left", ("1", "left", "l")), ("right", ("2", "right", "r")))
@@ -184,7 +190,7 @@ def _find_side(entries: Mapping[str, Any], names: Iterable[str], sides: Iterable
 
 
 def _find_model(entries: Mapping[str, Any]) -> str | None:
-    """The lens model of an OpenCV file, fisheye or pinhole; None if the file does not state it."""
+    """Return the lens model of an OpenCV file, fisheye or pinhole; None if the file does not state it."""
     if _parse_bool(_find_first(entries, ("fisheyemodel", "fisheye")) or "no"):
         return "fisheye"
     named = _find_first(entries, ("distortionmodel", "cameramodel", "model"))
@@ -213,7 +219,7 @@ def _parse_model(named: object) -> str:
 
 
 def _find_unit(translation: Float[np.ndarray, "3"], stated: object) -> tuple[str, tuple[Note, ...]]:
-    """The translation's unit of length, and a note if it is assumed."""
+    """Return the translation's unit of length, and a note if the unit is assumed."""
     if stated is not None:
         if str(stated) not in _METRES:
             raise ValueError(f"translation_unit {reprlib.repr(stated)}, not one of {', '.join(_METRES)}")
@@ -221,7 +227,8 @@ def _find_unit(translation: Float[np.ndarray, "3"], stated: object) -> tuple[str
     length = float(np.linalg.norm(translation))
     unit, word = ("mm", "millimetres") if length > _MM_ABOVE else ("m", "metres")
     note = Note(
-        f"the calibration does not state its unit of length: the baseline of {length:g} is assumed in {word}",
+        f"the calibration does not state its unit of length: the baseline of {length:g} is assumed to be in "
+        f"{word}",
         Remedy("add the entry translation_unit: m, cm or mm if that is wrong"),
     )
     return unit, (note,)
@@ -235,7 +242,7 @@ def _find_size(entries: Mapping[str, Any]) -> Size | None:
             return None
     sides_px = _parse_numbers(both).ravel()
     if sides_px.size != 2:
-        raise ValueError(f"a picture size {reprlib.repr(both)}, not width and height")
+        raise ValueError(f"a picture size {reprlib.repr(both)} instead of width and height")
     width, height = sides_px
     return int(width), int(height)
 
@@ -243,10 +250,10 @@ def _find_size(entries: Mapping[str, Any]) -> Size | None:
 def _parse_kalibr(entries: Mapping[str, Any]) -> Rig:
     first, second = entries["cam0"], entries.get("cam1")
     if not isinstance(first, dict) or not isinstance(second, dict):
-        raise ValueError("no two cameras cam0 and cam1")
+        raise ValueError("no cameras cam0 and cam1")
     transform = second.get("T_cn_cnm1")
     if transform is None:
-        raise ValueError("no T_cn_cnm1 of cam1, the transform from cam0 to cam1")
+        raise ValueError("no entry T_cn_cnm1 in cam1, the transform from cam0 to cam1")
     to_right = _parse_numbers(transform).reshape(4, 4)
     left, right = _parse_kalibr_optics("cam0", first), _parse_kalibr_optics("cam1", second)
     return Rig(
@@ -261,11 +268,11 @@ def _parse_kalibr(entries: Mapping[str, Any]) -> Rig:
 def _parse_kalibr_optics(name: str, entries: Mapping[str, Any]) -> Optics:
     missing = {"intrinsics", "distortion_coeffs"} - entries.keys()
     if missing:
-        raise ValueError(f"no {' and no '.join(sorted(missing))} of {name}")
+        raise ValueError(f"no entry {' and no entry '.join(sorted(missing))} in {name}")
     camera, intrinsics = entries.get("camera_model", "pinhole"), _parse_numbers(entries["intrinsics"])
     if camera != "pinhole" or intrinsics.size != 4:
         raise ValueError(
-            f"the camera model {reprlib.repr(camera)} of {name}; "
+            f"unsupported camera model {reprlib.repr(camera)} of {name}; "
             "calibrate with pinhole-radtan or pinhole-equi"
         )
     fisheye = _parse_model(entries.get("distortion_model", "radtan")) == "fisheye"
@@ -279,7 +286,10 @@ def _parse_kalibr_optics(name: str, entries: Mapping[str, Any]) -> Optics:
 
 
 def _parse_kitti(text: str, size_px: Size | None) -> Rig:
-    """Source: the development kits of KITTI's raw data, stereo, object and odometry benchmarks."""
+    """Parse KITTI's calib.txt or calib_cam_to_cam.txt.
+
+    Source: the development kits of KITTI's raw data, stereo, object and odometry benchmarks.
+    """
     lines = (line.split(":", 1) for line in text.splitlines() if ":" in line)
     rows = {
         key.strip(): _parse_numbers(values.split())
@@ -303,7 +313,7 @@ def _parse_kitti(text: str, size_px: Size | None) -> Rig:
 
 
 def _make_kitti_raw_rig(rows: Mapping[str, Float[np.ndarray, " _"]], first: str, second: str) -> Rig:
-    """The rig of KITTI's raw pictures; poses in the file are relative to camera 0."""
+    """Return the rig of KITTI's raw pictures; the file's poses are relative to camera 0."""
     left, right = (
         Optics(
             matrix=_require_kitti_row(rows, f"K_{number}").reshape(3, 3),
@@ -335,7 +345,10 @@ def _find_kitti_size(rows: Mapping[str, Float[np.ndarray, " _"]], key: str) -> S
 
 
 def _parse_middlebury(text: str) -> Rig:
-    """Source: the Middlebury datasets of 2014, cam0=[f 0 cx; 0 f cy; 0 0 1], the baseline in millimetres."""
+    """Parse Middlebury's calib.txt: cam0=[f 0 cx; 0 f cy; 0 0 1], the baseline in millimetres.
+
+    Source: the Middlebury datasets of 2014.
+    """
     lines = (line.split("=", 1) for line in text.splitlines() if "=" in line)
     entries = {key.strip(): value for key, value in lines}
     missing = {"cam0", "doffs", "baseline", "width", "height"} - entries.keys()
@@ -346,7 +359,7 @@ def _parse_middlebury(text: str) -> Rig:
     right = left + np.array([[0, 0, float(entries["doffs"])], [0, 0, 0], [0, 0, 0]])
     baseline_m = float(entries["baseline"]) / 1000
     if not baseline_m > 0:
-        raise ValueError(f"a baseline of {entries['baseline']}, which must be positive")
+        raise ValueError(f"a baseline of {entries['baseline']} instead of a positive one")
     size_px = int(entries["width"]), int(entries["height"])
     return replace(make_rectified_rig(left, right, -baseline_m), size_px=size_px)
 
@@ -356,14 +369,14 @@ def _make_camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.
 
 
 def _parse_numbers(values: Any) -> Float[np.ndarray, "..."]:
-    """Parse the numbers of an entry: one, a list, a list of rows, or OpenCV's matrix."""
+    """Parse the numbers of an entry: a single number, a list, a list of rows, or OpenCV's matrix."""
     if isinstance(values, dict) and "data" in values:
         return _parse_matrix(values)
     if isinstance(values, str) and values.startswith(BASE64):
         return _decode_base64(values)
     try:
         return np.asarray(_parse_hexadecimal(values), dtype=np.float64)
-    except (TypeError, ValueError) as error:  # TypeError for a dict, for instance
+    except (TypeError, ValueError) as error:  # for example, TypeError for a dict
         raise ValueError(f"{reprlib.repr(values)} instead of numbers") from error
 
 
@@ -375,7 +388,7 @@ def _parse_hexadecimal(values: Any) -> Any:
 
 
 def _parse_matrix(entries: Mapping[str, Any]) -> Float[np.ndarray, "..."]:
-    """Parse OpenCV's matrix to the values that cv2.FileStorage gives, in float64."""
+    """Parse OpenCV's matrix to the same values as cv2.FileStorage, in float64."""
     written = re.fullmatch(r"(\d*)([A-Za-z])", str(entries.get("dt", "d")))
     if written is None:
         raise ValueError(f"a matrix of the type {reprlib.repr(entries['dt'])}")
@@ -386,14 +399,14 @@ def _parse_matrix(entries: Mapping[str, Any]) -> Float[np.ndarray, "..."]:
     shape = [
         *map(int, _parse_numbers(sides).ravel().tolist()),
         int(written[1] or 1),
-    ]  # the last: its channels
+    ]  # the last one is the number of channels
     if min(shape) < 0 or math.prod(shape) != numbers.size:
         raise ValueError(f"a matrix of {numbers.size} numbers in the shape {reprlib.repr(shape)}")
     return numbers.reshape(shape)
 
 
 def _decode_base64(data: str) -> Float[np.ndarray, " _"]:
-    """Decode OpenCV's base64: a header of 24 bytes that states the type, then the numbers."""
+    """Decode OpenCV's base64: a header of 24 bytes that states the type, followed by the numbers."""
     content = base64.b64decode(data.removeprefix(BASE64))
     written = re.fullmatch(rb"\d*([a-z]) *", content[:24])
     if written is None or written[1].decode() not in _BASE64_TYPES:

@@ -12,10 +12,10 @@ _LEAST_CONFIDENT_PERCENT = 30.0
 
 
 def find_problems(pair: StereoPair, estimate: Estimate) -> list[Note]:
-    """Diagnose a pair's problems; no notes for a sound pair.
+    """Return notes on a pair's problems; a sound pair has none.
 
-    The alignment is measured at feature matches (`stereoweave check` reports it in full). With too few
-    matches only the estimate's confidence decides, because a plain wall may be matched well.
+    The alignment is measured at feature matches (`stereoweave check` reports it in full). If there are too
+    few matches, only the estimate's confidence decides, because a plain wall may be matched well.
     """
     alignment = check_pair(pair.left, pair.right)
     if "too_few_matches" not in alignment.defects:

@@ -1,4 +1,4 @@
-"""The sign of disparities: detection of negative ones, and of the depth order at occlusions.
+"""Detection of negative disparities, and of the depth order at occlusions.
 
 Parallel cameras give disparities of 0 or more. Converged cameras and swapped pictures also give negative
 ones.
@@ -10,18 +10,19 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 # A disparity below this is negative.
 _NEGATIVE_PX = -1.5
-# At most this many points are tested, and at least this many must be certain.
+# At most this many points are tested, of which at least this many must be certain.
 _MOST_TRIED, _LEAST_SURE = 150, 4
 # A point is certain if its window correlates this well with its match, and much less with any window at a
 # disparity of 0 or more.
 _LEAST_LIKENESS, _MOST_AMBIGUOUS = 0.9, 0.7
-# Difference of equal windows caused by rounded grey levels.
+# Difference between identical windows that rounded grey levels cause.
 _ROUNDING = 0.003
 # Search range for the best window, as a share of the width.
 _REACH = 0.45
 _RADIUS_PX = 7
 
-# Areas without corners are matched densely at this width; beyond this range there are corners, or nothing.
+# Areas without corners are matched densely at this width and over this range. Points of larger disparity have
+# corners or no texture at all.
 _DENSE_WIDTH_PX, _DENSE_RANGE_PX = 160, (-5.0, 53.0)
 _DENSE_NEGATIVE_PX, _DENSE_RADIUS_PX = -0.5, 4
 _LEAST_TEXTURE_LEVELS = 1.0
@@ -30,7 +31,7 @@ _LEAST_TEXTURE_LEVELS = 1.0
 _OCCLUSION_WIDTH_PX = 320
 _BLOCK_PX, _MARGIN_PX = 5, 3
 _LEAST_JUMP_PX, _LEAST_COLOUR_STEP, _BESIDE_PX = 2.0, 10.0, 3
-# Regularisation: the number of neutral votes added.
+# Number of neutral votes added, as regularisation.
 _VOTES_OF_DOUBT = 20
 
 
@@ -40,17 +41,18 @@ def find_negative_disparities(
     places_px: Float[np.ndarray, "n 2"],
     disparity_px: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, " m"]:
-    """Find certain negative disparities in px: points without a plausible positive match; empty if few.
+    """Return the certain negative disparities in px, of points without a plausible positive match.
 
-    On repeated structures, such as a truss, matches can be off by a period. Then a positive candidate fits
-    about as well and is preferred, because parallel pairs are far more common than converged ones.
+    Returns an empty array if there are too few. On repeated structures, such as a truss, matches can be off
+    by a period. A positive candidate that fits about as well is then preferred, because parallel pairs are
+    far more common than converged ones.
 
     Args:
         left: The left image, uint8 RGB [H, W, 3].
         right: The right one, rectified.
         places_px: Columns and rows in the left image.
-        disparity_px: Disparity at these points. If they give too few certain values, areas without corners
-            are matched densely too.
+        disparity_px: Disparity at these points. If too few of them are certain, areas without corners are
+            also matched, densely.
     """
     negative = disparity_px < _NEGATIVE_PX
     greys = cv2.cvtColor(left, cv2.COLOR_RGB2GRAY), cv2.cvtColor(right, cv2.COLOR_RGB2GRAY)
@@ -68,7 +70,7 @@ def find_negative_disparities(
 def _find_dense_negative(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """Points of the left picture with a negative disparity by semi-global matching."""
+    """Return the points of the left picture to which semi-global matching gives a negative disparity."""
     disparity_px, seen = _match_densely(left, right, *_DENSE_RANGE_PX)
     slope = cv2.Sobel(cv2.cvtColor(left, cv2.COLOR_RGB2GRAY), cv2.CV_32F, 1, 0, scale=1 / 8)
     textured = cv2.blur(np.abs(slope), (_BLOCK_PX, _BLOCK_PX)) > _LEAST_TEXTURE_LEVELS
@@ -83,7 +85,7 @@ def _select_certain(
     disparity_px: Float[np.ndarray, " n"],
     radius_px: int,
 ) -> Float[np.ndarray, " m"]:
-    """Select, from a sample of the negative disparities, those that are unambiguous in both pictures."""
+    """Return the unambiguous disparities among a sample of the given ones, checked in both directions."""
     step = max(1, -(-len(places_px) // _MOST_TRIED))
     disparity_px = disparity_px[::step]
     columns, rows = np.rint(places_px[::step]).astype(int).T
@@ -108,13 +110,14 @@ def _is_unambiguous(
     reach_px: int,
     radius_px: int,
 ) -> bool:
-    """Whether a window correlates with its match, and with no window at a positive disparity.
+    """Return whether a window correlates with its match and with no window at a positive disparity.
 
     Args:
-        own: The picture of the window, with a border of `radius_px` + 1.
-        other: The other picture, with the same border.
-        place: Row, column and the partner's column, without that border.
-        reach_px: How far positive disparities go: to the left in the right picture, to the right in the left.
+        own: The picture with the window, padded by a border of `radius_px` + 1.
+        other: The other picture, padded by the same border.
+        place: Row and column of the window and column of its match, without the border.
+        reach_px: Search range of positive disparities: negative (to the left) in the right picture, positive
+            in the left one.
         radius_px: Radius of the window.
     """
     row, column, partner = place
@@ -133,17 +136,17 @@ def _is_unambiguous(
 def _cut_strip(
     bordered: UInt8[np.ndarray, "h w"], row: int, first: int, last: int, radius_px: int
 ) -> UInt8[np.ndarray, "h2 w2"]:
-    """Cut the strip covered by windows around the columns, with one more row above and below."""
+    """Return the strip that windows around the columns cover, with one more row above and below."""
     return bordered[row : row + 2 * radius_px + 3, first + 1 : last + 2 * radius_px + 2]
 
 
 def estimate_depth_order(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], range_px: tuple[float, float]
 ) -> float:
-    """Estimate the depth order: above 0 if greater disparities occlude smaller ones, else below 0; -1..1.
+    """Return the depth order, -1..1: positive if greater disparities occlude smaller ones, else negative.
 
-    In the left picture, an area occluded in the right one lies between a smaller and a greater disparity. It
-    belongs to the occluded surface, so it has the colour of the farther side.
+    In the left picture, an area that is occluded in the right one lies between a surface of smaller and one
+    of greater disparity. It belongs to the farther surface and has its colour.
     """
     factor = min(1.0, _OCCLUSION_WIDTH_PX / left.shape[1])
     small_left, small_right = (_shrink(image, factor) for image in (left, right))
@@ -158,7 +161,7 @@ def estimate_depth_order(
 def _vote_in_row(
     disparity_px: Float32[np.ndarray, " w"], seen: Bool[np.ndarray, " w"], colours: Float32[np.ndarray, "w 3"]
 ) -> list[float]:
-    """Votes in -1..1, one per occluded run of a row: likeness to the pixels on its left minus its right."""
+    """Return a vote in -1..1 for each occluded run of a row: positive if its left side is more similar."""
     votes = []
     changes = np.diff(seen.astype(np.int8))
     ends = np.flatnonzero(changes == 1) + 1
@@ -180,13 +183,13 @@ def _vote_in_row(
 def _match_densely(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], least_px: float, greatest_px: float
 ) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Left disparity by semi-global matching, and the mask of the left-right consistency check."""
+    """Return the left disparity by semi-global matching, and the mask that passes the left-right check."""
     first_px = int(np.floor(least_px)) - _MARGIN_PX
     count = int(np.ceil((greatest_px + _MARGIN_PX - first_px) / 16)) * 16
     penalty = _BLOCK_PX**2
     matcher = cv2.StereoSGBM.create(first_px, count, _BLOCK_PX, P1=8 * penalty, P2=32 * penalty)
     beside = max(first_px + count, -first_px, 0)
-    # Exposures may differ.
+    # Histograms are equalised because exposures may differ.
     greys = [cv2.equalizeHist(cv2.cvtColor(x, cv2.COLOR_RGB2GRAY)) for x in (left, right)]
     greys = [cv2.copyMakeBorder(x, 0, 0, beside, beside, cv2.BORDER_REPLICATE) for x in greys]
     mirrored = [np.ascontiguousarray(x[:, ::-1]) for x in reversed(greys)]

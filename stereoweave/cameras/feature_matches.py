@@ -1,10 +1,10 @@
 """Sparse feature matches between two pictures of one scene, rectified or not.
 
 A corner is described by a small window of grey levels, normalised for brightness and contrast. Two corners
-match if each is clearly the other's best candidate. This takes a twentieth of SIFT's time (15 ms against
-300 ms at 640x480) with nearly as many correct matches (82 against 86 %, median of rendered rooms). It
-tolerates a rotation of some 10 degrees and a scale difference of some 15 %, more than a rig or two hand-held
-pictures differ by.
+match if each is clearly the other's best candidate. This takes a twentieth of the time of SIFT (15 ms versus
+300 ms at 640x480), with nearly as many correct matches (82 versus 86 %, median over rendered rooms). It
+tolerates rotations up to about 10 degrees and scale differences up to about 15 %, which is more than occurs
+in rigs or between two hand-held pictures.
 """
 
 import math
@@ -19,33 +19,33 @@ _PIXELS = 1_500_000
 _CORNER_QUALITY = 0.005
 _CORNER_DISTANCE_PX = 4
 _TILES = 4
-# A window of 11x11 samples, 2 px apart, in smoothed pictures.
+# Windows have 11x11 samples, 2 px apart, in smoothed pictures.
 _WINDOW_RADIUS, _WINDOW_STEP_PX, _WINDOW_BLUR_PX = 5, 2.0, 1.0
 _LEAST_CORRELATION = 0.5
 # Largest ratio of the distances to the best and the second-best window.
 _MOST_AMBIGUOUS = 0.85
 # Largest vertical offset of a match, as a share of the height.
 _MOST_ROWS_OFF = 0.25
-# Windows at full resolution for the refinement of matches, and the number of steps.
+# Windows for the refinement of matches at full resolution, and the number of steps.
 _EXACT_RADIUS, _EXACT_STEPS = 6, 8
 _CONVERGED_PX, _LEAST_EXACT_CORRELATION = 0.05, 0.7
 _WEAK_CONTRAST_LEVELS = 1.0
 
 
 class Matches(NamedTuple):
-    """N matches: x and y in px in each picture, float64 [N, 2]; some are wrong."""
+    """N matches, some of them wrong: x and y in px in each picture, float64 [N, 2]."""
 
     left_px: Float[np.ndarray, "n 2"]
     right_px: Float[np.ndarray, "n 2"]
 
     @property
     def disparity_px(self) -> Float[np.ndarray, " n"]:
-        """How much farther left each match is in the right picture."""
+        """Distance in px by which each match is farther left in the right picture."""
         return self.left_px[:, 0] - self.right_px[:, 0]
 
     @property
     def lower_px(self) -> Float[np.ndarray, " n"]:
-        """How much lower each match is in the right picture; 0 in a rectified pair."""
+        """Distance in px by which each match is lower in the right picture; 0 in a rectified pair."""
         return self.right_px[:, 1] - self.left_px[:, 1]
 
 
@@ -54,7 +54,7 @@ def find_matches(
 ) -> Matches:
     """Find up to `most` matches, accurate to about 0.1 px; the pair need not be rectified.
 
-    About one in five is wrong; the caller rejects these by geometry.
+    About one match in five is wrong and must be rejected by the caller, by epipolar geometry.
     """
     greys = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right)]
     found = _pair_corners(greys, most, rows_off=_MOST_ROWS_OFF * left.shape[0])
@@ -73,7 +73,7 @@ def _pair_corners(greys: list[UInt8[np.ndarray, "h w"]], most: int, rows_off: fl
     partner, partner_of_right = alike.argmax(1), alike.argmax(0)
     best = alike[lefts, partner]
     alike[lefts, partner] = -1
-    # For windows of length 1 the squared distance is 2 - 2 * correlation.
+    # For windows of length 1, the squared distance is 2 - 2 * correlation.
     clear = 1 - best < _MOST_AMBIGUOUS**2 * (1 - alike.max(1))
     kept = clear & (partner_of_right[partner] == lefts) & (best > _LEAST_CORRELATION)
     return Matches(left[kept], right[partner[kept]])
@@ -82,7 +82,7 @@ def _pair_corners(greys: list[UInt8[np.ndarray, "h w"]], most: int, rows_off: fl
 def _find_corners(
     grey: UInt8[np.ndarray, "h w"], most: int
 ) -> tuple[Float[np.ndarray, "n 2"], Float32[np.ndarray, "n k"]]:
-    """Corners in px of the full picture, and their windows."""
+    """Return the corners in px of the full-size picture, and their windows."""
     factor = _downscale_factor(grey)
     height, width = grey.shape
     if factor > 1:
@@ -96,7 +96,7 @@ def _find_corners(
 
 
 def _find_spread_corners(grey: UInt8[np.ndarray, "h w"], most: int) -> Float[np.ndarray, "n 2"]:
-    """The strongest corners of each tile, so that low-contrast areas have some too."""
+    """Return the strongest corners of each tile, so that low-contrast areas have corners too."""
     found = [np.zeros((0, 2))]
     for rows in np.array_split(np.arange(grey.shape[0]), _TILES):
         for columns in np.array_split(np.arange(grey.shape[1]), _TILES):
@@ -112,8 +112,8 @@ def _refine_matches(
 ) -> Matches:
     """Refine the right positions to a fraction of a pixel, and drop matches that do not fit.
 
-    Source: the inverse compositional algorithm (Baker and Matthews 2004) for a translation, on windows
-    normalised in mean and contrast, because exposures may differ.
+    Source: the inverse compositional algorithm (Baker and Matthews 2004) for a translation. Mean and contrast
+    of the windows are normalised, because exposures may differ.
     """
     if not len(found.left_px):
         return found
@@ -142,7 +142,7 @@ def _refine_matches(
 def _sample_windows(
     grey: UInt8[np.ndarray, "h w"], centres_px: Float[np.ndarray, "n 2"], radius: int, step_px: float
 ) -> Float32[np.ndarray, "n k"]:
-    """Grey levels around each centre, in rows and columns `step_px` apart; the border is repeated outside."""
+    """Sample grey levels around each centre, `step_px` apart; outside the picture, its border is repeated."""
     offsets = np.arange(-radius, radius + 1) * step_px
     down, along = (offset.ravel() for offset in np.meshgrid(offsets, offsets, indexing="ij"))
     columns, rows = (
@@ -157,7 +157,7 @@ def _sample_windows(
 def _normalise(
     windows: Float32[np.ndarray, "n k"],
 ) -> tuple[Float32[np.ndarray, "n k"], Float32[np.ndarray, "n 1"]]:
-    """Windows with mean 0 and length 1, and their divisors; plain windows become nearly 0."""
+    """Normalise windows to mean 0 and length 1, or nearly 0 if plain; return them and their divisors."""
     centred = windows - windows.mean(1, keepdims=True)
     least = _WEAK_CONTRAST_LEVELS * math.sqrt(windows.shape[1])
     length = np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), least)
@@ -165,5 +165,5 @@ def _normalise(
 
 
 def _downscale_factor(picture: np.ndarray) -> float:
-    """Factor that shrinks the picture to at most _PIXELS; 1 if it is small enough."""
+    """Return the factor by which to downscale the picture to at most _PIXELS; 1 if it is small enough."""
     return max(1.0, math.sqrt(picture.shape[0] * picture.shape[1] / _PIXELS))

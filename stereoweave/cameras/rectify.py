@@ -11,10 +11,10 @@ from stereoweave.cameras.rig import Optics, Rig, pair_size_px
 from stereoweave.errors import Note, StereoweaveError
 from stereoweave.stereo import StereoCamera, StereoPair
 
-# Cells along the longer side in the search for the largest rectangle, and the fewest along the shorter
-# side, because a border makes whole cells unusable.
+# The largest rectangle is sought in a grid with this many cells along the longer side, and at least this many
+# along the shorter side, because one invalid pixel makes a whole cell unusable.
 _CELLS, _LEAST_CELLS = 256, 32
-# Samples in the search for the radius at which the distortion polynomial stops growing.
+# Number of samples in the search for the radius at which the distortion polynomial stops growing.
 _RADIUS_STEPS = 2000
 
 
@@ -23,8 +23,8 @@ class Rectified:
     """A rectified pair.
 
     Attributes:
-        pair: With masks that are False outside the source pictures, and with the camera if it is known.
-        notes: What rectification did.
+        pair: The pair, with masks that are False outside the source pictures, and with its camera if known.
+        notes: Notes on what rectification did.
     """
 
     pair: StereoPair
@@ -34,9 +34,10 @@ class Rectified:
 def rectify(pair: StereoPair, rig: Rig) -> Rectified:
     """Rectify a pair to two parallel pinhole cameras; the size stays the same, and the camera is added.
 
-    Both cameras are rotated to a common direction between theirs and perpendicular to the baseline. The focal
-    length is the mean of theirs, which keeps the resolution in the middle. Both views share one principal
-    point (doffs 0), chosen to keep most of the views visible. A pair of a rectified rig only gets its camera.
+    Both cameras are rotated to a common direction, between their own directions and perpendicular to the
+    baseline. The new focal length is the mean of the two, which preserves the resolution in the middle. Both
+    views share one principal point (doffs 0), chosen to keep most of each view visible. If the rig is
+    rectified already, the pictures do not change.
 
     Raises:
         FormatError: The rig is for pictures of another size.
@@ -47,7 +48,7 @@ def rectify(pair: StereoPair, rig: Rig) -> Rectified:
     if rig.unlike_rectified() is None:
         note = Note(f"{rig.name} is a calibration of rectified pictures: they are left unchanged")
         return Rectified(pair=replace(pair, camera=rig.camera()), notes=(*rig.notes, note))
-    # Values that cannot be computed are rejected later, as not finite.
+    # Values that cannot be computed are not finite, and are rejected later.
     with np.errstate(all="ignore"):
         turns = _find_rotations(rig)
         camera = _choose_camera(rig, turns, pair_size_px(pair))
@@ -61,7 +62,7 @@ def crop(pair: StereoPair) -> StereoPair:
     """Crop a pair to the largest rectangle that is valid in both pictures, and adjust its camera.
 
     Raises:
-        StereoweaveError: No pixel is valid in both.
+        StereoweaveError: No pixel is valid in both pictures.
     """
     if pair.left_seen is None and pair.right_seen is None:
         return pair
@@ -85,25 +86,25 @@ def _check_side_by_side(rig: Rig) -> None:
     if aside != "beside":
         raise StereoweaveError(
             f"{rig.name}: expected two cameras side by side, found the right one {aside} the left one "
-            f"({x:.3f} m aside, {y:.3f} m down, {z:.3f} m ahead); "
+            f"({x:.3f} m to the right, {y:.3f} m down, {z:.3f} m forward); "
             "if one camera is above the other, rotate the pictures by 90 degrees and calibrate again"
         )
     if x < 0:
         raise StereoweaveError(
             f"{rig.name}: expected the right camera on the right, found it {-x:.3f} m to the left "
-            "of the left one: left and right are swapped; exchange the pictures and calibrate again"
+            "of the left one: left and right are swapped; swap the pictures and calibrate again"
         )
 
 
 def _find_right_centre(rig: Rig) -> Float[np.ndarray, "3"]:
-    """Position of the right camera relative to the left one in metres: x right, y down, z forward."""
+    """Return the right camera's position relative to the left one in metres: x right, y down, z forward."""
     return -rig.rotation.T @ rig.translation_m
 
 
 def _find_rotations(rig: Rig) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
-    """Rotations from the left and the right camera to the rectified ones."""
+    """Return the rotations from the left and the right camera to the rectified cameras."""
     aside = _find_right_centre(rig) / rig.baseline_m
-    ahead = np.array([0, 0, 1]) + rig.rotation[2]  # the left camera's direction and the right one's
+    ahead = np.array([0, 0, 1]) + rig.rotation[2]  # sum of both cameras' viewing directions
     ahead -= ahead @ aside * aside
     ahead /= np.linalg.norm(ahead)
     turn = np.stack([aside, np.cross(ahead, aside), ahead])
@@ -113,7 +114,7 @@ def _find_rotations(rig: Rig) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarra
 def _choose_camera(
     rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], size_px: tuple[int, int]
 ) -> StereoCamera:
-    """Choose the rectified camera so that the two picture centres lie, on average, in the middle."""
+    """Choose the rectified camera so that both source pictures are, on average, centred in the result."""
     lenses = rig.left, rig.right
     focal_px = float(np.mean([optics.matrix[[0, 1], [0, 1]] for optics in lenses]))
     middle_px = (np.array(size_px) - 1) / 2
@@ -133,7 +134,7 @@ def _choose_camera(
 
 
 def _find_direction(optics: Optics, at_px: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
-    """Viewing direction of a pixel."""
+    """Return the viewing direction of a pixel, x and y at depth 1."""
     undistort = cv2.fisheye.undistortPoints if optics.fisheye else cv2.undistortPoints
     (x, y), *_ = undistort(at_px.reshape(1, 1, 2), optics.matrix, _pad_distortion(optics)).reshape(-1, 2)
     return np.array([x, y, 1])
@@ -142,9 +143,9 @@ def _find_direction(optics: Optics, at_px: Float[np.ndarray, "2"]) -> Float[np.n
 def _rectify_view(
     image: UInt8[np.ndarray, "h w 3"], optics: Optics, turn: Float[np.ndarray, "3 3"], camera: StereoCamera
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """Warp a picture to the rectified camera; returns it with the mask of its valid pixels.
+    """Warp a picture to the rectified camera; return it with the mask of its valid pixels.
 
-    The border is repeated outside the picture, because an edge there would be matched.
+    Outside the picture its border is repeated, because an edge at the border would be matched.
     """
     height, width = image.shape[:2]
     pinhole = np.array([[camera.focal_px, 0, camera.cx_px], [0, camera.focal_px, camera.cy_px], [0, 0, 1]])
@@ -159,10 +160,10 @@ def _rectify_view(
 def _find_valid_field(
     optics: Optics, turn: Float[np.ndarray, "3 3"], pinhole: Float[np.ndarray, "3 3"], shape: tuple[int, int]
 ) -> Bool[np.ndarray, "h w"]:
-    """Pixels where the lens model is valid: in front of the camera, before the polynomial folds back.
+    """Return the mask of pixels in front of the camera, and within the radius where the lens model is valid.
 
-    The polynomial is fitted inside the picture. Beyond it the polynomial may decrease, which would show the
-    border again, mirrored.
+    The distortion polynomial is fitted inside the picture. Outside it may decrease, which would show the
+    picture's border again, mirrored.
     """
     rows, columns = np.indices(shape, np.float32)
     to_direction = (turn.T @ np.linalg.inv(pinhole)).astype(np.float32)
@@ -175,7 +176,7 @@ def _find_valid_field(
 
 @np.errstate(all="ignore")  # values that cannot be computed count as not growing
 def _find_fold(optics: Optics, most: float) -> float:
-    """Radius (fisheye: angle) at which the distorted radius stops growing, at most `most`."""
+    """Return the radius (fisheye: angle), at most `most`, at which the distorted radius stops growing."""
     radius = np.linspace(0, most, _RADIUS_STEPS)
     squares = radius**2
     k = _pad_distortion(optics)
@@ -190,7 +191,7 @@ def _find_fold(optics: Optics, most: float) -> float:
 
 
 def _pad_distortion(optics: Optics) -> Float[np.ndarray, " n"]:
-    """Distortion for OpenCV, whose fisheye functions need four coefficients."""
+    """Return the distortion as OpenCV's fisheye functions need it: with four coefficients, not none."""
     return optics.distortion if optics.distortion.size else np.zeros(4)
 
 
@@ -205,7 +206,7 @@ def _summarize(rig: Rig, turns: Sequence[Float[np.ndarray, "3 3"]], pair: Stereo
 
 
 def _find_largest_rectangle(full: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
-    """Rows and columns of the largest full rectangle of whole cells, then grown pixel by pixel."""
+    """Return rows and columns of the largest full rectangle of cells, then enlarged pixel by pixel."""
     cell_px = max(1, min(-(-max(full.shape) // _CELLS), min(full.shape) // _LEAST_CELLS))
     top, bottom, start, stop = (
         cell_px * side for side in _find_largest_of_cells(_find_full_cells(full, cell_px))
@@ -220,7 +221,7 @@ def _find_largest_rectangle(full: Bool[np.ndarray, "h w"]) -> tuple[slice, slice
 
 
 def _find_full_cells(full: Bool[np.ndarray, "h w"], cell_px: int) -> Bool[np.ndarray, "rows columns"]:
-    """Which cells are full; a cell cut by the picture's border counts by its remaining pixels."""
+    """Return which cells are full; of a cell that the picture's border cuts, only the pixels inside count."""
     height, width = full.shape
     padded = np.pad(full, ((0, -height % cell_px), (0, -width % cell_px)), constant_values=True)
     cells = padded.reshape(-1, cell_px, padded.shape[1] // cell_px, cell_px)
@@ -228,7 +229,10 @@ def _find_full_cells(full: Bool[np.ndarray, "h w"], cell_px: int) -> Bool[np.nda
 
 
 def _find_largest_of_cells(full: Bool[np.ndarray, "rows columns"]) -> tuple[int, int, int, int]:
-    """Top, bottom, start and stop of the largest full rectangle, by a stack of bars for each row."""
+    """Return top, bottom, start and stop of the largest full rectangle.
+
+    For each row, it is the largest rectangle under a histogram of full cells, found with a stack of bars.
+    """
     best, found = 0, (0, 0, 0, 0)
     heights = np.zeros(full.shape[1], int)
     for row, cells in enumerate(full):

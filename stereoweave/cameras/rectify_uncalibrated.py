@@ -20,18 +20,18 @@ _RIGHT_PX = 1.0
 _STEPS = 40
 # Scale of the robust loss.
 _SOFT_PX = 0.5
-# Prior: standard deviations of the angles in radians and of log(focal length / width). Where the matches
-# leave the solution open, it selects the smallest rotations.
+# Standard deviations of the prior: of the angles in radians and of log(focal length / width). Where the
+# matches do not determine the solution, the prior selects the smallest rotations.
 _LIKELY_TURN, _LIKELY_LOG_FOCAL = 0.05, 0.3
 _MOST_TURN_DEGREES = 20.0
 _MOST_RESIDUAL_PX = 1.0
 _PIXELS_OF_RESIDUAL = 1_500_000
-# This share of the smallest disparities may come from wrong matches.
+# This percentage of the smallest disparities may come from wrong matches.
 _OUTER_PERCENT = 1.0
 
 
 class _Homographies(NamedTuple):
-    """Homographies that map each picture to common rows."""
+    """Homographies of the left and the right picture, after which corresponding rows coincide."""
 
     left: Float[np.ndarray, "3 3"]
     right: Float[np.ndarray, "3 3"]
@@ -40,14 +40,14 @@ class _Homographies(NamedTuple):
 def rectify_by_features(pair: StereoPair) -> Rectified:
     """Rectify a pair from its feature matches.
 
-    Both pictures are warped as by the smallest sufficient rotations of their cameras; the focal length is
-    fitted too. Unlike an arbitrary homography this preserves shapes. The result has no camera, because
-    neither focal length nor baseline is known well enough for metres.
+    Both pictures are warped by the smallest camera rotations that suffice; the focal length is fitted too.
+    Unlike arbitrary homographies, rotations preserve shapes. The result has no camera, because neither focal
+    length nor baseline is known well enough for metric depth.
 
     Source: "Quasi-Euclidean epipolar rectification of uncalibrated images" (Fusiello and Irsara 2011).
 
     Raises:
-        StereoweaveError: Too few matches, or no such rotation aligns their rows.
+        StereoweaveError: There are too few matches, or no rotation aligns their rows.
     """
     height, width = pair.left.shape[:2]
     matches = _select_inliers(find_matches(pair.left, pair.right))
@@ -63,19 +63,19 @@ def rectify_by_features(pair: StereoPair) -> Rectified:
     before_px = np.abs(matches.lower_px)
     note = Note(
         f"rectified by {len(missed_px)} matches: median vertical error {np.median(missed_px):.2f} px, before "
-        f"{np.median(before_px):.2f} px; the right picture was shifted by {moved_px:+.0f} px sideways"
+        f"{np.median(before_px):.2f} px; the right picture was shifted sideways by {moved_px:+.0f} px"
     )
     rectified = replace(pair, left=left, right=right, camera=None, left_seen=left_seen, right_seen=right_seen)
     return Rectified(pair=rectified, notes=(note,))
 
 
 def _select_inliers(found: Matches) -> Matches:
-    """Select the inliers of one epipolar geometry."""
+    """Return the matches that agree with one epipolar geometry."""
     count = len(found.left_px)
     right_ones = np.zeros(count, bool)
     if count >= _LEAST_MATCHES:
         cv2.setRNGSeed(0)
-        with suppress(cv2.error):  # raised if no geometry explains any of them
+        with suppress(cv2.error):  # raised if no geometry explains any match
             _, mask = cv2.findFundamentalMat(
                 found.left_px, found.right_px, cv2.USAC_MAGSAC, _RIGHT_PX, 0.9999, 5000
             )
@@ -92,9 +92,9 @@ def _select_inliers(found: Matches) -> Matches:
 
 
 def _fit_rotations(matches: Matches, width: int, height: int) -> Float[np.ndarray, " 6"]:
-    """Parameters of `_make_homographies`: five angles in radians and log(focal length / width).
+    """Fit the parameters of `_make_homographies`: five angles in radians and log(focal length / width).
 
-    Levenberg-Marquardt on the Sampson errors in px, with numeric slopes; large errors count for less.
+    Minimises a robust loss of the Sampson errors in px by Levenberg-Marquardt with numeric derivatives.
     """
     likely = np.array([_LIKELY_TURN] * 5 + [_LIKELY_LOG_FOCAL])
 
@@ -118,9 +118,9 @@ def _fit_rotations(matches: Matches, width: int, height: int) -> Float[np.ndarra
 
 
 def _make_homographies(parameters: Float[np.ndarray, " 6"], width: int, height: int) -> _Homographies:
-    """Homographies of rotations: the left camera by yaw and roll, the right one by pitch, yaw and roll.
+    """Return the homographies of rotations: left camera by yaw and roll, right camera by pitch, yaw and roll.
 
-    A common pitch does not change the alignment of rows, so the left camera has none.
+    A common pitch does not change the alignment of rows, so the left camera keeps its pitch.
     """
     left_yaw, left_roll, right_pitch, right_yaw, right_roll, log_focal = parameters
     focal_px = width * np.exp(log_focal)
@@ -132,7 +132,7 @@ def _make_homographies(parameters: Float[np.ndarray, " 6"], width: int, height: 
 
 
 def _measure_sampson_px(turns: _Homographies, matches: Matches) -> Float[np.ndarray, " n"]:
-    """Sampson error: first-order distance of each match from its epipolar lines, in source px."""
+    """Return the Sampson errors: first-order distance of each match to its epipolar lines, in source px."""
     across = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     fundamental = turns.right.T @ across @ turns.left
     ones = np.ones((len(matches.left_px), 1))
@@ -155,7 +155,7 @@ def _check(parameters: Float[np.ndarray, " 6"], residual_px: float, width: int, 
 
 
 def _align_views(turns: _Homographies, matches: Matches) -> tuple[_Homographies, float]:
-    """Keep the left picture centred; shift the right one left if needed, so that disparities start at 0.
+    """Keep the left picture centred, and shift the right one to the left if needed for disparities >= 0.
 
     Returns the homographies and the sideways shift of the right picture in px.
     """
@@ -175,7 +175,7 @@ def _warp(
     turn: Float[np.ndarray, "3 3"],
     seen: Bool[np.ndarray, "h w"] | None,
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """Warp a picture, repeating its border; returns it with the mask of its valid pixels."""
+    """Warp a picture, repeating its border; return it with the mask of its valid pixels."""
     size = image.shape[1::-1]
     before = np.ones(image.shape[:2], np.uint8) if seen is None else seen.astype(np.uint8)
     warped = cv2.warpPerspective(image, turn, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)

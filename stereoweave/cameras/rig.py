@@ -9,11 +9,11 @@ from jaxtyping import Float
 from stereoweave.errors import FormatError, Note, StereoweaveError
 from stereoweave.stereo import CAMERA_NUMBERS_BELOW, StereoCamera, StereoPair
 
-# Numbers of coefficients in OpenCV's models; 0 means no distortion.
+# Possible numbers of distortion coefficients in OpenCV's models; 0 means no distortion.
 _PINHOLE_COUNTS, _FISHEYE_COUNTS = (0, 4, 5, 8, 12, 14), (0, 4)
-# In the smallest pictures, 32 px wide, this is a field of view of 173 degrees.
+# In the smallest pictures, 32 px wide, this means a field of view of 173 degrees.
 _LEAST_FOCAL_PX = 1
-# Tolerances for files with few decimals: some hundredths of a pixel in a picture of 4000 px.
+# Tolerances for files with few decimals; they amount to some hundredths of a pixel in a picture of 4000 px.
 _ROTATION_OFF, _SAME_PX, _SAME_DIRECTION = 1e-5, 1e-2, 1e-3
 _ROUNDED = 1e-3
 
@@ -22,13 +22,14 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True, kw_only=True)
 class Optics:
-    """Camera intrinsics: project a point x, y, z in front of the camera (right, down, forward) to a pixel.
+    """Camera intrinsics: projection of a point x, y, z (right, down, forward) to a pixel.
 
     Attributes:
         matrix: [3, 3], focal lengths and principal point in px, without skew; pixel centres are integers.
-        distortion: [N] coefficients in OpenCV's order: k1 k2 p1 p2 k3 and so on (N is 0, 4, 5, 8, 12 or
-            14); for a fisheye lens k1 k2 k3 k4 (N is 0 or 4).
-        fisheye: Kannala and Brandt's model, which is OpenCV's fisheye and Kalibr's `equidistant`.
+        distortion: Coefficients [N] in OpenCV's order: k1 k2 p1 p2 k3 ... for a pinhole (N is 0, 4, 5, 8, 12
+            or 14), k1 k2 k3 k4 for a fisheye lens (N is 0 or 4).
+        fisheye: Whether the lens follows Kannala and Brandt's model, which OpenCV calls fisheye and Kalibr
+            `equidistant`.
     """
 
     matrix: Float[np.ndarray, "3 3"]
@@ -49,7 +50,7 @@ class Optics:
         counts = _FISHEYE_COUNTS if self.fisheye else _PINHOLE_COUNTS
         if self.distortion.size not in counts:
             raise StereoweaveError(
-                f"expected {' or '.join(map(str, counts))} distortion coefficients of a "
+                f"expected {' or '.join(map(str, counts))} distortion coefficients for a "
                 f"{'fisheye' if self.fisheye else 'pinhole'} lens, found {self.distortion.size}"
             )
 
@@ -59,13 +60,13 @@ class Rig:
     """Two cameras on one mount.
 
     Attributes:
-        left, right: The intrinsics.
-        rotation, translation_m: From left to right camera coordinates, in OpenCV's convention:
-            x_right = rotation @ x_left + translation_m. In a rectified rig translation_m[0] is minus the
+        left, right: Intrinsics of the two cameras.
+        rotation, translation_m: Transform from left to right camera coordinates, in OpenCV's convention:
+            x_right = rotation @ x_left + translation_m. In a rectified rig, translation_m[0] is minus the
             baseline.
         size_px: Picture width and height; None if the file does not state them.
-        name: Name in errors, such as the file.
-        notes: Assumptions made about the file.
+        name: Name of the rig in errors, such as its file.
+        notes: Notes on assumptions made about the file.
     """
 
     left: Optics
@@ -85,7 +86,7 @@ class Rig:
             )
         if not 0 < np.linalg.norm(self.translation_m) < CAMERA_NUMBERS_BELOW:
             raise StereoweaveError(
-                f"{self.name}: expected cameras at two positions under {CAMERA_NUMBERS_BELOW:g} m apart, "
+                f"{self.name}: expected cameras at two positions less than {CAMERA_NUMBERS_BELOW:g} m apart, "
                 f"found the translation {self.translation_m.tolist()}"
             )
         if self.size_px is not None and min(self.size_px) < 1:
@@ -95,7 +96,7 @@ class Rig:
 
     @property
     def baseline_m(self) -> float:
-        """Distance between the cameras."""
+        """Distance between the two cameras."""
         return float(np.linalg.norm(self.translation_m))
 
     @property
@@ -104,7 +105,7 @@ class Rig:
         return float(np.degrees(np.linalg.norm(cv2.Rodrigues(self.rotation)[0])))
 
     def unlike_rectified(self) -> str | None:
-        """Why the rig's pictures are not rectified, in a few words; None if they are."""
+        """Return why the rig's pictures are not rectified, in a few words; None if they are rectified."""
         left, right = self.left.matrix, self.right.matrix
         if any(optics.fisheye or optics.distortion.any() for optics in (self.left, self.right)):
             return "lenses with distortion"
@@ -114,11 +115,15 @@ class Rig:
         if np.abs(aside - (-1, 0, 0)).max() > _SAME_DIRECTION:
             return "a right camera that is not exactly to the right of the left one"
         if np.abs((left - right)[[0, 1, 1], [0, 1, 2]]).max() > _SAME_PX:
-            return "cameras with different focal lengths or rows of the principal point"
+            return "cameras with different focal lengths or different rows of the principal point"
         return None
 
     def camera(self) -> StereoCamera:
-        """The stereo camera of a rectified rig; raises StereoweaveError for any other rig."""
+        """Return the stereo camera of a rectified rig.
+
+        Raises:
+            StereoweaveError: The rig is not rectified.
+        """
         unlike = self.unlike_rectified()
         if unlike:
             raise StereoweaveError(
@@ -131,7 +136,7 @@ class Rig:
             baseline_m=self.baseline_m,
             cx_px=float(left[0, 2]),
             cy_px=float(left[1, 2]),
-            # Rounded, so that a file's 31.086 does not become 31.086000000000013 by the subtraction.
+            # Rounded, so that the subtraction does not turn a file's 31.086 into 31.086000000000013.
             doffs_px=round(float(right[0, 2] - left[0, 2]), 9),
         )
 
@@ -141,22 +146,22 @@ class Rig:
         if self.size_px not in (None, size_px):
             raise FormatError(
                 f"{self.name}: expected a calibration for pictures of {format_size(size_px)}, found one for "
-                f"{format_size(self.size_px)}; resize the pictures to that size, or calibrate at theirs"
+                f"{format_size(self.size_px)}; resize the pictures to that size, or calibrate at their size"
             )
 
 
 def pair_size_px(pair: StereoPair) -> Size:
-    """Picture width and height of a pair."""
+    """Return the width and height of a pair's images."""
     return pair.left.shape[1], pair.left.shape[0]
 
 
 def format_size(size_px: Size | None) -> str:
-    """Format a size as 640x480."""
+    """Format a size as WIDTHxHEIGHT, such as 640x480."""
     return "unknown size" if size_px is None else f"{size_px[0]}x{size_px[1]}"
 
 
 def rectified_rig(pair: StereoPair) -> Rig:
-    """The rig of a rectified pair with a camera."""
+    """Return the rig of a rectified pair whose camera is known."""
     camera = pair.camera
     if camera is None:
         raise StereoweaveError("expected a pair whose camera is known, found none; give it a calibration")
@@ -169,7 +174,10 @@ def rectified_rig(pair: StereoPair) -> Rig:
 def make_rectified_rig(
     left: Float[np.ndarray, "3 n"], right: Float[np.ndarray, "3 n"], aside_m: float
 ) -> Rig:
-    """The rig of rectified pictures; columns beyond a matrix's third are ignored."""
+    """Return a rectified rig, given two camera or projection matrices, of which three columns are used.
+
+    The right camera is `-aside_m` to the right of the left one.
+    """
     return Rig(
         left=Optics(matrix=left[:, :3], distortion=np.zeros(0)),
         right=Optics(matrix=right[:, :3], distortion=np.zeros(0)),

@@ -1,1 +1,1 @@
-"""Datasets: stereo pairs with ground truth."""
+"""Reading and writing of datasets: stereo pairs with ground truth."""

@@ -1,4 +1,4 @@
-"""ETH3D two-view (Schöps et al. 2017), training set: a folder per scene."""
+"""Training set of ETH3D's two-view benchmark (Schöps et al. 2017), with one folder per scene."""
 
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ from stereoweave.stereo import Sample
 
 
 def list_eth3d(root: Path) -> list[Frame]:
-    """Scenes of two_view_training with ground truth in two_view_training_gt, such as delivery_area_1l."""
+    """List the scenes of two_view_training, whose ground truth is in two_view_training_gt."""
     truth = require_folder(root / "two_view_training_gt")
     return [
         Frame(name=scene.name, read=partial(_read, scene, truth / scene.name))
@@ -26,6 +26,6 @@ def _read(scene: Path, truth: Path) -> Sample:
     pair = add_camera(read_pair(scene / "im0.png", scene / "im1.png"), scene / "calib.txt")
     disparity, visible = truth / "disp0GT.pfm", truth / "mask0nocc.png"
     disparity_px = require_size(read_pfm(disparity), disparity, pair)
-    # 255 means visible in both cameras; darker means occluded or unknown.
+    # 255 means visible in both images; lower values mean occluded or unknown.
     both = require_size(read_pixels(visible, "L"), visible, pair) == 255
     return make_sample(pair, disparity_px, occluded=np.isfinite(disparity_px) & ~both)

@@ -1,4 +1,4 @@
-"""Frames of a dataset, and the matching of their files by name."""
+"""Frames of a dataset, and matching of their files by name."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ class Frame:
     """A pair of a dataset, read on request.
 
     Attributes:
-        name: Unique and stable, with parts separated by "/"; the part before the last "/" is the sequence.
-        read: Reads the sample; raises a FormatError that names a missing or damaged file.
+        name: Unique and stable name, SEQUENCE/FRAME; the sequence may itself contain "/", or be absent.
+        read: Function that reads the sample; it raises a FormatError if a file is missing or damaged.
     """
 
     name: str
@@ -24,14 +24,14 @@ class Frame:
 
     @property
     def sequence(self) -> str:
-        """The name's part before the last "/"; empty for stills."""
+        """The part of the name before the last "/"; empty for stills."""
         return self.name.rpartition("/")[0]
 
 
 def match_files(*folders: Path, ending: str = "") -> dict[str, list[Path]]:
-    """Match the files of equal names in several folders: one from each folder per frame, sorted by name.
+    """Match the files of several folders by name: return one file from each folder per name, sorted by name.
 
-    A name is the path below the folder, without the suffix; only names with this `ending` count.
+    A name is the path below the folder without the suffix. Names without this `ending` are ignored.
 
     Raises:
         StereoweaveError: A folder does not exist.
@@ -45,7 +45,7 @@ def match_files(*folders: Path, ending: str = "") -> dict[str, list[Path]]:
             suffix = next((path.suffix for path in files.values()), "")
             raise FormatError(
                 f"{folder / missing[0]}{suffix}: expected a file, as in the folders beside it, found none; "
-                f"{len(missing)} of {len(names)} are missing there"
+                f"{len(missing)} of {len(names)} files are missing in this folder"
             )
     return {name: [files[name] for files in listings] for name in names}
 
@@ -53,13 +53,13 @@ def match_files(*folders: Path, ending: str = "") -> dict[str, list[Path]]:
 def require_folder(folder: Path) -> Path:
     """Return the folder; raise a StereoweaveError if it does not exist."""
     if not folder.is_dir():
-        found = "a file" if folder.exists() else "nothing of that name"
+        found = "a file" if folder.exists() else "no such folder"
         raise StereoweaveError(f"{folder}: expected a folder of the dataset, found {found}")
     return folder
 
 
 def list_scene_folders(root: Path) -> list[Path]:
-    """Folders in `root`, sorted by name, for datasets with one folder per scene."""
+    """List the folders in `root`, sorted by name, for datasets with one folder per scene."""
     return sorted(path for path in require_folder(root).iterdir() if path.is_dir() and path.name[0] != ".")
 
 

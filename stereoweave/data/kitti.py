@@ -1,4 +1,4 @@
-"""KITTI stereo 2012 (Geiger et al.) and 2015 (Menze and Geiger), training sets, as unpacked."""
+"""Training sets of KITTI stereo 2012 (Geiger et al.) and 2015 (Menze and Geiger), as unpacked."""
 
 from dataclasses import replace
 from functools import partial
@@ -18,10 +18,10 @@ from stereoweave.stereo import Sample, StereoCamera, StereoPair
 
 
 def list_kitti2012(root: Path) -> list[Frame]:
-    """The 194 grey pairs of 2012, such as 000000_10.
+    """List the 194 grey pairs of 2012, such as 000000_10.
 
-    The ground truth is for the grey cameras, 0 and 1; by the calibration the colour cameras, 2 and 3, are
-    6 cm beside them.
+    The ground truth is for the grey cameras, 0 and 1. According to the calibration, the colour cameras, 2 and
+    3, are 6 cm beside them.
     """
     training = root / "training"
     folders = [training / name for name in ("image_0", "image_1", "disp_occ", "disp_noc")]
@@ -29,9 +29,10 @@ def list_kitti2012(root: Path) -> list[Frame]:
 
 
 def list_kitti2015(root: Path) -> list[Frame]:
-    """The 200 colour pairs of 2015, such as 000000_10; calib_cam_to_cam is a separate archive.
+    """List the 200 colour pairs of 2015, such as 000000_10; calib_cam_to_cam comes in a separate archive.
 
-    disp_occ_1 is not read: it is the left view's disparity at the next time step, not the right view's.
+    disp_occ_1 is not read, because it is the left view's disparity at the next time step, not the right
+    view's disparity.
     """
     training = root / "training"
     folders = [training / name for name in ("image_2", "image_3", "disp_occ_0", "disp_noc_0")]
@@ -59,8 +60,11 @@ def _read_disparity(path: Path, pair: StereoPair) -> Float32[np.ndarray, "h w"]:
 
 
 def _read_camera(path: Path, keys: tuple[str, str]) -> StereoCamera:
-    """Read the camera from two projections P = K [I | t]: P[0, 3] = focal_px * t, baseline = t0 - t1."""
-    with reading(path, "a calibration of KITTI"):
+    """Read the camera from the projection matrices P = K [I | t] of both cameras.
+
+    The baseline is the left camera's t minus the right one's, where t is P[0, 3] / focal_px.
+    """
+    with reading(path, "a KITTI calibration"):
         lines = (
             line.partition(":") for line in read_calibration_bytes(path).decode(errors="replace").splitlines()
         )
@@ -68,7 +72,7 @@ def _read_camera(path: Path, keys: tuple[str, str]) -> StereoCamera:
         missing = [key for key in keys if len(entries.get(key, [])) != 12]
         if missing:
             raise FormatError(
-                f"{path}: expected a calibration of KITTI, found no {' and no '.join(missing)} of 12 numbers"
+                f"{path}: expected a KITTI calibration, found no {' and no '.join(missing)} with 12 numbers"
             )
         left, right = (np.array(entries[key], float).reshape(3, 4) for key in keys)
         return StereoCamera(

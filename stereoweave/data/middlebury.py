@@ -1,4 +1,4 @@
-"""Middlebury stereo (Scharstein et al.) of 2001, 2003, 2005, 2006, 2014 and 2021: a folder per scene."""
+"""Middlebury stereo datasets (Scharstein et al.) of 2001 to 2021, with one folder per scene."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -19,7 +19,7 @@ from stereoweave.stereo import Sample, StereoCamera, StereoPair
 
 @dataclass(frozen=True)
 class _SceneFiles:
-    """File names of a scene's views and disparities, and the factor of the stored disparities."""
+    """File names of a scene's views and disparities, and the scale of the stored disparities."""
 
     left: str
     right: str
@@ -34,7 +34,7 @@ _FILES_2001 = {
 }
 _OTHER_FILES_2001 = _SceneFiles("im2", "im6", "disp2", "disp6", 8)
 
-# Shrinking factor by height. Grey levels are pixels of the full size, and are divided by it.
+# Downscaling factor by height. Grey levels are disparities at full size, so they are divided by this factor.
 _2003_SHRINKING = {1500: 1, 750: 2, 375: 4}
 _2006_SHRINKING = {1110: 1, 555: 2, 370: 3}
 
@@ -43,7 +43,7 @@ _WITHOUT_TRUTH_2005 = {"Computer", "Drumsticks", "Dwarves"}
 
 
 def list_middlebury2001(root: Path) -> list[Frame]:
-    """Eight scenes of planes, from views 2 and 6 or similar; no camera is published."""
+    """List eight scenes of planes, with views 2 and 6 or similar ones; no camera is published."""
     return [
         Frame(
             name=scene.name, read=partial(_read_2001, scene, _FILES_2001.get(scene.name, _OTHER_FILES_2001))
@@ -53,33 +53,34 @@ def list_middlebury2001(root: Path) -> list[Frame]:
 
 
 def list_middlebury2003(root: Path) -> list[Frame]:
-    """Cones and teddy, views 2 and 6, in full, half or quarter size; no camera is published."""
+    """List cones and teddy, views 2 and 6, in full, half or quarter size; no camera is published."""
     return [Frame(name=scene.name, read=partial(_read_2003, scene)) for scene in list_scene_folders(root)]
 
 
 def list_middlebury2005(root: Path) -> list[Frame]:
-    """The scenes of 2005, views 1 and 5, in full, half or third size: Art, or Art/Illum1/Exp0."""
+    """List the scenes of 2005, views 1 and 5, in full, half or third size, such as Art or Art/Illum1/Exp0."""
     return [
         Frame(name=views.relative_to(root).as_posix(), read=partial(_read_2006, scene, views))
         for scene in list_scene_folders(root)
         if scene.name not in _WITHOUT_TRUTH_2005
-        # Archives of two views have one picture per view; archives of seven views have lights and exposures.
+        # Archives of two views have one picture per view. Those of seven views have one for each illumination
+        # and exposure.
         for views in sorted(scene.glob("Illum*/Exp*")) or [scene]
     ]
 
 
 def list_middlebury2006(root: Path) -> list[Frame]:
-    """The scenes of 2006, in the layout of 2005: Aloe, or Aloe/Illum1/Exp0."""
+    """List the scenes of 2006, such as Aloe or Aloe/Illum1/Exp0; their folders are organised as in 2005."""
     return list_middlebury2005(root)
 
 
 def list_middlebury2014(root: Path) -> list[Frame]:
-    """The scenes of 2014 in their default light: Adirondack-perfect, Adirondack-imperfect."""
+    """List the scenes of 2014 with default illumination, such as Adirondack-perfect."""
     return [Frame(name=scene.name, read=partial(_read_2014, scene)) for scene in list_scene_folders(root)]
 
 
 def list_middlebury2021(root: Path) -> list[Frame]:
-    """The scenes of 2021, in the layout of 2014: artroom1."""
+    """List the scenes of 2021, such as artroom1; their folders are organised as in 2014."""
     return list_middlebury2014(root)
 
 
@@ -117,13 +118,13 @@ def _read_2014(scene: Path) -> Sample:
 
 
 def _find_picture(scene: Path, name: str) -> Path:
-    """The picture's path in the downloaded format; .png if none exists."""
+    """Return the path of a picture in the format in which it was downloaded; .png if no such file exists."""
     kinds = (scene / f"{name}{suffix}" for suffix in (".ppm", ".pgm"))
     return next((path for path in kinds if path.exists()), scene / f"{name}.png")
 
 
 def _read_levels(path: Path, pair: StereoPair) -> Float32[np.ndarray, "h w"]:
-    """Read a disparity map's grey levels; 0, unknown, becomes NaN."""
+    """Read the grey levels of a disparity map; level 0, which means unknown, becomes NaN."""
     levels = require_size(read_pixels(path, "L"), path, pair)
     return np.where(levels > 0, levels, np.nan).astype(np.float32)
 
@@ -133,17 +134,17 @@ def _find_shrinking(path: Path, pair: StereoPair, by_height_px: dict[int, int]) 
     if height_px not in by_height_px:
         heights = ", ".join(map(str, by_height_px))
         raise FormatError(
-            f"{path}: expected a published size, {heights} pixels high, found {height_px}; the size gives "
-            "the unit of its disparities, so that it must not be rescaled"
+            f"{path}: expected a published size, {heights} pixels high, found {height_px}; use the published "
+            "picture, because its size determines the unit of the disparities"
         )
     return by_height_px[height_px]
 
 
 def _read_camera_2006(dmin: Path, pair: StereoPair, shrinking: int) -> StereoCamera:
-    """The published camera, focal length 3740 px in full size and baseline 160 mm.
+    """Return the published camera, with a focal length of 3740 px at full size and a baseline of 160 mm.
 
-    dmin.txt states, always in pixels of the full size, how much cropping reduced each disparity. No principal
-    point is published, so it is set to the middle of the picture.
+    dmin.txt states by how much cropping reduced each disparity, always in pixels of the full size. No
+    principal point is published, so it is set to the middle of the picture.
     """
     with reading(dmin, "a number of pixels"):
         doffs_px = float(read_small(dmin).decode(errors="replace")) / shrinking

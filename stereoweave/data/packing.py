@@ -5,10 +5,10 @@
     occluded.png, right_occluded.png                1 bit
     camera.json                                     the camera in pixels and metres, and steps_per_px
 
-A rendered pair of 640x480 takes 0.4 to 1.2 MB, 0.87 on average (17 pairs from all scenes). Packing takes 25
-to 60 ms on one core, unpacking 22.
+A rendered pair of 640x480 takes 0.4 to 1.2 MB, 0.87 MB on average (17 pairs from all scenes). On one core,
+packing takes 25 to 60 ms and unpacking 22 ms.
 
-A disparity of 0, such as the sky's, is known here, so KITTI's PNG, where 0 means unknown, is unsuitable.
+KITTI's PNG format is unsuitable, because it uses 0 for unknown: the sky has a known disparity of 0.
 """
 
 import io
@@ -28,7 +28,7 @@ from stereoweave.io.decoding import decode_packed_values
 from stereoweave.stereo import Sample, StereoCamera
 
 _UNKNOWN = 65535
-# The rounding error is half a step, 0.0005 px; each further power of two costs 20 kB per map.
+# The rounding error is at most half a step, 0.0005 px; each further power of two costs 20 kB per map.
 _MOST_STEPS_PER_PX = 1024
 # Data type and channels of a pixel.
 _Kind = tuple[type[np.generic], tuple[int, ...]]
@@ -36,19 +36,19 @@ _RGB: _Kind = np.uint8, (3,)
 _STEPS: _Kind = np.uint16, ()
 _MASK: _Kind = np.bool_, ()
 
-# Four photographs of 640x480 on a core, mean: 379 kB in 7 ms. Method 1 takes 31 ms for 365 kB, 4 takes 96 ms
+# Mean of four pictures of 640x480 on one core: 379 kB in 7 ms. Method 1 takes 31 ms for 365 kB, 4 takes 96 ms
 # for 352 kB; PNG 8 to 23 ms for 434 to 466 kB.
 _WEBP = {"lossless": True, "method": 0, "quality": 0}
-# Four rendered disparities, 512 steps a pixel: 145 kB in 10 ms. Level 6 takes 26 ms for 129 kB, OpenCV's
-# default 6 ms for 246 kB. A TIFF of float32 would be exact: 27 ms for 378 kB.
+# Mean of four rendered disparity maps, 512 steps per pixel: 145 kB in 10 ms. Level 6 takes 26 ms for 129 kB,
+# OpenCV's default 6 ms for 246 kB. A float32 TIFF would be exact, but takes 27 ms for 378 kB.
 _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 3, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB)
 
 
 def pack(sample: Sample, views: Mapping[float, UInt8[np.ndarray, "h w 3"]]) -> dict[str, bytes]:
-    """Pack a pair into files, by suffix of their names.
+    """Pack a pair into files; return their contents by name.
 
     Args:
-        sample: With disparities of 0 or more; NaN means unknown.
+        sample: The pair and its ground truth, with disparities of 0 or more; NaN means unknown.
         views: Additional views by position.
     """
     disparities_px = {
@@ -69,7 +69,11 @@ def pack(sample: Sample, views: Mapping[float, UInt8[np.ndarray, "h w 3"]]) -> d
 
 
 def unpack(files: Mapping[str, bytes]) -> Sample:
-    """Unpack the sample from files of `pack`; raises ValueError for any others."""
+    """Unpack the sample from the files of `pack`.
+
+    Raises:
+        ValueError: A file is missing or was not written by `pack`.
+    """
     steps_per_px, camera = _parse_camera(_require_file(files, "camera.json"))
     left = _decode(files, "left.webp", _RGB)
 
@@ -95,13 +99,17 @@ def unpack(files: Mapping[str, bytes]) -> Sample:
 
 
 def unpack_views(files: Mapping[str, bytes]) -> dict[float, UInt8[np.ndarray, "h w 3"]]:
-    """Unpack the additional views from files of `pack`, by position; raises ValueError for any others."""
+    """Unpack the additional views, by position, from the files of `pack`.
+
+    Raises:
+        ValueError: A view was not written by `pack`.
+    """
     names = sorted(name for name in files if name.startswith("view_"))
     return {float(name[len("view_") : -len(".webp")]): _decode(files, name, _RGB) for name in names}
 
 
 def _parse_camera(content: bytes) -> tuple[int, StereoCamera | None]:
-    """Parse the steps per pixel and the camera of camera.json."""
+    """Parse the content of camera.json; return the steps per pixel and the camera."""
     try:
         match json.loads(content):
             case {"steps_per_px": int(steps), "camera": None} if 0 < steps <= _MOST_STEPS_PER_PX:
@@ -109,18 +117,18 @@ def _parse_camera(content: bytes) -> tuple[int, StereoCamera | None]:
             case {"steps_per_px": int(steps), "camera": dict(camera)} if 0 < steps <= _MOST_STEPS_PER_PX:
                 return steps, StereoCamera(**{name: float(value) for name, value in camera.items()})
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
-        raise ValueError(f"camera.json that cannot be used: {error}") from error
+        raise ValueError(f"invalid camera.json: {error}") from error
     raise ValueError("camera.json without steps_per_px or camera")
 
 
 def _choose_steps_per_px(disparities_px: Iterable[Float[np.ndarray, "h w"]]) -> int:
-    """Choose the largest power of two that fits 16 bits; dividing by it is exact."""
+    """Choose the largest power of two whose multiples fit 16 bits; division by it is exact."""
     known_px = np.concatenate([values[~np.isnan(values)] for values in disparities_px])
     least_px, most_px = known_px.min(initial=0), known_px.max(initial=0)
     if least_px < 0 or most_px >= _UNKNOWN:
         raise StereoweaveError(
-            f"a pair to be kept: expected disparities of 0 to {_UNKNOWN - 1} px, NaN where unknown, "
-            f"found {least_px:g} to {most_px:g}"
+            f"a pair to pack: expected disparities of 0 to {_UNKNOWN - 1} px, NaN where unknown, "
+            f"found {least_px:g} to {most_px:g} px"
         )
     return min(_MOST_STEPS_PER_PX, 2 ** int(math.log2((_UNKNOWN - 1) / max(most_px, 1))))
 
@@ -145,8 +153,8 @@ def _require_file(files: Mapping[str, bytes], name: str) -> bytes:
 
 
 def _decode(files: Mapping[str, bytes], name: str, kind: _Kind) -> Shaped[np.ndarray, "h w *channels"]:
-    """Decode a picture and check its kind."""
+    """Decode a picture; require the given data type and channels."""
     values = decode_packed_values(name, _require_file(files, name))
     if (values.dtype.type, values.shape[2:]) != kind:
-        raise ValueError(f"{name} of another kind of picture")
+        raise ValueError(f"{name} with another data type or number of channels")
     return values

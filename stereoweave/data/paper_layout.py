@@ -1,14 +1,16 @@
-"""The folders of "Fast Depth Estimation for View Synthesis" (section IV-A): left, right and depth.
+"""Datasets in the layout of "Fast Depth Estimation for View Synthesis" (section IV-A).
 
-The paper states that the left view's depth ranges from 0 to 15 m, but not the file format. Two formats are
+The folders are left, right and depth.
+
+The paper states that the left view's depth ranges from 0 to 15 m, but not the file format. Two formats can be
 read:
 
-- 16-bit grey PNG of millimetres; 0 and values beyond 15 m are unknown;
-- 8-bit RGB PNG of (R + 256 G + 65536 B) / (2^24 - 1) of 15 m, as the simulator CARLA packs depth; 0 and the
-  maximum are unknown, because the maximum also stands for anything beyond 15 m.
+- 16-bit grey PNG with millimetres; 0 and values beyond 15 m are unknown;
+- 8-bit RGB PNG with depth as a fraction of 15 m, (R + 256 G + 65536 B) / (2^24 - 1), as in the simulator
+  CARLA; 0 is unknown, and so is the maximum, which also represents anything beyond 15 m.
 
-The second is written. Each written frame has its checksums in sums/NAME.sha256, for sha256sum --check in the
-root. They are written last, so a frame with checksums is complete.
+Frames are written in the second format. Their checksums in sums/NAME.sha256, for `sha256sum --check` in the
+root, are written last, so a frame with checksums is complete.
 """
 
 import os
@@ -34,10 +36,10 @@ _ENDINGS = {"left": "png", "right": "png", "calib": "txt", "depth": "png"}
 
 
 def list_paper(root: Path) -> list[Frame]:
-    """Frames from the folders left, right and depth, with files of equal names, such as scene/0001.
+    """List the frames in the folders left, right and depth, whose files have equal names, such as scene/0001.
 
-    The camera is in Middlebury's format: calib.txt beside the folders for all frames, or
-    calib/scene/0001.txt for each.
+    The camera is in Middlebury's format: calib.txt beside the folders applies to all frames;
+    calib/scene/0001.txt applies to one.
     """
     camera = root / "calib.txt"
     if not (camera.exists() or (root / "calib").is_dir()):
@@ -52,15 +54,15 @@ def list_paper(root: Path) -> list[Frame]:
 
 
 def write_frame(root: Path, name: str, sample: Sample) -> None:
-    """Write a frame with its camera, and its checksums last, which mark it complete.
+    """Write a frame and its camera; its checksums, written last, mark it as complete.
 
-    Depth of 15 m or more becomes unknown, the limit of the paper's camera.
+    Depth of 15 m or more, beyond the range of the paper's camera, becomes unknown.
 
     Raises:
         StereoweaveError: The sample has no camera, or the folder is full or not writable.
     """
     if sample.camera is None:
-        raise StereoweaveError(f"{root}: expected a sample with its camera, to write its depth, found none")
+        raise StereoweaveError(f"{root}: expected a sample whose camera is known, to write depth, found none")
     files = _frame_files(root, name)
     write_image(files["left"], sample.left)
     write_image(files["right"], sample.right)
@@ -71,13 +73,13 @@ def write_frame(root: Path, name: str, sample: Sample) -> None:
 
 
 def list_complete_frames(root: Path) -> list[str]:
-    """Names of the completely written frames."""
+    """Return the names of the completely written frames, sorted."""
     sums = root / "sums"
     return sorted(path.relative_to(sums).with_suffix("").as_posix() for path in sums.rglob("[!.]*.sha256"))
 
 
 def remove_unfinished(root: Path) -> None:
-    """Remove the files of incomplete frames; no other process may be writing."""
+    """Remove the files of incomplete frames; no other process may be writing to the folder."""
     whole = set(list_complete_frames(root))
     for folder in (root / name for name in _ENDINGS):
         for path in folder.rglob("*.*"):
@@ -86,7 +88,7 @@ def remove_unfinished(root: Path) -> None:
 
 
 def check_frame(root: Path, name: str) -> None:
-    """Raise a FormatError that names a damaged or missing file of a written frame."""
+    """Raise a FormatError if a file of a written frame is damaged or missing."""
     sums = _checksum_file(root, name)
     with reading(sums, "the checksums of a frame"):
         expected = sums.read_bytes()
@@ -95,7 +97,7 @@ def check_frame(root: Path, name: str) -> None:
         for path in _frame_files(root, name).values()
         if path.exists()
     }
-    remedy = f"delete {sums}, and the same stereoweave synth make makes it again"
+    remedy = f"delete {sums}, and rerun the same `stereoweave synth make` command"
     verify_checksums(contents, expected, root, remedy)
 
 
@@ -108,7 +110,7 @@ def _read(files: list[Path], camera: Path) -> Sample:
 
 
 def _unpack_depth_m(stored: Shaped[np.ndarray, "h w *channels"]) -> Float[np.ndarray, "h w"]:
-    """Depth in metres; unknown is NaN."""
+    """Return the depth in metres, NaN where unknown, given a picture in either format."""
     if stored.ndim == 2:
         return np.where((stored > 0) & (stored <= 1000 * RANGE_M), stored / 1000, np.nan)
     packed = stored @ np.array([1, 256, 65536])
@@ -116,7 +118,7 @@ def _unpack_depth_m(stored: Shaped[np.ndarray, "h w *channels"]) -> Float[np.nda
 
 
 def _pack_depth(depth_m: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """The inverse of `_unpack_depth_m`. A known depth is stored as at least 1, because 0 means unknown."""
+    """Pack depth into RGB, as `_unpack_depth_m` reads it; known depth becomes at least 1, as 0 is unknown."""
     known = (depth_m > 0) & (depth_m < RANGE_M)
     number = np.rint(np.where(known, depth_m, 0) / RANGE_M * _PACKED_MAX).clip(1, _PACKED_MAX - 1)
     number = np.where(known, number, 0).astype(np.uint32)
@@ -141,7 +143,7 @@ def _checksum_file(root: Path, name: str) -> Path:
 
 
 def _read_synced(path: Path) -> bytes:
-    """Read a file after syncing it to disk, so that a crash cannot keep its checksums and lose the file."""
+    """Read a file after syncing it to disk: a crash must not preserve its checksums but lose the file."""
     with path.open("rb") as stream:
         os.fsync(stream.fileno())
         return stream.read()

@@ -1,4 +1,4 @@
-"""Datasets by name, as frames for training, and scenes for scoring a matcher."""
+"""Access to datasets by name, as frames for training or as scenes for scoring a matcher."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -39,17 +39,17 @@ DATASETS: dict[str, Callable[[Path], list[Frame]]] = {
 
 
 def open_dataset(name: str, root: str | Path) -> list[Frame]:
-    """List the frames of a dataset, sorted by name, from the folder of its unpacked archives.
+    """List the frames of a dataset, sorted by name, given the folder of its unpacked archives.
 
     Raises:
         StereoweaveError: The dataset is unknown, a folder is missing, or there is no frame.
-        FormatError: The listing shows that a file is missing; a frame's `read` reports other missing files.
+        FormatError: A file is visibly missing from a listing; a frame's `read` reports other missing files.
     """
     if name not in DATASETS:
         raise StereoweaveError(f"expected one of {', '.join(DATASETS)}, found {name!r}", setting="dataset")
     frames = DATASETS[name](require_folder(Path(root)))
     if not frames:
-        raise StereoweaveError(f"{root}: expected the frames of {name}, unpacked as they come, found none")
+        raise StereoweaveError(f"{root}: expected the unpacked archives of {name}, found no frame")
     return sorted(frames, key=lambda frame: frame.name)
 
 
@@ -59,8 +59,8 @@ class Scene:
 
     Attributes:
         name: Name of the folder or frame.
-        pair: With its camera if known.
-        truth_px: float32 [H, W], true disparity of the left view; unknown is NaN.
+        pair: The pair, with its camera if known.
+        truth_px: float32 [H, W], true disparity of the left view; NaN where unknown.
         occluded: True occlusion of the left view; None if the right view's disparity is unknown.
     """
 
@@ -71,24 +71,24 @@ class Scene:
 
 
 def read_scenes(folder: str | Path, dataset: str | None = None) -> Iterator[Scene]:
-    """Read the scenes of `folder` lazily, sorted by name; arguments and errors as for `list_scenes`."""
+    """Return an iterator over the scenes of `folder`; arguments and errors are those of `list_scenes`."""
     return (read() for read in list_scenes(folder, dataset))
 
 
 def list_scenes(folder: str | Path, dataset: str | None = None) -> list[Callable[[], Scene]]:
-    """List the scenes of `folder` by name, as functions that read them.
+    """List the scenes of `folder`, sorted by name, as functions that read them.
 
     A scene is a folder with left.png, right.png, disparity.png (16 bit, pixels * 256, 0 = unknown) or
-    disparity.pfm (NaN or infinity = unknown), and optionally Middlebury's calib.txt. Without such folders
-    the scenes are the pairs of all rendered sets (`stereoweave synth make`) in `folder`.
+    disparity.pfm (NaN or infinity = unknown), and optionally Middlebury's calib.txt. If there are no such
+    folders, the scenes are the pairs of all rendered sets (`stereoweave synth make`) in `folder`.
 
     Args:
         folder: Folder of the scenes.
         dataset: Name in `DATASETS` of a dataset to read instead.
 
     Raises:
-        StereoweaveError: No scene in the folder, or as for `open_dataset`.
-        FormatError: On reading a scene: a file is missing, damaged or of a different size.
+        StereoweaveError: The folder has no scene, or `open_dataset` raises the error.
+        FormatError: Raised when a scene is read, if a file is missing, is damaged or has a different size.
     """
     if dataset:
         return [partial(_read_frame, frame) for frame in open_dataset(dataset, folder)]
@@ -98,8 +98,8 @@ def list_scenes(folder: str | Path, dataset: str | None = None) -> list[Callable
     frames = shards.list_frames(Path(folder))
     if not frames:
         raise StereoweaveError(
-            f"{folder}: expected <scene>/left.png below it, found none, and no rendered set; "
-            "a dataset has to be named"
+            f"{folder}: expected <scene>/left.png below it, or rendered sets, found neither; "
+            "if it is a dataset, give its name"
         )
     return [partial(_read_frame, frame) for frame in frames]
 
@@ -119,7 +119,7 @@ def _read_scene(folder: Path) -> Scene:
     truth_px = _read_truth(folder)
     if truth_px.shape != pair.left.shape[:2]:
         raise FormatError(
-            f"{folder}: expected ground truth of shape {pair.left.shape[:2]}, like its pictures, "
+            f"{folder}: expected ground truth of the pictures' shape {pair.left.shape[:2]}, "
             f"found {truth_px.shape}"
         )
     return Scene(name=folder.name, pair=pair, truth_px=truth_px)

@@ -1,4 +1,4 @@
-"""Samples from a dataset's arrays: sizes checked, unknown and occluded pixels marked."""
+"""Conversion of a dataset's arrays to samples, with unknown and occluded pixels marked."""
 
 from pathlib import Path
 
@@ -8,18 +8,18 @@ from jaxtyping import Bool, Float, Shaped
 from stereoweave.errors import FormatError
 from stereoweave.stereo import Sample, StereoPair
 
-# As in the project's collages: allows for rounding and nearly touching surfaces.
+# The tolerance of the project's collages, which allows for rounding and nearly touching surfaces.
 _TOLERANCE_PX = 0.5
 
 
 def require_size(
     values: Shaped[np.ndarray, "h w *channels"], path: Path, pair: StereoPair
 ) -> Shaped[np.ndarray, "h w *channels"]:
-    """Return the values; raise a FormatError that names `path` if their size is not the pair's."""
+    """Return the values; raise a FormatError that names `path` if their size differs from the pair's size."""
     (height_px, width_px), expected = values.shape[:2], pair.left.shape[:2]
     if (height_px, width_px) != expected:
         raise FormatError(
-            f"{path}: expected {expected[1]}x{expected[0]} pixels, like the pictures it belongs to, "
+            f"{path}: expected {expected[1]}x{expected[0]} pixels, like the pictures of its pair, "
             f"found {width_px}x{height_px}"
         )
     return values
@@ -34,10 +34,10 @@ def make_sample(
     """Make a sample from a pair and its ground truth.
 
     Args:
-        pair: With its camera if known.
-        disparity_px: Left view's disparity; NaN and infinity mean unknown.
-        right_disparity_px: Right view's disparity; None means unknown everywhere.
-        occluded: The dataset's mask of the left view; None computes it from the two disparities.
+        pair: The pair, with its camera if known.
+        disparity_px: Disparity of the left view; NaN and infinity mean unknown.
+        right_disparity_px: Disparity of the right view; None if it is unknown everywhere.
+        occluded: The dataset's mask for the left view; default: computed from the two disparities.
     """
     left_px = _mark_unknown(disparity_px)
     right_px = (
@@ -57,10 +57,10 @@ def make_sample(
 def find_occluded(
     disparity_px: Float[np.ndarray, "h w"], other_px: Float[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Find occluded pixels: the match lies outside the other picture or behind its visible surface.
+    """Return the mask of pixels whose match is outside the other image or behind the surface seen at it.
 
-    False if a needed disparity is unknown. The other view is to the right of this one; mirror both maps for
-    a right view.
+    A pixel is not marked if a disparity needed for this is unknown. The other view is to the right of this
+    one; for a right view, mirror both maps.
     """
     width_px = disparity_px.shape[1]
     match = np.arange(width_px) - disparity_px
@@ -70,8 +70,8 @@ def find_occluded(
     share = (match - before).astype(np.float32)
     after = before + (share > 0)
     before_px, after_px = (np.take_along_axis(other_px, columns, axis=1) for columns in (before, after))
-    # At a jump the closer of the two columns beside the match decides. On a slope that column may be nearer
-    # than the surface itself, but the interpolated value is not. Comparisons with NaN are False.
+    # At a disparity jump, the closer of the two columns beside the match decides. On a slope, that column may
+    # be nearer than the surface itself, but the interpolated value is not. Comparisons with NaN are False.
     column_px = np.where(share < 0.5, before_px, after_px)
     between_px = (1 - share) * before_px + share * after_px
     return outside | (np.minimum(column_px, between_px) > disparity_px + _TOLERANCE_PX)

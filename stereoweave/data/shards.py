@@ -1,8 +1,9 @@
-"""Large sets as tar files in webdataset's format, read by index or nearly sequentially.
+"""Large sets as tar files in webdataset's format, which are read by index or nearly sequentially.
 
-A set is a folder of shards SET-FIRST-LAST.tar, named after their first and last pair: ship-000050-000099.tar.
-Its pair 57 is the files ship-000057.left.webp and so on (packing.py) and their checksums,
-ship-000057.sha256. Equal pairs give equal bytes. A shard is written atomically and never changed.
+A set is a folder of shards SET-FIRST-LAST.tar, named after their first and last pair, such as
+ship-000050-000099.tar. Its pair 57 consists of the files of packing.py, such as ship-000057.left.webp, and of
+their checksums, ship-000057.sha256. Equal pairs give equal bytes. A shard is written atomically and never
+changed.
 """
 
 import os
@@ -30,9 +31,9 @@ from stereoweave.stereo import Sample
 Unpacked = TypeVar("Unpacked")
 
 _SUMS = "sha256"
-_DELETE = "delete it, and the same stereoweave synth make makes its pairs again"
+_DELETE = "delete it, and rerun the same `stereoweave synth make` command"
 _NAME = re.compile(r"(.+)-(\d{6,})-(\d{6,})\.tar")
-# Shards whose pairs are mixed in `Shards.order`: 400 pairs, as `stereoweave synth make` writes them.
+# Number of shards among which `Shards.order` mixes pairs: 400 pairs if `stereoweave synth make` wrote them.
 _WINDOW = 8
 
 
@@ -45,12 +46,12 @@ class Shard(NamedTuple):
     last: int
 
     def pair_name(self, number: int) -> str:
-        """Common prefix of a pair's file names."""
+        """Return the common prefix of a pair's file names."""
         return f"{self.set_name}-{number:06d}"
 
 
 def write_shard(folder: Path, set_name: str, first: int, pairs: Sequence[Mapping[str, bytes]]) -> None:
-    """Write pairs packed by `packing.pack`, numbered from `first`, as one shard.
+    """Write a shard of pairs packed by `packing.pack` and numbered from `first`.
 
     Raises:
         StereoweaveError: The folder is full or not writable; no partial shard remains.
@@ -61,7 +62,7 @@ def write_shard(folder: Path, set_name: str, first: int, pairs: Sequence[Mapping
         with tarfile.open(fileobj=stream, mode="w", format=tarfile.USTAR_FORMAT) as tar:
             for number, pair in enumerate(pairs, first):
                 _add_pair(tar, shard.pair_name(number), pair)
-        # Without the sync, a power failure could keep the new name and lose the bytes.
+        # Without the sync, a power failure could preserve the new name but lose the content.
         stream.flush()
         os.fsync(stream.fileno())
 
@@ -71,10 +72,10 @@ def list_shards(folder: Path, set_name: str | None = None) -> list[Shard]:
 
     Args:
         folder: Folder of the set.
-        set_name: Name of the set; None takes it from the first shard.
+        set_name: Name of the set; default: that of the first shard.
 
     Raises:
-        FormatError: A shard belongs to another set, or overlaps the one before it.
+        FormatError: A shard belongs to another set, or overlaps the previous one.
     """
     names = ((path, _NAME.fullmatch(path.name)) for path in folder.glob("[!.]*.tar"))
     shards = [Shard(path, found[1], int(found[2]), int(found[3])) for path, found in names if found]
@@ -82,28 +83,28 @@ def list_shards(folder: Path, set_name: str | None = None) -> list[Shard]:
     for shard in shards:
         if shard.set_name != (expected := set_name or shards[0].set_name):
             raise FormatError(
-                f"{shard.path}: expected a shard of {expected}, found another set's; move or delete it"
+                f"{shard.path}: expected a shard of {expected}, found one of another set; move or delete it"
             )
     for before, shard in pairwise(shards):
         if shard.first <= before.last:
             raise FormatError(
-                f"{shard.path}: expected no pair of {before.path.name}, found some in both; {_DELETE}"
+                f"{shard.path}: expected no pair of {before.path.name}, found some in both shards; {_DELETE}"
             )
     return shards
 
 
 class Shards:
-    """Pairs of a set by index; can be pickled, and keeps no file open."""
+    """The pairs of a set, by index; an object can be pickled and keeps no file open."""
 
     def __init__(self, folder: Path, set_name: str | None = None) -> None:
         """List the shards of a folder.
 
         Raises:
-            FormatError: There is no shard or a gap between shards, or as in `list_shards`.
+            FormatError: There is no shard, there is a gap between shards, or `list_shards` raises the error.
         """
         self.shards = list_shards(folder, set_name)
         if not self.shards:
-            raise FormatError(f"{folder}: expected shards like ship-000000-000049.tar, found none")
+            raise FormatError(f"{folder}: expected shards such as ship-000000-000049.tar, found none")
         self._starts = [0]
         for shard in self.shards:
             if shard.first != self._starts[-1]:
@@ -119,15 +120,19 @@ class Shards:
         return self._unpack_pair(index, unpack)
 
     def name(self, index: int) -> str:
-        """Common prefix of the pair's file names."""
+        """Return the common prefix of a pair's file names."""
         return self._find_shard(index).pair_name(index)
 
     def views(self, index: int) -> dict[float, UInt8[np.ndarray, "h w 3"]]:
-        """Additional views of a pair, by position."""
+        """Return the additional views of a pair, by position."""
         return self._unpack_pair(index, unpack_views)
 
     def files(self, index: int) -> dict[str, bytes]:
-        """Read and verify a pair's files, by suffix; raises FormatError if one is damaged."""
+        """Return the verified content of a pair's files, by suffix.
+
+        Raises:
+            FormatError: A file is damaged or missing.
+        """
         path, name = self._find_shard(index).path, self.name(index)
         with reading(path, "a shard"), path.open("rb") as stream:
             places = self._locate_files(path).get(name, {})
@@ -137,7 +142,7 @@ class Shards:
         return {end.removeprefix(f"{name}."): content for end, content in files.items()}
 
     def order(self, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
-        """Shuffle all indices so that reading them visits a few shards at a time, each once."""
+        """Return all indices in an order that is random but reads only a few shards at a time, each once."""
         sizes = np.diff(self._starts)
         window = rng.permutation(len(sizes)) // _WINDOW
         return np.lexsort((rng.random(self.count), window.repeat(sizes)))
@@ -148,8 +153,8 @@ class Shards:
             return unpack(files)
         except (ValueError, KeyError, TypeError) as error:  # valid checksums do not prove who wrote the files
             raise FormatError(
-                f"{self._find_shard(index).path}: expected the files of a pair, found {self.name(index)} "
-                f"without or with damaged ones ({error}); {_DELETE}"
+                f"{self._find_shard(index).path}: expected all files of a pair, found {self.name(index)} with "
+                f"missing or damaged ones ({error}); {_DELETE}"
             ) from error
 
     def _find_shard(self, index: int) -> Shard:
@@ -158,14 +163,14 @@ class Shards:
         return self.shards[bisect_right(self._starts, index) - 1]
 
     def _locate_files(self, path: Path) -> dict[str, dict[str, tuple[int, int]]]:
-        """Offset and size of each pair's files in a shard; cached, because reading them is slow."""
+        """Return offset and size of each pair's files in a shard; they are cached because reading is slow."""
         if path not in self._contents:
             self._contents[path] = _list_contents(path)
         return self._contents[path]
 
 
 def list_frames(root: Path) -> list[Frame]:
-    """Pairs of all sets in a folder and its subfolders, named SUBFOLDER/ship-000057."""
+    """List the pairs of all sets in a folder and its subfolders, such as SUBFOLDER/ship-000057."""
     frames = []
     for folder in sorted({path.parent for path in root.rglob("[!.]*.tar") if _NAME.fullmatch(path.name)}):
         pairs = Shards(folder)
@@ -200,7 +205,7 @@ def _list_contents(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
                 contents[name][end] = member.offset_data, member.size
     except tarfile.TarError as error:
         raise FormatError(
-            f"{path}: expected a shard, a tar file, found a damaged one ({error}); {_DELETE}"
+            f"{path}: expected a shard, which is a tar file, found a damaged one ({error}); {_DELETE}"
         ) from error
     return dict(contents)
 

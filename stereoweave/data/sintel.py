@@ -1,4 +1,4 @@
-"""MPI Sintel stereo, training set (Butler et al. 2012; Wulff and Black 2015), as unpacked."""
+"""Training set of MPI Sintel stereo (Butler et al. 2012; Wulff and Black 2015), as unpacked."""
 
 import struct
 from dataclasses import replace
@@ -23,9 +23,9 @@ _CAM_TAG = 202021.25
 
 
 def list_sintel(root: Path) -> list[Frame]:
-    """The 1,064 frames of `root`/training in passes "clean" and "final": clean/alley_1/frame_0001.
+    """List the 1,064 frames of `root`/training in both passes, such as clean/alley_1/frame_0001.
 
-    The camera is known if training/camdata_left, from the archive of Sintel's depth, is unpacked too.
+    The camera is known if training/camdata_left, which is in the archive of Sintel's depth, is unpacked too.
     """
     training = root / "training"
     truth = [training / folder for folder in ("disparities", "occlusions", "outofframe")]
@@ -43,7 +43,7 @@ def _read(files: list[Path], camera: Path) -> Sample:
     if camera.parents[1].is_dir():
         pair = replace(pair, camera=_read_camera(camera))
     packed = require_size(read_pixels(disparity, "RGB"), disparity, pair)
-    # Both masks mark pixels invisible to the right camera: occluded, or outside its picture.
+    # Both masks mark pixels that the right camera does not see: occluded ones, and those outside its picture.
     occluded = [
         require_size(read_pixels(mask, "L", "1"), mask, pair) > 0 for mask in (occlusions, outofframe)
     ]
@@ -51,15 +51,16 @@ def _read(files: list[Path], camera: Path) -> Sample:
 
 
 def _unpack_px(packed: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
-    """Disparity from its packing in RGB: R * 4 + G / 2^6 + B / 2^14.
+    """Return the disparity packed into RGB: R * 4 + G / 2^6 + B / 2^14.
 
-    The README calls them "negative disparities", because a match lies further left; the numbers are positive.
+    The README calls these values "negative disparities", because a match lies farther left, but the numbers
+    are positive.
     """
     return (packed @ np.array([4, 2**-6, 2**-14])).astype(np.float32)
 
 
 def _read_camera(path: Path) -> StereoCamera:
-    """The camera of a .cam file: a tag, then 3x3 intrinsics and 3x4 extrinsics, row by row, little-endian."""
+    """Read a .cam file: a tag, then 3x3 intrinsics and 3x4 extrinsics, row by row and little-endian."""
     with reading(path, "a camera of MPI Sintel"):
         content = read_small(path)
         if len(content) != _CAM.size or struct.unpack_from("<f", content)[0] != _CAM_TAG:

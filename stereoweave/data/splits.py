@@ -1,4 +1,4 @@
-"""Training and held-out frames of a dataset, by the rules in split_rules/."""
+"""Division of a dataset into training and held-out frames, by the rules in split_rules/."""
 
 import tomllib
 from fnmatch import fnmatchcase
@@ -19,7 +19,7 @@ def split_frames(frames: list[Frame], dataset: str, split: str) -> tuple[list[Fr
 
     Args:
         frames: Frames of one dataset, in any order.
-        dataset: Its name in `DATASETS`.
+        dataset: Name of the dataset in `DATASETS`.
         split: "random", as in the paper, or "disjoint", which holds out whole sequences or their ends.
 
     Raises:
@@ -31,7 +31,7 @@ def split_frames(frames: list[Frame], dataset: str, split: str) -> tuple[list[Fr
     if not (training and held_out):
         raise StereoweaveError(
             f"split {split!r} of {dataset}: expected frames to train on and frames to hold out, "
-            f"found {len(training)} and {len(held_out)}; is the dataset all there?"
+            f"found {len(training)} and {len(held_out)}; is the dataset complete?"
         )
     return training, [frame for frame in ordered if frame.name in held_out]
 
@@ -41,7 +41,7 @@ def _read_rule(dataset: str, split: str) -> dict[str, Any]:
         raise StereoweaveError(f"expected one of {', '.join(SPLITS)}, found {split!r}", setting="split")
     rules = tomllib.loads((files(__package__) / "split_rules" / f"{split}.toml").read_text(encoding="utf-8"))
     if dataset not in rules:
-        raise StereoweaveError(f"split of a dataset: expected one of {', '.join(rules)}, found {dataset!r}")
+        raise StereoweaveError(f"dataset to split: expected one of {', '.join(rules)}, found {dataset!r}")
     return rules[dataset]
 
 

@@ -1,1 +1,1 @@
-"""Stereo matching: from a pair to an estimate."""
+"""Stereo matching: estimates the disparity of a rectified pair."""

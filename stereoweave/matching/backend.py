@@ -1,4 +1,4 @@
-"""Network, threads and provider used for matching."""
+"""Choice of network, threads and execution provider for matching."""
 
 import functools
 import threading
@@ -12,10 +12,10 @@ from stereoweave.system.threads import thread_count
 
 @dataclass(frozen=True, kw_only=True)
 class Backend:
-    """A network and how it runs; each process loads it once.
+    """A network and the settings it runs with; each process loads it once.
 
     Attributes:
-        model: Name of a shipped network, `best`, or path of an .onnx matcher.
+        model: Name of a shipped network, `best`, or the path of an .onnx matcher file.
         threads: Maximum number of threads per call; default: all cores.
         provider: Execution provider, a name in `providers.PROVIDERS`.
     """
@@ -63,11 +63,11 @@ class PinnedBackend(Backend):
         return self.pinned
 
 
-# lru_cache does not wait for a call that computes the same value: threads would load a network each.
+# lru_cache does not wait for a concurrent call with the same arguments: each thread would load the network.
 _LOADING = threading.Lock()
 
 
 @functools.lru_cache(maxsize=4)
 def _load(backend: Backend, path: Path, modified_ns: int) -> Matcher:
-    # path and modified_ns only serve as cache key: a relative path may now name another file.
+    # path and modified_ns are part of the cache key only: a relative path may now name another file.
     return Matcher(backend.model, threads=backend.threads, provider=backend.provider)

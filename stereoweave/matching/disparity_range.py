@@ -1,7 +1,7 @@
-"""Disparity range of a pair from sparse matches, without limits on the disparity.
+"""Detection of a pair's disparity range from sparse matches, with no limit on the disparity.
 
-In some rows of the downsampled pair, high-contrast pixels of the left image are searched along the whole row
-of the right one.
+High-contrast pixels in sampled rows of the downsampled left image are searched for along the entire row of
+the right image.
 """
 
 from typing import NamedTuple
@@ -16,21 +16,23 @@ _WIDTH_PX = 384
 _ROWS = 32
 # Size of the windows that are compared.
 _WINDOW_ROWS, _WINDOW_COLUMNS = 7, 11
-# At most one pixel per this many columns is searched, and only if its window has this contrast.
+# At most one pixel per this many columns is matched, and only if its window has at least this contrast.
 _SPACING_PX = 6
 _LEAST_CONTRAST_LEVELS = 3.0
-# Least correlation of a match (1 is equal), and the ratio test against the second-best peak in the row.
+# Least correlation of a match (1 means identical), and the limit of the ratio test against the second-best
+# peak in the row.
 _LEAST_LIKENESS = 0.8
 _MOST_AMBIGUOUS = 0.7
 _PEAK_PX = 2
-# A match counts if this many lie in its cell or the adjacent ones of a grid over column, row and disparity.
+# A match counts if its cell of a grid over column, row and disparity and the adjacent cells contain at least
+# this many matches.
 _SUPPORT = 4
 _CELL_PX = (32, 32, 3)
 _LEAST_MATCHES = 30
 _ENDS_PERCENT = 0.5
-# Margin for nearer surfaces without matches: a share of the range plus px of the downsampled pair.
+# Margin for nearer surfaces without matches: a share of the range, plus pixels of the downsampled pair.
 _MARGIN_SHARE, _MARGIN_PX = 0.06, 2.0
-# A region exceeds a range if at least this number and share of its matches do.
+# A region exceeds a range if at least this number and this share of its matches do.
 _LEAST_BEYOND, _LEAST_SHARE_BEYOND = 6, 0.1
 _SLACK_PX = 0.6
 
@@ -40,7 +42,7 @@ class _Texture(NamedTuple):
 
     Attributes:
         windows: Grey levels minus their local mean, in windows [first row, centre column, rows, columns].
-        scale: Factor that normalises the window around a pixel to length 1; 0 if it is plain, to exclude it.
+        scale: Factor that normalises the window around a pixel to length 1; 0 excludes plain windows.
     """
 
     windows: Float32[np.ndarray, "h2 w r c"]
@@ -48,10 +50,11 @@ class _Texture(NamedTuple):
 
 
 def find_range(pair: StereoPair) -> tuple[float, float] | None:
-    """Find the least and greatest disparity of the left view in px, which may be negative.
+    """Return the least and greatest disparity of the left view in px; either may be negative.
 
-    The greatest has a margin for nearer surfaces without matches. The least has none, because a network puts
-    a plain sky at the lower end of its range (5 px lower doubles the wrong pixels of a rendered ship).
+    The greatest disparity includes a margin for nearer surfaces without matches. The least disparity has no
+    margin, because a network assigns a plain sky the lower end of its range: with a least disparity 5 px too
+    low, a rendered ship has twice as many wrong pixels.
 
     Pixels without content are ignored. Returns None if there are too few matches, as in plain images or
     images of different scenes.
@@ -65,7 +68,7 @@ def find_range(pair: StereoPair) -> tuple[float, float] | None:
 
 
 def goes_beyond(pair: StereoPair, where: Bool[np.ndarray, "h w"], range_px: tuple[float, float]) -> bool:
-    """Whether a region of the left image contains disparities outside a range."""
+    """Return whether the region `where` of the left image contains disparities outside a range."""
     slack_px = _SLACK_PX * _scale(pair.left)
     disparity_px = _find_disparities(pair, where)
     beyond = (disparity_px < range_px[0] - slack_px) | (disparity_px > range_px[1] + slack_px)
@@ -73,13 +76,13 @@ def goes_beyond(pair: StereoPair, where: Bool[np.ndarray, "h w"], range_px: tupl
 
 
 def _scale(image: UInt8[np.ndarray, "h w 3"]) -> float:
-    """Factor by which the image is downsampled."""
+    """Return the factor by which the image is downsampled."""
     width = image.shape[1]
     return width / min(width, _WIDTH_PX)
 
 
 def _find_disparities(pair: StereoPair, where: Bool[np.ndarray, "h w"] | None) -> Float[np.ndarray, " n"]:
-    """Disparities in px of the matched pixels, only those in the mask `where` if given."""
+    """Return the disparities in px of the matched left pixels, restricted to the mask `where` if given."""
     left, right = _small_grey(pair.left), _small_grey(pair.right)
     wanted = _find_inner(pair.left_seen, left)
     if where is not None:
@@ -104,7 +107,7 @@ def _small_mask(
 def _find_inner(
     seen: Bool[np.ndarray, "h w"] | None, small: Float32[np.ndarray, "h2 w2"]
 ) -> Bool[np.ndarray, "h2 w2"]:
-    """Mask of pixels whose whole window has content, since the border of the content is not texture."""
+    """Return the mask of pixels whose entire window has content: the content's border is not texture."""
     if seen is None:
         return np.ones(small.shape, bool)
     window = np.ones((_WINDOW_ROWS + 2, _WINDOW_COLUMNS + 2), np.uint8)
@@ -117,7 +120,7 @@ def _match_rows(
     wanted: Bool[np.ndarray, "h w"],
     seen: Bool[np.ndarray, "h w"],
 ) -> Float[np.ndarray, "n 3"]:
-    """Column, row and disparity in px of unambiguous matches that agree in both directions.
+    """Return column, row and disparity in px of the unambiguous matches that agree in both directions.
 
     Args:
         left: Left image, grey levels.
@@ -141,9 +144,9 @@ def _match_rows(
 def _peaks(
     likeness: Float32[np.ndarray, "n w"],
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Best column in each row of `likeness`, the subpixel offset of its peak, and whether it is unambiguous.
+    """Return each row's best column, the subpixel offset of its peak, and whether the peak is unambiguous.
 
-    Overwrites the values near the peaks.
+    The values of `likeness` near the peaks are overwritten.
     """
     width = likeness.shape[1]
     each, best = np.arange(len(likeness)), likeness.argmax(1)
@@ -151,7 +154,7 @@ def _peaks(
     near = np.clip(best[:, None] + np.arange(-_PEAK_PX, _PEAK_PX + 1), 0, width - 1)
     np.put_along_axis(likeness, near, -1, 1)
     sure = (highest >= _LEAST_LIKENESS) & (1 - highest <= _MOST_AMBIGUOUS * (1 - likeness.max(1)))
-    # Vertex of the parabola through the maximum and its neighbours.
+    # Vertex of the parabola through the maximum and its two neighbours.
     bend = np.maximum(2 * highest - before - behind, 1e-6)
     return best, np.clip((behind - before) / (2 * bend), -0.5, 0.5), sure
 
@@ -159,7 +162,7 @@ def _peaks(
 def _find_salient(
     grey: Float32[np.ndarray, "h w"], rows: Int[np.ndarray, " r"], wanted: Bool[np.ndarray, "h w"]
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """Rows and columns of the highest gradient in every _SPACING_PX columns, where wanted."""
+    """Return the row and column of the steepest pixel in every _SPACING_PX columns, if it is wanted."""
     steps = np.abs(cv2.Sobel(grey, cv2.CV_32F, 1, 0))[rows]
     count = grey.shape[1] // _SPACING_PX
     cells = steps[:, : count * _SPACING_PX].reshape(len(rows), count, _SPACING_PX)
@@ -172,7 +175,7 @@ def _find_salient(
 def _texture(grey: Float32[np.ndarray, "h w"]) -> _Texture:
     size = (_WINDOW_COLUMNS, _WINDOW_ROWS)
     uneven = grey - cv2.blur(grey, size)
-    # Rounding in cv2.blur may give values slightly below 0.
+    # Rounding in cv2.blur may produce values slightly below 0.
     contrast = np.sqrt(np.maximum(cv2.blur(uneven * uneven, size), 0))
     length = np.sqrt(np.float32(_WINDOW_ROWS * _WINDOW_COLUMNS)) * contrast
     scale = np.zeros_like(length)
@@ -185,21 +188,21 @@ def _texture(grey: Float32[np.ndarray, "h w"]) -> _Texture:
 def _likeness(
     own: _Texture, rows: Int[np.ndarray, " n"], columns: Int[np.ndarray, " n"], other: _Texture
 ) -> Float32[np.ndarray, "n w"]:
-    """Correlation of the window around each pixel with all windows in the other image's row."""
+    """Return the correlation of the window around each pixel with every window in the other image's row."""
     width, pixels = other.scale.shape[1], _WINDOW_ROWS * _WINDOW_COLUMNS
     likeness = np.empty((len(rows), width), np.float32)
-    # Row by row, so that its windows, a matrix [77, W], stay in the CPU's cache.
+    # Row by row: a row's windows, a matrix [77, W], stay in the CPU cache.
     for row in np.unique(rows):
         here, first = rows == row, row - _WINDOW_ROWS // 2
         within = own.windows[first, columns[here]].reshape(-1, pixels)
         along = other.windows[first].transpose(1, 2, 0).reshape(pixels, width)
-        # Not a matrix product, for which NumPy would use all cores regardless of the caller's limit.
+        # einsum, because NumPy's matrix product would use all cores regardless of the caller's limit.
         likeness[here] = np.einsum("nk,kw->nw", within, along)
     return likeness * own.scale[rows, columns, None] * other.scale[rows]
 
 
 def _keep_supported(matches: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """Keep the matches with enough neighbours of similar disparity."""
+    """Return the matches that have enough neighbours of similar disparity."""
     if not len(matches):
         return matches
     cells = (matches // _CELL_PX).astype(int)

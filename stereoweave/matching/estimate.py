@@ -1,8 +1,8 @@
 """`stereoweave.estimate`: matching of pairs of any size and disparity range.
 
-A network covers disparities from 0 to its maximum, in images up to a certain size. To cover other disparities
-the right image is shifted along its rows; to cover wider ranges and larger images both are scaled down, and
-`upsample` brings the estimate back to full size.
+A network covers disparities from 0 to its maximum, in images up to a certain size. For other disparities, the
+right image is shifted along its rows. For wider ranges and larger images, both images are scaled down, and
+`upsample` restores the estimate to full size.
 """
 
 import math
@@ -31,30 +31,31 @@ from stereoweave.matching.refine import right_confidence
 from stereoweave.matching.upsample import enlarge
 from stereoweave.stereo import LONGEST_SIDE_PX, Estimate, StereoPair
 
-# Beyond its range a network often predicts the end of the range, with a confidence between these two.
+# Where the true disparity is beyond its range, a network often predicts the end of the range, with a
+# confidence between these two.
 _CONFIDENT, _CONFIDENT_AT_END = 0.5, 0.9
 # The disparity range is searched if at least this percentage of the pixels is doubtful.
 _DOUBTFUL_PERCENT = 1.0
 # A network is less accurate near the ends of its range.
 _MARGIN_PX = 4
-# Disparities farther than this outside a given range are wrong, not just rounded.
+# Disparities more than this outside a given range are wrong, not just rounded.
 _OUTSIDE_PX = 1
 # Usable share of PIXEL_PAIRS_AT_ONCE, because the number of rows is rounded to a multiple.
 _FILLED = 0.95
-# Maximum combined rounding error of width and shift.
+# Greatest combined rounding error of width and shift.
 _ROUNDED_PX = 2
-# A second, magnified run below this magnification is not worth its time. Its range is that of a grid of
-# pixels, without this percentage at both ends.
+# Below this magnification, a second, magnified run is not worth its time. Its disparity range is measured on
+# a grid of pixels with this spacing, ignoring this percentage at both ends.
 _LEAST_MAGNIFICATION = 1.1
 _ENDS_PERCENT, _STEP_PX = 0.5, 4
-# Disparities of the magnified pair that differ by more belong to different surfaces.
+# Disparities of the magnified pair that differ by more than this belong to different surfaces.
 _OTHER_SURFACE_PX = 3.0
 # Median window applied to a magnified estimate before it is sampled at the pair's size.
 _MEDIAN_PX = 3
 
 
 class _NetworkInput(NamedTuple):
-    """Network input for a pair: the scaled pair, and the shift of its right image in px, if any."""
+    """Network input for a pair: the scaled pair, and the shift of its right image in px (None: no shift)."""
 
     small: StereoPair
     least_px: int | None = None
@@ -71,14 +72,14 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
     raw: bool = False,
     range_px: tuple[float, float] | None = None,
 ) -> Estimate:
-    """Disparity of both views, confidence and occlusion of a rectified pair.
+    """Estimate the disparity of both views, confidence and occlusion of a rectified pair.
 
     Args:
         left: Left image, at least 32x32: uint8 RGB [H, W, 3], or another type that `arrays.as_rgb` accepts,
             such as a PIL image or a PyTorch tensor.
         right: Right image of the same size.
-        model: Name of a shipped network, `best` (network base, run again at 1.5 times the size and refined),
-            or path of an .onnx matcher; loaded on the first call and cached.
+        model: Name of a shipped network; `best`, which runs network base a second time at 1.5 times the size
+            and refines its answer; or the path of an .onnx matcher file. Loaded on the first call and cached.
         threads: Maximum number of threads; default: all cores.
         provider: Execution provider: cpu, cuda, tensorrt, openvino, coreml or directml.
         refined: See `MatchOptions`.
@@ -86,8 +87,8 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
         range_px: See `MatchOptions`.
 
     Raises:
-        ValueError: MatcherError for an unknown model or an unavailable provider, ProviderError for one that
-            fails, StereoweaveError for invalid images or options.
+        ValueError: MatcherError for an unknown model or an unavailable provider, ProviderError for a provider
+            that fails, StereoweaveError for invalid images or options.
     """
     options = MatchOptions(range_px=range_px, refined=refined, raw=raw)
     pair = StereoPair(left=as_rgb(left, "left"), right=as_rgb(right, "right"))
@@ -96,17 +97,17 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
 
 
 def match(matcher: Matcher, pair: StereoPair, options: MatchOptions = DEFAULT_OPTIONS) -> Estimate:
-    """Match a pair of any size; equals `matcher.estimate` if the network takes the whole pair in one run.
+    """Match a pair of any size, as `matcher.estimate` does if the network takes the whole pair in one run.
 
     Args:
         matcher: The network.
         pair: The rectified pair. Left pixels without content get confidence 0; pixels whose match has no
             content in the right image are marked occluded.
         options: Matching options; `refined` and `raw` apply at the network's input size. The disparities of
-            larger pairs are upsampled even if `raw`.
+            larger pairs are upsampled even if `raw` is set.
 
     Raises:
-        StereoweaveError: The range is outside the images' width, or a side is shorter than 32 px.
+        StereoweaveError: The disparity range is outside the images' width, or a side is shorter than 32 px.
     """
     (found,) = match_many(matcher, [pair], options)
     return found
@@ -115,7 +116,7 @@ def match(matcher: Matcher, pair: StereoPair, options: MatchOptions = DEFAULT_OP
 def match_many(
     matcher: Matcher, pairs: Sequence[StereoPair], options: MatchOptions = DEFAULT_OPTIONS
 ) -> list[Estimate]:
-    """Match pairs of any sizes as `match` does, batching those with the same network input size."""
+    """Match pairs of any sizes as `match` does, in batches of pairs with the same network input size."""
     every_shown = [_prepare_first_input(matcher, pair, options.range_px) for pair in pairs]
     moved = [_shift(shown) for shown in every_shown]
     of_size: dict[tuple[int, ...], list[int]] = {}
@@ -131,11 +132,11 @@ def match_many(
 
 
 def _clip_to_width(range_px: tuple[float, float], width_px: int) -> tuple[float, float]:
-    """Clip a disparity range to the disparities that images of this width can have."""
+    """Clip a disparity range to the disparities that are possible in images of this width."""
     low_px, high_px = range_px
     if low_px >= width_px or high_px <= -width_px:
         raise StereoweaveError(
-            f"expected disparities of {-width_px} to {width_px} px, the width of the pictures, "
+            f"expected disparities between {-width_px} and {width_px} px, the width of the pictures, "
             f"got {low_px:g} and {high_px:g}; omit it for automatic detection",
             setting="range_px",
         )
@@ -145,7 +146,7 @@ def _clip_to_width(range_px: tuple[float, float], width_px: int) -> tuple[float,
 def _prepare_first_input(
     matcher: Matcher, pair: StereoPair, range_px: tuple[float, float] | None
 ) -> _NetworkInput:
-    """Prepare the network's first input: the whole pair, or one that covers the given range."""
+    """Return the input of the network's first run, which covers the given range or the network's own."""
     seen = _fit_network(matcher, pair)
     if range_px is None:
         return _NetworkInput(seen)
@@ -157,7 +158,7 @@ def _prepare_first_input(
 def _finish(
     matcher: Matcher, pair: StereoPair, shown: _NetworkInput, found: Estimate, options: MatchOptions
 ) -> Estimate:
-    """Turn the network's output for its first input into the pair's estimate, with further runs if needed."""
+    """Return the pair's estimate, given the output of the network's first run; run it again if needed."""
     found = _undo_shift(shown, found)
     if options.range_px is None:
         beyond_px = _find_wider_range(shown.small, found, matcher.max_disparity_px)
@@ -180,7 +181,7 @@ def _finish(
 
 
 def _fit_network(matcher: Matcher, pair: StereoPair) -> StereoPair:
-    """Scale the pair down if the network would otherwise need strips, whose seams would be visible."""
+    """Scale the pair to the size of one network run: strips would leave visible seams."""
     height, width = pair.left.shape[:2]
     return _resize(pair, _find_downscale(matcher, width, height))
 
@@ -188,10 +189,10 @@ def _fit_network(matcher: Matcher, pair: StereoPair) -> StereoPair:
 def _find_downscale(
     matcher: Matcher, width: int, height: int, moved_px: int = 0, largest: float = 1.0
 ) -> float:
-    """Factor by which to scale down an image of this size so that the network takes it in one run.
+    """Return the factor by which to scale down an image of this size so that one network run suffices.
 
     A factor below 1 magnifies: it is 1 / largest if the network can take an image `largest` times as large.
-    A shift of moved_px widens the image.
+    A shift of moved_px makes the image wider by that much.
     """
     width += moved_px
     if matcher.sees_whole(round(width * largest), round(height * largest)):
@@ -221,10 +222,10 @@ def _resize(pair: StereoPair, scale: float) -> StereoPair:
 def _match_magnified(
     matcher: Matcher, pair: StereoPair, small: StereoPair, found: Estimate
 ) -> tuple[StereoPair, Estimate]:
-    """Run the network again on the pair magnified by `matcher.magnification`; merge both estimates.
+    """Run the network again on the pair magnified by up to `matcher.magnification`; merge both estimates.
 
-    Disparity range or memory may limit the magnification. The first estimate wins where it differs and is
-    more confident: beyond the network's range and on textureless surfaces.
+    The disparity range or memory may limit the magnification. Where the two estimates differ, the first one
+    is kept if it is more confident, which it is beyond the network's range and on textureless surfaces.
 
     Args:
         matcher: The matcher, with a magnification above 1.
@@ -233,7 +234,7 @@ def _match_magnified(
         found: The first run's estimate.
 
     Returns:
-        The magnified pair and its merged estimate; `small` and `found` if magnification is not worthwhile.
+        The magnified pair and the merged estimate; `small` and `found` if magnification is not worthwhile.
     """
     height, width = pair.left.shape[:2]
     seen = _resize(pair, _find_downscale(matcher, width, height, largest=matcher.magnification))
@@ -247,7 +248,7 @@ def _match_magnified(
 
 
 def _merge(closer: Estimate, found: Estimate) -> Estimate:
-    """Merge: `closer`, but `found` where it shows another surface with higher confidence."""
+    """Merge two estimates: `closer`, except where `found` has another surface with higher confidence."""
     size = closer.disparity_px.shape[::-1]
     scale = np.float32(size[0] / found.disparity_px.shape[1])
     found_px, right_found_px, confidence, right_trust = (
@@ -275,12 +276,12 @@ def _merge(closer: Estimate, found: Estimate) -> Estimate:
 def _is_other(
     one_px: Float[np.ndarray, "h w"], other_px: Float[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Mask of pixels where two disparities belong to different surfaces."""
+    """Return the mask of pixels where the two disparities belong to different surfaces."""
     return np.abs(one_px - other_px) > _OTHER_SURFACE_PX
 
 
 def _downsample(found: Estimate, pair: StereoPair) -> Estimate:
-    """Scale a magnified estimate down to the pair's size without mixing surfaces in a pixel."""
+    """Scale a magnified estimate down to the pair's size without mixing surfaces within a pixel."""
     size = pair.left.shape[1::-1]
     scale = np.float32(size[0] / found.disparity_px.shape[1])
     disparity_px, right_disparity_px = (
@@ -302,7 +303,10 @@ def _resize_nearest(values: Shaped[np.ndarray, "h w"], size: tuple[int, int]) ->
 def _find_wider_range(
     pair: StereoPair, found: Estimate, max_disparity_px: float
 ) -> tuple[float, float] | None:
-    """Find the pair's disparity range if it exceeds the network's, in which `found` was estimated."""
+    """Return the pair's disparity range if it exceeds the network's range; None otherwise.
+
+    `found` is the estimate within the network's range.
+    """
     doubtful = _find_doubtful(found, max_disparity_px)
     if 100 * doubtful.mean() < _DOUBTFUL_PERCENT or not goes_beyond(pair, doubtful, (0, max_disparity_px)):
         return None
@@ -310,7 +314,7 @@ def _find_wider_range(
 
 
 def _find_doubtful(found: Estimate, max_disparity_px: float) -> Bool[np.ndarray, "h w"]:
-    """Mask of uncertain pixels whose disparity may be outside the network's range."""
+    """Return the mask of uncertain pixels, whose true disparity may be outside the network's range."""
     near_end = np.abs(found.disparity_px - max_disparity_px / 2) > max_disparity_px / 2 - _MARGIN_PX
     doubtful = (found.confidence < _CONFIDENT) & ~found.occluded
     doubtful |= (near_end & (found.confidence < _CONFIDENT_AT_END)) | (found.disparity_px <= 0)
@@ -322,9 +326,9 @@ def _find_doubtful(found: Estimate, max_disparity_px: float) -> Bool[np.ndarray,
 def _prepare_for_range(
     matcher: Matcher, pair: StereoPair, seen: StereoPair, range_px: tuple[float, float]
 ) -> _NetworkInput:
-    """Prepare a network input that covers a disparity range, by scaling and shifting the pair.
+    """Scale and shift a pair so that the network covers a disparity range.
 
-    `seen` is the pair scaled so that the network takes it in one run; the range is in its pixels.
+    `seen` is the pair scaled so that the network takes it in one run; `range_px` is in pixels of `seen`.
     """
     low_px, high_px = range_px
     most_px = matcher.max_disparity_px
@@ -334,7 +338,7 @@ def _prepare_for_range(
     small = seen
     if scale > 1:
         small = _resize(pair, scale * pair.left.shape[1] / seen.left.shape[1])
-    # Shift by exactly the least disparity: a network puts a plain sky at the lower end of its range.
+    # Shift by exactly the least disparity: a network assigns a plain sky the lower end of its range.
     least_px = math.floor(low_px * small.left.shape[1] / seen.left.shape[1])
     height, width = small.left.shape[:2]
     smaller = _find_downscale(matcher, width, height, abs(least_px))
@@ -345,7 +349,7 @@ def _prepare_for_range(
 
 
 def _shift(shown: _NetworkInput) -> StereoPair:
-    """Shift the right image by padding both images; the pair as the network receives it."""
+    """Return the pair that the network receives: the right image is shifted by padding both images."""
     if shown.least_px is None:
         return shown.small
     (left_at, right_at), more = _start_columns(shown.least_px), abs(shown.least_px)
@@ -356,7 +360,7 @@ def _shift(shown: _NetworkInput) -> StereoPair:
 
 
 def _undo_shift(shown: _NetworkInput, found: Estimate) -> Estimate:
-    """Undo the shift and padding of the network's input in its estimate."""
+    """Undo the input's shift and padding in the network's estimate."""
     if shown.least_px is None:
         return found
     width, least_px = shown.small.left.shape[1], np.float32(shown.least_px)
@@ -372,7 +376,7 @@ def _undo_shift(shown: _NetworkInput, found: Estimate) -> Estimate:
 
 
 def _start_columns(least_px: int) -> tuple[int, int]:
-    """First columns of the left and right image within their padded versions."""
+    """Return the columns at which the left and right image start within their padded versions."""
     return (-least_px, 0) if least_px < 0 else (0, least_px)
 
 
@@ -381,7 +385,7 @@ def _pad_columns(image: np.ndarray, before: int, behind: int) -> np.ndarray:
 
 
 def _clip(found: Estimate, low_px: float, high_px: float) -> Estimate:
-    """Clip disparities to a range; those more than _OUTSIDE_PX outside get confidence 0."""
+    """Clip disparities to a range; pixels more than _OUTSIDE_PX outside get confidence 0."""
     outside_px = np.maximum(low_px - found.disparity_px, found.disparity_px - high_px)
     return replace(
         found,
@@ -392,7 +396,7 @@ def _clip(found: Estimate, low_px: float, high_px: float) -> Estimate:
 
 
 def _apply_masks(found: Estimate, pair: StereoPair) -> Estimate:
-    """Apply the pair's content masks to confidence and occlusion."""
+    """Apply the content masks: zero confidence without left content, occlusion without right content."""
     confidence, occluded = found.confidence, found.occluded
     if pair.left_seen is not None:
         confidence = np.where(pair.left_seen, confidence, np.float32(0))

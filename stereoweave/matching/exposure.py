@@ -1,7 +1,7 @@
-"""Equalise exposure and colour of the two images of a pair.
+"""Equalisation of exposure and colour between the two images of a pair.
 
-Matched pixels give the correspondence between the levels of both images, channel by channel. Images that
-agree up to noise are left unchanged.
+The correspondence between the levels of both images is fitted to matched pixels, channel by channel. Images
+that differ only by noise are left unchanged.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float, Float32, Shaped, UInt8
 
 from stereoweave.stereo import Estimate
 
-# Both images are downsampled to about this many pixels: enough to fit a curve, and noise averages out.
+# Both images are downsampled to about this many pixels, which are enough to fit a curve and average out
+# noise.
 _PIXELS = 20_000
 _LEAST_CONFIDENCE = 0.5
 # Small matching errors do not matter where neighbours in the downsampled images differ by at most this.
@@ -21,17 +22,17 @@ _CALM_PX = 1.0
 _CALM_LEVELS = 32
 # A level this close to 0 or 255 may be clipped.
 _END_LEVELS = 4
-# Number of pixels without difference added to those at each end: black stays black and white stays white
-# without evidence against it.
+# This many pixels with no difference are added at each end: black stays black and white stays white unless
+# there is evidence to the contrary.
 _END_PRIOR = 3
-# A match is an outlier if its difference deviates from the median of its bin of levels by more than this many
-# median deviations and more than this many levels.
+# A match is an outlier if its level difference deviates from the median of its bin by more than this many
+# median deviations and by more than this many levels.
 _BIN_LEVELS = 16
 _OUTLIER_MEDIANS, _OUTLIER_LEVELS = 6, 8
 _KNOT_LEVELS = 5
-# Weight of the smoothness term. Errors are much the same from 0.03 to 1.
+# Weight of the smoothness term. Any value from 0.03 to 1 gives much the same errors.
 _STIFFNESS = 0.1
-# Small enough to decide only what data and smoothness leave undetermined.
+# Small enough to affect only what the data and the smoothness term leave undetermined.
 _PULL_TO_AGREEMENT = 1e-7
 # The correction fades in between these mean differences and numbers of matches, so that a video near the
 # threshold does not flicker.
@@ -43,7 +44,7 @@ _WHITE = (255, 255, 255)
 _ENDS = np.full(256, 255, np.uint8)
 _ENDS[_END_LEVELS : 256 - _END_LEVELS] = 0
 _IDENTITY = np.repeat(np.arange(256, dtype=np.float32)[:, None], 3, axis=1)
-# The means of two levels are multiples of 1/2.
+# The mean of two levels is a multiple of 1/2.
 _MEANS = np.arange(511) / 2
 _KNOTS = np.arange(0, 256, _KNOT_LEVELS)
 _HATS = np.maximum(1 - np.abs(_MEANS[:, None] - _KNOTS) / _KNOT_LEVELS, 0)
@@ -56,7 +57,7 @@ class _Channel(NamedTuple):
 
     Attributes:
         left, right: uint8 [N], mean level over a small window.
-        cut_off: bool [N], whether any level in either window may be clipped.
+        cut_off: bool [N], whether a level in either image's window may be clipped.
     """
 
     left: UInt8[np.ndarray, " n"]
@@ -64,7 +65,7 @@ class _Channel(NamedTuple):
     cut_off: Bool[np.ndarray, " n"]
 
     def swap(self) -> "_Channel":
-        """Return a copy with left and right exchanged."""
+        """Return a copy with left and right swapped."""
         return _Channel(self.right, self.left, self.cut_off)
 
 
@@ -82,11 +83,11 @@ class Looks:
     left_of_right: Float32[np.ndarray, "256 3"]
 
     def tables(self, position: float) -> tuple[Float32[np.ndarray, "256 3"], Float32[np.ndarray, "256 3"]]:
-        """Lookup tables [256, 3] that bring the left and the right image to a common look.
+        """Return lookup tables [256, 3] that give the left and the right image the same exposure and colour.
 
         Args:
-            position: 0 for the left image's look, whose table is then the identity; 1 for the right image's.
-                Interpolated linearly between, clamped outside 0..1.
+            position: 0 for the left image's look, for which the left table is the identity; 1 for the right
+                image's look. Values in between interpolate linearly; values outside 0..1 are clamped.
         """
         share = np.float32(np.clip(position, 0, 1))
         return (
@@ -98,18 +99,18 @@ class Looks:
 def recolour(
     image: UInt8[np.ndarray, "h w 3"], table: Float32[np.ndarray, "256 3"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Apply a lookup table with values in 0..255, rounded."""
+    """Apply a lookup table with values in 0..255 to each channel, and round the result."""
     return cv2.LUT(image, np.rint(table).astype(np.uint8)[None])
 
 
 def match_exposure(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], estimate: Estimate
 ) -> Looks | None:
-    """Fit the level correspondence of two images; None if they agree or too few pixels match.
+    """Fit the level correspondence of two images; return None if they agree or too few pixels match.
 
     Smooth curves equalise the histograms of reliably matched pixels, because small disparity errors swap
     neighbouring pixels but hardly change histograms. The correction fades out as the mean difference
-    approaches that caused by noise and lenses alone.
+    approaches the level caused by noise and lenses alone.
 
     Args:
         left: Left image, uint8 RGB [H, W, 3].
@@ -135,7 +136,7 @@ def match_exposure(
 def _collect_channels(
     left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], estimate: Estimate
 ) -> list[_Channel]:
-    """Collect the three channels of reliably matched pixels."""
+    """Return the three channels of the reliably matched pixels."""
     step = max(round((left.shape[0] * left.shape[1] / _PIXELS) ** 0.5), 1)
     disparity_px = _subsample(estimate.disparity_px, step) / step
     rows, columns = np.indices(disparity_px.shape, np.float32)
@@ -146,7 +147,7 @@ def _collect_channels(
 
     images = of_both(_downsample(left, step), _downsample(right, step))
     certain = _subsample(estimate.confidence, step) >= _LEAST_CONFIDENCE
-    # A clipped white sky is plain and has confidence 0, but its match need not be exact.
+    # A clipped white sky is plain and has confidence 0, but it needs no exact match.
     certain |= cv2.inRange(cv2.max(*images), _WHITE, _WHITE) > 0
     certain &= ~_subsample(estimate.occluded, step)
     certain &= (columns >= 0) & (columns <= columns.shape[1] - 1)
@@ -163,27 +164,27 @@ def _collect_channels(
 
 
 def _downsample(values: Shaped[np.ndarray, "h w *c"], step: int) -> Shaped[np.ndarray, "h2 w2 *c"]:
-    """Average over squares of `step` pixels, cropping the remainder at the right and bottom."""
+    """Average over squares of `step` x `step` pixels, cropping the remainder at the right and bottom."""
     height, width = (side // step for side in values.shape[:2])
     whole = values[: height * step, : width * step]
     return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
 
 
 def _subsample(values: Shaped[np.ndarray, "h w *c"], step: int) -> Shaped[np.ndarray, "h2 w2 *c"]:
-    """Take the values at the centres of the squares of `step` pixels."""
+    """Return the values at the centres of the squares of `step` x `step` pixels."""
     height, width = (side // step for side in values.shape[:2])
     return np.ascontiguousarray(values[step // 2 :: step, step // 2 :: step][:height, :width])
 
 
 def _range(values: Shaped[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]:
-    """Maximum minus minimum in the window around each pixel."""
+    """Return the maximum minus the minimum in the window around each pixel."""
     return cv2.morphologyEx(values, cv2.MORPH_GRADIENT, _WINDOW)
 
 
 def _difference(channel: _Channel) -> Float[np.ndarray, " 511"]:
-    """Right level minus left level as a function of their mean, which treats both sides alike.
+    """Return right level minus left level as a function of their mean, which treats both images alike.
 
-    Fades to 0 if there are too few pixels.
+    The difference fades to 0 if there are too few pixels.
     """
     kept = ~channel.cut_off
     known = _ramp(int(kept.sum()), *_MATCHES)
@@ -198,7 +199,7 @@ def _difference(channel: _Channel) -> Float[np.ndarray, " 511"]:
 def _measure_deviation(
     left: UInt8[np.ndarray, " n"], right: UInt8[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """Deviation of each level difference from the median of its bin of left levels."""
+    """Return the deviation of each level difference from the median difference of its bin of left levels."""
     differences = right.astype(int) - left
     bins = left // _BIN_LEVELS
     medians = [
@@ -208,18 +209,18 @@ def _measure_deviation(
 
 
 def _fit_curve(left: UInt8[np.ndarray, " n"], right: UInt8[np.ndarray, " n"]) -> Float[np.ndarray, " 511"]:
-    """Fit the level difference of N >= 1 pixels by a smooth curve over the mean level.
+    """Fit a smooth curve over the mean level to the level differences of N >= 1 pixels.
 
-    Sorted left and right levels correspond in order, as in histogram matching. The curve is linear between
-    knots with a penalty on bends (Eilers and Marx 1996, P-splines) and extrapolates linearly. Both levels
-    stay in 0..255.
+    The n-th smallest left level corresponds to the n-th smallest right level, as in histogram matching. The
+    curve is linear between knots with a penalty on bends (Eilers and Marx 1996, P-splines) and extrapolates
+    linearly. It keeps both levels in 0..255.
     """
     # NumPy's stable sort of bytes is a counting sort, 40 times as fast as its default.
     left, right = (np.sort(side, kind="stable").astype(int) for side in (left, right))
     weights = np.bincount(left + right, minlength=511) / len(left)
     sums = np.bincount(left + right, right - left, minlength=511) / len(left)
-    # No NumPy matrix products or solver: the threads of its BLAS keep spinning afterwards, on cores that the
-    # renderer needs.
+    # Uses no NumPy matrix product or solver: the BLAS threads would keep spinning afterwards, on cores that
+    # the renderer needs.
     weighted = weights[:, None] * _HATS
     beside = np.diag((weighted[:, 1:] * _HATS[:, :-1]).sum(0), 1)
     normal = np.diag((weighted * _HATS).sum(0)) + beside + beside.T + _PRICES
@@ -230,7 +231,7 @@ def _fit_curve(left: UInt8[np.ndarray, " n"], right: UInt8[np.ndarray, " n"]) ->
 
 
 def _mean_size(difference: Float[np.ndarray, " 511"], channel: _Channel) -> float:
-    """Mean absolute difference over the matched pixels; 0 if there are none."""
+    """Return the mean absolute difference over the matched pixels; 0 if there are no such pixels."""
     means = channel.left.astype(int) + channel.right
     return float(np.abs(difference[means]).sum()) / max(len(means), 1)
 
@@ -238,7 +239,7 @@ def _mean_size(difference: Float[np.ndarray, " 511"], channel: _Channel) -> floa
 def _tables(
     differences: list[Float[np.ndarray, " 511"]], channels: list[_Channel], strength: float
 ) -> Float32[np.ndarray, "256 3"]:
-    """Tabulate the right level for each left level in the three channels."""
+    """Tabulate the right level for each left level in all three channels."""
     tables = [
         _replace_ends(_table(difference), channel, strength)
         for difference, channel in zip(differences, channels, strict=True)
@@ -247,7 +248,7 @@ def _tables(
 
 
 def _table(difference: Float[np.ndarray, " 511"]) -> Float[np.ndarray, " 256"]:
-    """Tabulate the right level for each left level from the curve of their difference over their mean."""
+    """Tabulate the right level for each left level, given their difference as a function of their mean."""
     left, right = (np.maximum.accumulate(_MEANS + sign * difference / 2) for sign in (-1, 1))
     return np.interp(np.arange(256), left, right)
 
@@ -255,10 +256,10 @@ def _table(difference: Float[np.ndarray, " 511"]) -> Float[np.ndarray, " 256"]:
 def _replace_ends(
     table: Float[np.ndarray, " 256"], channel: _Channel, strength: float
 ) -> Float[np.ndarray, " 256"]:
-    """Replace both ends of the table: clipped levels map to the mean level that the other image shows there.
+    """Replace both ends of the table: clipped levels map to the mean level of their matches.
 
-    The curve cannot represent clipping, where many levels of one image correspond to one of the other. The
-    table is linear from the last level that is surely not clipped to the end.
+    The curve cannot represent clipping, where many levels of one image correspond to one level of the other.
+    The table is linear between the last level that is certainly not clipped and the end.
     """
     differences = channel.right.astype(int) - channel.left
 
@@ -273,5 +274,5 @@ def _replace_ends(
 
 
 def _ramp(value: float, low: float, high: float) -> float:
-    """Linear ramp: 0 up to low, 1 from high on."""
+    """Return 0 up to `low`, 1 from `high` on, and a linear ramp in between."""
     return float(np.clip((value - low) / (high - low), 0, 1))

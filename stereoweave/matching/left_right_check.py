@@ -1,19 +1,19 @@
-"""Left-right consistency check of the two views' disparities."""
+"""Left-right check: comparison of the disparities of both views."""
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 OCCLUSION_STEP_PX = 1.0
-"""A surface at the match that is nearer by more than this occludes the pixel; less is matching error."""
-# Rows checked at once; checking 50 megapixels at once would take another gigabyte.
+"""A pixel is occluded if the surface at its match is nearer by more than this; less is matching error."""
+# Number of rows checked at once: checking all 50 megapixels of an image at once would take another gigabyte.
 _BAND_ROWS = 256
 
 
 def find_occluded(
     disparity_px: Float[np.ndarray, "h w"], right_disparity_px: Float[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Mask of left pixels whose match is outside the right image or behind a nearer surface."""
+    """Return the mask of left pixels whose match is outside the right image or behind a nearer surface."""
     occluded = np.empty(disparity_px.shape, bool)
     for top in range(0, len(occluded), _BAND_ROWS):
         rows = slice(top, top + _BAND_ROWS)
@@ -24,7 +24,10 @@ def find_occluded(
 def measure_disagreement(
     disparity_px: Float[np.ndarray, "h w"], right_disparity_px: Float[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Right disparity at each left pixel's match minus its own, in px; mask of matches inside the image."""
+    """Return the views' disagreement at each left pixel in px, and the mask of matches inside the image.
+
+    The disagreement is the right disparity at the pixel's match minus the pixel's own disparity.
+    """
     seen_px, inside = at_match(right_disparity_px, disparity_px, -1)
     return seen_px - disparity_px, inside
 
@@ -32,16 +35,16 @@ def measure_disagreement(
 def is_occluded(
     disagreement_px: Float[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Mask of pixels that, by the two views' disagreement, only the left camera sees."""
+    """Return the mask of pixels that only the left camera sees, judging by the views' disagreement."""
     return ~inside | (disagreement_px > OCCLUSION_STEP_PX)
 
 
 def at_match(
     values: Shaped[np.ndarray, "h w"], disparity_px: Float[np.ndarray, "h w"], direction: int
 ) -> tuple[Shaped[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Sample the other view's values at each pixel's match; mask of matches inside that image.
+    """Return the other view's value at each pixel's match, and the mask of matches inside the other image.
 
-    Matches outside take the border column's value.
+    Matches outside take the value of the border column.
 
     Args:
         values: Values of the other view, float32 or uint8.

@@ -28,15 +28,16 @@ from stereoweave.system.threads import thread_count
 
 _FLOAT32 = "tensor(float)"
 PIXEL_PAIRS_AT_ONCE = 1920 * 1920 * 1088
-"""Limit for one run: comparing all pairs of columns in each row, this many in all, takes about 1 GB."""
-# After larger runs the memory is released, because upsampling their disparities needs as much.
+"""Greatest number of pixel pairs within rows that one run compares, which takes about 1 GB."""
+# Memory is released after larger runs, because upsampling their disparities needs as much.
 _KEPT_PIXEL_PAIRS = 1280 * 1280 * 960
-# Overlap of strips on each side; about 1 % of the pixels then differ by over 1 px from a run on the whole.
+# Overlap of strips on each side. About 1 % of the pixels then differ by more than 1 px from a run on the
+# whole image.
 _STRIP_OVERLAP_PX = 64
-# Images are padded to a multiple of this at most.
+# Upper limit of the number to whose multiple a matcher file may have images padded.
 _MOST_MULTIPLE_OF = 1024
-# A square is plain if its means over 9x9 px vary by no more than this, as noise of 3 grey levels alone does.
-# In collages 1 pixel in 5,000 is plain, and 1 in 3 of these has the right disparity.
+# A square window is plain if its means over 9x9 px vary by no more than this, the variation caused by noise
+# of 3 grey levels alone. In collages, 1 pixel in 5,000 is plain, and 1 in 3 of these has the right disparity.
 _PLAIN_WINDOW_PX = 65
 _PLAIN_MEAN_PX = 9
 _PLAIN_GREY_LEVELS = 2
@@ -57,11 +58,11 @@ class Mode(NamedTuple):
 
 
 MODES = {"best": Mode(network="base", magnification=1.5, refined=True)}
-"""`best` is for stills: better thin structures and edges, several times slower."""
+"""Presets by name. `best` is for stills: better thin structures and edges, but several times slower."""
 
 
 class Maps(NamedTuple):
-    """Network outputs for a pair, each float32 [H, W]; None if the graph lacks the output."""
+    """Network outputs for a pair, each float32 [H, W]; None for an output that the network lacks."""
 
     disparity_px: np.ndarray
     right_disparity_px: np.ndarray | None = None
@@ -72,18 +73,19 @@ class Matcher:
     """A loaded matcher file.
 
     Args:
-        model: Name of a shipped network (`shipped_models`), name in `MODES`, or path of an .onnx file.
+        model: Name of a shipped network (`shipped_models`) or of a preset in `MODES`, or the path of an .onnx
+            file.
         threads: Maximum number of threads per call; default: all cores available to the process.
         provider: Execution provider, a name in `providers.PROVIDERS`.
 
     Attributes:
         model: The name or path given.
-        fixed_size: Height and width of a network with fixed input size; None if any size works.
+        fixed_size: Height and width of a network with a fixed input size; None if it accepts any size.
         magnification: Greatest factor by which `match` magnifies pairs for the network; `estimate` ignores
             it.
 
     Raises:
-        MatcherError: Unknown model, invalid matcher file or unavailable provider.
+        MatcherError: The model is unknown, the matcher file is invalid or the provider is unavailable.
     """
 
     def __init__(
@@ -98,7 +100,7 @@ class Matcher:
         try:
             self._outputs = self._read_outputs()
             self.name, self.multiple_of, self.max_disparity_px = self._read_properties()
-            # Free dimensions have names, and a file may omit the shape altogether.
+            # Free dimensions have names instead of numbers, and a file may omit the shape altogether.
             shape: list[Any] = [*self._session.get_inputs()[0].shape, *["any"] * 4]
         except UnicodeDecodeError as error:
             raise MatcherError(f"{self._path}: expected metadata in UTF-8, found {error}") from error
@@ -115,17 +117,17 @@ class Matcher:
         refined: bool = False,
         raw: bool = False,
     ) -> Estimate:
-        """Disparity of both views, confidence and occlusion of a rectified pair, uint8 RGB of equal size.
+        """Estimate the disparity of both views, confidence and occlusion of a rectified pair.
 
-        The left view's disparity is refined to a fraction of a pixel (`subpixel.to_subpixel`) and filled with
-        the background where occluded (`occlusion_fill.fill_occluded`).
+        The left view's disparity is refined to a fraction of a pixel (`subpixel.to_subpixel`). Occluded
+        pixels are filled with the disparity of the background (`occlusion_fill.fill_occluded`).
 
         Args:
-            left: Left image [H, W, 3].
-            right: Right image [H, W, 3].
-            refined: Match once more at full resolution (`refine.refine`): slower, with thin structures and
-                sharper edges.
-            raw: Return the network's own disparities without any of these steps.
+            left: Left image, uint8 RGB [H, W, 3].
+            right: Right image of the same size.
+            refined: Match once more at full resolution (`refine.refine`), which is slower but recovers thin
+                structures and sharper edges.
+            raw: Return the network's own disparities without any post-processing.
 
         Raises:
             StereoweaveError: The images are invalid, shorter than 32 px on a side or larger than
@@ -137,7 +139,7 @@ class Matcher:
     def estimate_many(
         self, pairs: Sequence[StereoPair], *, refined: bool = False, raw: bool = False
     ) -> list[Estimate]:
-        """Match pairs of equal size as `estimate` does, batched if the file and the provider support it.
+        """Match pairs of equal size as `estimate` does, in batches if the matcher and provider support them.
 
         Raises:
             StereoweaveError: As for `estimate`, or the pairs differ in size.
@@ -160,7 +162,11 @@ class Matcher:
         return [self.finish(pair, own, refined=refined) for pair, own in zip(pairs, found, strict=True)]
 
     def finish(self, pair: StereoPair, found: Estimate, *, refined: bool = False) -> Estimate:
-        """Post-process the network's estimate: subpixel step, `refine` on request, occlusion filling."""
+        """Post-process the network's estimate: refine it to subpixel accuracy and fill occluded pixels.
+
+        If `refined` is set, or by the matcher's preset, `refine.refine` matches the pair once more in
+        between.
+        """
         found = to_subpixel(pair.left, pair.right, found, self.threads)
         if refined or self._refines:
             from stereoweave.matching.refine import refine  # Numba takes half a second to import
@@ -174,7 +180,7 @@ class Matcher:
         if len(sizes) > 1:
             found = ", ".join(f"{width}x{height}" for height, width in sizes)
             raise StereoweaveError(
-                f"pairs: expected all of one size, got {found}; matching.match_many takes pairs of any sizes"
+                f"pairs: expected pairs of equal size, got {found}; matching.match_many takes any sizes"
             )
         for height, width in sizes:
             got = f"got {width}x{height}"
@@ -184,12 +190,12 @@ class Matcher:
             if self.fixed_size is not None and not self.sees_whole(width, height):
                 most = f"{self.fixed_size[1]}x{self.fixed_size[0]}"
                 raise StereoweaveError(
-                    f"images: expected at most {most} px, the size that {self._path.name} takes, {got}; "
-                    "matching.match makes them smaller"
+                    f"images: expected at most {most} px, the input size of {self._path.name}, {got}; "
+                    "matching.match scales larger images down"
                 )
 
     def sees_whole(self, width: int, height: int) -> bool:
-        """Whether an image of this size is matched in one run, without strips of rows."""
+        """Return whether an image of this size is matched in one run, without strips of rows."""
         if self.fixed_size is not None:
             return height <= self.fixed_size[0] and width <= self.fixed_size[1]
         if max(height, width) > LONGEST_SIDE_PX:
@@ -259,12 +265,10 @@ class Matcher:
                     f"{self._path}: expected {name} of shape {expected}, found {list(value.shape)}"
                 )
             if not np.isfinite(value).all():
-                raise MatcherError(
-                    f"{self._path}: expected finite values of {name}, found NaN or infinite ones"
-                )
+                raise MatcherError(f"{self._path}: expected finite values of {name}, found NaN or infinity")
 
     def _run_options(self, pixel_pairs: int) -> Any:
-        """Run options: keep the memory arena for the next run, but release a very large one."""
+        """Return options that keep the memory arena for the next run but release a very large one."""
         import onnxruntime  # type: ignore[import-untyped]
 
         options = onnxruntime.RunOptions()
@@ -273,26 +277,26 @@ class Matcher:
         return options
 
     def _run_size(self, height: int, width: int) -> tuple[int, int]:
-        """Height and width of the network's input for an image of this size."""
+        """Return the height and width of the network's input for an image of this size."""
         if self.fixed_size is not None:
             return self.fixed_size
         return height + -height % self.multiple_of, width + -width % self.multiple_of
 
     def _borders_px(self, height: int, width: int) -> list[tuple[int, int]]:
-        """Padding (above, below) and (left, right) up to the network's input size.
+        """Return the padding (above, below) and (left, right) up to the network's input size.
 
-        Half on each side: padding at one border harms one view only, so both views are treated alike.
+        Each side gets half of it: padding at one border only would harm one view more than the other.
         """
         rows, columns = self._run_size(height, width)
         return [(px // 2, px - px // 2) for px in (rows - height, columns - width)]
 
     def _tensor(self, images: Sequence[UInt8[np.ndarray, "h w 3"]]) -> Float[np.ndarray, "b 3 h2 w2"]:
-        """Convert images to the network's input, padded by repeating their borders."""
+        """Convert images to the network's input; repeat their border pixels as padding."""
         (above, below), (before, behind) = self._borders_px(*images[0].shape[:2])
         padded = [
             cv2.copyMakeBorder(image, above, below, before, behind, cv2.BORDER_REPLICATE) for image in images
         ]
-        # Same result as cv2.dnn.blobFromImage in half the time.
+        # Gives the result of cv2.dnn.blobFromImage in half the time.
         planes = np.stack([plane for image in padded for plane in cv2.split(image)])
         return planes.reshape(len(images), 3, *padded[0].shape[:2]) * np.float32(1 / 255)
 
@@ -304,7 +308,7 @@ class Matcher:
         all_float32 = all(outputs[name] == _FLOAT32 for name in used)
         if inputs != {"left": _FLOAT32, "right": _FLOAT32} or "disparity_px" not in used or not all_float32:
             raise MatcherError(
-                f"{self._path}: expected a matcher, inputs left and right and an output disparity_px, "
+                f"{self._path}: expected a matcher with inputs left and right and output disparity_px, "
                 f"all {_FLOAT32}, found inputs {_format_types(inputs)} and outputs {_format_types(outputs)}"
             )
         return used
@@ -323,12 +327,12 @@ class Matcher:
         except ValueError:
             found = f"multiple_of {multiple_of!r}, max_disparity_px {max_disparity_px!r}"
         raise MatcherError(
-            f"{self._path}: expected a matcher's metadata, found {found}; `stereoweave export` writes it"
+            f"{self._path}: expected the metadata of a matcher, found {found}; `stereoweave export` writes it"
         )
 
 
 def shipped_models() -> list[str]:
-    """Return the names of the networks in the package."""
+    """Return the names of the networks in the package, sorted."""
     return sorted(Path(file.name).stem for file in _weights_folder().iterdir() if file.name.endswith(".onnx"))
 
 
@@ -341,12 +345,16 @@ def _weights_folder() -> Path:
 
 
 def model_file(model: str | Path) -> Path:
-    """Return the .onnx file of a shipped network, mode or path; raise MatcherError if there is none."""
+    """Return the .onnx file of a shipped network, a preset or a path.
+
+    Raises:
+        MatcherError: The model is unknown or its file does not exist.
+    """
     check_kind("model", model, str, Path)
     if str(model).endswith(".onnx"):
         path = Path(model)
         if not path.is_file():
-            raise MatcherError(f"{path}: expected an ONNX matcher, found no such file")
+            raise MatcherError(f"{path}: expected an ONNX matcher file, found no such file")
         return path
     name = MODES[str(model)].network if str(model) in MODES else str(model)
     if name not in shipped_models():
@@ -358,7 +366,7 @@ def model_file(model: str | Path) -> Path:
 
 
 def _strips(height: int, rows: int) -> Iterator[slice]:
-    """Overlapping row ranges of at most `rows` rows that cover `height`; lengths differ by at most one."""
+    """Yield overlapping ranges of at most `rows` rows that cover `height`; lengths differ by at most one."""
     if height <= rows:
         yield slice(0, height)
         return
@@ -369,17 +377,17 @@ def _strips(height: int, rows: int) -> Iterator[slice]:
 
 
 def _strip_weights(rows: slice, height: int) -> Float[np.ndarray, "h 1"]:
-    """Blending weight of each row of a strip, which decreases towards ends that overlap other strips."""
+    """Return the blending weight of each row of a strip, lower towards ends that overlap other strips."""
     places = np.arange(rows.start, rows.stop, dtype=np.float32)[:, None] + 0.5
     from_top = places - rows.start if rows.start > 0 else np.full_like(places, np.inf)
     from_bottom = rows.stop - places if rows.stop < height else np.full_like(places, np.inf)
-    # Almost no weight for the outermost quarter of the overlap, which suffers from the strip's border.
+    # The outermost quarter of the overlap has almost no weight, because it suffers from the strip's border.
     inset = np.minimum(from_top, from_bottom) - _STRIP_OVERLAP_PX / 2
     return np.clip(inset / _STRIP_OVERLAP_PX, 1e-6, 1).astype(np.float32)
 
 
 def _estimate(left: UInt8[np.ndarray, "h w 3"], maps: Maps) -> Estimate:
-    """Build the network's estimate from the maps of both views."""
+    """Build the estimate from the network's maps of both views."""
     right_px = maps.right_disparity_px
     assert right_px is not None
     disagreement_px, inside = measure_disagreement(maps.disparity_px, right_px)
@@ -397,23 +405,23 @@ def _confidence(
     inside: Bool[np.ndarray, "h w"],
     plain: Bool[np.ndarray, "h w"],
 ) -> Float[np.ndarray, "h w"]:
-    """Confidence from the network's log odds, or from the left-right disagreement if it has none.
+    """Return the confidence from the network's log odds, or from the views' disagreement if it has none.
 
     A pixel's match cannot be farther than the pixel itself, because both cameras see the nearest surface.
-    Where the right view's disparity is farther nevertheless, one of the two views is wrong, and the
-    network's probability is halved (on collages and real pairs about a quarter of such pixels are right,
-    where the network claims 0.4 to 0.5). It is 0 where the left image is plain.
+    Where the right view's disparity says that it is, one of the two views is wrong, and the network's
+    probability is halved: on collages and real pairs, about a quarter of such pixels are right, while the
+    network claims 0.4 to 0.5. The confidence is 0 where the left image is plain.
 
     Args:
-        logit: The network's log odds; None if it has no such output.
-        disagreement_px: The right view's disparity at the match minus the left view's.
+        logit: The network's log odds; None if the network has no such output.
+        disagreement_px: The right view's disparity at the match minus the left view's disparity.
         inside: Mask of matches inside the right image.
         plain: Mask of left pixels without texture to match.
     """
     if logit is None:
         probability = np.exp(-np.abs(disagreement_px))
     else:
-        # The logistic function in a form that does not overflow.
+        # The logistic function, in a form that does not overflow.
         probability = 0.5 * (1 + np.tanh(logit / 2))
         contradicted = inside & (disagreement_px < -OCCLUSION_STEP_PX)
         np.multiply(probability, 0.5, out=probability, where=contradicted)
@@ -422,7 +430,7 @@ def _confidence(
 
 
 def _find_plain(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
-    """Mask of pixels in whose _PLAIN_WINDOW_PX window local means vary by at most _PLAIN_GREY_LEVELS."""
+    """Return the mask of plain pixels: local means in the window around them are nearly equal."""
     window = np.ones((_PLAIN_WINDOW_PX, _PLAIN_WINDOW_PX), np.uint8)
     means = cv2.blur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (_PLAIN_MEAN_PX, _PLAIN_MEAN_PX))
     contrast = cv2.morphologyEx(means, cv2.MORPH_GRADIENT, window)

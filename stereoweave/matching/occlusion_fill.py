@@ -1,4 +1,4 @@
-"""Fill occluded pixels with the disparity of the background beside them."""
+"""Filling of occluded pixels with the disparity of the background beside them."""
 
 from dataclasses import replace
 
@@ -8,28 +8,30 @@ from jaxtyping import Bool, Float32, Int
 
 from stereoweave.stereo import Estimate
 
-# Visible pixels whose median represents one end of a run: the first alone often mixes two surfaces.
+# The median of this many visible pixels represents one end of a run: the first alone often mixes two
+# surfaces.
 _END_PX = 7
 _MEDIAN_PX = 5
-# The network's disparity is kept where it differs from the fill by more than this and lies between the
-# disparities of the surrounding visible pixels: there the fill is less accurate. The surroundings are 11x11
-# points of a grid with a spacing of 4 px.
+# The network's disparity is kept where it differs from the fill by more than this and lies within the
+# disparities of the surrounding visible pixels, because the fill is less accurate in this case. The
+# surroundings are 11x11 points of a grid with a spacing of 4 px.
 _FAR_OFF_PX = 10.0
 _SPACING_PX, _AROUND = 4, 11
-# Weight of the background's confidence in a filled pixel; the network's own has the rest. Fitted on collages
-# and rendered pairs: the network's alone is 0.02 to 0.12 too low, the mixture is off by 0.02 to 0.06.
+# Weight of the background's confidence in a filled pixel; the network's confidence has the rest. Fitted on
+# collages and rendered pairs: the network's confidence alone is 0.02 to 0.12 too low, the mixture is off by
+# 0.02 to 0.06.
 _SHARE_BESIDE = np.float32(0.4)
 
 
 def fill_occluded(estimate: Estimate, left_seen: Bool[np.ndarray, "h w"] | None = None) -> Estimate:
-    """Fill occluded pixels from the farther visible surface in their row.
+    """Give occluded pixels the disparity of the farther visible surface in their row.
 
-    Visible pixels and the `occluded` mask do not change. A filled pixel's confidence moves towards that of
-    the surface that fills it; a confidence of 0 stays 0.
+    Visible pixels and the `occluded` mask do not change. A filled pixel's confidence moves towards the
+    confidence of the surface that fills it, but a confidence of 0 stays 0.
 
     Args:
         estimate: The estimate to fill.
-        left_seen: Mask of left pixels with content, which the fill may come from; default: all.
+        left_seen: Mask of left pixels with content, from which occluded pixels may be filled; default: all.
     """
     occluded = estimate.occluded
     visible = ~occluded if left_seen is None else ~occluded & left_seen
@@ -51,10 +53,10 @@ def fill_occluded(estimate: Estimate, left_seen: Bool[np.ndarray, "h w"] | None 
 def _background(
     estimate: Estimate, visible: Bool[np.ndarray, "h w"]
 ) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
-    """Disparity and confidence of the background for each invisible pixel, in row-major order.
+    """Return the background's disparity and confidence for each invisible pixel, in row-major order.
 
-    The background is the farther of the two ends of the pixel's run of invisible pixels. In a row without
-    visible pixels the pixel keeps its own values.
+    The background is the farther of the two surfaces at the ends of the pixel's run of invisible pixels. In a
+    row without visible pixels, each pixel keeps its own values.
     """
     occluded = np.pad(~visible, ((0, 0), (1, 1)))
     changes = np.flatnonzero(occluded.ravel()[1:] != occluded.ravel()[:-1])
@@ -82,7 +84,10 @@ def _medians(
     rows: Int[np.ndarray, "n 1"],
     columns: Int[np.ndarray, "n k"],
 ) -> Float32[np.ndarray, " n"]:
-    """Lower median of the visible pixels among the given columns of each row; NaN if there are none."""
+    """Return the lower median of the visible pixels among K columns of each row; NaN if there are none.
+
+    Row i of `columns` [N, K] belongs to `rows[i]`.
+    """
     last = values.shape[1] - 1
     at = rows, columns.clip(0, last)
     known = (columns >= 0) & (columns <= last) & visible[at]
@@ -97,7 +102,7 @@ def _within_surroundings(
     rows: Int[np.ndarray, " n"],
     columns: Int[np.ndarray, " n"],
 ) -> Bool[np.ndarray, " n"]:
-    """Whether each pixel's disparity lies within the range of the visible pixels around it."""
+    """Return whether each pixel's disparity lies within the range of the visible pixels around it."""
     some = np.s_[::_SPACING_PX, ::_SPACING_PX]
     known, some_px = visible[some], disparity_px[some]
     window = np.ones((_AROUND, _AROUND), np.uint8)

@@ -1,4 +1,4 @@
-"""Matching options shared by all interfaces."""
+"""Matching options that all interfaces share."""
 
 import math
 from collections.abc import Sequence
@@ -15,10 +15,10 @@ class MatchOptions:
     """Matching options, validated on construction.
 
     Attributes:
-        range_px: Least and greatest disparity of the left view in px; values outside are clipped and get
-            confidence 0. Default: the network's range, extended where the pair shows that it is too small.
-        refined: Match once more at full resolution with the network's disparity as prior: slower, with thin
-            structures and sharper edges.
+        range_px: Least and greatest disparity of the left view in px; disparities outside are clipped and get
+            confidence 0. Default: the network's range, extended if the pair exceeds it.
+        refined: Match once more at full resolution with the network's disparity as prior, which is slower but
+            recovers thin structures and sharper edges.
         raw: Return the network's disparity without subpixel refinement and occlusion filling.
 
     Raises:
@@ -35,7 +35,7 @@ class MatchOptions:
         check_flag("raw", self.raw)
         if self.refined and self.raw:
             raise StereoweaveError(
-                "expected without refined: it is the network's own disparity",
+                "cannot be combined with refined, because it is the network's own disparity",
                 setting="raw",
                 remedy=Remedy("leave one of them out", ("raw", "refined")),
             )

@@ -1,8 +1,8 @@
 """ONNX Runtime execution providers.
 
-If a provider is unavailable, ONNX Runtime logs a message and falls back to the CPU. Here that is an error: a
-request for a GPU never runs on the CPU unnoticed. Only operations that a provider lacks run on the next one:
-CUDA after TensorRT, and finally the CPU.
+If a provider is unavailable, ONNX Runtime logs a message and falls back to the CPU. Here this is an error: a
+request for a GPU never runs on the CPU unnoticed. Only operations that a provider lacks run elsewhere, those
+of TensorRT on CUDA, and all others on the CPU.
 """
 
 import contextlib
@@ -27,12 +27,12 @@ class Provider:
     """Settings of an execution provider.
 
     Attributes:
-        name: ONNX Runtime's name for it.
+        name: The provider's name in ONNX Runtime.
         needs: Requirements, and how to install them.
-        options: Returns ONNX Runtime's provider options for a number of threads.
+        options: Function that returns ONNX Runtime's provider options for a number of threads.
         then: Provider, a name in `PROVIDERS`, that runs the operations this one lacks.
         batches: Whether batches of pairs are faster, as on a GPU. On a CPU they are slower because their maps
-            do not fit its caches (measured: 53 ms a pair of 320x240 in a batch of 8, 35 ms alone).
+            do not fit its caches (measured: 53 ms per pair of 320x240 in a batch of 8, 35 ms alone).
     """
 
     name: str
@@ -44,9 +44,9 @@ class Provider:
 
 def _cuda_options(threads: int) -> dict[str, str]:
     return {
-        # The exhaustive search would try every convolution algorithm again for each new image size.
+        # The exhaustive search would try every convolution algorithm for each new image size.
         "cudnn_conv_algo_search": "HEURISTIC",
-        # By default the arena doubles whenever it grows, and takes memory that other processes may need.
+        # By default, the arena doubles whenever it grows, and takes memory that other processes may need.
         "arena_extend_strategy": "kSameAsRequested",
         # TF32 has 10 mantissa bits: too few to match the CPU's disparities to a fraction of a pixel.
         "use_tf32": "0",
@@ -54,7 +54,7 @@ def _cuda_options(threads: int) -> dict[str, str]:
 
 
 def _tensorrt_options(threads: int) -> dict[str, str]:
-    """Cache engines, which take minutes to build, in the user's cache folder if it is writable."""
+    """Return options that cache engines, which take minutes to build, if the cache folder is writable."""
     from stereoweave.system.jit import cache_folder  # imports Numba
 
     folder = cache_folder().with_name("tensorrt")
@@ -76,7 +76,7 @@ def _openvino_options(threads: int) -> dict[str, str]:
 
 
 def _explain_replacement(package: str) -> str:
-    """How to switch packages; they overwrite each other's files and cannot be installed side by side."""
+    """Explain how to switch packages: they overwrite each other's files and cannot be installed together."""
     return (
         f"{package} instead of onnxruntime: pip uninstall onnxruntime {package}, then pip install {package}"
     )
@@ -105,7 +105,7 @@ PROVIDERS: dict[str, Provider] = {
     ),
     "coreml": Provider(
         name="CoreMLExecutionProvider",
-        needs="macOS, whose onnxruntime has it",
+        needs="macOS, whose onnxruntime includes it",
         options=lambda threads: {"ModelFormat": "MLProgram"},
     ),
     "directml": Provider(
@@ -126,7 +126,7 @@ def check_provider(provider: str) -> None:
     there = [name for name, known in PROVIDERS.items() if known.name in onnxruntime.get_available_providers()]
     if provider not in there:
         raise MatcherError(
-            f"provider {provider}: expected an ONNX Runtime that has it, found version "
+            f"provider {provider}: expected an ONNX Runtime that includes it, found version "
             f"{onnxruntime.__version__} with {', '.join(there)}; it needs {PROVIDERS[provider].needs}"
         )
 
@@ -135,7 +135,7 @@ def open_session(path: Path, provider: str, threads: int) -> Any:
     """Open an ONNX Runtime session for a matcher file; `threads` applies to the CPU.
 
     Raises:
-        MatcherError: Unknown provider, provider that is unavailable or fails to start, or invalid file.
+        MatcherError: The provider is unknown, unavailable or fails to start, or the file is invalid.
     """
     check_provider(provider)
     if provider == CPU:
@@ -151,8 +151,8 @@ def open_session(path: Path, provider: str, threads: int) -> Any:
         raise _start_error(provider, "a missing library or device")
     if _runs_nothing(session, PROVIDERS[provider].name):
         raise MatcherError(
-            f"{path}: expected a matcher with operations that provider {provider} has, found none; export it "
-            "for a fixed size with `stereoweave export`",
+            f"{path}: expected a matcher with operations that provider {provider} supports, found none of "
+            "them; export it for a fixed size with `stereoweave export`",
             remedy=_USE_CPU,
         )
     return session
@@ -160,7 +160,7 @@ def open_session(path: Path, provider: str, threads: int) -> Any:
 
 @contextmanager
 def explain_failure(provider: str, path: Path) -> Iterator[None]:
-    """Turn exceptions of a run into one-line errors that blame the provider or the matcher file."""
+    """Turn exceptions during a run into one-line errors that blame the provider or the matcher file."""
     try:
         yield
     except Exception as error:  # ONNX Runtime's exceptions have no common base class
@@ -169,7 +169,7 @@ def explain_failure(provider: str, path: Path) -> Iterator[None]:
         if unfit or (provider == CPU and not out_of_memory):
             raise _file_error(path, error) from error
         raise ProviderError(
-            f"provider {provider}: expected to run {path.name}, found that it failed: {_first_line(error)}; "
+            f"provider {provider}: failed to run {path.name}: {_first_line(error)}; "
             "use smaller pictures, or fewer processes at a time on the device",
             remedy=None if provider == CPU else _USE_CPU,
         ) from error
@@ -179,27 +179,27 @@ def _create_session(path: Path, provider: str, threads: int) -> Any:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
-    # ONNX Runtime's default takes two cores of a virtual machine for one with two hardware threads.
+    # By default, ONNX Runtime mistakes two cores of a virtual machine for one core with two hardware threads.
     options.intra_op_num_threads = threads
-    # By default its threads keep spinning after a run and slow down other work on these cores.
+    # By default, its threads keep spinning after a run and slow down other work on the same cores.
     options.add_session_config_entry("session.force_spinning_stop", "1")
     options.log_severity_level = 4  # the error below reports problems with the file
     if provider != CPU:
         options.add_session_config_entry("session.record_ep_graph_assignment_info", "1")
-        options.enable_mem_pattern = provider != "directml"  # which does not support it
+        options.enable_mem_pattern = provider != "directml"  # DirectML does not support it
     names = [provider]
     while names[-1] != CPU:
         names.append(PROVIDERS[names[-1]].then)
     providers = [(PROVIDERS[name].name, PROVIDERS[name].options(threads)) for name in names]
     try:
-        # Disable the fallback to the CPU when the provider fails.
+        # Without a fallback to the CPU if the provider fails.
         return onnxruntime.InferenceSession(str(path), options, providers=providers, enable_fallback=0)
     except Exception as error:  # no common base class, as above
         raise _file_error(path, error) from error
 
 
 def _load_libraries(provider: str) -> None:
-    """Load the CUDA and TensorRT libraries installed by pip, which are outside the system's library path."""
+    """Load the CUDA and TensorRT libraries that pip installed, which are not on the system's library path."""
     import onnxruntime
 
     if provider in ("cuda", "tensorrt") and hasattr(onnxruntime, "preload_dlls"):
@@ -212,7 +212,7 @@ def _load_libraries(provider: str) -> None:
 
 @contextmanager
 def _silence_log() -> Iterator[None]:
-    """Silence ONNX Runtime's log; its messages are raised as errors instead."""
+    """Silence ONNX Runtime's log, whose messages are raised as errors instead."""
     import onnxruntime
 
     onnxruntime.set_default_logger_severity(4)
@@ -223,7 +223,7 @@ def _silence_log() -> Iterator[None]:
 
 
 def _runs_nothing(session: Any, name: str) -> bool:
-    """Whether the provider runs no operation of the graph; known with ONNX Runtime 1.24 or later."""
+    """Return whether the provider runs no operation of the graph; False before ONNX Runtime 1.24."""
     if not hasattr(session, "get_provider_graph_assignment_info"):
         return False
     return all(part.ep_name != name for part in session.get_provider_graph_assignment_info())
@@ -231,17 +231,17 @@ def _runs_nothing(session: Any, name: str) -> bool:
 
 def _start_error(provider: str, found: str) -> MatcherError:
     return MatcherError(
-        f"provider {provider}: expected to start, found {found}; it needs {PROVIDERS[provider].needs}"
+        f"provider {provider}: failed to start: {found}; it needs {PROVIDERS[provider].needs}"
     )
 
 
 def _file_error(path: Path, error: Exception) -> MatcherError:
     return MatcherError(
-        f"{path}: expected an ONNX matcher, found a file ONNX Runtime refuses: {_first_line(error)}"
+        f"{path}: expected an ONNX matcher file, found one that ONNX Runtime rejects: {_first_line(error)}"
     )
 
 
 def _first_line(error: BaseException | None) -> str:
-    """First line of ONNX Runtime's message, without its source location."""
+    """Return the first line of ONNX Runtime's message, without its source location."""
     line = (str(error).splitlines() or [type(error).__name__])[0]
     return re.sub(r"/\S+:\d+ [^(]*\(.*?\) ", "", line)

@@ -1,9 +1,9 @@
-"""Refine an estimate: match once more at full resolution with the network's disparity as prior.
+"""Refinement of an estimate by matching once more at full resolution, with the network's disparity as prior.
 
-Semi-global matching (Hirschmueller 2008) over the disparities between the network's least and greatest. A
-candidate's cost is the colour and census difference plus its distance to the network's disparity, weighted by
-confidence. Disparities on which both views agree replace the network's: thin structures below its resolution,
-and edges.
+The method is semi-global matching (Hirschmueller 2008) over all disparities between the network's least and
+greatest. A candidate's cost is the colour and census difference, plus its distance to the network's disparity
+weighted by confidence. Disparities on which both views agree replace the network's disparities. This recovers
+edges, and thin structures below the network's resolution.
 """
 
 import math
@@ -21,16 +21,18 @@ from stereoweave.system.threads import in_bands, thread_count
 if TYPE_CHECKING:
     from stereoweave.matching.refine_kernels import Cues
 
-# Candidates extend this far beyond the network's range; their number is a multiple of the vector length.
+# Candidates extend this far beyond the estimate's disparities; their number is a multiple of the vector
+# length.
 _MARGIN_PX = 4
 _CANDIDATES_MULTIPLE = 16
-# Each takes 3 bytes, so larger images are refined in strips that overlap by this many rows on each side.
+# Each candidate of a pixel takes 3 bytes, so larger images are refined in strips, which overlap by this many
+# rows on each side.
 _CANDIDATES_AT_ONCE = 100_000_000
 _OVERLAP_PX = 24
-# Penalty of a large disparity step: greatest between equal grey levels, halved at this difference.
+# Penalty of a large disparity step: greatest between equal grey levels, halved at this grey difference.
 _LARGEST_STEP, _LEAST_LARGE_STEP = 125, 30
 _HALVING_LEVELS = 30
-# Factor on a pixel's confidence where the network's disparity of the other view disagrees.
+# Factor on a pixel's confidence where the network's disparities of both views disagree.
 _DOUBTED = 0.2
 _SAME_PX = 1.0
 _MOST_THREADS = 4
@@ -44,15 +46,15 @@ def refine(
 ) -> Estimate:
     """Correct the disparities of both views by semi-global matching at full resolution.
 
-    The network's disparity is kept where matching confirms it to 1.5 px (it is the more precise), where its
-    confidence is high, and where the two views disagree. The confidence does not change. Different exposures
-    are equalised first.
+    The network's disparity is kept where matching confirms it to within 1.5 px (it is then the more precise
+    one), where its confidence is high, and where the two views disagree. The confidence does not change.
+    Different exposures are equalised first.
 
     Args:
         left: Left image, uint8 RGB [H, W, 3].
         right: Right image of the same size.
         estimate: The pair's estimate (`stereoweave.estimate`).
-        threads: Maximum number of threads, of which at most four are used; default: all cores.
+        threads: Maximum number of threads; default: all cores. At most four are used.
     """
     pair = StereoPair(left=left, right=right)
     check_fits(estimate, pair)
@@ -78,7 +80,7 @@ def _settle(
     trust: Float32[np.ndarray, "h w"],
     towards: int,
 ) -> Float32[np.ndarray, "h w"]:
-    """Replace a view's disparity where both views found another one and agree."""
+    """Replace a view's disparity by the one found, where both views agree on it."""
     from stereoweave.matching import refine_kernels as kernels  # Numba takes half a second to import
 
     settled_px = np.array(disparity_px, np.float32, order="C")
@@ -91,7 +93,7 @@ def _settle(
 def _match_views(
     pair: StereoPair, estimate: Estimate, threads: int
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Match both views; their disparities of least cost."""
+    """Match both views; return each view's disparities of least cost."""
     first_px, count = _candidates(estimate)
     left = _cues(pair.left, estimate.disparity_px - first_px, estimate.confidence)
     right = _cues(pair.right, estimate.right_disparity_px - first_px, right_confidence(estimate))
@@ -111,7 +113,7 @@ def _match_views(
 def _match_strip(
     views: list[tuple["Cues", "Cues"]], first_px: int, count: int, threads: int
 ) -> Float32[np.ndarray, "2 h w"]:
-    """Match a strip of rows of both views, each as the left view of its pair."""
+    """Match a strip of rows of both views, each given as the left view of a pair."""
     size = (*views[0][0].grey.shape, count)
     # Both views share the buffers: allocating new memory takes as long as aggregating one path.
     costs, sums = np.empty(size, np.uint8), np.empty(size, np.uint16)
@@ -125,7 +127,7 @@ def _match_view(
     first_px: int,
     threads: int,
 ) -> Float32[np.ndarray, "h w"]:
-    """Match a left view; `volumes` are buffers for its costs and their sums over all paths."""
+    """Match a left view; `volumes` are buffers for the matching costs and their sums over all paths."""
     from stereoweave.matching import refine_kernels as kernels
 
     height, width = own.grey.shape
@@ -151,10 +153,10 @@ def _match_view(
 
 
 def _candidates(estimate: Estimate) -> tuple[int, int]:
-    """First candidate disparity in px and number of candidates."""
+    """Return the first candidate disparity in px and the number of candidates."""
     both = estimate.disparity_px, estimate.right_disparity_px
     least_px = math.floor(min(view.min() for view in both))
-    # Parallel cameras have none below 0; as candidates, a plain sky would take them.
+    # Parallel cameras have no disparities below 0; as candidates, they would attract a plain sky.
     first_px = least_px - _MARGIN_PX if least_px < 0 else max(least_px - _MARGIN_PX, 0)
     last_px = math.ceil(max(view.max() for view in both)) + _MARGIN_PX
     count = last_px - first_px + 1
@@ -182,19 +184,19 @@ def _cues(image: UInt8[np.ndarray, "h w 3"], above_first_px: np.ndarray, trust: 
 
 
 def _reverse_columns(cues: "Cues", first_px: int, count: int) -> "Cues":
-    """Reverse the other image's columns for the kernels and pad them by repeating the borders."""
+    """Reverse the other image's columns for the kernels, and pad them with copies of the border columns."""
     width = cues.grey.shape[1]
     columns = np.clip(width - 1 - first_px - np.arange(width + count - 1), 0, width - 1)
     return type(cues)(*(cue.take(columns, -1) for cue in cues))
 
 
 def _index_cues(cues: "Cues", index: Any) -> "Cues":
-    """Index all cues alike."""
+    """Apply the same index to every array of the cues."""
     return type(cues)(*(np.ascontiguousarray(cue[index]) for cue in cues))
 
 
 def right_confidence(estimate: Estimate) -> Float32[np.ndarray, "h w"]:
-    """Confidence of the right view's disparities, taken from the left view at their matches."""
+    """Return the confidence of the right view's disparities, taken from the left view at their matches."""
     seen_px, inside = at_match(estimate.disparity_px, estimate.right_disparity_px, 1)
     confidence, _ = at_match(np.asarray(estimate.confidence, np.float32), estimate.right_disparity_px, 1)
     agreed = inside & (np.abs(seen_px - estimate.right_disparity_px) <= _SAME_PX)
@@ -202,7 +204,7 @@ def right_confidence(estimate: Estimate) -> Float32[np.ndarray, "h w"]:
 
 
 def _large_steps(grey: UInt8[np.ndarray, "h w"], axis: int) -> UInt16[np.ndarray, "h w"]:
-    """Penalty of a large step between a pixel and the one before it, lower at strong grey edges."""
+    """Return the penalty of a large step between a pixel and the one before it; grey edges lower it."""
     before = grey.take([0, *range(grey.shape[axis] - 1)], axis)
     costs = _LARGEST_STEP / (1 + cv2.absdiff(grey, before).astype(np.float32) / _HALVING_LEVELS)
     return np.maximum(costs, _LEAST_LARGE_STEP).astype(np.uint16)

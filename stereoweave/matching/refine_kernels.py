@@ -1,9 +1,9 @@
 """Numba kernels of `refine`, in the order of their calls.
 
-Their plain reference is tests/helpers/plain_refining.py. All kernels treat a left view; the right view is
-the left one of the mirrored pair. Volumes are [H, W, D]. Candidate i is the disparity first_px + i. The
-columns of the other image's `Cues` are reversed, so that the candidates of column x, W - 1 - x + i, are
-contiguous in memory.
+The plain reference implementation is tests/helpers/plain_refining.py. All kernels process a left view; the
+right view is processed as the left view of the mirrored pair. Volumes are [H, W, D]. Candidate i is the
+disparity first_px + i. The columns of the other image's `Cues` are reversed, so the candidates of column x,
+which are W - 1 - x + i, are contiguous in memory.
 """
 
 import typing
@@ -13,21 +13,21 @@ import numpy as np
 from stereoweave.system.jit import inlined, kernel
 
 SUBSTEPS = 8
-"""The network's disparity is compared with candidates in steps of 1/8 px."""
+"""Number of steps per px in which a candidate's distance to the network's disparity is measured."""
 DOUBTLESS, FARTHEST = np.uint16(SUBSTEPS), np.uint16(8 * SUBSTEPS)
-"""Distances to the network's disparity: up to the first cost nothing; beyond it by the second cost most."""
+"""Distance to the network's disparity that costs nothing, and the excess from which the cost is greatest."""
 MOST_TRUST = 12
-"""The greatest cost of that distance, for a disparity of confidence 1."""
+"""Greatest cost of a distance to the network's disparity, reached at confidence 1."""
 MOST_DIFFERENCE = np.uint8(40)
-"""Truncation of a channel's difference: greater ones all mean a different surface."""
+"""Limit of a channel's difference: all greater differences mean a different surface."""
 SMALL_STEP = 20
 """Penalty of a disparity step of one candidate between two pixels of a path."""
 PRECISE_PX = 1.5
-"""Within this distance of the result the network's disparity is the more precise one."""
+"""Within this distance of the disparity found, the network's disparity is the more precise one."""
 CERTAIN = 0.85
 """Above this confidence, replacing the network's disparities does more harm than good."""
 AGREED_PX = 1.0
-"""Greatest difference between two views' disparities of one point."""
+"""Greatest difference between the two views' disparities of the same point."""
 RELIABLE_RUN = 8
 SLACK_PX = 2
 LARGEST_MOVE_PX = 24
@@ -35,7 +35,7 @@ LARGEST_MOVE_PX = 24
 _CENSUS_RADIUS = 2
 _NEVER = np.uint16(30000)
 _SIX = np.uint16(6)
-# Numba widens sums to 64 bits unless both operands are narrow, which halves the vector's elements.
+# Numba widens sums to 64 bits unless both operands are narrow; a vector then holds half as many elements.
 _ONE, _TWO, _FOUR, _TOP = (np.uint32(bits) for bits in (1, 2, 4, 24))
 _PAIRS, _FOURS, _EIGHTS, _SUM = (np.uint32(mask) for mask in (0x55555555, 0x33333333, 0x0F0F0F0F, 0x01010101))
 
@@ -44,8 +44,8 @@ class Cues(typing.NamedTuple):
     """Inputs of the matching cost for each pixel of an image; C-contiguous arrays [H, W].
 
     Attributes:
-        grey: uint8, determines the penalty of large disparity steps.
-        census: uint32, one bit for each of the 24 pixels around: whether it is darker.
+        grey: uint8, grey levels, which determine the penalty of large disparity steps.
+        census: uint32, one bit for each of the 24 surrounding pixels: whether it is darker.
         colour: uint8 [H, 3, W].
         darkest: uint8 [H, 3, W], least level within half a pixel to either side.
         brightest: uint8 [H, 3, W], greatest level within half a pixel to either side.
@@ -65,7 +65,7 @@ class Cues(typing.NamedTuple):
 @kernel
 @typing.no_type_check
 def census(grey, codes):
-    """Write the 5x5 census code of each pixel into codes: one bit per neighbour, set if it is darker."""
+    """Write the 5x5 census code of each pixel into codes: one bit per neighbour, set for a darker one."""
     height, width = grey.shape
     for y in range(height):
         for x in range(width):
@@ -82,7 +82,7 @@ def census(grey, codes):
 @inlined
 @typing.no_type_check
 def bits(code):
-    """Number of set bits in a 32-bit code."""
+    """Return the number of set bits in a 32-bit code."""
     pairs = np.uint32(code - ((code >> _ONE) & _PAIRS))
     fours = np.uint32((pairs & _FOURS) + ((pairs >> _TWO) & _FOURS))
     return np.int32(np.uint32(((fours + (fours >> _FOUR)) & _EIGHTS) * _SUM) >> _TOP)
@@ -91,14 +91,14 @@ def bits(code):
 @inlined
 @typing.no_type_check
 def _outside(level, dark, bright):
-    """Distance of a level to the interval dark..bright."""
+    """Return the distance between a level and the interval dark..bright."""
     return max(np.uint8(max(level, bright) - bright), np.uint8(dark - min(level, dark)))
 
 
 @inlined
 @typing.no_type_check
 def _difference(level, dark, bright, there, dark_there, bright_there):
-    """Sampling-insensitive difference of a channel (Birchfield and Tomasi 1998), truncated."""
+    """Return the truncated, sampling-insensitive difference of a channel (Birchfield and Tomasi 1998)."""
     nearest = min(_outside(level, dark_there, bright_there), _outside(there, dark, bright))
     return min(nearest, MOST_DIFFERENCE)
 
@@ -106,7 +106,7 @@ def _difference(level, dark, bright, there, dark_there, bright_there):
 @inlined
 @typing.no_type_check
 def _differences(level, dark, bright, levels, darks, brights, costs):
-    """Write half the colour difference of each candidate; arguments are tuples of three channels."""
+    """Write half the colour difference of each candidate into costs; the inputs are tuples of channels."""
     for i in range(costs.shape[0]):
         red = _difference(level[0], dark[0], bright[0], levels[0][i], darks[0][i], brights[0][i])
         green = _difference(level[1], dark[1], bright[1], levels[1][i], darks[1][i], brights[1][i])
@@ -117,21 +117,21 @@ def _differences(level, dark, bright, levels, darks, brights, costs):
 @inlined
 @typing.no_type_check
 def _at(channels, y, x):
-    """The three levels of a pixel; `channels` is [H, 3, W]."""
+    """Return the three levels of a pixel; `channels` is [H, 3, W]."""
     return channels[y, 0, x], channels[y, 1, x], channels[y, 2, x]
 
 
 @inlined
 @typing.no_type_check
 def _along(channels, y, start, end):
-    """The three channels of columns start..end of a row."""
+    """Return the three channels of columns start..end of row y; `channels` is [H, 3, W]."""
     return channels[y, 0, start:end], channels[y, 1, start:end], channels[y, 2, start:end]
 
 
 @inlined
 @typing.no_type_check
 def _add_census(code, codes, costs):
-    """Add twice the Hamming distance of the census codes."""
+    """Add twice the Hamming distance between the census codes to each candidate's cost."""
     for i in range(costs.shape[0]):
         costs[i] = np.uint8(costs[i] + 2 * bits(code ^ codes[i]))
 
@@ -139,7 +139,7 @@ def _add_census(code, codes, costs):
 @inlined
 @typing.no_type_check
 def _pull(prior, trust, candidate):
-    """Cost of a candidate's distance to the network's disparity: rises from 1 px to 9 px."""
+    """Return the cost of a candidate's distance to the network's disparity, which rises from 1 px to 9 px."""
     away = np.uint16(max(prior, candidate) - min(prior, candidate))
     beyond = np.uint16(max(away, DOUBTLESS) - DOUBTLESS)
     return np.uint16(np.uint16(min(beyond, FARTHEST) * trust) >> _SIX)
@@ -148,7 +148,7 @@ def _pull(prior, trust, candidate):
 @inlined
 @typing.no_type_check
 def _add_pulls(prior, trust, priors, trusts, costs):
-    """Add the pulls towards the network's disparities of both views."""
+    """Add the cost of the distances to the network's disparities in both views."""
     for i in range(costs.shape[0]):
         candidate = np.uint16(SUBSTEPS * i)
         pulls = _pull(prior, trust, candidate) + _pull(priors[i], trusts[i], candidate)
@@ -182,7 +182,7 @@ def match(own, other, first, last, costs):
 @inlined
 @typing.no_type_check
 def _step(before, least, costs, large_step, after, sums):
-    """Advance a path by one pixel: write its costs into after, add them to sums and return the least."""
+    """Advance a path by one pixel: write its costs into after, add them to sums and return the least cost."""
     limit = np.uint16(least + large_step)
     lowest = _NEVER
     for i in range(costs.shape[0]):
@@ -239,7 +239,7 @@ def along_columns(costs, large_step, first, last, sums):
 @inlined
 @typing.no_type_check
 def _between(before, here, after):
-    """Subpixel offset, -0.5..0.5: intersection of two lines of opposite slope through three costs."""
+    """Return the subpixel offset, -0.5..0.5, where two lines of opposite slope through three costs meet."""
     rise = max(np.int32(before), np.int32(after)) - np.int32(here)
     return 0.5 * (np.int32(before) - np.int32(after)) / rise if rise > 0 else 0.0
 
@@ -247,7 +247,7 @@ def _between(before, here, after):
 @kernel
 @typing.no_type_check
 def pick(sums, first_px, first, last, found_px):
-    """Write the disparities of least cost into rows first..last of found_px."""
+    """Write the disparities of least cost, with subpixel offset, into rows first..last of found_px."""
     _, width, count = sums.shape
     for y in range(first, last):
         for x in range(width):
@@ -266,10 +266,10 @@ def pick(sums, first_px, first, last, found_px):
 @kernel
 @typing.no_type_check
 def settle(found_px, other_px, trust, towards, disparity_px, agreed):
-    """Mark in agreed where both views agree; there replace the network's disparity in disparity_px.
+    """Mark in agreed the pixels where both views agree, and replace the network's disparity of these pixels.
 
-    Disparities of confidence `trust` >= CERTAIN, or off by no more than PRECISE_PX, are kept. towards is -1
-    if the match of column x is at x - disparity, 1 if it is at x + disparity.
+    The network's disparity is kept if its confidence `trust` is at least CERTAIN, or if it is off by at most
+    PRECISE_PX. towards is -1 if the match of column x is at x - disparity, 1 if it is at x + disparity.
     """
     height, width = found_px.shape
     for y in range(height):
@@ -285,11 +285,11 @@ def settle(found_px, other_px, trust, towards, disparity_px, agreed):
 @kernel
 @typing.no_type_check
 def extend(agreed, trust, towards, disparity_px):
-    """Extend the first surface of each row to the border that is outside the other image.
+    """Extend the first surface of each row to the image border, where the other camera sees nothing.
 
     A surface is a run of RELIABLE_RUN agreed pixels. It is extended if all pixels between it and the border
-    have their matches outside the other image. Certain disparities, and those farther from the surface than
-    LARGEST_MOVE_PX, are kept.
+    have their matches outside the other image. Disparities that are certain, or that differ from the surface
+    by more than LARGEST_MOVE_PX, are kept.
     """
     height, width = agreed.shape
     for y in range(height):

@@ -19,23 +19,24 @@ _LARGEST_PX = 2047
 
 
 class StereoMatcher:
-    """Replacement for cv2.StereoSGBM: `compute` returns int16 disparity * 16.
+    """Replacement for cv2.StereoSGBM; `compute` returns int16 disparity * 16.
 
-    minDisparity and numDisparities have OpenCV's names and meaning. Parameters of OpenCV's algorithm
-    (blockSize, P1, P2, disp12MaxDiff, preFilterCap, uniquenessRatio, speckleWindowSize, speckleRange, mode)
-    do not apply to a network and raise a TypeError.
+    minDisparity and numDisparities have the same names and meaning as in OpenCV. Parameters of OpenCV's
+    algorithm (blockSize, P1, P2, disp12MaxDiff, preFilterCap, uniquenessRatio, speckleWindowSize,
+    speckleRange, mode) do not apply to a network and raise a TypeError.
 
     Args:
-        minDisparity: Least disparity in px; below 0 for converged cameras.
-        numDisparities: Number of disparities from minDisparity; unlike in OpenCV, any number.
-        model: Name of a shipped network or path of an .onnx matcher.
+        minDisparity: Least disparity in px; negative for converged cameras.
+        numDisparities: Number of disparities from minDisparity; unlike in OpenCV, it need not be a multiple
+            of 16.
+        model: Name of a shipped network, or path of an .onnx matcher file.
         threads: Maximum number of threads per call; default: all cores.
         provider: See `stereoweave.estimate`.
         refined: See `stereoweave.estimate`.
         min_confidence: Pixels with a lower confidence are invalid.
     """
 
-    def __init__(  # noqa: PLR0913 - OpenCV's two and those of a matcher
+    def __init__(  # noqa: PLR0913 - two parameters of OpenCV and those of a matcher
         self,
         minDisparity: int = 0,
         numDisparities: int = 192,
@@ -58,13 +59,13 @@ class StereoMatcher:
     def compute(
         self, left: UInt8[np.ndarray, "h w *channels"], right: UInt8[np.ndarray, "h w *channels"]
     ) -> Int16[np.ndarray, "h w"]:
-        """Disparity of the left image in px * 16; invalid pixels are (minDisparity - 1) * 16.
+        """Return the disparity of the left image in px * 16; invalid pixels are (minDisparity - 1) * 16.
 
-        Invalid are occluded pixels, those with a confidence below min_confidence, and disparities outside
-        minDisparity to minDisparity + numDisparities.
+        A pixel is invalid if it is occluded, if its confidence is below min_confidence, or if its disparity
+        is outside minDisparity to minDisparity + numDisparities.
 
         Args:
-            left: Left image of a rectified pair as returned by cv2.imread: BGR or grey, uint8.
+            left: Left image of a rectified pair, as returned by cv2.imread: BGR or grey, uint8.
             right: Right image of the same size.
         """
         pair = StereoPair(left=_rgb_of_bgr(left, "left picture"), right=_rgb_of_bgr(right, "right picture"))
@@ -97,7 +98,7 @@ class StereoMatcher:
         # The value below minDisparity marks invalid pixels.
         if self._count < 1 or least_px - 1 < -_LARGEST_PX or most_px > _LARGEST_PX:
             raise StereoweaveError(
-                f"expected numDisparities of 1 or more, and disparities of {1 - _LARGEST_PX} to "
+                f"expected numDisparities of 1 or more, and disparities between {1 - _LARGEST_PX} and "
                 f"{_LARGEST_PX} px, the range of int16 / 16, found minDisparity {least_px} and "
                 f"numDisparities {self._count}; use stereoweave.estimate, which returns floats"
             )
@@ -107,7 +108,7 @@ def _rgb_of_bgr(picture: UInt8[np.ndarray, "h w *channels"], name: str) -> UInt8
     # PIL images and tensors are RGB and would be misread as BGR.
     if not isinstance(picture, np.ndarray) or picture.dtype != np.uint8:
         raise StereoweaveError(
-            f"{name}: expected uint8, BGR [H, W, 3] or grey [H, W], as cv2.imread gives it, "
+            f"{name}: expected a uint8 array, BGR [H, W, 3] or grey [H, W], as cv2.imread returns it, "
             f"got {getattr(picture, 'dtype', type(picture).__name__)}"
         )
     return np.ascontiguousarray(as_rgb(picture, name)[..., ::-1])

@@ -12,17 +12,17 @@ from stereoweave.system.threads import in_bands, thread_count
 _LARGEST_CHANGE_PX = 1.0
 # Neighbours whose disparities differ by more than about this belong to different surfaces.
 _SAME_PX = 0.6
-# Gradient variance caused by noise of 3 grey levels alone; keeps disparity unchanged in plain areas.
+# Gradient variance caused by noise of 3 grey levels alone; it keeps the disparity of plain areas unchanged.
 _PLAIN = 4.0
 # Horizontal derivative without the blur of a Sobel filter.
 _SLOPE = np.array([[1, -8, 0, 8, -1]], np.float32) / 12
-# Widths on the half-resolution grid, on which all smooth quantities are computed: smoothing before matching,
-# matching window, smoothing after matching.
+# Widths in pixels of the half-resolution grid, on which all smooth quantities are computed: smoothing before
+# matching, matching window, smoothing after matching.
 _SMOOTH_SIGMA, _WINDOW_SIGMA, _FOUND_SIGMA = 2.0, 0.8, 3.0
-# A depth edge is where the disparity differs by this from its mean over a window of that grid.
+# There is a depth edge where the disparity differs from its mean in a window of that grid by more than this.
 _EDGE_PX, _EDGE_PLACES = 0.5, 5
-# Bands of rows: overlap on each side that the result depends on; least number of rows worth a thread; most
-# pixels at once, at 40 bytes each.
+# Bands of rows: overlap on each side, as far as a pixel's result depends on others; least number of rows for
+# which a thread is worthwhile; greatest number of pixels at once, each of which takes 40 bytes.
 _REACH_PX = 32
 _LEAST_BAND_PX = 64
 _BAND_PIXELS = 2_000_000
@@ -35,16 +35,16 @@ def to_subpixel(
     estimate: Estimate,
     threads: int | None = None,
 ) -> Estimate:
-    """Refine the left view's disparity by at most 1 px, to best agreement of the images.
+    """Refine the left view's disparity by at most 1 px to align the images best.
 
-    Source: B. Lucas and T. Kanade, "An iterative image registration technique with an application to stereo
-    vision", 1981: in a window around each pixel, one least-squares step aligns the right image, warped by the
-    disparity, with the left one. Three deviations:
+    In a window around each pixel, one least-squares step aligns the right image, warped by the disparity,
+    with the left image. Source: B. Lucas and T. Kanade, "An iterative image registration technique with an
+    application to stereo vision", 1981. Three deviations:
 
-    - Contrast is equalised and window means are subtracted, so that different exposures cause no shift.
-    - Disparity is smoothed before and after the step, but not across edges, so that errors of opposite sign
+    - Contrast is equalised and window means are subtracted, so different exposures cause no shift.
+    - Disparity is smoothed before and after the step, but not across edges. Errors of opposite sign then
       cancel out (median depth error of walls 0.9 -> 0.5 %).
-    - Near depth edges, where a window covers two surfaces, no step is made (bad-1 there 31.3 -> 30.1 %).
+    - No step is made near depth edges, where a window covers two surfaces (bad-1 near edges 31.3 -> 30.1 %).
 
     Occluded pixels do not change.
 
@@ -58,7 +58,7 @@ def to_subpixel(
     gain = _gain(here, there, estimate)
     here, there = _pad_to_even(here), _pad_to_even(there)
     given_px = _pad_to_even(estimate.disparity_px.astype(np.float32))
-    # Parallel cameras have no disparities below 0; keep a sky from getting any.
+    # Parallel cameras have no disparities below 0; this keeps a plain sky from getting them.
     least_px = min(float(given_px.min()), 0.0)
     found_px = np.empty_like(given_px)
 
@@ -70,9 +70,9 @@ def to_subpixel(
 
     count = thread_count(threads)
     bands = max(1, min(max(count, here.size // _BAND_PIXELS), len(here) // _LEAST_BAND_PX))
-    # Bands of row pairs, so that none splits a row of the coarse grid.
+    # Bands consist of row pairs, so no band splits a row of the coarse grid.
     if bands == 1:
-        move(0, len(here) // 2)  # in another thread, memory allocation would take a fifth longer
+        move(0, len(here) // 2)  # memory allocation would take a fifth longer in another thread
     else:
         in_bands(move, len(here) // 2, bands, count)
     height, width = estimate.disparity_px.shape
@@ -87,7 +87,7 @@ def _pad_to_even(values: np.ndarray) -> np.ndarray:
 
 
 def _gain(here: UInt8[np.ndarray, "h w"], there: UInt8[np.ndarray, "h w"], estimate: Estimate) -> float:
-    """Ratio of left to right contrast: standard deviations over a sample of the visible pixels."""
+    """Return the ratio of left to right contrast: standard deviations over a sample of the visible pixels."""
     some = np.s_[::_GAIN_STEP_PX, ::_GAIN_STEP_PX]
     rows, columns = _GAIN_STEP_PX * np.argwhere(~estimate.occluded[some]).T
     if not rows.size:
@@ -105,7 +105,7 @@ def _refine_band(
     given_px: Float32[np.ndarray, "h w"],
     gain: float,
 ) -> Float32[np.ndarray, "h w"]:
-    """Refine the disparity of a band of rows of the left view; height and width are even."""
+    """Refine the disparity of a band of rows of the left view, whose height and width are even."""
     coarse_px = _halve(given_px)
     smooth_px = _double(_smooth(coarse_px, _SMOOTH_SIGMA))
     start_px = np.where(cv2.absdiff(smooth_px, given_px) < _SAME_PX, smooth_px, given_px)
@@ -122,7 +122,7 @@ def _missing_px(
     disparity_px: Float32[np.ndarray, "h w"],
     gain: float,
 ) -> Float32[np.ndarray, "h2 w2"]:
-    """Least-squares correction of the disparity on the coarse grid."""
+    """Return the least-squares correction of the disparity on the coarse grid."""
     height, width = disparity_px.shape
     columns = np.arange(width, dtype=np.float32) - disparity_px
     rows = np.broadcast_to(np.arange(height, dtype=np.float32)[:, None], columns.shape)
@@ -135,7 +135,7 @@ def _missing_px(
 
 
 def _near_edge(coarse_px: Float32[np.ndarray, "h2 w2"]) -> Bool[np.ndarray, "h2 w2"]:
-    """Mask of pixels near depth edges; a slanted plane, equal to its local mean, has none."""
+    """Return the mask of pixels near depth edges; a slanted plane equals its local mean and has no edge."""
     around = (_EDGE_PLACES, _EDGE_PLACES)
     off_px = cv2.absdiff(coarse_px, cv2.blur(coarse_px, around))
     return cv2.dilate(off_px, np.ones(around, np.uint8)) > _EDGE_PX
@@ -147,7 +147,7 @@ def _smooth(coarse_px: Float32[np.ndarray, "h2 w2"], sigma: float) -> Float32[np
 
 
 def _window(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h2 w2"]:
-    """Window means on the coarse grid."""
+    """Return the means of windows on the coarse grid."""
     return cv2.GaussianBlur(_halve(values), (0, 0), _WINDOW_SIGMA)
 
 

@@ -1,9 +1,10 @@
-"""Upsample the estimate of a downscaled pair to full size, with edges aligned to the full-size images.
+"""Upsampling of a downscaled pair's estimate to full size, with edges aligned to the full-size images.
 
 Each level is at most twice as large as the previous one, whose disparities are its prior. Semi-global
-matching (Hirschmueller 2008) with candidates near the prior's surfaces only (as in Rothermel et al. 2012)
-locates their edges and refines their disparity to a fraction of a pixel. Images are processed in strips of
-rows; the vertical paths' state passes from strip to strip, so that the strips' height does not matter.
+matching (Hirschmueller 2008), with candidates near the prior's surfaces only (as in Rothermel et al. 2012),
+locates the surfaces' edges and refines their disparity to a fraction of a pixel. Images are processed in
+strips of rows. The state of the vertical paths passes from strip to strip, so the result does not depend on
+the strips' height.
 """
 
 from collections.abc import Callable
@@ -27,26 +28,26 @@ _SURFACES_PX = 5
 # There is an edge where these surfaces differ by this much, in pixels of the smaller images.
 _EDGE_PX = 1.5
 # Cost per px of a candidate's distance to its surface, counted from _FREE_PX to _FARTHEST_PX: disparities of
-# the smaller images are accurate to about half of their pixels.
+# the smaller images are accurate to about half a pixel of those images.
 _PULL, _FREE_PX, _FARTHEST_PX = 2, 1, 8
-# Penalty of a large disparity step: greatest between equal grey levels, halved at this difference.
+# Penalty of a large disparity step: greatest between equal grey levels, halved at this grey difference.
 _LARGEST_STEP, _LEAST_LARGE_STEP = 125, 30
 _HALVING_LEVELS = 30
-# Where the prior is off by at most this, it is corrected by the mean difference in a window of this size.
+# A prior that is off by at most this is corrected by the mean difference in a window of this size.
 _FOLLOWED_PX = 2.0
 _MEAN_PX = 9
 _LEAST_SHARE, _LEAST_SHARE_AROUND = 0.3, 0.02
 _SETTLED_ROWS = 256
-# Factor on the prior's confidence, and its upper limit. On collages, disparities that follow the prior are
-# right as often as it claimed, those on which the views disagree 85 % as often, and changed ones half the
-# time.
+# Factor on the prior's confidence, and upper limit of the result. On collages, disparities that follow the
+# prior are right as often as its confidence claims, those on which the views disagree 85 % as often, and
+# changed ones half the time.
 _FOLLOWS, _UNSEEN, _CHANGED = 0, 1, 2
 _LEFT_OF_CONFIDENCE = np.array([1, 0.85, 1], np.float32)
 _MOST_CONFIDENCE = np.array([1, 1, 0.5], np.float32)
 
 
 class _StripCues(NamedTuple):
-    """Inputs of a strip's matching cost: census codes, uint32, and grey levels, uint8, [H, W]."""
+    """Inputs of a strip's matching cost: census codes, uint32 [H, W], and grey levels, uint8 [H, W]."""
 
     codes: UInt32[np.ndarray, "h w"]
     levels: UInt8[np.ndarray, "h w"]
@@ -66,7 +67,7 @@ class _StripView:
     Args:
         grey: Left image.
         other: Right image.
-        smaller_px: The left view's disparities at the smaller size, in pixels of that size.
+        smaller_px: Disparities of the left view at the smaller size, in pixels of the smaller images.
     """
 
     def __init__(
@@ -86,7 +87,7 @@ class _StripView:
         )
 
     def prior_px(self, rows: slice) -> Float32[np.ndarray, "h w"]:
-        """Interpolate the smaller images' disparity at each pixel of the rows."""
+        """Return the smaller images' disparity, interpolated at each pixel of the rows."""
         height, smaller = len(self.grey), len(self._columns_px)
         places = np.clip((np.arange(height)[rows] + 0.5) * smaller / height - 0.5, 0, smaller - 1)
         above = np.minimum(places.astype(int), smaller - 2)
@@ -94,11 +95,11 @@ class _StripView:
         return (1 - share) * self._columns_px[above] + share * self._columns_px[above + 1]
 
     def surfaces_px(self, rows: slice) -> list[Float32[np.ndarray, "h w"]]:
-        """Disparities of the farthest and nearest surface around each pixel of the rows."""
+        """Return the disparities of the farthest and the nearest surface around each pixel of the rows."""
         return [surface[self._rows[rows]][:, self._columns] for surface in self._surfaces_px]
 
     def cues(self, rows: slice, threads: int) -> tuple[_StripCues, _StripCues]:
-        """Cues of both images for `upsample_kernels.match`."""
+        """Return the cues of both images for `upsample_kernels.match`."""
         from stereoweave.matching import upsample_kernels as kernels  # Numba takes half a second to import
 
         with ThreadPoolExecutor(threads) as pool:
@@ -107,7 +108,7 @@ class _StripView:
         return own, _StripCues(*(np.pad(cue[:, ::-1], more, mode="edge") for cue in other))
 
     def first_candidates(self, rows: slice) -> Int16[np.ndarray, "h w 2"]:
-        """Least disparity of each band of candidates."""
+        """Return the least disparity of each pixel's two bands of candidates."""
         from stereoweave.matching import upsample_kernels as kernels
 
         farthest_px, nearest_px = self.surfaces_px(rows)
@@ -119,16 +120,16 @@ class _StripView:
     def at_edge(
         self, farthest_px: Float32[np.ndarray, "h w"], nearest_px: Float32[np.ndarray, "h w"]
     ) -> Bool[np.ndarray, "h w"]:
-        """Mask of pixels with more than one surface around them."""
+        """Return the mask of pixels with more than one surface around them."""
         return nearest_px - farthest_px > _EDGE_PX * self._scale
 
     def steps_along(self, rows: slice) -> UInt16[np.ndarray, "h w1"]:
-        """Penalty of a large step between each column and the one before it."""
+        """Return the penalty of a large step between each column and the one before it."""
         grey = self.grey[rows]
         return np.pad(_large_steps(grey[:, 1:], grey[:, :-1]), ((0, 0), (1, 1)))
 
     def steps_down(self, rows: slice) -> UInt16[np.ndarray, "h1 w"]:
-        """Penalty of a large step between each row and the one before it, and after the last row."""
+        """Return the penalty of a large step before each row and after the last one."""
         grey = self.grey[max(rows.start - 1, 0) : rows.stop + 1]
         ends = rows.start == 0, rows.stop == len(self.grey)
         return np.pad(_large_steps(grey[1:], grey[:-1]), (ends, (0, 0)))
@@ -142,13 +143,13 @@ def enlarge(
 ) -> Estimate:
     """Upsample the estimate of a downscaled pair to full size.
 
-    Disparities are in px of the full size. Confidence is lowered where the full-size images contradict the
-    smaller ones; occlusion is computed again.
+    The disparities are in px of the full-size images. Confidence is lowered where the full-size images
+    contradict the smaller ones, and occlusion is recomputed.
 
     Args:
         left: Left image, uint8 RGB [H, W, 3].
         right: Right image of the same size.
-        estimate: Estimate of the pair, downscaled by the same factor in both directions.
+        estimate: Estimate of the pair after downscaling by the same factor in both directions.
         threads: Maximum number of threads; default: all cores.
     """
     height, width = left.shape[:2]
@@ -159,7 +160,7 @@ def enlarge(
 
 
 def _divisors(width: int, smaller: int) -> list[int]:
-    """Downscaling factors of the levels; the last is 1."""
+    """Return the downscaling factors of the levels, of which the last is 1."""
     divisor = 1
     while width / (2 * divisor) > smaller:
         divisor *= 2
@@ -167,7 +168,7 @@ def _divisors(width: int, smaller: int) -> list[int]:
 
 
 def _grey(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "h2 w2"]:
-    """Convert to grey and resize."""
+    """Convert an image to grey and resize it."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     return cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
 
@@ -175,13 +176,13 @@ def _grey(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[np.
 def _upsample_level(
     left: UInt8[np.ndarray, "h w"], right: UInt8[np.ndarray, "h w"], smaller: Estimate, threads: int
 ) -> Estimate:
-    """Upsample an estimate to the size of these grey images."""
+    """Upsample an estimate to the size of the given grey images."""
     view = _StripView(left, right, smaller.disparity_px)
     right_view = _StripView(_mirror(right), _mirror(left), _mirror(smaller.right_disparity_px))
     found_px, right_found_px = _match_view(view, threads), _match_view(right_view, threads)
     disparity_px, doubt = _settle(view, found_px, _mirror(right_found_px), threads)
     right_disparity_px = _mirror(_settle(right_view, right_found_px, _mirror(found_px), threads)[0])
-    del view, right_view, found_px, right_found_px  # as large as the result: 1 GB of 50 megapixels
+    del view, right_view, found_px, right_found_px  # as large as the result: 1 GB for 50 megapixels
     return Estimate(
         disparity_px=disparity_px,
         right_disparity_px=right_disparity_px,
@@ -191,7 +192,7 @@ def _upsample_level(
 
 
 def _match_view(view: _StripView, threads: int) -> Float32[np.ndarray, "h w"]:
-    """Match a left view strip by strip; its disparities of least cost."""
+    """Match a left view strip by strip; return its disparities of least cost."""
     from stereoweave.matching import upsample_kernels as kernels
 
     height, width = view.grey.shape
@@ -238,20 +239,20 @@ class _Strip:
         self._in_bands(lambda *band: kernels.match(own, other, self._first, pull, band, self._costs), 0)
 
     def run_along(self) -> None:
-        """Write the summed costs of both horizontal paths."""
+        """Write the summed costs of both horizontal paths into the sums."""
         self._in_bands(
             lambda *band: self._kernels.along_rows(self._costs, self._first, self._along, band, self._sums), 0
         )
 
     def run_down(self, paths: _Paths, backwards: int) -> None:
-        """Add the costs of the path from above, or below; update `paths` for the next strip."""
+        """Add the costs of the path from above, or from below if backwards; update `paths`."""
         volumes = self._costs, self._first, self._down
         self._in_bands(
             lambda *band: self._kernels.along_columns(*volumes, backwards, band, *paths, self._sums), 1
         )
 
     def pick(self, found_px: Float32[np.ndarray, "h w"]) -> None:
-        """Write the disparities of least cost."""
+        """Write the disparities of least cost into `found_px`."""
         self._in_bands(lambda *band: self._kernels.pick(self._sums, self._first, band, found_px), 0)
 
     def _in_bands(self, work: Callable[[int, int], None], axis: int) -> None:
@@ -264,7 +265,10 @@ def _settle(
     other_px: Float32[np.ndarray, "h w"],
     threads: int,
 ) -> tuple[Float32[np.ndarray, "h w"], UInt8[np.ndarray, "h w"]]:
-    """Combine both views' disparities and the prior; doubt is _FOLLOWS, _UNSEEN or _CHANGED."""
+    """Combine both views' disparities with the prior; return the disparity and the doubt of each pixel.
+
+    Doubt is _FOLLOWS, _UNSEEN or _CHANGED.
+    """
     settled_px, doubt = np.empty(found_px.shape, np.float32), np.empty(found_px.shape, np.uint8)
     halo = _MEAN_PX // 2
 
@@ -277,7 +281,7 @@ def _settle(
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(settle, _strips(len(found_px), _SETTLED_ROWS)))
     if view.parallel:
-        # Parallel cameras have no disparities below 0; keep a plain sky from getting any.
+        # Parallel cameras have no disparities below 0; this keeps a plain sky from getting them.
         np.maximum(settled_px, 0, out=settled_px)
     return settled_px, doubt
 
@@ -312,7 +316,7 @@ def _settle_strip(
 def _confidence(
     smaller: Float[np.ndarray, "h2 w2"], doubt: UInt8[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"]:
-    """Resize the smaller pair's confidence and reduce it by doubt."""
+    """Resize the smaller pair's confidence and reduce it according to the doubt."""
     confidence = _resize(smaller, doubt.shape)
     for rows in _strips(len(doubt), _SETTLED_ROWS):
         kept = confidence[rows] * _LEFT_OF_CONFIDENCE[doubt[rows]]
@@ -321,7 +325,7 @@ def _confidence(
 
 
 def _no_paths(width: int) -> _Paths:
-    """Initial state of the vertical paths."""
+    """Return the initial state of the vertical paths."""
     from stereoweave.matching import upsample_kernels as kernels
 
     return _Paths(
@@ -336,7 +340,7 @@ def _strips(height: int, rows: int) -> list[slice]:
 
 
 def _cues(grey: UInt8[np.ndarray, "h w"], rows: slice) -> _StripCues:
-    """Cues of a strip of rows; census codes use the rows beyond it."""
+    """Return the cues of a strip of rows; its census codes also use the rows next to the strip."""
     from stereoweave.matching import refine_kernels as kernels
 
     above = min(_CENSUS_PX, rows.start)
@@ -347,7 +351,7 @@ def _cues(grey: UInt8[np.ndarray, "h w"], rows: slice) -> _StripCues:
 
 
 def _pull() -> UInt8[np.ndarray, " d"]:
-    """Cost of each candidate by its position in the band."""
+    """Return the cost of each candidate's position in its band."""
     from stereoweave.matching import upsample_kernels as kernels
 
     away_px = np.abs(np.arange(kernels.BAND) - kernels.MIDDLE)
@@ -355,14 +359,14 @@ def _pull() -> UInt8[np.ndarray, " d"]:
 
 
 def _places(size: int, smaller: int) -> Int[np.ndarray, " n"]:
-    """Index of the smaller image's pixel that covers each of `size` pixels."""
+    """Return, for each of `size` pixels, the index of the smaller image's pixel that covers it."""
     return np.minimum(((np.arange(size) + 0.5) * smaller / size).astype(int), smaller - 1)
 
 
 def _large_steps(
     grey: UInt8[np.ndarray, "h w"], before: UInt8[np.ndarray, "h w"]
 ) -> UInt16[np.ndarray, "h w"]:
-    """Penalty of a large step between two pixels, lower at strong grey edges."""
+    """Return the penalty of a large step between two pixels; grey edges lower it."""
     costs = _LARGEST_STEP / (1 + cv2.absdiff(grey, before).astype(np.float32) / _HALVING_LEVELS)
     return np.maximum(costs, _LEAST_LARGE_STEP).astype(np.uint16)
 

@@ -2,8 +2,8 @@
 
 The plain reference implementation is tests/helpers/plain_enlarging.py. All kernels process a left view; the
 right view is processed as the left view of the mirrored pair. A pixel has two bands of BAND candidates,
-around the farthest and the nearest surface nearby in the smaller images: candidate i of band b is the
-disparity first_candidate[y, x, b] + i. Volumes are [H, W, 2 * BAND]. H is the height of a strip.
+around the farthest and the nearest surface in its neighbourhood in the smaller images: candidate i of band b
+is the disparity first_candidate[y, x, b] + i. Volumes are [H, W, 2 * BAND]. H is the height of a strip.
 """
 
 import typing
@@ -15,16 +15,17 @@ from stereoweave.system.jit import inlined, kernel
 
 BAND = 16
 MIDDLE = 8
-"""Index of the candidate at the surface's disparity."""
+"""Index of the candidate whose disparity is that surface's."""
 SMALL_STEP = 12
 """Penalty of a disparity step of one candidate between two pixels of a path."""
 MOST_DIFFERENCE = np.uint8(40)
-"""Truncation of the grey difference: greater ones all mean a different surface."""
+"""Limit of the grey difference: all greater differences mean a different surface."""
 AGREED_PX = 1.0
-"""Greatest difference between two views' disparities of one point."""
+"""Greatest difference between the two views' disparities of the same point."""
 FILL_PX = 8.0
 """A gap is filled only with disparities within this distance of the surfaces around it."""
-# Padding of a path: the previous pixel's band may start this many candidates off; the padding costs most.
+# Padding of a path: the previous pixel's band may start this many candidates before or after. Candidates in
+# the padding have cost NEVER.
 _BESIDE = BAND + 2
 _ROOM = BAND + 2 * _BESIDE
 PATH = 2 * _ROOM
@@ -35,7 +36,7 @@ NEVER = np.uint16(30000)
 @inlined
 @typing.no_type_check
 def _compare(code, level, codes, levels, pull, costs):
-    """Write the costs of a band's candidates from census codes, grey levels and position in the band."""
+    """Write the costs of a band's candidates, given census codes, grey levels and costs of the positions."""
     for i in range(BAND):
         apart = np.uint8(max(level, levels[i]) - min(level, levels[i]))
         apart = np.uint8(min(apart, MOST_DIFFERENCE) >> np.uint8(1))
@@ -45,9 +46,9 @@ def _compare(code, level, codes, levels, pull, costs):
 @kernel
 @typing.no_type_check
 def match(own, other, first_candidate, pull, rows, costs):
-    """Write the matching cost of each candidate into some rows of costs, uint8.
+    """Write the matching cost of each candidate into the given rows of costs, uint8.
 
-    own and other are the census codes and grey levels of both images; the columns of `other` are reversed and
+    own and other are the census codes and grey levels of both images; the columns of other are reversed and
     padded by BAND at both ends. pull [BAND] is the cost of each position in a band.
     """
     codes, levels = own
@@ -68,7 +69,7 @@ def match(own, other, first_candidate, pull, rows, costs):
 def _step(before, least, moved, costs, large_step, after, sums):
     """Advance a band's path by one pixel: write its costs into after, add them to sums, return the least.
 
-    moved is the first candidate of this pixel's band minus that of the previous pixel.
+    moved is the first candidate of this pixel's band minus the first candidate of the previous pixel's band.
     """
     limit = np.uint16(least + large_step)
     at = _BESIDE + min(max(moved, -BAND - 1), BAND + 1)
@@ -87,7 +88,7 @@ def _step(before, least, moved, costs, large_step, after, sums):
 @inlined
 @typing.no_type_check
 def _step_both(before, least, first, first_before, costs, large_step, after, sums):
-    """Advance the path of both bands by one pixel; return its least cost."""
+    """Advance the path of both bands by one pixel; return the least cost of both."""
     lowest = NEVER
     for band in range(2):
         room = slice(band * _ROOM, (band + 1) * _ROOM)
@@ -101,7 +102,7 @@ def _step_both(before, least, first, first_before, costs, large_step, after, sum
 @kernel
 @typing.no_type_check
 def along_rows(costs, first_candidate, large_step, rows, sums):
-    """Write the summed costs of the paths from left and right into some rows of sums.
+    """Write the summed costs of the paths from left and right into the given rows of sums.
 
     large_step [H, W + 1] is the penalty of a large step between a column and the one before it, 0 at both
     ends.
@@ -125,7 +126,7 @@ def along_rows(costs, first_candidate, large_step, rows, sums):
 @kernel
 @typing.no_type_check
 def along_columns(costs, first_candidate, large_step, backwards, columns, paths, least, first_before, sums):
-    """Add the costs of the path from above, or below if backwards is 1, to some columns of sums.
+    """Add the costs of the path from above, or from below if backwards is 1, to the given columns of sums.
 
     large_step [H + 1, W] is the penalty of a large step between a row and the one before it, 0 at both ends
     of the image. paths [W, PATH], least [W] and first_before [W, 2] are the paths' state after the previous
@@ -148,7 +149,7 @@ def along_columns(costs, first_candidate, large_step, backwards, columns, paths,
 @kernel
 @typing.no_type_check
 def pick(sums, first_candidate, rows, found_px):
-    """Write the subpixel disparities of least cost into some rows of found_px (equiangular line fit)."""
+    """Write the disparities of least cost, with an equiangular line fit, into the given rows of found_px."""
     _, width, _ = sums.shape
     for y in range(rows[0], rows[1]):
         for x in range(width):
@@ -171,7 +172,7 @@ def pick(sums, first_candidate, rows, found_px):
 @kernel
 @typing.no_type_check
 def agree(found_px, other_px, agreed):
-    """Write into agreed whether the other view's disparity at each pixel's match is the same."""
+    """Write into agreed whether each pixel's disparity agrees with that of the other view at its match."""
     height, width = found_px.shape
     for y in range(height):
         for x in range(width):
@@ -183,9 +184,9 @@ def agree(found_px, other_px, agreed):
 @kernel
 @typing.no_type_check
 def fill(known, gap, farthest_px, nearest_px, disparity_px):
-    """Fill gaps with the farther of the known disparities to their left and right in the row.
+    """Fill each gap of a row with the farther of the known disparities at its two ends.
 
-    Only one camera sees a gap; a nearer surface hides it from the other one. A pixel is filled only if the
+    A gap is occluded by a nearer surface, so it belongs to the farther one. A pixel is filled only if the
     disparity fits the surfaces around it, farthest_px to nearest_px.
     """
     height, width = known.shape

@@ -1,1 +1,1 @@
-"""Opening of pictures: layouts, pairs in folders, and rectification."""
+"""Opening and rectification of stereo pictures, and search for pairs in folders."""

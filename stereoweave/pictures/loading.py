@@ -45,13 +45,13 @@ _CROSSED_ENDINGS = (".jps", ".pns")
 
 @dataclass(frozen=True, kw_only=True)
 class Opened:
-    """A pair as taken, before rectification.
+    """A pair before rectification, as the cameras took it.
 
     Attributes:
-        pair: Both views, upright, in sRGB.
+        pair: Both views, upright and in sRGB.
         layout: Layout of the files: a name in `PAIR_LAYOUTS`, "mpo" or "two_pictures".
-        notes: What was detected or changed.
-        lens: The cameras according to EXIF, in pixels of the pair; None if EXIF has nothing.
+        notes: Notes on what was detected or changed.
+        lens: Camera parameters from EXIF, in pixels of the pair; None if EXIF has none.
     """
 
     pair: StereoPair
@@ -69,9 +69,10 @@ def open_pictures(paths: Sequence[Path], format: str | None = None) -> Opened:
             format, the file's name, then its content.
 
     Raises:
-        FormatError: A file is unreadable, too large, in an unsupported format (named in the error) or without
-            two views; or the two pictures differ in size.
-        StereoweaveError: Unknown layout, a layout given for two files, or neither one nor two files.
+        FormatError: A file is unreadable, is too large, has an unsupported format (named in the error) or
+            lacks a second view; or the two pictures differ in size.
+        StereoweaveError: The layout is unknown or given for two files, or there are neither one nor two
+            files.
     """
     if format not in (None, *FORMATS):
         raise StereoweaveError(f"expected one of {', '.join(FORMATS)}, found {format!r}", setting="format")
@@ -88,12 +89,12 @@ def open_pictures(paths: Sequence[Path], format: str | None = None) -> Opened:
             return _open_one(both, format)
     names = " ".join(map(str, paths))
     raise StereoweaveError(
-        f"expected LEFT RIGHT or SIDE_BY_SIDE, one or two pictures, found {len(paths)}: {names}"
+        f"expected two pictures, left and right, or one that holds both views, found {len(paths)}: {names}"
     )
 
 
 def pixel_factor(path: Path, picture: Image.Image, format: str | None) -> int:
-    """Pixels of both views divided by the pixels in the header of their common file: 1 or 2.
+    """Return the number of pixels of both views divided by the number in their file's header: 1 or 2.
 
     It is 2 for MPO files, and for half-size views declared by `format` or by the file's JPS header.
     """
@@ -140,7 +141,7 @@ def _open_one(path: Path, format: str | None) -> Opened:
 
 
 def _open_mpo(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opened:
-    """Open the pair in an MPO file; both views share the first one's orientation, as one camera took them."""
+    """Open the pair in an MPO file; the first picture's orientation applies to both: one camera took them."""
     decoded = [read_frame(path, picture, index) for index in frames]
     lies = exif.read_orientation(decoded[0].tags)
     # CIPA DC-007 numbers viewpoints from the left; many files omit the number and store the left view first.
@@ -165,11 +166,11 @@ def _open_mpo(path: Path, picture: Image.Image, frames: Sequence[int]) -> Opened
 def _choose_orientations(
     left: DecodedPicture, right: DecodedPicture
 ) -> tuple[tuple[int | None, int | None], list[Note]]:
-    """Return the EXIF orientation to use for each of two pictures, and notes.
+    """Return the EXIF orientation to use for each of two pictures, and notes on it.
 
-    Each picture uses its own tag, unless their sizes then differ or one tag is missing. Editors drop the tag,
-    some after rotating the picture, some without. In these cases both use one tag if it makes the sizes equal
-    and the pictures more similar.
+    Each picture uses its own tag, unless the sizes then differ or one tag is missing: some editors rotate a
+    picture before they drop the tag, others do not. In these cases, both pictures use the same tag if this
+    makes the sizes equal and the pictures more similar.
     """
     own = exif.read_orientation(left.tags), exif.read_orientation(right.tags)
     if own[0] == own[1] or {*own} <= {None, 1}:
@@ -198,9 +199,10 @@ def _compare(left: DecodedPicture, right: DecodedPicture, lies: tuple[int | None
 
 
 def _read_declared(path: Path, picture: Image.Image, format: str | None) -> tuple[str | None, str | None]:
-    """Return the layout that the user or a JPS file declares, and the reason if it is the file; else None.
+    """Return the layout declared by the user or a JPS file, and where it came from unless it was the user.
 
-    Source: VRex's JPS format; after identifier and length, four bytes: separation, flags, layout, type.
+    Both are None if no layout is declared. Source: VRex's JPS format, which has four bytes after identifier
+    and length: separation, flags, layout and type.
     """
     if format not in (None, "jps"):
         return format, None
@@ -225,7 +227,7 @@ def _detect_picture_layout(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> str
     for kind, mark in _OTHER_LAYOUTS.items():
         if re.search(mark, path.stem):
             raise FormatError(
-                f"{path}: expected two views, found {kind}, according to its name", remedy=_OVERRIDE
+                f"{path}: expected two views, found {kind}, judging by its name", remedy=_OVERRIDE
             )
     return detect_layout(str(path), [image], photograph=True)
 
@@ -233,7 +235,7 @@ def _detect_picture_layout(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> str
 def _split_views(
     path: Path, image: UInt8[np.ndarray, "h w 3"], layout: PairLayout
 ) -> tuple[UInt8[np.ndarray, "h2 w2 3"], UInt8[np.ndarray, "h2 w2 3"]]:
-    """Split an image into the left and the right view, at full size."""
+    """Split an image into the left and the right view, both at full size."""
     height_px, width_px = image.shape[:2]
     try:
         view_px = layout.eye_size_px(width_px, height_px)
@@ -246,7 +248,7 @@ def _split_views(
 
 
 def _read_lens(decoded: Sequence[DecodedPicture]) -> exif.Lens | None:
-    """Read the cameras from the tags of both pictures; the first picture's take precedence."""
+    """Read camera parameters from the tags of both pictures; those of the first one take precedence."""
     first, second = decoded
     return exif.read_lens({**second.tags, **first.tags}, *first.image.size)
 
@@ -256,7 +258,7 @@ def _note_turns(lies: int | None) -> list[Note]:
 
 
 def _note_colours(decoded: Sequence[DecodedPicture]) -> list[Note]:
-    """Return notes on colour conversions, one if both pictures had the same."""
+    """Return notes on colour conversions: a single one if both pictures had the same conversion."""
     texts = [each.note for each in decoded]
     if len(set(texts)) == 1:
         return [Note(text) for text in texts[:1] if text]

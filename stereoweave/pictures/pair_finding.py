@@ -1,4 +1,4 @@
-"""Pairs of a batch: found in a folder, by two glob patterns or in a list; and their names."""
+"""Finding and naming of the pairs of a batch, in a folder, by two glob patterns or in a list."""
 
 import csv
 import glob
@@ -22,19 +22,20 @@ _CALIBRATION = "calib.txt"
 _ENDINGS = {
     # Unsupported formats are included, so that opening them fails with an error that names the format.
     "picture": (*ENDINGS, ".heic", ".heif"),
-    # These are pairs even if pictures lie beside them: cameras write an .mpo file and its left view as .jpg.
+    # These are pairs even if there are pictures beside them: cameras also write an .mpo file's left view as
+    # .jpg.
     "both views": (".mpo", ".jps", ".pns"),
     "film": (".mp4", ".mkv", ".mov", ".avi", ".webm"),
 }
 _SIDES = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R", "im0": "im1"}
 _OTHER_SIDES = _SIDES | {right: left for left, right in _SIDES.items()}
-# left, leftImg8bit and imgLeft, but not leftover; a single letter only at the start or end of a name.
+# Matches left, leftImg8bit and imgLeft, but not leftover; a single letter only at the start or end of a name.
 _MARK = re.compile(
     r"(?<![A-Za-z])(?:left|right|LEFT|RIGHT)(?![a-z])|(?:Left|Right)(?![a-z])"
     r"|^[lLrR](?=$|[ _.-])|(?<![A-Za-z])[lLrR]$|^im[01]$"
 )
 _NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*\x00-\x1f]')
-# Windows device names, and the files and folders of a batch.
+# Names of Windows devices, and of a batch's own files and folders.
 _TAKEN = re.compile(
     r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?|batch\.json|summary\.csv|manifest|plan|begun", re.IGNORECASE
 )
@@ -45,7 +46,7 @@ class NamedPair:
     """A pair of a batch.
 
     Attributes:
-        name: Folder of its results, unique in the batch.
+        name: Name of the pair and of the folder of its results, unique in the batch.
         pictures: Left and right picture, or one picture with both views.
         calibration: The pair's own calibration file, if any.
     """
@@ -59,8 +60,9 @@ class ListedPair(NamedTuple):
     """A pair or video among listed files.
 
     Attributes:
-        name: Folder of its results, unique among the files.
-        files: Paths, separated by "/": left and right picture, one picture with both views, or the video.
+        name: Name of the pair or video and of the folder of its results, unique among the files.
+        files: Paths, with "/" as separator, of the left and right picture, one picture with both views, or
+            the video.
         calibration: Path of the pair's own calibration file, if any.
     """
 
@@ -70,7 +72,7 @@ class ListedPair(NamedTuple):
 
 
 class Listed(NamedTuple):
-    """Pairs, videos, and pictures without a pair among listed files."""
+    """Pairs, videos, and pictures without a partner among listed files."""
 
     pairs: list[ListedPair]
     films: list[ListedPair]
@@ -88,17 +90,17 @@ class FoundPairs:
 def find_pairs(
     pictures: Sequence[Path], left: str | None, right: str | None, listed: Path | None
 ) -> FoundPairs | None:
-    """Find the pairs in a folder, by two patterns or in a list; return None for the pictures of one pair.
+    """Find the pairs in a folder, by two patterns or in a list; return None if the pictures are one pair.
 
     Args:
         pictures: A folder, or the pictures of one pair.
         left: Glob pattern of the left pictures.
         right: Glob pattern of the right pictures.
-        listed: A list of pairs.
+        listed: File with a list of pairs.
 
     Raises:
-        StereoweaveError: Not exactly one of the three is given; see also `find_pairs_in`,
-            `find_pairs_by_globs` and `read_pair_list`.
+        StereoweaveError: Pictures, patterns and list are all missing, or more than one of them is given; see
+            also `find_pairs_in`, `find_pairs_by_globs` and `read_pair_list`.
     """
     ways = {"pictures": pictures, "patterns": left or right, "a list": listed}
     given = [way for way, value in ways.items() if value]
@@ -126,7 +128,7 @@ def find_pairs_in(folder: Path) -> FoundPairs:
         raise StereoweaveError(f"{folder}: expected a folder of pictures, found {_describe_found(folder)}")
     listed = find_pairs_among(folder, (file.path for file in store_at(folder).files()))
     if not listed.pairs:
-        raise StereoweaveError(f"{folder}: expected pictures in it ({_list_endings()}), found none")
+        raise StereoweaveError(f"{folder}: expected a folder with pictures ({_list_endings()}), found none")
     pairs = [
         NamedPair(
             pair.name,
@@ -141,15 +143,16 @@ def find_pairs_in(folder: Path) -> FoundPairs:
 def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
     """Find the pairs and videos among the files of a folder.
 
-    A pair is two pictures whose paths differ only in the marks of the sides: left/a.png and right/a.png,
-    a_L.png and a_R.png, left_01.png and right_01.png, im0.png and im1.png. If one of them is missing, the
-    pair is listed and fails when it is read. A file with both views is a pair. Without any such
-    pair or file, every picture is taken to hold both views. A calib.txt beside left.png or im0.png belongs to
-    that pair. Output folders of batches are ignored.
+    Two pictures are a pair if their paths differ only in the marks of left and right: left/a.png and
+    right/a.png, a_L.png and a_R.png, left_01.png and right_01.png, im0.png and im1.png. If one picture is
+    missing, the pair is listed nevertheless and fails when it is read. A file with both views is also a pair.
+    If there is no such pair or file, every picture is taken to hold both views. A calib.txt beside left.png
+    or im0.png belongs to that pair. Output folders of batches are ignored.
 
     Args:
-        folder: Path or URL of the folder; a pair whose name consists of marks only takes the folder's name.
-        paths: Files below it, relative to it and separated by "/", without hidden ones.
+        folder: Path or URL of the folder; a pair whose name consists only of marks is named after the folder.
+        paths: Paths of the files in the folder, relative to it, with "/" as separator and without hidden
+            files.
 
     Raises:
         StereoweaveError: Two pairs have the same name.
@@ -171,7 +174,7 @@ def find_pairs_among(folder: str | Path, paths: Iterable[str]) -> Listed:
 
 
 def note_left_out(folder: str | Path, pictures: Sequence[str]) -> tuple[str, ...]:
-    """Return a note on a folder's pictures without a pair, if there are any."""
+    """Return a note on a folder's pictures without a partner, if there are any."""
     if not pictures:
         return ()
     count = "1 picture" if len(pictures) == 1 else f"{len(pictures)} pictures"
@@ -179,7 +182,7 @@ def note_left_out(folder: str | Path, pictures: Sequence[str]) -> tuple[str, ...
 
 
 def find_pairs_by_globs(left: str, right: str) -> list[NamedPair]:
-    """Pair the pictures that two patterns match, such as 'left/*.png', each sorted by name.
+    """Pair the pictures that match two patterns, such as 'left/*.png', in the order of their names.
 
     Raises:
         StereoweaveError: A pattern matches nothing, the patterns match different numbers of files, or two
@@ -204,11 +207,11 @@ def read_pair_list(path: Path) -> list[NamedPair]:
     """Read a list of pairs from a text file, one per line: left, right, and optionally the pair's name.
 
     Columns are separated by tabs, commas or spaces; double quotes protect separators. A picture with both
-    views stands alone, or with an empty second column before its name. Paths are relative to the list's
-    folder. Empty lines and lines that begin with # are ignored.
+    views is alone on its line, or followed by an empty second column and its name. Paths are relative to the
+    list's folder. Empty lines and lines that begin with # are ignored.
 
     Raises:
-        FormatError: The file is missing, no text or empty, or a line has more than three columns.
+        FormatError: The file is missing, empty or not text, or a line has more than three columns.
         StereoweaveError: Two pairs have the same name.
     """
     with reading(path, "a list of pairs"):
@@ -240,7 +243,7 @@ def _list_endings() -> str:
 
 
 def _group_by_kind(paths: Iterable[str]) -> dict[str, list[str]]:
-    """Group listed files by kind; drop unknown files and those in the output folders of batches."""
+    """Group listed files by kind; drop files of unknown kind and those in output folders of batches."""
     kinds: dict[str, list[str]] = {kind: [] for kind in (*_ENDINGS, BATCH_FILE, _CALIBRATION)}
     kind_of = {ending: kind for kind, endings in _ENDINGS.items() for ending in endings}
     kind_of |= {name: name for name in (BATCH_FILE, _CALIBRATION)}
@@ -258,28 +261,28 @@ def _group_by_kind(paths: Iterable[str]) -> dict[str, list[str]]:
 
 
 def _list_parents(path: str) -> list[str]:
-    """Return the folders above a path, from the innermost to the root, ""."""
+    """Return the folders that contain a path, from the innermost to the root, which is an empty string."""
     parts = path.split("/")
     return ["/".join(parts[:count]) for count in reversed(range(len(parts)))]
 
 
 def _pair_by_marks(paths: Sequence[str]) -> list[tuple[str, str]]:
-    """Pair up the paths that contain a mark, as (left, right); return nothing if no pair is complete."""
+    """Pair the paths that contain a mark, as (left, right); return an empty list if no pair is complete."""
     there, pairs, settled = set(paths), set(), set()
     for path in paths:
         if path not in settled and (marked := _swap_sides(path)):
             others, is_left = marked
             partner = next((other for other in others if other in there), others[0])
             pairs.add((path, partner) if is_left else (partner, path))
-            if partner == others[0]:  # its first choice is this path
+            if partner == others[0]:  # the partner's own first choice is this path
                 settled.add(partner)
     return sorted(pairs) if any(there.issuperset(pair) for pair in pairs) else []
 
 
 def _swap_sides(path: str) -> tuple[list[str], bool] | None:
-    """Return possible paths of the other side, and whether this one is the left; None without a mark.
+    """Return the other picture's possible paths, and whether this one is the left one; None without marks.
 
-    The other path has all marks swapped, or only the last one.
+    In the other path, all marks are swapped, or only the last one.
     """
     stem, ending = splitext(path)
     parts = stem.split("/")
@@ -295,7 +298,7 @@ def _swap_sides(path: str) -> tuple[list[str], bool] | None:
 
 
 def _split_path(path: str) -> list[str]:
-    """Split a path into its parts, the last without its ending."""
+    """Split a path into its parts, of which the last has no ending."""
     return splitext(path)[0].split("/")
 
 
@@ -324,8 +327,8 @@ def _split_columns(where: str, line: str) -> list[str]:
 def _make_pairs(
     pictures: Iterable[tuple[Path, ...]], root: Path, names: Iterable[str] = repeat("")
 ) -> list[NamedPair]:
-    """Create the pairs; a name defaults to the path below `root` without marks."""
-    # Not `resolve`, which follows links: names must be those that the user sees.
+    """Create the pairs; a pair's name defaults to its path below `root` without marks."""
+    # Not `resolve`, which follows links: users must recognise the names.
     above = Path(os.path.abspath(root))  # noqa: PTH100
     pairs = []
     for paths, given in zip(pictures, names, strict=False):
@@ -333,7 +336,7 @@ def _make_pairs(
         below = first.relative_to(above if first.is_relative_to(above) else first.anchor).as_posix()
         name = _sanitize(given) if given else _name_pair(below, len(paths), above.name)
         beside = paths[0].parent / _CALIBRATION
-        # Not Path.exists, which fails if a name is too long.
+        # Not Path.exists, which raises an error if a name is too long.
         is_own = _owns_calibration(below, len(paths)) and os.path.exists(beside)  # noqa: PTH110
         pairs.append(NamedPair(name, paths, beside if is_own else None))
     _check_names((pair.name, pair.pictures[0]) for pair in pairs)
@@ -341,20 +344,20 @@ def _make_pairs(
 
 
 def _check_names(names: Iterable[tuple[str, str | Path]]) -> None:
-    """Raise a StereoweaveError if two pairs have the same name; `names` gives each pair's first file."""
+    """Raise a StereoweaveError if two pairs have the same name; `names` gives name and first file of each."""
     seen: dict[str, str | Path] = {}
     for name, file in names:
         # Some file systems ignore case.
         other = seen.setdefault(name.casefold(), file)
         if other is not file:
             raise StereoweaveError(
-                f"expected pairs with different names, found {name} for {other} and for {file}; rename one",
+                f"expected pairs with different names, found {name} for both {other} and {file}; rename one",
                 remedy=Remedy("or name them in the third column of a list", ("listed",)),
             )
 
 
 def _name_pair(path: str, pictures: int, whole: str) -> str:
-    """Name a pair by its first picture's path without marks, or by the whole folder if nothing remains."""
+    """Name a pair after its first picture's path without marks, or after the folder if nothing remains."""
     parts = _split_path(path) if pictures == 1 else list(map(_strip_marks, _split_path(path)))
     return _sanitize("_".join(filter(None, parts)) or whole)
 
@@ -365,11 +368,11 @@ def _strip_marks(part: str) -> str:
 
 
 def _sanitize(name: str) -> str:
-    """Make a name valid as a folder on every system, and different from a batch's own files."""
+    """Make a name valid as a folder name on every system, and different from a batch's own files."""
     name = _NOT_IN_NAMES.sub("_", name).strip(" .") or "pair"
     return f"{name}_" if _TAKEN.fullmatch(name) else name
 
 
 def _owns_calibration(path: str, pictures: int) -> bool:
-    """Whether a calibration file beside a pair's first picture belongs to this pair alone."""
+    """Return whether a calibration file beside a pair's first picture belongs to that pair alone."""
     return pictures == 2 and _MARK.fullmatch(_split_path(path)[-1]) is not None

@@ -1,4 +1,4 @@
-"""Layouts of two views in one picture or video frame, and their detection."""
+"""Layouts of two views in one picture or video frame, and detection of the layout."""
 
 import re
 from collections.abc import Sequence
@@ -24,7 +24,11 @@ class PairLayout(NamedTuple):
     right_first: bool = False
 
     def eye_size_px(self, width_px: int, height_px: int) -> tuple[int, int]:
-        """Width and height of one view at full size; raises FormatError if the frame cannot be halved."""
+        """Return the width and height of one view at full size.
+
+        Raises:
+            FormatError: The frame cannot be halved, or its halves are too small.
+        """
         side, extent_px = ("width", width_px) if self.beside else ("height", height_px)
         if extent_px % 2 or extent_px < 2 * SMALLEST_SIDE_PX:
             raise FormatError(
@@ -36,7 +40,7 @@ class PairLayout(NamedTuple):
         return (width_px // 2, height_px) if self.beside else (width_px, height_px // 2)
 
     def eyes(self, frame: Frame) -> tuple[Picture, Picture]:
-        """Left and right view of one frame, each at full size."""
+        """Return the left and the right view of a frame, each at full size."""
         first, second = np.split(frame, 2, axis=1 if self.beside else 0)
         if self.half:
             size_px = frame.shape[1], frame.shape[0]
@@ -66,8 +70,8 @@ _WORDS_IN_NAMES = {
 _HALF = {"half", "hsbs", "halfsbs", "htb", "htab", "hou", "halfou"}
 _FULL = {"full", "lrf", "rlf", "tbf", "fsbs", "fullsbs", "fulltb", "fullou"}
 
-# Aspect ratios of one view. Screens and cameras have 4:3 to 2.4:1; views outside of that are half size. An
-# upright video, 9:16, cannot be distinguished by its aspect ratio and is taken for half size.
+# Aspect ratios of one view. Screens and cameras have 4:3 to 2.4:1; views outside this range are half size. An
+# upright video, 9:16, cannot be told from a half-size view by its aspect ratio, and is taken for one.
 _NARROWEST_EYE, _WIDEST_EYE = 1.2, 2.5
 # Photographs are upright, square or wide. If the aspect ratio fits full and half size, the ratio of
 # horizontal to vertical contrast between neighbouring pixels decides. Its median over painted pictures is
@@ -75,12 +79,13 @@ _NARROWEST_EYE, _WIDEST_EYE = 1.2, 2.5
 _UPRIGHT_EYE, _LOW_EYE, _LOWEST_EYE, _SQUEEZED_CONTRAST = 0.5, 2.0, 3.0, 1.25
 _SCREEN, _SCREEN_TOLERANCE = 16 / 9, 0.01
 _DETAIL_PX = 480
-# Limits of a whole frame's aspect ratio: two upright phone pictures side by side are at least as wide as the
-# first; two half-height views of the widest film, one above the other, are at most as wide as the second.
+# Limits of a whole frame's aspect ratio. Two upright phone pictures side by side have at least the first; two
+# half-height views of the widest film, one above the other, have at most the second.
 _NARROWEST_BESIDE, _WIDEST_ABOVE = 1.05, 2.45
 
-# The resemblance is 0.34 or more for 95 % of painted or rendered pairs, many with disparities far above those
-# of films. It is at most 0.13 for the halves of single pictures and 0.23 for those of blurred enlargements.
+# The resemblance is 0.34 or more for 95 % of painted or rendered pairs, many of which have far larger
+# disparities than films. It is at most 0.13 for the two halves of a single picture, and at most 0.23 if the
+# picture is a blurred enlargement.
 _ALIKE = 0.3
 _SMALL_PX = 160, 120
 _WINDOW_PX, _STEP_PX, _SHIFT_PX, _OFF_PX = 20, 10, 32, 2
@@ -97,18 +102,19 @@ def detect_layout(
     """Detect a video's layout, a name in `PAIR_LAYOUTS`, from its container, its name or its frames.
 
     The frames must confirm a layout in the name, unless they are too plain: "LR" has other meanings too. The
-    frames do not show which view comes first; it is the left one, unless the container or the name differs.
+    frames do not show which view comes first; it is the left one, unless the container or the name says
+    otherwise.
 
     Args:
-        name: Path of the file; its name, without folders, may contain a layout: film_SBS, film-half-OU.
+        name: Path of the file, whose name may contain a layout, such as film_SBS or film-half-OU.
         frames: Some frames of the video, far apart in time.
-        declared: Layout in the container, a full-size name in `PAIR_LAYOUTS`; the views may still be half
-            size.
+        declared: Layout that the container declares, a full-size name in `PAIR_LAYOUTS`; the views may
+            nevertheless be half size.
         photograph: Whether it is a photograph, which may be upright, rather than a video.
 
     Raises:
-        FormatError: The halves of the frames resemble each other in neither split, or the declared layout is
-            not in `PAIR_LAYOUTS`.
+        FormatError: The halves of the frames do not resemble each other, side by side or one above the other;
+            or the declared layout is not in `PAIR_LAYOUTS`.
     """
     if declared not in (None, *PAIR_LAYOUTS):
         raise FormatError(
@@ -125,12 +131,12 @@ def detect_layout(
 
 
 def measure_resemblance(first: Picture, second: Picture) -> float:
-    """Score from 0 to 1 of whether two images show one scene from two places; NaN if they are too plain.
+    """Return a score, 0 to 1, of whether two images show the same scene; NaN if they are too plain.
 
-    Windows of the first image are matched in the second, up to a fifth of the width away. The score is the
-    median of their best correlations, times the share of neighbouring windows with similar shifts: repeated
-    patterns also correlate, but with scattered shifts. Both images are first reduced to one small size and
-    high-pass filtered, because skies and floors look alike everywhere.
+    Windows of the first image are matched in the second one, up to a fifth of the width away. The score is
+    the median of their best correlations, times the share of neighbouring windows with similar shifts:
+    repeated patterns also correlate, but with scattered shifts. Both images are first resized to the same
+    small size and high-pass filtered, because skies and floors look alike everywhere.
     """
     here, there = _extract_detail(first), _extract_detail(second)
     rows = range(_OFF_PX, _SMALL_PX[1] - _WINDOW_PX - _OFF_PX + 1, _STEP_PX)
@@ -147,7 +153,7 @@ def measure_resemblance(first: Picture, second: Picture) -> float:
 def _match_window(
     here: Float32[np.ndarray, "h w"], there: Float32[np.ndarray, "h w"], top: int, left: int
 ) -> tuple[float, float]:
-    """Return the best correlation of a window and its shift in pixels; NaN for a plain window."""
+    """Return a window's best correlation and the shift there, in pixels; both are NaN for a plain window."""
     window = here[top : top + _WINDOW_PX, left : left + _WINDOW_PX]
     if window.std() < _PLAIN:
         return np.nan, np.nan
@@ -164,7 +170,7 @@ def _extract_detail(picture: Picture) -> Float32[np.ndarray, "120 160"]:
 
 
 def _score_halves(kind: str, frames: Sequence[Frame]) -> float:
-    """Median resemblance of the frames' halves; NaN if all frames are too plain."""
+    """Return the median resemblance of the frames' halves; NaN if all frames are too plain."""
     scores = [measure_resemblance(*_split_halves(kind, frame)) for frame in frames]
     known = [score for score in scores if not np.isnan(score)]
     return float(np.median(known)) if known else np.nan
@@ -213,7 +219,7 @@ def _looks_squeezed_photograph(kind: str, frame: Frame) -> bool:
     height_px, width_px = frame.shape[:2]
     if PAIR_LAYOUTS[kind].beside:
         aspect = width_px / 2 / height_px
-        # A picture with the aspect ratio of a screen is made for a 3-D screen, which stretches half views.
+        # A picture with a screen's aspect ratio is made for a 3-D screen, which stretches half-width views.
         if abs(width_px / height_px / _SCREEN - 1) < _SCREEN_TOLERANCE:
             return True
         if _UPRIGHT_EYE <= aspect < _NARROWEST_EYE:
@@ -226,7 +232,7 @@ def _looks_squeezed_photograph(kind: str, frame: Frame) -> bool:
 
 
 def _measure_contrast_ratio(kind: str, frame: Frame) -> float:
-    """Ratio of horizontal to vertical contrast between neighbouring pixels."""
+    """Return the ratio of horizontal to vertical contrast between neighbouring pixels."""
     beside, above = 0.0, 0.0
     for eye in _split_halves(kind, frame):
         smaller = min(1.0, _DETAIL_PX / max(eye.shape[:2]))

@@ -1,4 +1,4 @@
-"""Preparation of pictures for matching: open, rectify, find the camera."""
+"""Preparation of pictures for matching: opening, rectification and choice of the camera."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,8 +21,8 @@ class Request:
     Attributes:
         format: Layout of one picture with both views, a name in `loading.FORMATS`; default: detected.
         calibration: Calibration file of the two cameras (`calibration_files.read_rig`).
-        focal_px, baseline_m: The camera, without a calibration; default: from EXIF.
-        rectify: Whether to rectify the pair, by the calibration or, without one, by features.
+        focal_px, baseline_m: Focal length and baseline, instead of a calibration; default: from EXIF.
+        rectify: Whether to rectify the pair, with the calibration or, without one, from feature matches.
     """
 
     format: str | None = None
@@ -40,7 +40,7 @@ class Request:
 
 @dataclass(frozen=True, kw_only=True)
 class Prepared:
-    """A pair ready for matching, its files, and notes on what was detected or changed."""
+    """A pair ready for matching, its picture files, and notes on what was detected or changed."""
 
     pair: StereoPair
     pictures: tuple[Path, ...]
@@ -48,14 +48,14 @@ class Prepared:
 
 
 def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
-    """Open and rectify the pair in two pictures, left first, or in one picture with both views.
+    """Open a pair, from two pictures (left first) or one picture with both views; rectify it if requested.
 
-    The camera comes from the calibration, from the request, or from EXIF. The pair has none if focal length
-    or baseline is missing, or if it was rectified by features.
+    The camera comes from the calibration, from the request, or from EXIF. The pair has no camera if focal
+    length or baseline is unknown, or if it was rectified from feature matches.
 
     Raises:
         StereoweaveError: See `open_pictures`, `read_rig`, `rectify` and `rectify_by_features`; or the request
-            has one of focal length and baseline and the other is unknown.
+            gives only one of focal length and baseline, and EXIF lacks the other.
     """
     opened = open_pictures(pictures, request.format)
     if request.calibration:
@@ -69,7 +69,7 @@ def prepare(pictures: Sequence[Path], request: Request) -> Prepared:
 
 
 def _apply_calibration(pair: StereoPair, path: Path, rectified: bool) -> Rectified:
-    """Add the calibration's camera to the pair, and rectify the pair by it if requested."""
+    """Add the calibration's camera to the pair; if requested, rectify the pair with the calibration."""
     rig = read_rig(path, pair_size_px(pair))
     if rectified:
         return rectify(pair, rig)
@@ -108,7 +108,7 @@ def _find_camera(
 
 
 def _rectify_by_features(ready: Rectified) -> Rectified:
-    """Rectify the pair by its features and drop its camera: the disparity at infinity is then unknown."""
+    """Rectify the pair from feature matches and drop its camera: disparity at infinity is then unknown."""
     rectified = rectify_by_features(ready.pair)
     if ready.pair.camera is None:
         return rectified

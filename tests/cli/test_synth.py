@@ -60,7 +60,7 @@ def test_a_set_is_found_in_order_and_a_damaged_one_ends_with_1(words, capsys):
     shard.write_bytes(content)
     told = capsys.readouterr().out
     assert f"{shard}: expected pylon-000000." in told
-    assert told.endswith("makes its pairs again\n1 problem\n")
+    assert told.endswith("rerun the same `stereoweave synth make` command\n1 problem\n")
 
 
 @pytest.mark.needs_egl

@@ -46,7 +46,7 @@ def test_a_dataset_without_frames_is_an_error(tmp_path):
     for folder in ("left", "right", "depth"):
         (tmp_path / folder).mkdir()
     (tmp_path / "calib.txt").touch()
-    assert "frames of paper" in error_of(open_dataset, "paper", tmp_path)
+    assert "archives of paper" in error_of(open_dataset, "paper", tmp_path)
 
 
 def test_frames_are_sorted_by_name_and_know_their_sequence(root):

@@ -53,7 +53,9 @@ def test_scenes_come_by_name_and_other_folders_are_passed_over(scene):
 
 @pytest.mark.parametrize("folder", [".", "nowhere"])
 def test_a_folder_without_scenes_is_an_error_at_once(tmp_path, folder):
-    with pytest.raises(StereoweaveError, match="expected <scene>/left.png below it, found none"):
+    with pytest.raises(
+        StereoweaveError, match="expected <scene>/left.png below it, or rendered sets, found neither"
+    ):
         read_scenes(tmp_path / folder)
 
 
@@ -64,7 +66,9 @@ def test_a_scene_without_ground_truth_is_an_error(scene):
 
 def test_ground_truth_of_another_size_is_an_error(scene):
     maps.write_pfm(scene / "disparity.pfm", np.ones((32, 41)))
-    with pytest.raises(FormatError, match=r"expected ground truth of shape \(32, 40\).*found \(32, 41\)"):
+    with pytest.raises(
+        FormatError, match=r"expected ground truth of the pictures' shape \(32, 40\).*found \(32, 41\)"
+    ):
         list(read_scenes(scene.parent))
 
 

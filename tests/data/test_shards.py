@@ -100,14 +100,14 @@ def test_pairs_are_read_by_index_across_shards(folder):
     [
         ({"left.webp": b"RIFF"}, "left.webp: expected a picture"),
         ({"disparity.png": b"%!PS-Adobe-3.0 EPSF-3.0\n"}, "disparity.png: expected a picture"),
-        ({"camera.json": b"[]"}, "found ship-000000 without or with damaged ones"),
+        ({"camera.json": b"[]"}, "found ship-000000 with missing or damaged ones"),
         ({"camera.json": b"{}"}, "steps_per_px"),
     ],
 )
 def test_a_damaged_file_of_a_pair_is_named_though_its_checksum_is_right(tmp_path, damage, found):
     write_shard(tmp_path, "ship", 0, [pack(pair(1), {}) | damage])
     message = error_of(Shards(tmp_path).__getitem__, 0)
-    assert message.startswith(f"{tmp_path / 'ship-000000-000000.tar'}: expected the files of a pair")
+    assert message.startswith(f"{tmp_path / 'ship-000000-000000.tar'}: expected all files of a pair")
     assert found in message
 
 
@@ -160,7 +160,7 @@ def test_a_byte_that_changed_is_noticed_and_the_pair_named(folder):
     content[place] ^= 1
     path.write_bytes(content)
     message = error_of(Shards(folder).files, 6)
-    assert message.startswith(f"{path}: expected ship-000006.right.webp as it was written, found it damaged")
+    assert message.startswith(f"{path}: expected ship-000006.right.webp as written, found it damaged")
     assert_equal(Shards(folder)[5], pair(5))
 
 
@@ -190,8 +190,8 @@ def facts(**changes):
         ("camera.json", None, "no camera.json"),
         ("left.webp", b"no picture", "left.webp"),
         ("left.webp", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 48 32\n", "left.webp"),
-        ("left.webp", png(np.zeros((32, 48), np.uint8)), "left.webp of another kind"),
-        ("disparity.png", png(np.zeros((32, 48), np.uint8)), "disparity.png of another kind"),
+        ("left.webp", png(np.zeros((32, 48), np.uint8)), "left.webp with another data type"),
+        ("disparity.png", png(np.zeros((32, 48), np.uint8)), "disparity.png with another data type"),
         ("disparity.png", png(np.zeros((32, 47), np.uint16)), "disparity.png of 47x32"),
         ("occluded.png", png(np.zeros((31, 48), bool)), "occluded.png of 48x31"),
         ("camera.json", b"[" * 5000, "recursion"),
@@ -254,9 +254,9 @@ def test_a_shard_that_is_missing_between_others_is_noticed(folder):
     [
         (
             "ship-000003-000005.tar",
-            "expected no pair of ship-000000-000003.tar, found some in both; delete it",
+            "expected no pair of ship-000000-000003.tar, found some in both shards; delete it",
         ),
-        ("towns-000004-000007.tar", "expected a shard of ship, found another set's; move or delete it"),
+        ("towns-000004-000007.tar", "expected a shard of ship, found one of another set; move or delete it"),
     ],
 )
 def test_a_shard_too_many_is_named_with_what_to_do(folder, name, words):

@@ -172,7 +172,7 @@ def test_a_damaged_shard_is_made_again_once_it_is_deleted(finished, tmp_path):
     shard = tmp_path / "pylon-000004-000007.tar"
     shard.write_bytes(b"damaged")
     assert error_of(Shards(tmp_path).files, 5).endswith(
-        "delete it, and the same stereoweave synth make makes its pairs again"
+        "delete it, and rerun the same `stereoweave synth make` command"
     )
     assert made(tmp_path) == 0
     shard.unlink()
