@@ -51,28 +51,27 @@ ERRORS = {
     "out, and give the left one first": lambda: open_pictures(PAIR, "crossed"),
     "turned.yml: expected a calibration of rectified pictures, found lenses with distortion; rectify "
     "the pair with it (rectify)": lambda: prepare(PAIR, Request(calibration=Path("turned.yml"))),
-    "metres: expected a baseline beside the focal length, found none; give the baseline (baseline_m)": (
-        lambda: prepare(PAIR, Request(focal_px=500))
-    ),
-    "metres: expected a focal length in EXIF beside the baseline, found none; give the focal length "
+    "metres: expected a baseline in addition to the focal length, found none; give the baseline "
+    "(baseline_m)": (lambda: prepare(PAIR, Request(focal_px=500))),
+    "metres: expected a focal length in EXIF in addition to the baseline, found none; give the focal length "
     "(focal_px)": lambda: prepare(PAIR, Request(baseline_m=0.1)),
-    "rectify: expected at least 40 points that both pictures show from two positions, found 0 of 0 matches "
-    "that agree; take pictures with more texture and more overlap; or give a calibration (calibration)": (
+    "rectify: expected at least 40 feature matches that agree on the camera positions, found 0 of 0 "
+    "matches; take pictures with more texture and more overlap; or give a calibration (calibration)": (
         lambda: prepare(PLAIN, Request(rectify=True))
     ),
     "expected a camera for depth, found none; give a calibration, or the focal length and baseline of a "
     "rectified pair (calibration, focal_px, baseline_m)": (
         lambda: require_camera(sw.StereoPair(left=BLACK, right=BLACK))
     ),
-    "raw: expected without refined: it is the network's own disparity; leave one of them out "
+    "raw: cannot be combined with refined, because it is the network's own disparity; leave one of them out "
     "(raw, refined)": (lambda: MatchOptions(raw=True, refined=True)),
     "expected pictures or a folder, patterns of left and right pictures, or a list of pairs, found none; "
     "give exactly one of them (left, right, listed)": lambda: find_pairs([], None, None, None),
     "provider: expected one of cpu, cuda, tensorrt, openvino, coreml, directml, found 'gpu'": (
         lambda: sw.Matcher(provider="gpu")
     ),
-    "range_px: expected disparities of -64 to 64 px, the width of the pictures, got 70 and 80; omit it for "
-    "automatic detection": lambda: sw.estimate(BLACK, BLACK, range_px=(70, 80)),
+    "range_px: expected disparities between -64 and 64 px, the width of the pictures, got 70 and 80; omit it "
+    "for automatic detection": lambda: sw.estimate(BLACK, BLACK, range_px=(70, 80)),
     "threads: expected 1 or more, got 0; 1024 at most": lambda: sw.Matcher(threads=0),
     "position: expected -1.0 to 2.0 (0 left camera, 1 right), got 3": (
         lambda: sw.synthesize(BLACK, BLACK, 3, threads=1)

@@ -62,7 +62,7 @@ def test_a_camera_refuses_nonsense(name, value):
 
 @pytest.mark.usefixtures("without_shape_checks")
 def test_a_pair_refuses_pictures_of_two_sizes():
-    with pytest.raises(StereoweaveError, match=r"one size, got 40x32 and 41x32; crop"):
+    with pytest.raises(StereoweaveError, match=r"same size, got 40x32 and 41x32; crop"):
         StereoPair(left=np.zeros((32, 40, 3), np.uint8), right=np.zeros((32, 41, 3), np.uint8))
 
 
@@ -94,7 +94,9 @@ def make_estimate(**changes):
 def test_an_estimate_refuses_disparities_that_are_not_finite():
     disparity_px = np.zeros((4, 5), np.float32)
     disparity_px[1, :2] = np.nan, np.inf
-    with pytest.raises(StereoweaveError, match="right_disparity_px: expected finite values, got 2 NaN"):
+    with pytest.raises(
+        StereoweaveError, match="right_disparity_px: expected finite values, got 2 that are NaN"
+    ):
         make_estimate(right_disparity_px=disparity_px)
 
 

@@ -42,7 +42,7 @@ _NEIGHBOURS, _LEAST_AGREEING = 8, 4
 _AGREE_PX, _AGREE_SHARE = 2.0, 0.05
 _OUTER_PERCENT = 1.0
 
-# Exposure is compared in windows of this size, by levels that neither image clips.
+# Exposure is compared in windows of this size, and only at levels that neither image clips.
 _LIGHT_WINDOW_PX = 7
 _BLACK_LEVEL, _WHITE_LEVEL = 8, 250
 _GAMMA = 2.2
@@ -58,10 +58,10 @@ class Alignment:
     Attributes:
         matches: Number of matches.
         vertical_error_px, vertical_error_95_px: Median and 95th percentile of the vertical error.
-        vertical_shift_px: How much lower the right image is, at its centre.
+        vertical_shift_px: Vertical shift of the right image at its centre; positive if it is lower.
         rotation_degrees: Clockwise rotation of the right image.
         range_px: Least and greatest disparity, without the outermost 1 %.
-        exposure_ratio: Exposure of the right image divided by the left one's; NaN if unknown.
+        exposure_ratio: Exposure of the right image divided by that of the left one; NaN if unknown.
         defects: Defects found, names in `DEFECTS`; empty for a sound pair.
     """
 
@@ -93,7 +93,7 @@ class Alignment:
         return [*map(Note, found), *(defects or [sound])]
 
     def warnings(self) -> list[Note]:
-        """Return notes on the defects that impair depth, which excludes negative disparities."""
+        """Return notes on the defects that impair depth; negative disparities do not."""
         return [self._note(defect) for defect in self.defects if defect != "negative_disparity"]
 
     def _note(self, defect: Defect) -> Note:
@@ -236,7 +236,7 @@ def _fit_vertical_error(
 def _find_plane_inliers(
     terms: Float[np.ndarray, "n 3"], values: Float[np.ndarray, " n"], tolerated: float
 ) -> Bool[np.ndarray, " n"]:
-    """Return the inliers of the best plane among zero and many through three random values (RANSAC)."""
+    """Return the inliers of the best plane: the zero plane, or one through three random values (RANSAC)."""
     rng = np.random.default_rng(0)
     picked = rng.integers(0, len(values), (_TRIALS, 3))
     through = terms[picked]

@@ -1,4 +1,4 @@
-"""Calibration boards and the detection of their corners."""
+"""Calibration boards and detection of their corners."""
 
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -53,7 +53,7 @@ class Calibration:
         rig: The two cameras.
         left_error_px, right_error_px: RMS reprojection error.
         epipolar_error_px: Median distance of a right corner from the epipolar line of its left corner.
-        cover_percent: Share of the picture that the boards cover, in the view in which it is smaller.
+        cover_percent: Share of the picture that the boards cover, in the view with the smaller share.
         tilt_degrees: Angle between the optical axis and the normal of the most tilted board.
         used: Names of the pairs used.
         left_out: Reason for each picture or pair left out, by name.
@@ -208,7 +208,7 @@ def _find_all_corners(
     left_out: dict[str, str],
     progress: Callable[[str], None],
 ) -> tuple[list[PairCorners], Size]:
-    """Find the corners in every pair; return the pairs of the most common picture size, and that size."""
+    """Find the corners in every pair; return those of the pairs of the most common size, and that size."""
     seen: list[tuple[PairCorners, Size]] = []
     for name, paths in pairs.items():
         progress(name)
@@ -222,9 +222,7 @@ def _find_all_corners(
     size_px = Counter(size for _, size in seen).most_common(1)[0][0]
     for pair, found_px in seen:
         if found_px != size_px:
-            left_out[pair.name] = (
-                f"size {format_size(found_px)}, while most pairs have {format_size(size_px)}"
-            )
+            left_out[pair.name] = f"size {format_size(found_px)}, but most pairs have {format_size(size_px)}"
     return [pair for pair, found_px in seen if found_px == size_px], size_px
 
 

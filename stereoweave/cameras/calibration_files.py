@@ -1,4 +1,4 @@
-"""Reading of calibration files from common programs, and writing of OpenCV's."""
+"""Reading of calibration files from common programs, and writing of OpenCV's format."""
 
 import base64
 import contextlib
@@ -81,7 +81,7 @@ def read_calibration_bytes(path: str | Path) -> bytes:
 
 
 def add_camera(pair: StereoPair, path: str | Path) -> StereoPair:
-    """Return the rectified pair with the camera of a calibration file, which must be for its size."""
+    """Return the rectified pair with the camera of a calibration file for pictures of the same size."""
     rig = read_rig(path, pair_size_px(pair))
     rig.check_size(pair)
     return replace(pair, camera=rig.camera())
@@ -381,17 +381,17 @@ def _parse_numbers(values: Any) -> Float[np.ndarray, "..."]:
 
 
 def _parse_hexadecimal(values: Any) -> Any:
-    """Replace hexadecimal strings by numbers."""
+    """Replace hexadecimal strings with numbers."""
     if isinstance(values, list):
         return [_parse_hexadecimal(value) for value in values]
     return int(values, 16) if isinstance(values, str) and _HEXADECIMAL.fullmatch(values) else values
 
 
 def _parse_matrix(entries: Mapping[str, Any]) -> Float[np.ndarray, "..."]:
-    """Parse OpenCV's matrix to the same values as cv2.FileStorage, in float64."""
+    """Parse OpenCV's matrix to the same values as cv2.FileStorage does, in float64."""
     written = re.fullmatch(r"(\d*)([A-Za-z])", str(entries.get("dt", "d")))
     if written is None:
-        raise ValueError(f"a matrix of the type {reprlib.repr(entries['dt'])}")
+        raise ValueError(f"unsupported matrix type {reprlib.repr(entries['dt'])}")
     numbers = _parse_numbers(entries["data"])
     if written[2] in _ROUNDED:
         numbers = numbers.astype(_ROUNDED[written[2]]).astype(np.float64)
@@ -401,7 +401,7 @@ def _parse_matrix(entries: Mapping[str, Any]) -> Float[np.ndarray, "..."]:
         int(written[1] or 1),
     ]  # the last one is the number of channels
     if min(shape) < 0 or math.prod(shape) != numbers.size:
-        raise ValueError(f"a matrix of {numbers.size} numbers in the shape {reprlib.repr(shape)}")
+        raise ValueError(f"{numbers.size} numbers for a matrix of shape {reprlib.repr(shape)}")
     return numbers.reshape(shape)
 
 
@@ -410,5 +410,5 @@ def _decode_base64(data: str) -> Float[np.ndarray, " _"]:
     content = base64.b64decode(data.removeprefix(BASE64))
     written = re.fullmatch(rb"\d*([a-z]) *", content[:24])
     if written is None or written[1].decode() not in _BASE64_TYPES:
-        raise ValueError(f"base64 of the type {content[:24]!r}")
+        raise ValueError(f"unsupported base64 type {content[:24]!r}")
     return np.frombuffer(content, _BASE64_TYPES[written[1].decode()], offset=24).astype(np.float64)

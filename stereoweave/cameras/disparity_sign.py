@@ -48,9 +48,9 @@ def find_negative_disparities(
     far more common than converged ones.
 
     Args:
-        left: The left image, uint8 RGB [H, W, 3].
-        right: The right one, rectified.
-        places_px: Columns and rows in the left image.
+        left: Left image of a rectified pair, uint8 RGB [H, W, 3].
+        right: Right image of the same size.
+        places_px: Columns and rows of points in the left image.
         disparity_px: Disparity at these points. If too few of them are certain, areas without corners are
             also matched, densely.
     """

@@ -82,9 +82,8 @@ def _select_inliers(found: Matches) -> Matches:
             right_ones = right_ones if mask is None else mask.ravel() > 0
     if right_ones.sum() < max(_LEAST_MATCHES, _LEAST_RIGHT_SHARE * count):
         raise StereoweaveError(
-            f"expected at least {_LEAST_MATCHES} points that both pictures show from two positions, "
-            f"found {right_ones.sum()} of {count} matches that agree; take pictures with more texture and "
-            "more overlap",
+            f"expected at least {_LEAST_MATCHES} feature matches that agree on the camera positions, "
+            f"found {right_ones.sum()} of {count} matches; take pictures with more texture and more overlap",
             setting="rectify",
             remedy=Remedy("or give a calibration", ("calibration",)),
         )
@@ -147,7 +146,7 @@ def _check(parameters: Float[np.ndarray, " 6"], residual_px: float, width: int, 
     most_px = _MOST_RESIDUAL_PX * max(1.0, (width * height / _PIXELS_OF_RESIDUAL) ** 0.5)
     if residual_px > most_px or largest_degrees > _MOST_TURN_DEGREES:
         raise StereoweaveError(
-            f"expected cameras side by side, rotated by under {_MOST_TURN_DEGREES:.0f} degrees, found "
+            f"expected cameras side by side, rotated by less than {_MOST_TURN_DEGREES:.0f} degrees, found "
             f"vertical errors of {residual_px:.1f} px after a rotation of {largest_degrees:.0f} degrees; "
             "take the pictures from two positions side by side, without moving forward",
             setting="rectify",

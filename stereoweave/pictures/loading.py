@@ -49,7 +49,7 @@ class Opened:
 
     Attributes:
         pair: Both views, upright and in sRGB.
-        layout: Layout of the files: a name in `PAIR_LAYOUTS`, "mpo" or "two_pictures".
+        layout: Layout of the files, which is a name in `PAIR_LAYOUTS`, "mpo" or "two_pictures".
         notes: Notes on what was detected or changed.
         lens: Camera parameters from EXIF, in pixels of the pair; None if EXIF has none.
     """

@@ -110,7 +110,7 @@ def detect_layout(
         frames: Some frames of the video, far apart in time.
         declared: Layout that the container declares, a full-size name in `PAIR_LAYOUTS`; the views may
             nevertheless be half size.
-        photograph: Whether it is a photograph, which may be upright, rather than a video.
+        photograph: Whether the file is a still picture, which may be upright, rather than a video.
 
     Raises:
         FormatError: The halves of the frames do not resemble each other, side by side or one above the other;

@@ -96,12 +96,12 @@ def _find_camera(
         return camera, (Note(f"from EXIF: {', '.join(from_exif)}"),) if from_exif else ()
     if request.focal_px is not None:
         raise StereoweaveError(
-            "metres: expected a baseline beside the focal length, found none",
+            "metres: expected a baseline in addition to the focal length, found none",
             remedy=Remedy("give the baseline", ("baseline_m",)),
         )
     if request.baseline_m is not None:
         raise StereoweaveError(
-            "metres: expected a focal length in EXIF beside the baseline, found none",
+            "metres: expected a focal length in EXIF in addition to the baseline, found none",
             remedy=Remedy("give the focal length", ("focal_px",)),
         )
     return None, ()

@@ -269,7 +269,7 @@ def raise_provider_error(*_: object, **__: object) -> None:
 
 def test_a_provider_that_a_workers_machine_has_not_ends_the_run_and_is_no_row(stores_and_chunk):
     source, out, chunk = stores_and_chunk
-    with pytest.raises(MatcherError, match="provider directml: expected an ONNX Runtime that has it"):
+    with pytest.raises(MatcherError, match="provider directml: expected an ONNX Runtime that includes it"):
         ChunkWorker(source, out, replace(JOB, backend=Backend(provider="directml")))([chunk])
     assert read_rows(out, chunk) == {}
 

@@ -25,12 +25,12 @@ ERRORS = {
     "'diagonal'",
     f"depth {PAIR} --calib turned.yml -o out": "turned.yml: expected a calibration of rectified pictures, "
     "found lenses with distortion; rectify the pair with it (--rectify)",
-    f"depth {PAIR} --focal-px 500 -o out": "metres: expected a baseline beside the focal length, found none; "
-    "give the baseline (--baseline-m)",
-    f"depth {PAIR} --baseline-m 0.1 -o out": "metres: expected a focal length in EXIF beside the baseline, "
-    "found none; give the focal length (--focal-px)",
-    "view plain.png plain.png --rectify -o out.png": "--rectify: expected at least 40 points that both "
-    "pictures show from two positions, found 0 of 0 matches that agree; take pictures with more texture and "
+    f"depth {PAIR} --focal-px 500 -o out": "metres: expected a baseline in addition to the focal length, "
+    "found none; give the baseline (--baseline-m)",
+    f"depth {PAIR} --baseline-m 0.1 -o out": "metres: expected a focal length in EXIF in addition to the "
+    "baseline, found none; give the focal length (--focal-px)",
+    "view plain.png plain.png --rectify -o out.png": "--rectify: expected at least 40 feature matches "
+    "that agree on the camera positions, found 0 of 0 matches; take pictures with more texture and "
     "more overlap; or give a calibration (--calib)",
     "rectify plain.png plain.png -o out": "rectify: expected at least 40 points that both pictures show from "
     "two positions, found 0 of 0 matches that agree; take pictures with more texture and more overlap; or "
@@ -41,10 +41,10 @@ ERRORS = {
     f"depth {PAIR} --write x.obj -o out": "--write: expected all or one of "
     f"{', '.join(FILES)}, found 'x.obj'",
     f"measure {PAIR} --from 1,2 --to 3,4": NO_CAMERA,
-    f"depth {PAIR} --raw --refined -o out": "--raw: expected without refined: it is the network's own "
-    "disparity; leave one of them out (--raw, --refined)",
-    f"depth {PAIR} --range 700,800 -o out": "--range: expected disparities of -640 to 640 px, the width of "
-    "the pictures, got 700 and 800; omit it for automatic detection",
+    f"depth {PAIR} --raw --refined -o out": "--raw: cannot be combined with refined, because it is the "
+    "network's own disparity; leave one of them out (--raw, --refined)",
+    f"depth {PAIR} --range 700,800 -o out": "--range: expected disparities between -640 and 640 px, the "
+    "width of the pictures, got 700 and 800; omit it for automatic detection",
     f"depth {PAIR} --provider gpu -o out": "--provider: expected one of cpu, cuda, tensorrt, openvino, "
     "coreml, directml, found 'gpu'",
     f"depth {PAIR} --list list.txt -o out": "expected pictures or a folder, patterns of left and right "

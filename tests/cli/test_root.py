@@ -129,8 +129,8 @@ def mistakes(pictures) -> Path:
         ("depth left.png narrow.png -o out", ["left.png of 96x64", "narrow.png of 80x64", "the same size"]),
         ("depth tiny.png tiny.png -o out", ["tiny.png", "at least 32x32", "found 31x64"]),
         ("depth odd.png --format side_by_side -o out", ["odd.png", "an even width", "found 95x64"]),
-        ("depth left.png right.png both.png -o out", ["LEFT RIGHT or SIDE_BY_SIDE", "found 3", "both.png"]),
-        ("view left.png right.png both.png left.png -o out.png", ["LEFT RIGHT or SIDE_BY_SIDE", "found 4"]),
+        ("depth left.png right.png both.png -o out", ["two pictures, left and right", "found 3", "both.png"]),
+        ("view left.png right.png both.png left.png -o out.png", ["two pictures, left and right", "found 4"]),
         (
             "depth left.png right.png --calib half.txt -o out",
             ["half.txt", "expected a calibration of two cameras", "no entry"],
@@ -375,7 +375,7 @@ def test_training_without_pytorch_names_the_extra(tmp_path):
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "PyTorch" in done.stderr
-    assert "pip install 'stereoweave[train]', from the wheel or the copy you have" in done.stderr
+    assert "pip install 'stereoweave[train]', from your wheel or your copy of the source" in done.stderr
     assert list(tmp_path.iterdir()) == []
 
 

@@ -75,7 +75,11 @@ def test_the_network_is_loaded_as_the_backend_says():
     ("fields", "kind", "message"),
     [
         ({"model": "nonsense"}, MatcherError, "unknown model 'nonsense'"),
-        ({"model": "none.onnx"}, MatcherError, "none.onnx: expected an ONNX matcher, found no such file"),
+        (
+            {"model": "none.onnx"},
+            MatcherError,
+            "none.onnx: expected an ONNX matcher file, found no such file",
+        ),
         ({"provider": "abacus"}, MatcherError, "provider: expected one of cpu, "),
         ({"threads": 0}, StereoweaveError, "threads: expected 1 or more"),
     ],

@@ -308,7 +308,9 @@ def test_a_disparity_outside_of_the_range_that_is_given_is_brought_to_its_end_an
 
 @pytest.mark.parametrize("range_px", [(160, 170), (-170, -160)])
 def test_a_range_that_no_pixel_can_have_is_refused_in_one_line(matcher, rng, range_px):
-    with pytest.raises(StereoweaveError, match="expected disparities of -160 to 160 px, the width") as caught:
+    with pytest.raises(
+        StereoweaveError, match="expected disparities between -160 and 160 px, the width"
+    ) as caught:
         match(matcher, flat(rng, 12, (64, 160)), MatchOptions(range_px=range_px))
     assert "\n" not in str(caught.value)
 

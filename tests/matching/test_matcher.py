@@ -98,7 +98,7 @@ def test_an_estimate_cannot_be_both_refined_and_raw(both_views, call):
         "match": lambda: match(both_views, pair, MatchOptions(**both)),
         "match_many": lambda: match_many(both_views, [pair], MatchOptions(**both)),
     }
-    with pytest.raises(sw.StereoweaveError, match="raw: expected without refined"):
+    with pytest.raises(sw.StereoweaveError, match="raw: cannot be combined with refined"):
         calls[call]()
 
 
@@ -195,7 +195,7 @@ def test_an_unknown_name_lists_the_shipped_ones():
 def test_a_graph_that_is_no_matcher_is_refused(tmp_path):
     nodes = red_of("picture", "label")
     file = matcher_file(tmp_path / "other.onnx", nodes, ["label"], inputs=("picture",))
-    with pytest.raises(sw.MatcherError, match=r"other\.onnx: expected a matcher.*found inputs picture"):
+    with pytest.raises(sw.MatcherError, match=r"other\.onnx: expected a matcher with.*found inputs picture"):
         Matcher(file)
 
 
@@ -319,7 +319,7 @@ def test_no_pairs_give_no_estimates(both_views):
 
 def test_pairs_of_two_sizes_are_refused_together(both_views, five_pairs):
     smaller = StereoPair(left=five_pairs[0].left[:40], right=five_pairs[0].right[:40])
-    with pytest.raises(sw.StereoweaveError, match="all of one size, got 64x40, 64x48"):
+    with pytest.raises(sw.StereoweaveError, match="pairs of equal size, got 64x40, 64x48"):
         both_views.estimate_many([*five_pairs, smaller])
 
 
@@ -341,7 +341,7 @@ def test_a_file_for_one_size_takes_smaller_pictures_and_refuses_larger_ones_in_o
     found = network.estimate(picture, picture, raw=True)
     np.testing.assert_allclose(found.disparity_px, picture[:, :, 0], atol=1e-4)
     tall = np.zeros((65, 64, 3), np.uint8)
-    message = r"at most 80x64 px, the size that one_size\.onnx takes, got 64x65; matching\.match makes"
+    message = r"at most 80x64 px, the input size of one_size\.onnx, got 64x65; matching\.match scales"
     with pytest.raises(sw.StereoweaveError, match=message):
         network.estimate(tall, tall)
 

@@ -15,7 +15,7 @@ def test_a_range_of_other_than_two_finite_ascending_numbers_is_refused(range_px)
 def test_invalid_options_are_refused_before_anything_else_is_looked_at():
     with pytest.raises(StereoweaveError, match="^range_px: "):
         sw.estimate("no picture", "no picture", model="no model", range_px=(5.0, 2.0))
-    with pytest.raises(StereoweaveError, match="^raw: expected without refined"):
+    with pytest.raises(StereoweaveError, match="^raw: cannot be combined with refined"):
         sw.estimate("no picture", "no picture", model="no model", refined=True, raw=True)
 
 

@@ -213,5 +213,5 @@ def test_strips_of_rows_find_what_the_whole_finds(rng, monkeypatch):
 def test_an_estimate_of_other_photographs_is_refused(scene):
     left, right, _, right_px = scene
     given = estimate_of(right_px, right_px)
-    with pytest.raises(StereoweaveError, match="estimate: expected the photographs' size 159x64, got 160x64"):
+    with pytest.raises(StereoweaveError, match="expected the size of the images, 159x64, got 160x64"):
         refine(left[:, 1:], right[:, 1:], given)

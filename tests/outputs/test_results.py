@@ -216,7 +216,7 @@ def test_what_is_asked_of_the_estimate_is_handed_on(folder, matcher):
 
 
 def test_an_order_cannot_be_both_refined_and_raw():
-    with pytest.raises(StereoweaveError, match="raw: expected without refined"):
+    with pytest.raises(StereoweaveError, match="raw: cannot be combined with refined"):
         MatchOptions(refined=True, raw=True)
 
 

@@ -103,13 +103,13 @@ def test_hidden_files_and_results_of_a_batch_are_no_pictures(tmp_path):
 def test_two_pairs_of_one_name_are_refused_before_the_start_even_if_capitals_alone_differ(tmp_path):
     folder = put(tmp_path, "a_L.png", "a_R.png", "A_L.jpg", "A_R.jpg")
     with pytest.raises(
-        StereoweaveError, match="pairs with different names, found a for .*A_L.jpg and for .*a_L.png"
+        StereoweaveError, match="pairs with different names, found a for both .*A_L.jpg and .*a_L.png"
     ):
         find_pairs_in(folder)
 
 
 def test_a_folder_without_pictures_is_told_in_one_line(tmp_path):
-    with pytest.raises(StereoweaveError, match=r"expected pictures in it \(.*\), found none"):
+    with pytest.raises(StereoweaveError, match=r"expected a folder with pictures \(.*\), found none"):
         find_pairs_in(put(tmp_path, "film.mp4"))
     with pytest.raises(StereoweaveError, match="expected a folder of pictures, found no such folder"):
         find_pairs_in(tmp_path / "none")
@@ -147,7 +147,7 @@ def test_films_have_their_endings_in_their_names_and_are_no_pictures():
 
 
 def test_two_films_of_one_name_are_refused():
-    with pytest.raises(StereoweaveError, match="found a_b.mp4 for a/b.mp4 and for a_b.mp4"):
+    with pytest.raises(StereoweaveError, match="found a_b.mp4 for both a/b.mp4 and a_b.mp4"):
         find_pairs_among("pairs", ["a/b.mp4", "a_b.mp4"])
 
 
@@ -227,7 +227,7 @@ def test_a_pair_named_like_a_folder_of_a_batch_is_renamed_and_may_not_take_anoth
     assert [pair.name for pair in find_pairs_in(folder).pairs] == ["begun_", "manifest_"]
     put(tmp_path, "manifest_/left.png", "manifest_/right.png")
     with pytest.raises(
-        StereoweaveError, match="different names, found manifest_ for manifest.*and for manifest_"
+        StereoweaveError, match="different names, found manifest_ for both manifest.*and manifest_"
     ):
         find_pairs_in(folder)
 

@@ -209,9 +209,9 @@ def test_a_position_out_of_range_is_refused(rng, position):
 @pytest.mark.usefixtures("without_shape_checks")
 def test_sizes_that_differ_are_refused_in_one_line(rng):
     left, right, estimate = random_scene(rng)
-    with pytest.raises(ValueError, match=r"^left and right images must be of one size.*$"):
+    with pytest.raises(ValueError, match=r"^left and right images must have the same size.*$"):
         render(left[:, 1:], right, estimate, 0.5)
-    with pytest.raises(ValueError, match=r"^estimate: expected the photographs' size 39x14, got 40x14; .*$"):
+    with pytest.raises(ValueError, match=r"^estimate: expected the size of the images, 39x14, got 40x14; "):
         render(left[:, 1:], right[:, 1:], estimate, 0.5)
 
 

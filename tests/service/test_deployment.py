@@ -326,7 +326,7 @@ def test_a_port_that_is_taken_is_one_line(capsys):
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["--model", "none.onnx"], "none.onnx: expected an ONNX matcher"),
+        (["--model", "none.onnx"], "none.onnx: expected an ONNX matcher file"),
         (["--timeout-s", "inf"], "--timeout-s: expected a finite number, found inf"),
         (["--provider", "abacus"], "abacus"),
         (["--address", "127.0.0.1:1"], "127.0.0.1:1: expected the head of a Ray cluster"),
@@ -366,7 +366,10 @@ def test_a_network_that_the_cluster_does_not_have_is_named(ray_address, capsys):
     words = ["--address", ray_address, "--threads", "1", "--model", "none.onnx"]
     assert main(["serve", "--port", "0", *words]) == 2
     printed = capsys.readouterr().err
-    assert "found none.onnx: expected an ONNX matcher, found no such file; is the model there too?" in printed
+    assert (
+        "found none.onnx: expected an ONNX matcher file, found no such file; is the model there too?"
+        in printed
+    )
     assert printed.count("\n") == 1
 
 

@@ -31,21 +31,22 @@ ERRORS: dict[str, tuple[str, dict[str, str], dict[str, Any]]] = {
     "the left one first": ("/disparity", PAIR, {"format": "crossed"}),
     "calib: expected a calibration of rectified pictures, found lenses with distortion; rectify the pair "
     "with it (rectify)": ("/disparity", {**PAIR, "calib": "turned.yml"}, {}),
-    "metres: expected a baseline beside the focal length, found none; give the baseline (baseline_m)": (
+    "metres: expected a baseline in addition to the focal length, found none; give the baseline "
+    "(baseline_m)": (
         "/depth",
         PAIR,
         {"focal_px": 500},
     ),
-    "rectify: expected at least 40 points that both pictures show from two positions, found 0 of 0 matches "
-    "that agree; take pictures with more texture and more overlap; or give a calibration (calib)": (
+    "rectify: expected at least 40 feature matches that agree on the camera positions, found 0 of 0 "
+    "matches; take pictures with more texture and more overlap; or give a calibration (calib)": (
         "/view",
         {"left": "plain.png", "right": "plain.png"},
         {"rectify": True},
     ),
     "expected a camera for depth, found none; give a calibration, or the focal length and baseline of a "
     "rectified pair (calib, focal_px, baseline_m)": ("/depth", PAIR, {}),
-    "range: expected disparities of -640 to 640 px, the width of the pictures, got 700 and 800; omit it for "
-    "automatic detection": ("/disparity", PAIR, {"range": "700,800"}),
+    "range: expected disparities between -640 and 640 px, the width of the pictures, got 700 and 800; omit "
+    "it for automatic detection": ("/disparity", PAIR, {"range": "700,800"}),
     "position: expected -1.0 to 2.0 (0 left camera, 1 right), got 3.5": (
         "/view",
         PAIR,

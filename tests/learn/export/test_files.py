@@ -36,7 +36,7 @@ def test_variants_are_made_of_a_shipped_network(tmp_path, monkeypatch, capsys):
         ("export small -o a.onnx --half a.onnx", "a.onnx: expected a different file"),
         ("export small -o a.onnx --size 640", "such as 640x480, found '640'"),
         ("export small -o a.onnx --size 641x480", "expected multiples of 16 of at least 32, found 641x480"),
-        ("export none.onnx -o a.onnx", "none.onnx: expected an ONNX matcher, found no such file"),
+        ("export none.onnx -o a.onnx", "none.onnx: expected an ONNX matcher file, found no such file"),
         ("export none -o a.onnx", "none"),
         ("export small -o a.onnx --half folder.onnx", "folder.onnx: expected a file that can be written"),
     ],
