@@ -172,7 +172,7 @@ class Estimate:
 
 
 def check_fits(estimate: Estimate, pair: StereoPair) -> None:
-    """Require an estimate whose size is that of the pair."""
+    """Require an estimate of the same size as the pair."""
     check_kind("estimate", estimate, Estimate)
     check_kind("pair", pair, StereoPair)
     found, expected = estimate.disparity_px.shape, pair.left.shape[:2]

@@ -129,7 +129,7 @@ def _find_charuco(image: UInt8[np.ndarray, "h w"], board: Board) -> ViewCorners 
 
 
 def reorder_corners(here: ViewCorners, there: ViewCorners, board: Board) -> ViewCorners:
-    """Put the right corners in the same order as the left ones: a chessboard has no orientation mark."""
+    """Reorder the right corners like the left ones, because a chessboard has no orientation mark."""
     grid = there.at_px.reshape(board.rows, board.columns, 2)
     turns = (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
     orders = [np.rot90(grid, turn).reshape(-1, 2) for turn in turns]

@@ -41,7 +41,7 @@ def find_negative_disparities(
     places_px: Float[np.ndarray, "n 2"],
     disparity_px: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, " m"]:
-    """Return the certain negative disparities in px, of points without a plausible positive match.
+    """Return the negative disparities in px that are certain: no positive match is plausible.
 
     Returns an empty array if there are too few. On repeated structures, such as a truss, matches can be off
     by a period. A positive candidate that fits about as well is then preferred, because parallel pairs are

@@ -162,8 +162,8 @@ def _find_valid_field(
 ) -> Bool[np.ndarray, "h w"]:
     """Return the mask of pixels in front of the camera, and within the radius where the lens model is valid.
 
-    The distortion polynomial is fitted inside the picture. Outside it may decrease, which would show the
-    picture's border again, mirrored.
+    The distortion polynomial is fitted inside the picture. Outside the picture it may decrease, which would
+    show the border again, mirrored.
     """
     rows, columns = np.indices(shape, np.float32)
     to_direction = (turn.T @ np.linalg.inv(pinhole)).astype(np.float32)

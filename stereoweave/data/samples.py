@@ -57,7 +57,7 @@ def make_sample(
 def find_occluded(
     disparity_px: Float[np.ndarray, "h w"], other_px: Float[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Return the mask of pixels whose match is outside the other image or behind the surface seen at it.
+    """Return the mask of pixels whose match is outside the other image or behind the surface visible there.
 
     A pixel is not marked if a disparity needed for this is unknown. The other view is to the right of this
     one; for a right view, mirror both maps.

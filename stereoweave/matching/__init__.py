@@ -1,1 +1,1 @@
-"""Stereo matching: estimates the disparity of a rectified pair."""
+"""Stereo matching: estimation of the disparity of a rectified pair."""

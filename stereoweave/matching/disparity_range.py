@@ -162,7 +162,7 @@ def _peaks(
 def _find_salient(
     grey: Float32[np.ndarray, "h w"], rows: Int[np.ndarray, " r"], wanted: Bool[np.ndarray, "h w"]
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """Return the row and column of the steepest pixel in every _SPACING_PX columns, if it is wanted."""
+    """Return rows and columns of the highest gradient in every _SPACING_PX columns, limited to the mask."""
     steps = np.abs(cv2.Sobel(grey, cv2.CV_32F, 1, 0))[rows]
     count = grey.shape[1] // _SPACING_PX
     cells = steps[:, : count * _SPACING_PX].reshape(len(rows), count, _SPACING_PX)

@@ -97,7 +97,7 @@ def estimate(  # noqa: PLR0913 - all but the images are keyword-only and optiona
 
 
 def match(matcher: Matcher, pair: StereoPair, options: MatchOptions = DEFAULT_OPTIONS) -> Estimate:
-    """Match a pair of any size, as `matcher.estimate` does if the network takes the whole pair in one run.
+    """Match a pair of any size; if one run of the network suffices, the result equals `matcher.estimate`.
 
     Args:
         matcher: The network.
@@ -181,7 +181,7 @@ def _finish(
 
 
 def _fit_network(matcher: Matcher, pair: StereoPair) -> StereoPair:
-    """Scale the pair to the size of one network run: strips would leave visible seams."""
+    """Scale the pair to a size that one network run can take: strips would leave visible seams."""
     height, width = pair.left.shape[:2]
     return _resize(pair, _find_downscale(matcher, width, height))
 

@@ -49,7 +49,8 @@ def at_match(
     Args:
         values: Values of the other view, float32 or uint8.
         disparity_px: Disparity of this view.
-        direction: -1 for the left view's disparity, whose matches are to the left; 1 for the right view's.
+        direction: -1 for the left view's disparity, whose matches are to the left; 1 for the right view's
+            disparity.
     """
     height, width = disparity_px.shape
     columns = (np.arange(width, dtype=np.float32) + direction * disparity_px).astype(np.float32, copy=False)

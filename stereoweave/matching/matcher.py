@@ -142,7 +142,7 @@ class Matcher:
         """Match pairs of equal size as `estimate` does, in batches if the matcher and provider support them.
 
         Raises:
-            StereoweaveError: As for `estimate`, or the pairs differ in size.
+            StereoweaveError: An image or option is invalid, as for `estimate`, or the pairs differ in size.
         """
         MatchOptions(refined=refined, raw=raw)  # raises if both are set
         check_kind("pairs", pairs, Sequence)

@@ -1,8 +1,8 @@
 """ONNX Runtime execution providers.
 
 If a provider is unavailable, ONNX Runtime logs a message and falls back to the CPU. Here this is an error: a
-request for a GPU never runs on the CPU unnoticed. Only operations that a provider lacks run elsewhere, those
-of TensorRT on CUDA, and all others on the CPU.
+request for a GPU never runs on the CPU unnoticed. Only operations that a provider lacks run on the next
+provider: CUDA after TensorRT, and finally the CPU.
 """
 
 import contextlib

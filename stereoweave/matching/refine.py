@@ -80,7 +80,7 @@ def _settle(
     trust: Float32[np.ndarray, "h w"],
     towards: int,
 ) -> Float32[np.ndarray, "h w"]:
-    """Replace a view's disparity by the one found, where both views agree on it."""
+    """Replace a view's disparity with the one found, where both views agree on it."""
     from stereoweave.matching import refine_kernels as kernels  # Numba takes half a second to import
 
     settled_px = np.array(disparity_px, np.float32, order="C")

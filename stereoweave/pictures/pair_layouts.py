@@ -131,7 +131,7 @@ def detect_layout(
 
 
 def measure_resemblance(first: Picture, second: Picture) -> float:
-    """Return a score, 0 to 1, of whether two images show the same scene; NaN if they are too plain.
+    """Score from 0 to 1 how likely two images show the same scene; return NaN if they are too plain.
 
     Windows of the first image are matched in the second one, up to a fifth of the width away. The score is
     the median of their best correlations, times the share of neighbouring windows with similar shifts:

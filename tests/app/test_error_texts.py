@@ -23,12 +23,13 @@ ERRORS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
     "right.png; leave it out, and give the left one first": (PAIR, {"layout": "crossed"}),
     "turned.yml: expected a calibration of rectified pictures, found lenses with distortion; rectify the "
     "pair with it (“Rectify the pair”)": ({**PAIR, "calibration": "turned.yml"}, {}),
-    "metres: expected a baseline beside the focal length, found none; give the baseline (“Baseline, mm”)": (
+    "metres: expected a baseline in addition to the focal length, found none; give the baseline (“Baseline, "
+    "mm”)": (
         PAIR,
         {"focal": 500},
     ),
-    "metres: expected a focal length in EXIF beside the baseline, found none; give the focal length (“Focal "
-    "length, px”)": (PAIR, {"baseline": 100}),
+    "metres: expected a focal length in EXIF in addition to the baseline, found none; give the focal length "
+    "(“Focal length, px”)": (PAIR, {"baseline": 100}),
     "“Rectify the pair”: expected at least 40 feature matches that agree on the camera positions, "
     "found 0 of 0 matches; take pictures with more texture and more overlap; or give a "
     "calibration (“Calibration file, for metres”)": (

@@ -10,7 +10,7 @@ from stereoweave.learn.data.collage import paint_collage
 
 TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 SEED = 77
-# Painted pairs whose two exposures are alike.
+# Painted pairs whose images have the same exposure.
 ALIKE = 2, 6
 
 
@@ -39,7 +39,7 @@ ONE_DEFECT = {
 
 @pytest.fixture(scope="module")
 def pairs():
-    """The example, then painted ones."""
+    """Return the example pair, followed by painted pairs."""
     example = read_pair(TEXTURED / "left.png", TEXTURED / "right.png")
     painted = [paint_collage(SEED, 0, index, 480, 640) for index in ALIKE]
     return [(pair.left, pair.right) for pair in (example, *painted)]
@@ -50,12 +50,12 @@ def test_sound_pairs_have_no_defect(pairs):
 
 
 @pytest.mark.parametrize("defect", ONE_DEFECT)
-def test_one_defect_put_in_is_the_one_that_is_named(pairs, defect):
+def test_each_simulated_defect_is_the_one_reported(pairs, defect):
     for pair in pairs:
         assert check_pair(*ONE_DEFECT[defect](*pair)).defects == (defect,)
 
 
-def test_far_things_at_negative_disparities_are_named(pairs):
+def test_far_objects_at_negative_disparities_are_reported(pairs):
     for left, right in pairs:
         least_px = check_pair(left, right).range_px[0]
         columns = round(least_px) + 8
@@ -65,7 +65,7 @@ def test_far_things_at_negative_disparities_are_named(pairs):
         assert found.warnings() == []
 
 
-def test_amounts_are_those_put_in(pairs):
+def test_measured_amounts_equal_the_simulated_ones(pairs):
     left, right = pairs[0]
     lower = check_pair(*ONE_DEFECT["vertical_shift"](left, right))
     assert lower.vertical_shift_px == pytest.approx(2, abs=0.3)
@@ -107,7 +107,7 @@ def test_pictures_of_two_scenes_and_plain_ones_have_too_few_matches(pairs):
         assert str(found.lines()[0]).startswith("expected two pictures of the same scene, found ")
 
 
-def test_each_defect_has_its_words(pairs):
+def test_each_defect_has_a_note(pairs):
     found = check_pair(*pairs[0])
     assert all(len(str(found._note(defect))) > 20 for defect in DEFECTS)
 

@@ -17,7 +17,7 @@ from stereoweave.io.images import write_image
 CHESSBOARD = Board(columns=9, rows=6, square_m=0.025)
 CHARUCO = Board(columns=7, rows=5, square_m=0.04, marker_m=0.03, dictionary="DICT_4X4_50")
 TEXEL_M = 0.001
-# Where the board's middle is, in metres, and how it is turned, in degrees about x, y and z.
+# Position of the board's centre in metres, and its rotation in degrees about x, y and z.
 POSES = [
     ((-0.14, -0.14, 0.70), (25, 20, 5)),
     ((0.05, -0.16, 0.65), (-25, 20, -8)),
@@ -33,7 +33,7 @@ POSES = [
 
 
 def printed(board):
-    """The board on a large white sheet."""
+    """Return a picture of the board on a large white sheet."""
     side = round(board.square_m / TEXEL_M)
     if board.dictionary:
         picture = board.charuco().generateImage((board.columns * side, board.rows * side))
@@ -65,7 +65,7 @@ def charucos(tmp_path_factory):
     params=[(pinhole, CHESSBOARD), (pinhole, CHARUCO), (fisheye, CHESSBOARD), (fisheye, CHARUCO)],
 )
 def taken(request, tmp_path_factory, charucos):
-    """Pictures in a folder, what is on them, and the true rig that took them."""
+    """Return a folder of pictures, the board that they show, and the true rig that took them."""
     lens, board = request.param
     if (lens, board) == (pinhole, CHARUCO):
         return charucos, board, rig_of(lens)
@@ -93,7 +93,7 @@ def test_the_rig_that_took_the_pictures_is_found(taken, tmp_path):
     np.testing.assert_array_equal(read_rig(tmp_path / "rig.yml").right.matrix, found.rig.right.matrix)
 
 
-def test_what_was_found_is_told_in_plain_words(charucos):
+def test_results_are_reported_in_plain_words(charucos):
     told = calibrate(charucos, CHARUCO).lines()
     assert told[0].startswith("left camera: focal length 5") and told[0].endswith("640x480 px")
     assert "rotated by 2.6" in told[1]
@@ -198,13 +198,13 @@ def test_a_folder_without_pairs_is_refused(tmp_path, name):
         ({"marker_m": 0.02, "dictionary": "DICT_9X9_50"}, "expected one of DICT_4X4"),
     ],
 )
-def test_a_board_without_sense_is_refused(change, said):
+def test_an_invalid_board_is_refused(change, said):
     with pytest.raises(StereoweaveError, match=said):
         replace(CHESSBOARD, **change)
 
 
 def judged(**change):
-    """The verdict on a sound calibration with something changed."""
+    """Return the verdict on a sound calibration with some fields changed."""
     sound = {
         "rig": rig_of(pinhole),
         "left_error_px": 0.2,
@@ -223,7 +223,7 @@ def test_the_verdict_says_how_good_it_is_and_what_to_do():
     assert judged(cover_percent=50.0).startswith("fair: 0.20 px over 18 pairs; corners cover only 50 %")
     assert judged(cover_percent=30.0).endswith("add pictures with the board near the edges")
     assert judged(cover_percent=30.0).startswith("poor")
-    # The root of the mean of 0.6^2 and 0.8^2 is 0.71, that of 1 and 2^2 is 1.58.
+    # The root mean square of 0.6 and 0.8 is 0.71; the one of 1 and 2 is 1.58.
     assert judged(left_error_px=0.6, right_error_px=0.8).startswith("fair: 0.71 px")
     assert judged(left_error_px=1.0, right_error_px=2.0).startswith("poor: 1.58 px")
     assert judged(tilt_degrees=5.0).startswith("poor") and "tilted board" in judged(tilt_degrees=5.0)
@@ -232,8 +232,8 @@ def test_the_verdict_says_how_good_it_is_and_what_to_do():
     assert judged(rig=swapped).endswith("left and right pictures are swapped: rename them")
 
 
-def test_pictures_that_do_not_tell_how_a_lens_sees_are_refused_in_one_line(tmp_path):
-    # One picture again and again, of a board that is not tilted and in the middle.
+def test_pictures_that_do_not_determine_the_lens_are_refused_in_one_line(tmp_path):
+    # All pictures are the same, with a board in the middle that is not tilted.
     flat = Plane(np.array([0.02, 0, 0.8]), np.array([1.0, 0, 0]), np.array([0, 1.0, 0]))
     pair = Cameras(rig_of(fisheye), samples=1).photograph([flat], printed(CHARUCO), TEXEL_M)
     for number in range(5):

@@ -17,7 +17,7 @@ def example():
 
 
 def estimate_of(pair, confidence) -> Estimate:
-    """One confidence everywhere, or a map of it."""
+    """Return an estimate with the given confidence, a single value or a map."""
     size = pair.left.shape[:2]
     return Estimate(
         disparity_px=np.full(size, 20, np.float32),
@@ -37,14 +37,14 @@ def test_a_sound_pair_of_which_the_network_is_sure_gets_no_line(example):
     assert find_problems(example, estimate_of(example, 0.9)) == []
 
 
-def test_swapped_sides_are_told(example):
+def test_swapped_sides_are_reported(example):
     swapped = StereoPair(left=example.right, right=example.left)
     assert list(map(str, find_problems(swapped, estimate_of(swapped, 0.9)))) == [
         "left and right are swapped; give them the other way round"
     ]
 
 
-def test_a_pair_that_needs_rectifying_is_told_once(example):
+def test_a_pair_that_is_not_rectified_gets_one_note(example):
     lower = StereoPair(
         left=np.ascontiguousarray(example.left[:-2]), right=np.ascontiguousarray(example.right[2:])
     )
@@ -58,13 +58,13 @@ def test_negative_disparities_by_themselves_are_no_reason_for_a_line(example):
     assert find_problems(converged, estimate_of(converged, 0.9)) == []
 
 
-def test_low_confidence_nearly_everywhere_is_told():
+def test_low_confidence_nearly_everywhere_is_reported():
     (line,) = find_problems(plain_pair(), estimate_of(plain_pair(), 0.1))
     assert str(line).startswith("only 0 % of the disparities are confident")
     assert find_problems(plain_pair(), estimate_of(plain_pair(), 0.9)) == []
 
 
-def test_what_a_rectified_picture_does_not_show_needs_no_confidence():
+def test_pixels_without_content_need_no_confidence():
     seen = np.zeros((40, 200), bool)
     seen[:, :50] = True
     confidence = np.where(seen, 0.9, 0)

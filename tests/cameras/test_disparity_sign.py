@@ -8,13 +8,13 @@ NONE = np.zeros((0, 2)), np.zeros(0)
 
 
 def textured(rng, width, blur_px=1.0):
-    """A wall of noise that repeats nowhere."""
+    """Return a wall of noise without repetitions."""
     noise = cv2.GaussianBlur(rng.normal(0, 1, (240, width)).astype(np.float32), (0, 0), blur_px)
     return np.repeat(np.clip(128 + 40 * noise / noise.std(), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
 
 
 def apart(wall, disparity_px):
-    """Both views, 320 px wide, of a wall at one disparity."""
+    """Return both views, 320 px wide, of a wall with a single disparity."""
     start = 40 + disparity_px
     return np.ascontiguousarray(wall[:, 40:360]), np.ascontiguousarray(wall[:, start : start + 320])
 
@@ -24,7 +24,7 @@ def places(columns, disparity_px):
     return points, np.full(len(points), float(disparity_px))
 
 
-def test_what_is_behind_the_plane_of_convergence_is_sure(rng):
+def test_disparities_behind_the_plane_of_convergence_are_certain(rng):
     pair = apart(textured(rng, 400), -8)
     points, disparity_px = places(np.arange(20, 300, 40), -8)
     np.testing.assert_array_equal(find_negative_disparities(*pair, points, disparity_px), disparity_px)
@@ -47,7 +47,7 @@ def test_matches_a_period_too_far_are_not_sure(rng):
 
 
 def test_a_period_too_far_is_seen_from_the_other_picture_where_the_right_place_is_outside(rng):
-    # What lies at the left border is 12 px outside of the right picture.
+    # The match of the left border is 12 px outside the right picture.
     repeated = np.tile(textured(rng, 30), (1, 14, 1))
     assert len(find_negative_disparities(*apart(repeated, 12), *places(np.arange(0, 10, 2), 12 - 30))) == 0
 

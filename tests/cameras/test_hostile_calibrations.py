@@ -14,7 +14,7 @@ from stereoweave.outputs.results import DepthJob, job_facts
 from stereoweave.pictures.prepare import Request
 
 WITHOUT_LIMIT = ["/dev/zero", "/dev/urandom"]
-# Run in a process of its own, which may grow by 100 MB: an error of memory, or its death, fails.
+# Runs in a separate process that may grow by 100 MB; the test fails if it runs out of memory or dies.
 GROWING = """
 import resource, sys
 sys.path.insert(0, sys.argv[1])
@@ -37,7 +37,7 @@ for name, content in HOSTILE.items():
 
 
 def refusal(path):
-    """The line of the error in which reading the file must end."""
+    """Read the file, which must fail; return the error's line."""
     with pytest.raises(FormatError) as caught:
         read_rig(path)
     message = str(caught.value)
@@ -88,7 +88,7 @@ def test_a_pipe_into_which_nobody_writes_is_refused_in_place_of_a_calibration(tm
     assert "found a pipe or a device" in refusal(tmp_path / "calib.yml")
 
 
-def test_what_a_batch_writes_down_of_its_calibration_passes_the_same_gate(tmp_path):
+def test_the_calibration_recorded_by_a_batch_passes_the_same_checks(tmp_path):
     large = tmp_path / "calib"
     large.write_bytes(HOSTILE["size: json of a megabyte"])
     for path, found in ((Path("/dev/zero"), "found a pipe or a device"), (large, "bytes, found more")):
@@ -96,7 +96,7 @@ def test_what_a_batch_writes_down_of_its_calibration_passes_the_same_gate(tmp_pa
             job_facts(DepthJob(request=Request(calibration=path)))
 
 
-def test_the_file_beside_opencvs_two_passes_the_same_gate(tmp_path):
+def test_the_companion_of_an_opencv_file_passes_the_same_checks(tmp_path):
     (tmp_path / "extrinsics.yml").write_text(yaml_of({name: RIG[name] for name in "RT"}))
     beside = tmp_path / "intrinsics.yml"
     for content, found in (

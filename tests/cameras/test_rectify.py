@@ -33,7 +33,7 @@ def rig(request):
 
 @pytest.fixture(scope="module")
 def wall(rig):
-    """A pair of a textured wall, 5 m away in every direction, as it was rectified."""
+    """Return the rectified pair of a textured wall that is 5 m away in every direction."""
     texture = speckle(np.random.default_rng(0))
     pair = Cameras(rig).photograph([Sphere(WALL_M)], texture, texel_m=0.009)
     return rectify.rectify(pair, rig)
@@ -57,7 +57,7 @@ def noise(rng, width_px=640, height_px=480):
 
 
 def spots(at_px):
-    """A black picture with a soft white spot at each place."""
+    """Return a black picture with a soft white spot at each place."""
     rows, columns = np.mgrid[: SIZE_PX[1], : SIZE_PX[0]]
     light = np.zeros(SIZE_PX[::-1])
     for x, y in at_px:
@@ -66,7 +66,7 @@ def spots(at_px):
 
 
 def spot_places(image):
-    """Their centres of brightness, x and y, by row from the top."""
+    """Return x and y of the spots' centroids, sorted by row from the top."""
     _, labels, _, _ = cv2.connectedComponentsWithStats((image[..., 0] > 10).astype(np.uint8))
     rows, columns = np.mgrid[: SIZE_PX[1], : SIZE_PX[0]]
     light = image[..., 0].astype(float)
@@ -80,7 +80,7 @@ def spot_places(image):
 
 
 def test_points_of_a_crooked_rig_come_to_one_row_and_to_their_depth(rig, rng):
-    # Far enough apart that spots do not touch, at 2 to 8 m.
+    # The points are at 2 to 8 m, and far enough apart that their spots do not touch.
     across, down = np.meshgrid(np.linspace(-0.4, 0.41, 9), np.linspace(-0.3, 0.31, 7))
     points_m = np.stack([across, down, np.ones_like(down)], axis=-1).reshape(-1, 3) * rng.uniform(
         2, 8, (63, 1)
@@ -91,7 +91,7 @@ def test_points_of_a_crooked_rig_come_to_one_row_and_to_their_depth(rig, rng):
     pair = rectify.rectify(StereoPair(left=spots(left_px), right=spots(right_px)), rig).pair
     left_px, right_px = spot_places(pair.left), spot_places(pair.right)
     assert len(left_px) == len(right_px) == 63
-    # A spot's partner is the one on its row whose disparity is that of 2 to 8 m, and no other is so.
+    # A spot's match is the only spot in its row whose disparity corresponds to 2 to 8 m.
     disparity_px = left_px[:, None, 0] - right_px[None, :, 0]
     near = (disparity_px > 5) & (disparity_px < 30) & (np.abs(left_px[:, None, 1] - right_px[None, :, 1]) < 5)
     assert (near.sum(axis=1) == 1).all()
@@ -99,7 +99,7 @@ def test_points_of_a_crooked_rig_come_to_one_row_and_to_their_depth(rig, rng):
     vertical_px = np.abs(left_px[:, 1] - right_px[partner, 1])
     assert np.median(vertical_px) < 0.03
     assert vertical_px.max() < 0.1
-    # Distances from the left camera stay what they are, however it is turned.
+    # Rotating the left camera does not change distances from it.
     camera = pair.camera
     found_m = camera.depth_m((left_px[:, 0] - right_px[partner, 0])[None])[0]
     ideal = (left_px - (camera.cx_px, camera.cy_px)) / camera.focal_px
@@ -128,8 +128,8 @@ def test_depth_of_a_wall_at_5_m_by_a_crooked_rig_is_true(wall):
     assert np.percentile(error_percent, 90) < 4
 
 
-def test_what_no_picture_shows_is_masked_and_has_no_edge():
-    # The left camera's rows lie along the baseline; the right one is turned about its axis.
+def test_pixels_outside_the_source_are_masked_and_have_no_edge():
+    # The left camera's rows are parallel to the baseline; the right camera is rotated about its optical axis.
     turn = turned(0, 0, 12)
     rig = replace(flat_rig(), rotation=turn, translation_m=-turn @ np.array([0.1, 0, 0]))
     grey = np.full((480, 640, 3), 90, np.uint8)
@@ -163,7 +163,7 @@ def test_a_rectified_rig_gives_its_camera_and_leaves_the_pictures(rng):
     assert "left unchanged" in rectified.notes[-1].text
 
 
-def test_what_was_assumed_and_done_is_said(wall, rig, rng):
+def test_assumptions_and_changes_are_noted(wall, rig, rng):
     assert "rotated by" in wall.notes[-1].text
     assumed = Note("metres were assumed")
     notes = rectify.rectify(noise(rng), replace(rig, name="rig.yml", notes=(assumed,))).notes
@@ -196,14 +196,14 @@ def test_cameras_that_look_different_ways_are_refused(rng, degrees):
 
 
 def test_a_lens_whose_model_divides_by_0_far_outside_of_the_picture_is_rectified(rng):
-    """1 + k4 r^2, of OpenCV's rational model, is 0 at r = 10; the picture ends at r = 0.8."""
+    """The denominator 1 + k4 r^2 of OpenCV's rational model is 0 at r = 10; the picture ends at r = 0.8."""
     lens = Optics(matrix=flat_rig().left.matrix, distortion=np.array([0, 0, 0, 0, 0, -0.01, 0, 0]))
     found = rectify.rectify(noise(rng), replace(flat_rig(), left=lens))
     assert found.pair.left_seen is not None
     assert found.pair.left_seen.mean() > 0.95
 
 
-def test_a_focal_length_of_less_than_a_pixel_is_no_cameras():
+def test_a_focal_length_below_a_pixel_is_refused():
     with pytest.raises(StereoweaveError, match="focal lengths of at least 1 px"):
         Optics(matrix=np.diag([1e-320, 5.0, 1]), distortion=np.zeros(0))
 
@@ -224,7 +224,7 @@ def test_the_largest_rectangle_that_both_fill_is_kept(rng):
     right_seen[:, :31] = False
     pair = replace(noise(rng), camera=camera, left_seen=left_seen, right_seen=right_seen)
     cropped = rectify.crop(pair)
-    # Of the two ways around the corner the one without its 10 rows is larger: 450x609 against 460x599.
+    # There are two ways around the corner; leaving out its 10 rows keeps more: 450x609 versus 460x599.
     assert 460 * 599 > 450 * 609
     np.testing.assert_array_equal(cropped.left, pair.left[20:, 31:630])
     np.testing.assert_array_equal(cropped.right, pair.right[20:, 31:630])

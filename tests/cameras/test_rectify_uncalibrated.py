@@ -15,7 +15,7 @@ TEXTURED = Path(__file__).resolve().parents[1] / "textured_pair"
 
 
 def homography(size, degrees):
-    """What a camera's turn about its three axes does to its picture; the focal length is 0.9 widths."""
+    """Return the homography of a camera rotation about three axes; the focal length is 0.9 widths."""
     width, height = size
     camera = np.array([[0.9 * width, 0, width / 2], [0, 0.9 * width, height / 2], [0, 0, 1]])
     return camera @ cv2.Rodrigues(np.radians(np.float64(degrees)))[0] @ np.linalg.inv(camera)
@@ -29,7 +29,7 @@ def turned(photo, degrees):
 
 
 def sift_matches(left, right):
-    """Where OpenCV's SIFT, which rectification does not use, finds the same places: x and y in each."""
+    """Return matched points, x and y in each picture, by OpenCV's SIFT, which rectification does not use."""
     sift = cv2.SIFT_create(500)
     (left_points, left_words), (right_points, right_words) = (
         sift.detectAndCompute(cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY), None) for photo in (left, right)
@@ -75,10 +75,10 @@ def test_a_mended_pair_is_sound_and_of_the_same_size(example, mended):
     assert "matches: median vertical error 0." in mended.notes[0].text
 
 
-def test_what_no_picture_shows_is_masked_and_goes_on_from_the_border(mended):
+def test_pixels_outside_the_source_are_masked_and_repeat_the_border(mended):
     seen = mended.pair.right_seen
     assert 0.8 < seen.mean() < 1
-    # A border of black would be darker than all that is there.
+    # A black border would be darker than everything in the picture.
     assert mended.pair.right[~seen].mean() > mended.pair.right[seen].mean() / 2
 
 
@@ -89,7 +89,7 @@ def test_a_sound_pair_stays_nearly_what_it_is(example):
     assert np.percentile(np.linalg.norm(left_px - moved_px, axis=1), 90) < 3
 
 
-def test_a_mask_that_was_there_moves_with_its_picture(example):
+def test_an_existing_mask_is_warped_with_its_picture(example):
     seen = np.ones(example.left.shape[:2], bool)
     seen[:, :40] = False
     masked = StereoPair(left=example.left, right=example.right, left_seen=seen)

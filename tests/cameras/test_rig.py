@@ -26,7 +26,8 @@ P1: 700 0 600 -350 0 700 170 0 0 0 1 0
 P2: 700 0 600 35 0 700 170 0.2 0 0 1 0.003
 P3: 700 0 600 -336 0 700 170 2.2 0 0 1 0.002
 """
-# Camera 2 stands where camera 0 does, camera 3 half a metre to the right of it, turned by 90 degrees about z.
+# Camera 2 is at the position of camera 0. Camera 3 is half a metre to the right, rotated by 90 degrees about
+# z.
 KITTI_RAW = """\
 calib_time: 09-Jan-2012 13:57:47
 corner_dist: 9.950000e-02
@@ -113,7 +114,7 @@ def stored(tmp_path, text, name="calibration.txt"):
 
 
 def refusal(path):
-    """The message of the error that reading the file must end in, which names it in one line."""
+    """Read the file, which must fail; return the error's line, which must name the file."""
     with pytest.raises(FormatError) as caught:
         read_rig(path)
     message = str(caught.value)
@@ -176,7 +177,7 @@ def test_a_calibration_for_another_size_is_refused(tmp_path):
         ("; 0 994.978 254.877; 0 0 1]", "]", "size 3"),
     ],
 )
-def test_a_middlebury_calibration_without_sense_is_refused(tmp_path, old, new, found):
+def test_an_invalid_middlebury_calibration_is_refused(tmp_path, old, new, found):
     assert found in refusal(stored(tmp_path, MIDDLEBURY.replace(old, new, 1)))
 
 
@@ -211,8 +212,8 @@ def test_kittis_calibration_of_the_raw_pictures_is_taken_for_their_size(tmp_path
         assert rectified.camera().baseline_m == 0.5
 
 
-def test_the_way_between_two_turned_cameras_of_kitti_is_the_one_worked_out_by_hand(tmp_path):
-    # From camera 0 to 2 by 90 degrees about z, to 3 by 90 degrees about x. From 2 to 3: R = R3 R2^T =
+def test_the_pose_between_two_rotated_kitti_cameras_equals_the_manual_result(tmp_path):
+    # Camera 2 is rotated by 90 degrees about z, camera 3 by 90 degrees about x. From 2 to 3: R = R3 R2^T =
     # [1 0 0; 0 0 -1; 0 1 0] [0 1 0; -1 0 0; 0 0 1], and T = T3 - R T2 = (-0.5, 0, 0) - (2, -3, -1).
     turned_both = (
         KITTI_RAW.replace("R_02: 1 0 0 0 1 0 0 0 1", "R_02: 0 -1 0 1 0 0 0 0 1")
@@ -272,7 +273,7 @@ def test_kalibrs_radtan_is_a_pinhole(tmp_path):
         ("[461.6,", "[461.6", "cannot be read"),
     ],
 )
-def test_a_camchain_without_sense_is_refused(tmp_path, old, new, found):
+def test_an_invalid_camchain_is_refused(tmp_path, old, new, found):
     assert found in refusal(stored(tmp_path, KALIBR.replace(old, new, 1)))
 
 
@@ -386,7 +387,7 @@ def test_extrinsics_are_completed_by_the_intrinsics_beside_them(tmp_path):
         ("translation_unit: [mm]", "translation_unit ['mm'], not one of m, cm, mm"),
     ],
 )
-def test_a_size_a_matrix_or_a_unit_without_sense_is_refused(tmp_path, more, found):
+def test_an_invalid_size_matrix_or_unit_is_refused(tmp_path, more, found):
     assert found in refusal(stored(tmp_path, f"{OPENCV}{more}\n"))
 
 
@@ -424,7 +425,7 @@ def test_opencv_reads_a_rig_that_was_written_and_its_xml_is_read(tmp_path):
 @pytest.mark.parametrize(
     "content", [b"", b"hello", b"\x89PNG\r\n\x1a\n\x00\x01", b"[1, 2]", b"<a>", b"{", b"a: !!b 1"]
 )
-def test_what_is_no_calibration_is_refused(tmp_path, content):
+def test_a_file_that_is_not_a_calibration_is_refused(tmp_path, content):
     (tmp_path / "file").write_bytes(content)
     assert "a calibration of two cameras" in refusal(tmp_path / "file")
 
@@ -466,7 +467,7 @@ def test_the_rig_of_a_rectified_pair_is_written_and_gives_its_camera(tmp_path):
         calibration.rectified_rig(pair_of(640, 480))
 
 
-def test_a_rig_without_sense_is_refused():
+def test_an_invalid_rig_is_refused():
     rig = rig_of(pinhole)
     for change in (
         {"rotation": -np.eye(3)},

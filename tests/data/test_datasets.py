@@ -15,7 +15,7 @@ CALIBRATION = "cam0=[300 0 19.5; 0 300 15.5; 0 0 1]\ndoffs=0\nbaseline=100\nwidt
 
 @pytest.fixture
 def root(tmp_path):
-    """The paper's layout, the smallest."""
+    """Write the smallest dataset in the paper's layout."""
     for folder in ("left", "right"):
         for name in ("b/0001", "a/0002", "a/0001"):
             write_picture(tmp_path / folder / f"{name}.png", 10)
@@ -31,14 +31,14 @@ def test_an_unknown_dataset_is_an_error_that_names_the_known_ones(tmp_path):
 
 
 @pytest.mark.parametrize("name", DATASETS)
-def test_a_root_that_is_none_is_an_error(tmp_path, name):
+def test_a_missing_root_is_an_error(tmp_path, name):
     assert str(tmp_path / "nowhere") in error_of(open_dataset, name, tmp_path / "nowhere")
     (tmp_path / "file").touch()
     assert "found a file" in error_of(open_dataset, name, tmp_path / "file")
 
 
 @pytest.mark.parametrize("name", DATASETS)
-def test_a_root_without_what_is_looked_for_is_an_error(tmp_path, name):
+def test_a_root_without_the_expected_folders_is_an_error(tmp_path, name):
     assert str(tmp_path) in error_of(open_dataset, name, tmp_path)
 
 
@@ -75,7 +75,7 @@ def test_every_dataset_is_a_word_for_a_recipe():
     assert all(name.isidentifier() for name in DATASETS)
 
 
-# Files that belong together
+# Matching of files
 
 
 def test_files_are_matched_by_their_path_below_each_folder(tmp_path):
@@ -89,7 +89,7 @@ def test_files_are_matched_by_their_path_below_each_folder(tmp_path):
 
 
 @pytest.mark.parametrize("name", [".hidden.png", "._1.png", "readme.txt", "Thumbs.db"])
-def test_what_is_no_picture_does_not_count(tmp_path, name):
+def test_files_that_are_not_pictures_are_ignored(tmp_path, name):
     (tmp_path / "1.png").touch()
     (tmp_path / name).touch()
     assert list(match_files(tmp_path)) == ["1"]
@@ -104,7 +104,7 @@ def test_a_file_that_any_folder_lacks_is_named(tmp_path):
     assert "1 of 3" in message
 
 
-# What only one view sees
+# Occlusion
 
 
 def row(*values_px):
@@ -112,15 +112,15 @@ def row(*values_px):
 
 
 def test_a_match_beside_the_other_picture_is_hidden():
-    # The columns 0 to 3 land on -2, -1, 0 and 1.
+    # Columns 0 to 3 have their matches at -2, -1, 0 and 1.
     assert find_occluded(row(2, 2, 2, 2), row(2, 2, 2, 2)).tolist() == [[True, True, False, False]]
-    # Behind the plane of convergence they land further right.
+    # Behind the plane of convergence, matches are farther right.
     assert find_occluded(row(-1, -1, -1, -1), row(-1, -1, -1, -1)).tolist() == [[False, False, False, True]]
 
 
 def test_a_match_behind_something_nearer_is_hidden():
-    # A block at 3 px over a ground at 1 px. It is in the columns 4 and 5 here, in 1 and 2 there, where it
-    # hides the ground that here is in the columns 2 and 3.
+    # A block at 3 px is in front of a ground at 1 px. It is in columns 4 and 5 of this view and in columns 1
+    # and 2 of the other one, where it occludes the ground of this view's columns 2 and 3.
     disparity_px, other_px = row(1, 1, 1, 1, 3, 3, 1, 1), row(1, 3, 3, 1, 1, 1, 1, 1)
     assert find_occluded(disparity_px, other_px).tolist() == [
         [True, False, True, True, False, False, False, False]
@@ -129,14 +129,15 @@ def test_a_match_behind_something_nearer_is_hidden():
 
 @pytest.mark.parametrize(("match", "behind"), [(2.25, True), (2.75, False)])
 def test_at_a_jump_the_column_nearer_to_the_match_decides(match, behind):
-    # The ground that is in column 4 here; there a block of 8 px ends after column 2.
+    # The ground is in column 4 of this view; in the other view, a block at 8 px ends after column 2.
     ground_px = 4 - match
     disparity_px, other_px = row(*5 * [ground_px]), row(8, 8, 8, ground_px, ground_px)
     assert find_occluded(disparity_px, other_px)[0, 4] == behind
 
 
-def test_a_slope_does_not_hide_itself():
-    # d = 2 x / 3 here, so that column x is column x / 3 there, and the disparity there is twice the column.
+def test_a_slope_does_not_occlude_itself():
+    # d = 2 x / 3 in this view, so column x is column x / 3 of the other view, whose disparity is twice the
+    # column.
     columns = np.arange(16, dtype=np.float32)[None]
     assert not find_occluded(2 * columns / 3, 2 * columns).any()
 
@@ -145,7 +146,7 @@ def test_surfaces_that_all_but_touch_do_not_hide_each_other():
     assert find_occluded(row(0, 0, 0), row(0.5, 0.625, -9)).tolist() == [[False, True, False]]
 
 
-def test_what_is_unknown_is_not_hidden():
+def test_unknown_pixels_are_not_occluded():
     nan = np.nan
     assert not find_occluded(row(nan, nan, 0, 1), row(9, 9, nan, nan)).any()
     assert find_occluded(row(1, nan, nan, nan), row(nan, nan, nan, nan)).tolist() == [
@@ -157,7 +158,8 @@ def test_the_right_view_is_treated_as_the_mirror_shows_it():
     image = np.zeros((1, 8, 3), np.uint8)
     left_px, right_px = row(1, 1, 1, 1, 3, 3, 1, 1), row(1, 3, 3, 1, 1, 1, 1, 1)
     sample = make_sample(StereoPair(left=image, right=image), left_px, right_px)
-    # There the ground of the columns 3 and 4 lies in 4 and 5 here, behind the block; 7 lies beside.
+    # The ground in columns 3 and 4 of the right view is at 4 and 5 of the left one, behind the block; column
+    # 7 is beside it.
     assert sample.right_occluded.tolist() == [[False, False, False, True, True, False, False, True]]
 
 

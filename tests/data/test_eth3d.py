@@ -41,7 +41,7 @@ def test_disparity_is_a_pfm_where_infinity_is_unknown(root):
     assert np.isnan(sample.right_disparity_px).all()
 
 
-def test_what_is_known_and_not_seen_by_both_is_occluded(root):
+def test_known_pixels_that_only_one_camera_sees_are_occluded(root):
     sample = read_frame("eth3d", root, "forest_1s")
     assert np.argwhere(sample.occluded).tolist() == [[0, 1]]
     assert not sample.right_occluded.any()

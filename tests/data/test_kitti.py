@@ -6,7 +6,7 @@ from dataset_examples import cut, error_naming, names, read_frame, shades, write
 
 from stereoweave.stereo import StereoCamera
 
-# The numbers of a real drive, rounded: the colour cameras stand beside the grey ones.
+# Rounded values of a real drive; the colour cameras are beside the grey ones.
 PROJECTIONS = {0: (600, 0), 1: (600, -378), 2: (600, 42), 3: (601, -336)}
 LAYOUTS = {
     "kitti2012": ("image_0", "image_1", "disp_occ", "disp_noc", "calib", "P{}"),
@@ -21,7 +21,7 @@ def write_dataset(root, dataset):
     left, right, occ, noc, calib, key = LAYOUTS[dataset]
     training = root / "training"
     for number in ("000000", "000001"):
-        # 11 is the next moment, without ground truth.
+        # _11 is the next time step, which has no ground truth.
         for moment in ("10", "11"):
             write_picture(training / left / f"{number}_{moment}.png", 10)
             write_picture(training / right / f"{number}_{moment}.png", 20)
@@ -58,7 +58,7 @@ def test_disparity_is_256ths_of_a_pixel_and_0_is_unknown(dataset, tmp_path):
     assert np.isnan(sample.right_disparity_px).all()
 
 
-def test_what_is_known_only_with_the_occluded_is_occluded(dataset, tmp_path):
+def test_pixels_known_only_in_the_occluded_map_are_occluded(dataset, tmp_path):
     sample = read_frame(dataset, tmp_path, "000001_10")
     assert np.argwhere(sample.occluded).tolist() == [[0, 1]]
     assert not sample.right_occluded.any()
@@ -73,7 +73,8 @@ def test_the_disparity_of_the_next_moment_is_not_taken_for_the_right_view_s(tmp_
 def test_the_camera_comes_from_the_two_projections(tmp_path):
     write_dataset(tmp_path / "2012", "kitti2012")
     write_dataset(tmp_path / "2015", "kitti2015")
-    # 2012: (0 - -378) / 700; 2015: (42 - -336) / 700, and the right centre a pixel further.
+    # 2012: (0 - -378) / 700; 2015: (42 - -336) / 700, and the right principal point is one pixel farther
+    # right.
     grey = StereoCamera(focal_px=700, baseline_m=0.54, cx_px=600, cy_px=180)
     colour = StereoCamera(focal_px=700, baseline_m=0.54, cx_px=600, cy_px=180, doffs_px=1)
     assert read_frame("kitti2012", tmp_path / "2012", "000000_10").camera == grey

@@ -17,7 +17,7 @@ ndisp=280
 
 
 def write_scene(folder, pair, maps, shape=(32, 40)):
-    """Pictures of greys 10 and 20; maps of 24, but for an unknown corner and a 100 (right: 50) beside it."""
+    """Write pictures of levels 10 and 20, and maps of 24 with an unknown corner beside a 100 (right: 50)."""
     for name, shade in zip(pair, (10, 20), strict=True):
         write_picture(folder / name, shade, shape)
     for name, second in zip(maps, (100, 50), strict=False):
@@ -169,7 +169,8 @@ def test_no_camera_is_published_for_the_first_two(tmp_path, dataset_name):
 def test_the_last_columns_to_be_seen_by_one_view_alone_are_occluded(tmp_path):
     write_2003(tmp_path)
     sample = read_frame("middlebury2003", tmp_path, "teddy")
-    # 24 / 4 = 6 px: six columns at the left of the left view, and at the right of the right one.
+    # The disparity is 24 / 4 = 6 px: six columns at the left of the left view and at the right of the right
+    # view.
     assert np.argwhere(sample.occluded[1]).ravel().tolist() == [0, 1, 2, 3, 4, 5]
     assert np.argwhere(sample.right_occluded[1]).ravel().tolist() == [34, 35, 36, 37, 38, 39]
 
@@ -178,7 +179,7 @@ def test_each_missing_file_is_named(dataset, tmp_path):
     for path in [path for path in tmp_path.rglob("*.*") if path.is_file()]:
         content = path.read_bytes()
         path.unlink()
-        # Without a picture of theirs, the formats of 2001 and 2003 are asked for as .png.
+        # If a picture of 2001 or 2003 is missing, the error names it as .png.
         error_naming(path.with_suffix("") if path.suffix in (".ppm", ".pgm") else path, dataset, tmp_path)
         path.write_bytes(content)
 

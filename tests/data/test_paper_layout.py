@@ -38,7 +38,7 @@ def test_depth_packed_in_rgb_is_a_number_of_24_bits_lowest_byte_in_red(root):
     start = [(0, 0, 0), (255, 255, 255), (254, 255, 255), (0, 0, 128), (0, 64, 0)]
     write_map(root / "depth" / "mill" / "0001.png", start, (0, 0, 64), np.uint8)
     sample = read_frame("paper", root, "mill/0001")
-    # The largest number but one is 15 m; 2^23, 2^14 and 2^22 of it are its half, its 1024th and its quarter.
+    # The largest known number is 15 m; 2^23, 2^14 and 2^22 are about a half, a 1024th and a quarter of it.
     expected = [np.nan, np.nan, 2, 4, 2048, 8]
     np.testing.assert_allclose(sample.disparity_px[0, :6], expected, rtol=1e-6)
 

@@ -11,7 +11,7 @@ CALIBRATION = "cam0=[100 0 20; 0 100 16; 0 0 1]\ndoffs=0\nbaseline=50\nwidth=40\
 
 @pytest.fixture
 def scene(tmp_path, rng):
-    """A scene's folder, still without ground truth."""
+    """Return the folder of a scene without ground truth."""
     folder = tmp_path / "scenes" / "motorcycle"
     for side in ("left", "right"):
         images.write_image(folder / f"{side}.png", rng.integers(0, 256, (32, 40, 3), dtype=np.uint8))

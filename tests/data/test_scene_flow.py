@@ -72,8 +72,8 @@ def test_both_disparities_are_read_and_tell_what_is_hidden(monkaa):
     sample = read_frame("monkaa", monkaa, "clean/treeflight_x2/0006")
     np.testing.assert_array_equal(sample.disparity_px[0, :3], [7.25, 2.5, 2.5])
     assert (sample.right_disparity_px == 2.5).all()
-    # At 2.5 px the match of the first three columns lies left of the right picture, and of the right
-    # view's last three it lies right of the left one.
+    # At 2.5 px, the first three columns of the left view have their matches outside the right picture, and
+    # the last three columns of the right view have theirs outside the left one.
     assert np.argwhere(sample.occluded[1]).ravel().tolist() == [0, 1, 2]
     assert np.argwhere(sample.right_occluded[1]).ravel().tolist() == [37, 38, 39]
 

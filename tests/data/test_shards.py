@@ -25,7 +25,7 @@ def pair(number):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Ten pairs in three shards, the last one of two."""
+    """Write ten pairs in three shards, the last of which has two."""
     for first, count in ((0, 4), (4, 4), (8, 2)):
         write_shard(tmp_path, "ship", first, [pack(pair(first + i), {}) for i in range(count)])
     return tmp_path
@@ -129,7 +129,7 @@ def test_the_same_pairs_give_the_same_bytes(folder, tmp_path_factory):
     assert contents(other) == {"ship-000004-000007.tar": (folder / "ship-000004-000007.tar").read_bytes()}
 
 
-# It leaves the files that it read to the garbage collector.
+# webdataset leaves closing the files that it read to the garbage collector.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
 def test_webdataset_reads_the_shards(folder):
     urls = [str(shard.path) for shard in list_shards(folder)]
@@ -148,7 +148,7 @@ def test_sha256sum_checks_an_unpacked_shard(folder, tmp_path_factory):
         tar.extractall(place, filter="data")
     command = ["sha256sum", "--check", "ship-000008.sha256", "ship-000009.sha256"]
     done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=True)
-    # Left, right, and of both disparity and mask; the camera.
+    # Two pictures, two disparity maps, two masks and the camera.
     assert done.stdout.count(": OK") == 2 * 7
 
 
@@ -205,7 +205,7 @@ def facts(**changes):
     ],
     ids=itertools.count(),
 )
-def test_a_pair_of_which_a_file_is_another_than_ours_is_named_with_it(tmp_path, name, content, found):
+def test_a_pair_with_an_invalid_file_is_named_with_the_file(tmp_path, name, content, found):
     files = pack(pair(0), {}) | {name: content}
     write_shard(tmp_path, "ship", 0, [{end: made for end, made in files.items() if made is not None}])
     message = error_of(Shards(tmp_path).__getitem__, 0)
@@ -235,7 +235,7 @@ def test_a_shard_with_a_file_of_a_negative_size_is_refused(tmp_path):
     write_shard(tmp_path, "ship", 0, [pack(pair(0), {})])
     path = tmp_path / "ship-000000-000000.tar"
     head = bytearray(path.read_bytes()[:512])
-    head[124:136] = b"\xff" * 10 + b"\xfe\x00"  # -512, after which the same head comes again
+    head[124:136] = b"\xff" * 10 + b"\xfe\x00"  # -512, after which the same header is read again
     head[148:156] = b" " * 8
     head[148:156] = b"%06o\0 " % sum(head)
     path.write_bytes(head + path.read_bytes()[512:])
@@ -270,7 +270,7 @@ def test_a_folder_without_shards_is_refused(tmp_path):
     assert str(tmp_path) in error_of(Shards, tmp_path)
 
 
-# The order that training reads in
+# The order in which training reads
 
 
 def test_an_order_has_every_pair_once_and_depends_on_the_random_numbers_alone(folder):
@@ -285,7 +285,7 @@ def test_an_order_goes_through_a_few_shards_at_a_time(tmp_path):
         (tmp_path / f"ship-{first:06d}-{first + 1:06d}.tar").touch()
     order = Shards(tmp_path).order(np.random.default_rng(0))
     windows = (order // 2).reshape(-1, 16).tolist()
-    # 8 shards of 2 pairs at a time, in whose places none of the first one's neighbours need be.
+    # 8 shards of 2 pairs are read at a time.
     assert [len(set(window)) for window in windows] == [8] * 8
     assert max(windows[0]) > 8
     assert windows[0] != sorted(windows[0])

@@ -48,7 +48,7 @@ def test_each_pass_has_its_own_pictures(root, kind, expected):
 
 def test_disparity_is_packed_in_red_green_and_blue(root):
     sample = read_frame("sintel", root, "clean/alley_1/frame_0001")
-    # 3 * 4 + 96 / 64; 64 / 16384; 255 * 4 + 255 / 64; and 128 / 64 in all the others.
+    # 3 * 4 + 96 / 64; 64 / 16384; 255 * 4 + 255 / 64; and 128 / 64 everywhere else.
     np.testing.assert_array_equal(sample.disparity_px[0, :4], [13.5, 0.00390625, 1023.984375, 2.0])
     assert sample.disparity_px.dtype == np.float32
     assert np.isnan(sample.right_disparity_px).all()

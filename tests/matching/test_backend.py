@@ -10,10 +10,10 @@ from matcher_examples import matcher_file, painted, red_of
 import stereoweave as sw
 from stereoweave.errors import MatcherError, StereoweaveError
 from stereoweave.matching import matcher as matcher_module
-from stereoweave.matching.backend import Backend, _load
+from stereoweave.matching.backend import Backend
 
 
-def test_equal_backends_share_one_loaded_network_and_unlike_ones_do_not():
+def test_equal_backends_share_one_loaded_network_and_different_ones_do_not():
     backend = Backend(threads=1)
     assert backend.matcher() is Backend(threads=1).matcher()
     assert backend.matcher() is not replace(backend, model="base").matcher()
@@ -36,28 +36,7 @@ def test_a_model_is_loaded_once_and_kept(tmp_path, rng, monkeypatch):
     assert len(opened) == 1
 
 
-def test_a_checked_network_is_not_kept(tmp_path):
-    file = tmp_path / "matcher.onnx"
-    matcher_file(file, red_of("left", "disparity_px"), ["disparity_px"])
-    before = _load.cache_info().misses
-    Backend(model=file).check()
-    assert _load.cache_info().misses == before
-    file.write_bytes(b"no network")
-    with pytest.raises(MatcherError, match=r"matcher\.onnx: expected an ONNX matcher"):
-        Backend(model=file).check()
-
-
-def test_a_pinned_network_stays_though_its_file_changes(tmp_path):
-    file = tmp_path / "matcher.onnx"
-    matcher_file(file, red_of("left", "disparity_px"), ["disparity_px"])
-    pinned = Backend(model=file, threads=1).pin()
-    matcher = pinned.matcher()
-    file.write_bytes(b"no network")
-    assert pinned.matcher() is matcher
-    assert (pinned.model, pinned.threads, pinned.provider) == (file, 1, "cpu")
-
-
-def test_threads_that_ask_at_once_share_one_network(tmp_path):
+def test_concurrent_threads_share_one_network(tmp_path):
     file = tmp_path / "matcher.onnx"
     matcher_file(file, red_of("left", "disparity_px"), ["disparity_px"])
     with ThreadPoolExecutor(6) as pool:
@@ -65,7 +44,7 @@ def test_threads_that_ask_at_once_share_one_network(tmp_path):
     assert len(set(map(id, matchers))) == 1
 
 
-def test_the_network_is_loaded_as_the_backend_says():
+def test_the_network_is_loaded_with_the_settings_of_the_backend():
     matcher = Backend(model="best", threads=1).matcher()
     assert (matcher.name, matcher.magnification) == ("base", 1.5)
     assert (matcher.threads, matcher.provider) == (1, "cpu")
@@ -84,7 +63,7 @@ def test_the_network_is_loaded_as_the_backend_says():
         ({"threads": 0}, StereoweaveError, "threads: expected 1 or more"),
     ],
 )
-def test_what_cannot_be_loaded_is_one_line(fields, kind, message):
+def test_a_failure_to_load_is_a_one_line_error(fields, kind, message):
     with pytest.raises(kind, match=message) as caught:
         Backend(**fields).matcher()
     assert "\n" not in str(caught.value)
@@ -98,7 +77,7 @@ def test_a_failed_load_is_tried_again(tmp_path):
     assert Backend(model=file).matcher().threads is None
 
 
-def test_a_file_that_has_changed_is_loaded_again_whatever_its_path_is_relative_to(tmp_path, rng, monkeypatch):
+def test_a_changed_file_is_reloaded_even_if_its_path_is_relative(tmp_path, rng, monkeypatch):
     left, right = (painted(rng.integers(0, 255, (32, 48))) for _ in range(2))
     found = []
     for turn, (folder, image) in enumerate([("a", "left"), ("a", "right"), ("b", "left")]):

@@ -14,7 +14,7 @@ def soft_noise(rng, size):
 
 
 def scene(rng, far_px=FAR_PX, near_px=NEAR_PX):
-    """A wall, and a board before it on a fifth of the picture, 320x240 px."""
+    """Return a pair of 320x240 px: a wall, and a board in front of it that covers a fifth of the picture."""
     wall, board = soft_noise(rng, (240, 640)), soft_noise(rng, (120, 120))
     left, right = wall[:, 160:480].copy(), wall[:, 160 + far_px : 480 + far_px].copy()
     left[60:180, 150:270] = board
@@ -23,7 +23,7 @@ def scene(rng, far_px=FAR_PX, near_px=NEAR_PX):
 
 
 def cut(pair, by_px):
-    """The pair with by_px columns less, its disparities by_px lower."""
+    """Return the pair with by_px fewer columns and disparities by_px lower."""
     left, right = (np.ascontiguousarray(photo) for photo in (pair.left[:, by_px:], pair.right[:, :-by_px]))
     return StereoPair(left=left, right=right)
 
@@ -36,7 +36,7 @@ def enlarged(pair, times):
     return StereoPair(left=left, right=right)
 
 
-def test_the_range_is_the_scenes_and_a_little_nearer(rng):
+def test_the_range_is_that_of_the_scene_with_a_margin_for_nearer_surfaces(rng):
     low_px, high_px = find_range(scene(rng))
     assert abs(low_px - FAR_PX) < 1
     assert NEAR_PX + 1 <= high_px <= NEAR_PX + 6
@@ -50,7 +50,7 @@ def test_negative_disparities_are_found(rng, by_px):
 
 
 @pytest.mark.parametrize("times", [3, 8])
-def test_disparities_are_px_of_the_pictures_however_large_they_are(rng, times):
+def test_disparities_are_in_px_of_the_pictures_at_any_size(rng, times):
     low_px, high_px = find_range(enlarged(scene(rng), times))
     assert (FAR_PX - 1) * times <= low_px <= (FAR_PX + 0.3) * times
     assert (NEAR_PX + 1) * times <= high_px <= (NEAR_PX + 7) * times
@@ -63,19 +63,19 @@ def test_swapped_sides_have_negative_disparities(rng):
     assert -FAR_PX + 1 <= high_px <= -FAR_PX + 6
 
 
-def test_pictures_that_are_no_pair_or_plain_have_no_range(rng):
+def test_unrelated_and_plain_pictures_have_no_range(rng):
     left, right = soft_noise(rng, (240, 320)), soft_noise(rng, (240, 320))
     assert find_range(StereoPair(left=left, right=right)) is None
     plain = np.full((240, 320, 3), 90, np.uint8)
     assert find_range(StereoPair(left=plain, right=plain)) is None
 
 
-def test_a_pair_of_the_least_size_has_a_range_or_none_but_no_error(rng):
+def test_the_smallest_pair_raises_no_error(rng):
     left, right = (np.ascontiguousarray(photo[:32, :32]) for photo in (scene(rng).left, scene(rng).right))
     assert find_range(StereoPair(left=left, right=right)) is None
 
 
-def test_what_is_beyond_a_range_is_noticed_where_one_looks(rng):
+def test_disparities_beyond_a_range_are_detected_within_the_region(rng):
     pair = scene(rng)
     board = np.zeros((240, 320), bool)
     board[60:180, 150:270] = True
@@ -87,15 +87,15 @@ def test_what_is_beyond_a_range_is_noticed_where_one_looks(rng):
     assert not goes_beyond(pair, ~EVERYWHERE, (5, 20))
 
 
-def test_what_is_a_pixel_beyond_a_range_is_noticed_and_rounding_is_not(rng):
+def test_a_pixel_beyond_a_range_is_detected_but_rounding_is_not(rng):
     pair = scene(rng)
     assert goes_beyond(pair, EVERYWHERE, (FAR_PX + 1, 35))
     assert goes_beyond(pair, EVERYWHERE, (5, NEAR_PX - 1))
     assert not goes_beyond(pair, EVERYWHERE, (FAR_PX + 0.3, NEAR_PX - 0.3))
 
 
-def test_what_the_pictures_do_not_show_has_no_matches(rng):
-    """What is masked, in one of the pictures, is a second board, at 90 px."""
+def test_pixels_without_content_have_no_matches(rng):
+    """The mask of one of the pictures covers a second board, at 90 px."""
     pair, other = scene(rng), soft_noise(rng, (120, 60))
     left, right = pair.left.copy(), pair.right.copy()
     left[60:180, 90:150], right[60:180, 0:60] = other, other

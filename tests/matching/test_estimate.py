@@ -35,7 +35,7 @@ def same(one, other):
 
 
 def moved(pair, by_px):
-    """The pair with by_px columns less and disparities by_px lower."""
+    """Return the pair with by_px fewer columns and disparities by_px lower."""
     return sw.StereoPair(
         left=np.ascontiguousarray(pair.left[:, by_px:]), right=np.ascontiguousarray(pair.right[:, :-by_px])
     )
@@ -46,12 +46,12 @@ def sure(estimate, confidence=0.9):
 
 
 @pytest.mark.parametrize("refined", [False, True])
-def test_a_pair_that_the_network_sees_all_of_is_what_the_matcher_estimates(matcher, textured, refined):
+def test_a_pair_that_fits_the_network_gets_the_estimate_of_the_matcher(matcher, textured, refined):
     found = sw.estimate(textured.left, textured.right, refined=refined)
     same(found, matcher.estimate(textured.left, textured.right, refined=refined))
 
 
-def test_raw_is_the_networks_own_disparity_alone_and_among_others(matcher, textured):
+def test_raw_is_the_networks_own_disparity_alone_and_in_a_batch(matcher, textured):
     alone = matcher.estimate(textured.left, textured.right, raw=True)
     same(sw.estimate(textured.left, textured.right, raw=True), alone)
     same(match_many(matcher, [textured], MatchOptions(raw=True))[0], alone)
@@ -60,13 +60,13 @@ def test_raw_is_the_networks_own_disparity_alone_and_among_others(matcher, textu
     assert np.abs(filled.disparity_px - alone.disparity_px)[~alone.occluded].max() < 1.001
 
 
-def test_a_pair_of_pillow_is_what_its_pixels_are(textured):
+def test_pil_images_are_matched_like_arrays(textured):
     pictures = (Image.fromarray(photo) for photo in (textured.left, textured.right))
     same(sw.estimate(*pictures), sw.estimate(textured.left, textured.right))
 
 
 @pytest.mark.parametrize("by_px", [60, 100])
-def test_a_pair_with_columns_cut_off_has_so_much_less_disparity_negative_ones_too(matcher, textured, by_px):
+def test_cropped_columns_lower_the_disparity_even_below_zero(matcher, textured, by_px):
     whole = matcher.estimate(textured.left, textured.right)
     found = match(matcher, moved(textured, by_px))
     clear = sure(whole)[:, by_px:] & sure(found)
@@ -77,7 +77,7 @@ def test_a_pair_with_columns_cut_off_has_so_much_less_disparity_negative_ones_to
     assert abs(np.median(off_px[clear])) < 0.1
 
 
-def test_what_is_given_as_the_range_counts_and_not_what_is_found(matcher, textured):
+def test_a_given_range_overrides_detection(matcher, textured):
     whole = matcher.estimate(textured.left, textured.right)
     same(match(matcher, textured, MatchOptions(range_px=(0, 192))), whole)
     found = match(matcher, textured, MatchOptions(range_px=(-20, 120)))
@@ -100,7 +100,7 @@ def test_a_picture_twice_as_large_has_twice_the_disparity_even_if_it_is_matched_
 
 
 def flat(rng, disparity_px, size=(160, 480)):
-    """A pair of soft noise that is everywhere at one disparity."""
+    """Return a pair of soft noise with the same disparity everywhere."""
     height, width = size
     wide = cv2.GaussianBlur(rng.integers(0, 256, (height, width + disparity_px, 3), np.uint8), (0, 0), 3)
     wide = cv2.normalize(wide, None, 0, 255, cv2.NORM_MINMAX)
@@ -118,7 +118,7 @@ def test_a_disparity_of_37_px_is_37_px_however_much_the_pair_is_reduced(matcher,
     assert np.mean(np.abs(found.disparity_px[inner] - 37) > 1) < 0.02
 
 
-def test_a_part_that_is_nearer_than_the_networks_range_is_found(matcher, rng):
+def test_a_surface_nearer_than_the_networks_range_is_found(matcher, rng):
     pair = flat(rng, 37, size=(320, 720))
     board = flat(rng, 0, size=(160, 200)).left
     pair.left[80:240, 450:650] = pair.right[80:240, 450 - 260 : 650 - 260] = board
@@ -127,7 +127,7 @@ def test_a_part_that_is_nearer_than_the_networks_range_is_found(matcher, rng):
     assert abs(np.median(found_px[:60, 200:600]) - 37) < 1
 
 
-def test_a_pair_larger_than_what_is_seen_at_once_is_matched_smaller(matcher, rng, monkeypatch):
+def test_a_pair_too_large_for_one_run_is_matched_at_a_smaller_size(matcher, rng, monkeypatch):
     pair = flat(rng, 37, size=(320, 480))
     for module in (matching, matcher_module):
         monkeypatch.setattr(module, "PIXEL_PAIRS_AT_ONCE", 400 * 400 * 266)
@@ -139,7 +139,7 @@ def test_a_pair_larger_than_what_is_seen_at_once_is_matched_smaller(matcher, rng
 
 
 @pytest.mark.parametrize("size", [(1500, 2000), (4000, 6000), (5774, 8660), (1000, 5000), (9000, 2000)])
-def test_what_is_matched_smaller_is_seen_whole_so_that_no_seam_can_show(matcher, size):
+def test_a_downscaled_pair_fits_one_run_without_seams(matcher, size):
     photo = np.broadcast_to(np.zeros((1, 1, 3), np.uint8), (*size, 3))
     seen = matching._fit_network(matcher, sw.StereoPair(left=photo, right=photo)).left
     assert matcher.sees_whole(seen.shape[1], seen.shape[0])
@@ -147,13 +147,13 @@ def test_what_is_matched_smaller_is_seen_whole_so_that_no_seam_can_show(matcher,
     assert abs(seen.shape[1] / seen.shape[0] - size[1] / size[0]) < 0.01 * size[1] / size[0]
 
 
-def test_a_film_frame_of_1920x1080_is_seen_whole(matcher):
+def test_a_video_frame_of_1920x1080_fits_one_run(matcher):
     assert matcher.sees_whole(1920, 1080)
 
 
 @pytest.mark.parametrize("by_px", [40, 60])
-def test_something_just_below_zero_is_matched_as_such(matcher, rng, by_px):
-    """A wall 3 px behind the plane of the screen of a 3-D film, and a board before it."""
+def test_slightly_negative_disparities_are_matched(matcher, rng, by_px):
+    """A wall is 3 px behind the plane of convergence, with a board in front of it."""
     pair = flat(rng, 37, size=(240, 480))
     board = flat(rng, 0, size=(100, 120)).left
     pair.left[70:170, 300:420] = pair.right[70:170, 300 - by_px : 420 - by_px] = board
@@ -169,24 +169,24 @@ def best():
 
 @pytest.fixture(scope="module")
 def part(textured):
-    """160x96 px of the example."""
+    """Return a crop of 160x96 px from the example."""
     left, right = (np.ascontiguousarray(x[200:296, 240:400]) for x in (textured.left, textured.right))
     return sw.StereoPair(left=left, right=right)
 
 
 def test_best_is_base_at_one_and_a_half_times_the_size_and_refined(best, part):
-    # All of it is looked at closer, since nothing is surer of another surface at its own size.
+    # The magnified run decides everywhere: the first run is nowhere more confident of another surface.
     found = sw.estimate(part.left, part.right, model="best")
     larger = (cv2.resize(x, (240, 144), interpolation=cv2.INTER_CUBIC) for x in (part.left, part.right))
     expected = sw.estimate(*larger, model="base", refined=True)
     expected_px = cv2.resize(expected.disparity_px, (160, 96), interpolation=cv2.INTER_NEAREST_EXACT) / 1.5
     assert found.disparity_px.shape == found.confidence.shape == found.occluded.shape == (96, 160)
-    # All but what a median over 3x3 px moves.
+    # Everything agrees except what a median over 3x3 px changes.
     assert np.mean(np.abs(found.disparity_px - expected_px) > 0.2) < 0.05
     same(match_many(best, [part])[0], found)
 
 
-def test_best_is_refined_whether_it_is_asked_for_or_not(best, part):
+def test_best_is_always_refined(best, part):
     same(match(best, part, MatchOptions(refined=True)), match(best, part))
 
 
@@ -217,7 +217,7 @@ def test_a_disparity_of_37_px_is_37_px_for_best(best, rng, range_px):
 @pytest.mark.parametrize(
     ("size", "least", "most"), [((64, 80), 1.2, 1.5), ((60, 60), 1.5, 1.5), ((200, 200), 0, 0)]
 )
-def test_best_looks_closer_by_as_much_as_is_seen_whole(best, rng, monkeypatch, size, least, most):
+def test_best_magnifies_as_far_as_one_run_allows(best, rng, monkeypatch, size, least, most):
     for module in (matcher_module, matching):
         monkeypatch.setattr(module, "PIXEL_PAIRS_AT_ONCE", 100 * 100 * 100)
     seen = []
@@ -235,7 +235,7 @@ def test_best_looks_closer_by_as_much_as_is_seen_whole(best, rng, monkeypatch, s
     assert [least <= magnification <= most for magnification in closer] == [True] * (most > 0)
 
 
-def test_a_smaller_look_counts_where_it_is_surer_of_another_surface():
+def test_the_first_run_is_kept_where_it_is_more_confident_of_another_surface():
     closer, found = (
         sw.Estimate(
             disparity_px=np.full(size, px, np.float32),
@@ -246,7 +246,7 @@ def test_a_smaller_look_counts_where_it_is_surer_of_another_surface():
         for size, px, confidence in (((36, 48), 9, 0.5), ((24, 32), 6, 0.5))
     )
     closer.confidence[:, 40:] = 0.4
-    found.disparity_px[:12], found.right_disparity_px[:12] = 16, 16  # 24 px of the larger picture
+    found.disparity_px[:12], found.right_disparity_px[:12] = 16, 16  # 24 px in the larger picture
     found.disparity_px[12:], found.right_disparity_px[12:] = 7, 7  # 10.5 px
     merged = matching._merge(closer, found)
     expected_px = np.full((36, 48), 9)
@@ -257,7 +257,7 @@ def test_a_smaller_look_counts_where_it_is_surer_of_another_surface():
     np.testing.assert_allclose(merged.confidence[:18, 40:], 0.5)
 
 
-def test_masks_are_made_smaller_with_the_pictures(rng):
+def test_masks_are_downscaled_with_the_pictures(rng):
     pair = flat(rng, 37)
     seen = np.ones(pair.left.shape[:2], bool)
     seen[:, :120] = False
@@ -266,7 +266,7 @@ def test_masks_are_made_smaller_with_the_pictures(rng):
     np.testing.assert_array_equal(small.left_seen[:, [59, 60]], np.tile([False, True], (80, 1)))
 
 
-def test_what_the_pictures_do_not_show_has_no_confidence_and_matches_in_it_are_occluded(matcher, rng):
+def test_pixels_without_content_have_no_confidence_and_occlude_their_matches(matcher, rng):
     pair = flat(rng, 37)
     left_seen, right_seen = np.ones((2, *pair.left.shape[:2]), bool)
     left_seen[:, :100] = False
@@ -286,7 +286,7 @@ def test_matches_beyond_the_right_picture_are_occluded_whatever_the_range(matche
     assert found.occluded[20:-20, 40:-40].mean() < 0.02
 
 
-def test_where_a_match_is_beyond_the_right_picture_its_last_column_is_asked(matcher, rng):
+def test_a_match_beyond_the_right_picture_takes_its_last_column(matcher, rng):
     pair = flat(rng, 37)
     right_seen = np.ones(pair.left.shape[:2], bool)
     right_seen[:, -1] = False
@@ -295,7 +295,7 @@ def test_where_a_match_is_beyond_the_right_picture_its_last_column_is_asked(matc
     assert found.occluded[20:-20, 40:-40].mean() < 0.02
 
 
-def test_a_disparity_outside_of_the_range_that_is_given_is_brought_to_its_end_and_not_believed(matcher, rng):
+def test_a_disparity_outside_a_given_range_is_clipped_and_gets_no_confidence(matcher, rng):
     for range_px, end_px in [((50, 90), 50), ((-20, 20), 20)]:
         found = match(matcher, flat(rng, 37), MatchOptions(range_px=range_px))
         for disparity_px in (found.disparity_px, found.right_disparity_px):
@@ -315,7 +315,7 @@ def test_a_range_that_no_pixel_can_have_is_refused_in_one_line(matcher, rng, ran
     assert "\n" not in str(caught.value)
 
 
-def test_a_range_beyond_the_pictures_width_is_as_good_as_the_width(matcher, rng):
+def test_a_range_beyond_the_pictures_width_is_clipped_to_it(matcher, rng):
     pair = flat(rng, 12, (64, 160))
     same(
         match(matcher, pair, MatchOptions(range_px=(-9000, 20))),
@@ -328,13 +328,13 @@ def test_a_range_beyond_the_pictures_width_is_as_good_as_the_width(matcher, rng)
 
 
 @pytest.mark.parametrize("range_px", [(10, 10), (50, 0), (0, float("nan")), (float("-inf"), 10)])
-def test_a_range_that_is_none_is_refused_in_one_line(matcher, textured, range_px):
+def test_an_invalid_range_is_refused_in_one_line(matcher, textured, range_px):
     with pytest.raises(StereoweaveError, match="range_px: expected the least and the greatest") as caught:
         match(matcher, textured, MatchOptions(range_px=range_px))
     assert "\n" not in str(caught.value)
 
 
-def test_plain_pictures_and_pictures_that_are_no_pair_are_matched_all_the_same(matcher, rng):
+def test_plain_and_unrelated_pictures_are_matched_without_error(matcher, rng):
     plain = np.full((64, 96, 3), 90, np.uint8)
     assert (match(matcher, sw.StereoPair(left=plain, right=plain)).confidence == 0).all()
     noise = rng.integers(0, 256, (2, 64, 96, 3), np.uint8)
@@ -349,8 +349,8 @@ def test_the_answer_does_not_depend_on_earlier_calls_of_other_sizes(rng):
     np.testing.assert_array_equal(sw.estimate(left, right).disparity_px, first.disparity_px)
 
 
-def test_a_pair_that_is_moved_is_still_seen_whole(rng, monkeypatch):
-    for module in (matcher_module, matching):  # 8 px more than 96 columns are too many
+def test_a_shifted_pair_still_fits_one_run(rng, monkeypatch):
+    for module in (matcher_module, matching):  # 96 columns fit, but not 8 more
         monkeypatch.setattr(module, "PIXEL_PAIRS_AT_ONCE", 96 * 96 * 64)
     seen = []
     estimate_many = Matcher.estimate_many
@@ -366,7 +366,7 @@ def test_a_pair_that_is_moved_is_still_seen_whole(rng, monkeypatch):
     assert seen == [True]
 
 
-def test_a_pair_is_shown_no_smaller_than_its_range_asks_for(matcher, rng, monkeypatch):
+def test_a_pair_is_scaled_down_no_more_than_its_range_requires(matcher, rng, monkeypatch):
     seen = []
     estimate_many = Matcher.estimate_many
 
@@ -376,13 +376,14 @@ def test_a_pair_is_shown_no_smaller_than_its_range_asks_for(matcher, rng, monkey
 
     monkeypatch.setattr(Matcher, "estimate_many", noted)
     match(matcher, flat(rng, 37), MatchOptions(range_px=(-100, 300)))
-    # 400 px in the 188 that are seen well: 480x160 px become 226x75, of which the least is -47.1 px.
+    # 400 px must fit into the 188 px that the network covers well: 480x160 px become 226x75, and the least
+    # disparity becomes -47.1 px.
     assert seen == [(75, 226 + 48, 3)]
 
 
 @pytest.mark.parametrize("options", [MatchOptions(), MatchOptions(range_px=(-8, 100), refined=True)])
-def test_pairs_of_any_sizes_and_ranges_matched_together_are_as_each_is_alone(rng, monkeypatch, options):
-    monkeypatch.setitem(PROVIDERS, "cpu", replace(PROVIDERS["cpu"], batches=True))  # as a GPU takes them
+def test_pairs_of_any_sizes_and_ranges_give_the_same_results_together_and_alone(rng, monkeypatch, options):
+    monkeypatch.setitem(PROVIDERS, "cpu", replace(PROVIDERS["cpu"], batches=True))  # as on a GPU
     matcher = Matcher()
     noise = rng.integers(0, 256, (2, 64, 96, 3), np.uint8)
     shorter, negative = flat(rng, 12, (64, 96)), flat(rng, 30, (96, 160))
@@ -410,11 +411,11 @@ def test_a_pair_larger_than_the_only_size_of_a_matcher_file_is_matched_smaller(t
 
 @pytest.mark.parametrize("size", [(160, 321), (161, 320), (100, 321), (480, 640), (40, 2000), (320, 160)])
 @pytest.mark.parametrize("least_px", [0, -1, -7, -31])
-def test_whatever_is_shown_to_a_file_for_one_size_fits_it(tmp_path, size, least_px):
+def test_every_input_of_a_fixed_size_matcher_fits_it(tmp_path, size, least_px):
     fixed = Matcher(of_fixed_size("small", tmp_path / "fixed.onnx", 160, 320))
     blank = np.zeros((*size, 3), np.uint8)
     shown = matching._prepare_first_input(fixed, sw.StereoPair(left=blank, right=blank), (least_px, 60))
     height, width = matching._shift(shown).left.shape[:2]
     assert fixed.sees_whole(width, height)
-    # No smaller than it has to be.
+    # The pair is not smaller than necessary.
     assert max(height / 160, width / 320) > 0.97 or size[0] < 160

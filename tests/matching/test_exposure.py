@@ -20,7 +20,7 @@ SHIFT_PX = 8
 
 
 def levels(gain=(1.0, 1.0, 1.0), exponent=1.0):
-    """What a photograph shows, [256, 3] uint8, of what another one shows as 0, 1, ... 255."""
+    """Return the levels, uint8 [256, 3], that one image shows for levels 0, 1, ... 255 of another."""
     shares = np.array(gain) * (LEVELS[:, None] / 255) ** exponent
     return np.rint(255 * np.clip(shares, 0, 1)).astype(np.uint8)
 
@@ -34,7 +34,7 @@ DISTORTIONS = {
 
 
 def seen_alike(height, width):
-    """All is seen by both cameras at one disparity, for certain."""
+    """Return an estimate with one disparity and full confidence everywhere, and no occlusion."""
     return Estimate(
         disparity_px=np.full((height, width), SHIFT_PX, np.float32),
         right_disparity_px=np.full((height, width), SHIFT_PX, np.float32),
@@ -45,7 +45,7 @@ def seen_alike(height, width):
 
 @pytest.fixture
 def wall(rng):
-    """A soft pattern of all levels from 10 to 245, seen at SHIFT_PX; both looks are one."""
+    """Return a pair with a soft pattern of all levels from 10 to 245 at SHIFT_PX, equally exposed."""
     noise = cv2.GaussianBlur(rng.normal(size=(120, 160 + SHIFT_PX, 3)), (0, 0), 5)
     ranks = noise.reshape(-1, 3).argsort(axis=0).argsort(axis=0).reshape(noise.shape)
     picture = np.rint(10 + 235 * ranks / ranks.max()).astype(np.uint8)
@@ -64,7 +64,7 @@ def examples():
 
 
 def occurring(photo):
-    """Which levels, [256, 3], are at least 1 pixel in 500, and are not cut off."""
+    """Return which levels, bool [256, 3], occur in at least 1 pixel in 500 and are not clipped."""
     shares = np.stack([np.bincount(channel.ravel(), minlength=256) for channel in cv2.split(photo)], axis=1)
     return (shares > photo[..., 0].size / 500) & (np.abs(IDENTITY - 127.5) < 122)
 
@@ -83,13 +83,13 @@ def occurring_pixels(photo):
 
 
 @pytest.mark.parametrize("name", DISTORTIONS)
-def test_what_was_done_to_the_right_photograph_is_found_within_2_levels(name, examples, matcher):
+def test_a_distortion_of_the_right_image_is_recovered_within_2_levels(name, examples, matcher):
     right = recolour(examples.right, DISTORTIONS[name].astype(np.float32))
     looks = match_exposure(examples.left, right, matcher.estimate(examples.left, right))
     assert_recovered(looks, examples.left, DISTORTIONS[name], within=2)
 
 
-def test_in_a_rendered_pair_too(matcher):
+def test_a_distortion_is_recovered_in_a_rendered_pair(matcher):
     sample = render_pair(Raycaster(PLAIN), RenderSpec(scene="bridge", seed=3, size_px=(320, 240)), 1).sample
     right = recolour(sample.right, DISTORTIONS["gain"].astype(np.float32))
     looks = match_exposure(sample.left, right, matcher.estimate(sample.left, right))
@@ -97,13 +97,13 @@ def test_in_a_rendered_pair_too(matcher):
 
 
 @pytest.mark.parametrize("name", DISTORTIONS)
-def test_with_exact_matches_within_1_level(name, wall):
+def test_exact_matches_recover_a_distortion_within_1_level(name, wall):
     pair, estimate = wall
     looks = match_exposure(pair.left, recolour(pair.right, DISTORTIONS[name].astype(np.float32)), estimate)
     assert_recovered(looks, pair.left, DISTORTIONS[name], within=1.5)
 
 
-def test_photographs_that_agree_have_nothing_to_bring_together(examples, matcher, wall):
+def test_equally_exposed_images_need_no_correction(examples, matcher, wall):
     estimate = matcher.estimate(examples.left, examples.right)
     assert match_exposure(examples.left, examples.right, estimate) is None
     pair, estimate = wall
@@ -111,7 +111,7 @@ def test_photographs_that_agree_have_nothing_to_bring_together(examples, matcher
 
 
 @pytest.mark.parametrize("noise_levels", [4, 12])
-def test_nor_have_those_that_differ_by_noise(noise_levels, rng, examples, matcher):
+def test_images_that_differ_only_by_noise_need_no_correction(noise_levels, rng, examples, matcher):
     noise = rng.normal(0, noise_levels, examples.right.shape)
     right = np.clip(np.rint(examples.right + noise), 0, 255).astype(np.uint8)
     looks = match_exposure(examples.left, right, matcher.estimate(examples.left, right))
@@ -119,10 +119,10 @@ def test_nor_have_those_that_differ_by_noise(noise_levels, rng, examples, matche
         assert np.abs(looks.right_of_left - IDENTITY).max() < 0.5
 
 
-def test_as_the_difference_grows_the_correction_sets_in_without_a_jump(wall, rng):
+def test_the_correction_grows_smoothly_with_the_difference(wall, rng):
     pair, estimate = wall
-    # The white of a patch is 251 in the right photograph; all else is a level darker there, or two or three,
-    # for so many pixels that the mean is as wanted.
+    # A white patch has level 251 in the right image. All other pixels are darker there by one, two or three
+    # levels, in numbers that give the desired mean.
     patch = np.zeros(pair.left.shape, bool)
     patch[:20, 50:90] = True
     pair.left[patch] = 255
@@ -140,7 +140,7 @@ def test_as_the_difference_grows_the_correction_sets_in_without_a_jump(wall, rng
     assert np.abs(np.diff(middle)).max() < 0.35 and np.abs(np.diff(white)).max() < 0.6
 
 
-def test_as_more_becomes_certain_the_correction_sets_in_without_a_jump(wall):
+def test_the_correction_grows_smoothly_with_the_number_of_matches(wall):
     pair, estimate = wall
     right = recolour(pair.right, DISTORTIONS["darker"].astype(np.float32))
     changes = []
@@ -154,7 +154,7 @@ def test_as_more_becomes_certain_the_correction_sets_in_without_a_jump(wall):
 
 
 @pytest.mark.parametrize("unknown", ["occluded", "confidence"])
-def test_what_is_no_sure_match_does_not_matter(unknown, wall, rng):
+def test_uncertain_matches_are_ignored(unknown, wall, rng):
     pair, estimate = wall
     right = recolour(pair.right, DISTORTIONS["gain"].astype(np.float32))
     values = getattr(estimate, unknown).copy()
@@ -167,7 +167,7 @@ def test_what_is_no_sure_match_does_not_matter(unknown, wall, rng):
     np.testing.assert_array_equal(with_others.left_of_right, without.left_of_right)
 
 
-def test_matches_are_not_believed_where_disparities_are_torn(wall, rng):
+def test_matches_at_disparity_jumps_are_ignored(wall, rng):
     pair, estimate = wall
     estimate.disparity_px[:, 40:] = rng.integers(0, 40, (120, 120))
     right = recolour(pair.right, DISTORTIONS["cast"].astype(np.float32))
@@ -175,7 +175,7 @@ def test_matches_are_not_believed_where_disparities_are_torn(wall, rng):
     assert_recovered(looks, pair.left, DISTORTIONS["cast"], within=2)
 
 
-def test_a_part_of_wrong_matches_does_no_harm(wall, rng):
+def test_some_wrong_matches_do_no_harm(wall, rng):
     pair, estimate = wall
     squares = rng.integers(0, 60, (12, 6)) * (rng.random((12, 1)) < 0.5)
     estimate.disparity_px[:, 100:] += np.kron(squares, np.ones((10, 10)))
@@ -199,7 +199,7 @@ def test_without_sure_matches_there_is_no_correction(nothing, wall):
     assert match_exposure(pair.left, right, replace(estimate, **nothing)) is None
 
 
-def test_a_mirror_exchanges_the_looks(wall):
+def test_mirroring_swaps_the_looks(wall):
     pair, estimate = wall
     pair = replace(pair, right=recolour(pair.right, DISTORTIONS["cast"].astype(np.float32)))
     mirrored = pair.mirror()
@@ -209,7 +209,7 @@ def test_a_mirror_exchanges_the_looks(wall):
     np.testing.assert_allclose(exchanged.left_of_right[10:246], looks.right_of_left[10:246], atol=0.5)
 
 
-def test_a_plain_sky_that_is_white_in_both_photographs_stays_white_in_both_looks(wall):
+def test_a_sky_that_is_white_in_both_images_stays_white_in_both_looks(wall):
     pair, estimate = wall
     right = recolour(pair.right, DISTORTIONS["darker"].astype(np.float32))
     confidence = estimate.confidence.copy()
@@ -220,20 +220,20 @@ def test_a_plain_sky_that_is_white_in_both_photographs_stays_white_in_both_looks
     np.testing.assert_allclose(looks.right_of_left[200], 150, atol=1)
 
 
-def test_what_is_cut_off_to_white_becomes_the_mean_of_what_the_other_photograph_shows_of_it(wall):
+def test_clipped_white_becomes_the_mean_level_of_the_other_image(wall):
     pair, estimate = wall
     left, right = (np.repeat(photo[..., :1], 3, axis=2) for photo in (pair.left, pair.right))
     right = recolour(right, DISTORTIONS["gain"].astype(np.float32))
-    # A matcher has no confidence where a photograph is plain.
+    # A matcher has no confidence where an image is plain.
     estimate.confidence[np.roll(right[..., 0] == 255, SHIFT_PX, axis=1)] = 0
     looks = match_exposure(left, right, estimate)
-    # Of 1.3 times a level nothing is left above 255 / 1.3 = 196.2; levels up to 245 are equally frequent.
+    # A gain of 1.3 clips all levels above 255 / 1.3 = 196.2; levels up to 245 are equally frequent.
     np.testing.assert_allclose(looks.left_of_right[255], (196.5 + 245) / 2, atol=4)
     np.testing.assert_allclose(looks.left_of_right[250], 250 / 1.3, atol=1)
     assert (looks.right_of_left[200:] > 254).all()
 
 
-def test_tables_never_fall_nor_leave_the_range_whatever_the_photographs(rng):
+def test_tables_are_monotonic_and_stay_in_range_for_any_images(rng):
     left, right = rng.integers(0, 256, (2, 12, 16, 3), np.uint8)
     left, right = (cv2.resize(photo, (64, 48), interpolation=cv2.INTER_CUBIC) for photo in (left, right))
     looks = match_exposure(left, np.maximum(right, 90), seen_alike(48, 64))
@@ -242,7 +242,7 @@ def test_tables_never_fall_nor_leave_the_range_whatever_the_photographs(rng):
         assert table.dtype == np.float32 and table.shape == (256, 3)
 
 
-def test_the_look_changes_in_a_straight_line_from_one_photograph_to_the_other():
+def test_looks_are_interpolated_linearly_between_the_images():
     looks = Looks(
         right_of_left=np.minimum(2 * IDENTITY, 255).astype(np.float32),
         left_of_right=(IDENTITY / 2).astype(np.float32),
@@ -250,13 +250,14 @@ def test_the_look_changes_in_a_straight_line_from_one_photograph_to_the_other():
     np.testing.assert_array_equal(looks.tables(0), [IDENTITY, looks.left_of_right])
     np.testing.assert_array_equal(looks.tables(1), [looks.right_of_left, IDENTITY])
     left, right = looks.tables(0.25)
-    # A surface of 100 in the left photograph is 200 in the right one: a quarter of the way it is 125.
+    # A surface has level 100 in the left image and 200 in the right one, and 125 a quarter of the way
+    # between.
     assert left[100].tolist() == right[200].tolist() == [125, 125, 125]
     np.testing.assert_array_equal(looks.tables(-0.5), looks.tables(0))
     np.testing.assert_array_equal(looks.tables(1.5), looks.tables(1))
 
 
-def test_levels_are_rounded_and_the_photographs_own_look_changes_nothing(examples):
+def test_levels_are_rounded_and_an_images_own_look_changes_nothing(examples):
     table = IDENTITY.astype(np.float32)
     np.testing.assert_array_equal(recolour(examples.left, table), examples.left)
     table[[7, 8, 255]] = [[1.4, 1.6, 2.0], [3.4, 3.6, 4.0], [254.4, 254.6, 255.0]]

@@ -6,7 +6,7 @@ from stereoweave.matching.left_right_check import at_match, find_occluded
 
 
 @pytest.mark.parametrize("height", [30, 256, 700])
-def test_the_check_is_what_the_plain_loops_do_however_many_rows_there_are(rng, height):
+def test_the_check_equals_the_plain_loops_for_any_number_of_rows(rng, height):
     disparity_px, right_disparity_px = rng.uniform(-2, 7, (2, height, 40)).astype(np.float32)
     found = find_occluded(disparity_px, right_disparity_px)
     np.testing.assert_array_equal(found, plain_hidden(disparity_px, right_disparity_px))

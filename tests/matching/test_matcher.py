@@ -31,7 +31,7 @@ def test_the_shipped_network_takes_any_size_from_32_px_up(rng, height, width):
     assert found.confidence.min() >= 0 and found.confidence.max() <= 1
 
 
-def test_no_network_is_shown_more_rows_than_opencv_takes():
+def test_no_run_has_more_rows_than_opencv_supports():
     small = Matcher("small", threads=1)
     assert small.sees_whole(32, 32_766)
     assert not small.sees_whole(32, 32_767)
@@ -56,25 +56,25 @@ def test_padding_repeats_the_border(tmp_path):
     y, x = np.mgrid[:33, :45]
     ramp = painted(2 * x + 3 * y)
     found = Matcher(matcher_file(tmp_path / "corner.onnx", nodes, ["disparity_px"])).estimate(ramp, ramp)
-    # The padded picture of 48x48 ends as this one does; reflected, it would end darker.
+    # The picture padded to 48x48 ends with the level of its border; reflected padding would be darker.
     np.testing.assert_allclose(found.disparity_px, 2 * 44 + 3 * 32, atol=1e-4)
 
 
 def test_a_nearer_surface_and_the_left_border_occlude(both_views):
-    # A wall at disparity 4, and on its columns 20..29 a board at 10, which the right camera sees at 10..19:
-    # of the wall it hides left columns 14..23, of which the left camera sees 14..19.
+    # A wall is at disparity 4. A board at disparity 10 covers columns 20..29, which the right camera sees at
+    # 10..19. It occludes the wall's left columns 14..23, of which the left camera sees 14..19.
     left_px, right_px = np.full((32, 40), 4), np.full((32, 40), 4)
     left_px[:, 20:30] = 10
     right_px[:, 10:20] = 10
     expected = np.zeros((32, 40), bool)
-    expected[:, :4] = True  # their match lies left of the right image
+    expected[:, :4] = True  # their match is beyond the right image's left border
     expected[:, 14:20] = True
     found = both_views.estimate(painted(left_px), painted(right_px))
     np.testing.assert_array_equal(found.occluded, expected)
 
 
-def test_what_a_board_hides_of_a_wall_takes_the_walls_disparity_and_raw_is_what_the_network_says(both_views):
-    # As above, but of the hidden part of the wall the network says 2 px.
+def test_the_occluded_wall_takes_the_walls_disparity_unless_raw(both_views):
+    # As above, but the network gives the occluded part of the wall 2 px.
     left_px, right_px = np.full((32, 40), 4), np.full((32, 40), 4)
     left_px[:, 20:30] = 10
     right_px[:, 10:20] = 10
@@ -111,7 +111,7 @@ def test_confidence_is_the_probability_of_the_logit(tmp_path, rng):
     np.testing.assert_allclose(found.confidence, 1 / (1 + np.exp(-3.0)), rtol=1e-5)
 
 
-def test_the_confidence_of_a_logit_beyond_what_float32_can_raise_is_0_or_1():
+def test_the_confidence_of_an_extreme_logit_is_0_or_1():
     logit = np.array([[-200, -89, 0, 89, 200]], np.float32)
     nowhere = np.zeros((1, 5), bool)
     found = matcher._confidence(logit, np.zeros((1, 5), np.float32), ~nowhere, nowhere)
@@ -119,9 +119,9 @@ def test_the_confidence_of_a_logit_beyond_what_float32_can_raise_is_0_or_1():
     assert found.dtype == np.float32
 
 
-def test_confidence_halves_where_the_right_view_sees_farther_than_the_match_and_is_0_where_all_is_plain():
-    # Even odds everywhere; at the first two matches and at the last, which lies outside of the right picture,
-    # the right view's disparity is lower by more than 1 px.
+def test_confidence_is_halved_where_the_views_contradict_and_0_in_plain_areas():
+    # The odds are even everywhere. At the first two matches, and at the last one, which is outside the right
+    # image, the right view's disparity is lower by more than 1 px.
     disagreement_px = np.array([[-3, -1.5, -1, 0, 5, 0, -3]], np.float32)
     inside = np.array([[True, True, True, True, True, True, False]])
     plain = np.array([[False, False, False, False, False, True, False]])
@@ -129,27 +129,28 @@ def test_confidence_halves_where_the_right_view_sees_farther_than_the_match_and_
     np.testing.assert_array_equal(found, [[0.25, 0.25, 0.5, 0.5, 0.5, 0, 0.5]])
 
 
-def test_without_a_logit_confidence_is_what_the_disagreement_suggests():
+def test_without_a_logit_confidence_depends_on_the_disagreement():
     disagreement_px = np.log(np.array([[0.5, 1, 2, 1]], np.float32))
     plain = np.array([[False, False, False, True]])
     found = matcher._confidence(None, disagreement_px, np.ones((1, 4), bool), plain)
     np.testing.assert_allclose(found, [[0.5, 1, 0.5, 0]], rtol=1e-6)
 
 
-def test_plain_is_what_has_nothing_to_match_by_within_32_px():
-    # Columns 0 to 99 are grey but for the rounding of 2 levels; a board of another grey begins at column 100.
+def test_a_pixel_is_plain_without_texture_within_32_px():
+    # Columns 0 to 99 are plain grey up to 2 levels of rounding; a board of another grey begins at column 100.
     image = painted(np.full((40, 140), 90))
     image[::2, ::3] += 2
     image[:, 100:] = 93
     expected = np.zeros((40, 140), bool)
-    # The last mean of 90 is at column 95, the first of 93 at 103: 8 of its 9 columns are the board's.
+    # The last mean of 90 is at column 95. The first mean of 93 is at column 103: 8 of its 9 columns are on
+    # the board.
     expected[:, : 103 - 32] = True
     expected[:, 95 + 32 + 1 :] = True
     np.testing.assert_array_equal(matcher._find_plain(image), expected)
 
 
-def test_strips_put_together_are_the_whole(tmp_path, rng, monkeypatch):
-    # Each answer is the mean of the 65 rows around it: nearer than 32 rows to its end a strip is wrong.
+def test_blended_strips_equal_the_whole(tmp_path, rng, monkeypatch):
+    # Each output is the mean of the 65 rows around it, so a strip is wrong within 32 rows of its ends.
     mean = helper.make_node(
         "AveragePool", ["all"], ["disparity_px"], kernel_shape=[65, 1], pads=[32, 0, 32, 0]
     )
@@ -174,8 +175,8 @@ def test_strips_cover_every_row_and_leave_no_row_without_weight(height, rows):
     assert weights.min() > 0.4
 
 
-def test_low_and_very_wide_pictures_are_not_matched_at_once(both_views):
-    # 256 rows, the least of a strip, of 20000 columns would be 25 times the pairs that are matched at once.
+def test_low_and_very_wide_pictures_do_not_fit_one_run(both_views):
+    # Even the smallest strip, of 256 rows, with 20000 columns exceeds the limit of pixel pairs 25 times.
     assert both_views.sees_whole(1920, 1088)
     assert both_views.sees_whole(200, 20_000)
     assert not both_views.sees_whole(20_000, 200)
@@ -249,7 +250,7 @@ def test_images_under_32_px_are_refused(both_views):
 
 
 def counting(path, size=ANY_SIZE):
-    """A matcher file whose disparity is the left red channel, and its right disparity how many pairs run."""
+    """Write a matcher file that returns left red as disparity, and the batch size as right disparity."""
     nodes = [
         *red_of("left", "disparity_px"),
         helper.make_node("Sub", ["disparity_px", "disparity_px"], ["nothing"]),
@@ -262,7 +263,7 @@ def counting(path, size=ANY_SIZE):
 
 @pytest.fixture
 def like_a_gpu(monkeypatch):
-    """The processor runs several pairs at once, which is what makes a GPU quicker, and itself slower."""
+    """Let the CPU run batches of pairs, as a GPU does."""
     monkeypatch.setitem(PROVIDERS, "cpu", replace(PROVIDERS["cpu"], batches=True))
 
 
@@ -274,7 +275,7 @@ def five_pairs(rng):
 @pytest.mark.parametrize(
     ("size", "counts"), [(ANY_SIZE, [2, 2, 2, 2, 1]), ((1, "h", "w"), [1] * 5), ((1, 64, 80), [1] * 5)]
 )
-def test_pairs_of_one_size_run_together_as_far_as_the_file_and_the_memory_go(
+def test_pairs_of_equal_size_run_in_batches_as_the_file_and_memory_allow(
     tmp_path, five_pairs, like_a_gpu, monkeypatch, size, counts
 ):
     monkeypatch.setattr(matcher, "PIXEL_PAIRS_AT_ONCE", 2 * 48 * 64 * 64 + 1)
@@ -285,8 +286,8 @@ def test_pairs_of_one_size_run_together_as_far_as_the_file_and_the_memory_go(
 
 
 @pytest.mark.parametrize("views", [1, 2])
-def test_pairs_matched_together_are_as_each_is_alone(tmp_path, five_pairs, like_a_gpu, views):
-    # 47x61 is padded; with one output the mirrored pairs run too.
+def test_pairs_give_the_same_results_in_a_batch_and_alone(tmp_path, five_pairs, like_a_gpu, views):
+    # 47x61 is padded; a network with one output also runs the mirrored pairs.
     outputs = ["disparity_px", "right_disparity_px"][:views]
     nodes = [
         node for image, out in zip(("left", "right"), outputs, strict=False) for node in red_of(image, out)
@@ -305,7 +306,7 @@ def test_the_processor_takes_one_pair_after_another(tmp_path, five_pairs):
     assert [estimate.right_disparity_px.max() for estimate in found] == [1] * 5
 
 
-def test_the_shipped_network_gives_pairs_together_what_it_gives_each(five_pairs, like_a_gpu):
+def test_the_shipped_network_gives_the_same_results_in_a_batch_and_alone(five_pairs, like_a_gpu):
     network = Matcher()
     for pair, found in zip(five_pairs[:2], network.estimate_many(five_pairs[:2]), strict=True):
         alone = network.estimate(pair.left, pair.right)
@@ -346,7 +347,7 @@ def test_a_file_for_one_size_takes_smaller_pictures_and_refuses_larger_ones_in_o
         network.estimate(tall, tall)
 
 
-def test_what_a_picture_is_padded_with_up_to_a_fixed_size_changes_little(tmp_path):
+def test_padding_to_a_fixed_size_changes_little(tmp_path):
     pair = read_pair("tests/textured_pair/left.png", "tests/textured_pair/right.png")
     left, right = (np.ascontiguousarray(x[120:280, 200:424]) for x in (pair.left, pair.right))
     fixed = Matcher(of_fixed_size("small", tmp_path / "fixed.onnx", 240, 320))

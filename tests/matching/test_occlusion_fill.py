@@ -23,7 +23,7 @@ def estimate_of(disparity_px, occluded, confidence=0.5):
 
 @pytest.fixture
 def scene():
-    """A wall, and a board on columns 50 to 89, which hides columns 24 to 49 and what is left of column 4."""
+    """Return a wall and a board (columns 50 to 89), with columns 0 to 3 and 24 to 49 occluded."""
     disparity_px = np.full((40, 120), WALL_PX, np.float32)
     disparity_px[:, 50:90] = BOARD_PX
     occluded = np.zeros((40, 120), bool)
@@ -34,7 +34,7 @@ def scene():
 
 @pytest.fixture
 def clutter(rng):
-    """Patches of many disparities with no sense in them, a third of them occluded."""
+    """Return an estimate of random patches with many disparities, a third of them occluded."""
     disparity_px = np.repeat(np.repeat(rng.uniform(-20, 40, (12, 20)), 4, 0), 4, 1)[:45, :77]
     disparity_px += rng.uniform(-1, 1, disparity_px.shape)
     occluded = cv2.blur(rng.random((45, 77)), (7, 3)) < 0.45
@@ -60,7 +60,7 @@ def test_a_mix_of_two_surfaces_beside_a_run_is_not_continued(scene):
     np.testing.assert_array_equal(found.disparity_px[:, 24:50], WALL_PX)
 
 
-def test_what_is_visible_stays_and_so_do_the_mask_and_the_other_view(clutter):
+def test_visible_pixels_the_mask_and_the_other_view_do_not_change(clutter):
     found = fill_occluded(clutter)
     visible = ~clutter.occluded
     for name in ("disparity_px", "confidence"):
@@ -74,8 +74,8 @@ def test_a_row_without_a_visible_pixel_stays(scene):
     np.testing.assert_array_equal(fill_occluded(alone).disparity_px, 7)
 
 
-def test_a_disparity_far_from_the_rows_stays_where_surfaces_around_reach_as_far(scene):
-    # Farther than the wall by 14 px; a window in it, above and below the pixels, is farther still.
+def test_a_disparity_far_from_the_fill_is_kept_within_the_surroundings(scene):
+    # The pixels are 14 px farther than the wall. Windows in the wall above and below them are farther still.
     scene.disparity_px[15:25, 30:40] = -10
     assert (fill_occluded(scene).disparity_px[15:25, 30:40] == WALL_PX).all()
     scene.disparity_px[4:12, 20:24] = scene.disparity_px[28:36, 20:24] = -12
@@ -84,7 +84,7 @@ def test_a_disparity_far_from_the_rows_stays_where_surfaces_around_reach_as_far(
     assert (found.confidence[15:25, 30:40] == 0.5).all()
 
 
-def test_filled_pixels_are_believed_as_is_what_they_are_filled_from_unless_they_have_no_confidence(scene):
+def test_filled_pixels_mix_both_confidences_unless_their_own_is_0(scene):
     scene.confidence[:, :24], scene.confidence[:, 50:] = 1, 0.25
     scene.confidence[:, 24:30] = 0
     found = fill_occluded(scene)
@@ -92,8 +92,8 @@ def test_filled_pixels_are_believed_as_is_what_they_are_filled_from_unless_they_
     np.testing.assert_allclose(found.confidence[:, 30:50], 0.6 * 0.5 + 0.4 * 1, rtol=1e-6)
 
 
-def test_what_the_left_picture_does_not_show_is_not_continued(scene):
-    # A black border of 24 columns, of which the network says 2 px.
+def test_pixels_without_content_do_not_fill_others(scene):
+    # The network gives a black border of 24 columns 2 px.
     scene.disparity_px[:, 4:24] = 2
     seen = np.ones(scene.occluded.shape, bool)
     seen[:, :24] = False

@@ -12,7 +12,7 @@ def test_a_range_of_other_than_two_finite_ascending_numbers_is_refused(range_px)
         MatchOptions(range_px=range_px)
 
 
-def test_invalid_options_are_refused_before_anything_else_is_looked_at():
+def test_invalid_options_are_refused_first():
     with pytest.raises(StereoweaveError, match="^range_px: "):
         sw.estimate("no picture", "no picture", model="no model", range_px=(5.0, 2.0))
     with pytest.raises(StereoweaveError, match="^raw: cannot be combined with refined"):
@@ -20,7 +20,7 @@ def test_invalid_options_are_refused_before_anything_else_is_looked_at():
 
 
 @pytest.mark.usefixtures("without_shape_checks")
-def test_equal_options_are_one_key_however_the_range_is_given():
+def test_equal_options_are_one_key_for_any_type_of_range():
     for range_px in ([-8, 96], np.array([-8, 96]), (np.float32(-8), 96.0)):
         options = MatchOptions(range_px=range_px)
         assert {options: "found"}[MatchOptions(range_px=(-8.0, 96.0))] == "found"

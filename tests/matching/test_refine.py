@@ -20,7 +20,7 @@ def rng():
 
 
 def photographs(rng, true_px, size):
-    """A pair of noise, shown at the disparities `true_px` of the right view, each row far to near."""
+    """Return a pair of noise with the disparities `true_px` of the right view, drawn from far to near."""
     height, width = size
     right = rng.integers(0, 256, (height, width, 3), np.uint8)
     left = rng.integers(0, 256, (height, width, 3), np.uint8)
@@ -44,7 +44,7 @@ def estimate_of(disparity_px, right_disparity_px, confidence=0.2):
 
 @pytest.fixture
 def scene(rng):
-    """A stick and a block before a far wall: photographs, true disparities of both views, and the wall's."""
+    """Return a stick and a block in front of a far wall: images and true disparities of both views."""
     right_px = np.full((64, 160), FAR_PX)
     right_px[:, STICK] = STICK_PX
     right_px[BLOCK] = NEAR_PX
@@ -65,39 +65,39 @@ def test_a_stick_that_the_network_missed_comes_back_in_both_views(scene):
     assert (abs(refined.right_disparity_px[:, STICK] - STICK_PX) < 1).mean() > 0.95
 
 
-def test_what_a_certain_network_says_stays(scene):
+def test_certain_disparities_of_the_network_are_kept(scene):
     left, right, left_px, right_px = scene
     given = estimate_of(*without_stick(left_px, right_px), confidence=0.9)
     np.testing.assert_array_equal(refine(left, right, given).disparity_px, given.disparity_px)
 
 
-def test_what_is_right_stays_to_the_last_bit(scene):
+def test_correct_disparities_do_not_change_by_a_bit(scene):
     left, right, left_px, right_px = scene
     given = estimate_of(np.where(np.isnan(left_px), FAR_PX, left_px) + 0.3, right_px + 0.3, confidence=0.8)
     refined = refine(left, right, given)
     inner = np.isfinite(left_px) & (np.arange(160) >= NEAR_PX)
-    # In noise, a pixel in some thousands finds a better match elsewhere.
+    # In noise, one pixel in several thousand finds a better match elsewhere.
     assert (refined.disparity_px == given.disparity_px)[inner].mean() > 0.999
 
 
-def test_the_part_beyond_the_other_picture_continues_the_surface_beside_it(scene):
+def test_pixels_beyond_the_other_picture_continue_the_surface_beside_them(scene):
     left, right, left_px, right_px = scene
     wrong_px = np.where(np.arange(160) < FAR_PX, 1, FAR_PX) * np.ones((64, 1))
     refined = refine(left, right, estimate_of(wrong_px, right_px))
     np.testing.assert_allclose(refined.disparity_px[:, :FAR_PX], FAR_PX, atol=1)
 
 
-def test_what_the_network_sees_far_from_that_surface_stays(scene):
+def test_disparities_far_from_that_surface_are_kept(scene):
     left, right, left_px, right_px = scene
     near_px = np.where(np.arange(160) < FAR_PX, FAR_PX + 30, FAR_PX) * np.ones((64, 1))
     refined = refine(left, right, estimate_of(near_px, right_px))
     assert (refined.disparity_px[:, 0] == FAR_PX + 30).all()
 
 
-def test_what_a_nearer_surface_hides_is_occluded(scene):
+def test_pixels_behind_a_nearer_surface_are_occluded(scene):
     left, right, left_px, right_px = scene
     refined = refine(left, right, estimate_of(*without_stick(left_px, right_px)))
-    hidden = slice(STICK.start + FAR_PX, STICK.stop + FAR_PX)  # the wall that the stick hides from the right
+    hidden = slice(STICK.start + FAR_PX, STICK.stop + FAR_PX)  # the part of the wall that the stick occludes
     assert refined.occluded[:, hidden].mean() > 0.9
     assert refined.occluded[:, 30:60].mean() < 0.02
 
@@ -115,8 +115,8 @@ def test_disparities_behind_the_plane_of_convergence_are_found_alike(rng):
     assert (there.disparity_px[:, 69:74] > 18).mean() > 0.9
 
 
-def test_parallel_cameras_are_given_nothing_below_zero(rng):
-    # The network's least is 0, and a plain sky would take whatever is offered.
+def test_parallel_cameras_get_no_negative_disparities(rng):
+    # The network's least disparity is 0, and a plain sky would take any candidate.
     photo = np.full((48, 120, 3), 200, np.uint8)
     photo[20:30, 40:80] = rng.integers(0, 256, (10, 40, 3), dtype=np.uint8)
     flat_px = np.zeros((48, 120))
@@ -126,7 +126,7 @@ def test_parallel_cameras_are_given_nothing_below_zero(rng):
 
 
 def random_pair(rng):
-    """Photographs and an estimate with no sense in them, in which every branch is taken."""
+    """Return random images and a random estimate, which exercise every branch."""
     left, right = (cv2.blur(rng.integers(0, 256, (24, 50, 3), np.uint8), (3, 3)) for _ in range(2))
     maps = [np.repeat(rng.uniform(-3, 9, (24, 10)), 5, 1) for _ in range(2)]
     given = estimate_of(*maps)

@@ -18,7 +18,7 @@ Q = np.array([[1, 0, 0, -319.5], [0, 1, 0, -239.5], [0, 0, 0, 600], [0, 0, 10, 0
 
 
 def photographs() -> tuple[np.ndarray, np.ndarray]:
-    """The example pair as users of OpenCV have it, in BGR."""
+    """Return the example pair in BGR, as users of OpenCV have it."""
     left, right = (cv2.imread(str(TEXTURED / name)) for name in ("left.png", "right.png"))
     assert left is not None
     assert right is not None
@@ -26,7 +26,7 @@ def photographs() -> tuple[np.ndarray, np.ndarray]:
 
 
 def moved_pair(by_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """A textured wall of 96x160 in BGR, each column x of the left one at x - by_px in the right."""
+    """Return a BGR pair of 96x160 with a textured wall at a disparity of by_px."""
     coarse = np.random.default_rng(0).integers(0, 256, (24, 64, 3), dtype=np.uint8)
     wall = cv2.resize(coarse, (256, 96), interpolation=cv2.INTER_CUBIC)
     return wall[:, 48 : 48 + 160], wall[:, 48 + by_px : 48 + by_px + 160]
@@ -47,7 +47,7 @@ def sgbm() -> cv2.StereoSGBM:
 
 
 def points_of(matcher: cv2.StereoMatcher | StereoMatcher) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What programs written for StereoSGBM do: disparity in px, the points it gives, and which are some."""
+    """Return disparity in px, points and the mask of valid pixels as programs for StereoSGBM do."""
     left, right = photographs()
     disparity = matcher.compute(left, right)
     assert disparity.dtype == np.int16
@@ -66,7 +66,7 @@ def test_a_program_for_sgbm_finds_the_same_points_through_it():
     assert abs(depths_m[0] - depths_m[1]) < 0.02 * depths_m[0]
 
 
-def test_what_is_known_is_the_estimate_times_16_and_the_rest_says_so():
+def test_valid_pixels_are_the_estimate_times_16_and_others_are_marked():
     left, right = photographs()
     pair = read_pair(TEXTURED / "left.png", TEXTURED / "right.png")
     estimate = match(Matcher(), pair, MatchOptions(range_px=(0, 64)))
@@ -78,7 +78,7 @@ def test_what_is_known_is_the_estimate_times_16_and_the_rest_says_so():
     assert (disparity[~known] == -16).all()
 
 
-def test_a_wall_beyond_the_range_is_not_known_and_one_within_it_is():
+def test_a_wall_is_valid_within_the_range_and_invalid_beyond_it():
     left, right = moved_pair(12)
     matcher = StereoMatcher(minDisparity=0, numDisparities=32)
     disparity = matcher.compute(left, right)
@@ -101,7 +101,7 @@ def test_grey_pictures_are_taken():
     assert abs(np.median(disparity[:, 40:]) - 12 * 16) <= 4
 
 
-def test_what_was_set_is_what_is_got():
+def test_getters_return_what_was_set():
     matcher = StereoMatcher(-8, 40)
     assert (matcher.getMinDisparity(), matcher.getNumDisparities()) == (-8, 40)
     matcher.setMinDisparity(3)
@@ -128,7 +128,7 @@ def test_the_widest_ranges_that_int16_holds_are_taken():
     assert StereoMatcher(-2046, 4093).getNumDisparities() == 4093
 
 
-def test_what_steers_sgbm_is_refused_by_its_name():
+def test_parameters_of_the_sgbm_algorithm_are_refused_by_name():
     with pytest.raises(TypeError, match="blockSize"):
         StereoMatcher(0, 64, blockSize=5)
 
@@ -138,6 +138,6 @@ def test_what_steers_sgbm_is_refused_by_its_name():
     ("picture", "found"),
     [(Image.new("RGB", (64, 64)), "got Image"), (np.zeros((64, 64), np.float32), "got float32")],
 )
-def test_what_cv2_would_not_read_is_refused(picture, found):
+def test_pictures_that_cv2_would_not_return_are_refused(picture, found):
     with pytest.raises(StereoweaveError, match=found):
         StereoMatcher(0, 64).compute(picture, picture)

@@ -21,7 +21,7 @@ def estimate_of(disparity_px, occluded=None):
 
 
 def pair_with(disparity_px, texture):
-    """A right picture, and a left one that shows at x what the right one shows at x - disparity."""
+    """Return a right image, and a left image that shows at x what the right one shows at x - disparity."""
     right = texture[:HEIGHT, :WIDTH]
     rows, columns = np.indices((HEIGHT, WIDTH), np.float32)
     left = cv2.remap(
@@ -31,13 +31,13 @@ def pair_with(disparity_px, texture):
 
 
 def ramp_px():
-    """Disparity of a slanted floor: 6 px on top, 12 px below."""
+    """Return the disparity of a slanted floor: 6 px at the top, 12 px at the bottom."""
     rows = np.linspace(6, 12, HEIGHT, dtype=np.float32)
     return np.repeat(rows[:, None], WIDTH, axis=1)
 
 
 def errors_px(found, truth_px):
-    # Away from the border, which mirrors.
+    # The border is excluded, because the image is mirrored beyond it.
     return np.abs(found.disparity_px - truth_px)[8:-8, 20:-8]
 
 
@@ -136,7 +136,7 @@ def test_no_threads_are_refused(texture):
         to_subpixel(left, right, estimate_of(ramp_px()), threads=0)
 
 
-def test_disparity_falls_below_zero_only_where_some_was_given_so(texture):
+def test_disparity_becomes_negative_only_if_the_input_is(texture):
     left, right = pair_with(np.full((HEIGHT, WIDTH), -0.4, np.float32), texture)
     given_px = np.full((HEIGHT, WIDTH), 0.1, np.float32)
     parallel = to_subpixel(left, right, estimate_of(given_px))

@@ -32,7 +32,7 @@ BOARD = (slice(40, 80), slice(90, 150))  # in the right view; the left one sees 
 
 @pytest.fixture
 def scene(rng):
-    """A board before a wall, both of soft noise: two photographs and the disparities of both views."""
+    """Return images and disparities of both views of a board in front of a wall, both of soft noise."""
     noise = rng.integers(0, 256, (2, 120, 260, 3), np.uint8)
     wall, board = (cv2.GaussianBlur(photo, (0, 0), 1.2) for photo in noise)
     left, right = wall[:, :240].copy(), wall[:, FAR_PX : FAR_PX + 240].copy()
@@ -45,13 +45,13 @@ def scene(rng):
 
 
 def smaller(disparity_px, times):
-    """What is found of it in a copy so many times smaller, where edges are blurred."""
+    """Return the disparity found in a copy that is `times` smaller, with blurred edges."""
     size = disparity_px.shape[1] // times, disparity_px.shape[0] // times
     return cv2.resize(disparity_px, size, interpolation=cv2.INTER_AREA) / times
 
 
 def shifted_noise(rng, disparity_px, size=(96, 160)):
-    """A pair of soft noise that is everywhere at one disparity."""
+    """Return a pair of soft noise with the same disparity everywhere."""
     height, width = size
     noise = rng.integers(0, 256, (height, width + abs(disparity_px), 3), np.uint8)
     wide = cv2.GaussianBlur(noise, (0, 0), 1.2)
@@ -78,13 +78,13 @@ def test_disparities_behind_the_plane_of_convergence_are_enlarged_alike(rng):
     assert abs(np.median(found.disparity_px) + 18) < 0.15
 
 
-def test_parallel_cameras_are_given_nothing_below_zero():
+def test_parallel_cameras_get_no_negative_disparities():
     photo = np.full((96, 160, 3), 200, np.uint8)
     flat_px = np.zeros((48, 80))
     assert enlarge(photo, photo, estimate_of(flat_px, flat_px)).disparity_px.min() == 0
 
 
-def test_errors_of_the_smaller_copies_are_mended_and_edges_become_those_of_the_photographs(scene):
+def test_errors_of_the_smaller_pair_are_corrected_and_edges_follow_the_images(scene):
     left, right, *true_px = scene
     left_px, right_px = (cv2.blur(smaller(px, 3), (3, 3)) + 0.5 for px in true_px)  # blurred, 1.5 px too near
     found = enlarge(left, right, estimate_of(left_px, right_px))
@@ -92,13 +92,13 @@ def test_errors_of_the_smaller_copies_are_mended_and_edges_become_those_of_the_p
     seen = np.s_[:, 20:]
     assert bad_percent(plain_px[seen], true_px[0][seen], 1) > 95
     assert bad_percent(found.disparity_px[seen], true_px[0][seen], 1) < 2
-    # The board's rim itself is within a pixel of where it is.
+    # The board's edge is within a pixel of its true position.
     found_board = found.disparity_px > (FAR_PX + NEAR_PX) / 2
     board = true_px[0] > (FAR_PX + NEAR_PX) / 2
     assert (found_board ^ board)[:, 20:].sum() < 2 * (40 + 60)
 
 
-def test_strips_put_together_are_the_whole(scene, monkeypatch):
+def test_blended_strips_equal_the_whole(scene, monkeypatch):
     left, right, *true_px = scene
     given = estimate_of(*(smaller(px, 4) for px in true_px))
     whole = enlarge(left, right, given)
@@ -117,21 +117,21 @@ def test_a_plain_picture_keeps_what_the_smaller_ones_showed():
     np.testing.assert_allclose(found.disparity_px, expected_px, atol=2)
 
 
-def test_confidence_stays_where_the_photographs_bear_it_out_and_falls_where_they_do_not(rng):
+def test_confidence_is_kept_where_the_images_confirm_it_and_lowered_elsewhere(rng):
     left, right = shifted_noise(rng, 18)
     found = enlarge(left, right, estimate_of(*[np.full((48, 80), 9.0)] * 2, confidence=0.8))
     inner = np.s_[8:-8, 40:-40]
     np.testing.assert_allclose(found.confidence[inner], 0.8, atol=1e-6)
-    # 7 px off: the photographs show another disparity, and the prior's confidence was not for that.
+    # The prior is off by 7 px: the images show another disparity, to which its confidence does not apply.
     found = enlarge(left, right, estimate_of(*[np.full((48, 80), 12.5)] * 2, confidence=0.8))
     assert np.median(found.confidence[inner]) == 0.5
-    # Nothing is alike: the views agree by chance alone.
+    # Nothing in the images matches: the views agree only by chance.
     other = rng.integers(0, 256, left.shape, np.uint8)
     found = enlarge(left, other, estimate_of(*[np.full((48, 80), 9.0)] * 2, confidence=0.8))
     assert np.isclose(found.confidence[inner], 0.8 * 0.85).mean() > 0.2
 
 
-def test_what_has_no_match_in_the_picture_is_occluded(rng):
+def test_pixels_without_a_match_in_the_picture_are_occluded(rng):
     left, right = shifted_noise(rng, 18)
     flat_px = np.full((48, 80), 9.0)
     occluded = enlarge(left, right, estimate_of(flat_px, flat_px)).occluded
@@ -158,7 +158,7 @@ def test_bands_are_around_the_surfaces_that_the_smaller_copy_shows_near_a_pixel(
     smaller_px[:, 15:] = 20
     grey = np.zeros((40, 60), np.uint8)
     first = enlarging._StripView(grey, grey, smaller_px).first_candidates(slice(10, 11))[0]
-    # Within two of its pixels of the edge between columns 14 and 15, which are 28..29 and 30..31, both count.
+    # Within two small pixels of the edge between columns 14 (28..29) and 15 (30..31), both surfaces count.
     np.testing.assert_array_equal(first[:26], [[0, 0]] * 26)
     np.testing.assert_array_equal(first[26:34], [[0, 32]] * 8)
     np.testing.assert_array_equal(first[34:], [[32, 32]] * 26)
@@ -171,7 +171,7 @@ def test_agreeing_and_filling_are_what_the_plain_loops_do(rng):
     np.testing.assert_array_equal(agreed, plain_agreed(found_px, other_px))
     known, gap = rng.random((2, 30, 40)) < 0.3, rng.random((30, 40)) < 0.8
     known = known[0]
-    known[3] = False  # a row of which nothing is known stays
+    known[3] = False  # a row without known pixels does not change
     farthest_px = rng.uniform(-12, 4, found_px.shape).astype(np.float32)
     nearest_px = farthest_px + 3
     expected_px = plain_filled(known, gap, farthest_px, nearest_px, found_px)
@@ -179,7 +179,7 @@ def test_agreeing_and_filling_are_what_the_plain_loops_do(rng):
     np.testing.assert_array_equal(found_px, expected_px)
 
 
-def test_what_a_nearer_surface_hides_gets_the_disparity_of_what_is_behind():
+def test_pixels_behind_a_nearer_surface_get_the_background_disparity():
     known = np.array([[True, True, False, False, False, True, True]])
     gap = np.array([[False, False, True, True, False, False, False]])
     disparity_px = np.array([[3, 4, 7, 7, 7, 12, 12]], np.float32)

@@ -33,7 +33,7 @@ def pair():
 
 
 def assert_eyes(opened, pair, tolerance=0.0):
-    """Either eye is its own picture, or on the mean of its values at most `tolerance` levels away."""
+    """Require both views to equal the pair's images, up to a mean difference of `tolerance` levels."""
     for found, taken in ((opened.pair.left, pair.left), (opened.pair.right, pair.right)):
         assert found.shape == taken.shape
         assert np.abs(found.astype(int) - taken).mean() <= tolerance
@@ -72,7 +72,7 @@ def write_mpo(path, left, right, **options):
 
 
 def write_jps(path, image, flags, layout=2, kind=1):
-    # JPEG's marker APP3 and its length; the name; the count of four bytes: separation, flags, layout, type.
+    # JPEG's marker APP3 and its length; the name; the number of bytes, four: separation, flags, layout, type.
     segment = b"\xff\xe3\x00\x12_JPSJPS_\x00\x04" + bytes([0, flags, layout, kind]) + b"\0\0"
     Image.fromarray(image).save(path, "JPEG", extra=segment, **FINE)
     return path
@@ -123,7 +123,7 @@ def test_values_that_no_photograph_has_are_refused_with_the_name(tmp_path, pair,
 @pytest.mark.parametrize("count", [0, 3])
 def test_one_or_two_files_are_expected(tmp_path, count):
     message = refusal(*[tmp_path / "a.png"] * count, kind=StereoweaveError)
-    assert f"one or two pictures, found {count}" in message
+    assert f"one that holds both views, found {count}" in message
 
 
 def test_a_format_is_for_one_file_and_one_of_the_formats(tmp_path):
