@@ -107,7 +107,9 @@ def test_plain_pictures_and_two_scenes_are_refused(example):
     plain = np.full((100, 200, 3), 90, np.uint8)
     other = paint_collage(77, 0, 2, *example.left.shape[:2]).right
     for pair in (StereoPair(left=plain, right=plain), StereoPair(left=example.left, right=other)):
-        with pytest.raises(StereoweaveError, match=r"^rectify: expected at least 40 points .*, found \d+ of"):
+        with pytest.raises(
+            StereoweaveError, match=r"^rectify: expected at least 40 .* matches .*, found \d+ of"
+        ):
             rectify_by_features(pair)
 
 
