@@ -314,7 +314,8 @@ def test_four_coefficients_are_a_pinholes_unless_the_file_says_fisheye(tmp_path)
     guessed = read_rig(stored(tmp_path, four))
     assert not guessed.left.fisheye
     assert str(guessed.notes[-1]) == (
-        "a pinhole with k1 k2 p1 p2 is assumed"distortion_model: fisheye if that is wrong"
+        "the calibration does not state its lens model: a pinhole with k1 k2 p1 p2 is assumed; "
+        "add the entry distortion_model: fisheye if that is wrong"
     )
     for said in ("distortion_model: fisheye", "fisheye_model: 1", "camera_model: Kannala-Brandt"):
         assert read_rig(stored(tmp_path, f"{four}{said}\n")).left.fisheye

@@ -96,6 +96,6 @@ def test_a_picture_whose_head_cannot_be_read_in_time_is_refused(processes):
 
 def test_a_network_that_cannot_be_loaded_is_said_before_any_order(tmp_path):
     processes = ReplicaProcesses(partial(load_answerer, Backend(model="none.onnx")), tmp_path / "files")
-    with pytest.raises(MatcherError, match=r"none\.onnx: expected an ONNX matcher"):
+    with pytest.raises(MatcherError, match=r"none\.onnx: expected an ONNX matcher file"):
         processes.warm_up()
     processes.close()
