@@ -1,4 +1,4 @@
-"""The networks by their names in recipes."""
+"""Registry of the networks by their names in recipes."""
 
 from collections.abc import Callable
 from functools import partial
@@ -28,10 +28,12 @@ MODELS: dict[str, Callable[..., Any]] = {
 
 @runtime_checkable
 class CodeNetwork(Protocol):
-    """The paper's network and its rivals: images [B, 3, H, W] in 0..1 of any size to maps [B, 1, H, W].
+    """Interface of the paper's network and its rivals.
+
+    They map images [B, 3, H, W] in 0..1, of any size, to maps [B, 1, H, W].
 
     Attributes:
-        predicts: Code of a `DepthCurve`, or disparity in pixels.
+        predicts: Whether a map holds the code of a `DepthCurve` or disparity in pixels.
         output_weights: Weight of each of `outputs` in the loss.
     """
 
@@ -39,18 +41,18 @@ class CodeNetwork(Protocol):
     output_weights: tuple[float, ...]
 
     def outputs(self, left: Tensor, right: Tensor) -> tuple[Tensor, ...]:
-        """All supervised outputs; the last one is the estimate."""
+        """Return all supervised outputs; the last one is the estimate."""
         ...
 
     def __call__(self, left: Tensor, right: Tensor) -> Tensor:
-        """The estimate."""
+        """Return the estimate."""
         ...
 
     def eval(self) -> Any: ...
 
 
 def build_network(recipe: Recipe) -> Any:
-    """The network of a recipe with random weights; FormatError for an unknown name."""
+    """Build the network of a recipe with random weights. Raises FormatError for an unknown name."""
     if recipe.model not in MODELS:
         raise FormatError(f"{recipe.name}: model = {recipe.model!r}, expected {' or '.join(MODELS)}")
     if recipe.model == "psmnet":

@@ -1,7 +1,7 @@
 """DenseMapNet: R. Atienza, "Fast Disparity Estimation Using Dense Networks", ICRA 2018.
 
-The predecessor of the paper's network: the same matching of both views stacked and pooled by 8, with the
-result upsampled by 8 in one step. Shared parts are in layers.py. The layers match the published weights
+It is the predecessor of the paper's network. Both match the two views stacked and pooled by 8; DenseMapNet
+upsamples the result by 8 in one step. Shared parts are in layers.py. The layers match the published weights
 (github.com/roatienza/densemapnet, MIT licence), which `load_keras` reads.
 
 Deviation: images whose sides are not multiples of 8 are padded below and on the right by repeating border
@@ -63,7 +63,7 @@ class DenseMapNet(nn.Module):
     def outputs(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> tuple[Float[Tensor, "b 1 h w"]]:
-        """All supervised outputs: the code."""
+        """Return the only supervised output, the code."""
         height, width = left.shape[2:]
         left, right = (pad_to_multiple(view, self.multiple_of) for view in (left, right))
         if self.channels == 1:
@@ -75,7 +75,9 @@ class DenseMapNet(nn.Module):
     def forward(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> Float[Tensor, "b 1 h w"]:
-        """The left view's code [B, 1, H, W] in 0..1, near is high; published networks: disparity / d_max.
+        """Return the left view's code [B, 1, H, W] in 0..1; near is high.
+
+        The code of the published networks is disparity / d_max.
 
         Args:
             left: Left view [B, 3, H, W], RGB in 0..1, of any size.
@@ -85,9 +87,9 @@ class DenseMapNet(nn.Module):
 
 
 def load_keras(path: str | Path) -> DenseMapNet:
-    """Load a published network from a Keras HDF5 weight file, in eval mode; grey if the file is.
+    """Load a published network, for RGB or grey, from a Keras HDF5 weight file. Returns it in eval mode.
 
-    Its code is disparity / d_max, but d_max, the largest disparity in training, is not in the file.
+    Its code is disparity / d_max. The file does not contain d_max, the largest disparity in training.
 
     Raises:
         FormatError: The file is missing, is not HDF5, or its layers or shapes are not DenseMapNet's.
@@ -102,16 +104,16 @@ def load_keras(path: str | Path) -> DenseMapNet:
             theirs = found.pop(name)
             if theirs.shape != values.shape:
                 raise FormatError(
-                    f"{path}: expected {name} of shape {tuple(values.shape)}, found {theirs.shape}"
+                    f"{path}: expected {name} of shape {tuple(values.shape)}, found shape {theirs.shape}"
                 )
             values.copy_(torch.from_numpy(theirs))
     if found:
-        raise FormatError(f"{path}: expected only DenseMapNet's weights, found also {min(found)}")
+        raise FormatError(f"{path}: expected only DenseMapNet's weights, also found {min(found)}")
     return network.eval()
 
 
 def _read_hdf5(path: str | Path) -> dict[str, np.ndarray]:
-    """Read every array of the file, by full name."""
+    """Read all arrays of the file, keyed by full name."""
     import h5py  # type: ignore[import-untyped]
 
     arrays = {}
@@ -124,17 +126,17 @@ def _read_hdf5(path: str | Path) -> dict[str, np.ndarray]:
         with h5py.File(path) as file:
             file.visititems(keep)
     except FileNotFoundError as error:
-        raise FormatError(f"{path}: expected Keras weights as HDF5, found no such file") from error
+        raise FormatError(f"{path}: expected Keras weights in HDF5, found no such file") from error
     except (OSError, KeyError, RuntimeError, ValueError) as error:
-        # HDF5's own message is long and spans several lines; it stays with the cause.
-        raise FormatError(f"{path}: expected Keras weights as HDF5, found something else") from error
+        # HDF5's own message is long and spans several lines; it remains in the chained exception.
+        raise FormatError(f"{path}: expected Keras weights in HDF5, found something else") from error
     return arrays
 
 
 def _iterate_keras_tensors(network: nn.Module) -> Iterator[tuple[str, Tensor]]:
-    """Yield every tensor of the network under its Keras name, with axes in Keras's order.
+    """Yield each tensor of the network with its Keras name and with axes in Keras's order.
 
-    Keras numbers the layers of a kind in the order of construction, as does `modules()`.
+    Keras numbers the layers of each type in the order of construction, which is the order of `modules()`.
     """
     count = Counter[str]()
     for layer in network.modules():

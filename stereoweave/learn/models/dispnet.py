@@ -3,8 +3,9 @@
 N. Mayer et al., A Large Dataset to Train Convolutional Networks for Disparity, Optical Flow, and Scene Flow
 Estimation, CVPR 2016, arXiv:1512.02134.
 
-Parameters: kernel area * inputs * outputs + outputs per layer, channels from Table 1 of the paper. conv1 and
-conv2 process both views; 41 candidates and the 64 channels of conv_redir make the 105 inputs of conv3a:
+conv1 and conv2 process both views. The 105 inputs of conv3a are 41 candidates and the 64 channels of
+conv_redir. Each layer has kernel area * inputs * outputs + outputs parameters, with channels from Table 1 of
+the paper:
 
     conv1     49 *    3 *   64 +   64 =     9,472
     conv2     25 *   64 *  128 +  128 =   204,928
@@ -28,12 +29,12 @@ conv2 process both views; 41 candidates and the 64 channels of conv_redir make t
 Deviations, and choices where the paper is silent:
 
 - The paper starts with a loss on pr6 alone and shifts the weight to finer outputs during training. Here the
-  weights are constant and halve with each coarser output: every output learns from the first step, the final
-  one weighs as much as all others together, and no schedule for this network alone is needed.
-- A prediction is upsampled bilinearly for the next iconv; the table names no layer for it.
-- A leaky ReLU, slope 0.1, follows every convolution except the predictions.
+  weights are constant and halve with each coarser output. Every output then learns from the first step, the
+  final one weighs about as much as all others together, and the network needs no schedule of its own.
+- A prediction is upsampled bilinearly for the next iconv, because the table names no layer for this step.
+- A leaky ReLU with a slope of 0.1 follows every convolution except the predictions.
 - Colours are scaled to -1..1.
-- Images are padded to multiples of 64, the stride of conv6, and the result is cropped to their size.
+- Images are padded to multiples of 64, the stride of conv6, and the result is cropped to the original size.
 """
 
 from typing import ClassVar, Literal
@@ -46,26 +47,26 @@ from torch import Tensor, nn
 from stereoweave.learn.models.layers import correlation_volume, pad_to_multiple
 
 SLOPE = 0.1
-# 0 to 40 px at 1/4 resolution: 160 px of the images.
+# Candidates of 0 to 40 px at 1/4 resolution, which are 0 to 160 px of the images.
 LEVELS = 41
 
 
 def convolution(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Sequential:
-    """Convolution and leaky ReLU, at 1 / `stride` of the input's resolution."""
+    """Build a convolution and a leaky ReLU, at 1 / `stride` of the input's resolution."""
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, kernel, stride, padding=kernel // 2), nn.LeakyReLU(SLOPE, inplace=True)
     )
 
 
 def prediction(inputs: int) -> nn.Conv2d:
-    """Convolution from `inputs` channels to disparity in pixels of the full resolution."""
+    """Build a convolution from `inputs` channels to disparity in full-resolution pixels."""
     return nn.Conv2d(inputs, 1, 3, padding=1)
 
 
 def mean_correlation(
     first: Float[Tensor, "b c h w"], second: Float[Tensor, "b c h w"]
 ) -> Float[Tensor, "b 41 h w"]:
-    """Mean product of the channels at column x of `first` and column x - d of `second`, d = 0 .. 40."""
+    """Correlate column x of `first` with column x - d of `second`, d = 0 .. 40, as a mean over channels."""
     return correlation_volume(first, second, LEVELS) / first.shape[1]
 
 
@@ -77,7 +78,8 @@ def enlarge(map_: Float[Tensor, "b c h w"], scale: int) -> Float[Tensor, "b c h2
 class Expansion(nn.Module):
     """One decoder step to twice the resolution.
 
-    Layers: upconv; iconv of its output, the current disparity and the encoder's maps; prediction.
+    upconv upsamples the maps, iconv joins its output with the current disparity and the encoder's maps, and
+    prediction returns the new disparity.
     """
 
     def __init__(self, inputs: int, skipped: int, outputs: int) -> None:
@@ -94,16 +96,16 @@ class Expansion(nn.Module):
         disparity_px: Float[Tensor, "b 1 h w"],
         skipped: Float[Tensor, "b c2 h2 w2"],
     ) -> tuple[Float[Tensor, "b c3 h2 w2"], Float[Tensor, "b 1 h2 w2"]]:
-        """Maps and disparity at twice the resolution of `maps`; disparity in full-resolution pixels."""
+        """Return maps and disparity (in full-resolution pixels) at twice the resolution of `maps`."""
         maps = self.iconv(torch.cat([self.upconv(maps), enlarge(disparity_px, 2), skipped], 1))
         return maps, self.prediction(maps)
 
 
 class DispNet(nn.Module):
-    """Disparity of the left view by correlation over 160 px. 42,174,022 parameters.
+    """Network that estimates the left view's disparity by correlation over 160 px.
 
-    38.17 G multiply-adds at 640x480, padded to 640x512: convolutions, and the correlation of all columns with
-    all columns; upsampling and activations are not counted.
+    42,174,022 parameters; 38.17 G multiply-adds at 640x480, padded to 640x512. The count covers convolutions
+    and the correlation of all columns with all columns, but not upsampling and activations.
     """
 
     multiple_of = 64
@@ -135,7 +137,7 @@ class DispNet(nn.Module):
     def predictions(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> list[Float[Tensor, "b 1 _ _"]]:
-        """Disparities pr6 to pr1 at 1/64 to 1/2 of the padded images' size, in full-resolution pixels."""
+        """Return disparities pr6 to pr1, in full-resolution pixels, at 1/64 to 1/2 of the padded size."""
         views = pad_to_multiple(torch.cat([left, right]), self.multiple_of)
         half = self.conv1(views * 2 - 1)
         batch = left.shape[0]  # not chunk(), which would fix the batch size on export
@@ -156,7 +158,7 @@ class DispNet(nn.Module):
     def outputs(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> tuple[Float[Tensor, "b 1 h w"], ...]:
-        """Disparities pr6 to pr1 in pixels, upsampled to full resolution; the last one is the estimate."""
+        """Return disparities pr6 to pr1 in pixels at full resolution; the last one is the estimate."""
         height, width = left.shape[2:]
         return tuple(
             enlarge(disparity_px.float(), 64 >> level)[..., :height, :width]
@@ -166,16 +168,16 @@ class DispNet(nn.Module):
     def forward(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> Float[Tensor, "b 1 h w"]:
-        """Disparity of the left view in pixels, from RGB images in 0..1."""
+        """Return the disparity of the left view in pixels, from RGB images in 0..1."""
         return self.outputs(left, right)[-1]
 
 
 def _initialise(layer: nn.Module) -> None:
-    """Draw normal weights of variance 2 / (1 + SLOPE^2) / terms (He et al. 2015), `terms` per output.
+    """Draw normal weights of variance 2 / (1 + SLOPE^2) / terms (He et al. 2015).
 
-    Without batch norm the initialisation alone preserves the signal's scale through 16 layers; PyTorch's
-    default loses about two thirds of it per layer. A transposed convolution's output sums 1 / stride^2 of
-    its kernel.
+    `terms` is the number of products in the sum of one output; a transposed convolution uses 1 / stride^2 of
+    its kernel per output. Without batch norm, the initialisation alone preserves the signal's scale through
+    16 layers. PyTorch's default loses about two thirds of it per layer.
     """
     if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
         kernel, stride = layer.kernel_size[0], layer.stride[0] if layer.transposed else 1

@@ -1,14 +1,14 @@
 """FastDepthNet: the network of "Fast Depth Estimation for View Synthesis", section III-A.
 
-The matching of DenseMapNet (Atienza, "Fast Disparity Estimation Using Dense Networks", ICRA 2018) with a
-decoder in steps of two, with a skip connection from the left view at each step. Shared parts are in
-layers.py.
+It combines the matching of DenseMapNet (Atienza, "Fast Disparity Estimation Using Dense Networks", ICRA 2018)
+with a decoder that upsamples in steps of two, each with a skip connection from the left view. Shared parts
+are in layers.py.
 
-The paper gives the structure. Filter counts, dropout of single values and the constants of batch norm are
-from the published implementations, and add up to their 314,722 parameters. Where neither specifies:
+The paper gives the structure. Filter counts, elementwise dropout and the constants of batch norm are from the
+published implementations, and the parameters add up to the same 314,722. Choices where both are silent:
 
 - Upsampling is by nearest neighbour, Keras's default.
-- Initial weights are Glorot's and biases 0, Keras's defaults.
+- Weights are initialised by Glorot's method and biases to 0, Keras's defaults.
 - Images whose sides are not multiples of 8 are padded below and on the right by repeating border pixels,
   and the result is cropped. Both views are padded alike and keep their origin, so disparities do not change.
 """
@@ -35,8 +35,8 @@ class FastDepthNet(nn.Module):
     314,722 parameters; 7.39 G multiply-adds at 640x480.
 
     Args:
-        skips: Whether the decoder's steps see the left view's pooled features; False (301,858 parameters)
-            tests the paper's claim for them.
+        skips: Whether the decoder's steps receive the left view's pooled features. The variant without them
+            (301,858 parameters) tests the paper's claim about skip connections.
     """
 
     multiple_of = 8
@@ -56,7 +56,7 @@ class FastDepthNet(nn.Module):
     def outputs(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> tuple[Float[Tensor, "b 1 h w"]]:
-        """All supervised outputs: the code."""
+        """Return the only supervised output, the code."""
         height, width = left.shape[2:]
         left, right = (pad_to_multiple(view, self.multiple_of) for view in (left, right))
         matches, features, left_channel = self.matching(left, right)
@@ -68,7 +68,7 @@ class FastDepthNet(nn.Module):
     def forward(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> Float[Tensor, "b 1 h w"]:
-        """The left view's code [B, 1, H, W] in 0..1, near is high; `DepthCurve` decodes it.
+        """Return the left view's code [B, 1, H, W] in 0..1, for `DepthCurve` to decode; near is high.
 
         Args:
             left: Left view [B, 3, H, W], RGB in 0..1, of any size.

@@ -9,11 +9,12 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
-# Column blocks of a correlation. At 1/4 of images whose sides are multiples of 16, four divide every width:
-# an exported graph needs no padding and has the same number of matrix products for every width.
+# Number of column blocks in a correlation. At 1/4 of images whose sides are multiples of 16, every width is a
+# multiple of four: an exported graph needs no padding and has the same number of matrix products for any
+# width.
 _BLOCKS = 4
-# Weight of a rejected neighbour: avoids division by zero if all are rejected, and still averages neighbours
-# only.
+# Weight of a rejected neighbour. Avoids division by zero if all neighbours are rejected; the result is then
+# their mean.
 _LEAST_SHARE = 1e-4
 
 
@@ -31,10 +32,10 @@ class ConvBlock(nn.Sequential):
 
 
 class Halve(nn.Sequential):
-    """ConvBlock at half the resolution.
+    """Convolution, batch norm and ReLU at half the input's resolution.
 
-    The kernel is even, so that an output pixel is centred on the input pixels that it covers. A network that
-    mirrors its feature maps needs a grid that is its own mirror image.
+    The kernel size is even, so that an output pixel is centred on the input pixels that it covers. A network
+    that mirrors its feature maps needs such a symmetric grid.
     """
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 2) -> None:
@@ -63,7 +64,7 @@ Block = TypeVar("Block", Residual, nn.Conv2d)
 
 
 def zero_initialise(block: Block) -> Block:
-    """Set the block's last weights to zero, so that a trained network can grow by it."""
+    """Set the block's last layer to zero, so that adding the block to a trained network changes nothing."""
     last = block.second[1] if isinstance(block, Residual) else block
     for parameter in last.parameters():
         nn.init.zeros_(parameter)
@@ -71,10 +72,12 @@ def zero_initialise(block: Block) -> Block:
 
 
 class DilatedDense(nn.Module):
-    """The paper's densely connected blocks: each narrows all previous maps, dilates, and appends its own.
+    """The paper's densely connected blocks of dilated convolutions.
 
-    Deviation: convolution, norm, ReLU (the paper: norm, ReLU, convolution), so that every norm folds into its
-    convolution on export.
+    Each block narrows all previous maps, applies a dilated convolution, and appends the result.
+
+    Deviation: norm and ReLU follow each convolution, while in the paper they precede it. Every norm can then
+    be folded into its convolution on export.
     """
 
     def __init__(self, inputs: int, narrow: int, growth: int, dilations: tuple[int, ...]) -> None:
@@ -102,10 +105,10 @@ def mirror(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
 def correlation_volume(
     first: Float[Tensor, "b c h w"], second: Float[Tensor, "b c h w"], levels: int
 ) -> Float[Tensor, "b d h w"]:
-    """Correlation of column x of `first` with column x - d of `second`, d = 0 .. levels - 1; 0 outside.
+    """Correlate column x of `first` with column x - d of `second`, d = 0 .. levels - 1; 0 outside.
 
-    Each matrix product compares a quarter of a row's columns with all columns they can match: at 640x480
-    half the work of comparing all with all. Plain reference: `correlation_volume_plain` in
+    Each matrix product compares a quarter of a row's columns with all columns that they can match. At 640x480
+    this is half the work of comparing all with all. Plain reference: `correlation_volume_plain` in
     tests/learn/models/test_layers.py.
     """
     width = first.shape[3]
@@ -113,7 +116,7 @@ def correlation_volume(
         return correlation_volume(F.pad(first, (0, behind)), F.pad(second, (0, behind)), levels)[..., :width]
     block = width // _BLOCKS
     columns = first.permute(0, 2, 3, 1)
-    # Column x - d is column x - d + levels - 1 of these.
+    # Column x - d of `second` is column x - d + levels - 1 of `others`.
     others = F.pad(second, (levels - 1, 0)).permute(0, 2, 1, 3)
     starts = [i * block for i in range(_BLOCKS)]
     products = [columns[:, :, x : x + block] @ others[..., x : x + block + levels - 1] for x in starts]
@@ -122,9 +125,9 @@ def correlation_volume(
 
 
 def _diagonals(products: Float[Tensor, "b h n m"], levels: int) -> Float[Tensor, "b h n d"]:
-    """products[..., i, i + e] at [..., i, e], for e = 0 .. levels - 1 = m - n.
+    """Move products[..., i, i + e] to [..., i, e], for e = 0 .. levels - 1 = m - n.
 
-    In rows that are one element longer, the diagonals become columns.
+    Reading the same elements in rows that are one element longer turns diagonals into columns.
     """
     rows = products.shape[2]
     longer = torch.unflatten(F.pad(products.flatten(2), (0, rows)), 2, (rows, rows + levels))
@@ -132,18 +135,18 @@ def _diagonals(products: Float[Tensor, "b h n m"], levels: int) -> Float[Tensor,
 
 
 def local_soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
-    """Expected level under a softmax over levels near the best one.
+    """Return the expected level under a softmax over the levels near the best one.
 
     The window keeps a distant second candidate from pulling the mean off the surface. It first covers 2
-    levels on each side of the best one, then moves to the mean found there, fading out over 3 levels.
-    Repeated three times, it converges to the same place even where rounding decides which of two levels is
-    best.
+    levels on each side of the best one. Then it is centred on the mean three times, with weights that fade
+    out over 3 levels. The result converges to the same place even where rounding decides which of two levels
+    is best.
     """
     best = logits.detach().argmax(1, keepdim=True)
     near, reach = 2, 3
     farthest = near + reach
     steps = torch.arange(-farthest, farthest + 1, device=logits.device).view(1, -1, 1, 1)
-    # Levels beyond the volume's ends are far less likely than any inside.
+    # Levels beyond the ends of the volume are far less likely than any level inside it.
     padded = F.pad(logits, (0, 0, 0, 0, farthest, farthest), value=-1e4)
     around = padded.gather(1, best + steps + farthest)
     likelihood = (around - around.amax(1, keepdim=True)).exp()
@@ -155,9 +158,9 @@ def local_soft_argmax(logits: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h 
 
 
 def expected_step(logits: Float[Tensor, "b k h w"]) -> Float[Tensor, "b 1 h w"]:
-    """Expectation of -radius .. radius under a softmax over channels, k = 2 * radius + 1.
+    """Return the expectation of -radius .. radius under a softmax over channels, k = 2 * radius + 1.
 
-    Written out because ONNX Runtime's softmax over channels is ten times slower.
+    The softmax is written out, because ONNX Runtime's own softmax over channels is ten times slower.
     """
     radius = logits.shape[1] // 2
     steps = torch.arange(-radius, radius + 1, device=logits.device).view(1, -1, 1, 1)
@@ -171,14 +174,15 @@ def correlate_nearby(
     disparity: Float[Tensor, "b 1 h w"],
     radius: int,
 ) -> Float[Tensor, "b k h w"]:
-    """Correlation of column x of `first` with column x - disparity - k of `second`, k = -radius .. radius.
+    """Correlate column x of `first` with column x - disparity - k of `second`, k = -radius .. radius.
 
-    Linearly interpolated between columns; columns outside the map take the border's value. One offset at a
-    time, so that gathered features stay in the processor's cache until they are summed.
+    The correlation is linearly interpolated between columns; columns outside the map take the border's value.
+    Offsets are processed one at a time, which keeps gathered features in the processor's cache until they are
+    summed.
     """
     batch, channels, height, width = first.shape
     whole = disparity.detach().floor()
-    # float32: bfloat16 cannot count a map's columns.
+    # In float32, because bfloat16 cannot represent the index of every column.
     columns = torch.arange(width, dtype=torch.float32, device=first.device) - whole
     left, pixels = _pixels(first), _pixels(second)
     products = []
@@ -195,11 +199,11 @@ def correlate_warped(
     disparity: Float[Tensor, "b 1 h w"],
     radius: int,
 ) -> Float[Tensor, "b k h w"]:
-    """Correlation of column x of `first` with column x - k of the warped `second`, k = -radius .. radius.
+    """Correlate column x of `first` with column x - k of the warped `second`, k = -radius .. radius.
 
-    `disparity` warps it. On smooth surfaces this equals `correlate_nearby` and costs less: two columns per
-    pixel are gathered for any radius. Columns outside the map take the border's value; outside the warped
-    map the correlation is 0.
+    `second` is warped by `disparity`. On smooth surfaces the result equals that of `correlate_nearby` at a
+    lower cost, because only two columns per pixel are gathered for any radius. Columns outside the map take
+    the border's value; outside the warped map the correlation is 0.
     """
     batch, channels, height, width = first.shape
     columns = torch.arange(width, dtype=torch.float32, device=first.device) - disparity.detach()
@@ -218,7 +222,7 @@ def correlate_warped(
 def sample_at_match(
     other: Float[Tensor, "b 1 h w"], disparity: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b 1 h w"]:
-    """The other view's map at column x - disparity, linearly interpolated; the border is replicated."""
+    """Sample the other view's map at column x - disparity, linearly interpolated with a replicated border."""
     width = other.shape[3]
     columns = torch.arange(width, dtype=torch.float32, device=other.device) - disparity.detach()
     columns = columns.clamp(0, width - 1)
@@ -231,7 +235,7 @@ def sample_at_match(
 def gather_neighbours(
     x: Float[Tensor, "b 1 h w"], offsets: Sequence[tuple[int, int]]
 ) -> Float[Tensor, "b k h w"]:
-    """The map's values at (row, column) offsets from each pixel; the border is replicated."""
+    """Return the map's values at (row, column) offsets from each pixel; the border is replicated."""
     height, width = x.shape[2:]
     reach = max(abs(side) for offset in offsets for side in offset)
     around = F.pad(x, (reach, reach, reach, reach), mode="replicate")
@@ -241,12 +245,12 @@ def gather_neighbours(
 
 
 def _pixels(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "n c"]:
-    """Features as one row per pixel, so that a lookup is one contiguous copy."""
+    """Return features with one row per pixel, so that a lookup is one contiguous copy."""
     return x.permute(0, 2, 3, 1).reshape(-1, x.shape[1])
 
 
 def _places(columns: Float[Tensor, "b 1 h w"]) -> Int64[Tensor, " n"]:
-    """Row indices in `_pixels` of these integer columns, clamped to their own line and image."""
+    """Return the row indices in `_pixels` of these integer columns, clamped to their own image row."""
     batch, _, height, width = columns.shape
     lines = torch.arange(batch * height, device=columns.device).view(batch, 1, height, 1)
     # Clamped as integers, so that a NaN disparity gives a NaN loss instead of an error here.
@@ -258,11 +262,12 @@ def upsample_convex(
 ) -> Float[Tensor, "b 1 h2 w2"]:
     """Upsample by two: each new pixel is a convex combination of old ones (RAFT, Teed & Deng 2020).
 
-    `weights` are logits per old and new pixel: [B, 9 * 4, H, W] combines the 3x3 surrounding old pixels,
-    [B, 4 * 4, H, W] the 2x2 whose centres enclose the new pixel. The combination can place an edge anywhere
-    between two old pixels without values between its two sides.
+    `weights` holds one logit per old and new pixel: [B, 9 * 4, H, W] combines the surrounding 3x3 old pixels,
+    [B, 4 * 4, H, W] the 2x2 old pixels whose centres enclose the new one. The combination can place a sharp
+    edge anywhere between two old pixels.
 
-    Deviation: normalised sigmoids; RAFT's softmax costs more in ONNX Runtime than all convolutions.
+    Deviation: the weights are normalised sigmoids, because RAFT's softmax takes longer in ONNX Runtime than
+    all convolutions.
     """
     neighbours, logits = _neighbours(x, weights)
     shares = logits.sigmoid() + _LEAST_SHARE
@@ -272,22 +277,23 @@ def upsample_convex(
 def upsample_to_a_side(
     x: Float[Tensor, "b 1 h w"], weights: Float[Tensor, "b k h w"], step: float = 2.0
 ) -> Float[Tensor, "b 1 h2 w2"]:
-    """Like `upsample_convex`, but a mixture of two surfaces snaps to the one with the larger share.
+    """Upsample like `upsample_convex`, but snap a mixture of two surfaces to the one with the larger share.
 
-    The neighbours are split at the mixture; they are two surfaces if their means are more than `step` apart.
-    The mean of two surfaces lies on neither and would be a flying pixel. All thresholds are soft, so that
-    rounding errors cannot flip the result: a share of three quarters snaps fully. Not for training: the
-    losing side gets hardly any gradient.
+    The neighbours are split at the mixture into two sides, which count as two surfaces if their means are
+    more than `step` apart. The mean of two surfaces lies on neither and would be a flying pixel. All
+    thresholds are soft, so rounding errors cannot flip the result; a share of three quarters snaps fully.
+    Unsuitable for training, because the losing side gets hardly any gradient.
     """
     neighbours, logits = _neighbours(x, weights)
-    # Written out: ONNX Runtime's sigmoid has an error of 1e-7, too much where all neighbours are rejected.
-    # The gradient of this form is NaN below a logit of -88, so training uses PyTorch's sigmoid.
+    # The sigmoid is written out, because ONNX Runtime's own has an error of 1e-7, too much where all
+    # neighbours are rejected. The gradient of this form is NaN below a logit of -88, so training uses
+    # PyTorch's sigmoid.
     shares = (1 + (-logits).exp()).reciprocal() + _LEAST_SHARE
     share, total = shares.sum(1), (shares * neighbours).sum(1)
     mixed = total / share
     above = shares * (neighbours - (mixed - 0.5).unsqueeze(1)).clamp(0, 1)
     share_above, total_above = above.sum(1), (above * neighbours).sum(1)
-    # 1e-6: if all neighbours are far above or far below, the other side is empty.
+    # 1e-6 avoids division by zero: if all neighbours are far above or far below, the other side is empty.
     mean_above = total_above / (share_above + 1e-6)
     mean_below = (total - total_above) / (share - share_above + 1e-6)
     belongs_above = (2 * share_above / share - 0.5).clamp(0, 1)
@@ -297,14 +303,17 @@ def upsample_to_a_side(
 
 
 def _neighbours(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Old pixels around each new one, [B, 9, 1, H, W], and the logits of their weights, [B, 9, 4, H, W]."""
+    """Return the old pixels around each new one, and the logits of their weights.
+
+    Shapes are [B, 9, 1, H, W] and [B, 9, 4, H, W] for nine neighbours, twice [B, 4, 4, H, W] for four.
+    """
     batch, channels, height, width = weights.shape
     around = F.pad(x, (1, 1, 1, 1), mode="replicate")
     shifted = [around[:, :, dy : dy + height, dx : dx + width] for dy in range(3) for dx in range(3)]
     if channels == 9 * 4:
         neighbours = torch.stack(shifted, 1)
     else:
-        # Old pixel (a, b) of the four, for new pixel (i, j) of the four.
+        # Old pixel (a, b) of the enclosing 2x2, for new pixel (i, j) of the 2x2 that replace one old pixel.
         corners = [(0, 0), (0, 1), (1, 0), (1, 1)]
         neighbours = torch.cat([shifted[3 * (i + a) + j + b] for a, b in corners for i, j in corners], 1)
         neighbours = neighbours.view(batch, 4, 4, height, width)
@@ -314,8 +323,8 @@ def _neighbours(x: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
 def pad_to_multiple(image: Float[Tensor, "b c h w"], multiple: int) -> Float[Tensor, "b c h2 w2"]:
     """Pad the image by repeating its last row and column until both sides are multiples of `multiple`.
 
-    Padding is below and on the right, so that pixels keep their coordinates; crop results to
-    [..., :height, :width]. An image that fits is returned itself, so an exported graph whose sides are
+    Padding is added below and on the right, so pixels keep their coordinates; crop results to
+    [..., :height, :width]. An image that fits is returned unchanged, so an exported graph whose sides are
     declared as multiples contains no padding.
     """
     below, behind = (-side % multiple for side in image.shape[2:])
@@ -325,7 +334,7 @@ def pad_to_multiple(image: Float[Tensor, "b c h w"], multiple: int) -> Float[Ten
 
 
 class NormReluConv(nn.Sequential):
-    """Batch norm, ReLU, convolution, in the order of DenseMapNet and the paper, at the input's resolution."""
+    """Batch norm, ReLU, then convolution, as in DenseMapNet and the paper, at the input's resolution."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 5, dilation: int = 1) -> None:
         super().__init__(
@@ -334,7 +343,7 @@ class NormReluConv(nn.Sequential):
 
 
 class PooledMatching(nn.Module):
-    """DenseMapNet's correspondence network, also used in the paper: both views stacked and pooled by 8.
+    """DenseMapNet's correspondence network, also used in the paper, over both views stacked and pooled by 8.
 
     Layers are registered in the order in which Keras numbers them in DenseMapNet's published weights.
 
@@ -359,7 +368,7 @@ class PooledMatching(nn.Module):
     def forward(
         self, left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"]
     ) -> tuple[Float[Tensor, "b 32 h8 w8"], Float[Tensor, "b 16 h w"], Float[Tensor, "b 1 h w"]]:
-        """Matches at 1/8 resolution, and the left view's features and one-channel map at full resolution."""
+        """Return matches at 1/8 resolution, and the left view's features and single-channel map."""
         features = self.left_features(left)
         stereo = self.stereo_features(torch.cat([left, right], 1))
         stereo = F.relu(self.norm(F.max_pool2d(stereo, 8)))
@@ -372,7 +381,10 @@ class PooledMatching(nn.Module):
 
 
 class CodeHead(nn.Module):
-    """Head of DenseMapNet and the paper's network: a code in 0..1 from decoded maps and the left channel."""
+    """Head of DenseMapNet and the paper's network, which predicts a code in 0..1.
+
+    Its inputs are the decoded maps and the left view's one-channel map.
+    """
 
     def __init__(self, inputs: int) -> None:
         super().__init__()
@@ -389,12 +401,12 @@ class CodeHead(nn.Module):
 
 
 def same_conv(inputs: int, outputs: int, kernel: int = 5, dilation: int = 1) -> nn.Conv2d:
-    """Convolution with bias at the input's resolution."""
+    """Build a convolution with bias at the input's resolution."""
     return nn.Conv2d(inputs, outputs, kernel, padding=dilation * (kernel // 2), dilation=dilation)
 
 
 def keras_norm(channels: int) -> nn.BatchNorm2d:
-    """Batch norm with Keras's default constants, as in the published DenseMapNet and paper networks."""
+    """Build a batch norm with Keras's default constants, as in DenseMapNet and the paper's network."""
     return nn.BatchNorm2d(channels, eps=1e-3, momentum=0.01)
 
 
@@ -402,8 +414,8 @@ def initialise_as_keras(network: nn.Module) -> None:
     """Initialise every convolution with Glorot-uniform weights and zero biases, Keras's defaults.
 
     PyTorch's default would start a transposed convolution to one channel with weights more than twice as
-    large: the logits of the sigmoid that follows would have a standard deviation of 2 instead of 0.8
-        (measured).
+    large. The logits of the following sigmoid would have a standard deviation of 2 instead of 0.8, as
+    measured.
     """
     for layer in network.modules():
         if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):

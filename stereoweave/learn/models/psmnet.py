@@ -4,16 +4,17 @@ J.-R. Chang and Y.-S. Chen, Pyramid Stereo Matching Network, CVPR 2018, arXiv:18
 
 Deviations, and choices where the paper is silent:
 
-- The features' batch norms see both views in one batch: faster than two batches, and shared weights need
-  shared statistics. This also lets a single pair train where pooling leaves one pixel per map.
-- Pooling windows are limited to the size of the map, so that small crops can train.
+- The feature extractor's batch norms see both views in one batch. This is faster than two batches, gives
+  shared weights shared statistics, and allows batches of a single pair where pooling leaves one pixel per
+  map.
+- Pooling windows are limited to the size of the map, so that small crops can be used in training.
 - The pyramid's branches have 1x1 kernels, as in the paper's text; with the 3x3 ones of its table the
   parameter count would exceed the published one by 131,072.
 - Right features are 0 where the candidate is outside the right image; left features are kept.
-- Colours are scaled to -1..1 instead of by a dataset's mean and deviation: a batch norm follows.
+- Colours are scaled to -1..1 instead of by a dataset's mean and deviation, because a batch norm follows.
 - Upsampling treats pixels as areas (align_corners=False). This places cost level k at candidate 4 k + 1.5,
   while the cost volume shifts level k by exactly 4 k px: a sharp minimum at level 10 gives 41.5 px, not 40.
-  Training absorbs the 1.5 px except at the end of the range: the first two candidates always have equal
+  Training absorbs the 1.5 px except at the low end of the range: the first two candidates always have equal
   costs, so no estimate is below 0.5 px, and disparities under about 1.5 px are inaccurate.
 """
 
@@ -29,7 +30,7 @@ from stereoweave.learn.models.layers import ConvBlock, pad_to_multiple
 
 
 def norm_convolution(inputs: int, outputs: int, kernel: int, stride: int, dilation: int) -> nn.Sequential:
-    """Convolution and batch norm, at 1 / `stride` of the input's resolution."""
+    """Build a convolution and a batch norm, at 1 / `stride` of the input's resolution."""
     padding = dilation * (kernel // 2)
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, kernel, stride, padding, dilation, bias=False), nn.BatchNorm2d(outputs)
@@ -37,14 +38,14 @@ def norm_convolution(inputs: int, outputs: int, kernel: int, stride: int, dilati
 
 
 def norm_convolution_3d(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
-    """3x3x3 convolution and batch norm, at 1 / `stride` of the input's resolution and candidates."""
+    """Build a 3x3x3 convolution and a batch norm, at 1 / `stride` of the resolution in each dimension."""
     return nn.Sequential(
         nn.Conv3d(inputs, outputs, 3, stride, padding=1, bias=False), nn.BatchNorm3d(outputs)
     )
 
 
 def norm_expansion_3d(inputs: int, outputs: int) -> nn.Sequential:
-    """3x3x3 transposed convolution and batch norm, at twice the input's resolution and candidates."""
+    """Build a 3x3x3 transposed convolution and a batch norm, at twice the resolution in each dimension."""
     return nn.Sequential(
         nn.ConvTranspose3d(inputs, outputs, 3, stride=2, padding=1, output_padding=1, bias=False),
         nn.BatchNorm3d(outputs),
@@ -52,7 +53,7 @@ def norm_expansion_3d(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class BasicBlock(nn.Module):
-    """Two 3x3 convolutions added to their input, or to its 1x1 convolution if the shape changes."""
+    """Residual block of two 3x3 convolutions, with a 1x1 convolution as shortcut if the shape changes."""
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1, dilation: int = 1) -> None:
         super().__init__()
@@ -77,7 +78,7 @@ def stack_basic_blocks(
 
 
 class PyramidPooling(nn.Module):
-    """Mean pooling with windows of four sizes, each reduced to 32 channels and upsampled: [B, 128, H, W]."""
+    """Mean pooling over windows of four sizes; each result has 32 channels and the input's resolution."""
 
     windows = (64, 32, 16, 8)
 
@@ -119,10 +120,10 @@ class PSMFeatures(nn.Module):
 def cost_volume(
     left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"], levels: int
 ) -> Float[Tensor, "b c2 d h w"]:
-    """Features of column x of `left`, then of column x - d of `right`, for d = 0 .. levels - 1; 0 outside.
+    """Join features of column x of `left` and column x - d of `right`, d = 0 .. levels - 1; 0 outside.
 
-    Windows as wide as the image slide over the right view, zero-padded on the left; the last window is d = 0.
-    Plain reference: `cost_volume_plain` in tests/learn/models/test_psmnet.py.
+    A window as wide as the image slides over the right view, which is zero-padded on the left; d is 0 in its
+    last position. Plain reference: `cost_volume_plain` in tests/learn/models/test_psmnet.py.
     """
     windows = F.pad(right, (levels - 1, 0)).unfold(3, right.shape[3], 1)
     shifted = windows.flip(3).transpose(2, 3)
@@ -130,7 +131,7 @@ def cost_volume(
 
 
 def soft_argmin(cost: Float[Tensor, "b d h w"]) -> Float[Tensor, "b 1 h w"]:
-    """Expected disparity under a softmax over matching costs (Kendall et al. 2017).
+    """Return the expected disparity under a softmax over matching costs (Kendall et al. 2017).
 
     Args:
         cost: Matching cost per candidate [B, D, H, W]; low is good. Candidate i means a disparity of i pixels
@@ -166,9 +167,10 @@ class Hourglass(nn.Module):
         way_down: Float[Tensor, "b 64 d2 h2 w2"] | None,
         way_up: Float[Tensor, "b 64 d2 h2 w2"] | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Correction of the volume [B, 32, D, H, W], and the maps on the way down and up at half resolution.
+        """Return a correction of the volume [B, 32, D, H, W], and the maps on the way down and up.
 
-        `way_down` is from the first hourglass, `way_up` from the previous one; both are None in the first.
+        The maps on the way down and up are at half resolution. `way_down` is from the first hourglass,
+        `way_up` from the previous one; both are None in the first.
         """
         down = self.down(x)
         here = F.relu(down if way_up is None else down + way_up)
@@ -177,10 +179,11 @@ class Hourglass(nn.Module):
 
 
 class PSMNet(nn.Module):
-    """Disparity of the left view, 0.5 to `max_disparity_px` - 1.5: mean of a distribution over pixels.
+    """Network that estimates the left view's disparity as the mean of a distribution over candidates.
 
-    5,224,768 parameters. 432.88 G multiply-adds at 640x480 with 192 candidates: convolutions only, without
-    batch norm, pooling, upsampling of the costs and softmax.
+    Estimates are between 0.5 and `max_disparity_px` - 1.5. 5,224,768 parameters; 432.88 G multiply-adds at
+    640x480 with 192 candidates. The count covers only convolutions, not batch norm, pooling, upsampling of
+    the costs and softmax.
 
     Args:
         max_disparity_px: Number of candidates, a multiple of 16.
@@ -194,7 +197,7 @@ class PSMNet(nn.Module):
         super().__init__()
         if max_disparity_px < 16 or max_disparity_px % 16:
             raise StereoweaveError(
-                f"PSMNet: max_disparity_px must be a positive multiple of 16, got {max_disparity_px}"
+                f"PSMNet: max_disparity_px: expected a multiple of 16 above 0, found {max_disparity_px}"
             )
         self.max_disparity_px = max_disparity_px
         self.features = PSMFeatures()
@@ -214,7 +217,7 @@ class PSMNet(nn.Module):
     def compute_costs(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> list[Float[Tensor, "b 1 d4 h4 w4"]]:
-        """Matching costs after each hourglass, for 1/4 of the candidates at 1/4 of the padded size."""
+        """Return matching costs after each hourglass, for 1/4 of the candidates at 1/4 of the padded size."""
         views = pad_to_multiple(torch.cat([left, right]), self.multiple_of)
         left_features, right_features = self.features(views).chunk(2)
         narrowed = self.narrow(cost_volume(left_features, right_features, self.max_disparity_px // 4))
@@ -231,13 +234,13 @@ class PSMNet(nn.Module):
     def outputs(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> tuple[Float[Tensor, "b 1 h w"], ...]:
-        """Disparities in pixels after each hourglass; the last one is the estimate."""
+        """Return the disparities in pixels after each hourglass; the last one is the estimate."""
         return tuple(_disparity_px(cost, left) for cost in self.compute_costs(left, right))
 
     def forward(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> Float[Tensor, "b 1 h w"]:
-        """Disparity of the left view in pixels, from RGB images in 0..1."""
+        """Return the disparity of the left view in pixels, from RGB images in 0..1."""
         return _disparity_px(self.compute_costs(left, right)[-1], left)
 
 
@@ -250,10 +253,10 @@ def _make_head() -> nn.Sequential:
 def _disparity_px(
     cost: Float[Tensor, "b 1 d4 h4 w4"], image: Float[Tensor, "b 3 h w"]
 ) -> Float[Tensor, "b 1 h w"]:
-    """Disparity at the size of `image`, from costs at a quarter of its padded size.
+    """Return the disparity at the size of `image`, from costs at a quarter of its padded size.
 
-    Level k of the costs is placed at candidate 4 k + 1.5; see the deviations above. In float32 for any type
-    of costs: between 128 and 256 bfloat16 has no fractions.
+    Level k of the costs is placed at candidate 4 k + 1.5; see the deviations above. Costs of any type are
+    converted to float32, because bfloat16 has no fractions between 128 and 256.
     """
     full = F.interpolate(cost.float(), scale_factor=4.0, mode="trilinear").squeeze(1)
     return soft_argmin(full)[..., : image.shape[2], : image.shape[3]]

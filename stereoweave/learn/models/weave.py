@@ -1,6 +1,6 @@
 """WeaveNet: the paper's dilated dense blocks and stepwise decoder around a correlation of shared features.
 
-The paper matches by convolutions over both views stacked and pooled by 8, which ties what it learns to
+The paper matches by convolutions over both views, stacked and pooled by 8, which ties the learned matching to
 the training pictures. WeaveNet instead correlates features of one shared encoder. It keeps the paper's
 dilated, densely connected blocks, the decoder in steps of two, and the skip connections from the image.
 """
@@ -37,8 +37,8 @@ class WeaveSize:
 
     Attributes:
         channels: Channels of the encoder's maps.
-        convolutions: 3x3 convolutions of the encoder at each resolution, after the one that halves; an even
-            number makes residual blocks.
+        convolutions: Number of 3x3 convolutions of the encoder at each resolution, after the one that halves
+            it; an even number forms residual blocks.
         dilations: Dilations of the dense blocks at 1/8.
         growth: Channels that each dense block adds.
         bottleneck: Output channels of the dense blocks.
@@ -46,12 +46,12 @@ class WeaveSize:
         join_kernel: Kernel of the last convolution before the correlation.
         propagation: Channels of the blocks at 1/4 that spread confident disparities; 0 for none.
         compared: Channels that are correlated at 1/2.
-        handed: Channels passed from the decoder to 1/2. ONNX Runtime is faster if 4 divides the number of
-            channels joined there; BASE has 29, like the network that it grew from.
-        warps: Whether `compared` channels are correlated with the other view warped once, instead of looked
-            up for each offset.
-        refinement: 3x3 convolutions at 1/2.
-        neighbours: Old pixels that an upsampled pixel combines, 9 or 4.
+        handed: Channels passed from the decoder to 1/2. ONNX Runtime is faster if the number of channels
+            joined there is a multiple of 4; BASE joins 29, like the network that it grew from.
+        warps: Whether the other view is warped once for the correlation at 1/2, instead of being gathered
+            for each offset.
+        refinement: Number of 3x3 convolutions at 1/2.
+        neighbours: Number of old pixels that an upsampled pixel combines, 9 or 4.
         wider: Channels of the context at 1/32; 0 for none.
         completion: Channels of the stage at 1/4 that completes occluded areas; 0 for none.
         sharpening: Channels that are correlated at full resolution; 0 for none.
@@ -106,18 +106,20 @@ BASE = WeaveSize(
     neighbours=9,
 )
 
-# BASE with its optional stages, which add nothing until trained.
+# BASE with all optional stages, which change nothing until they are trained.
 BASE_GROWN = replace(BASE, wider=64, completion=32, sharpening=8)
 
 
 @dataclass(frozen=True, kw_only=True)
 class WeaveStages:
-    """Every stage of a prediction, for the losses; both views in one batch, the second half mirrored.
+    """Every stage of a prediction, for the losses.
+
+    The batch holds the left views first, then the mirrored right views.
 
     Attributes:
         correlation: Raw matching scores per level of 4 px at 1/4 resolution [2B, D, H/4, W/4].
         scores: Matching scores after aggregation.
-        coarse_px: Disparity before the refinement, at half resolution, in pixels of the full one.
+        coarse_px: Disparity before the refinement, at half resolution, in full-resolution pixels.
         disparity_px: Final disparity [2B, 1, H, W].
         confidence_logit: Log odds that the disparity is within 1 px [2B, 1, H, W].
     """
@@ -139,12 +141,12 @@ class WeaveFeatures(NamedTuple):
 
 
 def as_left_view(views: Tensor, batch: int | torch.SymInt) -> Tensor:
-    """From maps of the left and right views: those of the left views, then of the right views mirrored."""
+    """Return the maps of the left views, then the mirrored maps of the right views."""
     return torch.cat([views[:batch], mirror(views[batch:])])
 
 
 def as_other_view(views: Tensor, batch: int | torch.SymInt) -> Tensor:
-    """The counterparts of `as_left_view`: maps of the right views, then of the left views mirrored."""
+    """Return the counterparts of `as_left_view`: maps of the right views, then mirrored ones of the left."""
     return torch.cat([views[batch:], mirror(views[:batch])])
 
 
@@ -156,7 +158,7 @@ def stack_convolutions(channels: int, count: int) -> list[nn.Module]:
 
 
 class Encoder(nn.Module):
-    """Features of one view: down to 1/16, and up again so that finer maps include context."""
+    """Feature encoder of one view: down to 1/16, then up again, so that finer maps include context."""
 
     def __init__(self, size: WeaveSize) -> None:
         super().__init__()
@@ -183,7 +185,7 @@ class Encoder(nn.Module):
 
 
 class Context(nn.Module):
-    """Context at 1/16: a textureless surface is recognised by where it ends."""
+    """Context at 1/16, wide enough to reach the edges of textureless surfaces."""
 
     def __init__(self, inputs: int, sixteenth: int, size: WeaveSize) -> None:
         super().__init__()
@@ -202,7 +204,7 @@ class Context(nn.Module):
 
 
 class Aggregation(nn.Module):
-    """Matching scores refined by their context: dilated dense blocks at 1/8, decoded to 1/4."""
+    """Aggregation of matching scores over their context by dilated dense blocks at 1/8, decoded to 1/4."""
 
     def __init__(self, levels: int, size: WeaveSize) -> None:
         super().__init__()
@@ -216,7 +218,7 @@ class Aggregation(nn.Module):
         self.scores = nn.Conv2d(32, levels, 1)
 
     def forward(self, correlation: Tensor, features: WeaveFeatures) -> tuple[Tensor, Tensor]:
-        """Scores [B, D, H/4, W/4] and the decoder's features [B, 32, H/4, W/4]."""
+        """Return scores [B, D, H/4, W/4] and the decoder's features [B, 32, H/4, W/4]."""
         matches = torch.cat([correlation, features.quarter], 1)
         dense = self.dense(torch.cat([self.down(matches), features.eighth], 1))
         wide = self.bottleneck(dense) + self.context(dense, features.sixteenth)
@@ -225,7 +227,10 @@ class Aggregation(nn.Module):
 
 
 class Propagation(nn.Module):
-    """Disparity at 1/4, smoothed where the surface is smooth, from its deviation from the local mean."""
+    """Correction of the disparity at 1/4, which smooths the disparity of smooth surfaces.
+
+    One of its inputs is the disparity's deviation from the local mean.
+    """
 
     def __init__(self, quarter: int, channels: int) -> None:
         super().__init__()
@@ -235,15 +240,15 @@ class Propagation(nn.Module):
         self.decoded = zero_initialise(nn.Conv2d(channels, 32, 1))
 
     def forward(self, disparity: Tensor, quarter: Tensor, decoded: Tensor) -> tuple[Tensor, Tensor]:
-        """Disparity in levels [B, 1, H/4, W/4] and the decoder's features."""
-        # In float32: near a disparity of 100 px bfloat16 cannot distinguish a slope from a plane.
+        """Return the disparity in levels [B, 1, H/4, W/4] and the decoder's features."""
+        # In float32, because near a disparity of 100 px bfloat16 cannot resolve the slope of a surface.
         departure = disparity - F.avg_pool2d(disparity, 9, 1, 4, count_include_pad=False)
         x = self.body(self.join(torch.cat([decoded, quarter, departure, disparity / 16], 1)))
         return disparity + self.correction(x).float(), decoded + self.decoded(x)
 
 
 class Refinement(nn.Module):
-    """A correction of at most `radius` pixels at half resolution, from correlations around the estimate."""
+    """Correction by at most `radius` pixels at half resolution, from correlations around the estimate."""
 
     def __init__(self, size: WeaveSize, radius: int = 2) -> None:
         super().__init__()
@@ -259,7 +264,7 @@ class Refinement(nn.Module):
     def forward(
         self, disparity: Tensor, first: Tensor, second: Tensor, context: Tensor, decoded: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Disparity in pixels of this resolution, weights of the last upsampling, confidence, features."""
+        """Return disparity in pixels of this resolution, weights for upsampling, confidence and features."""
         matches = self.matches(first, second, disparity, self.radius)
         x = self.body(self.join(torch.cat([matches, context, decoded], 1)))
         correction = expected_step((matches + self.scores(x)).float())
@@ -267,12 +272,12 @@ class Refinement(nn.Module):
 
 
 class WeaveNet(nn.Module):
-    """Disparity of both views of a rectified pair, and the left view's confidence.
+    """Network that estimates the disparity of both views of a rectified pair, and the left view's confidence.
 
     Sides must be multiples of 16, or of 32 with a context at 1/32. The disparity range is 0 to `levels` * 4 -
-    1 px. For both views at 640x480 SMALL takes 2.96 G multiply-adds with its 278,029 parameters, BASE takes
-    13.41 G multiply-adds with its 1,274,290 parameters, BASE_GROWN takes 15.98 G multiply-adds with its
-    1,470,020 parameters.
+    1 px. SMALL has 278,029 parameters and takes 2.96 G multiply-adds for both views at 640x480. BASE has
+    1,274,290 parameters and takes 13.41 G multiply-adds; BASE_GROWN has 1,470,020 parameters and takes
+    15.98 G multiply-adds.
     """
 
     def __init__(self, size: WeaveSize = SMALL, levels: int = 48) -> None:
@@ -297,18 +302,17 @@ class WeaveNet(nn.Module):
 
     @property
     def confidence_layers(self) -> tuple[nn.Conv2d, ...]:
-        """The layers whose outputs sum to the confidence's logit."""
+        """Layers whose outputs add up to the confidence logit."""
         sharpened = () if self.sharpening is None else (self.sharpening.confidence,)
         return self.refinement.confidence, *sharpened
 
     def stages(self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]) -> WeaveStages:
-        """Every stage of the prediction for both views."""
-        batch = left.shape[
-            0
-        ]  # here and below, no len() and no chunk(): they would fix the batch size on export
+        """Return every stage of the prediction for both views."""
+        # No len() and no chunk(), here and below: they would fix the batch size on export.
+        batch = left.shape[0]
         images = torch.cat([left, right])
         maps = self.encoder(images)
-        # Mirrored, the right view is a left view, so that one aggregation serves both.
+        # A mirrored right view is a left view, so one aggregation serves both.
         first = WeaveFeatures(*(as_left_view(map_, batch) for map_ in maps))
         correlation, scores, decoded = self.match(maps, first)
         quarter = self.read_disparity(scores.float(), decoded)
@@ -334,7 +338,7 @@ class WeaveNet(nn.Module):
         )
 
     def match(self, maps: WeaveFeatures, first: WeaveFeatures) -> tuple[Tensor, Tensor, Tensor]:
-        """Matching scores before and after aggregation, and the decoder's features.
+        """Return matching scores before and after aggregation, and the decoder's features.
 
         Args:
             maps: Features of the left views, then of the right ones.
@@ -346,11 +350,11 @@ class WeaveNet(nn.Module):
         return correlation, *self.aggregation(correlation, first)
 
     def upsample(self, x: Tensor, weights: Tensor) -> Tensor:
-        """Guided upsampling by two; sharper at inference than in training, which needs the gradient."""
+        """Upsample by two, guided by `weights`; sharper at inference, when no gradient is needed."""
         return upsample_convex(x, weights) if self.training else upsample_to_a_side(x, weights)
 
     def read_disparity(self, scores: Tensor, decoded: Tensor) -> Tensor:
-        """Disparity in pixels of 1/4 resolution; coarser variants also use the decoder's features."""
+        """Return disparity in pixels at 1/4 resolution; coarser variants also use the decoder's features."""
         return local_soft_argmax(scores)
 
     def _propagate(
@@ -371,7 +375,7 @@ class WeaveNet(nn.Module):
             return disparity_px, logit
         features, match = self.sharpening.views(images)
         if self.training:
-            # Left views only, at half the cost; the right ones supervise the disparity before sharpening.
+            # Sharpening only the left views halves the cost; the right views supervise the earlier stages.
             lefts = (disparity_px[:batch], match[:batch], match[batch:], features[:batch], context[:batch])
             sharp_px, more = self.sharpening(*lefts)
             right_px, right_logit = disparity_px[batch:], logit[batch:]
@@ -381,8 +385,8 @@ class WeaveNet(nn.Module):
         return sharp_px, logit + more
 
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Left disparity, right disparity and the left view's confidence logit, each [B, 1, H, W]."""
+        """Return left disparity, right disparity and the left view's confidence logit, each [B, 1, H, W]."""
         stages, batch = self.stages(left, right), left.shape[0]
-        # Noise at infinity has both signs; parallel cameras have no negative disparities.
+        # Noise at infinity has both signs, but parallel cameras have no negative disparities.
         disparity_px = stages.disparity_px.clamp(min=0)
         return disparity_px[:batch], mirror(disparity_px[batch:]), stages.confidence_logit[:batch]

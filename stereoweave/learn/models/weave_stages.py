@@ -1,4 +1,4 @@
-"""Optional stages to add to a trained WeaveNet; they change nothing until they are trained."""
+"""Optional stages that can be added to a trained WeaveNet; they change nothing until they are trained."""
 
 import torch
 import torch.nn.functional as F
@@ -23,7 +23,7 @@ OFFSETS = tuple(
     for step in steps
     for sign in (-1, 1)
 )
-# Left-right differences are clamped to this, in pixels of 1/4 resolution.
+# Left-right differences are clamped to this magnitude, in pixels of 1/4 resolution.
 _LARGEST_CHECK = 4.0
 
 
@@ -41,12 +41,12 @@ class WiderContext(nn.Module):
 
 
 class Completion(nn.Module):
-    """Disparity at 1/4, completed from its surroundings where the two views disagree.
+    """Completion of the disparity at 1/4 from its surroundings where the two views disagree.
 
-    An occluded pixel has no match. The left-right consistency check finds such pixels, and each takes a
-    convex
-    combination of disparities 2 to 32 pixels away in its row and column: the learned affinities of spatial
-    propagation networks (Liu et al., NeurIPS 2017) with fixed, distant offsets instead of repeated steps.
+    An occluded pixel has no match. The left-right check finds such pixels, and each takes a convex
+    combination of disparities 2 to 32 pixels away in its row and column. The weights are learned affinities,
+    as in spatial propagation networks (Liu et al., NeurIPS 2017), but with fixed, distant offsets instead of
+    repeated steps.
     """
 
     def __init__(self, quarter: int, channels: int) -> None:
@@ -64,7 +64,7 @@ class Completion(nn.Module):
         quarter: Float[Tensor, "b c h w"],
         decoded: Float[Tensor, "b 32 h w"],
     ) -> tuple[Tensor, Tensor]:
-        """Disparity in pixels of 1/4 resolution, and the decoder's features.
+        """Return the completed disparity in pixels of 1/4 resolution, and the decoder's features.
 
         Args:
             disparity: Disparity in pixels of 1/4 resolution.
@@ -81,9 +81,9 @@ class Completion(nn.Module):
         return disparity + share * (mixed - disparity), decoded + self.decoded(x)
 
     def _checks(self, disparity: Tensor, other: Tensor) -> tuple[Tensor, ...]:
-        """Cues for occlusion: deviation from the local mean, disparity, left-right check, border distance."""
+        """Return cues for occlusion: deviation from the mean, disparity, left-right check, border check."""
         columns = torch.arange(disparity.shape[3], dtype=torch.float32, device=disparity.device)
-        # In float32: near a disparity of 100 px bfloat16 cannot distinguish a slope from a plane.
+        # In float32, because near a disparity of 100 px bfloat16 cannot resolve the slope of a surface.
         departure = disparity - F.avg_pool2d(disparity, 9, 1, 4, count_include_pad=False)
         check = (sample_at_match(other, disparity) - disparity).clamp(-_LARGEST_CHECK, _LARGEST_CHECK)
         inside = (columns - disparity).clamp(-_LARGEST_CHECK, _LARGEST_CHECK)
@@ -91,7 +91,7 @@ class Completion(nn.Module):
 
 
 class Sharpening(nn.Module):
-    """A correction of at most `radius` pixels at full resolution, from correlations around the estimate."""
+    """Correction by at most `radius` pixels at full resolution, from correlations around the estimate."""
 
     def __init__(self, handed: int, inputs: int, channels: int, radius: int = 2) -> None:
         super().__init__()
@@ -107,14 +107,14 @@ class Sharpening(nn.Module):
         self.confidence = zero_initialise(nn.Conv2d(16, 1, 1))
 
     def views(self, images: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, Tensor]:
-        """Features of the images, and the maps to correlate."""
+        """Return the features of the images, and the maps to correlate."""
         features = self.features(images * 2 - 1)
         return features, self.to_match(features)
 
     def forward(
         self, disparity: Tensor, first: Tensor, second: Tensor, features: Tensor, context: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Disparity in pixels, and the change of the confidence's logit.
+        """Return the corrected disparity in pixels, and the change of the confidence logit.
 
         Args:
             disparity: Disparity in pixels of full resolution.

@@ -1,4 +1,4 @@
-"""DenseMapNet: its counts, its sizes, and the published weights with what they are known to give."""
+"""DenseMapNet: its parameter count, its image sizes, and the known results of the published weights."""
 
 import h5py
 import numpy as np
@@ -11,7 +11,7 @@ from stereoweave.io.images import read_pair
 from stereoweave.io.maps import read_disparity_png
 from stereoweave.learn.models.densemapnet import DenseMapNet, load_keras
 
-# Kernels in Keras's order: rows, columns, inputs, outputs; the transposed convolution's last two exchanged.
+# Kernels in Keras's order: rows, columns, inputs, outputs. The transposed convolution swaps the last two.
 KERNELS = [
     *[(5, 5, 3, 16), (5, 5, 3, 1), (5, 5, 6, 32)],
     *[(5, 5, 32, 32)] * 4,
@@ -49,7 +49,7 @@ def parameters(network):
 
 
 def values_of(network):
-    """Parameters and batch norm's statistics; not its counters of steps, which Keras does not have."""
+    """Return the number of parameters and batch-norm statistics, without step counters, which Keras lacks."""
     return sum(values.numel() for values in network.state_dict().values() if values.is_floating_point())
 
 
@@ -60,14 +60,14 @@ def test_the_network_has_its_published_number_of_parameters():
     assert "290,290 parameters" in DenseMapNet.__doc__
 
 
-def test_a_grey_network_has_one_channel_in_place_of_three_in_each_view():
-    # Two channels less: 25 weights to 16 features and to 1 channel of the left view, 25 of two views to 32.
+def test_a_grey_network_has_one_channel_per_view_instead_of_three():
+    # Two channels fewer: 25 weights each to 16 features and 1 channel of the left view, and to 32 of both.
     assert 2 * 25 * (16 + 1 + 2 * 32) == 4_050
     assert parameters(DenseMapNet(channels=1)) == 290_290 - 4_050
     assert values_of(DenseMapNet(channels=1)) == 289_060
 
 
-def test_the_network_costs_8_giga_multiply_adds():
+def test_the_network_takes_8_giga_multiply_adds():
     network, image = DenseMapNet().to("meta"), torch.empty(1, 3, 480, 640, device="meta")
     with FlopCounterMode(display=False) as counter:
         network(image, image)
@@ -86,7 +86,7 @@ def test_the_code_has_the_size_of_the_pictures_and_is_between_0_and_1(size, chan
     assert len(network.outputs(left, right)) == len(network.output_weights) == 1
 
 
-def test_an_odd_size_is_answered_as_the_picture_with_its_border_repeated():
+def test_a_picture_of_odd_size_gives_the_result_of_the_picture_padded_by_its_border():
     network = DenseMapNet().eval()
     left, right = torch.rand(2, 1, 3, 37, 53)
     rows, columns = torch.arange(40).clamp(max=36), torch.arange(56).clamp(max=52)
@@ -106,7 +106,7 @@ def test_a_grey_network_weighs_the_colours_by_rec_601():
             torch.testing.assert_close(network(*coloured), network(*grey))
 
 
-def test_every_value_of_a_keras_file_lands_in_its_place(tmp_path, rng):
+def test_every_value_of_a_keras_file_is_loaded_into_its_place(tmp_path, rng):
     arrays = arrays_of_a_keras_file(rng)
     write_keras(tmp_path / "some.h5", arrays)
     network = load_keras(tmp_path / "some.h5")
@@ -139,7 +139,7 @@ def test_every_value_of_a_keras_file_lands_in_its_place(tmp_path, rng):
         torch.testing.assert_close(values, torch.from_numpy(arrays[f"batch_normalization_12/{part}"]))
 
 
-def test_a_file_of_another_network_is_refused_with_what_is_wrong(tmp_path, rng):
+def test_a_file_of_another_network_is_refused_with_the_difference(tmp_path, rng):
     arrays, path = arrays_of_a_keras_file(rng), tmp_path / "some.h5"
     last = "conv2d_transpose_1/kernel"
     for changed, complaint in (
@@ -149,9 +149,9 @@ def test_a_file_of_another_network_is_refused_with_what_is_wrong(tmp_path, rng):
         ),
         (
             arrays | {"batch_normalization_3/beta": np.zeros(48, np.float32)},
-            r"batch_normalization_3/beta:0 of shape \(64,\), found \(48,\)",
+            r"batch_normalization_3/beta:0 of shape \(64,\), found shape \(48,\)",
         ),
-        (arrays | {"dense_1/kernel": np.zeros((2, 2))}, "found also dense_1/dense_1/kernel:0"),
+        (arrays | {"dense_1/kernel": np.zeros((2, 2))}, "also found dense_1/dense_1/kernel:0"),
         ({}, "found no conv2d_1/conv2d_1/kernel:0"),
     ):
         write_keras(path, changed)
@@ -161,16 +161,16 @@ def test_a_file_of_another_network_is_refused_with_what_is_wrong(tmp_path, rng):
         assert "\n" not in str(raised.value)
 
 
-def test_a_file_that_is_missing_or_no_hdf5_is_refused_in_one_line(tmp_path, rng):
+def test_a_file_that_is_missing_or_not_hdf5_is_refused_in_one_line(tmp_path, rng):
     text, damaged = tmp_path / "text.h5", tmp_path / "damaged.h5"
     text.write_text("conv2d_1")
     write_keras(damaged, arrays_of_a_keras_file(rng))
     damaged.write_bytes(damaged.read_bytes()[:100_000])
     for path, complaint in (
         (tmp_path / "missing.h5", "found no such file"),
-        (tmp_path, "as HDF5, found something else"),
-        (text, "as HDF5, found something else"),
-        (damaged, "as HDF5, found something else"),
+        (tmp_path, "in HDF5, found something else"),
+        (text, "in HDF5, found something else"),
+        (damaged, "in HDF5, found something else"),
     ):
         with pytest.raises(FormatError, match=complaint) as raised:
             load_keras(path)
@@ -216,7 +216,7 @@ def test_the_published_weights_give_their_known_errors_on_motorcycle(testdata, n
         code = load_keras(testdata / "densemapnet" / f"{name}.h5")(left, right)[0, 0].numpy()
     known = np.isfinite(truth_px)
     code, truth_px = code[known].astype(float), truth_px[known].astype(float)
-    # d_max is not known; the factor of least squares takes its place.
+    # d_max is unknown, so a least-squares factor replaces it.
     scaled_px = code * (code @ truth_px) / (code @ code)
     assert np.abs(scaled_px - truth_px).mean() == pytest.approx(error_px, rel=0.01)
     assert np.corrcoef(code, truth_px)[0, 1] == pytest.approx(correlation, rel=0.01)

@@ -1,4 +1,4 @@
-"""DispNet: Table 1's size, the sign of its correlation, and six outputs in pixels of the full resolution."""
+"""DispNet: the size in Table 1, the sign of the correlation, and six outputs in full-resolution pixels."""
 
 import pytest
 import torch
@@ -31,7 +31,7 @@ def test_features_shifted_by_three_columns_correlate_fully_at_level_three():
     first = second.roll(3, dims=3)
     volume = mean_correlation(first, second)
     assert volume.shape == (1, 41, 4, 60)
-    # The mean of 32 products of a sign with itself.
+    # The mean of 32 products of a sign with itself is 1.
     assert (volume[:, 3, :, 3:] == 1).all()
     assert (volume[..., 3:].argmax(1) == 3).all()
 
@@ -46,7 +46,7 @@ def test_a_pair_shifted_by_eight_pixels_correlates_best_at_level_two(network):
         network(left, right)
     handle.remove()
     assert matched[0].shape == (1, 41 + 64, 16, 64)
-    # Only there do all 41 candidates lie in the right image, and none at its border.
+    # Only in these columns are all 41 candidates inside the right image and away from its border.
     assert matched[0][0, :41, 2:-2, 44:60].mean((1, 2)).argmax() == 2
 
 
@@ -73,7 +73,7 @@ def test_a_prediction_is_in_pixels_of_the_full_resolution_at_every_level(network
         torch.testing.assert_close(output, torch.full((1, 1, 64, 64), 7.0))
 
 
-def test_other_sizes_are_padded_by_their_border_and_cut_back(network):
+def test_other_sizes_are_padded_by_their_border_and_cropped_again(network):
     pair = random_pair(50, 71)
     padded = [F.pad(image, (0, 128 - 71, 0, 64 - 50), mode="replicate") for image in pair]
     with torch.no_grad():
@@ -95,7 +95,7 @@ def test_each_parameter_gets_a_gradient_from_the_supervised_outputs(network):
 @pytest.mark.parametrize(
     "layer", [nn.Conv2d(256, 64, 3), nn.ConvTranspose2d(256, 64, 4, stride=2)], ids=["plain", "transposed"]
 )
-def test_a_layer_starts_with_a_gain_that_its_leaky_relu_takes_back(layer):
+def test_a_layer_starts_with_a_gain_that_its_leaky_relu_undoes(layer):
     torch.manual_seed(0)
     _initialise(layer)
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""The paper's network: its counts, its sizes, its dropout, and the skips of its decoder."""
+"""The paper's network: its parameter count, its image sizes, its dropout, and its decoder's skips."""
 
 import math
 
@@ -30,7 +30,7 @@ def test_the_network_has_the_papers_number_of_parameters():
     assert "314,722 parameters" in FastDepthNet.__doc__
 
 
-def test_the_network_costs_7_giga_multiply_adds():
+def test_the_network_takes_7_giga_multiply_adds():
     network, image = FastDepthNet().to("meta"), torch.empty(1, 3, 480, 640, device="meta")
     with FlopCounterMode(display=False) as counter:
         network(image, image)
@@ -40,8 +40,8 @@ def test_the_network_costs_7_giga_multiply_adds():
 
 
 def test_without_skips_exactly_the_skips_channels_are_missing():
-    # Two steps of the decoder, each without 16 channels of the left view: from each the 5x5 weights to 16
-    # outputs, and its scale and shift in the batch norm.
+    # Two decoder steps lack 16 channels of the left view. Each channel has 5x5 weights to 16 outputs, and a
+    # scale and a shift in the batch norm.
     assert 2 * 16 * (5 * 5 * 16 + 2) == 12_864
     plain = FastDepthNet(skips=False)
     assert parameters(plain) == 314_722 - 12_864 == 301_858
@@ -60,7 +60,7 @@ def test_the_decoder_sees_the_left_view_at_a_quarter_and_a_half_only_with_skips(
         network(left, right)
         assert [tuple(x.shape[1:]) for x in seen] == inputs
         if skips:
-            # The last 16 channels are the strongest features of 4x4 and of 2x2 pixels.
+            # The last 16 channels are the largest features of 4x4 and of 2x2 pixels.
             for x, pool in zip(seen, (4, 2), strict=True):
                 blocks = features.unflatten(3, (-1, pool)).unflatten(2, (-1, pool))
                 torch.testing.assert_close(x[:, -16:], blocks.amax((3, 5)))
@@ -74,7 +74,7 @@ def test_the_code_has_the_size_of_the_pictures_and_is_between_0_and_1(size):
     assert ((code > 0) & (code < 1)).all()
 
 
-def test_an_odd_size_is_answered_as_the_picture_with_its_border_repeated():
+def test_a_picture_of_odd_size_gives_the_result_of_the_picture_padded_by_its_border():
     network = FastDepthNet().eval()
     left, right = torch.rand(2, 1, 3, 37, 53)
     rows, columns = torch.arange(40).clamp(max=36), torch.arange(56).clamp(max=52)
@@ -90,7 +90,7 @@ def test_padding_repeats_the_last_row_and_column_up_to_the_next_multiple():
     torch.testing.assert_close(pad_to_multiple(image[..., :2], 2)[0, 0], expected[:, :2])
 
 
-def test_what_already_fits_is_not_padded():
+def test_an_image_that_already_fits_is_not_padded():
     image = torch.rand(1, 3, 16, 24)
     assert pad_to_multiple(image, 8) is image
 
@@ -105,7 +105,7 @@ def test_training_supervises_one_output_which_is_the_answer():
     torch.testing.assert_close(outputs[-1], network(left, right))
 
 
-def test_dropout_takes_a_fifth_of_the_single_values_of_eight_maps_in_training_only():
+def test_dropout_removes_a_fifth_of_the_values_of_eight_maps_in_training_only():
     network = FastDepthNet()
     assert [type(m) for m in network.modules() if "Dropout" in type(m).__name__] == [nn.Dropout]
     kept = []
@@ -116,9 +116,9 @@ def test_dropout_takes_a_fifth_of_the_single_values_of_eight_maps_in_training_on
         assert (first - second).abs().max() > 1e-3
         assert [y.shape[1] for _, y in kept] == 2 * [32, 32, 32, 32, 16, 16, 16, 16]
         dropped = torch.cat([(y == 0).float().flatten() for _, y in kept])
-        # 24,576 values: a standard deviation of 0.26 %.
+        # With 24,576 values the share has a standard deviation of 0.26 %.
         assert dropped.mean().item() == pytest.approx(0.2, abs=0.01)
-        # Single values, no whole channels: of 64 at a place in the map hardly any channel keeps all or none.
+        # Dropout is elementwise: hardly any channel would keep all or none of its 64 values.
         assert all(0 < (y[0, 0] == 0).float().mean() < 0.5 for _, y in kept)
         torch.testing.assert_close(kept[0][1][kept[0][1] != 0] * 0.8, kept[0][0][kept[0][1] != 0])
         network.eval()
@@ -132,7 +132,7 @@ def test_batch_norm_has_the_constants_of_keras():
     assert {(norm.eps, norm.momentum) for norm in norms} == {(1e-3, 0.01)}
 
 
-def test_weights_start_as_glorots_and_biases_at_0():
+def test_weights_start_with_glorots_initialisation_and_biases_at_0():
     network = FastDepthNet()
     # sqrt(6 / (25 * 32 inputs + 25 * 32 outputs)), and sqrt(6 / (81 * 33 + 81)) for the head.
     for layer, bound in (

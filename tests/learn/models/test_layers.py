@@ -70,7 +70,7 @@ def warped_matches_plain(first, second, disparity, radius):
 
 
 def scores(levels, **likelihood):
-    """One pixel's scores: the logarithm of a likelihood at the levels named, hardly anything elsewhere."""
+    """Return one pixel's scores: the log of a likelihood at the named levels, almost none elsewhere."""
     logits = torch.full((1, levels, 1, 1), -30.0)
     for level, value in likelihood.items():
         logits[0, int(level[1:])] = math.log(value)
@@ -87,7 +87,7 @@ def test_the_fast_correlation_equals_the_plain_one(levels, width):
 
 def test_the_correlation_is_greatest_at_the_shift_between_the_maps():
     first = nn.functional.normalize(torch.randn(1, 16, 4, 20), dim=1)
-    second = first.roll(-3, 3)  # column x of the first is at x - 3 in the second
+    second = first.roll(-3, 3)  # column x of `first` is at x - 3 in `second`
     assert (correlation_volume(first, second, 8).argmax(1)[..., 3:] == 3).all()
 
 
@@ -116,7 +116,7 @@ def test_warped_matches_equal_the_plain_loop_between_columns_and_beyond_the_bord
 
 
 @pytest.mark.parametrize("matches", [correlate_nearby, correlate_warped])
-def test_columns_are_found_as_well_in_bfloat16_which_cannot_count_them(matches):
+def test_columns_are_found_in_bfloat16_too_which_cannot_represent_their_indices(matches):
     first, second = torch.randn(2, 1, 4, 1, 600).bfloat16()
     disparity = torch.full((1, 1, 1, 600), 3.0, dtype=torch.bfloat16)
     expected = matches(first.float(), second.float(), disparity.float(), 1)
@@ -133,7 +133,7 @@ def test_two_equal_neighbours_give_the_level_between_them():
 
 
 @pytest.mark.parametrize(("one", "other", "expected"), [(0, 1, 0.5), (10, 11, 10.5)])
-def test_the_ends_of_the_volume_do_not_pull(one, other, expected):
+def test_the_ends_of_the_volume_do_not_pull_the_estimate(one, other, expected):
     assert local_soft_argmax(scores(12, **{f"l{one}": 1, f"l{other}": 1})).item() == pytest.approx(expected)
 
 
@@ -143,13 +143,13 @@ def test_a_lone_peak_at_an_end_is_found_there():
 
 
 def test_the_window_fades_out_over_three_levels_and_rests_on_its_own_mean():
-    # 5 weighs 4 and 6 weighs 2; around 5 + c that fades to 4 (1 - c/3) and 2 (2/3 + c/3), of mean 5 + c
-    # where c (16 - 2c) = 4 + 2c.
+    # Levels 5 and 6 have weights of 4 and 2. Around 5 + c they fade to 4 (1 - c/3) and 2 (2/3 + c/3), and the
+    # mean is 5 + c where c (16 - 2c) = 4 + 2c.
     c = (7 - 41**0.5) / 2
     assert local_soft_argmax(scores(12, l5=4, l6=2)).item() == pytest.approx(5 + c, abs=1e-3)
 
 
-def test_a_far_second_peak_does_not_pull():
+def test_a_far_second_peak_does_not_pull_the_estimate():
     assert local_soft_argmax(scores(24, l4=1, l20=0.99)).item() == pytest.approx(4, abs=1e-6)
 
 
@@ -178,16 +178,16 @@ def test_upsampled_values_lie_within_those_of_the_nine_neighbours():
 def test_the_weights_say_which_neighbour_a_new_pixel_takes():
     x = torch.arange(12.0).view(1, 1, 3, 4)
     weights = torch.full((1, 9, 2, 2, 3, 4), -30.0)
-    weights[:, 1, 0, 0] = 30  # upper left new pixel: the old one above
+    weights[:, 1, 0, 0] = 30  # upper left new pixel: the old pixel above
     weights[:, 4, 0, 1] = 30  # upper right: the old one itself
     weights[:, 6, 1, 0] = 30  # lower left: the old one below on the left
     weights[:, 5, 1, 1] = 30  # lower right: the old one on the right
     fine = upsample_convex(x, weights.view(1, 36, 3, 4))[0, 0]
-    # Old pixel (1, 1) is 5: above it 1, below on the left 8, on the right 6. Shares of 1e-4 count little.
+    # Old pixel (1, 1) is 5. Above it is 1, below on the left 8, on the right 6. Shares of 1e-4 hardly matter.
     torch.testing.assert_close(fine[2:4, 2:4], torch.tensor([[1.0, 5.0], [8.0, 6.0]]), atol=0.01, rtol=0)
 
 
-def test_where_every_neighbour_is_refused_their_mean_is_taken():
+def test_if_all_neighbours_are_rejected_the_result_is_their_mean():
     x = torch.arange(9.0).view(1, 1, 3, 3)
     fine = upsample_convex(x, torch.full((1, 36, 3, 3), -1000.0))
     assert fine[0, 0, 2, 2].item() == pytest.approx(4)
@@ -203,14 +203,14 @@ def test_halving_keeps_the_grid_its_own_mirror_image(kernel):
     torch.testing.assert_close(halve(mirror(image)), mirror(halve(image)))
 
 
-def test_dense_blocks_hand_on_their_input_in_front_of_what_they_add():
+def test_dense_blocks_pass_on_their_input_before_the_channels_that_they_add():
     dense = DilatedDense(5, narrow=3, growth=2, dilations=(1, 2, 4)).eval()
     x = torch.randn(1, 5, 6, 6)
     assert dense(x).shape == (1, dense.outputs, 6, 6) == (1, 11, 6, 6)
     torch.testing.assert_close(dense(x)[:, :5], x)
 
 
-def test_a_residual_of_nothing_is_its_input():
+def test_a_residual_block_with_zero_weights_returns_its_input():
     residual = Residual(3).eval()
     nn.init.zeros_(residual.second[0].weight)
     x = torch.rand(1, 3, 5, 5)
@@ -218,7 +218,7 @@ def test_a_residual_of_nothing_is_its_input():
 
 
 def upsampled_corner(upsample, neighbours, logits):
-    """The first of the four new pixels of the middle one of 3x3 old ones, each with its weight."""
+    """Return the first of the four new pixels that replace the centre of 3x3 weighted old pixels."""
     x = torch.tensor(neighbours).view(1, 1, 3, 3)
     weights = torch.tensor(logits).view(1, 9, 1, 1, 1).expand(1, 9, 4, 3, 3).reshape(1, 36, 3, 3)
     return upsample(x, weights)[0, 0, 2, 2].item()
@@ -231,7 +231,7 @@ TWO_SURFACES = [10.0, 10.0, 50.0, 11.0, 10.0, 50.0, 10.0, 10.0, 10.0]
     ("logits", "expected"),
     [([0.0] * 9, 71 / 7), ([-9.0, -9.0, 0.0, -9.0, -9.0, 0.0, -9.0, -9.0, -9.0], 50)],
 )
-def test_a_mixture_of_two_surfaces_becomes_the_one_that_has_three_quarters_of_it(logits, expected):
+def test_a_mixture_of_two_surfaces_becomes_the_one_with_a_share_of_three_quarters(logits, expected):
     found = upsampled_corner(upsample_to_a_side, TWO_SURFACES, logits)
     assert found == pytest.approx(expected, abs=0.1)
 
@@ -240,7 +240,7 @@ def test_the_plain_mixture_of_two_surfaces_is_on_neither():
     assert upsampled_corner(upsample_convex, TWO_SURFACES, [0.0] * 9) == pytest.approx(171 / 9, abs=1e-3)
 
 
-def test_a_slanted_surface_is_mixed_as_ever():
+def test_the_mixture_of_a_slanted_surface_does_not_snap():
     slant = [float(i) / 2 for i in range(9)]
     logits = torch.linspace(-1, 1, 9).tolist()
     mixed = upsampled_corner(upsample_convex, slant, logits)
@@ -248,7 +248,7 @@ def test_a_slanted_surface_is_mixed_as_ever():
 
 
 @pytest.mark.parametrize("logit", [-1000.0, -89.0, 0.0, 1000.0])
-def test_the_gradient_of_the_upsampling_is_finite_however_surely_neighbours_are_refused(logit):
+def test_the_gradient_of_the_upsampling_is_finite_even_for_extreme_logits(logit):
     # Below -88 exp(-logit) is infinite in float32: trained weights have reached -92.
     x = torch.arange(9.0).view(1, 1, 3, 3).requires_grad_()
     weights = torch.full((1, 36, 3, 3), logit).requires_grad_()
@@ -257,14 +257,14 @@ def test_the_gradient_of_the_upsampling_is_finite_however_surely_neighbours_are_
     assert weights.grad.isfinite().all()
 
 
-def test_a_map_is_looked_up_at_the_match_between_two_columns_and_at_the_border():
+def test_a_map_is_sampled_at_the_match_between_two_columns_and_at_the_border():
     other = torch.tensor([10.0, 20.0, 40.0, 80.0]).view(1, 1, 1, 4)
     disparity = torch.tensor([0.0, 0.25, 5.0, -3.0]).view(1, 1, 1, 4)
     # Columns 0, 0.75, -3 and 6.
     assert sample_at_match(other, disparity).flatten().tolist() == pytest.approx([10, 17.5, 10, 80])
 
 
-def test_surroundings_are_the_values_at_the_offsets_and_outside_the_border_s():
+def test_neighbours_are_the_values_at_the_offsets_and_outside_the_map_those_of_the_border():
     x = torch.arange(12.0).view(1, 1, 3, 4)
     below, left_far = gather_neighbours(x, [(1, 0), (0, -5)])[0]
     assert below.tolist() == [[4, 5, 6, 7], [8, 9, 10, 11], [8, 9, 10, 11]]

@@ -1,4 +1,4 @@
-"""The house tests: what holds for every network that a recipe can name."""
+"""Tests that every network in MODELS must pass."""
 
 from functools import cache
 
@@ -24,7 +24,7 @@ PARAMETERS = {
     "psmnet": 5_224_768,
 }
 CODE_NETWORKS = [name for name in MODELS if not name.startswith("weave")]
-# What each learns one pair with: loss, learning rate and steps.
+# Loss, learning rate and steps with which each network overfits one pair.
 LEARNS = {
     "fast_depth": ("l2", 2e-3, 20),
     "fast_depth_without_skips": ("l2", 2e-3, 20),
@@ -36,7 +36,7 @@ LEARNS = {
 
 @cache
 def random_network(name):
-    """One for all tests, which leave its weights as they are: DispNet's take half a second to draw."""
+    """Return a network that all tests share and must not change; drawing DispNet's weights takes 0.5 s."""
     return untrained(name)
 
 
@@ -46,7 +46,7 @@ def random_pair(batch, height, width):
 
 
 def outputs_of(network, pair):
-    """All that training supervises of a network's answers."""
+    """Return all outputs that training supervises."""
     return network.outputs(*pair) if isinstance(network, CodeNetwork) else network(*pair)
 
 
@@ -83,7 +83,7 @@ def test_each_output_has_its_weight_and_the_last_one_is_the_answer(name):
 def test_each_parameter_gets_a_gradient(name):
     network = untrained(name).train()
     for parameter in network.parameters():
-        # What adds nothing until it is trained would hide what lies before it.
+        # A layer of zeros, which adds nothing until it is trained, blocks the gradient of earlier layers.
         if not parameter.any():
             nn.init.normal_(parameter, std=0.1)
     maps = outputs_of(network, random_pair(2, 32, 64))
@@ -94,7 +94,7 @@ def test_each_parameter_gets_a_gradient(name):
         assert parameter.grad.any(), parameter_name
 
 
-def test_a_pair_is_not_told_from_the_others_in_its_batch(name):
+def test_the_result_of_a_pair_does_not_depend_on_the_others_in_its_batch(name):
     network = random_network(name).eval()
     left, right = random_pair(3, 32, 64)
     with torch.no_grad():
@@ -116,13 +116,13 @@ def test_the_network_overfits_one_pair(name):
     loss, learning_rate, steps = LEARNS[name]
     recipe = recipe_of(name, loss=loss, max_disparity_px=16.0)
     torch.manual_seed(0)
-    # In training mode, because the running mean of Keras's batch norm lags 100 steps behind; but all kept.
+    # In training mode, because the running mean of Keras's batch norm lags 100 steps behind; without dropout.
     network = build_network(recipe).train()
     for layer in network.modules():
         if isinstance(layer, nn.Dropout):
             layer.p = 0.0
     if name == "dispnet":
-        # Nine tenths of its weights, which are slow to train, and of a picture this small see 4x4 places.
+        # These parts hold nine tenths of the weights and are slow to train, but see at most 4x4 pixels here.
         for part in (network.conv4, network.conv5, network.conv6, *network.expansions[:2]):
             part.requires_grad_(False)
     objective = build_objective(recipe, network)
@@ -137,15 +137,15 @@ def test_the_network_overfits_one_pair(name):
         optimiser.zero_grad()
         torch.stack(list(objective.losses(predicted, batch).values())).sum().backward()
         optimiser.step()
-    # A box of 12 px that covers a quarter of a wall of 4 px: the best constant is off by 2 px.
+    # A box at 12 px covers a quarter of a wall at 4 px, so the best constant has an error of 2 px.
     assert errors_px[-1] < 1.5 < 2 < errors_px[0]
 
 
-def test_psmnet_has_as_many_candidates_as_the_recipe_says():
+def test_psmnet_has_the_number_of_candidates_of_the_recipe():
     assert build_network(recipe_of("psmnet", max_disparity_px=64.0)).max_disparity_px == 64
 
 
-def test_an_unknown_name_is_answered_with_the_known_ones():
+def test_the_error_for_an_unknown_network_lists_the_known_ones():
     with pytest.raises(FormatError) as caught:
         build_network(recipe_of("spider"))
     assert str(caught.value) == (

@@ -1,4 +1,4 @@
-"""PSMNet: its published size, its cost volume and soft-argmin beside plain ones, and its three outputs."""
+"""PSMNet: its published size, its cost volume and soft-argmin against references, and its three outputs."""
 
 import math
 
@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from stereoweave.errors import StereoweaveError
 from stereoweave.learn.models.psmnet import PSMNet, _disparity_px, cost_volume, soft_argmin
 
-# Volumes this small cost more to share among threads than to compute.
+# For volumes this small, sharing the work among threads costs more than computing.
 torch.set_num_threads(1)
 
 
@@ -40,7 +40,7 @@ def test_the_network_has_its_published_number_of_parameters(network):
     assert f"{count:,} parameters" in PSMNet.__doc__
 
 
-def test_192_disparities_are_candidates_unless_told_otherwise():
+def test_192_disparities_are_candidates_by_default():
     with torch.device("meta"):
         assert PSMNet().max_disparity_px == 192
 
@@ -52,7 +52,7 @@ def test_the_cost_volume_equals_the_plain_one(levels):
     assert torch.equal(cost_volume(left, right, levels), cost_volume_plain(left, right, levels))
 
 
-def test_features_shifted_by_two_columns_meet_themselves_at_level_two():
+def test_features_shifted_by_two_columns_are_equal_at_level_two():
     torch.manual_seed(0)
     scene = torch.rand(1, 3, 4, 12)
     volume = cost_volume(scene[..., :-2], scene[..., 2:], levels=4)
@@ -80,7 +80,7 @@ def test_soft_argmin_is_the_expected_candidate(costs, disparity_px):
 def test_a_level_of_the_quarter_volume_stands_for_its_four_candidates():
     costs = torch.zeros(1, 1, 8, 2, 3)
     costs[:, :, 3] = -60
-    # Candidates 12 to 15, whose middle is 13.5.
+    # These are candidates 12 to 15, with a mean of 13.5.
     torch.testing.assert_close(
         _disparity_px(costs, torch.zeros(1, 3, 8, 12)), torch.full((1, 1, 8, 12), 13.5)
     )
@@ -100,7 +100,7 @@ def test_the_answer_is_the_last_of_three_weighted_outputs(network, training):
         assert ((output >= 0) & (output <= 31)).all()
 
 
-def test_other_sizes_are_padded_by_their_border_and_cut_back(network):
+def test_other_sizes_are_padded_by_their_border_and_cropped_again(network):
     network.train()
     pair = random_pair(1, 18, 35)
     padded = [F.pad(image, (0, 48 - 35, 0, 32 - 18), mode="replicate") for image in pair]
@@ -130,5 +130,5 @@ def test_weights_start_normal_with_the_variance_of_their_fan_out():
 
 @pytest.mark.parametrize("max_disparity_px", [-16, 0, 8, 100])
 def test_candidates_that_the_hourglass_cannot_halve_are_refused(max_disparity_px):
-    with pytest.raises(StereoweaveError, match=f"^PSMNet: .*multiple of 16.*got {max_disparity_px}$"):
+    with pytest.raises(StereoweaveError, match=f"^PSMNet: .*multiple of 16.*found {max_disparity_px}$"):
         PSMNet(max_disparity_px)

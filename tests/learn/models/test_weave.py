@@ -1,4 +1,4 @@
-"""What WeaveNet's design promises, beside the tests of every network in test_models.py."""
+"""Tests of WeaveNet's design, in addition to the tests of every network in test_models.py."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ def random_pair(batch, height, width):
 
 
 @pytest.mark.parametrize("size", [(16, 16), (32, 32), (16, 112), (48, 80), (112, 32)])
-def test_any_size_that_the_network_divides_gives_maps_of_that_size(size):
+def test_any_size_that_is_a_multiple_of_16_gives_maps_of_that_size(size):
     with torch.no_grad():
         maps = untrained()(*random_pair(1, *size))
     assert len(maps) == 3
@@ -33,13 +33,13 @@ def test_any_size_that_the_network_divides_gives_maps_of_that_size(size):
 @pytest.mark.parametrize(
     ("name", "most"), [("weave_small", 3e9), ("weave_base", 16e9), ("weave_base_grown", 16e9)]
 )
-def test_the_whole_graph_of_both_views_costs_at_most_what_was_promised(name, most):
+def test_the_whole_graph_of_both_views_takes_no_more_multiply_adds_than_promised(name, most):
     count = count_multiply_adds(untrained(name))
     assert count <= most
     assert f"{count / 1e9:.2f} G multiply-adds" in WeaveNet.__doc__
 
 
-def test_a_network_that_grows_answers_as_before_until_it_is_trained_on():
+def test_a_network_that_grows_gives_the_same_results_until_it_is_trained_further():
     torch.manual_seed(0)
     before = WeaveNet(replace(BASE, convolutions=(1, 2, 2, 2), propagation=0, refinement=2)).eval()
     grown = WeaveNet(BASE).eval()
@@ -59,8 +59,8 @@ def test_the_network_overfits_one_pair():
 
 
 def test_a_mirrored_pair_gives_mirrored_answers():
-    """Exactly so if the features are those of a mirror-symmetric encoder; training has to teach the rest."""
-    # In double precision rounding decides nothing between two levels that match as well.
+    """Use a mirror-symmetric encoder, with which the results are mirrored exactly."""
+    # In double precision, because rounding could decide between two levels that match equally well.
     network = untrained().double()
     with torch.no_grad():
         for layer in network.encoder.modules():
@@ -74,7 +74,7 @@ def test_a_mirrored_pair_gives_mirrored_answers():
     assert (left_px - right_px).abs().max() > 0.1
 
 
-def test_the_stages_hold_both_views_the_right_one_mirrored():
+def test_the_stages_hold_the_left_views_and_the_mirrored_right_views():
     network = untrained()
     pair = random_pair(2, 32, 64)
     with torch.no_grad():
@@ -86,9 +86,9 @@ def test_the_stages_hold_both_views_the_right_one_mirrored():
     assert stages.coarse_px.shape == (4, 1, 16, 32)
 
 
-def test_a_disparity_below_zero_comes_out_as_zero():
+def test_a_disparity_below_zero_becomes_zero():
     network = untrained()
-    # Half resolution's coarse estimate stays near 0 px, and the refinement takes 2 px off.
+    # The coarse estimate stays near 0 px, and the refinement subtracts 2 px at half resolution.
     torch.nn.init.zeros_(network.refinement.scores.weight)
     with torch.no_grad():
         network.aggregation.scores.bias[0] = 1e4
@@ -104,7 +104,7 @@ def test_forty_eight_levels_reach_192_px():
 
 
 @pytest.mark.parametrize("part", ["wider", "completion", "sharpening"])
-def test_each_stage_that_a_network_grows_by_adds_nothing_until_it_is_trained(part):
+def test_each_optional_stage_changes_nothing_until_it_is_trained(part):
     torch.manual_seed(0)
     before = WeaveNet(BASE).eval()
     grown = WeaveNet(replace(BASE, **{part: getattr(BASE_GROWN, part)})).eval()
@@ -116,12 +116,12 @@ def test_each_stage_that_a_network_grows_by_adds_nothing_until_it_is_trained(par
 
 
 def test_every_stage_of_a_grown_network_learns():
-    """In bfloat16 too, in which oneDNN's gradients of some convolutions are not finite."""
+    """Train in bfloat16, in which oneDNN's gradients of some convolutions are not finite."""
     torch.manual_seed(0)
     network = WeaveNet(BASE_GROWN).train()
     left, right = random_pair(2, 64, 96)
     truth_px = torch.full((4, 1, 64, 96), 9.0)
-    for _ in range(4):  # what is silent passes a gradient on once it has moved
+    for _ in range(4):  # a layer of zeros passes on a gradient only after its first step
         with torch.autocast("cpu", torch.bfloat16):
             stages = network.stages(left, right)
         terms = weave_losses(stages, truth_px, torch.zeros_like(truth_px, dtype=torch.bool))
@@ -137,7 +137,7 @@ def test_every_stage_of_a_grown_network_learns():
 
 
 def test_a_mirrored_pair_is_completed_and_sharpened_alike():
-    """Whatever the features are: the stages are shown each view with the other one in its own columns."""
+    """Use mirror-symmetric features; the stages receive each view with the other one in its own columns."""
     torch.manual_seed(0)
     network = WeaveNet(BASE_GROWN).eval().double()
     for layer in (network.completion.share, network.sharpening.scores):
@@ -155,7 +155,7 @@ def test_a_mirrored_pair_is_completed_and_sharpened_alike():
 
 
 def test_a_completion_takes_the_surface_that_its_affinities_point_to():
-    """A hole of 3 columns in a wall at 2: each pixel takes the one 8 columns to the left instead."""
+    """Complete a hole of 3 columns in a wall at 2, with affinities for the pixel 8 columns to the left."""
     torch.manual_seed(0)
     completion = Completion(quarter=4, channels=8).eval()
     disparity = torch.full((1, 1, 6, 24), 2.0)
