@@ -1,1 +1,1 @@
-"""Training data: collages, rendered pairs, datasets, batches."""
+"""Training data: collages, rendered pairs, datasets, and the batches made from them."""

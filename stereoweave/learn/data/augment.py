@@ -1,4 +1,4 @@
-"""Augmentation of a pair: crop, scale, mirror, recolour, erase patches."""
+"""Augmentation of pairs: crop, scale, mirror, recolour, and erase patches."""
 
 from dataclasses import replace
 
@@ -11,11 +11,11 @@ from stereoweave.stereo import Sample, StereoCamera
 
 
 def crop(sample: Sample, height: int, width: int, rng: np.random.Generator) -> Sample:
-    """Crop the sample at random, without scaling. Raises StereoweaveError if it is smaller than the crop."""
+    """Crop the sample at a random place, unscaled. Raises StereoweaveError if the crop is larger."""
     rows, columns = sample.disparity_px.shape
     if rows < height or columns < width:
         raise StereoweaveError(
-            f"crop_size = {[height, width]}: expected at most the pictures' {[rows, columns]}; "
+            f"crop_size = {[height, width]}, expected at most {[rows, columns]}, the size of the pictures; "
             "use a smaller crop"
         )
     top, start = int(rng.integers(rows - height + 1)), int(rng.integers(columns - width + 1))
@@ -39,7 +39,7 @@ def augment(
         width: Width of the crop in px.
         rng: Source of all draws.
         offset_share: Share of samples whose right crop is shifted to the right, by up to 14 % of the width.
-            Their disparity grows by as much, so that textureless surfaces are not always far.
+            Their disparity grows by the same amount, so textureless surfaces are not always far away.
     """
     offset = rng.uniform(0, _LARGEST_OFFSET) if offset_share and rng.random() < offset_share else 0.0
     sample = crop_and_scale(sample, height, width, rng, offset)
@@ -57,14 +57,14 @@ def augment(
 def crop_and_scale(
     sample: Sample, height: int, width: int, rng: np.random.Generator, offset: float = 0.0
 ) -> Sample:
-    """Crop the sample at random and scale the crop to height x width; disparity scales with it.
+    """Crop the sample at a random place and scale the crop to height x width; disparity scales with it.
 
     The right view's crop is shifted right by the share `offset` of its width, as far as the sample allows.
     """
     rows, columns = sample.disparity_px.shape
     smallest = max(height / rows, width / columns)
     scale = max(smallest, float(np.exp(rng.uniform(np.log(0.75), np.log(1.4)))))
-    # Height and width are stretched slightly differently, as by real cameras.
+    # Height and width are scaled slightly differently, as by cameras whose pixels are not square.
     stretch = float(np.exp(rng.uniform(-0.1, 0.1)))
     scale_y = max(scale * stretch, height / rows)
     part_height, part_width = min(round(height / scale_y), rows), min(round(width / scale), columns)
@@ -84,7 +84,7 @@ def crop_and_scale(
         )
 
     def nearest(values: np.ndarray) -> np.ndarray:
-        # Never average across an edge.
+        # An average across an edge would be the disparity of neither side.
         return cv2.resize(values, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
 
     def disparity_px(values: np.ndarray) -> np.ndarray:
@@ -104,9 +104,9 @@ def crop_and_scale(
 def crop_camera(
     camera: StereoCamera | None, start_px: int, top_px: int, scale_x: float = 1.0, scale_y: float = 1.0
 ) -> StereoCamera | None:
-    """The camera of a crop with this left column and top row, after scaling.
+    """Return the camera of a crop with this left column and top row, after scaling.
 
-    The focal length is the horizontal one, which determines depth.
+    Its focal length is the horizontal one, which determines depth.
     """
     return camera and replace(
         camera,
@@ -118,7 +118,7 @@ def crop_camera(
 
 
 def mirror(sample: Sample) -> Sample:
-    """The sample as seen in a mirror: the views swap."""
+    """Mirror the sample left to right, which swaps its views."""
     camera = sample.camera
     last = sample.left.shape[1] - 1
     return Sample(
@@ -133,7 +133,7 @@ def mirror(sample: Sample) -> Sample:
 
 
 def flip_rows(sample: Sample) -> Sample:
-    """The sample upside down."""
+    """Flip the sample upside down."""
     maps = {name: value[::-1] for name, value in vars(sample).items() if name != "camera"}
     camera, last = sample.camera, sample.left.shape[0] - 1
     return Sample(**maps, camera=camera and replace(camera, cy_px=last - camera.cy_px))

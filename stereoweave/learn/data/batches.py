@@ -1,4 +1,4 @@
-"""The batch of every step: which pairs it has, how they are cropped, collated and split."""
+"""Batches for training: how their pairs are chosen, cropped, collated and split."""
 
 import numpy as np
 import torch
@@ -15,8 +15,8 @@ from stereoweave.stereo import Sample
 class Batches(Dataset[dict[str, torch.Tensor]]):
     """The batch of every step, or one rank's share of it.
 
-    A micro-batch depends only on (seed, step, its index in the step), not on who requests it or in what
-    order.
+    A micro-batch depends only on the seed, the step and its index in the step, not on the process that
+    requests it or on the order of the requests.
     """
 
     def __init__(self, recipe: Recipe, pairs: PairSource, rank: ProcessRank | None = None) -> None:
@@ -37,27 +37,27 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
         )
 
     def key(self, step: int, part: int) -> tuple[int, ...]:
-        """Seed of a micro-batch's draws.
+        """Return the seed of a micro-batch's random draws.
 
-        Trailing zeros do not change a seed: the first micro-batch has the draws of (seed, step), as a step
-        had before it was split into micro-batches. The last number is even because odd ones seed the orders
-        of pairs and sets.
+        Trailing zeros do not change a seed, so the first micro-batch has the draws of (seed, step), like a
+        whole step before there were micro-batches. The last number is even, because odd numbers seed the
+        order of pairs and sets.
         """
         return self.recipe.seed, step, 0, 2 * part
 
     def list_pairs(self, step: int) -> list[int]:
-        """Indices of a step's pairs. Every pair of a set comes once before any comes again."""
+        """Return the indices of a step's pairs. Every pair of a set is drawn once before any is repeated."""
         first, end = step * self.recipe.batch, (step + 1) * self.recipe.batch
         while len(self._drawn) < end:
             self._draw(2 * len(self._drawn) + end)
         return [self._index(int(self._drawn[i]), int(self._turns[i])) for i in range(first, end)]
 
     def names(self, step: int) -> list[str]:
-        """Names of a step's pairs for error messages."""
+        """Return the names of a step's pairs, for error messages."""
         return [self.pairs.name(index) for index in self.list_pairs(step)]
 
     def _draw(self, places: int) -> None:
-        """Draw the set of each of the first `places` pairs, and count its earlier draws."""
+        """Draw the set of each of the first `places` pairs, and count the earlier draws of that set."""
         self._drawn = self.mix.draw_sets(places, np.random.default_rng((self.recipe.seed, 0, 0, 1)))
         self._turns = np.zeros(places, np.int64)
         for which in range(len(self.mix.sets)):
@@ -72,7 +72,7 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
         return [crop(sample, *size, rng) for sample in samples]
 
     def _index(self, which: int, turn: int) -> int:
-        """Index of the pair of set `which` at its draw number `turn`, counted from 0."""
+        """Return the index of the pair that draw number `turn`, counted from 0, takes from set `which`."""
         one = self.mix.sets[which]
         epoch, place = divmod(turn, one.count)
         rng = np.random.default_rng((self.recipe.seed, epoch, 1 + which))
@@ -81,7 +81,7 @@ class Batches(Dataset[dict[str, torch.Tensor]]):
 
 
 class CaughtBatches(Dataset[dict[str, torch.Tensor] | StereoweaveError]):
-    """The batches, with errors as values.
+    """Batches that return errors as values instead of raising them.
 
     An error raised in the loader's process would arrive with PyTorch's traceback as its message.
     """
@@ -102,15 +102,17 @@ def read_known(pairs: PairSource, index: int) -> Sample:
     if not np.isfinite(sample.disparity_px).any():
         raise StereoweaveError(
             f"{pairs.name(index)}: expected at least one pixel of known disparity, found none; "
-            "remove it from the dataset"
+            "remove the pair from the dataset"
         )
     return sample
 
 
 def collate(samples: list[Sample]) -> dict[str, torch.Tensor]:
-    """Collate samples: images [B, 3, H, W] in 0..1; maps [2B, 1, H, W], left views, then mirrored right ones.
+    """Collate samples into a batch, a dictionary of tensors.
 
-    If every sample has a camera, also `focal_baseline_px_m` and `doffs_px`, [B, 1, 1, 1].
+    Images are [B, 3, H, W] in 0..1. Maps are [2B, 1, H, W]: those of the left views, then the mirrored maps
+    of the right views. If every sample has a camera, the batch also has `focal_baseline_px_m` and `doffs_px`,
+    both [B, 1, 1, 1].
 
     Raises:
         StereoweaveError: The samples differ in size.
@@ -118,8 +120,8 @@ def collate(samples: list[Sample]) -> dict[str, torch.Tensor]:
     sizes = sorted({sample.left.shape[:2] for sample in samples})
     if len(sizes) > 1:
         raise StereoweaveError(
-            f"a batch: expected pairs of one size, found {' and '.join(f'{w}x{h}' for h, w in sizes)}; "
-            "crop them to one crop_size"
+            f"batch: expected pairs of one size, found {' and '.join(f'{w}x{h}' for h, w in sizes)}; "
+            "crop them to the same crop_size"
         )
 
     def images(side: str) -> torch.Tensor:

@@ -1,7 +1,7 @@
 """Endless training pairs: collages of flat, slanted and bent surfaces, painted into both views.
 
-Natural textures and a wide range of disparities matter more for photographs than realistic geometry. Still,
-disparity and occlusion are exact in both views.
+For accuracy on photographs, natural textures and a wide range of disparities matter more than realistic
+geometry. Disparity and occlusion are nevertheless exact in both views.
 """
 
 from collections.abc import Callable
@@ -17,11 +17,11 @@ from stereoweave.learn.data.paint_kernels import Sheet, colour, cover, expose, f
 from stereoweave.learn.data.textures import LIGHT_MAPS, draw_natural_colour, make_light_map
 from stereoweave.stereo import Sample
 
-CLEAN_SHARE = 0.25  # pairs without any photometric difference
-FAULTY_SHARE = 0.03  # pairs with the faults of bad cameras
-NOISE_SHARE = 0.02  # training pairs of plain noise
-SHIFTED_APART_SHARE = 0.04  # training pairs with partly negative disparities
-NOTHING_PX = -1000.0  # disparity of pixels without any match; below 0 however the views are shifted
+CLEAN_SHARE = 0.25  # of pairs, without any photometric difference
+FAULTY_SHARE = 0.03  # of pairs, with the faults of poor cameras
+NOISE_SHARE = 0.02  # of training pairs, which show nothing but noise
+SHIFTED_APART_SHARE = 0.04  # of training pairs, with partly negative disparities
+NOTHING_PX = -1000.0  # disparity of pixels without any match; stays below 0 under any shift of the views
 LEVELS = np.arange(1021, dtype=np.float32) / 4  # grey levels that a tone curve distinguishes
 
 
@@ -37,21 +37,21 @@ class PaintedView:
 
 
 def paint_collage(seed: int, epoch: int, index: int, height: int = 256, width: int = 384) -> Sample:
-    """Paint the mixed collage of this index, with exact disparity and occlusion for both views.
+    """Paint the mixed collage with this index, with exact disparity and occlusion for both views.
 
     The same arguments give the same pair in every process. Disparities are finite and >= 0. The first call
-    builds the textures, which takes some seconds.
+    builds the textures, which takes a few seconds.
     """
     rng = np.random.default_rng((seed, epoch, index))
     return _make_sample(rng, *_paint_matchable(rng, draw_scene, height, width))
 
 
 def paint_training_collage(seed: int, epoch: int, index: int, height: int = 256, width: int = 384) -> Sample:
-    """Paint a collage of any kind, in the format of `paint_collage`; 6 % of pairs train only the confidence.
+    """Paint a collage of any kind, in the format of `paint_collage`.
 
-    Their disparities are partly or all below 0, where a network that clamps at 0 cannot find them. Either the
-    crops of both views are shifted apart, with exact disparities of both signs, or both views are plain noise
-    and all disparities are NOTHING_PX.
+    6 % of the pairs train only the confidence. Some or all of their disparities are below 0, where a network
+    that clamps at 0 cannot find them. Either the crops of both views are shifted apart, with exact
+    disparities of both signs, or both views are plain noise, with NOTHING_PX as disparity.
     """
     rng = np.random.default_rng((seed, epoch, index, 1))
     kind = rng.random()
@@ -69,7 +69,7 @@ def _paint_matchable(
     height: int,
     width: int,
 ) -> tuple[PaintedView, PaintedView]:
-    """Paint both views of random scenes until one has enough to match."""
+    """Paint both views of random scenes until a scene has enough contrast and few enough occlusions."""
     while True:
         left, right = paint_scene(draw(rng, height, width))
         occluded, right_occluded = _find_occlusions(left, right)
@@ -102,7 +102,7 @@ def _make_sample(rng: np.random.Generator, left: PaintedView, right: PaintedView
 def _crop_apart(
     rng: np.random.Generator, left: PaintedView, right: PaintedView, width: int
 ) -> tuple[PaintedView, PaintedView]:
-    """Crop both views to `width`, the left one so far to the right that many disparities are below 0."""
+    """Crop both views to `width`, the left one far enough to the right that many disparities are below 0."""
     spare = left.image.shape[1] - width
     start = int(np.clip(np.ceil(np.quantile(left.disparity_px, rng.uniform(0.1, 0.7))), 1, spare))
 
@@ -116,7 +116,7 @@ def _crop_apart(
 
 
 def _paint_plain_noise(rng: np.random.Generator, height: int, width: int) -> Sample:
-    """Two views of one colour under smooth light, each with its own sensor noise."""
+    """Paint two views of a single colour under smooth light, each with its own sensor noise."""
     light = 1 + rng.uniform(0, 0.3) * (make_light_map(int(rng.integers(LIGHT_MAPS))) - 1)
     shown = (
         draw_natural_colour(rng)
@@ -138,7 +138,7 @@ def _paint_plain_noise(rng: np.random.Generator, height: int, width: int) -> Sam
 
 
 def paint_scene(scene: CollageScene) -> tuple[PaintedView, PaintedView]:
-    """Paint both views of a scene, left and right, as ideal cameras see it."""
+    """Paint the left and right views of a scene, as ideal cameras see it."""
     left_sheets = [layer.sheet() for layer in scene.layers]
     right_sheets = [warp_to_right(sheet, scene.width) for sheet in left_sheets]
     return _paint_view(scene, left_sheets, 0), _paint_view(scene, right_sheets, 1)
@@ -159,7 +159,7 @@ def simulate_cameras(
     rng: np.random.Generator, left: Float[np.ndarray, "h w 3"], right: Float[np.ndarray, "h w 3"]
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
     """Simulate two real cameras: slight differences in height, sharpness, tone and noise."""
-    # A separate generator, so that pairs without faults are the same as before faults were added.
+    # A separate generator: pairs without faults stay the same as before faults were introduced.
     fault_rng = rng.spawn(1)[0]
     if fault_rng.random() < FAULTY_SHARE:
         left, right = _add_faults(fault_rng, left, right)
@@ -168,7 +168,8 @@ def simulate_cameras(
         return expose(left, plain, still, left), expose(right, plain, still, right)
     if rng.random() < 0.33:
         right = _shift_down(right, rng.uniform(-0.5, 0.5))
-    # One pair in six has clearly different exposures; the others differ like two cameras of one model.
+    # One pair in six has clearly different exposures; in the others they differ as between two cameras of the
+    # same model.
     spread = 0.2 if rng.random() < 0.17 else 0.04
     noise_level = float(np.exp(rng.uniform(np.log(0.2), np.log(5)))) if rng.random() < 0.75 else 0.0
     blur_share = 0.5 if rng.random() < 0.4 else 0.0
@@ -197,12 +198,12 @@ def _add_faults(rng: np.random.Generator, left: View, right: View) -> tuple[View
 
 
 def _misalign_rows(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
-    """Shift the cameras one or two rows apart in height."""
+    """Shift the right view up or down by one or two rows."""
     return left, _shift_down(right, rng.choice([-1, 1]) * rng.uniform(0.8, 2))
 
 
 def _blur_one(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
-    """Defocus one lens."""
+    """Blur one of the views, like a defocused lens."""
     deviation_px, which = rng.uniform(0.7, 1.6), rng.integers(2)
     if which:
         return left, cv2.GaussianBlur(right, (0, 0), deviation_px)
@@ -210,13 +211,13 @@ def _blur_one(rng: np.random.Generator, left: View, right: View) -> tuple[View, 
 
 
 def _darken_corners(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
-    """Apply different vignetting to each lens."""
+    """Darken the corners of both views by different vignetting."""
     own, other = (_make_vignette(left.shape[0], left.shape[1], rng.uniform(0.2, 0.7)) for _ in range(2))
     return left * own, right * other
 
 
 def _interpolate_colours(rng: np.random.Generator, left: View, right: View) -> tuple[View, View]:
-    """Apply Bayer interpolation to one or both cameras."""
+    """Apply Bayer interpolation to one or both views."""
     which = rng.integers(3)
     return left if which == 1 else demosaic(left), right if which == 2 else demosaic(right)
 

@@ -1,4 +1,4 @@
-"""Kinds of collages: mixed objects, near textureless boards, streets, and film shots."""
+"""Kinds of collages: mixed objects, textureless planes close to the camera, streets, and film shots."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ NETWORK_REACH_PX = 188  # largest disparity that a network can find
 
 @dataclass(frozen=True, kw_only=True)
 class CollageCanvas:
-    """The area in which layers are drawn, from the views' size in px and the scene's largest disparity."""
+    """The area in which layers are drawn, from the size of the views and the largest disparity in px."""
 
     view_width: int
     height: int
@@ -42,24 +42,24 @@ class CollageCanvas:
 
     @property
     def width(self) -> int:
-        """Columns of the left view, plus those to its right that only the right camera sees."""
+        """Number of columns of the left view and of the area to its right that only the right camera sees."""
         return self.view_width + int(np.ceil(self.limit_px)) + 2
 
     def whole(self) -> Placement:
-        """Placement over the whole canvas."""
+        """Return the placement that covers the whole canvas."""
         return Placement(self.width / 2, self.height / 2, self.width / 2, self.width, self.height)
 
     def place(self, x: float, y: float, radius_px: float) -> Placement:
-        """Placement at a point of the canvas."""
+        """Return a placement at a point of the canvas."""
         return Placement(x, y, radius_px, self.width, self.height)
 
     def anywhere(self, rng: np.random.Generator, smallest: float, largest: float) -> Placement:
-        """Random placement; its half extent is log-uniform between these shares of the width."""
+        """Draw a placement whose half extent is log-uniform between these shares of the width."""
         radius_px = self.width * float(np.exp(rng.uniform(np.log(smallest), np.log(largest))))
         return self.place(rng.uniform(0, self.width), rng.uniform(0, self.height), radius_px)
 
     def between(self, far_px: float, nearness: float) -> float:
-        """Disparity at a nearness of 0 (far_px) to 1 (the scene's largest disparity)."""
+        """Return the disparity at a nearness of 0 (far_px) to 1 (the scene's largest disparity)."""
         return far_px + (self.limit_px - far_px) * nearness
 
 
@@ -69,7 +69,7 @@ Kind = Callable[[np.random.Generator, CollageCanvas], list[CollageLayer]]
 def draw_scene(rng: np.random.Generator, height: int, width: int) -> CollageScene:
     """Draw a mixed scene, as used for validation.
 
-    Its largest disparity is log-uniform, mostly 10 to 110 px of 384, at times 6 to 188.
+    Its largest disparity is log-uniform: mostly 10 to 110 px, sometimes 6 to 188 px, for views 384 px wide.
     """
     low, high = (10, 110) if rng.random() < 0.7 else (6, 190)
     limit_px = float(np.exp(rng.uniform(np.log(low), np.log(high)))) * width / 384
@@ -79,10 +79,11 @@ def draw_scene(rng: np.random.Generator, height: int, width: int) -> CollageScen
 def draw_training_scene(rng: np.random.Generator, height: int, width: int) -> CollageScene:
     """Draw a scene of any kind, with a wider baseline than for validation.
 
-    Its largest disparity is log-uniform, mostly 22 to 175 px, at times 6 to 188; less below 384 columns.
+    Its largest disparity is log-uniform: mostly 22 to 175 px, sometimes 6 to 188 px. It is proportionally
+    smaller in views that are less than 384 px wide.
     """
     low, high = (22, 175) if rng.random() < 0.7 else (6, NETWORK_REACH_PX)
-    # Wider views show more of a scene, not larger disparities: the network's range is limited.
+    # Wider views show more of a scene, not larger disparities, because the network's range is limited.
     limit_px = float(np.exp(rng.uniform(np.log(low), np.log(high)))) * min(width / 384, 1)
     kind = list(KINDS)[rng.choice(len(KINDS), p=list(KINDS.values()))]
     return _draw(rng, kind, height, width, limit_px)
@@ -96,14 +97,14 @@ def _draw(rng: np.random.Generator, kind: Kind, height: int, width: int, limit_p
 
 
 def draw_mixed(rng: np.random.Generator, canvas: CollageCanvas) -> list[CollageLayer]:
-    """Draw one or two backgrounds, objects, and in half of the scenes bunches of rods."""
+    """Draw one or two backgrounds, objects and, in half of the scenes, bunches of rods."""
     far_px = rng.uniform(0, 1) if rng.random() < 0.1 else canvas.limit_px * rng.uniform(0.08, 0.5)
     layers = _draw_backgrounds(rng, canvas, far_px)
     bunches = int(rng.integers(1, 5)) if rng.random() < 0.5 else 0
     for k in range(rng.integers(6, 25)):
         thin = k < bunches
         place = canvas.anywhere(rng, 0.07 if thin else 0.012, 0.6)
-        # Large objects tend to be in the back and rods in front, so that little is hidden.
+        # Large objects tend to be in the back and rods in front, so that little is occluded.
         nearness = rng.random() ** (0.8 if thin else 1 + 3 * place.radius_px / canvas.view_width)
         patch = draw_rods(rng, place) if thin else draw_shape(rng, place)
         layers.append(draw_layer(rng, patch, place, canvas.between(far_px, nearness), canvas.limit_px))
@@ -124,9 +125,12 @@ def _draw_floor(
     least_rise: float,
     paint: Callable[[np.random.Generator, Placement], Paint],
 ) -> CollageLayer:
-    """Draw a plane below a horizon with disparity start_px; it rises by a share of the remaining range."""
+    """Draw a floor that starts at a horizon of disparity start_px.
+
+    Its disparity rises towards the bottom by a random share of the remaining range.
+    """
     horizon, tilt = rng.uniform(0.3, 0.8) * canvas.height, rng.normal(0, 0.1)
-    # Its disparity is constant along the horizon.
+    # The floor's disparity is constant along the horizon.
     rise = rng.uniform(least_rise, 1.0) * (canvas.limit_px - start_px) / (canvas.height - horizon)
     slope, middle_x = min(rise, PLANE_SLOPE), canvas.width / 2
     return CollageLayer(
@@ -139,7 +143,7 @@ def _draw_floor(
 
 
 def draw_boards(rng: np.random.Generator, canvas: CollageCanvas) -> list[CollageLayer]:
-    """Draw near textureless planes larger than a crop, with objects before and behind them."""
+    """Draw textureless planes, close to the camera and larger than a crop, with objects around them."""
     far_px = canvas.limit_px * rng.uniform(0.05, 0.4)
     layers = _draw_backgrounds(rng, canvas, far_px)
     for _ in range(rng.integers(2, 9)):
@@ -153,7 +157,7 @@ def draw_boards(rng: np.random.Generator, canvas: CollageCanvas) -> list[Collage
 
 
 def _draw_plain_plane(rng: np.random.Generator, canvas: CollageCanvas, far_px: float) -> CollageLayer:
-    """Draw a board (one half), a table (one quarter) or a wall (one quarter)."""
+    """Draw a plain board, table or wall, with probabilities of 1/2, 1/4 and 1/4."""
     kind = rng.random()
     if kind < 0.25:
         return _draw_floor(rng, canvas, canvas.between(far_px, rng.uniform(0.1, 0.6)), 0.5, draw_plain_paint)
@@ -182,7 +186,7 @@ def _draw_attached(
 def _draw_objects_before(
     rng: np.random.Generator, canvas: CollageCanvas, plain: CollageLayer
 ) -> list[CollageLayer]:
-    """Draw objects before or on the plane, and in half of the scenes a pillar that splits it."""
+    """Draw objects on or in front of the plane and, in half of the scenes, a pillar that splits it."""
     places = [canvas.anywhere(rng, 0.02, 0.2) for _ in range(rng.integers(1, 6))]
     patches = [draw_shape(rng, place) for place in places]
     if rng.random() < 0.5:
@@ -216,7 +220,7 @@ def draw_street(rng: np.random.Generator, canvas: CollageCanvas) -> list[Collage
 
 
 def _draw_sky(rng: np.random.Generator, canvas: CollageCanvas) -> CollageLayer:
-    """Draw a textureless sky, in two fifths of the streets with clouds."""
+    """Draw a sky, which has clouds in two fifths of the streets and is textureless in the others."""
     bright = rng.uniform(120, 245) * np.array([rng.uniform(0.6, 1), rng.uniform(0.8, 1), 1.0])
     clouded = rng.random() < 0.4
     paint = (
@@ -238,7 +242,7 @@ def _draw_ground(rng: np.random.Generator, canvas: CollageCanvas, ground: Collag
 def _draw_markings(
     rng: np.random.Generator, canvas: CollageCanvas, ground: CollageSurface
 ) -> list[CollageLayer]:
-    """Draw strips on the ground towards a vanishing point, solid or dashed."""
+    """Draw solid or dashed strips on the ground that converge at a vanishing point."""
     middle_x, horizon = ground.plane[3:]
     layers = []
     for _ in range(rng.integers(0, 5)):
@@ -260,7 +264,7 @@ def _draw_markings(
 def _draw_upright(
     rng: np.random.Generator, canvas: CollageCanvas, ground: CollageSurface, nearness: float, tallness: float
 ) -> CollageLayer:
-    """Draw an object at the disparity of its foot; `tallness` is its height in camera heights."""
+    """Draw an upright object with the disparity of its foot; `tallness` is its height in camera heights."""
     horizon = ground.plane[4]
     height = nearness * (canvas.height - horizon)
     foot_x, foot_y = rng.uniform(0, canvas.width), horizon + height
@@ -299,7 +303,10 @@ def _draw_facade(
 
 
 def draw_film(rng: np.random.Generator, canvas: CollageCanvas) -> list[CollageLayer]:
-    """Draw focused figures far before an unfocused background, in a third of scenes past a near object."""
+    """Draw focused figures far in front of an unfocused background.
+
+    In a third of the scenes, an unfocused object is close to the camera.
+    """
     far_px = canvas.limit_px * rng.uniform(0.02, 0.25)
     layers = [_draw_unfocused(rng, canvas, _cover_canvas(canvas), canvas.whole(), far_px)]
     for _ in range(rng.integers(1, 5)):
@@ -322,7 +329,7 @@ def _draw_unfocused(
 
 
 def _draw_figure(rng: np.random.Generator, canvas: CollageCanvas, level_px: float) -> list[CollageLayer]:
-    """Draw a large smooth object with few details on its surface."""
+    """Draw a large object, mostly plain, with a few details on its surface."""
     place = canvas.anywhere(rng, 0.12, 0.4)
     smooth = rng.random() < 0.6
     body = draw_layer(rng, draw_shape(rng, place), place, level_px, canvas.limit_px)

@@ -20,13 +20,13 @@ from stereoweave.learn.data.textures import (
 
 PLANE_SLOPE = 0.3  # px of disparity per px: steeper surfaces are rare and nearly edge-on to one camera
 BEND_SLOPE = 0.25  # bends add to the plane; the sum stays below 0.6, so that every surface faces both cameras
-RELIEF = 0.3  # largest variation of one surface, approximately, as a share of the scene's largest disparity
+RELIEF = 0.3  # approximate largest variation of a surface, as a share of the scene's largest disparity
 
 
 def draw_layer(
     rng: np.random.Generator, patch: Patch, place: Placement, level_px: float, limit_px: float
 ) -> CollageLayer:
-    """Draw a layer with any surface and paint."""
+    """Draw a layer with a random surface and a random paint."""
     return CollageLayer(
         patch=patch,
         surface=draw_surface(rng, place, level_px, limit_px),
@@ -37,7 +37,7 @@ def draw_layer(
 def draw_plane(
     rng: np.random.Generator, place: Placement, level_px: float, limit_px: float
 ) -> CollageSurface:
-    """Draw a plane with this disparity at its centre; one in five faces the camera."""
+    """Draw a plane with this disparity at its centre; one plane in five faces the camera."""
     slope = min(PLANE_SLOPE, RELIEF * limit_px / place.radius_px)
     flat = rng.random() < 0.2
     slope_x, slope_y = (0.0, 0.0) if flat else (slope * rng.triangular(-1, 0, 1, 2)).tolist()
@@ -47,7 +47,7 @@ def draw_plane(
 def draw_surface(
     rng: np.random.Generator, place: Placement, level_px: float, limit_px: float
 ) -> CollageSurface:
-    """Draw a plane, bent in half of the layers."""
+    """Draw a surface, which is a plane in half of the layers and bent in the others."""
     plane = draw_plane(rng, place, level_px, limit_px).plane
     relief_px = RELIEF * limit_px
     waves, hills = [], []
@@ -69,7 +69,7 @@ def draw_surface(
 
 
 def draw_paint(rng: np.random.Generator, place: Placement) -> Paint:
-    """Draw a lit texture of any kind and colour, almost textureless in a fifth of the layers."""
+    """Draw a lit texture of a random kind and colour, almost without contrast in a fifth of the layers."""
     texture, count = (
         (make_periodic, PERIODIC_TEXTURES) if rng.random() < 0.12 else (make_natural, NATURAL_TEXTURES)
     )
@@ -88,7 +88,7 @@ def draw_paint(rng: np.random.Generator, place: Placement) -> Paint:
 def draw_plain_paint(
     rng: np.random.Generator, place: Placement, colour: Float[np.ndarray, "3"] | None = None
 ) -> Paint:
-    """Draw a nearly plain paint: a colour, at most 3 % of a texture's contrast, nearly even light."""
+    """Draw a nearly plain paint: one colour, at most 3 % of a texture's contrast, and nearly even light."""
     paint = draw_paint(rng, place)
     contrast = rng.uniform(0, 0.03) if rng.random() < 0.7 else 0.0
     light = 1 + rng.uniform(0, 0.35) * (paint.light - 1)
@@ -97,7 +97,7 @@ def draw_plain_paint(
 
 
 def draw_unfocused_paint(rng: np.random.Generator, place: Placement) -> Paint:
-    """Draw a texture out of focus: without detail finer than 8 to 32 px."""
+    """Draw an out-of-focus texture, without detail finer than 8 to 32 px."""
     paint = draw_paint(rng, place)
     texels, side = int(SIDE / rng.uniform(8, 32)), SIDE // 2
     small = cv2.resize(paint.texture, (texels, texels), interpolation=cv2.INTER_AREA)
@@ -106,7 +106,7 @@ def draw_unfocused_paint(rng: np.random.Generator, place: Placement) -> Paint:
 
 
 def _draw_mapping(rng: np.random.Generator, texels_per_px: float, side: int) -> Float[np.ndarray, "2 3"]:
-    # In photographs most uprights stay upright.
+    # Most vertical structures are vertical in photographs too.
     turn = rng.normal(0, 0.1) if rng.random() < 0.5 else rng.uniform(0, 2 * np.pi)
     cosine, sine = texels_per_px * np.cos(turn), texels_per_px * np.sin(turn)
     shift = rng.uniform(0, 2 * side, 2)
@@ -114,7 +114,7 @@ def _draw_mapping(rng: np.random.Generator, texels_per_px: float, side: int) -> 
 
 
 def _draw_recolouring(rng: np.random.Generator) -> Float[np.ndarray, "3 4"]:
-    """Draw a colour transform: almost textureless in a fifth of the layers, else gain, tint and hue."""
+    """Draw a colour transform, which removes most contrast in a fifth of the layers."""
     if rng.random() < 0.2:
         return _reduce_contrast(rng.uniform(0.01, 0.08), draw_natural_colour(rng))
     gain = np.exp(rng.normal(0, 0.25) + rng.normal(0, 0.1, 3))
@@ -130,7 +130,7 @@ def _reduce_contrast(contrast: float, colour: Float[np.ndarray, "3"]) -> Float[n
 
 
 def _draw_gloss(rng: np.random.Generator, place: Placement) -> Float[np.ndarray, "6"]:
-    """Draw a highlight on a fifth of the layers; in the right view it shifts by up to 8 px on the surface."""
+    """Draw a highlight on a fifth of the layers; it shifts by up to 8 px on the surface in the right view."""
     if rng.random() < 0.8:
         return np.zeros(6, np.float32)
     x, y = rng.normal([place.x, place.y], place.radius_px / 2)

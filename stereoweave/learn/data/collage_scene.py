@@ -1,4 +1,4 @@
-"""A collage's parts: layers of painted surfaces within silhouettes."""
+"""Parts of a collage: layers of painted surfaces within silhouettes."""
 
 from dataclasses import dataclass
 
@@ -11,11 +11,11 @@ from stereoweave.learn.data.silhouettes import Patch
 
 @dataclass(frozen=True, kw_only=True)
 class CollageSurface:
-    """Disparity over left-image x, y: a sum of products of functions of x and of y, clamped to 0..limit_px.
+    """Disparity as a function of left-image x and y: plane, waves and hills, clamped to 0..limit_px.
 
     Attributes:
-        plane: Disparity at the centre, its slopes along x and y, the centre's x and y.
-        waves: Rows of amplitude_px, angular frequencies along x and y, phase.
+        plane: Disparity at the centre, its slopes along x and y, and the centre's x and y.
+        waves: Rows of amplitude_px, angular frequencies along x and y, and phase.
         hills: Rows of height_px, centre x and y, inverse radii along x and y (0: a ridge, as on a cylinder).
         limit_px: Largest disparity of the scene.
     """
@@ -26,12 +26,12 @@ class CollageSurface:
     limit_px: float
 
     def plane_px(self, x: float, y: float) -> float:
-        """Disparity at a point, without waves and hills."""
+        """Return the disparity at a point, without waves and hills."""
         level, slope_x, slope_y, centre_x, centre_y = self.plane
         return min(max(level + slope_x * (x - centre_x) + slope_y * (y - centre_y), 0.0), self.limit_px)
 
     def over(self, patch: Patch) -> Float[np.ndarray, "h w"]:
-        """Disparity float32 at each pixel of the patch."""
+        """Return the disparity at each pixel of the patch, float32."""
         x = np.arange(patch.field.shape[1], dtype=np.float32) + patch.left
         y = np.arange(patch.field.shape[0], dtype=np.float32) + patch.top
         level, slope_x, slope_y, centre_x, centre_y = self.plane
@@ -57,7 +57,7 @@ class CollageLayer:
     paint: Paint
 
     def sheet(self) -> Sheet:
-        """The layer as the left camera sees it."""
+        """Return the layer as the left camera sees it."""
         return Sheet(self.patch.field, self.surface.over(self.patch), self.patch.left, self.patch.top)
 
 

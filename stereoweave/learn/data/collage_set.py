@@ -1,4 +1,4 @@
-"""Collages as a set on disk, in the shards of rendered sets, for `stereoweave bench pairs`."""
+"""Collages as a set on disk, in the same shards as rendered sets, for `stereoweave bench pairs`."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,12 +16,12 @@ _PAIRS_A_SHARD = 50
 
 
 def write_collages(out: Path, pairs: int, seed: int, size_px: tuple[int, int]) -> None:
-    """Write the first `pairs` collages of a seed, epoch 0, as shards.
+    """Write `pairs` collages as shards: the first ones of epoch 0 with the given seed.
 
     Args:
         out: The folder, new or empty.
         pairs: Number of pairs.
-        seed: `sources.VALIDATION_SEED` gives the validation pairs of trainings.
+        seed: Seed of the collages; `sources.VALIDATION_SEED` gives the pairs that trainings validate on.
         size_px: Height and width.
 
     Raises:

@@ -1,7 +1,7 @@
 """Kernels that paint collages: distance fields of silhouettes, blending of layers, occlusion.
 
 A layer is defined over left-image columns and rows, as a `Sheet`. Its disparity is linear between columns,
-so that warping to the right view is exact.
+so warping to the right view is exact.
 """
 
 import math
@@ -12,16 +12,16 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numba import njit
 
-REACH_PX = 2.0  # beyond it a pixel is clearly inside or outside, even halfway between two columns
+REACH_PX = 2.0  # at this distance a pixel is clearly inside or outside, even halfway between two columns
 
 
 class Sheet(NamedTuple):
-    """A layer as seen in one view, from column `left` and row `top` on.
+    """A layer as seen in one view, starting at column `left` and row `top`.
 
     Attributes:
         field: Float32 [h, w], signed distance in px to the silhouette, positive inside, clamped to
-            +-REACH_PX. Coverage of a pixel is field + 0.5, clamped to 0..1; disparity is defined where field
-            >= 0.
+            +-REACH_PX. Coverage of a pixel is field + 0.5, clamped to 0..1; disparity is defined where the
+            field is >= 0.
         disparity_px: Float32 [h, w].
     """
 
@@ -32,7 +32,7 @@ class Sheet(NamedTuple):
 
 
 class Paint(NamedTuple):
-    """A layer's appearance. All mappings start from left-image x, y; all but the texture are float32.
+    """A layer's appearance. Coordinates x, y are of the left image; all arrays but the texture are float32.
 
     Attributes:
         texture: uint8 RGB, tiled by mirroring.
@@ -54,7 +54,7 @@ class Paint(NamedTuple):
 def draw_outline_field(
     contours: tuple[Float[np.ndarray, "_ 2"], ...], left: int, top: int, shape: tuple[int, int]
 ) -> Float[np.ndarray, "h w"]:
-    """Signed distance in px, float32, to closed contours (x, y) filled by the even-odd rule."""
+    """Return the signed distance in px, float32, to closed contours (x, y) filled by the even-odd rule."""
     field = np.full(shape, -REACH_PX, np.float32)
     crossings = np.zeros(shape, np.uint8)
     for contour in contours:
@@ -68,7 +68,7 @@ def draw_outline_field(
 def draw_stroke_field(
     strokes: tuple[tuple[Float[np.ndarray, "_ 2"], float], ...], left: int, top: int, shape: tuple[int, int]
 ) -> Float[np.ndarray, "h w"]:
-    """Signed distance in px, float32, to polylines (x, y), each with its half width in px."""
+    """Return the signed distance in px, float32, to polylines (x, y), each with its half width in px."""
     field = np.full(shape, -REACH_PX, np.float32)
     for points, half_width_px in strokes:
         _stroke(field, points - (left, top), half_width_px)
@@ -78,7 +78,7 @@ def draw_stroke_field(
 def sum_surface(
     columns: Float[np.ndarray, "k w"], rows: Float[np.ndarray, "k h"], limit_px: float
 ) -> Float[np.ndarray, "h w"]:
-    """Disparity float32: the sum of products rows[k, y] * columns[k, x], clamped to 0..limit_px."""
+    """Return a disparity, float32, as the sum of rows[k, y] * columns[k, x], clamped to 0..limit_px."""
     return _sum_surface(columns, rows, limit_px)
 
 
@@ -89,7 +89,11 @@ def warp_to_right(sheet: Sheet, width: int) -> Sheet:
 
 
 def cover(sheet: Sheet, nearest: Float[np.ndarray, "h w"], nearest_opaque: Float[np.ndarray, "h w"]) -> None:
-    """Raise `nearest` where the sheet is nearer and covers half a pixel, `nearest_opaque` where all of it."""
+    """Update the disparity of the nearest sheet at each pixel with another sheet, in place.
+
+    `nearest` is raised where the sheet is nearer and covers at least half of the pixel. `nearest_opaque` is
+    raised where the sheet is nearer and covers the whole pixel.
+    """
     _cover(sheet, nearest, nearest_opaque)
 
 
@@ -102,7 +106,7 @@ def colour(
 ) -> None:
     """Blend the sheet's colours into the float32 image (0..255) where no opaque sheet is nearer.
 
-    side is 0 in the left view and 1 in the right one: column x shows column x + side * disparity_px of the
+    `side` is 0 in the left view and 1 in the right one: column x shows column x + side * disparity_px of the
     left image.
     """
     _colour(image, sheet, paint, nearest_opaque, side)
@@ -111,7 +115,7 @@ def colour(
 def find_occluded(
     disparity_px: Float[np.ndarray, "h w"], other_px: Float[np.ndarray, "h w"], sign: int
 ) -> Bool[np.ndarray, "h w"]:
-    """Pixels whose match, at sign * disparity, is outside the other view or behind its surface.
+    """Find pixels whose match, at sign * disparity, is outside the other view or behind its surface.
 
     Args:
         disparity_px: This view's disparity, known everywhere.
@@ -127,7 +131,7 @@ def expose(
     deviation: Float[np.ndarray, "3 1021"],
     noise: Float[np.ndarray, "h w 3"],
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Apply a tone curve per channel and noise to the image (0..255), and round.
+    """Apply a tone curve per channel to the image, add noise, and round.
 
     Args:
         image: float32, 0..255.
@@ -257,7 +261,7 @@ def _fold(position, last):
 @njit(cache=True, nogil=True)
 @typing.no_type_check
 def _place(mapping, x, y, map_height, map_width):
-    # Column, row, and fractions towards the next ones.
+    # Returns column, row, and the fractions towards the next column and row.
     u, across = _fold(mapping[0, 0] * x + mapping[0, 1] * y + mapping[0, 2], map_width - 1)
     v, down = _fold(mapping[1, 0] * x + mapping[1, 1] * y + mapping[1, 2], map_height - 1)
     return u, v, across, down
@@ -320,8 +324,8 @@ def _colour(image, sheet, paint, nearest_opaque, side):
 @njit(cache=True, nogil=True)
 @typing.no_type_check
 def _find_occluded(disparity, other, sign):
-    # Half a pixel of tolerance for rounding and surfaces that nearly touch. On a slope, one of the two
-    # columns beside the match is never nearer than the surface itself, so that it does not occlude itself.
+    # Half a pixel of tolerance for rounding and for surfaces that nearly touch. On a slope, one of the two
+    # columns beside the match is never nearer than the surface itself, so a slope does not occlude itself.
     height, width = disparity.shape
     occluded = np.empty((height, width), np.bool_)
     for y in range(height):

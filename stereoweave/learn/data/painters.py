@@ -1,7 +1,7 @@
-"""Worker processes that paint and crop batches during training, handed over in shared memory.
+"""Worker processes that paint and crop batches during training and pass them through shared memory.
 
-Each process has two slots for batches and a pipe, and no lock that a killed process could hold. A process
-that ends is noticed at once.
+Each process has two slots for batches and a pipe, but no lock that a killed process could leave held. The end
+of a process is noticed at once.
 """
 
 import multiprocessing
@@ -31,15 +31,15 @@ from stereoweave.stereo import Sample
 _SLOTS = 2  # per process: one is filled while the other waits to be taken
 # Compiling kernels and building textures takes a minute on a slow machine.
 _PATIENCE_S = 180.0
-# Pairs that a process holds to crop them again.
+# Pairs that a process keeps in memory to crop them again.
 _HELD = 96
 _MOST_CUTS = 4.0
-# Added to the seed for the cool-down: its batches have the same numbers but need other pairs.
+# Added to the seed for the cool-down, whose batches have the same numbers but need other pairs.
 _OTHER_SEED = 1000
 
 
 class BatchRequest(NamedTuple):
-    """A request for a batch: its slot, its number, the recipe's index, and how often each pair is cropped."""
+    """A request for a batch: slot, batch number, recipe index, and how often each pair is cropped."""
 
     slot: int
     number: int
@@ -48,7 +48,7 @@ class BatchRequest(NamedTuple):
 
 
 class PainterShare(NamedTuple):
-    """One process's share: recipes, folder of the held-out pairs, index and number of processes."""
+    """One process's share: recipes, folder of the held-out pairs, its index, and the number of processes."""
 
     recipes: tuple[Recipe, ...]
     folder: Path
@@ -57,7 +57,7 @@ class PainterShare(NamedTuple):
 
 
 class PaintedBatch(NamedTuple):
-    """A finished batch; `problem` is the traceback if it failed."""
+    """A finished batch; `problem` is the traceback if the batch failed."""
 
     request: BatchRequest
     problem: str = ""
@@ -72,7 +72,7 @@ class TensorPlace(NamedTuple):
 
 
 class ReusedPairs:
-    """A source that returns each pair `cuts` times on average: painting takes longer than cropping."""
+    """A source that returns each pair `cuts` times on average, since painting takes longer than cropping."""
 
     def __init__(self, pairs: PairSource, held: int = _HELD) -> None:
         self.pairs, self.cuts = pairs, 1.0
@@ -91,7 +91,7 @@ class ReusedPairs:
 
 
 class Painters:
-    """Processes that make a recipe's batches; a context manager that ends them.
+    """Processes that make a recipe's batches; leaving the context ends them.
 
     Args:
         recipes: Recipes of the batches; `switch` selects one.
@@ -102,8 +102,8 @@ class Painters:
 
     Attributes:
         cuts: How often each new pair is cropped; 1 while painting keeps up with training.
-        taken: Batches taken.
-        late: Batches that were not ready when requested.
+        taken: Number of batches taken.
+        late: Number of batches that were not ready when requested.
         failures: Tracebacks of failed batches.
     """
 
@@ -146,7 +146,7 @@ class Painters:
             process.join()
 
     def switch(self, recipe: int) -> None:
-        """Request batches of another recipe from now on; pending ones come first."""
+        """Request batches of another recipe from now on; batches already requested come first."""
         self.recipe = recipe
 
     def adapt(self, late_share: float) -> None:
@@ -160,7 +160,7 @@ class Painters:
         """Take the next finished batch, in the format of `collate` but with uint8 images.
 
         Raises:
-            StereoweaveError: All processes have ended, most batches fail, or none arrives for minutes.
+            StereoweaveError: All processes have ended, too many batches failed, or none arrived in 3 minutes.
         """
         self._collect(0)
         self.late += not self._ready
@@ -184,7 +184,7 @@ class Painters:
         if len(self.failures) > 5 + self.taken // 20:
             raise StereoweaveError(
                 f"{len(self.failures)} of {len(self.failures) + self.taken} batches failed; "
-                f"the last: {done.problem}"
+                f"the last failure: {done.problem}"
             )
         self._request(here, done.request.slot)
 
@@ -204,7 +204,7 @@ class Painters:
         del self._memory[here]
         self._ready = deque(entry for entry in self._ready if entry[0] is not here)
         if not self._memory:
-            raise StereoweaveError("every process that makes batches has ended; is there enough memory?")
+            raise StereoweaveError("every process that makes batches has ended; check for lack of memory")
 
     def _request(self, here: Connection, slot: int) -> None:
         try:
@@ -218,7 +218,7 @@ class Painters:
 
 
 def _run_painter(pipe: Connection, memory: Any, share: PainterShare) -> None:
-    """Main loop of a worker process: make requested batches until the pipe closes."""
+    """Make requested batches in a worker process until the pipe closes."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     _save_held_out(share)
@@ -247,7 +247,7 @@ def _make_batches(recipe: Recipe, folder: Path) -> Batches:
 
 
 def _paint_batch(request: BatchRequest, batches: Batches, memory: Any) -> PaintedBatch:
-    """Make a batch in its slot."""
+    """Make the requested batch in its slot of the shared memory."""
     assert isinstance(batches.pairs, ReusedPairs)
     batches.pairs.cuts = request.cuts
     try:
@@ -255,13 +255,13 @@ def _paint_batch(request: BatchRequest, batches: Batches, memory: Any) -> Painte
         for name, view in _view_tensors(memory, request.slot, batches.recipe).items():
             values = batch[name]
             view.copy_((values * 255).round() if view.dtype == torch.uint8 else values)
-    except Exception:  # any error of one batch must not stop the others
+    except Exception:  # an error in one batch must not stop the others
         return PaintedBatch(request, traceback.format_exc())
     return PaintedBatch(request)
 
 
 def _view_tensors(memory: Any, slot: int, recipe: Recipe) -> dict[str, torch.Tensor]:
-    """A batch's tensors as views into its slot of the shared memory."""
+    """Return a batch's tensors as views into its slot of the shared memory."""
     layout, _ = _compute_layout(recipe)
     start = slot * (len(memory) // _SLOTS)
     return {
@@ -273,11 +273,11 @@ def _view_tensors(memory: Any, slot: int, recipe: Recipe) -> dict[str, torch.Ten
 
 
 def _compute_layout(recipe: Recipe) -> tuple[dict[str, TensorPlace], int]:
-    """Place of each tensor of a batch in a slot, and the slot's size in bytes."""
+    """Return the place of each tensor of a batch in a slot, and the slot's size in bytes."""
     height, width = recipe.crop_size
     layout, offset = dict[str, TensorPlace](), 0
     for name, channels, dtype in (
-        ("disparity_px", 1, torch.float32),  # first, for an offset that is a multiple of four bytes
+        ("disparity_px", 1, torch.float32),  # first, so that its offset is a multiple of four bytes
         ("left", 3, torch.uint8),
         ("right", 3, torch.uint8),
         ("occluded", 1, torch.bool),
@@ -290,7 +290,10 @@ def _compute_layout(recipe: Recipe) -> tuple[dict[str, TensorPlace], int]:
 
 
 def make_cool_down_recipe(recipe: Recipe, crop_size: tuple[int, int]) -> Recipe:
-    """The recipe with other crops of other pairs: the same margins, and about as many pixels per batch."""
+    """Return the recipe with crops of another size, cut from other pairs.
+
+    Pairs keep their margins around the crops, and a batch keeps about the same number of pixels.
+    """
     margins = [pair - crop for pair, crop in zip(recipe.pair_size, recipe.crop_size, strict=True)]
     pair_size = (crop_size[0] + margins[0], crop_size[1] + margins[1])
     batch = max(1, round(recipe.batch * prod(recipe.crop_size) / prod(crop_size)))

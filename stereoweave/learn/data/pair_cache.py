@@ -1,4 +1,4 @@
-"""Cache of collage pairs on disk, so that a step only crops and recolours them."""
+"""Cache of collage pairs on disk, so that a training step only crops and recolours them."""
 
 import hashlib
 import multiprocessing
@@ -29,20 +29,21 @@ _SOURCES = (
 
 
 class CachedPairs:
-    """The first `count` collage pairs of (seed, epoch 0), cached in a subfolder of `folder`."""
+    """The first `count` collage pairs of epoch 0 with a seed, cached in a subfolder of `folder`."""
 
     def __init__(self, folder: Path, seed: int, count: int, size: tuple[int, int]) -> None:
         self.folder = folder / f"seed{seed}-{size[0]}x{size[1]}-{generator_version()}"
         self.seed, self.count, self.size = seed, count, size
 
     def missing(self) -> list[int]:
-        """Indices of the pairs not yet made."""
+        """Return the indices of the pairs that are not cached yet."""
         return [i for i in range(self.count) if not self._file(i).exists()]
 
     def make(self, console: Console) -> Iterable[int]:
         """Make the missing pairs in parallel. Yields the index of each when it is done.
 
-        Trainings in one folder share their pairs; a second one prints that it is waiting for the first.
+        Trainings with the same folder share their pairs; the second one prints a note and waits for the
+        first.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         note = f"{self.folder}: another training is making these pairs; waiting for it"
@@ -74,7 +75,7 @@ class CachedPairs:
 
 
 def generator_version() -> str:
-    """8 hexadecimal digits that change with the code that paints collages."""
+    """Return 8 hexadecimal digits that change with the code that paints collages."""
     package = Path(__file__).parents[2]
     return hashlib.sha256(b"".join((package / source).read_bytes() for source in _SOURCES)).hexdigest()[:8]
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from stereoweave.learn.data.paint_kernels import REACH_PX, draw_outline_field, draw_stroke_field
 
-MARGIN_PX = 3  # around a silhouette, so that its patch ends clearly outside
+MARGIN_PX = 3  # around a silhouette, so that the edge of its patch is clearly outside
 
 Points = Float[np.ndarray, "_ 2"]
 Strokes = tuple[tuple[Points, float], ...]
@@ -17,7 +17,10 @@ Strokes = tuple[tuple[Points, float], ...]
 
 @dataclass(frozen=True)
 class Patch:
-    """Signed distances in px to a silhouette, float32 [h, w], positive inside; left and top locate it."""
+    """Signed distances in px to a silhouette, float32 [h, w], positive inside.
+
+    The patch starts at column `left` and row `top` of the left image.
+    """
 
     field: Float[np.ndarray, "h w"]
     left: int
@@ -35,12 +38,12 @@ class Placement:
     height: int
 
     def ring(self, angles: Float[np.ndarray, " n"], radii: Float[np.ndarray, " n"]) -> Points:
-        """Points at these angles and multiples of the half extent."""
+        """Return the points at these angles and these multiples of the half extent."""
         reach = self.radius_px * radii
         return np.stack([self.x + reach * np.cos(angles), self.y + reach * np.sin(angles)], axis=1)
 
     def box(self, points: Points, margin_px: float) -> tuple[int, int, tuple[int, int]]:
-        """Left, top and shape (height, width) of the points' bounding box on the canvas; may be empty."""
+        """Return left, top and (height, width) of the points' bounding box on the canvas; may be empty."""
         canvas = [self.width, self.height]
         low = np.clip(np.floor(points.min(axis=0) - margin_px), 0, canvas).astype(int)
         high = np.clip(np.ceil(points.max(axis=0) + margin_px) + 1, low, canvas).astype(int)
@@ -54,12 +57,12 @@ def draw_shape(rng: np.random.Generator, place: Placement) -> Patch:
 
 
 def cover_canvas(width: int, height: int) -> Patch:
-    """A patch that covers the whole canvas."""
+    """Return a patch that covers the whole canvas."""
     return Patch(np.full((height, width), REACH_PX, np.float32), 0, 0)
 
 
 def cover_below(line_y: float, tilt: float, width: int, height: int) -> Patch:
-    """The canvas below a line that starts at height line_y at the left edge."""
+    """Return a patch that covers the canvas below a line; the line starts at row line_y at the left edge."""
     distance = np.arange(height)[:, None] - (line_y + tilt * np.arange(width)[None])
     return Patch(np.clip(distance, -REACH_PX, REACH_PX).astype(np.float32), 0, 0)
 
@@ -82,7 +85,7 @@ def draw_rods(rng: np.random.Generator, place: Placement) -> Patch:
 
 
 def draw_board(rng: np.random.Generator, place: Placement) -> Patch:
-    """Draw a rectangle in perspective, mostly upright; its half width is the half extent."""
+    """Draw a rectangle in perspective, mostly upright, with the placement's half extent as half width."""
     turn = rng.normal(0, 0.06) if rng.random() < 0.8 else rng.uniform(0, np.pi)
     half_height = rng.uniform(0.4, 1.1)
     corners = np.array([[-1, -half_height], [1, -half_height], [1, half_height], [-1, half_height]])
@@ -93,7 +96,7 @@ def draw_board(rng: np.random.Generator, place: Placement) -> Patch:
 
 
 def draw_pillar(rng: np.random.Generator, place: Placement) -> Patch:
-    """Draw a bar across the canvas, mostly upright; its half width is the half extent."""
+    """Draw a bar across the canvas, mostly upright, with the placement's half extent as half width."""
     turn = np.pi / 2 + rng.normal(0, 0.05) if rng.random() < 0.8 else rng.uniform(0, np.pi)
     reach = np.hypot(place.width, place.height) + place.radius_px
     along = reach * np.array([np.cos(turn), np.sin(turn)])
@@ -186,7 +189,7 @@ def _draw_foliage(rng: np.random.Generator, place: Placement) -> Patch:
     noise = _enlarge(coarse, width, height) + 0.4 * _enlarge(fine, width, height)
     y, x = np.ogrid[top : top + height, left : left + width]
     fall = np.hypot(x - place.x, y - place.y) / place.radius_px
-    # The noise changes by about 1 across a leaf; times the leaf's size it approximates a distance.
+    # The noise changes by about 1 across a leaf; multiplied by the leaf's size, it approximates a distance.
     field = (noise + 2.5 * (rng.uniform(0.5, 0.8) - fall)) * (0.7 * leaf_px)
     inside = np.minimum(field, (1 - fall) * place.radius_px - 1)
     return Patch(np.clip(inside, -REACH_PX, REACH_PX).astype(np.float32), left, top)
@@ -197,7 +200,7 @@ def _enlarge(noise: Float[np.ndarray, "_ _"], width: int, height: int) -> Float[
 
 
 def _draw_marks(rng: np.random.Generator, place: Placement) -> Patch:
-    """Draw a line of strokes like lettering."""
+    """Draw a row of strokes that resembles lettering."""
     count = int(rng.integers(2, 9))
     size = 2 * place.radius_px / count
     half_width_px = float(max(0.6, size * rng.uniform(0.05, 0.12)))

@@ -1,4 +1,4 @@
-"""Sources of a recipe's pairs: collages, rendered sets mixed in, or a dataset on disk."""
+"""Sources of a recipe's pairs: collages, rendered sets, or a dataset on disk."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +23,7 @@ VALIDATION_SEED = 1_000_003
 
 @runtime_checkable
 class PairSource(Protocol):
-    """Samples by index."""
+    """Interface of a source that returns samples by index."""
 
     @property
     def count(self) -> int: ...
@@ -31,16 +31,16 @@ class PairSource(Protocol):
     def __getitem__(self, index: int) -> Sample: ...
 
     def name(self, index: int) -> str:
-        """Name of the sample in error messages."""
+        """Return the name of the sample in error messages."""
         ...
 
 
 @runtime_checkable
 class OrderedSource(Protocol):
-    """A source that is faster to read in some orders."""
+    """Interface of a source that is faster to read in some orders than in others."""
 
     def order(self, rng: np.random.Generator) -> Int[np.ndarray, " n"] | range:
-        """All indices, in an order that is fast to read."""
+        """Return all indices, in an order that is fast to read."""
         ...
 
 
@@ -64,11 +64,11 @@ class MixedSource:
         return source.name(place)
 
     def first_index(self, which: int) -> int:
-        """Index of the first pair of a set."""
+        """Return the index of the first pair of a set."""
         return sum(one.count for one in self.sets[:which])
 
     def draw_sets(self, places: int, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
-        """Draw a set for each place by weight; with the same random numbers, a prefix of a longer draw."""
+        """Draw a set for each place by weight; with the same seed, longer draws begin with shorter ones."""
         bounds = np.cumsum(self.weights) / np.sum(self.weights)
         return np.searchsorted(bounds[:-1], rng.random(places), side="right")
 
@@ -82,7 +82,7 @@ class MixedSource:
 
 @dataclass(frozen=True)
 class FreshCollages:
-    """Training collages painted on demand, never cached."""
+    """Training collages that are painted on demand and never cached."""
 
     seed: int
     size: tuple[int, int]
@@ -95,13 +95,13 @@ class FreshCollages:
         return f"collage {index} of seed {self.seed}"
 
     def order(self, rng: np.random.Generator) -> range:
-        """Sequential: all collages are equally random."""
+        """Return all indices in sequence, because collages are random in any order."""
         return range(self.count)
 
 
 @dataclass(frozen=True)
 class RenderedSet:
-    """A rendered set with simulated camera imperfections, the same for every read of a pair."""
+    """A rendered set with simulated camera imperfections, which are the same whenever a pair is read."""
 
     shards: Shards
 
@@ -111,7 +111,7 @@ class RenderedSet:
 
     def __getitem__(self, index: int) -> Sample:
         sample = self.shards[index]
-        # As for collages: without noise, blur and tone differences, matching is too easy.
+        # As for collages, because matching is too easy without noise, blur and tone differences.
         left, right = collage.simulate_cameras(
             np.random.default_rng(index), sample.left.astype(np.float32), sample.right.astype(np.float32)
         )
@@ -144,7 +144,7 @@ class DatasetFrames:
 def open_sources(recipe: Recipe, folder: Path, whole: bool = False) -> tuple[PairSource, PairSource]:
     """Open a recipe's training and held-out pairs; collages are cached in folders below `folder`.
 
-    Of a dataset's held-out frames, `validation_pairs` evenly spread ones are used, or all if `whole`.
+    If `whole`, all held-out frames of a dataset are used, otherwise `validation_pairs` evenly spread ones.
     """
     if recipe.dataset == COLLAGE:
         collages = _open_collages(recipe, folder)
@@ -181,7 +181,7 @@ def _mix_sets(recipe: Recipe, collages: PairSource) -> MixedSource:
 
 
 def open_held_out_sets(recipe: Recipe) -> dict[str, PairSource]:
-    """Open a recipe's further validation sets by name. Raises FormatError if one is missing."""
+    """Open a recipe's further validation sets, keyed by name. Raises FormatError if one is missing."""
     sets: dict[str, PairSource] = {}
     for name, folder in recipe.held_out:
         found = tuple(
@@ -192,18 +192,18 @@ def open_held_out_sets(recipe: Recipe) -> dict[str, PairSource]:
 
 
 def _find_set_folders(recipe: Recipe, key: str, folder: Path) -> list[Path]:
-    """The folder itself if it is a rendered set, else the sets in it. FormatError if there are none."""
+    """Return the folder if it is a rendered set, else the sets in it. Raises FormatError if there is none."""
     folders = [path for path in (folder, *sorted(folder.glob("*/"))) if list_shards(path)]
     if not folders:
         raise FormatError(
             f"{recipe.name}: {key}: {folder}: expected pairs of `stereoweave synth make`, or folders of "
-            "them, found none; make them first"
+            "such pairs, found none; render them first"
         )
     return folders
 
 
 def _open_rendered_sets(recipe: Recipe, folder: Path) -> list[PairSource]:
-    """Open the set in a folder, or all sets in it. FormatError if there are none or one is too small."""
+    """Open the rendered sets of a folder. Raises FormatError if there are none, or pairs are too small."""
     folders = _find_set_folders(recipe, "mix", folder)
     sets: list[PairSource] = [RenderedSet(Shards(path)) for path in folders]
     for path, one in zip(folders, sets, strict=True):
@@ -226,6 +226,6 @@ def cache_pairs(pairs: PairSource, console: Console) -> PairSource:
             task = bar.add_task("making pairs", total=missing, loss="", rate="")
             for _ in pairs.make(console):
                 bar.advance(task)
-            # Another training may have made some of them.
+            # Another training may have made some of the pairs.
             bar.update(task, completed=missing)
     return pairs

@@ -1,4 +1,4 @@
-"""Textures of the collages: procedural ones, and crops of photographs.
+"""Textures of the collages: procedural patterns and crops of photographs.
 
 The photographs are included in scikit-image's wheel; docs/training-data.md lists their licences.
 """
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-SIDE = 384  # texels; at 0.35 to 1 texel per pixel it spans the width of a training picture
+SIDE = 384  # texels; at no more than 1 texel per pixel, a texture spans the width of a training crop
 BANK_SEED = 20_240_607
 PHOTOGRAPH_CROPS = 110
 NATURAL_TEXTURES = PHOTOGRAPH_CROPS + 90
@@ -23,7 +23,7 @@ Pattern = Float[np.ndarray, "side side"]
 Photograph = UInt8[np.ndarray, "_ _ 3"]
 Procedure = Callable[[np.random.Generator], Picture]
 
-# Excluded: Motorcycle (a test pair), lfw_subset (people who were not asked), moon and page (no licence).
+# Excluded: Motorcycle (a test pair), lfw_subset (people without their consent), moon and page (no licence).
 # The weights favour objects and places over scans and microscopy.
 PHOTOGRAPHS = {
     "astronaut": 3,
@@ -46,18 +46,18 @@ PHOTOGRAPHS = {
 
 @functools.cache
 def make_natural(k: int) -> Texture:
-    """Texture k of 0..NATURAL_TEXTURES - 1, the same in every process; made on first use."""
+    """Return natural texture k of 0..NATURAL_TEXTURES - 1, made on first use; the same in every process."""
     return crop_photograph(k) if k < PHOTOGRAPH_CROPS else make_procedural(NATURAL, k - PHOTOGRAPH_CROPS)
 
 
 @functools.cache
 def make_periodic(k: int) -> Texture:
-    """Periodic texture k of 0..PERIODIC_TEXTURES - 1, the same in every process; made on first use."""
+    """Return periodic texture k of 0..PERIODIC_TEXTURES - 1, made on first use; the same in every process."""
     return make_procedural(PERIODIC, k)
 
 
 def crop_photograph(k: int) -> Texture:
-    """Crop k: part of a photograph, turned, mirrored, scaled and recoloured."""
+    """Make crop k, a part of a photograph that is turned, mirrored, scaled and recoloured."""
     rng = np.random.default_rng((BANK_SEED, 1, k))
     weights = np.array(list(PHOTOGRAPHS.values()), float)
     photograph = _load_photograph(str(rng.choice(list(PHOTOGRAPHS), p=weights / weights.sum())))
@@ -68,7 +68,7 @@ def crop_photograph(k: int) -> Texture:
 
 
 def make_procedural(kinds: dict[str, Procedure], k: int) -> Texture:
-    """Texture k of these kinds, which alternate."""
+    """Make procedural texture k; consecutive textures cycle through the kinds."""
     rng = np.random.default_rng((BANK_SEED, 2, k))
     image = kinds[list(kinds)[k % len(kinds)]](rng)
     # Photographs have detail at the scale of a pixel.
@@ -77,7 +77,10 @@ def make_procedural(kinds: dict[str, Procedure], k: int) -> Texture:
 
 
 def draw_power_noise(rng: np.random.Generator, exponent: float, side: int = SIDE) -> Pattern:
-    """Draw noise whose amplitude falls as frequency**-exponent (1 in photographs); mean 0, deviation 1."""
+    """Draw noise of mean 0 and standard deviation 1 whose amplitude falls as frequency**-exponent.
+
+    The exponent is about 1 in photographs.
+    """
     frequency = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None])
     frequency[0, 0] = 1
     spectrum = np.fft.rfft2(rng.standard_normal((side, side))) * frequency**-exponent
@@ -95,7 +98,7 @@ def draw_natural_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
 
 @functools.cache
 def make_light_map(k: int) -> Float[np.ndarray, "64 64"]:
-    """Light map k, float32 [64, 64] around 1: smooth, half of them with a soft-edged shadow."""
+    """Return light map k, float32 [64, 64] around 1; half of the maps have a soft-edged shadow."""
     rng = np.random.default_rng((BANK_SEED, 3, k))
     light = 1 + rng.uniform(0.05, 0.2) * draw_power_noise(rng, 2.5, 64)
     if rng.random() < 0.5:
@@ -119,7 +122,7 @@ def _crop_turned(rng: np.random.Generator, photograph: Photograph) -> Texture:
     # Most of the picture, with little upsampling: blur is not a texture.
     span = max(min(height, width) * rng.uniform(0.7, 1.0), 0.8 * SIDE)
     angle = rng.uniform(0, 360) if rng.random() < 0.4 else rng.integers(4) * 90 + rng.normal(0, 4)
-    shrunk = min(1.0, 1.4 * SIDE / span)  # area-averaged first, so that the turn does not alias
+    shrunk = min(1.0, 1.4 * SIDE / span)  # area-averaged first, so that the rotation does not alias
     small = cv2.resize(photograph, None, fx=shrunk, fy=shrunk, interpolation=cv2.INTER_AREA)
     matrix = cv2.getRotationMatrix2D((0, 0), angle, SIDE / (span * shrunk))
     centre = np.array([rng.uniform(0.3, 0.7) * small.shape[1], rng.uniform(0.3, 0.7) * small.shape[0]])
@@ -169,8 +172,8 @@ def _marble(rng: np.random.Generator) -> Picture:
 
 
 def _dead_leaves(rng: np.random.Generator) -> Picture:
-    """Dead leaves: overlapping shapes of all sizes, a classic model of natural images."""
-    # Counts fall as the cube of the size, so that every size covers the same area.
+    """Draw dead leaves: overlapping shapes of all sizes, a classic model of natural images."""
+    # Counts fall with the cube of the size, so that every size covers the same area.
     inverse_squares = rng.uniform(1 / rng.uniform(30, 120) ** 2, 1 / rng.uniform(2, 5) ** 2, 1500)
     return _strew(rng, inverse_squares**-0.5, slim=rng.uniform(0.25, 0.9))
 
@@ -193,12 +196,12 @@ def _strew(rng: np.random.Generator, radii: Float[np.ndarray, " n"], slim: float
 
 
 def _soften(image: Picture) -> Picture:
-    # Shapes drawn by OpenCV without antialiasing are sharper than any lens.
+    # Shapes that OpenCV draws without antialiasing are sharper than any photograph.
     return cv2.GaussianBlur(image, (0, 0), 0.6)
 
 
 def _grain(rng: np.random.Generator) -> Picture:
-    """Wood: warped rings around a distant axis, with fibres along them."""
+    """Draw wood grain: fibres, and warped rings around a distant axis."""
     x, y = _make_turned_grid(rng)
     warp = draw_power_noise(rng, 2.0) * rng.uniform(3, 12)
     rings = np.hypot(x * rng.uniform(0.02, 0.2), y + warp - rng.uniform(-300, 300)) / rng.uniform(6, 30)
@@ -208,7 +211,7 @@ def _grain(rng: np.random.Generator) -> Picture:
 
 
 def _writing(rng: np.random.Generator) -> Picture:
-    """Rows of marks like a script."""
+    """Draw rows of marks that resemble writing."""
     page = np.zeros((SIDE, SIDE), np.uint8)
     size = rng.uniform(6, 30)
     y = size

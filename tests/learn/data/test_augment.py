@@ -22,14 +22,14 @@ CAMERA = StereoCamera(focal_px=90.0, baseline_m=0.1, cx_px=70.0, cy_px=40.0, dof
 
 
 def picture(x, y):
-    """A smooth pattern at places of the surface, so that a resampled picture is the pattern once more."""
+    """Return a smooth pattern at points of the surface, so that resampling reproduces the pattern."""
     waves = [np.sin(x / 7 + y / 11 + phase) + np.sin(x / 13 - y / 9 + 2 * phase) for phase in (0, 1, 2)]
     return np.round(127.5 + 60 * np.stack(waves, -1)).astype(np.uint8)
 
 
 @pytest.fixture
 def sample():
-    """A slanted wall: column x of the left view has 5 + x / 20 px, so the right one shows (x + 5) / 0.95."""
+    """Return a slanted wall: left column x has 5 + x / 20 px, so right column x shows (x + 5) / 0.95."""
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     seen = (x + NEAR_PX) / (1 - SLOPE)
     return Sample(
@@ -43,7 +43,7 @@ def sample():
 
 
 def looked_up(values, columns):
-    """Rows of `values` at fractional columns, linearly, and where those lie inside."""
+    """Return rows of `values` interpolated at fractional columns, and the mask of columns inside."""
     before = np.clip(np.floor(columns).astype(int), 0, values.shape[1] - 2)
     share = (columns - before).reshape(*columns.shape, *[1] * (values.ndim - 2))
     rows = np.arange(len(values))[:, None]
@@ -52,7 +52,7 @@ def looked_up(values, columns):
 
 
 def assert_views_agree(sample, grey_levels):
-    """The right view looked up at the left one's matches is the left view, and the other way round."""
+    """Assert that each view, sampled at the other view's matches, equals that other view."""
     columns = np.arange(sample.left.shape[1])
     for here, there, matches in (
         (sample.left, sample.right, columns - sample.disparity_px),
@@ -73,14 +73,14 @@ def test_the_example_itself_is_exact(sample):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_a_scaled_cut_stays_exact(sample, seed):
+def test_a_scaled_crop_stays_exact(sample, seed):
     part = crop_and_scale(sample, 64, 80, np.random.default_rng(seed))
     assert part.left.shape == part.right.shape == (64, 80, 3)
     assert_views_agree(part, 4)
 
 
-def test_cuts_are_scaled_up_and_down(sample):
-    # The slope of the wall is the same at any scale; its disparity at the left border tells the scale.
+def test_crops_are_scaled_up_and_down(sample):
+    # The slope of the wall is the same at any scale; its disparity at the left border shows the scale.
     spans = [
         np.ptp(crop_and_scale(sample, 64, 80, np.random.default_rng(seed)).disparity_px) for seed in range(40)
     ]
@@ -101,12 +101,12 @@ def test_a_sample_upside_down_stays_exact(sample):
 
 
 @pytest.mark.parametrize("change", [mirror, flip_rows])
-def test_what_is_turned_twice_is_as_before(sample, change):
+def test_mirroring_or_flipping_twice_restores_the_sample(sample, change):
     assert_same(change(change(sample)), sample)
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_an_augmented_sample_has_matching_disparities_and_the_size_asked_for(sample, seed):
+def test_an_augmented_sample_has_matching_disparities_and_the_requested_size(sample, seed):
     augmented = augment(sample, 64, 80, np.random.default_rng(seed))
     assert augmented.left.shape == augmented.right.shape == (64, 80, 3)
     assert augmented.left.dtype == augmented.right.dtype == np.uint8
@@ -122,7 +122,7 @@ def test_the_same_draws_give_the_same_sample(sample):
     assert_same(one, other)
 
 
-def test_both_views_keep_one_order_of_colours():
+def test_both_views_get_the_same_order_of_colour_channels():
     image = np.full((4, 4, 3), (200, 100, 0), np.uint8)
     darkest = []
     for seed in range(20):
@@ -132,12 +132,12 @@ def test_both_views_keep_one_order_of_colours():
     assert len(set(darkest)) > 1
 
 
-def test_views_are_recoloured_much_alike():
+def test_both_views_are_recoloured_similarly():
     ramp = np.tile(np.arange(0, 240, 10, dtype=np.uint8)[None, :, None], (2, 1, 3))
     changes = []
     for seed in range(20):
         left, right = (image.astype(int) for image in recolour(ramp, ramp, np.random.default_rng(seed)))
-        # Own gains within 5 %, own gammas within 4 % of at most 1.4, which is steepest at 1 / e of white.
+        # Separate gains differ by up to 5 %, and gammas by up to 4 % of 1.4, most visibly at 1 / e of white.
         assert np.abs(left - right).max() < 60
         changes.append(np.abs(left - ramp).mean())
     assert max(changes) > 30
@@ -154,9 +154,9 @@ def test_erasing_puts_flat_patches_into_a_copy(rng):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_cut_keeps_every_value_and_moves_the_camera_s_centre(sample, seed):
+def test_a_crop_keeps_every_value_and_moves_the_principal_point(sample, seed):
     part = crop(replace(sample, camera=CAMERA), 30, 50, np.random.default_rng(seed))
-    # The camera tells where the part lies.
+    # The camera's principal point shows where the crop is.
     start, top = round(70 - part.camera.cx_px), round(40 - part.camera.cy_px)
     assert 0 <= start <= WIDTH - 50 and 0 <= top <= HEIGHT - 30
     for name, values in vars(sample).items():
@@ -167,7 +167,7 @@ def test_a_cut_keeps_every_value_and_moves_the_camera_s_centre(sample, seed):
     assert part.camera == replace(CAMERA, cx_px=70.0 - start, cy_px=40.0 - top)
 
 
-def test_cuts_lie_in_different_places_and_the_whole_is_one_of_them(sample):
+def test_crops_are_in_different_places_and_can_be_the_whole_sample(sample):
     whole = replace(sample, camera=CAMERA)
     centres = {crop(whole, 30, 50, np.random.default_rng(seed)).camera.cx_px for seed in range(20)}
     assert len(centres) > 10
@@ -175,13 +175,13 @@ def test_cuts_lie_in_different_places_and_the_whole_is_one_of_them(sample):
 
 
 @pytest.mark.parametrize("size", [(HEIGHT + 1, 50), (30, WIDTH + 1)])
-def test_a_cut_larger_than_the_sample_is_refused(sample, size):
+def test_a_crop_larger_than_the_sample_is_refused(sample, size):
     assert complaint(crop, sample, *size, np.random.default_rng(0)) == (
-        f"crop_size = {list(size)}: expected at most the pictures' [96, 144]; use a smaller crop"
+        f"crop_size = {list(size)}, expected at most [96, 144], the size of the pictures; use a smaller crop"
     )
 
 
-def test_a_scaled_camera_sees_with_a_longer_focal_length():
+def test_the_camera_of_an_enlarged_crop_has_a_longer_focal_length():
     assert crop_camera(CAMERA, 10, 20, 2.0, 0.5) == StereoCamera(
         focal_px=180.0, baseline_m=0.1, cx_px=120.0, cy_px=10.0, doffs_px=12.0
     )
@@ -189,21 +189,21 @@ def test_a_scaled_camera_sees_with_a_longer_focal_length():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_depth_stays_when_a_sample_is_scaled(sample, seed):
-    # 9 px m over 5 + x / 20 + 6 px: the nearest and the farthest of the wall bound what a part can see.
+def test_scaling_a_sample_preserves_depth(sample, seed):
+    # The depth of column x is 9 px m over 5 + x / 20 + 6 px.
     part = crop_and_scale(replace(sample, camera=CAMERA), 64, 80, np.random.default_rng(seed))
     scale = part.camera.focal_px / 90
     assert part.camera.doffs_px == pytest.approx(6 * scale)
     columns = (part.disparity_px / scale - NEAR_PX) / SLOPE
     expected_m = 9 / (NEAR_PX + SLOPE * columns + 6)
     np.testing.assert_allclose(part.camera.depth_m(part.disparity_px), expected_m, rtol=1e-5)
-    # Where the columns lie that the part shows, the camera says too: 70 px right of the wall's beginning.
+    # The camera also gives the columns of the crop: its principal point is 70 px right of the wall's start.
     first = 70 - part.camera.cx_px / scale
     np.testing.assert_allclose(columns[0], first + np.arange(80) / scale, atol=1.01)
 
 
 def places_m(sample):
-    """Where the left view's pixels lie, in metres from the left camera: right, down and ahead [H, W, 3]."""
+    """Return the left view's points in metres from the left camera: right, down and forward [H, W, 3]."""
     camera = sample.camera
     y, x = np.mgrid[: sample.left.shape[0], : sample.left.shape[1]]
     depth_m = camera.depth_m(sample.disparity_px)
@@ -211,16 +211,16 @@ def places_m(sample):
     return np.stack([right * depth_m, down * depth_m, depth_m], -1)
 
 
-def test_a_sample_upside_down_shows_every_place_upside_down(sample):
+def test_a_flipped_sample_has_every_point_upside_down(sample):
     sample = replace(sample, camera=CAMERA)
     turned = places_m(flip_rows(sample))[::-1]
     np.testing.assert_allclose(turned, places_m(sample) * [1, -1, 1], rtol=1e-5, atol=1e-6)
 
 
-def test_a_mirrored_sample_shows_every_place_from_the_other_camera(sample):
+def test_a_mirrored_sample_has_every_point_as_seen_from_the_other_camera(sample):
     sample = replace(sample, camera=CAMERA)
     seen = mirror(sample)
-    # The right camera of the sample, 10 cm further right, whose centre is doffs further right.
+    # The sample's right camera is 10 cm further right, and its principal point doffs further right.
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     depth_m = 9 / (sample.right_disparity_px + 6)
     right_m, down_m = (x - 76.0) / 90 * depth_m, (y - 40.0) / 90 * depth_m
@@ -230,7 +230,7 @@ def test_a_mirrored_sample_shows_every_place_from_the_other_camera(sample):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_sky_stays_at_no_disparity(sample, seed):
+def test_a_sky_keeps_a_disparity_of_0(sample, seed):
     sky = np.zeros_like(sample.disparity_px)
     sample = replace(sample, disparity_px=sky, right_disparity_px=sky, camera=replace(CAMERA, doffs_px=0.0))
     augmented = augment(sample, 64, 80, np.random.default_rng(seed))
@@ -247,12 +247,12 @@ def test_a_pair_without_the_right_view_s_disparity_is_never_mirrored(sample):
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("offset", [0.05, 0.14])
-def test_a_right_crop_further_to_the_right_stays_exact(sample, seed, offset):
+def test_a_pair_whose_right_crop_is_shifted_stays_exact(sample, seed, offset):
     part = crop_and_scale(sample, 64, 96, np.random.default_rng(seed), offset)
     assert_views_agree(part, 12)
 
 
-def test_a_right_crop_further_to_the_right_adds_its_offset_to_the_disparity():
+def test_shifting_the_right_crop_adds_its_offset_to_the_disparity():
     x = np.mgrid[:64, :96][1].astype(np.float32)
     flat = np.full((64, 96), 5, np.float32)
     sample = Sample(
@@ -260,20 +260,20 @@ def test_a_right_crop_further_to_the_right_adds_its_offset_to_the_disparity():
         occluded=flat < 0, right_occluded=flat < 0, camera=CAMERA,
     )  # fmt: skip
     part = crop_and_scale(sample, 64, 64, np.random.default_rng(0), 0.125)
-    width = 64 / part.camera.focal_px * 90  # of what was cut
+    width = 64 / part.camera.focal_px * 90  # of the crop before scaling
     offset_px = round(0.125 * width)
     assert 0 < offset_px <= 12
     np.testing.assert_allclose(part.disparity_px, (5 + offset_px) * 64 / width, rtol=1e-5)
-    # Depth stays: 9 px m over 5 + 6 px.
+    # Depth is preserved: 9 px m over 5 + 6 px.
     np.testing.assert_allclose(part.camera.depth_m(part.disparity_px), 9 / 11, rtol=1e-5)
 
 
-def test_the_share_of_right_crops_that_are_moved_is_the_one_asked_for(sample):
+def test_the_requested_share_of_right_crops_is_shifted(sample):
     def nearest_px(share, seed):
         part = augment(replace(sample, camera=CAMERA), 48, 48, np.random.default_rng(seed), share)
         return part.camera.doffs_px / part.camera.focal_px
 
     moved_ones = [nearest_px(0.3, seed) < 6 / 90 - 1e-9 for seed in range(300)]
-    # 90 of 300 expected, of which a few are moved by less than half a pixel; the deviation is 8.
+    # 90 of 300 are expected, a few of them shifted by less than half a pixel; the deviation is 8.
     assert 60 < sum(moved_ones) < 120
     assert not any(nearest_px(0, seed) < 6 / 90 - 1e-9 for seed in range(30))

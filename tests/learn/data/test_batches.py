@@ -24,7 +24,7 @@ def pairs():
 
 @dataclass(frozen=True)
 class Backwards(Listed):
-    """Pairs that are read best from the last to the first."""
+    """Pairs that are fastest to read from last to first."""
 
     def order(self, rng):
         return np.arange(self.count)[::-1]
@@ -39,7 +39,7 @@ def chosen_of(mix, steps, **changes):
     return [index for step in range(steps) for index in batches.list_pairs(step)]
 
 
-def test_every_pair_comes_once_before_any_comes_again():
+def test_every_pair_is_drawn_once_before_any_is_repeated():
     recipe = replace(RECIPE, pairs=7, batch=3)
     batches = Batches(recipe, CachedPairs(Path("unused"), 0, recipe.pairs, PAIR_SIZE))
     chosen = [index for step in range(7) for index in batches.list_pairs(step)]
@@ -49,14 +49,14 @@ def test_every_pair_comes_once_before_any_comes_again():
 
 
 def test_the_pairs_of_a_step_come_in_the_order_of_their_seed_and_epoch():
-    """As they did before sets were mixed: runs of old are resumed and compared with."""
+    """Keep the order from before sets could be mixed, so that old runs can be resumed and compared."""
     batches = Batches(replace(RECIPE, batch=3, seed=5), Listed(samples(1) * 7))
     orders = [np.random.default_rng((5, epoch, 1)).permutation(7) for epoch in range(3)]
     chosen = [index for step in range(7) for index in batches.list_pairs(step)]
     assert chosen == np.concatenate(orders).tolist()
 
 
-def test_of_each_set_of_a_mix_every_pair_comes_once_before_any_comes_again():
+def test_every_pair_of_each_set_of_a_mix_is_drawn_once_before_any_is_repeated():
     chosen = chosen_of(mix_of(5, 3, weights=(3.0, 1.0)), 40, batch=4)
     for own in (range(5), range(5, 8)):
         drawn = [index for index in chosen if index in own]
@@ -68,7 +68,7 @@ def test_of_each_set_of_a_mix_every_pair_comes_once_before_any_comes_again():
 
 def test_the_sets_of_a_mix_are_drawn_by_weight():
     counts = Counter(index // 10 for index in chosen_of(mix_of(10, 10, 10, weights=(5, 4, 1)), 100, batch=40))
-    # Of 4,000 draws; the deviations are 32, 31 and 19.
+    # For 4,000 draws the deviations are 32, 31 and 19.
     assert [counts[which] for which in range(3)] == pytest.approx([2000, 1600, 400], abs=130)
 
 
@@ -110,7 +110,7 @@ def test_a_batch_depends_on_the_seed_and_the_step_alone(pairs):
     assert not torch.equal(first["left"], one[2]["left"])
 
 
-def test_a_batch_without_augmentation_holds_cuts_of_the_pairs_as_they_are(pairs):
+def test_a_batch_without_augmentation_holds_unchanged_crops(pairs):
     batches = Batches(replace(RECIPE, augment=False, crop_size=PAIR_SIZE), pairs)
     batch = batches[0]
     for place, index in enumerate(batches.list_pairs(0)):
@@ -119,7 +119,7 @@ def test_a_batch_without_augmentation_holds_cuts_of_the_pairs_as_they_are(pairs)
         np.testing.assert_array_equal(found, pairs[index].right)
 
 
-def test_a_batch_holds_the_left_views_maps_and_behind_them_the_right_ones_mirrored():
+def test_a_batch_holds_the_left_views_maps_and_then_the_mirrored_maps_of_the_right_views():
     first, second = samples(2)
     batch = collate([first, second])
     height, width = PAIR_SIZE
@@ -136,12 +136,12 @@ def test_each_sample_keeps_its_own_camera():
     first, second = samples(2, camera=CAMERA)
     second = replace(second, camera=replace(CAMERA, focal_px=60.0, doffs_px=3.0))
     batch = collate([first, second])
-    # 120 px and 60 px times 0.2 m.
+    # These are 120 px and 60 px times 0.2 m.
     torch.testing.assert_close(batch["focal_baseline_px_m"], torch.tensor([24.0, 12.0]).view(2, 1, 1, 1))
     torch.testing.assert_close(batch["doffs_px"], torch.tensor([0.0, 3.0]).view(2, 1, 1, 1))
 
 
-def test_a_batch_in_which_one_sample_has_no_camera_has_none():
+def test_a_batch_with_one_sample_without_a_camera_has_no_cameras():
     first, second = samples(2, camera=CAMERA)
     assert "focal_baseline_px_m" not in collate([first, replace(second, camera=None)])
 
@@ -149,16 +149,17 @@ def test_a_batch_in_which_one_sample_has_no_camera_has_none():
 def test_a_batch_of_mixed_sizes_is_refused():
     mixed = [box_before_a_wall(np.random.default_rng(0), size) for size in ((64, 96), (32, 48), (64, 96))]
     assert complaint(collate, mixed) == (
-        "a batch: expected pairs of one size, found 48x32 and 96x64; crop them to one crop_size"
+        "batch: expected pairs of one size, found 48x32 and 96x64; crop them to the same crop_size"
     )
 
 
-def test_a_pair_without_a_single_known_pixel_is_named():
+def test_the_error_for_a_pair_without_a_known_pixel_names_it():
     unknown_px = np.full(PAIR_SIZE, np.nan, np.float32)
     pairs = Listed([*samples(2), *samples(1, disparity_px=unknown_px)])
     assert read_known(pairs, 1) is pairs[1]
     assert complaint(read_known, pairs, 2) == (
-        "sample 2: expected at least one pixel of known disparity, found none; remove it from the dataset"
+        "sample 2: expected at least one pixel of known disparity, found none; "
+        "remove the pair from the dataset"
     )
     batches = Batches(replace(RECIPE, batch=3), pairs)
     assert "sample 2: " in complaint(batches.__getitem__, 0)
@@ -174,13 +175,13 @@ def test_one_known_pixel_is_enough():
 def test_a_crop_larger_than_the_pictures_is_refused(pairs):
     batches = Batches(replace(RECIPE, augment=False, crop_size=(64, 112)), pairs)
     assert complaint(batches.__getitem__, 0) == (
-        "crop_size = [64, 112]: expected at most the pictures' [64, 96]; use a smaller crop"
+        "crop_size = [64, 112], expected at most [64, 96], the size of the pictures; use a smaller crop"
     )
 
 
 @dataclass(frozen=True)
 class Watched(Listed):
-    """Pairs that note which of them are read."""
+    """Pairs that record which of them are read."""
 
     read: list[int]
 
@@ -190,7 +191,7 @@ class Watched(Listed):
 
 
 def shares_of(recipe, count, step):
-    """What each of so many processes reads for a step, and what it makes of it."""
+    """Return the batch that each of `count` processes makes for a step, and the pairs that it reads."""
     watched = [Watched(samples(1) * 12, []) for _ in range(count)]
     batches = [Batches(recipe, pairs, ProcessRank(rank, count)) for rank, pairs in enumerate(watched)]
     return [one[step] for one in batches], [one.read for one in watched]
@@ -201,16 +202,16 @@ def assert_same_batches(one, other):
     assert all(torch.equal(one[name].nan_to_num(-1), other[name].nan_to_num(-1)) for name in one)
 
 
-def test_processes_read_their_own_neighbouring_pairs_of_a_step_and_no_others():
+def test_each_process_reads_only_its_own_consecutive_pairs_of_a_step():
     recipe = replace(RECIPE, batch=6, micro_batch=1, seed=5)
-    # Of 12 pairs in this order step 1 has the last six: three processes make two micro-batches each.
+    # Step 1 has the last six of 12 pairs in this order; three processes make two micro-batches each.
     order = np.random.default_rng((5, 0, 1)).permutation(12).tolist()
     _, read = shares_of(recipe, 3, 1)
     assert read == [order[6:8], order[8:10], order[10:12]]
 
 
 @pytest.mark.parametrize("count", [2, 4])
-def test_processes_make_the_very_micro_batches_that_one_process_makes(count):
+def test_several_processes_make_the_same_micro_batches_as_a_single_process(count):
     recipe = replace(RECIPE, batch=8, micro_batch=2)
     ((whole,), _), (shares, _) = shares_of(recipe, 1, 3), shares_of(recipe, count, 3)
     parts = [part for share in shares for part in split_batch(share, 4 // count)]
@@ -218,22 +219,22 @@ def test_processes_make_the_very_micro_batches_that_one_process_makes(count):
         assert_same_batches(one, other)
 
 
-def test_the_first_micro_batch_is_cut_as_a_batch_that_is_not_parted(pairs):
+def test_the_first_micro_batch_has_the_crops_of_a_batch_that_is_not_split(pairs):
     recipe = replace(RECIPE, batch=2)
     parted = split_batch(Batches(replace(recipe, micro_batch=1), pairs)[4], 2)
     whole = Batches(recipe, pairs)[4]
     assert torch.equal(parted[0]["left"][0], whole["left"][0])
-    # Its own generator, not the first one's going on.
+    # The second micro-batch has a generator of its own.
     assert not torch.equal(parted[1]["left"][0], whole["left"][1])
 
 
-def test_zeros_behind_seed_and_step_change_no_draw():
-    """By which recipes without micro-batches are cut as they were before there were any."""
+def test_zeros_after_seed_and_step_do_not_change_the_draws():
+    """Recipes without micro-batches depend on this for the crops that they had before micro-batches."""
     key = Batches(replace(RECIPE, seed=3), Listed(samples(2))).key(7, 0)
     assert np.random.default_rng(key).random() == np.random.default_rng((3, 7)).random()
 
 
-def test_a_batch_is_split_into_what_its_samples_would_be_collated_to(pairs):
+def test_the_parts_of_a_batch_equal_its_samples_collated_separately(pairs):
     for one, other in zip(
         split_batch(collate(pairs.samples), 2), (pairs.samples[:2], pairs.samples[2:]), strict=True
     ):

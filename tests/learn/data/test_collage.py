@@ -37,7 +37,7 @@ def flat(disparity_px):
 
 
 def matt_scene(index, draw=draw_scene):
-    """A scene without highlights, which are the one thing that moves on a surface."""
+    """Return a scene without highlights, which would move on their surfaces between the views."""
     scene = draw(np.random.default_rng(index), HEIGHT, WIDTH)
     layers = tuple(
         dataclasses.replace(layer, paint=layer.paint._replace(gloss=np.zeros(6, np.float32)))
@@ -95,7 +95,7 @@ def test_the_greatest_disparities_are_spread_widely():
     assert max(greatest_px) > 80
 
 
-def test_degenerate_pairs_do_not_come():
+def test_there_are_no_degenerate_pairs():
     for index in range(30):
         pair = paint_collage(2, 0, index, HEIGHT, WIDTH)
         assert pair.occluded.mean() < 0.6
@@ -122,7 +122,7 @@ def test_the_disparities_of_both_views_agree_where_both_see_a_surface(here, ther
         disparity_px, other_px = views[here].disparity_px, views[there].disparity_px
         hidden = find_occluded(disparity_px, other_px, sign)
         error_px = np.abs(sampled(other_px[..., None], sign * disparity_px)[..., 0] - disparity_px)
-        # Away from edges, which lie between two columns.
+        # Only away from edges, which are between two columns.
         match = np.arange(WIDTH) + sign * disparity_px
         before = np.clip(match.astype(int), 0, WIDTH - 2)
         row = np.arange(HEIGHT)[:, None]
@@ -131,9 +131,10 @@ def test_the_disparities_of_both_views_agree_where_both_see_a_surface(here, ther
         assert np.median(error_px[~hidden]) < 1e-3
 
 
-def test_a_square_before_a_wall_hides_what_it_must():
-    # Disparity 6 in columns 10..13 before a wall at 2. The wall's columns 6..9 would match the right view's
-    # 4..7, where the square is; columns 0, 1 match nothing. From the right: the wall's 8..11 match 10..13.
+def test_a_square_in_front_of_a_wall_occludes_the_expected_columns():
+    # The square in columns 10..13 has a disparity of 6, the wall 2. The wall's columns 6..9 would match the
+    # right view's 4..7, where the square is; columns 0 and 1 have no match. In the right view, the wall's
+    # columns 8..11 would match 10..13.
     square = rectangle(9.5, -3, 13.5, 12, canvas=(40, 8))
     layers = (
         CollageLayer(patch=cover_canvas(40, 8), surface=flat(2.0), paint=PLAIN),
@@ -151,19 +152,19 @@ def test_a_square_before_a_wall_hides_what_it_must():
     assert np.flatnonzero(right_occluded[3]).tolist() == [8, 9, 10, 11, 28, 29]
 
 
-def test_a_slanted_wall_does_not_hide_itself():
-    # Disparity falls from 20 by 0.4 a column: the right view sees the wall shrunk, but all of it.
+def test_a_slanted_wall_does_not_occlude_itself():
+    # Disparity falls from 20 by 0.4 per column: the right view stretches the wall, but shows all of it.
     falling = CollageSurface(plane=(20.0, -0.4, 0.0, 0.0, 0.0), waves=(), hills=(), limit_px=100.0)
     layer = CollageLayer(patch=cover_canvas(90, 4), surface=falling, paint=PLAIN)
     left, right = paint_scene(CollageScene(layers=(layer,), height=4, width=40))
     np.testing.assert_allclose(left.disparity_px[0], 20 - 0.4 * np.arange(40), atol=1e-5)
     occluded = find_occluded(left.disparity_px, right.disparity_px, -1)
-    # x - (20 - 0.4 x) >= 0 from x = 14.3 on
+    # The match x - (20 - 0.4 x) is inside the right view from x = 14.3.
     assert np.flatnonzero(~occluded[0]).tolist() == list(range(15, 40))
 
 
 def test_the_right_view_inverts_a_slope_exactly():
-    # d = 10 + 0.25 x, so right column c shows x = (c + 10) / 0.75, with disparity x - c.
+    # With d = 10 + 0.25 x, right column c shows x = (c + 10) / 0.75 and has a disparity of x - c.
     rising = CollageSurface(plane=(10.0, 0.25, 0.0, 0.0, 0.0), waves=(), hills=(), limit_px=100.0)
     layer = CollageLayer(patch=cover_canvas(140, 4), surface=rising, paint=PLAIN)
     _, right = paint_scene(CollageScene(layers=(layer,), height=4, width=40))
@@ -172,7 +173,7 @@ def test_the_right_view_inverts_a_slope_exactly():
 
 
 @pytest.mark.parametrize("draw", [draw_scene, draw_training_scene])
-def test_surfaces_never_turn_their_back(draw):
+def test_surfaces_always_face_both_cameras(draw):
     for index in range(30):
         for layer in draw(np.random.default_rng(index), HEIGHT, WIDTH).layers:
             disparity_px = layer.surface.over(layer.patch)
@@ -194,7 +195,7 @@ def training_pairs():
     return [paint_training_collage(6, 0, index, 64, 96) for index in range(150)]
 
 
-def test_the_same_numbers_give_the_same_training_pair_and_not_the_one_of_validation(training_pairs):
+def test_the_same_numbers_give_the_same_training_pair_but_another_validation_pair(training_pairs):
     assert digest(paint_training_collage(6, 0, 9, 64, 96)) == digest(training_pairs[9])
     assert digest(paint_collage(6, 0, 9, 64, 96)) != digest(training_pairs[9])
 
@@ -203,7 +204,7 @@ def test_some_training_pairs_have_negative_disparities(training_pairs):
     assert 3 <= sum(pair.disparity_px.min() < 0 for pair in training_pairs) <= 18
 
 
-def test_a_training_pair_of_plain_noise_has_nothing_to_find(training_pairs):
+def test_a_training_pair_of_plain_noise_has_no_matches(training_pairs):
     noise = [pair for pair in training_pairs if pair.disparity_px.max() < 0]
     assert noise
     for pair in noise:
@@ -213,7 +214,7 @@ def test_a_training_pair_of_plain_noise_has_nothing_to_find(training_pairs):
         assert abs(np.mean(across, axis=0)[0, 1]) < 0.1
 
 
-def test_views_cut_apart_have_exact_disparities_on_both_sides_of_0(training_pairs):
+def test_views_cropped_apart_have_exact_disparities_on_both_sides_of_0(training_pairs):
     apart = [pair for pair in training_pairs if pair.disparity_px.min() < 0 < pair.disparity_px.max()]
     assert apart
     for pair in apart:
@@ -241,15 +242,15 @@ def test_in_some_pairs_the_right_view_is_a_row_or_two_lower_or_higher():
     for index in range(3000):
         _, right = simulate_cameras(np.random.default_rng((8, index)), step, step)
         levels = right[20:28].mean(axis=(1, 2))
-        # How many of the eight rows are bright, parts of rows included; four where nothing moved.
+        # The number of bright rows among eight, including fractions; it is four in an unshifted view.
         rows.append(((levels - levels.min()) / (levels.max() - levels.min())).sum())
     moved_px = np.abs(np.array(rows) - 4)
-    # Half of the 3 % of pairs that have faults; the others are at most half a row apart.
+    # The shift occurs in half of the 3 % of pairs with faults; in other pairs it is at most half a row.
     assert 0.008 < (moved_px > 0.75).mean() < 0.022
     assert 1.6 < moved_px.max() < 2.3
 
 
-def test_a_bayer_filter_keeps_plain_colours_and_what_its_pixels_saw(rng):
+def test_a_bayer_filter_keeps_plain_colours_and_the_values_of_its_own_pixels(rng):
     plain = np.tile(np.array([200.0, 100.0, 50.0], np.float32), (7, 9, 1))
     np.testing.assert_array_equal(demosaic(plain), plain)
     image = np.round(rng.uniform(0, 255, (16, 20, 3))).astype(np.float32)

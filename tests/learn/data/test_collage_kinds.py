@@ -13,14 +13,14 @@ HEIGHT, WIDTH = 320, 512
 
 @pytest.fixture(scope="module")
 def painted():
-    """Disparity, its limit, and the image of the left views of 100 scenes as large as in training."""
+    """Return disparity, its limit, and the left image of 100 scenes of the size used in training."""
     scenes = [draw_training_scene(np.random.default_rng((7, index)), HEIGHT, WIDTH) for index in range(100)]
     views = [(paint_scene(scene)[0], scene.layers[0].surface.limit_px) for scene in scenes]
     return [(view.disparity_px, limit_px, view.image) for view, limit_px in views]
 
 
 def gradient(image):
-    """Grey levels a pixel."""
+    """Return the magnitude of the gradient in grey levels per pixel."""
     grey = image.mean(axis=2)
     return np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)) / 8
 
@@ -38,7 +38,7 @@ def wall(paint, height=96, width=128):
 @pytest.mark.parametrize("draw", [draw_scene, draw_training_scene])
 @pytest.mark.parametrize("width", [384, 704, 1440])
 def test_no_disparity_exceeds_the_networks_reach_at_any_width(draw, width):
-    # Fewer rows than columns: only the width matters, and painting takes time.
+    # Few rows, because only the width matters and painting takes time.
     for index in range(60):
         scene = draw(np.random.default_rng((9, index)), 64, width)
         greatest_px = max(layer.surface.over(layer.patch).max(initial=0) for layer in scene.layers)
@@ -47,14 +47,14 @@ def test_no_disparity_exceeds_the_networks_reach_at_any_width(draw, width):
 
 @pytest.mark.parametrize("draw", [draw_scene, draw_training_scene])
 def test_the_range_of_a_narrow_pair_shrinks_with_its_width(draw):
-    # 190 px of 384 columns are 95 of 192.
+    # 190 px for 384 columns are 95 px for 192.
     for index in range(60):
         scene = draw(np.random.default_rng((9, index)), 96, 192)
         assert max(layer.surface.over(layer.patch).max(initial=0) for layer in scene.layers) <= 95
 
 
 def test_plain_does_not_mean_far(painted):
-    # A 256x384 cut, as training sees it.
+    # A crop of 256x384 pixels, as in training.
     cut = np.s_[32:288, 64:448]
     deep = [far_from_texture(image[cut]) for _, _, image in painted]
     nearness = [(d[cut] / limit_px)[plain] for (d, limit_px, _), plain in zip(painted, deep, strict=True)]
@@ -62,13 +62,13 @@ def test_plain_does_not_mean_far(painted):
     assert 0.4 < np.median(np.concatenate(nearness)) < 0.8
 
 
-def test_as_much_of_the_left_view_is_outside_the_right_one_as_in_real_pairs(painted):
+def test_the_share_of_the_left_view_outside_the_right_one_is_as_in_real_pairs(painted):
     outside = [(np.arange(WIDTH) < disparity_px).mean() for disparity_px, _, _ in painted]
     assert 0.055 < np.mean(outside) < 0.085
     assert np.quantile(outside, 0.25) < 0.03 and np.quantile(outside, 0.9) > 0.1
 
 
-def test_a_plain_paint_has_hardly_any_texture_and_an_unfocused_one_no_fine_one(rng):
+def test_a_plain_paint_has_hardly_any_texture_and_an_unfocused_paint_no_fine_texture(rng):
     place = Placement(64, 48, 64, 128, 96)
     matt = np.zeros(6, np.float32)
     plain = [gradient(wall(draw_plain_paint(rng, place)._replace(gloss=matt))) for _ in range(20)]
@@ -85,13 +85,13 @@ def test_a_street_rises_from_the_horizon_to_the_nearest_below():
         layers = draw_street(np.random.default_rng(index), canvas)
         layers.sort(key=lambda layer: layer.surface.plane[0])
         disparity_px = paint_scene(CollageScene(layers=tuple(layers), height=128, width=192))[0].disparity_px
-        # At least half of the limit at the feet, of which the last row is one of at least 51 short.
+        # The bottom edge has at least half of the limit, and the last row is at most 1/51 short of it.
         assert disparity_px[-1].min() >= 0.5 * 40 * 50 / 51
         skies += disparity_px.min() == 0
     assert skies >= 15
 
 
-def test_what_stands_on_a_street_has_the_disparity_of_its_foot():
+def test_an_object_on_a_street_has_the_disparity_of_its_foot():
     canvas = CollageCanvas(view_width=192, height=128, limit_px=40.0)
     for index in range(20):
         sky, ground, *others = draw_street(np.random.default_rng(index), canvas)

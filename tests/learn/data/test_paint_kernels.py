@@ -8,9 +8,9 @@ LEVELS = np.tile(np.arange(1021, dtype=np.float32) / 4, (3, 1))
 STILL = np.zeros((3, 1021), np.float32)
 
 
-def test_an_outline_becomes_the_signed_distance_to_it():
+def test_an_outline_field_is_the_signed_distance_to_the_outline():
     field = draw_outline_field((SQUARE - 0.25,), 0, 0, (30, 30))
-    # Edges at 9.75 and 19.75 in x and y; beyond 2 px the distance is of no use.
+    # The edges are at 9.75 and 19.75 in x and y; the distance is clamped to 2 px.
     assert field[15, 10] == pytest.approx(0.25)
     assert field[15, 9] == pytest.approx(-0.75)
     assert field[15, 11] == pytest.approx(1.25)
@@ -37,10 +37,10 @@ def test_the_covered_area_is_that_of_the_polygon():
     assert np.clip(field + 0.5, 0, 1).sum() == pytest.approx(abs(ax * by - ay * bx) / 2, rel=0.003)
 
 
-def test_a_rod_is_as_thick_as_it_should_be():
+def test_a_rod_has_the_requested_thickness():
     rod = np.array([[5.0, 10.3], [40.0, 10.3]])
     field = draw_stroke_field(((rod, 1.5),), 0, 0, (20, 50))
-    # A rod from 8.8 to 11.8.
+    # The rod extends from row 8.8 to row 11.8.
     np.testing.assert_allclose(field[7:14, 20], [-1.8, -0.8, 0.2, 1.2, 0.8, -0.2, -1.2], atol=1e-5)
 
 
@@ -49,7 +49,7 @@ def test_an_exposure_without_changes_only_rounds():
     np.testing.assert_array_equal(expose(image, LEVELS, STILL, image), [[[0, 100, 255], [17, 128, 1]]])
 
 
-def test_noise_has_the_deviation_that_was_asked_for():
+def test_noise_has_the_requested_deviation():
     image = np.full((100, 100, 3), 120, np.float32)
     noise = np.random.default_rng(0).standard_normal(image.shape, np.float32)
     assert expose(image, LEVELS, STILL + 4, noise).std() == pytest.approx(4, rel=0.03)

@@ -53,7 +53,7 @@ def test_pairs_of_another_version_of_the_generator_are_kept_apart(tmp_path, monk
     assert CachedPairs(tmp_path, 3, 2, PAIR_SIZE).missing() == [0, 1]
 
 
-def test_pairs_that_another_training_makes_are_waited_for_and_not_made_again(tmp_path):
+def test_a_training_waits_for_pairs_that_another_one_makes_and_does_not_make_them_again(tmp_path):
     folder = keep_pairs(tmp_path, 3, 1).folder
     other = ExitStack()
 
@@ -71,7 +71,7 @@ def test_pairs_that_another_training_makes_are_waited_for_and_not_made_again(tmp
     assert screen.getvalue() == f"{folder}: another training is making these pairs; waiting for it\n"
 
 
-def test_what_is_missing_or_half_written_is_made_as_the_generator_makes_it(tmp_path):
+def test_missing_and_half_written_pairs_are_made_again_by_the_generator(tmp_path):
     pairs = keep_pairs(tmp_path, 3, 1)
     kept = next(pairs.folder.iterdir()).read_bytes()
     (pairs.folder / "000001.part").write_bytes(kept[: len(kept) // 2])

@@ -28,7 +28,7 @@ FRAMES = [f"mill/{number:04d}" for number in range(40)]
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    """Forty frames in the paper's layout, 5 m away; the left picture of each tells its number."""
+    """Return a dataset of forty frames, 5 m away; each left picture's grey level is its frame number."""
     root = tmp_path_factory.mktemp("mill")
     for number, frame in enumerate(FRAMES):
         write_picture(root / "left" / f"{frame}.png", number)
@@ -45,7 +45,7 @@ def recipe(root):
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
-    """Rendered sets: six pairs of rooms, and in one folder two of a ship and four of a crane."""
+    """Return a folder of rendered sets: six pairs of rooms, and two of a ship beside four of a crane."""
     root = tmp_path_factory.mktemp("rendered")
     for folder, count in (("rooms", 6), ("scenes/ship", 2), ("scenes/crane", 4)):
         (root / folder).mkdir(parents=True)
@@ -78,23 +78,23 @@ def test_collages_are_kept_apart_from_those_for_validation(tmp_path):
 def test_each_frame_of_a_dataset_is_trained_on_or_held_out(recipe, tmp_path):
     training, held_out = open_sources(recipe, tmp_path)
     assert isinstance(training, PairSource)
-    # The end of the sequence, a tenth of it.
+    # The last tenth of the sequence is held out.
     assert names(training) == FRAMES[:36]
     assert names(held_out) == FRAMES[36:]
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_split_is_the_recipe_s(recipe, tmp_path):
+def test_the_split_is_that_of_the_recipe(recipe, tmp_path):
     training, held_out = open_sources(replace(recipe, split="random"), tmp_path)
     assert sorted(names(training) + names(held_out)) == FRAMES
     assert names(held_out) != FRAMES[36:]
 
 
-def test_a_frame_is_read_when_it_is_asked_for(recipe, tmp_path):
+def test_a_frame_is_read_on_demand(recipe, tmp_path):
     training, _ = open_sources(recipe, tmp_path)
     sample = training[7]
     assert shades(sample) == (7, 100)
-    # f B = 30 px m, 5 m away.
+    # f B = 30 px m, at a depth of 5 m.
     np.testing.assert_allclose(sample.disparity_px[0, :2], [np.nan, 6])
     assert sample.camera.focal_px == 300
 
@@ -107,23 +107,23 @@ def test_validation_pairs_are_spread_over_the_held_out_frames(recipe, tmp_path, 
     assert names(held_out) == [FRAMES[number] for number in chosen]
 
 
-def test_all_held_out_frames_are_given_where_all_are_asked_for(recipe, tmp_path):
+def test_all_held_out_frames_are_returned_on_request(recipe, tmp_path):
     _, held_out = open_sources(replace(recipe, validation_pairs=1), tmp_path, whole=True)
     assert names(held_out) == FRAMES[36:]
 
 
-def test_an_unknown_dataset_is_answered_with_the_known_ones(recipe, tmp_path):
+def test_the_error_for_an_unknown_dataset_lists_the_known_ones(recipe, tmp_path):
     message = complaint(open_sources, replace(recipe, dataset="propeller"), tmp_path)
     assert message.startswith("tiny: dataset = 'propeller', expected collage or sintel, flyingthings3d, ")
 
 
-def test_a_root_that_lacks_a_folder_is_named(recipe, tmp_path):
+def test_the_error_for_a_missing_root_names_it(recipe, tmp_path):
     assert str(tmp_path / "nowhere") in complaint(
         open_sources, replace(recipe, root=str(tmp_path / "nowhere")), tmp_path
     )
 
 
-def test_a_mix_has_the_pairs_of_its_sets_one_behind_another(rendered, tmp_path):
+def test_a_mix_has_the_pairs_of_its_sets_one_after_another(rendered, tmp_path):
     keep_pairs(tmp_path, RECIPE.seed, RECIPE.pairs)
     training, held_out = open_sources(mixed(rendered, rooms=3.0, collage=1.0), tmp_path)
     assert isinstance(training, MixedSource) and isinstance(training, PairSource)
@@ -145,7 +145,7 @@ def test_the_sets_in_one_folder_share_its_weight_by_their_pairs(rendered, tmp_pa
     assert training.weights == pytest.approx((0.5, 0.2, 0.2, 0.1))
 
 
-def test_rendered_pairs_of_a_mix_are_photographed_each_always_alike(rendered, tmp_path):
+def test_rendered_pairs_of_a_mix_always_get_the_same_camera_imperfections(rendered, tmp_path):
     training, _ = open_sources(mixed(rendered, rooms=1.0), tmp_path)
     ideal = Shards(rendered / "rooms")
     np.testing.assert_array_equal(training[2].disparity_px, ideal[2].disparity_px)
@@ -164,20 +164,20 @@ def test_the_collages_of_a_mix_are_made_like_others(rendered, tmp_path, monkeypa
     assert made == [CachedPairs(tmp_path, RECIPE.seed, RECIPE.pairs, PAIR_SIZE).folder]
 
 
-def test_a_mix_without_collages_makes_none_to_train_on(rendered, tmp_path):
+def test_a_mix_without_collages_makes_no_training_collages(rendered, tmp_path):
     training, _ = open_sources(mixed(rendered, rooms=1.0), tmp_path)
     cache_pairs(training, Console(quiet=True))
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_set_of_a_mix_that_is_not_there_is_named(rendered, tmp_path):
+def test_the_error_for_a_missing_set_of_a_mix_names_it(rendered, tmp_path):
     assert complaint(open_sources, mixed(rendered, caves=1.0), tmp_path) == (
-        f"tiny: mix: {rendered}/caves: expected pairs of `stereoweave synth make`, or folders of them, found "
-        "none; make them first"
+        f"tiny: mix: {rendered}/caves: expected pairs of `stereoweave synth make`, or folders of such pairs, "
+        "found none; render them first"
     )
 
 
-def test_a_set_that_is_smaller_than_the_crop_is_named(rendered, tmp_path):
+def test_the_error_for_a_set_smaller_than_the_crop_names_it(rendered, tmp_path):
     recipe = replace(mixed(rendered, scenes=1.0), pair_size=(80, 96), crop_size=(80, 96))
     assert complaint(open_sources, recipe, tmp_path) == (
         f"tiny: crop_size = [80, 96], expected at most [64, 96], the size of the pairs in {rendered}/scenes/"
@@ -185,7 +185,7 @@ def test_a_set_that_is_smaller_than_the_crop_is_named(rendered, tmp_path):
     )
 
 
-def test_fresh_collages_are_those_of_the_seed_and_none_is_kept(tmp_path):
+def test_fresh_collages_depend_on_the_seed_and_are_not_cached(tmp_path):
     recipe = replace(RECIPE, fresh=True, pair_size=(32, 48), crop_size=(32, 32))
     training, held_out = open_sources(recipe, tmp_path)
     expected = paint_training_collage(recipe.seed, 0, 5, 32, 48)
@@ -204,6 +204,6 @@ def test_held_out_sets_are_read_from_their_folders(rendered):
     assert {name: pairs.count for name, pairs in held_out.items()} == {"rooms": 6, "all": 6}
 
 
-def test_a_held_out_set_that_is_not_there_is_named(tmp_path):
+def test_the_error_for_a_missing_held_out_set_names_it(tmp_path):
     message = complaint(open_held_out_sets, replace(RECIPE, held_out=(("rooms", str(tmp_path / "rooms")),)))
     assert message.startswith(f"tiny: held_out: {tmp_path / 'rooms'}: expected pairs of `stereoweave synth")

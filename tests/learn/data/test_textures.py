@@ -24,7 +24,7 @@ from stereoweave.learn.data.textures import (
 
 @pytest.fixture(scope="module")
 def textures() -> list[np.ndarray]:
-    """All of them, those of nature first."""
+    """Return all textures, the natural ones first."""
     return [make_natural(k) for k in range(NATURAL_TEXTURES)] + [
         make_periodic(k) for k in range(PERIODIC_TEXTURES)
     ]
@@ -63,10 +63,10 @@ def test_test_pairs_and_faces_are_not_among_the_photographs():
     assert not PHOTOGRAPHS.keys() & {"stereo_motorcycle", "lfw_subset"}
 
 
-def test_noise_has_the_spectrum_that_was_asked_for():
+def test_noise_has_the_requested_spectrum():
     noise = draw_power_noise(np.random.default_rng(0), 1.0)
     amplitude = np.abs(np.fft.fft2(noise))
-    # Amplitude ~ 1 / frequency: four times the frequency, a quarter of the amplitude.
+    # Amplitude is proportional to 1 / frequency: a quarter at four times the frequency.
     low = np.sqrt((amplitude[10, -10:] ** 2).mean() + (amplitude[10, 1:11] ** 2).mean())
     high = np.sqrt((amplitude[40, -40:] ** 2).mean() + (amplitude[40, 1:41] ** 2).mean())
     assert low / high == pytest.approx(4, rel=0.25)
@@ -74,7 +74,7 @@ def test_noise_has_the_spectrum_that_was_asked_for():
     assert noise.std() == pytest.approx(1, abs=1e-5)
 
 
-def test_light_maps_never_darken_to_black_nor_blind():
+def test_light_maps_neither_darken_to_black_nor_overexpose():
     for light in map(make_light_map, range(LIGHT_MAPS)):
         assert light.dtype == np.float32
         assert 0.2 < light.min() <= light.max() < 1.7
